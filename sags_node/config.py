@@ -1,0 +1,306 @@
+"""A launch file, typed and validated. An unknown key is an error that names the nearest known one."""
+
+from __future__ import annotations
+
+import difflib
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from sags_node.errors import UsageError
+
+Box = tuple[int, int, int, int]  # x, y, width, height in px
+
+
+class Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+# ---- source ----------------------------------------------------------------------------------------------
+
+
+class ReferenceConfig(Section):
+    """Where a recording keeps what is known to be true. Used by `sags eval` only."""
+
+    depth: Path | None = Field(None, description="folder of 16-bit PNGs named by frame number")
+    depth_unit: float = Field(1e-5, gt=0, description="metres per count")
+    depth_kind: Literal["exact", "structured_light", "ct", "stereo_network"] = "exact"
+    tracks: Path | None = Field(None, description="npz with points [T, P, 3] (m) and visible [T, P]")
+
+
+class RecordedSource(Section):
+    """What every recording has in common."""
+
+    pace: Literal["realtime", "fast", "step"] = Field(
+        "realtime",
+        description="realtime: the recording's clock, late frames are replaced; fast: as fast as the node "
+        "takes frames, none lost, stamped at release; step: the same with the recording's own stamps",
+    )
+    rate: float | None = Field(None, gt=0, description="frames per second; default: the recording's own")
+    loop: bool = False
+    start: float = Field(0.0, ge=0, description="seconds to skip at the beginning")
+    frames: int | None = Field(None, gt=0, description="stop after this many frames")
+    poses: Path | None = Field(None, description="npz with T_world_cam [T, 4, 4] (m)")
+    reference: ReferenceConfig = ReferenceConfig()
+
+
+class FoldersSource(RecordedSource):
+    """Two folders of pictures, paired by sorted file name."""
+
+    kind: Literal["folders"] = "folders"
+    left: Path
+    right: Path
+    tools: Path | None = Field(None, description="folder of mask PNGs, 255 = instrument (not tissue)")
+
+
+class VideosSource(RecordedSource):
+    """Two video files, paired by frame number."""
+
+    kind: Literal["videos"] = "videos"
+    left: Path
+    right: Path
+
+
+class SideBySideSource(RecordedSource):
+    """One video with both eyes side by side."""
+
+    kind: Literal["side_by_side"] = "side_by_side"
+    video: Path
+    order: Literal["LR", "RL"] = "LR"
+
+
+class PanesSource(RecordedSource):
+    """One video of several panes; each eye is a crop of it."""
+
+    kind: Literal["panes"] = "panes"
+    video: Path
+    left: Box
+    right: Box
+    tools: Box | None = Field(None, description="pane showing the left eye with instruments painted green")
+
+
+class PhantomSource(RecordedSource):
+    """The built-in synthetic session; rendered once into the cache folder, then replayed."""
+
+    kind: Literal["phantom"] = "phantom"
+    seconds: float = Field(4.0, gt=0, le=600)
+    width: int = Field(640, ge=64, le=4096)
+    height: int = Field(512, ge=64, le=4096)
+    seed: int = 0
+    camera_motion: bool = False
+    smoke: float = Field(0.0, ge=0, le=1)
+    noise: float = Field(0.01, ge=0, le=0.2, description="standard deviation, 0..1 scale")
+    blur: float = Field(0.0, ge=0, le=5, description="px")
+
+
+class V4l2Source(Section):
+    """Live cameras: two devices, or one that delivers both eyes side by side."""
+
+    kind: Literal["v4l2"] = "v4l2"
+    left: str = Field("/dev/video0", description="device; the only one when side_by_side is set")
+    right: str | None = Field("/dev/video2")
+    side_by_side: Literal["LR", "RL"] | None = None
+    width: int = Field(640, gt=0, description="of one device's picture")
+    height: int = Field(480, gt=0)
+    rate: float = Field(30.0, gt=0)
+    fourcc: str | None = Field(None, min_length=4, max_length=4, description="pixel format, e.g. YUYV, MJPG")
+    deadline: float = Field(1.0, gt=0, description="seconds without a picture before the device is reopened")
+    pair_tolerance_ms: float = Field(20.0, gt=0)
+
+
+Source = Annotated[
+    FoldersSource | VideosSource | SideBySideSource | PanesSource | PhantomSource | V4l2Source,
+    Field(discriminator="kind"),
+]
+
+# ---- the stages ------------------------------------------------------------------------------------------
+
+
+class StereoConfig(Section):
+    """Depth from the rectified pair."""
+
+    method: Literal["dis", "sgbm"] = Field("dis", description="dense inverse search, or StereoSGBM 3WAY")
+    scale: Literal[1, 2, 4] = Field(2, description="divide the working size by this for matching")
+    min_depth: float = Field(0.03, gt=0, description="m")
+    max_depth: float = Field(0.30, gt=0, description="m")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> StereoConfig:
+        if self.min_depth >= self.max_depth:
+            raise ValueError(f"min_depth {self.min_depth} must be below max_depth {self.max_depth}")
+        return self
+
+
+class TissueConfig(Section):
+    """Which pixels show tissue."""
+
+    method: Literal["session", "classical", "none"] = Field(
+        "session", description="session: the recording's masks, else classical; none: every pixel"
+    )
+    dilate: int = Field(2, ge=0, le=64, description="px added around instruments, working size")
+    exclude: tuple[Box, ...] = Field((), description="boxes of the raw left picture never to use (captions)")
+
+
+class VisionConfig(Section):
+    width: int | None = Field(None, ge=16, le=4096, description="working size; default: the calibration's")
+    height: int | None = Field(None, ge=16, le=4096)
+    stereo: StereoConfig = StereoConfig()
+    tissue: TissueConfig = TissueConfig()
+
+
+class EngineConfig(Section):
+    backend: Literal["numba", "reference"] = "numba"
+    threads: int | None = Field(None, ge=1, le=64, description="default: all cores of this process")
+
+
+class MappingConfig(Section):
+    budget_ms: float = Field(33.0, gt=0, description="wall time of one frame, all stages")
+    iterations: int | None = Field(None, ge=0, description="fixed steps per frame instead of the budget")
+    max_gaussians: int = Field(30000, ge=100, le=2_000_000)
+    skip_duplicates: bool = Field(True, description="a frame equal to its predecessor is not mapped again")
+
+
+class PublishConfig(Section):
+    data: tuple[str, ...] = Field(("tcp://127.0.0.1:5556",), description="XPUB endpoints")
+    ipc: bool = Field(True, description="also bind an ipc socket in the run directory")
+    control: str | None = Field("tcp://127.0.0.1:5557", description="ROUTER endpoint; null: none")
+    run_dir: Path | None = Field(None, description="default: $XDG_RUNTIME_DIR/sags or /tmp/sags-<uid>")
+    insecure: bool = Field(False, description="allow other addresses than loopback and ipc")
+    right: bool = Field(False, description="also publish the right eye's input and render")
+
+
+class LaunchConfig(Section):
+    """One way to run the node."""
+
+    ns: str = Field("sags", pattern=r"^[A-Za-z0-9_][A-Za-z0-9_/]*$")
+    seed: int = 0
+    rig: Path | None = Field(None, description="folder with left.yaml, right.yaml; the phantom has its own")
+    source: Source = PhantomSource()
+    vision: VisionConfig = VisionConfig()
+    engine: EngineConfig = EngineConfig()
+    mapping: MappingConfig = MappingConfig()
+    publish: PublishConfig = PublishConfig()
+    segments: dict[str, tuple[int, int]] = Field({}, description="name: [first, last] frame, for sags eval")
+
+
+# ---- reading ---------------------------------------------------------------------------------------------
+
+_PATH_KEYS = ("rig", "video", "left", "right", "tools", "poses", "depth", "tracks")
+DEFAULT_DATA = "../shared/data"
+
+
+def load_launch(path: Path | str | None = None, overrides: Sequence[str] = ()) -> LaunchConfig:
+    """Read a launch file (or a session folder that holds `launch.yaml`) and apply `key:=value` overrides.
+
+    `$SAGS_DATA` and other variables are expanded; relative paths in the file are relative to the file.
+    `path=None` gives the defaults: the built-in phantom session.
+
+    Raises:
+        UsageError: the file is missing, is not YAML, or holds an unknown key or a wrong value.
+    """
+    tree: dict[str, Any] = {}
+    name = "defaults"
+    if path is not None:
+        file = Path(path)
+        if file.is_dir():
+            file = file / "launch.yaml"
+        name = str(file)
+        tree = _read_yaml(file)
+        _resolve_paths(tree, file.parent)
+    for override in overrides:
+        _apply_override(tree, override)
+    try:
+        return LaunchConfig.model_validate(tree)
+    except ValidationError as error:
+        raise UsageError(_explain(error, name)) from None
+
+
+def _read_yaml(file: Path) -> dict[str, Any]:
+    try:
+        text = file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
+        raise UsageError(f"cannot read launch file {file}: {reason}; check the path") from None
+    try:
+        tree = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise UsageError(f"{file} is not valid YAML: {' '.join(str(error).split())}") from None
+    if tree is None:
+        return {}
+    if not isinstance(tree, dict):
+        raise UsageError(f"{file}: a launch file is a map of sections, this is a {type(tree).__name__}")
+    return tree
+
+
+def _resolve_paths(tree: Any, folder: Path) -> None:
+    """Expand variables in every string and make the known path keys relative to the launch file."""
+    os.environ.setdefault("SAGS_DATA", str((folder / ".." / DEFAULT_DATA).resolve()))
+    if not isinstance(tree, dict):
+        return
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            if value.get("kind") != "v4l2":
+                _resolve_paths(value, folder)
+        elif isinstance(value, str):
+            expanded = os.path.expandvars(value)
+            if "$" in expanded and key in _PATH_KEYS:
+                raise UsageError(f"{key}: {value} uses a variable that is not set; export it first")
+            tree[key] = str(folder / expanded) if key in _PATH_KEYS else expanded
+
+
+def _apply_override(tree: dict[str, Any], override: str) -> None:
+    key, separator, text = override.partition(":=")
+    if not separator or not key:
+        raise UsageError(f"'{override}' is not an override; write key:=value, e.g. mapping.budget_ms:=33")
+    try:
+        value = yaml.safe_load(text)
+    except yaml.YAMLError:
+        raise UsageError(f"'{override}': the value is not valid YAML; quote it") from None
+    node = tree
+    *parents, leaf = key.split(".")
+    for parent in parents:
+        node = node.setdefault(parent, {})
+        if not isinstance(node, dict):
+            raise UsageError(f"'{override}': {parent} is a value, not a section")
+    node[leaf] = value
+
+
+def _explain(error: ValidationError, name: str) -> str:
+    """One line per mistake: where, what, and the nearest known key for an unknown one."""
+    lines = []
+    for item in error.errors():
+        path = [str(part) for part in item["loc"]]
+        where = ".".join(part for part in path if part not in _SOURCES)
+        if item["type"] == "extra_forbidden":
+            known = _known_keys(path[:-1])
+            near = difflib.get_close_matches(path[-1], known, n=1, cutoff=0.5)
+            hint = f"did you mean '{near[0]}'?" if near else f"known keys: {', '.join(sorted(known))}"
+            lines.append(f"{name}: unknown key '{where}'; {hint}")
+        else:
+            lines.append(f"{name}: {where or 'launch file'}: {item['msg']} (got {item.get('input')!r})")
+    return "\n".join(lines)
+
+
+def _known_keys(path: Sequence[str]) -> list[str]:
+    model: Any = LaunchConfig
+    for part in path:
+        field = model.model_fields.get(part)
+        if part in _SOURCES:
+            model = _SOURCES[part]
+        elif field is not None and part != "source":
+            model = field.annotation
+    return list(model.model_fields)
+
+
+_SOURCES: dict[str, type[Section]] = {
+    "folders": FoldersSource,
+    "videos": VideosSource,
+    "side_by_side": SideBySideSource,
+    "panes": PanesSource,
+    "phantom": PhantomSource,
+    "v4l2": V4l2Source,
+}

@@ -1,0 +1,210 @@
+"""The types that cross module boundaries, and every convention of this package.
+
+Conventions
+-----------
+- SI units: metres and seconds; times inside types are integer nanoseconds of the wall clock
+  (`time.time_ns`) for live sources and of the recording for deterministic ones.
+- Images are uint8 RGB `[H, W, 3]` at the edges (sources, messages), float32 0..1 inside.
+- OpenCV camera axes: x right, y down, z forward. The centre of the first pixel is (0, 0), as in `K` of
+  OpenCV and ROS. The rasterisers sample at +0.5; `engine.rasterize` shifts once.
+- Depth is camera z, never ray length. 0 means unknown (NaN on the wire, REP 117/118).
+- A `tissue` mask is True where the pixel shows tissue and may be used. (EndoNeRF's files are the opposite.)
+- The world is the left rectified camera of the first frame unless a pose comes with the frame.
+  `T_world_cam` maps camera points to world points; `viewmat` is its inverse.
+- Quaternions are wxyz.
+- `frame_id` and `t_capture_ns` are set at capture (the left eye's stamp) and copied unchanged to everything
+  derived from that frame, so the age of any content is always computable.
+- An array in a published type is never written again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+U8 = NDArray[np.uint8]
+I64 = NDArray[np.int64]
+Bool = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """An undistorted pinhole camera."""
+
+    width: int  # px
+    height: int  # px
+    K: F64  # [3, 3] px
+    T_world_cam: F64  # [4, 4] m
+
+    @property
+    def viewmat(self) -> F64:
+        """World to camera, [4, 4]."""
+        R, t = self.T_world_cam[:3, :3], self.T_world_cam[:3, 3]
+        view = np.eye(4)
+        view[:3, :3] = R.T
+        view[:3, 3] = -R.T @ t
+        return view
+
+    def moved_right(self, distance: float) -> Camera:
+        """This camera moved along its own x axis by `distance` metres (the right eye: the baseline)."""
+        T = self.T_world_cam.copy()
+        T[:3, 3] += T[:3, 0] * distance
+        return Camera(self.width, self.height, self.K, T)
+
+
+@dataclass(frozen=True, slots=True)
+class Eye:
+    """One camera of a stereo rig, as a ROS camera_info file describes it."""
+
+    width: int  # px, of the raw picture
+    height: int
+    K: F64  # [3, 3] px, raw picture
+    distortion: F64  # [5] plumb_bob: k1 k2 p1 p2 k3
+    R: F64  # [3, 3] rotation from the raw to the rectified camera
+    P: F64  # [3, 4] projection of the rectified camera; P[0, 3] = -f B for the right eye, metres
+
+
+@dataclass(frozen=True, slots=True)
+class StereoRig:
+    """Two calibrated eyes whose rectified pictures share rows."""
+
+    name: str
+    left: Eye
+    right: Eye
+
+    @property
+    def baseline(self) -> float:
+        """Distance between the eyes, metres."""
+        return float(-self.right.P[0, 3] / self.right.P[0, 0])
+
+    @property
+    def T_right_left(self) -> F64:
+        """Left raw camera to right raw camera, [4, 4], metres."""
+        T = np.eye(4)
+        T[:3, :3] = self.right.R.T @ self.left.R
+        T[:3, 3] = self.right.R.T @ np.array([-self.baseline, 0.0, 0.0])
+        return T
+
+
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """What a recording knows to be true of one frame. Only for measuring: the frame path never reads it."""
+
+    depth: F32 | None = None  # [H, W] m, 0 unknown, left rectified picture at calibration size
+    depth_kind: str = "exact"  # exact | structured_light | ct | stereo_network
+    points: F64 | None = None  # [P, 3] m, world: the same surface points in every frame
+    points_visible: Bool | None = None  # [P] seen by the left eye in this frame
+
+
+@dataclass(frozen=True, slots=True)
+class StereoFrame:
+    """A raw stereo picture pair as a source delivers it."""
+
+    frame_id: int  # gaps are frames the source dropped
+    t_capture_ns: int  # left eye
+    t_capture_right_ns: int
+    left: U8  # [H, W, 3] RGB, raw
+    right: U8  # [H, W, 3] RGB, raw
+    epoch: int = 0  # grows when the clock jumps back or a recording loops
+    T_world_cam: F64 | None = None  # [4, 4] pose of the left rectified camera, when the session knows it
+    tissue: Bool | None = None  # [H, W] raw left picture, when the session knows it
+    reference: Reference | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class RectifiedPair:
+    """Row-aligned, undistorted pictures at the working size."""
+
+    frame_id: int
+    t_capture_ns: int
+    camera: Camera  # left eye
+    baseline: float  # m
+    left: U8  # [H, W, 3] RGB
+    right: U8  # [H, W, 3] RGB
+
+
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """All that the mapper may know of one frame."""
+
+    frame_id: int
+    t_capture_ns: int
+    camera: Camera
+    image: F32  # [H, W, 3] RGB 0..1
+    gray: U8  # [H, W], for optical flow
+    tissue: Bool  # [H, W] True = tissue
+    depth: F32  # [H, W] m, 0 unknown
+    depth_confidence: F32  # [H, W] 0..1
+
+
+@dataclass(frozen=True, slots=True)
+class Gaussians:
+    """Activated Gaussians at one time, ready to draw."""
+
+    means: F32  # [N, 3] m, world
+    quats: F32  # [N, 4] wxyz, any length but zero
+    scales: F32  # [N, 3] m, > 0
+    opacities: F32  # [N] 0..1
+    colors: F32  # [N, 3] RGB 0..1
+    ids: I64  # [N] stable over the life of a Gaussian
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """The model at the time of one frame; immutable."""
+
+    frame_id: int
+    t_capture_ns: int
+    step: int  # optimiser steps since the model was made
+    gaussians: Gaussians
+    velocities: F32  # [N, 3] m/s, world: the last observed motion
+    camera: Camera
+    loss: float  # mean absolute colour residual over tissue, last step
+    counts: Mapping[str, int] = field(default_factory=dict)  # inserted, pruned, iterations, ...
+
+
+@dataclass(frozen=True, slots=True)
+class RenderedView:
+    """The model drawn for one camera."""
+
+    frame_id: int
+    t_capture_ns: int
+    camera: Camera
+    rgb: F32  # [H, W, 3] 0..1, normalised by coverage
+    depth: F32  # [H, W] m along z, 0 where the model says nothing
+    alpha: F32  # [H, W] coverage 0..1
+
+
+@dataclass(frozen=True, slots=True)
+class FrameResult:
+    """One frame's whole story."""
+
+    pair: RectifiedPair
+    observation: Observation
+    snapshot: Snapshot
+    views: Mapping[str, RenderedView]  # "left", and "right" when it is asked for
+    epoch: int
+    timings_ms: Mapping[str, float]  # stage -> ms
+    skipped: Mapping[str, str] = field(default_factory=dict)  # what was left out, and why
+
+
+@dataclass(frozen=True, slots=True)
+class NodeHealth:
+    """What the node says of itself once a second, also when no frames come."""
+
+    state: str  # starting | running | waiting | degraded | stopping
+    rate_hz: float
+    latency_ms: Mapping[str, float]  # p50, p90, p99, max over the last seconds
+    stage_ms: Mapping[str, float]
+    dropped: Mapping[str, int]  # per slot
+    gaussians: int
+    rss_mb: float
+    last_error: str | None = None
