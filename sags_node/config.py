@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -219,6 +219,21 @@ def load_launch(path: Path | str | None = None, overrides: Sequence[str] = ()) -
         raise UsageError(_explain(error, name)) from None
 
 
+def with_parameters(config: LaunchConfig, parameters: Mapping[str, Any]) -> LaunchConfig:
+    """The same configuration with some `section.key` values replaced, validated again.
+
+    Raises:
+        UsageError: an unknown key or a wrong value.
+    """
+    tree = config.model_dump()
+    for key, value in parameters.items():
+        _set(tree, key, value, key)
+    try:
+        return LaunchConfig.model_validate(tree)
+    except ValidationError as error:
+        raise UsageError(_explain(error, "parameters")) from None
+
+
 def _read_yaml(file: Path) -> dict[str, Any]:
     try:
         text = file.read_text(encoding="utf-8")
@@ -260,12 +275,16 @@ def _apply_override(tree: dict[str, Any], override: str) -> None:
         value = yaml.safe_load(text)
     except yaml.YAMLError:
         raise UsageError(f"'{override}': the value is not valid YAML; quote it") from None
+    _set(tree, key, value, override)
+
+
+def _set(tree: dict[str, Any], key: str, value: Any, said: str) -> None:
     node = tree
     *parents, leaf = key.split(".")
     for parent in parents:
         node = node.setdefault(parent, {})
         if not isinstance(node, dict):
-            raise UsageError(f"'{override}': {parent} is a value, not a section")
+            raise UsageError(f"'{said}': {parent} is a value, not a section")
     node[leaf] = value
 
 

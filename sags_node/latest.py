@@ -26,7 +26,18 @@ class Latest(Generic[T]):
             if self._value is not None:
                 self.dropped += 1
             self._value = value
-            self._condition.notify()
+            self._condition.notify_all()
+        if self._on_put is not None:
+            self._on_put()
+
+    def hand_over(self, value: T) -> None:
+        """Wait until the slot is free, then put: nothing is dropped. For recordings not played live."""
+        with self._condition:
+            self._condition.wait_for(lambda: self._value is None or self._closed)
+            if self._closed:
+                return
+            self._value = value
+            self._condition.notify_all()
         if self._on_put is not None:
             self._on_put()
 
@@ -35,6 +46,7 @@ class Latest(Generic[T]):
         with self._condition:
             self._condition.wait_for(lambda: self._value is not None or self._closed, timeout)
             value, self._value = self._value, None
+            self._condition.notify_all()
             return value
 
     def close(self) -> None:

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
+I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 
@@ -207,4 +208,5 @@ class NodeHealth:
     dropped: Mapping[str, int]  # per slot
     gaussians: int
     rss_mb: float
+    skipped: Mapping[str, int]  # rule -> frames
     last_error: str | None = None

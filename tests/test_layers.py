@@ -13,7 +13,9 @@ LAYERS = [
     {"model"},
     {"mapping"},
     {"pipeline"},
-    {"node", "evaluation", "apps"},
+    {"session", "warm_up"},
+    {"node"},
+    {"evaluation", "apps"},
     {"cli"},
 ]
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}

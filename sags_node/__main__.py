@@ -1,0 +1,5 @@
+"""`python -m sags_node` is the `sags` command."""
+
+from sags_node.cli import main
+
+main()

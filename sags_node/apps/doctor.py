@@ -1,0 +1,123 @@
+"""`sags doctor`: is everything here that the node needs, and what would stand in its way."""
+
+from __future__ import annotations
+
+import ctypes.util
+import glob
+import importlib.metadata
+import os
+import platform
+import socket
+import tempfile
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Literal
+
+from sags_node.config import LaunchConfig
+
+Level = Literal["ok", "warning", "error"]
+REQUIRED = (
+    "numpy torch opencv-contrib-python-headless pyzmq open3d onnxruntime numba rosbags mcap msgspec "
+    "pydantic pyyaml click rich"
+).split()
+OPEN3D_LIBRARIES = {
+    "usb-1.0": "libusb-1.0-0",
+    "GL": "libgl1",
+    "EGL": "libegl1",
+    "gomp": "libgomp1",
+    "X11": "libx11-6",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    name: str
+    level: Level
+    found: str
+    mend: str = ""
+
+
+def examine(config: LaunchConfig) -> list[Check]:
+    """All checks, in the order a newcomer meets the problems."""
+    return [
+        _python(),
+        *(_package(name) for name in REQUIRED),
+        *(_library(name, package) for name, package in OPEN3D_LIBRARIES.items()),
+        _cores(),
+        _kernel_cache(),
+        *(_port(endpoint) for endpoint in (*config.publish.data, config.publish.control) if endpoint),
+        _cameras(),
+        _recordings(),
+    ]
+
+
+def as_rows(checks: list[Check]) -> list[dict[str, str]]:
+    return [asdict(check) for check in checks]
+
+
+def _python() -> Check:
+    return Check("Python", "ok", platform.python_version())
+
+
+def _package(name: str) -> Check:
+    try:
+        return Check(name, "ok", importlib.metadata.version(name))
+    except importlib.metadata.PackageNotFoundError:
+        return Check(name, "error", "not installed", "run `make setup`")
+
+
+def _library(name: str, package: str) -> Check:
+    if ctypes.util.find_library(name):
+        return Check(package, "ok", "installed")
+    return Check(package, "warning", "missing", f"Open3D needs it: sudo apt-get install {package}")
+
+
+def _cores() -> Check:
+    cores = len(os.sched_getaffinity(0))
+    if cores < 2:
+        return Check("CPU", "warning", f"{cores} core", "camera rate needs two cores")
+    return Check("CPU", "ok", f"{cores} cores, {platform.machine()}")
+
+
+def _kernel_cache() -> Check:
+    """Numba keeps compiled kernels beside the sources, or in NUMBA_CACHE_DIR."""
+    folder = Path(os.environ.get("NUMBA_CACHE_DIR", Path(__file__).parent.parent / "engine"))
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            return Check("kernel cache", "ok", "writable")
+    except OSError as error:
+        return Check(
+            "kernel cache",
+            "warning",
+            f"{folder}: {error.strerror}",
+            "kernels will be compiled at every start; set NUMBA_CACHE_DIR to a folder you can write",
+        )
+
+
+def _port(endpoint: str) -> Check:
+    host, _, port = endpoint.removeprefix("tcp://").rpartition(":")
+    if not endpoint.startswith("tcp://") or not port.isdigit():
+        return Check(endpoint, "ok", "not a TCP endpoint")
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, int(port)))
+            return Check(endpoint, "ok", "free")
+        except OSError as error:
+            return Check(
+                endpoint, "warning", error.strerror or "in use", "stop the other node or bind elsewhere"
+            )
+
+
+def _cameras() -> Check:
+    devices = sorted(glob.glob("/dev/video*"))
+    if not devices:
+        return Check("cameras", "ok", "none (replay needs none)")
+    return Check("cameras", "ok", ", ".join(devices))
+
+
+def _recordings() -> Check:
+    folder = Path(os.environ.get("SAGS_DATA", ""))
+    if "SAGS_DATA" in os.environ and folder.is_dir():
+        return Check("SAGS_DATA", "ok", str(folder))
+    return Check("SAGS_DATA", "ok", "not set: launch files look in ../shared/data beside the checkout")

@@ -1,0 +1,57 @@
+"""`sags run`: the node in the foreground, with what it does shown live."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+from sags_node.node import Node
+from sags_node.types import NodeHealth
+
+REFRESH = 4.0  # per second
+
+
+def run_node(node: Node, seconds: float | None, console: Console) -> NodeHealth:
+    """Run until the source ends, `seconds` have passed or Ctrl-C; returns the last health.
+
+    Raises:
+        SagsError: what ended the node, if something did.
+    """
+    deadline = None if seconds is None else time.monotonic() + seconds
+    node.start()
+    try:
+        with Live(console=console, refresh_per_second=REFRESH, transient=True) as live:
+            _watch(node, deadline, lambda: live.update(health_table(node.health())))
+    except KeyboardInterrupt:
+        console.print("stopping")
+    finally:
+        health = node.health()
+        node.stop()
+    return health
+
+
+def _watch(node: Node, deadline: float | None, show: Callable[[], None]) -> None:
+    while not node.wait(timeout=1 / REFRESH):
+        show()
+        if deadline is not None and time.monotonic() >= deadline:
+            return
+
+
+def health_table(health: NodeHealth) -> Table:
+    """One screen of what a person wants to know."""
+    table = Table(show_header=False, box=None, padding=(0, 2))
+    latency = health.latency_ms
+    table.add_row("state", health.state)
+    table.add_row("published", f"{health.rate_hz:.1f} Hz")
+    table.add_row("latency p50 / p99", f"{latency['p50']:.0f} / {latency['p99']:.0f} ms")
+    table.add_row("Gaussians", f"{health.gaussians:,}")
+    table.add_row("stages (ms)", "  ".join(f"{k} {v:.1f}" for k, v in health.stage_ms.items()))
+    table.add_row("dropped", "  ".join(f"{k} {v}" for k, v in health.dropped.items()))
+    if health.skipped:
+        table.add_row("skipped", "  ".join(f"{k} {v}" for k, v in health.skipped.items()))
+    table.add_row("memory", f"{health.rss_mb:.0f} MB")
+    return table

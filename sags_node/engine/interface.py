@@ -1,0 +1,89 @@
+"""What a rasteriser backend takes and gives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from sags_node.types import F32, F64, Camera, Gaussians
+
+# The camera model and the limits all backends share; see Mip-Splatting (Yu et al., CVPR 2024).
+NEAR_PLANE = 1e-3  # m; nearer Gaussians are not drawn
+MIP_VARIANCE = 0.1  # px^2 added to the projected covariance (the 2D Mip filter)
+MIN_ALPHA = 1.0 / 255.0  # a Gaussian is cut off where its alpha falls below this
+MAX_OPACITY = 0.999  # keeps 1 - alpha away from zero
+MIN_QUAT_NORM = 1e-12  # shorter quaternions have no direction; such Gaussians are not drawn
+FRUSTUM_MARGIN = 0.3  # x/z in the Jacobian is held within the frustum widened by this share of its half width
+
+
+@dataclass(frozen=True, slots=True)
+class Pinhole:
+    """A camera as the rasterisers see it: the first pixel covers 0..1, so its centre is (0.5, 0.5)."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    R: F64  # [3, 3] world to camera
+    t: F64  # [3] m
+
+    @property
+    def limits(self) -> tuple[float, float, float, float]:
+        """Smallest and largest x/z, then y/z, at which the projection is linearised."""
+        margin_x = FRUSTUM_MARGIN * 0.5 * self.width / self.fx
+        margin_y = FRUSTUM_MARGIN * 0.5 * self.height / self.fy
+        return (
+            -self.cx / self.fx - margin_x,
+            (self.width - self.cx) / self.fx + margin_x,
+            -self.cy / self.fy - margin_y,
+            (self.height - self.cy) / self.fy + margin_y,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Gradients:
+    """Derivatives with respect to what was drawn; rows of Gaussians that were not drawn are zero."""
+
+    means: F32  # [N, 3] per m
+    quats: F32  # [N, 4] of the given, not normalised, quaternion
+    scales: F32  # [N, 3] per m
+    opacities: F32  # [N]
+    colors: F32  # [N, 3]
+    contribution: F32  # [N] sum over pixels of (blending weight of this Gaussian) * (weight of the pixel)
+
+
+class Backend(Protocol):
+    """One implementation of the arithmetic; `make_rasterizer` wraps it with the checks."""
+
+    def forward(self, gaussians: Gaussians, pinhole: Pinhole) -> F32: ...
+
+    def backward(self, v_planes: F32, weight: F32, geometry: bool) -> Gradients: ...
+
+
+class Rasterizer(Protocol):
+    """Draws Gaussians and differentiates the drawing. Not for use by two threads at once."""
+
+    def forward(self, gaussians: Gaussians, camera: Camera) -> F32:
+        """Draw. Returns planes [5, H, W]: sums over the Gaussians of w r, w g, w b, w z (m) and w, where
+        w = alpha * transmittance; not normalised. A view into own memory, overwritten by the next `forward`.
+
+        Raises:
+            UsageError: an array or the camera has the wrong shape or size.
+            SagsError: the picture needs more memory than the engine allows itself.
+        """
+        ...
+
+    def backward(self, v_planes: F32, weight: F32, geometry: bool = True) -> Gradients:
+        """Gradients of sum(v_planes * planes) for the last `forward`, whose arrays must be unchanged.
+
+        Args:
+            v_planes: [5, H, W] cotangent of the planes.
+            weight: [H, W] pixel weights for `Gradients.contribution`.
+            geometry: False leaves out means, quats, scales and opacities: they come back empty, [0, ...].
+
+        Returns:
+            Views into own memory, overwritten by the next `backward`.
+        """
+        ...

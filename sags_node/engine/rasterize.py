@@ -1,0 +1,121 @@
+"""The one way to draw Gaussians: `make_rasterizer`, then `forward`, `backward`, `to_view`.
+
+Shapes are checked here, and here is the one place where OpenCV's pixel centres (first pixel at (0, 0)) become
+those of the rasterisers (first pixel at (0.5, 0.5)).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sags_node.engine.interface import Backend, Gradients, Pinhole, Rasterizer
+from sags_node.engine.jit import read_only
+from sags_node.engine.views import to_view
+from sags_node.errors import UsageError
+from sags_node.types import F32, Camera, Gaussians, RenderedView
+
+__all__ = ["Gradients", "Rasterizer", "make_rasterizer", "rasterize", "to_view"]
+
+
+def make_rasterizer(backend: str, width: int, height: int) -> Rasterizer:
+    """A rasteriser for pictures of one size (px). `backend`: "numba" (fast) or "reference" (torch, slow).
+
+    Raises:
+        UsageError: unknown backend or an empty picture.
+    """
+    if width < 1 or height < 1:
+        raise UsageError(f"cannot draw a picture of {width}x{height} px; give a size of at least 1x1")
+    if backend == "numba":
+        from sags_node.engine.numba_rasterizer import NumbaRasterizer
+
+        return _CheckedRasterizer(NumbaRasterizer(width, height), width, height)
+    if backend == "reference":
+        from sags_node.engine.reference import ReferenceRasterizer
+
+        return _CheckedRasterizer(ReferenceRasterizer(width, height), width, height)
+    raise UsageError(f"unknown engine backend '{backend}'; choose numba or reference")
+
+
+def rasterize(
+    gaussians: Gaussians,
+    camera: Camera,
+    frame_id: int = 0,
+    t_capture_ns: int = 0,
+    backend: str = "numba",
+) -> RenderedView:
+    """Draw Gaussians for a camera of any size and pose. Makes its own rasteriser each time: keep one from
+    `make_rasterizer` to draw often.
+
+    Raises:
+        UsageError: an array or the camera has the wrong shape or size.
+    """
+    rasterizer = make_rasterizer(backend, camera.width, camera.height)
+    return to_view(rasterizer.forward(gaussians, camera), camera, frame_id, t_capture_ns)
+
+
+class _CheckedRasterizer:
+    """A backend behind checked shapes and shifted pixel centres."""
+
+    def __init__(self, backend: Backend, width: int, height: int) -> None:
+        self._backend = backend
+        self._width, self._height = width, height
+        self._drawn = False
+
+    def forward(self, gaussians: Gaussians, camera: Camera) -> F32:
+        if (camera.width, camera.height) != (self._width, self._height):
+            raise UsageError(
+                f"this rasteriser draws {self._width}x{self._height} px, "
+                f"the camera has {camera.width}x{camera.height}; make one for its size"
+            )
+        planes = self._backend.forward(_checked(gaussians), _as_pinhole(camera))
+        self._drawn = True
+        return planes
+
+    def backward(self, v_planes: F32, weight: F32, geometry: bool = True) -> Gradients:
+        if not self._drawn:
+            raise UsageError("nothing was drawn yet; call forward before backward")
+        v_planes = _as_f32(v_planes, (5, self._height, self._width), "v_planes")
+        weight = _as_f32(weight, (self._height, self._width), "weight")
+        return self._backend.backward(v_planes, weight, geometry)
+
+
+def _as_pinhole(camera: Camera) -> Pinhole:
+    K, view = camera.K, camera.viewmat
+    if K.shape != (3, 3) or view.shape != (4, 4):
+        raise UsageError(f"a camera needs K [3, 3] and T_world_cam [4, 4], got {K.shape} and {view.shape}")
+    if not (K[0, 0] > 0 and K[1, 1] > 0 and K[0, 1] == 0):
+        raise UsageError(
+            f"a camera needs positive focal lengths and no skew, got fx {K[0, 0]}, fy {K[1, 1]}, skew {K[0, 1]}"
+        )
+    if not (np.isfinite(K).all() and np.isfinite(view).all()):
+        raise UsageError("the camera's K or pose holds NaN or infinity; check the calibration and the pose")
+    return Pinhole(
+        camera.width,
+        camera.height,
+        fx=float(K[0, 0]),
+        fy=float(K[1, 1]),
+        cx=float(K[0, 2]) + 0.5,
+        cy=float(K[1, 2]) + 0.5,
+        R=view[:3, :3],
+        t=view[:3, 3],
+    )
+
+
+def _checked(gaussians: Gaussians) -> Gaussians:
+    n = len(gaussians.means)
+    return Gaussians(
+        means=_as_f32(gaussians.means, (n, 3), "means"),
+        quats=_as_f32(gaussians.quats, (n, 4), "quats"),
+        scales=_as_f32(gaussians.scales, (n, 3), "scales"),
+        opacities=_as_f32(gaussians.opacities, (n,), "opacities"),
+        colors=_as_f32(gaussians.colors, (n, 3), "colors"),
+        ids=gaussians.ids,
+    )
+
+
+def _as_f32(array: NDArray[np.floating], shape: tuple[int, ...], name: str) -> F32:
+    """The same memory where it is float32 and contiguous already."""
+    if array.shape != shape:
+        raise UsageError(f"{name} has shape {list(array.shape)}, expected {list(shape)}")
+    return read_only(array.astype(np.float32, copy=False))

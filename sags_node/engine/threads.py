@@ -1,0 +1,32 @@
+"""Numba's threading, set deliberately.
+
+Layer: `omp`. Several Python threads may enter parallel kernels at once (the mapper, a consumer's own view);
+Numba's default fall-back `workqueue` aborts the process when that happens. The layer is fixed by importing
+this module, which every module with kernels does before Numba starts its pool. GNU OpenMP does not survive a
+fork: start other processes with the `spawn` method.
+
+Count: Numba keeps it per Python thread, and a new thread starts with all cores of the process.
+"""
+
+from __future__ import annotations
+
+import numba
+
+numba.config.THREADING_LAYER = "omp"
+
+
+def configure_threads(threads: int | None) -> int:
+    """Set how many cores the kernels called from *this* Python thread use; returns that count.
+
+    `None` means all cores this process may run on, which is also the upper bound: more threads than cores
+    only wait for each other. Call it in every thread that computes. Results do not depend on the count.
+    """
+    cores = int(numba.config.NUMBA_NUM_THREADS)
+    count = cores if threads is None else max(1, min(threads, cores))
+    numba.set_num_threads(count)
+    return count
+
+
+def thread_count() -> int:
+    """How many threads a kernel called now from this Python thread uses."""
+    return int(numba.get_num_threads())

@@ -1,0 +1,38 @@
+"""From blended planes to the picture that is shown: colour and depth normalised by coverage."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from sags_node.engine.jit import aligned, parallel_kernel, read_only
+from sags_node.types import F32, Camera, RenderedView
+
+f4 = np.float32
+ZERO, ONE = f4(0.0), f4(1.0)
+FAINT = f4(1e-3)  # below this coverage a colour means nothing
+SOLID = f4(0.5)  # coverage from which on a depth is stated
+
+
+@parallel_kernel
+def _normalise(planes: F32, rgb: F32, depth: F32, alpha: F32) -> None:
+    _, height, width = planes.shape
+    for y in numba.prange(height):
+        for x in range(width):
+            coverage = planes[4, y, x]
+            inverse = ONE / coverage if coverage > FAINT else ZERO
+            for k in range(3):
+                rgb[y, x, k] = min(max(planes[k, y, x] * inverse, ZERO), ONE)
+            depth[y, x] = planes[3, y, x] * inverse if coverage >= SOLID else ZERO
+            alpha[y, x] = min(max(coverage, ZERO), ONE)
+
+
+def to_view(planes: F32, camera: Camera, frame_id: int, t_capture_ns: int) -> RenderedView:
+    """The picture that `planes` [5, H, W] of `Rasterizer.forward` show, in fresh arrays.
+
+    rgb = C / alpha held in 0..1, 0 where alpha < 0.001; depth = D / alpha (m) where alpha >= 0.5, else 0.
+    """
+    _, height, width = planes.shape
+    rgb, depth, alpha = aligned((height, width, 3)), aligned((height, width)), aligned((height, width))
+    _normalise(read_only(planes), rgb, depth, alpha)
+    return RenderedView(frame_id, t_capture_ns, camera, rgb, depth, alpha)

@@ -1,0 +1,199 @@
+"""Go through a recording once more and measure what a spooled run showed of each of its frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from sags_node.config import Box
+from sags_node.engine.rasterize import make_rasterizer, to_view
+from sags_node.evaluation import metrics
+from sags_node.evaluation.gallery import Gallery
+from sags_node.evaluation.lpips import Lpips
+from sags_node.evaluation.spool import RunFacts, Spool, SpooledFrame
+from sags_node.evaluation.tracking import PointTracks, TrackErrors
+from sags_node.evaluation.views import extrapolated, right_eye_mask
+from sags_node.types import F32, Bool, Camera, Gaussians, RectifiedPair, Reference, StereoFrame
+from sags_node.vision.rectify import Rectifier
+
+Figures = dict[str, float]
+Progress = Callable[[str, int], None]  # what is going on, frames done
+TissueOf = Callable[[StereoFrame, RectifiedPair], Bool]
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """What to measure, and what the run must leave out for it."""
+
+    hold_out: int = 8  # frames i > 0 with (i - 1) % hold_out == 0 are never mapped; 0: none
+    every: int = 5  # the right eye and LPIPS are measured on every so many processed frames
+    lpips_weights: Path | None = None
+    paper_psnr: bool = False
+
+    def holds_out(self, frame_id: int) -> bool:
+        """The literature's test split, by frame number."""
+        return self.hold_out > 0 and frame_id > 0 and (frame_id - 1) % self.hold_out == 0
+
+
+@dataclass(frozen=True, slots=True)
+class FrameRow:
+    """All figures of one frame of the recording."""
+
+    frame_id: int
+    seconds: float  # on the recording's clock
+    figures: dict[str, Figures]  # online, predict, heldout, novel, depth, measured_depth: those that apply
+    facts: RunFacts | None = None  # None: held out, or dropped by the run
+    track: TrackErrors | None = None
+
+
+@dataclass(slots=True)
+class _Before:
+    """The last processed frame, from which the next one is predicted."""
+
+    shown: SpooledFrame
+    truth: F32
+    seconds: float  # on the recording's clock
+
+
+class Measurer:
+    """Measures a run frame by frame.
+
+    Attributes:
+        rows: one for each frame of the recording.
+        gallery: a few frames to look at.
+    """
+
+    def __init__(
+        self,
+        spool: Spool,
+        rectifier: Rectifier,
+        tissue_of: TissueOf,
+        options: Options,
+        exclude: tuple[Box, ...] = (),
+        backend: str = "numba",
+    ) -> None:
+        """
+        Args:
+            tissue_of: the run's own tissue mask, for frames that it held out.
+            exclude: boxes of the raw pictures that are never measured (captions, burnt into both eyes).
+        """
+        self.rows: list[FrameRow] = []
+        self.gallery = Gallery(len(spool))
+        self._spool = spool
+        self._places = {frame_id: place for place, frame_id in enumerate(spool.frame_ids)}
+        self._rectifier = rectifier
+        self._tissue_of = tissue_of
+        self._options = options
+        self._exclude = exclude
+        camera = rectifier.camera
+        self._rasterizer = make_rasterizer(backend, camera.width, camera.height)
+        self._lpips = Lpips(options.lpips_weights) if options.lpips_weights else None
+        self._usable_right: Bool | None = None
+        self._tracks: PointTracks | None = None
+        self._before: _Before | None = None
+        self._pace = 1.0  # seconds of the run in a second of the recording
+
+    def run(self, frames: Iterable[StereoFrame], progress: Progress) -> None:
+        """Measure all frames of the recording that the run was played from."""
+        for frame in frames:
+            pair = self._rectifier(frame)
+            seconds = frame.t_capture_ns * 1e-9
+            place = self._places.get(frame.frame_id)
+            if place is not None:
+                self.rows.append(self._processed(frame, pair, seconds, place))
+            elif self._options.holds_out(frame.frame_id) and self._before is not None:
+                self.rows.append(self._held_out(frame, pair, seconds, self._before))
+            else:
+                self.rows.append(FrameRow(frame.frame_id, seconds, {}))
+            progress("measuring", len(self.rows))
+
+    def _processed(self, frame: StereoFrame, pair: RectifiedPair, seconds: float, place: int) -> FrameRow:
+        shown = self._spool.read(place)
+        truth = metrics.as_float(pair.left)
+        costly = place % self._options.every == 0
+        figures = {"online": self._quality(metrics.as_float(shown.rgb), truth, shown.tissue, costly)}
+        if self._before is not None:
+            figures["predict"] = self._predict(self._before, shown, truth, seconds)
+        if costly:
+            figures["novel"] = {"psnr": self._novel(shown, pair, frame)}
+        track = None
+        if frame.reference is not None:
+            figures |= _depth_figures(shown, frame.reference)
+            track = self._follow(shown, frame.reference)
+        self.gallery.offer(place, shown, pair.left, figures["online"]["psnr"])
+        self._before = _Before(shown, truth, seconds)
+        return FrameRow(frame.frame_id, seconds, figures, shown.facts, track)
+
+    def _predict(self, before: _Before, shown: SpooledFrame, truth: F32, seconds: float) -> Figures:
+        elapsed = (shown.snapshot.t_capture_ns - before.shown.snapshot.t_capture_ns) * 1e-9
+        if elapsed > 0 and seconds > before.seconds:
+            self._pace = elapsed / (seconds - before.seconds)
+        guess = self._draw(extrapolated(before.shown.snapshot, elapsed), shown.snapshot.camera)
+        return {
+            "psnr": metrics.psnr(guess, truth, shown.tissue),
+            "copy_psnr": metrics.psnr(before.truth, truth, shown.tissue),
+        }
+
+    def _held_out(self, frame: StereoFrame, pair: RectifiedPair, seconds: float, before: _Before) -> FrameRow:
+        elapsed = (seconds - before.seconds) * self._pace
+        guess = self._draw(extrapolated(before.shown.snapshot, elapsed), pair.camera)
+        tissue = self._tissue_of(frame, pair)
+        quality = self._quality(guess, metrics.as_float(pair.left), tissue, costly=True)
+        return FrameRow(frame.frame_id, seconds, {"heldout": quality})
+
+    def _quality(self, picture: F32, truth: F32, tissue: Bool, costly: bool) -> Figures:
+        figures = {
+            "psnr": metrics.psnr(picture, truth, tissue),
+            "ssim": metrics.ssim(picture, truth, tissue),
+        }
+        if self._options.paper_psnr:
+            figures["paper_psnr"] = metrics.paper_psnr(picture, truth, tissue)
+        if costly and self._lpips is not None:
+            figures["lpips"] = self._lpips(picture, truth, tissue)
+        return figures
+
+    def _draw(self, gaussians: Gaussians, camera: Camera) -> F32:
+        return to_view(self._rasterizer.forward(gaussians, camera), camera, 0, 0).rgb
+
+    def _novel(self, shown: SpooledFrame, pair: RectifiedPair, frame: StereoFrame) -> float:
+        """PSNR of the right eye's picture, which the mapper never saw, after a fit of gain and offset."""
+        if self._usable_right is None:
+            self._usable_right = self._right_pixels(frame)
+        camera = shown.snapshot.camera
+        mask = right_eye_mask(shown.tissue, shown.depth, float(camera.K[0, 0]), shown.baseline)
+        mask &= self._usable_right
+        right = self._draw(shown.snapshot.gaussians, camera.moved_right(shown.baseline))
+        truth = metrics.as_float(pair.right)
+        return metrics.psnr(metrics.fit_gain_offset(right, truth, mask), truth, mask)
+
+    def _right_pixels(self, frame: StereoFrame) -> Bool:
+        """Where the rectified right picture shows the raw one, without the boxes left out."""
+        white = np.full_like(frame.right, 255)
+        for x, y, width, height in self._exclude:
+            white[y : y + height, x : x + width] = 0
+        usable: Bool = (self._rectifier(replace(frame, right=white)).right == 255).all(-1)
+        return usable
+
+    def _follow(self, shown: SpooledFrame, reference: Reference) -> TrackErrors | None:
+        if reference.points is None or reference.points_visible is None:
+            return None
+        if self._tracks is None:
+            self._tracks = PointTracks(len(reference.points))
+        snapshot = shown.snapshot
+        return self._tracks.update(
+            snapshot.gaussians, reference.points, reference.points_visible, snapshot.camera
+        )
+
+
+def _depth_figures(shown: SpooledFrame, reference: Reference) -> dict[str, Figures]:
+    if reference.depth is None:
+        return {}
+    height, width = shown.depth.shape
+    truth = metrics.resample_nearest(reference.depth, width, height)
+    return {
+        "depth": asdict(metrics.depth_errors(shown.depth, truth, shown.tissue)),
+        "measured_depth": asdict(metrics.depth_errors(shown.measured_depth, truth, shown.tissue)),
+    }

@@ -1,0 +1,158 @@
+"""A run on one page that opens anywhere: pictures, plots over time, and the figures."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Callable, Mapping, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from sags_node.evaluation.gallery import Picture
+from sags_node.evaluation.measure import FrameRow
+from sags_node.evaluation.plots import Series, line_plot
+from sags_node.evaluation.spool import RunFacts
+from sags_node.evaluation.tiles import ERROR_AT_TOP, depth_range, tiles
+from sags_node.types import U8
+
+BLUE, ORANGE, GREEN = "#2166ac", "#d6604d", "#1b7837"
+COLUMNS = ("input", "model", "depth", "error")
+_JPEG_QUALITY = 85
+
+_STYLE = """
+body { font: 15px/1.45 system-ui, sans-serif; color: #222 }
+body { max-width: 1480px; margin: 24px auto; padding: 0 16px }
+h1 { font-size: 22px; margin: 0 } h2 { font-size: 17px; margin: 28px 0 8px } p { margin: 4px 0 }
+table { border-collapse: collapse } td, th { padding: 3px 12px 3px 0; text-align: left; vertical-align: top }
+table.figures td { border-top: 1px solid #ddd } .number { font-variant-numeric: tabular-nums }
+table.pictures img { width: 100%; display: block } table.pictures td { padding: 2px; width: 25% }
+.plots { display: grid; grid-template-columns: repeat(auto-fit, minmax(520px, 1fr)); gap: 8px }
+.quiet { color: #666 }
+svg { width: 100%; background: #fafafa } .grid { stroke: #ddd } .span { fill: #f2e3c6 }
+svg text { font: 11px system-ui, sans-serif; fill: #444 } svg .title { font-weight: 600; font-size: 12px }
+svg .value { text-anchor: end } svg .frame { text-anchor: middle }
+"""
+
+
+def write_report(
+    folder: Path, summary: Mapping[str, Any], rows: Sequence[FrameRow], pictures: Sequence[Picture]
+) -> Path:
+    """Write `report.html` (self-contained, below 2 MB) and `sheet.png` (its pictures) into `folder`.
+
+    Args:
+        summary: as `summarise` makes it.
+
+    Returns:
+        The path of `report.html`.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    near, far = depth_range(pictures)
+    sheet = [tiles(picture, near, far) for picture in pictures]
+    if sheet:
+        grid = np.concatenate([np.concatenate(line, axis=1) for line in sheet])
+        (folder / "sheet.png").write_bytes(_encoded(".png", grid))
+    title = f"SAGS: {escape(str(summary['session']))}"
+    page = "\n".join(
+        [
+            f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>',
+            f"<style>{_STYLE}</style></head><body>",
+            f"<h1>{title}</h1>",
+            f'<p class="quiet">{escape(_circumstances(summary))}</p>',
+            "<h2>What it showed</h2>",
+            _picture_table(pictures, sheet),
+            f'<p class="quiet">Grey: not tissue, or nothing known. Depth from {near * 1e3:.0f} to '
+            f"{far * 1e3:.0f} mm; the error is brightest at {ERROR_AT_TOP:.0%} of full scale.</p>",
+            "<h2>Over time</h2>",
+            _plots(rows, summary.get("segments") or {}),
+            "<h2>Figures</h2>",
+            _figure_table(summary),
+            "</body></html>",
+        ]
+    )
+    file = folder / "report.html"
+    file.write_text(page, encoding="utf-8")
+    return file
+
+
+def _circumstances(summary: Mapping[str, Any]) -> str:
+    settings = summary.get("settings") or {}
+    said = [f"{key} {_text(value)}" for key, value in settings.items() if value not in (None, [])]
+    return "; ".join([str(summary.get("machine", "")), *said])
+
+
+def _picture_table(pictures: Sequence[Picture], sheet: Sequence[Sequence[U8]]) -> str:
+    head = "".join(f"<th>{name}</th>" for name in COLUMNS)
+    lines = [f'<table class="pictures"><tr>{head}</tr>']
+    worst = min((picture.psnr for picture in pictures), default=None)
+    for picture, line in zip(pictures, sheet, strict=True):
+        note = " (the worst)" if picture.psnr == worst and len(pictures) > 1 else ""
+        caption = f"frame {picture.frame_id}, {picture.psnr:.1f} dB{note}"
+        cells = "".join(
+            f'<td><img alt="{name}" src="{_uri(tile)}"></td>'
+            for name, tile in zip(COLUMNS, line, strict=True)
+        )
+        lines.append(f'<tr>{cells}</tr><tr><td colspan="4" class="quiet">{caption}</td></tr>')
+    return "\n".join([*lines, "</table>"])
+
+
+def _plots(rows: Sequence[FrameRow], spans: Mapping[str, tuple[int, int]]) -> str:
+    def quality(label: str, colour: str, group: str, dots: bool = False) -> Series:
+        points = [(row.frame_id, row.figures[group]["psnr"]) for row in rows if group in row.figures]
+        return Series(label, colour, points, dots)
+
+    def run(label: str, colour: str, value: Callable[[RunFacts], float | None]) -> Series:
+        facts = [(row.frame_id, value(row.facts)) for row in rows if row.facts is not None]
+        return Series(label, colour, [(frame, ms) for frame, ms in facts if ms is not None])
+
+    plots = [
+        line_plot(
+            "PSNR over tissue, dB",
+            [
+                quality("online", BLUE, "online"),
+                quality("predicted", ORANGE, "predict"),
+                quality("held out", GREEN, "heldout", dots=True),
+                quality("right eye", "#7b3294", "novel", dots=True),
+            ],
+            spans,
+        ),
+        line_plot("one frame, ms", [run("processing", BLUE, lambda facts: facts.frame_ms)], spans),
+        line_plot("capture to publish, ms", [run("latency", BLUE, lambda facts: facts.latency_ms)], spans),
+        line_plot("Gaussians", [run("Gaussians", BLUE, lambda facts: facts.gaussians)], spans),
+    ]
+    return f'<div class="plots">{"".join(plots)}</div>'
+
+
+def _figure_table(summary: Mapping[str, Any]) -> str:
+    lines = ['<table class="figures">']
+    for key, value in summary.items():
+        if key not in {"settings", "machine", "session"}:
+            lines.append(f'<tr><td>{escape(key)}</td><td class="number">{escape(_text(value))}</td></tr>')
+    return "\n".join([*lines, "</table>"])
+
+
+def _text(value: Any) -> str:
+    """A figure for people: maps on one line, None as a dash."""
+    if value is None:
+        return "–"
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {_inner(part)}" for key, part in value.items()) or "–"
+    if isinstance(value, list):
+        return " ".join(_text(part) for part in value)
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _inner(value: Any) -> str:
+    return f"({_text(value)})" if isinstance(value, Mapping) else _text(value)
+
+
+def _uri(tile: U8) -> str:
+    return "data:image/jpeg;base64," + base64.b64encode(_encoded(".jpg", tile)).decode()
+
+
+def _encoded(suffix: str, picture: U8) -> bytes:
+    options = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY] if suffix == ".jpg" else []
+    _, data = cv2.imencode(suffix, cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), options)
+    return bytes(data)

@@ -1,0 +1,202 @@
+"""Play a recording through the node's own pipeline, then measure what it showed."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal, Self
+
+from sags_node.config import LaunchConfig, PublishConfig, V4l2Source, load_launch
+from sags_node.errors import SagsError, UsageError
+from sags_node.evaluation.gallery import Picture
+from sags_node.evaluation.measure import FrameRow, Measurer, Options, Progress
+from sags_node.evaluation.spool import Spool
+from sags_node.evaluation.summary import GROUPS, summarise
+from sags_node.mapping.budget import Budget, StepBudget, TimeBudget
+from sags_node.node import Node
+from sags_node.pipeline import Pipeline
+from sags_node.session import Session, open_session
+from sags_node.sources.source import Source, open_source
+from sags_node.types import FrameResult, StereoFrame
+from sags_node.vision.rectify import Rectifier
+from sags_node.vision.tissue import TissueMask
+from sags_node.warm_up import warm_up
+
+Pace = Literal["realtime", "step"]
+PROGRESS_PERIOD = 0.2  # s
+DEFAULT_OPTIONS = Options()
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """The outcome of one measured run."""
+
+    summary: dict[str, Any]  # the keys of `sags eval --json`
+    rows: list[FrameRow]
+    pictures: list[Picture]
+
+
+def evaluate(
+    launch: Path | str | None,
+    overrides: Sequence[str] = (),
+    options: Options = DEFAULT_OPTIONS,
+    pace: Pace = "step",
+    iterations: int | None = None,
+    progress: Progress = lambda what, frames: None,
+) -> Evaluation:
+    """Run a recorded session once and measure it.
+
+    Args:
+        launch: a launch file or a session folder; None: the built-in phantom.
+        overrides: `key:=value`, as for `sags run`.
+        pace: `realtime` plays on the recording's clock through the node, sockets included, and drops what
+            comes too late; `step` takes every frame in turn, without threads or sockets.
+        iterations: fixed steps per frame instead of the time budget; with `step`, figures are reproducible.
+        progress: called with what is going on and the frames done.
+
+    Raises:
+        UsageError: a wrong key, value or path, live cameras, or a segment that is named like a figure.
+        SagsError: the recording cannot be used, the disk is full, or nothing was processed.
+    """
+    asked = load_launch(launch, overrides)
+    if isinstance(asked.source, V4l2Source):
+        raise UsageError("live cameras cannot be measured; record them first, then evaluate the recording")
+    _check_segments(asked)
+    forced = ["source.loop:=false", f"source.pace:={pace}"]
+    if iterations is not None:
+        forced.append(f"mapping.iterations:={iterations}")
+    session = open_session(launch, [*overrides, *forced])
+    config = session.config
+    warm_up(config)
+    with Spool() as spool:
+        if pace == "realtime":
+            run_realtime(session, options, spool, progress)
+        else:
+            run_step(session, options, spool, progress)
+        if len(spool) == 0:
+            raise SagsError("no frame was processed; check source.start, source.frames and the hold-out")
+        measurer = _measure(session, spool, options, progress)
+    summary = summarise(
+        _name(launch),
+        measurer.rows,
+        options,
+        config.segments,
+        None if config.mapping.iterations is not None else config.mapping.budget_ms,
+    )
+    summary["settings"] = {
+        "overrides": list(overrides),
+        "pace": pace,
+        "iterations": config.mapping.iterations,
+        "max_gaussians": config.mapping.max_gaussians,
+        "backend": config.engine.backend,
+        "seed": config.seed,
+        "width": config.vision.width or session.rig.left.width,
+        "height": config.vision.height or session.rig.left.height,
+        "hold_out": options.hold_out,
+        "novel_every": options.every,
+    }
+    return Evaluation(summary, measurer.rows, measurer.gallery.pictures)
+
+
+def run_step(session: Session, options: Options, spool: Spool, progress: Progress) -> None:
+    """Every frame in turn, none lost; only the pipeline's own work is timed."""
+    pipeline = Pipeline(session.config, session.rig)
+    budget = _budget(session.config)
+    with session.source as source:
+        for frame in source:
+            if options.holds_out(frame.frame_id):
+                continue
+            started = time.perf_counter()
+            result = pipeline.process(frame, budget)
+            frame_ms = (time.perf_counter() - started) * 1e3
+            spool.add(result, frame_ms, time.monotonic_ns())
+            progress("playing", len(spool))
+
+
+def run_realtime(session: Session, options: Options, spool: Spool, progress: Progress) -> None:
+    """The node itself, threads and sockets included, on the recording's clock."""
+
+    def keep(result: FrameResult, latency_ms: float) -> None:
+        spool.add(result, sum(result.timings_ms.values()), time.monotonic_ns(), latency_ms)
+
+    # Its own sockets, away from those of a node that may be running on this machine.
+    publish = PublishConfig(data=(), control=None, run_dir=spool.folder / "run")
+    config = session.config.model_copy(update={"publish": publish})
+    node = Node(config, session.rig, _WithoutHeldOut(session.source, options), on_result=keep)
+    node.start()
+    try:
+        while not node.wait(PROGRESS_PERIOD):
+            progress("playing", len(spool))
+    finally:
+        node.stop()
+
+
+def _budget(config: LaunchConfig) -> Budget:
+    if config.mapping.iterations is not None:
+        return StepBudget(config.mapping.iterations)
+    return TimeBudget(config.mapping.budget_ms * 1e-3)
+
+
+class _WithoutHeldOut:
+    """A source whose held-out frames never reach the node."""
+
+    def __init__(self, source: Source, options: Options) -> None:
+        self._source = source
+        self._options = options
+
+    @property
+    def rate(self) -> float:
+        return self._source.rate
+
+    @property
+    def frame_count(self) -> int | None:
+        return self._source.frame_count
+
+    @property
+    def dropped(self) -> int:
+        return self._source.dropped
+
+    def __enter__(self) -> Self:
+        self._source.__enter__()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._source.__exit__(kind, error, trace)
+
+    def __iter__(self) -> Iterator[StereoFrame]:
+        return (frame for frame in self._source if not self._options.holds_out(frame.frame_id))
+
+    def stop(self) -> None:
+        self._source.stop()
+
+
+def _measure(session: Session, spool: Spool, options: Options, progress: Progress) -> Measurer:
+    """Read the recording again, with its truth, and measure every frame."""
+    config = session.config
+    size = config.vision.width or session.rig.left.width, config.vision.height or session.rig.left.height
+    rectifier = Rectifier(session.rig, *size)
+    tissue = TissueMask(config.vision.tissue, rectifier)
+    exclude = config.vision.tissue.exclude
+    measurer = Measurer(spool, rectifier, tissue, options, exclude, config.engine.backend)
+    with open_source(config.source.model_copy(update={"pace": "step"})) as frames:
+        measurer.run(frames, progress)
+    return measurer
+
+
+def _check_segments(config: LaunchConfig) -> None:
+    figures = {key for keys in GROUPS.values() for key in keys}
+    for name in config.segments:
+        if name in figures:
+            raise UsageError(f"segments.{name}: a segment cannot be named like a figure; rename it")
+
+
+def _name(launch: Path | str | None) -> str:
+    if launch is None:
+        return "phantom"
+    path = Path(launch)
+    return path.name if path.is_dir() else path.stem

@@ -1,0 +1,160 @@
+"""What a run showed, kept on disk while it runs, so that measuring it later cannot slow it down.
+
+One file per frame: a line of JSON, then arrays in `.npy` form. Nothing but the frame numbers stays in memory.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import cv2
+import numpy as np
+
+from sags_node.errors import SagsError
+from sags_node.node import resident_mb
+from sags_node.types import F32, U8, Bool, Camera, FrameResult, Gaussians, Snapshot
+
+_ARRAYS = 13  # in a frame's file
+
+
+@dataclass(frozen=True, slots=True)
+class RunFacts:
+    """What the run itself says of one processed frame."""
+
+    t_shown_ns: int  # when its result was done or published; monotonic clock
+    frame_ms: float  # wall time of all stages
+    latency_ms: float | None  # capture stamp to publish; None when nothing was published
+    rss_mb: float
+    timings_ms: dict[str, float]  # stage -> ms
+    skipped: dict[str, str]
+    gaussians: int
+    counts: dict[str, int]  # inserted, removed, iterations, ...
+
+
+@dataclass(frozen=True, slots=True)
+class SpooledFrame:
+    """One processed frame as it was shown."""
+
+    facts: RunFacts
+    snapshot: Snapshot  # stamped on the clock of the run
+    baseline: float  # m
+    rgb: U8  # [H, W, 3] the model drawn for the left eye after this frame's update
+    depth: F32  # [H, W] m, the same, 0 where the model says nothing
+    tissue: Bool  # [H, W]
+    measured_depth: F32  # [H, W] m, the stereo stage's own, 0 unknown
+
+
+class Spool:
+    """A temporary folder of frames; gone when the `with` block ends, for whatever reason."""
+
+    def __init__(self) -> None:
+        self._folder = tempfile.TemporaryDirectory(prefix="sags-eval-")
+        self.folder = Path(self._folder.name)
+        self.frame_ids: list[int] = []
+
+    def __enter__(self) -> Spool:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._folder.cleanup()
+
+    def __len__(self) -> int:
+        return len(self.frame_ids)
+
+    def __iter__(self) -> Iterator[SpooledFrame]:
+        return (self.read(place) for place in range(len(self)))
+
+    def add(
+        self, result: FrameResult, frame_ms: float, t_shown_ns: int, latency_ms: float | None = None
+    ) -> None:
+        """Keep one frame: about 6 MB and a few milliseconds at 640x512 with 30,000 Gaussians.
+
+        Raises:
+            SagsError: the disk is full.
+        """
+        snapshot, view, seen = result.snapshot, result.views["left"], result.observation
+        gaussians = snapshot.gaussians
+        facts = RunFacts(
+            t_shown_ns,
+            frame_ms,
+            latency_ms,
+            resident_mb(),
+            dict(result.timings_ms),
+            dict(result.skipped),
+            len(gaussians),
+            dict(snapshot.counts),
+        )
+        header = {
+            "facts": asdict(facts),
+            "frame_id": snapshot.frame_id,
+            "t_capture_ns": snapshot.t_capture_ns,
+            "step": snapshot.step,
+            "loss": float(snapshot.loss),
+            "baseline": result.pair.baseline,
+        }
+        arrays = (
+            snapshot.camera.K,
+            snapshot.camera.T_world_cam,
+            cv2.convertScaleAbs(view.rgb, alpha=255),  # rounds and clips at 255
+            view.depth,
+            np.packbits(seen.tissue),
+            seen.depth,
+            gaussians.means,
+            gaussians.quats,
+            gaussians.scales,
+            gaussians.opacities,
+            gaussians.colors,
+            gaussians.ids,
+            snapshot.velocities,
+        )
+        try:
+            with self._file(len(self)).open("wb") as file:
+                file.write(json.dumps(header).encode() + b"\n")
+                for array in arrays:
+                    np.save(file, array, allow_pickle=False)
+        except OSError as error:
+            raise SagsError(
+                f"cannot keep frame {snapshot.frame_id} in {self.folder}: {error.strerror}; "
+                "set TMPDIR to a folder with room (about 6 MB per frame) or play fewer frames"
+            ) from None
+        self.frame_ids.append(snapshot.frame_id)
+
+    def read(self, place: int) -> SpooledFrame:
+        """The frame that was added as number `place`."""
+        with self._file(place).open("rb") as file:
+            header: dict[str, Any] = json.loads(file.readline())
+            K, T_world_cam, rgb, depth, tissue, measured_depth, *splats, velocities = (
+                np.load(file, allow_pickle=False) for _ in range(_ARRAYS)
+            )
+        facts = RunFacts(**header["facts"])
+        height, width = depth.shape
+        snapshot = Snapshot(
+            frame_id=header["frame_id"],
+            t_capture_ns=header["t_capture_ns"],
+            step=header["step"],
+            gaussians=Gaussians(*splats),
+            velocities=velocities,
+            camera=Camera(width, height, K, T_world_cam),
+            loss=header["loss"],
+            counts=facts.counts,
+        )
+        return SpooledFrame(
+            facts=facts,
+            snapshot=snapshot,
+            baseline=header["baseline"],
+            rgb=rgb,
+            depth=depth,
+            tissue=np.unpackbits(tissue, count=depth.size).reshape(depth.shape).view(bool),
+            measured_depth=measured_depth,
+        )
+
+    def _file(self, place: int) -> Path:
+        return self.folder / f"{place:06d}.frame"

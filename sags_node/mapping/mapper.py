@@ -1,0 +1,148 @@
+"""The online mapper: one observation in, one immutable snapshot out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sags_node.engine.losses import tissue_loss
+from sags_node.engine.rasterize import Rasterizer
+from sags_node.mapping import densify, initialise
+from sags_node.mapping.budget import Budget
+from sags_node.mapping.motion import OpticalFlow, scene_flow
+from sags_node.mapping.optimiser import Optimiser, Rates
+from sags_node.model.deformation import Deformation, NodeDeformation
+from sags_node.model.gaussians import GaussianModel
+from sags_node.types import F32, Observation, RenderedView, Snapshot
+
+CONTROL_NODES = 512
+INITIAL_STEPS = 30
+MIN_FIRST_GAUSSIANS = 100
+INITIAL_RATES = Rates().scaled(4.0)
+NODE_STEP_PX = 0.08
+DEPTH_WEIGHT = 2e-3  # of a depth residual of DEPTH_SCALE, against colours 0..1
+DEPTH_SCALE = 1e-3  # m: beyond this a depth residual counts linearly
+
+
+@dataclass(slots=True)
+class _Last:
+    """The frame before, as far as the next one needs it."""
+
+    observation: Observation
+    view: RenderedView
+
+
+class Mapper:
+    """Builds and refines the model while the video runs.
+
+    Each frame: predict where the tissue went (optical flow and depth, averaged on control nodes), remove what
+    floats in free space, insert where the model has a hole or something new appears, refine while the budget
+    lasts. The order and the constants follow a measured design; see `benchmarks/`.
+    """
+
+    def __init__(self, rasterizer: Rasterizer, max_gaussians: int) -> None:
+        self.model = GaussianModel(max_gaussians)
+        self.step = 0
+        self._rasterizer = rasterizer
+        self._optimiser = Optimiser()
+        self._flow = OpticalFlow()
+        self._deformation: Deformation | None = None
+        self._last: _Last | None = None
+        self._frames = 0
+        self._loss = 0.0
+        self._metres_per_px = 0.0  # at the tissue's median depth
+        self._v_planes: F32 = np.zeros((5, 1, 1), np.float32)
+        self._weight: F32 = np.zeros((1, 1), np.float32)
+
+    def update(self, observation: Observation, budget: Budget) -> Snapshot:
+        """Take one frame in. Call `drawn` with the picture of the snapshot before the next update."""
+        self._frames += 1
+        known = observation.depth[::8, ::8]
+        known = known[known > 0]
+        if known.size:
+            self._metres_per_px = float(np.median(known)) / observation.camera.K[0, 0]
+        if self._deformation is None:
+            counts = self._initialise(observation)
+        else:
+            counts = self._follow(observation, budget)
+        return Snapshot(
+            frame_id=observation.frame_id,
+            t_capture_ns=observation.t_capture_ns,
+            step=self.step,
+            gaussians=self.model.frozen(),
+            velocities=self.model.velocities.copy(),
+            camera=observation.camera,
+            loss=self._loss,
+            counts=counts,
+        )
+
+    def drawn(self, observation: Observation, view: RenderedView) -> None:
+        """Remember how the model looked at `observation`: the next frame's motion starts from there."""
+        self._last = _Last(observation, view)
+
+    def _initialise(self, observation: Observation) -> dict[str, int]:
+        depth = initialise.filled_depth(observation)
+        limit = int(initialise.INITIAL_SHARE * self.model.capacity)
+        pixels, spacing = initialise.first_pixels(observation, depth, limit)
+        if len(pixels) < MIN_FIRST_GAUSSIANS:
+            return {"inserted": 0}  # a black or covered picture: try again with the next frame
+        rows = initialise.insert(self.model, observation, pixels, depth, spacing)
+        self._deformation = NodeDeformation(self.model.means, CONTROL_NODES)
+        self._deformation.attach(self.model, rows)
+        for _ in range(INITIAL_STEPS):
+            self._refine(observation, self._draw(observation), INITIAL_RATES)
+        return {"inserted": len(pixels), "iterations": INITIAL_STEPS}
+
+    def _follow(self, observation: Observation, budget: Budget) -> dict[str, int]:
+        assert self._deformation is not None
+        self._predict(observation)
+        densify.free_space_violations(self.model, observation)
+        removed = self.model.remove(densify.doomed(self.model, observation.camera))
+
+        planes = self._draw(observation)
+        pixels = densify.candidates(planes, observation, phase=7 * self._frames)
+        rows = initialise.insert(self.model, observation, pixels, observation.depth, densify.GRID)
+        self._deformation.attach(self.model, rows)
+
+        iterations = 0
+        while budget.more():
+            if iterations > 0 or len(pixels) > 0:
+                planes = self._draw(observation)
+            self._refine(observation, planes, Rates())
+            iterations += 1
+        return {"inserted": rows.stop - rows.start, "removed": removed, "iterations": iterations}
+
+    def _predict(self, observation: Observation) -> None:
+        """Move all Gaussians to where flow and depth saw the tissue go."""
+        assert self._deformation is not None
+        if self._last is None:
+            return
+        before = self._last.observation
+        flow = self._flow(before.gray, observation.gray)
+        displacements, seen = scene_flow(self.model.means, self._last.view, before.tissue, flow, observation)
+        start = self.model.means.copy()
+        self._deformation.follow(self.model, displacements, seen)
+        seconds = (observation.t_capture_ns - before.t_capture_ns) * 1e-9
+        if seconds > 0:
+            self.model.velocities[:] = (self.model.means - start) / np.float32(seconds)
+
+    def _draw(self, observation: Observation) -> F32:
+        return self._rasterizer.forward(self.model.gaussians(), observation.camera)
+
+    def _refine(self, observation: Observation, planes: F32, rates: Rates) -> None:
+        """One step: loss and its gradient, back-propagation, nodes, Gaussians."""
+        assert self._deformation is not None
+        if self._v_planes.shape != planes.shape:
+            self._v_planes = np.zeros_like(planes)
+            self._weight = np.zeros(planes.shape[1:], np.float32)
+        self._loss = tissue_loss(
+            planes, observation.image, observation.tissue, observation.depth,
+            self._v_planes, self._weight, DEPTH_WEIGHT, DEPTH_SCALE,
+        )  # fmt: skip
+        gradients = self._rasterizer.backward(self._v_planes, self._weight)
+        self._deformation.descend(
+            self.model, gradients.means, gradients.contribution, NODE_STEP_PX * self._metres_per_px
+        )
+        self._optimiser.step(self.model, gradients, observation.camera, rates)
+        self.step += 1

@@ -1,0 +1,179 @@
+"""Stock ROS 2 messages as CDR, built with the rosbags type store.
+
+Images and point clouds are split in `prefix, data[, suffix]`, so that the bulk data is sent from the
+array it lies in. The parts joined are byte for byte what a CDR library writes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, get_typestore
+
+from sags_node.geometry import matrix_to_quat
+from sags_node.messaging import topics
+from sags_node.messaging.wire import Buffer, DType, Message, WireError
+from sags_node.types import F64, Camera
+
+WORLD_FRAME = "world"
+LEFT_FRAME = "left_optical_frame"
+RIGHT_FRAME = "right_optical_frame"
+IMAGE_ENCODINGS: dict[str, tuple[DType, int]] = {  # ROS name: dtype, channels
+    "rgb8": ("uint8", 3),
+    "rgba8": ("uint8", 4),
+    "mono8": ("uint8", 1),
+    "32FC1": ("float32", 1),
+}
+PACKED_FIELDS = ("id", "rgb")  # 32-bit words that are no numbers on a scale
+_POINT_FIELD_UINT32, _POINT_FIELD_FLOAT32 = 6, 7
+
+_store = get_typestore(Stores.ROS2_JAZZY)
+_ros = _store.types
+
+
+@dataclass(frozen=True, slots=True)
+class Content:
+    """What one message carries, apart from its number and its stamps."""
+
+    type: str
+    parts: tuple[Buffer, ...]
+    encoding: str = ""
+    shape: tuple[int, ...] = ()
+    dtype: DType = ""
+
+
+@cache
+def type_hash(type_name: str) -> str:
+    """The RIHS01 hash by which ROS 2 tells versions of a type apart."""
+    return str(_store.hash_rihs01(type_name))
+
+
+def parse(message: Message) -> Any:
+    """The ROS message object of a received message.
+
+    Raises:
+        WireError: the type is not a stock type of this protocol, its hash differs or the CDR is damaged.
+    """
+    name = message.meta.type
+    if name not in {topic.type for topic in topics.TOPICS}:
+        raise WireError(f"{message.topic}: unknown type {name!r}")
+    if message.meta.type_hash != type_hash(name):
+        raise WireError(f"{message.topic}: another version of {name} than ours")
+    try:
+        return _store.deserialize_cdr(message.cdr(), name)
+    except (SerdeError, ValueError, UnicodeError) as error:
+        raise WireError(f"{message.topic}: damaged {name}: {error}") from None
+
+
+def image(array: NDArray[Any], encoding: str, stamp_ns: int, frame: str = LEFT_FRAME) -> Content:
+    """`sensor_msgs/Image` of a picture [H, W] or [H, W, C] in one of `IMAGE_ENCODINGS`."""
+    dtype, channels = IMAGE_ENCODINGS[encoding]
+    height, width = array.shape[:2]
+    assert array.dtype == dtype and array.size == height * width * channels, (array.shape, array.dtype)
+    bytes_per_row = width * channels * array.itemsize
+    empty = np.empty(0, np.uint8)
+    message = _ros[topics.IMAGE](_header(stamp_ns, frame), height, width, encoding, 0, bytes_per_row, empty)
+    start = _serialize(message)[:-4]  # without the length of the empty data
+    data = np.ascontiguousarray(array)
+    return Content(topics.IMAGE, (start + _length(data), data.data), encoding, array.shape, dtype)
+
+
+def camera_info(camera: Camera, stamp_ns: int, frame: str = LEFT_FRAME, baseline: float = 0.0) -> Content:
+    """`sensor_msgs/CameraInfo` of a rectified camera; `baseline` (m) only for the right eye."""
+    P = np.zeros((3, 4))
+    P[:, :3] = camera.K
+    P[0, 3] = -camera.K[0, 0] * baseline
+    roi = _ros["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
+    K, R = np.asarray(camera.K, np.float64).ravel(), np.eye(3).ravel()
+    message = _ros[topics.CAMERA_INFO](
+        _header(stamp_ns, frame),
+        camera.height,
+        camera.width,
+        "plumb_bob",
+        np.zeros(5),
+        K,
+        R,
+        P.ravel(),
+        0,
+        0,
+        roi,
+    )
+    return Content(topics.CAMERA_INFO, (_serialize(message),))
+
+
+def point_cloud(columns: NDArray[np.float32], fields: Sequence[str], stamp_ns: int) -> Content:
+    """`sensor_msgs/PointCloud2` in the world frame of rows [N, len(fields)], every field four bytes.
+
+    Columns named in `PACKED_FIELDS` hold the bits of a uint32.
+    """
+    count, width = columns.shape
+    assert columns.dtype == np.float32 and width == len(fields), (columns.shape, columns.dtype)
+    kinds = [_POINT_FIELD_UINT32 if name == "id" else _POINT_FIELD_FLOAT32 for name in fields]
+    point_field = _ros["sensor_msgs/msg/PointField"]
+    described = [
+        point_field(name, 4 * i, kind, 1) for i, (name, kind) in enumerate(zip(fields, kinds, strict=True))
+    ]
+    empty = np.empty(0, np.uint8)
+    header = _header(stamp_ns, WORLD_FRAME)
+    row_bytes = 4 * width * count
+    message = _ros[topics.POINT_CLOUD](header, 1, count, described, False, 4 * width, row_bytes, empty, True)
+    whole = _serialize(message)
+    start, suffix = whole[:-5], whole[-1:]  # around the length of the empty data: is_dense
+    data = np.ascontiguousarray(columns)
+    parts = (start + _length(data), data.data, suffix)
+    return Content(topics.POINT_CLOUD, parts, ",".join(fields), columns.shape, "float32")
+
+
+def transform(T_world_cam: F64, stamp_ns: int) -> Content:
+    """`tf2_msgs/TFMessage` with the pose [4, 4] (m) of the left optical frame in the world."""
+    w, x, y, z = (float(q) for q in matrix_to_quat(T_world_cam[:3, :3]))
+    translation = _ros["geometry_msgs/msg/Vector3"](*(float(t) for t in T_world_cam[:3, 3]))
+    rotation = _ros["geometry_msgs/msg/Quaternion"](x, y, z, w)
+    pose = _ros["geometry_msgs/msg/Transform"](translation, rotation)
+    stamped = _ros["geometry_msgs/msg/TransformStamped"](_header(stamp_ns, WORLD_FRAME), LEFT_FRAME, pose)
+    return Content(topics.TF, (_serialize(_ros[topics.TF]([stamped])),))
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """One line of diagnostics."""
+
+    name: str
+    level: int  # 0 OK, 1 WARN, 2 ERROR, 3 STALE
+    message: str
+    values: Mapping[str, str]
+
+
+def diagnostics(statuses: Sequence[Status], stamp_ns: int) -> Content:
+    """`diagnostic_msgs/DiagnosticArray`."""
+    key_value = _ros["diagnostic_msgs/msg/KeyValue"]
+    status_type = _ros["diagnostic_msgs/msg/DiagnosticStatus"]
+    array = [
+        status_type(s.level, s.name, s.message, "", [key_value(k, v) for k, v in s.values.items()])
+        for s in statuses
+    ]
+    return Content(topics.DIAGNOSTICS, (_serialize(_ros[topics.DIAGNOSTICS](_header(stamp_ns, ""), array)),))
+
+
+def string(text: str) -> Content:
+    """`std_msgs/String`."""
+    return Content(topics.STRING, (_serialize(_ros[topics.STRING](text)),))
+
+
+def _header(stamp_ns: int, frame: str) -> Any:
+    seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
+    return _ros["std_msgs/msg/Header"](_ros["builtin_interfaces/msg/Time"](seconds, nanoseconds), frame)
+
+
+def _serialize(message: Any) -> bytes:
+    return bytes(_store.serialize_cdr(message, message.__msgtype__))
+
+
+def _length(data: NDArray[Any]) -> bytes:
+    return data.nbytes.to_bytes(4, "little")

@@ -1,0 +1,145 @@
+"""What each topic says of one frame (`FrameResult`) or of the node (`NodeHealth`)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import cv2
+import msgspec
+import numpy as np
+
+from sags_node.geometry import project
+from sags_node.messaging import cdr
+from sags_node.messaging.cdr import Content, Status
+from sags_node.types import F32, U8, Bool, FrameResult, NodeHealth, RenderedView
+
+SH_DEGREE_0 = 0.28209479  # Y_00: rgb = 0.5 + Y_00 f_dc
+SPLAT_FIELDS = (
+    *("x", "y", "z"),
+    *("scale_0", "scale_1", "scale_2"),
+    *("rot_w", "rot_x", "rot_y", "rot_z"),
+    *("f_dc_0", "f_dc_1", "f_dc_2"),
+    *("opacity", "id"),
+)
+POINT_FIELDS = ("x", "y", "z", "rgb")
+POINT_MIN_OPACITY = 0.1
+POINT_BEHIND_SURFACE = 0.003  # m; a Gaussian deeper than this under the drawn surface is not visible
+
+
+def splats(result: FrameResult) -> Content:
+    """Every Gaussian as one row of `SPLAT_FIELDS`, activated and at the time of the frame."""
+    gaussians = result.snapshot.gaussians
+    rows = np.empty((len(gaussians), len(SPLAT_FIELDS)), np.float32)
+    rows[:, 0:3] = gaussians.means
+    rows[:, 3:6] = gaussians.scales
+    rows[:, 6:10] = gaussians.quats / np.linalg.norm(gaussians.quats, axis=1, keepdims=True)
+    rows[:, 10:13] = (gaussians.colors - 0.5) / SH_DEGREE_0
+    rows[:, 13] = gaussians.opacities
+    rows.view(np.uint32)[:, 14] = gaussians.ids.astype(np.uint32)
+    return cdr.point_cloud(rows, SPLAT_FIELDS, result.pair.t_capture_ns)
+
+
+def points(result: FrameResult) -> Content:
+    """The Gaussians that the left eye sees, as rows of `POINT_FIELDS`."""
+    gaussians = result.snapshot.gaussians
+    seen = _visible(result)
+    rgb = np.clip(gaussians.colors[seen] * 255 + 0.5, 0, 255).astype(np.uint32)
+    rows = np.empty((len(rgb), len(POINT_FIELDS)), np.float32)
+    rows[:, 0:3] = gaussians.means[seen]
+    rows.view(np.uint32)[:, 3] = rgb[:, 0] << 16 | rgb[:, 1] << 8 | rgb[:, 2]
+    return cdr.point_cloud(rows, POINT_FIELDS, result.pair.t_capture_ns)
+
+
+def _visible(result: FrameResult) -> Bool:
+    """Which Gaussians [N] lie in the left picture and not under the surface drawn there."""
+    view, gaussians = result.views["left"], result.snapshot.gaussians
+    height, width = view.depth.shape
+    pixels, depths = project(view.camera, gaussians.means)
+    pixels = np.where(depths[:, None] > 0, pixels, -1.0)  # behind the camera: outside
+    inside = np.all((pixels > -0.5) & (pixels < (width - 0.5, height - 0.5)), axis=1)
+    columns, rows = np.rint(np.where(inside[:, None], pixels, 0.0)).astype(np.intp).T
+    surface = view.depth[rows, columns]
+    near = (surface == 0) | (depths < surface + POINT_BEHIND_SURFACE)
+    visible: Bool = inside & near & (gaussians.opacities >= POINT_MIN_OPACITY)
+    return visible
+
+
+def _rgba(view: RenderedView) -> U8:
+    """Straight-alpha picture [H, W, 4] of a rendered view."""
+    rgba = np.empty((*view.alpha.shape, 4), np.uint8)
+    rgba[..., :3] = cv2.convertScaleAbs(view.rgb, alpha=255.0)  # scales, rounds and saturates in one pass
+    rgba[..., 3] = cv2.convertScaleAbs(view.alpha, alpha=255.0)
+    return rgba
+
+
+def _depth(depth: F32) -> F32:
+    """REP 117: what is unknown is NaN on the wire."""
+    return np.where(depth > 0, depth, np.float32(np.nan))
+
+
+def _right_image(result: FrameResult) -> Content:
+    return cdr.image(result.pair.right, "rgb8", result.pair.t_capture_ns, cdr.RIGHT_FRAME)
+
+
+def _right_camera_info(result: FrameResult) -> Content:
+    pair = result.pair
+    return cdr.camera_info(pair.camera, pair.t_capture_ns, cdr.RIGHT_FRAME, pair.baseline)
+
+
+FRAME_CONTENT: Mapping[str, Callable[[FrameResult], Content]] = {
+    "left/image_rect_color": lambda r: cdr.image(r.pair.left, "rgb8", r.pair.t_capture_ns),
+    "right/image_rect_color": _right_image,
+    "left/camera_info": lambda r: cdr.camera_info(r.pair.camera, r.pair.t_capture_ns),
+    "right/camera_info": _right_camera_info,
+    "left/render/image": lambda r: cdr.image(_rgba(r.views["left"]), "rgba8", r.pair.t_capture_ns),
+    "right/render/image": lambda r: cdr.image(
+        _rgba(r.views["right"]), "rgba8", r.pair.t_capture_ns, cdr.RIGHT_FRAME
+    ),
+    "left/render/depth": lambda r: cdr.image(_depth(r.views["left"].depth), "32FC1", r.pair.t_capture_ns),
+    "left/depth": lambda r: cdr.image(_depth(r.observation.depth), "32FC1", r.pair.t_capture_ns),
+    "left/tissue_mask": lambda r: cdr.image(
+        r.observation.tissue.view(np.uint8) * np.uint8(255), "mono8", r.pair.t_capture_ns
+    ),
+    "points": points,
+    "splats": splats,
+    "tf": lambda r: cdr.transform(r.pair.camera.T_world_cam, r.pair.t_capture_ns),
+}
+
+
+def status(health: NodeHealth, last: FrameResult | None) -> dict[str, Any]:
+    """The fields of `NodeHealth`, and under `last_frame` its loss, counts and what was skipped."""
+    fields: dict[str, Any] = msgspec.to_builtins(health)
+    fields["last_frame"] = (
+        {}
+        if last is None
+        else {
+            "frame_id": last.pair.frame_id,
+            "loss": last.snapshot.loss,
+            "skipped": dict(last.skipped),
+            "counts": dict(last.snapshot.counts),
+        }
+    )
+    return fields
+
+
+def json_text(value: Mapping[str, Any]) -> Content:
+    """A JSON object as `std_msgs/String`; a number that is not finite becomes null."""
+    return cdr.string(msgspec.json.encode(value).decode())
+
+
+def diagnostics(health: NodeHealth, stamp_ns: int) -> Content:
+    """One status for the node, one per stage."""
+    level = {"running": 0, "stopping": 0}.get(health.state, 1)
+    values = {
+        "rate_hz": f"{health.rate_hz:.2f}",
+        "gaussians": str(health.gaussians),
+        "rss_mb": f"{health.rss_mb:.0f}",
+        **{f"latency_{name}_ms": f"{ms:.1f}" for name, ms in health.latency_ms.items()},
+        **{f"dropped_{slot}": str(count) for slot, count in health.dropped.items()},
+    }
+    statuses = [Status("node", level, health.last_error or health.state, values)]
+    running = health.state in ("running", "degraded")
+    for stage, ms in health.stage_ms.items():
+        statuses.append(Status(stage, 0 if running else 3, f"{ms:.1f} ms", {"ms": f"{ms:.3f}"}))
+    return cdr.diagnostics(statuses, stamp_ns)

@@ -1,0 +1,192 @@
+"""Requests to the node: msgpack `{v, id, op, args}` -> `{v, id, ok, result | error}`."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+from pathlib import Path
+from types import TracebackType
+from typing import Annotated, Any, Self
+
+import msgspec
+import zmq
+
+from sags_node.errors import SagsError
+from sags_node.messaging.rundir import read_connection
+from sags_node.messaging.wire import PROTOCOL
+
+MAX_REQUEST_BYTES = 65536  # per part
+MAX_REQUEST_PARTS = 4  # identity, the empty delimiter of REQ, the request
+MAX_REQUESTS_AT_ONCE = 32  # so that a flood cannot keep the publishing thread from its frames
+MAX_PENDING = 64
+RECEIVE_HIGH_WATER = 8
+
+Handler = Callable[[dict[str, Any]], Any]
+Identifier = int | Annotated[str, msgspec.Meta(max_length=128)] | None
+
+log = logging.getLogger(__name__)
+
+
+class Request(msgspec.Struct, frozen=True):
+    v: Annotated[str, msgspec.Meta(pattern=r"^1\.[0-9]{1,4}$")]
+    id: Identifier
+    op: Annotated[str, msgspec.Meta(max_length=64)]
+    args: dict[str, Any] = msgspec.field(default_factory=dict)
+
+
+class Reply(msgspec.Struct, frozen=True, omit_defaults=True):
+    v: str
+    id: Identifier
+    ok: bool
+    result: Any = None
+    error: str | None = None
+
+
+# What msgspec raises for bytes of a stranger: too deep, not hashable as a key, bad UTF-8 or a bad value.
+_BAD_BYTES = (msgspec.MsgspecError, UnicodeError, RecursionError, TypeError, ValueError)
+
+
+class ControlServer:
+    """Answers requests on a ROUTER socket; used from one thread.
+
+    A handler gets `args` and returns the result, or a `Future` of it when another thread must do the work.
+    A `SagsError` it raises is the answer; anything else is answered as an internal error and logged.
+    """
+
+    def __init__(self, socket: zmq.Socket[bytes], handlers: Mapping[str, Handler]) -> None:
+        self._socket = socket
+        self._handlers = handlers
+        self._pending: list[tuple[list[bytes], Identifier, Future[Any]]] = []
+        self._request = msgspec.msgpack.Decoder(Request)
+
+    @property
+    def pending(self) -> bool:
+        """True while a future's answer is owed."""
+        return bool(self._pending)
+
+    def serve(self) -> None:
+        """Answer what has arrived and what has been finished, without waiting."""
+        for _ in range(MAX_REQUESTS_AT_ONCE):
+            try:
+                parts = receive_parts(self._socket, MAX_REQUEST_PARTS)
+            except zmq.Again:
+                break
+            if len(parts) in (2, 3):
+                self._handle(parts[:-1], parts[-1])
+        finished = [entry for entry in self._pending if entry[2].done()]
+        for envelope, identifier, future in finished:
+            self._answer(envelope, identifier, future.result)
+        self._pending = [entry for entry in self._pending if entry not in finished]
+
+    def _handle(self, envelope: list[bytes], body: bytes) -> None:
+        try:
+            request = self._request.decode(body)
+        except _BAD_BYTES as error:
+            self._send(envelope, Reply(PROTOCOL, None, False, error=f"not a request: {error}"))
+            return
+        handler = self._handlers.get(request.op)
+        if handler is None:
+            known = ", ".join(sorted(self._handlers))
+            text = f"unknown op '{request.op}'; this node knows: {known}"
+            self._send(envelope, Reply(PROTOCOL, request.id, False, error=text))
+            return
+        self._answer(envelope, request.id, lambda: handler(request.args))
+
+    def _answer(self, envelope: list[bytes], identifier: Identifier, work: Callable[[], Any]) -> None:
+        try:
+            result = work()
+            if isinstance(result, Future):
+                if len(self._pending) >= MAX_PENDING:
+                    result.cancel()
+                    raise SagsError("too many requests are waiting; try again later")
+                self._pending.append((envelope, identifier, result))
+                return
+            self._send(envelope, Reply(PROTOCOL, identifier, True, result=result))
+        except SagsError as error:
+            self._send(envelope, Reply(PROTOCOL, identifier, False, error=str(error)))
+        except BaseException as error:  # a cancelled future is a BaseException too
+            if isinstance(error, KeyboardInterrupt | SystemExit):
+                raise
+            log.exception("a control request failed")
+            text = f"internal error: {type(error).__name__}: {error}"
+            self._send(envelope, Reply(PROTOCOL, identifier, False, error=text))
+
+    def _send(self, envelope: list[bytes], reply: Reply) -> None:
+        body = msgspec.msgpack.encode(reply)
+        try:
+            self._socket.send_multipart([*envelope, body], zmq.NOBLOCK)
+        except zmq.ZMQError as error:  # the peer is gone or does not read: its loss
+            log.debug("a reply was not sent: %s", error)
+
+
+def receive_parts(socket: zmq.Socket[bytes], limit: int) -> list[bytes]:
+    """The next message, without waiting; parts beyond `limit` + 1 are read and thrown away.
+
+    Raises:
+        zmq.Again: nothing has arrived.
+    """
+    parts = [socket.recv(zmq.NOBLOCK)]
+    while socket.getsockopt(zmq.RCVMORE):
+        part = socket.recv(zmq.NOBLOCK)
+        if len(parts) <= limit:
+            parts.append(part)
+    return parts
+
+
+class ControlClient:
+    """Asks the node; one request at a time, from one thread.
+
+    Args:
+        endpoint: of the ROUTER socket; default: from the connection file of `ns`.
+
+    Raises:
+        SagsError: no endpoint is known.
+    """
+
+    def __init__(self, endpoint: str | None = None, ns: str = "sags", run_dir: Path | None = None) -> None:
+        if endpoint is None:
+            endpoint = read_connection(ns, run_dir).control
+        if endpoint is None:
+            raise SagsError(f"the node '{ns}' has no control socket; start it with publish.control set")
+        self.endpoint = endpoint
+        self._context = zmq.Context()
+        self._socket = self._context.socket(zmq.DEALER)
+        self._socket.setsockopt(zmq.LINGER, 0)
+        self._socket.connect(endpoint)
+        self._last_id = 0
+
+    def request(self, op: str, args: Mapping[str, Any] | None = None, timeout: float = 2.0) -> Any:
+        """The result of an operation.
+
+        Raises:
+            SagsError: the node refused (its own words) or did not answer within `timeout` seconds.
+        """
+        self._last_id += 1
+        request = Request(PROTOCOL, self._last_id, op, dict(args or {}))
+        self._socket.send(msgspec.msgpack.encode(request))
+        deadline = time.monotonic() + timeout
+        while (left := deadline - time.monotonic()) > 0:
+            if not self._socket.poll(int(left * 1000) + 1):
+                break
+            try:
+                reply = msgspec.msgpack.decode(self._socket.recv(), type=Reply)
+            except _BAD_BYTES:
+                continue
+            if reply.id == self._last_id:  # an earlier one came too late for its own request
+                if not reply.ok:
+                    raise SagsError(f"{op}: {reply.error}")
+                return reply.result
+        raise SagsError(f"no answer from {self.endpoint} in {timeout:g} s; is the node running?")
+
+    def close(self) -> None:
+        self._context.destroy(linger=0)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

@@ -1,0 +1,97 @@
+"""Is what one topic shows new enough to be believed? Pure bookkeeping of stamps and sequence numbers."""
+
+from __future__ import annotations
+
+from collections import deque
+from itertools import pairwise
+from statistics import median
+
+from sags_node.errors import SagsError
+from sags_node.messaging.wire import Meta
+
+WINDOW = 20  # messages behind the period and the rate
+STALE_PERIODS = 10
+MIN_RATE = 0.9  # of what the sender sends, or of the declared rate
+UNKNOWN_PERIOD = 0.1  # s, until two messages have come
+MAX_CLOCK_AHEAD = 1.0  # s; beyond it an age says nothing
+
+
+class StaleError(SagsError):
+    """The newest content of a topic is too old or not valid: do not show it as new."""
+
+
+class Freshness:
+    """Follows one topic's messages.
+
+    Args:
+        rate_hz: what the topic must keep; default: every message that its sender sends.
+        periodic: False for a topic that speaks only when something changes: it cannot be too old.
+    """
+
+    def __init__(self, rate_hz: float | None = None, periodic: bool = True) -> None:
+        self.lost = 0  # messages of this sender that never came
+        self.last: Meta | None = None
+        self._rate_hz = rate_hz
+        self._periodic = periodic
+        self._window: deque[Meta] = deque(maxlen=WINDOW)
+
+    def accept(self, meta: Meta) -> bool:
+        """Note a message; False when it is not newer than the last one (a last value sent again)."""
+        last = self.last
+        if last is not None and meta.session == last.session:
+            if meta.seq <= last.seq or meta.epoch < last.epoch:
+                return False
+            self.lost += meta.seq - last.seq - 1
+        if last is None or meta.session != last.session or meta.epoch != last.epoch:
+            self._window.clear()
+        self.last = meta
+        self._window.append(meta)
+        return True
+
+    @property
+    def period(self) -> float:
+        """Seconds between two messages of the sender: declared, or the median of the capture stamps."""
+        if self._rate_hz is not None:
+            return 1 / self._rate_hz
+        steps = [
+            (after.stamp_ns - before.stamp_ns) * 1e-9 / (after.seq - before.seq)
+            for before, after in pairwise(self._window)
+        ]
+        return max(median(steps), 1e-3) if steps else UNKNOWN_PERIOD
+
+    @property
+    def rate(self) -> float:
+        """Messages that came over messages due, in the window."""
+        if len(self._window) < 2:
+            return 1.0
+        first, last = self._window[0], self._window[-1]
+        came = len(self._window) - 1
+        if self._rate_hz is None:
+            return came / (last.seq - first.seq)
+        span = (last.stamp_ns - first.stamp_ns) * 1e-9
+        return came / (span * self._rate_hz) if span > 0 else 1.0
+
+    def age(self, now_ns: int) -> float:
+        """Seconds since what the last message shows was captured; infinite before the first."""
+        return float("inf") if self.last is None else (now_ns - self.last.stamp_ns) * 1e-9
+
+    def problem(self, now_ns: int, max_age: float | None = None) -> str | None:
+        """Why the last message must not be shown as new; None when it may be.
+
+        `max_age` (s) tightens the limit of ten periods.
+        """
+        if self.last is None:
+            return "nothing received yet"
+        if not self._periodic:
+            return None
+        limit = STALE_PERIODS * self.period
+        if max_age is not None:
+            limit = min(limit, max_age)
+        age = self.age(now_ns)
+        if age < -MAX_CLOCK_AHEAD:
+            return f"stamped {-age:.2f} s ahead of this machine's clock; set both clocks"
+        if age > limit:
+            return f"too old: {age:.2f} s, the limit is {limit:.2f} s"
+        if self.rate < MIN_RATE:
+            return f"too few messages: {100 * self.rate:.0f} % of those due"
+        return None

@@ -1,0 +1,274 @@
+"""The node's sockets: results and health out, subscriptions and requests in. All from one thread."""
+
+from __future__ import annotations
+
+import errno
+import ipaddress
+import os
+import time
+from collections.abc import Mapping
+from types import TracebackType
+from typing import Any, Self
+
+import zmq
+
+from sags_node.config import PublishConfig
+from sags_node.errors import SagsError, UsageError
+from sags_node.messaging import content, control, topics
+from sags_node.messaging.cdr import Content, type_hash
+from sags_node.messaging.rundir import Connection, RunDirectory
+from sags_node.messaging.wire import PROTOCOL, Message, Meta, encode
+from sags_node.types import FrameResult, NodeHealth
+
+# Messages per slow peer, all topics together: two whole frames, so that the burst of one frame fits.
+SEND_HIGH_WATER = 2 * len(topics.TOPICS)
+MAX_SUBSCRIPTIONS_AT_ONCE = 1000
+MAX_SUBSCRIPTION_BYTES = 256
+PENDING_POLL_MS = 10  # how soon the result of a handler's future is looked for
+HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS = 2000, 6000
+
+
+class Publisher:
+    """Publishes frames and health, and answers control requests.
+
+    A topic is encoded only while somebody subscribes to it. Nothing here ever waits for a peer: one that
+    does not keep up loses messages and sees the gap in `seq`.
+
+    Raises:
+        UsageError: an endpoint that is neither loopback nor ipc, or a run directory open to others.
+        SagsError: an endpoint is taken, or another node holds the same namespace.
+    """
+
+    def __init__(self, config: PublishConfig, ns: str, session: str) -> None:
+        for endpoint in (*config.data, *([config.control] if config.control else [])):
+            check_endpoint(endpoint, config.insecure)
+        self.ns = ns
+        self.session = session
+        self._names = {topics.full_name(ns, t.name): t for t in topics.TOPICS if config.right or not t.right}
+        self._seq = dict.fromkeys((t.name for t in self._names.values()), 0)
+        self._subscribed: set[str] = set()  # prefixes, only those that match a topic of ours
+        self._handlers: dict[str, control.Handler] = {"ping": lambda _: "pong"}
+        self._last: FrameResult | None = None
+        self._dropped = 0
+        self._texts: dict[str, tuple[Content, int]] = {}  # status, parameters: last content and its stamp
+        self._run = RunDirectory(config.run_dir, ns)
+        self._context = zmq.Context()
+        try:
+            self._bind(config)
+        except BaseException:
+            self.close()
+            raise
+
+    def _bind(self, config: PublishConfig) -> None:
+        self._data = self._context.socket(zmq.XPUB)
+        _limit(self._data, SEND_HIGH_WATER, MAX_SUBSCRIPTION_BYTES)
+        self._data.setsockopt(
+            zmq.XPUB_VERBOSE, 1
+        )  # each new peer's subscription is seen: the last values are due
+        endpoints = [bind(self._data, self._run.ipc_endpoint, "publish.ipc")] if config.ipc else []
+        endpoints += [bind(self._data, endpoint, "publish.data") for endpoint in config.data]
+        self._poller = zmq.Poller()
+        self._poller.register(self._data, zmq.POLLIN)
+        self._control: control.ControlServer | None = None
+        control_endpoint = None
+        if config.control:
+            router = self._context.socket(zmq.ROUTER)
+            _limit(router, control.RECEIVE_HIGH_WATER, control.MAX_REQUEST_BYTES)
+            router.setsockopt(zmq.RCVHWM, control.RECEIVE_HIGH_WATER)
+            control_endpoint = bind(router, config.control, "publish.control")
+            self._poller.register(router, zmq.POLLIN)
+            self._control = control.ControlServer(router, self._handlers)
+        self.connection = Connection(
+            protocol=PROTOCOL,
+            ns=self.ns,
+            session=self.session,
+            pid=os.getpid(),
+            data=endpoints,
+            control=control_endpoint,
+        )
+        self._run.write_connection(self.connection)
+
+    # ---- out -------------------------------------------------------------------------------------------
+
+    def publish_result(self, result: FrameResult, dropped: int) -> None:
+        """Send one frame's topics to those who asked; `dropped` counts the frames the node left out."""
+        self._last = result
+        self._dropped = dropped
+        for name in content.FRAME_CONTENT:
+            if name in self._seq:
+                self._seq[name] += 1
+                if self.wanted(name):
+                    self._send_frame_topic(name)
+
+    def publish_health(self, health: NodeHealth) -> None:
+        """Send `status` and `diagnostics`, stamped now."""
+        now = time.time_ns()
+        self._publish_text("status", content.json_text(self.status(health)), now)
+        self._publish_text("diagnostics", content.diagnostics(health, now), now)
+
+    def status(self, health: NodeHealth) -> dict[str, Any]:
+        """What the topic `status` says."""
+        return content.status(health, self._last)
+
+    def publish_parameters(self, parameters: Mapping[str, Any]) -> None:
+        """Send the configuration in force; it is kept for those who subscribe later."""
+        self._publish_text("parameters", content.json_text(parameters), time.time_ns())
+
+    def wanted(self, name: str) -> bool:
+        """True while somebody subscribes to the topic `name` (without the namespace)."""
+        full = topics.full_name(self.ns, name)
+        return any(full.startswith(prefix) for prefix in self._subscribed)
+
+    def _publish_text(self, name: str, text: Content, stamp_ns: int) -> None:
+        self._seq[name] += 1
+        self._texts[name] = (text, stamp_ns)
+        if self.wanted(name):
+            self._send(name, text, -1, stamp_ns)
+
+    def _send_frame_topic(self, name: str) -> None:
+        assert self._last is not None
+        pair = self._last.pair
+        self._send(name, content.FRAME_CONTENT[name](self._last), pair.frame_id, pair.t_capture_ns)
+
+    def _send(self, name: str, body: Content, frame_id: int, stamp_ns: int) -> None:
+        meta = Meta(
+            type=body.type,
+            type_hash=type_hash(body.type),
+            seq=self._seq[name],
+            frame_id=frame_id,
+            stamp_ns=stamp_ns,
+            publish_ns=time.time_ns(),
+            session=self.session,
+            epoch=0 if self._last is None else self._last.epoch,
+            step=0 if self._last is None else self._last.snapshot.step,
+            encoding=body.encoding,
+            shape=list(body.shape),
+            dtype=body.dtype,
+            dropped=self._dropped,
+        )
+        frames = encode(Message(topics.full_name(self.ns, name), meta, body.parts))
+        # An XPUB socket drops for a full peer instead of blocking. Arrays are never written again, so
+        # they are sent from where they lie.
+        self._data.send_multipart(frames, zmq.NOBLOCK, copy=False)
+
+    # ---- in --------------------------------------------------------------------------------------------
+
+    def register(self, op: str, handler: control.Handler) -> None:
+        """Answer the control operation `op` with `handler`, see `control.ControlServer`."""
+        self._handlers[op] = handler
+
+    def poll(self, timeout_ms: int, wake_fd: int | None = None) -> bool:
+        """Serve subscriptions and requests for up to `timeout_ms`, at least once.
+
+        Returns early, with True, when the eventfd `wake_fd` has been written to; it is then read.
+        """
+        if wake_fd is not None:
+            self._poller.register(wake_fd, zmq.POLLIN)
+        try:
+            deadline = time.monotonic() + timeout_ms / 1000
+            while True:
+                left_ms = max(0, int((deadline - time.monotonic()) * 1000))
+                owed = self._control is not None and self._control.pending
+                events = dict(self._poller.poll(min(left_ms, PENDING_POLL_MS) if owed else left_ms))
+                self._serve_subscriptions()
+                if self._control is not None:
+                    self._control.serve()
+                if wake_fd is not None and wake_fd in events:
+                    os.eventfd_read(wake_fd)
+                    return True
+                if left_ms == 0:
+                    return False
+        finally:
+            if wake_fd is not None:
+                self._poller.unregister(wake_fd)
+
+    def _serve_subscriptions(self) -> None:
+        """Note who wants what, and send the last values once for all who have just asked."""
+        resend: set[str] = set()
+        for _ in range(MAX_SUBSCRIPTIONS_AT_ONCE):
+            try:
+                parts = control.receive_parts(self._data, 1)
+            except zmq.Again:
+                break
+            self._subscription(parts[0], resend)
+        for name in sorted(resend):
+            if name in self._texts:
+                text, stamp_ns = self._texts[name]
+                self._send(name, text, -1, stamp_ns)
+            elif name in content.FRAME_CONTENT and self._last is not None:
+                self._send_frame_topic(name)
+
+    def _subscription(self, message: bytes, resend: set[str]) -> None:
+        """`\\x01prefix` subscribes and `\\x00prefix` ends it; anything else is a stranger's noise."""
+        try:
+            prefix = message[1:].decode()
+        except UnicodeError:
+            return
+        matching = [topic for full, topic in self._names.items() if full.startswith(prefix)]
+        if message[:1] == b"\x01" and matching:
+            self._subscribed.add(prefix)
+            resend.update(topic.name for topic in matching if topic.cached)
+        elif message[:1] == b"\x00":
+            self._subscribed.discard(prefix)
+
+    def close(self) -> None:
+        """Close the sockets and remove the connection file."""
+        self._context.destroy(linger=0)
+        self._run.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def _limit(socket: zmq.Socket[bytes], send_high_water: int, max_message_bytes: int) -> None:
+    """Bound what one peer can make the socket hold."""
+    socket.setsockopt(zmq.SNDHWM, send_high_water)
+    socket.setsockopt(zmq.MAXMSGSIZE, max_message_bytes)
+    socket.setsockopt(zmq.LINGER, 0)
+    socket.setsockopt(zmq.HEARTBEAT_IVL, HEARTBEAT_MS)
+    socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, HEARTBEAT_TIMEOUT_MS)
+
+
+def check_endpoint(endpoint: str, insecure: bool) -> None:
+    """Refuse to listen where other machines can reach.
+
+    Raises:
+        UsageError: not tcp or ipc, or not loopback while `insecure` is false.
+    """
+    transport, separator, address = endpoint.partition("://")
+    if not separator or transport not in ("tcp", "ipc") or not address:
+        raise UsageError(f"'{endpoint}' is no endpoint; write tcp://127.0.0.1:PORT or ipc:///PATH")
+    if transport == "ipc" or insecure:
+        return
+    host = address.rpartition(":")[0].strip("[]")
+    try:
+        loopback = host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        loopback = False
+    if not loopback:
+        raise UsageError(
+            f"{endpoint} can be reached from other machines: that needs CURVE, which this version does not "
+            "have, or publish.insecure:=true (anybody who reaches it sees the video and controls the node)"
+        )
+
+
+def bind(socket: zmq.Socket[bytes], endpoint: str, key: str) -> str:
+    """Bind and return the endpoint as bound (a `*` port becomes its number).
+
+    Raises:
+        SagsError: the endpoint is taken or cannot be bound.
+    """
+    socket.setsockopt(zmq.IPV6, int("[" in endpoint))
+    try:
+        socket.bind(endpoint)
+    except zmq.ZMQError as error:
+        example = "'[tcp://127.0.0.1:5560]'" if key == "publish.data" else "tcp://127.0.0.1:5561"
+        hint = f"choose another, e.g. {key}:={example}"
+        reason = "already in use" if error.errno == errno.EADDRINUSE else f"cannot be bound: {error.strerror}"
+        raise SagsError(f"{endpoint} is {reason}; {hint}") from None
+    return socket.getsockopt_string(zmq.LAST_ENDPOINT)

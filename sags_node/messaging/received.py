@@ -1,0 +1,105 @@
+"""What a subscriber gets: each message as a typed value over the received memory."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sags_node.messaging import cdr, topics
+from sags_node.messaging.wire import Message, Meta, WireError
+from sags_node.types import F64
+
+
+@dataclass(frozen=True, slots=True)
+class Received:
+    """One message; subclasses add its content."""
+
+    topic: str  # with the namespace
+    meta: Meta
+    received_ns: int
+
+    @property
+    def stamp_ns(self) -> int:
+        """Capture time of what it shows."""
+        return self.meta.stamp_ns
+
+    def age(self, now_ns: int | None = None) -> float:
+        """Seconds since what it shows was captured."""
+        return ((time.time_ns() if now_ns is None else now_ns) - self.meta.stamp_ns) * 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class ReceivedImage(Received):
+    array: NDArray[Any]  # [H, W] or [H, W, C], read-only; uint8, or float32 metres with NaN unknown
+
+
+@dataclass(frozen=True, slots=True)
+class ReceivedCloud(Received):
+    points: NDArray[Any]  # [N] records, read-only; fields by name, e.g. points["x"]
+
+    def xyz(self) -> NDArray[np.float32]:
+        """Positions [N, 3], m, world."""
+        return np.stack([self.points["x"], self.points["y"], self.points["z"]], axis=1)
+
+
+@dataclass(frozen=True, slots=True)
+class ReceivedCameraInfo(Received):
+    width: int  # px
+    height: int
+    K: F64  # [3, 3] px
+    P: F64  # [3, 4]
+
+
+@dataclass(frozen=True, slots=True)
+class ReceivedText(Received):
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class ReceivedRos(Received):
+    message: Any  # a ROS message object of a type without a class of its own here: tf, diagnostics
+
+
+def interpret(message: Message, received_ns: int) -> Received:
+    """The typed value of a message from anybody.
+
+    Raises:
+        WireError: content and description do not fit, or the type is not one of this protocol.
+    """
+    head = (message.topic, message.meta, received_ns)
+    kind = message.meta.type
+    if kind == topics.IMAGE:
+        return ReceivedImage(*head, array=_image(message))
+    if kind == topics.POINT_CLOUD:
+        return ReceivedCloud(*head, points=_records(message))
+    ros = cdr.parse(message)
+    if kind == topics.CAMERA_INFO:
+        return ReceivedCameraInfo(*head, ros.width, ros.height, ros.k.reshape(3, 3), ros.p.reshape(3, 4))
+    if kind == topics.STRING:
+        return ReceivedText(*head, text=ros.data)
+    return ReceivedRos(*head, message=ros)
+
+
+def _image(message: Message) -> NDArray[Any]:
+    meta = message.meta
+    dtype, channels = cdr.IMAGE_ENCODINGS.get(meta.encoding, ("", 0))
+    shape = meta.shape[2:] if channels > 1 else [1, *meta.shape[2:]]
+    if dtype != meta.dtype or shape != [channels] or len(meta.shape) < 2:
+        raise WireError(f"{message.topic}: {meta.encoding!r} does not fit {meta.dtype} {meta.shape}")
+    return message.array()
+
+
+def _records(message: Message) -> NDArray[Any]:
+    meta = message.meta
+    names = meta.encoding.split(",")
+    well_named = len(set(names)) == len(names) and all(name.isidentifier() for name in names)
+    if meta.dtype != "float32" or len(meta.shape) != 2 or meta.shape[1] != len(names) or not well_named:
+        raise WireError(f"{message.topic}: fields {meta.encoding!r} do not fit {meta.dtype} {meta.shape}")
+    if not {"x", "y", "z"} <= set(names):
+        raise WireError(f"{message.topic}: a point cloud needs x, y and z")
+    record = np.dtype([(name, "<u4" if name in cdr.PACKED_FIELDS else "<f4") for name in names])
+    return message.array().reshape(-1).view(record)

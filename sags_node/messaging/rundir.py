@@ -1,0 +1,130 @@
+"""The run directory: private to its owner, it holds the ipc socket, a lock and the connection file.
+
+The connection file tells a client on this machine where the node is:
+`{protocol, ns, session, pid, data: [endpoints], control: endpoint | null, public_key: null}`.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import stat
+from pathlib import Path
+
+import msgspec
+
+from sags_node.errors import SagsError, UsageError
+
+MAX_CONNECTION_FILE_BYTES = 16384
+MAX_UNIX_SOCKET_PATH = 107  # bytes, sun_path of Linux without its final zero
+
+
+class Connection(msgspec.Struct, frozen=True, kw_only=True):
+    """What a client needs to reach a node."""
+
+    protocol: str
+    ns: str
+    session: str
+    pid: int
+    data: list[str]  # XPUB endpoints, the quickest first
+    control: str | None
+    public_key: str | None = None
+
+
+def default_run_dir() -> Path:
+    """`$XDG_RUNTIME_DIR/sags`, or `/tmp/sags-<uid>` where there is none."""
+    runtime = os.environ.get("XDG_RUNTIME_DIR")
+    return Path(runtime) / "sags" if runtime else Path(f"/tmp/sags-{os.getuid()}")
+
+
+def private_directory(path: Path) -> Path:
+    """Make `path` with mode 0700, or check that nobody else can write in it.
+
+    Raises:
+        UsageError: it is a link, belongs to somebody else or is open to others, or cannot be made.
+    """
+    try:
+        path.mkdir(mode=0o700, parents=True, exist_ok=True)
+        info = path.lstat()
+    except OSError as error:
+        raise UsageError(
+            f"run directory {path}: {error.strerror}; choose another with publish.run_dir"
+        ) from None
+    if not stat.S_ISDIR(info.st_mode) or info.st_uid != os.getuid():
+        raise UsageError(
+            f"run directory {path} is not a directory of yours; choose another with publish.run_dir"
+        )
+    if info.st_mode & 0o077:
+        raise UsageError(f"run directory {path} is open to other users; run: chmod 700 {path}")
+    return path
+
+
+class RunDirectory:
+    """One node's place in the run directory, from start to `close`.
+
+    Raises:
+        SagsError: another live node holds the same namespace.
+        UsageError: see `private_directory`.
+    """
+
+    def __init__(self, path: Path | None, ns: str) -> None:
+        folder = private_directory(path or default_run_dir())
+        self.connection_file = connection_path(folder, ns)
+        self.ipc_path = self.connection_file.with_suffix(".ipc")
+        self._lock = os.open(self.connection_file.with_suffix(".lock"), os.O_RDWR | os.O_CREAT, 0o600)
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            os.close(self._lock)
+            raise SagsError(
+                f"another node already runs as '{ns}' in {folder}; stop it, or choose another ns:=NAME"
+            ) from None
+
+    @property
+    def ipc_endpoint(self) -> str:
+        """Where to bind the ipc socket.
+
+        Raises:
+            UsageError: the path is too long for a Unix socket.
+        """
+        if len(os.fsencode(self.ipc_path)) > MAX_UNIX_SOCKET_PATH:
+            raise UsageError(
+                f"{self.ipc_path} is too long for a socket; set publish.run_dir or publish.ipc:=false"
+            )
+        return f"ipc://{self.ipc_path}"
+
+    def write_connection(self, connection: Connection) -> None:
+        """Replace the connection file in one step, mode 0600."""
+        partial = self.connection_file.with_suffix(".partial")
+        partial.unlink(missing_ok=True)
+        descriptor = os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(msgspec.json.encode(connection))
+        partial.replace(self.connection_file)
+
+    def close(self) -> None:
+        self.connection_file.unlink(missing_ok=True)
+        self.ipc_path.unlink(missing_ok=True)
+        os.close(self._lock)
+
+
+def connection_path(folder: Path, ns: str) -> Path:
+    return folder / f"{ns.strip('/').replace('/', '.')}.json"
+
+
+def read_connection(ns: str, run_dir: Path | None = None) -> Connection:
+    """Where the node named `ns` on this machine is.
+
+    Raises:
+        SagsError: no node with that name runs here, or its file is damaged.
+    """
+    file = connection_path(run_dir or default_run_dir(), ns)
+    try:
+        with file.open("rb") as opened:
+            content = opened.read(MAX_CONNECTION_FILE_BYTES)
+    except OSError:
+        raise SagsError(f"no node runs as '{ns}' (no {file}); start one with: sags run") from None
+    try:
+        return msgspec.json.decode(content, type=Connection)
+    except (msgspec.MsgspecError, UnicodeError):
+        raise SagsError(f"{file} is damaged; restart the node to write it again") from None

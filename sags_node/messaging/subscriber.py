@@ -1,0 +1,206 @@
+"""The consumer's side: a receiver thread keeps the newest messages of each topic, so lag cannot build up.
+
+with Subscriber(["left/render/depth"]) as subscriber:
+    depth = subscriber.wait("left/render/depth", timeout=1.0)
+    subscriber.read("left/render/depth")  # raises StaleError when it must not be shown as new
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import msgspec
+
+from sags_node.messaging import topics
+from sags_node.messaging.freshness import Freshness, StaleError
+from sags_node.messaging.received import Received, ReceivedText, interpret
+from sags_node.messaging.stream import POLL_MS, check_topic, data_endpoint, data_socket, receive
+from sags_node.messaging.wire import WireError
+
+KEPT = 4  # newest messages of a topic, so that topics of one frame can be joined by stamp
+VALID_STATES = ("running", "degraded")  # of the node, in `status`
+
+
+class _Status(msgspec.Struct):
+    state: str = ""
+
+
+class Subscriber:
+    """Receives topics in the background; `latest`, `read`, `wait` and `aligned` give what has come.
+
+    `status` is always received too: a sender that says it is not running makes every topic stale.
+    ZeroMQ reconnects by itself when the node is restarted.
+
+    Args:
+        names: topics without the namespace.
+        endpoint: of the XPUB socket; default: from the connection file of `ns`.
+        rates: Hz a topic must keep; default: every message that its sender sends.
+        clock_ns: the wall clock that capture stamps are compared with.
+
+    Raises:
+        UsageError: an unknown topic.
+        SagsError: no node named `ns` runs here and no endpoint is given.
+    """
+
+    def __init__(
+        self,
+        names: Iterable[str],
+        endpoint: str | None = None,
+        ns: str = "sags",
+        run_dir: Path | None = None,
+        rates: Mapping[str, float] | None = None,
+        clock_ns: Callable[[], int] = time.time_ns,
+    ) -> None:
+        wanted = [check_topic(name) for name in dict.fromkeys([*names, "status"])]
+        rates = rates or {}
+        self.endpoint = data_endpoint(endpoint, ns, run_dir)
+        self.rejected = 0  # messages that were none, or whose content does not fit its description
+        self._ns = ns
+        self._clock_ns = clock_ns
+        self._fresh = {topic.name: Freshness(rates.get(topic.name), topic.periodic) for topic in wanted}
+        self._kept: dict[str, deque[Received]] = {topic.name: deque(maxlen=KEPT) for topic in wanted}
+        self._arrived = threading.Condition()
+        self._stopping = threading.Event()
+        self._prefixes = {topics.full_name(ns, name): name for name in self._kept}
+        self._resources = ExitStack()  # holds the socket; only the receiver thread uses it once it runs
+        self._socket = self._resources.enter_context(data_socket(self.endpoint, list(self._prefixes)))
+        self._thread = threading.Thread(target=self._receive_all, name="sags-subscriber", daemon=True)
+        self._thread.start()
+
+    # ---- what has come ---------------------------------------------------------------------------------
+
+    def latest(self, name: str) -> Received | None:
+        """The newest message of a topic, however old it is."""
+        with self._arrived:
+            return self._newest(name)
+
+    def read(self, name: str, max_age: float | None = None) -> Received:
+        """The newest message of a topic, if it may be shown as new.
+
+        Raises:
+            StaleError: it is older than ten periods or `max_age` (s), fewer than 90 % of the messages
+                arrive, the sender says it is not running, or nothing has come.
+        """
+        with self._arrived:
+            problem = self._problem(name, max_age)
+            newest = self._newest(name)
+        if problem is not None or newest is None:
+            raise StaleError(f"{topics.full_name(self._ns, name)} is stale: {problem}")
+        return newest
+
+    def wait(self, name: str, timeout: float, after: Received | None = None) -> Received | None:
+        """The newest message of a topic once there is one newer than `after`; None after `timeout` s."""
+
+        def newer() -> bool:
+            newest = self._newest(name)
+            return newest is not None and (after is None or newest.meta != after.meta)
+
+        with self._arrived:
+            return self._newest(name) if self._arrived.wait_for(newer, timeout) else None
+
+    def aligned(
+        self, names: Iterable[str], stamp_ns: int, timeout: float = 0.0
+    ) -> dict[str, Received] | None:
+        """The messages of several topics that show the frame captured at `stamp_ns`.
+
+        None when one of them has not come within `timeout` seconds.
+        """
+        names = list(names)
+
+        def found() -> dict[str, Received] | None:
+            matches = {
+                name: message
+                for name in names
+                for message in self._kept[name]
+                if message.stamp_ns == stamp_ns
+            }
+            return matches if len(matches) == len(names) else None
+
+        with self._arrived:
+            return self._arrived.wait_for(found, timeout)
+
+    def problem(self, name: str, max_age: float | None = None) -> str | None:
+        """Why a strict `read` of this topic would raise; None when it would not."""
+        with self._arrived:
+            return self._problem(name, max_age)
+
+    def ok(self, name: str) -> bool:
+        """True while the newest message of a topic may be shown as new."""
+        return self.problem(name) is None
+
+    def lost(self, name: str) -> int:
+        """Messages of a topic that were sent and never came, seen as gaps in `seq`."""
+        with self._arrived:
+            return self._fresh[name].lost
+
+    def period(self, name: str) -> float:
+        """Seconds between two messages of a topic."""
+        with self._arrived:
+            return self._fresh[name].period
+
+    def _newest(self, name: str) -> Received | None:
+        kept = self._kept[name]
+        return kept[-1] if kept else None
+
+    def _problem(self, name: str, max_age: float | None) -> str | None:
+        problem = self._fresh[name].problem(self._clock_ns(), max_age)
+        return problem or self._sender_problem(name)
+
+    def _sender_problem(self, name: str) -> str | None:
+        """What the newest `status` says against the newest message of a topic."""
+        status, newest = self._newest("status"), self._newest(name)
+        if not isinstance(status, ReceivedText) or newest is None or newest.meta.frame_id < 0:
+            return None  # nothing is said against what shows no frame
+        if newest.meta.session != status.meta.session and newest.received_ns < status.received_ns:
+            return "the node was started anew since"
+        if newest.meta.epoch < status.meta.epoch:
+            return "the recording or the model started anew since"
+        try:
+            state = msgspec.json.decode(status.text, type=_Status).state
+        except (msgspec.MsgspecError, RecursionError):
+            return "the sender's status cannot be read"
+        return None if state in VALID_STATES else f"the sender says it is {state!r}"
+
+    # ---- the receiver thread ---------------------------------------------------------------------------
+
+    def _receive_all(self) -> None:
+        while not self._stopping.is_set():
+            if self._socket.poll(POLL_MS):
+                self._receive_one()
+
+    def _receive_one(self) -> None:
+        try:
+            message = receive(self._socket)
+            name = self._prefixes.get(message.topic)
+            if name is None or message.meta.type != topics.BY_NAME[name].type:
+                raise WireError(f"{message.topic}: not what was subscribed to")
+            received = interpret(message, self._clock_ns())
+        except WireError:
+            with self._arrived:
+                self.rejected += 1
+            return
+        with self._arrived:
+            if self._fresh[name].accept(received.meta):
+                self._kept[name].append(received)
+                self._arrived.notify_all()
+
+    def close(self) -> None:
+        """End the receiver thread; what has come stays readable."""
+        self._stopping.set()
+        self._thread.join()
+        self._resources.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

@@ -1,0 +1,48 @@
+"""Gaussians as a PLY file with the field names every splat viewer reads."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from sags_node.errors import SagsError
+from sags_node.types import Gaussians
+
+SH_C0 = 0.28209479177387814  # the constant spherical harmonic
+_FIELDS = (
+    "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3".split()
+)
+
+
+def write_ply(path: Path, gaussians: Gaussians) -> None:
+    """Write a binary PLY in the layout of 3D Gaussian Splatting (Kerbl et al., 2023): log scales, opacity
+    logits, quaternions wxyz, colours as degree-0 spherical harmonics; metres.
+
+    Raises:
+        SagsError: the file exists already (nothing is overwritten) or cannot be written.
+    """
+    opacities = np.clip(gaussians.opacities, 1e-6, 1 - 1e-6)
+    quats = gaussians.quats / np.linalg.norm(gaussians.quats, axis=1, keepdims=True)
+    columns = np.concatenate(
+        [
+            gaussians.means,
+            np.zeros_like(gaussians.means),
+            (gaussians.colors - 0.5) / SH_C0,
+            np.log(opacities / (1 - opacities))[:, None],
+            np.log(gaussians.scales),
+            quats,
+        ],
+        axis=1,
+    )
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(gaussians)}"]
+    header += [f"property float {name}" for name in _FIELDS]
+    header += ["end_header", ""]
+    try:
+        with path.open("xb") as file:
+            file.write("\n".join(header).encode())
+            file.write(np.ascontiguousarray(columns, "<f4").tobytes())
+    except FileExistsError:
+        raise SagsError(f"{path} exists already; choose another name") from None
+    except OSError as error:
+        raise SagsError(f"cannot write {path}: {error.strerror}") from None

@@ -1,0 +1,95 @@
+"""From bodies to a picture: one raw eye's view in linear light, smoke, and what lens and sensor make of it."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from sags_node.geometry import transform
+from sags_node.phantom.casting import Bodies, Hits, grid_position
+from sags_node.phantom.relief import SPACING, Relief
+from sags_node.phantom.shading import Lamp, develop, shade_metal, shade_tissue
+from sags_node.phantom.skin import Skin
+from sags_node.types import F32, F64, U8, Bool
+
+LENS_BLUR = 0.45  # px: no endoscope is sharper; it also softens the edges of single-sample rendering
+SMOKE_DISTANCE = 0.035  # m
+SMOKE_COLOR = np.array([0.42, 0.40, 0.40], np.float32)
+_BAND = 64  # rows at a time, so that the intermediate arrays stay in the cache
+_NOTHING = 0.003  # linear light where a ray leaves the scene
+
+
+def world_rays(directions: F32, offset: float, T_world_cam: F64) -> F32:
+    """Rays [..., 6] in the world of an eye `offset` m to the right of the camera.
+
+    `directions` [..., 3] are in the camera's axes with z = 1, so that a hit's distance is its depth.
+    """
+    rays = np.empty((*directions.shape[:-1], 6), np.float32)
+    rays[..., :3] = transform(T_world_cam, np.array([offset, 0.0, 0.0]))
+    rays[..., 3:] = directions @ T_world_cam[:3, :3].T.astype(np.float32)
+    return rays
+
+
+def look(
+    directions: F32, offset: float, T_world_cam: F64, bodies: Bodies, relief: Relief, skin: Skin, lamp: Lamp
+) -> tuple[F32, Bool]:
+    """Linear-light picture [H, W, 3] along `directions` [H, W, 3], and where it shows instruments [H, W]."""
+    bands = []
+    for top in range(0, len(directions), _BAND):
+        rays = world_rays(directions[top : top + _BAND], offset, T_world_cam)
+        hits = bodies.cast(rays)
+        bands.append((_shade(rays, hits, bodies, relief, skin, lamp), hits.tool))
+    pictures, tools = zip(*bands, strict=True)
+    return np.concatenate(pictures), np.concatenate(tools)
+
+
+def _shade(rays: F32, hits: Hits, bodies: Bodies, relief: Relief, skin: Skin, lamp: Lamp) -> F32:
+    directions = rays[..., 3:]
+    points = rays[..., :3] + np.where(np.isfinite(hits.distance), hits.distance, 1)[..., None] * directions
+    view = -directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+
+    place = grid_position(hits, len(relief.x))
+    normals = cv2.remap(bodies.normals, place, None, cv2.INTER_LINEAR)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    material = place * np.float32(SPACING) + np.array([relief.x[0] - skin.x0, relief.y[0] - skin.y0], np.float32)
+    texel = material / np.float32(skin.texel)
+    color = cv2.remap(skin.color, texel, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    surface = cv2.remap(skin.surface, texel, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    flat = [a.reshape(-1, 3) for a in (points, normals, view, color, surface)]
+    picture = shade_tissue(*flat, lamp).reshape(rays.shape[:-1] + (3,))
+    picture[~hits.tissue] = _NOTHING
+
+    if hits.tool.any():
+        tools = bodies.tools
+        face, (second, third) = hits.face[hits.tool], hits.barycentric[hits.tool].T
+        corners = tools.normals[tools.faces[face]]
+        weights = np.stack([1 - second - third, second, third], -1)
+        smooth = np.einsum("nk,nkc->nc", weights, corners)
+        smooth /= np.linalg.norm(smooth, axis=-1, keepdims=True)
+        materials = tools.materials[face].astype(np.float32)
+        picture[hits.tool] = shade_metal(
+            points[hits.tool], smooth.astype(np.float32), view[hits.tool], materials, lamp
+        )
+    return picture
+
+
+def add_smoke(picture: F32, directions: F32, offset: float, cloud: F32, drift: F64, density: float) -> F32:
+    """A veil [H, W, 3] over the picture: a lit cloud [S, S] that hangs in front of the tissue.
+
+    `drift` [2] moves the cloud, in its own pixels; `density` 0..1.
+    """
+    across = directions[..., :2] * np.float32(SMOKE_DISTANCE)
+    across[..., 0] += np.float32(offset)
+    place = (across / np.float32(0.3e-3) + drift + 0.5 * len(cloud)).astype(np.float32)
+    thick = cv2.remap(cloud, place, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
+    opacity = 1 - np.exp(-density * np.maximum(0.55 + 0.45 * thick, 0))
+    return np.asarray(picture + (SMOKE_COLOR - picture) * opacity[..., None], np.float32)
+
+
+def expose(linear: F32, blur: float, noise: float, rng: np.random.Generator) -> U8:
+    """The recorded picture [H, W, 3]: lens blur (px, standard deviation), tone curve, sensor noise (0..1 scale)."""
+    sharpness = float(np.hypot(LENS_BLUR, blur))
+    shown = develop(cv2.GaussianBlur(linear, (0, 0), sharpness))
+    if noise > 0:
+        shown += np.float32(noise) * rng.standard_normal(shown.shape, dtype=np.float32)
+    return np.asarray(np.clip(shown * 255 + 0.5, 0, 255), np.uint8)

@@ -1,0 +1,105 @@
+"""The phantom itself: one call gives both raw pictures of a frame and everything that is true of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sags_node.config import PhantomSource
+from sags_node.geometry import invert, transform
+from sags_node.phantom.camera import add_smoke, expose, look, world_rays
+from sags_node.phantom.casting import Bodies
+from sags_node.phantom.instruments import Instruments
+from sags_node.phantom.motion import Clock, scope_pose
+from sags_node.phantom.noise import fractal_noise
+from sags_node.phantom.relief import BED_DEPTH, make_relief
+from sags_node.phantom.rig import phantom_rig, raw_rays, rectified_rays
+from sags_node.phantom.shading import Lamp
+from sags_node.phantom.skin import paint_skin
+from sags_node.phantom.tissue import Tissue
+from sags_node.types import F32, F64, U8, Bool
+
+TRACKS = 240
+HOOK_DEPTH = 0.055  # m
+HIDDEN = 5e-5  # m: a surface this much nearer hides a tracked point
+
+
+@dataclass(frozen=True, slots=True)
+class PhantomFrame:
+    """One frame and its truth."""
+
+    left: U8  # [H, W, 3] RGB, raw
+    right: U8  # [H, W, 3] RGB, raw
+    tool: Bool  # [H, W] raw left picture, True = instrument
+    depth: F32  # [H, W] m, left rectified picture; 0 = instrument or nothing
+    points: F64  # [P, 3] m, world
+    visible: Bool  # [P]
+    T_world_cam: F64  # [4, 4] left rectified camera
+
+
+class Phantom:
+    """A seeded scene; a frame is a pure function of its place in the session."""
+
+    def __init__(self, config: PhantomSource) -> None:
+        self.config = config
+        self.rig = phantom_rig(config.width, config.height)
+        self._left_rays = raw_rays(self.rig.left).astype(np.float32)
+        self._right_rays = raw_rays(self.rig.right).astype(np.float32)
+        self._rectified_rays = rectified_rays(self.rig.left).astype(np.float32)
+        widest = np.maximum(np.abs(self._left_rays), np.abs(self._right_rays)).max((0, 1))
+        self._half_view = (float(widest[0]), float(widest[1]))
+
+        # Independent random streams, so that changing one part of the scene leaves the others as they are.
+        streams = np.random.SeedSequence(config.seed).spawn(5)
+        shape, paint, tracks, smoke = (np.random.default_rng(stream) for stream in streams[:4])
+        self._noise_key = streams[4].generate_state(2)
+        self._clock = Clock(config.seconds)
+        self._relief = make_relief(shape, self._half_view)
+        self._tissue = Tissue(self._relief, self._clock)
+        self._skin = paint_skin(self._relief, paint, footprint=0.8 * BED_DEPTH / float(self.rig.left.K[0, 0]))
+        self._instruments = Instruments()
+        self._tracks = self._tissue.track_indices(tracks, self._half_view, TRACKS)
+        self._cloud = fractal_noise(smoke, (512, 512), 70, 4)
+
+    def frame(self, index: int, count: int) -> PhantomFrame:
+        """Frame `index` of a session of `count` frames."""
+        phase = index / count
+        T_world_cam = scope_pose(phase, self.config.camera_motion)
+        vertices = self._tissue.vertices(phase)
+        hook_view = HOOK_DEPTH * np.array(self._half_view)
+        tools = self._instruments.mesh(self._clock.action(phase), self._tissue.grip(vertices), hook_view)
+        bodies = Bodies(self._tissue, vertices, tools)
+        lamp = Lamp.at_tip(T_world_cam, self.rig.baseline)
+
+        pictures, masks = [], []
+        for eye, (rays, offset) in enumerate(((self._left_rays, 0.0), (self._right_rays, self.rig.baseline))):
+            linear, mask = look(rays, offset, T_world_cam, bodies, self._relief, self._skin, lamp)
+            if self.config.smoke > 0:
+                drift = 60 * np.array([np.cos(2 * np.pi * phase), np.sin(2 * np.pi * phase)])
+                linear = add_smoke(linear, rays, offset, self._cloud, drift, self.config.smoke)
+            rng = np.random.default_rng([*self._noise_key, index, eye])
+            pictures.append(expose(linear, self.config.blur, self.config.noise, rng))
+            masks.append(mask)
+
+        hits = bodies.cast(world_rays(self._rectified_rays, 0.0, T_world_cam))
+        points = vertices.reshape(-1, 3)[self._tracks].astype(np.float64)
+        return PhantomFrame(
+            left=pictures[0],
+            right=pictures[1],
+            tool=masks[0],
+            depth=np.where(hits.tissue, hits.distance, np.float32(0)),
+            points=points,
+            visible=self._visible(bodies, points, T_world_cam),
+            T_world_cam=T_world_cam,
+        )
+
+    def _visible(self, bodies: Bodies, points: F64, T_world_cam: F64) -> Bool:
+        """Inside the left rectified picture and not behind anything, [P]."""
+        eye = self.rig.left
+        local = transform(invert(T_world_cam), points)
+        pixels = local @ eye.P[:, :3].T
+        pixels = pixels[:, :2] / pixels[:, 2:]
+        inside = ((pixels >= 0) & (pixels <= [eye.width - 1, eye.height - 1])).all(-1)
+        hits = bodies.cast(world_rays((local / local[:, 2:]).astype(np.float32), 0.0, T_world_cam))
+        return np.asarray(inside & (hits.distance > local[:, 2] - HIDDEN))

@@ -1,0 +1,159 @@
+"""What the tissue looks like: colour, wetness and fine relief, fixed in material coordinates."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from sags_node.phantom.noise import fractal_noise
+from sags_node.phantom.relief import SPACING, Relief
+from sags_node.phantom.vessels import grow_vessels
+from sags_node.types import F32
+
+PAINT_TEXEL = 0.1e-3  # m, the texture is always painted this fine, then shrunk to what the cameras resolve
+
+# Linear-light reflectances (RGB).
+_SEROSA = np.array([0.60, 0.235, 0.205], np.float32)
+_SEROSA_PALE = np.array([0.66, 0.36, 0.30], np.float32)
+_SEROSA_DARK = np.array([0.46, 0.115, 0.115], np.float32)
+_MESENTERY = np.array([0.47, 0.165, 0.140], np.float32)
+_FAT = np.array([0.74, 0.47, 0.225], np.float32)
+_LIVER = np.array([0.200, 0.050, 0.042], np.float32)
+# Optical density of a full vessel: blood takes green and blue; a deep vein looks bluish.
+_ARTERY = np.array([0.55, 1.75, 1.55], np.float32)
+_VEIN = np.array([0.95, 1.15, 0.80], np.float32)
+_CAPILLARY = np.array([0.12, 0.45, 0.40], np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class Skin:
+    """Textures over material coordinates; texel (row, col) lies at x = x0 + col * texel, y = y0 + row * texel."""
+
+    color: F32  # [H, W, 3] linear reflectance, furrows darkened
+    surface: F32  # [H, W, 3]: slope along x, slope along y, wetness 0..1
+    x0: float  # m
+    y0: float  # m
+    texel: float  # m
+
+
+def paint_skin(relief: Relief, rng: np.random.Generator, footprint: float) -> Skin:
+    """Paint the textures; `footprint` is what one camera pixel covers (m), finer detail is averaged away."""
+    zoom = SPACING / PAINT_TEXEL
+    shape = tuple(int(round(n * zoom)) for n in relief.chart.shape[:2])
+    size = (shape[1], shape[0])
+
+    def enlarge(field: F32) -> F32:
+        return cv2.resize(field, size, interpolation=cv2.INTER_LINEAR)
+
+    # Detail is drawn flat, then wrapped round the loops by their arc-length chart.
+    chart = enlarge(relief.chart)
+    at = (chart - np.array([relief.x[0], relief.y[0]], np.float32)) / np.float32(PAINT_TEXEL)
+
+    def wrap(flat: F32) -> F32:
+        return cv2.remap(flat, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
+
+    loop, liver, tint = enlarge(relief.loop), enlarge(relief.liver), enlarge(relief.tint)
+    bed = np.clip(1 - loop - liver, 0, 1)
+    fat = _fat_share(rng, shape, bed, loop)
+    color = _base_color(rng, shape, loop, liver, fat, tint, wrap)
+    color *= np.exp(-_blood(rng, shape, 1 - 0.8 * liver - 0.5 * fat, wrap))
+    color *= enlarge(relief.cavity)[..., None]
+
+    slope = _slopes(rng, shape, bed, liver, fat, wrap)
+    wetness = np.clip(0.75 + 0.30 * fractal_noise(rng, shape, 90, 3) - 0.25 * fat, 0.15, 1)
+    surface = np.dstack([slope, wetness]).astype(np.float32)
+
+    shrink = min(1.0, PAINT_TEXEL / (0.75 * footprint))
+    small = (max(8, int(size[0] * shrink)), max(8, int(size[1] * shrink)))
+    texel = SPACING * relief.chart.shape[1] / small[0]
+    corner = 0.5 * (texel - SPACING)  # from the centre of the first vertex to that of the first texel
+    return Skin(
+        color=cv2.resize(color, small, interpolation=cv2.INTER_AREA),
+        surface=cv2.resize(surface, small, interpolation=cv2.INTER_AREA),
+        x0=float(relief.x[0] + corner),
+        y0=float(relief.y[0] + corner),
+        texel=texel,
+    )
+
+
+Shape = tuple[int, int]
+Wrap = Callable[[F32], F32]
+
+
+def _between(low: float, high: float, values: F32) -> F32:
+    """Smooth step from 0 at `low` to 1 at `high`."""
+    t = np.clip((values - low) / (high - low), 0, 1)
+    return np.asarray(t * t * (3 - 2 * t), np.float32)
+
+
+def _mix(a: F32, b: F32, share: F32) -> F32:
+    return np.asarray(a + (b - a) * share[..., None], np.float32)
+
+
+def _fat_share(rng: np.random.Generator, shape: Shape, bed: F32, loop: F32) -> F32:
+    """Yellow patches: most of them in the bed, streaks where loops are attached."""
+    patches = fractal_noise(rng, shape, 140, 4)
+    return np.asarray(bed * _between(0.1, 0.9, patches) + 0.5 * loop * _between(1.6, 2.4, patches), np.float32)
+
+
+def _base_color(
+    rng: np.random.Generator, shape: Shape, loop: F32, liver: F32, fat: F32, tint: F32, wrap: Wrap
+) -> F32:
+    broad = wrap(fractal_noise(rng, shape, 260, 3)) + tint
+    mottle = wrap(fractal_noise(rng, shape, 45, 4))
+    grain = wrap(fractal_noise(rng, shape, 9, 2))
+    serosa = _mix(np.broadcast_to(_SEROSA, (*shape, 3)), _SEROSA_PALE, _between(0.2, 2.2, broad + 0.5 * mottle))
+    serosa = _mix(serosa, _SEROSA_DARK, _between(0.1, 2.2, -broad + 0.7 * mottle))
+    color = _mix(np.broadcast_to(_MESENTERY, (*shape, 3)), serosa, loop)
+    color = _mix(color, _FAT, fat)
+    color = _mix(color, _LIVER, liver)
+    color *= np.exp(0.10 * mottle + 0.05 * grain)[..., None]
+    color[..., 1:] *= np.exp(-0.07 * wrap(fractal_noise(rng, shape, 22, 3)))[..., None]  # patchy perfusion
+    return color
+
+
+def _blood(rng: np.random.Generator, shape: Shape, perfused: F32, wrap: Wrap) -> F32:
+    """Optical density [H, W, 3] of the vessels; the number of trees goes with the area."""
+    area = shape[0] * shape[1] / 1e6
+    veins = grow_vessels(rng, shape, roots=int(9 * area), width=9.0, thinnest=2.2)
+    arteries = grow_vessels(rng, shape, roots=int(26 * area), width=5.0, thinnest=0.55)
+    network = np.exp(-((fractal_noise(rng, shape, 26, 2) / 0.10) ** 2))  # lines along the zero crossings
+    patchy = _between(-0.6, 1.4, fractal_noise(rng, shape, 160, 2))
+    density = (
+        wrap(cv2.GaussianBlur(veins, (0, 0), 1.6))[..., None] * _VEIN
+        + wrap(arteries)[..., None] * _ARTERY
+        + wrap(network * patchy)[..., None] * _CAPILLARY
+    )
+    return np.asarray(density * perfused[..., None], np.float32)
+
+
+def _slopes(rng: np.random.Generator, shape: Shape, bed: F32, liver: F32, fat: F32, wrap: Wrap) -> F32:
+    """Slopes [H, W, 2] of the fine relief, far below the mesh spacing; they make the wet highlights."""
+    texel = np.float32(PAINT_TEXEL)
+    ripples = 0.06e-3 * fractal_noise(rng, shape, 20, 2)
+    wrinkles = 0.22e-3 * (1 - np.abs(fractal_noise(rng, shape, 26, 2)))
+    lobules = _lobules(rng, shape, cell=22.0) * texel
+    tremble = 0.030e-3 * fractal_noise(rng, shape, 7, 1)
+
+    def slope(height: F32) -> F32:
+        return wrap(np.dstack(np.gradient(height, texel)[::-1]).astype(np.float32))
+
+    total = (
+        slope(ripples + tremble)
+        + slope(wrinkles) * (np.clip(bed + 0.12, 0, 1) * (1 - fat))[..., None]
+        + slope(lobules) * fat[..., None]
+    )
+    total *= (1 - 0.6 * liver)[..., None]
+    return np.clip(total, -0.9, 0.9)
+
+
+def _lobules(rng: np.random.Generator, shape: Shape, cell: float) -> F32:
+    """Rounded cells side by side, height in px: fat."""
+    seeds = np.full(shape, 255, np.uint8)
+    count = int(shape[0] * shape[1] / cell**2)
+    seeds[rng.integers(0, shape[0], count), rng.integers(0, shape[1], count)] = 0
+    distance = cv2.GaussianBlur(cv2.distanceTransform(seeds, cv2.DIST_L2, 5), (0, 0), 1.5)
+    return np.asarray(-0.6 * distance**2 / cell, np.float32)

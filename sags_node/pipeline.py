@@ -1,0 +1,123 @@
+"""One stereo frame in, one result out: the straight line. No threads, sockets or clock decisions here."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+
+import numpy as np
+
+from sags_node.config import LaunchConfig
+from sags_node.engine.rasterize import make_rasterizer, to_view
+from sags_node.mapping.budget import Budget
+from sags_node.mapping.mapper import Mapper
+from sags_node.types import FrameResult, RectifiedPair, RenderedView, Snapshot, StereoFrame, StereoRig
+from sags_node.vision.observe import observe
+from sags_node.vision.rectify import Rectifier
+from sags_node.vision.stereo import StereoDepth
+from sags_node.vision.tissue import TissueMask
+
+DUPLICATE_RMS = 0.6  # grey levels: below a video codec's own noise (PSNR > 52 dB)
+
+
+class Pipeline:
+    """rectify -> tissue mask -> depth -> map -> render."""
+
+    def __init__(self, config: LaunchConfig, rig: StereoRig) -> None:
+        vision = config.vision
+        width, height = vision.width or rig.left.width, vision.height or rig.left.height
+        self.rectifier = Rectifier(rig, width, height)
+        self.tissue = TissueMask(vision.tissue, self.rectifier)
+        self.stereo = StereoDepth(vision.stereo, self.rectifier.camera, self.rectifier.baseline)
+        self._rasterizer = make_rasterizer(config.engine.backend, width, height)
+        self._config = config
+        self._mapped: FrameResult | None = None  # the last frame that was really mapped
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the model; the next frame makes a new one."""
+        self.mapper = Mapper(self._rasterizer, self._config.mapping.max_gaussians)
+        self._mapped = None
+
+    def reconfigure(self, config: LaunchConfig) -> None:
+        """Take changed parameters over; the model stays."""
+        self._config = config
+
+    def process(self, frame: StereoFrame, budget: Budget) -> FrameResult:
+        """Everything that happens to one frame."""
+        budget.start()
+        watch = Stopwatch()
+        with watch("rectify"):
+            pair = self.rectifier(frame)
+        if self._mapped is not None and self._config.mapping.skip_duplicates:
+            if _rms_difference(pair, self._mapped.pair) < DUPLICATE_RMS:
+                return _repeat(self._mapped, pair, frame.epoch, watch.timings_ms)
+        with watch("mask"):
+            tissue = self.tissue(frame, pair)
+        with watch("depth"):
+            depth, confidence = self.stereo(pair, tissue)
+            observation = observe(pair, tissue, depth, confidence)
+        with watch("map"):
+            snapshot = self.mapper.update(observation, budget)
+        with watch("render"):
+            views = {"left": self.draw(snapshot)}
+            if self._config.publish.right:
+                views["right"] = self.draw(snapshot, eye_distance=pair.baseline)
+            self.mapper.drawn(observation, views["left"])
+        budget.finish()
+        self._mapped = FrameResult(pair, observation, snapshot, views, frame.epoch, watch.timings_ms)
+        return self._mapped
+
+    def draw(self, snapshot: Snapshot, eye_distance: float = 0.0) -> RenderedView:
+        """The snapshot as its own camera sees it, moved right by `eye_distance` metres."""
+        camera = snapshot.camera.moved_right(eye_distance) if eye_distance else snapshot.camera
+        planes = self._rasterizer.forward(snapshot.gaussians, camera)
+        return to_view(planes, camera, snapshot.frame_id, snapshot.t_capture_ns)
+
+
+class Stopwatch:
+    """Wall time of named stages, ms."""
+
+    def __init__(self) -> None:
+        self.timings_ms: dict[str, float] = {}
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        started = time.perf_counter()
+        yield
+        self.timings_ms[stage] = (time.perf_counter() - started) * 1e3
+
+
+def _rms_difference(a: RectifiedPair, b: RectifiedPair) -> float:
+    """Grey levels, over every fourth pixel of both eyes: enough to tell a repeated frame from a moved one."""
+    squares = [
+        np.mean(np.square(x[::4, ::4].astype(np.float32) - y[::4, ::4]))
+        for x, y in ((a.left, b.left), (a.right, b.right))
+    ]
+    return float(np.sqrt(max(squares)))
+
+
+def _repeat(mapped: FrameResult, pair: RectifiedPair, epoch: int, timings: dict[str, float]) -> FrameResult:
+    """The last mapped result under the ids of a frame that equals it."""
+    frame_id, stamp = pair.frame_id, pair.t_capture_ns
+    still = np.zeros_like(mapped.snapshot.velocities)
+    return replace(
+        mapped,
+        pair=pair,
+        observation=replace(mapped.observation, frame_id=frame_id, t_capture_ns=stamp),
+        snapshot=replace(
+            mapped.snapshot,
+            frame_id=frame_id,
+            t_capture_ns=stamp,
+            velocities=still,
+            counts={"iterations": 0},
+        ),
+        views={
+            eye: replace(view, frame_id=frame_id, t_capture_ns=stamp) for eye, view in mapped.views.items()
+        },
+        epoch=epoch,
+        timings_ms=timings,
+        skipped={"frame": "equals its predecessor"},
+    )

@@ -1,0 +1,48 @@
+"""From a launch file to the three things the node runs on: configuration, rig and source."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from sags_node.calibration import load_rig
+from sags_node.config import LaunchConfig, PhantomSource, load_launch
+from sags_node.errors import UsageError
+from sags_node.phantom import cached_session
+from sags_node.sources.source import Source, open_source
+from sags_node.types import StereoRig
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    config: LaunchConfig
+    rig: StereoRig
+    source: Source
+
+
+def open_session(
+    launch: Path | str | None,
+    overrides: Sequence[str] = (),
+    progress: Callable[[int, int], None] | None = None,
+) -> Session:
+    """Read a launch file or session folder (None: the built-in phantom) and open what it names.
+
+    Args:
+        progress: called with (frames done, frames in all) while the phantom is rendered for the first time.
+
+    Raises:
+        UsageError: a wrong key, value or path.
+        SagsError: the recording or the calibration cannot be used.
+    """
+    config = load_launch(launch, overrides)
+    if isinstance(config.source, PhantomSource):
+        folder = cached_session(config.source, progress)
+        rig = load_rig(config.rig or folder / "calib")
+    elif config.rig is None:
+        raise UsageError(
+            "no calibration: set rig to a folder with left.yaml and right.yaml, e.g. rig:=calib/d4d"
+        )
+    else:
+        rig = load_rig(config.rig)
+    return Session(config, rig, open_source(config.source))

@@ -1,0 +1,130 @@
+"""One V4L2 capture device: opened as asked, verified, read with a time limit."""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+
+from sags_node.config import V4l2Source
+from sags_node.errors import SagsError
+from sags_node.types import U8
+
+log = logging.getLogger(__name__)
+
+FIRST_PICTURE_S = 3  # cameras need this long to start; OpenCV waits for the first picture in one piece
+PLAUSIBLE_AGE_NS = 1_000_000_000  # of a driver stamp against its arrival
+
+
+class Picture(NamedTuple):
+    """What a device delivers."""
+
+    t_ns: int  # wall clock
+    image: U8  # [H, W, 3] RGB
+
+
+class Device:
+    """An open camera.
+
+    Args:
+        path: device file; a udev link such as /dev/video-left follows its camera from port to port.
+        config: size, rate and pixel format to ask for.
+
+    Raises:
+        SagsError: the device is missing or cannot be opened, or the driver set another size.
+    """
+
+    def __init__(self, path: str, config: V4l2Source) -> None:
+        self._path = path
+        self._last_stamp_ms = 0.0
+        if not os.path.exists(path):
+            raise SagsError(f"camera {path} does not exist; {_present()}")
+        timeout = max(FIRST_PICTURE_S, math.ceil(config.deadline))
+        os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", str(timeout))  # OpenCV's own is 10 s
+        self._capture = cv2.VideoCapture(path, cv2.CAP_V4L2)
+        if not self._capture.isOpened():
+            raise SagsError(
+                f"{path} cannot be opened as a camera: another program uses it, this user may not "
+                f"(group 'video'), or it does not capture; {_present()}"
+            )
+        try:
+            self.rate = self._configure(config)
+        except SagsError:
+            self.close()
+            raise
+
+    def _configure(self, config: V4l2Source) -> float:
+        """Ask for size, rate and format; the rate that the driver set. Drivers may refuse any of them."""
+        capture = self._capture
+        if config.fourcc is not None:
+            capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*config.fourcc))
+        capture.set(cv2.CAP_PROP_FRAME_WIDTH, config.width)
+        capture.set(cv2.CAP_PROP_FRAME_HEIGHT, config.height)
+        capture.set(cv2.CAP_PROP_FPS, config.rate)
+
+        width = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH))
+        height = int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
+        if (width, height) != (config.width, config.height):
+            raise SagsError(
+                f"{self._path}: wanted {config.width}x{config.height} px, the driver gives {width}x{height}; "
+                "set source.width and source.height to a size of this camera"
+            )
+        fourcc = int(capture.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little").decode("ascii", "replace")
+        if config.fourcc is not None and fourcc != config.fourcc:
+            log.warning("%s: wanted pixel format %s, the driver gives %s", self._path, config.fourcc, fourcc)
+        rate = float(capture.get(cv2.CAP_PROP_FPS))
+        if rate <= 0:
+            return config.rate
+        if abs(rate - config.rate) > 0.01 * config.rate:
+            log.warning("%s: wanted %g frames/s, the driver gives %g", self._path, config.rate, rate)
+        return rate
+
+    def read(self, timeout: float) -> Picture | None:
+        """The next picture; None when none comes within `timeout` seconds or its stamp stands still.
+
+        Raises:
+            SagsError: the device is gone.
+        """
+        try:
+            ready, _ = cv2.VideoCapture.waitAny([self._capture], int(timeout * 1e9))
+            if not ready:
+                return None
+            found, picture = self._capture.read()
+        except cv2.error:
+            found = False
+        if not found:
+            raise SagsError(f"{self._path} stopped delivering pictures")
+        stamp_ms = self._capture.get(cv2.CAP_PROP_POS_MSEC)
+        if stamp_ms and stamp_ms == self._last_stamp_ms:
+            return None
+        self._last_stamp_ms = stamp_ms
+        t_ns = wall_stamp(round(stamp_ms * 1e6), time.monotonic_ns(), time.time_ns())
+        return Picture(t_ns, cv2.cvtColor(picture, cv2.COLOR_BGR2RGB))
+
+    def close(self) -> None:
+        self._capture.release()
+
+
+def wall_stamp(driver_ns: int, monotonic_ns: int, wall_ns: int) -> int:
+    """A driver's monotonic capture stamp on the wall clock, ns; the arrival time where it is no such stamp.
+
+    No picture is taken after it arrived: where a driver stamps ahead (vivid does), arrival counts.
+
+    Args:
+        driver_ns: the driver's stamp, 0 when it gives none.
+        monotonic_ns, wall_ns: both clocks at arrival.
+    """
+    age = monotonic_ns - driver_ns
+    if abs(age) > PLAUSIBLE_AGE_NS:
+        return wall_ns
+    return wall_ns - max(age, 0)
+
+
+def _present() -> str:
+    devices = sorted(str(device) for device in Path("/dev").glob("video*"))
+    return f"present: {', '.join(devices)}" if devices else "there is no /dev/video* at all"

@@ -1,0 +1,170 @@
+"""Stereo pairs from two folders of pictures."""
+
+from __future__ import annotations
+
+import logging
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from sags_node.errors import SagsError, UsageError
+from sags_node.types import U8, Bool
+
+log = logging.getLogger(__name__)
+
+PICTURE_SUFFIXES = {".jpg", ".jpeg", ".png"}
+JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
+PNG_START, PNG_END = b"\x89PNG", b"IEND\xaeB`\x82"
+LONGEST_PADDING = 512  # bytes some cameras write after the end of a picture
+
+
+class RawPair(NamedTuple):
+    """One moment of a recording, before it gets its stamps."""
+
+    left: U8  # [H, W, 3] RGB
+    right: U8  # [H, W, 3] RGB
+    tissue: Bool | None  # [H, W] of the left picture
+
+
+class FolderPairs:
+    """Pictures of two folders, paired by sorted name (numbers in names sort as numbers).
+
+    Raises:
+        UsageError: a folder is missing or empty, or the folders do not fit each other.
+    """
+
+    rate: float | None = None  # folders do not know it
+
+    def __init__(self, left: Path, right: Path, tools: Path | None = None) -> None:
+        self._left = list_pictures(left)
+        self._right = list_pictures(right)
+        self._tools = None if tools is None else list_pictures(tools)
+        _check_counts(left, self._left, right, self._right)
+        if tools is not None and self._tools is not None:
+            _check_counts(left, self._left, tools, self._tools)
+        _warn_of_gaps(self._left, self._right)
+        self.count = len(self._left)
+        self.size = _size(read_picture(self._left[0]))
+        self._next = 0
+        self.read()
+
+    def seek(self, index: int) -> None:
+        self._next = index
+
+    def skip(self) -> bool:
+        self._next += 1
+        return self._next <= self.count
+
+    def read(self) -> RawPair | None:
+        """The next pair, None at the end.
+
+        Raises:
+            SagsError: a picture is damaged or has another size than the first one.
+        """
+        index = self._next
+        if index >= self.count:
+            return None
+        self._next += 1
+        left = self._picture(self._left[index])
+        right = self._picture(self._right[index])
+        tissue = None
+        if self._tools is not None:
+            tissue = self._picture(self._tools[index], cv2.IMREAD_GRAYSCALE) < 128
+        return RawPair(left, right, tissue)
+
+    def close(self) -> None:
+        """Nothing stays open between pictures."""
+
+    def _picture(self, file: Path, flags: int = cv2.IMREAD_COLOR) -> U8:
+        picture = read_picture(file, flags)
+        if _size(picture) != self.size:
+            raise SagsError(
+                f"{file} is {size_text(*_size(picture))} px but {self._left[0]} is {size_text(*self.size)}; "
+                "all pictures must have one size"
+            )
+        return picture
+
+
+def list_pictures(folder: Path) -> list[Path]:
+    """JPEG and PNG files of a folder in order of their names, numbers compared as numbers.
+
+    Raises:
+        UsageError: the folder is missing or holds no picture.
+    """
+    if not folder.is_dir():
+        reason = "is not a folder" if folder.exists() else "does not exist"
+        raise UsageError(f"picture folder {folder} {reason}; check the path")
+    pictures = [file for file in folder.iterdir() if file.suffix.lower() in PICTURE_SUFFIXES]
+    if not pictures:
+        raise UsageError(f"picture folder {folder} holds no .jpg or .png file")
+    return sorted(pictures, key=lambda file: (_natural(file.stem), file.name))
+
+
+def read_picture(file: Path, flags: int = cv2.IMREAD_COLOR) -> U8:
+    """Decode one JPEG or PNG: RGB for `IMREAD_COLOR`, else as OpenCV's flags say.
+
+    OpenCV fills what is missing of a cut-off picture with grey and says nothing, so its end is checked first.
+
+    Raises:
+        SagsError: the file is missing, cut off or damaged.
+    """
+    try:
+        data = file.read_bytes()
+    except OSError as error:
+        raise SagsError(f"cannot read picture {file}: {error.strerror}") from None
+    picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if _is_whole(data) else None
+    if picture is None:
+        raise SagsError(
+            f"picture {file} is damaged or cut off ({len(data)} bytes); replace or remove the pair"
+        )
+    decoded: U8 = cv2.cvtColor(picture, cv2.COLOR_BGR2RGB) if flags == cv2.IMREAD_COLOR else picture
+    return decoded
+
+
+def _is_whole(data: bytes) -> bool:
+    end = data[-LONGEST_PADDING:]
+    if data.startswith(JPEG_START):
+        return JPEG_END in end
+    return data.startswith(PNG_START) and PNG_END in end
+
+
+def _natural(name: str) -> list[str | int]:
+    """'a10b' -> ['a', 10, 'b']: text and numbers alternate, so any two names compare."""
+    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
+
+
+def size_text(width: int, height: int) -> str:
+    """As people write a picture size: 640x480."""
+    return f"{width}x{height}"
+
+
+def _size(picture: U8) -> tuple[int, int]:
+    return picture.shape[1], picture.shape[0]
+
+
+def _check_counts(one: Path, one_files: list[Path], other: Path, other_files: list[Path]) -> None:
+    if len(one_files) != len(other_files):
+        raise UsageError(
+            f"{one} holds {len(one_files)} pictures but {other} holds {len(other_files)}; "
+            "pairing goes by sorted name, so both need the same number"
+        )
+
+
+def _warn_of_gaps(left: list[Path], right: list[Path]) -> None:
+    """Equal counts may still hide one missing picture on each side; the names' last numbers tell."""
+    shift: int | None = None
+    for left_file, right_file in zip(left, right, strict=True):
+        numbers = [re.findall(r"\d+", file.stem) for file in (left_file, right_file)]
+        if not all(numbers):
+            return
+        difference = int(numbers[0][-1]) - int(numbers[1][-1])
+        if shift is not None and difference != shift:
+            log.warning(
+                "%s is paired with %s, unlike the pairs before: is a picture missing?",
+                *(left_file, right_file),
+            )
+            return
+        shift = difference

@@ -1,0 +1,189 @@
+"""Plays a recording: at its own pace, as fast as it is taken, or step by step with its own stamps."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from types import TracebackType
+from typing import Protocol, Self
+
+from sags_node import config as cfg
+from sags_node.errors import UsageError
+from sags_node.sources.pictures import FolderPairs, RawPair
+from sags_node.sources.truth import Poses, References
+from sags_node.sources.videos import PanePairs, Video, VideoPairs, side_by_side_boxes
+from sags_node.types import StereoFrame
+
+Recording = cfg.FoldersSource | cfg.VideosSource | cfg.SideBySideSource | cfg.PanesSource
+DEFAULT_RATE = 30.0  # of folders, which do not know theirs
+
+
+class Pairs(Protocol):
+    """The readers of `pictures` and `videos`: pairs in order, from any start."""
+
+    rate: float | None  # the recording's own
+    count: int  # as announced; a video may end earlier
+
+    def seek(self, index: int) -> None:
+        """Make `index` the next pair."""
+
+    def skip(self) -> bool:
+        """Pass over one pair as cheaply as possible; False at the end."""
+
+    def read(self) -> RawPair | None:
+        """The next pair, None at the end."""
+
+    def close(self) -> None: ...
+
+
+class Replay:
+    """A `Source` that plays a recording.
+
+    Every pair of the recording has its turn, numbered by `frame_id`: its index in the first pass, counted on
+    when the recording loops. In `realtime` pace turn `n` is due `n / rate` seconds after the first; a pair
+    that would come more than one period late is left out and counted. In `step` pace the stamp is
+    `frame_id / rate`, whatever the clock says.
+
+    Args:
+        config: which recording, and how to play it.
+        references: read the recording's truth with each frame.
+        clock: monotonic seconds.
+        wall_ns: wall clock, nanoseconds.
+        sleep: waits for seconds; the default is cut short by `stop`.
+
+    Raises:
+        UsageError: files are missing or do not fit each other, or `start` lies behind the end.
+    """
+
+    def __init__(
+        self,
+        config: Recording,
+        *,
+        references: bool = True,
+        clock: Callable[[], float] = time.monotonic,
+        wall_ns: Callable[[], int] = time.time_ns,
+        sleep: Callable[[float], object] | None = None,
+    ) -> None:
+        self._config = config
+        self._stopped = threading.Event()
+        self._clock = clock
+        self._wall_ns = wall_ns
+        self._sleep = sleep or self._stopped.wait
+        self._poses = None if config.poses is None else Poses(config.poses)
+        self._references = References(config.reference) if references else None
+        self._pairs = _open_pairs(config)
+        self.rate = config.rate or self._pairs.rate or DEFAULT_RATE
+        self.dropped = 0
+        self._began: tuple[float, int] | None = None  # monotonic seconds and wall clock of the first turn
+        self._dropped_in_a_row = 0
+        self._first = round(config.start * self.rate)
+        if self._first >= self._pairs.count:
+            self._pairs.close()
+            seconds = self._pairs.count / self.rate
+            raise UsageError(
+                f"source.start {config.start} s lies behind the recording's end at {seconds:.2f} s"
+            )
+
+    @property
+    def frame_count(self) -> int | None:
+        """How many turns there will be; None for an endless loop."""
+        if self._config.loop:
+            return self._config.frames
+        there = self._pairs.count - self._first
+        return there if self._config.frames is None else min(there, self._config.frames)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+        self._pairs.close()
+
+    def stop(self) -> None:
+        """End the iteration; any thread may call this."""
+        self._stopped.set()
+
+    def __iter__(self) -> Iterator[StereoFrame]:
+        """Play from the start.
+
+        Raises:
+            SagsError: a picture is damaged, or the right eye ends before the left one.
+        """
+        self._pairs.seek(self._first)
+        self._began = None
+        self._dropped_in_a_row = 0
+        epoch, index, frame_id = 0, self._first, self._first
+        limit = None if self._config.frames is None else self._first + self._config.frames
+        while not self._stopped.is_set() and frame_id != limit:
+            pair = None
+            if self._is_too_late(frame_id):
+                ended = not self._pairs.skip()
+            else:
+                pair = self._pairs.read()
+                ended = pair is None
+            if ended:
+                if not self._config.loop or index == self._first:
+                    return
+                self._pairs.seek(self._first)
+                epoch, index = epoch + 1, self._first
+                continue
+            if pair is None:
+                self.dropped += 1
+                self._dropped_in_a_row += 1
+            else:
+                self._dropped_in_a_row = 0
+                pose = None if self._poses is None else self._poses.at(index)
+                reference = None if self._references is None else self._references.at(index)
+                stamp = self._wait_for_turn(frame_id)
+                if self._stopped.is_set():
+                    return
+                yield StereoFrame(
+                    frame_id, stamp, stamp, pair.left, pair.right, epoch, pose, pair.tissue, reference
+                )
+            index += 1
+            frame_id += 1
+
+    def _due_in(self, frame_id: int) -> float:
+        """Seconds until the turn of this frame, negative when it is over; the first turn is now."""
+        if self._began is None:
+            self._began = self._clock(), self._wall_ns()
+        return self._began[0] + (frame_id - self._first) / self.rate - self._clock()
+
+    def _is_too_late(self, frame_id: int) -> bool:
+        """Whether to leave this frame out.
+
+        One frame a second comes through even where skipping itself is slower than the recording.
+        """
+        if self._config.pace != "realtime" or self._began is None or self._dropped_in_a_row >= self.rate:
+            return False
+        return self._due_in(frame_id) < -1.0 / self.rate
+
+    def _wait_for_turn(self, frame_id: int) -> int:
+        """Wait as the pace asks; the capture stamp of this frame, ns."""
+        if self._config.pace == "step":
+            return round(frame_id * 1e9 / self.rate)
+        if self._config.pace == "fast":
+            return self._wall_ns()
+        wait = self._due_in(frame_id)
+        if wait > 0:
+            self._sleep(wait)
+        assert self._began is not None
+        return self._began[1] + round((frame_id - self._first) * 1e9 / self.rate)
+
+
+def _open_pairs(config: Recording) -> Pairs:
+    """The reader that fits the kind of recording."""
+    match config:
+        case cfg.FoldersSource():
+            return FolderPairs(config.left, config.right, config.tools)
+        case cfg.VideosSource():
+            return VideoPairs(config.left, config.right)
+        case cfg.SideBySideSource():
+            video = Video(config.video)
+            halves = side_by_side_boxes(video.width, video.height, config.order, str(config.video))
+            return PanePairs(video, *halves)
+        case cfg.PanesSource():
+            return PanePairs(Video(config.video), config.left, config.right, config.tools)

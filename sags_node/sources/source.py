@@ -1,0 +1,82 @@
+"""What every source of stereo frames offers, and the one function that opens any of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from types import TracebackType
+from typing import Protocol, Self
+
+from sags_node import config as cfg
+from sags_node.types import StereoFrame
+
+
+class Source(Protocol):
+    """A context manager that yields `StereoFrame`s until the recording ends or `stop` is called."""
+
+    @property
+    def rate(self) -> float:
+        """Nominal frames per second."""
+
+    @property
+    def frame_count(self) -> int | None:
+        """How many frames there will be, None when that is not known or there is no end."""
+
+    @property
+    def dropped(self) -> int:
+        """Frames the source itself left out: late in `realtime` pace, unpaired from cameras."""
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None: ...
+
+    def __iter__(self) -> Iterator[StereoFrame]:
+        """Frames in capture order.
+
+        Raises:
+            SagsError: a picture cannot be read, or the eyes do not fit each other.
+        """
+
+    def stop(self) -> None:
+        """End the iteration promptly, also while it waits. May be called from any thread."""
+
+
+def open_source(
+    config: cfg.Source,
+    references: bool = True,
+    progress: Callable[[int, int], None] | None = None,
+) -> Source:
+    """Open the source a launch file describes.
+
+    Args:
+        config: the `source` section.
+        references: read the recording's truth with each frame. Only measuring needs it.
+        progress: called with (done, total) while a phantom session is rendered.
+
+    Raises:
+        UsageError: a file, folder or device is missing or does not fit the rest.
+        SagsError: a device or file cannot be read.
+    """
+    if isinstance(config, cfg.V4l2Source):
+        from sags_node.sources.v4l2 import StereoCameras
+
+        return StereoCameras(config)
+
+    from sags_node.sources.replay import Replay
+
+    if isinstance(config, cfg.PhantomSource):
+        config = _phantom_recording(config, progress)
+    return Replay(config, references=references)
+
+
+def _phantom_recording(
+    config: cfg.PhantomSource, progress: Callable[[int, int], None] | None
+) -> cfg.FoldersSource:
+    """The rendered session's own pictures, played the way this launch file asks."""
+    from sags_node.phantom import cached_session
+
+    recorded = cfg.load_launch(cached_session(config, progress)).source
+    assert isinstance(recorded, cfg.FoldersSource)
+    playing = config.model_dump(include={"pace", "rate", "loop", "start", "frames"}, exclude_unset=True)
+    return recorded.model_copy(update=playing)

@@ -1,0 +1,124 @@
+"""What a recording knows of each frame besides the pictures: poses, and the references to measure against."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sags_node.config import ReferenceConfig
+from sags_node.errors import SagsError, UsageError
+from sags_node.sources.pictures import list_pictures, read_picture
+from sags_node.types import F32, F64, Reference
+
+
+class Poses:
+    """Camera poses of a recording, one per frame.
+
+    Raises:
+        UsageError: the file is missing, damaged, or does not hold `T_world_cam` [T, 4, 4].
+    """
+
+    def __init__(self, file: Path) -> None:
+        self._file = file
+        self._poses = load_array(file, "T_world_cam", (None, 4, 4)).astype(np.float64)
+        if not np.isfinite(self._poses).all():
+            raise UsageError(f"{file}: T_world_cam holds values that are not finite")
+
+    def at(self, index: int) -> F64:
+        """`T_world_cam` [4, 4] of one frame of the recording, metres."""
+        if index >= len(self._poses):
+            raise SagsError(f"{self._file} holds {len(self._poses)} poses, none for frame {index}")
+        pose: F64 = self._poses[index]
+        return pose
+
+
+class References:
+    """The truth that comes with a recording.
+
+    Raises:
+        UsageError: a file or folder is missing, damaged or not of the stated form.
+    """
+
+    def __init__(self, config: ReferenceConfig) -> None:
+        self._config = config
+        self._depth_files = {} if config.depth is None else _by_frame_number(config.depth)
+        self._points = self._visible = None
+        if config.tracks is not None:
+            self._points = load_array(config.tracks, "points", (None, None, 3)).astype(np.float64)
+            self._visible = load_array(config.tracks, "visible", self._points.shape[:2]).astype(np.bool_)
+
+    def at(self, index: int) -> Reference | None:
+        """What is known of one frame of the recording, None when that is nothing.
+
+        Raises:
+            SagsError: the depth picture is damaged or not 16 bit.
+        """
+        depth_file = self._depth_files.get(index)
+        points = visible = None
+        if self._points is not None and self._visible is not None and index < len(self._points):
+            points, visible = self._points[index], self._visible[index]
+        if depth_file is None and points is None:
+            return None
+        depth = None if depth_file is None else self._read_depth(depth_file)
+        return Reference(depth, self._config.depth_kind, points, visible)
+
+    def _read_depth(self, file: Path) -> F32:
+        counts = read_picture(file, cv2.IMREAD_UNCHANGED)
+        if counts.dtype != np.uint16 or counts.ndim != 2:
+            raise SagsError(f"{file} is not a 16-bit grey PNG; reference depth must be one")
+        return counts * np.float32(self._config.depth_unit)
+
+
+def _by_frame_number(folder: Path) -> dict[int, Path]:
+    files = list_pictures(folder)
+    for file in files:
+        if not file.stem.isdecimal():
+            raise UsageError(f"{file}: reference depth files are named by frame number, e.g. 0010.png")
+    return {int(file.stem): file for file in files}
+
+
+def load_array(file: Path, key: str, shape: tuple[int | None, ...]) -> NDArray[np.generic]:
+    """One numeric array of an npz file; `None` in `shape` stands for any length.
+
+    The header is compared with the bytes that are really there before memory is taken.
+
+    Raises:
+        UsageError: the file is missing or damaged, or the array is missing or of another shape or type.
+    """
+    try:
+        with zipfile.ZipFile(file) as archive:
+            member = archive.getinfo(f"{key}.npy")
+            with archive.open(member) as stream:
+                version = np.lib.format.read_magic(stream)
+                read_header = {
+                    (1, 0): np.lib.format.read_array_header_1_0,
+                    (2, 0): np.lib.format.read_array_header_2_0,
+                }[version]
+                found, _, dtype = read_header(stream)
+        fits = len(found) == len(shape) and all(
+            want in (None, got) for want, got in zip(shape, found, strict=True)
+        )
+        if not fits or dtype.kind not in "bfiu":
+            wanted = ", ".join("any" if length is None else str(length) for length in shape)
+            raise UsageError(f"{file}: '{key}' is {dtype} {list(found)}, wanted numbers [{wanted}]")
+        if (
+            member.file_size > _LARGEST
+            or int(np.prod(found, dtype=object)) * dtype.itemsize > member.file_size
+        ):
+            raise UsageError(f"{file}: '{key}' claims an impossible size {list(found)}")
+        with np.load(file, allow_pickle=False) as arrays:
+            array: NDArray[np.generic] = arrays[key]
+            return array
+    except FileNotFoundError:
+        raise UsageError(f"{file} does not exist; check the path") from None
+    except KeyError:
+        raise UsageError(f"{file} holds no array '{key}'") from None
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise UsageError(f"{file} is not a readable npz file: {error}") from None
+
+
+_LARGEST = 2**31  # bytes

@@ -1,0 +1,215 @@
+"""Stereo pairs from video files: one file per eye, or one file that shows both."""
+
+from __future__ import annotations
+
+import logging
+import os
+from pathlib import Path
+
+import cv2
+
+from sags_node.config import Box
+from sags_node.errors import SagsError, UsageError
+from sags_node.sources.painted import unpainted
+from sags_node.sources.pictures import RawPair, size_text
+from sags_node.types import U8
+
+log = logging.getLogger(__name__)
+
+# FFmpeg would print its own lines about broken files; OpenCV reads this when it opens its first video.
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+
+
+class Video:
+    """One video file, decoded forward.
+
+    Raises:
+        UsageError: the file is missing or is not a video.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._open()
+        self.rate = self._capture.get(cv2.CAP_PROP_FPS) or None
+        self.count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        self.width = int(self._capture.get(cv2.CAP_PROP_FRAME_WIDTH))
+        self.height = int(self._capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
+        if self.count <= 0 or not self._capture.grab():
+            raise UsageError(f"video {path} holds no picture")
+        self.seek(0)
+
+    def _open(self) -> None:
+        if not self.path.is_file():
+            raise UsageError(f"video {self.path} does not exist; check the path")
+        self._capture = cv2.VideoCapture(str(self.path), cv2.CAP_FFMPEG)
+        if not self._capture.isOpened():
+            raise UsageError(f"{self.path} cannot be read as a video; is it complete?")
+
+    def seek(self, index: int) -> None:
+        """Make `index` the next frame, by counting where the file cannot seek to it exactly."""
+        self._capture.release()
+        self._open()
+        if index and self._capture.set(cv2.CAP_PROP_POS_FRAMES, index):
+            if round(self._capture.get(cv2.CAP_PROP_POS_FRAMES)) == index:
+                self._next = index
+                return
+            self._capture.release()
+            self._open()
+        self._next = 0
+        while self._next < index and self.skip():
+            pass
+
+    def skip(self) -> bool:
+        """Pass over one frame without converting it; False at the end."""
+        found: bool = self._capture.grab()
+        self._next += found
+        return found
+
+    def read(self) -> U8 | None:
+        """The next frame, BGR [H, W, 3], None at the end."""
+        picture: U8
+        found, picture = self._capture.read()
+        if not found:
+            if self._next < self.count:
+                log.warning("%s ends at frame %d, it announces %d", self.path, self._next, self.count)
+            return None
+        self._next += 1
+        return picture
+
+    def close(self) -> None:
+        self._capture.release()
+
+
+class VideoPairs:
+    """Two videos, paired by frame number. The left one says how long the recording is.
+
+    Raises:
+        UsageError: a file is missing or not a video, or the two differ in size or rate.
+    """
+
+    def __init__(self, left: Path, right: Path) -> None:
+        self._left, self._right = Video(left), Video(right)
+        self.rate, self.count = self._left.rate, self._left.count
+        self.size = self._left.width, self._left.height
+        for what, one, other in (
+            ("px", size_text(*self.size), size_text(self._right.width, self._right.height)),
+            ("frames per second", _rounded(self.rate), _rounded(self._right.rate)),
+        ):
+            if one != other:
+                self.close()
+                raise UsageError(
+                    f"{left} has {one} {what} but {right} has {other}; they are not one stereo pair"
+                )
+        self._next = 0
+
+    def seek(self, index: int) -> None:
+        self._left.seek(index)
+        self._right.seek(index)
+        self._next = index
+
+    def skip(self) -> bool:
+        found = self._left.skip()
+        if found and not self._right.skip():
+            raise self._right_ended()
+        self._next += found
+        return found
+
+    def read(self) -> RawPair | None:
+        """The next pair, None at the end of the left video.
+
+        Raises:
+            SagsError: the right video is shorter than the left one.
+        """
+        left = self._left.read()
+        if left is None:
+            return None
+        right = self._right.read()
+        if right is None:
+            raise self._right_ended()
+        self._next += 1
+        return RawPair(_rgb(left), _rgb(right), None)
+
+    def close(self) -> None:
+        self._left.close()
+        self._right.close()
+
+    def _right_ended(self) -> SagsError:
+        return SagsError(
+            f"{self._right.path} ends at frame {self._next} but {self._left.path} goes on; "
+            f"set source.frames to stop there"
+        )
+
+
+class PanePairs:
+    """One video whose frames show both eyes, each in its own box.
+
+    Raises:
+        UsageError: a box leaves the picture or differs in size from the others.
+    """
+
+    def __init__(self, video: Video, left: Box, right: Box, tools: Box | None = None) -> None:
+        self._video = video
+        self._boxes = {"left": left, "right": right}
+        if tools is not None:
+            self._boxes["tools"] = tools
+        self.rate, self.count = video.rate, video.count
+        self.size = left[2], left[3]
+        try:
+            self._check_boxes()
+        except UsageError:
+            self.close()
+            raise
+
+    def _check_boxes(self) -> None:
+        width, height = self._video.width, self._video.height
+        for name, (x, y, w, h) in self._boxes.items():
+            if min(x, y) < 0 or min(w, h) < 1 or x + w > width or y + h > height:
+                raise UsageError(
+                    f"pane '{name}' {x, y, w, h} (x, y, width, height) leaves the picture: "
+                    f"{self._video.path} is {size_text(width, height)} px"
+                )
+            if (w, h) != self.size:
+                raise UsageError(
+                    f"pane '{name}' is {size_text(w, h)} px but the left pane is {size_text(*self.size)}; "
+                    "all panes must have one size"
+                )
+
+    def seek(self, index: int) -> None:
+        self._video.seek(index)
+
+    def skip(self) -> bool:
+        return self._video.skip()
+
+    def read(self) -> RawPair | None:
+        """The next pair, None at the end."""
+        picture = self._video.read()
+        if picture is None:
+            return None
+        panes = {name: picture[y : y + h, x : x + w] for name, (x, y, w, h) in self._boxes.items()}
+        tissue = unpainted(panes["tools"], panes["left"]) if "tools" in panes else None
+        return RawPair(_rgb(panes["left"]), _rgb(panes["right"]), tissue)
+
+    def close(self) -> None:
+        self._video.close()
+
+
+def side_by_side_boxes(width: int, height: int, order: str, name: str) -> tuple[Box, Box]:
+    """The left and the right eye's half of a picture; `order` is LR or RL.
+
+    Raises:
+        UsageError: the width is odd.
+    """
+    if width % 2:
+        raise UsageError(f"{name} is {width} px wide, which is odd: it cannot hold two eyes side by side")
+    first, second = (0, 0, width // 2, height), (width // 2, 0, width // 2, height)
+    return (first, second) if order == "LR" else (second, first)
+
+
+def _rgb(bgr: U8) -> U8:
+    """A new RGB picture, so that nothing the decoder owns leaves this file."""
+    rgb: U8 = cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
+    return rgb
+
+
+def _rounded(rate: float | None) -> str:
+    return "unknown" if rate is None else f"{rate:.2f}"

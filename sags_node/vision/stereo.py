@@ -1,0 +1,117 @@
+"""Metric depth, and how far to trust it, from a rectified pair."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from sags_node import geometry
+from sags_node.config import StereoConfig
+from sags_node.errors import UsageError
+from sags_node.types import F32, U8, Bool, Camera, RectifiedPair
+from sags_node.vision.matchers import InverseSearch, SemiGlobal
+
+SMALLEST_SIDE = 32  # px of the matching picture: four patches of the inverse search
+LEAST_AGREEMENT = 0.5  # matches below it are wrong more often than right
+AGREEMENT_WINDOW = 9  # px
+NOISE_VARIANCE = 1.0  # grey levels squared: texture below it is camera noise, not agreement
+EDGE_MARGIN = 5 / 640  # of the width: depths smear that far across an instrument's edge
+
+
+class StereoDepth:
+    """Depth of the left rectified picture. Keeps nothing from frame to frame.
+
+    Matching runs at the working size divided by `config.scale`. A match is trusted as far as its neighbourhood
+    agrees with the place in the right picture that it was matched to: the confidence is 0 at a zero-mean
+    normalised cross-correlation (ZNCC) of 0.5 and below, where the depth is unknown, and 1 at a ZNCC of 1.
+
+    Raises:
+        UsageError: the pictures are too small to match, or no disparity fits the depth range.
+    """
+
+    def __init__(self, config: StereoConfig, camera: Camera, baseline: float) -> None:
+        width, height = round(camera.width / config.scale), round(camera.height / config.scale)
+        if min(width, height) < SMALLEST_SIDE:
+            raise UsageError(
+                f"{width}x{height} px are too few to match; lower vision.stereo.scale or raise vision.width "
+                f"and vision.height"
+            )
+        self._size = width, height
+        self._focal = float(camera.K[0, 0]) * width / camera.width
+        self._baseline = baseline
+        self._smallest = self._focal * baseline / config.max_depth
+        self._largest = min(self._focal * baseline / config.min_depth, width - 1.0)
+        if self._smallest >= self._largest:
+            raise UsageError(
+                f"the eyes' pictures do not overlap at vision.stereo.max_depth {config.max_depth} m; raise it "
+                f"or check the calibration's baseline, {baseline * 1e3:.3g} mm"
+            )
+        self._match: SemiGlobal | InverseSearch
+        if config.method == "sgbm":
+            self._match = SemiGlobal(self._smallest, self._largest)
+        else:
+            self._match = InverseSearch(self._smallest, self._largest, self._size)
+        self._columns, self._rows = np.meshgrid(
+            np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)
+        )
+        margin = 2 * round(EDGE_MARGIN * camera.width) + 1
+        self._margin = np.ones((margin, margin), np.uint8)
+
+    def __call__(self, pair: RectifiedPair, tissue: Bool) -> tuple[F32, F32]:
+        """Depth [H, W] (m, 0 unknown) and confidence [H, W] (0..1, 0 where the depth is unknown).
+
+        Depth is unknown outside `tissue` [H, W] and within a few px of its edge.
+        """
+        left, right = self._gray(pair.left), self._gray(pair.right)
+        disparity, row_error, known = self._match(left, right)
+        agreement = self._agreement(left, right, disparity, row_error)
+        known &= (disparity >= self._smallest) & (disparity <= self._largest)
+        known &= (disparity <= self._columns) & (agreement > LEAST_AGREEMENT)
+        confidence = np.where(known, (agreement - LEAST_AGREEMENT) / (1 - LEAST_AGREEMENT), np.float32(0))
+
+        depth, confidence = self._enlarge(disparity, known, confidence, tissue.shape[1::-1])
+        inner = cv2.erode(tissue.view(np.uint8), self._margin)
+        return depth * inner, confidence * inner
+
+    def _gray(self, image: U8) -> U8:
+        gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        shrunk: U8 = cv2.resize(gray, self._size, interpolation=cv2.INTER_AREA)
+        return shrunk
+
+    def _agreement(self, left: U8, right: U8, disparity: F32, row_error: F32) -> F32:
+        """ZNCC [h, w] of each neighbourhood with the one it was matched to."""
+        matched = cv2.remap(
+            right,
+            self._columns - disparity,
+            self._rows + row_error,
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_REPLICATE,
+        )
+        a, b = left.astype(np.float32), matched.astype(np.float32)
+        mean_a, mean_b = _mean(a), _mean(b)
+        covariance = _mean(a * b) - mean_a * mean_b
+        variance_a = _mean(a * a) - mean_a * mean_a
+        variance_b = _mean(b * b) - mean_b * mean_b
+        noise = np.float32(NOISE_VARIANCE)
+        agreement: F32 = covariance / np.sqrt((variance_a + noise) * (variance_b + noise))
+        return agreement
+
+    def _enlarge(
+        self, disparity: F32, known: Bool, confidence: F32, size: tuple[int, int]
+    ) -> tuple[F32, F32]:
+        """Depth and confidence at the working size.
+
+        Disparity is what is linear on a plane, so it is interpolated, and only between known neighbours.
+        """
+        weight = known.astype(np.float32)
+        total = disparity * weight
+        if size != self._size:
+            total, weight, confidence = (cv2.resize(array, size) for array in (total, weight, confidence))
+        covered = weight > 0.5
+        total = np.divide(total, weight, out=np.zeros_like(total), where=covered)
+        return geometry.disparity_to_depth(total, self._focal, self._baseline), confidence * covered
+
+
+def _mean(picture: F32) -> F32:
+    mean: F32 = cv2.blur(picture, (AGREEMENT_WINDOW, AGREEMENT_WINDOW))
+    return mean

@@ -1,0 +1,48 @@
+"""Compile (once per machine) and load every kernel of the frame path, before the first frame needs it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sags_node.config import LaunchConfig, MappingConfig, VisionConfig
+from sags_node.mapping.budget import StepBudget
+from sags_node.pipeline import Pipeline
+from sags_node.types import Eye, StereoFrame, StereoRig
+
+_WIDTH, _HEIGHT, _FOCAL, _BASELINE, _DISPARITY = 160, 128, 150.0, 0.0043, 8
+
+
+def warm_up(config: LaunchConfig) -> None:
+    """Run a few small made-up frames through a pipeline of the same kind.
+
+    Kernels do not depend on sizes, so this takes well under a second once they are in Numba's disk cache,
+    and about half a minute the first time.
+    """
+    small = config.model_copy(
+        update={
+            "vision": VisionConfig(stereo=config.vision.stereo, tissue=config.vision.tissue),
+            "mapping": MappingConfig(max_gaussians=1000),
+        }
+    )
+    pipeline = Pipeline(small, _rig())
+    budget = StepBudget(1)
+    texture = np.random.default_rng(0).integers(40, 220, (_HEIGHT, _WIDTH + 64, 3), np.uint8)
+    for i in range(3):
+        left = np.ascontiguousarray(texture[:, i : i + _WIDTH])
+        right = np.ascontiguousarray(texture[:, i + _DISPARITY : i + _DISPARITY + _WIDTH])
+        tissue = np.ones((_HEIGHT, _WIDTH), bool)
+        stamp = i * 33_000_000
+        pipeline.process(StereoFrame(i, stamp, stamp, left, right, tissue=tissue), budget)
+
+
+def _rig() -> StereoRig:
+    K = np.array([[_FOCAL, 0, _WIDTH / 2], [0, _FOCAL, _HEIGHT / 2], [0, 0, 1]])
+    P = np.column_stack([K, np.zeros(3)])
+    P_right = P.copy()
+    P_right[0, 3] = -_FOCAL * _BASELINE
+    none = np.zeros(5)
+    return StereoRig(
+        "warm-up",
+        Eye(_WIDTH, _HEIGHT, K, none, np.eye(3), P),
+        Eye(_WIDTH, _HEIGHT, K, none, np.eye(3), P_right),
+    )

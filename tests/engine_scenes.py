@@ -1,0 +1,62 @@
+"""Small scenes for the engine's tests."""
+
+import math
+
+import numpy as np
+
+from sags_node.types import F64, Camera, Gaussians
+
+INPUTS = ("means", "quats", "scales", "opacities", "colors")
+
+
+def camera(width: int = 48, height: int = 40, focal: float = 60.0, moved: bool = False) -> Camera:
+    """Looks along z from the origin, or from a turned and shifted place; the principal point is off-centre."""
+    K = np.array([[focal, 0, width / 2 - 1.3], [0, focal * 1.03, height / 2 + 0.7], [0, 0, 1]])
+    T = np.eye(4)
+    if moved:
+        a, b = 0.15, -0.1
+        turn = np.array([[math.cos(a), 0, math.sin(a)], [0, 1, 0], [-math.sin(a), 0, math.cos(a)]])
+        tilt = np.array([[1, 0, 0], [0, math.cos(b), -math.sin(b)], [0, math.sin(b), math.cos(b)]])
+        T[:3, :3] = turn @ tilt
+        T[:3, 3] = [-0.004, 0.002, 0.003]
+    return Camera(width, height, K, T)
+
+
+def random_gaussians(seed: int, count: int, view: Camera, spread: float = 1.0) -> Gaussians:
+    """Gaussians of all shapes and turns in front of `view`, 5 to 9 cm away, some beyond its border."""
+    rng = np.random.default_rng(seed)
+    depth = rng.uniform(0.05, 0.09, count)
+    pixels = rng.uniform([-4, -4], [view.width + 4, view.height + 4], (count, 2))
+    local = np.stack(
+        [
+            (pixels[:, 0] - view.K[0, 2]) / view.K[0, 0] * depth,
+            (pixels[:, 1] - view.K[1, 2]) / view.K[1, 1] * depth,
+            depth,
+        ],
+        1,
+    )
+    means = local @ view.T_world_cam[:3, :3].T + view.T_world_cam[:3, 3]
+    spacing = 0.07 / view.K[0, 0] * math.sqrt(view.width * view.height / count)
+    return Gaussians(
+        means=means.astype(np.float32),
+        quats=rng.normal(size=(count, 4)).astype(np.float32),
+        scales=(spread * spacing * rng.uniform(0.3, 1.2, (count, 3))).astype(np.float32),
+        opacities=rng.uniform(0.3, 0.97, count).astype(np.float32),
+        colors=rng.uniform(0, 1, (count, 3)).astype(np.float32),
+        ids=np.arange(count),
+    )
+
+
+def one_gaussian(mean: F64, scale: float, opacity: float = 0.9) -> Gaussians:
+    return Gaussians(
+        means=np.asarray(mean, np.float32).reshape(1, 3),
+        quats=np.array([[1, 0, 0, 0]], np.float32),
+        scales=np.full((1, 3), scale, np.float32),
+        opacities=np.full(1, opacity, np.float32),
+        colors=np.array([[0.8, 0.5, 0.2]], np.float32),
+        ids=np.zeros(1, np.int64),
+    )
+
+
+def relative_error(found: np.ndarray, true: np.ndarray) -> float:
+    return float(np.linalg.norm(found - true) / np.linalg.norm(true))

@@ -1,0 +1,170 @@
+"""The mapper's parts against known truth, and the mapper on pictures it must reproduce."""
+
+import numpy as np
+import pytest
+
+from sags_node.mapping import densify, initialise
+from sags_node.mapping.budget import StepBudget, TimeBudget
+from sags_node.mapping.motion import scene_flow
+from sags_node.model.gaussians import GaussianModel
+from sags_node.types import Camera, Observation, RenderedView
+
+WIDTH, HEIGHT, FOCAL, DEPTH = 64, 48, 60.0, 0.08
+
+
+def camera(T: np.ndarray | None = None) -> Camera:
+    K = np.array([[FOCAL, 0, (WIDTH - 1) / 2], [0, FOCAL, (HEIGHT - 1) / 2], [0, 0, 1]])
+    return Camera(WIDTH, HEIGHT, K, np.eye(4) if T is None else T)
+
+
+def observation(depth: float = DEPTH, T: np.ndarray | None = None, seed: int = 0) -> Observation:
+    rng = np.random.default_rng(seed)
+    image = rng.uniform(0.2, 0.8, (HEIGHT, WIDTH, 3)).astype(np.float32)
+    shape = (HEIGHT, WIDTH)
+    return Observation(
+        1, 33_000_000, camera(T), image, np.zeros(shape, np.uint8), np.ones(shape, bool),
+        np.full(shape, depth, np.float32), np.ones(shape, np.float32),
+    )  # fmt: skip
+
+
+def view(depth: float = DEPTH) -> RenderedView:
+    shape = (HEIGHT, WIDTH)
+    return RenderedView(
+        0, 0, camera(), np.zeros((*shape, 3), np.float32), np.full(shape, depth, np.float32),
+        np.ones(shape, np.float32),
+    )  # fmt: skip
+
+
+def grid_points(depth: float = DEPTH) -> np.ndarray:
+    u, v = np.meshgrid(np.arange(8, 56, 4.0), np.arange(8, 40, 4.0))
+    x = (u.ravel() - (WIDTH - 1) / 2) / FOCAL * depth
+    y = (v.ravel() - (HEIGHT - 1) / 2) / FOCAL * depth
+    return np.stack([x, y, np.full(x.size, depth)], 1).astype(np.float32)
+
+
+def test_scene_flow_of_a_sideways_shift() -> None:
+    means = grid_points()
+    flow = np.zeros((HEIGHT, WIDTH, 2), np.float32)
+    flow[..., 0], flow[..., 1] = 3.0, -2.0
+    moved, seen = scene_flow(means, view(), np.ones((HEIGHT, WIDTH), bool), flow, observation())
+    assert seen.all()
+    assert np.allclose(moved, [3 * DEPTH / FOCAL, -2 * DEPTH / FOCAL, 0], atol=1e-6)
+
+
+def test_scene_flow_is_pulled_to_the_measured_depth_but_not_across_a_gap() -> None:
+    means = grid_points()
+    tissue = np.ones((HEIGHT, WIDTH), bool)
+    still = np.zeros((HEIGHT, WIDTH, 2), np.float32)
+    near, _ = scene_flow(means, view(), tissue, still, observation(depth=0.082))
+    assert np.all(near[:, 2] > 0.4e-3) and np.all(near[:, 2] < 1.6e-3)
+    other_surface, _ = scene_flow(means, view(), tissue, still, observation(depth=0.12))
+    assert np.allclose(other_surface, 0, atol=1e-7)
+
+
+def test_a_moving_camera_alone_moves_no_tissue() -> None:
+    """The flow that a camera motion causes must give zero displacement in the world."""
+    means = grid_points()
+    T = np.eye(4)
+    T[:3, 3] = [0.002, -0.001, 0.0]
+    flow = np.zeros((HEIGHT, WIDTH, 2), np.float32)
+    flow[..., 0], flow[..., 1] = -0.002 * FOCAL / DEPTH, 0.001 * FOCAL / DEPTH
+    moved, seen = scene_flow(means, view(), np.ones((HEIGHT, WIDTH), bool), flow, observation(T=T))
+    assert seen.mean() > 0.9
+    assert np.abs(moved[seen > 0]).max() < 1e-6
+
+
+def test_hidden_and_covered_gaussians_are_not_seen() -> None:
+    behind = grid_points(depth=0.095)
+    still = np.zeros((HEIGHT, WIDTH, 2), np.float32)
+    tissue = np.ones((HEIGHT, WIDTH), bool)
+    _, seen = scene_flow(behind, view(), tissue, still, observation())
+    assert not seen.any()
+    _, seen = scene_flow(grid_points(), view(), ~tissue, still, observation())
+    assert not seen.any()
+
+
+def test_candidates_fill_holes_first() -> None:
+    frame = observation()
+    planes = np.zeros((5, HEIGHT, WIDTH), np.float32)
+    planes[:3] = np.moveaxis(frame.image, -1, 0)
+    planes[3], planes[4] = DEPTH, 1.0
+    assert len(densify.candidates(planes, frame, 0)) == 0
+    planes[:, 10:30, 20:40] = 0
+    pixels = densify.candidates(planes, frame, 0)
+    assert len(pixels) == 25
+    assert pixels.min(0).tolist() == [20, 12] and pixels.max(0).tolist() == [36, 28]
+
+
+def test_candidates_need_residual_and_depth_to_agree_before_a_new_surface_is_believed() -> None:
+    frame = observation()
+    planes = np.zeros((5, HEIGHT, WIDTH), np.float32)
+    planes[:3] = np.moveaxis(frame.image, -1, 0)
+    planes[3], planes[4] = 1.2 * DEPTH, 1.0  # the model is far behind, but the picture agrees
+    assert len(densify.candidates(planes, frame, 0)) == 0
+    planes[:3] = 1 - planes[:3]
+    planes[0] += 0.3
+    assert len(densify.candidates(planes, frame, 0)) > 50
+
+
+def test_free_space_is_cleared_only_after_several_frames() -> None:
+    model = GaussianModel(200)
+    floating = grid_points(depth=0.06)
+    model.append(
+        floating, np.full((len(floating), 3), 2e-4, np.float32), np.zeros((len(floating), 3), np.float32), 0.9
+    )
+    frame = observation()
+    for _ in range(densify.FRONT_FRAMES - 1):
+        densify.free_space_violations(model, frame)
+        assert not densify.doomed(model, frame.camera).any()
+    densify.free_space_violations(model, frame)
+    assert densify.doomed(model, frame.camera).all()
+
+
+def test_filled_depth_keeps_what_is_known_and_fills_the_rest() -> None:
+    frame = observation()
+    frame.depth[10:20, 10:30] = 0
+    frame.depth[:, 40:] = 0.1
+    filled = initialise.filled_depth(frame)
+    known = frame.depth > 0
+    assert np.array_equal(filled[known], frame.depth[known])
+    assert np.all((filled >= 0.0799) & (filled <= 0.1001))
+
+
+def test_first_pixels_respect_the_limit_and_the_mask() -> None:
+    frame = observation()
+    frame.tissue[:, :32] = False
+    pixels, spacing = initialise.first_pixels(frame, frame.depth, 100)
+    assert 60 <= len(pixels) <= 130
+    assert pixels[:, 0].min() >= 32
+    assert spacing == pytest.approx(np.sqrt(32 * 48 / 100))
+
+
+def test_step_budget_counts() -> None:
+    budget = StepBudget(3)
+    for _ in range(2):
+        budget.start()
+        assert [budget.more() for _ in range(5)] == [True, True, True, False, False]
+
+
+def test_time_budget_takes_at_least_one_step_and_reserves_time_for_drawing() -> None:
+    now = 0.0
+    budget = TimeBudget(0.033, clock=lambda: now)
+
+    def frame(before: float, step: float, after: float) -> tuple[int, float]:
+        nonlocal now
+        start = now
+        budget.start()
+        now += before
+        steps = 0
+        while budget.more():
+            now += step
+            steps += 1
+        now += after
+        budget.finish()
+        return steps, now - start
+
+    for _ in range(30):
+        steps, spent = frame(before=0.010, step=0.005, after=0.006)
+    assert steps == 3 and spent <= 0.033
+    steps, _ = frame(before=0.050, step=0.005, after=0.006)
+    assert steps == 1

@@ -1,0 +1,338 @@
+"""Figures of merit against closed forms and cases made by hand."""
+
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from sags_node.errors import UsageError
+from sags_node.evaluation import metrics
+from sags_node.evaluation.lpips import Lpips
+from sags_node.evaluation.tracking import PointTracks
+from sags_node.evaluation.views import VELOCITY_SHARE, extrapolated, right_eye_mask
+from sags_node.types import Camera, Gaussians, Snapshot
+
+DATA = Path(os.environ.get("SAGS_DATA", Path(__file__).parent.parent.parent / "shared" / "data"))
+WEIGHTS = DATA / "lpips_squeeze" / "lpips_squeeze_v0.1.npz"
+
+
+def picture(seed: int = 0, height: int = 96, width: int = 128) -> np.ndarray:
+    """A smooth random texture, float32 RGB 0..1."""
+    noise = np.random.default_rng(seed).random((height, width, 3), np.float32)
+    smooth = cv2.GaussianBlur(noise, (0, 0), 2.0)
+    return (smooth - smooth.min()) / (smooth.max() - smooth.min())
+
+
+def half_mask(height: int = 96, width: int = 128) -> np.ndarray:
+    mask = np.zeros((height, width), bool)
+    mask[:, : width // 2] = True
+    return mask
+
+
+# ---- pictures --------------------------------------------------------------------------------------------
+
+
+def test_psnr_of_known_noise() -> None:
+    truth = picture()
+    sign = np.where(np.random.default_rng(1).random(truth.shape) < 0.5, -1, 1).astype(np.float32)
+    noisy = truth + 0.05 * sign  # squared error exactly 0.0025 everywhere
+    assert metrics.psnr(noisy, truth, half_mask()) == pytest.approx(-10 * np.log10(0.0025), abs=1e-4)
+    gaussian = truth + np.random.default_rng(2).normal(0, 0.02, truth.shape).astype(np.float32)
+    everywhere = np.ones(truth.shape[:2], bool)
+    assert metrics.psnr(gaussian, truth, everywhere) == pytest.approx(-20 * np.log10(0.02), abs=0.1)
+
+
+def test_psnr_sees_tissue_only_and_an_inverted_mask_shows() -> None:
+    truth = picture()
+    spoilt = truth.copy()
+    tissue = half_mask()
+    spoilt[~tissue] += 0.5
+    assert metrics.psnr(spoilt, truth, tissue) == metrics.BEST_PSNR
+    assert metrics.psnr(spoilt, truth, ~tissue) == pytest.approx(-20 * np.log10(0.5), abs=1e-3)
+
+
+def test_paper_psnr_counts_masked_pixels_as_perfect() -> None:
+    truth = picture()
+    wrong = truth + np.float32(0.1)
+    tissue = half_mask()
+    expected = -10 * np.log10(0.01 * 0.5)  # the error of half of the pixels, averaged over all of them
+    assert metrics.paper_psnr(wrong, truth, tissue) == pytest.approx(expected, abs=1e-3)
+    multiplied = ((wrong - truth) * tissue[..., None]).astype(np.float64)
+    assert metrics.paper_psnr(wrong, truth, tissue) == pytest.approx(-10 * np.log10(np.mean(multiplied**2)))
+
+
+def test_nothing_is_invented_over_an_empty_mask() -> None:
+    truth = picture()
+    empty = np.zeros(truth.shape[:2], bool)
+    for figure in (metrics.psnr, metrics.paper_psnr, metrics.ssim):
+        assert np.isnan(figure(truth, truth, empty))
+
+
+def direct_ssim_map(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Wang et al. 2004, equation 13, one window at a time, in float64."""
+    ramp = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
+    window = np.outer(ramp, ramp) / ramp.sum() ** 2
+    c1, c2 = (0.01 * 255) ** 2, (0.03 * 255) ** 2
+    a, b = a.astype(np.float64) * 255, b.astype(np.float64) * 255
+    height, width, channels = a.shape
+    out = np.full(a.shape, np.nan)
+    for y in range(5, height - 5):
+        for x in range(5, width - 5):
+            for k in range(channels):
+                p, q = a[y - 5 : y + 6, x - 5 : x + 6, k], b[y - 5 : y + 6, x - 5 : x + 6, k]
+                mp, mq = (window * p).sum(), (window * q).sum()
+                vp, vq = (window * (p - mp) ** 2).sum(), (window * (q - mq) ** 2).sum()
+                cov = (window * (p - mp) * (q - mq)).sum()
+                out[y, x, k] = (2 * mp * mq + c1) * (2 * cov + c2) / ((mp**2 + mq**2 + c1) * (vp + vq + c2))
+    return out
+
+
+def test_ssim_is_the_published_formula() -> None:
+    truth = picture(0, 32, 40)
+    other = np.clip(truth + 0.1 * picture(5, 32, 40) - 0.05, 0, 1)
+    inner = np.zeros(truth.shape[:2], bool)
+    inner[5:-5, 5:-5] = True
+    # windows of inner pixels see the frame of the picture too: make that frame equal in both
+    framed = np.where(inner[..., None], other, truth)
+    expected = direct_ssim_map(framed, truth)[inner].mean()
+    assert expected < 0.99
+    assert metrics.ssim(other, truth, inner) == pytest.approx(expected, abs=2e-5)
+
+
+def test_ssim_ignores_what_is_no_tissue() -> None:
+    truth, tissue = picture(), half_mask()
+    spoilt = truth.copy()
+    spoilt[~tissue] = 0
+    assert metrics.ssim(spoilt, truth, tissue) == pytest.approx(1, abs=1e-6)
+    assert metrics.ssim(spoilt, truth, ~tissue) < 0.5
+
+
+def test_gain_and_offset_are_recovered_exactly() -> None:
+    dark, tissue = picture(), half_mask()
+    truth = dark * np.array([1.3, 0.7, 1.0], np.float32) + np.array([0.05, -0.02, 0.1], np.float32)
+    truth[~tissue] = 0  # must not take part in the fit
+    fitted = metrics.fit_gain_offset(dark, truth, tissue)
+    np.testing.assert_allclose(fitted[tissue], truth[tissue], atol=2e-6)
+    flat = np.full_like(dark, 0.3)
+    np.testing.assert_allclose(
+        metrics.fit_gain_offset(flat, flat + np.float32(0.1), tissue)[tissue], 0.4, atol=1e-6
+    )
+
+
+# ---- depth and timings -----------------------------------------------------------------------------------
+
+
+def test_depth_errors_by_hand() -> None:
+    reference = np.full((10, 10), 0.1, np.float32)
+    reference[0] = 0  # unknown
+    tissue = np.ones((10, 10), bool)
+    tissue[1] = False
+    depth = reference + np.float32(0.001)
+    depth[2] = 0  # nothing known: 10 of 80 pixels
+    depth[3] = 0.104
+    depth[1] = 5.0  # an instrument: does not count
+    errors = metrics.depth_errors(depth, reference, tissue)
+    assert errors.coverage == pytest.approx(70 / 80)
+    assert errors.median_mm == pytest.approx(1.0, abs=1e-3)
+    assert errors.p90_mm == pytest.approx(4.0, abs=1e-3)
+    assert errors.rmse_mm == pytest.approx(np.sqrt((60 * 1 + 10 * 16) / 70), abs=1e-3)
+
+
+def test_depth_without_anything_to_compare() -> None:
+    known, unknown = np.full((4, 4), 0.1, np.float32), np.zeros((4, 4), np.float32)
+    tissue = np.ones((4, 4), bool)
+    nothing_drawn = metrics.depth_errors(unknown, known, tissue)
+    assert nothing_drawn.coverage == 0 and np.isnan(nothing_drawn.median_mm)
+    assert np.isnan(metrics.depth_errors(known, unknown, tissue).coverage)
+
+
+def test_nearest_resampling_keeps_pixel_centres() -> None:
+    ramp = np.tile(np.arange(12, dtype=np.float32), (9, 1))
+    np.testing.assert_array_equal(metrics.resample_nearest(ramp, 12, 9), ramp)
+    third = metrics.resample_nearest(ramp, 4, 3)  # centres 0, 1, 2, 3 lie at 1, 4, 7, 10
+    np.testing.assert_array_equal(third[0], [1, 4, 7, 10])
+    triple = metrics.resample_nearest(third, 12, 9)
+    np.testing.assert_array_equal(triple[0], np.repeat([1, 4, 7, 10], 3))
+
+
+def test_percentiles() -> None:
+    assert metrics.percentiles(list(range(101))) == {"p50": 50, "p90": 90, "p99": 99, "max": 100}
+    assert metrics.percentiles([]) is None
+
+
+# ---- LPIPS -----------------------------------------------------------------------------------------------
+
+needs_weights = pytest.mark.skipif(not WEIGHTS.exists(), reason=f"LPIPS weights are not at {WEIGHTS}")
+
+
+@needs_weights
+def test_lpips_grows_with_blur_and_is_symmetric() -> None:
+    lpips = Lpips(WEIGHTS)
+    truth = np.random.default_rng(0).random((96, 128, 3), np.float32)
+    everywhere = np.ones(truth.shape[:2], bool)
+    assert lpips(truth, truth, everywhere) == 0
+    distances = [lpips(cv2.GaussianBlur(truth, (0, 0), s), truth, everywhere) for s in (0.4, 0.8, 1.6)]
+    assert 0 < distances[0] < distances[1] < distances[2]
+    other = picture(3)
+    assert lpips(truth, other, everywhere) == pytest.approx(lpips(other, truth, everywhere), rel=1e-5)
+    spoilt = truth.copy()
+    spoilt[:, 64:] = 0
+    assert lpips(spoilt, truth, half_mask()) == 0
+    assert lpips(spoilt, truth, everywhere) > 0.1
+    assert np.isnan(lpips(truth, truth, np.zeros_like(everywhere)))
+
+
+def test_lpips_names_a_wrong_file(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"no\.npz"):
+        Lpips(tmp_path / "no.npz")
+    np.savez(tmp_path / "other.npz", weights=np.zeros(3))
+    with pytest.raises(UsageError, match=r"lacks net\.0\.weight"):
+        Lpips(tmp_path / "other.npz")
+    np.savez(tmp_path / "pickled.npz", weights=np.array([{}], dtype=object))
+    with pytest.raises(UsageError, match=r"pickled\.npz"):
+        Lpips(tmp_path / "pickled.npz")
+
+
+# ---- views of other moments and of the other eye -----------------------------------------------------------
+
+CAMERA = Camera(128, 96, np.array([[200.0, 0, 63.5], [0, 200.0, 47.5], [0, 0, 1]]), np.eye(4))
+
+
+def cloud(count: int = 4000, seed: int = 0) -> Gaussians:
+    """A slab of small Gaussians 0.1 m before the camera."""
+    rng = np.random.default_rng(seed)
+    means = rng.uniform([-0.03, -0.022, 0.099], [0.03, 0.022, 0.101], (count, 3)).astype(np.float32)
+    return Gaussians(
+        means=means,
+        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
+        scales=np.full((count, 3), 4e-4, np.float32),
+        opacities=np.full(count, 0.9, np.float32),
+        colors=rng.random((count, 3), np.float32),
+        ids=np.arange(100, 100 + count),
+    )
+
+
+def moved(gaussians: Gaussians, by: np.ndarray) -> Gaussians:
+    return Gaussians(
+        gaussians.means + by.astype(np.float32),
+        gaussians.quats,
+        gaussians.scales,
+        gaussians.opacities,
+        gaussians.colors,
+        gaussians.ids,
+    )
+
+
+def test_constant_velocity_is_predicted_by_its_stated_share() -> None:
+    velocity = np.array([0.02, -0.01, 0.03], np.float32)
+    start = cloud(50)
+    snapshot = Snapshot(0, 0, 0, start, np.tile(velocity, (50, 1)), CAMERA, 0.0)
+    seconds = 1 / 30
+    predicted = extrapolated(snapshot, seconds)
+    np.testing.assert_allclose(predicted.means, start.means + 0.8 * velocity * seconds, atol=1e-7)
+    assert VELOCITY_SHARE == 0.8
+    np.testing.assert_array_equal(predicted.ids, start.ids)
+    np.testing.assert_array_equal(snapshot.gaussians.means, cloud(50).means)  # the snapshot stays as it was
+
+
+def test_right_eye_mask_never_lets_an_instrument_through() -> None:
+    rng = np.random.default_rng(4)
+    focal_px, baseline = 200.0, 0.004
+    for _ in range(20):
+        depth = cv2.GaussianBlur(rng.uniform(0.04, 0.2, (96, 128)).astype(np.float32), (0, 0), 6)
+        tissue = np.ones((96, 128), bool)
+        x, y = rng.integers(0, 90), rng.integers(0, 70)
+        tissue[y : y + 26, x : x + 30] = False
+        mask = right_eye_mask(tissue, depth, focal_px, baseline)
+        known = depth[tissue]
+        disparities = np.unique(np.round(focal_px * baseline / known[::7], 1))
+        low, high = np.percentile(disparities, [1, 99])
+        rows, columns = np.nonzero(mask)
+        assert len(rows) > 0
+        for disparity in disparities[(disparities >= low) & (disparities <= high)]:
+            left = columns + disparity
+            assert (left <= 127).all()
+            assert tissue[rows, np.floor(left).astype(int)].all()
+            assert tissue[rows, np.ceil(left).astype(int)].all()
+
+
+def test_right_eye_mask_of_a_plane_is_the_shifted_tissue() -> None:
+    depth = np.full((8, 128), 0.1, np.float32)
+    tissue = np.ones((8, 128), bool)
+    tissue[:, 60:70] = False
+    mask = right_eye_mask(tissue, depth, 2500.0, 0.00042)  # disparity 10.5 px, widened to 9..12
+    expected = np.ones(128, bool)
+    expected[60 - 12 : 70 - 9] = False
+    expected[128 - 12 :] = False
+    np.testing.assert_array_equal(mask, np.tile(expected, (8, 1)))
+    assert not right_eye_mask(tissue, np.zeros_like(depth), 2500.0, 0.00042).any()
+
+
+# ---- tracking --------------------------------------------------------------------------------------------
+
+
+def surface_points() -> np.ndarray:
+    return np.random.default_rng(9).uniform([-0.02, -0.015, 0.0995], [0.02, 0.015, 0.1005], (40, 3))
+
+
+def test_a_cloud_that_moves_with_the_tissue_has_no_track_error() -> None:
+    start, points = cloud(), surface_points()
+    visible = np.ones(40, bool)
+    tracks = PointTracks(40)
+    first = tracks.update(start, points, visible, CAMERA)
+    assert len(first.errors_mm) == 0 and first.lost == 0  # binding says nothing of following
+    step = np.array([0.0004, -0.0002, 0.0003])
+    for frame in range(1, 6):
+        errors = tracks.update(moved(start, step * frame), points + step * frame, visible, CAMERA)
+        assert errors.lost == 0 and len(errors.errors_mm) == 40
+        assert errors.errors_mm.max() < 1e-4  # float32 means
+        assert errors.errors_px.max() < 1e-3
+
+
+def test_a_frozen_cloud_is_wrong_by_the_whole_motion() -> None:
+    start, points = cloud(), surface_points()
+    visible = np.ones(40, bool)
+    tracks = PointTracks(40)
+    tracks.update(start, points, visible, CAMERA)
+    errors = tracks.update(start, points + np.array([0.003, 0, 0]), visible, CAMERA)
+    np.testing.assert_allclose(errors.errors_mm, 3.0, atol=1e-6)
+    np.testing.assert_allclose(errors.errors_px, 200 * 0.003 / points[:, 2], rtol=1e-6)
+
+
+def test_points_survive_as_long_as_one_neighbour_does() -> None:
+    start, points = cloud(), surface_points()
+    visible = np.ones(40, bool)
+    tracks = PointTracks(40)
+    tracks.update(start, points, visible, CAMERA)
+    rng = np.random.default_rng(1)
+    order = rng.permutation(len(start))[:3000]  # rows shuffled, a quarter pruned: ids must do the work
+
+    def rows(cloud_now: Gaussians, keep: np.ndarray) -> Gaussians:
+        return Gaussians(
+            *(
+                getattr(cloud_now, name)[keep]
+                for name in ("means", "quats", "scales", "opacities", "colors", "ids")
+            )
+        )
+
+    step = np.array([0.001, 0, 0])
+    errors = tracks.update(rows(moved(start, step), order), points + step, visible, CAMERA)
+    assert errors.lost == 0 and errors.errors_mm.max() < 1e-4
+    nothing_left = tracks.update(rows(start, np.zeros(0, int)), points, visible, CAMERA)
+    assert nothing_left.lost == 40 and len(nothing_left.errors_mm) == 0
+
+
+def test_a_point_is_bound_when_it_is_first_seen_near_the_model() -> None:
+    start, points = cloud(), surface_points()
+    points[0] = [0, 0, 0.5]  # far from every Gaussian
+    visible = np.ones(40, bool)
+    visible[1] = False
+    tracks = PointTracks(40)
+    assert tracks.update(start, points, visible, CAMERA).lost == 1
+    visible[1] = True
+    later = tracks.update(start, points, visible, CAMERA)
+    assert later.lost == 1  # still the far one; the newly seen one is bound, not lost
+    assert len(later.errors_mm) == 38
+    assert len(tracks.update(start, points, visible, CAMERA).errors_mm) == 39

@@ -1,0 +1,112 @@
+"""Rows that stay together, nodes that carry hidden tissue, files that other viewers read."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sags_node.errors import SagsError
+from sags_node.model.deformation import NodeDeformation
+from sags_node.model.gaussians import GaussianModel
+from sags_node.model.ply import write_ply
+
+
+def patch(count: int = 2000, seed: int = 0) -> np.ndarray:
+    """Points on a gently curved sheet, metres."""
+    rng = np.random.default_rng(seed)
+    xy = rng.uniform(-0.03, 0.03, (count, 2))
+    z = 0.08 + 0.01 * np.sin(xy[:, 0] * 60)
+    return np.column_stack([xy, z]).astype(np.float32)
+
+
+def filled_model(means: np.ndarray) -> GaussianModel:
+    model = GaussianModel(len(means) + 10)
+    scales = np.full((len(means), 3), 2e-4, np.float32)
+    model.append(means, scales, np.full((len(means), 3), 0.5, np.float32), 0.9)
+    return model
+
+
+def test_removal_keeps_every_row_with_its_identity() -> None:
+    model = filled_model(patch(100))
+    model.colors[:, 0] = np.arange(100)
+    before = {int(i): m.copy() for i, m in zip(model.ids, model.means, strict=True)}
+    dead = np.zeros(100, bool)
+    dead[[0, 3, 50, 98, 99]] = True
+    assert model.remove(dead) == 5
+    assert model.count == 95
+    assert set(model.ids) == set(range(100)) - {0, 3, 50, 98, 99}
+    for i, mean, color in zip(model.ids, model.means, model.colors, strict=True):
+        assert np.array_equal(mean, before[int(i)])
+        assert color[0] == i
+
+
+def test_capacity_is_never_exceeded_and_ids_are_never_reused() -> None:
+    model = filled_model(patch(50))
+    rows = model.append(patch(50), np.full((50, 3), 1e-4, np.float32), np.zeros((50, 3), np.float32), 0.5)
+    assert rows.stop - rows.start == 10
+    assert model.free == 0
+    model.remove(np.ones(60, bool))
+    model.append(patch(1), np.full((1, 3), 1e-4, np.float32), np.zeros((1, 3), np.float32), 0.5)
+    assert model.ids[0] == 60
+
+
+def test_frozen_copies_do_not_change_with_the_model() -> None:
+    model = filled_model(patch(20))
+    frozen = model.frozen()
+    model.means[:] += 1
+    assert not np.any(frozen.means == model.means)
+
+
+def test_a_translation_seen_by_some_moves_all() -> None:
+    """Half of the sheet is hidden; it must follow its neighbours."""
+    model = filled_model(patch())
+    deformation = NodeDeformation(model.means, 200)
+    deformation.attach(model, slice(0, model.count))
+    start = model.means.copy()
+    move = np.array([1e-3, -5e-4, 2e-3], np.float32)
+    seen = (start[:, 0] < 0.012).astype(np.float32)
+    deformation.follow(model, np.tile(move, (model.count, 1)), seen)
+    hidden_near = (start[:, 0] > 0.012) & (start[:, 0] < 0.018)
+    assert np.allclose(model.means[seen > 0] - start[seen > 0], move, atol=1e-6)
+    assert np.abs(model.means[hidden_near] - start[hidden_near] - move).max() < 1e-4
+
+
+def test_nodes_average_noise_away() -> None:
+    model = filled_model(patch())
+    deformation = NodeDeformation(model.means, 100)
+    deformation.attach(model, slice(0, model.count))
+    start = model.means.copy()
+    noise = np.random.default_rng(1).normal(0, 1e-3, start.shape).astype(np.float32)
+    deformation.follow(model, noise, np.ones(model.count, np.float32))
+    assert np.std(model.means - start) < 0.35 * 1e-3
+
+
+def test_new_tissue_far_away_gets_nodes_of_its_own() -> None:
+    model = filled_model(patch())
+    deformation = NodeDeformation(model.means, 100)
+    nodes = len(deformation.nodes)
+    model.remove(np.arange(model.count) < 10)
+    far = patch(10) + np.array([0.2, 0, 0], np.float32)
+    rows = model.append(far, np.full((10, 3), 1e-4, np.float32), np.zeros((10, 3), np.float32), 0.5)
+    deformation.attach(model, rows)
+    assert len(deformation.nodes) > nodes
+    start = model.means[rows].copy()
+    seen = np.zeros(model.count, np.float32)
+    seen[: rows.start] = 1
+    deformation.follow(model, np.full((model.count, 3), 1e-3, np.float32), seen)
+    assert np.array_equal(model.means[rows], start)
+
+
+def test_ply_holds_what_viewers_expect_and_nothing_is_overwritten(tmp_path: Path) -> None:
+    model = filled_model(patch(7))
+    file = tmp_path / "model.ply"
+    write_ply(file, model.frozen())
+    header, _, body = file.read_bytes().partition(b"end_header\n")
+    names = [line.split()[-1] for line in header.decode().splitlines() if line.startswith("property")]
+    table = np.frombuffer(body, [(name, "<f4") for name in names])
+    assert len(table) == 7
+    assert np.allclose(np.exp(table["scale_0"]), 2e-4)
+    assert np.allclose(1 / (1 + np.exp(-table["opacity"])), 0.9)
+    assert np.allclose(0.5 + 0.28209479 * table["f_dc_1"], 0.5)
+    with pytest.raises(SagsError, match="exists already"):
+        write_ply(file, model.frozen())
