@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -55,6 +56,7 @@ def main(verbose: bool) -> None:
     Research software, not a medical device.
     """
     level = logging.INFO if verbose else logging.WARNING
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # a service manager's stop is a Ctrl-C
     logging.basicConfig(
         level=level, format="%(message)s", handlers=[RichHandler(console=console, show_path=False)]
     )
@@ -127,7 +129,7 @@ def demo(launch: tuple[str, ...], seconds: float, out: Path, json_out: bool) -> 
     show_default=True,
     help="realtime: the recording's clock, late frames are dropped; step: every frame, no threads.",
 )
-@click.option("--iterations", type=int, help="Fixed optimiser steps per frame: reproducible with --pace step.")
+@click.option("--iterations", type=int, help="Fixed steps per frame: reproducible with --pace step.")
 @click.option(
     "--hold-out", type=int, default=8, show_default=True, help="Leave out every so manieth frame; 0: none."
 )
@@ -180,9 +182,9 @@ def evaluate(
 @main.command()
 @endpoint_option
 @ns_option
-@click.option("--pin", type=(float, float), metavar="U V", help="Pixel of the tissue to pin to; default: centre.")
+@click.option("--pin", type=(float, float), metavar="U V", help="Tissue pixel to pin to; default: centre.")
 @click.option("--seconds", type=float, help="Stop after so long; default: Ctrl-C.")
-@click.option("--save", type=click.Path(path_type=Path), help="Write what is shown: .mp4, or .png for the last.")
+@click.option("--save", type=click.Path(path_type=Path), help="Write what is shown: .mp4, or .png.")
 @as_json
 def overlay(
     endpoint: str | None,
@@ -273,7 +275,7 @@ def phantom(folder: Path, overrides: tuple[str, ...]) -> None:
     config = load_launch(None, [f"source.{override}" for override in overrides]).source
     assert isinstance(config, PhantomSource)
     with _progress("rendering") as show:
-        write_session(config, folder, rate=config.rate or 30.0, progress=lambda done, all_: show(done, all_))
+        write_session(config, folder, rate=config.rate or 30.0, progress=show)
     console.print(f"session: [bold]{folder}[/]; play it with `sags run {folder}`")
 
 
@@ -327,7 +329,7 @@ def _open(path: str | None, overrides: Sequence[str]) -> Any:
     from sags_node.warm_up import warm_up
 
     with _progress("rendering the phantom (once)") as show:
-        session = open_session(path, overrides, lambda done, all_: show(done, all_))
+        session = open_session(path, overrides, show)
     with console.status("loading kernels (compiled once per machine, about half a minute)"):
         warm_up(session.config)
     return session

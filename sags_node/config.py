@@ -6,6 +6,7 @@ import difflib
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from string import Template
 from typing import Annotated, Any, Literal
 
 import yaml
@@ -251,17 +252,14 @@ def _read_yaml(file: Path) -> dict[str, Any]:
     return tree
 
 
-def _resolve_paths(tree: Any, folder: Path) -> None:
+def _resolve_paths(tree: dict[str, Any], folder: Path) -> None:
     """Expand variables in every string and make the known path keys relative to the launch file."""
-    os.environ.setdefault("SAGS_DATA", str((folder / ".." / DEFAULT_DATA).resolve()))
-    if not isinstance(tree, dict):
-        return
+    variables = {"SAGS_DATA": str((folder / ".." / DEFAULT_DATA).resolve()), **os.environ}
     for key, value in tree.items():
-        if isinstance(value, dict):
-            if value.get("kind") != "v4l2":
-                _resolve_paths(value, folder)
+        if isinstance(value, dict) and value.get("kind") != "v4l2":
+            _resolve_paths(value, folder)
         elif isinstance(value, str):
-            expanded = os.path.expandvars(value)
+            expanded = Template(value).safe_substitute(variables)
             if "$" in expanded and key in _PATH_KEYS:
                 raise UsageError(f"{key}: {value} uses a variable that is not set; export it first")
             tree[key] = str(folder / expanded) if key in _PATH_KEYS else expanded

@@ -17,7 +17,6 @@ import uuid
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import asdict
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any
@@ -75,7 +74,9 @@ class Node:
         self._stopping = threading.Event()
         self._parameters_changed = threading.Event()
         self._stats = _Statistics()
-        self._publisher = Publisher(config.publish, config.ns, uuid.uuid4().hex, self._handlers())
+        self._publisher = Publisher(config.publish, config.ns, uuid.uuid4().hex)
+        for op, handler in self._handlers().items():
+            self._publisher.register(op, handler)
         self._threads = [
             threading.Thread(target=self._guard, args=(work, after), name=name, daemon=True)
             for name, work, after in (
@@ -115,6 +116,15 @@ class Node:
         for thread in self._threads:
             if thread.is_alive():
                 thread.join(10)
+
+    @property
+    def endpoints(self) -> list[str]:
+        """Where the data socket is bound."""
+        return self._publisher.connection.data
+
+    @property
+    def control_endpoint(self) -> str | None:
+        return self._publisher.connection.control
 
     def health(self) -> NodeHealth:
         """What is true now; may be called from any thread."""
@@ -166,8 +176,7 @@ class Node:
         self._parameters_changed.set()
         next_health = time.monotonic()
         while not self._results.closed:
-            if self._publisher.poll(timeout_ms=100, wake_fd=self._wake):
-                os.eventfd_read(self._wake)
+            self._publisher.poll(timeout_ms=100, wake_fd=self._wake)
             if self._parameters_changed.is_set():
                 self._parameters_changed.clear()
                 self._publisher.publish_parameters(self.config.model_dump(mode="json"))
@@ -192,7 +201,7 @@ class Node:
 
     def _handlers(self) -> dict[str, Callable[[dict[str, Any]], Any]]:
         return {
-            "get_status": lambda args: asdict(self.health()),
+            "get_status": lambda args: self._publisher.status(self.health()),
             "get_parameters": lambda args: self.config.model_dump(mode="json"),
             "set_parameters": lambda args: self._on_mapping_thread(lambda: self._set_parameters(args)),
             "reset_model": lambda args: self._on_mapping_thread(self._reset_model),

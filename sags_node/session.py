@@ -9,7 +9,6 @@ from pathlib import Path
 from sags_node.calibration import load_rig
 from sags_node.config import LaunchConfig, PhantomSource, load_launch
 from sags_node.errors import UsageError
-from sags_node.phantom import cached_session
 from sags_node.sources.source import Source, open_source
 from sags_node.types import StereoRig
 
@@ -37,6 +36,8 @@ def open_session(
     """
     config = load_launch(launch, overrides)
     if isinstance(config.source, PhantomSource):
+        from sags_node.phantom import cached_session
+
         folder = cached_session(config.source, progress)
         rig = load_rig(config.rig or folder / "calib")
     elif config.rig is None:

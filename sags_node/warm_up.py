@@ -20,7 +20,7 @@ def warm_up(config: LaunchConfig) -> None:
     """
     small = config.model_copy(
         update={
-            "vision": VisionConfig(stereo=config.vision.stereo, tissue=config.vision.tissue),
+            "vision": VisionConfig(stereo=config.vision.stereo),
             "mapping": MappingConfig(max_gaussians=1000),
         }
     )

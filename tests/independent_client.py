@@ -10,6 +10,7 @@ import struct
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import msgpack
@@ -96,7 +97,7 @@ def check_meta(message: Received, ros_type: str) -> None:
 def check_sequence(messages: Sequence[Received]) -> int:
     """`seq` and `stamp_ns` grow within one session and epoch; returns how many messages were lost."""
     lost = 0
-    for before, after in zip(messages, messages[1:], strict=False):
+    for before, after in pairwise(messages):
         assert after.meta["session"] == before.meta["session"]
         assert after.meta["seq"] > before.meta["seq"]
         if after.meta["epoch"] == before.meta["epoch"]:
@@ -116,7 +117,7 @@ def check_image(message: Received, encoding: str, width: int, height: int) -> np
 
 
 def depth_error(depth: np.ndarray, truth: np.ndarray) -> tuple[float, float, float]:
-    """Median and 90th percentile of |depth - truth| (m) and the share of pixels with truth that have depth."""
+    """Median and 90th percentile of |depth - truth| (m), and the share of known pixels that have depth."""
     known = truth > 0
     given = known & np.isfinite(depth)
     assert not np.any(depth[np.isfinite(depth)] <= 0), "unknown depth must be NaN on the wire"

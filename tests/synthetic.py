@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -119,3 +120,30 @@ def publisher(run_dir: Path, **config: Any) -> Iterator[Publisher]:
     settings = {"data": ("tcp://127.0.0.1:*",), "control": "tcp://127.0.0.1:*", "run_dir": run_dir, **config}
     with Publisher(PublishConfig(**settings), "sags", "session-1") as running:
         yield running
+
+
+@contextmanager
+def stream(
+    running: Publisher, frame: Callable[[int], FrameResult] | None = None, rate: float = 30.0
+) -> Iterator[None]:
+    """Publish `frame(i)` (default: the plane, now) and every third time health, from one thread."""
+    plane = plane_result()
+    make = frame or (lambda i: at_frame(plane, i, time.time_ns()))
+    stop = threading.Event()
+
+    def publish() -> None:
+        i = 0
+        while not stop.is_set():
+            running.publish_result(make(i), dropped=i // 2)
+            if i % 3 == 0:
+                running.publish_health(health())
+            running.poll(int(1000 / rate))
+            i += 1
+
+    thread = threading.Thread(target=publish)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()

@@ -1,7 +1,6 @@
 """The spool, the measuring of a run with known answers, golden comparison and the report."""
 
 import json
-from collections.abc import Iterator
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -89,9 +88,7 @@ def stereo_frame(frame_id: int) -> StereoFrame:
         points=points,
         points_visible=np.ones(50, bool),
     )
-    return StereoFrame(
-        frame_id, stamp, stamp, left, right, tissue=tissue, reference=reference
-    )
+    return StereoFrame(frame_id, stamp, stamp, left, right, tissue=tissue, reference=reference)
 
 
 def frame_result(frame: StereoFrame, velocity: np.ndarray, late: float = 0.0) -> FrameResult:
@@ -116,21 +113,265 @@ def frame_result(frame: StereoFrame, velocity: np.ndarray, late: float = 0.0) ->
     )
 
 
-def spooled_run(
-    spool: Spool, velocity: np.ndarray, options: Options, late: float = 0.0, leave_out: int = -1
-) -> Iterator[StereoFrame]:
-    """Fill the spool as a run would; the frames to measure it with."""
-    frames = [stereo_frame(frame_id) for frame_id in range(FRAMES)]
-    for frame in frames:
-        if not options.holds_out(frame.frame_id) and frame.frame_id != leave_out:
-            spool.add(frame_result(frame, velocity, late), 21.0, frame.t_capture_ns)
-    return iter(frames)
-
-
-def measured(velocity: np.ndarray, options: Options = Options(), late: float = 0.0, leave_out: int = -1):  # type: ignore[no-untyped-def]  # noqa: B008  # frozen
-    rectifier = Rectifier(rig(), WIDTH, HEIGHT)
+def measured_run(
+    frames: list[StereoFrame],
+    velocity: np.ndarray,
+    options: Options = Options(),  # noqa: B008  # frozen
+    late: float = 0.0,
+    dropped: int | None = None,
+) -> Measurer:
+    """Spool a run that plays `frames`, and measure it."""
     with Spool() as spool:
-        frames = spooled_run(spool, velocity, options, late, leave_out)
-        measurer = Measurer(spool, rectifier, lambda frame, pair: frame.tissue, options)
+        for frame in frames:
+            if options.holds_out(frame.frame_id) or frame.frame_id == dropped:
+                continue
+            spool.add(frame_result(frame, velocity, late), 21.0, frame.t_capture_ns)
+        measurer = Measurer(spool, Rectifier(rig(), WIDTH, HEIGHT), lambda frame, pair: frame.tissue, options)
         measurer.run(frames, lambda what, done: None)
     return measurer
+
+
+def summary_of(measurer: Measurer, options: Options = Options(), **segments: tuple[int, int]):  # type: ignore[no-untyped-def]  # noqa: B008
+    return summarise("synthetic", measurer.rows, options, segments, 33.0)
+
+
+@pytest.fixture(scope="module")
+def frames() -> list[StereoFrame]:
+    return [stereo_frame(frame_id) for frame_id in range(FRAMES)]
+
+
+# ---- spool -----------------------------------------------------------------------------------------------
+
+
+def test_spool_gives_back_every_bit_and_leaves_nothing(frames: list[StereoFrame]) -> None:
+    rng = np.random.default_rng(0)
+    kept = []
+    with Spool() as spool:
+        folder = spool.folder
+        for frame in frames[:3]:
+            result = frame_result(frame, SPEED)
+            tissue = rng.random((HEIGHT, WIDTH)) < 0.5
+            depth = rng.random((HEIGHT, WIDTH), np.float32)
+            seen = replace(result.observation, tissue=tissue, depth=depth)
+            kept.append(replace(result, observation=seen))
+            spool.add(kept[-1], 12.5, 99, 40.25)
+        assert spool.frame_ids == [0, 1, 2]
+        for result, back in zip(kept, spool, strict=True):
+            view = result.views["left"]
+            np.testing.assert_array_equal(back.rgb, as_uint8(view.rgb))
+            for got, given in (
+                (back.depth, view.depth),
+                (back.tissue, result.observation.tissue),
+                (back.measured_depth, result.observation.depth),
+                (back.snapshot.velocities, result.snapshot.velocities),
+                (back.snapshot.camera.K, CAMERA.K),
+                *(
+                    (getattr(back.snapshot.gaussians, name), getattr(result.snapshot.gaussians, name))
+                    for name in ("means", "quats", "scales", "opacities", "colors", "ids")
+                ),
+            ):
+                np.testing.assert_array_equal(got, given)
+                assert got.dtype == given.dtype
+            assert back.snapshot.frame_id == result.snapshot.frame_id
+            assert back.snapshot.t_capture_ns == result.snapshot.t_capture_ns
+            assert back.snapshot.counts == result.snapshot.counts
+            assert back.facts.timings_ms == result.timings_ms
+            assert (back.facts.frame_ms, back.facts.t_shown_ns, back.facts.latency_ms) == (12.5, 99, 40.25)
+    assert not folder.exists()
+
+
+def test_spool_is_gone_after_ctrl_c(frames: list[StereoFrame]) -> None:
+    with pytest.raises(KeyboardInterrupt), Spool() as spool:
+        folder = spool.folder
+        spool.add(frame_result(frames[0], SPEED), 1.0, 0)
+        raise KeyboardInterrupt
+    assert not folder.exists()
+
+
+def test_spool_says_what_to_do_when_it_cannot_write(frames: list[StereoFrame]) -> None:
+    with Spool() as spool:
+        spool.folder.rmdir()
+        with pytest.raises(SagsError, match="set TMPDIR"):
+            spool.add(frame_result(frames[0], SPEED), 1.0, 0)
+
+
+# ---- a run with known answers ----------------------------------------------------------------------------
+
+
+def test_a_perfect_model_is_measured_as_perfect(frames: list[StereoFrame]) -> None:
+    summary = summary_of(measured_run(frames, SPEED / 0.8))
+    assert summary["online"]["psnr"] > 60  # the left pictures are its own renders, to the last bit
+    assert summary["online"]["ssim"] > 0.999
+    assert summary["predict"]["psnr"] > 45  # rounding to grey levels alone is 58 dB
+    assert summary["heldout"]["psnr"] > 45
+    assert summary["novel"]["psnr"] > 45  # despite the other exposure, and the instrument
+    assert summary["depth"]["median_mm"] < 0.01
+    assert summary["depth"]["coverage"] > 0.99
+    assert summary["measured_depth"]["median_mm"] == pytest.approx(2.0, abs=1e-3)
+    assert summary["track"]["median_mm"] < 1e-3
+    assert summary["track"]["lost"] == 0
+
+
+def test_prediction_uses_velocities_and_their_share(frames: list[StereoFrame]) -> None:
+    exact = summary_of(measured_run(frames, SPEED / 0.8))
+    taken_whole = summary_of(measured_run(frames, SPEED))
+    still = summary_of(measured_run(frames, np.zeros(3)))
+    for group in ("predict", "heldout"):
+        assert exact[group]["psnr"] > taken_whole[group]["psnr"] + 3 > still[group]["psnr"] + 6
+    assert still["predict"]["psnr"] == pytest.approx(still["predict"]["copy_psnr"], abs=1.5)
+    assert exact["online"] == still["online"]
+
+
+def test_a_late_model_is_measured_as_late(frames: list[StereoFrame]) -> None:
+    late = 2 * PERIOD_NS * 1e-9
+    summary = summary_of(measured_run(frames, SPEED, late=late))
+    assert summary["online"]["psnr"] < 30
+    assert summary["track"]["median_mm"] < 0.01  # late, but it moves along
+    frozen = [frames[0], *(replace(frame, left=frames[0].left, t_capture_ns=0) for frame in frames[1:])]
+    stuck = measured_run(frozen, SPEED)  # a model that never moves, while the points do
+    errors = np.concatenate([row.track.errors_mm for row in stuck.rows if row.track is not None])
+    assert errors.max() == pytest.approx(np.linalg.norm(SPEED) * 19 * PERIOD_NS * 1e-6, rel=1e-3)
+
+
+def test_counts_and_segments(frames: list[StereoFrame]) -> None:
+    measurer = measured_run(frames, SPEED / 0.8, dropped=12)
+    summary = summary_of(measurer, motion=(2, 6), never=(100, 200))
+    assert [summary[key] for key in ("frames", "processed", "held_out", "dropped")] == [20, 16, 3, 1]
+    inside = [row.figures["online"]["psnr"] for row in measurer.rows if 2 <= row.frame_id <= 6]
+    assert summary["online"]["motion"]["psnr"] == pytest.approx(np.mean(inside), abs=1e-4)
+    assert summary["online"]["never"] is None
+    assert summary["heldout"]["motion"] is None  # frames 1, 9, 17
+    assert summary["novel"]["motion"] is not None  # every fifth processed frame
+    assert summary["latency_ms"] is None  # nothing was published
+    assert summary["frame_ms"]["p50"] == 21.0
+    assert summary["stage_ms"]["map"] == 20.0
+    assert set(STAGES) <= summary["stage_ms"].keys() and summary["stage_ms"]["publish"] is None
+    assert summary["iterations_per_frame"] == 2
+    assert summary["skipped"] == {"frame": 1}
+    assert summary["gaussians"]["max"] == len(tissue_at(0))
+    assert summary["online"]["lpips"] is None and summary["lpips_backbone"] is None
+    assert json.loads(json.dumps(summary, allow_nan=False)) == summary
+
+
+def test_what_was_not_known_is_null(frames: list[StereoFrame]) -> None:
+    blind = [replace(frame, reference=None) for frame in frames[:4]]
+    options = Options(hold_out=0, paper_psnr=True)
+    summary = summary_of(measured_run(blind, SPEED, options, late=0.1), options)
+    assert summary["depth"] is None and summary["track"] is None and summary["heldout"] is None
+    assert summary["online"]["paper_psnr"] > summary["online"]["psnr"]
+    assert summary["held_out"] == 0
+
+
+# ---- golden ----------------------------------------------------------------------------------------------
+
+
+def test_golden_catches_a_planted_change(tmp_path: Path) -> None:
+    summary = {
+        "frames": 10,
+        "online": {"psnr": 34.2, "ssim": 0.91, "motion": {"psnr": 32.0}},
+        "track": None,
+        "frame_ms": {"p50": 30.0},
+        "settings": {"overrides": ["seed:=1"]},
+    }
+    tolerances = {"online": Tolerance(absolute=0.05), "online.ssim": Tolerance(relative=0.001)}
+    file = tmp_path / "golden.json"
+    write_golden(file, Golden(command="make golden", tolerances=tolerances, figures={}), summary)
+    golden = read_golden(file)
+    assert "frame_ms" not in golden.figures
+    assert compare(summary, golden) == []
+    summary["frame_ms"] = {"p50": 300.0}
+    summary["online"] = {"psnr": 34.24, "ssim": 0.9105, "motion": {"psnr": 32.0}}
+    assert compare(summary, golden) == []
+    summary["frames"] = 9
+    summary["online"] = {"psnr": 34.26, "ssim": 0.912, "motion": {"psnr": None}}
+    summary["novel"] = {"psnr": 30.0}
+    said = compare(summary, golden)
+    assert [line.split(":")[0] for line in said[:-1]] == [
+        "frames", "novel.psnr", "online.motion.psnr", "online.psnr", "online.ssim",
+    ]  # fmt: skip
+    assert "34.26" in said[3] and "34.2" in said[3] and "0.05" in said[3]
+    assert "make golden" in said[-1]
+    del summary["online"]
+    assert any("online.psnr: missing" in line for line in compare(summary, golden))
+
+
+def test_golden_file_errors_are_plain(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="cannot read golden file"):
+        read_golden(tmp_path / "none.json")
+    (tmp_path / "bad.json").write_text('{"command": "x", "figures": [1]}')
+    with pytest.raises(UsageError, match="figures"):
+        read_golden(tmp_path / "bad.json")
+
+
+# ---- report ----------------------------------------------------------------------------------------------
+
+
+class Page(HTMLParser):
+    """Counts what a page holds and whether every element is closed."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.images: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag == "img":
+            self.images.append(dict(attrs)["src"] or "")
+        if tag not in {"img", "meta"}:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        pass
+
+
+def test_report_opens_and_shows_the_worst_frame(frames: list[StereoFrame], tmp_path: Path) -> None:
+    spoilt = frames.copy()
+    spoilt[7] = replace(frames[7], left=255 - frames[7].left)  # unlike anything the model shows
+    measurer = measured_run(spoilt, SPEED / 0.8)
+    summary = {**summary_of(measurer, motion=(2, 5)), "session": "<b>name</b>"}
+    pictures = measurer.gallery.pictures
+    assert [picture.frame_id for picture in pictures] == [0, 7, 10, 19]
+    file = write_report(tmp_path / "out", summary, measurer.rows, pictures)
+    text = file.read_text(encoding="utf-8")
+    page = Page(text)
+    assert page.open == []
+    assert len(page.images) == 16 and all(uri.startswith("data:image/jpeg;base64,") for uri in page.images)
+    assert len(text) < 2_000_000
+    assert "frame 7," in text and "the worst" in text
+    assert "<b>name" not in text and "http" not in text
+    sheet = cv2.imread(str(file.parent / "sheet.png"))
+    assert sheet.shape == (4 * 288, 4 * 360, 3)
+
+
+def test_report_of_a_run_without_anything_optional(frames: list[StereoFrame], tmp_path: Path) -> None:
+    measurer = measured_run([replace(frames[0], reference=None)], SPEED, Options(hold_out=0))
+    file = write_report(tmp_path, summary_of(measurer), measurer.rows, measurer.gallery.pictures)
+    assert len(Page(file.read_text()).images) == 4
+
+
+def test_plot_is_valid_svg_inside_its_frame() -> None:
+    points = [(0, 10.0), (1, 35.0), (2, float("nan")), (3, 20.0), (4, 22.0)]
+    svg = line_plot("a < b", [Series("one", "#123456", points)], {"motion": (1, 99)})
+    tree = ElementTree.fromstring(svg)
+    path = next(each for each in tree.iter("path")).attrib["d"]
+    assert path.count("M") == 2 and path.count("L") == 2  # NaN breaks the line
+    numbers = np.array(path.replace("M", "").replace("L", "").split(), float).reshape(-1, 2)
+    assert (numbers >= 0).all() and (numbers[:, 0] <= 720).all() and (numbers[:, 1] <= 190).all()
+    assert numbers[1, 1] < numbers[0, 1]  # larger is higher
+    assert line_plot("empty", [Series("one", "#123456", [])], {}) == ""
+
+
+# ---- sessions that cannot be measured --------------------------------------------------------------------
+
+
+def test_live_cameras_and_ambiguous_segments_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="record them first"):
+        evaluate(None, ["source.kind:=v4l2"])
+    launch = tmp_path / "launch.yaml"
+    launch.write_text("segments: {psnr: [1, 2]}")
+    with pytest.raises(UsageError, match=r"segments\.psnr"):
+        evaluate(launch)

@@ -262,10 +262,10 @@ def test_right_eye_mask_of_a_plane_is_the_shifted_tissue() -> None:
     depth = np.full((8, 128), 0.1, np.float32)
     tissue = np.ones((8, 128), bool)
     tissue[:, 60:70] = False
-    mask = right_eye_mask(tissue, depth, 2500.0, 0.00042)  # disparity 10.5 px, widened to 9..12
+    mask = right_eye_mask(tissue, depth, 2500.0, 0.00042)  # disparity 10.5 px, widened to 9..16
     expected = np.ones(128, bool)
-    expected[60 - 12 : 70 - 9] = False
-    expected[128 - 12 :] = False
+    expected[60 - 16 : 70 - 9] = False
+    expected[128 - 16 :] = False
     np.testing.assert_array_equal(mask, np.tile(expected, (8, 1)))
     assert not right_eye_mask(tissue, np.zeros_like(depth), 2500.0, 0.00042).any()
 

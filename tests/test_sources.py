@@ -102,8 +102,8 @@ def recordings(tmp_path: Path) -> dict[str, Recording]:
     for n, (left, right) in enumerate(pairs):
         write_png(tmp_path / f"l/{n:03d}.png", left)
         write_png(tmp_path / f"r/{n:03d}.png", right)
-    left = write_video(tmp_path / "l.avi", [pair[0] for pair in pairs])
-    right = write_video(tmp_path / "r.avi", [pair[1] for pair in pairs])
+    left_file = write_video(tmp_path / "l.avi", [pair[0] for pair in pairs])
+    right_file = write_video(tmp_path / "r.avi", [pair[1] for pair in pairs])
     lr = write_video(tmp_path / "lr.avi", [np.hstack(pair) for pair in pairs])
     rl = write_video(tmp_path / "rl.avi", [np.hstack(pair[::-1]) for pair in pairs])
     panes = write_video(
@@ -111,7 +111,7 @@ def recordings(tmp_path: Path) -> dict[str, Recording]:
     )
     return {
         "folders": cfg.FoldersSource(left=tmp_path / "l", right=tmp_path / "r", pace="step", rate=25),
-        "videos": cfg.VideosSource(left=left, right=right, pace="step"),
+        "videos": cfg.VideosSource(left=left_file, right=right_file, pace="step"),
         "LR": cfg.SideBySideSource(video=lr, pace="step"),
         "RL": cfg.SideBySideSource(video=rl, order="RL", pace="step"),
         "panes": cfg.PanesSource(
@@ -280,6 +280,23 @@ def test_truth_follows_the_recording_through_a_loop(folders: cfg.FoldersSource, 
     assert frame.reference is None and frame.T_world_cam is not None and frame.tissue is not None
 
 
+def test_phantom_session_is_played_as_this_launch_file_asks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    config = cfg.PhantomSource(seconds=0.1, width=64, height=64, pace="step", rate=10, loop=True, frames=4)
+    with open_source(config) as source:
+        frames = list(source)
+    assert [frame.t_capture_ns for frame in frames] == [0, 100_000_000, 200_000_000, 300_000_000]
+    assert [frame.epoch for frame in frames] == [0, 0, 0, 1]
+    assert (frames[0].left == frames[3].left).all() and (frames[0].left != frames[1].left).any()
+    for frame in frames:
+        assert frame.left.shape == (64, 64, 3)
+        assert frame.tissue is not None and frame.T_world_cam is not None
+        assert frame.reference is not None and frame.reference.depth_kind == "exact"
+        assert frame.reference.depth is not None and frame.reference.points is not None
+
+
 # ---- mistakes --------------------------------------------------------------------------------------------
 
 
@@ -408,7 +425,7 @@ def depth_without_numbers(folder: Path) -> Recording:
         (crop_outside, r"pane 'right' \(40, 0, 32, 24\) .* leaves the picture: .*lr.avi is 64x24 px"),
         (crops_of_two_sizes, "pane 'right' is 16x24 px but the left pane is 32x24"),
         (videos_of_two_sizes, "l.avi has 32x24 px but .*lr.avi has 64x24; they are not one stereo pair"),
-        (videos_of_two_rates, "l.avi has 25.00 frames per second but .*slow.avi has 10.00"),
+        (videos_of_two_rates, r"l.avi has 25.0 frames/s but .*slow.avi has 10.0;"),
         (no_poses, "poses.npz does not exist; check the path"),
         (poses_of_wrong_shape, r"'T_world_cam' is float64 \[4, 4\], wanted numbers \[any, 4, 4\]"),
         (poses_of_other_name, "poses.npz holds no array 'T_world_cam'"),
@@ -526,8 +543,9 @@ def test_d4d_clip() -> None:
                 continue
             assert frame.reference.depth is not None and frame.reference.depth_kind == "stereo_network"
             known = frame.reference.depth[frame.reference.depth > 0]
-            assert 0.03 < np.median(known) < 0.15  # metres
+            assert 0.03 < float(np.median(known)) < 0.15  # metres
             mask = cv2.imread(str(D4D / f"toolmask/{index:04d}.png"), cv2.IMREAD_GRAYSCALE)
+            assert mask is not None
             tools, found = mask > 127, ~frame.tissue
             overlaps.append((tools & found).sum() / (tools | found).sum())
     assert index == 178

@@ -66,7 +66,7 @@ def test_one_camera_side_by_side(guest: dict[str, Any]) -> None:
     halves = guest["side_by_side"]
     assert halves["frames"] == 6
     assert halves["sizes"] == [[360, 320, 3]]
-    assert halves["largest_skew_ms"] == 0 and halves["dropped"] == 0
+    assert halves["largest_skew_ms"] == 0
     assert halves["left_advances"]
 
 

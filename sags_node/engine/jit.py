@@ -98,6 +98,16 @@ def round_to_even(typing_context: Any, x: Any) -> Any:
 
 
 @intrinsic
+def square_root(typing_context: Any, x: Any) -> Any:
+    """Square root of a float32: `np.sqrt` stays a call because it has to report negative arguments."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.call(builder.module.declare_intrinsic("llvm.sqrt", [_F32]), args)
+
+    return types.float32(types.float32), generate
+
+
+@intrinsic
 def scale_by_power_of_two(typing_context: Any, x: Any, exponent: Any) -> Any:
     """x * 2**exponent for float32 x near 1 and an integer-valued float32 exponent, by its exponent bits."""
 

@@ -17,7 +17,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from sags_node.engine.jit import inlined, parallel_kernel
+from sags_node.engine.jit import inlined, parallel_kernel, square_root
 from sags_node.types import F32
 
 f4 = np.float32
@@ -105,8 +105,8 @@ def _whitening(xx: Any, xy: Any, yy: Any, det0: Any) -> Row:
     det = det0 + MIP_VARIANCE * (xx + yy) + MIP_VARIANCE * MIP_VARIANCE
     filtered_yy = yy + MIP_VARIANCE
     inverse_yy = ONE / filtered_yy
-    along = np.sqrt(WHITEN2 * filtered_yy / det)
-    return along, -along * xy * inverse_yy, np.sqrt(WHITEN2 * inverse_yy), np.sqrt(det0 / det)
+    along = square_root(WHITEN2 * filtered_yy / det)
+    return along, -along * xy * inverse_yy, square_root(WHITEN2 * inverse_yy), square_root(det0 / det)
 
 
 @inlined
@@ -156,7 +156,7 @@ def project(
                 qw, qx, qy, qz = S[6, j], S[7, j], S[8, j], S[9, j]
                 norm2 = qw * qw + qx * qx + qy * qy + qz * qz
                 has_direction = norm2 > MIN_QUAT_NORM2
-                n = ONE / np.sqrt(norm2 if has_direction else ONE)
+                n = ONE / square_root(norm2 if has_direction else ONE)
                 Q = _rotation(qw * n, qx * n, qy * n, qz * n)
                 j00, j11 = fx * inverse_z, fy * inverse_z
                 A = _screen_axes(R, j00, -j00 * held_x, j11, -j11 * held_y)
@@ -247,7 +247,7 @@ def project_backward(
                 held_y = _clamp(slope_y, limits[2], limits[3])
                 qw, qx, qy, qz = S[6, j], S[7, j], S[8, j], S[9, j]
                 norm2 = qw * qw + qx * qx + qy * qy + qz * qz
-                n = ONE / np.sqrt(norm2 if norm2 > MIN_QUAT_NORM2 else ONE)
+                n = ONE / square_root(norm2 if norm2 > MIN_QUAT_NORM2 else ONE)
                 qw, qx, qy, qz = qw * n, qx * n, qy * n, qz * n
                 Q = _rotation(qw, qx, qy, qz)
                 j00, j11 = fx * inverse_z, fy * inverse_z
@@ -263,7 +263,8 @@ def project_backward(
                 v_mean_x = TWO_LN2 * along * S[12, j]
                 v_mean_y = TWO_LN2 * (across * S[12, j] + down * S[13, j])
                 # opacity' = opacity sqrt(det0 / det): its share of log det falls on the same quadratic form
-                v_log_opacity = S[11, j] if S[10, j] * kept < MAX_OPACITY else ZERO
+                v_log_opacity = S[11, j]
+                v_log_opacity = v_log_opacity if S[10, j] * kept < MAX_OPACITY else ZERO
                 n_uu = TWO_LN2 * S[14, j] - v_log_opacity
                 n_uv = TWO_LN2 * S[15, j]
                 n_vv = TWO_LN2 * S[16, j] - v_log_opacity
@@ -313,8 +314,10 @@ def project_backward(
                 v_j12 = a3 * R[6] + a4 * R[7] + a5 * R[8]
                 # j00 = fx / z, j02 = -fx / z held_x; a held slope is constant
                 v_inverse_z = fx * (v_j00 - held_x * v_j02) + fy * (v_j11 - held_y * v_j12)
-                v_slope_x = fx * v_mean_x - (j00 * v_j02 if held_x == slope_x else ZERO)
-                v_slope_y = fy * v_mean_y - (j11 * v_j12 if held_y == slope_y else ZERO)
+                free_x = ONE if held_x == slope_x else ZERO
+                free_y = ONE if held_y == slope_y else ZERO
+                v_slope_x = fx * v_mean_x - free_x * j00 * v_j02
+                v_slope_y = fy * v_mean_y - free_y * j11 * v_j12
                 v_x, v_y = v_slope_x * inverse_z, v_slope_y * inverse_z
                 v_z = S[17, j] - inverse_z * (
                     v_slope_x * slope_x + v_slope_y * slope_y + v_inverse_z * inverse_z

@@ -94,7 +94,6 @@ class Measurer:
         self._usable_right: Bool | None = None
         self._tracks: PointTracks | None = None
         self._before: _Before | None = None
-        self._pace = 1.0  # seconds of the run in a second of the recording
 
     def run(self, frames: Iterable[StereoFrame], progress: Progress) -> None:
         """Measure all frames of the recording that the run was played from."""
@@ -128,18 +127,16 @@ class Measurer:
         return FrameRow(frame.frame_id, seconds, figures, shown.facts, track)
 
     def _predict(self, before: _Before, shown: SpooledFrame, truth: F32, seconds: float) -> Figures:
-        elapsed = (shown.snapshot.t_capture_ns - before.shown.snapshot.t_capture_ns) * 1e-9
-        if elapsed > 0 and seconds > before.seconds:
-            self._pace = elapsed / (seconds - before.seconds)
-        guess = self._draw(extrapolated(before.shown.snapshot, elapsed), shown.snapshot.camera)
+        guess = self._draw(
+            extrapolated(before.shown.snapshot, seconds - before.seconds), shown.snapshot.camera
+        )
         return {
             "psnr": metrics.psnr(guess, truth, shown.tissue),
             "copy_psnr": metrics.psnr(before.truth, truth, shown.tissue),
         }
 
     def _held_out(self, frame: StereoFrame, pair: RectifiedPair, seconds: float, before: _Before) -> FrameRow:
-        elapsed = (seconds - before.seconds) * self._pace
-        guess = self._draw(extrapolated(before.shown.snapshot, elapsed), pair.camera)
+        guess = self._draw(extrapolated(before.shown.snapshot, seconds - before.seconds), pair.camera)
         tissue = self._tissue_of(frame, pair)
         quality = self._quality(guess, metrics.as_float(pair.left), tissue, costly=True)
         return FrameRow(frame.frame_id, seconds, {"heldout": quality})

@@ -46,6 +46,8 @@ def line_plot(title: str, series: Sequence[Series], spans: Mapping[str, tuple[in
         parts.append(f'<text x="{scale.x(tick):.1f}" y="{HEIGHT - 6}" class="frame">{tick:g}</text>')
     for place, each in enumerate(series):
         parts.append(_drawn(scale, each))
+        if len(series) == 1:
+            break
         x = WIDTH - RIGHT - 110 * (len(series) - place)
         parts.append(f'<rect x="{x}" y="7" width="10" height="10" fill="{each.colour}"/>')
         parts.append(f'<text x="{x + 14}" y="16" class="label">{escape(each.label)}</text>')

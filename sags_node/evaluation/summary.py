@@ -85,11 +85,11 @@ def _timings(facts: Sequence[RunFacts]) -> dict[str, Any]:
 
 
 def _rate(facts: Sequence[RunFacts]) -> float | None:
-    """Published frames per second; of a run that publishes nothing, what its frames alone would allow."""
+    """Published frames per second; of a run that publishes nothing, what its frames after the first allow."""
     if len(facts) < 2:
         return None
     if facts[0].latency_ms is None:
-        return 1e3 / float(np.mean([run.frame_ms for run in facts]))
+        return 1e3 / float(np.mean([run.frame_ms for run in facts[1:]]))
     return (len(facts) - 1) / ((facts[-1].t_shown_ns - facts[0].t_shown_ns) * 1e-9)
 
 

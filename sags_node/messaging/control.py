@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future
+from concurrent.futures import CancelledError, Future
 from pathlib import Path
 from types import TracebackType
 from typing import Annotated, Any, Self
@@ -92,23 +92,22 @@ class ControlServer:
             text = f"unknown op '{request.op}'; this node knows: {known}"
             self._send(envelope, Reply(PROTOCOL, request.id, False, error=text))
             return
+        if len(self._pending) >= MAX_PENDING:
+            text = "too many requests are waiting for an answer; try again later"
+            self._send(envelope, Reply(PROTOCOL, request.id, False, error=text))
+            return
         self._answer(envelope, request.id, lambda: handler(request.args))
 
     def _answer(self, envelope: list[bytes], identifier: Identifier, work: Callable[[], Any]) -> None:
         try:
             result = work()
             if isinstance(result, Future):
-                if len(self._pending) >= MAX_PENDING:
-                    result.cancel()
-                    raise SagsError("too many requests are waiting; try again later")
                 self._pending.append((envelope, identifier, result))
                 return
             self._send(envelope, Reply(PROTOCOL, identifier, True, result=result))
         except SagsError as error:
             self._send(envelope, Reply(PROTOCOL, identifier, False, error=str(error)))
-        except BaseException as error:  # a cancelled future is a BaseException too
-            if isinstance(error, KeyboardInterrupt | SystemExit):
-                raise
+        except (Exception, CancelledError) as error:  # a request must not end the node
             log.exception("a control request failed")
             text = f"internal error: {type(error).__name__}: {error}"
             self._send(envelope, Reply(PROTOCOL, identifier, False, error=text))

@@ -34,12 +34,21 @@ class Publisher:
     A topic is encoded only while somebody subscribes to it. Nothing here ever waits for a peer: one that
     does not keep up loses messages and sees the gap in `seq`.
 
+    Args:
+        handlers: control op -> function of its args, see `control.ControlServer`; `ping` is always there.
+
     Raises:
         UsageError: an endpoint that is neither loopback nor ipc, or a run directory open to others.
         SagsError: an endpoint is taken, or another node holds the same namespace.
     """
 
-    def __init__(self, config: PublishConfig, ns: str, session: str) -> None:
+    def __init__(
+        self,
+        config: PublishConfig,
+        ns: str,
+        session: str,
+        handlers: Mapping[str, control.Handler] | None = None,
+    ) -> None:
         for endpoint in (*config.data, *([config.control] if config.control else [])):
             check_endpoint(endpoint, config.insecure)
         self.ns = ns
@@ -47,19 +56,18 @@ class Publisher:
         self._names = {topics.full_name(ns, t.name): t for t in topics.TOPICS if config.right or not t.right}
         self._seq = dict.fromkeys((t.name for t in self._names.values()), 0)
         self._subscribed: set[str] = set()  # prefixes, only those that match a topic of ours
-        self._handlers: dict[str, control.Handler] = {"ping": lambda _: "pong"}
         self._last: FrameResult | None = None
         self._dropped = 0
         self._texts: dict[str, tuple[Content, int]] = {}  # status, parameters: last content and its stamp
         self._run = RunDirectory(config.run_dir, ns)
         self._context = zmq.Context()
         try:
-            self._bind(config)
+            self._bind(config, {"ping": lambda args: "pong", **(handlers or {})})
         except BaseException:
             self.close()
             raise
 
-    def _bind(self, config: PublishConfig) -> None:
+    def _bind(self, config: PublishConfig, handlers: Mapping[str, control.Handler]) -> None:
         self._data = self._context.socket(zmq.XPUB)
         _limit(self._data, SEND_HIGH_WATER, MAX_SUBSCRIPTION_BYTES)
         self._data.setsockopt(
@@ -77,7 +85,7 @@ class Publisher:
             router.setsockopt(zmq.RCVHWM, control.RECEIVE_HIGH_WATER)
             control_endpoint = bind(router, config.control, "publish.control")
             self._poller.register(router, zmq.POLLIN)
-            self._control = control.ControlServer(router, self._handlers)
+            self._control = control.ControlServer(router, handlers)
         self.connection = Connection(
             protocol=PROTOCOL,
             ns=self.ns,
@@ -103,12 +111,8 @@ class Publisher:
     def publish_health(self, health: NodeHealth) -> None:
         """Send `status` and `diagnostics`, stamped now."""
         now = time.time_ns()
-        self._publish_text("status", content.json_text(self.status(health)), now)
+        self._publish_text("status", content.json_text(content.status(health, self._last)), now)
         self._publish_text("diagnostics", content.diagnostics(health, now), now)
-
-    def status(self, health: NodeHealth) -> dict[str, Any]:
-        """What the topic `status` says."""
-        return content.status(health, self._last)
 
     def publish_parameters(self, parameters: Mapping[str, Any]) -> None:
         """Send the configuration in force; it is kept for those who subscribe later."""
@@ -153,14 +157,10 @@ class Publisher:
 
     # ---- in --------------------------------------------------------------------------------------------
 
-    def register(self, op: str, handler: control.Handler) -> None:
-        """Answer the control operation `op` with `handler`, see `control.ControlServer`."""
-        self._handlers[op] = handler
-
     def poll(self, timeout_ms: int, wake_fd: int | None = None) -> bool:
         """Serve subscriptions and requests for up to `timeout_ms`, at least once.
 
-        Returns early, with True, when the eventfd `wake_fd` has been written to; it is then read.
+        Returns early, with True, when the file descriptor `wake_fd` has something to read.
         """
         if wake_fd is not None:
             self._poller.register(wake_fd, zmq.POLLIN)
@@ -173,8 +173,7 @@ class Publisher:
                 self._serve_subscriptions()
                 if self._control is not None:
                     self._control.serve()
-                if wake_fd is not None and wake_fd in events:
-                    os.eventfd_read(wake_fd)
+                if wake_fd in events:
                     return True
                 if left_ms == 0:
                     return False

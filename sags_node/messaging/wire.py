@@ -24,8 +24,8 @@ MAX_META_BYTES = 4096
 
 Buffer = bytes | memoryview
 DType = Literal["", "uint8", "float32"]
-Stamp = Annotated[int, msgspec.Meta(ge=0, lt=2**63)]
-Count = Annotated[int, msgspec.Meta(ge=0, lt=2**63)]
+Stamp = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
+Count = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 Text = Annotated[str, msgspec.Meta(max_length=512)]
 
 
@@ -40,7 +40,7 @@ class Meta(msgspec.Struct, frozen=True, kw_only=True):
     type: Text  # ROS 2 type of the joined parts
     type_hash: Text  # RIHS01
     seq: Count  # per topic and session; a gap is a lost message
-    frame_id: Annotated[int, msgspec.Meta(ge=-1, lt=2**63)]  # captured frame shown; -1: none
+    frame_id: Annotated[int, msgspec.Meta(ge=-1, le=2**63 - 1)]  # captured frame shown; -1: none
     stamp_ns: Stamp  # capture time of that frame
     publish_ns: Stamp
     session: Text  # changes when the node is started anew

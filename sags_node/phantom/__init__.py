@@ -1,0 +1,5 @@
+"""A synthetic stereo endoscope session: deforming tissue, instruments, and the exact truth of both."""
+
+from sags_node.phantom.session import cached_session, write_session
+
+__all__ = ["cached_session", "write_session"]

@@ -10,6 +10,7 @@ from sags_node.phantom.casting import Bodies, Hits, grid_position
 from sags_node.phantom.relief import SPACING, Relief
 from sags_node.phantom.shading import Lamp, develop, shade_metal, shade_tissue
 from sags_node.phantom.skin import Skin
+from sags_node.phantom.vectors import normalized
 from sags_node.types import F32, F64, U8, Bool
 
 LENS_BLUR = 0.45  # px: no endoscope is sharper; it also softens the edges of single-sample rendering
@@ -46,17 +47,16 @@ def look(
 def _shade(rays: F32, hits: Hits, bodies: Bodies, relief: Relief, skin: Skin, lamp: Lamp) -> F32:
     directions = rays[..., 3:]
     points = rays[..., :3] + np.where(np.isfinite(hits.distance), hits.distance, 1)[..., None] * directions
-    view = -directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+    view = -normalized(directions)
 
     place = grid_position(hits, len(relief.x))
-    normals = cv2.remap(bodies.normals, place, None, cv2.INTER_LINEAR)
-    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    normals = normalized(cv2.remap(bodies.normals, place, None, cv2.INTER_LINEAR))
     material = place * np.float32(SPACING) + np.array([relief.x[0] - skin.x0, relief.y[0] - skin.y0], np.float32)
     texel = material / np.float32(skin.texel)
     color = cv2.remap(skin.color, texel, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     surface = cv2.remap(skin.surface, texel, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     flat = [a.reshape(-1, 3) for a in (points, normals, view, color, surface)]
-    picture = shade_tissue(*flat, lamp).reshape(rays.shape[:-1] + (3,))
+    picture = shade_tissue(*flat, lamp, lit=_lit(points, bodies, lamp).ravel()).reshape(rays.shape[:-1] + (3,))
     picture[~hits.tissue] = _NOTHING
 
     if hits.tool.any():
@@ -64,13 +64,20 @@ def _shade(rays: F32, hits: Hits, bodies: Bodies, relief: Relief, skin: Skin, la
         face, (second, third) = hits.face[hits.tool], hits.barycentric[hits.tool].T
         corners = tools.normals[tools.faces[face]]
         weights = np.stack([1 - second - third, second, third], -1)
-        smooth = np.einsum("nk,nkc->nc", weights, corners)
-        smooth /= np.linalg.norm(smooth, axis=-1, keepdims=True)
+        smooth = normalized(np.einsum("nk,nkc->nc", weights, corners))
         materials = tools.materials[face].astype(np.float32)
         picture[hits.tool] = shade_metal(
             points[hits.tool], smooth.astype(np.float32), view[hits.tool], materials, lamp
         )
     return picture
+
+
+def _lit(points: F32, bodies: Bodies, lamp: Lamp) -> F32:
+    """Share of the lamp's light [H, W] that reaches points [H, W, 3]; sampled at half resolution: soft edges."""
+    from_points = np.ascontiguousarray(points[::2, ::2])
+    shadow = bodies.occluded(np.concatenate([from_points, lamp.place - from_points], -1)).astype(np.float32)
+    soft = cv2.GaussianBlur(shadow, (0, 0), 1.2)
+    return 1 - cv2.resize(soft, points.shape[1::-1], interpolation=cv2.INTER_LINEAR)
 
 
 def add_smoke(picture: F32, directions: F32, offset: float, cloud: F32, drift: F64, density: float) -> F32:

@@ -55,6 +55,14 @@ class Bodies:
             barycentric=found["primitive_uvs"].numpy(),
         )
 
+    def occluded(self, rays: F32) -> Bool:
+        """Whether rays [..., 6], whose directions end at the light, are stopped on their way, [...]."""
+        import open3d.core as o3c
+
+        own_surface = 0.012  # of the way: not to be hidden by the place where the ray starts
+        stopped = self._caster.test_occlusions(o3c.Tensor.from_numpy(rays), own_surface, 1.0)
+        return np.asarray(stopped.numpy(), np.bool_)
+
 
 def grid_position(hits: Hits, cols: int) -> F32:
     """Column and row [..., 2] on the tissue's vertex grid (`Tissue.faces`); the corner 0, 0 where none was hit."""

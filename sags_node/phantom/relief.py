@@ -13,7 +13,7 @@ import numpy as np
 from sags_node.phantom.noise import fractal_noise
 from sags_node.types import F32, F64
 
-SPACING = 0.45e-3  # m between vertices
+SPACING = 0.6e-3  # m between vertices
 BED_DEPTH = 0.082  # m, on the optical axis
 BED_SLOPE = -0.16  # the far side is at the top of the picture
 FARTHEST = 0.098  # m, the extent covers the view at this depth
@@ -67,7 +67,7 @@ def make_relief(rng: np.random.Generator, half_view: tuple[float, float]) -> Rel
         charts.append(chart)
         tints.append(rng.uniform(-1, 1))
         if index == 0:
-            at = int(0.38 * len(curve))
+            at = int(0.46 * len(curve))
             grip_point = curve[at]
             grip_axis = (curve[at + 1] - curve[at - 1]) / np.linalg.norm(curve[at + 1] - curve[at - 1])
     heights.append(_liver_height(grid, half))

@@ -42,7 +42,7 @@ class Phantom:
     """A seeded scene; a frame is a pure function of its place in the session."""
 
     def __init__(self, config: PhantomSource) -> None:
-        self.config = config
+        self._config = config
         self.rig = phantom_rig(config.width, config.height)
         self._left_rays = raw_rays(self.rig.left).astype(np.float32)
         self._right_rays = raw_rays(self.rig.right).astype(np.float32)
@@ -65,7 +65,7 @@ class Phantom:
     def frame(self, index: int, count: int) -> PhantomFrame:
         """Frame `index` of a session of `count` frames."""
         phase = index / count
-        T_world_cam = scope_pose(phase, self.config.camera_motion)
+        T_world_cam = scope_pose(phase, self._config.camera_motion)
         vertices = self._tissue.vertices(phase)
         hook_view = HOOK_DEPTH * np.array(self._half_view)
         tools = self._instruments.mesh(self._clock.action(phase), self._tissue.grip(vertices), hook_view)
@@ -75,11 +75,11 @@ class Phantom:
         pictures, masks = [], []
         for eye, (rays, offset) in enumerate(((self._left_rays, 0.0), (self._right_rays, self.rig.baseline))):
             linear, mask = look(rays, offset, T_world_cam, bodies, self._relief, self._skin, lamp)
-            if self.config.smoke > 0:
+            if self._config.smoke > 0:
                 drift = 60 * np.array([np.cos(2 * np.pi * phase), np.sin(2 * np.pi * phase)])
-                linear = add_smoke(linear, rays, offset, self._cloud, drift, self.config.smoke)
+                linear = add_smoke(linear, rays, offset, self._cloud, drift, self._config.smoke)
             rng = np.random.default_rng([*self._noise_key, index, eye])
-            pictures.append(expose(linear, self.config.blur, self.config.noise, rng))
+            pictures.append(expose(linear, self._config.blur, self._config.noise, rng))
             masks.append(mask)
 
         hits = bodies.cast(world_rays(self._rectified_rays, 0.0, T_world_cam))

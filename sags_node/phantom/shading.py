@@ -1,4 +1,4 @@
-"""Light and colour: from what a ray met to a pixel. The light sits at the scope's tip, between the eyes."""
+"""Light and colour: from what a ray met to a pixel. The light sits at the scope's tip, just above the eyes."""
 
 from __future__ import annotations
 
@@ -6,10 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sags_node.geometry import transform
+from sags_node.phantom.vectors import dot, normalized
 from sags_node.types import F32, F64
 
-LIGHT_POWER = 0.0053  # m^2: brightness 1 on a white wall at sqrt(LIGHT_POWER)
-LIGHT_SPREAD = 1.6  # exponent of the fall-off towards the rim
+LAMP_ABOVE = 0.006  # m, off the eyes' axis: what makes shadows
+LIGHT_POWER = 0.0046  # m^2: brightness 1 on a white wall at sqrt(LIGHT_POWER)
+LIGHT_SPREAD = 3.0  # exponent of the fall-off towards the rim
 _WRAP = np.array([0.34, 0.14, 0.12], np.float32)  # red light leaks round into the shade: under-surface scattering
 _AMBIENT = np.array([0.085, 0.050, 0.047], np.float32)  # light that has bounced off other tissue
 _CAVITY_GLOW = np.array([0.30, 0.085, 0.075], np.float32)  # what metal mirrors when it faces the tissue
@@ -24,24 +27,20 @@ class Lamp:
 
     @staticmethod
     def at_tip(T_world_cam: F64, baseline: float) -> Lamp:
-        """Between the eyes of a scope whose left eye has this pose."""
-        middle = T_world_cam[:3, 3] + 0.5 * baseline * T_world_cam[:3, 0]
-        return Lamp(middle.astype(np.float32), T_world_cam[:3, 2].astype(np.float32))
+        """Above the eyes of a scope whose left eye has this pose."""
+        place = transform(T_world_cam, np.array([0.5 * baseline, -LAMP_ABOVE, 0.0]))
+        return Lamp(place.astype(np.float32), T_world_cam[:3, 2].astype(np.float32))
 
     def reach(self, points: F32) -> tuple[F32, F32]:
         """Directions to the light [N, 3] and strength received [N] at points [N, 3]."""
         to_light = self.place - points
-        squared = _dot(to_light, to_light)
-        to_light /= np.sqrt(squared)[:, None]
+        squared = dot(to_light, to_light)
+        to_light = normalized(to_light)
         strength = LIGHT_POWER / squared * np.maximum(-(to_light @ self.axis), 0) ** np.float32(LIGHT_SPREAD)
         return to_light, np.asarray(strength, np.float32)
 
 
-def _dot(a: F32, b: F32) -> F32:
-    return np.asarray(np.einsum("nc,nc->n", a, b), np.float32)
-
-
-def shade_tissue(points: F32, normals: F32, view: F32, color: F32, surface: F32, lamp: Lamp) -> F32:
+def shade_tissue(points: F32, normals: F32, view: F32, color: F32, surface: F32, lamp: Lamp, lit: F32) -> F32:
     """Linear-light colour [N, 3] of wet tissue.
 
     Args:
@@ -49,15 +48,15 @@ def shade_tissue(points: F32, normals: F32, view: F32, color: F32, surface: F32,
         view: [N, 3] unit vectors towards the eye.
         color: [N, 3] reflectance.
         surface: [N, 3] slopes of the fine relief along x and y, wetness.
+        lit: [N] share of the light that reaches the point, 0 = in shadow.
     """
     fine = _tilted(normals, surface[:, :2])
     to_light, strength = lamp.reach(points)
-    cosine = 0.45 * _dot(to_light, normals) + 0.55 * _dot(to_light, fine)  # scattering blurs the fine relief
+    strength = strength * lit
+    cosine = 0.45 * dot(to_light, normals) + 0.55 * dot(to_light, fine)  # scattering blurs the fine relief
     diffuse = np.maximum((cosine[:, None] + _WRAP) / (1 + _WRAP), 0)
 
-    halfway = to_light + view
-    halfway /= np.sqrt(_dot(halfway, halfway))[:, None]
-    facing = np.clip(_dot(halfway, fine), 0, 1)
+    facing = np.clip(dot(normalized(to_light + view), fine), 0, 1)  # of the half-way vector
     # Two lobes: the film of liquid, and the rougher tissue below it.
     film = surface[:, 2] ** 2 * 2.6 * facing**np.float32(260)
     gleam = 0.075 * facing**np.float32(22)
@@ -72,22 +71,20 @@ def _tilted(normals: F32, slope: F32) -> F32:
     safe_nz = np.minimum(nz, -0.2)
     scale_x, scale_y = 1 / np.sqrt(1 + (nx / safe_nz) ** 2), 1 / np.sqrt(1 + (ny / safe_nz) ** 2)
     a, b = slope[:, 0] * scale_x, slope[:, 1] * scale_y
-    tilted = np.stack([nx - a, ny - b, nz + a * nx / safe_nz + b * ny / safe_nz], -1)
-    tilted /= np.sqrt(_dot(tilted, tilted))[:, None]
-    return np.asarray(tilted, np.float32)
+    return normalized(np.stack([nx - a, ny - b, nz + a * nx / safe_nz + b * ny / safe_nz], -1))
 
 
 def shade_metal(points: F32, normals: F32, view: F32, materials: F32, lamp: Lamp) -> F32:
     """Linear-light colour [N, 3] of instrument parts; `materials` [N, 4] is reflectance and mirror share."""
     to_light, strength = lamp.reach(points)
     color, mirror = materials[:, :3], materials[:, 3:]
-    facing = _dot(normals, view)[:, None]
+    facing = dot(normals, view)[:, None]
     reflected = 2 * facing * normals - view
     towards_tissue = np.clip(0.5 + 0.5 * (reflected @ lamp.axis), 0, 1)[:, None]
-    towards_light = np.clip(_dot(reflected, to_light), 0, 1)[:, None]
+    towards_light = np.clip(dot(reflected, to_light), 0, 1)[:, None]
     strength = np.minimum(strength, 2.2)[:, None]
     surroundings = _CAVITY_GLOW * towards_tissue**2 + 0.9 * towards_light**3 + 4.0 * towards_light**90
-    matt = np.maximum(_dot(normals, to_light), 0)[:, None] + _AMBIENT
+    matt = np.maximum(dot(normals, to_light), 0)[:, None] + _AMBIENT
     gleam = 0.10 * towards_light**30 + 0.9 * towards_light**250
     rim = 0.05 * (1 - np.clip(facing, 0, 1)) ** 3
     return np.asarray(

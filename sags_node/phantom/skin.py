@@ -20,7 +20,7 @@ _SEROSA = np.array([0.60, 0.235, 0.205], np.float32)
 _SEROSA_PALE = np.array([0.66, 0.36, 0.30], np.float32)
 _SEROSA_DARK = np.array([0.46, 0.115, 0.115], np.float32)
 _MESENTERY = np.array([0.47, 0.165, 0.140], np.float32)
-_FAT = np.array([0.74, 0.47, 0.225], np.float32)
+_FAT = np.array([0.80, 0.50, 0.24], np.float32)
 _LIVER = np.array([0.200, 0.050, 0.042], np.float32)
 # Optical density of a full vessel: blood takes green and blue; a deep vein looks bluish.
 _ARTERY = np.array([0.55, 1.75, 1.55], np.float32)
@@ -96,7 +96,7 @@ def _mix(a: F32, b: F32, share: F32) -> F32:
 def _fat_share(rng: np.random.Generator, shape: Shape, bed: F32, loop: F32) -> F32:
     """Yellow patches: most of them in the bed, streaks where loops are attached."""
     patches = fractal_noise(rng, shape, 140, 4)
-    return np.asarray(bed * _between(0.1, 0.9, patches) + 0.5 * loop * _between(1.6, 2.4, patches), np.float32)
+    return np.asarray(bed * _between(0.1, 0.9, patches) + 0.45 * loop * _between(2.0, 3.0, patches), np.float32)
 
 
 def _base_color(
@@ -118,8 +118,8 @@ def _base_color(
 def _blood(rng: np.random.Generator, shape: Shape, perfused: F32, wrap: Wrap) -> F32:
     """Optical density [H, W, 3] of the vessels; the number of trees goes with the area."""
     area = shape[0] * shape[1] / 1e6
-    veins = grow_vessels(rng, shape, roots=int(9 * area), width=9.0, thinnest=2.2)
-    arteries = grow_vessels(rng, shape, roots=int(26 * area), width=5.0, thinnest=0.55)
+    veins = grow_vessels(rng, shape, roots=int(7 * area), width=9.0, thinnest=2.0)
+    arteries = grow_vessels(rng, shape, roots=int(24 * area), width=4.2, thinnest=0.5)
     network = np.exp(-((fractal_noise(rng, shape, 26, 2) / 0.10) ** 2))  # lines along the zero crossings
     patchy = _between(-0.6, 1.4, fractal_noise(rng, shape, 160, 2))
     density = (

@@ -6,9 +6,10 @@ import numpy as np
 
 from sags_node.phantom.motion import Clock, keyed
 from sags_node.phantom.relief import Relief
+from sags_node.phantom.vectors import normalized
 from sags_node.types import F32, F64, I64
 
-LIFT = np.array([-0.0030, 0.0025, -0.0120])  # m, how far the grip is pulled up, and aside
+LIFT = np.array([-0.0015, 0.0020, -0.0125])  # m, how far the grip is pulled up, and aside
 LIFT_KEYS = ((0.0, 0.0), (0.20, 0.0), (0.45, 1.0), (0.58, 1.0), (0.80, 0.0), (1.0, 0.0))
 BREATH_LIFT = 0.0012  # m
 HEART_PUSH = 0.0008  # m
@@ -35,10 +36,10 @@ class Tissue:
         across_axis = np.array([-relief.grip_axis[1], relief.grip_axis[0]], np.float32)
         across = from_grip @ across_axis
         wide = np.exp(-0.5 * ((along / 0.017) ** 2 + (across / 0.012) ** 2))
-        sharp = np.exp(-0.5 * (along**2 + across**2) / 0.0042**2)
+        sharp = np.exp(-0.5 * ((along / 0.0065) ** 2 + (across / 0.0045) ** 2))
         pinched = np.exp(-0.5 * ((along / 0.008) ** 2 + (across / 0.006) ** 2))
-        lifted = (0.68 * wide + 0.32 * sharp)[..., None] * LIFT.astype(np.float32)
-        lifted[..., :2] -= (0.42 * pinched * across)[..., None] * across_axis
+        lifted = (0.55 * wide + 0.45 * sharp)[..., None] * LIFT.astype(np.float32)
+        lifted[..., :2] -= (0.60 * pinched * across)[..., None] * across_axis
         self._lifted = lifted
 
         self._breath_delay = 14.0 * y + 6.0 * x  # radians: the wave comes from the diaphragm, far side first
@@ -80,5 +81,4 @@ def vertex_normals(vertices: F32) -> F32:
     down = np.empty_like(vertices)
     down[1:-1] = vertices[2:] - vertices[:-2]
     down[0], down[-1] = down[1], down[-2]
-    normals = np.cross(down, along_row)
-    return normals / np.linalg.norm(normals, axis=-1, keepdims=True)
+    return normalized(np.cross(down, along_row))

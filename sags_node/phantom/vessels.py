@@ -53,15 +53,15 @@ def grow_vessels(
 def _grow(rng: np.random.Generator, sprout: _Sprout, thinnest: float) -> tuple[F32, list[_Sprout]]:
     """One winding stretch [n, 2] (x, y) up to a fork, and what leaves the fork."""
     steps = int(rng.integers(8, 22))
-    step = 1.5 + 2.0 * np.sqrt(sprout.width)
-    bends = np.cumsum(rng.normal(0, 0.16, steps))
+    step = 1.2 + 1.5 * np.sqrt(sprout.width)
+    bends = np.cumsum(rng.normal(0, 0.24, steps))
     headings = sprout.heading + bends
     x = sprout.col + np.concatenate([[0.0], np.cumsum(np.cos(headings) * step)])
     y = sprout.row + np.concatenate([[0.0], np.cumsum(np.sin(headings) * step)])
     children = []
     side = rng.choice([-1.0, 1.0])
     # Murray's law would keep the sum of cubes; the larger branch goes nearly straight on.
-    for share, turn in ((rng.uniform(0.80, 0.94), -0.2), (rng.uniform(0.45, 0.72), rng.uniform(0.6, 1.2))):
+    for share, turn in ((rng.uniform(0.78, 0.92), -0.25), (rng.uniform(0.45, 0.75), rng.uniform(0.7, 1.3))):
         if sprout.width * share >= thinnest:
             heading = float(headings[-1] + side * turn)
             children.append(_Sprout(float(y[-1]), float(x[-1]), heading, sprout.width * share))

@@ -47,9 +47,10 @@ class FolderPairs:
             _check_counts(left, self._left, tools, self._tools)
         _warn_of_gaps(self._left, self._right)
         self.count = len(self._left)
-        self.size = _size(read_picture(self._left[0]))
+        self._size = _size(read_picture(self._left[0]))
         self._next = 0
-        self.read()
+        self.read()  # the first pair shows whether the eyes fit each other
+        self.seek(0)
 
     def seek(self, index: int) -> None:
         self._next = index
@@ -80,9 +81,9 @@ class FolderPairs:
 
     def _picture(self, file: Path, flags: int = cv2.IMREAD_COLOR) -> U8:
         picture = read_picture(file, flags)
-        if _size(picture) != self.size:
+        if _size(picture) != self._size:
             raise SagsError(
-                f"{file} is {size_text(*_size(picture))} px but {self._left[0]} is {size_text(*self.size)}; "
+                f"{file} is {size_text(*_size(picture))} px but {self._left[0]} is {size_text(*self._size)}; "
                 "all pictures must have one size"
             )
         return picture

@@ -183,7 +183,7 @@ def _open_pairs(config: Recording) -> Pairs:
             return VideoPairs(config.left, config.right)
         case cfg.SideBySideSource():
             video = Video(config.video)
-            halves = side_by_side_boxes(video.width, video.height, config.order, str(config.video))
+            halves = side_by_side_boxes(*video.size, config.order, str(config.video))
             return PanePairs(video, *halves)
         case cfg.PanesSource():
             return PanePairs(Video(config.video), config.left, config.right, config.tools)

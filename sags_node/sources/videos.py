@@ -32,10 +32,12 @@ class Video:
         self._open()
         self.rate = self._capture.get(cv2.CAP_PROP_FPS) or None
         self.count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
-        self.width = int(self._capture.get(cv2.CAP_PROP_FRAME_WIDTH))
-        self.height = int(self._capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
-        if self.count <= 0 or not self._capture.grab():
-            raise UsageError(f"video {path} holds no picture")
+        width, height = cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT
+        self.size = int(self._capture.get(width)), int(self._capture.get(height))
+        if self.count <= 0:
+            raise UsageError(f"video {path} does not say how many frames it holds; remux it (ffmpeg -c copy)")
+        if not self._capture.grab():
+            raise UsageError(f"video {path} holds no picture that can be decoded")
         self.seek(0)
 
     def _open(self) -> None:
@@ -90,15 +92,15 @@ class VideoPairs:
     def __init__(self, left: Path, right: Path) -> None:
         self._left, self._right = Video(left), Video(right)
         self.rate, self.count = self._left.rate, self._left.count
-        self.size = self._left.width, self._left.height
-        for what, one, other in (
-            ("px", size_text(*self.size), size_text(self._right.width, self._right.height)),
-            ("frames per second", _rounded(self.rate), _rounded(self._right.rate)),
+        one, other = self._left, self._right
+        for what, fits, values in (
+            ("px", one.size == other.size, (size_text(*one.size), size_text(*other.size))),
+            ("frames/s", _is_same_rate(one.rate, other.rate), (one.rate, other.rate)),
         ):
-            if one != other:
+            if not fits:
                 self.close()
                 raise UsageError(
-                    f"{left} has {one} {what} but {right} has {other}; they are not one stereo pair"
+                    f"{left} has {values[0]} {what} but {right} has {values[1]}; they are not one stereo pair"
                 )
         self._next = 0
 
@@ -153,7 +155,7 @@ class PanePairs:
         if tools is not None:
             self._boxes["tools"] = tools
         self.rate, self.count = video.rate, video.count
-        self.size = left[2], left[3]
+        self._size = left[2], left[3]
         try:
             self._check_boxes()
         except UsageError:
@@ -161,16 +163,16 @@ class PanePairs:
             raise
 
     def _check_boxes(self) -> None:
-        width, height = self._video.width, self._video.height
+        width, height = self._video.size
         for name, (x, y, w, h) in self._boxes.items():
             if min(x, y) < 0 or min(w, h) < 1 or x + w > width or y + h > height:
                 raise UsageError(
                     f"pane '{name}' {x, y, w, h} (x, y, width, height) leaves the picture: "
                     f"{self._video.path} is {size_text(width, height)} px"
                 )
-            if (w, h) != self.size:
+            if (w, h) != self._size:
                 raise UsageError(
-                    f"pane '{name}' is {size_text(w, h)} px but the left pane is {size_text(*self.size)}; "
+                    f"pane '{name}' is {size_text(w, h)} px but the left pane is {size_text(*self._size)}; "
                     "all panes must have one size"
                 )
 
@@ -211,5 +213,6 @@ def _rgb(bgr: U8) -> U8:
     return rgb
 
 
-def _rounded(rate: float | None) -> str:
-    return "unknown" if rate is None else f"{rate:.2f}"
+def _is_same_rate(one: float | None, other: float | None) -> bool:
+    """Rates measured from a file's stamps differ a little."""
+    return one is None or other is None or abs(one - other) <= 0.01 * one

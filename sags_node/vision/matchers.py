@@ -50,10 +50,10 @@ class SemiGlobal:
 class InverseSearch:
     """Dense inverse search (Kroeger et al., ECCV 2016), an optical flow, from left to right.
 
-    On the smooth surface of organs it is more accurate than `SemiGlobal` in the same time, but it only refines a
-    guess that is right to a few pixels. A coarse `SemiGlobal` gives it afresh for every frame: that takes a
-    millisecond, is as accurate as starting from the previous frame's disparity, and keeps no memory that could
-    lock in an error.
+    On the smooth surface of organs it is more accurate than `SemiGlobal` in the same time, but it only
+    refines a guess that is right to a few pixels. A coarse `SemiGlobal` gives it afresh for every frame: that
+    takes a millisecond, is as accurate as starting from the previous frame's disparity, and keeps no memory
+    that could lock in an error.
     """
 
     def __init__(self, smallest: float, largest: float, size: tuple[int, int]) -> None:

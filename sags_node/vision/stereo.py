@@ -21,9 +21,9 @@ EDGE_MARGIN = 5 / 640  # of the width: depths smear that far across an instrumen
 class StereoDepth:
     """Depth of the left rectified picture. Keeps nothing from frame to frame.
 
-    Matching runs at the working size divided by `config.scale`. A match is trusted as far as its neighbourhood
-    agrees with the place in the right picture that it was matched to: the confidence is 0 at a zero-mean
-    normalised cross-correlation (ZNCC) of 0.5 and below, where the depth is unknown, and 1 at a ZNCC of 1.
+    Matching runs at the working size divided by `config.scale`. A match is trusted as far as its
+    neighbourhood agrees with the place in the right picture that it was matched to: the confidence is 0 at a
+    zero-mean normalised cross-correlation (ZNCC) of 0.5 and below, where the depth is unknown, and 1 at 1.
 
     Raises:
         UsageError: the pictures are too small to match, or no disparity fits the depth range.
@@ -43,8 +43,8 @@ class StereoDepth:
         self._largest = min(self._focal * baseline / config.min_depth, width - 1.0)
         if self._smallest >= self._largest:
             raise UsageError(
-                f"the eyes' pictures do not overlap at vision.stereo.max_depth {config.max_depth} m; raise it "
-                f"or check the calibration's baseline, {baseline * 1e3:.3g} mm"
+                f"the eyes' pictures do not overlap at vision.stereo.max_depth {config.max_depth} m; raise "
+                f"it or check the calibration's baseline, {baseline * 1e3:.3g} mm"
             )
         self._match: SemiGlobal | InverseSearch
         if config.method == "sgbm":
@@ -93,8 +93,8 @@ class StereoDepth:
         variance_a = _mean(a * a) - mean_a * mean_a
         variance_b = _mean(b * b) - mean_b * mean_b
         noise = np.float32(NOISE_VARIANCE)
-        agreement: F32 = covariance / np.sqrt((variance_a + noise) * (variance_b + noise))
-        return agreement
+        spread = np.sqrt((variance_a + noise) * (variance_b + noise))
+        return (covariance / spread).astype(np.float32, copy=False)
 
     def _enlarge(
         self, disparity: F32, known: Bool, confidence: F32, size: tuple[int, int]

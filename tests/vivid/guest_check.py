@@ -9,6 +9,8 @@ import json
 import logging
 import threading
 import time
+from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -28,10 +30,10 @@ def facts(frames: list[StereoFrame]) -> dict[str, Any]:
     return {
         "frames": len(frames),
         "sizes": sorted({frame.left.shape for frame in frames} | {frame.right.shape for frame in frames}),
-        "left_advances": all(b > a for a, b in zip(left, left[1:], strict=False)),
-        "right_advances": all(b > a for a, b in zip(right, right[1:], strict=False)),
+        "left_advances": all(b > a for a, b in pairwise(left)),
+        "right_advances": all(b > a for a, b in pairwise(right)),
         "largest_skew_ms": max(abs(a - b) for a, b in zip(left, right, strict=True)) / 1e6,
-        "ids_advance": all(b.frame_id > a.frame_id for a, b in zip(frames, frames[1:], strict=False)),
+        "ids_advance": all(b.frame_id > a.frame_id for a, b in pairwise(frames)),
         "age_ms": (time.time_ns() - left[-1]) / 1e6,
         "contrast": float(frames[-1].left.std()),
         "pictures_differ": bool((frames[0].left != frames[-1].left).any()),
@@ -51,14 +53,17 @@ def take(config: V4l2Source, count: int) -> dict[str, Any]:
 def unplug_and_replug() -> dict[str, Any]:
     """Unbinding the driver makes both device files vanish under the open cameras, as pulling a plug does."""
     frames: list[StereoFrame] = []
-    vanished = threading.Event()
     with open_source(TWO) as source:
-        taking = threading.Thread(target=lambda: [frames.append(frame) for frame in source])
+
+        def keep_frames() -> None:
+            for frame in source:
+                frames.append(frame)
+
+        taking = threading.Thread(target=keep_frames)
         taking.start()
         wait_for(lambda: len(frames) >= 3)
         (DRIVER / "unbind").write_text("vivid.0")
-        if not Path("/dev/video0").exists():
-            vanished.set()
+        vanished = not Path("/dev/video0").exists()
         time.sleep(0.5)
         before = len(frames)
         (DRIVER / "bind").write_text("vivid.0")
@@ -66,14 +71,14 @@ def unplug_and_replug() -> dict[str, Any]:
         source.stop()
         taking.join(10)
     return {
-        "vanished": vanished.is_set(),
+        "vanished": vanished,
         "before": before,
         "after": len(frames),
         "ended": not taking.is_alive(),
     }
 
 
-def wait_for(condition: Any) -> None:
+def wait_for(condition: Callable[[], bool]) -> None:
     end = time.monotonic() + 30
     while not condition() and time.monotonic() < end:
         time.sleep(0.02)

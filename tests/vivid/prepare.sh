@@ -37,6 +37,8 @@ if [ ! -f "$cache/vmlinuz" ] || [ ! -d "$cache/root/lib/modules" ]; then
             mkdir -p "$cache/root/$modules/$(dirname "$module")"
             cp "$work/tree/$modules/$module" "$cache/root/$modules/$module"
         done
+    [ -f "$cache/root/$modules/kernel/drivers/media/test-drivers/vivid/vivid.ko" ] ||
+        { echo "prepare.sh: $package holds no uncompressed vivid module" >&2; exit 1; }
     cp "$work/tree/boot/vmlinuz-$release" "$cache/vmlinuz"
 fi
 

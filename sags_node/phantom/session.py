@@ -1,0 +1,137 @@
+"""A phantom session on disk: pictures, masks, truth, calibration and the launch file that plays them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import cv2
+import numpy as np
+import yaml
+
+from sags_node.calibration import save_rig
+from sags_node.config import PhantomSource
+from sags_node.errors import SagsError, UsageError
+from sags_node.phantom.scene import Phantom, PhantomFrame
+
+Progress = Callable[[int, int], None]  # frames done, frames in all
+
+VERSION = 1  # of what the generator draws: a cached session of another version is not used
+RATE = 30.0  # frames per second
+DEPTH_UNIT = 2.5e-6  # m per count
+JPEG_QUALITY = 95
+_SHAPING = ("seconds", "width", "height", "seed", "camera_motion", "smoke", "noise", "blur")
+_COMPLETE = "launch.yaml"  # written last
+
+
+def cached_session(config: PhantomSource, progress: Progress | None = None) -> Path:
+    """Folder of the session for `config` under `$XDG_CACHE_HOME/sags` (default `~/.cache/sags`).
+
+    Rendered at 30 frames per second when it is not there yet; see `write_session`.
+    """
+    shaping = {"version": VERSION, "rate": RATE} | {name: getattr(config, name) for name in _SHAPING}
+    digest = hashlib.sha256(json.dumps(shaping, sort_keys=True).encode()).hexdigest()[:16]
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sags"
+    folder = cache / f"phantom-{digest}"
+    if not (folder / _COMPLETE).exists():
+        write_session(config, folder, RATE, progress)
+    return folder
+
+
+def write_session(
+    config: PhantomSource, folder: Path, rate: float = RATE, progress: Progress | None = None
+) -> None:
+    """Render `round(config.seconds * rate)` frames and all that is true of them into a new folder.
+
+    The folder appears only when it is complete: until then everything is in a sibling whose name ends in
+    `.partial`, which is removed when rendering is interrupted. `sags_node.config.load_launch(folder)` reads it.
+    Same config and rate, same files on one machine.
+
+    Raises:
+        UsageError: the folder exists and is not empty.
+        SagsError: the folder cannot be written.
+    """
+    folder = Path(folder)
+    count = max(1, round(config.seconds * rate))
+    partial = folder.with_name(f"{folder.name}.{os.getpid()}.partial")
+    try:
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise UsageError(f"{folder} exists and is not empty; name a new folder for the phantom session")
+        partial.mkdir(parents=True)
+        _write_frames(config, partial, count, rate, progress)
+        partial.rename(folder)
+    except OSError as error:
+        raise SagsError(
+            f"cannot write the phantom session {folder}: {error.strerror}; check space and rights"
+        ) from None
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def _write_frames(
+    config: PhantomSource, folder: Path, count: int, rate: float, progress: Progress | None
+) -> None:
+    phantom = Phantom(config)
+    digits = max(4, len(str(count - 1)))  # sources sort by name
+    for name in ("left", "right", "tools", "depth"):
+        (folder / name).mkdir()
+
+    def render(index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        frame = phantom.frame(index, count)
+        _write_pictures(frame, folder, f"{index:0{digits}d}")
+        return frame.points, frame.visible, frame.T_world_cam
+
+    truth = []
+    workers = min(4, os.cpu_count() or 1)
+    with ThreadPoolExecutor(workers) as pool:
+        waiting = [pool.submit(render, index) for index in range(count)]
+        try:
+            for done in waiting:
+                truth.append(done.result())
+                if progress:
+                    progress(len(truth), count)
+        except BaseException:
+            pool.shutdown(wait=True, cancel_futures=True)
+            raise
+    points, visible, poses = (np.stack(part) for part in zip(*truth, strict=True))
+    np.savez(folder / "tracks.npz", points=points, visible=visible)
+    np.savez(folder / "poses.npz", T_world_cam=poses)
+    save_rig(phantom.rig, folder / "calib")
+    launch = {
+        "source": {
+            "kind": "folders",
+            "left": "left",
+            "right": "right",
+            "tools": "tools",
+            "poses": "poses.npz",
+            "rate": rate,
+            "reference": {
+                "depth": "depth",
+                "depth_unit": DEPTH_UNIT,
+                "depth_kind": "exact",
+                "tracks": "tracks.npz",
+            },
+        },
+        "rig": "calib",
+        "vision": {"width": config.width, "height": config.height},
+    }
+    (folder / _COMPLETE).write_text(yaml.safe_dump(launch, sort_keys=False), encoding="utf-8")
+
+
+def _write_pictures(frame: PhantomFrame, folder: Path, stem: str) -> None:
+    jpeg = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+    counts = np.clip(np.round(frame.depth / DEPTH_UNIT), 0, 65535).astype(np.uint16)
+    _write(folder / "left" / f"{stem}.jpg", frame.left[..., ::-1], jpeg)
+    _write(folder / "right" / f"{stem}.jpg", frame.right[..., ::-1], jpeg)
+    _write(folder / "tools" / f"{stem}.png", np.where(frame.tool, 255, 0).astype(np.uint8), [])
+    _write(folder / "depth" / f"{stem}.png", counts, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+
+
+def _write(file: Path, picture: np.ndarray, options: list[int]) -> None:
+    """`cv2.imwrite` only returns False on a full disk; a file written by Python raises."""
+    file.write_bytes(cv2.imencode(file.suffix, picture, options)[1].tobytes())

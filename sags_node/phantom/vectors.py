@@ -1,0 +1,17 @@
+"""Dot products and unit vectors of long float32 lists; einsum is several times faster here than `numpy.linalg`."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sags_node.types import F32
+
+
+def dot(a: F32, b: F32) -> F32:
+    """Dot products [...] of vectors [..., 3]."""
+    return np.asarray(np.einsum("...c,...c->...", a, b))
+
+
+def normalized(vectors: F32) -> F32:
+    """Unit vectors [..., 3] of vectors of any length but zero."""
+    return np.asarray(vectors * (1 / np.sqrt(dot(vectors, vectors)))[..., None])

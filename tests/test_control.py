@@ -1,0 +1,194 @@
+"""Requests to the node over a real socket, sane and insane."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures import Future
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import independent_client as client
+import msgpack
+import numpy as np
+import pytest
+import zmq
+
+from sags_node.config import PublishConfig
+from sags_node.errors import SagsError
+from sags_node.messaging.control import MAX_PENDING, ControlClient, Handler
+from sags_node.messaging.publisher import Publisher
+
+
+def refuse(args: dict[str, Any]) -> Any:
+    raise SagsError("mapping.nothing cannot be changed")
+
+
+@contextmanager
+def node(run_dir: Path, handlers: dict[str, Handler]) -> Iterator[str]:
+    """A publisher that answers from its own thread; gives the control endpoint."""
+    config = PublishConfig(data=(), control="tcp://127.0.0.1:*", run_dir=run_dir)
+    stop = threading.Event()
+    with Publisher(config, "sags", "session-1", handlers) as running:
+        thread = threading.Thread(target=lambda: [running.poll(20) for _ in iter(stop.is_set, True)])
+        thread.start()
+        try:
+            yield str(running.connection.control)
+        finally:
+            stop.set()
+            thread.join()
+
+
+def test_results_and_errors_come_back(tmp_path: Path) -> None:
+    handlers: dict[str, Handler] = {
+        "double": lambda args: {"twice": args["x"] * 2},
+        "refuse": refuse,
+        "broken": lambda args: args["missing"],
+        "unsendable": lambda args: object(),
+    }
+    with node(tmp_path / "run", handlers) as endpoint, ControlClient(endpoint) as asker:
+        assert asker.request("ping") == "pong"
+        assert asker.request("double", {"x": 21}) == {"twice": 42}
+        with pytest.raises(SagsError, match=r"refuse: mapping\.nothing cannot be changed"):
+            asker.request("refuse")
+        with pytest.raises(SagsError, match="KeyError"):
+            asker.request("broken")
+        with pytest.raises(SagsError, match="internal error"):
+            asker.request("unsendable")
+        with pytest.raises(SagsError, match="unknown op 'doubel'.*double"):
+            asker.request("doubel")
+        assert asker.request("ping") == "pong"
+
+
+def test_the_client_finds_the_node_by_its_name(tmp_path: Path) -> None:
+    with node(tmp_path / "run", {}), ControlClient(run_dir=tmp_path / "run") as asker:
+        assert asker.request("ping") == "pong"
+    with pytest.raises(SagsError, match="sags run"):
+        ControlClient(run_dir=tmp_path / "run")
+
+
+def test_a_client_without_our_code_is_answered(tmp_path: Path) -> None:
+    with node(tmp_path / "run", {"refuse": refuse}) as endpoint:
+        assert client.request(endpoint, "ping", {}) == {"v": "1.0", "id": 7, "ok": True, "result": "pong"}
+        reply = client.request(endpoint, "refuse", {})
+        assert reply["ok"] is False and "cannot be changed" in reply["error"]
+
+
+def test_a_future_is_answered_when_it_is_done_and_others_meanwhile(tmp_path: Path) -> None:
+    waiting: list[Future[Any]] = []
+
+    def later(args: dict[str, Any]) -> Future[Any]:
+        waiting.append(Future())
+        return waiting[-1]
+
+    with node(tmp_path / "run", {"later": later}) as endpoint:
+        with ControlClient(endpoint) as slow, ControlClient(endpoint) as quick:
+            answers: list[Any] = []
+            thread = threading.Thread(target=lambda: answers.append(slow.request("later", timeout=10)))
+            thread.start()
+            assert quick.request("ping") == "pong"
+            assert answers == []
+            waiting[0].set_result({"done": True})
+            thread.join()
+            assert answers == [{"done": True}]
+            waiting.clear()
+            with pytest.raises(SagsError, match="no answer"):
+                slow.request("later", timeout=0.05)
+            waiting[0].set_exception(SagsError("too late"))
+            assert slow.request("ping") == "pong"  # the late answer is not taken for this one
+
+
+def test_what_is_owed_is_bounded(tmp_path: Path) -> None:
+    with node(tmp_path / "run", {"never": lambda args: Future()}) as endpoint:
+        context = zmq.Context()
+        asker = context.socket(zmq.DEALER)
+        asker.connect(endpoint)
+        for i in range(MAX_PENDING + 5):
+            asker.send(msgpack.packb({"v": "1.0", "id": i, "op": "never"}))
+        refused = [msgpack.unpackb(asker.recv()) for _ in range(5) if asker.poll(5000)]
+        assert [reply["ok"] for reply in refused] == [False] * 5
+        assert "waiting" in refused[0]["error"]
+        context.destroy(linger=0)
+
+
+def test_silence_is_an_error() -> None:
+    with (
+        ControlClient("tcp://127.0.0.1:9") as asker,
+        pytest.raises(SagsError, match=r"no answer from tcp://127\.0\.0\.1:9 in 0\.1 s"),
+    ):
+        asker.request("ping", timeout=0.1)
+
+
+def _random_value(rng: np.random.Generator, depth: int = 0) -> Any:
+    choices: list[Any] = [
+        None,
+        True,
+        -1,
+        2**64 - 1,
+        float("nan"),
+        "x" * int(rng.integers(300)),
+        rng.bytes(20),
+    ]
+    if depth < 3:
+        choices += [
+            [_random_value(rng, depth + 1) for _ in range(int(rng.integers(4)))],
+            {str(i): _random_value(rng, depth + 1) for i in range(int(rng.integers(4)))},
+            msgpack.ExtType(int(rng.integers(128)), b"ext"),
+        ]
+    return choices[int(rng.integers(len(choices)))]
+
+
+def _random_request(rng: np.random.Generator) -> bytes:
+    kind = int(rng.integers(6))
+    if kind == 0:
+        return rng.bytes(int(rng.integers(200)))
+    if kind == 1:
+        return b"\x91" * int(rng.integers(1, 60_000))  # arrays in arrays
+    if kind == 2:
+        return b"\x81\xa4args" + b"\x81" * 2000 + b"\xc0"  # maps as keys of maps
+    fields = {"v": "1.0", "id": int(rng.integers(99)), "op": "echo", "args": {"a": _random_value(rng)}}
+    if kind == 3:
+        fields[str(rng.choice(["v", "id", "op", "args"]))] = _random_value(rng)
+    body = bytearray(msgpack.packb(fields))
+    if kind == 4:
+        body[int(rng.integers(len(body)))] = int(rng.integers(256))
+    return bytes(body)
+
+
+def test_thousands_of_random_requests_do_no_harm(tmp_path: Path) -> None:
+    rng = np.random.default_rng(4)
+    with node(tmp_path / "run", {"echo": lambda args: args}) as endpoint:
+        context = zmq.Context()
+        asker = context.socket(zmq.DEALER)
+        asker.setsockopt(zmq.SNDTIMEO, 5000)
+        asker.connect(endpoint)
+        answered = 0
+        for i in range(3000):
+            parts = [_random_request(rng)]
+            if i % 50 == 0:
+                parts = [b""] * int(rng.integers(1, 40)) + parts
+            asker.send_multipart(parts)
+            while asker.poll(0):
+                answered += _is_reply(asker.recv_multipart()[-1])
+        deadline = time.monotonic() + 10
+        while answered < 2900 and time.monotonic() < deadline and asker.poll(500):
+            answered += _is_reply(asker.recv_multipart()[-1])
+        context.destroy(linger=0)
+        assert answered >= 2900  # all but those in too many parts
+        with ControlClient(endpoint) as sane:
+            assert sane.request("echo", {"a": [1, {"b": 2.5}]}) == {"a": [1, {"b": 2.5}]}
+
+
+def test_an_oversized_request_is_cut_off(tmp_path: Path) -> None:
+    with node(tmp_path / "run", {"echo": lambda args: len(args["a"])}) as endpoint:
+        with ControlClient(endpoint) as asker, pytest.raises(SagsError, match="no answer"):
+            asker.request("echo", {"a": "x" * 1_000_000}, timeout=0.3)
+        with ControlClient(endpoint) as asker:
+            assert asker.request("echo", {"a": "x" * 60_000}) == 60_000
+
+
+def _is_reply(body: bytes) -> bool:
+    reply = msgpack.unpackb(body, strict_map_key=False)
+    return reply["v"] == "1.0" and isinstance(reply["ok"], bool)

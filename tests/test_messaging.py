@@ -1,0 +1,430 @@
+"""The publisher over real sockets, judged by a client that knows only the wire contract."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import socket
+import stat
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import independent_client as client
+import numpy as np
+import pytest
+import zmq
+from rosbags.typesys import Stores, get_typestore
+from synthetic import (
+    BASELINE,
+    HEIGHT,
+    WIDTH,
+    at_frame,
+    health,
+    plane_depth,
+    plane_result,
+    publisher,
+    stream,
+)
+
+from sags_node.config import PublishConfig
+from sags_node.errors import SagsError, UsageError
+from sags_node.geometry import project
+from sags_node.messaging import topics
+from sags_node.messaging.publisher import Publisher
+from sags_node.messaging.rundir import read_connection
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+FRAME_TOPICS = [t.name for t in topics.TOPICS if t.name not in ("status", "diagnostics", "parameters")]
+
+
+@pytest.fixture(scope="module")
+def received(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[client.Received]]:
+    """Five messages of every topic but `parameters`, as the independent client gets them over tcp."""
+    names = [t.name for t in topics.TOPICS if t.name != "parameters"]
+    run_dir = tmp_path_factory.mktemp("run", numbered=True) / "sags"
+    with publisher(run_dir, right=True) as running, stream(running):
+        endpoint = running.connection.data[-1]
+        assert endpoint.startswith("tcp://")
+        got = client.collect(endpoint, [f"sags/{name}" for name in names], count=5, timeout=20)
+    return {name: got[f"sags/{name}"] for name in names}
+
+
+# ---- what the frame topics say -------------------------------------------------------------------------
+
+
+def test_every_topic_arrives_complete_and_in_order(received: dict[str, list[client.Received]]) -> None:
+    for name, messages in received.items():
+        assert len(messages) == 5, name
+        for message in messages:
+            client.check_meta(message, topics.BY_NAME[name].type)
+            assert message.meta["session"] == "session-1"
+        assert client.check_sequence(messages) == 0, name
+
+
+def test_topics_of_one_frame_share_its_stamp(received: dict[str, list[client.Received]]) -> None:
+    stamps = {m.meta["frame_id"]: m.meta["stamp_ns"] for m in received["left/image_rect_color"]}
+    shared = 0
+    for name in FRAME_TOPICS:
+        for message in received[name]:
+            if message.meta["frame_id"] in stamps:
+                assert message.meta["stamp_ns"] == stamps[message.meta["frame_id"]], name
+                shared += 1
+    assert shared > 3 * len(FRAME_TOPICS)
+
+
+def test_pictures_and_mask_are_those_of_the_frame(received: dict[str, list[client.Received]]) -> None:
+    truth = plane_result()
+    left = client.check_image(received["left/image_rect_color"][0], "rgb8", WIDTH, HEIGHT)
+    right = client.check_image(received["right/image_rect_color"][0], "rgb8", WIDTH, HEIGHT)
+    mask = client.check_image(received["left/tissue_mask"][0], "mono8", WIDTH, HEIGHT)
+    assert np.array_equal(left, truth.pair.left) and np.array_equal(right, truth.pair.right)
+    assert np.array_equal(mask, np.where(truth.observation.tissue, 255, 0))
+    for name in ("left/render/image", "right/render/image"):
+        render = client.check_image(received[name][0], "rgba8", WIDTH, HEIGHT)
+        assert np.abs(render[..., :3].astype(int) - truth.pair.left).max() <= 1
+        assert np.abs(render[..., 3].astype(int) - 191).max() <= 1  # 0.75
+
+
+@pytest.mark.parametrize("name", ["left/depth", "left/render/depth"])
+def test_depth_is_metric(received: dict[str, list[client.Received]], name: str) -> None:
+    depth = client.check_image(received[name][0], "32FC1", WIDTH, HEIGHT)
+    truth = plane_depth(plane_result().pair.camera)
+    median, p90, coverage = client.depth_error(depth, truth)
+    assert p90 < 1e-7 and median < 1e-7
+    assert coverage == pytest.approx((HEIGHT - 1) / HEIGHT)
+    assert np.isnan(depth[0]).all()
+
+
+def test_cameras_and_pose_project_the_splats_to_their_pixels(
+    received: dict[str, list[client.Received]],
+) -> None:
+    """Camera info, tf and splats together put every Gaussian on the pixel it was made from."""
+    left = client.camera_info(received["left/camera_info"][0])
+    T_world_cam = client.camera_pose(received["tf"][0])
+    splats = client.check_splats(received["splats"][0])
+    means = np.stack([splats[axis] for axis in "xyz"], axis=1).astype(np.float64)
+    local = (means - T_world_cam[:3, 3]) @ T_world_cam[:3, :3]
+    pixels = (local @ left["K"].T)[:, :2] / local[:, 2:]
+    expected = np.stack(np.meshgrid(np.arange(2, WIDTH, 4), np.arange(2, HEIGHT, 4)), -1).reshape(-1, 2)
+    assert np.abs(pixels - expected).max() < 1e-3
+    assert (left["width"], left["height"], left["frame"]) == (WIDTH, HEIGHT, "left_optical_frame")
+    right = client.camera_info(received["right/camera_info"][0])
+    assert right["frame"] == "right_optical_frame"
+    assert -right["P"][0, 3] / right["P"][0, 0] == pytest.approx(BASELINE)
+    assert left["P"][0, 3] == 0
+
+
+def test_splats_hold_activated_values(received: dict[str, list[client.Received]]) -> None:
+    gaussians = plane_result().snapshot.gaussians
+    splats = client.check_splats(received["splats"][0])
+    assert np.allclose(client.splat_colors(splats), gaussians.colors, atol=1e-5)
+    assert np.allclose(splats["opacity"], gaussians.opacities)
+    assert np.allclose([splats["scale_0"][0], splats["scale_1"][0], splats["scale_2"][0]], [1e-3, 2e-3, 5e-4])
+    assert np.allclose(splats["rot_z"], 1.5 / np.sqrt(3))
+    assert np.array_equal(splats["id"], gaussians.ids)
+
+
+def test_points_are_coloured(received: dict[str, list[client.Received]]) -> None:
+    truth = plane_result()
+    message = received["points"][0]
+    xyz = message.array()[:, :3]
+    pixels, _ = project(truth.pair.camera, xyz.astype(np.float64))
+    u, v = np.rint(pixels).astype(int).T
+    assert np.abs(client.point_colors(message).astype(int) - truth.pair.left[v, u]).max() <= 1
+
+
+def test_status_is_json_and_says_what_was_skipped(received: dict[str, list[client.Received]]) -> None:
+    status = json.loads(client.text(received["status"][0]))
+    assert status["state"] == "running" and status["rate_hz"] == 30.0
+    assert status["latency_ms"] == {"p50": 40.0, "max": None}
+    assert status["last_frame"]["skipped"] == {"keyframe": "budget spent"}
+
+
+def test_joined_parts_are_ros_messages(received: dict[str, list[client.Received]]) -> None:
+    for name, messages in received.items():
+        kind = messages[0].meta["type"]
+        ros = STORE.deserialize_cdr(messages[0].cdr(), kind)
+        assert bytes(STORE.serialize_cdr(ros, kind)) == messages[0].cdr(), name
+    diagnostics = STORE.deserialize_cdr(received["diagnostics"][0].cdr(), topics.DIAGNOSTICS)
+    assert [(s.name, s.level) for s in diagnostics.status] == [("node", 0), ("rectify", 0), ("map", 0)]
+
+
+# ---- who asks, and when --------------------------------------------------------------------------------
+
+
+def test_a_late_subscriber_gets_the_last_values(tmp_path: Path) -> None:
+    """No frame is published any more: only the cached topics come, with their old stamps."""
+    with publisher(tmp_path / "run") as running:
+        old = time.time_ns() - 5_000_000_000
+        running.publish_result(plane_result(stamp_ns=old), dropped=0)
+        running.publish_health(health())
+        running.publish_parameters({"mapping": {"budget_ms": 33.0}})
+        names = ["left/camera_info", "splats", "parameters", "status", "left/depth", "points"]
+        got = _collect_while_polling(running, [f"sags/{name}" for name in names], seconds=1.0)
+    counts = {name: len(got[f"sags/{name}"]) for name in names}
+    assert counts == {
+        "left/camera_info": 1,
+        "splats": 1,
+        "parameters": 1,
+        "status": 1,
+        "left/depth": 0,
+        "points": 0,
+    }
+    assert got["sags/splats"][0].meta["stamp_ns"] == old
+    assert got["sags/splats"][0].meta["seq"] == 1
+    assert json.loads(client.text(got["sags/parameters"][0])) == {"mapping": {"budget_ms": 33.0}}
+
+
+def test_only_what_is_subscribed_to_is_encoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from sags_node.messaging import content  # the table is replaced, not the module's functions
+
+    encoded: list[str] = []
+    counted = {
+        name: (lambda result, name=name, build=build: (encoded.append(name), build(result))[1])
+        for name, build in content.FRAME_CONTENT.items()
+    }
+    monkeypatch.setattr(content, "FRAME_CONTENT", counted)
+    with publisher(tmp_path / "run") as running:
+        with stream(running, rate=100):
+            client.collect(running.connection.data[-1], ["sags/left/depth"], count=3, timeout=10)
+            assert set(encoded) == {"left/depth"}
+        for _ in range(20):  # the peer is gone: its subscription ends
+            running.poll(20)
+        encoded.clear()
+        running.publish_result(plane_result(), dropped=0)
+        assert encoded == [] and not running.wanted("left/depth")
+
+
+def test_right_eye_is_off_by_default(tmp_path: Path) -> None:
+    with publisher(tmp_path / "run") as running, stream(running):
+        got = client.collect(running.connection.data[0], ["sags/right/camera_info"], count=1, timeout=0.5)
+    assert got["sags/right/camera_info"] == []
+
+
+def test_a_prefix_subscribes_to_all_below_it(tmp_path: Path) -> None:
+    with publisher(tmp_path / "run") as running:
+        peer, context = _subscriber(running.connection.data[-1], "sags/left/render")
+        _poll_until(running, lambda: running.wanted("left/render/depth"))
+        assert running.wanted("left/render/image") and not running.wanted("left/depth")
+        running.publish_result(plane_result(), dropped=0)
+        names = {peer.recv_multipart()[0] for _ in range(2) if peer.poll(5000)}
+        assert names == {b"sags/left/render/image", b"sags/left/render/depth"}
+        context.destroy(linger=0)
+
+
+def test_restart_and_loop_are_visible(tmp_path: Path) -> None:
+    result = plane_result(epoch=4, step=11)
+    with publisher(tmp_path / "run") as running, stream(running, lambda i: at_frame(result, i, i + 1, 4 + i)):
+        got = client.collect(running.connection.data[-1], ["sags/tf"], count=3, timeout=10)["sags/tf"]
+    assert [m.meta["epoch"] - m.meta["frame_id"] for m in got] == [4, 4, 4]
+    assert {m.meta["step"] for m in got} == {11}
+    assert [m.meta["dropped"] for m in got] == [m.meta["frame_id"] // 2 for m in got]
+
+
+# ---- bad peers -----------------------------------------------------------------------------------------
+
+
+def test_a_subscriber_that_never_reads_harms_nobody(tmp_path: Path) -> None:
+    """Publishing goes on, memory stays bounded, and a good peer beside it gets every message."""
+    big = plane_result()
+    frames, published = 400, 0
+    with publisher(tmp_path / "run") as running:
+        _dead, context = _subscriber(running.connection.data[-1], "sags/", high_water=1)
+        good, good_context = _subscriber(running.connection.data[0], "sags/tf")
+        _poll_until(running, lambda: running.wanted("splats"))
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        seen = []
+        for i in range(frames):
+            running.publish_result(at_frame(big, i, i + 1), dropped=0)
+            running.poll(0)
+            published += 1
+            if good.poll(2000):
+                seen.append(good.recv_multipart(copy=False))
+        grown_mb = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
+        context.destroy(linger=0)
+        good_context.destroy(linger=0)
+    sent_mb = frames * 10 * WIDTH * HEIGHT * 4 / 1e6  # had it all been kept
+    assert published == frames and len(seen) == frames
+    assert grown_mb < sent_mb / 3
+
+
+@pytest.mark.parametrize("which", ["data", "control"])
+def test_garbage_bytes_do_no_harm(tmp_path: Path, which: str) -> None:
+    rng = np.random.default_rng(3)
+    with publisher(tmp_path / "run") as running:
+        connection = running.connection
+        endpoint = connection.data[-1] if which == "data" else connection.control
+        host, port = str(endpoint).removeprefix("tcp://").split(":")
+        for size in (1, 9, 10, 64, 1000, 4000):
+            for start in (b"", b"\xff\x00\x00\x00\x00\x00\x00\x00\x01\x7f", b"\x01\x00", b"\xff" * 12):
+                with socket.create_connection((host, int(port)), timeout=2) as raw:
+                    raw.sendall(start + rng.bytes(size))
+                    running.poll(1)
+        with stream(running):
+            got = client.collect(connection.data[-1], ["sags/left/depth"], count=2, timeout=10)
+            assert client.request(str(connection.control), "ping", {})["result"] == "pong"
+    assert len(got["sags/left/depth"]) == 2
+
+
+def test_subscription_spam_is_bounded(tmp_path: Path) -> None:
+    """Unknown and oversized subscriptions leave no trace in the publisher, and others are still served."""
+    with publisher(tmp_path / "run") as running:
+        context = zmq.Context()
+        spammer = context.socket(zmq.XSUB)
+        spammer.setsockopt(zmq.SNDHWM, 0)
+        spammer.connect(running.connection.data[-1])
+        for i in range(10_000):
+            spammer.send(b"\x01junk/%d" % i)
+        spammer.send(b"\x01\xff\xfe")
+        spammer.send(b"\x05sags/tf")
+        with stream(running):
+            got = client.collect(running.connection.data[-1], ["sags/tf"], count=2, timeout=20)
+        context.destroy(linger=0)
+        assert running._subscribed <= {"sags/tf"}
+    assert len(got["sags/tf"]) == 2
+
+
+# ---- where it listens ----------------------------------------------------------------------------------
+
+
+def test_run_directory_and_connection_file_are_private(tmp_path: Path) -> None:
+    run_dir = tmp_path / "run"
+    with publisher(run_dir) as running:
+        file = run_dir / "sags.json"
+        assert stat.S_IMODE(run_dir.stat().st_mode) == 0o700
+        assert stat.S_IMODE(file.stat().st_mode) == 0o600
+        said = json.loads(file.read_text())
+        assert said["pid"] == os.getpid() and said["protocol"] == "1.0" and said["ns"] == "sags"
+        assert said["public_key"] is None and said["session"] == "session-1"
+        assert said["data"] == running.connection.data
+        assert said["data"][0] == f"ipc://{run_dir}/sags.ipc" and said["control"].startswith(
+            "tcp://127.0.0.1:"
+        )
+        assert read_connection("sags", run_dir) == running.connection
+    assert not file.exists() and not (run_dir / "sags.ipc").exists()
+    with pytest.raises(SagsError, match="sags run"):
+        read_connection("sags", run_dir)
+
+
+def test_a_damaged_connection_file_is_named(tmp_path: Path) -> None:
+    (tmp_path / "sags.json").write_bytes(b"{" * 100_000)
+    with pytest.raises(SagsError, match="damaged"):
+        read_connection("sags", tmp_path)
+
+
+@pytest.mark.parametrize(
+    "endpoint",
+    [
+        "tcp://*:5556",
+        "tcp://0.0.0.0:5556",
+        "tcp://192.168.1.4:5556",
+        "tcp://[::]:5556",
+        "tcp://eth0:5556",
+        "udp://127.0.0.1:1",
+        "127.0.0.1:5556",
+        "tcp://",
+    ],
+)
+@pytest.mark.parametrize("key", ["data", "control"])
+def test_other_machines_are_refused(tmp_path: Path, key: str, endpoint: str) -> None:
+    value: Any = (endpoint,) if key == "data" else endpoint
+    with pytest.raises(UsageError), publisher(tmp_path / "run", **{key: value}):
+        pass
+    assert not (tmp_path / "run").exists()
+
+
+def test_insecure_allows_them(tmp_path: Path) -> None:
+    with publisher(tmp_path / "run", data=("tcp://*:*",), insecure=True) as running:
+        assert running.connection.data[-1].startswith("tcp://0.0.0.0:")
+
+
+def test_a_taken_port_is_named_with_a_way_out(tmp_path: Path) -> None:
+    with publisher(tmp_path / "one") as running:
+        taken = running.connection.data[-1]
+        with (
+            pytest.raises(SagsError, match=rf"{taken} is already in use.*publish\.data:=") as raised,
+            publisher(tmp_path / "two", data=(taken,)),
+        ):
+            pass
+        assert raised.value.exit_code == 1
+        with publisher(tmp_path / "two"):  # nothing was left behind by the failure
+            pass
+
+
+def test_one_name_one_node(tmp_path: Path) -> None:
+    with (
+        publisher(tmp_path / "run"),
+        pytest.raises(SagsError, match="another node already runs as 'sags'"),
+        publisher(tmp_path / "run"),
+    ):
+        pass
+    with publisher(tmp_path / "run"):
+        pass
+
+
+def test_an_open_run_directory_is_refused(tmp_path: Path) -> None:
+    tmp_path.chmod(0o755)
+    with pytest.raises(UsageError, match="chmod 700"), publisher(tmp_path):
+        pass
+    (tmp_path / "real").mkdir(mode=0o700)
+    (tmp_path / "link").symlink_to(tmp_path / "real")
+    with pytest.raises(UsageError, match="not a directory of yours"), publisher(tmp_path / "link"):
+        pass
+
+
+def test_a_long_run_directory_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="too long"), publisher(tmp_path / ("x" * 100)):
+        pass
+
+
+def test_no_control_socket(tmp_path: Path) -> None:
+    with Publisher(
+        PublishConfig(data=(), control=None, run_dir=tmp_path / "run"), "sags", "session-1"
+    ) as running:
+        assert running.connection.control is None and len(running.connection.data) == 1
+        running.publish_health(health())
+        assert running.poll(0) is False
+
+
+# ---- the loop ------------------------------------------------------------------------------------------
+
+
+def test_poll_returns_early_when_woken(tmp_path: Path) -> None:
+    wake = os.eventfd(0)
+    with publisher(tmp_path / "run") as running:
+        assert running.poll(1, wake) is False
+        threading.Timer(0.05, os.eventfd_write, (wake, 1)).start()
+        assert running.poll(30_000, wake) is True
+        os.eventfd_read(wake)
+        assert running.poll(0, wake) is False
+    os.close(wake)
+
+
+def _subscriber(endpoint: str, prefix: str, high_water: int = 1000) -> tuple[zmq.Socket[bytes], zmq.Context]:
+    context = zmq.Context()
+    peer = context.socket(zmq.SUB)
+    peer.setsockopt(zmq.RCVHWM, high_water)
+    peer.setsockopt_string(zmq.SUBSCRIBE, prefix)
+    peer.connect(endpoint)
+    return peer, context
+
+
+def _poll_until(running: Publisher, condition: Any) -> None:
+    deadline = time.monotonic() + 10
+    while not condition():
+        assert time.monotonic() < deadline
+        running.poll(10)
+
+
+def _collect_while_polling(running: Publisher, names: list[str], seconds: float) -> Any:
+    stop = threading.Event()
+    thread = threading.Thread(target=lambda: [running.poll(20) for _ in iter(stop.is_set, True)])
+    thread.start()
+    try:
+        return client.collect(running.connection.data[-1], names, count=2, timeout=seconds)
+    finally:
+        stop.set()
+        thread.join()

@@ -1,0 +1,210 @@
+"""The running node, seen from outside: real processes, real sockets, real faults."""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import independent_client
+import numpy as np
+import pytest
+from rosbags.typesys import Stores, get_typestore
+
+from sags_node.errors import SagsError
+from sags_node.messaging.control import ControlClient
+from sags_node.messaging.subscriber import Subscriber
+
+START_SECONDS = 90  # the first start on a machine compiles kernels
+
+
+class RunningNode:
+    """`sags run` in its own process."""
+
+    def __init__(self, session: Path, folder: Path, *overrides: str) -> None:
+        self.run_dir = folder / "run"
+        self.process = subprocess.Popen(
+            [
+                sys.executable, "-m", "sags_node", "run", str(session), "source.loop:=true",
+                "publish.data:=[tcp://127.0.0.1:*]", "publish.control:=tcp://127.0.0.1:*",
+                f"publish.run_dir:={self.run_dir}", "publish.right:=true", *overrides,
+            ],
+            stderr=subprocess.PIPE,
+            text=True,
+        )  # fmt: skip
+        file = self.run_dir / "sags.json"
+        deadline = time.monotonic() + START_SECONDS
+        while not file.exists():
+            assert self.process.poll() is None, self.process.stderr.read()  # type: ignore[union-attr]
+            assert time.monotonic() < deadline, "the node did not start"
+            time.sleep(0.05)
+        self.connection = json.loads(file.read_text())
+        self.data = next(e for e in self.connection["data"] if e.startswith("tcp"))
+
+    def stop(self) -> int:
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGINT)
+        return self.process.wait(20)
+
+
+@pytest.fixture(scope="module")
+def node(phantom_session: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningNode]:
+    running = RunningNode(phantom_session, tmp_path_factory.mktemp("node"))
+    yield running
+    running.stop()
+
+
+def truth_depth(session: Path, frame_id: int) -> np.ndarray:
+    import cv2
+
+    files = sorted((session / "depth").glob("*.png"))
+    return cv2.imread(str(files[frame_id % len(files)]), cv2.IMREAD_UNCHANGED) * np.float32(2.5e-6)
+
+
+def test_a_stranger_reads_pictures_depth_points_and_splats(node: RunningNode, phantom_session: Path) -> None:
+    """Everything a consumer needs, from the contract alone, in metres against the phantom's truth."""
+    names = {
+        name: f"sags/{name}"
+        for name in (
+            "left/image_rect_color", "right/image_rect_color", "left/render/image", "right/render/image",
+            "left/render/depth", "left/depth", "left/tissue_mask", "left/camera_info", "right/camera_info",
+            "points", "splats", "tf", "status",
+        )
+    }  # fmt: skip
+    got = independent_client.collect(node.data, list(names.values()), count=2, timeout=40)
+    by_name = {name: got[topic] for name, topic in names.items()}
+    missing = [name for name, messages in by_name.items() if not messages]
+    assert not missing
+    for messages in by_name.values():
+        independent_client.check_sequence(messages)
+
+    width, height = 320, 256
+    for name, encoding in (
+        ("left/image_rect_color", "rgb8"), ("right/image_rect_color", "rgb8"),
+        ("left/render/image", "rgba8"), ("right/render/image", "rgba8"), ("left/tissue_mask", "mono8"),
+        ("left/depth", "32FC1"),
+    ):  # fmt: skip
+        independent_client.check_image(by_name[name][-1], encoding, width, height)
+
+    rendered = by_name["left/render/depth"][-1]
+    depth = independent_client.check_image(rendered, "32FC1", width, height)
+    truth = truth_depth(phantom_session, rendered.meta["frame_id"])
+    median, p90, coverage = independent_client.depth_error(depth, truth)
+    assert median < 0.8e-3 and p90 < 4e-3 and coverage > 0.9
+
+    left = independent_client.camera_info(by_name["left/camera_info"][-1])
+    right = independent_client.camera_info(by_name["right/camera_info"][-1])
+    baseline = -right["P"][0, 3] / right["P"][0, 0]
+    assert 0.003 < baseline < 0.006 and (left["width"], left["height"]) == (width, height)
+
+    splats = by_name["splats"][-1]
+    columns = independent_client.check_splats(splats)
+    pose = independent_client.camera_pose(by_name["tf"][-1])
+    means = np.stack([columns[k] for k in "xyz"], 1)
+    local = (means - pose[:3, 3]) @ pose[:3, :3]
+    K = left["K"]
+    u = np.rint(K[0, 0] * local[:, 0] / local[:, 2] + K[0, 2]).astype(int)
+    v = np.rint(K[1, 1] * local[:, 1] / local[:, 2] + K[1, 2]).astype(int)
+    inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
+    surface = truth_depth(phantom_session, splats.meta["frame_id"])[v[inside], u[inside]]
+    error = np.abs(local[inside, 2] - surface)[surface > 0]
+    assert inside.mean() > 0.9 and np.median(error) < 1e-3
+    assert len(by_name["points"][-1].array()) <= len(means)
+
+
+def test_joined_parts_are_ros2_messages(node: RunningNode) -> None:
+    """A second, independent decoder reads every type that is published."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    topics = [
+        f"sags/{name}"
+        for name in ("left/render/image", "left/render/depth", "left/camera_info", "points", "splats", "tf",
+                     "diagnostics", "status", "parameters")
+    ]  # fmt: skip
+    got = independent_client.collect(node.data, topics, count=1, timeout=40)
+    for topic, messages in got.items():
+        assert messages, f"nothing on {topic}"
+        meta = messages[0].meta
+        decoded = store.deserialize_cdr(messages[0].cdr(), meta["type"])
+        if hasattr(decoded, "header"):
+            stamp = decoded.header.stamp.sec * 1_000_000_000 + decoded.header.stamp.nanosec
+            assert topic.endswith("diagnostics") or stamp == meta["stamp_ns"]
+        if meta["type"].endswith("Image"):
+            assert [decoded.height, decoded.width] == meta["shape"][:2]
+
+
+def test_control_socket_reads_changes_and_saves(node: RunningNode, tmp_path: Path) -> None:
+    control = node.connection["control"]
+    with ControlClient(control) as client:
+        assert client.request("ping") is not None
+        status = client.request("get_status")
+        assert status["gaussians"] > 1000
+        assert client.request("get_parameters")["mapping"]["budget_ms"] == 33
+        assert client.request("set_parameters", {"mapping.budget_ms": 50})["mapping"]["budget_ms"] == 50
+        with pytest.raises(SagsError, match="cannot be changed while running"):
+            client.request("set_parameters", {"source.loop": False})
+        with pytest.raises(SagsError, match="budget_ms"):
+            client.request("set_parameters", {"mapping.budget_ms": -1})
+        file = tmp_path / "model.ply"
+        saved = client.request("save_model", {"path": str(file)})
+        assert saved["gaussians"] > 1000 and file.stat().st_size > 1000 * 68
+        with pytest.raises(SagsError, match="exists already"):
+            client.request("save_model", {"path": str(file)})
+        with pytest.raises(SagsError, match="unknown"):
+            client.request("make_coffee")
+
+
+def test_reset_makes_a_new_model_and_a_new_epoch(node: RunningNode) -> None:
+    topic = "sags/left/render/image"
+    before = independent_client.collect(node.data, [topic], 1, 20)[topic][0].meta
+    reply = independent_client.request(node.connection["control"], "reset_model", {})
+    assert reply["ok"]
+    after = independent_client.collect(node.data, [topic], 1, 20)[topic][0].meta
+    assert after["epoch"] > before["epoch"]
+
+
+def test_a_killed_node_goes_stale_and_reads_fail(phantom_session: Path, tmp_path: Path) -> None:
+    """What was received from a dead node must not be taken for the present."""
+    running = RunningNode(phantom_session, tmp_path)
+    name = "left/render/image"
+    with Subscriber([name], endpoint=running.data) as subscriber:
+        assert subscriber.wait(name, timeout=30) is not None
+        deadline = time.monotonic() + 20
+        while not subscriber.ok(name) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        running.process.kill()
+        running.process.wait(10)
+        deadline = time.monotonic() + 10
+        while subscriber.ok(name) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        with pytest.raises(SagsError):
+            subscriber.read(name)
+
+
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+def test_stopping_is_clean(phantom_session: Path, tmp_path: Path, stop: signal.Signals) -> None:
+    running = RunningNode(phantom_session, tmp_path)
+    time.sleep(1.0)
+    running.process.send_signal(stop)
+    assert running.process.wait(20) == 0
+    assert not (running.run_dir / "sags.json").exists()
+    assert "Traceback" not in running.process.stderr.read()  # type: ignore[union-attr]
+
+
+def test_a_port_in_use_is_one_clear_message(phantom_session: Path, tmp_path: Path) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        outcome = subprocess.run(
+            [sys.executable, "-m", "sags_node", "run", str(phantom_session),
+             f"publish.data:=[tcp://127.0.0.1:{port}]", f"publish.run_dir:={tmp_path / 'run'}"],
+            capture_output=True, text=True, timeout=START_SECONDS, check=False,
+        )  # fmt: skip
+    assert outcome.returncode == 1
+    assert f"127.0.0.1:{port}" in outcome.stderr and "in use" in outcome.stderr
+    assert "Traceback" not in outcome.stderr

@@ -1,0 +1,263 @@
+"""Messages as bytes: equal to stock ROS 2 CDR, and proof against what strangers send."""
+
+from __future__ import annotations
+
+import tracemalloc
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+from independent_client import META_KEYS
+from rosbags.typesys import Stores, get_typestore
+from synthetic import health, plane_camera, plane_result
+
+from sags_node.messaging import cdr, content, topics
+from sags_node.messaging.cdr import Content
+from sags_node.messaging.received import interpret
+from sags_node.messaging.wire import Message, Meta, WireError, decode, encode
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+STAMP = 1_700_000_000_123_456_789
+
+
+def contents() -> dict[str, Content]:
+    """What every topic says of the synthetic frame."""
+    result = plane_result(stamp_ns=STAMP)
+    said = {name: build(result) for name, build in content.FRAME_CONTENT.items()}
+    said["status"] = content.json_text(content.status(health(), result))
+    said["parameters"] = content.json_text({"mapping": {"budget_ms": 33.0}})
+    said["diagnostics"] = content.diagnostics(health(), STAMP)
+    return said
+
+
+def meta_of(said: Content, **changes: Any) -> Meta:
+    fields: dict[str, Any] = {
+        "type": said.type,
+        "type_hash": cdr.type_hash(said.type),
+        "seq": 3,
+        "frame_id": 5,
+        "stamp_ns": STAMP,
+        "publish_ns": STAMP + 1,
+        "session": "s",
+        "epoch": 0,
+        "step": 9,
+        "encoding": said.encoding,
+        "shape": list(said.shape),
+        "dtype": said.dtype,
+        "dropped": 1,
+    }
+    return Meta(**{**fields, **changes})
+
+
+def message_of(said: Content, **changes: Any) -> Message:
+    return Message("sags/x", meta_of(said, **changes), said.parts)
+
+
+def test_every_topic_has_content_of_its_type() -> None:
+    said = contents()
+    assert set(said) == set(topics.BY_NAME)
+    for name, topic in topics.BY_NAME.items():
+        assert said[name].type == topic.type, name
+
+
+@pytest.mark.parametrize("name", topics.BY_NAME)
+def test_joined_parts_are_stock_cdr(name: str) -> None:
+    said = contents()[name]
+    joined = message_of(said).cdr()
+    ros = STORE.deserialize_cdr(joined, said.type)
+    assert bytes(STORE.serialize_cdr(ros, said.type)) == joined
+    if hasattr(ros, "header"):
+        assert ros.header.stamp.sec * 10**9 + ros.header.stamp.nanosec == STAMP
+
+
+def test_type_hash_is_the_published_one() -> None:
+    known = "RIHS01_d31d41a9a4c4bc8eae9be757b0beed306564f7526c88ea6a4588fb9582527d47"
+    assert cdr.type_hash(topics.IMAGE) == known
+
+
+@pytest.mark.parametrize("frame", ["", "a", "ab", "abc", "abcd", "left_optical_frame"])
+def test_image_header_is_aligned_for_every_frame_name(frame: str) -> None:
+    picture = np.arange(5 * 7 * 3, dtype=np.uint8).reshape(5, 7, 3)
+    ros = STORE.deserialize_cdr(message_of(cdr.image(picture, "rgb8", STAMP, frame)).cdr(), topics.IMAGE)
+    assert (ros.height, ros.width, ros.step, ros.encoding, ros.header.frame_id) == (5, 7, 21, "rgb8", frame)
+    assert np.array_equal(ros.data.reshape(5, 7, 3), picture)
+
+
+def test_bulk_part_is_the_array_itself() -> None:
+    picture = np.zeros((40, 50, 3), np.uint8)
+    assert np.shares_memory(np.frombuffer(cdr.image(picture, "rgb8", STAMP).parts[1], np.uint8), picture)
+
+
+def test_point_cloud_fields_describe_the_rows() -> None:
+    said = contents()["splats"]
+    ros = STORE.deserialize_cdr(message_of(said).cdr(), said.type)
+    assert [field.name for field in ros.fields] == list(content.SPLAT_FIELDS)
+    assert [field.offset for field in ros.fields] == list(range(0, 60, 4))
+    assert {field.name: field.datatype for field in ros.fields}["id"] == 6  # UINT32
+    assert (ros.height, ros.width, ros.point_step, ros.row_step) == (1, said.shape[0], 60, 60 * said.shape[0])
+    rows = ros.data.view(np.float32).reshape(-1, 15)
+    assert np.allclose(rows[:, :3], plane_result().snapshot.gaussians.means)
+
+
+def test_an_empty_cloud_and_an_empty_model_are_messages() -> None:
+    said = cdr.point_cloud(np.empty((0, 4), np.float32), content.POINT_FIELDS, STAMP)
+    ros = STORE.deserialize_cdr(message_of(said).cdr(), said.type)
+    assert ros.width == 0 and len(ros.data) == 0
+    assert interpret(message_of(said), 0).meta.shape == [0, 4]
+
+
+def test_right_camera_info_holds_the_baseline() -> None:
+    camera = plane_camera()
+    ros = cdr.parse(message_of(cdr.camera_info(camera, STAMP, cdr.RIGHT_FRAME, 0.0042)))
+    assert ros.p[3] == pytest.approx(-camera.K[0, 0] * 0.0042)
+    assert np.array_equal(ros.k.reshape(3, 3), camera.K)
+
+
+def test_points_leave_out_what_is_hidden_or_outside() -> None:
+    result = plane_result()
+    shown = content.points(result)
+    gaussians = result.snapshot.gaussians
+    row_with_depth = int((gaussians.opacities >= content.POINT_MIN_OPACITY).sum())
+    assert shown.shape == (row_with_depth, 4)
+    camera = result.pair.camera
+    gaussians.means[0] = camera.T_world_cam[:3, 3] - camera.T_world_cam[:3, 2] * 0.01  # behind the camera
+    gaussians.means[1] += camera.T_world_cam[:3, 2].astype(np.float32) * 0.02  # under the surface
+    gaussians.means[2] += camera.T_world_cam[:3, 0].astype(np.float32) * 10  # far to the right
+    assert content.points(result).shape == (row_with_depth - 3, 4)
+
+
+# ---- strangers -----------------------------------------------------------------------------------------
+
+
+def test_round_trip_and_unknown_keys() -> None:
+    said = contents()["left/depth"]
+    frames = encode(message_of(said))
+    fields = msgpack.unpackb(frames[1])
+    assert set(fields) == META_KEYS
+    frames[1] = msgpack.packb({**fields, "colour_of_the_sky": ["blue", {"deep": 1}], "v": "1.9"})
+    back = decode(frames)
+    assert back.meta.stamp_ns == STAMP and back.topic == "sags/x"
+    assert np.array_equal(back.array(), np.asarray(said.parts[1]), equal_nan=True)
+
+
+FORGERIES: list[tuple[str, Any]] = [
+    *((key, None) for key in sorted(META_KEYS)),
+    *((key, -2) for key in ("seq", "frame_id", "stamp_ns", "epoch", "dropped")),
+    *((key, 2**63) for key in ("seq", "stamp_ns", "step")),
+    *((key, "7") for key in ("seq", "stamp_ns", "shape")),
+    ("v", "2.0"),
+    ("v", "1"),
+    ("dtype", "O"),
+    ("dtype", "float64"),
+    ("shape", [1] * 5),
+    ("shape", [-1, 4]),
+    ("shape", [2**31]),
+    ("session", "x" * 513),
+]
+
+
+@pytest.mark.parametrize(("key", "value"), FORGERIES)
+def test_forged_meta_is_refused(key: str, value: Any) -> None:
+    frames = encode(message_of(contents()["left/depth"]))
+    frames[1] = msgpack.packb({**msgpack.unpackb(frames[1]), key: value})
+    with pytest.raises(WireError):
+        decode(frames)
+
+
+@pytest.mark.parametrize("key", sorted(META_KEYS - {"v"}))
+def test_missing_key_is_refused(key: str) -> None:
+    frames = encode(message_of(contents()["left/depth"]))
+    fields = msgpack.unpackb(frames[1])
+    del fields[key]
+    frames[1] = msgpack.packb(fields)
+    with pytest.raises(WireError):
+        decode(frames)
+
+
+def test_a_claimed_size_is_never_allocated() -> None:
+    said = contents()["left/depth"]
+    frames = encode(message_of(said, shape=[2**31 - 1, 2**31 - 1]))
+    tracemalloc.start()
+    with pytest.raises(WireError, match="claims"):
+        decode(frames).array()
+    # msgpack: an array of 2^32 - 1 elements, a string of 2^32 - 1 bytes
+    for claim in (b"\xdd\xff\xff\xff\xff", b"\xdb\xff\xff\xff\xff", b"\xdf\xff\xff\xff\xff"):
+        with pytest.raises(WireError):
+            decode([b"sags/x", claim, b""])
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 1_000_000
+
+
+@pytest.mark.parametrize(
+    "frames",
+    [
+        [],
+        [b"t"],
+        [b"t", b"\x80"],
+        [b"t", b"\x80", b""],
+        [b"\xff\xfe", b"\x80", b""],
+        [b"t" * 256, b"\x80", b""],
+        [b"t", b"\x91" * 5000, b""],
+        [b"t", b"\x91" * 4000, b""],
+        [b"t", b"\x80"] + [b""] * 7,
+    ],
+)
+def test_wrong_parts_are_refused(frames: list[bytes]) -> None:
+    with pytest.raises(WireError):
+        decode(frames)
+
+
+def test_random_bytes_only_ever_raise_wire_error() -> None:
+    rng = np.random.default_rng(1)
+    good = encode(message_of(contents()["left/camera_info"]))
+    for _ in range(3000):
+        frames = [bytes(frame) for frame in good]
+        which = int(rng.integers(1, len(frames)))
+        damaged = bytearray(frames[which])
+        for at in rng.integers(0, len(damaged), int(rng.integers(1, 6))):
+            damaged[at] = rng.integers(256)
+        frames[which] = bytes(damaged[: int(rng.integers(0, len(damaged) + 1))])
+        try:
+            interpret(decode(frames), 0)
+        except WireError:
+            continue
+
+
+@pytest.mark.parametrize("name", ["left/camera_info", "tf", "diagnostics", "status"])
+def test_damaged_cdr_only_ever_raises_wire_error(name: str) -> None:
+    rng = np.random.default_rng(2)
+    said = contents()[name]
+    good = bytes(said.parts[0])
+    for _ in range(1500):
+        damaged = bytearray(good)
+        for at in rng.integers(0, len(damaged), int(rng.integers(1, 9))):
+            damaged[at] = rng.choice([0, 1, 127, 255, int(rng.integers(256))])
+        part = bytes(damaged[: int(rng.integers(0, len(damaged) + 1))])
+        try:
+            interpret(Message("sags/x", meta_of(said), (part,)), 0)
+        except WireError:
+            continue
+
+
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [
+        ("left/depth", {"encoding": "rgb8"}),
+        ("left/depth", {"encoding": "16UC1"}),
+        ("left/depth", {"shape": [96 * 64]}),
+        ("left/image_rect_color", {"shape": [64, 96 * 3]}),
+        ("left/image_rect_color", {"shape": [64, 96, 3, 1]}),
+        ("splats", {"encoding": "x,y,z"}),
+        ("splats", {"encoding": ",".join(["x"] * 15)}),
+        ("splats", {"encoding": ",".join("abcdefghijklmno")}),
+        ("splats", {"dtype": "uint8"}),
+        ("tf", {"type_hash": "RIHS01_0"}),
+        ("tf", {"type": "sensor_msgs/msg/Joy"}),
+        ("tf", {"type": "sensor_msgs/msg/Image"}),
+    ],
+)
+def test_content_that_does_not_fit_its_meta_is_refused(name: str, changes: dict[str, Any]) -> None:
+    with pytest.raises(WireError):
+        interpret(message_of(contents()[name], **changes), 0)
