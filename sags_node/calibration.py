@@ -42,16 +42,25 @@ def load_rig(folder: Path) -> StereoRig:
     Raises:
         UsageError: a file is missing or malformed, or `check_rig` finds an error.
     """
-    folder = Path(folder)
-    rig = StereoRig(
-        name=folder.resolve().name,
-        left=_read_eye(folder / "left.yaml"),
-        right=_read_eye(folder / "right.yaml"),
-    )
+    rig = read_rig(folder)
     errors = [finding for finding in check_rig(rig) if finding.level == "error"]
     if errors:
         raise UsageError("\n".join(f"{folder}: {error.what}; {error.mend}" for error in errors))
     return rig
+
+
+def read_rig(folder: Path) -> StereoRig:
+    """Read the calibration in a folder without judging it, for `check_rig` to report on.
+
+    Raises:
+        UsageError: a file is missing or malformed.
+    """
+    folder = Path(folder)
+    return StereoRig(
+        name=folder.resolve().name,
+        left=_read_eye(folder / "left.yaml"),
+        right=_read_eye(folder / "right.yaml"),
+    )
 
 
 def save_rig(rig: StereoRig, folder: Path) -> None:

@@ -203,7 +203,7 @@ def load_launch(path: Path | str | None = None, overrides: Sequence[str] = ()) -
     Raises:
         UsageError: the file is missing, is not YAML, or holds an unknown key or a wrong value.
     """
-    tree: dict[str, Any] = {}
+    tree: dict[str, Any] = {"source": {"kind": "phantom"}}
     name = "defaults"
     if path is not None:
         file = Path(path)

@@ -17,6 +17,7 @@ import uuid
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
+from dataclasses import asdict
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any
@@ -74,9 +75,7 @@ class Node:
         self._stopping = threading.Event()
         self._parameters_changed = threading.Event()
         self._stats = _Statistics()
-        self._publisher = Publisher(config.publish, config.ns, uuid.uuid4().hex)
-        for op, handler in self._handlers().items():
-            self._publisher.register(op, handler)
+        self._publisher = Publisher(config.publish, config.ns, uuid.uuid4().hex, self._handlers())
         self._threads = [
             threading.Thread(target=self._guard, args=(work, after), name=name, daemon=True)
             for name, work, after in (
@@ -201,7 +200,7 @@ class Node:
 
     def _handlers(self) -> dict[str, Callable[[dict[str, Any]], Any]]:
         return {
-            "get_status": lambda args: self._publisher.status(self.health()),
+            "get_status": lambda args: asdict(self.health()),
             "get_parameters": lambda args: self.config.model_dump(mode="json"),
             "set_parameters": lambda args: self._on_mapping_thread(lambda: self._set_parameters(args)),
             "reset_model": lambda args: self._on_mapping_thread(self._reset_model),

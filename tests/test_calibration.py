@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import yaml
 
-from sags_node.calibration import check_rig, load_rig, rectified_camera, save_rig
+from sags_node.calibration import check_rig, load_rig, read_rig, rectified_camera, save_rig
 from sags_node.errors import UsageError
 from sags_node.types import Eye, StereoRig
 
@@ -174,6 +174,7 @@ def test_baseline_in_millimetres(folder: Path) -> None:
     message = refusal(folder)
     assert "looks like millimetres" in message
     assert "divide" in message
+    assert check_rig(read_rig(folder))[-1].level == "error"  # it can be read, to be reported on
 
 
 def test_unusual_baseline_is_only_a_warning(folder: Path) -> None:

@@ -1,6 +1,7 @@
 """The spool, the measuring of a run with known answers, golden comparison and the report."""
 
 import json
+import tempfile
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -10,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from sags_node.calibration import save_rig
 from sags_node.engine.rasterize import rasterize
 from sags_node.errors import SagsError, UsageError
 from sags_node.evaluation.golden import Golden, Tolerance, compare, read_golden, write_golden
@@ -52,12 +54,12 @@ def rig() -> StereoRig:
 
 def tissue_at(seconds: float) -> Gaussians:
     """A textured sheet, larger than the view, that slides with SPEED."""
-    spacing = 1.5 * DEPTH / FOCAL
-    x, y = np.meshgrid(np.arange(-80, 80), np.arange(-65, 65))
+    spacing = 2 * DEPTH / FOCAL
+    x, y = np.meshgrid(np.arange(-60, 60), np.arange(-49, 49))
     count = x.size
     means = np.stack([x.ravel() * spacing, y.ravel() * spacing, np.full(count, DEPTH)], 1).astype(np.float32)
     rng = np.random.default_rng(0)
-    texture = cv2.GaussianBlur(rng.random((130, 160, 3), np.float32), (0, 0), 1.5).reshape(-1, 3)
+    texture = cv2.GaussianBlur(rng.random((98, 120, 3), np.float32), (0, 0), 1.5).reshape(-1, 3)
     return Gaussians(
         means=means + SPEED * np.float32(seconds),
         quats=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
@@ -82,7 +84,7 @@ def stereo_frame(frame_id: int) -> StereoFrame:
     right = rasterize(tissue_at(stamp * 1e-9), CAMERA.moved_right(BASELINE)).rgb
     right = as_uint8(0.8 * right + 0.05)
     right[40:60, 88:] = (200, 255, 200)
-    points = tissue_at(0).means[10_000:10_050].astype(np.float64) + SPEED * stamp * 1e-9
+    points = tissue_at(0).means[7350:7400].astype(np.float64) + SPEED * stamp * 1e-9
     reference = Reference(
         depth=np.full((HEIGHT, WIDTH), DEPTH, np.float32),
         points=points,
@@ -365,7 +367,58 @@ def test_plot_is_valid_svg_inside_its_frame() -> None:
     assert line_plot("empty", [Series("one", "#123456", [])], {}) == ""
 
 
-# ---- sessions that cannot be measured --------------------------------------------------------------------
+# ---- whole sessions --------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def session_folder(frames: list[StereoFrame], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The synthetic session as a recording on disk, with its calibration and its truth."""
+    folder = tmp_path_factory.mktemp("session")
+    save_rig(rig(), folder / "calib")
+    for name in ("left", "right", "tools", "depth"):
+        (folder / name).mkdir()
+    for frame in frames:
+        assert frame.tissue is not None and frame.reference is not None
+        assert frame.reference.depth is not None
+        pictures = {
+            "left": frame.left[..., ::-1],
+            "right": frame.right[..., ::-1],
+            "tools": np.where(frame.tissue, 0, 255).astype(np.uint8),
+            "depth": (frame.reference.depth * 1e5).round().astype(np.uint16),
+        }
+        for name, picture in pictures.items():
+            cv2.imwrite(str(folder / name / f"{frame.frame_id:04d}.png"), picture)
+    points = np.stack([frame.reference.points for frame in frames if frame.reference is not None])
+    np.savez(folder / "tracks.npz", points=points, visible=np.ones(points.shape[:2], bool))
+    (folder / "launch.yaml").write_text(
+        "source: {kind: folders, left: left, right: right, tools: tools, rate: 30,"
+        " reference: {depth: depth, tracks: tracks.npz}}\n"
+        "rig: calib\nmapping: {max_gaussians: 12000}\nsegments: {motion: [5, 14]}\n"
+    )
+    return folder
+
+
+def test_a_session_in_steps_is_measured_and_reproducible(session_folder: Path) -> None:
+    first, second = (evaluate(session_folder, iterations=1).summary for _ in range(2))
+    assert compare(second, Golden(command="", figures=first)) == []
+    assert first["session"] == session_folder.name
+    assert [first[key] for key in ("frames", "processed", "held_out", "dropped")] == [20, 17, 3, 0]
+    assert first["online"]["ssim"] > 0.9 and first["online"]["motion"]["ssim"] > 0.9
+    assert first["heldout"]["ssim"] > 0.8 and first["novel"]["psnr"] > 28
+    assert first["depth"]["median_mm"] < 1.5 and first["depth"]["coverage"] > 0.9
+    assert first["track"]["median_px"] < 2 and first["track"]["lost"] < 0.05
+    assert first["iterations_per_frame"] == 1 and first["budget_ms"] is None
+    assert first["latency_ms"] is None
+
+
+def test_a_session_in_real_time_goes_through_the_node(session_folder: Path) -> None:
+    before = set(Path(tempfile.gettempdir()).glob("sags-eval-*"))
+    summary = evaluate(session_folder, ["source.rate:=10"], pace="realtime").summary
+    assert summary["frames"] == 20 and summary["held_out"] == 3
+    assert 1 <= summary["processed"] == 17 - summary["dropped"]
+    assert summary["latency_ms"]["p50"] > 0 and summary["rss_mb"]["max"] > 50
+    assert summary["online"]["ssim"] > 0.8
+    assert set(Path(tempfile.gettempdir()).glob("sags-eval-*")) <= before
 
 
 def test_live_cameras_and_ambiguous_segments_are_refused(tmp_path: Path) -> None:

@@ -253,7 +253,7 @@ def test_mistakes_are_named(tmp_path: Path) -> None:
         Subscriber(["left/rendr/depth"], endpoint="tcp://127.0.0.1:9")
     with pytest.raises(SagsError, match="no node runs as 'sags'"):
         Subscriber(["tf"], run_dir=tmp_path)
-    with pytest.raises(SagsError, match="cannot connect to 127.0.0.1"):
+    with pytest.raises(SagsError, match="cannot connect to 127"):
         Subscriber(["tf"], endpoint="127.0.0.1:5556")
 
 

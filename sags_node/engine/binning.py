@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numba
 import numpy as np
 
-from sags_node.engine.jit import inlined, kernel, parallel_kernel, prefetch_read, prefetch_write
+from sags_node.engine.jit import inlined, kernel, parallel_kernel, prefetch_read, prefetch_write, square_root
 from sags_node.types import F32
 
 f4 = np.float32
@@ -66,7 +65,7 @@ def sort_by_depth(depths: F32, order: Int32, spare_order: Int32, keys: Int32, sp
 @inlined
 def _whole(value: Any, low: int, high: int) -> int:
     """A float as an integer, held in a range first: a far-off float does not fit an integer."""
-    return int(min(max(value, f4(low)), f4(high)))
+    return np.int64(min(max(value, f4(low)), f4(high)))
 
 
 @parallel_kernel
@@ -75,8 +74,8 @@ def emit_pairs(
     order: Int32,  # [N] near to far
     width: int,
     height: int,
-    tile_width: int,
-    tile_height: int,
+    tile_width_bits: int,  # tiles are 2**bits px
+    tile_height_bits: int,
     emitted: Any,  # EMITTED, one equal part per worker, written
     histogram: Int32,  # [workers, tiles] pairs per tile, written
     emitted_counts: Int64,  # [workers] written
@@ -90,7 +89,8 @@ def emit_pairs(
     count = order.size
     workers = histogram.shape[0]
     room = emitted.size // workers
-    tiles_x = (width + tile_width - 1) // tile_width
+    tile_width, tile_height = 1 << tile_width_bits, 1 << tile_height_bits
+    tiles_x = (width + tile_width - 1) >> tile_width_bits
     for worker in numba.prange(workers):
         part = emitted[worker * room : (worker + 1) * room]
         tile_counts = histogram[worker]
@@ -113,30 +113,31 @@ def emit_pairs(
             # u^2 + v^2 <= extent with u = a dx + b dy, v = c dy
             mean_x, mean_y = splat.mean_x, splat.mean_y
             a, b, c = splat.whiten_xx, splat.whiten_xy, splat.whiten_yy
-            bb_cc = b * b + c * c
-            radius_x = np.sqrt(extent * bb_cc) / (a * c)
-            radius_y = np.sqrt(extent) / c
-            x_first = _whole(math.ceil(mean_x - radius_x - HALF), 0, width)
-            x_last = _whole(math.floor(mean_x + radius_x - HALF), -1, width - 1)
-            y_first = _whole(math.ceil(mean_y - radius_y - HALF), 0, height)
-            y_last = _whole(math.floor(mean_y + radius_y - HALF), -1, height - 1)
+            ab, ac, bb_cc = a * b, a * c, b * b + c * c
+            inverse = ONE / bb_cc
+            radius_x = square_root(extent * bb_cc) / ac
+            radius_y = square_root(extent) / c
+            x_first = _whole(np.ceil(mean_x - radius_x - HALF), 0, width)
+            x_last = _whole(np.floor(mean_x + radius_x - HALF), -1, width - 1)
+            y_first = _whole(np.ceil(mean_y - radius_y - HALF), 0, height)
+            y_last = _whole(np.floor(mean_y + radius_y - HALF), -1, height - 1)
             if x_first > x_last or y_first > y_last:
                 continue
             begin = n
             lowest_dx = -b / a * radius_y  # where the ellipse reaches dy = radius_y
-            for column in range(x_first // tile_width, x_last // tile_width + 1):
+            for column in range(x_first >> tile_width_bits, (x_last >> tile_width_bits) + 1):
                 left = max(f4(column * tile_width) + HALF - mean_x, -radius_x)
                 right = min(f4((column + 1) * tile_width) - HALF - mean_x, radius_x)
                 # the largest and smallest dy of the ellipse over this column of tiles
                 dx = min(max(lowest_dx, left), right)
-                bottom = (-a * b * dx + np.sqrt(max(bb_cc * extent - (a * c * dx) ** 2, ZERO))) / bb_cc
+                bottom = (square_root(max(bb_cc * extent - ac * ac * dx * dx, ZERO)) - ab * dx) * inverse
                 dx = min(max(-lowest_dx, left), right)
-                top = (-a * b * dx - np.sqrt(max(bb_cc * extent - (a * c * dx) ** 2, ZERO))) / bb_cc
-                row_first = max(y_first, _whole(math.ceil(mean_y + top - HALF - ROW_SLACK), 0, height))
-                row_last = min(y_last, _whole(math.floor(mean_y + bottom - HALF + ROW_SLACK), -1, height - 1))
+                top = -(square_root(max(bb_cc * extent - ac * ac * dx * dx, ZERO)) + ab * dx) * inverse
+                row_first = max(y_first, _whole(np.ceil(mean_y + top - HALF - ROW_SLACK), 0, height))
+                row_last = min(y_last, _whole(np.floor(mean_y + bottom - HALF + ROW_SLACK), -1, height - 1))
                 if row_first > row_last:
                     continue
-                for row in range(row_first // tile_height, row_last // tile_height + 1):
+                for row in range(row_first >> tile_height_bits, (row_last >> tile_height_bits) + 1):
                     if n < room:
                         tile = row * tiles_x + column
                         tile_counts[tile] += 1

@@ -30,7 +30,8 @@ f4 = np.float32
 u8 = np.uint64
 Int32 = np.ndarray[Any, np.dtype[np.int32]]
 
-TILE_WIDTH, TILE_HEIGHT = 16, 32  # px
+TILE_WIDTH_BITS, TILE_HEIGHT_BITS = 4, 5
+TILE_WIDTH, TILE_HEIGHT = 1 << TILE_WIDTH_BITS, 1 << TILE_HEIGHT_BITS  # 16x32 px
 TILE_PIXELS = TILE_WIDTH * TILE_HEIGHT
 PLANE = TILE_PIXELS + 16  # 64 bytes of padding: planes 4 KiB apart would evict each other
 SCRATCH = 12 * PLANE  # floats per worker

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from sags_node.engine import binning, compositing, layout, projection
-from sags_node.engine.compositing import TILE_HEIGHT, TILE_WIDTH
+from sags_node.engine.compositing import TILE_HEIGHT, TILE_HEIGHT_BITS, TILE_WIDTH, TILE_WIDTH_BITS
 from sags_node.engine.interface import Gradients, Pinhole
 from sags_node.engine.jit import aligned
 from sags_node.engine.threads import thread_count
@@ -40,7 +40,7 @@ class NumbaRasterizer:
     def _allocate_workers(self, workers: int) -> None:
         self._workers = workers
         self._tile_scratch = aligned((workers, compositing.SCRATCH))
-        self._block_scratch = aligned((workers, projection.PLANES, projection.BLOCK))
+        self._block_scratch = aligned((workers, projection.SCRATCH))
         self._histogram = aligned((workers, self._tiles), np.int32)
         self._emitted_counts = aligned((workers,), np.int64)
 
@@ -96,8 +96,8 @@ class NumbaRasterizer:
                 self._order[:n],
                 self._width,
                 self._height,
-                TILE_WIDTH,
-                TILE_HEIGHT,
+                TILE_WIDTH_BITS,
+                TILE_HEIGHT_BITS,
                 self._emitted,
                 self._histogram,
                 self._emitted_counts,

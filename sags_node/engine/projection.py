@@ -21,8 +21,17 @@ from sags_node.engine.jit import inlined, parallel_kernel, square_root
 from sags_node.types import F32
 
 f4 = np.float32
+u8 = np.uint64
 BLOCK = 64  # Gaussians per block
-PLANES = 38  # of a block's scratch; the larger of the two kernels
+
+# Planes of a block's scratch: the inputs, then what each kernel works out.
+MEAN_X, MEAN_Y, MEAN_Z, SCALE_X, SCALE_Y, SCALE_Z = (u8(k * BLOCK) for k in range(6))
+QUAT_W, QUAT_X, QUAT_Y, QUAT_Z, OPACITY = (u8(k * BLOCK) for k in range(6, 11))
+MEAN2D_X, MEAN2D_Y, WHITEN_XX, WHITEN_XY, WHITEN_YY, FILTERED, DEPTH = (u8(k * BLOCK) for k in range(11, 18))
+G, G_U, G_V, G_UU, G_UV, G_VV, G_DEPTH = (u8(k * BLOCK) for k in range(11, 18))
+V_MEAN_X, V_MEAN_Y, V_MEAN_Z, V_SCALE_X, V_SCALE_Y, V_SCALE_Z = (u8(k * BLOCK) for k in range(18, 24))
+V_QUAT_W, V_QUAT_X, V_QUAT_Y, V_QUAT_Z, V_OPACITY = (u8(k * BLOCK) for k in range(24, 29))
+SCRATCH = 29 * BLOCK  # floats per worker
 
 # The values of `engine.interface`, repeated because Numba's disk cache does not see other files.
 NEAR_PLANE = f4(1e-3)
@@ -114,6 +123,25 @@ def _clamp(value: Any, low: Any, high: Any) -> Any:
     return min(max(value, low), high)
 
 
+@inlined
+def _load_block(
+    S: F32, means: F32, quats: F32, scales: F32, opacities: F32, first: int, filled: int
+) -> None:
+    for lane in range(filled):
+        i, j = first + lane, u8(lane)
+        S[MEAN_X + j] = means[i, 0]
+        S[MEAN_Y + j] = means[i, 1]
+        S[MEAN_Z + j] = means[i, 2]
+        S[SCALE_X + j] = scales[i, 0]
+        S[SCALE_Y + j] = scales[i, 1]
+        S[SCALE_Z + j] = scales[i, 2]
+        S[QUAT_W + j] = quats[i, 0]
+        S[QUAT_X + j] = quats[i, 1]
+        S[QUAT_Y + j] = quats[i, 2]
+        S[QUAT_Z + j] = quats[i, 3]
+        S[OPACITY + j] = opacities[i]
+
+
 @parallel_kernel
 def project(
     means: F32,
@@ -125,7 +153,7 @@ def project(
     t: Row,  # 3
     intrinsics: Row,  # fx, fy, cx, cy
     limits: Row,  # of x/z and y/z in the Jacobian: low, high, low, high
-    scratch: F32,  # [workers, PLANES, BLOCK]
+    scratch: F32,  # [workers, SCRATCH]
     splats: Any,  # [N] SPLAT, written
     depths: F32,  # [N] written; 0 where not drawn
 ) -> None:
@@ -138,61 +166,55 @@ def project(
         for block in range(worker * blocks // workers, (worker + 1) * blocks // workers):
             first = block * BLOCK
             filled = min(BLOCK, count - first)
-            for j in range(filled):
-                i = first + j
-                for k in range(3):
-                    S[k, j] = means[i, k]
-                    S[3 + k, j] = scales[i, k]
-                for k in range(4):
-                    S[6 + k, j] = quats[i, k]
-                S[10, j] = opacities[i]
-            for j in range(BLOCK):
-                x, y, z = _to_camera(R, t, S[0, j], S[1, j], S[2, j])
+            _load_block(S, means, quats, scales, opacities, first, filled)
+            for lane in range(BLOCK):
+                j = u8(lane)
+                x, y, z = _to_camera(R, t, S[MEAN_X + j], S[MEAN_Y + j], S[MEAN_Z + j])
                 in_front = z > NEAR_PLANE
                 inverse_z = ONE / (z if in_front else ONE)
                 slope_x, slope_y = x * inverse_z, y * inverse_z
                 held_x = _clamp(slope_x, limits[0], limits[1])
                 held_y = _clamp(slope_y, limits[2], limits[3])
-                qw, qx, qy, qz = S[6, j], S[7, j], S[8, j], S[9, j]
+                qw, qx, qy, qz = S[QUAT_W + j], S[QUAT_X + j], S[QUAT_Y + j], S[QUAT_Z + j]
                 norm2 = qw * qw + qx * qx + qy * qy + qz * qz
                 has_direction = norm2 > MIN_QUAT_NORM2
                 n = ONE / square_root(norm2 if has_direction else ONE)
                 Q = _rotation(qw * n, qx * n, qy * n, qz * n)
                 j00, j11 = fx * inverse_z, fy * inverse_z
                 A = _screen_axes(R, j00, -j00 * held_x, j11, -j11 * held_y)
-                V = _scale_axes(_times_rotation(A, Q), S[3, j], S[4, j], S[5, j])
+                V = _scale_axes(_times_rotation(A, Q), S[SCALE_X + j], S[SCALE_Y + j], S[SCALE_Z + j])
                 xx, xy, yy, det0, _, _, _ = _covariance(V)
                 along, across, down, kept = _whitening(xx, xy, yy, det0)
                 mean_x, mean_y = fx * slope_x + cx, fy * slope_y + cy
                 in_range = abs(mean_x) + abs(mean_y) < MAX_COORDINATE and xx + yy < MAX_VALUE
-                opacity = min(S[10, j] * kept, MAX_OPACITY)
-                S[11, j] = mean_x
-                S[12, j] = mean_y
-                S[13, j] = along
-                S[14, j] = across
-                S[15, j] = down
-                S[16, j] = opacity if in_front and has_direction and in_range else ZERO
-                S[17, j] = z
-            for j in range(filled):
-                i = first + j
+                opacity = min(S[OPACITY + j] * kept, MAX_OPACITY)
+                S[MEAN2D_X + j] = mean_x
+                S[MEAN2D_Y + j] = mean_y
+                S[WHITEN_XX + j] = along
+                S[WHITEN_XY + j] = across
+                S[WHITEN_YY + j] = down
+                S[FILTERED + j] = opacity if in_front and has_direction and in_range else ZERO
+                S[DEPTH + j] = z
+            for lane in range(filled):
+                i, j = first + lane, u8(lane)
                 splat = splats[i]
-                opacity = S[16, j]
+                opacity = S[FILTERED + j]
                 log2_opacity = f4(math.log2(opacity)) if opacity > ZERO else TWO * LOG2_MIN_ALPHA
                 extent = max(log2_opacity - LOG2_MIN_ALPHA, ZERO)
                 if not abs(colors[i, 0]) + abs(colors[i, 1]) + abs(colors[i, 2]) < MAX_VALUE:
                     extent = ZERO
-                splat.mean_x = S[11, j]
-                splat.mean_y = S[12, j]
-                splat.whiten_xx = S[13, j]
-                splat.whiten_xy = S[14, j]
-                splat.whiten_yy = S[15, j]
+                splat.mean_x = S[MEAN2D_X + j]
+                splat.mean_y = S[MEAN2D_Y + j]
+                splat.whiten_xx = S[WHITEN_XX + j]
+                splat.whiten_xy = S[WHITEN_XY + j]
+                splat.whiten_yy = S[WHITEN_YY + j]
                 splat.log2_opacity = log2_opacity
                 splat.extent = extent
                 splat.red = colors[i, 0]
                 splat.green = colors[i, 1]
                 splat.blue = colors[i, 2]
-                splat.depth = S[17, j]
-                depths[i] = S[17, j] if extent > ZERO else ZERO
+                splat.depth = S[DEPTH + j]
+                depths[i] = S[DEPTH + j] if extent > ZERO else ZERO
 
 
 @parallel_kernel
@@ -222,30 +244,26 @@ def project_backward(
         for block in range(worker * blocks // workers, (worker + 1) * blocks // workers):
             first = block * BLOCK
             filled = min(BLOCK, count - first)
-            for j in range(filled):
-                i = first + j
-                for k in range(3):
-                    S[k, j] = means[i, k]
-                    S[3 + k, j] = scales[i, k]
-                for k in range(4):
-                    S[6 + k, j] = quats[i, k]
-                S[10, j] = opacities[i]
+            _load_block(S, means, quats, scales, opacities, first, filled)
+            for lane in range(filled):
+                i, j = first + lane, u8(lane)
                 v_splat = v_splats[i]
-                S[11, j] = v_splat.sum
-                S[12, j] = v_splat.u
-                S[13, j] = v_splat.v
-                S[14, j] = v_splat.uu
-                S[15, j] = v_splat.uv
-                S[16, j] = v_splat.vv
-                S[17, j] = v_splat.depth
-            for j in range(BLOCK):
+                S[G + j] = v_splat.sum
+                S[G_U + j] = v_splat.u
+                S[G_V + j] = v_splat.v
+                S[G_UU + j] = v_splat.uu
+                S[G_UV + j] = v_splat.uv
+                S[G_VV + j] = v_splat.vv
+                S[G_DEPTH + j] = v_splat.depth
+            for lane in range(BLOCK):
+                j = u8(lane)
                 # the forward pass again
-                x, y, z = _to_camera(R, t, S[0, j], S[1, j], S[2, j])
+                x, y, z = _to_camera(R, t, S[MEAN_X + j], S[MEAN_Y + j], S[MEAN_Z + j])
                 inverse_z = ONE / (z if z > NEAR_PLANE else ONE)
                 slope_x, slope_y = x * inverse_z, y * inverse_z
                 held_x = _clamp(slope_x, limits[0], limits[1])
                 held_y = _clamp(slope_y, limits[2], limits[3])
-                qw, qx, qy, qz = S[6, j], S[7, j], S[8, j], S[9, j]
+                qw, qx, qy, qz = S[QUAT_W + j], S[QUAT_X + j], S[QUAT_Y + j], S[QUAT_Z + j]
                 norm2 = qw * qw + qx * qx + qy * qy + qz * qz
                 n = ONE / square_root(norm2 if norm2 > MIN_QUAT_NORM2 else ONE)
                 qw, qx, qy, qz = qw * n, qx * n, qy * n, qz * n
@@ -253,21 +271,21 @@ def project_backward(
                 j00, j11 = fx * inverse_z, fy * inverse_z
                 A = _screen_axes(R, j00, -j00 * held_x, j11, -j11 * held_y)
                 U = _times_rotation(A, Q)
-                V = _scale_axes(U, S[3, j], S[4, j], S[5, j])
+                V = _scale_axes(U, S[SCALE_X + j], S[SCALE_Y + j], S[SCALE_Z + j])
                 xx, xy, yy, det0, m01, m02, m12 = _covariance(V)
                 along, across, down, kept = _whitening(xx, xy, yy, det0)
 
                 # log alpha = log opacity' - (u^2 + v^2) ln 2, (u, v) = W (pixel - mean2d):
                 #   dL/dmean2d = 2 ln 2 W^T (sum g (u, v))
                 #   dL/dcov    = 1/2 W'^T (sum g w' w'^T) W',  W' = sqrt(2 ln 2) W the base-e factor
-                v_mean_x = TWO_LN2 * along * S[12, j]
-                v_mean_y = TWO_LN2 * (across * S[12, j] + down * S[13, j])
+                v_mean_x = TWO_LN2 * along * S[G_U + j]
+                v_mean_y = TWO_LN2 * (across * S[G_U + j] + down * S[G_V + j])
                 # opacity' = opacity sqrt(det0 / det): its share of log det falls on the same quadratic form
-                v_log_opacity = S[11, j]
-                v_log_opacity = v_log_opacity if S[10, j] * kept < MAX_OPACITY else ZERO
-                n_uu = TWO_LN2 * S[14, j] - v_log_opacity
-                n_uv = TWO_LN2 * S[15, j]
-                n_vv = TWO_LN2 * S[16, j] - v_log_opacity
+                v_log_opacity = S[G + j]
+                v_log_opacity = v_log_opacity if S[OPACITY + j] * kept < MAX_OPACITY else ZERO
+                n_uu = TWO_LN2 * S[G_UU + j] - v_log_opacity
+                n_uv = TWO_LN2 * S[G_UV + j]
+                n_vv = TWO_LN2 * S[G_VV + j] - v_log_opacity
                 half_k = HALF * TWO_LN2
                 c_xx = half_k * along * along * n_uu
                 c_xy = half_k * along * (across * n_uu + down * n_uv)
@@ -282,10 +300,10 @@ def project_backward(
                 v5 = TWO * (c_xy * V[2] + c_yy * V[5]) + e * (m02 * V[0] + m12 * V[1])
 
                 # V = U S
-                S[18, j] = v0 * U[0] + v3 * U[3]
-                S[19, j] = v1 * U[1] + v4 * U[4]
-                S[20, j] = v2 * U[2] + v5 * U[5]
-                v0, v1, v2, v3, v4, v5 = _scale_axes((v0, v1, v2, v3, v4, v5), S[3, j], S[4, j], S[5, j])
+                S[V_SCALE_X + j] = v0 * U[0] + v3 * U[3]
+                S[V_SCALE_Y + j] = v1 * U[1] + v4 * U[4]
+                S[V_SCALE_Z + j] = v2 * U[2] + v5 * U[5]
+                v0, v1, v2, v3, v4, v5 = _scale_axes((v0, v1, v2, v3, v4, v5), S[SCALE_X + j], S[SCALE_Y + j], S[SCALE_Z + j])
 
                 # U = A Q: dL/dQ = A^T dL/dU, then to the quaternion and through its normalisation
                 g00, g01, g02 = A[0] * v0 + A[3] * v3, A[0] * v1 + A[3] * v4, A[0] * v2 + A[3] * v5
@@ -296,10 +314,10 @@ def project_backward(
                 v_qy = TWO * (qx * (g01 + g10) + qz * (g12 + g21) - TWO * qy * (g00 + g22) + qw * (g02 - g20))
                 v_qz = TWO * (qx * (g02 + g20) + qy * (g12 + g21) - TWO * qz * (g00 + g11) + qw * (g10 - g01))
                 radial = v_qw * qw + v_qx * qx + v_qy * qy + v_qz * qz
-                S[21, j] = (v_qw - radial * qw) * n
-                S[22, j] = (v_qx - radial * qx) * n
-                S[23, j] = (v_qy - radial * qy) * n
-                S[24, j] = (v_qz - radial * qz) * n
+                S[V_QUAT_W + j] = (v_qw - radial * qw) * n
+                S[V_QUAT_X + j] = (v_qx - radial * qx) * n
+                S[V_QUAT_Y + j] = (v_qy - radial * qy) * n
+                S[V_QUAT_Z + j] = (v_qz - radial * qz) * n
 
                 # A = J R_cam: dL/dA = dL/dU Q^T, dL/dJ = dL/dA R_cam^T
                 a0 = v0 * Q[0] + v1 * Q[1] + v2 * Q[2]
@@ -319,19 +337,24 @@ def project_backward(
                 v_slope_x = fx * v_mean_x - free_x * j00 * v_j02
                 v_slope_y = fy * v_mean_y - free_y * j11 * v_j12
                 v_x, v_y = v_slope_x * inverse_z, v_slope_y * inverse_z
-                v_z = S[17, j] - inverse_z * (
+                v_z = S[G_DEPTH + j] - inverse_z * (
                     v_slope_x * slope_x + v_slope_y * slope_y + v_inverse_z * inverse_z
                 )
-                S[25, j] = R[0] * v_x + R[3] * v_y + R[6] * v_z
-                S[26, j] = R[1] * v_x + R[4] * v_y + R[7] * v_z
-                S[27, j] = R[2] * v_x + R[5] * v_y + R[8] * v_z
-                S[28, j] = v_log_opacity / max(S[10, j], f4(1e-30))
-            for j in range(filled):
-                i = first + j
+                S[V_MEAN_X + j] = R[0] * v_x + R[3] * v_y + R[6] * v_z
+                S[V_MEAN_Y + j] = R[1] * v_x + R[4] * v_y + R[7] * v_z
+                S[V_MEAN_Z + j] = R[2] * v_x + R[5] * v_y + R[8] * v_z
+                S[V_OPACITY + j] = v_log_opacity / max(S[OPACITY + j], f4(1e-30))
+            for lane in range(filled):
+                i, j = first + lane, u8(lane)
                 drawn = splats[i].extent > ZERO
-                for k in range(3):
-                    v_scales[i, k] = S[18 + k, j] if drawn else ZERO
-                    v_means[i, k] = S[25 + k, j] if drawn else ZERO
-                for k in range(4):
-                    v_quats[i, k] = S[21 + k, j] if drawn else ZERO
-                v_opacities[i] = S[28, j] if drawn else ZERO
+                v_means[i, 0] = S[V_MEAN_X + j] if drawn else ZERO
+                v_means[i, 1] = S[V_MEAN_Y + j] if drawn else ZERO
+                v_means[i, 2] = S[V_MEAN_Z + j] if drawn else ZERO
+                v_scales[i, 0] = S[V_SCALE_X + j] if drawn else ZERO
+                v_scales[i, 1] = S[V_SCALE_Y + j] if drawn else ZERO
+                v_scales[i, 2] = S[V_SCALE_Z + j] if drawn else ZERO
+                v_quats[i, 0] = S[V_QUAT_W + j] if drawn else ZERO
+                v_quats[i, 1] = S[V_QUAT_X + j] if drawn else ZERO
+                v_quats[i, 2] = S[V_QUAT_Y + j] if drawn else ZERO
+                v_quats[i, 3] = S[V_QUAT_Z + j] if drawn else ZERO
+                v_opacities[i] = S[V_OPACITY + j] if drawn else ZERO

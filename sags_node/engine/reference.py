@@ -47,9 +47,9 @@ class ReferenceRasterizer:
         import torch
 
         means, quats, scales, opacities, colors = self._inputs
-        cotangent = torch.as_tensor(v_planes, dtype=self._dtype)
+        cotangent = torch.tensor(v_planes, dtype=self._dtype)
         # the red plane is sum of w * red: its gradient by red, with the weights as cotangent, is sum of w * weight
-        red = torch.as_tensor(weight, dtype=self._dtype)
+        red = torch.tensor(weight, dtype=self._dtype)
         (by_color,) = torch.autograd.grad(self._planes[0], colors, red, retain_graph=True, materialize_grads=True)
         wanted = [means, quats, scales, opacities, colors] if geometry else [colors]
         found = torch.autograd.grad(self._planes, wanted, cotangent, retain_graph=True, materialize_grads=True)

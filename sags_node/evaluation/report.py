@@ -10,6 +10,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from rich.table import Table
 
 from sags_node.evaluation.gallery import Picture
 from sags_node.evaluation.measure import FrameRow
@@ -75,6 +76,14 @@ def write_report(
     file = folder / "report.html"
     file.write_text(page, encoding="utf-8")
     return file
+
+
+def summary_table(summary: Mapping[str, Any]) -> Table:
+    """The figures for a terminal."""
+    table = Table(show_header=False, box=None, padding=(0, 2))
+    for key, value in summary.items():
+        table.add_row(key, _text(value))
+    return table
 
 
 def _circumstances(summary: Mapping[str, Any]) -> str:

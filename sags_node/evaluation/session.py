@@ -9,7 +9,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
 
-from sags_node.config import LaunchConfig, PublishConfig, V4l2Source, load_launch
+from sags_node.config import LaunchConfig, V4l2Source, load_launch
+from sags_node.engine.threads import configure_threads
 from sags_node.errors import SagsError, UsageError
 from sags_node.evaluation.gallery import Picture
 from sags_node.evaluation.measure import FrameRow, Measurer, Options, Progress
@@ -103,6 +104,7 @@ def evaluate(
 
 def run_step(session: Session, options: Options, spool: Spool, progress: Progress) -> None:
     """Every frame in turn, none lost; only the pipeline's own work is timed."""
+    configure_threads(session.config.engine.threads)
     pipeline = Pipeline(session.config, session.rig)
     budget = _budget(session.config)
     with session.source as source:
@@ -123,7 +125,8 @@ def run_realtime(session: Session, options: Options, spool: Spool, progress: Pro
         spool.add(result, sum(result.timings_ms.values()), time.monotonic_ns(), latency_ms)
 
     # Its own sockets, away from those of a node that may be running on this machine.
-    publish = PublishConfig(data=(), control=None, run_dir=spool.folder / "run")
+    private = {"data": (), "ipc": True, "control": None, "run_dir": spool.folder / "run"}
+    publish = session.config.publish.model_copy(update=private)
     config = session.config.model_copy(update={"publish": publish})
     node = Node(config, session.rig, _WithoutHeldOut(session.source, options), on_result=keep)
     node.start()

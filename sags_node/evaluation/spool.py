@@ -75,7 +75,7 @@ class Spool:
     def add(
         self, result: FrameResult, frame_ms: float, t_shown_ns: int, latency_ms: float | None = None
     ) -> None:
-        """Keep one frame: about 6 MB and a few milliseconds at 640x512 with 30,000 Gaussians.
+        """Keep one frame: about 6 MB and 2 to 10 ms at 640x512 with 30,000 Gaussians.
 
         Raises:
             SagsError: the disk is full.

@@ -23,8 +23,8 @@ def right_eye_mask(tissue: Bool, depth: F32, focal_px: float, baseline: float) -
     """The right eye's pixels that show tissue for certain, without having looked at the right picture.
 
     A pixel is kept when every disparity that tissue and instruments can have (1st to 99th percentile of the
-    drawn depth, widened by `FAR_MARGIN` and `NEAR_MARGIN`) takes it to a tissue pixel inside the left picture.
-    A mask made by warping with the depth itself would be wrong where the depth is wrong, on the shafts above
+    drawn depth, widened by `FAR_MARGIN` and `NEAR_MARGIN`) takes it to a tissue pixel of the left picture. A
+    mask made by warping with the depth itself would be wrong where the depth is wrong, on the shafts above
     all, and let the instrument into the figure.
 
     Args:

@@ -21,7 +21,8 @@ MAX_REQUEST_BYTES = 65536  # per part
 MAX_REQUEST_PARTS = 4  # identity, the empty delimiter of REQ, the request
 MAX_REQUESTS_AT_ONCE = 32  # so that a flood cannot keep the publishing thread from its frames
 MAX_PENDING = 64
-RECEIVE_HIGH_WATER = 8
+RECEIVE_HIGH_WATER = 8  # requests one peer may have waiting
+SEND_HIGH_WATER = 2 * MAX_REQUESTS_AT_ONCE  # answers, before a peer that does not read loses some
 
 Handler = Callable[[dict[str, Any]], Any]
 Identifier = int | Annotated[str, msgspec.Meta(max_length=128)] | None

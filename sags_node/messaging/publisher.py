@@ -81,7 +81,7 @@ class Publisher:
         control_endpoint = None
         if config.control:
             router = self._context.socket(zmq.ROUTER)
-            _limit(router, control.RECEIVE_HIGH_WATER, control.MAX_REQUEST_BYTES)
+            _limit(router, control.SEND_HIGH_WATER, control.MAX_REQUEST_BYTES)
             router.setsockopt(zmq.RCVHWM, control.RECEIVE_HIGH_WATER)
             control_endpoint = bind(router, config.control, "publish.control")
             self._poller.register(router, zmq.POLLIN)

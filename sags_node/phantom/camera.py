@@ -1,4 +1,4 @@
-"""From bodies to a picture: one raw eye's view in linear light, smoke, and what lens and sensor make of it."""
+"""From bodies to a picture: one raw eye's view in linear light, smoke, then lens and sensor."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from sags_node.types import F32, F64, U8, Bool
 LENS_BLUR = 0.45  # px: no endoscope is sharper; it also softens the edges of single-sample rendering
 SMOKE_DISTANCE = 0.035  # m
 SMOKE_COLOR = np.array([0.42, 0.40, 0.40], np.float32)
-_BAND = 64  # rows at a time, so that the intermediate arrays stay in the cache
 _NOTHING = 0.003  # linear light where a ray leaves the scene
 
 
@@ -35,28 +34,26 @@ def look(
     directions: F32, offset: float, T_world_cam: F64, bodies: Bodies, relief: Relief, skin: Skin, lamp: Lamp
 ) -> tuple[F32, Bool]:
     """Linear-light picture [H, W, 3] along `directions` [H, W, 3], and where it shows instruments [H, W]."""
-    bands = []
-    for top in range(0, len(directions), _BAND):
-        rays = world_rays(directions[top : top + _BAND], offset, T_world_cam)
-        hits = bodies.cast(rays)
-        bands.append((_shade(rays, hits, bodies, relief, skin, lamp), hits.tool))
-    pictures, tools = zip(*bands, strict=True)
-    return np.concatenate(pictures), np.concatenate(tools)
+    rays = world_rays(directions, offset, T_world_cam)
+    hits = bodies.cast(rays)
+    return _shade(rays, hits, bodies, relief, skin, lamp), hits.tool
 
 
 def _shade(rays: F32, hits: Hits, bodies: Bodies, relief: Relief, skin: Skin, lamp: Lamp) -> F32:
     directions = rays[..., 3:]
-    points = rays[..., :3] + np.where(np.isfinite(hits.distance), hits.distance, 1)[..., None] * directions
+    distance = np.where(np.isfinite(hits.distance), hits.distance, np.float32(1))
+    points = np.asarray(rays[..., :3] + distance[..., None] * directions, np.float32)
     view = -normalized(directions)
 
     place = grid_position(hits, len(relief.x))
     normals = normalized(cv2.remap(bodies.normals, place, None, cv2.INTER_LINEAR))
-    material = place * np.float32(SPACING) + np.array([relief.x[0] - skin.x0, relief.y[0] - skin.y0], np.float32)
+    material = place * np.float32(SPACING) + np.array(
+        [relief.x[0] - skin.x0, relief.y[0] - skin.y0], np.float32
+    )
     texel = material / np.float32(skin.texel)
     color = cv2.remap(skin.color, texel, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     surface = cv2.remap(skin.surface, texel, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    flat = [a.reshape(-1, 3) for a in (points, normals, view, color, surface)]
-    picture = shade_tissue(*flat, lamp, lit=_lit(points, bodies, lamp).ravel()).reshape(rays.shape[:-1] + (3,))
+    picture = shade_tissue(points, normals, view, color, surface, lamp, _lit(points, bodies, lamp))
     picture[~hits.tissue] = _NOTHING
 
     if hits.tool.any():
@@ -73,11 +70,11 @@ def _shade(rays: F32, hits: Hits, bodies: Bodies, relief: Relief, skin: Skin, la
 
 
 def _lit(points: F32, bodies: Bodies, lamp: Lamp) -> F32:
-    """Share of the lamp's light [H, W] that reaches points [H, W, 3]; sampled at half resolution: soft edges."""
+    """Share of the lamp's light [H, W] that reaches points [H, W, 3], at half resolution: soft edges."""
     from_points = np.ascontiguousarray(points[::2, ::2])
     shadow = bodies.occluded(np.concatenate([from_points, lamp.place - from_points], -1)).astype(np.float32)
     soft = cv2.GaussianBlur(shadow, (0, 0), 1.2)
-    return 1 - cv2.resize(soft, points.shape[1::-1], interpolation=cv2.INTER_LINEAR)
+    return np.asarray(1 - cv2.resize(soft, points.shape[1::-1], interpolation=cv2.INTER_LINEAR), np.float32)
 
 
 def add_smoke(picture: F32, directions: F32, offset: float, cloud: F32, drift: F64, density: float) -> F32:
@@ -94,7 +91,7 @@ def add_smoke(picture: F32, directions: F32, offset: float, cloud: F32, drift: F
 
 
 def expose(linear: F32, blur: float, noise: float, rng: np.random.Generator) -> U8:
-    """The recorded picture [H, W, 3]: lens blur (px, standard deviation), tone curve, sensor noise (0..1 scale)."""
+    """The recorded picture [H, W, 3]: lens blur (px, standard deviation), tone curve, noise (0..1)."""
     sharpness = float(np.hypot(LENS_BLUR, blur))
     shown = develop(cv2.GaussianBlur(linear, (0, 0), sharpness))
     if noise > 0:

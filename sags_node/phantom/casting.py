@@ -65,7 +65,7 @@ class Bodies:
 
 
 def grid_position(hits: Hits, cols: int) -> F32:
-    """Column and row [..., 2] on the tissue's vertex grid (`Tissue.faces`); the corner 0, 0 where none was hit."""
+    """Column and row [..., 2] on the tissue's vertex grid (`Tissue.faces`); 0, 0 where none was hit."""
     face = np.where(hits.tissue, hits.face, 0)
     row, col = np.divmod(face // 2, cols - 1)
     lower = (face % 2).astype(np.float32)[..., None]

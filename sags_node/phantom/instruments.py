@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from sags_node.phantom.motion import keyed
-from sags_node.types import F32, F64, I64
+from sags_node.types import F64, I64
 
 X, Y = np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
 JAW_LENGTH = 0.0145  # m, hinge to tip
@@ -121,28 +121,44 @@ def _grasper_parts() -> list[_Part]:
         parts.append(_Part(_tube(path, 0.00060, 0.00075, X, _STEEL), side))
         yoke = np.array([[0, 0, 0.0115], [0, 0, 0.0118], [0, 0, 0.0150], [0, 0, 0.0165], [0, 0, 0.0166]])
         yoke = yoke + side * np.array([0.0008, 0, 0])
-        parts.append(_Part(_tube(yoke, [0, 0.0009, 0.0012, 0.0012, 0], [0, 0.0016, 0.0024, 0.0022, 0], Y, _STEEL), side))
-    pin = np.array([[0, -0.0033, JAW_LENGTH], [0, -0.0032, JAW_LENGTH], [0, 0.0032, JAW_LENGTH], [0, 0.0033, JAW_LENGTH]])
+        parts.append(
+            _Part(
+                _tube(yoke, [0, 0.0009, 0.0012, 0.0012, 0], [0, 0.0016, 0.0024, 0.0022, 0], Y, _STEEL), side
+            )
+        )
+    pin = np.array(
+        [[0, -0.0033, JAW_LENGTH], [0, -0.0032, JAW_LENGTH], [0, 0.0032, JAW_LENGTH], [0, 0.0033, JAW_LENGTH]]
+    )
     parts.append(_Part(_tube(pin, [0, 0.0012, 0.0012, 0], [0, 0.0012, 0.0012, 0], X, _DARK_STEEL)))
     for side in (-1, 1):  # the fork that holds the hinge
         prong = np.array([[0, 0, 0.0126], [0, 0, 0.0129], [0, 0, 0.0150], [0, 0, 0.0200]]) + side * Y * 0.0025
         parts.append(_Part(_tube(prong, [0, 0.0016, 0.0021, 0.0026], [0, 0.0006, 0.0007, 0.0009], Y, _STEEL)))
     parts.append(_Part(_turned([(0.0175, 0), (0.0176, 0.0022), (0.0190, 0.0030), (0.0202, 0.0033)], _STEEL)))
-    housing = [(0.0200, 0.0), (0.0201, 0.0032), (0.0206, 0.0036), (0.0235, 0.0037), (0.0237, 0.0034), (0.0242, 0.0034),
-               (0.0244, 0.0037), (0.0275, 0.0038), (0.0282, 0.0036), (0.0283, 0.0)]  # fmt: skip
+    core = [(0.0148, 0.0), (0.0150, 0.0016), (0.0180, 0.0020)]
+    parts.append(_Part(_turned(core, _DARK_STEEL)))
+    housing = [
+        *[(0.0200, 0.0), (0.0201, 0.0032), (0.0206, 0.0036), (0.0235, 0.0037), (0.0237, 0.0034)],
+        *[(0.0242, 0.0034), (0.0244, 0.0037), (0.0275, 0.0038), (0.0282, 0.0036), (0.0283, 0.0)],
+    ]
     parts.append(_Part(_turned(housing, _CERAMIC)))
-    parts.append(_Part(_turned([(0.0280, 0.0), (0.0281, 0.0031), (0.0300, 0.0031), (0.0301, 0.0)], _DARK_STEEL)))
+    parts.append(
+        _Part(_turned([(0.0280, 0.0), (0.0281, 0.0031), (0.0300, 0.0031), (0.0301, 0.0)], _DARK_STEEL))
+    )
     parts.append(_Part(_turned([(0.0298, 0.0), (0.0299, SHAFT_RADIUS), (SHAFT_END, SHAFT_RADIUS)], _BLACK)))
     return parts
 
 
 def _hook_parts() -> list[_Part]:
     bend = np.linspace(0, 1, 13)
-    tip = np.stack([0.0030 * (1 - bend) ** 2.2, np.zeros(13), 0.0042 * bend - 0.0012 * np.sin(np.pi * bend)], -1)
+    tip = np.stack(
+        [0.0030 * (1 - bend) ** 2.2, np.zeros(13), 0.0042 * bend - 0.0012 * np.sin(np.pi * bend)], -1
+    )
     rod = np.vstack([tip, [[0, 0, 0.0060], [0, 0, 0.0100]]])
     radii = np.concatenate([[0.0, 0.00030], np.full(11, 0.00042), [0.0005, 0.0007]])
-    gold = [(0.0150, 0.0), (0.0151, 0.0022), (0.0165, 0.0031), (0.0195, 0.0033), (0.0197, 0.0029), (0.0204, 0.0029),
-            (0.0206, 0.0033), (0.0250, 0.0034), (0.0260, 0.0031), (0.0261, 0.0)]  # fmt: skip
+    gold = [
+        *[(0.0150, 0.0), (0.0151, 0.0022), (0.0165, 0.0031), (0.0195, 0.0033), (0.0197, 0.0029)],
+        *[(0.0204, 0.0029), (0.0206, 0.0033), (0.0250, 0.0034), (0.0260, 0.0031), (0.0261, 0.0)],
+    ]
     return [
         _Part(_tube(rod, radii, radii, Y, _STEEL)),
         _Part(_turned([(0.0098, 0.0), (0.0099, 0.0009), (0.0130, 0.0013), (0.0155, 0.0014)], _DARK_STEEL)),
@@ -165,7 +181,7 @@ def _tube(
     material: tuple[float, float, float, float],
     segments: int = 32,
 ) -> Mesh:
-    """Elliptic rings along a path [n, 3] that lies in (about) one plane; half axes in the plane and normal to it."""
+    """Elliptic rings along a path [n, 3] in (about) one plane; half axes (m) in it and normal to it."""
     count = len(path)
     tangent = np.gradient(path, axis=0)
     side = _unit(np.cross(plane_normal, tangent))

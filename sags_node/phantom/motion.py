@@ -1,4 +1,4 @@
-"""The clock of the phantom: periodic movements over the session's phase (0 at the first frame, 1 = 0 again)."""
+"""The clock of the phantom: periodic movements over the session's phase, 0 to 1."""
 
 from __future__ import annotations
 
@@ -45,6 +45,8 @@ def scope_pose(phase: float, moving: bool) -> F64:
     pose = np.eye(4)
     if moving:
         once, twice = 2 * np.pi * phase, 4 * np.pi * phase
-        pose[:3, :3] = cv2.Rodrigues(np.array([0.020 * np.sin(twice), 0.030 * np.sin(once), 0.015 * np.sin(once)]))[0]
+        pose[:3, :3] = cv2.Rodrigues(
+            np.array([0.020 * np.sin(twice), 0.030 * np.sin(once), 0.015 * np.sin(once)])
+        )[0]
         pose[:3, 3] = [0.0030 * np.sin(once), 0.0018 * np.sin(twice), 0.0020 * (1 - np.cos(once))]
     return pose

@@ -6,6 +6,7 @@ Material coordinates are the x and y (m) of a surface point at rest. They never 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -142,7 +143,7 @@ def _nearest_on_curve(grid: F64, curve: F64) -> tuple[F64, F64]:
     offset = np.zeros_like(grid)
     along = np.zeros(grid.shape[:2])
     start = 0.0
-    for a, b in zip(curve[:-1], curve[1:], strict=True):
+    for a, b in pairwise(curve):
         length = float(np.linalg.norm(b - a))
         direction = (b - a) / length
         place = np.clip((grid - a) @ direction, 0, length)
@@ -159,7 +160,7 @@ def _nearest_on_curve(grid: F64, curve: F64) -> tuple[F64, F64]:
 def _liver_height(grid: F64, half: F64) -> F64:
     scaled = (grid / (half * BED_DEPTH) - _LIVER_CENTER) / _LIVER_RADII
     inside = 1 - (scaled**2).sum(-1)
-    return np.where(inside > 0, np.sqrt(np.maximum(inside, 0)) * _LIVER_HEIGHT, 0.05 * inside)
+    return np.asarray(np.where(inside > 0, np.sqrt(np.maximum(inside, 0)) * _LIVER_HEIGHT, 0.05 * inside))
 
 
 def _cavity(height: F32) -> F32:

@@ -56,7 +56,7 @@ def raw_rays(eye: Eye) -> F64:
 
 
 def rectified_rays(eye: Eye) -> F64:
-    """Ray of every rectified pixel in the rectified camera's axes, [H, W, 3], with z = 1: its length is depth."""
+    """Ray of every rectified pixel in the rectified camera's axes, [H, W, 3], scaled to z = 1."""
     u, v = np.meshgrid(np.arange(eye.width, dtype=np.float64), np.arange(eye.height, dtype=np.float64))
     x, y = (u - eye.P[0, 2]) / eye.P[0, 0], (v - eye.P[1, 2]) / eye.P[1, 1]
     return np.stack([x, y, np.ones_like(x)], -1)

@@ -39,7 +39,11 @@ def cached_session(config: PhantomSource, progress: Progress | None = None) -> P
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sags"
     folder = cache / f"phantom-{digest}"
     if not (folder / _COMPLETE).exists():
-        write_session(config, folder, RATE, progress)
+        try:
+            write_session(config, folder, RATE, progress)
+        except SagsError:
+            if not (folder / _COMPLETE).exists():  # else another process finished the same session first
+                raise
     return folder
 
 
@@ -49,8 +53,8 @@ def write_session(
     """Render `round(config.seconds * rate)` frames and all that is true of them into a new folder.
 
     The folder appears only when it is complete: until then everything is in a sibling whose name ends in
-    `.partial`, which is removed when rendering is interrupted. `sags_node.config.load_launch(folder)` reads it.
-    Same config and rate, same files on one machine.
+    `.partial`, which is removed when rendering is interrupted. `sags_node.config.load_launch(folder)` reads
+    the result. Same config and rate, same files on one machine.
 
     Raises:
         UsageError: the folder exists and is not empty.
@@ -61,7 +65,7 @@ def write_session(
     partial = folder.with_name(f"{folder.name}.{os.getpid()}.partial")
     try:
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise UsageError(f"{folder} exists and is not empty; name a new folder for the phantom session")
+            raise UsageError(f"{folder} exists and is not empty; remove it or name another folder")
         partial.mkdir(parents=True)
         _write_frames(config, partial, count, rate, progress)
         partial.rename(folder)

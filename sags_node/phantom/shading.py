@@ -1,4 +1,4 @@
-"""Light and colour: from what a ray met to a pixel. The light sits at the scope's tip, just above the eyes."""
+"""Light and colour of tissue and metal. The light sits at the scope's tip, just above the eyes."""
 
 from __future__ import annotations
 
@@ -11,9 +11,11 @@ from sags_node.phantom.vectors import dot, normalized
 from sags_node.types import F32, F64
 
 LAMP_ABOVE = 0.006  # m, off the eyes' axis: what makes shadows
-LIGHT_POWER = 0.0046  # m^2: brightness 1 on a white wall at sqrt(LIGHT_POWER)
+LIGHT_POWER = 0.0052  # m^2: brightness 1 on a white wall at sqrt(LIGHT_POWER)
 LIGHT_SPREAD = 3.0  # exponent of the fall-off towards the rim
-_WRAP = np.array([0.34, 0.14, 0.12], np.float32)  # red light leaks round into the shade: under-surface scattering
+_WRAP = np.array(
+    [0.34, 0.14, 0.12], np.float32
+)  # red light leaks round into the shade: under-surface scattering
 _AMBIENT = np.array([0.085, 0.050, 0.047], np.float32)  # light that has bounced off other tissue
 _CAVITY_GLOW = np.array([0.30, 0.085, 0.075], np.float32)  # what metal mirrors when it faces the tissue
 
@@ -32,7 +34,7 @@ class Lamp:
         return Lamp(place.astype(np.float32), T_world_cam[:3, 2].astype(np.float32))
 
     def reach(self, points: F32) -> tuple[F32, F32]:
-        """Directions to the light [N, 3] and strength received [N] at points [N, 3]."""
+        """Directions to the light [..., 3] and strength received [...] at points [..., 3]."""
         to_light = self.place - points
         squared = dot(to_light, to_light)
         to_light = normalized(to_light)
@@ -41,36 +43,37 @@ class Lamp:
 
 
 def shade_tissue(points: F32, normals: F32, view: F32, color: F32, surface: F32, lamp: Lamp, lit: F32) -> F32:
-    """Linear-light colour [N, 3] of wet tissue.
+    """Linear-light colour [..., 3] of wet tissue.
 
     Args:
-        points, normals: [N, 3] m and unit vectors.
-        view: [N, 3] unit vectors towards the eye.
-        color: [N, 3] reflectance.
-        surface: [N, 3] slopes of the fine relief along x and y, wetness.
-        lit: [N] share of the light that reaches the point, 0 = in shadow.
+        points, normals: [..., 3] m and unit vectors.
+        view: [..., 3] unit vectors towards the eye.
+        color: [..., 3] reflectance.
+        surface: [..., 3] slopes of the fine relief along x and y, wetness.
+        lamp: the light.
+        lit: [...] share of the light that reaches the point, 0 = in shadow.
     """
-    fine = _tilted(normals, surface[:, :2])
+    fine = _tilted(normals, surface[..., :2])
     to_light, strength = lamp.reach(points)
     strength = strength * lit
     cosine = 0.45 * dot(to_light, normals) + 0.55 * dot(to_light, fine)  # scattering blurs the fine relief
-    diffuse = np.maximum((cosine[:, None] + _WRAP) / (1 + _WRAP), 0)
+    diffuse = np.maximum((cosine[..., None] + _WRAP) / (1 + _WRAP), 0)
 
     facing = np.clip(dot(normalized(to_light + view), fine), 0, 1)  # of the half-way vector
     # Two lobes: the film of liquid, and the rougher tissue below it.
-    film = surface[:, 2] ** 2 * 2.6 * facing**np.float32(260)
-    gleam = 0.075 * facing**np.float32(22)
+    film = surface[..., 2] ** 2 * 2.6 * facing ** np.float32(260)
+    gleam = 0.075 * facing ** np.float32(22)
     mirrored = (film + gleam) * np.minimum(strength, 1.6) * (cosine > 0)
-    return np.asarray(color * (diffuse * strength[:, None] + _AMBIENT) + mirrored[:, None], np.float32)
+    return np.asarray(color * (diffuse * strength[..., None] + _AMBIENT) + mirrored[..., None], np.float32)
 
 
 def _tilted(normals: F32, slope: F32) -> F32:
-    """Normals of a surface with fine slopes [N, 2] along its tangents nearest the x and y axes."""
-    nx, ny, nz = normals.T
+    """Normals of a surface with fine slopes [..., 2] along its tangents nearest the x and y axes."""
+    nx, ny, nz = normals[..., 0], normals[..., 1], normals[..., 2]
     # Tangents (1, 0, -nx/nz) and (0, 1, -ny/nz); the normal points to the camera, nz < 0.
     safe_nz = np.minimum(nz, -0.2)
     scale_x, scale_y = 1 / np.sqrt(1 + (nx / safe_nz) ** 2), 1 / np.sqrt(1 + (ny / safe_nz) ** 2)
-    a, b = slope[:, 0] * scale_x, slope[:, 1] * scale_y
+    a, b = slope[..., 0] * scale_x, slope[..., 1] * scale_y
     return normalized(np.stack([nx - a, ny - b, nz + a * nx / safe_nz + b * ny / safe_nz], -1))
 
 
@@ -88,7 +91,8 @@ def shade_metal(points: F32, normals: F32, view: F32, materials: F32, lamp: Lamp
     gleam = 0.10 * towards_light**30 + 0.9 * towards_light**250
     rim = 0.05 * (1 - np.clip(facing, 0, 1)) ** 3
     return np.asarray(
-        strength * (color * (mirror * surroundings + (1 - mirror) * matt) + (1 - mirror) * gleam + rim), np.float32
+        strength * (color * (mirror * surroundings + (1 - mirror) * matt) + (1 - mirror) * gleam + rim),
+        np.float32,
     )
 
 

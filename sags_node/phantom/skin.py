@@ -30,7 +30,7 @@ _CAPILLARY = np.array([0.12, 0.45, 0.40], np.float32)
 
 @dataclass(frozen=True, slots=True)
 class Skin:
-    """Textures over material coordinates; texel (row, col) lies at x = x0 + col * texel, y = y0 + row * texel."""
+    """Textures over material coordinates: texel (row, col) lies at x0 + col * texel, y0 + row * texel."""
 
     color: F32  # [H, W, 3] linear reflectance, furrows darkened
     surface: F32  # [H, W, 3]: slope along x, slope along y, wetness 0..1
@@ -42,18 +42,20 @@ class Skin:
 def paint_skin(relief: Relief, rng: np.random.Generator, footprint: float) -> Skin:
     """Paint the textures; `footprint` is what one camera pixel covers (m), finer detail is averaged away."""
     zoom = SPACING / PAINT_TEXEL
-    shape = tuple(int(round(n * zoom)) for n in relief.chart.shape[:2])
-    size = (shape[1], shape[0])
+    rows, cols = relief.chart.shape[:2]
+    shape = (round(rows * zoom), round(cols * zoom))
+    size = shape[::-1]
 
     def enlarge(field: F32) -> F32:
-        return cv2.resize(field, size, interpolation=cv2.INTER_LINEAR)
+        return np.asarray(cv2.resize(field, size, interpolation=cv2.INTER_LINEAR), np.float32)
 
     # Detail is drawn flat, then wrapped round the loops by their arc-length chart.
     chart = enlarge(relief.chart)
     at = (chart - np.array([relief.x[0], relief.y[0]], np.float32)) / np.float32(PAINT_TEXEL)
 
     def wrap(flat: F32) -> F32:
-        return cv2.remap(flat, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
+        folded = cv2.remap(flat, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
+        return np.asarray(folded, np.float32)
 
     loop, liver, tint = enlarge(relief.loop), enlarge(relief.liver), enlarge(relief.tint)
     bed = np.clip(1 - loop - liver, 0, 1)
@@ -68,7 +70,7 @@ def paint_skin(relief: Relief, rng: np.random.Generator, footprint: float) -> Sk
 
     shrink = min(1.0, PAINT_TEXEL / (0.75 * footprint))
     small = (max(8, int(size[0] * shrink)), max(8, int(size[1] * shrink)))
-    texel = SPACING * relief.chart.shape[1] / small[0]
+    texel = SPACING * cols / small[0]
     corner = 0.5 * (texel - SPACING)  # from the centre of the first vertex to that of the first texel
     return Skin(
         color=cv2.resize(color, small, interpolation=cv2.INTER_AREA),
@@ -96,7 +98,9 @@ def _mix(a: F32, b: F32, share: F32) -> F32:
 def _fat_share(rng: np.random.Generator, shape: Shape, bed: F32, loop: F32) -> F32:
     """Yellow patches: most of them in the bed, streaks where loops are attached."""
     patches = fractal_noise(rng, shape, 140, 4)
-    return np.asarray(bed * _between(0.1, 0.9, patches) + 0.45 * loop * _between(2.0, 3.0, patches), np.float32)
+    return np.asarray(
+        bed * _between(0.1, 0.9, patches) + 0.45 * loop * _between(2.0, 3.0, patches), np.float32
+    )
 
 
 def _base_color(
@@ -105,7 +109,9 @@ def _base_color(
     broad = wrap(fractal_noise(rng, shape, 260, 3)) + tint
     mottle = wrap(fractal_noise(rng, shape, 45, 4))
     grain = wrap(fractal_noise(rng, shape, 9, 2))
-    serosa = _mix(np.broadcast_to(_SEROSA, (*shape, 3)), _SEROSA_PALE, _between(0.2, 2.2, broad + 0.5 * mottle))
+    serosa = _mix(
+        np.broadcast_to(_SEROSA, (*shape, 3)), _SEROSA_PALE, _between(0.2, 2.2, broad + 0.5 * mottle)
+    )
     serosa = _mix(serosa, _SEROSA_DARK, _between(0.1, 2.2, -broad + 0.7 * mottle))
     color = _mix(np.broadcast_to(_MESENTERY, (*shape, 3)), serosa, loop)
     color = _mix(color, _FAT, fat)
@@ -133,13 +139,14 @@ def _blood(rng: np.random.Generator, shape: Shape, perfused: F32, wrap: Wrap) ->
 def _slopes(rng: np.random.Generator, shape: Shape, bed: F32, liver: F32, fat: F32, wrap: Wrap) -> F32:
     """Slopes [H, W, 2] of the fine relief, far below the mesh spacing; they make the wet highlights."""
     texel = np.float32(PAINT_TEXEL)
-    ripples = 0.06e-3 * fractal_noise(rng, shape, 20, 2)
-    wrinkles = 0.22e-3 * (1 - np.abs(fractal_noise(rng, shape, 26, 2)))
-    lobules = _lobules(rng, shape, cell=22.0) * texel
-    tremble = 0.030e-3 * fractal_noise(rng, shape, 7, 1)
+    ripples = np.float32(0.06e-3) * fractal_noise(rng, shape, 20, 2)
+    wrinkles = np.float32(-0.22e-3) * np.abs(fractal_noise(rng, shape, 26, 2))
+    lobules = texel * _lobules(rng, shape, cell=22.0)
+    tremble = np.float32(0.03e-3) * fractal_noise(rng, shape, 7, 1)
 
     def slope(height: F32) -> F32:
-        return wrap(np.dstack(np.gradient(height, texel)[::-1]).astype(np.float32))
+        down, right = np.gradient(height, texel)
+        return wrap(np.dstack([right, down]).astype(np.float32))
 
     total = (
         slope(ripples + tremble)
@@ -147,7 +154,7 @@ def _slopes(rng: np.random.Generator, shape: Shape, bed: F32, liver: F32, fat: F
         + slope(lobules) * fat[..., None]
     )
     total *= (1 - 0.6 * liver)[..., None]
-    return np.clip(total, -0.9, 0.9)
+    return np.asarray(np.clip(total, -0.9, 0.9), np.float32)
 
 
 def _lobules(rng: np.random.Generator, shape: Shape, cell: float) -> F32:

@@ -55,7 +55,7 @@ class Tissue:
         positions += np.float32(self._clock.heartbeat(phase)) * self._heart_push
         positions[..., 1] += (0.4 * BREATH_LIFT) * breath
         positions[..., 2] -= BREATH_LIFT * breath
-        return positions
+        return np.asarray(positions, np.float32)
 
     def lift(self, phase: float) -> float:
         """How far the grip is pulled, 0..1."""
@@ -63,7 +63,7 @@ class Tissue:
 
     def grip(self, vertices: F32) -> F64:
         """The gripped point [3] (m, world)."""
-        return vertices[self.relief.grip].astype(np.float64)
+        return np.asarray(vertices[self.relief.grip], np.float64)
 
     def track_indices(self, rng: np.random.Generator, half_view: tuple[float, float], count: int) -> I64:
         """Flat indices [count] of vertices spread over the view: the tracked surface points."""

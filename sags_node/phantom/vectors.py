@@ -1,4 +1,4 @@
-"""Dot products and unit vectors of long float32 lists; einsum is several times faster here than `numpy.linalg`."""
+"""Dot products and unit vectors of pictures of float32 vectors, several times faster than `numpy.linalg`."""
 
 from __future__ import annotations
 

@@ -27,7 +27,9 @@ def grow_vessels(
     canvas = np.zeros(shape, np.uint8)
     rows, cols = shape
     growing = [
-        _Sprout(rng.uniform(0, rows), rng.uniform(0, cols), rng.uniform(0, 2 * np.pi), width * rng.uniform(0.6, 1))
+        _Sprout(
+            rng.uniform(0, rows), rng.uniform(0, cols), rng.uniform(0, 2 * np.pi), width * rng.uniform(0.6, 1)
+        )
         for _ in range(roots)
     ]
     while growing:
@@ -47,7 +49,7 @@ def grow_vessels(
         )
         inside = [s for s in children if -20 < s.row < rows + 20 and -20 < s.col < cols + 20]
         growing.extend(inside)
-    return cv2.GaussianBlur(canvas, (0, 0), 0.7).astype(np.float32) / 255
+    return np.asarray(cv2.GaussianBlur(canvas, (0, 0), 0.7) / np.float32(255), np.float32)
 
 
 def _grow(rng: np.random.Generator, sprout: _Sprout, thinnest: float) -> tuple[F32, list[_Sprout]]:

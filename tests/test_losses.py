@@ -1,0 +1,130 @@
+"""The fused loss kernel against autograd of the loss it states."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numpy as np
+import pytest
+from engine_scenes import camera, random_gaussians, relative_error
+
+from sags_node.engine.losses import tissue_loss
+from sags_node.engine.rasterize import make_rasterizer
+from sags_node.types import F32
+
+HEIGHT, WIDTH = 23, 31
+DEPTH_WEIGHT, DEPTH_SCALE = 0.02, 1e-3
+
+
+def frame(seed: int = 0) -> dict[str, Any]:
+    """Planes of every coverage, and a frame to compare them with."""
+    rng = np.random.default_rng(seed)
+    coverage = rng.uniform(0, 1, (HEIGHT, WIDTH))
+    depth = rng.uniform(0.05, 0.06, (HEIGHT, WIDTH))
+    drawn_depth = depth + rng.normal(0, 1e-3, depth.shape)  # on both branches of the Huber function
+    planes = np.concatenate([rng.uniform(0, 1, (3, HEIGHT, WIDTH)), drawn_depth[None], np.ones((1, HEIGHT, WIDTH))])
+    depth[rng.uniform(size=depth.shape) < 0.3] = 0
+    return {
+        "planes": (planes * coverage).astype(np.float32),
+        "image": rng.uniform(0, 1, (HEIGHT, WIDTH, 3)).astype(np.float32),
+        "tissue": rng.uniform(size=(HEIGHT, WIDTH)) < 0.8,
+        "depth": depth.astype(np.float32),
+    }
+
+
+def run(inputs: dict[str, Any]) -> tuple[float, F32, F32]:
+    v_planes = np.full((5, HEIGHT, WIDTH), np.nan, np.float32)  # every value must be written
+    weight = np.full((HEIGHT, WIDTH), np.nan, np.float32)
+    mean = tissue_loss(
+        **inputs, v_planes=v_planes, weight=weight, depth_weight=DEPTH_WEIGHT, depth_scale=DEPTH_SCALE
+    )
+    return mean, v_planes, weight
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_kernel_writes_the_gradient_of_the_stated_loss(seed: int) -> None:
+    import torch
+
+    from sags_node.engine import reference
+
+    inputs = frame(seed)
+    _, v_planes, _ = run(inputs)
+    planes = torch.tensor(inputs["planes"], dtype=torch.float64, requires_grad=True)
+    arrays = [torch.tensor(inputs[name]) for name in ("image", "tissue", "depth")]
+    loss = reference.tissue_loss(planes, *arrays, depth_weight=DEPTH_WEIGHT, depth_scale=DEPTH_SCALE)
+    loss.backward()
+    assert planes.grad is not None
+    for plane in range(5):
+        assert relative_error(v_planes[plane], planes.grad[plane].numpy()) < 1e-5, plane
+
+
+def test_mean_residual_and_weight() -> None:
+    inputs = frame()
+    mean, _, weight = run(inputs)
+    coverage = inputs["planes"][4]
+    counts = inputs["tissue"] & (coverage > 0.05)
+    color = inputs["planes"][:3].transpose(1, 2, 0)[counts] / coverage[counts][:, None]
+    assert mean == pytest.approx(np.abs(color - inputs["image"][counts]).mean(), rel=1e-5)
+    np.testing.assert_allclose(weight[counts], 1 / coverage[counts], rtol=1e-6)
+    assert not weight[~counts].any()
+
+
+def test_no_tissue_no_gradient() -> None:
+    inputs = frame() | {"tissue": np.zeros((HEIGHT, WIDTH), np.bool_)}
+    mean, v_planes, weight = run(inputs)
+    assert mean == 0
+    assert not v_planes.any()
+    assert not weight.any()
+
+
+@pytest.mark.parametrize("name", ["image", "depth"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_broken_pixels_are_left_out(name: str, value: float) -> None:
+    clean, broken = frame(), frame()
+    for inputs in (clean, broken):
+        inputs["tissue"][4, 5] = True
+        inputs["planes"][4, 4, 5] = 1.0
+    broken[name][4, 5] = value
+    _, v_clean, _ = run(clean)
+    mean, v_broken, weight = run(broken)
+    assert np.isfinite(mean)
+    assert np.isfinite(v_broken).all()
+    assert np.isfinite(weight).all()
+    elsewhere = np.ones((HEIGHT, WIDTH), bool)
+    elsewhere[4, 5] = False
+    np.testing.assert_array_equal(v_broken[:, elsewhere], v_clean[:, elsewhere])
+
+
+def test_same_bits_for_one_and_all_threads() -> None:
+    inputs = frame()
+    together = run(inputs)
+    cores = numba.get_num_threads()
+    numba.set_num_threads(1)
+    try:
+        alone = run(inputs)
+    finally:
+        numba.set_num_threads(cores)
+    assert alone[0] == together[0]
+    np.testing.assert_array_equal(alone[1], together[1])
+
+
+def test_contribution_makes_the_closed_form_colour_step_converge() -> None:
+    """color -= gradient / contribution, repeated, explains a picture that the same Gaussians can draw."""
+    view = camera(WIDTH, HEIGHT, focal=40.0)
+    gaussians = random_gaussians(3, 80, view)
+    rasterizer = make_rasterizer("numba", WIDTH, HEIGHT)
+    planes = rasterizer.forward(gaussians, view)
+    coverage = planes[4].copy()
+    image = np.ascontiguousarray((planes[:3] / np.maximum(coverage, 1e-6)).transpose(1, 2, 0))
+    tissue = coverage > 0.3
+    unknown = np.zeros((HEIGHT, WIDTH), np.float32)
+    v_planes, weight = np.empty((5, HEIGHT, WIDTH), np.float32), np.empty((HEIGHT, WIDTH), np.float32)
+    gaussians.colors[:] = 0.5
+    losses = []
+    for _ in range(30):
+        planes = rasterizer.forward(gaussians, view)
+        losses.append(tissue_loss(planes, image, tissue, unknown, v_planes, weight, 0.0, DEPTH_SCALE))
+        gradients = rasterizer.backward(v_planes, weight, geometry=False)
+        gaussians.colors[:] -= gradients.colors / np.maximum(gradients.contribution, 1e-3)[:, None]
+    assert losses[-1] < 0.15 * losses[0]

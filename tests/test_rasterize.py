@@ -1,0 +1,439 @@
+"""The rasteriser: kernels against the twin, the twin against finite differences, and what breaks rasterisers."""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+from collections.abc import Callable
+
+import numba
+import numpy as np
+import pytest
+from engine_scenes import INPUTS, camera, one_gaussian, random_gaussians, relative_error
+
+from sags_node import geometry
+from sags_node.engine import binning, compositing, numba_rasterizer, projection, views
+from sags_node.engine.rasterize import Gradients, make_rasterizer, rasterize, to_view
+from sags_node.engine.warm_up import warm_up
+from sags_node.errors import SagsError, UsageError
+from sags_node.types import F32, Camera, Gaussians
+
+GRADIENTS = (*INPUTS, "contribution")
+
+
+def draw(
+    gaussians: Gaussians, view: Camera, backend: str = "numba", seed: int = 0
+) -> tuple[F32, dict[str, F32]]:
+    """Planes, and gradients for a random cotangent, as copies."""
+    rasterizer = make_rasterizer(backend, view.width, view.height)
+    planes = rasterizer.forward(gaussians, view).copy()
+    gradients = rasterizer.backward(*cotangent(view, seed))
+    return planes, copies(gradients)
+
+
+def cotangent(view: Camera, seed: int) -> tuple[F32, F32]:
+    rng = np.random.default_rng(seed)
+    v_planes = rng.normal(size=(5, view.height, view.width)).astype(np.float32)
+    return v_planes, rng.uniform(0, 2, (view.height, view.width)).astype(np.float32)
+
+
+def copies(gradients: Gradients) -> dict[str, F32]:
+    return {name: getattr(gradients, name).copy() for name in GRADIENTS}
+
+
+def assert_same_bits(a: tuple[F32, dict[str, F32]], b: tuple[F32, dict[str, F32]]) -> None:
+    np.testing.assert_array_equal(a[0], b[0])
+    for name in GRADIENTS:
+        np.testing.assert_array_equal(a[1][name], b[1][name], err_msg=name)
+
+
+def subset(gaussians: Gaussians, keep: np.ndarray) -> Gaussians:
+    return Gaussians(**{f.name: getattr(gaussians, f.name)[keep] for f in dataclasses.fields(Gaussians)})
+
+
+# ---- the arithmetic ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("moved", [False, True])
+def test_kernels_agree_with_the_float64_twin(seed: int, moved: bool) -> None:
+    view = camera(moved=moved)
+    gaussians = random_gaussians(seed, 60, view)
+    planes, found = draw(gaussians, view, "numba", seed)
+    true_planes, true = draw(gaussians, view, "reference", seed)
+    assert true_planes[4].mean() > 0.3  # the scene does cover the picture
+    np.testing.assert_allclose(planes, true_planes, atol=5e-6)
+    for name in GRADIENTS:
+        assert relative_error(found[name], true[name]) < 2e-5, name
+
+
+def test_twin_agrees_with_finite_differences() -> None:
+    """Everywhere alpha > 1/255, so that the loss is smooth. The last Gaussian lies beyond the widened frustum,
+    where the Jacobian is held."""
+    import torch
+
+    from sags_node.engine.rasterize import _as_pinhole
+    from sags_node.engine.reference import render
+
+    view = camera(width=7, height=6, focal=12.0, moved=True)
+    rng = np.random.default_rng(5)
+    pixels = np.append(rng.uniform(1, 5, (5, 2)), [[11.0, 2.0]], 0)
+    means = geometry.unproject(view, pixels, rng.uniform(0.05, 0.09, 6))
+    arrays = [
+        means,
+        rng.normal(size=(6, 4)),
+        np.append(rng.uniform(0.02, 0.05, (5, 3)), [[0.06, 0.05, 0.07]], 0),
+        rng.uniform(0.3, 0.8, 6),
+        rng.uniform(0, 1, (6, 3)),
+    ]
+    pinhole = _as_pinhole(view)
+    weights = torch.tensor(rng.normal(size=(5, view.height, view.width)))
+    tensors = [torch.tensor(array, requires_grad=True) for array in arrays]
+    (render(*tensors, pinhole) * weights).sum().backward()
+
+    def loss(index: int, changed: np.ndarray) -> float:
+        values = [torch.tensor(changed if i == index else a) for i, a in enumerate(arrays)]
+        return float((render(*values, pinhole) * weights).sum())
+
+    for index, name in enumerate(INPUTS):
+        differences = np.empty_like(arrays[index])
+        for at in np.ndindex(differences.shape):
+            step = 1e-6 * max(abs(arrays[index][at]), 1e-3)
+            up, down = arrays[index].copy(), arrays[index].copy()
+            up[at] += step
+            down[at] -= step
+            differences[at] = (loss(index, up) - loss(index, down)) / (2 * step)
+        found = tensors[index].grad
+        assert found is not None
+        assert np.abs(differences[-1]).max() > 0, name  # the far one takes part
+        np.testing.assert_allclose(
+            found.numpy(), differences, atol=1e-6 * np.abs(differences).max(), rtol=1e-5, err_msg=name
+        )
+
+
+def test_held_jacobian_agrees_with_the_twin() -> None:
+    """Large Gaussians whose centres lie outside the widened frustum reach into the picture."""
+    view = camera(moved=True)
+    rng = np.random.default_rng(11)
+    inside = random_gaussians(11, 12, view, spread=2.0)
+    pixels = rng.uniform([-60, -50], [-30, 80], (12, 2))
+    means = geometry.unproject(view, pixels, rng.uniform(0.05, 0.09, 12)).astype(np.float32)
+    scales = rng.uniform(0.02, 0.05, (12, 3)).astype(np.float32)
+    gaussians = dataclasses.replace(inside, means=means, scales=scales)
+    planes, found = draw(gaussians, view, "numba")
+    true_planes, true = draw(gaussians, view, "reference")
+    assert true_planes[4].mean() > 0.05
+    np.testing.assert_allclose(planes, true_planes, atol=1e-5)
+    for name in GRADIENTS:
+        assert relative_error(found[name], true[name]) < 2e-5, name
+
+
+def test_needles_of_one_to_ten_thousand_stay_exact() -> None:
+    view = camera(width=64, height=64, focal=80.0)
+    gaussians = random_gaussians(7, 12, view)
+    scales = np.tile(np.array([[0.1, 1e-5, 1e-3]], np.float32), (12, 1))
+    gaussians = dataclasses.replace(gaussians, scales=scales)
+    planes, found = draw(gaussians, view, "numba")
+    true_planes, true = draw(gaussians, view, "reference")
+    assert true_planes[4].max() > 0.01
+    assert np.percentile(np.abs(planes - true_planes), 99) < 1e-4
+    for name in ("opacities", "colors", "scales"):
+        assert relative_error(found[name], true[name]) < 1e-2, name
+
+
+def test_larger_picture_by_percentiles() -> None:
+    """Single pixels may differ by a splat cut at 1/255 or by two splats of equal depth in another order."""
+    view = camera(width=200, height=136, focal=200.0)
+    gaussians = random_gaussians(4, 3000, view)
+    planes, found = draw(gaussians, view, "numba")
+    true_planes, true = draw(gaussians, view, "reference")
+    errors = np.abs(planes - true_planes).max(0)
+    assert np.median(errors) < 1e-6
+    assert np.percentile(errors, 99.9) < 1e-4
+    for name in GRADIENTS:
+        assert relative_error(found[name], true[name]) < 1e-3, name
+
+
+def test_opaque_layers_stop_early_without_being_seen() -> None:
+    """Many opaque splats behind each other: what a finished tile leaves out is below 1e-4."""
+    view = camera(width=40, height=40)
+    gaussians = random_gaussians(9, 300, view, spread=6.0)
+    gaussians = dataclasses.replace(gaussians, opacities=np.full(300, 0.99, np.float32))
+    rasterizer = make_rasterizer("numba", 40, 40)
+    planes = rasterizer.forward(gaussians, view)
+    backend = rasterizer._backend  # type: ignore[attr-defined]  # the only way to see that tiles did stop
+    assert (backend._tile_ends < backend._tile_starts[1:]).any()
+    true_planes, true = draw(gaussians, view, "reference")
+    np.testing.assert_allclose(planes, true_planes, atol=3e-4)
+    found = copies(rasterizer.backward(*cotangent(view, 0)))
+    assert relative_error(found["colors"], true["colors"]) < 1e-3
+
+
+# ---- conventions -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("backend", ["numba", "reference"])
+@pytest.mark.parametrize("pixel", [(0, 0), (17, 5), (47, 39), (15, 31), (16, 32)])
+def test_unprojected_pixel_peaks_at_that_pixel(backend: str, pixel: tuple[int, int]) -> None:
+    view = camera(moved=True)
+    mean = geometry.unproject(view, np.array(pixel, float), np.array(0.07))
+    drawn = rasterize(one_gaussian(mean, 0.001), view, backend=backend)
+    row, column = np.unravel_index(np.argmax(drawn.alpha), drawn.alpha.shape)
+    assert (column, row) == pixel
+    assert drawn.depth[row, column] == pytest.approx(0.07, rel=1e-4)
+    np.testing.assert_allclose(drawn.rgb[row, column], [0.8, 0.5, 0.2], rtol=1e-4)
+
+
+def test_subpixel_splats_dim_with_the_square_of_the_distance() -> None:
+    """The 2D Mip filter keeps the light of a splat smaller than a pixel: coverage * z^2 stays the same."""
+    view = camera(width=160, height=160, focal=160.0)
+    rng = np.random.default_rng(3)
+    light = []
+    for distance in (0.05, 0.1):
+        grid = np.stack(np.meshgrid(np.arange(5, 155, 10.0), np.arange(5, 155, 10.0)), -1).reshape(-1, 2)
+        means = geometry.unproject(view, grid + rng.uniform(-0.5, 0.5, grid.shape), np.full(len(grid), distance))
+        gaussians = random_gaussians(0, len(grid), view)
+        gaussians = dataclasses.replace(
+            gaussians,
+            means=means.astype(np.float32),
+            scales=np.full((len(grid), 3), 0.5 * 0.05 / 160, np.float32),  # half a pixel, then a quarter
+            opacities=np.full(len(grid), 0.9, np.float32),
+        )
+        light.append(float(rasterize(gaussians, view).alpha.sum()) * distance**2)
+    assert light[1] / light[0] == pytest.approx(1.0, abs=0.06)
+
+
+def test_view_is_normalised_by_coverage() -> None:
+    view = camera(width=4, height=3)
+    planes = np.zeros((5, 3, 4), np.float32)
+    planes[:, 0, 0] = [0.3, 0.15, 0.9, 0.03, 0.6]
+    planes[:, 1, 1] = [0.1, 0.1, 0.1, 0.01, 0.4]  # too thin for a depth
+    planes[:, 2, 2] = [1e-5, 1e-5, 1e-5, 1e-6, 1e-4]  # nothing there
+    drawn = to_view(planes, view, 5, 6)
+    np.testing.assert_allclose(drawn.rgb[0, 0], [0.5, 0.25, 1.0], rtol=1e-6)
+    assert drawn.depth[0, 0] == pytest.approx(0.05)
+    np.testing.assert_allclose(drawn.rgb[1, 1], 0.25)
+    assert drawn.depth[1, 1] == 0
+    assert not drawn.rgb[2, 2].any()
+    assert drawn.alpha[2, 2] == pytest.approx(1e-4)
+    assert (drawn.frame_id, drawn.t_capture_ns) == (5, 6)
+    planes[:] = 0.9
+    assert drawn.rgb[0, 0, 0] == pytest.approx(0.5)  # fresh arrays
+
+
+def test_geometry_can_be_left_out() -> None:
+    view = camera()
+    gaussians = random_gaussians(2, 40, view)
+    rasterizer = make_rasterizer("numba", view.width, view.height)
+    rasterizer.forward(gaussians, view)
+    whole = copies(rasterizer.backward(*cotangent(view, 0)))
+    part = rasterizer.backward(*cotangent(view, 0), geometry=False)
+    np.testing.assert_array_equal(part.colors, whole["colors"])
+    np.testing.assert_array_equal(part.contribution, whole["contribution"])
+    assert [len(part.means), len(part.quats), len(part.scales), len(part.opacities)] == [0, 0, 0, 0]
+
+
+# ---- repeatable --------------------------------------------------------------------------------------------
+
+
+def test_same_bits_for_any_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    view = camera(width=100, height=77, focal=100.0)
+    gaussians = random_gaussians(6, 700, view)
+    cores = numba.get_num_threads()
+    numba.set_num_threads(1)
+    try:
+        alone = draw(gaussians, view)
+    finally:
+        numba.set_num_threads(cores)
+    assert_same_bits(alone, draw(gaussians, view))
+    for pieces in (2, 3, 7, 64):  # the work cut for more threads than this machine may have
+        monkeypatch.setattr(numba_rasterizer, "thread_count", lambda pieces=pieces: pieces)
+        assert_same_bits(alone, draw(gaussians, view))
+
+
+def test_repeated_runs_of_one_rasterizer_give_the_same_bits() -> None:
+    view = camera()
+    many, few = random_gaussians(6, 300, view, spread=3.0), random_gaussians(7, 20, view)
+    fresh_many, fresh_few = draw(many, view), draw(few, view)
+    rasterizer = make_rasterizer("numba", view.width, view.height)
+    for gaussians, fresh in [(few, fresh_few), (many, fresh_many), (few, fresh_few), (many, fresh_many)]:
+        planes = rasterizer.forward(gaussians, view).copy()
+        assert_same_bits((planes, copies(rasterizer.backward(*cotangent(view, 0)))), fresh)
+
+
+def test_two_python_threads_draw_at_once() -> None:
+    view = camera(width=100, height=77, focal=100.0)
+    scenes = [random_gaussians(seed, 500, view) for seed in (1, 2)]
+    alone = [draw(scene, view) for scene in scenes]
+    failures: list[BaseException] = []
+
+    def work(index: int) -> None:
+        try:
+            for _ in range(20):
+                assert_same_bits(draw(scenes[index], view), alone[index])
+        except BaseException as error:  # carried to the test's own thread
+            failures.append(error)
+
+    threads = [threading.Thread(target=work, args=(index,)) for index in (0, 1)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not failures, failures[0]
+
+
+def test_warm_up_leaves_nothing_to_compile() -> None:
+    """Also not for frozen arrays, which are another type to Numba."""
+    steps: list[tuple[str, int, int]] = []
+    warm_up(lambda name, done, total: steps.append((name, done, total)))
+    assert [done for _, done, _ in steps] == list(range(steps[-1][2] + 1))
+    kernels = [
+        projection.project,
+        projection.project_backward,
+        binning.sort_by_depth,
+        binning.emit_pairs,
+        binning.sort_into_tiles,
+        compositing.composite,
+        compositing.composite_backward,
+        compositing.sum_pairs,
+        views._normalise,
+    ]
+    compiled = [len(kernel.signatures) for kernel in kernels]
+    view = camera(moved=True)
+    gaussians = random_gaussians(1, 50, view)
+    for name in INPUTS:
+        getattr(gaussians, name).flags.writeable = False
+    draw(gaussians, view)
+    rasterize(gaussians, view)
+    assert [len(kernel.signatures) for kernel in kernels] == compiled == [1] * len(kernels)
+
+
+# ---- what breaks rasterisers -------------------------------------------------------------------------------
+
+
+def spoil(name: str, value: float) -> Callable[[Gaussians, int], None]:
+    def change(gaussians: Gaussians, index: int) -> None:
+        getattr(gaussians, name)[index] = value
+
+    return change
+
+
+def put_behind(gaussians: Gaussians, index: int) -> None:
+    gaussians.means[index, 2] *= -1
+
+
+SPOILERS = {
+    **{f"nan {name}": spoil(name, np.nan) for name in INPUTS},
+    **{f"infinite {name}": spoil(name, np.inf) for name in INPUTS},
+    "minus infinite means": spoil("means", -np.inf),
+    "zero quaternion": spoil("quats", 0.0),
+    "zero opacity": spoil("opacities", 0.0),
+    "negative opacity": spoil("opacities", -1.0),
+    "zero scale": spoil("scales", 0.0),
+    "vanishing scale": spoil("scales", 1e-30),
+    "huge scale": spoil("scales", 1e30),
+    "on the camera plane": spoil("means", 0.0),
+    "behind the camera": put_behind,
+}
+
+
+@pytest.mark.parametrize("name", SPOILERS)
+def test_a_spoilt_gaussian_is_left_out_and_harms_no_other(name: str) -> None:
+    view = camera()
+    clean = random_gaussians(8, 30, view)
+    spoilt = random_gaussians(8, 30, view)
+    SPOILERS[name](spoilt, 13)
+    others = np.arange(30) != 13
+    planes, found = draw(spoilt, view)
+    true_planes, true = draw(subset(clean, others), view)
+    np.testing.assert_array_equal(planes, true_planes)
+    for key in GRADIENTS:
+        np.testing.assert_array_equal(found[key][others], true[key], err_msg=key)
+        assert not found[key][13].any(), key
+
+
+@pytest.mark.parametrize("scale", [1e-7, 1e-5, 1e-3, 1e-1, 1.0])
+@pytest.mark.parametrize("distance", [1.001e-3, 0.07, 1e3])
+@pytest.mark.parametrize("opacity", [1e-6, 1 - 1e-6])
+def test_extreme_values_give_finite_pictures_and_gradients(scale: float, distance: float, opacity: float) -> None:
+    view = camera(width=33, height=35)
+    planes, found = draw(one_gaussian(np.array([0.0, 0.0, distance]), scale, opacity), view)
+    assert np.isfinite(planes).all()
+    assert (planes[4] >= 0).all()
+    assert planes[4].max() <= 1
+    for name in GRADIENTS:
+        assert np.isfinite(found[name]).all(), name
+
+
+@pytest.mark.parametrize("backend", ["numba", "reference"])
+def test_no_gaussians(backend: str) -> None:
+    view = camera()
+    planes, found = draw(subset(random_gaussians(0, 1, view), np.zeros(1, bool)), view, backend)
+    assert planes.shape == (5, 40, 48)
+    assert not planes.any()
+    assert found["means"].shape == (0, 3)
+    assert found["contribution"].shape == (0,)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 40), (50, 1), (15, 31), (17, 33), (16, 32), (100, 7)])
+def test_sizes_that_no_tile_divides(size: tuple[int, int]) -> None:
+    view = camera(*size, focal=30.0)
+    gaussians = random_gaussians(3, 25, view, spread=2.0)
+    planes, found = draw(gaussians, view)
+    true_planes, true = draw(gaussians, view, "reference")
+    np.testing.assert_allclose(planes, true_planes, atol=5e-6)
+    for name in GRADIENTS:
+        assert relative_error(found[name], true[name]) < 1e-4, name
+
+
+def test_buffers_grow_when_a_picture_needs_more_pairs() -> None:
+    """400 Gaussians that all cover all 54 tiles, from a fresh rasteriser with room for 4096 pairs."""
+    view = camera(width=140, height=180, focal=150.0)
+    gaussians = random_gaussians(1, 400, view)
+    gaussians = dataclasses.replace(
+        gaussians, scales=np.full((400, 3), 0.2, np.float32), opacities=np.full(400, 0.02, np.float32)
+    )
+    planes, found = draw(gaussians, view)
+    true_planes, true = draw(gaussians, view, "reference")
+    np.testing.assert_allclose(planes, true_planes, atol=2e-5)
+    assert (found["contribution"] > 0).all()
+    assert relative_error(found["colors"], true["colors"]) < 1e-4
+
+
+def test_too_many_pairs_are_refused_with_a_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(numba_rasterizer, "MAX_PAIRS", 50)
+    view = camera()
+    with pytest.raises(SagsError, match="pairs, the limit is 50"):
+        draw(random_gaussians(1, 60, view), view)
+
+
+def test_hundred_thousand_on_one_pixel() -> None:
+    view = camera()
+    count = 100_000
+    one = one_gaussian(geometry.unproject(view, np.array([20.0, 20.0]), np.array(0.07)), 1e-4)
+    index = np.zeros(count, int)
+    planes, found = draw(subset(one, index), view)
+    assert planes[4, 20, 20] > 0.9999
+    assert np.isfinite(found["means"]).all()
+
+
+def test_wrong_input_is_explained() -> None:
+    view = camera()
+    gaussians = random_gaussians(0, 5, view)
+    rasterizer = make_rasterizer("numba", view.width, view.height)
+    with pytest.raises(UsageError, match="call forward before backward"):
+        rasterizer.backward(*cotangent(view, 0))
+    with pytest.raises(UsageError, match=r"quats has shape \[5, 3\], expected \[5, 4\]"):
+        rasterizer.forward(dataclasses.replace(gaussians, quats=gaussians.means), view)
+    with pytest.raises(UsageError, match="draws 48x40 px, the camera has 50x40"):
+        rasterizer.forward(gaussians, camera(width=50))
+    rasterizer.forward(gaussians, view)
+    with pytest.raises(UsageError, match="v_planes has shape"):
+        rasterizer.backward(np.zeros((5, 3, 3), np.float32), cotangent(view, 0)[1])
+    with pytest.raises(UsageError, match="unknown engine backend 'cudnn'; choose"):
+        make_rasterizer("cudnn", 8, 8)
+    with pytest.raises(UsageError, match="0x8"):
+        make_rasterizer("numba", 0, 8)
+    spoilt = Camera(view.width, view.height, view.K, np.full((4, 4), np.nan))
+    with pytest.raises(UsageError, match="NaN or infinity"):
+        rasterizer.forward(gaussians, spoilt)
