@@ -19,6 +19,7 @@ import numpy as np
 from sags_node.engine.losses import tissue_loss
 from sags_node.engine.rasterize import make_rasterizer, to_view
 from sags_node.engine.threads import configure_threads
+from sags_node.geometry import invert
 from sags_node.types import Camera, Gaussians
 
 WIDTH, HEIGHT = 640, 512
@@ -42,7 +43,9 @@ def surface(count: int, width: int, height: int, seed: int = 0) -> tuple[Gaussia
     depth = np.clip(65 + waves + ripples, 40, 90) * 1e-3
     means = np.stack([(u - cx) / focal * depth, (v - cy) / focal * depth, depth], 1)
     scales = (depth * stride / focal)[:, None] * rng.uniform(0.6, 1.0, (n, 3)) * [1, 1, 0.5]
-    colors = np.stack([0.6 + 0.3 * np.sin(u / 40), 0.4 + 0.3 * np.sin(v / 33), 0.5 + 0.3 * np.cos((u + v) / 51)], 1)
+    colors = np.stack(
+        [0.6 + 0.3 * np.sin(u / 40), 0.4 + 0.3 * np.sin(v / 33), 0.5 + 0.3 * np.cos((u + v) / 51)], 1
+    )
     angle = 0.02
     viewmat = np.eye(4)
     viewmat[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
@@ -56,7 +59,7 @@ def surface(count: int, width: int, height: int, seed: int = 0) -> tuple[Gaussia
         ids=np.arange(n),
     )
     K = np.array([[focal, 0, cx - 0.5], [0, focal, cy - 0.5], [0, 0, 1]])
-    return gaussians, Camera(width, height, K, np.linalg.inv(viewmat))
+    return gaussians, Camera(width, height, K, invert(viewmat))
 
 
 def median_ms(function: Callable[[], object], runs: int = RUNS) -> float:
@@ -110,7 +113,9 @@ def time_losses() -> dict[str, Any]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, help="write the table as JSON, e.g. benchmarks/results/kernels.json")
+    parser.add_argument(
+        "--out", type=Path, help="write the table as JSON, e.g. benchmarks/results/kernels.json"
+    )
     parser.add_argument("--no-twin", action="store_true", help="leave out the slow torch twin")
     options = parser.parse_args()
     threads = configure_threads(None)
@@ -121,7 +126,7 @@ def main() -> None:
         row["twin_forward_backward_ms"] = twin["forward_backward_ms"]
         row["speedup_over_twin"] = twin["forward_backward_ms"] / row["forward_backward_ms"]
     losses = time_losses()
-    print(f"{WIDTH}x{HEIGHT}, {threads} threads, medians of {RUNS}; {platform.processor() or platform.machine()}")
+    print(f"{WIDTH}x{HEIGHT}, {threads} threads, medians of {RUNS}; {platform.machine()}")
     for row in rows:
         twin_text = f"   {row['speedup_over_twin']:.0f}x the torch twin" if "speedup_over_twin" in row else ""
         print(

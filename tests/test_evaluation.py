@@ -5,6 +5,7 @@ import tempfile
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import cv2
@@ -42,6 +43,7 @@ CAMERA = Camera(WIDTH, HEIGHT, K, np.eye(4))
 PERIOD_NS = 33_333_333
 SPEED = np.array([0.015, 0.006, 0.0], np.float32)  # m/s: 1.25 and 0.5 px a frame
 FRAMES = 20
+DEFAULTS = Options()
 
 
 def rig() -> StereoRig:
@@ -118,7 +120,7 @@ def frame_result(frame: StereoFrame, velocity: np.ndarray, late: float = 0.0) ->
 def measured_run(
     frames: list[StereoFrame],
     velocity: np.ndarray,
-    options: Options = Options(),  # noqa: B008  # frozen
+    options: Options = DEFAULTS,
     late: float = 0.0,
     dropped: int | None = None,
 ) -> Measurer:
@@ -133,7 +135,9 @@ def measured_run(
     return measurer
 
 
-def summary_of(measurer: Measurer, options: Options = Options(), **segments: tuple[int, int]):  # type: ignore[no-untyped-def]  # noqa: B008
+def summary_of(
+    measurer: Measurer, options: Options = DEFAULTS, **segments: tuple[int, int]
+) -> dict[str, Any]:
     return summarise("synthetic", measurer.rows, options, segments, 33.0)
 
 
@@ -409,6 +413,7 @@ def test_a_session_in_steps_is_measured_and_reproducible(session_folder: Path) -
     assert first["track"]["median_px"] < 2 and first["track"]["lost"] < 0.05
     assert first["iterations_per_frame"] == 1 and first["budget_ms"] is None
     assert first["latency_ms"] is None
+    assert first["settings"]["depth_reference"] == "exact"
 
 
 def test_a_session_in_real_time_goes_through_the_node(session_folder: Path) -> None:
@@ -419,6 +424,13 @@ def test_a_session_in_real_time_goes_through_the_node(session_folder: Path) -> N
     assert summary["latency_ms"]["p50"] > 0 and summary["rss_mb"]["max"] > 50
     assert summary["online"]["ssim"] > 0.8
     assert set(Path(tempfile.gettempdir()).glob("sags-eval-*")) <= before
+
+
+def test_options_out_of_range_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="every 0"):
+        Options(every=0)
+    with pytest.raises(UsageError, match=r"no file of LPIPS weights at .*none\.npz"):
+        Options(lpips_weights=tmp_path / "none.npz")
 
 
 def test_live_cameras_and_ambiguous_segments_are_refused(tmp_path: Path) -> None:

@@ -23,7 +23,9 @@ def frame(seed: int = 0) -> dict[str, Any]:
     coverage = rng.uniform(0, 1, (HEIGHT, WIDTH))
     depth = rng.uniform(0.05, 0.06, (HEIGHT, WIDTH))
     drawn_depth = depth + rng.normal(0, 1e-3, depth.shape)  # on both branches of the Huber function
-    planes = np.concatenate([rng.uniform(0, 1, (3, HEIGHT, WIDTH)), drawn_depth[None], np.ones((1, HEIGHT, WIDTH))])
+    planes = np.concatenate(
+        [rng.uniform(0, 1, (3, HEIGHT, WIDTH)), drawn_depth[None], np.ones((1, HEIGHT, WIDTH))]
+    )
     depth[rng.uniform(size=depth.shape) < 0.3] = 0
     return {
         "planes": (planes * coverage).astype(np.float32),

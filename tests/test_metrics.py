@@ -1,6 +1,5 @@
 """Figures of merit against closed forms and cases made by hand."""
 
-import os
 from pathlib import Path
 
 import cv2
@@ -13,9 +12,6 @@ from sags_node.evaluation.lpips import Lpips
 from sags_node.evaluation.tracking import PointTracks
 from sags_node.evaluation.views import VELOCITY_SHARE, extrapolated, right_eye_mask
 from sags_node.types import Camera, Gaussians, Snapshot
-
-DATA = Path(os.environ.get("SAGS_DATA", Path(__file__).parent.parent.parent / "shared" / "data"))
-WEIGHTS = DATA / "lpips_squeeze" / "lpips_squeeze_v0.1.npz"
 
 
 def picture(seed: int = 0, height: int = 96, width: int = 128) -> np.ndarray:
@@ -164,12 +160,9 @@ def test_percentiles() -> None:
 
 # ---- LPIPS -----------------------------------------------------------------------------------------------
 
-needs_weights = pytest.mark.skipif(not WEIGHTS.exists(), reason=f"LPIPS weights are not at {WEIGHTS}")
 
-
-@needs_weights
-def test_lpips_grows_with_blur_and_is_symmetric() -> None:
-    lpips = Lpips(WEIGHTS)
+def test_lpips_grows_with_blur_and_is_symmetric(data_folder: Path) -> None:
+    lpips = Lpips(data_folder / "lpips_squeeze" / "lpips_squeeze_v0.1.npz")
     truth = np.random.default_rng(0).random((96, 128, 3), np.float32)
     everywhere = np.ones(truth.shape[:2], bool)
     assert lpips(truth, truth, everywhere) == 0

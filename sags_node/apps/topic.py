@@ -141,13 +141,13 @@ def topic_delay(topic: str, endpoint: str | None = None, ns: str = "sags", secon
 
 
 def _listen_to(topic: str, endpoint: str | None, ns: str, seconds: float) -> list[_Sample]:
-    """What came on one topic, without the last value that is sent again at the start."""
+    """What came on one topic, each message once: a last value may be sent again for another peer."""
     samples: dict[tuple[str, int], _Sample] = {}
     for arrived in listen([topic], endpoint, ns, seconds):
         if arrived is not None:
             message, arrival_ns = arrived
             key = (message.meta.session, message.meta.seq)
-            samples[key] = _Sample(arrival_ns, message.meta.stamp_ns, _size(message))
+            samples.setdefault(key, _Sample(arrival_ns, message.meta.stamp_ns, _size(message)))
     if len(samples) < 2:
         raise _silence(topics.full_name(ns, topic), endpoint, ns, seconds)
     return list(samples.values())

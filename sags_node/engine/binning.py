@@ -63,7 +63,7 @@ def sort_by_depth(depths: F32, order: Int32, spare_order: Int32, keys: Int32, sp
 
 
 @inlined
-def _whole(value: Any, low: int, high: int) -> int:
+def _whole(value: Any, low: int, high: int) -> Any:
     """A float as an integer, held in a range first: a far-off float does not fit an integer."""
     return np.int64(min(max(value, f4(low)), f4(high)))
 
@@ -82,7 +82,7 @@ def emit_pairs(
     first_slots: Int32,  # [N] index of a Gaussian's first pair among its worker's, written
     slot_counts: Int32,  # [N] number of its pairs, written
 ) -> None:
-    """Find the tiles and rows that each splat touches. Each worker takes a contiguous part of the depth order.
+    """Find the tiles and rows that each splat touches. Each worker takes a contiguous part of the order.
 
     A worker whose part of `emitted` is full only goes on counting: `emitted_counts` then says what is needed.
     """

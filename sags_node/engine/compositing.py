@@ -2,7 +2,10 @@
 
 For a pixel with splats i from near to far: w_i = alpha_i T_i, T_(i+1) = T_i - w_i, out = sum w_i f_i with
 f = (r, g, b, z, 1). The backward pass runs front to back too: with g = dL/dout and s_i = f_i . g it keeps
-R_i = sum over j > i of w_j s_j, starting from out . g, so that dL/dlog alpha_i = w_i s_i - alpha_i R_i / (1 - alpha_i).
+R_i = sum over j > i of w_j s_j, starting from out . g, so that
+
+    dL/dlog alpha_i = w_i s_i - alpha_i R_i / (1 - alpha_i).
+
 Nothing is recovered by dividing, so saturated pixels cannot underflow.
 
 A tile stops when all its pixels have T <= 1e-4. Tile sizes stand here only: see `jit` on the disk cache.
@@ -63,7 +66,7 @@ def _alpha(exponent: Any) -> Any:
 
 @inlined
 def _open_tile(tile: F32, columns: int, rows: int) -> None:
-    """Transmittance 1 inside the picture, 0 outside, so that pixels outside neither draw nor keep a tile open."""
+    """Transmittance 1 inside the picture, 0 outside: pixels outside neither draw nor keep a tile open."""
     for i in range(TILE_PIXELS):
         x, y = i % TILE_WIDTH, i // TILE_WIDTH
         tile[PIXEL_X + u8(i)] = f4(x) + HALF
@@ -90,8 +93,8 @@ def composite(
             x0, y0 = t % tiles_x * TILE_WIDTH, t // tiles_x * TILE_HEIGHT
             columns, rows = min(TILE_WIDTH, width - x0), min(TILE_HEIGHT, height - y0)
             _open_tile(tile, columns, rows)
-            for i in range(4 * PLANE):
-                tile[RED + u8(i)] = ZERO
+            for k in range(4 * PLANE):
+                tile[RED + u8(k)] = ZERO
             p = tile_starts[t]
             end = tile_starts[t + 1]
             until_test = TEST_EVERY
@@ -160,8 +163,8 @@ def composite_backward(
             columns, rows = min(TILE_WIDTH, width - x0), min(TILE_HEIGHT, height - y0)
             _open_tile(tile, columns, rows)
             if columns < TILE_WIDTH or rows < TILE_HEIGHT:
-                for i in range(7 * PLANE):
-                    tile[RED + u8(i)] = ZERO
+                for k in range(7 * PLANE):
+                    tile[RED + u8(k)] = ZERO
             for y in range(rows):
                 for x in range(columns):
                     i = u8(y * TILE_WIDTH) + u8(x)

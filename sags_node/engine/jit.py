@@ -76,8 +76,11 @@ def aligned(shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> NDArray[An
 
 
 def read_only(array: NDArray[T]) -> NDArray[T]:
-    """The same memory as a contiguous array that kernels only read. Whether an array may be written is part of
-    its Numba type: without this, a caller's frozen array would compile every kernel a second time."""
+    """The same memory as a contiguous array that kernels only read.
+
+    Whether an array may be written is part of its Numba type: without this, a caller's frozen array would
+    compile every kernel a second time.
+    """
     view = np.ascontiguousarray(array).view()
     view.flags.writeable = False
     return view

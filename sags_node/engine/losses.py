@@ -100,8 +100,8 @@ def tissue_loss(
         coverage_weight: weight of the push towards full coverage.
 
     Returns:
-        Mean absolute colour residual over the tissue pixels that count; 0 if there are none. Does not depend on
-        the number of threads.
+        Mean absolute colour residual over the tissue pixels that count; 0 if there are none. It does not
+        depend on the number of threads.
     """
     row_sums = np.empty((planes.shape[1], 2), np.float32)
     _tissue_loss(

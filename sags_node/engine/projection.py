@@ -1,7 +1,7 @@
 """Projection of Gaussians to splats (EWA, Zwicker et al. 2001) with the 2D Mip filter, and its derivative.
 
     V = J R_cam R_q S  [2, 3]      cov0 = V V^T      cov = cov0 + 0.1 px^2 I
-    opacity' = opacity sqrt(det cov0 / det cov)                                  (Mip-Splatting, Yu et al. 2024)
+    opacity' = opacity sqrt(det cov0 / det cov)               (Mip-Splatting, Yu et al. 2024)
 
 det cov0 is the sum of the squared 2x2 minors of V (Cauchy-Binet): no cancellation for flat Gaussians. J is
 taken at x/z, y/z held within the widened frustum, as Mip-Splatting and gsplat do.
@@ -109,8 +109,8 @@ def _covariance(V: Row) -> Row:
 
 @inlined
 def _whitening(xx: Any, xy: Any, yy: Any, det0: Any) -> Row:
-    """Triangular factor (xx, xy, yy) of the conic of the filtered covariance, for exponents of base 2; and the
-    share of the opacity that the filter leaves."""
+    """Triangular factor (xx, xy, yy) of the conic of the filtered covariance, for exponents of base 2; and
+    the share of the opacity that the filter leaves."""
     det = det0 + MIP_VARIANCE * (xx + yy) + MIP_VARIANCE * MIP_VARIANCE
     filtered_yy = yy + MIP_VARIANCE
     inverse_yy = ONE / filtered_yy
@@ -124,9 +124,7 @@ def _clamp(value: Any, low: Any, high: Any) -> Any:
 
 
 @inlined
-def _load_block(
-    S: F32, means: F32, quats: F32, scales: F32, opacities: F32, first: int, filled: int
-) -> None:
+def _load_block(S: F32, means: F32, quats: F32, scales: F32, opacities: F32, first: int, filled: int) -> None:
     for lane in range(filled):
         i, j = first + lane, u8(lane)
         S[MEAN_X + j] = means[i, 0]
@@ -186,8 +184,10 @@ def project(
                 xx, xy, yy, det0, _, _, _ = _covariance(V)
                 along, across, down, kept = _whitening(xx, xy, yy, det0)
                 mean_x, mean_y = fx * slope_x + cx, fy * slope_y + cy
+                given = S[OPACITY + j]
                 in_range = abs(mean_x) + abs(mean_y) < MAX_COORDINATE and xx + yy < MAX_VALUE
-                opacity = min(S[OPACITY + j] * kept, MAX_OPACITY)
+                in_range = in_range and given < MAX_VALUE
+                opacity = min(given * kept, MAX_OPACITY)
                 S[MEAN2D_X + j] = mean_x
                 S[MEAN2D_Y + j] = mean_y
                 S[WHITEN_XX + j] = along
@@ -303,7 +303,9 @@ def project_backward(
                 S[V_SCALE_X + j] = v0 * U[0] + v3 * U[3]
                 S[V_SCALE_Y + j] = v1 * U[1] + v4 * U[4]
                 S[V_SCALE_Z + j] = v2 * U[2] + v5 * U[5]
-                v0, v1, v2, v3, v4, v5 = _scale_axes((v0, v1, v2, v3, v4, v5), S[SCALE_X + j], S[SCALE_Y + j], S[SCALE_Z + j])
+                v0, v1, v2, v3, v4, v5 = _scale_axes(
+                    (v0, v1, v2, v3, v4, v5), S[SCALE_X + j], S[SCALE_Y + j], S[SCALE_Z + j]
+                )
 
                 # U = A Q: dL/dQ = A^T dL/dU, then to the quaternion and through its normalisation
                 g00, g01, g02 = A[0] * v0 + A[3] * v3, A[0] * v1 + A[3] * v4, A[0] * v2 + A[3] * v5

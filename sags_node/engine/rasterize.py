@@ -86,7 +86,8 @@ def _as_pinhole(camera: Camera) -> Pinhole:
         raise UsageError(f"a camera needs K [3, 3] and T_world_cam [4, 4], got {K.shape} and {view.shape}")
     if not (K[0, 0] > 0 and K[1, 1] > 0 and K[0, 1] == 0):
         raise UsageError(
-            f"a camera needs positive focal lengths and no skew, got fx {K[0, 0]}, fy {K[1, 1]}, skew {K[0, 1]}"
+            "a camera needs positive focal lengths and no skew, "
+            f"got fx {K[0, 0]}, fy {K[1, 1]}, skew {K[0, 1]}; check the calibration"
         )
     if not (np.isfinite(K).all() and np.isfinite(view).all()):
         raise UsageError("the camera's K or pose holds NaN or infinity; check the calibration and the pose")

@@ -1,4 +1,4 @@
-"""The readable twin of the CPU kernels in torch: the same formulas, any float precision, gradients by autograd.
+"""The readable twin of the CPU kernels in torch: the same formulas in any precision, gradients by autograd.
 
 Slow: seconds per picture. For tests, and for whoever wants to know what the kernels compute.
 """
@@ -40,7 +40,7 @@ class ReferenceRasterizer:
 
         arrays = gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.colors
         self._inputs = [torch.tensor(array, dtype=self._dtype, requires_grad=True) for array in arrays]
-        self._planes = render(*self._inputs, pinhole)
+        self._planes = render(pinhole, *self._inputs)
         return self._planes.detach().numpy().astype(np.float32)
 
     def backward(self, v_planes: F32, weight: F32, geometry: bool) -> Gradients:
@@ -48,19 +48,26 @@ class ReferenceRasterizer:
 
         means, quats, scales, opacities, colors = self._inputs
         cotangent = torch.tensor(v_planes, dtype=self._dtype)
-        # the red plane is sum of w * red: its gradient by red, with the weights as cotangent, is sum of w * weight
+        # the red plane is the sum of w * red: its gradient with the pixel weights as cotangent is the sum of
+        # w * weight
         red = torch.tensor(weight, dtype=self._dtype)
-        (by_color,) = torch.autograd.grad(self._planes[0], colors, red, retain_graph=True, materialize_grads=True)
+        (by_color,) = torch.autograd.grad(
+            self._planes[0], colors, red, retain_graph=True, materialize_grads=True
+        )
         wanted = [means, quats, scales, opacities, colors] if geometry else [colors]
-        found = torch.autograd.grad(self._planes, wanted, cotangent, retain_graph=True, materialize_grads=True)
+        found = torch.autograd.grad(
+            self._planes, wanted, cotangent, retain_graph=True, materialize_grads=True
+        )
         arrays = [gradient.numpy().astype(np.float32) for gradient in found]
         if not geometry:
-            arrays = [np.empty((0, *t.shape[1:]), np.float32) for t in (means, quats, scales, opacities)] + arrays
+            arrays = [
+                np.empty((0, *t.shape[1:]), np.float32) for t in (means, quats, scales, opacities)
+            ] + arrays
         return Gradients(*arrays, contribution=by_color[:, 0].numpy().astype(np.float32))
 
 
 def render(
-    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, pinhole: Pinhole
+    pinhole: Pinhole, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor
 ) -> Tensor:
     """Planes [5, H, W]; differentiable in all five tensors (shapes as in `types.Gaussians`)."""
     import torch
@@ -72,7 +79,9 @@ def render(
     features = torch.cat([colors[usable], depth[:, None], torch.ones_like(depth)[:, None]], 1)
     near_to_far = torch.argsort(depth.detach(), stable=True)
     near_to_far = near_to_far[(opacity > MIN_ALPHA)[near_to_far]]
-    splats = [values[near_to_far] for values in (mean2d, covariance, opacity, features)]
+    mean2d, covariance, opacity, features = (
+        values[near_to_far] for values in (mean2d, covariance, opacity, features)
+    )
     bands = []
     for y in range(0, pinhole.height, TILE):
         bottom = min(y + TILE, pinhole.height)
@@ -92,7 +101,8 @@ def _usable(
 
     everything = torch.cat([means, quats, scales, opacities[:, None], colors], 1)
     z = _camera_points(means, pinhole)[:, 2]
-    return torch.isfinite(everything).all(1) & (z > NEAR_PLANE) & (quats.norm(dim=1) > MIN_QUAT_NORM)
+    finite: Tensor = torch.isfinite(everything).all(1)
+    return finite & (z > NEAR_PLANE) & (quats.norm(dim=1) > MIN_QUAT_NORM)
 
 
 def _camera_points(means: Tensor, pinhole: Pinhole) -> Tensor:

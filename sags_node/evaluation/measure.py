@@ -10,6 +10,7 @@ import numpy as np
 
 from sags_node.config import Box
 from sags_node.engine.rasterize import make_rasterizer, to_view
+from sags_node.errors import UsageError
 from sags_node.evaluation import metrics
 from sags_node.evaluation.gallery import Gallery
 from sags_node.evaluation.lpips import Lpips
@@ -26,12 +27,22 @@ TissueOf = Callable[[StereoFrame, RectifiedPair], Bool]
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """What to measure, and what the run must leave out for it."""
+    """What to measure, and what the run must leave out for it.
+
+    Raises:
+        UsageError: a count is out of range, or there is no file of weights.
+    """
 
     hold_out: int = 8  # frames i > 0 with (i - 1) % hold_out == 0 are never mapped; 0: none
     every: int = 5  # the right eye and LPIPS are measured on every so many processed frames
     lpips_weights: Path | None = None
     paper_psnr: bool = False
+
+    def __post_init__(self) -> None:
+        if self.hold_out < 0 or self.every < 1:
+            raise UsageError(f"hold_out {self.hold_out} must be 0 or more, every {self.every} 1 or more")
+        if self.lpips_weights is not None and not self.lpips_weights.is_file():
+            raise UsageError(f"there is no file of LPIPS weights at {self.lpips_weights}; check the path")
 
     def holds_out(self, frame_id: int) -> bool:
         """The literature's test split, by frame number."""
@@ -64,6 +75,7 @@ class Measurer:
     Attributes:
         rows: one for each frame of the recording.
         gallery: a few frames to look at.
+        depth_kind: what the reference depth is, None without one.
     """
 
     def __init__(
@@ -82,6 +94,7 @@ class Measurer:
         """
         self.rows: list[FrameRow] = []
         self.gallery = Gallery(len(spool))
+        self.depth_kind: str | None = None
         self._spool = spool
         self._places = {frame_id: place for place, frame_id in enumerate(spool.frame_ids)}
         self._rectifier = rectifier
@@ -120,7 +133,9 @@ class Measurer:
             figures["novel"] = {"psnr": self._novel(shown, pair, frame)}
         track = None
         if frame.reference is not None:
-            figures |= _depth_figures(shown, frame.reference)
+            if frame.reference.depth is not None:
+                self.depth_kind = frame.reference.depth_kind
+                figures |= _depth_figures(shown, frame.reference.depth)
             track = self._follow(shown, frame.reference)
         self.gallery.offer(place, shown, pair.left, figures["online"]["psnr"])
         self._before = _Before(shown, truth, seconds)
@@ -185,11 +200,9 @@ class Measurer:
         )
 
 
-def _depth_figures(shown: SpooledFrame, reference: Reference) -> dict[str, Figures]:
-    if reference.depth is None:
-        return {}
+def _depth_figures(shown: SpooledFrame, reference: F32) -> dict[str, Figures]:
     height, width = shown.depth.shape
-    truth = metrics.resample_nearest(reference.depth, width, height)
+    truth = metrics.resample_nearest(reference, width, height)
     return {
         "depth": asdict(metrics.depth_errors(shown.depth, truth, shown.tissue)),
         "measured_depth": asdict(metrics.depth_errors(shown.measured_depth, truth, shown.tissue)),

@@ -96,6 +96,7 @@ def evaluate(
         "seed": config.seed,
         "width": config.vision.width or session.rig.left.width,
         "height": config.vision.height or session.rig.left.height,
+        "depth_reference": measurer.depth_kind,
         "hold_out": options.hold_out,
         "novel_every": options.every,
     }

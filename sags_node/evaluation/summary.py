@@ -40,7 +40,7 @@ def summarise(
     `predict.copy_psnr` is the picture before, shown again: on tissue that hardly moves it is hard to beat.
     """
     facts = [row.facts for row in rows if row.facts is not None]
-    held_out = sum(options.holds_out(row.frame_id) for row in rows) if options.hold_out else 0
+    held_out = sum(options.holds_out(row.frame_id) for row in rows)
     summary: dict[str, Any] = {
         "session": session,
         "frames": len(rows),

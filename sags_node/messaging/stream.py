@@ -87,7 +87,9 @@ def receive(socket: zmq.Socket[bytes]) -> wire.Message:
 def listen(
     names: Sequence[str], endpoint: str | None, ns: str, seconds: float | None, run_dir: Path | None = None
 ) -> Iterator[tuple[wire.Message, int] | None]:
-    """Every message of some topics (none named: all) with its time of arrival, for up to `seconds`.
+    """Every message of some topics and its time of arrival, for up to `seconds`.
+
+    Topics may be named with or without `ns`; naming none means all.
 
     Yields None at least every `POLL_MS` while nothing arrives, so that a caller can keep time. What is no
     message is left out.
@@ -96,7 +98,8 @@ def listen(
         UsageError: an unknown topic.
         SagsError: no endpoint is known.
     """
-    prefixes = [topics.full_name(ns, check_topic(name).name) for name in names] or [f"{ns}/"]
+    known = [check_topic(name.lstrip("/").removeprefix(f"{ns}/")) for name in names]
+    prefixes = [topics.full_name(ns, topic.name) for topic in known] or [f"{ns}/"]
     deadline = None if seconds is None else time.monotonic() + seconds
     with data_socket(data_endpoint(endpoint, ns, run_dir), prefixes) as socket:
         while deadline is None or time.monotonic() < deadline:
