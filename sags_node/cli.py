@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import logging
 import signal
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import click
 from rich.console import Console
@@ -110,14 +111,22 @@ def demo(launch: tuple[str, ...], seconds: float, out: Path, json_out: bool) -> 
     from sags_node.apps.demo import run_demo
 
     path, overrides = _split(launch)
-    session = _open(path, ["source.loop:=true", "source.pace:=realtime", *overrides])
-    with _progress("playing") as show:
-        outcome = run_demo(session, seconds, out, show)
+    # Its own sockets and run directory, so that a demo does not meet a node that is already running.
+    with tempfile.TemporaryDirectory(prefix="sags-demo-") as private:
+        forced = ["source.loop:=true", "source.pace:=realtime", f"source.frames:={round(30 * seconds)}"]
+        forced += [
+            "publish.data:=[tcp://127.0.0.1:*]",
+            "publish.control:=null",
+            f"publish.run_dir:={private}",
+        ]
+        session = _open(path, [*forced, *overrides])
+        with _progress("playing") as show:
+            outcome = run_demo(session, out, show)
     if json_out:
         click.echo(json.dumps(outcome.summary))
         return
     console.print(outcome.table)
-    console.print(f"report: [bold]{outcome.report}[/]")
+    console.print(f"report: [bold]{outcome.report}[/], overlay video beside it")
 
 
 @main.command("eval")
@@ -157,13 +166,19 @@ def evaluate(
     """
     from sags_node.evaluation.measure import Options
     from sags_node.evaluation.report import summary_table, write_report
+    from sags_node.evaluation.session import Pace
     from sags_node.evaluation.session import evaluate as measure
 
     path, overrides = _split(session)
     options = Options(hold_out, every, lpips_weights, paper_psnr)
     with _progress("measuring") as show:
         outcome = measure(
-            path, overrides, options, pace, iterations, lambda what, frames: show(frames, None, what)
+            path,
+            overrides,
+            options,
+            cast(Pace, pace),
+            iterations,
+            lambda what, frames: show(frames, None, what),
         )
     if report is not None:
         page = write_report(report, outcome.summary, outcome.rows, outcome.pictures)

@@ -17,7 +17,7 @@ import uuid
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any
@@ -28,7 +28,7 @@ from sags_node.config import LaunchConfig, V4l2Source, with_parameters
 from sags_node.engine.threads import configure_threads
 from sags_node.errors import SagsError
 from sags_node.latest import Latest
-from sags_node.mapping.budget import Budget, StepBudget, TimeBudget
+from sags_node.mapping.budget import make_budget
 from sags_node.messaging.publisher import Publisher
 from sags_node.model.ply import write_ply
 from sags_node.pipeline import Pipeline
@@ -65,7 +65,7 @@ class Node:
         self._source = source
         self._on_result = on_result
         self._pipeline = Pipeline(config, rig)
-        self._budget = _budget(config)
+        self._budget = make_budget(config.mapping)
         self._live = isinstance(config.source, V4l2Source) or config.source.pace == "realtime"
         self._wake = os.eventfd(0, os.EFD_NONBLOCK)
         self._frames: Latest[StereoFrame] = Latest()
@@ -192,7 +192,8 @@ class Node:
         self._publisher.publish_result(result, dropped=self._frames.dropped + self._results.dropped)
         publish_ms = (time.perf_counter() - started) * 1e3
         latency_ms = (time.time_ns() - result.pair.t_capture_ns) * 1e-6
-        self._stats.add(result, publish_ms, latency_ms)
+        result = replace(result, timings_ms={**result.timings_ms, "publish": publish_ms})
+        self._stats.add(result, latency_ms)
         if self._on_result is not None:
             self._on_result(result, latency_ms)
 
@@ -232,7 +233,7 @@ class Node:
             )
         self.config = with_parameters(self.config, args)
         self._pipeline.reconfigure(self.config)
-        self._budget = _budget(self.config)
+        self._budget = make_budget(self.config.mapping)
         self._parameters_changed.set()
         return self.config.model_dump(mode="json")
 
@@ -252,12 +253,6 @@ class Node:
         return {"path": str(file), "gaussians": len(gaussians)}
 
 
-def _budget(config: LaunchConfig) -> Budget:
-    if config.mapping.iterations is not None:
-        return StepBudget(config.mapping.iterations)
-    return TimeBudget(config.mapping.budget_ms * 1e-3)
-
-
 class _Statistics:
     """What the last frames tell of rate, latency and cost."""
 
@@ -270,12 +265,12 @@ class _Statistics:
         self._gaussians = 0
         self._started = False
 
-    def add(self, result: FrameResult, publish_ms: float, latency_ms: float) -> None:
+    def add(self, result: FrameResult, latency_ms: float) -> None:
         with self._lock:
             self._started = True
             self._published.append(time.monotonic())
             self._latency.append(latency_ms)
-            for stage, ms in (*result.timings_ms.items(), ("publish", publish_ms)):
+            for stage, ms in result.timings_ms.items():
                 self._stages.setdefault(stage, deque(maxlen=WINDOW)).append(ms)
             for what in result.skipped:
                 self._skipped[what] = self._skipped.get(what, 0) + 1

@@ -15,6 +15,8 @@ from sags_node.types import StereoRig
 
 @dataclass(frozen=True, slots=True)
 class Session:
+    """What a node needs. The source brings no truth with its frames; measuring opens its own."""
+
     config: LaunchConfig
     rig: StereoRig
     source: Source
@@ -46,4 +48,4 @@ def open_session(
         )
     else:
         rig = load_rig(config.rig)
-    return Session(config, rig, open_source(config.source))
+    return Session(config, rig, open_source(config.source, references=False))

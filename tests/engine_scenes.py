@@ -3,14 +3,15 @@
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
-from sags_node.types import F64, Camera, Gaussians
+from sags_node.types import Camera, Gaussians
 
 INPUTS = ("means", "quats", "scales", "opacities", "colors")
 
 
 def camera(width: int = 48, height: int = 40, focal: float = 60.0, moved: bool = False) -> Camera:
-    """Looks along z from the origin, or from a turned and shifted place; the principal point is off-centre."""
+    """Looks along z from the origin, or from a turned and shifted place; off-centre principal point."""
     K = np.array([[focal, 0, width / 2 - 1.3], [0, focal * 1.03, height / 2 + 0.7], [0, 0, 1]])
     T = np.eye(4)
     if moved:
@@ -47,7 +48,7 @@ def random_gaussians(seed: int, count: int, view: Camera, spread: float = 1.0) -
     )
 
 
-def one_gaussian(mean: F64, scale: float, opacity: float = 0.9) -> Gaussians:
+def one_gaussian(mean: NDArray[np.floating], scale: float, opacity: float = 0.9) -> Gaussians:
     return Gaussians(
         means=np.asarray(mean, np.float32).reshape(1, 3),
         quats=np.array([[1, 0, 0, 0]], np.float32),
@@ -58,5 +59,5 @@ def one_gaussian(mean: F64, scale: float, opacity: float = 0.9) -> Gaussians:
     )
 
 
-def relative_error(found: np.ndarray, true: np.ndarray) -> float:
+def relative_error(found: NDArray[np.floating], true: NDArray[np.floating]) -> float:
     return float(np.linalg.norm(found - true) / np.linalg.norm(true))

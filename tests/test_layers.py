@@ -15,7 +15,8 @@ LAYERS = [
     {"pipeline"},
     {"session", "warm_up"},
     {"node"},
-    {"evaluation", "apps"},
+    {"evaluation"},
+    {"apps"},
     {"cli"},
 ]
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}

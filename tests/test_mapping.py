@@ -88,11 +88,22 @@ def test_candidates_fill_holes_first() -> None:
     planes = np.zeros((5, HEIGHT, WIDTH), np.float32)
     planes[:3] = np.moveaxis(frame.image, -1, 0)
     planes[3], planes[4] = DEPTH, 1.0
-    assert len(densify.candidates(planes, frame, 0)) == 0
+    assert len(densify.candidates(planes, frame, 0)[0]) == 0
     planes[:, 10:30, 20:40] = 0
-    pixels = densify.candidates(planes, frame, 0)
+    pixels, _ = densify.candidates(planes, frame, 0)
     assert len(pixels) == 25
     assert pixels.min(0).tolist() == [20, 12] and pixels.max(0).tolist() == [36, 28]
+
+
+def test_a_hole_without_depth_takes_that_of_its_neighbours() -> None:
+    frame = observation()
+    frame.depth[:, :20] = 0
+    frame.depth[:, 20:] = 0.09
+    pixels, depths = densify.candidates(np.zeros((5, HEIGHT, WIDTH), np.float32), frame, 0)
+    assert len(pixels) == (WIDTH // 4) * (HEIGHT // 4)
+    assert np.allclose(depths, 0.09)
+    frame.depth[:] = 0
+    assert len(densify.candidates(np.zeros((5, HEIGHT, WIDTH), np.float32), frame, 0)[0]) == 0
 
 
 def test_candidates_need_residual_and_depth_to_agree_before_a_new_surface_is_believed() -> None:
@@ -100,10 +111,10 @@ def test_candidates_need_residual_and_depth_to_agree_before_a_new_surface_is_bel
     planes = np.zeros((5, HEIGHT, WIDTH), np.float32)
     planes[:3] = np.moveaxis(frame.image, -1, 0)
     planes[3], planes[4] = 1.2 * DEPTH, 1.0  # the model is far behind, but the picture agrees
-    assert len(densify.candidates(planes, frame, 0)) == 0
+    assert len(densify.candidates(planes, frame, 0)[0]) == 0
     planes[:3] = 1 - planes[:3]
     planes[0] += 0.3
-    assert len(densify.candidates(planes, frame, 0)) > 50
+    assert len(densify.candidates(planes, frame, 0)[0]) > 50
 
 
 def test_free_space_is_cleared_only_after_several_frames() -> None:

@@ -60,7 +60,7 @@ class PinnedOverlay:
     """
 
     def __init__(self, pixel: tuple[float, float] | None, shape: str) -> None:
-        self.path: list[F64] = []  # world position (m) in each frame since the point was pinned
+        self.paths: list[list[F64]] = []  # world positions (m), frame by frame, for each time it was pinned
         self.pixel: tuple[int, int] | None = None  # where it was pinned
         self._wanted = pixel
         self._shape = overlay_draw.SHAPES[shape]
@@ -71,7 +71,7 @@ class PinnedOverlay:
     def draw(self, scene: Scene) -> tuple[U8, str | None]:
         """The picture with the shape, or the plain picture and the reason why there is none."""
         if scene.generation != self._generation:
-            self._generation, self._pin, self._normal, self.path = scene.generation, None, None, []
+            self._generation, self._pin, self._normal = scene.generation, None, None
         if self._pin is None and not self._attach(scene):
             return scene.picture, "nothing to pin to"
         assert self._pin is not None
@@ -91,11 +91,12 @@ class PinnedOverlay:
         normal = self._smooth(surface_normal(scene.depth, scene.tissue, scene.K, point))
         if normal is None:
             return scene.picture, "no surface at the pin"
-        self.path.append(world)
-        samples = self._shape(point, normal, float(scene.K[0, 0]))
+        self.paths[-1].append(world)
+        samples = self._shape(point, normal, scene.K, scene.depth)
         picture, drawn = overlay_draw.draw(scene.picture, samples, scene.K, scene.depth, scene.tissue)
         if drawn:
             overlay_draw.label(picture, point, scene.K, f"{1000 * point[2]:.0f} mm")
+            picture[~scene.tissue] = scene.picture[~scene.tissue]  # instruments are in front of text too
         return picture, None
 
     def _attach(self, scene: Scene) -> bool:
@@ -107,6 +108,7 @@ class PinnedOverlay:
         world = np.asarray(transform(scene.T_world_cam, local), np.float64)
         self._pin = Pin.attach(world, scene.means, scene.ids)
         self.pixel = pixel
+        self.paths.append([])
         return self._pin is not None
 
     def _smooth(self, normal: F64 | None) -> F64 | None:
@@ -134,7 +136,8 @@ def run_overlay(
 
     Returns:
         frames, overlay (frames with it), blanked (reason -> frames), latency_ms (capture to drawn), pin
-        (pixel, how far it moved at most and the 90th percentile of its steps, mm), lost (messages), saved.
+        (pixel, how often it was pinned, how far it moved and the 90th percentile of its steps, mm), lost
+        (messages), saved.
 
     Raises:
         UsageError: an unknown shape or kind of file.
@@ -216,15 +219,16 @@ def scene_of(picture: ReceivedImage, frame: dict[str, Received]) -> Scene | None
 
 
 def _wander(overlay: PinnedOverlay) -> dict[str, Any]:
-    path = 1000 * np.array(overlay.path).reshape(-1, 3)
-    if len(path) < 2:
-        return {"pixel": overlay.pixel, "moved_mm": None, "step_mm_p90": None}
-    steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
-    moved = np.linalg.norm(path - path[0], axis=1)
+    """Where the point was pinned, how often, and how it moved."""
+    paths = [1000 * np.array(path) for path in overlay.paths if path]
+    steps = [np.linalg.norm(np.diff(path, axis=0), axis=1) for path in paths if len(path) > 1]
     return {
         "pixel": overlay.pixel,
-        "moved_mm": float(moved.max()),
-        "step_mm_p90": float(np.percentile(steps, 90)),
+        "pinned": len(paths),
+        "moved_mm": max(
+            (float(np.linalg.norm(path - path[0], axis=1).max()) for path in paths), default=None
+        ),
+        "step_mm_p90": float(np.percentile(np.concatenate(steps), 90)) if steps else None,
     }
 
 

@@ -14,9 +14,11 @@ import numpy as np
 from sags_node.types import F32, F64, U8, Bool
 
 OPACITY = 0.85
-ON_SURFACE = 0.001  # m; what lies this little under the surface is still drawn: it lies on it
+ON_SURFACE = 0.0005  # m; what lies this little under the surface is still drawn: it lies on it
+DRAPE_REACH = 0.004  # m; how far a flat shape bends to lie on a curved surface
 SAMPLES_PER_PIXEL = 2.0  # along a line
 MAX_SAMPLES_ALONG = 400  # bounds the cost of a shape close to the camera
+LABEL_ASIDE = 0.005  # m to the right of the point
 LEAN = np.array([0.5, -0.8, 0.0])  # to the upper right of the picture
 GREEN, YELLOW = (60, 230, 120), (255, 210, 40)  # RGB
 
@@ -32,22 +34,41 @@ class Samples:
         )
 
 
-def target(point: F64, normal: F64, focal: float) -> Samples:
+def target(point: F64, normal: F64, K: F64, depth: F32) -> Samples:
     """A ring on the surface and an arrow that points at its middle."""
-    spacing = _spacing(point, focal)
-    ring = disc(point, normal, 0.003, 0.004, spacing, GREEN)
+    spacing = _spacing(point, K)
     leaning = normal + LEAN  # along the line of sight an arrow would be a dot
-    return ring + arrow(point + 0.001 * normal, leaning / np.linalg.norm(leaning), 0.010, spacing, YELLOW)
+    tip = point + 0.001 * normal
+    return _ring(point, normal, K, depth) + arrow(
+        tip, leaning / np.linalg.norm(leaning), 0.010, spacing, YELLOW
+    )
 
 
-def marker(point: F64, normal: F64, focal: float) -> Samples:
+def marker(point: F64, normal: F64, K: F64, depth: F32) -> Samples:
     """A ring on the surface and a sphere that hovers 5 mm above it."""
-    spacing = _spacing(point, focal)
-    ring = disc(point, normal, 0.003, 0.004, spacing, GREEN)
-    return ring + sphere(point + 0.005 * normal, 0.0015, spacing, YELLOW)
+    ball = sphere(point + 0.005 * normal, 0.0015, _spacing(point, K), YELLOW)
+    return _ring(point, normal, K, depth) + ball
 
 
 SHAPES = {"target": target, "sphere": marker}
+
+
+def _ring(point: F64, normal: F64, K: F64, depth: F32) -> Samples:
+    return drape(disc(point, normal, 0.003, 0.004, _spacing(point, K), GREEN), K, depth)
+
+
+def drape(samples: Samples, K: F64, depth: F32) -> Samples:
+    """Move samples along their rays onto the surface `depth` [H, W] (m), where it is within `DRAPE_REACH`."""
+    height, width = depth.shape
+    points = samples.points.copy()
+    pixels = points @ K.T
+    columns, rows = np.rint(pixels[:, :2] / pixels[:, 2:]).astype(np.intp).T
+    inside = (points[:, 2] > 0) & (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+    surface = np.full(len(points), np.nan)
+    surface[inside] = depth[rows[inside], columns[inside]]
+    near = np.abs(surface - points[:, 2]) < DRAPE_REACH  # NaN compares as False
+    points[near] *= (surface[near] / points[near, 2])[:, None]
+    return Samples(points, samples.colors)
 
 
 def disc(
@@ -99,29 +120,25 @@ def draw(picture: U8, samples: Samples, K: F64, depth: F32, tissue: Bool) -> tup
     seen = (z < depth[rows, columns] + ON_SURFACE) & tissue[rows, columns]  # NaN compares as False
     order = np.argsort(-z[seen])  # far to near: the nearest is written last and stays
     columns, rows, colors = columns[seen][order], rows[seen][order], colors[seen][order]
-    layer = picture.copy()
-    layer[rows, columns] = colors
-    covered = np.zeros((height, width), bool)
-    covered[rows, columns] = True
     drawn = picture.copy()
-    drawn[covered] = cv2.addWeighted(layer[covered], OPACITY, picture[covered], 1 - OPACITY, 0)
-    return drawn, int(covered.sum())
+    drawn[rows, columns] = np.rint(OPACITY * colors + (1 - OPACITY) * picture[rows, columns])
+    return drawn, len(np.unique(rows * width + columns))
 
 
 def label(picture: U8, point: F64, K: F64, text: str) -> None:
     """Write beside the pixel of a point, in place."""
     u, v = (K @ point)[:2] / point[2]
     scale = picture.shape[0] / 1000
-    at = (int(u + 40 * scale), int(v - 40 * scale))
+    at = (int(u + LABEL_ASIDE * K[0, 0] / point[2]), int(v))
     for color, thickness in (((0, 0, 0), 3), ((255, 255, 255), 1)):
         cv2.putText(
             picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, max(scale, 0.4), color, thickness, cv2.LINE_AA
         )
 
 
-def _spacing(point: F64, focal: float) -> float:
+def _spacing(point: F64, K: F64) -> float:
     """Distance (m) between samples that lie closer than a pixel at the depth of `point`."""
-    return float(point[2]) / (focal * SAMPLES_PER_PIXEL)
+    return float(point[2] / (K[0, 0] * SAMPLES_PER_PIXEL))
 
 
 def _grid(start: float, end: float, around: float, spacing: float) -> tuple[F64, F64]:

@@ -13,6 +13,7 @@ NEIGHBOURS = 16
 MAX_DISTANCE = 0.005  # m; Gaussians farther than this from the point do not carry it
 RENEW_BELOW = 0.8  # share of the weight still there: below it new neighbours are taken
 LOST_BELOW = 0.5  # below it the point cannot be trusted any more
+MIN_SPREAD = 1e-3  # second over first singular value: below it the Gaussians lie on a line
 PATCH = 8  # px around the pin whose depth gives the normal
 PATCH_DEPTH = 0.005  # m; pixels farther from the pin in depth belong to another surface
 MIN_PATCH = 30  # pixels
@@ -25,7 +26,7 @@ class Pin:
     """A surface point held by its nearest Gaussians."""
 
     ids: Ids  # [k]
-    offsets: F64  # [k, 3] m, from each Gaussian to the point
+    places: F64  # [k, 3] m, of the Gaussians, seen from the point
     weights: F64  # [k], sum 1
 
     @staticmethod
@@ -39,12 +40,12 @@ class Pin:
             return None
         near = distances[nearest]
         weights = np.exp(-0.5 * (near / (near.mean() + 1e-6)) ** 2)
-        return Pin(ids[nearest], point - means[nearest].astype(np.float64), weights / weights.sum())
+        return Pin(ids[nearest], means[nearest].astype(np.float64) - point, weights / weights.sum())
 
     def locate(self, means: F32, ids: Ids) -> tuple[F64, float] | None:
         """Where the point is in a later model, and the share of its weight that is still there.
 
-        None when too few of its Gaussians are left.
+        The point moves with the rigid motion that fits its Gaussians best. None when too few are left.
         """
         rows = np.flatnonzero(np.isin(ids, self.ids))
         mine = {int(one): i for i, one in enumerate(self.ids)}
@@ -52,8 +53,24 @@ class Pin:
         remaining = float(self.weights[own].sum())
         if remaining < LOST_BELOW:
             return None
-        places = means[rows].astype(np.float64) + self.offsets[own]
-        return self.weights[own] @ places / remaining, remaining
+        weights = self.weights[own] / remaining
+        before, after = self.places[own], means[rows].astype(np.float64)
+        middle_before, middle_after = weights @ before, weights @ after
+        R = _rotation(before - middle_before, after - middle_after, weights)
+        return middle_after - R @ middle_before, remaining
+
+
+def _rotation(before: F64, after: F64, weights: F64) -> F64:
+    """The rotation [3, 3] that best turns centred points [k, 3] into others (Kabsch 1976).
+
+    None of it can be told from points on one line: then there is no rotation.
+    """
+    U, spread, Vt = np.linalg.svd((before * weights[:, None]).T @ after)
+    if spread[1] < MIN_SPREAD * spread[0] or spread[0] == 0:
+        return np.eye(3)
+    flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
+    rotation: F64 = Vt.T @ flip @ U.T
+    return rotation
 
 
 def pin_pixel(wanted: tuple[float, float] | None, depth: F32, tissue: Bool) -> tuple[int, int] | None:

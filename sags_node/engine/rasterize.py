@@ -33,7 +33,7 @@ def make_rasterizer(backend: str, width: int, height: int) -> Rasterizer:
     if backend == "reference":
         from sags_node.engine.reference import ReferenceRasterizer
 
-        return _CheckedRasterizer(ReferenceRasterizer(width, height), width, height)
+        return _CheckedRasterizer(ReferenceRasterizer(), width, height)
     raise UsageError(f"unknown engine backend '{backend}'; choose numba or reference")
 
 

@@ -21,49 +21,47 @@ from sags_node.engine.interface import (
 from sags_node.types import F32, Gaussians
 
 if TYPE_CHECKING:  # torch takes seconds to import; only who draws with this backend pays
-    import torch
     from torch import Tensor
 
 TILE = 64  # px; pictures are blended tile by tile to bound memory
 
 
 class ReferenceRasterizer:
-    """Backend `reference`."""
-
-    def __init__(self, width: int, height: int, dtype: torch.dtype | None = None) -> None:
-        import torch
-
-        self._dtype = dtype or torch.float64
+    """Backend `reference`, in float64."""
 
     def forward(self, gaussians: Gaussians, pinhole: Pinhole) -> F32:
         import torch
 
         arrays = gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.colors
-        self._inputs = [torch.tensor(array, dtype=self._dtype, requires_grad=True) for array in arrays]
+        self._inputs = [torch.tensor(array, dtype=torch.float64, requires_grad=True) for array in arrays]
         self._planes = render(pinhole, *self._inputs)
         return self._planes.detach().numpy().astype(np.float32)
 
     def backward(self, v_planes: F32, weight: F32, geometry: bool) -> Gradients:
         import torch
 
-        means, quats, scales, opacities, colors = self._inputs
-        cotangent = torch.tensor(v_planes, dtype=self._dtype)
+        cotangent = torch.tensor(v_planes, dtype=torch.float64)
         # the red plane is the sum of w * red: its gradient with the pixel weights as cotangent is the sum of
         # w * weight
-        red = torch.tensor(weight, dtype=self._dtype)
-        (by_color,) = torch.autograd.grad(
-            self._planes[0], colors, red, retain_graph=True, materialize_grads=True
+        red = torch.tensor(weight, dtype=torch.float64)
+        (by_red,) = torch.autograd.grad(
+            self._planes[0], self._inputs[4], red, retain_graph=True, materialize_grads=True
         )
-        wanted = [means, quats, scales, opacities, colors] if geometry else [colors]
         found = torch.autograd.grad(
-            self._planes, wanted, cotangent, retain_graph=True, materialize_grads=True
+            self._planes, self._inputs, cotangent, retain_graph=True, materialize_grads=True
         )
-        arrays = [gradient.numpy().astype(np.float32) for gradient in found]
-        if not geometry:
-            arrays = [
-                np.empty((0, *t.shape[1:]), np.float32) for t in (means, quats, scales, opacities)
-            ] + arrays
-        return Gradients(*arrays, contribution=by_color[:, 0].numpy().astype(np.float32))
+        by_means, by_quats, by_scales, by_opacities, by_colors = (
+            gradient.numpy().astype(np.float32) for gradient in found
+        )
+        kept = None if geometry else 0
+        return Gradients(
+            by_means[:kept],
+            by_quats[:kept],
+            by_scales[:kept],
+            by_opacities[:kept],
+            by_colors,
+            contribution=by_red[:, 0].numpy().astype(np.float32),
+        )
 
 
 def render(
@@ -86,7 +84,7 @@ def render(
     for y in range(0, pinhole.height, TILE):
         bottom = min(y + TILE, pinhole.height)
         tiles = [
-            _blend_tile(*splats, x, y, min(x + TILE, pinhole.width), bottom)
+            _blend_tile(mean2d, covariance, opacity, features, x, y, min(x + TILE, pinhole.width), bottom)
             for x in range(0, pinhole.width, TILE)
         ]
         bands.append(torch.cat(tiles, 2))
@@ -108,8 +106,9 @@ def _usable(
 def _camera_points(means: Tensor, pinhole: Pinhole) -> Tensor:
     import torch
 
-    R = torch.as_tensor(pinhole.R, dtype=means.dtype)
-    return means @ R.T + torch.as_tensor(pinhole.t, dtype=means.dtype)
+    R, t = torch.as_tensor(pinhole.R, dtype=means.dtype), torch.as_tensor(pinhole.t, dtype=means.dtype)
+    points: Tensor = means @ R.T + t
+    return points
 
 
 def project(

@@ -16,7 +16,7 @@ from sags_node.evaluation.gallery import Picture
 from sags_node.evaluation.measure import FrameRow, Measurer, Options, Progress
 from sags_node.evaluation.spool import Spool
 from sags_node.evaluation.summary import GROUPS, summarise
-from sags_node.mapping.budget import Budget, StepBudget, TimeBudget
+from sags_node.mapping.budget import make_budget
 from sags_node.node import Node
 from sags_node.pipeline import Pipeline
 from sags_node.session import Session, open_session
@@ -77,11 +77,28 @@ def evaluate(
             run_realtime(session, options, spool, progress)
         else:
             run_step(session, options, spool, progress)
-        if len(spool) == 0:
-            raise SagsError("no frame was processed; check source.start, source.frames and the hold-out")
-        measurer = _measure(session, spool, options, progress)
+        return measure(_name(launch), session, spool, options, overrides, progress)
+
+
+def measure(
+    name: str,
+    session: Session,
+    spool: Spool,
+    options: Options,
+    overrides: Sequence[str] = (),
+    progress: Progress = lambda what, frames: None,
+) -> Evaluation:
+    """Measure a finished run against the recording it was played from, which is read once more.
+
+    Raises:
+        SagsError: nothing was processed, or the recording cannot be read again.
+    """
+    if len(spool) == 0:
+        raise SagsError("no frame was processed; check source.start, source.frames and the hold-out")
+    config = session.config
+    measurer = _measured(session, spool, options, progress)
     summary = summarise(
-        _name(launch),
+        name,
         measurer.rows,
         options,
         config.segments,
@@ -89,7 +106,7 @@ def evaluate(
     )
     summary["settings"] = {
         "overrides": list(overrides),
-        "pace": pace,
+        "pace": None if isinstance(config.source, V4l2Source) else config.source.pace,
         "iterations": config.mapping.iterations,
         "max_gaussians": config.mapping.max_gaussians,
         "backend": config.engine.backend,
@@ -107,7 +124,7 @@ def run_step(session: Session, options: Options, spool: Spool, progress: Progres
     """Every frame in turn, none lost; only the pipeline's own work is timed."""
     configure_threads(session.config.engine.threads)
     pipeline = Pipeline(session.config, session.rig)
-    budget = _budget(session.config)
+    budget = make_budget(session.config.mapping)
     with session.source as source:
         for frame in source:
             if options.holds_out(frame.frame_id):
@@ -136,12 +153,6 @@ def run_realtime(session: Session, options: Options, spool: Spool, progress: Pro
             progress("playing", len(spool))
     finally:
         node.stop()
-
-
-def _budget(config: LaunchConfig) -> Budget:
-    if config.mapping.iterations is not None:
-        return StepBudget(config.mapping.iterations)
-    return TimeBudget(config.mapping.budget_ms * 1e-3)
 
 
 class _WithoutHeldOut:
@@ -179,7 +190,7 @@ class _WithoutHeldOut:
         self._source.stop()
 
 
-def _measure(session: Session, spool: Spool, options: Options, progress: Progress) -> Measurer:
+def _measured(session: Session, spool: Spool, options: Options, progress: Progress) -> Measurer:
     """Read the recording again, with its truth, and measure every frame."""
     config = session.config
     size = config.vision.width or session.rig.left.width, config.vision.height or session.rig.left.height

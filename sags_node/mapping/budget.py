@@ -6,6 +6,8 @@ import time
 from collections.abc import Callable
 from typing import Protocol
 
+from sags_node.config import MappingConfig
+
 
 class Budget(Protocol):
     """Asked once before every refinement step."""
@@ -68,3 +70,10 @@ class TimeBudget:
     def finish(self) -> None:
         """What came after the last refusal is the cost to reserve in the next frame."""
         self._after_cost += 0.3 * (self._clock() - self._asked - self._after_cost)
+
+
+def make_budget(config: MappingConfig) -> Budget:
+    """Fixed steps where the configuration names them, else its time."""
+    if config.iterations is not None:
+        return StepBudget(config.iterations)
+    return TimeBudget(config.budget_ms * 1e-3)

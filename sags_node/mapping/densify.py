@@ -15,6 +15,7 @@ RESIDUAL_NEW_SURFACE = 0.2  # summed over RGB: with a surface in front of the mo
 RESIDUAL_DETAIL = 0.45  # summed over RGB: with the right depth, detail is missing
 DEPTH_TOLERANCE = 0.035  # of the depth
 GRID = 4  # px between candidates
+REACH = 48  # px: how far a hole without depth looks for one
 MAX_INSERTED = 1500  # per frame: a budget, and a brake on runaway insertion
 FRONT_TOLERANCE = 0.065  # of the depth: so far in front of the measured surface is free space
 FRONT_FRAMES = 3  # in a row, since stereo is wrong now and then
@@ -22,16 +23,23 @@ MIN_OPACITY = 0.03
 CROWDED = 0.9  # share of the cap above which what left the view is given up
 
 
-def candidates(planes: F32, observation: Observation, phase: int) -> I32:
-    """Pixels [M, 2] (x, y) that want a Gaussian: holes, then new surfaces, then missing detail.
+def candidates(planes: F32, observation: Observation, phase: int) -> tuple[I32, F32]:
+    """Pixels [M, 2] (x, y) that want a Gaussian, and their depths [M] m: holes, then new surfaces, then
+    missing detail.
+
+    A hole beside an instrument or in the strip that one eye does not see has no depth of its own; it takes
+    that of the nearest pixel in its row or column that has one.
 
     Args:
         planes: [5, H, W] of the rasteriser: sums of w*rgb, w*z, w.
         phase: shifts the candidate grid, so that every pixel has its turn over the frames.
     """
-    found = np.empty((MAX_INSERTED, 2), np.int32)
-    count = _candidates(planes, observation.image, observation.tissue, observation.depth, phase % GRID, found)
-    return found[:count]
+    pixels = np.empty((MAX_INSERTED, 2), np.int32)
+    depths = np.empty(MAX_INSERTED, np.float32)
+    count = _candidates(
+        planes, observation.image, observation.tissue, observation.depth, phase % GRID, pixels, depths
+    )
+    return pixels[:count], depths[:count]
 
 
 def free_space_violations(model: GaussianModel, observation: Observation) -> None:
@@ -53,19 +61,23 @@ def doomed(model: GaussianModel, camera: Camera) -> Bool:
 
 
 @kernel
-def _candidates(planes: F32, image: F32, tissue: Bool, depth: F32, phase: int, found: I32) -> int:
+def _candidates(
+    planes: F32, image: F32, tissue: Bool, depth: F32, phase: int, pixels: I32, depths: F32
+) -> int:
     height, width = tissue.shape
     n = 0
     for rank in range(3):
         for y in range(phase, height, GRID):
             for x in range(phase, width, GRID):
-                z = depth[y, x]
-                if not tissue[y, x] or z <= 0:
+                if not tissue[y, x]:
                     continue
+                z = depth[y, x]
                 alpha = planes[4, y, x]
-                if rank == 0:
-                    wanted = alpha < HOLE_ALPHA
-                elif alpha < HOLE_ALPHA:
+                if alpha < HOLE_ALPHA:
+                    if z <= 0 and rank == 0:
+                        z = _nearest_depth(depth, x, y)
+                    wanted = rank == 0 and z > 0
+                elif rank == 0 or z <= 0:
                     wanted = False
                 else:
                     residual = np.float32(0)
@@ -77,12 +89,29 @@ def _candidates(planes: F32, image: F32, tissue: Bool, depth: F32, phase: int, f
                     else:
                         wanted = residual > RESIDUAL_DETAIL and abs(behind) < DEPTH_TOLERANCE * z
                 if wanted:
-                    if n == len(found):
+                    if n == len(pixels):
                         return n
-                    found[n, 0] = x
-                    found[n, 1] = y
+                    pixels[n, 0] = x
+                    pixels[n, 1] = y
+                    depths[n] = z
                     n += 1
     return n
+
+
+@kernel
+def _nearest_depth(depth: F32, x: int, y: int) -> float:
+    """The nearest known depth in row y or column x, within REACH px; 0 if there is none."""
+    height, width = depth.shape
+    for r in range(1, REACH):
+        if x - r >= 0 and depth[y, x - r] > 0:
+            return depth[y, x - r]
+        if x + r < width and depth[y, x + r] > 0:
+            return depth[y, x + r]
+        if y - r >= 0 and depth[y - r, x] > 0:
+            return depth[y - r, x]
+        if y + r < height and depth[y + r, x] > 0:
+            return depth[y + r, x]
+    return np.float32(0)
 
 
 @parallel_kernel

@@ -15,8 +15,8 @@ OPACITY = 0.9
 INITIAL_SHARE = 0.75  # of the cap used by the first frame; the rest is for what appears later
 
 
-def insert(model: GaussianModel, observation: Observation, pixels: I32, depth: F32, spacing: float) -> slice:
-    """Add one Gaussian for each pixel [M, 2] (x, y), coloured by the picture, at `depth` [H, W] m.
+def insert(model: GaussianModel, observation: Observation, pixels: I32, z: F32, spacing: float) -> slice:
+    """Add one Gaussian for each pixel [M, 2] (x, y), coloured by the picture, at depth `z` [M] m.
 
     Args:
         spacing: px between neighbouring pixels of the list; it sets the scales.
@@ -25,7 +25,6 @@ def insert(model: GaussianModel, observation: Observation, pixels: I32, depth: F
         The new rows of the model.
     """
     x, y = pixels[:, 0], pixels[:, 1]
-    z = depth[y, x]
     camera = observation.camera
     across = SCALE_PER_SPACING * spacing * z / np.float32(camera.K[0, 0])
     scales = np.stack([across, across, FLATNESS * across], 1).astype(np.float32)

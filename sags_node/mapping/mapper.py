@@ -87,7 +87,8 @@ class Mapper:
         pixels, spacing = initialise.first_pixels(observation, depth, limit)
         if len(pixels) < MIN_FIRST_GAUSSIANS:
             return {"inserted": 0}  # a black or covered picture: try again with the next frame
-        rows = initialise.insert(self.model, observation, pixels, depth, spacing)
+        x, y = pixels[:, 0], pixels[:, 1]
+        rows = initialise.insert(self.model, observation, pixels, depth[y, x], spacing)
         self._deformation = NodeDeformation(self.model.means, CONTROL_NODES)
         self._deformation.attach(self.model, rows)
         for _ in range(INITIAL_STEPS):
@@ -101,8 +102,8 @@ class Mapper:
         removed = self.model.remove(densify.doomed(self.model, observation.camera))
 
         planes = self._draw(observation)
-        pixels = densify.candidates(planes, observation, phase=7 * self._frames)
-        rows = initialise.insert(self.model, observation, pixels, observation.depth, densify.GRID)
+        pixels, depths = densify.candidates(planes, observation, phase=7 * self._frames)
+        rows = initialise.insert(self.model, observation, pixels, depths, densify.GRID)
         self._deformation.attach(self.model, rows)
 
         iterations = 0

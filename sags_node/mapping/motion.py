@@ -19,7 +19,7 @@ class OpticalFlow:
     """Dense inverse search flow (Kroeger et al., ECCV 2016) between consecutive left pictures."""
 
     def __init__(self) -> None:
-        self._dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+        self._dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
 
     def __call__(self, before: U8, after: U8) -> F32:
         """Flow [H, W, 2] in px from `before` to `after`, both gray [H, W]."""

@@ -1,0 +1,91 @@
+"""`sags demo`: a session played live beside an overlay subscriber, and the report of both."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from sags_node.config import LaunchConfig
+from sags_node.errors import SagsError
+from sags_node.evaluation.measure import Options
+from sags_node.evaluation.report import summary_table, write_report
+from sags_node.evaluation.session import measure
+from sags_node.evaluation.spool import Spool
+from sags_node.node import Node
+from sags_node.session import Session
+from sags_node.types import FrameResult
+
+OVERLAY_GRACE = 15.0  # s for the overlay to write its video after the node has ended
+_OPTIONS = Options(hold_out=0)
+
+
+@dataclass(frozen=True, slots=True)
+class Demo:
+    """What a demo leaves behind."""
+
+    summary: dict[str, Any]  # as `sags eval`, and what the overlay subscriber counted under "overlay"
+    table: Table
+    report: Path
+
+
+def run_demo(session: Session, out: Path, progress: Callable[[int, int | None, str], None]) -> Demo:
+    """Play a recorded session once through the node, sockets included, and measure what it showed.
+
+    Args:
+        session: a recording in real time, of a known length.
+        out: folder for `report.html`, `sheet.png` and `overlay.mp4`.
+        progress: called with (frames done, frames in all, what is going on).
+
+    Raises:
+        SagsError: the node or the overlay failed.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    frames = session.source.frame_count
+    seconds = (frames or 0) / session.source.rate
+    with Spool() as spool:
+
+        def keep(result: FrameResult, latency_ms: float) -> None:
+            spool.add(result, sum(result.timings_ms.values()), time.monotonic_ns(), latency_ms)
+
+        node = Node(session.config, session.rig, session.source, on_result=keep)
+        overlay = _start_overlay(session.config, node.endpoints[-1], seconds, out / "overlay.mp4")
+        try:
+            node.start()
+            while not node.wait(0.25):
+                progress(len(spool), frames, "playing")
+        finally:
+            node.stop()
+            consumed = _finish_overlay(overlay)
+        outcome = measure(
+            "demo", session, spool, _OPTIONS, progress=lambda what, done: progress(done, frames, what)
+        )
+    outcome.summary["overlay"] = consumed
+    page = write_report(out, outcome.summary, outcome.rows, outcome.pictures)
+    return Demo(outcome.summary, summary_table(outcome.summary), page)
+
+
+def _start_overlay(config: LaunchConfig, endpoint: str, seconds: float, video: Path) -> subprocess.Popen[str]:
+    """The consumer is a process of its own, as it would be in a theatre."""
+    command = [sys.executable, "-m", "sags_node", "overlay", "--endpoint", endpoint, "--ns", config.ns]
+    command += ["--seconds", f"{seconds:.1f}", "--save", str(video), "--json"]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def _finish_overlay(overlay: subprocess.Popen[str]) -> dict[str, Any]:
+    try:
+        stdout, stderr = overlay.communicate(timeout=OVERLAY_GRACE)
+    except subprocess.TimeoutExpired:
+        overlay.kill()
+        raise SagsError("the overlay subscriber did not end; see `sags overlay --help`") from None
+    if overlay.returncode != 0:
+        raise SagsError(f"the overlay subscriber failed: {stderr.strip()}")
+    counted: dict[str, Any] = json.loads(stdout)
+    return counted
