@@ -17,7 +17,7 @@ import uuid
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any
@@ -29,6 +29,7 @@ from sags_node.engine.threads import configure_threads
 from sags_node.errors import SagsError
 from sags_node.latest import Latest
 from sags_node.mapping.budget import make_budget
+from sags_node.messaging import content
 from sags_node.messaging.publisher import Publisher
 from sags_node.model.ply import write_ply
 from sags_node.pipeline import Pipeline
@@ -75,6 +76,7 @@ class Node:
         self._stopping = threading.Event()
         self._parameters_changed = threading.Event()
         self._stats = _Statistics()
+        self._last_sent: FrameResult | None = None
         self._publisher = Publisher(config.publish, config.ns, uuid.uuid4().hex, self._handlers())
         self._threads = [
             threading.Thread(target=self._guard, args=(work, after), name=name, daemon=True)
@@ -175,7 +177,8 @@ class Node:
         self._parameters_changed.set()
         next_health = time.monotonic()
         while not self._results.closed:
-            self._publisher.poll(timeout_ms=100, wake_fd=self._wake)
+            if self._publisher.poll(timeout_ms=100, wake_fd=self._wake):
+                os.eventfd_read(self._wake)
             if self._parameters_changed.is_set():
                 self._parameters_changed.clear()
                 self._publisher.publish_parameters(self.config.model_dump(mode="json"))
@@ -194,6 +197,7 @@ class Node:
         latency_ms = (time.time_ns() - result.pair.t_capture_ns) * 1e-6
         result = replace(result, timings_ms={**result.timings_ms, "publish": publish_ms})
         self._stats.add(result, latency_ms)
+        self._last_sent = result
         if self._on_result is not None:
             self._on_result(result, latency_ms)
 
@@ -201,7 +205,7 @@ class Node:
 
     def _handlers(self) -> dict[str, Callable[[dict[str, Any]], Any]]:
         return {
-            "get_status": lambda args: asdict(self.health()),
+            "get_status": lambda args: content.status(self.health(), self._last_sent),
             "get_parameters": lambda args: self.config.model_dump(mode="json"),
             "set_parameters": lambda args: self._on_mapping_thread(lambda: self._set_parameters(args)),
             "reset_model": lambda args: self._on_mapping_thread(self._reset_model),
@@ -221,7 +225,7 @@ class Node:
                 return
             try:
                 future.set_result(work())
-            except SagsError as error:
+            except Exception as error:  # a client's request must not end the node; it is the answer
                 future.set_exception(error)
 
     def _set_parameters(self, args: dict[str, Any]) -> dict[str, Any]:

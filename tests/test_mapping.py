@@ -131,23 +131,18 @@ def test_free_space_is_cleared_only_after_several_frames() -> None:
     assert densify.doomed(model, frame.camera).all()
 
 
-def test_filled_depth_keeps_what_is_known_and_fills_the_rest() -> None:
+def test_first_pixels_respect_the_limit_and_the_mask_and_fill_small_gaps_only() -> None:
     frame = observation()
-    frame.depth[10:20, 10:30] = 0
-    frame.depth[:, 40:] = 0.1
-    filled = initialise.filled_depth(frame)
-    known = frame.depth > 0
-    assert np.array_equal(filled[known], frame.depth[known])
-    assert np.all((filled >= 0.0799) & (filled <= 0.1001))
-
-
-def test_first_pixels_respect_the_limit_and_the_mask() -> None:
-    frame = observation()
-    frame.tissue[:, :32] = False
-    pixels, spacing = initialise.first_pixels(frame, frame.depth, 100)
-    assert 60 <= len(pixels) <= 130
-    assert pixels[:, 0].min() >= 32
-    assert spacing == pytest.approx(np.sqrt(32 * 48 / 100))
+    frame.tissue[:, :16] = False
+    frame.depth[10:20, 30:] = 0
+    frame.depth[:, 60:] = 0
+    pixels, depths, spacing = initialise.first_pixels(frame, 100)
+    assert spacing == pytest.approx(np.sqrt(48 * 48 / 100))
+    assert 80 <= len(pixels) <= 120
+    assert pixels[:, 0].min() >= 16
+    assert np.allclose(depths, DEPTH)
+    frame.depth[:] = 0
+    assert len(initialise.first_pixels(frame, 100)[0]) == 0
 
 
 def test_step_budget_counts() -> None:

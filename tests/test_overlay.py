@@ -108,15 +108,15 @@ def test_shapes_lie_on_and_above_the_surface(shape: str) -> None:
 
 
 def test_a_ring_bends_over_a_curved_surface() -> None:
-    """A flat ring on a ridge would vanish into it; a draped one is seen all around."""
-    v, u = np.mgrid[: SIZE[0], : SIZE[1]]
-    ridge = (0.05 + 0.003 * np.cos(u / 12.0)).astype(np.float32)
-    center = np.array([0.0, 0.0, float(ridge[30, 40])])
+    """A flat ring in a hollow is half hidden by its sides; a draped one is seen all around."""
+    u = np.broadcast_to(np.arange(SIZE[1]), SIZE)
+    hollow = (0.05 - 0.002 * np.cos(u / 12.0)).astype(np.float32)
+    center = np.array([0.0, 0.0, float(hollow[30, 40])])
     flat = overlay_draw.disc(center, np.array([0.0, 0.0, -1.0]), 0.003, 0.004, 5e-5, (0, 255, 0))
     everywhere = overlay_draw.draw(GRAY, flat, K, np.full(SIZE, 1.0, np.float32), TISSUE)[1]
-    assert overlay_draw.draw(GRAY, flat, K, ridge, TISSUE)[1] < 0.5 * everywhere
-    draped = overlay_draw.drape(flat, K, ridge)
-    assert overlay_draw.draw(GRAY, draped, K, ridge, TISSUE)[1] > 0.9 * everywhere
+    assert overlay_draw.draw(GRAY, flat, K, hollow, TISSUE)[1] < 0.5 * everywhere
+    draped = overlay_draw.drape(flat, K, hollow)
+    assert overlay_draw.draw(GRAY, draped, K, hollow, TISSUE)[1] > 0.9 * everywhere
 
 
 # ---- the pin -------------------------------------------------------------------------------------------

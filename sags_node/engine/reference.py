@@ -99,16 +99,16 @@ def _usable(
 
     everything = torch.cat([means, quats, scales, opacities[:, None], colors], 1)
     z = _camera_points(means, pinhole)[:, 2]
-    finite: Tensor = torch.isfinite(everything).all(1)
-    return finite & (z > NEAR_PLANE) & (quats.norm(dim=1) > MIN_QUAT_NORM)
+    directed = torch.linalg.vector_norm(quats, dim=1) > MIN_QUAT_NORM
+    usable: Tensor = torch.isfinite(everything).all(1) & (z > NEAR_PLANE) & directed
+    return usable
 
 
 def _camera_points(means: Tensor, pinhole: Pinhole) -> Tensor:
     import torch
 
     R, t = torch.as_tensor(pinhole.R, dtype=means.dtype), torch.as_tensor(pinhole.t, dtype=means.dtype)
-    points: Tensor = means @ R.T + t
-    return points
+    return torch.addmm(t, means, R.T)
 
 
 def project(
@@ -142,7 +142,7 @@ def _rotations(quats: Tensor) -> Tensor:
     """Rotation matrices [N, 3, 3]."""
     import torch
 
-    w, x, y, z = (quats / quats.norm(dim=1, keepdim=True)).unbind(1)
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=1, eps=0).unbind(1)
     rows = [
         torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], 1),
         torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], 1),

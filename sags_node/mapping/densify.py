@@ -7,6 +7,7 @@ from numba import prange
 
 from sags_node.engine.jit import kernel, parallel_kernel
 from sags_node.geometry import project
+from sags_node.mapping.initialise import nearest_depth
 from sags_node.model.gaussians import GaussianModel
 from sags_node.types import F32, I32, Bool, Camera, Observation
 
@@ -15,7 +16,6 @@ RESIDUAL_NEW_SURFACE = 0.2  # summed over RGB: with a surface in front of the mo
 RESIDUAL_DETAIL = 0.45  # summed over RGB: with the right depth, detail is missing
 DEPTH_TOLERANCE = 0.035  # of the depth
 GRID = 4  # px between candidates
-REACH = 48  # px: how far a hole without depth looks for one
 MAX_INSERTED = 1500  # per frame: a budget, and a brake on runaway insertion
 FRONT_TOLERANCE = 0.065  # of the depth: so far in front of the measured surface is free space
 FRONT_FRAMES = 3  # in a row, since stereo is wrong now and then
@@ -75,7 +75,7 @@ def _candidates(
                 alpha = planes[4, y, x]
                 if alpha < HOLE_ALPHA:
                     if z <= 0 and rank == 0:
-                        z = _nearest_depth(depth, x, y)
+                        z = nearest_depth(depth, x, y)
                     wanted = rank == 0 and z > 0
                 elif rank == 0 or z <= 0:
                     wanted = False
@@ -96,22 +96,6 @@ def _candidates(
                     depths[n] = z
                     n += 1
     return n
-
-
-@kernel
-def _nearest_depth(depth: F32, x: int, y: int) -> float:
-    """The nearest known depth in row y or column x, within REACH px; 0 if there is none."""
-    height, width = depth.shape
-    for r in range(1, REACH):
-        if x - r >= 0 and depth[y, x - r] > 0:
-            return depth[y, x - r]
-        if x + r < width and depth[y, x + r] > 0:
-            return depth[y, x + r]
-        if y - r >= 0 and depth[y - r, x] > 0:
-            return depth[y - r, x]
-        if y + r < height and depth[y + r, x] > 0:
-            return depth[y + r, x]
-    return np.float32(0)
 
 
 @parallel_kernel

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 
+from sags_node.engine.jit import kernel
 from sags_node.geometry import unproject
 from sags_node.model.gaussians import GaussianModel
 from sags_node.types import F32, I32, Observation
@@ -12,6 +12,7 @@ from sags_node.types import F32, I32, Observation
 SCALE_PER_SPACING = 0.4  # of the distance between neighbours; measured best (0.3-0.5), 0.8 loses 4 dB
 FLATNESS = 0.5  # the extent along the ray against the extent across it
 OPACITY = 0.9
+REACH = 48  # px: how far a pixel without depth looks for one
 INITIAL_SHARE = 0.75  # of the cap used by the first frame; the rest is for what appears later
 
 
@@ -32,33 +33,42 @@ def insert(model: GaussianModel, observation: Observation, pixels: I32, z: F32, 
     return model.append(means, scales, observation.image[y, x], OPACITY)
 
 
-def first_pixels(observation: Observation, depth: F32, limit: int) -> tuple[I32, float]:
-    """A regular grid of at most about `limit` tissue pixels with depth: pixels [M, 2] and their spacing."""
-    usable = observation.tissue & (depth > 0)
-    spacing = max(1.0, float(np.sqrt(np.count_nonzero(usable) / limit)))
-    height, width = usable.shape
+def first_pixels(observation: Observation, limit: int) -> tuple[I32, F32, float]:
+    """A regular grid of at most about `limit` tissue pixels: pixels [M, 2], depths [M] m, spacing px.
+
+    Pixels without depth take the nearest one in their row or column; those far from any are left out.
+    """
+    tissue = observation.tissue
+    spacing = max(1.0, float(np.sqrt(np.count_nonzero(tissue) / limit)))
+    height, width = tissue.shape
     ys = np.arange(0.5 * (spacing - 1), height - 0.5, spacing)
     xs = np.arange(0.5 * (spacing - 1), width - 0.5, spacing)
     x, y = np.meshgrid(np.rint(xs).astype(np.int32), np.rint(ys).astype(np.int32))
-    chosen = usable[y, x]
-    return np.stack([x[chosen], y[chosen]], 1), spacing
+    pixels = np.stack([x[tissue[y, x]], y[tissue[y, x]]], 1)
+    depths = _depths_at(observation.depth, pixels)
+    known = depths > 0
+    return pixels[known], depths[known], spacing
 
 
-def filled_depth(observation: Observation) -> F32:
-    """Depth [H, W] with its unknown pixels filled from around them (push-pull: coarse levels fill fine ones).
+@kernel
+def _depths_at(depth: F32, pixels: I32) -> F32:
+    depths = np.empty(len(pixels), np.float32)
+    for i in range(len(pixels)):
+        depths[i] = nearest_depth(depth, pixels[i, 0], pixels[i, 1])
+    return depths
 
-    For the first frame only: a model without holes needs a guess where stereo had none.
-    """
-    depths = [observation.depth]
-    weights = [(observation.depth > 0).astype(np.float32)]
-    while min(depths[-1].shape) > 4:
-        size = (depths[-1].shape[1] // 2, depths[-1].shape[0] // 2)
-        weight = cv2.resize(weights[-1], size, interpolation=cv2.INTER_AREA)
-        total = cv2.resize(depths[-1] * weights[-1], size, interpolation=cv2.INTER_AREA)
-        depths.append(total / np.maximum(weight, 1e-6))
-        weights.append((weight > 0).astype(np.float32))
-    filled = depths[-1]
-    for depth, weight in zip(depths[-2::-1], weights[-2::-1], strict=True):
-        coarse = cv2.resize(filled, depth.shape[::-1], interpolation=cv2.INTER_LINEAR)
-        filled = np.where(weight > 0, depth, coarse)
-    return filled.astype(np.float32)
+
+@kernel
+def nearest_depth(depth: F32, x: int, y: int) -> float:
+    """Depth [H, W] at a pixel, else the nearest known one in its row or column within REACH px, else 0."""
+    height, width = depth.shape
+    for r in range(REACH):
+        if x - r >= 0 and depth[y, x - r] > 0:
+            return depth[y, x - r]
+        if x + r < width and depth[y, x + r] > 0:
+            return depth[y, x + r]
+        if y - r >= 0 and depth[y - r, x] > 0:
+            return depth[y - r, x]
+        if y + r < height and depth[y + r, x] > 0:
+            return depth[y + r, x]
+    return np.float32(0)

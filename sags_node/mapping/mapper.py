@@ -82,13 +82,11 @@ class Mapper:
         self._last = _Last(observation, view)
 
     def _initialise(self, observation: Observation) -> dict[str, int]:
-        depth = initialise.filled_depth(observation)
         limit = int(initialise.INITIAL_SHARE * self.model.capacity)
-        pixels, spacing = initialise.first_pixels(observation, depth, limit)
+        pixels, depths, spacing = initialise.first_pixels(observation, limit)
         if len(pixels) < MIN_FIRST_GAUSSIANS:
             return {"inserted": 0}  # a black or covered picture: try again with the next frame
-        x, y = pixels[:, 0], pixels[:, 1]
-        rows = initialise.insert(self.model, observation, pixels, depth[y, x], spacing)
+        rows = initialise.insert(self.model, observation, pixels, depths, spacing)
         self._deformation = NodeDeformation(self.model.means, CONTROL_NODES)
         self._deformation.attach(self.model, rows)
         for _ in range(INITIAL_STEPS):
