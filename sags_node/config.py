@@ -125,7 +125,9 @@ class StereoConfig(Section):
     """Depth from the rectified pair."""
 
     method: Literal["dis", "sgbm"] = Field("dis", description="dense inverse search, or StereoSGBM 3WAY")
-    scale: Literal[1, 2, 4] = Field(2, description="divide the working size by this for matching")
+    scale: Literal[1, 2, 4] | None = Field(
+        None, description="divide the working size by this for matching; default: 2 from 480 px width, else 1"
+    )
     min_depth: float = Field(0.03, gt=0, description="m")
     max_depth: float = Field(0.30, gt=0, description="m")
 

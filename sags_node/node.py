@@ -40,6 +40,7 @@ log = logging.getLogger(__name__)
 
 HEALTH_PERIOD = 1.0  # s
 WAITING_AFTER = 1.0  # s without a frame
+STOP_SECONDS = 10.0  # longest wait for each thread to end
 WINDOW = 150  # frames behind the published rates and latencies
 LIVE_PARAMETERS = ("mapping.budget_ms", "mapping.skip_duplicates")
 
@@ -78,13 +79,16 @@ class Node:
         self._stats = _Statistics()
         self._last_sent: FrameResult | None = None
         self._publisher = Publisher(config.publish, config.ns, uuid.uuid4().hex, self._handlers())
+        work = {
+            "capture": (self._capture, self._frames.close),
+            "mapping": (self._map, self._results.close),
+            "publishing": (self._publish, self._publisher.close),
+        }
+        # Events, not joins: in Python 3.11 a Ctrl-C during a join marks a living thread as ended.
+        self._ended = {name: threading.Event() for name in work}
         self._threads = [
-            threading.Thread(target=self._guard, args=(work, after), name=name, daemon=True)
-            for name, work, after in (
-                ("capture", self._capture, self._frames.close),
-                ("mapping", self._map, self._results.close),
-                ("publishing", self._publish, self._publisher.close),
-            )
+            threading.Thread(target=self._guard, args=(name, *parts), name=name, daemon=True)
+            for name, parts in work.items()
         ]
 
     # ---- life ----------------------------------------------------------------------------------------
@@ -95,16 +99,15 @@ class Node:
             thread.start()
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Wait for the end of the source; True when the node has ended. Short waits let Ctrl-C through.
+        """Wait for the end of the source; True when the node has ended.
 
         Raises:
             the error that ended the node, if one did.
         """
-        deadline = None if timeout is None else time.monotonic() + timeout
-        while any(thread.is_alive() for thread in self._threads):
-            if deadline is not None and time.monotonic() >= deadline:
+        deadline = time.monotonic() + (threading.TIMEOUT_MAX if timeout is None else timeout)
+        for ended in self._ended.values():
+            if not ended.wait(max(0.0, deadline - time.monotonic())):
                 return False
-            self._threads[-1].join(0.1)
         if self._error is not None:
             raise self._error
         return True
@@ -114,9 +117,9 @@ class Node:
         self._stopping.set()
         self._source.stop()
         self._frames.close()
-        for thread in self._threads:
-            if thread.is_alive():
-                thread.join(10)
+        for thread, ended in zip(self._threads, self._ended.values(), strict=True):
+            if thread.ident is not None:  # it was started
+                ended.wait(STOP_SECONDS)
 
     @property
     def endpoints(self) -> list[str]:
@@ -139,7 +142,7 @@ class Node:
             error=self._error,
         )
 
-    def _guard(self, work: Callable[[], None], after: Callable[[], None]) -> None:
+    def _guard(self, name: str, work: Callable[[], None], after: Callable[[], None]) -> None:
         """Run one thread's work; its failure ends the node in order, and is raised by `wait`."""
         try:
             work()
@@ -147,11 +150,14 @@ class Node:
             if self._error is None:
                 self._error = error
             if not isinstance(error, SagsError):
-                log.exception("the %s thread failed", threading.current_thread().name)
+                log.exception("the %s thread failed", name)
             self._source.stop()
             self._frames.close()
         finally:
-            after()
+            try:
+                after()
+            finally:
+                self._ended[name].set()
 
     # ---- the three threads ---------------------------------------------------------------------------
 

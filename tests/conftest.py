@@ -24,9 +24,9 @@ def data_folder() -> Path:
 
 @pytest.fixture(scope="session")
 def phantom_session(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """One second of the phantom at a small size, with its truth."""
+    """Forty frames of the phantom at a small size, with their truth."""
     folder = tmp_path_factory.mktemp("phantom") / "session"
-    write_session(PhantomSource(seconds=1.0, width=320, height=256, seed=1), folder, rate=30.0)
+    write_session(PhantomSource(seconds=4.0, width=320, height=256, seed=1), folder, rate=10.0)
     return folder
 
 

@@ -520,7 +520,7 @@ def test_large_disparities_and_highlights_of_a_beating_heart(method: str) -> Non
     """
     folder = recording("hamlyn_invivo_001_100")
     rectifier = Rectifier(load_rig(ROOT / "calib/hamlyn_heart"), 360, 288)
-    stereo = StereoDepth(StereoConfig(method=method), rectifier.camera, rectifier.baseline)
+    stereo = StereoDepth(StereoConfig(method=method, scale=2), rectifier.camera, rectifier.baseline)
     columns, rows = np.meshgrid(np.arange(360, dtype=np.float32), np.arange(288, dtype=np.float32))
     for index in (1, 50, 100):
         left, right = (read_rgb(folder / side / f"{index:04d}.jpg") for side in ("left", "right"))

@@ -37,13 +37,13 @@ TILE_WIDTH_BITS, TILE_HEIGHT_BITS = 4, 5
 TILE_WIDTH, TILE_HEIGHT = 1 << TILE_WIDTH_BITS, 1 << TILE_HEIGHT_BITS  # 16x32 px
 TILE_PIXELS = TILE_WIDTH * TILE_HEIGHT
 PLANE = TILE_PIXELS + 16  # 64 bytes of padding: planes 4 KiB apart would evict each other
-SCRATCH = 12 * PLANE  # floats per worker
+SCRATCH = 11 * PLANE  # floats per worker
 
 # planes of the scratch array
 TRANSMITTANCE = u8(0)
 PIXEL_X, PIXEL_Y = u8(PLANE), u8(2 * PLANE)  # centres, relative to the tile
 RED, GREEN, BLUE, DEPTH, COVERAGE = u8(3 * PLANE), u8(4 * PLANE), u8(5 * PLANE), u8(6 * PLANE), u8(7 * PLANE)
-REMAINING, WEIGHT = u8(8 * PLANE), u8(9 * PLANE)
+REMAINING, WEIGHT, STAGED = u8(8 * PLANE), u8(9 * PLANE), u8(10 * PLANE)
 
 ZERO, HALF, ONE = f4(0.0), f4(0.5), f4(1.0)
 OPAQUE = f4(1e-4)  # transmittance at which a pixel is finished
@@ -72,6 +72,32 @@ def _open_tile(tile: F32, columns: int, rows: int) -> None:
         tile[PIXEL_X + u8(i)] = f4(x) + HALF
         tile[PIXEL_Y + u8(i)] = f4(y) + HALF
         tile[TRANSMITTANCE + u8(i)] = ONE if x < columns and y < rows else ZERO
+
+
+@inlined
+def _load(tile: F32, plane: Any, picture: F32, x0: int, y0: int, columns: int, rows: int) -> None:
+    """Copy the tile's part of a picture [H, W] into a plane of the scratch."""
+    for y in range(rows):
+        row, first = picture[y0 + y], plane + u8(y * TILE_WIDTH)
+        if columns == TILE_WIDTH:  # a constant length vectorises
+            for x in range(TILE_WIDTH):
+                tile[first + u8(x)] = row[u8(x0) + u8(x)]
+        else:
+            for x in range(columns):
+                tile[first + u8(x)] = row[u8(x0) + u8(x)]
+
+
+@inlined
+def _store(tile: F32, plane: Any, picture: F32, x0: int, y0: int, columns: int, rows: int) -> None:
+    """Copy a plane of the scratch into the tile's part of a picture [H, W]."""
+    for y in range(rows):
+        row, first = picture[y0 + y], plane + u8(y * TILE_WIDTH)
+        if columns == TILE_WIDTH:
+            for x in range(TILE_WIDTH):
+                row[u8(x0) + u8(x)] = tile[first + u8(x)]
+        else:
+            for x in range(columns):
+                row[u8(x0) + u8(x)] = tile[first + u8(x)]
 
 
 @parallel_kernel
@@ -130,14 +156,10 @@ def composite(
                     if unfinished == ZERO:
                         break
             tile_ends[t] = p
-            for y in range(rows):
-                for x in range(columns):
-                    i = u8(y * TILE_WIDTH) + u8(x)
-                    planes[0, y0 + y, x0 + x] = tile[RED + i]
-                    planes[1, y0 + y, x0 + x] = tile[GREEN + i]
-                    planes[2, y0 + y, x0 + x] = tile[BLUE + i]
-                    planes[3, y0 + y, x0 + x] = tile[DEPTH + i]
-                    planes[4, y0 + y, x0 + x] = ONE - tile[TRANSMITTANCE + i]
+            for k in range(TILE_PIXELS):
+                tile[COVERAGE + u8(k)] = ONE - tile[TRANSMITTANCE + u8(k)]
+            for k in range(5):
+                _store(tile, RED + u8(k * PLANE), planes[k], x0, y0, columns, rows)
 
 
 @parallel_kernel
@@ -163,27 +185,18 @@ def composite_backward(
             columns, rows = min(TILE_WIDTH, width - x0), min(TILE_HEIGHT, height - y0)
             _open_tile(tile, columns, rows)
             if columns < TILE_WIDTH or rows < TILE_HEIGHT:
-                for k in range(7 * PLANE):
+                for k in range(8 * PLANE):
                     tile[RED + u8(k)] = ZERO
-            for y in range(rows):
-                for x in range(columns):
-                    i = u8(y * TILE_WIDTH) + u8(x)
-                    yy, xx = y0 + y, x0 + x
-                    v_red, v_green, v_blue = v_planes[0, yy, xx], v_planes[1, yy, xx], v_planes[2, yy, xx]
-                    v_depth, v_coverage = v_planes[3, yy, xx], v_planes[4, yy, xx]
-                    tile[RED + i] = v_red
-                    tile[GREEN + i] = v_green
-                    tile[BLUE + i] = v_blue
-                    tile[DEPTH + i] = v_depth
-                    tile[COVERAGE + i] = v_coverage
-                    tile[WEIGHT + i] = weight[yy, xx]
-                    tile[REMAINING + i] = (
-                        v_red * planes[0, yy, xx]
-                        + v_green * planes[1, yy, xx]
-                        + v_blue * planes[2, yy, xx]
-                        + v_depth * planes[3, yy, xx]
-                        + v_coverage * planes[4, yy, xx]
-                    )
+            for k in range(TILE_PIXELS):
+                tile[REMAINING + u8(k)] = ZERO
+            for k in range(5):
+                plane = RED + u8(k * PLANE)
+                _load(tile, plane, v_planes[k], x0, y0, columns, rows)
+                _load(tile, STAGED, planes[k], x0, y0, columns, rows)
+                for j in range(TILE_PIXELS):
+                    i = u8(j)
+                    tile[REMAINING + i] += tile[plane + i] * tile[STAGED + i]
+            _load(tile, WEIGHT, weight, x0, y0, columns, rows)
             end = tile_ends[t]
             for p in range(tile_starts[t], end):
                 if p + AHEAD < end:

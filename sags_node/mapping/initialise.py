@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from sags_node.engine.jit import kernel
@@ -59,7 +61,7 @@ def _depths_at(depth: F32, pixels: I32) -> F32:
 
 
 @kernel
-def nearest_depth(depth: F32, x: int, y: int) -> float:
+def nearest_depth(depth: F32, x: int, y: int) -> Any:
     """Depth [H, W] at a pixel, else the nearest known one in its row or column within REACH px, else 0."""
     height, width = depth.shape
     for r in range(REACH):

@@ -11,6 +11,7 @@ from sags_node.errors import UsageError
 from sags_node.types import F32, U8, Bool, Camera, RectifiedPair
 from sags_node.vision.matchers import InverseSearch, SemiGlobal
 
+FULL_SIZE_BELOW = 480  # px width: matching at half of less costs half of the accuracy and saves little
 SMALLEST_SIDE = 32  # px of the matching picture: four patches of the inverse search
 LEAST_AGREEMENT = 0.5  # matches below it are wrong more often than right
 AGREEMENT_WINDOW = 9  # px
@@ -21,7 +22,7 @@ EDGE_MARGIN = 5 / 640  # of the width: depths smear that far across an instrumen
 class StereoDepth:
     """Depth of the left rectified picture. Keeps nothing from frame to frame.
 
-    Matching runs at the working size divided by `config.scale`. A match is trusted as far as its
+    Matching runs at the working size divided by the scale. A match is trusted as far as its
     neighbourhood agrees with the place in the right picture that it was matched to: the confidence is 0 at a
     zero-mean normalised cross-correlation (ZNCC) of 0.5 and below, where the depth is unknown, and 1 at 1.
 
@@ -30,7 +31,8 @@ class StereoDepth:
     """
 
     def __init__(self, config: StereoConfig, camera: Camera, baseline: float) -> None:
-        width, height = round(camera.width / config.scale), round(camera.height / config.scale)
+        scale = config.scale or (2 if camera.width >= FULL_SIZE_BELOW else 1)
+        width, height = round(camera.width / scale), round(camera.height / scale)
         if min(width, height) < SMALLEST_SIDE:
             raise UsageError(
                 f"{width}x{height} px are too few to match; lower vision.stereo.scale or raise vision.width "
