@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import cv2
+import numba
 import numpy as np
 
 from sags_node import geometry
@@ -15,6 +16,7 @@ FULL_SIZE_BELOW = 480  # px width: matching at half of less costs half of the ac
 SMALLEST_SIDE = 32  # px of the matching picture: four patches of the inverse search
 LEAST_AGREEMENT = 0.5  # matches below it are wrong more often than right
 AGREEMENT_WINDOW = 9  # px
+HIDDEN_TOLERANCE = 2.0  # px of disparity between two matches of one right pixel
 NOISE_VARIANCE = 1.0  # grey levels squared: texture below it is camera noise, not agreement
 EDGE_MARGIN = 5 / 640  # of the width: depths smear that far across an instrument's edge
 
@@ -69,6 +71,7 @@ class StereoDepth:
         agreement = self._agreement(left, right, disparity, row_error)
         known &= (disparity >= self._smallest) & (disparity <= self._largest)
         known &= (disparity <= self._columns) & (agreement > LEAST_AGREEMENT)
+        _forget_hidden(disparity, known)
         confidence = np.where(known, (agreement - LEAST_AGREEMENT) / (1 - LEAST_AGREEMENT), np.float32(0))
 
         depth, confidence = self._enlarge(disparity, known, confidence, tissue.shape[1::-1])
@@ -112,6 +115,26 @@ class StereoDepth:
         covered = weight > 0.5
         total = np.divide(total, weight, out=np.zeros_like(total), where=covered)
         return geometry.disparity_to_depth(total, self._focal, self._baseline), confidence * covered
+
+
+@numba.njit(cache=True, nogil=True)
+def _forget_hidden(disparity: F32, known: Bool) -> None:
+    """Clear `known` where the right eye's pixel is taken by a nearer surface: the match must be wrong.
+
+    This is what is left of the left-right check when only the left picture is matched. It catches the strip
+    that the right eye does not see, where a match is always found and never true.
+    """
+    height, width = disparity.shape
+    for y in range(height):
+        nearest = np.zeros(width, np.float32)  # by right column
+        for x in range(width):
+            if known[y, x]:
+                column = int(x - disparity[y, x] + 0.5)
+                nearest[column] = max(nearest[column], disparity[y, x])
+        for x in range(width):
+            if known[y, x]:
+                column = int(x - disparity[y, x] + 0.5)
+                known[y, x] = disparity[y, x] > nearest[column] - HIDDEN_TOLERANCE
 
 
 def _mean(picture: F32) -> F32:
