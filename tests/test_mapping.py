@@ -125,10 +125,22 @@ def test_free_space_is_cleared_only_after_several_frames() -> None:
     )
     frame = observation()
     for _ in range(densify.FRONT_FRAMES - 1):
-        densify.free_space_violations(model, frame)
-        assert not densify.doomed(model, frame.camera).any()
-    densify.free_space_violations(model, frame)
-    assert densify.doomed(model, frame.camera).all()
+        assert not densify.doomed(model, frame).any()
+    assert densify.doomed(model, frame).all()
+
+
+def test_what_is_not_finite_or_transparent_goes_at_once_and_what_left_the_view_when_it_is_crowded() -> None:
+    points = grid_points()
+    model = GaussianModel(len(points))
+    size, grey = np.full((len(points), 3), 2e-4, np.float32), np.full((len(points), 3), 0.5, np.float32)
+    model.append(points[:50], size[:50], grey[:50], 0.9)
+    model.means[0, 1] = np.nan
+    model.colors[1, 2] = np.inf
+    model.opacities[2] = 0.01
+    model.means[3, 0] = 1.0
+    assert np.flatnonzero(densify.doomed(model, observation())).tolist() == [0, 1, 2]
+    model.append(points[50:], size[50:], grey[50:], 0.9)
+    assert np.flatnonzero(densify.doomed(model, observation())).tolist() == [0, 1, 2, 3]
 
 
 def test_first_pixels_respect_the_limit_and_the_mask_and_fill_small_gaps_only() -> None:

@@ -13,6 +13,9 @@ The rules; breaking one costs up to 5 times without any error, so time a kernel 
 5. A record that is reached through an index is prefetched a few steps ahead.
 6. Results must not depend on the number of threads: work is cut into pieces whose result does not depend
    on who does them, every output has one writer, and partial sums are added in a fixed order.
+7. The body of a `prange` loop branches little and unpacks no tuples: it calls a serial kernel for one item.
+   With `continue` and `x, y = f()` in the body, Numba 0.68 shares `x` and `y` between threads, silently.
+   `tests/test_kernels.py` compares every kernel of the mapper with its own Python source.
 
 Numba's disk cache only sees the file a kernel stands in and the types of its arguments. So constants that
 shape a kernel stand in the same file as every kernel that uses them, and layouts shared between files are

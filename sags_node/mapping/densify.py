@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import prange
 
 from sags_node.engine.jit import kernel, parallel_kernel
-from sags_node.geometry import project
 from sags_node.mapping.initialise import nearest_depth
+from sags_node.mapping.pinhole import pack, to_camera, to_pixel
 from sags_node.model.gaussians import GaussianModel
-from sags_node.types import F32, I32, Bool, Camera, Observation
+from sags_node.types import F32, I32, Bool, Observation
 
 HOLE_ALPHA = 0.4  # below this a tissue pixel is a hole; 0.8 would count the gaps between small Gaussians
 RESIDUAL_NEW_SURFACE = 0.2  # summed over RGB: with a surface in front of the model, content is new
@@ -42,21 +44,14 @@ def candidates(planes: F32, observation: Observation, phase: int) -> tuple[I32, 
     return pixels[:count], depths[:count]
 
 
-def free_space_violations(model: GaussianModel, observation: Observation) -> None:
-    """Count the frames in a row that saw the surface well behind each Gaussian (updates `in_front`)."""
-    pixels, depths = project(observation.camera, model.means)
-    _count_in_front(pixels, depths, observation.tissue, observation.depth, model.in_front)
-
-
-def doomed(model: GaussianModel, camera: Camera) -> Bool:
-    """[N] what to remove: in free space, transparent, not finite, or out of view when N nears its cap."""
-    remove: Bool = (model.in_front >= FRONT_FRAMES) | (model.opacities < MIN_OPACITY)
-    remove |= ~np.isfinite(model.means).all(1) | ~np.isfinite(model.colors).all(1)
-    if model.count > CROWDED * model.capacity:
-        pixels, _ = project(camera, model.means)
-        margin = 0.06 * camera.width
-        size = np.array([camera.width, camera.height])
-        remove |= ~((pixels > -margin) & (pixels < size + margin)).all(1)
+def doomed(model: GaussianModel, observation: Observation) -> Bool:
+    """[N] what to remove: in free space for several frames in a row, transparent, not finite, or out of view
+    when N nears its cap. Counts the frames in free space (`in_front`)."""
+    remove = np.zeros(model.count, np.bool_)
+    _inspect(
+        model.means, model.opacities, model.colors, pack(observation.camera), observation.tissue,
+        observation.depth, model.count > CROWDED * model.capacity, model.in_front, remove,
+    )  # fmt: skip
     return remove
 
 
@@ -99,15 +94,33 @@ def _candidates(
 
 
 @parallel_kernel
-def _count_in_front(pixels: F32, depths: F32, tissue: Bool, depth: F32, in_front: I32) -> None:
+def _inspect(
+    means: F32, opacities: F32, colors: F32, cam: F32, tissue: Bool, depth: F32, crowded: bool,
+    in_front: I32, remove: Bool,
+) -> None:  # fmt: skip
+    for i in prange(len(means)):
+        remove[i] = _is_doomed(means[i], opacities[i], colors[i], cam, tissue, depth, crowded, in_front, i)
+
+
+@kernel
+def _is_doomed(
+    mean: F32, opacity: Any, color: F32, cam: F32, tissue: Bool, depth: F32, crowded: bool,
+    in_front: I32, i: int,
+) -> bool:  # fmt: skip
     height, width = tissue.shape
-    for i in prange(len(depths)):
-        u, v = pixels[i, 0], pixels[i, 1]
-        if not (u > -0.5 and v > -0.5 and u < width - 0.5 and v < height - 0.5):
-            continue
-        x, y = int(u + 0.5), int(v + 0.5)
-        if tissue[y, x] and depth[y, x] > 0:
-            if depth[y, x] - depths[i] > FRONT_TOLERANCE * depth[y, x]:
-                in_front[i] += 1
-            else:
-                in_front[i] = 0
+    size = opacity
+    for k in range(3):
+        size += abs(mean[k]) + abs(color[k])
+    if not size < np.inf or opacity < MIN_OPACITY:
+        return True
+    x, y, z = to_camera(cam, mean[0], mean[1], mean[2])
+    if not z > 0:
+        return crowded
+    u, v = to_pixel(cam, x, y, z)
+    if not (u > -0.5 and v > -0.5 and u < width - 0.5 and v < height - 0.5):
+        return crowded
+    px, py = int(u + 0.5), int(v + 0.5)
+    measured = depth[py, px]
+    if tissue[py, px] and measured > 0:
+        in_front[i] = in_front[i] + 1 if measured - z > FRONT_TOLERANCE * measured else 0
+    return in_front[i] >= FRONT_FRAMES

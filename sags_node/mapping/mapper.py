@@ -96,19 +96,18 @@ class Mapper:
     def _follow(self, observation: Observation, budget: Budget) -> dict[str, int]:
         assert self._deformation is not None
         self._predict(observation)
-        densify.free_space_violations(self.model, observation)
-        removed = self.model.remove(densify.doomed(self.model, observation.camera))
+        removed = self.model.remove(densify.doomed(self.model, observation))
 
         planes = self._draw(observation)
         pixels, depths = densify.candidates(planes, observation, phase=7 * self._frames)
+        iterations = 0
+        if budget.more():  # before inserting, so that the drawing above serves both
+            self._refine(observation, planes, Rates())
+            iterations = 1
         rows = initialise.insert(self.model, observation, pixels, depths, densify.GRID)
         self._deformation.attach(self.model, rows)
-
-        iterations = 0
         while budget.more():
-            if iterations > 0 or len(pixels) > 0:
-                planes = self._draw(observation)
-            self._refine(observation, planes, Rates())
+            self._refine(observation, self._draw(observation), Rates())
             iterations += 1
         return {"inserted": rows.stop - rows.start, "removed": removed, "iterations": iterations}
 

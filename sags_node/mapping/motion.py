@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numba import prange
 
 from sags_node.engine.jit import kernel, parallel_kernel
-from sags_node.types import F32, U8, Bool, Camera, Observation, RenderedView
+from sags_node.mapping.pinhole import pack, to_camera, to_pixel
+from sags_node.types import F32, U8, Bool, Observation, RenderedView
 
 DEPTH_GATE = 0.13  # of the depth: a larger innovation is another surface, not this one
 BEHIND_TOLERANCE = 0.035  # of the depth: a Gaussian this far behind the drawn surface is hidden by it
@@ -45,18 +48,10 @@ def scene_flow(
     displacements = np.zeros_like(means)
     seen = np.zeros(len(means), np.float32)
     _advect(
-        means, _pack(before.camera), before.depth, before.alpha, tissue_before, flow,
-        _pack(after.camera), after.tissue, after.depth, displacements, seen,
+        means, pack(before.camera), before.depth, before.alpha, tissue_before, flow,
+        pack(after.camera), after.tissue, after.depth, displacements, seen,
     )  # fmt: skip
     return displacements, seen
-
-
-def _pack(camera: Camera) -> F32:
-    """viewmat rows (12), fx, fy, cx, cy: what a kernel needs of a camera."""
-    K = camera.K
-    return np.concatenate([camera.viewmat[:3].ravel(), [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]]).astype(
-        np.float32
-    )
 
 
 @parallel_kernel
@@ -64,51 +59,57 @@ def _advect(
     means: F32, cam0: F32, drawn_depth: F32, alpha: F32, tissue0: Bool, flow: F32,
     cam1: F32, tissue1: Bool, depth1: F32, displacements: F32, seen: F32,
 ) -> None:  # fmt: skip
-    height, width = alpha.shape
     for i in prange(len(means)):
-        x, y, z = _to_camera(cam0, means[i, 0], means[i, 1], means[i, 2])
-        if not z > 1e-3:
-            continue
-        u = cam0[12] * x / z + cam0[14]
-        v = cam0[13] * y / z + cam0[15]
-        if not (u >= 0 and v >= 0 and u <= width - 1 and v <= height - 1):
-            continue
-        px, py = int(u + 0.5), int(v + 0.5)
-        if not tissue0[py, px] or alpha[py, px] < SEEN_ALPHA:
-            continue
-        if drawn_depth[py, px] > 0 and z - drawn_depth[py, px] > BEHIND_TOLERANCE * z:
-            continue
-        u0, v0 = min(int(u), width - 2), min(int(v), height - 2)
-        a, b = np.float32(u - u0), np.float32(v - v0)
-        one = np.float32(1)
-        du = ((one - a) * flow[v0, u0, 0] + a * flow[v0, u0 + 1, 0]) * (one - b) + (
-            (one - a) * flow[v0 + 1, u0, 0] + a * flow[v0 + 1, u0 + 1, 0]
-        ) * b
-        dv = ((one - a) * flow[v0, u0, 1] + a * flow[v0, u0 + 1, 1]) * (one - b) + (
-            (one - a) * flow[v0 + 1, u0, 1] + a * flow[v0 + 1, u0 + 1, 1]
-        ) * b
-        u += du
-        v += dv
-        _, _, z1 = _to_camera(cam1, means[i, 0], means[i, 1], means[i, 2])
-        if u >= 0 and v >= 0 and u <= width - 1 and v <= height - 1:
-            px, py = int(u + 0.5), int(v + 0.5)
-            if not tissue1[py, px]:
-                continue  # flow into an instrument is the instrument's motion
-            measured = depth1[py, px]
-            if measured > 0 and abs(measured - z1) < DEPTH_GATE * z1:
-                z1 += np.float32(DEPTH_PULL) * (measured - z1)
-        x1 = (u - cam1[14]) * z1 / cam1[12] - cam1[3]
-        y1 = (v - cam1[15]) * z1 / cam1[13] - cam1[7]
-        z1 -= cam1[11]
-        for k in range(3):  # camera to world: the transposed rotation
-            displacements[i, k] = cam1[k] * x1 + cam1[4 + k] * y1 + cam1[8 + k] * z1 - means[i, k]
-        seen[i] = 1.0
+        seen[i] = _advect_one(
+            means[i], cam0, drawn_depth, alpha, tissue0, flow, cam1, tissue1, depth1, displacements[i]
+        )
 
 
 @kernel
-def _to_camera(cam: F32, x: float, y: float, z: float) -> tuple[float, float, float]:
-    return (
-        cam[0] * x + cam[1] * y + cam[2] * z + cam[3],
-        cam[4] * x + cam[5] * y + cam[6] * z + cam[7],
-        cam[8] * x + cam[9] * y + cam[10] * z + cam[11],
-    )
+def _advect_one(
+    mean: F32, cam0: F32, drawn_depth: F32, alpha: F32, tissue0: Bool, flow: F32,
+    cam1: F32, tissue1: Bool, depth1: F32, displacement: F32,
+) -> float:  # fmt: skip
+    """Writes the displacement; 1 if it was observed, else 0."""
+    height, width = alpha.shape
+    x, y, z = to_camera(cam0, mean[0], mean[1], mean[2])
+    if not z > 1e-3:
+        return 0.0
+    u, v = to_pixel(cam0, x, y, z)
+    if not (u >= 0 and v >= 0 and u <= width - 1 and v <= height - 1):
+        return 0.0
+    px, py = int(u + 0.5), int(v + 0.5)
+    if not tissue0[py, px] or alpha[py, px] < SEEN_ALPHA:
+        return 0.0
+    if drawn_depth[py, px] > 0 and z - drawn_depth[py, px] > BEHIND_TOLERANCE * z:
+        return 0.0
+    du, dv = _bilinear(flow, u, v, 0), _bilinear(flow, u, v, 1)
+    u += du
+    v += dv
+    _, _, z1 = to_camera(cam1, mean[0], mean[1], mean[2])
+    if u >= 0 and v >= 0 and u <= width - 1 and v <= height - 1:
+        px, py = int(u + 0.5), int(v + 0.5)
+        if not tissue1[py, px]:
+            return 0.0  # flow into an instrument is the instrument's motion
+        measured = depth1[py, px]
+        if measured > 0 and abs(measured - z1) < DEPTH_GATE * z1:
+            z1 += np.float32(DEPTH_PULL) * (measured - z1)
+    # From pixel and depth to the world: the transposed rotation.
+    x1 = (u - cam1[14]) * z1 / cam1[12] - cam1[3]
+    y1 = (v - cam1[15]) * z1 / cam1[13] - cam1[7]
+    z1 -= cam1[11]
+    for k in range(3):
+        displacement[k] = cam1[k] * x1 + cam1[4 + k] * y1 + cam1[8 + k] * z1 - mean[k]
+    return 1.0
+
+
+@kernel
+def _bilinear(flow: F32, u: Any, v: Any, channel: int) -> Any:
+    """Flow at a pixel inside the picture."""
+    height, width, _ = flow.shape
+    x, y = min(int(u), width - 2), min(int(v), height - 2)
+    a, b = np.float32(u - x), np.float32(v - y)
+    one = np.float32(1)
+    upper = (one - a) * flow[y, x, channel] + a * flow[y, x + 1, channel]
+    lower = (one - a) * flow[y + 1, x, channel] + a * flow[y + 1, x + 1, channel]
+    return (one - b) * upper + b * lower

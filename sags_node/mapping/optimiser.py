@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numba import prange
 
-from sags_node.engine.jit import parallel_kernel
+from sags_node.engine.jit import kernel, parallel_kernel
 from sags_node.engine.rasterize import Gradients
 from sags_node.model.gaussians import ADAM_PARAMETERS, GaussianModel
-from sags_node.types import F32, F64, Camera
+from sags_node.types import F32, Camera
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,44 +72,58 @@ def _step(
     means: F32, quats: F32, log_scales: F32, opacity_logits: F32, scales: F32, opacities: F32, colors: F32,
     adam_m: F32, adam_v: F32,
     v_means: F32, v_quats: F32, v_scales: F32, v_opacities: F32, v_colors: F32, contribution: F32,
-    lengths: F32, view_z: F64, focal: float, corrections: F32,
+    lengths: F32, view_z: F32, focal: float, corrections: F32,
 ) -> None:  # fmt: skip
-    one = np.float32(1)
     for i in prange(len(means)):
-        w = contribution[i]
-        if not w > MIN_CONTRIBUTION:
-            continue
-        g = np.empty(ADAM_PARAMETERS, np.float32)
-        for k in range(3):
-            g[k] = v_means[i, k]
-            g[7 + k] = v_scales[i, k] * scales[i, k]  # by log scale
-        for k in range(4):
-            g[3 + k] = v_quats[i, k]
-        g[10] = v_opacities[i] * opacities[i] * (one - opacities[i])  # by logit
-        finite = w < np.inf
-        for k in range(ADAM_PARAMETERS):
-            finite = finite and abs(g[k]) < np.inf
-        for k in range(3):
-            finite = finite and abs(v_colors[i, k]) < np.inf
-        if not finite:
-            continue
-        gain = np.float32(COLOUR_RELAXATION) / (w + np.float32(COLOUR_DAMPING))
-        for k in range(3):
-            colors[i, k] = min(max(colors[i, k] - gain * v_colors[i, k], np.float32(-0.5)), np.float32(1.5))
-        z = view_z[0] * means[i, 0] + view_z[1] * means[i, 1] + view_z[2] * means[i, 2] + view_z[3]
-        pixel = np.float32(abs(z) / focal)  # metres that one pixel spans at this depth
-        for k in range(ADAM_PARAMETERS):
-            adam_m[i, k] += np.float32(1 - BETA1) * (g[k] - adam_m[i, k])
-            adam_v[i, k] += np.float32(1 - BETA2) * (g[k] * g[k] - adam_v[i, k])
-            g[k] = lengths[k] * adam_m[i, k] * corrections[0]
-            g[k] /= np.sqrt(adam_v[i, k] * corrections[1]) + np.float32(1e-8)
-        for k in range(3):
-            means[i, k] -= pixel * g[k]
-            value = log_scales[i, k] - g[7 + k]
-            log_scales[i, k] = min(max(value, np.float32(LOG_SCALE_RANGE[0])), np.float32(LOG_SCALE_RANGE[1]))
-            scales[i, k] = math.exp(log_scales[i, k])
-        for k in range(4):
-            quats[i, k] -= g[3 + k]
-        value = opacity_logits[i] - g[10]
-        opacity_logits[i] = min(max(value, np.float32(LOGIT_RANGE[0])), np.float32(LOGIT_RANGE[1]))
-        opacities[i] = one / (one + math.exp(-opacity_logits[i]))
+        if contribution[i] > MIN_CONTRIBUTION:
+            mean = means[i]
+            z = view_z[0] * mean[0] + view_z[1] * mean[1] + view_z[2] * mean[2] + view_z[3]
+            _step_one(
+                mean, quats[i], log_scales[i], opacity_logits, scales[i], opacities, colors[i],
+                adam_m[i], adam_v[i],
+                v_means[i], v_quats[i], v_scales[i], v_opacities[i], v_colors[i], contribution[i],
+                lengths, np.float32(abs(z) / focal), corrections, i,
+            )  # fmt: skip
+
+
+@kernel
+def _step_one(
+    mean: F32, quat: F32, log_scale: F32, opacity_logits: F32, scale: F32, opacities: F32, color: F32,
+    adam_m: F32, adam_v: F32,
+    v_mean: F32, v_quat: F32, v_scale: F32, v_opacity: Any, v_color: F32, contribution: Any,
+    lengths: F32, pixel: Any, corrections: F32, i: int,
+) -> None:  # fmt: skip
+    """One row. `pixel`: metres that a pixel spans at the Gaussian's depth."""
+    one = np.float32(1)
+    g = np.empty(ADAM_PARAMETERS, np.float32)
+    for k in range(3):
+        g[k] = v_mean[k]
+        g[7 + k] = v_scale[k] * scale[k]  # by log scale
+    for k in range(4):
+        g[3 + k] = v_quat[k]
+    g[10] = v_opacity * opacities[i] * (one - opacities[i])  # by logit
+    size = contribution
+    for k in range(ADAM_PARAMETERS):
+        size += abs(g[k])
+    for k in range(3):
+        size += abs(v_color[k])
+    if not size < np.inf:
+        return
+    gain = np.float32(COLOUR_RELAXATION) / (contribution + np.float32(COLOUR_DAMPING))
+    for k in range(3):
+        color[k] = min(max(color[k] - gain * v_color[k], np.float32(-0.5)), np.float32(1.5))
+    for k in range(ADAM_PARAMETERS):
+        adam_m[k] += np.float32(1 - BETA1) * (g[k] - adam_m[k])
+        adam_v[k] += np.float32(1 - BETA2) * (g[k] * g[k] - adam_v[k])
+        g[k] = lengths[k] * adam_m[k] * corrections[0]
+        g[k] /= np.sqrt(adam_v[k] * corrections[1]) + np.float32(1e-8)
+    for k in range(3):
+        mean[k] -= pixel * g[k]
+        value = log_scale[k] - g[7 + k]
+        log_scale[k] = min(max(value, np.float32(LOG_SCALE_RANGE[0])), np.float32(LOG_SCALE_RANGE[1]))
+        scale[k] = math.exp(log_scale[k])
+    for k in range(4):
+        quat[k] -= g[3 + k]
+    value = opacity_logits[i] - g[10]
+    opacity_logits[i] = min(max(value, np.float32(LOGIT_RANGE[0])), np.float32(LOGIT_RANGE[1]))
+    opacities[i] = one / (one + math.exp(-opacity_logits[i]))

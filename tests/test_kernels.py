@@ -1,0 +1,125 @@
+"""Every kernel of the mapper, compiled and parallel, does what its Python source says.
+
+Numba has been seen to share variables of a parallel loop between threads; only a comparison shows it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sags_node.mapping import densify, motion, optimiser
+from sags_node.mapping.pinhole import pack
+from sags_node.model import deformation
+from sags_node.types import Camera
+
+N, WIDTH, HEIGHT = 3000, 160, 120
+
+
+@pytest.fixture(scope="module")
+def scene() -> dict[str, np.ndarray]:
+    """Random Gaussians in, beside and behind two slightly different views, with holes in every map."""
+    rng = np.random.default_rng(5)
+    f4 = np.float32
+    K = np.array([[150.0, 0, 80], [0, 150, 60], [0, 0, 1]])
+    T = np.eye(4)
+    T[:3, 3] = [1e-3, -2e-3, 1e-3]
+    means = rng.uniform([-0.05, -0.04, -0.01], [0.05, 0.04, 0.11], (N, 3)).astype(f4)
+    means[::97] = np.nan
+    return {
+        "means": means,
+        "opacities": rng.uniform(0, 1, N).astype(f4),
+        "colors": rng.uniform(0, 1, (N, 3)).astype(f4),
+        "cam0": pack(Camera(WIDTH, HEIGHT, K, np.eye(4))),
+        "cam1": pack(Camera(WIDTH, HEIGHT, K, T)),
+        "tissue": rng.random((HEIGHT, WIDTH)) > 0.2,
+        "depth": rng.uniform(0.03, 0.1, (HEIGHT, WIDTH)).astype(f4) * (rng.random((HEIGHT, WIDTH)) > 0.2),
+        "alpha": rng.random((HEIGHT, WIDTH)).astype(f4),
+        "flow": rng.normal(0, 2, (HEIGHT, WIDTH, 2)).astype(f4),
+        "rows": rng.normal(0, 1, (N, 40)).astype(f4),
+        "index": rng.integers(0, 50, (N, 4)).astype(np.int32),
+        "weight": rng.uniform(0, 1, (N, 4)).astype(f4),
+    }
+
+
+def test_advect(scene: dict[str, np.ndarray]) -> None:
+    s = scene
+    arguments = (s["means"], s["cam0"], s["depth"], s["alpha"], s["tissue"], s["flow"], s["cam1"],
+                 s["tissue"][::-1].copy(), s["depth"][::-1].copy())  # fmt: skip
+    moved, seen = np.zeros((2, N, 3), np.float32), np.zeros((2, N), np.float32)
+    motion._advect(*arguments, moved[0], seen[0])
+    motion._advect.py_func(*arguments, moved[1], seen[1])
+    assert 100 < seen[0].sum() < N
+    assert np.array_equal(seen[0], seen[1])
+    assert np.allclose(moved[0], moved[1], atol=1e-6)
+
+
+@pytest.mark.parametrize("crowded", [False, True])
+def test_inspect(scene: dict[str, np.ndarray], crowded: bool) -> None:
+    s = scene
+    arguments = (s["means"], s["opacities"], s["colors"], s["cam0"], s["tissue"], s["depth"], crowded)
+    front, remove = np.full((2, N), 2, np.int32), np.zeros((2, N), bool)
+    densify._inspect(*arguments, front[0], remove[0])
+    densify._inspect.py_func(*arguments, front[1], remove[1])
+    assert 100 < remove[0].sum() < N
+    assert np.array_equal(front[0], front[1])
+    assert np.array_equal(remove[0], remove[1])
+
+
+def test_candidates(scene: dict[str, np.ndarray]) -> None:
+    rng = np.random.default_rng(6)
+    planes = rng.random((5, HEIGHT, WIDTH)).astype(np.float32)
+    image = rng.random((HEIGHT, WIDTH, 3)).astype(np.float32)
+    pixels, depths = np.zeros((2, 400, 2), np.int32), np.zeros((2, 400), np.float32)
+    arguments = (planes, image, scene["tissue"], scene["depth"], 1)
+    count = densify._candidates(*arguments, pixels[0], depths[0])
+    assert count == densify._candidates.py_func(*arguments, pixels[1], depths[1]) == 400
+    assert np.array_equal(pixels[0], pixels[1])
+    assert np.array_equal(depths[0], depths[1])
+
+
+def test_optimiser_step(scene: dict[str, np.ndarray]) -> None:
+    r = scene["rows"]
+    contribution = np.abs(r[:, 39]) * (r[:, 38] > -1)
+    v_means = r[:, 20:23].copy()
+    v_means[5::101] = np.inf
+    gradients = (v_means, r[:, 23:27], r[:, 27:30], r[:, 30], r[:, 31:34], contribution)
+    lengths = np.linspace(0.01, 0.02, 11, dtype=np.float32)
+    view_z = np.array([0, 0, 1, 0.1], np.float32)
+    states = []
+    for step in (optimiser._step, optimiser._step.py_func):
+        state = [r[:, 0:3], r[:, 3:7], r[:, 7:10], r[:, 10], np.exp(r[:, 7:10]), 1 / (1 + np.exp(-r[:, 10])),
+                 r[:, 11:14], np.zeros((N, 11)), np.zeros((N, 11))]  # fmt: skip
+        state = [np.ascontiguousarray(array, np.float32) for array in state]
+        step(*state, *(np.ascontiguousarray(g) for g in gradients), lengths, view_z, 500.0,
+             np.array([2.0, 100.0], np.float32))  # fmt: skip
+        states.append(state)
+    assert np.array_equal(states[0][0][5::101], r[5::101, 0:3])  # gradient not finite: left alone
+    assert (states[0][0] != r[:, 0:3]).any(1).mean() > 0.7
+    for compiled, source in zip(*states, strict=True):
+        assert np.allclose(compiled, source, rtol=1e-5, atol=1e-6)
+
+
+def test_skin_and_nearest_nodes(scene: dict[str, np.ndarray]) -> None:
+    s = scene
+    nodes = np.random.default_rng(7).uniform(-0.05, 0.1, (50, 3)).astype(np.float32)
+    points = np.nan_to_num(s["means"])
+    compiled, source = (f(points, nodes) for f in (deformation._nearest, deformation._nearest.py_func))
+    assert np.array_equal(compiled[0], source[0])
+    assert np.allclose(compiled[1], source[1], atol=1e-5)
+    assert np.allclose(compiled[1].sum(1), 1, atol=1e-5)
+    a, b = points.copy(), points.copy()
+    deformation._skin(nodes, s["index"], s["weight"], a)
+    deformation._skin.py_func(nodes, s["index"], s["weight"], b)
+    assert np.allclose(a, b, atol=1e-6)
+
+
+def test_average_at_nodes(scene: dict[str, np.ndarray]) -> None:
+    s = scene
+    values, seen = np.ascontiguousarray(s["rows"][:, :3]), (s["rows"][:, 5] > 0).astype(np.float32)
+    compiled, source = (
+        f(values, seen, s["index"], s["weight"], 60)
+        for f in (deformation._average, deformation._average.py_func)
+    )
+    assert np.allclose(compiled[0], source[0], atol=1e-4)
+    assert np.allclose(compiled[1], source[1], rtol=1e-5)
