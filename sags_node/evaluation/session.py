@@ -72,7 +72,7 @@ def evaluate(
     session = open_session(launch, [*overrides, *forced])
     config = session.config
     warm_up(config)
-    with Spool() as spool:
+    with Spool(config.engine.backend) as spool:
         if pace == "realtime":
             run_realtime(session, options, spool, progress)
         else:

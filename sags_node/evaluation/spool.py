@@ -16,11 +16,12 @@ from typing import Any
 import cv2
 import numpy as np
 
+from sags_node.engine.rasterize import Rasterizer, make_rasterizer, to_view
 from sags_node.errors import SagsError
 from sags_node.node import resident_mb
-from sags_node.types import F32, U8, Bool, Camera, FrameResult, Gaussians, Snapshot
+from sags_node.types import F32, U8, Bool, Camera, FrameResult, Gaussians, RenderedView, Snapshot
 
-_ARRAYS = 13  # in a frame's file
+_ARRAYS = 11  # in a frame's file
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +54,10 @@ class SpooledFrame:
 class Spool:
     """A temporary folder of frames; gone when the `with` block ends, for whatever reason."""
 
-    def __init__(self) -> None:
+    def __init__(self, backend: str = "numba") -> None:
+        """`backend`: the engine that drew, to draw again."""
+        self._backend = backend
+        self._rasterizer: Rasterizer | None = None
         self._folder = tempfile.TemporaryDirectory(prefix="sags-eval-")
         self.folder = Path(self._folder.name)
         self.frame_ids: list[int] = []
@@ -75,12 +79,12 @@ class Spool:
     def add(
         self, result: FrameResult, frame_ms: float, t_shown_ns: int, latency_ms: float | None = None
     ) -> None:
-        """Keep one frame: about 6 MB and 2 to 10 ms at 640x512 with 30,000 Gaussians.
+        """Keep one frame: about 3.5 MB and 1 to 2 ms at 640x512 with 30,000 Gaussians.
 
         Raises:
             SagsError: the disk is full.
         """
-        snapshot, view, seen = result.snapshot, result.views["left"], result.observation
+        snapshot, seen = result.snapshot, result.observation
         gaussians = snapshot.gaussians
         facts = RunFacts(
             t_shown_ns,
@@ -103,8 +107,6 @@ class Spool:
         arrays = (
             snapshot.camera.K,
             snapshot.camera.T_world_cam,
-            cv2.convertScaleAbs(view.rgb, alpha=255),  # rounds and clips at 255
-            view.depth,
             np.packbits(seen.tissue),
             seen.depth,
             gaussians.means,
@@ -123,7 +125,7 @@ class Spool:
         except OSError as error:
             raise SagsError(
                 f"cannot keep frame {snapshot.frame_id} in {self.folder}: {error.strerror}; "
-                "set TMPDIR to a folder with room (about 6 MB per frame) or play fewer frames"
+                "set TMPDIR to a folder with room (about 3.5 MB per frame) or play fewer frames"
             ) from None
         self.frame_ids.append(snapshot.frame_id)
 
@@ -131,11 +133,11 @@ class Spool:
         """The frame that was added as number `place`."""
         with self._file(place).open("rb") as file:
             header: dict[str, Any] = json.loads(file.readline())
-            K, T_world_cam, rgb, depth, tissue, measured_depth, *splats, velocities = (
+            K, T_world_cam, tissue, measured_depth, *splats, velocities = (
                 np.load(file, allow_pickle=False) for _ in range(_ARRAYS)
             )
         facts = RunFacts(**header["facts"])
-        height, width = depth.shape
+        height, width = measured_depth.shape
         snapshot = Snapshot(
             frame_id=header["frame_id"],
             t_capture_ns=header["t_capture_ns"],
@@ -146,15 +148,24 @@ class Spool:
             loss=header["loss"],
             counts=facts.counts,
         )
+        view = self._draw(snapshot)
         return SpooledFrame(
             facts=facts,
             snapshot=snapshot,
             baseline=header["baseline"],
-            rgb=rgb,
-            depth=depth,
-            tissue=np.unpackbits(tissue, count=depth.size).reshape(depth.shape).view(bool),
+            rgb=cv2.convertScaleAbs(view.rgb, alpha=255),  # rounds and clips at 255, as on the wire
+            depth=view.depth,
+            tissue=np.unpackbits(tissue, count=width * height).reshape(height, width).view(bool),
             measured_depth=measured_depth,
         )
+
+    def _draw(self, snapshot: Snapshot) -> RenderedView:
+        """What was shown: drawing depends on nothing but the snapshot, so it need not be kept."""
+        camera = snapshot.camera
+        if self._rasterizer is None:
+            self._rasterizer = make_rasterizer(self._backend, camera.width, camera.height)
+        planes = self._rasterizer.forward(snapshot.gaussians, camera)
+        return to_view(planes, camera, snapshot.frame_id, snapshot.t_capture_ns)
 
     def _file(self, place: int) -> Path:
         return self.folder / f"{place:06d}.frame"

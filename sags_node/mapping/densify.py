@@ -123,4 +123,4 @@ def _is_doomed(
     measured = depth[py, px]
     if tissue[py, px] and measured > 0:
         in_front[i] = in_front[i] + 1 if measured - z > FRONT_TOLERANCE * measured else 0
-    return in_front[i] >= FRONT_FRAMES
+    return bool(in_front[i] >= FRONT_FRAMES)
