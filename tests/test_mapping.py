@@ -83,6 +83,18 @@ def test_hidden_and_covered_gaussians_are_not_seen() -> None:
     assert not seen.any()
 
 
+def test_the_motion_of_an_instrument_is_not_taken_for_that_of_the_tissue_beside_it() -> None:
+    """Flow near a mask's edge belongs to the instrument: those Gaussians follow their nodes instead."""
+    flow = np.zeros((HEIGHT, WIDTH, 2), np.float32)
+    flow[:, :32] = 5.0
+    tissue = np.ones((HEIGHT, WIDTH), bool)
+    tissue[:, :31] = False
+    means = grid_points()
+    moved, seen = scene_flow(means, view(), tissue, flow, observation())
+    assert 0 < seen.sum() < len(means) / 2
+    assert np.allclose(moved[seen > 0], 0, atol=1e-7)
+
+
 def test_candidates_fill_holes_first() -> None:
     frame = observation()
     planes = np.zeros((5, HEIGHT, WIDTH), np.float32)

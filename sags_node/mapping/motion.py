@@ -15,6 +15,7 @@ from sags_node.types import F32, U8, Bool, Observation, RenderedView
 DEPTH_GATE = 0.13  # of the depth: a larger innovation is another surface, not this one
 BEHIND_TOLERANCE = 0.035  # of the depth: a Gaussian this far behind the drawn surface is hidden by it
 SEEN_ALPHA = 0.3
+FLOW_MARGIN = 20 / 640  # of the width: flow smears an instrument's motion that far into the tissue
 DEPTH_PULL = 0.4  # share of the depth innovation taken per frame; measured best 0.3-0.5
 
 
@@ -47,9 +48,13 @@ def scene_flow(
     """
     displacements = np.zeros_like(means)
     seen = np.zeros(len(means), np.float32)
+    margin = 2 * round(FLOW_MARGIN * flow.shape[1]) + 1
+    kernel_size = np.ones((margin, margin), np.uint8)
+    clear_before = cv2.erode(tissue_before.view(np.uint8), kernel_size).view(np.bool_)
+    clear_after = cv2.erode(after.tissue.view(np.uint8), kernel_size).view(np.bool_)
     _advect(
-        means, pack(before.camera), before.depth, before.alpha, tissue_before, flow,
-        pack(after.camera), after.tissue, after.depth, displacements, seen,
+        means, pack(before.camera), before.depth, before.alpha, clear_before, flow,
+        pack(after.camera), clear_after, after.depth, displacements, seen,
     )  # fmt: skip
     return displacements, seen
 
