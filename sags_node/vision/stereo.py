@@ -72,6 +72,9 @@ class StereoDepth:
         known &= (disparity >= self._smallest) & (disparity <= self._largest)
         known &= (disparity <= self._columns) & (agreement > LEAST_AGREEMENT)
         _forget_hidden(disparity, known)
+        some = disparity[::4, ::4][known[::4, ::4]]
+        if some.size:  # the strip that the right eye does not see: a match is found there, never a true one
+            known &= self._columns >= np.median(some)
         confidence = np.where(known, (agreement - LEAST_AGREEMENT) / (1 - LEAST_AGREEMENT), np.float32(0))
 
         depth, confidence = self._enlarge(disparity, known, confidence, tissue.shape[1::-1])
@@ -121,8 +124,7 @@ class StereoDepth:
 def _forget_hidden(disparity: F32, known: Bool) -> None:
     """Clear `known` where the right eye's pixel is taken by a nearer surface: the match must be wrong.
 
-    This is what is left of the left-right check when only the left picture is matched. It catches the strip
-    that the right eye does not see, where a match is always found and never true.
+    This is what is left of the left-right check when only the left picture is matched.
     """
     height, width = disparity.shape
     for y in range(height):
