@@ -1,28 +1,36 @@
-"""The `sags` command. Exit codes: 0 ok, 1 failure, 2 usage, 3 data lost."""
+"""The `sags` command. Exit codes: 0 ok, 1 failure, 2 usage, 3 data lost, 130 stopped with Ctrl-C."""
 
 from __future__ import annotations
 
 import json
 import logging
+import os
 import signal
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import click
 from rich.console import Console
 from rich.logging import RichHandler
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from sags_node import __version__
+from sags_node.apps import text
 from sags_node.errors import SagsError, UsageError
 
-# People read stderr, machines read stdout.
-console = Console(stderr=True)
+if TYPE_CHECKING:
+    from sags_node.session import Session
+
+# Results go to stdout; what is going on, and errors, to stderr.
+console = Console(stderr=True, highlight=False)
+
+positive = click.FloatRange(min=0, min_open=True)
 
 as_json = click.option("--json", "json_out", is_flag=True, help="Print JSON on stdout, for machines.")
 endpoint_option = click.option(
@@ -38,7 +46,7 @@ class Sags(click.Group):
         try:
             return super().invoke(ctx)
         except SagsError as error:
-            console.print(f"[red]error:[/] {error}", highlight=False, soft_wrap=True)
+            console.print(f"[red]error:[/] {escape(str(error))}", soft_wrap=True)
             ctx.exit(error.exit_code)
         except KeyboardInterrupt:
             console.print("stopped")

@@ -24,6 +24,7 @@ from sags_node.session import Session
 from sags_node.types import FrameResult
 
 OVERLAY_GRACE = 15.0  # s for the overlay to write its video after the node has ended
+OVERLAY_STOP = 2.0  # s to do so when the demo is interrupted
 _OPTIONS = Options(hold_out=0)
 
 
@@ -61,9 +62,12 @@ def run_demo(session: Session, out: Path, progress: Callable[[int, int | None, s
             node.start()
             while not node.wait(0.25):
                 progress(len(spool), frames, "playing")
+        except BaseException:
+            _end(overlay)
+            raise
         finally:
             node.stop()
-            consumed = _finish_overlay(overlay)
+        consumed = _finish_overlay(overlay)
         outcome = measure(
             "demo", session, spool, _OPTIONS, progress=lambda what, done: progress(done, frames, what)
         )
@@ -79,11 +83,22 @@ def _start_overlay(config: LaunchConfig, endpoint: str, seconds: float, video: P
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
+def _end(overlay: subprocess.Popen[str]) -> None:
+    """Let it close its video, but do not wait until it has played to its end."""
+    overlay.terminate()
+    try:
+        overlay.communicate(timeout=OVERLAY_STOP)
+    except subprocess.TimeoutExpired:
+        overlay.kill()
+        overlay.communicate()
+
+
 def _finish_overlay(overlay: subprocess.Popen[str]) -> dict[str, Any]:
     try:
         stdout, stderr = overlay.communicate(timeout=OVERLAY_GRACE)
     except subprocess.TimeoutExpired:
         overlay.kill()
+        overlay.communicate()
         raise SagsError("the overlay subscriber did not end; see `sags overlay --help`") from None
     if overlay.returncode != 0:
         raise SagsError(f"the overlay subscriber failed: {stderr.strip()}")

@@ -13,7 +13,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
-from sags_node.config import LaunchConfig
+from sags_node.config import LaunchConfig, PublishConfig
+from sags_node.errors import UsageError
+from sags_node.messaging.publisher import check_endpoint
 
 Level = Literal["ok", "warning", "error"]
 REQUIRED = (
@@ -45,7 +47,7 @@ def examine(config: LaunchConfig) -> list[Check]:
         *(_library(name, package) for name, package in OPEN3D_LIBRARIES.items()),
         _cores(),
         _kernel_cache(),
-        *(_port(endpoint) for endpoint in (*config.publish.data, config.publish.control) if endpoint),
+        *_ports(config.publish),
         _cameras(),
         _recordings(),
     ]
@@ -94,19 +96,27 @@ def _kernel_cache() -> Check:
         )
 
 
-def _port(endpoint: str) -> Check:
+def _ports(config: PublishConfig) -> list[Check]:
+    endpoints = [endpoint for endpoint in (*config.data, config.control) if endpoint]
+    return [_port(endpoint, config.insecure) for endpoint in endpoints]
+
+
+def _port(endpoint: str, insecure: bool) -> Check:
+    try:
+        check_endpoint(endpoint, insecure)
+    except UsageError as error:
+        return Check(endpoint, "error", "cannot be used", str(error))
     host, _, port = endpoint.removeprefix("tcp://").rpartition(":")
-    if not endpoint.startswith("tcp://") or not port.isdigit():
-        return Check(endpoint, "ok", "not a TCP endpoint")
+    if endpoint.startswith("ipc:") or port == "*":
+        return Check(endpoint, "ok", "needs no port of its own")
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            probe.bind((host, int(port)))
+            probe.bind((host.replace("*", ""), int(port)))
             return Check(endpoint, "ok", "free")
-        except OSError as error:
-            return Check(
-                endpoint, "warning", error.strerror or "in use", "stop the other node or bind elsewhere"
-            )
+        except (OSError, ValueError, OverflowError) as error:  # taken, not a number, not a port
+            mend = "stop the other node, or set publish.data and publish.control to other ports"
+            return Check(endpoint, "warning", str(error), mend)
 
 
 def _cameras() -> Check:
@@ -117,7 +127,10 @@ def _cameras() -> Check:
 
 
 def _recordings() -> Check:
-    folder = Path(os.environ.get("SAGS_DATA", ""))
-    if "SAGS_DATA" in os.environ and folder.is_dir():
-        return Check("SAGS_DATA", "ok", str(folder))
-    return Check("SAGS_DATA", "ok", "not set: launch files look in ../shared/data beside the checkout")
+    folder = os.environ.get("SAGS_DATA")
+    if folder is None:
+        return Check("SAGS_DATA", "ok", "not set: launch files look in ../shared/data beside the checkout")
+    if Path(folder).is_dir():
+        return Check("SAGS_DATA", "ok", folder)
+    mend = "set it to the folder of your recordings; without any, sags run plays the phantom"
+    return Check("SAGS_DATA", "warning", f"{folder} is no folder", mend)

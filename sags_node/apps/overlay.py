@@ -34,6 +34,7 @@ NEEDED = ("left/render/depth", "left/tissue_mask", "left/camera_info", "tf", "sp
 WAIT_FOR_FRAME = 0.2  # s for a picture
 WAIT_FOR_REST = 0.05  # s for what belongs to the picture
 NORMAL_MEMORY = 0.8  # of the last normal; the depth of one frame is noisy
+PATIENCE = 5.0  # s for the very first picture
 PICTURES_BEFORE_VIDEO = 5  # the frame rate must be known before a video file is opened
 
 
@@ -137,11 +138,11 @@ def run_overlay(
     Returns:
         frames, overlay (frames with it), blanked (reason -> frames), latency_ms (capture to drawn), pin
         (pixel, how often it was pinned, how far it moved and the 90th percentile of its steps, mm), lost
-        (messages), saved.
+        (messages), saved (the file; None when too little was shown to write one).
 
     Raises:
-        UsageError: an unknown shape or kind of file.
-        SagsError: no node is known, no picture came, or the file cannot be written.
+        UsageError: an unknown shape or kind of file, or a pin outside the picture.
+        SagsError: no node is known, no picture came within `PATIENCE`, or the file cannot be written.
     """
     if shape not in overlay_draw.SHAPES:
         raise UsageError(f"unknown shape '{shape}'; shapes: {', '.join(overlay_draw.SHAPES)}")
@@ -149,14 +150,18 @@ def run_overlay(
     overlay = PinnedOverlay(pin, shape)
     blanked: Counter[str] = Counter()
     latencies_ms: list[float] = []
-    deadline = None if seconds is None else time.monotonic() + seconds
+    began = time.monotonic()
     last: Received | None = None
     with Subscriber([PICTURE, *NEEDED], endpoint, ns, run_dir) as subscriber:
         try:
-            while deadline is None or time.monotonic() < deadline:
+            while seconds is None or time.monotonic() < began + seconds:
                 received = subscriber.wait(PICTURE, WAIT_FOR_FRAME, after=last)
                 if not isinstance(received, ReceivedImage):
+                    if last is None and time.monotonic() > began + PATIENCE:
+                        break
                     continue
+                if last is None:
+                    _check_pin(pin, received)
                 last = received
                 picture, reason = _overlaid(subscriber, overlay, received)
                 latencies_ms.append(1000 * received.age())
@@ -179,8 +184,14 @@ def run_overlay(
         "latency_ms": {f"p{q}": float(np.percentile(latencies_ms, q)) for q in (50, 90, 99)},
         "pin": _wander(overlay),
         "lost": lost,
-        "saved": None if save is None else str(save),
+        "saved": output.saved,
     }
+
+
+def _check_pin(pin: tuple[float, float] | None, picture: ReceivedImage) -> None:
+    height, width = picture.array.shape[:2]
+    if pin is not None and not (0 <= pin[0] < width and 0 <= pin[1] < height):
+        raise UsageError(f"pin {pin[0]:g} {pin[1]:g} lies outside the picture of {width}x{height} px")
 
 
 def _overlaid(
@@ -244,6 +255,7 @@ class _Output:
         self._still: U8 | None = None
         self._video: Any = None
         self._shown = 0
+        self.saved: str | None = None  # what has been written
 
     def add(self, picture: U8, with_overlay: bool, period: float) -> None:
         self._shown += 1
@@ -266,7 +278,8 @@ class _Output:
     def close(self) -> None:
         if self._video is not None:
             self._video.release()
-        if self._still is not None and not cv2.imwrite(
-            str(self._file), cv2.cvtColor(self._still, cv2.COLOR_RGB2BGR)
-        ):
-            raise SagsError(f"cannot write {self._file}; check the folder's rights and the disk")
+            self.saved = str(self._file)
+        if self._still is not None:
+            if not cv2.imwrite(str(self._file), cv2.cvtColor(self._still, cv2.COLOR_RGB2BGR)):
+                raise SagsError(f"cannot write {self._file}; check the folder's rights and the disk")
+            self.saved = str(self._file)

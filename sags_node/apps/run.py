@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
+from sags_node.apps import text
 from sags_node.node import Node
 from sags_node.types import NodeHealth
 
@@ -24,8 +25,11 @@ def run_node(node: Node, seconds: float | None, console: Console) -> NodeHealth:
     deadline = None if seconds is None else time.monotonic() + seconds
     node.start()
     try:
-        with Live(console=console, refresh_per_second=REFRESH, transient=True) as live:
-            _watch(node, deadline, lambda: live.update(health_table(node.health())))
+        if console.is_terminal:
+            with Live(console=console, refresh_per_second=REFRESH, transient=True) as live:
+                _watch(node, deadline, lambda: live.update(health_table(node.health())))
+        else:
+            _watch(node, deadline, lambda: None)
     except KeyboardInterrupt:
         console.print("stopping")
     finally:
@@ -43,7 +47,7 @@ def _watch(node: Node, deadline: float | None, show: Callable[[], None]) -> None
 
 def health_table(health: NodeHealth) -> Table:
     """One screen of what a person wants to know."""
-    table = Table(show_header=False, box=None, padding=(0, 2))
+    table = text.table()
     latency = health.latency_ms
     table.add_row("state", health.state)
     table.add_row("published", f"{health.rate_hz:.1f} Hz")

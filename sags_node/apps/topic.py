@@ -6,8 +6,9 @@ Each function gives plain dictionaries that JSON can hold.
 from __future__ import annotations
 
 import dataclasses
+import time
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import msgspec
@@ -29,6 +30,8 @@ from sags_node.messaging.stream import data_endpoint, listen
 
 Record = dict[str, Any]
 
+PATIENCE = 5.0  # s that `topic_echo` waits for the first message
+
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class _Sample:
@@ -37,25 +40,26 @@ class _Sample:
     size: int  # bytes
 
 
-def topic_list(endpoint: str | None = None, ns: str = "sags", seconds: float = 2.0) -> list[Record]:
-    """Every topic of the contract with the rate and the size heard in `seconds`; 0 where nothing came.
+def topic_list(endpoint: str | None = None, ns: str = "sags", seconds: float = 3.0) -> list[Record]:
+    """Every topic of the contract with what was heard of it in `seconds`.
+
+    `messages` and `mean_bytes` are 0 where nothing came; `rate_hz` is None where too little came to tell.
 
     Raises:
         SagsError: no node is known, or nothing at all came.
     """
-    heard: dict[str, list[int]] = defaultdict(list)
-    for arrived in listen([], endpoint, ns, seconds):
-        if arrived is not None:
-            heard[arrived[0].topic].append(_size(arrived[0]))
+    heard = _heard([], endpoint, ns, seconds)
     if not heard:
-        raise _silence(f"{ns}/*", endpoint, ns, seconds)
+        raise _silence("*", endpoint, ns, seconds)
     rows = []
     for topic in topics.TOPICS:
         full = topics.full_name(ns, topic.name)
-        sizes = heard[full]
-        mean_size = sum(sizes) / len(sizes) if sizes else 0.0
-        row: Record = {"topic": full, "type": topic.type, "messages": len(sizes)}
-        rows.append({**row, "rate_hz": round(len(sizes) / seconds, 1), "mean_bytes": round(mean_size)})
+        samples = heard.get(full, [])
+        mean_size = sum(sample.size for sample in samples) / len(samples) if samples else 0.0
+        steps = np.diff([sample.arrival_ns for sample in _without_resent(topic.name, samples)]) * 1e-9
+        row: Record = {"topic": full, "type": topic.type, "messages": len(samples)}
+        row["rate_hz"] = round(float(1 / steps.mean()), 1) if len(steps) else None
+        rows.append({**row, "mean_bytes": round(mean_size)})
     return rows
 
 
@@ -70,19 +74,22 @@ def topic_echo(
 
     Raises:
         UsageError: there is no such topic.
-        SagsError: no node is known, or nothing came within `seconds`.
+        SagsError: no node is known, or nothing came within `seconds` or `PATIENCE`.
     """
     shown = 0
+    began = time.monotonic()
     for arrived in listen([topic], endpoint, ns, seconds):
         if arrived is None:
+            if not shown and time.monotonic() - began > PATIENCE:
+                raise _silence(topic, endpoint, ns, PATIENCE)
             continue
         message, arrival_ns = arrived
         yield _echo(interpret(message, arrival_ns))
         shown += 1
         if shown == count:
             return
-    if not shown:
-        raise _silence(topics.full_name(ns, topic), endpoint, ns, seconds)
+    if not shown and seconds is not None:
+        raise _silence(topic, endpoint, ns, seconds)
 
 
 def topic_hz(topic: str, endpoint: str | None = None, ns: str = "sags", seconds: float = 5.0) -> Record:
@@ -141,26 +148,48 @@ def topic_delay(topic: str, endpoint: str | None = None, ns: str = "sags", secon
 
 
 def _listen_to(topic: str, endpoint: str | None, ns: str, seconds: float) -> list[_Sample]:
-    """What came on one topic, each message once: a last value may be sent again for another peer."""
-    samples: dict[tuple[str, int], _Sample] = {}
-    for arrived in listen([topic], endpoint, ns, seconds):
+    """At least two messages of one topic."""
+    heard = _heard([topic], endpoint, ns, seconds)
+    if not heard:
+        raise _silence(topic, endpoint, ns, seconds)
+    ((full, samples),) = heard.items()
+    fresh = _without_resent(full.removeprefix(f"{ns}/"), samples)
+    if len(fresh) < 2:
+        raise SagsError(
+            f"too few messages came on {full} in {seconds:g} s to measure; set --seconds to listen longer"
+        )
+    return fresh
+
+
+def _heard(
+    names: Sequence[str], endpoint: str | None, ns: str, seconds: float
+) -> dict[str, list[_Sample]]:
+    """What came on some topics, each message once: a last value may be sent again for another peer."""
+    heard: dict[str, dict[tuple[str, int], _Sample]] = defaultdict(dict)
+    for arrived in listen(names, endpoint, ns, seconds):
         if arrived is not None:
             message, arrival_ns = arrived
             key = (message.meta.session, message.meta.seq)
-            samples.setdefault(key, _Sample(arrival_ns, message.meta.stamp_ns, _size(message)))
-    if len(samples) < 2:
-        raise _silence(topics.full_name(ns, topic), endpoint, ns, seconds)
-    return list(samples.values())
+            sample = _Sample(arrival_ns, message.meta.stamp_ns, _size(message))
+            heard[message.topic].setdefault(key, sample)
+    return {topic: list(samples.values()) for topic, samples in heard.items()}
+
+
+def _without_resent(name: str, samples: list[_Sample]) -> list[_Sample]:
+    """The last value that a cached topic sends again to a new subscriber says nothing of its rate."""
+    return samples[1:] if topics.BY_NAME[name].cached else samples
 
 
 def _size(message: wire.Message) -> int:
     return sum(memoryview(part).nbytes for part in message.parts)
 
 
-def _silence(full: str, endpoint: str | None, ns: str, seconds: float | None) -> SagsError:
-    where = data_endpoint(endpoint, ns)
-    during = "" if seconds is None else f" in {seconds:g} s"
-    return SagsError(f"no messages on {full} from {where}{during}; is the node running and not waiting?")
+def _silence(topic: str, endpoint: str | None, ns: str, seconds: float) -> SagsError:
+    full = topics.full_name(ns, topic.lstrip("/").removeprefix(f"{ns}/"))
+    hint = "is the node running and not waiting?"
+    if "/right/" in full:
+        hint += " The right eye needs publish.right:=true"
+    return SagsError(f"no messages on {full} from {data_endpoint(endpoint, ns)} in {seconds:g} s; {hint}")
 
 
 def _echo(received: Received) -> Record:
@@ -190,7 +219,12 @@ def _content(received: Received) -> Any:
         except (msgspec.MsgspecError, RecursionError):
             return received.text
     assert isinstance(received, ReceivedRos)
-    return dataclasses.asdict(received.message)
+    return dataclasses.asdict(received.message, dict_factory=_fields)
+
+
+def _fields(pairs: list[tuple[str, Any]]) -> Record:
+    """Without a message's type and constants: the fields of ROS messages are in lower case."""
+    return {key: value for key, value in pairs if key[0].islower()}
 
 
 def _range(array: NDArray[Any]) -> Record:

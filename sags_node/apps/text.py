@@ -1,0 +1,108 @@
+"""What `sags topic` and `sags overlay` found, for people. Programs get the same records as JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import yaml
+from rich.table import Table
+
+Record = Mapping[str, Any]
+
+
+def table(*headings: str) -> Table:
+    """An empty table without lines, flush with the left margin."""
+    made = Table(box=None, padding=(0, 3, 0, 0), pad_edge=False, show_header=bool(headings))
+    for heading in headings:
+        made.add_column(heading)
+    return made
+
+
+def rows_table(rows: Sequence[Record]) -> Table:
+    """Records that share their keys, which become the headings."""
+    made = table(*(rows[0] if rows else ()))
+    for row in rows:
+        made.add_row(*(str(value) for value in row.values()))
+    return made
+
+
+def topics_table(rows: Sequence[Record]) -> Table:
+    """Of `topic_list`; a dash where nothing was heard, or too little to tell a rate."""
+    made = table("topic", "type")
+    made.add_column("rate", justify="right")
+    made.add_column("message", justify="right")
+    for row in rows:
+        rate = "–" if row["rate_hz"] is None else f"{row['rate_hz']:.1f} Hz"
+        message = byte_text(row["mean_bytes"]) if row["messages"] else "–"
+        made.add_row(row["topic"], row["type"], rate, message)
+    return made
+
+
+def hz_text(figures: Record) -> str:
+    return f"average rate: {figures['average_rate']:.3f} Hz\n  {_spread(figures)}"
+
+
+def delay_text(figures: Record) -> str:
+    return f"average delay: {_ms(figures['average_delay_s'])}\n  {_spread(figures)}"
+
+
+def bw_text(figures: Record) -> str:
+    mean, smallest, largest = (byte_text(figures[f"{which}_bytes"]) for which in ("mean", "min", "max"))
+    return (
+        f"{byte_text(figures['bytes_per_s'])}/s from {figures['window']} messages\n"
+        f"  message size mean: {mean}  min: {smallest}  max: {largest}"
+    )
+
+
+def echo_text(record: Record) -> str:
+    """One message as YAML, ended by a line of dashes."""
+    return yaml.safe_dump(_short(record), sort_keys=False, default_flow_style=None, width=100) + "---"
+
+
+def overlay_table(summary: Record) -> Table:
+    made = table()
+    latency, pin = summary["latency_ms"], summary["pin"]
+    made.add_row("pictures", f"{summary['frames']}, {summary['overlay']} with the overlay")
+    for reason, count in summary["blanked"].items():
+        made.add_row("", f"{count} without: {reason}")
+    made.add_row("latency", "  ".join(f"{name} {value:.0f} ms" for name, value in latency.items()))
+    if pin["pixel"] is not None:
+        made.add_row("pinned at", f"pixel {pin['pixel'][0]} {pin['pixel'][1]}, {pin['pinned']} times")
+    if pin["step_mm_p90"] is not None:
+        moved = f"up to {pin['moved_mm']:.1f} mm, p90 of a step {pin['step_mm_p90']:.2f} mm"
+        made.add_row("moved", moved)
+    made.add_row("lost", f"{summary['lost']} messages")
+    if summary["saved"] is not None:
+        made.add_row("saved", summary["saved"])
+    return made
+
+
+def byte_text(count: float) -> str:
+    """Bytes in decimal units, three digits: 328 kB."""
+    for unit in ("B", "kB", "MB"):
+        if count < 999.5:
+            return f"{count:.3g} {unit}"
+        count /= 1000
+    return f"{count:.3g} GB"
+
+
+def _spread(figures: Record) -> str:
+    spread = "  ".join(f"{name}: {_ms(figures[f'{key}_s'])}" for key, name in _SPREAD.items())
+    return f"{spread}  window: {figures['window']} messages"
+
+
+_SPREAD = {"min": "min", "max": "max", "std_dev": "std dev"}
+
+
+def _ms(seconds: float) -> str:
+    return f"{1000 * seconds:.1f} ms"
+
+
+def _short(value: Any) -> Any:
+    """The same with six significant digits."""
+    if isinstance(value, Mapping):
+        return {key: _short(part) for key, part in value.items()}
+    if isinstance(value, list):
+        return [_short(part) for part in value]
+    return float(f"{value:.6g}") if isinstance(value, float) else value
