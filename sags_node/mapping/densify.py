@@ -49,14 +49,10 @@ def doomed(model: GaussianModel, observation: Observation) -> Bool:
     when N nears its cap. Counts the frames in free space (`in_front`)."""
     remove = np.zeros(model.count, np.bool_)
     _inspect(
-        model.means, model.opacities, model.colors, model.contribution, pack(observation.camera), observation.tissue,
+        model.means, model.opacities, model.colors, pack(observation.camera), observation.tissue,
         observation.depth, model.count > CROWDED * model.capacity, model.in_front, remove,
     )  # fmt: skip
     return remove
-
-
-import os
-NC = float(os.environ.get('NC','0.01')); NF = int(os.environ.get('NF','10'))
 
 
 @kernel
@@ -99,16 +95,16 @@ def _candidates(
 
 @parallel_kernel
 def _inspect(
-    means: F32, opacities: F32, colors: F32, contribution: F32, cam: F32, tissue: Bool, depth: F32, crowded: bool,
+    means: F32, opacities: F32, colors: F32, cam: F32, tissue: Bool, depth: F32, crowded: bool,
     in_front: I32, remove: Bool,
 ) -> None:  # fmt: skip
     for i in prange(len(means)):
-        remove[i] = _is_doomed(means[i], opacities[i], colors[i], contribution[i], cam, tissue, depth, crowded, in_front, i)
+        remove[i] = _is_doomed(means[i], opacities[i], colors[i], cam, tissue, depth, crowded, in_front, i)
 
 
 @kernel
 def _is_doomed(
-    mean: F32, opacity: Any, color: F32, contribution: Any, cam: F32, tissue: Bool, depth: F32, crowded: bool,
+    mean: F32, opacity: Any, color: F32, cam: F32, tissue: Bool, depth: F32, crowded: bool,
     in_front: I32, i: int,
 ) -> bool:  # fmt: skip
     height, width = tissue.shape
@@ -126,10 +122,5 @@ def _is_doomed(
     px, py = int(u + 0.5), int(v + 0.5)
     measured = depth[py, px]
     if tissue[py, px] and measured > 0:
-        if measured - z > FRONT_TOLERANCE * measured:
-            in_front[i] = (in_front[i] & 255) + 1
-        elif abs(measured - z) < FRONT_TOLERANCE * measured and contribution < NC:
-            in_front[i] = (in_front[i] & ~255) + 256
-        else:
-            in_front[i] = 0
-    return bool((in_front[i] & 255) >= FRONT_FRAMES or (in_front[i] >> 8) >= NF)
+        in_front[i] = in_front[i] + 1 if measured - z > FRONT_TOLERANCE * measured else 0
+    return bool(in_front[i] >= FRONT_FRAMES)

@@ -142,6 +142,5 @@ class Mapper:
         self._deformation.descend(
             self.model, gradients.means, gradients.contribution, NODE_STEP_PX * self._metres_per_px
         )
-        self.model.contribution[:] = gradients.contribution
         self._optimiser.step(self.model, gradients, observation.camera, rates)
         self.step += 1
