@@ -1,34 +1,27 @@
-"""The `sags` command. Exit codes: 0 ok, 1 failure, 2 usage, 3 data lost, 130 stopped with Ctrl-C."""
+"""The `sags` command. Exit codes: 0 ok, 1 failure, 2 usage, 130 stopped with Ctrl-C."""
 
 from __future__ import annotations
 
 import json
 import logging
-import os
 import signal
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import click
-from rich.console import Console
 from rich.logging import RichHandler
 from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from rich.table import Table
 
 from sags_node import __version__
 from sags_node.apps import text
+from sags_node.apps.terminal import check_file, check_folder, console, progress, show, writing
 from sags_node.errors import SagsError, UsageError
 
 if TYPE_CHECKING:
     from sags_node.session import Session
-
-# Results go to stdout; what is going on, and errors, to stderr.
-console = Console(stderr=True, highlight=False)
 
 positive = click.FloatRange(min=0, min_open=True)
 
@@ -76,10 +69,10 @@ def main(verbose: bool) -> None:
 
 @main.command()
 @click.argument("launch", nargs=-1, metavar="[LAUNCH.yaml | SESSION] [key:=value ...]")
-@click.option("--seconds", type=float, help="Stop after so long; default: when the source ends or Ctrl-C.")
+@click.option("--seconds", type=positive, help="Stop after so long; default: when the source ends or Ctrl-C.")
 @as_json
 def run(launch: tuple[str, ...], seconds: float | None, json_out: bool) -> None:
-    """Run the node: map the source and publish the results until it ends.
+    """Run the node: map the source and publish until it ends.
 
     Without a launch file the built-in phantom session plays in a loop.
 
@@ -88,53 +81,60 @@ def run(launch: tuple[str, ...], seconds: float | None, json_out: bool) -> None:
     sags run launch/v4l2.yaml source.left:=/dev/video-left mapping.budget_ms:=25
     """
     from sags_node.apps.run import health_table, run_node
+    from sags_node.config import PhantomSource, load_launch
     from sags_node.node import Node
 
     path, overrides = _split(launch)
-    if path is None:
+    if path is None and isinstance(load_launch(None, overrides).source, PhantomSource):
         overrides = ["source.loop:=true", *overrides]
     session = _open(path, overrides)
     node = Node(session.config, session.rig, session.source)
-    console.print(
-        f"publishing on {', '.join(node.endpoints)} as [bold]{session.config.ns}/...[/]  (Ctrl-C ends)"
-    )
+    where = escape(", ".join(node.endpoints))
+    console.print(f"publishing on {where} as [bold]{session.config.ns}/...[/]  (Ctrl-C ends)", soft_wrap=True)
     health = run_node(node, seconds, console)
-    if json_out:
-        click.echo(json.dumps(asdict(health)))
-    else:
-        console.print(health_table(health))
+    show(asdict(health) if json_out else health_table(health))
 
 
 @main.command()
 @click.argument("launch", nargs=-1, metavar="[LAUNCH.yaml | SESSION] [key:=value ...]")
-@click.option("--seconds", type=float, default=10.0, show_default=True, help="How long it plays.")
-@click.option("--out", type=click.Path(path_type=Path), default=Path("out/demo"), show_default=True)
+@click.option("--seconds", type=positive, default=10.0, show_default=True, help="How long it plays.")
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    default=Path("out/demo"),
+    show_default=True,
+    help="Folder for report.html, sheet.png and overlay.mp4; older ones are replaced.",
+)
 @as_json
 def demo(launch: tuple[str, ...], seconds: float, out: Path, json_out: bool) -> None:
-    """Play a session live beside an overlay subscriber, and leave a report.
+    """Play a session live beside an overlay subscriber; leave a report.
 
     The node publishes over real sockets; `sags overlay` runs as its own process and consumes. The report
     shows input, render, depth and error side by side and figures over time. Default: the built-in phantom.
     """
     from sags_node.apps.demo import run_demo
+    from sags_node.config import V4l2Source, load_launch
+    from sags_node.session import open_session
 
     path, overrides = _split(launch)
+    if isinstance(load_launch(path, overrides).source, V4l2Source):
+        raise UsageError("sags demo plays recordings; for cameras use sags run and sags overlay")
+    check_folder(out)
+    with _open(path, overrides).source as source:
+        frames = max(1, round(source.rate * seconds))
     # Its own sockets and run directory, so that a demo does not meet a node that is already running.
     with tempfile.TemporaryDirectory(prefix="sags-demo-") as private:
-        forced = ["source.loop:=true", "source.pace:=realtime", f"source.frames:={round(30 * seconds)}"]
+        forced = ["source.loop:=true", "source.pace:=realtime", f"source.frames:={frames}"]
         forced += [
             "publish.data:=[tcp://127.0.0.1:*]",
             "publish.control:=null",
             f"publish.run_dir:={private}",
         ]
-        session = _open(path, [*forced, *overrides])
-        with _progress("playing") as show:
-            outcome = run_demo(session, out, show)
-    if json_out:
-        click.echo(json.dumps(outcome.summary))
-        return
-    console.print(outcome.table)
-    console.print(f"report: [bold]{outcome.report}[/], overlay video beside it")
+        session = open_session(path, [*forced, *overrides])
+        with progress("playing") as advance:
+            outcome = run_demo(session, out, advance)
+    show(outcome.summary if json_out else outcome.table)
+    console.print(f"report: [bold]{escape(str(outcome.report))}[/], overlay video beside it", soft_wrap=True)
 
 
 @main.command("eval")
@@ -146,11 +146,23 @@ def demo(launch: tuple[str, ...], seconds: float, out: Path, json_out: bool) -> 
     show_default=True,
     help="realtime: the recording's clock, late frames are dropped; step: every frame, no threads.",
 )
-@click.option("--iterations", type=int, help="Fixed steps per frame: reproducible with --pace step.")
 @click.option(
-    "--hold-out", type=int, default=8, show_default=True, help="Leave out every so manieth frame; 0: none."
+    "--iterations", type=click.IntRange(0), help="Fixed steps per frame: reproducible with --pace step."
 )
-@click.option("--every", type=int, default=5, show_default=True, help="Right eye and LPIPS on every so many.")
+@click.option(
+    "--hold-out",
+    type=click.IntRange(0),
+    default=8,
+    show_default=True,
+    help="Leave out every so manieth frame; 0: none.",
+)
+@click.option(
+    "--every",
+    type=click.IntRange(1),
+    default=5,
+    show_default=True,
+    help="Right eye and LPIPS on every so manieth frame.",
+)
 @click.option("--lpips-weights", type=click.Path(path_type=Path), help="npz of LPIPS SqueezeNet weights.")
 @click.option("--paper-psnr", is_flag=True, help="Also PSNR with masked pixels counted as perfect.")
 @click.option("--report", type=click.Path(path_type=Path), help="Folder for an HTML report.")
@@ -166,7 +178,9 @@ def evaluate(
     report: Path | None,
     json_out: str | None,
 ) -> None:
-    """Measure a recorded session: run time against error, played through the node's own pipeline.
+    """Measure a recorded session: run time against error.
+
+    It is played through the node's own pipeline, then read once more and compared with what was shown.
 
     \b
     sags eval launch/d4d_pull.yaml --json out.json
@@ -179,24 +193,31 @@ def evaluate(
 
     path, overrides = _split(session)
     options = Options(hold_out, every, lpips_weights, paper_psnr)
-    with _progress("measuring") as show:
+    # A long run must not end with nowhere to put its figures.
+    if report is not None:
+        check_folder(report)
+    if json_out is not None and json_out != "-":
+        check_file(Path(json_out))
+    with progress("measuring") as advance:
         outcome = measure(
             path,
             overrides,
             options,
             cast(Pace, pace),
             iterations,
-            lambda what, frames: show(frames, None, what),
+            lambda what, frames: advance(frames, None, what),
         )
     if report is not None:
-        page = write_report(report, outcome.summary, outcome.rows, outcome.pictures)
-        console.print(f"report: [bold]{page}[/]")
-    if json_out == "-":
-        click.echo(json.dumps(outcome.summary, indent=1))
-    elif json_out is not None:
-        _write(Path(json_out), json.dumps(outcome.summary, indent=1) + "\n")
+        with writing(report):
+            page = write_report(report, outcome.summary, outcome.rows, outcome.pictures)
+        console.print(f"report: [bold]{escape(str(page))}[/]", soft_wrap=True)
+    if json_out is None:
+        show(summary_table(outcome.summary))
+    elif json_out == "-":
+        show(outcome.summary)
     else:
-        console.print(summary_table(outcome.summary))
+        with writing(Path(json_out)):
+            Path(json_out).write_text(json.dumps(outcome.summary, indent=1) + "\n", encoding="utf-8")
 
 
 # ---- consumers -------------------------------------------------------------------------------------------
@@ -206,7 +227,7 @@ def evaluate(
 @endpoint_option
 @ns_option
 @click.option("--pin", type=(float, float), metavar="U V", help="Tissue pixel to pin to; default: centre.")
-@click.option("--seconds", type=float, help="Stop after so long; default: Ctrl-C.")
+@click.option("--seconds", type=positive, help="Stop after so long; default: Ctrl-C.")
 @click.option("--save", type=click.Path(path_type=Path), help="Write what is shown: .mp4, or .png.")
 @as_json
 def overlay(
@@ -217,65 +238,68 @@ def overlay(
     save: Path | None,
     json_out: bool,
 ) -> None:
-    """Draw virtual geometry pinned to the tissue over the live left picture of a running node.
+    """Draw geometry pinned to the tissue over a node's live picture.
 
-    It is depth-tested against the tissue, hidden behind instruments, and blanks when anything it needs is
-    stale; the video itself is never hidden.
+    The shape is depth-tested against the tissue, hidden behind instruments, and blanks when anything it
+    needs is stale; the video itself is never hidden.
     """
     from sags_node.apps.overlay import run_overlay
 
     summary = run_overlay(endpoint=endpoint, ns=ns, pin=pin, seconds=seconds, save=save)
-    _report(summary, json_out)
+    show(summary if json_out else text.overlay_table(summary))
 
 
 @main.group()
 def topic() -> None:
-    """Look at what a running node publishes, in the words of `ros2 topic`."""
+    """Look at what a running node publishes, as `ros2 topic` does."""
 
 
 @topic.command("list")
 @endpoint_option
 @ns_option
-@click.option("--seconds", type=float, default=2.0, show_default=True, help="How long to listen.")
+@click.option("--seconds", type=positive, default=3.0, show_default=True, help="How long to listen.")
 @as_json
 def topic_list(endpoint: str | None, ns: str, seconds: float, json_out: bool) -> None:
-    """Topics heard, with their type, rate and size."""
+    """Every topic with its type, and the rate and size of what was heard."""
     from sags_node.apps import topic as tool
 
-    _report_rows(tool.topic_list(endpoint=endpoint, ns=ns, seconds=seconds), json_out)
+    rows = tool.topic_list(endpoint=endpoint, ns=ns, seconds=seconds)
+    show(rows if json_out else text.topics_table(rows))
 
 
 @topic.command("echo")
 @click.argument("name")
 @endpoint_option
 @ns_option
-@click.option("--count", type=int, help="Stop after so many messages.")
+@click.option("--count", type=click.IntRange(1), help="Stop after so many messages; default: Ctrl-C.")
 @as_json
 def topic_echo(name: str, endpoint: str | None, ns: str, count: int | None, json_out: bool) -> None:
-    """Print the messages of a topic; bulk data as shape and range."""
+    """Print the messages of topic NAME; bulk data as shape and range."""
     from sags_node.apps import topic as tool
 
     for message in tool.topic_echo(name, endpoint=endpoint, ns=ns, count=count):
-        _report(message, json_out)
+        show(message if json_out else text.echo_text(message))
 
 
-def _rate_command(name: str, doc: str) -> None:
+def _measuring(name: str, doc: str) -> None:
+    """The commands that listen to one topic for a while."""
+
     @topic.command(name, help=doc)
     @click.argument("topic_name", metavar="NAME")
     @endpoint_option
     @ns_option
-    @click.option("--seconds", type=float, default=5.0, show_default=True, help="How long to listen.")
+    @click.option("--seconds", type=positive, default=5.0, show_default=True, help="How long to listen.")
     @as_json
     def command(topic_name: str, endpoint: str | None, ns: str, seconds: float, json_out: bool) -> None:
         from sags_node.apps import topic as tool
 
-        measure = getattr(tool, f"topic_{name}")
-        _report(measure(topic_name, endpoint=endpoint, ns=ns, seconds=seconds), json_out)
+        figures = getattr(tool, f"topic_{name}")(topic_name, endpoint=endpoint, ns=ns, seconds=seconds)
+        show(figures if json_out else getattr(text, f"{name}_text")(figures))
 
 
-_rate_command("hz", "Average rate, min, max and std dev of the intervals, and the window.")
-_rate_command("bw", "Bytes per second and per message.")
-_rate_command("delay", "Age of messages: now minus the capture stamp.")
+_measuring("hz", "Rate of topic NAME, and min, max and std dev of the intervals.")
+_measuring("bw", "Bytes per second and per message of topic NAME.")
+_measuring("delay", "Age of the messages of topic NAME: now minus the capture stamp.")
 
 
 # ---- tools -----------------------------------------------------------------------------------------------
@@ -285,7 +309,9 @@ _rate_command("delay", "Age of messages: now minus the capture stamp.")
 @click.argument("folder", type=click.Path(path_type=Path))
 @click.argument("overrides", nargs=-1, metavar="[key:=value ...]")
 def phantom(folder: Path, overrides: tuple[str, ...]) -> None:
-    """Write a synthetic stereo session with exact truth to FOLDER.
+    """Write a synthetic stereo session with exact truth.
+
+    FOLDER must be new or empty. Keys: seconds, rate, width, height, seed, camera_motion, smoke, noise, blur.
 
     \b
     sags phantom out/session seconds:=8 seed:=3 camera_motion:=true smoke:=0.3
@@ -293,13 +319,12 @@ def phantom(folder: Path, overrides: tuple[str, ...]) -> None:
     from sags_node.config import PhantomSource, load_launch
     from sags_node.phantom import write_session
 
-    if folder.exists() and any(folder.iterdir()):
-        raise UsageError(f"{folder} is not empty; nothing is overwritten, name another folder")
     config = load_launch(None, [f"source.{override}" for override in overrides]).source
-    assert isinstance(config, PhantomSource)
-    with _progress("rendering") as show:
-        write_session(config, folder, rate=config.rate or 30.0, progress=show)
-    console.print(f"session: [bold]{folder}[/]; play it with `sags run {folder}`")
+    if not isinstance(config, PhantomSource):
+        raise UsageError(f"sags phantom writes phantom sessions; kind:={config.kind} is something else")
+    with progress("rendering") as advance:
+        write_session(config, folder, rate=config.rate or 30.0, progress=advance)
+    console.print(f"session: [bold]{escape(str(folder))}[/]; play it with: sags run {escape(str(folder))}")
 
 
 @main.command()
@@ -311,7 +336,8 @@ def doctor(launch: tuple[str, ...], json_out: bool) -> None:
     from sags_node.config import load_launch
 
     checks = examine(load_launch(*_split(launch)))
-    _report_rows(as_rows(checks), json_out)
+    rows = as_rows(checks)
+    show(rows if json_out else text.rows_table(rows))
     if any(check.level == "error" for check in checks):
         raise SagsError("something the node needs is missing; see the mends above")
 
@@ -325,11 +351,15 @@ def calib() -> None:
 @click.argument("folder", type=click.Path(path_type=Path))
 @as_json
 def calib_check(folder: Path, json_out: bool) -> None:
-    """Look over FOLDER/left.yaml and right.yaml (ROS camera_info) for what usually goes wrong."""
+    """Look over a calibration for what usually goes wrong.
+
+    FOLDER holds left.yaml and right.yaml (ROS camera_info).
+    """
     from sags_node.calibration import check_rig, read_rig
 
     findings = check_rig(read_rig(folder))
-    _report_rows([asdict(finding) for finding in findings], json_out)
+    rows = [asdict(finding) for finding in findings]
+    show(rows if json_out else text.rows_table(rows))
     if any(finding.level == "error" for finding in findings):
         raise SagsError(f"{folder} cannot be used as it is; see the mends above")
 
@@ -341,61 +371,21 @@ def _split(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
     """A launch file or session folder, if there is one, and the overrides."""
     overrides = [argument for argument in arguments if ":=" in argument]
     paths = [argument for argument in arguments if ":=" not in argument]
+    for path in paths:
+        if "=" in path and not Path(path).exists():
+            raise UsageError(f"'{path}' is not an override; write {path.replace('=', ':=', 1)}")
     if len(paths) > 1:
         raise UsageError(f"one launch file or session at a time, not {', '.join(paths)}")
     return (paths[0] if paths else None), overrides
 
 
-def _open(path: str | None, overrides: Sequence[str]) -> Any:
+def _open(path: str | None, overrides: Sequence[str]) -> Session:
     """Open a session and make its kernels ready, saying what takes long."""
     from sags_node.session import open_session
     from sags_node.warm_up import warm_up
 
-    with _progress("rendering the phantom (once)") as show:
-        session = open_session(path, overrides, show)
+    with progress("rendering the phantom (once)") as advance:
+        session = open_session(path, overrides, advance)
     with console.status("loading kernels (compiled once per machine, about half a minute)"):
         warm_up(session.config)
     return session
-
-
-@contextmanager
-def _progress(what: str) -> Iterator[Callable[..., None]]:
-    """A progress bar that appears with its first report: show(done, total=None, what=None)."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True) as bar:
-        task = bar.add_task(what, total=None, visible=False)
-
-        def show(done: int, total: int | None = None, description: str | None = None) -> None:
-            bar.update(task, completed=done, total=total, description=description or what, visible=True)
-
-        yield show
-
-
-def _report(figures: dict[str, Any], json_out: bool) -> None:
-    if json_out:
-        click.echo(json.dumps(figures))
-        return
-    table = Table(show_header=False, box=None, padding=(0, 2))
-    for key, value in figures.items():
-        table.add_row(key, f"{value:.3f}" if isinstance(value, float) else str(value))
-    console.print(table)
-
-
-def _report_rows(rows: Sequence[dict[str, Any]], json_out: bool) -> None:
-    if json_out:
-        click.echo(json.dumps(list(rows)))
-        return
-    table = Table(box=None, padding=(0, 2))
-    for key in rows[0] if rows else ():
-        table.add_column(key)
-    for row in rows:
-        table.add_row(*(f"{v:.2f}" if isinstance(v, float) else str(v) for v in row.values()))
-    console.print(table)
-
-
-def _write(path: Path, text: str) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
-    except OSError as error:
-        raise SagsError(f"cannot write {path}: {error.strerror}") from None

@@ -295,13 +295,33 @@ def _explain(error: ValidationError, name: str) -> str:
         path = [str(part) for part in item["loc"]]
         where = ".".join(part for part in path if part not in _SOURCES)
         if item["type"] == "extra_forbidden":
-            known = _known_keys(path[:-1])
-            near = difflib.get_close_matches(path[-1], known, n=1, cutoff=0.5)
-            hint = f"did you mean '{near[0]}'?" if near else f"known keys: {', '.join(sorted(known))}"
-            lines.append(f"{name}: unknown key '{where}'; {hint}")
+            lines.append(f"{name}: unknown key '{where}'; {_nearest(path)}")
+        elif item["type"] == "missing":
+            lines.append(f"{name}: {where} is missing; set it")
+        elif item["type"] in ("union_tag_invalid", "union_tag_not_found"):
+            kinds = ", ".join(repr(kind) for kind in _SOURCES)
+            lines.append(f"{name}: source.kind: should be one of {kinds} (got {item['input'].get('kind')!r})")
         else:
-            lines.append(f"{name}: {where or 'launch file'}: {item['msg']} (got {item.get('input')!r})")
+            what = _PLAIN.get(item["type"], item["msg"])
+            lines.append(f"{name}: {where or 'launch file'}: {what} (got {item.get('input')!r})")
     return "\n".join(lines)
+
+
+_PLAIN = {  # where pydantic speaks of Python
+    "path_type": "Input should be a path",
+    "tuple_type": "Input should be a list, e.g. [a, b]",
+    "model_type": "Input should be a section of keys",
+    "model_attributes_type": "Input should be a section of keys",
+}
+
+
+def _nearest(path: Sequence[str]) -> str:
+    """The known key that was probably meant: of this section, or one of that name in another."""
+    known = _known_keys(path[:-1])
+    near = difflib.get_close_matches(path[-1], known, n=1, cutoff=0.5)
+    if not near:
+        near = [f"{section}.{path[-1]}" for section in _SECTIONS if path[-1] in _known_keys([section])]
+    return f"did you mean '{near[0]}'?" if near else f"known keys: {', '.join(sorted(known))}"
 
 
 def _known_keys(path: Sequence[str]) -> list[str]:
@@ -315,6 +335,7 @@ def _known_keys(path: Sequence[str]) -> list[str]:
     return list(model.model_fields)
 
 
+_SECTIONS = ("vision", "engine", "mapping", "publish")
 _SOURCES: dict[str, type[Section]] = {
     "folders": FoldersSource,
     "videos": VideosSource,

@@ -11,9 +11,3 @@ class UsageError(SagsError):
     """The request itself is wrong (a key, a path, an option). Exit code 2."""
 
     exit_code = 2
-
-
-class DataLostError(SagsError):
-    """Part of a recording could not be kept or recovered. Exit code 3."""
-
-    exit_code = 3

@@ -33,14 +33,12 @@ class Pipeline:
         self.stereo = StereoDepth(vision.stereo, self.rectifier.camera, self.rectifier.baseline)
         self._rasterizer = make_rasterizer(config.engine.backend, width, height)
         self._config = config
-        self._resets = -1
+        self.mapper = Mapper(self._rasterizer, config.mapping.max_gaussians)
         self._mapped: FrameResult | None = None  # the last frame that was really mapped
-        self.reset()
 
     def reset(self) -> None:
         """Forget the model; the next frame makes a new one, in a new epoch."""
-        self._resets += 1
-        self.mapper = Mapper(self._rasterizer, self._config.mapping.max_gaussians)
+        self.mapper.restart()
         self._mapped = None
 
     def reconfigure(self, config: LaunchConfig) -> None:
@@ -51,12 +49,11 @@ class Pipeline:
         """Everything that happens to one frame."""
         budget.start()
         watch = Stopwatch()
-        epoch = frame.epoch + self._resets
         with watch("rectify"):
             pair = self.rectifier(frame)
         if self._mapped is not None and self._config.mapping.skip_duplicates:
             if _rms_difference(pair, self._mapped.pair) < DUPLICATE_RMS:
-                return _repeat(self._mapped, pair, epoch, watch.timings_ms)
+                return _repeat(self._mapped, pair, self._epoch(frame), watch.timings_ms)
         with watch("mask"):
             tissue = self.tissue(frame, pair)
         with watch("depth"):
@@ -70,8 +67,13 @@ class Pipeline:
                 views["right"] = self.draw(snapshot, eye_distance=pair.baseline)
             self.mapper.drawn(observation, views["left"])
         budget.finish()
+        epoch = self._epoch(frame)
         self._mapped = FrameResult(pair, observation, snapshot, views, epoch, watch.timings_ms)
         return self._mapped
+
+    def _epoch(self, frame: StereoFrame) -> int:
+        """Grows with the source's epochs and with every new model: ids then mean other Gaussians."""
+        return frame.epoch + self.mapper.restarts
 
     def draw(self, snapshot: Snapshot, eye_distance: float = 0.0) -> RenderedView:
         """The snapshot as its own camera sees it, moved right by `eye_distance` metres."""

@@ -57,7 +57,10 @@ def test_advect(scene: dict[str, np.ndarray]) -> None:
 @pytest.mark.parametrize("crowded", [False, True])
 def test_inspect(scene: dict[str, np.ndarray], crowded: bool) -> None:
     s = scene
-    arguments = (s["means"], s["opacities"], s["colors"], s["cam0"], s["tissue"], s["depth"], crowded)
+    r = np.abs(s["rows"]) + np.float32(1e-6)
+    quats, scales, contribution = (np.ascontiguousarray(r[:, k]) for k in (slice(4), slice(4, 7), 7))
+    arguments = (s["means"], quats, scales, s["opacities"], s["colors"], contribution, s["cam0"], s["tissue"],
+                 s["depth"], crowded)  # fmt: skip
     front, remove = np.full((2, N), 2, np.int32), np.zeros((2, N), bool)
     densify._inspect(*arguments, front[0], remove[0])
     densify._inspect.py_func(*arguments, front[1], remove[1])

@@ -68,7 +68,8 @@ def overlay_table(summary: Record) -> Table:
         made.add_row("", f"{count} without: {reason}")
     made.add_row("latency", "  ".join(f"{name} {value:.0f} ms" for name, value in latency.items()))
     if pin["pixel"] is not None:
-        made.add_row("pinned at", f"pixel {pin['pixel'][0]} {pin['pixel'][1]}, {pin['pinned']} times")
+        anew = f", then {pin['pinned'] - 1} times anew" if pin["pinned"] > 1 else ""
+        made.add_row("pinned at", f"pixel {pin['pixel'][0]} {pin['pixel'][1]}{anew}")
     if pin["step_mm_p90"] is not None:
         moved = f"up to {pin['moved_mm']:.1f} mm, p90 of a step {pin['step_mm_p90']:.2f} mm"
         made.add_row("moved", moved)

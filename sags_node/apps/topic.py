@@ -161,9 +161,7 @@ def _listen_to(topic: str, endpoint: str | None, ns: str, seconds: float) -> lis
     return fresh
 
 
-def _heard(
-    names: Sequence[str], endpoint: str | None, ns: str, seconds: float
-) -> dict[str, list[_Sample]]:
+def _heard(names: Sequence[str], endpoint: str | None, ns: str, seconds: float) -> dict[str, list[_Sample]]:
     """What came on some topics, each message once: a last value may be sent again for another peer."""
     heard: dict[str, dict[tuple[str, int], _Sample]] = defaultdict(dict)
     for arrived in listen(names, endpoint, ns, seconds):

@@ -69,8 +69,11 @@ def evaluate(
     forced = ["source.loop:=false", f"source.pace:={pace}"]
     if iterations is not None:
         forced.append(f"mapping.iterations:={iterations}")
-    session = open_session(launch, [*overrides, *forced])
+    session = open_session(
+        launch, [*overrides, *forced], lambda done, total: progress("rendering the phantom (once)", done)
+    )
     config = session.config
+    progress("loading kernels", 0)
     warm_up(config)
     with Spool(config.engine.backend) as spool:
         if pace == "realtime":

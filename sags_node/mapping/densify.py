@@ -22,7 +22,9 @@ MAX_INSERTED = 1500  # per frame: a budget, and a brake on runaway insertion
 FRONT_TOLERANCE = 0.065  # of the depth: so far in front of the measured surface is free space
 FRONT_FRAMES = 3  # in a row, since stereo is wrong now and then
 MIN_OPACITY = 0.03
-CROWDED = 0.9  # share of the cap above which what left the view is given up
+CROWDED = 0.9  # share of the cap above which what does not show is given up
+IDLE = 0.1  # px of coverage: less does not show
+LARGEST = 1e6  # metres, colours, quaternions: no honest value comes near
 
 
 def candidates(planes: F32, observation: Observation, phase: int) -> tuple[I32, F32]:
@@ -45,12 +47,14 @@ def candidates(planes: F32, observation: Observation, phase: int) -> tuple[I32, 
 
 
 def doomed(model: GaussianModel, observation: Observation) -> Bool:
-    """[N] what to remove: in free space for several frames in a row, transparent, not finite, or out of view
-    when N nears its cap. Counts the frames in free space (`in_front`)."""
+    """[N] what to remove: in free space for several frames in a row, transparent or not finite; when N nears
+    its cap also what left the view, and what lies on the visible surface without showing. What an instrument
+    or other tissue hides is kept. Counts the frames in free space (`in_front`)."""
     remove = np.zeros(model.count, np.bool_)
     _inspect(
-        model.means, model.opacities, model.colors, pack(observation.camera), observation.tissue,
-        observation.depth, model.count > CROWDED * model.capacity, model.in_front, remove,
+        model.means, model.quats, model.scales, model.opacities, model.colors, model.contribution,
+        pack(observation.camera), observation.tissue, observation.depth,
+        model.count > CROWDED * model.capacity, model.in_front, remove,
     )  # fmt: skip
     return remove
 
@@ -95,24 +99,31 @@ def _candidates(
 
 @parallel_kernel
 def _inspect(
-    means: F32, opacities: F32, colors: F32, cam: F32, tissue: Bool, depth: F32, crowded: bool,
-    in_front: I32, remove: Bool,
+    means: F32, quats: F32, scales: F32, opacities: F32, colors: F32, contribution: F32,
+    cam: F32, tissue: Bool, depth: F32, crowded: bool, in_front: I32, remove: Bool,
 ) -> None:  # fmt: skip
     for i in prange(len(means)):
-        remove[i] = _is_doomed(means[i], opacities[i], colors[i], cam, tissue, depth, crowded, in_front, i)
+        if _is_sound(means[i], quats[i], scales[i], opacities[i], colors[i]):
+            idle = contribution[i] < IDLE
+            remove[i] = _is_doomed(means[i], cam, tissue, depth, crowded, idle, in_front, i)
+        else:
+            remove[i] = True
+
+
+@kernel
+def _is_sound(mean: F32, quat: F32, scale: F32, opacity: Any, color: F32) -> bool:
+    """Finite, and something to draw."""
+    size = abs(quat[0]) + abs(quat[1]) + abs(quat[2]) + abs(quat[3])
+    for k in range(3):
+        size += abs(mean[k]) + abs(color[k]) + abs(scale[k])
+    return bool(size < LARGEST and min(scale[0], scale[1], scale[2]) > 0 and MIN_OPACITY <= opacity <= 1)
 
 
 @kernel
 def _is_doomed(
-    mean: F32, opacity: Any, color: F32, cam: F32, tissue: Bool, depth: F32, crowded: bool,
-    in_front: I32, i: int,
-) -> bool:  # fmt: skip
+    mean: F32, cam: F32, tissue: Bool, depth: F32, crowded: bool, idle: bool, in_front: I32, i: int
+) -> bool:
     height, width = tissue.shape
-    size = opacity
-    for k in range(3):
-        size += abs(mean[k]) + abs(color[k])
-    if not size < np.inf or opacity < MIN_OPACITY:
-        return True
     x, y, z = to_camera(cam, mean[0], mean[1], mean[2])
     if not z > 0:
         return crowded
@@ -121,6 +132,8 @@ def _is_doomed(
         return crowded
     px, py = int(u + 0.5), int(v + 0.5)
     measured = depth[py, px]
+    on_surface = False
     if tissue[py, px] and measured > 0:
+        on_surface = abs(measured - z) < FRONT_TOLERANCE * measured
         in_front[i] = in_front[i] + 1 if measured - z > FRONT_TOLERANCE * measured else 0
-    return bool(in_front[i] >= FRONT_FRAMES)
+    return bool(in_front[i] >= FRONT_FRAMES or (crowded and idle and on_surface))

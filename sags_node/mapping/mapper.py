@@ -18,7 +18,9 @@ from sags_node.types import F32, Observation, RenderedView, Snapshot
 
 CONTROL_NODES = 512
 INITIAL_STEPS = 30
-MIN_FIRST_GAUSSIANS = 100
+MIN_FIRST_DEPTHS = 200  # px
+LOST_RESIDUAL = 0.08  # mean over RGB and tissue, 0..1; a beating heart stays below half of it
+LOST_COVERAGE = 0.3  # of the tissue
 INITIAL_RATES = Rates().scaled(4.0)
 NODE_STEP_PX = 0.08
 DEPTH_WEIGHT = 2e-3  # of a depth residual of DEPTH_SCALE, against colours 0..1
@@ -44,6 +46,7 @@ class Mapper:
     def __init__(self, rasterizer: Rasterizer, max_gaussians: int) -> None:
         self.model = GaussianModel(max_gaussians)
         self.step = 0
+        self.restarts = 0  # how often a new model was begun because the old one did not fit any more
         self._rasterizer = rasterizer
         self._optimiser = Optimiser()
         self._flow = OpticalFlow()
@@ -77,15 +80,22 @@ class Mapper:
             counts=counts,
         )
 
+    def restart(self) -> None:
+        """Forget the model; the next frame, or this one if it is being taken in, makes a new one."""
+        self.model.clear()
+        self._deformation = None
+        self._last = None
+        self.restarts += 1
+
     def drawn(self, observation: Observation, view: RenderedView) -> None:
         """Remember how the model looked at `observation`: the next frame's motion starts from there."""
         self._last = _Last(observation, view)
 
     def _initialise(self, observation: Observation) -> dict[str, int]:
+        if not self._can_start(observation):
+            return {"inserted": 0}  # a black or covered picture: try again with the next frame
         limit = int(initialise.INITIAL_SHARE * self.model.capacity)
         pixels, depths, spacing = initialise.first_pixels(observation, limit)
-        if len(pixels) < MIN_FIRST_GAUSSIANS:
-            return {"inserted": 0}  # a black or covered picture: try again with the next frame
         rows = initialise.insert(self.model, observation, pixels, depths, spacing)
         self._deformation = NodeDeformation(self.model.means, CONTROL_NODES)
         self._deformation.attach(self.model, rows)
@@ -99,6 +109,9 @@ class Mapper:
         removed = self.model.remove(densify.doomed(self.model, observation))
 
         planes = self._draw(observation)
+        if _is_lost(planes, observation) and self._can_start(observation):
+            self.restart()
+            return self._initialise(observation) | {"restarted": 1}
         pixels, depths = densify.candidates(planes, observation, phase=7 * self._frames)
         iterations = 0
         if budget.more():  # before inserting, so that the drawing above serves both
@@ -125,6 +138,10 @@ class Mapper:
         if seconds > 0:
             self.model.velocities[:] = (self.model.means - start) / np.float32(seconds)
 
+    def _can_start(self, observation: Observation) -> bool:
+        """Whether this frame has depth enough for a first model."""
+        return bool(np.count_nonzero(observation.depth) >= MIN_FIRST_DEPTHS)
+
     def _draw(self, observation: Observation) -> F32:
         return self._rasterizer.forward(self.model.gaussians(), observation.camera)
 
@@ -142,5 +159,22 @@ class Mapper:
         self._deformation.descend(
             self.model, gradients.means, gradients.contribution, NODE_STEP_PX * self._metres_per_px
         )
+        self.model.contribution[:] = gradients.contribution
         self._optimiser.step(self.model, gradients, observation.camera, rates)
         self.step += 1
+
+
+def _is_lost(planes: F32, observation: Observation) -> bool:
+    """Whether the model, moved to this frame, shows another scene: after a cut, a blackout or damage. Looking
+    at every eighth pixel is enough."""
+    tissue = observation.tissue[::8, ::8]
+    alpha = planes[4, ::8, ::8]
+    covered = tissue & (alpha > densify.HOLE_ALPHA)
+    tissue_pixels, covered_pixels = np.count_nonzero(tissue), np.count_nonzero(covered)
+    if tissue_pixels == 0:
+        return False  # all is instrument: nothing to judge by
+    if covered_pixels < LOST_COVERAGE * tissue_pixels:
+        return True
+    drawn = planes[:3, ::8, ::8][:, covered] / alpha[covered]
+    residual = np.abs(drawn - observation.image[::8, ::8][covered].T).mean()
+    return bool(residual > LOST_RESIDUAL)

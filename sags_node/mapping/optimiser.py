@@ -50,8 +50,8 @@ class Optimiser:
         self._steps = 0
 
     def step(self, model: GaussianModel, gradients: Gradients, camera: Camera, rates: Rates) -> None:
-        """Update every row of the model that contributed to the picture. Rows with a gradient that is not
-        finite are left as they are."""
+        """Update every row of the model that contributed to the picture. A row whose gradient or optimiser
+        state is not finite sits the step out, with its state made anew."""
         self._steps += 1
         corrections = 1.0 / (1.0 - np.array([BETA1, BETA2]) ** self._steps)
         lengths = np.array(
@@ -107,7 +107,11 @@ def _step_one(
         size += abs(g[k])
     for k in range(3):
         size += abs(v_color[k])
-    if not size < np.inf:
+    for k in range(ADAM_PARAMETERS):
+        size += abs(adam_m[k]) + abs(adam_v[k])
+    raw = abs(log_scale[0]) + abs(log_scale[1]) + abs(log_scale[2]) + abs(opacity_logits[i])
+    if not size + raw < np.inf:
+        _mend(log_scale, opacity_logits, scale, opacities, adam_m, adam_v, i)
         return
     gain = np.float32(COLOUR_RELAXATION) / (contribution + np.float32(COLOUR_DAMPING))
     for k in range(3):
@@ -127,3 +131,16 @@ def _step_one(
     value = opacity_logits[i] - g[10]
     opacity_logits[i] = min(max(value, np.float32(LOGIT_RANGE[0])), np.float32(LOGIT_RANGE[1]))
     opacities[i] = one / (one + math.exp(-opacity_logits[i]))
+
+
+@kernel
+def _mend(
+    log_scale: F32, opacity_logits: F32, scale: F32, opacities: F32, adam_m: F32, adam_v: F32, i: int
+) -> None:
+    """Make a row's hidden state anew from what is drawn of it, which is known to be sound."""
+    adam_m[:] = 0
+    adam_v[:] = 0
+    for k in range(3):
+        log_scale[k] = math.log(scale[k])
+    opacity = min(opacities[i], np.float32(0.999))
+    opacity_logits[i] = math.log(opacity / (np.float32(1) - opacity))

@@ -26,6 +26,7 @@ MAX_SUBSCRIPTIONS_AT_ONCE = 1000
 MAX_SUBSCRIPTION_BYTES = 256
 PENDING_POLL_MS = 10  # how soon the result of a handler's future is looked for
 HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS = 2000, 6000
+LAST_WORDS_MS = 200  # longest wait at the end for what is still on its way to a peer
 
 
 class Publisher:
@@ -212,7 +213,7 @@ class Publisher:
 
     def close(self) -> None:
         """Close the sockets and remove the connection file."""
-        self._context.destroy(linger=0)
+        self._context.destroy(linger=LAST_WORDS_MS)
         self._run.close()
 
     def __enter__(self) -> Self:

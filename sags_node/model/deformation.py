@@ -55,6 +55,7 @@ class NodeDeformation:
     def __init__(self, means: F32, count: int) -> None:
         """Place about `count` nodes over `means` [N, 3] m: the centres of occupied cells of a cubic grid."""
         self.spacing = _spacing_for(means, count)
+        self._most = 4 * count  # beyond this, new tissue follows the nodes there are
         self.nodes = _cell_centres(means, self.spacing)  # [M, 3] m
         self._momentum = np.zeros_like(self.nodes)
         self._variance = np.zeros_like(self.nodes)
@@ -66,7 +67,7 @@ class NodeDeformation:
             return
         index, weight, distance = _nearest(means, self.nodes)
         far = distance > _NEW_NODE_DISTANCE * self.spacing
-        if far.any():
+        if far.any() and len(self.nodes) < self._most:
             self._add_nodes(_cell_centres(means[far], self.spacing))
             index, weight, _ = _nearest(means, self.nodes)
         model.node_index[rows] = index

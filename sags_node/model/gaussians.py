@@ -36,6 +36,7 @@ class GaussianModel:
             "colors": rows(3),
             "velocities": rows(3),  # m/s, world
             "ids": np.zeros(capacity, np.int64),
+            "contribution": rows(),  # px, in the last optimiser step
             "in_front": np.zeros(capacity, np.int32),  # frames in a row in front of the measured surface
             "node_index": np.zeros((capacity, NEIGHBOURS), np.int32),
             "node_weight": rows(NEIGHBOURS),
@@ -75,10 +76,15 @@ class GaussianModel:
         rows["colors"][added] = colors[:fits]
         rows["opacities"][added] = opacity
         rows["opacity_logits"][added] = np.log(opacity / (1.0 - opacity))
+        rows["contribution"][added] = 1.0  # not known yet
         rows["ids"][added] = np.arange(self._next_id, self._next_id + fits)
         self._next_id += fits
         self.count += fits
         return added
+
+    def clear(self) -> None:
+        """Forget all rows; ids go on."""
+        self.count = 0
 
     def remove(self, doomed: np.ndarray) -> int:
         """Remove the rows where `doomed` [count] is True: the last rows move into the holes."""

@@ -97,7 +97,7 @@ def list_pictures(folder: Path) -> list[Path]:
     """
     if not folder.is_dir():
         reason = "is not a folder" if folder.exists() else "does not exist"
-        raise UsageError(f"picture folder {folder} {reason}; check the path")
+        raise UsageError(f"picture folder {folder} {reason}; check the path, or SAGS_DATA if it is used")
     pictures = [file for file in folder.iterdir() if file.suffix.lower() in PICTURE_SUFFIXES]
     if not pictures:
         raise UsageError(f"picture folder {folder} holds no .jpg or .png file")

@@ -16,8 +16,10 @@ from sags_node.types import U8
 
 log = logging.getLogger(__name__)
 
-# FFmpeg would print its own lines about broken files; OpenCV reads this when it opens its first video.
+# FFmpeg and OpenCV would print their own lines about broken files beside our message. FFmpeg's level is read
+# when the first video is opened.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
 
 
 class Video:
@@ -42,7 +44,7 @@ class Video:
 
     def _open(self) -> None:
         if not self.path.is_file():
-            raise UsageError(f"video {self.path} does not exist; check the path")
+            raise UsageError(f"video {self.path} does not exist; check the path, or SAGS_DATA if it is used")
         self._capture = cv2.VideoCapture(str(self.path), cv2.CAP_FFMPEG)
         if not self._capture.isOpened():
             raise UsageError(f"{self.path} cannot be read as a video; is it complete?")

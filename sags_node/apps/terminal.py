@@ -1,0 +1,73 @@
+"""How the command line talks to people and programs: results on stdout, everything else on stderr."""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from sags_node.errors import SagsError
+
+WIDE = 200  # columns of a table that goes to a file or another program, and so is not cut to a screen
+
+console = Console(stderr=True, highlight=False)
+
+
+@contextmanager
+def progress(what: str) -> Iterator[Callable[..., None]]:
+    """A progress bar that appears with its first advance(done, total=None, what=None)."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task(what, total=None, visible=False)
+
+        def advance(done: int, total: int | None = None, description: str | None = None) -> None:
+            bar.update(task, completed=done, total=total, description=description or what, visible=True)
+
+        yield advance
+
+
+def show(result: Table | str | dict[str, Any] | list[dict[str, Any]]) -> None:
+    """Print a result: tables and text for people, anything else as JSON."""
+    if isinstance(result, Table):
+        result = _drawn(result)
+    click.echo(result if isinstance(result, str) else json.dumps(result))
+
+
+def _drawn(table: Table) -> str:
+    screen = Console(width=None if sys.stdout.isatty() else WIDE, highlight=False, markup=False)
+    with screen.capture() as captured:
+        screen.print(table)
+    return "\n".join(line.rstrip() for line in captured.get().splitlines())
+
+
+@contextmanager
+def writing(target: Path) -> Iterator[None]:
+    """A full disk or missing rights become one message."""
+    try:
+        yield
+    except OSError as error:
+        raise SagsError(f"cannot write {target}: {error.strerror}; name another place") from None
+
+
+def check_folder(folder: Path) -> None:
+    """Make the folder, and be sure that a file can be made in it."""
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+
+
+def check_file(file: Path) -> None:
+    """Be sure that this file can be written, without touching it."""
+    check_folder(file.parent)
+    with writing(file):
+        if file.exists():
+            file.open("r+b").close()

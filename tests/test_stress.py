@@ -1,0 +1,176 @@
+"""What no recording promises: unusable pictures, damage in the model, cuts, long runs. The node goes on,
+shows nothing that is not finite, and finds back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sags_node.mapping.budget import StepBudget
+from sags_node.node import resident_mb
+from sags_node.pipeline import Pipeline
+from sags_node.session import Session, open_session
+from sags_node.types import FrameResult, StereoFrame
+
+SESSION = Path(__file__).parent.parent / "replay/phantom_pull"
+CAP = 8000
+Spoil = Callable[[StereoFrame, np.random.Generator], StereoFrame]
+
+
+@pytest.fixture(scope="module")
+def session() -> Session:
+    return open_session(SESSION, ["source.pace:=step", f"mapping.max_gaussians:={CAP}"])
+
+
+@pytest.fixture(scope="module")
+def frames(session: Session) -> list[StereoFrame]:
+    with session.source as source:
+        return list(source)
+
+
+def play(pipeline: Pipeline, frames: list[StereoFrame]) -> list[FrameResult]:
+    """Process frames with fresh numbers and stamps, checking each result."""
+    results = []
+    for frame in frames:
+        number = play.number = getattr(play, "number", 0) + 1  # type: ignore[attr-defined]
+        stamp = number * 100_000_000
+        result = pipeline.process(replace(frame, frame_id=number, t_capture_ns=stamp), StepBudget(1))
+        check(result)
+        results.append(result)
+    return results
+
+
+def check(result: FrameResult) -> None:
+    """Everything a consumer gets is finite and in its range."""
+    gaussians, view = result.snapshot.gaussians, result.views["left"]
+    for name in ("means", "quats", "scales", "opacities", "colors"):
+        assert np.isfinite(getattr(gaussians, name)).all(), name
+    assert np.isfinite(result.snapshot.velocities).all()
+    assert len(gaussians) <= CAP and len(np.unique(gaussians.ids)) == len(gaussians)
+    assert (gaussians.scales > 0).all()
+    assert ((gaussians.opacities >= 0) & (gaussians.opacities <= 1)).all()
+    assert np.isfinite(view.rgb).all() and view.rgb.min() >= 0 and view.rgb.max() <= 1
+    assert np.isfinite(view.depth).all() and view.depth.min() >= 0
+    assert view.alpha.min() >= 0 and view.alpha.max() <= 1 + 1e-5
+
+
+def psnr(result: FrameResult) -> float:
+    tissue = result.observation.tissue
+    error = (result.views["left"].rgb - result.observation.image)[tissue]
+    return float(-10 * np.log10(np.mean(np.square(error)) + 1e-12))
+
+
+def _noise(frame: StereoFrame, rng: np.random.Generator) -> StereoFrame:
+    return replace(
+        frame,
+        left=rng.integers(0, 256, frame.left.shape, np.uint8),
+        right=rng.integers(0, 256, frame.right.shape, np.uint8),
+    )
+
+
+def _flat(value: int) -> Spoil:
+    return lambda frame, rng: replace(
+        frame, left=np.full_like(frame.left, value), right=np.full_like(frame.right, value)
+    )
+
+
+SPOILED: dict[str, Spoil] = {
+    "black": _flat(0),
+    "white": _flat(255),
+    "grey": _flat(128),
+    "noise": _noise,
+    "one eye twice": lambda frame, rng: replace(frame, right=frame.left),
+    "eyes swapped": lambda frame, rng: replace(frame, left=frame.right, right=frame.left),
+    "all instrument": lambda frame, rng: replace(frame, tissue=np.zeros(frame.left.shape[:2], bool)),
+}
+
+
+@pytest.mark.parametrize("name", SPOILED)
+def test_unusable_pictures_are_survived_and_left_behind(
+    session: Session, frames: list[StereoFrame], name: str
+) -> None:
+    rng = np.random.default_rng(0)
+    pipeline = Pipeline(session.config, session.rig)
+    before = psnr(play(pipeline, frames[:8])[-1])
+    play(pipeline, [SPOILED[name](frame, rng) for frame in frames[8:12]])
+    after = [psnr(result) for result in play(pipeline, frames[12:22])]
+    assert max(after[2:]) > before - 3.0, (before, after)
+
+
+@pytest.mark.parametrize("name", ["black", "noise", "all instrument"])
+def test_an_unusable_first_picture_only_delays_the_start(
+    session: Session, frames: list[StereoFrame], name: str
+) -> None:
+    pipeline = Pipeline(session.config, session.rig)
+    play(pipeline, [SPOILED[name](frames[0], np.random.default_rng(0))])
+    assert psnr(play(pipeline, frames[1:6])[-1]) > 28
+
+
+def test_a_cut_begins_a_new_model_in_a_new_epoch(session: Session, frames: list[StereoFrame]) -> None:
+    """Another scene in front of the same cameras: here, the negative of the first."""
+    negative = [replace(f, left=255 - f.left, right=255 - f.right) for f in frames]
+    pipeline = Pipeline(session.config, session.rig)
+    before = play(pipeline, frames[:4])[-1]
+    after = play(pipeline, negative[4:6])
+    assert after[0].epoch == before.epoch + 1
+    assert psnr(after[0]) > 30
+    assert before.snapshot.gaussians.ids.max() < after[0].snapshot.gaussians.ids.min()
+
+
+def test_motion_alone_never_restarts_the_model(session: Session, frames: list[StereoFrame]) -> None:
+    pipeline = Pipeline(session.config, session.rig)
+    assert {result.epoch for result in play(pipeline, frames)} == {0}
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e30])
+@pytest.mark.parametrize(
+    "array",
+    ["means", "quats", "log_scales", "scales", "opacities", "opacity_logits", "colors", "velocities",
+     "adam_m", "adam_v", "node_weight"],
+)  # fmt: skip
+def test_damage_in_the_model_heals(
+    session: Session, frames: list[StereoFrame], array: str, value: float
+) -> None:
+    """A tenth of the rows of one array is overwritten between two frames."""
+    pipeline = Pipeline(session.config, session.rig)
+    play(pipeline, frames[:3])
+    getattr(pipeline.mapper.model, array)[::10] = value
+    healed = play(pipeline, frames[3:6])[-1]
+    undamaged = Pipeline(session.config, session.rig)
+    assert psnr(healed) > psnr(play(undamaged, frames[:6])[-1]) - 2.5
+
+
+def test_hours_in_small(session: Session, frames: list[StereoFrame]) -> None:
+    """Ten loops: no growth of N, nodes or memory, no drift of quality."""
+    pipeline = Pipeline(session.config, session.rig)
+    qualities, memory = [], []
+    for _ in range(10):
+        qualities.append(np.mean([psnr(result) for result in play(pipeline, frames)]))
+        memory.append(resident_mb())
+    assert qualities[-1] > qualities[1] - 0.5, qualities
+    assert memory[-1] - memory[3] < 20, memory
+    assert pipeline.mapper.restarts == 0
+
+
+@pytest.mark.parametrize(("width", "height"), [(97, 71), (33, 41), (319, 255)])
+def test_sizes_that_no_tile_divides(frames: list[StereoFrame], width: int, height: int) -> None:
+    session = open_session(
+        SESSION,
+        [f"vision.width:={width}", f"vision.height:={height}", f"mapping.max_gaussians:={CAP}"],
+    )
+    pipeline = Pipeline(session.config, session.rig)
+    assert psnr(play(pipeline, frames[:4])[-1]) > 28
+
+
+def test_a_repeated_picture_is_not_mapped_again_but_keeps_its_own_stamp(
+    session: Session, frames: list[StereoFrame]
+) -> None:
+    pipeline = Pipeline(session.config, session.rig)
+    first, again, moved = play(pipeline, [frames[0], frames[0], frames[5]])
+    assert again.skipped and not moved.skipped
+    assert again.snapshot.step == first.snapshot.step
+    assert again.views["left"].t_capture_ns == again.pair.t_capture_ns > first.pair.t_capture_ns
