@@ -62,7 +62,6 @@ class Node:
             SagsError: an endpoint cannot be bound, or the configuration does not fit the rig.
         """
         self.config = config
-        self.started_at = 0.0
         self._rig = rig
         self._source = source
         self._on_result = on_result
@@ -94,7 +93,6 @@ class Node:
     # ---- life ----------------------------------------------------------------------------------------
 
     def start(self) -> None:
-        self.started_at = time.monotonic()
         for thread in self._threads:
             thread.start()
 
@@ -125,10 +123,6 @@ class Node:
     def endpoints(self) -> list[str]:
         """Where the data socket is bound."""
         return self._publisher.connection.data
-
-    @property
-    def control_endpoint(self) -> str | None:
-        return self._publisher.connection.control
 
     def health(self) -> NodeHealth:
         """What is true now; may be called from any thread."""

@@ -13,7 +13,6 @@ from sags_node.errors import SagsError
 from sags_node.types import F32, Gaussians
 
 MAX_PAIRS = 1 << 25  # 2 GiB of gradients
-FIRST_PAIRS_PER_GAUSSIAN = 4  # a first guess; the buffers grow when a picture needs more
 SPARE = 1.25  # what is asked for beyond the need when a buffer grows
 
 Row = tuple[np.float32, ...]
