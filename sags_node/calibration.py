@@ -43,10 +43,31 @@ def load_rig(folder: Path) -> StereoRig:
         UsageError: a file is missing or malformed, or `check_rig` finds an error.
     """
     rig = read_rig(folder)
-    errors = [finding for finding in check_rig(rig) if finding.level == "error"]
-    if errors:
-        raise UsageError("\n".join(f"{folder}: {error.what}; {error.mend}" for error in errors))
+    refuse_errors(check_rig(rig), folder)
     return rig
+
+
+def refuse_errors(findings: list[Finding], where: Path) -> None:
+    """End with the errors among the findings on a file or folder.
+
+    Raises:
+        UsageError: there are some.
+    """
+    errors = [finding for finding in findings if finding.level == "error"]
+    if errors:
+        raise UsageError("\n".join(f"{where}: {error.what}; {error.mend}" for error in errors))
+
+
+def rectified_rig(name: str, width: int, height: int, K: F64, baseline: float) -> StereoRig:
+    """A rig whose pictures are rectified already: both eyes have `K` [3, 3] px and no distortion.
+
+    Args:
+        baseline: m.
+    """
+    left, right = np.column_stack([K, np.zeros(3)]), np.column_stack([K, np.zeros(3)])
+    right[0, 3] = -K[0, 0] * baseline
+    eyes = [Eye(width, height, K, np.zeros(5), np.eye(3), P) for P in (left, right)]
+    return StereoRig(name, *eyes)
 
 
 def read_rig(folder: Path) -> StereoRig:
@@ -182,14 +203,15 @@ def _check_numbers(rig: StereoRig) -> list[Finding]:
 def _check_eyes(rig: StereoRig) -> list[Finding]:
     found = []
     for file, eye in _eyes(rig):
-        if np.abs(eye.R @ eye.R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(eye.R) < 0:
+        if not geometry.is_rotation(eye.R):
             found.append(Finding("error", f"{file}: rectification_matrix is not a rotation", RECALIBRATE))
         for key, K in (("camera_matrix", eye.K), ("projection_matrix", eye.P[:, :3])):
-            found += _check_intrinsics(f"{file}: {key}", K, eye.width, eye.height)
+            found += check_intrinsics(f"{file}: {key}", K, eye.width, eye.height)
     return found or [Finding("ok", "rotations, focal lengths and principal points are plausible")]
 
 
-def _check_intrinsics(where: str, K: F64, width: int, height: int) -> list[Finding]:
+def check_intrinsics(where: str, K: F64, width: int, height: int) -> list[Finding]:
+    """What is odd or wrong with `K` [3, 3] px of a picture; `where` names it."""
     found = []
     for axis, focal in (("fx", K[0, 0]), ("fy", K[1, 1])):
         if not 0.2 * width < focal < 20 * width:

@@ -220,6 +220,234 @@ def evaluate(
             Path(json_out).write_text(json.dumps(outcome.summary, indent=1) + "\n", encoding="utf-8")
 
 
+@main.command()
+@click.argument("dataset", nargs=-1, metavar="[DATASET | LAUNCH.yaml] [key:=value ...]")
+@click.option(
+    "--out", type=click.Path(path_type=Path), default=Path("out/fit"), show_default=True, help="Folder."
+)
+@click.option("--resume", is_flag=True, help="Go on from the checkpoint in the folder; same settings.")
+@click.option(
+    "--schedule",
+    type=click.Choice(["paper", "online"]),
+    default="online",
+    show_default=True,
+    help="paper: random points, warm-up on the first frame; online: one pass of the mapper.",
+)
+@click.option(
+    "--warm-up", type=click.IntRange(0), default=1000, show_default=True, help="Iterations; paper only."
+)
+@click.option(
+    "--iterations", type=click.IntRange(0), default=3000, show_default=True, help="With deformation."
+)
+@click.option(
+    "--tokens",
+    type=click.Choice(["self", "planes", "nodes"]),
+    default="self",
+    show_default=True,
+    help="What the attention sees: the Gaussian alone, its levels, or all control nodes.",
+)
+@click.option("--no-adaptive", is_flag=True, help="Without the self-adaptive block of the decoder.")
+@click.option("--no-alias-free", is_flag=True, help="Without both filters.")
+@click.option(
+    "--max-gaussians",
+    type=click.IntRange(100, 2_000_000),
+    default=30_000,
+    show_default=True,
+    help="Cap on N.",
+)
+@click.option("--seed", type=int, default=0, show_default=True, help="Of everything random.")
+@click.option(
+    "--hold-out", type=click.IntRange(0), default=8, show_default=True, help="Test on every so manieth."
+)
+@click.option("--lpips-weights", type=click.Path(path_type=Path), help="npz of LPIPS SqueezeNet weights.")
+@as_json
+def fit(
+    dataset: tuple[str, ...],
+    out: Path,
+    resume: bool,
+    schedule: str,
+    warm_up: int,
+    iterations: int,
+    tokens: str,
+    no_adaptive: bool,
+    no_alias_free: bool,
+    max_gaussians: int,
+    seed: int,
+    hold_out: int,
+    lpips_weights: Path | None,
+    json_out: bool,
+) -> None:
+    """Fit the SAGS model offline to a whole recording.
+
+    By the protocol of the paper: warm-up, then all parameters together, every eighth frame for testing.
+
+    DATASET is a folder in EndoNeRF or SCARED layout, or any session the node can play. Leaves a checkpoint,
+    the model as PLY (standard 3DGS fields, filters folded in), the drawn test frames and figures.json.
+
+    \b
+    sags fit launch/d4d_pull.yaml --out out/d4d
+    sags fit /data/endonerf/pulling_soft_tissues --schedule paper
+    """
+    from sags_node.apps.fit import figures_table, fit_session
+    from sags_node.config import V4l2Source, load_launch
+    from sags_node.evaluation.measure import Options
+    from sags_node.fitting.settings import FitSettings, Schedule, Tokens
+
+    path, overrides = _split(dataset)
+    if isinstance(load_launch(path, overrides).source, V4l2Source):
+        raise UsageError("live cameras cannot be fitted; record them first, then fit the recording")
+    options = Options(hold_out, 1, lpips_weights)
+    settings = FitSettings(
+        schedule=cast(Schedule, schedule),
+        warm_up=warm_up,
+        iterations=iterations,
+        tokens=cast(Tokens, tokens),
+        adaptive=not no_adaptive,
+        antialias=not no_alias_free,
+        max_gaussians=max_gaussians,
+        seed=seed,
+    )
+    check_folder(out)
+    session = _open(path, [*overrides, "source.loop:=false", "source.pace:=step"])
+    with progress("fitting") as advance:
+        found = fit_session(session, settings, options, out, resume, advance)
+    show(found if json_out else figures_table(found))
+
+
+# ---- bench -----------------------------------------------------------------------------------------------
+
+
+@main.group()
+def bench() -> None:
+    """Measure how fast this machine is at it."""
+
+
+@bench.command("kernels")
+@click.option("--quick", is_flag=True, help="A tiny scene and few runs: does it work, not how fast is it.")
+@click.option("--large", is_flag=True, help="Also a million Gaussians.")
+@click.option("--contention", is_flag=True, help="Also beside another process that burns one core.")
+@click.option("--no-twin", is_flag=True, help="Leave out the torch twins (most of the time, 10 GB).")
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE.json",
+    help="Write the table as JSON, and a plot of the same name, .svg, beside it.",
+)
+@click.option(
+    "--check",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE.json",
+    help="Compare with a table written by --out; fail if a kernel has become slower.",
+)
+@click.option(
+    "--tolerance",
+    type=click.FloatRange(min=1.0),
+    default=1.3,
+    show_default=True,
+    help="How many times slower than in --check's table is too slow.",
+)
+@as_json
+def bench_kernels(
+    quick: bool,
+    large: bool,
+    contention: bool,
+    no_twin: bool,
+    out: Path | None,
+    check: Path | None,
+    tolerance: float,
+    json_out: bool,
+) -> None:
+    """Time every kernel of the engine beside the machine's peak.
+
+    Milliseconds per stage, pixel-Gaussian pairs per second, the share of the machine's peak (multiply-adds or
+    memory, whichever binds; both measured in the same run), the gain over the plain torch twin, how it scales
+    with threads, and what idle pauses cost. Takes two minutes, in which the machine should do nothing else.
+
+    --check is the guard against kernels that became slow without an error. It compares each kernel's time in
+    units of the machine's own peak, so a table from another machine serves too, less sharply. Exit code 1 and
+    the kernel's name if one is slower than the tolerance.
+
+    \b
+    sags bench kernels --out benchmarks/results/kernels.json
+    sags bench kernels --check benchmarks/results/kernels.json
+    """
+    from dataclasses import replace
+
+    from sags_node.benchmark import check as guard
+    from sags_node.benchmark import report
+    from sags_node.benchmark.kernels import MILLION, QUICK, Settings, measure_kernels
+
+    settings = QUICK if quick else Settings()
+    if large:
+        settings = replace(settings, counts=(*settings.counts, MILLION))
+    settings = replace(settings, twin=not no_twin, contention=contention)
+    if check is None:
+        if out is not None:
+            check_file(out)
+        with progress("measuring") as advance:
+            measured = measure_kernels(settings, advance)
+        for table in [measured] if json_out else report.tables(measured):
+            show(table)
+        if out is not None:
+            with writing(out):
+                out.write_text(json.dumps(measured, indent=1) + "\n", encoding="utf-8")
+                out.with_suffix(".svg").write_text(report.plot(measured), encoding="utf-8")
+        return
+    if out is not None:
+        raise UsageError("give --out or --check: a check measures up to three times and keeps no table")
+    kept = guard.read_table(check)
+    settings = replace(settings, twin=False, rhythm=False, contention=False)
+    with progress("measuring") as advance:
+        compared = guard.check(lambda: measure_kernels(settings, advance), kept, tolerance)
+    show([asdict(each) for each in compared] if json_out else report.check_table(compared, tolerance))
+    slower = [f"{each.kernel} {each.ratio:.2f} times" for each in compared if each.ratio > tolerance]
+    if slower:
+        raise SagsError(f"slower than in {check}, three times in a row: {'; '.join(slower)}")
+
+
+@bench.command("alias")
+@click.option("--quick", is_flag=True, help="A tiny scene and few steps: does it work, not how good is it.")
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE.json",
+    help="Write the table as JSON.",
+)
+@click.option(
+    "--picture",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE.png",
+    help="Draw the truth, both filters and none side by side.",
+)
+@as_json
+def bench_alias(quick: bool, out: Path | None, picture: Path | None, json_out: bool) -> None:
+    """What both filters are worth at other sizes and distances.
+
+    Four models of one instant of the phantom, with each choice of filters, are drawn at 1/4 to 4 times the
+    size and from 1/2 to 4 times the distance, and compared with the ray-cast truth: PSNR, the brightness of
+    thin vessels, flicker in a slow motion. Takes about two minutes.
+
+    \b
+    sags bench alias --out benchmarks/results/alias.json --picture docs/alias.png
+    """
+    from sags_node.benchmark import alias_report
+    from sags_node.benchmark.alias import QUICK, Settings, measure_alias
+
+    for file in (out, picture):
+        if file is not None:
+            check_file(file)
+    with progress("measuring") as advance:
+        measured = measure_alias(QUICK if quick else Settings(), advance)
+    for table in [measured.table] if json_out else alias_report.tables(measured.table):
+        show(table)
+    if out is not None:
+        with writing(out):
+            out.write_text(json.dumps(measured.table, indent=1) + "\n", encoding="utf-8")
+    if picture is not None:
+        with writing(picture):
+            picture.write_bytes(alias_report.picture(measured.truth, measured.models))
+
+
 # ---- consumers -------------------------------------------------------------------------------------------
 
 

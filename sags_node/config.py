@@ -45,6 +45,7 @@ class RecordedSource(Section):
     loop: bool = False
     start: float = Field(0.0, ge=0, description="seconds to skip at the beginning")
     frames: int | None = Field(None, gt=0, description="stop after this many frames")
+    stride: int = Field(1, ge=1, description="play only each stride-th frame")
     poses: Path | None = Field(None, description="npz with T_world_cam [T, 4, 4] (m)")
     reference: ReferenceConfig = ReferenceConfig()
 
@@ -84,6 +85,29 @@ class PanesSource(RecordedSource):
     tools: Box | None = Field(None, description="pane showing the left eye with instruments painted green")
 
 
+class EndoNerfSource(RecordedSource):
+    """A clip in the layout of EndoNeRF; docs/recordings.md says what is read and how."""
+
+    kind: Literal["endonerf"] = "endonerf"
+    folder: Path = Field(description="holds images/, masks/, depth/ and poses_bounds.npy")
+    rate: float | None = Field(15.0, gt=0, description="frames per second; the files do not say it")
+    depth_unit: float = Field(1e-3, gt=0, description="metres per count of depth/; the files do not say it")
+    instruments: Literal["white", "black"] = Field("white", description="how masks/ shows them")
+    baseline: float | None = Field(
+        None,
+        gt=0,
+        le=0.5,
+        description="m between the eyes; makes images_right/ usable, the files do not say it",
+    )
+
+
+class ScaredSource(RecordedSource):
+    """One keyframe folder of SCARED; docs/recordings.md says what is read and how."""
+
+    kind: Literal["scared"] = "scared"
+    folder: Path = Field(description="dataset_D/keyframe_K, holds endoscope_calibration.yaml and data/")
+
+
 class PhantomSource(RecordedSource):
     """The built-in synthetic session; rendered once into the cache folder, then replayed."""
 
@@ -114,7 +138,14 @@ class V4l2Source(Section):
 
 
 Source = Annotated[
-    FoldersSource | VideosSource | SideBySideSource | PanesSource | PhantomSource | V4l2Source,
+    FoldersSource
+    | VideosSource
+    | SideBySideSource
+    | PanesSource
+    | EndoNerfSource
+    | ScaredSource
+    | PhantomSource
+    | V4l2Source,
     Field(discriminator="kind"),
 ]
 
@@ -164,6 +195,7 @@ class MappingConfig(Section):
     budget_ms: float = Field(33.0, gt=0, description="wall time of one frame, all stages")
     iterations: int | None = Field(None, ge=0, description="fixed steps per frame instead of the budget")
     max_gaussians: int = Field(30000, ge=100, le=2_000_000)
+    smoothing: bool = Field(True, description="the 3D filter of Mip-Splatting: nothing finer than was seen")
     skip_duplicates: bool = Field(True, description="a frame equal to its predecessor is not mapped again")
 
 
@@ -192,12 +224,13 @@ class LaunchConfig(Section):
 
 # ---- reading ---------------------------------------------------------------------------------------------
 
-_PATH_KEYS = ("rig", "video", "left", "right", "tools", "poses", "depth", "tracks")
+_PATH_KEYS = ("rig", "folder", "video", "left", "right", "tools", "poses", "depth", "tracks")
 DEFAULT_DATA = "../shared/data"
 
 
 def load_launch(path: Path | str | None = None, overrides: Sequence[str] = ()) -> LaunchConfig:
-    """Read a launch file (or a session folder that holds `launch.yaml`) and apply `key:=value` overrides.
+    """Read a launch file, or a folder that holds `launch.yaml` or a known recording, and apply `key:=value`
+    overrides.
 
     `$SAGS_DATA` and other variables are expanded; relative paths in the file are relative to the file.
     `path=None` gives the defaults: the built-in phantom session.
@@ -209,17 +242,38 @@ def load_launch(path: Path | str | None = None, overrides: Sequence[str] = ()) -
     name = "defaults"
     if path is not None:
         file = Path(path)
-        if file.is_dir():
+        recording = _known_recording(file)
+        if file.is_dir() and recording is None:
             file = file / "launch.yaml"
         name = str(file)
-        tree = _read_yaml(file)
-        _resolve_paths(tree, file.parent)
+        if recording is not None:
+            tree = recording
+        else:
+            tree = _read_yaml(file)
+            _resolve_paths(tree, file.parent)
     for override in overrides:
         _apply_override(tree, override)
     try:
         return LaunchConfig.model_validate(tree)
     except ValidationError as error:
         raise UsageError(_explain(error, name)) from None
+
+
+def _known_recording(folder: Path) -> dict[str, Any] | None:
+    """How to play a folder that is no session of ours but has the layout of a research data set."""
+    if (folder / "launch.yaml").exists():
+        return None
+    if (folder / "poses_bounds.npy").is_file() or all(
+        (folder / name).is_dir() for name in ("images", "masks")
+    ):
+        return {"source": {"kind": "endonerf", "folder": str(folder)}}
+    if (folder / "endoscope_calibration.yaml").is_file() or (folder / "data/rgb.mp4").is_file():
+        # No instrument is in view; the search for them by colour would only take tissue away.
+        return {
+            "source": {"kind": "scared", "folder": str(folder)},
+            "vision": {"tissue": {"method": "none"}},
+        }
+    return None
 
 
 def with_parameters(config: LaunchConfig, parameters: Mapping[str, Any]) -> LaunchConfig:
@@ -341,6 +395,8 @@ _SOURCES: dict[str, type[Section]] = {
     "videos": VideosSource,
     "side_by_side": SideBySideSource,
     "panes": PanesSource,
+    "endonerf": EndoNerfSource,
+    "scared": ScaredSource,
     "phantom": PhantomSource,
     "v4l2": V4l2Source,
 }

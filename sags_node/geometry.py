@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from sags_node.types import F32, F64, Camera
 
 Array = NDArray[np.floating]
+ROTATION_TOLERANCE = 1e-3  # of the elements of R R^T
 
 
 def invert(T: F64) -> F64:
@@ -21,6 +22,13 @@ def invert(T: F64) -> F64:
 def transform(T: F64, points: Array) -> Array:
     """Apply a rigid transform [4, 4] to points [..., 3]."""
     return points @ T[:3, :3].T.astype(points.dtype) + T[:3, 3].astype(points.dtype)
+
+
+def is_rotation(matrices: F64) -> NDArray[np.bool_]:
+    """Which of the matrices [..., 3, 3] are rotations, as exactly as files written by people give them."""
+    products = matrices @ np.swapaxes(matrices, -1, -2)
+    orthogonal = np.abs(products - np.eye(3)).max((-1, -2)) < ROTATION_TOLERANCE
+    return np.asarray(orthogonal & (np.linalg.det(matrices) > 0))
 
 
 def quat_to_matrix(quats: Array) -> Array:

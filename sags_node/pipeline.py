@@ -13,7 +13,16 @@ from sags_node.config import LaunchConfig
 from sags_node.engine.rasterize import make_rasterizer, to_view
 from sags_node.mapping.budget import Budget
 from sags_node.mapping.mapper import Mapper
-from sags_node.types import FrameResult, RectifiedPair, RenderedView, Snapshot, StereoFrame, StereoRig
+from sags_node.types import (
+    F32,
+    Bool,
+    FrameResult,
+    RectifiedPair,
+    RenderedView,
+    Snapshot,
+    StereoFrame,
+    StereoRig,
+)
 from sags_node.vision.observe import observe
 from sags_node.vision.rectify import Rectifier
 from sags_node.vision.stereo import StereoDepth
@@ -33,7 +42,7 @@ class Pipeline:
         self.stereo = StereoDepth(vision.stereo, self.rectifier.camera, self.rectifier.baseline)
         self._rasterizer = make_rasterizer(config.engine.backend, width, height)
         self._config = config
-        self.mapper = Mapper(self._rasterizer, config.mapping.max_gaussians)
+        self.mapper = Mapper(self._rasterizer, config.mapping.max_gaussians, config.mapping.smoothing)
         self._mapped: FrameResult | None = None  # the last frame that was really mapped
 
     def reset(self) -> None:
@@ -57,7 +66,7 @@ class Pipeline:
         with watch("mask"):
             tissue = self.tissue(frame, pair)
         with watch("depth"):
-            depth, confidence = self.stereo(pair, tissue)
+            depth, confidence = self.depth(frame, pair, tissue)
             observation = observe(pair, tissue, depth, confidence)
         with watch("map"):
             snapshot = self.mapper.update(observation, budget)
@@ -71,6 +80,13 @@ class Pipeline:
         self._mapped = FrameResult(pair, observation, snapshot, views, epoch, watch.timings_ms)
         return self._mapped
 
+    def depth(self, frame: StereoFrame, pair: RectifiedPair, tissue: Bool) -> tuple[F32, F32]:
+        """Depth and confidence [H, W]: the session's own depth, fully trusted, or else stereo."""
+        if frame.depth is None:
+            return self.stereo(pair, tissue)
+        depth = self.rectifier.depth(frame.depth) * tissue
+        return depth, (depth > 0).astype(np.float32)
+
     def _epoch(self, frame: StereoFrame) -> int:
         """Grows with the source's epochs and with every new model: ids then mean other Gaussians."""
         return frame.epoch + self.mapper.restarts
@@ -78,8 +94,8 @@ class Pipeline:
     def draw(self, snapshot: Snapshot, eye_distance: float = 0.0) -> RenderedView:
         """The snapshot as its own camera sees it, moved right by `eye_distance` metres."""
         camera = snapshot.camera.moved_right(eye_distance) if eye_distance else snapshot.camera
-        planes = self._rasterizer.forward(snapshot.gaussians, camera)
-        return to_view(planes, camera, snapshot.frame_id, snapshot.t_capture_ns)
+        planes = self._rasterizer.forward(snapshot.gaussians, [camera])
+        return to_view(planes[0], camera, snapshot.frame_id, snapshot.t_capture_ns)
 
 
 class Stopwatch:
@@ -100,6 +116,7 @@ def _rms_difference(a: RectifiedPair, b: RectifiedPair) -> float:
     squares = [
         np.mean(np.square(x[::8, ::8].astype(np.float32) - y[::8, ::8]))
         for x, y in ((a.left, b.left), (a.right, b.right))
+        if x is not None and y is not None
     ]
     return float(np.sqrt(max(squares)))
 

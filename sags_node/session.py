@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sags_node.calibration import load_rig
-from sags_node.config import LaunchConfig, PhantomSource, load_launch
+from sags_node.config import EndoNerfSource, LaunchConfig, PhantomSource, load_launch
 from sags_node.errors import UsageError
-from sags_node.sources.source import Source, open_source
+from sags_node.sources.source import Source, open_source, recorded_rig
 from sags_node.types import StereoRig
 
 
@@ -37,15 +37,30 @@ def open_session(
         SagsError: the recording or the calibration cannot be used.
     """
     config = load_launch(launch, overrides)
+    one_eyed = isinstance(config.source, EndoNerfSource) and config.source.baseline is None
+    if config.publish.right and one_eyed:
+        raise UsageError(
+            "publish.right: there is no right eye; set source.baseline, or leave publish.right out"
+        )
     if isinstance(config.source, PhantomSource):
         from sags_node.phantom import cached_session
 
         folder = cached_session(config.source, progress)
         rig = load_rig(config.rig or folder / "calib")
-    elif config.rig is None:
+    else:
+        rig = _rig(config)
+    return Session(config, rig, open_source(config.source, references=False))
+
+
+def _rig(config: LaunchConfig) -> StereoRig:
+    """The calibration that comes with the recording, or the one that the launch file names."""
+    recorded = recorded_rig(config.source)
+    if recorded is not None and config.rig is not None:
+        raise UsageError(f"rig: {config.rig} is one calibration too many: the recording brings its own")
+    if recorded is not None:
+        return recorded
+    if config.rig is None:
         raise UsageError(
             "no calibration: set rig to a folder with left.yaml and right.yaml, e.g. rig:=calib/d4d"
         )
-    else:
-        rig = load_rig(config.rig)
-    return Session(config, rig, open_source(config.source, references=False))
+    return load_rig(config.rig)

@@ -110,11 +110,12 @@ class StereoFrame:
     t_capture_ns: int  # left eye
     t_capture_right_ns: int
     left: U8  # [H, W, 3] RGB, raw
-    right: U8  # [H, W, 3] RGB, raw
+    right: U8 | None  # [H, W, 3] RGB, raw; None only where `depth` is given
     epoch: int = 0  # grows when the clock jumps back or a recording loops
     T_world_cam: F64 | None = None  # [4, 4] pose of the left rectified camera, when the session knows it
     tissue: Bool | None = None  # [H, W] raw left picture, when the session knows it
     reference: Reference | None = None
+    depth: F32 | None = None  # [H, W] m, 0 unknown, left rectified, at calibration size; instead of stereo
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +127,7 @@ class RectifiedPair:
     camera: Camera  # left eye
     baseline: float  # m
     left: U8  # [H, W, 3] RGB
-    right: U8  # [H, W, 3] RGB
+    right: U8 | None  # [H, W, 3] RGB; None where the session has no right eye
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,8 +152,10 @@ class Gaussians:
     quats: F32  # [N, 4] wxyz, any length but zero
     scales: F32  # [N, 3] m, > 0
     opacities: F32  # [N] 0..1
-    colors: F32  # [N, 3] RGB 0..1
+    colors: F32  # [N, 3] RGB 0..1, the part that does not depend on the view
     ids: I64  # [N] stable over the life of a Gaussian
+    sh_rest: F32 | None = None  # [N, K - 1, 3] real spherical harmonics of degree 1 to 3 without the constant
+    smoothing: F32 | None = None  # [N] m^2, variance of the 3D filter (Mip-Splatting), still to be applied
 
     def __len__(self) -> int:
         return len(self.means)

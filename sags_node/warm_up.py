@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from sags_node.calibration import rectified_rig
 from sags_node.config import LaunchConfig, MappingConfig, VisionConfig
 from sags_node.mapping.budget import StepBudget
 from sags_node.pipeline import Pipeline
-from sags_node.types import Eye, StereoFrame, StereoRig
+from sags_node.types import StereoFrame, StereoRig
 
 _WIDTH, _HEIGHT, _FOCAL, _BASELINE, _DISPARITY = 160, 128, 150.0, 0.0043, 8
 
@@ -37,12 +38,4 @@ def warm_up(config: LaunchConfig) -> None:
 
 def _rig() -> StereoRig:
     K = np.array([[_FOCAL, 0, _WIDTH / 2], [0, _FOCAL, _HEIGHT / 2], [0, 0, 1]])
-    P = np.column_stack([K, np.zeros(3)])
-    P_right = P.copy()
-    P_right[0, 3] = -_FOCAL * _BASELINE
-    none = np.zeros(5)
-    return StereoRig(
-        "warm-up",
-        Eye(_WIDTH, _HEIGHT, K, none, np.eye(3), P),
-        Eye(_WIDTH, _HEIGHT, K, none, np.eye(3), P_right),
-    )
+    return rectified_rig("warm-up", _WIDTH, _HEIGHT, K, _BASELINE)

@@ -1,13 +1,17 @@
 """Small scenes for the engine's tests."""
 
+import dataclasses
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sags_node.types import Camera, Gaussians
+from sags_node.engine.rasterize import Gradients, make_rasterizer
+from sags_node.types import F32, Camera, Gaussians
 
 INPUTS = ("means", "quats", "scales", "opacities", "colors")
+DERIVATIVES = tuple(field.name for field in dataclasses.fields(Gradients))
 
 
 def camera(width: int = 48, height: int = 40, focal: float = 60.0, moved: bool = False) -> Camera:
@@ -37,7 +41,7 @@ def random_gaussians(seed: int, count: int, view: Camera, spread: float = 1.0) -
         1,
     )
     means = local @ view.T_world_cam[:3, :3].T + view.T_world_cam[:3, 3]
-    spacing = 0.07 / view.K[0, 0] * math.sqrt(view.width * view.height / count)
+    spacing = 0.07 / view.K[0, 0] * math.sqrt(view.width * view.height / max(count, 1))
     return Gaussians(
         means=means.astype(np.float32),
         quats=rng.normal(size=(count, 4)).astype(np.float32),
@@ -57,6 +61,42 @@ def one_gaussian(mean: NDArray[np.floating], scale: float, opacity: float = 0.9)
         colors=np.array([[0.8, 0.5, 0.2]], np.float32),
         ids=np.zeros(1, np.int64),
     )
+
+
+def with_view_dependence(gaussians: Gaussians, degree: int, seed: int = 0) -> Gaussians:
+    """The same with spherical harmonics, strong enough to leave the range of colours."""
+    shape = (len(gaussians), (degree + 1) ** 2 - 1, 3)
+    sh_rest = np.random.default_rng(seed).normal(0, 0.4, shape).astype(np.float32)
+    return dataclasses.replace(gaussians, sh_rest=sh_rest)
+
+
+def with_filter(gaussians: Gaussians, seed: int = 0) -> Gaussians:
+    """The same with a 3D filter of up to the Gaussians' own size; the first has none."""
+    widths = gaussians.scales.mean(1) * np.random.default_rng(seed).uniform(0, 1, len(gaussians))
+    widths[:1] = 0
+    return dataclasses.replace(gaussians, smoothing=(widths**2).astype(np.float32))
+
+
+def cotangents(views: Sequence[Camera], seed: int) -> tuple[F32, F32]:
+    """Random v_planes [C, 5, H, W] and weight [C, H, W]."""
+    rng = np.random.default_rng(seed)
+    size = views[0].height, views[0].width
+    v_planes = rng.normal(size=(len(views), 5, *size)).astype(np.float32)
+    return v_planes, rng.uniform(0, 2, (len(views), *size)).astype(np.float32)
+
+
+def draw_and_differentiate(
+    gaussians: Gaussians,
+    views: Sequence[Camera],
+    backend: str = "numba",
+    seed: int = 0,
+    antialias: bool = True,
+) -> tuple[F32, dict[str, NDArray[np.floating]]]:
+    """Planes, and gradients for a random cotangent, as copies."""
+    rasterizer = make_rasterizer(backend, views[0].width, views[0].height, antialias)
+    planes = rasterizer.forward(gaussians, views).copy()
+    gradients = rasterizer.backward(*cotangents(views, seed))
+    return planes, {name: getattr(gradients, name).copy() for name in DERIVATIVES}
 
 
 def relative_error(found: NDArray[np.floating], true: NDArray[np.floating]) -> float:

@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sags_node.engine.pinhole import pack
 from sags_node.mapping import densify, motion, optimiser
-from sags_node.mapping.pinhole import pack
 from sags_node.model import deformation
 from sags_node.types import Camera
 
@@ -107,7 +107,9 @@ def test_skin_and_nearest_nodes(scene: dict[str, np.ndarray]) -> None:
     s = scene
     nodes = np.random.default_rng(7).uniform(-0.05, 0.1, (50, 3)).astype(np.float32)
     points = np.nan_to_num(s["means"])
-    compiled, source = (f(points, nodes) for f in (deformation._nearest, deformation._nearest.py_func))
+    compiled, source = (
+        f(points, nodes) for f in (deformation.nearest_nodes, deformation.nearest_nodes.py_func)
+    )
     assert np.array_equal(compiled[0], source[0])
     assert np.allclose(compiled[1], source[1], atol=1e-5)
     assert np.allclose(compiled[1].sum(1), 1, atol=1e-5)

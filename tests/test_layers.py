@@ -16,6 +16,8 @@ LAYERS = [
     {"session", "warm_up"},
     {"node"},
     {"evaluation"},
+    {"fitting"},
+    {"benchmark"},
     {"apps"},
     {"cli"},
 ]

@@ -79,22 +79,53 @@ def test_no_tissue_no_gradient() -> None:
     assert not weight.any()
 
 
-@pytest.mark.parametrize("name", ["image", "depth"])
+@pytest.mark.parametrize("where", ["image", "depth", *range(5)])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_broken_pixels_are_left_out(name: str, value: float) -> None:
+def test_broken_pixels_are_left_out(where: str | int, value: float) -> None:
     clean, broken = frame(), frame()
     for inputs in (clean, broken):
         inputs["tissue"][4, 5] = True
         inputs["planes"][4, 4, 5] = 1.0
-    broken[name][4, 5] = value
-    _, v_clean, _ = run(clean)
+        inputs["depth"][4, 5] = inputs["planes"][3, 4, 5]
+    only_depth = where in ("depth", 3)  # then the colour still counts
+    clean["depth" if only_depth else "tissue"][4, 5] = 0
+    if isinstance(where, str):
+        broken[where][4, 5] = value
+    else:
+        broken["planes"][where, 4, 5] = value
+    expected, v_clean, _ = run(clean)
     mean, v_broken, weight = run(broken)
-    assert np.isfinite(mean)
+    assert mean == expected
     assert np.isfinite(v_broken).all()
     assert np.isfinite(weight).all()
-    elsewhere = np.ones((HEIGHT, WIDTH), bool)
-    elsewhere[4, 5] = False
-    np.testing.assert_array_equal(v_broken[:, elsewhere], v_clean[:, elsewhere])
+    np.testing.assert_array_equal(v_broken, v_clean)
+
+
+@pytest.mark.parametrize(("height", "width"), [(1, 1), (1, 256), (257, 1), (16, 32)])
+def test_every_size(height: int, width: int) -> None:
+    import torch
+
+    from sags_node.engine import reference
+
+    inputs = {
+        name: np.ascontiguousarray(np.resize(array, (*array.shape[:-2], height, width)))
+        for name, array in frame().items()
+        if name != "image"
+    }
+    inputs["tissue"][0, 0], inputs["planes"][4, 0, 0] = True, 0.5
+    inputs["image"] = np.random.default_rng(1).uniform(0, 1, (height, width, 3)).astype(np.float32)
+    v_planes, weight = (
+        np.full((5, height, width), np.nan, np.float32),
+        np.full((height, width), np.nan, np.float32),
+    )
+    tissue_loss(
+        **inputs, v_planes=v_planes, weight=weight, depth_weight=DEPTH_WEIGHT, depth_scale=DEPTH_SCALE
+    )
+    planes = torch.tensor(inputs["planes"], dtype=torch.float64, requires_grad=True)
+    image, tissue, depth = (torch.tensor(inputs[name]) for name in ("image", "tissue", "depth"))
+    loss = reference.tissue_loss(planes, image, tissue, depth, DEPTH_WEIGHT, DEPTH_SCALE)
+    (true,) = torch.autograd.grad(loss, planes)
+    assert relative_error(v_planes, true.numpy()) < 1e-5
 
 
 def test_same_bits_for_one_and_all_threads() -> None:
@@ -115,7 +146,7 @@ def test_contribution_makes_the_closed_form_colour_step_converge() -> None:
     view = camera(WIDTH, HEIGHT, focal=40.0)
     gaussians = random_gaussians(3, 80, view)
     rasterizer = make_rasterizer("numba", WIDTH, HEIGHT)
-    planes = rasterizer.forward(gaussians, view)
+    (planes,) = rasterizer.forward(gaussians, [view])
     coverage = planes[4].copy()
     image = np.ascontiguousarray((planes[:3] / np.maximum(coverage, 1e-6)).transpose(1, 2, 0))
     tissue = coverage > 0.3
@@ -124,8 +155,8 @@ def test_contribution_makes_the_closed_form_colour_step_converge() -> None:
     gaussians.colors[:] = 0.5
     losses = []
     for _ in range(30):
-        planes = rasterizer.forward(gaussians, view)
+        (planes,) = rasterizer.forward(gaussians, [view])
         losses.append(tissue_loss(planes, image, tissue, unknown, v_planes, weight, 0.0, DEPTH_SCALE))
-        gradients = rasterizer.backward(v_planes, weight, geometry=False)
+        gradients = rasterizer.backward(v_planes[None], weight[None], geometry=False)
         gaussians.colors[:] -= gradients.colors / np.maximum(gradients.contribution, 1e-3)[:, None]
     assert losses[-1] < 0.15 * losses[0]

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from sags_node.types import F32, F64, Camera, Gaussians
+from sags_node.types import F32, F64, I32, Bool, Camera, Gaussians
 
 # The camera model and the limits all backends share; see Mip-Splatting (Yu et al., CVPR 2024).
 NEAR_PLANE = 1e-3  # m; nearer Gaussians are not drawn
 MIP_VARIANCE = 0.1  # px^2 added to the projected covariance (the 2D Mip filter)
+DILATION_VARIANCE = 0.3  # px^2, in its place without antialiasing: 3D Gaussian Splatting (Kerbl et al., 2023)
 MIN_ALPHA = 1.0 / 255.0  # a Gaussian is cut off where its alpha falls below this
 MAX_OPACITY = 0.999  # keeps 1 - alpha away from zero
 MIN_QUAT_NORM = 1e-12  # shorter quaternions have no direction; such Gaussians are not drawn
@@ -44,33 +46,50 @@ class Pinhole:
 
 @dataclass(frozen=True, slots=True)
 class Gradients:
-    """Derivatives with respect to what was drawn; rows of Gaussians that were not drawn are zero."""
+    """Derivatives with respect to what was drawn, summed over the cameras; rows of Gaussians that were not
+    drawn are zero."""
 
     means: F32  # [N, 3] per m
     quats: F32  # [N, 4] of the given, not normalised, quaternion
-    scales: F32  # [N, 3] per m
-    opacities: F32  # [N]
+    scales: F32  # [N, 3] per m, before the 3D filter
+    opacities: F32  # [N] before the filters
     colors: F32  # [N, 3]
+    sh_rest: F32  # [N, K - 1, 3]; [N, 0, 3] without spherical harmonics
+    poses: F64  # [C, 6] per m and per rad: of a small motion (translation, rotation vector) of each camera's
+    # view, viewmat' = exp(twist) viewmat
     contribution: F32  # [N] sum over pixels of (blending weight of this Gaussian) * (weight of the pixel)
 
 
 class Backend(Protocol):
     """One implementation of the arithmetic; `make_rasterizer` wraps it with the checks."""
 
-    def forward(self, gaussians: Gaussians, pinhole: Pinhole) -> F32: ...
+    def forward(self, gaussians: Gaussians, pinholes: Sequence[Pinhole], tiles: Bool | None) -> F32: ...
 
     def backward(self, v_planes: F32, weight: F32, geometry: bool) -> Gradients: ...
+
+    def median(self) -> tuple[F32, I32]: ...
 
 
 class Rasterizer(Protocol):
     """Draws Gaussians and differentiates the drawing. Not for use by two threads at once."""
 
-    def forward(self, gaussians: Gaussians, camera: Camera) -> F32:
-        """Draw. Returns planes [5, H, W]: sums over the Gaussians of w r, w g, w b, w z (m) and w, where
-        w = alpha * transmittance; not normalised. A view into own memory, overwritten by the next `forward`.
+    def forward(self, gaussians: Gaussians, cameras: Sequence[Camera], tiles: Bool | None = None) -> F32:
+        """Draw for one or several cameras of the same picture size, both eyes for example.
+
+        Args:
+            gaussians: what is drawn.
+            cameras: C of them.
+            tiles: [C, ceil(H / TILE_HEIGHT), ceil(W / TILE_WIDTH)] True: this tile is drawn. The pixels of
+                the others keep what the call before left there, and their part of `v_planes` is ignored.
+                None: all are drawn.
+
+        Returns:
+            Planes [C, 5, H, W]: sums over the Gaussians of w r, w g, w b, w z (m) and w, where
+            w = alpha * transmittance; not normalised. A view into own memory, overwritten by the next
+            `forward`.
 
         Raises:
-            UsageError: an array or the camera has the wrong shape or size.
+            UsageError: an array or a camera has the wrong shape or size.
             SagsError: the picture needs more memory than the engine allows itself.
         """
         ...
@@ -79,11 +98,16 @@ class Rasterizer(Protocol):
         """Gradients of sum(v_planes * planes) for the last `forward`, whose arrays must be unchanged.
 
         Args:
-            v_planes: [5, H, W] cotangent of the planes.
-            weight: [H, W] pixel weights for `Gradients.contribution`.
-            geometry: False leaves out means, quats, scales and opacities: they come back empty, [0, ...].
+            v_planes: [C, 5, H, W] cotangent of the planes.
+            weight: [C, H, W] pixel weights for `Gradients.contribution`.
+            geometry: False leaves out everything but colours and contribution: it comes back empty, [0, ...].
 
         Returns:
             Views into own memory, overwritten by the next `backward`.
         """
+        ...
+
+    def median(self) -> tuple[F32, I32]:
+        """Where the transmittance of the last `forward` falls to one half: depth [C, H, W] m and row of that
+        Gaussian [C, H, W]. Where it stays above: 0 and -1. Tiles that were not drawn keep what was there."""
         ...

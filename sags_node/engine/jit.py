@@ -1,21 +1,27 @@
 """How the CPU kernels are compiled, and the rules that make LLVM vectorise them.
 
 The rules; breaking one costs up to 5 times without any error, so time a kernel after every edit
-(`benchmarks/kernels.py`):
+(`sags bench kernels --check benchmarks/results/kernels.json`):
 
 1. Indices of inner loops are `np.uint64`, and so is every constant added to them. A signed index gets a
    wrap-around test that stops vectorisation; uint64 + int64 silently becomes float64.
 2. An inner loop works on planes of ONE scratch array at constant offsets: several arrays would need alias
    tests. Scratch comes 64-byte aligned from Python (`aligned`), and planes are padded by 64 bytes because
    streams a multiple of 4 KiB apart evict each other.
-3. Rows times columns of a tile are flattened to one loop, so that sums stay in vector registers.
+3. Sums over a tile are kept one per column, in an array of `stack_floats`: they stay in vector registers
+   and are added up once at the end.
 4. Reductions that must vectorise are sums; a max over floats does not.
 5. A record that is reached through an index is prefetched a few steps ahead.
 6. Results must not depend on the number of threads: work is cut into pieces whose result does not depend
-   on who does them, every output has one writer, and partial sums are added in a fixed order.
+   on who does them, every output has one writer, and partial sums are added in a fixed order. Which worker
+   does which piece is left open (`take`): pieces differ in cost, and another process may hold a core.
 7. The body of a `prange` loop branches little and unpacks no tuples: it calls a serial kernel for one item.
    With `continue` and `x, y = f()` in the body, Numba 0.68 shares `x` and `y` between threads, silently.
-   `tests/test_kernels.py` compares every kernel of the mapper with its own Python source.
+   `tests/test_kernels.py` compares every kernel of the mapper with its own Python source. The index of the
+   loop becomes `np.int64` before it is handed on, or all that is called compiles twice.
+8. Two conditional sums in one loop do not vectorise: write what was selected to planes, and add those up.
+9. A function with branches or loops that takes arrays counts references to them with atomic instructions,
+   5 ns each, even when inlined: in the innermost loops arrays go to intrinsics only.
 
 Numba's disk cache only sees the file a kernel stands in and the types of its arguments. So constants that
 shape a kernel stand in the same file as every kernel that uses them, and layouts shared between files are
@@ -33,6 +39,7 @@ from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
+from numba.np.arrayobj import populate_array
 from numpy.typing import DTypeLike, NDArray
 
 from sags_node.engine import threads  # noqa: F401  (fixes the threading layer before the first kernel)
@@ -91,26 +98,24 @@ def read_only(array: NDArray[T]) -> NDArray[T]:
 
 _F32 = ir.FloatType()
 _I32 = ir.IntType(32)
+_I64 = ir.IntType(64)
 
 
-@intrinsic
-def round_to_even(typing_context: Any, x: Any) -> Any:
-    """Nearest integer as float32: one vector instruction, where `round` is a call."""
+def _make_unary(name: str) -> Any:
+    def unary(typing_context: Any, x: Any) -> Any:
+        def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            return builder.call(builder.module.declare_intrinsic(name, [_F32]), args)
 
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.call(builder.module.declare_intrinsic("llvm.rint", [_F32]), args)
+        return types.float32(types.float32), generate
 
-    return types.float32(types.float32), generate
+    return unary
 
 
-@intrinsic
-def square_root(typing_context: Any, x: Any) -> Any:
-    """Square root of a float32: `np.sqrt` stays a call because it has to report negative arguments."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.call(builder.module.declare_intrinsic("llvm.sqrt", [_F32]), args)
-
-    return types.float32(types.float32), generate
+# Of a float32: one instruction, also in vectors, where the functions of Python and NumPy are calls.
+square_root = intrinsic(_make_unary("llvm.sqrt"))
+round_to_even = intrinsic(_make_unary("llvm.rint"))
+round_up = intrinsic(_make_unary("llvm.ceil"))
+round_down = intrinsic(_make_unary("llvm.floor"))
 
 
 @intrinsic
@@ -122,6 +127,56 @@ def scale_by_power_of_two(typing_context: Any, x: Any, exponent: Any) -> Any:
         return builder.bitcast(builder.add(builder.bitcast(args[0], _I32), shift), _F32)
 
     return types.float32(types.float32, types.float32), generate
+
+
+@intrinsic
+def take(typing_context: Any, counter: Any, amount: Any) -> Any:
+    """Add to the first element of an int64 array and return what it was before, in one step for all threads.
+    Free workers share out items with it: `item = take(counter, 1)` until all are taken."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        data = context.make_array(signature.args[0])(context, builder, args[0]).data
+        added = context.cast(builder, args[1], signature.args[1], types.int64)
+        return builder.atomic_rmw("add", builder.bitcast(data, _I64.as_pointer()), added, "monotonic")
+
+    return types.int64(counter, amount), generate
+
+
+@intrinsic
+def copy(typing_context: Any, to: Any, to_start: Any, source: Any, start: Any, count: Any) -> Any:
+    """to[to_start : to_start + count] = source[start : start + count] for contiguous arrays of one dimension
+    that do not overlap. A loop would have to expect that they do, and copy element by element."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        pointers = []
+        for array, position in ((0, 1), (2, 3)):
+            struct = context.make_array(signature.args[array])(context, builder, args[array])
+            pointers.append(builder.gep(struct.data, [args[position]]))
+        item = context.get_abi_sizeof(context.get_data_type(signature.args[0].dtype))
+        cgutils.raw_memcpy(builder, *pointers, args[4], item, align=item)
+        return context.get_dummy_value()
+
+    return types.void(to, to_start, source, start, count), generate
+
+
+@intrinsic(prefer_literal=True)
+def stack_floats(typing_context: Any, size: Any) -> Any:
+    """An uninitialised float32 array on the stack, of a size that the source states. Call it outside loops.
+
+    Unlike any other array it cannot overlap those of the arguments: sums kept in it stay in vector registers.
+    """
+    array = types.Array(types.float32, 1, "C")
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        count = size.literal_value
+        data = cgutils.alloca_once(builder, ir.ArrayType(_F32, count))
+        data.align = 64
+        struct = context.make_array(array)(context, builder)
+        length, item = context.get_constant(types.intp, count), context.get_constant(types.intp, 4)
+        populate_array(struct, builder.bitcast(data, _F32.as_pointer()), [length], [item], item, None)
+        return struct._getvalue()
+
+    return array(size), generate
 
 
 def _make_prefetch(write: int) -> Any:

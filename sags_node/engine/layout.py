@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-# A projected Gaussian. With d = pixel - mean2d, u = whiten_xx dx + whiten_xy dy and v = whiten_yy dy,
-# its alpha is 2**(log2_opacity - u^2 - v^2). The triangular factor of the conic is kept instead of the conic
-# because a sum of squares cannot cancel: long thin Gaussians stay exact in float32.
+# A Gaussian projected to one camera. With d = pixel - mean2d, u = whiten_xx dx + whiten_xy dy and
+# v = whiten_yy dy, its alpha is 2**(log2_opacity - u^2 - v^2). The triangular factor of the conic is kept
+# instead of the conic because a sum of squares cannot cancel: long thin Gaussians stay exact in float32.
 SPLAT = np.dtype(
     {
         "names": [
@@ -20,7 +20,7 @@ SPLAT = np.dtype(
             "whiten_xy",
             "whiten_yy",
             "log2_opacity",  # after the 2D Mip filter
-            "extent",  # largest u^2 + v^2 that is drawn; 0: this Gaussian is not drawn
+            "extent",  # largest u^2 + v^2 that is drawn; 0: this splat is not drawn
             "red",
             "green",
             "blue",
@@ -31,18 +31,21 @@ SPLAT = np.dtype(
     }
 )
 
-# One Gaussian in one tile.
+# One splat in one tile.
 PAIR = np.dtype(
     [
         ("splat", "i4"),
-        ("slot", "i4"),  # where this pair's gradient goes: pairs of one Gaussian are neighbours there
-        ("row_begin", "i4"),  # rows of the tile that the Gaussian touches
+        ("slot", "i4"),  # where this pair's gradient goes: pairs of one splat are neighbours there
+        ("row_begin", "i4"),  # rows of the tile that the splat touches
         ("row_end", "i4"),
     ]
 )
 
-# A pair before it is sorted into its tile.
-EMITTED = np.dtype([("tile", "i4"), ("splat", "i4"), ("row_begin", "i4"), ("row_end", "i4")])
+# A pair before it is sorted into its tile; it stands at its slot.
+EMITTED = np.dtype([("tile", "i4"), ("row_begin", "i2"), ("row_end", "i2")])
+
+# The slots of one splat's pairs.
+SLOTS = np.dtype([("first", "i4"), ("count", "i4")])
 
 # Sums over pixels of g = dL/d(log alpha): moments in the whitened coordinates u, v of the Gaussian.
 SPLAT_GRADIENT = np.dtype(

@@ -7,15 +7,93 @@ from typing import Any
 import numba
 import numpy as np
 
-from sags_node.engine.jit import parallel_kernel, read_only
+from sags_node.engine.jit import aligned, kernel, parallel_kernel, read_only
+from sags_node.engine.pieces import clear, load_frame, store
+from sags_node.engine.threads import thread_count
 from sags_node.types import F32, Bool
 
 f4 = np.float32
-ZERO, ONE, HALF = f4(0.0), f4(1.0), f4(0.5)
+u8 = np.uint64
+ZERO, ONE, INFINITY = f4(0.0), f4(1.0), f4(np.inf)
 COVERED = f4(0.05)  # below this coverage the normalised colour means nothing
 DEPTH_COVERED = f4(0.3)  # the same for depth
 FULL = f4(0.9)  # coverage that tissue should reach
 MAX_RESIDUAL = f4(1e3)  # also rejects NaN in the picture
+
+# Pixels are taken in pieces; a piece stands in planes of a scratch array.
+PIECE = 256
+PLANE = PIECE + 16  # 64 bytes of padding
+SCRATCH = 11 * PLANE  # floats per worker
+RED, GREEN, BLUE, DEPTH, COVERAGE = u8(0), u8(PLANE), u8(2 * PLANE), u8(3 * PLANE), u8(4 * PLANE)
+TRUE_RED, TRUE_GREEN, TRUE_BLUE, TRUE_DEPTH = u8(5 * PLANE), u8(6 * PLANE), u8(7 * PLANE), u8(8 * PLANE)
+TISSUE, WEIGHT = u8(9 * PLANE), u8(10 * PLANE)
+RESIDUAL, USED = TRUE_RED, TISSUE  # results stand where the inputs stood
+
+
+@kernel
+def _piece_loss(
+    scratch: F32,  # [SCRATCH]
+    planes: F32,  # [5, P]
+    image: F32,  # [3 P]
+    tissue: Bool,  # [P]
+    depth: F32,
+    v_planes: F32,
+    weight: F32,
+    start: Any,
+    count: int,
+    depth_weight: Any,
+    inverse_scale: Any,
+    coverage_weight: Any,
+    sums: F32,  # [2] written
+) -> None:
+    if count == PIECE:  # a constant length vectorises
+        load_frame(scratch, PLANE, planes, image, tissue, depth, start, PIECE)
+    else:
+        load_frame(scratch, PLANE, planes, image, tissue, depth, start, count)
+        clear(scratch, TISSUE, count, PIECE)
+    depth_slope = depth_weight * inverse_scale
+    for k in range(PIECE):
+        i = u8(k)
+        coverage, is_tissue = scratch[COVERAGE + i], scratch[TISSUE + i] > ZERO
+        inverse = ONE / coverage
+        c0, c1, c2 = scratch[RED + i] * inverse, scratch[GREEN + i] * inverse, scratch[BLUE + i] * inverse
+        r0, r1, r2 = c0 - scratch[TRUE_RED + i], c1 - scratch[TRUE_GREEN + i], c2 - scratch[TRUE_BLUE + i]
+        residual = abs(r0) + abs(r1) + abs(r2)
+        # selects, not branches or products: they vectorise, and keep NaN out
+        used = is_tissue & (coverage > COVERED) & (coverage < INFINITY) & (residual < MAX_RESIDUAL)
+        scratch[RESIDUAL + i] = residual if used else ZERO
+        scratch[USED + i] = ONE if used else ZERO
+        d = scratch[DEPTH + i] * inverse
+        true_depth = scratch[TRUE_DEPTH + i]
+        depth_residual = (d - true_depth) * inverse_scale
+        measured = used & (coverage > DEPTH_COVERED) & (true_depth > ZERO) & (abs(depth_residual) < INFINITY)
+        slope = min(max(depth_residual, -ONE), ONE)
+        v_red, v_green, v_blue, v_depth = (
+            inverse * r0,
+            inverse * r1,
+            inverse * r2,
+            inverse * depth_slope * slope,
+        )
+        by_color, by_depth = v_red * c0 + v_green * c1 + v_blue * c2, v_depth * d
+        scratch[RED + i] = v_red if used else ZERO
+        scratch[GREEN + i] = v_green if used else ZERO
+        scratch[BLUE + i] = v_blue if used else ZERO
+        scratch[DEPTH + i] = v_depth if measured else ZERO
+        push = coverage_weight if is_tissue & (abs(coverage) < FULL) else ZERO
+        scratch[COVERAGE + i] = -(by_color if used else ZERO) - (by_depth if measured else ZERO) - push
+        scratch[WEIGHT + i] = inverse if used else ZERO
+    residuals = pixels = ZERO
+    for k in range(PIECE):  # in the loop above, two conditional sums would not vectorise
+        residuals += scratch[RESIDUAL + u8(k)]
+        pixels += scratch[USED + u8(k)]
+    sums[0] = residuals
+    sums[1] = pixels
+    store(scratch, RED, v_planes[0], start, count)
+    store(scratch, GREEN, v_planes[1], start, count)
+    store(scratch, BLUE, v_planes[2], start, count)
+    store(scratch, DEPTH, v_planes[3], start, count)
+    store(scratch, COVERAGE, v_planes[4], start, count)
+    store(scratch, WEIGHT, weight, start, count)
 
 
 @parallel_kernel
@@ -27,44 +105,24 @@ def _tissue_loss(
     v_planes: F32,
     weight: F32,
     depth_weight: Any,
-    depth_scale: Any,
+    inverse_scale: Any,
     coverage_weight: Any,
-    row_sums: F32,  # [H, 2] written: sum of absolute colour residuals, pixels
+    scratch: F32,  # [workers, SCRATCH]
+    sums: F32,  # [pieces, 2] written: sum of absolute colour residuals, pixels
 ) -> None:
-    _, height, width = planes.shape
-    inverse_scale = ONE / depth_scale
-    for y in numba.prange(height):
-        residuals = ZERO
-        pixels = ZERO
-        for x in range(width):
-            coverage = planes[4, y, x]
-            covered = tissue[y, x] and coverage > COVERED
-            inverse = ONE / coverage if covered else ZERO
-            c0, c1, c2 = planes[0, y, x] * inverse, planes[1, y, x] * inverse, planes[2, y, x] * inverse
-            r0, r1, r2 = c0 - image[y, x, 0], c1 - image[y, x, 1], c2 - image[y, x, 2]
-            residual = abs(r0) + abs(r1) + abs(r2)
-            used = covered and residual < MAX_RESIDUAL
-            share = inverse if used else ZERO
-            r0, r1, r2 = (r0, r1, r2) if used else (ZERO, ZERO, ZERO)
-            residuals += residual if used else ZERO
-            pixels += ONE if used else ZERO
-            v_coverage = -share * (r0 * c0 + r1 * c1 + r2 * c2)
-            v_depth = ZERO
-            if used and coverage > DEPTH_COVERED and depth[y, x] > ZERO:
-                d = planes[3, y, x] * inverse
-                slope = min(max((d - depth[y, x]) * inverse_scale, -ONE), ONE)
-                v_depth = depth_weight * inverse_scale * slope * inverse
-                v_coverage -= v_depth * d
-            if tissue[y, x] and coverage < FULL:
-                v_coverage -= coverage_weight
-            v_planes[0, y, x] = share * r0
-            v_planes[1, y, x] = share * r1
-            v_planes[2, y, x] = share * r2
-            v_planes[3, y, x] = v_depth
-            v_planes[4, y, x] = v_coverage
-            weight[y, x] = share
-        row_sums[y, 0] = residuals
-        row_sums[y, 1] = pixels
+    pixels = tissue.size
+    workers = scratch.shape[0]
+    flat_planes, flat_v_planes = planes.reshape(5, pixels), v_planes.reshape(5, pixels)
+    flat_image, flat_tissue = image.reshape(3 * pixels), tissue.reshape(pixels)
+    flat_depth, flat_weight = depth.reshape(pixels), weight.reshape(pixels)
+    for worker in numba.prange(workers):
+        for p in range(worker, sums.shape[0], workers):
+            _piece_loss(
+                scratch[worker],
+                flat_planes, flat_image, flat_tissue, flat_depth, flat_v_planes, flat_weight,
+                u8(p * PIECE), min(PIECE, pixels - p * PIECE),
+                depth_weight, inverse_scale, coverage_weight, sums[p],
+            )  # fmt: skip
 
 
 def tissue_loss(
@@ -103,7 +161,7 @@ def tissue_loss(
         Mean absolute colour residual over the tissue pixels that count; 0 if there are none. It does not
         depend on the number of threads.
     """
-    row_sums = np.empty((planes.shape[1], 2), np.float32)
+    sums = np.empty((-(-tissue.size // PIECE), 2), np.float32)
     _tissue_loss(
         read_only(planes),
         read_only(image),
@@ -112,9 +170,10 @@ def tissue_loss(
         v_planes,
         weight,
         f4(depth_weight),
-        f4(depth_scale),
+        f4(1.0 / depth_scale),
         f4(coverage_weight),
-        row_sums,
+        aligned((thread_count(), SCRATCH)),
+        sums,
     )
-    residuals, pixels = row_sums.sum(axis=0, dtype=np.float64)
+    residuals, pixels = sums.sum(axis=0, dtype=np.float64)
     return float(residuals / (3.0 * pixels)) if pixels > 0 else 0.0

@@ -6,20 +6,31 @@ those of the rasterisers (first pixel at (0.5, 0.5)).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
+from sags_node.engine.compositing import TILE_HEIGHT, TILE_WIDTH
 from sags_node.engine.interface import Backend, Gradients, Pinhole, Rasterizer
 from sags_node.engine.jit import read_only
 from sags_node.engine.views import to_view
 from sags_node.errors import UsageError
-from sags_node.types import F32, Camera, Gaussians, RenderedView
+from sags_node.types import F32, I32, Bool, Camera, Gaussians, RenderedView
 
-__all__ = ["Gradients", "Rasterizer", "make_rasterizer", "rasterize", "to_view"]
+SH_TERMS = (0, 3, 8, 15)  # spherical harmonics of degree 0 to 3 without the constant
+
+__all__ = ["TILE_HEIGHT", "TILE_WIDTH", "Gradients", "Rasterizer", "make_rasterizer", "rasterize", "to_view"]
 
 
-def make_rasterizer(backend: str, width: int, height: int) -> Rasterizer:
-    """A rasteriser for pictures of one size (px). `backend`: "numba" (fast) or "reference" (torch, slow).
+def make_rasterizer(backend: str, width: int, height: int, antialias: bool = True) -> Rasterizer:
+    """A rasteriser for pictures of one size (px).
+
+    Args:
+        backend: "numba" (fast) or "reference" (torch, slow).
+        width, height: px.
+        antialias: the 2D filter of Mip-Splatting. False: the fixed dilation of 3D Gaussian Splatting in its
+            place, which grows brighter and thicker when the picture gets smaller. For comparison only.
 
     Raises:
         UsageError: unknown backend or an empty picture.
@@ -29,11 +40,11 @@ def make_rasterizer(backend: str, width: int, height: int) -> Rasterizer:
     if backend == "numba":
         from sags_node.engine.numba_rasterizer import NumbaRasterizer
 
-        return _CheckedRasterizer(NumbaRasterizer(width, height), width, height)
+        return _CheckedRasterizer(NumbaRasterizer(width, height, antialias), width, height)
     if backend == "reference":
         from sags_node.engine.reference import ReferenceRasterizer
 
-        return _CheckedRasterizer(ReferenceRasterizer(), width, height)
+        return _CheckedRasterizer(ReferenceRasterizer(antialias), width, height)
     raise UsageError(f"unknown engine backend '{backend}'; choose numba or reference")
 
 
@@ -51,7 +62,7 @@ def rasterize(
         UsageError: an array or the camera has the wrong shape or size.
     """
     rasterizer = make_rasterizer(backend, camera.width, camera.height)
-    return to_view(rasterizer.forward(gaussians, camera), camera, frame_id, t_capture_ns)
+    return to_view(rasterizer.forward(gaussians, [camera])[0], camera, frame_id, t_capture_ns)
 
 
 class _CheckedRasterizer:
@@ -60,24 +71,40 @@ class _CheckedRasterizer:
     def __init__(self, backend: Backend, width: int, height: int) -> None:
         self._backend = backend
         self._width, self._height = width, height
-        self._drawn = False
+        self._drawn = 0  # cameras of the last forward
 
-    def forward(self, gaussians: Gaussians, camera: Camera) -> F32:
-        if (camera.width, camera.height) != (self._width, self._height):
+    def forward(self, gaussians: Gaussians, cameras: Sequence[Camera], tiles: Bool | None = None) -> F32:
+        if not cameras:
+            raise UsageError("no camera was given; forward takes one or several")
+        for camera in cameras:
+            if (camera.width, camera.height) != (self._width, self._height):
+                raise UsageError(
+                    f"this rasteriser draws {self._width}x{self._height} px, "
+                    f"the camera has {camera.width}x{camera.height}; make one for its size"
+                )
+        shape = (len(cameras), -(-self._height // TILE_HEIGHT), -(-self._width // TILE_WIDTH))
+        if tiles is not None and (tiles.shape != shape or tiles.dtype != np.bool_):
             raise UsageError(
-                f"this rasteriser draws {self._width}x{self._height} px, "
-                f"the camera has {camera.width}x{camera.height}; make one for its size"
+                f"tiles is {tiles.dtype} {list(tiles.shape)}, expected bool {list(shape)}: one for each "
+                f"{TILE_WIDTH}x{TILE_HEIGHT} px of each camera"
             )
-        planes = self._backend.forward(_checked(gaussians), _as_pinhole(camera))
-        self._drawn = True
+        planes = self._backend.forward(
+            _checked(gaussians), [_as_pinhole(camera) for camera in cameras], tiles
+        )
+        self._drawn = len(cameras)
         return planes
 
     def backward(self, v_planes: F32, weight: F32, geometry: bool = True) -> Gradients:
         if not self._drawn:
             raise UsageError("nothing was drawn yet; call forward before backward")
-        v_planes = _as_f32(v_planes, (5, self._height, self._width), "v_planes")
-        weight = _as_f32(weight, (self._height, self._width), "weight")
+        v_planes = _as_f32(v_planes, (self._drawn, 5, self._height, self._width), "v_planes")
+        weight = _as_f32(weight, (self._drawn, self._height, self._width), "weight")
         return self._backend.backward(v_planes, weight, geometry)
+
+    def median(self) -> tuple[F32, I32]:
+        if not self._drawn:
+            raise UsageError("nothing was drawn yet; call forward before median")
+        return self._backend.median()
 
 
 def _as_pinhole(camera: Camera) -> Pinhole:
@@ -112,7 +139,20 @@ def _checked(gaussians: Gaussians) -> Gaussians:
         opacities=_as_f32(gaussians.opacities, (n,), "opacities"),
         colors=_as_f32(gaussians.colors, (n, 3), "colors"),
         ids=gaussians.ids,
+        sh_rest=_checked_harmonics(gaussians.sh_rest, n),
+        smoothing=None if gaussians.smoothing is None else _as_f32(gaussians.smoothing, (n,), "smoothing"),
     )
+
+
+def _checked_harmonics(sh_rest: F32 | None, n: int) -> F32 | None:
+    """None where there is no view dependence."""
+    if sh_rest is None or sh_rest.shape == (n, 0, 3):
+        return None
+    if sh_rest.ndim != 3 or sh_rest.shape[1] not in SH_TERMS:
+        raise UsageError(
+            f"sh_rest has shape {list(sh_rest.shape)}, expected [{n}, K, 3] with K one of {SH_TERMS}"
+        )
+    return _as_f32(sh_rest, (n, sh_rest.shape[1], 3), "sh_rest")
 
 
 def _as_f32(array: NDArray[np.floating], shape: tuple[int, ...], name: str) -> F32:

@@ -10,6 +10,10 @@ spinning. On free cores that costs nothing measurable; when another process or t
 worker keeps it from the one everybody waits for, and a frame takes up to 2.5 times longer. OpenMP reads this
 when its library is loaded: import this module before torch.
 
+Place: left to the system. Some schedulers pack threads that were asleep onto one core, and a drawing right
+after a pause then takes twice as long. Pinning a thread and its workers to cores of their own mends that for
+a kernel alone, but cost the whole node 5 to 25 % of its rate: its other threads want the same cores.
+
 Count: Numba keeps it per Python thread, and a new thread starts with all cores of the process.
 """
 

@@ -17,7 +17,7 @@ from sags_node.evaluation.lpips import Lpips
 from sags_node.evaluation.spool import RunFacts, Spool, SpooledFrame
 from sags_node.evaluation.tracking import PointTracks, TrackErrors
 from sags_node.evaluation.views import extrapolated, right_eye_mask
-from sags_node.types import F32, Bool, Camera, Gaussians, RectifiedPair, Reference, StereoFrame
+from sags_node.types import F32, U8, Bool, Camera, Gaussians, RectifiedPair, Reference, StereoFrame
 from sags_node.vision.rectify import Rectifier
 
 Figures = dict[str, float]
@@ -129,8 +129,8 @@ class Measurer:
         figures = {"online": self._quality(metrics.as_float(shown.rgb), truth, shown.tissue, costly)}
         if self._before is not None:
             figures["predict"] = self._predict(self._before, shown, truth, seconds)
-        if costly:
-            figures["novel"] = {"psnr": self._novel(shown, pair, frame)}
+        if costly and pair.right is not None:
+            figures["novel"] = {"psnr": self._novel(shown, pair.right, frame)}
         track = None
         if frame.reference is not None:
             if frame.reference.depth is not None:
@@ -168,9 +168,9 @@ class Measurer:
         return figures
 
     def _draw(self, gaussians: Gaussians, camera: Camera) -> F32:
-        return to_view(self._rasterizer.forward(gaussians, camera), camera, 0, 0).rgb
+        return to_view(self._rasterizer.forward(gaussians, [camera])[0], camera, 0, 0).rgb
 
-    def _novel(self, shown: SpooledFrame, pair: RectifiedPair, frame: StereoFrame) -> float:
+    def _novel(self, shown: SpooledFrame, picture: U8, frame: StereoFrame) -> float:
         """PSNR of the right eye's picture, which the mapper never saw, after a fit of gain and offset."""
         if self._usable_right is None:
             self._usable_right = self._right_pixels(frame)
@@ -178,15 +178,17 @@ class Measurer:
         mask = right_eye_mask(shown.tissue, shown.depth, float(camera.K[0, 0]), shown.baseline)
         mask &= self._usable_right
         right = self._draw(shown.snapshot.gaussians, camera.moved_right(shown.baseline))
-        truth = metrics.as_float(pair.right)
+        truth = metrics.as_float(picture)
         return metrics.psnr(metrics.fit_gain_offset(right, truth, mask), truth, mask)
 
     def _right_pixels(self, frame: StereoFrame) -> Bool:
         """Where the rectified right picture shows the raw one, without the boxes left out."""
-        white = np.full_like(frame.right, 255)
+        white = np.full_like(frame.left, 255)
         for x, y, width, height in self._exclude:
             white[y : y + height, x : x + width] = 0
-        usable: Bool = (self._rectifier(replace(frame, right=white)).right == 255).all(-1)
+        rectified = self._rectifier(replace(frame, right=white)).right
+        assert rectified is not None
+        usable: Bool = (rectified == 255).all(-1)
         return usable
 
     def _follow(self, shown: SpooledFrame, reference: Reference) -> TrackErrors | None:

@@ -164,8 +164,8 @@ class Spool:
         camera = snapshot.camera
         if self._rasterizer is None:
             self._rasterizer = make_rasterizer(self._backend, camera.width, camera.height)
-        planes = self._rasterizer.forward(snapshot.gaussians, camera)
-        return to_view(planes, camera, snapshot.frame_id, snapshot.t_capture_ns)
+        planes = self._rasterizer.forward(snapshot.gaussians, [camera])
+        return to_view(planes[0], camera, snapshot.frame_id, snapshot.t_capture_ns)
 
     def _file(self, place: int) -> Path:
         return self.folder / f"{place:06d}.frame"

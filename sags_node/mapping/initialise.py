@@ -8,21 +8,26 @@ import numpy as np
 
 from sags_node.engine.jit import kernel
 from sags_node.geometry import unproject
+from sags_node.model.alias_free import smoothing_variances
 from sags_node.model.gaussians import GaussianModel
 from sags_node.types import F32, I32, Observation
 
 SCALE_PER_SPACING = 0.4  # of the distance between neighbours; measured best (0.3-0.5), 0.8 loses 4 dB
 FLATNESS = 0.5  # the extent along the ray against the extent across it
 OPACITY = 0.9
+LEAST_SHARE = 0.3  # of the drawn scale that is left when the 3D filter's share is taken off
 REACH = 48  # px: how far a pixel without depth looks for one
 INITIAL_SHARE = 0.75  # of the cap used by the first frame; the rest is for what appears later
 
 
-def insert(model: GaussianModel, observation: Observation, pixels: I32, z: F32, spacing: float) -> slice:
+def insert(
+    model: GaussianModel, observation: Observation, pixels: I32, z: F32, spacing: float, smoothing: bool
+) -> slice:
     """Add one Gaussian for each pixel [M, 2] (x, y), coloured by the picture, at depth `z` [M] m.
 
     Args:
-        spacing: px between neighbouring pixels of the list; it sets the scales.
+        spacing: px between neighbouring pixels of the list; it sets the scales as they are drawn.
+        smoothing: give them the 3D filter.
 
     Returns:
         The new rows of the model.
@@ -32,7 +37,11 @@ def insert(model: GaussianModel, observation: Observation, pixels: I32, z: F32, 
     across = SCALE_PER_SPACING * spacing * z / np.float32(camera.K[0, 0])
     scales = np.stack([across, across, FLATNESS * across], 1).astype(np.float32)
     means = unproject(camera, pixels.astype(np.float32), z).astype(np.float32)
-    return model.append(means, scales, observation.image[y, x], OPACITY)
+    variances = smoothing_variances(means, [camera]) if smoothing else np.zeros(len(means), np.float32)
+    scales = np.sqrt(np.maximum(scales**2 - variances[:, None], (LEAST_SHARE * scales) ** 2))
+    rows = model.append(means, scales, observation.image[y, x], OPACITY)
+    model.smoothing[rows] = variances[: rows.stop - rows.start]
+    return rows
 
 
 def first_pixels(observation: Observation, limit: int) -> tuple[I32, F32, float]:

@@ -12,6 +12,7 @@ from sags_node.mapping import densify, initialise
 from sags_node.mapping.budget import Budget
 from sags_node.mapping.motion import OpticalFlow, scene_flow
 from sags_node.mapping.optimiser import Optimiser, Rates
+from sags_node.model.alias_free import smoothing_variances
 from sags_node.model.deformation import Deformation, NodeDeformation
 from sags_node.model.gaussians import GaussianModel
 from sags_node.types import F32, Observation, RenderedView, Snapshot
@@ -43,11 +44,13 @@ class Mapper:
     lasts. The order and the constants follow a measured design; see `benchmarks/`.
     """
 
-    def __init__(self, rasterizer: Rasterizer, max_gaussians: int) -> None:
+    def __init__(self, rasterizer: Rasterizer, max_gaussians: int, smoothing: bool = True) -> None:
+        """`smoothing`: draw the Gaussians with the 3D filter (`model.alias_free`)."""
         self.model = GaussianModel(max_gaussians)
         self.step = 0
         self.restarts = 0  # how often a new model was begun because the old one did not fit any more
         self._rasterizer = rasterizer
+        self._smoothing = smoothing
         self._optimiser = Optimiser()
         self._flow = OpticalFlow()
         self._deformation: Deformation | None = None
@@ -96,7 +99,7 @@ class Mapper:
             return {"inserted": 0}  # a black or covered picture: try again with the next frame
         limit = int(initialise.INITIAL_SHARE * self.model.capacity)
         pixels, depths, spacing = initialise.first_pixels(observation, limit)
-        rows = initialise.insert(self.model, observation, pixels, depths, spacing)
+        rows = initialise.insert(self.model, observation, pixels, depths, spacing, self._smoothing)
         self._deformation = NodeDeformation(self.model.means, CONTROL_NODES)
         self._deformation.attach(self.model, rows)
         for _ in range(INITIAL_STEPS):
@@ -107,6 +110,8 @@ class Mapper:
         assert self._deformation is not None
         self._predict(observation)
         removed = self.model.remove(densify.doomed(self.model, observation))
+        if self._smoothing:
+            self._sharpen(observation)
 
         planes = self._draw(observation)
         if _is_lost(planes, observation) and self._can_start(observation):
@@ -117,7 +122,7 @@ class Mapper:
         if budget.more():  # before inserting, so that the drawing above serves both
             self._refine(observation, planes, Rates())
             iterations = 1
-        rows = initialise.insert(self.model, observation, pixels, depths, densify.GRID)
+        rows = initialise.insert(self.model, observation, pixels, depths, densify.GRID, self._smoothing)
         self._deformation.attach(self.model, rows)
         while budget.more():
             self._refine(observation, self._draw(observation), Rates())
@@ -138,12 +143,19 @@ class Mapper:
         if seconds > 0:
             self.model.velocities[:] = (self.model.means - start) / np.float32(seconds)
 
+    def _sharpen(self, observation: Observation) -> None:
+        """Narrow the 3D filter of what this camera sees finer than any before. What is out of view keeps its
+        filter. The right eye has the left's depths and so its sampling rates."""
+        variances = smoothing_variances(self.model.means, [observation.camera])
+        np.minimum(self.model.smoothing, variances, out=self.model.smoothing)
+
     def _can_start(self, observation: Observation) -> bool:
         """Whether this frame has depth enough for a first model."""
         return bool(np.count_nonzero(observation.depth) >= MIN_FIRST_DEPTHS)
 
     def _draw(self, observation: Observation) -> F32:
-        return self._rasterizer.forward(self.model.gaussians(), observation.camera)
+        planes: F32 = self._rasterizer.forward(self.model.gaussians(), [observation.camera])[0]
+        return planes
 
     def _refine(self, observation: Observation, planes: F32, rates: Rates) -> None:
         """One step: loss and its gradient, back-propagation, nodes, Gaussians."""
@@ -155,7 +167,7 @@ class Mapper:
             planes, observation.image, observation.tissue, observation.depth,
             self._v_planes, self._weight, DEPTH_WEIGHT, DEPTH_SCALE,
         )  # fmt: skip
-        gradients = self._rasterizer.backward(self._v_planes, self._weight)
+        gradients = self._rasterizer.backward(self._v_planes[None], self._weight[None])
         self._deformation.descend(
             self.model, gradients.means, gradients.contribution, NODE_STEP_PX * self._metres_per_px
         )

@@ -9,7 +9,7 @@ import numpy as np
 from numba import prange
 
 from sags_node.engine.jit import kernel, parallel_kernel
-from sags_node.mapping.pinhole import pack, to_camera, to_pixel
+from sags_node.engine.pinhole import pack, to_camera, to_pixel
 from sags_node.types import F32, U8, Bool, Observation, RenderedView
 
 DEPTH_GATE = 0.13  # of the depth: a larger innovation is another surface, not this one

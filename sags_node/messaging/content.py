@@ -79,6 +79,7 @@ def _depth(depth: F32) -> F32:
 
 
 def _right_image(result: FrameResult) -> Content:
+    assert result.pair.right is not None  # publish.right is refused where there is no right eye
     return cdr.image(result.pair.right, "rgb8", result.pair.t_capture_ns, cdr.RIGHT_FRAME)
 
 

@@ -65,11 +65,11 @@ class NodeDeformation:
         means = model.means[rows]
         if len(means) == 0:
             return
-        index, weight, distance = _nearest(means, self.nodes)
+        index, weight, distance = nearest_nodes(means, self.nodes)
         far = distance > _NEW_NODE_DISTANCE * self.spacing
         if far.any() and len(self.nodes) < self._most:
             self._add_nodes(_cell_centres(means[far], self.spacing))
-            index, weight, _ = _nearest(means, self.nodes)
+            index, weight, _ = nearest_nodes(means, self.nodes)
         model.node_index[rows] = index
         model.node_weight[rows] = weight
 
@@ -108,6 +108,11 @@ class NodeDeformation:
         return np.argsort(squared, axis=1)[:, :k].astype(np.int32)
 
 
+def spread_nodes(means: F32, count: int) -> F32:
+    """About `count` places [M, 3] m spread evenly over points [N, 3] m."""
+    return _cell_centres(means, _spacing_for(means, count))
+
+
 def _spacing_for(means: F32, count: int) -> float:
     """Cell size that gives about `count` occupied cells (bisection: the surface may have any shape)."""
     low, high = 1e-5, float(np.ptp(means, axis=0).max()) + 1e-5
@@ -128,7 +133,7 @@ def _cell_centres(means: F32, cell: float) -> F32:
 
 
 @parallel_kernel
-def _nearest(points: F32, nodes: F32) -> tuple[I32, F32, F32]:
+def nearest_nodes(points: F32, nodes: F32) -> tuple[I32, F32, F32]:
     """Indices [N, 4], skinning weights [N, 4] and distance [N] of the nearest nodes.
 
     The weights fall off as a Gaussian whose width is the mean distance, so they are smooth and scale-free.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from sags_node.engine.smoothing import folded
 from sags_node.types import F32, I64, Gaussians
 
 NEIGHBOURS = 4  # control nodes a Gaussian follows
@@ -30,9 +31,10 @@ class GaussianModel:
             "means": rows(3),  # m, world
             "quats": rows(4),  # wxyz
             "log_scales": rows(3),
-            "scales": rows(3),  # m
+            "scales": rows(3),  # m, before the 3D filter
+            "smoothing": rows(),  # m^2, variance of the 3D filter; 0: off
             "opacity_logits": rows(),
-            "opacities": rows(),
+            "opacities": rows(),  # before the 3D filter
             "colors": rows(3),
             "velocities": rows(3),  # m/s, world
             "ids": np.zeros(capacity, np.int64),
@@ -101,18 +103,28 @@ class GaussianModel:
 
     def gaussians(self) -> Gaussians:
         """Views of the live rows, for drawing now."""
-        return Gaussians(self.means, self.quats, self.scales, self.opacities, self.colors, self._ids())
+        return Gaussians(
+            self.means,
+            self.quats,
+            self.scales,
+            self.opacities,
+            self.colors,
+            self._ids(),
+            None,
+            self.smoothing,
+        )
 
     def frozen(self) -> Gaussians:
-        """Copies of the live rows, for publishing."""
-        live = self.gaussians()
+        """Copies of the live rows, for publishing, with the 3D filter folded in: any renderer draws the same
+        picture."""
+        drawn = folded(self.gaussians())
         return Gaussians(
-            live.means.copy(),
-            live.quats.copy(),
-            live.scales.copy(),
-            live.opacities.copy(),
-            live.colors.copy(),
-            live.ids.copy(),
+            self.means.copy(),
+            self.quats.copy(),
+            drawn.scales,
+            drawn.opacities,
+            self.colors.copy(),
+            self._ids().copy(),
         )
 
     def _ids(self) -> I64:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sags_node.engine.smoothing import folded
 from sags_node.errors import SagsError
 from sags_node.types import Gaussians
 
@@ -17,11 +18,13 @@ _FIELDS = (
 
 def write_ply(path: Path, gaussians: Gaussians) -> None:
     """Write a binary PLY in the layout of 3D Gaussian Splatting (Kerbl et al., 2023): log scales, opacity
-    logits, quaternions wxyz, colours as degree-0 spherical harmonics; metres.
+    logits, quaternions wxyz, colours as degree-0 spherical harmonics; metres. The 3D filter is folded in:
+    viewers do not know it.
 
     Raises:
         SagsError: the file exists already (nothing is overwritten) or cannot be written.
     """
+    gaussians = folded(gaussians)
     opacities = np.clip(gaussians.opacities, 1e-6, 1 - 1e-6)
     quats = gaussians.quats / np.linalg.norm(gaussians.quats, axis=1, keepdims=True)
     columns = np.concatenate(

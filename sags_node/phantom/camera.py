@@ -44,17 +44,7 @@ def _shade(rays: F32, hits: Hits, bodies: Bodies, relief: Relief, skin: Skin, la
     distance = np.where(np.isfinite(hits.distance), hits.distance, np.float32(1))
     points = np.asarray(rays[..., :3] + distance[..., None] * directions, np.float32)
     view = -normalized(directions)
-
-    place = grid_position(hits, len(relief.x))
-    normals = normalized(cv2.remap(bodies.normals, place, None, cv2.INTER_LINEAR))
-    material = place * np.float32(SPACING) + np.array(
-        [relief.x[0] - skin.x0, relief.y[0] - skin.y0], np.float32
-    )
-    texel = material / np.float32(skin.texel)
-    color = cv2.remap(skin.color, texel, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    surface = cv2.remap(skin.surface, texel, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    picture = shade_tissue(points, normals, view, color, surface, lamp, _lit(points, bodies, lamp))
-    picture[~hits.tissue] = _NOTHING
+    picture = shine(points, view, hits, bodies, relief, skin, lamp, _lit(points, bodies, lamp))
 
     if hits.tool.any():
         tools = bodies.tools
@@ -66,6 +56,29 @@ def _shade(rays: F32, hits: Hits, bodies: Bodies, relief: Relief, skin: Skin, la
         picture[hits.tool] = shade_metal(
             points[hits.tool], smooth.astype(np.float32), view[hits.tool], materials, lamp
         )
+    return picture
+
+
+def shine(
+    points: F32, view: F32, hits: Hits, bodies: Bodies, relief: Relief, skin: Skin, lamp: Lamp, lit: F32
+) -> F32:
+    """Linear light [..., 3] of the tissue at the hits of rays; what hit none is nearly dark.
+
+    Args:
+        points: [..., 3] where the rays hit, m, world.
+        view: [..., 3] unit vectors towards the eye.
+        lit: [...] share of the lamp's light that arrives.
+    """
+    place = grid_position(hits, len(relief.x))
+    normals = normalized(cv2.remap(bodies.normals, place, None, cv2.INTER_LINEAR))
+    material = place * np.float32(SPACING) + np.array(
+        [relief.x[0] - skin.x0, relief.y[0] - skin.y0], np.float32
+    )
+    texel = material / np.float32(skin.texel)
+    color = cv2.remap(skin.color, texel, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    surface = cv2.remap(skin.surface, texel, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    picture = shade_tissue(points, normals, view, color, surface, lamp, lit)
+    picture[~hits.tissue] = _NOTHING
     return picture
 
 

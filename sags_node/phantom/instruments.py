@@ -46,6 +46,9 @@ class Mesh:
     materials: F64  # [F, 4] reflectance RGB, mirror share
 
 
+NOTHING = Mesh(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3), np.int64), np.zeros((0, 4)))
+
+
 @dataclass(frozen=True, slots=True)
 class _Part:
     mesh: Mesh

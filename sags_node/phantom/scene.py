@@ -10,13 +10,14 @@ from sags_node.config import PhantomSource
 from sags_node.geometry import invert, transform
 from sags_node.phantom.camera import add_smoke, expose, look, world_rays
 from sags_node.phantom.casting import Bodies
-from sags_node.phantom.instruments import Instruments
+from sags_node.phantom.instruments import NOTHING, Instruments
 from sags_node.phantom.motion import Clock, scope_pose
 from sags_node.phantom.noise import fractal_noise
 from sags_node.phantom.relief import BED_DEPTH, make_relief
 from sags_node.phantom.rig import phantom_rig, raw_rays, rectified_rays
 from sags_node.phantom.shading import Lamp
 from sags_node.phantom.skin import paint_skin
+from sags_node.phantom.still import Still
 from sags_node.phantom.tissue import Tissue
 from sags_node.types import F32, F64, U8, Bool
 
@@ -93,6 +94,13 @@ class Phantom:
             visible=self._visible(bodies, points, T_world_cam),
             T_world_cam=T_world_cam,
         )
+
+    def still(self, phase: float) -> Still:
+        """The tissue alone at a phase 0..1 of the session, as the left rectified camera there sees it."""
+        T_world_cam = scope_pose(phase, self._config.camera_motion)
+        bodies = Bodies(self._tissue, self._tissue.vertices(phase), NOTHING)
+        lamp = Lamp.at_tip(T_world_cam, self.rig.baseline)
+        return Still(bodies, self._relief, self._skin, lamp, eye=T_world_cam[:3, 3])
 
     def _visible(self, bodies: Bodies, points: F64, T_world_cam: F64) -> Bool:
         """Inside the left rectified picture and not behind anything, [P]."""

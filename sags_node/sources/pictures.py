@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from sags_node.errors import SagsError, UsageError
-from sags_node.types import U8, Bool
+from sags_node.types import F32, F64, U8, Bool, Reference
 
 log = logging.getLogger(__name__)
 
@@ -22,15 +22,22 @@ LONGEST_PADDING = 512  # bytes some cameras write after the end of a picture
 
 
 class RawPair(NamedTuple):
-    """One moment of a recording, before it gets its stamps."""
+    """One moment of a recording, before it gets its stamps; the fields are those of `StereoFrame`."""
 
     left: U8  # [H, W, 3] RGB
-    right: U8  # [H, W, 3] RGB
+    right: U8 | None  # [H, W, 3] RGB
     tissue: Bool | None  # [H, W] of the left picture
+    depth: F32 | None = None  # [H, W] m
+    T_world_cam: F64 | None = None  # [4, 4] m
+    reference: Reference | None = None
 
 
 class FolderPairs:
-    """Pictures of two folders, paired by sorted name (numbers in names sort as numbers).
+    """Pictures of two folders, paired by sorted name (numbers in names sort as numbers), or of the left one.
+
+    Attributes:
+        files: the left pictures in order.
+        size: width and height of all pictures, px.
 
     Raises:
         UsageError: a folder is missing or empty, or the folders do not fit each other.
@@ -38,16 +45,17 @@ class FolderPairs:
 
     rate: float | None = None  # folders do not know it
 
-    def __init__(self, left: Path, right: Path, tools: Path | None = None) -> None:
-        self._left = list_pictures(left)
-        self._right = list_pictures(right)
+    def __init__(self, left: Path, right: Path | None, tools: Path | None = None) -> None:
+        self.files = list_pictures(left)
+        self._right = None if right is None else list_pictures(right)
         self._tools = None if tools is None else list_pictures(tools)
-        _check_counts(left, self._left, right, self._right)
+        if right is not None and self._right is not None:
+            check_counts(left, self.files, right, self._right)
+            _warn_of_gaps(self.files, self._right)
         if tools is not None and self._tools is not None:
-            _check_counts(left, self._left, tools, self._tools)
-        _warn_of_gaps(self._left, self._right)
-        self.count = len(self._left)
-        self._size = _size(read_picture(self._left[0]))
+            check_counts(left, self.files, tools, self._tools)
+        self.count = len(self.files)
+        self.size = _size(read_picture(self.files[0]))
         self._next = 0
         self.read()  # the first pair shows whether the eyes fit each other
         self.seek(0)
@@ -69,8 +77,8 @@ class FolderPairs:
         if index >= self.count:
             return None
         self._next += 1
-        left = self._picture(self._left[index])
-        right = self._picture(self._right[index])
+        left = self._picture(self.files[index])
+        right = None if self._right is None else self._picture(self._right[index])
         tissue = None
         if self._tools is not None:
             tissue = self._picture(self._tools[index], cv2.IMREAD_GRAYSCALE) < 128
@@ -81,9 +89,9 @@ class FolderPairs:
 
     def _picture(self, file: Path, flags: int = cv2.IMREAD_COLOR) -> U8:
         picture = read_picture(file, flags)
-        if _size(picture) != self._size:
+        if _size(picture) != self.size:
             raise SagsError(
-                f"{file} is {size_text(*_size(picture))} px but {self._left[0]} is {size_text(*self._size)}; "
+                f"{file} is {size_text(*_size(picture))} px but {self.files[0]} is {size_text(*self.size)}; "
                 "all pictures must have one size"
             )
         return picture
@@ -146,7 +154,12 @@ def _size(picture: U8) -> tuple[int, int]:
     return picture.shape[1], picture.shape[0]
 
 
-def _check_counts(one: Path, one_files: list[Path], other: Path, other_files: list[Path]) -> None:
+def check_counts(one: Path, one_files: list[Path], other: Path, other_files: list[Path]) -> None:
+    """Refuse two folders that cannot be paired.
+
+    Raises:
+        UsageError: they do not hold the same number of pictures.
+    """
     if len(one_files) != len(other_files):
         raise UsageError(
             f"{one} holds {len(one_files)} pictures but {other} holds {len(other_files)}; "

@@ -10,17 +10,26 @@ from typing import Protocol, Self
 
 from sags_node import config as cfg
 from sags_node.errors import UsageError
+from sags_node.sources.endonerf import EndoNerfPairs
 from sags_node.sources.pictures import FolderPairs, RawPair
+from sags_node.sources.scared import ScaredPairs
 from sags_node.sources.truth import Poses, References
 from sags_node.sources.videos import PanePairs, Video, VideoPairs, side_by_side_boxes
 from sags_node.types import StereoFrame
 
-Recording = cfg.FoldersSource | cfg.VideosSource | cfg.SideBySideSource | cfg.PanesSource
+Recording = (
+    cfg.FoldersSource
+    | cfg.VideosSource
+    | cfg.SideBySideSource
+    | cfg.PanesSource
+    | cfg.EndoNerfSource
+    | cfg.ScaredSource
+)
 DEFAULT_RATE = 30.0  # of folders, which do not know theirs
 
 
 class Pairs(Protocol):
-    """The readers of `pictures` and `videos`: pairs in order, from any start."""
+    """The readers of recordings: pairs in order, from any start."""
 
     rate: float | None  # the recording's own
     count: int  # as announced; a video may end earlier
@@ -40,10 +49,10 @@ class Pairs(Protocol):
 class Replay:
     """A `Source` that plays a recording.
 
-    Every pair of the recording has its turn, numbered by `frame_id`: its index in the first pass, counted on
-    when the recording loops. In `realtime` pace turn `n` is due `n / rate` seconds after the first; a pair
-    that would come more than one period late is left out and counted. In `step` pace the stamp is
-    `frame_id / rate`, whatever the clock says.
+    Every pair of the recording (each stride-th, if a stride is set) has its turn, numbered by `frame_id`: its
+    place in the first pass, counted on when the recording loops. `rate` is that of the turns. In `realtime`
+    pace turn `n` is due `n / rate` seconds after the first; a pair that would come more than one period late
+    is left out and counted. In `step` pace the stamp is `frame_id / rate`, whatever the clock says.
 
     Args:
         config: which recording, and how to play it.
@@ -72,15 +81,16 @@ class Replay:
         self._sleep = sleep or self._stopped.wait
         self._poses = None if config.poses is None else Poses(config.poses)
         self._references = References(config.reference) if references else None
-        self._pairs = _open_pairs(config)
-        self.rate = config.rate or self._pairs.rate or DEFAULT_RATE
+        self._pairs = _open_pairs(config, references)
+        self._count = -(-self._pairs.count // config.stride)  # rounded up
+        self.rate = (config.rate or self._pairs.rate or DEFAULT_RATE) / config.stride
         self.dropped = 0
         self._began: tuple[float, int] | None = None  # monotonic seconds and wall clock of the first turn
         self._dropped_in_a_row = 0
         self._first = round(config.start * self.rate)
-        if self._first >= self._pairs.count:
+        if self._first >= self._count:
             self._pairs.close()
-            seconds = self._pairs.count / self.rate
+            seconds = self._count / self.rate
             raise UsageError(
                 f"source.start {config.start} s lies behind the recording's end at {seconds:.2f} s"
             )
@@ -90,7 +100,7 @@ class Replay:
         """How many turns there will be; None for an endless loop."""
         if self._config.loop:
             return self._config.frames
-        there = self._pairs.count - self._first
+        there = self._count - self._first
         return there if self._config.frames is None else min(there, self._config.frames)
 
     def __enter__(self) -> Self:
@@ -112,7 +122,8 @@ class Replay:
         Raises:
             SagsError: a picture is damaged, or the right eye ends before the left one.
         """
-        self._pairs.seek(self._first)
+        stride = self._config.stride
+        self._pairs.seek(self._first * stride)
         self._began = None
         self._dropped_in_a_row = 0
         epoch, index, frame_id = 0, self._first, self._first
@@ -127,7 +138,7 @@ class Replay:
             if ended:
                 if not self._config.loop or index == self._first:
                     return
-                self._pairs.seek(self._first)
+                self._pairs.seek(self._first * stride)
                 epoch, index = epoch + 1, self._first
                 continue
             if pair is None:
@@ -135,14 +146,27 @@ class Replay:
                 self._dropped_in_a_row += 1
             else:
                 self._dropped_in_a_row = 0
-                pose = None if self._poses is None else self._poses.at(index)
-                reference = None if self._references is None else self._references.at(index)
+                pose = pair.T_world_cam if self._poses is None else self._poses.at(index * stride)
+                reference = pair.reference
+                if reference is None and self._references is not None:
+                    reference = self._references.at(index * stride)
                 stamp = self._wait_for_turn(frame_id)
                 if self._stopped.is_set():
                     return
                 yield StereoFrame(
-                    frame_id, stamp, stamp, pair.left, pair.right, epoch, pose, pair.tissue, reference
+                    frame_id,
+                    t_capture_ns=stamp,
+                    t_capture_right_ns=stamp,
+                    left=pair.left,
+                    right=pair.right,
+                    epoch=epoch,
+                    T_world_cam=pose,
+                    tissue=pair.tissue,
+                    reference=reference,
+                    depth=pair.depth,
                 )
+            for _ in range(stride - 1):
+                self._pairs.skip()
             index += 1
             frame_id += 1
 
@@ -174,7 +198,7 @@ class Replay:
         return self._began[1] + round((frame_id - self._first) * 1e9 / self.rate)
 
 
-def _open_pairs(config: Recording) -> Pairs:
+def _open_pairs(config: Recording, references: bool) -> Pairs:
     """The reader that fits the kind of recording."""
     match config:
         case cfg.FoldersSource():
@@ -187,3 +211,7 @@ def _open_pairs(config: Recording) -> Pairs:
             return PanePairs(video, *halves)
         case cfg.PanesSource():
             return PanePairs(Video(config.video), config.left, config.right, config.tools)
+        case cfg.EndoNerfSource():
+            return EndoNerfPairs(config)
+        case cfg.ScaredSource():
+            return ScaredPairs(config.folder, references)

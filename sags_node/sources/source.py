@@ -7,7 +7,7 @@ from types import TracebackType
 from typing import Protocol, Self
 
 from sags_node import config as cfg
-from sags_node.types import StereoFrame
+from sags_node.types import StereoFrame, StereoRig
 
 
 class Source(Protocol):
@@ -70,6 +70,23 @@ def open_source(
     return Replay(config, references=references)
 
 
+def recorded_rig(config: cfg.Source) -> StereoRig | None:
+    """The calibration that comes with a research recording; None where the launch file must name one.
+
+    Raises:
+        UsageError: its files are missing, damaged or implausible.
+    """
+    if isinstance(config, cfg.EndoNerfSource):
+        from sags_node.sources import endonerf
+
+        return endonerf.read_rig(config)
+    if isinstance(config, cfg.ScaredSource):
+        from sags_node.sources import scared
+
+        return scared.read_rig(config.folder)
+    return None
+
+
 def _phantom_recording(
     config: cfg.PhantomSource, progress: Callable[[int, int], None] | None
 ) -> cfg.FoldersSource:
@@ -78,5 +95,7 @@ def _phantom_recording(
 
     recorded = cfg.load_launch(cached_session(config, progress)).source
     assert isinstance(recorded, cfg.FoldersSource)
-    playing = config.model_dump(include={"pace", "rate", "loop", "start", "frames"}, exclude_unset=True)
+    playing = config.model_dump(
+        include={"pace", "rate", "loop", "start", "frames", "stride"}, exclude_unset=True
+    )
     return recorded.model_copy(update=playing)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import zipfile
 from pathlib import Path
+from typing import IO
 
 import cv2
 import numpy as np
@@ -93,23 +94,7 @@ def load_array(file: Path, key: str, shape: tuple[int | None, ...]) -> NDArray[n
         with zipfile.ZipFile(file) as archive:
             member = archive.getinfo(f"{key}.npy")
             with archive.open(member) as stream:
-                version = np.lib.format.read_magic(stream)
-                read_header = {
-                    (1, 0): np.lib.format.read_array_header_1_0,
-                    (2, 0): np.lib.format.read_array_header_2_0,
-                }[version]
-                found, _, dtype = read_header(stream)
-        fits = len(found) == len(shape) and all(
-            want in (None, got) for want, got in zip(shape, found, strict=True)
-        )
-        if not fits or dtype.kind not in "bfiu":
-            wanted = ", ".join("any" if length is None else str(length) for length in shape)
-            raise UsageError(f"{file}: '{key}' is {dtype} {list(found)}, wanted numbers [{wanted}]")
-        if (
-            member.file_size > _LARGEST
-            or int(np.prod(found, dtype=object)) * dtype.itemsize > member.file_size
-        ):
-            raise UsageError(f"{file}: '{key}' claims an impossible size {list(found)}")
+                _check_header(stream, f"{file}: '{key}'", shape, member.file_size)
         with np.load(file, allow_pickle=False) as arrays:
             array: NDArray[np.generic] = arrays[key]
             return array
@@ -119,6 +104,42 @@ def load_array(file: Path, key: str, shape: tuple[int | None, ...]) -> NDArray[n
         raise UsageError(f"{file} holds no array '{key}'") from None
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise UsageError(f"{file} is not a readable npz file: {error}") from None
+
+
+def load_npy(file: Path, shape: tuple[int | None, ...]) -> NDArray[np.generic]:
+    """The numeric array of an npy file; see `load_array`.
+
+    Raises:
+        UsageError: the file is missing or damaged, or the array is of another shape or type.
+    """
+    try:
+        with file.open("rb") as stream:
+            _check_header(stream, str(file), shape, file.stat().st_size)
+        array: NDArray[np.generic] = np.load(file, allow_pickle=False)
+        return array
+    except FileNotFoundError:
+        raise UsageError(f"{file} does not exist; check the path") from None
+    except (KeyError, OSError, ValueError, EOFError) as error:
+        raise UsageError(f"{file} is not a readable npy file: {error}") from None
+
+
+def _check_header(stream: IO[bytes], what: str, shape: tuple[int | None, ...], room: int) -> None:
+    """Compare the header of an npy stream with the wanted shape and with `room`, the bytes of the stream."""
+    version = np.lib.format.read_magic(stream)
+    read_header = {
+        (1, 0): np.lib.format.read_array_header_1_0,
+        (2, 0): np.lib.format.read_array_header_2_0,
+    }[version]
+    found, _, dtype = read_header(stream)
+    fits = len(found) == len(shape) and all(
+        want in (None, got) for want, got in zip(shape, found, strict=True)
+    )
+    if not fits or dtype.kind not in "bfiu":
+        wanted = ", ".join("any" if length is None else str(length) for length in shape)
+        raise UsageError(f"{what} is {dtype} {list(found)}, wanted numbers [{wanted}]")
+    size = int(np.prod(found, dtype=object)) * dtype.itemsize
+    if room > _LARGEST or size > room - stream.tell():
+        raise UsageError(f"{what} claims an impossible size {list(found)}")
 
 
 _LARGEST = 2**31  # bytes

@@ -19,7 +19,7 @@ log = logging.getLogger(__name__)
 # FFmpeg and OpenCV would print their own lines about broken files beside our message. FFmpeg's level is read
 # when the first video is opened.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_FATAL)
 
 
 class Video:
@@ -147,6 +147,9 @@ class VideoPairs:
 class PanePairs:
     """One video whose frames show both eyes, each in its own box.
 
+    Attributes:
+        size: width and height of one box, px.
+
     Raises:
         UsageError: a box leaves the picture or differs in size from the others.
     """
@@ -157,7 +160,7 @@ class PanePairs:
         if tools is not None:
             self._boxes["tools"] = tools
         self.rate, self.count = video.rate, video.count
-        self._size = left[2], left[3]
+        self.size = left[2], left[3]
         try:
             self._check_boxes()
         except UsageError:
@@ -172,9 +175,9 @@ class PanePairs:
                     f"pane '{name}' {x, y, w, h} (x, y, width, height) leaves the picture: "
                     f"{self._video.path} is {size_text(width, height)} px"
                 )
-            if (w, h) != self._size:
+            if (w, h) != self.size:
                 raise UsageError(
-                    f"pane '{name}' is {size_text(w, h)} px but the left pane is {size_text(*self._size)}; "
+                    f"pane '{name}' is {size_text(w, h)} px but the left pane is {size_text(*self.size)}; "
                     "all panes must have one size"
                 )
 

@@ -8,7 +8,7 @@ import numpy as np
 from sags_node import geometry
 from sags_node.calibration import rectified_camera
 from sags_node.errors import SagsError
-from sags_node.types import F64, U8, Bool, Camera, Eye, RectifiedPair, StereoFrame, StereoRig
+from sags_node.types import F32, F64, U8, Bool, Camera, Eye, RectifiedPair, StereoFrame, StereoRig
 
 
 class _EyeMap:
@@ -76,6 +76,7 @@ class Rectifier:
     def __init__(self, rig: StereoRig, width: int, height: int) -> None:
         self.camera = rectified_camera(rig, width, height)
         self.baseline = rig.baseline
+        self._size = width, height
         self.raw_size = rig.left.width, rig.left.height
         K_rectified = rig.left.P[:, :3]
         self._left = _EyeMap(rig.left, K_rectified, self.camera)
@@ -88,7 +89,8 @@ class Rectifier:
             SagsError: the pictures do not have the calibration's size.
         """
         self._check(frame.left, "left")
-        self._check(frame.right, "right")
+        if frame.right is not None:
+            self._check(frame.right, "right")
         camera = self.camera
         if frame.T_world_cam is not None:
             camera = Camera(camera.width, camera.height, camera.K, frame.T_world_cam)
@@ -98,7 +100,7 @@ class Rectifier:
             camera=camera,
             baseline=self.baseline,
             left=self._left.image(frame.left),
-            right=self._right.image(frame.right),
+            right=None if frame.right is None else self._right.image(frame.right),
         )
 
     def mask(self, mask: Bool) -> Bool:
@@ -110,7 +112,18 @@ class Rectifier:
         self._check(mask, "left mask")
         return self._left.mask(mask)
 
-    def _check(self, picture: U8 | Bool, name: str) -> None:
+    def depth(self, depth: F32) -> F32:
+        """Depth of the left rectified picture, at the working size. It is never interpolated: a mean across
+        an edge is a surface that does not exist.
+
+        Raises:
+            SagsError: the depth picture does not have the calibration's size.
+        """
+        self._check(depth, "depth")
+        resized: F32 = cv2.resize(depth, self._size, interpolation=cv2.INTER_NEAREST_EXACT)
+        return resized
+
+    def _check(self, picture: U8 | Bool | F32, name: str) -> None:
         width, height = self.raw_size
         if picture.shape[:2] != (height, width):
             raise SagsError(

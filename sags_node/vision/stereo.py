@@ -66,6 +66,7 @@ class StereoDepth:
 
         Depth is unknown outside `tissue` [H, W] and within a few px of its edge.
         """
+        assert pair.right is not None  # a frame without a right eye brings its depth
         left, right = self._gray(pair.left), self._gray(pair.right)
         disparity, row_error, known = self._match(left, right)
         agreement = self._agreement(left, right, disparity, row_error)

@@ -1,0 +1,146 @@
+"""`sags fit`: the offline fit of a recording, from its folder to a model, drawn test frames and figures."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from sags_node.apps import text
+from sags_node.engine.smoothing import folded
+from sags_node.engine.threads import configure_threads
+from sags_node.errors import UsageError
+from sags_node.evaluation.machine import machine_name
+from sags_node.evaluation.measure import Options
+from sags_node.fitting import checkpoint
+from sags_node.fitting.clip import read_clip
+from sags_node.fitting.fit import Fit
+from sags_node.fitting.score import PUBLISHED, score
+from sags_node.fitting.settings import FitSettings
+from sags_node.model.ply import write_ply
+from sags_node.session import Session
+
+CHECKPOINT_PERIOD = 30.0  # s
+
+Advance = Callable[[int, int | None, str], None]  # done, of, what
+
+
+def fit_session(
+    session: Session,
+    settings: FitSettings,
+    options: Options,
+    out: Path,
+    resume: bool,
+    advance: Advance,
+) -> dict[str, Any]:
+    """Fit a recording and leave `checkpoint.npz`, `model.ply`, `test/` and `figures.json` in `out`.
+
+    Args:
+        session: a recording.
+        settings: of the fit.
+        options: hold-out and LPIPS weights.
+        out: an existing folder. An earlier result there is replaced.
+        resume: go on from its checkpoint.
+        advance: called with what is going on.
+
+    Returns:
+        The figures.
+
+    Raises:
+        UsageError: nothing to resume, or made with other settings or frames.
+        SagsError: the recording cannot be used, or a file cannot be written.
+    """
+    stored = out / "checkpoint.npz"
+    if resume and not stored.is_file():
+        raise UsageError(f"there is no {stored} to resume from; start without --resume")
+    configure_threads(session.config.engine.threads)
+    count = session.source.frame_count
+    clip = read_clip(session, options.holds_out, lambda done: advance(done, count, "reading"))
+    fit = Fit(clip, settings)
+    if resume:
+        advance(0, None, "reading the checkpoint")
+        checkpoint.load(fit, stored)
+    else:
+        advance(0, None, "starting")
+        fit.start(lambda what, done, of: advance(done, of, what))
+    _iterate(fit, stored, advance)
+
+    drawn = out / "test"
+    drawn.mkdir(exist_ok=True)
+    advance(0, len(clip.test), "measuring")
+    segments = session.config.segments
+    found = {
+        "session": session.config.source.kind,
+        "settings": asdict(settings),
+        "machine": machine_name(),
+        "seconds": round(fit.seconds, 1),
+        "gaussians": len(fit.model),
+        "cap": settings.max_gaussians,
+        "pruned": fit.pruned,
+        "split": fit.split,
+        "heldout": score(
+            fit, clip.test, segments, options.lpips_weights, drawn,
+            lambda done: advance(done, len(clip.test), "measuring"),
+        ),
+        "train": score(fit, clip.train[:: max(1, options.hold_out)], segments),
+        "published": PUBLISHED,
+    }  # fmt: skip
+    last = fit.gaussians(clip.train[-1])
+    ply = out / "model.ply"
+    ply.unlink(missing_ok=True)
+    write_ply(ply, folded(last))
+    (out / "figures.json").write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    return found
+
+
+def _iterate(fit: Fit, stored: Path, advance: Advance) -> None:
+    """All iterations that are left. Ctrl-C leaves a checkpoint, too."""
+    saved = time.monotonic()
+    try:
+        while not fit.done:
+            step = fit.iterate()
+            advance(fit.iteration, fit.total, f"fitting, L1 {step.color:.4f}, {len(fit.model)} Gaussians")
+            if time.monotonic() - saved > CHECKPOINT_PERIOD:
+                checkpoint.save(fit, stored)
+                saved = time.monotonic()
+    finally:
+        checkpoint.save(fit, stored)
+
+
+def figures_table(found: dict[str, Any]) -> Table:
+    """Figures of the fit beside the published ones."""
+    table = text.table("", "frames", "PSNR* (tissue)", "PSNR (masked)", "SSIM", "LPIPS", "depth median")
+    for name in ("heldout", "train"):
+        row = found[name]
+        lpips = next((value for key, value in row.items() if key.startswith("lpips")), None)
+        depth = row.get("depth_median_mm")
+        table.add_row(
+            name,
+            str(row["frames"]),
+            _number(row.get("psnr"), "dB"),
+            _number(row.get("paper_psnr"), "dB"),
+            _number(row.get("ssim")),
+            _number(lpips),
+            _number(depth, "mm"),
+        )
+    for name, row in found["published"].items():
+        table.add_row(
+            name,
+            "28",
+            "–",
+            _number(row["paper_psnr"], "dB"),
+            _number(row["ssim"]),
+            _number(row["lpips"]),
+            "–",
+        )
+    table.caption = f"{found['gaussians']} Gaussians (at most {found['cap']}), {found['seconds']:.0f} s"
+    return table
+
+
+def _number(value: float | None, unit: str = "") -> str:
+    return "–" if value is None else f"{value:.3f} {unit}".strip() if not unit else f"{value:.2f} {unit}"

@@ -1,0 +1,169 @@
+"""Times of the rasteriser, stage by stage."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from sags_node.benchmark.peak import Peak
+from sags_node.benchmark.scenes import SCENES, with_harmonics
+from sags_node.benchmark.timing import Stages, StageTimes, median_ms, stage_clock
+from sags_node.benchmark.work import Work, share_of_peak, stage_rows
+from sags_node.engine import (
+    binning,
+    compositing,
+    pair_sums,
+    projection,
+    projection_backward,
+    spherical_harmonics,
+)
+from sags_node.engine.compositing import TILE_HEIGHT, TILE_WIDTH
+from sags_node.engine.rasterize import make_rasterizer
+from sags_node.types import F32, Bool, Camera, Gaussians
+
+STAGES: Stages = {
+    (projection, "project"): "project",
+    (spherical_harmonics, "color"): "color",
+    (binning, "sort_by_depth"): "sort",
+    (binning, "emit_pairs"): "bin",
+    (binning, "sort_into_tiles"): "bin",
+    (compositing, "composite"): "composite",
+    (compositing, "composite_backward"): "composite backward",
+    (pair_sums, "sum_pairs"): "sum",
+    (projection_backward, "project_backward"): "project backward",
+    (spherical_harmonics, "color_backward"): "color backward",
+}
+# On one pixel of one pair, with everything out of the loop that is the same along a row of pixels: a
+# multiply-add, a rounding, a shift, a division count as one each. The AVX-512 machine code of the innermost
+# loops holds as many vector instructions beside its loads and stores.
+OPERATIONS_PER_PAIR = {"composite": 18, "composite backward": 36}
+BASELINE = 4e-3  # m, between the two eyes of a stereo endoscope
+
+
+@dataclass(frozen=True, slots=True)
+class RasterCase:
+    """What is drawn, and with how many threads."""
+
+    count: int
+    width: int
+    height: int
+    threads: int
+    scene: str = "surface"
+    cameras: int = 1
+    active_tiles: float = 1.0  # share of the tiles
+    sh_degree: int = 0
+
+
+def measure_rasterizer(case: RasterCase, runs: int, peak: Peak, twin_runs: int = 0) -> dict[str, Any]:
+    """One row of the table. The calling thread must be set to `case.threads`, and `peak` be that of them.
+
+    Args:
+        twin_runs: how often to draw with the slow torch twin, too; 0: not at all.
+    """
+    drawing = Drawing(case)
+    forward_ms, both_ms = median_ms(drawing.forward, runs), median_ms(drawing.forward_backward, runs)
+    with stage_clock(STAGES) as clock:
+        stages_ms = clock.medians_ms(drawing.forward_backward, runs)
+    work = {stage: _work(stage, clock) for stage in stages_ms}
+    row: dict[str, Any] = {
+        "n": len(drawing.gaussians),
+        "width": case.width,
+        "height": case.height,
+        "scene": case.scene,
+        "cameras": case.cameras,
+        "active_tiles": case.active_tiles,
+        "sh_degree": case.sh_degree,
+        "threads": case.threads,
+        "forward_ms": forward_ms,
+        "forward_backward_ms": both_ms,
+        "pixel_pairs": work["composite"].pairs,
+        "share_of_peak": share_of_peak(both_ms, work, peak),
+        "stages": stage_rows(stages_ms, work, peak),
+        "between_stages_ms": max(0.0, both_ms - sum(stages_ms.values())),
+    }
+    if twin_runs > 0:
+        row["twin_forward_backward_ms"] = _time_twin(case, twin_runs)
+        row["speedup_over_twin"] = row["twin_forward_backward_ms"] / both_ms
+    return row
+
+
+def _time_twin(case: RasterCase, runs: int) -> float:
+    import torch
+
+    torch.set_num_threads(case.threads)
+    Drawing(replace(case, count=100, width=32, height=32), "reference").forward_backward()  # torch starts up
+    return median_ms(Drawing(case, "reference").forward_backward, runs, warm_up=0)
+
+
+class Drawing:
+    """One case, ready to be drawn again and again."""
+
+    def __init__(self, case: RasterCase, backend: str = "numba") -> None:
+        self.gaussians, self._cameras = _scene(case)
+        self._tiles = _active_tiles(case)
+        size = (case.cameras, case.height, case.width)
+        rng = np.random.default_rng(0)
+        self._v_planes = rng.normal(size=(size[0], 5, *size[1:])).astype(np.float32)
+        self._weight = np.ones(size, np.float32)
+        self._rasterizer = make_rasterizer(backend, case.width, case.height)
+
+    def forward(self) -> F32:
+        return self._rasterizer.forward(self.gaussians, self._cameras, self._tiles)
+
+    def forward_backward(self) -> None:
+        self.forward()
+        self._rasterizer.backward(self._v_planes, self._weight)
+
+
+def _scene(case: RasterCase) -> tuple[Gaussians, list[Camera]]:
+    gaussians, left = SCENES[case.scene](case.count, case.width, case.height)
+    if case.sh_degree > 0:
+        gaussians = with_harmonics(gaussians, case.sh_degree)
+    return gaussians, [left.moved_right(eye * BASELINE) for eye in range(case.cameras)]
+
+
+def _active_tiles(case: RasterCase) -> Bool | None:
+    """The tiles that are drawn, spread at random; None: all."""
+    if case.active_tiles == 1.0:
+        return None
+    shape = (case.cameras, -(-case.height // TILE_HEIGHT), -(-case.width // TILE_WIDTH))
+    order = np.random.default_rng(0).permutation(int(np.prod(shape)))
+    return (order < case.active_tiles * order.size).reshape(shape)
+
+
+def evaluated_pairs(arguments: Mapping[str, Any]) -> int:
+    """Pixel-Gaussian pairs that `composite` evaluated: whole rows of a tile, until the tile was finished.
+
+    Args:
+        arguments: `pairs`, `tile_starts`, `tile_ends` and `drawn` as `composite` left them.
+    """
+    pairs, starts, drawn = arguments["pairs"], arguments["tile_starts"], arguments["drawn"]
+    rows = (pairs["row_end"] - pairs["row_begin"])[: starts[-1]]
+    rows_before = np.concatenate([[0], np.cumsum(rows, dtype=np.int64)])
+    ends = arguments["tile_ends"][drawn]
+    return int((rows_before[ends] - rows_before[starts[drawn]]).sum()) * TILE_WIDTH
+
+
+_PER_PAIR = {"emitted", "pairs", "v_pairs"}  # buffers larger than what is used of them
+_PICTURES = {"planes", "v_planes", "weight"}  # only read and written where drawn
+_IN_CACHE = {"scratch"}
+
+
+def _work(stage: str, clock: StageTimes) -> Work:
+    drawing = clock.arguments["composite"]
+    tile_pairs, tiles = int(drawing["tile_starts"][-1]), drawing["tile_ends"].size
+    drawn_share = drawing["drawn"].size / tiles
+    touched = 0.0
+    for function in (name for (_, name), each in STAGES.items() if each == stage):
+        for name, value in clock.arguments[function].items():
+            if not isinstance(value, np.ndarray) or name in _IN_CACHE:
+                continue
+            used = tile_pairs * value.itemsize if name in _PER_PAIR else value.nbytes
+            touched += used * drawn_share if name in _PICTURES else used
+    if stage in OPERATIONS_PER_PAIR:
+        pairs = evaluated_pairs(drawing)
+        return Work(touched, OPERATIONS_PER_PAIR[stage] * pairs, pairs)
+    return Work(touched)

@@ -1,0 +1,89 @@
+"""Stop watches: medians of repeated calls, and the stages inside a call."""
+
+from __future__ import annotations
+
+import inspect
+import statistics
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from types import ModuleType
+from typing import Any
+
+WARM_UP_CALLS = 3
+
+Stages = Mapping[tuple[ModuleType | type, str], str]  # (module or class, name of a function in it) -> stage
+
+
+def times_ms(
+    function: Callable[[], object], runs: int, warm_up: int = WARM_UP_CALLS, period_s: float = 0.0
+) -> list[float]:
+    """Wall times of `runs` calls, after `warm_up` calls that do not count.
+
+    Args:
+        period_s: sleep after each call until so much time has passed since it began: the rhythm of a camera.
+    """
+    times = []
+    for run in range(-warm_up, runs):
+        start = time.perf_counter()
+        function()
+        taken = time.perf_counter() - start
+        if run >= 0:
+            times.append(taken * 1e3)
+        if taken < period_s:
+            time.sleep(period_s - taken)
+    return times
+
+
+def median_ms(function: Callable[[], object], runs: int, warm_up: int = WARM_UP_CALLS) -> float:
+    return statistics.median(times_ms(function, runs, warm_up))
+
+
+class StageTimes:
+    """What `stage_clock` has seen."""
+
+    def __init__(self) -> None:
+        self.passed: dict[str, float] = {}  # stage -> s, since it was emptied last
+        self.arguments: dict[str, dict[str, Any]] = {}  # function -> arguments of its last call, by name
+
+    def watched(self, function: Callable[..., Any], name: str, stage: str) -> Callable[..., Any]:
+        """`function`, with its time and arguments noted here."""
+        signature = inspect.signature(getattr(function, "py_func", function))
+
+        def timed(*args: Any, **kwargs: Any) -> Any:
+            start = time.perf_counter()
+            result = function(*args, **kwargs)
+            self.passed[stage] = self.passed.get(stage, 0.0) + time.perf_counter() - start
+            self.arguments[name] = signature.bind(*args, **kwargs).arguments
+            return result
+
+        return timed
+
+    def medians_ms(self, function: Callable[[], object], runs: int) -> dict[str, float]:
+        """Stage -> median time in it over `runs` calls of `function`, after some that do not count."""
+        found: dict[str, list[float]] = {}
+        for run in range(-WARM_UP_CALLS, runs):
+            self.passed.clear()
+            function()
+            if run >= 0:
+                for stage, seconds in self.passed.items():
+                    found.setdefault(stage, []).append(seconds * 1e3)
+        return {stage: statistics.median(times) for stage, times in found.items()}
+
+
+@contextmanager
+def stage_clock(stages: Stages) -> Iterator[StageTimes]:
+    """Time functions where their callers look them up, in their modules or classes, until the block ends.
+
+    So stages are timed inside the whole, one after the other with the caches as they are there, and what is
+    timed carries no stop watch of its own. Several functions may be one stage.
+    """
+    times = StageTimes()
+    originals = {(module, name): getattr(module, name) for module, name in stages}
+    try:
+        for (module, name), stage in stages.items():
+            setattr(module, name, times.watched(originals[module, name], name, stage))
+        yield times
+    finally:
+        for (module, name), function in originals.items():
+            setattr(module, name, function)

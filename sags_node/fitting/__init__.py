@@ -1,0 +1,1 @@
+"""Offline fit of the deformable model to a whole clip."""

@@ -1,0 +1,95 @@
+"""A whole recording in memory, as the fit sees it: rectified pictures, tissue and depth of every frame."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from sags_node.errors import SagsError
+from sags_node.pipeline import Pipeline
+from sags_node.session import Session
+from sags_node.sources.source import open_source
+from sags_node.types import F32, U8, Bool, Camera, Observation, Reference
+
+MEMORY_SHARE = 0.5  # of what is free: the fit itself needs the rest
+
+
+@dataclass(frozen=True, slots=True)
+class ClipFrame:
+    """One frame, as small as it can be kept."""
+
+    frame_id: int
+    t_capture_ns: int
+    camera: Camera
+    image: U8  # [H, W, 3] RGB
+    tissue: Bool  # [H, W]
+    depth: F32  # [H, W] m, 0 unknown
+    reference: Reference | None
+
+    def observation(self) -> Observation:
+        """The frame as the mapper takes it."""
+        return Observation(
+            frame_id=self.frame_id,
+            t_capture_ns=self.t_capture_ns,
+            camera=self.camera,
+            image=self.image * np.float32(1 / 255),
+            gray=cv2.cvtColor(self.image, cv2.COLOR_RGB2GRAY),
+            tissue=self.tissue,
+            depth=self.depth,
+            depth_confidence=(self.depth > 0).astype(np.float32),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Clip:
+    """The frames a fit learns from, and those it is tested on."""
+
+    train: Sequence[ClipFrame]
+    test: Sequence[ClipFrame]
+
+
+def read_clip(
+    session: Session, held_out: Callable[[int], bool], progress: Callable[[int], None] = lambda done: None
+) -> Clip:
+    """Play a session once through the node's own front end and keep every frame.
+
+    Args:
+        session: it is opened anew, with what it knows to be true.
+        held_out: whether the frame of that number is for testing only.
+        progress: called with the frames done.
+
+    Raises:
+        SagsError: no frame to learn from, the recording cannot be read, or it does not fit into memory.
+    """
+    pipeline = Pipeline(session.config, session.rig)
+    train: list[ClipFrame] = []
+    test: list[ClipFrame] = []
+    with open_source(session.config.source, references=True) as source:
+        for frame in source:
+            pair = pipeline.rectifier(frame)
+            tissue = pipeline.tissue(frame, pair)
+            depth, _ = pipeline.depth(frame, pair, tissue)
+            kept = ClipFrame(
+                pair.frame_id, pair.t_capture_ns, pair.camera, pair.left, tissue, depth, frame.reference
+            )
+            if not train and not test:
+                _check_memory(kept, source.frame_count)
+            (test if held_out(frame.frame_id) else train).append(kept)
+            progress(len(train) + len(test))
+    if not train:
+        raise SagsError("no frame to learn from; check source.start, source.frames and the hold-out")
+    return Clip(train, test)
+
+
+def _check_memory(frame: ClipFrame, count: int | None) -> None:
+    needed = (count or 0) * (frame.image.nbytes + frame.tissue.nbytes + frame.depth.nbytes)
+    free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    if needed > MEMORY_SHARE * free:
+        raise SagsError(
+            f"{count} frames take {needed / 1e9:.1f} GB, {MEMORY_SHARE * free / 1e9:.1f} GB may be used; "
+            "set source.frames, source.stride or a smaller vision.width and vision.height"
+        )

@@ -1,0 +1,228 @@
+"""The offline fit: canonical Gaussians and the deformation field, learnt from a clip's training frames."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sags_node.engine.adam import AdamState
+from sags_node.engine.photometric import LossTerms, PhotometricLoss
+from sags_node.engine.rasterize import make_rasterizer
+from sags_node.fitting.clip import Clip, ClipFrame
+from sags_node.fitting.density import EVERY, Density
+from sags_node.fitting.settings import FitSettings
+from sags_node.fitting.start import Progress, follow_online, learn_paths, pooled_rows
+from sags_node.model import columns
+from sags_node.model.decoder import Decoder, DecoderConfig
+from sags_node.model.deformable import DeformableModel
+from sags_node.model.deformation import spread_nodes
+from sags_node.model.exposure import Exposure
+from sags_node.model.field import Deltas, Field, NodeField, PointField
+from sags_node.model.hexplane import HexPlaneField
+from sags_node.types import F32, F64, Gaussians
+
+NODES = 512
+BOX_QUANTILE = 1e-3  # of the Gaussians beyond the field's box on either side: strays must not blow it up
+LOG_SCALE_RATE, QUAT_RATE, COLOR_RATE, LOGIT_RATE = 5e-3, 1e-3, 2.5e-3, 0.05  # EndoGaussian, SAGS
+EXPOSURE_RATE = 2e-3
+DENSIFY_UNTIL = 0.5  # of the iterations
+
+
+class Fit:
+    """A model being fitted: `start`, then `iterate` until `done`."""
+
+    def __init__(self, clip: Clip, settings: FitSettings) -> None:
+        self.clip = clip
+        self.settings = settings
+        self.iteration = 0
+        self.seconds = 0.0  # spent on starting and iterating
+        self.pruned = self.split = 0
+        first = clip.train[0]
+        height, width = first.tissue.shape
+        self.rasterizer = make_rasterizer("numba", width, height, antialias=settings.antialias)
+        self._loss = PhotometricLoss(width, height, settings.weights)
+        self._v_planes = np.zeros((1, 5, height, width), np.float32)
+        self._weight = np.zeros((1, height, width), np.float32)
+        self._unseen = ~np.any([frame.tissue for frame in clip.train], axis=0)
+        self._rng = np.random.default_rng(settings.seed)
+        self._order: list[int] = []
+        known = first.depth[first.depth > 0]
+        pixel = float(np.median(known)) / float(first.camera.K[0, 0]) if known.size else 1e-4
+        self._rates = np.empty(columns.COUNT, np.float32)
+        self._rates[columns.MEAN] = settings.mean_px * pixel
+        self._rates[columns.LOG_SCALE] = LOG_SCALE_RATE
+        self._rates[columns.QUAT] = QUAT_RATE
+        self._rates[columns.COLOR] = COLOR_RATE
+        self._rates[columns.LOGIT] = LOGIT_RATE
+
+    def start(self, progress: Progress) -> None:
+        """Make the model.
+
+        Raises:
+            SagsError: no frame has depth enough.
+        """
+        started = time.perf_counter()
+        settings, exposure = self.settings, self._make_exposure()
+        if settings.schedule == "paper":
+            rows = pooled_rows(self.clip, exposure, settings)
+            field = self._make_field(rows[:, columns.MEAN])
+        else:
+            rows, paths = follow_online(self.clip, self.rasterizer, exposure, settings, progress)
+            field = self._make_field(rows[:, columns.MEAN])
+            learn_paths(field, rows, paths, settings, progress)
+        self._start_means = np.ascontiguousarray(rows[:, columns.MEAN])
+        self.model = DeformableModel(rows, field, exposure, settings.antialias)
+        self._density = Density(self.model, settings.max_gaussians)
+        self.seconds += time.perf_counter() - started
+
+    @property
+    def warm_up(self) -> int:
+        """Iterations without deformation."""
+        return self.settings.warm_up if self.settings.schedule == "paper" else 0
+
+    @property
+    def done(self) -> bool:
+        return self.iteration >= self.total
+
+    @property
+    def total(self) -> int:
+        """Iterations in all."""
+        return self.warm_up + self.settings.iterations
+
+    def iterate(self) -> LossTerms:
+        """One step on one training frame; returns its loss."""
+        started = time.perf_counter()
+        deformed = self.iteration >= self.warm_up
+        frame = self._next_frame() if deformed else self.clip.train[0]
+        observation = frame.observation()
+        gaussians = self.model.at(frame.t_capture_ns, [frame.camera], deformed)
+        planes = self.rasterizer.forward(gaussians, [frame.camera])
+        terms = self._loss.evaluate(
+            planes[0], observation.image, frame.tissue, frame.depth, self._v_planes[0], self._weight[0],
+            self._unseen,
+        )  # fmt: skip
+        gradients = self.rasterizer.backward(self._v_planes, self._weight)
+        share = self.settings.decay ** self._progress()
+        self.model.descend(
+            gradients,
+            self._rates * np.float32(share),
+            self.settings.field_rates.scaled(share),
+            EXPOSURE_RATE * share,
+        )
+        self._density.observe(gradients)
+        self.iteration += 1
+        if self.iteration % EVERY == 0 and self._progress() < DENSIFY_UNTIL:
+            pruned, split = self._density.adapt(self._rng)
+            self.pruned, self.split = self.pruned + pruned, self.split + split
+        self.seconds += time.perf_counter() - started
+        return terms
+
+    def gaussians(self, frame: ClipFrame) -> Gaussians:
+        """The model at the time of a frame."""
+        return self.model.at(frame.t_capture_ns, [frame.camera])
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """All arrays that `restore` needs."""
+        model, deltas = self.model, self.model.field.deltas
+        tables = {
+            "rows": (model.rows, model.adam),
+            "gains": (model.exposure.gains, model.exposure.adam),
+            "cells": (deltas.hexplane.cells, deltas.hexplane.adam),
+            "decoder": (deltas.decoder.values, deltas.adam),
+        }
+        found: dict[str, NDArray[Any]] = {name: values for name, (values, _) in tables.items()}
+        for name, (_, adam) in tables.items():
+            found |= {f"{name}.moments": adam.moments, f"{name}.shares": adam.shares}
+        if isinstance(model.field, NodeField):
+            found |= {"index": model.field.index, "weight": model.field.weight}
+        return found | {
+            "ids": model.ids,
+            "start": self._start_means,
+            "pull": self._density.pull,
+            "seen": self._density.seen,
+        }
+
+    def state(self) -> dict[str, Any]:
+        """The rest of what `restore` needs."""
+        return {
+            "iteration": self.iteration,
+            "seconds": self.seconds,
+            "pruned": self.pruned,
+            "split": self.split,
+            "next_id": self.model.next_id,
+            "order": self._order,
+            "rng": self._rng.bit_generator.state,
+        }
+
+    def restore(self, state: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
+        """Go on from there, instead of `start`: the same bits as without the interruption."""
+        self._start_means = arrays["start"]
+        field = self._make_field(self._start_means)
+        model = self.model = DeformableModel(
+            arrays["rows"], field, self._make_exposure(), self.settings.antialias
+        )
+        if isinstance(field, NodeField):
+            field.index, field.weight = arrays["index"], arrays["weight"]
+        deltas = field.deltas
+        deltas.hexplane.cells[:] = arrays["cells"]
+        deltas.decoder.values[:] = arrays["decoder"]
+        model.exposure.gains[:] = arrays["gains"]
+        model.exposure.adam = AdamState(arrays["gains.moments"], arrays["gains.shares"])
+        model.adam = AdamState(arrays["rows.moments"], arrays["rows.shares"])
+        deltas.hexplane.adam = AdamState(arrays["cells.moments"], arrays["cells.shares"])
+        deltas.adam = AdamState(arrays["decoder.moments"], arrays["decoder.shares"])
+        model.ids, model.next_id = arrays["ids"], int(state["next_id"])
+        self._density = Density(model, self.settings.max_gaussians)
+        self._density.pull, self._density.seen = arrays["pull"], arrays["seen"]
+        self.iteration, self._order = int(state["iteration"]), list(state["order"])
+        self.seconds = float(state["seconds"])
+        self.pruned, self.split = int(state["pruned"]), int(state["split"])
+        self._rng.bit_generator.state = state["rng"]
+
+    def _progress(self) -> float:
+        """How far the stage is, 0..1; each stage has its own schedule."""
+        if self.iteration < self.warm_up:
+            return self.iteration / self.warm_up
+        return (self.iteration - self.warm_up) / max(1, self.settings.iterations)
+
+    def _next_frame(self) -> ClipFrame:
+        """Every training frame once, in random order, then again."""
+        if not self._order:
+            self._order = self._rng.permutation(len(self.clip.train)).tolist()
+        return self.clip.train[self._order.pop()]
+
+    def _make_exposure(self) -> Exposure:
+        times = np.array([frame.t_capture_ns for frame in self.clip.train])
+        brightness = [
+            frame.image[frame.tissue].mean(axis=0) / 255 if frame.tissue.any() else np.zeros(3)
+            for frame in self.clip.train
+        ]
+        return Exposure(times, np.array(brightness, np.float32))
+
+    def _make_field(self, means: F32) -> Field:
+        """A new field over canonical means [N, 3] m, which decide where its box and its nodes are."""
+        settings = self.settings
+        times = [frame.t_capture_ns for frame in (*self.clip.train, *self.clip.test)]
+        hexplane = HexPlaneField.for_clip(
+            _box(means), min(times), max(times), settings.slots,
+            cells=settings.cells, levels=settings.levels, channels=settings.channels, seed=settings.seed,
+        )  # fmt: skip
+        config = DecoderConfig(
+            settings.tokens,
+            features=hexplane.grid.features,
+            levels=settings.levels if settings.tokens == "planes" else 1,
+        )
+        deltas = Deltas(hexplane, Decoder(config, settings.seed), settings.adaptive)
+        return (
+            NodeField(deltas, spread_nodes(means, NODES))
+            if settings.tokens == "nodes"
+            else PointField(deltas)
+        )
+
+
+def _box(means: F32) -> F64:
+    low, high = np.quantile(means, [BOX_QUANTILE, 1 - BOX_QUANTILE], axis=0)
+    return np.array([low, np.maximum(high, low + 1e-3)])

@@ -1,0 +1,100 @@
+"""The SAGS model: canonical Gaussians, the field that deforms them, and the exposure they are seen with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sags_node.engine.adam import AdamState, adam_step
+from sags_node.engine.interface import Gradients
+from sags_node.model import columns
+from sags_node.model.activation import activate, activate_backward
+from sags_node.model.alias_free import smoothing_variances
+from sags_node.model.exposure import Exposure
+from sags_node.model.field import Field, FieldRates
+from sags_node.types import F32, I64, Bool, Camera, Gaussians
+
+BETAS = (0.9, 0.999)
+
+
+class DeformableModel:
+    """Canonical Gaussians in rows (`columns`) with their optimiser, and a field. Not for two threads."""
+
+    def __init__(self, rows: F32, field: Field, exposure: Exposure, smooth: bool = True) -> None:
+        """
+        Args:
+            rows: [N, 14] canonical.
+            field: deforms them.
+            exposure: scales their colours.
+            smooth: whether the 3D filter is on.
+        """
+        self.rows = np.ascontiguousarray(rows, np.float32)
+        self.ids: I64 = np.arange(len(rows))
+        self.field = field
+        self.exposure = exposure
+        self._smooth = smooth
+        self.next_id = len(rows)
+        self.adam = AdamState.new(*self.rows.shape)
+        field.follow(self.rows[:, columns.MEAN])
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def at(self, t_ns: int, cameras: Sequence[Camera], deformed: bool = True) -> Gaussians:
+        """The Gaussians at one time.
+
+        Args:
+            t_ns: the time.
+            cameras: those it was fitted to, for the 3D filter.
+            deformed: False leaves the field out.
+        """
+        self._t_ns, self._deformed = t_ns, deformed
+        rows = self.field.deform(self.rows, t_ns) if deformed else self.rows.copy()
+        self._plain = rows[:, columns.COLOR].copy()
+        self._gain = self.exposure.at(t_ns)
+        rows[:, columns.COLOR] *= self._gain
+        means = np.ascontiguousarray(rows[:, columns.MEAN])
+        smoothing = smoothing_variances(means, cameras) if self._smooth else None
+        self._drawn = activate(rows, self.ids, smoothing)
+        return self._drawn
+
+    def descend(
+        self, gradients: Gradients, rates: F32, field_rates: FieldRates, exposure_rate: float
+    ) -> None:
+        """One step of Adam against the gradients of what the last `at` gave.
+
+        Args:
+            gradients: of the loss by those Gaussians.
+            rates: [14] learning rates of the canonical rows.
+            field_rates: of the field.
+            exposure_rate: of the gains.
+        """
+        v_rows = activate_backward(self._drawn, gradients)
+        self.exposure.descend(self._t_ns, (v_rows[:, columns.COLOR] * self._plain).sum(axis=0), exposure_rate)
+        v_rows[:, columns.COLOR] *= self._gain
+        if self._deformed:
+            v_rows = self.field.backward(v_rows)
+            self.field.step(field_rates)
+        seen = np.flatnonzero(gradients.contribution > 0)
+        adam_step(self.rows, v_rows, self.adam, rates, rows=seen, betas=BETAS)
+
+    def keep(self, kept: Bool) -> None:
+        """Remove the Gaussians where `kept` [N] is False."""
+        self._replace(self.rows[kept], self.ids[kept], self.adam.moments[kept], self.adam.shares[kept])
+
+    def append(self, rows: F32) -> None:
+        """Add Gaussians [M, 14], canonical."""
+        new = AdamState.new(*rows.shape)
+        ids = np.arange(self.next_id, self.next_id + len(rows))
+        self.next_id += len(rows)
+        self._replace(
+            np.concatenate([self.rows, rows]),
+            np.concatenate([self.ids, ids]),
+            np.concatenate([self.adam.moments, new.moments]),
+            np.concatenate([self.adam.shares, new.shares]),
+        )
+
+    def _replace(self, rows: F32, ids: I64, moments: F32, shares: F32) -> None:
+        self.rows, self.ids, self.adam = rows, ids, AdamState(moments, shares)
+        self.field.follow(rows[:, columns.MEAN])

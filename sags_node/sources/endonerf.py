@@ -1,0 +1,213 @@
+"""Clips in the layout of EndoNeRF (Wang et al., MICCAI 2022).
+
+`images/` are left pictures, `masks/` instruments, `depth/` what a stereo network made of the pair, and
+`poses_bounds.npy` is the camera in LLFF form. What the files do not say (rate, units, polarity of the masks)
+is a source option; docs/recordings.md explains the defaults.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from sags_node import geometry
+from sags_node.calibration import check_intrinsics, rectified_rig, refuse_errors
+from sags_node.config import EndoNerfSource
+from sags_node.errors import SagsError, UsageError
+from sags_node.sources.pictures import (
+    FolderPairs,
+    RawPair,
+    check_counts,
+    list_pictures,
+    read_picture,
+    size_text,
+)
+from sags_node.sources.truth import load_npy
+from sags_node.types import F32, F64, StereoRig
+
+# Of a frame's known depths: what lies outside is drawn to them, as EndoGaussian's loader does.
+DEPTH_PERCENTILES = (3.0, 99.8)
+PLAUSIBLE_DEPTH = (0.01, 1.0)  # m, the median of a frame: in an endoscope's view
+NOMINAL_BASELINE = 0.005  # m; without a right picture nothing depends on it
+CHECKED_MASKS = 9  # spread over the clip
+
+
+class Llff(NamedTuple):
+    """What `poses_bounds.npy` says."""
+
+    width: int  # px
+    height: int
+    focal: float  # px
+    T_world_cam: F64  # [N, 4, 4] m
+
+
+class EndoNerfPairs:
+    """The frames of a clip, in order of the files' names (numbers in names sort as numbers).
+
+    Raises:
+        UsageError: files are missing or do not fit each other, or the units or the masks cannot be right.
+    """
+
+    def __init__(self, config: EndoNerfSource) -> None:
+        folder = config.folder
+        right = None if config.baseline is None else folder / "images_right"
+        self._llff = read_llff(config)
+        self._pictures = FolderPairs(folder / "images", right, folder / "masks")
+        self._depth_unit = config.depth_unit
+        self._depth_files: list[Path] | None = None
+        self._black = config.instruments == "black"
+        self.rate: float | None = None
+        self.count = self._pictures.count
+        self._next = 0
+        self._check_camera(folder)
+        _check_masks(folder / "masks", config.instruments)
+        if (folder / "depth").is_dir():
+            self._depth_files = list_pictures(folder / "depth")
+            check_counts(folder / "images", self._pictures.files, folder / "depth", self._depth_files)
+            self._check_unit(self._depth_files[0])
+        elif right is None:
+            raise UsageError(
+                f"{folder} holds no depth/; set source.baseline (m between the eyes) to measure depth from "
+                "images/ and images_right/"
+            )
+
+    def seek(self, index: int) -> None:
+        self._pictures.seek(index)
+        self._next = index
+
+    def skip(self) -> bool:
+        self._next += 1
+        return self._pictures.skip()
+
+    def read(self) -> RawPair | None:
+        """The next frame, None at the end.
+
+        Raises:
+            SagsError: a picture is damaged, or of another size or form than it must be.
+        """
+        pair = self._pictures.read()
+        if pair is None or pair.tissue is None:
+            return None
+        index = self._next
+        self._next += 1
+        return pair._replace(
+            tissue=~pair.tissue if self._black else pair.tissue,
+            depth=None if self._depth_files is None else self._read_depth(self._depth_files[index]),
+            T_world_cam=self._llff.T_world_cam[index],
+        )
+
+    def close(self) -> None:
+        self._pictures.close()
+
+    def _read_depth(self, file: Path) -> F32:
+        """Depth [H, W] m; a count of 0 is unknown."""
+        counts = read_picture(file, cv2.IMREAD_UNCHANGED)
+        if counts.ndim != 2:
+            raise SagsError(
+                f"{file} has {counts.shape[2]} channels; a depth picture is a grey PNG of 8 or 16 bit"
+            )
+        if counts.shape[1::-1] != self._pictures.size:
+            raise SagsError(
+                f"{file} is {size_text(*counts.shape[1::-1])} px but the pictures are "
+                f"{size_text(*self._pictures.size)}; all pictures of a clip must have one size"
+            )
+        known = counts > 0
+        if not known.any():
+            return np.zeros(counts.shape, np.float32)
+        near, far = np.percentile(counts[known], DEPTH_PERCENTILES)
+        depth: F32 = np.where(known, np.clip(counts, near, far) * self._depth_unit, 0).astype(np.float32)
+        return depth
+
+    def _check_camera(self, folder: Path) -> None:
+        file, llff = folder / "poses_bounds.npy", self._llff
+        if len(llff.T_world_cam) != self.count:
+            raise UsageError(
+                f"{file} holds {len(llff.T_world_cam)} poses but {folder / 'images'} {self.count} pictures; "
+                "there must be one pose for each picture"
+            )
+        if self._pictures.size != (llff.width, llff.height):
+            raise UsageError(
+                f"{file} is for {size_text(llff.width, llff.height)} px but the pictures are "
+                f"{size_text(*self._pictures.size)}; scale columns 4, 9, 14 (height, width, focal length)"
+            )
+
+    def _check_unit(self, file: Path) -> None:
+        depth = self._read_depth(file)
+        known = depth[depth > 0]
+        if known.size == 0:
+            return
+        median = float(np.median(known))
+        if not PLAUSIBLE_DEPTH[0] <= median <= PLAUSIBLE_DEPTH[1]:
+            raise UsageError(
+                f"{file}: the median depth would be {median:.3g} m, but an endoscope sees "
+                f"{PLAUSIBLE_DEPTH[0]:g} to {PLAUSIBLE_DEPTH[1]:g} m; set source.depth_unit (m per count, "
+                f"now {self._depth_unit:g})"
+            )
+
+
+def read_llff(config: EndoNerfSource) -> Llff:
+    """Read `poses_bounds.npy`: [N, 17], per row a 3x5 matrix and two depth bounds.
+
+    The matrix is [R | t | (height, width, focal length)], camera to world. Unlike in other LLFF files the
+    axes are OpenCV's. Lengths are in the unit of `depth/`; the bounds are not needed.
+
+    Raises:
+        UsageError: the file is missing, damaged, of another form, or its camera is implausible.
+    """
+    file = config.folder / "poses_bounds.npy"
+    table = load_npy(file, (None, 17)).astype(np.float64)
+    if not len(table) or not np.isfinite(table).all():
+        raise UsageError(f"{file} holds no poses, or values that are not finite")
+    matrices = table[:, :15].reshape(-1, 3, 5)
+    if (matrices[:, :, 4] != matrices[0, :, 4]).any():
+        raise UsageError(f"{file}: size and focal length must be the same for all frames")
+    height, width, focal = int(matrices[0, 0, 4]), int(matrices[0, 1, 4]), float(matrices[0, 2, 4])
+    findings = check_intrinsics("camera", _intrinsics(width, height, focal), width, height)
+    refuse_errors(findings[:1], file)  # fx and fy are one number
+    poses = np.tile(np.eye(4), (len(table), 1, 1))
+    poses[:, :3] = matrices[:, :, :4]
+    wrong = ~geometry.is_rotation(poses[:, :3, :3])
+    if wrong.any():
+        raise UsageError(
+            f"{file}: the pose of frame {int(np.argmax(wrong))} is not a rotation and a translation; a "
+            "camera that does not move has the identity"
+        )
+    poses[:, :3, 3] *= config.depth_unit
+    return Llff(width, height, focal, poses)
+
+
+def read_rig(config: EndoNerfSource) -> StereoRig:
+    """The clip's calibration: one focal length, principal point in the middle.
+
+    Raises:
+        UsageError: as `read_llff`.
+    """
+    width, height, focal, _ = read_llff(config)
+    K = _intrinsics(width, height, focal)
+    return rectified_rig(config.folder.name, width, height, K, config.baseline or NOMINAL_BASELINE)
+
+
+def _intrinsics(width: int, height: int, focal: float) -> F64:
+    """Principal point in the picture's middle; the centre of the first pixel is (0, 0)."""
+    return np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
+
+
+def _check_masks(folder: Path, instruments: str) -> None:
+    """Masks of both polarities are in use: a wrong one would show the model nothing but instruments."""
+    files = list_pictures(folder)
+    shares = []
+    for file in files[:: -(-len(files) // CHECKED_MASKS)]:
+        mask = read_picture(file, cv2.IMREAD_GRAYSCALE)
+        if 0 < mask.max() < 128:
+            raise UsageError(f"{file}: no value is above {mask.max()}; a mask holds 0 and 255, scale it")
+        shares.append(np.mean((mask >= 128) == (instruments == "white")))
+    share = float(np.median(shares))
+    if share > 0.5:
+        other = "black" if instruments == "white" else "white"
+        raise UsageError(
+            f"{folder} would take {share:.0%} of the picture for instruments; if {instruments} means tissue "
+            f"there, set source.instruments:={other}"
+        )

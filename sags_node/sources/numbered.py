@@ -1,0 +1,105 @@
+"""Files of one kind, one per frame, in a folder or in a `.tar.gz`: found by the number in their names."""
+
+from __future__ import annotations
+
+import re
+import tarfile
+import zlib
+from pathlib import Path
+from typing import Protocol
+
+from sags_node.errors import SagsError, UsageError
+
+
+class NumberedFiles(Protocol):
+    def read(self, number: int) -> bytes | None:
+        """The content of one file, None when there is none of this number.
+
+        Raises:
+            SagsError: it cannot be read, or is too large to be right.
+        """
+
+    def close(self) -> None: ...
+
+
+def open_numbered(path: Path, suffix: str, largest: int) -> NumberedFiles | None:
+    """The files in folder `path`, or else in `path` + `.tar.gz`; None when there is neither.
+
+    Args:
+        suffix: of the files, with the dot.
+        largest: bytes one file may have.
+
+    Raises:
+        UsageError: the archive cannot be read.
+    """
+    if path.is_dir():
+        return _Unpacked(path, suffix, largest)
+    archive = path.with_name(path.name + ".tar.gz")
+    return _Packed(archive, suffix, largest) if archive.is_file() else None
+
+
+class _Unpacked:
+    def __init__(self, folder: Path, suffix: str, largest: int) -> None:
+        self._largest = largest
+        self._files = {_number(file.name, suffix): file for file in folder.iterdir()}
+
+    def read(self, number: int) -> bytes | None:
+        file = self._files.get(number)
+        if file is None:
+            return None
+        try:
+            _check_size(file.stat().st_size, self._largest, str(file))
+            return file.read_bytes()
+        except OSError as error:
+            raise SagsError(f"cannot read {file}: {error.strerror}") from None
+
+    def close(self) -> None:
+        """Nothing stays open."""
+
+
+class _Packed:
+    """Reads forward as far as it is asked to; going back unpacks from the start again."""
+
+    def __init__(self, archive: Path, suffix: str, largest: int) -> None:
+        self._archive = archive
+        self._suffix = suffix
+        self._largest = largest
+        self._members: dict[int | None, tarfile.TarInfo] = {}
+        try:
+            self._tar = tarfile.open(archive, "r:gz")
+        except (tarfile.TarError, OSError, EOFError, zlib.error) as error:
+            raise UsageError(
+                f"{archive} is not a readable tar.gz: {error}; unpack or download it again"
+            ) from None
+
+    def read(self, number: int) -> bytes | None:
+        try:
+            while number not in self._members:
+                member = self._tar.next()
+                if member is None:
+                    return None
+                if member.isfile():
+                    self._members[_number(Path(member.name).name, self._suffix)] = member
+            member = self._members[number]
+            _check_size(member.size, self._largest, f"{self._archive}: {member.name}")
+            stream = self._tar.extractfile(member)
+            assert stream is not None  # only members that are files are kept
+            return stream.read()
+        except (tarfile.TarError, OSError, EOFError, zlib.error) as error:
+            raise SagsError(f"{self._archive} is cut off or damaged ({error}); download it again") from None
+
+    def close(self) -> None:
+        self._tar.close()
+
+
+def _number(name: str, suffix: str) -> int | None:
+    """The last number in the name of a file; None of other files, hidden ones too."""
+    found = re.search(rf"(\d+){re.escape(suffix)}$", name)
+    return int(found[1]) if found and not name.startswith(".") else None
+
+
+def _check_size(size: int, largest: int, name: str) -> None:
+    if size > largest:
+        raise SagsError(
+            f"{name} has {size} bytes, more than the {largest} it can need; it is not what it seems"
+        )

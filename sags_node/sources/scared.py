@@ -1,0 +1,267 @@
+"""Keyframe folders of SCARED (Allan et al., arXiv 2101.01133).
+
+A keyframe is one view of a still organ, measured with structured light, and a video of the scope moving away
+from there: `endoscope_calibration.yaml`, `data/rgb.mp4` (left picture above the right one), `data/frame_data`
+(poses) and `data/scene_points` (the measured surface seen from each frame). The files give millimetres.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from sags_node import geometry
+from sags_node.calibration import check_intrinsics, rectified_rig, refuse_errors
+from sags_node.errors import SagsError, UsageError
+from sags_node.sources.numbered import NumberedFiles, open_numbered
+from sags_node.sources.pictures import FolderPairs, RawPair
+from sags_node.sources.videos import PanePairs, Video
+from sags_node.types import F32, F64, Eye, Reference, StereoRig
+
+log = logging.getLogger(__name__)
+
+METRES = 1e-3  # per unit of the files
+BASELINES = (1e-3, 50e-3)  # m: outside, the file is not in millimetres
+RECTIFIED_FOLDERS = (("left_rectified", "right_rectified"), ("data/left_finalpass", "data/right_finalpass"))
+LARGEST_JSON = 2**20  # bytes
+LARGEST_POINTS = 2**28
+LARGEST_CALIBRATION = 2**20
+
+
+@dataclass(frozen=True, slots=True)
+class Rectification:
+    """The calibration of a keyframe and the rectification that follows from it."""
+
+    size: tuple[int, int]  # width and height of one eye's picture, px
+    K: tuple[F64, F64]  # left, right: [3, 3] px
+    distortion: tuple[F64, F64]  # [5]
+    R: tuple[F64, F64]  # [3, 3] raw to rectified camera
+    P: tuple[F64, F64]  # [3, 4] px, P[1][0, 3] = -f B in metres
+
+    @property
+    def T_rectified_raw(self) -> F64:
+        """Left raw camera to left rectified camera, [4, 4]."""
+        T = np.eye(4)
+        T[:3, :3] = self.R[0]
+        return T
+
+
+class ScaredPairs:
+    """The frames of a keyframe's video with their poses and, if `references`, the structured light depth.
+
+    Raises:
+        UsageError: files are missing, damaged or do not fit each other.
+    """
+
+    def __init__(self, folder: Path, references: bool) -> None:
+        self._pictures, _ = _open_pictures(folder)
+        self._points: NumberedFiles | None = None
+        try:
+            self._rectification = read_rectification(folder, self._pictures.size)
+            self._poses = _read_poses(folder, self._pictures.count, self._rectification.T_rectified_raw)
+            if references:
+                self._points = open_numbered(folder / "data/scene_points", ".tiff", LARGEST_POINTS)
+        except SagsError:
+            self.close()
+            raise
+        self._look_up = cv2.initUndistortRectifyMap(
+            *(self._rectification.K[0], self._rectification.distortion[0], self._rectification.R[0]),
+            *(self._rectification.P[0], self._rectification.size, cv2.CV_32FC1),
+        )
+        self.rate = self._pictures.rate
+        self.count = self._pictures.count if self._poses is None else len(self._poses)
+        self._next = 0
+
+    def seek(self, index: int) -> None:
+        self._pictures.seek(index)
+        self._next = index
+
+    def skip(self) -> bool:
+        self._next += 1
+        return self._next <= self.count and self._pictures.skip()
+
+    def read(self) -> RawPair | None:
+        """The next frame, None at the end.
+
+        Raises:
+            SagsError: a file of this frame is damaged or not of the stated form.
+        """
+        index = self._next
+        pair = self._pictures.read() if index < self.count else None
+        if pair is None:
+            return None
+        self._next += 1
+        return pair._replace(
+            T_world_cam=None if self._poses is None else self._poses[index],
+            reference=self._reference(index),
+        )
+
+    def close(self) -> None:
+        self._pictures.close()
+        if self._points is not None:
+            self._points.close()
+
+    def _reference(self, index: int) -> Reference | None:
+        data = None if self._points is None else self._points.read(index)
+        if data is None:
+            return None
+        width, height = self._rectification.size
+        # OpenCV takes the three channels for R, G, B and gives B, G, R.
+        points = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        if points is None or points.dtype != np.float32 or points.shape != (2 * height, width, 3):
+            raise SagsError(
+                f"data/scene_points of frame {index} is no whole float TIFF of {width}x{2 * height} px and "
+                "3 channels; unpack or download scene_points.tar.gz again"
+            )
+        return Reference(self._rectified_depth(points[:height, :, ::-1]), "structured_light")
+
+    def _rectified_depth(self, points: F32) -> F32:
+        """Depth [H, W] m in the left rectified picture, of points [H, W, 3] mm at the raw picture's pixels.
+        Each rectified pixel takes the point of the nearest raw one: points are never averaged.
+        """
+        depth = points @ (self._rectification.R[0][2] * METRES).astype(np.float32)
+        rectified = cv2.remap(depth, *self._look_up, cv2.INTER_NEAREST, borderValue=0)
+        known: F32 = np.where(
+            rectified > 0, rectified, np.float32(0)
+        )  # unknown: NaN in some files, 0 in others
+        return known
+
+
+def read_rig(folder: Path) -> StereoRig:
+    """The keyframe's calibration, for the pictures that are played: raw ones or rectified ones.
+
+    Raises:
+        UsageError: pictures or calibration are missing, damaged or implausible.
+    """
+    pictures, rectified = _open_pictures(folder)
+    pictures.close()
+    found = read_rectification(folder, pictures.size)
+    name, (width, height) = f"{folder.parent.name}_{folder.name}", found.size
+    if rectified:
+        baseline = -found.P[1][0, 3] / found.P[1][0, 0]
+        return rectified_rig(name, width, height, found.P[0][:, :3], baseline)
+    eyes = [
+        Eye(width, height, *parts) for parts in zip(found.K, found.distortion, found.R, found.P, strict=True)
+    ]
+    return StereoRig(name, *eyes)
+
+
+def read_rectification(folder: Path, size: tuple[int, int]) -> Rectification:
+    """Read `endoscope_calibration.yaml` and rectify as OpenCV does by default, like the public tools for it.
+
+    Args:
+        size: width and height of one eye's picture, px.
+
+    Raises:
+        UsageError: the file is missing, damaged or implausible.
+    """
+    file = folder / "endoscope_calibration.yaml"
+    storage = _open_storage(file)
+    M1, M2, R = (_matrix(storage, file, key, (9,)).reshape(3, 3) for key in ("M1", "M2", "R"))
+    D1, D2 = (_matrix(storage, file, key, (4, 5)) for key in ("D1", "D2"))
+    T = _matrix(storage, file, "T", (3,)) * METRES
+    for key, K in (("M1", M1), ("M2", M2)):
+        refuse_errors(check_intrinsics(key, K, *size), file)
+    if not geometry.is_rotation(R):
+        raise UsageError(f"{file}: R is not a rotation; download the file again")
+    if not BASELINES[0] <= np.linalg.norm(T) <= BASELINES[1]:
+        raise UsageError(
+            f"{file}: T puts the eyes {np.linalg.norm(T) / METRES:.3g} mm apart, possible are "
+            f"{BASELINES[0] / METRES:g} to {BASELINES[1] / METRES:g}; the unit is millimetres"
+        )
+    if T[0] > 0:
+        raise UsageError(f"{file}: T points to the left: the eyes are exchanged; SCARED maps left to right")
+    R1, R2, P1, P2, *_ = cv2.stereoRectify(M1, D1, M2, D2, size, R, T[:, None])
+    distortion = np.pad(D1, (0, 5 - len(D1))), np.pad(D2, (0, 5 - len(D2)))
+    return Rectification(size, (M1, M2), distortion, (R1, R2), (P1, P2))
+
+
+def _open_storage(file: Path) -> cv2.FileStorage:
+    try:
+        if file.stat().st_size > LARGEST_CALIBRATION:
+            raise UsageError(f"{file} is too large for a calibration; download it again")
+        text = file.read_text(encoding="utf-8")
+        return cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+    except OSError as error:
+        raise UsageError(
+            f"cannot read calibration {file}: {error.strerror}; SCARED keyframes have it"
+        ) from None
+    except (UnicodeDecodeError, cv2.error, SystemError):
+        raise UsageError(f"{file} is not a YAML file as OpenCV writes it; download it again") from None
+
+
+def _matrix(storage: cv2.FileStorage, file: Path, key: str, lengths: tuple[int, ...]) -> F64:
+    """The numbers of one matrix, as one row."""
+    try:
+        values = storage.getNode(key).mat()
+    except cv2.error:  # fewer numbers than it has rows and columns
+        values = None
+    if values is None or values.size not in lengths or not np.isfinite(values).all():
+        needed = " or ".join(map(str, lengths))
+        raise UsageError(f"{file}: {key} is not a matrix of {needed} numbers; download the file again")
+    numbers: F64 = values.astype(np.float64).ravel()
+    return numbers
+
+
+def _open_pictures(folder: Path) -> tuple[PanePairs | FolderPairs, bool]:
+    """The reader of the pictures that are there, and whether they are rectified."""
+    if (folder / "data/rgb.mp4").is_file():
+        video = Video(folder / "data/rgb.mp4")
+        width, height = video.size[0], video.size[1] // 2
+        return PanePairs(video, (0, 0, width, height), (0, height, width, height)), False
+    for left, right in RECTIFIED_FOLDERS:
+        if (folder / left).is_dir():
+            pictures = FolderPairs(folder / left, folder / right)
+            names = [pictures.files[0].stem, pictures.files[-1].stem]
+            numbers = [int(name[-6:]) if name[-6:].isdecimal() else -1 for name in names]
+            if numbers != [0, pictures.count - 1]:
+                raise UsageError(
+                    f"{folder / left}: the pictures must be numbered like the poses, from 000000 without "
+                    f"gaps, not {names[0]} to {names[1]}"
+                )
+            return pictures, True
+    raise UsageError(
+        f"{folder} holds neither data/rgb.mp4 nor left_rectified/ and right_rectified/; check the path, and "
+        "that the keyframe has a video (keyframe_5 has none)"
+    )
+
+
+def _read_poses(folder: Path, count: int, T_rectified_raw: F64) -> F64 | None:
+    """`T_world_cam` [N, 4, 4] m of the left rectified camera; the world is that of frame 0. None without
+    files.
+
+    `camera-pose` maps points of the keyframe's raw left camera to the frame's.
+    """
+    files = open_numbered(folder / "data/frame_data", ".json", LARGEST_JSON)
+    if files is None:
+        log.warning("%s has no data/frame_data: the camera is taken to stand still", folder)
+        return None
+    poses: list[F64] = []
+    T_world_key = np.eye(4)
+    while len(poses) < count and (text := files.read(len(poses))) is not None:
+        T_raw_key = _read_pose(text, f"{folder / 'data/frame_data'} {len(poses)}")
+        if not poses:
+            T_world_key = T_rectified_raw @ T_raw_key
+        poses.append(T_world_key @ geometry.invert(T_rectified_raw @ T_raw_key))
+    files.close()
+    if not poses:
+        raise UsageError(f"{folder / 'data/frame_data'} holds no frame_data000000.json; unpack it again")
+    if len(poses) < count:
+        log.warning("%s has poses for %d of %d frames; the rest is left out", folder, len(poses), count)
+    return np.stack(poses)
+
+
+def _read_pose(text: bytes, name: str) -> F64:
+    try:
+        pose = np.array(json.loads(text)["camera-pose"], np.float64)
+    except (ValueError, TypeError, KeyError):
+        raise UsageError(f"{name}: no JSON with a camera-pose of numbers; unpack it again") from None
+    if pose.shape != (4, 4) or not np.isfinite(pose).all() or not geometry.is_rotation(pose[:3, :3]):
+        raise UsageError(f"{name}: camera-pose is not a rotation and a translation [4, 4]; unpack it again")
+    pose[:3, 3] *= METRES
+    return pose

@@ -1,0 +1,318 @@
+"""Pictures stay right at other sizes and distances; the 3D filter where it belongs; exports draw the same."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from engine_scenes import DERIVATIVES, camera, draw_and_differentiate, random_gaussians, relative_error
+
+from sags_node.benchmark.alias import VARIANTS, Settings, Trained, train
+from sags_node.benchmark.alias_truth import moved, resized
+from sags_node.cli import main
+from sags_node.engine.rasterize import make_rasterizer, rasterize
+from sags_node.engine.smoothing import folded
+from sags_node.evaluation.metrics import psnr
+from sags_node.mapping.budget import StepBudget
+from sags_node.mapping.mapper import Mapper
+from sags_node.model.alias_free import FILTER_VARIANCE, smoothing_variances
+from sags_node.model.gaussians import GaussianModel
+from sags_node.model.ply import SH_C0, write_ply
+from sags_node.types import F32, Camera, Gaussians, Observation
+
+VIEW = camera(moved=True)
+
+
+# ---- the 2D filter switched off ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_gradients_of_the_dilation_agree_with_the_float64_twin(seed: int) -> None:
+    gaussians = random_gaussians(seed, 60, VIEW, spread=0.4)
+    planes, found = draw_and_differentiate(gaussians, [VIEW], "numba", seed, antialias=False)
+    true_planes, true = draw_and_differentiate(gaussians, [VIEW], "reference", seed, antialias=False)
+    filtered, _ = draw_and_differentiate(gaussians, [VIEW], "numba", seed)
+    assert np.abs(planes - filtered).max() > 0.05  # it is another picture
+    np.testing.assert_allclose(planes, true_planes, atol=1e-5)
+    for name in set(DERIVATIVES) - {"sh_rest"}:
+        assert relative_error(found[name], true[name]) < 1e-4, name
+
+
+def test_dilation_is_that_of_3d_gaussian_splatting() -> None:
+    """One round Gaussian of 1 px: variance 1 + 0.3 px^2, and its opacity as it was."""
+    view = camera(width=41, height=41, focal=100.0)
+    view.K[:] = [[100, 0, 20], [0, 100, 20], [0, 0, 1]]
+    gaussian = Gaussians(
+        means=np.array([[0, 0, 0.1]], np.float32),
+        quats=np.array([[1, 0, 0, 0]], np.float32),
+        scales=np.full((1, 3), 1e-3, np.float32),
+        opacities=np.array([0.8], np.float32),
+        colors=np.ones((1, 3), np.float32),
+        ids=np.zeros(1, np.int64),
+    )
+    alpha = make_rasterizer("numba", 41, 41, antialias=False).forward(gaussian, [view])[0, 4]
+    offsets = np.arange(-2, 3)
+    np.testing.assert_allclose(alpha[20, 18:23], 0.8 * np.exp(-0.5 * offsets**2 / 1.3), rtol=1e-4)
+
+
+# ---- other sizes and distances -----------------------------------------------------------------------------
+
+SIDE = 256
+
+
+def texture() -> F32:
+    """Detail of all sizes, down to 2 px, [4 SIDE, 4 SIDE, 3]: a picture four times as fine as trained."""
+    rng = np.random.default_rng(3)
+    total = np.full((4 * SIDE, 4 * SIDE, 3), 0.5, np.float32)
+    for cells in (16, 32, 64, 128):
+        coarse = rng.normal(0, 0.07, (cells, cells, 3)).astype(np.float32)
+        total += cv2.resize(coarse, (4 * SIDE, 4 * SIDE), interpolation=cv2.INTER_CUBIC)
+    return np.clip(total, 0, 1)
+
+
+def shrunk(fine: F32, factor: float) -> F32:
+    """The picture `factor` times as large as trained, by averaging the four times finer one."""
+    size = round(SIDE * factor)
+    return np.asarray(cv2.resize(fine, (size, size), interpolation=cv2.INTER_AREA), np.float32)
+
+
+def flat_scene(fine: F32) -> Observation:
+    """The picture on a wall 8 cm away."""
+    K = np.array([[250.0, 0, (SIDE - 1) / 2], [0, 250, (SIDE - 1) / 2], [0, 0, 1]])
+    shape = (SIDE, SIDE)
+    return Observation(
+        frame_id=0,
+        t_capture_ns=0,
+        camera=Camera(SIDE, SIDE, K, np.eye(4)),
+        image=shrunk(fine, 1),
+        gray=np.zeros(shape, np.uint8),
+        tissue=np.ones(shape, bool),
+        depth=np.full(shape, 0.08, np.float32),
+        depth_confidence=np.ones(shape, np.float32),
+    )
+
+
+SETTINGS = Settings(width=SIDE, height=SIDE, max_gaussians=8000, rounds=1)
+
+
+@pytest.fixture(scope="module")
+def wall() -> tuple[Observation, dict[str, Trained]]:
+    observation = flat_scene(texture())
+    return observation, {name: train(observation, VARIANTS[name], SETTINGS) for name in ("both", "none")}
+
+
+def error_db(model: Trained, camera: Camera, truth: F32) -> float:
+    return psnr(model.draw(camera), truth, np.ones(truth.shape[:2], bool))
+
+
+def test_both_filters_beat_none_at_a_quarter_of_the_size(
+    wall: tuple[Observation, dict[str, Trained]],
+) -> None:
+    observation, models = wall
+    camera, truth = resized(observation.camera, 0.25), shrunk(texture(), 0.25)
+    assert error_db(models["both"], camera, truth) > error_db(models["none"], camera, truth) + 3
+    assert error_db(models["both"], camera, truth) > 32
+
+
+def test_both_filters_beat_none_from_four_times_the_distance(
+    wall: tuple[Observation, dict[str, Trained]],
+) -> None:
+    """The wall then fills a quarter of the picture, as the small picture shows it."""
+    observation, models = wall
+    camera = moved(observation.camera, np.array([0, 0, -3 * 0.08]))
+    quarter, first = SIDE // 4, SIDE * 3 // 8
+    inside = slice(first + 2, first + quarter - 2)
+    truth = shrunk(texture(), 0.25)[2:-2, 2:-2]
+    counted = np.ones(truth.shape[:2], bool)
+    both, none = (
+        psnr(models[name].draw(camera)[inside, inside], truth, counted) for name in ("both", "none")
+    )
+    assert both > none + 3
+
+
+def test_filters_cost_nothing_at_the_trained_size(wall: tuple[Observation, dict[str, Trained]]) -> None:
+    observation, models = wall
+    both, none = (error_db(models[name], observation.camera, observation.image) for name in ("both", "none"))
+    assert both > 30
+    assert both > none - 0.5
+
+
+def light_of_a_line(factor: float, antialias: bool) -> float:
+    """All light of one bright line 1.4 px thick, drawn `factor` times as large as it was trained, in pixels
+    of the trained size."""
+    camera = Camera(128, 96, np.array([[500.0, 0, 63.5], [0, 500, 47.5], [0, 0, 1]]), np.eye(4))
+    means = np.array([[0, 0, 0.08]], np.float32)
+    line = Gaussians(
+        means=means,
+        quats=np.array([[0.99, 0, 0, 0.14]], np.float32),
+        scales=np.array([[15, 0.6, 0.1]], np.float32) * np.float32(0.08 / 500),  # px
+        opacities=np.array([0.9], np.float32),
+        colors=np.ones((1, 3), np.float32),
+        ids=np.zeros(1, np.int64),
+        smoothing=smoothing_variances(means, [camera]),
+    )
+    view = resized(camera, factor)
+    planes = make_rasterizer("numba", view.width, view.height, antialias).forward(line, [view])
+    return float(planes[0, 0].sum(dtype=np.float64)) / factor**2
+
+
+@pytest.mark.parametrize("factor", [0.25, 0.5, 2, 4])
+def test_a_thin_bright_line_keeps_its_light(factor: float) -> None:
+    assert light_of_a_line(factor, True) == pytest.approx(light_of_a_line(1, True), rel=0.02)
+
+
+def test_a_thin_bright_line_grows_with_the_dilation() -> None:
+    assert light_of_a_line(0.25, False) > 1.8 * light_of_a_line(1, False)
+
+
+def test_bench_alias_measures_the_phantom(tmp_path: Path) -> None:
+    """The command, and that its figures say what the test above says of a wall."""
+    out, drawn = tmp_path / "alias.json", tmp_path / "alias.png"
+    arguments = ["bench", "alias", "--quick", "--json", "--out", str(out), "--picture", str(drawn)]
+    result = CliRunner().invoke(main, arguments)
+    assert result.exit_code == 0, result.output
+    table = json.loads(out.read_text())
+    assert table == json.loads(result.stdout)
+    assert table["gain_db_quarter"] > 3
+    assert table["gain_db_distance_4"] > 3
+    quarter = table["psnr_at_size"][0]
+    assert quarter["both"] - quarter["none"] == pytest.approx(table["gain_db_quarter"])
+    assert all(abs(row["both"]) < 0.02 for row in table["thin_vessel_brightness_change"])
+    assert drawn.read_bytes().startswith(b"\x89PNG")
+
+
+# ---- the 3D filter's width ---------------------------------------------------------------------------------
+
+
+def looking(focal: float, place: tuple[float, float, float] = (0, 0, 0)) -> Camera:
+    T = np.eye(4)
+    T[:3, 3] = place
+    return Camera(100, 80, np.array([[focal, 0, 50.0], [0, focal * 0.9, 40], [0, 0, 1]]), T)
+
+
+def test_variance_is_that_of_the_sampling_interval() -> None:
+    means = np.array([[0, 0, 0.08], [0, 0, 0.16], [0.01, -0.005, 0.04]], np.float32)
+    expected = FILTER_VARIANCE * (means[:, 2].astype(float) / 120) ** 2
+    np.testing.assert_allclose(smoothing_variances(means, [looking(120)]), expected, rtol=1e-5)
+
+
+def test_the_camera_that_sees_finest_counts() -> None:
+    means = np.array([[0, 0, 0.08]], np.float32)
+    near = looking(120, (0, 0, 0.06))
+    assert smoothing_variances(means, [looking(120), near]) == pytest.approx(0.2 * (0.02 / 120) ** 2)
+    assert smoothing_variances(means, [near, looking(120)]) == pytest.approx(0.2 * (0.02 / 120) ** 2)
+    sharp = looking(480)
+    assert smoothing_variances(means, [looking(120), sharp]) == pytest.approx(0.2 * (0.08 / 480) ** 2)
+
+
+def test_what_no_camera_sees_takes_the_widest_filter() -> None:
+    """Beside the picture, behind the camera, not a number."""
+    means = np.array([[0, 0, 0.04], [0, 0, 0.08], [1, 0, 0.02], [0, 0, -0.02], [np.nan, 0, 1]], np.float32)
+    found = smoothing_variances(means, [looking(120)])
+    np.testing.assert_allclose(found[2:], found[1])
+    # a second camera that does see the point on the side
+    found = smoothing_variances(means, [looking(120), looking(120, (1, 0, 0.01))])
+    assert found[2] == pytest.approx(0.2 * (0.01 / 120) ** 2, rel=1e-4)
+
+
+def test_a_little_beyond_the_border_still_counts_as_seen() -> None:
+    def beside(u: float) -> F32:
+        return np.array([[0, 0, 0.08], [(u - 50) / 120 * 0.04, 0, 0.04]], np.float32)
+
+    inside, outside = (smoothing_variances(beside(u), [looking(120)]) for u in (-14.0, -16.0))
+    assert inside[1] == pytest.approx(inside[0] / 4, rel=1e-4)
+    assert outside[1] == outside[0]
+
+
+def test_nothing_seen_is_nothing_filtered() -> None:
+    assert smoothing_variances(np.zeros((0, 3), np.float32), [looking(120)]).shape == (0,)
+    behind = np.array([[0, 0, -1]], np.float32)
+    assert smoothing_variances(behind, [looking(120)]) == 0
+    assert smoothing_variances(behind, []) == 0
+
+
+# ---- in the mapper, and on the way out ---------------------------------------------------------------------
+
+
+def mapped(smoothing: bool) -> tuple[GaussianModel, Gaussians, Observation]:
+    """A small model after two frames, and what was published of it."""
+    observation = flat_scene(texture())
+    rasterizer = make_rasterizer("numba", SIDE, SIDE)
+    mapper = Mapper(rasterizer, 3000, smoothing)
+    mapper.update(observation, StepBudget(1))
+    snapshot = mapper.update(observation, StepBudget(1))
+    return mapper.model, snapshot.gaussians, observation
+
+
+def test_mapper_filters_and_publishes_what_it_draws() -> None:
+    model, published, observation = mapped(smoothing=True)
+    expected = smoothing_variances(model.means, [observation.camera])
+    np.testing.assert_allclose(model.smoothing, expected, rtol=0.05)  # one step moves them a little
+    assert published.smoothing is None
+    drawn = rasterize(model.gaussians(), observation.camera)
+    sent = rasterize(published, observation.camera)
+    np.testing.assert_array_equal(sent.rgb, drawn.rgb)
+    unfiltered = rasterize(dataclasses.replace(model.gaussians(), smoothing=None), observation.camera)
+    assert np.abs(unfiltered.alpha - drawn.alpha).max() > 0.05  # the filter does something
+
+
+def test_first_scales_are_as_drawn_without_a_filter() -> None:
+    filtered, plain = (mapped(smoothing)[1] for smoothing in (True, False))
+    np.testing.assert_allclose(np.median(filtered.scales, 0), np.median(plain.scales, 0), rtol=0.1)
+
+
+def test_the_filter_stays_as_narrow_as_the_nearest_look_was() -> None:
+    """From farther away nothing is forgotten of what was seen from near by."""
+    observation = flat_scene(texture())
+    mapper = Mapper(make_rasterizer("numba", SIDE, SIDE), 3000)
+    mapper.update(observation, StepBudget(0))
+    before = mapper.model.smoothing.copy()
+    far = dataclasses.replace(
+        observation,
+        camera=moved(observation.camera, np.array([0, 0, -0.08])),
+        depth=observation.depth * 2,
+        tissue=np.zeros((SIDE, SIDE), bool),
+    )
+    mapper.update(far, StepBudget(0))
+    np.testing.assert_array_equal(mapper.model.smoothing, before)
+    near = dataclasses.replace(far, camera=moved(observation.camera, np.array([0, 0, 0.04])))
+    mapper.update(near, StepBudget(0))
+    assert (mapper.model.smoothing <= before).all()
+    assert mapper.model.smoothing.min() == pytest.approx(before.min() / 4, rel=0.1)
+
+
+def test_a_ply_file_draws_the_same_without_knowing_the_filter(tmp_path: Path) -> None:
+    model, _, observation = mapped(smoothing=True)
+    file = tmp_path / "model.ply"
+    write_ply(file, model.gaussians())
+    header, _, body = file.read_bytes().partition(b"end_header\n")
+    names = [line.split()[-1] for line in header.decode().splitlines() if line.startswith("property")]
+    rows = np.frombuffer(body, [(name, "<f4") for name in names])
+
+    def columns(*wanted: str) -> F32:
+        return np.stack([rows[name] for name in wanted], 1)
+
+    read = Gaussians(
+        means=columns("x", "y", "z"),
+        quats=columns("rot_0", "rot_1", "rot_2", "rot_3"),
+        scales=np.exp(columns("scale_0", "scale_1", "scale_2")),
+        opacities=1 / (1 + np.exp(-rows["opacity"])),
+        colors=columns("f_dc_0", "f_dc_1", "f_dc_2") * np.float32(SH_C0) + np.float32(0.5),
+        ids=np.arange(len(rows)),
+    )
+    found, drawn = rasterize(read, observation.camera), rasterize(model.gaussians(), observation.camera)
+    step = 1 / 255  # a logit's last bit may carry a pixel over the cut-off
+    np.testing.assert_allclose(found.rgb, drawn.rgb, atol=step)
+    np.testing.assert_allclose(found.alpha, drawn.alpha, atol=step)
+    assert np.abs(found.rgb - drawn.rgb).mean() < 1e-6
+
+
+def test_folding_twice_changes_nothing() -> None:
+    model, _, _ = mapped(smoothing=True)
+    once = folded(model.gaussians())
+    assert folded(once) is once

@@ -1,0 +1,379 @@
+"""Clips in the layout of EndoNeRF: read back exactly, refused when they cannot be right, measured."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from sags_node import config as cfg
+from sags_node.cli import main
+from sags_node.errors import SagsError, UsageError
+from sags_node.mapping.budget import StepBudget
+from sags_node.pipeline import Pipeline
+from sags_node.session import open_session
+from sags_node.sources.source import open_source
+from sags_node.types import U8, StereoFrame
+
+WIDTH, HEIGHT, FOCAL = 160, 128, 150.0
+FRAMES = 12
+
+
+def left_picture(number: int) -> U8:
+    """Texture (RGB) that moves right by one pixel per frame."""
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
+    columns -= number
+    waves = np.sin(columns / 5) * np.sin(rows / 7) + 0.5 * np.sin(columns / 17 + rows / 11)
+    return np.stack([150 + 40 * waves, 80 + 20 * waves, 70 - 15 * waves], -1).astype(np.uint8)
+
+
+def instrument(number: int) -> U8:
+    """255 = instrument: a bar that grows by a column per frame."""
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    mask[40:60, : 20 + number] = 255
+    return mask
+
+
+def depth_counts(number: int) -> U8:
+    """Millimetres: a step from 60 to 80, half a frame each."""
+    counts = np.full((HEIGHT, WIDTH), 60, np.uint8)
+    counts[:, WIDTH // 2 :] = 80
+    return counts
+
+
+def poses_bounds(count: int = FRAMES) -> np.ndarray:
+    """Identity poses as the data set has them."""
+    matrix = np.column_stack([np.eye(3), np.zeros(3), [HEIGHT, WIDTH, FOCAL]])
+    return np.tile(np.concatenate([matrix.ravel(), [60, 80]]), (count, 1))
+
+
+def write(file: Path, picture: np.ndarray) -> None:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(file), picture[..., ::-1] if picture.ndim == 3 else picture)
+
+
+@pytest.fixture
+def clip(tmp_path: Path) -> Path:
+    folder = tmp_path / "pulling_soft_tissues"
+    for number in range(FRAMES):
+        write(folder / f"images/{number:06d}.png", left_picture(number))
+        write(folder / f"masks/{number:06d}.png", instrument(number))
+        write(folder / f"depth/frame-{number}.png", depth_counts(number))  # not padded, as in some copies
+    np.save(folder / "poses_bounds.npy", poses_bounds())
+    return folder
+
+
+def play(clip: Path, **options: Any) -> list[StereoFrame]:
+    with open_source(cfg.EndoNerfSource(folder=clip, pace="step", **options)) as source:
+        return list(source)
+
+
+# ---- what is read ----------------------------------------------------------------------------------------
+
+
+def test_every_frame_comes_as_it_was_written(clip: Path) -> None:
+    frames = play(clip)
+    assert len(frames) == FRAMES
+    for number, frame in enumerate(frames):
+        assert frame.frame_id == number and frame.t_capture_ns == round(number * 1e9 / 15)
+        assert (frame.left == left_picture(number)).all()
+        assert frame.right is None and frame.reference is None
+        assert frame.tissue is not None and (frame.tissue == (instrument(number) == 0)).all()
+        assert frame.depth is not None and frame.depth.dtype == np.float32
+        assert np.array_equal(frame.depth, (depth_counts(number) * 1e-3).astype(np.float32))
+        assert frame.T_world_cam is not None and (frame.T_world_cam == np.eye(4)).all()
+
+
+def test_zero_is_unknown_and_outliers_are_drawn_to_the_percentiles(clip: Path) -> None:
+    counts = depth_counts(0)
+    counts[0, :5] = 255
+    counts[1, :5] = 2
+    counts[2, :5] = 0
+    write(clip / "depth/frame-0.png", counts)
+    depth = play(clip, frames=1)[0].depth
+    assert depth is not None
+    assert np.allclose(depth[0, :5], 0.080) and np.allclose(depth[1, :5], 0.060)
+    assert (depth[2, :5] == 0).all() and np.count_nonzero(depth == 0) == 5
+
+
+def test_sixteen_bit_depth_in_another_unit(clip: Path) -> None:
+    for number in range(FRAMES):
+        counts = depth_counts(number).astype(np.uint16) * 100 + number
+        write(clip / f"depth/frame-{number}.png", counts)
+    frame = play(clip, depth_unit=1e-5)[7]
+    assert frame.depth is not None
+    assert np.allclose(frame.depth[0, [0, -1]], [0.06007, 0.08007], atol=1e-8)
+
+
+def test_a_frame_without_any_depth_knows_none(clip: Path) -> None:
+    write(clip / "depth/frame-3.png", np.zeros((HEIGHT, WIDTH), np.uint8))
+    depth = play(clip)[3].depth
+    assert depth is not None and not depth.any()
+
+
+def test_a_moving_camera_has_lengths_in_the_unit_of_the_depth(clip: Path) -> None:
+    table = poses_bounds()
+    turn = cv2.Rodrigues(np.array([0.0, 0.2, 0.0]))[0]
+    table[4, :15] = np.column_stack([turn, [10, 0, -5], [HEIGHT, WIDTH, FOCAL]]).ravel()
+    np.save(clip / "poses_bounds.npy", table)
+    pose = play(clip)[4].T_world_cam
+    assert pose is not None
+    assert np.allclose(pose[:3, :3], turn) and np.allclose(pose[:3, 3], [0.010, 0, -0.005])
+
+
+def test_right_pictures_are_used_when_the_baseline_is_known(clip: Path) -> None:
+    for number in range(FRAMES):
+        write(clip / f"images_right/{number:06d}.png", left_picture(number + 3))
+    assert play(clip)[2].right is None
+    frame = play(clip, baseline=0.0042)[2]
+    assert frame.right is not None and (frame.right == left_picture(5)).all()
+    assert open_session(clip, ["source.baseline:=0.0042"]).rig.baseline == pytest.approx(0.0042)
+
+
+def test_stereo_replaces_missing_depth(clip: Path) -> None:
+    for number in range(FRAMES):
+        write(clip / f"images_right/{number:06d}.png", left_picture(number))
+    for file in (clip / "depth").iterdir():
+        file.unlink()
+    (clip / "depth").rmdir()
+    with pytest.raises(UsageError, match=r"holds no depth/; set source\.baseline"):
+        play(clip)
+    frame = play(clip, baseline=0.0042)[0]
+    assert frame.depth is None and frame.right is not None
+
+
+def test_the_calibration_comes_from_the_poses_file(clip: Path) -> None:
+    session = open_session(clip)
+    left = session.rig.left
+    assert (left.width, left.height) == (WIDTH, HEIGHT)
+    expected = [[FOCAL, 0, (WIDTH - 1) / 2], [0, FOCAL, (HEIGHT - 1) / 2], [0, 0, 1]]
+    assert (left.K == expected).all() and (left.P[:, :3] == expected).all()
+    assert session.rig.name == "pulling_soft_tissues"
+    with pytest.raises(UsageError, match="recording brings its own"):
+        open_session(clip, [f"rig:={clip}"])
+
+
+def test_a_folder_is_known_by_its_files_and_a_launch_file_wins(clip: Path) -> None:
+    source = cfg.load_launch(clip, ["source.stride:=3"]).source
+    assert isinstance(source, cfg.EndoNerfSource) and source.folder == clip and source.stride == 3
+    (clip / "launch.yaml").write_text("source: {kind: endonerf, folder: ., depth_unit: 0.002}\n")
+    source = cfg.load_launch(clip).source
+    assert isinstance(source, cfg.EndoNerfSource) and source.depth_unit == 0.002
+    assert source.folder.resolve() == clip.resolve()
+
+
+def test_a_stride_keeps_the_clock_and_counts_what_is_played(clip: Path) -> None:
+    with open_source(cfg.EndoNerfSource(folder=clip, pace="step", stride=5, loop=True, frames=5)) as source:
+        assert source.rate == 3 and source.frame_count == 5
+        frames = list(source)
+    assert [frame.frame_id for frame in frames] == [0, 1, 2, 3, 4]
+    for frame, number in zip(frames, [0, 5, 10, 0, 5], strict=True):
+        assert (frame.left == left_picture(number)).all()
+        assert frame.tissue is not None and (~frame.tissue).sum() == 20 * (20 + number)
+    assert [frame.epoch for frame in frames] == [0, 0, 0, 1, 1]
+    assert frames[1].t_capture_ns == round(5 * 1e9 / 15)
+
+
+# ---- polarity of the masks -------------------------------------------------------------------------------
+
+
+def test_masks_of_the_other_polarity_are_refused_and_can_be_flipped(clip: Path) -> None:
+    for number in range(FRAMES):
+        write(clip / f"masks/{number:06d}.png", 255 - instrument(number))
+    with pytest.raises(UsageError) as caught:
+        play(clip)
+    assert "masks would take 98% of the picture for instruments" in str(caught.value)
+    assert "source.instruments:=black" in str(caught.value)
+    for number, frame in enumerate(play(clip, instruments="black")):
+        assert frame.tissue is not None and (frame.tissue == (instrument(number) == 0)).all()
+    for number in range(FRAMES):
+        write(clip / f"masks/{number:06d}.png", instrument(number))
+    with pytest.raises(UsageError, match=r"source\.instruments:=white"):
+        play(clip, instruments="black")
+
+
+def test_one_frame_full_of_instruments_is_possible(clip: Path) -> None:
+    write(clip / "masks/000004.png", np.full((HEIGHT, WIDTH), 255, np.uint8))
+    tissue = play(clip)[4].tissue
+    assert tissue is not None and not tissue.any()
+
+
+# ---- mistakes --------------------------------------------------------------------------------------------
+
+
+def no_masks(clip: Path) -> None:
+    for file in (clip / "masks").iterdir():
+        file.unlink()
+    (clip / "masks").rmdir()
+
+
+def one_mask_less(clip: Path) -> None:
+    (clip / "masks/000005.png").unlink()
+
+
+def one_depth_less(clip: Path) -> None:
+    (clip / "depth/frame-5.png").unlink()
+
+
+def label_masks(clip: Path) -> None:
+    for number in range(FRAMES):
+        write(clip / f"masks/{number:06d}.png", instrument(number) // 255)
+
+
+def small_mask(clip: Path) -> None:
+    write(clip / "masks/000000.png", instrument(0)[:-2])
+
+
+def small_depth(clip: Path) -> None:
+    write(clip / "depth/frame-0.png", depth_counts(0)[:, :-4])
+
+
+def coloured_depth(clip: Path) -> None:
+    write(clip / "depth/frame-0.png", left_picture(0))
+
+
+def depth_in_micrometres(clip: Path) -> None:
+    for number in range(FRAMES):
+        write(clip / f"depth/frame-{number}.png", depth_counts(number).astype(np.uint16) * 500)
+
+
+def no_poses(clip: Path) -> None:
+    (clip / "poses_bounds.npy").unlink()
+
+
+def poses_of_wrong_shape(clip: Path) -> None:
+    np.save(clip / "poses_bounds.npy", poses_bounds()[:, :12])
+
+
+def pickled_poses(clip: Path) -> None:
+    np.save(clip / "poses_bounds.npy", poses_bounds().astype(object), allow_pickle=True)
+
+
+def pickle_as_npy(clip: Path) -> None:
+    (clip / "poses_bounds.npy").write_bytes(pickle.dumps(poses_bounds()))
+
+
+def torn_poses(clip: Path) -> None:
+    file = clip / "poses_bounds.npy"
+    file.write_bytes(file.read_bytes()[:-64])
+
+
+def fewer_poses(clip: Path) -> None:
+    np.save(clip / "poses_bounds.npy", poses_bounds(FRAMES - 2))
+
+
+def nan_poses(clip: Path) -> None:
+    np.save(clip / "poses_bounds.npy", poses_bounds() * np.nan)
+
+
+def poses_for_another_size(clip: Path) -> None:
+    table = poses_bounds()
+    table[:, 4], table[:, 9] = 2 * HEIGHT, 2 * WIDTH
+    np.save(clip / "poses_bounds.npy", table)
+
+
+def focal_length_in_metres(clip: Path) -> None:
+    table = poses_bounds()
+    table[:, 14] = 0.004
+    np.save(clip / "poses_bounds.npy", table)
+
+
+def zoom(clip: Path) -> None:
+    table = poses_bounds()
+    table[3:, 14] *= 2
+    np.save(clip / "poses_bounds.npy", table)
+
+
+def sheared_pose(clip: Path) -> None:
+    table = poses_bounds()
+    table[6, 1] = 0.5
+    np.save(clip / "poses_bounds.npy", table)
+
+
+@pytest.mark.parametrize(
+    ("mistake", "message"),
+    [
+        (no_masks, "masks does not exist; check the path"),
+        (one_mask_less, "images holds 12 pictures but .*masks holds 11"),
+        (one_depth_less, "images holds 12 pictures but .*depth holds 11"),
+        (label_masks, "masks/000000.png: no value is above 1; a mask holds 0 and 255, scale it"),
+        (small_mask, "masks/000000.png is 160x126 px but .*images/000000.png is 160x128"),
+        (small_depth, "depth/frame-0.png is 156x128 px but the pictures are 160x128"),
+        (coloured_depth, "depth/frame-0.png has 3 channels; a depth picture is a grey PNG of 8 or 16 bit"),
+        (depth_in_micrometres, r"frame-0.png: the median depth would be \d+ m, .*set source.depth_unit"),
+        (no_poses, "poses_bounds.npy does not exist; check the path"),
+        (poses_of_wrong_shape, r"poses_bounds.npy is float64 \[12, 12\], wanted numbers \[any, 17\]"),
+        (pickled_poses, "poses_bounds.npy is object"),
+        (pickle_as_npy, "poses_bounds.npy is not a readable npy file"),
+        (torn_poses, "poses_bounds.npy claims an impossible size"),
+        (fewer_poses, "poses_bounds.npy holds 10 poses but .*images 12 pictures; there must be one pose"),
+        (nan_poses, "poses_bounds.npy holds no poses, or values that are not finite"),
+        (poses_for_another_size, "poses_bounds.npy is for 320x256 px but the pictures are 160x128; scale"),
+        (focal_length_in_metres, "poses_bounds.npy: camera: fx = 0.004 px is not plausible"),
+        (zoom, "poses_bounds.npy: size and focal length must be the same for all frames"),
+        (sheared_pose, "poses_bounds.npy: the pose of frame 6 is not a rotation and a translation"),
+    ],
+    ids=lambda value: value.__name__ if callable(value) else "",
+)
+def test_mistakes_are_named_with_their_mend(
+    clip: Path, mistake: Callable[[Path], None], message: str
+) -> None:
+    mistake(clip)
+    with pytest.raises(SagsError, match=message) as caught:
+        open_source(cfg.load_launch(clip).source)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_depth_picture_of_wrong_form_in_the_middle_ends_the_clip_there(clip: Path) -> None:
+    write(clip / "depth/frame-7.png", depth_counts(7)[:-2])
+    seen = []
+    with open_source(cfg.EndoNerfSource(folder=clip, pace="step")) as source:
+        with pytest.raises(SagsError, match=r"frame-7\.png is 160x126 px"):
+            for frame in source:
+                seen.append(frame.frame_id)
+    assert seen == list(range(7))
+
+
+# ---- through the node ------------------------------------------------------------------------------------
+
+
+def test_the_pipeline_takes_the_given_depth_instead_of_stereo(clip: Path) -> None:
+    overrides = ["source.pace:=step", "vision.width:=80", "vision.height:=64", "vision.tissue.dilate:=0"]
+    session = open_session(clip, overrides)
+    pipeline = Pipeline(session.config, session.rig)
+    with session.source as source:
+        result = pipeline.process(next(iter(source)), StepBudget(1))
+    observation = result.observation
+    bar = np.zeros((64, 80), bool)
+    bar[20:30, :10] = True
+    assert (observation.tissue == ~bar).all()
+    expected = np.where(bar, 0, np.where(np.arange(80) < 40, 0.060, 0.080)).astype(np.float32)
+    assert np.array_equal(observation.depth, expected)
+    assert np.array_equal(observation.depth_confidence, (expected > 0).astype(np.float32))
+    assert result.pair.right is None and len(result.snapshot.gaussians) > 200
+
+
+def test_a_clip_is_measured_by_its_path_alone(clip: Path) -> None:
+    command = ["eval", str(clip), "--pace", "step", "--iterations", "2", "--paper-psnr", "--json", "-"]
+    result = CliRunner().invoke(main, command)
+    assert result.exit_code == 0, result.output
+    figures = json.loads(result.stdout, parse_constant=lambda name: pytest.fail(f"{name} is no figure"))
+    assert figures["session"] == "pulling_soft_tissues"
+    # The literature's test split: frames 1 and 9.
+    assert [figures[key] for key in ("frames", "processed", "held_out", "dropped")] == [12, 10, 2, 0]
+    assert figures["online"]["psnr"] > 45 and figures["online"]["paper_psnr"] > figures["online"]["psnr"]
+    assert figures["heldout"]["psnr"] > 40 and figures["predict"]["psnr"] > figures["predict"]["copy_psnr"]
+    assert figures["novel"] is None and figures["depth"] is None  # no right eye, no reference
+
+
+def test_a_right_eye_that_is_not_there_cannot_be_published(clip: Path) -> None:
+    result = CliRunner().invoke(main, ["run", str(clip), "publish.right:=true"])
+    assert result.exit_code == 2
+    assert "publish.right: there is no right eye; set source.baseline" in result.stderr

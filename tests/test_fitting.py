@@ -1,0 +1,184 @@
+"""The offline fit on a short phantom session: it learns, stops, goes on, and says what is wrong."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from sags_node.cli import main
+from sags_node.engine.threads import configure_threads
+from sags_node.errors import SagsError, UsageError
+from sags_node.fitting import checkpoint
+from sags_node.fitting.clip import Clip, read_clip
+from sags_node.fitting.fit import Fit
+from sags_node.fitting.score import score
+from sags_node.fitting.settings import FitSettings
+from sags_node.fitting.start import follow_online
+from sags_node.model import columns
+from sags_node.session import open_session
+
+SMALL = FitSettings(iterations=120, max_gaussians=3000, cells=16, slots=8, channels=16)
+PAPER = dataclasses.replace(SMALL, schedule="paper", warm_up=60)
+FRAMES = ["source.pace:=step", "source.loop:=false", "source.frames:=12"]
+
+
+def held_out(frame_id: int) -> bool:
+    return frame_id in (3, 8)
+
+
+def quietly(what: str, done: int, of: int) -> None:
+    """No progress shown."""
+
+
+@pytest.fixture(scope="module")
+def clip(phantom_session: Path) -> Clip:
+    configure_threads(None)
+    return read_clip(open_session(phantom_session, FRAMES), held_out)
+
+
+def fitted(clip: Clip, settings: FitSettings, iterations: int | None = None) -> Fit:
+    fit = Fit(clip, settings)
+    fit.start(quietly)
+    while not fit.done and (iterations is None or fit.iteration < iterations):
+        fit.iterate()
+    return fit
+
+
+def test_a_clip_is_split_and_whole(clip: Clip) -> None:
+    assert [frame.frame_id for frame in clip.test] == [3, 8]
+    assert [frame.frame_id for frame in clip.train] == [0, 1, 2, 4, 5, 6, 7, 9, 10, 11]
+    frame = clip.train[0]
+    assert frame.image.dtype == np.uint8 and frame.image.shape == (*frame.tissue.shape, 3)
+    assert not frame.depth[~frame.tissue].any()
+    assert frame.reference is not None and frame.reference.depth is not None
+
+
+@pytest.mark.parametrize("tokens", ["self", "planes", "nodes"])
+def test_a_fit_learns_frames_it_never_saw(clip: Clip, tokens: Any) -> None:
+    settings = dataclasses.replace(PAPER, tokens=tokens, iterations=240)
+    start = Fit(clip, settings)
+    start.start(quietly)
+    before = score(start, clip.test, {})
+    after = score(fitted(clip, settings), clip.test, {})
+    assert after["psnr"] > before["psnr"] + 2
+    assert after["ssim"] > before["ssim"]
+    assert after["paper_psnr"] > after["psnr"]  # masked pixels count as perfect
+
+
+def test_the_field_learns_the_mappers_paths(clip: Clip) -> None:
+    fit = Fit(clip, SMALL)
+    fit.start(quietly)
+    rows, paths = follow_online(clip, fit.rasterizer, fit.model.exposure, SMALL, quietly)
+    still, learnt = [], []
+    for t, time_ns in enumerate(paths.times_ns):
+        deformed = fit.model.field.deform(rows, int(time_ns))
+        truth, known = paths.means[t], paths.known[t]
+        still.append(np.abs(rows[known, columns.MEAN] - truth[known]).mean())
+        learnt.append(np.abs(deformed[known, columns.MEAN] - truth[known]).mean())
+    assert np.mean(learnt) < 0.35 * np.mean(still)
+
+
+def test_the_paths_are_those_of_the_gaussians_that_are_left(clip: Clip) -> None:
+    fit = Fit(clip, SMALL)
+    fit.start(quietly)
+    rows, paths = follow_online(clip, fit.rasterizer, fit.model.exposure, SMALL, quietly)
+    assert paths.means.shape == (len(clip.train), len(rows), 3)
+    assert paths.known[-1].all()
+    mean = (paths.means * paths.known[..., None]).sum(0) / paths.known.sum(0)[:, None]
+    np.testing.assert_allclose(rows[:, columns.MEAN], mean, atol=1e-6)
+
+
+def test_the_number_of_gaussians_stays_under_its_cap(clip: Clip) -> None:
+    settings = dataclasses.replace(PAPER, max_gaussians=2000, iterations=900)
+    fit = Fit(clip, settings)
+    fit.start(quietly)
+    fit.model.keep(np.arange(len(fit.model)) < 1500)  # room to grow
+    fit = _restarted(fit)
+    while not fit.done:
+        fit.iterate()
+        assert len(fit.model) <= 2000
+    assert fit.split > 0
+    assert len(np.unique(fit.model.ids)) == len(fit.model)
+
+
+def _restarted(fit: Fit) -> Fit:
+    """The same fit, whose density counts begin anew with the Gaussians there are."""
+    arrays = fit.arrays()
+    arrays["pull"], arrays["seen"] = np.zeros(len(fit.model), np.float32), np.zeros(len(fit.model), np.int64)
+    other = Fit(fit.clip, fit.settings)
+    other.restore(fit.state(), arrays)
+    return other
+
+
+@pytest.mark.parametrize(
+    "settings", [SMALL, dataclasses.replace(PAPER, tokens="nodes")], ids=["self", "nodes"]
+)
+def test_a_resumed_fit_gives_the_same_bits(clip: Clip, settings: FitSettings, tmp_path: Path) -> None:
+    settings = dataclasses.replace(settings, iterations=20, warm_up=5)
+    whole = fitted(clip, settings)
+    part = fitted(clip, settings, iterations=9)
+    checkpoint.save(part, tmp_path / "checkpoint.npz")
+    resumed = Fit(clip, settings)
+    checkpoint.load(resumed, tmp_path / "checkpoint.npz")
+    while not resumed.done:
+        resumed.iterate()
+    for name, array in whole.arrays().items():
+        np.testing.assert_array_equal(resumed.arrays()[name], array, err_msg=name)
+
+
+def test_a_checkpoint_of_another_fit_is_refused(clip: Clip, tmp_path: Path) -> None:
+    path = tmp_path / "checkpoint.npz"
+    settings = dataclasses.replace(PAPER, iterations=5, warm_up=2)
+    checkpoint.save(fitted(clip, settings), path)
+    with pytest.raises(UsageError, match="other settings \\(seed\\)"):
+        checkpoint.load(Fit(clip, dataclasses.replace(settings, seed=1)), path)
+    with pytest.raises(UsageError, match="other training frames"):
+        checkpoint.load(Fit(Clip(clip.train[1:], clip.test), settings), path)
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(SagsError, match="cannot resume"):
+        checkpoint.load(Fit(clip, settings), path)
+
+
+def sags_fit(*arguments: str | Path) -> Any:
+    return CliRunner().invoke(main, ["fit", *map(str, arguments)])
+
+
+def test_the_command_leaves_model_pictures_and_figures(phantom_session: Path, tmp_path: Path) -> None:
+    out = tmp_path / "fit"
+    options = ["--out", out, "--iterations", "20", "--max-gaussians", "1500", "--json"]
+    result = sags_fit(phantom_session, "source.frames:=10", *options)
+    assert result.exit_code == 0, result.output
+    found = json.loads(result.stdout)
+    assert found == json.loads((out / "figures.json").read_text())
+    assert found["heldout"]["frames"] == 2 and found["heldout"]["psnr"] > 15
+    assert found["heldout"]["depth_median_mm"] < 10
+    assert 0 < found["gaussians"] <= 1500
+    assert sorted(path.name for path in (out / "test").iterdir()) == ["000001.png", "000009.png"]
+    header = (out / "model.ply").read_bytes()[:400]
+    assert f"element vertex {found['gaussians']}".encode() in header
+
+    again = sags_fit(phantom_session, "source.frames:=10", *options, "--resume")
+    assert again.exit_code == 0, again.output
+    assert json.loads(again.stdout)["heldout"]["psnr"] == found["heldout"]["psnr"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (["--resume"], 2, "start without --resume"),
+        (["--lpips-weights", "nothing.npz"], 2, "nothing.npz"),
+        (["source.frames:=1", "vision.stereo.min_depth:=0.25"], 1, "depth"),
+    ],
+)
+def test_a_fit_that_cannot_be_says_why(
+    phantom_session: Path, tmp_path: Path, arguments: list[str], code: int, said: str
+) -> None:
+    result = sags_fit(phantom_session, *arguments, "--out", tmp_path / "fit", "--iterations", "1")
+    assert result.exit_code == code, result.output
+    assert said in result.output and "Traceback" not in result.output

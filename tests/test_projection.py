@@ -1,0 +1,384 @@
+"""From Gaussians to splats: view-dependent colour, the 3D filter, several cameras, and every derivative."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from engine_scenes import (
+    DERIVATIVES,
+    INPUTS,
+    camera,
+    cotangents,
+    draw_and_differentiate,
+    one_gaussian,
+    random_gaussians,
+    relative_error,
+    with_filter,
+    with_view_dependence,
+)
+from numpy.typing import NDArray
+
+from sags_node import geometry
+from sags_node.engine import numba_rasterizer, projection, projection_backward, projector, smoothing
+from sags_node.engine import spherical_harmonics as harmonics
+from sags_node.engine.rasterize import make_rasterizer, rasterize
+from sags_node.errors import UsageError
+from sags_node.types import F64, Camera, Gaussians
+
+VIEW = camera(moved=True)
+EYES = [VIEW, VIEW.moved_right(0.004)]
+
+
+def moved_by(view: Camera, twist: Sequence[float]) -> Camera:
+    """The camera whose viewmat is exp(twist) viewmat, by the exponential's series."""
+    x, y, z = twist[3:]
+    generator = np.zeros((4, 4))
+    generator[:3, :3] = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
+    generator[:3, 3] = twist[:3]
+    motion = sum(np.linalg.matrix_power(generator, k) / math.factorial(k) for k in range(6))
+    return Camera(view.width, view.height, view.K, np.linalg.inv(motion @ view.viewmat))
+
+
+def same_bits(a: tuple[Any, dict[str, Any]], b: tuple[Any, dict[str, Any]]) -> None:
+    np.testing.assert_array_equal(a[0], b[0])
+    for name in DERIVATIVES:
+        np.testing.assert_array_equal(a[1][name], b[1][name], err_msg=name)
+
+
+# ---- derivatives -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("views", [[VIEW], EYES], ids=["one", "two"])
+@pytest.mark.parametrize(("degree", "filtered"), [(0, False), (1, True), (2, False), (3, True)])
+def test_every_gradient_agrees_with_the_float64_twin(
+    seed: int, views: list[Camera], degree: int, filtered: bool
+) -> None:
+    gaussians = with_view_dependence(random_gaussians(seed, 60, VIEW), degree, seed)
+    if filtered:
+        gaussians = with_filter(gaussians, seed)
+    planes, found = draw_and_differentiate(gaussians, views, "numba", seed)
+    true_planes, true = draw_and_differentiate(gaussians, views, "reference", seed)
+    assert true_planes[:, 4].mean() > 0.25  # the scene does cover the pictures
+    np.testing.assert_allclose(planes, true_planes, atol=1e-5)
+    for name in DERIVATIVES:
+        assert found[name].shape == true[name].shape
+        if name == "sh_rest" and degree == 0:
+            continue
+        assert relative_error(found[name], true[name]) < 1e-4, name
+    for half in (slice(0, 3), slice(3, 6)):  # rotations are an order of magnitude smaller than translations
+        assert relative_error(found["poses"][:, half], true["poses"][:, half]) < 1e-4, half
+
+
+def smooth_scene() -> tuple[Camera, list[F64], F64]:
+    """Alpha stays above 1/255 everywhere, so that a loss is smooth: inputs in float64, and the filter. The
+    last Gaussian lies beyond the widened frustum, where the Jacobian is held."""
+    view = camera(width=7, height=6, focal=12.0, moved=True)
+    rng = np.random.default_rng(5)
+    pixels = np.append(rng.uniform(1, 5, (5, 2)), [[11.0, 2.0]], 0)
+    inputs = [
+        geometry.unproject(view, pixels, rng.uniform(0.05, 0.09, 6)),
+        rng.normal(size=(6, 4)),
+        np.append(rng.uniform(0.02, 0.05, (5, 3)), [[0.06, 0.05, 0.07]], 0),
+        rng.uniform(0.6, 0.9, 6),
+        rng.uniform(0, 1, (6, 3)),
+        rng.normal(0, 0.4, (6, 15, 3)),
+    ]
+    return view, inputs, rng.uniform(1e-5, 1e-4, 6)
+
+
+def twin_planes(view: Camera, inputs: Sequence[Any], variance: F64, twist: Any = None) -> Any:
+    import torch
+
+    from sags_node.engine import reference
+    from sags_node.engine.rasterize import _as_pinhole
+
+    tensors = [torch.as_tensor(array) for array in inputs]
+    splats = reference.project(_as_pinhole(view), tensors, torch.tensor(variance), twist)
+    return reference.blend(splats, view.width, view.height)
+
+
+def test_twin_agrees_with_finite_differences() -> None:
+    import torch
+
+    view, inputs, variance = smooth_scene()
+    weights = torch.tensor(np.random.default_rng(6).normal(size=(5, view.height, view.width)))
+    tensors = [torch.tensor(array, requires_grad=True) for array in inputs]
+    twist = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+    planes = twin_planes(view, tensors, variance, twist)
+    found = torch.autograd.grad((planes * weights).sum(), [*tensors, twist])
+
+    def loss(view: Camera, inputs: list[F64]) -> float:
+        return float((twin_planes(view, inputs, variance) * weights).sum())
+
+    for index, name in enumerate((*INPUTS, "sh_rest")):
+        differences = np.empty_like(inputs[index])
+        for at in np.ndindex(differences.shape):
+            step = 1e-6 * max(float(abs(inputs[index][at])), 1e-3)
+            up, down = list(inputs), list(inputs)
+            up[index], down[index] = inputs[index].copy(), inputs[index].copy()
+            up[index][at] += step
+            down[index][at] -= step
+            differences[at] = (loss(view, up) - loss(view, down)) / (2 * step)
+        assert np.abs(differences[-1]).max() > 0, name  # the one with the held Jacobian takes part
+        assert relative_error(found[index].numpy(), differences) < 1e-5, name
+
+    steps = 1e-6 * np.eye(6)
+    differences = np.array(
+        [(loss(moved_by(view, s), inputs) - loss(moved_by(view, -s), inputs)) / 2e-6 for s in steps]
+    )
+    np.testing.assert_allclose(found[-1].numpy(), differences, rtol=1e-5)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, 3])
+def test_pose_gradient_predicts_how_pictures_change(seed: int) -> None:
+    """The kernels' gradient against the kernels' own pictures from cameras a little moved and turned."""
+    view, inputs, variance = smooth_scene()
+    f32 = [array.astype(np.float32) for array in inputs]
+    gaussians = Gaussians(*f32[:5], np.arange(6), f32[5], variance.astype(np.float32))
+    rasterizer = make_rasterizer("numba", view.width, view.height)
+    v_planes, weight = cotangents([view], seed)
+    rasterizer.forward(gaussians, [view])
+    (pose,) = rasterizer.backward(v_planes, weight).poses
+
+    def loss(twist: F64) -> float:
+        planes = rasterizer.forward(gaussians, [moved_by(view, twist)])
+        return float((planes.astype(np.float64) * v_planes).sum())
+
+    lengths = np.array([3e-4, 3e-4, 3e-4, 5e-3, 5e-3, 5e-3])  # m, rad
+    change = np.array([loss(step) - loss(-step) for step in np.diag(lengths)]) / (2 * lengths)
+    for half in (slice(0, 3), slice(3, 6)):
+        assert relative_error(pose[half], change[half]) < 5e-3, half
+
+
+def test_cameras_add_up() -> None:
+    """Gradients of two cameras in one call are the sum of those of each alone; poses stay apart."""
+    gaussians = with_filter(with_view_dependence(random_gaussians(4, 60, VIEW), 2))
+    v_planes, weight = cotangents(EYES, 1)
+    together, alone = make_rasterizer("numba", 48, 40), make_rasterizer("numba", 48, 40)
+    together.forward(gaussians, EYES)
+    both = together.backward(v_planes, weight)
+    sums: dict[str, Any] = dict.fromkeys(DERIVATIVES, 0.0)
+    for c, view in enumerate(EYES):
+        alone.forward(gaussians, [view])
+        found = alone.backward(v_planes[c : c + 1], weight[c : c + 1])
+        np.testing.assert_array_equal(both.poses[c], found.poses[0])
+        for name in DERIVATIVES:
+            sums[name] = sums[name] + getattr(found, name)
+    for name in set(DERIVATIVES) - {"poses"}:
+        assert relative_error(getattr(both, name), sums[name]) < 1e-6, name
+
+
+@pytest.mark.parametrize("pieces", [1, 3, 64])
+def test_same_bits_for_any_number_of_threads(pieces: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    gaussians = with_filter(with_view_dependence(random_gaussians(6, 700, VIEW), 3))
+    expected = draw_and_differentiate(gaussians, EYES)
+    for module in (numba_rasterizer, projector):
+        monkeypatch.setattr(module, "thread_count", lambda: pieces)
+    same_bits(draw_and_differentiate(gaussians, EYES), expected)
+
+
+def test_a_rasterizer_used_again_gives_what_a_fresh_one_gives() -> None:
+    """Other numbers of Gaussians and degrees, half of them out of sight."""
+    many = with_filter(with_view_dependence(random_gaussians(6, 300, VIEW), 1))
+    away = np.where(np.arange(300)[:, None] % 2, many.means, many.means + np.float32(9))
+    few = with_view_dependence(random_gaussians(7, 20, VIEW), 3)
+    scenes = [many, dataclasses.replace(many, means=away), few, random_gaussians(8, 40, VIEW), many]
+    rasterizer = make_rasterizer("numba", VIEW.width, VIEW.height)
+    for gaussians in scenes:
+        planes = rasterizer.forward(gaussians, EYES).copy()
+        gradients = rasterizer.backward(*cotangents(EYES, 0))
+        found = {name: getattr(gradients, name) for name in DERIVATIVES}
+        same_bits((planes, found), draw_and_differentiate(gaussians, EYES))
+
+
+def test_geometry_can_be_left_out() -> None:
+    gaussians = with_filter(with_view_dependence(random_gaussians(2, 40, VIEW), 1))
+    rasterizer = make_rasterizer("numba", VIEW.width, VIEW.height)
+    rasterizer.forward(gaussians, EYES)
+    whole = rasterizer.backward(*cotangents(EYES, 0)).colors.copy()
+    part = rasterizer.backward(*cotangents(EYES, 0), geometry=False)
+    np.testing.assert_array_equal(part.colors, whole)
+    assert len(part.sh_rest) == len(part.poses) == 0
+
+
+def test_kernels_compile_once() -> None:
+    """Also for frozen arrays and other float types, which are other types to Numba."""
+    plain = with_filter(with_view_dependence(random_gaussians(1, 30, VIEW), 1))
+    for name in (*INPUTS, "sh_rest", "smoothing"):
+        getattr(plain, name).flags.writeable = False
+    wide = {name: getattr(plain, name).astype(np.float64) for name in (*INPUTS, "sh_rest", "smoothing")}
+    for gaussians in (plain, dataclasses.replace(plain, **wide)):
+        draw_and_differentiate(gaussians, EYES)
+        smoothing.smoothed(gaussians.scales, gaussians.opacities, gaussians.smoothing)
+    kernels: list[Any] = [
+        projection.project,
+        projection_backward.project_backward,
+        smoothing.smooth,
+        smoothing.smooth_backward,
+        harmonics.color,
+        harmonics.color_backward,
+    ]
+    assert [len(kernel.signatures) for kernel in kernels] == [1] * len(kernels)
+
+
+# ---- spherical harmonics -----------------------------------------------------------------------------------
+
+
+def basis(directions: F64) -> NDArray[np.float32]:
+    """Y_1 to Y_15 [M, 15] as the kernel has them."""
+    means = directions.astype(np.float32)
+    found = np.empty((len(means), 15), np.float32)
+    for k in range(0, 15, 3):  # three terms per call, one in each colour
+        sh_rest = np.zeros((len(means), 15, 3), np.float32)
+        sh_rest[:, [k, k + 1, k + 2], [0, 1, 2]] = 1
+        colors = np.zeros((len(means), 3), np.float32)
+        centre = (np.float32(0), np.float32(0), np.float32(0))
+        seen = np.empty_like(colors)
+        harmonics.color(*(array_for_kernel(a) for a in (means, colors, sh_rest)), centre, seen)
+        found[:, k : k + 3] = seen
+    return found
+
+
+def array_for_kernel(array: NDArray[np.float32]) -> NDArray[np.float32]:
+    array.flags.writeable = False
+    return array
+
+
+def test_basis_is_orthonormal_on_the_sphere() -> None:
+    """By a quadrature that is exact for products of two harmonics of degree 3."""
+    heights, weights = np.polynomial.legendre.leggauss(8)
+    angles = np.arange(16) * (2 * np.pi / 16)
+    z, angle = (grid.ravel() for grid in np.meshgrid(heights, angles, indexing="ij"))
+    flat = np.sqrt(1 - z**2)
+    found = basis(np.stack([flat * np.cos(angle), flat * np.sin(angle), z], 1)).astype(np.float64)
+    areas = weights.repeat(16) * (2 * np.pi / 16)
+    np.testing.assert_allclose(found.T * areas @ found, np.eye(15), atol=2e-6)
+    np.testing.assert_allclose(areas @ found, 0, atol=2e-6)  # nor do they touch the constant
+
+
+def test_basis_has_the_order_and_the_signs_of_3d_gaussian_splatting() -> None:
+    """Degree by degree, order from -l to l, with the Condon-Shortley phase: Legendre's polynomials."""
+    rng = np.random.default_rng(2)
+    directions = rng.normal(size=(50, 3))
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    x, y, z = directions.T
+    angle, flat = np.arctan2(y, x), np.hypot(x, y)
+    expected = []
+    for degree in (1, 2, 3):
+        for order in range(-degree, degree + 1):
+            m = abs(order)
+            legendre = np.polynomial.Legendre.basis(degree)
+            height = legendre.deriv(m)(z) if m else legendre(z)
+            share = math.factorial(degree - m) / math.factorial(degree + m)
+            scale = (-1) ** m * math.sqrt((2 - (m == 0)) * (2 * degree + 1) / (4 * math.pi) * share)
+            turn = np.sin(m * angle) if order < 0 else np.cos(m * angle)
+            expected.append(scale * flat**m * height * turn)
+    np.testing.assert_allclose(basis(directions), np.stack(expected, 1), atol=2e-6)
+
+
+def test_direction_runs_from_the_camera_to_the_gaussian_in_the_world() -> None:
+    """One Gaussian with a green that grows along the world's z, seen from both sides."""
+    sh_rest = np.zeros((1, 3, 3), np.float32)
+    sh_rest[0, 1, 1] = 0.3
+    gaussians = dataclasses.replace(one_gaussian(np.array([0, 0, 0.07]), 0.002), sh_rest=sh_rest)
+    behind = np.diag([-1.0, 1.0, -1.0, 1.0])
+    behind[2, 3] = 0.14
+    for T, side in [(np.eye(4), 1), (behind, -1)]:
+        view = Camera(41, 41, np.array([[60.0, 0, 20], [0, 60, 20], [0, 0, 1]]), T)
+        seen = rasterize(gaussians, view).rgb[20, 20]
+        green = 0.5 + side * 0.3 * math.sqrt(3 / (4 * math.pi))
+        np.testing.assert_allclose(seen, [0.8, green, 0.2], rtol=1e-4)
+
+
+def test_colour_is_linear_beyond_its_range() -> None:
+    gaussians = random_gaussians(3, 40, VIEW)
+    rasterizer = make_rasterizer("numba", VIEW.width, VIEW.height)
+    strong = with_view_dependence(gaussians, 2)
+    strong = dataclasses.replace(strong, sh_rest=strong.sh_rest * 10)
+    plain, half, whole = (
+        rasterizer.forward(scene, [VIEW])[0, :3].astype(np.float64)
+        for scene in (gaussians, dataclasses.replace(strong, sh_rest=strong.sh_rest / 2), strong)
+    )
+    assert whole.min() < -0.5
+    np.testing.assert_allclose(whole - plain, 2 * (half - plain), atol=1e-5)
+
+
+def test_no_view_dependence_and_no_filter_change_nothing() -> None:
+    gaussians = random_gaussians(3, 60, VIEW)
+    expected = draw_and_differentiate(gaussians, EYES)
+    empty = dataclasses.replace(gaussians, sh_rest=np.zeros((60, 0, 3), np.float32))
+    same_bits(draw_and_differentiate(empty, EYES), expected)
+    unfiltered = dataclasses.replace(gaussians, smoothing=np.zeros(60, np.float32))
+    same_bits(draw_and_differentiate(unfiltered, EYES), expected)
+    flat = dataclasses.replace(gaussians, sh_rest=np.zeros((60, 8, 3), np.float32))
+    planes, found = draw_and_differentiate(flat, EYES)
+    np.testing.assert_array_equal(planes, expected[0])
+    np.testing.assert_array_equal(found["means"], expected[1]["means"])
+
+
+# ---- the 3D filter -----------------------------------------------------------------------------------------
+
+
+def test_filter_enlarges_the_covariance_and_keeps_the_mass_on_the_surface() -> None:
+    """R S S^T R^T + f I, taken apart again by its eigenvectors, drawn without a filter."""
+    gaussians = with_filter(random_gaussians(5, 60, VIEW))
+    R = geometry.quat_to_matrix(gaussians.quats.astype(np.float64))
+    scales = gaussians.scales.astype(np.float64)
+    covariance = R * scales[:, None, :] ** 2 @ R.transpose(0, 2, 1)
+    covariance += gaussians.smoothing[:, None, None] * np.eye(3)
+    variances, axes = np.linalg.eigh(covariance)
+    axes[np.linalg.det(axes) < 0] *= -1
+    ratios = np.sort(scales) / np.sqrt(variances)  # eigenvalues come sorted
+    kept = ratios[:, 1:].prod(1)  # thickness does not count
+    assert kept.min() < 0.6
+    enlarged = dataclasses.replace(
+        gaussians,
+        scales=np.sqrt(variances).astype(np.float32),
+        quats=np.stack([geometry.matrix_to_quat(matrix) for matrix in axes]).astype(np.float32),
+        opacities=(gaussians.opacities * kept).astype(np.float32),
+        smoothing=None,
+    )
+    rasterizer = make_rasterizer("numba", VIEW.width, VIEW.height)
+    expected = rasterizer.forward(enlarged, [VIEW]).copy()
+    assert expected[0, 4].mean() > 0.1
+    np.testing.assert_allclose(rasterizer.forward(gaussians, [VIEW]), expected, atol=2e-5)
+
+
+def test_what_is_exported_draws_the_same() -> None:
+    gaussians = with_filter(random_gaussians(5, 60, VIEW))
+    scales, opacities = smoothing.smoothed(gaussians.scales, gaussians.opacities, gaussians.smoothing)
+    exported = dataclasses.replace(gaussians, scales=scales, opacities=opacities, smoothing=None)
+    rasterizer = make_rasterizer("numba", VIEW.width, VIEW.height)
+    expected = rasterizer.forward(gaussians, [VIEW]).copy()
+    np.testing.assert_array_equal(rasterizer.forward(exported, [VIEW]), expected)
+
+
+def test_filter_of_vanishing_scales() -> None:
+    scales = np.array([[1e-7, 1e-7, 1e-7], [1e-7, 1e-3, 1.0], [1e-7, 1e-7, 1e-7]], np.float32)
+    opacities = np.array([1 - 1e-6, 0.5, 1e-6], np.float32)
+    variance = np.array([1e-9, 1e-9, 0], np.float32)
+    found_scales, found_opacities = smoothing.smoothed(scales, opacities, variance)
+    true_scales = np.sqrt(scales.astype(np.float64) ** 2 + variance[:, None])
+    true_opacities = opacities * np.sort(scales / true_scales)[:, 1:].prod(1)
+    np.testing.assert_allclose(found_scales, true_scales, rtol=1e-6)
+    np.testing.assert_allclose(found_opacities, true_opacities, rtol=1e-6)
+    np.testing.assert_array_equal(found_scales[2], scales[2])
+
+
+# ---- wrong input -------------------------------------------------------------------------------------------
+
+
+def test_wrong_shapes_are_explained() -> None:
+    gaussians = random_gaussians(0, 5, VIEW)
+    rasterizer = make_rasterizer("numba", VIEW.width, VIEW.height)
+    for shape in [(5, 4, 3), (4, 3, 3), (5, 3), (5, 3, 4)]:
+        with pytest.raises(UsageError, match="sh_rest has shape"):
+            rasterizer.forward(dataclasses.replace(gaussians, sh_rest=np.zeros(shape, np.float32)), [VIEW])
+    with pytest.raises(UsageError, match=r"smoothing has shape \[6\], expected \[5\]"):
+        rasterizer.forward(dataclasses.replace(gaussians, smoothing=np.zeros(6, np.float32)), [VIEW])

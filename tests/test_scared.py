@@ -1,0 +1,442 @@
+"""Keyframe folders of SCARED: a made-up scene whose depth, poses and pictures are known is read back."""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+import tarfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import pytest
+
+from sags_node import config as cfg
+from sags_node.errors import SagsError, UsageError
+from sags_node.evaluation.measure import Options
+from sags_node.evaluation.session import evaluate
+from sags_node.geometry import invert, project, unproject
+from sags_node.session import open_session
+from sags_node.sources.source import open_source
+from sags_node.types import F32, F64, U8, StereoFrame
+from sags_node.vision.rectify import Rectifier
+
+WIDTH, HEIGHT, FRAMES = 160, 128, 6
+PIXELS = np.stack(np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT)), -1).astype(np.float64)
+
+
+class Eye(NamedTuple):
+    K: F64
+    D: F64
+
+
+# The eyes differ and look a little past each other, so that nothing agrees by chance.
+LEFT = Eye(np.array([[150.0, 0, 74], [0, 151, 66], [0, 0, 1]]), np.array([-0.02, 0.01, 1e-3, -1e-3, 0]))
+RIGHT = Eye(np.array([[149.0, 0, 86], [0, 149, 61], [0, 0, 1]]), np.array([-0.01, 0.02, 0, 1e-3, 0]))
+R = cv2.Rodrigues(np.array([0.02, -0.03, 0.01]))[0]
+T = np.array([-4.2, 0.15, -0.1])  # mm
+# The surface: normal . X = distance, in the keyframe's raw left camera, mm.
+NORMAL, DISTANCE = np.array([0.25, -0.15, 1.0]), 62.0
+
+
+def key_to_frame(number: int) -> F64:
+    """`camera-pose` of a scope that moves and turns away from the keyframe, which is not frame 0; mm."""
+    pose = np.eye(4)
+    pose[:3, :3] = cv2.Rodrigues(np.array([0.010, -0.015, 0.02]) * (number + 1))[0]
+    pose[:3, 3] = np.array([1.0, -0.5, 2.0]) * (number + 1)
+    return pose
+
+
+def seen(eye: Eye, key_to_camera: F64) -> tuple[F64, U8]:
+    """Points [H, W, 3] mm of the surface at a camera's pixels, in that camera, and its picture (RGB)."""
+    plain = cv2.undistortPoints(PIXELS.reshape(-1, 1, 2), eye.K, eye.D).reshape(HEIGHT, WIDTH, 2)
+    rays = np.concatenate([plain, np.ones((HEIGHT, WIDTH, 1))], -1)
+    camera_to_key = invert(key_to_camera)
+    directions, origin = rays @ camera_to_key[:3, :3].T, camera_to_key[:3, 3]
+    lengths = (DISTANCE - NORMAL @ origin) / (directions @ NORMAL)
+    x, y, _ = np.moveaxis(origin + directions * lengths[..., None], -1, 0)
+    waves = np.sin(x / 3) * np.sin(y / 4)
+    picture = np.stack([150 + 60 * waves, 90 + 40 * np.sin(x / 5), 80 - 30 * waves], -1)
+    return rays * lengths[..., None], picture.astype(np.uint8)
+
+
+def pictures(number: int) -> tuple[U8, U8]:
+    left_to_right = np.eye(4)
+    left_to_right[:3, :3], left_to_right[:3, 3] = R, T
+    pose = key_to_frame(number)
+    return seen(LEFT, pose)[1], seen(RIGHT, left_to_right @ pose)[1]
+
+
+def scene_points(number: int) -> F32:
+    """[2H, W, 3] mm: left above right; a corner was not measured."""
+    points = seen(LEFT, key_to_frame(number))[0].astype(np.float32)
+    points[:20, :30] = 0
+    points[20:40, :30] = np.nan
+    return np.concatenate([points, np.full_like(points, 999.0)])
+
+
+def tiff(array: F32) -> bytes:
+    """An uncompressed float TIFF [H, W, 3], written by hand: the order of its channels is beyond doubt."""
+    height, width, _ = array.shape
+    data = array.astype("<f4").tobytes()
+    long, short = 4, 3
+    entries = [
+        (256, long, 1, width), (257, long, 1, height), (258, short, 3, 8 + len(data)), (259, short, 1, 1),
+        (262, short, 1, 2), (273, long, 1, 8), (277, short, 1, 3), (278, long, 1, height),
+        (279, long, 1, len(data)), (284, short, 1, 1), (339, short, 3, 8 + len(data) + 6),
+    ]  # fmt: skip
+    directory = struct.pack("<H", len(entries)) + b"".join(struct.pack("<HHII", *entry) for entry in entries)
+    counts = struct.pack("<6H", 32, 32, 32, 3, 3, 3)
+    header = struct.pack("<2sHI", b"II", 42, 8 + len(data) + len(counts))
+    return header + data + counts + directory + bytes(4)
+
+
+def frame_json(number: int) -> bytes:
+    calibration = {"KL": LEFT.K, "DL": LEFT.D[None], "KR": RIGHT.K, "DR": RIGHT.D[None], "R": R, "T": T[None]}
+    numbers = {key: value.tolist() for key, value in calibration.items()}
+    pose = key_to_frame(number).tolist()
+    return json.dumps({"camera-calibration": numbers, "camera-pose": pose, "timestamp": number}).encode()
+
+
+def write_calibration(file: Path, **changed: Any) -> None:
+    """As OpenCV 3 wrote it: with a header that is not YAML 1.1."""
+    values = {"M1": LEFT.K, "D1": LEFT.D, "M2": RIGHT.K, "D2": RIGHT.D, "R": R, "T": T[:, None]} | changed
+    lines = ["%YAML:1.0", "---"]
+    for key, value in values.items():
+        if value is not None:
+            matrix = np.atleast_2d(value)
+            data = ", ".join(repr(float(number)) for number in matrix.ravel())
+            lines.append(f"{key}: !!opencv-matrix\n   rows: {matrix.shape[0]}\n   cols: {matrix.shape[1]}")
+            lines.append(f"   dt: d\n   data: [ {data} ]")
+    file.write_text("\n".join(lines) + "\n")
+
+
+def pack(file: Path, members: dict[str, bytes]) -> None:
+    with tarfile.open(file, "w:gz") as archive:
+        for name, data in members.items():
+            member = tarfile.TarInfo(name)
+            member.size = len(data)
+            archive.addfile(member, io.BytesIO(data))
+
+
+def write_video(file: Path, frames: list[U8]) -> None:
+    height, width = frames[0].shape[:2]
+    writer = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"mp4v"), 25.0, (width, height))
+    for frame in frames:
+        writer.write(np.ascontiguousarray(frame[..., ::-1]))
+    writer.release()
+
+
+@pytest.fixture
+def keyframe(tmp_path: Path) -> Path:
+    """As it is downloaded: a video of stacked pictures and packed data."""
+    folder = tmp_path / "dataset_1/keyframe_2"
+    (folder / "data").mkdir(parents=True)
+    write_calibration(folder / "endoscope_calibration.yaml")
+    write_video(folder / "data/rgb.mp4", [np.vstack(pictures(number)) for number in range(FRAMES)])
+    # In the order of a file system, with what a Mac leaves behind.
+    order = [0, 2, 1, 5, 3, 4]
+    poses = {f"./frame_data{number:06d}.json": frame_json(number) for number in order}
+    pack(folder / "data/frame_data.tar.gz", {"./._frame_data000000.json": b"Mac"} | poses)
+    points = {f"scene_points{number:06d}.tiff": tiff(scene_points(number)) for number in order}
+    pack(folder / "data/scene_points.tar.gz", points)
+    return folder
+
+
+def unpack(keyframe: Path) -> None:
+    for name in ("frame_data", "scene_points"):
+        (keyframe / "data" / name).mkdir()
+        with tarfile.open(keyframe / f"data/{name}.tar.gz") as archive:
+            archive.extractall(keyframe / "data" / name, filter="data")
+        (keyframe / f"data/{name}.tar.gz").unlink()
+
+
+def play(keyframe: Path, **options: Any) -> list[StereoFrame]:
+    with open_source(cfg.ScaredSource(folder=keyframe, pace="step", **options)) as source:
+        return list(source)
+
+
+# ---- what is read ----------------------------------------------------------------------------------------
+
+
+def test_the_pictures_come_from_the_two_halves_of_the_video(keyframe: Path) -> None:
+    frames = play(keyframe)
+    assert [frame.t_capture_ns for frame in frames] == [number * 40_000_000 for number in range(FRAMES)]
+    for frame in frames:
+        for shown, drawn in zip((frame.left, frame.right), pictures(frame.frame_id), strict=True):
+            assert shown is not None and shown.shape == (HEIGHT, WIDTH, 3)
+            assert np.abs(shown.astype(float) - drawn).mean() < 6  # lossy video, halved colour resolution
+        assert frame.tissue is None and frame.depth is None
+
+
+def test_the_rectified_eyes_agree_with_each_other(keyframe: Path) -> None:
+    """Depth, pose, baseline and rectification together: a point has one colour in both eyes."""
+    rig = open_session(keyframe).rig
+    assert rig.baseline == pytest.approx(np.linalg.norm(T) * 1e-3)
+    assert rig.name == "dataset_1_keyframe_2"
+    rectifier = Rectifier(rig, WIDTH, HEIGHT)
+    frame = play(keyframe)[2]
+    pair = rectifier(frame)
+    assert pair.right is not None and frame.reference is not None and frame.reference.depth is not None
+    depth = frame.reference.depth
+    points = unproject(pair.camera, PIXELS, depth.astype(np.float64))
+    in_right, _ = project(pair.camera.moved_right(rig.baseline), points)
+    assert np.allclose(in_right[depth > 0][:, 1], PIXELS[depth > 0][:, 1], atol=1e-6)
+    warped = cv2.remap(pair.right, in_right.astype(np.float32), None, cv2.INTER_LINEAR)
+    inner = (depth > 0) & (in_right[..., 0] > 5) & (in_right[..., 0] < WIDTH - 5)
+    inner[:8] = inner[-8:] = False
+    right_place = np.abs(warped[inner].astype(float) - pair.left[inner]).mean()
+    wrong_place = np.abs(pair.right[inner].astype(float) - pair.left[inner]).mean()
+    assert inner.mean() > 0.5 and right_place < 6 < wrong_place / 3
+
+
+@pytest.mark.parametrize("packed", [True, False])
+def test_structured_light_depth_is_that_of_the_rectified_camera(keyframe: Path, packed: bool) -> None:
+    if not packed:
+        unpack(keyframe)
+    rig = open_session(keyframe).rig
+    K, R1 = rig.left.P[:, :3], rig.left.R
+    for frame in play(keyframe):
+        assert frame.reference is not None and frame.reference.depth_kind == "structured_light"
+        depth = frame.reference.depth
+        assert depth is not None and depth.shape == (HEIGHT, WIDTH) and depth.dtype == np.float32
+        assert np.isfinite(depth).all() and (depth >= 0).all()
+        # The plane in the rectified camera of this frame: n . z K^-1 p = d.
+        frame_to_key = invert(key_to_frame(frame.frame_id))
+        normal = R1 @ frame_to_key[:3, :3].T @ NORMAL
+        distance = DISTANCE - NORMAL @ frame_to_key[:3, 3]
+        rays = np.concatenate([PIXELS, np.ones((HEIGHT, WIDTH, 1))], -1) @ np.linalg.inv(K).T
+        exact = 1e-3 * distance / (rays @ normal)
+        known = depth > 0
+        assert known.mean() > 0.8
+        for unmeasured in ((20.0, 10.0), (20.0, 30.0)):  # raw pixels that hold 0 and NaN
+            place = (
+                cv2.undistortPoints(np.array([[unmeasured]]), LEFT.K, LEFT.D, R=R1, P=K).round().astype(int)
+            )
+            assert not known[place[0, 0, 1], place[0, 0, 0]]
+        errors = depth[known] - exact[known]
+        assert np.abs(errors).max() < 1.5e-4  # the nearest raw pixel is up to 0.7 px away
+        assert abs(errors.mean()) < 5e-6  # and to no side in particular
+
+
+def test_poses_put_every_frame_on_one_surface(keyframe: Path) -> None:
+    """The camera moves by centimetres; wrong direction, unit or order of the poses would tear the surface."""
+    rig = open_session(keyframe).rig
+    rectifier = Rectifier(rig, WIDTH, HEIGHT)
+    frames = play(keyframe)
+    assert frames[0].T_world_cam is not None and np.allclose(frames[0].T_world_cam, np.eye(4), atol=1e-12)
+    # The world is the rectified camera of frame 0.
+    frame_to_key = invert(key_to_frame(0))
+    normal = rig.left.R @ frame_to_key[:3, :3].T @ NORMAL
+    distance = 1e-3 * (DISTANCE - NORMAL @ frame_to_key[:3, 3])
+    for frame in frames:
+        assert frame.reference is not None and frame.reference.depth is not None
+        camera, depth = rectifier(frame).camera, frame.reference.depth
+        points = unproject(camera, PIXELS, depth.astype(np.float64))[depth > 0]
+        assert np.abs(points @ normal - distance).max() < 3e-4
+    assert frames[-1].T_world_cam is not None
+    assert np.linalg.norm(frames[-1].T_world_cam[:3, 3]) > 5e-3
+
+
+def test_only_measuring_reads_the_points(keyframe: Path) -> None:
+    (keyframe / "data/scene_points.tar.gz").write_bytes(b"not packed at all")
+    with open_session(keyframe, ["source.pace:=step"]).source as source:
+        assert [frame.reference for frame in source] == [None] * FRAMES
+
+
+def test_a_loop_and_a_stride_stay_with_their_frames(keyframe: Path) -> None:
+    """Going back in a packed archive unpacks it again; the numbers must still belong together."""
+    plain = play(keyframe)
+    frames = play(keyframe, stride=2, loop=True, frames=5)
+    for frame, number in zip(frames, [0, 2, 4, 0, 2], strict=True):
+        truth = plain[number]
+        assert np.array_equal(frame.left, truth.left) and np.array_equal(frame.T_world_cam, truth.T_world_cam)
+        assert frame.reference is not None and truth.reference is not None
+        assert np.array_equal(frame.reference.depth, truth.reference.depth)
+    assert [frame.frame_id for frame in frames] == [0, 1, 2, 3, 4]
+
+
+def test_rectified_pictures_take_the_place_of_the_video(keyframe: Path) -> None:
+    rectifier = Rectifier(open_session(keyframe).rig, WIDTH, HEIGHT)
+    raw = play(keyframe)
+    for folder in ("left_rectified", "right_rectified"):
+        (keyframe / folder).mkdir()
+    for frame in raw:
+        pair = rectifier(frame)
+        for side, picture in (("left", pair.left), ("right", pair.right)):
+            assert picture is not None
+            cv2.imwrite(str(keyframe / f"{side}_rectified/{frame.frame_id:06d}.png"), picture[..., ::-1])
+    (keyframe / "data/rgb.mp4").unlink()
+    rig = open_session(keyframe).rig
+    assert rig.baseline == pytest.approx(np.linalg.norm(T) * 1e-3)
+    again = Rectifier(rig, WIDTH, HEIGHT)
+    for before, frame in zip(raw, play(keyframe), strict=True):
+        assert np.array_equal(again(frame).left, rectifier(before).left)
+        assert np.array_equal(frame.T_world_cam, before.T_world_cam)
+        assert frame.reference is not None and before.reference is not None
+        assert np.array_equal(frame.reference.depth, before.reference.depth)
+    (keyframe / "left_rectified/000003.png").unlink()
+    (keyframe / "right_rectified/000003.png").unlink()
+    with pytest.raises(UsageError, match="from 000000 without gaps, not 000000 to 000005"):
+        play(keyframe)
+
+
+def test_a_test_keyframe_without_poses_and_points_plays_with_a_still_camera(
+    keyframe: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (keyframe / "data/frame_data.tar.gz").unlink()
+    (keyframe / "data/scene_points.tar.gz").unlink()
+    frames = play(keyframe)
+    assert len(frames) == FRAMES
+    assert all(frame.T_world_cam is None and frame.reference is None for frame in frames)
+    assert "has no data/frame_data: the camera is taken to stand still" in caplog.text
+
+
+def test_frames_without_a_pose_are_left_out(keyframe: Path, caplog: pytest.LogCaptureFixture) -> None:
+    unpack(keyframe)
+    (keyframe / "data/frame_data/frame_data000005.json").unlink()
+    assert [frame.frame_id for frame in play(keyframe, loop=True, frames=7)] == list(range(7))
+    with open_source(cfg.ScaredSource(folder=keyframe)) as source:
+        assert source.frame_count == 5
+    assert "has poses for 5 of 6 frames; the rest is left out" in caplog.text
+
+
+def test_a_frame_without_points_has_no_reference(keyframe: Path) -> None:
+    unpack(keyframe)
+    (keyframe / "data/scene_points/scene_points000003.tiff").unlink()
+    assert [frame.reference is None for frame in play(keyframe)] == [number == 3 for number in range(FRAMES)]
+
+
+def test_a_folder_is_known_by_its_files(keyframe: Path) -> None:
+    config = cfg.load_launch(keyframe, ["source.stride:=2"])
+    assert isinstance(config.source, cfg.ScaredSource)
+    assert config.source.folder == keyframe and config.source.stride == 2
+    assert config.vision.tissue.method == "none"
+    with pytest.raises(UsageError, match="the recording brings its own"):
+        open_session(keyframe, [f"rig:={keyframe}"])
+
+
+def test_a_keyframe_is_measured_by_its_path_alone(keyframe: Path) -> None:
+    figures = evaluate(keyframe, options=Options(hold_out=4, every=1), iterations=2).summary
+    assert [figures[key] for key in ("session", "processed", "held_out")] == ["keyframe_2", 4, 2]
+    assert figures["settings"]["depth_reference"] == "structured_light"
+    assert figures["depth"]["median_mm"] < 2 and figures["measured_depth"]["median_mm"] < 2  # one pixel: 6 mm
+    assert figures["online"]["psnr"] > 38 and figures["novel"]["psnr"] > 32
+
+
+# ---- mistakes --------------------------------------------------------------------------------------------
+
+
+def calibration(**changed: Any) -> Callable[[Path], None]:
+    return lambda keyframe: write_calibration(keyframe / "endoscope_calibration.yaml", **changed)
+
+
+def replaced(name: str, data: bytes) -> Callable[[Path], None]:
+    def replace(keyframe: Path) -> None:
+        unpack(keyframe)
+        (keyframe / name).write_bytes(data)
+
+    return replace
+
+
+def no_calibration(keyframe: Path) -> None:
+    (keyframe / "endoscope_calibration.yaml").unlink()
+
+
+def calibration_that_is_none(keyframe: Path) -> None:
+    (keyframe / "endoscope_calibration.yaml").write_text("hello")
+
+
+def no_video(keyframe: Path) -> None:
+    (keyframe / "data/rgb.mp4").unlink()
+
+
+def torn_archive(keyframe: Path) -> None:
+    file = keyframe / "data/frame_data.tar.gz"
+    file.write_bytes(file.read_bytes()[:-300])
+
+
+def no_archive(keyframe: Path) -> None:
+    (keyframe / "data/frame_data.tar.gz").write_bytes(b"hello")
+
+
+def empty_archive(keyframe: Path) -> None:
+    pack(keyframe / "data/frame_data.tar.gz", {})
+
+
+POSE = "data/frame_data/frame_data000001.json"
+SHEARED = np.eye(4) + np.eye(4, k=1)
+
+
+@pytest.mark.parametrize(
+    ("mistake", "message"),
+    [
+        (no_calibration, r"cannot read calibration .*endoscope_calibration\.yaml: No such file"),
+        (calibration_that_is_none, r"endoscope_calibration\.yaml is not a YAML file as OpenCV writes it"),
+        (calibration(M2=None), r"endoscope_calibration\.yaml: M2 is not a matrix of 9 numbers"),
+        (calibration(D1=np.zeros(8)), "D1 is not a matrix of 4 or 5 numbers"),
+        (calibration(R=np.full((3, 3), np.nan)), "R is not a matrix of 9 numbers"),
+        (calibration(R=np.ones((3, 3))), "R is not a rotation"),
+        (
+            calibration(T=T / 1000),
+            r"T puts the eyes 0\.0042 mm apart, possible are 1 to 50; the unit is mill",
+        ),
+        (calibration(T=-T), "the eyes are exchanged"),
+        (calibration(M1=np.diag([9e4, 151, 1.0])), "M1: fx = 90000 px is not plausible"),
+        (no_video, "holds neither data/rgb.mp4 nor left_rectified/ and right_rectified/"),
+        (torn_archive, r"frame_data\.tar\.gz is cut off or damaged .*download it again"),
+        (no_archive, r"frame_data\.tar\.gz is not a readable tar\.gz: .*; unpack or download it again"),
+        (empty_archive, "data/frame_data holds no frame_data000000.json; unpack it again"),
+        (replaced(POSE, b"{"), "data/frame_data 1: no JSON with a camera-pose of numbers"),
+        (replaced(POSE, b'{"camera-pose": "here"}'), "data/frame_data 1: no JSON with a camera-pose"),
+        (replaced(POSE, b'{"camera-pose": [[1, 0], [0, 1]]}'), "data/frame_data 1: camera-pose is not a rot"),
+        (
+            replaced(POSE, json.dumps({"camera-pose": SHEARED.tolist()}).encode()),
+            "data/frame_data 1: camera-pose is not a rotation and a translation",
+        ),
+        (
+            replaced(POSE, bytes(2**20 + 1)),
+            r"frame_data000001\.json has 1048577 bytes, more than the 1048576",
+        ),
+    ],
+    ids=lambda value: getattr(value, "__name__", ""),
+)
+def test_mistakes_are_named_with_their_mend(
+    keyframe: Path, mistake: Callable[[Path], None], message: str
+) -> None:
+    mistake(keyframe)
+    with pytest.raises(SagsError, match=message) as caught:
+        open_source(cfg.load_launch(keyframe).source)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [b"hello", tiff(scene_points(2))[:5000], tiff(scene_points(2)[:HEIGHT])],
+    ids=["text", "torn", "half"],
+)
+def test_damaged_points_in_the_middle_are_named(keyframe: Path, data: bytes) -> None:
+    unpack(keyframe)
+    (keyframe / "data/scene_points/scene_points000002.tiff").write_bytes(data)
+    frames = []
+    with open_source(cfg.ScaredSource(folder=keyframe, pace="step")) as source:
+        with pytest.raises(SagsError, match="scene_points of frame 2 is no whole float TIFF of 160x256 px"):
+            for frame in source:
+                frames.append(frame)
+    assert len(frames) == 2
+
+
+def test_archive_members_that_are_no_files_are_passed_over(keyframe: Path) -> None:
+    """A link could point anywhere, and a folder may be named like a frame."""
+    with tarfile.open(keyframe / "data/frame_data.tar.gz", "w:gz") as archive:
+        link = tarfile.TarInfo("frame_data000000.json")
+        link.type, link.linkname = tarfile.SYMTYPE, "/etc/hostname"
+        archive.addfile(link)
+        for number in range(FRAMES):
+            member = tarfile.TarInfo(f"frame_data/frame_data{number:06d}.json")
+            member.size = len(frame_json(number))
+            archive.addfile(member, io.BytesIO(frame_json(number)))
+    assert len(play(keyframe)) == FRAMES

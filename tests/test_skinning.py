@@ -1,0 +1,94 @@
+"""Skinning by control nodes against a float64 twin in torch."""
+
+import numpy as np
+import pytest
+import torch
+
+from sags_node.engine.threads import configure_threads
+from sags_node.model import columns
+from sags_node.model.skinning import skin, skin_backward
+
+
+def scene(seed: int, count: int = 40, nodes: int = 7) -> tuple[np.ndarray, ...]:
+    rng = np.random.default_rng(seed)
+    rows = rng.normal(size=(count, columns.COUNT)).astype(np.float32)
+    places = rng.normal(size=(nodes, 3)).astype(np.float32)
+    deltas = (0.4 * rng.normal(size=(nodes, columns.COUNT))).astype(np.float32)
+    index = np.stack([rng.permutation(nodes)[:4] for _ in range(count)]).astype(np.int32)
+    weight = rng.uniform(0.1, 1, (count, 4)).astype(np.float32)
+    return rows, places, deltas, index, weight / weight.sum(1, keepdims=True)
+
+
+def product(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """Hamilton product of quaternions [..., 4], wxyz."""
+    w = a[..., :1] * b[..., :1] - (a[..., 1:] * b[..., 1:]).sum(-1, keepdim=True)
+    v = a[..., :1] * b[..., 1:] + b[..., :1] * a[..., 1:] + torch.linalg.cross(a[..., 1:], b[..., 1:])
+    return torch.cat([w, v], -1)
+
+
+def twin(
+    rows: torch.Tensor, nodes: torch.Tensor, deltas: torch.Tensor, index: torch.Tensor, weight: torch.Tensor
+) -> torch.Tensor:
+    own = deltas[index]  # [N, 4, 14]
+    identity = rows.new_tensor([1.0, 0, 0, 0])
+    turn = identity + own[..., columns.QUAT]
+    unit = torch.nn.functional.normalize(turn, dim=-1)
+    arm = rows[:, None, columns.MEAN] - nodes[index]
+    arm4 = torch.cat([torch.zeros_like(arm[..., :1]), arm], -1)
+    conjugate = unit * rows.new_tensor([1.0, -1, -1, -1])
+    turned = product(product(unit, arm4), conjugate)[..., 1:]
+    w = weight[..., None]
+    mean = rows[:, columns.MEAN] + (w * (turned - arm + own[..., columns.MEAN])).sum(1)
+    plain = rows + (w * own).sum(1)
+    quat = product((w * turn).sum(1), rows[:, columns.QUAT])
+    return torch.cat([mean, plain[:, columns.LOG_SCALE], quat, plain[:, 10:]], 1)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_skinning_and_its_gradients_equal_the_twin(seed: int) -> None:
+    rows, nodes, deltas, index, weight = scene(seed)
+    skinned = np.empty_like(rows)
+    skin(rows, nodes, deltas, index, weight, skinned)
+    exact = [torch.tensor(array, dtype=torch.float64) for array in (rows, nodes, deltas)]
+    exact[0].requires_grad_()
+    exact[2].requires_grad_()
+    expected = twin(*exact, torch.tensor(index, dtype=torch.int64), torch.tensor(weight, dtype=torch.float64))
+    np.testing.assert_allclose(skinned, expected.detach().numpy(), atol=2e-6)
+
+    cotangent = np.random.default_rng(seed + 9).normal(size=rows.shape).astype(np.float32)
+    found = skin_backward(rows, nodes, deltas, index, weight, cotangent)
+    wanted = torch.autograd.grad(expected, [exact[0], exact[2]], torch.tensor(cotangent, dtype=torch.float64))
+    for got, want in zip(found, wanted, strict=True):
+        error = np.linalg.norm(got - want.numpy()) / np.linalg.norm(want.numpy())
+        assert error < 1e-5
+
+
+def test_no_delta_leaves_everything_as_it_is() -> None:
+    rows, nodes, deltas, index, weight = scene(0)
+    skinned = np.empty_like(rows)
+    skin(rows, nodes, np.zeros_like(deltas), index, weight, skinned)
+    np.testing.assert_array_equal(skinned, rows)
+
+
+def test_a_rigid_motion_of_all_nodes_moves_everything_rigidly() -> None:
+    rows, nodes, deltas, index, weight = scene(1)
+    half = 0.3
+    turn = np.array([np.cos(half), 0, 0, np.sin(half)])
+    R = np.array([[np.cos(0.6), -np.sin(0.6), 0], [np.sin(0.6), np.cos(0.6), 0], [0, 0, 1]])
+    shift = np.array([0.1, -0.2, 0.3])
+    deltas[:] = 0
+    deltas[:, columns.QUAT] = turn - [1, 0, 0, 0]
+    deltas[:, columns.MEAN] = nodes @ R.T + shift - nodes
+    skinned = np.empty_like(rows)
+    skin(rows, nodes, deltas, index, weight, skinned)
+    np.testing.assert_allclose(skinned[:, :3], rows[:, :3] @ R.T + shift, atol=2e-6)
+
+
+def test_the_gradients_are_the_same_bits_on_one_and_two_threads() -> None:
+    rows, nodes, deltas, index, weight = scene(2, count=1000, nodes=50)
+    found = []
+    for threads in (1, None):
+        configure_threads(threads)
+        found.append(skin_backward(rows, nodes, deltas, index, weight, rows))
+    for one, two in zip(*found, strict=True):
+        np.testing.assert_array_equal(one, two)
