@@ -66,7 +66,7 @@ def fit_session(
         advance(0, None, "reading the checkpoint")
         checkpoint.load(fit, stored)
     else:
-        advance(0, None, "starting")
+        advance(0, None, "starting; the first time, kernels are compiled for a minute")
         fit.start(lambda what, done, of: advance(done, of, what))
     _iterate(fit, stored, advance)
 
