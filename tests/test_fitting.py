@@ -140,6 +140,10 @@ def test_a_checkpoint_of_another_fit_is_refused(clip: Clip, tmp_path: Path) -> N
         checkpoint.load(Fit(clip, dataclasses.replace(settings, seed=1)), path)
     with pytest.raises(UsageError, match="other training frames"):
         checkpoint.load(Fit(Clip(clip.train[1:], clip.test), settings), path)
+    whole = dict(np.load(path))
+    np.savez(path, **{name: array for name, array in whole.items() if name != "cells"})
+    with pytest.raises(SagsError, match=r"damaged .*cells"):
+        checkpoint.load(Fit(clip, settings), path)
     path.write_bytes(path.read_bytes()[:1000])
     with pytest.raises(SagsError, match="cannot resume"):
         checkpoint.load(Fit(clip, settings), path)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import io
 import itertools
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -391,41 +389,3 @@ def test_growth_has_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
         field.grow(np.array(BOX) * np.inf)
     assert field.cells is cells
     assert field.grid is grid
-
-
-def test_save_and_load() -> None:
-    field = small_field()
-    field.advance(T0 + 9 * SECOND, lambda t_ns: None)
-    field.cells[:] = random_cells(field.grid)
-    field.grow(np.array(BOX) * 1.5)
-    file = io.BytesIO()
-    np.savez(file, **field.to_arrays())
-    file.seek(0)
-    loaded = HexPlaneField.from_arrays(np.load(file, allow_pickle=False))
-    points = random_points(100, margin=0.05)
-    for t_ns in (T0, T0 + 15 * SECOND // 2, T0 + 99 * SECOND):
-        assert np.allclose(loaded.sample(points, t_ns), field.sample(points, t_ns), atol=1e-4)
-    assert loaded.grid.nodes == field.grid.nodes
-    assert (loaded.oldest, loaded.newest) == (field.oldest, field.newest)
-
-
-BREAK: dict[str, Callable[[dict[str, np.ndarray]], object]] = {
-    "no cells": lambda a: a.pop("cells"),
-    "fewer cells": lambda a: a.update(cells=a["cells"][1:]),
-    "not finite": lambda a: a["cells"].__setitem__(5, np.nan),
-    "no box": lambda a: a.pop("box"),
-    "text": lambda a: a.update(box=np.array([["a", "b", "c"]] * 2)),
-    "no room": lambda a: a.update(box=a["box"] * 0),
-    "too many cells": lambda a: a.update(counts=a["counts"] * 10**9),
-    "too many levels": lambda a: a.update(shape=np.array([10**6, 4, 16])),
-    "no slot": lambda a: a.update(shape=np.array([2, -4, 16])),
-    "no time": lambda a: a.update(time_ns=np.array([0, 0, 0])),
-}
-
-
-@pytest.mark.parametrize("fault", BREAK)
-def test_load_refuses_what_is_broken(fault: str) -> None:
-    arrays = small_field().to_arrays()
-    BREAK[fault](arrays)
-    with pytest.raises(SagsError):
-        HexPlaneField.from_arrays(arrays)

@@ -64,4 +64,7 @@ def load(fit: Fit, path: Path) -> None:
         )
     if frames != [frame.frame_id for frame in fit.clip.train]:
         raise UsageError(f"{path} belongs to other training frames; start without --resume")
-    fit.restore(progress, arrays)
+    try:
+        fit.restore(progress, arrays)
+    except (KeyError, ValueError, TypeError) as error:
+        raise SagsError(f"{path} is damaged ({error}); start without --resume") from None

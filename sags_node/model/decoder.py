@@ -11,17 +11,14 @@ formulas stand in `engine.decoder_block`). There are three choices of tokens for
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
 from sags_node.engine.decoder import NodeDecoder, PointDecoder
 from sags_node.engine.decoder_block import ATTENTION_BIAS, ATTENTION_WEIGHT, VALUE_BIAS, VALUE_WEIGHT, Weights
 from sags_node.engine.decoder_layout import Sizes, flat_weights, named_weights
-from sags_node.errors import SagsError, UsageError
-from sags_node.sources.truth import load_array
+from sags_node.errors import UsageError
 from sags_node.types import F32
 
 TOKEN_CHOICES = ("self", "planes", "nodes")
@@ -146,20 +143,6 @@ class Decoder:
             self._unfold_gradients()
         return v_features
 
-    def save(self, path: Path) -> None:
-        """Write configuration and parameters as npz.
-
-        Raises:
-            SagsError: the file cannot be written.
-        """
-        config = asdict(self.config) | {"tokens": TOKEN_CHOICES.index(self.config.tokens)}
-        arrays: dict[str, Any] = config | self.parameters
-        try:
-            with path.open("wb") as file:
-                np.savez(file, **arrays)
-        except OSError as error:
-            raise SagsError(f"cannot write {path}: {error.strerror}") from None
-
     def _folded(self) -> Weights:
         """The weights with value and output layer of the attention in one: W_o (W_v x + b_v) + b_o."""
         vectors, matrices = self._weights.vectors.copy(), self._weights.matrices.copy()
@@ -195,24 +178,3 @@ def _check(name: str, array: F32, shape: tuple[int, ...]) -> None:
     if array.shape != shape or array.dtype != np.float32:
         wanted, given = f"float32 {list(shape)}", f"{array.dtype} {list(array.shape)}"
         raise UsageError(f"the deformation decoder takes {name} as {wanted}, not {given}")
-
-
-def load_decoder(path: Path) -> Decoder:
-    """Read what `Decoder.save` wrote.
-
-    Raises:
-        UsageError: the file is missing or damaged, or is no decoder.
-    """
-    config = {field.name: load_array(path, field.name, ()).item() for field in fields(DecoderConfig)}
-    wrong = [name for name, value in config.items() if not isinstance(value, int)]
-    if wrong or not 0 <= config["tokens"] < len(TOKEN_CHOICES):
-        raise UsageError(f"{path} is not a saved deformation decoder: see {(wrong or ['tokens'])[0]!r} in it")
-    try:
-        decoder = Decoder(DecoderConfig(**config | {"tokens": TOKEN_CHOICES[config["tokens"]]}))
-    except UsageError as error:
-        raise UsageError(f"{path}: {error}") from None
-    for name, parameter in decoder.parameters.items():
-        parameter[:] = load_array(path, name, parameter.shape)
-        if not np.isfinite(parameter).all():
-            raise UsageError(f"{path}: '{name}' holds values that are not finite")
-    return decoder

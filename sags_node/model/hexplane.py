@@ -12,7 +12,7 @@ of the newest.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -167,41 +167,6 @@ class HexPlaneField:
         self.grid, self._counts = grid, counts.astype(np.int64)
         self._sampler = HexPlane(grid)
         return True
-
-    def to_arrays(self) -> dict[str, NDArray[Any]]:
-        """What `from_arrays` needs, for `np.savez`. The optimiser's state is left out."""
-        return {
-            "cells": self.cells,
-            "box": np.array(self.grid.box),
-            "counts": self._counts,
-            "shape": np.array([self.grid.levels, self.grid.slots, self.grid.channels]),
-            "time_ns": np.array([self.t0_ns, self.slot_ns, self.newest]),
-        }
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> HexPlaneField:
-        """The field that `to_arrays` described.
-
-        Raises:
-            SagsError: an array is missing, or has the wrong shape or values.
-        """
-        shapes = {"box": (2, 3), "counts": (3,), "shape": (3,), "time_ns": (3,)}
-        for name, shape in shapes.items():
-            if name not in arrays or arrays[name].shape != shape or arrays[name].dtype.kind not in "if":
-                raise SagsError(f"a stored HexPlane lacks its '{name}' {list(shape)}; the file is not whole")
-        counts, shape, time_ns = (
-            arrays[name].astype(np.int64).tolist() for name in ("counts", "shape", "time_ns")
-        )
-        levels, slots, channels = shape
-        field = cls(arrays["box"], time_ns[0], time_ns[1], slots, tuple(counts), levels, channels)
-        cells = arrays.get("cells")
-        if cells is None or cells.shape != field.cells.shape or not np.isfinite(cells).all():
-            raise SagsError(
-                f"a stored HexPlane lacks its finite 'cells' {list(field.cells.shape)}; the file is not whole"
-            )
-        field.cells[:] = cells
-        field.newest = max(0, time_ns[2])
-        return field
 
 
 def _make_grid(low: F64, cell: F64, counts: NDArray[Any], levels: int, slots: int, channels: int) -> Grid:
