@@ -6,10 +6,9 @@ import json
 import logging
 import signal
 import tempfile
-from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import click
 from rich.logging import RichHandler
@@ -17,15 +16,11 @@ from rich.markup import escape
 
 from sags_node import __version__
 from sags_node.apps import text
+from sags_node.apps.launching import as_json, open_launched, positive, split
 from sags_node.apps.terminal import check_file, check_folder, console, progress, show, writing
+from sags_node.cli_bench import bench
 from sags_node.errors import SagsError, UsageError
 
-if TYPE_CHECKING:
-    from sags_node.session import Session
-
-positive = click.FloatRange(min=0, min_open=True)
-
-as_json = click.option("--json", "json_out", is_flag=True, help="Print JSON on stdout, for machines.")
 endpoint_option = click.option(
     "--endpoint", help="Data socket of the node; default: the connection file of the node on this machine."
 )
@@ -84,10 +79,10 @@ def run(launch: tuple[str, ...], seconds: float | None, json_out: bool) -> None:
     from sags_node.config import PhantomSource, load_launch
     from sags_node.node import Node
 
-    path, overrides = _split(launch)
+    path, overrides = split(launch)
     if path is None and isinstance(load_launch(None, overrides).source, PhantomSource):
         overrides = ["source.loop:=true", *overrides]
-    session = _open(path, overrides)
+    session = open_launched(path, overrides)
     node = Node(session.config, session.rig, session.source)
     where = escape(", ".join(node.endpoints))
     console.print(f"publishing on {where} as [bold]{session.config.ns}/...[/]  (Ctrl-C ends)", soft_wrap=True)
@@ -116,11 +111,11 @@ def demo(launch: tuple[str, ...], seconds: float, out: Path, json_out: bool) -> 
     from sags_node.config import V4l2Source, load_launch
     from sags_node.session import open_session
 
-    path, overrides = _split(launch)
+    path, overrides = split(launch)
     if isinstance(load_launch(path, overrides).source, V4l2Source):
         raise UsageError("sags demo plays recordings; for cameras use sags run and sags overlay")
     check_folder(out)
-    with _open(path, overrides).source as source:
+    with open_launched(path, overrides).source as source:
         frames = max(1, round(source.rate * seconds))
     # Its own sockets and run directory, so that a demo does not meet a node that is already running.
     with tempfile.TemporaryDirectory(prefix="sags-demo-") as private:
@@ -191,7 +186,7 @@ def evaluate(
     from sags_node.evaluation.session import Pace
     from sags_node.evaluation.session import evaluate as measure
 
-    path, overrides = _split(session)
+    path, overrides = split(session)
     options = Options(hold_out, every, lpips_weights, paper_psnr)
     # A long run must not end with nowhere to put its figures.
     if report is not None:
@@ -242,7 +237,7 @@ def evaluate(
 @click.option(
     "--tokens",
     type=click.Choice(["self", "planes", "nodes"]),
-    default="self",
+    default="nodes",
     show_default=True,
     help="What the attention sees: the Gaussian alone, its levels, or all control nodes.",
 )
@@ -251,7 +246,7 @@ def evaluate(
 @click.option(
     "--max-gaussians",
     type=click.IntRange(100, 2_000_000),
-    default=30_000,
+    default=60_000,
     show_default=True,
     help="Cap on N.",
 )
@@ -293,7 +288,7 @@ def fit(
     from sags_node.evaluation.measure import Options
     from sags_node.fitting.settings import FitSettings, Schedule, Tokens
 
-    path, overrides = _split(dataset)
+    path, overrides = split(dataset)
     if isinstance(load_launch(path, overrides).source, V4l2Source):
         raise UsageError("live cameras cannot be fitted; record them first, then fit the recording")
     options = Options(hold_out, 1, lpips_weights)
@@ -308,144 +303,13 @@ def fit(
         seed=seed,
     )
     check_folder(out)
-    session = _open(path, [*overrides, "source.loop:=false", "source.pace:=step"])
+    session = open_launched(path, [*overrides, "source.loop:=false", "source.pace:=step"])
     with progress("fitting") as advance:
         found = fit_session(session, settings, options, out, resume, advance)
     show(found if json_out else figures_table(found))
 
 
-# ---- bench -----------------------------------------------------------------------------------------------
-
-
-@main.group()
-def bench() -> None:
-    """Measure how fast this machine is at it."""
-
-
-@bench.command("kernels")
-@click.option("--quick", is_flag=True, help="A tiny scene and few runs: does it work, not how fast is it.")
-@click.option("--large", is_flag=True, help="Also a million Gaussians.")
-@click.option("--contention", is_flag=True, help="Also beside another process that burns one core.")
-@click.option("--no-twin", is_flag=True, help="Leave out the torch twins (most of the time, 10 GB).")
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path, dir_okay=False),
-    metavar="FILE.json",
-    help="Write the table as JSON, and a plot of the same name, .svg, beside it.",
-)
-@click.option(
-    "--check",
-    type=click.Path(path_type=Path, dir_okay=False),
-    metavar="FILE.json",
-    help="Compare with a table written by --out; fail if a kernel has become slower.",
-)
-@click.option(
-    "--tolerance",
-    type=click.FloatRange(min=1.0),
-    default=1.3,
-    show_default=True,
-    help="How many times slower than in --check's table is too slow.",
-)
-@as_json
-def bench_kernels(
-    quick: bool,
-    large: bool,
-    contention: bool,
-    no_twin: bool,
-    out: Path | None,
-    check: Path | None,
-    tolerance: float,
-    json_out: bool,
-) -> None:
-    """Time every kernel of the engine beside the machine's peak.
-
-    Milliseconds per stage, pixel-Gaussian pairs per second, the share of the machine's peak (multiply-adds or
-    memory, whichever binds; both measured in the same run), the gain over the plain torch twin, how it scales
-    with threads, and what idle pauses cost. Takes two minutes, in which the machine should do nothing else.
-
-    --check is the guard against kernels that became slow without an error. It compares each kernel's time in
-    units of the machine's own peak, so a table from another machine serves too, less sharply. Exit code 1 and
-    the kernel's name if one is slower than the tolerance.
-
-    \b
-    sags bench kernels --out benchmarks/results/kernels.json
-    sags bench kernels --check benchmarks/results/kernels.json
-    """
-    from dataclasses import replace
-
-    from sags_node.benchmark import check as guard
-    from sags_node.benchmark import report
-    from sags_node.benchmark.kernels import MILLION, QUICK, Settings, measure_kernels
-
-    settings = QUICK if quick else Settings()
-    if large:
-        settings = replace(settings, counts=(*settings.counts, MILLION))
-    settings = replace(settings, twin=not no_twin, contention=contention)
-    if check is None:
-        if out is not None:
-            check_file(out)
-        with progress("measuring") as advance:
-            measured = measure_kernels(settings, advance)
-        for table in [measured] if json_out else report.tables(measured):
-            show(table)
-        if out is not None:
-            with writing(out):
-                out.write_text(json.dumps(measured, indent=1) + "\n", encoding="utf-8")
-                out.with_suffix(".svg").write_text(report.plot(measured), encoding="utf-8")
-        return
-    if out is not None:
-        raise UsageError("give --out or --check: a check measures up to three times and keeps no table")
-    kept = guard.read_table(check)
-    settings = replace(settings, twin=False, rhythm=False, contention=False)
-    with progress("measuring") as advance:
-        compared = guard.check(lambda: measure_kernels(settings, advance), kept, tolerance)
-    show([asdict(each) for each in compared] if json_out else report.check_table(compared, tolerance))
-    slower = [f"{each.kernel} {each.ratio:.2f} times" for each in compared if each.ratio > tolerance]
-    if slower:
-        raise SagsError(f"slower than in {check}, three times in a row: {'; '.join(slower)}")
-
-
-@bench.command("alias")
-@click.option("--quick", is_flag=True, help="A tiny scene and few steps: does it work, not how good is it.")
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path, dir_okay=False),
-    metavar="FILE.json",
-    help="Write the table as JSON.",
-)
-@click.option(
-    "--picture",
-    type=click.Path(path_type=Path, dir_okay=False),
-    metavar="FILE.png",
-    help="Draw the truth, both filters and none side by side.",
-)
-@as_json
-def bench_alias(quick: bool, out: Path | None, picture: Path | None, json_out: bool) -> None:
-    """What both filters are worth at other sizes and distances.
-
-    Four models of one instant of the phantom, with each choice of filters, are drawn at 1/4 to 4 times the
-    size and from 1/2 to 4 times the distance, and compared with the ray-cast truth: PSNR, the brightness of
-    thin vessels, flicker in a slow motion. Takes about two minutes.
-
-    \b
-    sags bench alias --out benchmarks/results/alias.json --picture docs/alias.png
-    """
-    from sags_node.benchmark import alias_report
-    from sags_node.benchmark.alias import QUICK, Settings, measure_alias
-
-    for file in (out, picture):
-        if file is not None:
-            check_file(file)
-    with progress("measuring") as advance:
-        measured = measure_alias(QUICK if quick else Settings(), advance)
-    for table in [measured.table] if json_out else alias_report.tables(measured.table):
-        show(table)
-    if out is not None:
-        with writing(out):
-            out.write_text(json.dumps(measured.table, indent=1) + "\n", encoding="utf-8")
-    if picture is not None:
-        with writing(picture):
-            picture.write_bytes(alias_report.picture(measured.truth, measured.models))
+main.add_command(bench)
 
 
 # ---- consumers -------------------------------------------------------------------------------------------
@@ -563,7 +427,7 @@ def doctor(launch: tuple[str, ...], json_out: bool) -> None:
     from sags_node.apps.doctor import as_rows, examine
     from sags_node.config import load_launch
 
-    checks = examine(load_launch(*_split(launch)))
+    checks = examine(load_launch(*split(launch)))
     rows = as_rows(checks)
     show(rows if json_out else text.rows_table(rows))
     if any(check.level == "error" for check in checks):
@@ -590,30 +454,3 @@ def calib_check(folder: Path, json_out: bool) -> None:
     show(rows if json_out else text.rows_table(rows))
     if any(finding.level == "error" for finding in findings):
         raise SagsError(f"{folder} cannot be used as it is; see the mends above")
-
-
-# ---- shared ----------------------------------------------------------------------------------------------
-
-
-def _split(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
-    """A launch file or session folder, if there is one, and the overrides."""
-    overrides = [argument for argument in arguments if ":=" in argument]
-    paths = [argument for argument in arguments if ":=" not in argument]
-    for path in paths:
-        if "=" in path and not Path(path).exists():
-            raise UsageError(f"'{path}' is not an override; write {path.replace('=', ':=', 1)}")
-    if len(paths) > 1:
-        raise UsageError(f"one launch file or session at a time, not {', '.join(paths)}")
-    return (paths[0] if paths else None), overrides
-
-
-def _open(path: str | None, overrides: Sequence[str]) -> Session:
-    """Open a session and make its kernels ready, saying what takes long."""
-    from sags_node.session import open_session
-    from sags_node.warm_up import warm_up
-
-    with progress("rendering the phantom (once)") as advance:
-        session = open_session(path, overrides, advance)
-    with console.status("loading kernels (compiled once per machine, about half a minute)"):
-        warm_up(session.config)
-    return session

@@ -251,9 +251,8 @@ def never(t_ns: int) -> None:
 def test_first_values() -> None:
     field = small_field()
     space, time = field.cells[: field.grid.space_rows], field.cells[field.grid.space_rows :]
-    assert space.min() >= 0.1
-    assert space.max() <= 0.5
-    assert abs(space.mean() - 0.3) < 0.01
+    assert 0.7 <= space.min() < 0.75 and 1.25 < space.max() <= 1.3
+    assert abs(space.mean() - 1.0) < 0.01
     assert (time == 1).all()
     assert np.array_equal(field.cells, small_field().cells)
 
@@ -369,7 +368,7 @@ def test_growth_keeps_old_cells_trainable() -> None:
     low, high = np.array(BOX)
     inside = rng.uniform(low, high, (2000, 3)).astype(np.float32)
     assert residual(inside, 0.5) > 0.4
-    fit(inside, 0.5, 100)
+    fit(inside, 0.5, 150)
     assert residual(inside, 0.5) < 0.01
     shift = 3 * (high - low)
     far = (inside + shift).astype(np.float32)

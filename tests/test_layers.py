@@ -19,6 +19,7 @@ LAYERS = [
     {"fitting"},
     {"benchmark"},
     {"apps"},
+    {"cli_bench"},
     {"cli"},
 ]
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}

@@ -15,6 +15,7 @@ from sags_node.apps import text
 from sags_node.engine.smoothing import folded
 from sags_node.engine.threads import configure_threads
 from sags_node.errors import UsageError
+from sags_node.evaluation.lpips import Lpips
 from sags_node.evaluation.machine import machine_name
 from sags_node.evaluation.measure import Options
 from sags_node.fitting import checkpoint
@@ -58,6 +59,7 @@ def fit_session(
     stored = out / "checkpoint.npz"
     if resume and not stored.is_file():
         raise UsageError(f"there is no {stored} to resume from; start without --resume")
+    lpips = None if options.lpips_weights is None else Lpips(options.lpips_weights)
     configure_threads(session.config.engine.threads)
     count = session.source.frame_count
     clip = read_clip(session, options.holds_out, lambda done: advance(done, count, "reading"))
@@ -84,7 +86,7 @@ def fit_session(
         "pruned": fit.pruned,
         "split": fit.split,
         "heldout": score(
-            fit, clip.test, segments, options.lpips_weights, drawn,
+            fit, clip.test, segments, lpips, drawn,
             lambda done: advance(done, len(clip.test), "measuring"),
         ),
         "train": score(fit, clip.train[:: max(1, options.hold_out)], segments),
@@ -103,8 +105,8 @@ def _iterate(fit: Fit, stored: Path, advance: Advance) -> None:
     saved = time.monotonic()
     try:
         while not fit.done:
-            step = fit.iterate()
-            advance(fit.iteration, fit.total, f"fitting, L1 {step.color:.4f}, {len(fit.model)} Gaussians")
+            residual = fit.iterate()
+            advance(fit.iteration, fit.total, f"fitting, L1 {residual:.4f}, {len(fit.model)} Gaussians")
             if time.monotonic() - saved > CHECKPOINT_PERIOD:
                 checkpoint.save(fit, stored)
                 saved = time.monotonic()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -52,6 +52,27 @@ class Clip:
     test: Sequence[ClipFrame]
 
 
+def play(session: Session, references: bool) -> Iterator[ClipFrame]:
+    """Frames of a session, which is opened anew, through the node's own front end.
+
+    Args:
+        session: it is played from its start.
+        references: also deliver what it knows to be true.
+
+    Raises:
+        SagsError: the recording cannot be read.
+    """
+    pipeline = Pipeline(session.config, session.rig)
+    with open_source(session.config.source, references) as source:
+        for frame in source:
+            pair = pipeline.rectifier(frame)
+            tissue = pipeline.tissue(frame, pair)
+            depth, _ = pipeline.depth(frame, pair, tissue)
+            yield ClipFrame(
+                pair.frame_id, pair.t_capture_ns, pair.camera, pair.left, tissue, depth, frame.reference
+            )
+
+
 def read_clip(
     session: Session, held_out: Callable[[int], bool], progress: Callable[[int], None] = lambda done: None
 ) -> Clip:
@@ -65,21 +86,13 @@ def read_clip(
     Raises:
         SagsError: no frame to learn from, the recording cannot be read, or it does not fit into memory.
     """
-    pipeline = Pipeline(session.config, session.rig)
     train: list[ClipFrame] = []
     test: list[ClipFrame] = []
-    with open_source(session.config.source, references=True) as source:
-        for frame in source:
-            pair = pipeline.rectifier(frame)
-            tissue = pipeline.tissue(frame, pair)
-            depth, _ = pipeline.depth(frame, pair, tissue)
-            kept = ClipFrame(
-                pair.frame_id, pair.t_capture_ns, pair.camera, pair.left, tissue, depth, frame.reference
-            )
-            if not train and not test:
-                _check_memory(kept, source.frame_count)
-            (test if held_out(frame.frame_id) else train).append(kept)
-            progress(len(train) + len(test))
+    for frame in play(session, references=True):
+        if not train and not test:
+            _check_memory(frame, session.source.frame_count)
+        (test if held_out(frame.frame_id) else train).append(frame)
+        progress(len(train) + len(test))
     if not train:
         raise SagsError("no frame to learn from; check source.start, source.frames and the hold-out")
     return Clip(train, test)

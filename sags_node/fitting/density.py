@@ -40,7 +40,7 @@ class Density:
         split = np.argsort(-pull, kind="stable")[: max(room, 0)]
         split = split[pull[split] > 0]
         if len(split) > 0:
-            model.append(_split(model.rows, split, rng))
+            model.append(_split(model.rows, split, rng), split)
         self._forget()
         return pruned, len(split)
 

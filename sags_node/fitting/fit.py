@@ -1,7 +1,13 @@
-"""The offline fit: canonical Gaussians and the deformation field, learnt from a clip's training frames."""
+"""The offline fit: canonical Gaussians and the deformation field, learnt from a clip's training frames.
+
+`paper`: Adam on everything against the paper's loss. `online`: the start knows where the tissue went and how
+it looked; what is left are small corrections of the field and of single Gaussians (`model.residuals`), by
+squared colour residuals and the closed-form colour step, as the online mapper does.
+"""
 
 from __future__ import annotations
 
+import math
 import time
 from typing import Any
 
@@ -9,12 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sags_node.engine.adam import AdamState
-from sags_node.engine.photometric import LossTerms, PhotometricLoss
+from sags_node.engine.losses import tissue_loss
+from sags_node.engine.photometric import PhotometricLoss
 from sags_node.engine.rasterize import make_rasterizer
 from sags_node.fitting.clip import Clip, ClipFrame
 from sags_node.fitting.density import EVERY, Density
 from sags_node.fitting.settings import FitSettings
-from sags_node.fitting.start import Progress, follow_online, learn_paths, pooled_rows
+from sags_node.fitting.start import Progress, follow_online, learn_paths, pooled_rows, remainder
+from sags_node.mapping.mapper import DEPTH_SCALE, DEPTH_WEIGHT
 from sags_node.model import columns
 from sags_node.model.decoder import Decoder, DecoderConfig
 from sags_node.model.deformable import DeformableModel
@@ -22,6 +30,7 @@ from sags_node.model.deformation import spread_nodes
 from sags_node.model.exposure import Exposure
 from sags_node.model.field import Deltas, Field, NodeField, PointField
 from sags_node.model.hexplane import HexPlaneField
+from sags_node.model.residuals import Residuals
 from sags_node.types import F32, F64, Gaussians
 
 NODES = 512
@@ -29,6 +38,10 @@ BOX_QUANTILE = 1e-3  # of the Gaussians beyond the field's box on either side: s
 LOG_SCALE_RATE, QUAT_RATE, COLOR_RATE, LOGIT_RATE = 5e-3, 1e-3, 2.5e-3, 0.05  # EndoGaussian, SAGS
 EXPOSURE_RATE = 2e-3
 DENSIFY_UNTIL = 0.5  # of the iterations
+COLOR_RELAXATION = 1.6  # of SIRT; 0 < value < 2 converges
+REFINE_QUAT_RATE, REFINE_LOGIT_RATE = 2.5e-3, 7.5e-3  # gentle: the start is good
+REFINE_FIELD_SHARE = 0.003  # of the field's rates, which are for learning from nothing
+REFINE_DECAY = 0.1
 
 
 class Fit:
@@ -57,6 +70,10 @@ class Fit:
         self._rates[columns.QUAT] = QUAT_RATE
         self._rates[columns.COLOR] = COLOR_RATE
         self._rates[columns.LOGIT] = LOGIT_RATE
+        self._refine_rates = self._rates.copy()
+        self._refine_rates[columns.QUAT] = REFINE_QUAT_RATE
+        self._refine_rates[columns.COLOR] = 0
+        self._refine_rates[columns.LOGIT] = REFINE_LOGIT_RATE
 
     def start(self, progress: Progress) -> None:
         """Make the model.
@@ -65,7 +82,7 @@ class Fit:
             SagsError: no frame has depth enough.
         """
         started = time.perf_counter()
-        settings, exposure = self.settings, self._make_exposure()
+        settings, exposure, residuals = self.settings, self._make_exposure(), None
         if settings.schedule == "paper":
             rows = pooled_rows(self.clip, exposure, settings)
             field = self._make_field(rows[:, columns.MEAN])
@@ -73,8 +90,9 @@ class Fit:
             rows, paths = follow_online(self.clip, self.rasterizer, exposure, settings, progress)
             field = self._make_field(rows[:, columns.MEAN])
             learn_paths(field, rows, paths, settings, progress)
+            residuals = remainder(field, rows, paths)
         self._start_means = np.ascontiguousarray(rows[:, columns.MEAN])
-        self.model = DeformableModel(rows, field, exposure, settings.antialias)
+        self.model = DeformableModel(rows, field, exposure, settings.antialias, residuals)
         self._density = Density(self.model, settings.max_gaussians)
         self.seconds += time.perf_counter() - started
 
@@ -92,9 +110,18 @@ class Fit:
         """Iterations in all."""
         return self.warm_up + self.settings.iterations
 
-    def iterate(self) -> LossTerms:
-        """One step on one training frame; returns its loss."""
+    def iterate(self) -> float:
+        """One step on one training frame; returns its mean absolute colour residual."""
         started = time.perf_counter()
+        if self.settings.schedule == "paper":
+            residual = self._descend()
+        else:
+            residual = self._refine()
+        self.seconds += time.perf_counter() - started
+        return residual
+
+    def _descend(self) -> float:
+        """A step of the paper's schedule."""
         deformed = self.iteration >= self.warm_up
         frame = self._next_frame() if deformed else self.clip.train[0]
         observation = frame.observation()
@@ -117,8 +144,28 @@ class Fit:
         if self.iteration % EVERY == 0 and self._progress() < DENSIFY_UNTIL:
             pruned, split = self._density.adapt(self._rng)
             self.pruned, self.split = self.pruned + pruned, self.split + split
-        self.seconds += time.perf_counter() - started
-        return terms
+        return terms.color
+
+    def _refine(self) -> float:
+        """A step of the joint refinement after the online pass."""
+        frame = self._next_frame()
+        observation = frame.observation()
+        gaussians = self.model.at(frame.t_capture_ns, [frame.camera])
+        planes = self.rasterizer.forward(gaussians, [frame.camera])
+        residual = tissue_loss(
+            planes[0], observation.image, frame.tissue, frame.depth, self._v_planes[0], self._weight[0],
+            DEPTH_WEIGHT, DEPTH_SCALE,
+        )  # fmt: skip
+        gradients = self.rasterizer.backward(self._v_planes, self._weight)
+        share = REFINE_DECAY ** self._progress()
+        self.model.refine(
+            gradients,
+            self._refine_rates * np.float32(share),
+            COLOR_RELAXATION * math.sqrt(share),  # less and less, so that frames average out
+            self.settings.field_rates.scaled(REFINE_FIELD_SHARE * share),
+        )
+        self.iteration += 1
+        return residual
 
     def gaussians(self, frame: ClipFrame) -> Gaussians:
         """The model at the time of a frame."""
@@ -138,6 +185,11 @@ class Fit:
             found |= {f"{name}.moments": adam.moments, f"{name}.shares": adam.shares}
         if isinstance(model.field, NodeField):
             found |= {"index": model.field.index, "weight": model.field.weight}
+        residuals = model.residuals
+        if residuals is not None:
+            found |= {"residuals": residuals.values, "residuals.times": residuals.times_ns}
+            found |= {"residuals.moments": np.stack([adam.moments for adam in residuals.adam])}
+            found |= {"residuals.shares": np.stack([adam.shares for adam in residuals.adam])}
         return found | {
             "ids": model.ids,
             "start": self._start_means,
@@ -161,8 +213,14 @@ class Fit:
         """Go on from there, instead of `start`: the same bits as without the interruption."""
         self._start_means = arrays["start"]
         field = self._make_field(self._start_means)
+        residuals = None
+        if self.settings.schedule == "online":
+            residuals = Residuals(arrays["residuals.times"], len(arrays["rows"]))
+            residuals.values[:] = arrays["residuals"]
+            adam = zip(arrays["residuals.moments"], arrays["residuals.shares"], strict=True)
+            residuals.adam = [AdamState(moments, shares) for moments, shares in adam]
         model = self.model = DeformableModel(
-            arrays["rows"], field, self._make_exposure(), self.settings.antialias
+            arrays["rows"], field, self._make_exposure(), self.settings.antialias, residuals
         )
         if isinstance(field, NodeField):
             field.index, field.weight = arrays["index"], arrays["weight"]

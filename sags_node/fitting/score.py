@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -14,8 +14,10 @@ from sags_node.engine.rasterize import to_view
 from sags_node.errors import SagsError
 from sags_node.evaluation import metrics
 from sags_node.evaluation.lpips import BACKBONE, Lpips
+from sags_node.evaluation.tracking import PointTracks
 from sags_node.fitting.clip import ClipFrame
 from sags_node.fitting.fit import Fit
+from sags_node.types import F64
 
 Segments = dict[str, tuple[int, int]]  # first and last frame
 
@@ -32,7 +34,7 @@ def score(
     fit: Fit,
     frames: Sequence[ClipFrame],
     segments: Segments,
-    lpips_weights: Path | None = None,
+    lpips: Lpips | None = None,
     pictures: Path | None = None,
     progress: Callable[[int], None] = lambda done: None,
 ) -> dict[str, Any]:
@@ -42,7 +44,7 @@ def score(
         fit: started.
         frames: what to measure on.
         segments: named stretches, whose means are given too.
-        lpips_weights: npz of LPIPS weights; None: no LPIPS.
+        lpips: measures LPIPS; None: it is left out.
         pictures: an existing folder that takes the drawn frames, PNG.
         progress: called with the frames done.
 
@@ -52,7 +54,6 @@ def score(
     Raises:
         SagsError: a picture cannot be written.
     """
-    lpips = Lpips(lpips_weights) if lpips_weights is not None else None
     rows = []
     for done, frame in enumerate(frames):
         planes = fit.rasterizer.forward(fit.gaussians(frame), [frame.camera])[0]
@@ -81,6 +82,42 @@ def score(
         if inside:
             found[name] = _means(inside)
     return found
+
+
+def score_tracks(fit: Fit, frames: Iterable[ClipFrame]) -> dict[str, Any] | None:
+    """How well the model's Gaussians stay on true surface points, median over points and frames.
+
+    Args:
+        fit: started.
+        frames: in the order of time.
+
+    Returns:
+        `median_mm`, `p90_mm`, `median_px` and `lost`, points without a Gaussian to follow, summed over
+        frames; None if no frame knows such points.
+    """
+    tracks: PointTracks | None = None
+    errors_mm: list[F64] = []
+    errors_px: list[F64] = []
+    lost = 0
+    for frame in frames:
+        reference = frame.reference
+        if reference is None or reference.points is None or reference.points_visible is None:
+            continue
+        if tracks is None:
+            tracks = PointTracks(len(reference.points))
+        found = tracks.update(fit.gaussians(frame), reference.points, reference.points_visible, frame.camera)
+        errors_mm.append(found.errors_mm)
+        errors_px.append(found.errors_px)
+        lost += found.lost
+    if not errors_mm or sum(map(len, errors_mm)) == 0:
+        return None
+    mm, px = np.concatenate(errors_mm), np.concatenate(errors_px)
+    return {
+        "median_mm": round(float(np.median(mm)), 4),
+        "p90_mm": round(float(np.quantile(mm, 0.9)), 4),
+        "median_px": round(float(np.median(px)), 4),
+        "lost": lost,
+    }
 
 
 def _means(rows: list[dict[str, float]]) -> dict[str, Any]:

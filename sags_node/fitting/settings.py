@@ -19,14 +19,14 @@ class FitSettings:
     schedule: Schedule = "online"  # how it starts: see `fitting.start`
     warm_up: int = 1000  # iterations on the first frame without deformation; only with schedule = paper
     iterations: int = 3000  # on all training frames, with deformation
-    tokens: Tokens = "self"
+    tokens: Tokens = "nodes"
     adaptive: bool = True  # False: without the self-adaptive block, as EndoGaussian
     antialias: bool = True  # both filters
-    max_gaussians: int = 30_000
+    max_gaussians: int = 60_000
     seed: int = 0
     levels: int = 2  # of the HexPlane
     cells: int = 64  # along each axis, coarsest level
-    slots: int = 60  # of time
+    slots: int = 25  # of time
     channels: int = 32
     mean_px: float = 0.08  # learning rate of canonical means, in px at the tissue's median depth
     decay: float = 0.01  # learning rates fall to this share of their first values

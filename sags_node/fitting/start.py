@@ -2,7 +2,7 @@
 
 `paper`: points of all training frames pooled at random (EndoGaussian, SAGS); the field knows nothing.
 `online`: the online mapper plays the clip once. It follows every Gaussian through the frames; the field
-learns these paths by regression, which needs no drawing and so is fast, before it is refined on the pictures.
+learns these paths by regression, which needs no drawing and so is fast. What it leaves becomes residuals.
 """
 
 from __future__ import annotations
@@ -23,27 +23,28 @@ from sags_node.model import columns
 from sags_node.model.activation import deactivate
 from sags_node.model.exposure import Exposure
 from sags_node.model.field import Field
+from sags_node.model.residuals import Residuals
 from sags_node.types import F32, I64, Bool, Gaussians
 
 POOLED_SHARE = 0.01  # of a frame's pixels
 FIRST_OPACITY = 0.1
-ONLINE_STEPS = 1  # of the mapper per frame
+ONLINE_STEPS = 2  # of the mapper per frame
 PATH_POINTS = 8192  # Gaussians per step of the regression
-PATH_STEPS = 2000
-POSITION_TOLERANCE = 1e-4  # m: an error of a path that counts as much as one of `COLOR_TOLERANCE`
-COLOR_TOLERANCE = 0.02
+PATH_STEPS = 1500
+FRAMES_PER_SLOT = 3  # training frames from one time of the paths to the next
+CARRIERS = 8  # Gaussians that tell a new one where it lay before
+HIDDEN = -5.0  # of an opacity logit
 
 Progress = Callable[[str, int, int], None]  # what, done, of
 
 
 @dataclass(frozen=True, slots=True)
 class Paths:
-    """Where the online mapper saw each Gaussian, and how coloured."""
+    """How the online mapper saw each Gaussian at some times."""
 
-    times_ns: I64  # [T]
-    means: F32  # [T, N, 3] m
-    colors: F32  # [T, N, 3]
-    known: Bool  # [T, N]
+    times_ns: I64  # [K]
+    states: F32  # [K, N, 14], see `columns`
+    known: Bool  # [K, N]
 
 
 def pooled_rows(clip: Clip, exposure: Exposure, settings: FitSettings) -> F32:
@@ -98,46 +99,79 @@ def follow_online(
     """Play the training frames through the online mapper.
 
     Returns:
-        Canonical rows [N, 14], at the mean of each Gaussian's path, and the paths, without exposure.
+        Canonical rows [N, 14], placed as the tissue lay in the first frame, and the paths, without exposure.
 
     Raises:
         SagsError: no frame had depth enough to start a model.
     """
     mapper, budget = Mapper(rasterizer, settings.max_gaussians), StepBudget(ONLINE_STEPS)
-    seen: list[tuple[I64, F32, F32]] = []
+    slots = {*range(0, len(clip.train), FRAMES_PER_SLOT), len(clip.train) - 1}
+    seen: list[tuple[I64, F32]] = []
+    first = _Places()
     for done, frame in enumerate(clip.train):
         observation = frame.observation()
         budget.start()
         snapshot = mapper.update(observation, budget)
         planes = rasterizer.forward(snapshot.gaussians, [frame.camera])[0]
         mapper.drawn(observation, to_view(planes, frame.camera, frame.frame_id, frame.t_capture_ns))
-        gaussians = snapshot.gaussians
-        colors = gaussians.colors / exposure.at(frame.t_capture_ns)
-        seen.append((gaussians.ids, gaussians.means, colors))
+        gaussians = mapper.model.gaussians()  # before the 3D filter: the fit applies its own
+        first.add(gaussians.ids, gaussians.means)
+        if done in slots:
+            rows = deactivate(gaussians)
+            rows[:, columns.COLOR] /= exposure.at(frame.t_capture_ns)
+            seen.append((gaussians.ids, rows))
         progress("following the tissue", done + 1, len(clip.train))
-    final = mapper.model.gaussians()  # before the 3D filter: the fit applies its own
-    if len(final) == 0:
+    ids = np.unique(np.concatenate([ids for ids, _ in seen]))
+    if len(ids) == 0:
         raise SagsError("no training frame had depth enough to start a model; check vision.stereo")
-    shape = (len(seen), len(final), 3)
-    means, colors = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-    known = np.zeros(shape[:2], np.bool_)
-    row_of = np.full(max(int(ids.max(initial=0)) for ids, _, _ in seen) + 1, -1)
-    row_of[final.ids] = np.arange(len(final))
-    for t, (ids, at, colored) in enumerate(seen):
-        rows = row_of[ids]
-        kept = rows >= 0
-        means[t, rows[kept]], colors[t, rows[kept]] = at[kept], colored[kept]
-        known[t, rows[kept]] = True
-    rows = deactivate(final)
-    weight = known[..., None] / known.sum(0)[None, :, None]
-    rows[:, columns.MEAN] = (means * weight).sum(0)
-    rows[:, columns.COLOR] = (colors * weight).sum(0)
-    times = np.array([frame.t_capture_ns for frame in clip.train])
-    return rows, Paths(times, means, colors, known)
+    states = np.zeros((len(seen), len(ids), columns.COUNT), np.float32)
+    known = np.zeros(states.shape[:2], np.bool_)
+    for slot, (those, rows) in enumerate(seen):
+        at = np.searchsorted(ids, those)
+        states[slot, at], known[slot, at] = rows, True
+    rows = (states * (known[..., None] / known.sum(0)[None, :, None]).astype(np.float32)).sum(0)
+    rows[:, columns.MEAN] = first.of(ids)
+    return rows, Paths(np.array([clip.train[slot].t_capture_ns for slot in sorted(slots)]), states, known)
+
+
+class _Places:
+    """Where each Gaussian lay in the first frame. One that appears later is carried back there by the
+    displacement of those around it."""
+
+    def __init__(self) -> None:
+        self._places = np.zeros((0, 3), np.float32)  # by id
+        self._known = np.zeros(0, np.bool_)
+
+    def add(self, ids: I64, means: F32) -> None:
+        """Where they are in the next frame: ids [N], means [N, 3] m."""
+        more = max(int(ids.max(initial=-1)) + 1 - len(self._known), 0)
+        self._places = np.pad(self._places, ((0, more), (0, 0)))
+        self._known = np.pad(self._known, (0, more))
+        known = self._known[ids]
+        new = means[~known].copy()
+        if known.any() and len(new):
+            displacement = means[known] - self._places[ids[known]]
+            new -= displacement[_nearest(means[known], new)].mean(axis=1)
+        self._places[ids[~known]], self._known[ids[~known]] = new, True
+
+    def of(self, ids: I64) -> F32:
+        """Places [N, 3] m of Gaussians that were added."""
+        return self._places[ids]
+
+
+def _nearest(points: F32, queries: F32) -> I64:
+    """The points nearest to each query, [M, CARRIERS]."""
+    import open3d as o3d
+
+    search = o3d.core.nns.NearestNeighborSearch(o3d.core.Tensor.from_numpy(np.ascontiguousarray(points)))
+    search.knn_index()
+    found, _ = search.knn_search(o3d.core.Tensor.from_numpy(queries), min(CARRIERS, len(points)))
+    index: I64 = found.numpy()
+    return index
 
 
 def learn_paths(field: Field, rows: F32, paths: Paths, settings: FitSettings, progress: Progress) -> None:
-    """Let the field learn the paths: mean absolute errors of positions and colours, at random times."""
+    """Let the field learn the paths: mean absolute errors of positions, at random times."""
     rng = np.random.default_rng(settings.seed)
     for step in range(PATH_STEPS):
         t = int(rng.integers(len(paths.times_ns)))
@@ -146,11 +180,25 @@ def learn_paths(field: Field, rows: F32, paths: Paths, settings: FitSettings, pr
         canonical = rows[picked]
         field.follow(canonical[:, columns.MEAN])
         deformed = field.deform(canonical, int(paths.times_ns[t]))
+        off = deformed - paths.states[t, picked]
         v_deformed = np.zeros_like(deformed)
-        means, colors = paths.means[t, picked], paths.colors[t, picked]
-        v_deformed[:, columns.MEAN] = np.sign(deformed[:, columns.MEAN] - means) / POSITION_TOLERANCE
-        v_deformed[:, columns.COLOR] = np.sign(deformed[:, columns.COLOR] - colors) / COLOR_TOLERANCE
-        field.backward(v_deformed / np.float32(len(picked)))
+        v_deformed[:, columns.MEAN] = np.sign(off[:, columns.MEAN]) / np.float32(len(picked))
+        field.backward(v_deformed)
         field.step(settings.field_rates.scaled(settings.decay ** (step / PATH_STEPS)))
         progress("learning the paths", step + 1, PATH_STEPS)
     field.follow(rows[:, columns.MEAN])
+
+
+def remainder(field: Field, rows: F32, paths: Paths) -> Residuals:
+    """What the paths are beyond the field. Where the mapper did not know a Gaussian, it does as at the
+    nearest time it was known, but hides."""
+    residuals = Residuals(paths.times_ns, len(rows))
+    for slot, t_ns in enumerate(paths.times_ns.tolist()):
+        residuals.values[slot] = paths.states[slot] - field.deform(rows, t_ns)
+    slots = np.arange(len(paths.times_ns))
+    for slot in range(len(slots)):
+        lost = np.flatnonzero(~paths.known[slot])
+        distance = np.where(paths.known[:, lost], np.abs(slots - slot)[:, None], len(slots))
+        residuals.values[slot, lost] = residuals.values[distance.argmin(axis=0), lost]
+        residuals.values[slot, lost, columns.LOGIT] += HIDDEN
+    return residuals

@@ -1,4 +1,7 @@
-"""The SAGS model: canonical Gaussians, the field that deforms them, and the exposure they are seen with."""
+"""The SAGS model: canonical Gaussians, the field that deforms them, and the exposure they are seen with.
+
+Beyond SAGS a Gaussian may have residuals of its own (`residuals`), added to what the field makes of it.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,7 @@ from sags_node.model.activation import activate, activate_backward
 from sags_node.model.alias_free import smoothing_variances
 from sags_node.model.exposure import Exposure
 from sags_node.model.field import Field, FieldRates
+from sags_node.model.residuals import Residuals, Steps
 from sags_node.types import F32, I64, Bool, Camera, Gaussians
 
 BETAS = (0.9, 0.999)
@@ -21,18 +25,27 @@ BETAS = (0.9, 0.999)
 class DeformableModel:
     """Canonical Gaussians in rows (`columns`) with their optimiser, and a field. Not for two threads."""
 
-    def __init__(self, rows: F32, field: Field, exposure: Exposure, smooth: bool = True) -> None:
+    def __init__(
+        self,
+        rows: F32,
+        field: Field,
+        exposure: Exposure,
+        smooth: bool = True,
+        residuals: Residuals | None = None,
+    ) -> None:
         """
         Args:
             rows: [N, 14] canonical.
             field: deforms them.
             exposure: scales their colours.
             smooth: whether the 3D filter is on.
+            residuals: of these Gaussians.
         """
         self.rows = np.ascontiguousarray(rows, np.float32)
         self.ids: I64 = np.arange(len(rows))
         self.field = field
         self.exposure = exposure
+        self.residuals = residuals
         self._smooth = smooth
         self.next_id = len(rows)
         self.adam = AdamState.new(*self.rows.shape)
@@ -51,6 +64,8 @@ class DeformableModel:
         """
         self._t_ns, self._deformed = t_ns, deformed
         rows = self.field.deform(self.rows, t_ns) if deformed else self.rows.copy()
+        if deformed and self.residuals is not None:
+            rows += self.residuals.at(t_ns)
         self._plain = rows[:, columns.COLOR].copy()
         self._gain = self.exposure.at(t_ns)
         rows[:, columns.COLOR] *= self._gain
@@ -62,7 +77,7 @@ class DeformableModel:
     def descend(
         self, gradients: Gradients, rates: F32, field_rates: FieldRates, exposure_rate: float
     ) -> None:
-        """One step of Adam against the gradients of what the last `at` gave.
+        """One step of Adam on everything but residuals, against the gradients of what the last `at` gave.
 
         Args:
             gradients: of the loss by those Gaussians.
@@ -73,18 +88,43 @@ class DeformableModel:
         v_rows = activate_backward(self._drawn, gradients)
         self.exposure.descend(self._t_ns, (v_rows[:, columns.COLOR] * self._plain).sum(axis=0), exposure_rate)
         v_rows[:, columns.COLOR] *= self._gain
+        seen = np.flatnonzero(gradients.contribution > 0)
         if self._deformed:
             v_rows = self.field.backward(v_rows)
             self.field.step(field_rates)
-        seen = np.flatnonzero(gradients.contribution > 0)
         adam_step(self.rows, v_rows, self.adam, rates, rows=seen, betas=BETAS)
+
+    def refine(self, gradients: Gradients, rates: F32, relaxation: float, field_rates: FieldRates) -> None:
+        """One step on residuals and field, against the gradients of what the last `at` gave.
+
+        Args:
+            gradients: of half the squared colour residuals, weighted for SIRT, by those Gaussians.
+            rates: [14] lengths of the residuals' steps; none for colours.
+            relaxation: of the colour step.
+            field_rates: of the field. It is not moved by colours: those are the residuals'.
+
+        Raises:
+            ValueError: the model has no residuals.
+        """
+        if self.residuals is None:
+            raise ValueError("a model without residuals cannot be refined")
+        v_rows = activate_backward(self._drawn, gradients)
+        v_rows[:, columns.COLOR] = 0
+        steps = Steps(rates, np.float32(relaxation) / self._gain)
+        self.residuals.refine(self._t_ns, v_rows, gradients.colors, gradients.contribution, steps)
+        self.field.backward(v_rows)
+        self.field.step(field_rates)
 
     def keep(self, kept: Bool) -> None:
         """Remove the Gaussians where `kept` [N] is False."""
+        if self.residuals is not None:
+            self.residuals.keep(kept)
         self._replace(self.rows[kept], self.ids[kept], self.adam.moments[kept], self.adam.shares[kept])
 
-    def append(self, rows: F32) -> None:
-        """Add Gaussians [M, 14], canonical."""
+    def append(self, rows: F32, parents: I64) -> None:
+        """Add Gaussians [M, 14], canonical, that otherwise do as their parents, rows [M] of the model."""
+        if self.residuals is not None:
+            self.residuals.append(parents)
         new = AdamState.new(*rows.shape)
         ids = np.arange(self.next_id, self.next_id + len(rows))
         self.next_id += len(rows)

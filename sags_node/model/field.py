@@ -7,7 +7,7 @@ Two ways to ask it. `PointField`: every Gaussian samples it at its own canonical
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -18,7 +18,7 @@ from sags_node.model.decoder import Decoder
 from sags_node.model.deformation import nearest_nodes
 from sags_node.model.hexplane import HexPlaneField
 from sags_node.model.skinning import skin, skin_backward
-from sags_node.types import F32
+from sags_node.types import F32, I64
 
 # What an output of 1 of the decoder means: small against a scene for a mean, of order one for the rest. A
 # step of Adam has a fixed length in units of the outputs, so this sets how fast each kind of delta is learnt.
@@ -66,6 +66,7 @@ class Deltas:
         self.hexplane = hexplane
         self.decoder = decoder
         self._adaptive = adaptive
+        self._aside: tuple[I64, F32, F32] | None = None
         self.adam = AdamState.new(1, len(decoder.values))
 
     def forward(self, points: F32, t_ns: int) -> F32:
@@ -77,7 +78,16 @@ class Deltas:
         self._found = self.hexplane.backward(self.decoder.backward(v_deltas * DELTA_UNITS))
         return self._found.v_points
 
+    def set_aside(self) -> None:
+        """Keep the gradients by the parameters that the last `backward` found; `step` adds them to those of
+        the next one."""
+        rows = self._found.rows.copy()
+        self._aside = rows, self._found.v_cells[rows], self.decoder.gradients.copy()
+
     def step(self, rates: FieldRates) -> None:
+        if self._aside is not None:
+            self._add(*self._aside)
+            self._aside = None
         decoder, hexplane, found = self.decoder, self.hexplane, self._found
         if not self._adaptive:
             for name, gradient in decoder.parameter_gradients.items():
@@ -89,6 +99,14 @@ class Deltas:
         )  # fmt: skip
         cell_rates = np.full(hexplane.grid.channels, rates.cells, np.float32)
         adam_step(hexplane.cells, found.v_cells, hexplane.adam, cell_rates, rows=found.rows)
+
+    def _add(self, rows: I64, v_cells: F32, v_decoder: F32) -> None:
+        """Add gradients of cells [K, C] in `rows` [K] and of the decoder [P] to those found."""
+        found = self._found
+        found.v_cells[np.setdiff1d(rows, found.rows, assume_unique=True)] = 0
+        found.v_cells[rows] += v_cells
+        self._found = replace(found, rows=np.union1d(rows, found.rows))
+        self.decoder.gradients += v_decoder
 
 
 class PointField:

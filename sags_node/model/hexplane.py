@@ -28,7 +28,11 @@ from sags_node.types import F32, F64, I64
 MAX_BYTES = 1 << 28  # of the cells; their optimiser's state takes twice as much again, their gradients once
 MAX_LEVELS = 8
 GROWTH_MARGIN = 4  # coarsest cells added beyond the need, so that a box does not grow every frame
-SPACE_RANGE = (0.1, 0.5)  # first values of the planes in space, as in EndoGaussian; the lines start at 1
+
+# First values of the planes in space; the lines in time start at 1. EndoGaussian takes 0.1 to 0.5: the
+# product of three planes is then about 0.03, the decoder sees next to nothing at first, and after 1300
+# iterations on a real clip PSNR is 2.7 dB behind.
+SPACE_RANGE = (0.7, 1.3)
 
 
 class HexPlaneField:

@@ -1,0 +1,253 @@
+"""`sags bench`: measure how fast and how good this machine is at it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import click
+
+from sags_node.apps.launching import as_json, open_launched, positive, split
+from sags_node.apps.terminal import check_file, progress, show, writing
+from sags_node.errors import SagsError, UsageError
+
+
+@click.group()
+def bench() -> None:
+    """Measure how fast this machine is at it."""
+
+
+@bench.command("kernels")
+@click.option("--quick", is_flag=True, help="A tiny scene and few runs: does it work, not how fast is it.")
+@click.option("--large", is_flag=True, help="Also a million Gaussians.")
+@click.option("--contention", is_flag=True, help="Also beside another process that burns one core.")
+@click.option("--no-twin", is_flag=True, help="Leave out the torch twins (most of the time, 10 GB).")
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE.json",
+    help="Write the table as JSON, and a plot of the same name, .svg, beside it.",
+)
+@click.option(
+    "--check",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE.json",
+    help="Compare with a table written by --out; fail if a kernel has become slower.",
+)
+@click.option(
+    "--tolerance",
+    type=click.FloatRange(min=1.0),
+    default=1.3,
+    show_default=True,
+    help="How many times slower than in --check's table is too slow.",
+)
+@as_json
+def bench_kernels(
+    quick: bool,
+    large: bool,
+    contention: bool,
+    no_twin: bool,
+    out: Path | None,
+    check: Path | None,
+    tolerance: float,
+    json_out: bool,
+) -> None:
+    """Time every kernel of the engine beside the machine's peak.
+
+    Milliseconds per stage, pixel-Gaussian pairs per second, the share of the machine's peak (multiply-adds or
+    memory, whichever binds; both measured in the same run), the gain over the plain torch twin, how it scales
+    with threads, and what idle pauses cost. Takes two minutes, in which the machine should do nothing else.
+
+    --check is the guard against kernels that became slow without an error. It compares each kernel's time in
+    units of the machine's own peak, so a table from another machine serves too, less sharply. Exit code 1 and
+    the kernel's name if one is slower than the tolerance.
+
+    \b
+    sags bench kernels --out benchmarks/results/kernels.json
+    sags bench kernels --check benchmarks/results/kernels.json
+    """
+    from dataclasses import replace
+
+    from sags_node.benchmark import check as guard
+    from sags_node.benchmark import report
+    from sags_node.benchmark.kernels import MILLION, QUICK, Settings, measure_kernels
+
+    settings = QUICK if quick else Settings()
+    if large:
+        settings = replace(settings, counts=(*settings.counts, MILLION))
+    settings = replace(settings, twin=not no_twin, contention=contention)
+    if check is None:
+        if out is not None:
+            check_file(out)
+        with progress("measuring") as advance:
+            measured = measure_kernels(settings, advance)
+        for table in [measured] if json_out else report.tables(measured):
+            show(table)
+        if out is not None:
+            with writing(out):
+                out.write_text(json.dumps(measured, indent=1) + "\n", encoding="utf-8")
+                out.with_suffix(".svg").write_text(report.plot(measured), encoding="utf-8")
+        return
+    if out is not None:
+        raise UsageError("give --out or --check: a check measures up to three times and keeps no table")
+    kept = guard.read_table(check)
+    settings = replace(settings, twin=False, rhythm=False, contention=False)
+    with progress("measuring") as advance:
+        compared = guard.check(lambda: measure_kernels(settings, advance), kept, tolerance)
+    show([asdict(each) for each in compared] if json_out else report.check_table(compared, tolerance))
+    slower = [f"{each.kernel} {each.ratio:.2f} times" for each in compared if each.ratio > tolerance]
+    if slower:
+        raise SagsError(f"slower than in {check}, three times in a row: {'; '.join(slower)}")
+
+
+@bench.command("alias")
+@click.option("--quick", is_flag=True, help="A tiny scene and few steps: does it work, not how good is it.")
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE.json",
+    help="Write the table as JSON.",
+)
+@click.option(
+    "--picture",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE.png",
+    help="Draw the truth, both filters and none side by side.",
+)
+@as_json
+def bench_alias(quick: bool, out: Path | None, picture: Path | None, json_out: bool) -> None:
+    """What both filters are worth at other sizes and distances.
+
+    Four models of one instant of the phantom, with each choice of filters, are drawn at 1/4 to 4 times the
+    size and from 1/2 to 4 times the distance, and compared with the ray-cast truth: PSNR, the brightness of
+    thin vessels, flicker in a slow motion. Takes about two minutes.
+
+    \b
+    sags bench alias --out benchmarks/results/alias.json --picture docs/alias.png
+    """
+    from sags_node.benchmark import alias_report
+    from sags_node.benchmark.alias import QUICK, Settings, measure_alias
+
+    for file in (out, picture):
+        if file is not None:
+            check_file(file)
+    with progress("measuring") as advance:
+        measured = measure_alias(QUICK if quick else Settings(), advance)
+    for table in [measured.table] if json_out else alias_report.tables(measured.table):
+        show(table)
+    if out is not None:
+        with writing(out):
+            out.write_text(json.dumps(measured.table, indent=1) + "\n", encoding="utf-8")
+    if picture is not None:
+        with writing(picture):
+            picture.write_bytes(alias_report.picture(measured.truth, measured.models))
+
+
+@bench.command("stream")
+@click.argument("launch", nargs=-1, metavar="[LAUNCH.yaml | SESSION] [key:=value ...]")
+@click.option(
+    "--seconds", type=positive, default=8.0, show_default=True, help="How long it plays, in a loop."
+)
+@click.option("--window", type=positive, default=2.0, show_default=True, help="Seconds the model looks back.")
+@click.option("--quick", is_flag=True, help="A tiny model: does it work, not how good is it.")
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE.json",
+    help="Write the table as JSON.",
+)
+@as_json
+def bench_stream(
+    launch: tuple[str, ...], seconds: float, window: float, quick: bool, out: Path | None, json_out: bool
+) -> None:
+    """Whether the SAGS model lasts over a stream that never ends.
+
+    A session, by default the built-in phantom, is played in a loop for several times the window that the
+    deformation field remembers. What leaves the window is folded into the Gaussians. Beside it: a model that
+    forgets it instead, and one whose window covers all. Second by second: PSNR on tissue of the newest frame
+    before and after it was learnt from and of earlier ones, the largest change of the picture as the window
+    moves, sizes and times. Takes some five minutes.
+
+    \b
+    sags bench stream launch/phantom.yaml --out benchmarks/results/stream.json
+    """
+    from dataclasses import replace
+
+    from sags_node.benchmark import stream
+    from sags_node.config import V4l2Source, load_launch
+    from sags_node.fitting.stream import QUICK, StreamSettings
+
+    path, overrides = split(launch)
+    if isinstance(load_launch(path, overrides).source, V4l2Source):
+        raise UsageError("sags bench stream plays recordings; live cameras do not come twice alike")
+    if seconds < window:
+        raise UsageError(f"--seconds {seconds:g} is shorter than --window {window:g}: nothing would leave it")
+    if out is not None:
+        check_file(out)
+    with open_launched(path, overrides).source as source:
+        frames = max(1, round(source.rate * seconds))
+    forced = ["source.loop:=true", "source.pace:=step", f"source.frames:={frames}"]
+    session = open_launched(path, [*overrides, *forced])
+    settings = replace(QUICK if quick else StreamSettings(), window=window)
+    with progress("measuring") as advance:
+        measured = stream.measure_stream(session, settings, advance)
+    for table in [measured] if json_out else stream.tables(measured):
+        show(table)
+    if out is not None:
+        with writing(out):
+            out.write_text(json.dumps(measured, indent=1) + "\n", encoding="utf-8")
+
+
+@bench.command("ablation")
+@click.argument("launch", nargs=-1, metavar="[LAUNCH.yaml | SESSION] [key:=value ...]")
+@click.option(
+    "--warm-up", type=click.IntRange(0), default=300, show_default=True, help="Of the paper's schedule."
+)
+@click.option(
+    "--iterations", type=click.IntRange(1), default=1500, show_default=True, help="With deformation."
+)
+@click.option(
+    "--hold-out", type=click.IntRange(2), default=8, show_default=True, help="Test on every so manieth."
+)
+@click.option("--lpips-weights", type=click.Path(path_type=Path), help="npz of LPIPS SqueezeNet weights.")
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE.json",
+    help="Write the table as JSON.",
+)
+@as_json
+def bench_ablation(
+    launch: tuple[str, ...],
+    warm_up: int,
+    iterations: int,
+    hold_out: int,
+    lpips_weights: Path | None,
+    out: Path | None,
+    json_out: bool,
+) -> None:
+    """What each part of the SAGS model brings, offline.
+
+    Fits a recording, by default the built-in phantom, with and without the self-adaptive decoder, the
+    alias-free filters and the online start, and with each choice of tokens; measures every eighth frame and
+    the last three, from which nothing is learnt. Takes some fifteen minutes.
+
+    \b
+    sags bench ablation launch/d4d_pull.yaml --out benchmarks/results/ablation_d4d.json
+    """
+    from sags_node.benchmark import ablation
+    from sags_node.config import V4l2Source, load_launch
+
+    path, overrides = split(launch)
+    if isinstance(load_launch(path, overrides).source, V4l2Source):
+        raise UsageError("sags bench ablation plays recordings; record the cameras first")
+    if out is not None:
+        check_file(out)
+    session = open_launched(path, [*overrides, "source.loop:=false", "source.pace:=step"])
+    with progress("measuring") as advance:
+        measured = ablation.measure_ablation(session, warm_up, iterations, hold_out, lpips_weights, advance)
+    show(measured if json_out else ablation.table(measured))
+    if out is not None:
+        with writing(out):
+            out.write_text(json.dumps(measured, indent=1) + "\n", encoding="utf-8")

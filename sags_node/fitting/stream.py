@@ -1,0 +1,216 @@
+"""The SAGS model learnt from a stream that never ends, in bounded memory.
+
+Of the pictures only those of the last window are kept. With each frame the window advances, what leaves it is
+folded into the Gaussians (`model.window`), holes get new ones, and a few steps are taken: some on the newest
+frame, to follow it, some on earlier ones, which the field would forget otherwise.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from sags_node.engine.photometric import LossWeights, PhotometricLoss
+from sags_node.engine.rasterize import make_rasterizer
+from sags_node.errors import SagsError
+from sags_node.fitting.clip import ClipFrame
+from sags_node.fitting.settings import Tokens
+from sags_node.mapping import densify, initialise
+from sags_node.mapping.mapper import MIN_FIRST_DEPTHS
+from sags_node.model import columns
+from sags_node.model.activation import deactivate
+from sags_node.model.decoder import Decoder, DecoderConfig
+from sags_node.model.deformation import spread_nodes
+from sags_node.model.field import Deltas, Field, FieldRates, NodeField, PointField
+from sags_node.model.gaussians import GaussianModel
+from sags_node.model.hexplane import HexPlaneField
+from sags_node.model.window import WindowModel, awaken
+from sags_node.types import F32, I32, I64, Camera, Gaussians, Observation
+
+NODES = 512
+BOX_QUANTILE = 1e-3  # of the first Gaussians beyond the field's box on either side
+MOST_KEPT = 64  # frames, at any frame rate
+FIRST_STEPS, FIRST_SPEED = 30, 4.0  # on the first frame, without deformation; times the learning rates
+TIDY_EVERY = 3  # frames between two looks for holes and for what is transparent
+MIN_LOGIT = float(np.log(densify.MIN_OPACITY / (1 - densify.MIN_OPACITY)))
+MEAN_PX = 0.08  # learning rate of the means, in px at the tissue's median depth
+LOG_SCALE_RATE, QUAT_RATE, COLOR_RATE, LOGIT_RATE = 5e-3, 1e-3, 2.5e-3, 0.05  # EndoGaussian, SAGS
+
+
+@dataclass(frozen=True, slots=True)
+class StreamSettings:
+    """What can be chosen."""
+
+    window: float = 2.0  # s
+    slot: float = 0.1  # s between slots of the field
+    newest_steps: int = 2  # per frame, on the newest
+    replay_steps: int = 2  # per frame, on random ones of the window
+    tokens: Tokens = "nodes"
+    max_gaussians: int = 30_000
+    cells: int = 64  # of the field, along each axis, coarsest level
+    levels: int = 2
+    channels: int = 32
+    seed: int = 0
+    folds: bool = True  # False: forget what leaves the window; shows what folding is for
+
+
+QUICK = StreamSettings(max_gaussians=4000, cells=16, channels=16)
+
+
+class StreamFit:
+    """`arrive` with each frame, then `learn` from it. Not for two threads."""
+
+    def __init__(self, width: int, height: int, settings: StreamSettings) -> None:
+        """Pictures of `width` x `height` px."""
+        self.settings = settings
+        self.rasterizer = make_rasterizer("numba", width, height)
+        self.kept: deque[ClipFrame] = deque()  # of the window, oldest first; the newest is always there
+        self.inserted = self.pruned = 0
+        self._model: WindowModel | None = None
+        self._frames = 0
+        self._loss = PhotometricLoss(width, height, LossWeights(coverage=0.1))
+        self._v_planes = np.zeros((1, 5, height, width), np.float32)
+        self._weight = np.zeros((1, height, width), np.float32)
+        self._unseen = np.ones((height, width), np.bool_)
+        self._drawn_ns: I64 = np.zeros(0, np.int64)  # [N] newest frame that each Gaussian had a part in
+        self._rng = np.random.default_rng(settings.seed)
+
+    @property
+    def model(self) -> WindowModel:
+        """
+        Raises:
+            SagsError: no frame so far had depth enough.
+        """
+        if self._model is None:
+            raise SagsError("no frame of the stream had depth enough to start a model; check vision.stereo")
+        return self._model
+
+    def arrive(self, frame: ClipFrame) -> int:
+        """A frame comes; the model can be drawn at its time now, as the field expects it to be.
+
+        Returns:
+            How many slots left the window.
+        """
+        self._frames += 1
+        self._unseen &= ~frame.tissue
+        self._keep(frame)
+        if self._model is None:
+            self._begin(frame)
+            return 0
+        return self._model.advance(frame.t_capture_ns, self.settings.folds)
+
+    def learn(self) -> None:
+        """Refine the model with the frames that are kept."""
+        if self._model is None:
+            return
+        newest, settings = self.kept[-1], self.settings
+        if self._frames % TIDY_EVERY == 0:
+            self._tidy(newest)
+        for step in range(max(settings.newest_steps, settings.replay_steps)):
+            if step < settings.replay_steps:
+                self._step(self.kept[self._rng.integers(len(self.kept))])
+            if step < settings.newest_steps:
+                self._step(newest)
+
+    def gaussians(self, t_ns: int, camera: Camera) -> Gaussians:
+        """The model at a time within the window."""
+        return self.model.at(t_ns, [camera])
+
+    def draw(self, t_ns: int, camera: Camera) -> F32:
+        """Planes [5, H, W] of the model at a time within the window, in the rasteriser's memory."""
+        planes: F32 = self.rasterizer.forward(self.gaussians(t_ns, camera), [camera])[0]
+        return planes
+
+    def _keep(self, frame: ClipFrame) -> None:
+        window_ns = round(self.settings.window * 1e9)
+        if len(self.kept) > 1 and self.kept[-1].t_capture_ns - self.kept[-2].t_capture_ns < (
+            window_ns // MOST_KEPT
+        ):
+            self.kept.pop()
+        self.kept.append(frame)
+        while self.kept[0].t_capture_ns < frame.t_capture_ns - window_ns or len(self.kept) > MOST_KEPT:
+            self.kept.popleft()
+
+    def _begin(self, frame: ClipFrame) -> None:
+        if np.count_nonzero(frame.depth) < MIN_FIRST_DEPTHS:
+            return  # a black or covered picture: try again with the next frame
+        observation = frame.observation()
+        limit = int(initialise.INITIAL_SHARE * self.settings.max_gaussians)
+        pixels, depths, spacing = initialise.first_pixels(observation, limit)
+        rows = _rows(observation, pixels, depths, spacing)
+        self._drawn_ns = np.full(len(rows), frame.t_capture_ns)
+        self._model = WindowModel(rows, self._make_field(rows[:, columns.MEAN], frame.t_capture_ns))
+        pixel = float(np.median(depths)) / float(frame.camera.K[0, 0])  # m
+        self._rates = np.empty(columns.COUNT, np.float32)
+        self._rates[columns.MEAN] = MEAN_PX * pixel
+        self._rates[columns.LOG_SCALE] = LOG_SCALE_RATE
+        self._rates[columns.QUAT] = QUAT_RATE
+        self._rates[columns.COLOR] = COLOR_RATE
+        self._rates[columns.LOGIT] = LOGIT_RATE
+        for _ in range(FIRST_STEPS):
+            self._step(frame, FIRST_SPEED, deformed=False)
+
+    def _make_field(self, means: F32, t0_ns: int) -> Field:
+        settings = self.settings
+        low, high = np.quantile(means, [BOX_QUANTILE, 1 - BOX_QUANTILE], axis=0)
+        hexplane = HexPlaneField(
+            np.array([low, np.maximum(high, low + 1e-3)]),
+            t0_ns,
+            round(settings.slot * 1e9),
+            # One more: the newest slot lies up to one slot after the newest frame.
+            slots=round(settings.window / settings.slot) + 2,
+            cells=settings.cells,
+            levels=settings.levels,
+            channels=settings.channels,
+            seed=settings.seed,
+        )
+        levels = settings.levels if settings.tokens == "planes" else 1
+        decoder = Decoder(DecoderConfig(settings.tokens, hexplane.grid.features, levels), settings.seed)
+        awaken(decoder, settings.seed)
+        deltas = Deltas(hexplane, decoder)
+        if settings.tokens == "nodes":
+            return NodeField(deltas, spread_nodes(means, NODES))
+        return PointField(deltas)
+
+    def _step(self, frame: ClipFrame, speed: float = 1.0, deformed: bool = True) -> None:
+        model, observation = self.model, frame.observation()
+        gaussians = model.at(frame.t_capture_ns, [frame.camera], deformed)
+        planes = self.rasterizer.forward(gaussians, [frame.camera])
+        self._loss.evaluate(
+            planes[0], observation.image, frame.tissue, frame.depth, self._v_planes[0], self._weight[0],
+            self._unseen,
+        )  # fmt: skip
+        gradients = self.rasterizer.backward(self._v_planes, self._weight)
+        model.descend(gradients, self._rates * np.float32(speed), FieldRates(), exposure_rate=0.0)
+        drawn = gradients.contribution > densify.IDLE
+        self._drawn_ns[drawn] = np.maximum(self._drawn_ns[drawn], frame.t_capture_ns)
+
+    def _tidy(self, frame: ClipFrame) -> None:
+        """Remove what is transparent, and when N nears its cap what did not show in the whole window; fill
+        the holes."""
+        model, cap = self.model, self.settings.max_gaussians
+        kept = (model.rows[:, columns.LOGIT] > MIN_LOGIT) & np.isfinite(model.rows).all(axis=1)
+        if len(model) > densify.CROWDED * cap:
+            kept &= self._drawn_ns >= self.kept[0].t_capture_ns
+        self.pruned += len(kept) - int(np.count_nonzero(kept))
+        if kept.any() and not kept.all():
+            model.keep(kept)
+            self._drawn_ns = self._drawn_ns[kept]
+        observation = frame.observation()
+        planes = self.draw(frame.t_capture_ns, frame.camera)
+        pixels, depths = densify.candidates(planes, observation, phase=7 * self._frames)
+        room = cap - len(model)
+        if min(room, len(pixels)) > 0:
+            rows = _rows(observation, pixels[:room], depths[:room], densify.GRID)
+            model.insert(rows, frame.t_capture_ns)
+            self._drawn_ns = np.concatenate([self._drawn_ns, np.full(len(rows), frame.t_capture_ns)])
+            self.inserted += len(rows)
+
+
+def _rows(observation: Observation, pixels: I32, depths: F32, spacing: float) -> F32:
+    """New Gaussians [M, 14] at pixels [M, 2] and depths [M] m, as the mapper makes them."""
+    made = GaussianModel(len(pixels))
+    initialise.insert(made, observation, pixels, depths, spacing, smoothing=True)
+    return deactivate(made.gaussians())

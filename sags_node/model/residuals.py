@@ -1,0 +1,116 @@
+"""What single Gaussians do beyond the field: a row of deltas for each at some times, linear in between.
+
+The field is smooth in space, so it carries what neighbours share. What a Gaussian does alone (a texture that
+does not quite follow, a colour that turns as light moves over wet tissue, tissue that appears) stands here.
+Not part of SAGS; curves of one's own for each Gaussian are known from Deform3DGS (MICCAI 2024).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sags_node.engine.adam import AdamState, adam_step
+from sags_node.engine.jit import aligned
+from sags_node.errors import SagsError
+from sags_node.model import columns
+from sags_node.types import F32, I64, Bool
+
+BETAS = (0.5, 0.99)  # low momentum: a slot is visited now and then, from other frames each time
+LEAST_CONTRIBUTION = 1e-3  # px: what was seen less is not touched
+COLOR_DAMPING = 0.3  # px: a barely seen Gaussian changes its colour slowly
+MAX_BYTES = 1 << 29  # of the values; their optimiser's state takes twice as much again
+
+
+@dataclass(frozen=True, slots=True)
+class Steps:
+    """Lengths of one improvement."""
+
+    geometry: F32  # [14] of Adam; 0 for colours
+    colors: F32  # [3] of SIRT, by the colours without exposure; 0 to 2 over the gain converges
+
+
+class Residuals:
+    """`values` [K, N, 14] (`columns`) at `times_ns` [K], and what their optimiser remembers."""
+
+    def __init__(self, times_ns: I64, count: int) -> None:
+        """All zero, for `count` Gaussians.
+
+        Args:
+            times_ns: [K] ascending; beyond the first and the last the values stay as they are there.
+            count: N.
+
+        Raises:
+            SagsError: they are larger than the memory they may take.
+        """
+        size = len(times_ns) * count * columns.COUNT * 4
+        if size > MAX_BYTES:
+            raise SagsError(
+                f"residuals of {count} Gaussians at {len(times_ns)} times take {size / 1e6:.0f} MB, the "
+                f"limit is {MAX_BYTES / 1e6:.0f} MB: take fewer frames (source.frames, source.stride) or a "
+                "smaller max_gaussians"
+            )
+        self.times_ns = times_ns
+        self.values: F32 = aligned((len(times_ns), count, columns.COUNT))
+        self.adam = [AdamState.new(count, columns.COUNT) for _ in times_ns]
+
+    def at(self, t_ns: int) -> F32:
+        """Deltas [N, 14] at one time."""
+        (slot, share), *rest = self._parts(t_ns)
+        deltas: F32 = np.float32(share) * self.values[slot]
+        for slot, share in rest:
+            deltas += np.float32(share) * self.values[slot]
+        return deltas
+
+    def refine(self, t_ns: int, v_rows: F32, v_colors: F32, contribution: F32, steps: Steps) -> None:
+        """Improve both slots around a time: Adam on the geometry, one SIRT step on the colours (each colour
+        moves by the mean residual of the pixels it covers, weighted by its share in them).
+
+        Args:
+            t_ns: the time.
+            v_rows: [N, 14] gradient of half the squared colour residuals by the deltas at that time.
+            v_colors: [N, 3] the same by the colours as drawn.
+            contribution: [N] px, the weight of each Gaussian in the picture.
+            steps: their lengths.
+        """
+        seen = np.flatnonzero(contribution > LEAST_CONTRIBUTION)
+        colors = v_colors[seen] * (steps.colors / (contribution[seen, None] + COLOR_DAMPING))
+        parts = self._parts(t_ns)
+        norm = sum(share * share for _, share in parts)
+        for slot, share in parts:
+            values = self.values[slot]
+            adam_step(
+                values, v_rows * np.float32(share), self.adam[slot], steps.geometry, rows=seen,
+                betas=BETAS, eps=1e-12,
+            )  # fmt: skip
+            # the smallest change of both slots whose blend is the step
+            values[seen, columns.COLOR] -= np.float32(share / norm) * colors
+
+    def keep(self, kept: Bool) -> None:
+        """Forget the Gaussians where `kept` [N] is False."""
+        self._take(np.flatnonzero(kept), fresh=0)
+
+    def append(self, parents: I64) -> None:
+        """Add one Gaussian that does as its parent, for each of `parents` [M]."""
+        count = self.values.shape[1]
+        self._take(np.concatenate([np.arange(count), parents]), fresh=len(parents))
+
+    def _take(self, rows: I64, fresh: int) -> None:
+        values: F32 = aligned((len(self.times_ns), len(rows), columns.COUNT))
+        np.take(self.values, rows, axis=1, out=values)
+        self.values = values
+        known = len(rows) - fresh
+        for slot, old in enumerate(self.adam):
+            new = AdamState.new(len(rows), columns.COUNT)
+            new.moments[:known], new.shares[:known] = old.moments[rows[:known]], old.shares[rows[:known]]
+            self.adam[slot] = new
+
+    def _parts(self, t_ns: int) -> list[tuple[int, float]]:
+        """Slots around a time and their shares; one slot where the other's share is 0."""
+        after = int(np.searchsorted(self.times_ns, t_ns, side="right"))
+        if after in {0, len(self.times_ns)}:
+            return [(max(after - 1, 0), 1.0)]
+        first, last = int(self.times_ns[after - 1]), int(self.times_ns[after])
+        share = (t_ns - first) / (last - first)
+        return [(after - 1, 1.0)] if share == 0 else [(after - 1, 1 - share), (after, share)]
