@@ -21,6 +21,7 @@ from sags_node.fitting.score import score, score_tracks
 from sags_node.fitting.settings import FitSettings
 from sags_node.fitting.start import follow_online
 from sags_node.model import columns
+from sags_node.model.deformable import FADE_NS, LOOK_BACK_NS
 from sags_node.session import open_session
 
 SMALL = FitSettings(iterations=120, max_gaussians=3000, cells=16, slots=8, channels=16)
@@ -208,3 +209,22 @@ def test_a_fit_that_cannot_be_says_why(
     result = sags_fit(phantom_session, *arguments, "--out", tmp_path / "fit", "--iterations", "1")
     assert result.exit_code == code, result.output
     assert said in result.output and "Traceback" not in result.output
+
+
+def test_beyond_the_last_frame_the_model_moves_on_and_comes_to_rest(clip: Clip) -> None:
+    fit = fitted(clip, SMALL, iterations=1)
+    model, last = fit.model, clip.train[-1]
+    t_ns, cameras = last.t_capture_ns, [last.camera]
+
+    def means(later_ns: int) -> Any:
+        return model.predict(t_ns + later_ns, t_ns, cameras).means
+
+    now = model.at(t_ns, cameras).means
+    before = model.field.deform(model.rows, t_ns - LOOK_BACK_NS)[:, columns.MEAN]
+    velocity = (model.field.deform(model.rows, t_ns)[:, columns.MEAN] - before) / LOOK_BACK_NS
+    assert np.abs(velocity).max() * 1e9 > 1e-3  # m/s: there is something to go on with
+    np.testing.assert_allclose(means(0), now, atol=1e-7)
+    np.testing.assert_allclose(means(1_000_000), now + velocity * 1e6, atol=1e-6)
+    np.testing.assert_allclose(means(10**12), now + velocity * FADE_NS, atol=1e-6)
+    later = dataclasses.replace(last, t_capture_ns=t_ns + 30_000_000)
+    np.testing.assert_array_equal(fit.gaussians(later).means, means(30_000_000))

@@ -44,23 +44,65 @@ def twin(
     return torch.cat([mean, plain[:, columns.LOG_SCALE], quat, plain[:, 10:]], 1)
 
 
+def twin_and_gradients(
+    rows: np.ndarray,
+    nodes: np.ndarray,
+    deltas: np.ndarray,
+    index: np.ndarray,
+    weight: np.ndarray,
+    v: np.ndarray,
+) -> tuple[np.ndarray, ...]:
+    """What the twin makes of it in float64, and its gradients by rows and by deltas."""
+    x, n, d, w, v_skinned = (torch.tensor(a, dtype=torch.float64) for a in (rows, nodes, deltas, weight, v))
+    x.requires_grad_()
+    d.requires_grad_()
+    skinned = twin(x, n, d, torch.tensor(index, dtype=torch.int64), w)
+    gradients = torch.autograd.grad(skinned, [x, d], v_skinned)
+    return skinned.detach().numpy(), *(gradient.numpy() for gradient in gradients)
+
+
+def relative_error(got: np.ndarray, want: np.ndarray) -> float:
+    return float(np.linalg.norm(got - want) / np.linalg.norm(want))
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_skinning_and_its_gradients_equal_the_twin(seed: int) -> None:
-    rows, nodes, deltas, index, weight = scene(seed)
+    rows, nodes, deltas, index, weight = scene(seed, count=(5, 40, 1500)[seed])
+    cotangent = np.random.default_rng(seed + 9).normal(size=rows.shape).astype(np.float32)
+    expected, *wanted = twin_and_gradients(rows, nodes, deltas, index, weight, cotangent)
     skinned = np.empty_like(rows)
     skin(rows, nodes, deltas, index, weight, skinned)
-    exact = [torch.tensor(array, dtype=torch.float64) for array in (rows, nodes, deltas)]
-    exact[0].requires_grad_()
-    exact[2].requires_grad_()
-    expected = twin(*exact, torch.tensor(index, dtype=torch.int64), torch.tensor(weight, dtype=torch.float64))
-    np.testing.assert_allclose(skinned, expected.detach().numpy(), atol=2e-6)
-
-    cotangent = np.random.default_rng(seed + 9).normal(size=rows.shape).astype(np.float32)
+    np.testing.assert_allclose(skinned, expected, atol=2e-6)
     found = skin_backward(rows, nodes, deltas, index, weight, cotangent)
-    wanted = torch.autograd.grad(expected, [exact[0], exact[2]], torch.tensor(cotangent, dtype=torch.float64))
     for got, want in zip(found, wanted, strict=True):
-        error = np.linalg.norm(got - want.numpy()) / np.linalg.norm(want.numpy())
-        assert error < 1e-5
+        assert relative_error(got, want) < 1e-5
+
+
+def test_a_node_may_stand_twice_among_the_four() -> None:
+    """As the first does, with no weight, where there are fewer than four."""
+    rows, nodes, deltas, index, weight = scene(3)
+    index[::2, 2:] = index[::2, :1]
+    expected, _, wanted = twin_and_gradients(rows, nodes, deltas, index, weight, rows)
+    skinned = np.empty_like(rows)
+    skin(rows, nodes, deltas, index, weight, skinned)
+    np.testing.assert_allclose(skinned, expected, atol=2e-6)
+    assert relative_error(skin_backward(rows, nodes, deltas, index, weight, rows)[1], wanted) < 1e-5
+
+
+def test_rotations_learn_from_short_arms_far_from_the_origin() -> None:
+    """Arms of 4 mm at 10 m: what the place contributes to the gradient by a rotation must cancel."""
+    rows, nodes, deltas, index, weight = scene(4, count=1500)
+    offset = np.array([0, 0, 10], np.float32)
+    nodes[:] = 0.004 * nodes + offset
+    rows[:, columns.MEAN] = 0.004 * rows[:, columns.MEAN] + offset
+    pull = np.zeros_like(rows)
+    pull[:, columns.MEAN] = [0.3, 0.5, 1.0]
+    expected, _, wanted = twin_and_gradients(rows, nodes, deltas, index, weight, pull)
+    skinned = np.empty_like(rows)
+    skin(rows, nodes, deltas, index, weight, skinned)
+    np.testing.assert_allclose(skinned[:, columns.MEAN], expected[:, columns.MEAN], atol=3e-6)
+    _, found = skin_backward(rows, nodes, deltas, index, weight, pull)
+    assert relative_error(found[:, columns.QUAT], wanted[:, columns.QUAT]) < 1e-5
 
 
 def test_no_delta_leaves_everything_as_it_is() -> None:
@@ -84,11 +126,13 @@ def test_a_rigid_motion_of_all_nodes_moves_everything_rigidly() -> None:
     np.testing.assert_allclose(skinned[:, :3], rows[:, :3] @ R.T + shift, atol=2e-6)
 
 
-def test_the_gradients_are_the_same_bits_on_one_and_two_threads() -> None:
+def test_the_same_bits_on_one_and_two_threads() -> None:
     rows, nodes, deltas, index, weight = scene(2, count=1000, nodes=50)
     found = []
     for threads in (1, None):
         configure_threads(threads)
-        found.append(skin_backward(rows, nodes, deltas, index, weight, rows))
+        skinned = np.empty_like(rows)
+        skin(rows, nodes, deltas, index, weight, skinned)
+        found.append([skinned, *skin_backward(rows, nodes, deltas, index, weight, rows)])
     for one, two in zip(*found, strict=True):
         np.testing.assert_array_equal(one, two)

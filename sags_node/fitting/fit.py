@@ -168,7 +168,10 @@ class Fit:
         return residual
 
     def gaussians(self, frame: ClipFrame) -> Gaussians:
-        """The model at the time of a frame."""
+        """The model at the time of a frame; after the last training frame it is a prediction."""
+        last_ns = self.clip.train[-1].t_capture_ns
+        if frame.t_capture_ns > last_ns:
+            return self.model.predict(frame.t_capture_ns, last_ns, [frame.camera])
         return self.model.at(frame.t_capture_ns, [frame.camera])
 
     def arrays(self) -> dict[str, NDArray[Any]]:

@@ -5,6 +5,7 @@ Beyond SAGS a Gaussian may have residuals of its own (`residuals`), added to wha
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -20,6 +21,8 @@ from sags_node.model.residuals import Residuals, Steps
 from sags_node.types import F32, I64, Bool, Camera, Gaussians
 
 BETAS = (0.9, 0.999)
+LOOK_BACK_NS = 200_000_000  # a prediction's velocity is the mean over this time
+FADE_NS = 150_000_000  # in which it falls to 1/e
 
 
 class DeformableModel:
@@ -66,6 +69,30 @@ class DeformableModel:
         rows = self.field.deform(self.rows, t_ns) if deformed else self.rows.copy()
         if deformed and self.residuals is not None:
             rows += self.residuals.at(t_ns)
+        return self._finished(rows, t_ns, cameras)
+
+    def predict(self, t_ns: int, last_ns: int, cameras: Sequence[Camera]) -> Gaussians:
+        """The Gaussians at a time after all that was learnt.
+
+        They go on as the field moved them just before, slower and slower; all else stays as it was last.
+        What single Gaussians did beyond the field is no guide: it added nothing where it was tried.
+
+        Args:
+            t_ns: the time.
+            last_ns: the last time that was learnt, before `t_ns`.
+            cameras: those it was fitted to, for the 3D filter.
+        """
+        before = self.field.deform(self.rows, last_ns - LOOK_BACK_NS)[:, columns.MEAN]
+        rows = self.field.deform(self.rows, last_ns)
+        velocity = (rows[:, columns.MEAN] - before) / np.float32(LOOK_BACK_NS)
+        if self.residuals is not None:
+            rows += self.residuals.at(last_ns)
+        ahead = FADE_NS * -math.expm1((last_ns - t_ns) / FADE_NS)
+        rows[:, columns.MEAN] += np.float32(ahead) * velocity
+        return self._finished(rows, last_ns, cameras)
+
+    def _finished(self, rows: F32, t_ns: int, cameras: Sequence[Camera]) -> Gaussians:
+        """As they are drawn: with the exposure of a time, and filtered."""
         self._plain = rows[:, columns.COLOR].copy()
         self._gain = self.exposure.at(t_ns)
         rows[:, columns.COLOR] *= self._gain
@@ -77,7 +104,7 @@ class DeformableModel:
     def descend(
         self, gradients: Gradients, rates: F32, field_rates: FieldRates, exposure_rate: float
     ) -> None:
-        """One step of Adam on everything but residuals, against the gradients of what the last `at` gave.
+        """One step of Adam on everything but residuals, against the gradients of what `at` gave last.
 
         Args:
             gradients: of the loss by those Gaussians.
@@ -95,7 +122,7 @@ class DeformableModel:
         adam_step(self.rows, v_rows, self.adam, rates, rows=seen, betas=BETAS)
 
     def refine(self, gradients: Gradients, rates: F32, relaxation: float, field_rates: FieldRates) -> None:
-        """One step on residuals and field, against the gradients of what the last `at` gave.
+        """One step on residuals and field, against the gradients of what `at` gave last.
 
         Args:
             gradients: of half the squared colour residuals, weighted for SIRT, by those Gaussians.

@@ -3,9 +3,13 @@
 A node carries a row of deltas (`columns`): a shift t, a rotation 1 + dq, and what is added to log scale,
 colour and opacity logit. A Gaussian x with nodes n_k and weights w_k becomes
 
-    x' = x + sum_k w_k (R_k (x - n_k) - (x - n_k) + t_k)        R_k of the unit quaternion of 1 + dq_k
-    q' = (sum_k w_k (1 + dq_k)) q
+    x' = x + sum_k w_k (A_k (x - n_k) + t_k)        A_k = R_k - 1, R_k of the unit quaternion of 1 + dq_k
+    q' = (1 + sum_k w_k dq_k) q
     everything else: + sum_k w_k delta_k
+
+All sums are linear in what a node alone determines: [A_k | t_k - A_k n_k] and its other deltas. So each node
+writes that down once, as its record; a Gaussian blends the records of its four nodes and applies the blend.
+Places are measured from the middle of the nodes: A_k x and A_k n_k cancel, far from it in many digits.
 """
 
 from __future__ import annotations
@@ -15,14 +19,26 @@ from typing import Any
 import numpy as np
 from numba import prange
 
-from sags_node.engine.jit import kernel, parallel_kernel, read_only
+from sags_node.engine.jit import inlined, kernel, parallel_kernel, read_only, square_root, stack_floats
+from sags_node.engine.projection import rotation
 from sags_node.model import columns
 from sags_node.types import F32, I32
 
-GROUPS = 32  # of Gaussians, whose sums over nodes are added in order: the same bits on any number of threads
-COUNT = columns.COUNT
 f4 = np.float32
-ONE, TWO = f4(1), f4(2)
+u8 = np.uint64
+ZERO, ONE, TWO = f4(0), f4(1), f4(2)
+SHORTEST = f4(1e-12)  # a shorter quaternion has no direction
+
+BLOCK = 64  # Gaussians that are blended before the blends are applied
+GROUPS = 16  # of Gaussians, whose sums over nodes are added in order: the same bits on any number of threads
+COUNT = columns.COUNT
+
+# A record: three rows of [A | t - A n], the deltas from log scale to logit, and a 0 that fills the vectors.
+RECORD = 24
+OTHERS = u8(9)  # column c >= 3 of `columns` stands at c + OTHERS
+W, X, Y, Z = (u8(15 + k) for k in range(4))  # dq
+
+Quat = tuple[Any, Any, Any, Any]
 
 
 def skin(rows: F32, nodes: F32, deltas: F32, index: I32, weight: F32, skinned: F32) -> None:
@@ -32,154 +48,214 @@ def skin(rows: F32, nodes: F32, deltas: F32, index: I32, weight: F32, skinned: F
         rows: [N, 14] of `columns`, canonical.
         nodes: [M, 3] m, canonical.
         deltas: [M, 14].
-        index: [N, K] the nodes of each Gaussian.
-        weight: [N, K], summing to 1.
+        index: [N, 4] the nodes of each Gaussian.
+        weight: [N, 4], summing to 1.
         skinned: [N, 14] written.
     """
-    _skin(read_only(rows), read_only(nodes), read_only(deltas), read_only(index), read_only(weight), skinned)
+    middle, _, records = _records(nodes, deltas)
+    _skin(read_only(rows), middle, records, read_only(index), read_only(weight), skinned)
 
 
 def skin_backward(
     rows: F32, nodes: F32, deltas: F32, index: I32, weight: F32, v_skinned: F32
 ) -> tuple[F32, F32]:
     """Gradients of sum(v_skinned * skinned): by rows [N, 14] and by deltas [M, 14]. The rest is constant."""
-    v_rows = np.empty_like(rows)
-    partial = np.zeros((GROUPS, *deltas.shape), f4)
+    middle, places, records = _records(nodes, deltas)
+    v_rows, v_deltas = np.empty_like(rows), np.empty_like(deltas)
+    v_records = np.empty((GROUPS, *records.shape), f4)
     _skin_backward(
-        read_only(rows), read_only(nodes), read_only(deltas), read_only(index), read_only(weight),
-        read_only(v_skinned), v_rows, partial,
+        read_only(rows), middle, records, read_only(index), read_only(weight), read_only(v_skinned),
+        v_rows, v_records,
     )  # fmt: skip
-    return v_rows, partial.sum(axis=0)
+    _records_backward(places, read_only(deltas), v_records.sum(axis=0), v_deltas)
+    return v_rows, v_deltas
+
+
+def _records(nodes: F32, deltas: F32) -> tuple[F32, F32, F32]:
+    """The middle of the nodes [3], the nodes as seen from there [M, 3], and their records [M, RECORD]."""
+    middle = nodes.mean(axis=0)
+    places = read_only(nodes - middle)
+    records = np.empty((len(nodes), RECORD), f4)
+    _write_records(places, read_only(deltas), records)
+    return read_only(middle), places, read_only(records)
+
+
+@inlined
+def _product(a: Quat, b: Quat) -> Quat:
+    """Hamilton product. The gradient of sum(v * a b) by a is v b*, by b it is a* v."""
+    return (
+        a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
+        a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
+        a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
+        a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
+    )
+
+
+@inlined
+def _conjugate(q: Quat) -> Quat:
+    return q[0], -q[1], -q[2], -q[3]
+
+
+@inlined
+def _unit(w: Any, x: Any, y: Any, z: Any) -> tuple[Any, ...]:
+    """The unit quaternion, and 1 / the length before."""
+    scale = ONE / max(square_root(w * w + x * x + y * y + z * z), SHORTEST)
+    return w * scale, x * scale, y * scale, z * scale, scale
 
 
 @kernel
-def _turn(q: F32, x: F32, turned: F32) -> None:
-    """`turned` = R(q) x, q unit."""
-    w, a, b, c = q[0], q[1], q[2], q[3]
-    u0 = TWO * (b * x[2] - c * x[1])
-    u1 = TWO * (c * x[0] - a * x[2])
-    u2 = TWO * (a * x[1] - b * x[0])
-    turned[0] = x[0] + w * u0 + b * u2 - c * u1
-    turned[1] = x[1] + w * u1 + c * u0 - a * u2
-    turned[2] = x[2] + w * u2 + a * u1 - b * u0
+def _write_records(places: F32, deltas: F32, records: F32) -> None:
+    for node in range(len(places)):
+        n = u8(node)
+        w, x, y, z, _ = _unit(ONE + deltas[n, 6], deltas[n, 7], deltas[n, 8], deltas[n, 9])
+        R = rotation(w, x, y, z)
+        records[n, 0], records[n, 1], records[n, 2] = R[0] - ONE, R[1], R[2]
+        records[n, 4], records[n, 5], records[n, 6] = R[3], R[4] - ONE, R[5]
+        records[n, 8], records[n, 9], records[n, 10] = R[6], R[7], R[8] - ONE
+        for axis in range(3):
+            a, row = u8(axis), u8(4 * axis)
+            turned = ZERO
+            for k in range(3):
+                turned += records[n, row + u8(k)] * places[n, u8(k)]
+            records[n, row + u8(3)] = deltas[n, a] - turned
+        for column in range(3, COUNT):
+            c = u8(column)
+            records[n, c + OTHERS] = deltas[n, c]
+        records[n, RECORD - 1] = ZERO
 
 
-@kernel
-def _unit(delta: F32, q: F32) -> Any:
-    """`q` = the unit quaternion of 1 + delta; returns the length before."""
-    q[0] = ONE + delta[6]
-    for k in range(3):
-        q[1 + k] = delta[7 + k]
-    length = max(np.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]), f4(1e-12))
-    for k in range(4):
-        q[k] /= length
-    return length
+@inlined
+def _blend(records: F32, index: I32, weight: F32, first: int, end: int, blends: F32) -> None:
+    """`blends` [(end - first) RECORD] = the records of each Gaussian's nodes, weighted and summed."""
+    for gaussian in range(first, end):
+        i, at = u8(gaussian), u8((gaussian - first) * RECORD)
+        n0, n1, n2, n3 = u8(index[i, 0]), u8(index[i, 1]), u8(index[i, 2]), u8(index[i, 3])
+        w0, w1, w2, w3 = weight[i, 0], weight[i, 1], weight[i, 2], weight[i, 3]
+        # All four nodes at once: with a loop over them LLVM gathers across nodes, 4 times slower.
+        for part in range(RECORD):
+            c = u8(part)
+            near = w0 * records[n0, c] + w1 * records[n1, c]
+            blends[at + c] = near + w2 * records[n2, c] + w3 * records[n3, c]
 
 
-@kernel
-def _skin_one(row: F32, nodes: F32, deltas: F32, index: I32, weight: F32, skinned: F32) -> None:
-    blend = np.zeros(COUNT, np.float32)
-    q, arm, turned = np.empty(4, np.float32), np.empty(3, np.float32), np.empty(3, np.float32)
-    for k in range(len(index)):
-        w, delta, node = weight[k], deltas[index[k]], nodes[index[k]]
-        _unit(delta, q)
-        for a in range(3):
-            arm[a] = row[a] - node[a]
-        _turn(q, arm, turned)
-        for a in range(3):
-            blend[a] += w * (turned[a] - arm[a])
-        for a in range(COUNT):
-            blend[a] += w * delta[a]
-    for a in range(COUNT):
-        skinned[a] = row[a] + blend[a]
-    w0, w1, w2, w3 = ONE + blend[6], blend[7], blend[8], blend[9]
-    q0, q1, q2, q3 = row[6], row[7], row[8], row[9]
-    skinned[6] = w0 * q0 - w1 * q1 - w2 * q2 - w3 * q3
-    skinned[7] = w0 * q1 + w1 * q0 + w2 * q3 - w3 * q2
-    skinned[8] = w0 * q2 - w1 * q3 + w2 * q0 + w3 * q1
-    skinned[9] = w0 * q3 + w1 * q2 - w2 * q1 + w3 * q0
-
-
-@kernel
-def _skin_one_backward(
-    row: F32, nodes: F32, deltas: F32, index: I32, weight: F32, v_skinned: F32, v_row: F32, v_deltas: F32
+@inlined
+def _scatter(
+    v_blends: F32, index: I32, weight: F32, first: int, end: int, group: int, v_records: F32
 ) -> None:
-    blend = np.zeros(4, np.float32)  # of the rotations
-    for k in range(len(index)):
-        for a in range(4):
-            blend[a] += weight[k] * deltas[index[k], 6 + a]
-    blend[0] += ONE
-    for a in range(COUNT):
-        v_row[a] = v_skinned[a]
-    # q' = b q: to q by the conjugate of b from the left, to b by the conjugate of q from the right
-    b0, b1, b2, b3 = blend[0], blend[1], blend[2], blend[3]
-    q0, q1, q2, q3 = row[6], row[7], row[8], row[9]
-    v0, v1, v2, v3 = v_skinned[6], v_skinned[7], v_skinned[8], v_skinned[9]
-    v_row[6] = b0 * v0 + b1 * v1 + b2 * v2 + b3 * v3
-    v_row[7] = b0 * v1 - b1 * v0 - b2 * v3 + b3 * v2
-    v_row[8] = b0 * v2 + b1 * v3 - b2 * v0 - b3 * v1
-    v_row[9] = b0 * v3 - b1 * v2 + b2 * v1 - b3 * v0
-    v_blend = np.empty(4, np.float32)
-    v_blend[0] = q0 * v0 + q1 * v1 + q2 * v2 + q3 * v3
-    v_blend[1] = q0 * v1 - q1 * v0 + q2 * v3 - q3 * v2
-    v_blend[2] = q0 * v2 - q1 * v3 - q2 * v0 + q3 * v1
-    v_blend[3] = q0 * v3 + q1 * v2 - q2 * v1 - q3 * v0
-    q, arm, turned = np.empty(4, np.float32), np.empty(3, np.float32), np.empty(3, np.float32)
-    v_q, back = np.empty(4, np.float32), np.empty(4, np.float32)
-    v = v_skinned[0:3]
-    for a in range(3):
-        v_row[a] = v[a]
-    for k in range(len(index)):
-        w, delta, node, v_delta = weight[k], deltas[index[k]], nodes[index[k]], v_deltas[index[k]]
-        length = _unit(delta, q)
-        for a in range(3):
-            arm[a] = row[a] - node[a]
-        # by the arm: R^T v - v
-        back[0] = q[0]
-        for a in range(3):
-            back[1 + a] = -q[1 + a]
-        _turn(back, v, turned)
-        for a in range(3):
-            v_row[a] += w * (turned[a] - v[a])
-        # by the unit quaternion of R(q) arm = arm + 2 w (u x arm) + 2 u x (u x arm)
-        cx = arm[1] * v[2] - arm[2] * v[1]
-        cy = arm[2] * v[0] - arm[0] * v[2]
-        cz = arm[0] * v[1] - arm[1] * v[0]
-        dot_v = q[1] * v[0] + q[2] * v[1] + q[3] * v[2]
-        dot_arm = q[1] * arm[0] + q[2] * arm[1] + q[3] * arm[2]
-        both = arm[0] * v[0] + arm[1] * v[1] + arm[2] * v[2]
-        v_q[0] = TWO * (q[1] * cx + q[2] * cy + q[3] * cz)
-        v_q[1] = TWO * (q[0] * cx + dot_v * arm[0] + dot_arm * v[0] - TWO * q[1] * both)
-        v_q[2] = TWO * (q[0] * cy + dot_v * arm[1] + dot_arm * v[1] - TWO * q[2] * both)
-        v_q[3] = TWO * (q[0] * cz + dot_v * arm[2] + dot_arm * v[2] - TWO * q[3] * both)
-        radial = v_q[0] * q[0] + v_q[1] * q[1] + v_q[2] * q[2] + v_q[3] * q[3]
-        for a in range(4):
-            v_delta[6 + a] += w * ((v_q[a] - radial * q[a]) / length + v_blend[a])
-        for a in range(6):
-            v_delta[a] += w * v_skinned[a]
-        for a in range(10, COUNT):
-            v_delta[a] += w * v_skinned[a]
+    """Add the gradients of the blends to those of the records of one group."""
+    g = u8(group)
+    for gaussian in range(first, end):
+        i, at = u8(gaussian), u8((gaussian - first) * RECORD)
+        n0, n1, n2, n3 = u8(index[i, 0]), u8(index[i, 1]), u8(index[i, 2]), u8(index[i, 3])
+        w0, w1, w2, w3 = weight[i, 0], weight[i, 1], weight[i, 2], weight[i, 3]
+        for part in range(RECORD):
+            c = u8(part)
+            v_blend = v_blends[at + c]
+            v_records[g, n0, c] += w0 * v_blend
+            v_records[g, n1, c] += w1 * v_blend
+            v_records[g, n2, c] += w2 * v_blend
+            v_records[g, n3, c] += w3 * v_blend
+
+
+@kernel
+def _skin_block(
+    first: Any, rows: F32, middle: F32, records: F32, index: I32, weight: F32, skinned: F32
+) -> None:
+    blends = stack_floats(1536)  # BLOCK RECORD
+    end = min(first + BLOCK, len(rows))
+    _blend(records, index, weight, first, end, blends)
+    for gaussian in range(first, end):
+        i, at = u8(gaussian), u8((gaussian - first) * RECORD)
+        x, y, z = rows[i, 0] - middle[0], rows[i, 1] - middle[1], rows[i, 2] - middle[2]
+        for axis in range(3):
+            a, row = u8(axis), at + u8(4 * axis)
+            moved = blends[row] * x + blends[row + u8(1)] * y + blends[row + u8(2)] * z
+            skinned[i, a] = rows[i, a] + (moved + blends[row + u8(3)])
+        for column in range(3, COUNT):
+            c = u8(column)
+            skinned[i, c] = rows[i, c] + blends[at + c + OTHERS]
+        turn = ONE + blends[at + W], blends[at + X], blends[at + Y], blends[at + Z]
+        quat = _product(turn, (rows[i, 6], rows[i, 7], rows[i, 8], rows[i, 9]))
+        skinned[i, 6], skinned[i, 7], skinned[i, 8], skinned[i, 9] = quat
 
 
 @parallel_kernel
-def _skin(rows: F32, nodes: F32, deltas: F32, index: I32, weight: F32, skinned: F32) -> None:
-    for i in prange(len(rows)):
-        _skin_one(rows[i], nodes, deltas, index[i], weight[i], skinned[i])
+def _skin(rows: F32, middle: F32, records: F32, index: I32, weight: F32, skinned: F32) -> None:
+    for block in prange((len(rows) + BLOCK - 1) // BLOCK):
+        _skin_block(np.int64(block) * BLOCK, rows, middle, records, index, weight, skinned)
 
 
 @kernel
 def _skin_group_backward(
-    group: int, rows: F32, nodes: F32, deltas: F32, index: I32, weight: F32, v_skinned: F32, v_rows: F32,
-    v_deltas: F32,
+    group: Any, rows: F32, middle: F32, records: F32, index: I32, weight: F32, v_skinned: F32, v_rows: F32,
+    v_records: F32,
 ) -> None:  # fmt: skip
-    count = len(rows)
-    for i in range(group * count // GROUPS, (group + 1) * count // GROUPS):
-        _skin_one_backward(rows[i], nodes, deltas, index[i], weight[i], v_skinned[i], v_rows[i], v_deltas)
+    blends, v_blends = stack_floats(1536), stack_floats(1536)  # BLOCK RECORD
+    v_records[group] = ZERO
+    last = (group + 1) * len(rows) // GROUPS
+    for first in range(group * len(rows) // GROUPS, last, BLOCK):
+        end = min(first + BLOCK, last)
+        _blend(records, index, weight, first, end, blends)
+        for gaussian in range(first, end):
+            i, at = u8(gaussian), u8((gaussian - first) * RECORD)
+            x, y, z = rows[i, 0] - middle[0], rows[i, 1] - middle[1], rows[i, 2] - middle[2]
+            v_x, v_y, v_z = v_skinned[i, 0], v_skinned[i, 1], v_skinned[i, 2]
+            for axis in range(3):
+                a, row = u8(axis), at + u8(4 * axis)
+                v = v_skinned[i, a]
+                v_blends[row], v_blends[row + u8(1)], v_blends[row + u8(2)] = v * x, v * y, v * z
+                v_blends[row + u8(3)] = v
+                v_moved = blends[at + a] * v_x + blends[at + a + u8(4)] * v_y + blends[at + a + u8(8)] * v_z
+                v_rows[i, a] = v + v_moved
+            for column in range(3, COUNT):
+                c = u8(column)
+                v_rows[i, c] = v_blends[at + c + OTHERS] = v_skinned[i, c]
+            v_blends[at + u8(RECORD - 1)] = ZERO
+            turn = ONE + blends[at + W], blends[at + X], blends[at + Y], blends[at + Z]
+            quat = rows[i, 6], rows[i, 7], rows[i, 8], rows[i, 9]
+            v_quat = v_skinned[i, 6], v_skinned[i, 7], v_skinned[i, 8], v_skinned[i, 9]
+            v_turn = _product(v_quat, _conjugate(quat))
+            v_blends[at + W], v_blends[at + X], v_blends[at + Y], v_blends[at + Z] = v_turn
+            v_rows[i, 6], v_rows[i, 7], v_rows[i, 8], v_rows[i, 9] = _product(_conjugate(turn), v_quat)
+        _scatter(v_blends, index, weight, first, end, group, v_records)
 
 
 @parallel_kernel
 def _skin_backward(
-    rows: F32, nodes: F32, deltas: F32, index: I32, weight: F32, v_skinned: F32, v_rows: F32, partial: F32
+    rows: F32, middle: F32, records: F32, index: I32, weight: F32, v_skinned: F32, v_rows: F32, v_records: F32
 ) -> None:
     for group in prange(GROUPS):
-        _skin_group_backward(group, rows, nodes, deltas, index, weight, v_skinned, v_rows, partial[group])
+        _skin_group_backward(
+            np.int64(group), rows, middle, records, index, weight, v_skinned, v_rows, v_records
+        )
+
+
+@kernel
+def _records_backward(places: F32, deltas: F32, v_records: F32, v_deltas: F32) -> None:
+    v_A = stack_floats(9)
+    for node in range(len(places)):
+        n = u8(node)
+        for axis in range(3):
+            a, row = u8(axis), u8(4 * axis)
+            v_t = v_records[n, row + u8(3)]
+            v_deltas[n, a] = v_t
+            for k in range(3):
+                v_A[u8(3) * a + u8(k)] = v_records[n, row + u8(k)] - v_t * places[n, u8(k)]
+        for column in range(3, COUNT):
+            c = u8(column)
+            v_deltas[n, c] = v_records[n, c + OTHERS]
+        w, x, y, z, scale = _unit(ONE + deltas[n, 6], deltas[n, 7], deltas[n, 8], deltas[n, 9])
+        # through the rotation of the unit quaternion: the skew and the symmetric parts of v_A, its diagonal
+        skew_x, skew_y, skew_z = v_A[7] - v_A[5], v_A[2] - v_A[6], v_A[3] - v_A[1]
+        yz, xz, xy = v_A[7] + v_A[5], v_A[2] + v_A[6], v_A[3] + v_A[1]
+        xx, yy, zz = TWO * v_A[0], TWO * v_A[4], TWO * v_A[8]
+        v_w = TWO * (x * skew_x + y * skew_y + z * skew_z)
+        v_x = TWO * (w * skew_x + y * xy + z * xz - x * (yy + zz))
+        v_y = TWO * (w * skew_y + x * xy + z * yz - y * (xx + zz))
+        v_z = TWO * (w * skew_z + x * xz + y * yz - z * (xx + yy))
+        # through its length
+        along = v_w * w + v_x * x + v_y * y + v_z * z
+        v_deltas[n, 6] += (v_w - along * w) * scale
+        v_deltas[n, 7] += (v_x - along * x) * scale
+        v_deltas[n, 8] += (v_y - along * y) * scale
+        v_deltas[n, 9] += (v_z - along * z) * scale
