@@ -6,7 +6,9 @@ import json
 import logging
 import signal
 import tempfile
+from collections.abc import Callable
 from dataclasses import asdict
+from functools import wraps
 from pathlib import Path
 from typing import Any, cast
 
@@ -25,6 +27,29 @@ endpoint_option = click.option(
     "--endpoint", help="Data socket of the node; default: the connection file of the node on this machine."
 )
 ns_option = click.option("--ns", default="sags", show_default=True, help="Namespace of the topics.")
+
+
+def keys_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Options for a node that wants keys; the command gets them as `keys`."""
+
+    @click.option(
+        "--key",
+        metavar="FILE.key",
+        type=click.Path(path_type=Path),
+        help="Your secret key file (sags keygen), for a node that wants one.",
+    )
+    @click.option(
+        "--server-key",
+        metavar="KEY",
+        help="The node's .pub file or the key itself; default: the connection file.",
+    )
+    @wraps(command)
+    def with_keys(*args: Any, key: Path | None, server_key: str | None, **rest: Any) -> None:
+        from sags_node.messaging.address import client_keys
+
+        command(*args, keys=client_keys(key, server_key), **rest)
+
+    return with_keys
 
 
 class Sags(click.Group):
@@ -241,6 +266,11 @@ def evaluate(
     show_default=True,
     help="What the attention sees: the Gaussian alone, its levels, or all control nodes.",
 )
+@click.option(
+    "--monocular",
+    is_flag=True,
+    help="The depth is an estimate from one picture, true up to scale and shift; paper only.",
+)
 @click.option("--no-adaptive", is_flag=True, help="Without the self-adaptive block of the decoder.")
 @click.option("--no-alias-free", is_flag=True, help="Without both filters.")
 @click.option(
@@ -264,6 +294,7 @@ def fit(
     warm_up: int,
     iterations: int,
     tokens: str,
+    monocular: bool,
     no_adaptive: bool,
     no_alias_free: bool,
     max_gaussians: int,
@@ -274,23 +305,27 @@ def fit(
 ) -> None:
     """Fit the SAGS model offline to a whole recording.
 
-    By the protocol of the paper: warm-up, then all parameters together, every eighth frame for testing.
+    Every eighth frame is for testing. By default the online mapper plays the recording once, and what it saw
+    is refined jointly; --schedule paper is the protocol of the paper: warm-up on the first frame, then all
+    parameters together (with --tokens self: its decoder).
 
     DATASET is a folder in EndoNeRF or SCARED layout, or any session the node can play. Leaves a checkpoint,
     the model as PLY (standard 3DGS fields, filters folded in), the drawn test frames and figures.json.
 
     \b
     sags fit launch/d4d_pull.yaml --out out/d4d
-    sags fit /data/endonerf/pulling_soft_tissues --schedule paper
+    sags fit /data/endonerf/pulling_soft_tissues --schedule paper --tokens self
     """
     from sags_node.apps.fit import figures_table, fit_session
     from sags_node.config import V4l2Source, load_launch
     from sags_node.evaluation.measure import Options
-    from sags_node.fitting.settings import FitSettings, Schedule, Tokens
+    from sags_node.fitting.settings import MONOCULAR, STEREO, FitSettings, Schedule, Tokens
 
     path, overrides = split(dataset)
     if isinstance(load_launch(path, overrides).source, V4l2Source):
         raise UsageError("live cameras cannot be fitted; record them first, then fit the recording")
+    if monocular and schedule != "paper":
+        raise UsageError("--monocular needs --schedule paper: the online start measures distances")
     options = Options(hold_out, 1, lpips_weights)
     settings = FitSettings(
         schedule=cast(Schedule, schedule),
@@ -301,6 +336,7 @@ def fit(
         antialias=not no_alias_free,
         max_gaussians=max_gaussians,
         seed=seed,
+        weights=MONOCULAR if monocular else STEREO,
     )
     check_folder(out)
     session = open_launched(path, [*overrides, "source.loop:=false", "source.pace:=step"])
@@ -318,6 +354,7 @@ main.add_command(bench)
 @main.command()
 @endpoint_option
 @ns_option
+@keys_options
 @click.option("--pin", type=(float, float), metavar="U V", help="Tissue pixel to pin to; default: centre.")
 @click.option("--seconds", type=positive, help="Stop after so long; default: Ctrl-C.")
 @click.option("--save", type=click.Path(path_type=Path), help="Write what is shown: .mp4, or .png.")
@@ -329,6 +366,7 @@ def overlay(
     seconds: float | None,
     save: Path | None,
     json_out: bool,
+    keys: Any,
 ) -> None:
     """Draw geometry pinned to the tissue over a node's live picture.
 
@@ -337,7 +375,7 @@ def overlay(
     """
     from sags_node.apps.overlay import run_overlay
 
-    summary = run_overlay(endpoint=endpoint, ns=ns, pin=pin, seconds=seconds, save=save)
+    summary = run_overlay(endpoint=endpoint, ns=ns, pin=pin, seconds=seconds, save=save, keys=keys)
     show(summary if json_out else text.overlay_table(summary))
 
 
@@ -349,13 +387,14 @@ def topic() -> None:
 @topic.command("list")
 @endpoint_option
 @ns_option
+@keys_options
 @click.option("--seconds", type=positive, default=3.0, show_default=True, help="How long to listen.")
 @as_json
-def topic_list(endpoint: str | None, ns: str, seconds: float, json_out: bool) -> None:
+def topic_list(endpoint: str | None, ns: str, seconds: float, json_out: bool, keys: Any) -> None:
     """Every topic with its type, and the rate and size of what was heard."""
     from sags_node.apps import topic as tool
 
-    rows = tool.topic_list(endpoint=endpoint, ns=ns, seconds=seconds)
+    rows = tool.topic_list(endpoint=endpoint, ns=ns, seconds=seconds, keys=keys)
     show(rows if json_out else text.topics_table(rows))
 
 
@@ -363,13 +402,16 @@ def topic_list(endpoint: str | None, ns: str, seconds: float, json_out: bool) ->
 @click.argument("name")
 @endpoint_option
 @ns_option
+@keys_options
 @click.option("--count", type=click.IntRange(1), help="Stop after so many messages; default: Ctrl-C.")
 @as_json
-def topic_echo(name: str, endpoint: str | None, ns: str, count: int | None, json_out: bool) -> None:
+def topic_echo(
+    name: str, endpoint: str | None, ns: str, count: int | None, json_out: bool, keys: Any
+) -> None:
     """Print the messages of topic NAME; bulk data as shape and range."""
     from sags_node.apps import topic as tool
 
-    for message in tool.topic_echo(name, endpoint=endpoint, ns=ns, count=count):
+    for message in tool.topic_echo(name, endpoint=endpoint, ns=ns, count=count, keys=keys):
         show(message if json_out else text.echo_text(message))
 
 
@@ -380,12 +422,16 @@ def _measuring(name: str, doc: str) -> None:
     @click.argument("topic_name", metavar="NAME")
     @endpoint_option
     @ns_option
+    @keys_options
     @click.option("--seconds", type=positive, default=5.0, show_default=True, help="How long to listen.")
     @as_json
-    def command(topic_name: str, endpoint: str | None, ns: str, seconds: float, json_out: bool) -> None:
+    def command(
+        topic_name: str, endpoint: str | None, ns: str, seconds: float, json_out: bool, keys: Any
+    ) -> None:
         from sags_node.apps import topic as tool
 
-        figures = getattr(tool, f"topic_{name}")(topic_name, endpoint=endpoint, ns=ns, seconds=seconds)
+        measure = getattr(tool, f"topic_{name}")
+        figures = measure(topic_name, endpoint=endpoint, ns=ns, seconds=seconds, keys=keys)
         show(figures if json_out else getattr(text, f"{name}_text")(figures))
 
 
@@ -417,6 +463,30 @@ def phantom(folder: Path, overrides: tuple[str, ...]) -> None:
     with progress("rendering") as advance:
         write_session(config, folder, rate=config.rate or 30.0, progress=advance)
     console.print(f"session: [bold]{escape(str(folder))}[/]; play it with: sags run {escape(str(folder))}")
+
+
+@main.command()
+@click.argument("name")
+@click.option(
+    "--out", type=click.Path(path_type=Path), default=Path(), show_default=True, help="Folder for both files."
+)
+def keygen(name: str, out: Path) -> None:
+    """Make a key pair for a node or for a client.
+
+    NAME.key is secret: it stays with whoever runs the node or the client. NAME.pub is for the other side. A
+    node with keys encrypts its tcp sockets and lets in only clients whose .pub it has.
+
+    \b
+    sags keygen node --out keys
+    sags keygen viewer --out keys/clients
+    sags run publish.key:=keys/node.key publish.allow:=keys/clients 'publish.data:=[tcp://*:5556]'
+    sags topic hz tf --endpoint tcp://HOST:5556 --key keys/clients/viewer.key --server-key keys/node.pub
+    """
+    from sags_node.messaging.security import write_key_pair
+
+    secret, public = write_key_pair(out, name)
+    console.print(f"secret, stays here: [bold]{escape(str(secret))}[/]", soft_wrap=True)
+    console.print(f"public, give it to the other side: [bold]{escape(str(public))}[/]", soft_wrap=True)
 
 
 @main.command()

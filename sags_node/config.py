@@ -10,11 +10,14 @@ from string import Template
 from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from sags_node.errors import UsageError
 
 Box = tuple[int, int, int, int]  # x, y, width, height in px
+Paths = Annotated[
+    tuple[Path, ...], BeforeValidator(lambda said: [said] if isinstance(said, str | Path) else said)
+]
 
 
 class Section(BaseModel):
@@ -204,8 +207,16 @@ class PublishConfig(Section):
     ipc: bool = Field(True, description="also bind an ipc socket in the run directory")
     control: str | None = Field("tcp://127.0.0.1:5557", description="ROUTER endpoint; null: none")
     run_dir: Path | None = Field(None, description="default: $XDG_RUNTIME_DIR/sags or /tmp/sags-<uid>")
-    insecure: bool = Field(False, description="allow other addresses than loopback and ipc")
+    key: Path | None = Field(None, description="the node's secret key file (sags keygen): encrypt all tcp")
+    allow: Paths = Field((), description="who may connect: .pub files, and folders of them")
+    insecure: bool = Field(False, description="allow other addresses than loopback and ipc without keys")
     right: bool = Field(False, description="also publish the right eye's input and render")
+
+    @model_validator(mode="after")
+    def _keys_together(self) -> PublishConfig:
+        if (self.key is None) != (not self.allow):
+            raise ValueError("key and allow belong together: who the node is, and who may connect")
+        return self
 
 
 class LaunchConfig(Section):
@@ -224,7 +235,7 @@ class LaunchConfig(Section):
 
 # ---- reading ---------------------------------------------------------------------------------------------
 
-_PATH_KEYS = ("rig", "folder", "video", "left", "right", "tools", "poses", "depth", "tracks")
+_PATH_KEYS = ("rig", "folder", "video", "left", "right", "tools", "poses", "depth", "tracks", "key", "allow")
 DEFAULT_DATA = "../shared/data"
 
 
@@ -315,10 +326,18 @@ def _resolve_paths(tree: dict[str, Any], folder: Path) -> None:
         if isinstance(value, dict) and value.get("kind") != "v4l2":
             _resolve_paths(value, folder)
         elif isinstance(value, str):
-            expanded = Template(value).safe_substitute(variables)
-            if "$" in expanded and key in _PATH_KEYS:
-                raise UsageError(f"{key}: {value} uses a variable that is not set; export it first")
-            tree[key] = str(folder / expanded) if key in _PATH_KEYS else expanded
+            tree[key] = _resolve(key, value, folder, variables)
+        elif isinstance(value, list):
+            tree[key] = [
+                _resolve(key, item, folder, variables) if isinstance(item, str) else item for item in value
+            ]
+
+
+def _resolve(key: str, value: str, folder: Path, variables: Mapping[str, str]) -> str:
+    expanded = Template(value).safe_substitute(variables)
+    if "$" in expanded and key in _PATH_KEYS:
+        raise UsageError(f"{key}: {value} uses a variable that is not set; export it first")
+    return str(folder / expanded) if key in _PATH_KEYS else expanded
 
 
 def _apply_override(tree: dict[str, Any], override: str) -> None:

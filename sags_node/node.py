@@ -134,6 +134,7 @@ class Node:
             },
             stopping=self._stopping.is_set(),
             error=self._error,
+            connections=self._publisher.connections,
         )
 
     def _guard(self, name: str, work: Callable[[], None], after: Callable[[], None]) -> None:
@@ -280,7 +281,13 @@ class _Statistics:
                 self._skipped[what] = self._skipped.get(what, 0) + 1
             self._gaussians = len(result.snapshot.gaussians)
 
-    def health(self, dropped: dict[str, int], stopping: bool, error: BaseException | None) -> NodeHealth:
+    def health(
+        self,
+        dropped: dict[str, int],
+        stopping: bool,
+        error: BaseException | None,
+        connections: dict[str, dict[str, int]],
+    ) -> NodeHealth:
         with self._lock:
             now = time.monotonic()
             waiting = not self._published or now - self._published[-1] > WAITING_AFTER
@@ -309,6 +316,7 @@ class _Statistics:
                 rss_mb=resident_mb(),
                 skipped=dict(self._skipped),
                 last_error=str(error) if error else None,
+                connections=connections,
             )
 
 

@@ -17,6 +17,7 @@ from sags_node.types import StereoRig
 class Session:
     """What a node needs. The source brings no truth with its frames; measuring opens its own."""
 
+    name: str  # of the launch file or folder
     config: LaunchConfig
     rig: StereoRig
     source: Source
@@ -49,7 +50,14 @@ def open_session(
         rig = load_rig(config.rig or folder / "calib")
     else:
         rig = _rig(config)
-    return Session(config, rig, open_source(config.source, references=False))
+    return Session(_name(launch), config, rig, open_source(config.source, references=False))
+
+
+def _name(launch: Path | str | None) -> str:
+    if launch is None:
+        return "phantom"
+    path = Path(launch)
+    return path.name if path.is_dir() else path.stem
 
 
 def _rig(config: LaunchConfig) -> StereoRig:

@@ -213,3 +213,4 @@ class NodeHealth:
     rss_mb: float
     skipped: Mapping[str, int]  # rule -> frames
     last_error: str | None = None
+    connections: Mapping[str, Mapping[str, int]] = field(default_factory=dict)  # socket -> open, refused

@@ -15,6 +15,7 @@ import msgpack
 import numpy as np
 import pytest
 import zmq
+from hostile import is_reply, random_request
 
 from sags_node.config import PublishConfig
 from sags_node.errors import SagsError
@@ -123,42 +124,6 @@ def test_silence_is_an_error() -> None:
         asker.request("ping", timeout=0.1)
 
 
-def _random_value(rng: np.random.Generator, depth: int = 0) -> Any:
-    choices: list[Any] = [
-        None,
-        True,
-        -1,
-        2**64 - 1,
-        float("nan"),
-        "x" * int(rng.integers(300)),
-        rng.bytes(20),
-    ]
-    if depth < 3:
-        choices += [
-            [_random_value(rng, depth + 1) for _ in range(int(rng.integers(4)))],
-            {str(i): _random_value(rng, depth + 1) for i in range(int(rng.integers(4)))},
-            msgpack.ExtType(int(rng.integers(128)), b"ext"),
-        ]
-    return choices[int(rng.integers(len(choices)))]
-
-
-def _random_request(rng: np.random.Generator) -> bytes:
-    kind = int(rng.integers(6))
-    if kind == 0:
-        return rng.bytes(int(rng.integers(200)))
-    if kind == 1:
-        return b"\x91" * int(rng.integers(1, 60_000))  # arrays in arrays
-    if kind == 2:
-        return b"\x81\xa4args" + b"\x81" * 2000 + b"\xc0"  # maps as keys of maps
-    fields = {"v": "1.0", "id": int(rng.integers(99)), "op": "echo", "args": {"a": _random_value(rng)}}
-    if kind == 3:
-        fields[str(rng.choice(["v", "id", "op", "args"]))] = _random_value(rng)
-    body = bytearray(msgpack.packb(fields))
-    if kind == 4:
-        body[int(rng.integers(len(body)))] = int(rng.integers(256))
-    return bytes(body)
-
-
 def test_thousands_of_random_requests_do_no_harm(tmp_path: Path) -> None:
     rng = np.random.default_rng(4)
     with node(tmp_path / "run", {"echo": lambda args: args}) as endpoint:
@@ -168,15 +133,15 @@ def test_thousands_of_random_requests_do_no_harm(tmp_path: Path) -> None:
         asker.connect(endpoint)
         answered = 0
         for i in range(3000):
-            parts = [_random_request(rng)]
+            parts = [random_request(rng)]
             if i % 50 == 0:
                 parts = [b""] * int(rng.integers(1, 40)) + parts
             asker.send_multipart(parts)
             while asker.poll(0):
-                answered += _is_reply(asker.recv_multipart()[-1])
+                answered += is_reply(asker.recv_multipart()[-1])
         deadline = time.monotonic() + 10
         while answered < 2900 and time.monotonic() < deadline and asker.poll(500):
-            answered += _is_reply(asker.recv_multipart()[-1])
+            answered += is_reply(asker.recv_multipart()[-1])
         context.destroy(linger=0)
         assert answered >= 2900  # all but those in too many parts
         with ControlClient(endpoint) as sane:
@@ -196,8 +161,3 @@ def _until(condition: Callable[[], Any]) -> None:
     while not condition():
         assert time.monotonic() < deadline
         time.sleep(0.005)
-
-
-def _is_reply(body: bytes) -> bool:
-    reply = msgpack.unpackb(body, strict_map_key=False, ext_hook=lambda code, data: data)
-    return reply["v"] == "1.0" and isinstance(reply["ok"], bool)

@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -14,10 +15,10 @@ from click.testing import CliRunner
 from sags_node.cli import main
 from sags_node.engine.threads import configure_threads
 from sags_node.errors import SagsError, UsageError
-from sags_node.fitting import checkpoint
+from sags_node.fitting import checkpoint, start
 from sags_node.fitting.clip import Clip, read_clip
 from sags_node.fitting.fit import Fit
-from sags_node.fitting.score import score, score_tracks
+from sags_node.fitting.score import score, score_depth, score_tracks
 from sags_node.fitting.settings import FitSettings
 from sags_node.fitting.start import follow_online
 from sags_node.model import columns
@@ -35,6 +36,12 @@ def held_out(frame_id: int) -> bool:
 
 def quietly(what: str, done: int, of: int) -> None:
     """No progress shown."""
+
+
+@pytest.fixture(autouse=True)
+def short_regression(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Twelve frames are learnt sooner than a clip."""
+    monkeypatch.setattr(start, "PATH_STEPS", 600)
 
 
 @pytest.fixture(scope="module")
@@ -63,9 +70,9 @@ def test_a_clip_is_split_and_whole(clip: Clip) -> None:
 @pytest.mark.parametrize("tokens", ["self", "planes", "nodes"])
 def test_a_fit_learns_frames_it_never_saw(clip: Clip, tokens: Any) -> None:
     settings = dataclasses.replace(PAPER, tokens=tokens, iterations=240)
-    start = Fit(clip, settings)
-    start.start(quietly)
-    before = score(start, clip.test, {})
+    fresh = Fit(clip, settings)
+    fresh.start(quietly)
+    before = score(fresh, clip.test, {})
     after = score(fitted(clip, settings), clip.test, {})
     assert after["psnr"] > before["psnr"] + 2
     assert after["ssim"] > before["ssim"]
@@ -104,7 +111,9 @@ def test_refining_an_online_start_helps_frames_it_never_saw(clip: Clip) -> None:
     after = score(fit, clip.test, {})
     assert after["psnr"] > before["psnr"] + 0.2
     assert after["ssim"] > before["ssim"]
-    assert after["depth_median_mm"] < before["depth_median_mm"] + 0.02
+    depth = score_depth(fit, clip.test, {"first": (0, 5)})
+    assert depth is not None and depth["frames"] == 2 and depth["first"]["frames"] == 1
+    assert depth["median_mm"] < 0.6 and depth["coverage"] > 0.98
 
 
 def test_gaussians_stay_on_their_tissue(clip: Clip) -> None:
@@ -184,7 +193,7 @@ def test_the_command_leaves_model_pictures_and_figures(phantom_session: Path, tm
     found = json.loads(result.stdout)
     assert found == json.loads((out / "figures.json").read_text())
     assert found["heldout"]["frames"] == 2 and found["heldout"]["psnr"] > 15
-    assert found["heldout"]["depth_median_mm"] < 10
+    assert found["depth"]["median_mm"] < 10
     assert 0 < found["gaussians"] <= 1500
     assert sorted(path.name for path in (out / "test").iterdir()) == ["000001.png", "000009.png"]
     header = (out / "model.ply").read_bytes()[:400]
@@ -228,3 +237,67 @@ def test_beyond_the_last_frame_the_model_moves_on_and_comes_to_rest(clip: Clip) 
     np.testing.assert_allclose(means(10**12), now + velocity * FADE_NS, atol=1e-6)
     later = dataclasses.replace(last, t_capture_ns=t_ns + 30_000_000)
     np.testing.assert_array_equal(fit.gaussians(later).means, means(30_000_000))
+
+
+def test_monocular_depth_is_for_the_papers_schedule(phantom_session: Path, tmp_path: Path) -> None:
+    wrong = sags_fit(phantom_session, "--monocular", "--out", tmp_path / "fit")
+    assert wrong.exit_code == 2 and "--schedule paper" in wrong.output
+    options = [
+        "--schedule",
+        "paper",
+        "--warm-up",
+        "2",
+        "--iterations",
+        "2",
+        "--max-gaussians",
+        "500",
+        "--json",
+    ]
+    result = sags_fit(phantom_session, "source.frames:=6", "--monocular", *options, "--out", tmp_path / "fit")
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout)["settings"]["weights"]["inverse_depth"] == 0
+
+
+@pytest.mark.parametrize("schedule", ["online", "paper"])
+def test_a_clip_of_a_public_data_set_is_fitted_from_its_path(tmp_path: Path, schedule: str) -> None:
+    folder = tmp_path / "pulling"
+    rows, across = np.mgrid[:128, :160].astype(np.float32)
+    for number in range(10):
+        waves = np.sin((across - number) / 5) * np.sin(rows / 7)  # texture that moves right
+        mask, depth = np.zeros((128, 160), np.uint8), np.full((128, 160), 60, np.uint8)
+        mask[40:60, : 20 + number] = 255
+        for name, picture in (
+            ("images", np.stack([150 + 40 * waves, 80 + 20 * waves, 70 - 15 * waves], -1)),
+            ("masks", mask),
+            ("depth", depth),
+        ):
+            (folder / name).mkdir(parents=True, exist_ok=True)
+            assert cv2.imwrite(str(folder / name / f"{number:06d}.png"), picture)
+    matrix = np.column_stack([np.eye(3), np.zeros(3), [128, 160, 150.0]])
+    np.save(folder / "poses_bounds.npy", np.tile(np.concatenate([matrix.ravel(), [60, 80]]), (10, 1)))
+    options = ["--schedule", schedule, "--warm-up", "40", "--iterations", "80", "--max-gaussians", "2000"]
+    result = sags_fit(folder, *options, "--out", tmp_path / "fit", "--json")
+    assert result.exit_code == 0, result.output
+    found = json.loads(result.stdout)
+    assert found["session"] == "pulling" and found["depth"] is None and found["track"] is None
+    assert found["heldout"]["frames"] == 2
+    assert found["heldout"]["psnr"] > (25 if schedule == "online" else 18)
+
+
+def test_a_cut_in_the_recording_keeps_the_cap(clip: Clip) -> None:
+    """The mapper begins anew, so that more Gaussians lived than ever at a time."""
+    other = [
+        dataclasses.replace(frame, image=np.ascontiguousarray(255 - frame.image[::-1]))
+        for frame in clip.train[5:]
+    ]
+    cut = Clip([*clip.train[:5], *other], clip.test)
+    settings = dataclasses.replace(SMALL, max_gaussians=1200)
+    fit = fitted(cut, settings, iterations=60)
+    assert len(fit.model) == 1200
+    for frame in (cut.train[1], cut.train[-2]):
+        assert score(fit, [frame], {})["psnr"] > 18  # two scenes share the cap
+
+
+def test_a_clip_too_long_for_its_memory_is_refused_at_once(clip: Clip) -> None:
+    with pytest.raises(SagsError, match="max-gaussians"):
+        fitted(clip, dataclasses.replace(SMALL, max_gaussians=5_000_000))

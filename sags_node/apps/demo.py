@@ -68,9 +68,7 @@ def run_demo(session: Session, out: Path, progress: Callable[[int, int | None, s
         finally:
             node.stop()
         consumed = _finish_overlay(overlay)
-        outcome = measure(
-            "demo", session, spool, _OPTIONS, progress=lambda what, done: progress(done, frames, what)
-        )
+        outcome = measure(session, spool, _OPTIONS, progress=lambda what, done: progress(done, frames, what))
     outcome.summary["overlay"] = consumed
     page = write_report(out, outcome.summary, outcome.rows, outcome.pictures)
     return Demo(outcome.summary, summary_table(outcome.summary), page)

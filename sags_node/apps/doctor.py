@@ -15,7 +15,7 @@ from typing import Literal
 
 from sags_node.config import LaunchConfig, PublishConfig
 from sags_node.errors import UsageError
-from sags_node.messaging.publisher import check_endpoint
+from sags_node.messaging.security import check_endpoint, read_allow_list, read_key_pair
 
 Level = Literal["ok", "warning", "error"]
 REQUIRED = (
@@ -48,6 +48,7 @@ def examine(config: LaunchConfig) -> list[Check]:
         _cores(),
         _kernel_cache(),
         *_ports(config.publish),
+        *_keys(config.publish),
         _cameras(),
         _recordings(),
     ]
@@ -98,12 +99,12 @@ def _kernel_cache() -> Check:
 
 def _ports(config: PublishConfig) -> list[Check]:
     endpoints = [endpoint for endpoint in (*config.data, config.control) if endpoint]
-    return [_port(endpoint, config.insecure) for endpoint in endpoints]
+    return [_port(endpoint, config) for endpoint in endpoints]
 
 
-def _port(endpoint: str, insecure: bool) -> Check:
+def _port(endpoint: str, config: PublishConfig) -> Check:
     try:
-        check_endpoint(endpoint, insecure)
+        check_endpoint(endpoint, config)
     except UsageError as error:
         return Check(endpoint, "error", "cannot be used", str(error))
     host, _, port = endpoint.removeprefix("tcp://").rpartition(":")
@@ -117,6 +118,17 @@ def _port(endpoint: str, insecure: bool) -> Check:
         except (OSError, ValueError, OverflowError) as error:  # taken, not a number, not a port
             mend = "stop the other node, or set publish.data and publish.control to other ports"
             return Check(endpoint, "warning", str(error), mend)
+
+
+def _keys(config: PublishConfig) -> list[Check]:
+    if config.key is None:
+        return []
+    try:
+        read_key_pair(config.key)
+        allowed = read_allow_list(config.allow)
+    except UsageError as error:
+        return [Check("keys", "error", "cannot be used", str(error))]
+    return [Check("keys", "ok", f"{config.key}; may connect: {', '.join(allowed.values())}")]
 
 
 def _cameras() -> Check:

@@ -15,18 +15,18 @@ from sags_node.apps import text
 from sags_node.engine.smoothing import folded
 from sags_node.engine.threads import configure_threads
 from sags_node.errors import UsageError
-from sags_node.evaluation.lpips import Lpips
+from sags_node.evaluation.lpips import BACKBONE, Lpips
 from sags_node.evaluation.machine import machine_name
 from sags_node.evaluation.measure import Options
 from sags_node.fitting import checkpoint
 from sags_node.fitting.clip import read_clip
 from sags_node.fitting.fit import Fit
-from sags_node.fitting.score import PUBLISHED, score
+from sags_node.fitting.score import PUBLISHED, score, score_depth, score_tracks
 from sags_node.fitting.settings import FitSettings
 from sags_node.model.ply import write_ply
 from sags_node.session import Session
 
-CHECKPOINT_PERIOD = 30.0  # s
+CHECKPOINT_PERIOD = 60.0  # s; it holds hundreds of MB
 
 Advance = Callable[[int, int | None, str], None]  # done, of, what
 
@@ -76,8 +76,9 @@ def fit_session(
     drawn.mkdir(exist_ok=True)
     advance(0, len(clip.test), "measuring")
     segments = session.config.segments
+    everything = sorted((*clip.train, *clip.test), key=lambda frame: frame.frame_id)
     found = {
-        "session": session.config.source.kind,
+        "session": session.name,
         "settings": asdict(settings),
         "machine": machine_name(),
         "seconds": round(fit.seconds, 1),
@@ -89,7 +90,11 @@ def fit_session(
             fit, clip.test, segments, lpips, drawn,
             lambda done: advance(done, len(clip.test), "measuring"),
         ),
+        "depth": score_depth(fit, everything, segments),
+        "track": score_tracks(fit, everything),
         "train": score(fit, clip.train[:: max(1, options.hold_out)], segments),
+        "psnr_convention": "tissue",
+        "lpips_backbone": BACKBONE if lpips is not None else None,
         "published": PUBLISHED,
     }  # fmt: skip
     last = fit.gaussians(clip.train[-1])
@@ -116,19 +121,16 @@ def _iterate(fit: Fit, stored: Path, advance: Advance) -> None:
 
 def figures_table(found: dict[str, Any]) -> Table:
     """Figures of the fit beside the published ones."""
-    table = text.table("", "frames", "PSNR* (tissue)", "PSNR (masked)", "SSIM", "LPIPS", "depth median")
+    table = text.table("", "frames", "PSNR* (tissue)", "PSNR (masked)", "SSIM", "LPIPS")
     for name in ("heldout", "train"):
         row = found[name]
-        lpips = next((value for key, value in row.items() if key.startswith("lpips")), None)
-        depth = row.get("depth_median_mm")
         table.add_row(
             name,
             str(row["frames"]),
             _number(row.get("psnr"), "dB"),
             _number(row.get("paper_psnr"), "dB"),
             _number(row.get("ssim")),
-            _number(lpips),
-            _number(depth, "mm"),
+            _number(row.get("lpips")),
         )
     for name, row in found["published"].items():
         table.add_row(
@@ -138,9 +140,12 @@ def figures_table(found: dict[str, Any]) -> Table:
             _number(row["paper_psnr"], "dB"),
             _number(row["ssim"]),
             _number(row["lpips"]),
-            "–",
         )
-    table.caption = f"{found['gaussians']} Gaussians (at most {found['cap']}), {found['seconds']:.0f} s"
+    depth = found["depth"]
+    depths = f", depth {depth['median_mm']:.2f} mm off (median, {depth['frames']} frames)" if depth else ""
+    table.caption = (
+        f"{found['gaussians']} Gaussians (at most {found['cap']}), {found['seconds']:.0f} s{depths}"
+    )
     return table
 
 

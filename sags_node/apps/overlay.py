@@ -19,6 +19,7 @@ from sags_node.apps import overlay_draw
 from sags_node.apps.overlay_pin import RENEW_BELOW, Ids, Pin, pin_pixel, surface_normal
 from sags_node.errors import SagsError, UsageError
 from sags_node.geometry import invert, quat_to_matrix, transform
+from sags_node.messaging.address import ClientKeys
 from sags_node.messaging.received import (
     Received,
     ReceivedCameraInfo,
@@ -128,12 +129,14 @@ def run_overlay(
     seconds: float | None = None,
     save: Path | None = None,
     run_dir: Path | None = None,
+    keys: ClientKeys | None = None,
 ) -> dict[str, Any]:
     """Draw over the left picture of a running node until `seconds` have passed or Ctrl-C.
 
     Args:
         pin: pixel (u, v) of the tissue to pin to; default: the middle of the tissue.
         save: .mp4 for every picture shown, .png for the last one with the overlay.
+        keys: for a node that wants them.
 
     Returns:
         frames, overlay (frames with it), blanked (reason -> frames), latency_ms (capture to drawn), pin
@@ -152,7 +155,7 @@ def run_overlay(
     latencies_ms: list[float] = []
     began = time.monotonic()
     last: Received | None = None
-    with Subscriber([PICTURE, *NEEDED], endpoint, ns, run_dir) as subscriber:
+    with Subscriber([PICTURE, *NEEDED], endpoint, ns, run_dir, keys=keys) as subscriber:
         try:
             while seconds is None or time.monotonic() < began + seconds:
                 received = subscriber.wait(PICTURE, WAIT_FOR_FRAME, after=last)
@@ -173,9 +176,8 @@ def run_overlay(
         finally:
             output.close()
         if not latencies_ms:
-            raise SagsError(
-                f"no picture came from {subscriber.endpoint}; is the node running and not waiting?"
-            )
+            silence = f"no picture came from {subscriber.endpoint}; is the node running and not waiting?"
+            raise SagsError(subscriber.refusal or silence)
         lost = sum(subscriber.lost(name) for name in (PICTURE, *NEEDED))
     return {
         "frames": len(latencies_ms),

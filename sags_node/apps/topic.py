@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from sags_node.errors import SagsError
 from sags_node.messaging import topics, wire
+from sags_node.messaging.address import ClientKeys, find_data
 from sags_node.messaging.received import (
     Received,
     ReceivedCameraInfo,
@@ -26,7 +27,7 @@ from sags_node.messaging.received import (
     ReceivedText,
     interpret,
 )
-from sags_node.messaging.stream import data_endpoint, listen
+from sags_node.messaging.stream import listen
 
 Record = dict[str, Any]
 
@@ -40,7 +41,9 @@ class _Sample:
     size: int  # bytes
 
 
-def topic_list(endpoint: str | None = None, ns: str = "sags", seconds: float = 3.0) -> list[Record]:
+def topic_list(
+    endpoint: str | None = None, ns: str = "sags", seconds: float = 3.0, keys: ClientKeys | None = None
+) -> list[Record]:
     """Every topic of the contract with what was heard of it in `seconds`.
 
     `messages` and `mean_bytes` are 0 where nothing came; `rate_hz` is None where too little came to tell.
@@ -48,9 +51,9 @@ def topic_list(endpoint: str | None = None, ns: str = "sags", seconds: float = 3
     Raises:
         SagsError: no node is known, or nothing at all came.
     """
-    heard = _heard([], endpoint, ns, seconds)
+    heard = _heard([], endpoint, ns, seconds, keys)
     if not heard:
-        raise _silence("*", endpoint, ns, seconds)
+        raise _silence("*", endpoint, ns, seconds, keys)
     rows = []
     for topic in topics.TOPICS:
         full = topics.full_name(ns, topic.name)
@@ -69,6 +72,7 @@ def topic_echo(
     ns: str = "sags",
     seconds: float | None = None,
     count: int | None = None,
+    keys: ClientKeys | None = None,
 ) -> Iterator[Record]:
     """Each message of a topic: who, when, and its content (arrays as their range).
 
@@ -78,10 +82,10 @@ def topic_echo(
     """
     shown = 0
     began = time.monotonic()
-    for arrived in listen([topic], endpoint, ns, seconds):
+    for arrived in listen([topic], endpoint, ns, seconds, keys=keys):
         if arrived is None:
             if not shown and time.monotonic() - began > PATIENCE:
-                raise _silence(topic, endpoint, ns, PATIENCE)
+                raise _silence(topic, endpoint, ns, PATIENCE, keys)
             continue
         message, arrival_ns = arrived
         yield _echo(interpret(message, arrival_ns))
@@ -89,17 +93,23 @@ def topic_echo(
         if shown == count:
             return
     if not shown and seconds is not None:
-        raise _silence(topic, endpoint, ns, seconds)
+        raise _silence(topic, endpoint, ns, seconds, keys)
 
 
-def topic_hz(topic: str, endpoint: str | None = None, ns: str = "sags", seconds: float = 5.0) -> Record:
+def topic_hz(
+    topic: str,
+    endpoint: str | None = None,
+    ns: str = "sags",
+    seconds: float = 5.0,
+    keys: ClientKeys | None = None,
+) -> Record:
     """Average rate over `seconds`, and the shortest, longest and standard deviation of the intervals.
 
     Raises:
         UsageError: there is no such topic.
         SagsError: no node is known, or fewer than two messages came.
     """
-    samples = _listen_to(topic, endpoint, ns, seconds)
+    samples = _listen_to(topic, endpoint, ns, seconds, keys)
     steps = np.diff([sample.arrival_ns for sample in samples]) * 1e-9
     return {
         "average_rate": float(1 / steps.mean()),
@@ -110,14 +120,20 @@ def topic_hz(topic: str, endpoint: str | None = None, ns: str = "sags", seconds:
     }
 
 
-def topic_bw(topic: str, endpoint: str | None = None, ns: str = "sags", seconds: float = 5.0) -> Record:
+def topic_bw(
+    topic: str,
+    endpoint: str | None = None,
+    ns: str = "sags",
+    seconds: float = 5.0,
+    keys: ClientKeys | None = None,
+) -> Record:
     """Bytes per second over `seconds`, and the mean, smallest and largest message.
 
     Raises:
         UsageError: there is no such topic.
         SagsError: no node is known, or fewer than two messages came.
     """
-    samples = _listen_to(topic, endpoint, ns, seconds)
+    samples = _listen_to(topic, endpoint, ns, seconds, keys)
     sizes = np.array([sample.size for sample in samples])
     span = (samples[-1].arrival_ns - samples[0].arrival_ns) * 1e-9
     return {
@@ -129,14 +145,20 @@ def topic_bw(topic: str, endpoint: str | None = None, ns: str = "sags", seconds:
     }
 
 
-def topic_delay(topic: str, endpoint: str | None = None, ns: str = "sags", seconds: float = 5.0) -> Record:
+def topic_delay(
+    topic: str,
+    endpoint: str | None = None,
+    ns: str = "sags",
+    seconds: float = 5.0,
+    keys: ClientKeys | None = None,
+) -> Record:
     """How long after their frame's capture the messages of `seconds` arrived.
 
     Raises:
         UsageError: there is no such topic.
         SagsError: no node is known, or fewer than two messages came.
     """
-    samples = _listen_to(topic, endpoint, ns, seconds)
+    samples = _listen_to(topic, endpoint, ns, seconds, keys)
     delays = np.array([sample.arrival_ns - sample.stamp_ns for sample in samples]) * 1e-9
     return {
         "average_delay_s": float(delays.mean()),
@@ -147,11 +169,13 @@ def topic_delay(topic: str, endpoint: str | None = None, ns: str = "sags", secon
     }
 
 
-def _listen_to(topic: str, endpoint: str | None, ns: str, seconds: float) -> list[_Sample]:
+def _listen_to(
+    topic: str, endpoint: str | None, ns: str, seconds: float, keys: ClientKeys | None
+) -> list[_Sample]:
     """At least two messages of one topic."""
-    heard = _heard([topic], endpoint, ns, seconds)
+    heard = _heard([topic], endpoint, ns, seconds, keys)
     if not heard:
-        raise _silence(topic, endpoint, ns, seconds)
+        raise _silence(topic, endpoint, ns, seconds, keys)
     ((full, samples),) = heard.items()
     fresh = _without_resent(full.removeprefix(f"{ns}/"), samples)
     if len(fresh) < 2:
@@ -161,10 +185,12 @@ def _listen_to(topic: str, endpoint: str | None, ns: str, seconds: float) -> lis
     return fresh
 
 
-def _heard(names: Sequence[str], endpoint: str | None, ns: str, seconds: float) -> dict[str, list[_Sample]]:
+def _heard(
+    names: Sequence[str], endpoint: str | None, ns: str, seconds: float, keys: ClientKeys | None
+) -> dict[str, list[_Sample]]:
     """What came on some topics, each message once: a last value may be sent again for another peer."""
     heard: dict[str, dict[tuple[str, int], _Sample]] = defaultdict(dict)
-    for arrived in listen(names, endpoint, ns, seconds):
+    for arrived in listen(names, endpoint, ns, seconds, keys=keys):
         if arrived is not None:
             message, arrival_ns = arrived
             key = (message.meta.session, message.meta.seq)
@@ -182,12 +208,13 @@ def _size(message: wire.Message) -> int:
     return sum(memoryview(part).nbytes for part in message.parts)
 
 
-def _silence(topic: str, endpoint: str | None, ns: str, seconds: float) -> SagsError:
+def _silence(topic: str, endpoint: str | None, ns: str, seconds: float, keys: ClientKeys | None) -> SagsError:
     full = topics.full_name(ns, topic.lstrip("/").removeprefix(f"{ns}/"))
     hint = "is the node running and not waiting?"
     if "/right/" in full:
         hint += " The right eye needs publish.right:=true"
-    return SagsError(f"no messages on {full} from {data_endpoint(endpoint, ns)} in {seconds:g} s; {hint}")
+    where = find_data(endpoint, ns, keys=keys).endpoint
+    return SagsError(f"no messages on {full} from {where} in {seconds:g} s; {hint}")
 
 
 def _echo(received: Received) -> Record:

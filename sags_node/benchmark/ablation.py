@@ -18,7 +18,7 @@ from sags_node.evaluation.lpips import Lpips
 from sags_node.evaluation.machine import machine_name
 from sags_node.fitting.clip import Clip, read_clip
 from sags_node.fitting.fit import Fit
-from sags_node.fitting.score import score, score_tracks
+from sags_node.fitting.score import score, score_depth, score_tracks
 from sags_node.fitting.settings import FitSettings
 from sags_node.session import Session
 
@@ -90,6 +90,7 @@ def measure_ablation(
         variants[name] = {
             "heldout": score(fit, known.test, session.config.segments, lpips),
             "ahead": score(fit, ahead, {}, lpips),
+            "depth": score_depth(fit, everything[:-AHEAD], session.config.segments),
             "track": score_tracks(fit, everything[:-AHEAD]),
             "track_with_ahead": score_tracks(fit, [everything[0], *ahead]),
             "gaussians": len(fit.model),
@@ -97,7 +98,7 @@ def measure_ablation(
             "seconds": round(fit.seconds, 1),
         }
     return {
-        "session": session.config.source.kind,
+        "session": session.name,
         "warm_up": warm_up,
         "iterations": iterations,
         "settings": {name: asdict(chosen) for name, chosen in VARIANTS.items()},
@@ -111,11 +112,10 @@ def table(measured: dict[str, Any]) -> Table:
     headings = ("", "PSNR* held-out", "SSIM", "LPIPS", "depth mm", "ahead", "track mm", "N", "ms/it")
     made = Table(*headings, box=None, padding=(0, 3, 0, 0), pad_edge=False)
     for name, row in measured["variants"].items():
-        heldout, track = row["heldout"], row["track"] or {}
-        lpips = next((value for key, value in heldout.items() if key.startswith("lpips")), None)
+        heldout, depth, track = row["heldout"], row["depth"] or {}, row["track"] or {}
         figures = (
-            heldout["psnr"], heldout["ssim"], lpips, heldout.get("depth_median_mm"), row["ahead"]["psnr"],
-            track.get("median_mm"), row["gaussians"], row["ms_per_iteration"],
+            heldout["psnr"], heldout["ssim"], heldout.get("lpips"), depth.get("median_mm"),
+            row["ahead"]["psnr"], track.get("median_mm"), row["gaussians"], row["ms_per_iteration"],
         )  # fmt: skip
         made.add_row(name, *("–" if value is None else f"{value:.4g}" for value in figures))
     return made

@@ -80,11 +80,10 @@ def evaluate(
             run_realtime(session, options, spool, progress)
         else:
             run_step(session, options, spool, progress)
-        return measure(_name(launch), session, spool, options, overrides, progress)
+        return measure(session, spool, options, overrides, progress)
 
 
 def measure(
-    name: str,
     session: Session,
     spool: Spool,
     options: Options,
@@ -101,7 +100,7 @@ def measure(
     config = session.config
     measurer = _measured(session, spool, options, progress)
     summary = summarise(
-        name,
+        session.name,
         measurer.rows,
         options,
         config.segments,
@@ -211,10 +210,3 @@ def _check_segments(config: LaunchConfig) -> None:
     for name in config.segments:
         if name in figures:
             raise UsageError(f"segments.{name}: a segment cannot be named like a figure; rename it")
-
-
-def _name(launch: Path | str | None) -> str:
-    if launch is None:
-        return "phantom"
-    path = Path(launch)
-    return path.name if path.is_dir() else path.stem

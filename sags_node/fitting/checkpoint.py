@@ -14,7 +14,7 @@ import numpy as np
 from sags_node.errors import SagsError, UsageError
 from sags_node.fitting.fit import Fit
 
-VERSION = 1
+VERSION = 2
 
 
 def save(fit: Fit, path: Path) -> None:
@@ -52,9 +52,12 @@ def load(fit: Fit, path: Path) -> None:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         about = json.loads(str(arrays.pop("about")))
-        settings, frames, progress = about["settings"], about["frames"], about["progress"]
+        version, settings = about["version"], about["settings"]
+        frames, progress = about["frames"], about["progress"]
     except (OSError, ValueError, KeyError, BadZipFile) as error:
         raise SagsError(f"cannot resume from {path}: {error}; start without --resume") from None
+    if version != VERSION:
+        raise UsageError(f"{path} was made by another version of this software; start without --resume")
     mine = json.loads(json.dumps(asdict(fit.settings)))
     others = [key for key in mine if settings.get(key) != mine[key]]
     if others:

@@ -13,7 +13,7 @@ import numpy as np
 from sags_node.engine.rasterize import to_view
 from sags_node.errors import SagsError
 from sags_node.evaluation import metrics
-from sags_node.evaluation.lpips import BACKBONE, Lpips
+from sags_node.evaluation.lpips import Lpips
 from sags_node.evaluation.tracking import PointTracks
 from sags_node.fitting.clip import ClipFrame
 from sags_node.fitting.fit import Fit
@@ -49,7 +49,8 @@ def score(
         progress: called with the frames done.
 
     Returns:
-        Means over frames by figure, those of each segment below its name, and `frames`, their number.
+        Means over frames: `psnr` over tissue and `paper_psnr`, dB; `ssim` and `lpips`; the same for each
+        segment below its name; and `frames`, their number.
 
     Raises:
         SagsError: a picture cannot be written.
@@ -66,22 +67,28 @@ def score(
             "ssim": metrics.ssim(view.rgb, truth, frame.tissue),
         }
         if lpips is not None:
-            figures[BACKBONE] = lpips(view.rgb, truth, frame.tissue)
-        if frame.reference is not None and frame.reference.depth is not None:
-            height, width = frame.tissue.shape
-            reference = metrics.resample_nearest(frame.reference.depth, width, height)
-            errors = asdict(metrics.depth_errors(view.depth, reference, frame.tissue))
-            figures |= {f"depth_{name}": value for name, value in errors.items()}
+            figures["lpips"] = lpips(view.rgb, truth, frame.tissue)
         rows.append(figures)
         if pictures is not None:
             _write(pictures / f"{frame.frame_id:06d}.png", view.rgb)
         progress(done + 1)
-    found: dict[str, Any] = _means(rows)
-    for name, (first, last) in segments.items():
-        inside = [row for row in rows if first <= row["frame_id"] <= last]
-        if inside:
-            found[name] = _means(inside)
-    return found
+    return _summary(rows, segments)
+
+
+def score_depth(fit: Fit, frames: Iterable[ClipFrame], segments: Segments) -> dict[str, Any] | None:
+    """Depth of the model against the session's reference, `metrics.DepthErrors`, means over those frames
+    that have one and `frames`, their number; the same for each segment. None without a reference."""
+    rows = []
+    for frame in frames:
+        if frame.reference is None or frame.reference.depth is None:
+            continue
+        planes = fit.rasterizer.forward(fit.gaussians(frame), [frame.camera])[0]
+        depth = to_view(planes, frame.camera, frame.frame_id, frame.t_capture_ns).depth
+        height, width = frame.tissue.shape
+        reference = metrics.resample_nearest(frame.reference.depth, width, height)
+        errors = asdict(metrics.depth_errors(depth, reference, frame.tissue))
+        rows.append({"frame_id": frame.frame_id, **errors})
+    return _summary(rows, segments) if rows else None
 
 
 def score_tracks(fit: Fit, frames: Iterable[ClipFrame]) -> dict[str, Any] | None:
@@ -118,6 +125,15 @@ def score_tracks(fit: Fit, frames: Iterable[ClipFrame]) -> dict[str, Any] | None
         "median_px": round(float(np.median(px)), 4),
         "lost": lost,
     }
+
+
+def _summary(rows: list[dict[str, float]], segments: Segments) -> dict[str, Any]:
+    found: dict[str, Any] = _means(rows)
+    for name, (first, last) in segments.items():
+        inside = [row for row in rows if first <= row["frame_id"] <= last]
+        if inside:
+            found[name] = _means(inside)
+    return found
 
 
 def _means(rows: list[dict[str, float]]) -> dict[str, Any]:

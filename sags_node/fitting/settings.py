@@ -12,6 +12,10 @@ Tokens = Literal["self", "planes", "nodes"]
 Schedule = Literal["paper", "online"]
 
 
+STEREO = LossWeights(coverage=0.1)
+MONOCULAR = LossWeights(inverse_depth=0.0, correlation=1e-3, coverage=0.1)  # depth up to scale and shift
+
+
 @dataclass(frozen=True, slots=True)
 class FitSettings:
     """Defaults are the paper's where it says (arXiv 2510.27318), the released code's where it does not."""
@@ -31,4 +35,4 @@ class FitSettings:
     mean_px: float = 0.08  # learning rate of canonical means, in px at the tissue's median depth
     decay: float = 0.01  # learning rates fall to this share of their first values
     field_rates: FieldRates = field(default_factory=FieldRates)
-    weights: LossWeights = field(default_factory=lambda: LossWeights(coverage=0.1))
+    weights: LossWeights = STEREO  # only with schedule = paper

@@ -23,7 +23,7 @@ from sags_node.model import columns
 from sags_node.model.activation import deactivate
 from sags_node.model.exposure import Exposure
 from sags_node.model.field import Field
-from sags_node.model.residuals import Residuals
+from sags_node.model.residuals import Residuals, check_size
 from sags_node.types import F32, I64, Bool, Gaussians
 
 POOLED_SHARE = 0.01  # of a frame's pixels
@@ -102,10 +102,11 @@ def follow_online(
         Canonical rows [N, 14], placed as the tissue lay in the first frame, and the paths, without exposure.
 
     Raises:
-        SagsError: no frame had depth enough to start a model.
+        SagsError: no frame had depth enough to start a model, or the clip is too long for its memory.
     """
-    mapper, budget = Mapper(rasterizer, settings.max_gaussians), StepBudget(ONLINE_STEPS)
     slots = {*range(0, len(clip.train), FRAMES_PER_SLOT), len(clip.train) - 1}
+    check_size(len(slots), settings.max_gaussians)
+    mapper, budget = Mapper(rasterizer, settings.max_gaussians), StepBudget(ONLINE_STEPS)
     seen: list[tuple[I64, F32]] = []
     first = _Places()
     for done, frame in enumerate(clip.train):
@@ -119,16 +120,19 @@ def follow_online(
         if done in slots:
             rows = deactivate(gaussians)
             rows[:, columns.COLOR] /= exposure.at(frame.t_capture_ns)
-            seen.append((gaussians.ids, rows))
+            seen.append((gaussians.ids.copy(), rows))  # the mapper goes on writing into its own
         progress("following the tissue", done + 1, len(clip.train))
-    ids = np.unique(np.concatenate([ids for ids, _ in seen]))
+    ids, lives = np.unique(np.concatenate([ids for ids, _ in seen]), return_counts=True)
+    if len(ids) > settings.max_gaussians:  # after a cut in the recording
+        ids = np.sort(ids[np.argsort(-lives, kind="stable")[: settings.max_gaussians]])
     if len(ids) == 0:
         raise SagsError("no training frame had depth enough to start a model; check vision.stereo")
     states = np.zeros((len(seen), len(ids), columns.COUNT), np.float32)
     known = np.zeros(states.shape[:2], np.bool_)
     for slot, (those, rows) in enumerate(seen):
-        at = np.searchsorted(ids, those)
-        states[slot, at], known[slot, at] = rows, True
+        kept = np.isin(those, ids)
+        at = np.searchsorted(ids, those[kept])
+        states[slot, at], known[slot, at] = rows[kept], True
     rows = (states * (known[..., None] / known.sum(0)[None, :, None]).astype(np.float32)).sum(0)
     rows[:, columns.MEAN] = first.of(ids)
     return rows, Paths(np.array([clip.train[slot].t_capture_ns for slot in sorted(slots)]), states, known)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numba import prange
 
-from sags_node.engine.jit import kernel, parallel_kernel
+from sags_node.engine.jit import inlined, kernel, parallel_kernel
 from sags_node.engine.pinhole import pack, to_camera, to_pixel
 from sags_node.mapping.initialise import nearest_depth
 from sags_node.model.gaussians import GaussianModel
@@ -24,6 +24,7 @@ FRONT_FRAMES = 3  # in a row, since stereo is wrong now and then
 MIN_OPACITY = 0.03
 CROWDED = 0.9  # share of the cap above which what does not show is given up
 IDLE = 0.1  # px of coverage: less does not show
+PIECE = 1024  # rows a thread takes at a time: a call for each row would count references to every array
 LARGEST = 1e6  # metres, colours, quaternions: no honest value comes near
 
 
@@ -102,38 +103,47 @@ def _inspect(
     means: F32, quats: F32, scales: F32, opacities: F32, colors: F32, contribution: F32,
     cam: F32, tissue: Bool, depth: F32, crowded: bool, in_front: I32, remove: Bool,
 ) -> None:  # fmt: skip
-    for i in prange(len(means)):
-        if _is_sound(means[i], quats[i], scales[i], opacities[i], colors[i]):
-            idle = contribution[i] < IDLE
-            remove[i] = _is_doomed(means[i], cam, tissue, depth, crowded, idle, in_front, i)
-        else:
-            remove[i] = True
+    for piece in prange(-(-len(means) // PIECE)):
+        first = np.int64(piece) * PIECE
+        _inspect_rows(
+            means, quats, scales, opacities, colors, contribution, cam, tissue, depth, crowded,
+            in_front, remove, first, min(first + PIECE, len(means)),
+        )  # fmt: skip
 
 
 @kernel
-def _is_sound(mean: F32, quat: F32, scale: F32, opacity: Any, color: F32) -> bool:
-    """Finite, and something to draw."""
-    size = abs(quat[0]) + abs(quat[1]) + abs(quat[2]) + abs(quat[3])
-    for k in range(3):
-        size += abs(mean[k]) + abs(color[k]) + abs(scale[k])
-    return bool(size < LARGEST and min(scale[0], scale[1], scale[2]) > 0 and MIN_OPACITY <= opacity <= 1)
-
-
-@kernel
-def _is_doomed(
-    mean: F32, cam: F32, tissue: Bool, depth: F32, crowded: bool, idle: bool, in_front: I32, i: int
-) -> bool:
+def _inspect_rows(
+    means: F32, quats: F32, scales: F32, opacities: F32, colors: F32, contribution: F32,
+    cam: F32, tissue: Bool, depth: F32, crowded: bool, in_front: I32, remove: Bool, first: Any, end: Any,
+) -> None:  # fmt: skip
     height, width = tissue.shape
-    x, y, z = to_camera(cam, mean[0], mean[1], mean[2])
-    if not z > 0:
-        return crowded
-    u, v = to_pixel(cam, x, y, z)
-    if not (u > -0.5 and v > -0.5 and u < width - 0.5 and v < height - 0.5):
-        return crowded
-    px, py = int(u + 0.5), int(v + 0.5)
-    measured = depth[py, px]
-    on_surface = False
-    if tissue[py, px] and measured > 0:
-        on_surface = abs(measured - z) < FRONT_TOLERANCE * measured
-        in_front[i] = in_front[i] + 1 if measured - z > FRONT_TOLERANCE * measured else 0
-    return bool(in_front[i] >= FRONT_FRAMES or (crowded and idle and on_surface))
+    for i in range(first, end):
+        if not _is_sound(means, quats, scales, opacities, colors, i):
+            remove[i] = True
+            continue
+        x, y, z = to_camera(cam, means[i, 0], means[i, 1], means[i, 2])
+        if not z > 0:
+            remove[i] = crowded
+            continue
+        u, v = to_pixel(cam, x, y, z)
+        if not (u > -0.5 and v > -0.5 and u < width - 0.5 and v < height - 0.5):
+            remove[i] = crowded
+            continue
+        px, py = int(u + 0.5), int(v + 0.5)
+        measured = depth[py, px]
+        on_surface = False
+        if tissue[py, px] and measured > 0:
+            on_surface = abs(measured - z) < FRONT_TOLERANCE * measured
+            in_front[i] = in_front[i] + 1 if measured - z > FRONT_TOLERANCE * measured else 0
+        idle = contribution[i] < IDLE
+        remove[i] = in_front[i] >= FRONT_FRAMES or (crowded and idle and on_surface)
+
+
+@inlined
+def _is_sound(means: F32, quats: F32, scales: F32, opacities: F32, colors: F32, i: int) -> bool:
+    """Finite, and something to draw."""
+    size = abs(quats[i, 0]) + abs(quats[i, 1]) + abs(quats[i, 2]) + abs(quats[i, 3])
+    for k in range(3):
+        size += abs(means[i, k]) + abs(colors[i, k]) + abs(scales[i, k])
+    least = min(scales[i, 0], scales[i, 1], scales[i, 2])
+    return bool(size < LARGEST and least > 0 and MIN_OPACITY <= opacities[i] <= 1)

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numba import prange
 
-from sags_node.engine.jit import kernel, parallel_kernel
+from sags_node.engine.jit import inlined, kernel, parallel_kernel
 from sags_node.engine.pinhole import pack, to_camera, to_pixel
 from sags_node.types import F32, U8, Bool, Observation, RenderedView
 
@@ -16,6 +16,7 @@ DEPTH_GATE = 0.13  # of the depth: a larger innovation is another surface, not t
 BEHIND_TOLERANCE = 0.035  # of the depth: a Gaussian this far behind the drawn surface is hidden by it
 SEEN_ALPHA = 0.3
 FLOW_MARGIN = 20 / 640  # of the width: flow smears an instrument's motion that far into the tissue
+PIECE = 1024  # rows a thread takes at a time: a call for each row would count references to every array
 DEPTH_PULL = 0.4  # share of the depth innovation taken per frame; measured best 0.3-0.5
 
 
@@ -64,51 +65,54 @@ def _advect(
     means: F32, cam0: F32, drawn_depth: F32, alpha: F32, tissue0: Bool, flow: F32,
     cam1: F32, tissue1: Bool, depth1: F32, displacements: F32, seen: F32,
 ) -> None:  # fmt: skip
-    for i in prange(len(means)):
-        seen[i] = _advect_one(
-            means[i], cam0, drawn_depth, alpha, tissue0, flow, cam1, tissue1, depth1, displacements[i]
-        )
+    for piece in prange(-(-len(means) // PIECE)):
+        first = np.int64(piece) * PIECE
+        _advect_rows(
+            means, cam0, drawn_depth, alpha, tissue0, flow, cam1, tissue1, depth1, displacements, seen,
+            first, min(first + PIECE, len(means)),
+        )  # fmt: skip
 
 
 @kernel
-def _advect_one(
-    mean: F32, cam0: F32, drawn_depth: F32, alpha: F32, tissue0: Bool, flow: F32,
-    cam1: F32, tissue1: Bool, depth1: F32, displacement: F32,
-) -> float:  # fmt: skip
-    """Writes the displacement; 1 if it was observed, else 0."""
+def _advect_rows(
+    means: F32, cam0: F32, drawn_depth: F32, alpha: F32, tissue0: Bool, flow: F32,
+    cam1: F32, tissue1: Bool, depth1: F32, displacements: F32, seen: F32, first: Any, end: Any,
+) -> None:  # fmt: skip
+    """Writes the displacement and 1 where it was observed; leaves the others as they are."""
     height, width = alpha.shape
-    x, y, z = to_camera(cam0, mean[0], mean[1], mean[2])
-    if not z > 1e-3:
-        return 0.0
-    u, v = to_pixel(cam0, x, y, z)
-    if not (u >= 0 and v >= 0 and u <= width - 1 and v <= height - 1):
-        return 0.0
-    px, py = int(u + 0.5), int(v + 0.5)
-    if not tissue0[py, px] or alpha[py, px] < SEEN_ALPHA:
-        return 0.0
-    if drawn_depth[py, px] > 0 and z - drawn_depth[py, px] > BEHIND_TOLERANCE * z:
-        return 0.0
-    du, dv = _bilinear(flow, u, v, 0), _bilinear(flow, u, v, 1)
-    u += du
-    v += dv
-    _, _, z1 = to_camera(cam1, mean[0], mean[1], mean[2])
-    if u >= 0 and v >= 0 and u <= width - 1 and v <= height - 1:
+    for i in range(first, end):
+        x, y, z = to_camera(cam0, means[i, 0], means[i, 1], means[i, 2])
+        if not z > 1e-3:
+            continue
+        u, v = to_pixel(cam0, x, y, z)
+        if not (u >= 0 and v >= 0 and u <= width - 1 and v <= height - 1):
+            continue
         px, py = int(u + 0.5), int(v + 0.5)
-        if not tissue1[py, px]:
-            return 0.0  # flow into an instrument is the instrument's motion
-        measured = depth1[py, px]
-        if measured > 0 and abs(measured - z1) < DEPTH_GATE * z1:
-            z1 += np.float32(DEPTH_PULL) * (measured - z1)
-    # From pixel and depth to the world: the transposed rotation.
-    x1 = (u - cam1[14]) * z1 / cam1[12] - cam1[3]
-    y1 = (v - cam1[15]) * z1 / cam1[13] - cam1[7]
-    z1 -= cam1[11]
-    for k in range(3):
-        displacement[k] = cam1[k] * x1 + cam1[4 + k] * y1 + cam1[8 + k] * z1 - mean[k]
-    return 1.0
+        if not tissue0[py, px] or alpha[py, px] < SEEN_ALPHA:
+            continue
+        if drawn_depth[py, px] > 0 and z - drawn_depth[py, px] > BEHIND_TOLERANCE * z:
+            continue
+        du, dv = _bilinear(flow, u, v, 0), _bilinear(flow, u, v, 1)
+        u += du
+        v += dv
+        _, _, z1 = to_camera(cam1, means[i, 0], means[i, 1], means[i, 2])
+        if u >= 0 and v >= 0 and u <= width - 1 and v <= height - 1:
+            px, py = int(u + 0.5), int(v + 0.5)
+            if not tissue1[py, px]:
+                continue  # flow into an instrument is the instrument's motion
+            measured = depth1[py, px]
+            if measured > 0 and abs(measured - z1) < DEPTH_GATE * z1:
+                z1 += np.float32(DEPTH_PULL) * (measured - z1)
+        # From pixel and depth to the world: the transposed rotation.
+        x1 = (u - cam1[14]) * z1 / cam1[12] - cam1[3]
+        y1 = (v - cam1[15]) * z1 / cam1[13] - cam1[7]
+        z1 -= cam1[11]
+        for k in range(3):
+            displacements[i, k] = cam1[k] * x1 + cam1[4 + k] * y1 + cam1[8 + k] * z1 - means[i, k]
+        seen[i] = 1
 
 
-@kernel
+@inlined
 def _bilinear(flow: F32, u: Any, v: Any, channel: int) -> Any:
     """Flow at a pixel inside the picture."""
     height, width, _ = flow.shape

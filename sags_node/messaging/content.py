@@ -138,6 +138,11 @@ def diagnostics(health: NodeHealth, stamp_ns: int) -> Content:
         "rss_mb": f"{health.rss_mb:.0f}",
         **{f"latency_{name}_ms": f"{ms:.1f}" for name, ms in health.latency_ms.items()},
         **{f"dropped_{slot}": str(count) for slot, count in health.dropped.items()},
+        **{
+            f"{socket}_connections_{what}": str(count)
+            for socket, counts in health.connections.items()
+            for what, count in counts.items()
+        },
     }
     statuses = [Status("node", level, health.last_error or health.state, values)]
     running = health.state in ("running", "degraded")

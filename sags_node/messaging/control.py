@@ -14,10 +14,13 @@ import msgspec
 import zmq
 
 from sags_node.errors import SagsError
-from sags_node.messaging.rundir import read_connection
+from sags_node.messaging.address import ClientKeys, connect, find_control
+from sags_node.messaging.sockets import receive_frames
 from sags_node.messaging.wire import PROTOCOL
 
 MAX_REQUEST_BYTES = 65536  # per part
+MAX_UNANSWERED_BYTES = 4 << 20  # one peer may have sent; more than its high-water mark can hold
+MAX_REPLY_BYTES = 1 << 20
 MAX_REQUEST_PARTS = 4  # identity, the empty delimiter of REQ, the request
 MAX_REQUESTS_AT_ONCE = 32  # so that a flood cannot keep the publishing thread from its frames
 MAX_PENDING = 64
@@ -25,6 +28,7 @@ RECEIVE_HIGH_WATER = 8  # requests one peer may have waiting
 SEND_HIGH_WATER = 2 * MAX_REQUESTS_AT_ONCE  # answers, before a peer that does not read loses some
 
 Handler = Callable[[dict[str, Any]], Any]
+Took = Callable[[int, int], None]
 Identifier = int | Annotated[str, msgspec.Meta(max_length=128)] | None
 
 log = logging.getLogger(__name__)
@@ -54,11 +58,17 @@ class ControlServer:
 
     A handler gets `args` and returns the result, or a `Future` of it when another thread must do the work.
     A `SagsError` it raises is the answer; anything else is answered as an internal error and logged.
+
+    Args:
+        took: told the file descriptor of a peer and the bytes of each request read from it.
     """
 
-    def __init__(self, socket: zmq.Socket[bytes], handlers: Mapping[str, Handler]) -> None:
+    def __init__(
+        self, socket: zmq.Socket[bytes], handlers: Mapping[str, Handler], took: Took = lambda *_: None
+    ) -> None:
         self._socket = socket
         self._handlers = handlers
+        self._took = took
         self._pending: list[tuple[list[bytes], Identifier, Future[Any]]] = []
         self._request = msgspec.msgpack.Decoder(Request)
 
@@ -71,9 +81,11 @@ class ControlServer:
         """Answer what has arrived and what has been finished, without waiting."""
         for _ in range(MAX_REQUESTS_AT_ONCE):
             try:
-                parts = receive_parts(self._socket, MAX_REQUEST_PARTS)
+                frames = receive_frames(self._socket, MAX_REQUEST_PARTS)
             except zmq.Again:
                 break
+            parts = [frame.bytes for frame in frames]
+            self._took(int(frames[-1].get(zmq.SRCFD)), sum(map(len, parts)))
             if len(parts) in (2, 3):
                 self._handle(parts[:-1], parts[-1])
         finished = [entry for entry in self._pending if entry[2].done()]
@@ -121,51 +133,46 @@ class ControlServer:
             log.debug("a reply was not sent: %s", error)
 
 
-def receive_parts(socket: zmq.Socket[bytes], limit: int) -> list[bytes]:
-    """The next message, without waiting; parts beyond `limit` + 1 are read and thrown away.
-
-    Raises:
-        zmq.Again: nothing has arrived.
-    """
-    parts = [socket.recv(zmq.NOBLOCK)]
-    while socket.getsockopt(zmq.RCVMORE):
-        part = socket.recv(zmq.NOBLOCK)
-        if len(parts) <= limit:
-            parts.append(part)
-    return parts
-
-
 class ControlClient:
     """Asks the node; one request at a time, from one thread.
 
     Args:
         endpoint: of the ROUTER socket; default: from the connection file of `ns`.
+        keys: for a node that wants them.
 
     Raises:
-        SagsError: no endpoint is known.
+        SagsError: no endpoint is known, or it is malformed.
+        UsageError: the node wants keys that are not given, or the other way round.
     """
 
-    def __init__(self, endpoint: str | None = None, ns: str = "sags", run_dir: Path | None = None) -> None:
-        if endpoint is None:
-            endpoint = read_connection(ns, run_dir).control
-        if endpoint is None:
-            raise SagsError(f"the node '{ns}' has no control socket; start it with publish.control set")
-        self.endpoint = endpoint
+    def __init__(
+        self,
+        endpoint: str | None = None,
+        ns: str = "sags",
+        run_dir: Path | None = None,
+        keys: ClientKeys | None = None,
+    ) -> None:
+        address = find_control(endpoint, ns, run_dir, keys)
+        self.endpoint = address.endpoint
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.DEALER)
-        self._socket.setsockopt(zmq.LINGER, 0)
-        self._socket.connect(endpoint)
+        try:
+            self._watch = connect(self._socket, address, MAX_REPLY_BYTES)
+        except SagsError:
+            self.close()
+            raise
         self._last_id = 0
 
     def request(self, op: str, args: Mapping[str, Any] | None = None, timeout: float = 2.0) -> Any:
         """The result of an operation.
 
         Raises:
-            SagsError: the node refused (its own words) or did not answer within `timeout` seconds.
+            SagsError: the node refused (its own words), refuses this client altogether, or did not answer
+                within `timeout` seconds.
         """
         self._last_id += 1
         request = Request(PROTOCOL, self._last_id, op, dict(args or {}))
-        self._socket.send(msgspec.msgpack.encode(request))
+        self._socket.send(msgspec.msgpack.encode(request), zmq.NOBLOCK)
         deadline = time.monotonic() + timeout
         while (left := deadline - time.monotonic()) > 0:
             if not self._socket.poll(int(left * 1000) + 1):
@@ -178,7 +185,8 @@ class ControlClient:
                 if not reply.ok:
                     raise SagsError(f"{op}: {reply.error}")
                 return reply.result
-        raise SagsError(f"no answer from {self.endpoint} in {timeout:g} s; is the node running?")
+        silence = f"no answer from {self.endpoint} in {timeout:g} s; is the node running?"
+        raise SagsError(self._watch.refusal() or silence)
 
     def close(self) -> None:
         self._context.destroy(linger=0)

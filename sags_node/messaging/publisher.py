@@ -2,30 +2,32 @@
 
 from __future__ import annotations
 
-import errno
-import ipaddress
 import os
 import time
 from collections.abc import Mapping
+from contextlib import ExitStack
 from types import TracebackType
 from typing import Any, Self
 
 import zmq
 
 from sags_node.config import PublishConfig
-from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import content, control, topics
 from sags_node.messaging.cdr import Content, type_hash
+from sags_node.messaging.peers import Peers
 from sags_node.messaging.rundir import Connection, RunDirectory
+from sags_node.messaging.security import KeyPair, authenticated, check_endpoint
+from sags_node.messaging.sockets import bind, limit, receive_frames
 from sags_node.messaging.wire import PROTOCOL, Message, Meta, encode
 from sags_node.types import FrameResult, NodeHealth
 
 # Messages per slow peer, all topics together: two whole frames, so that the burst of one frame fits.
 SEND_HIGH_WATER = 2 * len(topics.TOPICS)
-MAX_SUBSCRIPTIONS_AT_ONCE = 1000
-MAX_SUBSCRIPTION_BYTES = 256
+MAX_SUBSCRIPTIONS_AT_ONCE = 200
+MAX_SUBSCRIPTION_BYTES = 512  # also the longest step of a CURVE handshake
+MAX_SUBSCRIPTIONS_BYTES = 16384  # of one peer, all together: ZeroMQ remembers them until the peer goes
+SUBSCRIPTIONS_HIGH_WATER = 64  # that one peer may have waiting
 PENDING_POLL_MS = 10  # how soon the result of a handler's future is looked for
-HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS = 2000, 6000
 LAST_WORDS_MS = 200  # longest wait at the end for what is still on its way to a peer
 
 
@@ -39,7 +41,8 @@ class Publisher:
         handlers: control op -> function of its args, see `control.ControlServer`; `ping` is always there.
 
     Raises:
-        UsageError: an endpoint that is neither loopback nor ipc, or a run directory open to others.
+        UsageError: an endpoint open to other machines without keys, a key file that cannot be used, or a run
+            directory open to others.
         SagsError: an endpoint is taken, or another node holds the same namespace.
     """
 
@@ -51,7 +54,7 @@ class Publisher:
         handlers: Mapping[str, control.Handler] | None = None,
     ) -> None:
         for endpoint in (*config.data, *([config.control] if config.control else [])):
-            check_endpoint(endpoint, config.insecure)
+            check_endpoint(endpoint, config)
         self.ns = ns
         self.session = session
         self._names = {topics.full_name(ns, t.name): t for t in topics.TOPICS if config.right or not t.right}
@@ -60,33 +63,37 @@ class Publisher:
         self._last: FrameResult | None = None
         self._dropped = 0
         self._texts: dict[str, tuple[Content, int]] = {}  # status, parameters: last content and its stamp
+        self._peers: dict[str, Peers] = {}
+        self._resources = ExitStack()
         self._run = RunDirectory(config.run_dir, ns)
         self._context = zmq.Context()
         try:
-            self._bind(config, {"ping": lambda args: "pong", **(handlers or {})})
+            keys = self._resources.enter_context(authenticated(self._context, config))
+            self._bind(config, keys, {"ping": lambda args: "pong", **(handlers or {})})
         except BaseException:
             self.close()
             raise
 
-    def _bind(self, config: PublishConfig, handlers: Mapping[str, control.Handler]) -> None:
+    def _bind(
+        self, config: PublishConfig, keys: KeyPair | None, handlers: Mapping[str, control.Handler]
+    ) -> None:
         self._data = self._context.socket(zmq.XPUB)
-        _limit(self._data, SEND_HIGH_WATER, MAX_SUBSCRIPTION_BYTES)
+        limit(self._data, SEND_HIGH_WATER, SUBSCRIPTIONS_HIGH_WATER, MAX_SUBSCRIPTION_BYTES)
+        self._poller = zmq.Poller()
+        self._watch("data", self._data, MAX_SUBSCRIPTIONS_BYTES)
         self._data.setsockopt(
             zmq.XPUB_VERBOSE, 1
         )  # each new peer's subscription is seen: the last values are due
-        endpoints = [bind(self._data, self._run.ipc_endpoint, "publish.ipc")] if config.ipc else []
-        endpoints += [bind(self._data, endpoint, "publish.data") for endpoint in config.data]
-        self._poller = zmq.Poller()
-        self._poller.register(self._data, zmq.POLLIN)
+        endpoints = [bind(self._data, self._run.ipc_endpoint, "publish.ipc", keys)] if config.ipc else []
+        endpoints += [bind(self._data, endpoint, "publish.data", keys) for endpoint in config.data]
         self._control: control.ControlServer | None = None
         control_endpoint = None
         if config.control:
             router = self._context.socket(zmq.ROUTER)
-            _limit(router, control.SEND_HIGH_WATER, control.MAX_REQUEST_BYTES)
-            router.setsockopt(zmq.RCVHWM, control.RECEIVE_HIGH_WATER)
-            control_endpoint = bind(router, config.control, "publish.control")
-            self._poller.register(router, zmq.POLLIN)
-            self._control = control.ControlServer(router, handlers)
+            limit(router, control.SEND_HIGH_WATER, control.RECEIVE_HIGH_WATER, control.MAX_REQUEST_BYTES)
+            self._watch("control", router, control.MAX_UNANSWERED_BYTES)
+            control_endpoint = bind(router, config.control, "publish.control", keys)
+            self._control = control.ControlServer(router, handlers, self._peers["control"].took)
         self.connection = Connection(
             protocol=PROTOCOL,
             ns=self.ns,
@@ -94,8 +101,18 @@ class Publisher:
             pid=os.getpid(),
             data=endpoints,
             control=control_endpoint,
+            public_key=None if keys is None else keys.public.decode(),
         )
         self._run.write_connection(self.connection)
+
+    def _watch(self, name: str, socket: zmq.Socket[bytes], max_untaken: int) -> None:
+        self._peers[name] = Peers(socket, name, max_untaken)
+        self._poller.register(socket, zmq.POLLIN)
+
+    @property
+    def connections(self) -> dict[str, dict[str, int]]:
+        """Of each socket: connections open and refused, see `Peers.counts`."""
+        return {name: peers.counts() for name, peers in self._peers.items()}
 
     # ---- out -------------------------------------------------------------------------------------------
 
@@ -187,10 +204,10 @@ class Publisher:
         resend: set[str] = set()
         for _ in range(MAX_SUBSCRIPTIONS_AT_ONCE):
             try:
-                parts = control.receive_parts(self._data, 1)
+                frames = receive_frames(self._data, 1)
             except zmq.Again:
                 break
-            self._subscription(parts[0], resend)
+            self._subscription(frames[0].bytes, resend)
         for name in sorted(resend):
             if name in self._texts:
                 text, stamp_ns = self._texts[name]
@@ -213,6 +230,9 @@ class Publisher:
 
     def close(self) -> None:
         """Close the sockets and remove the connection file."""
+        for peers in self._peers.values():
+            peers.close()
+        self._resources.close()
         self._context.destroy(linger=LAST_WORDS_MS)
         self._run.close()
 
@@ -223,52 +243,3 @@ class Publisher:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-
-def _limit(socket: zmq.Socket[bytes], send_high_water: int, max_message_bytes: int) -> None:
-    """Bound what one peer can make the socket hold."""
-    socket.setsockopt(zmq.SNDHWM, send_high_water)
-    socket.setsockopt(zmq.MAXMSGSIZE, max_message_bytes)
-    socket.setsockopt(zmq.LINGER, 0)
-    socket.setsockopt(zmq.HEARTBEAT_IVL, HEARTBEAT_MS)
-    socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, HEARTBEAT_TIMEOUT_MS)
-
-
-def check_endpoint(endpoint: str, insecure: bool) -> None:
-    """Refuse to listen where other machines can reach.
-
-    Raises:
-        UsageError: not tcp or ipc, or not loopback while `insecure` is false.
-    """
-    transport, separator, address = endpoint.partition("://")
-    if not separator or transport not in ("tcp", "ipc") or not address:
-        raise UsageError(f"'{endpoint}' is no endpoint; write tcp://127.0.0.1:PORT or ipc:///PATH")
-    if transport == "ipc" or insecure:
-        return
-    host = address.rpartition(":")[0].strip("[]")
-    try:
-        loopback = host == "localhost" or ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        loopback = False
-    if not loopback:
-        raise UsageError(
-            f"{endpoint} can be reached from other machines: that needs CURVE, which this version does not "
-            "have, or publish.insecure:=true (anybody who reaches it sees the video and controls the node)"
-        )
-
-
-def bind(socket: zmq.Socket[bytes], endpoint: str, key: str) -> str:
-    """Bind and return the endpoint as bound (a `*` port becomes its number).
-
-    Raises:
-        SagsError: the endpoint is taken or cannot be bound.
-    """
-    socket.setsockopt(zmq.IPV6, int("[" in endpoint))
-    try:
-        socket.bind(endpoint)
-    except zmq.ZMQError as error:
-        example = "'[tcp://127.0.0.1:5560]'" if key == "publish.data" else "tcp://127.0.0.1:5561"
-        hint = f"choose another, e.g. {key}:={example}"
-        reason = "already in use" if error.errno == errno.EADDRINUSE else f"cannot be bound: {error.strerror}"
-        raise SagsError(f"{endpoint} is {reason}; {hint}") from None
-    return socket.getsockopt_string(zmq.LAST_ENDPOINT)

@@ -1,7 +1,7 @@
 """The run directory: private to its owner, it holds the ipc socket, a lock and the connection file.
 
 The connection file tells a client on this machine where the node is:
-`{protocol, ns, session, pid, data: [endpoints], control: endpoint | null, public_key: null}`.
+`{protocol, ns, session, pid, data: [endpoints], control: endpoint | null, public_key: Z85 | null}`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Connection(msgspec.Struct, frozen=True, kw_only=True):
     pid: int
     data: list[str]  # XPUB endpoints, the quickest first
     control: str | None
-    public_key: str | None = None
+    public_key: str | None = None  # Z85; set when the tcp endpoints speak CURVE
 
 
 def default_run_dir() -> Path:

@@ -12,20 +12,12 @@ import zmq
 
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import topics, wire
-from sags_node.messaging.rundir import read_connection
+from sags_node.messaging.address import Address, ClientKeys, HandshakeWatch, connect, find_data
+from sags_node.messaging.sockets import receive_frames
 
 MAX_MESSAGE_BYTES = 128 << 20  # of one part: a 4096 x 4096 picture of 8 bytes a pixel
 RECEIVE_HIGH_WATER = 32
 POLL_MS = 100  # how soon a reader notices that it should end
-
-
-def data_endpoint(endpoint: str | None, ns: str, run_dir: Path | None = None) -> str:
-    """The given endpoint, or the quickest one in the connection file of `ns`.
-
-    Raises:
-        SagsError: no node with that name runs here.
-    """
-    return endpoint if endpoint is not None else read_connection(ns, run_dir).data[0]
 
 
 def check_topic(name: str) -> topics.Topic:
@@ -42,8 +34,10 @@ def check_topic(name: str) -> topics.Topic:
 
 
 @contextmanager
-def data_socket(endpoint: str, prefixes: Sequence[str]) -> Iterator[zmq.Socket[bytes]]:
-    """A SUB socket for every topic that begins with one of `prefixes`.
+def data_socket(
+    address: Address, prefixes: Sequence[str]
+) -> Iterator[tuple[zmq.Socket[bytes], HandshakeWatch]]:
+    """A SUB socket for every topic that begins with one of `prefixes`, and what a node has against it.
 
     Raises:
         SagsError: the endpoint is malformed.
@@ -52,18 +46,9 @@ def data_socket(endpoint: str, prefixes: Sequence[str]) -> Iterator[zmq.Socket[b
     try:
         socket = context.socket(zmq.SUB)
         socket.setsockopt(zmq.RCVHWM, RECEIVE_HIGH_WATER)
-        socket.setsockopt(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
-        socket.setsockopt(zmq.LINGER, 0)
-        socket.setsockopt(zmq.IPV6, int("[" in endpoint))
         for prefix in prefixes:
             socket.setsockopt_string(zmq.SUBSCRIBE, prefix)
-        try:
-            socket.connect(endpoint)
-        except zmq.ZMQError as error:
-            raise SagsError(
-                f"cannot connect to {endpoint}: {error.strerror}; e.g. tcp://127.0.0.1:5556"
-            ) from None
-        yield socket
+        yield socket, connect(socket, address, MAX_MESSAGE_BYTES)
     finally:
         context.destroy(linger=0)
 
@@ -75,17 +60,16 @@ def receive(socket: zmq.Socket[bytes]) -> wire.Message:
         WireError: it is none.
         zmq.Again: nothing has arrived.
     """
-    frames = [socket.recv(zmq.NOBLOCK, copy=False)]
-    while frames[-1].more:
-        part = socket.recv(zmq.NOBLOCK, copy=False)
-        if len(frames) > wire.MAX_PARTS:
-            frames.pop()  # too many already: read to the end, keep nothing more
-        frames.append(part)
-    return wire.decode([frame.buffer for frame in frames])
+    return wire.decode([frame.buffer for frame in receive_frames(socket, wire.MAX_PARTS)])
 
 
 def listen(
-    names: Sequence[str], endpoint: str | None, ns: str, seconds: float | None, run_dir: Path | None = None
+    names: Sequence[str],
+    endpoint: str | None,
+    ns: str,
+    seconds: float | None,
+    run_dir: Path | None = None,
+    keys: ClientKeys | None = None,
 ) -> Iterator[tuple[wire.Message, int] | None]:
     """Every message of some topics and its time of arrival, for up to `seconds`.
 
@@ -96,14 +80,17 @@ def listen(
 
     Raises:
         UsageError: an unknown topic.
-        SagsError: no endpoint is known.
+        SagsError: no endpoint is known, or the node refuses this client.
     """
     known = [check_topic(name.lstrip("/").removeprefix(f"{ns}/")) for name in names]
     prefixes = [topics.full_name(ns, topic.name) for topic in known] or [f"{ns}/"]
     deadline = None if seconds is None else time.monotonic() + seconds
-    with data_socket(data_endpoint(endpoint, ns, run_dir), prefixes) as socket:
+    address = find_data(endpoint, ns, run_dir, keys)
+    with data_socket(address, prefixes) as (socket, watch):
         while deadline is None or time.monotonic() < deadline:
             if not socket.poll(POLL_MS):
+                if (refusal := watch.refusal()) is not None:
+                    raise SagsError(refusal)
                 yield None
                 continue
             try:

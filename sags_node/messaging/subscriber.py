@@ -19,9 +19,10 @@ from typing import Self
 import msgspec
 
 from sags_node.messaging import topics
+from sags_node.messaging.address import ClientKeys, find_data
 from sags_node.messaging.freshness import Freshness, StaleError
 from sags_node.messaging.received import Received, ReceivedText, interpret
-from sags_node.messaging.stream import POLL_MS, check_topic, data_endpoint, data_socket, receive
+from sags_node.messaging.stream import POLL_MS, check_topic, data_socket, receive
 from sags_node.messaging.wire import WireError
 
 KEPT = 4  # newest messages of a topic, so that topics of one frame can be joined by stamp
@@ -43,9 +44,10 @@ class Subscriber:
         endpoint: of the XPUB socket; default: from the connection file of `ns`.
         rates: Hz a topic must keep; default: every message that its sender sends.
         clock_ns: the wall clock that capture stamps are compared with.
+        keys: for a node that wants them.
 
     Raises:
-        UsageError: an unknown topic.
+        UsageError: an unknown topic, or the node wants keys that are not given.
         SagsError: no node named `ns` runs here and no endpoint is given.
     """
 
@@ -57,10 +59,13 @@ class Subscriber:
         run_dir: Path | None = None,
         rates: Mapping[str, float] | None = None,
         clock_ns: Callable[[], int] = time.time_ns,
+        keys: ClientKeys | None = None,
     ) -> None:
         wanted = [check_topic(name) for name in dict.fromkeys([*names, "status"])]
         rates = rates or {}
-        self.endpoint = data_endpoint(endpoint, ns, run_dir)
+        address = find_data(endpoint, ns, run_dir, keys)
+        self.endpoint = address.endpoint
+        self.refusal: str | None = None  # why the node does not let this client in
         self.rejected = 0  # messages that were none, or whose content does not fit its description
         self._ns = ns
         self._clock_ns = clock_ns
@@ -70,7 +75,7 @@ class Subscriber:
         self._stopping = threading.Event()
         self._prefixes = {topics.full_name(ns, name): name for name in self._kept}
         self._resources = ExitStack()  # holds the socket; only the receiver thread uses it once it runs
-        self._socket = self._resources.enter_context(data_socket(self.endpoint, list(self._prefixes)))
+        self._socket, self._watch = self._resources.enter_context(data_socket(address, list(self._prefixes)))
         self._thread = threading.Thread(target=self._receive_all, name="sags-subscriber", daemon=True)
         self._thread.start()
 
@@ -151,6 +156,8 @@ class Subscriber:
 
     def _problem(self, name: str, max_age: float | None) -> str | None:
         problem = self._fresh[name].problem(self._clock_ns(), max_age)
+        if problem is not None and self.refusal is not None:
+            return self.refusal
         return problem or self._sender_problem(name)
 
     def _sender_problem(self, name: str) -> str | None:
@@ -174,6 +181,8 @@ class Subscriber:
         while not self._stopping.is_set():
             if self._socket.poll(POLL_MS):
                 self._receive_one()
+            else:
+                self.refusal = self._watch.refusal()
 
     def _receive_one(self) -> None:
         try:

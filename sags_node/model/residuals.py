@@ -23,6 +23,20 @@ COLOR_DAMPING = 0.3  # px: a barely seen Gaussian changes its colour slowly
 MAX_BYTES = 1 << 29  # of the values; their optimiser's state takes twice as much again
 
 
+def check_size(times: int, count: int) -> None:
+    """
+    Raises:
+        SagsError: residuals of that many Gaussians at that many times take more memory than they may.
+    """
+    size = times * count * columns.COUNT * 4
+    if size > MAX_BYTES:
+        raise SagsError(
+            f"residuals of {count} Gaussians at {times} times take {size / 1e6:.0f} MB, the limit is "
+            f"{MAX_BYTES / 1e6:.0f} MB: take fewer frames (source.frames, source.stride) or a smaller "
+            "--max-gaussians"
+        )
+
+
 @dataclass(frozen=True, slots=True)
 class Steps:
     """Lengths of one improvement."""
@@ -44,13 +58,7 @@ class Residuals:
         Raises:
             SagsError: they are larger than the memory they may take.
         """
-        size = len(times_ns) * count * columns.COUNT * 4
-        if size > MAX_BYTES:
-            raise SagsError(
-                f"residuals of {count} Gaussians at {len(times_ns)} times take {size / 1e6:.0f} MB, the "
-                f"limit is {MAX_BYTES / 1e6:.0f} MB: take fewer frames (source.frames, source.stride) or a "
-                "smaller max_gaussians"
-            )
+        check_size(len(times_ns), count)
         self.times_ns = times_ns
         self.values: F32 = aligned((len(times_ns), count, columns.COUNT))
         self.adam = [AdamState.new(count, columns.COUNT) for _ in times_ns]

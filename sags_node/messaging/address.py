@@ -1,0 +1,168 @@
+"""The consumer's side of a connection: where the node is, which keys it wants, and why it refuses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import zmq
+from zmq.utils.monitor import recv_monitor_message
+
+from sags_node.errors import SagsError, UsageError
+from sags_node.messaging.rundir import read_connection
+from sags_node.messaging.security import KeyPair, public_key, read_key_pair
+
+HANDSHAKE_MS = 5000
+RETRIES = 3  # failed handshakes in a row, where one alone may be a node that is just starting anew
+
+_FAILED = (
+    zmq.EVENT_HANDSHAKE_FAILED_AUTH,
+    zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL,
+    zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL,
+)
+_EVENTS = zmq.EVENT_HANDSHAKE_SUCCEEDED | _FAILED[0] | _FAILED[1] | _FAILED[2]
+_HOW = "make a key pair with sags keygen, have its .pub put into the node's publish.allow, and give --key"
+
+
+@dataclass(frozen=True, slots=True)
+class ClientKeys:
+    """A consumer's key pair, and the public key of the node where no connection file tells it."""
+
+    own: KeyPair
+    node: bytes | None = None
+
+
+def client_keys(key: Path | None, node_key: str | None) -> ClientKeys | None:
+    """The keys named on the command line: a `.key` file, and the node's public key or `.pub` file.
+
+    Raises:
+        UsageError: a file is not what it should be, or the node's key is given without an own one.
+    """
+    if key is None:
+        if node_key is not None:
+            raise UsageError(f"--server-key needs --key: {_HOW}")
+        return None
+    return ClientKeys(read_key_pair(key), None if node_key is None else public_key(node_key))
+
+
+@dataclass(frozen=True, slots=True)
+class Address:
+    """One socket of a node. `keys` are for tcp only: ipc is guarded by the rights of its file."""
+
+    endpoint: str
+    keys: ClientKeys | None = None
+
+
+def find_data(
+    endpoint: str | None, ns: str, run_dir: Path | None = None, keys: ClientKeys | None = None
+) -> Address:
+    """The data socket given, or the quickest one in the connection file of `ns`.
+
+    Raises:
+        SagsError: no node with that name runs here.
+        UsageError: it wants keys that are not given, or keys are given that it does not want.
+    """
+    if endpoint is not None:
+        return _given(endpoint, keys)
+    connection = read_connection(ns, run_dir)
+    return _known(connection.data[0], connection.public_key, keys)
+
+
+def find_control(
+    endpoint: str | None, ns: str, run_dir: Path | None = None, keys: ClientKeys | None = None
+) -> Address:
+    """The control socket given, or the one in the connection file of `ns`; see `find_data`.
+
+    Raises:
+        SagsError: also when the node has none.
+    """
+    if endpoint is not None:
+        return _given(endpoint, keys)
+    connection = read_connection(ns, run_dir)
+    if connection.control is None:
+        raise SagsError(f"the node '{ns}' has no control socket; start it with publish.control set")
+    return _known(connection.control, connection.public_key, keys)
+
+
+def _given(endpoint: str, keys: ClientKeys | None) -> Address:
+    if endpoint.startswith("ipc:") or keys is None:
+        return Address(endpoint)
+    if keys.node is None:
+        raise UsageError(f"{endpoint}: --key needs --server-key, the .pub file of the node")
+    return Address(endpoint, keys)
+
+
+def _known(endpoint: str, node_key: str | None, keys: ClientKeys | None) -> Address:
+    if endpoint.startswith("ipc:"):
+        return Address(endpoint)
+    if node_key is None and keys is not None:
+        raise UsageError(f"{endpoint} is not encrypted; leave out --key, or set publish.key for the node")
+    if node_key is not None and keys is None:
+        raise UsageError(f"{endpoint} wants a key: {_HOW}")
+    if node_key is None or keys is None:
+        return Address(endpoint)
+    return Address(endpoint, ClientKeys(keys.own, keys.node or node_key.encode()))
+
+
+def connect(socket: zmq.Socket[bytes], address: Address, max_message_bytes: int) -> HandshakeWatch:
+    """Connect a consumer's socket, bound what it takes in, and watch it from its own thread.
+
+    Raises:
+        SagsError: the endpoint is malformed.
+    """
+    endpoint = address.endpoint
+    socket.setsockopt(zmq.MAXMSGSIZE, max_message_bytes)
+    socket.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_MS)
+    socket.setsockopt(zmq.LINGER, 0)
+    socket.setsockopt(zmq.IPV6, int("[" in endpoint))
+    if address.keys is not None:
+        assert address.keys.node is not None  # `_given` and `_known` see to it
+        socket.setsockopt(zmq.CURVE_PUBLICKEY, address.keys.own.public)
+        socket.setsockopt(zmq.CURVE_SECRETKEY, address.keys.own.secret)
+        socket.setsockopt(zmq.CURVE_SERVERKEY, address.keys.node)
+    watch = HandshakeWatch(socket, address)
+    try:
+        socket.connect(endpoint)
+    except zmq.ZMQError as error:
+        raise SagsError(
+            f"cannot connect to {endpoint}: {error.strerror}; e.g. tcp://127.0.0.1:5556"
+        ) from None
+    return watch
+
+
+class HandshakeWatch:
+    """Why a consumer gets nothing: without it a refused socket is merely silent."""
+
+    def __init__(self, socket: zmq.Socket[bytes], address: Address) -> None:
+        self._monitor = socket.get_monitor_socket(_EVENTS)
+        self._address = address
+        self._failures = 0  # in a row
+        self._last = (0, 0)  # event and value of the last one
+
+    def refusal(self) -> str | None:
+        """What the node has against this client, and how to mend it; None while nothing speaks against it."""
+        while self._monitor.poll(0):
+            said = recv_monitor_message(self._monitor)
+            if said["event"] == zmq.EVENT_HANDSHAKE_SUCCEEDED:
+                self._failures = 0
+            else:
+                self._failures += 1
+                self._last = (int(said["event"]), int(said["value"]))
+        return self._explained() if self._failures else None
+
+    def _explained(self) -> str | None:
+        endpoint, plain = self._address.endpoint, self._address.keys is None
+        if self._last[0] == zmq.EVENT_HANDSHAKE_FAILED_AUTH:
+            return f"{endpoint} refuses this key: have its .pub put into publish.allow and the node restarted"
+        if self._last[1] == zmq.PROTOCOL_ERROR_ZMTP_MECHANISM_MISMATCH:
+            if plain:
+                return f"{endpoint} wants a key: {_HOW}, and --server-key"
+            return f"{endpoint} is not encrypted; leave out --key, or set publish.key for the node"
+        if self._failures < RETRIES:
+            return None
+        if plain:  # some nodes are too quick: the connection is gone before their greeting was read
+            return f"{endpoint} breaks off the connection; it probably wants a key: {_HOW}, and --server-key"
+        return (
+            f"{endpoint} breaks off the connection; is it encrypted at all, and "
+            "is --server-key the public key of this very node?"
+        )

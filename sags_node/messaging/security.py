@@ -1,0 +1,242 @@
+"""Who may connect: key files, the list of allowed clients, and where a node may listen.
+
+ZeroMQ's CURVE encrypts and authenticates both sides. A key pair is two files in ZeroMQ's certificate format:
+`NAME.key` (both keys, mode 0600, never leaves its owner) and `NAME.pub` (the public key, given to others).
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import logging
+import os
+import re
+import struct
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import zmq
+from zmq.auth import load_certificate
+from zmq.auth.thread import ThreadAuthenticator
+from zmq.utils import z85
+
+from sags_node.config import PublishConfig
+from sags_node.errors import SagsError, UsageError
+
+KEY_CHARACTERS = 40  # a CURVE key in Z85
+MAX_KEY_FILE_BYTES = 4096
+MAX_ALLOWED = 1000
+ZAP_DOMAIN = b"sags"  # set on plain sockets too: libzmq then refuses peers of the old protocols 1 and 2
+LOG_PERIOD = 10.0  # s between two lines about refused connections
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class KeyPair:
+    """A CURVE key pair in Z85; the secret half is never printed."""
+
+    public: bytes
+    secret: bytes = field(repr=False)
+
+
+# ---- key files -------------------------------------------------------------------------------------------
+
+
+def write_key_pair(folder: Path, name: str) -> tuple[Path, Path]:
+    """Make a new key pair: `name.key` (mode 0600) and `name.pub` in `folder`.
+
+    Raises:
+        UsageError: a file of that name exists, the name is no file name, or the folder cannot be written.
+    """
+    if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*", name):
+        raise UsageError(f"'{name}' is no name for a key; use letters, digits, - _ and .")
+    secret_file, public_file = folder / f"{name}.key", folder / f"{name}.pub"
+    public, secret = (key.decode() for key in zmq.curve_keypair())
+    private = f"# Secret key of a SAGS node or client; keep it to yourself.\n{_curve(public)}"
+    private += f'    secret-key = "{secret}"\n'
+    shared = f"# Public key of a SAGS node or client; give it to the other side.\n{_curve(public)}"
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if public_file.exists():
+            raise FileExistsError(None, None, str(public_file))
+        _write_new(secret_file, private, 0o600)
+        _write_new(public_file, shared, 0o644)
+    except FileExistsError as error:
+        raise UsageError(f"{error.filename} exists already; choose another name or remove it") from None
+    except OSError as error:
+        raise UsageError(f"cannot write keys into {folder}: {error.strerror}; choose another --out") from None
+    return secret_file, public_file
+
+
+def _curve(public: str) -> str:
+    return f'curve\n    public-key = "{public}"\n'
+
+
+def _write_new(file: Path, text: str, mode: int) -> None:
+    """Never with a moment in which others can read it, never over another file."""
+    descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+    with os.fdopen(descriptor, "w", encoding="ascii") as opened:
+        opened.write(text)
+
+
+def read_key_pair(file: Path) -> KeyPair:
+    """The key pair in a `.key` file.
+
+    Raises:
+        UsageError: the file is missing, open to others or holds no key pair.
+    """
+    public, secret = _read(file)
+    if secret is None:
+        raise UsageError(f"{file} holds no secret key; give the .key file that sags keygen wrote")
+    if file.stat().st_mode & 0o077:
+        raise UsageError(f"{file} can be read by others; run: chmod 600 {file}")
+    if not _is_key(secret) or zmq.curve_public(secret) != public:
+        raise UsageError(f"{file} is damaged; make a new key pair with sags keygen")
+    return KeyPair(public, secret)
+
+
+def read_public_key(file: Path) -> bytes:
+    """The key in a `.pub` file, Z85.
+
+    Raises:
+        UsageError: the file is missing, holds no key, or holds a secret one.
+    """
+    public, secret = _read(file)
+    if secret is not None:
+        raise UsageError(f"{file} holds a secret key; use the .pub file, and keep this one where it was made")
+    return public
+
+
+def public_key(said: str) -> bytes:
+    """A public key given as its 40 characters or as the path of its `.pub` file, Z85.
+
+    Raises:
+        UsageError: neither.
+    """
+    return said.encode() if _is_key(said.encode()) else read_public_key(Path(said))
+
+
+def read_allow_list(places: Sequence[Path]) -> dict[bytes, str]:
+    """The clients that may connect, public key (Z85) -> name, from `.pub` files and folders of them.
+
+    Raises:
+        UsageError: there is none, there are too many, or a file is no public key.
+    """
+    files = [
+        file for place in places for file in (sorted(place.glob("*.pub")) if place.is_dir() else [place])
+    ]
+    if not files:
+        where = ", ".join(str(place) for place in places)
+        raise UsageError(f"publish.allow: no .pub file in {where}; put the public keys of the clients there")
+    if len(files) > MAX_ALLOWED:
+        raise UsageError(f"publish.allow: {len(files)} keys; at most {MAX_ALLOWED} are allowed")
+    return {read_public_key(file): file.stem for file in files}
+
+
+def _read(file: Path) -> tuple[bytes, bytes | None]:
+    """Public and, if there is one, secret key of a certificate file; only the public one is checked."""
+    try:
+        if not file.is_file() or file.stat().st_size > MAX_KEY_FILE_BYTES:
+            raise UsageError(f"{file} is no key file; make a key pair with sags keygen")
+        public, secret = load_certificate(file)
+    except OSError as error:
+        raise UsageError(f"cannot read key {file}: {error.strerror}; check the path") from None
+    except (ValueError, IndexError):
+        public, secret = b"", None
+    if not _is_key(public):
+        raise UsageError(f"{file} holds no key; make a key pair with sags keygen")
+    return public, secret
+
+
+def _is_key(key: bytes) -> bool:
+    try:
+        return len(key) == KEY_CHARACTERS and len(z85.decode(key)) == 32
+    except (KeyError, ValueError, struct.error):
+        return False
+
+
+# ---- the node's side -------------------------------------------------------------------------------------
+
+
+def check_endpoint(endpoint: str, config: PublishConfig) -> None:
+    """Refuse to listen where other machines can reach, unless only listed keys get in.
+
+    Raises:
+        UsageError: not tcp or ipc, or not loopback while neither keys are set nor `publish.insecure`.
+    """
+    transport, separator, address = endpoint.partition("://")
+    if not separator or transport not in ("tcp", "ipc") or not address:
+        raise UsageError(f"'{endpoint}' is no endpoint; write tcp://127.0.0.1:PORT or ipc:///PATH")
+    if transport == "ipc" and address.startswith("@"):
+        raise UsageError(f"{endpoint} is open to every user of this machine; write ipc:///PATH")
+    if transport == "ipc" or config.key is not None or _is_loopback(address):
+        return
+    if not config.insecure:
+        raise UsageError(
+            f"{endpoint} can be reached from other machines: set publish.key and publish.allow (see sags "
+            "keygen), or publish.insecure:=true (anybody who reaches it sees the video and controls the node)"
+        )
+    log.warning("%s is open: anybody who reaches it sees the video and controls the node", endpoint)
+
+
+def _is_loopback(address: str) -> bool:
+    host = address.rpartition(":")[0].strip("[]")
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+class Seldom:
+    """Keeps a stranger from filling the log."""
+
+    def __init__(self, period: float = LOG_PERIOD) -> None:
+        self._period = period
+        self._next = 0.0
+
+    def due(self) -> bool:
+        """True at most once per period."""
+        now = time.monotonic()
+        if now < self._next:
+            return False
+        self._next = now + self._period
+        return True
+
+
+class _AllowList:
+    """Answers the authenticator whether a key may come in."""
+
+    def __init__(self, allowed: Mapping[bytes, str]) -> None:
+        self._allowed = allowed
+        self._seldom = Seldom()
+
+    def callback(self, domain: str, key: bytes) -> bool:
+        if key not in self._allowed and self._seldom.due():
+            log.warning("refused a client with the key %s, which is not in publish.allow", key.decode())
+        return key in self._allowed
+
+
+@contextmanager
+def authenticated(context: zmq.Context[zmq.Socket[bytes]], config: PublishConfig) -> Iterator[KeyPair | None]:
+    """The node's key pair while only the keys of `publish.allow` are let in; None without `publish.key`.
+
+    Raises:
+        UsageError: a key file is missing, damaged or open to others, or nobody is allowed.
+        SagsError: this ZeroMQ library was built without CURVE.
+    """
+    if config.key is None:
+        yield None
+        return
+    if not zmq.has("curve"):
+        raise SagsError("this ZeroMQ library has no CURVE; install pyzmq from its wheel")
+    keys = read_key_pair(config.key)
+    authenticator = ThreadAuthenticator(context)
+    authenticator.configure_curve_callback(ZAP_DOMAIN.decode(), _AllowList(read_allow_list(config.allow)))
+    authenticator.start()
+    try:
+        yield keys
+    finally:
+        authenticator.stop()

@@ -1,0 +1,74 @@
+"""What every socket here has in common: bounded memory, and never more read than a message may hold."""
+
+from __future__ import annotations
+
+import errno
+import os
+
+import zmq
+
+from sags_node.errors import SagsError
+from sags_node.messaging.security import ZAP_DOMAIN, KeyPair
+
+HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS = 2000, 6000
+RECEIVE_BUFFER = 16384  # bytes in the kernel, which an expelled peer still gets read
+HANDSHAKE_MS = 3000  # a peer that has not made itself known by then is cut off
+
+
+def limit(
+    socket: zmq.Socket[bytes], send_high_water: int, receive_high_water: int, max_part_bytes: int
+) -> None:
+    """Bound what one peer can make a bound socket hold. ZeroMQ cannot bound the number of parts."""
+    socket.setsockopt(zmq.SNDHWM, send_high_water)
+    socket.setsockopt(zmq.RCVHWM, receive_high_water)
+    socket.setsockopt(zmq.MAXMSGSIZE, max_part_bytes)
+    socket.setsockopt(zmq.RCVBUF, RECEIVE_BUFFER)
+    socket.setsockopt(zmq.LINGER, 0)
+    socket.setsockopt(zmq.HEARTBEAT_IVL, HEARTBEAT_MS)
+    socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, HEARTBEAT_TIMEOUT_MS)
+    socket.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_MS)
+    socket.setsockopt(zmq.ZAP_DOMAIN, ZAP_DOMAIN)
+
+
+def bind(socket: zmq.Socket[bytes], endpoint: str, key: str, keys: KeyPair | None) -> str:
+    """Bind and return the endpoint as bound (a `*` port becomes its number).
+
+    With `keys` a tcp endpoint speaks CURVE; an ipc endpoint never does: only the owner may open its file.
+
+    Args:
+        key: of the launch file, for the message.
+
+    Raises:
+        SagsError: the endpoint is taken or cannot be bound.
+    """
+    ipc = endpoint.startswith("ipc:")
+    socket.setsockopt(zmq.IPV6, int("[" in endpoint))
+    if keys is not None:
+        socket.setsockopt(zmq.CURVE_SECRETKEY, keys.secret)
+    socket.setsockopt(zmq.CURVE_SERVER, int(keys is not None and not ipc))  # of what is bound from here on
+    try:
+        socket.bind(endpoint)
+    except zmq.ZMQError as error:
+        example = "'[tcp://127.0.0.1:5560]'" if key == "publish.data" else "tcp://127.0.0.1:5561"
+        hint = f"choose another, e.g. {key}:={example}"
+        reason = "already in use" if error.errno == errno.EADDRINUSE else f"cannot be bound: {error.strerror}"
+        raise SagsError(f"{endpoint} is {reason}; {hint}") from None
+    bound = socket.getsockopt_string(zmq.LAST_ENDPOINT)
+    if ipc:
+        os.chmod(bound.removeprefix("ipc://"), 0o600)
+    return bound
+
+
+def receive_frames(socket: zmq.Socket[bytes], most: int) -> list[zmq.Frame]:
+    """The next message, without waiting; of more than `most` parts one is kept and the rest thrown away.
+
+    Raises:
+        zmq.Again: nothing has arrived.
+    """
+    frames = [socket.recv(zmq.NOBLOCK, copy=False)]
+    while frames[-1].more:
+        frame = socket.recv(zmq.NOBLOCK, copy=False)
+        if len(frames) > most:
+            frames.pop()
+        frames.append(frame)
+    return frames

@@ -1,0 +1,49 @@
+"""`sags bench ablation`: every variant is fitted and measured alike, on frames it never saw."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+
+from sags_node.benchmark import ablation
+from sags_node.cli import main
+from sags_node.fitting import start
+from sags_node.fitting.fit import Fit
+
+
+def test_all_variants_are_measured_on_the_same_frames(
+    phantom_session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small = {
+        name: dataclasses.replace(settings, max_gaussians=800, cells=8, slots=4, channels=16)
+        for name, settings in ablation.VARIANTS.items()
+    }
+    monkeypatch.setattr(ablation, "VARIANTS", small)
+    monkeypatch.setattr(start, "PATH_STEPS", 20)
+    learnt: list[list[int]] = []
+    begin = Fit.start
+
+    def noted(fit: Fit, progress: Any) -> None:
+        learnt.append([frame.frame_id for frame in fit.clip.train])
+        begin(fit, progress)
+
+    monkeypatch.setattr(Fit, "start", noted)
+    out = tmp_path / "ablation.json"
+    arguments = ["source.frames:=12", "--warm-up", "2", "--iterations", "3", "--out", str(out), "--json"]
+    result = CliRunner().invoke(main, ["bench", "ablation", str(phantom_session), *arguments])
+    assert result.exit_code == 0, result.output
+    found = json.loads(result.stdout)
+    assert found == json.loads(out.read_text())
+    assert list(found["variants"]) == list(ablation.VARIANTS)
+    assert learnt == [[0, 2, 3, 4, 5, 6, 7, 8]] * len(small)
+    for name, row in found["variants"].items():
+        assert row["heldout"]["frames"] == 1 and row["ahead"]["frames"] == ablation.AHEAD, name
+        assert row["gaussians"] <= 800
+        assert row["track"]["median_mm"] > 0 and row["track_with_ahead"]["median_mm"] > 0
+    base, online = found["variants"]["base"]["heldout"], found["variants"]["online"]["heldout"]
+    assert online["psnr"] > base["psnr"]

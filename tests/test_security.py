@@ -1,0 +1,481 @@
+"""Keys, who is let in, and what strangers can do to the node: nothing."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import stat
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import hostile
+import numpy as np
+import pytest
+import zmq
+from click.testing import CliRunner
+from synthetic import publisher, stream
+from zmq.auth import load_certificate
+
+from sags_node.cli import main
+from sags_node.config import load_launch
+from sags_node.errors import SagsError, UsageError
+from sags_node.messaging.address import ClientKeys, client_keys
+from sags_node.messaging.control import ControlClient, ControlServer
+from sags_node.messaging.peers import MAX_PEERS
+from sags_node.messaging.publisher import Publisher
+from sags_node.messaging.security import read_allow_list, read_key_pair, read_public_key, write_key_pair
+from sags_node.messaging.subscriber import Subscriber
+
+TOPIC = "left/depth"
+
+
+@pytest.fixture(scope="module")
+def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """node.*, stranger.* and clients/viewer.*"""
+    folder = tmp_path_factory.mktemp("keys")
+    for name in ("node", "stranger"):
+        write_key_pair(folder, name)
+    write_key_pair(folder / "clients", "viewer")
+    return folder
+
+
+@contextmanager
+def secured(run_dir: Path, keys: Path, **config: Any) -> Iterator[Publisher]:
+    with publisher(run_dir, key=keys / "node.key", allow=(keys / "clients",), **config) as running:
+        yield running
+
+
+def of(keys: Path, client: str, node: str = "node") -> ClientKeys:
+    return ClientKeys(read_key_pair(keys / f"{client}.key"), read_public_key(keys / f"{node}.pub"))
+
+
+# ---- key files -----------------------------------------------------------------------------------------
+
+
+def test_keygen_writes_a_private_and_a_public_file(tmp_path: Path) -> None:
+    old = os.umask(0)
+    try:
+        outcome = CliRunner().invoke(main, ["keygen", "node", "--out", str(tmp_path / "keys")])
+    finally:
+        os.umask(old)
+    assert outcome.exit_code == 0
+    secret_file, public_file = tmp_path / "keys/node.key", tmp_path / "keys/node.pub"
+    assert stat.S_IMODE(secret_file.stat().st_mode) == 0o600
+    assert stat.S_IMODE(secret_file.parent.stat().st_mode) == 0o700
+    public, secret = load_certificate(secret_file)
+    assert secret is not None and zmq.curve_public(secret) == public
+    assert load_certificate(public_file) == (public, None)
+    pair = read_key_pair(secret_file)
+    assert (pair.public, pair.secret) == (public, secret)
+    for said in (outcome.output, public_file.read_text(), repr(pair), str(pair)):
+        assert secret.decode() not in said
+
+
+@pytest.mark.parametrize("there", ["node.key", "node.pub"])
+def test_keygen_never_overwrites(tmp_path: Path, there: str) -> None:
+    (tmp_path / there).write_text("precious")
+    outcome = CliRunner().invoke(main, ["keygen", "node", "--out", str(tmp_path)])
+    assert outcome.exit_code == 2
+    assert [file.name for file in tmp_path.iterdir()] == [there]
+    assert (tmp_path / there).read_text() == "precious"
+
+
+@pytest.mark.parametrize("name", ["../node", "a/b", "", ".hidden", "a b"])
+def test_a_key_name_is_a_file_name(tmp_path: Path, name: str) -> None:
+    with pytest.raises(UsageError, match="no name for a key"):
+        write_key_pair(tmp_path / "keys", name)
+    assert not (tmp_path / "keys").exists()
+
+
+@pytest.mark.parametrize("mode", [0o640, 0o604, 0o620, 0o644])
+def test_a_key_that_others_can_read_is_refused_with_the_mend(tmp_path: Path, keys: Path, mode: int) -> None:
+    file, _ = write_key_pair(tmp_path, "node")
+    file.chmod(mode)
+    with pytest.raises(UsageError, match=rf"run: chmod 600 {file}") as raised:
+        read_key_pair(file)
+    assert load_certificate(file)[1].decode() not in str(raised.value)  # type: ignore[union-attr]  # there is one
+    with (
+        pytest.raises(UsageError, match="chmod 600"),
+        publisher(tmp_path / "run", key=file, allow=(keys / "clients",)),
+    ):
+        pass
+    file.chmod(0o600)
+    read_key_pair(file)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"public-key",
+        b"\xff" * 100,
+        b'    public-key = "short"\n',
+        b'    public-key = "' + b"~" * 40 + b'"\n',
+        b'    public-key = "' + b"#" * 40 + b'"\n',
+        b"public-key = x" * 1000,
+    ],
+)
+def test_one_bad_entry_in_the_allow_list_is_one_clear_error(
+    keys: Path, tmp_path: Path, content: bytes
+) -> None:
+    write_key_pair(tmp_path, "good")
+    (tmp_path / "bad.pub").write_bytes(content)
+    with pytest.raises(UsageError, match=r"bad\.pub"):
+        read_allow_list([tmp_path])
+
+
+def test_allow_lists(keys: Path, tmp_path: Path) -> None:
+    viewer, stranger = (read_key_pair(keys / f"{name}.key") for name in ("clients/viewer", "stranger"))
+    listed = read_allow_list([keys / "clients", keys / "stranger.pub"])
+    assert listed == {viewer.public: "viewer", stranger.public: "stranger"}
+    with pytest.raises(UsageError, match=r"no \.pub file"):
+        read_allow_list([tmp_path])
+    with pytest.raises(UsageError, match="holds a secret key"):
+        read_allow_list([keys / "node.key"])
+    with pytest.raises(UsageError, match="no secret key"):
+        read_key_pair(keys / "node.pub")
+
+
+def test_keys_in_a_launch_file_are_relative_to_it(tmp_path: Path) -> None:
+    file = tmp_path / "launch.yaml"
+    file.write_text("publish: {key: node.key, allow: [clients, one.pub]}")
+    publish = load_launch(file).publish
+    assert (publish.key, publish.allow) == (
+        tmp_path / "node.key",
+        (tmp_path / "clients", tmp_path / "one.pub"),
+    )
+    assert load_launch(None, ["publish.key:=a.key", "publish.allow:=b"]).publish.allow == (Path("b"),)
+    with pytest.raises(UsageError, match="belong together"):
+        load_launch(None, ["publish.key:=a.key"])
+    with pytest.raises(UsageError, match="belong together"):
+        load_launch(None, ["publish.allow:=clients"])
+
+
+# ---- who is let in -------------------------------------------------------------------------------------
+
+
+def test_other_machines_only_with_keys_or_with_a_warning(
+    tmp_path: Path, keys: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with secured(tmp_path / "run", keys, data=("tcp://*:*",)) as running:
+        assert running.connection.data[-1].startswith("tcp://0.0.0.0:")
+    assert not caplog.records
+    with publisher(tmp_path / "run", data=("tcp://*:*",), insecure=True):
+        assert "anybody" in caplog.text
+    with (
+        pytest.raises(UsageError, match=r"publish\.key and publish\.allow"),
+        publisher(tmp_path / "run", data=("tcp://*:*",)),
+    ):
+        pass
+    with (
+        pytest.raises(UsageError, match="every user of this machine"),
+        publisher(tmp_path / "run", data=("ipc://@sags",)),
+    ):
+        pass
+
+
+def test_a_listed_key_gets_data_and_answers(tmp_path: Path, keys: Path) -> None:
+    run_dir = tmp_path / "run"
+    viewer = of(keys, "clients/viewer")
+    with secured(run_dir, keys) as running, stream(running):
+        for node_key in (viewer.node, None):  # named, or from the connection file
+            endpoint = running.connection.data[-1] if node_key else None
+            control = running.connection.control if node_key else None
+            mine = ClientKeys(viewer.own, node_key)
+            with Subscriber([TOPIC], endpoint=endpoint, run_dir=run_dir, keys=mine) as subscriber:
+                assert subscriber.wait(TOPIC, 10) is not None and subscriber.refusal is None
+            with ControlClient(control, run_dir=run_dir, keys=mine) as asker:
+                assert asker.request("ping") == "pong"
+        said = json.loads((run_dir / "sags.json").read_text())
+        assert said["public_key"] == viewer.node.decode()  # type: ignore[union-attr]  # `of` sets it
+        secret = read_key_pair(keys / "node.key").secret.decode()
+        assert secret not in (run_dir / "sags.json").read_text()
+
+
+@pytest.mark.parametrize("which", ["data", "control"])
+@pytest.mark.parametrize(
+    ("client", "node", "why"),
+    [
+        ("stranger", "node", "refuses this key"),
+        (None, None, "wants a key"),
+        ("clients/viewer", "stranger", "is --server-key the public key of this very node"),
+    ],
+)
+def test_others_are_refused_counted_and_told_why(
+    tmp_path: Path, keys: Path, which: str, client: str | None, node: str | None, why: str
+) -> None:
+    mine = None if client is None else of(keys, client, str(node))
+    with secured(tmp_path / "run", keys) as running, stream(running):
+        if which == "data":
+            with Subscriber([TOPIC], endpoint=running.connection.data[-1], keys=mine) as subscriber:
+                assert subscriber.wait(TOPIC, 1.5) is None
+                assert why in str(subscriber.problem(TOPIC))
+        else:
+            with ControlClient(running.connection.control, keys=mine) as asker:
+                with pytest.raises(SagsError, match=why):
+                    asker.request("ping", timeout=1.5)
+        _until(lambda: running.connections[which]["refused"] >= 1)
+        assert running.connections[which]["unlisted_key"] == (client == "stranger")
+        other = {"data": "control", "control": "data"}[which]
+        assert running.connections[other] == dict.fromkeys(running.connections[other], 0)
+        assert not running.wanted(TOPIC)
+
+
+def test_ipc_needs_no_key_and_belongs_to_its_user(tmp_path: Path, keys: Path) -> None:
+    run_dir = tmp_path / "run"
+    with (
+        secured(run_dir, keys) as running,
+        stream(running),
+        Subscriber([TOPIC], run_dir=run_dir) as subscriber,
+    ):
+        assert subscriber.endpoint.startswith("ipc:")
+        assert subscriber.wait(TOPIC, 10) is not None
+        assert stat.S_IMODE((run_dir / "sags.ipc").stat().st_mode) == 0o600
+
+
+def test_missing_and_needless_keys_are_named_at_once(tmp_path: Path, keys: Path) -> None:
+    run_dir = tmp_path / "run"
+    viewer = ClientKeys(read_key_pair(keys / "clients/viewer.key"))
+    with secured(run_dir, keys, ipc=False):
+        with pytest.raises(UsageError, match="wants a key: make a key pair with sags keygen"):
+            ControlClient(run_dir=run_dir)
+        with pytest.raises(UsageError, match="wants a key"):
+            Subscriber([TOPIC], run_dir=run_dir)
+    with publisher(run_dir) as plain:
+        with pytest.raises(UsageError, match="is not encrypted; leave out --key"):
+            ControlClient(run_dir=run_dir, keys=viewer)
+        with (
+            ControlClient(plain.connection.control, keys=of(keys, "clients/viewer")) as asker,
+            pytest.raises(SagsError, match=r"is not encrypted; leave out --key|is it encrypted at all"),
+        ):
+            asker.request("ping", timeout=1.0)
+    with pytest.raises(UsageError, match="--key needs --server-key"):
+        Subscriber([TOPIC], endpoint="tcp://127.0.0.1:9", keys=viewer)
+    with pytest.raises(UsageError, match="--server-key needs --key"):
+        client_keys(None, str(keys / "node.pub"))
+    assert client_keys(keys / "stranger.key", str(keys / "node.pub")) == of(keys, "stranger")
+
+
+def test_refusals_reach_the_log_but_do_not_fill_it(
+    tmp_path: Path, keys: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    stranger = of(keys, "stranger")
+    with (
+        caplog.at_level(logging.DEBUG, "sags_node"),
+        secured(tmp_path / "run", keys) as running,
+        stream(running),
+    ):
+        for _ in range(20):
+            with Subscriber([TOPIC], endpoint=running.connection.data[-1], keys=stranger) as subscriber:
+                _until(lambda subscriber=subscriber: subscriber.refusal is not None)
+        _until(lambda: running.connections["data"]["unlisted_key"] == 20)
+    warnings = [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
+    assert len(warnings) == 2
+    assert any(stranger.own.public.decode() in warning for warning in warnings)
+    assert stranger.own.secret.decode() not in caplog.text
+
+
+# ---- strangers -----------------------------------------------------------------------------------------
+
+
+def test_a_hundred_thousand_malformed_requests(tmp_path: Path) -> None:
+    """Every one is answered, none ends the server, none leaves memory behind."""
+    count, batch = 100_000, 200
+    context = zmq.Context()
+    router, asker = context.socket(zmq.ROUTER), context.socket(zmq.DEALER)
+    router.bind(f"ipc://{tmp_path}/fuzz")
+    asker.connect(f"ipc://{tmp_path}/fuzz")
+    rng = np.random.default_rng(8)
+    requests = [hostile.random_request(rng) for _ in range(count // 10)]
+    server = ControlServer(router, {"echo": lambda args: args})
+    answered, refused, settled_mb = 0, 0, 0.0
+    for start in range(0, count, batch):
+        for i in range(start, start + batch):
+            body = bytearray(requests[i % len(requests)])
+            if i >= len(requests) and body:
+                body[i * 7919 % min(len(body), 100)] = i * 31 % 256  # near the start, where the fields are
+            asker.send(bytes(body))
+        sent = start + batch
+        deadline = time.monotonic() + 10
+        while answered < sent and time.monotonic() < deadline:
+            server.serve()
+            while asker.poll(0):
+                reply = asker.recv()
+                answered += hostile.is_reply(reply)
+                refused += b"not a request" in reply
+        if sent == count // 4:
+            settled_mb = _resident_mb()
+    grown_mb = _resident_mb() - settled_mb
+    context.destroy(linger=0)
+    assert answered == count
+    assert refused > count / 2
+    assert grown_mb < 30
+
+
+@pytest.mark.parametrize("with_keys", [False, True])
+def test_random_bytes_on_both_ports_while_a_client_receives(
+    tmp_path: Path, keys: Path, with_keys: bool
+) -> None:
+    rng = np.random.default_rng(9)
+    mine = of(keys, "clients/viewer") if with_keys else None
+    opened = secured(tmp_path / "run", keys) if with_keys else publisher(tmp_path / "run")
+    starts = (
+        b"",
+        b"\xff" + bytes(8) + b"\x7f",
+        b"\xff" + bytes(8) + b"\x7f\x03\x00NULL",
+        b"\x01\x00",
+        b"GET / ",
+    )
+    with opened as running, stream(running):
+        connection = running.connection
+        with Subscriber([TOPIC], endpoint=connection.data[-1], keys=mine) as subscriber:
+            assert subscriber.wait(TOPIC, 10) is not None
+            before = _resident_mb()
+            for i in range(400):
+                endpoint = str(connection.control if i % 2 else connection.data[-1])
+                with hostile.raw(endpoint) as stranger:
+                    stranger.sendall(starts[i % len(starts)] + rng.bytes(int(rng.integers(1, 3000))))
+            _until(lambda: sum(running.connections[name]["refused"] for name in ("data", "control")) == 400)
+            newest = subscriber.latest(TOPIC)
+            assert subscriber.wait(TOPIC, 5, after=newest) is not None
+            assert subscriber.lost(TOPIC) == 0 and subscriber.refusal is None
+            assert _resident_mb() - before < 30
+        with ControlClient(connection.control, keys=mine) as asker:
+            assert asker.request("ping") == "pong"
+
+
+def test_a_peer_of_the_old_protocol_is_no_subscriber(tmp_path: Path) -> None:
+    """ZMTP 1.0 has no signature: any bytes could be a subscription to everything."""
+    with publisher(tmp_path / "run") as running, hostile.raw(running.connection.data[-1]) as stranger:
+        stranger.sendall(b"\x01\x00\x02\x00\x01")
+        stranger.settimeout(0.05)
+        for _ in range(20):
+            running.poll(20)
+        assert not running.wanted(TOPIC)
+        _until(
+            lambda: running.connections["data"] == {**running.connections["data"], "open": 0, "refused": 1}
+        )
+
+
+def test_peers_are_capped_and_those_who_are_in_stay_in(tmp_path: Path) -> None:
+    with publisher(tmp_path / "run") as running, stream(running):
+        endpoint = running.connection.data[-1]
+        with Subscriber([TOPIC], endpoint=endpoint) as subscriber:
+            assert subscriber.wait(TOPIC, 10) is not None
+            crowd = [hostile.raw(endpoint) for _ in range(MAX_PEERS + 30)]
+            _until(lambda: running.connections["data"]["too_many"] >= 31)
+            _until(lambda: running.connections["data"]["open"] <= MAX_PEERS)
+            assert subscriber.wait(TOPIC, 5, after=subscriber.latest(TOPIC)) is not None
+            for connection in crowd:
+                connection.close()
+            with Subscriber([TOPIC], endpoint=endpoint) as late:
+                assert late.wait(TOPIC, 10) is not None
+            assert subscriber.lost(TOPIC) == 0
+
+
+SUBSCRIPTIONS = b"".join(b"\x00\xc9\x01" + np.random.default_rng(i).bytes(200) for i in range(2000))
+ENDLESS = b"".join(b"\x01\xc9" + bytes(201) for _ in range(2000))  # each part says: more to come
+
+
+@pytest.mark.parametrize(
+    ("which", "kind", "block"), [("data", b"SUB", SUBSCRIPTIONS), ("control", b"DEALER", ENDLESS)]
+)
+def test_a_flood_is_cut_off(tmp_path: Path, which: str, kind: bytes, block: bytes) -> None:
+    """Endless subscriptions and endless messages; ZeroMQ would keep them all."""
+    with publisher(tmp_path / "run") as running, stream(running):
+        endpoint = str(running.connection.control if which == "control" else running.connection.data[-1])
+        with Subscriber([TOPIC], endpoint=running.connection.data[-1]) as subscriber:
+            assert subscriber.wait(TOPIC, 10) is not None
+            before = _resident_mb()
+            sent: list[int] = []
+            attack = threading.Thread(target=lambda: sent.append(hostile.flood(endpoint, kind, block, 2.0)))
+            attack.start()
+            attack.join()
+            assert running.connections[which]["flooding"] >= 1 and sent[0] > len(block)
+            assert _resident_mb() - before < 100
+            assert subscriber.wait(TOPIC, 5, after=subscriber.latest(TOPIC)) is not None
+            assert subscriber.lost(TOPIC) == 0
+
+
+def test_a_reply_too_large_for_the_client_is_not_taken() -> None:
+    context = zmq.Context()
+    router = context.socket(zmq.ROUTER)
+    router.bind("tcp://127.0.0.1:*")
+
+    def answer() -> None:
+        identity, _ = router.recv_multipart()
+        router.send_multipart([identity, bytes(8 << 20)])
+
+    thread = threading.Thread(target=answer)
+    thread.start()
+    with (
+        ControlClient(router.getsockopt_string(zmq.LAST_ENDPOINT)) as asker,
+        pytest.raises(SagsError, match="no answer"),
+    ):
+        asker.request("ping", timeout=0.5)
+    thread.join()
+    context.destroy(linger=0)
+
+
+# ---- the whole, as processes ---------------------------------------------------------------------------
+
+
+def test_a_secured_node_and_its_clients_as_processes(
+    phantom_session: Path, keys: Path, tmp_path: Path
+) -> None:
+    run_dir = tmp_path / "run"
+    node = subprocess.Popen(
+        [
+            *(sys.executable, "-m", "sags_node", "run", str(phantom_session), "source.loop:=true"),
+            *(
+                "publish.data:=[tcp://*:*]",
+                "publish.control:=tcp://127.0.0.1:*",
+                f"publish.run_dir:={run_dir}",
+            ),
+            *(f"publish.key:={keys}/node.key", f"publish.allow:={keys}/clients"),
+        ],
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        _until((run_dir / "sags.json").exists, 90)
+        port = json.loads((run_dir / "sags.json").read_text())["data"][-1].rpartition(":")[2]
+        where = ["--endpoint", f"tcp://127.0.0.1:{port}"]
+        good = _sags(*where, "--key", f"{keys}/clients/viewer.key", "--server-key", f"{keys}/node.pub")
+        assert good.returncode == 0 and json.loads(good.stdout)["average_rate"] > 0
+        unlisted = _sags(*where, "--key", f"{keys}/stranger.key", "--server-key", f"{keys}/node.pub")
+        assert unlisted.returncode == 1 and "refuses this key" in unlisted.stderr
+        plain = _sags(*where)
+        assert plain.returncode == 1 and "wants a key" in plain.stderr
+        viewer = ClientKeys(read_key_pair(keys / "clients/viewer.key"))
+        with ControlClient(run_dir=run_dir, keys=viewer) as asker:
+            connections = asker.request("get_status")["connections"]
+        assert connections["data"]["unlisted_key"] == 1 and connections["data"]["refused"] >= 2
+    finally:
+        node.terminate()
+        _, said = node.communicate(timeout=30)
+    assert "Traceback" not in said + good.stderr + unlisted.stderr + plain.stderr
+    assert read_key_pair(keys / "stranger.key").public.decode() in said.replace("\n", "").replace(" ", "")
+
+
+def _sags(*options: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "sags_node", "topic", "hz", "tf", "--seconds", "3", "--json", *options]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+
+
+def _resident_mb() -> float:
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def _until(condition: Any, seconds: float = 10.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
