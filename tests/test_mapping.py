@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 
-from sags_node.engine.rasterize import make_rasterizer
 from sags_node.mapping import densify, initialise
 from sags_node.mapping.budget import StepBudget, TimeBudget
-from sags_node.mapping.mapper import Mapper
 from sags_node.mapping.motion import scene_flow
 from sags_node.model.gaussians import GaussianModel
 from sags_node.types import Camera, Observation, RenderedView
@@ -169,20 +167,6 @@ def test_first_pixels_respect_the_limit_and_the_mask_and_fill_small_gaps_only() 
     assert np.allclose(depths, DEPTH)
     frame.depth[:] = 0
     assert len(initialise.first_pixels(frame, 100)[0]) == 0
-
-
-def test_a_restarted_mapper_begins_as_a_new_one_does() -> None:
-    """Nothing of the old model is left, the step count of Adam's bias correction included."""
-    frame = observation()
-    models = []
-    for begun_before in (False, True):
-        mapper = Mapper(make_rasterizer("numba", WIDTH, HEIGHT), 300)
-        if begun_before:
-            mapper.update(observation(seed=1), StepBudget(0))
-            mapper.restart()
-        models.append(mapper.update(frame, StepBudget(0)).gaussians)
-    for name in ("means", "scales", "colors"):
-        assert np.array_equal(getattr(models[0], name), getattr(models[1], name)), name
 
 
 def test_step_budget_counts() -> None:

@@ -22,7 +22,7 @@ INITIAL_STEPS = 30
 MIN_FIRST_DEPTHS = 200  # px
 LOST_RESIDUAL = 0.08  # mean over RGB and tissue, 0..1; a beating heart stays below half of it
 LOST_COVERAGE = 0.3  # of the tissue
-INITIAL_RATES = Rates(mean_px=0.32, quat=0.01, log_scale=0.02, opacity_logit=0.03)
+INITIAL_RATES = Rates().scaled(4.0)
 NODE_STEP_PX = 0.08
 DEPTH_WEIGHT = 2e-3  # of a depth residual of DEPTH_SCALE, against colours 0..1
 DEPTH_SCALE = 1e-3  # m: beyond this a depth residual counts linearly
@@ -86,7 +86,6 @@ class Mapper:
     def restart(self) -> None:
         """Forget the model; the next frame, or this one if it is being taken in, makes a new one."""
         self.model.clear()
-        self._optimiser = Optimiser()
         self._deformation = None
         self._last = None
         self.restarts += 1

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numba import prange
 
-from sags_node.engine.jit import kernel, parallel_kernel, square_root
+from sags_node.engine.jit import kernel, parallel_kernel
 from sags_node.engine.rasterize import Gradients
 from sags_node.model.gaussians import ADAM_PARAMETERS, GaussianModel
 from sags_node.types import F32, Camera
@@ -24,11 +24,15 @@ class Rates:
     log_scale: float = 0.005
     opacity_logit: float = 0.0075
 
+    def scaled(self, factor: float) -> Rates:
+        return Rates(
+            factor * self.mean_px, factor * self.quat, factor * self.log_scale, factor * self.opacity_logit
+        )
+
 
 COLOUR_RELAXATION = 1.6  # SIRT over-relaxation; 0 < value < 2 converges
 COLOUR_DAMPING = 0.3  # px of coverage: a barely seen Gaussian changes its colour slowly
 BETA1, BETA2 = 0.5, 0.99  # low momentum: a few steps per frame must not coast
-PIECE = 1024  # rows a thread takes at a time: a call for each row would count references to every array
 MIN_CONTRIBUTION = 1e-3  # px: rows that were not seen are not touched
 LOG_SCALE_RANGE = (math.log(1e-6), math.log(5e-3))  # m
 LOGIT_RANGE = (-6.0, 6.0)
@@ -70,75 +74,73 @@ def _step(
     v_means: F32, v_quats: F32, v_scales: F32, v_opacities: F32, v_colors: F32, contribution: F32,
     lengths: F32, view_z: F32, focal: float, corrections: F32,
 ) -> None:  # fmt: skip
-    for piece in prange(-(-len(means) // PIECE)):
-        first = np.int64(piece) * PIECE
-        _step_rows(
-            means, quats, log_scales, opacity_logits, scales, opacities, colors, adam_m, adam_v,
-            v_means, v_quats, v_scales, v_opacities, v_colors, contribution,
-            lengths, view_z, np.float32(focal), corrections, first, min(first + PIECE, len(means)),
-        )  # fmt: skip
+    for i in prange(len(means)):
+        if contribution[i] > MIN_CONTRIBUTION:
+            mean = means[i]
+            z = view_z[0] * mean[0] + view_z[1] * mean[1] + view_z[2] * mean[2] + view_z[3]
+            _step_one(
+                mean, quats[i], log_scales[i], opacity_logits, scales[i], opacities, colors[i],
+                adam_m[i], adam_v[i],
+                v_means[i], v_quats[i], v_scales[i], v_opacities[i], v_colors[i], contribution[i],
+                lengths, np.float32(abs(z) / focal), corrections, i,
+            )  # fmt: skip
 
 
 @kernel
-def _step_rows(
-    means: F32, quats: F32, log_scales: F32, opacity_logits: F32, scales: F32, opacities: F32, colors: F32,
+def _step_one(
+    mean: F32, quat: F32, log_scale: F32, opacity_logits: F32, scale: F32, opacities: F32, color: F32,
     adam_m: F32, adam_v: F32,
-    v_means: F32, v_quats: F32, v_scales: F32, v_opacities: F32, v_colors: F32, contribution: F32,
-    lengths: F32, view_z: F32, focal: Any, corrections: F32, first: Any, end: Any,
+    v_mean: F32, v_quat: F32, v_scale: F32, v_opacity: Any, v_color: F32, contribution: Any,
+    lengths: F32, pixel: Any, corrections: F32, i: int,
 ) -> None:  # fmt: skip
+    """One row. `pixel`: metres that a pixel spans at the Gaussian's depth."""
     one = np.float32(1)
     g = np.empty(ADAM_PARAMETERS, np.float32)
-    for i in range(first, end):
-        if not contribution[i] > MIN_CONTRIBUTION:
-            continue
-        for k in range(3):
-            g[k] = v_means[i, k]
-            g[7 + k] = v_scales[i, k] * scales[i, k]  # by log scale
-        for k in range(4):
-            g[3 + k] = v_quats[i, k]
-        g[10] = v_opacities[i] * opacities[i] * (one - opacities[i])  # by logit
-        size = contribution[i] + abs(opacity_logits[i])
-        for k in range(3):
-            size += abs(v_colors[i, k]) + abs(log_scales[i, k])
-        for k in range(ADAM_PARAMETERS):
-            size += abs(g[k]) + abs(adam_m[i, k]) + abs(adam_v[i, k])
-        if not size < np.inf:
-            _mend(log_scales, opacity_logits, scales, opacities, adam_m, adam_v, i)
-            continue
-        gain = np.float32(COLOUR_RELAXATION) / (contribution[i] + np.float32(COLOUR_DAMPING))
-        for k in range(3):
-            color = colors[i, k] - gain * v_colors[i, k]
-            colors[i, k] = min(max(color, np.float32(-0.5)), np.float32(1.5))
-        for k in range(ADAM_PARAMETERS):
-            m = adam_m[i, k] + np.float32(1 - BETA1) * (g[k] - adam_m[i, k])
-            v = adam_v[i, k] + np.float32(1 - BETA2) * (g[k] * g[k] - adam_v[i, k])
-            adam_m[i, k] = m
-            adam_v[i, k] = v
-            g[k] = lengths[k] * m * corrections[0] / (square_root(v * corrections[1]) + np.float32(1e-8))
-        z = view_z[0] * means[i, 0] + view_z[1] * means[i, 1] + view_z[2] * means[i, 2] + view_z[3]
-        pixel = abs(z) / focal  # metres that a pixel spans at the Gaussian's depth
-        for k in range(3):
-            means[i, k] -= pixel * g[k]
-            value = log_scales[i, k] - g[7 + k]
-            value = min(max(value, np.float32(LOG_SCALE_RANGE[0])), np.float32(LOG_SCALE_RANGE[1]))
-            log_scales[i, k] = value
-            scales[i, k] = math.exp(value)
-        for k in range(4):
-            quats[i, k] -= g[3 + k]
-        value = opacity_logits[i] - g[10]
-        value = min(max(value, np.float32(LOGIT_RANGE[0])), np.float32(LOGIT_RANGE[1]))
-        opacity_logits[i] = value
-        opacities[i] = one / (one + math.exp(-value))
+    for k in range(3):
+        g[k] = v_mean[k]
+        g[7 + k] = v_scale[k] * scale[k]  # by log scale
+    for k in range(4):
+        g[3 + k] = v_quat[k]
+    g[10] = v_opacity * opacities[i] * (one - opacities[i])  # by logit
+    size = contribution
+    for k in range(ADAM_PARAMETERS):
+        size += abs(g[k])
+    for k in range(3):
+        size += abs(v_color[k])
+    for k in range(ADAM_PARAMETERS):
+        size += abs(adam_m[k]) + abs(adam_v[k])
+    raw = abs(log_scale[0]) + abs(log_scale[1]) + abs(log_scale[2]) + abs(opacity_logits[i])
+    if not size + raw < np.inf:
+        _mend(log_scale, opacity_logits, scale, opacities, adam_m, adam_v, i)
+        return
+    gain = np.float32(COLOUR_RELAXATION) / (contribution + np.float32(COLOUR_DAMPING))
+    for k in range(3):
+        color[k] = min(max(color[k] - gain * v_color[k], np.float32(-0.5)), np.float32(1.5))
+    for k in range(ADAM_PARAMETERS):
+        adam_m[k] += np.float32(1 - BETA1) * (g[k] - adam_m[k])
+        adam_v[k] += np.float32(1 - BETA2) * (g[k] * g[k] - adam_v[k])
+        g[k] = lengths[k] * adam_m[k] * corrections[0]
+        g[k] /= np.sqrt(adam_v[k] * corrections[1]) + np.float32(1e-8)
+    for k in range(3):
+        mean[k] -= pixel * g[k]
+        value = log_scale[k] - g[7 + k]
+        log_scale[k] = min(max(value, np.float32(LOG_SCALE_RANGE[0])), np.float32(LOG_SCALE_RANGE[1]))
+        scale[k] = math.exp(log_scale[k])
+    for k in range(4):
+        quat[k] -= g[3 + k]
+    value = opacity_logits[i] - g[10]
+    opacity_logits[i] = min(max(value, np.float32(LOGIT_RANGE[0])), np.float32(LOGIT_RANGE[1]))
+    opacities[i] = one / (one + math.exp(-opacity_logits[i]))
 
 
 @kernel
 def _mend(
-    log_scales: F32, opacity_logits: F32, scales: F32, opacities: F32, adam_m: F32, adam_v: F32, i: int
+    log_scale: F32, opacity_logits: F32, scale: F32, opacities: F32, adam_m: F32, adam_v: F32, i: int
 ) -> None:
     """Make a row's hidden state anew from what is drawn of it, which is known to be sound."""
-    adam_m[i] = 0
-    adam_v[i] = 0
+    adam_m[:] = 0
+    adam_v[:] = 0
     for k in range(3):
-        log_scales[i, k] = math.log(scales[i, k])
+        log_scale[k] = math.log(scale[k])
     opacity = min(opacities[i], np.float32(0.999))
     opacity_logits[i] = math.log(opacity / (np.float32(1) - opacity))
