@@ -475,7 +475,7 @@ def test_a_topic_that_says_too_little(beside_node: dict[str, Any]) -> None:
 
 
 def test_topic_tools_in_words_and_in_json(beside_node: dict[str, Any]) -> None:
-    listen = ("--seconds", "0.6")
+    listen = ("--seconds", "1.2")  # a busy machine delivers the first late
     rows = {row["topic"]: row for row in pure_json(sags("topic", "list", *listen, "--json").stdout)}
     assert 5 < rows["sags/left/depth"]["rate_hz"] < 20
     assert rows["sags/parameters"]["messages"] == 1 and rows["sags/parameters"]["rate_hz"] is None
