@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 
 import click
 
-from sags_node.apps.launching import as_json, open_launched, positive, split
-from sags_node.apps.terminal import check_file, progress, show, writing
+from sags_node.apps.launching import (
+    as_json,
+    check_files,
+    count_frames,
+    file_option,
+    launch_argument,
+    lpips_option,
+    open_launched,
+    positive,
+    split_recording,
+    table_option,
+    write_json,
+)
+from sags_node.apps.terminal import progress, show, writing
 from sags_node.errors import SagsError, UsageError
 
 
@@ -23,17 +34,9 @@ def bench() -> None:
 @click.option("--large", is_flag=True, help="Also a million Gaussians.")
 @click.option("--contention", is_flag=True, help="Also beside another process that burns one core.")
 @click.option("--no-twin", is_flag=True, help="Leave out the torch twins (most of the time, 10 GB).")
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path, dir_okay=False),
-    metavar="FILE.json",
-    help="Write the table as JSON, and a plot of the same name, .svg, beside it.",
-)
-@click.option(
-    "--check",
-    type=click.Path(path_type=Path, dir_okay=False),
-    metavar="FILE.json",
-    help="Compare with a table written by --out; fail if a kernel has become slower.",
+@file_option("--out", "FILE.json", "Write the table as JSON, and a plot of the same name, .svg, beside it.")
+@file_option(
+    "--check", "FILE.json", "Compare with a table written by --out; fail if a kernel has become slower."
 )
 @click.option(
     "--tolerance",
@@ -78,15 +81,14 @@ def bench_kernels(
         settings = replace(settings, counts=(*settings.counts, MILLION))
     settings = replace(settings, twin=not no_twin, contention=contention)
     if check is None:
-        if out is not None:
-            check_file(out)
+        check_files(out)
         with progress("measuring") as advance:
             measured = measure_kernels(settings, advance)
         for table in [measured] if json_out else report.tables(measured):
             show(table)
+        write_json(out, measured)
         if out is not None:
             with writing(out):
-                out.write_text(json.dumps(measured, indent=1) + "\n", encoding="utf-8")
                 out.with_suffix(".svg").write_text(report.plot(measured), encoding="utf-8")
         return
     if out is not None:
@@ -103,18 +105,8 @@ def bench_kernels(
 
 @bench.command("alias")
 @click.option("--quick", is_flag=True, help="A tiny scene and few steps: does it work, not how good is it.")
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path, dir_okay=False),
-    metavar="FILE.json",
-    help="Write the table as JSON.",
-)
-@click.option(
-    "--picture",
-    type=click.Path(path_type=Path, dir_okay=False),
-    metavar="FILE.png",
-    help="Draw the truth, both filters and none side by side.",
-)
+@table_option
+@file_option("--picture", "FILE.png", "Draw the truth, both filters and none side by side.")
 @as_json
 def bench_alias(quick: bool, out: Path | None, picture: Path | None, json_out: bool) -> None:
     """What both filters are worth at other sizes and distances.
@@ -129,64 +121,55 @@ def bench_alias(quick: bool, out: Path | None, picture: Path | None, json_out: b
     from sags_node.benchmark import alias_report
     from sags_node.benchmark.alias import QUICK, Settings, measure_alias
 
-    for file in (out, picture):
-        if file is not None:
-            check_file(file)
+    check_files(out, picture)
     with progress("measuring") as advance:
         measured = measure_alias(QUICK if quick else Settings(), advance)
     for table in [measured.table] if json_out else alias_report.tables(measured.table):
         show(table)
-    if out is not None:
-        with writing(out):
-            out.write_text(json.dumps(measured.table, indent=1) + "\n", encoding="utf-8")
+    write_json(out, measured.table)
     if picture is not None:
         with writing(picture):
             picture.write_bytes(alias_report.picture(measured.truth, measured.models))
 
 
 @bench.command("stream")
-@click.argument("launch", nargs=-1, metavar="[LAUNCH.yaml | SESSION] [key:=value ...]")
+@launch_argument
 @click.option(
-    "--seconds", type=positive, default=8.0, show_default=True, help="How long it plays, in a loop."
+    "--seconds",
+    type=positive,
+    default=8.0,
+    show_default=True,
+    help="Length of the stream, on the recording's clock; a shorter recording begins again.",
 )
 @click.option("--window", type=positive, default=2.0, show_default=True, help="Seconds the model looks back.")
 @click.option("--quick", is_flag=True, help="A tiny model: does it work, not how good is it.")
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path, dir_okay=False),
-    metavar="FILE.json",
-    help="Write the table as JSON.",
-)
+@table_option
 @as_json
 def bench_stream(
     launch: tuple[str, ...], seconds: float, window: float, quick: bool, out: Path | None, json_out: bool
 ) -> None:
     """Whether the SAGS model lasts over a stream that never ends.
 
-    A session, by default the built-in phantom, is played in a loop for several times the window that the
-    deformation field remembers. What leaves the window is folded into the Gaussians. Beside it: a model that
-    forgets it instead, and one whose window covers all. Second by second: PSNR on tissue of the newest frame
-    before and after it was learnt from and of earlier ones, the largest change of the picture as the window
-    moves, sizes and times. Takes some five minutes.
+    A session, by default the built-in phantom, is played frame by frame, however long each takes; --seconds
+    should be several times the --window that the deformation field remembers. What leaves the window is
+    folded into the Gaussians. Beside it: a model that forgets it instead, and one whose window covers all.
+    Second by second: PSNR on tissue of the newest frame before and after it was learnt from and of earlier
+    ones, the largest change of the picture as the window moves, sizes and times. Takes some five minutes.
 
     \b
-    sags bench stream launch/phantom.yaml --out benchmarks/results/stream.json
+    sags bench stream launch/phantom.yaml --seconds 6.5 --out benchmarks/results/stream.json
     """
     from dataclasses import replace
 
     from sags_node.benchmark import stream
-    from sags_node.config import V4l2Source, load_launch
     from sags_node.fitting.stream import QUICK, StreamSettings
 
-    path, overrides = split(launch)
-    if isinstance(load_launch(path, overrides).source, V4l2Source):
-        raise UsageError("sags bench stream plays recordings; live cameras do not come twice alike")
+    no_cameras = "sags bench stream plays recordings; live cameras do not come twice alike"
+    path, overrides = split_recording(launch, no_cameras)
     if seconds < window:
         raise UsageError(f"--seconds {seconds:g} is shorter than --window {window:g}: nothing would leave it")
-    if out is not None:
-        check_file(out)
-    with open_launched(path, overrides).source as source:
-        frames = max(1, round(source.rate * seconds))
+    check_files(out)
+    frames = count_frames(path, overrides, seconds)
     forced = ["source.loop:=true", "source.pace:=step", f"source.frames:={frames}"]
     session = open_launched(path, [*overrides, *forced])
     settings = replace(QUICK if quick else StreamSettings(), window=window)
@@ -194,13 +177,11 @@ def bench_stream(
         measured = stream.measure_stream(session, settings, advance)
     for table in [measured] if json_out else stream.tables(measured):
         show(table)
-    if out is not None:
-        with writing(out):
-            out.write_text(json.dumps(measured, indent=1) + "\n", encoding="utf-8")
+    write_json(out, measured)
 
 
 @bench.command("ablation")
-@click.argument("launch", nargs=-1, metavar="[LAUNCH.yaml | SESSION] [key:=value ...]")
+@launch_argument
 @click.option(
     "--warm-up", type=click.IntRange(0), default=300, show_default=True, help="Of the paper's schedule."
 )
@@ -210,13 +191,8 @@ def bench_stream(
 @click.option(
     "--hold-out", type=click.IntRange(2), default=8, show_default=True, help="Test on every so manieth."
 )
-@click.option("--lpips-weights", type=click.Path(path_type=Path), help="npz of LPIPS SqueezeNet weights.")
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path, dir_okay=False),
-    metavar="FILE.json",
-    help="Write the table as JSON.",
-)
+@lpips_option
+@table_option
 @as_json
 def bench_ablation(
     launch: tuple[str, ...],
@@ -237,20 +213,87 @@ def bench_ablation(
     sags bench ablation launch/d4d_pull.yaml --out benchmarks/results/ablation_d4d.json
     """
     from sags_node.benchmark import ablation
-    from sags_node.config import V4l2Source, load_launch
+    from sags_node.evaluation.measure import Options
 
-    path, overrides = split(launch)
-    if isinstance(load_launch(path, overrides).source, V4l2Source):
-        raise UsageError("sags bench ablation plays recordings; record the cameras first")
-    if out is not None:
-        check_file(out)
+    no_cameras = "sags bench ablation plays recordings; record the cameras first"
+    path, overrides = split_recording(launch, no_cameras)
+    options = Options(hold_out, lpips_weights=lpips_weights)
+    check_files(out)
     session = open_launched(path, [*overrides, "source.loop:=false", "source.pace:=step"])
     with progress("measuring") as advance:
-        measured = ablation.measure_ablation(session, warm_up, iterations, hold_out, lpips_weights, advance)
+        measured = ablation.measure_ablation(session, warm_up, iterations, options, advance)
     show(measured if json_out else ablation.table(measured))
-    if out is not None:
-        with writing(out):
-            out.write_text(json.dumps(measured, indent=1) + "\n", encoding="utf-8")
+    write_json(out, measured)
+
+
+@bench.command("pareto")
+@click.argument("launch", nargs=-1, metavar="[LAUNCH.yaml | SESSION]... [key:=value ...]")
+@click.option("--only", metavar="PARTS", help="Some of budgets,resolutions,gaussians,skips.")
+@click.option("--frames", type=click.IntRange(1), help="Of each recording; default: all.")
+@click.option(
+    "--repeat",
+    type=click.IntRange(1),
+    default=1,
+    show_default=True,
+    help="Play each setting so often; the run of middle speed counts.",
+)
+@click.option(
+    "--fit",
+    "fits",
+    multiple=True,
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE.json",
+    help="Figures of sags fit, for the session they name. Default: benchmarks/results/fit_*.json.",
+)
+@table_option
+@file_option("--plot", "FILE.png", "Draw the picture's quality over the time of a frame.")
+@as_json
+def bench_pareto(
+    launch: tuple[str, ...],
+    only: str | None,
+    frames: int | None,
+    repeat: int,
+    fits: tuple[Path, ...],
+    out: Path | None,
+    plot: Path | None,
+    json_out: bool,
+) -> None:
+    """Run time against error of the online mapper.
+
+    Plays recordings, by default the built-in phantom, with other time budgets, working sizes and numbers of
+    Gaussians than their launch files say, and with each rule that skips work on and off. Settings that no
+    other beats in both time and picture are marked. Beside them: the previous picture shown again, the left
+    picture warped into the right eye, stereo alone, and the offline fit.
+
+    A smaller working size is measured at that size, and once more at the launch file's, for which its
+    Gaussians are drawn there: the figure to compare. Takes three to five seconds per frame.
+
+    \b
+    sags bench pareto launch/d4d_pull.yaml launch/hamlyn_heart.yaml source.start:=1.6 --frames 60 \\
+        --out benchmarks/results/pareto.json --plot docs/pareto.png
+    """
+    from sags_node.benchmark import pareto_plot, pareto_report
+    from sags_node.benchmark.pareto import measure_pareto
+    from sags_node.benchmark.pareto_baselines import read_fits
+    from sags_node.benchmark.pareto_settings import PARTS, Sweep
+
+    overrides = [argument for argument in launch if ":=" in argument]
+    if frames is not None:
+        overrides.append(f"source.frames:={frames}")
+    alone = [[path, *overrides] for path in launch if ":=" not in path] or [overrides]
+    no_cameras = "sags bench pareto plays recordings; live cameras do not come twice alike"
+    paths = [split_recording(arguments, no_cameras)[0] for arguments in alone]
+    sweep = Sweep(PARTS if only is None else tuple(only.split(",")), repeat)
+    known_fits = read_fits(fits or sorted(Path("benchmarks/results").glob("fit_*.json")))
+    check_files(out, plot)
+    with progress("measuring") as advance:
+        measured = measure_pareto(paths, overrides, sweep, known_fits, advance)
+    for table in [measured] if json_out else pareto_report.tables(measured):
+        show(table)
+    write_json(out, measured)
+    if plot is not None:
+        with writing(plot):
+            plot.write_bytes(pareto_plot.picture(measured))
 
 
 @bench.command("transport")
@@ -263,7 +306,7 @@ def bench_transport(frames: int, json_out: bool) -> None:
     call to the arrival, at 30 frames per second. Takes 20 seconds.
     """
     from sags_node.apps.text import rows_table
-    from sags_node.apps.transport import measure_transport
+    from sags_node.benchmark.transport import measure_transport
 
     rows = measure_transport(frames)
     show(rows if json_out else rows_table(rows))

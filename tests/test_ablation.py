@@ -44,6 +44,26 @@ def test_all_variants_are_measured_on_the_same_frames(
     for name, row in found["variants"].items():
         assert row["heldout"]["frames"] == 1 and row["ahead"]["frames"] == ablation.AHEAD, name
         assert row["gaussians"] <= 800
+        used = found["settings"][name]
+        assert used["iterations"] == 3 and used["warm_up"] == (0 if used["schedule"] == "online" else 2)
         assert row["track"]["median_mm"] > 0 and row["track_with_ahead"]["median_mm"] > 0
     base, online = found["variants"]["base"]["heldout"], found["variants"]["online"]["heldout"]
     assert online["psnr"] > base["psnr"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (["source.frames:=2"], 1, ("2 frames", "0 are left to learn from and 0 to test on", "source.frames")),
+        (["source.frames:=4"], 1, ("4 frames", "1 are left to learn from and 0 to test on", "source.frames")),
+        (["source.start:=0.2", "source.frames:=9"], 1, ("6 are left", "0 to test on", "--hold-out")),
+        (["--lpips-weights", "gone.npz"], 2, ("gone.npz", "check the path")),
+    ],
+)
+def test_an_ablation_that_cannot_be_says_why(
+    phantom_session: Path, arguments: list[str], code: int, said: tuple[str, ...]
+) -> None:
+    result = CliRunner().invoke(main, ["bench", "ablation", str(phantom_session), *arguments])
+    assert result.exit_code == code, result.output
+    for part in said:
+        assert part in result.stderr

@@ -19,7 +19,7 @@ LAYERS = [
     {"fitting"},
     {"benchmark"},
     {"apps"},
-    {"cli_bench"},
+    {"cli_bench", "cli_consumers", "cli_offline"},
     {"cli"},
 ]
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}

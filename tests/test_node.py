@@ -40,11 +40,16 @@ class RunningNode:
         file = self.run_dir / "sags.json"
         deadline = time.monotonic() + START_SECONDS
         while not file.exists():
-            assert self.process.poll() is None, self.process.stderr.read()  # type: ignore[union-attr]
+            assert self.process.poll() is None, self.said()
             assert time.monotonic() < deadline, "the node did not start"
             time.sleep(0.05)
         self.connection = json.loads(file.read_text())
         self.data = next(e for e in self.connection["data"] if e.startswith("tcp"))
+
+    def said(self) -> str:
+        """Everything on stderr, once it has ended."""
+        assert self.process.stderr is not None
+        return self.process.stderr.read()
 
     def stop(self) -> int:
         if self.process.poll() is None:
@@ -193,7 +198,7 @@ def test_stopping_is_clean(phantom_session: Path, tmp_path: Path, stop: signal.S
     running.process.send_signal(stop)
     assert running.process.wait(20) == 0
     assert not (running.run_dir / "sags.json").exists()
-    assert "Traceback" not in running.process.stderr.read()  # type: ignore[union-attr]
+    assert "Traceback" not in running.said()
 
 
 def test_a_port_in_use_is_one_clear_message(phantom_session: Path, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@ shows nothing that is not finite, and finds back."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +19,7 @@ from sags_node.types import FrameResult, StereoFrame
 
 SESSION = Path(__file__).parent.parent / "replay/phantom_pull"
 CAP = 8000
+NUMBERS = itertools.count(1)  # of frames: a pipeline plays several times, and its time goes on
 Spoil = Callable[[StereoFrame, np.random.Generator], StereoFrame]
 
 
@@ -36,7 +38,7 @@ def play(pipeline: Pipeline, frames: list[StereoFrame]) -> list[FrameResult]:
     """Process frames with fresh numbers and stamps, checking each result."""
     results = []
     for frame in frames:
-        number = play.number = getattr(play, "number", 0) + 1  # type: ignore[attr-defined]
+        number = next(NUMBERS)
         stamp = number * 100_000_000
         result = pipeline.process(replace(frame, frame_id=number, t_capture_ns=stamp), StepBudget(1))
         check(result)

@@ -1,22 +1,38 @@
-"""What commands that open a session have in common."""
+"""What commands that open a session or keep figures have in common."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from sags_node.apps.terminal import console, progress
+from sags_node.apps.terminal import check_file, console, progress, writing
 from sags_node.errors import UsageError
 
 if TYPE_CHECKING:
     from sags_node.session import Session
 
+Command = TypeVar("Command", bound=Callable[..., Any])
+
 positive = click.FloatRange(min=0, min_open=True)
 
+launch_argument = click.argument("launch", nargs=-1, metavar="[LAUNCH.yaml | SESSION] [key:=value ...]")
 as_json = click.option("--json", "json_out", is_flag=True, help="Print JSON on stdout, for machines.")
+lpips_option = click.option(
+    "--lpips-weights", type=click.Path(path_type=Path), help="npz of LPIPS SqueezeNet weights."
+)
+
+
+def file_option(name: str, metavar: str, says: str) -> Callable[[Command], Command]:
+    """An option for one file, no folder."""
+    kind = click.Path(path_type=Path, dir_okay=False)
+    return click.option(name, type=kind, metavar=metavar, help=says)
+
+
+table_option = file_option("--out", "FILE.json", "Write the table as JSON.")
 
 
 def split(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
@@ -31,6 +47,20 @@ def split(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
     return (paths[0] if paths else None), overrides
 
 
+def split_recording(arguments: Sequence[str], no_cameras: str) -> tuple[str | None, list[str]]:
+    """`split`, for a command that cannot do with live cameras; `no_cameras` says what to do instead.
+
+    Raises:
+        UsageError: the source is live cameras, or the launch is wrong.
+    """
+    from sags_node.config import V4l2Source, load_launch
+
+    path, overrides = split(arguments)
+    if isinstance(load_launch(path, overrides).source, V4l2Source):
+        raise UsageError(no_cameras)
+    return path, overrides
+
+
 def open_launched(path: str | None, overrides: Sequence[str]) -> Session:
     """Open a session and make its kernels ready, saying what takes long."""
     from sags_node.session import open_session
@@ -41,3 +71,31 @@ def open_launched(path: str | None, overrides: Sequence[str]) -> Session:
     with console.status("loading kernels (compiled once per machine, about half a minute)"):
         warm_up(session.config)
     return session
+
+
+def count_frames(path: str | None, overrides: Sequence[str], seconds: float) -> int:
+    """How many frames a recording plays in so long."""
+    with open_launched(path, overrides).source as source:
+        return max(1, round(source.rate * seconds))
+
+
+def check_files(*files: Path | None) -> None:
+    """A long run must not end with nowhere to put its figures.
+
+    Raises:
+        SagsError: one of the files that were asked for cannot be written.
+    """
+    for file in files:
+        if file is not None:
+            check_file(file)
+
+
+def write_json(file: Path | None, figures: Any) -> None:
+    """Keep figures, if a file was asked for.
+
+    Raises:
+        SagsError: it cannot be written.
+    """
+    if file is not None:
+        with writing(file):
+            file.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")

@@ -8,15 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
-from pathlib import Path
 from typing import Any
 
 from rich.table import Table
 
 from sags_node.engine.threads import configure_threads
+from sags_node.errors import SagsError
 from sags_node.evaluation.lpips import Lpips
 from sags_node.evaluation.machine import machine_name
-from sags_node.fitting.clip import Clip, read_clip
+from sags_node.evaluation.measure import Options
+from sags_node.fitting.clip import Clip, ClipFrame, read_clip
 from sags_node.fitting.fit import Fit
 from sags_node.fitting.score import score, score_depth, score_tracks
 from sags_node.fitting.settings import FitSettings
@@ -43,44 +44,36 @@ Advance = Callable[[int, int | None, str], None]  # done, of, what
 
 
 def measure_ablation(
-    session: Session,
-    warm_up: int,
-    iterations: int,
-    hold_out: int,
-    lpips_weights: Path | None,
-    advance: Advance,
+    session: Session, warm_up: int, iterations: int, options: Options, advance: Advance
 ) -> dict[str, Any]:
     """Fit and measure every variant.
 
     Args:
-        session: a recording of more than `AHEAD` training frames.
-        warm_up, iterations: of each fit.
-        hold_out: every so manieth frame is for testing only.
-        lpips_weights: npz of LPIPS weights; None: no LPIPS.
+        session: a recording.
+        warm_up: iterations of each fit without deformation; only of the paper's schedule.
+        iterations: of each fit, with deformation.
+        options: hold-out and LPIPS weights.
         advance: called with what is going on.
 
     Returns:
         The table, keys as benchmarks/README.md lists them.
 
     Raises:
-        SagsError: the recording cannot be read, or no frame has depth enough.
+        SagsError: the recording cannot be read or is too short, or no frame has depth enough.
     """
-    lpips = None if lpips_weights is None else Lpips(lpips_weights)
+    lpips = None if options.lpips_weights is None else Lpips(options.lpips_weights)
     configure_threads(session.config.engine.threads)
     count = session.source.frame_count
-    clip = read_clip(
-        session, lambda i: i > 0 and (i - 1) % hold_out == 0, lambda done: advance(done, count, "reading")
-    )
-    first_ahead = sorted(frame.frame_id for frame in (*clip.train, *clip.test))[-AHEAD]
-    known = Clip(
-        [frame for frame in clip.train if frame.frame_id < first_ahead],
-        [frame for frame in clip.test if frame.frame_id < first_ahead],
-    )
-    everything = sorted((*clip.train, *clip.test), key=lambda frame: frame.frame_id)
-    ahead = everything[-AHEAD:]
+    clip = read_clip(session, options.holds_out, lambda done: advance(done, count, "reading"))
+    known, ahead = _split(clip)
+    known_frames = _by_time(known)
+    chosen = {
+        name: replace(settings, warm_up=warm_up if settings.schedule == "paper" else 0, iterations=iterations)
+        for name, settings in VARIANTS.items()
+    }
     variants = {}
-    for name, chosen in VARIANTS.items():
-        fit = Fit(known, replace(chosen, warm_up=warm_up, iterations=iterations))
+    for name, settings in chosen.items():
+        fit = Fit(known, settings)
         advance(0, None, f"{name}: starting")
         fit.start(lambda what, done, of: advance(done, of, what))
         started = fit.seconds
@@ -90,9 +83,9 @@ def measure_ablation(
         variants[name] = {
             "heldout": score(fit, known.test, session.config.segments, lpips),
             "ahead": score(fit, ahead, {}, lpips),
-            "depth": score_depth(fit, everything[:-AHEAD], session.config.segments),
-            "track": score_tracks(fit, everything[:-AHEAD]),
-            "track_with_ahead": score_tracks(fit, [everything[0], *ahead]),
+            "depth": score_depth(fit, known_frames, session.config.segments),
+            "track": score_tracks(fit, known_frames),
+            "track_with_ahead": score_tracks(fit, [known_frames[0], *ahead]),
             "gaussians": len(fit.model),
             "ms_per_iteration": round(1e3 * (fit.seconds - started) / fit.total, 1),
             "seconds": round(fit.seconds, 1),
@@ -101,10 +94,31 @@ def measure_ablation(
         "session": session.name,
         "warm_up": warm_up,
         "iterations": iterations,
-        "settings": {name: asdict(chosen) for name, chosen in VARIANTS.items()},
+        "settings": {name: asdict(settings) for name, settings in chosen.items()},
         "machine": machine_name(),
         "variants": variants,
     }
+
+
+def _by_time(clip: Clip) -> list[ClipFrame]:
+    return sorted((*clip.train, *clip.test), key=lambda frame: frame.frame_id)
+
+
+def _split(clip: Clip) -> tuple[Clip, list[ClipFrame]]:
+    """The clip without its last frames, and those."""
+    frames = _by_time(clip)
+    ahead = {frame.frame_id for frame in frames[-AHEAD:]}
+    known = Clip(
+        [frame for frame in clip.train if frame.frame_id not in ahead],
+        [frame for frame in clip.test if frame.frame_id not in ahead],
+    )
+    if not known.train or not known.test:
+        raise SagsError(
+            f"there are {len(frames)} frames; without the last {AHEAD}, which are for looking ahead, "
+            f"{len(known.train)} are left to learn from and {len(known.test)} to test on, and each needs "
+            "one: play more (source.frames, source.start) or change --hold-out"
+        )
+    return known, frames[-AHEAD:]
 
 
 def table(measured: dict[str, Any]) -> Table:

@@ -20,26 +20,22 @@ from sags_node.engine.photometric import PhotometricLoss
 from sags_node.engine.rasterize import make_rasterizer
 from sags_node.fitting.clip import Clip, ClipFrame
 from sags_node.fitting.density import EVERY, Density
+from sags_node.fitting.field import make_box, make_decoder, make_field, row_rates
 from sags_node.fitting.settings import FitSettings
 from sags_node.fitting.start import Progress, follow_online, learn_paths, pooled_rows, remainder
 from sags_node.mapping.mapper import DEPTH_SCALE, DEPTH_WEIGHT
+from sags_node.mapping.optimiser import COLOUR_RELAXATION, Rates
 from sags_node.model import columns
-from sags_node.model.decoder import Decoder, DecoderConfig
 from sags_node.model.deformable import DeformableModel
-from sags_node.model.deformation import spread_nodes
 from sags_node.model.exposure import Exposure
-from sags_node.model.field import Deltas, Field, NodeField, PointField
+from sags_node.model.field import Deltas, Field, NodeField
 from sags_node.model.hexplane import HexPlaneField
 from sags_node.model.residuals import Residuals
-from sags_node.types import F32, F64, Gaussians
+from sags_node.types import F32, Gaussians
 
-NODES = 512
-BOX_QUANTILE = 1e-3  # of the Gaussians beyond the field's box on either side: strays must not blow it up
-LOG_SCALE_RATE, QUAT_RATE, COLOR_RATE, LOGIT_RATE = 5e-3, 1e-3, 2.5e-3, 0.05  # EndoGaussian, SAGS
 EXPOSURE_RATE = 2e-3
 DENSIFY_UNTIL = 0.5  # of the iterations
-COLOR_RELAXATION = 1.6  # of SIRT; 0 < value < 2 converges
-REFINE_QUAT_RATE, REFINE_LOGIT_RATE = 2.5e-3, 7.5e-3  # gentle: the start is good
+REFINE_RATES = Rates()  # the mapper's, gentle: the start is good
 REFINE_FIELD_SHARE = 0.003  # of the field's rates, which are for learning from nothing
 REFINE_DECAY = 0.1
 
@@ -64,16 +60,11 @@ class Fit:
         self._order: list[int] = []
         known = first.depth[first.depth > 0]
         pixel = float(np.median(known)) / float(first.camera.K[0, 0]) if known.size else 1e-4
-        self._rates = np.empty(columns.COUNT, np.float32)
-        self._rates[columns.MEAN] = settings.mean_px * pixel
-        self._rates[columns.LOG_SCALE] = LOG_SCALE_RATE
-        self._rates[columns.QUAT] = QUAT_RATE
-        self._rates[columns.COLOR] = COLOR_RATE
-        self._rates[columns.LOGIT] = LOGIT_RATE
+        self._rates = row_rates(settings.mean_px * pixel)
         self._refine_rates = self._rates.copy()
-        self._refine_rates[columns.QUAT] = REFINE_QUAT_RATE
-        self._refine_rates[columns.COLOR] = 0
-        self._refine_rates[columns.LOGIT] = REFINE_LOGIT_RATE
+        self._refine_rates[columns.QUAT] = REFINE_RATES.quat
+        self._refine_rates[columns.COLOR] = 0  # which has its closed form
+        self._refine_rates[columns.LOGIT] = REFINE_RATES.opacity_logit
 
     def start(self, progress: Progress) -> None:
         """Make the model.
@@ -161,7 +152,7 @@ class Fit:
         self.model.refine(
             gradients,
             self._refine_rates * np.float32(share),
-            COLOR_RELAXATION * math.sqrt(share),  # less and less, so that frames average out
+            COLOUR_RELAXATION * math.sqrt(share),  # less and less, so that frames average out
             self.settings.field_rates.scaled(REFINE_FIELD_SHARE * share),
         )
         self.iteration += 1
@@ -268,22 +259,8 @@ class Fit:
         settings = self.settings
         times = [frame.t_capture_ns for frame in (*self.clip.train, *self.clip.test)]
         hexplane = HexPlaneField.for_clip(
-            _box(means), min(times), max(times), settings.slots,
+            make_box(means), min(times), max(times), settings.slots,
             cells=settings.cells, levels=settings.levels, channels=settings.channels, seed=settings.seed,
         )  # fmt: skip
-        config = DecoderConfig(
-            settings.tokens,
-            features=hexplane.grid.features,
-            levels=settings.levels if settings.tokens == "planes" else 1,
-        )
-        deltas = Deltas(hexplane, Decoder(config, settings.seed), settings.adaptive)
-        return (
-            NodeField(deltas, spread_nodes(means, NODES))
-            if settings.tokens == "nodes"
-            else PointField(deltas)
-        )
-
-
-def _box(means: F32) -> F64:
-    low, high = np.quantile(means, [BOX_QUANTILE, 1 - BOX_QUANTILE], axis=0)
-    return np.array([low, np.maximum(high, low + 1e-3)])
+        decoder = make_decoder(hexplane, settings.tokens, settings.seed)
+        return make_field(Deltas(hexplane, decoder, settings.adaptive), means, settings.tokens)

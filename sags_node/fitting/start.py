@@ -83,14 +83,21 @@ def _random_points(frame: ClipFrame, exposure: Exposure, rng: np.random.Generato
 
 def _neighbour_distance(points: F32) -> F32:
     """Root mean square distance [N] m to the three nearest others."""
+    _, squared = _nearest(points, points, 4)  # the nearest is the point itself
+    distances: F32 = np.sqrt(np.maximum(squared[:, 1:].mean(1), 1e-10))
+    return distances
+
+
+def _nearest(points: F32, queries: F32, count: int) -> tuple[I64, F32]:
+    """The points nearest to each query, at most `count`: indices and squared distances, [M, count]."""
     import open3d as o3d  # takes seconds to import
 
-    places = o3d.core.Tensor.from_numpy(points)
-    index = o3d.core.nns.NearestNeighborSearch(places)
-    index.knn_index()
-    _, squared = index.knn_search(places, min(4, len(points)))
-    distances: F32 = np.sqrt(np.maximum(squared.numpy()[:, 1:].mean(1), 1e-10))
-    return distances
+    search = o3d.core.nns.NearestNeighborSearch(o3d.core.Tensor.from_numpy(np.ascontiguousarray(points)))
+    search.knn_index()
+    found, squared = search.knn_search(
+        o3d.core.Tensor.from_numpy(np.ascontiguousarray(queries)), min(count, len(points))
+    )
+    return found.numpy(), squared.numpy()
 
 
 def follow_online(
@@ -155,23 +162,13 @@ class _Places:
         new = means[~known].copy()
         if known.any() and len(new):
             displacement = means[known] - self._places[ids[known]]
-            new -= displacement[_nearest(means[known], new)].mean(axis=1)
+            carriers, _ = _nearest(means[known], new, CARRIERS)
+            new -= displacement[carriers].mean(axis=1)
         self._places[ids[~known]], self._known[ids[~known]] = new, True
 
     def of(self, ids: I64) -> F32:
         """Places [N, 3] m of Gaussians that were added."""
         return self._places[ids]
-
-
-def _nearest(points: F32, queries: F32) -> I64:
-    """The points nearest to each query, [M, CARRIERS]."""
-    import open3d as o3d
-
-    search = o3d.core.nns.NearestNeighborSearch(o3d.core.Tensor.from_numpy(np.ascontiguousarray(points)))
-    search.knn_index()
-    found, _ = search.knn_search(o3d.core.Tensor.from_numpy(queries), min(CARRIERS, len(points)))
-    index: I64 = found.numpy()
-    return index
 
 
 def learn_paths(field: Field, rows: F32, paths: Paths, settings: FitSettings, progress: Progress) -> None:

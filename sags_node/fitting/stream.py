@@ -16,27 +16,23 @@ from sags_node.engine.photometric import LossWeights, PhotometricLoss
 from sags_node.engine.rasterize import make_rasterizer
 from sags_node.errors import SagsError
 from sags_node.fitting.clip import ClipFrame
+from sags_node.fitting.field import make_box, make_decoder, make_field, row_rates
 from sags_node.fitting.settings import Tokens
 from sags_node.mapping import densify, initialise
 from sags_node.mapping.mapper import MIN_FIRST_DEPTHS
 from sags_node.model import columns
 from sags_node.model.activation import deactivate
-from sags_node.model.decoder import Decoder, DecoderConfig
-from sags_node.model.deformation import spread_nodes
-from sags_node.model.field import Deltas, Field, FieldRates, NodeField, PointField
+from sags_node.model.field import Deltas, Field, FieldRates
 from sags_node.model.gaussians import GaussianModel
 from sags_node.model.hexplane import HexPlaneField
 from sags_node.model.window import WindowModel, awaken
 from sags_node.types import F32, I32, I64, Camera, Gaussians, Observation
 
-NODES = 512
-BOX_QUANTILE = 1e-3  # of the first Gaussians beyond the field's box on either side
 MOST_KEPT = 64  # frames, at any frame rate
 FIRST_STEPS, FIRST_SPEED = 30, 4.0  # on the first frame, without deformation; times the learning rates
 TIDY_EVERY = 3  # frames between two looks for holes and for what is transparent
 MIN_LOGIT = float(np.log(densify.MIN_OPACITY / (1 - densify.MIN_OPACITY)))
 MEAN_PX = 0.08  # learning rate of the means, in px at the tissue's median depth
-LOG_SCALE_RATE, QUAT_RATE, COLOR_RATE, LOGIT_RATE = 5e-3, 1e-3, 2.5e-3, 0.05  # EndoGaussian, SAGS
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,20 +139,14 @@ class StreamFit:
         self._drawn_ns = np.full(len(rows), frame.t_capture_ns)
         self._model = WindowModel(rows, self._make_field(rows[:, columns.MEAN], frame.t_capture_ns))
         pixel = float(np.median(depths)) / float(frame.camera.K[0, 0])  # m
-        self._rates = np.empty(columns.COUNT, np.float32)
-        self._rates[columns.MEAN] = MEAN_PX * pixel
-        self._rates[columns.LOG_SCALE] = LOG_SCALE_RATE
-        self._rates[columns.QUAT] = QUAT_RATE
-        self._rates[columns.COLOR] = COLOR_RATE
-        self._rates[columns.LOGIT] = LOGIT_RATE
+        self._rates = row_rates(MEAN_PX * pixel)
         for _ in range(FIRST_STEPS):
             self._step(frame, FIRST_SPEED, deformed=False)
 
     def _make_field(self, means: F32, t0_ns: int) -> Field:
         settings = self.settings
-        low, high = np.quantile(means, [BOX_QUANTILE, 1 - BOX_QUANTILE], axis=0)
         hexplane = HexPlaneField(
-            np.array([low, np.maximum(high, low + 1e-3)]),
+            make_box(means),
             t0_ns,
             round(settings.slot * 1e9),
             # One more: the newest slot lies up to one slot after the newest frame.
@@ -166,13 +156,9 @@ class StreamFit:
             channels=settings.channels,
             seed=settings.seed,
         )
-        levels = settings.levels if settings.tokens == "planes" else 1
-        decoder = Decoder(DecoderConfig(settings.tokens, hexplane.grid.features, levels), settings.seed)
+        decoder = make_decoder(hexplane, settings.tokens, settings.seed)
         awaken(decoder, settings.seed)
-        deltas = Deltas(hexplane, decoder)
-        if settings.tokens == "nodes":
-            return NodeField(deltas, spread_nodes(means, NODES))
-        return PointField(deltas)
+        return make_field(Deltas(hexplane, decoder), means, settings.tokens)
 
     def _step(self, frame: ClipFrame, speed: float = 1.0, deformed: bool = True) -> None:
         model, observation = self.model, frame.observation()
