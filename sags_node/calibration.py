@@ -89,8 +89,13 @@ def save_rig(rig: StereoRig, folder: Path) -> None:
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     for side, eye in (("left", rig.left), ("right", rig.right)):
-        text = yaml.safe_dump(_eye_to_tree(eye, side), sort_keys=False, default_flow_style=None)
-        (folder / f"{side}.yaml").write_text(text, encoding="utf-8")
+        (folder / f"{side}.yaml").write_text(eye_text(eye, side), encoding="utf-8")
+
+
+def eye_text(eye: Eye, name: str) -> str:
+    """The content of `left.yaml` or `right.yaml`: one eye as a ROS camera_info file."""
+    text: str = yaml.safe_dump(_eye_to_tree(eye, name), sort_keys=False, default_flow_style=None)
+    return text
 
 
 def _eye_to_tree(eye: Eye, side: str) -> dict[str, Any]:

@@ -269,7 +269,7 @@ def bench_pareto(
     Gaussians are drawn there: the figure to compare. Takes three to five seconds per frame.
 
     \b
-    sags bench pareto launch/d4d_pull.yaml launch/hamlyn_heart.yaml source.start:=1.6 --frames 60 \\
+    sags bench pareto launch/d4d_pull.yaml launch/phantom.yaml source.start:=2 --frames 50 \\
         --out benchmarks/results/pareto.json --plot docs/pareto.png
     """
     from sags_node.benchmark import pareto_plot, pareto_report

@@ -111,6 +111,26 @@ class ScaredSource(RecordedSource):
     folder: Path = Field(description="dataset_D/keyframe_K, holds endoscope_calibration.yaml and data/")
 
 
+class BagSource(RecordedSource):
+    """A ROS recording: rosbag2 folder or file (MCAP, db3) or ROS 1 .bag; docs/recordings.md says more."""
+
+    kind: Literal["bag"] = "bag"
+    path: Path = Field(description="folder with metadata.yaml, or a .mcap, .db3 or .bag file")
+    left: str | None = Field(None, description="picture topic; default: guessed, e.g. /<rig>/left/image_raw")
+    right: str | None = None
+    left_info: str | None = Field(None, description="camera_info topic; default: beside the pictures'")
+    right_info: str | None = None
+    tolerance: float = Field(0.02, gt=0, description="s; how far the stamps of a pair may lie apart")
+
+
+class DvrkSource(RecordedSource):
+    """A session of dVRK's `record`: side-by-side MP4 and its sidecar JSON."""
+
+    kind: Literal["dvrk"] = "dvrk"
+    path: Path = Field(description="the sidecar .json, or a folder with one stereo video in it")
+    side_by_side: Literal["LR", "RL"] | None = Field(None, description="default: what the sidecar says")
+
+
 class PhantomSource(RecordedSource):
     """The built-in synthetic session; rendered once into the cache folder, then replayed."""
 
@@ -147,6 +167,8 @@ Source = Annotated[
     | PanesSource
     | EndoNerfSource
     | ScaredSource
+    | BagSource
+    | DvrkSource
     | PhantomSource
     | V4l2Source,
     Field(discriminator="kind"),
@@ -235,8 +257,11 @@ class LaunchConfig(Section):
 
 # ---- reading ---------------------------------------------------------------------------------------------
 
-_PATH_KEYS = ("rig", "folder", "video", "left", "right", "tools", "poses", "depth", "tracks", "key", "allow")
+_PATH_KEYS = ("rig", "folder", "path", "video", "left", "right", "tools", "poses", "depth", "tracks", "key", "allow")
 DEFAULT_DATA = "../shared/data"
+BAG_SUFFIXES = (".mcap", ".db3", ".bag")
+SIDECAR_TYPE = "dvrk_data:video_sidecar@"
+SIDECAR_LOOK = 65536  # bytes at either end; jsoncpp sorts the keys, so the type comes after the frames
 
 
 def load_launch(path: Path | str | None = None, overrides: Sequence[str] = ()) -> LaunchConfig:
@@ -271,9 +296,15 @@ def load_launch(path: Path | str | None = None, overrides: Sequence[str] = ()) -
 
 
 def _known_recording(folder: Path) -> dict[str, Any] | None:
-    """How to play a folder that is no session of ours but has the layout of a research data set."""
+    """How to play a file or folder that is no session of ours but a ROS bag, a dVRK session or a research data
+    set."""
     if (folder / "launch.yaml").exists():
         return None
+    is_folder = folder.is_dir()
+    if folder.suffix in BAG_SUFFIXES or (folder / "metadata.yaml").is_file() or any(folder.glob("*.mcap")):
+        return {"source": {"kind": "bag", "path": str(folder)}}
+    if any(_is_sidecar(file) for file in (folder.glob("*.json") if is_folder else [folder])):
+        return {"source": {"kind": "dvrk", "path": str(folder)}}
     if (folder / "poses_bounds.npy").is_file() or all(
         (folder / name).is_dir() for name in ("images", "masks")
     ):
@@ -285,6 +316,16 @@ def _known_recording(folder: Path) -> dict[str, Any] | None:
             "vision": {"tissue": {"method": "none"}},
         }
     return None
+
+
+def _is_sidecar(file: Path) -> bool:
+    """Whether this describes a video of dVRK's `record`; its type stands at the beginning or the end."""
+    if file.suffix != ".json" or not file.is_file():
+        return False
+    with file.open("rb") as opened:
+        start = opened.read(SIDECAR_LOOK)
+        opened.seek(max(0, file.stat().st_size - SIDECAR_LOOK))
+        return SIDECAR_TYPE.encode() in start + opened.read(SIDECAR_LOOK)
 
 
 def with_parameters(config: LaunchConfig, parameters: Mapping[str, Any]) -> LaunchConfig:
@@ -416,6 +457,8 @@ _SOURCES: dict[str, type[Section]] = {
     "panes": PanesSource,
     "endonerf": EndoNerfSource,
     "scared": ScaredSource,
+    "bag": BagSource,
+    "dvrk": DvrkSource,
     "phantom": PhantomSource,
     "v4l2": V4l2Source,
 }

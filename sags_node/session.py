@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sags_node.calibration import load_rig
-from sags_node.config import EndoNerfSource, LaunchConfig, PhantomSource, load_launch
+from sags_node.config import BagSource, EndoNerfSource, LaunchConfig, PhantomSource, load_launch
 from sags_node.errors import UsageError
 from sags_node.sources.source import Source, open_source, recorded_rig
 from sags_node.types import StereoRig
@@ -62,6 +62,8 @@ def _name(launch: Path | str | None) -> str:
 
 def _rig(config: LaunchConfig) -> StereoRig:
     """The calibration that comes with the recording, or the one that the launch file names."""
+    if config.rig is not None and isinstance(config.source, BagSource):
+        return load_rig(config.rig)  # what drivers write into bags is often uncalibrated, or of another day
     recorded = recorded_rig(config.source)
     if recorded is not None and config.rig is not None:
         raise UsageError(f"rig: {config.rig} is one calibration too many: the recording brings its own")

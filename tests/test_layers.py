@@ -9,7 +9,9 @@ LAYERS = [
     {"geometry", "config"},
     {"calibration"},
     {"phantom"},
-    {"sources", "vision", "engine", "messaging"},
+    {"vision", "engine", "messaging"},
+    {"recording"},
+    {"sources"},
     {"model"},
     {"mapping"},
     {"pipeline"},
@@ -20,6 +22,7 @@ LAYERS = [
     {"benchmark"},
     {"apps"},
     {"cli_bench", "cli_consumers", "cli_offline"},
+    {"cli_bag"},
     {"cli"},
 ]
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}

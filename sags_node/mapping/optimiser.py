@@ -36,6 +36,7 @@ BETA1, BETA2 = 0.5, 0.99  # low momentum: a few steps per frame must not coast
 MIN_CONTRIBUTION = 1e-3  # px: rows that were not seen are not touched
 LOG_SCALE_RANGE = (math.log(1e-6), math.log(5e-3))  # m
 LOGIT_RANGE = (-6.0, 6.0)
+PIECE = 1024  # rows a thread takes at a time: a call for each row would count references to every array
 
 
 class Optimiser:
@@ -74,63 +75,64 @@ def _step(
     v_means: F32, v_quats: F32, v_scales: F32, v_opacities: F32, v_colors: F32, contribution: F32,
     lengths: F32, view_z: F32, focal: float, corrections: F32,
 ) -> None:  # fmt: skip
-    for i in prange(len(means)):
-        if contribution[i] > MIN_CONTRIBUTION:
-            mean = means[i]
-            z = view_z[0] * mean[0] + view_z[1] * mean[1] + view_z[2] * mean[2] + view_z[3]
-            _step_one(
-                mean, quats[i], log_scales[i], opacity_logits, scales[i], opacities, colors[i],
-                adam_m[i], adam_v[i],
-                v_means[i], v_quats[i], v_scales[i], v_opacities[i], v_colors[i], contribution[i],
-                lengths, np.float32(abs(z) / focal), corrections, i,
-            )  # fmt: skip
+    for piece in prange(-(-len(means) // PIECE)):
+        first = np.int64(piece) * PIECE
+        _step_rows(
+            means, quats, log_scales, opacity_logits, scales, opacities, colors, adam_m, adam_v,
+            v_means, v_quats, v_scales, v_opacities, v_colors, contribution,
+            lengths, view_z, focal, corrections, first, min(first + PIECE, len(means)),
+        )  # fmt: skip
 
 
 @kernel
-def _step_one(
-    mean: F32, quat: F32, log_scale: F32, opacity_logits: F32, scale: F32, opacities: F32, color: F32,
+def _step_rows(
+    means: F32, quats: F32, log_scales: F32, opacity_logits: F32, scales: F32, opacities: F32, colors: F32,
     adam_m: F32, adam_v: F32,
-    v_mean: F32, v_quat: F32, v_scale: F32, v_opacity: Any, v_color: F32, contribution: Any,
-    lengths: F32, pixel: Any, corrections: F32, i: int,
+    v_means: F32, v_quats: F32, v_scales: F32, v_opacities: F32, v_colors: F32, contribution: F32,
+    lengths: F32, view_z: F32, focal: Any, corrections: F32, first: Any, end: Any,
 ) -> None:  # fmt: skip
-    """One row. `pixel`: metres that a pixel spans at the Gaussian's depth."""
     one = np.float32(1)
     g = np.empty(ADAM_PARAMETERS, np.float32)
-    for k in range(3):
-        g[k] = v_mean[k]
-        g[7 + k] = v_scale[k] * scale[k]  # by log scale
-    for k in range(4):
-        g[3 + k] = v_quat[k]
-    g[10] = v_opacity * opacities[i] * (one - opacities[i])  # by logit
-    size = contribution
-    for k in range(ADAM_PARAMETERS):
-        size += abs(g[k])
-    for k in range(3):
-        size += abs(v_color[k])
-    for k in range(ADAM_PARAMETERS):
-        size += abs(adam_m[k]) + abs(adam_v[k])
-    raw = abs(log_scale[0]) + abs(log_scale[1]) + abs(log_scale[2]) + abs(opacity_logits[i])
-    if not size + raw < np.inf:
-        _mend(log_scale, opacity_logits, scale, opacities, adam_m, adam_v, i)
-        return
-    gain = np.float32(COLOUR_RELAXATION) / (contribution + np.float32(COLOUR_DAMPING))
-    for k in range(3):
-        color[k] = min(max(color[k] - gain * v_color[k], np.float32(-0.5)), np.float32(1.5))
-    for k in range(ADAM_PARAMETERS):
-        adam_m[k] += np.float32(1 - BETA1) * (g[k] - adam_m[k])
-        adam_v[k] += np.float32(1 - BETA2) * (g[k] * g[k] - adam_v[k])
-        g[k] = lengths[k] * adam_m[k] * corrections[0]
-        g[k] /= np.sqrt(adam_v[k] * corrections[1]) + np.float32(1e-8)
-    for k in range(3):
-        mean[k] -= pixel * g[k]
-        value = log_scale[k] - g[7 + k]
-        log_scale[k] = min(max(value, np.float32(LOG_SCALE_RANGE[0])), np.float32(LOG_SCALE_RANGE[1]))
-        scale[k] = math.exp(log_scale[k])
-    for k in range(4):
-        quat[k] -= g[3 + k]
-    value = opacity_logits[i] - g[10]
-    opacity_logits[i] = min(max(value, np.float32(LOGIT_RANGE[0])), np.float32(LOGIT_RANGE[1]))
-    opacities[i] = one / (one + math.exp(-opacity_logits[i]))
+    for i in range(first, end):
+        if not contribution[i] > MIN_CONTRIBUTION:
+            continue
+        for k in range(3):
+            g[k] = v_means[i, k]
+            g[7 + k] = v_scales[i, k] * scales[i, k]  # by log scale
+        for k in range(4):
+            g[3 + k] = v_quats[i, k]
+        g[10] = v_opacities[i] * opacities[i] * (one - opacities[i])  # by logit
+        size = contribution[i]
+        for k in range(ADAM_PARAMETERS):
+            size += abs(g[k]) + abs(adam_m[i, k]) + abs(adam_v[i, k])
+        for k in range(3):
+            size += abs(v_colors[i, k]) + abs(log_scales[i, k])
+        if not size + abs(opacity_logits[i]) < np.inf:
+            _mend(log_scales[i], opacity_logits, scales[i], opacities, adam_m[i], adam_v[i], i)
+            continue
+        gain = np.float32(COLOUR_RELAXATION) / (contribution[i] + np.float32(COLOUR_DAMPING))
+        for k in range(3):
+            color = colors[i, k] - gain * v_colors[i, k]
+            colors[i, k] = min(max(color, np.float32(-0.5)), np.float32(1.5))
+        for k in range(ADAM_PARAMETERS):
+            adam_m[i, k] += np.float32(1 - BETA1) * (g[k] - adam_m[i, k])
+            adam_v[i, k] += np.float32(1 - BETA2) * (g[k] * g[k] - adam_v[i, k])
+            g[k] = lengths[k] * adam_m[i, k] * corrections[0]
+            g[k] /= np.sqrt(adam_v[i, k] * corrections[1]) + np.float32(1e-8)
+        z = view_z[0] * means[i, 0] + view_z[1] * means[i, 1] + view_z[2] * means[i, 2] + view_z[3]
+        pixel = np.float32(abs(z) / focal)  # metres that a pixel spans at the Gaussian's depth
+        for k in range(3):
+            means[i, k] -= pixel * g[k]
+            value = log_scales[i, k] - g[7 + k]
+            value = min(max(value, np.float32(LOG_SCALE_RANGE[0])), np.float32(LOG_SCALE_RANGE[1]))
+            log_scales[i, k] = value
+            scales[i, k] = math.exp(value)
+        for k in range(4):
+            quats[i, k] -= g[3 + k]
+        value = opacity_logits[i] - g[10]
+        value = min(max(value, np.float32(LOGIT_RANGE[0])), np.float32(LOGIT_RANGE[1]))
+        opacity_logits[i] = value
+        opacities[i] = one / (one + math.exp(-value))
 
 
 @kernel

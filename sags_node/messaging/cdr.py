@@ -30,6 +30,7 @@ IMAGE_ENCODINGS: dict[str, tuple[DType, int]] = {  # ROS name: dtype, channels
     "mono8": ("uint8", 1),
     "32FC1": ("float32", 1),
 }
+COMPRESSED = "sensor_msgs/msg/CompressedImage"
 PACKED_FIELDS = ("id", "rgb")  # 32-bit words that are no numbers on a scale
 _POINT_FIELD_UINT32, _POINT_FIELD_FLOAT32 = 6, 7
 
@@ -66,9 +67,56 @@ def parse(message: Message) -> Any:
     if message.meta.type_hash != type_hash(name):
         raise WireError(f"{message.topic}: another version of {name} than ours")
     try:
-        return _store.deserialize_cdr(message.cdr(), name)
+        return decode(message.cdr(), name)
+    except WireError as error:
+        raise WireError(f"{message.topic}: {error}") from None
+
+
+def knows(type_name: str) -> bool:
+    """Whether this is a stock ROS 2 type."""
+    return type_name in _store.fielddefs
+
+
+@cache
+def definition(type_name: str) -> str:
+    """The `ros2msg` text of a stock type and of all that it is made of."""
+    return str(_store.generate_msgdef(type_name, ros_version=2)[0])
+
+
+def decode(data: Buffer, type_name: str) -> Any:
+    """The ROS message object in the CDR of a stock type; its arrays lie in `data`.
+
+    Raises:
+        WireError: the CDR is damaged.
+    """
+    try:
+        return _store.deserialize_cdr(data, type_name)
     except (SerdeError, ValueError, UnicodeError) as error:
-        raise WireError(f"{message.topic}: damaged {name}: {error}") from None
+        raise WireError(f"damaged {type_name}: {error}") from None
+
+
+def from_ros1(raw: bytes, type_name: str) -> bytes:
+    """The CDR of a ROS 1 message; one of a type that is not stock stays as it is.
+
+    Raises:
+        WireError: it is damaged.
+    """
+    if not knows(type_name):
+        return raw
+    try:
+        return bytes(_store.ros1_to_cdr(raw, type_name))
+    except (SerdeError, ValueError, UnicodeError, AssertionError) as error:
+        raise WireError(f"damaged {type_name}: {error}") from None
+
+
+def compressed_image(data: bytes, kind: str, encoding: str, header: Any) -> bytes:
+    """`sensor_msgs/CompressedImage` of a JPEG or PNG file (`kind`), with the header of the picture's message.
+
+    `encoding` is that of the picture; the format says it in the words of ROS's compressed_image_transport.
+    """
+    stored = encoding.replace("rgb", "bgr")  # the channel order of OpenCV, which writes and reads these files
+    form = f"{encoding}; {kind} compressed {stored}"
+    return _serialize(_ros[COMPRESSED](header, form, np.frombuffer(data, np.uint8)))
 
 
 def image(array: NDArray[Any], encoding: str, stamp_ns: int, frame: str = LEFT_FRAME) -> Content:

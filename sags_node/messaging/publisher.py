@@ -136,6 +136,13 @@ class Publisher:
         """Send the configuration in force; it is kept for those who subscribe later."""
         self._publish_text("parameters", content.json_text(parameters), time.time_ns())
 
+    def publish_content(self, name: str, body: Content, frame_id: int, stamp_ns: int, epoch: int) -> None:
+        """Send what was made elsewhere, e.g. recorded; the topic `name` (without namespace) may be any."""
+        self._seq[name] = self._seq.get(name, 0) + 1
+        if name in topics.BY_NAME and topics.BY_NAME[name].cached:
+            self._texts[name] = (body, stamp_ns)
+        self._send(name, body, frame_id, stamp_ns, epoch)
+
     def wanted(self, name: str) -> bool:
         """True while somebody subscribes to the topic `name` (without the namespace)."""
         full = topics.full_name(self.ns, name)
@@ -152,7 +159,9 @@ class Publisher:
         pair = self._last.pair
         self._send(name, content.FRAME_CONTENT[name](self._last), pair.frame_id, pair.t_capture_ns)
 
-    def _send(self, name: str, body: Content, frame_id: int, stamp_ns: int) -> None:
+    def _send(self, name: str, body: Content, frame_id: int, stamp_ns: int, epoch: int | None = None) -> None:
+        if epoch is None:
+            epoch = 0 if self._last is None else self._last.epoch
         meta = Meta(
             type=body.type,
             type_hash=type_hash(body.type),
@@ -161,7 +170,7 @@ class Publisher:
             stamp_ns=stamp_ns,
             publish_ns=time.time_ns(),
             session=self.session,
-            epoch=0 if self._last is None else self._last.epoch,
+            epoch=epoch,
             step=0 if self._last is None else self._last.snapshot.step,
             encoding=body.encoding,
             shape=list(body.shape),

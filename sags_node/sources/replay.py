@@ -8,14 +8,18 @@ from collections.abc import Callable, Iterator
 from types import TracebackType
 from typing import Protocol, Self
 
+import numpy as np
+
 from sags_node import config as cfg
 from sags_node.errors import UsageError
+from sags_node.sources.bags import BagPairs
+from sags_node.sources.dvrk import DvrkPairs
 from sags_node.sources.endonerf import EndoNerfPairs
 from sags_node.sources.pictures import FolderPairs, RawPair
 from sags_node.sources.scared import ScaredPairs
 from sags_node.sources.truth import Poses, References
 from sags_node.sources.videos import PanePairs, Video, VideoPairs, side_by_side_boxes
-from sags_node.types import StereoFrame
+from sags_node.types import I64, StereoFrame
 
 Recording = (
     cfg.FoldersSource
@@ -24,6 +28,8 @@ Recording = (
     | cfg.PanesSource
     | cfg.EndoNerfSource
     | cfg.ScaredSource
+    | cfg.BagSource
+    | cfg.DvrkSource
 )
 DEFAULT_RATE = 30.0  # of folders, which do not know theirs
 
@@ -53,6 +59,8 @@ class Replay:
     place in the first pass, counted on when the recording loops. `rate` is that of the turns. In `realtime`
     pace turn `n` is due `n / rate` seconds after the first; a pair that would come more than one period late
     is left out and counted. In `step` pace the stamp is `frame_id / rate`, whatever the clock says.
+
+    A recording that keeps a stamp of each picture is played by those, unless `config.rate` is set.
 
     Args:
         config: which recording, and how to play it.
@@ -84,10 +92,16 @@ class Replay:
         self._pairs = _open_pairs(config, references)
         self._count = -(-self._pairs.count // config.stride)  # rounded up
         self.rate = (config.rate or self._pairs.rate or DEFAULT_RATE) / config.stride
+        self._stamps: I64 | None = None  # [turns, 2] ns, of the left and the right picture
+        if isinstance(self._pairs, BagPairs | DvrkPairs) and config.rate is None:
+            self._stamps = self._pairs.stamps[:: config.stride]
         self.dropped = 0
         self._began: tuple[float, int] | None = None  # monotonic seconds and wall clock of the first turn
         self._dropped_in_a_row = 0
         self._first = round(config.start * self.rate)
+        if self._stamps is not None:
+            start_ns = self._stamps[0, 0] + round(config.start * 1e9)
+            self._first = int(np.searchsorted(self._stamps[:, 0], start_ns))
         if self._first >= self._count:
             self._pairs.close()
             seconds = self._count / self.rate
@@ -156,7 +170,7 @@ class Replay:
                 yield StereoFrame(
                     frame_id,
                     t_capture_ns=stamp,
-                    t_capture_right_ns=stamp,
+                    t_capture_right_ns=stamp + self._skew(index),
                     left=pair.left,
                     right=pair.right,
                     epoch=epoch,
@@ -174,7 +188,21 @@ class Replay:
         """Seconds until the turn of this frame, negative when it is over; the first turn is now."""
         if self._began is None:
             self._began = self._clock(), self._wall_ns()
-        return self._began[0] + (frame_id - self._first) / self.rate - self._clock()
+        return self._began[0] + self._elapsed(frame_id) * 1e-9 - self._clock()
+
+    def _elapsed(self, frame_id: int) -> int:
+        """Time from the first turn to this one, as the recording has it, ns."""
+        turns = frame_id - self._first
+        if self._stamps is None:
+            return round(turns * 1e9 / self.rate)
+        times = self._stamps[self._first :, 0]
+        passes, turn = divmod(turns, len(times))
+        one_pass = int(times[-1] - times[0]) + round(1e9 / self.rate)
+        return passes * one_pass + int(times[turn] - times[0])
+
+    def _skew(self, index: int) -> int:
+        """How much later the right picture was taken, ns."""
+        return 0 if self._stamps is None else int(self._stamps[index, 1] - self._stamps[index, 0])
 
     def _is_too_late(self, frame_id: int) -> bool:
         """Whether to leave this frame out.
@@ -188,6 +216,8 @@ class Replay:
     def _wait_for_turn(self, frame_id: int) -> int:
         """Wait as the pace asks; the capture stamp of this frame, ns."""
         if self._config.pace == "step":
+            if self._stamps is not None:
+                return int(self._stamps[self._first, 0]) + self._elapsed(frame_id)
             return round(frame_id * 1e9 / self.rate)
         if self._config.pace == "fast":
             return self._wall_ns()
@@ -195,7 +225,7 @@ class Replay:
         if wait > 0:
             self._sleep(wait)
         assert self._began is not None
-        return self._began[1] + round((frame_id - self._first) * 1e9 / self.rate)
+        return self._began[1] + self._elapsed(frame_id)
 
 
 def _open_pairs(config: Recording, references: bool) -> Pairs:
@@ -215,3 +245,7 @@ def _open_pairs(config: Recording, references: bool) -> Pairs:
             return EndoNerfPairs(config)
         case cfg.ScaredSource():
             return ScaredPairs(config.folder, references)
+        case cfg.BagSource():
+            return BagPairs(config)
+        case cfg.DvrkSource():
+            return DvrkPairs(config)

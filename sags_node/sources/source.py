@@ -84,6 +84,10 @@ def recorded_rig(config: cfg.Source) -> StereoRig | None:
         from sags_node.sources import scared
 
         return scared.read_rig(config.folder)
+    if isinstance(config, cfg.BagSource):
+        from sags_node.sources import bags
+
+        return bags.read_rig(config)
     return None
 
 
