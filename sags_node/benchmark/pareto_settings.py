@@ -1,0 +1,95 @@
+"""The settings of the online mapper that are compared: each a few overrides of a launch file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from sags_node.config import LaunchConfig, MappingConfig
+from sags_node.errors import UsageError
+from sags_node.evaluation.measure import Options
+
+PARTS = ("budgets", "resolutions", "gaussians", "skips")
+BUDGETS_MS = (25.0, 33.0, 50.0, 100.0, 200.0)
+SIZES = (0.75, 0.5)  # of the launch file's working size
+COUNTS = (10_000, 20_000, 30_000, 50_000, 70_000)
+COUNT_BUDGETS_MS = (33.0, 100.0)
+SKIP_STEPS = 2  # per frame, where rules that leave work out are compared
+
+BUDGET, COUNT = "mapping.budget_ms", "mapping.max_gaussians"
+WIDTH, HEIGHT = "vision.width", "vision.height"
+
+DEFAULT_OPTIONS = Options()
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """One way to run a recording."""
+
+    part: str  # of PARTS, or "default"
+    name: str
+    overrides: tuple[str, ...]  # key:=value, on top of the launch file; none: the default
+
+
+@dataclass(frozen=True, slots=True)
+class Sweep:
+    """What to compare.
+
+    Raises:
+        UsageError: an unknown part.
+    """
+
+    parts: tuple[str, ...] = PARTS
+    repeat: int = 1
+    options: Options = DEFAULT_OPTIONS
+
+    def __post_init__(self) -> None:
+        unknown = [part for part in self.parts if part not in PARTS]
+        if unknown or not self.parts:
+            raise UsageError(f"unknown part '{', '.join(unknown)}'; choose from {', '.join(PARTS)}")
+
+
+def time_settings(config: LaunchConfig, size: tuple[int, int], parts: Sequence[str]) -> list[Setting]:
+    """The settings with a budget of time, each once, the default (the launch file as it is) first.
+
+    `size`: the default's working size, width and height, px.
+    """
+    default = {
+        BUDGET: config.mapping.budget_ms,
+        WIDTH: size[0],
+        HEIGHT: size[1],
+        COUNT: config.mapping.max_gaussians,
+    }
+    asked: list[tuple[str, Mapping[str, float]]] = [("default", {})]
+    if "budgets" in parts:
+        asked += [("budgets", {BUDGET: ms}) for ms in BUDGETS_MS]
+    if "resolutions" in parts:
+        shrunk = [(round(size[0] * share), round(size[1] * share)) for share in SIZES]
+        asked += [("resolutions", {WIDTH: width, HEIGHT: height}) for width, height in shrunk]
+    if "gaussians" in parts:
+        asked += [("gaussians", {BUDGET: ms, COUNT: count}) for ms in COUNT_BUDGETS_MS for count in COUNTS]
+    settings: dict[tuple[str, ...], Setting] = {}
+    for part, values in asked:
+        overrides = tuple(f"{key}:={value}" for key, value in values.items() if value != default[key])
+        settings.setdefault(overrides, Setting(part, _name({**default, **values}), overrides))
+    return list(settings.values())
+
+
+def skip_settings(mapping: MappingConfig) -> list[Setting]:
+    """All rules as they are, then each rule of `skip_rules` turned round, at a fixed number of steps."""
+    steps = f"mapping.iterations:={SKIP_STEPS}"
+    settings = [Setting("skips", "all rules as they are", (steps,))]
+    for rule in skip_rules():
+        turned = f"mapping.{rule}:={str(not getattr(mapping, rule)).lower()}"
+        settings.append(Setting("skips", turned, (steps, turned)))
+    return settings
+
+
+def skip_rules() -> list[str]:
+    """The mapper's rules that leave work out: all switches of its configuration named skip_*."""
+    fields = MappingConfig.model_fields.items()
+    return [name for name, field in fields if name.startswith("skip_") and field.annotation is bool]
+
+
+def _name(values: Mapping[str, float]) -> str:
+    return f"{values[BUDGET]:g} ms, {values[WIDTH]}x{values[HEIGHT]}, {values[COUNT] / 1e3:g}k"
