@@ -25,6 +25,7 @@ from sags_node.apps.launching import (
     split_recording,
 )
 from sags_node.apps.terminal import check_folder, console, progress, show
+from sags_node.cli_bag import bag
 from sags_node.cli_bench import bench
 from sags_node.cli_consumers import overlay, topic
 from sags_node.cli_offline import evaluate, fit
@@ -219,5 +220,5 @@ def calib_check(folder: Path, json_out: bool) -> None:
         raise SagsError(f"{folder} cannot be used as it is; see the mends above")
 
 
-for command in (evaluate, fit, bench, overlay, topic):
+for command in (evaluate, fit, bag, bench, overlay, topic):
     main.add_command(command)

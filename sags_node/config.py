@@ -219,9 +219,12 @@ class EngineConfig(Section):
 class MappingConfig(Section):
     budget_ms: float = Field(33.0, gt=0, description="wall time of one frame, all stages")
     iterations: int | None = Field(None, ge=0, description="fixed steps per frame instead of the budget")
-    max_gaussians: int = Field(30000, ge=100, le=2_000_000)
+    max_gaussians: int | None = Field(
+        None, ge=100, le=2_000_000, description="default: as many as two cores refine within the budget"
+    )
     smoothing: bool = Field(True, description="the 3D filter of Mip-Splatting: nothing finer than was seen")
     skip_duplicates: bool = Field(True, description="a frame equal to its predecessor is not mapped again")
+    skip_still: bool = Field(True, description="while nothing moves: no matching, a step where it pays most")
 
 
 class PublishConfig(Section):
@@ -257,7 +260,10 @@ class LaunchConfig(Section):
 
 # ---- reading ---------------------------------------------------------------------------------------------
 
-_PATH_KEYS = ("rig", "folder", "path", "video", "left", "right", "tools", "poses", "depth", "tracks", "key", "allow")
+_PATH_KEYS = (
+    *("rig", "folder", "path", "video", "left", "right", "tools"),
+    *("poses", "depth", "tracks", "key", "allow"),
+)
 DEFAULT_DATA = "../shared/data"
 BAG_SUFFIXES = (".mcap", ".db3", ".bag")
 SIDECAR_TYPE = "dvrk_data:video_sidecar@"
@@ -296,8 +302,7 @@ def load_launch(path: Path | str | None = None, overrides: Sequence[str] = ()) -
 
 
 def _known_recording(folder: Path) -> dict[str, Any] | None:
-    """How to play a file or folder that is no session of ours but a ROS bag, a dVRK session or a research data
-    set."""
+    """How to play what is no session of ours but a ROS bag, or laid out as dVRK or a research data set."""
     if (folder / "launch.yaml").exists():
         return None
     is_folder = folder.is_dir()

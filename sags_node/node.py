@@ -33,6 +33,7 @@ from sags_node.messaging import content
 from sags_node.messaging.publisher import Publisher
 from sags_node.model.ply import write_ply
 from sags_node.pipeline import Pipeline
+from sags_node.recording.child import RecorderProcess
 from sags_node.sources.source import Source
 from sags_node.types import FrameResult, NodeHealth, StereoFrame, StereoRig
 
@@ -42,7 +43,7 @@ HEALTH_PERIOD = 1.0  # s
 WAITING_AFTER = 1.0  # s without a frame
 STOP_SECONDS = 10.0  # longest wait for each thread to end
 WINDOW = 150  # frames behind the published rates and latencies
-LIVE_PARAMETERS = ("mapping.budget_ms", "mapping.skip_duplicates")
+LIVE_PARAMETERS = ("mapping.budget_ms", "mapping.skip_duplicates", "mapping.skip_still")
 
 OnResult = Callable[[FrameResult, float], None]  # a published result and its latency, ms
 
@@ -69,7 +70,7 @@ class Node:
         self._budget = make_budget(config.mapping)
         self._live = isinstance(config.source, V4l2Source) or config.source.pace == "realtime"
         self._wake = os.eventfd(0, os.EFD_NONBLOCK)
-        self._frames: Latest[StereoFrame] = Latest()
+        self._frames: Latest[tuple[StereoFrame, float]] = Latest()  # and when it came
         self._results: Latest[FrameResult] = Latest(on_put=lambda: os.eventfd_write(self._wake, 1))
         self._requests: SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = SimpleQueue()
         self._error: BaseException | None = None
@@ -78,6 +79,8 @@ class Node:
         self._stats = _Statistics()
         self._last_sent: FrameResult | None = None
         self._publisher = Publisher(config.publish, config.ns, uuid.uuid4().hex, self._handlers())
+        ipc = [endpoint for endpoint in self.endpoints if endpoint.startswith("ipc:")]
+        self._recorder = RecorderProcess(config.ns, ipc[0] if ipc else None)
         work = {
             "capture": (self._capture, self._frames.close),
             "mapping": (self._map, self._results.close),
@@ -118,6 +121,7 @@ class Node:
         for thread, ended in zip(self._threads, self._ended.values(), strict=True):
             if thread.ident is not None:  # it was started
                 ended.wait(STOP_SECONDS)
+        self._recorder.close()
 
     @property
     def endpoints(self) -> list[str]:
@@ -162,16 +166,18 @@ class Node:
             for frame in self._source:
                 if self._stopping.is_set():
                     return
-                give(frame)
+                give((frame, time.monotonic()))
 
     def _map(self) -> None:
         configure_threads(self.config.engine.threads)
         give = self._results.put if self._live else self._results.hand_over
         while not self._frames.closed:
-            frame = self._frames.get(timeout=0.05)
+            came = self._frames.get(timeout=0.05)
             self._serve_requests()
-            if frame is not None:
-                give(self._pipeline.process(frame, self._budget))
+            if came is not None:
+                frame, at = came
+                waited = time.monotonic() - at if self._live else 0.0
+                give(self._pipeline.process(frame, self._budget, waited))
         self._serve_requests()
 
     def _publish(self) -> None:
@@ -210,6 +216,9 @@ class Node:
             "get_parameters": lambda args: self.config.model_dump(mode="json"),
             "set_parameters": lambda args: self._on_mapping_thread(lambda: self._set_parameters(args)),
             "reset_model": lambda args: self._on_mapping_thread(self._reset_model),
+            "start_recording": self._start_recording,
+            "stop_recording": lambda args: self._recorder.stop(),
+            "take_snapshot": lambda args: self._recorder.snapshot(),
             "save_model": lambda args: self._on_mapping_thread(lambda: self._save_model(args)),
         }
 
@@ -241,6 +250,9 @@ class Node:
         self._budget = make_budget(self.config.mapping)
         self._parameters_changed.set()
         return self.config.model_dump(mode="json")
+
+    def _start_recording(self, args: dict[str, Any]) -> Future[Any]:
+        return self._recorder.start(args)
 
     def _reset_model(self) -> dict[str, Any]:
         self._pipeline.reset()

@@ -11,11 +11,12 @@ import numpy as np
 
 from sags_node.config import LaunchConfig
 from sags_node.engine.rasterize import make_rasterizer, to_view
-from sags_node.mapping.budget import Budget
+from sags_node.mapping.budget import Budget, capacity
 from sags_node.mapping.mapper import Mapper
 from sags_node.types import (
     F32,
     Bool,
+    Camera,
     FrameResult,
     RectifiedPair,
     RenderedView,
@@ -23,6 +24,7 @@ from sags_node.types import (
     StereoFrame,
     StereoRig,
 )
+from sags_node.vision.change import StillScene
 from sags_node.vision.observe import observe
 from sags_node.vision.rectify import Rectifier
 from sags_node.vision.stereo import StereoDepth
@@ -42,42 +44,48 @@ class Pipeline:
         self.stereo = StereoDepth(vision.stereo, self.rectifier.camera, self.rectifier.baseline)
         self._rasterizer = make_rasterizer(config.engine.backend, width, height)
         self._config = config
-        self.mapper = Mapper(self._rasterizer, config.mapping.max_gaussians, config.mapping.smoothing)
+        self.mapper = Mapper(self._rasterizer, capacity(config.mapping, width, height), config.mapping.smoothing)
+        self._still = StillScene()
         self._mapped: FrameResult | None = None  # the last frame that was really mapped
 
     def reset(self) -> None:
         """Forget the model; the next frame makes a new one, in a new epoch."""
         self.mapper.restart()
+        self._still.forget()
         self._mapped = None
 
     def reconfigure(self, config: LaunchConfig) -> None:
         """Take changed parameters over; the model stays."""
         self._config = config
 
-    def process(self, frame: StereoFrame, budget: Budget) -> FrameResult:
-        """Everything that happens to one frame."""
-        budget.start()
+    def process(self, frame: StereoFrame, budget: Budget, waited: float = 0.0) -> FrameResult:
+        """Everything that happens to one frame, `waited` seconds after it came."""
+        budget.start(waited)
         watch = Stopwatch()
         with watch("rectify"):
             pair = self.rectifier(frame)
         if self._mapped is not None and self._config.mapping.skip_duplicates:
             if _rms_difference(pair, self._mapped.pair) < DUPLICATE_RMS:
                 return _repeat(self._mapped, pair, self._epoch(frame), watch.timings_ms)
+        still = self._still(pair) if self._config.mapping.skip_still else 0  # frames
         with watch("mask"):
             tissue = self.tissue(frame, pair)
         with watch("depth"):
-            depth, confidence = self.depth(frame, pair, tissue)
+            if still and self._mapped is not None:
+                known = self._mapped.observation
+                depth, confidence = known.depth * tissue, known.depth_confidence * tissue
+            else:
+                depth, confidence = self.depth(frame, pair, tissue)
             observation = observe(pair, tissue, depth, confidence)
         with watch("map"):
-            snapshot = self.mapper.update(observation, budget)
+            snapshot = self.mapper.update(observation, budget, still)
         with watch("render"):
-            views = {"left": self.draw(snapshot)}
-            if self._config.publish.right:
-                views["right"] = self.draw(snapshot, eye_distance=pair.baseline)
+            views = self._draw_eyes(snapshot, pair.baseline)
             self.mapper.drawn(observation, views["left"])
         budget.finish()
+        skipped = dict.fromkeys(("depth", "motion"), "nothing moves") if still else {}
         epoch = self._epoch(frame)
-        self._mapped = FrameResult(pair, observation, snapshot, views, epoch, watch.timings_ms)
+        self._mapped = FrameResult(pair, observation, snapshot, views, epoch, watch.timings_ms, skipped)
         return self._mapped
 
     def depth(self, frame: StereoFrame, pair: RectifiedPair, tissue: Bool) -> tuple[F32, F32]:
@@ -91,10 +99,15 @@ class Pipeline:
         """Grows with the source's epochs and with every new model: ids then mean other Gaussians."""
         return frame.epoch + self.mapper.restarts
 
-    def draw(self, snapshot: Snapshot, eye_distance: float = 0.0) -> RenderedView:
-        """The snapshot as its own camera sees it, moved right by `eye_distance` metres."""
-        camera = snapshot.camera.moved_right(eye_distance) if eye_distance else snapshot.camera
-        planes = self._rasterizer.forward(snapshot.gaussians, [camera])
+    def _draw_eyes(self, snapshot: Snapshot, baseline: float) -> dict[str, RenderedView]:
+        """The left eye is drawn last: the mapper looks at what the rasteriser drew last."""
+        if not self._config.publish.right:
+            return {"left": self._draw(snapshot, snapshot.camera, self.mapper.stale_tiles)}
+        right = self._draw(snapshot, snapshot.camera.moved_right(baseline))
+        return {"left": self._draw(snapshot, snapshot.camera), "right": right}
+
+    def _draw(self, snapshot: Snapshot, camera: Camera, tiles: Bool | None = None) -> RenderedView:
+        planes = self._rasterizer.forward(snapshot.gaussians, [camera], tiles)
         return to_view(planes[0], camera, snapshot.frame_id, snapshot.t_capture_ns)
 
 

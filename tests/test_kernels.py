@@ -107,12 +107,12 @@ def test_skin_and_nearest_nodes(scene: dict[str, np.ndarray]) -> None:
     s = scene
     nodes = np.random.default_rng(7).uniform(-0.05, 0.1, (50, 3)).astype(np.float32)
     points = np.nan_to_num(s["means"])
-    compiled, source = (
-        f(points, nodes) for f in (deformation.nearest_nodes, deformation.nearest_nodes.py_func)
-    )
-    assert np.array_equal(compiled[0], source[0])
-    assert np.allclose(compiled[1], source[1], atol=1e-5)
-    assert np.allclose(compiled[1].sum(1), 1, atol=1e-5)
+    index, squared = deformation._nearest(points, nodes, 4)
+    distances = np.linalg.norm(points[:, None] - nodes, axis=-1)
+    assert np.array_equal(index, np.argsort(distances, 1, kind="stable")[:, :4])
+    assert np.allclose(np.sqrt(squared), np.sort(distances, 1)[:, :4], atol=1e-6)
+    weight = deformation.nearest_nodes(points, nodes)[1]
+    assert np.allclose(weight.sum(1), 1, atol=1e-5) and (np.diff(weight, axis=1) <= 0).all()
     a, b = points.copy(), points.copy()
     deformation._skin(nodes, s["index"], s["weight"], a)
     deformation._skin.py_func(nodes, s["index"], s["weight"], b)

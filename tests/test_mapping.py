@@ -137,8 +137,8 @@ def test_free_space_is_cleared_only_after_several_frames() -> None:
     )
     frame = observation()
     for _ in range(densify.FRONT_FRAMES - 1):
-        assert not densify.doomed(model, frame).any()
-    assert densify.doomed(model, frame).all()
+        assert not densify.doomed(model, frame, model.capacity).any()
+    assert densify.doomed(model, frame, model.capacity).all()
 
 
 def test_what_is_not_finite_or_transparent_goes_at_once_and_what_left_the_view_when_it_is_crowded() -> None:
@@ -150,9 +150,9 @@ def test_what_is_not_finite_or_transparent_goes_at_once_and_what_left_the_view_w
     model.colors[1, 2] = np.inf
     model.opacities[2] = 0.01
     model.means[3, 0] = 1.0
-    assert np.flatnonzero(densify.doomed(model, observation())).tolist() == [0, 1, 2]
+    assert np.flatnonzero(densify.doomed(model, observation(), model.capacity)).tolist() == [0, 1, 2]
     model.append(points[50:], size[50:], grey[50:], 0.9)
-    assert np.flatnonzero(densify.doomed(model, observation())).tolist() == [0, 1, 2, 3]
+    assert np.flatnonzero(densify.doomed(model, observation(), model.capacity)).tolist() == [0, 1, 2, 3]
 
 
 def test_first_pixels_respect_the_limit_and_the_mask_and_fill_small_gaps_only() -> None:

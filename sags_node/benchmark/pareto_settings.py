@@ -54,12 +54,9 @@ def time_settings(config: LaunchConfig, size: tuple[int, int], parts: Sequence[s
 
     `size`: the default's working size, width and height, px.
     """
-    default = {
-        BUDGET: config.mapping.budget_ms,
-        WIDTH: size[0],
-        HEIGHT: size[1],
-        COUNT: config.mapping.max_gaussians,
-    }
+    default = {BUDGET: config.mapping.budget_ms, WIDTH: size[0], HEIGHT: size[1]}
+    if config.mapping.max_gaussians is not None:
+        default[COUNT] = config.mapping.max_gaussians
     asked: list[tuple[str, Mapping[str, float]]] = [("default", {})]
     if "budgets" in parts:
         asked += [("budgets", {BUDGET: ms}) for ms in BUDGETS_MS]
@@ -70,7 +67,7 @@ def time_settings(config: LaunchConfig, size: tuple[int, int], parts: Sequence[s
         asked += [("gaussians", {BUDGET: ms, COUNT: count}) for ms in COUNT_BUDGETS_MS for count in COUNTS]
     settings: dict[tuple[str, ...], Setting] = {}
     for part, values in asked:
-        overrides = tuple(f"{key}:={value}" for key, value in values.items() if value != default[key])
+        overrides = tuple(f"{key}:={value}" for key, value in values.items() if value != default.get(key))
         settings.setdefault(overrides, Setting(part, _name({**default, **values}), overrides))
     return list(settings.values())
 
@@ -92,4 +89,6 @@ def skip_rules() -> list[str]:
 
 
 def _name(values: Mapping[str, float]) -> str:
-    return f"{values[BUDGET]:g} ms, {values[WIDTH]}x{values[HEIGHT]}, {values[COUNT] / 1e3:g}k"
+    """Without a number of Gaussians it is the one that follows from the budget."""
+    count = f", {values[COUNT] / 1e3:g}k" if COUNT in values else ""
+    return f"{values[BUDGET]:g} ms, {values[WIDTH]}x{values[HEIGHT]}{count}"

@@ -16,7 +16,7 @@ from sags_node.evaluation.gallery import Picture
 from sags_node.evaluation.measure import FrameRow, Measurer, Options, Progress
 from sags_node.evaluation.spool import Spool
 from sags_node.evaluation.summary import GROUPS, summarise
-from sags_node.mapping.budget import make_budget
+from sags_node.mapping.budget import capacity, make_budget
 from sags_node.node import Node
 from sags_node.pipeline import Pipeline
 from sags_node.session import Session, open_session
@@ -106,15 +106,16 @@ def measure(
         config.segments,
         None if config.mapping.iterations is not None else config.mapping.budget_ms,
     )
+    size = config.vision.width or session.rig.left.width, config.vision.height or session.rig.left.height
     summary["settings"] = {
         "overrides": list(overrides),
         "pace": None if isinstance(config.source, V4l2Source) else config.source.pace,
         "iterations": config.mapping.iterations,
-        "max_gaussians": config.mapping.max_gaussians,
+        "max_gaussians": capacity(config.mapping, *size),
         "backend": config.engine.backend,
         "seed": config.seed,
-        "width": config.vision.width or session.rig.left.width,
-        "height": config.vision.height or session.rig.left.height,
+        "width": size[0],
+        "height": size[1],
         "depth_reference": measurer.depth_kind,
         "hold_out": options.hold_out,
         "novel_every": options.every,

@@ -1,4 +1,5 @@
-"""How long a frame may be refined. The clock is an argument, so that results are reproducible."""
+"""How long a frame may be refined, and how many Gaussians the machine can afford. The clock is an argument, so
+that results are reproducible."""
 
 from __future__ import annotations
 
@@ -8,12 +9,23 @@ from typing import Protocol
 
 from sags_node.config import MappingConfig
 
+LEARNING = 0.2  # share of a new measurement in a running mean
+LEAST_SHARE = 0.25  # of the model's capacity
+SHRINK, GROW = 0.98, 1.005  # per frame: fewer Gaussians soon, more of them slowly
+GAUSSIANS_PER_MS = 1100  # of the budget; measured, see benchmarks/mapping.md
+PIXELS_PER_GAUSSIAN = 3  # fewer pixels have no more to tell
+COMFORT = 0.9  # of the time: below it there is room for more Gaussians
+
 
 class Budget(Protocol):
     """Asked once before every refinement step."""
 
-    def start(self) -> None:
-        """A new frame begins."""
+    @property
+    def share(self) -> float:
+        """How much of the model's capacity may be used, 0..1."""
+
+    def start(self, waited: float = 0.0) -> None:
+        """A new frame begins, `waited` seconds after it came."""
 
     def more(self) -> bool:
         """True when one more step may be taken."""
@@ -25,11 +37,13 @@ class Budget(Protocol):
 class StepBudget:
     """A fixed number of steps per frame: deterministic."""
 
+    share = 1.0
+
     def __init__(self, steps: int) -> None:
         self._steps = steps
         self._left = steps
 
-    def start(self) -> None:
+    def start(self, waited: float = 0.0) -> None:
         self._left = self._steps
 
     def more(self) -> bool:
@@ -43,33 +57,71 @@ class StepBudget:
 class TimeBudget:
     """Wall time per frame, at least one step.
 
-    A step is taken when the time it is expected to cost, and the time expected after the last step (drawing),
-    both learnt from the frames before, still fit.
+    The first step is part of what a frame cannot do without. A further one is taken when its cost and that of
+    what follows the last step (drawing), both learnt from the frames before, still fit. The time that a frame
+    waited is gone, so that one late frame does not make the next late.
+
+    Where what a frame cannot do without takes longer than the budget, the share of Gaussians falls, and it
+    recovers when there is room: the machine may be slow, or busy with something else.
     """
 
     def __init__(self, seconds: float, clock: Callable[[], float] = time.perf_counter) -> None:
         self.seconds = seconds
+        self.share = 1.0
         self._clock = clock
-        self._started = self._asked = clock()
-        self._first = True
-        self._step_cost = 0.0
-        self._after_cost = 0.0
+        self._step_cost = _RunningMean()
+        self._after_cost = _RunningMean()
+        self._essential = _RunningMean()
+        self._begin(0.0)
 
-    def start(self) -> None:
-        self._started = self._clock()
-        self._first = True
+    def start(self, waited: float = 0.0) -> None:
+        self._begin(waited)
+
+    def _begin(self, waited: float) -> None:
+        self._started = self._asked = self._clock()
+        self._deadline = self._started + max(0.0, self.seconds - waited)
+        self._asks = 0
+        self._optional = 0.0  # s, spent on all steps but the first
 
     def more(self) -> bool:
         now = self._clock()
-        first, self._first = self._first, False
-        if not first:
-            self._step_cost += 0.3 * (now - self._asked - self._step_cost)
+        if self._asks > 1:  # what came before the first step, and the first, are no measure of a further one
+            self._step_cost.add(now - self._asked)
+            self._optional += now - self._asked
         self._asked = now
-        return first or now - self._started + self._step_cost + self._after_cost <= self.seconds
+        self._asks += 1
+        return self._asks == 1 or now + self._step_cost.value + self._after_cost.value <= self._deadline
 
     def finish(self) -> None:
-        """What came after the last refusal is the cost to reserve in the next frame."""
-        self._after_cost += 0.3 * (self._clock() - self._asked - self._after_cost)
+        """Learn from this frame. One that never asked, since it made a new model, tells nothing."""
+        if self._asks == 0:
+            return
+        now = self._clock()
+        self._after_cost.add(now - self._asked)
+        self._essential.add(now - self._started - self._optional)
+        if self._essential.value > self.seconds:
+            self.share = max(LEAST_SHARE, SHRINK * self.share)
+        elif self._essential.value + self._step_cost.value < COMFORT * self.seconds:
+            self.share = min(1.0, GROW * self.share)
+
+
+class _RunningMean:
+    """Of times, s; begins with the first."""
+
+    def __init__(self) -> None:
+        self.value = 0.0
+        self._empty = True
+
+    def add(self, value: float) -> None:
+        self.value += (1.0 if self._empty else LEARNING) * (value - self.value)
+        self._empty = False
+
+
+def capacity(config: MappingConfig, width: int, height: int) -> int:
+    """How many Gaussians a model of pictures of this size may have. A slow or busy machine uses a share of it."""
+    if config.max_gaussians is not None:
+        return config.max_gaussians
+    return max(100, round(min(GAUSSIANS_PER_MS * config.budget_ms, width * height / PIXELS_PER_GAUSSIAN)))
 
 
 def make_budget(config: MappingConfig) -> Budget:

@@ -23,6 +23,7 @@ FRONT_TOLERANCE = 0.065  # of the depth: so far in front of the measured surface
 FRONT_FRAMES = 3  # in a row, since stereo is wrong now and then
 MIN_OPACITY = 0.03
 CROWDED = 0.9  # share of the cap above which what does not show is given up
+SHED = 0.01  # of all, per frame: so many are given up while there are more than the machine can afford
 IDLE = 0.1  # px of coverage: less does not show
 PIECE = 1024  # rows a thread takes at a time: a call for each row would count references to every array
 LARGEST = 1e6  # metres, colours, quaternions: no honest value comes near
@@ -33,7 +34,7 @@ def candidates(planes: F32, observation: Observation, phase: int) -> tuple[I32, 
     missing detail.
 
     A hole beside an instrument or in the strip that one eye does not see has no depth of its own; it takes
-    that of the nearest pixel in its row or column that has one.
+    that of a near pixel in its row or column that has one. Missing detail takes that of the model.
 
     Args:
         planes: [5, H, W] of the rasteriser: sums of w*rgb, w*z, w.
@@ -47,16 +48,19 @@ def candidates(planes: F32, observation: Observation, phase: int) -> tuple[I32, 
     return pixels[:count], depths[:count]
 
 
-def doomed(model: GaussianModel, observation: Observation) -> Bool:
+def doomed(model: GaussianModel, observation: Observation, limit: int) -> Bool:
     """[N] what to remove: in free space for several frames in a row, transparent or not finite; when N nears
-    its cap also what left the view, and what lies on the visible surface without showing. What an instrument
-    or other tissue hides is kept. Counts the frames in free space (`in_front`)."""
+    its `limit` also what left the view, and what lies on the visible surface without showing. What an instrument
+    or other tissue hides is kept. Beyond the limit those that show least go. Counts the frames in free space (`in_front`)."""
     remove = np.zeros(model.count, np.bool_)
     _inspect(
         model.means, model.quats, model.scales, model.opacities, model.colors, model.contribution,
         pack(observation.camera), observation.tissue, observation.depth,
-        model.count > CROWDED * model.capacity, model.in_front, remove,
+        model.count > CROWDED * limit, model.in_front, remove,
     )  # fmt: skip
+    excess = min(model.count - limit, int(SHED * model.count))
+    if excess > 0:
+        remove[np.argpartition(model.contribution, excess)[:excess]] = True
     return remove
 
 
@@ -77,13 +81,16 @@ def _candidates(
                     if z <= 0 and rank == 0:
                         z = nearest_depth(depth, x, y)
                     wanted = rank == 0 and z > 0
-                elif rank == 0 or z <= 0:
+                elif rank == 0 or (rank == 1 and z <= 0):
                     wanted = False
                 else:
                     residual = np.float32(0)
                     for c in range(3):
                         residual += abs(planes[c, y, x] / alpha - image[y, x, c])
-                    behind = planes[3, y, x] / alpha - z
+                    drawn_z = planes[3, y, x] / alpha
+                    if z <= 0:
+                        z = drawn_z
+                    behind = drawn_z - z
                     if rank == 1:
                         wanted = residual > RESIDUAL_NEW_SURFACE and behind > 2 * DEPTH_TOLERANCE * z
                     else:

@@ -16,7 +16,7 @@ SCALE_PER_SPACING = 0.4  # of the distance between neighbours; measured best (0.
 FLATNESS = 0.5  # the extent along the ray against the extent across it
 OPACITY = 0.9
 LEAST_SHARE = 0.3  # of the drawn scale that is left when the 3D filter's share is taken off
-REACH = 48  # px: how far a pixel without depth looks for one
+REACH = 96  # px: how far a pixel without depth looks for one
 INITIAL_SHARE = 0.75  # of the cap used by the first frame; the rest is for what appears later
 
 
@@ -71,15 +71,22 @@ def _depths_at(depth: F32, pixels: I32) -> F32:
 
 @kernel
 def nearest_depth(depth: F32, x: int, y: int) -> Any:
-    """Depth [H, W] at a pixel, else the nearest known one in its row or column within REACH px, else 0."""
+    """Depth [H, W] at a pixel, else of the nearest known pixels in its row and column the farthest, else 0.
+
+    Depth is missing beside what stands in front: where the other eye sees past an edge, and around instruments.
+    What is seen there belongs to the surface behind.
+    """
+    if depth[y, x] > 0:
+        return depth[y, x]
     height, width = depth.shape
-    for r in range(REACH):
-        if x - r >= 0 and depth[y, x - r] > 0:
-            return depth[y, x - r]
-        if x + r < width and depth[y, x + r] > 0:
-            return depth[y, x + r]
-        if y - r >= 0 and depth[y - r, x] > 0:
-            return depth[y - r, x]
-        if y + r < height and depth[y + r, x] > 0:
-            return depth[y + r, x]
-    return np.float32(0)
+    farthest = np.float32(0)
+    for side in range(4):
+        dx, dy = (1, 0) if side == 0 else (-1, 0) if side == 1 else (0, 1) if side == 2 else (0, -1)
+        for r in range(1, REACH):
+            u, v = x + r * dx, y + r * dy
+            if u < 0 or v < 0 or u >= width or v >= height:
+                break
+            if depth[v, u] > 0:
+                farthest = max(farthest, depth[v, u])
+                break
+    return farthest

@@ -7,18 +7,21 @@ from dataclasses import dataclass
 import numpy as np
 
 from sags_node.engine.losses import tissue_loss
-from sags_node.engine.rasterize import Rasterizer
+from sags_node.engine.rasterize import Gradients, Rasterizer
 from sags_node.mapping import densify, initialise
 from sags_node.mapping.budget import Budget
+from sags_node.mapping.focus import with_neighbours, worst_tiles
 from sags_node.mapping.motion import OpticalFlow, scene_flow
 from sags_node.mapping.optimiser import Optimiser, Rates
 from sags_node.model.alias_free import smoothing_variances
 from sags_node.model.deformation import Deformation, NodeDeformation
 from sags_node.model.gaussians import GaussianModel
-from sags_node.types import F32, Observation, RenderedView, Snapshot
+from sags_node.types import F32, Bool, Observation, RenderedView, Snapshot
 
 CONTROL_NODES = 512
 INITIAL_STEPS = 30
+SETTLED = 10  # frames: a model that has not changed for so long has little more to learn
+FOCUS = 0.15  # of the picture: where all steps but the first of a frame are taken
 MIN_FIRST_DEPTHS = 200  # px
 LOST_RESIDUAL = 0.08  # mean over RGB and tissue, 0..1; a beating heart stays below half of it
 LOST_COVERAGE = 0.3  # of the tissue
@@ -41,7 +44,7 @@ class Mapper:
 
     Each frame: predict where the tissue went (optical flow and depth, averaged on control nodes), remove what
     floats in free space, insert where the model has a hole or something new appears, refine while the budget
-    lasts. The order and the constants follow a measured design; see `benchmarks/`.
+    lasts: once the whole picture, then where it is worst. The order and the constants follow a measured design; see `benchmarks/`.
     """
 
     def __init__(self, rasterizer: Rasterizer, max_gaussians: int, smoothing: bool = True) -> None:
@@ -55,21 +58,30 @@ class Mapper:
         self._flow = OpticalFlow()
         self._deformation: Deformation | None = None
         self._last: _Last | None = None
+        self.stale_tiles: Bool | None = None  # [1, rows, columns] to be drawn anew after `update`; None: all
         self._frames = 0
         self._loss = 0.0
         self._metres_per_px = 0.0  # at the tissue's median depth
         self._v_planes: F32 = np.zeros((5, 1, 1), np.float32)
         self._weight: F32 = np.zeros((1, 1), np.float32)
+        self._planes: F32 = np.zeros((5, 1, 1), np.float32)  # the rasteriser's memory: what it drew last
 
-    def update(self, observation: Observation, budget: Budget) -> Snapshot:
-        """Take one frame in. Call `drawn` with the picture of the snapshot before the next update."""
+    def update(self, observation: Observation, budget: Budget, still: int = 0) -> Snapshot:
+        """Take one frame in. Call `drawn` with the picture of the snapshot before the next update.
+
+        Args:
+            still: for how many frames, this one included, nothing has moved.
+        """
         self._frames += 1
+        self.stale_tiles = None
         known = observation.depth[::8, ::8]
         known = known[known > 0]
         if known.size:
             self._metres_per_px = float(np.median(known)) / observation.camera.K[0, 0]
         if self._deformation is None:
             counts = self._initialise(observation)
+        elif still:
+            counts = self._touch_up(observation, budget, settled=still > SETTLED)
         else:
             counts = self._follow(observation, budget)
         return Snapshot(
@@ -103,13 +115,15 @@ class Mapper:
         self._deformation = NodeDeformation(self.model.means, CONTROL_NODES)
         self._deformation.attach(self.model, rows)
         for _ in range(INITIAL_STEPS):
-            self._refine(observation, self._draw(observation), INITIAL_RATES)
+            self._draw(observation)
+            self.model.contribution[:] = self._refine(observation, INITIAL_RATES).contribution
         return {"inserted": len(pixels), "iterations": INITIAL_STEPS}
 
     def _follow(self, observation: Observation, budget: Budget) -> dict[str, int]:
         assert self._deformation is not None
         self._predict(observation)
-        removed = self.model.remove(densify.doomed(self.model, observation))
+        limit = self._limit(budget)
+        removed = self.model.remove(densify.doomed(self.model, observation, limit))
         if self._smoothing:
             self._sharpen(observation)
 
@@ -120,14 +134,33 @@ class Mapper:
         pixels, depths = densify.candidates(planes, observation, phase=7 * self._frames)
         iterations = 0
         if budget.more():  # before inserting, so that the drawing above serves both
-            self._refine(observation, planes, Rates())
+            self.model.contribution[:] = self._refine(observation, Rates()).contribution
             iterations = 1
+        room = max(0, limit - self.model.count)
+        pixels, depths = pixels[:room], depths[:room]
         rows = initialise.insert(self.model, observation, pixels, depths, densify.GRID, self._smoothing)
         self._deformation.attach(self.model, rows)
         while budget.more():
-            self._refine(observation, self._draw(observation), Rates())
+            self._refine_worst(observation)
             iterations += 1
         return {"inserted": rows.stop - rows.start, "removed": removed, "iterations": iterations}
+
+    def _touch_up(self, observation: Observation, budget: Budget, settled: bool) -> dict[str, int]:
+        """Nothing moved: what was drawn last shows where steps pay, and only there the picture changes."""
+        self.model.velocities[:] = 0
+        removed = self.model.remove(densify.doomed(self.model, observation, self._limit(budget)))
+        touched: list[Bool] = []
+        while not (settled and touched) and budget.more():
+            touched.append(self._refine_worst(observation))
+        if touched and removed == 0:
+            self.stale_tiles = with_neighbours(np.logical_or.reduce(touched))
+        return {"inserted": 0, "removed": removed, "iterations": len(touched)}
+
+    def _refine_worst(self, observation: Observation) -> Bool:
+        tiles = worst_tiles(self._planes, observation.image, observation.tissue, FOCUS)
+        self._draw(observation, tiles)
+        self._refine(observation, Rates())
+        return tiles
 
     def _predict(self, observation: Observation) -> None:
         """Move all Gaussians to where flow and depth saw the tissue go."""
@@ -149,17 +182,22 @@ class Mapper:
         variances = smoothing_variances(self.model.means, [observation.camera])
         np.minimum(self.model.smoothing, variances, out=self.model.smoothing)
 
+    def _limit(self, budget: Budget) -> int:
+        """How many Gaussians this machine can afford."""
+        return round(budget.share * self.model.capacity)
+
     def _can_start(self, observation: Observation) -> bool:
         """Whether this frame has depth enough for a first model."""
         return bool(np.count_nonzero(observation.depth) >= MIN_FIRST_DEPTHS)
 
-    def _draw(self, observation: Observation) -> F32:
-        planes: F32 = self._rasterizer.forward(self.model.gaussians(), [observation.camera])[0]
-        return planes
+    def _draw(self, observation: Observation, tiles: Bool | None = None) -> F32:
+        self._planes = self._rasterizer.forward(self.model.gaussians(), [observation.camera], tiles)[0]
+        return self._planes
 
-    def _refine(self, observation: Observation, planes: F32, rates: Rates) -> None:
-        """One step: loss and its gradient, back-propagation, nodes, Gaussians."""
+    def _refine(self, observation: Observation, rates: Rates) -> Gradients:
+        """One step on what was drawn last: loss and its gradient, back-propagation, nodes, Gaussians."""
         assert self._deformation is not None
+        planes = self._planes
         if self._v_planes.shape != planes.shape:
             self._v_planes = np.zeros_like(planes)
             self._weight = np.zeros(planes.shape[1:], np.float32)
@@ -171,9 +209,9 @@ class Mapper:
         self._deformation.descend(
             self.model, gradients.means, gradients.contribution, NODE_STEP_PX * self._metres_per_px
         )
-        self.model.contribution[:] = gradients.contribution
         self._optimiser.step(self.model, gradients, observation.camera, rates)
         self.step += 1
+        return gradients
 
 
 def _is_lost(planes: F32, observation: Observation) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -35,7 +35,7 @@ def check_topic(name: str) -> topics.Topic:
 
 @contextmanager
 def data_socket(
-    address: Address, prefixes: Sequence[str]
+    address: Address, prefixes: Sequence[str], high_water: int = RECEIVE_HIGH_WATER
 ) -> Iterator[tuple[zmq.Socket[bytes], HandshakeWatch]]:
     """A SUB socket for every topic that begins with one of `prefixes`, and what a node has against it.
 
@@ -45,7 +45,7 @@ def data_socket(
     context = zmq.Context()
     try:
         socket = context.socket(zmq.SUB)
-        socket.setsockopt(zmq.RCVHWM, RECEIVE_HIGH_WATER)
+        socket.setsockopt(zmq.RCVHWM, high_water)
         for prefix in prefixes:
             socket.setsockopt_string(zmq.SUBSCRIBE, prefix)
         yield socket, connect(socket, address, MAX_MESSAGE_BYTES)
@@ -70,10 +70,12 @@ def listen(
     seconds: float | None,
     run_dir: Path | None = None,
     keys: ClientKeys | None = None,
-) -> Iterator[tuple[wire.Message, int] | None]:
+    high_water: int = RECEIVE_HIGH_WATER,
+) -> Generator[tuple[wire.Message, int] | None, None, None]:
     """Every message of some topics and its time of arrival, for up to `seconds`.
 
-    Topics may be named with or without `ns`; naming none means all.
+    Topics may be named with or without `ns`; naming none means all. Up to `high_water` messages wait when the
+    caller is slow.
 
     Yields None at least every `POLL_MS` while nothing arrives, so that a caller can keep time. What is no
     message is left out.
@@ -86,7 +88,7 @@ def listen(
     prefixes = [topics.full_name(ns, topic.name) for topic in known] or [f"{ns}/"]
     deadline = None if seconds is None else time.monotonic() + seconds
     address = find_data(endpoint, ns, run_dir, keys)
-    with data_socket(address, prefixes) as (socket, watch):
+    with data_socket(address, prefixes, high_water) as (socket, watch):
         while deadline is None or time.monotonic() < deadline:
             if not socket.poll(POLL_MS):
                 if (refusal := watch.refusal()) is not None:

@@ -102,10 +102,8 @@ class NodeDeformation:
 
     def _find_neighbours(self) -> I32:
         """[M, 6] nearest other nodes."""
-        squared = ((self.nodes[:, None] - self.nodes[None]) ** 2).sum(-1)
-        np.fill_diagonal(squared, np.inf)
         k = min(6, max(len(self.nodes) - 1, 1))
-        return np.argsort(squared, axis=1)[:, :k].astype(np.int32)
+        return _nearest(self.nodes, self.nodes, k + 1)[0][:, 1:]
 
 
 def spread_nodes(means: F32, count: int) -> F32:
@@ -132,43 +130,48 @@ def _cell_centres(means: F32, cell: float) -> F32:
     return (sums / counts[:, None]).astype(np.float32)
 
 
-@parallel_kernel
 def nearest_nodes(points: F32, nodes: F32) -> tuple[I32, F32, F32]:
     """Indices [N, 4], skinning weights [N, 4] and distance [N] of the nearest nodes.
 
     The weights fall off as a Gaussian whose width is the mean distance, so they are smooth and scale-free.
     """
-    n = len(points)
-    index = np.zeros((n, NEIGHBOURS), np.int32)
-    weight = np.zeros((n, NEIGHBOURS), np.float32)
-    nearest = np.empty(n, np.float32)
-    for i in prange(n):
-        best = np.full(NEIGHBOURS, np.float32(np.inf))
-        for j in range(len(nodes)):
-            d = np.float32(0)
-            for k in range(3):
-                e = points[i, k] - nodes[j, k]
-                d += e * e
-            if d < best[NEIGHBOURS - 1]:
-                slot = NEIGHBOURS - 1
-                while slot > 0 and best[slot - 1] > d:
-                    best[slot] = best[slot - 1]
-                    index[i, slot] = index[i, slot - 1]
-                    slot -= 1
-                best[slot] = d
-                index[i, slot] = j
-        found = min(NEIGHBOURS, len(nodes))
-        width = np.float32(1e-12)
-        for k in range(found):
-            width += np.float32(1.2) * best[k] / np.float32(found)
-        total = np.float32(0)
-        for k in range(found):
-            weight[i, k] = np.exp(-(best[k] - best[0]) / width)
-            total += weight[i, k]
-        for k in range(found):
-            weight[i, k] /= total
-        nearest[i] = np.sqrt(best[0])
-    return index, weight, nearest
+    index, squared = _nearest(points, nodes, NEIGHBOURS)
+    weight = np.zeros_like(squared)
+    found = min(NEIGHBOURS, len(nodes))
+    near = squared[:, :found]
+    width = np.float32(1e-12) + np.float32(1.2) * near.mean(1, keepdims=True)
+    weight[:, :found] = np.exp((near[:, :1] - near) / width)
+    weight /= weight.sum(1, keepdims=True)
+    return index, weight, np.sqrt(squared[:, 0])
+
+
+@parallel_kernel
+def _nearest(points: F32, nodes: F32, count: int) -> tuple[I32, F32]:
+    """Indices [N, count] of the nearest nodes, nearest first, and squared distances; where there are fewer
+    nodes, 0 and infinity."""
+    index = np.zeros((len(points), count), np.int32)
+    squared = np.full((len(points), count), np.float32(np.inf))
+    for i in prange(len(points)):
+        _nearest_of(points[i], nodes, index[i], squared[i])
+    return index, squared
+
+
+@kernel
+def _nearest_of(point: F32, nodes: F32, index: I32, squared: F32) -> None:
+    last = len(index) - 1
+    for j in range(len(nodes)):
+        d = np.float32(0)
+        for k in range(3):
+            e = point[k] - nodes[j, k]
+            d += e * e
+        if d < squared[last]:
+            slot = last
+            while slot > 0 and squared[slot - 1] > d:
+                squared[slot] = squared[slot - 1]
+                index[slot] = index[slot - 1]
+                slot -= 1
+            squared[slot] = d
+            index[slot] = j
 
 
 @kernel

@@ -228,7 +228,7 @@ class Replay:
         return self._began[1] + self._elapsed(frame_id)
 
 
-def _open_pairs(config: Recording, references: bool) -> Pairs:
+def _open_pairs(config: Recording, references: bool) -> Pairs:  # noqa: PLR0911, one return per kind
     """The reader that fits the kind of recording."""
     match config:
         case cfg.FoldersSource():

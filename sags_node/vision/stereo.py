@@ -18,7 +18,7 @@ LEAST_AGREEMENT = 0.5  # matches below it are wrong more often than right
 AGREEMENT_WINDOW = 9  # px
 HIDDEN_TOLERANCE = 2.0  # px of disparity between two matches of one right pixel
 NOISE_VARIANCE = 1.0  # grey levels squared: texture below it is camera noise, not agreement
-EDGE_MARGIN = 5 / 640  # of the width: depths smear that far across an instrument's edge
+EDGE_MARGIN = 16 / 640  # of the width: depths smear that far across an instrument's edge
 
 
 class StereoDepth:

@@ -1,0 +1,107 @@
+"""From messages of the wire to a bag: topics, compressed pictures; calibration and parameters attached."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+from mcap.records import Schema
+from numpy.typing import NDArray
+
+from sags_node import __version__
+from sags_node.calibration import eye_text
+from sags_node.messaging import cdr, topics
+from sags_node.messaging.topics import CAMERA_INFO, IMAGE
+from sags_node.messaging.wire import PROTOCOL, Message, WireError
+from sags_node.recording.backlog import Arrived
+from sags_node.recording.bag_writer import BagWriter
+from sags_node.recording.pictures import read_eye
+
+Compression = Literal["none", "jpeg", "png"]
+JPEG_QUALITY = 92
+PNG_LEVEL = 1
+_TO_OPENCV = {"rgb8": cv2.COLOR_RGB2BGR, "rgba8": cv2.COLOR_RGBA2BGRA, "mono8": None}
+
+
+class MessageWriter:
+    """Writes messages as they came into a new bag.
+
+    Args:
+        compression: of 8-bit pictures. `jpeg` takes colour pictures only: alpha and masks must stay exact and
+            become PNG. Depth is never compressed.
+
+    Raises:
+        UsageError: something is at `folder` already.
+        SagsError: it cannot be written.
+    """
+
+    def __init__(self, folder: Path, ns: str, compression: Compression) -> None:
+        self.bag = BagWriter(folder)
+        self._ns = ns
+        self._compression = compression
+        self._channels: dict[str, int] = {}
+        self._attached: set[str] = set()
+        self._session = ""
+
+    def write(self, arrived: Arrived) -> None:
+        """Write one message.
+
+        Raises:
+            WireError: its content is not what it says.
+        """
+        message, meta = arrived.message, arrived.message.meta
+        if meta.session != self._session:
+            self._session = meta.session
+            self.bag.note(
+                "sags",
+                {"session": meta.session, "protocol": PROTOCOL, "ns": self._ns, "version": __version__},
+            )
+        self._attach(arrived)
+        name, kind, data = message.topic, meta.type, b"".join(message.parts)
+        if self._compression != "none" and kind == IMAGE and meta.encoding in _TO_OPENCV:
+            form = "jpeg" if self._compression == "jpeg" and meta.encoding == "rgb8" else "png"
+            name, kind, data = f"{name}/compressed", cdr.COMPRESSED, _compressed(message, data, form)
+        if name not in self._channels:
+            self._channels[name] = self._announce(name, kind)
+        self.bag.write(self._channels[name], arrived.received_ns, meta.stamp_ns, meta.seq, data)
+
+    def _announce(self, name: str, kind: str) -> int:
+        known = topics.BY_NAME.get(name.removeprefix(f"{self._ns}/"))
+        schema = Schema(id=0, name=kind, encoding="ros2msg", data=cdr.definition(kind).encode())
+        latched = known is not None and known.cached
+        return self.bag.add_topic(f"/{name}", kind, schema, cdr.type_hash(kind), latched)
+
+    def _attach(self, arrived: Arrived) -> None:
+        """Calibration and parameters lie in the file as files too, for people who open it years later."""
+        topic, message = arrived.message.topic, arrived.message
+        if topic in self._attached:
+            return
+        if topic.endswith("/parameters"):
+            text = cdr.parse(message).data.encode()
+            self.bag.attach("parameters.json", "application/json", text, arrived.received_ns)
+        elif message.meta.type == CAMERA_INFO:
+            side = topic.split("/")[-2]
+            text = eye_text(read_eye(message.cdr(), topic), side).encode()
+            self.bag.attach(f"calib/{side}.yaml", "application/yaml", text, arrived.received_ns)
+        else:
+            return
+        self._attached.add(topic)
+
+
+def _compressed(message: Message, data: bytes, form: str) -> bytes:
+    """The CDR of the compressed picture."""
+    code = _TO_OPENCV[message.meta.encoding]
+    picture = message.array()
+    stored: NDArray[np.uint8] = picture if code is None else cv2.cvtColor(picture, code)
+    quality = (
+        [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+        if form == "jpeg"
+        else [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL]
+    )
+    done, packed = cv2.imencode(f".{form}", stored, quality)
+    if not done:
+        raise WireError(f"{message.topic}: a picture cannot be compressed as {form}")
+    header = cdr.decode(data, IMAGE).header
+    return cdr.compressed_image(packed.tobytes(), form, message.meta.encoding, header)

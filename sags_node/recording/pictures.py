@@ -1,0 +1,164 @@
+"""What cameras say in ROS: pictures, raw and compressed, and their calibration, checked and decoded."""
+
+from __future__ import annotations
+
+import struct
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+
+from sags_node.errors import SagsError, UsageError
+from sags_node.messaging import cdr
+from sags_node.messaging.topics import CAMERA_INFO, IMAGE
+from sags_node.types import U8, Eye
+
+IMAGE_TYPES = (IMAGE, cdr.COMPRESSED)
+LARGEST_SIDE = 16384  # px
+MAX_PIXELS = 64 << 20
+_PNG_START = b"\x89PNG\r\n\x1a\n"
+_STAMP = struct.Struct("<iI")
+_BIG_STAMP = struct.Struct(">iI")
+
+_FILE_TO_RGB = {1: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGB}  # channels: conversion
+
+
+class Encoding(NamedTuple):
+    """How one of ROS's picture encodings becomes RGB."""
+
+    bytes_per_pixel: int
+    to_rgb: int | None  # OpenCV's conversion
+
+
+ENCODINGS = {
+    "rgb8": Encoding(3, None),
+    "bgr8": Encoding(3, cv2.COLOR_BGR2RGB),
+    "8UC3": Encoding(3, cv2.COLOR_BGR2RGB),
+    "rgba8": Encoding(4, cv2.COLOR_RGBA2RGB),
+    "bgra8": Encoding(4, cv2.COLOR_BGRA2RGB),
+    "8UC4": Encoding(4, cv2.COLOR_BGRA2RGB),
+    "mono8": Encoding(1, cv2.COLOR_GRAY2RGB),
+    "8UC1": Encoding(1, cv2.COLOR_GRAY2RGB),
+    "uyvy": Encoding(2, cv2.COLOR_YUV2RGB_UYVY),
+    "yuv422": Encoding(2, cv2.COLOR_YUV2RGB_UYVY),  # the old name
+    "yuyv": Encoding(2, cv2.COLOR_YUV2RGB_YUYV),
+    "yuv422_yuy2": Encoding(2, cv2.COLOR_YUV2RGB_YUYV),
+    "bayer_rggb8": Encoding(1, cv2.COLOR_BayerRGGB2RGB),
+    "bayer_bggr8": Encoding(1, cv2.COLOR_BayerBGGR2RGB),
+    "bayer_gbrg8": Encoding(1, cv2.COLOR_BayerGBRG2RGB),
+    "bayer_grbg8": Encoding(1, cv2.COLOR_BayerGRBG2RGB),
+}
+
+
+def header_stamp(data: bytes | memoryview) -> int:
+    """The stamp (ns) of a CDR message that begins with a `std_msgs/Header`.
+
+    Raises:
+        SagsError: it is too short to have one.
+    """
+    if len(data) < 12:
+        raise SagsError(f"a message of {len(data)} bytes has no header")
+    seconds, nanoseconds = (_STAMP if data[1] & 1 else _BIG_STAMP).unpack_from(data, 4)
+    return int(seconds) * 1_000_000_000 + int(nanoseconds)
+
+
+def decode_picture(data: bytes | memoryview, kind: str, where: str) -> U8:
+    """The RGB picture [H, W, 3] in an `Image` or `CompressedImage`; a new array.
+
+    Args:
+        kind: ROS type of the message.
+        where: what to call it in messages.
+
+    Raises:
+        SagsError: the message is damaged, or of an encoding that is not read.
+    """
+    message = _decoded(data, kind, where)
+    if kind == cdr.COMPRESSED:
+        decoded = decode_file(np.asarray(message.data, np.uint8), where)
+        channels = 1 if decoded.ndim == 2 else decoded.shape[2]
+        of_file: U8 = cv2.cvtColor(decoded, _FILE_TO_RGB[channels])
+        return of_file
+    return _raw_to_rgb(message, where)
+
+
+def _raw_to_rgb(message: Any, where: str) -> U8:
+    encoding = ENCODINGS.get(message.encoding)
+    if encoding is None:
+        known = ", ".join(ENCODINGS)
+        raise SagsError(f"{where}: a picture encoded as {message.encoding!r} is not read; known: {known}")
+    height, width, step = message.height, message.width, message.step
+    used = width * encoding.bytes_per_pixel
+    sizes = 0 < height <= LARGEST_SIDE and 0 < width <= LARGEST_SIDE
+    if not sizes or step < used or message.data.size < height * step:
+        raise SagsError(
+            f"{where}: {width}x{height} px of {message.encoding} in rows of {step} bytes do not fit "
+            f"{message.data.size} bytes"
+        )
+    rows = message.data[: height * step].reshape(height, step)[:, :used]
+    pixels = rows if encoding.bytes_per_pixel == 1 else rows.reshape(height, width, -1)
+    try:
+        rgb: U8 = pixels.copy() if encoding.to_rgb is None else cv2.cvtColor(pixels, encoding.to_rgb)
+    except cv2.error:
+        raise SagsError(f"{where}: {width}x{height} px cannot be {message.encoding}") from None
+    return rgb
+
+
+def decode_file(file: U8, where: str) -> U8:
+    """A JPEG or PNG as OpenCV decodes it: [H, W] or BGR(A) [H, W, C].
+
+    Raises:
+        SagsError: it is none, larger than `MAX_PIXELS`, or not of 8 bit.
+    """
+    size = _file_size(file[: 1 << 16].tobytes())
+    if size is None or not 0 < size[0] * size[1] <= MAX_PIXELS:
+        raise SagsError(f"{where}: a compressed picture is no JPEG or PNG, or too large (64 Mpx)")
+    picture: U8 | None = cv2.imdecode(file, cv2.IMREAD_UNCHANGED)
+    if picture is None or picture.dtype != np.uint8:
+        raise SagsError(f"{where}: a compressed picture is damaged or not of 8 bit")
+    return picture
+
+
+def _file_size(start: bytes) -> tuple[int, int] | None:
+    """Height and width that the head of a JPEG or PNG claims, before anything is decoded."""
+    if start.startswith(_PNG_START) and len(start) >= 24:
+        width, height = struct.unpack_from(">II", start, 16)
+        return height, width
+    at = 2 if start.startswith(b"\xff\xd8") else len(start)
+    while at + 9 <= len(start) and start[at] == 0xFF:
+        marker, length = start[at + 1], int.from_bytes(start[at + 2 : at + 4], "big")
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # start of frame
+            height, width = struct.unpack_from(">HH", start, at + 5)
+            return height, width
+        at += 2 + length
+    return None
+
+
+def read_eye(data: bytes | memoryview, where: str) -> Eye:
+    """The calibration in a `CameraInfo`.
+
+    Raises:
+        SagsError: the message is damaged.
+        UsageError: a distortion model that is not supported.
+    """
+    message = _decoded(data, CAMERA_INFO, where)
+    distortion = np.asarray(message.d, np.float64)
+    if message.distortion_model not in ("plumb_bob", "") or len(distortion) > 5:
+        raise UsageError(
+            f"{where}: distortion model {message.distortion_model!r} with {len(distortion)} coefficients is "
+            "not supported; calibrate with 'plumb_bob', or set rig"
+        )
+    return Eye(
+        width=message.width,
+        height=message.height,
+        K=np.array(message.k, np.float64).reshape(3, 3),
+        distortion=np.pad(distortion, (0, 5 - len(distortion))),
+        R=np.array(message.r, np.float64).reshape(3, 3),
+        P=np.array(message.p, np.float64).reshape(3, 4),
+    )
+
+
+def _decoded(data: bytes | memoryview, kind: str, where: str) -> Any:
+    try:
+        return cdr.decode(data, kind)
+    except SagsError as error:
+        raise SagsError(f"{where}: {error}") from None

@@ -1,0 +1,138 @@
+"""Publishes a bag on the wire again, as a node would: same sockets, same messages, stamped as if live."""
+
+from __future__ import annotations
+
+import threading
+import time
+import uuid
+from collections import OrderedDict
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from sags_node.config import PublishConfig
+from sags_node.errors import SagsError
+from sags_node.messaging import cdr, topics
+from sags_node.messaging.publisher import Publisher
+from sags_node.recording.bag import BagMessage, read_messages
+from sags_node.recording.outgoing import COMPRESSED_SUFFIX, original_stamp, outgoing
+
+POLL_MS = 20  # how soon pause and stop are noticed
+STAMPS_KEPT = 64
+FRAME_TYPES = (topics.IMAGE, topics.POINT_CLOUD, topics.CAMERA_INFO, topics.TF)
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """The flags of `ros2 bag play`. Seconds are those of the recording, but for `delay`.
+
+    Attributes:
+        topics, exclude: without leading slash and namespace; no topics: all.
+        remap: from old to new name, the same way.
+    """
+
+    rate: float = 1.0
+    loop: bool = False
+    delay: float = 0.0
+    start_offset: float = 0.0
+    playback_duration: float | None = None
+    topics: tuple[str, ...] = ()
+    exclude: tuple[str, ...] = ()
+    remap: dict[str, str] = field(default_factory=dict)
+
+
+class Player:
+    """Call `play` once. `stop` and `toggle_pause` may be called from any thread or signal handler."""
+
+    def __init__(
+        self, path: Path, options: Options, config: PublishConfig, ns: str = "sags", paused: bool = False
+    ) -> None:
+        self._path = path
+        self._options = options
+        self._config = config
+        self._ns = ns
+        self._stopping = threading.Event()
+        self._paused = paused
+        self._sent = 0
+        self._frames: OrderedDict[int, int] = OrderedDict()  # original stamp -> number of the frame
+        self._frame_count = 0
+
+    def stop(self) -> None:
+        self._stopping.set()
+
+    def toggle_pause(self) -> None:
+        self._paused = not self._paused
+
+    def play(self) -> dict[str, Any]:
+        """Publish until the bag ends or `stop`; returns messages, passes and seconds.
+
+        Raises:
+            UsageError: there is no bag, or an endpoint is open to others without keys.
+            SagsError: the bag is damaged, an endpoint is taken, or nothing in the bag was asked for.
+        """
+        began = time.monotonic()
+        passes = 0
+        with Publisher(self._config, self._ns, uuid.uuid4().hex) as publisher:
+            self._wait_until(time.monotonic() + self._options.delay, publisher)
+            while not self._stopping.is_set():
+                self._play_once(publisher, epoch=passes)
+                passes += 1
+                if not self._sent and not self._stopping.is_set():
+                    raise SagsError(f"{self._path} holds no message that was asked for; see sags bag info")
+                if not self._options.loop:
+                    break
+        return {"messages": self._sent, "passes": passes, "seconds": round(time.monotonic() - began, 3)}
+
+    def _play_once(self, publisher: Publisher, epoch: int) -> None:
+        options = self._options
+        first_ns = 0
+        started, started_ns = 0.0, 0
+        for message in read_messages(self._path):
+            if not first_ns:
+                first_ns = message.log_ns + round(options.start_offset * 1e9)
+                started, started_ns = time.monotonic(), time.time_ns()
+            after = (message.log_ns - first_ns) * 1e-9
+            if after < 0 or not self._is_wanted(message):
+                continue
+            if options.playback_duration is not None and after > options.playback_duration:
+                return
+            paused = self._wait_until(started + after / options.rate, publisher)
+            started, started_ns = started + paused, started_ns + round(paused * 1e9)
+            if self._stopping.is_set():
+                return
+            original = original_stamp(message)
+            stamp_ns = started_ns + round((original - first_ns) / options.rate)
+            name, content = outgoing(message, stamp_ns)
+            number = self._frame_number(original) if content.type in FRAME_TYPES else -1
+            name = name.removeprefix(f"{self._ns}/")
+            publisher.publish_content(options.remap.get(name, name), content, number, stamp_ns, epoch)
+            self._sent += 1
+
+    def _wait_until(self, due: float, publisher: Publisher) -> float:
+        """Serve subscriptions until it is time; returns how long playing was paused, s."""
+        paused = 0.0
+        while not self._stopping.is_set():
+            left = due + paused - time.monotonic()
+            if left <= 0 and not self._paused:
+                break
+            before = time.monotonic()
+            publisher.poll(POLL_MS if self._paused else min(POLL_MS, int(left * 1e3)))
+            if self._paused:
+                paused += time.monotonic() - before
+        return paused
+
+    def _is_wanted(self, message: BagMessage) -> bool:
+        name = message.topic.lstrip("/").removesuffix(COMPRESSED_SUFFIX).removeprefix(f"{self._ns}/")
+        options = self._options
+        if not cdr.knows(message.type):
+            return False  # it could not be described to anybody
+        return (not options.topics or name in options.topics) and name not in options.exclude
+
+    def _frame_number(self, stamp_ns: int) -> int:
+        """What has one stamp shows one frame."""
+        if stamp_ns not in self._frames:
+            self._frames[stamp_ns] = self._frame_count
+            self._frame_count += 1
+            if len(self._frames) > STAMPS_KEPT:
+                self._frames.popitem(last=False)
+        return self._frames[stamp_ns]

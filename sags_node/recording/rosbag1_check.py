@@ -1,0 +1,91 @@
+"""A look over a ROS 1 bag before it is opened: every length fits, every chunk unpacks to little.
+
+Format: http://wiki.ros.org/Bags/Format/2.0. A record is header length, header fields, data length, data.
+"""
+
+from __future__ import annotations
+
+import bz2
+import struct
+from pathlib import Path
+from typing import BinaryIO
+
+import lz4.frame
+
+from sags_node.recording.mcap_file import MAX_CHUNK_BYTES, MAX_RECORD_BYTES, DamagedError
+
+MAGIC = b"#ROSBAG V2.0\n"
+MAX_HEADER_BYTES = 1 << 20
+CHUNK_OP = b"\x05"
+_LENGTH = struct.Struct("<I")
+
+
+def chunk_positions(file: Path) -> set[int]:
+    """Where the chunks of a bag begin.
+
+    Raises:
+        DamagedError: it is no ROS 1 bag, a length does not fit, or a chunk unpacks to too much.
+    """
+    size = file.stat().st_size
+    positions = set()
+    with file.open("rb") as bag:
+        if bag.read(len(MAGIC)) != MAGIC:
+            raise DamagedError(0, "it does not begin as a ROS 1 bag of version 2.0")
+        while (position := bag.tell()) < size:
+            header = bag.read(_length(bag, size, MAX_HEADER_BYTES))
+            length = _length(bag, size, MAX_RECORD_BYTES)
+            fields = _fields(header, position)
+            if fields.get(b"op") == CHUNK_OP:
+                positions.add(position)
+                _check_chunk(bag, length, fields, position)
+            bag.seek(position + 8 + len(header) + length)
+    return positions
+
+
+def _length(bag: BinaryIO, size: int, most: int) -> int:
+    position = bag.tell()
+    read = bag.read(_LENGTH.size)
+    if len(read) < _LENGTH.size:
+        raise DamagedError(position, "the file ends inside a record")
+    length = int(_LENGTH.unpack(read)[0])
+    if length > min(most, size - bag.tell()):
+        raise DamagedError(
+            position, f"a part of {length} bytes is larger than the file's rest or than any may be"
+        )
+    return length
+
+
+def _fields(header: bytes, position: int) -> dict[bytes, bytes]:
+    fields, at = {}, 0
+    while at + _LENGTH.size <= len(header):
+        (length,) = _LENGTH.unpack_from(header, at)
+        at += _LENGTH.size
+        name, equals, value = header[at : at + length].partition(b"=")
+        if not equals or at + length > len(header):
+            raise DamagedError(position, "the header of a record cannot be read")
+        fields[name] = value
+        at += length
+    return fields
+
+
+def _check_chunk(bag: BinaryIO, length: int, fields: dict[bytes, bytes], position: int) -> None:
+    """The packed data is unpacked once here, with a limit that the reader itself does not have."""
+    said = fields.get(b"size", b"")
+    size = int(_LENGTH.unpack(said)[0]) if len(said) == _LENGTH.size else MAX_CHUNK_BYTES + 1
+    if size > MAX_CHUNK_BYTES:
+        raise DamagedError(position, "a chunk says that it unpacks to more than 256 MB, or does not say")
+    compression = fields.get(b"compression")
+    if compression == b"none":
+        return
+    packed = bag.read(length)
+    try:
+        if compression == b"bz2":
+            data = bz2.BZ2Decompressor().decompress(packed, max_length=size + 1)
+        elif compression == b"lz4":
+            data = lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size + 1)
+        else:
+            raise DamagedError(position, f"a chunk of unknown compression {compression!r}")
+    except (OSError, RuntimeError, EOFError) as error:
+        raise DamagedError(position, f"a chunk cannot be unpacked: {error}") from None
+    if len(data) != size:
+        raise DamagedError(position, f"a chunk does not unpack to the {size} bytes it says")

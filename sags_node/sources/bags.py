@@ -1,0 +1,311 @@
+"""Stereo pairs and calibration from ROS recordings.
+
+A bag is read through once when it is opened: that finds every damage, the stamps that pair the eyes, and the
+calibration. Playing reads it forward again.
+"""
+
+from __future__ import annotations
+
+import difflib
+import logging
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from sags_node.calibration import check_rig, refuse_errors
+from sags_node.config import BagSource
+from sags_node.errors import SagsError, UsageError
+from sags_node.messaging.topics import CAMERA_INFO
+from sags_node.recording.bag import BagMessage, read_messages
+from sags_node.recording.pictures import IMAGE_TYPES, decode_picture, header_stamp, read_eye
+from sags_node.sources.pictures import RawPair, size_text
+from sags_node.sources.stamps import nearest, pair
+from sags_node.types import I64, U8, StereoRig
+
+log = logging.getLogger(__name__)
+
+# What drivers and this node call an eye's picture, the most usual first; "/compressed" may follow.
+PICTURE_NAMES = ("image_raw", "image_rect_color", "image_color", "image_rect", "image", "image_mono")
+COMPRESSED = "/compressed"
+MAX_WAITING = 64  # pictures read ahead of their partner
+FEW_PAIRS = 0.9  # of the left pictures; fewer are worth a warning
+
+Key = tuple[int, int]  # when a message was recorded and its own stamp, ns: names it within its topic
+
+
+@dataclass(slots=True)
+class _Topic:
+    type: str
+    keys: list[Key] = field(default_factory=list)
+
+
+@dataclass(frozen=True, slots=True)
+class Contents:
+    """What one reading of a bag found."""
+
+    types: dict[str, str]  # every topic
+    pictures: dict[str, _Topic]
+    infos: dict[str, bytes]  # the first camera_info of each topic
+
+
+class Eyes(NamedTuple):
+    """The topics of both eyes."""
+
+    left: str
+    right: str
+
+
+def read_contents(path: Path) -> Contents:
+    """Topics, stamps and calibration of a bag; the last one read is remembered.
+
+    Raises:
+        UsageError: there is no bag.
+        SagsError: it is damaged.
+    """
+    changed = path.stat().st_mtime_ns if path.exists() else 0
+    return _read_contents(path, changed)
+
+
+@lru_cache(maxsize=1)
+def _read_contents(path: Path, changed: int) -> Contents:
+    types: dict[str, str] = {}
+    pictures: dict[str, _Topic] = {}
+    infos: dict[str, bytes] = {}
+    for message in read_messages(path):
+        types.setdefault(message.topic, message.type)
+        if message.type in IMAGE_TYPES:
+            key = message.log_ns, _stamp(path, message)
+            pictures.setdefault(message.topic, _Topic(message.type)).keys.append(key)
+        elif message.type == CAMERA_INFO:
+            infos.setdefault(message.topic, bytes(message.data))
+    return Contents(types, pictures, infos)
+
+
+def _stamp(path: Path, message: BagMessage) -> int:
+    """The capture stamp; when it was recorded where a driver left it zero."""
+    try:
+        return header_stamp(message.data) or message.log_ns
+    except SagsError as error:
+        raise SagsError(f"{path}: {message.topic}: {error}") from None
+
+
+class BagPairs:
+    """The stereo pairs of a bag: pictures whose stamps are each other's nearest, and near enough.
+
+    Attributes:
+        stamps: [count, 2] ns, capture of the left and the right picture.
+
+    Raises:
+        UsageError: there is no bag, its topics are not clear, or nothing pairs.
+        SagsError: it is damaged.
+    """
+
+    def __init__(self, config: BagSource) -> None:
+        self._path = config.path
+        contents = read_contents(config.path)
+        self._eyes = find_eyes(config, contents)
+        left, right = (contents.pictures[name].keys for name in self._eyes)
+        pairs = pair(np.array(left, np.int64)[:, 1], np.array(right, np.int64)[:, 1], config.tolerance)
+        if not len(pairs):
+            raise UsageError(_nothing_pairs(config, self._eyes, left, right))
+        if len(pairs) < FEW_PAIRS * len(left):
+            log.warning(
+                "%s: %d pairs of %d left and %d right pictures",
+                config.path,
+                len(pairs),
+                len(left),
+                len(right),
+            )
+        self._keys = [(left[i], right[j]) for i, j in pairs]
+        self.stamps: I64 = np.array([[a[1], b[1]] for a, b in self._keys], np.int64)
+        self.count = len(self._keys)
+        steps = np.diff(self.stamps[:, 0])
+        self.rate: float | None = (
+            float(1e9 / np.median(steps)) if len(steps) and np.median(steps) > 0 else None
+        )
+        self._turns = [{keys[eye]: turn for turn, keys in enumerate(self._keys)} for eye in (0, 1)]
+        self._size: tuple[int, int] | None = None
+        self.seek(0)
+
+    def seek(self, index: int) -> None:
+        self._next = index
+        self._waiting: dict[tuple[int, Key], BagMessage] = {}
+        self._messages: Iterator[BagMessage] | None = None
+
+    def skip(self) -> bool:
+        self._next += 1
+        return self._next <= self.count
+
+    def read(self) -> RawPair | None:
+        """The next pair, None at the end.
+
+        Raises:
+            SagsError: a picture is damaged, of an encoding that is not read, or of another size.
+        """
+        if self._next >= self.count:
+            return None
+        if self._messages is None:
+            start_ns = min(key[0] for keys in self._keys[self._next :] for key in keys)
+            self._messages = read_messages(self._path, self._eyes, start_ns)
+        left, right = (self._picture(eye, key) for eye, key in enumerate(self._keys[self._next]))
+        self._next += 1
+        return RawPair(left, right, None)
+
+    def close(self) -> None:
+        self._messages = None
+
+    def _picture(self, eye: int, key: Key) -> U8:
+        message = self._find(eye, key)
+        where = f"{self._path}: {message.topic} at {key[1]} ns"
+        picture = decode_picture(message.data, message.type, where)
+        size = picture.shape[1], picture.shape[0]
+        self._size = self._size or size
+        if size != self._size:
+            raise SagsError(
+                f"{where}: {size_text(*size)} px, but the pictures before are {size_text(*self._size)}; "
+                "all pictures must have one size"
+            )
+        return picture
+
+    def _find(self, eye: int, key: Key) -> BagMessage:
+        """Read forward to one message; those of later pairs wait in memory."""
+        assert self._messages is not None
+        if (eye, key) in self._waiting:
+            return self._waiting.pop((eye, key))
+        for message in self._messages:
+            side = self._eyes.index(message.topic)
+            found = message.log_ns, _stamp(self._path, message)
+            if (side, found) == (eye, key):
+                return message
+            if self._turns[side].get(found, -1) >= self._next:
+                self._waiting[side, found] = message
+            if len(self._waiting) > MAX_WAITING:
+                raise SagsError(
+                    f"{self._path}: left and right pictures of one moment lie too far apart in the file; "
+                    "sort it by time (ros2 bag convert)"
+                )
+        raise SagsError(f"{self._path} changed while it was read")
+
+
+# ---- which topics ----------------------------------------------------------------------------------------
+
+
+def find_eyes(config: BagSource, contents: Contents) -> Eyes:
+    """The picture topics that are named, or the only ones that look like a stereo pair.
+
+    Raises:
+        UsageError: a named topic is missing or holds no pictures, or none or several pairs are there.
+    """
+    if config.left is not None:
+        left = _named(config, contents, "left", config.left)
+        right = config.right or _counterpart(config.left)
+        if right is None:
+            raise UsageError(f"source.right is missing: {config.left} does not tell the right eye's topic")
+        return Eyes(left, _named(config, contents, "right", right))
+    if config.right is not None:
+        raise UsageError("source.left is missing: name both eyes, or neither")
+    found = sorted((rank, eyes) for eyes in _pairs(contents) if (rank := _rank(eyes.left)) is not None)
+    best = [eyes for rank, eyes in found if rank == found[0][0]]
+    if len(best) == 1:
+        return best[0]
+    listed = "; ".join(f"{eyes.left} and {eyes.right}" for eyes in best) or "none"
+    there = ", ".join(sorted(contents.pictures)) or "none"
+    raise UsageError(
+        f"{config.path}: stereo pairs of topics that look usable: {listed}; set source.left and "
+        f"source.right. Picture topics: {there}. (A node publishes its right eye with publish.right:=true)"
+    )
+
+
+def _pairs(contents: Contents) -> Iterator[Eyes]:
+    for name in contents.pictures:
+        right = _counterpart(name)
+        if right in contents.pictures:
+            yield Eyes(name, right)
+
+
+def _counterpart(left: str) -> str | None:
+    """The right eye's topic: the last "left" in the name becomes "right"."""
+    before, said, after = left.rpartition("left")
+    return f"{before}right{after}" if said else None
+
+
+def _rank(left: str) -> int | None:
+    """How usual a name is; None for pictures that no camera made (render, depth, masks)."""
+    compressed = left.endswith(COMPRESSED)
+    parts = left.removesuffix(COMPRESSED).split("/")
+    if parts[-1] not in PICTURE_NAMES or "render" in parts:
+        return None
+    return 2 * PICTURE_NAMES.index(parts[-1]) + compressed
+
+
+def _named(config: BagSource, contents: Contents, key: str, name: str) -> str:
+    """A topic as the bag spells it: with or without leading slash, raw or compressed."""
+    for candidate in (name, f"/{name}", name.lstrip("/")):
+        for full in (candidate, candidate + COMPRESSED):
+            if full in contents.pictures:
+                return full
+            if full in contents.types:
+                raise UsageError(
+                    f"source.{key}: {full} in {config.path} is {contents.types[full]}, not a picture topic"
+                )
+    near = difflib.get_close_matches(name, contents.pictures, n=1, cutoff=0.3)
+    hint = f"did you mean '{near[0]}'?" if near else "it has no picture topics"
+    raise UsageError(f"source.{key}: {config.path} has no topic {name}; {hint}")
+
+
+# ---- which pictures --------------------------------------------------------------------------------------
+
+
+def _nothing_pairs(config: BagSource, eyes: Eyes, left: Sequence[Key], right: Sequence[Key]) -> str:
+    stamps = [np.array(keys, np.int64)[:, 1] for keys in (left, right)]
+    skew = float(np.median(np.abs(stamps[0] - stamps[1][nearest(*stamps)]))) * 1e-6
+    return (
+        f"{config.path}: left {len(left)} pictures ({eyes.left}), right {len(right)} ({eyes.right}), "
+        f"pairs 0: the median skew is {skew:.3g} ms, source.tolerance {config.tolerance * 1e3:g} ms; if that "
+        f"is right, set source.tolerance:={skew * 1.5e-3:.3g}"
+    )
+
+
+# ---- calibration -----------------------------------------------------------------------------------------
+
+
+def read_rig(config: BagSource) -> StereoRig | None:
+    """The calibration in the bag's camera_info topics; None where both are missing or say nothing.
+
+    Raises:
+        UsageError: a named topic is missing, only one eye is calibrated, or the calibration is implausible.
+        SagsError: the bag is damaged.
+    """
+    contents = read_contents(config.path)
+    eyes = find_eyes(config, contents)
+    found = [
+        _info(config, contents, key, name, topic)
+        for key, name, topic in zip(
+            ("left_info", "right_info"), (config.left_info, config.right_info), eyes, strict=True
+        )
+    ]
+    read = [None if topic is None else read_eye(contents.infos[topic], topic) for topic in found]
+    left, right = (None if eye is None or eye.K[0, 0] == 0 else eye for eye in read)  # ROS: 0 = uncalibrated
+    if left is None and right is None:
+        return None
+    if left is None or right is None:
+        side = "left" if left is None else "right"
+        raise UsageError(f"{config.path} calibrates one eye only, the {side} one is missing; set rig")
+    rig = StereoRig(config.path.stem, left, right)
+    refuse_errors(check_rig(rig), config.path)
+    return rig
+
+
+def _info(config: BagSource, contents: Contents, key: str, name: str | None, topic: str) -> str | None:
+    if name is None:
+        beside = topic.removesuffix(COMPRESSED).rpartition("/")[0] + "/camera_info"
+        return beside if beside in contents.infos else None
+    for candidate in (name, f"/{name}", name.lstrip("/")):
+        if candidate in contents.infos:
+            return candidate
+    kind = contents.types.get(name, "not there")
+    raise UsageError(f"source.{key}: {name} in {config.path} is {kind}, not a camera_info topic")

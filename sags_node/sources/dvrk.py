@@ -1,0 +1,182 @@
+"""Sessions of dVRK's `record` (dvrk_data): a side-by-side MP4 and a sidecar JSON with the stamps of frames.
+
+The sidecar follows `dvrk_data:video_sidecar@1.0.0`. Its frames are those that reached the recorder; where
+the encoder kept another number of them, each frame of the video takes the stamps of the nearest presentation
+time.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import msgspec
+import numpy as np
+
+from sags_node.config import SIDECAR_TYPE, DvrkSource
+from sags_node.errors import UsageError
+from sags_node.sources.pictures import RawPair
+from sags_node.sources.stamps import nearest
+from sags_node.sources.videos import PanePairs, Video, side_by_side_boxes
+from sags_node.types import I64
+
+MAX_SIDECAR_BYTES = 512 << 20  # hours at 60 Hz
+
+Stamp = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
+
+
+class _Gst(msgspec.Struct):
+    pts_ns: Stamp | None = None
+
+
+class _Realtime(msgspec.Struct):
+    recorder_reception_ns: Stamp
+    left_source_ns: Stamp | None = None
+    right_source_ns: Stamp | None = None
+    stereo_output_ns: Stamp | None = None
+
+
+class _Cpu(msgspec.Struct):
+    realtime: _Realtime
+
+
+class _Frame(msgspec.Struct):
+    cpu: _Cpu
+    gst: _Gst = msgspec.field(default_factory=_Gst)
+
+    def stamps(self) -> tuple[int, int]:
+        """Capture of the left and the right picture, ns; of what knows them best."""
+        seen = self.cpu.realtime
+        fallback = seen.stereo_output_ns or seen.recorder_reception_ns
+        left, right = seen.left_source_ns, seen.right_source_ns
+        return left or right or fallback, right or left or fallback
+
+
+class Sidecar(msgspec.Struct):
+    """What is read of the file; other keys are ignored."""
+
+    type: str
+    video_file: str
+    frames: list[_Frame]
+    side_by_side: Literal["undefined", "LR", "RL"] = "undefined"
+
+
+class DvrkPairs:
+    """The frames of a session.
+
+    Attributes:
+        stamps: [count, 2] ns, capture of the left and the right picture.
+
+    Raises:
+        UsageError: files are missing or damaged, or the video is not stereo.
+    """
+
+    def __init__(self, config: DvrkSource) -> None:
+        file = find_sidecar(config.path)
+        sidecar = read_sidecar(file)
+        order = config.side_by_side or sidecar.side_by_side
+        if order == "undefined":
+            raise UsageError(
+                f"{file} does not say that the video is stereo; set source.side_by_side to LR or RL"
+            )
+        video = Video(file.parent / Path(sidecar.video_file).name)  # a name cannot lead out of the folder
+        try:
+            halves = side_by_side_boxes(*video.size, order, str(video.path))
+            self.stamps = _stamps(file, sidecar, video)
+        except UsageError:
+            video.close()
+            raise
+        self._pairs = PanePairs(video, *halves)
+        self.count = len(self.stamps)
+        steps = np.diff(self.stamps[:, 0])
+        self.rate = float(1e9 / np.median(steps)) if len(steps) and np.median(steps) > 0 else video.rate
+        self._next = 0
+
+    def seek(self, index: int) -> None:
+        self._pairs.seek(index)
+        self._next = index
+
+    def skip(self) -> bool:
+        self._next += 1
+        return self._next <= self.count and self._pairs.skip()
+
+    def read(self) -> RawPair | None:
+        """The next pair, None at the end."""
+        if self._next >= self.count:
+            return None
+        self._next += 1
+        return self._pairs.read()
+
+    def close(self) -> None:
+        self._pairs.close()
+
+
+def find_sidecar(path: Path) -> Path:
+    """The sidecar at `path`, or the only stereo one in that folder.
+
+    Raises:
+        UsageError: there is none, or several.
+    """
+    if path.suffix == ".mp4":
+        return path.with_suffix(".json")
+    if not path.is_dir():
+        return path
+    stereo = [file for file in sorted(path.glob("*.json")) if _is_stereo(file)]
+    if len(stereo) != 1:
+        names = ", ".join(file.name for file in stereo) or "none"
+        raise UsageError(f"{path}: one sidecar of a stereo video is needed, there are: {names}; name one")
+    return stereo[0]
+
+
+def _is_stereo(file: Path) -> bool:
+    try:
+        return read_sidecar(file).side_by_side != "undefined"
+    except UsageError:
+        return False
+
+
+def read_sidecar(file: Path) -> Sidecar:
+    """Read and check a sidecar.
+
+    Raises:
+        UsageError: it is missing, of another type or version, or damaged.
+    """
+    try:
+        if file.stat().st_size > MAX_SIDECAR_BYTES:
+            raise UsageError(f"{file} is too large to be the sidecar of a video")
+        sidecar = msgspec.json.decode(file.read_bytes(), type=Sidecar)
+    except OSError as error:
+        raise UsageError(f"cannot read sidecar {file}: {error.strerror}; check the path") from None
+    except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
+        raise UsageError(f"{file} is not a {SIDECAR_TYPE}1.0.0 file: {error}") from None
+    if not sidecar.type.startswith(f"{SIDECAR_TYPE}1."):
+        raise UsageError(f"{file} is of type {sidecar.type!r}; what is read is {SIDECAR_TYPE}1.0.0")
+    if not sidecar.frames:
+        raise UsageError(f"{file} lists no frames; was anything recorded?")
+    return sidecar
+
+
+def _stamps(file: Path, sidecar: Sidecar, video: Video) -> I64:
+    stamps = np.array([frame.stamps() for frame in sidecar.frames], np.int64)
+    if len(stamps) != video.count:
+        stamps = stamps[_nearest_frames(file, sidecar, video)]
+    if (np.diff(stamps[:, 0]) < 0).any():
+        turn = int(np.argmax(np.diff(stamps[:, 0]) < 0)) + 1
+        raise UsageError(
+            f"{file}: the stamp of frame {turn} lies before that of the frame before; play the MP4 "
+            "alone with source.kind:=side_by_side"
+        )
+    return stamps
+
+
+def _nearest_frames(file: Path, sidecar: Sidecar, video: Video) -> I64:
+    """For each frame of the video the one of the sidecar at the same presentation time."""
+    pts = [frame.gst.pts_ns for frame in sidecar.frames]
+    known = np.array([-1 if at is None else at for at in pts], np.int64)
+    if (known < 0).any() or video.rate is None or (np.diff(known) < 0).any():
+        raise UsageError(
+            f"{file} lists {len(known)} frames but {video.path} holds {video.count}, and there are no rising "
+            "presentation times to join them by; play the MP4 alone with source.kind:=side_by_side"
+        )
+    at = np.round(np.arange(video.count) * 1e9 / video.rate).astype(np.int64)
+    return nearest(at, known - known[0])

@@ -1,0 +1,50 @@
+"""Whether anything moved."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from sags_node.types import U8, RectifiedPair
+
+SHRINK = 8  # px are averaged: camera noise up to 4 grey levels stays below the limit
+BLOCK = 4  # shrunk px: 32 px, the length over which something moves or does not
+LARGEST_DIFFERENCE = 1.0  # grey levels, mean over a block
+LARGEST_SHARE = 0.02  # of the blocks that may differ more: a highlight flickers, an instrument trembles
+
+
+class StillScene:
+    """Compares pictures with those of the last frame in which something moved, not with the frame before: slow
+    motion adds up and is seen."""
+
+    def __init__(self) -> None:
+        self._eyes: list[U8] | None = None
+        self._frames = 0
+
+    def forget(self) -> None:
+        """Take the next frame for one in which something moved."""
+        self._eyes = None
+
+    def __call__(self, pair: RectifiedPair) -> int:
+        """For how many frames, this one included, both eyes have seen the same; 0: something moved."""
+        eyes = [_shrunk(eye) for eye in (pair.left, pair.right) if eye is not None]
+        before = self._eyes
+        if before is not None and len(before) == len(eyes) and all(map(_alike, eyes, before)):
+            self._frames += 1
+        else:
+            self._eyes, self._frames = eyes, 0
+        return self._frames
+
+
+def _shrunk(image: U8) -> U8:
+    height, width = image.shape[:2]
+    size = max(1, width // SHRINK), max(1, height // SHRINK)
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+
+
+def _alike(a: U8, b: U8) -> bool:
+    difference = cv2.absdiff(a, b).astype(np.float32).mean(-1)
+    height, width = difference.shape
+    blocks = max(1, width // BLOCK), max(1, height // BLOCK)
+    mean = cv2.resize(difference, blocks, interpolation=cv2.INTER_AREA)
+    return bool(np.mean(mean > LARGEST_DIFFERENCE) <= LARGEST_SHARE)

@@ -1,0 +1,107 @@
+"""Bags of every kind, written by `rosbags`, with pictures whose every pixel is known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from rosbags import rosbag1, rosbag2
+from rosbags.typesys import Stores, get_typestore
+
+ROS2, ROS1 = get_typestore(Stores.ROS2_JAZZY), get_typestore(Stores.ROS1_NOETIC)
+IMAGE, COMPRESSED, INFO = (f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "CameraInfo"))
+WIDTH, HEIGHT = 64, 48
+FOCAL, BASELINE = 80.0, 0.005
+MS = 1_000_000
+START = 1_700_000_000_000_000_000  # ns
+
+Row = tuple[str, Any, int]  # topic, message without stamp, stamp ns
+
+
+def picture(number: int, eye: int) -> np.ndarray:
+    """RGB [H, W, 3]; no two are alike."""
+    v, u = np.mgrid[:HEIGHT, :WIDTH]
+    return np.stack([u * 3 + number, v * 5 + 7 * eye, u + v + number * 2], -1).astype(np.uint8)
+
+
+def header(store: Any, stamp_ns: int) -> Any:
+    time = store.types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, 10**9))
+    kind = store.types["std_msgs/msg/Header"]
+    return kind(3, time, "eye") if store is ROS1 else kind(time, "eye")
+
+
+def image(store: Any, rgb: np.ndarray, stamp_ns: int, encoding: str = "rgb8", padding: int = 0) -> Any:
+    """`rgb` as a driver would send it in that encoding, with `padding` bytes after each row."""
+    codes = {"bgr8": cv2.COLOR_RGB2BGR, "bgra8": cv2.COLOR_RGB2BGRA, "rgba8": cv2.COLOR_RGB2RGBA}
+    codes["mono8"] = cv2.COLOR_RGB2GRAY
+    pixels = rgb if encoding == "rgb8" else cv2.cvtColor(rgb, codes[encoding])
+    rows = pixels.reshape(len(rgb), -1)
+    rows = np.pad(rows, ((0, 0), (0, padding)))
+    kind = store.types[IMAGE]
+    head = header(store, stamp_ns)
+    return kind(head, *rgb.shape[:2], encoding, 0, rows.shape[1], np.ascontiguousarray(rows).ravel())
+
+
+def compressed(store: Any, rgb: np.ndarray, stamp_ns: int, kind: str = "png") -> Any:
+    data = cv2.imencode(f".{kind}", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))[1].ravel()
+    return store.types[COMPRESSED](header(store, stamp_ns), f"rgb8; {kind} compressed bgr8", data)
+
+
+def camera_info(store: Any, stamp_ns: int, eye: int) -> Any:
+    K = np.array([FOCAL, 0, WIDTH / 2, 0, FOCAL, HEIGHT / 2, 0, 0, 1.0])
+    P = np.column_stack([K.reshape(3, 3), [-FOCAL * BASELINE * eye, 0, 0]]).ravel()
+    roi = store.types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
+    numbers = (np.zeros(5), K, np.eye(3).ravel(), P)
+    return store.types[INFO](header(store, stamp_ns), HEIGHT, WIDTH, "plumb_bob", *numbers, 0, 0, roi)
+
+
+def stereo_rows(
+    store: Any,
+    count: int = 10,
+    names: tuple[str, str] = ("/rig/left/image_raw", "/rig/right/image_raw"),
+    skew_ms: float = 2.0,
+    make: Any = image,
+    infos: bool = True,
+    **options: Any,
+) -> list[Row]:
+    """A stereo camera at 25 Hz whose right eye is `skew_ms` late."""
+    rows: list[Row] = []
+    for number in range(count):
+        for eye, name in enumerate(names):
+            stamp = START + number * 40 * MS + round(eye * skew_ms * MS)
+            rows.append((name, make(store, picture(number, eye), stamp, **options), stamp))
+            if infos:
+                beside = name.removesuffix("/compressed").rpartition("/")[0] + "/camera_info"
+                rows.append((beside, camera_info(store, stamp, eye), stamp))
+    return rows
+
+
+def write_rosbag2(path: Path, rows: list[Row], plugin: str = "MCAP", compression: str | None = None) -> Path:
+    """A rosbag2 folder; what was stamped t was recorded 5 ms later."""
+    writer = rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin[plugin])
+    if compression is not None:
+        writer.set_compression(rosbag2.CompressionMode[compression], rosbag2.CompressionFormat.ZSTD)
+    with writer:
+        known: dict[str, Any] = {}
+        for topic, message, stamp in rows:
+            kind = message.__msgtype__
+            if topic not in known:
+                known[topic] = writer.add_connection(topic, kind, typestore=ROS2)
+            writer.write(known[topic], stamp + 5 * MS, ROS2.serialize_cdr(message, kind))
+    return path
+
+
+def write_rosbag1(path: Path, rows: list[Row], compression: str | None = None) -> Path:
+    writer = rosbag1.Writer(path)
+    if compression is not None:
+        writer.set_compression(rosbag1.Writer.CompressionFormat[compression])
+    with writer:
+        known: dict[str, Any] = {}
+        for topic, message, stamp in rows:
+            kind = message.__msgtype__
+            if topic not in known:
+                known[topic] = writer.add_connection(topic, kind, typestore=ROS1)
+            writer.write(known[topic], stamp + 5 * MS, ROS1.serialize_ros1(message, kind))
+    return path

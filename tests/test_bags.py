@@ -1,0 +1,475 @@
+"""ROS recordings and dVRK sessions as sources: every kind of file, every way it can be wrong."""
+
+from __future__ import annotations
+
+import json
+import random
+import resource
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import bag_files as files
+import cv2
+import numpy as np
+import pytest
+from bag_files import MS, ROS1, ROS2, START, picture
+
+from sags_node.apps.launching import split
+from sags_node.calibration import save_rig
+from sags_node.config import BagSource, DvrkSource, LaunchConfig, load_launch
+from sags_node.errors import SagsError, UsageError
+from sags_node.recording.info import bag_info
+from sags_node.session import open_session
+from sags_node.sources.bags import read_rig
+from sags_node.sources.replay import Replay
+from sags_node.sources.stamps import pair
+from sags_node.types import StereoFrame
+
+COUNT = 10
+
+
+def play(path: Path, **config: Any) -> list[StereoFrame]:
+    with Replay(BagSource(path=path, pace="step", **config)) as source:
+        return list(source)
+
+
+def assert_frames(frames: list[StereoFrame], numbers: list[int], tolerance: int = 0) -> None:
+    """These pictures of `bag_files.picture`, with the stamps they were taken at."""
+    assert [frame.t_capture_ns for frame in frames] == [START + number * 40 * MS for number in numbers]
+    for frame, number in zip(frames, numbers, strict=True):
+        assert frame.t_capture_right_ns - frame.t_capture_ns == 2 * MS
+        for eye, seen in enumerate((frame.left, frame.right)):
+            assert seen is not None
+            assert np.abs(seen.astype(int) - picture(number, eye)).max() <= tolerance
+
+
+# ---- what can be read ------------------------------------------------------------------------------------
+
+KINDS: dict[str, Callable[[Path], Path]] = {
+    "mcap folder": lambda p: files.write_rosbag2(p / "bag", files.stereo_rows(ROS2)),
+    "mcap file": lambda p: files.write_rosbag2(p / "bag", files.stereo_rows(ROS2)) / "bag.mcap",
+    "mcap zstd": lambda p: files.write_rosbag2(p / "bag", files.stereo_rows(ROS2), compression="STORAGE"),
+    "db3 folder": lambda p: files.write_rosbag2(p / "bag", files.stereo_rows(ROS2), "SQLITE3"),
+    "db3 file": lambda p: files.write_rosbag2(p / "bag", files.stereo_rows(ROS2), "SQLITE3") / "bag.db3",
+    "db3 messages": lambda p: files.write_rosbag2(p / "b", files.stereo_rows(ROS2), "SQLITE3", "MESSAGE"),
+    "ros1": lambda p: files.write_rosbag1(p / "a.bag", files.stereo_rows(ROS1)),
+    "ros1 lz4": lambda p: files.write_rosbag1(p / "a.bag", files.stereo_rows(ROS1), "LZ4"),
+    "ros1 bz2": lambda p: files.write_rosbag1(p / "a.bag", files.stereo_rows(ROS1), "BZ2"),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_of_file(kind: str, tmp_path: Path) -> None:
+    path = KINDS[kind](tmp_path)
+    assert_frames(play(path), list(range(COUNT)))
+    config = load_launch(path)  # given directly, as in `sags run recording.mcap`
+    assert isinstance(config.source, BagSource) and config.source.path == path
+    rig = read_rig(config.source)
+    assert rig is not None and rig.baseline == pytest.approx(files.BASELINE)
+    assert (rig.left.width, rig.left.height) == (files.WIDTH, files.HEIGHT)
+    found = bag_info(path)
+    rows = {row["topic"]: row for row in found["topics"]}
+    assert rows["/rig/left/image_raw"]["messages"] == COUNT and found["messages"] == 4 * COUNT
+    assert rows["/rig/left/image_raw"]["rate_hz"] == pytest.approx(25)
+    assert rows["/rig/left/image_raw"]["type"] == "sensor_msgs/msg/Image"
+
+
+@pytest.mark.parametrize("encoding", ["rgb8", "bgr8", "rgba8", "bgra8", "mono8"])
+@pytest.mark.parametrize("padding", [0, 5])
+def test_raw_encodings(encoding: str, padding: int, tmp_path: Path) -> None:
+    rows = files.stereo_rows(ROS2, 2, encoding=encoding, padding=padding)
+    frames = play(files.write_rosbag2(tmp_path / "bag", rows))
+    if encoding != "mono8":
+        assert_frames(frames, [0, 1])
+    else:
+        grey = cv2.cvtColor(picture(1, 0), cv2.COLOR_RGB2GRAY)
+        assert np.array_equal(frames[1].left, np.repeat(grey[..., None], 3, 2))
+
+
+@pytest.mark.parametrize(("kind", "tolerance"), [("png", 0), ("jpg", 12)])
+def test_compressed_pictures(kind: str, tolerance: int, tmp_path: Path) -> None:
+    names = "/rig/left/image_raw/compressed", "/rig/right/image_raw/compressed"
+    rows = files.stereo_rows(ROS2, 3, names, make=files.compressed, kind=kind)
+    path = files.write_rosbag2(tmp_path / "bag", rows)
+    assert_frames(play(path), [0, 1, 2], tolerance)
+    assert_frames(play(path, left="rig/left/image_raw"), [0, 1, 2], tolerance)  # found by its raw name
+    assert read_rig(BagSource(path=path)) is not None
+
+
+def test_playing_from_anywhere_again_and_again(tmp_path: Path) -> None:
+    path = files.write_rosbag2(tmp_path / "bag", files.stereo_rows(ROS2, 60, infos=False))
+    numbers = list(range(60))
+    with Replay(BagSource(path=path, pace="step", start=1.0)) as source:
+        assert source.frame_count == 35 and source.rate == pytest.approx(25)
+        for _ in range(2):
+            assert_frames(list(source), numbers[25:])
+    assert_frames(play(path, stride=7), numbers[::7])
+    looped = play(path, loop=True, frames=70)
+    steps = np.diff([frame.t_capture_ns for frame in looped])
+    assert (steps == 40 * MS).all() and [frame.epoch for frame in looped] == [0] * 60 + [1] * 10
+    assert np.array_equal(looped[61].left, picture(1, 0))
+
+
+def test_the_recordings_own_clock_and_a_gap_in_it(tmp_path: Path) -> None:
+    """A camera that paused for a second is played with that pause."""
+    rows = files.stereo_rows(ROS2, 6, infos=False)
+    late = [
+        (topic, message, stamp) for topic, message, stamp in rows if not 60 * MS < stamp - START < 140 * MS
+    ]
+    path = files.write_rosbag2(tmp_path / "bag", late)
+    assert_frames(play(path), [0, 1, 4, 5])
+    now = [0.0]
+    config = BagSource(path=path, pace="realtime")
+    with Replay(
+        config, clock=lambda: now[0], wall_ns=lambda: 0, sleep=lambda s: now.__setitem__(0, now[0] + s)
+    ) as source:
+        assert [frame.t_capture_ns // MS for frame in source] == [0, 40, 160, 200]
+    assert now[0] == pytest.approx(0.2)
+
+
+# ---- which topics ----------------------------------------------------------------------------------------
+
+
+def test_topics_can_be_named(tmp_path: Path) -> None:
+    odd = "/endo/A", "/endo/B"
+    path = files.write_rosbag2(tmp_path / "bag", files.stereo_rows(ROS2, 3, odd, infos=False))
+    with pytest.raises(
+        UsageError, match=r"set source\.left and source\.right.*/endo/A, /endo/B.*publish\.right"
+    ):
+        play(path)
+    assert_frames(play(path, left="/endo/A", right="endo/B"), [0, 1, 2])
+    with pytest.raises(UsageError, match=r"source\.right is missing"):
+        play(path, left="/endo/A")
+    with pytest.raises(UsageError, match=r"source\.left: .* has no topic /endo/AA; did you mean '/endo/A'"):
+        play(path, left="/endo/AA", right="/endo/B")
+
+
+def test_the_usual_names_are_found_among_others(tmp_path: Path) -> None:
+    rows = files.stereo_rows(ROS2, 3, ("/sags/left/render/image", "/sags/right/render/image"), infos=False)
+    rows += files.stereo_rows(ROS2, 3, ("/sags/left/image_rect_color", "/sags/right/image_rect_color"))
+    rows += files.stereo_rows(ROS2, 3, ("/sags/left/depth", "/sags/right/depth"), infos=False)
+    path = files.write_rosbag2(tmp_path / "bag", sorted(rows, key=lambda row: row[2]))
+    assert_frames(play(path), [0, 1, 2])
+    two = files.stereo_rows(ROS2, 3) + files.stereo_rows(ROS2, 3, ("/b/left/image_raw", "/b/right/image_raw"))
+    path = files.write_rosbag2(tmp_path / "two", sorted(two, key=lambda row: row[2]))
+    with pytest.raises(
+        UsageError, match=r"/b/left/image_raw and .*; /rig/left/image_raw and .*set source\.left"
+    ):
+        play(path)
+    assert_frames(play(path, left="/rig/left/image_raw"), [0, 1, 2])
+
+
+def test_a_topic_of_the_wrong_type(tmp_path: Path) -> None:
+    path = files.write_rosbag2(tmp_path / "bag", files.stereo_rows(ROS2, 2))
+    with pytest.raises(
+        UsageError, match=r"camera_info in .* is sensor_msgs/msg/CameraInfo, not a picture topic"
+    ):
+        play(path, left="/rig/left/camera_info", right="/rig/right/image_raw")
+    config = BagSource(path=path, left_info="/rig/left/image_raw")
+    with pytest.raises(
+        UsageError, match=r"source\.left_info: .* is sensor_msgs/msg/Image, not a camera_info"
+    ):
+        read_rig(config)
+
+
+def test_an_encoding_that_is_not_read(tmp_path: Path) -> None:
+    rows = files.stereo_rows(ROS2, 2)
+    for _, message, _ in rows:
+        if message.__msgtype__ == files.IMAGE:
+            object.__setattr__(message, "encoding", "16UC1")
+    with pytest.raises(SagsError, match=r"/rig/left/image_raw at \d+ ns: .*'16UC1' is not read; known: rgb8"):
+        play(files.write_rosbag2(tmp_path / "bag", rows))
+
+
+# ---- pairing ---------------------------------------------------------------------------------------------
+
+
+def test_pairs_are_mutual_nearest_and_near_enough() -> None:
+    left = np.array([0, 40, 80, 120, 160]) * MS
+    right = np.array([43, 3, 300, 84, 79]) * MS
+    assert pair(left, right, 0.01).tolist() == [[0, 1], [1, 0], [2, 4]]  # 79 is nearer to 80 than 84 is
+    assert pair(left, right, 0.002).tolist() == [[2, 4]]
+    shuffled = np.random.default_rng(0).permutation(5)
+    pairs = pair(left[shuffled], right, 0.01)
+    assert sorted(shuffled[pairs[:, 0]]) == [0, 1, 2] and pairs[:, 1].tolist() == [1, 0, 4]
+
+
+def test_a_picture_without_partner_is_left_out(tmp_path: Path) -> None:
+    rows = files.stereo_rows(ROS2, infos=False)
+    del rows[7], rows[4]  # the right picture 3 and the left picture 2
+    assert_frames(play(files.write_rosbag2(tmp_path / "bag", rows)), [0, 1, 4, 5, 6, 7, 8, 9])
+
+
+def test_nothing_pairs(tmp_path: Path) -> None:
+    path = files.write_rosbag2(tmp_path / "bag", files.stereo_rows(ROS2, skew_ms=17.0))
+    with pytest.raises(
+        UsageError,
+        match=r"left 10 .*, right 10 .*, pairs 0: the median skew is 17 ms, source\.tolerance 5 ms.*0255",
+    ):
+        play(path, tolerance=0.005)
+    frames = play(path, tolerance=0.018)
+    assert len(frames) == COUNT and frames[0].t_capture_right_ns - frames[0].t_capture_ns == 17 * MS
+
+
+def test_headers_without_stamps_use_the_time_of_recording(tmp_path: Path) -> None:
+    rows = [(t, files.image(ROS2, m.data.reshape(files.HEIGHT, files.WIDTH, 3), 0), s) for t, m, s in
+            files.stereo_rows(ROS2, 3, infos=False)]  # fmt: skip
+    frames = play(files.write_rosbag2(tmp_path / "bag", rows))
+    assert [frame.t_capture_ns - START - 5 * MS for frame in frames] == [0, 40 * MS, 80 * MS]
+
+
+# ---- calibration -----------------------------------------------------------------------------------------
+
+
+def test_a_rig_that_is_given_wins_and_one_is_needed(tmp_path: Path) -> None:
+    bare = files.write_rosbag2(tmp_path / "bare", files.stereo_rows(ROS2, 2, infos=False))
+    with pytest.raises(UsageError, match="no calibration: set rig"):
+        open_session(bare)
+    calibrated = files.write_rosbag2(tmp_path / "bag", files.stereo_rows(ROS2, 2))
+    session = open_session(calibrated)
+    assert session.rig.name == "bag" and session.name == "bag"
+    save_rig(session.rig, tmp_path / "mine")
+    for path in (bare, calibrated):
+        assert open_session(path, [f"rig:={tmp_path / 'mine'}"]).rig.name == "mine"
+
+
+def test_one_eye_calibrated_or_nonsense_is_refused(tmp_path: Path) -> None:
+    rows = [row for row in files.stereo_rows(ROS2, 2) if row[0] != "/rig/right/camera_info"]
+    with pytest.raises(UsageError, match="calibrates one eye only, the right one is missing; set rig"):
+        read_rig(BagSource(path=files.write_rosbag2(tmp_path / "one", rows)))
+    rows = files.stereo_rows(ROS2, 2)
+    for _, message, _ in rows:
+        if message.__msgtype__ == files.INFO:
+            message.p[3] *= 1000
+    with pytest.raises(UsageError, match="looks like millimetres"):
+        read_rig(BagSource(path=files.write_rosbag2(tmp_path / "mm", rows)))
+    for _, message, _ in rows:
+        if message.__msgtype__ == files.INFO:
+            message.k[:] = 0  # ROS: not calibrated
+    assert read_rig(BagSource(path=files.write_rosbag2(tmp_path / "zero", rows))) is None
+
+
+# ---- hostile files ---------------------------------------------------------------------------------------
+
+
+def consume(path: Path) -> bool:
+    """Use a file in every way; True when all went well. Only our errors may come out."""
+    try:
+        load_launch(path)
+        bag_info(path)
+        read_rig(BagSource(path=path))
+        play(path)
+    except SagsError as error:
+        assert str(error) and "\n" not in str(error)
+        return False
+    return True
+
+
+@pytest.fixture
+def bounded_memory() -> Any:
+    """Address space for a gigabyte more than now: a forged size that is believed fails the test."""
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (used + (1 << 30), before[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+HOSTILE = ("mcap file", "mcap zstd", "db3 file", "ros1", "ros1 lz4", "ros1 bz2")
+
+
+@pytest.mark.parametrize("kind", HOSTILE)
+def test_cut_off_anywhere(kind: str, tmp_path: Path, bounded_memory: None) -> None:
+    file = single_file(KINDS[kind](tmp_path))
+    whole = file.read_bytes()
+    rng = random.Random(1)
+    cut = tmp_path / f"cut{file.suffix}"
+    went_well = 0
+    for length in [0, 1, 8, 20, len(whole) - 1, *(rng.randrange(len(whole)) for _ in range(20))]:
+        cut.write_bytes(whole[:length])
+        went_well += consume(cut)
+    assert went_well == 0 or kind == "db3 file"  # sqlite can do without unused pages at its end
+
+
+@pytest.mark.parametrize("kind", HOSTILE)
+def test_flipped_bits(kind: str, tmp_path: Path, bounded_memory: None) -> None:
+    file = single_file(KINDS[kind](tmp_path))
+    whole = file.read_bytes()
+    flipped = tmp_path / f"flipped{file.suffix}"
+    for seed in range(120):
+        rng = random.Random(seed)
+        data = bytearray(whole)
+        # Also in the first and last bytes, where the structure is: pictures are most of the file.
+        place = (rng.randrange(len(data)), rng.randrange(400), len(data) - 1 - rng.randrange(3000))[seed % 3]
+        data[place] ^= 1 << rng.randrange(8)
+        flipped.write_bytes(data)
+        consume(flipped)
+
+
+@pytest.mark.parametrize("length", [2**60, 2**63, 2**64 - 1, 1 << 33, 300 << 20])
+def test_forged_lengths_of_mcap_records(length: int, tmp_path: Path, bounded_memory: None) -> None:
+    file = KINDS["mcap zstd"](tmp_path) / "bag.mcap"
+    whole = file.read_bytes()
+    position, forged = 8, 0
+    while position < len(whole) - 8:
+        (record,) = struct.unpack_from("<Q", whole, position + 1)
+        forged_file = tmp_path / "forged.mcap"
+        forged_file.write_bytes(whole[: position + 1] + struct.pack("<Q", length) + whole[position + 9 :])
+        with pytest.raises(SagsError, match=f"damaged at byte {position}: a record of {length} bytes"):
+            bag_info(forged_file)
+        position, forged = position + 9 + record, forged + 1
+    assert forged > 5
+
+
+@pytest.mark.parametrize("size", [2**60, 257 << 20, 5])
+def test_a_chunk_that_unpacks_to_too_much(size: int, tmp_path: Path, bounded_memory: None) -> None:
+    """A bomb: a gigabyte of zeros in a few kB. It may say so, or lie."""
+    import zstandard
+
+    packer = zstandard.ZstdCompressor().compressobj()
+    bomb = b"".join(packer.compress(bytes(1 << 20)) for _ in range(1 << 10)) + packer.flush()
+    chunk = struct.pack("<QQQI", 0, 1, size, 0) + b"\x04\0\0\0zstd" + struct.pack("<Q", len(bomb)) + bomb
+    file = tmp_path / "bomb.mcap"
+    header = b"\x04\0\0\0ros2" + bytes(4)
+    body = b"\x01" + struct.pack("<Q", len(header)) + header + b"\x06" + struct.pack("<Q", len(chunk)) + chunk
+    file.write_bytes(b"\x89MCAP0\r\n" + body)
+    with pytest.raises(SagsError, match="unpack"):
+        bag_info(file)
+
+
+def test_what_is_no_bag(tmp_path: Path) -> None:
+    for name in ("a.mcap", "a.db3", "a.bag"):
+        file = tmp_path / name
+        file.write_bytes(np.random.default_rng(0).bytes(5000))
+        with pytest.raises(SagsError, match=f"{name} is damaged"):
+            bag_info(file)
+    with pytest.raises(UsageError, match="does not exist"):
+        bag_info(tmp_path / "nowhere.mcap")
+    with pytest.raises(UsageError, match=r"neither metadata\.yaml nor a \.mcap"):
+        bag_info(tmp_path.parent)
+    for text, said in [
+        ("[", "not valid YAML"),
+        ("a: 1", "rosbag2_bagfile_information"),
+        ("rosbag2_bagfile_information: {relative_file_paths: 3}", "names no files"),
+        (
+            "rosbag2_bagfile_information: {relative_file_paths: [../../etc/passwd]}",
+            "names passwd, which is not",
+        ),
+        ("rosbag2_bagfile_information: {relative_file_paths: [a.mcap], compression_mode: file}", "zstd -d"),
+    ]:
+        (tmp_path / "metadata.yaml").write_text(text)
+        with pytest.raises(UsageError, match=said):
+            bag_info(tmp_path)
+
+
+def single_file(path: Path) -> Path:
+    if path.is_file():
+        return path
+    (found,) = [file for file in path.iterdir() if file.name != "metadata.yaml"]
+    return found
+
+
+# ---- dVRK sessions ---------------------------------------------------------------------------------------
+
+
+def frame_record(number: int, **realtime: int | None) -> dict[str, Any]:
+    """As `dvrk_data:video_sidecar@1.0.0` has it."""
+    stamp = START + number * 40 * MS
+    seen = {
+        "mono_source_ns": None,
+        "left_source_ns": stamp,
+        "right_source_ns": stamp + 3 * MS,
+        "stereo_output_ns": stamp + 9 * MS,
+        "overlay_output_ns": None,
+        "recorder_reception_ns": stamp + 11 * MS,
+        **realtime,
+    }
+    gst = dict.fromkeys(("dts_ns", "duration_ns", "running_time_ns", "stream_time_ns", "clock_time_ns"))
+    return {
+        "frame_index": number,
+        "gst": {"pts_ns": 500 * MS + number * 40 * MS, **gst},
+        "cpu": {"realtime": seen, "monotonic": {"recorder_reception_ns": number}},
+    }
+
+
+def write_session(folder: Path, frames: list[dict[str, Any]], shown: int = 8, order: str = "LR") -> Path:
+    """A sidecar of these frames beside a video of `shown` frames at 25 Hz."""
+    folder.mkdir()
+    sidecar = {
+        "type": "dvrk_data:video_sidecar@1.0.0",
+        "video_file": "stereo.mp4",
+        "stream_name": "stereo",
+        "frames": frames,
+        "side_by_side": order,
+        "estimated_latency_ms": 0,
+    }
+    (folder / "stereo.json").write_text(json.dumps(sidecar, indent=1, sort_keys=True))  # as jsoncpp writes it
+    (folder / "index.json").write_text("{}")
+    video = cv2.VideoWriter(
+        str(folder / "stereo.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 25.0, (2 * files.WIDTH, files.HEIGHT)
+    )
+    for number in range(shown):
+        eyes = [picture(number, 0), np.full_like(picture(0, 0), 200)]
+        both = np.hstack(eyes if order == "LR" else eyes[::-1])
+        video.write(cv2.cvtColor(both, cv2.COLOR_RGB2BGR))
+    video.release()
+    return folder
+
+
+@pytest.mark.parametrize("order", ["LR", "RL"])
+def test_a_dvrk_session(order: str, tmp_path: Path) -> None:
+    frames = [frame_record(number) for number in range(8)]
+    frames[3] = frame_record(3, left_source_ns=None)
+    frames[5] = frame_record(5, left_source_ns=None, right_source_ns=None)
+    folder = write_session(tmp_path / "session", frames, order=order)
+    for given in (folder, folder / "stereo.json"):
+        assert isinstance(load_launch(given).source, DvrkSource)
+    with Replay(DvrkSource(path=folder, pace="step")) as source:
+        played = list(source)
+        assert source.rate == pytest.approx(25, rel=0.1)
+    stamps = [((f.t_capture_ns - START) // MS, (f.t_capture_right_ns - START) // MS) for f in played]
+    assert stamps == [(0, 3), (40, 43), (80, 83), (123, 123), (160, 163), (209, 209), (240, 243), (280, 283)]
+    for frame in played:
+        assert frame.right is not None and abs(float(frame.right.mean()) - 200) < 8
+    assert np.abs(played[6].left.astype(int) - picture(6, 0)).mean() < 15
+
+
+def test_a_dvrk_video_with_other_frames_than_its_sidecar(tmp_path: Path) -> None:
+    """The encoder made 25 Hz of frames of which two never came."""
+    frames = [frame_record(number) for number in (0, 1, 2, 5, 6, 7)]
+    folder = write_session(tmp_path / "session", frames)
+    with Replay(DvrkSource(path=folder, pace="step")) as source:
+        stamps = [(frame.t_capture_ns - START) // MS for frame in source]
+    assert stamps == [0, 40, 80, 80, 200, 200, 240, 280]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"type": "dvrk_data:sidecar@1.0.0"}, "is of type 'dvrk_data:sidecar@1.0.0'"),
+        ({"frames": []}, "lists no frames"),
+        ({"frames": [{"cpu": 3}]}, r"not a dvrk_data:video_sidecar@1\.0\.0 file: .*cpu"),
+        ({"frames": [frame_record(0), frame_record(0, left_source_ns=-5)]}, "not a dvrk_data"),
+        ({"frames": [frame_record(n) for n in (0, 1, 2, 4, 3, 5, 6, 7)]}, "frame 4 lies before"),
+        ({"side_by_side": "undefined"}, "set source.side_by_side to LR or RL"),
+        ({"video_file": "../../other.mp4"}, "other.mp4 does not exist"),
+    ],
+)
+def test_a_wrong_sidecar(change: dict[str, Any], said: str, tmp_path: Path) -> None:
+    folder = write_session(tmp_path / "session", [frame_record(number) for number in range(8)])
+    file = folder / "stereo.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), **change}))
+    with pytest.raises(UsageError, match=said):
+        Replay(DvrkSource(path=file))
+
+
+def test_a_session_as_users_give_it(tmp_path: Path) -> None:
+    folder = write_session(tmp_path / "session", [frame_record(number) for number in range(8)])
+    path, overrides = split([str(folder), "source.side_by_side:=RL"])
+    config = load_launch(path, overrides)
+    assert isinstance(config, LaunchConfig) and isinstance(config.source, DvrkSource)
+    assert config.source.side_by_side == "RL"
+    with pytest.raises(UsageError, match="one sidecar of a stereo video is needed, there are: none"):
+        Replay(DvrkSource(path=tmp_path))
