@@ -14,7 +14,7 @@ from sags_node.types import F32, U8, Bool, Camera, Eye, RectifiedPair, StereoFra
 from sags_node.vision.matchers import SemiGlobal
 from sags_node.vision.observe import observe
 from sags_node.vision.rectify import Rectifier
-from sags_node.vision.stereo import StereoDepth
+from sags_node.vision.stereo import EDGE_MARGIN, StereoDepth
 from sags_node.vision.tissue import TissueMask, find_instruments
 
 ROOT = Path(__file__).parent.parent
@@ -420,7 +420,7 @@ def decode(video: Path, every: int) -> Iterator[tuple[int, U8]]:
 
 @pytest.mark.parametrize(
     ("method", "median_mm", "p90_mm"),
-    [("dis", 1.05, 4.4), ("sgbm", 2.2, 5.0)],  # the reference itself is good to about 1 mm
+    [("dis", 1.05, 3.6), ("sgbm", 2.2, 5.0)],  # the reference itself is good to about 1 mm
 )
 def test_depth_of_a_real_session(
     d4d: list[tuple[U8, U8, Bool, F32]], method: str, median_mm: float, p90_mm: float
@@ -436,7 +436,9 @@ def test_depth_of_a_real_session(
         depth, _ = stereo(pair, mask)
         truth = cv2.resize(reference, (640, 512), interpolation=cv2.INTER_NEAREST)
         errors.append(np.abs(depth - truth)[mask & (truth > 0) & (depth > 0)] * 1e3)
-        wanted += int((mask & (truth > 0)).sum())
+        side = 2 * round(EDGE_MARGIN * 640) + 1  # so near to an instrument depth is not asked for
+        inner = cv2.erode(mask.view(np.uint8), np.ones((side, side), np.uint8)) > 0
+        wanted += int((inner & (truth > 0)).sum())
     error = np.concatenate(errors)
     assert np.median(error) < median_mm
     assert np.percentile(error, 90) < p90_mm
@@ -458,7 +460,7 @@ def test_confidence_tells_good_depth_from_bad(d4d: list[tuple[U8, U8, Bool, F32]
         np.median(error[(confidence > low) & (confidence <= low + 0.25)]) for low in (0, 0.25, 0.5, 0.75)
     ]
     assert medians == sorted(medians, reverse=True)
-    assert medians[0] > 5 * medians[-1]
+    assert medians[0] > 3 * medians[-1]  # where it is worst, beside instruments, there is no depth at all
 
 
 def test_instruments_of_a_real_session_by_colour(d4d: list[tuple[U8, U8, Bool, F32]]) -> None:

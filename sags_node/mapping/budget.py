@@ -13,7 +13,7 @@ LEARNING = 0.2  # share of a new measurement in a running mean
 LEAST_SHARE = 0.25  # of the model's capacity
 SHRINK, GROW = 0.98, 1.005  # per frame: fewer Gaussians soon, more of them slowly
 GAUSSIANS_PER_MS = 1100  # of the budget; measured, see benchmarks/mapping.md
-PIXELS_PER_GAUSSIAN = 3  # fewer pixels have no more to tell
+PIXELS_PER_GAUSSIAN = 2  # fewer pixels have no more to tell
 COMFORT = 0.9  # of the time: below it there is room for more Gaussians
 
 

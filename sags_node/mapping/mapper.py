@@ -10,6 +10,7 @@ from sags_node.engine.losses import tissue_loss
 from sags_node.engine.rasterize import Gradients, Rasterizer
 from sags_node.mapping import densify, initialise
 from sags_node.mapping.budget import Budget
+from sags_node.mapping.exposure import exposure_gain
 from sags_node.mapping.focus import with_neighbours, worst_tiles
 from sags_node.mapping.motion import OpticalFlow, scene_flow
 from sags_node.mapping.optimiser import Optimiser, Rates
@@ -47,15 +48,19 @@ class Mapper:
     lasts: once the whole picture, then where it is worst. The order and the constants follow a measured design; see `benchmarks/`.
     """
 
-    def __init__(self, rasterizer: Rasterizer, max_gaussians: int, smoothing: bool = True) -> None:
-        """`smoothing`: draw the Gaussians with the 3D filter (`model.alias_free`)."""
+    def __init__(self, rasterizer: Rasterizer, max_gaussians: int, smoothing: bool = True, fine_flow: bool = False) -> None:
+        """
+        Args:
+            smoothing: draw the Gaussians with the 3D filter (`model.alias_free`).
+            fine_flow: see `OpticalFlow`.
+        """
         self.model = GaussianModel(max_gaussians)
         self.step = 0
         self.restarts = 0  # how often a new model was begun because the old one did not fit any more
         self._rasterizer = rasterizer
         self._smoothing = smoothing
         self._optimiser = Optimiser()
-        self._flow = OpticalFlow()
+        self._flow = OpticalFlow(fine_flow)
         self._deformation: Deformation | None = None
         self._last: _Last | None = None
         self.stale_tiles: Bool | None = None  # [1, rows, columns] to be drawn anew after `update`; None: all
@@ -128,6 +133,9 @@ class Mapper:
             self._sharpen(observation)
 
         planes = self._draw(observation)
+        gain = exposure_gain(planes, observation)
+        planes[:3] *= gain[:, None, None]
+        self.model.colors[:] *= gain
         if _is_lost(planes, observation) and self._can_start(observation):
             self.restart()
             return self._initialise(observation) | {"restarted": 1}

