@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -22,6 +23,9 @@ from sags_node.apps.launching import (
 )
 from sags_node.apps.terminal import progress, show, writing
 from sags_node.errors import SagsError, UsageError
+
+if TYPE_CHECKING:
+    from sags_node.benchmark.endurance import Order
 
 
 @click.group()
@@ -294,6 +298,50 @@ def bench_pareto(
     if plot is not None:
         with writing(plot):
             plot.write_bytes(pareto_plot.picture(measured))
+
+
+@bench.command("endurance")
+@launch_argument
+@click.option("--frames", type=click.IntRange(1), default=10_000, show_default=True, help="To be played.")
+@click.option(
+    "--window", type=click.IntRange(2), default=500, show_default=True, help="Frames of a line of the table."
+)
+@click.option(
+    "--order",
+    type=click.Choice(["there-and-back", "wrap", "walk"]),
+    default="there-and-back",
+    show_default=True,
+    help="Without a jump; from the start again after the last frame; or a random walk that never repeats.",
+)
+@table_option
+@as_json
+def bench_endurance(
+    launch: tuple[str, ...], frames: int, window: int, order: Order, out: Path | None, json_out: bool
+) -> None:
+    """Whether the node lasts: thousands of frames in a row.
+
+    Plays a recording, by default the built-in phantom, over and over, with the launch file's time budget and
+    each frame in turn. Window by window: times, PSNR on tissue against each frame, Gaussians, nodes and
+    memory; at the end how they change per 1000 frames, and what a scene costs in which nothing moves. Takes
+    the budget for each frame, so six minutes for 10,000 at 33 ms; Ctrl-C ends it with the table so far.
+
+    \b
+    sags bench endurance launch/d4d_pull.yaml --order walk --out benchmarks/results/endurance_d4d.json
+    """
+    from sags_node.benchmark import endurance
+
+    no_cameras = "sags bench endurance plays recordings; record the cameras first"
+    path, overrides = split_recording(launch, no_cameras)
+    check_files(out)
+    session = open_launched(path, [*overrides, "source.loop:=false", "source.pace:=step"])
+    with progress("playing") as advance:
+        measured = endurance.measure_endurance(session, frames, window, order, advance)
+    if json_out:
+        show(measured)
+    else:
+        show(endurance.table(measured))
+        show(endurance.statement(measured))
+    write_json(out, measured)
 
 
 @bench.command("transport")

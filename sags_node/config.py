@@ -224,6 +224,7 @@ class MappingConfig(Section):
     )
     smoothing: bool = Field(True, description="the 3D filter of Mip-Splatting: nothing finer than was seen")
     skip_duplicates: bool = Field(True, description="a frame equal to its predecessor is not mapped again")
+    skip_depth: bool = Field(True, description="when time is short, match depth in every other frame only")
     skip_still: bool = Field(True, description="while nothing moves: no matching, a step where it pays most")
 
 

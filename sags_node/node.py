@@ -1,10 +1,11 @@
-"""The running node: three threads and two slots. The only file that knows threads.
+r"""The running node: four threads and the slots between them. The only file that knows threads.
 
     capture --frames--> mapping --results--> publishing
+                           \--scenes--> drawing --views--/
 
 Slots hold the newest value only (live), or hand every value over (recordings not played in real time).
 The sockets live on the publishing thread; what a client asks of the model runs on the mapping thread,
-between two frames.
+between two frames. Consumers' own views are drawn on a thread that gives way to all others.
 """
 
 from __future__ import annotations
@@ -14,10 +15,9 @@ import os
 import threading
 import time
 import uuid
-from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any
@@ -27,23 +27,25 @@ import numpy as np
 from sags_node.config import LaunchConfig, V4l2Source, with_parameters
 from sags_node.engine.threads import configure_threads
 from sags_node.errors import SagsError
+from sags_node.health import Statistics
 from sags_node.latest import Latest
 from sags_node.mapping.budget import make_budget
 from sags_node.messaging import content
 from sags_node.messaging.publisher import Publisher
+from sags_node.messaging.requests import AnchorName, AnchorRequest, ViewName, ViewRequest, parse
 from sags_node.model.ply import write_ply
 from sags_node.pipeline import Pipeline
 from sags_node.recording.child import RecorderProcess
 from sags_node.sources.source import Source
-from sags_node.types import FrameResult, NodeHealth, StereoFrame, StereoRig
+from sags_node.types import DrawnView, FrameResult, NodeHealth, StereoFrame, StereoRig
+from sags_node.views import Views, prepare_thread
 
 log = logging.getLogger(__name__)
 
 HEALTH_PERIOD = 1.0  # s
-WAITING_AFTER = 1.0  # s without a frame
 STOP_SECONDS = 10.0  # longest wait for each thread to end
-WINDOW = 150  # frames behind the published rates and latencies
-LIVE_PARAMETERS = ("mapping.budget_ms", "mapping.skip_duplicates", "mapping.skip_still")
+REQUEST_WAIT = 0.05  # s: how soon a request is served while no frames come
+LIVE_PARAMETERS = ("mapping.budget_ms", "mapping.skip_duplicates", "mapping.skip_depth", "mapping.skip_still")
 
 OnResult = Callable[[FrameResult, float], None]  # a published result and its latency, ms
 
@@ -71,19 +73,29 @@ class Node:
         self._live = isinstance(config.source, V4l2Source) or config.source.pace == "realtime"
         self._wake = os.eventfd(0, os.EFD_NONBLOCK)
         self._frames: Latest[tuple[StereoFrame, float]] = Latest()  # and when it came
-        self._results: Latest[FrameResult] = Latest(on_put=lambda: os.eventfd_write(self._wake, 1))
-        self._requests: SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = SimpleQueue()
+        self._results: Latest[FrameResult] = Latest(on_put=self._wake_publishing)
+        self._scenes: Latest[tuple[FrameResult, bool]] = Latest()  # and whether frames were missed
+        # By name, the newest only; None: closed. Single operations on a dict need no lock.
+        self._drawn: dict[str, DrawnView | None] = {}
+        self._views = Views(config.engine.backend)
+        self._watched: frozenset[str] = frozenset()  # views that somebody subscribes to
+        self._mapping_requests = _Requests()
+        self._view_requests = _Requests()
         self._error: BaseException | None = None
         self._stopping = threading.Event()
+        self._paused = threading.Event()
         self._parameters_changed = threading.Event()
-        self._stats = _Statistics()
+        self._state_changed = threading.Event()  # status is due at once
+        self._stats = Statistics()
         self._last_sent: FrameResult | None = None
+        self._scene: FrameResult | None = None  # drawn last; of the drawing thread
         self._publisher = Publisher(config.publish, config.ns, uuid.uuid4().hex, self._handlers())
         ipc = [endpoint for endpoint in self.endpoints if endpoint.startswith("ipc:")]
         self._recorder = RecorderProcess(config.ns, ipc[0] if ipc else None)
         work = {
             "capture": (self._capture, self._frames.close),
-            "mapping": (self._map, self._results.close),
+            "mapping": (self._map, self._close_results),
+            "drawing": (self._draw_views, lambda: None),
             "publishing": (self._publish, self._publisher.close),
         }
         # Events, not joins: in Python 3.11 a Ctrl-C during a join marks a living thread as ended.
@@ -137,8 +149,10 @@ class Node:
                 "publish": self._results.dropped,
             },
             stopping=self._stopping.is_set(),
+            paused=self._paused.is_set(),
             error=self._error,
             connections=self._publisher.connections,
+            views=self._views.status,
         )
 
     def _guard(self, name: str, work: Callable[[], None], after: Callable[[], None]) -> None:
@@ -158,7 +172,7 @@ class Node:
             finally:
                 self._ended[name].set()
 
-    # ---- the three threads ---------------------------------------------------------------------------
+    # ---- the four threads ----------------------------------------------------------------------------
 
     def _capture(self) -> None:
         give = self._frames.put if self._live else self._frames.hand_over
@@ -171,14 +185,46 @@ class Node:
     def _map(self) -> None:
         configure_threads(self.config.engine.threads)
         give = self._results.put if self._live else self._results.hand_over
+        dropped = 0
         while not self._frames.closed:
-            came = self._frames.get(timeout=0.05)
-            self._serve_requests()
-            if came is not None:
+            self._mapping_requests.serve()
+            ending = self._stopping.is_set() or self._error is not None
+            if self._paused.is_set() and not self._live and not ending:
+                self._stopping.wait(REQUEST_WAIT)  # the recording waits; live frames are taken and left out
+                continue
+            came = self._frames.get(timeout=REQUEST_WAIT)
+            if came is not None and not self._paused.is_set():
                 frame, at = came
                 waited = time.monotonic() - at if self._live else 0.0
-                give(self._pipeline.process(frame, self._budget, waited))
-        self._serve_requests()
+                result = self._pipeline.process(frame, self._budget, waited)
+                give(result)
+                dropped, before = self._frames.dropped, dropped
+                self._scenes.put((result, dropped > before))
+        self._mapping_requests.serve()
+
+    def _draw_views(self) -> None:
+        prepare_thread()
+        newest: FrameResult | None = None
+        while not self._scenes.closed:
+            came = self._scenes.get(timeout=REQUEST_WAIT)
+            if came is not None:
+                newest, missed = came
+                for name, drawn in self._views.draw_due(newest, self._watched, missed):
+                    self._hand_over_view(name, drawn)
+            self._scene = newest
+            self._view_requests.serve()
+        self._view_requests.serve()
+
+    def _hand_over_view(self, name: str, drawn: DrawnView | None) -> None:
+        self._drawn[name] = drawn
+        self._wake_publishing()
+
+    def _wake_publishing(self) -> None:
+        os.eventfd_write(self._wake, 1)
+
+    def _close_results(self) -> None:
+        self._scenes.close()
+        self._results.close()
 
     def _publish(self) -> None:
         self._parameters_changed.set()
@@ -192,7 +238,9 @@ class Node:
             result = self._results.get(timeout=0)
             if result is not None:
                 self._send(result)
-            if time.monotonic() >= next_health:
+            self._send_views()
+            if time.monotonic() >= next_health or self._state_changed.is_set():
+                self._state_changed.clear()
                 next_health = time.monotonic() + HEALTH_PERIOD
                 self._publisher.publish_health(self.health())
         self._publisher.publish_health(self.health())
@@ -208,35 +256,34 @@ class Node:
         if self._on_result is not None:
             self._on_result(result, latency_ms)
 
+    def _send_views(self) -> None:
+        while self._drawn:
+            name, drawn = self._drawn.popitem()
+            if drawn is None:
+                self._publisher.forget_view(name)
+            else:
+                self._publisher.publish_view(name, drawn)
+        self._watched = frozenset(name for name in self._views.status if self._publisher.watches_view(name))
+
     # ---- control -------------------------------------------------------------------------------------
 
     def _handlers(self) -> dict[str, Callable[[dict[str, Any]], Any]]:
         return {
             "get_status": lambda args: content.status(self.health(), self._last_sent),
             "get_parameters": lambda args: self.config.model_dump(mode="json"),
-            "set_parameters": lambda args: self._on_mapping_thread(lambda: self._set_parameters(args)),
-            "reset_model": lambda args: self._on_mapping_thread(self._reset_model),
+            "set_parameters": lambda args: self._mapping_requests.post(lambda: self._set_parameters(args)),
+            "reset_model": lambda args: self._mapping_requests.post(self._reset_model),
+            "pause": lambda args: self._mapping_requests.post(self._pause),
+            "resume": lambda args: self._mapping_requests.post(self._resume),
+            "add_anchor": lambda args: self._mapping_requests.post(lambda: self._add_anchor(args)),
+            "remove_anchor": lambda args: self._mapping_requests.post(lambda: self._remove_anchor(args)),
+            "open_view": lambda args: self._view_requests.post(lambda: self._open_view(args)),
+            "close_view": lambda args: self._view_requests.post(lambda: self._close_view(args)),
             "start_recording": self._start_recording,
             "stop_recording": lambda args: self._recorder.stop(),
             "take_snapshot": lambda args: self._recorder.snapshot(),
-            "save_model": lambda args: self._on_mapping_thread(lambda: self._save_model(args)),
+            "save_model": lambda args: self._mapping_requests.post(lambda: self._save_model(args)),
         }
-
-    def _on_mapping_thread(self, work: Callable[[], Any]) -> Future[Any]:
-        future: Future[Any] = Future()
-        self._requests.put((work, future))
-        return future
-
-    def _serve_requests(self) -> None:
-        while True:
-            try:
-                work, future = self._requests.get_nowait()
-            except Empty:
-                return
-            try:
-                future.set_result(work())
-            except Exception as error:  # a client's request must not end the node; it is the answer
-                future.set_exception(error)
 
     def _set_parameters(self, args: dict[str, Any]) -> dict[str, Any]:
         refused = [key for key in args if key not in LIVE_PARAMETERS]
@@ -258,6 +305,49 @@ class Node:
         self._pipeline.reset()
         return {}
 
+    def _pause(self) -> dict[str, Any]:
+        self._paused.set()
+        self._state_changed.set()
+        return {"paused": True}
+
+    def _resume(self) -> dict[str, Any]:
+        if self._paused.is_set():
+            self._stats.forget_rate()
+            self._paused.clear()
+            self._state_changed.set()
+        return {"paused": False}
+
+    def _add_anchor(self, args: dict[str, Any]) -> dict[str, Any]:
+        request = parse(AnchorRequest, args)
+        newest = self._pipeline.newest
+        if newest is None:
+            raise SagsError("there is no model yet; wait for the first frame")
+        frame = newest.observation, newest.snapshot, newest.views["left"]
+        if request.u is not None and request.v is not None:
+            anchor = self._pipeline.anchors.add_pixel(request.u, request.v, *frame)
+        else:
+            point = np.array([request.x, request.y, request.z], np.float64)
+            anchor = self._pipeline.anchors.add_point(point, *frame)
+        return {"id": anchor, "frame_id": newest.pair.frame_id}
+
+    def _remove_anchor(self, args: dict[str, Any]) -> dict[str, Any]:
+        self._pipeline.anchors.remove(parse(AnchorName, args).id)
+        return {}
+
+    def _open_view(self, args: dict[str, Any]) -> dict[str, Any]:
+        request = parse(ViewRequest, args)
+        drawn = self._views.open(request, self._scene)
+        if drawn is not None:
+            self._hand_over_view(request.name, drawn)
+        status = self._views.status[request.name]
+        return {"topics": content.view_topics(request.name, request.stereo, request.depth), **asdict(status)}
+
+    def _close_view(self, args: dict[str, Any]) -> dict[str, Any]:
+        name = parse(ViewName, args).name
+        self._views.close(name)
+        self._hand_over_view(name, None)
+        return {}
+
     def _save_model(self, args: dict[str, Any]) -> dict[str, Any]:
         path = args.get("path")
         if not isinstance(path, str) or not path.endswith(".ply"):
@@ -270,69 +360,25 @@ class Node:
         return {"path": str(file), "gaussians": len(gaussians)}
 
 
-class _Statistics:
-    """What the last frames tell of rate, latency and cost."""
+class _Requests:
+    """Work that other threads leave for one thread to do."""
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._published: deque[float] = deque(maxlen=WINDOW)
-        self._latency: deque[float] = deque(maxlen=WINDOW)
-        self._stages: dict[str, deque[float]] = {}
-        self._skipped: dict[str, int] = {}
-        self._gaussians = 0
-        self._started = False
+        self._waiting: SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = SimpleQueue()
 
-    def add(self, result: FrameResult, latency_ms: float) -> None:
-        with self._lock:
-            self._started = True
-            self._published.append(time.monotonic())
-            self._latency.append(latency_ms)
-            for stage, ms in result.timings_ms.items():
-                self._stages.setdefault(stage, deque(maxlen=WINDOW)).append(ms)
-            for what in result.skipped:
-                self._skipped[what] = self._skipped.get(what, 0) + 1
-            self._gaussians = len(result.snapshot.gaussians)
+    def post(self, work: Callable[[], Any]) -> Future[Any]:
+        future: Future[Any] = Future()
+        self._waiting.put((work, future))
+        return future
 
-    def health(
-        self,
-        dropped: dict[str, int],
-        stopping: bool,
-        error: BaseException | None,
-        connections: dict[str, dict[str, int]],
-    ) -> NodeHealth:
-        with self._lock:
-            now = time.monotonic()
-            waiting = not self._published or now - self._published[-1] > WAITING_AFTER
-            span = self._published[-1] - self._published[0] if len(self._published) > 1 else 0.0
-            if stopping:
-                state = "stopping"
-            elif error is not None:
-                state = "degraded"
-            elif waiting:
-                state = "waiting" if self._started else "starting"
-            else:
-                state = "running"
-            latency = np.array(self._latency) if self._latency else np.zeros(1)
-            return NodeHealth(
-                state=state,
-                rate_hz=(len(self._published) - 1) / span if span > 0 and not waiting else 0.0,
-                latency_ms={
-                    "p50": float(np.percentile(latency, 50)),
-                    "p90": float(np.percentile(latency, 90)),
-                    "p99": float(np.percentile(latency, 99)),
-                    "max": float(latency.max()),
-                },
-                stage_ms={stage: float(np.median(ms)) for stage, ms in self._stages.items()},
-                dropped=dropped,
-                gaussians=self._gaussians,
-                rss_mb=resident_mb(),
-                skipped=dict(self._skipped),
-                last_error=str(error) if error else None,
-                connections=connections,
-            )
-
-
-def resident_mb() -> float:
-    """Resident memory of this process, MB."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+    def serve(self) -> None:
+        """Do all that waits; its failure is the answer, and does not end the thread."""
+        while True:
+            try:
+                work, future = self._waiting.get_nowait()
+            except Empty:
+                return
+            try:
+                future.set_result(work())
+            except Exception as error:  # a client's request must not end the node; it is the answer
+                future.set_exception(error)

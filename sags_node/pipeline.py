@@ -11,10 +11,13 @@ import numpy as np
 
 from sags_node.config import LaunchConfig
 from sags_node.engine.rasterize import make_rasterizer, to_view
+from sags_node.mapping.anchors import Anchors
 from sags_node.mapping.budget import Budget, capacity
 from sags_node.mapping.mapper import Mapper
 from sags_node.types import (
     F32,
+    NO_TIME,
+    AnchorStates,
     Bool,
     Camera,
     FrameResult,
@@ -30,6 +33,8 @@ from sags_node.vision.rectify import Rectifier
 from sags_node.vision.stereo import StereoDepth
 from sags_node.vision.tissue import TissueMask
 
+FINE_FLOW_MS = 60.0  # a budget that has room for it
+FARTHEST = 10.0  # m: what a session says to be beyond is no depth
 DUPLICATE_RMS = 0.6  # grey levels: below a video codec's own noise (PSNR > 52 dB)
 
 
@@ -44,7 +49,13 @@ class Pipeline:
         self.stereo = StereoDepth(vision.stereo, self.rectifier.camera, self.rectifier.baseline)
         self._rasterizer = make_rasterizer(config.engine.backend, width, height)
         self._config = config
-        self.mapper = Mapper(self._rasterizer, capacity(config.mapping, width, height), config.mapping.smoothing)
+        self.mapper = Mapper(
+            self._rasterizer,
+            capacity(config.mapping, width, height),
+            config.mapping.smoothing,
+            fine_flow=config.mapping.budget_ms >= FINE_FLOW_MS,
+        )
+        self.anchors = Anchors()
         self._still = StillScene()
         self._mapped: FrameResult | None = None  # the last frame that was really mapped
 
@@ -53,6 +64,11 @@ class Pipeline:
         self.mapper.restart()
         self._still.forget()
         self._mapped = None
+
+    @property
+    def newest(self) -> FrameResult | None:
+        """The frame mapped last; None before the first, and after a reset."""
+        return self._mapped
 
     def reconfigure(self, config: LaunchConfig) -> None:
         """Take changed parameters over; the model stays."""
@@ -66,14 +82,20 @@ class Pipeline:
             pair = self.rectifier(frame)
         if self._mapped is not None and self._config.mapping.skip_duplicates:
             if _rms_difference(pair, self._mapped.pair) < DUPLICATE_RMS:
-                return _repeat(self._mapped, pair, self._epoch(frame), watch.timings_ms)
+                anchors = self.anchors.at(pair.t_capture_ns)
+                return _repeat(self._mapped, pair, self._epoch(frame), watch.timings_ms, anchors)
         still = self._still(pair) if self._config.mapping.skip_still else 0  # frames
+        skipped: dict[str, str] = {}
         with watch("mask"):
             tissue = self.tissue(frame, pair)
         with watch("depth"):
-            if still and self._mapped is not None:
-                known = self._mapped.observation
+            known = self._mapped.observation if still and self._mapped is not None else None
+            if known is not None and known.depth.any():
                 depth, confidence = known.depth * tissue, known.depth_confidence * tissue
+                skipped = dict.fromkeys(("depth", "motion"), "nothing moves")
+            elif self._lacks_time_for_depth(frame, budget):
+                depth, confidence = np.zeros((2, *tissue.shape), np.float32)
+                skipped["depth"] = NO_TIME
             else:
                 depth, confidence = self.depth(frame, pair, tissue)
             observation = observe(pair, tissue, depth, confidence)
@@ -81,19 +103,30 @@ class Pipeline:
             snapshot = self.mapper.update(observation, budget, still)
         with watch("render"):
             views = self._draw_eyes(snapshot, pair.baseline)
-            self.mapper.drawn(observation, views["left"])
-        budget.finish()
-        skipped = dict.fromkeys(("depth", "motion"), "nothing moves") if still else {}
+            if not still:  # slow motion adds up: the next flow starts where the last one ended
+                self.mapper.drawn(observation, views["left"])
+        with watch("anchors"):
+            self.anchors.update(observation, snapshot, views["left"])
+            anchors = self.anchors.at(pair.t_capture_ns)
+        if not still:  # which tells nothing of what a moving frame costs
+            budget.finish()
         epoch = self._epoch(frame)
-        self._mapped = FrameResult(pair, observation, snapshot, views, epoch, watch.timings_ms, skipped)
+        self._mapped = FrameResult(
+            pair, observation, snapshot, views, epoch, watch.timings_ms, skipped, anchors
+        )
         return self._mapped
+
+    def _lacks_time_for_depth(self, frame: StereoFrame, budget: Budget) -> bool:
+        needs_matching = frame.depth is None and self.mapper.model.count > 0  # a first model needs depth
+        return needs_matching and self._config.mapping.skip_depth and not budget.affords_depth()
 
     def depth(self, frame: StereoFrame, pair: RectifiedPair, tissue: Bool) -> tuple[F32, F32]:
         """Depth and confidence [H, W]: the session's own depth, fully trusted, or else stereo."""
         if frame.depth is None:
             return self.stereo(pair, tissue)
-        depth = self.rectifier.depth(frame.depth) * tissue
-        return depth, (depth > 0).astype(np.float32)
+        given = self.rectifier.depth(frame.depth)
+        known = tissue & (given > 0) & (given < FARTHEST)
+        return np.where(known, given, np.float32(0)), known.astype(np.float32)
 
     def _epoch(self, frame: StereoFrame) -> int:
         """Grows with the source's epochs and with every new model: ids then mean other Gaussians."""
@@ -134,7 +167,9 @@ def _rms_difference(a: RectifiedPair, b: RectifiedPair) -> float:
     return float(np.sqrt(max(squares)))
 
 
-def _repeat(mapped: FrameResult, pair: RectifiedPair, epoch: int, timings: dict[str, float]) -> FrameResult:
+def _repeat(
+    mapped: FrameResult, pair: RectifiedPair, epoch: int, timings: dict[str, float], anchors: AnchorStates
+) -> FrameResult:
     """The last mapped result under the ids of a frame that equals it."""
     frame_id, stamp = pair.frame_id, pair.t_capture_ns
     still = np.zeros_like(mapped.snapshot.velocities)
@@ -155,4 +190,5 @@ def _repeat(mapped: FrameResult, pair: RectifiedPair, epoch: int, timings: dict[
         epoch=epoch,
         timings_ms=timings,
         skipped={"frame": "equals its predecessor"},
+        anchors=anchors,
     )

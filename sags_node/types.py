@@ -188,6 +188,31 @@ class RenderedView:
 
 
 @dataclass(frozen=True, slots=True)
+class AnchorStates:
+    """The points that users pinned to the tissue, at one time."""
+
+    ids: I64  # [A] never used again
+    points: F32  # [A, 3] m, world; NaN: lost
+    pixels: F32  # [A, 2] in the left picture, also beyond its edges; NaN: behind the camera or lost
+    visibility: F32  # [A] 0..1, seen by the left eye: neither behind an instrument nor behind other tissue
+    confidence: F32  # [A] 0..1; falls while the anchor is not seen, 0: lost
+    ages: F32  # [A] s since it was pinned
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    @staticmethod
+    def none() -> AnchorStates:
+        def empty(*shape: int) -> F32:
+            return np.empty((0, *shape), np.float32)
+
+        return AnchorStates(np.empty(0, np.int64), empty(3), empty(2), empty(), empty(), empty())
+
+
+NO_TIME = "no time"  # why something was left out, in `FrameResult.skipped`
+
+
+@dataclass(frozen=True, slots=True)
 class FrameResult:
     """One frame's whole story."""
 
@@ -198,13 +223,36 @@ class FrameResult:
     epoch: int
     timings_ms: Mapping[str, float]  # stage -> ms
     skipped: Mapping[str, str] = field(default_factory=dict)  # what was left out, and why
+    anchors: AnchorStates = field(default_factory=AnchorStates.none)
+
+
+@dataclass(frozen=True, slots=True)
+class DrawnView:
+    """The model drawn from a viewpoint that a consumer asked for."""
+
+    eyes: Mapping[str, RenderedView]  # "left" and "right" of a stereo pair, "" of a single view
+    baseline: float  # m, of the pair
+    depth: bool  # also publish the depth
+    still: bool  # drawn once: sent again to who subscribes later
+    epoch: int
+
+
+@dataclass(frozen=True, slots=True)
+class ViewStatus:
+    """How well a view that a consumer asked for is served."""
+
+    asked_hz: float  # 0: drawn once
+    granted_hz: float  # what its share of the machine allows
+    held_hz: float  # drawn over the last seconds
+    draw_ms: float  # of one drawing; 0 before the first
+    limited_by: str  # what keeps it below the rate asked for; empty: nothing
 
 
 @dataclass(frozen=True, slots=True)
 class NodeHealth:
     """What the node says of itself once a second, also when no frames come."""
 
-    state: str  # starting | running | waiting | degraded | stopping
+    state: str  # starting | running | waiting | paused | degraded | stopping
     rate_hz: float
     latency_ms: Mapping[str, float]  # p50, p90, p99, max over the last seconds
     stage_ms: Mapping[str, float]
@@ -214,3 +262,4 @@ class NodeHealth:
     skipped: Mapping[str, int]  # rule -> frames
     last_error: str | None = None
     connections: Mapping[str, Mapping[str, int]] = field(default_factory=dict)  # socket -> open, refused
+    views: Mapping[str, ViewStatus] = field(default_factory=dict)  # those that consumers asked for, by name

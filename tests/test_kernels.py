@@ -45,7 +45,7 @@ def scene() -> dict[str, np.ndarray]:
 def test_advect(scene: dict[str, np.ndarray]) -> None:
     s = scene
     arguments = (s["means"], s["cam0"], s["depth"], s["alpha"], s["tissue"], s["flow"], s["cam1"],
-                 s["tissue"][::-1].copy(), s["depth"][::-1].copy())  # fmt: skip
+                 s["tissue"][::-1].copy(), s["depth"][::-1].copy(), np.float32(0.4))  # fmt: skip
     moved, seen = np.zeros((2, N, 3), np.float32), np.zeros((2, N), np.float32)
     motion._advect(*arguments, moved[0], seen[0])
     motion._advect.py_func(*arguments, moved[1], seen[1])
@@ -59,8 +59,9 @@ def test_inspect(scene: dict[str, np.ndarray], crowded: bool) -> None:
     s = scene
     r = np.abs(s["rows"]) + np.float32(1e-6)
     quats, scales, contribution = (np.ascontiguousarray(r[:, k]) for k in (slice(4), slice(4, 7), 7))
-    arguments = (s["means"], quats, scales, s["opacities"], s["colors"], contribution, s["cam0"], s["tissue"],
-                 s["depth"], crowded)  # fmt: skip
+    smoothing, weight = np.full(N, 1e-9, np.float32), np.full((N, 4), 0.25, np.float32)
+    arguments = (s["means"], quats, scales, smoothing, weight, s["opacities"], s["colors"], contribution,
+                 s["cam0"], s["tissue"], s["depth"], crowded)  # fmt: skip
     front, remove = np.full((2, N), 2, np.int32), np.zeros((2, N), bool)
     densify._inspect(*arguments, front[0], remove[0])
     densify._inspect.py_func(*arguments, front[1], remove[1])

@@ -15,7 +15,7 @@ LAYERS = [
     {"model"},
     {"mapping"},
     {"pipeline"},
-    {"session", "warm_up"},
+    {"session", "warm_up", "views", "health"},
     {"node"},
     {"evaluation"},
     {"fitting"},

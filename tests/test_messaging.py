@@ -9,6 +9,7 @@ import socket
 import stat
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,7 @@ from sags_node.geometry import project
 from sags_node.messaging import topics
 from sags_node.messaging.publisher import Publisher
 from sags_node.messaging.rundir import read_connection
+from sags_node.types import NO_TIME, FrameResult
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 FRAME_TOPICS = [t.name for t in topics.TOPICS if t.name not in ("status", "diagnostics", "parameters")]
@@ -213,6 +215,22 @@ def test_a_prefix_subscribes_to_all_below_it(tmp_path: Path) -> None:
         names = {peer.recv_multipart()[0] for _ in range(2) if peer.poll(5000)}
         assert names == {b"sags/left/render/image", b"sags/left/render/depth"}
         context.destroy(linger=0)
+
+
+def test_a_frame_without_time_for_depth_sends_none_and_leaves_no_gap(tmp_path: Path) -> None:
+    """A hole in `seq` means a lost message; depth of another frame under this stamp would be a lie."""
+    plane = plane_result()
+
+    def every_other(i: int) -> FrameResult:
+        skipped = {"depth": NO_TIME} if i % 2 else {}
+        return replace(at_frame(plane, i, time.time_ns()), skipped=skipped)
+
+    wanted = ["sags/left/depth", "sags/tf"]
+    with publisher(tmp_path / "run") as running, stream(running, every_other):
+        got = client.collect(running.connection.data[-1], wanted, count=4, timeout=10)
+    assert all(message.meta["frame_id"] % 2 == 0 for message in got["sags/left/depth"])
+    assert np.diff([message.meta["seq"] for message in got["sags/left/depth"]]).tolist() == [1, 1, 1]
+    assert np.diff([message.meta["frame_id"] for message in got["sags/tf"]]).tolist() == [1, 1, 1]
 
 
 def test_restart_and_loop_are_visible(tmp_path: Path) -> None:

@@ -55,7 +55,7 @@ def test_each_setting_is_played_once_and_the_default_first() -> None:
     config = load_launch(None, ["mapping.budget_ms:=40"])
     settings = time_settings(config, (640, 512), pareto_settings.PARTS)
     assert settings[0].overrides == () and settings[0].name == "40 ms, 640x512"
-    assert len({setting.overrides for setting in settings}) == len(settings) == 1 + 5 + 2 + 8
+    assert len({setting.overrides for setting in settings}) == len(settings) == 1 + 5 + 2 + 2 * 5
     assert ("vision.width:=320", "vision.height:=256") in [setting.overrides for setting in settings]
     for setting in settings:
         found = load_launch(None, ["mapping.budget_ms:=40", *setting.overrides])
@@ -180,7 +180,16 @@ def test_a_duplicate_that_is_skipped_saves_its_time(phantom_session: Path, tmp_p
         first, *others = sorted((folder / name).iterdir())
         for other in others:
             shutil.copy(first, other)
-    result = bench(folder, "mapping.max_gaussians:=2000", "--frames", 6, "--only", "skips", "--json")
+    result = bench(
+        folder,
+        "mapping.max_gaussians:=2000",
+        "mapping.skip_still:=false",
+        "--frames",
+        6,
+        "--only",
+        "skips",
+        "--json",
+    )
     assert result.exit_code == 0, result.output
     (session,) = json.loads(result.stdout)["sessions"]
     skip = next(each for each in session["skips"] if each["rule"] == "skip_duplicates")

@@ -96,8 +96,8 @@ def _frame(panel: U8, axes: _Axes, session: Row, period_ms: float) -> None:
 
 def _difference(name: str, default: str) -> str:
     """Of a name "budget, size, N": what is not as in the default's."""
-    pairs = zip(name.split(", "), default.split(", "), strict=True)
-    return ", ".join(said for said, usual in pairs if said != usual) or name
+    usual = default.split(", ")
+    return ", ".join(said for said in name.split(", ") if said not in usual) or name
 
 
 def _label(panel: U8, place: Pixel, text: str, colour: tuple[int, int, int], taken: list[Box]) -> None:

@@ -205,7 +205,8 @@ class Measurer:
 def _depth_figures(shown: SpooledFrame, reference: F32) -> dict[str, Figures]:
     height, width = shown.depth.shape
     truth = metrics.resample_nearest(reference, width, height)
-    return {
-        "depth": asdict(metrics.depth_errors(shown.depth, truth, shown.tissue)),
-        "measured_depth": asdict(metrics.depth_errors(shown.measured_depth, truth, shown.tissue)),
-    }
+    figures = {"depth": asdict(metrics.depth_errors(shown.depth, truth, shown.tissue))}
+    if shown.measured_depth.any():  # there may have been no time for it
+        measured = metrics.depth_errors(shown.measured_depth, truth, shown.tissue)
+        figures["measured_depth"] = asdict(measured)
+    return figures

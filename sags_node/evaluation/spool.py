@@ -18,7 +18,7 @@ import numpy as np
 
 from sags_node.engine.rasterize import Rasterizer, make_rasterizer, to_view
 from sags_node.errors import SagsError
-from sags_node.node import resident_mb
+from sags_node.health import resident_mb
 from sags_node.types import F32, U8, Bool, Camera, FrameResult, Gaussians, RenderedView, Snapshot
 
 _ARRAYS = 11  # in a frame's file

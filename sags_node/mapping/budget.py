@@ -1,5 +1,5 @@
-"""How long a frame may be refined, and how many Gaussians the machine can afford. The clock is an argument, so
-that results are reproducible."""
+"""How long a frame may be refined, and how many Gaussians the machine can afford. The clock is an argument,
+so that results are reproducible."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ from typing import Protocol
 from sags_node.config import MappingConfig
 
 LEARNING = 0.2  # share of a new measurement in a running mean
-LEAST_SHARE = 0.25  # of the model's capacity
-SHRINK, GROW = 0.98, 1.005  # per frame: fewer Gaussians soon, more of them slowly
+FORGET = 0.95  # of the cost of a step, per frame in which it seemed not to fit
+LEAST_SHARE = 0.6  # of the model's capacity: fewer would save little, most of a frame does not depend on them
+SHRINK, GROW = 0.995, 1.002  # per frame
 GAUSSIANS_PER_MS = 1100  # of the budget; measured, see benchmarks/mapping.md
 PIXELS_PER_GAUSSIAN = 2  # fewer pixels have no more to tell
 COMFORT = 0.9  # of the time: below it there is room for more Gaussians
@@ -26,6 +27,9 @@ class Budget(Protocol):
 
     def start(self, waited: float = 0.0) -> None:
         """A new frame begins, `waited` seconds after it came."""
+
+    def affords_depth(self) -> bool:
+        """True when depth may be matched in this frame; False never twice in a row."""
 
     def more(self) -> bool:
         """True when one more step may be taken."""
@@ -46,6 +50,9 @@ class StepBudget:
     def start(self, waited: float = 0.0) -> None:
         self._left = self._steps
 
+    def affords_depth(self) -> bool:
+        return True
+
     def more(self) -> bool:
         self._left -= 1
         return self._left >= 0
@@ -61,8 +68,9 @@ class TimeBudget:
     what follows the last step (drawing), both learnt from the frames before, still fit. The time that a frame
     waited is gone, so that one late frame does not make the next late.
 
-    Where what a frame cannot do without takes longer than the budget, the share of Gaussians falls, and it
-    recovers when there is room: the machine may be slow, or busy with something else.
+    What does not fit is left out in this order: further steps; depth in every other frame, which the model's
+    own depth bridges; and while that is not enough, the share of Gaussians falls. All recover when there is
+    room: the machine may be slow, or busy with something else.
     """
 
     def __init__(self, seconds: float, clock: Callable[[], float] = time.perf_counter) -> None:
@@ -72,6 +80,8 @@ class TimeBudget:
         self._step_cost = _RunningMean()
         self._after_cost = _RunningMean()
         self._essential = _RunningMean()
+        self._cost_with_depth = _RunningMean()
+        self._had_depth = False
         self._begin(0.0)
 
     def start(self, waited: float = 0.0) -> None:
@@ -81,7 +91,13 @@ class TimeBudget:
         self._started = self._asked = self._clock()
         self._deadline = self._started + max(0.0, self.seconds - waited)
         self._asks = 0
+        self._depth: bool | None = None  # whether it is matched; None: nobody asked
         self._optional = 0.0  # s, spent on all steps but the first
+
+    def affords_depth(self) -> bool:
+        fits = self._started + self._cost_with_depth.value <= self._deadline
+        self._depth = fits or not self._had_depth
+        return self._depth
 
     def more(self) -> bool:
         now = self._clock()
@@ -90,15 +106,24 @@ class TimeBudget:
             self._optional += now - self._asked
         self._asked = now
         self._asks += 1
-        return self._asks == 1 or now + self._step_cost.value + self._after_cost.value <= self._deadline
+        if self._asks == 1 or now + self._step_cost.value + self._after_cost.value <= self._deadline:
+            return True
+        if self._asks == 2:  # nothing is learnt of a step that is never taken: try one again some day
+            self._step_cost.value *= FORGET
+        return False
 
     def finish(self) -> None:
         """Learn from this frame. One that never asked, since it made a new model, tells nothing."""
+        if self._depth is not None:
+            self._had_depth = self._depth
         if self._asks == 0:
             return
         now = self._clock()
         self._after_cost.add(now - self._asked)
-        self._essential.add(now - self._started - self._optional)
+        essential = now - self._started - self._optional
+        self._essential.add(essential)
+        if self._depth:
+            self._cost_with_depth.add(essential)
         if self._essential.value > self.seconds:
             self.share = max(LEAST_SHARE, SHRINK * self.share)
         elif self._essential.value + self._step_cost.value < COMFORT * self.seconds:
@@ -118,7 +143,7 @@ class _RunningMean:
 
 
 def capacity(config: MappingConfig, width: int, height: int) -> int:
-    """How many Gaussians a model of pictures of this size may have. A slow or busy machine uses a share of it."""
+    """How many Gaussians a model of pictures of this size may have; a slow machine uses a share of them."""
     if config.max_gaussians is not None:
         return config.max_gaussians
     return max(100, round(min(GAUSSIANS_PER_MS * config.budget_ms, width * height / PIXELS_PER_GAUSSIAN)))

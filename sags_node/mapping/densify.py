@@ -24,6 +24,7 @@ FRONT_FRAMES = 3  # in a row, since stereo is wrong now and then
 MIN_OPACITY = 0.03
 CROWDED = 0.9  # share of the cap above which what does not show is given up
 SHED = 0.01  # of all, per frame: so many are given up while there are more than the machine can afford
+LITTLE = 4.0  # px of coverage: what shows more would leave a hole
 IDLE = 0.1  # px of coverage: less does not show
 PIECE = 1024  # rows a thread takes at a time: a call for each row would count references to every array
 LARGEST = 1e6  # metres, colours, quaternions: no honest value comes near
@@ -50,17 +51,20 @@ def candidates(planes: F32, observation: Observation, phase: int) -> tuple[I32, 
 
 def doomed(model: GaussianModel, observation: Observation, limit: int) -> Bool:
     """[N] what to remove: in free space for several frames in a row, transparent or not finite; when N nears
-    its `limit` also what left the view, and what lies on the visible surface without showing. What an instrument
-    or other tissue hides is kept. Beyond the limit those that show least go. Counts the frames in free space (`in_front`)."""
+    its `limit` also what left the view, and what lies on the visible surface without showing; beyond it
+    what shows little. What an instrument or other tissue hides is kept. Counts the frames in free space
+    (`in_front`)."""
     remove = np.zeros(model.count, np.bool_)
     _inspect(
-        model.means, model.quats, model.scales, model.opacities, model.colors, model.contribution,
+        model.means, model.quats, model.scales, model.smoothing, model.node_weight,
+        model.opacities, model.colors, model.contribution,
         pack(observation.camera), observation.tissue, observation.depth,
         model.count > CROWDED * limit, model.in_front, remove,
     )  # fmt: skip
     excess = min(model.count - limit, int(SHED * model.count))
     if excess > 0:
-        remove[np.argpartition(model.contribution, excess)[:excess]] = True
+        least = np.argpartition(model.contribution, excess)[:excess]
+        remove[least] |= model.contribution[least] < LITTLE
     return remove
 
 
@@ -107,25 +111,27 @@ def _candidates(
 
 @parallel_kernel
 def _inspect(
-    means: F32, quats: F32, scales: F32, opacities: F32, colors: F32, contribution: F32,
+    means: F32, quats: F32, scales: F32, smoothing: F32, node_weight: F32,
+    opacities: F32, colors: F32, contribution: F32,
     cam: F32, tissue: Bool, depth: F32, crowded: bool, in_front: I32, remove: Bool,
 ) -> None:  # fmt: skip
     for piece in prange(-(-len(means) // PIECE)):
         first = np.int64(piece) * PIECE
         _inspect_rows(
-            means, quats, scales, opacities, colors, contribution, cam, tissue, depth, crowded,
-            in_front, remove, first, min(first + PIECE, len(means)),
+            means, quats, scales, smoothing, node_weight, opacities, colors, contribution,
+            cam, tissue, depth, crowded, in_front, remove, first, min(first + PIECE, len(means)),
         )  # fmt: skip
 
 
 @kernel
 def _inspect_rows(
-    means: F32, quats: F32, scales: F32, opacities: F32, colors: F32, contribution: F32,
+    means: F32, quats: F32, scales: F32, smoothing: F32, node_weight: F32,
+    opacities: F32, colors: F32, contribution: F32,
     cam: F32, tissue: Bool, depth: F32, crowded: bool, in_front: I32, remove: Bool, first: Any, end: Any,
 ) -> None:  # fmt: skip
     height, width = tissue.shape
     for i in range(first, end):
-        if not _is_sound(means, quats, scales, opacities, colors, i):
+        if not _is_sound(means, quats, scales, smoothing, node_weight, opacities, colors, i):
             remove[i] = True
             continue
         x, y, z = to_camera(cam, means[i, 0], means[i, 1], means[i, 2])
@@ -147,10 +153,13 @@ def _inspect_rows(
 
 
 @inlined
-def _is_sound(means: F32, quats: F32, scales: F32, opacities: F32, colors: F32, i: int) -> bool:
+def _is_sound(
+    means: F32, quats: F32, scales: F32, smoothing: F32, node_weight: F32, opacities: F32, colors: F32, i: int
+) -> bool:
     """Finite, and something to draw."""
-    size = abs(quats[i, 0]) + abs(quats[i, 1]) + abs(quats[i, 2]) + abs(quats[i, 3])
+    held = abs(node_weight[i, 0]) + abs(node_weight[i, 1]) + abs(node_weight[i, 2]) + abs(node_weight[i, 3])
+    size = abs(smoothing[i]) + abs(quats[i, 0]) + abs(quats[i, 1]) + abs(quats[i, 2]) + abs(quats[i, 3])
     for k in range(3):
         size += abs(means[i, k]) + abs(colors[i, k]) + abs(scales[i, k])
     least = min(scales[i, 0], scales[i, 1], scales[i, 2])
-    return bool(size < LARGEST and least > 0 and MIN_OPACITY <= opacities[i] <= 1)
+    return bool(size < LARGEST and held < 2 and least > 0 and MIN_OPACITY <= opacities[i] <= 1)

@@ -16,8 +16,8 @@ LARGEST = 1.5  # a larger change within one frame is another scene, not another 
 def exposure_gain(planes: F32, observation: Observation) -> F32:
     """Factor [3] by which the picture is brighter than the model, for each channel.
 
-    An endoscope's exposure follows what comes near, and all colours change at once; taking that as one gain spares
-    the model to learn it Gaussian by Gaussian. The median does not see highlights and what has just appeared.
+    An endoscope's exposure follows what comes near, and all colours change at once; taking that as one gain
+    spares the model to learn it Gaussian by Gaussian. The median does not see highlights and what is new.
 
     Args:
         planes: [5, H, W] of the rasteriser, drawn as `observation` should see the model.
@@ -30,5 +30,5 @@ def exposure_gain(planes: F32, observation: Observation) -> F32:
     fair = ((seen > DARK) & (seen < BRIGHT) & (drawn > DARK) & (drawn < BRIGHT)).all(-1)
     if np.count_nonzero(fair) < LEAST_PIXELS:
         return np.ones(3, np.float32)
-    gain = np.median(seen[fair] / drawn[fair], axis=0)
-    return np.clip(gain, 1 / LARGEST, LARGEST).astype(np.float32)
+    gain: F32 = np.median(seen[fair] / drawn[fair], axis=0).astype(np.float32)
+    return gain.clip(1 / LARGEST, LARGEST)

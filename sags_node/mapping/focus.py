@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from typing import Any
 
+import cv2
 import numpy as np
 from numba import prange
 
 from sags_node.engine.jit import kernel, parallel_kernel
 from sags_node.engine.rasterize import TILE_HEIGHT, TILE_WIDTH
-from sags_node.types import F32, Bool
+from sags_node.types import F32, U8, Bool
 
 EVERY = 2  # px: a quarter of the pixels tells enough
+REACH = 32  # px: few Gaussians are larger, and those are faint out there
 LEAST_COVERAGE = 0.05  # where less is drawn, the colour means nothing
 
 
@@ -37,14 +39,11 @@ def worst_tiles(planes: F32, image: F32, tissue: Bool, share: float) -> Bool:
 
 
 def with_neighbours(tiles: Bool) -> Bool:
-    """The tiles [1, rows, columns] and those that touch them: a Gaussian may reach into its tile's neighbours."""
-    grown = tiles.copy()
-    grown[:, 1:] |= tiles[:, :-1]
-    grown[:, :-1] |= tiles[:, 1:]
-    tiles = grown.copy()
-    grown[:, :, 1:] |= tiles[:, :, :-1]
-    grown[:, :, :-1] |= tiles[:, :, 1:]
-    return grown
+    """The tiles [1, rows, columns] and those less than `REACH` px away: a Gaussian may reach into them."""
+    rows, columns = -(-REACH // TILE_HEIGHT), -(-REACH // TILE_WIDTH)
+    window = np.ones((2 * rows + 1, 2 * columns + 1), np.uint8)
+    grown: U8 = cv2.dilate(tiles[0].view(np.uint8), window)
+    return grown.view(np.bool_)[None]
 
 
 @parallel_kernel

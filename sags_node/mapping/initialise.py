@@ -16,7 +16,6 @@ SCALE_PER_SPACING = 0.4  # of the distance between neighbours; measured best (0.
 FLATNESS = 0.5  # the extent along the ray against the extent across it
 OPACITY = 0.9
 LEAST_SHARE = 0.3  # of the drawn scale that is left when the 3D filter's share is taken off
-REACH = 96  # px: how far a pixel without depth looks for one
 INITIAL_SHARE = 0.75  # of the cap used by the first frame; the rest is for what appears later
 
 
@@ -47,7 +46,7 @@ def insert(
 def first_pixels(observation: Observation, limit: int) -> tuple[I32, F32, float]:
     """A regular grid of at most about `limit` tissue pixels: pixels [M, 2], depths [M] m, spacing px.
 
-    Pixels without depth take the nearest one in their row or column; those far from any are left out.
+    Pixels without depth take that of others in their row or column; without any they are left out.
     """
     tissue = observation.tissue
     spacing = max(1.0, float(np.sqrt(np.count_nonzero(tissue) / limit)))
@@ -73,8 +72,8 @@ def _depths_at(depth: F32, pixels: I32) -> F32:
 def nearest_depth(depth: F32, x: int, y: int) -> Any:
     """Depth [H, W] at a pixel, else of the nearest known pixels in its row and column the farthest, else 0.
 
-    Depth is missing beside what stands in front: where the other eye sees past an edge, and around instruments.
-    What is seen there belongs to the surface behind.
+    Depth is missing beside what stands in front: where the other eye sees past an edge, and around
+    instruments. What is seen there belongs to the surface behind.
     """
     if depth[y, x] > 0:
         return depth[y, x]
@@ -82,11 +81,11 @@ def nearest_depth(depth: F32, x: int, y: int) -> Any:
     farthest = np.float32(0)
     for side in range(4):
         dx, dy = (1, 0) if side == 0 else (-1, 0) if side == 1 else (0, 1) if side == 2 else (0, -1)
-        for r in range(1, REACH):
-            u, v = x + r * dx, y + r * dy
-            if u < 0 or v < 0 or u >= width or v >= height:
-                break
+        u, v = x + dx, y + dy
+        while u >= 0 and v >= 0 and u < width and v < height:
             if depth[v, u] > 0:
                 farthest = max(farthest, depth[v, u])
                 break
+            u += dx
+            v += dy
     return farthest

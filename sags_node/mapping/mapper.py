@@ -12,7 +12,7 @@ from sags_node.mapping import densify, initialise
 from sags_node.mapping.budget import Budget
 from sags_node.mapping.exposure import exposure_gain
 from sags_node.mapping.focus import with_neighbours, worst_tiles
-from sags_node.mapping.motion import OpticalFlow, scene_flow
+from sags_node.mapping.motion import OpticalFlow, depth_pull, scene_flow
 from sags_node.mapping.optimiser import Optimiser, Rates
 from sags_node.model.alias_free import smoothing_variances
 from sags_node.model.deformation import Deformation, NodeDeformation
@@ -21,6 +21,8 @@ from sags_node.types import F32, Bool, Observation, RenderedView, Snapshot
 
 CONTROL_NODES = 512
 INITIAL_STEPS = 30
+HOLES = 200  # Gaussians per frame that may be added even when there are as many as the machine affords
+TORN = 0.02  # of the Gaussians: where more are removed at once, they leave holes
 SETTLED = 10  # frames: a model that has not changed for so long has little more to learn
 FOCUS = 0.15  # of the picture: where all steps but the first of a frame are taken
 MIN_FIRST_DEPTHS = 200  # px
@@ -45,10 +47,13 @@ class Mapper:
 
     Each frame: predict where the tissue went (optical flow and depth, averaged on control nodes), remove what
     floats in free space, insert where the model has a hole or something new appears, refine while the budget
-    lasts: once the whole picture, then where it is worst. The order and the constants follow a measured design; see `benchmarks/`.
+    lasts: once the whole picture, then where it is worst. The order and the constants follow a measured
+    design; see `benchmarks/`.
     """
 
-    def __init__(self, rasterizer: Rasterizer, max_gaussians: int, smoothing: bool = True, fine_flow: bool = False) -> None:
+    def __init__(
+        self, rasterizer: Rasterizer, max_gaussians: int, smoothing: bool = True, fine_flow: bool = False
+    ) -> None:
         """
         Args:
             smoothing: draw the Gaussians with the 3D filter (`model.alias_free`).
@@ -65,6 +70,7 @@ class Mapper:
         self._last: _Last | None = None
         self.stale_tiles: Bool | None = None  # [1, rows, columns] to be drawn anew after `update`; None: all
         self._frames = 0
+        self._frames_to_depth = 0  # since depth was known last
         self._loss = 0.0
         self._metres_per_px = 0.0  # at the tissue's median depth
         self._v_planes: F32 = np.zeros((5, 1, 1), np.float32)
@@ -144,7 +150,7 @@ class Mapper:
         if budget.more():  # before inserting, so that the drawing above serves both
             self.model.contribution[:] = self._refine(observation, Rates()).contribution
             iterations = 1
-        room = max(0, limit - self.model.count)
+        room = max(HOLES, limit - self.model.count)
         pixels, depths = pixels[:room], depths[:room]
         rows = initialise.insert(self.model, observation, pixels, depths, densify.GRID, self._smoothing)
         self._deformation.attach(self.model, rows)
@@ -155,19 +161,22 @@ class Mapper:
 
     def _touch_up(self, observation: Observation, budget: Budget, settled: bool) -> dict[str, int]:
         """Nothing moved: what was drawn last shows where steps pay, and only there the picture changes."""
+        doomed = densify.doomed(self.model, observation, self._limit(budget))
+        if np.count_nonzero(doomed) > TORN * self.model.count:
+            return self._follow(observation, budget)  # damage: there are holes to be filled
         self.model.velocities[:] = 0
-        removed = self.model.remove(densify.doomed(self.model, observation, self._limit(budget)))
+        removed = self.model.remove(doomed)
         touched: list[Bool] = []
         while not (settled and touched) and budget.more():
-            touched.append(self._refine_worst(observation))
+            touched.append(self._refine_worst(observation, nodes=False))
         if touched and removed == 0:
             self.stale_tiles = with_neighbours(np.logical_or.reduce(touched))
         return {"inserted": 0, "removed": removed, "iterations": len(touched)}
 
-    def _refine_worst(self, observation: Observation) -> Bool:
+    def _refine_worst(self, observation: Observation, nodes: bool = True) -> Bool:
         tiles = worst_tiles(self._planes, observation.image, observation.tissue, FOCUS)
         self._draw(observation, tiles)
-        self._refine(observation, Rates())
+        self._refine(observation, Rates(), nodes)
         return tiles
 
     def _predict(self, observation: Observation) -> None:
@@ -177,7 +186,13 @@ class Mapper:
             return
         before = self._last.observation
         flow = self._flow(before.gray, observation.gray)
-        displacements, seen = scene_flow(self.model.means, self._last.view, before.tissue, flow, observation)
+        self._frames_to_depth += 1
+        displacements, seen = scene_flow(
+            self.model.means, self._last.view, before.tissue, flow, observation,
+            depth_pull(self._frames_to_depth),
+        )  # fmt: skip
+        if observation.depth.any():
+            self._frames_to_depth = 0
         start = self.model.means.copy()
         self._deformation.follow(self.model, displacements, seen)
         seconds = (observation.t_capture_ns - before.t_capture_ns) * 1e-9
@@ -202,7 +217,7 @@ class Mapper:
         self._planes = self._rasterizer.forward(self.model.gaussians(), [observation.camera], tiles)[0]
         return self._planes
 
-    def _refine(self, observation: Observation, rates: Rates) -> Gradients:
+    def _refine(self, observation: Observation, rates: Rates, nodes: bool = True) -> Gradients:
         """One step on what was drawn last: loss and its gradient, back-propagation, nodes, Gaussians."""
         assert self._deformation is not None
         planes = self._planes
@@ -214,9 +229,10 @@ class Mapper:
             self._v_planes, self._weight, DEPTH_WEIGHT, DEPTH_SCALE,
         )  # fmt: skip
         gradients = self._rasterizer.backward(self._v_planes[None], self._weight[None])
-        self._deformation.descend(
-            self.model, gradients.means, gradients.contribution, NODE_STEP_PX * self._metres_per_px
-        )
+        if nodes:  # they move all that follows them, also far from the tiles that were drawn
+            self._deformation.descend(
+                self.model, gradients.means, gradients.contribution, NODE_STEP_PX * self._metres_per_px
+            )
         self._optimiser.step(self.model, gradients, observation.camera, rates)
         self.step += 1
         return gradients

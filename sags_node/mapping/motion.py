@@ -18,13 +18,14 @@ SEEN_ALPHA = 0.3
 FLOW_MARGIN = 20 / 640  # of the width: flow smears an instrument's motion that far into the tissue
 PIECE = 1024  # rows a thread takes at a time: a call for each row would count references to every array
 DEPTH_PULL = 0.4  # share of the depth innovation taken per frame; measured best 0.3-0.5
+MOST_FRAMES = 4  # without depth, after which the pull is not stronger any more
 
 
 class OpticalFlow:
     """Dense inverse search flow (Kroeger et al., ECCV 2016) between consecutive left pictures.
 
-    It searches at half of the pictures' size. OpenCV's preset `FAST` searches whole pictures, only to stop two
-    octaves above them as this does: the same flow for 1.6 times the work.
+    It searches at half of the pictures' size. OpenCV's preset `FAST` searches whole pictures, only to stop
+    two octaves above them as this does: the same flow for 1.6 times the work.
     """
 
     def __init__(self, fine: bool) -> None:
@@ -43,8 +44,14 @@ class OpticalFlow:
         return np.asarray(flow)
 
 
+def depth_pull(frames: int) -> float:
+    """Share of the depth innovation to take when depth is known again after `frames` frames: as much as if it
+    had been known in each."""
+    return float(1 - (1 - DEPTH_PULL) ** min(frames, MOST_FRAMES))
+
+
 def scene_flow(
-    means: F32, before: RenderedView, tissue_before: Bool, flow: F32, after: Observation
+    means: F32, before: RenderedView, tissue_before: Bool, flow: F32, after: Observation, pull: float
 ) -> tuple[F32, F32]:
     """Displacement of each Gaussian from one frame to the next.
 
@@ -54,6 +61,7 @@ def scene_flow(
         tissue_before: [H, W].
         flow: [h, w, 2] px of the whole pictures, from the earlier to the later one, at any size.
         after: the later frame; its depth pulls the Gaussian along the ray.
+        pull: by which share of the difference; see `depth_pull`.
 
     Returns:
         displacements [N, 3] m, world, and seen [N]: 1 where the displacement was observed, else 0.
@@ -66,7 +74,7 @@ def scene_flow(
     clear_after = cv2.erode(after.tissue.view(np.uint8), kernel_size).view(np.bool_)
     _advect(
         means, pack(before.camera), before.depth, before.alpha, clear_before, flow,
-        pack(after.camera), clear_after, after.depth, displacements, seen,
+        pack(after.camera), clear_after, after.depth, np.float32(pull), displacements, seen,
     )  # fmt: skip
     return displacements, seen
 
@@ -74,12 +82,12 @@ def scene_flow(
 @parallel_kernel
 def _advect(
     means: F32, cam0: F32, drawn_depth: F32, alpha: F32, tissue0: Bool, flow: F32,
-    cam1: F32, tissue1: Bool, depth1: F32, displacements: F32, seen: F32,
+    cam1: F32, tissue1: Bool, depth1: F32, pull: Any, displacements: F32, seen: F32,
 ) -> None:  # fmt: skip
     for piece in prange(-(-len(means) // PIECE)):
         first = np.int64(piece) * PIECE
         _advect_rows(
-            means, cam0, drawn_depth, alpha, tissue0, flow, cam1, tissue1, depth1, displacements, seen,
+            means, cam0, drawn_depth, alpha, tissue0, flow, cam1, tissue1, depth1, pull, displacements, seen,
             first, min(first + PIECE, len(means)),
         )  # fmt: skip
 
@@ -87,7 +95,7 @@ def _advect(
 @kernel
 def _advect_rows(
     means: F32, cam0: F32, drawn_depth: F32, alpha: F32, tissue0: Bool, flow: F32,
-    cam1: F32, tissue1: Bool, depth1: F32, displacements: F32, seen: F32, first: Any, end: Any,
+    cam1: F32, tissue1: Bool, depth1: F32, pull: Any, displacements: F32, seen: F32, first: Any, end: Any,
 ) -> None:  # fmt: skip
     """Writes the displacement and 1 where it was observed; leaves the others as they are."""
     height, width = alpha.shape
@@ -116,7 +124,7 @@ def _advect_rows(
                 continue  # flow into an instrument is the instrument's motion
             measured = depth1[py, px]
             if measured > 0 and abs(measured - z1) < DEPTH_GATE * z1:
-                z1 += np.float32(DEPTH_PULL) * (measured - z1)
+                z1 += pull * (measured - z1)
         # From pixel and depth to the world: the transposed rotation.
         x1 = (u - cam1[14]) * z1 / cam1[12] - cam1[3]
         y1 = (v - cam1[15]) * z1 / cam1[13] - cam1[7]

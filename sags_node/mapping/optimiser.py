@@ -36,6 +36,8 @@ BETA1, BETA2 = 0.5, 0.99  # low momentum: a few steps per frame must not coast
 MIN_CONTRIBUTION = 1e-3  # px: rows that were not seen are not touched
 LOG_SCALE_RANGE = (math.log(1e-6), math.log(5e-3))  # m
 LOGIT_RANGE = (-6.0, 6.0)
+LARGEST = 1e20  # sum of a row's gradients, momenta and variances
+LARGEST_RAW = 100.0  # sum of a row's log scales and logit: no honest value comes near
 PIECE = 1024  # rows a thread takes at a time: a call for each row would count references to every array
 
 
@@ -106,9 +108,10 @@ def _step_rows(
         for k in range(ADAM_PARAMETERS):
             size += abs(g[k]) + abs(adam_m[i, k]) + abs(adam_v[i, k])
         for k in range(3):
-            size += abs(v_colors[i, k]) + abs(log_scales[i, k])
-        if not size + abs(opacity_logits[i]) < np.inf:
-            _mend(log_scales[i], opacity_logits, scales[i], opacities, adam_m[i], adam_v[i], i)
+            size += abs(v_colors[i, k])
+        raw = abs(opacity_logits[i]) + abs(log_scales[i, 0]) + abs(log_scales[i, 1]) + abs(log_scales[i, 2])
+        if not (size < np.float32(LARGEST) and raw < np.float32(LARGEST_RAW)):
+            _mend(log_scales[i], opacity_logits, scales[i], opacities, adam_m[i], adam_v[i], g, i)
             continue
         gain = np.float32(COLOUR_RELAXATION) / (contribution[i] + np.float32(COLOUR_DAMPING))
         for k in range(3):
@@ -137,11 +140,12 @@ def _step_rows(
 
 @kernel
 def _mend(
-    log_scale: F32, opacity_logits: F32, scale: F32, opacities: F32, adam_m: F32, adam_v: F32, i: int
+    log_scale: F32, opacity_logits: F32, scale: F32, opacities: F32, adam_m: F32, adam_v: F32, g: F32, i: int
 ) -> None:
     """Make a row's hidden state anew from what is drawn of it, which is known to be sound."""
-    adam_m[:] = 0
-    adam_v[:] = 0
+    for k in range(ADAM_PARAMETERS):
+        adam_m[k] = 0
+        adam_v[k] = g[k] * g[k] if abs(g[k]) < np.inf else np.float32(0)
     for k in range(3):
         log_scale[k] = math.log(scale[k])
     opacity = min(opacities[i], np.float32(0.999))

@@ -155,10 +155,12 @@ def camera_info(camera: Camera, stamp_ns: int, frame: str = LEFT_FRAME, baseline
     return Content(topics.CAMERA_INFO, (_serialize(message),))
 
 
-def point_cloud(columns: NDArray[np.float32], fields: Sequence[str], stamp_ns: int) -> Content:
+def point_cloud(
+    columns: NDArray[np.float32], fields: Sequence[str], stamp_ns: int, dense: bool = True
+) -> Content:
     """`sensor_msgs/PointCloud2` in the world frame of rows [N, len(fields)], every field four bytes.
 
-    Columns named in `PACKED_FIELDS` hold the bits of a uint32.
+    Columns named in `PACKED_FIELDS` hold the bits of a uint32. `dense`: no position is NaN.
     """
     count, width = columns.shape
     assert columns.dtype == np.float32 and width == len(fields), (columns.shape, columns.dtype)
@@ -170,7 +172,7 @@ def point_cloud(columns: NDArray[np.float32], fields: Sequence[str], stamp_ns: i
     empty = np.empty(0, np.uint8)
     header = _header(stamp_ns, WORLD_FRAME)
     row_bytes = 4 * width * count
-    message = _ros[topics.POINT_CLOUD](header, 1, count, described, False, 4 * width, row_bytes, empty, True)
+    message = _ros[topics.POINT_CLOUD](header, 1, count, described, False, 4 * width, row_bytes, empty, dense)
     whole = _serialize(message)
     start, suffix = whole[:-5], whole[-1:]  # around the length of the empty data: is_dense
     data = np.ascontiguousarray(columns)

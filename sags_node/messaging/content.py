@@ -12,7 +12,7 @@ import numpy as np
 from sags_node.geometry import project
 from sags_node.messaging import cdr
 from sags_node.messaging.cdr import Content, Status
-from sags_node.types import F32, U8, Bool, FrameResult, NodeHealth, RenderedView
+from sags_node.types import F32, NO_TIME, U8, Bool, DrawnView, FrameResult, NodeHealth, RenderedView
 
 SH_DEGREE_0 = 0.28209479  # Y_00: rgb = 0.5 + Y_00 f_dc
 SPLAT_FIELDS = (
@@ -23,6 +23,7 @@ SPLAT_FIELDS = (
     *("opacity", "id"),
 )
 POINT_FIELDS = ("x", "y", "z", "rgb")
+ANCHOR_FIELDS = ("x", "y", "z", "id", "u", "v", "visibility", "age", "confidence")
 POINT_MIN_OPACITY = 0.1
 POINT_BEHIND_SURFACE = 0.003  # m; a Gaussian deeper than this under the drawn surface is not visible
 
@@ -51,6 +52,40 @@ def points(result: FrameResult) -> Content:
     return cdr.point_cloud(rows, POINT_FIELDS, result.pair.t_capture_ns)
 
 
+def anchors(result: FrameResult) -> Content:
+    """The points pinned to the tissue, as rows of `ANCHOR_FIELDS`; the position of a lost one is NaN."""
+    states = result.anchors
+    rows = np.empty((len(states), len(ANCHOR_FIELDS)), np.float32)
+    rows[:, 0:3] = states.points
+    rows.view(np.uint32)[:, 3] = states.ids.astype(np.uint32)
+    rows[:, 4:6] = states.pixels
+    rows[:, 6], rows[:, 7], rows[:, 8] = states.visibility, states.ages, states.confidence
+    dense = bool(np.isfinite(states.points).all())
+    return cdr.point_cloud(rows, ANCHOR_FIELDS, result.pair.t_capture_ns, dense)
+
+
+def view_topics(name: str, stereo: bool, depth: bool) -> list[str]:
+    """The topics of a view, without the namespace."""
+    kinds = ("image", "camera_info", *(("depth",) if depth else ()))
+    return [
+        f"view/{name}/{eye}{kind}" for eye in (("left/", "right/") if stereo else ("",)) for kind in kinds
+    ]
+
+
+def view(name: str, drawn: DrawnView) -> dict[str, Content]:
+    """What the topics of a view that a consumer asked for say, by name without the namespace."""
+    said = {}
+    for eye, picture in drawn.eyes.items():
+        topic = f"view/{name}/{eye}/" if eye else f"view/{name}/"
+        frame = f"{topic[:-1].replace('/', '_')}_optical_frame"
+        stamp_ns, baseline = picture.t_capture_ns, drawn.baseline if eye == "right" else 0.0
+        said[f"{topic}camera_info"] = cdr.camera_info(picture.camera, stamp_ns, frame, baseline)
+        said[f"{topic}image"] = cdr.image(_rgba(picture), "rgba8", stamp_ns, frame)
+        if drawn.depth:
+            said[f"{topic}depth"] = cdr.image(_depth(picture.depth), "32FC1", stamp_ns, frame)
+    return said
+
+
 def _visible(result: FrameResult) -> Bool:
     """Which Gaussians [N] lie in the left picture and not under the surface drawn there."""
     view, gaussians = result.views["left"], result.snapshot.gaussians
@@ -65,11 +100,11 @@ def _visible(result: FrameResult) -> Bool:
     return visible
 
 
-def _rgba(view: RenderedView) -> U8:
+def _rgba(picture: RenderedView) -> U8:
     """Straight-alpha picture [H, W, 4] of a rendered view."""
-    rgba = np.empty((*view.alpha.shape, 4), np.uint8)
-    rgba[..., :3] = cv2.convertScaleAbs(view.rgb, alpha=255.0)  # scales, rounds and saturates in one pass
-    rgba[..., 3] = cv2.convertScaleAbs(view.alpha, alpha=255.0)
+    rgba = np.empty((*picture.alpha.shape, 4), np.uint8)
+    rgba[..., :3] = cv2.convertScaleAbs(picture.rgb, alpha=255.0)  # scales, rounds and saturates in one pass
+    rgba[..., 3] = cv2.convertScaleAbs(picture.alpha, alpha=255.0)
     return rgba
 
 
@@ -104,8 +139,14 @@ FRAME_CONTENT: Mapping[str, Callable[[FrameResult], Content]] = {
     ),
     "points": points,
     "splats": splats,
+    "anchors": anchors,
     "tf": lambda r: cdr.transform(r.pair.camera.T_world_cam, r.pair.t_capture_ns),
 }
+
+
+def tells_of(result: FrameResult, topic: str) -> bool:
+    """Whether a frame has something for a topic: there may have been no time to measure its depth."""
+    return topic != "left/depth" or result.skipped.get("depth") != NO_TIME
 
 
 def status(health: NodeHealth, last: FrameResult | None) -> dict[str, Any]:

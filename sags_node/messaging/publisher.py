@@ -6,6 +6,7 @@ import os
 import time
 from collections.abc import Mapping
 from contextlib import ExitStack
+from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Self
 
@@ -19,16 +20,27 @@ from sags_node.messaging.rundir import Connection, RunDirectory
 from sags_node.messaging.security import KeyPair, authenticated, check_endpoint
 from sags_node.messaging.sockets import bind, limit, receive_frames
 from sags_node.messaging.wire import PROTOCOL, Message, Meta, encode
-from sags_node.types import FrameResult, NodeHealth
+from sags_node.types import DrawnView, FrameResult, NodeHealth
 
 # Messages per slow peer, all topics together: two whole frames, so that the burst of one frame fits.
 SEND_HIGH_WATER = 2 * len(topics.TOPICS)
 MAX_SUBSCRIPTIONS_AT_ONCE = 200
 MAX_SUBSCRIPTION_BYTES = 512  # also the longest step of a CURVE handshake
 MAX_SUBSCRIPTIONS_BYTES = 16384  # of one peer, all together: ZeroMQ remembers them until the peer goes
+MAX_PREFIXES = 1024  # noted: a view may be subscribed to before it is opened, so any name may come
 SUBSCRIPTIONS_HIGH_WATER = 64  # that one peer may have waiting
 PENDING_POLL_MS = 10  # how soon the result of a handler's future is looked for
 LAST_WORDS_MS = 200  # longest wait at the end for what is still on its way to a peer
+
+
+@dataclass(frozen=True, slots=True)
+class _Kept:
+    """The last value of a topic, for those who subscribe later."""
+
+    body: Content
+    stamp_ns: int
+    frame_id: int = -1
+    epoch: int | None = None
 
 
 class Publisher:
@@ -59,10 +71,10 @@ class Publisher:
         self.session = session
         self._names = {topics.full_name(ns, t.name): t for t in topics.TOPICS if config.right or not t.right}
         self._seq = dict.fromkeys((t.name for t in self._names.values()), 0)
-        self._subscribed: set[str] = set()  # prefixes, only those that match a topic of ours
+        self._subscribed: set[str] = set()  # prefixes, only those of our topics and of views
         self._last: FrameResult | None = None
         self._dropped = 0
-        self._texts: dict[str, tuple[Content, int]] = {}  # status, parameters: last content and its stamp
+        self._kept: dict[str, _Kept] = {}  # last values that no `FrameResult` holds
         self._peers: dict[str, Peers] = {}
         self._resources = ExitStack()
         self._run = RunDirectory(config.run_dir, ns)
@@ -121,7 +133,7 @@ class Publisher:
         self._last = result
         self._dropped = dropped
         for name in content.FRAME_CONTENT:
-            if name in self._seq:
+            if name in self._seq and content.tells_of(result, name):
                 self._seq[name] += 1
                 if self.wanted(name):
                     self._send_frame_topic(name)
@@ -139,9 +151,30 @@ class Publisher:
     def publish_content(self, name: str, body: Content, frame_id: int, stamp_ns: int, epoch: int) -> None:
         """Send what was made elsewhere, e.g. recorded; the topic `name` (without namespace) may be any."""
         self._seq[name] = self._seq.get(name, 0) + 1
-        if name in topics.BY_NAME and topics.BY_NAME[name].cached:
-            self._texts[name] = (body, stamp_ns)
+        topic = topics.find(name)
+        if topic is not None and topic.cached:
+            self._kept[name] = _Kept(body, stamp_ns, frame_id, epoch)
         self._send(name, body, frame_id, stamp_ns, epoch)
+
+    def publish_view(self, name: str, drawn: DrawnView) -> None:
+        """Send the topics of the view `name` to those who asked for them."""
+        shown = next(iter(drawn.eyes.values()))
+        for topic, body in content.view(name, drawn).items():
+            self._seq[topic] = self._seq.get(topic, 0) + 1
+            if drawn.still or body.type == topics.CAMERA_INFO:
+                self._kept[topic] = _Kept(body, shown.t_capture_ns, shown.frame_id, drawn.epoch)
+            if self.wanted(topic):
+                self._send(topic, body, shown.frame_id, shown.t_capture_ns, drawn.epoch)
+
+    def forget_view(self, name: str) -> None:
+        """Nothing is sent again of a view that was closed."""
+        for topic in [kept for kept in self._kept if kept.startswith(f"view/{name}/")]:
+            del self._kept[topic]
+
+    def watches_view(self, name: str) -> bool:
+        """True while somebody subscribes to a topic of the view `name`."""
+        start = topics.full_name(self.ns, f"view/{name}/")
+        return any(start.startswith(prefix) or prefix.startswith(start) for prefix in self._subscribed)
 
     def wanted(self, name: str) -> bool:
         """True while somebody subscribes to the topic `name` (without the namespace)."""
@@ -150,7 +183,7 @@ class Publisher:
 
     def _publish_text(self, name: str, text: Content, stamp_ns: int) -> None:
         self._seq[name] += 1
-        self._texts[name] = (text, stamp_ns)
+        self._kept[name] = _Kept(text, stamp_ns)
         if self.wanted(name):
             self._send(name, text, -1, stamp_ns)
 
@@ -218,9 +251,9 @@ class Publisher:
                 break
             self._subscription(frames[0].bytes, resend)
         for name in sorted(resend):
-            if name in self._texts:
-                text, stamp_ns = self._texts[name]
-                self._send(name, text, -1, stamp_ns)
+            if name in self._kept:
+                kept = self._kept[name]
+                self._send(name, kept.body, kept.frame_id, kept.stamp_ns, kept.epoch)
             elif name in content.FRAME_CONTENT and self._last is not None:
                 self._send_frame_topic(name)
 
@@ -231,11 +264,18 @@ class Publisher:
         except UnicodeError:
             return
         matching = [topic for full, topic in self._names.items() if full.startswith(prefix)]
-        if message[:1] == b"\x01" and matching:
+        views = topics.full_name(self.ns, "view/")
+        of_views = prefix.startswith(views) or views.startswith(prefix)
+        if message[:1] == b"\x01" and (matching or (of_views and len(self._subscribed) < MAX_PREFIXES)):
             self._subscribed.add(prefix)
             resend.update(topic.name for topic in matching if topic.cached)
+            if of_views:
+                resend.update(name for name in self._kept if self._is_kept_view(name, prefix))
         elif message[:1] == b"\x00":
             self._subscribed.discard(prefix)
+
+    def _is_kept_view(self, name: str, prefix: str) -> bool:
+        return name.startswith("view/") and topics.full_name(self.ns, name).startswith(prefix)
 
     def close(self) -> None:
         """Close the sockets and remove the connection file."""

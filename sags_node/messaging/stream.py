@@ -26,11 +26,12 @@ def check_topic(name: str) -> topics.Topic:
     Raises:
         UsageError: there is no such topic.
     """
-    if name not in topics.BY_NAME:
+    topic = topics.find(name)
+    if topic is None:
         near = difflib.get_close_matches(name, topics.BY_NAME, n=1)
         hint = f"did you mean '{near[0]}'?" if near else f"topics: {', '.join(topics.BY_NAME)}"
         raise UsageError(f"unknown topic '{name}'; {hint}")
-    return topics.BY_NAME[name]
+    return topic
 
 
 @contextmanager

@@ -70,6 +70,7 @@ class Subscriber:
         self._ns = ns
         self._clock_ns = clock_ns
         self._fresh = {topic.name: Freshness(rates.get(topic.name), topic.periodic) for topic in wanted}
+        self._types = {topic.name: topic.type for topic in wanted}
         self._kept: dict[str, deque[Received]] = {topic.name: deque(maxlen=KEPT) for topic in wanted}
         self._arrived = threading.Condition()
         self._stopping = threading.Event()
@@ -188,7 +189,7 @@ class Subscriber:
         try:
             message = receive(self._socket)
             name = self._prefixes.get(message.topic)
-            if name is None or message.meta.type != topics.BY_NAME[name].type:
+            if name is None or message.meta.type != self._types[name]:
                 raise WireError(f"{message.topic}: not what was subscribed to")
             received = interpret(message, self._clock_ns())
         except WireError:

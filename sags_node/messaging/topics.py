@@ -1,12 +1,14 @@
 """The contents page of the wire: every topic this node publishes, under its namespace.
 
-Coordinates: images and depth belong to the left or right optical frame, `points` and `splats` to `world`.
+Coordinates: images and depth belong to the left or right optical frame, `points`, `splats` and `anchors` to
+`world`.
 `splats` holds linear, activated values: scales in metres, opacity 0..1, and colour as the degree-0 spherical
 harmonic f_dc = (rgb - 0.5) / 0.28209479. (A 3DGS PLY file holds the logarithm and the logit instead.)
 """
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 IMAGE = "sensor_msgs/msg/Image"
@@ -39,12 +41,30 @@ TOPICS = (
     Topic("left/tissue_mask", IMAGE, "mono8, 255 = tissue"),
     Topic("points", POINT_CLOUD, "x y z (m, world) rgb: the visible Gaussians"),
     Topic("splats", POINT_CLOUD, "every Gaussian: linear scales (m), opacity 0..1, world", cached=True),
+    Topic("anchors", POINT_CLOUD, "points pinned to the tissue: x y z (m, world), pixel, visibility, age"),
     Topic("tf", TF, "world -> left optical frame"),
     Topic("diagnostics", DIAGNOSTICS, "1 Hz, one status per stage"),
     Topic("status", STRING, "JSON: rates, latencies, drops, memory, what was skipped", cached=True),
     Topic("parameters", STRING, "JSON: the launch configuration in force", cached=True, periodic=False),
 )
 BY_NAME = {topic.name: topic for topic in TOPICS}
+
+
+VIEW_NAME = re.compile(r"[A-Za-z0-9_]{1,64}")
+_VIEW_TOPIC = re.compile(rf"view/{VIEW_NAME.pattern}/(?:(?:left|right)/)?(image|depth|camera_info)")
+_VIEW_KINDS = {
+    "image": (IMAGE, "rgba8, the model from a viewpoint that a consumer asked for"),
+    "depth": (IMAGE, "32FC1, metres along z of that viewpoint, NaN where the model says nothing"),
+    "camera_info": (CAMERA_INFO, "the camera of that viewpoint"),
+}
+
+
+def find(name: str) -> Topic | None:
+    """The entry of a topic named without the namespace, also of a view that a consumer may have opened."""
+    if name in BY_NAME:
+        return BY_NAME[name]
+    view = _VIEW_TOPIC.fullmatch(name)
+    return None if view is None else Topic(name, *_VIEW_KINDS[view[1]], cached=view[1] == "camera_info")
 
 
 def full_name(ns: str, name: str) -> str:

@@ -89,6 +89,8 @@ class NodeDeformation:
         )
         self._momentum += 0.2 * (gradient - self._momentum)
         self._variance += 0.05 * (gradient * gradient - self._variance)
+        damaged = ~np.isfinite(self._momentum + self._variance)
+        self._momentum[damaged] = self._variance[damaged] = 0
         motion = (-step * self._momentum / (np.sqrt(self._variance) + 1e-12)).astype(np.float32)
         self.nodes += motion
         _skin(motion, model.node_index, model.node_weight, model.means)
@@ -186,6 +188,8 @@ def _average(values: F32, seen: F32, index: I32, weight: F32, nodes: int) -> tup
         if seen[i] > 0:
             for k in range(NEIGHBOURS):
                 w = weight[i, k] * seen[i]
+                if not (w >= 0 and w <= 1):
+                    continue  # damaged: it is removed with what it moves to
                 j = index[i, k]
                 mass[j] += w
                 for a in range(3):

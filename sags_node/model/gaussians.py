@@ -78,7 +78,7 @@ class GaussianModel:
         rows["colors"][added] = colors[:fits]
         rows["opacities"][added] = opacity
         rows["opacity_logits"][added] = np.log(opacity / (1.0 - opacity))
-        rows["contribution"][added] = 1.0  # not known yet
+        rows["contribution"][added] = np.inf  # not known yet
         rows["ids"][added] = np.arange(self._next_id, self._next_id + fits)
         self._next_id += fits
         self.count += fits

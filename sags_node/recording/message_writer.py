@@ -81,7 +81,7 @@ class MessageWriter:
         if topic.endswith("/parameters"):
             text = cdr.parse(message).data.encode()
             self.bag.attach("parameters.json", "application/json", text, arrived.received_ns)
-        elif message.meta.type == CAMERA_INFO:
+        elif message.meta.type == CAMERA_INFO and topic.removeprefix(f"{self._ns}/") in topics.BY_NAME:
             side = topic.split("/")[-2]
             text = eye_text(read_eye(message.cdr(), topic), side).encode()
             self.bag.attach(f"calib/{side}.yaml", "application/yaml", text, arrived.received_ns)

@@ -5,20 +5,21 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from sags_node.types import U8, RectifiedPair
+from sags_node.types import F64, U8, RectifiedPair
 
 SHRINK = 8  # px are averaged: camera noise up to 4 grey levels stays below the limit
 BLOCK = 4  # shrunk px: 32 px, the length over which something moves or does not
 LARGEST_DIFFERENCE = 1.0  # grey levels, mean over a block
-LARGEST_SHARE = 0.02  # of the blocks that may differ more: a highlight flickers, an instrument trembles
+LARGEST_SHARE = 0.005  # of the blocks that may differ more: a highlight flickers
 
 
 class StillScene:
-    """Compares pictures with those of the last frame in which something moved, not with the frame before: slow
-    motion adds up and is seen."""
+    """Compares pictures with those of the last frame in which something moved, not with the frame before:
+    slow motion adds up and is seen."""
 
     def __init__(self) -> None:
         self._eyes: list[U8] | None = None
+        self._pose: F64 = np.eye(4)
         self._frames = 0
 
     def forget(self) -> None:
@@ -26,13 +27,14 @@ class StillScene:
         self._eyes = None
 
     def __call__(self, pair: RectifiedPair) -> int:
-        """For how many frames, this one included, both eyes have seen the same; 0: something moved."""
+        """For how many frames, this one included, pictures and pose are the same; 0: something moved."""
         eyes = [_shrunk(eye) for eye in (pair.left, pair.right) if eye is not None]
-        before = self._eyes
-        if before is not None and len(before) == len(eyes) and all(map(_alike, eyes, before)):
+        before, pose = self._eyes, pair.camera.T_world_cam
+        stays = np.array_equal(pose, self._pose)
+        if stays and before is not None and len(before) == len(eyes) and all(map(_alike, eyes, before)):
             self._frames += 1
         else:
-            self._eyes, self._frames = eyes, 0
+            self._eyes, self._pose, self._frames = eyes, pose, 0
         return self._frames
 
 

@@ -65,8 +65,8 @@ class InverseSearch:
         self._guess_shrink = size[0] / self._guess_size[0]
         self._guess = SemiGlobal(smallest / self._guess_shrink, largest / self._guess_shrink)
         self._dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-        # The guess is good at its own resolution: no need to search at coarser ones. Fewer patches at the finest
-        # resolution cost as much as many at half of it with refinement, and halve the error at edges.
+        # The guess is good at its own resolution: no need to search at coarser ones. Fewer patches at the
+        # finest resolution cost as much as many at half of it, and halve the error at edges.
         self._dis.setFinestScale(0)
         self._dis.setCoarsestScale(max(0, shrink.bit_length() - 2))
         self._dis.setPatchStride(PATCH_STRIDE)

@@ -1,0 +1,322 @@
+"""Points pinned to the tissue by a user and followed through its deformation.
+
+An anchor moves with the Gaussians around it, known by their ids: these follow the control nodes, also under
+an instrument. What is seen corrects it. Sideways, the patch of the picture that surrounded it at first is
+found again, so that nothing drifts; along the ray, it keeps its distance to the drawn surface.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import cv2
+import numpy as np
+
+from sags_node.errors import SagsError
+from sags_node.geometry import project, unproject
+from sags_node.types import (
+    F32,
+    F64,
+    I64,
+    U8,
+    AnchorStates,
+    Bool,
+    Gaussians,
+    Observation,
+    RenderedView,
+    Snapshot,
+)
+
+MAX_ANCHORS = 256
+NEIGHBOURS = 16  # Gaussians that carry an anchor
+REACH = 0.005  # m; Gaussians farther than this from an anchor do not carry it
+SOFT = 1e-4  # m; Gaussians nearer than this weigh the same
+RENEW_BELOW = 0.8  # share of the weight still there: below it new neighbours are taken
+RENEWED_PER_FRAME = 8  # anchors; taking neighbours costs a third of a millisecond
+
+SEEN_RADIUS = 2  # px around the anchor that must be free for it to be fully visible
+BEHIND = 0.035  # of the depth: an anchor this far behind the drawn surface is hidden by it
+PATCH_RADIUS = 10  # px
+SEARCH_RADIUS = 4  # px, of an anchor found in the frame before
+SEARCH_GROWTH = 30.0  # px/s since it was found last
+MAX_SEARCH_RADIUS = 16  # px
+FOUND_AGREEMENT = 0.8  # normalised cross-correlation from which on the patch counts as found
+SEARCHED_PER_FRAME = 32  # anchors, in turn
+DEPTH_PULL = 0.1  # share of the depth error taken per frame
+DEPTH_GATE = 0.05  # of the depth: a larger error is another surface
+HALF_LIFE = 2.0  # s: confidence halves in so long without a sight of the patch
+
+_NOBODY = -1  # in the place of a Gaussian's id
+_SIDE = 2 * PATCH_RADIUS + 1
+
+
+@dataclass(frozen=True, slots=True)
+class _Table:
+    """One row for each anchor; the arrays are written in place."""
+
+    ids: I64  # [A]
+    points: F64  # [A, 3] m, world; NaN: lost
+    carriers: I64  # [A, NEIGHBOURS] ids of Gaussians
+    weights: F64  # [A, NEIGHBOURS] 0: this carrier is gone, or there never was one
+    means: F64  # [A, NEIGHBOURS, 3] m, of the carriers in the last snapshot
+    pixels: F64  # [A, 2] px; NaN: behind the camera or lost
+    depths: F64  # [A] m, camera z
+    visibility: F64  # [A] 0..1
+    patches: U8  # [A, _SIDE, _SIDE] gray, around the anchor when it was first seen clearly
+    depth_offsets: F64  # [A] m, drawn surface minus anchor at that time; NaN: there was none yet
+    agreement: F64  # [A] 0..1, of the patch when it was found last
+    unseen: F64  # [A] s since it was found last
+    searched: I64  # [A] number of the frame in which it was searched last
+    ages: F64  # [A] s since it was pinned
+
+
+class Anchors:
+    """All anchors of one node. Their ids are never used again."""
+
+    def __init__(self) -> None:
+        self._table = _row(0, np.zeros(3), (np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3))))
+        self._table = _selected(self._table, np.zeros(1, bool))
+        self._next_id = 1
+        self._frames = 0
+        self._stamp_ns: int | None = None  # of the last frame
+
+    def __len__(self) -> int:
+        return len(self._table.ids)
+
+    def add_pixel(
+        self, u: float, v: float, observation: Observation, snapshot: Snapshot, view: RenderedView
+    ) -> int:
+        """Pin the tissue seen at a pixel (u, v) of the left picture; returns the anchor's id.
+
+        Raises:
+            SagsError: the pixel is outside the picture, on an instrument or without depth, or there are too
+                many anchors.
+        """
+        height, width = observation.tissue.shape
+        if not (-0.5 <= u < width - 0.5 and -0.5 <= v < height - 0.5):
+            raise SagsError(f"pixel ({u:g}, {v:g}) is outside the left picture of {width}x{height} px")
+        row, column = round(v), round(u)
+        if not observation.tissue[row, column]:
+            raise SagsError(f"pixel ({u:g}, {v:g}) shows an instrument, not tissue; choose another")
+        depth = float(view.depth[row, column]) or float(observation.depth[row, column])
+        if depth <= 0:
+            raise SagsError(f"there is no depth at pixel ({u:g}, {v:g}) in this frame; choose another")
+        point = unproject(observation.camera, np.array([u, v], np.float64), np.array(depth))
+        return self.add_point(np.asarray(point), observation, snapshot, view)
+
+    def add_point(self, point: F64, observation: Observation, snapshot: Snapshot, view: RenderedView) -> int:
+        """Pin a point [3] (m, world), which may be hidden; returns the anchor's id.
+
+        Raises:
+            SagsError: no tissue of the model is near, or there are too many anchors.
+        """
+        if len(self) >= MAX_ANCHORS:
+            raise SagsError(
+                f"there are {MAX_ANCHORS} anchors already, the most there can be; remove some first"
+            )
+        carriers = _carriers(point, snapshot.gaussians)
+        if len(carriers[0]) == 0:
+            place = ", ".join(f"{x:.4f}" for x in point)
+            raise SagsError(f"the model has no tissue within {REACH * 1e3:g} mm of ({place}) m, world")
+        anchor_id = self._next_id
+        row = _row(anchor_id, point, carriers)
+        _look(row, observation, view)
+        self._table = _joined(self._table, row)
+        self._next_id += 1
+        return anchor_id
+
+    def remove(self, anchor_id: int) -> None:
+        """Forget an anchor.
+
+        Raises:
+            SagsError: there is no such anchor.
+        """
+        kept = self._table.ids != anchor_id
+        if kept.all():
+            raise SagsError(f"there is no anchor {anchor_id}; it was removed, or never added")
+        self._table = _selected(self._table, kept)
+
+    def update(self, observation: Observation, snapshot: Snapshot, view: RenderedView) -> None:
+        """Follow the tissue to the next frame.
+
+        An anchor whose Gaussians are all gone at once, as after a restart of the model, is lost for good.
+
+        Args:
+            snapshot: the model at that frame.
+            view: it drawn for the left eye.
+        """
+        self._frames += 1
+        if len(self):
+            _carry(self._table, snapshot.gaussians)
+            _look(self._table, observation, view)
+            self._find(observation)
+
+    def at(self, stamp_ns: int) -> AnchorStates:
+        """All anchors as they are now, as part of the frame captured at `stamp_ns`."""
+        before, self._stamp_ns = self._stamp_ns, stamp_ns
+        passed = 0.0 if before is None else max(0.0, (stamp_ns - before) * 1e-9)
+        table = self._table
+        table.ages[:] += passed
+        table.unseen[:] += passed
+        return AnchorStates(
+            ids=table.ids.copy(),
+            points=table.points.astype(np.float32),
+            pixels=table.pixels.astype(np.float32),
+            visibility=table.visibility.astype(np.float32),
+            confidence=(table.agreement * 0.5 ** (table.unseen / HALF_LIFE)).astype(np.float32),
+            ages=table.ages.astype(np.float32),
+        )
+
+    def _find(self, observation: Observation) -> None:
+        """Search the picture for the patches of visible anchors, in turn; what is found moves its anchor."""
+        table = self._table
+        seen = np.flatnonzero((table.visibility == 1) & np.isfinite(table.depth_offsets))
+        for i in seen[np.argsort(table.searched[seen], kind="stable")][:SEARCHED_PER_FRAME]:
+            table.searched[i] = self._frames
+            radius = int(min(SEARCH_RADIUS + SEARCH_GROWTH * table.unseen[i], MAX_SEARCH_RADIUS))
+            window = _patch(observation, table.pixels[i], PATCH_RADIUS + radius)
+            found = None if window is None else _match(window, table.patches[i])
+            if found is not None:
+                shift, table.agreement[i] = found
+                table.pixels[i] += shift - radius
+                table.points[i] = unproject(observation.camera, table.pixels[i], table.depths[i])
+                table.unseen[i] = 0.0
+
+
+def _carry(table: _Table, gaussians: Gaussians) -> None:
+    """Move each anchor by the mean displacement of its Gaussians since the last snapshot."""
+    order = np.argsort(gaussians.ids, kind="stable")  # nearly sorted already: cheap
+    ids = np.append(gaussians.ids[order], np.iinfo(np.int64).max)
+    places = np.searchsorted(ids, table.carriers)
+    alive = (ids[places] == table.carriers) & (table.weights > 0)
+    rows = np.append(order, 0)[places]
+    table.weights[~alive] = 0
+    share = table.weights.sum(1)
+    lost = share == 0
+    means = gaussians.means[rows].astype(np.float64) if len(gaussians) else table.means
+    displacements = (table.weights[..., None] * (means - table.means)).sum(1)
+    table.points[:] += displacements / np.where(lost, np.nan, share)[:, None]
+    table.means[:] = means
+    table.agreement[lost] = 0
+    thin = np.flatnonzero(~lost & (share < RENEW_BELOW))
+    for i in thin[np.argsort(share[thin])][:RENEWED_PER_FRAME]:
+        _hold(table, i, _carriers(table.points[i], gaussians))
+
+
+def _look(table: _Table, observation: Observation, view: RenderedView) -> None:
+    """Where each anchor is and how much of it is seen; it keeps its distance to the drawn surface."""
+    pixels, depths = project(observation.camera, table.points)
+    table.pixels[:], table.depths[:] = pixels, depths
+    table.visibility[:] = _seen(table.pixels, table.depths, observation.tissue, view.depth)
+    drawn = np.zeros(len(depths))
+    clear = np.flatnonzero(table.visibility == 1)
+    columns, rows = np.rint(table.pixels[clear]).astype(np.intp).T
+    drawn[clear] = view.depth[rows, columns]
+    for i in clear[np.isnan(table.depth_offsets[clear])]:
+        patch = _patch(observation, table.pixels[i], PATCH_RADIUS)
+        if patch is not None and drawn[i] > 0:
+            table.patches[i] = patch
+            table.depth_offsets[i] = drawn[i] - table.depths[i]
+            table.unseen[i] = 0.0
+    error = drawn - table.depth_offsets - table.depths  # NaN: never seen clearly
+    near = (drawn > 0) & (np.abs(error) < DEPTH_GATE * table.depths)
+    table.depths[near] += DEPTH_PULL * error[near]
+    table.points[near] = unproject(observation.camera, table.pixels[near], table.depths[near])
+
+
+def _carriers(point: F64, gaussians: Gaussians) -> tuple[I64, F64, F64]:
+    """Ids [k], weights [k] (sum 1) and means [k, 3] of the nearest Gaussians within `REACH`."""
+    squares = np.square(gaussians.means - point.astype(np.float32)).sum(1)
+    count = min(NEIGHBOURS, len(squares))
+    rows = np.argpartition(squares, count - 1)[:count] if count else np.zeros(0, np.intp)
+    rows = rows[squares[rows] < REACH**2]
+    weights = 1 / np.maximum(np.sqrt(squares[rows].astype(np.float64)), SOFT)
+    return gaussians.ids[rows], weights / weights.sum(), gaussians.means[rows].astype(np.float64)
+
+
+def _hold(table: _Table, i: int, carriers: tuple[I64, F64, F64]) -> None:
+    """Let some Gaussians carry the anchor in row i, if there are any."""
+    count = len(carriers[0])
+    if count:
+        table.carriers[i], table.weights[i] = _NOBODY, 0
+        table.carriers[i, :count], table.weights[i, :count], table.means[i, :count] = carriers
+
+
+def _row(anchor_id: int, point: F64, carriers: tuple[I64, F64, F64]) -> _Table:
+    """The table of one new anchor."""
+    table = _Table(
+        ids=np.array([anchor_id], np.int64),
+        points=point[None].astype(np.float64),
+        carriers=np.full((1, NEIGHBOURS), _NOBODY, np.int64),
+        weights=np.zeros((1, NEIGHBOURS)),
+        means=np.zeros((1, NEIGHBOURS, 3)),
+        pixels=np.full((1, 2), np.nan),
+        depths=np.zeros(1),
+        visibility=np.zeros(1),
+        patches=np.zeros((1, _SIDE, _SIDE), np.uint8),
+        depth_offsets=np.full(1, np.nan),
+        agreement=np.ones(1),
+        unseen=np.zeros(1),
+        searched=np.zeros(1, np.int64),
+        ages=np.zeros(1),
+    )
+    _hold(table, 0, carriers)
+    return table
+
+
+def _joined(table: _Table, more: _Table) -> _Table:
+    names = [field.name for field in fields(_Table)]
+    return _Table(**{name: np.concatenate([getattr(table, name), getattr(more, name)]) for name in names})
+
+
+def _selected(table: _Table, kept: Bool) -> _Table:
+    return replace(table, **{field.name: getattr(table, field.name)[kept] for field in fields(_Table)})
+
+
+def _seen(pixels: F64, depths: F64, tissue: Bool, drawn: F32) -> F64:
+    """Share [A] of the pixels around each anchor that show tissue, none of it in front of the anchor."""
+    height, width = tissue.shape
+    around = np.arange(-SEEN_RADIUS, SEEN_RADIUS + 1)
+    known: Bool = np.asarray(np.isfinite(pixels).all(1))
+    centres = np.rint(np.where(known[:, None], np.clip(pixels, -1e6, 1e6), -1e6)).astype(np.intp)
+    rows = centres[:, 1, None, None] + around[:, None]
+    columns = centres[:, 0, None, None] + around
+    inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
+    places = np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)
+    surface = drawn[places]
+    free = (surface == 0) | (surface > (1 - BEHIND) * depths[:, None, None])
+    return np.asarray(np.mean(inside & tissue[places] & free, axis=(1, 2)), np.float64)
+
+
+def _patch(observation: Observation, pixel: F64, radius: int) -> U8 | None:
+    """The gray picture around a place, to a part of a pixel; None where not all of it is tissue."""
+    height, width = observation.tissue.shape
+    column, row = (round(float(x)) for x in pixel)
+    reach = radius + 1
+    if not (reach <= row < height - reach and reach <= column < width - reach):
+        return None
+    if not observation.tissue[row - reach : row + reach + 1, column - reach : column + reach + 1].all():
+        return None
+    size = 2 * radius + 1
+    return np.asarray(cv2.getRectSubPix(observation.gray, (size, size), (float(pixel[0]), float(pixel[1]))))
+
+
+def _match(window: U8, patch: U8) -> tuple[F64, float] | None:
+    """Where [2] (x, y) in the window the patch begins, to a part of a pixel, and how well it fits; None where
+    it is not found."""
+    scores: F32 = np.asarray(cv2.matchTemplate(window, patch, cv2.TM_CCOEFF_NORMED))
+    row, column = np.unravel_index(int(np.argmax(scores)), scores.shape)
+    best = float(scores[row, column])
+    inside = 0 < row < len(scores) - 1 and 0 < column < len(scores) - 1
+    if not inside or best < FOUND_AGREEMENT:
+        return None
+    x = column + _vertex(scores[row, column - 1 : column + 2])
+    y = row + _vertex(scores[row - 1 : row + 2, column])
+    return np.array([x, y]), min(best, 1.0)
+
+
+def _vertex(values: F32) -> float:
+    """Place of the maximum of the parabola through three values at -1, 0, 1."""
+    before, middle, after = (float(value) for value in values)
+    curvature = before - 2 * middle + after
+    return 0.0 if curvature == 0 else 0.5 * (before - after) / curvature

@@ -1,0 +1,130 @@
+"""What the control operations of consumers take as `args`, checked."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Annotated, Any, TypeVar
+
+import msgspec
+import numpy as np
+
+from sags_node.errors import SagsError
+from sags_node.geometry import is_rotation
+from sags_node.messaging.topics import VIEW_NAME
+from sags_node.types import F64
+
+MAX_VIEW_SIDE = 1920  # px
+MAX_VIEW_PIXELS = 1920 * 1200  # of each eye
+MAX_VIEW_HZ = 60.0
+MAX_DISTANCE = 10.0  # m from the world's origin or the left camera
+
+Row = tuple[float, ...]
+Name = Annotated[str, msgspec.Meta(pattern=f"^{VIEW_NAME.pattern}$")]
+Side = Annotated[int, msgspec.Meta(ge=16, le=MAX_VIEW_SIDE)]
+R = TypeVar("R", bound=msgspec.Struct)
+
+
+class AnchorRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """`add_anchor`: a pixel of the left picture, or a point in the world."""
+
+    u: float | None = None  # px
+    v: float | None = None
+    x: float | None = None  # m
+    y: float | None = None
+    z: float | None = None
+
+    def __post_init__(self) -> None:
+        given = {name for name in self.__struct_fields__ if getattr(self, name) is not None}
+        if given not in ({"u", "v"}, {"x", "y", "z"}):
+            raise ValueError("give either a pixel {u, v} of the left picture or a point {x, y, z} in metres")
+        if not all(math.isfinite(getattr(self, name)) for name in given):
+            raise ValueError(f"{', '.join(sorted(given))} must be finite")
+
+
+class AnchorName(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """`remove_anchor`."""
+
+    id: int
+
+
+class ViewRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """`open_view`: a viewpoint, in the world or as seen from the left camera, which it then follows."""
+
+    name: Name
+    width: Side = 640
+    height: Side = 512
+    T_world_cam: tuple[Row, ...] | None = None  # [4][4] m
+    T_left_cam: tuple[Row, ...] | None = None  # [4][4] m; default: where the left camera is
+    K: tuple[Row, ...] | None = None  # [3][3] px; default: the left camera's, scaled to this size
+    fov: Annotated[float, msgspec.Meta(ge=5, le=150)] | None = None  # degrees across, instead of K
+    rate_hz: Annotated[float, msgspec.Meta(gt=0, le=MAX_VIEW_HZ)] = 10.0
+    depth: bool = False
+    static: bool = False  # draw once
+    stereo: bool = False  # and the right eye, at the rig's baseline
+
+    def __post_init__(self) -> None:
+        if self.width * self.height > MAX_VIEW_PIXELS:
+            raise ValueError(
+                f"{self.width}x{self.height} px is too large; at most {MAX_VIEW_PIXELS} px in all"
+            )
+        if self.T_world_cam is not None and self.T_left_cam is not None:
+            raise ValueError("give T_world_cam or T_left_cam, not both")
+        if self.K is not None and self.fov is not None:
+            raise ValueError("give K or fov, not both")
+        self.pose()
+        self.intrinsics()
+
+    def pose(self) -> F64:
+        """[4, 4] m: `T_world_cam`, or else `T_left_cam`."""
+        rows = self.T_world_cam if self.T_world_cam is not None else self.T_left_cam
+        if rows is None:
+            return np.eye(4)
+        name = "T_left_cam" if self.T_world_cam is None else "T_world_cam"
+        T = _matrix(rows, 4, name)
+        if not is_rotation(T[:3, :3]) or np.abs(T[3] - (0, 0, 0, 1)).max() > 0:
+            raise ValueError(f"{name} must be a rotation and a translation above a last row 0 0 0 1")
+        if np.linalg.norm(T[:3, 3]) > MAX_DISTANCE:
+            raise ValueError(f"{name} is more than {MAX_DISTANCE:g} m away; translations are in metres")
+        return T
+
+    def intrinsics(self) -> F64 | None:
+        """[3, 3] px; None: those of the left camera."""
+        if self.fov is not None:
+            focal = 0.5 * self.width / math.tan(math.radians(0.5 * self.fov))
+            centre = 0.5 * (self.width - 1), 0.5 * (self.height - 1)
+            return np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1]])
+        if self.K is None:
+            return None
+        K = _matrix(self.K, 3, "K")
+        plain = K[0, 0] > 0 and K[1, 1] > 0 and K[0, 1] == K[1, 0] == 0 and tuple(K[2]) == (0, 0, 1)
+        if not plain:
+            raise ValueError("K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in px with positive fx, fy")
+        return K
+
+
+class ViewName(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """`close_view`."""
+
+    name: Name
+
+
+def parse(kind: type[R], args: Mapping[str, Any]) -> R:
+    """The typed request in `args`.
+
+    Raises:
+        SagsError: something is missing, unknown, of the wrong type or out of range.
+    """
+    try:
+        return msgspec.convert(dict(args), kind)
+    except (msgspec.ValidationError, RecursionError) as error:
+        raise SagsError(str(error).replace("$.", "")) from None
+
+
+def _matrix(rows: tuple[Row, ...], size: int, name: str) -> F64:
+    if len(rows) != size or any(len(row) != size for row in rows):
+        raise ValueError(f"{name} must be {size} rows of {size} numbers")
+    matrix = np.array(rows, np.float64)
+    if not np.isfinite(matrix).all():
+        raise ValueError(f"{name} must be finite")
+    return matrix

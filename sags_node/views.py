@@ -1,0 +1,204 @@
+"""Viewpoints that consumers asked for, drawn from the newest snapshot beside the mapping.
+
+Mapping goes first. All views together get `SHARE` of one core, and `LEAST_SHARE` while the mapping misses
+frames; it is split so that each keeps the same part of the rate it asked for. A view that nobody subscribes
+to is not drawn. Used from one thread; only `status` may be read by others.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections import deque
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass, field
+
+from sags_node.engine.interface import Rasterizer
+from sags_node.engine.rasterize import make_rasterizer, to_view
+from sags_node.engine.threads import configure_threads
+from sags_node.errors import SagsError
+from sags_node.geometry import scale_intrinsics
+from sags_node.messaging.requests import ViewRequest
+from sags_node.types import Camera, DrawnView, FrameResult, ViewStatus
+
+MAX_VIEWS = 8
+SHARE = 0.25  # of one core, for all views together
+LEAST_SHARE = 0.05  # while the mapping is behind: less than its own rate varies by
+BEHIND = 0.05  # share of missed frames from which on it is
+HELD_OVER = 5.0  # s over which the held rate is counted
+EARLY = 0.25  # of a period: a view that is nearly due is drawn rather than left to the next frame
+LEARNING = 0.2  # share of a new measurement in a running mean of costs
+FORGETTING = 0.03  # the same for missed frames: about a second
+
+Clock = Callable[[], float]
+
+
+@dataclass(slots=True)
+class _View:
+    request: ViewRequest
+    due: float  # when it is to be drawn next
+    cost: float = 0.0  # s of processor time for one drawing; 0: never drawn
+    drawn_at: deque[float] = field(default_factory=deque)
+    failure: str = ""
+
+    @property
+    def finished(self) -> bool:
+        return self.request.static and self.cost > 0
+
+
+def prepare_thread() -> None:
+    """Let the calling thread draw on one core, and give way to all others at once."""
+    configure_threads(1)
+    os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+
+
+class Views:
+    """The open views.
+
+    Attributes:
+        status: how each is served; replaced as a whole whenever it changes.
+    """
+
+    def __init__(
+        self, backend: str, clock: Clock = time.monotonic, processor_clock: Clock = time.thread_time
+    ) -> None:
+        self.status: Mapping[str, ViewStatus] = {}
+        self._backend = backend
+        self._clock = clock
+        self._processor_clock = processor_clock
+        self._views: dict[str, _View] = {}
+        self._rasterizers: dict[tuple[int, int], Rasterizer] = {}
+        self._watched: Collection[str] = ()
+        self._missed = 0.0  # running share of the frames
+
+    def open(self, request: ViewRequest, scene: FrameResult | None) -> DrawnView | None:
+        """Open a view, or change one of that name; returns its first picture where there is a scene.
+
+        Raises:
+            SagsError: there are too many views, or it cannot be drawn.
+        """
+        known = self._views.get(request.name)
+        if known is None and len(self._views) >= MAX_VIEWS:
+            names = ", ".join(sorted(self._views))
+            raise SagsError(f"{MAX_VIEWS} views are open, the most there can be ({names}); close one first")
+        view = _View(request, self._clock()) if known is None else known
+        view.request = request
+        self._views[request.name] = view
+        self._watched = {*self._watched, request.name}  # until it is known better
+        drawn = None
+        if scene is not None and (known is None or request.static):
+            try:
+                drawn = self._draw(view, scene)
+            except SagsError:
+                self.close(request.name)
+                raise
+        self._note()
+        return drawn
+
+    def close(self, name: str) -> None:
+        """Raises:
+        SagsError: no view of that name is open.
+        """
+        if self._views.pop(name, None) is None:
+            raise SagsError(f"no view '{name}' is open; open are: {', '.join(sorted(self._views)) or 'none'}")
+        sizes = {(view.request.width, view.request.height) for view in self._views.values()}
+        self._rasterizers = {size: kept for size, kept in self._rasterizers.items() if size in sizes}
+        self._note()
+
+    def draw_due(
+        self, scene: FrameResult, watched: Collection[str], missed: bool
+    ) -> Iterator[tuple[str, DrawnView]]:
+        """Draw what is due of a new scene, longest overdue first.
+
+        Args:
+            watched: views that somebody subscribes to.
+            missed: the mapping left out a frame before this one.
+        """
+        self._watched = watched
+        self._missed += FORGETTING * (missed - self._missed)
+        for name, view in sorted(self._views.items(), key=lambda item: item[1].due):
+            if view.finished or (view.cost > 0 and name not in watched):
+                continue
+            now = self._clock()
+            period = 1 / self._granted(view)
+            if now < view.due - EARLY * period:
+                continue
+            view.due = max(view.due + period, now)
+            try:
+                yield name, self._draw(view, scene)
+            except SagsError as error:
+                view.failure = str(error)
+        self._note()
+
+    def _draw(self, view: _View, scene: FrameResult) -> DrawnView:
+        request = view.request
+        started = self._processor_clock()
+        size = request.width, request.height
+        if size not in self._rasterizers:
+            self._rasterizers[size] = make_rasterizer(self._backend, *size)
+        snapshot = scene.snapshot
+        camera = view_camera(request, snapshot.camera)
+        eyes = {"": camera}
+        if request.stereo:
+            eyes = {"left": camera, "right": camera.moved_right(scene.pair.baseline)}
+        planes = self._rasterizers[size].forward(snapshot.gaussians, list(eyes.values()))
+        pictures = {
+            eye: to_view(planes[i], eyes[eye], snapshot.frame_id, snapshot.t_capture_ns)
+            for i, eye in enumerate(eyes)
+        }
+        spent = self._processor_clock() - started
+        view.cost = spent if view.cost == 0 else view.cost + LEARNING * (spent - view.cost)
+        view.failure = ""
+        view.drawn_at.append(self._clock())
+        return DrawnView(pictures, scene.pair.baseline, request.depth, request.static, scene.epoch)
+
+    # ---- rates -----------------------------------------------------------------------------------------
+
+    def _granted(self, view: _View) -> float:
+        """Hz: the part of the rate asked for that all views can keep."""
+        served = {id(view): view, **{id(v): v for n, v in self._views.items() if n in self._watched}}
+        demand = sum(one.cost * one.request.rate_hz for one in served.values() if not one.request.static)
+        return view.request.rate_hz * min(1.0, self._share / max(demand, 1e-9))
+
+    @property
+    def _behind(self) -> bool:
+        return self._missed > BEHIND
+
+    @property
+    def _share(self) -> float:
+        return LEAST_SHARE if self._behind else SHARE
+
+    def _note(self) -> None:
+        self.status = {name: self._status(name, view) for name, view in self._views.items()}
+
+    def _status(self, name: str, view: _View) -> ViewStatus:
+        now = self._clock()
+        while view.drawn_at and view.drawn_at[0] < now - HELD_OVER:
+            view.drawn_at.popleft()
+        span = now - view.drawn_at[0] if view.drawn_at else 0.0
+        held = (len(view.drawn_at) - 1) / span if span > 0 else 0.0
+        asked = 0.0 if view.request.static else view.request.rate_hz
+        granted = 0.0 if view.request.static else self._granted(view)
+        return ViewStatus(asked, granted, held, view.cost * 1e3, self._limit(name, view, granted))
+
+    def _limit(self, name: str, view: _View, granted: float) -> str:
+        live = not view.request.static
+        short = live and granted < 0.95 * view.request.rate_hz
+        reasons = (
+            (bool(view.failure), view.failure),
+            (view.cost == 0, "no frame has come yet"),
+            (live and name not in self._watched, "nobody subscribes"),
+            (short and self._behind, "the mapping misses frames and goes first"),
+            (short, f"all views together get {SHARE:g} of a core"),
+        )
+        return next((why for applies, why in reasons if applies), "")
+
+
+def view_camera(request: ViewRequest, left: Camera) -> Camera:
+    """The camera of a view when the left camera is `left`."""
+    size = request.width, request.height
+    K = request.intrinsics()
+    if K is None:
+        K = scale_intrinsics(left.K, (left.width, left.height), size)
+    pose = request.pose()
+    return Camera(*size, K, pose if request.T_world_cam is not None else left.T_world_cam @ pose)

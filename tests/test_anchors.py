@@ -1,0 +1,266 @@
+"""Points pinned to tissue: known motion, hidden tissue, removed Gaussians, and the phantom's exact points."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from sags_node.errors import SagsError
+from sags_node.geometry import project
+from sags_node.mapping import anchors as module
+from sags_node.mapping.anchors import Anchors
+from sags_node.mapping.budget import StepBudget
+from sags_node.pipeline import Pipeline
+from sags_node.session import open_session
+from sags_node.sources.source import open_source
+from sags_node.types import AnchorStates, Camera, Gaussians, Observation, RenderedView, Snapshot
+
+WIDTH, HEIGHT, FOCAL, DEPTH = 128, 96, 100.0, 0.08
+CENTRE = (WIDTH - 1) / 2, (HEIGHT - 1) / 2
+PERIOD_NS = 100_000_000
+
+Scene = tuple[Observation, Snapshot, RenderedView]
+
+
+def texture(shift: tuple[int, int] = (0, 0)) -> np.ndarray:
+    """Smooth random grey values, moved by (x, y) px."""
+    noise = np.random.default_rng(3).uniform(0, 255, (HEIGHT + 40, WIDTH + 40)).astype(np.float32)
+    smooth = cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 2), None, 20, 230, cv2.NORM_MINMAX)
+    x, y = 20 - shift[0], 20 - shift[1]
+    return smooth[y : y + HEIGHT, x : x + WIDTH].astype(np.uint8)
+
+
+def plane_means() -> np.ndarray:
+    """Gaussians on a plane, one for every second pixel."""
+    u, v = np.meshgrid(np.arange(0, WIDTH, 2.0), np.arange(0, HEIGHT, 2.0))
+    x, y = (u.ravel() - CENTRE[0]) / FOCAL * DEPTH, (v.ravel() - CENTRE[1]) / FOCAL * DEPTH
+    return np.stack([x, y, np.full(x.size, DEPTH)], 1).astype(np.float32)
+
+
+def scene(frame: int = 0, gray: np.ndarray | None = None, drawn: float = DEPTH) -> Scene:
+    """The plane, all of it tissue."""
+    camera = Camera(
+        WIDTH, HEIGHT, np.array([[FOCAL, 0, CENTRE[0]], [0, FOCAL, CENTRE[1]], [0, 0, 1]]), np.eye(4)
+    )
+    shape, stamp, means = (HEIGHT, WIDTH), frame * PERIOD_NS, plane_means()
+    count = len(means)
+    gaussians = Gaussians(
+        means,
+        np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
+        np.full((count, 3), 1e-3, np.float32),
+        np.ones(count, np.float32),
+        np.ones((count, 3), np.float32),
+        np.arange(count),
+    )
+    depth = np.full(shape, drawn, np.float32)
+    image = np.zeros((*shape, 3), np.float32)
+    observation = Observation(
+        frame, stamp, camera, image, texture() if gray is None else gray, np.ones(shape, bool), depth, depth
+    )
+    snapshot = Snapshot(frame, stamp, 0, gaussians, np.zeros_like(means), camera, 0.0)
+    return observation, snapshot, RenderedView(frame, stamp, camera, image, depth, np.ones_like(depth))
+
+
+def moved(one: Scene, by: np.ndarray, kept: np.ndarray | None = None) -> Scene:
+    """The scene with its Gaussians moved by [N, 3] or [3] m, and only some of them."""
+    observation, snapshot, view = one
+    old = snapshot.gaussians
+    rows = np.arange(len(old)) if kept is None else np.flatnonzero(kept)
+    arrays = {name: getattr(old, name)[rows] for name in ("quats", "scales", "opacities", "colors", "ids")}
+    means = (old.means + by).astype(np.float32)[rows]
+    return observation, replace(snapshot, gaussians=replace(old, means=means, **arrays)), view
+
+
+def flat(frame: int) -> Scene:
+    """A picture in which nothing can be found again: only the Gaussians tell where the tissue went."""
+    return scene(frame, np.full((HEIGHT, WIDTH), 90, np.uint8))
+
+
+def only(states: AnchorStates) -> tuple[np.ndarray, np.ndarray, float, float]:
+    """Point, pixel, visibility and confidence of the only anchor."""
+    assert len(states) == 1
+    return states.points[0], states.pixels[0], float(states.visibility[0]), float(states.confidence[0])
+
+
+def test_an_anchor_moves_with_the_gaussians_around_it() -> None:
+    anchors = Anchors()
+    assert anchors.add_pixel(40.3, 50.6, *flat(0)) == 1
+    start, pixel, visibility, _ = only(anchors.at(0))
+    assert (
+        np.allclose(pixel, [40.3, 50.6], atol=1e-3) and visibility == 1 and start[2] == pytest.approx(DEPTH)
+    )
+    for i in range(1, 4):
+        anchors.update(*moved(flat(i), np.array([i * 4e-4, -i * 8e-4, 0])))
+    point, pixel, _, _ = only(anchors.at(3 * PERIOD_NS))
+    assert np.allclose(point - start, [12e-4, -24e-4, 0], atol=1e-6)
+    assert np.allclose(pixel, [40.3 + 1.5, 50.6 - 3], atol=1e-2)
+
+
+def test_gaussians_far_away_do_not_move_it() -> None:
+    anchors = Anchors()
+    anchors.add_pixel(30, 50, *flat(0))
+    start = only(anchors.at(0))[0]
+    one = flat(1)
+    anchors.update(*moved(one, np.where(one[1].gaussians.means[:, :1] > 0, 0.01, 0.0)))
+    assert np.allclose(only(anchors.at(PERIOD_NS))[0], start, atol=1e-7)
+
+
+def test_what_the_picture_shows_corrects_what_the_gaussians_missed() -> None:
+    """The tissue moves by whole pixels, the Gaussians stay: the anchor is found again on its texture."""
+    anchors = Anchors()
+    anchors.add_pixel(60, 45, *scene(0))
+    for i, shift in enumerate([(2, -1), (4, -3), (7, -3)]):
+        anchors.update(*scene(i + 1, texture(shift)))
+    point, pixel, visibility, confidence = only(anchors.at(3 * PERIOD_NS))
+    assert np.allclose(pixel, [67, 42], atol=0.1)
+    assert np.allclose(point[:2], (np.array([67, 42]) - CENTRE) / FOCAL * DEPTH, atol=1e-4)
+    assert visibility == 1 and confidence > 0.8
+
+
+def test_it_keeps_its_distance_to_the_drawn_surface() -> None:
+    anchors = Anchors()
+    anchors.add_point(np.array([0, 0, DEPTH + 1e-3]), *flat(0))
+    for i in range(1, 60):
+        observation, snapshot, view = flat(i)
+        anchors.update(observation, snapshot, replace(view, depth=view.depth + np.float32(5e-4)))
+    assert only(anchors.at(0))[0][2] == pytest.approx(DEPTH + 1.5e-3, abs=2e-5)
+
+
+def test_removed_gaussians_are_replaced_by_their_neighbours() -> None:
+    anchors = Anchors()
+    anchors.add_pixel(60, 45, *flat(0))
+    start = only(anchors.at(0))[0]
+    rng = np.random.default_rng(0)
+    kept = np.ones(len(plane_means()), bool)
+    for i in range(1, 12):  # of every Gaussian's kind less than one in three is left at the end
+        kept &= rng.uniform(size=len(kept)) > 0.1
+        anchors.update(*moved(flat(i), np.array([i * 1e-4, 0, 0]), kept))
+    assert np.allclose(only(anchors.at(PERIOD_NS))[0] - start, [11e-4, 0, 0], atol=1e-6)
+
+
+def test_after_a_restart_of_the_model_it_is_lost_for_good_and_says_so() -> None:
+    anchors = Anchors()
+    anchors.add_pixel(60, 45, *flat(0))
+    observation, snapshot, view = flat(1)
+    fresh = replace(snapshot.gaussians, ids=snapshot.gaussians.ids + 100_000)
+    for gaussians in (fresh, snapshot.gaussians):
+        anchors.update(observation, replace(snapshot, gaussians=gaussians), view)
+        point, pixel, visibility, confidence = only(anchors.at(PERIOD_NS))
+        assert np.isnan(point).all() and np.isnan(pixel).all() and visibility == confidence == 0
+    anchors.remove(1)
+    assert len(anchors.at(PERIOD_NS)) == 0
+
+
+def test_visibility_tells_what_hides_it_and_confidence_falls_meanwhile() -> None:
+    anchors = Anchors()
+    anchors.add_pixel(60, 45, *scene(0))
+    assert only(anchors.at(0))[2:] == (1.0, 1.0)
+    observation, snapshot, view = scene(1)
+    observation.tissue[:, 60:] = False  # an instrument over the right half of the 5 x 5 px around it
+    anchors.update(observation, snapshot, view)
+    assert only(anchors.at(0))[2] == pytest.approx(0.4)
+    anchors.update(*scene(2, drawn=0.9 * DEPTH))  # other tissue in front
+    assert only(anchors.at(0))[2] == 0
+    observation, snapshot, view = scene(3)
+    observation.tissue[:] = False
+    seconds = 3
+    for i in range(1, seconds + 1):
+        anchors.update(observation, snapshot, view)
+        states = anchors.at(i * 10 * PERIOD_NS)
+    assert states.confidence[0] == pytest.approx(0.5 ** (seconds / module.HALF_LIFE))
+    assert states.ages[0] == pytest.approx(seconds)
+    anchors.update(*scene(4))
+    assert only(anchors.at(seconds * 10 * PERIOD_NS))[2:] == (1.0, pytest.approx(1.0, abs=0.01))
+
+
+def test_what_leaves_the_picture_is_followed_there() -> None:
+    anchors = Anchors()
+    anchors.add_pixel(4, 45, *flat(0))
+    anchors.update(*moved(flat(1), np.array([-8e-3, 0, 0])))
+    _, pixel, visibility, _ = only(anchors.at(0))
+    assert pixel[0] == pytest.approx(-6, abs=0.01) and visibility == 0
+
+
+def test_what_cannot_be_pinned_is_a_clear_error() -> None:
+    anchors = Anchors()
+    observation, snapshot, view = scene()
+    observation.tissue[:, :20] = False
+    observation.depth[30:40] = view.depth[30:40] = 0
+    for pixel, message in (
+        ((-0.6, 5), "outside the left picture of 128x96"), ((50, 95.5), "outside"),
+        ((10, 50), "instrument"), ((50, 35), "no depth"),
+    ):  # fmt: skip
+        with pytest.raises(SagsError, match=message):
+            anchors.add_pixel(*pixel, observation, snapshot, view)
+    with pytest.raises(SagsError, match="no tissue within 5 mm"):
+        anchors.add_point(np.array([0, 0, DEPTH + 0.006]), observation, snapshot, view)
+    with pytest.raises(SagsError, match="no anchor 1"):
+        anchors.remove(1)
+    assert len(anchors) == 0
+
+
+def test_ids_are_never_used_again_and_their_number_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "MAX_ANCHORS", 3)
+    anchors = Anchors()
+    assert [anchors.add_pixel(50, 50, *scene()) for _ in range(3)] == [1, 2, 3]
+    with pytest.raises(SagsError, match="3 anchors already"):
+        anchors.add_pixel(50, 50, *scene())
+    anchors.remove(3)
+    assert anchors.add_pixel(50, 50, *scene()) == 4
+    assert anchors.at(0).ids.tolist() == [1, 2, 4]
+
+
+# ---- on the phantom --------------------------------------------------------------------------------------
+
+
+def test_exact_surface_points_of_the_phantom_are_followed(phantom_session: Path) -> None:
+    """Pinned in the first frame at their true places; nothing about the truth is used after that."""
+    session = open_session(phantom_session, ["source.pace:=step"])
+    pipeline, budget = Pipeline(session.config, session.rig), StepBudget(2)
+    millimetres, pixels, truly_visible, shown = [], [], [], []
+    with open_source(session.config.source) as frames:
+        for frame in frames:
+            result = pipeline.process(frame, budget)
+            assert frame.reference is not None
+            truth, visible = frame.reference.points, frame.reference.points_visible
+            assert truth is not None and visible is not None
+            if frame.frame_id == 0:
+                chosen = np.flatnonzero(visible)
+                for point in truth[chosen]:
+                    pipeline.anchors.add_point(
+                        point, result.observation, result.snapshot, result.views["left"]
+                    )
+                continue
+            states, truth = result.anchors, truth[chosen]
+            assert len(states) == len(chosen)
+            millimetres.append(np.linalg.norm(states.points - truth, axis=1) * 1e3)
+            pixels.append(np.linalg.norm(states.pixels - project(result.pair.camera, truth)[0], axis=1))
+            truly_visible.append(visible[chosen])
+            shown.append(states.visibility > 0.5)
+    mm, px, seen = np.array(millimetres), np.array(pixels), np.array(truly_visible)
+    always = seen.all(0)
+    assert always.sum() > 100 and (~seen).sum() > 200
+    assert np.median(px[:, always]) < 0.4 and np.median(mm[:, always]) < 0.5
+    assert np.percentile(px[:, always], 90) < 2 and np.percentile(mm[:, always], 90) < 2
+    assert np.median(mm[~seen]) < 3
+    assert np.mean(np.array(shown) == seen) > 0.9
+
+
+def test_skipped_and_repeated_frames_keep_the_anchors(phantom_session: Path) -> None:
+    session = open_session(phantom_session, ["source.pace:=step"])
+    pipeline, budget = Pipeline(session.config, session.rig), StepBudget(1)
+    with session.source as frames:
+        first, *_, later = (frame for frame, _ in zip(frames, range(4), strict=False))
+    mapped = pipeline.process(first, budget)
+    pipeline.anchors.add_pixel(160, 128, mapped.observation, mapped.snapshot, mapped.views["left"])
+    again = pipeline.process(replace(first, frame_id=1, t_capture_ns=first.t_capture_ns + PERIOD_NS), budget)
+    assert again.skipped.keys() == {"frame"} and len(again.anchors) == 1 and len(mapped.anchors) == 0
+    jumped = pipeline.process(later, budget)
+    assert np.isfinite(jumped.anchors.points).all()
+    pipeline.reset()
+    fresh = pipeline.process(later, budget)
+    assert fresh.epoch > jumped.epoch and np.isnan(fresh.anchors.points).all()

@@ -1,0 +1,345 @@
+"""Views on request, anchors and pausing, from outside: a real node process and real sockets."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import independent_client as client
+import msgpack
+import numpy as np
+import pytest
+import zmq
+from synthetic import at_frame, plane_result
+from test_node import START_SECONDS, RunningNode
+
+from sags_node.engine.rasterize import rasterize
+from sags_node.errors import SagsError
+from sags_node.messaging.control import ControlClient
+from sags_node.messaging.requests import AnchorRequest, ViewRequest, parse
+from sags_node.types import Camera, Gaussians
+from sags_node.views import LEAST_SHARE, MAX_VIEWS, SHARE, Views, view_camera
+
+ANCHOR_FIELDS = ["x", "y", "z", "id", "u", "v", "visibility", "age", "confidence"]
+CLOSE_UP = [[0.995, 0, 0.1, -0.003], [0, 1, 0, 0.002], [-0.1, 0, 0.995, 0.012], [0, 0, 0, 1]]
+
+
+# ---- the running node ------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def node(phantom_session: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningNode]:
+    # No frame is left out, so what is shown does not depend on how busy the machine is.
+    running = RunningNode(phantom_session, tmp_path_factory.mktemp("node"), "source.pace:=fast")
+    yield running
+    assert running.stop() == 0, running.said()
+
+
+@pytest.fixture
+def control(node: RunningNode) -> Iterator[ControlClient]:
+    with ControlClient(node.connection["control"]) as asker:
+        deadline = time.monotonic() + START_SECONDS
+        while asker.request("get_status")["gaussians"] == 0:
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        yield asker
+
+
+def collect(node: RunningNode, names: list[str], count: int = 1, timeout: float = 20) -> dict[str, list[Any]]:
+    got = client.collect(node.data, [f"sags/{name}" for name in names], count, timeout)
+    return {name: got[f"sags/{name}"] for name in names}
+
+
+def anchor_rows(message: client.Received) -> dict[int, np.ndarray]:
+    """Rows by anchor id."""
+    client.check_meta(message, "sensor_msgs/msg/PointCloud2")
+    assert message.meta["encoding"].split(",") == ANCHOR_FIELDS
+    rows = message.array()
+    ids = rows.view(np.uint32)[:, ANCHOR_FIELDS.index("id")]
+    return {int(one): row for one, row in zip(ids, rows, strict=True)}
+
+
+def test_anchors_are_added_followed_and_removed(node: RunningNode, control: ControlClient) -> None:
+    by_pixel = control.request("add_anchor", {"u": 150.5, "v": 120})["id"]
+    point = anchor_rows(collect(node, ["anchors"])["anchors"][0])[by_pixel][:3]
+    by_point = control.request("add_anchor", {axis: float(x) for axis, x in zip("xyz", point, strict=True)})[
+        "id"
+    ]
+    assert by_point > by_pixel
+    messages = collect(node, ["anchors"], count=8)["anchors"]
+    assert client.check_sequence(messages) == 0
+    tracks = np.array([anchor_rows(message)[by_pixel] for message in messages])
+    assert np.isfinite(tracks[:, [0, 1, 2, 4, 5, 6, 7, 8]]).all()
+    assert (np.diff(tracks[:, 7]) > 0).all(), "age grows"
+    assert 0.01 < np.ptp(tracks[:, 4:6], axis=0).max() < 40, "it moves with the tissue, not away"
+    assert tracks[:, 6].mean() > 0.5 and tracks[:, 8].min() > 0.3
+    assert control.request("remove_anchor", {"id": by_pixel}) == {}
+    left = anchor_rows(collect(node, ["anchors"], count=3)["anchors"][-1])
+    assert by_pixel not in left and by_point in left
+    with pytest.raises(SagsError, match=f"no anchor {by_pixel}"):
+        control.request("remove_anchor", {"id": by_pixel})
+    control.request("remove_anchor", {"id": by_point})
+
+
+def test_a_model_that_starts_anew_loses_its_anchors_visibly(
+    node: RunningNode, control: ControlClient
+) -> None:
+    anchor = control.request("add_anchor", {"u": 150, "v": 120})["id"]
+    before = collect(node, ["anchors"], count=2)["anchors"][-1]
+    control.request("reset_model")
+    deadline = time.monotonic() + 10
+    while (after := collect(node, ["anchors"])["anchors"][0]).meta["epoch"] <= before.meta["epoch"]:
+        assert time.monotonic() < deadline
+    row = anchor_rows(after)[anchor]
+    assert np.isnan(row[[0, 1, 2, 4, 5]]).all() and row[6] == row[8] == 0
+    control.request("remove_anchor", {"id": anchor})
+
+
+def test_a_view_is_the_published_model_drawn_from_there(node: RunningNode, control: ControlClient) -> None:
+    opened = control.request(
+        "open_view",
+        {"name": "close", "width": 240, "height": 200, "fov": 50, "T_world_cam": CLOSE_UP, "depth": True,
+         "rate_hz": 30},
+    )  # fmt: skip
+    assert opened["asked_hz"] == 30 and opened["draw_ms"] > 0
+    names = ["view/close/image", "view/close/depth", "view/close/camera_info"]
+    assert set(opened["topics"]) == set(names)
+    got = collect(node, [*names, "splats"], count=12)
+    splats = {message.meta["stamp_ns"]: message for message in got["splats"]}
+    depths = {message.meta["stamp_ns"]: message for message in got["view/close/depth"]}
+    both = [
+        m for m in got["view/close/image"] if m.meta["stamp_ns"] in splats and m.meta["stamp_ns"] in depths
+    ]
+    assert both, "no view of a frame whose splats came"
+    stamp = both[-1].meta["stamp_ns"]
+    info = client.camera_info(got["view/close/camera_info"][-1])
+    focal = 120 / np.tan(np.radians(25))
+    assert np.allclose(info["K"], [[focal, 0, 119.5], [0, focal, 99.5], [0, 0, 1]])
+    assert (info["width"], info["height"], info["P"][0, 3]) == (240, 200, 0)
+
+    columns = client.check_splats(splats[stamp])
+
+    def stack(*keys: str) -> np.ndarray:
+        return np.stack([columns[key] for key in keys], 1)
+
+    gaussians = Gaussians(
+        stack("x", "y", "z"), stack("rot_w", "rot_x", "rot_y", "rot_z"),
+        stack("scale_0", "scale_1", "scale_2"), columns["opacity"].copy(),
+        client.splat_colors(columns).astype(np.float32), columns["id"].astype(np.int64),
+    )  # fmt: skip
+    expected = rasterize(gaussians, Camera(240, 200, info["K"], np.array(CLOSE_UP)))
+    shown = client.check_image(both[-1], "rgba8", 240, 200).astype(float)
+    solid = expected.alpha > 0.5
+    assert solid.mean() > 0.9
+    assert np.abs(shown[..., :3] / 255 - expected.rgb)[solid].max() < 2 / 255
+    assert np.abs(shown[..., 3] / 255 - expected.alpha).max() < 2 / 255
+    depth = client.check_image(depths[stamp], "32FC1", 240, 200)
+    assert np.allclose(depth[solid], expected.depth[solid], atol=2e-5)
+    assert np.isnan(depth[expected.depth == 0]).all()
+
+    status = control.request("get_status")["views"]["close"]
+    assert status["held_hz"] > 0 and status["draw_ms"] > 0
+    control.request("close_view", {"name": "close"})
+    assert collect(node, ["view/close/image"], timeout=0.5)["view/close/image"] == []
+    assert "close" not in control.request("get_status")["views"]
+    with pytest.raises(SagsError, match="no view 'close' is open"):
+        control.request("close_view", {"name": "close"})
+
+
+def test_a_stereo_pair_follows_the_camera_at_the_rigs_baseline(
+    node: RunningNode, control: ControlClient
+) -> None:
+    """Opened without a pose and at the node's own size, its eyes show what the node's renders show."""
+    opened = control.request("open_view", {"name": "eyes", "stereo": True, "width": 320, "height": 256})
+    names = [f"view/eyes/{eye}/{kind}" for eye in ("left", "right") for kind in ("image", "camera_info")]
+    assert set(opened["topics"]) == set(names)
+    got = collect(node, [*names, "left/render/image", "right/render/image", "right/camera_info"], count=10)
+    for eye in ("left", "right"):
+        own = {message.meta["stamp_ns"]: message for message in got[f"{eye}/render/image"]}
+        pairs = [
+            (m, own[m.meta["stamp_ns"]]) for m in got[f"view/eyes/{eye}/image"] if m.meta["stamp_ns"] in own
+        ]
+        assert pairs
+        view, render = (client.check_image(m, "rgba8", 320, 256).astype(float) for m in pairs[-1])
+        assert np.mean(np.abs(view - render)) < 1
+    P = client.camera_info(got["view/eyes/right/camera_info"][-1])["P"]
+    assert np.allclose(P, client.camera_info(got["right/camera_info"][-1])["P"])
+    control.request("close_view", {"name": "eyes"})
+
+
+def test_a_static_view_is_sent_again_to_who_comes_later(node: RunningNode, control: ControlClient) -> None:
+    opened = control.request("open_view", {"name": "still", "static": True, "width": 64, "height": 48})
+    assert (opened["asked_hz"], opened["limited_by"]) == (0, "")
+    first, again = (collect(node, ["view/still/image"])["view/still/image"][0] for _ in range(2))
+    assert first.meta["stamp_ns"] == again.meta["stamp_ns"] and first.parts == again.parts
+    assert collect(node, ["view/still/image"], count=2, timeout=0.5)["view/still/image"][1:] == []
+    control.request("close_view", {"name": "still"})
+    assert collect(node, ["view/still/image"], timeout=0.5)["view/still/image"] == []
+
+
+def test_what_is_wrong_with_a_request_is_said(node: RunningNode, control: ControlClient) -> None:
+    outside = {"x": 0.0, "y": 0.0, "z": 3.0}
+    for op, args, message in (
+        ("add_anchor", {}, "either a pixel"), ("add_anchor", {"u": 1}, "either a pixel"),
+        ("add_anchor", {"u": 1, "v": 2, "x": 3}, "either a pixel"),
+        ("add_anchor", {"u": "1", "v": 2}, "`str`"),
+        ("add_anchor", {"u": float("nan"), "v": 2}, "finite"), ("add_anchor", {"u": 900, "v": 2}, "outside"),
+        ("add_anchor", outside, "no tissue within"), ("remove_anchor", {}, "missing required field `id`"),
+        ("remove_anchor", {"id": "all"}, "`int`"), ("open_view", {}, "missing required field `name`"),
+        ("open_view", {"name": "a/b"}, "name"), ("open_view", {"name": "a", "colour": 1}, "unknown field"),
+        ("open_view", {"name": "a", "width": 4000}, "1920"), ("close_view", {"name": "a"}, "open are: none"),
+    ):  # fmt: skip
+        with pytest.raises(SagsError, match=message):
+            control.request(op, args)
+    assert control.request("get_status")["views"] == {}
+
+
+def test_paused_it_says_so_sends_nothing_and_goes_on_with_what_is_new(
+    node: RunningNode, control: ControlClient
+) -> None:
+    context = zmq.Context()
+    socket = context.socket(zmq.SUB)
+    socket.setsockopt_string(zmq.SUBSCRIBE, "sags/left/render/depth")
+    socket.connect(node.data)
+    try:
+        assert socket.poll(10_000)
+        assert control.request("pause") == {"paused": True}
+        assert control.request("get_status")["state"] == "paused"
+        newest = None
+        while socket.poll(300):  # the last ones that were on their way
+            newest = msgpack.unpackb(socket.recv_multipart()[1])
+        assert not socket.poll(500)
+        assert control.request("get_status")["rate_hz"] == 0
+        assert control.request("resume") == {"paused": False}
+        assert socket.poll(5_000)
+        meta = msgpack.unpackb(socket.recv_multipart()[1])
+        assert newest is None or (meta["seq"], meta["frame_id"]) == (
+            newest["seq"] + 1,
+            newest["frame_id"] + 1,
+        )
+    finally:
+        context.destroy(linger=0)
+    deadline = time.monotonic() + 5
+    while control.request("get_status")["state"] != "running":
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+# ---- requests --------------------------------------------------------------------------------------------
+
+
+def test_wrong_poses_and_cameras_are_refused() -> None:
+    identity, mirrored = np.eye(4).tolist(), np.diag([1.0, 1, -1, 1]).tolist()
+    far = (np.eye(4) + np.eye(4, k=3) * 25).tolist()
+    skewed = [[100, 2, 0], [0, 100, 0], [0, 0, 1]]
+    for args, message in (
+        ({"T_world_cam": identity, "T_left_cam": identity}, "not both"),
+        ({"K": skewed, "fov": 50}, "not both"),
+        ({"T_world_cam": mirrored}, "rotation"), ({"T_left_cam": far}, "in metres"), ({"K": skewed}, "fx"),
+        ({"T_left_cam": identity[:3]}, "4 rows of 4"), ({"K": [[float("nan")] * 3] * 3}, "finite"),
+        ({"fov": 170}, "150"), ({"rate_hz": 0}, "> 0"), ({"width": 1920, "height": 1920}, "too large"),
+    ):  # fmt: skip
+        with pytest.raises(SagsError, match=message):
+            parse(ViewRequest, {"name": "a", **args})
+    assert parse(AnchorRequest, {"u": 3, "v": 4}).u == 3
+
+
+def test_a_relative_view_moves_with_the_left_camera() -> None:
+    left = plane_result().snapshot.camera
+    ahead = np.eye(4)
+    ahead[:3, 3] = [0.001, 0, 0.01]
+    camera = view_camera(parse(ViewRequest, {"name": "a", "T_left_cam": ahead.tolist()}), left)
+    assert np.allclose(camera.T_world_cam, left.T_world_cam @ ahead)
+    assert camera.K[0, 0] == pytest.approx(left.K[0, 0] * 640 / left.width)
+
+
+# ---- sharing the machine ---------------------------------------------------------------------------------
+
+
+class Clocks:
+    """Wall time set by the test; every drawing costs `cost` s of processor time."""
+
+    def __init__(self, cost: float) -> None:
+        self.now, self.cost, self._calls = 0.0, cost, 0
+
+    def wall(self) -> float:
+        return self.now
+
+    def processor(self) -> float:
+        self._calls += 1
+        return self.cost * (self._calls // 2)
+
+
+def run(views: Views, clocks: Clocks, seconds: float, watched: set[str], missed: bool = False) -> list[str]:
+    """Names drawn while scenes come at 30 Hz."""
+    drawn, plane = [], plane_result()
+    for i in range(round(30 * seconds)):
+        clocks.now += 1 / 30
+        scene = at_frame(plane, i, i)
+        drawn += [name for name, _ in views.draw_due(scene, watched, missed)]
+    return drawn
+
+
+def opened(cost: float, **rates: float) -> tuple[Views, Clocks]:
+    clocks = Clocks(cost)
+    views = Views("numba", clocks.wall, clocks.processor)
+    for name, rate in rates.items():
+        request = parse(ViewRequest, {"name": name, "width": 32, "height": 32, "rate_hz": rate})
+        assert views.open(request, plane_result()) is not None
+    return views, clocks
+
+
+def test_each_view_keeps_its_rate_while_there_is_time() -> None:
+    views, clocks = opened(0.005, a=10, b=4)
+    drawn = run(views, clocks, 10, {"a", "b"})
+    assert drawn.count("a") == pytest.approx(100, abs=3) and drawn.count("b") == pytest.approx(40, abs=2)
+    status = views.status["a"]
+    assert status.held_hz == pytest.approx(10, rel=0.05) and status.limited_by == ""
+
+
+def test_too_much_is_shared_in_proportion_and_said() -> None:
+    views, clocks = opened(0.05, a=10, b=5)  # would take three quarters of a core
+    drawn = run(views, clocks, 20, {"a", "b"})
+    assert 0.05 * len(drawn) <= 20 * SHARE * 1.1
+    assert drawn.count("a") == pytest.approx(2 * drawn.count("b"), rel=0.1)
+    status = views.status["a"]
+    assert status.granted_hz == pytest.approx(10 / 3, rel=0.01)
+    assert status.held_hz == pytest.approx(10 / 3, rel=0.15) and "of a core" in status.limited_by
+
+
+def test_while_the_mapping_misses_frames_little_is_drawn() -> None:
+    views, clocks = opened(0.01, a=10, b=10)
+    run(views, clocks, 1, {"a", "b"}, missed=True)
+    drawn = run(views, clocks, 20, {"a", "b"}, missed=True)
+    assert 0.01 * len(drawn) == pytest.approx(20 * LEAST_SHARE, rel=0.1)
+    assert abs(drawn.count("a") - drawn.count("b")) <= 1
+    assert "misses frames" in views.status["a"].limited_by
+    run(views, clocks, 5, {"a", "b"})
+    assert len(run(views, clocks, 4, {"a", "b"})) == pytest.approx(80, abs=3)
+    assert views.status["a"].limited_by == ""
+
+
+def test_what_nobody_watches_costs_nothing() -> None:
+    views, clocks = opened(0.05, a=10, b=10)
+    assert set(run(views, clocks, 4, {"b"})) == {"b"}
+    assert views.status["a"].limited_by == "nobody subscribes"
+    assert views.status["b"].granted_hz == pytest.approx(SHARE / 0.05)
+
+
+def test_views_are_limited_and_one_of_the_same_name_is_moved() -> None:
+    views, _ = opened(0.005, **{f"v{i}": 10.0 for i in range(MAX_VIEWS)})
+    scene = plane_result()
+    with pytest.raises(SagsError, match="8 views are open"):
+        views.open(parse(ViewRequest, {"name": "more"}), scene)
+    assert views.open(parse(ViewRequest, {"name": "v0", "rate_hz": 3}), scene) is None
+    assert views.status["v0"].asked_hz == 3 and len(views.status) == MAX_VIEWS
+
+
+def test_a_view_opened_before_the_first_frame_is_drawn_with_it() -> None:
+    clocks = Clocks(0.005)
+    views = Views("numba", clocks.wall, clocks.processor)
+    assert views.open(parse(ViewRequest, {"name": "a", "width": 32, "height": 32}), None) is None
+    assert views.status["a"].limited_by == "no frame has come yet"
+    assert run(views, clocks, 0.1, set()) == ["a"]
