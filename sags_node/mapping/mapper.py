@@ -23,6 +23,7 @@ CONTROL_NODES = 512
 INITIAL_STEPS = 30
 HOLES = 200  # Gaussians per frame that may be added even when there are as many as the machine affords
 TORN = 0.02  # of the Gaussians: where more are removed at once, they leave holes
+EXPOSURE_JUMP = 0.01  # smaller changes of the gain are left to the colour steps
 SETTLED = 10  # frames: a model that has not changed for so long has little more to learn
 FOCUS = 0.15  # of the picture: where all steps but the first of a frame are taken
 MIN_FIRST_DEPTHS = 200  # px
@@ -140,8 +141,9 @@ class Mapper:
 
         planes = self._draw(observation)
         gain = exposure_gain(planes, observation)
-        planes[:3] *= gain[:, None, None]
-        self.model.colors[:] *= gain
+        if np.abs(gain - 1).max() > EXPOSURE_JUMP:
+            self.model.colors[:] *= gain
+            planes = self._draw(observation)
         if _is_lost(planes, observation) and self._can_start(observation):
             self.restart()
             return self._initialise(observation) | {"restarted": 1}
