@@ -54,7 +54,7 @@ def bag() -> None:
     metavar="SECONDS",
     help="Keep only the last seconds in memory; write them on SIGUSR1.",
 )
-@click.option("--stdin", "from_stdin", is_flag=True, hidden=True)
+@click.option("--stdin", "from_stdin", is_flag=True, help="A line on stdin saves the ring; its end ends it.")
 @endpoint_option
 @ns_option
 @keys_options
@@ -155,7 +155,7 @@ def play(
     ns: str,
     json_out: bool,
 ) -> None:
-    """Publish a recording again, as a node would; Enter pauses and goes on.
+    """Publish a recording again; Enter pauses and goes on.
 
     Consumers cannot tell it from a node: stamps are moved to now, compressed pictures are sent raw.
 

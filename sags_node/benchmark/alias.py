@@ -78,7 +78,7 @@ def train(observation: Observation, filters: Filters, settings: Settings) -> Tra
     """A model of one still picture, by the node's own mapper."""
     camera = observation.camera
     rasterizer = make_rasterizer("numba", camera.width, camera.height, filters.screen)
-    mapper = Mapper(rasterizer, settings.max_gaussians, filters.world)
+    mapper = Mapper(rasterizer, settings.max_gaussians, filters.world, focus=1.0)
     for _ in range(1 + settings.rounds):  # the first places the Gaussians
         mapper.update(observation, StepBudget(STEPS_PER_ROUND))
     return Trained(mapper.model.gaussians(), filters.screen)

@@ -25,7 +25,7 @@ HOLES = 200  # Gaussians per frame that may be added even when there are as many
 TORN = 0.02  # of the Gaussians: where more are removed at once, they leave holes
 EXPOSURE_JUMP = 0.01  # smaller changes of the gain are left to the colour steps
 SETTLED = 10  # frames: a model that has not changed for so long has little more to learn
-FOCUS = 0.15  # of the picture: where all steps but the first of a frame are taken
+FOCUS = 0.15  # of the picture; measured: half the gain of a whole step in a quarter of its time
 MIN_FIRST_DEPTHS = 200  # px
 LOST_RESIDUAL = 0.08  # mean over RGB and tissue, 0..1; a beating heart stays below half of it
 LOST_COVERAGE = 0.3  # of the tissue
@@ -53,18 +53,25 @@ class Mapper:
     """
 
     def __init__(
-        self, rasterizer: Rasterizer, max_gaussians: int, smoothing: bool = True, fine_flow: bool = False
+        self,
+        rasterizer: Rasterizer,
+        max_gaussians: int,
+        smoothing: bool = True,
+        fine_flow: bool = False,
+        focus: float = FOCUS,
     ) -> None:
         """
         Args:
             smoothing: draw the Gaussians with the 3D filter (`model.alias_free`).
             fine_flow: see `OpticalFlow`.
+            focus: share of the picture, where it is worst, for the steps after the first of a frame.
         """
         self.model = GaussianModel(max_gaussians)
         self.step = 0
         self.restarts = 0  # how often a new model was begun because the old one did not fit any more
         self._rasterizer = rasterizer
         self._smoothing = smoothing
+        self._focus = focus
         self._optimiser = Optimiser()
         self._flow = OpticalFlow(fine_flow)
         self._deformation: Deformation | None = None
@@ -176,7 +183,7 @@ class Mapper:
         return {"inserted": 0, "removed": removed, "iterations": len(touched)}
 
     def _refine_worst(self, observation: Observation, nodes: bool = True) -> Bool:
-        tiles = worst_tiles(self._planes, observation.image, observation.tissue, FOCUS)
+        tiles = worst_tiles(self._planes, observation.image, observation.tissue, self._focus)
         self._draw(observation, tiles)
         self._refine(observation, Rates(), nodes)
         return tiles

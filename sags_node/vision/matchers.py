@@ -13,6 +13,7 @@ Match = tuple[F32, F32, Bool]
 
 SGBM_BLOCK = 5  # px
 PATCH_STRIDE = 6  # px, of patches of 8
+SMALL_WIDTH = 320  # px
 SEARCH_STEPS = 8
 GUESS_WIDTH = 160  # px: coarse matching wide enough for the folds of an organ
 LARGEST_ROW_ERROR = 2.0  # px
@@ -65,13 +66,15 @@ class InverseSearch:
         self._guess_shrink = size[0] / self._guess_size[0]
         self._guess = SemiGlobal(smallest / self._guess_shrink, largest / self._guess_shrink)
         self._dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-        # The guess is good at its own resolution: no need to search at coarser ones. Fewer patches at the
-        # finest resolution cost as much as many at half of it, and halve the error at edges.
-        self._dis.setFinestScale(0)
-        self._dis.setCoarsestScale(max(0, shrink.bit_length() - 2))
-        self._dis.setPatchStride(PATCH_STRIDE)
-        self._dis.setGradientDescentIterations(SEARCH_STEPS)
-        self._dis.setVariationalRefinementIterations(1)
+        # The guess is good at its own resolution: no need to search at coarser ones.
+        if size[0] >= SMALL_WIDTH:
+            # Fewer patches at the finest resolution cost as much as many at half of it, and halve the error at
+            # edges. In smaller pictures, whose patches span more, refinement matters more.
+            self._dis.setFinestScale(0)
+            self._dis.setPatchStride(PATCH_STRIDE)
+            self._dis.setGradientDescentIterations(SEARCH_STEPS)
+        self._dis.setCoarsestScale(max(self._dis.getFinestScale(), shrink.bit_length() - 2))
+        self._dis.setVariationalRefinementIterations(1 if size[0] >= SMALL_WIDTH else 2)
 
     def __call__(self, left: U8, right: U8) -> Match:
         small = [cv2.resize(eye, self._guess_size, interpolation=cv2.INTER_AREA) for eye in (left, right)]
