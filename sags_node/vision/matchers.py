@@ -68,8 +68,8 @@ class InverseSearch:
         self._dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
         # The guess is good at its own resolution: no need to search at coarser ones.
         if size[0] >= SMALL_WIDTH:
-            # Fewer patches at the finest resolution cost as much as many at half of it, and halve the error at
-            # edges. In smaller pictures, whose patches span more, refinement matters more.
+            # Fewer patches at the finest resolution cost as much as many at half of it, and halve the error
+            # at edges. In smaller pictures, whose patches span more, refinement matters more.
             self._dis.setFinestScale(0)
             self._dis.setPatchStride(PATCH_STRIDE)
             self._dis.setGradientDescentIterations(SEARCH_STEPS)
