@@ -81,7 +81,8 @@ def run(launch: tuple[str, ...], seconds: float | None, json_out: bool) -> None:
     sags run launch/v4l2.yaml source.left:=/dev/video-left mapping.budget_ms:=25
     """
     from sags_node.apps.run import health_table, run_node
-    from sags_node.config import PhantomSource, load_launch
+    from sags_node.config import PhantomSource
+    from sags_node.launch_file import load_launch
     from sags_node.node import Node
 
     path, overrides = split(launch)
@@ -148,7 +149,8 @@ def phantom(folder: Path, overrides: tuple[str, ...]) -> None:
     \b
     sags phantom out/session seconds:=8 seed:=3 camera_motion:=true smoke:=0.3
     """
-    from sags_node.config import PhantomSource, load_launch
+    from sags_node.config import PhantomSource
+    from sags_node.launch_file import load_launch
     from sags_node.phantom import write_session
 
     config = load_launch(None, [f"source.{override}" for override in overrides]).source
@@ -189,7 +191,7 @@ def keygen(name: str, out: Path) -> None:
 def doctor(launch: tuple[str, ...], json_out: bool) -> None:
     """Check that everything the node needs is here."""
     from sags_node.apps.doctor import as_rows, examine
-    from sags_node.config import load_launch
+    from sags_node.launch_file import load_launch
 
     checks = examine(load_launch(*split(launch)))
     rows = as_rows(checks)

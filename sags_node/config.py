@@ -1,18 +1,11 @@
-"""A launch file, typed and validated. An unknown key is an error that names the nearest known one."""
+"""What a launch file may hold, typed and validated."""
 
 from __future__ import annotations
 
-import difflib
-import os
-from collections.abc import Mapping, Sequence
 from pathlib import Path
-from string import Template
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-import yaml
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
-
-from sags_node.errors import UsageError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 Box = tuple[int, int, int, int]  # x, y, width, height in px
 Paths = Annotated[
@@ -210,6 +203,10 @@ class VisionConfig(Section):
     stereo: StereoConfig = StereoConfig()
     tissue: TissueConfig = TissueConfig()
 
+    def working_size(self, width: int, height: int) -> tuple[int, int]:
+        """Width and height of the pictures that are worked on, for a camera of `width` x `height` px."""
+        return self.width or width, self.height or height
+
 
 class EngineConfig(Section):
     backend: Literal["numba", "reference"] = "numba"
@@ -257,214 +254,3 @@ class LaunchConfig(Section):
     mapping: MappingConfig = MappingConfig()
     publish: PublishConfig = PublishConfig()
     segments: dict[str, tuple[int, int]] = Field({}, description="name: [first, last] frame, for sags eval")
-
-
-# ---- reading ---------------------------------------------------------------------------------------------
-
-_PATH_KEYS = (
-    *("rig", "folder", "path", "video", "left", "right", "tools"),
-    *("poses", "depth", "tracks", "key", "allow"),
-)
-DEFAULT_DATA = "../shared/data"
-BAG_SUFFIXES = (".mcap", ".db3", ".bag")
-SIDECAR_TYPE = "dvrk_data:video_sidecar@"
-SIDECAR_LOOK = 65536  # bytes at either end; jsoncpp sorts the keys, so the type comes after the frames
-
-
-def load_launch(path: Path | str | None = None, overrides: Sequence[str] = ()) -> LaunchConfig:
-    """Read a launch file, or a folder that holds `launch.yaml` or a known recording, and apply `key:=value`
-    overrides.
-
-    `$SAGS_DATA` and other variables are expanded; relative paths in the file are relative to the file.
-    `path=None` gives the defaults: the built-in phantom session.
-
-    Raises:
-        UsageError: the file is missing, is not YAML, or holds an unknown key or a wrong value.
-    """
-    tree: dict[str, Any] = {"source": {"kind": "phantom"}}
-    name = "defaults"
-    if path is not None:
-        file = Path(path)
-        recording = _known_recording(file)
-        if file.is_dir() and recording is None:
-            file = file / "launch.yaml"
-        name = str(file)
-        if recording is not None:
-            tree = recording
-        else:
-            tree = _read_yaml(file)
-            _resolve_paths(tree, file.parent)
-    for override in overrides:
-        _apply_override(tree, override)
-    try:
-        return LaunchConfig.model_validate(tree)
-    except ValidationError as error:
-        raise UsageError(_explain(error, name)) from None
-
-
-def _known_recording(folder: Path) -> dict[str, Any] | None:
-    """How to play what is no session of ours but a ROS bag, or laid out as dVRK or a research data set."""
-    if (folder / "launch.yaml").exists():
-        return None
-    is_folder = folder.is_dir()
-    if folder.suffix in BAG_SUFFIXES or (folder / "metadata.yaml").is_file() or any(folder.glob("*.mcap")):
-        return {"source": {"kind": "bag", "path": str(folder)}}
-    if any(_is_sidecar(file) for file in (folder.glob("*.json") if is_folder else [folder])):
-        return {"source": {"kind": "dvrk", "path": str(folder)}}
-    if (folder / "poses_bounds.npy").is_file() or all(
-        (folder / name).is_dir() for name in ("images", "masks")
-    ):
-        return {"source": {"kind": "endonerf", "folder": str(folder)}}
-    if (folder / "endoscope_calibration.yaml").is_file() or (folder / "data/rgb.mp4").is_file():
-        # No instrument is in view; the search for them by colour would only take tissue away.
-        return {
-            "source": {"kind": "scared", "folder": str(folder)},
-            "vision": {"tissue": {"method": "none"}},
-        }
-    return None
-
-
-def _is_sidecar(file: Path) -> bool:
-    """Whether this describes a video of dVRK's `record`; its type stands at the beginning or the end."""
-    if file.suffix != ".json" or not file.is_file():
-        return False
-    with file.open("rb") as opened:
-        start = opened.read(SIDECAR_LOOK)
-        opened.seek(max(0, file.stat().st_size - SIDECAR_LOOK))
-        return SIDECAR_TYPE.encode() in start + opened.read(SIDECAR_LOOK)
-
-
-def with_parameters(config: LaunchConfig, parameters: Mapping[str, Any]) -> LaunchConfig:
-    """The same configuration with some `section.key` values replaced, validated again.
-
-    Raises:
-        UsageError: an unknown key or a wrong value.
-    """
-    tree = config.model_dump()
-    for key, value in parameters.items():
-        _set(tree, key, value, key)
-    try:
-        return LaunchConfig.model_validate(tree)
-    except ValidationError as error:
-        raise UsageError(_explain(error, "parameters")) from None
-
-
-def _read_yaml(file: Path) -> dict[str, Any]:
-    try:
-        text = file.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise UsageError(f"cannot read launch file {file}: {reason}; check the path") from None
-    try:
-        tree = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise UsageError(f"{file} is not valid YAML: {' '.join(str(error).split())}") from None
-    if tree is None:
-        return {}
-    if not isinstance(tree, dict):
-        raise UsageError(f"{file}: a launch file is a map of sections, this is a {type(tree).__name__}")
-    return tree
-
-
-def _resolve_paths(tree: dict[str, Any], folder: Path) -> None:
-    """Expand variables in every string and make the known path keys relative to the launch file."""
-    variables = {"SAGS_DATA": str((folder / ".." / DEFAULT_DATA).resolve()), **os.environ}
-    for key, value in tree.items():
-        if isinstance(value, dict) and value.get("kind") != "v4l2":
-            _resolve_paths(value, folder)
-        elif isinstance(value, str):
-            tree[key] = _resolve(key, value, folder, variables)
-        elif isinstance(value, list):
-            tree[key] = [
-                _resolve(key, item, folder, variables) if isinstance(item, str) else item for item in value
-            ]
-
-
-def _resolve(key: str, value: str, folder: Path, variables: Mapping[str, str]) -> str:
-    expanded = Template(value).safe_substitute(variables)
-    if "$" in expanded and key in _PATH_KEYS:
-        raise UsageError(f"{key}: {value} uses a variable that is not set; export it first")
-    return str(folder / expanded) if key in _PATH_KEYS else expanded
-
-
-def _apply_override(tree: dict[str, Any], override: str) -> None:
-    key, separator, text = override.partition(":=")
-    if not separator or not key:
-        raise UsageError(f"'{override}' is not an override; write key:=value, e.g. mapping.budget_ms:=33")
-    try:
-        value = yaml.safe_load(text)
-    except yaml.YAMLError:
-        raise UsageError(f"'{override}': the value is not valid YAML; quote it") from None
-    _set(tree, key, value, override)
-
-
-def _set(tree: dict[str, Any], key: str, value: Any, said: str) -> None:
-    node = tree
-    *parents, leaf = key.split(".")
-    for parent in parents:
-        node = node.setdefault(parent, {})
-        if not isinstance(node, dict):
-            raise UsageError(f"'{said}': {parent} is a value, not a section")
-    node[leaf] = value
-
-
-def _explain(error: ValidationError, name: str) -> str:
-    """One line per mistake: where, what, and the nearest known key for an unknown one."""
-    lines = []
-    for item in error.errors():
-        path = [str(part) for part in item["loc"]]
-        where = ".".join(part for part in path if part not in _SOURCES)
-        if item["type"] == "extra_forbidden":
-            lines.append(f"{name}: unknown key '{where}'; {_nearest(path)}")
-        elif item["type"] == "missing":
-            lines.append(f"{name}: {where} is missing; set it")
-        elif item["type"] in ("union_tag_invalid", "union_tag_not_found"):
-            kinds = ", ".join(repr(kind) for kind in _SOURCES)
-            lines.append(f"{name}: source.kind: should be one of {kinds} (got {item['input'].get('kind')!r})")
-        else:
-            what = _PLAIN.get(item["type"], item["msg"])
-            lines.append(f"{name}: {where or 'launch file'}: {what} (got {item.get('input')!r})")
-    return "\n".join(lines)
-
-
-_PLAIN = {  # where pydantic speaks of Python
-    "path_type": "Input should be a path",
-    "tuple_type": "Input should be a list, e.g. [a, b]",
-    "model_type": "Input should be a section of keys",
-    "model_attributes_type": "Input should be a section of keys",
-}
-
-
-def _nearest(path: Sequence[str]) -> str:
-    """The known key that was probably meant: of this section, or one of that name in another."""
-    known = _known_keys(path[:-1])
-    near = difflib.get_close_matches(path[-1], known, n=1, cutoff=0.5)
-    if not near:
-        near = [f"{section}.{path[-1]}" for section in _SECTIONS if path[-1] in _known_keys([section])]
-    return f"did you mean '{near[0]}'?" if near else f"known keys: {', '.join(sorted(known))}"
-
-
-def _known_keys(path: Sequence[str]) -> list[str]:
-    model: Any = LaunchConfig
-    for part in path:
-        field = model.model_fields.get(part)
-        if part in _SOURCES:
-            model = _SOURCES[part]
-        elif field is not None and part != "source":
-            model = field.annotation
-    return list(model.model_fields)
-
-
-_SECTIONS = ("vision", "engine", "mapping", "publish")
-_SOURCES: dict[str, type[Section]] = {
-    "folders": FoldersSource,
-    "videos": VideosSource,
-    "side_by_side": SideBySideSource,
-    "panes": PanesSource,
-    "endonerf": EndoNerfSource,
-    "scared": ScaredSource,
-    "bag": BagSource,
-    "dvrk": DvrkSource,
-    "phantom": PhantomSource,
-    "v4l2": V4l2Source,
-}

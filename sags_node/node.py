@@ -24,11 +24,12 @@ from typing import Any
 
 import numpy as np
 
-from sags_node.config import LaunchConfig, V4l2Source, with_parameters
+from sags_node.config import LaunchConfig, V4l2Source
 from sags_node.engine.threads import configure_threads
 from sags_node.errors import SagsError
 from sags_node.health import Statistics
 from sags_node.latest import Latest
+from sags_node.launch_file import with_parameters
 from sags_node.mapping.budget import make_budget
 from sags_node.messaging import content
 from sags_node.messaging.publisher import Publisher
@@ -126,7 +127,7 @@ class Node:
         return True
 
     def stop(self) -> None:
-        """End capture first, then mapping, then publishing, so that the last health message gets out."""
+        """End capture first, then mapping, drawing and publishing: the last health message gets out."""
         self._stopping.set()
         self._source.stop()
         self._frames.close()

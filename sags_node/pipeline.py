@@ -43,7 +43,7 @@ class Pipeline:
 
     def __init__(self, config: LaunchConfig, rig: StereoRig) -> None:
         vision = config.vision
-        width, height = vision.width or rig.left.width, vision.height or rig.left.height
+        width, height = vision.working_size(rig.left.width, rig.left.height)
         self.rectifier = Rectifier(rig, width, height)
         self.tissue = TissueMask(vision.tissue, self.rectifier)
         self.stereo = StereoDepth(vision.stereo, self.rectifier.camera, self.rectifier.baseline)
@@ -103,8 +103,7 @@ class Pipeline:
             snapshot = self.mapper.update(observation, budget, still)
         with watch("render"):
             views = self._draw_eyes(snapshot, pair.baseline)
-            if not still:  # slow motion adds up: the next flow starts where the last one ended
-                self.mapper.drawn(observation, views["left"])
+            self.mapper.drawn(observation, views["left"])
         with watch("anchors"):
             self.anchors.update(observation, snapshot, views["left"])
             anchors = self.anchors.at(pair.t_capture_ns)
@@ -189,6 +188,6 @@ def _repeat(
         },
         epoch=epoch,
         timings_ms=timings,
-        skipped={"frame": "equals its predecessor"},
+        skipped={**mapped.skipped, "frame": "equals its predecessor"},
         anchors=anchors,
     )

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sags_node.calibration import load_rig
-from sags_node.config import BagSource, EndoNerfSource, LaunchConfig, PhantomSource, load_launch
+from sags_node.config import BagSource, EndoNerfSource, LaunchConfig, PhantomSource
 from sags_node.errors import UsageError
+from sags_node.launch_file import load_launch
 from sags_node.sources.source import Source, open_source, recorded_rig
 from sags_node.types import StereoRig
 
@@ -21,6 +22,11 @@ class Session:
     config: LaunchConfig
     rig: StereoRig
     source: Source
+
+    @property
+    def working_size(self) -> tuple[int, int]:
+        """Width and height of the pictures that the mapper works on, px."""
+        return self.config.vision.working_size(self.rig.left.width, self.rig.left.height)
 
 
 def open_session(

@@ -18,8 +18,9 @@ from bag_files import MS, ROS1, ROS2, START, picture
 
 from sags_node.apps.launching import split
 from sags_node.calibration import save_rig
-from sags_node.config import BagSource, DvrkSource, LaunchConfig, load_launch
+from sags_node.config import BagSource, DvrkSource, LaunchConfig
 from sags_node.errors import SagsError, UsageError
+from sags_node.launch_file import load_launch
 from sags_node.recording.info import bag_info
 from sags_node.session import open_session
 from sags_node.sources.bags import read_rig

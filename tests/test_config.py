@@ -4,8 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from sags_node.config import FoldersSource, LaunchConfig, PanesSource, load_launch, with_parameters
+from sags_node.config import FoldersSource, LaunchConfig, PanesSource
 from sags_node.errors import UsageError
+from sags_node.launch_file import load_launch, with_parameters
 
 ROOT = Path(__file__).parent.parent
 

@@ -16,6 +16,7 @@ from click.testing import CliRunner
 from sags_node import config as cfg
 from sags_node.cli import main
 from sags_node.errors import SagsError, UsageError
+from sags_node.launch_file import load_launch
 from sags_node.mapping.budget import StepBudget
 from sags_node.pipeline import Pipeline
 from sags_node.session import open_session
@@ -161,10 +162,10 @@ def test_the_calibration_comes_from_the_poses_file(clip: Path) -> None:
 
 
 def test_a_folder_is_known_by_its_files_and_a_launch_file_wins(clip: Path) -> None:
-    source = cfg.load_launch(clip, ["source.stride:=3"]).source
+    source = load_launch(clip, ["source.stride:=3"]).source
     assert isinstance(source, cfg.EndoNerfSource) and source.folder == clip and source.stride == 3
     (clip / "launch.yaml").write_text("source: {kind: endonerf, folder: ., depth_unit: 0.002}\n")
-    source = cfg.load_launch(clip).source
+    source = load_launch(clip).source
     assert isinstance(source, cfg.EndoNerfSource) and source.depth_unit == 0.002
     assert source.folder.resolve() == clip.resolve()
 
@@ -327,7 +328,7 @@ def test_mistakes_are_named_with_their_mend(
 ) -> None:
     mistake(clip)
     with pytest.raises(SagsError, match=message) as caught:
-        open_source(cfg.load_launch(clip).source)
+        open_source(load_launch(clip).source)
     assert "\n" not in str(caught.value)
 
 

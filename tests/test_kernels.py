@@ -75,7 +75,7 @@ def test_candidates(scene: dict[str, np.ndarray]) -> None:
     planes = rng.random((5, HEIGHT, WIDTH)).astype(np.float32)
     image = rng.random((HEIGHT, WIDTH, 3)).astype(np.float32)
     pixels, depths = np.zeros((2, 400, 2), np.int32), np.zeros((2, 400), np.float32)
-    arguments = (planes, image, scene["tissue"], scene["depth"], 1)
+    arguments = (planes, image, scene["tissue"], scene["depth"], True, 1)
     count = densify._candidates(*arguments, pixels[0], depths[0])
     assert count == densify._candidates.py_func(*arguments, pixels[1], depths[1]) == 400
     assert np.array_equal(pixels[0], pixels[1])

@@ -7,6 +7,7 @@ ROOT = Path(__file__).parent.parent / "sags_node"
 LAYERS = [
     {"errors", "types", "latest"},
     {"geometry", "config"},
+    {"launch_file"},
     {"calibration"},
     {"phantom"},
     {"vision", "engine", "messaging"},

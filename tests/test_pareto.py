@@ -18,8 +18,9 @@ from sags_node.benchmark.pareto_baselines import right_pixels, warp_to_right
 from sags_node.benchmark.pareto_settings import skip_rules, skip_settings, time_settings
 from sags_node.calibration import load_rig
 from sags_node.cli import main
-from sags_node.config import MappingConfig, load_launch
+from sags_node.config import MappingConfig
 from sags_node.evaluation import metrics
+from sags_node.launch_file import load_launch
 from sags_node.sources.source import open_source
 from sags_node.vision.rectify import Rectifier
 

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from sags_node.calibration import load_rig
-from sags_node.config import FoldersSource, PhantomSource, load_launch
+from sags_node.config import FoldersSource, PhantomSource
 from sags_node.errors import SagsError, UsageError
 from sags_node.geometry import invert, transform
+from sags_node.launch_file import load_launch
 from sags_node.phantom import cached_session, write_session
 from sags_node.phantom.motion import Clock
 from sags_node.phantom.relief import make_relief

@@ -19,6 +19,7 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.evaluation.measure import Options
 from sags_node.evaluation.session import evaluate
 from sags_node.geometry import invert, project, unproject
+from sags_node.launch_file import load_launch
 from sags_node.session import open_session
 from sags_node.sources.source import open_source
 from sags_node.types import F32, F64, U8, StereoFrame
@@ -311,7 +312,7 @@ def test_a_frame_without_points_has_no_reference(keyframe: Path) -> None:
 
 
 def test_a_folder_is_known_by_its_files(keyframe: Path) -> None:
-    config = cfg.load_launch(keyframe, ["source.stride:=2"])
+    config = load_launch(keyframe, ["source.stride:=2"])
     assert isinstance(config.source, cfg.ScaredSource)
     assert config.source.folder == keyframe and config.source.stride == 2
     assert config.vision.tissue.method == "none"
@@ -409,7 +410,7 @@ def test_mistakes_are_named_with_their_mend(
 ) -> None:
     mistake(keyframe)
     with pytest.raises(SagsError, match=message) as caught:
-        open_source(cfg.load_launch(keyframe).source)
+        open_source(load_launch(keyframe).source)
     assert "\n" not in str(caught.value)
 
 

@@ -24,8 +24,8 @@ from synthetic import publisher, stream
 from zmq.auth import load_certificate
 
 from sags_node.cli import main
-from sags_node.config import load_launch
 from sags_node.errors import SagsError, UsageError
+from sags_node.launch_file import load_launch
 from sags_node.messaging.address import ClientKeys, client_keys
 from sags_node.messaging.control import ControlClient, ControlServer
 from sags_node.messaging.peers import MAX_PEERS

@@ -15,12 +15,13 @@ import pytest
 
 from sags_node import config as cfg
 from sags_node.errors import SagsError, UsageError
+from sags_node.launch_file import DEFAULT_DATA
 from sags_node.sources.replay import Recording, Replay
 from sags_node.sources.source import open_source
 from sags_node.types import U8, StereoFrame
 
 ROOT = Path(__file__).parent.parent
-DATA = Path(os.environ.get("SAGS_DATA", ROOT / cfg.DEFAULT_DATA))
+DATA = Path(os.environ.get("SAGS_DATA", ROOT / DEFAULT_DATA))
 D4D = DATA / "d4d_pull"
 D4D_VIDEO = D4D / "2025_03_06-16_49_40_combined_2x2.mp4"
 needs_d4d = pytest.mark.skipif(not D4D_VIDEO.exists(), reason=f"no D4D recording in {DATA}; set SAGS_DATA")

@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 
 from sags_node.calibration import rectified_rig
-from sags_node.config import load_launch
 from sags_node.engine.rasterize import make_rasterizer, to_view
 from sags_node.evaluation.metrics import psnr
+from sags_node.launch_file import load_launch
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.mapper import SETTLED
 from sags_node.mapping.motion import OpticalFlow
+from sags_node.messaging.content import tells_of
 from sags_node.pipeline import Pipeline
 from sags_node.session import Session, open_session
 from sags_node.types import F32, Camera, FrameResult, RectifiedPair, RenderedView, StereoFrame
@@ -248,6 +249,30 @@ def test_a_rest_makes_up_for_the_depth_that_there_was_no_time_for(
     known = [result.observation.depth.any() for result in results]
     assert known == [True, True, False, True, True]
     assert calls["depth"] == 3
+
+
+def test_a_repeated_frame_does_not_claim_depth_that_was_never_matched(frames: list[StereoFrame]) -> None:
+    session, budget = opened(), Hurried(1)
+    pipeline = Pipeline(session.config, session.rig)
+    pipeline.process(frames[0], budget)
+    budget.hurry = True
+    hurried = pipeline.process(frames[4], budget)
+    repeated = pipeline.process(replace(frames[4], frame_id=99), budget)
+    assert "frame" in repeated.skipped
+    assert not hurried.observation.depth.any()
+    for result in (hurried, repeated):
+        assert not tells_of(result, "left/depth")
+
+
+def test_motion_is_followed_at_once_after_a_model_was_begun_while_nothing_moved(
+    frames: list[StereoFrame], calls: dict[str, int]
+) -> None:
+    play = Player(opened())
+    play(frames[0])
+    play.pipeline.mapper.restart()
+    play.again(frames[0])
+    play(frames[3])
+    assert calls["flow"] == 1
 
 
 @pytest.mark.parametrize("overrides", [(), ("publish.right:=true",)])

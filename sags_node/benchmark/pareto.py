@@ -106,7 +106,7 @@ class _Comparison:
         self._sweep = sweep
         self._advance = advance
         self._session = self._open(())
-        self._size = working_size(self._session)
+        self._size = self._session.working_size
         warm_up(self._session.config)
 
     def measure(self, fits: Mapping[str, Row]) -> Row:
@@ -165,7 +165,7 @@ class _Comparison:
     def _measured(self, setting: Setting, session: Session, spool: Spool, progress: Progress) -> Row:
         summary = measure(session, spool, self._sweep.options, setting.overrides, progress).summary
         at_full_size = summary["online"]
-        if working_size(session) != self._size:
+        if session.working_size != self._size:
             at_full_size = self._at_full_size(session, spool, progress)
         if at_full_size["psnr"] is None:
             raise SagsError(
@@ -212,12 +212,6 @@ class _Comparison:
     def _progress(self, what: str) -> Progress:
         name, count = self._session.name, self._session.source.frame_count
         return lambda doing, done: self._advance(done, count, f"{name}, {what}: {doing}")
-
-
-def working_size(session: Session) -> tuple[int, int]:
-    """Width and height of the pictures that the mapper works on, px."""
-    vision, eye = session.config.vision, session.rig.left
-    return vision.width or eye.width, vision.height or eye.height
 
 
 def _place(row: Row) -> tuple[float, float]:

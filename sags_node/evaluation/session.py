@@ -9,13 +9,14 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
 
-from sags_node.config import LaunchConfig, V4l2Source, load_launch
+from sags_node.config import LaunchConfig, V4l2Source
 from sags_node.engine.threads import configure_threads
 from sags_node.errors import SagsError, UsageError
 from sags_node.evaluation.gallery import Picture
 from sags_node.evaluation.measure import FrameRow, Measurer, Options, Progress
 from sags_node.evaluation.spool import Spool
 from sags_node.evaluation.summary import GROUPS, summarise
+from sags_node.launch_file import load_launch
 from sags_node.mapping.budget import capacity, make_budget
 from sags_node.node import Node
 from sags_node.pipeline import Pipeline
@@ -106,16 +107,15 @@ def measure(
         config.segments,
         None if config.mapping.iterations is not None else config.mapping.budget_ms,
     )
-    size = config.vision.width or session.rig.left.width, config.vision.height or session.rig.left.height
     summary["settings"] = {
         "overrides": list(overrides),
         "pace": None if isinstance(config.source, V4l2Source) else config.source.pace,
         "iterations": config.mapping.iterations,
-        "max_gaussians": capacity(config.mapping, *size),
+        "max_gaussians": capacity(config.mapping, *session.working_size),
         "backend": config.engine.backend,
         "seed": config.seed,
-        "width": size[0],
-        "height": size[1],
+        "width": session.working_size[0],
+        "height": session.working_size[1],
         "depth_reference": measurer.depth_kind,
         "hold_out": options.hold_out,
         "novel_every": options.every,
@@ -196,8 +196,7 @@ class _WithoutHeldOut:
 def _measured(session: Session, spool: Spool, options: Options, progress: Progress) -> Measurer:
     """Read the recording again, with its truth, and measure every frame."""
     config = session.config
-    size = config.vision.width or session.rig.left.width, config.vision.height or session.rig.left.height
-    rectifier = Rectifier(session.rig, *size)
+    rectifier = Rectifier(session.rig, *session.working_size)
     tissue = TissueMask(config.vision.tissue, rectifier)
     exclude = config.vision.tissue.exclude
     measurer = Measurer(spool, rectifier, tissue, options, exclude, config.engine.backend)

@@ -82,12 +82,9 @@ class TimeBudget:
         self._essential = _RunningMean()
         self._cost_with_depth = _RunningMean()
         self._had_depth = False
-        self._begin(0.0)
+        self.start()
 
     def start(self, waited: float = 0.0) -> None:
-        self._begin(waited)
-
-    def _begin(self, waited: float) -> None:
         self._started = self._asked = self._clock()
         self._deadline = self._started + max(0.0, self.seconds - waited)
         self._asks = 0

@@ -43,8 +43,9 @@ def candidates(planes: F32, observation: Observation, phase: int) -> tuple[I32, 
     """
     pixels = np.empty((MAX_INSERTED, 2), np.int32)
     depths = np.empty(MAX_INSERTED, np.float32)
+    depth = observation.depth
     count = _candidates(
-        planes, observation.image, observation.tissue, observation.depth, phase % GRID, pixels, depths
+        planes, observation.image, observation.tissue, depth, bool(depth.any()), phase % GRID, pixels, depths
     )
     return pixels[:count], depths[:count]
 
@@ -70,7 +71,7 @@ def doomed(model: GaussianModel, observation: Observation, limit: int) -> Bool:
 
 @kernel
 def _candidates(
-    planes: F32, image: F32, tissue: Bool, depth: F32, phase: int, pixels: I32, depths: F32
+    planes: F32, image: F32, tissue: Bool, depth: F32, any_depth: bool, phase: int, pixels: I32, depths: F32
 ) -> int:
     height, width = tissue.shape
     n = 0
@@ -82,7 +83,7 @@ def _candidates(
                 z = depth[y, x]
                 alpha = planes[4, y, x]
                 if alpha < HOLE_ALPHA:
-                    if z <= 0 and rank == 0:
+                    if z <= 0 and rank == 0 and any_depth:
                         z = nearest_depth(depth, x, y)
                     wanted = rank == 0 and z > 0
                 elif rank == 0 or (rank == 1 and z <= 0):

@@ -76,6 +76,7 @@ class Mapper:
         self._flow = OpticalFlow(fine_flow)
         self._deformation: Deformation | None = None
         self._last: _Last | None = None
+        self._still = False  # whether nothing moved in the frame taken in last
         self.stale_tiles: Bool | None = None  # [1, rows, columns] to be drawn anew after `update`; None: all
         self._frames = 0
         self._frames_to_depth = 0  # since depth was known last
@@ -92,6 +93,7 @@ class Mapper:
             still: for how many frames, this one included, nothing has moved.
         """
         self._frames += 1
+        self._still = still > 0
         self.stale_tiles = None
         known = observation.depth[::8, ::8]
         known = known[known > 0]
@@ -122,8 +124,10 @@ class Mapper:
         self.restarts += 1
 
     def drawn(self, observation: Observation, view: RenderedView) -> None:
-        """Remember how the model looked at `observation`: the next frame's motion starts from there."""
-        self._last = _Last(observation, view)
+        """Remember how the model looked at `observation`: the next frame's motion starts from there. A still
+        frame is passed over: slow motion adds up until it is seen."""
+        if not self._still or self._last is None:
+            self._last = _Last(observation, view)
 
     def _initialise(self, observation: Observation) -> dict[str, int]:
         if not self._can_start(observation):

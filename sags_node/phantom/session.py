@@ -53,8 +53,8 @@ def write_session(
     """Render `round(config.seconds * rate)` frames and all that is true of them into a new folder.
 
     The folder appears only when it is complete: until then everything is in a sibling whose name ends in
-    `.partial`, which is removed when rendering is interrupted. `sags_node.config.load_launch(folder)` reads
-    the result. Same config and rate, same files on one machine.
+    `.partial`, which is removed when rendering is interrupted. `launch_file.load_launch(folder)` reads the
+    result. Same config and rate, same files on one machine.
 
     Raises:
         UsageError: the folder exists and is not empty.

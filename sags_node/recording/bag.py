@@ -17,8 +17,8 @@ import zstandard
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
-from sags_node.config import BAG_SUFFIXES as SUFFIXES
 from sags_node.errors import SagsError, UsageError
+from sags_node.launch_file import BAG_SUFFIXES as SUFFIXES
 from sags_node.messaging import cdr
 from sags_node.recording import mcap_file, rosbag1_check
 from sags_node.recording.mcap_file import MAGIC, MAX_RECORD_BYTES, DamagedError, Entry, Head, Inner

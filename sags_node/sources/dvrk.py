@@ -13,8 +13,9 @@ from typing import Annotated, Literal
 import msgspec
 import numpy as np
 
-from sags_node.config import SIDECAR_TYPE, DvrkSource
+from sags_node.config import DvrkSource
 from sags_node.errors import UsageError
+from sags_node.launch_file import SIDECAR_TYPE
 from sags_node.sources.pictures import RawPair
 from sags_node.sources.stamps import nearest
 from sags_node.sources.videos import PanePairs, Video, side_by_side_boxes

@@ -7,6 +7,7 @@ from types import TracebackType
 from typing import Protocol, Self
 
 from sags_node import config as cfg
+from sags_node.launch_file import load_launch
 from sags_node.types import StereoFrame, StereoRig
 
 
@@ -97,7 +98,7 @@ def _phantom_recording(
     """The rendered session's own pictures, played the way this launch file asks."""
     from sags_node.phantom import cached_session
 
-    recorded = cfg.load_launch(cached_session(config, progress)).source
+    recorded = load_launch(cached_session(config, progress)).source
     assert isinstance(recorded, cfg.FoldersSource)
     playing = config.model_dump(
         include={"pace", "rate", "loop", "start", "frames", "stride"}, exclude_unset=True
