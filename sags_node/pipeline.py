@@ -98,7 +98,7 @@ class Pipeline:
                 skipped["depth"] = NO_TIME
             else:
                 depth, confidence = self.depth(frame, pair, tissue)
-            observation = observe(pair, tissue, depth, confidence)
+            observation = observe(pair, tissue, depth, confidence, self._config.mapping.right_eye)
         with watch("map"):
             snapshot = self.mapper.update(observation, budget, still)
         with watch("render"):

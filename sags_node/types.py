@@ -65,7 +65,7 @@ class Eye:
     width: int  # px, of the raw picture
     height: int
     K: F64  # [3, 3] px, raw picture
-    distortion: F64  # [5] plumb_bob: k1 k2 p1 p2 k3
+    distortion: F64  # [5] plumb_bob: k1 k2 p1 p2 k3; or [8] rational_polynomial: and k4 k5 k6
     R: F64  # [3, 3] rotation from the raw to the rectified camera
     P: F64  # [3, 4] projection of the rectified camera; P[0, 3] = -f B for the right eye, metres
 
@@ -142,6 +142,8 @@ class Observation:
     tissue: Bool  # [H, W] True = tissue
     depth: F32  # [H, W] m, 0 unknown
     depth_confidence: F32  # [H, W] 0..1
+    right: F32 | None = None  # [H, W, 3] RGB 0..1, the right eye, if the mapper is to learn from it
+    baseline: float = 0.0  # m, to the right eye
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,18 +10,11 @@ from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.exposure import LARGEST, exposure_gain
 from sags_node.pipeline import Pipeline
 from sags_node.session import open_session
-from sags_node.types import Camera, FrameResult, Observation, StereoFrame
+from sags_node.types import FrameResult, StereoFrame
 
 SIZE = 96
+ALL = np.ones((SIZE, SIZE), bool)
 SESSION = Path(__file__).parent.parent / "replay/phantom_pull"
-
-
-def observation(image: np.ndarray) -> Observation:
-    shape = image.shape[:2]
-    camera = Camera(shape[1], shape[0], np.eye(3), np.eye(4))
-    tissue = np.ones(shape, bool)
-    depth = np.ones(shape, np.float32)
-    return Observation(0, 0, camera, image, np.zeros(shape, np.uint8), tissue, depth, depth)
 
 
 def planes_of(image: np.ndarray, coverage: float) -> np.ndarray:
@@ -39,7 +32,7 @@ def test_the_gain_of_each_channel_is_found_whatever_is_new_or_bright(picture: np
     seen = picture * gain
     seen[:30] = 0.1  # something dark came in
     seen[40:50] = 1.0  # highlights
-    assert np.allclose(exposure_gain(planes_of(picture, 0.8), observation(seen)), gain, atol=1e-3)
+    assert np.allclose(exposure_gain(planes_of(picture, 0.8), seen, ALL), gain, atol=1e-3)
 
 
 def test_where_nothing_can_be_compared_the_gain_is_one(picture: np.ndarray) -> None:
@@ -48,8 +41,9 @@ def test_where_nothing_can_be_compared_the_gain_is_one(picture: np.ndarray) -> N
         (np.zeros_like(picture), planes_of(picture, 1.0)),  # a blackout
         (picture, np.full((5, SIZE, SIZE), np.nan, np.float32)),
     ):
-        assert np.array_equal(exposure_gain(planes, observation(seen)), np.ones(3, np.float32))
-    assert exposure_gain(planes_of(picture, 1.0), observation(np.minimum(3 * picture, 0.94))).max() <= LARGEST
+        assert np.array_equal(exposure_gain(planes, seen, ALL), np.ones(3, np.float32))
+    bright = np.minimum(3 * picture, 0.94)
+    assert exposure_gain(planes_of(picture, 1.0), bright, ALL).max() <= LARGEST
 
 
 def test_a_jump_of_the_exposure_is_followed_at_once_and_begins_no_new_model() -> None:

@@ -10,7 +10,8 @@ from sags_node.errors import UsageError
 from sags_node.evaluation import metrics
 from sags_node.evaluation.lpips import Lpips
 from sags_node.evaluation.tracking import PointTracks
-from sags_node.evaluation.views import VELOCITY_SHARE, extrapolated, right_eye_mask
+from sags_node.evaluation.views import VELOCITY_SHARE, extrapolated
+from sags_node.mapping.right_eye import right_eye_mask
 from sags_node.types import Camera, Gaussians, Snapshot
 
 
@@ -238,7 +239,7 @@ def test_right_eye_mask_never_lets_an_instrument_through() -> None:
         tissue = np.ones((96, 128), bool)
         x, y = rng.integers(0, 90), rng.integers(0, 70)
         tissue[y : y + 26, x : x + 30] = False
-        mask = right_eye_mask(tissue, depth, focal_px, baseline)
+        mask = right_eye_mask(tissue, depth[tissue], focal_px, baseline)
         known = depth[tissue]
         disparities = np.unique(np.round(focal_px * baseline / known[::7], 1))
         low, high = np.percentile(disparities, [1, 99])
@@ -256,12 +257,12 @@ def test_right_eye_mask_of_a_plane_is_the_shifted_tissue() -> None:
     depth = np.full((8, 128), 0.1, np.float32)
     tissue = np.ones((8, 128), bool)
     tissue[:, 60:70] = False
-    mask = right_eye_mask(tissue, depth, 2500.0, 0.00042)  # disparity 10.5 px, widened to 9..16
+    mask = right_eye_mask(tissue, depth[tissue], 2500.0, 0.00042)  # disparity 10.5 px, widened to 9..16
     expected = np.ones(128, bool)
     expected[60 - 16 : 70 - 9] = False
     expected[128 - 16 :] = False
     np.testing.assert_array_equal(mask, np.tile(expected, (8, 1)))
-    assert not right_eye_mask(tissue, np.zeros_like(depth), 2500.0, 0.00042).any()
+    assert not right_eye_mask(tissue, depth[:0], 2500.0, 0.00042).any()
 
 
 # ---- tracking --------------------------------------------------------------------------------------------

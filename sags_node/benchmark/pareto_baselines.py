@@ -20,7 +20,7 @@ from sags_node.evaluation import metrics
 from sags_node.evaluation.measure import FrameRow, Options, Progress
 from sags_node.evaluation.spool import Spool, SpooledFrame
 from sags_node.evaluation.summary import summarise
-from sags_node.evaluation.views import right_eye_mask
+from sags_node.mapping.right_eye import right_eye_mask
 from sags_node.session import Session
 from sags_node.sources.source import open_source
 from sags_node.types import F32, U8, Bool, StereoRig
@@ -213,7 +213,8 @@ def _right_views(
     is measured; and the share of `novel`'s pixels that is."""
     camera = shown.snapshot.camera
     focal_px = float(camera.K[0, 0])
-    mask = right_eye_mask(shown.tissue, shown.depth, focal_px, shown.baseline) & usable
+    depths = shown.depth[shown.tissue & (shown.depth > 0)]
+    mask = right_eye_mask(shown.tissue, depths, focal_px, shown.baseline) & usable
     warp, known = warp_to_right(metrics.as_float(left), shown.measured_depth, focal_px, shown.baseline)
     right_camera = camera.moved_right(shown.baseline)
     planes = rasterizer.forward(shown.snapshot.gaussians, [right_camera])

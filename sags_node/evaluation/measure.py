@@ -16,7 +16,8 @@ from sags_node.evaluation.gallery import Gallery
 from sags_node.evaluation.lpips import Lpips
 from sags_node.evaluation.spool import RunFacts, Spool, SpooledFrame
 from sags_node.evaluation.tracking import PointTracks, TrackErrors
-from sags_node.evaluation.views import extrapolated, right_eye_mask
+from sags_node.evaluation.views import extrapolated
+from sags_node.mapping.right_eye import right_eye_mask
 from sags_node.types import F32, U8, Bool, Camera, Gaussians, RectifiedPair, Reference, StereoFrame
 from sags_node.vision.rectify import Rectifier
 
@@ -171,11 +172,13 @@ class Measurer:
         return to_view(self._rasterizer.forward(gaussians, [camera])[0], camera, 0, 0).rgb
 
     def _novel(self, shown: SpooledFrame, picture: U8, frame: StereoFrame) -> float:
-        """PSNR of the right eye's picture, which the mapper never saw, after a fit of gain and offset."""
+        """PSNR of the right eye's picture after a fit of gain and offset. The mapper never saw it, unless
+        `mapping.right_eye` is set."""
         if self._usable_right is None:
             self._usable_right = self._right_pixels(frame)
         camera = shown.snapshot.camera
-        mask = right_eye_mask(shown.tissue, shown.depth, float(camera.K[0, 0]), shown.baseline)
+        known = shown.depth[shown.tissue & (shown.depth > 0)]
+        mask = right_eye_mask(shown.tissue, known, float(camera.K[0, 0]), shown.baseline)
         mask &= self._usable_right
         right = self._draw(shown.snapshot.gaussians, camera.moved_right(shown.baseline))
         truth = metrics.as_float(picture)

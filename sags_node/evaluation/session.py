@@ -111,6 +111,7 @@ def measure(
         "overrides": list(overrides),
         "pace": None if isinstance(config.source, V4l2Source) else config.source.pace,
         "iterations": config.mapping.iterations,
+        "right_eye": config.mapping.right_eye,
         "max_gaussians": capacity(config.mapping, *session.working_size),
         "backend": config.engine.backend,
         "seed": config.seed,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sags_node.types import F32, Observation
+from sags_node.types import F32, Bool
 
 EVERY = 8  # px
 COVERED = 0.5
@@ -13,18 +13,20 @@ LEAST_PIXELS = 50
 LARGEST = 1.5  # a larger change within one frame is another scene, not another exposure
 
 
-def exposure_gain(planes: F32, observation: Observation) -> F32:
-    """Factor [3] by which the picture is brighter than the model, for each channel.
+def exposure_gain(planes: F32, image: F32, tissue: Bool) -> F32:
+    """Factor [3] by which a picture is brighter than the model, for each channel.
 
     An endoscope's exposure follows what comes near, and all colours change at once; taking that as one gain
     spares the model to learn it Gaussian by Gaussian. The median does not see highlights and what is new.
 
     Args:
-        planes: [5, H, W] of the rasteriser, drawn as `observation` should see the model.
+        planes: [5, H, W] of the rasteriser, drawn for that picture.
+        image: [H, W, 3] RGB 0..1.
+        tissue: [H, W] where to compare.
     """
-    image = observation.image[::EVERY, ::EVERY]
+    image = image[::EVERY, ::EVERY]
     coverage = planes[4, ::EVERY, ::EVERY]
-    used = observation.tissue[::EVERY, ::EVERY] & (coverage > COVERED)
+    used = tissue[::EVERY, ::EVERY] & (coverage > COVERED)
     seen = image[used]
     drawn = planes[:3, ::EVERY, ::EVERY][:, used].T / coverage[used, None]
     fair = ((seen > DARK) & (seen < BRIGHT) & (drawn > DARK) & (drawn < BRIGHT)).all(-1)

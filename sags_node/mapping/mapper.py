@@ -14,6 +14,7 @@ from sags_node.mapping.exposure import exposure_gain
 from sags_node.mapping.focus import with_neighbours, worst_tiles
 from sags_node.mapping.motion import OpticalFlow, depth_pull, scene_flow
 from sags_node.mapping.optimiser import Optimiser, Rates
+from sags_node.mapping.right_eye import right_eye_loss
 from sags_node.model.alias_free import smoothing_variances
 from sags_node.model.deformation import Deformation, NodeDeformation
 from sags_node.model.gaussians import GaussianModel
@@ -82,9 +83,9 @@ class Mapper:
         self._frames_to_depth = 0  # since depth was known last
         self._loss = 0.0
         self._metres_per_px = 0.0  # at the tissue's median depth
-        self._v_planes: F32 = np.zeros((5, 1, 1), np.float32)
-        self._weight: F32 = np.zeros((1, 1), np.float32)
-        self._planes: F32 = np.zeros((5, 1, 1), np.float32)  # the rasteriser's memory: what it drew last
+        # [eyes, 5, H, W] and [eyes, H, W]; the planes are the rasteriser's memory: what it drew last
+        self._planes: F32 = np.zeros((1, 5, 1, 1), np.float32)
+        self._v_planes, self._weight = np.zeros_like(self._planes), np.zeros((1, 1, 1), np.float32)
 
     def update(self, observation: Observation, budget: Budget, still: int = 0) -> Snapshot:
         """Take one frame in. Call `drawn` with the picture of the snapshot before the next update.
@@ -151,7 +152,7 @@ class Mapper:
             self._sharpen(observation)
 
         planes = self._draw(observation)
-        gain = exposure_gain(planes, observation)
+        gain = exposure_gain(planes, observation.image, observation.tissue)
         if np.abs(gain - 1).max() > EXPOSURE_JUMP:
             self.model.colors[:] *= gain
             planes = self._draw(observation)
@@ -187,7 +188,7 @@ class Mapper:
         return {"inserted": 0, "removed": removed, "iterations": len(touched)}
 
     def _refine_worst(self, observation: Observation, nodes: bool = True) -> Bool:
-        tiles = worst_tiles(self._planes, observation.image, observation.tissue, self._focus)
+        tiles = worst_tiles(self._planes[0], observation.image, observation.tissue, self._focus)
         self._draw(observation, tiles)
         self._refine(observation, Rates(), nodes)
         return tiles
@@ -227,21 +228,31 @@ class Mapper:
         return bool(np.count_nonzero(observation.depth) >= MIN_FIRST_DEPTHS)
 
     def _draw(self, observation: Observation, tiles: Bool | None = None) -> F32:
-        self._planes = self._rasterizer.forward(self.model.gaussians(), [observation.camera], tiles)[0]
-        return self._planes
+        """Planes [5, H, W] of the left eye; the right one is drawn too where it is learnt from, except by
+        `tiles`: those are of the left eye."""
+        cameras = [observation.camera]
+        if observation.right is not None and tiles is None:
+            cameras.append(observation.camera.moved_right(observation.baseline))
+        self._planes = self._rasterizer.forward(self.model.gaussians(), cameras, tiles)
+        left: F32 = self._planes[0]
+        return left
 
     def _refine(self, observation: Observation, rates: Rates, nodes: bool = True) -> Gradients:
         """One step on what was drawn last: loss and its gradient, back-propagation, nodes, Gaussians."""
         assert self._deformation is not None
         planes = self._planes
-        if self._v_planes.shape != planes.shape:
+        eyes = len(planes)
+        if len(self._weight) < eyes or self._weight.shape[1:] != planes.shape[2:]:
             self._v_planes = np.zeros_like(planes)
-            self._weight = np.zeros(planes.shape[1:], np.float32)
+            self._weight = np.zeros((eyes, *planes.shape[2:]), np.float32)
+        v_planes, weight = self._v_planes[:eyes], self._weight[:eyes]
         self._loss = tissue_loss(
-            planes, observation.image, observation.tissue, observation.depth,
-            self._v_planes, self._weight, DEPTH_WEIGHT, DEPTH_SCALE,
+            planes[0], observation.image, observation.tissue, observation.depth,
+            v_planes[0], weight[0], DEPTH_WEIGHT, DEPTH_SCALE,
         )  # fmt: skip
-        gradients = self._rasterizer.backward(self._v_planes[None], self._weight[None])
+        if eyes > 1:
+            right_eye_loss(planes, observation, v_planes[1], weight[1])
+        gradients = self._rasterizer.backward(v_planes, weight)
         if nodes:  # they move all that follows them, also far from the tiles that were drawn
             self._deformation.descend(
                 self.model, gradients.means, gradients.contribution, NODE_STEP_PX * self._metres_per_px

@@ -8,8 +8,15 @@ import numpy as np
 from sags_node.types import F32, Bool, Observation, RectifiedPair
 
 
-def observe(pair: RectifiedPair, tissue: Bool, depth: F32, confidence: F32) -> Observation:
-    """Gather one frame's observation; `depth` and `confidence` [H, W] are those of `StereoDepth`."""
+def observe(
+    pair: RectifiedPair, tissue: Bool, depth: F32, confidence: F32, right_eye: bool = False
+) -> Observation:
+    """Gather one frame's observation.
+
+    Args:
+        depth, confidence: [H, W] those of `StereoDepth`.
+        right_eye: with the right eye's picture, where there is one.
+    """
     return Observation(
         frame_id=pair.frame_id,
         t_capture_ns=pair.t_capture_ns,
@@ -19,4 +26,6 @@ def observe(pair: RectifiedPair, tissue: Bool, depth: F32, confidence: F32) -> O
         tissue=tissue,
         depth=depth,
         depth_confidence=confidence,
+        right=pair.right * np.float32(1 / 255) if right_eye and pair.right is not None else None,
+        baseline=pair.baseline,
     )
