@@ -133,8 +133,11 @@ class Pipeline:
 
     def _draw_eyes(self, snapshot: Snapshot, baseline: float) -> dict[str, RenderedView]:
         """The left eye is drawn last: the mapper looks at what the rasteriser drew last."""
+        stale, before = self.mapper.stale_tiles, self._mapped
+        if before is not None and stale is not None and not stale.any():
+            return _restamped(before.views, snapshot.frame_id, snapshot.t_capture_ns)
         if not self._config.publish.right:
-            return {"left": self._draw(snapshot, snapshot.camera, self.mapper.stale_tiles)}
+            return {"left": self._draw(snapshot, snapshot.camera, stale)}
         right = self._draw(snapshot, snapshot.camera.moved_right(baseline))
         return {"left": self._draw(snapshot, snapshot.camera), "right": right}
 
@@ -166,6 +169,11 @@ def _rms_difference(a: RectifiedPair, b: RectifiedPair) -> float:
     return float(np.sqrt(max(squares)))
 
 
+def _restamped(views: dict[str, RenderedView], frame_id: int, stamp: int) -> dict[str, RenderedView]:
+    """Pictures of what has not changed since."""
+    return {eye: replace(view, frame_id=frame_id, t_capture_ns=stamp) for eye, view in views.items()}
+
+
 def _repeat(
     mapped: FrameResult, pair: RectifiedPair, epoch: int, timings: dict[str, float], anchors: AnchorStates
 ) -> FrameResult:
@@ -183,9 +191,7 @@ def _repeat(
             velocities=still,
             counts={"iterations": 0},
         ),
-        views={
-            eye: replace(view, frame_id=frame_id, t_capture_ns=stamp) for eye, view in mapped.views.items()
-        },
+        views=_restamped(mapped.views, frame_id, stamp),
         epoch=epoch,
         timings_ms=timings,
         skipped={**mapped.skipped, "frame": "equals its predecessor"},

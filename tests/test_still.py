@@ -16,7 +16,7 @@ from sags_node.engine.rasterize import make_rasterizer, to_view
 from sags_node.evaluation.metrics import psnr
 from sags_node.launch_file import load_launch
 from sags_node.mapping.budget import StepBudget
-from sags_node.mapping.mapper import SETTLED
+from sags_node.mapping.mapper import SETTLED, SETTLED_EVERY
 from sags_node.mapping.motion import OpticalFlow
 from sags_node.messaging.content import tells_of
 from sags_node.pipeline import Pipeline
@@ -205,9 +205,10 @@ def test_neither_depth_nor_flow_is_asked_for_until_something_moves(
         result = play.again(frames[4])
         assert set(result.skipped) == {"depth", "motion"}
         assert not result.snapshot.velocities.any()
-        settled += result.snapshot.counts["iterations"] == 1
-        assert result.snapshot.counts["iterations"] == (1 if turn >= SETTLED else 2)
-    assert calls == {"depth": 5, "flow": 4} and settled == 25 - SETTLED
+        steps = result.snapshot.counts["iterations"]
+        assert steps == 2 if turn < SETTLED else steps <= 1
+        settled += steps if turn >= SETTLED else 0
+    assert calls == {"depth": 5, "flow": 4} and settled - (25 - SETTLED) // SETTLED_EVERY in (0, 1)
     assert not play(frames[6]).skipped
     assert calls == {"depth": 6, "flow": 5}
 

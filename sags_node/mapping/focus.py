@@ -29,13 +29,18 @@ def worst_tiles(planes: F32, image: F32, tissue: Bool, share: float) -> Bool:
         tissue: [H, W] the pixels that count.
         share: of all tiles, 0..1; at least one is chosen.
     """
-    height, width = tissue.shape
-    sums = np.zeros((-(-height // TILE_HEIGHT), -(-width // TILE_WIDTH)), np.float32)
+    chosen = tile_grid(tissue)
+    sums = np.zeros(chosen.shape[1:], np.float32)
     _sum_residuals(planes, image, tissue, sums)
     count = max(1, round(share * sums.size))
-    chosen = np.zeros(sums.size, np.bool_)
-    chosen[np.argpartition(sums.ravel(), -count)[-count:]] = True
-    return chosen.reshape(1, *sums.shape)
+    chosen.ravel()[np.argpartition(sums.ravel(), -count)[-count:]] = True
+    return chosen
+
+
+def tile_grid(mask: Bool) -> Bool:
+    """The rasteriser's tiles [1, rows, columns] of a picture as large as `mask` [H, W]; none is chosen."""
+    height, width = mask.shape
+    return np.zeros((1, -(-height // TILE_HEIGHT), -(-width // TILE_WIDTH)), np.bool_)
 
 
 def with_neighbours(tiles: Bool) -> Bool:

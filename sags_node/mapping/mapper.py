@@ -11,7 +11,7 @@ from sags_node.engine.rasterize import Gradients, Rasterizer
 from sags_node.mapping import densify, initialise
 from sags_node.mapping.budget import Budget
 from sags_node.mapping.exposure import exposure_gain
-from sags_node.mapping.focus import with_neighbours, worst_tiles
+from sags_node.mapping.focus import tile_grid, with_neighbours, worst_tiles
 from sags_node.mapping.motion import OpticalFlow, depth_pull, scene_flow
 from sags_node.mapping.optimiser import Optimiser, Rates
 from sags_node.mapping.right_eye import right_eye_loss
@@ -26,6 +26,7 @@ HOLES = 200  # Gaussians per frame that may be added even when there are as many
 TORN = 0.02  # of the Gaussians: where more are removed at once, they leave holes
 EXPOSURE_JUMP = 0.01  # smaller changes of the gain are left to the colour steps
 SETTLED = 10  # frames: a model that has not changed for so long has little more to learn
+SETTLED_EVERY = 4  # frames: then it is refined so rarely
 FOCUS = 0.15  # of the picture; measured: half the gain of a whole step in a quarter of its time
 MIN_FIRST_DEPTHS = 200  # px
 LOST_RESIDUAL = 0.08  # mean over RGB and tissue, 0..1; a beating heart stays below half of it
@@ -180,11 +181,13 @@ class Mapper:
             return self._follow(observation, budget)  # damage: there are holes to be filled
         self.model.velocities[:] = 0
         removed = self.model.remove(doomed)
+        rests = settled and self._frames % SETTLED_EVERY > 0
         touched: list[Bool] = []
-        while not (settled and touched) and budget.more():
+        while not (rests or (settled and touched)) and budget.more():
             touched.append(self._refine_worst(observation, nodes=False))
-        if touched and removed == 0:
-            self.stale_tiles = with_neighbours(np.logical_or.reduce(touched))
+        if removed == 0:
+            untouched = tile_grid(observation.tissue)
+            self.stale_tiles = with_neighbours(np.logical_or.reduce([untouched, *touched]))
         return {"inserted": 0, "removed": removed, "iterations": len(touched)}
 
     def _refine_worst(self, observation: Observation, nodes: bool = True) -> Bool:
