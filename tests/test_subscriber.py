@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import json
+import signal
+import socket
+import subprocess
+import sys
+import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Self, cast
 
+import msgspec
 import numpy as np
 import pytest
 import zmq
@@ -16,12 +22,20 @@ from synthetic import HEIGHT, WIDTH, at_frame, health, plane_result, publisher, 
 
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import cdr
+from sags_node.messaging import stream as data_stream
 from sags_node.messaging.freshness import Freshness, StaleError
-from sags_node.messaging.received import ReceivedCameraInfo, ReceivedCloud, ReceivedImage, ReceivedText
+from sags_node.messaging.received import (
+    ReceivedCameraInfo,
+    ReceivedCloud,
+    ReceivedImage,
+    ReceivedText,
+    TopicName,
+)
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.messaging.wire import Message, Meta, encode
 
 MS = 1_000_000
+ROOT = Path(__file__).parent.parent
 
 
 def meta(seq: int, stamp_ms: float, **changes: Any) -> Meta:
@@ -255,6 +269,205 @@ def test_mistakes_are_named(tmp_path: Path) -> None:
         Subscriber(["tf"], run_dir=tmp_path)
     with pytest.raises(SagsError, match="cannot connect to 127"):
         Subscriber(["tf"], endpoint="127.0.0.1:5556")
+
+
+# ---- typed names, and memory ---------------------------------------------------------------------------
+
+
+def test_typed_names_need_no_cast(tmp_path: Path) -> None:
+    """A program of a user who lets mypy check everything."""
+    program = tmp_path / "program.py"
+    program.write_text(
+        """
+from typing import assert_type
+from sags_node.messaging.async_subscriber import AsyncSubscriber
+from sags_node.messaging.received import Frame, Received, ReceivedCloud, ReceivedImage, TopicName
+from sags_node.messaging.subscriber import Subscriber
+
+depth, splats = TopicName("left/render/depth", ReceivedImage), TopicName("splats", ReceivedCloud)
+with Subscriber([depth, splats]) as subscriber:
+    assert_type(subscriber.wait(depth, 1.0), ReceivedImage | None)
+    assert_type(subscriber.latest(splats), ReceivedCloud | None)
+    assert_type(subscriber.read(splats), ReceivedCloud)
+    assert_type(subscriber.read("splats"), Received)
+    frame = subscriber.aligned([depth, splats], subscriber.read(depth).stamp_ns)
+    assert_type(frame, Frame | None)
+    if frame is not None:
+        assert_type(frame[splats], ReceivedCloud)
+
+async def follow() -> None:
+    async with AsyncSubscriber([depth]) as subscriber:
+        assert_type(await subscriber.wait(depth, 1.0), ReceivedImage | None)
+        async for message in subscriber.messages(depth):
+            assert_type(message, ReceivedImage)
+"""
+    )
+    checked = subprocess.run(
+        [sys.executable, "-m", "mypy", "--strict", program],
+        cwd=ROOT, check=False, capture_output=True, text=True,
+    )  # fmt: skip
+    assert checked.returncode == 0, checked.stdout + checked.stderr
+
+
+def test_a_typed_name_is_a_name_of_that_type() -> None:
+    assert TopicName("left/render/depth", ReceivedImage) == "left/render/depth"
+    assert TopicName("view/mine/depth", ReceivedImage) == "view/mine/depth"
+    with pytest.raises(UsageError, match="'splats' brings ReceivedCloud, not ReceivedImage"):
+        TopicName("splats", ReceivedImage)
+    with pytest.raises(UsageError, match="did you mean 'splats'"):
+        TopicName("splat", ReceivedCloud)
+
+
+def test_arrays_are_the_received_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures and clouds are not copied between ZeroMQ and the consumer."""
+    parts: list[np.ndarray] = []
+
+    def receive_frames(socket: zmq.Socket[bytes], most: int) -> list[zmq.Frame]:
+        frames = receive(socket, most)
+        parts.extend(np.frombuffer(frame.buffer, np.uint8) for frame in frames)
+        return frames
+
+    receive = data_stream.receive_frames
+    monkeypatch.setattr(data_stream, "receive_frames", receive_frames)
+    picture, splats = TopicName("left/image_rect_color", ReceivedImage), TopicName("splats", ReceivedCloud)
+    with publisher(tmp_path / "run") as running, stream(running):
+        with Subscriber([picture, splats], run_dir=tmp_path / "run") as subscriber:
+            image, cloud = subscriber.wait(picture, 10), subscriber.wait(splats, 10)
+    assert image is not None and cloud is not None
+    for array in (image.array, cloud.points):
+        assert any(np.shares_memory(array, part) for part in parts)
+        assert not array.flags.writeable
+
+
+# ---- a node that dies ----------------------------------------------------------------------------------
+
+
+@contextmanager
+def _node(run_dir: Path, session: str, port: int, ipc: bool = False) -> Iterator[subprocess.Popen[bytes]]:
+    """A publisher in its own process, which ends with SIGKILL and so leaves its files behind."""
+    program = (
+        "import time; from pathlib import Path; from synthetic import publisher, stream\n"
+        f"data = ('tcp://127.0.0.1:{port or '*'}',)\n"
+        f"with publisher(Path({str(run_dir)!r}), data=data, ipc={ipc}) as running:\n"
+        f"    running.session = {session!r}\n"
+        "    with stream(running):\n"
+        "        time.sleep(60)\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", program], cwd=Path(__file__).parent)
+    try:
+        yield process
+    finally:
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@pytest.mark.parametrize(
+    ("by_file", "ipc", "moves"),
+    [(False, False, False), (True, True, False), (True, False, True)],
+    ids=["same port", "ipc", "another port"],
+)
+def test_a_killed_node_is_followed(tmp_path: Path, by_file: bool, ipc: bool, moves: bool) -> None:
+    run_dir, port = tmp_path / "run", _free_port()
+    where = {} if by_file else {"endpoint": f"tcp://127.0.0.1:{port}"}
+    with _node(run_dir, "first", port, ipc):
+        _until((run_dir / "sags.json").exists)
+        subscriber = Subscriber(["tf"], run_dir=run_dir, **where)
+        found = subscriber.wait("tf", 10)
+        assert found is not None and found.meta.session == "first"
+    with subscriber:
+        _until(lambda: not subscriber.ok("tf"))
+        before = subscriber.endpoint
+        with _node(run_dir, "second", _free_port() if moves else port, ipc):
+            _until(
+                lambda: (newest := subscriber.latest("tf")) is not None and newest.meta.session == "second"
+            )
+            _until(lambda: subscriber.ok("tf"))
+        assert (subscriber.endpoint != before) == moves
+        assert subscriber.lost("tf") == 0
+
+
+def test_a_connection_that_died_without_a_word_is_made_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A machine that lost its power closes nothing: only a missing heartbeat tells."""
+    monkeypatch.setattr(data_stream, "HEARTBEAT_MS", 100)
+    monkeypatch.setattr(data_stream, "HEARTBEAT_TIMEOUT_MS", 300)
+    with publisher(tmp_path / "run", ipc=False) as running, stream(running):
+        with Cable(running.connection.data[0]) as cable:
+            with Subscriber(["tf"], endpoint=cable.endpoint) as subscriber:
+                assert subscriber.wait("tf", 10) is not None
+                cable.cut()
+                _until(lambda: not subscriber.ok("tf"))
+                _until(lambda: subscriber.ok("tf"))
+                assert cable.connections == 2
+
+
+class Cable:
+    """Passes connections on. Those that are open when it is cut stay open, and silent."""
+
+    def __init__(self, endpoint: str) -> None:
+        host, port = endpoint.removeprefix("tcp://").split(":")
+        self._far = (host, int(port))
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.endpoint = f"tcp://127.0.0.1:{self._listener.getsockname()[1]}"
+        self.connections = 0
+        self._open: list[socket.socket] = []
+        self._cut = threading.Event()
+        self._threads = [threading.Thread(target=self._accept)]
+        self._threads[0].start()
+
+    def cut(self) -> None:
+        self._cut.set()
+        self._cut = threading.Event()
+
+    def _accept(self) -> None:
+        while True:
+            try:
+                near, _ = self._listener.accept()
+            except OSError:
+                return
+            far = socket.create_connection(self._far)
+            self.connections += 1
+            self._open += [near, far]
+            for source, target in ((near, far), (far, near)):
+                passing = threading.Thread(target=self._pass, args=(source, target, self._cut))
+                self._threads.append(passing)
+                passing.start()
+
+    @staticmethod
+    def _pass(source: socket.socket, target: socket.socket, cut: threading.Event) -> None:
+        try:
+            while (data := source.recv(65536)) and not cut.is_set():
+                target.sendall(data)
+        except OSError:
+            return
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for one in (self._listener, *self._open):
+            with suppress(OSError):
+                one.shutdown(socket.SHUT_RDWR)
+            one.close()
+        for thread in self._threads:
+            thread.join()
+
+
+def test_a_node_that_wants_keys_after_its_restart_says_so(tmp_path: Path) -> None:
+    run_dir = tmp_path / "run"
+    with publisher(run_dir, ipc=False) as running:
+        known, subscriber = running.connection, Subscriber(["tf"], run_dir=run_dir)
+    with subscriber:
+        with_keys = msgspec.json.encode(msgspec.structs.replace(known, public_key="k" * 40))
+        (run_dir / "sags.json").write_bytes(with_keys)
+        _until(lambda: "wants a key" in str(subscriber.problem("tf")))
 
 
 def _until(condition: Any) -> None:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Generic, Self, TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sags_node.errors import UsageError
+from sags_node.geometry import quat_to_matrix
 from sags_node.messaging import cdr, topics
+from sags_node.messaging.stream import check_topic
 from sags_node.messaging.wire import Message, Meta, WireError
 from sags_node.types import F64
 
@@ -62,6 +65,59 @@ class ReceivedText(Received):
 @dataclass(frozen=True, slots=True)
 class ReceivedRos(Received):
     message: Any  # a ROS message object of a type without a class of its own here: tf, diagnostics
+
+    def pose(self) -> F64:
+        """The only transform of a `tf` message, child to parent frame, [4, 4], m.
+
+        Raises:
+            WireError: it has none, or several.
+        """
+        transforms: Any = getattr(self.message, "transforms", ())
+        if len(transforms) != 1:
+            raise WireError(f"{self.topic}: {len(transforms)} transforms, expected one")
+        moved = transforms[0].transform
+        T = np.eye(4)
+        T[:3, :3] = quat_to_matrix(np.array([getattr(moved.rotation, axis) for axis in "wxyz"]))
+        T[:3, 3] = [getattr(moved.translation, axis) for axis in "xyz"]
+        return T
+
+
+R = TypeVar("R", bound=Received)
+_KINDS: dict[str, type[Received]] = {
+    topics.IMAGE: ReceivedImage,
+    topics.POINT_CLOUD: ReceivedCloud,
+    topics.CAMERA_INFO: ReceivedCameraInfo,
+    topics.STRING: ReceivedText,
+}
+
+
+class TopicName(str, Generic[R]):
+    """A topic's name that tells type checkers what comes on it: `depth.array` then needs no cast.
+
+    depth = subscriber.read(TopicName("left/render/depth", ReceivedImage))
+
+    Raises:
+        UsageError: there is no such topic, or something else comes on it.
+    """
+
+    __slots__ = ()
+
+    def __new__(cls, name: str, kind: type[R]) -> Self:
+        comes = _KINDS.get(check_topic(name).type, ReceivedRos)
+        if comes is not kind:
+            raise UsageError(f"'{name}' brings {comes.__name__}, not {kind.__name__}")
+        return super().__new__(cls, name)
+
+
+class Frame(dict[str, Received]):
+    """Messages that show the same captured frame, by topic."""
+
+    @overload
+    def __getitem__(self, name: TopicName[R]) -> R: ...
+    @overload
+    def __getitem__(self, name: str) -> Received: ...
+    def __getitem__(self, name: str) -> Received:
+        return super().__getitem__(name)
 
 
 def interpret(message: Message, received_ns: int) -> Received:

@@ -3,6 +3,8 @@
 with Subscriber(["left/render/depth"]) as subscriber:
     depth = subscriber.wait("left/render/depth", timeout=1.0)
     subscriber.read("left/render/depth")  # raises StaleError when it must not be shown as new
+
+`received.TopicName` in place of a plain name makes the results typed; `async_subscriber` is for asyncio.
 """
 
 from __future__ import annotations
@@ -10,18 +12,20 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import ExitStack
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Self, overload
 
 import msgspec
 
+from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import topics
-from sags_node.messaging.address import ClientKeys, find_data
+from sags_node.messaging.address import Address, ClientKeys, find_data
 from sags_node.messaging.freshness import Freshness, StaleError
-from sags_node.messaging.received import Received, ReceivedText, interpret
+from sags_node.messaging.received import Frame, R, Received, ReceivedText, TopicName, interpret
 from sags_node.messaging.stream import POLL_MS, check_topic, data_socket, receive
 from sags_node.messaging.wire import WireError
 
@@ -33,11 +37,11 @@ class _Status(msgspec.Struct):
     state: str = ""
 
 
-class Subscriber:
-    """Receives topics in the background; `latest`, `read`, `wait` and `aligned` give what has come.
+class Receiver:
+    """What `Subscriber` and `AsyncSubscriber` have in common: everything but the waiting.
 
-    `status` is always received too: a sender that says it is not running makes every topic stale.
-    ZeroMQ reconnects by itself when the node is restarted.
+    `status` is always received too: a sender that says it is not running makes every topic stale. A node
+    that is restarted is followed, to another port, too, when it was found by its connection file.
 
     Args:
         names: topics without the namespace.
@@ -63,8 +67,6 @@ class Subscriber:
     ) -> None:
         wanted = [check_topic(name) for name in dict.fromkeys([*names, "status"])]
         rates = rates or {}
-        address = find_data(endpoint, ns, run_dir, keys)
-        self.endpoint = address.endpoint
         self.refusal: str | None = None  # why the node does not let this client in
         self.rejected = 0  # messages that were none, or whose content does not fit its description
         self._ns = ns
@@ -73,20 +75,35 @@ class Subscriber:
         self._types = {topic.name: topic.type for topic in wanted}
         self._kept: dict[str, deque[Received]] = {topic.name: deque(maxlen=KEPT) for topic in wanted}
         self._arrived = threading.Condition()
+        self._wakes: list[Callable[[], None]] = []
         self._stopping = threading.Event()
         self._prefixes = {topics.full_name(ns, name): name for name in self._kept}
+        self._find = partial(find_data, endpoint, ns, run_dir, keys)
         self._resources = ExitStack()  # holds the socket; only the receiver thread uses it once it runs
-        self._socket, self._watch = self._resources.enter_context(data_socket(address, list(self._prefixes)))
+        self._connect(self._find())
         self._thread = threading.Thread(target=self._receive_all, name="sags-subscriber", daemon=True)
         self._thread.start()
 
+    @property
+    def endpoint(self) -> str:
+        """Where the node is, or was when it was last heard of."""
+        return self._address.endpoint
+
     # ---- what has come ---------------------------------------------------------------------------------
 
+    @overload
+    def latest(self, name: TopicName[R]) -> R | None: ...
+    @overload
+    def latest(self, name: str) -> Received | None: ...
     def latest(self, name: str) -> Received | None:
         """The newest message of a topic, however old it is."""
         with self._arrived:
             return self._newest(name)
 
+    @overload
+    def read(self, name: TopicName[R], max_age: float | None = None) -> R: ...
+    @overload
+    def read(self, name: str, max_age: float | None = None) -> Received: ...
     def read(self, name: str, max_age: float | None = None) -> Received:
         """The newest message of a topic, if it may be shown as new.
 
@@ -100,37 +117,6 @@ class Subscriber:
         if problem is not None or newest is None:
             raise StaleError(f"{topics.full_name(self._ns, name)} is stale: {problem}")
         return newest
-
-    def wait(self, name: str, timeout: float, after: Received | None = None) -> Received | None:
-        """The newest message of a topic once there is one newer than `after`; None after `timeout` s."""
-
-        def newer() -> bool:
-            newest = self._newest(name)
-            return newest is not None and (after is None or newest.meta != after.meta)
-
-        with self._arrived:
-            return self._newest(name) if self._arrived.wait_for(newer, timeout) else None
-
-    def aligned(
-        self, names: Iterable[str], stamp_ns: int, timeout: float = 0.0
-    ) -> dict[str, Received] | None:
-        """The messages of several topics that show the frame captured at `stamp_ns`.
-
-        None when one of them has not come within `timeout` seconds.
-        """
-        names = list(names)
-
-        def found() -> dict[str, Received] | None:
-            matches = {
-                name: message
-                for name in names
-                for message in self._kept[name]
-                if message.stamp_ns == stamp_ns
-            }
-            return matches if len(matches) == len(names) else None
-
-        with self._arrived:
-            return self._arrived.wait_for(found, timeout)
 
     def problem(self, name: str, max_age: float | None = None) -> str | None:
         """Why a strict `read` of this topic would raise; None when it would not."""
@@ -151,9 +137,29 @@ class Subscriber:
         with self._arrived:
             return self._fresh[name].period
 
+    @contextmanager
+    def notified(self, wake: Callable[[], None]) -> Iterator[None]:
+        """Within, the receiver thread calls `wake` for every message that comes; it must be quick."""
+        with self._arrived:
+            self._wakes.append(wake)
+        try:
+            yield
+        finally:
+            with self._arrived:
+                self._wakes.remove(wake)
+
     def _newest(self, name: str) -> Received | None:
         kept = self._kept[name]
         return kept[-1] if kept else None
+
+    def _newer(self, name: str, after: Received | None) -> Received | None:
+        newest = self._newest(name)
+        return None if newest is None or (after is not None and newest.meta == after.meta) else newest
+
+    def _frame(self, names: list[str], stamp_ns: int) -> Frame | None:
+        kept = ((name, message) for name in names for message in self._kept[name])
+        matches = Frame((name, message) for name, message in kept if message.stamp_ns == stamp_ns)
+        return matches if len(matches) == len(names) else None
 
     def _problem(self, name: str, max_age: float | None) -> str | None:
         problem = self._fresh[name].problem(self._clock_ns(), max_age)
@@ -178,12 +184,30 @@ class Subscriber:
 
     # ---- the receiver thread ---------------------------------------------------------------------------
 
+    def _connect(self, address: Address) -> None:
+        resources = ExitStack()
+        self._socket, self._watch = resources.enter_context(data_socket(address, list(self._prefixes)))
+        self._resources.close()
+        self._resources, self._address = resources, address
+
     def _receive_all(self) -> None:
         while not self._stopping.is_set():
             if self._socket.poll(POLL_MS):
                 self._receive_one()
             else:
-                self.refusal = self._watch.refusal()
+                self._look_for_node()
+
+    def _look_for_node(self) -> None:
+        """Nothing comes: the node may have been restarted elsewhere, or not let this client in."""
+        self.refusal = self._watch.refusal()
+        try:
+            address = self._find()
+            if address != self._address:
+                self._connect(address)
+        except UsageError as error:  # the new one wants keys, or wants none any more
+            self.refusal = str(error)
+        except SagsError:  # there is none; ZeroMQ goes on trying where the last one was
+            return
 
     def _receive_one(self) -> None:
         try:
@@ -200,12 +224,39 @@ class Subscriber:
             if self._fresh[name].accept(received.meta):
                 self._kept[name].append(received)
                 self._arrived.notify_all()
+                for wake in self._wakes:
+                    wake()
 
     def close(self) -> None:
         """End the receiver thread; what has come stays readable."""
         self._stopping.set()
         self._thread.join()
         self._resources.close()
+
+
+class Subscriber(Receiver):
+    """Receives topics in the background; `latest`, `read`, `wait` and `aligned` give what has come.
+
+    Arguments and errors: see `Receiver`. Any number of threads may ask.
+    """
+
+    @overload
+    def wait(self, name: TopicName[R], timeout: float, after: Received | None = None) -> R | None: ...
+    @overload
+    def wait(self, name: str, timeout: float, after: Received | None = None) -> Received | None: ...
+    def wait(self, name: str, timeout: float, after: Received | None = None) -> Received | None:
+        """The newest message of a topic once there is one newer than `after`; None after `timeout` s."""
+        with self._arrived:
+            return self._arrived.wait_for(lambda: self._newer(name, after), timeout)
+
+    def aligned(self, names: Iterable[str], stamp_ns: int, timeout: float = 0.0) -> Frame | None:
+        """The messages of several topics that show the frame captured at `stamp_ns`.
+
+        None when one of them has not come within `timeout` seconds.
+        """
+        wanted = list(names)
+        with self._arrived:
+            return self._arrived.wait_for(lambda: self._frame(wanted, stamp_ns), timeout)
 
     def __enter__(self) -> Self:
         return self
