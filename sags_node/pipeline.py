@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -169,7 +169,7 @@ def _rms_difference(a: RectifiedPair, b: RectifiedPair) -> float:
     return float(np.sqrt(max(squares)))
 
 
-def _restamped(views: dict[str, RenderedView], frame_id: int, stamp: int) -> dict[str, RenderedView]:
+def _restamped(views: Mapping[str, RenderedView], frame_id: int, stamp: int) -> dict[str, RenderedView]:
     """Pictures of what has not changed since."""
     return {eye: replace(view, frame_id=frame_id, t_capture_ns=stamp) for eye, view in views.items()}
 

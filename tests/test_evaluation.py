@@ -210,6 +210,7 @@ def test_a_perfect_model_is_measured_as_perfect(frames: list[StereoFrame]) -> No
     assert summary["online"]["ssim"] > 0.999
     assert summary["predict"]["psnr"] > 45  # rounding to grey levels alone is 58 dB
     assert summary["heldout"]["psnr"] > 45
+    assert summary["between"]["psnr"] > 45 > summary["between"]["mean_psnr"] + 3
     assert summary["novel"]["psnr"] > 45  # despite the other exposure, and the instrument
     assert summary["depth"]["median_mm"] < 0.01
     assert summary["depth"]["coverage"] > 0.99
@@ -224,6 +225,7 @@ def test_prediction_uses_velocities_and_their_share(frames: list[StereoFrame]) -
     still = summary_of(measured_run(frames, np.zeros(3)))
     for group in ("predict", "heldout"):
         assert exact[group]["psnr"] > taken_whole[group]["psnr"] + 3 > still[group]["psnr"] + 6
+    assert still["between"] == exact["between"]  # both frames around are known: no velocity is needed
     assert still["predict"]["psnr"] == pytest.approx(still["predict"]["copy_psnr"], abs=1.5)
     assert exact["online"] == still["online"]
 

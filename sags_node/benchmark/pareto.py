@@ -30,8 +30,8 @@ from sags_node.warm_up import warm_up
 
 SHORTEST = 3  # frames: the first one, in which the model is made, has times of its own
 KEPT = (
-    "frame_ms", "stage_ms", "rate_hz", "iterations_per_frame", "online", "predict", "heldout", "novel",
-    "depth", "measured_depth", "track", "gaussians", "skipped",
+    "frame_ms", "stage_ms", "rate_hz", "iterations_per_frame", "online", "predict", "heldout", "between",
+    "novel", "depth", "measured_depth", "track", "gaussians", "skipped",
 )  # fmt: skip
 
 Row = dict[str, Any]

@@ -16,7 +16,7 @@ from sags_node.evaluation.gallery import Gallery
 from sags_node.evaluation.lpips import Lpips
 from sags_node.evaluation.spool import RunFacts, Spool, SpooledFrame
 from sags_node.evaluation.tracking import PointTracks, TrackErrors
-from sags_node.evaluation.views import extrapolated
+from sags_node.evaluation.views import between, extrapolated
 from sags_node.mapping.right_eye import right_eye_mask
 from sags_node.types import F32, U8, Bool, Camera, Gaussians, RectifiedPair, Reference, StereoFrame
 from sags_node.vision.rectify import Rectifier
@@ -56,7 +56,9 @@ class FrameRow:
 
     frame_id: int
     seconds: float  # on the recording's clock
-    figures: dict[str, Figures]  # online, predict, heldout, novel, depth, measured_depth: those that apply
+    figures: dict[
+        str, Figures
+    ]  # online, predict, heldout, between, novel, depth, measured_depth: those that apply
     facts: RunFacts | None = None  # None: held out, or dropped by the run
     track: TrackErrors | None = None
 
@@ -68,6 +70,16 @@ class _Before:
     shown: SpooledFrame
     truth: F32
     seconds: float  # on the recording's clock
+
+
+@dataclass(slots=True)
+class _HeldOut:
+    """A frame that was not mapped, until the next one was."""
+
+    row: FrameRow
+    camera: Camera
+    truth: F32
+    tissue: Bool
 
 
 class Measurer:
@@ -108,6 +120,7 @@ class Measurer:
         self._usable_right: Bool | None = None
         self._tracks: PointTracks | None = None
         self._before: _Before | None = None
+        self._held: _HeldOut | None = None
 
     def run(self, frames: Iterable[StereoFrame], progress: Progress) -> None:
         """Measure all frames of the recording that the run was played from."""
@@ -139,7 +152,10 @@ class Measurer:
                 figures |= _depth_figures(shown, frame.reference.depth)
             track = self._follow(shown, frame.reference)
         self.gallery.offer(place, shown, pair.left, figures["online"]["psnr"])
-        self._before = _Before(shown, truth, seconds)
+        after = _Before(shown, truth, seconds)
+        if self._held is not None and self._before is not None:
+            self._held.row.figures["between"] = self._between(self._before, self._held, after)
+        self._held, self._before = None, after
         return FrameRow(frame.frame_id, seconds, figures, shown.facts, track)
 
     def _predict(self, before: _Before, shown: SpooledFrame, truth: F32, seconds: float) -> Figures:
@@ -153,9 +169,22 @@ class Measurer:
 
     def _held_out(self, frame: StereoFrame, pair: RectifiedPair, seconds: float, before: _Before) -> FrameRow:
         guess = self._draw(extrapolated(before.shown.snapshot, seconds - before.seconds), pair.camera)
-        tissue = self._tissue_of(frame, pair)
-        quality = self._quality(guess, metrics.as_float(pair.left), tissue, costly=True)
-        return FrameRow(frame.frame_id, seconds, {"heldout": quality})
+        tissue, truth = self._tissue_of(frame, pair), metrics.as_float(pair.left)
+        quality = self._quality(guess, truth, tissue, costly=True)
+        row = FrameRow(frame.frame_id, seconds, {"heldout": quality})
+        self._held = _HeldOut(row, pair.camera, truth, tissue)
+        return row
+
+    def _between(self, before: _Before, held: _HeldOut, after: _Before) -> Figures:
+        """A held-out frame, drawn when the next one is known; beside it the mean of both pictures."""
+        share = (held.row.seconds - before.seconds) / (after.seconds - before.seconds)
+        states = before.shown.snapshot.gaussians, after.shown.snapshot.gaussians
+        guess = self._draw(between(*states, share), held.camera)
+        mean = before.truth + np.float32(share) * (after.truth - before.truth)
+        return {
+            "psnr": metrics.psnr(guess, held.truth, held.tissue),
+            "mean_psnr": metrics.psnr(mean, held.truth, held.tissue),
+        }
 
     def _quality(self, picture: F32, truth: F32, tissue: Bool, costly: bool) -> Figures:
         figures = {

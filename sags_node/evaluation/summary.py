@@ -19,6 +19,7 @@ GROUPS = {
     "online": ("psnr", "ssim", "lpips"),
     "predict": ("psnr", "copy_psnr"),
     "heldout": ("psnr", "ssim", "lpips"),
+    "between": ("psnr", "mean_psnr"),
     "novel": ("psnr",),
     "depth": ("median_mm", "p90_mm", "rmse_mm", "coverage"),
     "measured_depth": ("median_mm", "p90_mm", "rmse_mm", "coverage"),
@@ -38,6 +39,7 @@ def summarise(
     A figure of quality is the mean over the frames that have it, and again over each named segment
     (`online.motion.psnr`; first and last frame belong to it). Track errors are pooled over points and frames.
     `predict.copy_psnr` is the picture before, shown again: on tissue that hardly moves it is hard to beat.
+    `between` is `heldout` once the next frame is known; `between.mean_psnr` the mean of the pictures around.
     """
     facts = [row.facts for row in rows if row.facts is not None]
     held_out = sum(options.holds_out(row.frame_id) for row in rows)

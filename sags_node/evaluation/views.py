@@ -15,3 +15,18 @@ def extrapolated(snapshot: Snapshot, seconds: float) -> Gaussians:
     """The Gaussians `seconds` after the snapshot, by 0.8 times their last observed velocity."""
     means = snapshot.gaussians.means + snapshot.velocities * np.float32(VELOCITY_SHARE * seconds)
     return replace(snapshot.gaussians, means=means)
+
+
+def between(before: Gaussians, after: Gaussians, share: float) -> Gaussians:
+    """The Gaussians of a moment that was not mapped, once the next one was: places and colours lie on the
+    line between the two, `share` of the way from the earlier to the later, 0..1. What the earlier one has
+    not yet is as in the later one."""
+    order = np.argsort(before.ids)
+    places = order[np.minimum(np.searchsorted(before.ids[order], after.ids), len(order) - 1)]
+    shared = before.ids[places] == after.ids
+    left = np.where(shared, np.float32(1 - share), np.float32(0))[:, None]
+    return replace(
+        after,
+        means=after.means + left * (before.means[places] - after.means),
+        colors=after.colors + left * (before.colors[places] - after.colors),
+    )
