@@ -344,6 +344,38 @@ def bench_endurance(
     write_json(out, measured)
 
 
+@bench.command("tracking")
+@launch_argument
+@click.option(
+    "--frames", "numbers", default="10,40,70,90", show_default=True, help="After how many frames to measure."
+)
+@table_option
+@as_json
+def bench_tracking(launch: tuple[str, ...], numbers: str, out: Path | None, json_out: bool) -> None:
+    """How well anchors stay on the tissue.
+
+    Pins anchors all over the first frame of a recording, follows them with one step of the mapper a frame,
+    and compares with direct optical flow between the first and a later frame, where that is consistent.
+    The model's Gaussians beside them.
+
+    \b
+    sags bench tracking launch/d4d_pull.yaml --out benchmarks/results/tracking_d4d.json
+    """
+    from sags_node.benchmark import tracking
+
+    if not all(number.strip().isdigit() and int(number) > 0 for number in numbers.split(",")):
+        raise UsageError(f"--frames {numbers}: give numbers above 0 with commas between, e.g. 10,40")
+    path, overrides = split_recording(
+        launch, "sags bench tracking plays recordings; record the cameras first"
+    )
+    check_files(out)
+    session = open_launched(path, [*overrides, "source.loop:=false", "source.pace:=step"])
+    with progress("following") as advance:
+        measured = tracking.measure_tracking(session, [int(n) for n in numbers.split(",")], advance)
+    show(measured if json_out else tracking.table(measured))
+    write_json(out, measured)
+
+
 @bench.command("transport")
 @click.option("--frames", type=click.IntRange(1), default=150, show_default=True, help="Of each transport.")
 @as_json

@@ -153,7 +153,7 @@ class Measurer:
             track = self._follow(shown, frame.reference)
         self.gallery.offer(place, shown, pair.left, figures["online"]["psnr"])
         after = _Before(shown, truth, seconds)
-        if self._held is not None and self._before is not None:
+        if self._held is not None and self._before is not None and seconds > self._before.seconds:
             self._held.row.figures["between"] = self._between(self._before, self._held, after)
         self._held, self._before = None, after
         return FrameRow(frame.frame_id, seconds, figures, shown.facts, track)

@@ -1,0 +1,38 @@
+"""`sags bench tracking`: its truth, and what it says of the node on the phantom."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sags_node.benchmark.tracking import measure_tracking, table
+from sags_node.errors import SagsError
+from sags_node.mapping.anchors import Anchors
+from sags_node.session import Session, open_session
+
+SESSION = Path(__file__).parent.parent / "replay/phantom_pull"
+
+
+def opened() -> Session:
+    return open_session(SESSION, ["source.pace:=step", "source.loop:=false"])
+
+
+def test_anchors_stay_where_the_flow_goes() -> None:
+    measured = measure_tracking(opened(), [4, 12], lambda done, of, what: None)
+    for row in measured["frames"]:
+        assert row["anchors"] > 10 and row["gaussians"] > 1000
+        assert row["anchors_px"]["p50"] < 0.3 and row["gaussians_px"]["p50"] < 0.8
+    assert measured["frames"][1]["motion_px"]["p90"] > 1.5  # they had to move
+    assert table(measured).row_count == 2
+
+
+def test_anchors_that_stand_still_are_seen_to_be_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Anchors, "update", lambda self, *arguments: None)
+    row = measure_tracking(opened(), [12], lambda done, of, what: None)["frames"][0]
+    assert row["anchors_px"]["p90"] == pytest.approx(row["motion_px"]["p90"], rel=0.1)
+    assert np.isfinite(row["gaussians_px"]["p90"])
+
+
+def test_a_recording_that_is_too_short_is_named() -> None:
+    with pytest.raises(SagsError, match="ends before frame 5000"):
+        measure_tracking(opened(), [2, 5000], lambda done, of, what: None)
