@@ -27,8 +27,11 @@ from sags_node.apps.launching import (
 from sags_node.apps.terminal import check_folder, console, progress, show
 from sags_node.cli_bag import bag
 from sags_node.cli_bench import bench
+from sags_node.cli_calib import calib
 from sags_node.cli_consumers import overlay, topic
+from sags_node.cli_export import export
 from sags_node.cli_offline import evaluate, fit
+from sags_node.cli_view import view
 from sags_node.errors import SagsError, UsageError
 
 
@@ -125,7 +128,7 @@ def demo(launch: tuple[str, ...], seconds: float, out: Path, json_out: bool) -> 
         forced = ["source.loop:=true", "source.pace:=realtime", f"source.frames:={frames}"]
         forced += [
             "publish.data:=[tcp://127.0.0.1:*]",
-            "publish.control:=null",
+            "publish.control:=tcp://127.0.0.1:*",
             f"publish.run_dir:={private}",
         ]
         session = open_session(path, [*forced, *overrides])
@@ -200,27 +203,5 @@ def doctor(launch: tuple[str, ...], json_out: bool) -> None:
         raise SagsError("something the node needs is missing; see the mends above")
 
 
-@main.group()
-def calib() -> None:
-    """Work with camera calibrations."""
-
-
-@calib.command("check")
-@click.argument("folder", type=click.Path(path_type=Path))
-@as_json
-def calib_check(folder: Path, json_out: bool) -> None:
-    """Look over a calibration for what usually goes wrong.
-
-    FOLDER holds left.yaml and right.yaml (ROS camera_info).
-    """
-    from sags_node.calibration import check_rig, read_rig
-
-    findings = check_rig(read_rig(folder))
-    rows = [asdict(finding) for finding in findings]
-    show(rows if json_out else text.rows_table(rows))
-    if any(finding.level == "error" for finding in findings):
-        raise SagsError(f"{folder} cannot be used as it is; see the mends above")
-
-
-for command in (evaluate, fit, bag, bench, overlay, topic):
+for command in (evaluate, fit, export, bag, bench, calib, overlay, view, topic):
     main.add_command(command)

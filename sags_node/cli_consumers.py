@@ -44,29 +44,47 @@ def keys_options(command: Callable[..., None]) -> Callable[..., None]:
 
 @click.command()
 @endpoint_option
+@click.option("--control", metavar="ENDPOINT", help="Control socket of the node; needed with --endpoint.")
 @ns_option
 @keys_options
-@click.option("--pin", type=(float, float), metavar="U V", help="Tissue pixel to pin to; default: centre.")
+@click.option(
+    "--scene",
+    metavar="FILE.yaml",
+    type=click.Path(path_type=Path),
+    help="Meshes, points and labels, and the anchors that hold them; default: a built-in target.",
+)
+@click.option(
+    "--pin", type=(float, float), metavar="U V", help="Pixel of the target; default: middle of tissue."
+)
+@click.option("--repin", is_flag=True, help="Pin again where it was after the model was started anew.")
+@click.option(
+    "--max-age",
+    type=positive,
+    default=0.5,
+    show_default=True,
+    help="Seconds after which an overlay is blanked.",
+)
+@click.option(
+    "--show-latency", is_flag=True, help="Write the time from capture to overlay into the left eye."
+)
+@click.option("--own-ns", default="overlay", show_default=True, help="Namespace of what is published here.")
+@click.option(
+    "--run-dir",
+    type=click.Path(path_type=Path),
+    help="Of the connection files, the node's and this overlay's; default: that of the node.",
+)
 @click.option("--seconds", type=positive, help="Stop after so long; default: Ctrl-C.")
 @click.option("--save", type=click.Path(path_type=Path), help="Write what is shown: .mp4, or .png.")
 @as_json
-def overlay(
-    endpoint: str | None,
-    ns: str,
-    pin: tuple[float, float] | None,
-    seconds: float | None,
-    save: Path | None,
-    json_out: bool,
-    keys: Any,
-) -> None:
-    """Draw geometry pinned to the tissue over a node's live picture.
+def overlay(json_out: bool, **options: Any) -> None:
+    """Publish geometry held by the tissue, for both eyes.
 
-    The shape is depth-tested against the tissue, hidden behind instruments, and blanks when anything it
-    needs is stale; the video itself is never hidden.
+    It is tested against the depth of the tissue, hidden behind instruments, and blank as soon as anything it
+    needs is stale. docs/wire.md says what is published and how a scene file looks.
     """
-    from sags_node.apps.overlay import run_overlay
+    from sags_node.apps.overlay import Options, run_overlay
 
-    summary = run_overlay(endpoint=endpoint, ns=ns, pin=pin, seconds=seconds, save=save, keys=keys)
+    summary = run_overlay(Options(**options))
     show(summary if json_out else text.overlay_table(summary))
 
 

@@ -28,7 +28,7 @@ from sags_node.messaging.subscriber import Subscriber
 ROOT = Path(__file__).parent.parent
 START_SECONDS = 90  # the first start on a machine compiles kernels
 PROMPT_SECONDS = 5  # to end after Ctrl-C
-FREE_PORTS = ("publish.data:=[tcp://127.0.0.1:*]", "publish.control:=null")
+FREE_PORTS = ("publish.data:=[tcp://127.0.0.1:*]", "publish.control:=tcp://127.0.0.1:*")
 SHORT = 6  # frames of the right video that ends too early
 
 

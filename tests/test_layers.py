@@ -21,9 +21,9 @@ LAYERS = [
     {"evaluation"},
     {"fitting"},
     {"benchmark"},
-    {"apps"},
-    {"cli_bench", "cli_consumers", "cli_offline"},
-    {"cli_bag"},
+    {"apps", "viewer"},
+    {"cli_bench", "cli_calib", "cli_consumers", "cli_offline"},
+    {"cli_bag", "cli_export", "cli_view"},
     {"cli"},
 ]
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}

@@ -68,10 +68,12 @@ def test_each_setting_is_played_once_and_the_default_first() -> None:
 def test_every_skip_rule_of_the_mapper_is_turned_round() -> None:
     switches = [name for name in MappingConfig.model_fields if name.startswith("skip_")]
     assert "skip_duplicates" in switches and skip_rules() == switches
-    as_is, *turned = skip_settings(MappingConfig())
-    for rule, setting in zip(switches, turned, strict=True):
-        steps, change = setting.overrides
-        assert as_is.overrides == (steps,)
+    pairs = skip_settings(MappingConfig(), 20_000)
+    assert list(pairs) == switches
+    for rule, (as_is, turned) in pairs.items():
+        *base, change = turned.overrides
+        assert as_is.overrides == tuple(base)
+        assert (load_launch(None, base).mapping.iterations is None) == (rule == "skip_depth")
         changed = load_launch(None, [change]).mapping
         assert [name for name in MappingConfig.model_fields
                 if getattr(changed, name) != getattr(MappingConfig(), name)] == [rule]  # fmt: skip
@@ -168,6 +170,8 @@ def test_everything_is_measured_on_a_tiny_session(phantom_session: Path, tmp_pat
     assert full["depth"]["median_mm"] < halved["depth"]["median_mm"] < 3 and full["frame_ms"]["p50"] > 0
     assert offline["heldout"]["psnr"] == 41.0
 
+    depth = next(each for each in session["skips"] if each["rule"] == "skip_depth")
+    assert depth["on"]["skipped"]["depth"] > 0 and "depth" not in depth["off"]["skipped"]
     skip = next(each for each in session["skips"] if each["rule"] == "skip_duplicates")
     assert skip["default"] and skip["online_db"] == 0  # no frame repeats: the rule changes nothing
     picture = cv2.imdecode(np.frombuffer(plot.read_bytes(), np.uint8), cv2.IMREAD_COLOR)

@@ -19,10 +19,12 @@ from sags_node.evaluation.measure import Options
 from sags_node.evaluation.report import summary_table, write_report
 from sags_node.evaluation.session import measure
 from sags_node.evaluation.spool import Spool
+from sags_node.messaging.rundir import connection_path, default_run_dir
 from sags_node.node import Node
 from sags_node.session import Session
 from sags_node.types import FrameResult
 
+OVERLAY_START = 15.0  # s for the overlay to load its shapes and listen
 OVERLAY_GRACE = 15.0  # s for the overlay to write its video after the node has ended
 OVERLAY_STOP = 2.0  # s to do so when the demo is interrupted
 _OPTIONS = Options(hold_out=0)
@@ -57,8 +59,9 @@ def run_demo(session: Session, out: Path, progress: Callable[[int, int | None, s
             spool.add(result, sum(result.timings_ms.values()), time.monotonic_ns(), latency_ms)
 
         node = Node(session.config, session.rig, session.source, on_result=keep)
-        overlay = _start_overlay(session.config, node.endpoints[-1], seconds, out / "overlay.mp4")
+        overlay = _start_overlay(session.config, seconds, out / "overlay.mp4")
         try:
+            _await_overlay(session.config, overlay)
             node.start()
             while not node.wait(0.25):
                 progress(len(spool), frames, "playing")
@@ -74,11 +77,20 @@ def run_demo(session: Session, out: Path, progress: Callable[[int, int | None, s
     return Demo(outcome.summary, summary_table(outcome.summary), page)
 
 
-def _start_overlay(config: LaunchConfig, endpoint: str, seconds: float, video: Path) -> subprocess.Popen[str]:
+def _start_overlay(config: LaunchConfig, seconds: float, video: Path) -> subprocess.Popen[str]:
     """The consumer is a process of its own, as it would be in a theatre."""
-    command = [sys.executable, "-m", "sags_node", "overlay", "--endpoint", endpoint, "--ns", config.ns]
+    command = [sys.executable, "-m", "sags_node", "overlay", "--ns", config.ns, "--repin"]
+    command += ["--run-dir", str(config.publish.run_dir or default_run_dir())]
     command += ["--seconds", f"{seconds:.1f}", "--save", str(video), "--json"]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def _await_overlay(config: LaunchConfig, overlay: subprocess.Popen[str]) -> None:
+    """Wait until it listens: a short demo would be over before."""
+    ready = connection_path(config.publish.run_dir or default_run_dir(), "overlay")
+    deadline = time.monotonic() + OVERLAY_START
+    while not ready.exists() and overlay.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.02)
 
 
 def _end(overlay: subprocess.Popen[str]) -> None:

@@ -1,287 +1,264 @@
-"""The first consumer: virtual geometry pinned to the tissue, over the live left picture.
+"""`sags overlay`: virtual geometry held by anchors in the tissue, published for both eyes of a display.
 
-It fails transparent: when anything it needs is stale, missing or lost, the plain picture is shown. The
-picture itself is never held back.
+It fails transparent: when anything it needs is stale, missing or lost, empty pictures are sent and `status`
+says why. The video itself does not pass through here, so nothing here can hide it.
 """
 
 from __future__ import annotations
 
 import time
-from collections import Counter
+from collections import Counter, deque
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from sags_node.apps import overlay_draw
-from sags_node.apps.overlay_pin import RENEW_BELOW, Ids, Pin, pin_pixel, surface_normal
+from sags_node.apps.overlay_draw import Body, Placed
+from sags_node.apps.overlay_frame import NEEDED, RIGHT_INFO, TissueFrame, tissue_frame
+from sags_node.apps.overlay_held import HeldObject, Pinner
+from sags_node.apps.overlay_mesh import mesh_of
+from sags_node.apps.overlay_save import Output
+from sags_node.apps.overlay_scene import SceneSpec, built_in, read_scene
+from sags_node.apps.overlay_stream import OverlayStream
 from sags_node.errors import SagsError, UsageError
-from sags_node.geometry import invert, quat_to_matrix, transform
-from sags_node.messaging.address import ClientKeys
-from sags_node.messaging.received import (
-    Received,
-    ReceivedCameraInfo,
-    ReceivedCloud,
-    ReceivedImage,
-    ReceivedRos,
-)
+from sags_node.messaging.address import ClientKeys, find_control
+from sags_node.messaging.control import ControlClient
+from sags_node.messaging.received import Received, ReceivedImage, TopicName
 from sags_node.messaging.subscriber import Subscriber
-from sags_node.types import F32, F64, U8, Bool
+from sags_node.types import U8
 
-PICTURE = "left/image_rect_color"
-NEEDED = ("left/render/depth", "left/tissue_mask", "left/camera_info", "tf", "splats")
-WAIT_FOR_FRAME = 0.2  # s for a picture
-WAIT_FOR_REST = 0.05  # s for what belongs to the picture
-NORMAL_MEMORY = 0.8  # of the last normal; the depth of one frame is noisy
-PATIENCE = 5.0  # s for the very first picture
-PICTURES_BEFORE_VIDEO = 5  # the frame rate must be known before a video file is opened
+PICTURE = TopicName("left/image_rect_color", ReceivedImage)
+MAX_AGE = 0.5  # s since capture; an older overlay is taken away
+WAIT_FOR_FRAME = 0.05  # s; also how soon a stale picture is noticed
+WAIT_FOR_REST = 0.05  # s for what belongs to the frame
+PATIENCE = 5.0  # s for the very first frame
+REMEMBERED = 54_000  # latencies: half an hour at 30 Hz
+RECENT = 300  # of them are behind the figures in `status`
 
 
 @dataclass(frozen=True, slots=True)
-class Scene:
-    """What the overlay knows of one frame."""
+class Options:
+    """How `sags overlay` runs; the defaults are those of the command."""
 
-    picture: U8  # [H, W, 3]
-    depth: F32  # [H, W] m, NaN unknown
-    tissue: Bool  # [H, W]
-    K: F64  # [3, 3]
-    T_world_cam: F64  # [4, 4]
-    means: F32  # [N, 3] m, world
-    ids: Ids  # [N]
-    generation: tuple[str, int]  # session and epoch: ids of another generation mean other Gaussians
-
-
-class PinnedOverlay:
-    """Draws one shape at one tissue point, frame after frame.
-
-    Args:
-        pixel: (u, v) of the tissue to pin to, in the first frame that has depth there; None: its middle.
-        shape: one of `overlay_draw.SHAPES`.
-    """
-
-    def __init__(self, pixel: tuple[float, float] | None, shape: str) -> None:
-        self.paths: list[list[F64]] = []  # world positions (m), frame by frame, for each time it was pinned
-        self.pixel: tuple[int, int] | None = None  # where it was pinned
-        self._wanted = pixel
-        self._shape = overlay_draw.SHAPES[shape]
-        self._pin: Pin | None = None
-        self._normal: F64 | None = None
-        self._generation: tuple[str, int] | None = None
-
-    def draw(self, scene: Scene) -> tuple[U8, str | None]:
-        """The picture with the shape, or the plain picture and the reason why there is none."""
-        if scene.generation != self._generation:
-            self._generation, self._pin, self._normal = scene.generation, None, None
-        if self._pin is None and not self._attach(scene):
-            return scene.picture, "nothing to pin to"
-        assert self._pin is not None
-        found = self._pin.locate(scene.means, scene.ids)
-        if found is None:
-            return scene.picture, "pin lost"
-        world, remaining = found
-        if remaining < RENEW_BELOW:
-            self._pin = Pin.attach(world, scene.means, scene.ids) or self._pin
-        point = np.asarray(transform(invert(scene.T_world_cam), world), np.float64)
-        height, width = scene.depth.shape
-        u, v = np.rint((scene.K @ point)[:2] / point[2]) if point[2] > 0 else (-1, -1)
-        if not (0 <= u < width and 0 <= v < height):
-            return scene.picture, "pin outside the picture"
-        if not np.isfinite(scene.depth[int(v), int(u)]):
-            return scene.picture, "no depth at the pin"
-        normal = self._smooth(surface_normal(scene.depth, scene.tissue, scene.K, point))
-        if normal is None:
-            return scene.picture, "no surface at the pin"
-        self.paths[-1].append(world)
-        samples = self._shape(point, normal, scene.K, scene.depth)
-        picture, drawn = overlay_draw.draw(scene.picture, samples, scene.K, scene.depth, scene.tissue)
-        if drawn:
-            overlay_draw.label(picture, point, scene.K, f"{1000 * point[2]:.0f} mm")
-            picture[~scene.tissue] = scene.picture[~scene.tissue]  # instruments are in front of text too
-        return picture, None
-
-    def _attach(self, scene: Scene) -> bool:
-        pixel = pin_pixel(self._wanted, scene.depth, scene.tissue)
-        if pixel is None:
-            return False
-        u, v = pixel
-        local = np.linalg.inv(scene.K) @ (u, v, 1.0) * float(scene.depth[v, u])
-        world = np.asarray(transform(scene.T_world_cam, local), np.float64)
-        self._pin = Pin.attach(world, scene.means, scene.ids)
-        self.pixel = pixel
-        self.paths.append([])
-        return self._pin is not None
-
-    def _smooth(self, normal: F64 | None) -> F64 | None:
-        if normal is not None and self._normal is not None:
-            normal = NORMAL_MEMORY * self._normal + (1 - NORMAL_MEMORY) * normal
-            normal /= np.linalg.norm(normal)
-        self._normal = self._normal if normal is None else normal
-        return self._normal
+    endpoint: str | None = None  # of the node's data; default: its connection file
+    control: str | None = None  # of the node's requests; to be given with `endpoint`
+    ns: str = "sags"
+    own_ns: str = "overlay"
+    run_dir: Path | None = None  # of the connection files, the node's and the overlay's
+    keys: ClientKeys | None = None
+    scene: Path | None = None
+    pin: tuple[float, float] | None = None  # u v, of the built-in shape; default: middle of the tissue
+    shape: str = "target"
+    seconds: float | None = None  # default: until Ctrl-C
+    save: Path | None = None  # .mp4 for every picture, .png for the last one with the overlay
+    max_age: float = MAX_AGE
+    repin: bool = False
+    show_latency: bool = False
 
 
-def run_overlay(
-    endpoint: str | None = None,
-    ns: str = "sags",
-    pin: tuple[float, float] | None = None,
-    shape: str = "target",
-    seconds: float | None = None,
-    save: Path | None = None,
-    run_dir: Path | None = None,
-    keys: ClientKeys | None = None,
-) -> dict[str, Any]:
-    """Draw over the left picture of a running node until `seconds` have passed or Ctrl-C.
-
-    Args:
-        pin: pixel (u, v) of the tissue to pin to; default: the middle of the tissue.
-        save: .mp4 for every picture shown, .png for the last one with the overlay.
-        keys: for a node that wants them.
+def run_overlay(options: Options) -> dict[str, Any]:
+    """Publish an overlay of a running node until its time is over or Ctrl-C.
 
     Returns:
-        frames, overlay (frames with it), blanked (reason -> frames), latency_ms (capture to drawn), pin
-        (pixel, how often it was pinned, how far it moved and the 90th percentile of its steps, mm), lost
-        (messages), saved (the file; None when too little was shown to write one).
+        frames, overlay (frames with one), blanked (reason -> frames), latency_ms (capture to published) and
+        draw_ms (p50, p90, p99), objects (see `HeldObject.status`), lost (messages), endpoints, saved (the
+        file; None when too little was shown to write one).
 
     Raises:
-        UsageError: an unknown shape or kind of file, or a pin outside the picture.
-        SagsError: no node is known, no picture came within `PATIENCE`, or the file cannot be written.
+        UsageError: a wrong scene, mesh, pin or kind of file.
+        SagsError: no node is known, no frame came within `PATIENCE`, the node has no control socket, or the
+            file cannot be written.
     """
-    if shape not in overlay_draw.SHAPES:
-        raise UsageError(f"unknown shape '{shape}'; shapes: {', '.join(overlay_draw.SHAPES)}")
-    output = _Output(save)
-    overlay = PinnedOverlay(pin, shape)
-    blanked: Counter[str] = Counter()
-    latencies_ms: list[float] = []
-    began = time.monotonic()
-    last: Received | None = None
-    with Subscriber([PICTURE, *NEEDED], endpoint, ns, run_dir, keys=keys) as subscriber:
-        try:
-            while seconds is None or time.monotonic() < began + seconds:
-                received = subscriber.wait(PICTURE, WAIT_FOR_FRAME, after=last)
-                if not isinstance(received, ReceivedImage):
-                    if last is None and time.monotonic() > began + PATIENCE:
-                        break
-                    continue
-                if last is None:
-                    _check_pin(pin, received)
+    if options.scene is not None and options.pin is not None:
+        raise UsageError("--pin is for the built-in target; a scene file says where its objects are pinned")
+    if options.endpoint is not None and options.control is None:
+        raise UsageError("--endpoint needs --control, the node's control socket: anchors are asked for there")
+    output = Output(options.save)
+    scene = built_in(options.pin, options.shape) if options.scene is None else read_scene(options.scene)
+    overlay_draw.warm_up()
+    bodies = [Body(mesh_of(spec), spec.opacity, spec.label) for spec in scene.objects]
+    wanted: list[str] = [*NEEDED, RIGHT_INFO, *([] if options.save is None else [PICTURE])]
+    with Subscriber(wanted, options.endpoint, options.ns, options.run_dir, keys=options.keys) as subscriber:
+        with OverlayStream(options.own_ns, options.run_dir, scene.color_key) as stream:
+            overlay = _Overlay(options, scene, bodies, subscriber, stream, output)
+            try:
+                overlay.run()
+            except KeyboardInterrupt:
+                pass
+            finally:
+                overlay.close()
+            return overlay.summary()
+
+
+class _Overlay:
+    def __init__(
+        self,
+        options: Options,
+        scene: SceneSpec,
+        bodies: Sequence[Body],
+        subscriber: Subscriber,
+        stream: OverlayStream,
+        output: Output,
+    ) -> None:
+        connect = partial(ControlClient, options.control, options.ns, options.run_dir, options.keys)
+        self._options = options
+        self._bodies = bodies
+        self._subscriber = subscriber
+        self._stream = stream
+        self._output = output
+        self._pinner = Pinner(connect)
+        self._objects = [
+            HeldObject(
+                spec, "pin" if options.scene is None else f"{spec.name}: pixel", self._pinner, options.repin
+            )
+            for spec in scene.objects
+        ]
+        self._source: tuple[str, int] | None = None  # session and epoch of the node
+        self._epoch = -1  # of what is published: grows with every new `_source`
+        self._right = "nothing received yet"  # why there is no right eye
+        self._frames = 0
+        self._blanked: Counter[str] = Counter()
+        self._latency_ms: deque[float] = deque(maxlen=REMEMBERED)
+        self._draw_ms: deque[float] = deque(maxlen=REMEMBERED)
+
+    def run(self) -> None:
+        """Draw every frame that comes.
+
+        Raises:
+            UsageError: a pixel lies outside the picture.
+            SagsError: no frame came, or the node has no control socket.
+        """
+        leading = NEEDED[0] if self._options.save is None else PICTURE
+        seconds, began = self._options.seconds, time.monotonic()
+        last: Received | None = None
+        while seconds is None or time.monotonic() < began + seconds:
+            self._stream.serve()
+            received = self._subscriber.wait(leading, WAIT_FOR_FRAME, after=last)
+            if received is not None:
+                if last is None:  # a node without a control socket: better said now than never
+                    find_control(
+                        self._options.control, self._options.ns, self._options.run_dir, self._options.keys
+                    )
                 last = received
-                picture, reason = _overlaid(subscriber, overlay, received)
-                latencies_ms.append(1000 * received.age())
-                if reason is not None:
-                    blanked[reason] += 1
-                output.add(picture, reason is None, subscriber.period(PICTURE))
-        except KeyboardInterrupt:
-            pass
-        finally:
-            output.close()
-        if not latencies_ms:
-            silence = f"no picture came from {subscriber.endpoint}; is the node running and not waiting?"
-            raise SagsError(subscriber.refusal or silence)
-        lost = sum(subscriber.lost(name) for name in (PICTURE, *NEEDED))
-    return {
-        "frames": len(latencies_ms),
-        "overlay": len(latencies_ms) - blanked.total(),
-        "blanked": dict(blanked),
-        "latency_ms": {f"p{q}": float(np.percentile(latencies_ms, q)) for q in (50, 90, 99)},
-        "pin": _wander(overlay),
-        "lost": lost,
-        "saved": output.saved,
-    }
-
-
-def _check_pin(pin: tuple[float, float] | None, picture: ReceivedImage) -> None:
-    height, width = picture.array.shape[:2]
-    if pin is not None and not (0 <= pin[0] < width and 0 <= pin[1] < height):
-        raise UsageError(f"pin {pin[0]:g} {pin[1]:g} lies outside the picture of {width}x{height} px")
-
-
-def _overlaid(
-    subscriber: Subscriber, overlay: PinnedOverlay, picture: ReceivedImage
-) -> tuple[U8, str | None]:
-    """The picture with the overlay if everything of that very frame is there and fresh; else plain."""
-    frame = subscriber.aligned(NEEDED, picture.stamp_ns, WAIT_FOR_REST)
-    for name in (PICTURE, *NEEDED):
-        if subscriber.problem(name) is not None:
-            return picture.array, f"stale {name}"
-    if frame is None:
-        return picture.array, "incomplete frame"
-    scene = scene_of(picture, frame)
-    return (picture.array, "sizes differ") if scene is None else overlay.draw(scene)
-
-
-def scene_of(picture: ReceivedImage, frame: dict[str, Received]) -> Scene | None:
-    """The messages of one frame as a scene; None when they do not fit together."""
-    depth, tissue, info, pose, splats = (frame[name] for name in NEEDED)
-    assert isinstance(depth, ReceivedImage) and isinstance(tissue, ReceivedImage)
-    assert isinstance(info, ReceivedCameraInfo) and isinstance(pose, ReceivedRos)
-    assert isinstance(splats, ReceivedCloud)
-    size = picture.array.shape[:2]
-    if not depth.array.shape == tissue.array.shape == size == (info.height, info.width):
-        return None
-    if "id" not in (splats.points.dtype.names or ()) or len(pose.message.transforms) != 1:
-        return None
-    moved = pose.message.transforms[0].transform
-    T = np.eye(4)
-    T[:3, :3] = quat_to_matrix(np.array([getattr(moved.rotation, axis) for axis in "wxyz"]))
-    T[:3, 3] = [getattr(moved.translation, axis) for axis in "xyz"]
-    generation = (splats.meta.session, splats.meta.epoch)
-    return Scene(
-        picture.array, depth.array, tissue.array > 0, info.K, T, splats.xyz(), splats.points["id"], generation
-    )
-
-
-def _wander(overlay: PinnedOverlay) -> dict[str, Any]:
-    """Where the point was pinned, how often, and how it moved."""
-    paths = [1000 * np.array(path) for path in overlay.paths if path]
-    steps = [np.linalg.norm(np.diff(path, axis=0), axis=1) for path in paths if len(path) > 1]
-    return {
-        "pixel": overlay.pixel,
-        "pinned": len(paths),
-        "moved_mm": max(
-            (float(np.linalg.norm(path - path[0], axis=1).max()) for path in paths), default=None
-        ),
-        "step_mm_p90": float(np.percentile(np.concatenate(steps), 90)) if steps else None,
-    }
-
-
-class _Output:
-    """Keeps what is shown: every picture as video, or the last one with the overlay as PNG."""
-
-    def __init__(self, file: Path | None) -> None:
-        if file is not None and file.suffix not in (".mp4", ".png"):
-            raise UsageError(f"cannot save {file}: the name must end in .mp4 or .png")
-        if file is not None and not file.parent.is_dir():
-            raise UsageError(f"cannot save {file}: there is no folder {file.parent}")
-        self._file = file
-        self._still: U8 | None = None
-        self._video: Any = None
-        self._shown = 0
-        self.saved: str | None = None  # what has been written
-
-    def add(self, picture: U8, with_overlay: bool, period: float) -> None:
-        self._shown += 1
-        if self._file is None:
-            return
-        if self._file.suffix == ".png":
-            if with_overlay or self._still is None:
-                self._still = picture
-            return
-        if self._shown < PICTURES_BEFORE_VIDEO:
-            return
-        if self._video is None:
-            size = (picture.shape[1], picture.shape[0])
-            code = cv2.VideoWriter_fourcc(*"mp4v")  # type: ignore[attr-defined]  # the stubs lack it
-            self._video = cv2.VideoWriter(str(self._file), code, 1 / period, size)
-            if not self._video.isOpened():
-                raise SagsError(f"cannot write {self._file}; check the folder's rights and the disk")
-        self._video.write(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+                self._take(received)
+            elif last is None and time.monotonic() > began + PATIENCE:
+                break
+            self._look_at_the_clock()
+            self._stream.tell(self._facts())
+        if last is None:
+            silence = f"no frame came from {self._subscriber.endpoint}; is the node running and not waiting?"
+            raise SagsError(self._subscriber.refusal or silence)
 
     def close(self) -> None:
-        if self._video is not None:
-            self._video.release()
-            self.saved = str(self._file)
-        if self._still is not None:
-            if not cv2.imwrite(str(self._file), cv2.cvtColor(self._still, cv2.COLOR_RGB2BGR)):
-                raise SagsError(f"cannot write {self._file}; check the folder's rights and the disk")
-            self.saved = str(self._file)
+        """Leave nothing standing: neither the last overlay nor anchors in the node."""
+        self._stream.blank("the overlay was stopped")
+        self._stream.tell(self._facts())
+        self._pinner.close()
+        self._output.close()
+
+    def summary(self) -> dict[str, Any]:
+        """See `run_overlay`."""
+        names = [name for name in NEEDED if self._subscriber.latest(name) is not None]
+        return {
+            "frames": self._frames,
+            "overlay": self._frames - self._blanked.total(),
+            "blanked": dict(self._blanked),
+            "latency_ms": _percentiles(self._latency_ms),
+            "draw_ms": _percentiles(self._draw_ms),
+            "objects": [held.status() for held in self._objects],
+            "lost": sum(self._subscriber.lost(name) for name in names),
+            "endpoints": self._stream.endpoints,
+            "saved": self._output.saved,
+        }
+
+    # ---- one frame -----------------------------------------------------------------------------------------
+
+    def _take(self, leading: Received) -> None:
+        """Show the overlay of one frame, or count why there is none."""
+        self._frames += 1
+        rgba, reason = self._overlay(leading.stamp_ns)
+        if reason is not None:
+            self._blanked[reason] += 1
+        if isinstance(leading, ReceivedImage) and self._options.save is not None:
+            shown = leading.array if rgba is None else overlay_draw.over(leading.array, rgba)
+            self._output.add(shown, rgba is not None, self._subscriber.period(PICTURE))
+
+    def _overlay(self, stamp_ns: int) -> tuple[U8 | None, str | None]:
+        """The left eye's overlay, published; or why there is none."""
+        messages = self._subscriber.aligned(NEEDED, stamp_ns, WAIT_FOR_REST)
+        if (stale := self._stale()) is not None:
+            self._stream.blank(stale)
+            return None, stale
+        frame = None if messages is None else tissue_frame(messages, self._right_info())
+        if frame is None:  # the next one may be whole; if not, the clock takes the overlay away
+            return None, "incomplete frame"
+        poses = [held.place(frame) for held in self._objects]
+        placed = [Placed(body, T) for body, T in zip(self._bodies, poses, strict=True) if T is not None]
+        if not placed:
+            reason = self._objects[0].reason or "nothing to draw"
+            self._stream.blank(reason)
+            return None, reason
+        return self._show(frame, placed), None
+
+    def _show(self, frame: TissueFrame, placed: Sequence[Placed]) -> U8:
+        if (frame.session, frame.epoch) != self._source:
+            self._source, self._epoch = (frame.session, frame.epoch), self._epoch + 1
+        began = time.perf_counter()
+        pictures = {"left": overlay_draw.draw(frame, placed, note=self._note())}
+        if frame.baseline is not None and self._stream.wants("right"):
+            pictures["right"] = overlay_draw.draw(frame, placed, frame.baseline)
+        self._stream.show(pictures, frame.frame_id, frame.stamp_ns, self._epoch)
+        self._draw_ms.append(1e3 * (time.perf_counter() - began))
+        self._latency_ms.append(1e-6 * (time.time_ns() - frame.stamp_ns))
+        return pictures["left"]
+
+    def _right_info(self) -> Any:
+        problem = self._subscriber.problem(RIGHT_INFO)
+        self._right = "" if problem is None else f"no right/camera_info ({problem}): set publish.right:=true"
+        return self._subscriber.latest(RIGHT_INFO) if problem is None else None
+
+    # ---- what is not right ---------------------------------------------------------------------------------
+
+    def _stale(self) -> str | None:
+        """What may not be shown as new any more, of all that is needed."""
+        for name in NEEDED:
+            if self._subscriber.problem(name, self._options.max_age) is not None:
+                return f"stale {name}"
+        return None
+
+    def _look_at_the_clock(self) -> None:
+        """Take the overlay away when what it shows has become too old."""
+        shown_ns = self._stream.shown_ns
+        if shown_ns is None:
+            self._stream.blank(self._stream.reason or "waiting for the node")
+        elif (time.time_ns() - shown_ns) * 1e-9 > self._options.max_age:
+            self._stream.blank(self._stale() or "no whole frame came")
+
+    # ---- what is said --------------------------------------------------------------------------------------
+
+    def _facts(self) -> dict[str, Any]:
+        recent = list(self._latency_ms)[-RECENT:]
+        return {
+            "frames": self._frames,
+            "overlay": self._frames - self._blanked.total(),
+            "blanked": dict(self._blanked),
+            "latency_ms": _percentiles(recent),
+            "draw_ms": _percentiles(list(self._draw_ms)[-RECENT:]),
+            "max_age": self._options.max_age,
+            "no_right_eye": self._right or None,
+            "objects": [held.status() for held in self._objects],
+        }
+
+    def _note(self) -> str:
+        if not self._options.show_latency or not self._latency_ms:
+            return ""
+        p50, p99 = np.percentile(list(self._latency_ms)[-RECENT:], (50, 99))
+        return f"{self._latency_ms[-1]:.0f} ms (p50 {p50:.0f}, p99 {p99:.0f})"
+
+
+def _percentiles(values: Sequence[float] | deque[float]) -> dict[str, float | None]:
+    return {f"p{q}": round(float(np.percentile(values, q)), 2) if values else None for q in (50, 90, 99)}

@@ -1,165 +1,170 @@
-"""Virtual geometry over a picture, hidden where real things are in front of it.
+"""Draws placed objects for one eye, tested against tissue and instruments.
 
-Shapes are clouds of surface samples, dense enough to leave no holes; drawing is one z-buffer over them.
-Everything is in the left camera's coordinates, metres.
+What is in front of the tissue or on it is drawn in full. What lies under it shows through: `UNDER` of its
+opacity. Over instruments, and where no depth is known, nothing is drawn.
+
+Depth and instruments are known for the left eye. For the right eye each point is looked up where the left
+eye sees it. How near an instrument is, is not known, so in the right eye its place is anywhere between the
+tissue and `NEAREST`; all of that stays free.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-from sags_node.types import F32, F64, U8, Bool
+from sags_node.apps.overlay_frame import TissueFrame
+from sags_node.apps.overlay_mesh import Mesh
+from sags_node.apps.overlay_raster import fill, hide, key_out
+from sags_node.engine.jit import read_only
+from sags_node.geometry import invert, transform
+from sags_node.types import F32, F64, U8, Bool, Camera
 
-OPACITY = 0.85
-ON_SURFACE = 0.0005  # m; what lies this little under the surface is still drawn: it lies on it
-DRAPE_REACH = 0.004  # m; how far a flat shape bends to lie on a curved surface
-SAMPLES_PER_PIXEL = 2.0  # along a line
-MAX_SAMPLES_ALONG = 400  # bounds the cost of a shape close to the camera
-LABEL_ASIDE = 0.005  # m to the right of the point
-LEAN = np.array([0.5, -0.8, 0.0])  # to the upper right of the picture
-GREEN, YELLOW = (60, 230, 120), (255, 210, 40)  # RGB
+UNDER = 0.35
+ON_SURFACE = 0.001  # m; what lies this little under the surface lies on it
+NEAREST = 0.03  # m; no instrument is nearer to the right eye
+DARKEST = 0.45  # of a colour, where the surface is seen edge on
+LABEL_ASIDE = 6  # px to the right of the middle
+FONT = cv2.FONT_HERSHEY_SIMPLEX
+
+
+class Body:
+    """A mesh made ready to be drawn again and again; None: only a label."""
+
+    def __init__(self, mesh: Mesh | None, opacity: float, label: str | None) -> None:
+        self.label = label
+        self.middle = np.zeros(3)
+        self._mesh = mesh
+        self._vertices = np.zeros((0, 3)) if mesh is None else mesh.vertices.astype(np.float64)
+        if mesh is None:
+            return
+        corners = self._vertices[mesh.triangles]  # [T, 3, 3]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+        self._normals = normals / np.where(lengths > 0, lengths, 1)
+        self._centres = corners.mean(1)
+        self._alpha = np.uint8(round(255 * opacity))
+        self.middle = (self._vertices.min(0) + self._vertices.max(0)) / 2
+
+    def draw(self, camera: Camera, T_world_body: F64, z: F32, rgba: U8) -> None:
+        """Add what one eye sees of it to a picture [H, W, 4] with depths [H, W] (m), in place."""
+        if self._mesh is None:
+            return
+        T_cam_body = invert(camera.T_world_cam) @ T_world_body
+        local = np.asarray(transform(T_cam_body, self._vertices), np.float64)
+        depths = np.ascontiguousarray(local[:, 2])
+        flat = local / np.where(depths != 0, depths, 1)[:, None]
+        pixels = np.ascontiguousarray((flat @ camera.K.T)[:, :2])
+        colors = self._lit(invert(T_cam_body)[:3, 3])
+        fill(pixels, depths, read_only(self._mesh.triangles), colors, z, rgba)
+
+    def _lit(self, eye: F64) -> U8:
+        """Colours [T, 4] lit from the eye (at [3], m), as an endoscope lights."""
+        assert self._mesh is not None
+        rays = self._centres - eye
+        facing = np.abs(np.einsum("tc,tc->t", self._normals, rays)) / np.linalg.norm(rays, axis=1)
+        light = DARKEST + (1 - DARKEST) * facing
+        colors = np.full((len(light), 4), self._alpha, np.uint8)
+        colors[:, :3] = np.rint(light[:, None] * self._mesh.colors)
+        return colors
 
 
 @dataclass(frozen=True, slots=True)
-class Samples:
-    points: F64  # [N, 3] m
-    colors: F64  # [N, 3] RGB 0..255, shaded
-
-    def __add__(self, other: Samples) -> Samples:
-        return Samples(
-            np.concatenate([self.points, other.points]), np.concatenate([self.colors, other.colors])
-        )
+class Placed:
+    body: Body
+    T_world_body: F64  # [4, 4]
 
 
-def target(point: F64, normal: F64, K: F64, depth: F32) -> Samples:
-    """A ring on the surface and an arrow that points at its middle."""
-    spacing = _spacing(point, K)
-    leaning = normal + LEAN  # along the line of sight an arrow would be a dot
-    tip = point + 0.001 * normal
-    return _ring(point, normal, K, depth) + arrow(
-        tip, leaning / np.linalg.norm(leaning), 0.010, spacing, YELLOW
-    )
+def draw(frame: TissueFrame, objects: Sequence[Placed], baseline: float = 0.0, note: str = "") -> U8:
+    """The overlay [H, W, 4] RGBA, not premultiplied, of the eye `baseline` (m) to the right of the left one.
 
-
-def marker(point: F64, normal: F64, K: F64, depth: F32) -> Samples:
-    """A ring on the surface and a sphere that hovers 5 mm above it."""
-    ball = sphere(point + 0.005 * normal, 0.0015, _spacing(point, K), YELLOW)
-    return _ring(point, normal, K, depth) + ball
-
-
-SHAPES = {"target": target, "sphere": marker}
-
-
-def _ring(point: F64, normal: F64, K: F64, depth: F32) -> Samples:
-    return drape(disc(point, normal, 0.003, 0.004, _spacing(point, K), GREEN), K, depth)
-
-
-def drape(samples: Samples, K: F64, depth: F32) -> Samples:
-    """Move samples along their rays onto the surface `depth` [H, W] (m), where it is within `DRAPE_REACH`."""
-    height, width = depth.shape
-    points = samples.points.copy()
-    pixels = points @ K.T
-    columns, rows = np.rint(pixels[:, :2] / pixels[:, 2:]).astype(np.intp).T
-    inside = (points[:, 2] > 0) & (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
-    surface = np.full(len(points), np.nan)
-    surface[inside] = depth[rows[inside], columns[inside]]
-    near = np.abs(surface - points[:, 2]) < DRAPE_REACH  # NaN compares as False
-    points[near] *= (surface[near] / points[near, 2])[:, None]
-    return Samples(points, samples.colors)
-
-
-def disc(
-    center: F64, normal: F64, inner: float, outer: float, spacing: float, color: tuple[int, int, int]
-) -> Samples:
-    """The part of a disc between two radii."""
-    radii, angles = _grid(inner, outer, 2 * np.pi * outer, spacing)
-    across, along = _tangents(normal)
-    offsets = radii[:, None] * (np.cos(angles)[:, None] * across + np.sin(angles)[:, None] * along)
-    points = center + offsets
-    return Samples(points, _shade(points, np.broadcast_to(normal, points.shape), color))
-
-
-def sphere(center: F64, radius: float, spacing: float, color: tuple[int, int, int]) -> Samples:
-    """Samples on a spiral of golden angles: as dense at the poles as elsewhere."""
-    count = int(np.clip(4 * np.pi * (radius / spacing) ** 2, 50, MAX_SAMPLES_ALONG**2))
-    heights = 1 - (2 * np.arange(count) + 1) / count
-    angles = np.pi * (3 - np.sqrt(5)) * np.arange(count)
-    flat = np.sqrt(1 - heights**2)
-    normals = np.stack([flat * np.cos(angles), flat * np.sin(angles), heights], axis=1)
-    points = center + radius * normals
-    return Samples(points, _shade(points, normals, color))
-
-
-def arrow(tip: F64, away: F64, length: float, spacing: float, color: tuple[int, int, int]) -> Samples:
-    """An arrow whose tip is at `tip` and whose tail lies in direction `away` (unit)."""
-    head, wide, thin = 0.35 * length, 0.12 * length, 0.04 * length
-    along, angles = _grid(0.0, length, 2 * np.pi * wide, spacing)
-    radii = np.where(along < head, wide * along / head, thin)
-    first, second = _tangents(away)
-    outwards = np.cos(angles)[:, None] * first + np.sin(angles)[:, None] * second
-    points = tip + along[:, None] * away + radii[:, None] * outwards
-    return Samples(points, _shade(points, outwards, color))
-
-
-def draw(picture: U8, samples: Samples, K: F64, depth: F32, tissue: Bool) -> tuple[U8, int]:
-    """Draw samples over a picture [H, W, 3] where nothing real is in front; returns it and the pixels drawn.
-
-    A sample is hidden where the surface `depth` [H, W] (m, NaN unknown) is nearer, where the depth is
-    unknown, and where the pixel is not `tissue`: an instrument is in front.
+    `note` is written small into the upper right corner.
     """
-    height, width = depth.shape
-    ahead = samples.points[:, 2] > 0
-    points, colors = samples.points[ahead], samples.colors[ahead]
-    pixels = points @ K.T
-    columns, rows = np.rint(pixels[:, :2] / pixels[:, 2:]).astype(np.intp).T
-    inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
-    columns, rows, z, colors = columns[inside], rows[inside], points[inside, 2], colors[inside]
-    seen = (z < depth[rows, columns] + ON_SURFACE) & tissue[rows, columns]  # NaN compares as False
-    order = np.argsort(-z[seen])  # far to near: the nearest is written last and stays
-    columns, rows, colors = columns[seen][order], rows[seen][order], colors[seen][order]
-    drawn = picture.copy()
-    drawn[rows, columns] = np.rint(OPACITY * colors + (1 - OPACITY) * picture[rows, columns])
-    return drawn, len(np.unique(rows * width + columns))
+    height, width = frame.depth.shape
+    camera = frame.camera.moved_right(baseline)
+    z, rgba = np.full((height, width), np.inf, np.float32), np.zeros((height, width, 4), np.uint8)
+    for placed in objects:
+        placed.body.draw(camera, placed.T_world_body, z, rgba)
+    _hide(z, rgba, frame.depth, frame.tissue, camera, baseline, UNDER)
+    for placed in objects:
+        if placed.body.label is not None:
+            _label(rgba, frame, camera, placed, baseline)
+    if note:
+        (across, down), _ = cv2.getTextSize(note, FONT, _text_scale(height), 1)
+        _write(rgba, frame, note, (width - across - 6, down + 6), NEAREST, baseline)
+    return rgba
 
 
-def label(picture: U8, point: F64, K: F64, text: str) -> None:
-    """Write beside the pixel of a point, in place."""
-    u, v = (K @ point)[:2] / point[2]
-    scale = picture.shape[0] / 1000
-    at = (int(u + LABEL_ASIDE * K[0, 0] / point[2]), int(v))
-    for color, thickness in (((0, 0, 0), 3), ((255, 255, 255), 1)):
-        cv2.putText(
-            picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, max(scale, 0.4), color, thickness, cv2.LINE_AA
-        )
+def color_key(rgba: U8, key: tuple[int, int, int]) -> U8:
+    """The overlay [H, W, 4] on the key colour [H, W, 3], for displays that know no opacity.
+
+    A pixel is either exactly the key colour or the overlay's own. Of what is less than half opaque, every
+    other pixel is drawn, as on a chessboard. An overlay's colour that is the key by chance is changed by one.
+    """
+    keyed = np.empty((*rgba.shape[:2], 3), np.uint8)
+    key_out(read_only(rgba), np.array(key, np.uint8), keyed)
+    return keyed
 
 
-def _spacing(point: F64, K: F64) -> float:
-    """Distance (m) between samples that lie closer than a pixel at the depth of `point`."""
-    return float(point[2] / (K[0, 0] * SAMPLES_PER_PIXEL))
+def over(picture: U8, rgba: U8) -> U8:
+    """The picture [H, W, 3] with the overlay [H, W, 4] over it."""
+    rows, columns = np.nonzero(rgba[..., 3])
+    alpha = rgba[rows, columns, 3:].astype(np.float32) / 255
+    shown = picture.copy()
+    shown[rows, columns] = np.rint(alpha * rgba[rows, columns, :3] + (1 - alpha) * picture[rows, columns])
+    return shown
 
 
-def _grid(start: float, end: float, around: float, spacing: float) -> tuple[F64, F64]:
-    """Samples between `start` and `end`, and angles around a circle of circumference `around`: all pairs."""
-    rows = int(np.clip((end - start) / spacing, 2, MAX_SAMPLES_ALONG))
-    columns = int(np.clip(around / spacing, 8, MAX_SAMPLES_ALONG))
-    values, angles = np.meshgrid(np.linspace(start, end, rows), np.linspace(0, 2 * np.pi, columns))
-    return values.ravel(), angles.ravel()
+def warm_up() -> None:
+    """Load the kernels, or compile them once: not while frames wait."""
+    corner = np.array([[0, 0, 1], [3, 0, 1], [0, 3, 1]], np.float32)
+    mesh = Mesh(corner, np.array([[0, 1, 2]], np.int32), np.zeros((1, 3), np.float32))
+    shape = (4, 4)
+    camera = Camera(*shape, np.eye(3), np.eye(4))
+    frame = TissueFrame(
+        0, 0, "", 0, camera, None, read_only(np.ones(shape, np.float32)), np.ones(shape, bool), {}
+    )
+    color_key(draw(frame, [Placed(Body(mesh, 1.0, None), np.eye(4))]), (0, 0, 0))
 
 
-def _tangents(normal: F64) -> tuple[F64, F64]:
-    """Two unit vectors across `normal` and across each other."""
-    helper = np.eye(3)[int(np.argmin(np.abs(normal)))]
-    first = np.cross(normal, helper)
-    first /= np.linalg.norm(first)
-    return first, np.cross(normal, first)
+def _hide(z: F32, rgba: U8, depth: F32, tissue: Bool, camera: Camera, baseline: float, under: float) -> None:
+    shift = float(camera.K[0, 0] * baseline)
+    hide(z, rgba, read_only(depth), read_only(tissue), shift, NEAREST, ON_SURFACE, under)
 
 
-def _shade(points: F64, normals: F64, color: tuple[int, int, int]) -> F64:
-    """Colour lit from the camera, as an endoscope lights."""
-    towards = -points / np.linalg.norm(points, axis=1, keepdims=True)
-    light = 0.45 + 0.55 * np.abs((normals * towards).sum(axis=1))
-    shaded: F64 = light[:, None] * np.array(color, np.float64)
-    return shaded
+def _label(rgba: U8, frame: TissueFrame, camera: Camera, placed: Placed, baseline: float) -> None:
+    assert placed.body.label is not None
+    middle = np.asarray(transform(placed.T_world_body, placed.body.middle))
+    point = np.asarray(transform(camera.viewmat, middle))
+    if point[2] > 0:
+        u, v = (camera.K @ point)[:2] / point[2]
+        if 0 <= u < camera.width and 0 <= v < camera.height:
+            _write(rgba, frame, placed.body.label, (int(u) + LABEL_ASIDE, int(v)), point[2], baseline)
+
+
+def _write(
+    rgba: U8, frame: TissueFrame, text: str, at: tuple[int, int], depth: float, baseline: float
+) -> None:
+    """White on black, in place, as if at a depth (m): before the tissue, but not over instruments."""
+    height, width = rgba.shape[:2]
+    scale = _text_scale(height)
+    (_, above), below = cv2.getTextSize(text, FONT, scale, 1)
+    top, bottom = max(0, at[1] - above - 2), min(height, at[1] + below + 2)
+    if top >= bottom:
+        return
+    letters = np.zeros((bottom - top, width), np.uint8)
+    cv2.putText(letters, text, (at[0], at[1] - top), FONT, scale, 255, 1, cv2.LINE_AA)
+    z, written = np.full(letters.shape, depth, np.float32), np.empty((*letters.shape, 4), np.uint8)
+    written[..., :3] = letters[..., None]
+    written[..., 3] = cv2.dilate(letters, np.ones((3, 3), np.uint8))
+    lines = slice(top, bottom)
+    _hide(z, written, frame.depth[lines], frame.tissue[lines], frame.camera, baseline, under=1.0)
+    free = written[..., 3] > 0
+    rgba[lines][free] = written[free]
+
+
+def _text_scale(height: int) -> float:
+    return max(height / 1000, 0.4)

@@ -62,17 +62,17 @@ def echo_text(record: Record) -> str:
 
 def overlay_table(summary: Record) -> Table:
     made = table()
-    latency, pin = summary["latency_ms"], summary["pin"]
-    made.add_row("pictures", f"{summary['frames']}, {summary['overlay']} with the overlay")
+    made.add_row("frames", f"{summary['frames']}, {summary['overlay']} with the overlay")
     for reason, count in summary["blanked"].items():
         made.add_row("", f"{count} without: {reason}")
-    made.add_row("latency", "  ".join(f"{name} {value:.0f} ms" for name, value in latency.items()))
-    if pin["pixel"] is not None:
-        anew = f", then {pin['pinned'] - 1} times anew" if pin["pinned"] > 1 else ""
-        made.add_row("pinned at", f"pixel {pin['pixel'][0]} {pin['pixel'][1]}{anew}")
-    if pin["step_mm_p90"] is not None:
-        moved = f"up to {pin['moved_mm']:.1f} mm, p90 of a step {pin['step_mm_p90']:.2f} mm"
-        made.add_row("moved", moved)
+    for key, name in (("latency_ms", "latency"), ("draw_ms", "drawing")):
+        figures = [f"{which} {value:.0f} ms" for which, value in summary[key].items() if value is not None]
+        made.add_row(name, "  ".join(figures) or "–")
+    for thing in summary["objects"]:
+        anchors = ", ".join(str(anchor["id"]) for anchor in thing["anchors"])
+        held = f"held by anchor {anchors}" if anchors else "not held"
+        anew = f", {thing['pinned'] - 1} times anew" if thing["pinned"] > 1 else ""
+        made.add_row(thing["name"], held + anew + (f"; {thing['reason']}" if thing["reason"] else ""))
     made.add_row("lost", f"{summary['lost']} messages")
     if summary["saved"] is not None:
         made.add_row("saved", summary["saved"])

@@ -13,7 +13,7 @@ from typing import Any
 import cv2
 
 from sags_node.benchmark.pareto_baselines import baselines_of_run, measured_baselines
-from sags_node.benchmark.pareto_settings import Setting, Sweep, skip_rules, skip_settings, time_settings
+from sags_node.benchmark.pareto_settings import Setting, Sweep, skip_settings, time_settings
 from sags_node.engine.rasterize import make_rasterizer, to_view
 from sags_node.errors import SagsError
 from sags_node.evaluation import metrics
@@ -22,6 +22,7 @@ from sags_node.evaluation.measure import FrameRow, Progress
 from sags_node.evaluation.session import measure, run_step
 from sags_node.evaluation.spool import Spool
 from sags_node.evaluation.summary import summarise
+from sags_node.mapping.budget import capacity
 from sags_node.session import Session, open_session
 from sags_node.sources.source import open_source
 from sags_node.vision.rectify import Rectifier
@@ -112,8 +113,10 @@ class _Comparison:
     def measure(self, fits: Mapping[str, Row]) -> Row:
         session, parts = self._session, self._sweep.parts
         timed = time_settings(session.config, self._size, parts)
-        skips = skip_settings(session.config.mapping) if "skips" in parts else []
-        runs: dict[Setting, list[Row]] = {setting: [] for setting in (*timed, *skips)}
+        mapping = session.config.mapping
+        skips = skip_settings(mapping, capacity(mapping, *self._size)) if "skips" in parts else {}
+        pairs = [setting for pair in skips.values() for setting in pair]
+        runs: dict[Setting, list[Row]] = {setting: [] for setting in (*timed, *pairs)}
         turns = [setting for _ in range(self._sweep.repeat) for setting in runs]
         baselines: list[Row] = []
         for place, setting in enumerate(turns, 1):
@@ -138,17 +141,17 @@ class _Comparison:
             "why_default": why_default(rows, 1e3 / rate),
             "settings": rows,
             "baselines": baselines,
-            "skips": self._skips([_middle(runs[setting]) for setting in skips]) if skips else [],
+            "skips": [
+                self._skip(rule, _middle(runs[as_is]), _middle(runs[turned]))
+                for rule, (as_is, turned) in skips.items()
+            ],
         }
 
-    def _skips(self, rows: Sequence[Row]) -> list[Row]:
-        """Rows of `skip_settings` -> what each rule changes."""
-        found = []
-        for rule, turned in zip(skip_rules(), rows[1:], strict=True):
-            is_on = bool(getattr(self._session.config.mapping, rule))
-            on, off = (rows[0], turned) if is_on else (turned, rows[0])
-            found.append({"rule": rule, "default": is_on, **_effect(on, off), "on": on, "off": off})
-        return found
+    def _skip(self, rule: str, as_is: Row, turned: Row) -> Row:
+        """What a rule changes."""
+        is_on = bool(getattr(self._session.config.mapping, rule))
+        on, off = (as_is, turned) if is_on else (turned, as_is)
+        return {"rule": rule, "default": is_on, **_effect(on, off), "on": on, "off": off}
 
     @contextmanager
     def _played(self, setting: Setting, progress: Progress) -> Iterator[tuple[Session, Spool]]:

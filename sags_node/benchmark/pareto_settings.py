@@ -15,6 +15,8 @@ SIZES = (0.75, 0.5)  # of the launch file's working size
 COUNTS = (10_000, 20_000, 30_000, 50_000, 70_000)
 COUNT_BUDGETS_MS = (33.0, 100.0)
 SKIP_STEPS = 2  # per frame, where rules that leave work out are compared
+HURRIED_RULES = ("skip_depth",)  # that act when time is short
+HURRY_MS = 1.0  # a budget that no frame keeps
 
 BUDGET, COUNT = "mapping.budget_ms", "mapping.max_gaussians"
 WIDTH, HEIGHT = "vision.width", "vision.height"
@@ -72,14 +74,20 @@ def time_settings(config: LaunchConfig, size: tuple[int, int], parts: Sequence[s
     return list(settings.values())
 
 
-def skip_settings(mapping: MappingConfig) -> list[Setting]:
-    """All rules as they are, then each rule of `skip_rules` turned round, at a fixed number of steps."""
-    steps = f"mapping.iterations:={SKIP_STEPS}"
-    settings = [Setting("skips", "all rules as they are", (steps,))]
+def skip_settings(mapping: MappingConfig, gaussians: int) -> dict[str, tuple[Setting, Setting]]:
+    """For each rule of `skip_rules`: all rules as they are, and this one turned round.
+
+    Both at a fixed number of steps. A rule for when time is short would never act there: it is compared where
+    time is always short, with the default's number of `gaussians`.
+    """
+    steps = Setting("skips", "all rules as they are", (f"mapping.iterations:={SKIP_STEPS}",))
+    hurry = Setting("skips", "in a hurry", (f"{BUDGET}:={HURRY_MS}", f"{COUNT}:={gaussians}"))
+    pairs = {}
     for rule in skip_rules():
+        base = hurry if rule in HURRIED_RULES else steps
         turned = f"mapping.{rule}:={str(not getattr(mapping, rule)).lower()}"
-        settings.append(Setting("skips", turned, (steps, turned)))
-    return settings
+        pairs[rule] = base, Setting("skips", f"{base.name}, {turned}", (*base.overrides, turned))
+    return pairs
 
 
 def skip_rules() -> list[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from types import TracebackType
@@ -51,6 +51,7 @@ class Publisher:
 
     Args:
         handlers: control op -> function of its args, see `control.ControlServer`; `ping` is always there.
+        offered: what may be subscribed to, beside views.
 
     Raises:
         UsageError: an endpoint open to other machines without keys, a key file that cannot be used, or a run
@@ -64,12 +65,13 @@ class Publisher:
         ns: str,
         session: str,
         handlers: Mapping[str, control.Handler] | None = None,
+        offered: Sequence[topics.Topic] = topics.TOPICS,
     ) -> None:
         for endpoint in (*config.data, *([config.control] if config.control else [])):
             check_endpoint(endpoint, config)
         self.ns = ns
         self.session = session
-        self._names = {topics.full_name(ns, t.name): t for t in topics.TOPICS if config.right or not t.right}
+        self._names = {topics.full_name(ns, t.name): t for t in offered if config.right or not t.right}
         self._seq = dict.fromkeys((t.name for t in self._names.values()), 0)
         self._subscribed: set[str] = set()  # prefixes, only those of our topics and of views
         self._last: FrameResult | None = None

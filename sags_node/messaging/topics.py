@@ -49,6 +49,16 @@ TOPICS = (
 )
 BY_NAME = {topic.name: topic for topic in TOPICS}
 
+# What `sags overlay` publishes on a socket of its own.
+_KEYED = "rgb8, the overlay on a key colour, for displays that blend by one"
+OVERLAY_TOPICS = (
+    Topic("left/overlay/image", IMAGE, "rgba8, virtual geometry, not premultiplied"),
+    Topic("right/overlay/image", IMAGE, "rgba8, virtual geometry, not premultiplied"),
+    Topic("left/overlay/color_key", IMAGE, _KEYED),
+    Topic("right/overlay/color_key", IMAGE, _KEYED),
+    Topic("status", STRING, "JSON: what is drawn, or why nothing is; latency", cached=True),
+)
+_OVERLAY_BY_NAME = {topic.name: topic for topic in OVERLAY_TOPICS}
 
 VIEW_NAME = re.compile(r"[A-Za-z0-9_]{1,64}")
 _VIEW_TOPIC = re.compile(rf"view/{VIEW_NAME.pattern}/(?:(?:left|right)/)?(image|depth|camera_info)")
@@ -60,9 +70,11 @@ _VIEW_KINDS = {
 
 
 def find(name: str) -> Topic | None:
-    """The entry of a topic named without the namespace, also of a view that a consumer may have opened."""
-    if name in BY_NAME:
-        return BY_NAME[name]
+    """The entry of a topic named without the namespace, also of an overlay, or of a view that a consumer may
+    have opened."""
+    known = BY_NAME.get(name) or _OVERLAY_BY_NAME.get(name)
+    if known is not None:
+        return known
     view = _VIEW_TOPIC.fullmatch(name)
     return None if view is None else Topic(name, *_VIEW_KINDS[view[1]], cached=view[1] == "camera_info")
 

@@ -67,7 +67,7 @@ class Phantom:
         """Frame `index` of a session of `count` frames."""
         phase = index / count
         T_world_cam = scope_pose(phase, self._config.camera_motion)
-        vertices = self._tissue.vertices(phase)
+        vertices = self._tissue.vertices(0.0 if self._config.still_tissue else phase)
         hook_view = HOOK_DEPTH * np.array(self._half_view)
         tools = self._instruments.mesh(self._clock.action(phase), self._tissue.grip(vertices), hook_view)
         bodies = Bodies(self._tissue, vertices, tools)
@@ -76,7 +76,9 @@ class Phantom:
         pictures, masks = [], []
         for eye, (rays, offset) in enumerate(((self._left_rays, 0.0), (self._right_rays, self.rig.baseline))):
             linear, mask = look(rays, offset, T_world_cam, bodies, self._relief, self._skin, lamp)
-            if self._config.smoke > 0:
+            if self._is_dark(phase):
+                linear = np.zeros_like(linear)
+            elif self._config.smoke > 0:
                 drift = 60 * np.array([np.cos(2 * np.pi * phase), np.sin(2 * np.pi * phase)])
                 linear = add_smoke(linear, rays, offset, self._cloud, drift, self._config.smoke)
             rng = np.random.default_rng([*self._noise_key, index, eye])
@@ -95,10 +97,17 @@ class Phantom:
             T_world_cam=T_world_cam,
         )
 
+    def _is_dark(self, phase: float) -> bool:
+        if self._config.blackout is None:
+            return False
+        first, last = self._config.blackout
+        return first <= phase * self._config.seconds < last
+
     def still(self, phase: float) -> Still:
         """The tissue alone at a phase 0..1 of the session, as the left rectified camera there sees it."""
         T_world_cam = scope_pose(phase, self._config.camera_motion)
-        bodies = Bodies(self._tissue, self._tissue.vertices(phase), NOTHING)
+        vertices = self._tissue.vertices(0.0 if self._config.still_tissue else phase)
+        bodies = Bodies(self._tissue, vertices, NOTHING)
         lamp = Lamp.at_tip(T_world_cam, self.rig.baseline)
         return Still(bodies, self._relief, self._skin, lamp, eye=T_world_cam[:3, 3])
 

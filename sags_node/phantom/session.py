@@ -25,7 +25,10 @@ VERSION = 1  # of what the generator draws: a cached session of another version 
 RATE = 30.0  # frames per second
 DEPTH_UNIT = 2.5e-6  # m per count
 JPEG_QUALITY = 95
-_SHAPING = ("seconds", "width", "height", "seed", "camera_motion", "smoke", "noise", "blur")
+_SHAPING = (
+    *("seconds", "width", "height", "seed", "camera_motion", "smoke", "noise", "blur"),
+    *("still_tissue", "blackout"),
+)
 _COMPLETE = "launch.yaml"  # written last
 
 

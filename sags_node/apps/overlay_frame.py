@@ -1,0 +1,88 @@
+"""The node's messages of one frame, joined to what the overlay needs of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sags_node.geometry import quat_to_matrix
+from sags_node.messaging.received import (
+    Frame,
+    ReceivedCameraInfo,
+    ReceivedCloud,
+    ReceivedImage,
+    ReceivedRos,
+    TopicName,
+)
+from sags_node.types import F32, F64, Bool, Camera
+
+DEPTH = TopicName("left/render/depth", ReceivedImage)
+TISSUE = TopicName("left/tissue_mask", ReceivedImage)
+INFO = TopicName("left/camera_info", ReceivedCameraInfo)
+POSE = TopicName("tf", ReceivedRos)
+ANCHORS = TopicName("anchors", ReceivedCloud)
+RIGHT_INFO = TopicName("right/camera_info", ReceivedCameraInfo)
+NEEDED = (DEPTH, TISSUE, INFO, POSE, ANCHORS)
+
+
+@dataclass(frozen=True, slots=True)
+class Anchor:
+    """Where the node says that an anchor is."""
+
+    place: F64  # [3] m, world; NaN: lost
+    visibility: float  # 0..1
+    confidence: float  # 0..1
+
+    @property
+    def sure(self) -> float:
+        """0..1: an anchor in sight moves with the tissue around it, also where that has changed its looks."""
+        return max(self.visibility, self.confidence)
+
+
+@dataclass(frozen=True, slots=True)
+class TissueFrame:
+    """The tissue at one time, as the node knows it."""
+
+    frame_id: int
+    stamp_ns: int
+    session: str  # of the node: anchors of another session are other points
+    epoch: int
+    camera: Camera  # left
+    baseline: float | None  # m to the right eye; None: unknown
+    depth: F32  # [H, W] m, NaN unknown
+    tissue: Bool  # [H, W], False: instrument
+    anchors: dict[int, Anchor]
+
+
+def tissue_frame(messages: Frame, right: ReceivedCameraInfo | None) -> TissueFrame | None:
+    """The messages `NEEDED` of one frame joined; None when they do not fit together."""
+    depth, tissue, info, anchors = messages[DEPTH], messages[TISSUE], messages[INFO], messages[ANCHORS]
+    size = (info.height, info.width)
+    poses = messages[POSE].message.transforms
+    fields = anchors.points.dtype.names or ()
+    said = {(message.meta.session, message.meta.epoch) for message in messages.values()}
+    if not depth.array.shape == tissue.array.shape == size or len(poses) != 1 or len(said) != 1:
+        return None
+    if not {"id", "visibility", "confidence"} <= set(fields):
+        return None
+    moved = poses[0].transform
+    T = np.eye(4)
+    T[:3, :3] = quat_to_matrix(np.array([getattr(moved.rotation, axis) for axis in "wxyz"]))
+    T[:3, 3] = [getattr(moved.translation, axis) for axis in "xyz"]
+    rows = anchors.points
+    places = anchors.xyz().astype(np.float64)
+    return TissueFrame(
+        frame_id=depth.meta.frame_id,
+        stamp_ns=depth.stamp_ns,
+        session=depth.meta.session,
+        epoch=depth.meta.epoch,
+        camera=Camera(info.width, info.height, info.K, T),
+        baseline=None if right is None else float(-right.P[0, 3] / right.P[0, 0]),
+        depth=depth.array,
+        tissue=tissue.array > 0,
+        anchors={
+            int(row["id"]): Anchor(place, float(row["visibility"]), float(row["confidence"]))
+            for row, place in zip(rows, places, strict=True)
+        },
+    )

@@ -1,0 +1,153 @@
+"""What `sags overlay` draws: a YAML file of objects and the anchors that hold them, typed and validated."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self, get_args
+
+import yaml
+from pydantic import Field, ValidationError, model_validator
+
+from sags_node.config import Section
+from sags_node.errors import UsageError
+
+MAX_FILE_BYTES = 1 << 20
+KEY_DISTANCE = 64  # of 255: an object's colour nearer than this to the key colour could be taken for it
+
+Number = Annotated[float, Field(allow_inf_nan=False)]
+Place = tuple[Number, Number, Number]  # m
+Byte = Annotated[int, Field(ge=0, le=255)]
+Color = tuple[Byte, Byte, Byte]  # RGB
+Shape = Literal["target", "sphere"]
+SHAPES: tuple[str, ...] = get_args(Shape)
+
+
+class AnchorSpec(Section):
+    """One point of the tissue that holds an object."""
+
+    pixel: tuple[Number, Number] | None = Field(None, description="u v of the left picture, first good frame")
+    place: Place | None = Field(None, description="x y z in the world, m")
+    at: Place | None = Field(None, description="the point of the object that lies there, m")
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Self:
+        if (self.pixel is None) == (self.place is None):
+            raise ValueError("an anchor needs either pixel: [u, v] or place: [x, y, z]")
+        return self
+
+
+class ObjectSpec(Section):
+    """A mesh, a point cloud, a built-in shape or a mere label, fixed to the tissue."""
+
+    file: Path | None = Field(None, description="mesh (.ply .obj .stl) or points (.ply .pcd .xyz)")
+    shape: Shape | None = None
+    label: Annotated[str, Field(min_length=1, max_length=64)] | None = None
+    color: Color = (255, 210, 40)
+    opacity: float = Field(0.85, gt=0, le=1)
+    scale: float = Field(1.0, gt=0, le=1000, description="metres per unit of the file")
+    point_size: float = Field(5e-4, gt=0, le=0.01, description="radius of each point of a point cloud, m")
+    coordinates: Literal["camera", "world"] = Field(
+        "camera",
+        description="of the file when three or more anchors hold it and none says `at`: the left camera's "
+        "when it is pinned, or the world's",
+    )
+    anchors: tuple[AnchorSpec, ...] = Field((), max_length=32, description="one, or three and more; default: "
+                                            "one in the middle of the tissue")  # fmt: skip
+
+    @model_validator(mode="after")
+    def _complete(self) -> Self:
+        if self.file is None and self.shape is None and self.label is None:
+            raise ValueError("an object needs a file, a shape or a label")
+        if self.file is not None and self.shape is not None:
+            raise ValueError("an object has a file or a shape, not both")
+        if len(self.anchors) == 2:
+            raise ValueError("two anchors leave it free to turn: give one, or three and more")
+        said = [anchor.at is not None for anchor in self.anchors]
+        if len(said) > 1 and any(said) and not all(said):
+            raise ValueError("either every anchor says `at`, or none does")
+        return self
+
+    @property
+    def name(self) -> str:
+        return self.label or (self.file.name if self.file is not None else str(self.shape))
+
+
+class SceneSpec(Section):
+    objects: tuple[ObjectSpec, ...] = Field(min_length=1, max_length=32)
+    color_key: Color = Field((0, 0, 255), description="RGB that a display replaces by the video")
+
+    @model_validator(mode="after")
+    def _colors_apart(self) -> Self:
+        for thing in self.objects:
+            if max(abs(a - b) for a, b in zip(thing.color, self.color_key, strict=True)) < KEY_DISTANCE:
+                raise ValueError(
+                    f"the colour of {thing.name} {list(thing.color)} is too near the key colour "
+                    f"{list(self.color_key)}: a display would replace it by the video"
+                )
+        return self
+
+
+def built_in(pixel: tuple[float, float] | None, shape: str) -> SceneSpec:
+    """One shape at a pixel, or in the middle of the tissue.
+
+    Raises:
+        UsageError: there is no such shape.
+    """
+    if shape not in SHAPES:
+        raise UsageError(f"unknown shape '{shape}'; shapes: {', '.join(SHAPES)}")
+    anchors = [] if pixel is None else [{"pixel": pixel}]
+    return SceneSpec.model_validate({"objects": [{"shape": shape, "anchors": anchors}]})
+
+
+def read_scene(file: Path) -> SceneSpec:
+    """Read a scene file; the files it names are relative to it.
+
+    Raises:
+        UsageError: it is missing or too large, is not YAML, or holds an unknown key or a wrong value.
+    """
+    try:
+        with file.open("rb") as opened:
+            content = opened.read(MAX_FILE_BYTES + 1)
+    except OSError as error:
+        raise UsageError(f"cannot read scene file {file}: {error.strerror}; check the path") from None
+    if len(content) > MAX_FILE_BYTES:
+        raise UsageError(f"{file} is larger than {MAX_FILE_BYTES >> 20} MiB: this is no scene file")
+    try:
+        tree = yaml.safe_load(content)
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise UsageError(f"{file} is not valid YAML: {' '.join(str(error).split())}") from None
+    try:
+        scene = SceneSpec.model_validate(tree)
+    except ValidationError as error:
+        raise UsageError(_explain(error, file)) from None
+    folder = file.parent
+    located = [
+        thing if thing.file is None else thing.model_copy(update={"file": folder / thing.file})
+        for thing in scene.objects
+    ]
+    return scene.model_copy(update={"objects": tuple(located)})
+
+
+def _explain(error: ValidationError, file: Path) -> str:
+    """One mistake: where, what, and the nearest known key for an unknown one, which explains most others."""
+    first = min(error.errors(), key=lambda item: item["type"] != "extra_forbidden")
+    path = [str(part) for part in first["loc"]]
+    where = ".".join(path)
+    if first["type"] == "extra_forbidden":
+        return f"{file}: unknown key '{where}'; {_nearest(path)}"
+    if first["type"] == "missing":
+        return f"{file}: {where} is missing; set it"
+    what = first["msg"].removeprefix("Value error, ")
+    if first["type"] == "model_type":
+        what = f"this should be a map of keys, it is a {type(first['input']).__name__}"
+    return f"{file}: {where + ': ' if where else ''}{what}"
+
+
+def _nearest(path: Sequence[str]) -> str:
+    models: dict[str, Any] = {"objects": ObjectSpec, "anchors": AnchorSpec}
+    sections = [models[part] for part in path[:-1] if part in models]
+    known = list((sections[-1] if sections else SceneSpec).model_fields)
+    near = difflib.get_close_matches(path[-1], known, n=1, cutoff=0.5)
+    return f"did you mean '{near[0]}'?" if near else f"known keys: {', '.join(known)}"

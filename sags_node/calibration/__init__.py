@@ -1,0 +1,40 @@
+"""Stereo calibrations: files of any usual form read into a checked `StereoRig`, and rigs made from boards."""
+
+from sags_node.calibration.check import (
+    Finding,
+    check_eyes,
+    check_intrinsics,
+    check_pair,
+    check_rig,
+    refuse_errors,
+)
+from sags_node.calibration.read import Form, find_form, load_rig, read_rig, unknown_form
+from sags_node.calibration.rig import (
+    fit_distortion,
+    rectified_camera,
+    rectified_rig,
+    rectify_eyes,
+    resized_rig,
+)
+from sags_node.calibration.ros import eye_text, save_rig
+
+__all__ = [
+    "Finding",
+    "Form",
+    "check_eyes",
+    "check_intrinsics",
+    "check_pair",
+    "check_rig",
+    "eye_text",
+    "find_form",
+    "fit_distortion",
+    "load_rig",
+    "read_rig",
+    "rectified_camera",
+    "rectified_rig",
+    "rectify_eyes",
+    "refuse_errors",
+    "resized_rig",
+    "save_rig",
+    "unknown_form",
+]

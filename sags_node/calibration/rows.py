@@ -1,0 +1,184 @@
+"""What matched points say of a calibration: do rows agree, is tissue in front of both eyes, and if not, which
+end is wrong, the calibration or the pictures.
+
+Nothing is remapped: the raw pixels of a match go through the calibration, so that other readings of it (eyes
+exchanged, a sign, another size) are tried at no cost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from sags_node.calibration.check import RECALIBRATE, Finding, size_made_for
+from sags_node.types import F64, Eye, StereoRig
+
+FEWEST_MATCHES = 30
+LARGEST_ROW_ERROR = 1 / 180  # of the width, median: beyond it stereo finds no match
+IN_FRONT = 0.8  # of the matches: fewer are no scene seen by two eyes
+CLEARLY = 1.5  # times the row error, and
+CLEARLY_PX = 0.3  # px: a reading that is worse by more does not fit
+WRONG_MATCH = 4.0  # times the median distance from the median row error
+PLAUSIBLE_DEPTH = (0.005, 1.0)  # m, the median: in an endoscope's view
+
+
+class Rows(NamedTuple):
+    """Matches in the rectified cameras' pixels."""
+
+    errors: F64  # [M] px, how far below its row in the left picture a point lies in the right one
+    disparities: F64  # [M] px
+    in_front: float  # share of points in front of both eyes
+    median: float  # px, of the errors without their sign
+    p90: float
+    turn: tuple[float, float]  # degrees, pitch and roll of one eye that explain the errors best
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """One way in which calibration and pictures may belong together."""
+
+    rows: Rows
+    what: str
+    mend: str
+
+
+def rectified_rows(rig: StereoRig, matches: F64) -> Rows:
+    """Row errors and disparities of matches [M, 4], raw pixels, as `match_eyes` gives them."""
+    left, right = _undistorted(rig.left, matches[:, :2]), _undistorted(rig.right, matches[:, 2:])
+    K = rig.left.P[:, :3]
+    errors = K[1, 1] * (right[:, 1] - left[:, 1])
+    disparities = K[0, 0] * (left[:, 0] - right[:, 0])
+    in_front = float(np.mean(_signed_baseline(rig) * disparities > 0))
+    median, p90 = np.percentile(np.abs(errors), [50, 90])
+    turn = _turn(errors / K[1, 1], left[:, 0])
+    return Rows(errors, disparities, in_front, float(median), float(p90), turn)
+
+
+def judge_matches(rig: StereoRig, matches: F64) -> list[Finding]:
+    """What the matches [M, 4] (raw pixels) of a picture pair, or of several, say of a rig.
+
+    An error says which end is wrong: the calibration or the pictures.
+    """
+    if len(matches) < FEWEST_MATCHES:
+        what = f"{len(matches)} points found in both eyes: too few to judge rows"
+        return [Finding("warning", what, "give more pictures, sharp and with texture")]
+    as_is, *others = _readings(rig, matches)
+    fitting = [reading for reading in (as_is, *others) if reading.rows.in_front >= IN_FRONT]
+    limit = LARGEST_ROW_ERROR * rig.left.width
+    best = min((reading.rows.median for reading in fitting), default=np.inf)
+    if best <= limit:
+        enough = max(CLEARLY * best, best + CLEARLY_PX)
+        named = next(reading for reading in fitting if reading.rows.median <= enough)
+        if named is not as_is or _signed_baseline(rig) < 0:
+            return [Finding("error", named.what, named.mend, _figures(named.rows))]
+    if as_is.rows.median > limit:
+        return [_rows_differ(as_is.rows)]
+    if as_is.rows.in_front < IN_FRONT:
+        what = f"only {as_is.rows.in_front:.0%} of the points lie in front of both eyes"
+        mend = "the calibration is not of these pictures, or they show no stereo pair"
+        return [Finding("error", what, mend, _figures(as_is.rows))]
+    return _depth(rig, as_is.rows)
+
+
+def _readings(rig: StereoRig, matches: F64) -> Iterator[Reading]:
+    """As it is, then all that users get wrong; of two that fit alike the first is meant."""
+    rows = rectified_rows(rig, matches)
+    exchanged = rectified_rows(StereoRig(rig.name, rig.right, rig.left), matches)
+    swapped_files = Reading(
+        exchanged,
+        "the eyes are swapped in the calibration: left.yaml is of the camera that took the right pictures",
+        "exchange left.yaml and right.yaml; the pictures are in order",
+    )
+    wrong_sign = Reading(
+        rows._replace(in_front=1 - rows.in_front),
+        "T, or projection_matrix[3] of the right eye, has the wrong sign: points would lie behind the eyes",
+        "change that sign in the calibration; the pictures are in order",
+    )
+    if _signed_baseline(rig) > 0:
+        yield Reading(rows, "", "")
+        yield Reading(
+            exchanged,
+            "the pictures are swapped: the left ones come from the right camera",
+            "exchange left and right of the source; the calibration is in order",
+        )
+        yield wrong_sign
+    else:
+        yield Reading(
+            rows,
+            "pictures and calibration agree that the left eye stands to the right of the other",
+            "exchange left and right of the source, and both files of the calibration",
+        )
+        yield from (swapped_files, wrong_sign) if rig.left.P[0, 3] < 0 else (wrong_sign, swapped_files)
+    size = size_made_for(rig)
+    if size is not None:
+        yield Reading(
+            rectified_rows(_other_size(rig, 1 / size), matches),
+            f"camera_matrix is for pictures of {size:.3g} times the size that the calibration states",
+            f"multiply camera_matrix and projection_matrix by {1 / size:.3g}, or calibrate at full size",
+        )
+
+
+def _other_size(rig: StereoRig, factor: float) -> StereoRig:
+    scale = np.diag([factor, factor, 1.0])
+    left, right = (replace(eye, K=scale @ eye.K, P=scale @ eye.P) for eye in (rig.left, rig.right))
+    return StereoRig(rig.name, left, right)
+
+
+def _undistorted(eye: Eye, pixels: F64) -> F64:
+    """Where pixels [M, 2] lie in the rectified camera, at distance 1."""
+    rays: F64 = cv2.undistortPoints(pixels[:, None], eye.K, eye.distortion, R=eye.R)[:, 0]
+    return rays
+
+
+def _signed_baseline(rig: StereoRig) -> float:
+    """How far the right eye stands to the right of the left one, m, whichever of them is the reference."""
+    return float(rig.left.P[0, 3] / rig.left.P[0, 0] - rig.right.P[0, 3] / rig.right.P[0, 0])
+
+
+def _figures(rows: Rows) -> dict[str, float]:
+    return {
+        "matches": len(rows.errors),
+        "row_error_median_px": round(rows.median, 3),
+        "row_error_p90_px": round(rows.p90, 3),
+        "disparity_median_px": round(float(np.median(rows.disparities)), 3),
+    }
+
+
+def _rows_differ(rows: Rows) -> Finding:
+    """Rows that no reading explains; the nearest turn of one eye says by how much."""
+    pitch, roll = rows.turn
+    what = (
+        f"rows differ by {rows.median:.2f} px (median), {rows.p90:.2f} px (90 %): as if one eye were turned "
+        f"by {pitch:.2f} degrees up or down and {roll:.2f} degrees about its axis"
+    )
+    mend = "the calibration is not of these pictures (another scope, zoom or focus): calibrate again"
+    return Finding("error", what, mend, _figures(rows) | {"pitch_deg": pitch, "roll_deg": roll})
+
+
+def _turn(errors: F64, x: F64) -> tuple[float, float]:
+    """Pitch and roll, degrees, of row errors [M] at columns `x` [M], both at distance 1; wrong matches left
+    out."""
+    away = np.abs(errors - np.median(errors))
+    inner = away <= WRONG_MATCH * np.median(away) + 1e-12
+    design = np.column_stack([np.ones(inner.sum()), x[inner]])
+    pitch, roll = np.degrees(np.linalg.lstsq(design, errors[inner], rcond=None)[0])
+    return round(float(pitch), 3), round(float(roll), 3)
+
+
+def _depth(rig: StereoRig, rows: Rows) -> list[Finding]:
+    depth = float(np.median(_signed_baseline(rig) * rig.left.P[0, 0] / rows.disparities))
+    figures = _figures(rows) | {"depth_median_m": round(depth, 4)}
+    if not PLAUSIBLE_DEPTH[0] <= depth <= PLAUSIBLE_DEPTH[1]:
+        what = f"points would lie at {depth:.3g} m (median); an endoscope sees 0.005 to 1 m"
+        thousandth = PLAUSIBLE_DEPTH[0] <= depth / 1000 <= PLAUSIBLE_DEPTH[1]
+        mend = (
+            "the calibration is in millimetres: divide by 1000, or --unit mm" if thousandth else RECALIBRATE
+        )
+        return [Finding("error", what, mend, figures)]
+    return [
+        Finding("ok", f"the pictures' points lie in front of both eyes, at {depth * 1e3:.0f} mm", "", figures)
+    ]

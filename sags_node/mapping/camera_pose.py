@@ -1,0 +1,125 @@
+"""The camera's pose from points of the model that were found again in a picture: robust least squares."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from sags_node.engine.jit import inlined, kernel
+from sags_node.types import F32, F64, Camera
+
+ROUNDS = 10
+SPREADS = 2.0  # spreads of the residuals beyond which a point counts less than a quarter
+SMALLEST_SCALE = 0.3  # px: better than this no flow is
+FIRST_SCALE = 16.0  # px: so that the start may be that far off
+INLIER = 0.25  # weight: the residual is below the scale
+DAMPING = 1e-6  # of the largest diagonal element: a direction nothing says anything of is left alone
+CONVERGED = 1e-7  # m and rad
+NEAREST = 1e-3  # m
+
+
+@dataclass(frozen=True, slots=True)
+class PoseFit:
+    """A camera pose, and how well the points agree with it."""
+
+    T_world_cam: F64  # [4, 4]
+    weights: F32  # [M] 0..1: how far each point is believed
+    scale: float  # px: residuals beyond it count less than a quarter
+
+    @property
+    def inliers(self) -> int:
+        return int(np.count_nonzero(self.weights > INLIER))
+
+
+def fit_pose(points: F32, pixels: F32, disparities: F32, camera: Camera, baseline: float) -> PoseFit:
+    """The pose from which most of the points are seen where they were found.
+
+    Gauss-Newton on SE(3), on residuals in px: of the place, and of the disparity where it was measured, as
+    ORB-SLAM2 does (R. Mur-Artal and J. D. Tardos, T-RO 2017). The robust weights are Geman and McClure's; their
+    scale starts wide and follows the median (graduated non-convexity), so that a large minority that moves
+    otherwise is given up.
+
+    Args:
+        points: [M, 3] m, world.
+        pixels: [M, 2] where they were found.
+        disparities: [M] px, 0: not measured.
+        camera: the pose to start from.
+        baseline: m.
+    """
+    view = camera.viewmat
+    focal = float(camera.K[0, 0])
+    intrinsics = np.array([focal, camera.K[1, 1], camera.K[0, 2], camera.K[1, 2], focal * baseline])
+    weights, squares = np.zeros(len(points), np.float32), np.zeros(len(points), np.float32)
+    scale = FIRST_SCALE
+    for _ in range(ROUNDS):
+        normal, gradient = _normal_equations(
+            view, intrinsics, points, pixels, disparities, scale * scale, weights, squares
+        )
+        normal[np.diag_indices(6)] += DAMPING * normal.max() + 1e-12
+        twist = -np.linalg.solve(normal, gradient)
+        view = exponential(twist) @ view
+        spread = SPREADS * 1.4826 * float(np.sqrt(np.median(squares) / 2)) if len(squares) else 0.0
+        if np.abs(twist).max() < CONVERGED:
+            break
+        scale = max(min(scale / 2, spread), SMALLEST_SCALE)
+    T_world_cam = np.eye(4)
+    T_world_cam[:3, :3] = view[:3, :3].T
+    T_world_cam[:3, 3] = -view[:3, :3].T @ view[:3, 3]
+    return PoseFit(T_world_cam, weights, scale)
+
+
+def exponential(twist: F64) -> F64:
+    """Rigid transform [4, 4] of a small motion [6]: translation (m), then rotation vector (rad)."""
+    T = np.eye(4)
+    T[:3, :3] = cv2.Rodrigues(twist[3:])[0]
+    T[:3, 3] = twist[:3]
+    return T
+
+
+@kernel
+def _normal_equations(
+    view: F64, intrinsics: F64, points: F32, pixels: F32, disparities: F32,
+    scale2: float, weights: F32, squares: F32,
+) -> tuple[F64, F64]:  # fmt: skip
+    """J^T W J [6, 6] and J^T W r [6] for a twist on the left of the view matrix; writes each point's weight
+    and squared residual (px^2). What lies behind the camera has no weight."""
+    normal, gradient = np.zeros((6, 6)), np.zeros(6)
+    jacobian, residual, p = np.zeros((3, 6)), np.zeros(3), np.zeros(3)
+    fx, fy, cx, cy, focal_baseline = intrinsics
+    for i in range(len(points)):
+        for k in range(3):
+            p[k] = view[k, 3]
+            for a in range(3):
+                p[k] += view[k, a] * points[i, a]
+        weights[i], squares[i] = 0, np.inf
+        if not p[2] > NEAREST:
+            continue
+        rows = 3 if disparities[i] > 0 else 2
+        x, y, per_z = p[0] / p[2], p[1] / p[2], 1 / p[2]
+        residual[0] = fx * x + cx - pixels[i, 0]
+        residual[1] = fy * y + cy - pixels[i, 1]
+        residual[2] = focal_baseline * per_z - disparities[i]
+        square = residual[0] ** 2 + residual[1] ** 2
+        if rows == 3:
+            square += residual[2] ** 2
+        _chain(jacobian[0], p, fx * per_z, 0.0, -fx * x * per_z)
+        _chain(jacobian[1], p, 0.0, fy * per_z, -fy * y * per_z)
+        _chain(jacobian[2], p, 0.0, 0.0, -focal_baseline * per_z * per_z)
+        weight = (scale2 / (scale2 + square)) ** 2
+        weights[i], squares[i] = weight, square
+        for r in range(rows):
+            for a in range(6):
+                gradient[a] += weight * jacobian[r, a] * residual[r]
+                for b in range(6):
+                    normal[a, b] += weight * jacobian[r, a] * jacobian[r, b]
+    return normal, gradient
+
+
+@inlined
+def _chain(row: F64, p: F64, gx: float, gy: float, gz: float) -> None:
+    """Derivative [6] by a twist of the view of what changes by g when the point p (camera axes) moves:
+    g . (t + w x p) = t . g + w . (p x g)."""
+    row[0], row[1], row[2] = gx, gy, gz
+    row[3], row[4], row[5] = p[1] * gz - p[2] * gy, p[2] * gx - p[0] * gz, p[0] * gy - p[1] * gx

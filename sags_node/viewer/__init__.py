@@ -1,0 +1,1 @@
+"""`sags view`: a running node in a web browser on this machine (extra `viewer`: viser)."""

@@ -1,0 +1,226 @@
+"""What a running node shows at this moment, and why nothing is shown when there is nothing.
+
+The node may come, go and come back: the feed connects by itself and lets go of what is old.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from sags_node.errors import SagsError, UsageError
+from sags_node.evaluation.gallery import Picture
+from sags_node.messaging.address import ClientKeys, find_data
+from sags_node.messaging.received import (
+    Received,
+    ReceivedCameraInfo,
+    ReceivedCloud,
+    ReceivedImage,
+    ReceivedRos,
+    ReceivedText,
+)
+from sags_node.messaging.subscriber import Subscriber
+from sags_node.messaging.wire import WireError
+from sags_node.types import U8, Camera
+
+PICTURE = "left/image_rect_color"
+FRAME = (PICTURE, "left/render/image", "left/render/depth", "left/tissue_mask", "left/camera_info", "tf")
+SPLATS, ANCHORS = "splats", "anchors"
+TOPICS = (*FRAME, SPLATS, ANCHORS)
+SPLAT_FIELDS = {"scale_0", "rot_w", "f_dc_0", "opacity", "id"}
+ANCHOR_FIELDS = {"id", "visibility", "confidence", "age"}
+
+MAX_AGE = 1.0  # s; older content is not shown
+LEAST_HZ = 0.5  # the viewer shows a few frames of many, so losing some of them is no fault; age is
+WAIT_FOR_REST = 0.05  # s for what belongs to a picture
+SILENT_AFTER = 2.5  # s without a `status`, which comes every second
+
+_STATES = {
+    "starting": "the node is starting: waiting for the first frame",
+    "waiting": "waiting for the left camera: the source gives no frames",
+    "paused": "the node is paused; Resume goes on",
+    "stopping": "the node is stopping",
+}
+
+
+class Status(msgspec.Struct, frozen=True):
+    """What the node says of itself, as far as it is shown."""
+
+    state: str = ""  # "" before it has said anything
+    rate_hz: float = 0.0
+    latency_ms: dict[str, float] = {}
+    gaussians: int = 0
+    last_error: str | None = None
+
+
+SILENT = Status()
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """All that may be shown as new; what may not is None."""
+
+    problem: str | None = None  # why nothing is shown; None while all is well
+    status: Status = SILENT
+    picture: U8 | None = None  # [H, W, 3] left input
+    model: Picture | None = None  # input, render, depth and tissue of one frame
+    camera: Camera | None = None  # of that frame
+    splats: NDArray[Any] | None = None  # [N] records, see docs/wire.md
+    anchors: NDArray[Any] | None = None
+
+
+class Feed:
+    """Follows the node named `ns`, or the one at `endpoint`; used from one thread.
+
+    Raises:
+        UsageError: the node wants keys that are not given, or the other way round.
+        SagsError: `endpoint` is malformed. That no node runs yet is no error.
+    """
+
+    def __init__(
+        self, endpoint: str | None, ns: str, keys: ClientKeys | None = None, run_dir: Path | None = None
+    ) -> None:
+        self._where = (endpoint, ns, run_dir, keys)
+        self._subscriber: Subscriber | None = None
+        self._frame: dict[str, Received] | None = None  # the newest that came as a whole
+        self._absent: str | None = None  # why there is no subscriber
+        try:
+            self._connect()
+        except UsageError:
+            raise
+        except SagsError as error:
+            if endpoint is not None:
+                raise
+            self._absent = str(error)
+
+    def now(self) -> Moment:
+        """What may be shown now; waits up to `WAIT_FOR_REST` for the rest of the newest frame."""
+        self._follow()
+        subscriber = self._subscriber
+        if subscriber is None:
+            return Moment(self._absent)
+        status = _status_of(subscriber)
+        problem = self._problem(subscriber, status)
+        if problem is not None:
+            return Moment(problem, status)
+        picture = subscriber.latest(PICTURE)
+        assert isinstance(picture, ReceivedImage)  # else there was a problem
+        model, camera = self._whole_frame(subscriber, picture)
+        return Moment(
+            problem=None if model is not None else "waiting for the model of this picture",
+            status=status,
+            picture=picture.array,
+            model=model,
+            camera=camera,
+            splats=_records(subscriber, SPLATS, SPLAT_FIELDS),
+            anchors=_records(subscriber, ANCHORS, ANCHOR_FIELDS),
+        )
+
+    def rest(self) -> None:
+        """Take nothing from the node until the next `now`: nobody looks."""
+        if self._subscriber is not None:
+            self._subscriber.close()
+        self._subscriber = self._frame = None
+
+    def _connect(self) -> None:
+        endpoint, ns, run_dir, keys = self._where
+        self._subscriber = Subscriber(
+            TOPICS, endpoint, ns, run_dir, rates=dict.fromkeys(TOPICS, LEAST_HZ), keys=keys
+        )
+        self._absent = None
+
+    def _follow(self) -> None:
+        """Connect, and again where the node is now, when it has moved or has ended."""
+        try:
+            if self._subscriber is not None and _silence(self._subscriber) > SILENT_AFTER:
+                if find_data(*self._where).endpoint != self._subscriber.endpoint:
+                    self.rest()
+            if self._subscriber is None:
+                self._connect()
+        except SagsError as error:
+            self.rest()
+            self._absent = str(error)
+
+    def _problem(self, subscriber: Subscriber, status: Status) -> str | None:
+        """Why nothing may be shown: what the node is, and else what its pictures are."""
+        if not status.state:
+            return subscriber.refusal or f"waiting for a node at {subscriber.endpoint}"
+        if (silence := _silence(subscriber)) > SILENT_AFTER:
+            return subscriber.refusal or f"stale for {silence:.1f} s: the node is silent"
+        if status.state in _STATES:
+            return _STATES[status.state]
+        newest = subscriber.latest(PICTURE)
+        if newest is None:
+            return "waiting for the left camera"
+        if newest.age() > MAX_AGE:
+            return f"stale for {newest.age():.1f} s: no picture comes"
+        return subscriber.problem(PICTURE, MAX_AGE)
+
+    def _whole_frame(
+        self, subscriber: Subscriber, picture: ReceivedImage
+    ) -> tuple[Picture | None, Camera | None]:
+        """The newest frame of which everything came, while it is not too old."""
+        self._frame = subscriber.aligned(FRAME, picture.stamp_ns, WAIT_FOR_REST) or self._frame
+        if self._frame is None:
+            return None, None
+        shown = self._frame[PICTURE]
+        generation = (shown.meta.session, shown.meta.epoch)
+        if shown.age() > MAX_AGE or generation != (picture.meta.session, picture.meta.epoch):
+            return None, None
+        return _unpack(self._frame)
+
+
+def _silence(subscriber: Subscriber) -> float:
+    """Seconds since the node last spoke of itself; 0 where it has not spoken yet."""
+    status = subscriber.latest("status")
+    return 0.0 if status is None else (time.time_ns() - status.meta.publish_ns) * 1e-9
+
+
+def _status_of(subscriber: Subscriber) -> Status:
+    status = subscriber.latest("status")
+    if not isinstance(status, ReceivedText):
+        return SILENT
+    try:
+        return msgspec.json.decode(status.text, type=Status)
+    except (msgspec.MsgspecError, RecursionError):
+        return SILENT
+
+
+def _records(subscriber: Subscriber, name: str, fields: set[str]) -> NDArray[Any] | None:
+    """The rows of a cloud that may be shown as new and has these fields."""
+    cloud = subscriber.latest(name)
+    if subscriber.problem(name, MAX_AGE) is not None or not isinstance(cloud, ReceivedCloud):
+        return None
+    return cloud.points if fields <= set(cloud.points.dtype.names or ()) else None
+
+
+def _unpack(frame: Mapping[str, Received]) -> tuple[Picture | None, Camera | None]:
+    """The messages of one frame as pictures and camera; None when they do not fit together."""
+    picture, render, depth, tissue, info, pose = (frame[name] for name in FRAME)
+    assert isinstance(picture, ReceivedImage) and isinstance(render, ReceivedImage)
+    assert isinstance(depth, ReceivedImage) and isinstance(tissue, ReceivedImage)
+    assert isinstance(info, ReceivedCameraInfo) and isinstance(pose, ReceivedRos)
+    size = (info.height, info.width)
+    pictures = (picture, render, depth, tissue)
+    if any(image.array.shape[:2] != size for image in pictures) or depth.array.ndim != 2:
+        return None, None
+    try:
+        T_world_cam = pose.pose()
+    except WireError:
+        return None, None
+    model = Picture(
+        frame_id=picture.meta.frame_id,
+        psnr=np.nan,  # not of every frame: it costs more than all the rest here
+        truth=picture.array,
+        render=render.array[..., :3],
+        depth=np.nan_to_num(depth.array, nan=0.0),
+        tissue=tissue.array > 0,
+    )
+    return model, Camera(info.width, info.height, info.K, T_world_cam)

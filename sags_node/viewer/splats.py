@@ -1,0 +1,76 @@
+"""The node's Gaussians as a browser draws them, and the tissue that a ray through them meets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sags_node.geometry import quat_to_matrix
+from sags_node.messaging.content import SH_DEGREE_0
+from sags_node.types import F32, F64
+
+MAX_SPLATS = 60_000  # that a browser draws smoothly; of more, those that cover most
+REACH = 3.0  # standard deviations within which a Gaussian is met
+SURFACE = 0.5  # of the light has been taken: where the renderer puts the depth, too
+
+
+@dataclass(frozen=True, slots=True)
+class Splats:
+    """Gaussians in metres, world."""
+
+    means: F32  # [N, 3]
+    rotations: F32  # [N, 3, 3]
+    scales: F32  # [N, 3] standard deviations
+    colors: F32  # [N, 3] 0..1
+    opacities: F32  # [N]
+
+    def covariances(self, unit: float) -> F32:
+        """[N, 3, 3] in squares of a unit of so many metres."""
+        sides = self.rotations * (self.scales / unit)[:, None, :]
+        return sides @ np.swapaxes(sides, 1, 2)
+
+    def hit(self, origin: F64, direction: F64) -> F64 | None:
+        """Where a ray from `origin` (m) along `direction` meets the tissue: half of its light is taken there.
+
+        Each Gaussian counts where it is densest along the ray, front to back. None when the ray meets nothing
+        that is more opaque than clear.
+        """
+        ray = direction / np.linalg.norm(direction)
+        offsets = self.means - origin
+        apart = np.linalg.norm(np.cross(offsets, ray), axis=1)
+        near = np.flatnonzero((apart < REACH * self.scales.max(axis=1)) & (offsets @ ray > 0))
+        scales, rotations = self.scales[near], self.rotations[near]
+        # In the frame where a Gaussian is a unit ball, its densest point along the ray is the nearest one.
+        start = -np.einsum("nji,nj->ni", rotations, offsets[near]) / scales
+        step = np.einsum("nji,j->ni", rotations, ray) / scales
+        along = -np.sum(start * step, axis=1) / np.sum(step * step, axis=1)
+        square = np.sum((start + along[:, None] * step) ** 2, axis=1)
+        order = np.argsort(along)
+        alphas = (self.opacities[near] * np.exp(-0.5 * square))[order]
+        met = np.flatnonzero(np.cumprod(1 - alphas) < SURFACE)
+        if met.size == 0:
+            return None
+        return np.asarray(origin + ray * along[order[met[0]]], np.float64)
+
+
+def splats_of(points: NDArray[Any]) -> Splats:
+    """The rows of the topic `splats`, at most `MAX_SPLATS`."""
+    if len(points) > MAX_SPLATS:
+        scales = np.sort(_columns(points, "scale_0", "scale_1", "scale_2"), axis=1)
+        cover = points["opacity"] * scales[:, 1] * scales[:, 2]
+        points = points[np.argpartition(cover, -MAX_SPLATS)[-MAX_SPLATS:]]
+    f_dc = _columns(points, "f_dc_0", "f_dc_1", "f_dc_2")
+    return Splats(
+        means=_columns(points, "x", "y", "z"),
+        rotations=quat_to_matrix(_columns(points, "rot_w", "rot_x", "rot_y", "rot_z")),
+        scales=_columns(points, "scale_0", "scale_1", "scale_2"),
+        colors=np.clip(0.5 + np.float32(SH_DEGREE_0) * f_dc, 0, 1),
+        opacities=np.ascontiguousarray(points["opacity"]),
+    )
+
+
+def _columns(points: NDArray[Any], *names: str) -> F32:
+    return np.stack([points[name] for name in names], axis=1)

@@ -1,0 +1,380 @@
+"""Boards drawn through the exact model of a known rig, and the rig found again."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from click.testing import CliRunner
+
+from sags_node.calibration import load_rig, rectify_eyes
+from sags_node.calibration.boards import Charuco, Chessboard, StereoView, find_in_both
+from sags_node.calibration.coverage import coverage_hints
+from sags_node.calibration.solve import Solution, calibrate
+from sags_node.cli import main
+from sags_node.errors import SagsError, UsageError
+from sags_node.types import F32, F64, U8, Eye, StereoRig
+
+SIZE = 480, 384
+SQUARES = 10, 7
+SQUARE = 0.0045  # m
+TEXELS = 40  # of a square of the printed board
+FINER = 3  # samples along each side of a pixel
+
+
+def known_rig() -> StereoRig:
+    K_left = np.array([[430.0, 0, 246.0], [0, 432.0, 187.0], [0, 0, 1]])
+    K_right = np.array([[433.0, 0, 235.0], [0, 434.0, 195.0], [0, 0, 1]])
+    distortion = np.array([-0.17, 0.06, 6e-4, -4e-4, 0]), np.array([-0.15, 0.05, -5e-4, 3e-4, 0])
+    R = cv2.Rodrigues(np.radians([0.3, 0.8, -0.4]))[0]
+    return rectify_eyes("known", SIZE, (K_left, K_right), distortion, R, np.array([-0.0047, 6e-5, -9e-5]))
+
+
+def poses() -> list[F64]:
+    """Board to left camera, [4, 4] m: all over the picture, tilted all ways, near and far."""
+    rng = np.random.default_rng(5)
+    made = []
+    for index in range(18):
+        tilts = rng.uniform(-28, 28, 2)
+        turn = cv2.Rodrigues(np.radians([tilts[0], tilts[1], rng.uniform(-15, 15)]))[0]
+        distance = rng.uniform(0.055, 0.085)
+        across = np.array([(index % 3 - 1) * 0.011, (index // 3 % 3 - 1) * 0.008]) * distance / 0.07
+        centre = np.array([SQUARES[0] / 2 - 1, SQUARES[1] / 2 - 1, 0]) * SQUARE
+        pose = np.eye(4)
+        pose[:3, :3] = turn
+        pose[:3, 3] = np.array([*across, distance]) - turn @ centre
+        made.append(pose)
+    return made
+
+
+@dataclass(frozen=True)
+class Print:
+    """A printed board: texels, and where its first inner corner lies in them."""
+
+    picture: U8
+    origin: float
+
+
+def chessboard_print(squares: tuple[int, int] = SQUARES) -> Print:
+    columns, rows = np.meshgrid(np.arange(squares[0]), np.arange(squares[1]))
+    fields = np.where((columns + rows) % 2, 235, 20).astype(np.uint8)
+    board = np.kron(fields, np.ones((TEXELS, TEXELS), np.uint8))
+    return Print(cv2.copyMakeBorder(board, *[TEXELS] * 4, cv2.BORDER_CONSTANT, value=235), 2 * TEXELS - 0.5)
+
+
+def charuco_print() -> Print:
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    board = cv2.aruco.CharucoBoard(SQUARES, SQUARE, 0.75 * SQUARE, dictionary)
+    picture = board.generateImage((SQUARES[0] * TEXELS, SQUARES[1] * TEXELS))
+    return Print(cv2.copyMakeBorder(picture, *[TEXELS] * 4, cv2.BORDER_CONSTANT, value=235), 2 * TEXELS - 0.5)
+
+
+def fine_rays(eye: Eye) -> F64:
+    """Rays [H * FINER, W * FINER, 2] at distance 1 of points spread evenly over each raw pixel."""
+    steps = [(np.arange(side * FINER) + 0.5) / FINER - 0.5 for side in SIZE]
+    pixels = np.stack(np.meshgrid(*steps), -1).reshape(-1, 1, 2)
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
+    plain = cv2.undistortPoints(pixels, eye.K, eye.distortion, criteria=criteria)
+    return plain.reshape(SIZE[1] * FINER, SIZE[0] * FINER, 2)
+
+
+def draw(printed: Print, rays: F64, camera_from_board: F64) -> U8:
+    """The board on its plane, seen along rays; each pixel is the mean of its samples."""
+    plane_to_ray = np.column_stack(
+        [camera_from_board[:3, 0], camera_from_board[:3, 1], camera_from_board[:3, 3]]
+    )
+    on_board = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], -1) @ np.linalg.inv(plane_to_ray).T
+    texels = (on_board[..., :2] / on_board[..., 2:] / SQUARE * TEXELS + printed.origin).astype(np.float32)
+    fine = cv2.remap(printed.picture, texels, None, cv2.INTER_LINEAR, borderValue=90)
+    gray = cv2.GaussianBlur(cv2.resize(fine, SIZE, interpolation=cv2.INTER_AREA), (0, 0), 0.6)
+    return np.repeat(gray[..., None], 3, -1)
+
+
+def draw_pairs(printed: Print, board_poses: list[F64]) -> list[tuple[U8, U8]]:
+    rig = known_rig()
+    left, right = fine_rays(rig.left), fine_rays(rig.right)
+    return [
+        (draw(printed, left, pose), draw(printed, right, rig.T_right_left @ pose)) for pose in board_poses
+    ]
+
+
+def write_pairs(folder: Path, pairs: list[tuple[U8, U8]]) -> tuple[Path, Path]:
+    for side in ("left", "right"):
+        (folder / side).mkdir(parents=True)
+    for index, pair in enumerate(pairs):
+        for side, picture in zip(("left", "right"), pair, strict=True):
+            cv2.imwrite(str(folder / side / f"{index:02d}.png"), picture)
+    return folder / "left", folder / "right"
+
+
+@pytest.fixture(scope="module")
+def chess_pairs() -> list[tuple[U8, U8]]:
+    return draw_pairs(chessboard_print(), poses())
+
+
+@pytest.fixture(scope="module")
+def chess_folders(
+    chess_pairs: list[tuple[U8, U8]], tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, Path]:
+    return write_pairs(tmp_path_factory.mktemp("chess"), chess_pairs)
+
+
+def exact_views(count: int = 18) -> list[StereoView]:
+    """The corners themselves, without pictures."""
+    rig, points = known_rig(), Chessboard(SQUARES, SQUARE).points.astype(np.float64)
+    views = []
+    for index, pose in enumerate(poses()[:count]):
+        corners = []
+        for eye, T in ((rig.left, np.eye(4)), (rig.right, rig.T_right_left)):
+            camera = T @ pose
+            rvec = cv2.Rodrigues(camera[:3, :3])[0]
+            corners.append(cv2.projectPoints(points, rvec, camera[:3, 3], eye.K, eye.distortion)[0][:, 0])
+        left, right = (corner.astype(np.float32) for corner in corners)
+        views.append(StereoView(f"{index:02d}.png", np.arange(len(points)), left, right))
+    return views
+
+
+def sags(*arguments: object) -> tuple[int, str, str]:
+    result = CliRunner().invoke(main, ["calib", "stereo", *map(str, arguments)])
+    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
+    return result.exit_code, result.stdout, result.stderr
+
+
+BOARD = ["--squares", "10x7", "--square-mm", "4.5"]
+
+
+def assert_recovered(rig: StereoRig) -> None:
+    """Focal lengths to 0.5 %, baseline to 1 %, and the found rig rectifies what the known one sees."""
+    known = known_rig()
+    for found, true in ((rig.left, known.left), (rig.right, known.right)):
+        np.testing.assert_allclose(np.diag(found.K), np.diag(true.K), rtol=0.005)
+        np.testing.assert_allclose(found.K[:2, 2], true.K[:2, 2], atol=2.0)
+    assert rig.baseline == pytest.approx(known.baseline, rel=0.01)
+    points = np.random.default_rng(1).uniform([-0.02, -0.015, 0.05], [0.02, 0.015, 0.12], (400, 3))
+    rows = []
+    for eye, own, T in ((rig.left, known.left, np.eye(4)), (rig.right, known.right, known.T_right_left)):
+        rvec = cv2.Rodrigues(T[:3, :3])[0]
+        raw = cv2.projectPoints(points, rvec, T[:3, 3], own.K, own.distortion)[0]
+        inside = ((raw[:, 0] > 0) & (raw[:, 0] < np.array(SIZE) - 1)).all(-1)
+        rectified = cv2.undistortPoints(raw, eye.K, eye.distortion, R=eye.R)[:, 0, 1] * eye.P[1, 1]
+        rows.append(np.where(inside, rectified, np.nan))
+    errors = np.abs(rows[0] - rows[1])
+    assert np.isfinite(errors).sum() > 100
+    assert np.nanpercentile(errors, 90) < 0.2
+
+
+# ---- the whole command -----------------------------------------------------------------------------------
+
+
+def test_chessboard_pictures_to_a_rig(chess_folders: tuple[Path, Path], tmp_path: Path) -> None:
+    out = tmp_path / "rig"
+    code, said, _ = sags(*chess_folders, *BOARD, "-o", out, "--json")
+    summary = json.loads(said)
+    assert code == 0
+    assert_recovered(load_rig(out))
+    assert summary["views"] >= 15 and summary["error_px"] < 0.2
+    assert summary["row_error_px"]["p90"] < 0.2
+    assert {finding["level"] for finding in summary["findings"]} == {"ok"}
+    assert summary["dropped"] == {}
+    tree = yaml.safe_load((out / "right.yaml").read_text())
+    assert tree["distortion_model"] == "plumb_bob" and tree["projection_matrix"]["data"][3] < 0
+
+
+def test_charuco_seen_in_part(tmp_path: Path) -> None:
+    """Held so near that part of the board is outside: only markers tell which corners are seen."""
+    near = []
+    for pose in poses()[:12]:
+        moved = pose.copy()
+        moved[:3, 3] *= 0.72
+        near.append(moved)
+    folders = write_pairs(tmp_path / "pictures", draw_pairs(charuco_print(), near))
+    charuco = ["--board", "charuco", "--marker-mm", "3.375", "--dictionary", "4X4_50"]
+    code, said, err = sags(*folders, *BOARD, *charuco, "-o", tmp_path / "rig", "--json")
+    assert code == 0, err
+    corners = [view["corners"] for view in json.loads(said)["per_view"].values()]
+    assert min(corners) < 54  # the recording is what the test is for
+    assert_recovered(load_rig(tmp_path / "rig"))
+
+
+def test_report_for_people(chess_folders: tuple[Path, Path], tmp_path: Path) -> None:
+    code, said, err = sags(*chess_folders, *BOARD, "-o", tmp_path / "rig")
+    assert code == 0 and "calibration:" in err
+    for part in ("baseline", "4.7", "focal length", "worst views", "check: ok"):
+        assert part in said
+
+
+def test_live_takes_new_views_that_are_held_still(chess_pairs: list[tuple[U8, U8]], tmp_path: Path) -> None:
+    """A session in which poses are passed, then one is held for two frames; the first comes back at the end."""
+    held: list[tuple[U8, U8]] = []
+    for index in range(8):
+        held += [chess_pairs[8 + index], chess_pairs[index], chess_pairs[index]]
+    held += chess_pairs[:1] * 2
+    write_pairs(tmp_path / "session", held)
+    launch = tmp_path / "session/launch.yaml"
+    launch.write_text(
+        yaml.safe_dump(
+            {"source": {"kind": "folders", "left": "left", "right": "right", "rate": 30, "pace": "step"}}
+        )
+    )
+    out = tmp_path / "rig"
+    code, said, err = sags("--live", launch, *BOARD, "-o", out, "--json")
+    assert code == 0, err
+    summary = json.loads(said)
+    assert summary["pairs"] == 8  # those that were held, once each
+    assert len(list((out / "views/left").iterdir())) == len(list((out / "views/right").iterdir())) == 8
+    assert load_rig(out).baseline == pytest.approx(known_rig().baseline, rel=0.02)
+    code, _, err = sags("--live", launch, *BOARD, "-o", out)
+    assert code == 2 and "is not empty" in err
+
+
+# ---- clear messages --------------------------------------------------------------------------------------
+
+
+def test_too_few_views(chess_pairs: list[tuple[U8, U8]], tmp_path: Path) -> None:
+    folders = write_pairs(tmp_path / "few", chess_pairs[:4])
+    code, out, err = sags(*folders, *BOARD, "-o", tmp_path / "rig")
+    assert code == 1 and out == "" and "4 usable views" in err and "6 are needed" in err
+    assert not (tmp_path / "rig/left.yaml").exists()
+
+
+@pytest.mark.parametrize("said", ["9x6", "11x8"])
+def test_wrong_number_of_squares(chess_pairs: list[tuple[U8, U8]], tmp_path: Path, said: str) -> None:
+    """9x6 is what ROS calls this board: it counts inner corners. A part of the board must not pass for it."""
+    folders = write_pairs(tmp_path / "wrong", chess_pairs[:7])
+    code, _, err = sags(*folders, "--squares", said, "--square-mm", "4.5", "-o", tmp_path / "rig")
+    assert code == 1 and "a board of 10x7 squares is seen" in err
+
+
+def test_wrong_dictionary_and_wrong_charuco(tmp_path: Path) -> None:
+    left, right = draw_pairs(charuco_print(), poses()[:1])[0]
+    gray = left[..., 0]
+    assert "no marker of 6X6_250 is seen" in Charuco(SQUARES, SQUARE, 0.75 * SQUARE, "6X6_250").explain(gray)
+    small = Charuco((5, 4), SQUARE, 0.75 * SQUARE, "4X4_50")
+    assert find_in_both(small, "a", left, right) is None
+    assert "the board has 0 to 9" in small.explain(gray)
+
+
+def test_counts_that_differ(chess_folders: tuple[Path, Path], tmp_path: Path, chess_pairs: Any) -> None:
+    left, right = write_pairs(tmp_path / "odd", chess_pairs[:7])
+    (right / "03.png").unlink()
+    code, _, err = sags(left, right, *BOARD, "-o", tmp_path / "rig")
+    assert code == 2 and "holds 7 pictures" in err and "holds 6" in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["left"], "give two folders"),
+        (["left", "right", "--live", "x.yaml"], "give two folders"),
+        (["left", "right", "--board", "charuco"], "needs --marker-mm and --dictionary"),
+        (
+            ["left", "right", "--board", "charuco", "--marker-mm", "5", "--dictionary", "4X4_50"],
+            "must be below",
+        ),
+        (["left", "right", "--board", "charuco", "--marker-mm", "3", "--dictionary", "9X9"], "known are"),
+        (["left", "right", "--marker-mm", "3"], "belong to --board charuco"),
+        (["gone_left", "gone_right"], "picture folder gone_left does not exist"),
+    ],
+)
+def test_usage(tmp_path: Path, arguments: list[str], said: str) -> None:
+    code, out, err = sags(*arguments, *BOARD, "-o", tmp_path / "rig")
+    assert code == 2 and out == "" and said in err, err
+
+
+def test_a_dictionary_that_is_too_small() -> None:
+    with pytest.raises(UsageError, match="has 50 markers, a board of 12x10 squares 60"):
+        Charuco((12, 10), SQUARE, 0.7 * SQUARE, "4X4_50")
+
+
+# ---- the solution ----------------------------------------------------------------------------------------
+
+
+def solve(views: list[StereoView]) -> Solution:
+    return calibrate("found", views, Chessboard(SQUARES, SQUARE).points, SIZE)
+
+
+def test_exact_corners_give_the_exact_rig() -> None:
+    solution = solve(exact_views())
+    known = known_rig()
+    assert solution.error < 1e-3
+    np.testing.assert_allclose(solution.rig.left.K, known.left.K, atol=0.05)
+    assert solution.rig.baseline == pytest.approx(known.baseline, rel=1e-4)
+    np.testing.assert_allclose(solution.board_poses, np.stack(poses()), atol=1e-4)
+
+
+def test_a_bad_view_is_left_out_and_named() -> None:
+    views = exact_views()
+    bad = StereoView("bad.png", views[4].ids, views[4].left, views[4].right + np.float32([3.0, 8.0]))
+    rng = np.random.default_rng(2)
+    noisy = [
+        StereoView(view.name, view.ids, jitter(view.left, rng), jitter(view.right, rng)) for view in views
+    ]
+    noisy[4] = bad
+    solution = solve(noisy)
+    assert list(solution.dropped) == ["bad.png"] and solution.dropped["bad.png"] > 1
+    assert_recovered(solution.rig)
+
+
+def jitter(corners: F32, rng: np.random.Generator) -> F32:
+    return (corners + rng.normal(0, 0.1, corners.shape)).astype(np.float32)
+
+
+def test_left_and_right_of_different_moments() -> None:
+    views = exact_views()
+    mixed = [
+        StereoView(view.name, view.ids, view.left, other.right)
+        for view, other in zip(views, views[1:] + views[:1], strict=True)
+    ]
+    with pytest.raises(SagsError, match=r"same moment|usable views"):
+        solve(mixed)
+
+
+def test_a_chessboard_upside_down_in_one_eye_is_turned_back(chess_pairs: list[tuple[U8, U8]]) -> None:
+    """Symmetric boards (here 9x7 squares) look the same upside down; the eyes must not disagree."""
+
+    class Upside(Chessboard):
+        calls = 0
+
+        def find(self, gray: U8) -> Any:
+            seen = super().find(gray)
+            self.calls += 1
+            return seen if seen is None or self.calls % 2 else seen._replace(corners=seen.corners[::-1])
+
+    plain = find_in_both(Chessboard(SQUARES, SQUARE), "a", *chess_pairs[0])
+    turned = find_in_both(Upside(SQUARES, SQUARE), "a", *chess_pairs[0])
+    assert plain is not None and turned is not None
+    np.testing.assert_array_equal(plain.right, turned.right)
+
+
+# ---- hints -----------------------------------------------------------------------------------------------
+
+
+def test_good_views_lack_nothing() -> None:
+    solution = solve(exact_views())
+    assert coverage_hints(solution.views, solution.board_poses, SIZE) == []
+
+
+def test_hints_name_what_is_lacking() -> None:
+    flat = np.tile(np.eye(4), (6, 1, 1))
+    flat[:, 2, 3] = 0.07
+    corners = np.random.default_rng(0).uniform((165, 0), (SIZE[0] - 1, SIZE[1] - 1), (60, 2))
+    views = [
+        StereoView(str(i), np.arange(60), corners.astype(np.float32), corners.astype(np.float32))
+        for i in range(6)
+    ]
+    hints = "\n".join(coverage_hints(views, flat, SIZE))
+    assert "6 views are few" in hints
+    assert "the left picture has hardly any corners at top left, middle left, bottom left" in hints
+    assert "tilted left and right by 0 degrees" in hints and "tilted up and down by 0 degrees" in hints
+    assert "same distance" in hints
+    tilted = flat.copy()
+    for index, degrees in enumerate(np.linspace(-20, 20, 6)):
+        tilted[index, :3, :3] = cv2.Rodrigues(np.radians([0.0, degrees, 0.0]))[0]
+    hints = "\n".join(coverage_hints(views, tilted, SIZE))
+    assert "left and right by" not in hints and "up and down by 0 degrees" in hints

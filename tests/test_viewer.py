@@ -1,0 +1,347 @@
+"""`sags view`: what it shows, what it takes away, and whom it lets in; the page in a real browser."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from sags_node.cli import main
+from sags_node.config import PhantomSource
+from sags_node.evaluation.gallery import Picture
+from sags_node.messaging.content import SH_DEGREE_0, SPLAT_FIELDS
+from sags_node.messaging.received import ReceivedCloud
+from sags_node.messaging.subscriber import Subscriber
+from sags_node.phantom import write_session
+from sags_node.types import Camera
+from sags_node.viewer import splats as viewer_splats
+from sags_node.viewer.feed import Moment, Status
+from sags_node.viewer.history import GAP, History
+from sags_node.viewer.pictures import Sheet
+from sags_node.viewer.splats import Splats, splats_of
+
+START_SECONDS = 90  # the first start on a machine compiles kernels
+CHROMIUM = shutil.which("chromium")
+SOFTWARE_GL = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+
+needs_viser = pytest.mark.skipif(
+    subprocess.run([sys.executable, "-c", "import viser"], capture_output=True, check=False).returncode != 0,
+    reason="viser is not installed (extra: viewer)",
+)
+
+
+# ---- what a click meets ----------------------------------------------------------------------------------
+
+
+def sheet_of_splats(z: float, opacity: float, tilt: float = 0.0) -> Splats:
+    """A flat square of 41 x 41 splats, 20 mm wide, its middle at (0, 0, z) m, turned about y."""
+    side = np.linspace(-0.01, 0.01, 41, dtype=np.float32)
+    flat = np.stack([*np.meshgrid(side, side), np.zeros((41, 41), np.float32)], -1).reshape(-1, 3)
+    turn = np.array(
+        [[np.cos(tilt), 0, np.sin(tilt)], [0, 1, 0], [-np.sin(tilt), 0, np.cos(tilt)]], np.float32
+    )
+    means = flat @ turn.T + np.array([0, 0, z], np.float32)
+    count = len(means)
+    return Splats(
+        means=means,
+        rotations=np.broadcast_to(turn, (count, 3, 3)),
+        scales=np.broadcast_to(np.array([4e-4, 4e-4, 2e-5], np.float32), (count, 3)),
+        colors=np.full((count, 3), 0.5, np.float32),
+        opacities=np.full(count, opacity, np.float32),
+    )
+
+
+def both(first: Splats, second: Splats) -> Splats:
+    names = Splats.__dataclass_fields__
+    return Splats(**{name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in names})
+
+
+def test_a_ray_meets_the_nearest_opaque_surface() -> None:
+    front, behind, veil = (
+        sheet_of_splats(0.08, 0.9, tilt=0.6),
+        sheet_of_splats(0.1, 0.9),
+        sheet_of_splats(0.05, 0.05),
+    )
+    tissue = both(both(behind, front), veil)
+    eye = np.array([0.004, -0.002, -0.01])
+    for target in ([0.0, 0.0, 0.08], [0.003, 0.004, 0.08 - 0.003 * np.tan(0.6)]):
+        met = tissue.hit(eye, 7 * (np.array(target) - eye))
+        assert met is not None and np.linalg.norm(met - target) < 2e-4
+    assert veil.hit(eye, np.array([0.0, 0.0, 1.0])) is None, "that is clearer than opaque"
+    assert tissue.hit(eye, np.array([0.0, 0.0, -1.0])) is None, "behind the eye"
+    assert tissue.hit(eye, np.array([1.0, 0.0, 0.3])) is None, "beside the tissue"
+
+
+def rows_of(count: int, **columns: Any) -> Any:
+    rows = np.zeros(count, [(name, "<u4" if name == "id" else "<f4") for name in SPLAT_FIELDS])
+    for name, values in columns.items():
+        rows[name] = values
+    return rows
+
+
+def test_splats_keep_shape_and_colour(monkeypatch: pytest.MonkeyPatch) -> None:
+    half_turn = np.sqrt(0.5)  # 90 degrees about z
+    row = rows_of(
+        1, z=0.08, scale_0=1e-3, scale_1=2e-3, scale_2=3e-3, rot_w=half_turn, rot_z=half_turn,
+        f_dc_0=0.5 / SH_DEGREE_0, f_dc_1=-0.25 / SH_DEGREE_0, opacity=0.7,
+    )  # fmt: skip
+    splats = splats_of(row)
+    np.testing.assert_allclose(splats.covariances(1e-3)[0], np.diag([4.0, 1.0, 9.0]), atol=1e-5)
+    np.testing.assert_allclose(splats.colors, [[1.0, 0.25, 0.5]], atol=1e-6)
+    monkeypatch.setattr(viewer_splats, "MAX_SPLATS", 3)
+    sizes = np.array([1, 5, 2, 4, 3], np.float32) * 1e-3
+    many = splats_of(
+        rows_of(5, scale_0=sizes, scale_1=sizes, scale_2=1e-5, rot_w=1, opacity=[1, 0.01, 1, 1, 1])
+    )
+    assert sorted(many.scales[:, 0] * 1e3) == pytest.approx([2, 3, 4]), "those that cover most"
+
+
+# ---- pictures and figures --------------------------------------------------------------------------------
+
+
+def moment(level: int = 90) -> Moment:
+    """A frame whose model is 10 grey levels too bright in the right half."""
+    truth = np.full((64, 80, 3), level, np.uint8)
+    drawn = truth.copy()
+    drawn[:, 40:] += 10
+    depth = np.full((64, 80), 0.08, np.float32)
+    depth[:32] = 0.05
+    model = Picture(0, np.nan, truth, drawn, depth, np.ones((64, 80), bool))
+    camera = Camera(80, 64, np.diag([100.0, 100.0, 1.0]), np.eye(4))
+    return Moment(None, Status("running", 30.0, {"p50": 20.0, "p99": 40.0}), truth, model, camera)
+
+
+def test_the_sheet_shows_what_is_new_and_nothing_else() -> None:
+    sheet = Sheet()
+    ground = sheet.draw(Moment("gone"))
+    half, middle = ground.shape[1] // 2, ground.shape[0] // 2
+    assert len(np.unique(ground[60:middle])) == 1, "empty but for the captions"
+    full = sheet.draw(moment())
+    height = full.shape[0] // 2
+    assert (full[100, 50] == 90).all() and (full[100, half + half - 50] == 100).all(), "input, model"
+    warm, cold = full[height + 60, 50].astype(int), full[-60, 50].astype(int)
+    assert warm[0] > warm[2] and cold[2] > cold[0], "near is warm, and up is up"
+    left, right = full[height + 100, half + 50], full[height + 100, -50]
+    assert right.astype(int).sum() > left.astype(int).sum() + 30, "error where the model is wrong"
+    only_picture = sheet.draw(Moment("no model", picture=moment().picture))
+    assert (only_picture[100, 50] == 90).all() and (
+        only_picture[100, half + 50] == ground[100, half + 50]
+    ).all()
+    assert (sheet.draw(Moment("gone"))[60 : height - 5] == ground[60, 60]).all()
+
+
+def test_figures_grow_by_the_second_and_go_after_a_gap() -> None:
+    now = [100.0]
+    history = History(lambda: now[0])
+    for _ in range(30):
+        history.add(moment())
+        now[0] += 0.25
+    times, rate, psnr = history.series("rate", "psnr")
+    assert len(times) == 8 and times[-1] == 0 and np.diff(times).min() >= 1
+    assert (rate == 30).all()
+    np.testing.assert_allclose(psnr, 20 * np.log10(255 / 10) + 10 * np.log10(2), rtol=1e-5)
+    now[0] += GAP - 2
+    assert not history.add(Moment("stale"))
+    now[0] += 3
+    assert history.add(Moment("stale")) and len(history.series("p50")[0]) == 0
+
+
+# ---- the command -----------------------------------------------------------------------------------------
+
+
+def refused(code: int, *arguments: str) -> str:
+    result = CliRunner().invoke(main, ["view", *arguments])
+    assert result.exit_code == code and "Traceback" not in result.output
+    return " ".join(result.output.split())
+
+
+def test_without_viser_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert "pip install 'sags-node[viewer]'" in refused(2)
+
+
+@needs_viser
+def test_other_machines_and_taken_ports_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "nice", lambda increment: 0)  # that is for a process of its own
+    said = refused(2, "--host", "0.0.0.0")
+    assert "without keys" in said and "--insecure" in said and "ssh -L" in said
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        assert f"port {port}" in refused(1, "--port", str(port))
+    assert "e.g. tcp://127.0.0.1:5556" in refused(1, "--port", "0", "--endpoint", "nonsense")
+
+
+class RunningView:
+    """`sags view` in its own process, for nodes of its own run directory."""
+
+    def __init__(self, runtime: Path) -> None:
+        self.runtime = runtime
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "sags_node", "view", "--port", "0", "--json"],
+            env=os.environ | {"XDG_RUNTIME_DIR": str(runtime)},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        assert self.process.stdout is not None
+        self.where: dict[str, Any] = json.loads(self.process.stdout.readline())
+
+    def upgrade(self, origin: str) -> int:
+        """HTTP status of the answer to a page of `origin` that asks for the websocket."""
+        lines = (
+            "GET / HTTP/1.1",
+            f"Host: 127.0.0.1:{self.where['port']}",
+            f"Origin: {origin}",
+            "Upgrade: websocket",
+            "Connection: Upgrade",
+            "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==",
+            "Sec-WebSocket-Version: 13",
+            "Sec-WebSocket-Protocol: viser-v0",
+        )
+        with socket.create_connection(("127.0.0.1", self.where["port"]), timeout=10) as peer:
+            peer.sendall("\r\n".join((*lines, "", "")).encode())
+            return int(peer.recv(100).split()[1])
+
+    def stop(self) -> tuple[str, str]:
+        """What it says after Ctrl-C."""
+        self.process.send_signal(signal.SIGINT)
+        return self.process.communicate(timeout=10)
+
+
+@pytest.fixture(scope="module")
+def view(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningView]:
+    running = RunningView(tmp_path_factory.mktemp("runtime"))
+    yield running
+    stdout, stderr = running.stop()
+    assert running.process.returncode == 0 and stdout == "" and "Traceback" not in stderr, stderr
+
+
+@needs_viser
+def test_only_its_own_page_may_connect(view: RunningView) -> None:
+    url, port = view.where["url"], view.where["port"]
+    assert url == f"http://127.0.0.1:{port}"
+    assert view.upgrade(url) == view.upgrade(f"http://localhost:{port}") == 101
+    for stranger in ("https://example.org", f"http://example.org:{port}", f"{url}.example.org", "null"):
+        assert view.upgrade(stranger) == 403
+    peer = socket.socket()
+    peer.settimeout(1)
+    with peer, pytest.raises(OSError):  # another address of this machine
+        peer.connect(("127.0.0.2", port))
+
+
+# ---- in a browser ----------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def page(view: RunningView) -> Iterator[Any]:
+    """The viewer's page in a headless browser; `page.requests` are the addresses it asked for."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (extra: dev)")
+    if CHROMIUM is None:
+        pytest.skip("there is no chromium on this machine (Debian: chromium)")
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE_GL)
+        page = browser.new_page(viewport={"width": 1050, "height": 400})
+        page.set_default_timeout(30_000)
+        page.requests = []
+        page.on("request", lambda request: page.requests.append(request.url))
+        page.goto(view.where["url"])
+        page.wait_for_selector("canvas")
+        yield page
+        browser.close()
+
+
+@pytest.fixture
+def node(view: RunningView, tmp_path: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """A node that the viewer finds by itself; small, for the browser draws without a graphics card."""
+    session = tmp_path / "session"
+    write_session(PhantomSource(seconds=2.0, width=160, height=128, seed=1), session, rate=10.0)
+    command = [sys.executable, "-m", "sags_node", "run", session, "source.loop:=true"]
+    command += ["source.rate:=5", "publish.data:=[]", "publish.control:=tcp://127.0.0.1:*"]
+    running = subprocess.Popen(
+        list(map(str, command)),
+        env=os.environ | {"XDG_RUNTIME_DIR": str(view.runtime)},
+        stderr=subprocess.DEVNULL,
+    )
+    yield running
+    running.kill()
+    running.wait()
+
+
+def status(page: Any) -> str:
+    return str(page.locator("#sags-status").text_content())
+
+
+def until(met: Callable[[], bool], page: Any, seconds: float = 30) -> None:
+    deadline = time.monotonic() + seconds
+    while not met():
+        assert time.monotonic() < deadline, f"the page says: {status(page)}"
+        page.wait_for_timeout(300)  # keeps its events going; looking oftener slows it down
+
+
+def contrast(page: Any) -> float:
+    """Standard deviation of the pixels in the lower half of the 3D scene, above which nothing floats."""
+    box = page.locator("canvas").first.bounding_box()
+    clip = {**box, "y": box["y"] + box["height"] / 2, "height": box["height"] / 2}
+    picture = cv2.imdecode(np.frombuffer(page.screenshot(clip=clip), np.uint8), cv2.IMREAD_COLOR)
+    return float(picture.astype(np.float32).std())
+
+
+def anchors(subscriber: Subscriber) -> dict[int, np.ndarray]:
+    cloud = subscriber.latest("anchors")
+    if not isinstance(cloud, ReceivedCloud):
+        return {}
+    return dict(zip(cloud.points["id"].tolist(), cloud.xyz(), strict=True))
+
+
+@needs_viser
+def test_without_a_node_it_says_so(page: Any) -> None:
+    until(lambda: "no node runs as 'sags'" in status(page), page)
+    assert contrast(page) < 2, "an empty scene"
+
+
+@needs_viser
+def test_a_live_node_is_shown_obeys_and_disappears(
+    page: Any, view: RunningView, node: subprocess.Popen[bytes]
+) -> None:
+    run_dir = view.runtime / "sags"
+    until(lambda: "running" in status(page), page, START_SECONDS)
+    until(lambda: contrast(page) > 15, page)
+    with Subscriber(["anchors"], run_dir=run_dir) as subscriber:
+        box = page.locator("canvas").first.bounding_box()
+        page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+        until(lambda: len(anchors(subscriber)) == 1, page)
+        ((number, place),) = anchors(subscriber).items()
+        assert np.abs(place[:2]).max() < 5e-3, "the page looks at the middle of the tissue"
+        assert 0.04 < place[2] < 0.15
+        until(lambda: page.locator(f"td:text-is('{number}')").count() == 1, page)
+
+        page.get_by_label("Anchor", exact=True).click()
+        page.get_by_role("option", name=str(number)).click()
+        page.get_by_role("button", name="Remove", exact=True).click()
+        until(lambda: anchors(subscriber) == {}, page)
+
+    page.get_by_role("button", name="Pause").click()
+    until(lambda: "paused" in status(page) and contrast(page) < 2, page)
+    page.get_by_role("button", name="Resume").click()
+    until(lambda: "running" in status(page) and contrast(page) > 15, page)
+
+    node.kill()
+    until(lambda: "stale for" in status(page), page, 10)
+    until(lambda: contrast(page) < 2, page, 10)
+    own = (view.where["url"], f"blob:{view.where['url']}", "data:")
+    assert page.requests and all(request.startswith(own) for request in page.requests)
