@@ -5,17 +5,20 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 # Shared libraries that Open3D needs and its wheel does not bring.
 DEBIAN := libusb-1.0-0 libgl1 libegl1 libgomp1 libx11-6
+# What tests use beyond that: a browser for the viewer, a compiler for the C++ client.
+DEBIAN_TESTS := chromium g++ cmake pkg-config cppzmq-dev libmsgpack-cxx-dev
+missing = $(shell for p in $(1); do dpkg -s $$p >/dev/null 2>&1 || echo $$p; done)
+apt_install = apt-get update -qq && apt-get install -y -qq --no-install-recommends $(1) >/dev/null
 
-.PHONY: setup run test lint golden clean
+.PHONY: setup run test test-tools lint golden clean
 
 setup: $(STAMP)
 
 $(STAMP): pyproject.toml constraints.txt
-	@missing=""; for p in $(DEBIAN); do dpkg -s $$p >/dev/null 2>&1 || missing="$$missing $$p"; done; \
-	if [ -n "$$missing" ]; then \
-	  if [ "$$(id -u)" = 0 ]; then apt-get update -qq && apt-get install -y -qq --no-install-recommends $$missing >/dev/null; \
+	@if [ -n "$(call missing,$(DEBIAN))" ]; then \
+	  if [ "$$(id -u)" = 0 ]; then $(call apt_install,$(call missing,$(DEBIAN))); \
 	  else echo "Open3D needs Debian packages; run this once, then make again:"; \
-	       echo "  sudo apt-get install --no-install-recommends$$missing"; exit 1; fi; fi
+	       echo "  sudo apt-get install --no-install-recommends $(call missing,$(DEBIAN))"; exit 1; fi; fi
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "Python 3.11 or newer is needed: make PYTHON=/path/to/python3.11"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
@@ -27,8 +30,14 @@ $(STAMP): pyproject.toml constraints.txt
 run: setup
 	$(BIN)/sags demo
 
-test: setup lint
+test: setup lint test-tools
 	$(BIN)/python -m pytest
+
+# Tests whose tools are missing are skipped, and say so.
+test-tools:
+	@if [ -n "$(call missing,$(DEBIAN_TESTS))" ]; then \
+	  if [ "$$(id -u)" = 0 ]; then $(call apt_install,$(call missing,$(DEBIAN_TESTS))) || true; \
+	  else echo "Some tests will be skipped without: sudo apt-get install $(call missing,$(DEBIAN_TESTS))"; fi; fi
 
 lint: setup
 	$(BIN)/ruff check .

@@ -376,6 +376,41 @@ def bench_tracking(launch: tuple[str, ...], numbers: str, out: Path | None, json
     write_json(out, measured)
 
 
+@bench.command("crowd")
+@launch_argument
+@click.option(
+    "--seconds",
+    type=positive,
+    default=60.0,
+    show_default=True,
+    help="With the crowd; a quarter before and after.",
+)
+@click.option(
+    "--many", type=click.IntRange(0, 50), default=20, show_default=True, help="Further subscribers."
+)
+@table_option
+@as_json
+def bench_crowd(launch: tuple[str, ...], seconds: float, many: int, out: Path | None, json_out: bool) -> None:
+    """Whether subscribers disturb the node.
+
+    Runs a node, by default of the built-in phantom, in a process of its own, alone and then with a fast
+    subscriber, a slow one (200 ms a frame), a dead one (never reads) and many more, each group in its own
+    process. The node's rate, latency and memory, and how old the frames are that the subscribers take.
+
+    \b
+    sags bench crowd --seconds 600 --out benchmarks/results/crowd.json
+    """
+    from sags_node.benchmark import crowd
+
+    check_files(out)
+    path, overrides = split_recording(launch, "sags bench crowd plays recordings; record the cameras first")
+    open_launched(path, overrides)  # what takes long is not part of the node's start
+    with progress("listening") as advance:
+        measured = crowd.measure_crowd(launch, seconds / 4, seconds, many, advance)
+    show(measured if json_out else crowd.table(measured))
+    write_json(out, measured)
+
+
 @bench.command("transport")
 @click.option("--frames", type=click.IntRange(1), default=150, show_default=True, help="Of each transport.")
 @as_json
