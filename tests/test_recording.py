@@ -21,6 +21,7 @@ import yaml
 import zmq
 from click.testing import CliRunner
 from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from synthetic import HEIGHT, WIDTH, at_frame, plane_result, publisher, stream
 
@@ -120,8 +121,8 @@ def test_every_topic_is_recorded_as_it_was_published(tmp_path: Path) -> None:
     assert json.loads(cdr.decode(found["parameters"][0].data, "std_msgs/msg/String").data) == {"seed": 5}
 
 
-def test_two_other_readers_agree(tmp_path: Path) -> None:
-    """`rosbags` reads the folder, `mcap` the file, checksums and all."""
+def test_other_readers_agree(tmp_path: Path) -> None:
+    """`rosbags` reads the folder, `mcap` the file, checksums and all, `mcap_ros2` what the messages say."""
     path, summary = record_plane(tmp_path, seconds=0.5)
     ours = [(m.topic, m.log_ns, bytes(m.data)) for m in read_messages(path)]
     with AnyReader([path]) as reader:
@@ -132,6 +133,14 @@ def test_two_other_readers_agree(tmp_path: Path) -> None:
     assert sorted(theirs) == sorted(ours) and len(ours) == summary["messages"]
     assert {"/sags/left/camera_info", "/sags/parameters"} <= latched and "/sags/left/depth" not in latched
     (file,) = path.glob("*.mcap")
+    with file.open("rb") as opened:
+        mcap = make_reader(opened, decoder_factories=[DecoderFactory()])
+        said = {channel.topic: message for _, channel, _, message in mcap.iter_decoded_messages()}
+    assert set(said) == {topic for topic, _, _ in ours}
+    picture, splats = said["/sags/left/image_rect_color"], said["/sags/splats"]
+    left = plane_result().pair.left
+    assert np.array_equal(np.frombuffer(picture.data, np.uint8).reshape(left.shape), left)
+    assert splats.width == len(plane_result().snapshot.gaussians) and splats.fields[0].name == "x"
     with file.open("rb") as opened:
         mcap = make_reader(opened, validate_crcs=True)
         assert mcap.get_header().profile == "ros2"
