@@ -210,7 +210,7 @@ def test_report_for_people(chess_folders: tuple[Path, Path], tmp_path: Path) -> 
 
 
 def test_live_takes_new_views_that_are_held_still(chess_pairs: list[tuple[U8, U8]], tmp_path: Path) -> None:
-    """A session in which poses are passed, then one is held for two frames; the first comes back at the end."""
+    """A session in which poses are passed, then one is held for two frames; the first comes back last."""
     held: list[tuple[U8, U8]] = []
     for index in range(8):
         held += [chess_pairs[8 + index], chess_pairs[index], chess_pairs[index]]

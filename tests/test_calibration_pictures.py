@@ -220,9 +220,9 @@ def test_highlights_are_no_points_of_the_tissue(phantom: tuple[StereoRig, Pairs]
     down = round(float(np.median(clean[:, 3] - clean[:, 1])))  # raw pictures: rows differ
     rng = np.random.default_rng(3)
     shining = rng.uniform((60, 20), (290, 230), (25, 2)).astype(int)
-    for x, y in shining:
-        shape = tuple(int(side) for side in rng.integers(2, 6, 2)), int(rng.integers(0, 180))
-        for eye, (dx, dy) in ((left, (0, 0)), (right, (-30, down))):
+    for x, y in np.repeat(shining, 4, axis=0) + rng.integers(-5, 6, (100, 2)):  # in clusters
+        shape = tuple(int(side) for side in rng.integers(1, 5, 2)), int(rng.integers(0, 180))
+        for eye, (dx, dy) in ((left, (0, 0)), (right, (-14, down))):
             cv2.ellipse(eye, (int(x + dx), int(y + dy)), *shape, 0, 360, (255, 255, 255), -1)
     matches = match_eyes(left, right)
     assert len(matches) > 200

@@ -10,7 +10,7 @@ from sags_node.types import F64, U8, Bool
 FEATURES = 3000  # of each picture
 CONTRAST = 0.01  # tissue has little
 LARGEST_RATIO = 0.8  # best to second best descriptor distance (Lowe, IJCV 2004, section 7.1)
-HIGHLIGHT = 300  # grey level
+HIGHLIGHT = 245  # grey level
 HIGHLIGHT_MARGIN = 9  # px: a highlight lies at another depth than the tissue it shines on
 EPIPOLAR_DISTANCE = 1.5 / 640  # of the width: as far as lens distortion bends an epipolar line
 LEAST = 16  # matches for an epipolar geometry worth the name
