@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from sags_node.engine.jit import kernel
 from sags_node.types import F32, Bool
 
 EVERY = 8  # px
@@ -24,13 +25,31 @@ def exposure_gain(planes: F32, image: F32, tissue: Bool) -> F32:
         image: [H, W, 3] RGB 0..1.
         tissue: [H, W] where to compare.
     """
-    image = image[::EVERY, ::EVERY]
-    coverage = planes[4, ::EVERY, ::EVERY]
-    used = tissue[::EVERY, ::EVERY] & (coverage > COVERED)
-    seen = image[used]
-    drawn = planes[:3, ::EVERY, ::EVERY][:, used].T / coverage[used, None]
-    fair = ((seen > DARK) & (seen < BRIGHT) & (drawn > DARK) & (drawn < BRIGHT)).all(-1)
-    if np.count_nonzero(fair) < LEAST_PIXELS:
+    most = -(-tissue.shape[0] // EVERY) * -(-tissue.shape[1] // EVERY)
+    ratios = np.empty((3, most), np.float32)
+    count = _ratios(planes, image, tissue, ratios)
+    if count < LEAST_PIXELS:
         return np.ones(3, np.float32)
-    gain: F32 = np.median(seen[fair] / drawn[fair], axis=0).astype(np.float32)
+    gain: F32 = np.median(ratios[:, :count], axis=1).astype(np.float32)
     return gain.clip(1 / LARGEST, LARGEST)
+
+
+@kernel
+def _ratios(planes: F32, image: F32, tissue: Bool, ratios: F32) -> int:
+    """Picture over model of every so many fair pixels, ratios [3, M] written; returns how many."""
+    height, width = tissue.shape
+    dark, bright = np.float32(DARK), np.float32(BRIGHT)
+    n = 0
+    for y in range(0, height, EVERY):
+        for x in range(0, width, EVERY):
+            coverage = planes[4, y, x]
+            if not (tissue[y, x] and coverage > np.float32(COVERED)):
+                continue
+            fair = True
+            for c in range(3):
+                seen, drawn = image[y, x, c], planes[c, y, x] / coverage
+                fair = fair and seen > dark and seen < bright and drawn > dark and drawn < bright
+                ratios[c, n] = seen / drawn
+            if fair:
+                n += 1
+    return n
