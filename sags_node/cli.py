@@ -26,7 +26,7 @@ from sags_node.apps.launching import (
 )
 from sags_node.apps.terminal import check_folder, console, progress, show
 from sags_node.cli_bag import bag
-from sags_node.cli_bench_node import bench
+from sags_node.cli_bench import bench
 from sags_node.cli_calib import calib
 from sags_node.cli_consumers import overlay, topic
 from sags_node.cli_export import export

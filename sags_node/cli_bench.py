@@ -21,12 +21,33 @@ from sags_node.apps.launching import (
     write_json,
 )
 from sags_node.apps.terminal import progress, show, writing
+from sags_node.cli_bench_depth import bench_depth
+from sags_node.cli_bench_masks import bench_masks
+from sags_node.cli_bench_node import (
+    bench_crowd,
+    bench_endurance,
+    bench_pareto,
+    bench_tracking,
+    bench_transport,
+)
 from sags_node.errors import SagsError, UsageError
 
 
 @click.group()
 def bench() -> None:
     """Measure how fast this machine is at it."""
+
+
+for command in (
+    bench_depth,
+    bench_masks,
+    bench_pareto,
+    bench_endurance,
+    bench_tracking,
+    bench_crowd,
+    bench_transport,
+):
+    bench.add_command(command)
 
 
 @bench.command("kernels")

@@ -19,16 +19,13 @@ from sags_node.apps.launching import (
     write_json,
 )
 from sags_node.apps.terminal import progress, show, writing
-from sags_node.cli_bench import bench
 from sags_node.errors import UsageError
 
 if TYPE_CHECKING:
     from sags_node.benchmark.endurance import Order
 
-__all__ = ["bench"]  # with these commands
 
-
-@bench.command("pareto")
+@click.command("pareto")
 @click.argument("launch", nargs=-1, metavar="[LAUNCH.yaml | SESSION]... [key:=value ...]")
 @click.option("--only", metavar="PARTS", help="Some of budgets,resolutions,gaussians,skips.")
 @click.option("--frames", type=click.IntRange(1), help="Of each recording; default: all.")
@@ -98,7 +95,7 @@ def bench_pareto(
             plot.write_bytes(pareto_plot.picture(measured))
 
 
-@bench.command("endurance")
+@click.command("endurance")
 @launch_argument
 @click.option("--frames", type=click.IntRange(1), default=10_000, show_default=True, help="To be played.")
 @click.option(
@@ -142,7 +139,7 @@ def bench_endurance(
     write_json(out, measured)
 
 
-@bench.command("tracking")
+@click.command("tracking")
 @launch_argument
 @click.option(
     "--frames", "numbers", default="10,40,70,90", show_default=True, help="After how many frames to measure."
@@ -174,7 +171,7 @@ def bench_tracking(launch: tuple[str, ...], numbers: str, out: Path | None, json
     write_json(out, measured)
 
 
-@bench.command("crowd")
+@click.command("crowd")
 @launch_argument
 @click.option(
     "--seconds",
@@ -209,7 +206,7 @@ def bench_crowd(launch: tuple[str, ...], seconds: float, many: int, out: Path | 
     write_json(out, measured)
 
 
-@bench.command("transport")
+@click.command("transport")
 @click.option("--frames", type=click.IntRange(1), default=150, show_default=True, help="Of each transport.")
 @as_json
 def bench_transport(frames: int, json_out: bool) -> None:

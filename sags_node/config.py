@@ -11,6 +11,8 @@ Box = tuple[int, int, int, int]  # x, y, width, height in px
 Paths = Annotated[
     tuple[Path, ...], BeforeValidator(lambda said: [said] if isinstance(said, str | Path) else said)
 ]
+Positive = Annotated[float, Field(gt=0)]
+Side = Annotated[int, Field(ge=16, le=4096)]  # px
 
 
 class Section(BaseModel):
@@ -47,20 +49,20 @@ class RecordedSource(Section):
 
 
 class FoldersSource(RecordedSource):
-    """Two folders of pictures, paired by sorted file name."""
+    """Two folders of pictures, paired by sorted file name, or one of a single camera's."""
 
     kind: Literal["folders"] = "folders"
     left: Path
-    right: Path
+    right: Path | None = Field(None, description="null: one camera, with a monocular vision.onnx")
     tools: Path | None = Field(None, description="folder of mask PNGs, 255 = instrument (not tissue)")
 
 
 class VideosSource(RecordedSource):
-    """Two video files, paired by frame number."""
+    """Two video files, paired by frame number, or one of a single camera's."""
 
     kind: Literal["videos"] = "videos"
     left: Path
-    right: Path
+    right: Path | None = Field(None, description="null: one camera, with a monocular vision.onnx")
 
 
 class SideBySideSource(RecordedSource):
@@ -136,6 +138,9 @@ class PhantomSource(RecordedSource):
     smoke: float = Field(0.0, ge=0, le=1)
     noise: float = Field(0.01, ge=0, le=0.2, description="standard deviation, 0..1 scale")
     blur: float = Field(0.0, ge=0, le=5, description="px")
+    gloss: float = Field(1.0, ge=0, le=100, description="strength of the wet highlights")
+    still_tissue: bool = Field(False, description="only the instruments move, and the scope if it is to")
+    blackout: tuple[float, float] | None = Field(None, description="s: without light from, until")
 
 
 class V4l2Source(Section):
@@ -187,21 +192,94 @@ class StereoConfig(Section):
         return self
 
 
+class Normalization(Section):
+    """A network is fed (value / 255 - mean) / std: one number for all channels, or three for R, G and B."""
+
+    mean: tuple[float] | tuple[float, float, float] = (0.0,)
+    std: tuple[Positive] | tuple[Positive, Positive, Positive] = (1.0,)
+
+
+NORMALIZATIONS = {
+    "unit": Normalization(),  # 0..1
+    "bytes": Normalization(std=(1 / 255,)),  # 0..255
+    "imagenet": Normalization(mean=(0.485, 0.456, 0.406), std=(0.229, 0.224, 0.225)),
+    "symmetric": Normalization(mean=(0.5,), std=(0.5,)),  # -1..1
+}
+
+
+def _by_name(said: object) -> object:
+    if isinstance(said, str):
+        if said not in NORMALIZATIONS:
+            raise ValueError(f"Input should be one of {', '.join(NORMALIZATIONS)}, or {{mean: [], std: []}}")
+        return NORMALIZATIONS[said]
+    return said
+
+
+class NetworkFormat(Section):
+    """How a depth network takes pictures and what it gives. What is not said is found out."""
+
+    inputs: tuple[str, ...] | None = Field(None, description="names: left eye, right eye")
+    layout: Literal["nchw", "nhwc"] | None = None
+    color: Literal["rgb", "bgr"] | None = Field(None, description="default: rgb")
+    normalization: Annotated[Normalization | None, BeforeValidator(_by_name)] = Field(
+        None, description="unit, bytes, imagenet, symmetric, or mean and std"
+    )
+    size: tuple[Side, Side] | None = Field(
+        None, description="width and height for a network that takes any; default: the working size"
+    )
+    multiple: int | None = Field(None, ge=1, le=512, description="px that width and height are padded to")
+    output: str | None = Field(None, description="name of the output to use")
+    meaning: Literal["disparity", "negative_disparity", "depth", "inverse_depth"] | None = None
+
+
+class OnnxConfig(NetworkFormat):
+    """Depth from a network of the user's; docs/depth.md says what is recognised."""
+
+    path: Path | None = Field(
+        None, description="the .onnx file; null: depth is matched as vision.stereo says"
+    )
+    providers: tuple[Literal["cuda", "cpu"], ...] = Field(("cuda", "cpu"), min_length=1)
+    threads: int | None = Field(None, ge=1, le=64, description="default: all cores of this process")
+    fallback: bool = Field(True, description="match where the network fails while running; false: end")
+    declared_depth: float | None = Field(
+        None, gt=0, description="m to the middle of the first picture: the scale of one camera alone"
+    )
+
+
 class TissueConfig(Section):
     """Which pixels show tissue."""
 
-    method: Literal["session", "classical", "none"] = Field(
-        "session", description="session: the recording's masks, else classical; none: every pixel"
+    method: Literal["session", "classical", "onnx", "none"] = Field(
+        "session",
+        description="session: the recording's masks, else classical; onnx: a network's; none: every pixel",
+    )
+    path: Path | None = Field(None, description="the .onnx file of a segmentation network, for onnx")
+    tissue_is: Literal["white", "black"] | tuple[int, ...] | None = Field(
+        None,
+        description="what shows tissue in the network's answer: white (class 1 and above), black (class 0), "
+        "or a list of class numbers",
     )
     dilate: int = Field(2, ge=0, le=64, description="px added around instruments, working size")
     exclude: tuple[Box, ...] = Field((), description="boxes of the raw left picture never to use (captions)")
+
+    @model_validator(mode="after")
+    def _network_is_described(self) -> TissueConfig:
+        if self.method == "onnx" and (self.path is None or self.tissue_is is None):
+            raise ValueError("onnx needs path (the .onnx file) and tissue_is (white, black or class numbers)")
+        return self
 
 
 class VisionConfig(Section):
     width: int | None = Field(None, ge=16, le=4096, description="working size; default: the calibration's")
     height: int | None = Field(None, ge=16, le=4096)
     stereo: StereoConfig = StereoConfig()
+    onnx: OnnxConfig = OnnxConfig()
     tissue: TissueConfig = TissueConfig()
+    pose: Literal["session", "fixed", "estimate"] = Field(
+        "session",
+        description="of the camera: the session's, fixed where it has none; always fixed; or estimated from "
+        "the pictures, by the motion that most of the tissue shares",
+    )
 
     def working_size(self, width: int, height: int) -> tuple[int, int]:
         """Width and height of the pictures that are worked on, for a camera of `width` x `height` px."""
@@ -252,10 +330,17 @@ class LaunchConfig(Section):
 
     ns: str = Field("sags", pattern=r"^[A-Za-z0-9_][A-Za-z0-9_/]*$")
     seed: int = 0
-    rig: Path | None = Field(None, description="folder with left.yaml, right.yaml; the phantom has its own")
+    rig: Path | None = Field(
+        None, description="a calibration in any form of docs/calibration.md; the phantom has its own"
+    )
     source: Source = PhantomSource()
     vision: VisionConfig = VisionConfig()
     engine: EngineConfig = EngineConfig()
     mapping: MappingConfig = MappingConfig()
     publish: PublishConfig = PublishConfig()
     segments: dict[str, tuple[int, int]] = Field({}, description="name: [first, last] frame, for sags eval")
+
+    @property
+    def one_camera(self) -> bool:
+        """There is no right eye, and nothing in its place."""
+        return isinstance(self.source, FoldersSource | VideosSource) and self.source.right is None

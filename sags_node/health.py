@@ -51,6 +51,7 @@ class Statistics:
         stopping: bool,
         paused: bool,
         error: BaseException | None,
+        warnings: dict[str, str],
         connections: dict[str, dict[str, int]],
         views: Mapping[str, ViewStatus],
     ) -> NodeHealth:
@@ -84,6 +85,7 @@ class Statistics:
                 rss_mb=resident_mb(),
                 skipped=dict(self._skipped),
                 last_error=str(error) if error else None,
+                warnings=warnings,
                 connections=connections,
                 views=views,
             )

@@ -51,9 +51,15 @@ def load_launch(path: Path | str | None = None, overrides: Sequence[str] = ()) -
     for override in overrides:
         _apply_override(tree, override)
     try:
-        return LaunchConfig.model_validate(tree)
+        config = LaunchConfig.model_validate(tree)
     except ValidationError as error:
         raise UsageError(_explain(error, name)) from None
+    if config.one_camera and config.vision.onnx.path is None:
+        raise UsageError(
+            f"{name}: source.right is missing; with one camera alone depth comes from a monocular network: "
+            "set vision.onnx.path"
+        )
+    return config
 
 
 def _known_recording(folder: Path) -> dict[str, Any] | None:

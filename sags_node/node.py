@@ -152,6 +152,7 @@ class Node:
             stopping=self._stopping.is_set(),
             paused=self._paused.is_set(),
             error=self._error,
+            warnings=self._pipeline.warnings,
             connections=self._publisher.connections,
             views=self._views.status,
         )
@@ -200,7 +201,8 @@ class Node:
                 result = self._pipeline.process(frame, self._budget, waited)
                 give(result)
                 dropped, before = self._frames.dropped, dropped
-                self._scenes.put((result, dropped > before))
+                if not result.camera_lost:
+                    self._scenes.put((result, dropped > before))
         self._mapping_requests.serve()
 
     def _draw_views(self) -> None:

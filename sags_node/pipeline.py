@@ -13,6 +13,7 @@ from sags_node.config import LaunchConfig
 from sags_node.engine.rasterize import make_rasterizer, to_view
 from sags_node.mapping.anchors import Anchors
 from sags_node.mapping.budget import Budget, capacity
+from sags_node.mapping.camera_tracker import CameraTracker
 from sags_node.mapping.mapper import Mapper
 from sags_node.types import (
     F32,
@@ -21,6 +22,7 @@ from sags_node.types import (
     Bool,
     Camera,
     FrameResult,
+    Observation,
     RectifiedPair,
     RenderedView,
     Snapshot,
@@ -29,11 +31,12 @@ from sags_node.types import (
 )
 from sags_node.vision.change import StillScene
 from sags_node.vision.observe import observe
+from sags_node.vision.onnx_depth import NetworkDepth
 from sags_node.vision.rectify import Rectifier
 from sags_node.vision.stereo import StereoDepth
 from sags_node.vision.tissue import TissueMask
 
-FINE_FLOW_MS = 60.0  # a budget that has room for it
+UNHURRIED_MS = 60.0  # a budget that has room for several steps and a finer flow
 FARTHEST = 10.0  # m: what a session says to be beyond is no depth
 DUPLICATE_RMS = 0.6  # grey levels: below a video codec's own noise (PSNR > 52 dB)
 
@@ -46,15 +49,22 @@ class Pipeline:
         width, height = vision.working_size(rig.left.width, rig.left.height)
         self.rectifier = Rectifier(rig, width, height)
         self.tissue = TissueMask(vision.tissue, self.rectifier)
-        self.stereo = StereoDepth(vision.stereo, self.rectifier.camera, self.rectifier.baseline)
+        camera, baseline = self.rectifier.camera, self.rectifier.baseline
+        self.stereo = StereoDepth(vision.stereo, camera, baseline)
+        self._network: NetworkDepth | None = None
+        if vision.onnx.path is not None:
+            self._network = NetworkDepth(vision, self.stereo, camera, baseline)
         self._rasterizer = make_rasterizer(config.engine.backend, width, height)
         self._config = config
         self.mapper = Mapper(
             self._rasterizer,
             capacity(config.mapping, width, height),
             config.mapping.smoothing,
-            fine_flow=config.mapping.budget_ms >= FINE_FLOW_MS,
+            unhurried=config.mapping.budget_ms >= UNHURRIED_MS,
         )
+        self._tracker: CameraTracker | None = None
+        if vision.pose == "estimate":
+            self._tracker = CameraTracker(self.mapper, self._draw_model)
         self.anchors = Anchors()
         self._still = StillScene()
         self._mapped: FrameResult | None = None  # the last frame that was really mapped
@@ -70,6 +80,20 @@ class Pipeline:
         """The frame mapped last; None before the first, and after a reset."""
         return self._mapped
 
+    @property
+    def warnings(self) -> dict[str, str]:
+        """Stage -> what is wrong and how to mend it. May be read from any thread."""
+        alignment = self.stereo.rows.alignment
+        found = {"calibration": alignment.warning} if alignment is not None and alignment.warning else {}
+        lost = None if self._tracker is None else self._tracker.lost
+        if lost is not None:
+            found["pose"] = f"the camera is lost: {lost}"
+        if self._network is not None and self._network.problem:
+            found["network"] = self._network.problem
+        if self.tissue.problem:
+            found["mask"] = self.tissue.problem
+        return found
+
     def reconfigure(self, config: LaunchConfig) -> None:
         """Take changed parameters over; the model stays."""
         self._config = config
@@ -79,31 +103,45 @@ class Pipeline:
         budget.start(waited)
         watch = Stopwatch()
         with watch("rectify"):
-            pair = self.rectifier(frame)
+            pair = self._placed(frame)
         if self._mapped is not None and self._config.mapping.skip_duplicates:
             if _rms_difference(pair, self._mapped.pair) < DUPLICATE_RMS:
                 anchors = self.anchors.at(pair.t_capture_ns)
                 return _repeat(self._mapped, pair, self._epoch(frame), watch.timings_ms, anchors)
-        still = self._still(pair) if self._config.mapping.skip_still else 0  # frames
+        still = self._still_frames(pair)
         skipped: dict[str, str] = {}
         with watch("mask"):
-            tissue = self.tissue(frame, pair)
+            drawn = None if self._mapped is None else self._mapped.views["left"]
+            tissue = self.tissue(frame, pair, drawn)
+            if self.tissue.problem:
+                skipped["mask"] = self.tissue.problem
         with watch("depth"):
             known = self._mapped.observation if still and self._mapped is not None else None
             if known is not None and known.depth.any():
                 depth, confidence = known.depth * tissue, known.depth_confidence * tissue
-                skipped = dict.fromkeys(("depth", "motion"), "nothing moves")
+                skipped |= dict.fromkeys(("depth", "motion"), "nothing moves")
             elif self._lacks_time_for_depth(frame, budget):
                 depth, confidence = np.zeros((2, *tissue.shape), np.float32)
                 skipped["depth"] = NO_TIME
             else:
                 depth, confidence = self.depth(frame, pair, tissue)
+                if self._network is not None and self._network.problem:
+                    skipped["network"] = self._network.problem
             observation = observe(pair, tissue, depth, confidence, self._config.mapping.right_eye)
+        if self._tracker is not None and not still:
+            with watch("pose"):
+                tracked = self._tracker.track(observation)
+                camera = replace(pair.camera, T_world_cam=self._tracker.pose)
+                pair, observation = replace(pair, camera=camera), replace(observation, camera=camera)
+            if not tracked and self._mapped is not None:
+                return self._held(self._mapped, pair, observation, self._epoch(frame), watch.timings_ms)
         with watch("map"):
             snapshot = self.mapper.update(observation, budget, still)
         with watch("render"):
             views = self._draw_eyes(snapshot, pair.baseline)
             self.mapper.drawn(observation, views["left"])
+            if self._tracker is not None:
+                self._tracker.mapped(observation, views["left"])
         with watch("anchors"):
             self.anchors.update(observation, snapshot, views["left"])
             anchors = self.anchors.at(pair.t_capture_ns)
@@ -115,17 +153,61 @@ class Pipeline:
         )
         return self._mapped
 
+    def _placed(self, frame: StereoFrame) -> RectifiedPair:
+        """The rectified pair; until its pose is estimated its camera is where it was last."""
+        if self._config.vision.pose == "session":
+            return self.rectifier(frame)
+        pose = None if self._tracker is None else self._tracker.pose
+        return self.rectifier(replace(frame, T_world_cam=pose))
+
+    def _still_frames(self, pair: RectifiedPair) -> int:
+        if not self._config.mapping.skip_still:
+            return 0
+        if self._tracker is not None:  # an estimated pose tells nothing that the pictures do not
+            pair = replace(pair, camera=self.rectifier.camera)
+        return self._still(pair)
+
+    def _held(
+        self,
+        mapped: FrameResult,
+        pair: RectifiedPair,
+        observation: Observation,
+        epoch: int,
+        timings: dict[str, float],
+    ) -> FrameResult:
+        """While the camera is lost: the last model, and nothing is learnt from the picture."""
+        assert self._tracker is not None and self._tracker.lost is not None
+        self._still.forget()
+        held = _repeat(mapped, pair, epoch, timings, self.anchors.at(pair.t_capture_ns))
+        return replace(held, observation=observation, skipped={"pose": self._tracker.lost})
+
     def _lacks_time_for_depth(self, frame: StereoFrame, budget: Budget) -> bool:
-        needs_matching = frame.depth is None and self.mapper.model.count > 0  # a first model needs depth
+        costs = frame.depth is None or self._network is not None
+        needs_matching = costs and self.mapper.model.count > 0  # a first model needs depth
         return needs_matching and self._config.mapping.skip_depth and not budget.affords_depth()
 
     def depth(self, frame: StereoFrame, pair: RectifiedPair, tissue: Bool) -> tuple[F32, F32]:
-        """Depth and confidence [H, W]: the session's own depth, fully trusted, or else stereo."""
-        if frame.depth is None:
-            return self.stereo(pair, tissue)
-        given = self.rectifier.depth(frame.depth)
-        known = tissue & (given > 0) & (given < FARTHEST)
-        return np.where(known, given, np.float32(0)), known.astype(np.float32)
+        """Depth and confidence [H, W]: the network's where one delivers, else what is measured."""
+        if self._network is not None:
+
+            def measure() -> F32 | None:
+                can = frame.depth is not None or pair.right is not None
+                return self._measured(frame, pair, tissue)[0] if can else None
+
+            found = self._network(pair, tissue, measure)
+            if found is not None:
+                return found
+        return self._measured(frame, pair, tissue)
+
+    def _measured(self, frame: StereoFrame, pair: RectifiedPair, tissue: Bool) -> tuple[F32, F32]:
+        """The session's own depth, fully trusted, or else stereo; all unknown for one camera alone."""
+        if frame.depth is not None:
+            given = self.rectifier.depth(frame.depth)
+            known = tissue & (given > 0) & (given < FARTHEST)
+            return np.where(known, given, np.float32(0)), known.astype(np.float32)
+        if pair.right is None:
+            return np.zeros(tissue.shape, np.float32), np.zeros(tissue.shape, np.float32)
+        return self.stereo(pair, tissue)
 
     def _epoch(self, frame: StereoFrame) -> int:
         """Grows with the source's epochs and with every new model: ids then mean other Gaussians."""
@@ -140,6 +222,11 @@ class Pipeline:
             return {"left": self._draw(snapshot, snapshot.camera, stale)}
         right = self._draw(snapshot, snapshot.camera.moved_right(baseline))
         return {"left": self._draw(snapshot, snapshot.camera), "right": right}
+
+    def _draw_model(self, camera: Camera) -> RenderedView:
+        """The model as it is now."""
+        planes = self._rasterizer.forward(self.mapper.model.gaussians(), [camera])
+        return to_view(planes[0], camera, 0, 0)
 
     def _draw(self, snapshot: Snapshot, camera: Camera, tiles: Bool | None = None) -> RenderedView:
         planes = self._rasterizer.forward(snapshot.gaussians, [camera], tiles)

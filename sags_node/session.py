@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from sags_node.calibration import load_rig
-from sags_node.config import BagSource, EndoNerfSource, FoldersSource, LaunchConfig, PhantomSource
+from sags_node.calibration import load_camera, load_rig
+from sags_node.config import BagSource, EndoNerfSource, LaunchConfig, PhantomSource
 from sags_node.errors import UsageError
 from sags_node.launch_file import load_launch
 from sags_node.sources.source import Source, open_source, recorded_rig
@@ -44,16 +44,8 @@ def open_session(
         SagsError: the recording or the calibration cannot be used.
     """
     config = load_launch(launch, overrides)
-    source = config.source
-    if isinstance(source, FoldersSource) and source.right is None and config.vision.onnx.path is None:
-        raise UsageError(
-            "source.right is missing; with one camera alone depth comes from a monocular network: set "
-            "vision.onnx.path"
-        )
-    one_eyed = (isinstance(source, EndoNerfSource) and source.baseline is None) or (
-        isinstance(source, FoldersSource) and source.right is None
-    )
-    if config.publish.right and one_eyed:
+    one_eyed = isinstance(config.source, EndoNerfSource) and config.source.baseline is None
+    if config.publish.right and (config.one_camera or one_eyed):
         raise UsageError(
             "publish.right: there is no right eye; set source.baseline, or leave publish.right out"
         )
@@ -87,4 +79,6 @@ def _rig(config: LaunchConfig) -> StereoRig:
         raise UsageError(
             "no calibration: set rig to a folder with left.yaml and right.yaml, e.g. rig:=calib/d4d"
         )
+    if config.one_camera and not config.rig.is_dir():
+        return load_camera(config.rig)
     return load_rig(config.rig)

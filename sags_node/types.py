@@ -227,6 +227,11 @@ class FrameResult:
     skipped: Mapping[str, str] = field(default_factory=dict)  # what was left out, and why
     anchors: AnchorStates = field(default_factory=AnchorStates.none)
 
+    @property
+    def camera_lost(self) -> bool:
+        """Whether nobody knows from where the picture was taken: the model is that of an older frame."""
+        return "pose" in self.skipped
+
 
 @dataclass(frozen=True, slots=True)
 class DrawnView:
@@ -263,5 +268,6 @@ class NodeHealth:
     rss_mb: float
     skipped: Mapping[str, int]  # rule -> frames
     last_error: str | None = None
+    warnings: Mapping[str, str] = field(default_factory=dict)  # stage -> what is wrong and how to mend it
     connections: Mapping[str, Mapping[str, int]] = field(default_factory=dict)  # socket -> open, refused
     views: Mapping[str, ViewStatus] = field(default_factory=dict)  # those that consumers asked for, by name

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
 from sags_node.calibration import rectified_rig
@@ -9,6 +10,7 @@ from sags_node.config import LaunchConfig, MappingConfig, VisionConfig
 from sags_node.mapping.budget import StepBudget
 from sags_node.pipeline import Pipeline
 from sags_node.types import StereoFrame, StereoRig
+from sags_node.vision.tissue_classical import InstrumentFinder
 
 _WIDTH, _HEIGHT, _FOCAL, _BASELINE, _DISPARITY = 160, 128, 150.0, 0.0043, 8
 
@@ -21,19 +23,21 @@ def warm_up(config: LaunchConfig) -> None:
     """
     small = config.model_copy(
         update={
-            "vision": VisionConfig(stereo=config.vision.stereo),
+            "vision": VisionConfig(stereo=config.vision.stereo, pose=config.vision.pose),
             "mapping": MappingConfig(max_gaussians=1000),
         }
     )
     pipeline = Pipeline(small, _rig())
     budget = StepBudget(1)
-    texture = np.random.default_rng(0).integers(40, 220, (_HEIGHT, _WIDTH + 64, 3), np.uint8)
+    coarse = np.random.default_rng(0).integers(40, 220, (_HEIGHT // 4, _WIDTH // 4 + 16, 3), np.uint8)
+    texture = cv2.resize(coarse, (_WIDTH + 64, _HEIGHT))
     for i in range(3):
         left = np.ascontiguousarray(texture[:, i : i + _WIDTH])
         right = np.ascontiguousarray(texture[:, i + _DISPARITY : i + _DISPARITY + _WIDTH])
         tissue = np.ones((_HEIGHT, _WIDTH), bool)
         stamp = i * 33_000_000
-        pipeline.process(StereoFrame(i, stamp, stamp, left, right, tissue=tissue), budget)
+        result = pipeline.process(StereoFrame(i, stamp, stamp, left, right, tissue=tissue), budget)
+    InstrumentFinder()(left, result.views["left"])  # for sessions without masks
 
 
 def _rig() -> StereoRig:

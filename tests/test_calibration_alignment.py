@@ -8,18 +8,26 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from synthetic import health
 
 from sags_node.calibration import load_rig
+from sags_node.mapping.budget import StepBudget
+from sags_node.messaging.cdr import decode
+from sags_node.messaging.content import diagnostics
+from sags_node.pipeline import Pipeline
+from sags_node.session import open_session
 from sags_node.sources.pictures import read_picture
 from sags_node.types import F32, U8, Bool, StereoFrame, StereoRig
-from sags_node.vision.alignment import FEWEST_FIELDS, WINDOW, RowMonitor, measure_rows
+from sags_node.vision.alignment import FEWEST_FIELDS, WINDOW, RowMonitor
 from sags_node.vision.matchers import InverseSearch
 from sags_node.vision.rectify import Rectifier
+from sags_node.vision.row_error import measure_rows
 
 SIZE = 640, 512
 MATCHING = 320, 256
 DISPARITIES = 8.0, 60.0  # px at the matching size
 Field = tuple[F32, Bool]
+SESSION = Path(__file__).parent.parent / "replay/phantom_pull"
 
 
 def rectified(session: Path, degrees: tuple[float, float, float]) -> tuple[U8, U8]:
@@ -127,3 +135,19 @@ def test_dense_rows_of_nothing() -> None:
     rng = np.random.default_rng(0)
     left, right = rng.integers(0, 255, (2, 256, 320, 3), np.uint8)
     assert measure_rows(left, right, 2, 60) is None
+
+
+@pytest.mark.parametrize("degrees", [0.0, 0.3])
+def test_the_node_warns_while_it_runs(degrees: float) -> None:
+    session = open_session(SESSION, ["source.pace:=step", "mapping.max_gaussians:=2000"])
+    turn = cv2.Rodrigues(np.radians((degrees, 0.0, 0.0)))[0]
+    right = replace(session.rig.right, R=turn @ session.rig.right.R)
+    pipeline = Pipeline(session.config, StereoRig("turned", session.rig.left, right))
+    with session.source as source:
+        for frame, _ in zip(source, range(FEWEST_FIELDS + 2), strict=False):
+            pipeline.process(frame, StepBudget(0))
+    warnings = pipeline.warnings
+    assert list(warnings) == (["calibration"] if degrees else [])
+    content = diagnostics(replace(health(), warnings=warnings), 0)
+    statuses = decode(b"".join(content.parts), "diagnostic_msgs/msg/DiagnosticArray").status
+    assert ("rows of the eyes differ" in " ".join(status.message for status in statuses)) == bool(degrees)

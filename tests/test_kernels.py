@@ -42,10 +42,15 @@ def scene() -> dict[str, np.ndarray]:
     }
 
 
-def test_advect(scene: dict[str, np.ndarray]) -> None:
+def test_find_and_advect(scene: dict[str, np.ndarray]) -> None:
     s = scene
-    arguments = (s["means"], s["cam0"], s["depth"], s["alpha"], s["tissue"], s["flow"], s["cam1"],
-                 s["tissue"][::-1].copy(), s["depth"][::-1].copy(), np.float32(0.4))  # fmt: skip
+    arguments = (s["means"], s["cam0"], s["depth"], s["alpha"], s["tissue"], s["flow"],
+                 s["tissue"][::-1].copy())  # fmt: skip
+    pixels = np.full((2, N, 2), np.float32(np.nan))
+    motion._find(*arguments, pixels[0])
+    motion._find.py_func(*arguments, pixels[1])
+    assert np.allclose(pixels[0], pixels[1], atol=1e-4, equal_nan=True)
+    arguments = (s["means"], pixels[0], s["cam1"], s["depth"][::-1].copy(), np.float32(0.4))
     moved, seen = np.zeros((2, N, 3), np.float32), np.zeros((2, N), np.float32)
     motion._advect(*arguments, moved[0], seen[0])
     motion._advect.py_func(*arguments, moved[1], seen[1])

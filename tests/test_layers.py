@@ -22,8 +22,9 @@ LAYERS = [
     {"fitting"},
     {"benchmark"},
     {"apps", "viewer"},
+    {"cli_bench_depth", "cli_bench_masks", "cli_bench_node"},
     {"cli_bench", "cli_calib", "cli_consumers", "cli_offline"},
-    {"cli_bag", "cli_bench_node", "cli_export", "cli_view"},
+    {"cli_bag", "cli_export", "cli_view"},
     {"cli"},
 ]
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}

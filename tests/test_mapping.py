@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sags_node.mapping import densify, initialise
-from sags_node.mapping.motion import scene_flow
+from sags_node.mapping.motion import found_again, scene_flow
 from sags_node.model.gaussians import GaussianModel
 from sags_node.types import Camera, Observation, RenderedView
 
@@ -41,11 +41,17 @@ def grid_points(depth: float = DEPTH) -> np.ndarray:
     return np.stack([x, y, np.full(x.size, depth)], 1).astype(np.float32)
 
 
+def flow_of(
+    means: np.ndarray, before: RenderedView, tissue: np.ndarray, flow: np.ndarray, after: Observation
+) -> tuple[np.ndarray, np.ndarray]:
+    return scene_flow(means, found_again(means, before, tissue, flow, after.tissue), after, 0.4)
+
+
 def test_scene_flow_of_a_sideways_shift() -> None:
     means = grid_points()
     flow = np.zeros((HEIGHT, WIDTH, 2), np.float32)
     flow[..., 0], flow[..., 1] = 3.0, -2.0
-    moved, seen = scene_flow(means, view(), np.ones((HEIGHT, WIDTH), bool), flow, observation(), 0.4)
+    moved, seen = flow_of(means, view(), np.ones((HEIGHT, WIDTH), bool), flow, observation())
     assert seen.all()
     assert np.allclose(moved, [3 * DEPTH / FOCAL, -2 * DEPTH / FOCAL, 0], atol=1e-6)
 
@@ -54,9 +60,9 @@ def test_scene_flow_is_pulled_to_the_measured_depth_but_not_across_a_gap() -> No
     means = grid_points()
     tissue = np.ones((HEIGHT, WIDTH), bool)
     still = np.zeros((HEIGHT, WIDTH, 2), np.float32)
-    near, _ = scene_flow(means, view(), tissue, still, observation(depth=0.082), 0.4)
+    near, _ = flow_of(means, view(), tissue, still, observation(depth=0.082))
     assert np.all(near[:, 2] > 0.4e-3) and np.all(near[:, 2] < 1.6e-3)
-    other_surface, _ = scene_flow(means, view(), tissue, still, observation(depth=0.12), 0.4)
+    other_surface, _ = flow_of(means, view(), tissue, still, observation(depth=0.12))
     assert np.allclose(other_surface, 0, atol=1e-7)
 
 
@@ -67,7 +73,7 @@ def test_a_moving_camera_alone_moves_no_tissue() -> None:
     T[:3, 3] = [0.002, -0.001, 0.0]
     flow = np.zeros((HEIGHT, WIDTH, 2), np.float32)
     flow[..., 0], flow[..., 1] = -0.002 * FOCAL / DEPTH, 0.001 * FOCAL / DEPTH
-    moved, seen = scene_flow(means, view(), np.ones((HEIGHT, WIDTH), bool), flow, observation(T=T), 0.4)
+    moved, seen = flow_of(means, view(), np.ones((HEIGHT, WIDTH), bool), flow, observation(T=T))
     assert seen.mean() > 0.9
     assert np.abs(moved[seen > 0]).max() < 1e-6
 
@@ -76,9 +82,9 @@ def test_hidden_and_covered_gaussians_are_not_seen() -> None:
     behind = grid_points(depth=0.095)
     still = np.zeros((HEIGHT, WIDTH, 2), np.float32)
     tissue = np.ones((HEIGHT, WIDTH), bool)
-    _, seen = scene_flow(behind, view(), tissue, still, observation(), 0.4)
+    _, seen = flow_of(behind, view(), tissue, still, observation())
     assert not seen.any()
-    _, seen = scene_flow(grid_points(), view(), ~tissue, still, observation(), 0.4)
+    _, seen = flow_of(grid_points(), view(), ~tissue, still, observation())
     assert not seen.any()
 
 
@@ -89,7 +95,7 @@ def test_the_motion_of_an_instrument_is_not_taken_for_that_of_the_tissue_beside_
     tissue = np.ones((HEIGHT, WIDTH), bool)
     tissue[:, :31] = False
     means = grid_points()
-    moved, seen = scene_flow(means, view(), tissue, flow, observation(), 0.4)
+    moved, seen = flow_of(means, view(), tissue, flow, observation())
     assert 0 < seen.sum() < len(means) / 2
     assert np.allclose(moved[seen > 0], 0, atol=1e-7)
 
@@ -168,6 +174,18 @@ def test_where_the_machine_affords_fewer_those_that_show_least_go_but_none_that_
     assert 0 < doomed.sum() <= densify.SHED * model.count
     assert not doomed[old:].any()
     assert model.contribution[:old][doomed[:old]].max() <= np.sort(model.contribution[:old])[doomed.sum() - 1]
+
+
+def test_a_full_model_gives_up_what_shows_least_and_nothing_that_shows_much() -> None:
+    points = grid_points()
+    size, grey = np.full((len(points), 3), 2e-4, np.float32), np.full((len(points), 3), 0.5, np.float32)
+    model = GaussianModel(len(points))
+    model.append(points, size, grey, 0.9)
+    model.contribution[:] = np.linspace(10, 1, len(points))
+    doomed = densify.least_shown(model, 10)
+    assert np.flatnonzero(doomed).tolist() == list(range(len(points) - 10, len(points)))
+    model.contribution[:] = 2 * densify.LITTLE
+    assert not densify.least_shown(model, 10).any()
 
 
 def test_first_pixels_respect_the_limit_and_the_mask_and_fill_gaps() -> None:

@@ -34,6 +34,7 @@ from sags_node.config import PublishConfig
 from sags_node.errors import SagsError, UsageError
 from sags_node.geometry import project
 from sags_node.messaging import topics
+from sags_node.messaging.content import OF_THE_MODEL
 from sags_node.messaging.publisher import Publisher
 from sags_node.messaging.rundir import read_connection
 from sags_node.types import NO_TIME, FrameResult
@@ -231,6 +232,24 @@ def test_a_frame_without_time_for_depth_sends_none_and_leaves_no_gap(tmp_path: P
     assert all(message.meta["frame_id"] % 2 == 0 for message in got["sags/left/depth"])
     assert np.diff([message.meta["seq"] for message in got["sags/left/depth"]]).tolist() == [1, 1, 1]
     assert np.diff([message.meta["frame_id"] for message in got["sags/tf"]]).tolist() == [1, 1, 1]
+
+
+def test_while_the_camera_is_lost_no_model_goes_out_under_a_new_stamp(tmp_path: Path) -> None:
+    """Not even to who subscribes just then and is sent the last values."""
+    result = plane_result()
+    with publisher(tmp_path / "run") as running:
+        running.publish_result(at_frame(result, 0, time.time_ns()), dropped=0)
+        lost = replace(at_frame(result, 1, time.time_ns()), skipped={"pose": "too dark"})
+        running.publish_result(lost, dropped=0)
+        peer, context = _subscriber(running.connection.data[0], "sags/")
+        _poll_until(running, lambda: running.wanted("splats"))
+        running.publish_result(lost, dropped=0)
+        names = set()
+        while peer.poll(500):
+            names.add(peer.recv_multipart()[0].decode().removeprefix("sags/"))
+        context.destroy(linger=0)
+    assert {"left/image_rect_color", "left/tissue_mask", "left/camera_info"} <= names
+    assert not names & set(OF_THE_MODEL)
 
 
 def test_restart_and_loop_are_visible(tmp_path: Path) -> None:

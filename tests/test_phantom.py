@@ -186,6 +186,22 @@ def test_still_scope_keeps_identity() -> None:
     assert np.array_equal(Phantom(TINY).frame(1, 3).T_world_cam, np.eye(4))
 
 
+def test_still_tissue_stays_where_the_scope_and_the_instruments_move() -> None:
+    phantom = Phantom(TINY.model_copy(update={"still_tissue": True, "camera_motion": True}))
+    first, later = phantom.frame(0, 3), phantom.frame(1, 3)
+    assert np.array_equal(first.points, later.points)
+    assert not np.array_equal(first.T_world_cam, later.T_world_cam)
+    assert not np.array_equal(first.tool, later.tool)
+
+
+def test_blackout_takes_the_light_for_its_time_and_nothing_else() -> None:
+    phantom = Phantom(TINY.model_copy(update={"blackout": (0.03, 0.06)}))  # of 0.1 s
+    dark, lit = phantom.frame(1, 3), phantom.frame(2, 3)
+    assert dark.left.max() < 30 < lit.left.mean()
+    assert dark.right.max() < 30
+    assert np.array_equal(dark.depth, Phantom(TINY).frame(1, 3).depth)
+
+
 def test_smoke_veils_the_picture() -> None:
     clear, smoky = (
         Phantom(TINY.model_copy(update={"smoke": smoke})).frame(1, 3).left for smoke in (0.0, 0.8)

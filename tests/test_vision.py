@@ -15,7 +15,7 @@ from sags_node.vision.matchers import SemiGlobal
 from sags_node.vision.observe import observe
 from sags_node.vision.rectify import Rectifier
 from sags_node.vision.stereo import EDGE_MARGIN, StereoDepth
-from sags_node.vision.tissue import TissueMask, find_instruments
+from sags_node.vision.tissue import TissueMask
 
 ROOT = Path(__file__).parent.parent
 DATA = Path(os.environ.get("SAGS_DATA", ROOT / "../shared/data"))
@@ -172,56 +172,6 @@ def test_outside_the_raw_picture_there_is_no_tissue() -> None:
     )
     assert not everything[:, :99].any()
     assert everything[:, 101:].all()
-
-
-# ---- tissue ----------------------------------------------------------------------------------------------
-
-
-def flat_frame(tissue: Bool | None) -> tuple[StereoFrame, Rectifier, RectifiedPair]:
-    rectifier = Rectifier(load_rig(ROOT / "calib/d4d"), 675, 540)
-    image = np.full((540, 675, 3), (180, 90, 90), np.uint8)
-    frame = make_frame(image, image, tissue)
-    return frame, rectifier, rectifier(frame)
-
-
-def test_session_masks_are_dilated_and_boxes_left_out() -> None:
-    tissue = np.ones((540, 675), np.bool_)
-    tissue[200:300, 400:] = False
-    frame, rectifier, pair = flat_frame(tissue)
-    mask = TissueMask(TissueConfig(dilate=3, exclude=((10, 20, 30, 40),)), rectifier)(frame, pair)
-    expected = np.ones((540, 675), np.bool_)
-    expected[197:303, 397:] = False
-    expected[20:60, 10:40] = False
-    assert (mask != expected).sum() < 30  # the ellipse rounds the corners
-    assert not mask[~tissue].any()
-
-
-def test_no_method_uses_every_pixel_but_the_boxes() -> None:
-    frame, rectifier, pair = flat_frame(np.zeros((540, 675), np.bool_))
-    mask = TissueMask(TissueConfig(method="none", exclude=((0, 0, 5, 5),)), rectifier)(frame, pair)
-    assert (~mask).sum() == 25
-
-
-@pytest.mark.parametrize("box", [(-1, 0, 5, 5), (670, 0, 6, 5), (0, 0, 0, 5), (0, 539, 5, 2)])
-def test_a_box_outside_the_picture_is_refused(box: tuple[int, int, int, int]) -> None:
-    with pytest.raises(UsageError, match="675x540"):
-        TissueMask(TissueConfig(exclude=(box,)), Rectifier(load_rig(ROOT / "calib/d4d"), 640, 512))
-
-
-def test_without_a_session_mask_instruments_are_found_by_colour() -> None:
-    frame, rectifier, _ = flat_frame(None)
-    image = frame.left.copy()
-    image[250:320, 300:] = (150, 150, 152)  # a metal shaft from the right edge
-    image[100:115, 100:115] = 255  # a highlight
-    frame = make_frame(image, image)
-    mask = TissueMask(TissueConfig(), rectifier)(frame, rectifier(frame))
-    assert not mask[255:315, 310:].any()
-    assert mask[:240].all()
-    assert mask[:, :280].all()
-
-
-def test_a_dark_picture_shows_no_tissue() -> None:
-    assert find_instruments(np.full((60, 80, 3), 3, np.uint8)).all()
 
 
 # ---- stereo: scenes with exact truth ---------------------------------------------------------------------
@@ -461,18 +411,6 @@ def test_confidence_tells_good_depth_from_bad(d4d: list[tuple[U8, U8, Bool, F32]
     ]
     assert medians == sorted(medians, reverse=True)
     assert medians[0] > 3 * medians[-1]  # where it is worst, beside instruments, there is no depth at all
-
-
-def test_instruments_of_a_real_session_by_colour(d4d: list[tuple[U8, U8, Bool, F32]]) -> None:
-    both = either = lost = tissue_pixels = 0
-    for left, _, tissue, _ in d4d:
-        found = find_instruments(left)
-        both += int((found & ~tissue).sum())
-        either += int((found | ~tissue).sum())
-        lost += int((found & tissue).sum())
-        tissue_pixels += int(tissue.sum())
-    assert both / either > 0.45
-    assert lost / tissue_pixels < 0.05
 
 
 @pytest.mark.parametrize(("method", "coverage"), [("dis", 0.9), ("sgbm", 0.9)])

@@ -18,8 +18,8 @@ from sags_node.phantom import cached_session
 from sags_node.sources.pictures import size_text
 from sags_node.sources.source import recorded_rig
 from sags_node.types import F64, StereoFrame, StereoRig
-from sags_node.vision.alignment import measure_rows
 from sags_node.vision.rectify import Rectifier
+from sags_node.vision.row_error import measure_rows
 
 Progress = Callable[[int, int], None]
 GOOD_ROWS = (0.7, 2.0)  # px of the full picture, median and 90 %

@@ -8,7 +8,7 @@ from sags_node.calibration.check import (
     check_rig,
     refuse_errors,
 )
-from sags_node.calibration.read import Form, find_form, load_rig, read_rig, unknown_form
+from sags_node.calibration.read import Form, find_form, load_camera, load_rig, read_rig, unknown_form
 from sags_node.calibration.rig import (
     fit_distortion,
     rectified_camera,
@@ -28,6 +28,7 @@ __all__ = [
     "eye_text",
     "find_form",
     "fit_distortion",
+    "load_camera",
     "load_rig",
     "read_rig",
     "rectified_camera",

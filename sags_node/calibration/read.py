@@ -13,6 +13,7 @@ from sags_node.calibration.check import check_rig, refuse_errors
 from sags_node.errors import UsageError
 from sags_node.types import StereoRig
 
+NOMINAL_BASELINE = 0.005  # m, of one camera alone
 ARCHIVE = "calibrationdata.tar.gz"
 ARCHIVE_SUFFIXES = (".tar.gz", ".tgz")
 
@@ -35,6 +36,17 @@ def load_rig(path: Path) -> StereoRig:
     """
     rig = read_rig(path)
     refuse_errors(check_rig(rig), path)
+    return rig
+
+
+def load_camera(file: Path) -> StereoRig:
+    """Read and check the camera_info file of one camera; the right eye is a nominal one.
+
+    Raises:
+        UsageError: it cannot be read, or `check_rig` finds an error.
+    """
+    rig = ros.read_one(Path(file), NOMINAL_BASELINE)
+    refuse_errors(check_rig(rig), file)
     return rig
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import gzip
 import tarfile
 import zlib
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -42,6 +43,25 @@ def read_folder(folder: Path) -> StereoRig:
             mend = "a rig is a folder with left.yaml and right.yaml"
             raise UsageError(f"cannot read calibration {file}: {error.strerror}; {mend}") from None
     return StereoRig(folder.resolve().name, *eyes)
+
+
+def read_one(file: Path, baseline: float) -> StereoRig:
+    """The rig of one camera's camera_info file (`ost.yaml`, `left.yaml`), named after the file.
+
+    Args:
+        baseline: m to a right eye that is not there; nothing may depend on it.
+
+    Raises:
+        UsageError: the file is missing or malformed.
+    """
+    try:
+        with file.open("rb") as opened:
+            eye = _read_eye(opened.read(LARGEST_FILE + 1), str(file))
+    except OSError as error:
+        raise UsageError(f"cannot read calibration {file}: {error.strerror}; check the path") from None
+    P = eye.P.copy()
+    P[0, 3] = -P[0, 0] * baseline
+    return StereoRig(file.stem, eye, replace(eye, P=P))
 
 
 def read_archive(archive: Path) -> StereoRig:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -16,9 +17,11 @@ from sags_node.evaluation.gallery import Gallery
 from sags_node.evaluation.lpips import Lpips
 from sags_node.evaluation.spool import RunFacts, Spool, SpooledFrame
 from sags_node.evaluation.tracking import PointTracks, TrackErrors
+from sags_node.evaluation.trajectory import RigidOdometry
 from sags_node.evaluation.views import between, extrapolated
+from sags_node.geometry import transform
 from sags_node.mapping.right_eye import right_eye_mask
-from sags_node.types import F32, U8, Bool, Camera, Gaussians, RectifiedPair, Reference, StereoFrame
+from sags_node.types import F32, F64, U8, Bool, Camera, Gaussians, RectifiedPair, Reference, StereoFrame
 from sags_node.vision.rectify import Rectifier
 
 Figures = dict[str, float]
@@ -51,6 +54,15 @@ class Options:
 
 
 @dataclass(frozen=True, slots=True)
+class Poses:
+    """Of one frame's camera, `T_world_cam` [4, 4]."""
+
+    known: F64  # as the session says
+    shown: F64  # as the run had it
+    rigid: F64  # of the baseline, see `RigidOdometry`
+
+
+@dataclass(frozen=True, slots=True)
 class FrameRow:
     """All figures of one frame of the recording."""
 
@@ -61,6 +73,7 @@ class FrameRow:
     ]  # online, predict, heldout, between, novel, depth, measured_depth: those that apply
     facts: RunFacts | None = None  # None: held out, or dropped by the run
     track: TrackErrors | None = None
+    poses: Poses | None = None  # None: the session has none, or the run was given them
 
 
 @dataclass(slots=True)
@@ -68,6 +81,7 @@ class _Before:
     """The last processed frame, from which the next one is predicted."""
 
     shown: SpooledFrame
+    given: Camera  # as the session says
     truth: F32
     seconds: float  # on the recording's clock
 
@@ -99,11 +113,13 @@ class Measurer:
         options: Options,
         exclude: tuple[Box, ...] = (),
         backend: str = "numba",
+        pose: Literal["session", "fixed", "estimate"] = "session",
     ) -> None:
         """
         Args:
             tissue_of: the run's own tissue mask, for frames that it held out.
             exclude: boxes of the raw pictures that are never measured (captions, burnt into both eyes).
+            pose: where the run had its poses from.
         """
         self.rows: list[FrameRow] = []
         self.gallery = Gallery(len(spool))
@@ -119,6 +135,8 @@ class Measurer:
         self._lpips = Lpips(options.lpips_weights) if options.lpips_weights else None
         self._usable_right: Bool | None = None
         self._tracks: PointTracks | None = None
+        self._pose = pose
+        self._rigid = RigidOdometry()
         self._before: _Before | None = None
         self._held: _HeldOut | None = None
 
@@ -150,13 +168,33 @@ class Measurer:
             if frame.reference.depth is not None:
                 self.depth_kind = frame.reference.depth_kind
                 figures |= _depth_figures(shown, frame.reference.depth)
-            track = self._follow(shown, frame.reference)
+            track = self._follow(shown, frame.reference, pair.camera)
         self.gallery.offer(place, shown, pair.left, figures["online"]["psnr"])
-        after = _Before(shown, truth, seconds)
+        after = _Before(shown, pair.camera, truth, seconds)
         if self._held is not None and self._before is not None and seconds > self._before.seconds:
             self._held.row.figures["between"] = self._between(self._before, self._held, after)
         self._held, self._before = None, after
-        return FrameRow(frame.frame_id, seconds, figures, shown.facts, track)
+        poses = self._poses(frame, pair, shown)
+        return FrameRow(frame.frame_id, seconds, figures, shown.facts, track, poses)
+
+    def _poses(self, frame: StereoFrame, pair: RectifiedPair, shown: SpooledFrame) -> Poses | None:
+        if self._pose == "session" or frame.T_world_cam is None:
+            return None
+        rigid = self._rigid(pair.left, shown.measured_depth, shown.tissue, pair.camera)
+        return Poses(frame.T_world_cam, shown.snapshot.camera.T_world_cam, rigid)
+
+    def _in_world_of_run(self, given: Camera, shown: SpooledFrame) -> F64:
+        """[4, 4] from the session's world to the run's, where one frame's camera is the same in both."""
+        return shown.snapshot.camera.T_world_cam @ given.viewmat
+
+    def _camera_of_run(self, given: Camera, before: _Before) -> Camera:
+        """The camera of a frame that the run never saw: since the frame before it has moved as given."""
+        if self._pose == "session":
+            return given
+        if self._pose == "fixed":
+            return before.shown.snapshot.camera
+        world = self._in_world_of_run(before.given, before.shown)
+        return replace(given, T_world_cam=world @ given.T_world_cam)
 
     def _predict(self, before: _Before, shown: SpooledFrame, truth: F32, seconds: float) -> Figures:
         guess = self._draw(
@@ -168,11 +206,12 @@ class Measurer:
         }
 
     def _held_out(self, frame: StereoFrame, pair: RectifiedPair, seconds: float, before: _Before) -> FrameRow:
-        guess = self._draw(extrapolated(before.shown.snapshot, seconds - before.seconds), pair.camera)
+        camera = self._camera_of_run(pair.camera, before)
+        guess = self._draw(extrapolated(before.shown.snapshot, seconds - before.seconds), camera)
         tissue, truth = self._tissue_of(frame, pair), metrics.as_float(pair.left)
         quality = self._quality(guess, truth, tissue, costly=True)
         row = FrameRow(frame.frame_id, seconds, {"heldout": quality})
-        self._held = _HeldOut(row, pair.camera, truth, tissue)
+        self._held = _HeldOut(row, camera, truth, tissue)
         return row
 
     def _between(self, before: _Before, held: _HeldOut, after: _Before) -> Figures:
@@ -223,15 +262,15 @@ class Measurer:
         usable: Bool = (rectified == 255).all(-1)
         return usable
 
-    def _follow(self, shown: SpooledFrame, reference: Reference) -> TrackErrors | None:
+    def _follow(self, shown: SpooledFrame, reference: Reference, given: Camera) -> TrackErrors | None:
         if reference.points is None or reference.points_visible is None:
             return None
         if self._tracks is None:
             self._tracks = PointTracks(len(reference.points))
-        snapshot = shown.snapshot
-        return self._tracks.update(
-            snapshot.gaussians, reference.points, reference.points_visible, snapshot.camera
-        )
+        snapshot, points = shown.snapshot, reference.points
+        if self._pose != "session":
+            points = np.asarray(transform(self._in_world_of_run(given, shown), points), np.float64)
+        return self._tracks.update(snapshot.gaussians, points, reference.points_visible, snapshot.camera)
 
 
 def _depth_figures(shown: SpooledFrame, reference: F32) -> dict[str, Figures]:

@@ -117,6 +117,7 @@ def measure(
         "seed": config.seed,
         "width": session.working_size[0],
         "height": session.working_size[1],
+        "pose": config.vision.pose,
         "depth_reference": measurer.depth_kind,
         "hold_out": options.hold_out,
         "novel_every": options.every,
@@ -200,7 +201,7 @@ def _measured(session: Session, spool: Spool, options: Options, progress: Progre
     rectifier = Rectifier(session.rig, *session.working_size)
     tissue = TissueMask(config.vision.tissue, rectifier)
     exclude = config.vision.tissue.exclude
-    measurer = Measurer(spool, rectifier, tissue, options, exclude, config.engine.backend)
+    measurer = Measurer(spool, rectifier, tissue, options, exclude, config.engine.backend, config.vision.pose)
     with open_source(config.source.model_copy(update={"pace": "step"})) as frames:
         measurer.run(frames, progress)
     return measurer

@@ -14,6 +14,7 @@ from sags_node.evaluation.machine import machine_name
 from sags_node.evaluation.measure import FrameRow, Options
 from sags_node.evaluation.metrics import percentiles
 from sags_node.evaluation.spool import RunFacts
+from sags_node.evaluation.trajectory import trajectory_errors
 
 GROUPS = {
     "online": ("psnr", "ssim", "lpips"),
@@ -40,6 +41,8 @@ def summarise(
     (`online.motion.psnr`; first and last frame belong to it). Track errors are pooled over points and frames.
     `predict.copy_psnr` is the picture before, shown again: on tissue that hardly moves it is hard to beat.
     `between` is `heldout` once the next frame is known; `between.mean_psnr` the mean of the pictures around.
+    `pose` compares with the session's poses those of a run that was not given them; `pose.rigid_...` are
+    those of the baseline, see `RigidOdometry`.
     """
     facts = [row.facts for row in rows if row.facts is not None]
     held_out = sum(options.holds_out(row.frame_id) for row in rows)
@@ -116,7 +119,20 @@ def _quality(rows: Sequence[FrameRow], options: Options) -> dict[str, dict[str, 
                 key: _mean([each[key] for each in figures if key in each]) for key in (*keys, *extra)
             }
     groups["track"] = _track(rows)
+    groups["pose"] = _pose(rows)
     return groups
+
+
+def _pose(rows: Sequence[FrameRow]) -> dict[str, float] | None:
+    poses = [row.poses for row in rows if row.poses is not None]
+    if not poses:
+        return None
+    known = np.stack([each.known for each in poses])
+    rigid = trajectory_errors(np.stack([each.rigid for each in poses]), known)
+    return {
+        **trajectory_errors(np.stack([each.shown for each in poses]), known),
+        **{f"rigid_{name}": error for name, error in rigid.items()},
+    }
 
 
 def _track(rows: Sequence[FrameRow]) -> dict[str, Any] | None:

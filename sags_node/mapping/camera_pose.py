@@ -8,16 +8,18 @@ import cv2
 import numpy as np
 
 from sags_node.engine.jit import inlined, kernel
+from sags_node.geometry import invert
 from sags_node.types import F32, F64, Camera
 
-ROUNDS = 10
+ROUNDS = 8
 SPREADS = 2.0  # spreads of the residuals beyond which a point counts less than a quarter
 SMALLEST_SCALE = 0.3  # px: better than this no flow is
-FIRST_SCALE = 16.0  # px: so that the start may be that far off
+FIRST_SCALE = 8.0  # px: so that the start may be that far off
 INLIER = 0.25  # weight: the residual is below the scale
 DAMPING = 1e-6  # of the largest diagonal element: a direction nothing says anything of is left alone
-CONVERGED = 1e-7  # m and rad
+CONVERGED = 1e-6  # m and rad
 NEAREST = 1e-3  # m
+LARGEST = 1e12  # px^2: no honest residual comes near
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,9 +39,9 @@ def fit_pose(points: F32, pixels: F32, disparities: F32, camera: Camera, baselin
     """The pose from which most of the points are seen where they were found.
 
     Gauss-Newton on SE(3), on residuals in px: of the place, and of the disparity where it was measured, as
-    ORB-SLAM2 does (R. Mur-Artal and J. D. Tardos, T-RO 2017). The robust weights are Geman and McClure's; their
-    scale starts wide and follows the median (graduated non-convexity), so that a large minority that moves
-    otherwise is given up.
+    ORB-SLAM2 does (R. Mur-Artal and J. D. Tardos, T-RO 2017). The robust weights are Geman and McClure's;
+    their scale starts wide and follows the median (graduated non-convexity), so that a large minority that
+    moves otherwise is given up.
 
     Args:
         points: [M, 3] m, world.
@@ -57,17 +59,15 @@ def fit_pose(points: F32, pixels: F32, disparities: F32, camera: Camera, baselin
         normal, gradient = _normal_equations(
             view, intrinsics, points, pixels, disparities, scale * scale, weights, squares
         )
-        normal[np.diag_indices(6)] += DAMPING * normal.max() + 1e-12
-        twist = -np.linalg.solve(normal, gradient)
+        normal.flat[::7] += DAMPING * normal.max() + 1e-12  # the diagonal
+        twist = np.asarray(-np.linalg.solve(normal, gradient), np.float64)
         view = exponential(twist) @ view
         spread = SPREADS * 1.4826 * float(np.sqrt(np.median(squares) / 2)) if len(squares) else 0.0
-        if np.abs(twist).max() < CONVERGED:
+        widest, scale = scale, min(max(scale / 2, spread, SMALLEST_SCALE), FIRST_SCALE)
+        if scale >= 0.9 * widest and np.abs(twist).max() < CONVERGED:
             break
-        scale = max(min(scale / 2, spread), SMALLEST_SCALE)
-    T_world_cam = np.eye(4)
-    T_world_cam[:3, :3] = view[:3, :3].T
-    T_world_cam[:3, 3] = -view[:3, :3].T @ view[:3, 3]
-    return PoseFit(T_world_cam, weights, scale)
+    view[:3, :3] = cv2.Rodrigues(cv2.Rodrigues(view[:3, :3])[0])[0]  # poses are chained: no error may grow
+    return PoseFit(invert(view), weights, scale)
 
 
 def exponential(twist: F64) -> F64:
@@ -84,7 +84,8 @@ def _normal_equations(
     scale2: float, weights: F32, squares: F32,
 ) -> tuple[F64, F64]:  # fmt: skip
     """J^T W J [6, 6] and J^T W r [6] for a twist on the left of the view matrix; writes each point's weight
-    and squared residual (px^2). What lies behind the camera has no weight."""
+    and squared residual (px^2). What lies behind the camera or is not finite has
+    no weight."""
     normal, gradient = np.zeros((6, 6)), np.zeros(6)
     jacobian, residual, p = np.zeros((3, 6)), np.zeros(3), np.zeros(3)
     fx, fy, cx, cy, focal_baseline = intrinsics
@@ -104,6 +105,8 @@ def _normal_equations(
         square = residual[0] ** 2 + residual[1] ** 2
         if rows == 3:
             square += residual[2] ** 2
+        if not square < LARGEST:
+            continue
         _chain(jacobian[0], p, fx * per_z, 0.0, -fx * x * per_z)
         _chain(jacobian[1], p, 0.0, fy * per_z, -fy * y * per_z)
         _chain(jacobian[2], p, 0.0, 0.0, -focal_baseline * per_z * per_z)
@@ -112,8 +115,11 @@ def _normal_equations(
         for r in range(rows):
             for a in range(6):
                 gradient[a] += weight * jacobian[r, a] * residual[r]
-                for b in range(6):
+                for b in range(a + 1):
                     normal[a, b] += weight * jacobian[r, a] * jacobian[r, b]
+    for a in range(6):
+        for b in range(a):
+            normal[b, a] = normal[a, b]
     return normal, gradient
 
 

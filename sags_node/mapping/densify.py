@@ -64,8 +64,15 @@ def doomed(model: GaussianModel, observation: Observation, limit: int) -> Bool:
     )  # fmt: skip
     excess = min(model.count - limit, int(SHED * model.count))
     if excess > 0:
-        least = np.argpartition(model.contribution, excess)[:excess]
-        remove[least] |= model.contribution[least] < LITTLE
+        remove |= least_shown(model, excess)
+    return remove
+
+
+def least_shown(model: GaussianModel, count: int) -> Bool:
+    """[N] those up to `count` that show least, and little."""
+    remove = np.zeros(model.count, np.bool_)
+    least = np.argpartition(model.contribution, count)[:count]
+    remove[least] = model.contribution[least] < LITTLE
     return remove
 
 

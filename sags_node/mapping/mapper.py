@@ -12,13 +12,13 @@ from sags_node.mapping import densify, initialise
 from sags_node.mapping.budget import Budget
 from sags_node.mapping.exposure import exposure_gain
 from sags_node.mapping.focus import tile_grid, with_neighbours, worst_tiles
-from sags_node.mapping.motion import OpticalFlow, depth_pull, scene_flow
+from sags_node.mapping.motion import OpticalFlow, depth_pull, found_again, scene_flow
 from sags_node.mapping.optimiser import Optimiser, Rates
 from sags_node.mapping.right_eye import right_eye_loss
 from sags_node.model.alias_free import smoothing_variances
 from sags_node.model.deformation import Deformation, NodeDeformation
 from sags_node.model.gaussians import GaussianModel
-from sags_node.types import F32, Bool, Observation, RenderedView, Snapshot
+from sags_node.types import F32, U8, Bool, Observation, RenderedView, Snapshot
 
 CONTROL_NODES = 512
 INITIAL_STEPS = 30
@@ -32,14 +32,15 @@ MIN_FIRST_DEPTHS = 200  # px
 LOST_RESIDUAL = 0.08  # mean over RGB and tissue, 0..1; a beating heart stays below half of it
 LOST_COVERAGE = 0.3  # of the tissue
 INITIAL_RATES = Rates().scaled(4.0)
+UNHURRIED_RATES = 0.6  # measured with six steps: +0.3 dB; with one step a frame it loses as much
 NODE_STEP_PX = 0.08
 DEPTH_WEIGHT = 2e-3  # of a depth residual of DEPTH_SCALE, against colours 0..1
 DEPTH_SCALE = 1e-3  # m: beyond this a depth residual counts linearly
 
 
 @dataclass(slots=True)
-class _Last:
-    """The frame before, as far as the next one needs it."""
+class Drawn:
+    """A frame and the model drawn for it: what the next frame's motion starts from."""
 
     observation: Observation
     view: RenderedView
@@ -59,13 +60,13 @@ class Mapper:
         rasterizer: Rasterizer,
         max_gaussians: int,
         smoothing: bool = True,
-        fine_flow: bool = False,
+        unhurried: bool = False,
         focus: float = FOCUS,
     ) -> None:
         """
         Args:
             smoothing: draw the Gaussians with the 3D filter (`model.alias_free`).
-            fine_flow: see `OpticalFlow`.
+            unhurried: there is time for several steps a frame. They are shorter then, and the flow finer.
             focus: share of the picture, where it is worst, for the steps after the first of a frame.
         """
         self.model = GaussianModel(max_gaussians)
@@ -75,9 +76,11 @@ class Mapper:
         self._smoothing = smoothing
         self._focus = focus
         self._optimiser = Optimiser()
-        self._flow = OpticalFlow(fine_flow)
+        self._flow = OpticalFlow(fine=unhurried)
+        self._rates = Rates().scaled(UNHURRIED_RATES) if unhurried else Rates()
         self._deformation: Deformation | None = None
-        self._last: _Last | None = None
+        self._last: Drawn | None = None
+        self._found: tuple[U8, F32] | None = None  # a picture, and the pixels where the Gaussians are in it
         self._still = False  # whether nothing moved in the frame taken in last
         self.stale_tiles: Bool | None = None  # [1, rows, columns] to be drawn anew after `update`; None: all
         self._frames = 0
@@ -125,11 +128,35 @@ class Mapper:
         self._last = None
         self.restarts += 1
 
+    def found_again(self, observation: Observation) -> F32:
+        """Pixels [N, 2] where the Gaussians are found in a frame that is not taken in yet, see
+        `motion.found_again`; all NaN where there is no frame before."""
+        if self._found is None or self._found[0] is not observation.gray:
+            pixels = np.full((self.model.count, 2), np.float32(np.nan))
+            if self._last is not None:
+                before = self._last.observation
+                flow = self._flow(before.gray, observation.gray)
+                pixels = found_again(
+                    self.model.means, self._last.view, before.tissue, flow, observation.tissue
+                )
+            self._found = observation.gray, pixels
+        return self._found[1]
+
     def drawn(self, observation: Observation, view: RenderedView) -> None:
         """Remember how the model looked at `observation`: the next frame's motion starts from there. A still
         frame is passed over: slow motion adds up until it is seen."""
         if not self._still or self._last is None:
-            self._last = _Last(observation, view)
+            self.start_from(Drawn(observation, view))
+
+    @property
+    def last(self) -> Drawn | None:
+        """What the next frame's motion starts from; None: nothing yet."""
+        return self._last
+
+    def start_from(self, last: Drawn | None) -> Drawn | None:
+        """Let the next frame's motion start from this one; returns from which it would have started."""
+        before, self._last, self._found = self._last, last, None
+        return before
 
     def _initialise(self, observation: Observation) -> dict[str, int]:
         if not self._can_start(observation):
@@ -163,10 +190,13 @@ class Mapper:
         pixels, depths = densify.candidates(planes, observation, phase=7 * self._frames)
         iterations = 0
         if budget.more():  # before inserting, so that the drawing above serves both
-            self.model.contribution[:] = self._refine(observation, Rates()).contribution
+            self.model.contribution[:] = self._refine(observation, self._rates).contribution
             iterations = 1
         room = max(HOLES, limit - self.model.count)
         pixels, depths = pixels[:room], depths[:room]
+        lacking = min(len(pixels), HOLES) - self.model.free
+        if 0 < lacking < self.model.count:  # the view has grown: what is in it gives way
+            removed += self.model.remove(densify.least_shown(self.model, lacking))
         rows = initialise.insert(self.model, observation, pixels, depths, densify.GRID, self._smoothing)
         self._deformation.attach(self.model, rows)
         while budget.more():
@@ -193,7 +223,7 @@ class Mapper:
     def _refine_worst(self, observation: Observation, nodes: bool = True) -> Bool:
         tiles = worst_tiles(self._planes[0], observation.image, observation.tissue, self._focus)
         self._draw(observation, tiles)
-        self._refine(observation, Rates(), nodes)
+        self._refine(observation, self._rates, nodes)
         return tiles
 
     def _predict(self, observation: Observation) -> None:
@@ -202,12 +232,10 @@ class Mapper:
         if self._last is None:
             return
         before = self._last.observation
-        flow = self._flow(before.gray, observation.gray)
         self._frames_to_depth += 1
         displacements, seen = scene_flow(
-            self.model.means, self._last.view, before.tissue, flow, observation,
-            depth_pull(self._frames_to_depth),
-        )  # fmt: skip
+            self.model.means, self.found_again(observation), observation, depth_pull(self._frames_to_depth)
+        )
         if observation.depth.any():
             self._frames_to_depth = 0
         start = self.model.means.copy()

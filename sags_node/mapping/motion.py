@@ -50,16 +50,35 @@ def depth_pull(frames: int) -> float:
     return float(1 - (1 - DEPTH_PULL) ** min(frames, MOST_FRAMES))
 
 
-def scene_flow(
-    means: F32, before: RenderedView, tissue_before: Bool, flow: F32, after: Observation, pull: float
-) -> tuple[F32, F32]:
-    """Displacement of each Gaussian from one frame to the next.
+def found_again(means: F32, before: RenderedView, tissue_before: Bool, flow: F32, tissue_after: Bool) -> F32:
+    """Where in the later picture each Gaussian of the earlier one is found.
 
     Args:
         means: [N, 3] m, world, at the earlier frame.
         before: the model drawn at the earlier frame, to know what was hidden.
-        tissue_before: [H, W].
+        tissue_before, tissue_after: [H, W].
         flow: [h, w, 2] px of the whole pictures, from the earlier to the later one, at any size.
+
+    Returns:
+        Pixels [N, 2], also beyond the picture's edges; NaN: not seen, or covered by an instrument now.
+    """
+    margin = 2 * round(FLOW_MARGIN * before.alpha.shape[1]) + 1
+    kernel_size = np.ones((margin, margin), np.uint8)
+    clear_before = cv2.erode(tissue_before.view(np.uint8), kernel_size).view(np.bool_)
+    clear_after = cv2.erode(tissue_after.view(np.uint8), kernel_size).view(np.bool_)
+    pixels = np.full((len(means), 2), np.float32(np.nan))
+    _find(
+        means, pack(before.camera), before.depth, before.alpha, clear_before, flow, clear_after, pixels
+    )  # fmt: skip
+    return pixels
+
+
+def scene_flow(means: F32, pixels: F32, after: Observation, pull: float) -> tuple[F32, F32]:
+    """Displacement of each Gaussian to where it was found.
+
+    Args:
+        means: [N, 3] m, world, at the earlier frame.
+        pixels: [N, 2] in the later one, of `found_again`.
         after: the later frame; its depth pulls the Gaussian along the ray.
         pull: by which share of the difference; see `depth_pull`.
 
@@ -68,36 +87,28 @@ def scene_flow(
     """
     displacements = np.zeros_like(means)
     seen = np.zeros(len(means), np.float32)
-    margin = 2 * round(FLOW_MARGIN * before.alpha.shape[1]) + 1
-    kernel_size = np.ones((margin, margin), np.uint8)
-    clear_before = cv2.erode(tissue_before.view(np.uint8), kernel_size).view(np.bool_)
-    clear_after = cv2.erode(after.tissue.view(np.uint8), kernel_size).view(np.bool_)
-    _advect(
-        means, pack(before.camera), before.depth, before.alpha, clear_before, flow,
-        pack(after.camera), clear_after, after.depth, np.float32(pull), displacements, seen,
-    )  # fmt: skip
+    _advect(means, pixels, pack(after.camera), after.depth, np.float32(pull), displacements, seen)
     return displacements, seen
 
 
 @parallel_kernel
-def _advect(
-    means: F32, cam0: F32, drawn_depth: F32, alpha: F32, tissue0: Bool, flow: F32,
-    cam1: F32, tissue1: Bool, depth1: F32, pull: Any, displacements: F32, seen: F32,
-) -> None:  # fmt: skip
+def _find(
+    means: F32, cam0: F32, drawn_depth: F32, alpha: F32, tissue0: Bool, flow: F32, tissue1: Bool, pixels: F32
+) -> None:
     for piece in prange(-(-len(means) // PIECE)):
         first = np.int64(piece) * PIECE
-        _advect_rows(
-            means, cam0, drawn_depth, alpha, tissue0, flow, cam1, tissue1, depth1, pull, displacements, seen,
+        _find_rows(
+            means, cam0, drawn_depth, alpha, tissue0, flow, tissue1, pixels,
             first, min(first + PIECE, len(means)),
         )  # fmt: skip
 
 
 @kernel
-def _advect_rows(
-    means: F32, cam0: F32, drawn_depth: F32, alpha: F32, tissue0: Bool, flow: F32,
-    cam1: F32, tissue1: Bool, depth1: F32, pull: Any, displacements: F32, seen: F32, first: Any, end: Any,
+def _find_rows(
+    means: F32, cam0: F32, drawn_depth: F32, alpha: F32, tissue0: Bool, flow: F32, tissue1: Bool, pixels: F32,
+    first: Any, end: Any,
 ) -> None:  # fmt: skip
-    """Writes the displacement and 1 where it was observed; leaves the others as they are."""
+    """Writes the pixels of what is found; leaves the others as they are."""
     height, width = alpha.shape
     half = np.float32(0.5)
     across, down = np.float32(flow.shape[1] / width), np.float32(flow.shape[0] / height)
@@ -117,12 +128,38 @@ def _advect_rows(
         du, dv = _bilinear(flow, fx, fy, 0), _bilinear(flow, fx, fy, 1)
         u += du
         v += dv
+        if u >= 0 and v >= 0 and u <= width - 1 and v <= height - 1:
+            if not tissue1[int(v + 0.5), int(u + 0.5)]:
+                continue  # flow into an instrument is the instrument's motion
+        pixels[i, 0] = u
+        pixels[i, 1] = v
+
+
+@parallel_kernel
+def _advect(
+    means: F32, pixels: F32, cam1: F32, depth1: F32, pull: Any, displacements: F32, seen: F32
+) -> None:
+    for piece in prange(-(-len(means) // PIECE)):
+        first = np.int64(piece) * PIECE
+        _advect_rows(
+            means, pixels, cam1, depth1, pull, displacements, seen, first, min(first + PIECE, len(means))
+        )
+
+
+@kernel
+def _advect_rows(
+    means: F32, pixels: F32, cam1: F32, depth1: F32, pull: Any, displacements: F32, seen: F32,
+    first: Any, end: Any,
+) -> None:  # fmt: skip
+    """Writes the displacement and 1 where it was observed; leaves the others as they are."""
+    height, width = depth1.shape
+    for i in range(first, end):
+        u, v = pixels[i, 0], pixels[i, 1]
+        if np.isnan(u):
+            continue
         _, _, z1 = to_camera(cam1, means[i, 0], means[i, 1], means[i, 2])
         if u >= 0 and v >= 0 and u <= width - 1 and v <= height - 1:
-            px, py = int(u + 0.5), int(v + 0.5)
-            if not tissue1[py, px]:
-                continue  # flow into an instrument is the instrument's motion
-            measured = depth1[py, px]
+            measured = depth1[int(v + 0.5), int(u + 0.5)]
             if measured > 0 and abs(measured - z1) < DEPTH_GATE * z1:
                 z1 += pull * (measured - z1)
         # From pixel and depth to the world: the transposed rotation.

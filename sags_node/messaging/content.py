@@ -144,8 +144,17 @@ FRAME_CONTENT: Mapping[str, Callable[[FrameResult], Content]] = {
 }
 
 
+OF_THE_MODEL = (
+    *("left/render/image", "right/render/image", "left/render/depth"),
+    *("points", "splats", "anchors", "tf"),
+)
+
+
 def tells_of(result: FrameResult, topic: str) -> bool:
-    """Whether a frame has something for a topic: there may have been no time to measure its depth."""
+    """Whether a frame has something for a topic: there may have been no time to measure its depth, and while
+    the camera is lost nothing of the model belongs to the frame."""
+    if result.camera_lost and topic in OF_THE_MODEL:
+        return False
     return topic != "left/depth" or result.skipped.get("depth") != NO_TIME
 
 
@@ -189,4 +198,5 @@ def diagnostics(health: NodeHealth, stamp_ns: int) -> Content:
     running = health.state in ("running", "degraded")
     for stage, ms in health.stage_ms.items():
         statuses.append(Status(stage, 0 if running else 3, f"{ms:.1f} ms", {"ms": f"{ms:.3f}"}))
+    statuses += [Status(stage, 1, warning, {}) for stage, warning in health.warnings.items()]
     return cdr.diagnostics(statuses, stamp_ns)

@@ -256,8 +256,9 @@ class Publisher:
             if name in self._kept:
                 kept = self._kept[name]
                 self._send(name, kept.body, kept.frame_id, kept.stamp_ns, kept.epoch)
-            elif name in content.FRAME_CONTENT and self._last is not None:
-                self._send_frame_topic(name)
+            elif self._last is not None and name in content.FRAME_CONTENT:
+                if content.tells_of(self._last, name):
+                    self._send_frame_topic(name)
 
     def _subscription(self, message: bytes, resend: set[str]) -> None:
         """`\\x01prefix` subscribes and `\\x00prefix` ends it; anything else is a stranger's noise."""

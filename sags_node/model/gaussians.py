@@ -29,6 +29,7 @@ class GaussianModel:
 
         self._rows: dict[str, np.ndarray] = {
             "means": rows(3),  # m, world
+            "rest": rows(3),  # m, world: where it is most of the time; NaN: not known yet
             "quats": rows(4),  # wxyz
             "log_scales": rows(3),
             "scales": rows(3),  # m, before the 3D filter
@@ -72,6 +73,7 @@ class GaussianModel:
             values[added] = 0
         rows = self._rows
         rows["means"][added] = means[:fits]
+        rows["rest"][added] = np.nan
         rows["quats"][added, 0] = 1.0
         rows["scales"][added] = scales[:fits]
         rows["log_scales"][added] = np.log(scales[:fits])

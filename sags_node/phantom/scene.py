@@ -59,6 +59,7 @@ class Phantom:
         self._relief = make_relief(shape, self._half_view)
         self._tissue = Tissue(self._relief, self._clock)
         self._skin = paint_skin(self._relief, paint, footprint=0.8 * BED_DEPTH / float(self.rig.left.K[0, 0]))
+        self._skin.surface[..., 2] *= np.sqrt(config.gloss)  # highlights go with the square of the wetness
         self._instruments = Instruments()
         self._tracks = self._tissue.track_indices(tracks, self._half_view, TRACKS)
         self._cloud = fractal_noise(smoke, (512, 512), 70, 4)

@@ -27,7 +27,7 @@ DEPTH_UNIT = 2.5e-6  # m per count
 JPEG_QUALITY = 95
 _SHAPING = (
     *("seconds", "width", "height", "seed", "camera_motion", "smoke", "noise", "blur"),
-    *("still_tissue", "blackout"),
+    *("still_tissue", "blackout", "gloss"),
 )
 _COMPLETE = "launch.yaml"  # written last
 

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
+from sags_node.calibration import fit_distortion
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import cdr
 from sags_node.messaging.topics import CAMERA_INFO, IMAGE
@@ -141,17 +142,16 @@ def read_eye(data: bytes | memoryview, where: str) -> Eye:
         UsageError: a distortion model that is not supported.
     """
     message = _decoded(data, CAMERA_INFO, where)
-    distortion = np.asarray(message.d, np.float64)
-    if message.distortion_model not in ("plumb_bob", "") or len(distortion) > 5:
+    if message.distortion_model not in ("plumb_bob", "rational_polynomial", ""):
         raise UsageError(
-            f"{where}: distortion model {message.distortion_model!r} with {len(distortion)} coefficients is "
-            "not supported; calibrate with 'plumb_bob', or set rig"
+            f"{where}: distortion model {message.distortion_model!r} is not supported; calibrate with "
+            "'plumb_bob' or 'rational_polynomial', or set rig"
         )
     return Eye(
         width=message.width,
         height=message.height,
         K=np.array(message.k, np.float64).reshape(3, 3),
-        distortion=np.pad(distortion, (0, 5 - len(distortion))),
+        distortion=fit_distortion(np.asarray(message.d, np.float64), where),
         R=np.array(message.r, np.float64).reshape(3, 3),
         P=np.array(message.p, np.float64).reshape(3, 4),
     )

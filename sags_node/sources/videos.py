@@ -85,16 +85,21 @@ class Video:
 
 
 class VideoPairs:
-    """Two videos, paired by frame number. The left one says how long the recording is.
+    """Two videos, paired by frame number, or the left one alone, which says how long it is.
 
     Raises:
         UsageError: a file is missing or not a video, or the two differ in size or rate.
     """
 
-    def __init__(self, left: Path, right: Path) -> None:
-        self._left, self._right = Video(left), Video(right)
+    def __init__(self, left: Path, right: Path | None) -> None:
+        self._left = Video(left)
+        self._right = None if right is None else Video(right)
         self.rate, self.count = self._left.rate, self._left.count
-        one, other = self._left, self._right
+        self._next = 0
+        if self._right is not None:
+            self._check(self._left, self._right)
+
+    def _check(self, one: Video, other: Video) -> None:
         for what, fits, values in (
             ("px", one.size == other.size, (size_text(*one.size), size_text(*other.size))),
             ("frames/s", _is_same_rate(one.rate, other.rate), (one.rate, other.rate)),
@@ -102,19 +107,19 @@ class VideoPairs:
             if not fits:
                 self.close()
                 raise UsageError(
-                    f"{left} has {values[0]} {what} but {right} has {values[1]}; they are not one stereo pair"
+                    f"{one.path} has {values[0]} {what} but {other.path} has {values[1]}; they are not one "
+                    "stereo pair"
                 )
-        self._next = 0
 
     def seek(self, index: int) -> None:
-        self._left.seek(index)
-        self._right.seek(index)
+        for video in self._videos:
+            video.seek(index)
         self._next = index
 
     def skip(self) -> bool:
         found = self._left.skip()
-        if found and not self._right.skip():
-            raise self._right_ended()
+        if found and self._right is not None and not self._right.skip():
+            raise self._right_ended(self._right)
         self._next += found
         return found
 
@@ -127,19 +132,23 @@ class VideoPairs:
         left = self._left.read()
         if left is None:
             return None
-        right = self._right.read()
-        if right is None:
-            raise self._right_ended()
+        right = None if self._right is None else self._right.read()
+        if self._right is not None and right is None:
+            raise self._right_ended(self._right)
         self._next += 1
-        return RawPair(_rgb(left), _rgb(right), None)
+        return RawPair(_rgb(left), None if right is None else _rgb(right), None)
 
     def close(self) -> None:
-        self._left.close()
-        self._right.close()
+        for video in self._videos:
+            video.close()
 
-    def _right_ended(self) -> SagsError:
+    @property
+    def _videos(self) -> list[Video]:
+        return [self._left] if self._right is None else [self._left, self._right]
+
+    def _right_ended(self, right: Video) -> SagsError:
         return SagsError(
-            f"{self._right.path} ends at frame {self._next} but {self._left.path} goes on; "
+            f"{right.path} ends at frame {self._next} but {self._left.path} goes on; "
             f"set source.frames to stop there"
         )
 

@@ -19,6 +19,8 @@ GUESS_WIDTH = 160  # px: coarse matching wide enough for the folds of an organ
 LARGEST_ROW_ERROR = 2.0  # px
 LARGEST_ROW_STEP = 0.35  # px beside the mean row error around
 ROW_WINDOW = 21  # px
+SMOOTHING_RADIUS = 1 / 100  # of the width
+SMOOTHING_VARIANCE = 0.2  # px squared: where disparity varies less around, it is noise on a smooth surface
 
 
 class SemiGlobal:
@@ -73,6 +75,9 @@ class InverseSearch:
             self._dis.setFinestScale(0)
             self._dis.setPatchStride(PATCH_STRIDE)
             self._dis.setGradientDescentIterations(SEARCH_STEPS)
+            self._smoothing_radius = round(SMOOTHING_RADIUS * size[0])
+        else:
+            self._smoothing_radius = 0  # refinement has smoothed as much as these few pixels bear
         self._dis.setCoarsestScale(max(self._dis.getFinestScale(), shrink.bit_length() - 2))
         self._dis.setVariationalRefinementIterations(1 if size[0] >= SMALL_WIDTH else 2)
 
@@ -86,7 +91,23 @@ class InverseSearch:
         row_error = np.clip(flow[..., 1], -LARGEST_ROW_ERROR, LARGEST_ROW_ERROR)
         step = np.abs(row_error - cv2.blur(row_error, (ROW_WINDOW, ROW_WINDOW)))
         known = (step < LARGEST_ROW_STEP) & (np.abs(row_error) < LARGEST_ROW_ERROR)
-        return -flow[..., 0], row_error, known
+        disparity = -flow[..., 0]
+        if self._smoothing_radius > 0:
+            disparity = _smooth(disparity, self._smoothing_radius)
+        return disparity, row_error, known
+
+
+def _smooth(disparity: F32, radius: int) -> F32:
+    """The guided filter (He et al., PAMI 2013) with the picture as its own guide.
+
+    Planes and steps larger than the noise stay as they are.
+    """
+    window = 2 * radius + 1, 2 * radius + 1
+    mean = cv2.blur(disparity, window)
+    variance = cv2.blur(disparity * disparity, window) - mean * mean
+    kept = variance / (variance + np.float32(SMOOTHING_VARIANCE))
+    smooth: F32 = cv2.blur(kept, window) * disparity + cv2.blur(mean * (1 - kept), window)
+    return smooth
 
 
 def _fill(disparity: F32, known: Bool) -> F32:

@@ -2,89 +2,126 @@
 
 from __future__ import annotations
 
+import logging
+
 import cv2
 import numpy as np
 
 from sags_node.config import TissueConfig
 from sags_node.errors import UsageError
-from sags_node.types import U8, Bool, RectifiedPair, StereoFrame
+from sags_node.types import U8, Bool, RectifiedPair, RenderedView, StereoFrame
+from sags_node.vision.onnx_session import DepthNetworkError
 from sags_node.vision.rectify import Rectifier
+from sags_node.vision.tissue_classical import InstrumentFinder
+from sags_node.vision.tissue_network import TissueNetwork
 
-CLASSICAL_WIDTH = 320  # px: instruments are large, their outline is enlarged by `dilate` anyhow
-DARK = 12  # grey level below which colour says nothing: the black border, shafts in shadow
-LEAST_REDNESS = 0.45  # of the picture's median
-THINNEST = 5  # px at CLASSICAL_WIDTH
-RED_MINUS_GREEN_AND_SUM = np.array([[1, -1, 0], [1, 1, 1]], np.float32)
+log = logging.getLogger(__name__)
+
+LARGEST_INSTRUMENTS = 0.5  # of the usable picture
+FIRST_FRAMES = 5  # all of them with more: the mask is upside down
 
 
 class TissueMask:
-    """The tissue mask of every frame: the session's own, or found by colour.
+    """The tissue mask of every frame: the session's own, a network's, or found without either.
+
+    Attributes:
+        problem: why the newest frame's mask is not the network's; empty: it is, or there is no network.
 
     Raises:
-        UsageError: a box to exclude does not lie in the raw picture.
+        UsageError: a box to exclude does not lie in the raw picture, or the network cannot be used.
     """
 
     def __init__(self, config: TissueConfig, rectifier: Rectifier) -> None:
         self._config = config
         self._rectifier = rectifier
-        width, height = rectifier.raw_size
-        usable = np.ones((height, width), np.bool_)
-        for x, y, box_width, box_height in config.exclude:
-            if (
-                min(x, y) < 0
-                or min(box_width, box_height) < 1
-                or x + box_width > width
-                or y + box_height > height
-            ):
-                raise UsageError(
-                    f"vision.tissue.exclude: box {[x, y, box_width, box_height]} (x, y, width, height) is "
-                    f"not inside the raw picture of {width}x{height}"
-                )
-            usable[y : y + box_height, x : x + box_width] = False
-        self._usable = rectifier.mask(usable)
+        self._usable = rectifier.mask(_outside(config, rectifier.raw_size))
+        self._network: TissueNetwork | None = None
+        if config.method == "onnx":
+            camera = rectifier.camera
+            self._network = TissueNetwork(config, (camera.width, camera.height))
+        self._find_instruments = InstrumentFinder()
+        self._frames_checked = 0
         side = 2 * config.dilate + 1
         self._neighbourhood = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+        self.problem = ""
 
-    def __call__(self, frame: StereoFrame, pair: RectifiedPair) -> Bool:
-        """Mask [H, W], True = tissue; highlights on tissue are tissue."""
+    def __call__(self, frame: StereoFrame, pair: RectifiedPair, expected: RenderedView | None = None) -> Bool:
+        """Mask [H, W], True = tissue; highlights on tissue are tissue.
+
+        Args:
+            expected: the model as it was drawn last, where there is one: only looked at where neither session
+                nor network gives a mask.
+
+        Raises:
+            UsageError: the masks that were given say of the first frames that most of them is instrument.
+        """
         if self._config.method == "none":
             return self._usable
-        if self._config.method == "session" and frame.tissue is not None:
-            tissue = self._rectifier.mask(frame.tissue)
+        tissue = self._given(frame, pair)
+        if tissue is None:
+            tissue = ~self._find_instruments(pair.left, expected, pair.t_capture_ns)
         else:
-            tissue = ~find_instruments(pair.left)
+            self._check_polarity(tissue)
         # The picture's border counts as tissue here: only instruments grow.
         eroded: U8 = cv2.erode(tissue.view(np.uint8), self._neighbourhood)
         return eroded.view(np.bool_) & self._usable
 
+    def _given(self, frame: StereoFrame, pair: RectifiedPair) -> Bool | None:
+        if self._network is not None:
+            try:
+                tissue = self._network(pair.left)
+            except DepthNetworkError as error:
+                if not self.problem:
+                    log.warning("%s; instruments are found without it", error)
+                self.problem = str(error)
+                return None
+            self.problem = ""
+            return tissue
+        if self._config.method == "session" and frame.tissue is not None:
+            return self._rectifier.mask(frame.tissue)
+        return None
 
-def find_instruments(image: U8) -> Bool:
-    """Instruments and black borders [H, W] of a picture [H, W, 3] by colour and position alone.
+    def _check_polarity(self, tissue: Bool) -> None:
+        """A mask upside down would have the model learn the instruments alone."""
+        if self._frames_checked == FIRST_FRAMES:
+            return
+        share = float(np.mean(~tissue[self._usable]))
+        if share <= LARGEST_INSTRUMENTS:
+            self._frames_checked = FIRST_FRAMES
+            return
+        self._frames_checked += 1
+        if self._frames_checked == FIRST_FRAMES:
+            if self._network is not None:
+                said = self._config.tissue_is
+                opposite = {"white": "black", "black": "white"}.get(str(said), "other class numbers")
+                whose, hint = "network's", f"set vision.tissue.tissue_is to {opposite}, it is {said}"
+            else:
+                whose, hint = (
+                    "session's",
+                    "white must be instrument in its files; EndoNeRF's are turned round ",
+                )
+                hint += "by source.instruments"
+            raise UsageError(
+                f"the {whose} masks call over half of each of the first {FIRST_FRAMES} pictures instrument "
+                f"({share:.0%} now): upside down? {hint}. If they are right, begin later (source.start), or "
+                "find instruments without them: vision.tissue.method:=classical"
+            )
 
-    Tissue is redder than metal and plastic under any white balance, so redness (R - G) / (R + G + B) is
-    compared with the picture's own median. Instruments come in from the picture's edge, so a pale patch that
-    does not touch the edge is a highlight, fat or gauze and stays tissue.
 
-    A stopgap for recordings without masks, not a segmentation: gold or red instrument parts are missed, pale
-    tissue at the edge is lost. On D4D (18 frames with masks): instrument IoU 0.47, 3 % of the tissue lost,
-    37 % of the instrument pixels missed, mostly the gold wrist and the tips.
-    """
-    height, width = image.shape[:2]
-    size = min(width, CLASSICAL_WIDTH), max(1, round(height * min(1.0, CLASSICAL_WIDTH / width)))
-    small = cv2.blur(cv2.resize(image, size, interpolation=cv2.INTER_AREA), (THINNEST, THINNEST))
-    difference, light = cv2.split(cv2.transform(small.astype(np.float32), RED_MINUS_GREEN_AND_SUM))
-    redness = difference / (light + 1)
-    dark = light <= 3 * DARK
-    sample = redness[::4, ::4][~dark[::4, ::4]]
-    if len(sample) == 0:
-        return np.ones((height, width), np.bool_)
-    pale = (redness < LEAST_REDNESS * np.median(sample)) | dark
-    opening = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (THINNEST, THINNEST))
-    solid = cv2.morphologyEx(pale.view(np.uint8), cv2.MORPH_OPEN, opening)
-    count, labels = cv2.connectedComponents(solid)
-    touches_edge = np.zeros(count, np.uint8)
-    for edge in (labels[0], labels[-1], labels[:, 0], labels[:, -1]):
-        touches_edge[edge] = 1
-    touches_edge[0] = 0  # the background
-    instruments: U8 = cv2.resize(touches_edge[labels], (width, height), interpolation=cv2.INTER_NEAREST)
-    return instruments.view(np.bool_)
+def _outside(config: TissueConfig, raw_size: tuple[int, int]) -> Bool:
+    """Where no box is, [H, W] of the raw picture."""
+    width, height = raw_size
+    outside = np.ones((height, width), np.bool_)
+    for x, y, box_width, box_height in config.exclude:
+        if (
+            min(x, y) < 0
+            or min(box_width, box_height) < 1
+            or x + box_width > width
+            or y + box_height > height
+        ):
+            raise UsageError(
+                f"vision.tissue.exclude: box {[x, y, box_width, box_height]} (x, y, width, height) is not "
+                f"inside the raw picture of {width}x{height}"
+            )
+        outside[y : y + box_height, x : x + box_width] = False
+    return outside

@@ -1,0 +1,128 @@
+"""How right masks are that were not given, and what each source of masks is worth to the mapper."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+from sags_node.config import TissueConfig
+from sags_node.engine.threads import configure_threads
+from sags_node.errors import SagsError
+from sags_node.evaluation import metrics
+from sags_node.mapping.budget import StepBudget
+from sags_node.pipeline import Pipeline
+from sags_node.session import Session
+from sags_node.sources.source import open_source
+from sags_node.types import Bool, FrameResult, Reference, StereoFrame
+from sags_node.vision.tissue import TissueMask
+
+Advance = Callable[[int, int | None, str], None]  # frames done, of, what
+Row = dict[str, Any]
+
+
+def measure_masks(session: Session, advance: Advance) -> Row:
+    """Play a recording that has masks of its own, with those that its launch file asks for, one step of the
+    mapper a frame.
+
+    Masks are compared with the recording's own without dilation. Pictures and depth are measured under the
+    recording's own mask, whatever the mapper was given: figures of different sources compare.
+
+    Raises:
+        SagsError: the recording has no masks.
+    """
+    configure_threads(session.config.engine.threads)
+    run, method = _Run(session), session.config.vision.tissue.method
+    with open_source(session.config.source) as frames:  # which reads the truth too
+        for number, frame in enumerate(frames):
+            run.take(frame)
+            advance(number + 1, frames.frame_count, f"masks: {method}")
+    return {"session": session.name, "frames": run.frames, "masks": method, **run.figures()}
+
+
+class _Run:
+    """One pass through the recording."""
+
+    def __init__(self, session: Session) -> None:
+        config = session.config.vision.tissue
+        self._pipeline = Pipeline(session.config, session.rig)
+        self._budget = StepBudget(1)
+        self._given = self._mask(config.model_copy(update={"method": "session"}))
+        self._given_bare = self._mask(config.model_copy(update={"method": "session", "dilate": 0}))
+        self._found_bare = self._mask(config.model_copy(update={"dilate": 0}))
+        self._everything = self._mask(config.model_copy(update={"method": "none"}))
+        self._before: tuple[Bool, Bool] | None = None  # instruments given and found
+        self._pixels = np.zeros(5)  # usable, given, found, both, flickering
+        self._mask_ms: list[float] = []
+        self._psnr: list[float] = []
+        self._depth: list[metrics.DepthErrors] = []
+        self.frames = 0
+
+    def _mask(self, config: TissueConfig) -> TissueMask:
+        return TissueMask(config, self._pipeline.rectifier)
+
+    def take(self, frame: StereoFrame) -> None:
+        """Map one frame and measure it.
+
+        Raises:
+            SagsError: it has no mask.
+        """
+        if frame.tissue is None:
+            raise SagsError(f"frame {frame.frame_id} has no mask to compare with; choose another recording")
+        before = self._pipeline.newest
+        result = self._pipeline.process(frame, self._budget)
+        self.frames += 1
+        self._mask_ms.append(result.timings_ms.get("mask", 0.0))
+        self._compare(frame, result, before)
+        self._measure(result, self._given(frame, result.pair), frame.reference)
+
+    def _compare(self, frame: StereoFrame, result: FrameResult, before: FrameResult | None) -> None:
+        usable = self._everything(frame, result.pair)
+        drawn = None if before is None else before.views["left"]
+        given = usable & ~self._given_bare(frame, result.pair)
+        found = usable & ~self._found_bare(frame, result.pair, drawn)
+        flickering = np.zeros_like(found)
+        if self._before is not None:
+            flickering = (found != self._before[1]) & (given == self._before[0])
+        self._before = given, found
+        self._pixels += [np.count_nonzero(mask) for mask in (usable, given, found, given & found, flickering)]
+
+    def _measure(self, result: FrameResult, tissue: Bool, reference: Reference | None) -> None:
+        view = result.views["left"]
+        self._psnr.append(metrics.psnr(view.rgb, metrics.as_float(result.pair.left), tissue))
+        if reference is not None and reference.depth is not None:
+            truth = metrics.resample_nearest(reference.depth, view.camera.width, view.camera.height)
+            self._depth.append(metrics.depth_errors(view.depth, truth, tissue))
+
+    def figures(self) -> Row:
+        """Of the whole pass; shares are 0..1."""
+        usable, given, found, both, flickering = self._pixels.tolist()
+        return {
+            "iou": _ratio(both, given + found - both),
+            "missed": _ratio(given - both, given),
+            "tissue_lost": _ratio(found - both, usable - given),
+            "flicker": _ratio(flickering, usable),
+            "mask_ms": round(float(np.median(self._mask_ms)), 2),
+            "online_psnr": round(float(np.mean(self._psnr)), 2),
+            "depth_median_mm": _mean([errors.median_mm for errors in self._depth]),
+            "depth_p90_mm": _mean([errors.p90_mm for errors in self._depth]),
+            "depth_coverage": _mean([errors.coverage for errors in self._depth]),
+        }
+
+
+def _ratio(part: float, whole: float) -> float:
+    return round(part / max(1.0, whole), 4)
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    return round(float(np.nanmean(values)), 3) if values else None
+
+
+def table(rows: Sequence[Row]) -> Table:
+    """For people; each row as `measure_masks` returns it."""
+    made = Table(*rows[0])
+    for row in rows:
+        made.add_row(*("-" if value is None else str(value) for value in row.values()))
+    return made

@@ -1,0 +1,110 @@
+"""Tissue by a user's segmentation network."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sags_node.config import NORMALIZATIONS, OnnxConfig, TissueConfig
+from sags_node.errors import UsageError
+from sags_node.types import U8, Bool
+from sags_node.vision.onnx_format import read_format
+from sags_node.vision.onnx_inputs import Fit, Size, recognise
+from sags_node.vision.onnx_outputs import COARSENESS, unfit
+from sags_node.vision.onnx_session import DepthNetworkError, OnnxSession
+
+MULTIPLE = 32  # px, of sides that the network leaves open
+
+
+class TissueNetwork:
+    """One picture in; out come scores of classes, one score, or class numbers, of the picture or coarser.
+
+    The highest of several scores is the class. One score is a probability while it lies within 0 and 1, else
+    a logit; where it is high is class 1. How pictures are fed is said as for depth networks, in the file's
+    metadata or a .yaml beside it; by default RGB as for ImageNet.
+
+    Args:
+        size: width and height of the pictures it will get, px.
+
+    Raises:
+        UsageError: the file is missing or no such network.
+    """
+
+    def __init__(self, config: TissueConfig, size: Size) -> None:
+        assert config.path is not None and config.tissue_is is not None  # the launch file was checked
+        if not config.path.is_file():
+            raise UsageError(f"vision.tissue.path: {config.path} is no file; check the path")
+        as_onnx = OnnxConfig(path=config.path)
+        self._session = OnnxSession(as_onnx)
+        self._tissue_is = config.tissue_is
+        self._size = size
+        self._said = read_format(as_onnx, self._session.metadata)
+        inputs = recognise(self._session.inputs, self._said, self._session.name)
+        if len(inputs) != 1 or inputs[0].eyes != ("left",):
+            raise UsageError(f"{self._session.name} takes several pictures; a mask is made of the left one")
+        self._input = inputs[0]
+        self._fit: Fit = self._input.fit(size, self._said.multiple or MULTIPLE)
+        self._is_logit = False
+        try:
+            self(np.full((size[1], size[0], 3), 128, np.uint8))
+        except DepthNetworkError as error:
+            raise UsageError(f"vision.tissue.path: {error}") from None
+
+    def __call__(self, image: U8) -> Bool:
+        """Tissue [H, W] of a picture [H, W, 3] RGB.
+
+        Raises:
+            DepthNetworkError: the network failed, or its answer is no mask.
+        """
+        normalization = self._said.normalization or NORMALIZATIONS["imagenet"]
+        fed = self._input.tensor({"left": image}, self._fit, normalization, self._said.color == "bgr")
+        classes = self._classes(self._session.run({self._input.name: fed}))
+        if self._tissue_is == "white":
+            tissue = classes > 0
+        elif self._tissue_is == "black":
+            tissue = classes == 0
+        else:
+            tissue = np.isin(classes, self._tissue_is)
+        share: NDArray[np.float32] = cv2.resize(unfit(tissue.astype(np.float32), self._fit), self._size)
+        return share > 0.5
+
+    def _classes(self, outputs: Mapping[str, NDArray[Any]]) -> NDArray[np.intp]:
+        """Class numbers [h, w] of the padded picture."""
+        for name, values in outputs.items():
+            scores = _scores(values, self._fit)
+            if scores is None or self._said.output not in (None, name):
+                continue
+            if not np.isfinite(scores).all():
+                raise DepthNetworkError(f"{self._session.name}: output {name} is not finite")
+            if len(scores) > 1:
+                return np.asarray(scores.argmax(0))
+            if scores.dtype.kind in "iub":
+                return np.asarray(scores[0], np.intp)
+            self._is_logit |= bool(scores.min() < 0 or scores.max() > 1)
+            return np.asarray(scores[0] > (0 if self._is_logit else 0.5), np.intp)
+        width, height = self._fit.outer
+        raise DepthNetworkError(
+            f"{self._session.name}: no output is a mask of the {width}x{height} px that it was given, or of "
+            "a half, a quarter or an eighth of them"
+        )
+
+
+def _scores(values: NDArray[Any], fit: Fit) -> NDArray[Any] | None:
+    """The channels [C, h, w] of an output, in whichever order it has them; None: it is no map."""
+    if values.ndim == 4 and values.shape[0] == 1:
+        values = values[0]
+    if values.ndim == 2:
+        values = values[None]
+    if values.ndim != 3:
+        return None
+    for coarseness in COARSENESS:
+        shape = -(-fit.outer[1] // coarseness), -(-fit.outer[0] // coarseness)
+        if values.shape[1:] == shape:
+            return values
+        if values.shape[:2] == shape:
+            return values.transpose(2, 0, 1)
+    return None

@@ -1,0 +1,491 @@
+"""Depth by networks of every convention, in real ONNX Runtime sessions, and what happens when one fails."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from onnx_networks import save_matcher, save_odd, save_table
+
+from sags_node.config import NORMALIZATIONS, OnnxConfig, StereoConfig
+from sags_node.errors import UsageError
+from sags_node.health import Statistics
+from sags_node.launch_file import load_launch
+from sags_node.mapping.budget import StepBudget
+from sags_node.messaging.content import status
+from sags_node.pipeline import Pipeline
+from sags_node.session import open_session
+from sags_node.sources.source import open_source
+from sags_node.types import F32, U8, Bool, FrameResult, StereoFrame
+from sags_node.vision.mono_depth import MonoDepth
+from sags_node.vision.mono_scale import fit_scale_shift
+from sags_node.vision.onnx_network import DepthNetwork
+from sags_node.vision.onnx_session import DepthNetworkError
+from sags_node.vision.onnx_test_pair import make_pair
+from sags_node.vision.rectify import Rectifier
+
+WIDTH, HEIGHT = 320, 256
+PICTURE = [1, 3, "h", "w"]
+FRAMES = 30
+
+
+class Scene(NamedTuple):
+    """What a network is shown, and the truth."""
+
+    left: U8  # [H, W, 3]
+    right: U8
+    disparity: F32  # [H, W] px, 0 unknown
+    seen: Bool  # [H, W] known, and seen by both eyes
+    focal_baseline: float  # px m
+
+
+@pytest.fixture(scope="module")
+def frames(phantom_session: Path) -> list[StereoFrame]:
+    config = load_launch(phantom_session, ["source.pace:=step", f"source.frames:={FRAMES}"])
+    with open_source(config.source) as source:
+        return list(source)
+
+
+@pytest.fixture(scope="module")
+def scene(phantom_session: Path, frames: list[StereoFrame]) -> Scene:
+    rectifier = Rectifier(open_session(phantom_session).rig, WIDTH, HEIGHT)
+    pair = rectifier(frames[5])
+    focal_baseline = float(rectifier.camera.K[0, 0]) * rectifier.baseline
+    depth = truth(frames[5])
+    disparity = np.divide(focal_baseline, depth, out=np.zeros_like(depth), where=depth > 0)
+    seen = (depth > 0) & (np.arange(WIDTH) > disparity + 4)
+    assert pair.right is not None
+    return Scene(pair.left, pair.right, disparity, seen, focal_baseline)
+
+
+def truth(frame: StereoFrame) -> F32:
+    assert frame.reference is not None and frame.reference.depth is not None
+    return frame.reference.depth
+
+
+def load(path: Path, scene: Scene, **said: Any) -> DepthNetwork:
+    return DepthNetwork(OnnxConfig(path=path, threads=2, **said), (WIDTH, HEIGHT), scene.focal_baseline)
+
+
+def error(network: DepthNetwork, scene: Scene) -> float:
+    found = network(scene.left, scene.right)
+    assert found.shape == scene.disparity.shape and found.dtype == np.float32
+    return float(np.median(np.abs(found - scene.disparity)[scene.seen]))
+
+
+# ---- stereo networks, with nothing said ------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("made", "normalization", "output"),
+    [
+        ({"expects": "bytes"}, "bytes", "disparity"),
+        ({"expects": "unit"}, "unit", "disparity"),
+        ({"expects": "imagenet"}, "imagenet", "disparity"),
+        ({"expects": "symmetric"}, "symmetric", "disparity"),
+        ({"nhwc": True, "uint8": True}, "unit", "disparity"),
+        ({"nhwc": True, "expects": "unit"}, "unit", "disparity"),
+        ({"concatenated": True}, "bytes", "disparity"),
+        ({"concatenated": True, "channels": 1, "expects": "unit"}, "unit", "disparity"),
+        ({"channels": 1}, "bytes", "disparity"),
+        ({"size": (WIDTH, HEIGHT)}, "bytes", "disparity"),
+        ({"size": (448, 320)}, "bytes", "disparity"),
+        ({"size": (WIDTH, HEIGHT), "guided": True}, "bytes", "disparity"),
+        ({"size": (300, "h")}, "bytes", "disparity"),
+        ({"names": ("left", "a_right")}, "bytes", "disparity"),  # the file holds the right one first
+        ({"factor": -1.0}, "bytes", "disparity"),
+        ({"factor": 1 / 320}, "bytes", "disparity"),  # widths of the picture
+        ({"output": "half"}, "bytes", "disparity"),
+        ({"output": "half", "factor": 0.5}, "bytes", "disparity"),  # px of the smaller map
+        ({"output": "several"}, "bytes", "final"),
+    ],
+    ids=str,
+)
+def test_a_stereo_network_is_recognised(
+    made: dict[str, Any], normalization: str, output: str, scene: Scene, tmp_path: Path
+) -> None:
+    network = load(save_matcher(tmp_path / "network.onnx", **made), scene)
+    assert network.is_stereo and network.processor == "cpu"
+    assert network.way.normalization == NORMALIZATIONS[normalization]
+    assert network.way.map_name.output == output
+    assert error(network, scene) < 0.6
+
+
+def test_a_size_that_is_no_multiple_is_padded_and_cut_off_again(scene: Scene, tmp_path: Path) -> None:
+    path = save_matcher(tmp_path / "network.onnx")
+    odd = Scene(scene.left[:-3, :-5], scene.right[:-3, :-5], *(a[:-3, :-5] for a in scene[2:4]), 1.0)
+    network = DepthNetwork(OnnxConfig(path=path, threads=2), (WIDTH - 5, HEIGHT - 3), scene.focal_baseline)
+    assert error(network, odd) < 0.6
+
+
+def test_depth_in_metres_of_this_rig_is_recognised(scene: Scene, tmp_path: Path) -> None:
+    """A network with the rig's focal length and baseline in it."""
+    network = load(save_matcher(tmp_path / "network.onnx", depth_of=scene.focal_baseline), scene)
+    assert network.way.reading.inverted
+    assert error(network, scene) < 0.6
+
+
+# ---- what is said wins -----------------------------------------------------------------------------------
+
+
+def test_metadata_sidecar_and_launch_file_say_more_in_this_order(scene: Scene, tmp_path: Path) -> None:
+    said = {"normalization": "{mean: [0.4, 0.5, 0.6], std: [0.2]}", "author": "somebody"}
+    path = save_matcher(tmp_path / "network.onnx", expects="imagenet", metadata=said)
+    assert load(path, scene).way.normalization.mean == (0.4, 0.5, 0.6)
+    path.with_suffix(".yaml").write_text("normalization: imagenet\nmultiple: 16\n")
+    network = load(path, scene)
+    assert network.way.normalization == NORMALIZATIONS["imagenet"] and network.way.multiple == 16
+    assert load(path, scene, multiple=8).way.multiple == 8
+    assert error(network, scene) < 0.6
+
+
+def test_inputs_and_output_can_be_named(scene: Scene, tmp_path: Path) -> None:
+    path = save_matcher(tmp_path / "network.onnx", names=("b", "a"), output="several")
+    with pytest.raises(UsageError, match=r"is off by \d+"):
+        load(path, scene)  # in the file's order the eyes are exchanged
+    network = load(path, scene, inputs=("b", "a"), output="guess")
+    assert network.way.map_name.output == "guess" and network.way.map_name.coarseness == 4
+
+
+def test_a_declared_size_is_used(scene: Scene, tmp_path: Path) -> None:
+    network = load(save_matcher(tmp_path / "network.onnx"), scene, size=(256, 192))
+    assert 0.0 < error(network, scene) < 0.6
+
+
+def test_what_is_wholly_said_is_only_warned_of(
+    scene: Scene, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = save_odd(tmp_path / "network.onnx", {"a": PICTURE, "b": PICTURE}, "noise")
+    path.with_suffix(".yaml").write_text("normalization: unit\nmeaning: disparity\n")
+    assert load(path, scene).is_stereo
+    assert "network.onnx is used as it is said, but the best is off by" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("normalisation: unit", "normalisation: known keys: inputs, layout"),
+        ("normalization: half", "normalization: .*one of unit, bytes, imagenet, symmetric"),
+        ("- 1", "a map of keys"),
+        ("a: [", "not valid YAML"),
+        ("meaning: inverse_depth", "meaning: a stereo network gives no inverse_depth"),
+        ("inputs: [left, right]", "inputs: its inputs are first, second"),
+        ("output: depth", "output depth is not a map"),
+    ],
+)
+def test_a_wrong_sidecar_is_named_with_its_mend(text: str, words: str, scene: Scene, tmp_path: Path) -> None:
+    path = save_matcher(tmp_path / "network.onnx")
+    path.with_suffix(".yaml").write_text(text)
+    with pytest.raises(UsageError, match=words) as caught:
+        load(path, scene)
+    assert "\n" not in str(caught.value)
+
+
+# ---- what is no depth network ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("inputs", "output", "words"),
+    [
+        ({"x": [1, 10]}, "same", "input x is 1x10; a picture is"),
+        ({"x": [4, 3, "h", "w"]}, "same", "batch size 1"),
+        ({"a": PICTURE, "b": PICTURE, "c": PICTURE}, "same", r"takes 3 inputs \(a, b, c\)"),
+        ({"a": [1, 5, 64, 64], "b": [1, 5, 64, 64]}, "same", "a has 5 channels|is 1x5x64x64"),
+        ({"a": PICTURE, "b": PICTURE}, "nan", "not finite"),
+        ({"a": PICTURE, "b": PICTURE}, "small", "no output is a map of the 320x256 px"),
+        ({"a": PICTURE, "b": PICTURE}, "noise", r"best is off by [\d.]+ px .*; docs/depth.md"),
+        ({"a": [1, 3, 5000, 5000]}, "same", "more than 4096 px"),
+        ({"a": PICTURE}, "nan", "not finite"),
+    ],
+    ids=str,
+)
+def test_a_wrong_network_is_refused_in_one_line(
+    inputs: dict[str, Sequence[Any]], output: str, words: str, scene: Scene, tmp_path: Path
+) -> None:
+    path = save_odd(tmp_path / "network.onnx", inputs, output)
+    with pytest.raises(UsageError, match=words) as caught:
+        load(path, scene)
+    assert "\n" not in str(caught.value) and "network.onnx" in str(caught.value)
+
+
+def test_a_file_that_is_no_network_is_refused(
+    scene: Scene, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "network.onnx"
+    with pytest.raises(UsageError, match="is no file; check the path"):
+        load(path, scene)
+    path.write_text("not a model\n")
+    with pytest.raises(UsageError, match="is no ONNX model that can be run"):
+        load(path, scene)
+    save_matcher(path)
+    path.write_bytes(path.read_bytes()[:-200])
+    with pytest.raises(UsageError, match="is no ONNX model that can be run"):
+        load(path, scene)
+    assert capfd.readouterr() == ("", "")  # the runtime says nothing of its own
+
+
+def test_a_file_too_large_is_not_read(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "network.onnx"
+    with path.open("wb") as sparse:
+        sparse.truncate(2**31 + 1)
+    monkeypatch.setattr("onnxruntime.InferenceSession", lambda *_, **__: pytest.fail("it was opened"))
+    with pytest.raises(UsageError, match="2 GB at most"):
+        load(path, scene)
+
+
+def test_a_provider_that_is_not_there_is_passed_over(scene: Scene, tmp_path: Path) -> None:
+    import onnxruntime
+
+    path = save_matcher(tmp_path / "network.onnx")
+    assert load(path, scene, providers=("cuda", "cpu")).processor in ("cuda", "cpu")
+    if "CUDAExecutionProvider" not in onnxruntime.get_available_providers():
+        with pytest.raises(UsageError, match="none of cuda"):
+            load(path, scene, providers=("cuda",))
+
+
+# ---- through the pipeline --------------------------------------------------------------------------------
+
+
+def pipeline_with(session: Path, network: Path, *overrides: str) -> Pipeline:
+    said = ["source.pace:=step", f"vision.onnx.path:={network}", "vision.onnx.threads:=2", *overrides]
+    opened = open_session(session, said)
+    return Pipeline(opened.config, opened.rig)
+
+
+def play(pipeline: Pipeline, frames: Sequence[StereoFrame]) -> list[FrameResult]:
+    budget = StepBudget(1)
+    return [pipeline.process(frame, budget) for frame in frames]
+
+
+def depth_error(result: FrameResult, frame: StereoFrame) -> tuple[float, float]:
+    """Median error, as a share of the depth, and how much of the tissue it was measured on."""
+    found, true = result.observation.depth, truth(frame)
+    both = (found > 0) & (true > 0)
+    return float(np.median(np.abs(found - true)[both] / true[both])), both.sum() / (true > 0).sum()
+
+
+def dark(frame: StereoFrame) -> StereoFrame:
+    assert frame.right is not None
+    return replace(frame, left=frame.left // 8, right=frame.right // 8)
+
+
+def test_a_network_replaces_the_matcher(
+    phantom_session: Path, frames: list[StereoFrame], tmp_path: Path
+) -> None:
+    pipeline = pipeline_with(phantom_session, save_matcher(tmp_path / "network.onnx"))
+    for result, frame in zip(play(pipeline, frames[:3]), frames, strict=False):
+        off, share = depth_error(result, frame)
+        assert off < 0.02 and share > 0.6 and not result.skipped
+        matched, _ = pipeline.stereo(result.pair, result.observation.tissue)
+        assert not np.array_equal(matched, result.observation.depth)
+        confidence = result.observation.depth_confidence
+        assert ((confidence > 0) <= (result.observation.depth > 0)).all() and confidence.max() <= 1
+
+
+@pytest.mark.parametrize(("fault", "words"), [("nan", "not finite"), ("error", "failed: .*(Gather|indices)")])
+def test_where_it_fails_the_matcher_takes_over_and_says_so(
+    fault: str, words: str, phantom_session: Path, frames: list[StereoFrame], tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+) -> None:  # fmt: skip
+    pipeline = pipeline_with(phantom_session, save_matcher(tmp_path / "network.onnx", fault=fault))
+    shown = [frames[0], dark(frames[1]), frames[2], *map(dark, frames[3:7]), frames[7]]
+    with caplog.at_level(logging.WARNING):
+        results = play(pipeline, shown)
+    failed = [bool(result.skipped.get("network")) for result in results]
+    assert failed == [False, True, False, True, True, True, True, True]  # the last: not tried any more
+    result = results[1]
+    assert np.array_equal(
+        result.observation.depth, pipeline.stereo(result.pair, result.observation.tissue)[0]
+    )
+    assert result.observation.depth.any()
+    statistics = Statistics()
+    statistics.add(result, 1.0)
+    health = statistics.health(
+        dropped={}, stopping=False, paused=False, error=None, warnings=pipeline.warnings, connections={},
+        views={},
+    )  # fmt: skip
+    assert health.skipped == {"network": 1} and health.warnings["network"].startswith("network.onnx")
+    reason = status(health, result)["last_frame"]["skipped"]["network"]
+    assert reason.startswith("network.onnx") and "\n" not in reason
+    assert [record.levelname for record in caplog.records] == ["WARNING"] * 3  # twice news, once the end
+    assert "3 times in a row: not tried again" in results[-1].skipped["network"]
+
+
+def test_without_fallback_a_failure_ends_the_run(
+    phantom_session: Path, frames: list[StereoFrame], tmp_path: Path
+) -> None:
+    path = save_matcher(tmp_path / "network.onnx", fault="nan")
+    pipeline = pipeline_with(phantom_session, path, "vision.onnx.fallback:=false")
+    with pytest.raises(DepthNetworkError, match="not finite"):
+        play(pipeline, [frames[0], dark(frames[1])])
+
+
+def test_a_stereo_network_needs_both_eyes(
+    phantom_session: Path, frames: list[StereoFrame], tmp_path: Path
+) -> None:
+    pipeline = pipeline_with(phantom_session, save_matcher(tmp_path / "network.onnx"))
+    with pytest.raises(UsageError, match="has no right eye; name a monocular one"):
+        play(pipeline, [replace(frames[0], right=None)])
+
+
+# ---- one eye ---------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def pictures(phantom_session: Path, frames: list[StereoFrame]) -> np.ndarray:
+    """[N, H, W, 3] as the network sees them."""
+    rectifier = Rectifier(open_session(phantom_session).rig, WIDTH, HEIGHT)
+    return np.stack([rectifier(frame).left for frame in frames])
+
+
+@pytest.fixture(scope="module")
+def knowing(
+    pictures: np.ndarray, frames: list[StereoFrame], tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    """A monocular network that is right but for scale and shift, which differ from frame to frame."""
+    rng = np.random.default_rng(0)
+    maps = []
+    for place, frame in enumerate(frames):
+        depth = truth(frame)
+        inverse = np.divide(1, depth, out=np.full_like(depth, 1 / 0.04), where=depth > 0)
+        shift = 0.0 if place == 0 else rng.uniform(-5, 5)
+        maps.append(rng.uniform(0.02, 0.05) * (inverse + shift) + rng.normal(0, 0.002, depth.shape))
+    return save_table(tmp_path_factory.mktemp("mono") / "network.onnx", pictures, np.stack(maps))
+
+
+def test_a_monocular_network_is_recognised(knowing: Path, scene: Scene) -> None:
+    network = load(knowing, scene)
+    assert not network.is_stereo and network.way.normalization == NORMALIZATIONS["imagenet"]
+    relative = network(scene.left, None)
+    assert np.corrcoef(relative[scene.seen], scene.disparity[scene.seen])[0, 1] > 0.99
+    with pytest.raises(UsageError, match="meaning: a monocular network gives depth or inverse_depth"):
+        load(knowing, scene, meaning="disparity")
+
+
+def test_scale_and_shift_are_found_among_outliers() -> None:
+    rng = np.random.default_rng(0)
+    inverse = rng.uniform(10, 30, (100, 120))
+    relative = (0.03 * inverse - 0.2 + rng.normal(0, 0.003, inverse.shape)).astype(np.float32)
+    depth = (1 / inverse).astype(np.float32)
+    depth[:40] = rng.uniform(0.02, 0.06, (40, 120))  # moved, or wrong
+    depth[90:] = 0
+    relative[50, 50] = np.nan
+    everywhere = np.ones(depth.shape, bool)
+    found = fit_scale_shift(relative, depth, everywhere)
+    assert found is not None
+    assert found.scale == pytest.approx(1 / 0.03, rel=0.02)
+    assert found.shift == pytest.approx(0.2 / 0.03, abs=0.3)
+    assert fit_scale_shift(-relative, depth, everywhere) is None
+    assert fit_scale_shift(np.ones_like(relative), depth, everywhere) is None
+    assert fit_scale_shift(relative, depth * (np.arange(120) == 3), everywhere) is None  # 90 px
+
+
+def test_a_network_of_depth_is_turned_round(scene: Scene) -> None:
+    mono = MonoDepth(None, StereoConfig())
+    depth = np.where(scene.disparity > 0, scene.focal_baseline / np.maximum(scene.disparity, 1), 0)
+    depth = depth.astype(np.float32)
+    with pytest.raises(DepthNetworkError, match="does not rise"):
+        mono(depth, scene.seen, lambda: depth)
+
+
+def test_one_eye_beside_stereo_is_aligned_to_it(
+    knowing: Path, phantom_session: Path, frames: list[StereoFrame]
+) -> None:
+    """Stereo is matched in every fifth frame; in between each is laid onto the one before."""
+    pipeline = pipeline_with(phantom_session, knowing)
+    matched = []
+    match = pipeline.stereo.__call__
+    pipeline.stereo = lambda pair, tissue: matched.append(pair.frame_id) or match(pair, tissue)  # type: ignore
+    results = play(pipeline, frames)
+    figures = [depth_error(result, frame) for result, frame in zip(results, frames, strict=True)]
+    assert not any(result.skipped for result in results)
+    assert matched == list(range(0, FRAMES, 5))
+    assert max(off for off, _ in figures) < 0.02, figures
+    assert min(share for _, share in figures) > 0.8, figures
+
+
+def test_one_camera_alone_keeps_the_declared_scale(
+    knowing: Path, phantom_session: Path, frames: list[StereoFrame]
+) -> None:
+    known = truth(frames[0])
+    declared = float(np.median(known[known > 0]))
+    pipeline = pipeline_with(phantom_session, knowing, f"vision.onnx.declared_depth:={declared}")
+    results = play(pipeline, [replace(frame, right=None) for frame in frames])
+    figures = [depth_error(result, frame) for result, frame in zip(results, frames, strict=True)]
+    assert not any(result.skipped for result in results)
+    assert max(off for off, _ in figures) < 0.04, figures
+    assert min(share for _, share in figures) > 0.8, figures
+    assert all(result.snapshot.loss < 0.05 for result in results[1:])
+
+
+def test_one_camera_alone_must_be_told_a_distance(
+    knowing: Path, phantom_session: Path, frames: list[StereoFrame]
+) -> None:
+    pipeline = pipeline_with(phantom_session, knowing)
+    with pytest.raises(UsageError, match=r"set vision\.onnx\.declared_depth"):
+        play(pipeline, [replace(frames[0], right=None)])
+
+
+def test_where_one_camera_s_network_fails_depth_is_unknown(
+    pictures: np.ndarray, phantom_session: Path, frames: list[StereoFrame], tmp_path: Path
+) -> None:
+    maps = np.full((3, HEIGHT, WIDTH), np.linspace(1, 2, WIDTH))
+    maps[1] = np.nan
+    test_pair = make_pair(WIDTH, HEIGHT)[0]
+    path = save_table(tmp_path / "network.onnx", np.stack([*pictures[:2], test_pair]), maps)
+    pipeline = pipeline_with(phantom_session, path, "vision.onnx.declared_depth:=0.07")
+    good, bad = play(pipeline, [replace(frame, right=None) for frame in frames[:2]])
+    assert good.observation.depth.any() and "network" not in good.skipped
+    assert not bad.observation.depth.any() and "not finite" in bad.skipped["network"]
+    assert len(bad.snapshot.gaussians) > 200  # the model goes on
+
+
+def one_camera_launch(phantom_session: Path, knowing: Path, folder: Path, source: dict[str, str]) -> Path:
+    """A launch file with paths of its own folder: pictures, network, and one camera's calibration."""
+    (folder / "network.onnx").write_bytes(knowing.read_bytes())
+    (folder / "ost.yaml").write_text((phantom_session / "calib/left.yaml").read_text())
+    tree = {
+        "source": {**source, "pace": "step"},
+        "rig": "ost.yaml",
+        "vision": {"onnx": {"path": "network.onnx", "declared_depth": 0.07, "threads": 2}},
+    }
+    (folder / "launch.yaml").write_text(yaml.safe_dump(tree))
+    return folder / "launch.yaml"
+
+
+@pytest.mark.parametrize("kind", ["folders", "videos"])
+def test_a_recording_of_one_camera_is_played(
+    kind: str, knowing: Path, phantom_session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left = phantom_session / "left"
+    if kind == "videos":
+        film = tmp_path / "film.avi"
+        video = cv2.VideoWriter(str(film), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (WIDTH, HEIGHT))
+        for file in sorted(left.iterdir())[:3]:
+            video.write(cv2.imread(str(file)))
+        video.release()
+        left = film
+    launch = one_camera_launch(phantom_session, knowing, tmp_path, {"kind": kind, "left": str(left)})
+    monkeypatch.chdir("/")
+    session = open_session(launch, ["source.frames:=2"])
+    with session.source as source:
+        results = play(Pipeline(session.config, session.rig), list(source))
+    assert len(results) == 2
+    for result in results:
+        depth = result.observation.depth
+        assert result.pair.right is None and not result.skipped
+        assert np.median(depth[depth > 0]) == pytest.approx(0.07, rel=0.02)
+        assert len(result.snapshot.gaussians) > 200
+    with pytest.raises(UsageError, match=r"source\.right is missing; .*vision\.onnx\.path"):
+        open_session(launch, ["vision.onnx.path:=null"])
+    with pytest.raises(UsageError, match=r"publish\.right: there is no right eye"):
+        open_session(launch, ["publish.right:=true"])
+    with pytest.raises(UsageError, match=r"cannot read calibration|does not exist"):
+        open_session(launch, ["rig:=/nowhere/ost.yaml"])
