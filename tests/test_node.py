@@ -54,7 +54,10 @@ class RunningNode:
     def stop(self) -> int:
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGINT)
-        return self.process.wait(20)
+        try:
+            return self.process.wait(20)
+        finally:
+            self.process.kill()  # a node that does not end must not disturb the tests that follow
 
 
 @pytest.fixture(scope="module")
