@@ -71,8 +71,9 @@ class InstrumentFinder:
             found = _regions(evidence)
         else:
             memory = self._memory or _Memory(evidence.shape, stamp_ns)
-            drawn = cv2.split(_mean(_sampled(expected.rgb, size), WINDOW))
-            alpha = _sampled(expected.alpha, size)
+            # Not averaged: the model's picture has no noise, and reading all of it takes long.
+            sampled = cv2.resize(expected.rgb, size, interpolation=cv2.INTER_NEAREST)
+            drawn, alpha = cv2.split(_mean(sampled, WINDOW)), _shrunk(expected.alpha, size)
             doubtful = _doubtful(*colors, *drawn, alpha, is_open, memory.found, memory.trusted)
             found = _regions(evidence + _mean(doubtful, WINDOW))
             memory.update(found, evidence, stamp_ns)
@@ -127,8 +128,7 @@ def _around(evidence: F32, is_open: F32) -> F32:
     height, width = evidence.shape
     coarse = max(1, width // COARSE), max(1, height // COARSE)
     total, weight = (
-        _mean(cv2.resize(plane, coarse, interpolation=cv2.INTER_AREA), CLIPPED_WINDOW // COARSE)
-        for plane in (evidence * is_open, is_open)
+        _mean(_shrunk(plane, coarse), CLIPPED_WINDOW // COARSE) for plane in (evidence * is_open, is_open)
     )
     around: F32 = cv2.resize(total / (weight + np.float32(1e-3)), (width, height))
     return around
@@ -208,10 +208,9 @@ def _mean(picture: F32, window: int) -> F32:
     return mean
 
 
-def _sampled(picture: F32, size: tuple[int, int]) -> F32:
-    """Not averaged: the model's picture has no noise, and a third of the time goes into reading it."""
-    sampled: F32 = cv2.resize(picture, size, interpolation=cv2.INTER_NEAREST)
-    return sampled
+def _shrunk(plane: F32, size: tuple[int, int]) -> F32:
+    shrunk: F32 = cv2.resize(plane, size, interpolation=cv2.INTER_AREA)
+    return shrunk
 
 
 def _disc(side: int) -> U8:
