@@ -97,6 +97,7 @@ class Pipeline:
     def reconfigure(self, config: LaunchConfig) -> None:
         """Take changed parameters over; the model stays."""
         self._config = config
+        self.mapper.pace(config.mapping.budget_ms >= UNHURRIED_MS)
 
     def process(self, frame: StereoFrame, budget: Budget, waited: float = 0.0) -> FrameResult:
         """Everything that happens to one frame, `waited` seconds after it came."""

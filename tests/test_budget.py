@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from sags_node.config import MappingConfig
+from sags_node.launch_file import with_parameters
 from sags_node.mapping.budget import (
     GAUSSIANS_PER_MS,
     LEAST_SHARE,
@@ -19,8 +21,11 @@ from sags_node.mapping.budget import (
     make_budget,
 )
 from sags_node.mapping.densify import SHED
+from sags_node.pipeline import Pipeline
+from sags_node.session import open_session
 
 BUDGET, PERIOD = 0.033, 1 / 30  # s
+SESSION = Path(__file__).parent.parent / "replay/phantom_pull"
 
 
 @dataclass
@@ -200,3 +205,21 @@ def test_fixed_steps_go_before_time() -> None:
     steps = make_budget(MappingConfig(iterations=2, budget_ms=1))
     assert [steps.more() for _ in range(4)] == [True, True, False, False] and steps.share == 1.0
     assert isinstance(make_budget(MappingConfig(budget_ms=1)), TimeBudget)
+
+
+def test_a_budget_that_is_changed_while_running_is_as_if_it_had_been_so() -> None:
+    """With time for several steps these are shorter and the flow is finer, whenever that became so."""
+
+    def play(*budgets: float) -> list[np.ndarray]:
+        settings = ["source.pace:=step", "mapping.max_gaussians:=4000", f"mapping.budget_ms:={budgets[0]}"]
+        session = open_session(SESSION, settings)
+        pipeline = Pipeline(session.config, session.rig)
+        for budget in budgets[1:]:
+            pipeline.reconfigure(with_parameters(session.config, {"mapping.budget_ms": budget}))
+        with session.source as source:
+            frames = [frame for frame, _ in zip(source, range(3), strict=False)]
+        return [pipeline.process(frame, StepBudget(2)).snapshot.gaussians.means for frame in frames]
+
+    changed, patient, hurried = play(33, 100), play(100), play(100, 33)
+    assert all(np.array_equal(a, b) for a, b in zip(changed, patient, strict=True))
+    assert not np.array_equal(hurried[-1], patient[-1])

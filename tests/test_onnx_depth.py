@@ -23,13 +23,14 @@ from sags_node.messaging.content import status
 from sags_node.pipeline import Pipeline
 from sags_node.session import open_session
 from sags_node.sources.source import open_source
-from sags_node.types import F32, U8, Bool, FrameResult, StereoFrame
+from sags_node.types import F32, U8, Bool, FrameResult, RectifiedPair, StereoFrame
 from sags_node.vision.mono_depth import MonoDepth
 from sags_node.vision.mono_scale import fit_scale_shift
 from sags_node.vision.onnx_network import DepthNetwork
 from sags_node.vision.onnx_session import DepthNetworkError
 from sags_node.vision.onnx_test_pair import make_pair
 from sags_node.vision.rectify import Rectifier
+from sags_node.vision.stereo import StereoDepth
 
 WIDTH, HEIGHT = 320, 256
 PICTURE = [1, 3, "h", "w"]
@@ -396,13 +397,18 @@ def test_a_network_of_depth_is_turned_round(scene: Scene) -> None:
 
 
 def test_one_eye_beside_stereo_is_aligned_to_it(
-    knowing: Path, phantom_session: Path, frames: list[StereoFrame]
+    knowing: Path, phantom_session: Path, frames: list[StereoFrame], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Stereo is matched in every fifth frame; in between each is laid onto the one before."""
     pipeline = pipeline_with(phantom_session, knowing)
-    matched = []
-    match = pipeline.stereo.__call__
-    pipeline.stereo = lambda pair, tissue: matched.append(pair.frame_id) or match(pair, tissue)  # type: ignore
+    matched: list[int] = []
+    match = StereoDepth.__call__
+
+    def counted(self: StereoDepth, pair: RectifiedPair, tissue: Bool) -> tuple[F32, F32]:
+        matched.append(pair.frame_id)
+        return match(self, pair, tissue)
+
+    monkeypatch.setattr(StereoDepth, "__call__", counted)
     results = play(pipeline, frames)
     figures = [depth_error(result, frame) for result, frame in zip(results, frames, strict=True)]
     assert not any(result.skipped for result in results)

@@ -376,7 +376,7 @@ SHEARED = np.eye(4) + np.eye(4, k=1)
     ("mistake", "message"),
     [
         (no_calibration, r"cannot read calibration .*endoscope_calibration\.yaml: No such file"),
-        (calibration_that_is_none, r"endoscope_calibration\.yaml is not a YAML file as OpenCV writes it"),
+        (calibration_that_is_none, r"calibration\.yaml is not a YAML or XML file as OpenCV writes it"),
         (calibration(M2=None), r"endoscope_calibration\.yaml: M2 is not a matrix of 9 numbers"),
         (calibration(D1=np.zeros(8)), "D1 is not a matrix of 4 or 5 numbers"),
         (calibration(R=np.full((3, 3), np.nan)), "R is not a matrix of 9 numbers"),

@@ -60,7 +60,7 @@ def read_files(
     Raises:
         UsageError: a file cannot be read, a matrix is missing or malformed, or the size is not known.
     """
-    storages = [(file, _open(file)) for file in files]
+    storages = [(file, open_storage(file)) for file in files]
     where = " and ".join(map(str, files))
     K = _matrix(storages, "M1", (9,)).reshape(3, 3), _matrix(storages, "M2", (9,)).reshape(3, 3)
     left, right = (
@@ -87,7 +87,12 @@ def read_files(
 Storages = Sequence[tuple[Path, cv2.FileStorage]]
 
 
-def _open(file: Path) -> cv2.FileStorage:
+def open_storage(file: Path) -> cv2.FileStorage:
+    """A file of matrices.
+
+    Raises:
+        UsageError: it is missing, too large, or not written by OpenCV.
+    """
     try:
         if file.stat().st_size > LARGEST_FILE:
             raise UsageError(f"{file} is too large for a calibration; check the path")
@@ -116,14 +121,15 @@ def _matrix(storages: Storages, key: str, lengths: tuple[int, ...]) -> F64:
         where = " and ".join(str(file) for file, _ in storages)
         raise UsageError(f"{where}: looked for a matrix named {names}; a stereo calibration needs it")
     file, node = found
-    numbers = _numbers(node)
+    numbers = numbers_in(node)
     if numbers is None or numbers.size not in lengths:
         needed = " or ".join(map(str, lengths))
         raise UsageError(f"{file}: {node.name()} is not a matrix of {needed} numbers; save the file again")
     return numbers
 
 
-def _numbers(node: cv2.FileNode) -> F64 | None:
+def numbers_in(node: cv2.FileNode) -> F64 | None:
+    """The numbers of a matrix or list, as one row; None: it is neither, or too large for a calibration."""
     if node.isSeq():
         return np.array([node.at(index).real() for index in range(min(node.size(), LARGEST_MATRIX))])
     if not node.isMap():
@@ -143,7 +149,7 @@ def _numbers(node: cv2.FileNode) -> F64 | None:
 def _size(storages: Storages) -> tuple[int, int] | None:
     for key in SIZE_LISTS:
         found = _find(storages, key)
-        numbers = None if found is None else _numbers(found[1])
+        numbers = None if found is None else numbers_in(found[1])
         if numbers is not None and len(numbers) == 2:
             return _pixels(numbers[0]), _pixels(numbers[1])
     for names in SIZES:

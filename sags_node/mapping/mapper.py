@@ -66,7 +66,7 @@ class Mapper:
         """
         Args:
             smoothing: draw the Gaussians with the 3D filter (`model.alias_free`).
-            unhurried: there is time for several steps a frame. They are shorter then, and the flow finer.
+            unhurried: see `pace`.
             focus: share of the picture, where it is worst, for the steps after the first of a frame.
         """
         self.model = GaussianModel(max_gaussians)
@@ -76,8 +76,7 @@ class Mapper:
         self._smoothing = smoothing
         self._focus = focus
         self._optimiser = Optimiser()
-        self._flow = OpticalFlow(fine=unhurried)
-        self._rates = Rates().scaled(UNHURRIED_RATES) if unhurried else Rates()
+        self.pace(unhurried)
         self._deformation: Deformation | None = None
         self._last: Drawn | None = None
         self._found: tuple[U8, F32] | None = None  # a picture, and the pixels where the Gaussians are in it
@@ -120,6 +119,11 @@ class Mapper:
             loss=self._loss,
             counts=counts,
         )
+
+    def pace(self, unhurried: bool) -> None:
+        """Whether there is time for several steps a frame. They are shorter then, and the flow is finer."""
+        self._flow = OpticalFlow(fine=unhurried)
+        self._rates = Rates().scaled(UNHURRIED_RATES) if unhurried else Rates()
 
     def restart(self) -> None:
         """Forget the model; the next frame, or this one if it is being taken in, makes a new one."""

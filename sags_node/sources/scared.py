@@ -17,6 +17,7 @@ import numpy as np
 
 from sags_node import geometry
 from sags_node.calibration import check_intrinsics, rectified_rig, refuse_errors
+from sags_node.calibration.opencv import numbers_in, open_storage
 from sags_node.errors import SagsError, UsageError
 from sags_node.sources.numbered import NumberedFiles, open_numbered
 from sags_node.sources.pictures import FolderPairs, RawPair
@@ -30,7 +31,6 @@ BASELINES = (1e-3, 50e-3)  # m: outside, the file is not in millimetres
 RECTIFIED_FOLDERS = (("left_rectified", "right_rectified"), ("data/left_finalpass", "data/right_finalpass"))
 LARGEST_JSON = 2**20  # bytes
 LARGEST_POINTS = 2**28
-LARGEST_CALIBRATION = 2**20
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,7 +161,7 @@ def read_rectification(folder: Path, size: tuple[int, int]) -> Rectification:
         UsageError: the file is missing, damaged or implausible.
     """
     file = folder / "endoscope_calibration.yaml"
-    storage = _open_storage(file)
+    storage = open_storage(file)
     M1, M2, R = (_matrix(storage, file, key, (9,)).reshape(3, 3) for key in ("M1", "M2", "R"))
     D1, D2 = (_matrix(storage, file, key, (4, 5)) for key in ("D1", "D2"))
     T = _matrix(storage, file, "T", (3,)) * METRES
@@ -181,31 +181,13 @@ def read_rectification(folder: Path, size: tuple[int, int]) -> Rectification:
     return Rectification(size, (M1, M2), distortion, (R1, R2), (P1, P2))
 
 
-def _open_storage(file: Path) -> cv2.FileStorage:
-    try:
-        if file.stat().st_size > LARGEST_CALIBRATION:
-            raise UsageError(f"{file} is too large for a calibration; download it again")
-        text = file.read_text(encoding="utf-8")
-        return cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-    except OSError as error:
-        raise UsageError(
-            f"cannot read calibration {file}: {error.strerror}; SCARED keyframes have it"
-        ) from None
-    except (UnicodeDecodeError, cv2.error, SystemError):
-        raise UsageError(f"{file} is not a YAML file as OpenCV writes it; download it again") from None
-
-
 def _matrix(storage: cv2.FileStorage, file: Path, key: str, lengths: tuple[int, ...]) -> F64:
     """The numbers of one matrix, as one row."""
-    try:
-        values = storage.getNode(key).mat()
-    except cv2.error:  # fewer numbers than it has rows and columns
-        values = None
+    values = numbers_in(storage.getNode(key))
     if values is None or values.size not in lengths or not np.isfinite(values).all():
         needed = " or ".join(map(str, lengths))
         raise UsageError(f"{file}: {key} is not a matrix of {needed} numbers; download the file again")
-    numbers: F64 = values.astype(np.float64).ravel()
-    return numbers
+    return values
 
 
 def _open_pictures(folder: Path) -> tuple[PanePairs | FolderPairs, bool]:

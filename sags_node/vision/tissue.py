@@ -96,11 +96,8 @@ class TissueMask:
                 opposite = {"white": "black", "black": "white"}.get(str(said), "other class numbers")
                 whose, hint = "network's", f"set vision.tissue.tissue_is to {opposite}, it is {said}"
             else:
-                whose, hint = (
-                    "session's",
-                    "white must be instrument in its files; EndoNeRF's are turned round ",
-                )
-                hint += "by source.instruments"
+                whose = "session's"
+                hint = "white must be instrument in its files; source.instruments turns EndoNeRF's round"
             raise UsageError(
                 f"the {whose} masks call over half of each of the first {FIRST_FRAMES} pictures instrument "
                 f"({share:.0%} now): upside down? {hint}. If they are right, begin later (source.start), or "
