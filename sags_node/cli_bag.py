@@ -49,6 +49,24 @@ def bag() -> None:
     help="What may wait for the disk; beyond it messages are dropped and counted.",
 )
 @click.option(
+    "-b",
+    "--max-bag-size",
+    type=click.IntRange(0),
+    default=0,
+    show_default=True,
+    metavar="BYTES",
+    help="Go on in a new file of the folder when one is so large; 0: never.",
+)
+@click.option(
+    "-d",
+    "--max-bag-duration",
+    type=click.FloatRange(0),
+    default=0.0,
+    show_default=True,
+    metavar="SECONDS",
+    help="Go on in a new file of the folder when one is so long; 0: never.",
+)
+@click.option(
     "--snapshot-mode",
     type=positive,
     metavar="SECONDS",
@@ -65,6 +83,8 @@ def record(
     topics: tuple[str, ...],
     compression: str,
     max_cache: float,
+    max_bag_size: int,
+    max_bag_duration: float,
     snapshot_mode: float | None,
     from_stdin: bool,
     endpoint: str | None,
@@ -75,18 +95,20 @@ def record(
 ) -> None:
     """Record what a running node publishes until Ctrl-C.
 
-    Leaves a rosbag2 folder: an MCAP file that Foxglove, PlotJuggler and `ros2 bag` open, and metadata.yaml.
+    Leaves a rosbag2 folder: MCAP files that Foxglove, PlotJuggler and `ros2 bag` open, and metadata.yaml.
     Calibration and parameters are attached. Messages that the disk was too slow for are counted as dropped,
     those that never arrived as lost. A killed recorder's file is mended by `sags bag recover`.
 
     \b
     sags bag record -o out/case1 --compression jpeg
     sags bag record --topics left/image_rect_color --topics right/image_rect_color
+    sags bag record -o out/case2 --max-bag-size 4000000000
     sags bag record -o out/last --snapshot-mode 20 & kill -USR1 $!
     """
     from datetime import datetime
 
     from sags_node.messaging.stream import check_topic
+    from sags_node.recording.bag_writer import Limits
     from sags_node.recording.message_writer import Compression
     from sags_node.recording.recorder import Options, Recorder
 
@@ -99,6 +121,7 @@ def record(
             compression=cast(Compression, compression),
             max_cache_mb=max_cache,
             snapshot_seconds=snapshot_mode,
+            limits=Limits(max_bag_size, max_bag_duration),
             ns=ns,
             endpoint=endpoint,
             keys=keys,
@@ -131,6 +154,15 @@ def record(
 @click.option("-r", "--rate", type=positive, default=1.0, show_default=True, help="Times as fast.")
 @click.option("-l", "--loop", is_flag=True, help="Begin anew at the end.")
 @click.option("-d", "--delay", type=click.FloatRange(0), default=0.0, help="Seconds to wait before.")
+@click.option(
+    "--clock",
+    "clock_hz",
+    is_flag=False,
+    flag_value=40.0,  # as in ros2 bag play
+    type=positive,
+    metavar="[HZ]",
+    help="Publish the recording's time on the topic clock, so often; without a number 40 Hz.",
+)
 @click.option("-p", "--start-paused", is_flag=True, help="Wait for the first Enter.")
 @click.option("--start-offset", type=click.FloatRange(0), default=0.0, help="Seconds to leave out.")
 @click.option("--playback-duration", type=positive, help="Seconds of the recording to play.")
@@ -145,6 +177,7 @@ def play(
     rate: float,
     loop: bool,
     delay: float,
+    clock_hz: float | None,
     start_paused: bool,
     start_offset: float,
     playback_duration: float | None,
@@ -161,6 +194,7 @@ def play(
 
     \b
     sags bag play out/case1 --rate 0.5 --loop
+    sags bag play out/case1 --clock 100
     """
     from sags_node.config import PublishConfig
     from sags_node.recording.player import Options, Player
@@ -174,6 +208,7 @@ def play(
         topics=tuple(say.plain(name, ns) for name in topics),
         exclude=tuple(say.plain(name, ns) for name in exclude),
         remap=say.remappings(remap, ns),
+        clock_hz=clock_hz,
     )
     player = Player(path, options, PublishConfig(data=(endpoint,), control=None), ns, start_paused)
     _on_signals(player.stop)

@@ -90,7 +90,10 @@ def overlay(json_out: bool, **options: Any) -> None:
 
 @click.group()
 def topic() -> None:
-    """Look at what a running node publishes, as `ros2 topic` does."""
+    """Look at what a running node publishes, as `ros2 topic` does.
+
+    An overlay, a player and others are found by their namespace: --ns overlay.
+    """
 
 
 @topic.command("list")
@@ -100,7 +103,12 @@ def topic() -> None:
 @click.option("--seconds", type=positive, default=3.0, show_default=True, help="How long to listen.")
 @as_json
 def topic_list(endpoint: str | None, ns: str, seconds: float, json_out: bool, keys: Any) -> None:
-    """Every topic with its type, and the rate and size of what was heard."""
+    """Every topic with its type, and the rate and size of what was heard.
+
+    \b
+    sags topic list
+    sags topic list --ns overlay
+    """
     from sags_node.apps import topic as tool
 
     rows = tool.topic_list(endpoint=endpoint, ns=ns, seconds=seconds, keys=keys)

@@ -13,6 +13,7 @@ Paths = Annotated[
 ]
 Positive = Annotated[float, Field(gt=0)]
 Side = Annotated[int, Field(ge=16, le=4096)]  # px
+NAMESPACE = r"^[A-Za-z0-9_][A-Za-z0-9_/]*$"
 
 
 class Section(BaseModel):
@@ -249,23 +250,31 @@ class OnnxConfig(NetworkFormat):
 class TissueConfig(Section):
     """Which pixels show tissue."""
 
-    method: Literal["session", "classical", "onnx", "none"] = Field(
+    method: Literal["session", "classical", "onnx", "topic", "none"] = Field(
         "session",
-        description="session: the recording's masks, else classical; onnx: a network's; none: every pixel",
+        description="session: the recording's masks, else classical; onnx: a network's; topic: another "
+        "process's; none: every pixel",
     )
     path: Path | None = Field(None, description="the .onnx file of a segmentation network, for onnx")
     tissue_is: Literal["white", "black"] | tuple[int, ...] | None = Field(
         None,
-        description="what shows tissue in the network's answer: white (class 1 and above), black (class 0), "
-        "or a list of class numbers",
+        description="what shows tissue, for onnx and topic: white (class 1 and above), black (class 0), or a "
+        "list of a network's class numbers",
+    )
+    endpoint: str | None = Field(None, description="data socket that publishes left/tissue_mask, for topic")
+    ns: str = Field("masks", pattern=NAMESPACE, description="namespace of that topic")
+    tolerance: float = Field(
+        0.1, gt=0, le=10, description="s; how far the stamps of mask and picture may lie apart"
     )
     dilate: int = Field(2, ge=0, le=64, description="px added around instruments, working size")
     exclude: tuple[Box, ...] = Field((), description="boxes of the raw left picture never to use (captions)")
 
     @model_validator(mode="after")
-    def _network_is_described(self) -> TissueConfig:
+    def _source_is_described(self) -> TissueConfig:
         if self.method == "onnx" and (self.path is None or self.tissue_is is None):
             raise ValueError("onnx needs path (the .onnx file) and tissue_is (white, black or class numbers)")
+        if self.method == "topic" and (self.endpoint is None or self.tissue_is not in ("white", "black")):
+            raise ValueError("topic needs endpoint (tcp://127.0.0.1:PORT) and tissue_is (white or black)")
         return self
 
 
@@ -328,7 +337,7 @@ class PublishConfig(Section):
 class LaunchConfig(Section):
     """One way to run the node."""
 
-    ns: str = Field("sags", pattern=r"^[A-Za-z0-9_][A-Za-z0-9_/]*$")
+    ns: str = Field("sags", pattern=NAMESPACE)
     seed: int = 0
     rig: Path | None = Field(
         None, description="a calibration in any form of docs/calibration.md; the phantom has its own"

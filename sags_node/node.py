@@ -32,13 +32,14 @@ from sags_node.latest import Latest
 from sags_node.launch_file import with_parameters
 from sags_node.mapping.budget import make_budget
 from sags_node.messaging import content
+from sags_node.messaging.masks import MaskSubscriber
 from sags_node.messaging.publisher import Publisher
 from sags_node.messaging.requests import AnchorName, AnchorRequest, ViewName, ViewRequest, parse
 from sags_node.model.ply import write_ply
 from sags_node.pipeline import Pipeline
 from sags_node.recording.child import RecorderProcess
 from sags_node.sources.source import Source
-from sags_node.types import DrawnView, FrameResult, NodeHealth, StereoFrame, StereoRig
+from sags_node.types import DrawnView, FrameResult, NodeHealth, RectifiedPair, StereoFrame, StereoRig
 from sags_node.views import Views, prepare_thread
 
 log = logging.getLogger(__name__)
@@ -69,7 +70,13 @@ class Node:
         self._rig = rig
         self._source = source
         self._on_result = on_result
-        self._pipeline = Pipeline(config, rig)
+        self._masks: MaskSubscriber | None = None
+        if config.vision.tissue.endpoint is not None and config.vision.tissue.method == "topic":
+            self._masks = MaskSubscriber(config.vision.tissue.endpoint, config.vision.tissue.ns)
+            self._pipeline = Pipeline(config, rig, self._masks.nearest, self._offer_picture)
+        else:
+            self._pipeline = Pipeline(config, rig)
+        self._pictures: Latest[tuple[RectifiedPair, int]] = Latest(on_put=self._wake_publishing)  # and epoch
         self._budget = make_budget(config.mapping)
         self._live = isinstance(config.source, V4l2Source) or config.source.pace == "realtime"
         self._wake = os.eventfd(0, os.EFD_NONBLOCK)
@@ -135,6 +142,8 @@ class Node:
             if thread.ident is not None:  # it was started
                 ended.wait(STOP_SECONDS)
         self._recorder.close()
+        if self._masks is not None:
+            self._masks.close()
 
     @property
     def endpoints(self) -> list[str]:
@@ -222,6 +231,10 @@ class Node:
         self._drawn[name] = drawn
         self._wake_publishing()
 
+    def _offer_picture(self, pair: RectifiedPair, epoch: int) -> None:
+        """Out with it now: a mask made of it is in time for the next frame then."""
+        self._pictures.put((pair, epoch))
+
     def _wake_publishing(self) -> None:
         os.eventfd_write(self._wake, 1)
 
@@ -241,6 +254,9 @@ class Node:
             result = self._results.get(timeout=0)
             if result is not None:
                 self._send(result)
+            picture = self._pictures.get(timeout=0)  # of a later frame
+            if picture is not None:
+                self._publisher.publish_picture(*picture)
             self._send_views()
             if time.monotonic() >= next_health or self._state_changed.is_set():
                 self._state_changed.clear()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -35,6 +35,7 @@ from sags_node.vision.onnx_depth import NetworkDepth
 from sags_node.vision.rectify import Rectifier
 from sags_node.vision.stereo import StereoDepth
 from sags_node.vision.tissue import TissueMask
+from sags_node.vision.tissue_topic import NearestMask
 
 UNHURRIED_MS = 60.0  # a budget that has room for several steps and a finer flow
 FARTHEST = 10.0  # m: what a session says to be beyond is no depth
@@ -42,13 +43,25 @@ DUPLICATE_RMS = 0.6  # grey levels: below a video codec's own noise (PSNR > 52 d
 
 
 class Pipeline:
-    """rectify -> tissue mask -> depth -> map -> render."""
+    """rectify -> tissue mask -> depth -> map -> render.
 
-    def __init__(self, config: LaunchConfig, rig: StereoRig) -> None:
+    Args:
+        masks: of another process, for `vision.tissue.method` topic.
+        on_rectified: called with each pair and its epoch, before anything else is done with it.
+    """
+
+    def __init__(
+        self,
+        config: LaunchConfig,
+        rig: StereoRig,
+        masks: NearestMask | None = None,
+        on_rectified: Callable[[RectifiedPair, int], None] = lambda pair, epoch: None,
+    ) -> None:
         vision = config.vision
         width, height = vision.working_size(rig.left.width, rig.left.height)
         self.rectifier = Rectifier(rig, width, height)
-        self.tissue = TissueMask(vision.tissue, self.rectifier)
+        self.tissue = TissueMask(vision.tissue, self.rectifier, masks)
+        self._on_rectified = on_rectified
         camera, baseline = self.rectifier.camera, self.rectifier.baseline
         self.stereo = StereoDepth(vision.stereo, camera, baseline)
         self._network: NetworkDepth | None = None
@@ -105,6 +118,7 @@ class Pipeline:
         watch = Stopwatch()
         with watch("rectify"):
             pair = self._placed(frame)
+        self._on_rectified(pair, self._epoch(frame))
         if self._mapped is not None and self._config.mapping.skip_duplicates:
             if _rms_difference(pair, self._mapped.pair) < DUPLICATE_RMS:
                 anchors = self.anchors.at(pair.t_capture_ns)

@@ -6,6 +6,8 @@ import json
 import random
 import resource
 import struct
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,12 +17,16 @@ import cv2
 import numpy as np
 import pytest
 from bag_files import MS, ROS1, ROS2, START, picture
+from mcap.records import Schema
 
 from sags_node.apps.launching import split
 from sags_node.calibration import save_rig
 from sags_node.config import BagSource, DvrkSource, LaunchConfig
 from sags_node.errors import SagsError, UsageError
 from sags_node.launch_file import load_launch
+from sags_node.messaging import cdr
+from sags_node.recording import rosbag1_check
+from sags_node.recording.bag_writer import BagWriter, Limits
 from sags_node.recording.info import bag_info
 from sags_node.session import open_session
 from sags_node.sources.bags import read_rig
@@ -128,6 +134,48 @@ def test_the_recordings_own_clock_and_a_gap_in_it(tmp_path: Path) -> None:
     ) as source:
         assert [frame.t_capture_ns // MS for frame in source] == [0, 40, 160, 200]
     assert now[0] == pytest.approx(0.2)
+
+
+def test_opening_a_large_bag_takes_little_memory(tmp_path: Path) -> None:
+    """Of 130 MB in two files no more is ever held than a few chunks."""
+    big = np.zeros((600, 720, 3), np.uint8)
+    schema = Schema(id=0, name=files.IMAGE, encoding="ros2msg", data=cdr.definition(files.IMAGE).encode())
+    with BagWriter(tmp_path / "bag", Limits(bytes=80_000_000)) as writer:
+        channels = [
+            writer.add_topic(f"/rig/{eye}/image_raw", files.IMAGE, schema) for eye in ("left", "right")
+        ]
+        for number in range(50):
+            stamp = START + number * 40 * MS
+            data = b"".join(bytes(part) for part in cdr.image(big, "rgb8", stamp).parts)
+            for channel in channels:
+                writer.write(channel, stamp, stamp, number, data)
+    program = (
+        "import resource, sys; from pathlib import Path; from sags_node.config import BagSource\n"
+        "from sags_node.sources.bags import BagPairs, read_rig\n"
+        "def most(): return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
+        "before, config = most(), BagSource(path=Path(sys.argv[1]))\n"
+        "pairs = BagPairs(config); read_rig(config)\n"
+        "print(pairs.count, most() - before)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(tmp_path / "bag")], capture_output=True, text=True, check=True
+    )
+    count, grown_kb = map(int, done.stdout.split())
+    assert count == 50 and grown_kb < 40_000
+
+
+def test_a_ros1_bag_is_checked_once_until_it_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A loop must not wait until all of it was unpacked again."""
+    checked: list[int] = []
+    check = rosbag1_check._check_chunk
+    monkeypatch.setattr(rosbag1_check, "_check_chunk", lambda *chunk: (checked.append(1), check(*chunk)))
+    path = KINDS["ros1 lz4"](tmp_path)
+    assert len(play(path, loop=True, frames=3 * COUNT)) == 3 * COUNT
+    once = len(checked)
+    path.unlink()
+    files.write_rosbag1(path, files.stereo_rows(ROS1, 2 * COUNT), "LZ4")
+    assert len(play(path)) == 2 * COUNT
+    assert 0 < once < len(checked) <= 3 * once
 
 
 # ---- which topics ----------------------------------------------------------------------------------------

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -12,15 +14,17 @@ from typing import Any
 
 import independent_client as client
 import msgpack
+import msgspec
 import numpy as np
 import pytest
 import zmq
 from hostile import is_reply, random_request
 
 from sags_node.config import PublishConfig
-from sags_node.errors import SagsError
+from sags_node.errors import SagsError, UsageError
 from sags_node.messaging.control import MAX_PENDING, ControlClient, Handler
 from sags_node.messaging.publisher import Publisher
+from sags_node.messaging.rundir import Connection
 
 
 def refuse(args: dict[str, Any]) -> Any:
@@ -146,6 +150,110 @@ def test_thousands_of_random_requests_do_no_harm(tmp_path: Path) -> None:
         assert answered >= 2900  # all but those in too many parts
         with ControlClient(endpoint) as sane:
             assert sane.request("echo", {"a": [1, {"b": 2.5}]}) == {"a": [1, {"b": 2.5}]}
+
+
+# ---- a node that is started anew -------------------------------------------------------------------------
+
+
+@contextmanager
+def node_process(run_dir: Path, session: str, control: str = "tcp://127.0.0.1:*") -> Iterator[None]:
+    """A node in its own process, which ends with SIGKILL and so leaves its connection file behind."""
+    program = (
+        "import sys; from pathlib import Path\n"
+        "from sags_node.config import PublishConfig; from sags_node.messaging.publisher import Publisher\n"
+        f"config = PublishConfig(data=(), control={control!r}, run_dir=Path({str(run_dir)!r}))\n"
+        f"handlers = {{'who': lambda args: {session!r}}}\n"
+        f"with Publisher(config, 'sags', {session!r}, handlers) as running:\n"
+        "    print(running.connection.control, flush=True)\n"
+        "    while True:\n"
+        "        running.poll(20)\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline().startswith("tcp://")
+        try:
+            yield
+        finally:
+            process.kill()
+            process.wait()
+
+
+def test_a_killed_node_is_followed_to_another_port(tmp_path: Path) -> None:
+    with node_process(tmp_path / "run", "first"):
+        asker = ControlClient(run_dir=tmp_path / "run")
+        assert asker.request("who", timeout=10) == "first"
+    with asker:
+        before = asker.endpoint
+        with pytest.raises(SagsError, match=f"no answer from {before} in 0.3 s"):
+            asker.request("who", timeout=0.3)
+        with node_process(tmp_path / "run", "second"):
+            assert asker.request("who", timeout=10) == "second"
+            assert asker.endpoint != before
+
+
+def test_a_node_that_stopped_in_order_is_waited_for(tmp_path: Path) -> None:
+    """It leaves no connection file, so nothing is sent before the next one is there."""
+    asked: list[str] = []
+    with node(tmp_path / "run", {}):
+        asker = ControlClient(run_dir=tmp_path / "run")
+        assert asker.request("ping") == "pong"
+    with asker:
+        with pytest.raises(SagsError, match="no node runs as 'sags'"):
+            asker.request("ping", timeout=0.3)
+        answers: list[Any] = []
+        thread = threading.Thread(target=lambda: answers.append(asker.request("mark", timeout=20)))
+        thread.start()
+        time.sleep(0.3)
+        with node(tmp_path / "run", {"mark": lambda args: asked.append("x")}) as endpoint:
+            thread.join(20)
+            assert answers == [None] and asked == ["x"]  # once
+            assert asker.endpoint == endpoint
+
+
+def test_what_may_have_been_done_is_not_asked_for_again(tmp_path: Path) -> None:
+    """The node dies with a request unanswered, and another one comes while the client waits."""
+    asked: list[str] = []
+
+    def never(args: dict[str, Any]) -> Future[Any]:
+        asked.append("first")
+        return Future()
+
+    with node(tmp_path / "run", {"mark": never}):
+        asker = ControlClient(run_dir=tmp_path / "run")
+        errors: list[str] = []
+
+        def ask() -> None:
+            try:
+                asker.request("mark", timeout=20)
+            except SagsError as error:
+                errors.append(str(error))
+
+        thread = threading.Thread(target=ask)
+        thread.start()
+        _until(lambda: asked)
+    with asker, node(tmp_path / "run", {"mark": lambda args: asked.append("second")}):
+        thread.join(10)
+        assert len(errors) == 1 and "started anew before it answered; ask again" in errors[0]
+        assert asked == ["first"]
+        asker.request("mark", timeout=10)
+        assert asked == ["first", "second"]
+
+
+def test_a_node_that_wants_keys_after_its_restart_says_so(tmp_path: Path) -> None:
+    with node(tmp_path / "run", {}), ControlClient(run_dir=tmp_path / "run") as asker:
+        file = tmp_path / "run/sags.json"
+        known = msgspec.json.decode(file.read_bytes(), type=Connection)
+        file.write_bytes(msgspec.json.encode(msgspec.structs.replace(known, public_key="k" * 40)))
+        with pytest.raises(UsageError, match="wants a key"):
+            asker.request("ping")
+
+
+def test_an_endpoint_that_was_given_is_kept(tmp_path: Path) -> None:
+    with node(tmp_path / "run", {}) as endpoint:
+        asker = ControlClient(endpoint, run_dir=tmp_path / "run")
+        assert asker.request("ping") == "pong"
+    with asker, node(tmp_path / "run", {}), pytest.raises(SagsError, match=f"no answer from {endpoint}"):
+        asker.request("ping", timeout=0.4)
 
 
 def test_an_oversized_request_is_cut_off(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -25,17 +26,21 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from synthetic import HEIGHT, WIDTH, at_frame, plane_result, publisher, stream
 
+from sags_node.apps.topic import topic_hz
 from sags_node.cli import main
 from sags_node.config import PublishConfig
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import cdr
 from sags_node.messaging.control import ControlClient
 from sags_node.messaging.received import ReceivedCloud, ReceivedImage
+from sags_node.messaging.rundir import read_connection
+from sags_node.messaging.stream import listen
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.messaging.topics import TOPICS
 from sags_node.messaging.wire import Message, Meta, encode
 from sags_node.recording.backlog import Arrived, Backlog
 from sags_node.recording.bag import BagMessage, read_messages
+from sags_node.recording.bag_writer import Limits
 from sags_node.recording.info import bag_info
 from sags_node.recording.pictures import decode_picture
 from sags_node.recording.player import Options as PlayOptions
@@ -180,6 +185,95 @@ def test_only_the_topics_asked_for(tmp_path: Path) -> None:
         "sags/left/depth",
         "sags/tf",
     }
+
+
+# ---- in several files ------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def split_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """More than ten files, so that their names do not sort as text."""
+    path, summary = record_plane(tmp_path_factory.mktemp("split"), seconds=2.0, limits=Limits(bytes=600_000))
+    assert summary["dropped"] == 0
+    return path
+
+
+def test_a_full_file_is_followed_by_the_next(split_bag: Path) -> None:
+    whole = list(read_messages(split_bag))
+    described = yaml.safe_load((split_bag / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    names = [f"bag_{number}.mcap" for number in range(len(list(split_bag.glob("*.mcap"))))]
+    assert len(names) > 10
+    assert described["relative_file_paths"] == names == [file["path"] for file in described["files"]]
+    assert described["message_count"] == len(whole)
+    assert sum(file["message_count"] for file in described["files"]) == len(whole)
+    with AnyReader([split_bag]) as reader:
+        assert reader.message_count == len(whole)
+        assert [(c.topic, bytes(raw)) for c, _, raw in reader.messages()] == [
+            (m.topic, bytes(m.data)) for m in whole
+        ]
+    for messages in by_topic(split_bag).values():
+        sequence = [message.sequence for message in messages]
+        assert sequence == list(range(sequence[0], sequence[0] + len(messages)))
+    assert bag_info(split_bag)["files"] == names
+
+
+def test_each_file_can_be_read_alone(split_bag: Path) -> None:
+    """By two readers; calibration and parameters are in each, and its own description."""
+    described = yaml.safe_load((split_bag / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    joined = []
+    for said in described["files"]:
+        file = split_bag / said["path"]
+        alone = list(read_messages(file))
+        joined += content(alone)
+        assert len(alone) == said["message_count"] > 0
+        assert alone[0].log_ns == said["starting_time"]["nanoseconds_since_epoch"]
+        assert sum(len(message.data) for message in alone) <= 600_000
+        with file.open("rb") as opened:
+            mcap = make_reader(opened, validate_crcs=True, decoder_factories=[DecoderFactory()])
+            assert sum(1 for _ in mcap.iter_decoded_messages()) == len(alone)
+            attached = {a.name: a.data.decode() for a in mcap.iter_attachments()}
+            notes = {m.name: m.metadata for m in mcap.iter_metadata()}
+        own = yaml.safe_load(notes["rosbag2"]["serialized_metadata"])
+        assert own["relative_file_paths"] == [file.name] and own["message_count"] == len(alone)
+        counts = {t["topic_metadata"]["name"]: t["message_count"] for t in own["topics_with_message_count"]}
+        assert counts["/sags/tf"] == sum(message.topic == "/sags/tf" for message in alone)
+        if file.name != "bag_0.mcap":  # where they may come after the first pictures
+            assert set(attached) == {"parameters.json", "calib/left.yaml", "calib/right.yaml"}
+            assert notes["sags"]["session"] == "session-1"
+    assert joined == content(list(read_messages(split_bag)))
+
+
+def test_a_file_ends_after_its_time(tmp_path: Path) -> None:
+    path, _ = record_plane(tmp_path, seconds=1.6, limits=Limits(seconds=0.5))
+    files = sorted(path.glob("*.mcap"))
+    assert 3 <= len(files) <= 4
+    for file in files:
+        times = [message.log_ns for message in read_messages(file)]
+        assert times[-1] - times[0] <= 0.5e9
+    assert bag_info(path)["messages"] == sum(bag_info(file)["messages"] for file in files)
+
+
+def test_split_recordings_are_recovered_and_played(split_bag: Path, tmp_path: Path) -> None:
+    """As a killed recorder leaves it: no metadata.yaml, and the last file cut off."""
+    whole = content(list(read_messages(split_bag)))
+    killed = tmp_path / "killed"
+    shutil.copytree(split_bag, killed)
+    (killed / "metadata.yaml").unlink()
+    assert content(list(read_messages(killed))) == whole  # the files are in order all the same
+    last = killed / f"bag_{len(list(killed.glob('*.mcap'))) - 1}.mcap"
+    last.write_bytes(last.read_bytes()[: last.stat().st_size // 2])
+    result = sags("bag", "info", killed)
+    assert result.exit_code == 1 and last.name in result.stderr and "sags bag recover" in result.stderr
+    result = sags("bag", "recover", killed, "-o", tmp_path / "saved", "--json")
+    done = json.loads(result.stdout)
+    assert result.exit_code == 3 and done["unclosed_files"] == 1
+    saved = content(list(read_messages(tmp_path / "saved")))
+    assert saved == whole[: len(saved)] and len(saved) > 0.9 * len(whole) - 40
+    with (tmp_path / "saved/saved_0.mcap").open("rb") as opened:
+        attached = [a.name for a in make_reader(opened).iter_attachments()]
+    assert sorted(attached) == ["calib/left.yaml", "calib/right.yaml", "parameters.json"]  # once
+    config = PublishConfig(data=("tcp://127.0.0.1:*",), control=None, run_dir=tmp_path / "run")
+    assert Player(split_bag, PlayOptions(rate=50.0), config).play()["messages"] == len(whole)
 
 
 # ---- what is missing -------------------------------------------------------------------------------------
@@ -529,6 +623,70 @@ def test_flags_of_play(bag: Path, tmp_path: Path) -> None:
     assert sags("bag", "play", bag, "--remap", "a=b").exit_code == 2
 
 
+def test_a_clock_tells_the_moment_of_the_recording(bag: Path, tmp_path: Path) -> None:
+    """Half as fast, with a pause: by clock and stamp every message is found in the recording again."""
+    recorded = {m.sequence: m.publish_ns for m in by_topic(bag)["left/depth"]}
+    run_dir, rate = tmp_path / "run", 0.5
+    clocks: list[tuple[float, int, int]] = []  # when it came (s), wall clock and recording (ns)
+    depths: list[int] = []
+    with playing(bag, run_dir, topics=("left/depth",), rate=rate, clock_hz=50.0) as player:
+        began = time.monotonic()
+        toggles = [0.0, 0.8, 1.5]
+        for arrived in listen(["clock", "left/depth"], None, "sags", 2.4, run_dir=run_dir):
+            at = time.monotonic() - began
+            if toggles and at >= toggles[0]:
+                toggles.pop(0)
+                player.toggle_pause()
+            if arrived is None:
+                continue
+            message, _ = arrived
+            if message.topic == "sags/clock":
+                said = cdr.parse(message).clock
+                clocks.append((at, message.meta.stamp_ns, said.sec * 10**9 + said.nanosec))
+            else:
+                depths.append(message.meta.stamp_ns)
+    ats, walls, told = (np.array(column) for column in zip(*clocks, strict=True))
+    assert (np.diff(walls) >= 0).all() and (np.diff(told) >= 0).all()
+    paused = (ats > 1.0) & (ats < 1.4)
+    assert np.count_nonzero(paused) > 8 and np.ptp(told[paused]) < 2e6
+    for playing_on in (ats < 0.7, ats > 1.7):
+        steps, real = np.diff(told[playing_on]), np.diff(walls[playing_on])
+        assert len(steps) > 12 and np.median(real) == pytest.approx(1e9 / 50, rel=0.2)
+        assert steps.sum() / real.sum() == pytest.approx(rate, rel=0.02)
+    for stamp in depths[5:]:
+        nearest = int(np.argmin(np.abs(walls - stamp)))
+        moment = told[nearest] + (stamp - walls[nearest]) * rate
+        assert min(abs(moment - original) for original in recorded.values()) < 2e6
+
+
+def test_without_being_asked_there_is_no_clock(bag: Path, tmp_path: Path) -> None:
+    with (
+        playing(bag, tmp_path / "run") as player,
+        Subscriber(["clock", "tf"], run_dir=tmp_path / "run") as sub,
+    ):
+        player.toggle_pause()
+        assert sub.wait("tf", 10) is not None
+        time.sleep(0.2)
+        assert sub.latest("clock") is None
+
+
+def test_the_clock_on_the_command_line(bag: Path, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "sags_node", "bag", "play", str(bag), "--loop", "--clock"]
+    command += ["--endpoint", "tcp://127.0.0.1:*"]
+    environment = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)}
+    with subprocess.Popen(
+        command, env=environment, stdin=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    ) as process:
+        try:
+            until((tmp_path / "sags/sags.json").exists, START_SECONDS)
+            figures = topic_hz("clock", read_connection("sags", tmp_path / "sags").data[0], seconds=1.5)
+        finally:
+            process.send_signal(signal.SIGINT)
+            assert process.wait(20) == 0
+    assert 25 < figures["average_rate"] < 45
+    assert sags("bag", "play", bag, "--clock", "0").exit_code == 2
+
+
 # ---- a real node, a real recorder, and a real kill -------------------------------------------------------
 
 
@@ -606,6 +764,20 @@ def test_a_killed_recording_is_recovered_and_replayed(node: Path, tmp_path: Path
     assert session.rig.baseline > 0 and session.rig.left.width == frame.left.shape[1]
 
 
+def test_a_long_recording_in_several_files_is_a_session(node: Path, tmp_path: Path) -> None:
+    """What `ros2 bag record -b` is for: a real node, a real recorder, and every command takes the folder."""
+    process = start_recorder(node, "-o", tmp_path / "bag", "-b", 12_000_000, "--seconds", 4)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 0, errors
+    files = list((tmp_path / "bag").glob("*.mcap"))
+    assert len(files) > 3 and max(file.stat().st_size for file in files) < 12_400_000
+    result = sags("bag", "info", tmp_path / "bag", "--json")
+    assert result.exit_code == 0 and len(json.loads(result.stdout)["files"]) == len(files)
+    result = sags("eval", tmp_path / "bag", "source.frames:=10", "--pace", "step", "--json", "-")
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout)["frames"] == 10  # out of three files
+
+
 def test_ctrl_c_closes_the_file_and_a_signal_takes_a_snapshot(node: Path, tmp_path: Path) -> None:
     straight = start_recorder(
         node, "-o", tmp_path / "bag", "--json", "--topics", "left/depth", "--topics", "/sags/tf"
@@ -644,9 +816,10 @@ def test_recording_on_the_control_socket(node: Path, tmp_path: Path) -> None:
         assert summary["messages"] == len(by_topic(tmp_path / "bag")["left/depth"]) > 3
         with pytest.raises(SagsError, match="exists already; name a new folder"):
             control.request("start_recording", args, timeout=20)
-        args = {"path": str(tmp_path / "ring"), "snapshot_seconds": 1}
+        args = {"path": str(tmp_path / "ring"), "snapshot_seconds": 1, "max_bag_size": 2_000_000}
         control.request("start_recording", args, timeout=20)
         time.sleep(1)
         taken = control.request("take_snapshot", timeout=20)
-        assert bag_info(Path(taken["snapshot"]))["messages"] == taken["messages"] > 5
+        saved = bag_info(Path(taken["snapshot"]))
+        assert saved["messages"] == taken["messages"] > 5 and len(saved["files"]) > 1
         assert control.request("stop_recording", timeout=20)["messages"] == taken["messages"]

@@ -14,6 +14,7 @@ from sags_node.config import LaunchConfig, PhantomSource, TissueConfig
 from sags_node.errors import UsageError
 from sags_node.launch_file import load_launch
 from sags_node.mapping.budget import StepBudget
+from sags_node.messaging.masks import MaskSubscriber
 from sags_node.phantom.scene import Phantom
 from sags_node.pipeline import Pipeline
 from sags_node.types import U8, Bool, Camera, RectifiedPair, RenderedView, StereoFrame
@@ -365,3 +366,135 @@ def test_a_network_that_gives_no_mask_is_refused(tmp_path: Path) -> None:
     path = g.save(tmp_path / "net.onnx", {"picture": (FLOAT, [1, 3, "h", "w"])}, ["out"])
     with pytest.raises(UsageError, match="no output is a mask of the 320x256 px"):
         TissueMask(TissueConfig(method="onnx", path=path, tissue_is="white"), rig_of_tests())
+
+
+def test_a_file_that_is_no_network_is_named_by_its_own_setting(tmp_path: Path) -> None:
+    """A mask's network is not looked for under vision.onnx, where the depth's is set."""
+    path = tmp_path / "net.onnx"
+    path.write_bytes(b"this is no network")
+    with pytest.raises(UsageError, match=r"^vision\.tissue\.path: .*net\.onnx is no ONNX model"):
+        TissueMask(TissueConfig(method="onnx", path=path, tissue_is="white"), rig_of_tests())
+
+
+# ---- another process's -----------------------------------------------------------------------------------
+
+TOPIC = TissueConfig(method="topic", endpoint="ipc:///run/masks.ipc", tissue_is="white", dilate=0)
+
+
+class Sender:
+    """Stands for the socket: masks by stamp."""
+
+    def __init__(self) -> None:
+        self.sent: dict[int, np.ndarray] = {}
+
+    def __call__(self, stamp_ns: int) -> tuple[int, np.ndarray] | None:
+        nearest = min(self.sent, key=lambda sent: abs(sent - stamp_ns), default=None)
+        return None if nearest is None else (nearest, self.sent[nearest])
+
+
+def topic_mask(sender: Sender, **changes: object) -> tuple[TissueMask, Rectifier]:
+    rectifier = rig_of_tests()
+    return TissueMask(TOPIC.model_copy(update=changes), rectifier, sender), rectifier
+
+
+def shaft_mask() -> tuple[U8, Bool]:
+    """As it is sent, white = tissue, and what it means."""
+    truth = np.ones((HEIGHT, WIDTH), np.bool_)
+    truth[SHAFT] = False
+    return truth.view(np.uint8) * np.uint8(255), truth
+
+
+@pytest.mark.parametrize("tissue_is", ["white", "black"])
+def test_the_mask_of_the_nearest_picture_is_taken(tissue_is: str) -> None:
+    sender = Sender()
+    find_tissue, rectifier = topic_mask(sender, tissue_is=tissue_is)
+    values, truth = shaft_mask()
+    sent = values if tissue_is == "white" else 255 - values
+    sender.sent = {0: np.roll(sent, 30, 0), FRAME_NS: sent, 3 * FRAME_NS: np.roll(sent, 60, 0)}
+    frame = make_frame(textured_tissue(), number=1)
+    assert np.array_equal(find_tissue(frame, rectifier(frame)), truth)
+    assert find_tissue.problem == ""
+
+
+def test_a_late_mask_is_carried_along_until_its_tolerance_is_over() -> None:
+    """Then instruments are found without it, with a word about why, until masks come again."""
+    sender = Sender()
+    find_tissue, rectifier = topic_mask(sender, tolerance=0.1)
+    values, truth = shaft_mask()
+    picture = textured_tissue()
+    frames = [make_frame(picture, number=number) for number in range(6)]
+    assert find_tissue(frames[0], rectifier(frames[0])).all()  # as the classical default: no instrument
+    assert "no mask has come on masks/left/tissue_mask from ipc:///run/masks.ipc" in find_tissue.problem
+    sender.sent = {0: values}
+    for frame in frames[:4]:  # 100 ms
+        assert np.array_equal(find_tissue(frame, rectifier(frame)), truth)
+        assert find_tissue.problem == ""
+    assert find_tissue(frames[4], rectifier(frames[4])).all()
+    assert "0.133 s older than the picture; vision.tissue.tolerance is 0.1 s" in find_tissue.problem
+    sender.sent[5 * FRAME_NS] = values
+    assert np.array_equal(find_tissue(frames[5], rectifier(frames[5])), truth)
+    assert find_tissue.problem == ""
+    sender.sent = {20 * FRAME_NS: values}
+    assert find_tissue(frames[5], rectifier(frames[5])).all()
+    assert "newer than the picture" in find_tissue.problem
+
+
+def test_masks_of_another_size_are_resized() -> None:
+    sender = Sender()
+    find_tissue, rectifier = topic_mask(sender)
+    values, truth = shaft_mask()
+    frame = make_frame(textured_tissue())
+    for size in ((160, 128), (640, 512), (96, 77)):
+        sender.sent = {0: cv2.resize(values, size, interpolation=cv2.INTER_NEAREST)}
+        mask = find_tissue(frame, rectifier(frame))
+        assert find_tissue.problem == "" and iou(~mask, ~truth) > 0.85
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        (np.full((HEIGHT, WIDTH, 3), 255, np.uint8), "is no mask: mono8 is expected"),
+        (np.ones((HEIGHT, WIDTH), np.float32), "is no mask"),
+        (np.full((WIDTH, HEIGHT), 255, np.uint8), "has 256x320 px, the picture 320x256"),
+        (np.full((16 * HEIGHT, 16 * WIDTH), 255, np.uint8), "has 5120x4096 px"),
+        (np.ones((HEIGHT, WIDTH), np.uint8), "no value above 1: 255 is white"),
+        (np.empty((0, 0), np.uint8), "is no mask"),
+    ],
+)
+def test_what_is_no_mask_is_named_and_not_used(values: np.ndarray, said: str) -> None:
+    sender = Sender()
+    find_tissue, rectifier = topic_mask(sender)
+    sender.sent = {0: values}
+    frame = make_frame(textured_tissue())
+    assert find_tissue(frame, rectifier(frame)).all()
+    assert said in find_tissue.problem
+
+
+def test_a_topic_upside_down_is_refused_with_a_hint() -> None:
+    """One bad mask that is carried along for several frames is one, not several."""
+    sender = Sender()
+    find_tissue, rectifier = topic_mask(sender)
+    values, _ = shaft_mask()
+    for number in range(FIRST_FRAMES - 1):
+        sender.sent = {2 * number * FRAME_NS: 255 - values}
+        for again in range(2):
+            frame = make_frame(textured_tissue(), number=2 * number + again)
+            find_tissue(frame, rectifier(frame))
+    sender.sent = {2 * FIRST_FRAMES * FRAME_NS: 255 - values}
+    frame = make_frame(textured_tissue(), number=2 * FIRST_FRAMES)
+    with pytest.raises(
+        UsageError, match=r"topic's masks.*set vision\.tissue\.tissue_is to black, it is white"
+    ):
+        find_tissue(frame, rectifier(frame))
+
+
+def test_a_topic_needs_an_address_a_polarity_and_a_node() -> None:
+    for said in (["vision.tissue.endpoint:=tcp://127.0.0.1:1"], ["vision.tissue.tissue_is:=white"]):
+        with pytest.raises(UsageError, match="topic needs endpoint"):
+            load_launch(None, ["vision.tissue.method:=topic", *said])
+    with pytest.raises(UsageError, match="topic is for a running node"):
+        TissueMask(TOPIC, rig_of_tests())
+    with pytest.raises(
+        UsageError, match=r"vision\.tissue\.endpoint: tcp://10\.0\.0\.1:5600 is not on this machine"
+    ):
+        MaskSubscriber("tcp://10.0.0.1:5600", "masks")

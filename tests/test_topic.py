@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import json
+import threading
+import time
 from collections.abc import Iterator
+from pathlib import Path
 
+import numpy as np
 import pytest
-from synthetic import HEIGHT, WIDTH, publisher, stream
+from click.testing import CliRunner
+from synthetic import HEIGHT, WIDTH, health, publisher, stream
 
+from sags_node.apps.overlay_stream import OverlayStream
 from sags_node.apps.topic import topic_bw, topic_delay, topic_echo, topic_hz, topic_list
+from sags_node.cli import main
 from sags_node.errors import SagsError, UsageError
-from sags_node.messaging import topics
+from sags_node.messaging import cdr, topics
 
 RATE = 40.0
 
@@ -48,6 +55,82 @@ def test_list(endpoint: str) -> None:
     assert rows["sags/left/depth"]["type"] == "sensor_msgs/msg/Image"
     assert rows["sags/parameters"]["messages"] == 1  # the last value, sent again
     assert rows["sags/right/camera_info"]["messages"] == 0  # off by default
+
+
+@pytest.fixture(scope="module")
+def overlay(tmp_path_factory: pytest.TempPathFactory) -> Iterator[OverlayStream]:
+    """An overlay's own socket, served on a thread: a picture and `status` ten times a second."""
+    run_dir = tmp_path_factory.mktemp("overlay") / "run"
+    stop = threading.Event()
+    with OverlayStream("overlay", run_dir, (0, 0, 255)) as stream:
+
+        def serve() -> None:
+            number = 0
+            while not stop.wait(0.1):
+                stream.serve()
+                picture = np.full((HEIGHT, WIDTH, 4), number % 256, np.uint8)
+                stream.show({"left": picture}, number, time.time_ns(), 0)
+                stream.tell({"frames": number})
+                number += 1
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        try:
+            yield stream
+        finally:
+            stop.set()
+            thread.join()
+
+
+def test_an_overlay_is_listed_and_measured(overlay: OverlayStream) -> None:
+    endpoint = overlay.endpoints[-1]
+    rows = {row["topic"]: row for row in topic_list(endpoint, ns="overlay", seconds=1.2)}
+    assert set(rows) == {f"overlay/{topic.name}" for topic in topics.OVERLAY_TOPICS}
+    assert 5 < rows["overlay/left/overlay/image"]["rate_hz"] < 15
+    assert rows["overlay/left/overlay/image"]["mean_bytes"] > 4 * WIDTH * HEIGHT
+    assert rows["overlay/status"]["messages"] >= 1
+    assert rows["overlay/right/overlay/color_key"]["type"] == topics.IMAGE
+    figures = topic_hz("left/overlay/color_key", endpoint, ns="overlay", seconds=1.0)
+    assert 5 < figures["average_rate"] < 15
+    assert (
+        topic_bw("left/overlay/image", endpoint, ns="overlay", seconds=1.0)["mean_bytes"] > 4 * WIDTH * HEIGHT
+    )
+    (said,) = topic_echo("status", endpoint, ns="overlay", count=1, seconds=5)
+    assert said["content"]["state"] == "running"
+
+
+def test_an_overlay_is_found_by_its_namespace_alone(
+    overlay: OverlayStream, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As people type it: `sags topic list --ns overlay`."""
+    run_dir = Path(overlay.endpoints[0].removeprefix("ipc://")).parent
+    monkeypatch.setattr("sags_node.messaging.rundir.default_run_dir", lambda: run_dir)
+    result = CliRunner().invoke(main, ["topic", "list", "--ns", "overlay", "--seconds", "1", "--json"])
+    assert result.exit_code == 0, result.output
+    heard = {row["topic"] for row in json.loads(result.stdout) if row["messages"]}
+    assert heard >= {"overlay/left/overlay/image", "overlay/right/overlay/image", "overlay/status"}
+
+
+def test_what_a_node_sends_beside_its_fixed_topics_is_listed(tmp_path: Path) -> None:
+    with publisher(tmp_path / "run") as running:
+        endpoint = running.connection.data[-1]
+        stop = threading.Event()
+
+        def serve() -> None:
+            while not stop.is_set():
+                running.publish_health(health())
+                running.publish_content("clock", cdr.clock(5), -1, time.time_ns(), 0)
+                running.poll(100)
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        try:
+            rows = {row["topic"]: row for row in topic_list(endpoint, seconds=0.8)}
+        finally:
+            stop.set()
+            thread.join()
+    assert set(rows) == {f"sags/{name}" for name in (*topics.BY_NAME, "clock")}
+    assert rows["sags/clock"]["rate_hz"] > 3 and rows["sags/clock"]["type"] == topics.CLOCK
 
 
 @pytest.mark.parametrize("name", [t.name for t in topics.TOPICS if not t.right])

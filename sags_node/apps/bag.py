@@ -45,9 +45,9 @@ def info_table(info: Mapping[str, Any]) -> Table:
     for row in info["topics"]:
         cells = (row[key] for key in ("topic", "type", "messages", "rate_hz", "lost", "longest_gap_s"))
         table.add_row(*("-" if cell is None else str(cell) for cell in cells))
-    table.caption = (
-        f"{info['path']}: {info['duration_s']} s, {info['messages']} messages, {info['size'] / 1e6:.1f} MB"
-    )
+    files = f" in {len(info['files'])} files" if len(info["files"]) > 1 else ""
+    held = f"{info['duration_s']} s, {info['messages']} messages, {info['size'] / 1e6:.1f} MB{files}"
+    table.caption = f"{info['path']}: {held}"
     return table
 
 

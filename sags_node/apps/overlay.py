@@ -18,7 +18,7 @@ import numpy as np
 
 from sags_node.apps import overlay_draw
 from sags_node.apps.overlay_draw import Body, Placed
-from sags_node.apps.overlay_frame import NEEDED, RIGHT_INFO, TissueFrame, tissue_frame
+from sags_node.apps.overlay_frame import NEEDED, RIGHT_INFO, TISSUE, TissueFrame, tissue_frame
 from sags_node.apps.overlay_held import HeldObject, Pinner
 from sags_node.apps.overlay_mesh import mesh_of
 from sags_node.apps.overlay_save import Output
@@ -132,7 +132,8 @@ class _Overlay:
             UsageError: a pixel lies outside the picture.
             SagsError: no frame came, or the node has no control socket.
         """
-        leading = NEEDED[0] if self._options.save is None else PICTURE
+        # A mask comes with every frame, also while the camera is lost, and never before the picture.
+        leading = NEEDED[0] if self._options.save is None else TISSUE
         seconds, began = self._options.seconds, time.monotonic()
         last: Received | None = None
         while seconds is None or time.monotonic() < began + seconds:
@@ -183,8 +184,12 @@ class _Overlay:
         rgba, reason = self._overlay(leading.stamp_ns)
         if reason is not None:
             self._blanked[reason] += 1
-        if isinstance(leading, ReceivedImage) and self._options.save is not None:
-            shown = leading.array if rgba is None else overlay_draw.over(leading.array, rgba)
+        if self._options.save is None:
+            return
+        came = self._subscriber.aligned([PICTURE], leading.stamp_ns, WAIT_FOR_REST)
+        if came is not None:
+            picture = came[PICTURE].array
+            shown = picture if rgba is None else overlay_draw.over(picture, rgba)
             self._output.add(shown, rgba is not None, self._subscriber.period(PICTURE))
 
     def _overlay(self, stamp_ns: int) -> tuple[U8 | None, str | None]:

@@ -44,7 +44,7 @@ class _Sample:
 def topic_list(
     endpoint: str | None = None, ns: str = "sags", seconds: float = 3.0, keys: ClientKeys | None = None
 ) -> list[Record]:
-    """Every topic of the contract with what was heard of it in `seconds`.
+    """Every topic of the contract, a node's or an overlay's, and others that were heard in `seconds`.
 
     `messages` and `mean_bytes` are 0 where nothing came; `rate_hz` is None where too little came to tell.
 
@@ -55,7 +55,7 @@ def topic_list(
     if not heard:
         raise _silence("*", endpoint, ns, seconds, keys)
     rows = []
-    for topic in topics.TOPICS:
+    for topic in _listed({full.removeprefix(f"{ns}/") for full in heard}):
         full = topics.full_name(ns, topic.name)
         samples = heard.get(full, [])
         mean_size = sum(sample.size for sample in samples) / len(samples) if samples else 0.0
@@ -64,6 +64,16 @@ def topic_list(
         row["rate_hz"] = round(float(1 / steps.mean()), 1) if len(steps) else None
         rows.append({**row, "mean_bytes": round(mean_size)})
     return rows
+
+
+def _listed(heard: set[str]) -> list[topics.Topic]:
+    """What the sender of these topics may send: only an overlay has nothing but an overlay's topics."""
+    of_overlay = heard <= {topic.name for topic in topics.OVERLAY_TOPICS}
+    listed = {topic.name: topic for topic in (topics.OVERLAY_TOPICS if of_overlay else topics.TOPICS)}
+    for name in sorted(heard - set(listed)):  # views, a clock; not what no contract knows
+        if (topic := topics.find(name)) is not None:
+            listed[name] = topic
+    return list(listed.values())
 
 
 def topic_echo(
@@ -201,7 +211,8 @@ def _heard(
 
 def _without_resent(name: str, samples: list[_Sample]) -> list[_Sample]:
     """The last value that a cached topic sends again to a new subscriber says nothing of its rate."""
-    return samples[1:] if topics.BY_NAME[name].cached else samples
+    topic = topics.find(name)
+    return samples[1:] if topic is not None and topic.cached else samples
 
 
 def _size(message: wire.Message) -> int:

@@ -62,7 +62,7 @@ def parse(message: Message) -> Any:
         WireError: the type is not a stock type of this protocol, its hash differs or the CDR is damaged.
     """
     name = message.meta.type
-    if name not in {topic.type for topic in topics.TOPICS}:
+    if name not in {topic.type for topic in (*topics.TOPICS, *topics.PLAYER_TOPICS)}:
         raise WireError(f"{message.topic}: unknown type {name!r}")
     if message.meta.type_hash != type_hash(name):
         raise WireError(f"{message.topic}: another version of {name} than ours")
@@ -216,9 +216,17 @@ def string(text: str) -> Content:
     return Content(topics.STRING, (_serialize(_ros[topics.STRING](text)),))
 
 
+def clock(time_ns: int) -> Content:
+    """`rosgraph_msgs/Clock`."""
+    return Content(topics.CLOCK, (_serialize(_ros[topics.CLOCK](_time(time_ns))),))
+
+
 def _header(stamp_ns: int, frame: str) -> Any:
-    seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
-    return _ros["std_msgs/msg/Header"](_ros["builtin_interfaces/msg/Time"](seconds, nanoseconds), frame)
+    return _ros["std_msgs/msg/Header"](_time(stamp_ns), frame)
+
+
+def _time(stamp_ns: int) -> Any:
+    return _ros["builtin_interfaces/msg/Time"](*divmod(stamp_ns, 1_000_000_000))
 
 
 def _serialize(message: Any) -> bytes:

@@ -12,7 +12,17 @@ import numpy as np
 from sags_node.geometry import project
 from sags_node.messaging import cdr
 from sags_node.messaging.cdr import Content, Status
-from sags_node.types import F32, NO_TIME, U8, Bool, DrawnView, FrameResult, NodeHealth, RenderedView
+from sags_node.types import (
+    F32,
+    NO_TIME,
+    U8,
+    Bool,
+    DrawnView,
+    FrameResult,
+    NodeHealth,
+    RectifiedPair,
+    RenderedView,
+)
 
 SH_DEGREE_0 = 0.28209479  # Y_00: rgb = 0.5 + Y_00 f_dc
 SPLAT_FIELDS = (
@@ -113,6 +123,11 @@ def _depth(depth: F32) -> F32:
     return np.where(depth > 0, depth, np.float32(np.nan))
 
 
+def left_image(pair: RectifiedPair) -> Content:
+    """The rectified left picture."""
+    return cdr.image(pair.left, "rgb8", pair.t_capture_ns)
+
+
 def _right_image(result: FrameResult) -> Content:
     assert result.pair.right is not None  # publish.right is refused where there is no right eye
     return cdr.image(result.pair.right, "rgb8", result.pair.t_capture_ns, cdr.RIGHT_FRAME)
@@ -124,7 +139,7 @@ def _right_camera_info(result: FrameResult) -> Content:
 
 
 FRAME_CONTENT: Mapping[str, Callable[[FrameResult], Content]] = {
-    "left/image_rect_color": lambda r: cdr.image(r.pair.left, "rgb8", r.pair.t_capture_ns),
+    "left/image_rect_color": lambda r: left_image(r.pair),
     "right/image_rect_color": _right_image,
     "left/camera_info": lambda r: cdr.camera_info(r.pair.camera, r.pair.t_capture_ns),
     "right/camera_info": _right_camera_info,

@@ -6,6 +6,7 @@ import logging
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import CancelledError, Future
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Annotated, Any, Self
@@ -13,8 +14,8 @@ from typing import Annotated, Any, Self
 import msgspec
 import zmq
 
-from sags_node.errors import SagsError
-from sags_node.messaging.address import ClientKeys, connect, find_control
+from sags_node.errors import SagsError, UsageError
+from sags_node.messaging.address import Address, ClientKeys, connect, find_control
 from sags_node.messaging.sockets import receive_frames
 from sags_node.messaging.wire import PROTOCOL
 
@@ -26,6 +27,7 @@ MAX_REQUESTS_AT_ONCE = 32  # so that a flood cannot keep the publishing thread f
 MAX_PENDING = 64
 RECEIVE_HIGH_WATER = 8  # requests one peer may have waiting
 SEND_HIGH_WATER = 2 * MAX_REQUESTS_AT_ONCE  # answers, before a peer that does not read loses some
+LOOK_MS = 100  # how soon a client notices that its node is another one
 
 Handler = Callable[[dict[str, Any]], Any]
 Took = Callable[[int, int], None]
@@ -136,6 +138,8 @@ class ControlServer:
 class ControlClient:
     """Asks the node; one request at a time, from one thread.
 
+    A node that is restarted is followed, to another port, too, when it was found by its connection file.
+
     Args:
         endpoint: of the ROUTER socket; default: from the connection file of `ns`.
         keys: for a node that wants them.
@@ -152,31 +156,33 @@ class ControlClient:
         run_dir: Path | None = None,
         keys: ClientKeys | None = None,
     ) -> None:
-        address = find_control(endpoint, ns, run_dir, keys)
-        self.endpoint = address.endpoint
-        self._context = zmq.Context()
-        self._socket = self._context.socket(zmq.DEALER)
-        try:
-            self._watch = connect(self._socket, address, MAX_REPLY_BYTES)
-        except SagsError:
-            self.close()
-            raise
+        self._find = partial(find_control, endpoint, ns, run_dir, keys)
         self._last_id = 0
+        self._connect(self._find())
+
+    @property
+    def endpoint(self) -> str:
+        """Where the node is, or was when it was last asked."""
+        return self._address.endpoint
 
     def request(self, op: str, args: Mapping[str, Any] | None = None, timeout: float = 2.0) -> Any:
-        """The result of an operation.
+        """The result of an operation. It is asked for once: what may have been done is not repeated.
 
         Raises:
-            SagsError: the node refused (its own words), refuses this client altogether, or did not answer
-                within `timeout` seconds.
+            SagsError: the node refused (its own words), refuses this client altogether, is another one before
+                it answered, or did not answer within `timeout` seconds.
+            UsageError: the node wants keys that are not given, or the other way round.
         """
+        deadline = time.monotonic() + timeout
+        self._follow(deadline)
         self._last_id += 1
         request = Request(PROTOCOL, self._last_id, op, dict(args or {}))
         self._socket.send(msgspec.msgpack.encode(request), zmq.NOBLOCK)
-        deadline = time.monotonic() + timeout
         while (left := deadline - time.monotonic()) > 0:
-            if not self._socket.poll(int(left * 1000) + 1):
-                break
+            if not self._socket.poll(min(int(left * 1000) + 1, LOOK_MS)):
+                if self._has_moved():
+                    raise SagsError(f"{op}: the node was started anew before it answered; ask again")
+                continue
             try:
                 reply = msgspec.msgpack.decode(self._socket.recv(), type=Reply)
             except _BAD_BYTES:
@@ -187,6 +193,42 @@ class ControlClient:
                 return reply.result
         silence = f"no answer from {self.endpoint} in {timeout:g} s; is the node running?"
         raise SagsError(self._watch.refusal() or silence)
+
+    def _follow(self, deadline: float) -> None:
+        """Connect to the node that runs now; wait for one while there is none.
+
+        Raises:
+            SagsError: none came in time.
+        """
+        while True:
+            try:
+                address = self._find()
+                break
+            except UsageError:
+                raise
+            except SagsError:
+                if time.monotonic() > deadline:
+                    raise
+            time.sleep(LOOK_MS * 1e-3)
+        if address != self._address:
+            self._context.destroy(linger=0)
+            self._connect(address)
+
+    def _has_moved(self) -> bool:
+        """Whether another node has taken the place of the one that was asked."""
+        try:
+            return self._find() != self._address
+        except SagsError:  # there is none, or it cannot be asked: the next request will say so
+            return False
+
+    def _connect(self, address: Address) -> None:
+        self._context, self._address = zmq.Context(), address
+        self._socket = self._context.socket(zmq.DEALER)
+        try:
+            self._watch = connect(self._socket, address, MAX_REPLY_BYTES)
+        except SagsError:
+            self.close()
+            raise
 
     def close(self) -> None:
         self._context.destroy(linger=0)

@@ -20,7 +20,7 @@ from sags_node.messaging.rundir import Connection, RunDirectory
 from sags_node.messaging.security import KeyPair, authenticated, check_endpoint
 from sags_node.messaging.sockets import bind, limit, receive_frames
 from sags_node.messaging.wire import PROTOCOL, Message, Meta, encode
-from sags_node.types import DrawnView, FrameResult, NodeHealth
+from sags_node.types import DrawnView, FrameResult, NodeHealth, RectifiedPair
 
 # Messages per slow peer, all topics together: two whole frames, so that the burst of one frame fits.
 SEND_HIGH_WATER = 2 * len(topics.TOPICS)
@@ -30,6 +30,7 @@ MAX_SUBSCRIPTIONS_BYTES = 16384  # of one peer, all together: ZeroMQ remembers t
 MAX_PREFIXES = 1024  # noted: a view may be subscribed to before it is opened, so any name may come
 SUBSCRIPTIONS_HIGH_WATER = 64  # that one peer may have waiting
 PENDING_POLL_MS = 10  # how soon the result of a handler's future is looked for
+EARLY_PICTURE = "left/image_rect_color"
 LAST_WORDS_MS = 200  # longest wait at the end for what is still on its way to a peer
 
 
@@ -76,6 +77,7 @@ class Publisher:
         self._subscribed: set[str] = set()  # prefixes, only those of our topics and of views
         self._last: FrameResult | None = None
         self._dropped = 0
+        self._pictured = -1  # the newest frame whose picture went before its result
         self._kept: dict[str, _Kept] = {}  # last values that no `FrameResult` holds
         self._peers: dict[str, Peers] = {}
         self._resources = ExitStack()
@@ -130,12 +132,21 @@ class Publisher:
 
     # ---- out -------------------------------------------------------------------------------------------
 
+    def publish_picture(self, pair: RectifiedPair, epoch: int) -> None:
+        """Send a frame's left picture before its result, which then comes without it."""
+        self._pictured = pair.frame_id
+        self._seq[EARLY_PICTURE] += 1
+        if self.wanted(EARLY_PICTURE):
+            body = content.left_image(pair)
+            self._send(EARLY_PICTURE, body, pair.frame_id, pair.t_capture_ns, epoch)
+
     def publish_result(self, result: FrameResult, dropped: int) -> None:
         """Send one frame's topics to those who asked; `dropped` counts the frames the node left out."""
         self._last = result
         self._dropped = dropped
+        sent = {EARLY_PICTURE} if result.pair.frame_id <= self._pictured else set()
         for name in content.FRAME_CONTENT:
-            if name in self._seq and content.tells_of(result, name):
+            if name in self._seq and name not in sent and content.tells_of(result, name):
                 self._seq[name] += 1
                 if self.wanted(name):
                     self._send_frame_topic(name)

@@ -172,7 +172,7 @@ def check_endpoint(endpoint: str, config: PublishConfig) -> None:
         raise UsageError(f"'{endpoint}' is no endpoint; write tcp://127.0.0.1:PORT or ipc:///PATH")
     if transport == "ipc" and address.startswith("@"):
         raise UsageError(f"{endpoint} is open to every user of this machine; write ipc:///PATH")
-    if transport == "ipc" or config.key is not None or _is_loopback(address):
+    if config.key is not None or is_local(endpoint):
         return
     if not config.insecure:
         raise UsageError(
@@ -180,6 +180,12 @@ def check_endpoint(endpoint: str, config: PublishConfig) -> None:
             "keygen), or publish.insecure:=true (anybody who reaches it sees the video and controls the node)"
         )
     log.warning("%s is open: anybody who reaches it sees the video and controls the node", endpoint)
+
+
+def is_local(endpoint: str) -> bool:
+    """Whether only this machine can be at the other end."""
+    transport, _, address = endpoint.partition("://")
+    return transport == "ipc" or (transport == "tcp" and _is_loopback(address))
 
 
 def _is_loopback(address: str) -> bool:

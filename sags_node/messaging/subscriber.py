@@ -101,6 +101,15 @@ class Receiver:
             return self._newest(name)
 
     @overload
+    def nearest(self, name: TopicName[R], stamp_ns: int) -> R | None: ...
+    @overload
+    def nearest(self, name: str, stamp_ns: int) -> Received | None: ...
+    def nearest(self, name: str, stamp_ns: int) -> Received | None:
+        """Of the newest messages of a topic the one whose stamp is nearest; None before the first."""
+        with self._arrived:
+            return min(self._kept[name], key=lambda kept: abs(kept.stamp_ns - stamp_ns), default=None)
+
+    @overload
     def read(self, name: TopicName[R], max_age: float | None = None) -> R: ...
     @overload
     def read(self, name: str, max_age: float | None = None) -> Received: ...

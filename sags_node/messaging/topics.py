@@ -17,6 +17,7 @@ POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 TF = "tf2_msgs/msg/TFMessage"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 STRING = "std_msgs/msg/String"
+CLOCK = "rosgraph_msgs/msg/Clock"
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +50,9 @@ TOPICS = (
 )
 BY_NAME = {topic.name: topic for topic in TOPICS}
 
+# What `sags bag play --clock` adds to the topics of the recording.
+PLAYER_TOPICS = (Topic("clock", CLOCK, "the moment of the recording that is played now"),)
+
 # What `sags overlay` publishes on a socket of its own.
 _KEYED = "rgb8, the overlay on a key colour, for displays that blend by one"
 OVERLAY_TOPICS = (
@@ -58,7 +62,7 @@ OVERLAY_TOPICS = (
     Topic("right/overlay/color_key", IMAGE, _KEYED),
     Topic("status", STRING, "JSON: what is drawn, or why nothing is; latency", cached=True),
 )
-_OVERLAY_BY_NAME = {topic.name: topic for topic in OVERLAY_TOPICS}
+_OF_OTHERS = {topic.name: topic for topic in (*PLAYER_TOPICS, *OVERLAY_TOPICS)}
 
 VIEW_NAME = re.compile(r"[A-Za-z0-9_]{1,64}")
 _VIEW_TOPIC = re.compile(rf"view/{VIEW_NAME.pattern}/(?:(?:left|right)/)?(image|depth|camera_info)")
@@ -70,9 +74,9 @@ _VIEW_KINDS = {
 
 
 def find(name: str) -> Topic | None:
-    """The entry of a topic named without the namespace, also of an overlay, or of a view that a consumer may
-    have opened."""
-    known = BY_NAME.get(name) or _OVERLAY_BY_NAME.get(name)
+    """The entry of a topic named without the namespace, also of a player or an overlay, or of a view that a
+    consumer may have opened."""
+    known = BY_NAME.get(name) or _OF_OTHERS.get(name)
     if known is not None:
         return known
     view = _VIEW_TOPIC.fullmatch(name)

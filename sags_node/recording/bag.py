@@ -74,7 +74,7 @@ def storage_files(path: Path) -> tuple[list[Path], bool]:
             raise UsageError(f"{path} is not a recording; what is read: folders, {', '.join(SUFFIXES)}")
         return [path], False
     if not (path / METADATA).is_file():
-        files = sorted(path.glob("*.mcap"))
+        files = mcap_files(path)
         if not files:
             raise UsageError(f"{path} holds neither {METADATA} nor a .mcap file; it is not a rosbag2 folder")
         return files, False
@@ -90,6 +90,16 @@ def storage_files(path: Path) -> tuple[list[Path], bool]:
         if not file.is_file() or file.suffix not in (".mcap", ".db3"):
             raise UsageError(f"{path / METADATA} names {file.name}, which is not a .mcap or .db3 file there")
     return files, mode == "message"
+
+
+def mcap_files(folder: Path) -> list[Path]:
+    """The MCAP files in a folder in the order of their numbers: case_2 before case_10."""
+    return sorted(folder.glob("*.mcap"), key=lambda file: (_number(file.stem), file.name))
+
+
+def _number(stem: str) -> int:
+    digits = stem.rpartition("_")[2]
+    return int(digits) if digits.isdecimal() and len(digits) < 10 else 0
 
 
 def _metadata(file: Path) -> dict[str, Any]:
@@ -217,7 +227,7 @@ def _read_with_rosbags(file: Path, topics: Collection[str] | None, start_ns: int
     from rosbags import rosbag1, rosbag2
 
     ros1 = file.suffix == ".bag"
-    positions = rosbag1_check.chunk_positions(file) if ros1 else set()
+    positions = rosbag1_check.chunk_positions(file) if ros1 else frozenset()
     reader: Any = rosbag1.Reader(file) if ros1 else rosbag2.Reader(file)
     with _damage_as_one_error(), reader:
         if ros1 and not {info.pos for info in reader.chunk_infos} <= positions:

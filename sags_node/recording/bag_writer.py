@@ -1,4 +1,4 @@
-"""Writes a rosbag2 folder: one MCAP file of profile `ros2`, and at the end `metadata.yaml` (version 9).
+"""Writes a rosbag2 folder: MCAP files of profile `ros2`, and at the end `metadata.yaml`.
 
 A message is in the file at the latest after the next `flush`: the file of a process that is killed can be
 recovered up to there.
@@ -6,10 +6,11 @@ recovered up to there.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Self, TypeVar
 
 import yaml
 from mcap.records import Schema
@@ -18,44 +19,53 @@ from mcap.writer import CompressionType, Writer
 from sags_node import __version__
 from sags_node.errors import SagsError, UsageError
 from sags_node.recording.bag import METADATA
+from sags_node.recording.bag_metadata import Part, Topic, describe, quality
 
 CHUNK_BYTES = 1 << 20  # what is lost at most when the process is killed between two flushes
-_NEVER = {"sec": 9223372036, "nsec": 854775807}
+MESSAGE_HEAD_BYTES = 31  # of an MCAP message record
+
+T = TypeVar("T")
 
 
-@dataclass(slots=True)
-class _Topic:
-    name: str
-    type: str
-    type_hash: str
-    latched: bool
-    count: int = 0
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Where a file of the bag ends and the next one begins; 0: never.
+
+    Attributes:
+        bytes: of messages in one file; its index comes on top. A larger message has its own file.
+        seconds: between the first and the last message of one file.
+    """
+
+    bytes: int = 0
+    seconds: float = 0.0
+
+
+NO_LIMITS = Limits()
 
 
 class BagWriter:
-    """A bag that is being written.
+    """A bag that is being written: `<folder>_0.mcap` and so on, each of which can be read alone.
 
     Raises:
         UsageError: something is at `folder` already.
         SagsError: it cannot be written.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, limits: Limits = NO_LIMITS) -> None:
         self.folder = folder
         self.bytes = 0  # of messages
-        self._topics: dict[int, _Topic] = {}
+        self._limits = limits
+        self._topics: dict[int, Topic] = {}  # by channel, the same number in every file
+        self._beginning: list[Callable[[Writer], object]] = []  # what every file has to say first
         self._schemas: dict[tuple[str, str, bytes], int] = {}
-        self._first_ns, self._last_ns = 2**63 - 1, 0
+        self._parts: list[Part] = []
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise UsageError(f"{folder} exists already; name a new folder")
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            self._file = (folder / f"{folder.resolve().name}_0.mcap").open("xb")
+            self._begin_file()
         except OSError as error:
             raise SagsError(f"cannot write {folder}: {error.strerror}; name another place") from None
-        # Chunks are small and not compressed: pictures hardly shrink, and time is short.
-        self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.NONE)
-        self._writer.start(profile="ros2", library=f"sags-node {__version__}")
 
     def add_topic(
         self, name: str, kind: str, schema: Schema, type_hash: str = "", latched: bool = False
@@ -69,28 +79,41 @@ class BagWriter:
         """
         key = (schema.name, schema.encoding, schema.data)
         if key not in self._schemas:
-            self._schemas[key] = self._writer.register_schema(*key)
-        quality = yaml.safe_dump(_quality(latched), sort_keys=False)
-        metadata = {"offered_qos_profiles": quality, "topic_type_hash": type_hash}
-        channel: int = self._writer.register_channel(name, "cdr", self._schemas[key], metadata)
-        self._topics[channel] = _Topic(name, kind, type_hash, latched)
+            self._schemas[key] = self._say_first(lambda writer: writer.register_schema(*key))
+        metadata = {
+            "offered_qos_profiles": yaml.safe_dump(quality(latched), sort_keys=False),
+            "topic_type_hash": type_hash,
+        }
+        schema_id = self._schemas[key]
+        channel: int = self._say_first(
+            lambda writer: writer.register_channel(name, "cdr", schema_id, metadata)
+        )
+        self._topics[channel] = Topic(name, kind, type_hash, latched)
         return channel
 
     def write(
         self, channel: int, log_ns: int, publish_ns: int, sequence: int, data: bytes | memoryview
     ) -> None:
+        """Write one message, into the next file if this one is full.
+
+        Raises:
+            OSError: the disk is full.
+        """
+        if self._is_full(log_ns, len(data)):
+            self._end_file()
+            self._begin_file()
         self._writer.add_message(channel, log_ns, data, publish_ns, sequence & 0xFFFFFFFF)
-        self._topics[channel].count += 1
+        self._parts[-1].add(channel, log_ns)
+        self._file_bytes += MESSAGE_HEAD_BYTES + len(data)
         self.bytes += len(data)
-        self._first_ns, self._last_ns = min(self._first_ns, log_ns), max(self._last_ns, log_ns)
 
     def attach(self, name: str, media_type: str, data: bytes, log_ns: int) -> None:
         """Put a file into the bag."""
-        self._writer.add_attachment(log_ns, log_ns, name, media_type, data)
+        self._say_first(lambda writer: writer.add_attachment(log_ns, log_ns, name, media_type, data))
 
     def note(self, name: str, values: dict[str, str]) -> None:
         """Put key-value metadata into the bag."""
-        self._writer.add_metadata(name, values)
+        self._say_first(lambda writer: writer.add_metadata(name, values))
 
     def flush(self) -> None:
         """Hand everything over to the operating system."""
@@ -98,50 +121,48 @@ class BagWriter:
 
     @property
     def messages(self) -> int:
-        return sum(topic.count for topic in self._topics.values())
+        return sum(part.counts.total() for part in self._parts)
 
     def close(self) -> None:
         """Finish the file and describe the bag."""
-        information = self._information()
-        self.note("rosbag2", {"serialized_metadata": yaml.safe_dump(information, sort_keys=False)})
-        self._writer.finish()
-        self._file.close()
-        text = yaml.safe_dump({"rosbag2_bagfile_information": information}, sort_keys=False)
+        self._end_file()
+        text = yaml.safe_dump(
+            {"rosbag2_bagfile_information": describe(self._parts, self._topics)}, sort_keys=False
+        )
         (self.folder / METADATA).write_text(text, encoding="utf-8")
 
-    def _information(self) -> dict[str, Any]:
-        """The content of `metadata.yaml`, as `rosbag2_storage` defines it."""
-        span: dict[str, Any] = {
-            "starting_time": {"nanoseconds_since_epoch": self._first_ns if self.messages else 0},
-            "duration": {"nanoseconds": max(0, self._last_ns - self._first_ns)},
-            "message_count": self.messages,
-        }
-        name = Path(self._file.name).name
-        topics = [
-            {
-                "topic_metadata": {
-                    "name": topic.name,
-                    "type": topic.type,
-                    "serialization_format": "cdr",
-                    "offered_qos_profiles": _quality(topic.latched),
-                    "type_description_hash": topic.type_hash,
-                },
-                "message_count": topic.count,
-            }
-            for topic in self._topics.values()
-        ]
-        return {
-            "version": 9,
-            "storage_identifier": "mcap",
-            "relative_file_paths": [name],
-            **span,
-            "topics_with_message_count": topics,
-            "compression_format": "",
-            "compression_mode": "",
-            "files": [{"path": name, **span}],
-            "custom_data": None,
-            "ros_distro": "jazzy",
-        }
+    # ---- its files -------------------------------------------------------------------------------------
+
+    def _say_first(self, say: Callable[[Writer], T]) -> T:
+        """Say it in this file, and at the beginning of those to come."""
+        if self._limits != NO_LIMITS:
+            self._beginning.append(say)
+        return say(self._writer)  # numbers are given in order: they are the same in every file
+
+    def _is_full(self, log_ns: int, size: int) -> bool:
+        part, limits = self._parts[-1], self._limits
+        if not part.counts:
+            return False
+        too_large = 0 < limits.bytes < self._file_bytes + MESSAGE_HEAD_BYTES + size
+        too_long = 0 < limits.seconds < (log_ns - part.first_ns) * 1e-9
+        return too_large or too_long
+
+    def _begin_file(self) -> None:
+        self._parts.append(Part(f"{self.folder.resolve().name}_{len(self._parts)}.mcap"))
+        self._file = (self.folder / self._parts[-1].file).open("xb")
+        self._file_bytes = 0
+        # Chunks are small and not compressed: pictures hardly shrink, and time is short.
+        self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.NONE)
+        self._writer.start(profile="ros2", library=f"sags-node {__version__}")
+        for say in self._beginning:
+            say(self._writer)
+
+    def _end_file(self) -> None:
+        description = describe(self._parts[-1:], self._topics)
+        serialized = yaml.safe_dump(description, sort_keys=False)
+        self._writer.add_metadata("rosbag2", {"serialized_metadata": serialized})
+        self._writer.finish()
+        self._file.close()
 
     def __enter__(self) -> Self:
         return self
@@ -153,21 +174,3 @@ class BagWriter:
             self.close()
         else:
             self._file.close()  # what has been written stays, for `recover`
-
-
-def _quality(latched: bool) -> list[dict[str, Any]]:
-    """The quality of service of a publisher, as rosbag2 writes it down; a new object each time: YAML would
-    else write references."""
-    return [
-        {
-            "history": "keep_last",
-            "depth": 1 if latched else 5,
-            "reliability": "reliable" if latched else "best_effort",
-            "durability": "transient_local" if latched else "volatile",
-            "deadline": dict(_NEVER),
-            "lifespan": dict(_NEVER),
-            "liveliness": "automatic",
-            "liveliness_lease_duration": dict(_NEVER),
-            "avoid_ros_namespace_conventions": False,
-        }
-    ]

@@ -26,6 +26,8 @@ class _Request(msgspec.Struct, forbid_unknown_fields=True):
     compression: Literal["none", "jpeg", "png"] = "none"
     max_cache_mb: float | None = None
     snapshot_seconds: float | None = None
+    max_bag_size: int | None = None
+    max_bag_duration: float | None = None
 
 
 class RecorderProcess:
@@ -77,6 +79,8 @@ class RecorderProcess:
         for option, value in (
             ("--max-cache", request.max_cache_mb),
             ("--snapshot-mode", request.snapshot_seconds),
+            ("--max-bag-size", request.max_bag_size),
+            ("--max-bag-duration", request.max_bag_duration),
         ):
             if value is not None:
                 command += [option, str(value)]

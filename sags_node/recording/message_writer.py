@@ -16,7 +16,7 @@ from sags_node.messaging import cdr, topics
 from sags_node.messaging.topics import CAMERA_INFO, IMAGE
 from sags_node.messaging.wire import PROTOCOL, Message, WireError
 from sags_node.recording.backlog import Arrived
-from sags_node.recording.bag_writer import BagWriter
+from sags_node.recording.bag_writer import NO_LIMITS, BagWriter, Limits
 from sags_node.recording.pictures import read_eye
 
 Compression = Literal["none", "jpeg", "png"]
@@ -31,14 +31,15 @@ class MessageWriter:
     Args:
         compression: of 8-bit pictures. `jpeg` takes colour pictures only: alpha and masks must stay exact and
             become PNG. Depth is never compressed.
+        limits: of each file in the bag.
 
     Raises:
         UsageError: something is at `folder` already.
         SagsError: it cannot be written.
     """
 
-    def __init__(self, folder: Path, ns: str, compression: Compression) -> None:
-        self.bag = BagWriter(folder)
+    def __init__(self, folder: Path, ns: str, compression: Compression, limits: Limits = NO_LIMITS) -> None:
+        self.bag = BagWriter(folder, limits)
         self._ns = ns
         self._compression = compression
         self._channels: dict[str, int] = {}

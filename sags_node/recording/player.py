@@ -16,9 +16,11 @@ from sags_node.messaging import cdr, topics
 from sags_node.messaging.publisher import Publisher
 from sags_node.recording.bag import BagMessage, read_messages
 from sags_node.recording.outgoing import COMPRESSED_SUFFIX, original_stamp, outgoing
+from sags_node.recording.play_clock import PlayClock
 
-POLL_MS = 20  # how soon pause and stop are noticed
+POLL_SECONDS = 0.02  # how soon pause and stop are noticed
 STAMPS_KEPT = 64
+CLOCK_TOPIC = topics.PLAYER_TOPICS[0].name
 FRAME_TYPES = (topics.IMAGE, topics.POINT_CLOUD, topics.CAMERA_INFO, topics.TF)
 
 
@@ -29,6 +31,7 @@ class Options:
     Attributes:
         topics, exclude: without leading slash and namespace; no topics: all.
         remap: from old to new name, the same way.
+        clock_hz: how often to publish the recording's time; None: never.
     """
 
     rate: float = 1.0
@@ -39,6 +42,7 @@ class Options:
     topics: tuple[str, ...] = ()
     exclude: tuple[str, ...] = ()
     remap: dict[str, str] = field(default_factory=dict)
+    clock_hz: float | None = None
 
 
 class Player:
@@ -54,6 +58,7 @@ class Player:
         self._stopping = threading.Event()
         self._paused = paused
         self._sent = 0
+        self._clock_due = 0.0
         self._frames: OrderedDict[int, int] = OrderedDict()  # original stamp -> number of the frame
         self._frame_count = 0
 
@@ -72,8 +77,9 @@ class Player:
         """
         began = time.monotonic()
         passes = 0
-        with Publisher(self._config, self._ns, uuid.uuid4().hex) as publisher:
-            self._wait_until(time.monotonic() + self._options.delay, publisher)
+        offered = (*topics.TOPICS, *topics.PLAYER_TOPICS)
+        with Publisher(self._config, self._ns, uuid.uuid4().hex, offered=offered) as publisher:
+            self._delay(publisher)
             while not self._stopping.is_set():
                 self._play_once(publisher, epoch=passes)
                 passes += 1
@@ -86,46 +92,71 @@ class Player:
     def _play_once(self, publisher: Publisher, epoch: int) -> None:
         options = self._options
         first_ns = 0
-        started, started_ns = 0.0, 0
+        clock = PlayClock(0, options.rate)
         for message in read_messages(self._path):
             if not first_ns:
                 first_ns = message.log_ns + round(options.start_offset * 1e9)
-                started, started_ns = time.monotonic(), time.time_ns()
+                clock = PlayClock(first_ns, options.rate)
             after = (message.log_ns - first_ns) * 1e-9
             if after < 0 or not self._is_wanted(message):
                 continue
             if options.playback_duration is not None and after > options.playback_duration:
                 return
-            paused = self._wait_until(started + after / options.rate, publisher)
-            started, started_ns = started + paused, started_ns + round(paused * 1e9)
+            self._wait_for(message.log_ns, clock, publisher, epoch)
             if self._stopping.is_set():
                 return
             original = original_stamp(message)
-            stamp_ns = started_ns + round((original - first_ns) / options.rate)
+            stamp_ns = clock.wall_ns(original)
             name, content = outgoing(message, stamp_ns)
             number = self._frame_number(original) if content.type in FRAME_TYPES else -1
             name = name.removeprefix(f"{self._ns}/")
             publisher.publish_content(options.remap.get(name, name), content, number, stamp_ns, epoch)
             self._sent += 1
 
-    def _wait_until(self, due: float, publisher: Publisher) -> float:
-        """Serve subscriptions until it is time; returns how long playing was paused, s."""
-        paused = 0.0
+    def _delay(self, publisher: Publisher) -> None:
+        """Serve subscriptions before playing begins."""
+        began = time.monotonic()
         while not self._stopping.is_set():
-            left = due + paused - time.monotonic()
-            if left <= 0 and not self._paused:
-                break
-            before = time.monotonic()
-            publisher.poll(POLL_MS if self._paused else min(POLL_MS, int(left * 1e3)))
+            left = began + self._options.delay - time.monotonic()
+            if left <= 0:
+                return
+            publisher.poll(int(min(POLL_SECONDS, left) * 1e3))
+
+    def _wait_for(self, recorded_ns: int, clock: PlayClock, publisher: Publisher, epoch: int) -> None:
+        """Serve subscriptions until a moment of the recording is due, and playing is not paused."""
+        before = time.monotonic()
+        while not self._stopping.is_set():
+            now = time.monotonic()
             if self._paused:
-                paused += time.monotonic() - before
-        return paused
+                clock.pause(now - before)
+            before = now
+            self._tell_time(now, clock, publisher, epoch)
+            left = clock.until(recorded_ns, now)
+            if left <= 0 and not self._paused:
+                return
+            wait = POLL_SECONDS if self._paused else min(POLL_SECONDS, left)
+            if self._options.clock_hz is not None:
+                wait = min(wait, self._clock_due - now)
+            publisher.poll(int(max(wait, 0.0) * 1e3))
+
+    def _tell_time(self, now: float, clock: PlayClock, publisher: Publisher, epoch: int) -> None:
+        """Publish the clock when that is due, also while playing is paused."""
+        hz = self._options.clock_hz
+        if hz is None or now < self._clock_due:
+            return
+        self._clock_due += 1 / hz
+        if self._clock_due < now:  # the first time, or this machine is too busy for so many
+            self._clock_due = now + 1 / hz
+        moment_ns = clock.moment_ns(now)
+        publisher.publish_content(CLOCK_TOPIC, cdr.clock(moment_ns), -1, clock.wall_ns(moment_ns), epoch)
 
     def _is_wanted(self, message: BagMessage) -> bool:
         name = message.topic.lstrip("/").removesuffix(COMPRESSED_SUFFIX).removeprefix(f"{self._ns}/")
         options = self._options
         if not cdr.knows(message.type):
             return False  # it could not be described to anybody
+        if options.clock_hz is not None and name == CLOCK_TOPIC:
+            return False  # there is one clock
         return (not options.topics or name in options.topics) and name not in options.exclude
 
     def _frame_number(self, stamp_ns: int) -> int:

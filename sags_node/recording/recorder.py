@@ -22,6 +22,7 @@ from sags_node.messaging.freshness import Freshness
 from sags_node.messaging.stream import listen
 from sags_node.messaging.wire import WireError
 from sags_node.recording.backlog import Arrived, Backlog
+from sags_node.recording.bag_writer import NO_LIMITS, Limits
 from sags_node.recording.message_writer import Compression, MessageWriter
 from sags_node.recording.ring import Ring
 
@@ -38,6 +39,7 @@ class Options:
     Attributes:
         topics: with or without the namespace; empty: all.
         snapshot_seconds: keep only the last seconds in memory, and write them when asked to.
+        limits: of each file in the bag.
     """
 
     folder: Path
@@ -45,6 +47,7 @@ class Options:
     compression: Compression = "none"
     max_cache_mb: float = DEFAULT_CACHE_MB
     snapshot_seconds: float | None = None
+    limits: Limits = NO_LIMITS
     ns: str = "sags"
     endpoint: str | None = None
     run_dir: Path | None = None
@@ -142,6 +145,10 @@ class Recorder:
                 if topic.fresh.accept(message.meta):  # a last value sent again is nothing new
                     yield Arrived(message, received_ns)
 
+    def _writer(self, folder: Path) -> MessageWriter:
+        options = self._options
+        return MessageWriter(folder, options.ns, options.compression, options.limits)
+
     # ---- everything ----------------------------------------------------------------------------------
 
     def _record(self, tell: Callable[[dict[str, Any]], None]) -> None:
@@ -149,7 +156,7 @@ class Recorder:
         backlog = Backlog(self._most_bytes)
         with closing(self._messages()) as messages:
             first = next(messages, None)  # connects: without a node there will be no folder
-            writer = MessageWriter(options.folder, options.ns, options.compression)
+            writer = self._writer(options.folder)
             thread = threading.Thread(target=self._write, args=(writer, backlog), name="bag-writer")
             thread.start()
             try:
@@ -213,7 +220,7 @@ class Recorder:
     def _save(self, folder: Path, messages: list[Arrived], tell: Callable[[dict[str, Any]], None]) -> None:
         """A thread for each snapshot, so that receiving goes on."""
         try:
-            writer = MessageWriter(folder, self._options.ns, self._options.compression)
+            writer = self._writer(folder)
             with writer.bag:
                 for arrived in messages:
                     self._write_one(writer, arrived)

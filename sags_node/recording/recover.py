@@ -5,6 +5,7 @@ from __future__ import annotations
 import mmap
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from hashlib import sha256
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -13,7 +14,7 @@ from mcap.records import Channel, Schema
 
 from sags_node.errors import SagsError, UsageError
 from sags_node.recording import mcap_file
-from sags_node.recording.bag import Channels, read_messages, records_of, storage_files
+from sags_node.recording.bag import Channels, mcap_files, read_messages, records_of, storage_files
 from sags_node.recording.bag_writer import BagWriter
 from sags_node.recording.mcap_file import HEAD, MAGIC, MAX_RECORD_BYTES, DamagedError, Entry, Head
 
@@ -44,7 +45,7 @@ def recover(path: Path, out: Path) -> dict[str, Any]:
         UsageError: there is no MCAP file, or something is at `out` already.
         SagsError: nothing can be saved, or the new bag cannot be written.
     """
-    files = sorted(path.glob("*.mcap")) if path.is_dir() else storage_files(path)[0]
+    files = mcap_files(path) if path.is_dir() else storage_files(path)[0]
     if not files or files[0].suffix != ".mcap":
         raise UsageError(
             f"{path}: only MCAP is recovered; for ROS 1 use rosbag reindex, for db3 sqlite3 .recover"
@@ -72,6 +73,7 @@ class _Writer:
         self._bag = bag
         self._done = done
         self._known: dict[tuple[str, str, bytes], int] = {}  # topic, type and schema: channel
+        self._attached: set[tuple[str, bytes]] = set()  # name and digest: each file of a bag has them all
 
     def write(self, entry: Entry, channel: Channel, schema: Schema) -> None:
         key = (channel.topic, schema.name, schema.data)
@@ -85,9 +87,13 @@ class _Writer:
         self._done.messages += 1
 
     def attach(self, content: bytes) -> None:
-        """Copy an attachment whose checksum is right."""
+        """Copy an attachment whose checksum is right, once."""
         attachment = mcap_file.read_attachment(content)
-        if attachment is not None:
+        if attachment is None:
+            return
+        key = attachment.name, sha256(attachment.data).digest()
+        if key not in self._attached:
+            self._attached.add(key)
             self._bag.attach(attachment.name, attachment.media_type, attachment.data, attachment.log_time)
 
 

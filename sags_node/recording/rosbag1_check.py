@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import bz2
 import struct
+from functools import lru_cache
 from pathlib import Path
 from typing import BinaryIO
 
@@ -20,13 +21,18 @@ CHUNK_OP = b"\x05"
 _LENGTH = struct.Struct("<I")
 
 
-def chunk_positions(file: Path) -> set[int]:
-    """Where the chunks of a bag begin.
+def chunk_positions(file: Path) -> frozenset[int]:
+    """Where the chunks of a bag begin; the last file's are remembered until it changes.
 
     Raises:
         DamagedError: it is no ROS 1 bag, a length does not fit, or a chunk unpacks to too much.
     """
-    size = file.stat().st_size
+    found = file.stat()
+    return _chunk_positions(file, found.st_size, found.st_mtime_ns)
+
+
+@lru_cache(maxsize=1)  # a bag is opened again for every loop, and unpacking all of it takes seconds
+def _chunk_positions(file: Path, size: int, changed: int) -> frozenset[int]:
     positions = set()
     with file.open("rb") as bag:
         if bag.read(len(MAGIC)) != MAGIC:
@@ -39,7 +45,7 @@ def chunk_positions(file: Path) -> set[int]:
                 positions.add(position)
                 _check_chunk(bag, length, fields, position)
             bag.seek(position + 8 + len(header) + length)
-    return positions
+    return frozenset(positions)
 
 
 def _length(bag: BinaryIO, size: int, most: int) -> int:

@@ -41,6 +41,9 @@ class Tensor:
 class OnnxSession:
     """ONNX Runtime's session of one file.
 
+    Args:
+        setting: where the launch file names it.
+
     Attributes:
         inputs: in the file's order.
         metadata: what the file says of itself.
@@ -50,12 +53,12 @@ class OnnxSession:
         UsageError: the file is missing, too large, no ONNX model, or asks for what cannot be given.
     """
 
-    def __init__(self, config: OnnxConfig) -> None:
+    def __init__(self, config: OnnxConfig, setting: str = "vision.onnx") -> None:
         import onnxruntime as ort
 
         path = config.path
         assert path is not None  # no network, no session
-        _check_file(path)
+        _check_file(path, setting)
         options = ort.SessionOptions()
         options.log_severity_level = 4  # fatal: what goes wrong is raised, once
         options.intra_op_num_threads = config.threads or len(os.sched_getaffinity(0))
@@ -65,13 +68,15 @@ class OnnxSession:
         wanted = [PROVIDERS[name] for name in config.providers if PROVIDERS[name] in there]
         if not wanted:
             raise UsageError(
-                f"vision.onnx.providers: none of {', '.join(config.providers)} is in this ONNX Runtime; add "
+                f"{setting}.providers: none of {', '.join(config.providers)} is in this ONNX Runtime; add "
                 "cpu, or install onnxruntime-gpu"
             )
         try:
             self._session = ort.InferenceSession(str(path), options, providers=wanted)
         except Exception as error:  # the runtime raises a class of its own for every kind of fault
-            raise UsageError(f"{path} is no ONNX model that can be run: {first_line(error)}") from None
+            raise UsageError(
+                f"{setting}.path: {path} is no ONNX model that can be run: {first_line(error)}"
+            ) from None
         self.name = path.name
         self.inputs = tuple(self._tensor(tensor) for tensor in self._session.get_inputs())
         self.metadata: Mapping[str, str] = self._session.get_modelmeta().custom_metadata_map
@@ -109,12 +114,15 @@ class OnnxSession:
         return Tensor(declared.name, shape, TYPES[declared.type])
 
 
-def _check_file(path: Path) -> None:
+def _check_file(path: Path, setting: str) -> None:
     if not path.is_file():
-        raise UsageError(f"vision.onnx.path: {path} is no file; check the path")
+        raise UsageError(f"{setting}.path: {path} is no file; check the path")
     size = path.stat().st_size
     if size > LARGEST_FILE:
-        raise UsageError(f"{path} has {size / 1e9:.1f} GB, an ONNX file has 2 GB at most; it is another file")
+        raise UsageError(
+            f"{setting}.path: {path} has {size / 1e9:.1f} GB, an ONNX file has 2 GB at most; "
+            "it is another file"
+        )
 
 
 def first_line(error: Exception) -> str:

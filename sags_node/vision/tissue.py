@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 
 import cv2
 import numpy as np
@@ -14,6 +15,7 @@ from sags_node.vision.onnx_session import DepthNetworkError
 from sags_node.vision.rectify import Rectifier
 from sags_node.vision.tissue_classical import InstrumentFinder
 from sags_node.vision.tissue_network import TissueNetwork
+from sags_node.vision.tissue_topic import NearestMask, NoMaskError, TopicMasks
 
 log = logging.getLogger(__name__)
 
@@ -22,23 +24,32 @@ FIRST_FRAMES = 5  # all of them with more: the mask is upside down
 
 
 class TissueMask:
-    """The tissue mask of every frame: the session's own, a network's, or found without either.
+    """The tissue mask of every frame: the session's own, a network's, another process's, or found without.
 
     Attributes:
-        problem: why the newest frame's mask is not the network's; empty: it is, or there is no network.
+        problem: why the newest frame's mask is not the network's or the other process's; empty: it is, or
+            there is none.
+
+    Args:
+        masks: those of another process, for method topic.
 
     Raises:
-        UsageError: a box to exclude does not lie in the raw picture, or the network cannot be used.
+        UsageError: a box to exclude does not lie in the raw picture, the network cannot be used, or nothing
+            receives masks.
     """
 
-    def __init__(self, config: TissueConfig, rectifier: Rectifier) -> None:
+    def __init__(self, config: TissueConfig, rectifier: Rectifier, masks: NearestMask | None = None) -> None:
         self._config = config
         self._rectifier = rectifier
         self._usable = rectifier.mask(_outside(config, rectifier.raw_size))
-        self._network: TissueNetwork | None = None
+        self._segment: Callable[[RectifiedPair], Bool] | None = None
+        self._topic: TopicMasks | None = None
         if config.method == "onnx":
             camera = rectifier.camera
-            self._network = TissueNetwork(config, (camera.width, camera.height))
+            network = TissueNetwork(config, (camera.width, camera.height))
+            self._segment = lambda pair: network(pair.left)
+        elif config.method == "topic":
+            self._segment = self._topic = TopicMasks(config, masks)
         self._find_instruments = InstrumentFinder()
         self._frames_checked = 0
         side = 2 * config.dilate + 1
@@ -49,8 +60,8 @@ class TissueMask:
         """Mask [H, W], True = tissue; highlights on tissue are tissue.
 
         Args:
-            expected: the model as it was drawn last, where there is one: only looked at where neither session
-                nor network gives a mask.
+            expected: the model as it was drawn last, where there is one: only looked at where nobody gives a
+                mask.
 
         Raises:
             UsageError: the masks that were given say of the first frames that most of them is instrument.
@@ -60,17 +71,17 @@ class TissueMask:
         tissue = self._given(frame, pair)
         if tissue is None:
             tissue = ~self._find_instruments(pair.left, expected, pair.t_capture_ns)
-        else:
+        elif self._topic is None or self._topic.is_new:
             self._check_polarity(tissue)
         # The picture's border counts as tissue here: only instruments grow.
         eroded: U8 = cv2.erode(tissue.view(np.uint8), self._neighbourhood)
         return eroded.view(np.bool_) & self._usable
 
     def _given(self, frame: StereoFrame, pair: RectifiedPair) -> Bool | None:
-        if self._network is not None:
+        if self._segment is not None:
             try:
-                tissue = self._network(pair.left)
-            except DepthNetworkError as error:
+                tissue = self._segment(pair)
+            except (DepthNetworkError, NoMaskError) as error:
                 if not self.problem:
                     log.warning("%s; instruments are found without it", error)
                 self.problem = str(error)
@@ -91,12 +102,11 @@ class TissueMask:
             return
         self._frames_checked += 1
         if self._frames_checked == FIRST_FRAMES:
-            if self._network is not None:
-                said = self._config.tissue_is
-                opposite = {"white": "black", "black": "white"}.get(str(said), "other class numbers")
-                whose, hint = "network's", f"set vision.tissue.tissue_is to {opposite}, it is {said}"
-            else:
-                whose = "session's"
+            said = self._config.tissue_is
+            opposite = {"white": "black", "black": "white"}.get(str(said), "other class numbers")
+            hint = f"set vision.tissue.tissue_is to {opposite}, it is {said}"
+            whose = {"onnx": "network's", "topic": "topic's"}.get(self._config.method, "session's")
+            if self._segment is None:
                 hint = "white must be instrument in its files; source.instruments turns EndoNeRF's round"
             raise UsageError(
                 f"the {whose} masks call over half of each of the first {FIRST_FRAMES} pictures instrument "

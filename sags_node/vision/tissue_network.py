@@ -36,10 +36,8 @@ class TissueNetwork:
 
     def __init__(self, config: TissueConfig, size: Size) -> None:
         assert config.path is not None and config.tissue_is is not None  # the launch file was checked
-        if not config.path.is_file():
-            raise UsageError(f"vision.tissue.path: {config.path} is no file; check the path")
         as_onnx = OnnxConfig(path=config.path)
-        self._session = OnnxSession(as_onnx)
+        self._session = OnnxSession(as_onnx, "vision.tissue")
         self._tissue_is = config.tissue_is
         self._size = size
         self._said = read_format(as_onnx, self._session.metadata)
