@@ -30,17 +30,19 @@ SESSION = Path(__file__).parent.parent / "replay/phantom_pull"
 
 @dataclass
 class Machine:
-    """Frames on a made-up clock: `before`, the first step and `after` must be, depth every other time, and
-    further steps may be."""
+    """Frames on a made-up clock: `before`, the first step and `after` must be, depth every other time, what a
+    first step on the whole picture costs more (`rest`) where there is time, and further steps may be."""
 
     seconds: float = BUDGET
     before: float = 0.010
     depth: float = 0.0
     step: float = 0.004
+    rest: float = 0.0
     after: float = 0.005
     now: float = 0.0
     budget: TimeBudget = field(init=False)
     matched: list[bool] = field(default_factory=list)  # whether there was time for depth, frame by frame
+    whole: list[bool] = field(default_factory=list)  # and for a first step on the whole picture
 
     def __post_init__(self) -> None:
         self.budget = TimeBudget(self.seconds, clock=lambda: self.now)
@@ -55,6 +57,9 @@ class Machine:
             self.now += self.depth * self.matched[-1]
         while self.budget.more():
             steps += 1
+            if steps == 1:
+                self.whole.append(self.budget.affords_whole())
+                self.now += self.rest * self.whole[-1]
             self.now += self.step + 0.080 * (spike == "step" and steps == 2)
         self.now += self.after + 0.080 * (spike == "after")
         self.budget.finish()
@@ -165,6 +170,20 @@ def test_depth_is_matched_where_it_fits_else_in_every_other_frame_and_again_when
     machine.before = 0.010
     machine.play(30)
     assert all(machine.matched[-10:])
+
+
+def test_the_first_step_is_on_the_whole_picture_where_that_fits_and_again_when_it_fits() -> None:
+    machine = Machine(before=0.015, rest=0.006)
+    machine.play(20)
+    assert all(machine.whole[5:])
+    machine.before = 0.021  # 36 ms with all of it, 30 without
+    machine.whole.clear()
+    done = machine.play(60)
+    assert sum(machine.whole) < 20  # it is tried now and then, as a further step is
+    assert np.mean([age for _, _, age in done[10:]]) < 0.035
+    machine.before = 0.015
+    machine.play(30)
+    assert all(machine.whole[-10:])
 
 
 @pytest.mark.parametrize("floor", [0.004, 0.030])

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from sags_node.engine.rasterize import TILE_HEIGHT, TILE_WIDTH
 from sags_node.mapping import focus
+from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.focus import EVERY, LEAST_COVERAGE, with_neighbours, worst_tiles
+from sags_node.pipeline import Pipeline
+from sags_node.session import open_session
 from sags_node.types import F32, Bool
 
+PHANTOM = Path(__file__).parent.parent / "replay/phantom_pull"
 HEIGHT, WIDTH = 3 * TILE_HEIGHT + 7, 5 * TILE_WIDTH + 3  # no tile divides it
 SHAPE = -(-HEIGHT // TILE_HEIGHT), -(-WIDTH // TILE_WIDTH)
 
@@ -96,3 +102,28 @@ def test_neighbours_are_all_around_and_stay_inside(place: tuple[int, int]) -> No
     assert grown[0][touching].all()
     reach = np.argwhere(grown[0])
     assert (reach.max(0) - reach.min(0) <= [2, 4]).all()  # tiles are twice as high as wide
+
+
+class Hurried(StepBudget):
+    def affords_whole(self) -> bool:
+        return False
+
+
+def test_in_a_hurry_the_first_step_leaves_alone_what_fits_best() -> None:
+    """The rest of the model keeps its colours, and what is known of how much it shows."""
+    session = open_session(PHANTOM, ["source.pace:=step", "mapping.max_gaussians:=4000"])
+    pipeline, budget = Pipeline(session.config, session.rig), StepBudget(1)
+    with session.source as source:
+        first, second = (frame for frame, _ in zip(source, range(2), strict=False))
+    pipeline.process(first, budget)
+    model = pipeline.mapper.model
+    before = {
+        int(i): (c.copy(), s) for i, c, s in zip(model.ids, model.colors, model.contribution, strict=True)
+    }
+    pipeline.process(second, Hurried(1))
+    kept = [
+        np.array_equal(color, before[int(i)][0]) and shown == before[int(i)][1]
+        for i, color, shown in zip(model.ids, model.colors, model.contribution, strict=True)
+        if int(i) in before
+    ]
+    assert 0.1 < np.mean(kept) < 0.6

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from sags_node.errors import SagsError
+from sags_node.model import deformation as deformation_module
 from sags_node.model.deformation import NodeDeformation
 from sags_node.model.gaussians import GaussianModel
 from sags_node.model.ply import write_ply
@@ -69,6 +70,30 @@ def test_a_translation_seen_by_some_moves_all() -> None:
     hidden_near = (start[:, 0] > 0.012) & (start[:, 0] < 0.018)
     assert np.allclose(model.means[seen > 0] - start[seen > 0], move, atol=1e-6)
     assert np.abs(model.means[hidden_near] - start[hidden_near] - move).max() < 1e-4
+
+
+def test_tissue_that_turns_takes_places_and_orientations_along(monkeypatch: pytest.MonkeyPatch) -> None:
+    angle = 0.02  # rad around z; and 1 % of stretch
+    gradient = np.array([[0.01, -angle, 0], [angle, 0.01, 0], [0, 0, 0]], np.float32)
+
+    def follow() -> tuple[float, np.ndarray]:
+        """How far the Gaussians away from the rim are from where they should be, and how they turned."""
+        model = filled_model(patch())
+        deformation = NodeDeformation(model.means, 200)
+        deformation.attach(model, slice(0, model.count))
+        move = (model.means - model.means.mean(0)) @ gradient.T
+        inner = np.abs(model.means[:, :2]).max(1) < 0.02  # nodes at the rim have neighbours on one side only
+        there = model.means + move
+        deformation.follow(model, move, np.ones(model.count, np.float32))
+        return float(np.linalg.norm(model.means - there, axis=1)[inner].mean()), model.quats[inner]
+
+    missed, turned = follow()
+    assert (
+        0.5 * angle < 2 * np.median(turned[:, 3]) < 1.02 * angle
+    )  # of what little is known a part is believed
+    assert np.abs(turned[:, 1:3]).mean() < 0.1 * angle
+    monkeypatch.setattr(deformation_module, "_LEAST_STIFFNESS", 1e6)  # the nodes' translations alone
+    assert missed < 0.4 * follow()[0]
 
 
 def test_nodes_average_noise_away() -> None:

@@ -207,6 +207,26 @@ def test_geometry_can_be_left_out() -> None:
 # ---- repeatable --------------------------------------------------------------------------------------------
 
 
+def test_what_is_not_asked_of_a_tile_leaves_nothing_of_an_earlier_answer() -> None:
+    """Tiles without a cotangent are passed over; their pairs still hold the gradients of the call before."""
+    view = camera()
+    gaussians = random_gaussians(4, 60, view)
+    v_planes, weight = cotangents([view], 4)
+    used, fresh = (make_rasterizer("numba", view.width, view.height) for _ in range(2))
+    used.forward(gaussians, [view])
+    used.backward(v_planes, weight)
+    asked = np.zeros((view.height, view.width), np.bool_)
+    asked[: view.height // 2, : view.width // 3] = True
+    twin = make_rasterizer("reference", view.width, view.height)
+    fresh.forward(gaussians, [view])
+    twin.forward(gaussians, [view])
+    found, again, true = (copies(r.backward(v_planes * asked, weight * asked)) for r in (used, fresh, twin))
+    for name in GRADIENTS:
+        np.testing.assert_array_equal(found[name], again[name], err_msg=name)
+        assert relative_error(found[name], true[name]) < 2e-5, name
+    assert 0 < np.count_nonzero(found["contribution"]) < len(gaussians)
+
+
 def test_same_bits_for_any_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     view = camera(width=100, height=77, focal=100.0)
     gaussians = random_gaussians(6, 700, view)

@@ -207,6 +207,18 @@ def composite(
         )
 
 
+@inlined
+def _is_zero(tile: F32) -> bool:
+    """Whether no pixel has a cotangent or a weight; NaN is not zero."""
+    size = ZERO
+    for plane in range(5):
+        for n in range(TILE_PIXELS):
+            size += abs(tile[RED + u8(plane * PLANE) + u8(n)])
+    for n in range(TILE_PIXELS):
+        size += abs(tile[WEIGHT + u8(n)])
+    return bool(size == ZERO)
+
+
 @kernel
 def _composite_tiles_backward(
     splats: Any, pairs: Any, tile_starts: I32, tile_ends: I32, drawn: I32, next_tile: I64, tile: F32,
@@ -234,6 +246,8 @@ def _composite_tiles_backward(
                 tile[REMAINING + u8(n)] += tile[plane + u8(n)] * tile[STAGED + u8(n)]
         _load(tile, WEIGHT, weight, (camera * height + y0) * width + x0, width, columns, rows)
         end = tile_ends[t]
+        if _is_zero(tile):
+            end = tile_starts[t]
         for p in range(tile_starts[t], end):
             if p + AHEAD < end:
                 prefetch_read(splats, pairs[p + AHEAD].splat)
@@ -302,7 +316,7 @@ def _composite_tiles_backward(
             v_pair.blue = sum_blue
             v_pair.depth = sum_depth
             v_pair.contribution = sum_weight
-        for p in range(end, tile_starts[t + 1]):  # hidden behind a finished tile
+        for p in range(end, tile_starts[t + 1]):  # hidden behind a finished tile, or nothing is asked of it
             v_pair = v_pairs[pairs[p].slot]
             v_pair.sum = v_pair.u = v_pair.v = v_pair.uu = v_pair.uv = v_pair.vv = ZERO
             v_pair.red = v_pair.green = v_pair.blue = v_pair.depth = v_pair.contribution = ZERO

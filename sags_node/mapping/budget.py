@@ -12,7 +12,7 @@ from sags_node.config import MappingConfig
 LEARNING = 0.2  # share of a new measurement in a running mean
 FORGET = 0.95  # of the cost of a step, per frame in which it seemed not to fit
 LEAST_SHARE = 0.6  # of the model's capacity: fewer would save little, most of a frame does not depend on them
-SHRINK, GROW = 0.995, 1.002  # per frame
+SHRINK, GROW = 0.99, 1.002  # per frame
 GAUSSIANS_PER_MS = 1100  # of the budget; measured, see benchmarks/mapping.md
 PIXELS_PER_GAUSSIAN = 2  # fewer pixels have no more to tell
 COMFORT = 0.9  # of the time: below it there is room for more Gaussians
@@ -33,6 +33,9 @@ class Budget(Protocol):
 
     def more(self) -> bool:
         """True when one more step may be taken."""
+
+    def affords_whole(self) -> bool:
+        """True when the first step, about to be taken, may be one on the whole picture."""
 
     def finish(self) -> None:
         """The frame is done."""
@@ -57,6 +60,9 @@ class StepBudget:
         self._left -= 1
         return self._left >= 0
 
+    def affords_whole(self) -> bool:
+        return True
+
     def finish(self) -> None:
         pass
 
@@ -69,8 +75,9 @@ class TimeBudget:
     waited is gone, so that one late frame does not make the next late.
 
     What does not fit is left out in this order: further steps; depth in every other frame, which the model's
-    own depth bridges; and while that is not enough, the share of Gaussians falls. All recover when there is
-    room: the machine may be slow, or busy with something else.
+    own depth bridges; the part of the picture, in this frame, that needs the first step least; and while that
+    is not enough, the share of Gaussians falls. All recover when there is room: the machine may be slow, or
+    busy with something else.
     """
 
     def __init__(self, seconds: float, clock: Callable[[], float] = time.perf_counter) -> None:
@@ -78,6 +85,7 @@ class TimeBudget:
         self.share = 1.0
         self._clock = clock
         self._step_cost = _RunningMean()
+        self._whole_cost = _RunningMean()  # of a first step on the whole picture, until the second may begin
         self._after_cost = _RunningMean()
         self._essential = _RunningMean()
         self._cost_with_depth = _RunningMean()
@@ -89,6 +97,7 @@ class TimeBudget:
         self._deadline = self._started + max(0.0, self.seconds - waited)
         self._asks = 0
         self._depth: bool | None = None  # whether it is matched; None: nobody asked
+        self._whole = True  # the first step
         self._optional = 0.0  # s, spent on all steps but the first
 
     def affords_depth(self) -> bool:
@@ -98,6 +107,8 @@ class TimeBudget:
 
     def more(self) -> bool:
         now = self._clock()
+        if self._asks == 1 and self._whole:
+            self._whole_cost.add(now - self._asked)
         if self._asks > 1:  # what came before the first step, and the first, are no measure of a further one
             self._step_cost.add(now - self._asked)
             self._optional += now - self._asked
@@ -108,6 +119,13 @@ class TimeBudget:
         if self._asks == 2:  # nothing is learnt of a step that is never taken: try one again some day
             self._step_cost.value *= FORGET
         return False
+
+    def affords_whole(self) -> bool:
+        needed = self._whole_cost.value + self._after_cost.value
+        self._whole = self._clock() + needed <= self._deadline
+        if not self._whole:  # as above
+            self._whole_cost.value *= FORGET
+        return self._whole
 
     def finish(self) -> None:
         """Learn from this frame. One that never asked, since it made a new model, tells nothing."""

@@ -43,6 +43,12 @@ def tile_grid(mask: Bool) -> Bool:
     return np.zeros((1, -(-height // TILE_HEIGHT), -(-width // TILE_WIDTH)), np.bool_)
 
 
+def pixels_of(tiles: Bool, shape: tuple[int, ...]) -> Bool:
+    """The pixels [H, W] of the tiles [1, rows, columns] of a picture of that shape."""
+    rows = np.repeat(tiles[0], TILE_HEIGHT, axis=0)[: shape[0]]
+    return np.repeat(rows, TILE_WIDTH, axis=1)[:, : shape[1]]
+
+
 def with_neighbours(tiles: Bool) -> Bool:
     """The tiles [1, rows, columns] and those less than `REACH` px away: a Gaussian may reach into them."""
     rows, columns = -(-REACH // TILE_HEIGHT), -(-REACH // TILE_WIDTH)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from sags_node.engine.rasterize import Gradients, Rasterizer
 from sags_node.mapping import densify, initialise
 from sags_node.mapping.budget import Budget
 from sags_node.mapping.exposure import exposure_gain
-from sags_node.mapping.focus import tile_grid, with_neighbours, worst_tiles
+from sags_node.mapping.focus import pixels_of, tile_grid, with_neighbours, worst_tiles
 from sags_node.mapping.motion import OpticalFlow, depth_pull, found_again, scene_flow
 from sags_node.mapping.optimiser import Optimiser, Rates
 from sags_node.mapping.right_eye import right_eye_loss
@@ -28,6 +28,7 @@ EXPOSURE_JUMP = 0.01  # smaller changes of the gain are left to the colour steps
 SETTLED = 10  # frames: a model that has not changed for so long has little more to learn
 SETTLED_EVERY = 4  # frames: then it is refined so rarely
 FOCUS = 0.15  # of the picture; measured: half the gain of a whole step in a quarter of its time
+HURRIED_SHARE = 0.6  # of the picture, in the first step of a frame that is late
 MIN_FIRST_DEPTHS = 200  # px
 LOST_RESIDUAL = 0.08  # mean over RGB and tissue, 0..1; a beating heart stays below half of it
 LOST_COVERAGE = 0.3  # of the tissue
@@ -194,7 +195,7 @@ class Mapper:
         pixels, depths = densify.candidates(planes, observation, phase=7 * self._frames)
         iterations = 0
         if budget.more():  # before inserting, so that the drawing above serves both
-            self.model.contribution[:] = self._refine(observation, self._rates).contribution
+            self._refine_first(observation, budget)
             iterations = 1
         room = max(HOLES, limit - self.model.count)
         pixels, depths = pixels[:room], depths[:room]
@@ -223,6 +224,18 @@ class Mapper:
             untouched = tile_grid(observation.tissue)
             self.stale_tiles = with_neighbours(np.logical_or.reduce([untouched, *touched]))
         return {"inserted": 0, "removed": removed, "iterations": len(touched)}
+
+    def _refine_first(self, observation: Observation, budget: Budget) -> None:
+        """A step on the whole picture, or in a hurry on the larger part of it that needs it most."""
+        contribution = self.model.contribution
+        if budget.affords_whole():
+            contribution[:] = self._refine(observation, self._rates).contribution
+            return
+        tissue = observation.tissue
+        tiles = worst_tiles(self._planes[0], observation.image, tissue, HURRIED_SHARE)
+        part = replace(observation, tissue=tissue & pixels_of(tiles, tissue.shape))
+        shown = self._refine(part, self._rates).contribution
+        np.copyto(contribution, shown, where=shown > 0)  # what lies elsewhere shows what it did before
 
     def _refine_worst(self, observation: Observation, nodes: bool = True) -> Bool:
         tiles = worst_tiles(self._planes[0], observation.image, observation.tissue, self._focus)

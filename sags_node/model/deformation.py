@@ -5,17 +5,20 @@ A deformation turns what was observed of some Gaussians into a motion of all of 
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numba import prange
 
-from sags_node.engine.jit import kernel, parallel_kernel
+from sags_node.engine.jit import inlined, kernel, parallel_kernel
 from sags_node.model.gaussians import NEIGHBOURS, GaussianModel
 from sags_node.types import F32, I32
 
 _SMOOTHING_ROUNDS = 3  # how far, in nodes, motion spreads into hidden tissue per frame
+_LEAST_SEEN = 0.5  # weight of what was seen around a node: below it nothing is known of it
+_LEAST_STIFFNESS = 0.2  # in squared node spacings: what little is known of a gradient is not believed
 _NEW_NODE_DISTANCE = 1.5  # in node spacings: farther new tissue gets nodes of its own
+_PIECE = 1024  # rows a thread takes at a time: a call for each row would count references to every array
 
 
 class Deformation(Protocol):
@@ -46,7 +49,8 @@ class Deformation(Protocol):
 
 class NodeDeformation:
     """Control nodes spread over the tissue; each Gaussian follows its nearest ones (embedded deformation:
-    R. W. Sumner et al., SIGGRAPH 2007, translations only).
+    R. W. Sumner et al., SIGGRAPH 2007). How tissue turns and stretches around a node follows from the motion
+    of its neighbours.
 
     Hundreds of nodes average thousands of noisy per-Gaussian motions, which is what keeps identity: a
     Gaussian stays on its piece of tissue.
@@ -76,8 +80,13 @@ class NodeDeformation:
     def follow(self, model: GaussianModel, displacements: F32, seen: F32) -> None:
         motion, weight = _average(displacements, seen, model.node_index, model.node_weight, len(self.nodes))
         _spread(motion, weight, self._neighbours, _SMOOTHING_ROUNDS)
-        self.nodes += motion
-        _skin(motion, model.node_index, model.node_weight, model.means)
+        # The motion is that of the middle of what was seen around a node, not of the node itself.
+        places, _ = _average(model.means, seen, model.node_index, model.node_weight, len(self.nodes))
+        places = np.where(weight[:, None] > _LEAST_SEEN, places, self.nodes)
+        least = np.float32(_LEAST_STIFFNESS * self.spacing**2)
+        gradients = _motion_gradients(places, motion, self._neighbours, least)
+        _carry(places, motion, gradients, model.node_index, model.node_weight, model.means, model.quats)
+        self.nodes += motion + np.einsum("mab,mb->ma", gradients, self.nodes - places)
 
     def descend(self, model: GaussianModel, gradients: F32, contribution: F32, step: float) -> None:
         gradient, _ = _average(
@@ -196,14 +205,14 @@ def _average(values: F32, seen: F32, index: I32, weight: F32, nodes: int) -> tup
                     total[j, a] += w * values[i, a]
     for j in range(nodes):
         for a in range(3):
-            total[j, a] = total[j, a] / mass[j] if mass[j] > 0.5 else np.float32(0)
+            total[j, a] = total[j, a] / mass[j] if mass[j] > np.float32(_LEAST_SEEN) else np.float32(0)
     return total, mass
 
 
 @kernel
 def _spread(motion: F32, mass: F32, neighbours: I32, rounds: int) -> None:
     """Nodes that nothing was seen of take the mean motion of the neighbours that have one."""
-    known = mass > 0.5
+    known = mass > np.float32(_LEAST_SEEN)
     for _ in range(rounds):
         reached = known.copy()
         for j in range(len(motion)):
@@ -221,6 +230,88 @@ def _spread(motion: F32, mass: F32, neighbours: I32, rounds: int) -> None:
                     motion[j, a] /= n
                 reached[j] = True
         known = reached
+
+
+@kernel
+def _motion_gradients(places: F32, motion: F32, neighbours: I32, least: Any) -> F32:
+    """Gradient [M, 3, 3] of the motion around each place: least squares over its neighbours, drawn to 0 by
+    `least` (m^2). Row a is the gradient of the motion along axis a."""
+    gradients = np.zeros((len(places), 3, 3), np.float32)
+    moments, products = np.empty((3, 3), np.float32), np.empty((3, 3), np.float32)
+    count = neighbours.shape[1]
+    for j in range(len(places)):
+        for a in range(3):
+            for b in range(3):
+                moments[a, b] = least * count if a == b else np.float32(0)
+                products[a, b] = np.float32(0)
+        for k in range(count):
+            i = neighbours[j, k]
+            for b in range(3):
+                arm = places[i, b] - places[j, b]
+                for a in range(3):
+                    moments[a, b] += (places[i, a] - places[j, a]) * arm
+                    products[a, b] += (motion[i, a] - motion[j, a]) * arm
+        _divide(products, moments, gradients[j])
+    return gradients
+
+
+@inlined
+def _divide(products: F32, moments: F32, quotient: F32) -> None:
+    """quotient = products moments^-1, [3, 3], `moments` symmetric; unchanged where that has no inverse."""
+    xx, xy, xz = moments[0, 0], moments[0, 1], moments[0, 2]
+    yy, yz, zz = moments[1, 1], moments[1, 2], moments[2, 2]
+    a, b, c = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
+    d, e, f = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
+    determinant = xx * a + xy * b + xz * c
+    if determinant > 0:
+        scale = np.float32(1) / determinant
+        for k in range(3):
+            x, y, z = products[k, 0] * scale, products[k, 1] * scale, products[k, 2] * scale
+            quotient[k, 0] = x * a + y * b + z * c
+            quotient[k, 1] = x * b + y * d + z * e
+            quotient[k, 2] = x * c + y * e + z * f
+
+
+@parallel_kernel
+def _carry(
+    places: F32, motion: F32, gradients: F32, index: I32, weight: F32, means: F32, quats: F32
+) -> None:  # fmt: skip
+    for piece in prange(-(-len(means) // _PIECE)):
+        first = np.int64(piece) * _PIECE
+        _carry_rows(
+            places, motion, gradients, index, weight, means, quats, first, min(first + _PIECE, len(means))
+        )
+
+
+@kernel
+def _carry_rows(
+    places: F32, motion: F32, gradients: F32, index: I32, weight: F32, means: F32, quats: F32,
+    first: Any, end: Any,
+) -> None:  # fmt: skip
+    """Move each Gaussian by the weighted motion of its nodes, and turn it with the tissue around."""
+    half = np.float32(0.5)
+    for i in range(first, end):
+        x = y = z = turn_x = turn_y = turn_z = np.float32(0)
+        for k in range(NEIGHBOURS):
+            j, w = index[i, k], weight[i, k]
+            g = gradients[j]
+            dx, dy, dz = means[i, 0] - places[j, 0], means[i, 1] - places[j, 1], means[i, 2] - places[j, 2]
+            x += w * (motion[j, 0] + g[0, 0] * dx + g[0, 1] * dy + g[0, 2] * dz)
+            y += w * (motion[j, 1] + g[1, 0] * dx + g[1, 1] * dy + g[1, 2] * dz)
+            z += w * (motion[j, 2] + g[2, 0] * dx + g[2, 1] * dy + g[2, 2] * dz)
+            turn_x += w * (g[2, 1] - g[1, 2])
+            turn_y += w * (g[0, 2] - g[2, 0])
+            turn_z += w * (g[1, 0] - g[0, 1])
+        means[i, 0] += x
+        means[i, 1] += y
+        means[i, 2] += z
+        # A small rotation: half of the curl is the rotation vector, and half of that the quaternion's.
+        turn_x, turn_y, turn_z = half * half * turn_x, half * half * turn_y, half * half * turn_z
+        q0, q1, q2, q3 = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
+        quats[i, 0] = q0 - turn_x * q1 - turn_y * q2 - turn_z * q3
+        quats[i, 1] = q1 + turn_x * q0 + turn_y * q3 - turn_z * q2
+        quats[i, 2] = q2 + turn_y * q0 + turn_z * q1 - turn_x * q3
+        quats[i, 3] = q3 + turn_z * q0 + turn_x * q2 - turn_y * q1
 
 
 @parallel_kernel

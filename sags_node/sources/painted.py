@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import cv2
+import numba
 import numpy as np
 
 from sags_node.types import U8, Bool
 
 # The paint is blended at 30 %: painted pixels gain about 70 counts of green against the mean of blue and red,
 # and the dimming of the others takes the same share from every channel. Half of the gain separates them.
-GREEN_EXCESS = np.array([[-0.5, 1.0, -0.5]], np.float32)  # of blue, green, red
-PAINTED_ABOVE = 36  # counts
+PAINTED_ABOVE = 73  # counts, of twice that gain
 OPEN = np.ones((3, 3), np.uint8)  # removes codec specks
 CLOSE = np.ones((5, 5), np.uint8)  # fills dots inside instruments
 
@@ -22,9 +22,22 @@ def unpainted(pane: U8, left: U8) -> Bool:
         pane: [H, W, 3] BGR, the left picture with semi-transparent green instruments.
         left: [H, W, 3] BGR, the same picture without paint.
     """
-    gained = cv2.transform(cv2.subtract(pane, left, dtype=cv2.CV_16S), GREEN_EXCESS)
-    painted = (gained > PAINTED_ABOVE).astype(np.uint8)
+    painted = np.empty(pane.shape[:2], np.uint8)
+    _find_paint(pane, left, painted)
     painted = cv2.morphologyEx(painted, cv2.MORPH_OPEN, OPEN)
     painted = cv2.morphologyEx(painted, cv2.MORPH_CLOSE, CLOSE)
     tissue: Bool = painted == 0
     return tissue
+
+
+@numba.njit(cache=True, nogil=True)
+def _find_paint(pane: U8, left: U8, painted: U8) -> None:
+    """Write 1 where green was gained, else 0; in one pass, since pictures in between cost four times that."""
+    for y in range(painted.shape[0]):
+        for x in range(painted.shape[1]):
+            blue, green, red = (
+                np.int32(pane[y, x, 0]) - left[y, x, 0],
+                np.int32(pane[y, x, 1]) - left[y, x, 1],
+                np.int32(pane[y, x, 2]) - left[y, x, 2],
+            )
+            painted[y, x] = 2 * green - blue - red > PAINTED_ABOVE

@@ -7,7 +7,7 @@ import numpy as np
 
 from sags_node.types import F64, U8, RectifiedPair
 
-SHRINK = 8  # px are averaged: camera noise up to 4 grey levels stays below the limit
+HALVINGS = 3  # 8x8 px are averaged: camera noise up to 4 grey levels stays below the limit
 BLOCK = 4  # shrunk px: 32 px, the length over which something moves or does not
 LARGEST_DIFFERENCE = 1.0  # grey levels, mean over a block
 LARGEST_SHARE = 0.005  # of the blocks that may differ more: a highlight flickers
@@ -39,9 +39,11 @@ class StillScene:
 
 
 def _shrunk(image: U8) -> U8:
-    height, width = image.shape[:2]
-    size = max(1, width // SHRINK), max(1, height // SHRINK)
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+    """In halves: averaging 2x2 px is so much faster than 8x8 at once that all three are."""
+    for _ in range(HALVINGS):
+        height, width = image.shape[:2]
+        image = cv2.resize(image, (max(1, width // 2), max(1, height // 2)), interpolation=cv2.INTER_AREA)
+    return image
 
 
 def _alike(a: U8, b: U8) -> bool:
