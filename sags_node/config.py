@@ -314,6 +314,7 @@ class MappingConfig(Section):
     smoothing: bool = Field(True, description="the 3D filter of Mip-Splatting: nothing finer than was seen")
     skip_duplicates: bool = Field(True, description="a frame equal to its predecessor is not mapped again")
     skip_depth: bool = Field(True, description="when time is short, match depth in every other frame only")
+    skip_fitted: bool = Field(True, description="when time is short, refine where it fits worst only")
     skip_still: bool = Field(True, description="while nothing moves: no matching, a step where it pays most")
 
 
@@ -334,11 +335,17 @@ class PublishConfig(Section):
         return self
 
 
+DeviceName = Literal["auto", "cpu", "cuda"]
+
+
 class LaunchConfig(Section):
     """One way to run the node."""
 
     ns: str = Field("sags", pattern=NAMESPACE)
     seed: int = 0
+    device: DeviceName = Field(
+        "auto", description="auto: a GPU where one can be used, else the CPU; cuda: a GPU; docs/gpu.md"
+    )
     rig: Path | None = Field(
         None, description="a calibration in any form of docs/calibration.md; the phantom has its own"
     )
@@ -348,6 +355,12 @@ class LaunchConfig(Section):
     mapping: MappingConfig = MappingConfig()
     publish: PublishConfig = PublishConfig()
     segments: dict[str, tuple[int, int]] = Field({}, description="name: [first, last] frame, for sags eval")
+
+    @model_validator(mode="after")
+    def _one_engine(self) -> LaunchConfig:
+        if self.device == "cuda" and self.engine.backend == "reference":
+            raise ValueError("device cuda and engine.backend reference: choose one of them")
+        return self
 
     @property
     def one_camera(self) -> bool:

@@ -47,7 +47,13 @@ log = logging.getLogger(__name__)
 HEALTH_PERIOD = 1.0  # s
 STOP_SECONDS = 10.0  # longest wait for each thread to end
 REQUEST_WAIT = 0.05  # s: how soon a request is served while no frames come
-LIVE_PARAMETERS = ("mapping.budget_ms", "mapping.skip_duplicates", "mapping.skip_depth", "mapping.skip_still")
+LIVE_PARAMETERS = (
+    "mapping.budget_ms",
+    "mapping.skip_duplicates",
+    "mapping.skip_depth",
+    "mapping.skip_fitted",
+    "mapping.skip_still",
+)
 
 OnResult = Callable[[FrameResult, float], None]  # a published result and its latency, ms
 

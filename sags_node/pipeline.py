@@ -10,10 +10,11 @@ from dataclasses import replace
 import numpy as np
 
 from sags_node.config import LaunchConfig
-from sags_node.engine.rasterize import make_rasterizer, to_view
+from sags_node.engine.rasterize import to_view
 from sags_node.mapping.anchors import Anchors
-from sags_node.mapping.budget import Budget, capacity
+from sags_node.mapping.budget import Budget
 from sags_node.mapping.camera_tracker import CameraTracker
+from sags_node.mapping.devices import affordable, make_refiner
 from sags_node.mapping.mapper import Mapper
 from sags_node.types import (
     F32,
@@ -67,11 +68,11 @@ class Pipeline:
         self._network: NetworkDepth | None = None
         if vision.onnx.path is not None:
             self._network = NetworkDepth(vision, self.stereo, camera, baseline)
-        self._rasterizer = make_rasterizer(config.engine.backend, width, height)
+        self._refiner = make_refiner(config, width, height)
         self._config = config
         self.mapper = Mapper(
-            self._rasterizer,
-            capacity(config.mapping, width, height),
+            self._refiner,
+            affordable(config, width, height),
             config.mapping.smoothing,
             unhurried=config.mapping.budget_ms >= UNHURRIED_MS,
         )
@@ -105,6 +106,8 @@ class Pipeline:
             found["network"] = self._network.problem
         if self.tissue.problem:
             found["mask"] = self.tissue.problem
+        if self._refiner.problem:
+            found["device"] = self._refiner.problem
         return found
 
     def reconfigure(self, config: LaunchConfig) -> None:
@@ -229,7 +232,7 @@ class Pipeline:
         return frame.epoch + self.mapper.restarts
 
     def _draw_eyes(self, snapshot: Snapshot, baseline: float) -> dict[str, RenderedView]:
-        """The left eye is drawn last: the mapper looks at what the rasteriser drew last."""
+        """The left eye is drawn last: the refiner looks at what it drew last."""
         stale, before = self.mapper.stale_tiles, self._mapped
         if before is not None and stale is not None and not stale.any():
             return _restamped(before.views, snapshot.frame_id, snapshot.t_capture_ns)
@@ -240,12 +243,11 @@ class Pipeline:
 
     def _draw_model(self, camera: Camera) -> RenderedView:
         """The model as it is now."""
-        planes = self._rasterizer.forward(self.mapper.model.gaussians(), [camera])
-        return to_view(planes[0], camera, 0, 0)
+        return to_view(self._refiner.show(self.mapper.model.gaussians(), camera), camera, 0, 0)
 
     def _draw(self, snapshot: Snapshot, camera: Camera, tiles: Bool | None = None) -> RenderedView:
-        planes = self._rasterizer.forward(snapshot.gaussians, [camera], tiles)
-        return to_view(planes[0], camera, snapshot.frame_id, snapshot.t_capture_ns)
+        planes = self._refiner.show(snapshot.gaussians, camera, tiles)
+        return to_view(planes, camera, snapshot.frame_id, snapshot.t_capture_ns)
 
 
 class Stopwatch:

@@ -19,16 +19,20 @@ def warm_up(config: LaunchConfig) -> None:
     """Run a few small made-up frames through a pipeline of the same kind.
 
     Kernels do not depend on sizes, so this takes well under a second once they are in Numba's disk cache,
-    and about half a minute the first time.
+    and about half a minute the first time. A GPU is tried out, and its kernels are compiled, by the same
+    frames.
+
+    Raises:
+        UsageError: a GPU is wanted and none can be used.
     """
     small = config.model_copy(
         update={
             "vision": VisionConfig(stereo=config.vision.stereo, pose=config.vision.pose),
-            "mapping": MappingConfig(max_gaussians=1000),
+            "mapping": MappingConfig(max_gaussians=1000, right_eye=config.mapping.right_eye),
         }
     )
     pipeline = Pipeline(small, _rig())
-    budget = StepBudget(1)
+    budget = StepBudget(2)  # the first on the whole picture, the second where it is worst
     coarse = np.random.default_rng(0).integers(40, 220, (_HEIGHT // 4, _WIDTH // 4 + 16, 3), np.uint8)
     texture = cv2.resize(coarse, (_WIDTH + 64, _HEIGHT))
     for i in range(3):

@@ -3,14 +3,37 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import torch
 
 from sags_node.config import PhantomSource
 from sags_node.phantom import write_session
 
 ROOT = Path(__file__).parent.parent
+
+if not torch.cuda.is_available():
+    os.environ["TRITON_INTERPRET"] = "1"  # read when a kernel is imported: they then run on the CPU
+
+
+@pytest.fixture(scope="module")
+def quick_interpreter() -> Iterator[None]:
+    """Triton's interpreter prepares its language anew for every call of a function, which takes longer than
+    all the rest: prepare it once."""
+    if torch.cuda.is_available():
+        yield
+        return
+    import triton.language as tl
+    from triton.runtime import interpreter
+
+    prepared = interpreter._patch_lang(tl.zeros.fn)
+    with pytest.MonkeyPatch.context() as patch:
+        function = interpreter.InterpretedFunction
+        patch.setattr(function, "__call__", lambda self, *args, **names: self.rewrite()(*args, **names))
+        yield
+    prepared.restore()
 
 
 @pytest.fixture(scope="session")

@@ -20,6 +20,7 @@ from sags_node.engine.smoothing import folded
 from sags_node.evaluation.metrics import psnr
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.mapper import Mapper
+from sags_node.mapping.refiner import CpuRefiner
 from sags_node.model.alias_free import FILTER_VARIANCE, smoothing_variances
 from sags_node.model.gaussians import GaussianModel
 from sags_node.model.ply import SH_C0, write_ply
@@ -243,7 +244,7 @@ def mapped(smoothing: bool) -> tuple[GaussianModel, Gaussians, Observation]:
     """A small model after two frames, and what was published of it."""
     observation = flat_scene(texture())
     rasterizer = make_rasterizer("numba", SIDE, SIDE)
-    mapper = Mapper(rasterizer, 3000, smoothing)
+    mapper = Mapper(CpuRefiner(rasterizer), 3000, smoothing)
     mapper.update(observation, StepBudget(1))
     snapshot = mapper.update(observation, StepBudget(1))
     return mapper.model, snapshot.gaussians, observation
@@ -269,7 +270,7 @@ def test_first_scales_are_as_drawn_without_a_filter() -> None:
 def test_the_filter_stays_as_narrow_as_the_nearest_look_was() -> None:
     """From farther away nothing is forgotten of what was seen from near by."""
     observation = flat_scene(texture())
-    mapper = Mapper(make_rasterizer("numba", SIDE, SIDE), 3000)
+    mapper = Mapper(CpuRefiner(make_rasterizer("numba", SIDE, SIDE)), 3000)
     mapper.update(observation, StepBudget(0))
     before = mapper.model.smoothing.copy()
     far = dataclasses.replace(

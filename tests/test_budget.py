@@ -186,6 +186,13 @@ def test_the_first_step_is_on_the_whole_picture_where_that_fits_and_again_when_i
     assert all(machine.whole[-10:])
 
 
+def test_the_rule_that_leaves_out_what_fits_can_be_switched_off() -> None:
+    machine = Machine(before=0.050, rest=0.006)
+    machine.budget = TimeBudget(BUDGET, skip_fitted=False, clock=lambda: machine.now)
+    machine.play(20)
+    assert all(machine.whole)
+
+
 @pytest.mark.parametrize("floor", [0.004, 0.030])
 def test_the_share_falls_to_what_fits_and_recovers(floor: float) -> None:
     """A frame costs `floor` and up to 20 ms for the Gaussians, which are shed as fast as the mapper does."""

@@ -15,7 +15,7 @@ from click.testing import CliRunner, Result
 from sags_node.benchmark import pareto, pareto_settings
 from sags_node.benchmark.pareto import non_dominated, why_default
 from sags_node.benchmark.pareto_baselines import right_pixels, warp_to_right
-from sags_node.benchmark.pareto_settings import skip_rules, skip_settings, time_settings
+from sags_node.benchmark.pareto_settings import HURRIED_RULES, skip_rules, skip_settings, time_settings
 from sags_node.calibration import load_rig
 from sags_node.cli import main
 from sags_node.config import MappingConfig
@@ -73,7 +73,7 @@ def test_every_skip_rule_of_the_mapper_is_turned_round() -> None:
     for rule, (as_is, turned) in pairs.items():
         *base, change = turned.overrides
         assert as_is.overrides == tuple(base)
-        assert (load_launch(None, base).mapping.iterations is None) == (rule == "skip_depth")
+        assert (load_launch(None, base).mapping.iterations is None) == (rule in HURRIED_RULES)
         changed = load_launch(None, [change]).mapping
         assert [name for name in MappingConfig.model_fields
                 if getattr(changed, name) != getattr(MappingConfig(), name)] == [rule]  # fmt: skip
@@ -170,6 +170,7 @@ def test_everything_is_measured_on_a_tiny_session(phantom_session: Path, tmp_pat
     assert full["depth"]["median_mm"] < halved["depth"]["median_mm"] < 3 and full["frame_ms"]["p50"] > 0
     assert offline["heldout"]["psnr"] == 41.0
 
+    assert {each["rule"] for each in session["skips"]} == set(skip_rules())
     depth = next(each for each in session["skips"] if each["rule"] == "skip_depth")
     assert depth["on"]["skipped"]["depth"] > 0 and "depth" not in depth["off"]["skipped"]
     skip = next(each for each in session["skips"] if each["rule"] == "skip_duplicates")

@@ -96,10 +96,10 @@ def twin_planes(view: Camera, inputs: Sequence[Any], variance: F64, twist: Any =
     import torch
 
     from sags_node.engine import reference
-    from sags_node.engine.rasterize import _as_pinhole
+    from sags_node.engine.rasterize import as_pinhole
 
     tensors = [torch.as_tensor(array) for array in inputs]
-    splats = reference.project(_as_pinhole(view), tensors, torch.tensor(variance), twist)
+    splats = reference.project(as_pinhole(view), tensors, torch.tensor(variance), twist)
     return reference.blend(splats, view.width, view.height)
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Literal
 
 from sags_node.config import LaunchConfig, PublishConfig
+from sags_node.engine.device import find_gpu, has_gpu
 from sags_node.errors import UsageError
 from sags_node.messaging.security import check_endpoint, read_allow_list, read_key_pair
 
@@ -46,6 +47,7 @@ def examine(config: LaunchConfig) -> list[Check]:
         *(_package(name) for name in REQUIRED),
         *(_library(name, package) for name, package in OPEN3D_LIBRARIES.items()),
         _cores(),
+        _gpu(config),
         _kernel_cache(),
         *_ports(config.publish),
         *_keys(config.publish),
@@ -80,6 +82,17 @@ def _cores() -> Check:
     if cores < 2:
         return Check("CPU", "warning", f"{cores} core", "camera rate needs two cores")
     return Check("CPU", "ok", f"{cores} cores, {platform.machine()}")
+
+
+def _gpu(config: LaunchConfig) -> Check:
+    """What the GPU's test drawing says. A machine without one is no worse for it, unless one is wanted."""
+    if config.device == "cpu":
+        return Check("GPU", "ok", "not used: device is cpu")
+    found = find_gpu()
+    if found.kind == "cuda":
+        return Check("GPU", "ok", f"{found.name}: draws what the CPU draws")
+    level: Level = "error" if config.device == "cuda" else "warning" if has_gpu() else "ok"
+    return Check("GPU", level, f"not used: {found.reason}", found.mend if level != "ok" else "")
 
 
 def _kernel_cache() -> Check:

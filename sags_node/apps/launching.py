@@ -13,6 +13,7 @@ from sags_node.apps.terminal import check_file, console, progress, writing
 from sags_node.errors import UsageError
 
 if TYPE_CHECKING:
+    from sags_node.engine.device import Device
     from sags_node.session import Session
 
 Command = TypeVar("Command", bound=Callable[..., Any])
@@ -63,7 +64,8 @@ def split_recording(arguments: Sequence[str], no_cameras: str) -> tuple[str | No
 
 
 def open_launched(path: str | None, overrides: Sequence[str]) -> Session:
-    """Open a session and make its kernels ready, saying what takes long."""
+    """Open a session and make its kernels ready, saying what takes long and what it runs on."""
+    from sags_node.mapping.devices import device_of
     from sags_node.session import open_session
     from sags_node.warm_up import warm_up
 
@@ -71,7 +73,12 @@ def open_launched(path: str | None, overrides: Sequence[str]) -> Session:
         session = open_session(path, overrides, advance)
     with console.status("loading kernels (compiled once per machine, about half a minute)"):
         warm_up(session.config)
+    console.print(_runs_on(device_of(session.config)), soft_wrap=True)
     return session
+
+
+def _runs_on(device: Device) -> str:
+    return f"refining on {device.name}" + (f" ({device.reason})" if device.reason else "")
 
 
 def count_frames(path: str | None, overrides: Sequence[str], seconds: float) -> int:

@@ -20,6 +20,7 @@ from sags_node.evaluation.machine import machine_name
 from sags_node.evaluation.metrics import psnr
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.mapper import Mapper
+from sags_node.mapping.refiner import CpuRefiner
 from sags_node.model.alias_free import smoothing_variances
 from sags_node.types import F32, Camera, Gaussians, Observation
 
@@ -78,7 +79,7 @@ def train(observation: Observation, filters: Filters, settings: Settings) -> Tra
     """A model of one still picture, by the node's own mapper."""
     camera = observation.camera
     rasterizer = make_rasterizer("numba", camera.width, camera.height, filters.screen)
-    mapper = Mapper(rasterizer, settings.max_gaussians, filters.world, focus=1.0)
+    mapper = Mapper(CpuRefiner(rasterizer), settings.max_gaussians, filters.world, focus=1.0)
     for _ in range(1 + settings.rounds):  # the first places the Gaussians
         mapper.update(observation, StepBudget(STEPS_PER_ROUND))
     return Trained(mapper.model.gaussians(), filters.screen)

@@ -22,7 +22,7 @@ from sags_node.evaluation.measure import FrameRow, Progress
 from sags_node.evaluation.session import measure, run_step
 from sags_node.evaluation.spool import Spool
 from sags_node.evaluation.summary import summarise
-from sags_node.mapping.budget import capacity
+from sags_node.mapping.devices import affordable
 from sags_node.session import Session, open_session
 from sags_node.sources.source import open_source
 from sags_node.vision.rectify import Rectifier
@@ -114,7 +114,8 @@ class _Comparison:
         session, parts = self._session, self._sweep.parts
         timed = time_settings(session.config, self._size, parts)
         mapping = session.config.mapping
-        skips = skip_settings(mapping, capacity(mapping, *self._size)) if "skips" in parts else {}
+        most = affordable(session.config, *self._size)
+        skips = skip_settings(mapping, most) if "skips" in parts else {}
         pairs = [setting for pair in skips.values() for setting in pair]
         runs: dict[Setting, list[Row]] = {setting: [] for setting in (*timed, *pairs)}
         turns = [setting for _ in range(self._sweep.repeat) for setting in runs]

@@ -15,7 +15,7 @@ SIZES = (0.75, 0.5)  # of the launch file's working size
 COUNTS = (10_000, 20_000, 30_000, 50_000, 70_000)
 COUNT_BUDGETS_MS = (33.0, 100.0)
 SKIP_STEPS = 2  # per frame, where rules that leave work out are compared
-HURRIED_RULES = ("skip_depth",)  # that act when time is short
+HURRIED_RULES = ("skip_depth", "skip_fitted")  # that act when time is short
 HURRY_MS = 1.0  # a budget that no frame keeps
 
 BUDGET, COUNT = "mapping.budget_ms", "mapping.max_gaussians"

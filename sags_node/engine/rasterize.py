@@ -20,14 +20,17 @@ from sags_node.types import F32, I32, Bool, Camera, Gaussians, RenderedView
 
 SH_TERMS = (0, 3, 8, 15)  # spherical harmonics of degree 0 to 3 without the constant
 
-__all__ = ["TILE_HEIGHT", "TILE_WIDTH", "Gradients", "Rasterizer", "make_rasterizer", "rasterize", "to_view"]
+__all__ = [
+    "TILE_HEIGHT", "TILE_WIDTH", "Gradients", "Rasterizer", "as_pinhole", "make_rasterizer", "rasterize",
+    "to_view",
+]  # fmt: skip
 
 
 def make_rasterizer(backend: str, width: int, height: int, antialias: bool = True) -> Rasterizer:
     """A rasteriser for pictures of one size (px).
 
     Args:
-        backend: "numba" (fast) or "reference" (torch, slow).
+        backend: "numba" (CPU), "cuda" (Triton kernels on a GPU) or "reference" (torch, slow).
         width, height: px.
         antialias: the 2D filter of Mip-Splatting. False: the fixed dilation of 3D Gaussian Splatting in its
             place, which grows brighter and thicker when the picture gets smaller. For comparison only.
@@ -41,11 +44,15 @@ def make_rasterizer(backend: str, width: int, height: int, antialias: bool = Tru
         from sags_node.engine.numba_rasterizer import NumbaRasterizer
 
         return _CheckedRasterizer(NumbaRasterizer(width, height, antialias), width, height)
+    if backend == "cuda":
+        from sags_node.engine.cuda.backend import CudaBackend
+
+        return _CheckedRasterizer(CudaBackend(width, height, antialias), width, height)
     if backend == "reference":
         from sags_node.engine.reference import ReferenceRasterizer
 
         return _CheckedRasterizer(ReferenceRasterizer(antialias), width, height)
-    raise UsageError(f"unknown engine backend '{backend}'; choose numba or reference")
+    raise UsageError(f"unknown engine backend '{backend}'; choose numba, cuda or reference")
 
 
 def rasterize(
@@ -88,9 +95,7 @@ class _CheckedRasterizer:
                 f"tiles is {tiles.dtype} {list(tiles.shape)}, expected bool {list(shape)}: one for each "
                 f"{TILE_WIDTH}x{TILE_HEIGHT} px of each camera"
             )
-        planes = self._backend.forward(
-            _checked(gaussians), [_as_pinhole(camera) for camera in cameras], tiles
-        )
+        planes = self._backend.forward(_checked(gaussians), [as_pinhole(camera) for camera in cameras], tiles)
         self._drawn = len(cameras)
         return planes
 
@@ -107,7 +112,8 @@ class _CheckedRasterizer:
         return self._backend.median()
 
 
-def _as_pinhole(camera: Camera) -> Pinhole:
+def as_pinhole(camera: Camera) -> Pinhole:
+    """A camera as the rasterisers see it. UsageError: it has the wrong shape, or is no pinhole."""
     K, view = camera.K, camera.viewmat
     if K.shape != (3, 3) or view.shape != (4, 4):
         raise UsageError(f"a camera needs K [3, 3] and T_world_cam [4, 4], got {K.shape} and {view.shape}")

@@ -17,7 +17,8 @@ from sags_node.evaluation.measure import FrameRow, Measurer, Options, Progress
 from sags_node.evaluation.spool import Spool
 from sags_node.evaluation.summary import GROUPS, summarise
 from sags_node.launch_file import load_launch
-from sags_node.mapping.budget import capacity, make_budget
+from sags_node.mapping.budget import make_budget
+from sags_node.mapping.devices import affordable, device_of
 from sags_node.node import Node
 from sags_node.pipeline import Pipeline
 from sags_node.session import Session, open_session
@@ -112,8 +113,9 @@ def measure(
         "pace": None if isinstance(config.source, V4l2Source) else config.source.pace,
         "iterations": config.mapping.iterations,
         "right_eye": config.mapping.right_eye,
-        "max_gaussians": capacity(config.mapping, *session.working_size),
+        "max_gaussians": affordable(config, *session.working_size),
         "backend": config.engine.backend,
+        "device": device_of(config).kind,
         "seed": config.seed,
         "width": session.working_size[0],
         "height": session.working_size[1],

@@ -23,8 +23,8 @@ from sags_node.fitting.density import EVERY, Density
 from sags_node.fitting.field import make_box, make_decoder, make_field, row_rates
 from sags_node.fitting.settings import FitSettings
 from sags_node.fitting.start import Progress, follow_online, learn_paths, pooled_rows, remainder
-from sags_node.mapping.mapper import DEPTH_SCALE, DEPTH_WEIGHT
 from sags_node.mapping.optimiser import COLOUR_RELAXATION, Rates
+from sags_node.mapping.refiner import DEPTH_SCALE, DEPTH_WEIGHT
 from sags_node.model import columns
 from sags_node.model.deformable import DeformableModel
 from sags_node.model.exposure import Exposure

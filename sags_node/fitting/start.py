@@ -19,6 +19,7 @@ from sags_node.fitting.settings import FitSettings
 from sags_node.geometry import unproject
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.mapper import Mapper
+from sags_node.mapping.refiner import CpuRefiner
 from sags_node.model import columns
 from sags_node.model.activation import deactivate
 from sags_node.model.exposure import Exposure
@@ -113,7 +114,7 @@ def follow_online(
     """
     slots = {*range(0, len(clip.train), FRAMES_PER_SLOT), len(clip.train) - 1}
     check_size(len(slots), settings.max_gaussians)
-    mapper, budget = Mapper(rasterizer, settings.max_gaussians), StepBudget(ONLINE_STEPS)
+    mapper, budget = Mapper(CpuRefiner(rasterizer), settings.max_gaussians), StepBudget(ONLINE_STEPS)
     seen: list[tuple[I64, F32]] = []
     first = _Places()
     for done, frame in enumerate(clip.train):

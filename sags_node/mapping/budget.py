@@ -80,8 +80,15 @@ class TimeBudget:
     busy with something else.
     """
 
-    def __init__(self, seconds: float, clock: Callable[[], float] = time.perf_counter) -> None:
+    def __init__(
+        self, seconds: float, skip_fitted: bool = True, clock: Callable[[], float] = time.perf_counter
+    ) -> None:
+        """
+        Args:
+            skip_fitted: False: the first step is on the whole picture, whatever the time.
+        """
         self.seconds = seconds
+        self._skip_fitted = skip_fitted
         self.share = 1.0
         self._clock = clock
         self._step_cost = _RunningMean()
@@ -122,7 +129,7 @@ class TimeBudget:
 
     def affords_whole(self) -> bool:
         needed = self._whole_cost.value + self._after_cost.value
-        self._whole = self._clock() + needed <= self._deadline
+        self._whole = not self._skip_fitted or self._clock() + needed <= self._deadline
         if not self._whole:  # as above
             self._whole_cost.value *= FORGET
         return self._whole
@@ -168,4 +175,4 @@ def make_budget(config: MappingConfig) -> Budget:
     """Fixed steps where the configuration names them, else its time."""
     if config.iterations is not None:
         return StepBudget(config.iterations)
-    return TimeBudget(config.budget_ms * 1e-3)
+    return TimeBudget(config.budget_ms * 1e-3, config.skip_fitted)

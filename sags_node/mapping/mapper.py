@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from sags_node.engine.losses import tissue_loss
-from sags_node.engine.rasterize import Gradients, Rasterizer
 from sags_node.mapping import densify, initialise
 from sags_node.mapping.budget import Budget
-from sags_node.mapping.exposure import exposure_gain
-from sags_node.mapping.focus import pixels_of, tile_grid, with_neighbours, worst_tiles
+from sags_node.mapping.focus import with_neighbours
 from sags_node.mapping.motion import OpticalFlow, depth_pull, found_again, scene_flow
-from sags_node.mapping.optimiser import Optimiser, Rates
-from sags_node.mapping.right_eye import right_eye_loss
+from sags_node.mapping.optimiser import Rates
+from sags_node.mapping.refiner import Refiner
 from sags_node.model.alias_free import smoothing_variances
-from sags_node.model.deformation import Deformation, NodeDeformation
+from sags_node.model.deformation import NodeDeformation
 from sags_node.model.gaussians import GaussianModel
 from sags_node.types import F32, U8, Bool, Observation, RenderedView, Snapshot
 
@@ -35,8 +32,6 @@ LOST_COVERAGE = 0.3  # of the tissue
 INITIAL_RATES = Rates().scaled(4.0)
 UNHURRIED_RATES = 0.6  # measured with six steps: +0.3 dB; with one step a frame it loses as much
 NODE_STEP_PX = 0.08
-DEPTH_WEIGHT = 2e-3  # of a depth residual of DEPTH_SCALE, against colours 0..1
-DEPTH_SCALE = 1e-3  # m: beyond this a depth residual counts linearly
 
 
 @dataclass(slots=True)
@@ -58,7 +53,7 @@ class Mapper:
 
     def __init__(
         self,
-        rasterizer: Rasterizer,
+        refiner: Refiner,
         max_gaussians: int,
         smoothing: bool = True,
         unhurried: bool = False,
@@ -66,6 +61,7 @@ class Mapper:
     ) -> None:
         """
         Args:
+            refiner: draws and refines the model; it must be drawn with `refiner.show` for `drawn`.
             smoothing: draw the Gaussians with the 3D filter (`model.alias_free`).
             unhurried: see `pace`.
             focus: share of the picture, where it is worst, for the steps after the first of a frame.
@@ -73,23 +69,18 @@ class Mapper:
         self.model = GaussianModel(max_gaussians)
         self.step = 0
         self.restarts = 0  # how often a new model was begun because the old one did not fit any more
-        self._rasterizer = rasterizer
+        self._refiner = refiner
         self._smoothing = smoothing
         self._focus = focus
-        self._optimiser = Optimiser()
         self.pace(unhurried)
-        self._deformation: Deformation | None = None
+        self._deformation: NodeDeformation | None = None
         self._last: Drawn | None = None
         self._found: tuple[U8, F32] | None = None  # a picture, and the pixels where the Gaussians are in it
         self._still = False  # whether nothing moved in the frame taken in last
         self.stale_tiles: Bool | None = None  # [1, rows, columns] to be drawn anew after `update`; None: all
         self._frames = 0
         self._frames_to_depth = 0  # since depth was known last
-        self._loss = 0.0
         self._metres_per_px = 0.0  # at the tissue's median depth
-        # [eyes, 5, H, W] and [eyes, H, W]; the planes are the rasteriser's memory: what it drew last
-        self._planes: F32 = np.zeros((1, 5, 1, 1), np.float32)
-        self._v_planes, self._weight = np.zeros_like(self._planes), np.zeros((1, 1, 1), np.float32)
 
     def update(self, observation: Observation, budget: Budget, still: int = 0) -> Snapshot:
         """Take one frame in. Call `drawn` with the picture of the snapshot before the next update.
@@ -117,7 +108,7 @@ class Mapper:
             gaussians=self.model.frozen(),
             velocities=self.model.velocities.copy(),
             camera=observation.camera,
-            loss=self._loss,
+            loss=self._refiner.loss,
             counts=counts,
         )
 
@@ -171,9 +162,12 @@ class Mapper:
         rows = initialise.insert(self.model, observation, pixels, depths, spacing, self._smoothing)
         self._deformation = NodeDeformation(self.model.means, CONTROL_NODES)
         self._deformation.attach(self.model, rows)
+        self._begin(observation)
         for _ in range(INITIAL_STEPS):
-            self._draw(observation)
-            self.model.contribution[:] = self._refine(observation, INITIAL_RATES).contribution
+            self._refiner.draw()
+            self._refiner.refine(INITIAL_RATES)
+        self._refiner.give_back()
+        self.step += INITIAL_STEPS
         return {"inserted": len(pixels), "iterations": INITIAL_STEPS}
 
     def _follow(self, observation: Observation, budget: Budget) -> dict[str, int]:
@@ -184,29 +178,37 @@ class Mapper:
         if self._smoothing:
             self._sharpen(observation)
 
-        planes = self._draw(observation)
-        gain = exposure_gain(planes, observation.image, observation.tissue)
+        self._begin(observation)
+        self._refiner.draw()
+        gain = self._refiner.exposure_gain()
         if np.abs(gain - 1).max() > EXPOSURE_JUMP:
             self.model.colors[:] *= gain
-            planes = self._draw(observation)
+            self._refiner.take(self._all_rows)
+            self._refiner.draw()
+        planes = self._refiner.planes()
         if _is_lost(planes, observation) and self._can_start(observation):
             self.restart()
             return self._initialise(observation) | {"restarted": 1}
         pixels, depths = densify.candidates(planes, observation, phase=7 * self._frames)
         iterations = 0
         if budget.more():  # before inserting, so that the drawing above serves both
-            self._refine_first(observation, budget)
+            self._refiner.refine(self._rates, 1.0 if budget.affords_whole() else HURRIED_SHARE)
             iterations = 1
         room = max(HOLES, limit - self.model.count)
         pixels, depths = pixels[:room], depths[:room]
         lacking = min(len(pixels), HOLES) - self.model.free
         if 0 < lacking < self.model.count:  # the view has grown: what is in it gives way
+            self._refiner.give_back()
             removed += self.model.remove(densify.least_shown(self.model, lacking))
+            self._refiner.take(self._all_rows)
         rows = initialise.insert(self.model, observation, pixels, depths, densify.GRID, self._smoothing)
         self._deformation.attach(self.model, rows)
+        self._refiner.take(rows)
         while budget.more():
-            self._refine_worst(observation)
+            self._refiner.refine_worst(self._focus, self._rates)
             iterations += 1
+        self._refiner.give_back()
+        self.step += iterations
         return {"inserted": rows.stop - rows.start, "removed": removed, "iterations": iterations}
 
     def _touch_up(self, observation: Observation, budget: Budget, settled: bool) -> dict[str, int]:
@@ -217,31 +219,25 @@ class Mapper:
         self.model.velocities[:] = 0
         removed = self.model.remove(doomed)
         rests = settled and self._frames % SETTLED_EVERY > 0
-        touched: list[Bool] = []
-        while not (rests or (settled and touched)) and budget.more():
-            touched.append(self._refine_worst(observation, nodes=False))
+        iterations = 0
+        self._begin(observation)
+        while not (rests or (settled and iterations)) and budget.more():
+            self._refiner.refine_worst(self._focus, self._rates, nodes=False)
+            iterations += 1
+        self._refiner.give_back()
+        self.step += iterations
         if removed == 0:
-            untouched = tile_grid(observation.tissue)
-            self.stale_tiles = with_neighbours(np.logical_or.reduce([untouched, *touched]))
-        return {"inserted": 0, "removed": removed, "iterations": len(touched)}
+            self.stale_tiles = with_neighbours(self._refiner.touched())
+        return {"inserted": 0, "removed": removed, "iterations": iterations}
 
-    def _refine_first(self, observation: Observation, budget: Budget) -> None:
-        """A step on the whole picture, or in a hurry on the larger part of it that needs it most."""
-        contribution = self.model.contribution
-        if budget.affords_whole():
-            contribution[:] = self._refine(observation, self._rates).contribution
-            return
-        tissue = observation.tissue
-        tiles = worst_tiles(self._planes[0], observation.image, tissue, HURRIED_SHARE)
-        part = replace(observation, tissue=tissue & pixels_of(tiles, tissue.shape))
-        shown = self._refine(part, self._rates).contribution
-        np.copyto(contribution, shown, where=shown > 0)  # what lies elsewhere shows what it did before
+    def _begin(self, observation: Observation) -> None:
+        assert self._deformation is not None
+        step = NODE_STEP_PX * self._metres_per_px
+        self._refiner.begin(self.model, self._deformation, observation, step)
 
-    def _refine_worst(self, observation: Observation, nodes: bool = True) -> Bool:
-        tiles = worst_tiles(self._planes[0], observation.image, observation.tissue, self._focus)
-        self._draw(observation, tiles)
-        self._refine(observation, self._rates, nodes)
-        return tiles
+    @property
+    def _all_rows(self) -> slice:
+        return slice(0, self.model.count)
 
     def _predict(self, observation: Observation) -> None:
         """Move all Gaussians to where flow and depth saw the tissue go."""
@@ -269,45 +265,11 @@ class Mapper:
 
     def _limit(self, budget: Budget) -> int:
         """How many Gaussians this machine can afford."""
-        return round(budget.share * self.model.capacity)
+        return round(min(budget.share, self._refiner.share) * self.model.capacity)
 
     def _can_start(self, observation: Observation) -> bool:
         """Whether this frame has depth enough for a first model."""
         return bool(np.count_nonzero(observation.depth) >= MIN_FIRST_DEPTHS)
-
-    def _draw(self, observation: Observation, tiles: Bool | None = None) -> F32:
-        """Planes [5, H, W] of the left eye; the right one is drawn too where it is learnt from, except by
-        `tiles`: those are of the left eye."""
-        cameras = [observation.camera]
-        if observation.right is not None and tiles is None:
-            cameras.append(observation.camera.moved_right(observation.baseline))
-        self._planes = self._rasterizer.forward(self.model.gaussians(), cameras, tiles)
-        left: F32 = self._planes[0]
-        return left
-
-    def _refine(self, observation: Observation, rates: Rates, nodes: bool = True) -> Gradients:
-        """One step on what was drawn last: loss and its gradient, back-propagation, nodes, Gaussians."""
-        assert self._deformation is not None
-        planes = self._planes
-        eyes = len(planes)
-        if len(self._weight) < eyes or self._weight.shape[1:] != planes.shape[2:]:
-            self._v_planes = np.zeros_like(planes)
-            self._weight = np.zeros((eyes, *planes.shape[2:]), np.float32)
-        v_planes, weight = self._v_planes[:eyes], self._weight[:eyes]
-        self._loss = tissue_loss(
-            planes[0], observation.image, observation.tissue, observation.depth,
-            v_planes[0], weight[0], DEPTH_WEIGHT, DEPTH_SCALE,
-        )  # fmt: skip
-        if eyes > 1:
-            right_eye_loss(planes, observation, v_planes[1], weight[1])
-        gradients = self._rasterizer.backward(v_planes, weight)
-        if nodes:  # they move all that follows them, also far from the tiles that were drawn
-            self._deformation.descend(
-                self.model, gradients.means, gradients.contribution, NODE_STEP_PX * self._metres_per_px
-            )
-        self._optimiser.step(self.model, gradients, observation.camera, rates)
-        self.step += 1
-        return gradients
 
 
 def _is_lost(planes: F32, observation: Observation) -> bool:

@@ -1,11 +1,9 @@
-"""How the tissue moves: what every deformation must offer, and the one made of control nodes.
-
-A deformation turns what was observed of some Gaussians into a motion of all of them, the hidden ones too.
-"""
+"""How the tissue moves: what was observed of some Gaussians becomes a motion of all of them, the hidden ones
+too."""
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numba import prange
@@ -19,32 +17,6 @@ _LEAST_SEEN = 0.5  # weight of what was seen around a node: below it nothing is 
 _LEAST_STIFFNESS = 0.2  # in squared node spacings: what little is known of a gradient is not believed
 _NEW_NODE_DISTANCE = 1.5  # in node spacings: farther new tissue gets nodes of its own
 _PIECE = 1024  # rows a thread takes at a time: a call for each row would count references to every array
-
-
-class Deformation(Protocol):
-    """What the mapper asks of a deformation."""
-
-    def attach(self, model: GaussianModel, rows: slice) -> None:
-        """Let the Gaussians in `rows` follow this deformation."""
-
-    def follow(self, model: GaussianModel, displacements: F32, seen: F32) -> None:
-        """Move all Gaussians by what was observed.
-
-        Args:
-            model: its `means` are moved.
-            displacements: [N, 3] m, observed where `seen`.
-            seen: [N] weight of the observation, 0 = not seen.
-        """
-
-    def descend(self, model: GaussianModel, gradients: F32, contribution: F32, step: float) -> None:
-        """Move all Gaussians down the loss.
-
-        Args:
-            model: its `means` are moved.
-            gradients: [N, 3] of the loss by the means.
-            contribution: [N] weight of each Gaussian in the picture, 0 = not seen.
-            step: length of one step, m.
-        """
 
 
 class NodeDeformation:
@@ -66,6 +38,7 @@ class NodeDeformation:
         self._neighbours = self._find_neighbours()
 
     def attach(self, model: GaussianModel, rows: slice) -> None:
+        """Let the Gaussians in `rows` follow the nodes."""
         means = model.means[rows]
         if len(means) == 0:
             return
@@ -78,6 +51,13 @@ class NodeDeformation:
         model.node_weight[rows] = weight
 
     def follow(self, model: GaussianModel, displacements: F32, seen: F32) -> None:
+        """Move and turn all Gaussians by what was observed.
+
+        Args:
+            model: its `means` and `quats` are changed.
+            displacements: [N, 3] m, observed where `seen`.
+            seen: [N] weight of the observation, 0 = not seen.
+        """
         motion, weight = _average(displacements, seen, model.node_index, model.node_weight, len(self.nodes))
         _spread(motion, weight, self._neighbours, _SMOOTHING_ROUNDS)
         # The motion is that of the middle of what was seen around a node, not of the node itself.
@@ -89,6 +69,14 @@ class NodeDeformation:
         self.nodes += motion + np.einsum("mab,mb->ma", gradients, self.nodes - places)
 
     def descend(self, model: GaussianModel, gradients: F32, contribution: F32, step: float) -> None:
+        """Move all Gaussians down the loss.
+
+        Args:
+            model: its `means` are moved.
+            gradients: [N, 3] of the loss by the means.
+            contribution: [N] weight of each Gaussian in the picture, 0 = not seen.
+            step: length of one step, m.
+        """
         gradient, _ = _average(
             gradients,
             (contribution > 1e-3).astype(np.float32),

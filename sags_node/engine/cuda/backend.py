@@ -1,0 +1,69 @@
+"""The GPU rasteriser as `interface.Backend`: arrays of the host in and out, copied on every call."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+import triton
+
+from sags_node.engine.cuda.rasterizer import CudaRasterizer
+from sags_node.engine.cuda.scene import DeviceGaussians
+from sags_node.engine.interface import Gradients, Pinhole
+from sags_node.errors import UsageError
+from sags_node.types import F32, I32, Bool, Gaussians
+
+
+def default_device() -> torch.device:
+    """The current GPU, or the CPU where Triton's interpreter runs the kernels.
+
+    Raises:
+        UsageError: there is no GPU.
+    """
+    if triton.knobs.runtime.interpret:
+        return torch.device("cpu")
+    if not torch.cuda.is_available():
+        raise UsageError(
+            "the cuda backend found no GPU: this torch has no CUDA build or sees no driver (try nvidia-smi); "
+            "mend that, or choose the numba backend"
+        )
+    return torch.device("cuda", torch.cuda.current_device())
+
+
+class CudaBackend:
+    """Backend `cuda`. For arrays that live on the host; what stays on the device uses `CudaRasterizer`."""
+
+    def __init__(self, width: int, height: int, antialias: bool) -> None:
+        self._device = default_device()
+        self._rasterizer = CudaRasterizer(width, height, antialias, self._device)
+
+    def forward(self, gaussians: Gaussians, pinholes: Sequence[Pinhole], tiles: Bool | None) -> F32:
+        planes: F32 = (
+            self._rasterizer.draw(
+                DeviceGaussians.from_host(gaussians, self._device),
+                pinholes,
+                None if tiles is None else torch.tensor(tiles),
+            )
+            .cpu()
+            .numpy()
+        )
+        return planes
+
+    def backward(self, v_planes: F32, weight: F32, geometry: bool) -> Gradients:
+        found = self._rasterizer.pull_back(
+            torch.tensor(v_planes, device=self._device), torch.tensor(weight, device=self._device), geometry
+        )
+        return Gradients(
+            means=found.means.cpu().numpy(),
+            quats=found.quats.cpu().numpy(),
+            scales=found.scales.cpu().numpy(),
+            opacities=found.opacities.cpu().numpy(),
+            colors=found.colors.cpu().numpy(),
+            sh_rest=found.sh_rest.cpu().numpy(),
+            poses=found.poses.cpu().numpy(),
+            contribution=found.contribution.cpu().numpy(),
+        )
+
+    def median(self) -> tuple[F32, I32]:
+        depths, rows = self._rasterizer.median_depth()
+        return depths.cpu().numpy(), rows.cpu().numpy()

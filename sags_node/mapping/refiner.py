@@ -1,0 +1,172 @@
+"""What is done to the model many times per frame, behind one small interface; here on the CPU."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Protocol
+
+import numpy as np
+
+from sags_node.engine.losses import tissue_loss
+from sags_node.engine.rasterize import Gradients, Rasterizer
+from sags_node.mapping.exposure import exposure_gain
+from sags_node.mapping.focus import pixels_of, tile_grid, worst_tiles
+from sags_node.mapping.optimiser import Optimiser, Rates
+from sags_node.mapping.right_eye import right_eye_loss
+from sags_node.model.deformation import NodeDeformation
+from sags_node.model.gaussians import GaussianModel
+from sags_node.types import F32, Bool, Camera, Gaussians, Observation
+
+DEPTH_WEIGHT = 2e-3  # of a depth residual of DEPTH_SCALE, against colours 0..1
+DEPTH_SCALE = 1e-3  # m: beyond this a depth residual counts linearly
+
+
+class Refiner(Protocol):
+    """Draws the model and moves it towards a frame.
+
+    Between `begin` and `give_back` the refiner owns the rows that it was given: what it did to them, and to
+    the nodes, is seen in the model only after `give_back`. Rows may be appended meanwhile (`take`).
+    """
+
+    @property
+    def loss(self) -> float:
+        """Mean absolute colour residual before the last step that was given back."""
+
+    @property
+    def share(self) -> float:
+        """How much of the model's capacity it can refine, 0..1."""
+
+    @property
+    def problem(self) -> str | None:
+        """What is wrong with it and how to mend it; None: nothing. May be read from any thread."""
+
+    def begin(
+        self, model: GaussianModel, deformation: NodeDeformation, observation: Observation, node_step: float
+    ) -> None:
+        """Take the model, all of it, and the frame that it is to show.
+
+        Args:
+            node_step: m, length of one step of the nodes.
+        """
+
+    def take(self, rows: slice) -> None:
+        """Take these rows of the model, which the host has written; nodes that were added as well."""
+
+    def give_back(self) -> None:
+        """Write what was refined into the model and the nodes."""
+
+    def draw(self) -> None:
+        """Draw the model for the frame's camera; the right eye too where it is learnt from."""
+
+    def planes(self) -> F32:
+        """[5, H, W] of the left eye, as they were drawn last; overwritten by the next drawing."""
+
+    def exposure_gain(self) -> F32:
+        """[3] see `exposure.exposure_gain`, of what was drawn last."""
+
+    def refine(self, rates: Rates, share: float = 1.0) -> None:
+        """One step on what was drawn last: loss and its gradient, back-propagation, nodes, Gaussians. The
+        model learns what each of them contributes to the picture.
+
+        Args:
+            share: of the picture that counts, where it is worst.
+        """
+
+    def refine_worst(self, share: float, rates: Rates, nodes: bool = True) -> None:
+        """Draw that share of the picture anew, where it is worst, and take one step on it.
+
+        Args:
+            nodes: move them too.
+        """
+
+    def touched(self) -> Bool:
+        """The tiles [1, rows, columns] that `refine_worst` drew since `begin`."""
+
+    def show(self, gaussians: Gaussians, camera: Camera, tiles: Bool | None = None) -> F32:
+        """Planes [5, H, W] of any Gaussians: what was drawn last from then on. As `Rasterizer.forward`."""
+
+
+class CpuRefiner:
+    """The refiner that works on the model's own arrays."""
+
+    share = 1.0
+    problem: str | None = None
+
+    def __init__(self, rasterizer: Rasterizer) -> None:
+        self.loss = 0.0
+        self._rasterizer = rasterizer
+        self._optimiser = Optimiser()
+        # [eyes, 5, H, W] and [eyes, H, W]; the planes are the rasteriser's memory: what it drew last
+        self._planes: F32 = np.zeros((1, 5, 1, 1), np.float32)
+        self._v_planes, self._weight = np.zeros_like(self._planes), np.zeros((1, 1, 1), np.float32)
+
+    def begin(
+        self, model: GaussianModel, deformation: NodeDeformation, observation: Observation, node_step: float
+    ) -> None:
+        self._model, self._deformation, self._observation = model, deformation, observation
+        self._node_step = node_step
+        self._touched = tile_grid(observation.tissue)
+
+    def take(self, rows: slice) -> None:
+        pass
+
+    def give_back(self) -> None:
+        pass
+
+    def draw(self) -> None:
+        observation = self._observation
+        cameras = [observation.camera]
+        if observation.right is not None:
+            cameras.append(observation.camera.moved_right(observation.baseline))
+        self._planes = self._rasterizer.forward(self._model.gaussians(), cameras)
+
+    def planes(self) -> F32:
+        left: F32 = self._planes[0]
+        return left
+
+    def exposure_gain(self) -> F32:
+        return exposure_gain(self._planes[0], self._observation.image, self._observation.tissue)
+
+    def refine(self, rates: Rates, share: float = 1.0) -> None:
+        contribution = self._model.contribution
+        if share >= 1.0:
+            contribution[:] = self._step(self._observation, rates).contribution
+            return
+        observation, tissue = self._observation, self._observation.tissue
+        tiles = worst_tiles(self._planes[0], observation.image, tissue, share)
+        part = replace(observation, tissue=tissue & pixels_of(tiles, tissue.shape))
+        shown = self._step(part, rates).contribution
+        np.copyto(contribution, shown, where=shown > 0)  # what lies elsewhere shows what it did before
+
+    def refine_worst(self, share: float, rates: Rates, nodes: bool = True) -> None:
+        observation = self._observation
+        tiles = worst_tiles(self._planes[0], observation.image, observation.tissue, share)
+        self._planes = self._rasterizer.forward(self._model.gaussians(), [observation.camera], tiles)
+        self._step(observation, rates, nodes)
+        self._touched |= tiles
+
+    def touched(self) -> Bool:
+        return self._touched
+
+    def show(self, gaussians: Gaussians, camera: Camera, tiles: Bool | None = None) -> F32:
+        self._planes = self._rasterizer.forward(gaussians, [camera], tiles)
+        return self.planes()
+
+    def _step(self, observation: Observation, rates: Rates, nodes: bool = True) -> Gradients:
+        planes = self._planes
+        eyes = len(planes)
+        if len(self._weight) < eyes or self._weight.shape[1:] != planes.shape[2:]:
+            self._v_planes = np.zeros_like(planes)
+            self._weight = np.zeros((eyes, *planes.shape[2:]), np.float32)
+        v_planes, weight = self._v_planes[:eyes], self._weight[:eyes]
+        self.loss = tissue_loss(
+            planes[0], observation.image, observation.tissue, observation.depth,
+            v_planes[0], weight[0], DEPTH_WEIGHT, DEPTH_SCALE,
+        )  # fmt: skip
+        if eyes > 1:
+            right_eye_loss(planes, observation, v_planes[1], weight[1])
+        gradients = self._rasterizer.backward(v_planes, weight)
+        if nodes:  # they move all that follows them, also far from the tiles that were drawn
+            self._deformation.descend(self._model, gradients.means, gradients.contribution, self._node_step)
+        self._optimiser.step(self._model, gradients, observation.camera, rates)
+        return gradients

@@ -1,0 +1,445 @@
+"""The mapper on the device, in Triton's interpreter or on a GPU, against the mapper on the CPU; what happens
+when the device fails; and how a device is chosen."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("triton", reason="Triton comes with torch's CUDA builds, or by `pip install triton`")
+
+from sags_node.calibration import rectified_rig
+from sags_node.config import LaunchConfig, MappingConfig
+from sags_node.engine.cuda.rasterizer import CudaRasterizer
+from sags_node.engine.device import DeviceMemoryError
+from sags_node.engine.rasterize import make_rasterizer, to_view
+from sags_node.errors import UsageError
+from sags_node.mapping import cuda_refiner, densify, exposure, guarded_refiner, mapper
+from sags_node.mapping.anchors import Anchors
+from sags_node.mapping.budget import StepBudget
+from sags_node.mapping.cuda_refiner import REFINED, CudaRefiner
+from sags_node.mapping.guarded_refiner import LOWERED, GuardedRefiner
+from sags_node.mapping.mapper import HURRIED_SHARE, Mapper
+from sags_node.mapping.optimiser import Rates
+from sags_node.mapping.refiner import CpuRefiner, Refiner
+from sags_node.pipeline import Pipeline
+from sags_node.types import F32, Camera, Observation, RenderedView, Snapshot, StereoFrame
+
+# kernels divide by a coverage of zero and select afterwards; a GPU says nothing of it
+pytestmark = [
+    pytest.mark.filterwarnings("ignore::RuntimeWarning"),
+    pytest.mark.usefixtures("quick_interpreter"),
+]
+
+WIDTH, HEIGHT, FOCAL, BASELINE, DEPTH = 48, 24, 60.0, 0.004, 0.056
+CAPACITY = 72
+SAME_PSNR = 0.02  # dB
+CUDA_ERROR = RuntimeError("CUDA error: an illegal memory access was encountered\nand much more")
+
+
+@pytest.fixture(autouse=True)
+def small_mapper(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mapper, "INITIAL_STEPS", 1)
+    monkeypatch.setattr(mapper, "CONTROL_NODES", 8)
+    monkeypatch.setattr(exposure, "LEAST_PIXELS", 8)
+    rule = replace(cuda_refiner.EXPOSURE, least_pixels=8)
+    monkeypatch.setattr(cuda_refiner, "EXPOSURE", rule)
+    monkeypatch.setattr(cuda_refiner, "RIGHT_EYE", replace(cuda_refiner.RIGHT_EYE, exposure=rule))
+
+
+def texture(seed: int) -> F32:
+    coarse = np.random.default_rng(seed).uniform(0.2, 0.8, (5, 16, 3)).astype(np.float32)
+    return cv2.resize(coarse, (WIDTH + 48, HEIGHT))
+
+
+def frame(i: int, seed: int = 1, brightness: float = 1.0, instrument: bool = True) -> Observation:
+    """A tilted sheet that moves by a pixel per frame to the left, partly hidden."""
+    image = np.ascontiguousarray(texture(seed)[:, i : i + WIDTH]) * np.float32(brightness)
+    K = np.array([[FOCAL, 0, (WIDTH - 1) / 2], [0, FOCAL, (HEIGHT - 1) / 2], [0, 0, 1]])
+    tissue = np.ones((HEIGHT, WIDTH), np.bool_)
+    tissue[6:14, 30:38] = not instrument
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    depth = (DEPTH + 1e-4 * x + 1.3e-4 * y).astype(np.float32) * tissue  # no two Gaussians lie equally far
+    return Observation(
+        i, i * 33_000_000, Camera(WIDTH, HEIGHT, K, np.eye(4)), image,
+        (image.mean(2) * 255).astype(np.uint8), tissue, depth, np.ones_like(depth),
+    )  # fmt: skip
+
+
+def with_right_eye(observation: Observation) -> Observation:
+    """The disparity is 4 px."""
+    right = np.ascontiguousarray(texture(1)[:, observation.frame_id + 4 :][:, :WIDTH])
+    return replace(observation, right=right, baseline=BASELINE)
+
+
+def psnr(view: RenderedView, observation: Observation) -> float:
+    return float(-10 * np.log10(np.mean(np.square(view.rgb - observation.image)[observation.tissue])))
+
+
+@dataclass
+class Played:
+    """A mapper that has taken frames in, as the pipeline lets it."""
+
+    refiner: Refiner
+    mapper: Mapper
+
+    @classmethod
+    def on(cls, refiner: Refiner, capacity: int = CAPACITY) -> Played:
+        return cls(refiner, Mapper(refiner, capacity))
+
+    def take(self, observation: Observation, steps: int = 1, still: int = 0) -> tuple[Snapshot, RenderedView]:
+        snapshot = self.mapper.update(observation, started(StepBudget(steps)), still)
+        planes = self.refiner.show(snapshot.gaussians, snapshot.camera, self.mapper.stale_tiles)
+        view = to_view(planes, snapshot.camera, snapshot.frame_id, snapshot.t_capture_ns)
+        self.mapper.drawn(observation, view)
+        return snapshot, view
+
+    def row(self, name: str) -> np.ndarray:
+        return np.array(getattr(self.mapper.model, name))
+
+
+def started(budget: Any) -> Any:
+    budget.start()
+    return budget
+
+
+def on_cpu(capacity: int = CAPACITY) -> Played:
+    return Played.on(CpuRefiner(make_rasterizer("numba", WIDTH, HEIGHT)), capacity)
+
+
+def on_device(capacity: int = CAPACITY) -> Played:
+    return Played.on(CudaRefiner(WIDTH, HEIGHT), capacity)
+
+
+# ---- the same as on the CPU --------------------------------------------------------------------------------
+
+
+ADAM_COLUMNS = {
+    "means": slice(0, 3), "quats": slice(3, 7), "scales": slice(7, 10), "log_scales": slice(7, 10),
+    "opacities": slice(10, 11), "opacity_logits": slice(10, 11),
+}  # fmt: skip
+
+
+def assert_same_rows(a: Played, b: Played) -> None:
+    """After one step. Where a gradient is zero but for rounding, as that of a round Gaussian that is turned
+    around its axis, Adam makes a full step of its sign: such values are left out."""
+    assert np.array_equal(a.row("ids"), b.row("ids"))
+    for name in REFINED:
+        expected, found = a.row(name), b.row(name)
+        if name in ADAM_COLUMNS:
+            slopes = np.abs(a.row("adam_m")[:, ADAM_COLUMNS[name]]).reshape(expected.shape)
+            matters = slopes > 1e-4 * slopes.max()
+            assert matters.mean() > 0.3, name
+            expected, found = expected[matters], found[matters]
+        within = 1e-3 if "adam" in name else 1e-5
+        np.testing.assert_allclose(found, expected, rtol=2e-4, atol=within, err_msg=name)
+    nodes_a, nodes_b = (p.mapper._deformation.nodes for p in (a, b) if p.mapper._deformation)
+    np.testing.assert_allclose(nodes_b, nodes_a, atol=1e-7)
+
+
+@pytest.mark.parametrize("right", [False, True])
+def test_a_step_is_the_cpus(right: bool) -> None:
+    """The whole of it: drawing, both losses, gradients, nodes, optimiser, and the way there and back."""
+    observation = with_right_eye(frame(0)) if right else frame(0)
+    cpu, device, without = on_cpu(), on_device(), on_cpu()
+    for played in (cpu, device):
+        played.take(observation)
+    assert_same_rows(cpu, device)
+    without.take(frame(0))
+    learnt = np.abs(device.row("colors") - without.row("colors")).max() > 1e-3
+    assert learnt == right
+
+
+def test_a_hurried_step_is_the_cpus(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mapper, "INITIAL_STEPS", 0)
+    both = on_cpu(), on_device()
+    for played in both:
+        played.mapper.update(frame(0), StepBudget(0))
+        played.refiner.draw()
+        played.mapper.model.contribution[:] = 7.0
+        played.refiner.take(slice(0, played.mapper.model.count))
+        played.refiner.refine(Rates(), HURRIED_SHARE)
+        played.refiner.give_back()
+    assert_same_rows(*both)
+    kept = both[1].row("contribution") == 7.0
+    assert 0.05 < kept.mean() < 0.6
+
+
+def test_follows_the_tissue_as_the_cpu_does() -> None:
+    """Motion, insertion at the edge and where the instrument was, a jump of the exposure, anchors."""
+    frames = [frame(0), frame(1), frame(2, instrument=False), frame(3, brightness=0.8)]
+    found = []
+    for played in (on_cpu(), on_device()):
+        anchors, errors, counts = Anchors(), [], []
+        for observation in frames:
+            snapshot, view = played.take(observation, steps=2)
+            if observation.frame_id == 0:
+                anchors.add_pixel(20.0, 12.0, observation, snapshot, view)
+            anchors.update(observation, snapshot, view)
+            errors.append(psnr(view, observation))
+            counts.append(dict(snapshot.counts))
+        state = anchors.at(snapshot.t_capture_ns)
+        found.append((errors, counts, played.row("ids"), state.points, snapshot.step, snapshot.loss))
+    (errors, counts, ids, points, step, loss), device = found
+    np.testing.assert_allclose(device[0], errors, atol=SAME_PSNR)
+    assert min(errors) > 19
+    assert device[1] == counts and np.array_equal(device[2], ids) and device[4] == step == 7
+    np.testing.assert_allclose(device[3], points, atol=1e-5)
+    assert counts[2]["inserted"] > 2
+    assert device[5] == pytest.approx(loss, rel=0.05)
+
+
+def test_as_many_steps_as_the_budget_gives() -> None:
+    losses = []
+    for steps in (1, 3):
+        played = on_device()
+        played.take(frame(0))
+        snapshot, _ = played.take(frame(1), steps=steps)
+        assert snapshot.counts["iterations"] == steps
+        losses.append(snapshot.loss)
+    assert losses[1] < losses[0]  # before the last step
+
+
+def test_nothing_is_copied_between_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    played = on_device()
+    played.take(frame(0))
+    played.mapper._begin(frame(1))
+    played.refiner.draw()
+    before = {name: played.row(name) for name in REFINED}
+    with monkeypatch.context() as forbidden:
+        forbidden.setattr(torch.Tensor, "cpu", lambda self: pytest.fail("fetched from the device"))
+        forbidden.setattr(CudaRefiner, "_sent", lambda self, array: pytest.fail("sent to the device"))
+        played.refiner.refine(Rates())
+        played.refiner.refine_worst(0.3, Rates())
+    assert all(np.array_equal(before[name], played.row(name)) for name in REFINED)
+    played.refiner.give_back()
+    assert all(not np.array_equal(before[name], played.row(name)) for name in REFINED)
+
+
+def test_still_frames_touch_the_same_tiles() -> None:
+    found = []
+    for played in (on_cpu(), on_device()):
+        played.take(frame(0))
+        played.take(frame(0), steps=1, still=1)
+        stale = played.mapper.stale_tiles
+        assert stale is not None and 0 < stale.sum()
+        found.append((stale, played.refiner.touched()))
+    assert found[0][1].sum() == 1
+    np.testing.assert_array_equal(found[1], found[0])
+
+
+def test_a_still_frame_that_rests_changes_nothing() -> None:
+    played = on_device()
+    played.take(frame(0))
+    before = played.row("means")
+    snapshot, _ = played.take(frame(0), steps=0, still=1)
+    assert snapshot.counts["iterations"] == 0 and np.array_equal(before, played.row("means"))
+    assert played.mapper.stale_tiles is not None and not played.mapper.stale_tiles.any()
+
+
+def test_a_cut_begins_a_new_model_on_the_device() -> None:
+    played = on_device()
+    first, _ = played.take(frame(0))
+    negative = replace(frame(1), image=1 - frame(1, seed=5).image)
+    snapshot, view = played.take(negative)
+    assert snapshot.counts["restarted"] == 1 and played.mapper.restarts == 1
+    assert snapshot.gaussians.ids.min() > first.gaussians.ids.max()
+    assert psnr(view, negative) > 18
+    snapshot, view = played.take(replace(negative, frame_id=2, t_capture_ns=66_000_000))
+    assert "restarted" not in snapshot.counts and psnr(view, negative) > 18
+
+
+@pytest.mark.parametrize("where", ["means", "adam_m", "node_weight", "nodes"])
+def test_damage_is_healed(where: str) -> None:
+    """On its way through the device too; nodes are damaged for good on neither, but they move nothing."""
+    played = on_device()
+    played.take(frame(0))
+    deformation = played.mapper._deformation
+    assert deformation is not None
+    count = played.mapper.model.count
+    if where == "nodes":
+        played.refiner._nodes.momentum[3] = torch.nan  # type: ignore[attr-defined]
+    else:
+        getattr(played.mapper.model, where)[5] = np.nan
+    _, view = played.take(frame(1))
+    for name in REFINED:
+        assert not np.isnan(played.row(name)).any(), name
+    assert np.isfinite(deformation.nodes).all()
+    assert psnr(view, frame(1)) > 18 and played.mapper.model.count > 0.9 * count
+
+
+def test_a_full_model_gives_way_to_what_comes_into_view(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rows are removed between two steps: the model is fetched and sent once more."""
+    monkeypatch.setattr(densify, "LITTLE", 1e9)  # whatever shows least may go
+    found = []
+    for played in (on_cpu(56), on_device(56)):
+        removed = [played.take(frame(4 * i), steps=2)[0].counts.get("removed", 0) for i in range(3)]
+        found.append((removed, played.row("ids"), played.row("means"), played.row("colors")))
+    cpu, device = found
+    assert device[0] == cpu[0] and cpu[0][2] > 2
+    np.testing.assert_array_equal(device[1], cpu[1])
+    np.testing.assert_allclose(device[2], cpu[2], atol=1e-5)
+    np.testing.assert_allclose(device[3], cpu[3], atol=1e-2)
+
+
+def test_tissue_that_comes_into_view_gets_nodes_on_the_device_too() -> None:
+    counts = []
+    for played in (on_cpu(), on_device()):
+        for i in range(2):
+            observation = frame(i)
+            hidden = np.s_[:, : 0 if i else WIDTH // 2]
+            observation.tissue[hidden] = False
+            observation.depth[hidden] = 0
+            played.take(observation, steps=2)
+            assert played.mapper._deformation is not None
+            counts.append(len(played.mapper._deformation.nodes))
+    assert counts[1] > counts[0] and counts[2:] == counts[:2]
+    assert played.mapper.model.node_index.max() >= counts[0]
+    on_gpu = played.refiner._nodes.places.cpu().numpy()  # type: ignore[attr-defined]
+    np.testing.assert_array_equal(on_gpu, played.mapper._deformation.nodes)
+
+
+# ---- when the device fails ---------------------------------------------------------------------------------
+
+
+def guarded(cpu_share: float = 0.5) -> Played:
+    cpu = CpuRefiner(make_rasterizer("numba", WIDTH, HEIGHT))
+    return Played.on(GuardedRefiner(CudaRefiner(WIDTH, HEIGHT), cpu, cpu_share))
+
+
+@dataclass
+class Fault:
+    """Lets the call of that number of a method fail, and all after it where it is for good."""
+
+    error: Exception
+    call: int
+    for_good: bool = False
+    calls: int = 0
+
+    def break_(self, monkeypatch: pytest.MonkeyPatch, owner: type, method: str) -> Fault:
+        works = getattr(owner, method)
+
+        def may_fail(*args: Any, **names: Any) -> Any:
+            self.calls += 1
+            if self.calls == self.call or (self.for_good and self.calls > self.call):
+                raise self.error
+            return works(*args, **names)
+
+        monkeypatch.setattr(owner, method, may_fail)
+        return self
+
+
+FAULTS = [
+    (CudaRasterizer, "draw", 1), (CudaRasterizer, "draw", 2), (CudaRasterizer, "pull_back", 2),
+    (CudaRefiner, "begin", 1), (CudaRefiner, "take", 2), (CudaRefiner, "give_back", 1),
+    (CudaRefiner, "show", 1),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("owner", "method", "call"), FAULTS)
+def test_a_cuda_error_anywhere_leaves_the_cpu_to_go_on(
+    owner: type, method: str, call: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    played = guarded()
+    first, _ = played.take(frame(0))
+    fault = Fault(CUDA_ERROR, call, for_good=True).break_(monkeypatch, owner, method)
+    snapshot, view = played.take(frame(1), steps=2)
+    assert fault.calls == call  # and never again
+    assert snapshot.counts["iterations"] == 2 and psnr(view, frame(1)) > 19
+    assert np.isin(first.gaussians.ids, snapshot.gaussians.ids).mean() > 0.9
+    problem = played.refiner.problem
+    assert problem is not None and "illegal memory access" in problem and "restart the node" in problem
+    assert "and much more" not in problem
+    assert played.refiner.share == 0.5
+    after, view = played.take(frame(2))
+    assert fault.calls == call and psnr(view, frame(2)) > 19 and after.loss > 0
+
+
+def test_a_lack_of_memory_lowers_the_limit_and_the_gpu_is_tried_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(guarded_refiner, "PAUSE", 2)
+    played = guarded()
+    played.take(frame(0))
+    count = played.mapper.model.count
+    fault = Fault(torch.OutOfMemoryError("CUDA out of memory"), 2).break_(monkeypatch, CudaRasterizer, "draw")
+    snapshot, view = played.take(frame(1), steps=2)
+    assert fault.calls == 2 and psnr(view, frame(1)) > 19 and snapshot.counts["iterations"] == 2
+    limit = LOWERED * played.mapper.model.count
+    assert played.refiner.share * CAPACITY == pytest.approx(limit, rel=0.15)
+    assert played.mapper._limit(StepBudget(1)) < count
+    assert "memory" in str(played.refiner.problem) and "lower mapping.max_gaussians" in str(
+        played.refiner.problem
+    )
+    played.take(frame(2))
+    assert fault.calls == 2  # the pause
+    _, view = played.take(frame(3))
+    assert fault.calls > 3 and psnr(view, frame(3)) > 19
+    assert played.refiner.share < 1
+
+
+def test_a_lack_of_memory_before_the_first_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    """There is no model yet whose size could have been too large."""
+    played = guarded()
+    Fault(DeviceMemoryError("full"), 1).break_(monkeypatch, CudaRasterizer, "draw")
+    played.refiner.show(played.mapper.model.gaussians(), frame(0).camera)
+    assert played.refiner.share == LOWERED
+    snapshot, _ = played.take(frame(0))
+    assert len(snapshot.gaussians) > 40
+
+
+def test_after_the_pause_the_gpu_begins_with_a_drawing_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What it drew last is of long ago, and still frames are judged by it."""
+    monkeypatch.setattr(guarded_refiner, "PAUSE", 1)
+    played = guarded()
+    played.take(frame(0))
+    Fault(DeviceMemoryError("full"), 1).break_(monkeypatch, CudaRefiner, "begin")
+    played.take(frame(6))
+    played.mapper._begin(frame(6))
+    rasterizer = make_rasterizer("numba", WIDTH, HEIGHT)
+    expected = rasterizer.forward(played.mapper.model.gaussians(), [frame(6).camera])[0]
+    assert played.refiner._working is played.refiner._gpu  # type: ignore[attr-defined]
+    np.testing.assert_allclose(played.refiner.planes(), expected, atol=1e-4)
+
+
+def test_a_request_that_is_wrong_is_no_fault_of_the_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    played = guarded()
+    Fault(UsageError("tiles have another shape"), 1).break_(monkeypatch, CudaRasterizer, "draw")
+    with pytest.raises(UsageError):
+        played.take(frame(0))
+
+
+def pipeline_on(device: str, steps: int) -> tuple[Pipeline, Callable[[int], Any]]:
+    """A pipeline, and how to let it take a frame in."""
+    K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+    rig = rectified_rig("sheet", WIDTH, HEIGHT, K, BASELINE)
+    mapping = MappingConfig(max_gaussians=100, skip_still=False)
+    pipeline = Pipeline(LaunchConfig(device=device, mapping=mapping), rig)
+
+    def take(i: int) -> Any:
+        observation = frame(i)
+        left = np.rint(observation.image * 255).astype(np.uint8)
+        stamp = i * 33_000_000
+        given = StereoFrame(i, stamp, stamp, left, left, tissue=observation.tissue, depth=observation.depth)
+        return pipeline.process(given, StepBudget(steps))
+
+    return pipeline, take
+
+
+def test_the_pipeline_runs_on_the_device_and_says_when_it_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sags_node.vision.stereo.SMALLEST_SIDE", 16)  # the frames bring their depth
+    pipeline, take = pipeline_on("cuda", 1)
+    assert isinstance(pipeline._refiner, GuardedRefiner)
+    assert psnr(take(0).views["left"], frame(0)) > 19
+    take(1)
+    assert "device" not in pipeline.warnings
+    Fault(CUDA_ERROR, 1).break_(monkeypatch, CudaRasterizer, "pull_back")
+    result = take(2)
+    assert psnr(result.views["left"], frame(2)) > 20 and len(result.snapshot.gaussians) > 60
+    assert "the CPU goes on" in pipeline.warnings["device"]
