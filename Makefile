@@ -10,7 +10,7 @@ DEBIAN_TESTS := chromium g++ cmake pkg-config cppzmq-dev libmsgpack-cxx-dev
 missing = $(shell for p in $(1); do dpkg -s $$p >/dev/null 2>&1 || echo $$p; done)
 apt_install = apt-get update -qq && apt-get install -y -qq --no-install-recommends $(1) >/dev/null
 
-.PHONY: setup run test test-tools lint golden clean
+.PHONY: setup run test test-tools twins lint golden clean
 
 setup: $(STAMP)
 
@@ -30,8 +30,13 @@ $(STAMP): pyproject.toml constraints.txt
 run: setup
 	$(BIN)/sags demo
 
-test: setup lint test-tools
-	$(BIN)/python -m pytest
+# The linters and the twins of the GPU kernels use one core each: they run side by side.
+test: setup test-tools
+	$(MAKE) --no-print-directory -j2 -Otarget lint twins
+	$(BIN)/python -m pytest --ignore-glob='*/test_cuda_*.py'
+
+twins: setup
+	$(BIN)/python -m pytest tests/test_cuda_*.py
 
 # Tests whose tools are missing are skipped, and say so.
 test-tools:

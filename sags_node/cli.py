@@ -47,6 +47,11 @@ class Sags(click.Group):
         except KeyboardInterrupt:
             console.print("stopped")
             ctx.exit(130)
+        except SystemError as error:  # what a Ctrl-C becomes in C code that calls Python: loading a kernel
+            if not isinstance(error.__cause__, KeyboardInterrupt):
+                raise
+            console.print("stopped")
+            ctx.exit(130)
 
 
 @click.group(cls=Sags, context_settings={"help_option_names": ["-h", "--help"]})

@@ -576,6 +576,24 @@ def test_ctrl_c_ends_a_measured_run(command: list[str], phantom_session: Path, t
     assert not any(temporary.iterdir())
 
 
+def test_a_ctrl_c_that_comes_while_a_kernel_is_loaded_is_one_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Python turns it into a SystemError when it passes through C code; any other of those is a defect."""
+
+    def interrupted(*arguments: object) -> None:
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt as cause:
+            raise SystemError("returned a result with an exception set") from cause
+
+    def broken(*arguments: object) -> None:
+        raise SystemError("broken")
+
+    monkeypatch.setattr("sags_node.apps.doctor.examine", interrupted)
+    assert CliRunner().invoke(main, ["doctor"]).exit_code == 130
+    monkeypatch.setattr("sags_node.apps.doctor.examine", broken)
+    assert isinstance(CliRunner().invoke(main, ["doctor"]).exception, SystemError)
+
+
 def test_ctrl_c_ends_the_rendering_of_a_phantom(tmp_path: Path) -> None:
     process = start(["phantom", tmp_path / "session", "seconds:=60", "width:=320", "height:=256"])
     until(process, lambda: any(tmp_path.glob("*.partial/left/*.jpg")))

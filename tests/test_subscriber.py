@@ -518,3 +518,14 @@ def _send(socket: zmq.Socket[bytes], subscriber: Subscriber, topic: str, seq: in
     socket.send_multipart(encode(Message(topic, _image_meta(said, seq), said.parts)))
     name = topic.removeprefix("sags/")
     _until(lambda: (newest := subscriber.latest(name)) is not None and newest.meta.seq == seq)
+
+
+def test_a_subscriber_that_nobody_closed_lets_the_program_end_in_silence(tmp_path: Path) -> None:
+    script = (
+        "from sags_node.messaging.subscriber import Subscriber\n"
+        f"Subscriber(['left/render/depth'], 'ipc://{tmp_path}/nobody')\n"
+    )
+    ended = subprocess.run(
+        [sys.executable, "-c", script], check=False, capture_output=True, text=True, timeout=60
+    )
+    assert (ended.returncode, ended.stdout, ended.stderr) == (0, "", "")

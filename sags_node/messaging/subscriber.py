@@ -9,6 +9,7 @@ with Subscriber(["left/render/depth"]) as subscriber:
 
 from __future__ import annotations
 
+import atexit
 import threading
 import time
 from collections import deque
@@ -83,6 +84,7 @@ class Receiver:
         self._connect(self._find())
         self._thread = threading.Thread(target=self._receive_all, name="sags-subscriber", daemon=True)
         self._thread.start()
+        atexit.register(self.close)  # the thread must not outlive the interpreter
 
     @property
     def endpoint(self) -> str:
@@ -238,6 +240,7 @@ class Receiver:
 
     def close(self) -> None:
         """End the receiver thread; what has come stays readable."""
+        atexit.unregister(self.close)
         self._stopping.set()
         self._thread.join()
         self._resources.close()

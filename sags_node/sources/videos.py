@@ -10,7 +10,6 @@ import cv2
 
 from sags_node.config import Box
 from sags_node.errors import SagsError, UsageError
-from sags_node.sources.painted import unpainted
 from sags_node.sources.pictures import RawPair, size_text
 from sags_node.types import U8
 
@@ -201,6 +200,8 @@ class PanePairs:
         picture = self._video.read()
         if picture is None:
             return None
+        from sags_node.sources.painted import unpainted  # a kernel that cameras do without
+
         panes = {name: picture[y : y + h, x : x + w] for name, (x, y, w, h) in self._boxes.items()}
         tissue = unpainted(panes["tools"], panes["left"]) if "tools" in panes else None
         return RawPair(_rgb(panes["left"]), _rgb(panes["right"]), tissue)
