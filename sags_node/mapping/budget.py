@@ -9,10 +9,11 @@ from typing import Protocol
 
 from sags_node.config import MappingConfig
 
+PLANNED = 0.92  # of the budget: costs vary, and half of all frames would take longer than what is planned
 LEARNING = 0.2  # share of a new measurement in a running mean
 FORGET = 0.95  # of the cost of a step, per frame in which it seemed not to fit
-LEAST_SHARE = 0.6  # of the model's capacity: fewer would save little, most of a frame does not depend on them
-SHRINK, GROW = 0.99, 1.002  # per frame
+LEAST_SHARE = 0.7  # of the model's capacity: fewer would save little, most of a frame does not depend on them
+SHRINK, GROW = 0.995, 1.002  # per frame
 GAUSSIANS_PER_MS = 1100  # of the budget; measured, see benchmarks/mapping.md
 PIXELS_PER_GAUSSIAN = 2  # fewer pixels have no more to tell
 COMFORT = 0.9  # of the time: below it there is room for more Gaussians
@@ -175,4 +176,4 @@ def make_budget(config: MappingConfig) -> Budget:
     """Fixed steps where the configuration names them, else its time."""
     if config.iterations is not None:
         return StepBudget(config.iterations)
-    return TimeBudget(config.budget_ms * 1e-3, config.skip_fitted)
+    return TimeBudget(PLANNED * config.budget_ms * 1e-3, config.skip_fitted)

@@ -19,7 +19,7 @@ from sags_node.types import F32, U8, Bool, Observation, RenderedView, Snapshot
 
 CONTROL_NODES = 512
 INITIAL_STEPS = 30
-HOLES = 200  # Gaussians per frame that may be added even when there are as many as the machine affords
+HOLES = 500  # Gaussians per frame that may be added even when there are as many as the machine affords
 TORN = 0.02  # of the Gaussians: where more are removed at once, they leave holes
 EXPOSURE_JUMP = 0.01  # smaller changes of the gain are left to the colour steps
 SETTLED = 10  # frames: a model that has not changed for so long has little more to learn
