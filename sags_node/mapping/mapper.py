@@ -19,7 +19,8 @@ from sags_node.types import F32, U8, Bool, Observation, RenderedView, Snapshot
 
 CONTROL_NODES = 512
 INITIAL_STEPS = 30
-HOLES = 500  # Gaussians per frame that may be added even when there are as many as the machine affords
+HOLES = 200  # Gaussians per frame that are exchanged for new ones when the model is full
+ADDED = 500  # Gaussians per frame that may be added even when there are as many as the machine affords
 TORN = 0.02  # of the Gaussians: where more are removed at once, they leave holes
 EXPOSURE_JUMP = 0.01  # smaller changes of the gain are left to the colour steps
 SETTLED = 10  # frames: a model that has not changed for so long has little more to learn
@@ -194,7 +195,7 @@ class Mapper:
         if budget.more():  # before inserting, so that the drawing above serves both
             self._refiner.refine(self._rates, 1.0 if budget.affords_whole() else HURRIED_SHARE)
             iterations = 1
-        room = max(HOLES, limit - self.model.count)
+        room = max(ADDED, limit - self.model.count)
         pixels, depths = pixels[:room], depths[:room]
         lacking = min(len(pixels), HOLES) - self.model.free
         if 0 < lacking < self.model.count:  # the view has grown: what is in it gives way
