@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,10 @@ import cv2
 import numpy as np
 from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_typestore
+
+from sags_node.config import BagSource
+from sags_node.sources.replay import Replay
+from sags_node.types import StereoFrame
 
 ROS2, ROS1 = get_typestore(Stores.ROS2_JAZZY), get_typestore(Stores.ROS1_NOETIC)
 IMAGE, COMPRESSED, INFO = (f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "CameraInfo"))
@@ -105,3 +110,21 @@ def write_rosbag1(path: Path, rows: list[Row], compression: str | None = None) -
                 known[topic] = writer.add_connection(topic, kind, typestore=ROS1)
             writer.write(known[topic], stamp + 5 * MS, ROS1.serialize_ros1(message, kind))
     return path
+
+
+KINDS: dict[str, Callable[[Path], Path]] = {
+    "mcap folder": lambda p: write_rosbag2(p / "bag", stereo_rows(ROS2)),
+    "mcap file": lambda p: write_rosbag2(p / "bag", stereo_rows(ROS2)) / "bag.mcap",
+    "mcap zstd": lambda p: write_rosbag2(p / "bag", stereo_rows(ROS2), compression="STORAGE"),
+    "db3 folder": lambda p: write_rosbag2(p / "bag", stereo_rows(ROS2), "SQLITE3"),
+    "db3 file": lambda p: write_rosbag2(p / "bag", stereo_rows(ROS2), "SQLITE3") / "bag.db3",
+    "db3 messages": lambda p: write_rosbag2(p / "b", stereo_rows(ROS2), "SQLITE3", "MESSAGE"),
+    "ros1": lambda p: write_rosbag1(p / "a.bag", stereo_rows(ROS1)),
+    "ros1 lz4": lambda p: write_rosbag1(p / "a.bag", stereo_rows(ROS1), "LZ4"),
+    "ros1 bz2": lambda p: write_rosbag1(p / "a.bag", stereo_rows(ROS1), "BZ2"),
+}
+
+
+def play(path: Path, **config: Any) -> list[StereoFrame]:
+    with Replay(BagSource(path=path, pace="step", **config)) as source:
+        return list(source)

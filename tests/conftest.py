@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from sags_node.config import PhantomSource
+from sags_node.config import FoldersSource, PhantomSource
 from sags_node.phantom import write_session
 
 ROOT = Path(__file__).parent.parent
@@ -50,6 +50,43 @@ def phantom_session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Forty frames of the phantom at a small size, with their truth."""
     folder = tmp_path_factory.mktemp("phantom") / "session"
     write_session(PhantomSource(seconds=4.0, width=320, height=256, seed=1), folder, rate=10.0)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def plane_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sound recording of some ten chunks."""
+    from recorded_plane import record_plane
+
+    path, _ = record_plane(tmp_path_factory.mktemp("plane"), seconds=2.0)
+    return path
+
+
+@pytest.fixture
+def folders(tmp_path: Path) -> FoldersSource:
+    """Twelve pairs whose numbers are not padded: plain text order would play 1, 10, 11, 2."""
+    from numbered_pictures import picture, write_png
+
+    for number in range(12):
+        write_png(tmp_path / f"left/L{number}.png", picture(number))
+        write_png(tmp_path / f"right/R{number}.png", picture(number, eye=1))
+    return FoldersSource(left=tmp_path / "left", right=tmp_path / "right", pace="step", rate=20)
+
+
+@pytest.fixture
+def run_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where nodes of this test would leave their files, away from a node that may run on this machine."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    return tmp_path / "sags"
+
+
+@pytest.fixture(scope="session")
+def user_files(phantom_session: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of `user_files.write_user_files`."""
+    from user_files import write_user_files
+
+    folder = tmp_path_factory.mktemp("user")
+    write_user_files(folder, phantom_session)
     return folder
 
 

@@ -12,6 +12,7 @@ from sags_node.types import F32, Camera, Gaussians
 
 INPUTS = ("means", "quats", "scales", "opacities", "colors")
 DERIVATIVES = tuple(field.name for field in dataclasses.fields(Gradients))
+PER_GAUSSIAN = tuple(name for name in DERIVATIVES if name != "poses")
 
 
 def camera(width: int = 48, height: int = 40, focal: float = 60.0, moved: bool = False) -> Camera:
@@ -75,6 +76,12 @@ def with_filter(gaussians: Gaussians, seed: int = 0) -> Gaussians:
     widths = gaussians.scales.mean(1) * np.random.default_rng(seed).uniform(0, 1, len(gaussians))
     widths[:1] = 0
     return dataclasses.replace(gaussians, smoothing=(widths**2).astype(np.float32))
+
+
+def rows(gaussians: Gaussians, keep: NDArray[np.bool_] | NDArray[np.integer] | slice) -> Gaussians:
+    """Some of the Gaussians, with everything that belongs to them."""
+    values = {field.name: getattr(gaussians, field.name) for field in dataclasses.fields(Gaussians)}
+    return Gaussians(**{name: None if value is None else value[keep] for name, value in values.items()})
 
 
 def cotangents(views: Sequence[Camera], seed: int) -> tuple[F32, F32]:

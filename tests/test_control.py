@@ -6,7 +6,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 import zmq
 from hostile import is_reply, random_request
+from waiting import until
 
 from sags_node.config import PublishConfig
 from sags_node.errors import SagsError, UsageError
@@ -93,7 +94,7 @@ def test_a_future_is_answered_when_it_is_done_and_others_meanwhile(tmp_path: Pat
             answers: list[Any] = []
             thread = threading.Thread(target=lambda: answers.append(slow.request("later", timeout=10)))
             thread.start()
-            _until(lambda: waiting)
+            until(lambda: waiting)
             assert quick.request("ping") == "pong"
             assert answers == []
             waiting[0].set_result({"done": True})
@@ -102,7 +103,7 @@ def test_a_future_is_answered_when_it_is_done_and_others_meanwhile(tmp_path: Pat
             waiting.clear()
             with pytest.raises(SagsError, match="no answer"):
                 slow.request("later", timeout=0.05)
-            _until(lambda: waiting)
+            until(lambda: waiting)
             waiting[0].set_exception(SagsError("too late"))
             assert slow.request("ping") == "pong"  # the late answer is not taken for this one
 
@@ -230,7 +231,7 @@ def test_what_may_have_been_done_is_not_asked_for_again(tmp_path: Path) -> None:
 
         thread = threading.Thread(target=ask)
         thread.start()
-        _until(lambda: asked)
+        until(lambda: asked)
     with asker, node(tmp_path / "run", {"mark": lambda args: asked.append("second")}):
         thread.join(10)
         assert len(errors) == 1 and "started anew before it answered; ask again" in errors[0]
@@ -262,10 +263,3 @@ def test_an_oversized_request_is_cut_off(tmp_path: Path) -> None:
             asker.request("echo", {"a": "x" * 1_000_000}, timeout=0.3)
         with ControlClient(endpoint) as asker:
             assert asker.request("echo", {"a": "x" * 60_000}) == 60_000
-
-
-def _until(condition: Callable[[], Any]) -> None:
-    deadline = time.monotonic() + 10
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.005)

@@ -18,6 +18,7 @@ from sags_node.engine.cuda import adam, nodes, optimiser
 from sags_node.engine.cuda.backend import default_device
 from sags_node.engine.interface import Gradients
 from sags_node.mapping import optimiser as mapping_optimiser
+from sags_node.mapping.cuda_refiner import STEP
 from sags_node.mapping.optimiser import Rates
 from sags_node.model.deformation import NodeDeformation
 from sags_node.model.gaussians import GaussianModel
@@ -41,17 +42,6 @@ TABLES = (
     "colors",
     "adam_m",
     "adam_v",
-)
-CONSTANTS = optimiser.Constants(
-    relaxation=mapping_optimiser.COLOUR_RELAXATION,
-    damping=mapping_optimiser.COLOUR_DAMPING,
-    beta1=mapping_optimiser.BETA1,
-    beta2=mapping_optimiser.BETA2,
-    least_contribution=mapping_optimiser.MIN_CONTRIBUTION,
-    log_scale_range=mapping_optimiser.LOG_SCALE_RANGE,
-    logit_range=mapping_optimiser.LOGIT_RANGE,
-    largest=mapping_optimiser.LARGEST,
-    largest_raw=mapping_optimiser.LARGEST_RAW,
 )
 
 
@@ -202,7 +192,7 @@ def check_model(found: optimiser.Model, model: GaussianModel) -> None:
 def test_the_mappers_step_is_the_mappers() -> None:
     model = make_model()
     found, before = model_on_device(model), model_on_device(model)
-    host, device, rates = mapping_optimiser.Optimiser(), optimiser.Optimiser(CONSTANTS), Rates().scaled(20)
+    host, device, rates = mapping_optimiser.Optimiser(), optimiser.Optimiser(STEP), Rates().scaled(20)
     for step in range(4):
         gradients = make_gradients(step)
         host.step(model, gradients, camera(moved=True), rates)
@@ -236,7 +226,7 @@ def test_the_mappers_step_mends_broken_rows(where: str, value: float) -> None:
     model.opacities[broken] = 1.0  # has no logit
     found = model_on_device(model)
     mapping_optimiser.Optimiser().step(model, gradients, camera(moved=True), Rates())
-    device_step(optimiser.Optimiser(CONSTANTS), found, gradients, Rates())
+    device_step(optimiser.Optimiser(STEP), found, gradients, Rates())
     check_model(found, model)
     assert torch.isfinite(found.log_scales).all() and torch.isfinite(found.opacity_logits).all()
 
@@ -244,7 +234,7 @@ def test_the_mappers_step_mends_broken_rows(where: str, value: float) -> None:
 def test_no_gaussians_no_step() -> None:
     empty = optimiser.Model(**{name: torch.zeros((0, 3), device=DEVICE) for name in TABLES})
     slopes = optimiser.Slopes(*torch.zeros((6, 0, 3), device=DEVICE))
-    optimiser.Optimiser(CONSTANTS).step(empty, slopes, (1.0, 1.0, 1.0, 1.0), (0.0, 0.0, 1.0, 0.0), 50.0)
+    optimiser.Optimiser(STEP).step(empty, slopes, (1.0, 1.0, 1.0, 1.0), (0.0, 0.0, 1.0, 0.0), 50.0)
 
 
 class Follow:

@@ -264,7 +264,8 @@ def test_damage_is_healed(where: str) -> None:
     assert deformation is not None
     count = played.mapper.model.count
     if where == "nodes":
-        played.refiner._nodes.momentum[3] = torch.nan  # type: ignore[attr-defined]
+        assert isinstance(played.refiner, CudaRefiner)
+        played.refiner._nodes.momentum[3] = torch.nan
     else:
         getattr(played.mapper.model, where)[5] = np.nan
     _, view = played.take(frame(1))
@@ -301,7 +302,8 @@ def test_tissue_that_comes_into_view_gets_nodes_on_the_device_too() -> None:
             counts.append(len(played.mapper._deformation.nodes))
     assert counts[1] > counts[0] and counts[2:] == counts[:2]
     assert played.mapper.model.node_index.max() >= counts[0]
-    on_gpu = played.refiner._nodes.places.cpu().numpy()  # type: ignore[attr-defined]
+    assert isinstance(played.refiner, CudaRefiner)
+    on_gpu = played.refiner._nodes.places.cpu().numpy()
     np.testing.assert_array_equal(on_gpu, played.mapper._deformation.nodes)
 
 
@@ -404,7 +406,7 @@ def test_after_the_pause_the_gpu_begins_with_a_drawing_of_its_own(monkeypatch: p
     played.mapper._begin(frame(6))
     rasterizer = make_rasterizer("numba", WIDTH, HEIGHT)
     expected = rasterizer.forward(played.mapper.model.gaussians(), [frame(6).camera])[0]
-    assert played.refiner._working is played.refiner._gpu  # type: ignore[attr-defined]
+    assert isinstance(played.refiner, GuardedRefiner) and played.refiner._working is played.refiner._gpu
     np.testing.assert_allclose(played.refiner.planes(), expected, atol=1e-4)
 
 

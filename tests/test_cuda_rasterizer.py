@@ -13,12 +13,14 @@ import pytest
 import torch
 from engine_scenes import (
     DERIVATIVES,
+    PER_GAUSSIAN,
     camera,
     cotangents,
     draw_and_differentiate,
     one_gaussian,
     random_gaussians,
     relative_error,
+    rows,
     with_filter,
     with_view_dependence,
 )
@@ -45,7 +47,6 @@ from sags_node.engine.cuda.scene import ColourStep, DeviceGaussians  # noqa: E40
 VIEW = camera(width=35, height=21, focal=42.0)  # no whole number of tiles
 EYES = [camera(width=35, height=21, focal=42.0, moved=True)]
 EYES.append(EYES[0].moved_right(0.004))
-PER_GAUSSIAN = tuple(name for name in DERIVATIVES if name != "poses")
 
 
 def kernels_are_interpreted() -> bool:
@@ -58,16 +59,11 @@ def new_rasterizer(views: list[Camera]) -> Rasterizer:
 
 def inner(rasterizer: Rasterizer) -> Any:
     """The tensor-level rasteriser: the only way to see what was not done."""
-    return rasterizer._backend._rasterizer  # type: ignore[attr-defined]
+    return rasterizer._backend._rasterizer  # type: ignore[attr-defined]  (of the CUDA backend)
 
 
 def copies(gradients: Any) -> dict[str, Any]:
     return {name: getattr(gradients, name).copy() for name in DERIVATIVES}
-
-
-def rows(gaussians: Gaussians, keep: Any) -> Gaussians:
-    values = {field.name: getattr(gaussians, field.name) for field in dataclasses.fields(Gaussians)}
-    return Gaussians(**{name: None if value is None else value[keep] for name, value in values.items()})
 
 
 def assert_agrees(

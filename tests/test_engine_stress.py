@@ -10,12 +10,14 @@ import pytest
 from engine_scenes import (
     DERIVATIVES,
     INPUTS,
+    PER_GAUSSIAN,
     camera,
     cotangents,
     draw_and_differentiate,
     one_gaussian,
     random_gaussians,
     relative_error,
+    rows,
     with_filter,
     with_view_dependence,
 )
@@ -26,13 +28,7 @@ from sags_node.engine.rasterize import make_rasterizer
 from sags_node.types import Camera, Gaussians
 
 VIEW = camera()
-PER_GAUSSIAN = tuple(name for name in DERIVATIVES if name != "poses")
 FULL = with_filter(with_view_dependence(random_gaussians(8, 30, VIEW), 2))
-
-
-def rows(gaussians: Gaussians, keep: np.ndarray) -> Gaussians:
-    values = {field.name: getattr(gaussians, field.name) for field in dataclasses.fields(Gaussians)}
-    return Gaussians(**{name: None if value is None else value[keep] for name, value in values.items()})
 
 
 def changed(gaussians: Gaussians, name: str, row: int, value: float) -> Gaussians:

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import open3d
 import pytest
-from test_cli import refused, run_dir, sags  # noqa: F401  (run_dir works by being here)
+from command_line import refused, sags
 from test_node import RunningNode
 
 from sags_node.apps import export, export_scene, export_surface
@@ -28,6 +28,8 @@ from sags_node.model.ply import SH_C0
 from sags_node.phantom.scene import Phantom
 from sags_node.pipeline import Pipeline
 from sags_node.session import open_session
+
+pytestmark = pytest.mark.usefixtures("run_dir")
 
 STEP = ("source.pace:=step", "mapping.iterations:=2")
 FRAME, FRAMES = 20, 40  # the lift, at 2 s

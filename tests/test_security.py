@@ -21,6 +21,7 @@ import pytest
 import zmq
 from click.testing import CliRunner
 from synthetic import publisher, stream
+from waiting import until
 from zmq.auth import load_certificate
 
 from sags_node.cli import main
@@ -221,7 +222,7 @@ def test_others_are_refused_counted_and_told_why(
             with ControlClient(running.connection.control, keys=mine) as asker:
                 with pytest.raises(SagsError, match=why):
                     asker.request("ping", timeout=1.5)
-        _until(lambda: running.connections[which]["refused"] >= 1)
+        until(lambda: running.connections[which]["refused"] >= 1)
         assert running.connections[which]["unlisted_key"] == (client == "stranger")
         other = {"data": "control", "control": "data"}[which]
         assert running.connections[other] == dict.fromkeys(running.connections[other], 0)
@@ -274,8 +275,8 @@ def test_refusals_reach_the_log_but_do_not_fill_it(
     ):
         for _ in range(20):
             with Subscriber([TOPIC], endpoint=running.connection.data[-1], keys=stranger) as subscriber:
-                _until(lambda subscriber=subscriber: subscriber.refusal is not None)
-        _until(lambda: running.connections["data"]["unlisted_key"] == 20)
+                until(lambda subscriber=subscriber: subscriber.refusal is not None)
+        until(lambda: running.connections["data"]["unlisted_key"] == 20)
     warnings = [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
     assert len(warnings) == 2
     assert any(stranger.own.public.decode() in warning for warning in warnings)
@@ -342,7 +343,7 @@ def test_random_bytes_on_both_ports_while_a_client_receives(
                 endpoint = str(connection.control if i % 2 else connection.data[-1])
                 with hostile.raw(endpoint) as stranger:
                     stranger.sendall(starts[i % len(starts)] + rng.bytes(int(rng.integers(1, 3000))))
-            _until(lambda: sum(running.connections[name]["refused"] for name in ("data", "control")) == 400)
+            until(lambda: sum(running.connections[name]["refused"] for name in ("data", "control")) == 400)
             newest = subscriber.latest(TOPIC)
             assert subscriber.wait(TOPIC, 5, after=newest) is not None
             assert subscriber.lost(TOPIC) == 0 and subscriber.refusal is None
@@ -359,9 +360,7 @@ def test_a_peer_of_the_old_protocol_is_no_subscriber(tmp_path: Path) -> None:
         for _ in range(20):
             running.poll(20)
         assert not running.wanted(TOPIC)
-        _until(
-            lambda: running.connections["data"] == {**running.connections["data"], "open": 0, "refused": 1}
-        )
+        until(lambda: running.connections["data"] == {**running.connections["data"], "open": 0, "refused": 1})
 
 
 def test_peers_are_capped_and_those_who_are_in_stay_in(tmp_path: Path) -> None:
@@ -370,8 +369,8 @@ def test_peers_are_capped_and_those_who_are_in_stay_in(tmp_path: Path) -> None:
         with Subscriber([TOPIC], endpoint=endpoint) as subscriber:
             assert subscriber.wait(TOPIC, 10) is not None
             crowd = [hostile.raw(endpoint) for _ in range(MAX_PEERS + 30)]
-            _until(lambda: running.connections["data"]["too_many"] >= 31)
-            _until(lambda: running.connections["data"]["open"] <= MAX_PEERS)
+            until(lambda: running.connections["data"]["too_many"] >= 31)
+            until(lambda: running.connections["data"]["open"] <= MAX_PEERS)
             assert subscriber.wait(TOPIC, 5, after=subscriber.latest(TOPIC)) is not None
             for connection in crowd:
                 connection.close()
@@ -445,7 +444,7 @@ def test_a_secured_node_and_its_clients_as_processes(
         text=True,
     )
     try:
-        _until((run_dir / "sags.json").exists, 90)
+        until((run_dir / "sags.json").exists, 90)
         port = json.loads((run_dir / "sags.json").read_text())["data"][-1].rpartition(":")[2]
         where = ["--endpoint", f"tcp://127.0.0.1:{port}"]
         good = _sags(*where, "--key", f"{keys}/clients/viewer.key", "--server-key", f"{keys}/node.pub")
@@ -472,10 +471,3 @@ def _sags(*options: str) -> subprocess.CompletedProcess[str]:
 
 def _resident_mb() -> float:
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
-
-
-def _until(condition: Any, seconds: float = 10.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)

@@ -22,6 +22,8 @@ SESSION = Path(__file__).parent.parent / "replay/phantom_pull"
 CAP = 8000
 NUMBERS = itertools.count(1)  # of frames: a pipeline plays several times, and its time goes on
 Spoil = Callable[[StereoFrame, np.random.Generator], StereoFrame]
+# What these tests damage goes through sums and products before it is found and taken out.
+damaging = pytest.mark.filterwarnings("ignore:invalid value encountered:RuntimeWarning")
 
 
 @pytest.fixture(scope="module")
@@ -163,6 +165,7 @@ def scene(
     return shown, psnr(results[-1])
 
 
+@damaging
 @pytest.mark.parametrize("every", [100, 1])
 @pytest.mark.parametrize("array", ARRAYS + NODE_ARRAYS)
 def test_damage_in_the_model_heals_within_three_frames(
@@ -235,6 +238,7 @@ def test_a_mask_that_misses_the_instruments_for_a_while_does_no_lasting_harm(
     assert psnr(play(pipeline, frames[6:9])[-1]) > undamaged - 1.0
 
 
+@damaging
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_a_pose_that_is_no_pose_is_refused_and_does_no_harm(
     session: Session, frames: list[StereoFrame], value: float

@@ -1,63 +1,25 @@
-"""Tissue masks: the session's, a network's, and those found by colour and by misfit to the model."""
+"""Tissue masks from outside: the session's, a network's, another process's, and when they are wrong."""
 
-import os
-from itertools import pairwise
+from __future__ import annotations
+
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from onnx_networks import FLOAT, Graph, floats
+from tissue_pictures import FRAME_NS, HEIGHT, SHAFT, WIDTH, iou, make_frame, textured_tissue
 
 from sags_node.calibration import load_rig, rectified_rig
-from sags_node.config import LaunchConfig, PhantomSource, TissueConfig
+from sags_node.config import TissueConfig
 from sags_node.errors import UsageError
 from sags_node.launch_file import load_launch
-from sags_node.mapping.budget import StepBudget
 from sags_node.messaging.masks import MaskSubscriber
-from sags_node.phantom.scene import Phantom
-from sags_node.pipeline import Pipeline
-from sags_node.types import U8, Bool, Camera, RectifiedPair, RenderedView, StereoFrame
+from sags_node.types import U8, Bool, RectifiedPair, StereoFrame
 from sags_node.vision.rectify import Rectifier
 from sags_node.vision.tissue import FIRST_FRAMES, TissueMask
-from sags_node.vision.tissue_classical import LONGEST_DOUBT, InstrumentFinder
 
 ROOT = Path(__file__).parent.parent
-DATA = Path(os.environ.get("SAGS_DATA", ROOT / "../shared/data"))
-WIDTH, HEIGHT = 320, 256
-FRAME_NS = 33_333_333
-SHAFT, GOLD, JAW = (
-    (slice(110, 150), slice(240, 320)),
-    (slice(112, 148), slice(200, 240)),
-    (120, 140, 150, 200),
-)
-
-
-def make_frame(left: U8, tissue: Bool | None = None, number: int = 0) -> StereoFrame:
-    return StereoFrame(number, number * FRAME_NS, number * FRAME_NS, left, left, tissue=tissue)
-
-
-def textured_tissue(seed: int = 0) -> U8:
-    rng = np.random.default_rng(seed)
-    shade = cv2.GaussianBlur(rng.normal(0, 1, (HEIGHT, WIDTH)), (0, 0), 5)
-    shade = 1 + 0.12 * shade / shade.std()
-    return np.clip(shade[..., None] * (170, 88, 84), 0, 255).astype(np.uint8)
-
-
-def noisy(picture: U8, seed: int) -> U8:
-    noise = np.random.default_rng(seed).normal(0, 5, picture.shape)
-    return np.clip(picture + noise, 0, 255).astype(np.uint8)
-
-
-def drawn(picture: U8) -> RenderedView:
-    """A model that looks like this picture."""
-    camera = Camera(WIDTH, HEIGHT, np.eye(3), np.eye(4))
-    plane = np.ones((HEIGHT, WIDTH), np.float32)
-    return RenderedView(0, 0, camera, picture.astype(np.float32) / 255, plane, plane)
-
-
-def iou(a: Bool, b: Bool) -> float:
-    return np.count_nonzero(a & b) / np.count_nonzero(a | b)
 
 
 # ---- the session's masks ---------------------------------------------------------------------------------
@@ -111,158 +73,6 @@ def test_an_instrument_may_come_close_for_a_while() -> None:
     find_tissue = TissueMask(TissueConfig(), rectifier)
     for frame in [upside_down] * (FIRST_FRAMES - 1) + [ordinary] + [upside_down] * FIRST_FRAMES:
         assert find_tissue(frame, pair).any() == (frame is ordinary)
-
-
-# ---- found without masks ---------------------------------------------------------------------------------
-
-
-def test_grey_and_gold_that_come_in_from_the_edge_are_instruments() -> None:
-    picture = textured_tissue()
-    picture[SHAFT] = (150, 150, 152)
-    picture[GOLD] = (170, 140, 50)
-    found = InstrumentFinder()(picture)
-    truth = np.zeros((HEIGHT, WIDTH), np.bool_)
-    truth[SHAFT] = truth[GOLD] = True
-    assert iou(found, truth) > 0.9
-
-
-def test_a_jaw_that_mirrors_tissue_is_found_by_what_it_hides() -> None:
-    tissue = textured_tissue()
-    picture = tissue.copy()
-    picture[SHAFT] = picture[GOLD] = (150, 150, 152)
-    jaw = np.zeros((HEIGHT, WIDTH), np.bool_)
-    jaw[JAW[0] : JAW[1], JAW[2] : JAW[3]] = True
-    picture[jaw] = (150, 100, 97)
-    assert InstrumentFinder()(picture)[jaw].mean() < 0.2
-    found = InstrumentFinder()(picture, drawn(tissue))
-    assert found[jaw].mean() > 0.85  # its corners are rounded
-    assert found[:, :140].mean() == 0
-
-
-def test_highlights_stay_tissue_also_beside_an_instrument() -> None:
-    tissue = textured_tissue()
-    picture = tissue.copy()
-    picture[SHAFT] = (150, 150, 152)
-    picture[125:135, 260:300] = 255  # on the instrument
-    lights = np.zeros((HEIGHT, WIDTH), np.bool_)
-    lights[40:52, 60:72] = True
-    lights[150:180, 250:258] = True  # touches the shaft
-    lights[0:10, 30:45] = True  # at the picture's edge
-    picture[lights] = 255
-    for expected in (None, drawn(tissue)):
-        found = InstrumentFinder()(picture, expected)
-        assert found[lights].mean() < 0.1
-        assert found[SHAFT].mean() > 0.9
-
-
-def test_a_pale_patch_inside_and_a_dark_picture() -> None:
-    picture = textured_tissue()
-    picture[60:120, 100:180] = (190, 170, 160)  # gauze
-    assert not InstrumentFinder()(picture).any()
-    assert InstrumentFinder()(np.full((60, 80, 3), 3, np.uint8)).all()
-
-
-def test_tissue_that_the_model_does_not_know_is_let_go_in_time() -> None:
-    """Pale tissue moves in from the edge over a redder model that would never be mended."""
-    tissue = textured_tissue()
-    picture = tissue.copy()
-    picture[SHAFT] = (150, 150, 152)
-    moved = np.zeros((HEIGHT, WIDTH), np.bool_)
-    moved[150:200, 240:] = True
-    picture[moved] = (150, 104, 100)
-    find = InstrumentFinder()
-    held = [find(picture, drawn(tissue), number * FRAME_NS)[moved].mean() for number in range(90)]
-    assert held[0] > 0.9
-    longest = round(LONGEST_DOUBT * 30)
-    assert min(held[longest : longest + 3]) < 0.1
-    released = np.flatnonzero(np.array(held) < 0.1)
-    assert np.diff(released).max() <= longest + 1  # again and again
-    model, number = drawn(picture), 90  # what was let go was learnt: it stays tissue
-    assert all(find(picture, model, (number + i) * FRAME_NS)[moved].mean() < 0.1 for i in range(60))
-    assert find(picture, model, 151 * FRAME_NS)[SHAFT].mean() > 0.9  # an instrument is not let go
-
-
-def test_tissue_that_an_instrument_has_left_is_tissue_at_once() -> None:
-    """Where the model drew the instrument itself, which it should not have learnt."""
-    tissue = textured_tissue()
-    with_shaft = tissue.copy()
-    with_shaft[SHAFT] = (150, 150, 152)
-    find = InstrumentFinder()
-    assert find(with_shaft, drawn(with_shaft), 0)[SHAFT].mean() > 0.9
-    assert find(tissue, drawn(with_shaft), FRAME_NS)[SHAFT].mean() == 0
-
-
-def test_noise_makes_a_remembered_mask_flicker_less() -> None:
-    """A part in doubt: half of its evidence is noise."""
-    picture = textured_tissue()
-    picture[SHAFT] = (150, 150, 152)
-    picture[GOLD] = (150, 138, 130)
-    picture[GOLD][::2] = (150, 128, 120)
-    flickering = {}
-    for name in ("remembered", "alone"):
-        find = InstrumentFinder()
-        masks = []
-        for number in range(24):
-            if name == "alone":
-                find = InstrumentFinder()
-            masks.append(find(noisy(picture, number), drawn(picture), number * FRAME_NS))
-        flickering[name] = np.mean([(a != b)[:, 150:].mean() for a, b in pairwise(masks)])
-    assert flickering["alone"] > 0.0005
-    assert flickering["remembered"] < 0.7 * flickering["alone"]
-
-
-def test_instruments_of_the_phantom_while_it_is_mapped() -> None:
-    """The masks shape the model, and the model the masks."""
-    source = PhantomSource(width=WIDTH, height=HEIGHT, seconds=4.0, noise=0.02)
-    phantom = Phantom(source)
-    config = LaunchConfig.model_validate(
-        {
-            "source": source,
-            "vision": {"tissue": {"method": "classical", "dilate": 0}},
-            "mapping": {"max_gaussians": 8000},
-        }
-    )
-    pipeline, budget = Pipeline(config, phantom.rig), StepBudget(1)
-    both = either = lost = missed = pixels = tools = 0
-    for number in range(30, 54):
-        frame = phantom.frame(number, 120)
-        stereo = StereoFrame(
-            number, number * FRAME_NS, number * FRAME_NS, frame.left, frame.right, 0, frame.T_world_cam
-        )
-        found = ~pipeline.process(stereo, budget).observation.tissue
-        truth = pipeline.rectifier.mask(frame.tool)
-        usable = pipeline.rectifier.mask(np.ones_like(frame.tool))
-        both += np.count_nonzero(found & truth & usable)
-        either += np.count_nonzero((found | truth) & usable)
-        lost += np.count_nonzero(found & ~truth & usable)
-        missed += np.count_nonzero(truth & ~found)
-        pixels += np.count_nonzero(usable & ~truth)
-        tools += np.count_nonzero(truth)
-    assert both / either > 0.8
-    assert lost / pixels < 0.01
-    assert missed / tools < 0.2
-
-
-def test_instruments_of_a_real_session_by_colour_alone() -> None:
-    """D4D, every 20th frame: a steel grasper, a gold wrist, a grey spleen at the edge, a large highlight."""
-    folder = DATA / "d4d_pull"
-    if not folder.is_dir():
-        pytest.skip(f"recording d4d_pull is not under SAGS_DATA ({DATA})")
-    video = cv2.VideoCapture(str(folder / "2025_03_06-16_49_40_combined_2x2.mp4"))
-    both = either = lost = pixels = index = 0
-    while video.grab():
-        if index % 20 == 0:
-            left = cv2.cvtColor(video.retrieve()[1], cv2.COLOR_BGR2RGB)[:540, :675]
-            tool = cv2.imread(str(folder / f"toolmask/{index:04d}.png"), cv2.IMREAD_GRAYSCALE) > 127
-            found = InstrumentFinder()(left)
-            both += np.count_nonzero(found & tool)
-            either += np.count_nonzero(found | tool)
-            lost += np.count_nonzero(found & ~tool)
-            pixels += np.count_nonzero(~tool)
-        index += 1
-    video.release()
-    assert both / either > 0.7
-    assert lost / pixels < 0.01
 
 
 # ---- a network's -----------------------------------------------------------------------------------------

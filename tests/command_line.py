@@ -1,0 +1,85 @@
+"""The command `sags`: in this process with what it said, or in one of its own."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner, Result
+
+from sags_node.cli import main
+
+START_SECONDS = 120  # the first start on a machine compiles kernels
+PROMPT_SECONDS = 5  # to end after Ctrl-C
+FREE_PORTS = ("publish.data:=[tcp://127.0.0.1:*]", "publish.control:=tcp://127.0.0.1:*")
+
+
+def sags(*arguments: object) -> Result:
+    """The command in this process, with any exception that it did not turn into a message; the process keeps
+    its signal handlers."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)}
+    try:
+        result = CliRunner().invoke(main, [str(argument) for argument in arguments])
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result
+
+
+def refused(code: int, *arguments: object, said: tuple[str, ...]) -> None:
+    """One message on stderr, that says all of this, and nothing on stdout."""
+    result = sags(*arguments)
+    assert result.exit_code == code, result.output
+    assert result.stdout == ""
+    assert result.stderr.lower().count("error:") == 1, result.stderr
+    for part in said:
+        assert part in result.stderr
+
+
+def pure_json(text: str) -> Any:
+    """Strict JSON and nothing else; NaN is none."""
+
+    def no_constant(name: str) -> None:
+        raise AssertionError(f"{name} is not JSON")
+
+    return json.loads(text, parse_constant=no_constant)
+
+
+def start(arguments: list[Any], **environment: str | Path) -> subprocess.Popen[str]:
+    """The command as a process in a group of its own."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "sags_node", *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        env=os.environ | {key: str(value) for key, value in environment.items()},
+    )
+
+
+def wait_for(process: subprocess.Popen[str], ready: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + START_SECONDS
+    while not ready():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline, "it did not start"
+        time.sleep(0.02)
+
+
+def stopped(process: subprocess.Popen[str]) -> tuple[str, str]:
+    """What it says after Ctrl-C; it and all its children have ended."""
+    process.send_signal(signal.SIGINT)
+    stdout, stderr = process.communicate(timeout=PROMPT_SECONDS)
+    with pytest.raises(ProcessLookupError):
+        os.killpg(process.pid, 0)
+    assert "Traceback" not in stderr
+    return stdout, stderr

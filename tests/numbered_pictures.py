@@ -1,0 +1,76 @@
+"""Stereo recordings of every kind whose pictures tell their frame number and their eye."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from sags_node import config as cfg
+from sags_node.sources.replay import Recording
+from sags_node.types import U8, StereoFrame
+
+WIDTH, HEIGHT = 32, 24
+
+
+def picture(number: int, eye: int = 0) -> U8:
+    """An RGB picture that tells its frame number (red) and its eye (blue)."""
+    return np.full((HEIGHT, WIDTH, 3), (10 * number, 100, 200 * eye), np.uint8)
+
+
+def number_of(rgb: U8) -> int:
+    return round(float(rgb[..., 0].mean()) / 10)
+
+
+def eye_of(rgb: U8) -> int:
+    return int(rgb[..., 2].mean() > 100)
+
+
+def write_png(file: Path, rgb: U8) -> None:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(file), rgb[..., ::-1])
+
+
+def write_video(file: Path, pictures: list[U8], rate: float = 25.0) -> Path:
+    """Lossy MJPG, as capture boxes write it."""
+    height, width = pictures[0].shape[:2]
+    writer = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"MJPG"), rate, (width, height))
+    assert writer.isOpened()
+    for rgb in pictures:
+        writer.write(np.ascontiguousarray(rgb[..., ::-1]))
+    writer.release()
+    return file
+
+
+def numbers(frames: list[StereoFrame]) -> list[int]:
+    """Frame numbers as the pictures show them; both eyes must show the same one."""
+    for frame in frames:
+        assert (eye_of(frame.left), eye_of(frame.right)) == (0, 1)
+        assert number_of(frame.left) == number_of(frame.right)
+    return [number_of(frame.left) for frame in frames]
+
+
+def recordings(tmp_path: Path) -> dict[str, Recording]:
+    """The same eight frames in every kind of file."""
+    pairs = [(picture(n), picture(n, eye=1)) for n in range(8)]
+    green = np.zeros_like(pairs[0][0])
+    for n, (left, right) in enumerate(pairs):
+        write_png(tmp_path / f"l/{n:03d}.png", left)
+        write_png(tmp_path / f"r/{n:03d}.png", right)
+    left_file = write_video(tmp_path / "l.avi", [pair[0] for pair in pairs])
+    right_file = write_video(tmp_path / "r.avi", [pair[1] for pair in pairs])
+    lr = write_video(tmp_path / "lr.avi", [np.hstack(pair) for pair in pairs])
+    rl = write_video(tmp_path / "rl.avi", [np.hstack(pair[::-1]) for pair in pairs])
+    panes = write_video(
+        tmp_path / "panes.avi", [np.vstack([np.hstack(p), np.hstack([green] * 2)]) for p in pairs]
+    )
+    return {
+        "folders": cfg.FoldersSource(left=tmp_path / "l", right=tmp_path / "r", pace="step", rate=25),
+        "videos": cfg.VideosSource(left=left_file, right=right_file, pace="step"),
+        "LR": cfg.SideBySideSource(video=lr, pace="step"),
+        "RL": cfg.SideBySideSource(video=rl, order="RL", pace="step"),
+        "panes": cfg.PanesSource(
+            video=panes, left=(0, 0, WIDTH, HEIGHT), right=(WIDTH, 0, WIDTH, HEIGHT), pace="step"
+        ),
+    }

@@ -1,0 +1,64 @@
+"""The plane of `synthetic`, recorded by a recorder of this process."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from synthetic import publisher, stream
+from waiting import until
+
+from sags_node.errors import SagsError
+from sags_node.recording.bag import BagMessage, read_messages
+from sags_node.recording.recorder import Options, Recorder
+
+
+@contextmanager
+def recording(options: Options) -> Iterator[tuple[Recorder, list[dict[str, Any]]]]:
+    """A recorder on a thread, ready; the summary is the last thing that it says."""
+    recorder, said = Recorder(options), []
+    failed: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            said.append(recorder.run(said.append))
+        except SagsError as error:
+            failed.append(error)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    until(lambda: said or failed)
+    try:
+        yield recorder, said
+    finally:
+        recorder.stop()
+        thread.join(30)
+    if failed:
+        raise failed[0]
+
+
+def record_plane(tmp_path: Path, seconds: float = 1.0, **options: Any) -> tuple[Path, dict[str, Any]]:
+    """A bag of the plane of `synthetic`, and the recorder's summary."""
+    run_dir = tmp_path / "run"
+    with publisher(run_dir, right=True) as running:
+        running.publish_parameters({"seed": 5})
+        with stream(running):
+            time.sleep(0.1)  # the last values are there
+            with recording(Options(tmp_path / "bag", run_dir=run_dir, **options)) as (_, said):
+                time.sleep(seconds)
+    return tmp_path / "bag", said[-1]
+
+
+def by_topic(path: Path) -> dict[str, list[BagMessage]]:
+    found: dict[str, list[BagMessage]] = {}
+    for message in read_messages(path):
+        found.setdefault(message.topic.removeprefix("/sags/"), []).append(message)
+    return found
+
+
+def content(messages: list[BagMessage]) -> list[tuple[str, int, int, bytes]]:
+    return [(m.topic, m.log_ns, m.sequence, bytes(m.data)) for m in messages]

@@ -1,0 +1,169 @@
+"""Commands that listen: beside no node, beside one that has died, and beside a running one."""
+
+from __future__ import annotations
+
+import json
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import pytest
+from command_line import FREE_PORTS, pure_json, refused, sags, start, stopped, wait_for
+
+from sags_node.apps import overlay, topic
+
+pytestmark = pytest.mark.usefixtures("run_dir")
+
+
+# ---- beside no node --------------------------------------------------------------------------------------
+
+LISTENERS = [
+    ["topic", "list"],
+    ["topic", "echo", "tf"],
+    ["topic", "hz", "tf"],
+    ["topic", "bw", "tf"],
+    ["topic", "delay", "tf"],
+    ["overlay"],
+]
+
+
+@pytest.mark.parametrize("arguments", LISTENERS, ids=" ".join)
+def test_no_node_runs(arguments: list[str], run_dir: Path) -> None:
+    said = ("no node runs as 'other'", str(run_dir / "other.json"), "start one with: sags run")
+    refused(1, *arguments, "--ns", "other", said=said)
+
+
+@pytest.mark.parametrize("arguments", LISTENERS, ids=" ".join)
+def test_a_node_that_has_died_without_a_word(
+    arguments: list[str], run_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its connection file is still there, and nobody answers."""
+    run_dir.mkdir(mode=0o700)
+    endpoint = f"ipc://{run_dir}/sags.ipc"
+    dead = {"protocol": "1.0", "ns": "sags", "session": "a", "pid": 1, "data": [endpoint], "control": None}
+    (run_dir / "sags.json").write_text(json.dumps(dead))
+    monkeypatch.setattr(topic, "PATIENCE", 0.2)
+    monkeypatch.setattr(overlay, "PATIENCE", 0.2)
+    seconds = ["--seconds", "0.2"] if arguments[-1] != "overlay" and "echo" not in arguments else []
+    refused(1, *arguments, *seconds, said=("no ", endpoint, "is the node running"))
+
+
+def test_an_endpoint_that_is_none() -> None:
+    refused(1, "topic", "hz", "tf", "--endpoint", "nonsense", said=("nonsense", "e.g. tcp://127.0.0.1:5556"))
+
+
+def test_a_place_for_the_overlay_that_cannot_be(tmp_path: Path) -> None:
+    refused(2, "overlay", "--save", tmp_path / "x.avi", said=("x.avi", ".mp4 or .png"))
+    refused(2, "overlay", "--save", tmp_path / "gone/x.mp4", said=("there is no folder", "gone"))
+
+
+# ---- beside a node ---------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def node(phantom_session: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Where a running node's run directory lies: the folder `XDG_RUNTIME_DIR` should name."""
+    runtime = tmp_path_factory.mktemp("runtime")
+    process = start(["run", phantom_session, "source.loop:=true", *FREE_PORTS], XDG_RUNTIME_DIR=runtime)
+    wait_for(process, (runtime / "sags/sags.json").exists)
+    yield runtime
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=20)
+
+
+@pytest.fixture
+def beside_node(node: Path, run_dir: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """The connection file of a running node that every command finds by itself."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(node))
+    connection: dict[str, Any] = json.loads((node / "sags/sags.json").read_text())
+    return connection
+
+
+@pytest.mark.parametrize("tool", ["echo", "hz", "bw", "delay"])
+def test_an_unknown_topic_names_the_nearest(tool: str, beside_node: dict[str, Any]) -> None:
+    said = ("unknown topic 'left/rendr/depth'", "did you mean 'left/render/depth'")
+    refused(2, "topic", tool, "left/rendr/depth", said=said)
+
+
+def test_a_topic_that_says_too_little(beside_node: dict[str, Any]) -> None:
+    listen = ("--seconds", "0.3")
+    refused(1, "topic", "hz", "parameters", *listen, said=("sags/parameters", "too few", "--seconds"))
+    refused(1, "topic", "hz", "right/camera_info", *listen, said=("no messages", "publish.right:=true"))
+
+
+def test_topic_tools_in_words_and_in_json(beside_node: dict[str, Any]) -> None:
+    listen = ("--seconds", "1.2")  # a busy machine delivers the first late
+    rows = {row["topic"]: row for row in pure_json(sags("topic", "list", *listen, "--json").stdout)}
+    assert 5 < rows["sags/left/depth"]["rate_hz"] < 20
+    assert rows["sags/parameters"]["messages"] == 1 and rows["sags/parameters"]["rate_hz"] is None
+    assert rows["sags/right/camera_info"]["messages"] == 0
+    assert "sags/left/depth" in sags("topic", "list", *listen).stdout
+    for tool, key, unit in (
+        ("hz", "average_rate", " Hz"),
+        ("bw", "bytes_per_s", "MB/s"),
+        ("delay", "min_s", " ms"),
+    ):
+        command = ("topic", tool, "left/depth", *listen)
+        assert pure_json(sags(*command, "--json").stdout)[key] > 0
+        assert unit in sags(*command).stdout
+
+
+def test_echo_in_words_and_in_json(beside_node: dict[str, Any]) -> None:
+    lines = sags("topic", "echo", "left/depth", "--count", "2", "--json").stdout.splitlines()
+    assert [pure_json(line)["topic"] for line in lines] == ["sags/left/depth"] * 2
+    transform = sags("topic", "echo", "/sags/tf", "--count", "1").stdout
+    assert "rotation: {x: " in transform and transform.endswith("---\n") and "msgtype" not in transform
+
+
+def test_overlay_in_words_and_in_json(beside_node: dict[str, Any], tmp_path: Path) -> None:
+    still, video = tmp_path / "still.png", tmp_path / "video.mp4"
+    summary = pure_json(sags("overlay", "--seconds", "1.5", "--save", still, "--json").stdout)
+    assert summary["frames"] > 3 and summary["saved"] == str(still)
+    assert cv2.imread(str(still)).shape == (256, 320, 3)
+    assert "with the overlay" in sags("overlay", "--seconds", "1.5", "--save", video).stdout
+    assert cv2.VideoCapture(str(video)).read()[0]
+    refused(2, "overlay", "--pin", "5000", "3", said=("pin 5000 3", "320x256"))
+
+
+def test_a_second_node_of_the_same_name(beside_node: dict[str, Any], phantom_session: Path) -> None:
+    said = ("another node already runs as 'sags'", "ns:=NAME")
+    refused(1, "run", phantom_session, *FREE_PORTS, said=said)
+
+
+def test_a_port_that_another_node_has(beside_node: dict[str, Any], phantom_session: Path) -> None:
+    taken = next(endpoint for endpoint in beside_node["data"] if endpoint.startswith("tcp"))
+    overrides = ("ns:=second", f"publish.data:=[{taken}]", "publish.control:=null")
+    refused(1, "run", phantom_session, *overrides, said=(taken, "in use", "publish.data:="))
+
+
+def test_a_run_directory_that_others_can_enter(phantom_session: Path, tmp_path: Path) -> None:
+    tmp_path.chmod(0o755)
+    override = f"publish.run_dir:={tmp_path}"
+    refused(2, "run", phantom_session, *FREE_PORTS, override, said=("open to other users", "chmod 700"))
+
+
+def test_a_socket_for_other_machines(phantom_session: Path) -> None:
+    override = "publish.data:=[tcp://0.0.0.0:5556]"
+    refused(2, "run", phantom_session, override, said=("0.0.0.0", "other machines", "publish.insecure"))
+
+
+# ---- Ctrl-C ----------------------------------------------------------------------------------------------
+
+
+def test_ctrl_c_ends_the_overlay_with_its_figures(beside_node: dict[str, Any], tmp_path: Path) -> None:
+    video = tmp_path / "video.mp4"
+    process = start(["overlay", "--save", video, "--json"])
+    wait_for(process, lambda: video.exists() and video.stat().st_size > 0)
+    stdout, _ = stopped(process)
+    assert process.returncode == 0 and pure_json(stdout)["frames"] > 0
+    assert cv2.VideoCapture(str(video)).read()[0]
+
+
+def test_ctrl_c_ends_a_topic_tool(beside_node: dict[str, Any]) -> None:
+    process = start(["topic", "echo", "tf"])
+    assert process.stdout is not None
+    assert process.stdout.readline() == "topic: sags/tf\n"
+    stopped(process)
+    assert process.returncode == 130

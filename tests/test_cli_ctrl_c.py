@@ -1,0 +1,52 @@
+"""Ctrl-C ends every command that takes long: at once, with exit code 130, and leaves nothing behind."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from command_line import start, stopped, wait_for
+
+from sags_node.cli import main
+
+pytestmark = pytest.mark.usefixtures("run_dir")
+
+
+@pytest.mark.parametrize("command", [["eval", "--json", "-"], ["eval", "--pace", "step"], ["demo", "--json"]])
+def test_ctrl_c_ends_a_measured_run(command: list[str], phantom_session: Path, tmp_path: Path) -> None:
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    if command[0] == "demo":
+        command = [*command, "--out", str(tmp_path / "demo")]
+    process = start([*command, phantom_session, "source.rate:=2"], TMPDIR=temporary)
+    wait_for(process, lambda: any(temporary.glob("sags-eval-*/*.frame")))
+    stdout, stderr = stopped(process)
+    assert process.returncode == 130 and "stopped" in stderr and stdout == ""
+    assert not any(temporary.iterdir())
+
+
+def test_a_ctrl_c_that_comes_while_a_kernel_is_loaded_is_one_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Python turns it into a SystemError when it passes through C code; any other of those is a defect."""
+
+    def interrupted(*arguments: object) -> None:
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt as cause:
+            raise SystemError("returned a result with an exception set") from cause
+
+    def broken(*arguments: object) -> None:
+        raise SystemError("broken")
+
+    monkeypatch.setattr("sags_node.apps.doctor.examine", interrupted)
+    assert CliRunner().invoke(main, ["doctor"]).exit_code == 130
+    monkeypatch.setattr("sags_node.apps.doctor.examine", broken)
+    assert isinstance(CliRunner().invoke(main, ["doctor"]).exception, SystemError)
+
+
+def test_ctrl_c_ends_the_rendering_of_a_phantom(tmp_path: Path) -> None:
+    process = start(["phantom", tmp_path / "session", "seconds:=60", "width:=320", "height:=256"])
+    wait_for(process, lambda: any(tmp_path.glob("*.partial/left/*.jpg")))
+    stopped(process)
+    assert process.returncode == 130
+    assert not any(tmp_path.iterdir())

@@ -1,0 +1,74 @@
+"""When content is stale: the rules, with a clock of our own."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from made_messages import MS, meta
+
+from sags_node.messaging.freshness import Freshness
+
+
+def followed(sequence: list[int], period_ms: float = 33.0, **settings: Any) -> Freshness:
+    """What follows messages `sequence` of a sender with that period."""
+    fresh = Freshness(**settings)
+    for seq in sequence:
+        fresh.accept(meta(seq, seq * period_ms))
+    return fresh
+
+
+def test_stale_after_ten_periods() -> None:
+    fresh = followed(list(range(1, 31)))
+    newest = 30 * 33
+    assert fresh.period == pytest.approx(0.033)
+    assert fresh.problem((newest + 329) * MS) is None
+    assert "too old" in str(fresh.problem((newest + 331) * MS))
+    assert "too old" in str(fresh.problem((newest + 101) * MS, max_age=0.1))
+    assert fresh.problem((newest + 99) * MS, max_age=0.1) is None
+    assert "too old" in str(fresh.problem((newest + 331) * MS, max_age=10.0))  # it only tightens
+
+
+def test_stale_before_the_period_is_known() -> None:
+    assert Freshness().problem(0) == "nothing received yet"
+    fresh = followed([4])
+    assert fresh.problem((4 * 33 + 990) * MS) is None
+    assert "too old" in str(fresh.problem((4 * 33 + 1010) * MS))
+
+
+def test_losses_do_not_stretch_the_period_but_count() -> None:
+    fresh = followed([1, 2, 3, 5, 6, 9])
+    assert fresh.period == pytest.approx(0.033) and fresh.lost == 3
+
+
+@pytest.mark.parametrize(("every", "stale"), [(12, False), (5, True)])
+def test_stale_under_ninety_percent(every: int, stale: bool) -> None:
+    """Every fifth lost is 80 %, every twelfth 92 %."""
+    fresh = followed([seq for seq in range(1, 80) if seq % every])
+    problem = fresh.problem(80 * 33 * MS)
+    assert (problem is not None and "too few" in problem) == stale
+    for seq in range(80, 110):  # it recovers
+        fresh.accept(meta(seq, seq * 33.0))
+    assert fresh.problem(110 * 33 * MS) is None
+
+
+def test_a_declared_rate_must_be_kept() -> None:
+    now = 30 * 33 * MS
+    assert followed(list(range(1, 31)), rate_hz=30.0).problem(now) is None
+    assert "too few" in str(followed(list(range(1, 31)), rate_hz=40.0).problem(now))
+
+
+def test_repeats_and_late_ones_are_not_news() -> None:
+    fresh = followed([1, 2, 3])
+    assert not fresh.accept(meta(3, 99)) and not fresh.accept(meta(2, 99)) and fresh.lost == 0
+    assert fresh.accept(meta(1, 50, session="restarted")) and fresh.lost == 0
+    assert fresh.accept(meta(2, 1, session="restarted", epoch=1))  # the recording looped: stamps jump back
+    assert not fresh.accept(meta(3, 2, session="restarted", epoch=0))
+
+
+def test_a_clock_ahead_is_not_fresh() -> None:
+    assert "ahead" in str(followed([1, 2, 3]).problem(-2000 * MS))
+
+
+def test_an_event_topic_never_grows_old() -> None:
+    assert followed([1], periodic=False).problem(10**18) is None

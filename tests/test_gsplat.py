@@ -1,0 +1,325 @@
+"""The gsplat backend against the CPU engine and the float64 twin. On the CPU gsplat runs with the torch
+versions of its own stages (`gsplat_on_cpu`), so this shows what is handed to it and what is made of its
+results; its kernels themselves need a GPU."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import sys
+from collections.abc import Iterator
+from types import ModuleType
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from engine_scenes import (
+    DERIVATIVES,
+    PER_GAUSSIAN,
+    camera,
+    cotangents,
+    draw_and_differentiate,
+    one_gaussian,
+    random_gaussians,
+    relative_error,
+    rows,
+    with_filter,
+    with_view_dependence,
+)
+
+from sags_node import geometry
+from sags_node.apps.doctor import examine
+from sags_node.engine.interface import MAX_OPACITY, MIN_ALPHA, NEAR_PLANE
+from sags_node.engine.rasterize import TILE_HEIGHT, TILE_WIDTH, make_rasterizer, to_view
+from sags_node.errors import SagsError, UsageError
+from sags_node.launch_file import load_launch
+from sags_node.mapping import mapper
+from sags_node.mapping.budget import StepBudget
+from sags_node.mapping.refiner import CpuRefiner
+from sags_node.types import Camera, Gaussians, Observation
+
+pytest.importorskip("gsplat", reason="the optional backend is not installed: pip install 'sags-node[gsplat]'")
+pytest.importorskip("triton", reason="Triton comes with torch's CUDA builds, or by `pip install triton`")
+
+from gsplat_on_cpu import use_gsplat_on_cpu
+
+from sags_node.engine import gsplat_backend
+
+VIEW = camera(width=50, height=44, focal=60.0, moved=True)
+EYES = [VIEW, VIEW.moved_right(0.004)]
+
+
+@pytest.fixture(autouse=True)
+def on_cpu(request: pytest.FixtureRequest) -> Iterator[None]:
+    if "machine" in request.fixturenames:  # the true choice, on a machine that is made up
+        yield
+        return
+    with pytest.MonkeyPatch.context() as patch:
+        use_gsplat_on_cpu(patch)
+        yield
+
+
+def assert_agrees(
+    gaussians: Gaussians,
+    views: list[Camera],
+    planes_within: float = 5e-6,
+    gradients_within: float = 2e-5,
+    antialias: bool = True,
+) -> dict[str, Any]:
+    """Planes, and gradients of a random cotangent, against both the CPU engine and the float64 twin."""
+    planes, found = draw_and_differentiate(gaussians, views, "gsplat", antialias=antialias)
+    for backend in ("numba", "reference"):
+        true_planes, true = draw_and_differentiate(gaussians, views, backend, antialias=antialias)
+        assert true_planes[:, 4].max() > 0.05  # there is something to see
+        np.testing.assert_allclose(planes, true_planes, atol=planes_within)
+        for name in DERIVATIVES:
+            error = np.linalg.norm(found[name] - true[name])
+            assert error <= gradients_within * np.linalg.norm(true[name]), (backend, name, error)
+    return found
+
+
+# ---- where gsplat's semantics are ours ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("degree", "filtered", "antialias"),
+    [(0, False, True), (1, True, False), (2, False, True), (3, True, True)],
+)
+def test_planes_and_gradients_are_ours(degree: int, filtered: bool, antialias: bool) -> None:
+    """Two turned cameras, every derivative, harmonics of all degrees, both filters on and off."""
+    gaussians = random_gaussians(degree, 40, VIEW)
+    if degree:
+        gaussians = with_view_dependence(gaussians, degree)
+    if filtered:
+        gaussians = with_filter(gaussians)
+    assert_agrees(gaussians, EYES, antialias=antialias)
+
+
+def test_a_jacobian_held_within_the_frustum() -> None:
+    """Large Gaussians whose centres lie outside the widened frustum reach into the picture."""
+    rng = np.random.default_rng(11)
+    pixels = rng.uniform([-60, -30], [-30, 60], (6, 2))
+    gaussians = dataclasses.replace(
+        random_gaussians(11, 6, VIEW),
+        means=geometry.unproject(VIEW, pixels, rng.uniform(0.05, 0.09, 6)).astype(np.float32),
+        scales=rng.uniform(0.02, 0.05, (6, 3)).astype(np.float32),
+    )
+    assert_agrees(gaussians, [VIEW], planes_within=1e-5, gradients_within=1e-4)
+
+
+def test_what_cannot_be_drawn_is_left_out_and_harms_nobody() -> None:
+    """Behind the near plane, on the camera and behind it; NaN, infinity, no direction; nearly transparent."""
+    view = camera(width=50, height=44, focal=60.0)
+    gaussians = with_filter(with_view_dependence(random_gaussians(2, 20, view), 1))
+    sound = rows(gaussians, slice(10, 20))
+    gaussians.means[0] = [0, 0, 0.9 * NEAR_PLANE]
+    gaussians.means[1] = 0
+    gaussians.means[2] *= -1
+    gaussians.means[3, 0] = np.nan
+    gaussians.scales[4, 1] = np.inf
+    gaussians.quats[5] = 0
+    gaussians.opacities[6] = 0.99 * MIN_ALPHA
+    gaussians.colors[7, 2] = np.nan
+    gaussians.sh_rest[8, 1, 1] = np.inf
+    gaussians.smoothing[9] = np.nan
+    planes, found = draw_and_differentiate(gaussians, [view], "gsplat")
+    expected, true = draw_and_differentiate(sound, [view], "gsplat")
+    np.testing.assert_array_equal(planes, expected)
+    for name in PER_GAUSSIAN:
+        assert not found[name][:10].any(), name
+        assert relative_error(found[name][10:], true[name]) < 1e-5, name
+    assert_agrees(sound, [view])
+
+
+def test_no_gaussians() -> None:
+    planes, found = draw_and_differentiate(rows(random_gaussians(0, 3, VIEW), slice(0)), EYES, "gsplat")
+    assert not planes.any() and not found["poses"].any()
+    assert [len(found[name]) for name in PER_GAUSSIAN] == [0] * len(PER_GAUSSIAN)
+
+
+# ---- where they differ: what docs/gpu.md says of it --------------------------------------------------------
+
+
+def test_opacities_above_the_largest_of_ours() -> None:
+    """Ours holds the opacity at 0.999, gsplat alpha at every pixel: apart by 0.001, and at the rim of each
+    Gaussian, where only one of them is cut off, by the smallest alpha."""
+    gaussians = dataclasses.replace(random_gaussians(4, 40, VIEW), opacities=np.ones(40, np.float32))
+    planes, _ = draw_and_differentiate(gaussians, [VIEW], "gsplat")
+    true_planes, _ = draw_and_differentiate(gaussians, [VIEW], "numba")
+    apart = np.abs(planes - true_planes)[0, 4]
+    assert 2e-4 < apart.max() < 3 * MIN_ALPHA
+    assert np.median(apart) < 2e-4
+    wall = one_gaussian(np.array([0, 0, 0.07]), 0.5, 1.0)
+    for backend in ("gsplat", "numba"):
+        drawn, _ = draw_and_differentiate(wall, [camera()], backend)
+        assert drawn[0, 4].max() == pytest.approx(MAX_OPACITY, abs=1e-5)
+
+
+def test_where_hardly_anything_shines_through_any_more() -> None:
+    """gsplat leaves out the Gaussian that would darken a pixel to 1e-4, and all behind it; ours finishes the
+    tile. What gsplat lets shine through is less than 1e-4 / (1 - alpha) of that Gaussian."""
+    opacity = 0.95
+    gaussians = dataclasses.replace(
+        random_gaussians(6, 400, VIEW, spread=4.0), opacities=np.full(400, opacity, np.float32)
+    )
+    planes, found = draw_and_differentiate(gaussians, [VIEW], "gsplat")
+    true_planes, true = draw_and_differentiate(gaussians, [VIEW], "numba")
+    assert true_planes[0, 4].min() > 0.9999
+    apart = (true_planes - planes)[0, 4]
+    assert -1e-6 < apart.min() and 1e-3 < apart.max() < 1e-4 / (1 - opacity)
+    for name in PER_GAUSSIAN[:5]:
+        assert 1e-4 < relative_error(found[name], true[name]) < 2e-2, name
+
+
+# ---- tiles, parts, limits ----------------------------------------------------------------------------------
+
+
+def test_tiles_that_are_not_asked_for_stay_and_count_for_nothing() -> None:
+    gaussians, before = random_gaussians(5, 25, VIEW, spread=0.5), random_gaussians(9, 6, VIEW)
+    tiles = np.zeros((2, -(-44 // TILE_HEIGHT), -(-50 // TILE_WIDTH)), bool)
+    tiles[[0, 0, 1], [0, 1, 1], [1, 3, 0]] = True
+    drawn = np.kron(tiles, np.ones((TILE_HEIGHT, TILE_WIDTH), bool))[:, :44, :50]
+    v_planes, weight = cotangents(EYES, 1)
+    whole, part = (make_rasterizer("gsplat", 50, 44) for _ in range(2))
+    everything = whole.forward(gaussians, EYES).copy()
+    expected = whole.backward(np.where(drawn[:, None], v_planes, 0), np.where(drawn, weight, 0))
+    part.forward(before, EYES[:1])
+    old = np.zeros_like(everything)
+    old[:1] = part.forward(before, EYES[:1])
+    planes = part.forward(gaussians, EYES, tiles)
+    np.testing.assert_array_equal(planes, np.where(drawn[:, None], everything, old))
+    found = part.backward(v_planes, weight)
+    for name in ("means", "quats", "scales", "opacities", "colors", "poses", "contribution"):
+        assert relative_error(getattr(found, name), getattr(expected, name)) < 1e-5, name  # sums in any order
+    assert 2 < int((found.contribution == 0).sum()) < 23
+
+
+def test_geometry_can_be_left_out_and_asked_for_later() -> None:
+    drawing = make_rasterizer("gsplat", 50, 44)
+    drawing.forward(with_view_dependence(random_gaussians(2, 8, VIEW), 1), EYES)
+    v_planes, weight = cotangents(EYES, 0)
+    part, whole = drawing.backward(v_planes, weight, geometry=False), drawing.backward(v_planes, weight)
+    assert relative_error(part.colors, whole.colors) < 1e-6
+    assert relative_error(part.contribution, whole.contribution) < 1e-6
+    for name in ("means", "quats", "scales", "opacities", "sh_rest", "poses"):
+        assert len(getattr(part, name)) == 0 and getattr(whole, name).any(), name
+
+
+def test_limits_are_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawing = make_rasterizer("gsplat", 50, 44)
+    gaussians = random_gaussians(2, 8, VIEW)
+    drawing.forward(gaussians, [VIEW])
+    with pytest.raises(UsageError, match=r"gsplat gives no median depth; choose the numba"):
+        drawing.median()
+
+    def full(*_: Any, **__: Any) -> None:
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+    monkeypatch.setattr("gsplat.rasterization", full)
+    with pytest.raises(SagsError, match="not enough free memory for gsplat to draw 8 Gaussians at 50x44 px"):
+        drawing.forward(gaussians, [VIEW])
+    with pytest.raises(UsageError, match="last drawing failed"):
+        drawing.backward(*cotangents([VIEW], 0))
+
+
+def test_a_mapper_learns_the_same_with_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A tilted, moving sheet, frame by frame: what is drawn, back-propagated, refined in the worst tiles, and
+    shown, is as with the CPU engine."""
+    monkeypatch.setattr(mapper, "INITIAL_STEPS", 2)
+    pictures = np.random.default_rng(0).uniform(0.2, 0.8, (24, 60, 3)).astype(np.float32)
+    pictures = cv2.GaussianBlur(pictures, None, 3)
+    y, x = np.mgrid[:24, :48].astype(np.float32)
+    learnt = []
+    for backend in ("gsplat", "numba"):
+        rasterizer = make_rasterizer(backend, 48, 24)
+        learning = mapper.Mapper(CpuRefiner(rasterizer), 60)
+        for i in range(3):
+            image = np.ascontiguousarray(pictures[:, i : i + 48])
+            observation = Observation(
+                i, i * 33_000_000, camera(48, 24), image, (255 * image.mean(2)).astype(np.uint8),
+                np.ones((24, 48), np.bool_), 0.056 + 1e-4 * x + 1.3e-4 * y, np.ones((24, 48), np.float32),
+            )  # fmt: skip
+            budget = StepBudget(1)
+            budget.start()
+            snapshot = learning.update(observation, budget)
+            view = to_view(
+                rasterizer.forward(snapshot.gaussians, [observation.camera])[0], camera(48, 24), i, 0
+            )
+            learning.drawn(observation, view)
+        learnt.append((snapshot.gaussians, view, float(np.square(view.rgb - image).mean())))
+    (found, view, error), (expected, true_view, true_error) = learnt
+    np.testing.assert_array_equal(found.ids, expected.ids)
+    assert len(found) > 40 and true_error < 0.01
+    assert error == pytest.approx(true_error, rel=0.01)
+    assert relative_error(found.means, expected.means) < 1e-4
+    assert np.abs(view.rgb - true_view.rgb).max() < 0.02
+
+
+# ---- whether it can be used --------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def machine(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
+    """As far as torch says, with a GPU."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
+    return monkeypatch
+
+
+def test_where_gsplat_is_not_installed(machine: pytest.MonkeyPatch) -> None:
+    machine.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(UsageError, match=r"not installed: pip install 'sags-node\[gsplat\]'"):
+        make_rasterizer("gsplat", 8, 8)
+
+
+def test_where_there_is_no_gpu(machine: pytest.MonkeyPatch) -> None:
+    machine.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(UsageError, match=r"gsplat backend found no GPU.*choose the numba backend"):
+        make_rasterizer("gsplat", 8, 8)
+
+
+def test_where_its_kernels_are_missing_or_cannot_be_built(machine: pytest.MonkeyPatch) -> None:
+    built = ModuleType("gsplat.cuda._backend")
+    built._C = None  # type: ignore[attr-defined]
+    machine.setitem(sys.modules, built.__name__, built)
+    machine.setattr("gsplat.cuda._backend", built, raising=False)
+    with pytest.raises(UsageError, match=r"without kernels and found no CUDA compiler.*nvcc"):
+        make_rasterizer("gsplat", 8, 8)
+    machine.delattr("gsplat.cuda._backend")
+    machine.setitem(sys.modules, built.__name__, None)
+    with pytest.raises(UsageError, match=r"gsplat's kernels could not be built: .*_backend"):
+        make_rasterizer("gsplat", 8, 8)
+
+
+def test_it_is_a_launch_key_and_the_doctor_looks_at_it(machine: pytest.MonkeyPatch) -> None:
+    config = load_launch(None, ["engine.backend:=gsplat"])
+    with pytest.raises(UsageError, match="choose one of them"):
+        load_launch(None, ["engine.backend:=gsplat", "device:=cuda"])
+    machine.setattr(torch.cuda, "is_available", lambda: False)
+    (found,) = (check for check in examine(config) if check.name == "gsplat")
+    assert found.level == "error" and "found no GPU" in found.mend
+    machine.setattr(gsplat_backend, "usable_device", lambda: torch.device("cuda"))
+    (found,) = (check for check in examine(config) if check.name == "gsplat")
+    assert found.level == "ok"
+    assert not [check for check in examine(load_launch()) if check.name == "gsplat"]
+
+
+# ---- on a GPU ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="gsplat's kernels need a GPU")
+def test_its_kernels_draw_what_the_cpu_engine_draws(machine: pytest.MonkeyPatch) -> None:
+    """They are compiled with fast, inexact arithmetic."""
+    machine.undo()
+    try:
+        gsplat_backend.usable_device()
+    except UsageError as error:
+        pytest.skip(str(error))
+    gaussians = with_filter(with_view_dependence(random_gaussians(3, 200, VIEW), 3))
+    planes, found = draw_and_differentiate(gaussians, EYES, "gsplat")
+    true_planes, true = draw_and_differentiate(gaussians, EYES, "numba")
+    np.testing.assert_allclose(planes, true_planes, atol=2e-4)
+    for name in DERIVATIVES:
+        assert relative_error(found[name], true[name]) < 2e-3, name

@@ -1,0 +1,231 @@
+"""What holds the objects of the overlay: poses found from anchors, through motion, hiding and new starts."""
+
+from __future__ import annotations
+
+from concurrent.futures import Future
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from synthetic import BASELINE, NORMAL, plane_depth, plane_result
+
+from sags_node.apps.overlay_frame import Anchor, TissueFrame
+from sags_node.apps.overlay_held import HeldObject, Pinner, Request
+from sags_node.apps.overlay_pose import on_a_line, on_surface, rigid_fit, surface_normal
+from sags_node.apps.overlay_scene import ObjectSpec
+from sags_node.errors import SagsError, UsageError
+from sags_node.geometry import invert, quat_to_matrix, transform
+
+# ---- poses -----------------------------------------------------------------------------------------------
+
+
+def pose(seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    T = np.eye(4)
+    T[:3, :3] = quat_to_matrix(rng.normal(size=4))
+    T[:3, 3] = rng.normal(size=3)
+    return T
+
+
+def test_a_rigid_motion_is_found_also_when_one_anchor_went_astray() -> None:
+    rng = np.random.default_rng(4)
+    model = rng.uniform(-0.02, 0.02, (6, 3))
+    T = pose(5)
+    places = np.asarray(transform(T, model))
+    found, error = rigid_fit(model, places, np.ones(6))
+    assert np.allclose(found, T, atol=1e-9) and error < 1e-9
+    places[2] += [0.02, -0.01, 0.015]
+    found, error = rigid_fit(model, places, np.ones(6))
+    assert (
+        np.linalg.norm(transform(found, model)[[0, 1, 3, 4, 5]] - places[[0, 1, 3, 4, 5]], axis=1).max()
+        < 5e-4
+    )
+    flat = model * [1, 1, 0]  # a mirror image fits as well, but is no motion
+    found, _ = rigid_fit(flat, np.asarray(transform(T, flat)), np.ones(6))
+    assert np.linalg.det(found[:3, :3]) == pytest.approx(1) and np.allclose(found, T, atol=1e-9)
+
+
+def test_points_on_a_line_hold_nothing() -> None:
+    line = np.arange(4.0)[:, None] * [1, 2, 3]
+    assert on_a_line(line) and on_a_line(np.zeros((3, 3)))
+    assert not on_a_line(line + np.eye(4, 3))
+
+
+def plane_frame() -> TissueFrame:
+    result = plane_result()
+    camera = result.pair.camera
+    depth, tissue = plane_depth(camera), result.observation.tissue
+    return TissueFrame(5, 5, "s", 2, camera, BASELINE, depth, tissue, {})
+
+
+def on_plane(frame: TissueFrame, u: int, v: int) -> np.ndarray:
+    local = np.linalg.inv(frame.camera.K) @ (u, v, 1.0) * float(frame.depth[v, u])
+    return np.asarray(transform(frame.camera.T_world_cam, local))
+
+
+def test_one_anchor_gives_the_place_and_the_normal_of_the_surface() -> None:
+    frame = plane_frame()
+    place = on_plane(frame, 30, 40)
+    normal = surface_normal(frame, place)
+    assert normal is not None
+    towards = frame.camera.T_world_cam[:3, :3] @ NORMAL
+    assert np.allclose(normal, -towards / np.linalg.norm(NORMAL), atol=1e-3)
+    assert surface_normal(replace(frame, depth=frame.depth * np.float32(np.nan)), place) is None
+    assert surface_normal(replace(frame, tissue=~np.ones_like(frame.tissue)), place) is None
+    assert surface_normal(frame, frame.camera.T_world_cam[:3, 3] - frame.camera.T_world_cam[:3, 2]) is None
+    right = frame.camera.T_world_cam[:3, 0]
+    T = on_surface(place, np.array([0.0, 0, 0.001]), normal, right)
+    assert np.allclose(T[:3, 2], normal) and T[:3, 0] @ right > 0.9
+    assert np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3)) and np.linalg.det(T[:3, :3]) > 0
+    assert np.allclose(transform(T, np.array([0, 0, 0.001])), place)
+
+
+# ---- objects held by anchors -----------------------------------------------------------------------------
+
+
+class FakePinner(Pinner):
+    """Gives ids at once, or refuses; remembers what was asked."""
+
+    def __init__(self) -> None:
+        self.asked: list[Any] = []
+        self.removed: list[int] = []
+        self.forgotten: list[int] = []
+        self.refusal: SagsError | None = None
+        self._next = 1
+
+    def pin(self, requests: Any) -> Future[list[int]]:
+        self.asked.append(requests)
+        future: Future[list[int]] = Future()
+        if self.refusal is not None:
+            future.set_exception(self.refusal)
+            return future
+        future.set_result(list(range(self._next, self._next + len(requests))))
+        self._next += len(requests)
+        return future
+
+    def remove(self, ids: Any) -> None:
+        self.removed += ids
+
+    def forget(self, ids: Any) -> None:
+        self.forgotten += ids
+
+
+PIXELS = [[20, 20], [70, 30], [30, 55], [85, 50]]
+
+
+def held(anchors: list[Request] | list[dict[str, Any]], repin: bool = False, **more: Any) -> HeldObject:
+    spec = ObjectSpec.model_validate({"shape": "sphere", "anchors": anchors, **more})
+    return HeldObject(spec, "pin", FakePinner(), repin)
+
+
+def with_anchors(frame: TissueFrame, places: Any, confidence: Any = 1.0) -> TissueFrame:
+    """The frame with anchors 1, 2, ... at these places, hidden below a confidence of 1; None: no such row."""
+    sure = np.broadcast_to(confidence, len(places))
+    anchors = {
+        i + 1: Anchor(np.asarray(place, np.float64), float(sure[i] == 1), float(sure[i]))
+        for i, place in enumerate(places)
+        if place is not None
+    }
+    return replace(frame, anchors=anchors)
+
+
+def placed_at(thing: HeldObject, frame: TissueFrame) -> np.ndarray:
+    """Its pose, once it has been pinned."""
+    for _ in range(3):
+        T = thing.place(frame)
+        if T is not None:
+            return T
+    raise AssertionError(thing.reason)
+
+
+def test_one_anchor_carries_the_object_and_keeps_its_direction_while_hidden() -> None:
+    frame = plane_frame()
+    thing = held([{"pixel": [30, 40]}])
+    T = placed_at(thing, with_anchors(frame, [on_plane(frame, 30, 40)]))
+    assert thing._pinner.asked == [[{"u": 30, "v": 40}]]  # type: ignore[attr-defined]  # the fake one
+    assert np.allclose(T[:3, 3], on_plane(frame, 30, 40))
+    hidden = replace(frame, tissue=~np.ones_like(frame.tissue))
+    again = thing.place(with_anchors(hidden, [on_plane(frame, 33, 41)], 0.3))
+    assert again is not None and np.allclose(again[:3, :3], T[:3, :3])
+    assert np.allclose(again[:3, 3], on_plane(frame, 33, 41))
+    assert thing.place(with_anchors(hidden, [on_plane(frame, 33, 41)], 0.05)) is None
+    assert thing.reason == "its anchor was not seen for too long"
+    changed = Anchor(on_plane(frame, 33, 41), visibility=1.0, confidence=0.01)
+    assert thing.place(replace(hidden, anchors={1: changed})) is not None  # it is in sight
+
+
+def test_many_anchors_carry_it_rigidly_whatever_is_hidden() -> None:
+    frame = plane_frame()
+    places = np.stack([on_plane(frame, u, v) for u, v in PIXELS])
+    thing = held([{"pixel": p} for p in PIXELS])
+    T = placed_at(thing, with_anchors(frame, places))
+    assert np.allclose(T, frame.camera.T_world_cam, atol=1e-6)  # coordinates of the camera
+    motion = np.eye(4)
+    motion[:3, :3] = quat_to_matrix(np.array([1.0, 0.1, -0.05, 0.08]))
+    motion[:3, 3] = [0.003, -0.002, 0.001]
+    moved = np.asarray(transform(motion, places))
+    for confidence in (1.0, [1, 1, 0.02, 1]):
+        astray = moved.copy()
+        if confidence != 1.0:
+            astray[2] += 0.01  # of the hidden one
+        T = placed_at(thing, with_anchors(frame, astray, confidence))
+        assert np.allclose(T, motion @ frame.camera.T_world_cam, atol=1e-6)
+    assert thing.place(with_anchors(frame, moved, [1, 1, 0.02, 0.02])) is None
+    assert thing.reason == "2 of its 4 anchors are sure, 3 are needed"
+
+
+def test_named_points_of_the_object_come_to_lie_at_its_anchors() -> None:
+    frame = plane_frame()
+    T = frame.camera.T_world_cam @ pose(3)
+    places = np.stack([on_plane(frame, u, v) for u, v in PIXELS])
+    model = np.asarray(transform(invert(T), places))
+    thing = held([{"pixel": p, "at": at.tolist()} for p, at in zip(PIXELS, model, strict=True)])
+    assert np.allclose(placed_at(thing, with_anchors(frame, places)), T, atol=1e-6)
+    in_world = held([{"place": place.tolist()} for place in places], coordinates="world")
+    assert np.allclose(placed_at(in_world, with_anchors(frame, places)), np.eye(4), atol=1e-6)
+
+
+def test_it_waits_for_tissue_with_depth_and_for_the_node() -> None:
+    frame = plane_frame()
+    thing = held([{"pixel": [65, 30]}])  # columns 60 to 69 are an instrument
+    assert thing.place(frame) is None and thing.reason == "pixel 65 30 shows an instrument"
+    unknown = replace(frame, depth=frame.depth * np.float32(np.nan), tissue=np.ones_like(frame.tissue))
+    assert thing.place(unknown) is None and thing.reason == "no depth at pixel 65 30"
+    assert held([]).place(unknown) is None
+    with pytest.raises(UsageError, match=r"pin 96 30 lies outside the left picture of 96x64"):
+        held([{"pixel": [96, 30]}]).place(frame)
+    thing = held([{"pixel": [30, 30]}])
+    thing._pinner.refusal = SagsError("there are 256 anchors already")  # type: ignore[attr-defined]  # fake
+    assert [thing.place(frame) for _ in range(2)] == [None, None]
+    assert thing.reason == "there are 256 anchors already"
+
+
+def test_the_default_place_is_the_middle_of_the_tissue() -> None:
+    thing = held([])
+    thing.place(plane_frame())
+    ((asked,),) = thing._pinner.asked  # type: ignore[attr-defined]  # the fake one
+    assert abs(asked["u"] - 43) < 8 and abs(asked["v"] - 32) < 3
+
+
+@pytest.mark.parametrize("how", ["model", "node", "removed"])
+@pytest.mark.parametrize("repin", [False, True])
+def test_after_a_new_start_it_is_lost_or_pinned_anew(how: str, repin: bool) -> None:
+    frame = plane_frame()
+    place = on_plane(frame, 30, 40)
+    thing = held([{"pixel": [30, 40]}], repin)
+    placed_at(thing, with_anchors(frame, [place]))
+    after = {
+        "model": with_anchors(frame, [np.full(3, np.nan)]),
+        "node": replace(with_anchors(frame, [place]), session="another"),
+        "removed": with_anchors(frame, [None]),
+    }[how]
+    assert thing.place(after) is None and str(thing.reason).startswith("lost: ")
+    pinner: Any = thing._pinner
+    assert (pinner.removed, pinner.forgotten) == (([], [1]) if how == "node" else ([1], []))
+    if not repin:
+        assert thing.place(with_anchors(frame, [place])) is None and str(thing.reason).startswith("lost: ")
+        return
+    fresh = replace(with_anchors(frame, [None, place]), session=after.session)
+    assert np.allclose(placed_at(thing, fresh)[:3, 3], place)
+    assert thing.status()["pinned"] == 2

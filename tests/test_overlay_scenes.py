@@ -1,0 +1,113 @@
+"""Scene files of the overlay and the meshes that they name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import refused
+
+from sags_node.apps.overlay_mesh import mesh_of
+from sags_node.apps.overlay_scene import SHAPES, ObjectSpec, built_in
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_built_in_shapes_stand_on_the_tissue(shape: str) -> None:
+    mesh = mesh_of(built_in((1, 2), shape).objects[0])
+    assert mesh is not None and 100 < len(mesh.triangles) < 5000
+    assert mesh.vertices[:, 2].min() > -0.0025 and np.ptp(mesh.vertices, axis=0).max() < 0.02
+
+
+def mesh_file(folder: Path, name: str, scale: float = 1.0) -> Path:
+    import open3d
+
+    made = open3d.geometry.TriangleMesh.create_box(0.01, 0.02, 0.03).scale(scale, center=(0, 0, 0))
+    made.compute_triangle_normals()  # STL wants them
+    if name.endswith((".pcd", ".xyz")):
+        points = open3d.geometry.PointCloud(made.vertices)
+        assert open3d.io.write_point_cloud(str(folder / name), points, write_ascii=name.endswith("xyz"))
+    else:
+        assert open3d.io.write_triangle_mesh(str(folder / name), made)
+    return folder / name
+
+
+@pytest.mark.parametrize("name", ["box.ply", "box.obj", "box.stl", "box.pcd", "box.xyz"])
+def test_meshes_and_points_are_read_in_metres(name: str, tmp_path: Path) -> None:
+    spec = ObjectSpec(file=mesh_file(tmp_path, name, 1000.0), scale=0.001, point_size=0.001)
+    mesh = mesh_of(spec)
+    assert mesh is not None
+    points = name.endswith((".pcd", ".xyz"))
+    assert len(mesh.triangles) == (8 * 8 if points else 12)
+    room = 0.002 if points else 0.0
+    assert np.allclose(np.ptp(mesh.vertices, axis=0), np.array([0.01, 0.02, 0.03]) + room, atol=1e-6)
+
+
+PLY = "ply\nformat ascii 1.0\nelement vertex {v}\nproperty float x\nproperty float y\nproperty float z\n"
+PLY += "element face {f}\nproperty list uchar int vertex_indices\nend_header\n{body}"
+CORNERS = "0 0 0\n0.01 0 0\n0 0.01 0\n"
+
+
+def ply(vertices: int = 3, faces: int = 1, body: str = CORNERS + "3 0 1 2\n") -> bytes:
+    return PLY.format(v=vertices, f=faces, body=body).encode()
+
+
+BAD_FILES = {
+    "gone.ply": (None, "No such file"),
+    "empty.ply": (b"", "no PLY header"),
+    "nothing.ply": (ply(0, 0, ""), "holds no points"),
+    "nothing.obj": (b"# nothing\n", "holds no triangles"),
+    "nan.ply": (ply(body=CORNERS.replace("0.01", "nan", 1) + "3 0 1 2\n"), "1 of its 3 vertices"),
+    "far.ply": (ply(body=CORNERS.replace("0.01", "10") + "3 0 1 2\n"), "for millimetres set scale: 0.001"),
+    "index.ply": (ply(body=CORNERS + "3 0 1 7\n"), "a vertex that is not there"),
+    "claims.ply": (ply(3_000_000_000), "claims 3000000001 elements"),
+    "claims.stl": (bytes(80) + (10**9).to_bytes(4, "little"), "1000000000 triangles"),
+    "claims.pcd": (b"# .PCD\nFIELDS x y z\nPOINTS 999999999\nDATA binary\n", "claims 999999999"),
+    "packed.pcd": (b"# .PCD\nFIELDS x y z\nPOINTS 9\nDATA binary_compressed\n", "save it as ascii or binary"),
+    "mesh.gltf": (b"{}", "must end in one of"),
+    "large.stl": ("solid\n" * (12 << 20), "64 at most are read"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD_FILES)
+def test_a_bad_mesh_is_one_clear_message(name: str, tmp_path: Path) -> None:
+    content, said = BAD_FILES[name]
+    if content is not None:
+        (tmp_path / name).write_bytes(content.encode() if isinstance(content, str) else content)
+    (tmp_path / "scene.yaml").write_text(f"objects: [{{file: {name}, anchors: [{{pixel: [1, 2]}}]}}]")
+    scene_refused(tmp_path / "scene.yaml", name, said)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("objects: [{shape: target, colour: [1, 2, 3]}]", "'objects.0.colour'; did you mean 'color'?"),
+        ("objects: [{shape: target, anchors: [{pixl: [1, 2]}]}]", "did you mean 'pixel'?"),
+        ("object: []", "did you mean 'objects'?"),
+        ("objects: []", "objects: "),
+        ("[1, 2]", "a map of keys, it is a list"),
+        ("objects: [", "not valid YAML"),
+        ("objects: [{color: [1, 2, 3]}]", "needs a file, a shape or a label"),
+        ("objects: [{shape: target, file: a.ply}]", "a file or a shape, not both"),
+        ("objects: [{shape: cube}]", "'target' or 'sphere'"),
+        ("objects: [{shape: target, anchors: [{pixel: [1, 2]}, {pixel: [3, 4]}]}]", "two anchors"),
+        ("objects: [{shape: target, anchors: [{pixel: [1, 2], place: [1, 2, 3]}]}]", "either pixel: [u, v]"),
+        ("objects: [{shape: target, anchors: [{pixel: [.nan, 2]}]}]", "finite number"),
+        ("objects: [{shape: target, color: [0, 0, 240]}]", "too near the key colour"),
+        ("objects: [{shape: target, opacity: 0}]", "greater than 0"),
+    ],
+)  # fmt: skip
+def test_a_wrong_scene_is_one_clear_message(text: str, said: str, tmp_path: Path) -> None:
+    (tmp_path / "scene.yaml").write_text(text)
+    scene_refused(tmp_path / "scene.yaml", "scene.yaml", said)
+
+
+def test_other_mistakes_are_named(tmp_path: Path) -> None:
+    scene_refused(tmp_path / "gone.yaml", "gone.yaml", "check the path")
+    (tmp_path / "scene.yaml").write_text("objects: [{shape: target}]")
+    scene_refused(tmp_path / "scene.yaml", "--pin is for the built-in target", extra=("--pin", "3", "4"))
+    scene_refused(tmp_path / "scene.yaml", "--control", extra=("--endpoint", "tcp://127.0.0.1:9"))
+
+
+def scene_refused(scene: Path, *said: str, extra: tuple[str, ...] = ()) -> None:
+    refused(2, "overlay", "--scene", scene, *extra, said=said)

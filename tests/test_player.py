@@ -1,0 +1,189 @@
+"""A recording that is played again: for consumers it is a node."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from command_line import START_SECONDS, sags
+from recorded_plane import by_topic, record_plane
+from synthetic import HEIGHT, WIDTH, plane_result
+from waiting import until
+
+from sags_node.apps.topic import topic_hz
+from sags_node.config import PublishConfig
+from sags_node.errors import SagsError
+from sags_node.messaging import cdr
+from sags_node.messaging.received import ReceivedCloud, ReceivedImage
+from sags_node.messaging.rundir import read_connection
+from sags_node.messaging.stream import listen
+from sags_node.messaging.subscriber import Subscriber
+from sags_node.recording.info import bag_info
+from sags_node.recording.player import Options as PlayOptions
+from sags_node.recording.player import Player
+
+
+@contextmanager
+def playing(path: Path, run_dir: Path, paused: bool = True, **options: Any) -> Iterator[Player]:
+    """A player on a thread, paused so that subscribers can come."""
+    config = PublishConfig(data=("tcp://127.0.0.1:*",), control=None, run_dir=run_dir)
+    player = Player(path, PlayOptions(**options), config, "sags", paused)
+    outcome: list[Any] = []
+    thread = threading.Thread(target=lambda: outcome.append(player.play()))
+    thread.start()
+    until((run_dir / "sags.json").exists)
+    try:
+        yield player
+    finally:
+        player.stop()
+        thread.join(10)
+    assert outcome
+
+
+def test_a_consumer_sees_a_played_bag_as_a_node(plane_bag: Path, tmp_path: Path) -> None:
+    names = ["left/image_rect_color", "left/render/depth", "splats", "left/camera_info"]
+    truth = plane_result()
+    with (
+        playing(plane_bag, tmp_path / "run", loop=True) as player,
+        Subscriber(names, run_dir=tmp_path / "run") as sub,
+    ):
+        time.sleep(0.3)
+        player.toggle_pause()
+        picture = sub.wait(names[0], 10)
+        assert picture is not None
+        frame = sub.aligned(names, picture.stamp_ns, timeout=5)
+        assert frame is not None and len({message.meta.frame_id for message in frame.values()}) == 1
+        assert np.array_equal(cast(ReceivedImage, frame[names[0]]).array, truth.pair.left)
+        depth = cast(ReceivedImage, frame["left/render/depth"]).array
+        assert np.array_equal(depth[1:], truth.views["left"].depth[1:]) and np.isnan(depth[0]).all()
+        ids = cast(ReceivedCloud, frame["splats"]).points["id"]
+        assert np.array_equal(ids, truth.snapshot.gaussians.ids)
+        until(lambda: all(sub.ok(name) for name in names))  # fresh: a strict reader takes them
+        stamp = cdr.decode(cdr_of(picture), picture.meta.type).header.stamp
+        assert stamp.sec * 10**9 + stamp.nanosec == picture.stamp_ns
+        player.toggle_pause()
+        until(lambda: not sub.ok(names[0]))
+
+
+def cdr_of(received: Any) -> bytes:
+    """The message again, as its sender must have joined it."""
+    body = cdr.image(received.array, received.meta.encoding, received.stamp_ns)
+    return b"".join(bytes(part) for part in body.parts)
+
+
+def test_compressed_pictures_are_played_raw(tmp_path: Path) -> None:
+    path, _ = record_plane(tmp_path, seconds=0.6, compression="png")
+    names = ["left/image_rect_color", "left/render/image", "left/tissue_mask"]
+    with (
+        playing(path, tmp_path / "again", loop=True) as player,
+        Subscriber(names, run_dir=tmp_path / "again") as sub,
+    ):
+        player.toggle_pause()
+        seen = {name: cast(ReceivedImage, sub.wait(name, 10)) for name in names}
+    assert np.array_equal(seen[names[0]].array, plane_result().pair.left)
+    assert seen[names[1]].meta.encoding == "rgba8" and seen[names[1]].array[..., 3].max() == 191
+    assert seen[names[2]].array.shape == (HEIGHT, WIDTH)
+
+
+def test_flags_of_play(plane_bag: Path, tmp_path: Path) -> None:
+    depth = by_topic(plane_bag)["left/depth"]
+    recorded = bag_info(plane_bag)["duration_s"]
+    config = PublishConfig(data=("tcp://127.0.0.1:*",), control=None, run_dir=tmp_path / "run")
+
+    def outcome(**options: Any) -> dict[str, Any]:
+        return Player(plane_bag, PlayOptions(**options), config).play()
+
+    all_of_it = outcome(rate=20.0, topics=("left/depth",))
+    assert all_of_it["messages"] == len(depth)
+    slow = outcome(topics=("left/depth",), start_offset=recorded - 0.8, rate=0.5)  # it cannot be quicker
+    assert slow["seconds"] > 1.0 and 0 < slow["messages"] < len(depth)
+    short = outcome(topics=("left/depth",), playback_duration=1.0, rate=10.0)
+    assert 0 < short["messages"] < len(depth)
+    without = outcome(rate=50.0, exclude=("left/depth",))
+    assert without["messages"] == bag_info(plane_bag)["messages"] - len(depth)
+    with pytest.raises(SagsError, match="no message that was asked for"):
+        outcome(topics=("left/dept",))
+    with (
+        playing(
+            plane_bag, tmp_path / "other", topics=("left/depth",), remap={"left/depth": "left/render/depth"}
+        ) as player,
+        Subscriber(["left/render/depth", "left/depth"], run_dir=tmp_path / "other") as subscriber,
+    ):
+        player.toggle_pause()
+        assert subscriber.wait("left/render/depth", 10) is not None
+        assert subscriber.latest("left/depth") is None
+    assert sags("bag", "play", plane_bag, "--remap", "a=b").exit_code == 2
+
+
+def test_a_clock_tells_the_moment_of_the_recording(plane_bag: Path, tmp_path: Path) -> None:
+    """Half as fast, with a pause: by clock and stamp every message is found in the recording again."""
+    recorded = {m.sequence: m.publish_ns for m in by_topic(plane_bag)["left/depth"]}
+    run_dir, rate = tmp_path / "run", 0.5
+    clocks: list[tuple[float, int, int]] = []  # when it came (s), wall clock and recording (ns)
+    depths: list[int] = []
+    with playing(plane_bag, run_dir, topics=("left/depth",), rate=rate, clock_hz=50.0) as player:
+        began = time.monotonic()
+        toggles = [0.0, 0.8, 1.5]
+        for arrived in listen(["clock", "left/depth"], None, "sags", 2.4, run_dir=run_dir):
+            at = time.monotonic() - began
+            if toggles and at >= toggles[0]:
+                toggles.pop(0)
+                player.toggle_pause()
+            if arrived is None:
+                continue
+            message, _ = arrived
+            if message.topic == "sags/clock":
+                said = cdr.parse(message).clock
+                clocks.append((at, message.meta.stamp_ns, said.sec * 10**9 + said.nanosec))
+            else:
+                depths.append(message.meta.stamp_ns)
+    ats, walls, told = (np.array(column) for column in zip(*clocks, strict=True))
+    assert (np.diff(walls) >= 0).all() and (np.diff(told) >= 0).all()
+    paused = (ats > 1.0) & (ats < 1.4)
+    assert np.count_nonzero(paused) > 8 and np.ptp(told[paused]) < 2e6
+    for playing_on in (ats < 0.7, ats > 1.7):
+        steps, real = np.diff(told[playing_on]), np.diff(walls[playing_on])
+        assert len(steps) > 12 and np.median(real) == pytest.approx(1e9 / 50, rel=0.2)
+        assert steps.sum() / real.sum() == pytest.approx(rate, rel=0.02)
+    for stamp in depths[5:]:
+        nearest = int(np.argmin(np.abs(walls - stamp)))
+        moment = told[nearest] + (stamp - walls[nearest]) * rate
+        assert min(abs(moment - original) for original in recorded.values()) < 2e6
+
+
+def test_without_being_asked_there_is_no_clock(plane_bag: Path, tmp_path: Path) -> None:
+    with (
+        playing(plane_bag, tmp_path / "run") as player,
+        Subscriber(["clock", "tf"], run_dir=tmp_path / "run") as sub,
+    ):
+        player.toggle_pause()
+        assert sub.wait("tf", 10) is not None
+        time.sleep(0.2)
+        assert sub.latest("clock") is None
+
+
+def test_the_clock_on_the_command_line(plane_bag: Path, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "sags_node", "bag", "play", str(plane_bag), "--loop", "--clock"]
+    command += ["--endpoint", "tcp://127.0.0.1:*"]
+    environment = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)}
+    with subprocess.Popen(
+        command, env=environment, stdin=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    ) as process:
+        try:
+            until((tmp_path / "sags/sags.json").exists, START_SECONDS)
+            figures = topic_hz("clock", read_connection("sags", tmp_path / "sags").data[0], seconds=1.5)
+        finally:
+            process.send_signal(signal.SIGINT)
+            assert process.wait(20) == 0
+    assert 25 < figures["average_rate"] < 45
+    assert sags("bag", "play", plane_bag, "--clock", "0").exit_code == 2

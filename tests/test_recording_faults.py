@@ -1,0 +1,120 @@
+"""What a recorder could not keep is counted, and what it cannot do is named."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+import msgspec
+import pytest
+import zmq
+from made_messages import meta
+from recorded_plane import by_topic, recording
+from synthetic import HEIGHT, WIDTH, at_frame, plane_result, publisher, stream
+from waiting import until
+
+from sags_node.errors import SagsError, UsageError
+from sags_node.messaging import cdr
+from sags_node.messaging.wire import Message, encode
+from sags_node.recording.backlog import Arrived, Backlog
+from sags_node.recording.info import bag_info
+from sags_node.recording.recorder import Options
+
+
+def text_message(seq: int, text: str = "x") -> Message:
+    content = cdr.string(text)
+    of_text = meta(seq, seq, type=content.type, type_hash=cdr.type_hash(content.type), frame_id=-1)
+    return Message("sags/status", of_text, content.parts)
+
+
+def test_gaps_repeats_and_strangers_are_counted(tmp_path: Path) -> None:
+    context = zmq.Context()
+    socket = context.socket(zmq.XPUB)
+    endpoint = f"ipc://{tmp_path / 'data'}"
+    socket.bind(endpoint)
+    try:
+        with recording(Options(tmp_path / "bag", endpoint=endpoint)) as (_, said):
+            socket.recv()  # the subscription
+            for seq in (3, 4, 4, 7, 8, 3, 12):
+                socket.send_multipart(encode(text_message(seq)))
+            socket.send_multipart([b"sags/status", b"junk", b"junk"])
+            unknown = text_message(1)
+            of_own = msgspec.structs.replace(unknown.meta, type="my_msgs/msg/Own")
+            socket.send_multipart(encode(Message("sags/own", of_own, (b"1234",))))
+            time.sleep(0.5)
+    finally:
+        context.destroy(linger=0)
+    row = said[-1]["topics"]["sags/status"]
+    assert row == {"messages": 5, "dropped": 0, "lost": 2 + 3} and said[-1]["rejected"] == 1
+    (listed,) = bag_info(tmp_path / "bag")["topics"]
+    assert listed["messages"] == 5 and listed["lost"] == 5
+
+
+def test_the_backlog_is_bounded() -> None:
+    backlog = Backlog(100)
+    arrived = Arrived(text_message(1, "y" * 50), 1)
+    assert backlog.put(arrived) and not backlog.put(arrived)
+    assert backlog.take(0.1) is arrived and backlog.put(arrived)
+    backlog.close()
+    assert not backlog.finished and backlog.take(0.1) is arrived and backlog.finished
+    assert backlog.take(5.0) is None  # at once
+
+
+def test_a_disk_that_is_too_slow_costs_messages_that_are_counted(tmp_path: Path) -> None:
+    """Room for two depth pictures and no more: a burst cannot be kept."""
+    run_dir = tmp_path / "run"
+    most = 2.5 * 4 * WIDTH * HEIGHT / 1e6
+    options = Options(tmp_path / "bag", ("left/depth",), "png", max_cache_mb=most, run_dir=run_dir)
+    plane = plane_result()
+    with publisher(run_dir) as running, recording(options) as (_, said):
+        until(lambda: running.poll(10) or running.wanted("left/depth"))
+        for i in range(300):
+            running.publish_result(at_frame(plane, i, time.time_ns()), dropped=0)
+        for i in range(300, 320):  # at a pace at which the last ones arrive
+            running.publish_result(at_frame(plane, i, time.time_ns()), dropped=0)
+            running.poll(30)
+    row = said[-1]["topics"]["sags/left/depth"]
+    assert row["messages"] + row["dropped"] + row["lost"] == 320 and row["dropped"] > 0
+    assert row["messages"] == len(by_topic(tmp_path / "bag")["left/depth"]) > 0
+
+
+def test_mistakes_are_named(tmp_path: Path) -> None:
+    taken = tmp_path / "taken"
+    taken.mkdir()
+    (taken / "mine").write_text("mine")
+    with publisher(tmp_path / "run"):
+        with (
+            pytest.raises(UsageError, match="taken exists already"),
+            recording(Options(taken, run_dir=tmp_path / "run")),
+        ):
+            pass
+        with (
+            pytest.raises(SagsError, match="cannot write"),
+            recording(Options(Path("/proc/nowhere/bag"), run_dir=tmp_path / "run")),
+        ):
+            pass
+    with (
+        pytest.raises(SagsError, match="no node runs as 'sags'"),
+        recording(Options(tmp_path / "none", run_dir=tmp_path / "run")),
+    ):
+        pass
+    assert not (tmp_path / "none").exists()
+
+
+def test_a_full_disk_ends_with_one_message(tmp_path: Path) -> None:
+    with publisher(tmp_path / "run") as running, stream(running):
+        file = Path("/dev/full")
+        recorder_folder = tmp_path / "bag"
+        recorder_folder.mkdir()
+        with pytest.raises(SagsError, match=r"cannot write .*: No space left on device; save what is there"):
+            with recording(Options(recorder_folder, run_dir=tmp_path / "run")) as (_, _):
+                # The file that is being written becomes a full disk.
+                (written,) = recorder_folder.glob("*.mcap")
+                descriptors = Path("/proc/self/fd")
+                number = next(
+                    int(d.name) for d in descriptors.iterdir() if os.path.realpath(d) == str(written)
+                )
+                with file.open("wb") as full:
+                    os.dup2(full.fileno(), number)
+                time.sleep(2)

@@ -1,0 +1,165 @@
+"""A real node, a real recorder, and a real kill."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+import pytest
+from command_line import START_SECONDS, sags
+from mcap.reader import make_reader
+from recorded_plane import by_topic
+from rosbags.highlevel import AnyReader
+from waiting import until
+
+from sags_node.errors import SagsError
+from sags_node.messaging.control import ControlClient
+from sags_node.messaging.received import ReceivedImage
+from sags_node.messaging.subscriber import Subscriber
+from sags_node.messaging.topics import TOPICS
+from sags_node.recording.bag import read_messages
+from sags_node.recording.info import bag_info
+from sags_node.session import open_session
+
+
+@pytest.fixture(scope="module")
+def node(phantom_session: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """`sags run` in its own process; its run directory."""
+    home = tmp_path_factory.mktemp("node")
+    command = [sys.executable, "-m", "sags_node", "run", str(phantom_session), "source.loop:=true"]
+    command += [
+        "publish.right:=true",
+        "publish.data:=[tcp://127.0.0.1:*]",
+        "publish.control:=tcp://127.0.0.1:*",
+    ]
+    command += ["mapping.budget_ms:=20"]
+    environment = {**os.environ, "XDG_RUNTIME_DIR": str(home)}
+    with subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL) as process:
+        try:
+            until((home / "sags/sags.json").exists, START_SECONDS)
+            with Subscriber(["tf"], run_dir=home / "sags") as subscriber:
+                assert subscriber.wait("tf", START_SECONDS) is not None
+            yield home
+        finally:
+            process.send_signal(signal.SIGINT)
+            process.wait(20)
+
+
+def start_recorder(home: Path, *arguments: object) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "sags_node", "bag", "record", *map(str, arguments)]
+    environment = {**os.environ, "XDG_RUNTIME_DIR": str(home)}
+    return subprocess.Popen(
+        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+def test_a_killed_recording_is_recovered_and_replayed(node: Path, tmp_path: Path) -> None:
+    seen: dict[int, dict[str, np.ndarray]] = {}
+    eyes = ["left/image_rect_color", "right/image_rect_color"]
+    with Subscriber(eyes, run_dir=node / "sags") as subscriber:
+        process = start_recorder(node, "-o", tmp_path / "bag")
+        bag_file = tmp_path / "bag/bag_0.mcap"
+        deadline = time.monotonic() + 60
+        newest = None
+        while not (bag_file.exists() and bag_file.stat().st_size > 40e6):
+            assert time.monotonic() < deadline
+            newest = subscriber.wait(eyes[0], 1, after=newest)
+            pair = newest and subscriber.aligned(eyes, newest.stamp_ns, timeout=0.5)
+            if newest and pair:
+                arrays = {name: cast(ReceivedImage, message).array.copy() for name, message in pair.items()}
+                seen[newest.stamp_ns] = arrays
+        process.kill()
+        process.wait()
+    assert not (tmp_path / "bag/metadata.yaml").exists()
+    result = sags("bag", "recover", tmp_path / "bag", "-o", tmp_path / "saved", "--json")
+    assert result.exit_code == 3
+    done = json.loads(result.stdout)
+    assert done["chunks_damaged"] <= 1 and done["messages_lost"] == 0
+    with AnyReader([tmp_path / "saved"]) as reader:
+        assert reader.message_count == done["messages"] > 50
+        every_second = {"/sags/diagnostics"}  # may not have come yet
+        wanted = {f"/sags/{topic.name}" for topic in TOPICS}
+        assert {c.topic for c in reader.connections} | every_second == wanted
+    with (tmp_path / "saved/saved_0.mcap").open("rb") as opened:
+        reader2 = make_reader(opened, validate_crcs=True)
+        assert sum(1 for _ in reader2.iter_messages()) == done["messages"]
+    session = open_session(tmp_path / "saved", ["source.pace:=step"])
+    compared = 0
+    with session.source as source:
+        for frame in source:
+            published = seen.get(frame.t_capture_ns)
+            if published is not None:
+                assert np.array_equal(frame.left, published[eyes[0]])
+                assert np.array_equal(frame.right, published[eyes[1]])
+                compared += 1
+    assert compared >= 5
+    assert session.rig.baseline > 0 and session.rig.left.width == frame.left.shape[1]
+
+
+def test_a_long_recording_in_several_files_is_a_session(node: Path, tmp_path: Path) -> None:
+    """What `ros2 bag record -b` is for: a real node, a real recorder, and every command takes the folder."""
+    process = start_recorder(node, "-o", tmp_path / "bag", "-b", 12_000_000, "--seconds", 4)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 0, errors
+    files = list((tmp_path / "bag").glob("*.mcap"))
+    assert len(files) > 3 and max(file.stat().st_size for file in files) < 12_400_000
+    result = sags("bag", "info", tmp_path / "bag", "--json")
+    assert result.exit_code == 0 and len(json.loads(result.stdout)["files"]) == len(files)
+    result = sags("eval", tmp_path / "bag", "source.frames:=10", "--pace", "step", "--json", "-")
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout)["frames"] == 10  # out of three files
+
+
+def test_ctrl_c_closes_the_file_and_a_signal_takes_a_snapshot(node: Path, tmp_path: Path) -> None:
+    straight = start_recorder(
+        node, "-o", tmp_path / "bag", "--json", "--topics", "left/depth", "--topics", "/sags/tf"
+    )
+    ring = start_recorder(node, "-o", tmp_path / "ring", "--json", "--snapshot-mode", "1")
+    assert straight.stderr is not None and ring.stderr is not None
+    for process in (straight, ring):
+        assert process.stderr is not None and "recording" in process.stderr.readline()
+    time.sleep(2)
+    ring.send_signal(signal.SIGUSR1)
+    assert "snapshot_000" in ring.stderr.readline()
+    for process in (straight, ring):
+        process.send_signal(signal.SIGINT)
+        stdout, _ = process.communicate(timeout=20)
+        assert process.returncode == 0
+        summary = json.loads(stdout)
+        assert summary["messages"] > 5 and summary["dropped"] == 0
+    assert {m.topic for m in read_messages(tmp_path / "bag")} == {"/sags/left/depth", "/sags/tf"}
+    assert (tmp_path / "bag/metadata.yaml").exists()
+    assert bag_info(tmp_path / "ring/snapshot_000")["messages"] > 5
+
+
+def test_recording_on_the_control_socket(node: Path, tmp_path: Path) -> None:
+    with ControlClient(run_dir=node / "sags") as control:
+        with pytest.raises(SagsError, match="nothing is being recorded"):
+            control.request("stop_recording", timeout=10)
+        for wrong in ({}, {"path": "x", "speed": 3}, {"path": "x", "compression": "gif"}):
+            with pytest.raises(SagsError, match="start_recording takes path"):
+                control.request("start_recording", wrong, timeout=10)
+        args = {"path": str(tmp_path / "bag"), "topics": ["left/depth"]}
+        assert control.request("start_recording", args, timeout=20) == {"recording": str(tmp_path / "bag")}
+        with pytest.raises(SagsError, match="running already"):
+            control.request("start_recording", args, timeout=10)
+        time.sleep(1.5)
+        summary = control.request("stop_recording", timeout=20)
+        assert summary["messages"] == len(by_topic(tmp_path / "bag")["left/depth"]) > 3
+        with pytest.raises(SagsError, match="exists already; name a new folder"):
+            control.request("start_recording", args, timeout=20)
+        args = {"path": str(tmp_path / "ring"), "snapshot_seconds": 1, "max_bag_size": 2_000_000}
+        control.request("start_recording", args, timeout=20)
+        time.sleep(1)
+        taken = control.request("take_snapshot", timeout=20)
+        saved = bag_info(Path(taken["snapshot"]))
+        assert saved["messages"] == taken["messages"] > 5 and len(saved["files"]) > 1
+        assert control.request("stop_recording", timeout=20)["messages"] == taken["messages"]

@@ -1,0 +1,114 @@
+"""Damaged recordings: what is whole is saved, and nothing that is wrong."""
+
+from __future__ import annotations
+
+import json
+import random
+from pathlib import Path
+from typing import Any
+
+import yaml
+from command_line import sags
+from recorded_plane import content
+
+from sags_node.errors import SagsError
+from sags_node.recording.bag import BagMessage, read_messages
+from sags_node.recording.info import bag_info
+from sags_node.recording.recover import recover
+
+
+def recovered(file: bytes, tmp_path: Path, name: str) -> tuple[dict[str, Any] | None, list[BagMessage]]:
+    """What `recover` makes of a file; None when it says that nothing is left."""
+    damaged, out = tmp_path / f"{name}.mcap", tmp_path / name
+    damaged.write_bytes(file)
+    try:
+        done = recover(damaged, out)
+    except SagsError as error:
+        assert "holds no whole message" in str(error)
+        return None, []
+    return done, list(read_messages(out))
+
+
+def test_recovery_after_a_cut_keeps_all_before_it(plane_bag: Path, tmp_path: Path) -> None:
+    (file,) = plane_bag.glob("*.mcap")
+    whole, original = file.read_bytes(), content(list(read_messages(plane_bag)))
+    rng = random.Random(0)
+    sizes = []
+    for number, length in enumerate(sorted(rng.randrange(len(whole)) for _ in range(12))):
+        done, kept = recovered(whole[:length], tmp_path, f"cut{number}")
+        assert done is None or done["lost"]
+        assert content(kept) == original[: len(kept)]
+        assert len(kept) >= len(original) * (length / len(whole)) * 0.9 - 40  # nearly all that is there
+        sizes.append(len(kept))
+    assert sizes == sorted(sizes) and sizes[-1] > len(original) / 2
+
+
+def test_recovery_from_flipped_bits_keeps_only_what_is_right(plane_bag: Path, tmp_path: Path) -> None:
+    (file,) = plane_bag.glob("*.mcap")
+    whole, original = file.read_bytes(), set(content(list(read_messages(plane_bag))))
+    for seed in range(24):
+        rng = random.Random(seed)
+        data = bytearray(whole)
+        for _ in range(1 + seed % 3):
+            place = (rng.randrange(len(data)), rng.randrange(2000), len(data) - 1 - rng.randrange(8000))[
+                seed % 3
+            ]
+            data[place] ^= 1 << rng.randrange(8)
+        done, kept = recovered(bytes(data), tmp_path, f"flip{seed}")
+        found = set(content(kept))
+        assert done is not None and found <= original and len(kept) == len(found)
+        assert done["lost"] or len(found) == len(original)
+        if seed % 3 == 0:  # one flip costs one chunk
+            assert len(found) > 0.75 * len(original)
+
+
+def test_recovery_finds_the_chunks_behind_a_hole(plane_bag: Path, tmp_path: Path) -> None:
+    (file,) = plane_bag.glob("*.mcap")
+    whole, original = file.read_bytes(), content(list(read_messages(plane_bag)))
+    hole = bytearray(whole)
+    third = len(whole) // 3
+    hole[third : third + 1000] = b"\x06" * 1000
+    for name, data in (
+        ("hole", hole),
+        ("gone", whole[:third] + whole[third + 500 :]),
+        ("more", whole[:third] + b"\x06\xff" * 300 + whole[third:]),
+    ):
+        done, kept = recovered(bytes(data), tmp_path, name)
+        assert done is not None and done["lost"] and set(content(kept)) <= set(original)
+        assert content(kept)[-1] == original[-1] and len(kept) > 0.6 * len(original)
+
+
+def test_recovery_with_nothing_lost(plane_bag: Path, tmp_path: Path) -> None:
+    (file,) = plane_bag.glob("*.mcap")
+    whole, original = file.read_bytes(), content(list(read_messages(plane_bag)))
+    for name, data in (("sound", whole), ("footer", whole[:-20]), ("index", whole[:-2000] + bytes(2000))):
+        done, kept = recovered(data, tmp_path, name)
+        assert done is not None and not done["lost"] and content(kept) == original
+    with (tmp_path / "sound").joinpath("metadata.yaml").open() as described:
+        topics = yaml.safe_load(described)["rosbag2_bagfile_information"]["topics_with_message_count"]
+    kept_for_late = [
+        t for t in topics if "transient_local" in str(t["topic_metadata"]["offered_qos_profiles"])
+    ]
+    latched = [t["topic_metadata"]["name"] for t in kept_for_late]
+    assert "/sags/parameters" in latched and "/sags/left/depth" not in latched
+    assert all(t["topic_metadata"]["type_description_hash"].startswith("RIHS01_") for t in topics)
+
+
+def test_recover_on_the_command_line(plane_bag: Path, tmp_path: Path) -> None:
+    (file,) = plane_bag.glob("*.mcap")
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(file.read_bytes()[:-200_000])
+    (tmp_path / "empty").mkdir()
+    result = sags("bag", "info", cut)
+    assert result.exit_code == 1 and "sags bag recover" in result.stderr
+    result = sags("bag", "recover", cut, "-o", tmp_path / "saved", "--json")
+    assert result.exit_code == 3 and json.loads(result.stdout)["lost"] is True
+    result = sags("bag", "recover", file, "-o", tmp_path / "again")
+    assert result.exit_code == 0 and "nothing was lost" in result.stdout
+    assert sags("bag", "recover", file, "-o", tmp_path / "again").exit_code == 2
+    for other in (tmp_path / "nowhere.mcap", tmp_path / "empty", __file__):
+        assert sags("bag", "recover", other, "-o", tmp_path / "out").exit_code == 2
+    listed = json.loads(sags("bag", "info", tmp_path / "again", "--json").stdout)
+    assert listed["messages"] == bag_info(plane_bag)["messages"] and {
+        t["lost"] for t in listed["topics"]
+    } == {0}

@@ -1,0 +1,13 @@
+"""Waiting for what comes in its own time."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+
+def until(done: Callable[[], object], seconds: float = 10.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not done():
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.01)
