@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -51,6 +53,13 @@ for command in (
 
 
 @bench.command("kernels")
+@click.option(
+    "--device",
+    type=click.Choice(["cpu", "cuda"]),
+    default="cpu",
+    show_default=True,
+    help="cuda: the rasteriser on a GPU, beside gsplat where that is installed.",
+)
 @click.option("--quick", is_flag=True, help="A tiny scene and few runs: does it work, not how fast is it.")
 @click.option("--large", is_flag=True, help="Also a million Gaussians.")
 @click.option("--contention", is_flag=True, help="Also beside another process that burns one core.")
@@ -68,6 +77,7 @@ for command in (
 )
 @as_json
 def bench_kernels(
+    device: str,
     quick: bool,
     large: bool,
     contention: bool,
@@ -90,38 +100,74 @@ def bench_kernels(
     \b
     sags bench kernels --out benchmarks/results/kernels.json
     sags bench kernels --check benchmarks/results/kernels.json
+    sags bench kernels --device cuda --out gpu.json
     """
-    from dataclasses import replace
-
     from sags_node.benchmark import check as guard
-    from sags_node.benchmark import report
-    from sags_node.benchmark.kernels import MILLION, QUICK, Settings, measure_kernels
+    from sags_node.benchmark import device_report, report
 
-    settings = QUICK if quick else Settings()
-    if large:
-        settings = replace(settings, counts=(*settings.counts, MILLION))
-    settings = replace(settings, twin=not no_twin, contention=contention)
+    on_gpu = device == "cuda"
+    if on_gpu and (large or contention or no_twin):
+        raise UsageError("--large, --contention and --no-twin are about the CPU's table; leave them out")
+    if check is not None and out is not None:
+        raise UsageError("give --out or --check: a check measures up to three times and keeps no table")
+    checks = check is not None
+    measure = (
+        _device_kernels(quick, checks) if on_gpu else _kernels(quick, large, contention, no_twin, checks)
+    )
     if check is None:
         check_files(out)
         with progress("measuring") as advance:
-            measured = measure_kernels(settings, advance)
-        for table in [measured] if json_out else report.tables(measured):
+            measured = measure(advance)
+        reporter = device_report if on_gpu else report
+        for table in [measured] if json_out else reporter.tables(measured):
             show(table)
         write_json(out, measured)
         if out is not None:
             with writing(out):
-                out.with_suffix(".svg").write_text(report.plot(measured), encoding="utf-8")
+                out.with_suffix(".svg").write_text(reporter.plot(measured), encoding="utf-8")
         return
-    if out is not None:
-        raise UsageError("give --out or --check: a check measures up to three times and keeps no table")
     kept = guard.read_table(check)
-    settings = replace(settings, twin=False, rhythm=False, contention=False)
     with progress("measuring") as advance:
-        compared = guard.check(lambda: measure_kernels(settings, advance), kept, tolerance)
+        compared = guard.check(lambda: measure(advance), kept, tolerance)
     show([asdict(each) for each in compared] if json_out else report.check_table(compared, tolerance))
     slower = [f"{each.kernel} {each.ratio:.2f} times" for each in compared if each.ratio > tolerance]
     if slower:
         raise SagsError(f"slower than in {check}, three times in a row: {'; '.join(slower)}")
+
+
+Advance = Callable[[int, int, str], None]  # done, total, what comes next
+Measure = Callable[[Advance], dict[str, Any]]
+
+
+def _kernels(quick: bool, large: bool, contention: bool, no_twin: bool, checks: bool) -> Measure:
+    """What measures the CPU's table; of what is only to be checked, the kernels alone."""
+    from dataclasses import replace
+
+    from sags_node.benchmark import kernels
+
+    settings = kernels.QUICK if quick else kernels.Settings()
+    if large:
+        settings = replace(settings, counts=(*settings.counts, kernels.MILLION))
+    if checks:
+        settings = replace(settings, twin=False, rhythm=False)
+    else:
+        settings = replace(settings, twin=not no_twin, contention=contention)
+    return lambda advance: kernels.measure_kernels(settings, advance)
+
+
+def _device_kernels(quick: bool, checks: bool) -> Measure:
+    """The same of a GPU.
+
+    Raises:
+        UsageError: torch and Triton are not here, as they must be for one.
+    """
+    from dataclasses import replace
+
+    from sags_node.benchmark import device_kernels
+
+    settings = device_kernels.QUICK if quick else device_kernels.DeviceSettings()
+    settings = replace(settings, gsplat=not checks)
+    return lambda advance: device_kernels.measure_device_kernels(settings, advance)
 
 
 @bench.command("alias")

@@ -296,7 +296,9 @@ class VisionConfig(Section):
 
 
 class EngineConfig(Section):
-    backend: Literal["numba", "reference"] = "numba"
+    backend: Literal["numba", "gsplat", "reference"] = Field(
+        "numba", description="numba: the CPU, or a GPU by device; gsplat: that package on a GPU, docs/gpu.md"
+    )
     threads: int | None = Field(None, ge=1, le=64, description="default: all cores of this process")
 
 
@@ -358,8 +360,8 @@ class LaunchConfig(Section):
 
     @model_validator(mode="after")
     def _one_engine(self) -> LaunchConfig:
-        if self.device == "cuda" and self.engine.backend == "reference":
-            raise ValueError("device cuda and engine.backend reference: choose one of them")
+        if self.device == "cuda" and self.engine.backend != "numba":
+            raise ValueError(f"device cuda and engine.backend {self.engine.backend}: choose one of them")
         return self
 
     @property

@@ -48,6 +48,7 @@ def examine(config: LaunchConfig) -> list[Check]:
         *(_library(name, package) for name, package in OPEN3D_LIBRARIES.items()),
         _cores(),
         _gpu(config),
+        *_gsplat(config),
         _kernel_cache(),
         *_ports(config.publish),
         *_keys(config.publish),
@@ -93,6 +94,19 @@ def _gpu(config: LaunchConfig) -> Check:
         return Check("GPU", "ok", f"{found.name}: draws what the CPU draws")
     level: Level = "error" if config.device == "cuda" else "warning" if has_gpu() else "ok"
     return Check("GPU", level, f"not used: {found.reason}", found.mend if level != "ok" else "")
+
+
+def _gsplat(config: LaunchConfig) -> list[Check]:
+    """Only where it was chosen: looking for it may build its kernels."""
+    if config.engine.backend != "gsplat":
+        return []
+    from sags_node.engine import gsplat_backend
+
+    try:
+        gsplat_backend.usable_device()
+    except UsageError as error:
+        return [Check("gsplat", "error", "cannot be used", str(error))]
+    return [Check("gsplat", "ok", importlib.metadata.version("gsplat"))]
 
 
 def _kernel_cache() -> Check:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import multiprocessing
+import os
 import subprocess
 import sys
 import tempfile
@@ -31,6 +32,7 @@ SMALL = ("tf", "anchors", "status")  # what each of the many listens to
 STATUS = TopicName("status", ReceivedText)
 WARM_UP = 10.0  # s
 STARTING = 60.0  # s for a node to bind its sockets
+LOWEST_PRIORITY = 19
 SLOW = 0.2  # s that the slow subscriber takes for each frame
 PHASE = "publish.data:=[tcp://127.0.0.1:*]", "publish.control:=null", "source.loop:=true"
 
@@ -42,6 +44,7 @@ def measure_crowd(launch: Sequence[str], alone: float, crowded: float, many: int
 
     The crowd: a fast subscriber that takes every picture and depth; a slow one that takes `SLOW` seconds for
     each; a dead one that is connected to everything and never reads; and `many` more that listen to `SMALL`.
+    They stand for other machines, and so take only what the node leaves of the cores.
 
     Args:
         launch: launch file and overrides of the node.
@@ -124,6 +127,7 @@ def _crowd(folder: Path, many: int | None) -> Iterator[Callable[[], dict[str, An
 
 def _take(folder: Path, seconds: float, ending: Event, there: Connection) -> None:
     """Take pictures and depth of the newest frame, and `seconds` for each."""
+    os.nice(LOWEST_PRIORITY)
     since_capture, since_sent = [], []
     with Subscriber(PICTURES, run_dir=folder) as subscriber:
         newest = subscriber.wait(PICTURES[0], timeout=STARTING)
@@ -143,6 +147,7 @@ def _take(folder: Path, seconds: float, ending: Event, there: Connection) -> Non
 
 def _sleep(folder: Path, _: float, ending: Event, there: Connection) -> None:
     """Be connected to everything and never read."""
+    os.nice(LOWEST_PRIORITY)
     context = zmq.Context()
     socket = context.socket(zmq.SUB)
     socket.subscribe("")
@@ -154,6 +159,7 @@ def _sleep(folder: Path, _: float, ending: Event, there: Connection) -> None:
 
 def _listen(folder: Path, count: float, ending: Event, there: Connection) -> None:
     """Many subscribers of small topics in one process."""
+    os.nice(LOWEST_PRIORITY)
     context, poller = zmq.Context(), zmq.Poller()
     address = find_data(None, "sags", folder)
     for _ in range(int(count)):

@@ -11,7 +11,7 @@ from sags_node.benchmark.adam import measure_adam
 from sags_node.benchmark.decoding import CONTROL_NODES, measure_decoder
 from sags_node.benchmark.disturbance import measure_contention, measure_rhythm
 from sags_node.benchmark.fields import measure_hexplane
-from sags_node.benchmark.peak import Peak, measure_peak
+from sags_node.benchmark.peak import Peak, measure_peak, peak_row
 from sags_node.benchmark.pictures import measure_losses
 from sags_node.benchmark.rasterizing import RasterCase, measure_rasterizer
 from sags_node.benchmark.step import measure_step
@@ -52,7 +52,7 @@ def measure_kernels(settings: Settings, advance: Advance) -> dict[str, Any]:
         "machine": machine_name(),
         "threads": every,
         "settings": asdict(settings),
-        "peaks": [_peak_row(peak) for peak in peaks.values()],
+        "peaks": [peak_row(peak) for peak in peaks.values()],
     }
     jobs = list(_jobs(settings, peaks))
     for done, job in enumerate(jobs):
@@ -121,11 +121,3 @@ def raster_cases(settings: Settings, thread_counts: list[int]) -> Iterator[Raste
     yield replace(second, sh_degree=3)
     for share in ACTIVE_SHARES:
         yield replace(second, active_tiles=share)
-
-
-def _peak_row(peak: Peak) -> dict[str, Any]:
-    return {
-        "threads": peak.threads,
-        "operations_per_s": peak.operations,
-        "bytes_per_s_over": {str(size): rate for size, rate in peak.bandwidths.items()},
-    }

@@ -48,6 +48,15 @@ class Peak:
         return self.bandwidths[next((size for size in sizes if touched <= size), sizes[-1])]
 
 
+def peak_row(peak: Peak) -> dict[str, Any]:
+    """What a table says of it."""
+    return {
+        "threads": peak.threads,
+        "operations_per_s": peak.operations,
+        "bytes_per_s_over": {str(size): rate for size, rate in peak.bandwidths.items()},
+    }
+
+
 def measure_peak(threads: int) -> Peak:
     """The best of several tries; half a second, and a few to compile the first time. Leaves the calling
     thread's number of threads as it was."""

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping, Sized
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from sags_node.benchmark.peak import Peak
 from sags_node.benchmark.scenes import SCENES, with_harmonics
-from sags_node.benchmark.timing import Stages, StageTimes, median_ms, stage_clock
+from sags_node.benchmark.timing import WALL, Clock, Stages, StageTimes, median_ms, stage_clock
 from sags_node.benchmark.work import Work, share_of_peak, stage_rows
 from sags_node.engine import (
     binning,
@@ -63,12 +63,44 @@ def measure_rasterizer(case: RasterCase, runs: int, peak: Peak, twin_runs: int =
     Args:
         twin_runs: how often to draw with the slow torch twin, too; 0: not at all.
     """
-    drawing = Drawing(case)
-    forward_ms, both_ms = median_ms(drawing.forward, runs), median_ms(drawing.forward_backward, runs)
-    with stage_clock(STAGES) as clock:
-        stages_ms = clock.medians_ms(drawing.forward_backward, runs)
-    work = {stage: _work(stage, clock) for stage in stages_ms}
-    row: dict[str, Any] = {
+    row = time_drawing(Drawing(case), case, runs, peak, STAGES, _work)
+    if twin_runs > 0:
+        row["twin_forward_backward_ms"] = _time_twin(case, twin_runs)
+        row["speedup_over_twin"] = row["twin_forward_backward_ms"] / row["forward_backward_ms"]
+    return row
+
+
+class Drawn(Protocol):
+    """One case that a rasteriser draws again and again."""
+
+    @property
+    def gaussians(self) -> Sized: ...
+
+    def forward(self) -> object: ...
+
+    def forward_backward(self) -> object: ...
+
+
+def time_drawing(
+    drawing: Drawn,
+    case: RasterCase,
+    runs: int,
+    peak: Peak,
+    stages: Stages,
+    work_of: Callable[[str, StageTimes], Work],
+    clock: Clock = WALL,
+) -> dict[str, Any]:
+    """What a row of the table says of any rasteriser.
+
+    Args:
+        work_of: a stage's, from the arguments of its last calls.
+    """
+    forward_ms = median_ms(drawing.forward, runs, clock=clock)
+    both_ms = median_ms(drawing.forward_backward, runs, clock=clock)
+    with stage_clock(stages, clock) as times:
+        stages_ms = times.medians_ms(drawing.forward_backward, runs)
+    work = {stage: work_of(stage, times) for stage in stages_ms}
+    return {
         "n": len(drawing.gaussians),
         "width": case.width,
         "height": case.height,
@@ -84,10 +116,6 @@ def measure_rasterizer(case: RasterCase, runs: int, peak: Peak, twin_runs: int =
         "stages": stage_rows(stages_ms, work, peak),
         "between_stages_ms": max(0.0, both_ms - sum(stages_ms.values())),
     }
-    if twin_runs > 0:
-        row["twin_forward_backward_ms"] = _time_twin(case, twin_runs)
-        row["speedup_over_twin"] = row["twin_forward_backward_ms"] / both_ms
-    return row
 
 
 def _time_twin(case: RasterCase, runs: int) -> float:
@@ -99,15 +127,12 @@ def _time_twin(case: RasterCase, runs: int) -> float:
 
 
 class Drawing:
-    """One case, ready to be drawn again and again."""
+    """One case on the host's arrays."""
 
     def __init__(self, case: RasterCase, backend: str = "numba") -> None:
-        self.gaussians, self._cameras = _scene(case)
+        self.gaussians, self._cameras = make_scene(case)
         self._tiles = _active_tiles(case)
-        size = (case.cameras, case.height, case.width)
-        rng = np.random.default_rng(0)
-        self._v_planes = rng.normal(size=(size[0], 5, *size[1:])).astype(np.float32)
-        self._weight = np.ones(size, np.float32)
+        self._v_planes, self._weight = make_cotangents(case)
         self._rasterizer = make_rasterizer(backend, case.width, case.height)
 
     def forward(self) -> F32:
@@ -118,11 +143,19 @@ class Drawing:
         self._rasterizer.backward(self._v_planes, self._weight)
 
 
-def _scene(case: RasterCase) -> tuple[Gaussians, list[Camera]]:
+def make_scene(case: RasterCase) -> tuple[Gaussians, list[Camera]]:
+    """What is drawn, and for whom."""
     gaussians, left = SCENES[case.scene](case.count, case.width, case.height)
     if case.sh_degree > 0:
         gaussians = with_harmonics(gaussians, case.sh_degree)
     return gaussians, [left.moved_right(eye * BASELINE) for eye in range(case.cameras)]
+
+
+def make_cotangents(case: RasterCase) -> tuple[F32, F32]:
+    """Random ones of the planes [C, 5, H, W], and the pixels' weights [C, H, W]."""
+    size = (case.cameras, case.height, case.width)
+    v_planes = np.random.default_rng(0).normal(size=(size[0], 5, *size[1:]))
+    return v_planes.astype(np.float32), np.ones(size, np.float32)
 
 
 def _active_tiles(case: RasterCase) -> Bool | None:
@@ -152,18 +185,24 @@ _PICTURES = {"planes", "v_planes", "weight"}  # only read and written where draw
 _IN_CACHE = {"scratch"}
 
 
-def _work(stage: str, clock: StageTimes) -> Work:
-    drawing = clock.arguments["composite"]
+def _work(stage: str, times: StageTimes) -> Work:
+    drawing = times.arguments["composite"]
     tile_pairs, tiles = int(drawing["tile_starts"][-1]), drawing["tile_ends"].size
     drawn_share = drawing["drawn"].size / tiles
     touched = 0.0
-    for function in (name for (_, name), each in STAGES.items() if each == stage):
-        for name, value in clock.arguments[function].items():
-            if not isinstance(value, np.ndarray) or name in _IN_CACHE:
-                continue
+    for name, value in arrays_of(stage, STAGES, times):
+        if name not in _IN_CACHE:
             used = tile_pairs * value.itemsize if name in _PER_PAIR else value.nbytes
             touched += used * drawn_share if name in _PICTURES else used
     if stage in OPERATIONS_PER_PAIR:
         pairs = evaluated_pairs(drawing)
         return Work(touched, OPERATIONS_PER_PAIR[stage] * pairs, pairs)
     return Work(touched)
+
+
+def arrays_of(stage: str, stages: Stages, times: StageTimes) -> Iterator[tuple[str, Any]]:
+    """Arrays or tensors, by their names, that the functions of a stage were given in their last calls."""
+    for function in (name for (_, name), each in stages.items() if each == stage):
+        for name, value in times.arguments[function].items():
+            if hasattr(value, "nbytes"):
+                yield name, value

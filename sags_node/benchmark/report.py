@@ -15,7 +15,9 @@ Row = Mapping[str, Any]
 
 def tables(measured: Row) -> Iterator[Table]:
     """`measured` as `measure_kernels` returns it."""
-    yield _peaks(measured)
+    peaks = measured["peaks"]
+    names = [f"{each['threads']} thread{'s' if each['threads'] > 1 else ''}" for each in peaks]
+    yield peaks_table(peaks, names, measured["machine"])
     yield _drawings(measured["rasterize"])
     yield _stages(measured)
     yield _twins(measured)
@@ -25,7 +27,7 @@ def tables(measured: Row) -> Iterator[Table]:
 
 def check_table(compared: Sequence[Compared], tolerance: float) -> Table:
     """The slowest kernel first."""
-    made = _table("kernel", "ms", "kept ms", "ratio", "")
+    made = new_table("kernel", "ms", "kept ms", "ratio", "")
     for each in compared:
         verdict = "slower" if each.ratio > tolerance else ""
         made.add_row(each.kernel, f"{each.ms:.2f}", f"{each.kept_ms:.2f}", f"{each.ratio:.2f}", verdict)
@@ -35,7 +37,7 @@ def check_table(compared: Sequence[Compared], tolerance: float) -> Table:
 def plot(measured: Row) -> str:
     """Where the time goes, as SVG."""
     drawings: list[Bar] = [
-        (f"{_count(row['n'])}, {row['width']}x{row['height']}", _by_stage(row))
+        (f"{_count(row['n'])}, {row['width']}x{row['height']}", by_stage(row))
         for row in measured["rasterize"]
         if _is_plain(row, measured["threads"])
     ]
@@ -55,22 +57,24 @@ def plot(measured: Row) -> str:
     )
 
 
-def _peaks(measured: Row) -> Table:
-    sizes = [f"{int(size) >> 20} MiB" for size in measured["peaks"][0]["bytes_per_s_over"]]
-    made = _table("peak of this machine", "multiply-adds", *sizes, title=measured["machine"])
-    for peak in measured["peaks"]:
-        threads = f"{peak['threads']} thread{'s' if peak['threads'] > 1 else ''}"
+def peaks_table(peaks: Sequence[Row], names: Sequence[str], title: str) -> Table:
+    """What each of `names` reached."""
+    sizes = [f"{int(size) >> 20} MiB" for size in peaks[0]["bytes_per_s_over"]]
+    made = new_table("peak of this machine", "multiply-adds", *sizes, title=title)
+    for name, peak in zip(names, peaks, strict=True):
         bandwidths = [f"{rate / 1e9:.0f} GB/s" for rate in peak["bytes_per_s_over"].values()]
-        made.add_row(threads, f"{peak['operations_per_s'] / 1e9:.0f} G/s", *bandwidths)
+        made.add_row(name, f"{peak['operations_per_s'] / 1e9:.0f} G/s", *bandwidths)
     return made
 
 
 def _drawings(rows: Sequence[Row]) -> Table:
-    made = _table("drawing", "threads", "forward ms", "+ backward ms", "of peak", "torch twin ms", "faster")
+    made = new_table(
+        "drawing", "threads", "forward ms", "+ backward ms", "of peak", "torch twin ms", "faster"
+    )
     for row in rows:
         twin = row.get("twin_forward_backward_ms")
         made.add_row(
-            _drawing(row),
+            drawing_name(row),
             str(row["threads"]),
             f"{row['forward_ms']:.2f}",
             f"{row['forward_backward_ms']:.2f}",
@@ -82,19 +86,24 @@ def _drawings(rows: Sequence[Row]) -> Table:
 
 
 def _stages(measured: Row) -> Table:
-    made = _table("stage", "of", "ms", "of peak", "bound by", "pairs/s")
+    made = stages_table()
     for row in measured["rasterize"]:
         if _is_plain(row, measured["threads"]):
-            _add_stages(made, row, _drawing(row))
+            add_stages(made, row, drawing_name(row))
     for section in ("hexplane", "decoder", "losses", "adam"):
         for row in measured[section]:
-            _add_stages(made, row, _kernel(section, row))
+            add_stages(made, row, _kernel(section, row))
     return made
+
+
+def stages_table() -> Table:
+    """To be filled by `add_stages`."""
+    return new_table("stage", "of", "ms", "of peak", "bound by", "pairs/s")
 
 
 def _twins(measured: Row) -> Table:
     """Beside the kernels of the field, the decoder and the loss."""
-    made = _table("forward and backward", "ms", "torch twin ms", "faster")
+    made = new_table("forward and backward", "ms", "torch twin ms", "faster")
     for section, key in (
         ("hexplane", "forward_backward_ms"),
         ("decoder", "forward_backward_ms"),
@@ -117,7 +126,7 @@ def _kernel(section: str, row: Row) -> str:
 
 
 def _steps(measured: Row) -> Table:
-    made = _table("whole step", "ms", "its stages, ms")
+    made = new_table("whole step", "ms", "its stages, ms")
     made.columns[2].justify = "left"
     for row in measured["step"]:
         loss = "with SSIM" if row["ssim"] else "without SSIM"
@@ -132,7 +141,7 @@ def _disturbances(measured: Row) -> Iterator[Table]:
     for section in ("rhythm", "contention"):
         for row in measured.get(section, []):
             what = f"forward and backward, {_count(row['n'])} at {row['width']}x{row['height']}"
-            made = _table(what, "p50 ms", "p90 ms")
+            made = new_table(what, "p50 ms", "p90 ms")
             for key, spread in row.items():
                 if isinstance(spread, Mapping):
                     situation = key.removesuffix("_ms").replace("_", " ")
@@ -140,7 +149,7 @@ def _disturbances(measured: Row) -> Iterator[Table]:
             yield made
 
 
-def _add_stages(made: Table, row: Row, of: str) -> None:
+def add_stages(made: Table, row: Row, of: str) -> None:
     for stage in row["stages"]:
         share, pairs = f"{stage['share_of_peak']:.0%}", ""
         if "pairs_per_s" in stage:
@@ -153,7 +162,7 @@ def _is_plain(row: Row, threads: int) -> bool:
     return not special and row["scene"] == "surface" and row["threads"] == threads
 
 
-def _drawing(row: Row) -> str:
+def drawing_name(row: Row) -> str:
     parts = [f"{_count(row['n'])} at {row['width']}x{row['height']}"]
     if row["scene"] != "surface":
         parts.append(row["scene"])
@@ -166,7 +175,7 @@ def _drawing(row: Row) -> str:
     return ", ".join(parts)
 
 
-def _by_stage(row: Row) -> dict[str, float]:
+def by_stage(row: Row) -> dict[str, float]:
     return {stage["stage"]: stage["ms"] for stage in row["stages"]}
 
 
@@ -176,7 +185,7 @@ def _count(n: int) -> str:
     return f"{n / 1e3:.0f}k" if n < 999_500 else f"{n / 1e6:.2g}M"
 
 
-def _table(first: str, *others: str, title: str | None = None) -> Table:
+def new_table(first: str, *others: str, title: str | None = None) -> Table:
     made = Table(box=None, padding=(0, 3, 0, 0), pad_edge=False, title=title, title_justify="left")
     made.add_column(first)
     for heading in others:

@@ -30,13 +30,14 @@ def make_rasterizer(backend: str, width: int, height: int, antialias: bool = Tru
     """A rasteriser for pictures of one size (px).
 
     Args:
-        backend: "numba" (CPU), "cuda" (Triton kernels on a GPU) or "reference" (torch, slow).
+        backend: "numba" (CPU), "cuda" (Triton kernels on a GPU), "gsplat" (that package's kernels on a GPU,
+            without median depth) or "reference" (torch, slow).
         width, height: px.
         antialias: the 2D filter of Mip-Splatting. False: the fixed dilation of 3D Gaussian Splatting in its
             place, which grows brighter and thicker when the picture gets smaller. For comparison only.
 
     Raises:
-        UsageError: unknown backend or an empty picture.
+        UsageError: unknown backend, one that cannot be used here, or an empty picture.
     """
     if width < 1 or height < 1:
         raise UsageError(f"cannot draw a picture of {width}x{height} px; give a size of at least 1x1")
@@ -45,14 +46,18 @@ def make_rasterizer(backend: str, width: int, height: int, antialias: bool = Tru
 
         return _CheckedRasterizer(NumbaRasterizer(width, height, antialias), width, height)
     if backend == "cuda":
-        from sags_node.engine.cuda.backend import CudaBackend
+        from sags_node.engine.cuda.backend import cuda_backend
 
-        return _CheckedRasterizer(CudaBackend(width, height, antialias), width, height)
+        return _CheckedRasterizer(cuda_backend(width, height, antialias), width, height)
+    if backend == "gsplat":
+        from sags_node.engine.gsplat_backend import gsplat_backend
+
+        return _CheckedRasterizer(gsplat_backend(width, height, antialias), width, height)
     if backend == "reference":
         from sags_node.engine.reference import ReferenceRasterizer
 
         return _CheckedRasterizer(ReferenceRasterizer(antialias), width, height)
-    raise UsageError(f"unknown engine backend '{backend}'; choose numba, cuda or reference")
+    raise UsageError(f"unknown engine backend '{backend}'; choose numba, cuda, gsplat or reference")
 
 
 def rasterize(

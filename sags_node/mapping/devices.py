@@ -13,7 +13,7 @@ GPU_SPEED = 10.0  # times two CPU cores, in Gaussians per ms of the budget: an E
 
 def device_of(config: LaunchConfig) -> Device:
     """The device that refines. UsageError: a GPU is wanted and none can be used."""
-    return choose_device("cpu" if config.engine.backend == "reference" else config.device)
+    return choose_device(config.device if config.engine.backend == "numba" else "cpu")
 
 
 def affordable(config: LaunchConfig, width: int, height: int) -> int:

@@ -1,17 +1,33 @@
-"""The GPU rasteriser as `interface.Backend`: arrays of the host in and out, copied on every call."""
+"""GPU rasterisers as `interface.Backend`: arrays of the host in and out, copied on every call."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Protocol
 
 import torch
 import triton
+from torch import Tensor
 
 from sags_node.engine.cuda.rasterizer import CudaRasterizer
-from sags_node.engine.cuda.scene import DeviceGaussians
+from sags_node.engine.cuda.scene import DeviceGaussians, DeviceGradients
 from sags_node.engine.interface import Gradients, Pinhole
 from sags_node.errors import UsageError
 from sags_node.types import F32, I32, Bool, Gaussians
+
+
+class DeviceRasterizer(Protocol):
+    """What `CudaRasterizer` explains, over tensors on `device`."""
+
+    device: torch.device
+
+    def draw(
+        self, gaussians: DeviceGaussians, pinholes: Sequence[Pinhole], tiles: Tensor | None = None
+    ) -> Tensor: ...
+
+    def pull_back(self, v_planes: Tensor, weight: Tensor, geometry: bool = True) -> DeviceGradients: ...
+
+    def median_depth(self) -> tuple[Tensor, Tensor]: ...
 
 
 def default_device() -> torch.device:
@@ -30,17 +46,21 @@ def default_device() -> torch.device:
     return torch.device("cuda", torch.cuda.current_device())
 
 
-class CudaBackend:
-    """Backend `cuda`. For arrays that live on the host; what stays on the device uses `CudaRasterizer`."""
+def cuda_backend(width: int, height: int, antialias: bool) -> DeviceBackend:
+    """Backend `cuda`, of our own kernels. UsageError: there is no GPU."""
+    return DeviceBackend(CudaRasterizer(width, height, antialias, default_device()))
 
-    def __init__(self, width: int, height: int, antialias: bool) -> None:
-        self._device = default_device()
-        self._rasterizer = CudaRasterizer(width, height, antialias, self._device)
+
+class DeviceBackend:
+    """For arrays that live on the host; what stays on the device uses the rasteriser itself."""
+
+    def __init__(self, rasterizer: DeviceRasterizer) -> None:
+        self._rasterizer = rasterizer
 
     def forward(self, gaussians: Gaussians, pinholes: Sequence[Pinhole], tiles: Bool | None) -> F32:
         planes: F32 = (
             self._rasterizer.draw(
-                DeviceGaussians.from_host(gaussians, self._device),
+                DeviceGaussians.from_host(gaussians, self._rasterizer.device),
                 pinholes,
                 None if tiles is None else torch.tensor(tiles),
             )
@@ -50,8 +70,9 @@ class CudaBackend:
         return planes
 
     def backward(self, v_planes: F32, weight: F32, geometry: bool) -> Gradients:
+        device = self._rasterizer.device
         found = self._rasterizer.pull_back(
-            torch.tensor(v_planes, device=self._device), torch.tensor(weight, device=self._device), geometry
+            torch.tensor(v_planes, device=device), torch.tensor(weight, device=device), geometry
         )
         return Gradients(
             means=found.means.cpu().numpy(),
