@@ -7,10 +7,12 @@ STAMP := $(VENV)/.installed
 DEBIAN := libusb-1.0-0 libgl1 libegl1 libgomp1 libx11-6
 # What tests use beyond that: a browser for the viewer, a compiler for the C++ client.
 DEBIAN_TESTS := chromium g++ cmake pkg-config cppzmq-dev libmsgpack-cxx-dev
+# The GPU backend in the mapper and the fit; the other tests of it are of single kernels.
+TWINS_WHOLE := $(wildcard tests/test_cuda_mapper.py tests/test_cuda_fit*.py)
 missing = $(shell for p in $(1); do dpkg -s $$p >/dev/null 2>&1 || echo $$p; done)
 apt_install = apt-get update -qq && apt-get install -y -qq --no-install-recommends $(1) >/dev/null
 
-.PHONY: setup run test test-tools twins lint golden clean
+.PHONY: setup run test test-tools twins twins-kernels twins-whole lint golden clean
 
 setup: $(STAMP)
 
@@ -35,8 +37,13 @@ test: setup test-tools
 	$(MAKE) --no-print-directory -j2 -Otarget lint twins
 	$(BIN)/python -m pytest --ignore-glob='*/test_cuda_*.py'
 
-twins: setup
-	$(BIN)/python -m pytest tests/test_cuda_*.py
+twins: twins-kernels twins-whole
+
+twins-kernels: setup
+	$(BIN)/python -m pytest $(filter-out $(TWINS_WHOLE),$(wildcard tests/test_cuda_*.py))
+
+twins-whole: setup
+	$(BIN)/python -m pytest $(TWINS_WHOLE)
 
 # Tests whose tools are missing are skipped, and say so.
 test-tools:

@@ -172,7 +172,8 @@ def fit(
     parameters together (with --tokens self: its decoder).
 
     DATASET is a folder in EndoNeRF or SCARED layout, or any session the node can play. Leaves a checkpoint,
-    the model as PLY (standard 3DGS fields, filters folded in), the drawn test frames and figures.json.
+    the model as PLY (standard 3DGS fields, filters folded in), the drawn test frames and figures.json. It
+    iterates on the device that the launch names (device:=cpu, cuda or auto); --resume may name another.
 
     \b
     sags fit launch/d4d_pull.yaml --out out/d4d

@@ -119,7 +119,7 @@ def test_a_missing_gpu_ends_the_command_with_one_message(
     machine: pytest.MonkeyPatch, phantom_session: Path
 ) -> None:
     without_hardware(machine)
-    for command in (["run"], ["eval", "--pace", "step"]):
+    for command in (["run"], ["eval", "--pace", "step"], ["fit"]):
         result = CliRunner().invoke(main, [*command, str(phantom_session), "device:=cuda"])
         assert result.exit_code == 2 and result.stdout == ""
         assert result.stderr.startswith("error: device: cuda cannot be used: this machine has no NVIDIA GPU")

@@ -23,10 +23,12 @@ from sags_node.fitting.clip import read_clip
 from sags_node.fitting.fit import Fit
 from sags_node.fitting.score import PUBLISHED, score, score_depth, score_tracks
 from sags_node.fitting.settings import FitSettings
+from sags_node.mapping.devices import device_of
 from sags_node.model.ply import write_ply
 from sags_node.session import Session
 
 CHECKPOINT_PERIOD = 60.0  # s; it holds hundreds of MB
+SHOWN_EVERY = 5  # iterations: what is shown waits for the GPU
 
 Advance = Callable[[int, int | None, str], None]  # done, of, what
 
@@ -42,7 +44,7 @@ def fit_session(
     """Fit a recording and leave `checkpoint.npz`, `model.ply`, `test/` and `figures.json` in `out`.
 
     Args:
-        session: a recording.
+        session: a recording; its launch's device is what iterates.
         settings: of the fit.
         options: hold-out and LPIPS weights.
         out: an existing folder. An earlier result there is replaced.
@@ -54,7 +56,7 @@ def fit_session(
 
     Raises:
         UsageError: nothing to resume, or made with other settings or frames.
-        SagsError: the recording cannot be used, or a file cannot be written.
+        SagsError: the recording cannot be used, a file cannot be written, or the GPU failed.
     """
     stored = out / "checkpoint.npz"
     if resume and not stored.is_file():
@@ -63,7 +65,7 @@ def fit_session(
     configure_threads(session.config.engine.threads)
     count = session.source.frame_count
     clip = read_clip(session, options.holds_out, lambda done: advance(done, count, "reading"))
-    fit = Fit(clip, settings)
+    fit = Fit(clip, settings, device_of(session.config).kind)
     if resume:
         advance(0, None, "reading the checkpoint")
         checkpoint.load(fit, stored)
@@ -81,6 +83,8 @@ def fit_session(
         "session": session.name,
         "settings": asdict(settings),
         "machine": machine_name(),
+        "device": fit.device,
+        "device_problem": fit.problem,
         "seconds": round(fit.seconds, 1),
         "gaussians": len(fit.model),
         "cap": settings.max_gaussians,
@@ -110,8 +114,10 @@ def _iterate(fit: Fit, stored: Path, advance: Advance) -> None:
     saved = time.monotonic()
     try:
         while not fit.done:
-            residual = fit.iterate()
-            advance(fit.iteration, fit.total, f"fitting, L1 {residual:.4f}, {len(fit.model)} Gaussians")
+            fit.iterate()
+            if fit.iteration % SHOWN_EVERY == 0 or fit.done:
+                what = f"fitting, L1 {fit.residual:.4f}, {fit.count} Gaussians"
+                advance(fit.iteration, fit.total, what)
             if time.monotonic() - saved > CHECKPOINT_PERIOD:
                 checkpoint.save(fit, stored)
                 saved = time.monotonic()

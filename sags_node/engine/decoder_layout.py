@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-
-import numpy as np
+from typing import Any
 
 from sags_node.engine import decoder_block as block
 from sags_node.engine.decoder_block import Weights, Workspace
@@ -66,11 +65,18 @@ def _weight_shapes(sizes: Sizes) -> list[tuple[int, ...]]:
 
 def flat_weights(sizes: Sizes) -> tuple[F32, Weights]:
     """Zeros for all weights in one array, and the weights as views into it."""
-    shapes = _weight_shapes(sizes)
-    ends = np.cumsum([math.prod(shape) for shape in shapes]).tolist()
-    flat = aligned((ends[-1],))
-    parts = np.split(flat, ends[:-1])
-    return flat, Weights(*(part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)))
+    flat = aligned((sum(math.prod(shape) for shape in _weight_shapes(sizes)),))
+    return flat, weights_in(flat, sizes)
+
+
+def weights_in(flat: Any, sizes: Sizes) -> Weights:
+    """The weights as views into one array [P] that holds them all, or into such a tensor."""
+    views, start = [], 0
+    for shape in _weight_shapes(sizes):
+        end = start + math.prod(shape)
+        views.append(flat[start:end].reshape(shape))
+        start = end
+    return Weights(*views)
 
 
 def named_weights(weights: Weights, attends: bool) -> dict[str, F32]:

@@ -15,16 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sags_node.engine.adam import AdamState
-from sags_node.engine.losses import tissue_loss
-from sags_node.engine.photometric import PhotometricLoss
 from sags_node.engine.rasterize import make_rasterizer
 from sags_node.fitting.clip import Clip, ClipFrame
 from sags_node.fitting.density import EVERY, Density
 from sags_node.fitting.field import make_box, make_decoder, make_field, row_rates
+from sags_node.fitting.learner import DeviceKind, make_learner
 from sags_node.fitting.settings import FitSettings
 from sags_node.fitting.start import Progress, follow_online, learn_paths, pooled_rows, remainder
 from sags_node.mapping.optimiser import COLOUR_RELAXATION, Rates
-from sags_node.mapping.refiner import DEPTH_SCALE, DEPTH_WEIGHT
 from sags_node.model import columns
 from sags_node.model.deformable import DeformableModel
 from sags_node.model.exposure import Exposure
@@ -43,7 +41,13 @@ REFINE_DECAY = 0.1
 class Fit:
     """A model being fitted: `start`, then `iterate` until `done`."""
 
-    def __init__(self, clip: Clip, settings: FitSettings) -> None:
+    def __init__(self, clip: Clip, settings: FitSettings, device: DeviceKind = "cpu") -> None:
+        """
+        Args:
+            clip: what it learns from.
+            settings: of the fit; a fit goes on on another device with the same.
+            device: what iterates; "cuda" where `engine.device` says that a GPU can be used.
+        """
         self.clip = clip
         self.settings = settings
         self.iteration = 0
@@ -52,10 +56,8 @@ class Fit:
         first = clip.train[0]
         height, width = first.tissue.shape
         self.rasterizer = make_rasterizer("numba", width, height, antialias=settings.antialias)
-        self._loss = PhotometricLoss(width, height, settings.weights)
-        self._v_planes = np.zeros((1, 5, height, width), np.float32)
-        self._weight = np.zeros((1, height, width), np.float32)
-        self._unseen = ~np.any([frame.tissue for frame in clip.train], axis=0)
+        unseen = ~np.any([frame.tissue for frame in clip.train], axis=0)
+        self._learner = make_learner(device, self.rasterizer, settings, unseen)
         self._rng = np.random.default_rng(settings.seed)
         self._order: list[int] = []
         known = first.depth[first.depth > 0]
@@ -70,7 +72,7 @@ class Fit:
         """Make the model.
 
         Raises:
-            SagsError: no frame has depth enough.
+            SagsError: no frame has depth enough, or the GPU failed.
         """
         started = time.perf_counter()
         settings, exposure, residuals = self.settings, self._make_exposure(), None
@@ -80,11 +82,11 @@ class Fit:
         else:
             rows, paths = follow_online(self.clip, self.rasterizer, exposure, settings, progress)
             field = self._make_field(rows[:, columns.MEAN])
-            learn_paths(field, rows, paths, settings, progress)
+            learn_paths(self._learner, field, rows, paths, settings, progress)
             residuals = remainder(field, rows, paths)
         self._start_means = np.ascontiguousarray(rows[:, columns.MEAN])
-        self.model = DeformableModel(rows, field, exposure, settings.antialias, residuals)
-        self._density = Density(self.model, settings.max_gaussians)
+        model = DeformableModel(rows, field, exposure, settings.antialias, residuals)
+        self._begin(model, Density(model, settings.max_gaussians))
         self.seconds += time.perf_counter() - started
 
     @property
@@ -101,62 +103,77 @@ class Fit:
         """Iterations in all."""
         return self.warm_up + self.settings.iterations
 
-    def iterate(self) -> float:
-        """One step on one training frame; returns its mean absolute colour residual."""
+    @property
+    def model(self) -> DeformableModel:
+        """As far as it was learnt; the next iteration begins with what it is then.
+
+        Raises:
+            SagsError: the GPU that it was on has failed.
+        """
+        self._learner.give_back()
+        return self._model
+
+    @property
+    def count(self) -> int:
+        """Gaussians; unlike the model, it may be asked for at every iteration."""
+        return len(self._model)
+
+    @property
+    def device(self) -> DeviceKind:
+        """What iterates: a GPU too small is left for the CPU."""
+        return self._learner.device
+
+    @property
+    def problem(self) -> str | None:
+        """What is wrong with the device, and how to mend it; None: nothing."""
+        return self._learner.problem
+
+    @property
+    def residual(self) -> float:
+        """Mean absolute colour residual of the last iteration. Reading it waits for a GPU."""
+        return self._learner.residual
+
+    def iterate(self) -> None:
+        """One step on one training frame.
+
+        Raises:
+            SagsError: the GPU failed.
+        """
         started = time.perf_counter()
         if self.settings.schedule == "paper":
-            residual = self._descend()
+            self._descend()
         else:
-            residual = self._refine()
+            self._refine()
         self.seconds += time.perf_counter() - started
-        return residual
 
-    def _descend(self) -> float:
+    def _descend(self) -> None:
         """A step of the paper's schedule."""
         deformed = self.iteration >= self.warm_up
         frame = self._next_frame() if deformed else self.clip.train[0]
-        observation = frame.observation()
-        gaussians = self.model.at(frame.t_capture_ns, [frame.camera], deformed)
-        planes = self.rasterizer.forward(gaussians, [frame.camera])
-        terms = self._loss.evaluate(
-            planes[0], observation.image, frame.tissue, frame.depth, self._v_planes[0], self._weight[0],
-            self._unseen,
-        )  # fmt: skip
-        gradients = self.rasterizer.backward(self._v_planes, self._weight)
         share = self.settings.decay ** self._progress()
-        self.model.descend(
-            gradients,
+        self._learner.descend(
+            frame,
             self._rates * np.float32(share),
             self.settings.field_rates.scaled(share),
             EXPOSURE_RATE * share,
+            deformed,
         )
-        self._density.observe(gradients)
         self.iteration += 1
         if self.iteration % EVERY == 0 and self._progress() < DENSIFY_UNTIL:
+            self._learner.give_back()
             pruned, split = self._density.adapt(self._rng)
             self.pruned, self.split = self.pruned + pruned, self.split + split
-        return terms.color
 
-    def _refine(self) -> float:
+    def _refine(self) -> None:
         """A step of the joint refinement after the online pass."""
-        frame = self._next_frame()
-        observation = frame.observation()
-        gaussians = self.model.at(frame.t_capture_ns, [frame.camera])
-        planes = self.rasterizer.forward(gaussians, [frame.camera])
-        residual = tissue_loss(
-            planes[0], observation.image, frame.tissue, frame.depth, self._v_planes[0], self._weight[0],
-            DEPTH_WEIGHT, DEPTH_SCALE,
-        )  # fmt: skip
-        gradients = self.rasterizer.backward(self._v_planes, self._weight)
         share = REFINE_DECAY ** self._progress()
-        self.model.refine(
-            gradients,
+        self._learner.refine(
+            self._next_frame(),
             self._refine_rates * np.float32(share),
             COLOUR_RELAXATION * math.sqrt(share),  # less and less, so that frames average out
             self.settings.field_rates.scaled(REFINE_FIELD_SHARE * share),
         )
         self.iteration += 1
-        return residual
 
     def gaussians(self, frame: ClipFrame) -> Gaussians:
         """The model at the time of a frame; after the last training frame it is a prediction."""
@@ -198,7 +215,7 @@ class Fit:
             "seconds": self.seconds,
             "pruned": self.pruned,
             "split": self.split,
-            "next_id": self.model.next_id,
+            "next_id": self._model.next_id,
             "order": self._order,
             "rng": self._rng.bit_generator.state,
         }
@@ -213,7 +230,7 @@ class Fit:
             residuals.values[:] = arrays["residuals"]
             adam = zip(arrays["residuals.moments"], arrays["residuals.shares"], strict=True)
             residuals.adam = [AdamState(moments, shares) for moments, shares in adam]
-        model = self.model = DeformableModel(
+        model = DeformableModel(
             arrays["rows"], field, self._make_exposure(), self.settings.antialias, residuals
         )
         if isinstance(field, NodeField):
@@ -227,12 +244,17 @@ class Fit:
         deltas.hexplane.adam = AdamState(arrays["cells.moments"], arrays["cells.shares"])
         deltas.adam = AdamState(arrays["decoder.moments"], arrays["decoder.shares"])
         model.ids, model.next_id = arrays["ids"], int(state["next_id"])
-        self._density = Density(model, self.settings.max_gaussians)
-        self._density.pull, self._density.seen = arrays["pull"], arrays["seen"]
+        density = Density(model, self.settings.max_gaussians)
+        density.pull, density.seen = arrays["pull"], arrays["seen"]
+        self._begin(model, density)
         self.iteration, self._order = int(state["iteration"]), list(state["order"])
         self.seconds = float(state["seconds"])
         self.pruned, self.split = int(state["pruned"]), int(state["split"])
         self._rng.bit_generator.state = state["rng"]
+
+    def _begin(self, model: DeformableModel, density: Density) -> None:
+        self._model, self._density = model, density
+        self._learner.begin(model, density)
 
     def _progress(self) -> float:
         """How far the stage is, 0..1; each stage has its own schedule."""

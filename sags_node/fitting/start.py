@@ -15,6 +15,7 @@ import numpy as np
 from sags_node.engine.rasterize import Rasterizer, to_view
 from sags_node.errors import SagsError
 from sags_node.fitting.clip import Clip, ClipFrame
+from sags_node.fitting.learner import Learner
 from sags_node.fitting.settings import FitSettings
 from sags_node.geometry import unproject
 from sags_node.mapping.budget import StepBudget
@@ -172,22 +173,23 @@ class _Places:
         return self._places[ids]
 
 
-def learn_paths(field: Field, rows: F32, paths: Paths, settings: FitSettings, progress: Progress) -> None:
-    """Let the field learn the paths: mean absolute errors of positions, at random times."""
+def learn_paths(
+    learner: Learner, field: Field, rows: F32, paths: Paths, settings: FitSettings, progress: Progress
+) -> None:
+    """Let the field learn the paths: mean absolute errors of positions, at random times.
+
+    Raises:
+        SagsError: the learner's GPU failed.
+    """
     rng = np.random.default_rng(settings.seed)
+    learner.begin_paths(field, rows, paths)
     for step in range(PATH_STEPS):
         t = int(rng.integers(len(paths.times_ns)))
         known = np.flatnonzero(paths.known[t])
         picked = rng.choice(known, min(PATH_POINTS, len(known)), replace=False)
-        canonical = rows[picked]
-        field.follow(canonical[:, columns.MEAN])
-        deformed = field.deform(canonical, int(paths.times_ns[t]))
-        off = deformed - paths.states[t, picked]
-        v_deformed = np.zeros_like(deformed)
-        v_deformed[:, columns.MEAN] = np.sign(off[:, columns.MEAN]) / np.float32(len(picked))
-        field.backward(v_deformed)
-        field.step(settings.field_rates.scaled(settings.decay ** (step / PATH_STEPS)))
+        learner.learn_paths(t, picked, settings.field_rates.scaled(settings.decay ** (step / PATH_STEPS)))
         progress("learning the paths", step + 1, PATH_STEPS)
+    learner.give_back()
     field.follow(rows[:, columns.MEAN])
 
 

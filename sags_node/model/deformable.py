@@ -49,7 +49,7 @@ class DeformableModel:
         self.field = field
         self.exposure = exposure
         self.residuals = residuals
-        self._smooth = smooth
+        self.smooth = smooth
         self.next_id = len(rows)
         self.adam = AdamState.new(*self.rows.shape)
         field.follow(self.rows[:, columns.MEAN])
@@ -97,7 +97,7 @@ class DeformableModel:
         self._gain = self.exposure.at(t_ns)
         rows[:, columns.COLOR] *= self._gain
         means = np.ascontiguousarray(rows[:, columns.MEAN])
-        smoothing = smoothing_variances(means, cameras) if self._smooth else None
+        smoothing = smoothing_variances(means, cameras) if self.smooth else None
         self._drawn = activate(rows, self.ids, smoothing)
         return self._drawn
 

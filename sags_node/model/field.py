@@ -65,7 +65,7 @@ class Deltas:
         what is left is EndoGaussian's decoder."""
         self.hexplane = hexplane
         self.decoder = decoder
-        self._adaptive = adaptive
+        self.adaptive = adaptive
         self._aside: tuple[I64, F32, F32] | None = None
         self.adam = AdamState.new(1, len(decoder.values))
 
@@ -89,7 +89,7 @@ class Deltas:
             self._add(*self._aside)
             self._aside = None
         decoder, hexplane, found = self.decoder, self.hexplane, self._found
-        if not self._adaptive:
+        if not self.adaptive:
             for name, gradient in decoder.parameter_gradients.items():
                 if name.startswith(BLOCK):
                     gradient[:] = 0

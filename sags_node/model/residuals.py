@@ -19,6 +19,7 @@ from sags_node.types import F32, I64, Bool
 
 BETAS = (0.5, 0.99)  # low momentum: a slot is visited now and then, from other frames each time
 LEAST_CONTRIBUTION = 1e-3  # px: what was seen less is not touched
+EPS = 1e-12
 COLOR_DAMPING = 0.3  # px: a barely seen Gaussian changes its colour slowly
 MAX_BYTES = 1 << 29  # of the values; their optimiser's state takes twice as much again
 
@@ -35,6 +36,17 @@ def check_size(times: int, count: int) -> None:
             f"{MAX_BYTES / 1e6:.0f} MB: take fewer frames (source.frames, source.stride) or a smaller "
             "--max-gaussians"
         )
+
+
+def slots_around(times_ns: I64, t_ns: int) -> list[tuple[int, float]]:
+    """Which of the times [K], ascending, a time lies between, and their shares in a linear blend; one slot
+    where the other's share is 0, also before the first time and after the last."""
+    after = int(np.searchsorted(times_ns, t_ns, side="right"))
+    if after in {0, len(times_ns)}:
+        return [(max(after - 1, 0), 1.0)]
+    first, last = int(times_ns[after - 1]), int(times_ns[after])
+    share = (t_ns - first) / (last - first)
+    return [(after - 1, 1.0)] if share == 0 else [(after - 1, 1 - share), (after, share)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +77,7 @@ class Residuals:
 
     def at(self, t_ns: int) -> F32:
         """Deltas [N, 14] at one time."""
-        (slot, share), *rest = self._parts(t_ns)
+        (slot, share), *rest = slots_around(self.times_ns, t_ns)
         deltas: F32 = np.float32(share) * self.values[slot]
         for slot, share in rest:
             deltas += np.float32(share) * self.values[slot]
@@ -84,13 +96,13 @@ class Residuals:
         """
         seen = np.flatnonzero(contribution > LEAST_CONTRIBUTION)
         colors = v_colors[seen] * (steps.colors / (contribution[seen, None] + COLOR_DAMPING))
-        parts = self._parts(t_ns)
+        parts = slots_around(self.times_ns, t_ns)
         norm = sum(share * share for _, share in parts)
         for slot, share in parts:
             values = self.values[slot]
             adam_step(
                 values, v_rows * np.float32(share), self.adam[slot], steps.geometry, rows=seen,
-                betas=BETAS, eps=1e-12,
+                betas=BETAS, eps=EPS,
             )  # fmt: skip
             # the smallest change of both slots whose blend is the step
             values[seen, columns.COLOR] -= np.float32(share / norm) * colors
@@ -113,12 +125,3 @@ class Residuals:
             new = AdamState.new(len(rows), columns.COUNT)
             new.moments[:known], new.shares[:known] = old.moments[rows[:known]], old.shares[rows[:known]]
             self.adam[slot] = new
-
-    def _parts(self, t_ns: int) -> list[tuple[int, float]]:
-        """Slots around a time and their shares; one slot where the other's share is 0."""
-        after = int(np.searchsorted(self.times_ns, t_ns, side="right"))
-        if after in {0, len(self.times_ns)}:
-            return [(max(after - 1, 0), 1.0)]
-        first, last = int(self.times_ns[after - 1]), int(self.times_ns[after])
-        share = (t_ns - first) / (last - first)
-        return [(after - 1, 1.0)] if share == 0 else [(after - 1, 1 - share), (after, share)]

@@ -107,6 +107,10 @@ class AdamState:
     def new(cls, rows: int, columns: int, device: torch.device) -> AdamState:
         return cls(torch.zeros((rows, columns, 2), device=device), torch.zeros((rows, 2), device=device))
 
+    def rows(self, rows: slice) -> AdamState:
+        """A part of the same state."""
+        return AdamState(self.moments[rows], self.shares[rows])
+
 
 def adam_step(
     values: Tensor,

@@ -101,6 +101,11 @@ class PhotometricLoss:
             NORMALISED=self._normalised, SIMILAR=similar, EVERYWHERE=unseen is None, BLOCK=BLOCK,
         )  # fmt: skip
 
+    @property
+    def color(self) -> Tensor:
+        """The colour term of the last `evaluate`, [] float64 on the device; the next overwrites it."""
+        return self._terms[kernels.COLOR.value]
+
     def terms(self) -> LossTerms:
         """Values of the last `evaluate`. Waits for the device."""
         color, inverse_depth, correlation, coverage, colors = self._terms.tolist()
