@@ -178,7 +178,7 @@ def bench_tracking(launch: tuple[str, ...], numbers: str, out: Path | None, json
     type=positive,
     default=60.0,
     show_default=True,
-    help="With the crowd; a quarter before and after.",
+    help="With the crowd; a quarter for each of the others.",
 )
 @click.option(
     "--many", type=click.IntRange(0, 50), default=20, show_default=True, help="Further subscribers."
@@ -188,9 +188,10 @@ def bench_tracking(launch: tuple[str, ...], numbers: str, out: Path | None, json
 def bench_crowd(launch: tuple[str, ...], seconds: float, many: int, out: Path | None, json_out: bool) -> None:
     """Whether subscribers disturb the node.
 
-    Runs a node, by default of the built-in phantom, in a process of its own, alone and then with a fast
-    subscriber, a slow one (200 ms a frame), a dead one (never reads) and many more, each group in its own
-    process. The node's rate, latency and memory, and how old the frames are that the subscribers take.
+    Runs a node, by default of the built-in phantom, in a process of its own: alone; with one reader of
+    everything; and with a fast subscriber, a slow one (200 ms a frame), a dead one (never reads) and many
+    more, each group in its own process. The node's rate, latency and memory, and how old the frames are that
+    the subscribers take.
 
     \b
     sags bench crowd --seconds 600 --out benchmarks/results/crowd.json

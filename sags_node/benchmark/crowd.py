@@ -9,7 +9,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from multiprocessing.connection import Connection
 from multiprocessing.synchronize import Event
@@ -37,10 +37,12 @@ SLOW = 0.2  # s that the slow subscriber takes for each frame
 PHASE = "publish.data:=[tcp://127.0.0.1:*]", "publish.control:=null", "source.loop:=true"
 
 Advance = Callable[[int, int | None, str], None]  # done, of, what
+Work = tuple[Callable[[Path, float, Event, Connection], None], float]  # of a subscriber, and its argument
 
 
 def measure_crowd(launch: Sequence[str], alone: float, crowded: float, many: int, advance: Advance) -> Any:
-    """One node in its own process: first with one quiet observer, then with a crowd, then alone again.
+    """One node in its own process: with one quiet observer, with a reader of everything, with a crowd, and
+    alone again. What the reader costs is that all is computed and sent; what the crowd costs beyond, itself.
 
     The crowd: a fast subscriber that takes every picture and depth; a slow one that takes `SLOW` seconds for
     each; a dead one that is connected to everything and never reads; and `many` more that listen to `SMALL`.
@@ -56,8 +58,13 @@ def measure_crowd(launch: Sequence[str], alone: float, crowded: float, many: int
     with tempfile.TemporaryDirectory() as folder, _node(launch, Path(folder)) as node:
         with Subscriber([STATUS], run_dir=Path(folder)) as observer:
             phases = []
-            for name, seconds in (("alone", alone), ("crowd", crowded), ("alone again", alone)):
-                with _crowd(Path(folder), many if name == "crowd" else None) as stop:
+            for name, seconds, work in (
+                ("alone", alone, {}),
+                ("one reader", alone, {"reader": (_read, 0.0)}),
+                ("crowd", crowded, _crowd(many)),
+                ("alone again", alone, {}),
+            ):
+                with _peers(Path(folder), work) as stop:
                     seen = []
                     for status in _watch(observer, seconds, node):
                         seen.append(status)
@@ -98,15 +105,19 @@ def _watch(observer: Subscriber, seconds: float, node: subprocess.Popen[bytes]) 
             yield json.loads(newest.text)
 
 
+def _crowd(many: int) -> dict[str, Work]:
+    work: dict[str, Work] = {"fast": (_take, 0.0), "slow": (_take, SLOW), "dead": (_sleep, 0.0)}
+    if many:
+        work[f"{many} more"] = (_listen, float(many))
+    return work
+
+
 @contextmanager
-def _crowd(folder: Path, many: int | None) -> Iterator[Callable[[], dict[str, Any]]]:
+def _peers(folder: Path, work: Mapping[str, Work]) -> Iterator[Callable[[], dict[str, Any]]]:
     """Subscribers in processes of their own; what is given ends them and returns what they saw."""
     spawn = multiprocessing.get_context("spawn")
     ending = spawn.Event()
     members: list[tuple[str, Any, Connection]] = []
-    work = {} if many is None else {"fast": (_take, 0.0), "slow": (_take, SLOW), "dead": (_sleep, 0.0)}
-    if many:
-        work[f"{many} more"] = (_listen, float(many))
     for name, (target, argument) in work.items():
         here, there = spawn.Pipe()
         process = spawn.Process(target=target, args=(folder, argument, ending, there), daemon=True)
@@ -143,6 +154,22 @@ def _take(folder: Path, seconds: float, ending: Event, there: Connection) -> Non
     rate = len(since_sent) / (time.monotonic() - begun)
     ages = {"since_capture_ms": percentiles(since_capture), "since_sent_ms": percentiles(since_sent)}
     there.send({"rate_hz": rate, **ages})
+
+
+def _read(folder: Path, _: float, ending: Event, there: Connection) -> None:
+    """Take everything there is, as fast as it comes."""
+    os.nice(LOWEST_PRIORITY)
+    context = zmq.Context()
+    socket = context.socket(zmq.SUB)
+    socket.subscribe("")
+    connect(socket, find_data(None, "sags", folder), MAX_MESSAGE_BYTES)
+    taken = 0
+    while not ending.is_set():
+        if socket.poll(100):
+            socket.recv_multipart(copy=False)
+            taken += 1
+    there.send({"messages": taken})
+    context.destroy(linger=0)
 
 
 def _sleep(folder: Path, _: float, ending: Event, there: Connection) -> None:
