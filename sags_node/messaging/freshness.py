@@ -12,7 +12,8 @@ from sags_node.messaging.wire import Meta
 WINDOW = 20  # messages behind the period and the rate
 STALE_PERIODS = 10
 MIN_RATE = 0.9  # of what the sender sends, or of the declared rate
-UNKNOWN_PERIOD = 0.1  # s, until two messages have come
+ENOUGH_STEPS = 5  # from message to message, that say what the period is
+UNKNOWN_PERIOD = 0.1  # s, at most, until then: who begins slowly must not be believed for long
 MAX_CLOCK_AHEAD = 1.0  # s; beyond it an age says nothing
 
 
@@ -57,7 +58,10 @@ class Freshness:
             (after.stamp_ns - before.stamp_ns) * 1e-9 / (after.seq - before.seq)
             for before, after in pairwise(self._window)
         ]
-        return max(median(steps), 1e-3) if steps else UNKNOWN_PERIOD
+        period = median(steps) if steps else UNKNOWN_PERIOD
+        if len(steps) < ENOUGH_STEPS:
+            period = min(period, UNKNOWN_PERIOD)
+        return max(period, 1e-3)
 
     @property
     def rate(self) -> float:
