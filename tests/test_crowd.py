@@ -10,7 +10,7 @@ SMALL = ("replay/phantom_pull", "source.pace:=realtime", "mapping.max_gaussians:
 
 def test_everybody_hears_the_node_and_it_does_not_wait_for_any(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(crowd, "WARM_UP", 2.0)
-    measured = crowd.measure_crowd(SMALL, 3.0, 6.0, 3, lambda done, of, what: None)
+    measured = crowd.measure_crowd(SMALL, 5.0, 7.0, 3, lambda done, of, what: None)
     alone, read, crowded, _ = measured["phases"]
     assert [each["phase"] for each in measured["phases"]] == ["alone", "one reader", "crowd", "alone again"]
     assert read["peers"]["reader"]["messages"] > 3 * 6
