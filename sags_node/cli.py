@@ -44,11 +44,11 @@ class Sags(click.Group):
         except SagsError as error:
             console.print(f"[red]error:[/] {escape(str(error))}", soft_wrap=True)
             ctx.exit(error.exit_code)
-        except KeyboardInterrupt:
-            console.print("stopped")
-            ctx.exit(130)
-        except SystemError as error:  # what a Ctrl-C becomes in C code that calls Python: loading a kernel
-            if not isinstance(error.__cause__, KeyboardInterrupt):
+        except (KeyboardInterrupt, SystemError) as error:
+            # A Ctrl-C becomes a SystemError in C code that calls Python: loading a kernel.
+            if not isinstance(error, KeyboardInterrupt) and not isinstance(
+                error.__cause__, KeyboardInterrupt
+            ):
                 raise
             console.print("stopped")
             ctx.exit(130)

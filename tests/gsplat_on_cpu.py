@@ -35,8 +35,8 @@ def use_gsplat_on_cpu(patch: pytest.MonkeyPatch) -> None:
         return _torch_impl._rasterize_to_pixels(*arguments)
 
     nerfacc = ModuleType("nerfacc")
-    nerfacc.render_weight_from_alpha = render_weight_from_alpha  # type: ignore[attr-defined]
-    nerfacc.accumulate_along_rays = accumulate_along_rays  # type: ignore[attr-defined]
+    for function in (render_weight_from_alpha, accumulate_along_rays):
+        setattr(nerfacc, function.__name__, function)
     patch.setitem(sys.modules, "nerfacc", nerfacc)
     patch.setattr(rendering, "fully_fused_projection", projection)
     patch.setattr(rendering, "isect_tiles", isect_tiles)

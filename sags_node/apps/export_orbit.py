@@ -48,7 +48,7 @@ def write_orbit(path: Path, scene: Scene, degrees: float, seconds: float, advanc
     depth = draw(camera)[1]
     if not (depth > 0).any():
         raise SagsError("the left camera sees nothing of the model; export another moment")
-    code = cv2.VideoWriter_fourcc(*"mp4v")  # type: ignore[attr-defined]  # the stubs lack it
+    code = cv2.VideoWriter.fourcc(*"mp4v")
     video = cv2.VideoWriter(str(path), code, RATE, (camera.width, camera.height))
     try:
         if not video.isOpened():

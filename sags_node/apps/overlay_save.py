@@ -48,7 +48,7 @@ class Output:
             return
         if self._video is None:
             size = (picture.shape[1], picture.shape[0])
-            code = cv2.VideoWriter_fourcc(*"mp4v")  # type: ignore[attr-defined]  # the stubs lack it
+            code = cv2.VideoWriter.fourcc(*"mp4v")
             self._video = cv2.VideoWriter(str(self._file), code, 1 / period, size)
             if not self._video.isOpened():
                 raise SagsError(f"cannot write {self._file}; check the folder's rights and the disk")

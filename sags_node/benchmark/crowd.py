@@ -37,7 +37,8 @@ SLOW = 0.2  # s that the slow subscriber takes for each frame
 PHASE = "publish.data:=[tcp://127.0.0.1:*]", "publish.control:=null", "source.loop:=true"
 
 Advance = Callable[[int, int | None, str], None]  # done, of, what
-Work = tuple[Callable[[Path, float, Event, Connection], None], float]  # of a subscriber, and its argument
+Task = Callable[[Path, float, Event, Connection], None]  # of a subscriber
+Work = tuple[Task, float]  # with its argument
 
 
 def measure_crowd(launch: Sequence[str], alone: float, crowded: float, many: int, advance: Advance) -> Any:
@@ -120,7 +121,9 @@ def _peers(folder: Path, work: Mapping[str, Work]) -> Iterator[Callable[[], dict
     members: list[tuple[str, Any, Connection]] = []
     for name, (target, argument) in work.items():
         here, there = spawn.Pipe()
-        process = spawn.Process(target=target, args=(folder, argument, ending, there), daemon=True)
+        process = spawn.Process(
+            target=_with_what_is_left, args=(target, folder, argument, ending, there), daemon=True
+        )
         process.start()
         members.append((name, process, here))
 
@@ -136,9 +139,14 @@ def _peers(folder: Path, work: Mapping[str, Work]) -> Iterator[Callable[[], dict
             process.join()
 
 
+def _with_what_is_left(work: Task, *arguments: Any) -> None:
+    """Work at the lowest priority: a subscriber stands for another machine."""
+    os.nice(LOWEST_PRIORITY)
+    work(*arguments)
+
+
 def _take(folder: Path, seconds: float, ending: Event, there: Connection) -> None:
     """Take pictures and depth of the newest frame, and `seconds` for each."""
-    os.nice(LOWEST_PRIORITY)
     since_capture, since_sent = [], []
     with Subscriber(PICTURES, run_dir=folder) as subscriber:
         newest = subscriber.wait(PICTURES[0], timeout=STARTING)
@@ -158,35 +166,37 @@ def _take(folder: Path, seconds: float, ending: Event, there: Connection) -> Non
 
 def _read(folder: Path, _: float, ending: Event, there: Connection) -> None:
     """Take everything there is, as fast as it comes."""
-    os.nice(LOWEST_PRIORITY)
-    context = zmq.Context()
-    socket = context.socket(zmq.SUB)
-    socket.subscribe("")
-    connect(socket, find_data(None, "sags", folder), MAX_MESSAGE_BYTES)
     taken = 0
-    while not ending.is_set():
-        if socket.poll(100):
-            socket.recv_multipart(copy=False)
-            taken += 1
+    with _everything(folder) as socket:
+        while not ending.is_set():
+            if socket.poll(100):
+                socket.recv_multipart(copy=False)
+                taken += 1
     there.send({"messages": taken})
-    context.destroy(linger=0)
 
 
 def _sleep(folder: Path, _: float, ending: Event, there: Connection) -> None:
     """Be connected to everything and never read."""
-    os.nice(LOWEST_PRIORITY)
+    with _everything(folder):
+        ending.wait()
+    there.send({})
+
+
+@contextmanager
+def _everything(folder: Path) -> Iterator[zmq.Socket[bytes]]:
+    """A socket that is sent all topics."""
     context = zmq.Context()
     socket = context.socket(zmq.SUB)
     socket.subscribe("")
     connect(socket, find_data(None, "sags", folder), MAX_MESSAGE_BYTES)
-    ending.wait()
-    there.send({})
-    context.destroy(linger=0)
+    try:
+        yield socket
+    finally:
+        context.destroy(linger=0)
 
 
 def _listen(folder: Path, count: float, ending: Event, there: Connection) -> None:
     """Many subscribers of small topics in one process."""
-    os.nice(LOWEST_PRIORITY)
     context, poller = zmq.Context(), zmq.Poller()
     address = find_data(None, "sags", folder)
     for _ in range(int(count)):

@@ -12,8 +12,8 @@ from sags_node.messaging.wire import Meta
 WINDOW = 20  # messages behind the period and the rate
 STALE_PERIODS = 10
 MIN_RATE = 0.9  # of what the sender sends, or of the declared rate
-ENOUGH_STEPS = 5  # from message to message, that say what the period is
-UNKNOWN_PERIOD = 0.1  # s, at most, until then: who begins slowly must not be believed for long
+ENOUGH = 6  # messages that tell the period
+UNKNOWN_PERIOD = 0.1  # s, at most, until so many have come: who begins slowly must not be believed for long
 MAX_CLOCK_AHEAD = 1.0  # s; beyond it an age says nothing
 
 
@@ -58,10 +58,7 @@ class Freshness:
             (after.stamp_ns - before.stamp_ns) * 1e-9 / (after.seq - before.seq)
             for before, after in pairwise(self._window)
         ]
-        period = median(steps) if steps else UNKNOWN_PERIOD
-        if len(steps) < ENOUGH_STEPS:
-            period = min(period, UNKNOWN_PERIOD)
-        return max(period, 1e-3)
+        return max(median(steps), 1e-3) if steps else UNKNOWN_PERIOD
 
     @property
     def rate(self) -> float:
@@ -88,7 +85,8 @@ class Freshness:
             return "nothing received yet"
         if not self._periodic:
             return None
-        limit = STALE_PERIODS * self.period
+        sure = self._rate_hz is not None or len(self._window) >= ENOUGH
+        limit = STALE_PERIODS * (self.period if sure else min(self.period, UNKNOWN_PERIOD))
         if max_age is not None:
             limit = min(limit, max_age)
         age = self.age(now_ns)

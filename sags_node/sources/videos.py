@@ -166,7 +166,9 @@ class PanePairs:
         self._video = video
         self._boxes = {"left": left, "right": right}
         if tools is not None:
-            self._boxes["tools"] = tools
+            from sags_node.sources.painted import unpainted  # a kernel: other sources need no place for one
+
+            self._boxes["tools"], self._unpainted = tools, unpainted
         self.rate, self.count = video.rate, video.count
         self.size = left[2], left[3]
         try:
@@ -200,10 +202,8 @@ class PanePairs:
         picture = self._video.read()
         if picture is None:
             return None
-        from sags_node.sources.painted import unpainted  # a kernel that cameras do without
-
         panes = {name: picture[y : y + h, x : x + w] for name, (x, y, w, h) in self._boxes.items()}
-        tissue = unpainted(panes["tools"], panes["left"]) if "tools" in panes else None
+        tissue = self._unpainted(panes["tools"], panes["left"]) if "tools" in panes else None
         return RawPair(_rgb(panes["left"]), _rgb(panes["right"]), tissue)
 
     def close(self) -> None:

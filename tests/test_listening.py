@@ -1,0 +1,116 @@
+"""Where a publisher listens: sockets, run directory and the file that tells of them."""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+from pathlib import Path
+from typing import Any
+
+import pytest
+from synthetic import health, publisher
+
+from sags_node.config import PublishConfig
+from sags_node.errors import SagsError, UsageError
+from sags_node.messaging.publisher import Publisher
+from sags_node.messaging.rundir import read_connection
+
+
+def test_run_directory_and_connection_file_are_private(tmp_path: Path) -> None:
+    run_dir = tmp_path / "run"
+    with publisher(run_dir) as running:
+        file = run_dir / "sags.json"
+        assert stat.S_IMODE(run_dir.stat().st_mode) == 0o700
+        assert stat.S_IMODE(file.stat().st_mode) == 0o600
+        said = json.loads(file.read_text())
+        assert said["pid"] == os.getpid() and said["protocol"] == "1.0" and said["ns"] == "sags"
+        assert said["public_key"] is None and said["session"] == "session-1"
+        assert said["data"] == running.connection.data
+        assert said["data"][0] == f"ipc://{run_dir}/sags.ipc" and said["control"].startswith(
+            "tcp://127.0.0.1:"
+        )
+        assert read_connection("sags", run_dir) == running.connection
+    assert not file.exists() and not (run_dir / "sags.ipc").exists()
+    with pytest.raises(SagsError, match="sags run"):
+        read_connection("sags", run_dir)
+
+
+def test_a_damaged_connection_file_is_named(tmp_path: Path) -> None:
+    (tmp_path / "sags.json").write_bytes(b"{" * 100_000)
+    with pytest.raises(SagsError, match="damaged"):
+        read_connection("sags", tmp_path)
+
+
+@pytest.mark.parametrize(
+    "endpoint",
+    [
+        "tcp://*:5556",
+        "tcp://0.0.0.0:5556",
+        "tcp://192.168.1.4:5556",
+        "tcp://[::]:5556",
+        "tcp://eth0:5556",
+        "udp://127.0.0.1:1",
+        "127.0.0.1:5556",
+        "tcp://",
+    ],
+)
+@pytest.mark.parametrize("key", ["data", "control"])
+def test_other_machines_are_refused(tmp_path: Path, key: str, endpoint: str) -> None:
+    value: Any = (endpoint,) if key == "data" else endpoint
+    with pytest.raises(UsageError), publisher(tmp_path / "run", **{key: value}):
+        pass
+    assert not (tmp_path / "run").exists()
+
+
+def test_insecure_allows_them(tmp_path: Path) -> None:
+    with publisher(tmp_path / "run", data=("tcp://*:*",), insecure=True) as running:
+        assert running.connection.data[-1].startswith("tcp://0.0.0.0:")
+
+
+def test_a_taken_port_is_named_with_a_way_out(tmp_path: Path) -> None:
+    with publisher(tmp_path / "one") as running:
+        taken = running.connection.data[-1]
+        with (
+            pytest.raises(SagsError, match=rf"{taken} is already in use.*publish\.data:=") as raised,
+            publisher(tmp_path / "two", data=(taken,)),
+        ):
+            pass
+        assert raised.value.exit_code == 1
+        with publisher(tmp_path / "two"):  # nothing was left behind by the failure
+            pass
+
+
+def test_one_name_one_node(tmp_path: Path) -> None:
+    with (
+        publisher(tmp_path / "run"),
+        pytest.raises(SagsError, match="another node already runs as 'sags'"),
+        publisher(tmp_path / "run"),
+    ):
+        pass
+    with publisher(tmp_path / "run"):
+        pass
+
+
+def test_an_open_run_directory_is_refused(tmp_path: Path) -> None:
+    tmp_path.chmod(0o755)
+    with pytest.raises(UsageError, match="chmod 700"), publisher(tmp_path):
+        pass
+    (tmp_path / "real").mkdir(mode=0o700)
+    (tmp_path / "link").symlink_to(tmp_path / "real")
+    with pytest.raises(UsageError, match="not a directory of yours"), publisher(tmp_path / "link"):
+        pass
+
+
+def test_a_long_run_directory_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="too long"), publisher(tmp_path / ("x" * 100)):
+        pass
+
+
+def test_no_control_socket(tmp_path: Path) -> None:
+    with Publisher(
+        PublishConfig(data=(), control=None, run_dir=tmp_path / "run"), "sags", "session-1"
+    ) as running:
+        assert running.connection.control is None and len(running.connection.data) == 1
+        running.publish_health(health())
+        assert running.poll(0) is False
