@@ -368,7 +368,7 @@ def test_peers_are_capped_and_those_who_are_in_stay_in(tmp_path: Path) -> None:
         endpoint = running.connection.data[-1]
         with Subscriber([TOPIC], endpoint=endpoint) as subscriber:
             assert subscriber.wait(TOPIC, 10) is not None
-            crowd = [hostile.raw(endpoint) for _ in range(MAX_PEERS + 30)]
+            crowd = hostile.crowd(endpoint, MAX_PEERS + 30)
             until(lambda: running.connections["data"]["too_many"] >= 31)
             until(lambda: running.connections["data"]["open"] <= MAX_PEERS)
             assert subscriber.wait(TOPIC, 5, after=subscriber.latest(TOPIC)) is not None
