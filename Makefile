@@ -7,12 +7,10 @@ STAMP := $(VENV)/.installed
 DEBIAN := libusb-1.0-0 libgl1 libegl1 libgomp1 libx11-6
 # What tests use beyond that: a browser for the viewer, a compiler for the C++ client.
 DEBIAN_TESTS := chromium g++ cmake pkg-config cppzmq-dev libmsgpack-cxx-dev
-# The GPU backend in the mapper and the fit; the other tests of it are of single kernels.
-TWINS_WHOLE := $(wildcard tests/test_cuda_mapper.py tests/test_cuda_fit*.py)
 missing = $(shell for p in $(1); do dpkg -s $$p >/dev/null 2>&1 || echo $$p; done)
 apt_install = apt-get update -qq && apt-get install -y -qq --no-install-recommends $(1) >/dev/null
 
-.PHONY: setup run test test-tools twins twins-kernels twins-whole lint golden clean
+.PHONY: setup run test test-tools lint golden clean
 
 setup: $(STAMP)
 
@@ -32,18 +30,10 @@ $(STAMP): pyproject.toml constraints.txt
 run: setup
 	$(BIN)/sags demo
 
-# The linters and the twins of the GPU kernels use one core each: they run side by side.
-test: setup test-tools
-	$(MAKE) --no-print-directory -j2 -Otarget lint twins
-	$(BIN)/python -m pytest --ignore-glob='*/test_cuda_*.py'
-
-twins: twins-kernels twins-whole
-
-twins-kernels: setup
-	$(BIN)/python -m pytest $(filter-out $(TWINS_WHOLE),$(wildcard tests/test_cuda_*.py))
-
-twins-whole: setup
-	$(BIN)/python -m pytest $(TWINS_WHOLE)
+# What only computes runs side by side; what has sockets and clocks has the machine for itself.
+test: lint test-tools
+	$(BIN)/python -m pytest -m 'not live' -n 2 --dist loadfile
+	$(BIN)/python -m pytest -m live
 
 # Tests whose tools are missing are skipped, and say so.
 test-tools:

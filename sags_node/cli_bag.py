@@ -15,7 +15,7 @@ from rich.markup import escape
 
 from sags_node.apps import bag as say
 from sags_node.apps.launching import as_json, positive
-from sags_node.apps.terminal import console, show
+from sags_node.apps.terminal import console, on_stop_signals, show
 from sags_node.cli_consumers import endpoint_option, keys_options, ns_option
 
 DATA_LOST = 3  # exit code
@@ -127,7 +127,7 @@ def record(
             keys=keys,
         )
     )
-    _on_signals(recorder.stop)
+    on_stop_signals(recorder.stop)
     signal.signal(signal.SIGUSR1, lambda *_: recorder.snapshot())
     if from_stdin:
         _on_lines(recorder.snapshot, at_the_end=recorder.stop)
@@ -211,7 +211,7 @@ def play(
         clock_hz=clock_hz,
     )
     player = Player(path, options, PublishConfig(data=(endpoint,), control=None), ns, start_paused)
-    _on_signals(player.stop)
+    on_stop_signals(player.stop)
     _on_lines(player.toggle_pause)
     console.print(escape(f"publishing {path} on {endpoint} as {ns}/...  (Ctrl-C ends)"), soft_wrap=True)
     summary = player.play()
@@ -247,17 +247,6 @@ def recover(path: Path, output: Path, json_out: bool) -> None:
     show(done if json_out else say.recovered_text(done))
     if done["lost"]:
         click.get_current_context().exit(DATA_LOST)
-
-
-def _on_signals(stop: Callable[[], None]) -> None:
-    """Ctrl-C and a service manager's stop end in order; a second one breaks off."""
-
-    def handle(number: int, frame: object) -> None:
-        signal.signal(number, signal.default_int_handler)
-        stop()
-
-    signal.signal(signal.SIGINT, handle)
-    signal.signal(signal.SIGTERM, handle)
 
 
 def _on_lines(call: Callable[[], None], at_the_end: Callable[[], None] = lambda: None) -> None:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import threading
 from typing import Any
 
 import click
 from rich.markup import escape
 
 from sags_node.apps.launching import as_json
-from sags_node.apps.terminal import console, show
+from sags_node.apps.terminal import console, on_stop_signals, show
 from sags_node.cli_consumers import endpoint_option, keys_options, ns_option
 from sags_node.errors import UsageError
 
@@ -68,4 +69,6 @@ def view(
         else:
             console.print(f"open [bold]{escape(url)}[/] in a browser  (Ctrl-C ends)", soft_wrap=True)
 
-    run_viewer(host, port, insecure, endpoint, control, ns, keys, ready)
+    stop = threading.Event()
+    on_stop_signals(stop.set)
+    run_viewer(host, port, insecure, endpoint, control, ns, keys, ready, stop=stop)

@@ -7,22 +7,26 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-import torch
 
+import sags_node.engine.threads  # noqa: F401 - before torch: it says how idle workers wait, here as in a node
 from sags_node.config import FoldersSource, PhantomSource
 from sags_node.phantom import write_session
 
 ROOT = Path(__file__).parent.parent
 
-if not torch.cuda.is_available():
-    os.environ["TRITON_INTERPRET"] = "1"  # read when a kernel is imported: they then run on the CPU
+
+def pytest_configure() -> None:
+    import torch
+
+    if not torch.cuda.is_available():
+        os.environ["TRITON_INTERPRET"] = "1"  # read when a kernel is imported: they then run on the CPU
 
 
 @pytest.fixture(scope="module")
 def quick_interpreter() -> Iterator[None]:
     """Triton's interpreter prepares its language anew for every call of a function, which takes longer than
     all the rest: prepare it once."""
-    if torch.cuda.is_available():
+    if "TRITON_INTERPRET" not in os.environ:
         yield
         return
     import triton.language as tl

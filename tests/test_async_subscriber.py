@@ -17,6 +17,8 @@ from sags_node.messaging.freshness import StaleError
 from sags_node.messaging.publisher import Publisher
 from sags_node.messaging.received import Received, ReceivedImage, TopicName
 
+pytestmark = pytest.mark.live
+
 PICTURE = TopicName("left/image_rect_color", ReceivedImage)
 DEPTH = TopicName("left/render/depth", ReceivedImage)
 
@@ -53,13 +55,13 @@ def test_topics_of_one_frame_are_joined(running: Publisher) -> None:
     async def join() -> None:
         async with subscribed(running, PICTURE, DEPTH) as subscriber:
             with stream(running):
-                image = await subscriber.wait(PICTURE, 10)
+                image = await subscriber.wait(PICTURE, 30)
                 assert image is not None
-                frame = await subscriber.aligned([PICTURE, DEPTH], image.stamp_ns, timeout=5)
+                frame = await subscriber.aligned([PICTURE, DEPTH], image.stamp_ns, timeout=30)
                 assert frame is not None and frame[DEPTH].meta.frame_id == image.meta.frame_id
                 assert frame[DEPTH].array.shape == image.array.shape[:2]
                 assert subscriber.read(PICTURE).array.flags.writeable is False
-                later = await subscriber.wait(PICTURE, 10, after=image)
+                later = await subscriber.wait(PICTURE, 30, after=image)
                 assert later is not None and later.meta.seq > image.meta.seq
                 assert await subscriber.aligned([PICTURE], stamp_ns=1) is None
 
@@ -101,7 +103,7 @@ def test_a_waiting_task_sleeps(running: Publisher) -> None:
 def test_a_cancelled_wait_leaves_the_others_alone(running: Publisher) -> None:
     async def cancel() -> None:
         async with subscribed(running, PICTURE) as subscriber:
-            waiting = [asyncio.create_task(subscriber.wait(PICTURE, 10)) for _ in range(3)]
+            waiting = [asyncio.create_task(subscriber.wait(PICTURE, 30)) for _ in range(3)]
             await asyncio.sleep(0.05)
             waiting[1].cancel()
             with pytest.raises(asyncio.CancelledError):
@@ -132,7 +134,7 @@ def test_one_subscriber_serves_two_loops(running: Publisher) -> None:
     subscriber = subscribed(running, PICTURE)
 
     async def follow(name: str) -> None:
-        async for image in subscriber.messages(PICTURE, timeout=10):
+        async for image in subscriber.messages(PICTURE, timeout=30):
             numbers[name].append(image.meta.seq)
             if len(numbers[name]) == 8:
                 return
@@ -142,7 +144,7 @@ def test_one_subscriber_serves_two_loops(running: Publisher) -> None:
         for thread in threads:
             thread.start()
         for thread in threads:
-            thread.join(20)
+            thread.join(30)
     subscriber.close()
     for seen in numbers.values():
         assert len(seen) == 8 and seen == sorted(set(seen))
@@ -157,9 +159,9 @@ def test_a_loop_that_is_gone_does_not_end_the_receiver(running: Publisher) -> No
     loop.close()
     try:
         with stream(running):
-            newest = asyncio.run(subscriber.wait(PICTURE, 10))
+            newest = asyncio.run(subscriber.wait(PICTURE, 30))
             assert newest is not None
-            assert asyncio.run(subscriber.wait(PICTURE, 10, after=newest)) is not None
+            assert asyncio.run(subscriber.wait(PICTURE, 30, after=newest)) is not None
     finally:
         task._log_destroy_pending = False
         left.close()

@@ -10,7 +10,7 @@ from command_line import start, stopped, wait_for
 
 from sags_node.cli import main
 
-pytestmark = pytest.mark.usefixtures("run_dir")
+pytestmark = [pytest.mark.live, pytest.mark.usefixtures("run_dir")]
 
 
 @pytest.mark.parametrize("command", [["eval", "--json", "-"], ["eval", "--pace", "step"], ["demo", "--json"]])

@@ -11,7 +11,7 @@ from user_files import SHORT, videos
 
 from sags_node.messaging.subscriber import Subscriber
 
-pytestmark = pytest.mark.usefixtures("run_dir")
+pytestmark = [pytest.mark.live, pytest.mark.usefixtures("run_dir")]
 
 ROOT = Path(__file__).parent.parent
 
@@ -143,7 +143,7 @@ def test_a_right_video_that_ends_too_early_ends_the_node_at_that_frame(
         result = sags("run", *session, "source.rate:=5")
         last = subscriber.latest(depth)
         while last is not None and last.meta.frame_id < SHORT - 1:
-            last = subscriber.wait(depth, timeout=5, after=last)
+            last = subscriber.wait(depth, timeout=30, after=last)
     assert last is not None, "the last good frame never came"
     assert result.exit_code == 1
     assert f"short.mp4 ends at frame {SHORT}" in result.stderr and "set source.frames" in result.stderr

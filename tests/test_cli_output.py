@@ -16,7 +16,7 @@ from user_files import videos
 
 from sags_node.cli import main
 
-pytestmark = pytest.mark.usefixtures("run_dir")
+pytestmark = [pytest.mark.live, pytest.mark.usefixtures("run_dir")]
 
 ROOT = Path(__file__).parent.parent
 

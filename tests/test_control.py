@@ -27,6 +27,8 @@ from sags_node.messaging.control import MAX_PENDING, ControlClient, Handler
 from sags_node.messaging.publisher import Publisher
 from sags_node.messaging.rundir import Connection
 
+pytestmark = pytest.mark.live
+
 
 def refuse(args: dict[str, Any]) -> Any:
     raise SagsError("mapping.nothing cannot be changed")
@@ -92,7 +94,7 @@ def test_a_future_is_answered_when_it_is_done_and_others_meanwhile(tmp_path: Pat
     with node(tmp_path / "run", {"later": later}) as endpoint:
         with ControlClient(endpoint) as slow, ControlClient(endpoint) as quick:
             answers: list[Any] = []
-            thread = threading.Thread(target=lambda: answers.append(slow.request("later", timeout=10)))
+            thread = threading.Thread(target=lambda: answers.append(slow.request("later", timeout=30)))
             thread.start()
             until(lambda: waiting)
             assert quick.request("ping") == "pong"
@@ -144,7 +146,7 @@ def test_thousands_of_random_requests_do_no_harm(tmp_path: Path) -> None:
             asker.send_multipart(parts)
             while asker.poll(0):
                 answered += is_reply(asker.recv_multipart()[-1])
-        deadline = time.monotonic() + 10
+        deadline = time.monotonic() + 30
         while answered < 2900 and time.monotonic() < deadline and asker.poll(500):
             answered += is_reply(asker.recv_multipart()[-1])
         context.destroy(linger=0)
@@ -182,13 +184,13 @@ def node_process(run_dir: Path, session: str, control: str = "tcp://127.0.0.1:*"
 def test_a_killed_node_is_followed_to_another_port(tmp_path: Path) -> None:
     with node_process(tmp_path / "run", "first"):
         asker = ControlClient(run_dir=tmp_path / "run")
-        assert asker.request("who", timeout=10) == "first"
+        assert asker.request("who", timeout=30) == "first"
     with asker:
         before = asker.endpoint
         with pytest.raises(SagsError, match=f"no answer from {before} in 0.3 s"):
             asker.request("who", timeout=0.3)
         with node_process(tmp_path / "run", "second"):
-            assert asker.request("who", timeout=10) == "second"
+            assert asker.request("who", timeout=30) == "second"
             assert asker.endpoint != before
 
 
@@ -202,11 +204,11 @@ def test_a_node_that_stopped_in_order_is_waited_for(tmp_path: Path) -> None:
         with pytest.raises(SagsError, match="no node runs as 'sags'"):
             asker.request("ping", timeout=0.3)
         answers: list[Any] = []
-        thread = threading.Thread(target=lambda: answers.append(asker.request("mark", timeout=20)))
+        thread = threading.Thread(target=lambda: answers.append(asker.request("mark", timeout=30)))
         thread.start()
         time.sleep(0.3)
         with node(tmp_path / "run", {"mark": lambda args: asked.append("x")}) as endpoint:
-            thread.join(20)
+            thread.join(30)
             assert answers == [None] and asked == ["x"]  # once
             assert asker.endpoint == endpoint
 
@@ -225,7 +227,7 @@ def test_what_may_have_been_done_is_not_asked_for_again(tmp_path: Path) -> None:
 
         def ask() -> None:
             try:
-                asker.request("mark", timeout=20)
+                asker.request("mark", timeout=30)
             except SagsError as error:
                 errors.append(str(error))
 
@@ -233,10 +235,10 @@ def test_what_may_have_been_done_is_not_asked_for_again(tmp_path: Path) -> None:
         thread.start()
         until(lambda: asked)
     with asker, node(tmp_path / "run", {"mark": lambda args: asked.append("second")}):
-        thread.join(10)
+        thread.join(30)
         assert len(errors) == 1 and "started anew before it answered; ask again" in errors[0]
         assert asked == ["first"]
-        asker.request("mark", timeout=10)
+        asker.request("mark", timeout=30)
         assert asked == ["first", "second"]
 
 

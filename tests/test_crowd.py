@@ -5,6 +5,8 @@ import pytest
 from sags_node.benchmark import crowd
 from sags_node.errors import SagsError
 
+pytestmark = pytest.mark.live
+
 SMALL = ("replay/phantom_pull", "source.pace:=realtime", "mapping.max_gaussians:=2000")
 
 

@@ -233,6 +233,7 @@ def test_all_cameras_of_the_video_look_at_the_same_point(scene: Scene) -> None:
 # ---- where it comes from ---------------------------------------------------------------------------------
 
 
+@pytest.mark.live
 def test_a_running_node_is_exported_as_it_is_now(
     phantom_session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

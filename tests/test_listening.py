@@ -16,6 +16,8 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.messaging.publisher import Publisher
 from sags_node.messaging.rundir import read_connection
 
+pytestmark = pytest.mark.live
+
 
 def test_run_directory_and_connection_file_are_private(tmp_path: Path) -> None:
     run_dir = tmp_path / "run"

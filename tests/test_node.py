@@ -20,6 +20,8 @@ from sags_node.errors import SagsError
 from sags_node.messaging.control import ControlClient
 from sags_node.messaging.subscriber import Subscriber
 
+pytestmark = pytest.mark.live
+
 START_SECONDS = 90  # the first start on a machine compiles kernels
 
 
@@ -55,7 +57,7 @@ class RunningNode:
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGINT)
         try:
-            return self.process.wait(20)
+            return self.process.wait(30)
         finally:
             self.process.kill()  # a node that does not end must not disturb the tests that follow
 
@@ -182,11 +184,11 @@ def test_a_killed_node_goes_stale_and_reads_fail(phantom_session: Path, tmp_path
     name = "left/render/image"
     with Subscriber([name], endpoint=running.data) as subscriber:
         assert subscriber.wait(name, timeout=30) is not None
-        deadline = time.monotonic() + 20
+        deadline = time.monotonic() + 30
         while not subscriber.ok(name) and time.monotonic() < deadline:
             time.sleep(0.05)
         running.process.kill()
-        running.process.wait(10)
+        running.process.wait(30)
         deadline = time.monotonic() + 10
         while subscriber.ok(name) and time.monotonic() < deadline:
             time.sleep(0.05)
@@ -199,7 +201,7 @@ def test_stopping_is_clean(phantom_session: Path, tmp_path: Path, stop: signal.S
     running = RunningNode(phantom_session, tmp_path)
     time.sleep(1.0)
     running.process.send_signal(stop)
-    assert running.process.wait(20) == 0
+    assert running.process.wait(30) == 0
     assert not (running.run_dir / "sags.json").exists()
     assert "Traceback" not in running.said()
 

@@ -25,6 +25,8 @@ from sags_node.messaging.rundir import connection_path
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.types import Camera
 
+pytestmark = pytest.mark.live
+
 MAX_AGE = 0.5  # s
 NOTICED = 0.1  # s more until it is noticed: what docs/wire.md promises
 BUSY = 1.0  # s that a busy machine may take on top
@@ -41,7 +43,7 @@ def process(*arguments: str | Path) -> Iterator[subprocess.Popen[str]]:
         running.send_signal(signal.SIGCONT)
         running.terminate()
         try:
-            running.communicate(timeout=20)
+            running.communicate(timeout=30)
         except subprocess.TimeoutExpired:
             running.kill()
             running.communicate()
@@ -129,7 +131,7 @@ def test_on_the_phantom_both_eyes_follow_the_tissue(
     with overlay(run_dir, "--scene", scene) as (running, watcher):
         frames = watcher.pictures(45, drawn=True)  # once through the recording
         running.send_signal(signal.SIGINT)
-        summary = json.loads(running.communicate(timeout=10)[0])
+        summary = json.loads(running.communicate(timeout=30)[0])
     frames = [frame for frame in frames if len(frame) == 4]
     assert len(frames) > 20
     full = np.median([(frame["left/overlay/image"].array[..., 3] > 0).sum() for frame in frames])
@@ -215,7 +217,7 @@ def test_it_leaves_no_anchors_behind(run_dir: Path) -> None:
             watcher.pictures(1, drawn=True)
             until(lambda: anchors() == 1, running)
             running.send_signal(signal.SIGINT)
-            running.communicate(timeout=10)
+            running.communicate(timeout=30)
             until(lambda: anchors() == 0, seconds=5)
 
 
@@ -231,16 +233,16 @@ def test_it_goes_blank_when_the_node_stops_is_reset_or_dies(
         watcher.pictures(3, drawn=True)
 
         with ControlClient(run_dir=run_dir) as client:
-            client.request("reset_model", timeout=5)
+            client.request("reset_model", timeout=30)
         lost = "lost: the model was started anew"
         assert blank_in_time(watcher).startswith(("lost", "stale"))
         until(lambda: watcher.status()["reason"] == lost, running, seconds=20)
         running.send_signal(signal.SIGINT)
-        assert json.loads(running.communicate(timeout=10)[0])["blanked"][lost] > 0
+        assert json.loads(running.communicate(timeout=30)[0])["blanked"][lost] > 0
     with overlay(run_dir, "--repin") as (running, watcher):
         watcher.pictures(3, drawn=True)
         with ControlClient(run_dir=run_dir) as client:
-            client.request("reset_model", timeout=5)
+            client.request("reset_model", timeout=30)
         until(lambda: watcher.status()["objects"][0]["pinned"] > 1, running, seconds=20)
         watcher.pictures(3, drawn=True)
         node.kill()
@@ -255,7 +257,7 @@ def blank_in_time(watcher: Watcher) -> str:
         watcher._subscriber.latest("left/overlay/image") if shown is None else shown["left/overlay/image"]
     )
     while True:
-        newest = watcher._subscriber.wait("left/overlay/image", 10, after=last_shown)
+        newest = watcher._subscriber.wait("left/overlay/image", 30, after=last_shown)
         assert isinstance(newest, ReceivedImage), "the last overlay was left standing"
         if not newest.array.any():
             break

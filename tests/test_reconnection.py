@@ -21,6 +21,8 @@ from waiting import until
 from sags_node.messaging import stream as data_stream
 from sags_node.messaging.subscriber import Subscriber
 
+pytestmark = pytest.mark.live
+
 
 def test_a_restarted_node_is_followed(tmp_path: Path) -> None:
     run_dir = tmp_path / "run"
@@ -28,12 +30,12 @@ def test_a_restarted_node_is_followed(tmp_path: Path) -> None:
         port = running.connection.data[-1]
         subscriber = Subscriber(["tf"], endpoint=port)
         with stream(running):
-            first = subscriber.wait("tf", 10)
+            first = subscriber.wait("tf", 30)
         assert first is not None
     with publisher(run_dir, data=(port,)) as running:
         running.session = "session-2"
         with stream(running):
-            deadline = time.monotonic() + 20
+            deadline = time.monotonic() + 30
             newest = first
             while newest.meta.session != "session-2" and time.monotonic() < deadline:
                 newest = subscriber.wait("tf", 1, after=newest) or newest
@@ -78,7 +80,7 @@ def test_a_killed_node_is_followed(tmp_path: Path, by_file: bool, ipc: bool, mov
     with _node(run_dir, "first", port, ipc):
         until((run_dir / "sags.json").exists)
         subscriber = Subscriber(["tf"], run_dir=run_dir, **where)
-        found = subscriber.wait("tf", 10)
+        found = subscriber.wait("tf", 30)
         assert found is not None and found.meta.session == "first"
     with subscriber:
         until(lambda: not subscriber.ok("tf"))
@@ -99,7 +101,7 @@ def test_a_connection_that_died_without_a_word_is_made_anew(
     with publisher(tmp_path / "run", ipc=False) as running, stream(running):
         with Cable(running.connection.data[0]) as cable:
             with Subscriber(["tf"], endpoint=cable.endpoint) as subscriber:
-                assert subscriber.wait("tf", 10) is not None
+                assert subscriber.wait("tf", 30) is not None
                 cable.cut()
                 until(lambda: not subscriber.ok("tf"))
                 until(lambda: subscriber.ok("tf"))

@@ -22,6 +22,8 @@ from sags_node.recording.bag import read_messages
 from sags_node.recording.pictures import decode_picture
 from sags_node.recording.recorder import Options
 
+pytestmark = pytest.mark.live
+
 
 def test_every_topic_is_recorded_as_it_was_published(tmp_path: Path) -> None:
     path, summary = record_plane(tmp_path)

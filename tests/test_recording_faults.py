@@ -21,6 +21,8 @@ from sags_node.recording.backlog import Arrived, Backlog
 from sags_node.recording.info import bag_info
 from sags_node.recording.recorder import Options
 
+pytestmark = pytest.mark.live
+
 
 def text_message(seq: int, text: str = "x") -> Message:
     content = cdr.string(text)

@@ -29,6 +29,8 @@ from sags_node.recording.bag import read_messages
 from sags_node.recording.info import bag_info
 from sags_node.session import open_session
 
+pytestmark = pytest.mark.live
+
 
 @pytest.fixture(scope="module")
 def node(phantom_session: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
@@ -50,7 +52,7 @@ def node(phantom_session: Path, tmp_path_factory: pytest.TempPathFactory) -> Ite
             yield home
         finally:
             process.send_signal(signal.SIGINT)
-            process.wait(20)
+            process.wait(30)
 
 
 def start_recorder(home: Path, *arguments: object) -> subprocess.Popen[str]:
@@ -131,7 +133,7 @@ def test_ctrl_c_closes_the_file_and_a_signal_takes_a_snapshot(node: Path, tmp_pa
     assert "snapshot_000" in ring.stderr.readline()
     for process in (straight, ring):
         process.send_signal(signal.SIGINT)
-        stdout, _ = process.communicate(timeout=20)
+        stdout, _ = process.communicate(timeout=30)
         assert process.returncode == 0
         summary = json.loads(stdout)
         assert summary["messages"] > 5 and summary["dropped"] == 0
@@ -148,18 +150,18 @@ def test_recording_on_the_control_socket(node: Path, tmp_path: Path) -> None:
             with pytest.raises(SagsError, match="start_recording takes path"):
                 control.request("start_recording", wrong, timeout=10)
         args = {"path": str(tmp_path / "bag"), "topics": ["left/depth"]}
-        assert control.request("start_recording", args, timeout=20) == {"recording": str(tmp_path / "bag")}
+        assert control.request("start_recording", args, timeout=30) == {"recording": str(tmp_path / "bag")}
         with pytest.raises(SagsError, match="running already"):
             control.request("start_recording", args, timeout=10)
         time.sleep(1.5)
-        summary = control.request("stop_recording", timeout=20)
+        summary = control.request("stop_recording", timeout=30)
         assert summary["messages"] == len(by_topic(tmp_path / "bag")["left/depth"]) > 3
         with pytest.raises(SagsError, match="exists already; name a new folder"):
             control.request("start_recording", args, timeout=20)
         args = {"path": str(tmp_path / "ring"), "snapshot_seconds": 1, "max_bag_size": 2_000_000}
-        control.request("start_recording", args, timeout=20)
+        control.request("start_recording", args, timeout=30)
         time.sleep(1)
-        taken = control.request("take_snapshot", timeout=20)
+        taken = control.request("take_snapshot", timeout=30)
         saved = bag_info(Path(taken["snapshot"]))
         assert saved["messages"] == taken["messages"] > 5 and len(saved["files"]) > 1
-        assert control.request("stop_recording", timeout=20)["messages"] == taken["messages"]
+        assert control.request("stop_recording", timeout=30)["messages"] == taken["messages"]

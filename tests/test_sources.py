@@ -147,7 +147,7 @@ def test_stop_ends_a_wait(folders: cfg.FoldersSource) -> None:
         thread = threading.Thread(target=lambda: rest.extend(frames))
         thread.start()
         source.stop()
-        thread.join(5)
+        thread.join(30)
         assert not thread.is_alive()
     assert rest == []
 

@@ -19,6 +19,8 @@ from sags_node.cli import main
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import cdr, topics
 
+pytestmark = pytest.mark.live
+
 RATE = 40.0
 
 

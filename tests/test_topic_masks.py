@@ -22,6 +22,8 @@ from sags_node.messaging.received import ReceivedImage, TopicName
 from sags_node.messaging.stream import listen
 from sags_node.messaging.subscriber import Subscriber
 
+pytestmark = pytest.mark.live
+
 EXAMPLES = Path(__file__).parent.parent / "examples"
 START_SECONDS = 120  # the first start on a machine compiles kernels
 PICTURE, MASK = (TopicName(f"left/{name}", ReceivedImage) for name in ("image_rect_color", "tissue_mask"))
@@ -52,7 +54,7 @@ def process(home: Path, *command: str) -> Iterator[subprocess.Popen[str]]:
             yield running
         finally:
             running.send_signal(signal.SIGINT)
-            running.wait(20)
+            running.wait(30)
 
 
 def until(ready: Callable[[], Any], seconds: float = 20.0) -> Any:
@@ -91,7 +93,7 @@ def home(phantom_session: Path, tmp_path_factory: pytest.TempPathFactory) -> Ite
 
 
 def warning(client: ControlClient) -> str:
-    return str(client.request("get_status", timeout=5)["warnings"].get("mask", ""))
+    return str(client.request("get_status", timeout=30)["warnings"].get("mask", ""))
 
 
 def masker(home: Path) -> Any:
@@ -105,10 +107,10 @@ def test_masks_come_and_go_and_the_frames_go_on(home: Path) -> None:
         with masker(home):
             until(lambda: not warning(client))
             assert fits(subscriber, frames=20) > 15  # the phantom is played at 10 Hz
-            began, first = time.monotonic(), subscriber.wait(MASK, 5)
+            began, first = time.monotonic(), subscriber.wait(MASK, 30)
         assert "older than the picture" in until(lambda: warning(client))
         assert fits(subscriber, frames=10) < 5  # found without: other pixels
-        last = subscriber.wait(MASK, 5)
+        last = subscriber.wait(MASK, 30)
         assert first is not None and last is not None
         rate = (last.meta.frame_id - first.meta.frame_id) / (time.monotonic() - began)
         assert 9 < rate < 11 and subscriber.ok(MASK)
@@ -122,7 +124,7 @@ def fits(subscriber: Subscriber, frames: int) -> int:
     pictures: list[np.ndarray] = []
     last, count = None, 0
     for _ in range(frames):
-        last = subscriber.wait(MASK, 5, after=last)
+        last = subscriber.wait(MASK, 30, after=last)
         assert last is not None
         picture = subscriber.latest(PICTURE)
         assert picture is not None

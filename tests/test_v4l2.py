@@ -24,6 +24,8 @@ from sags_node.sources.pairing import QUEUE_LENGTH, Pairing
 from sags_node.sources.v4l2 import StereoCameras
 from sags_node.types import StereoFrame
 
+pytestmark = pytest.mark.live
+
 MS = 1_000_000
 CONFIG = V4l2Source(left="/dev/left", right="/dev/right", width=8, height=4, rate=50, deadline=0.15)
 
@@ -198,7 +200,7 @@ def test_delivers_pairs_with_both_stamps(plugs: Plugs) -> None:
         for n in range(5):
             plugs.put(20 * n, value=n, skew_ms=3)
             collector.wait_for(n + 1)
-    collector.thread.join(5)
+    collector.thread.join(30)
     assert not collector.thread.is_alive()
     assert collector.values() == [0, 1, 2, 3, 4]
     assert [frame.frame_id for frame in collector.frames] == [0, 1, 2, 3, 4]
@@ -253,7 +255,7 @@ def test_stop_ends_the_wait_for_absent_cameras(plugs: Plugs) -> None:
     with StereoCameras(CONFIG, plugs) as source:
         collector = Collector(source)
         source.stop()
-        collector.thread.join(5)
+        collector.thread.join(30)
         assert not collector.thread.is_alive()
     assert collector.frames == []
 

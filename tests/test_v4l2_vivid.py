@@ -16,6 +16,8 @@ from typing import Any
 
 import pytest
 
+pytestmark = pytest.mark.live
+
 ROOT = Path(__file__).resolve().parent.parent
 CACHE = Path(
     os.environ.get("SAGS_VIVID_CACHE")

@@ -33,6 +33,8 @@ from sags_node.viewer.history import GAP, History
 from sags_node.viewer.pictures import Sheet
 from sags_node.viewer.splats import Splats, splats_of
 
+pytestmark = pytest.mark.live
+
 START_SECONDS = 90  # the first start on a machine compiles kernels
 CHROMIUM = shutil.which("chromium")
 SOFTWARE_GL = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
@@ -220,7 +222,7 @@ class RunningView:
     def stop(self) -> tuple[str, str]:
         """What it says after Ctrl-C."""
         self.process.send_signal(signal.SIGINT)
-        return self.process.communicate(timeout=10)
+        return self.process.communicate(timeout=30)
 
 
 @pytest.fixture(scope="module")

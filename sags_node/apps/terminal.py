@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -71,3 +72,17 @@ def check_file(file: Path) -> None:
     with writing(file):
         if file.exists():
             file.open("r+b").close()
+
+
+def on_stop_signals(stop: Callable[[], None]) -> None:
+    """Let Ctrl-C and a service manager's stop call this; a second one breaks off.
+
+    For what runs until then: the exception that they raise otherwise is lost if it meets a finaliser.
+    """
+
+    def handle(number: int, frame: object) -> None:
+        signal.signal(number, signal.default_int_handler)
+        stop()
+
+    signal.signal(signal.SIGINT, handle)
+    signal.signal(signal.SIGTERM, handle)

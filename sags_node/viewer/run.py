@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
 from collections.abc import Callable
 from contextlib import redirect_stdout
@@ -29,8 +30,10 @@ def run_viewer(
     ns: str = "sags",
     keys: ClientKeys | None = None,
     ready: Callable[[str, int], None] = lambda url, port: None,
+    *,
+    stop: threading.Event,
 ) -> None:
-    """Serve the viewer until Ctrl-C.
+    """Serve the viewer until `stop` is set.
 
     Args:
         endpoint: data socket of the node; default: its connection file. No node need run yet.
@@ -49,20 +52,18 @@ def run_viewer(
             server.on_client_connect(scene.look)
             ready(url, server.get_port())
             with redirect_stdout(sys.stderr):  # what viser has to say; stdout is for machines
-                _follow(server, feed, scene, panel)
-    except KeyboardInterrupt:
-        pass
+                _follow(server, feed, scene, panel, stop)
     finally:
         feed.rest()
 
 
-def _follow(server: viser.ViserServer, feed: Feed, scene: Scene, panel: Panel) -> None:
+def _follow(server: viser.ViserServer, feed: Feed, scene: Scene, panel: Panel, stop: threading.Event) -> None:
     """Nothing is taken from the node while no browser looks, and no browser gets ahead of what it shows."""
-    while True:
+    while not stop.is_set():
         if not server.get_clients():
             feed.rest()
             scene.show(Moment())
-            time.sleep(IDLE_WAIT)
+            stop.wait(IDLE_WAIT)
             continue
         began = time.monotonic()
         moment = feed.now()
@@ -73,7 +74,7 @@ def _follow(server: viser.ViserServer, feed: Feed, scene: Scene, panel: Panel) -
             _await(client)
         answered = time.monotonic()
         # Half of the browser's time at most is for taking in updates; the rest is the user's.
-        time.sleep(max(began + 1 / panel.rate - answered, answered - sent))
+        stop.wait(max(began + 1 / panel.rate - answered, answered - sent))
 
 
 def _await(client: viser.ClientHandle) -> None:
