@@ -95,8 +95,8 @@ def test_a_topic_that_says_too_little(beside_node: dict[str, Any]) -> None:
 
 def test_topic_tools_in_words_and_in_json(beside_node: dict[str, Any]) -> None:
     listen = ("--seconds", "1.2")
-    rows = {row["topic"]: row for row in pure_json(sags("topic", "list", "--seconds", "4", "--json").stdout)}
-    assert 5 < rows["sags/left/depth"]["rate_hz"] < 20
+    rows = {row["topic"]: row for row in pure_json(sags("topic", "list", "--seconds", "3", "--json").stdout)}
+    assert 5 < rows["sags/left/render/depth"]["rate_hz"] < 20
     assert rows["sags/parameters"]["messages"] == 1 and rows["sags/parameters"]["rate_hz"] is None
     assert rows["sags/right/camera_info"]["messages"] == 0
     assert "sags/left/depth" in sags("topic", "list", *listen).stdout
