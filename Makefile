@@ -10,7 +10,7 @@ DEBIAN_TESTS := chromium g++ cmake pkg-config cppzmq-dev libmsgpack-cxx-dev
 missing = $(shell for p in $(1); do dpkg -s $$p >/dev/null 2>&1 || echo $$p; done)
 apt_install = apt-get update -qq && apt-get install -y -qq --no-install-recommends $(1) >/dev/null
 
-.PHONY: setup run test test-tools lint golden clean
+.PHONY: setup run test computed test-tools lint golden clean
 
 setup: $(STAMP)
 
@@ -31,9 +31,12 @@ run: setup
 	$(BIN)/sags demo
 
 # What only computes runs side by side; what has sockets and clocks has the machine for itself.
-test: lint test-tools
-	$(BIN)/python -m pytest -m 'not live' -n 2 --dist loadfile
+test: setup test-tools
+	$(MAKE) --no-print-directory -j2 lint computed
 	$(BIN)/python -m pytest -m live
+
+computed: setup
+	$(BIN)/python -m pytest -m 'not live' -n 2 --dist loadfile
 
 # Tests whose tools are missing are skipped, and say so.
 test-tools:

@@ -138,10 +138,10 @@ def test_run_prints_nothing_but_json(user_files: Path) -> None:
 
 def test_demo_prints_nothing_but_json(user_files: Path, tmp_path: Path) -> None:
     """It plays for as long as asked, at the recording's own rate."""
-    result = sags("demo", *videos(user_files), "--seconds", "2", "--out", tmp_path / "demo", "--json")
+    result = sags("demo", *videos(user_files), "--seconds", "3.5", "--out", tmp_path / "demo", "--json")
     assert result.exit_code == 0, result.stderr
     summary = pure_json(result.stdout)
-    assert summary["frames"] == 20 and summary["overlay"]["frames"] > 0
+    assert summary["frames"] == 35 and summary["overlay"]["frames"] > 0
     assert {file.name for file in (tmp_path / "demo").iterdir()} >= {"report.html", "overlay.mp4"}
 
 
