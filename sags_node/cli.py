@@ -46,9 +46,8 @@ class Sags(click.Group):
             ctx.exit(error.exit_code)
         except (KeyboardInterrupt, SystemError) as error:
             # A Ctrl-C becomes a SystemError in C code that calls Python: loading a kernel.
-            if not isinstance(error, KeyboardInterrupt) and not isinstance(
-                error.__cause__, KeyboardInterrupt
-            ):
+            cause = error.__cause__ if isinstance(error, SystemError) else error
+            if not isinstance(cause, KeyboardInterrupt):
                 raise
             console.print("stopped")
             ctx.exit(130)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import signal
+import threading
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
 from command_line import start, stopped, wait_for
 
+from sags_node.apps.terminal import on_stop_signals
 from sags_node.cli import main
 
 pytestmark = [pytest.mark.live, pytest.mark.usefixtures("run_dir")]
@@ -50,3 +54,31 @@ def test_ctrl_c_ends_the_rendering_of_a_phantom(tmp_path: Path) -> None:
     stopped(process)
     assert process.returncode == 130
     assert not any(tmp_path.iterdir())
+
+
+@pytest.fixture
+def stop() -> Iterator[threading.Event]:
+    """Set by Ctrl-C, as in commands that run until then."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    event = threading.Event()
+    on_stop_signals(event.set)
+    yield event
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+def test_a_ctrl_c_that_meets_a_finaliser_is_not_lost(stop: threading.Event) -> None:
+    """An exception there is printed and forgotten; a socket that is closed is such a place."""
+
+    class Socket:
+        def __del__(self) -> None:
+            signal.raise_signal(signal.SIGINT)
+
+    Socket()
+    assert stop.is_set()
+
+
+def test_a_second_ctrl_c_breaks_off(stop: threading.Event) -> None:
+    signal.raise_signal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)

@@ -7,11 +7,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from recorded_pairs import make_frame, read_rgb, recording, rig_from_text
+from frames import make_frame
 
 from sags_node import geometry
-from sags_node.calibration import check_rig, load_rig
+from sags_node.calibration import check_rig, load_rig, read_rig
 from sags_node.errors import SagsError
+from sags_node.sources.pictures import read_picture
 from sags_node.types import U8, Eye, StereoFrame, StereoRig
 from sags_node.vision.rectify import Rectifier
 
@@ -51,19 +52,11 @@ def test_a_point_lands_where_the_rectified_cameras_see_it(
     np.testing.assert_allclose(centroid(pair.right), expected, atol=0.1)
 
 
-def test_rows_of_a_real_unrectified_pair_become_equal() -> None:
-    folder = recording("hamlyn_f7_pair")
-    rig = rig_from_text(
-        folder / "calib.left.intrinsic.txt",
-        folder / "calib.left.distortion.txt",
-        folder / "calib.right.intrinsic.txt",
-        folder / "calib.right.distortion.txt",
-        folder / "calib.l2r.4x4",
-        360,
-        288,
-    )
+def test_rows_of_a_real_unrectified_pair_become_equal(data_folder: Path) -> None:
+    folder = data_folder / "hamlyn_f7_pair"
+    rig = read_rig(folder, (360, 288))
     assert all(finding.level == "ok" for finding in check_rig(rig))
-    raw = [read_rgb(folder / f"f7_dynamic_deint_{side}_0100.png") for side in "LR"]
+    raw = [read_picture(folder / f"f7_dynamic_deint_{side}_0100.png") for side in "LR"]
     pair = Rectifier(rig, 360, 288)(make_frame(*raw))
     assert abs(median_row_difference(*raw)) > 8  # the recording is what the test is for
     assert abs(median_row_difference(pair.left, pair.right)) < 0.5

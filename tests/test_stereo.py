@@ -8,12 +8,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from recorded_pairs import make_frame, read_rgb, recording, rig_from_text
+from frames import make_frame
 
 from sags_node import geometry
-from sags_node.calibration import load_rig
+from sags_node.calibration import load_rig, read_rig
 from sags_node.config import StereoConfig, TissueConfig
 from sags_node.errors import UsageError
+from sags_node.sources.pictures import read_picture
 from sags_node.types import F32, U8, Bool, Camera, RectifiedPair
 from sags_node.vision.matchers import SemiGlobal
 from sags_node.vision.observe import observe
@@ -198,9 +199,9 @@ def test_observation_carries_the_frame() -> None:
 
 
 @pytest.fixture(scope="module")
-def d4d() -> list[tuple[U8, U8, Bool, F32]]:
+def d4d(data_folder: Path) -> list[tuple[U8, U8, Bool, F32]]:
     """Left, right, tissue and reference depth (m) of every 20th frame."""
-    folder = recording("d4d_pull")
+    folder = data_folder / "d4d_pull"
     frames = []
     for index, picture in decode(folder / "2025_03_06-16_49_40_combined_2x2.mp4", every=20):
         tool = cv2.imread(str(folder / f"toolmask/{index:04d}.png"), cv2.IMREAD_GRAYSCALE) > 127
@@ -265,20 +266,12 @@ def test_confidence_tells_good_depth_from_bad(d4d: list[tuple[U8, U8, Bool, F32]
 
 
 @pytest.mark.parametrize(("method", "coverage"), [("dis", 0.9), ("sgbm", 0.9)])
-def test_metric_depth_against_a_ct_surface(method: str, coverage: float) -> None:
+def test_metric_depth_against_a_ct_surface(data_folder: Path, method: str, coverage: float) -> None:
     """Maier-Hein et al., TMI 2014: the CT surface is given in the left raw camera's frame, millimetres."""
-    folder = recording("tmi_ct_pair")
-    rig = rig_from_text(
-        folder / "calib.left.intrinsics.txt",
-        folder / "calib.left.distortion.txt",
-        folder / "calib.right.intrinsics.txt",
-        folder / "calib.right.distortion.txt",
-        folder / "calib.l2r.txt",
-        720,
-        576,
-    )
+    folder = data_folder / "tmi_ct_pair"
+    rig = read_rig(folder, (720, 576))
     rectifier = Rectifier(rig, 720, 576)
-    pair = rectifier(make_frame(read_rgb(folder / "left.png"), read_rgb(folder / "right.png")))
+    pair = rectifier(make_frame(read_picture(folder / "left.png"), read_picture(folder / "right.png")))
     stereo = StereoDepth(StereoConfig(method=method), rectifier.camera, rectifier.baseline)
     depth, _ = stereo(pair, np.ones((576, 720), np.bool_))
     surface = np.loadtxt(folder / "Stereo_SD_d_complete_22_CT_cut.xyz") * 1e-3
@@ -304,17 +297,17 @@ def seen_points(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_large_disparities_and_highlights_of_a_beating_heart(method: str) -> None:
+def test_large_disparities_and_highlights_of_a_beating_heart(data_folder: Path, method: str) -> None:
     """No reference here: the right picture, fetched by the depth found, must look like the left one.
 
     Rows above 70 hold instruments; columns left of 100 are not in the right picture.
     """
-    folder = recording("hamlyn_invivo_001_100")
+    folder = data_folder / "hamlyn_invivo_001_100"
     rectifier = Rectifier(load_rig(ROOT / "calib/hamlyn_heart"), 360, 288)
     stereo = StereoDepth(StereoConfig(method=method, scale=2), rectifier.camera, rectifier.baseline)
     columns, rows = np.meshgrid(np.arange(360, dtype=np.float32), np.arange(288, dtype=np.float32))
     for index in (1, 50, 100):
-        left, right = (read_rgb(folder / side / f"{index:04d}.jpg") for side in ("left", "right"))
+        left, right = (read_picture(folder / side / f"{index:04d}.jpg") for side in ("left", "right"))
         depth, _ = stereo(rectifier(make_frame(left, right)), np.ones((288, 360), np.bool_))
         known = depth > 0
         disparity = geometry.disparity_to_depth(depth, rectifier.camera.K[0, 0], rectifier.baseline)
