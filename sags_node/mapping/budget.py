@@ -16,6 +16,7 @@ LEAST_SHARE = 0.7  # of the model's capacity: fewer would save little, most of a
 SHRINK, GROW = 0.995, 1.002  # per frame
 GAUSSIANS_PER_MS = 1100  # of the budget; measured, see benchmarks/mapping.md
 PIXELS_PER_GAUSSIAN = 2  # fewer pixels have no more to tell
+MOST_PARTLY = 7  # frames in a row with a first step on part of the picture: a whole one tells what shows
 COMFORT = 0.9  # of the time: below it there is room for more Gaussians
 
 
@@ -36,7 +37,8 @@ class Budget(Protocol):
         """True when one more step may be taken."""
 
     def affords_whole(self) -> bool:
-        """True when the first step, about to be taken, may be one on the whole picture."""
+        """True when the first step, about to be taken, may be one on the whole picture; often enough for the
+        model to know which Gaussians show."""
 
     def finish(self) -> None:
         """The frame is done."""
@@ -98,6 +100,7 @@ class TimeBudget:
         self._essential = _RunningMean()
         self._cost_with_depth = _RunningMean()
         self._had_depth = False
+        self._partly = 0  # frames in a row whose first step was on part of the picture
         self.start()
 
     def start(self, waited: float = 0.0) -> None:
@@ -130,9 +133,9 @@ class TimeBudget:
 
     def affords_whole(self) -> bool:
         needed = self._whole_cost.value + self._after_cost.value
-        self._whole = not self._skip_fitted or self._clock() + needed <= self._deadline
-        if not self._whole:  # as above
-            self._whole_cost.value *= FORGET
+        fits = self._clock() + needed <= self._deadline
+        self._whole = fits or not self._skip_fitted or self._partly == MOST_PARTLY
+        self._partly = 0 if self._whole else self._partly + 1
         return self._whole
 
     def finish(self) -> None:

@@ -152,9 +152,7 @@ class CudaRefiner:
             return
         height, width = self._tissue.shape
         rows = self._worst_tiles(share)[0].repeat_interleave(TILE_HEIGHT, 0)[:height]
-        part = self._tissue & rows.repeat_interleave(TILE_WIDTH, 1)[:, :width]
-        shown = self._step(part, rates).contribution
-        self._contribution.copy_(torch.where(shown > 0, shown, self._contribution))
+        self._step(self._tissue & rows.repeat_interleave(TILE_WIDTH, 1)[:, :width], rates)
 
     def refine_worst(self, share: float, rates: Rates, nodes: bool = True) -> None:
         tiles = self._worst_tiles(share)

@@ -65,11 +65,11 @@ class Refiner(Protocol):
         """[3] see `exposure.exposure_gain`, of what was drawn last."""
 
     def refine(self, rates: Rates, share: float = 1.0) -> None:
-        """One step on what was drawn last: loss and its gradient, back-propagation, nodes, Gaussians. The
-        model learns what each of them contributes to the picture.
+        """One step on what was drawn last: loss and its gradient, back-propagation, nodes, Gaussians.
 
         Args:
-            share: of the picture that counts, where it is worst.
+            share: of the picture that counts, where it is worst. Only a step on all of it teaches the model
+                what each Gaussian contributes to the picture: the part does not tell what they show beyond.
         """
 
     def refine_worst(self, share: float, rates: Rates, nodes: bool = True) -> None:
@@ -128,15 +128,12 @@ class CpuRefiner:
         return exposure_gain(self._planes[0], self._observation.image, self._observation.tissue)
 
     def refine(self, rates: Rates, share: float = 1.0) -> None:
-        contribution = self._model.contribution
-        if share >= 1.0:
-            contribution[:] = self._step(self._observation, rates).contribution
-            return
         observation, tissue = self._observation, self._observation.tissue
+        if share >= 1.0:
+            self._model.contribution[:] = self._step(observation, rates).contribution
+            return
         tiles = worst_tiles(self._planes[0], observation.image, tissue, share)
-        part = replace(observation, tissue=tissue & pixels_of(tiles, tissue.shape))
-        shown = self._step(part, rates).contribution
-        np.copyto(contribution, shown, where=shown > 0)  # what lies elsewhere shows what it did before
+        self._step(replace(observation, tissue=tissue & pixels_of(tiles, tissue.shape)), rates)
 
     def refine_worst(self, share: float, rates: Rates, nodes: bool = True) -> None:
         observation = self._observation

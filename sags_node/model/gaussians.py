@@ -39,7 +39,7 @@ class GaussianModel:
             "colors": rows(3),
             "velocities": rows(3),  # m/s, world
             "ids": np.zeros(capacity, np.int64),
-            "contribution": rows(),  # px, in the last optimiser step
+            "contribution": rows(),  # px, in the last step on a whole picture
             "in_front": np.zeros(capacity, np.int32),  # frames in a row in front of the measured surface
             "node_index": np.zeros((capacity, NEIGHBOURS), np.int32),
             "node_weight": rows(NEIGHBOURS),
