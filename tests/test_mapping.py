@@ -184,7 +184,7 @@ def test_a_full_model_gives_up_what_shows_least_and_nothing_that_shows_much() ->
     model.contribution[:] = np.linspace(10, 1, len(points))
     doomed = densify.least_shown(model, 10)
     assert np.flatnonzero(doomed).tolist() == list(range(len(points) - 10, len(points)))
-    model.contribution[:] = 2 * densify.LITTLE
+    model.contribution[:] = np.linspace(10, 5, len(points))
     assert not densify.least_shown(model, 10).any()
 
 

@@ -24,7 +24,7 @@ FRONT_FRAMES = 3  # in a row, since stereo is wrong now and then
 MIN_OPACITY = 0.03
 CROWDED = 0.9  # share of the cap above which what does not show is given up
 SHED = 0.01  # of all, per frame: so many are given up while there are more than the machine can afford
-LITTLE = 4.0  # px of coverage: what shows more would leave a hole
+LITTLE = 0.35  # of the mean contribution: what shows more would leave a hole
 IDLE = 0.1  # px of coverage: less does not show
 PIECE = 1024  # rows a thread takes at a time: a call for each row would count references to every array
 LARGEST = 1e6  # metres, colours, quaternions: no honest value comes near
@@ -71,9 +71,17 @@ def doomed(model: GaussianModel, observation: Observation, limit: int) -> Bool:
 def least_shown(model: GaussianModel, count: int) -> Bool:
     """[N] those up to `count` that show least, and little."""
     remove = np.zeros(model.count, np.bool_)
-    least = np.argpartition(model.contribution, count)[:count]
-    remove[least] = model.contribution[least] < LITTLE
+    contribution = model.contribution
+    little = LITTLE * mean_contribution(model)
+    least = np.argpartition(contribution, count)[:count]
+    remove[least] = contribution[least] < little
     return remove
+
+
+def mean_contribution(model: GaussianModel) -> float:
+    """px, of those whose contribution is known; 0: of none."""
+    known = model.contribution[model.contribution < np.inf]
+    return float(known.mean()) if len(known) else 0.0
 
 
 @kernel

@@ -12,6 +12,7 @@ from sags_node.mapping.focus import with_neighbours
 from sags_node.mapping.motion import OpticalFlow, depth_pull, found_again, scene_flow
 from sags_node.mapping.optimiser import Rates
 from sags_node.mapping.refiner import Refiner
+from sags_node.mapping.split import split_worst
 from sags_node.model.alias_free import smoothing_variances
 from sags_node.model.deformation import NodeDeformation
 from sags_node.model.gaussians import GaussianModel
@@ -140,10 +141,12 @@ class Mapper:
         return self._found[1]
 
     def drawn(self, observation: Observation, view: RenderedView) -> None:
-        """Remember how the model looked at `observation`: the next frame's motion starts from there. A still
-        frame is passed over: slow motion adds up until it is seen."""
+        """Remember how the model looked at `observation`: the next frame's motion starts from there, and what
+        is worst in it is split. A still frame is passed over: slow motion adds up until it is seen."""
         if not self._still or self._last is None:
             self.start_from(Drawn(observation, view))
+            if self.model.free > HOLES:  # else what hardly shows is needed to fill holes
+                split_worst(self.model, observation, view)
 
     @property
     def last(self) -> Drawn | None:

@@ -81,10 +81,14 @@ class GaussianModel:
         rows["opacities"][added] = opacity
         rows["opacity_logits"][added] = np.log(opacity / (1.0 - opacity))
         rows["contribution"][added] = np.inf  # not known yet
-        rows["ids"][added] = np.arange(self._next_id, self._next_id + fits)
-        self._next_id += fits
+        rows["ids"][added] = self._new_ids(fits)
         self.count += fits
         return added
+
+    def replace(self, rows: I64, others: I64) -> None:
+        """Forget the Gaussians in `rows`; copies of those in `others` take their place, under new ids."""
+        for name, values in self._rows.items():
+            values[rows] = self._new_ids(len(rows)) if name == "ids" else values[others]
 
     def clear(self) -> None:
         """Forget all rows; ids go on."""
@@ -128,6 +132,10 @@ class GaussianModel:
             self.colors.copy(),
             self._ids().copy(),
         )
+
+    def _new_ids(self, count: int) -> I64:
+        self._next_id += count
+        return np.arange(self._next_id - count, self._next_id)
 
     def _ids(self) -> I64:
         ids: I64 = self._rows["ids"][: self.count]

@@ -1,0 +1,117 @@
+"""Where one Gaussian has to show what several could show better, it is split in three. The outer parts take
+the rows of Gaussians that hardly show, so that their number, and what they cost, stays.
+
+A split changes the picture less than a new Gaussian does, which covers what was there. The middle part stays
+where the whole was, under its id: who follows the tissue by ids sees nothing jump.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import prange
+
+from sags_node.engine.jit import kernel, parallel_kernel
+from sags_node.engine.pinhole import pack, to_camera, to_pixel
+from sags_node.geometry import quat_to_matrix
+from sags_node.mapping.densify import FRONT_TOLERANCE, mean_contribution
+from sags_node.model.gaussians import GaussianModel
+from sags_node.types import F32, I64, Bool, Observation, RenderedView
+
+SPLIT = 0.005  # of all, per frame: at most so many are split
+HARDLY = 0.15  # of the mean contribution: less hardly shows
+ENOUGH = 0.8  # of the mean contribution: what shows less is no worse than its neighbours
+APART = 1.1  # standard deviations of the whole, from its middle to that of an outer part
+PART_SIZE = 0.4  # of the whole, along its longest axis
+PIECE = 1024  # rows a thread takes at a time: a call for each row would count references to every array
+
+
+def split_worst(model: GaussianModel, observation: Observation, view: RenderedView) -> int:
+    """Split what shows most where the picture is worst.
+
+    What is hidden, by an instrument or other tissue, or out of view is not given up for it.
+
+    Args:
+        model: as it was drawn in `view`, for `observation`.
+
+    Returns:
+        How many were split.
+    """
+    contribution = model.contribution
+    mean = mean_contribution(model)
+    score = np.zeros(model.count, np.float32)
+    spare = np.zeros(model.count, np.bool_)
+    _look(
+        model.means, contribution, pack(view.camera), view.rgb, view.depth, observation.image,
+        observation.tissue, np.float32(HARDLY * mean), np.float32(ENOUGH * mean), score, spare,
+    )  # fmt: skip
+    spare_rows, wholes = np.flatnonzero(spare), np.flatnonzero(score)
+    count = min(int(SPLIT * model.count), len(spare_rows) // 2, len(wholes))
+    if count > 0:
+        least = np.argpartition(contribution[spare_rows], 2 * count - 1)[: 2 * count]
+        worst = np.argpartition(-score[wholes], count - 1)[:count]
+        _split(model, wholes[worst], spare_rows[least])
+    return count
+
+
+def _split(model: GaussianModel, wholes: I64, spare: I64) -> None:
+    """Split the Gaussians in the rows `wholes` [M]; their outer parts go into the rows `spare` [2 M]."""
+    count = len(wholes)
+    longest = np.argmax(model.scales[wholes], axis=1)
+    axes = quat_to_matrix(model.quats[wholes])[np.arange(count), :, longest]
+    size = np.sqrt(model.scales[wholes, longest] ** 2 + model.smoothing[wholes])
+    offsets = (np.float32(APART) * size)[:, None] * axes
+    model.scales[wholes, longest] *= np.float32(PART_SIZE)
+    model.log_scales[wholes, longest] += np.float32(np.log(PART_SIZE))
+    model.contribution[wholes] /= 3
+    model.adam_m[wholes] = 0
+    for rows, away in ((spare[:count], -offsets), (spare[count:], offsets)):
+        model.replace(rows, wholes)
+        model.means[rows] += away
+        model.rest[rows] += away
+
+
+@parallel_kernel
+def _look(
+    means: F32, contribution: F32, cam: F32, rgb: F32, drawn: F32, image: F32, tissue: Bool,
+    hardly: Any, enough: Any, score: F32, spare: Bool,
+) -> None:  # fmt: skip
+    for piece in prange(-(-len(means) // PIECE)):
+        first = np.int64(piece) * PIECE
+        _look_at_rows(
+            means, contribution, cam, rgb, drawn, image, tissue, hardly, enough, score, spare,
+            first, min(first + PIECE, len(means)),
+        )  # fmt: skip
+
+
+@kernel
+def _look_at_rows(
+    means: F32, contribution: F32, cam: F32, rgb: F32, drawn: F32, image: F32, tissue: Bool,
+    hardly: Any, enough: Any, score: F32, spare: Bool, first: Any, end: Any,
+) -> None:  # fmt: skip
+    """Of the Gaussians on the visible tissue, marks those that are to spare, and writes how much those that
+    may be split have to do with residuals of the colour."""
+    height, width = tissue.shape
+    for i in range(first, end):
+        much = contribution[i] > enough and contribution[i] < np.float32(np.inf)
+        if not (much or contribution[i] < hardly):
+            continue
+        x, y, z = to_camera(cam, means[i, 0], means[i, 1], means[i, 2])
+        if not z > 0:
+            continue
+        u, v = to_pixel(cam, x, y, z)
+        if not (u > -0.5 and v > -0.5 and u < width - 0.5 and v < height - 0.5):
+            continue
+        px, py = int(u + 0.5), int(v + 0.5)
+        if not (tissue[py, px] and abs(z - drawn[py, px]) < np.float32(FRONT_TOLERANCE) * z):
+            continue
+        if not much:
+            spare[i] = True
+            continue
+        square = np.float32(0)
+        for k in range(3):
+            difference = rgb[py, px, k] - image[py, px, k]
+            square += difference * difference
+        if square < np.float32(3):  # else one of them is damaged
+            score[i] = square * contribution[i]
