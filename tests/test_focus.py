@@ -111,7 +111,7 @@ class Hurried(StepBudget):
 
 def test_in_a_hurry_the_first_step_leaves_alone_what_fits_best() -> None:
     """The rest of the model keeps its colours. How much a Gaussian shows beyond the part is not told by a
-    step on it: who stands on the edge would be given up for showing little, some hundred in each frame."""
+    step on it: who stands on the edge would be given up for showing little."""
     session = open_session(PHANTOM, ["source.pace:=step", "mapping.max_gaussians:=4000"])
     pipeline, budget = Pipeline(session.config, session.rig), StepBudget(1)
     with session.source as source:
