@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sags_node.engine.pinhole import pack
-from sags_node.mapping import densify, motion, optimiser
+from sags_node.mapping import densify, motion, optimiser, split
 from sags_node.model import deformation
 from sags_node.types import Camera
 
@@ -57,6 +57,23 @@ def test_find_and_advect(scene: dict[str, np.ndarray]) -> None:
     assert 100 < seen[0].sum() < N
     assert np.array_equal(seen[0], seen[1])
     assert np.allclose(moved[0], moved[1], atol=1e-6)
+
+
+def test_look(scene: dict[str, np.ndarray]) -> None:
+    s = scene
+    means, depth = s["means"].copy(), np.full((HEIGHT, WIDTH), np.float32(0.06))
+    means[::2, 2] = 0.06  # the others are scattered before and behind
+    rgb, image = np.random.default_rng(8).random((2, HEIGHT, WIDTH, 3), np.float32)
+    contribution = s["weight"][:, 0].copy()
+    contribution[::31], contribution[1::31] = np.inf, np.nan
+    arguments = (means, contribution, s["cam0"], rgb, depth, image, s["tissue"],
+                 np.float32(0.4), np.float32(0.6))  # fmt: skip
+    score, spare = np.zeros((2, N), np.float32), np.zeros((2, N), np.bool_)
+    split._look(*arguments, score[0], spare[0])
+    split._look.py_func(*arguments, score[1], spare[1])
+    assert 30 < spare[0].sum() and 30 < np.count_nonzero(score[0])
+    assert not (spare[0] & (score[0] > 0)).any()
+    assert np.array_equal(spare[0], spare[1]) and np.allclose(score[0], score[1], rtol=1e-5)
 
 
 @pytest.mark.parametrize("crowded", [False, True])

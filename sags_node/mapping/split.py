@@ -15,7 +15,7 @@ from numba import prange
 from sags_node.engine.jit import kernel, parallel_kernel
 from sags_node.engine.pinhole import pack, to_camera, to_pixel
 from sags_node.geometry import quat_to_matrix
-from sags_node.mapping.densify import FRONT_TOLERANCE, mean_contribution
+from sags_node.mapping.densify import mean_contribution
 from sags_node.model.gaussians import GaussianModel
 from sags_node.types import F32, I64, Bool, Observation, RenderedView
 
@@ -24,6 +24,7 @@ HARDLY = 0.15  # of the mean contribution: less hardly shows
 ENOUGH = 0.8  # of the mean contribution: what shows less is no worse than its neighbours
 APART = 1.1  # standard deviations of the whole, from its middle to that of an outer part
 PART_SIZE = 0.4  # of the whole, along its longest axis
+NEAR = 0.065  # of the depth: so near the drawn surface it lies on it, and would show
 PIECE = 1024  # rows a thread takes at a time: a call for each row would count references to every array
 
 
@@ -104,7 +105,7 @@ def _look_at_rows(
         if not (u > -0.5 and v > -0.5 and u < width - 0.5 and v < height - 0.5):
             continue
         px, py = int(u + 0.5), int(v + 0.5)
-        if not (tissue[py, px] and abs(z - drawn[py, px]) < np.float32(FRONT_TOLERANCE) * z):
+        if not (tissue[py, px] and abs(z - drawn[py, px]) < np.float32(NEAR) * z):
             continue
         if not much:
             spare[i] = True
