@@ -110,7 +110,7 @@ class Node:
             "capture": (self._capture, self._frames.close),
             "mapping": (self._map, self._close_results),
             "drawing": (self._draw_views, lambda: None),
-            "publishing": (self._publish, self._publisher.close),
+            "publishing": (self._publish, self._close_publisher),
         }
         # Events, not joins: in Python 3.11 a Ctrl-C during a join marks a living thread as ended.
         self._ended = {name: threading.Event() for name in work}
@@ -248,6 +248,10 @@ class Node:
         self._scenes.close()
         self._results.close()
 
+    def _close_publisher(self) -> None:
+        self._results.close()  # mapping must not wait for a thread that failed
+        self._publisher.close()
+
     def _publish(self) -> None:
         self._parameters_changed.set()
         next_health = time.monotonic()
@@ -377,6 +381,8 @@ class Node:
         path = args.get("path")
         if not isinstance(path, str) or not path.endswith(".ply"):
             raise SagsError("save_model needs a path that ends in .ply")
+        if "\0" in path:
+            raise SagsError("save_model: path cannot hold a zero character")
         gaussians = self._pipeline.mapper.model.frozen()
         if len(gaussians) == 0:
             raise SagsError("there is no model yet; wait for the first frame")

@@ -165,6 +165,8 @@ def test_control_socket_reads_changes_and_saves(node: RunningNode, tmp_path: Pat
         assert saved["gaussians"] > 1000 and file.stat().st_size > 1000 * 68
         with pytest.raises(SagsError, match="exists already"):
             client.request("save_model", {"path": str(file)})
+        with pytest.raises(SagsError, match="zero character"):
+            client.request("save_model", {"path": "a\0b.ply"})
         with pytest.raises(SagsError, match="unknown"):
             client.request("make_coffee")
 

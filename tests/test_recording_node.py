@@ -153,6 +153,8 @@ def test_recording_on_the_control_socket(node: Path, tmp_path: Path) -> None:
         assert control.request("start_recording", args, timeout=30) == {"recording": str(tmp_path / "bag")}
         with pytest.raises(SagsError, match="running already"):
             control.request("start_recording", args, timeout=10)
+        with pytest.raises(SagsError, match="snapshot_seconds"):  # the recording goes on
+            control.request("take_snapshot", timeout=10)
         time.sleep(1.5)
         summary = control.request("stop_recording", timeout=30)
         assert summary["messages"] == len(by_topic(tmp_path / "bag")["left/depth"]) > 3

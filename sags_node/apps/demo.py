@@ -21,6 +21,7 @@ from sags_node.evaluation.session import measure
 from sags_node.evaluation.spool import Spool
 from sags_node.messaging.rundir import connection_path, default_run_dir
 from sags_node.node import Node
+from sags_node.processes import end
 from sags_node.session import Session
 from sags_node.types import FrameResult
 
@@ -95,20 +96,14 @@ def _await_overlay(config: LaunchConfig, overlay: subprocess.Popen[str]) -> None
 
 def _end(overlay: subprocess.Popen[str]) -> None:
     """Let it close its video, but do not wait until it has played to its end."""
-    overlay.terminate()
-    try:
-        overlay.communicate(timeout=OVERLAY_STOP)
-    except subprocess.TimeoutExpired:
-        overlay.kill()
-        overlay.communicate()
+    end(overlay, grace=OVERLAY_STOP)
 
 
 def _finish_overlay(overlay: subprocess.Popen[str]) -> dict[str, Any]:
     try:
         stdout, stderr = overlay.communicate(timeout=OVERLAY_GRACE)
     except subprocess.TimeoutExpired:
-        overlay.kill()
-        overlay.communicate()
+        end(overlay, grace=0.0)
         raise SagsError("the overlay subscriber did not end; see `sags overlay --help`") from None
     if overlay.returncode != 0:
         raise SagsError(f"the overlay subscriber failed: {stderr.strip()}")

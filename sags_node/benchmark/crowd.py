@@ -26,12 +26,14 @@ from sags_node.messaging.address import connect, find_data
 from sags_node.messaging.received import ReceivedText, TopicName
 from sags_node.messaging.stream import MAX_MESSAGE_BYTES
 from sags_node.messaging.subscriber import Subscriber
+from sags_node.processes import end
 
 PICTURES = ("left/render/image", "left/render/depth")
 SMALL = ("tf", "anchors", "status")  # what each of the many listens to
 STATUS = TopicName("status", ReceivedText)
 WARM_UP = 10.0  # s
 STARTING = 60.0  # s for a node to bind its sockets
+STOPPING = 30.0  # s for it, and for each of the crowd, to end
 LOWEST_PRIORITY = 19
 SLOW = 0.2  # s that the slow subscriber takes for each frame
 PHASE = "publish.data:=[tcp://127.0.0.1:*]", "publish.control:=null", "source.loop:=true"
@@ -78,20 +80,20 @@ def measure_crowd(launch: Sequence[str], alone: float, crowded: float, many: int
 @contextmanager
 def _node(launch: Sequence[str], folder: Path) -> Iterator[subprocess.Popen[bytes]]:
     command = [sys.executable, "-m", "sags_node", "run", *launch, *PHASE, f"publish.run_dir:={folder}"]
-    node = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
-    try:
-        deadline = time.monotonic() + STARTING
-        while not any(folder.glob("*.json")):
-            if node.poll() is not None:
-                assert node.stderr is not None
-                raise SagsError(f"the node did not start: {node.stderr.read().decode().strip()}")
-            if time.monotonic() > deadline:
-                raise SagsError(f"the node did not start within {STARTING:g} s")
-            time.sleep(0.1)
-        yield node
-    finally:
-        node.terminate()
-        node.wait()
+    with tempfile.TemporaryFile("w+") as errors:  # a pipe that is full would stop the node
+        node = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=errors)
+        try:
+            deadline = time.monotonic() + STARTING
+            while not any(folder.glob("*.json")):
+                if node.poll() is not None:
+                    errors.seek(0)
+                    raise SagsError(f"the node did not start: {errors.read().strip()}")
+                if time.monotonic() > deadline:
+                    raise SagsError(f"the node did not start within {STARTING:g} s")
+                time.sleep(0.1)
+            yield node
+        finally:
+            end(node, grace=STOPPING)
 
 
 def _watch(observer: Subscriber, seconds: float, node: subprocess.Popen[bytes]) -> Iterator[dict[str, Any]]:
@@ -136,7 +138,8 @@ def _peers(folder: Path, work: Mapping[str, Work]) -> Iterator[Callable[[], dict
     finally:
         for _, process, _ in members:
             process.terminate()
-            process.join()
+            process.join(STOPPING)
+            process.kill()
 
 
 def _with_what_is_left(work: Task, *arguments: Any) -> None:
@@ -145,13 +148,19 @@ def _with_what_is_left(work: Task, *arguments: Any) -> None:
     work(*arguments)
 
 
+def _is_over(ending: Event) -> bool:
+    """Also when the benchmark was killed."""
+    parent = multiprocessing.parent_process()
+    return ending.is_set() or parent is None or not parent.is_alive()
+
+
 def _take(folder: Path, seconds: float, ending: Event, there: Connection) -> None:
     """Take pictures and depth of the newest frame, and `seconds` for each."""
     since_capture, since_sent = [], []
     with Subscriber(PICTURES, run_dir=folder) as subscriber:
         newest = subscriber.wait(PICTURES[0], timeout=STARTING)
         begun = time.monotonic()
-        while not ending.is_set():
+        while not _is_over(ending):
             newest = subscriber.wait(PICTURES[0], timeout=1.0, after=newest) or newest
             if newest is None or subscriber.aligned(PICTURES, newest.stamp_ns, timeout=0.1) is None:
                 continue
@@ -168,7 +177,7 @@ def _read(folder: Path, _: float, ending: Event, there: Connection) -> None:
     """Take everything there is, as fast as it comes."""
     taken = 0
     with _everything(folder) as socket:
-        while not ending.is_set():
+        while not _is_over(ending):
             if socket.poll(100):
                 socket.recv_multipart(copy=False)
                 taken += 1
@@ -178,7 +187,8 @@ def _read(folder: Path, _: float, ending: Event, there: Connection) -> None:
 def _sleep(folder: Path, _: float, ending: Event, there: Connection) -> None:
     """Be connected to everything and never read."""
     with _everything(folder):
-        ending.wait()
+        while not _is_over(ending):
+            ending.wait(1.0)
     there.send({})
 
 
@@ -206,7 +216,7 @@ def _listen(folder: Path, count: float, ending: Event, there: Connection) -> Non
         connect(socket, address, MAX_MESSAGE_BYTES)
         poller.register(socket, zmq.POLLIN)
     heard = 0
-    while not ending.is_set():
+    while not _is_over(ending):
         for socket, _event in poller.poll(100):
             socket.recv_multipart()
             heard += 1

@@ -12,6 +12,7 @@ import numpy as np
 
 from sags_node.benchmark.rasterizing import Drawing, RasterCase
 from sags_node.benchmark.timing import times_ms
+from sags_node.processes import end
 
 CAMERA_PERIOD_S = 1 / 30
 
@@ -41,11 +42,11 @@ def _named(case: RasterCase) -> dict[str, Any]:
 
 @contextmanager
 def _burning_core() -> Iterator[subprocess.Popen[bytes]]:
-    with subprocess.Popen([sys.executable, "-c", "while True: pass"]) as process:
-        try:
-            yield process
-        finally:
-            process.kill()
+    process = subprocess.Popen([sys.executable, "-c", "while True: pass"])
+    try:
+        yield process
+    finally:
+        end(process, grace=0.0)
 
 
 def _spread(times: list[float]) -> dict[str, float]:

@@ -1,21 +1,34 @@
 """A recorder in a process of its own, started by the node: whatever the disk does, the node does not feel it.
 
 The child is `sags bag record --stdin`: it ends when its standard input does, so also when the node is killed.
+A disk may hang, so nothing here waits for the child without a limit.
 """
 
 from __future__ import annotations
 
 import json
+import logging
 import subprocess
 import sys
+import tempfile
+import threading
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
+from queue import Empty, SimpleQueue
 from typing import Any, Literal
 
 import msgspec
 
 from sags_node.errors import SagsError
+from sags_node.processes import KILL_SECONDS, end
+
+START_SECONDS = 60.0  # for the child to load and to open its file
+SNAPSHOT_SECONDS = 60.0  # to write what the ring holds
+FINISH_SECONDS = 60.0  # to write what waits and the index
+PATIENCE = 1.0  # s until a node that ends says what it waits for
+
+log = logging.getLogger(__name__)
 
 
 class _Request(msgspec.Struct, forbid_unknown_fields=True):
@@ -41,29 +54,49 @@ class RecorderProcess:
     def __init__(self, ns: str, endpoint: str | None) -> None:
         self._ns = ns
         self._endpoint = endpoint
-        self._process: subprocess.Popen[str] | None = None
-        self._waiting = ThreadPoolExecutor(max_workers=1, thread_name_prefix="recorder")
+        self._child: _Child | None = None
+        self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="recorder")
 
     def start(self, args: Mapping[str, Any]) -> Future[Any]:
         """Record to the new folder `path`; the answer is `{"recording": folder}`."""
-        return self._waiting.submit(self._start, args)
+        return self._worker.submit(self._start, args)
 
     def snapshot(self) -> Future[Any]:
         """Write the last seconds of a recording with `snapshot_seconds`; the answer names the folder."""
-        return self._waiting.submit(self._snapshot)
+        return self._worker.submit(self._snapshot)
 
     def stop(self) -> Future[Any]:
         """Finish the recording; the answer is its summary."""
-        return self._waiting.submit(self._stop)
+        return self._worker.submit(self._stop)
 
     def close(self) -> None:
-        """Finish a recording that is still running."""
-        if self._process is not None:
-            self.stop()
-        self._waiting.shutdown(wait=True)
+        """Finish a recording that is still running. A Ctrl-C meanwhile ends it at once."""
+        child = self._child
+        try:
+            if child is not None:
+                self._finish(self.stop(), child)
+        except BaseException:
+            if child is not None:
+                child.kill()
+            raise
+        finally:
+            self._worker.shutdown(wait=False)  # each of its requests has its time limit
+
+    def _finish(self, stopped: Future[Any], child: _Child) -> None:
+        waiting = [(PATIENCE, f"waiting for the recorder of {child.folder}; Ctrl-C breaks off")]
+        waiting += [(FINISH_SECONDS + SNAPSHOT_SECONDS, f"the recorder of {child.folder} does not answer")]
+        for seconds, said in waiting:
+            try:
+                stopped.result(seconds)
+                return
+            except TimeoutError:
+                log.warning(said)
+            except SagsError as error:
+                log.warning("%s", error)
+                return
 
     def _start(self, args: Mapping[str, Any]) -> Any:
-        if self._process is not None and self._process.poll() is None:
+        if self._child is not None and self._child.is_running:
             raise SagsError("a recording is running already; stop_recording ends it")
         if self._endpoint is None:
             raise SagsError("recording needs the node's ipc socket; start the node with publish.ipc:=true")
@@ -71,9 +104,10 @@ class RecorderProcess:
             request = msgspec.convert(dict(args), _Request)
         except msgspec.ValidationError as error:
             raise SagsError(f"{error}; start_recording takes path and what sags bag record takes") from None
+        folder = Path(request.path).absolute()
         command = [sys.executable, "-m", "sags_node", "bag", "record", "--stdin", "--json"]
         command += ["--endpoint", self._endpoint, "--ns", self._ns, "--compression", request.compression]
-        command += ["-o", str(Path(request.path).absolute())]
+        command += ["-o", str(folder)]
         for name in request.topics:
             command += ["--topics", name]
         for option, value in (
@@ -84,45 +118,151 @@ class RecorderProcess:
         ):
             if value is not None:
                 command += [option, str(value)]
-        self._process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
-        return self._next_line(self._process)
+        self._child = _Child(command, folder, has_ring=request.snapshot_seconds is not None)
+        try:
+            return self._child.answer(START_SECONDS)
+        except TimeoutError:
+            self._child.kill()
+            raise SagsError(
+                f"the recorder did not begin in {START_SECONDS:g} s; does the disk of {folder} answer?"
+            ) from None
 
     def _snapshot(self) -> Any:
-        process = self._running()
-        assert process.stdin is not None
+        child = self._running()
+        if not child.has_ring:
+            raise SagsError(
+                "this recording writes all that comes and keeps nothing for a snapshot; begin one with "
+                "start_recording with snapshot_seconds"
+            )
+        child.ask("snapshot")
         try:
-            process.stdin.write("snapshot\n")
-            process.stdin.flush()
-        except OSError:
-            pass  # it has ended; what it said is read below
-        return self._next_line(process)
+            return child.answer(SNAPSHOT_SECONDS)
+        except TimeoutError:
+            raise SagsError(
+                f"no snapshot came from the recorder in {SNAPSHOT_SECONDS:g} s; does the disk of "
+                f"{child.folder} answer?"
+            ) from None
 
     def _stop(self) -> Any:
-        process = self._running()
-        self._process = None
-        said, errors = process.communicate()
-        if process.returncode != 0:
-            raise SagsError(_last_words(errors))
-        return json.loads(said.splitlines()[-1])
+        child = self._running()
+        self._child = None
+        try:
+            return child.finish(FINISH_SECONDS)
+        except TimeoutError:
+            child.kill()
+            raise SagsError(
+                f"the recorder did not finish in {FINISH_SECONDS:g} s and was ended; save what it wrote "
+                f"with: sags bag recover {child.folder} -o OUT"
+            ) from None
 
-    def _running(self) -> subprocess.Popen[str]:
-        if self._process is None:
+    def _running(self) -> _Child:
+        if self._child is None:
             raise SagsError("nothing is being recorded; start_recording {path} begins")
-        return self._process
-
-    def _next_line(self, process: subprocess.Popen[str]) -> Any:
-        assert process.stdout is not None
-        line = process.stdout.readline()
-        if line:
-            return json.loads(line)
-        _, errors = process.communicate()
-        self._process = None
-        raise SagsError(_last_words(errors))
+        return self._child
 
 
-def _last_words(errors: str) -> str:
-    """The message of a command that failed."""
-    said = " ".join(errors.split())
-    return said.partition("error: ")[2] or said or "the recorder ended without a word"
+class _Child:
+    """The command and what it answers, line by line.
+
+    Args:
+        folder: of the recording.
+        has_ring: it was started to take snapshots.
+
+    Raises:
+        SagsError: it cannot be started.
+    """
+
+    def __init__(self, command: list[str], folder: Path, has_ring: bool) -> None:
+        if any("\0" in part for part in command):
+            raise SagsError("start_recording: path and topics cannot hold a zero character")
+        self.folder = folder
+        self.has_ring = has_ring
+        self._errors = tempfile.TemporaryFile("w+")  # a pipe that is full would stop the child
+        self._lines: SimpleQueue[str | None] = SimpleQueue()  # None: there will be no more
+        pipe = subprocess.PIPE
+        try:
+            self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=self._errors, text=True)
+        except OSError as error:
+            raise SagsError(f"the recorder cannot be started: {error.strerror}") from None
+        threading.Thread(target=self._listen, name="recorder-lines", daemon=True).start()
+
+    @property
+    def is_running(self) -> bool:
+        return self._process.poll() is None
+
+    def ask(self, line: str) -> None:
+        """Send a line; answers to earlier ones that came too late are forgotten."""
+        while not self._lines.empty() and self._next_line(0.0) is not None:
+            pass
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write(f"{line}\n")
+            self._process.stdin.flush()
+        except OSError:
+            pass  # it has ended; `answer` says why
+
+    def answer(self, seconds: float) -> Any:
+        """The next line it says.
+
+        Raises:
+            SagsError: it has ended instead.
+            TimeoutError: it says nothing.
+        """
+        line = self._next_line(seconds)
+        if line is None:
+            raise SagsError(self._last_words())
+        return json.loads(line)
+
+    def finish(self, seconds: float) -> Any:
+        """Let it end; the last line it says.
+
+        Raises:
+            SagsError: it has failed.
+            TimeoutError: it does not end.
+        """
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.close()
+        except OSError:
+            pass  # it has ended already
+        try:
+            self._process.wait(seconds)
+        except subprocess.TimeoutExpired:
+            raise TimeoutError from None
+        said = None
+        while (line := self._next_line(KILL_SECONDS)) is not None:
+            said = line
+        if self._process.returncode != 0 or said is None:
+            raise SagsError(self._last_words())
+        return json.loads(said)
+
+    def kill(self) -> None:
+        """End it at once. What it wrote can be recovered."""
+        if not end(self._process, grace=0.0):
+            log.warning("the recorder of %s cannot be ended; does its disk answer?", self.folder)
+
+    def _listen(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            self._lines.put(line)
+        self._lines.put(None)
+
+    def _next_line(self, seconds: float) -> str | None:
+        """None when there will be no more, however often it is asked."""
+        try:
+            line = self._lines.get(timeout=seconds)
+        except Empty:
+            raise TimeoutError from None
+        if line is None:
+            self._lines.put(None)
+        return line
+
+    def _last_words(self) -> str:
+        """The message of a command that failed."""
+        try:
+            self._process.wait(KILL_SECONDS)
+        except subprocess.TimeoutExpired:
+            return "the recorder closed its output and did not end"
+        self._errors.seek(0)
+        said = " ".join(self._errors.read().split())
+        return said.partition("error: ")[2] or said or "the recorder ended without a word"

@@ -157,7 +157,8 @@ class Recorder:
         with closing(self._messages()) as messages:
             first = next(messages, None)  # connects: without a node there will be no folder
             writer = self._writer(options.folder)
-            thread = threading.Thread(target=self._write, args=(writer, backlog), name="bag-writer")
+            # A daemon: a second Ctrl-C ends the process also while the disk hangs.
+            thread = threading.Thread(target=self._write, args=(writer, backlog), daemon=True)
             thread.start()
             try:
                 tell({"recording": str(options.folder)})
@@ -208,7 +209,9 @@ class Recorder:
                     self._snapshot_wanted.clear()
                     folder = self._options.folder / f"snapshot_{len(saving):03d}"
                     content = ring.content()
-                    saving.append(threading.Thread(target=self._save, args=(folder, content, tell)))
+                    saving.append(
+                        threading.Thread(target=self._save, args=(folder, content, tell), daemon=True)
+                    )
                     saving[-1].start()
         for thread in saving:
             thread.join()

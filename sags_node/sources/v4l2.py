@@ -23,6 +23,7 @@ from sags_node.types import StereoFrame
 log = logging.getLogger(__name__)
 
 POLL_S = 0.1  # how soon a reading thread notices `stop`
+CLOSE_S = 5.0  # a driver may take to give a reading thread back
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 5.0  # between attempts to open a device again
 
 
@@ -107,7 +108,7 @@ class StereoCameras:
         while True:
             with self._arrived:
                 while (pair := self._pairing.take()) is None and not self._stopped.is_set():
-                    self._arrived.wait()
+                    self._arrived.wait(POLL_S)
             if pair is None or self._stopped.is_set():
                 return
             frame_id, left, right = pair
@@ -160,7 +161,10 @@ class DeviceReader:
     def close(self) -> None:
         """Wait for the thread, which `stopped` ends, and close the device."""
         if self._thread.ident is not None:
-            self._thread.join()
+            self._thread.join(CLOSE_S)
+        if self._thread.is_alive():  # to close a device under its reader would crash
+            log.warning("%s: its driver does not answer; it is left open until this process ends", self._path)
+            return
         self._close_device()
 
     def _close_device(self) -> None:

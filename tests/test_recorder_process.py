@@ -1,0 +1,105 @@
+"""The recorder that a node starts: whatever it does or does not do, the node gets an answer and can end."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+from synthetic import publisher, stream
+
+from sags_node.errors import SagsError
+from sags_node.recording import child
+from sags_node.recording.child import RecorderProcess
+from sags_node.recording.info import bag_info
+
+pytestmark = pytest.mark.live
+
+ANSWER = 60.0  # s: a child starts in one or two
+
+
+@pytest.fixture
+def recorder(tmp_path: Path) -> Iterator[RecorderProcess]:
+    """Of a node that publishes a plane."""
+    with publisher(tmp_path / "run", ipc=True) as running, stream(running):
+        made = RecorderProcess("sags", f"ipc://{tmp_path / 'run/sags.ipc'}")
+        yield made
+        for process in recorders():  # what a failed test leaves behind must not keep it from ending
+            with suppress(ProcessLookupError):
+                os.kill(process, signal.SIGKILL)
+        made.close()
+
+
+def recorders() -> list[int]:
+    """The processes that this one has started to record."""
+    tasks = Path("/proc/self/task").glob("*/children")
+    started = [process for task in tasks for process in task.read_text().split()]
+    return [int(process) for process in started if b"record" in Path(f"/proc/{process}/cmdline").read_bytes()]
+
+
+def test_a_snapshot_of_an_ordinary_recording_is_refused_and_the_recording_goes_on(
+    recorder: RecorderProcess, tmp_path: Path
+) -> None:
+    recorder.start({"path": str(tmp_path / "bag")}).result(ANSWER)
+    with pytest.raises(SagsError, match="start_recording with snapshot_seconds"):
+        recorder.snapshot().result(ANSWER)
+    time.sleep(0.5)
+    summary = recorder.stop().result(ANSWER)
+    assert summary["messages"] == bag_info(tmp_path / "bag")["messages"] > 0
+
+
+def test_a_snapshot_of_nothing_is_refused(recorder: RecorderProcess) -> None:
+    with pytest.raises(SagsError, match="nothing is being recorded"):
+        recorder.snapshot().result(ANSWER)
+
+
+@pytest.mark.parametrize(
+    "args",
+    [{"path": "a\0b"}, {"path": "a", "topics": ["left/depth\0"]}],
+    ids=["path", "topic"],
+)
+def test_a_zero_character_is_refused(recorder: RecorderProcess, args: dict[str, object]) -> None:
+    with pytest.raises(SagsError, match="zero character"):
+        recorder.start(args).result(ANSWER)
+
+
+def test_a_recorder_that_does_not_answer_is_ended(
+    recorder: RecorderProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As on a disk that hangs: every request is answered, and the next recording begins."""
+    args = {"path": str(tmp_path / "ring"), "snapshot_seconds": 5}
+    recorder.start(args).result(ANSWER)
+    (process,) = recorders()
+    os.kill(process, signal.SIGSTOP)
+    monkeypatch.setattr(child, "SNAPSHOT_SECONDS", 0.2)
+    monkeypatch.setattr(child, "FINISH_SECONDS", 0.2)
+    with pytest.raises(SagsError, match="no snapshot came from the recorder"):
+        recorder.snapshot().result(ANSWER)
+    with pytest.raises(SagsError, match=r"did not finish in 0\.2 s.*sags bag recover"):
+        recorder.stop().result(ANSWER)
+    assert recorders() == []
+    recorder.start({"path": str(tmp_path / "bag")}).result(ANSWER)
+
+
+def test_a_node_ends_beside_a_recorder_that_does_not(
+    recorder: RecorderProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorder.start({"path": str(tmp_path / "bag")}).result(ANSWER)
+    (process,) = recorders()
+    os.kill(process, signal.SIGSTOP)
+    monkeypatch.setattr(child, "FINISH_SECONDS", 0.2)
+    recorder.close()
+    assert recorders() == []
+
+
+def test_a_recorder_that_does_not_begin_is_ended(
+    recorder: RecorderProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(child, "START_SECONDS", 0.01)
+    with pytest.raises(SagsError, match=r"did not begin in 0\.01 s"):
+        recorder.start({"path": str(tmp_path / "bag")}).result(ANSWER)
+    assert recorders() == []

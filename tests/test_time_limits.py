@@ -1,0 +1,105 @@
+"""No wait for another process, thread or device is without an end."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from command_line import FREE_PORTS
+
+from sags_node import processes
+from sags_node.benchmark import transport
+from sags_node.config import V4l2Source
+from sags_node.errors import SagsError
+from sags_node.messaging.publisher import Publisher
+from sags_node.node import Node
+from sags_node.session import open_session
+from sags_node.sources import v4l2
+from sags_node.sources.device import Picture
+
+pytestmark = pytest.mark.live
+
+SESSION = Path(__file__).parent.parent / "replay/phantom_pull"
+DEAF = """
+import signal, time
+signal.signal(signal.SIGTERM, signal.SIG_IGN)
+print("deaf", flush=True)
+time.sleep(99)
+"""
+
+
+def test_a_process_that_does_not_listen_is_killed() -> None:
+    with subprocess.Popen([sys.executable, "-c", DEAF], stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None and process.stdout.readline()
+        assert processes.end(process, grace=0.1)
+        assert process.returncode == -signal.SIGKILL
+
+
+def test_a_process_that_listens_is_not(tmp_path: Path) -> None:
+    with subprocess.Popen(["sleep", "99"]) as process:
+        assert processes.end(process, grace=30.0)
+        assert process.returncode == -signal.SIGTERM
+
+
+def test_a_node_whose_publishing_fails_ends_with_that_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Mapping waits until a result is taken where no frame may be lost; nobody takes it any more."""
+    taken = threading.Event()
+
+    def fail(*_: Any, **__: Any) -> None:
+        if taken.is_set():
+            time.sleep(1.0)  # the next result waits by now, and the one after it is computed
+            raise SagsError("the socket broke")
+        taken.set()
+
+    monkeypatch.setattr(Publisher, "publish_result", fail)
+    overrides = ["source.pace:=step", f"publish.run_dir:={tmp_path / 'run'}", *FREE_PORTS]
+    session = open_session(SESSION, [*overrides, "mapping.max_gaussians:=2000"])
+    node = Node(session.config, session.rig, session.source)
+    node.start()
+    try:
+        with pytest.raises(SagsError, match="the socket broke"):
+            assert node.wait(timeout=60), "it did not end"
+    finally:
+        node.stop()
+
+
+class HungCamera:
+    """A driver that does not come back."""
+
+    rate = 30.0
+    released = threading.Event()
+
+    def read(self, timeout: float) -> Picture | None:
+        self.released.wait(60)
+        return None
+
+    def close(self) -> None:
+        assert self.released.is_set(), "closed under its reader"
+
+
+def test_a_driver_that_does_not_come_back_does_not_keep_the_node(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(v4l2, "CLOSE_S", 0.1)
+    config = V4l2Source(left="/dev/left", right="/dev/right")
+    try:
+        with v4l2.StereoCameras(config, lambda path, config: HungCamera()) as source:
+            source.stop()
+            assert list(source) == []
+    finally:
+        HungCamera.released.set()
+    assert caplog.text.count("driver does not answer") == 2
+
+
+def test_a_receiver_that_never_comes_ends_the_transport_benchmark(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(transport, "STARTING", 0.01)
+    with pytest.raises(SagsError, match="did not start"):
+        transport.measure_transport(1)
