@@ -1,5 +1,9 @@
 """Errors a person can act on. The command line prints them as they are, without a traceback."""
 
+from __future__ import annotations
+
+from reprlib import Repr
+
 
 class SagsError(Exception):
     """Something failed: says what is wrong, where, and how to mend it. Exit code 1."""
@@ -11,3 +15,14 @@ class UsageError(SagsError):
     """The request itself is wrong (a key, a path, an option). Exit code 2."""
 
     exit_code = 2
+
+
+_LONGEST = 100  # characters of a value in a message
+_repr = Repr()
+_repr.maxstring = _repr.maxother = _LONGEST
+
+
+def brief(value: object) -> str:
+    """The `repr` of a value, cut for a message: what was given may be of any size."""
+    said = _repr.repr(value)
+    return said if len(said) <= _LONGEST else f"{said[: _LONGEST - 3]}..."

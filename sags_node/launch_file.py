@@ -9,16 +9,18 @@ from pathlib import Path
 from string import Template
 from typing import Any, get_args
 
-import yaml
 from pydantic import ValidationError
 
 from sags_node.config import LaunchConfig, Section, Source
-from sags_node.errors import UsageError
+from sags_node.errors import UsageError, brief
+from sags_node.files import open_file
+from sags_node.yaml_reader import parse_yaml, read_yaml
 
 _PATH_KEYS = (
     *("rig", "folder", "path", "video", "left", "right", "tools"),
     *("poses", "depth", "tracks", "key", "allow"),
 )
+MOST_MISTAKES = 10  # named at once
 DEFAULT_DATA = "../shared/data"
 BAG_SUFFIXES = (".mcap", ".db3", ".bag")
 SIDECAR_TYPE = "dvrk_data:video_sidecar@"
@@ -88,7 +90,7 @@ def _is_sidecar(file: Path) -> bool:
     """Whether this describes a video of dVRK's `record`; its type stands at the beginning or the end."""
     if file.suffix != ".json" or not file.is_file():
         return False
-    with file.open("rb") as opened:
+    with open_file(file) as opened:
         start = opened.read(SIDECAR_LOOK)
         opened.seek(max(0, file.stat().st_size - SIDECAR_LOOK))
         return SIDECAR_TYPE.encode() in start + opened.read(SIDECAR_LOOK)
@@ -110,15 +112,7 @@ def with_parameters(config: LaunchConfig, parameters: Mapping[str, Any]) -> Laun
 
 
 def _read_yaml(file: Path) -> dict[str, Any]:
-    try:
-        text = file.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise UsageError(f"cannot read launch file {file}: {reason}; check the path") from None
-    try:
-        tree = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise UsageError(f"{file} is not valid YAML: {' '.join(str(error).split())}") from None
+    tree = read_yaml(file, "launch file")
     if tree is None:
         return {}
     if not isinstance(tree, dict):
@@ -151,11 +145,7 @@ def _apply_override(tree: dict[str, Any], override: str) -> None:
     key, separator, text = override.partition(":=")
     if not separator or not key:
         raise UsageError(f"'{override}' is not an override; write key:=value, e.g. mapping.budget_ms:=33")
-    try:
-        value = yaml.safe_load(text)
-    except yaml.YAMLError:
-        raise UsageError(f"'{override}': the value is not valid YAML; quote it") from None
-    _set(tree, key, value, override)
+    _set(tree, key, parse_yaml(text, f"the value of {key}:="), override)
 
 
 def _set(tree: dict[str, Any], key: str, value: Any, said: str) -> None:
@@ -171,7 +161,8 @@ def _set(tree: dict[str, Any], key: str, value: Any, said: str) -> None:
 def _explain(error: ValidationError, name: str) -> str:
     """One line per mistake: where, what, and the nearest known key for an unknown one."""
     lines = []
-    for item in error.errors():
+    mistakes = error.errors()
+    for item in mistakes[:MOST_MISTAKES]:
         path = [str(part) for part in item["loc"]]
         where = ".".join(part for part in path if part not in _SOURCES)
         if item["type"] == "extra_forbidden":
@@ -180,10 +171,13 @@ def _explain(error: ValidationError, name: str) -> str:
             lines.append(f"{name}: {where} is missing; set it")
         elif item["type"] in ("union_tag_invalid", "union_tag_not_found"):
             kinds = ", ".join(repr(kind) for kind in _SOURCES)
-            lines.append(f"{name}: source.kind: should be one of {kinds} (got {item['input'].get('kind')!r})")
+            got = brief(item["input"].get("kind"))
+            lines.append(f"{name}: source.kind: should be one of {kinds} (got {got})")
         else:
             what = _PLAIN.get(item["type"], item["msg"])
-            lines.append(f"{name}: {where or 'launch file'}: {what} (got {item.get('input')!r})")
+            lines.append(f"{name}: {where or 'launch file'}: {what} (got {brief(item.get('input'))})")
+    if len(mistakes) > MOST_MISTAKES:
+        lines.append(f"{name}: and {len(mistakes) - MOST_MISTAKES} more")
     return "\n".join(lines)
 
 

@@ -6,7 +6,8 @@ from pathlib import Path
 ROOT = Path(__file__).parent.parent / "sags_node"
 LAYERS = [
     {"errors", "types", "latest", "processes"},
-    {"geometry", "config"},
+    {"files", "geometry", "config"},
+    {"yaml_reader"},
     {"launch_file"},
     {"calibration"},
     {"phantom"},

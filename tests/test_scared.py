@@ -400,7 +400,7 @@ SHEARED = np.eye(4) + np.eye(4, k=1)
         ),
         (
             replaced(POSE, bytes(2**20 + 1)),
-            r"frame_data000001\.json has 1048577 bytes, more than the 1048576",
+            r"frame_data000001\.json: it has 1048577 bytes, 1048576 at most",
         ),
     ],
     ids=lambda value: getattr(value, "__name__", ""),

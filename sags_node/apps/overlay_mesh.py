@@ -14,6 +14,7 @@ import numpy as np
 
 from sags_node.apps.overlay_scene import ObjectSpec
 from sags_node.errors import UsageError
+from sags_node.files import open_file
 from sags_node.types import F32, F64, I32
 
 MAX_FILE_BYTES = 64 << 20
@@ -82,7 +83,7 @@ def _check_file(file: Path) -> None:
         raise UsageError(f"cannot draw {file}: the name must end in one of {_KINDS}")
     try:
         size = file.stat().st_size
-        with file.open("rb") as opened:
+        with open_file(file) as opened:
             start = opened.read(HEADER_BYTES)
     except OSError as error:
         raise UsageError(f"cannot read {file}: {error.strerror}; check the path") from None

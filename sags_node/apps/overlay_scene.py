@@ -7,13 +7,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, get_args
 
-import yaml
 from pydantic import Field, ValidationError, model_validator
 
 from sags_node.config import Section
 from sags_node.errors import UsageError
+from sags_node.yaml_reader import read_yaml
 
-MAX_FILE_BYTES = 1 << 20
 KEY_DISTANCE = 64  # of 255: an object's colour nearer than this to the key colour could be taken for it
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
@@ -108,18 +107,7 @@ def read_scene(file: Path) -> SceneSpec:
         UsageError: it is missing or too large, is not YAML, or holds an unknown key or a wrong value.
     """
     try:
-        with file.open("rb") as opened:
-            content = opened.read(MAX_FILE_BYTES + 1)
-    except OSError as error:
-        raise UsageError(f"cannot read scene file {file}: {error.strerror}; check the path") from None
-    if len(content) > MAX_FILE_BYTES:
-        raise UsageError(f"{file} is larger than {MAX_FILE_BYTES >> 20} MiB: this is no scene file")
-    try:
-        tree = yaml.safe_load(content)
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise UsageError(f"{file} is not valid YAML: {' '.join(str(error).split())}") from None
-    try:
-        scene = SceneSpec.model_validate(tree)
+        scene = SceneSpec.model_validate(read_yaml(file, "scene file"))
     except ValidationError as error:
         raise UsageError(_explain(error, file)) from None
     folder = file.parent

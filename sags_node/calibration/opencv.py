@@ -14,7 +14,9 @@ import numpy as np
 
 from sags_node.calibration.rig import fit_distortion, rectify_eyes
 from sags_node.errors import UsageError
+from sags_node.files import open_file, read_file
 from sags_node.types import F64, Eye, StereoRig
+from sags_node.yaml_reader import check_dialect
 
 LARGEST_FILE = 2**20  # bytes
 LARGEST_MATRIX = 64  # numbers
@@ -36,7 +38,7 @@ def is_opencv(file: Path) -> bool:
     """Whether a file looks like one of `cv2.FileStorage`."""
     if file.suffix.lower() not in SUFFIXES or not file.is_file():
         return False
-    with file.open("rb") as opened:
+    with open_file(file) as opened:
         return opened.read(64).lstrip().startswith(STARTS)
 
 
@@ -94,9 +96,10 @@ def open_storage(file: Path) -> cv2.FileStorage:
         UsageError: it is missing, too large, or not written by OpenCV.
     """
     try:
-        if file.stat().st_size > LARGEST_FILE:
-            raise UsageError(f"{file} is too large for a calibration; check the path")
-        text = file.read_text(encoding="utf-8")
+        text = read_file(file, LARGEST_FILE).decode("utf-8")
+        directive, _, document = text.partition("\n")
+        if directive.startswith("%YAML"):  # of two keys OpenCV takes the first
+            check_dialect(document, str(file))
         return cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
     except OSError as error:
         raise UsageError(f"cannot read calibration {file}: {error.strerror}; check the path") from None

@@ -17,8 +17,10 @@ import numpy as np
 import yaml
 
 from sags_node.calibration.rig import LARGEST_SIDE, PLUMB_BOB, RATIONAL
-from sags_node.errors import UsageError
+from sags_node.errors import UsageError, brief
+from sags_node.files import open_file, read_file
 from sags_node.types import F64, Eye, StereoRig
+from sags_node.yaml_reader import parse_yaml
 
 LARGEST_FILE = 2**20  # bytes of one camera_info file
 LARGEST_READ = 2**24  # bytes taken from an archive at once
@@ -37,8 +39,7 @@ def read_folder(folder: Path) -> StereoRig:
     for side in SIDES:
         file = folder / side
         try:
-            with file.open("rb") as opened:
-                eyes.append(_read_eye(opened.read(LARGEST_FILE + 1), str(file)))
+            eyes.append(_read_eye(read_file(file, LARGEST_FILE), str(file)))
         except OSError as error:
             mend = "a rig is a folder with left.yaml and right.yaml"
             raise UsageError(f"cannot read calibration {file}: {error.strerror}; {mend}") from None
@@ -55,8 +56,7 @@ def read_one(file: Path, baseline: float) -> StereoRig:
         UsageError: the file is missing or malformed.
     """
     try:
-        with file.open("rb") as opened:
-            eye = _read_eye(opened.read(LARGEST_FILE + 1), str(file))
+        eye = _read_eye(read_file(file, LARGEST_FILE), str(file))
     except OSError as error:
         raise UsageError(f"cannot read calibration {file}: {error.strerror}; check the path") from None
     P = eye.P.copy()
@@ -72,7 +72,11 @@ def read_archive(archive: Path) -> StereoRig:
     """
     found: dict[str, Eye] = {}
     try:
-        with _Limited(archive) as unpacked, tarfile.open(fileobj=unpacked, mode="r:") as tar:
+        with (
+            open_file(archive) as packed,
+            _Limited(fileobj=packed) as unpacked,
+            tarfile.open(fileobj=unpacked, mode="r:") as tar,
+        ):
             for member in tar:
                 side = PurePosixPath(member.name).name
                 if side in SIDES and member.isfile() and side not in found:
@@ -152,10 +156,7 @@ def _read_eye(content: bytes, file: str) -> Eye:
 def _read_yaml(content: bytes, file: str) -> dict[str, Any]:
     if len(content) > LARGEST_FILE:
         raise UsageError(f"{file} is larger than {LARGEST_FILE} bytes: it is no calibration; check the path")
-    try:
-        tree = yaml.safe_load(content.decode("utf-8"))
-    except (UnicodeDecodeError, yaml.YAMLError) as error:
-        raise UsageError(f"{file} is not valid YAML: {' '.join(str(error).split())}") from None
+    tree = parse_yaml(content, file)
     if not isinstance(tree, dict):
         raise UsageError(f"{file} is not a ROS camera_info file: it holds no keys such as camera_matrix")
     return tree
@@ -170,7 +171,9 @@ def _field(tree: dict[str, Any], key: str, file: str) -> Any:
 def _side(tree: dict[str, Any], key: str, file: str) -> int:
     value = _field(tree, key, file)
     if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= LARGEST_SIDE:
-        raise UsageError(f"{file}: {key}: {value!r} is not a number of pixels between 1 and {LARGEST_SIDE}")
+        raise UsageError(
+            f"{file}: {key}: {brief(value)} is not a number of pixels between 1 and {LARGEST_SIDE}"
+        )
     return value
 
 
@@ -178,7 +181,7 @@ def _distortion(tree: dict[str, Any], file: str) -> F64:
     model = tree.get("distortion_model", "plumb_bob")
     if model not in MODELS:
         mend = f"calibrate with {' or '.join(map(repr, MODELS))}"
-        raise UsageError(f"{file}: distortion_model: {model!r} is not supported; {mend}")
+        raise UsageError(f"{file}: distortion_model: {brief(model)} is not supported; {mend}")
     coefficients = _numbers(tree, "distortion_coefficients", file)
     lengths = MODELS[model]
     if len(coefficients) not in lengths:
@@ -205,5 +208,5 @@ def _numbers(tree: dict[str, Any], key: str, file: str) -> F64:
     except (TypeError, ValueError):
         numbers = np.zeros(())
     if not isinstance(data, list) or numbers.ndim != 1:
-        raise UsageError(f"{file}: {key}.data: {data!r} is not a list of numbers")
+        raise UsageError(f"{file}: {key}.data: {brief(data)} is not a list of numbers")
     return numbers

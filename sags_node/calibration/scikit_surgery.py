@@ -12,6 +12,7 @@ import numpy as np
 
 from sags_node.calibration.rig import fit_distortion, rectify_eyes
 from sags_node.errors import UsageError
+from sags_node.files import read_file
 from sags_node.types import F64, StereoRig
 
 MILLIMETRE = 1e-3
@@ -63,9 +64,8 @@ def _matrix(folder: Path, what: str, lengths: tuple[int, ...]) -> F64:
         raise UsageError(f"{folder}: one file {PATTERNS[what]} is needed, found: {found}")
     file = files[0]
     try:
-        if file.stat().st_size > LARGEST_FILE:
-            raise UsageError(f"{file} is too large for a matrix; check the folder")
-        numbers = np.array(file.read_text(encoding="utf-8").replace(",", " ").split(), np.float64)
+        text = read_file(file, LARGEST_FILE).decode("utf-8")
+        numbers = np.array(text.replace(",", " ").split(), np.float64)
     except OSError as error:
         raise UsageError(f"cannot read calibration {file}: {error.strerror}; check the path") from None
     except ValueError:  # also of what is not UTF-8

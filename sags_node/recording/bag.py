@@ -12,16 +12,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
-import yaml
 import zstandard
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
 from sags_node.errors import SagsError, UsageError
+from sags_node.files import open_file
 from sags_node.launch_file import BAG_SUFFIXES as SUFFIXES
 from sags_node.messaging import cdr
 from sags_node.recording import mcap_file, rosbag1_check
 from sags_node.recording.mcap_file import MAGIC, MAX_RECORD_BYTES, DamagedError, Entry, Head, Inner
+from sags_node.yaml_reader import read_yaml
 
 MAX_METADATA_BYTES = 4 << 20
 METADATA = "metadata.yaml"
@@ -103,14 +104,7 @@ def _number(stem: str) -> int:
 
 
 def _metadata(file: Path) -> dict[str, Any]:
-    try:
-        if file.stat().st_size > MAX_METADATA_BYTES:
-            raise UsageError(f"{file} is too large to be the description of a bag")
-        tree = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UsageError(f"cannot read {file}: {error.strerror}") from None
-    except (UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
-        raise UsageError(f"{file} is not valid YAML: {' '.join(str(error).split())[:200]}") from None
+    tree = read_yaml(file, "description of a bag", MAX_METADATA_BYTES)
     information = tree.get("rosbag2_bagfile_information") if isinstance(tree, dict) else None
     if not isinstance(information, dict):
         raise UsageError(f"{file} has no rosbag2_bagfile_information; it does not describe a bag")
@@ -137,7 +131,7 @@ def _explained(file: Path) -> Iterator[None]:
 def _read_mcap(file: Path, topics: Collection[str] | None, start_ns: int) -> Iterator[BagMessage]:
     size = file.stat().st_size
     channels = Channels()
-    with file.open("rb") as opened:
+    with open_file(file) as opened:
         if opened.read(len(MAGIC)) != MAGIC:
             raise DamagedError(0, "it does not begin as an MCAP file")
         for head in mcap_file.heads(opened, size, len(MAGIC)):

@@ -13,6 +13,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
 from sags_node.errors import SagsError, UsageError
+from sags_node.files import open_file
 from sags_node.recording import mcap_file
 from sags_node.recording.bag import Channels, mcap_files, read_messages, records_of, storage_files
 from sags_node.recording.bag_writer import BagWriter
@@ -102,7 +103,7 @@ def _recover_file(path: Path, writer: _Writer, done: Recovery) -> None:
     if size == 0:
         done.unclosed_files += 1
         return
-    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as mapped:
+    with open_file(path) as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as mapped:
         channels = Channels()
         for record in _summary(file, size):
             channels.add(record)

@@ -13,6 +13,7 @@ from typing import BinaryIO
 
 import lz4.frame
 
+from sags_node.files import open_file
 from sags_node.recording.mcap_file import MAX_CHUNK_BYTES, MAX_RECORD_BYTES, DamagedError
 
 MAGIC = b"#ROSBAG V2.0\n"
@@ -34,7 +35,7 @@ def chunk_positions(file: Path) -> frozenset[int]:
 @lru_cache(maxsize=1)  # a bag is opened again for every loop, and unpacking all of it takes seconds
 def _chunk_positions(file: Path, size: int, changed: int) -> frozenset[int]:
     positions = set()
-    with file.open("rb") as bag:
+    with open_file(file) as bag:
         if bag.read(len(MAGIC)) != MAGIC:
             raise DamagedError(0, "it does not begin as a ROS 1 bag of version 2.0")
         while (position := bag.tell()) < size:

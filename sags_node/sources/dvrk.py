@@ -15,6 +15,7 @@ import numpy as np
 
 from sags_node.config import DvrkSource
 from sags_node.errors import UsageError
+from sags_node.files import read_file
 from sags_node.launch_file import SIDECAR_TYPE
 from sags_node.sources.pictures import RawPair
 from sags_node.sources.stamps import nearest
@@ -143,9 +144,7 @@ def read_sidecar(file: Path) -> Sidecar:
         UsageError: it is missing, of another type or version, or damaged.
     """
     try:
-        if file.stat().st_size > MAX_SIDECAR_BYTES:
-            raise UsageError(f"{file} is too large to be the sidecar of a video")
-        sidecar = msgspec.json.decode(file.read_bytes(), type=Sidecar)
+        sidecar = msgspec.json.decode(read_file(file, MAX_SIDECAR_BYTES), type=Sidecar)
     except OSError as error:
         raise UsageError(f"cannot read sidecar {file}: {error.strerror}; check the path") from None
     except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Protocol
 
 from sags_node.errors import SagsError, UsageError
+from sags_node.files import open_file, read_file
 
 
 class NumberedFiles(Protocol):
@@ -48,8 +49,7 @@ class _Unpacked:
         if file is None:
             return None
         try:
-            _check_size(file.stat().st_size, self._largest, str(file))
-            return file.read_bytes()
+            return read_file(file, self._largest)
         except OSError as error:
             raise SagsError(f"cannot read {file}: {error.strerror}") from None
 
@@ -66,7 +66,8 @@ class _Packed:
         self._largest = largest
         self._members: dict[int | None, tarfile.TarInfo] = {}
         try:
-            self._tar = tarfile.open(archive, "r:gz")
+            self._file = open_file(archive)
+            self._tar = tarfile.open(fileobj=self._file, mode="r:gz")
         except (tarfile.TarError, OSError, EOFError, zlib.error) as error:
             raise UsageError(
                 f"{archive} is not a readable tar.gz: {error}; unpack or download it again"
@@ -90,6 +91,7 @@ class _Packed:
 
     def close(self) -> None:
         self._tar.close()
+        self._file.close()
 
 
 def _number(name: str, suffix: str) -> int | None:

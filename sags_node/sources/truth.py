@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from sags_node.config import ReferenceConfig
 from sags_node.errors import SagsError, UsageError
+from sags_node.files import open_file
 from sags_node.sources.pictures import list_pictures, read_picture
 from sags_node.types import F32, F64, Reference
 
@@ -91,13 +92,13 @@ def load_array(file: Path, key: str, shape: tuple[int | None, ...]) -> NDArray[n
         UsageError: the file is missing or damaged, or the array is missing or of another shape or type.
     """
     try:
-        with zipfile.ZipFile(file) as archive:
+        with open_file(file) as opened, zipfile.ZipFile(opened) as archive:
             member = archive.getinfo(f"{key}.npy")
             with archive.open(member) as stream:
                 _check_header(stream, f"{file}: '{key}'", shape, member.file_size)
-        with np.load(file, allow_pickle=False) as arrays:
-            array: NDArray[np.generic] = arrays[key]
-            return array
+            with archive.open(member) as stream:
+                array: NDArray[np.generic] = np.load(stream, allow_pickle=False)
+                return array
     except FileNotFoundError:
         raise UsageError(f"{file} does not exist; check the path") from None
     except KeyError:
@@ -113,10 +114,11 @@ def load_npy(file: Path, shape: tuple[int | None, ...]) -> NDArray[np.generic]:
         UsageError: the file is missing or damaged, or the array is of another shape or type.
     """
     try:
-        with file.open("rb") as stream:
+        with open_file(file) as stream:
             _check_header(stream, str(file), shape, file.stat().st_size)
-        array: NDArray[np.generic] = np.load(file, allow_pickle=False)
-        return array
+            stream.seek(0)
+            array: NDArray[np.generic] = np.load(stream, allow_pickle=False)
+            return array
     except FileNotFoundError:
         raise UsageError(f"{file} does not exist; check the path") from None
     except (KeyError, OSError, ValueError, EOFError) as error:

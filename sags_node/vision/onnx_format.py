@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import yaml
 from pydantic import ValidationError
 
 from sags_node.config import NetworkFormat, OnnxConfig
 from sags_node.errors import UsageError
+from sags_node.yaml_reader import parse_yaml, read_yaml
 
 LARGEST_SIDECAR = 2**16  # bytes
 KEYS = tuple(NetworkFormat.model_fields)
@@ -35,12 +35,7 @@ def read_format(config: OnnxConfig, metadata: Mapping[str, str]) -> NetworkForma
 
 
 def _read_sidecar(file: Path) -> dict[str, Any]:
-    if file.stat().st_size > LARGEST_SIDECAR:
-        raise UsageError(f"{file} is too large to describe a network; remove it or name it otherwise")
-    try:
-        tree = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise UsageError(f"{file} is not valid YAML: {' '.join(str(error).split())}") from None
+    tree = read_yaml(file, "description of a network", LARGEST_SIDECAR)
     if not isinstance(tree, dict):
         raise UsageError(f"{file}: a map of keys is expected: {', '.join(KEYS)}")
     return tree
@@ -50,11 +45,10 @@ def _validated(tree: Mapping[str, Any], where: str) -> dict[str, Any]:
     """The values of a map that are said, typed; text is read as YAML, since metadata holds only text."""
     try:
         parsed = {
-            key: yaml.safe_load(value) if isinstance(value, str) else value for key, value in tree.items()
+            key: parse_yaml(value, f"{where}: {key}") if isinstance(value, str) else value
+            for key, value in tree.items()
         }
         checked = NetworkFormat.model_validate(parsed)
-    except yaml.YAMLError:
-        raise UsageError(f"{where}: a value is not valid YAML; quote it") from None
     except ValidationError as error:
         item = error.errors()[0]
         key = str(item["loc"][0]) if item["loc"] else "format"

@@ -1,0 +1,145 @@
+"""The one reader of YAML that others wrote.
+
+It gives what `yaml.safe_load` gives, and refuses what that takes in silence: keys that are given twice;
+aliases that contain themselves or unfold to far more than was written; zero characters, which no file name
+can hold.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+from yaml.constructor import ConstructorError
+
+from sags_node.errors import UsageError, brief
+from sags_node.files import read_file
+
+LARGEST_FILE = 1 << 20  # bytes
+MOST_VALUES = 100_000  # with all aliases unfolded
+LONGEST = 200  # characters of what PyYAML says
+
+
+def read_yaml(file: Path, what: str, largest: int = LARGEST_FILE) -> Any:
+    """The content of a file.
+
+    Args:
+        what: the file is meant to be, for the message, e.g. "launch file".
+        largest: bytes it may have.
+
+    Raises:
+        UsageError: it is missing, no plain file or too large, or as `parse_yaml`.
+    """
+    try:
+        content = read_file(file, largest)
+    except OSError as error:
+        raise UsageError(f"cannot read {what} {file}: {error.strerror}; check the path") from None
+    return parse_yaml(content, str(file))
+
+
+def parse_yaml(content: bytes | str, where: str) -> Any:
+    """The values of one document; None for an empty one.
+
+    Args:
+        where: it stands, for the message.
+
+    Raises:
+        UsageError: it is not UTF-8 or not YAML, or is one of the things that this module refuses.
+    """
+    try:
+        loader = yaml.SafeLoader(content if isinstance(content, str) else content.decode("utf-8"))
+        document = loader.get_single_node()
+        if document is None:
+            return None
+        _Check(loader).size(document)
+        return _unfolded(loader.construct_document(document))
+    except UnicodeDecodeError:
+        problem = "it is not UTF-8 text"
+    except RecursionError:
+        problem = "it is nested too deeply"
+    except yaml.YAMLError as error:
+        problem = _in_words(error)
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
+        # PyYAML lets these through: a date that is none, a number of too many digits, `!!int x`.
+        problem = f"a value is not what it looks like: {error}"[:LONGEST]
+    raise UsageError(f"{where} is not valid YAML: {problem}") from None
+
+
+def check_dialect(text: str, where: str) -> None:
+    """Refuse what this module refuses, of text that is read elsewhere and need not be proper YAML.
+
+    Raises:
+        UsageError: a key is given twice, and so on.
+    """
+    try:
+        loader = yaml.SafeLoader(text)
+        document = loader.get_single_node()
+        if document is not None:
+            _Check(loader).size(document)
+    except _RefusedError as error:
+        raise UsageError(f"{where} is not valid YAML: {_in_words(error)}") from None
+    except (yaml.YAMLError, RecursionError):
+        return  # its own reader says what it thinks of it
+
+
+class _RefusedError(ConstructorError):
+    """What PyYAML would take."""
+
+    def __init__(self, node: yaml.Node, problem: str) -> None:
+        super().__init__(None, None, problem, node.start_mark)
+
+
+class _Check:
+    """Walks through a document as it was written, before any value is made of it."""
+
+    def __init__(self, loader: yaml.SafeLoader) -> None:
+        self._loader = loader
+        self._sizes: dict[int, int] = {}  # by node; 0: this walk is inside it
+
+    def size(self, node: yaml.Node) -> int:
+        """How many values a node holds with its aliases unfolded."""
+        known = self._sizes.get(id(node))
+        if known == 0:
+            raise _RefusedError(node, "it contains itself, through an alias")
+        if known is not None:
+            return known
+        self._sizes[id(node)] = 0
+        size = 1
+        if isinstance(node, yaml.MappingNode):
+            self._refuse_twins(node)
+            size += sum(self.size(key) + self.size(value) for key, value in node.value)
+        elif isinstance(node, yaml.SequenceNode):
+            size += sum(map(self.size, node.value))
+        elif "\0" in node.value:
+            raise _RefusedError(node, "a text holds a zero character")
+        if size > MOST_VALUES:
+            raise _RefusedError(node, f"it holds more than {MOST_VALUES} values, with its aliases unfolded")
+        self._sizes[id(node)] = size
+        return size
+
+    def _refuse_twins(self, node: yaml.MappingNode) -> None:
+        lines: dict[Any, int] = {}
+        for key, _ in node.value:
+            if not isinstance(key, yaml.ScalarNode) or key.tag == "tag:yaml.org,2002:merge":
+                continue
+            name, line = self._loader.construct_object(key), key.start_mark.line + 1
+            if name in lines:
+                said = f"the key {brief(name)} is given twice, first in line {lines[name]}; keep one"
+                raise _RefusedError(key, said)
+            lines[name] = line
+
+
+def _unfolded(value: Any) -> Any:
+    """Without parts that two places share: to change one would change the other."""
+    if isinstance(value, dict):
+        return {key: _unfolded(part) for key, part in value.items()}
+    return list(map(_unfolded, value)) if isinstance(value, list) else value
+
+
+def _in_words(error: yaml.YAMLError) -> str:
+    """One line of what PyYAML says in several."""
+    if isinstance(error, yaml.MarkedYAMLError):
+        line = "" if error.problem_mark is None else f"line {error.problem_mark.line + 1}: "
+        return line + (error.problem or error.context or "it cannot be read")[:LONGEST]
+    return " ".join(str(error).split())[:LONGEST]
