@@ -5,8 +5,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).parent.parent / "sags_node"
 LAYERS = [
-    {"errors", "types", "latest", "processes"},
-    {"files", "geometry", "config"},
+    {"errors", "types", "latest", "processes", "native_output"},
+    {"files", "geometry", "config", "picture_file"},
     {"yaml_reader"},
     {"launch_file"},
     {"calibration"},

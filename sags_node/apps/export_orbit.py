@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import cv2
 import numpy as np
 
 from sags_node.apps.export_scene import Advance, Scene
+from sags_node.apps.video_file import VideoFile
 from sags_node.engine.rasterize import make_rasterizer, to_view
 from sags_node.errors import SagsError
 from sags_node.types import U8, Camera
@@ -48,14 +50,8 @@ def write_orbit(path: Path, scene: Scene, degrees: float, seconds: float, advanc
     depth = draw(camera)[1]
     if not (depth > 0).any():
         raise SagsError("the left camera sees nothing of the model; export another moment")
-    code = cv2.VideoWriter.fourcc(*"mp4v")
-    video = cv2.VideoWriter(str(path), code, RATE, (camera.width, camera.height))
-    try:
-        if not video.isOpened():
-            raise SagsError("the video cannot be written; is the disk full?")
+    with closing(VideoFile(path, RATE, (camera.width, camera.height))) as video:
         for done, eye in enumerate(orbit(camera, float(np.median(depth[depth > 0])), degrees, count)):
-            video.write(cv2.cvtColor(draw(eye)[0], cv2.COLOR_RGB2BGR))
+            video.add(draw(eye)[0])
             advance(done + 1, count, "drawing")
-    finally:
-        video.release()
     return count

@@ -15,6 +15,7 @@ import numpy as np
 from sags_node.apps.overlay_scene import ObjectSpec
 from sags_node.errors import UsageError
 from sags_node.files import open_file
+from sags_node.native_output import native_output
 from sags_node.types import F32, F64, I32
 
 MAX_FILE_BYTES = 64 << 20
@@ -57,12 +58,15 @@ def _load(spec: ObjectSpec, file: Path) -> Mesh:
 
     points: F64 = np.zeros((0, 3))
     triangles: I32 = np.zeros((0, 3), np.int32)
-    with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
+    verbosity = open3d.utility.VerbosityLevel.Error
+    with open3d.utility.VerbosityContextManager(verbosity), native_output() as said:
         if file.suffix.lower() in _MESHES:
             read = open3d.io.read_triangle_mesh(file)
             points, triangles = np.asarray(read.vertices), np.asarray(read.triangles, np.int32)
         if len(triangles) == 0 and file.suffix.lower() in _POINTS:
             points = np.asarray(open3d.io.read_point_cloud(file).points)
+    if said:  # what it read until then, or never read, would be drawn
+        raise UsageError(f"{file} is damaged: {said[0]}; open it in a mesh viewer")
     what = "triangles" if len(triangles) or file.suffix.lower() not in _POINTS else "points"
     count, most = (len(triangles), MAX_TRIANGLES) if what == "triangles" else (len(points), MAX_POINTS)
     if count == 0:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import cv2
 
+from sags_node.apps.video_file import VideoFile
 from sags_node.errors import SagsError, UsageError
 from sags_node.types import U8
 
@@ -27,7 +27,7 @@ class Output:
             raise UsageError(f"cannot save {file}: there is no folder {file.parent}")
         self._file = file
         self._still: U8 | None = None
-        self._video: Any = None
+        self._video: VideoFile | None = None
         self._shown = 0
         self.saved: str | None = None  # what has been written
 
@@ -47,12 +47,11 @@ class Output:
         if self._shown < PICTURES_BEFORE_VIDEO:
             return
         if self._video is None:
-            size = (picture.shape[1], picture.shape[0])
-            code = cv2.VideoWriter.fourcc(*"mp4v")
-            self._video = cv2.VideoWriter(str(self._file), code, 1 / period, size)
-            if not self._video.isOpened():
-                raise SagsError(f"cannot write {self._file}; check the folder's rights and the disk")
-        self._video.write(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+            try:
+                self._video = VideoFile(self._file, 1 / period, (picture.shape[1], picture.shape[0]))
+            except SagsError as error:
+                raise SagsError(f"{self._file}: {error}") from None
+        self._video.add(picture)
 
     def close(self) -> None:
         """Finish the file.
@@ -61,7 +60,7 @@ class Output:
             SagsError: it cannot be written.
         """
         if self._video is not None:
-            self._video.release()
+            self._video.close()
             self.saved = str(self._file)
         if self._still is not None:
             if not cv2.imwrite(str(self._file), cv2.cvtColor(self._still, cv2.COLOR_RGB2BGR)):

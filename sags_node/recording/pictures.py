@@ -12,12 +12,11 @@ from sags_node.calibration import fit_distortion
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import cdr
 from sags_node.messaging.topics import CAMERA_INFO, IMAGE
+from sags_node.picture_file import decode
 from sags_node.types import U8, Eye
 
 IMAGE_TYPES = (IMAGE, cdr.COMPRESSED)
 LARGEST_SIDE = 16384  # px
-MAX_PIXELS = 64 << 20
-_PNG_START = b"\x89PNG\r\n\x1a\n"
 _STAMP = struct.Struct("<iI")
 _BIG_STAMP = struct.Struct(">iI")
 
@@ -105,33 +104,15 @@ def _raw_to_rgb(message: Any, where: str) -> U8:
 
 
 def decode_file(file: U8, where: str) -> U8:
-    """A JPEG or PNG as OpenCV decodes it: [H, W] or BGR(A) [H, W, C].
+    """A picture file in a message as OpenCV decodes it: [H, W] or BGR(A) [H, W, C].
 
     Raises:
-        SagsError: it is none, larger than `MAX_PIXELS`, or not of 8 bit.
+        SagsError: it is none, damaged, too large, or not of 8 bit.
     """
-    size = _file_size(file[: 1 << 16].tobytes())
-    if size is None or not 0 < size[0] * size[1] <= MAX_PIXELS:
-        raise SagsError(f"{where}: a compressed picture is no JPEG or PNG, or too large (64 Mpx)")
-    picture: U8 | None = cv2.imdecode(file, cv2.IMREAD_UNCHANGED)
-    if picture is None or picture.dtype != np.uint8:
-        raise SagsError(f"{where}: a compressed picture is damaged or not of 8 bit")
-    return picture
-
-
-def _file_size(start: bytes) -> tuple[int, int] | None:
-    """Height and width that the head of a JPEG or PNG claims, before anything is decoded."""
-    if start.startswith(_PNG_START) and len(start) >= 24:
-        width, height = struct.unpack_from(">II", start, 16)
-        return height, width
-    at = 2 if start.startswith(b"\xff\xd8") else len(start)
-    while at + 9 <= len(start) and start[at] == 0xFF:
-        marker, length = start[at + 1], int.from_bytes(start[at + 2 : at + 4], "big")
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # start of frame
-            height, width = struct.unpack_from(">HH", start, at + 5)
-            return height, width
-        at += 2 + length
-    return None
+    decoded = decode(file, cv2.IMREAD_UNCHANGED, f"{where}: a compressed picture", "record it again")
+    if decoded.dtype != np.uint8:
+        raise SagsError(f"{where}: a compressed picture is {decoded.dtype}; what is read is 8 bit")
+    return decoded
 
 
 def read_eye(data: bytes | memoryview, where: str) -> Eye:

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import cv2
-import numpy as np
 
 from sags_node.errors import SagsError, UsageError
+from sags_node.files import read_file
+from sags_node.picture_file import decode
 from sags_node.types import F32, F64, U8, Bool, Reference
 
 log = logging.getLogger(__name__)
@@ -18,6 +19,8 @@ log = logging.getLogger(__name__)
 PICTURE_SUFFIXES = {".jpg", ".jpeg", ".png"}
 JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
 PNG_START, PNG_END = b"\x89PNG", b"IEND\xaeB`\x82"
+LARGEST_FILE = 256 << 20  # bytes: more than the largest picture that is decoded can need
+MEND = "replace or remove the pair"
 LONGEST_PADDING = 512  # bytes some cameras write after the end of a picture
 
 
@@ -101,12 +104,15 @@ def list_pictures(folder: Path) -> list[Path]:
     """JPEG and PNG files of a folder in order of their names, numbers compared as numbers.
 
     Raises:
-        UsageError: the folder is missing or holds no picture.
+        UsageError: the folder is missing or holds no picture, or what only has a picture's name.
     """
     if not folder.is_dir():
         reason = "is not a folder" if folder.exists() else "does not exist"
         raise UsageError(f"picture folder {folder} {reason}; check the path, or SAGS_DATA if it is used")
     pictures = [file for file in folder.iterdir() if file.suffix.lower() in PICTURE_SUFFIXES]
+    for file in pictures:
+        if file.exists() and not file.is_file():
+            raise UsageError(f"{file} has a picture's name but is no file; remove it from the folder")
     if not pictures:
         raise UsageError(f"picture folder {folder} holds no .jpg or .png file")
     return sorted(pictures, key=lambda file: (_natural(file.stem), file.name))
@@ -118,17 +124,15 @@ def read_picture(file: Path, flags: int = cv2.IMREAD_COLOR) -> U8:
     OpenCV fills what is missing of a cut-off picture with grey and says nothing, so its end is checked first.
 
     Raises:
-        SagsError: the file is missing, cut off or damaged.
+        SagsError: the file is missing, no plain file, cut off, damaged or too large.
     """
     try:
-        data = file.read_bytes()
+        data = read_file(file, LARGEST_FILE)
     except OSError as error:
         raise SagsError(f"cannot read picture {file}: {error.strerror}") from None
-    picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if _is_whole(data) else None
-    if picture is None:
-        raise SagsError(
-            f"picture {file} is damaged or cut off ({len(data)} bytes); replace or remove the pair"
-        )
+    if not _is_whole(data):
+        raise SagsError(f"picture {file} is damaged or cut off ({len(data)} bytes); {MEND}")
+    picture = decode(data, flags, f"picture {file}", MEND)
     decoded: U8 = cv2.cvtColor(picture, cv2.COLOR_BGR2RGB) if flags == cv2.IMREAD_COLOR else picture
     return decoded
 

@@ -19,6 +19,7 @@ from sags_node import geometry
 from sags_node.calibration import check_intrinsics, rectified_rig, refuse_errors
 from sags_node.calibration.opencv import numbers_in, open_storage
 from sags_node.errors import SagsError, UsageError
+from sags_node.picture_file import decode
 from sags_node.sources.numbered import NumberedFiles, open_numbered
 from sags_node.sources.pictures import FolderPairs, RawPair
 from sags_node.sources.videos import PanePairs, Video
@@ -112,10 +113,11 @@ class ScaredPairs:
             return None
         width, height = self._rectification.size
         # OpenCV takes the three channels for R, G, B and gives B, G, R.
-        points = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-        if points is None or points.dtype != np.float32 or points.shape != (2 * height, width, 3):
+        name = f"data/scene_points of frame {index}"
+        points = decode(data, cv2.IMREAD_UNCHANGED, name, "unpack or download scene_points.tar.gz again")
+        if points.dtype != np.float32 or points.shape != (2 * height, width, 3):
             raise SagsError(
-                f"data/scene_points of frame {index} is no whole float TIFF of {width}x{2 * height} px and "
+                f"{name} is no whole float TIFF of {width}x{2 * height} px and "
                 "3 channels; unpack or download scene_points.tar.gz again"
             )
         return Reference(self._rectified_depth(points[:height, :, ::-1]), "structured_light")

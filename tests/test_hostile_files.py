@@ -1,0 +1,208 @@
+"""Files that claim too much, are no files, or make a C library talk: one message of ours, nothing else."""
+
+from __future__ import annotations
+
+import os
+import socket
+import struct
+import threading
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numbered_pictures import HEIGHT, WIDTH, picture, recordings
+
+from sags_node import config as cfg
+from sags_node.apps.overlay_mesh import mesh_of
+from sags_node.apps.overlay_save import Output
+from sags_node.apps.overlay_scene import ObjectSpec
+from sags_node.errors import SagsError, UsageError
+from sags_node.files import open_file
+from sags_node.native_output import native_output
+from sags_node.picture_file import claimed_size
+from sags_node.recording.pictures import decode_file
+from sags_node.sources.numbered import open_numbered
+from sags_node.sources.pictures import read_picture
+from sags_node.sources.source import open_source
+
+PIXELS = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
+ROWS = b"".join(b"\0" + row.tobytes() for row in PIXELS)
+
+
+def chunk(kind: bytes, content: bytes) -> bytes:
+    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+
+def png(width: int = WIDTH, height: int = HEIGHT, data: bytes | None = None, extra: bytes = b"") -> bytes:
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))
+    body = chunk(b"IDAT", zlib.compress(ROWS) if data is None else data)
+    return b"\x89PNG\r\n\x1a\n" + header + extra + body + chunk(b"IEND", b"")
+
+
+def flipped(file: bytes, at: int) -> bytes:
+    return file[:at] + bytes([file[at] ^ 255]) + file[at + 1 :]
+
+
+def jpeg(width: int = WIDTH, height: int = HEIGHT) -> bytes:
+    file = bytearray(cv2.imencode(".jpg", PIXELS)[1].tobytes())
+    frame = file.find(b"\xff\xc0")
+    file[frame + 5 : frame + 9] = struct.pack(">HH", height, width)
+    return bytes(file)
+
+
+BAD = {
+    "huge.png": (png(60_000, 60_000), "says that it is 60000x60000 px; at most 64 Mpx are read"),
+    "large.png": (png(30_000, 30_000), "says that it is 30000x30000 px"),
+    "flat.png": (png(0, 10), "says that it is 0x10 px"),
+    "huge.jpg": (jpeg(60_000, 60_000), "says that it is 60000x60000 px"),
+    "short.png": (png(data=zlib.compress(ROWS[:500])), "libpng error: Not enough image data"),
+    "garbage.png": (png(data=b"garbage" * 30), "libpng error: IDAT: incorrect header check"),
+    "flipped.png": (flipped(png(), 80), "libpng error: "),
+    "headless.jpg": (b"\xff\xd8\xff\xd9", "is no JPEG, PNG or TIFF, or is damaged (4 bytes)"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_bad_picture_is_one_message_that_names_it(
+    name: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    content, said = BAD[name]
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(SagsError) as caught:
+        read_picture(tmp_path / name)
+    assert str(caught.value).startswith(f"picture {tmp_path / name} ") and said in str(caught.value)
+    assert str(caught.value).endswith("replace or remove the pair")
+    with pytest.raises(SagsError, match="bag: a compressed picture"):
+        decode_file(np.frombuffer(content, np.uint8), "bag")
+    assert capfd.readouterr() == ("", "")
+
+
+def test_what_a_decoder_says_of_a_picture_that_it_can_read_is_logged_once(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    for name, content in (
+        ("1.png", png(extra=chunk(b"iCCP", b"x\0\0garbage"))),
+        ("2.png", png(extra=chunk(b"iCCP", b"y\0\0garbage"))),
+        ("3.jpg", jpeg()[:-2] + b"padding\xff\xd9"),
+    ):
+        (tmp_path / name).write_bytes(content)
+        assert read_picture(tmp_path / name).shape == PIXELS.shape
+    assert "1.png: libpng warning: iCCP" in caplog.text and "2.png" not in caplog.text
+    assert "3.jpg: Corrupt JPEG data: " in caplog.text
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".tiff"])
+@pytest.mark.parametrize("size", [(WIDTH, HEIGHT), (1, 700), (1031, 3)])
+def test_sizes_are_read_as_opencv_reads_them(suffix: str, size: tuple[int, int]) -> None:
+    file = cv2.imencode(suffix, np.zeros((size[1], size[0], 3), np.uint8))[1]
+    assert claimed_size(file.data) == size
+    for length in range(60):
+        claimed_size(file.data[:length])  # no exception
+
+
+def test_progressive_jpegs_with_long_profiles_have_a_size() -> None:
+    file = cv2.imencode(".jpg", PIXELS, [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
+    profile = b"\xff\xe2" + struct.pack(">H", 65535) + bytes(65533)
+    assert claimed_size(memoryview(file[:2] + 3 * profile + file[2:])) == (WIDTH, HEIGHT)
+
+
+# ---- what is no file -------------------------------------------------------------------------------------
+
+
+def pipe(path: Path) -> None:
+    os.mkfifo(path)
+
+
+def bound_socket(path: Path) -> None:
+    with socket.socket(socket.AF_UNIX) as made:
+        made.bind(os.path.relpath(path))
+
+
+def device(path: Path) -> None:
+    path.symlink_to("/dev/zero")
+
+
+Maker = Callable[[Path], None]
+NO_FILES: list[Maker] = [pipe, bound_socket, device, Path.mkdir]
+
+
+@pytest.mark.parametrize("make", NO_FILES, ids=["pipe", "socket", "device", "folder"])
+def test_what_is_no_file_is_not_waited_for(make: Maker, tmp_path: Path) -> None:
+    recordings(tmp_path)
+    make(tmp_path / "r/000a.png")
+    with pytest.raises(UsageError, match=r"r/000a\.png has a picture's name but is no file; remove it"):
+        open_source(cfg.FoldersSource(left=tmp_path / "l", right=tmp_path / "r"))
+    with pytest.raises(SagsError, match=r"cannot read picture .*000a\.png: it is a"):
+        read_picture(tmp_path / "r/000a.png")
+    make(tmp_path / "poses.npz")
+    with pytest.raises(UsageError, match=r"poses\.npz is not a readable npz file: .*it is a"):
+        (tmp_path / "r/000a.png").rename(tmp_path / "aside")
+        open_source(
+            cfg.FoldersSource(left=tmp_path / "l", right=tmp_path / "r", poses=tmp_path / "poses.npz")
+        )
+    (tmp_path / "numbered").mkdir()
+    make(tmp_path / "numbered/0.json")
+    files = open_numbered(tmp_path / "numbered", ".json", 100)
+    assert files is not None
+    with pytest.raises(SagsError, match=r"0\.json: it is a"):
+        files.read(0)
+
+
+def test_a_link_to_a_file_is_one(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"content")
+    (tmp_path / "link").symlink_to("file")
+    with open_file(tmp_path / "link") as opened:
+        assert opened.read() == b"content"
+
+
+# ---- libraries that talk ---------------------------------------------------------------------------------
+
+
+def test_a_damaged_mesh_is_refused_in_one_message(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """What the reader had not read was drawn where memory happened to say."""
+    file = tmp_path / "mesh.ply"
+    header = "ply\nformat ascii 1.0\nelement vertex 3\n" + "".join(f"property float {a}\n" for a in "xyz")
+    faces = "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    file.write_text(header + faces + "0 0 0\n0.01 0 nonsense\n")
+    with pytest.raises(UsageError, match=r"mesh\.ply is damaged: RPly: Error reading 'z'"):
+        mesh_of(ObjectSpec(file=file))
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_video_that_cannot_be_written_is_one_message(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("OPENCV_FFMPEG_LOGLEVEL", raising=False)
+    output = Output(tmp_path / "video.mp4")
+    with pytest.raises(SagsError, match=r"video\.mp4: the video cannot be written"):
+        for _ in range(10):
+            output.add(np.zeros((8000, 9000, 3), np.uint8), True, period=1 / 30)
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("period", [1e-9, 1 / 70_000, 0.0333711, 50.0])
+def test_a_video_is_written_at_any_measured_rate(period: float, tmp_path: Path) -> None:
+    output = Output(tmp_path / "video.mp4")
+    for number in range(8):
+        output.add(np.ascontiguousarray(picture(number)), True, period)
+    output.close()
+    assert cv2.VideoCapture(str(tmp_path / "video.mp4")).isOpened()
+
+
+def test_what_others_say_meanwhile_is_not_lost(capfd: pytest.CaptureFixture[str]) -> None:
+    with native_output() as said:
+        os.write(2, b"libpng warning: one\n[ WARN:0@1.5] global x.cpp:3 two\n\n")
+        os.write(2, b"mine\n")
+        thread = threading.Thread(target=lambda: os.write(2, b"and theirs: libpng\n"))
+        thread.start()
+        thread.join()
+    assert said == ["libpng warning: one", "[ WARN:0@1.5] global x.cpp:3 two"]
+    assert capfd.readouterr().err == "mine\nand theirs: libpng\n"
+    with pytest.raises(ZeroDivisionError), native_output():
+        _ = 1 / 0
+    os.write(2, b"after\n")
+    assert capfd.readouterr().err == "after\n"
