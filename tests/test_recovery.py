@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import random
 from pathlib import Path
 from typing import Any
 
+import pytest
 import yaml
-from command_line import sags
+from command_line import refused, sags
 from recorded_plane import content
 
 from sags_node.errors import SagsError
 from sags_node.recording.bag import BagMessage, read_messages
+from sags_node.recording.bag_writer import BagWriter
 from sags_node.recording.info import bag_info
 from sags_node.recording.recover import recover
 
@@ -92,6 +95,37 @@ def test_recovery_with_nothing_lost(plane_bag: Path, tmp_path: Path) -> None:
     latched = [t["topic_metadata"]["name"] for t in kept_for_late]
     assert "/sags/parameters" in latched and "/sags/left/depth" not in latched
     assert all(t["topic_metadata"]["type_description_hash"].startswith("RIHS01_") for t in topics)
+
+
+@pytest.mark.parametrize("content", [b"", b"no MCAP at all" * 100, b"\x89MCAP0\r\n"])
+@pytest.mark.parametrize("there", [False, True], ids=["new", "empty"])
+def test_recovery_of_nothing_leaves_nothing(content: bytes, there: bool, tmp_path: Path) -> None:
+    damaged, out = tmp_path / "damaged.mcap", tmp_path / "out"
+    damaged.write_bytes(content)
+    if there:
+        out.mkdir()
+    refused(1, "bag", "recover", damaged, "-o", out, said=("holds no whole message",))
+    assert out.exists() == there and (not there or not any(out.iterdir()))
+    assert damaged.read_bytes() == content
+
+
+def test_recovery_that_is_broken_off_leaves_nothing(
+    plane_bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A full disk, or Ctrl-C: half a copy would be taken for all that could be saved."""
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(BagWriter, "write", full)
+    refused(1, "bag", "recover", plane_bag, "-o", tmp_path / "out", said=("No space left on device",))
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(BagWriter, "write", interrupted)
+    assert sags("bag", "recover", plane_bag, "-o", tmp_path / "out").exit_code == 130
+    assert not any(tmp_path.iterdir())
 
 
 def test_recover_on_the_command_line(plane_bag: Path, tmp_path: Path) -> None:

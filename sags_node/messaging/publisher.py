@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import time
 from collections.abc import Mapping, Sequence
@@ -13,14 +14,17 @@ from typing import Any, Self
 import zmq
 
 from sags_node.config import PublishConfig
+from sags_node.errors import SagsError
 from sags_node.messaging import content, control, topics
 from sags_node.messaging.cdr import Content, type_hash
 from sags_node.messaging.peers import Peers
 from sags_node.messaging.rundir import Connection, RunDirectory
-from sags_node.messaging.security import KeyPair, authenticated, check_endpoint
+from sags_node.messaging.security import KeyPair, Seldom, authenticated, check_endpoint
 from sags_node.messaging.sockets import bind, limit, receive_frames
 from sags_node.messaging.wire import PROTOCOL, Message, Meta, encode
 from sags_node.types import DrawnView, FrameResult, NodeHealth, RectifiedPair
+
+log = logging.getLogger(__name__)
 
 # Messages per slow peer, all topics together: two whole frames, so that the burst of one frame fits.
 SEND_HIGH_WATER = 2 * len(topics.TOPICS)
@@ -31,6 +35,7 @@ MAX_PREFIXES = 1024  # noted: a view may be subscribed to before it is opened, s
 SUBSCRIPTIONS_HIGH_WATER = 64  # that one peer may have waiting
 PENDING_POLL_MS = 10  # how soon the result of a handler's future is looked for
 EARLY_PICTURE = "left/image_rect_color"
+LOOK_SECONDS = 1.0  # between looks whether a client can still find this node
 LAST_WORDS_MS = 200  # longest wait at the end for what is still on its way to a peer
 
 
@@ -82,6 +87,9 @@ class Publisher:
         self._peers: dict[str, Peers] = {}
         self._resources = ExitStack()
         self._run = RunDirectory(config.run_dir, ns)
+        self._has_ipc = config.ipc
+        self._next_look = 0.0  # at the run directory
+        self._seldom = Seldom()
         self._context = zmq.Context()
         try:
             keys = self._resources.enter_context(authenticated(self._context, config))
@@ -246,6 +254,7 @@ class Publisher:
                 self._serve_subscriptions()
                 if self._control is not None:
                     self._control.serve()
+                self._stay_findable()
                 if wake_fd in events:
                     return True
                 if left_ms == 0:
@@ -290,6 +299,26 @@ class Publisher:
 
     def _is_kept_view(self, name: str, prefix: str) -> bool:
         return name.startswith("view/") and topics.full_name(self.ns, name).startswith(prefix)
+
+    def _stay_findable(self) -> None:
+        """Put back what somebody has removed from the run directory; who is connected stays so."""
+        if time.monotonic() < self._next_look:
+            return
+        self._next_look = time.monotonic() + LOOK_SECONDS
+        run = self._run
+        without_ipc = self._has_ipc and not run.ipc_path.exists()
+        if run.is_held and run.connection_file.exists() and not without_ipc:
+            return
+        try:
+            run.take_again()
+            if without_ipc:
+                bind(self._data, run.ipc_endpoint, "publish.ipc", None)
+            run.write_connection(self.connection)
+        except (SagsError, OSError) as error:
+            if self._seldom.due():
+                log.warning("%s was removed and cannot be made again: %s", run.folder, error)
+        else:
+            log.warning("%s was removed and is there again", run.folder)
 
     def close(self) -> None:
         """Close the sockets and remove the connection file."""

@@ -60,7 +60,7 @@ def private_directory(path: Path) -> Path:
 
 
 class RunDirectory:
-    """One node's place in the run directory, from start to `close`.
+    """One node's place in the run directory, from start to `close`; taken again when somebody removes it.
 
     Raises:
         SagsError: another live node holds the same namespace.
@@ -68,17 +68,46 @@ class RunDirectory:
     """
 
     def __init__(self, path: Path | None, ns: str) -> None:
-        folder = private_directory(path or default_run_dir())
-        self.connection_file = connection_path(folder, ns)
+        self.folder = path or default_run_dir()
+        self._ns = ns
+        self.connection_file = connection_path(self.folder, ns)
         self.ipc_path = self.connection_file.with_suffix(".ipc")
-        self._lock = os.open(self.connection_file.with_suffix(".lock"), os.O_RDWR | os.O_CREAT, 0o600)
+        self._lock_path = self.connection_file.with_suffix(".lock")
+        self._lock = self._take()
+
+    def _take(self) -> int:
+        """The descriptor of the locked lock file."""
+        private_directory(self.folder)
+        lock = os.open(self._lock_path, os.O_RDWR | os.O_CREAT, 0o600)
         try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
-            os.close(self._lock)
+            os.close(lock)
             raise SagsError(
-                f"another node already runs as '{ns}' in {folder}; stop it, or choose another ns:=NAME"
+                f"another node already runs as '{self._ns}' in {self.folder}; stop it, or choose another "
+                "ns:=NAME"
             ) from None
+        return lock
+
+    @property
+    def is_held(self) -> bool:
+        """Whether the lock file in the directory is the one that this node has locked."""
+        try:
+            return os.path.samestat(os.fstat(self._lock), os.stat(self._lock_path))
+        except OSError:
+            return False
+
+    def take_again(self) -> None:
+        """Make the directory anew and lock the place in it, where they have gone.
+
+        Raises:
+            SagsError: another node has taken the place meanwhile.
+            UsageError: see `private_directory`.
+        """
+        if not self.is_held:
+            lock = self._take()
+            os.close(self._lock)
+            self._lock = lock
 
     @property
     def ipc_endpoint(self) -> str:
@@ -103,8 +132,9 @@ class RunDirectory:
         partial.replace(self.connection_file)
 
     def close(self) -> None:
-        self.connection_file.unlink(missing_ok=True)
-        self.ipc_path.unlink(missing_ok=True)
+        if self.is_held:  # else they are another node's
+            self.connection_file.unlink(missing_ok=True)
+            self.ipc_path.unlink(missing_ok=True)
         os.close(self._lock)
 
 

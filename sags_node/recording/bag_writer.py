@@ -61,6 +61,7 @@ class BagWriter:
         self._parts: list[Part] = []
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise UsageError(f"{folder} exists already; name a new folder")
+        self._is_new = not folder.exists()
         try:
             folder.mkdir(parents=True, exist_ok=True)
             self._begin_file()
@@ -130,6 +131,14 @@ class BagWriter:
             {"rosbag2_bagfile_information": describe(self._parts, self._topics)}, sort_keys=False
         )
         (self.folder / METADATA).write_text(text, encoding="utf-8")
+
+    def discard(self) -> None:
+        """Remove what was written, and the folder if it was made for it."""
+        self._file.close()
+        for name in (*(part.file for part in self._parts), METADATA):
+            (self.folder / name).unlink(missing_ok=True)
+        if self._is_new:
+            self.folder.rmdir()
 
     # ---- its files -------------------------------------------------------------------------------------
 

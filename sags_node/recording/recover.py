@@ -39,6 +39,9 @@ class Recovery:
 def recover(path: Path, out: Path) -> dict[str, Any]:
     """Write what is whole of the MCAP file or folder at `path` as a new bag, and read it back.
 
+    Nothing stays at `out` where nothing could be saved or something went wrong: the damaged files are still
+    there to begin anew.
+
     Returns:
         The fields of `Recovery`, `lost` and the new folder.
 
@@ -52,15 +55,20 @@ def recover(path: Path, out: Path) -> dict[str, Any]:
             f"{path}: only MCAP is recovered; for ROS 1 use rosbag reindex, for db3 sqlite3 .recover"
         )
     done = Recovery()
-    with BagWriter(out) as bag:
-        writer = _Writer(bag, done)
-        try:
+    bag = BagWriter(out)
+    try:
+        with bag:
+            writer = _Writer(bag, done)
             for file in files:
                 _recover_file(file, writer, done)
-        except OSError as error:
-            raise SagsError(f"cannot recover {path} to {out}: {error.strerror}") from None
-        if done.messages == 0:
-            raise SagsError(f"{path} holds no whole message; nothing can be saved")
+            if done.messages == 0:
+                raise SagsError(f"{path} holds no whole message; nothing can be saved")
+    except OSError as error:
+        bag.discard()
+        raise SagsError(f"cannot recover {path} to {out}: {error.strerror}") from None
+    except BaseException:
+        bag.discard()
+        raise
     read_back = sum(1 for _ in read_messages(out))
     if read_back != done.messages:
         raise SagsError(f"{out} holds {read_back} of {done.messages} messages; is the disk sound?")
