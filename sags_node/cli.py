@@ -24,7 +24,7 @@ from sags_node.apps.launching import (
     split,
     split_recording,
 )
-from sags_node.apps.terminal import check_folder, console, progress, show
+from sags_node.apps.terminal import check_folder, console, interrupt, progress, show
 from sags_node.cli_bag import bag
 from sags_node.cli_bench import bench
 from sags_node.cli_calib import calib
@@ -40,10 +40,7 @@ class Sags(click.Group):
 
     def invoke(self, ctx: click.Context) -> Any:
         try:
-            return super().invoke(ctx)
-        except SagsError as error:
-            console.print(f"[red]error:[/] {escape(str(error))}", soft_wrap=True)
-            ctx.exit(error.exit_code)
+            return self._invoke(ctx)
         except (KeyboardInterrupt, SystemError) as error:
             # A Ctrl-C becomes a SystemError in C code that calls Python: loading a kernel.
             cause = error.__cause__ if isinstance(error, SystemError) else error
@@ -51,6 +48,13 @@ class Sags(click.Group):
                 raise
             console.print("stopped")
             ctx.exit(130)
+
+    def _invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except SagsError as error:
+            console.print(f"[red]error:[/] {escape(str(error))}", soft_wrap=True)
+            ctx.exit(error.exit_code)
 
 
 @click.group(cls=Sags, context_settings={"help_option_names": ["-h", "--help"]})
@@ -65,7 +69,9 @@ def main(verbose: bool) -> None:
     Research software, not a medical device.
     """
     level = logging.INFO if verbose else logging.WARNING
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # a service manager's stop is a Ctrl-C
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+        signal.signal(signal.SIGINT, interrupt)
+    signal.signal(signal.SIGTERM, interrupt)  # a service manager's stop is a Ctrl-C
     logging.basicConfig(
         level=level, format="%(message)s", handlers=[RichHandler(console=console, show_path=False)]
     )

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,7 +13,7 @@ import pytest
 from click.testing import CliRunner
 from command_line import start, stopped, wait_for
 
-from sags_node.apps.terminal import on_stop_signals
+from sags_node.apps.terminal import interrupt, on_stop_signals
 from sags_node.cli import main
 
 pytestmark = [pytest.mark.live, pytest.mark.usefixtures("run_dir")]
@@ -46,6 +48,49 @@ def test_a_ctrl_c_that_comes_while_a_kernel_is_loaded_is_one_too(monkeypatch: py
     assert CliRunner().invoke(main, ["doctor"]).exit_code == 130
     monkeypatch.setattr("sags_node.apps.doctor.examine", broken)
     assert isinstance(CliRunner().invoke(main, ["doctor"]).exception, SystemError)
+
+
+SLOW = """
+import sys, time
+print("loading", flush=True)
+try:
+    time.sleep(0.5)
+except BaseException:
+    raise ImportError("initialization failed")  # as C code has it
+
+def __getattr__(name):
+    if name.startswith("__"):
+        raise AttributeError(name)
+    time.sleep(10)
+"""
+
+
+@pytest.mark.parametrize(("module", "command"), [("click", ["doctor"]), ("open3d", ["overlay"])])
+def test_a_ctrl_c_while_modules_are_loaded_is_one_word(
+    module: str, command: list[str], run_dir: Path, tmp_path: Path
+) -> None:
+    """In the first moments of the command itself, and where a command loads what it needs."""
+    slow = tmp_path / f"modules/{module}/__init__.py"
+    slow.parent.mkdir(parents=True)
+    slow.write_text(SLOW)
+    process = start(command, PYTHONPATH=f"{tmp_path / 'modules'}:{os.environ.get('PYTHONPATH', '')}")
+    assert process.stdout is not None and process.stdout.readline() == "loading\n"
+    stdout, stderr = stopped(process)
+    assert process.returncode == 130 and (stdout, stderr) == ("", "stopped\n")
+
+
+def test_a_ctrl_c_in_a_finaliser_comes_through_after_it() -> None:
+    class Binding:
+        def __del__(self) -> None:
+            signal.raise_signal(signal.SIGINT)
+
+    before = signal.signal(signal.SIGINT, interrupt)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            Binding()
+            time.sleep(10)
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_ctrl_c_ends_the_rendering_of_a_phantom(tmp_path: Path) -> None:

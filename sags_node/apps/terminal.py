@@ -6,9 +6,11 @@ import json
 import signal
 import sys
 import tempfile
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import click
@@ -19,6 +21,9 @@ from rich.table import Table
 from sags_node.errors import SagsError
 
 WIDE = 200  # columns of a table that goes to a file or another program, and so is not cut to a screen
+
+LOOK_AGAIN = 0.02  # s until a Ctrl-C that could not come through is tried again
+_IMPORT = "<frozen importlib._bootstrap>"  # where the frames of an import are
 
 console = Console(stderr=True, highlight=False)
 
@@ -74,6 +79,22 @@ def check_file(file: Path) -> None:
             file.open("r+b").close()
 
 
+def interrupt(number: int, frame: FrameType | None) -> None:
+    """Handler of Ctrl-C: `KeyboardInterrupt`, as soon as it can come through.
+
+    In the middle of an import it may come out of C code as an `ImportError`; a finaliser loses it.
+    """
+    while frame is not None:
+        if frame.f_code.co_filename == _IMPORT or frame.f_code.co_name == "__del__":
+            # To this thread, the main one: it may be waiting by then, and must wake.
+            again = threading.Timer(LOOK_AGAIN, signal.pthread_kill, (threading.get_ident(), number))
+            again.daemon = True
+            again.start()
+            return
+        frame = frame.f_back
+    raise KeyboardInterrupt
+
+
 def on_stop_signals(stop: Callable[[], None]) -> None:
     """Let Ctrl-C and a service manager's stop call this; a second one breaks off.
 
@@ -81,7 +102,7 @@ def on_stop_signals(stop: Callable[[], None]) -> None:
     """
 
     def handle(number: int, frame: object) -> None:
-        signal.signal(number, signal.default_int_handler)
+        signal.signal(number, interrupt)
         stop()
 
     signal.signal(signal.SIGINT, handle)
