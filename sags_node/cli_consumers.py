@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import click
+from rich.markup import escape
 
 from sags_node.apps import text
 from sags_node.apps.launching import as_json, positive
-from sags_node.apps.terminal import show
+from sags_node.apps.terminal import console, show
 
 endpoint_option = click.option(
     "--endpoint", help="Data socket of the node; default: the connection file of the node on this machine."
@@ -80,11 +81,15 @@ def overlay(json_out: bool, **options: Any) -> None:
     """Publish geometry held by the tissue, for both eyes.
 
     It is tested against the depth of the tissue, hidden behind instruments, and blank as soon as anything it
-    needs is stale. docs/wire.md says what is published and how a scene file looks.
+    needs is stale. The node may be started later and restarted. docs/wire.md says what is published and how a
+    scene file looks.
     """
     from sags_node.apps.overlay import Options, run_overlay
 
-    summary = run_overlay(Options(**options))
+    def tell(said: str) -> None:
+        console.print(escape(said), soft_wrap=True)
+
+    summary = run_overlay(Options(**options), tell)
     show(summary if json_out else text.overlay_table(summary))
 
 

@@ -13,6 +13,8 @@ import pytest
 from command_line import FREE_PORTS, pure_json, refused, sags, start, stopped, wait_for
 
 from sags_node.apps import overlay, topic
+from sags_node.messaging.received import ReceivedText
+from sags_node.messaging.subscriber import Subscriber
 
 pytestmark = [pytest.mark.live, pytest.mark.usefixtures("run_dir")]
 
@@ -25,7 +27,6 @@ LISTENERS = [
     ["topic", "hz", "tf"],
     ["topic", "bw", "tf"],
     ["topic", "delay", "tf"],
-    ["overlay"],
 ]
 
 
@@ -35,7 +36,21 @@ def test_no_node_runs(arguments: list[str], run_dir: Path) -> None:
     refused(1, *arguments, "--ns", "other", said=said)
 
 
-@pytest.mark.parametrize("arguments", LISTENERS, ids=" ".join)
+def test_the_overlay_waits_for_a_node(run_dir: Path) -> None:
+    said = ("no node runs as 'other'", "waiting (Ctrl-C ends): ")
+    refused(1, "overlay", "--ns", "other", "--seconds", "0.3", said=said)
+    process = start(["overlay", "--json"])
+    assert process.stderr is not None and "waiting (Ctrl-C ends)" in process.stderr.readline()
+    with Subscriber([], ns="overlay", run_dir=run_dir) as subscriber:
+        status = subscriber.wait("status", 10)
+        assert isinstance(status, ReceivedText)
+        assert json.loads(status.text)["state"] == "blank"
+        assert json.loads(status.text)["reason"] == "waiting for the node"
+    stdout, _ = stopped(process)
+    assert process.returncode == 0 and pure_json(stdout)["frames"] == 0
+
+
+@pytest.mark.parametrize("arguments", [*LISTENERS, ["overlay"]], ids=" ".join)
 def test_a_node_that_has_died_without_a_word(
     arguments: list[str], run_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -46,8 +61,10 @@ def test_a_node_that_has_died_without_a_word(
     (run_dir / "sags.json").write_text(json.dumps(dead))
     monkeypatch.setattr(topic, "PATIENCE", 0.2)
     monkeypatch.setattr(overlay, "PATIENCE", 0.2)
-    seconds = ["--seconds", "0.2"] if arguments[-1] != "overlay" and "echo" not in arguments else []
+    seconds = [] if "echo" in arguments else ["--seconds", "0.6"]
     refused(1, *arguments, *seconds, said=("no ", endpoint, "is the node running"))
+    if arguments == ["overlay"]:
+        refused(1, *arguments, *seconds, said=("waiting (Ctrl-C ends): ",))
 
 
 def test_an_endpoint_that_is_none() -> None:

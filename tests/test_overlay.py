@@ -164,6 +164,17 @@ def test_on_the_phantom_both_eyes_follow_the_tissue(
     assert summary["overlay"] >= 20 and len(summary["objects"][0]["anchors"]) == 1
 
 
+def test_it_waits_for_a_node_that_is_started_later(phantom_session: Path, tmp_path: Path) -> None:
+    run_dir = tmp_path / "run"
+    with overlay(run_dir) as (running, watcher):
+        until(lambda: watcher.status().get("reason") == "waiting for the node", running)
+        assert running.stderr is not None and "waiting (Ctrl-C ends)" in running.stderr.readline()
+        settings = ["source.loop:=true", f"publish.run_dir:={run_dir}"]
+        settings += ["publish.data:=[tcp://127.0.0.1:*]", "publish.control:=tcp://127.0.0.1:*"]
+        with process("run", phantom_session, *settings):
+            assert watcher.pictures(3, drawn=True, seconds=START_SECONDS)
+
+
 def phantom_truth(session: Path) -> tuple[Callable[[int], Camera], np.ndarray, np.ndarray]:
     """The left camera of each frame, and its surface points [T, P, 3] with whether they are seen [T, P]."""
     from sags_node.session import open_session

@@ -6,9 +6,11 @@ says why. The video itself does not pass through here, so nothing here can hide 
 
 from __future__ import annotations
 
+import logging
+import math
 import time
 from collections import Counter, deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -31,11 +33,14 @@ from sags_node.messaging.received import Received, ReceivedImage, TopicName
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.types import U8
 
+log = logging.getLogger(__name__)
+
 PICTURE = TopicName("left/image_rect_color", ReceivedImage)
 MAX_AGE = 0.5  # s since capture; an older overlay is taken away
 WAIT_FOR_FRAME = 0.05  # s; also how soon a stale picture is noticed
 WAIT_FOR_REST = 0.05  # s for what belongs to the frame
-PATIENCE = 5.0  # s for the very first frame
+PATIENCE = 5.0  # s for the very first frame, before it is said that none comes
+LOOK = 0.1  # s between looks for a node
 REMEMBERED = 54_000  # latencies: half an hour at 30 Hz
 RECENT = 300  # of them are behind the figures in `status`
 
@@ -60,8 +65,11 @@ class Options:
     show_latency: bool = False
 
 
-def run_overlay(options: Options) -> dict[str, Any]:
-    """Publish an overlay of a running node until its time is over or Ctrl-C.
+def run_overlay(options: Options, tell: Callable[[str], object] = log.warning) -> dict[str, Any]:
+    """Publish an overlay of a node until its time is over or Ctrl-C. The node may be started later.
+
+    Args:
+        tell: what it waits for.
 
     Returns:
         frames, overlay (frames with one), blanked (reason -> frames), latency_ms (capture to published) and
@@ -70,8 +78,8 @@ def run_overlay(options: Options) -> dict[str, Any]:
 
     Raises:
         UsageError: a wrong scene, mesh, pin or kind of file.
-        SagsError: no node is known, no frame came within `PATIENCE`, the node has no control socket, or the
-            file cannot be written.
+        SagsError: no frame came until its time was over, the node refuses this client or has no control
+            socket, an endpoint is malformed, or the file cannot be written.
     """
     if options.scene is not None and options.pin is not None:
         raise UsageError("--pin is for the built-in target; a scene file says where its objects are pinned")
@@ -81,17 +89,15 @@ def run_overlay(options: Options) -> dict[str, Any]:
     scene = built_in(options.pin, options.shape) if options.scene is None else read_scene(options.scene)
     overlay_draw.warm_up()
     bodies = [Body(mesh_of(spec), spec.opacity, spec.label) for spec in scene.objects]
-    wanted: list[str] = [*NEEDED, RIGHT_INFO, *([] if options.save is None else [PICTURE])]
-    with Subscriber(wanted, options.endpoint, options.ns, options.run_dir, keys=options.keys) as subscriber:
-        with OverlayStream(options.own_ns, options.run_dir, scene.color_key) as stream:
-            overlay = _Overlay(options, scene, bodies, subscriber, stream, output)
-            try:
-                overlay.run()
-            except KeyboardInterrupt:
-                pass
-            finally:
-                overlay.close()
-            return overlay.summary()
+    with OverlayStream(options.own_ns, options.run_dir, scene.color_key) as stream:
+        overlay = _Overlay(options, scene, bodies, stream, output, tell)
+        try:
+            overlay.run()
+        except KeyboardInterrupt:
+            pass
+        finally:
+            overlay.close()
+        return overlay.summary()
 
 
 class _Overlay:
@@ -100,14 +106,16 @@ class _Overlay:
         options: Options,
         scene: SceneSpec,
         bodies: Sequence[Body],
-        subscriber: Subscriber,
         stream: OverlayStream,
         output: Output,
+        tell: Callable[[str], object],
     ) -> None:
         connect = partial(ControlClient, options.control, options.ns, options.run_dir, options.keys)
         self._options = options
         self._bodies = bodies
-        self._subscriber = subscriber
+        self._subscriber: Subscriber | None = None  # before there is a node
+        self._tell = tell
+        self._waiting_because = ""
         self._stream = stream
         self._output = output
         self._pinner = Pinner(connect)
@@ -129,16 +137,19 @@ class _Overlay:
         """Draw every frame that comes.
 
         Raises:
-            UsageError: a pixel lies outside the picture.
-            SagsError: no frame came, or the node has no control socket.
+            UsageError: a pixel lies outside the picture, or the node's keys do not fit.
+            SagsError: no frame came, or the node refuses this client or has no control socket.
         """
         # A mask comes with every frame, also while the camera is lost, and never before the picture.
         leading = NEEDED[0] if self._options.save is None else TISSUE
-        seconds, began = self._options.seconds, time.monotonic()
+        seconds = self._options.seconds
+        end = math.inf if seconds is None else time.monotonic() + seconds
+        self._subscriber = self._connected(end)
+        patient_until = time.monotonic() + PATIENCE
         last: Received | None = None
-        while seconds is None or time.monotonic() < began + seconds:
+        while time.monotonic() < end:
             self._stream.serve()
-            received = self._subscriber.wait(leading, WAIT_FOR_FRAME, after=last)
+            received = self._node.wait(leading, WAIT_FOR_FRAME, after=last)
             if received is not None:
                 if last is None:  # a node without a control socket: better said now than never
                     find_control(
@@ -146,16 +157,55 @@ class _Overlay:
                     )
                 last = received
                 self._take(received)
-            elif last is None and time.monotonic() > began + PATIENCE:
-                break
+            elif last is None and time.monotonic() > patient_until:
+                if self._node.refusal is not None:
+                    break
+                self._say_waiting(self._silence)
             self._look_at_the_clock()
             self._stream.tell(self._facts())
         if last is None:
-            silence = f"no frame came from {self._subscriber.endpoint}; is the node running and not waiting?"
-            raise SagsError(self._subscriber.refusal or silence)
+            raise SagsError(self._node.refusal or self._silence)
+
+    def _connected(self, end: float) -> Subscriber:
+        """The node's subscriber, as soon as a node is there.
+
+        Raises:
+            UsageError: the node's keys do not fit.
+            SagsError: none came until `end`, or the endpoint is malformed.
+        """
+        options = self._options
+        wanted: list[str] = [*NEEDED, RIGHT_INFO, *([] if options.save is None else [PICTURE])]
+        while True:
+            try:
+                return Subscriber(wanted, options.endpoint, options.ns, options.run_dir, keys=options.keys)
+            except SagsError as error:
+                is_absent = not isinstance(error, UsageError) and options.endpoint is None
+                if not is_absent or time.monotonic() > end:
+                    raise
+                self._say_waiting(str(error))
+            self._stream.serve()
+            self._stream.tell(self._facts())
+            time.sleep(LOOK)
+
+    def _say_waiting(self, why: str) -> None:
+        """Once, and again when it is for another reason."""
+        if why != self._waiting_because:
+            self._waiting_because = why
+            self._tell(f"waiting (Ctrl-C ends): {why}")
+
+    @property
+    def _node(self) -> Subscriber:
+        assert self._subscriber is not None  # what needs it comes after `_connected`
+        return self._subscriber
+
+    @property
+    def _silence(self) -> str:
+        return f"no frame came from {self._node.endpoint}; is the node running and not waiting?"
 
     def close(self) -> None:
         """Leave nothing standing: neither the last overlay nor anchors in the node."""
+        if self._subscriber is not None:
+            self._subscriber.close()  # what has come stays readable
         self._stream.blank("the overlay was stopped")
         self._stream.tell(self._facts())
         self._pinner.close()
@@ -163,7 +213,8 @@ class _Overlay:
 
     def summary(self) -> dict[str, Any]:
         """See `run_overlay`."""
-        names = [name for name in NEEDED if self._subscriber.latest(name) is not None]
+        node = self._subscriber
+        lost = [] if node is None else [node.lost(name) for name in NEEDED if node.latest(name) is not None]
         return {
             "frames": self._frames,
             "overlay": self._frames - self._blanked.total(),
@@ -171,7 +222,7 @@ class _Overlay:
             "latency_ms": _percentiles(self._latency_ms),
             "draw_ms": _percentiles(self._draw_ms),
             "objects": [held.status() for held in self._objects],
-            "lost": sum(self._subscriber.lost(name) for name in names),
+            "lost": sum(lost),
             "endpoints": self._stream.endpoints,
             "saved": self._output.saved,
         }
@@ -186,15 +237,15 @@ class _Overlay:
             self._blanked[reason] += 1
         if self._options.save is None:
             return
-        came = self._subscriber.aligned([PICTURE], leading.stamp_ns, WAIT_FOR_REST)
+        came = self._node.aligned([PICTURE], leading.stamp_ns, WAIT_FOR_REST)
         if came is not None:
             picture = came[PICTURE].array
             shown = picture if rgba is None else overlay_draw.over(picture, rgba)
-            self._output.add(shown, rgba is not None, self._subscriber.period(PICTURE))
+            self._output.add(shown, rgba is not None, self._node.period(PICTURE))
 
     def _overlay(self, stamp_ns: int) -> tuple[U8 | None, str | None]:
         """The left eye's overlay, published; or why there is none."""
-        messages = self._subscriber.aligned(NEEDED, stamp_ns, WAIT_FOR_REST)
+        messages = self._node.aligned(NEEDED, stamp_ns, WAIT_FOR_REST)
         if (stale := self._stale()) is not None:
             self._stream.blank(stale)
             return None, stale
@@ -222,16 +273,16 @@ class _Overlay:
         return pictures["left"]
 
     def _right_info(self) -> Any:
-        problem = self._subscriber.problem(RIGHT_INFO)
+        problem = self._node.problem(RIGHT_INFO)
         self._right = "" if problem is None else f"no right/camera_info ({problem}): set publish.right:=true"
-        return self._subscriber.latest(RIGHT_INFO) if problem is None else None
+        return self._node.latest(RIGHT_INFO) if problem is None else None
 
     # ---- what is not right ---------------------------------------------------------------------------------
 
     def _stale(self) -> str | None:
         """What may not be shown as new any more, of all that is needed."""
         for name in NEEDED:
-            if self._subscriber.problem(name, self._options.max_age) is not None:
+            if self._node.problem(name, self._options.max_age) is not None:
                 return f"stale {name}"
         return None
 
