@@ -382,7 +382,7 @@ class Node:
         if not isinstance(path, str) or not path.endswith(".ply"):
             raise SagsError("save_model needs a path that ends in .ply")
         if "\0" in path:
-            raise SagsError("save_model: path cannot hold a zero character")
+            raise SagsError("a path cannot hold a zero character")
         gaussians = self._pipeline.mapper.model.frozen()
         if len(gaussians) == 0:
             raise SagsError("there is no model yet; wait for the first frame")

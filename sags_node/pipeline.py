@@ -33,6 +33,7 @@ from sags_node.types import (
 from sags_node.vision.change import StillScene
 from sags_node.vision.observe import observe
 from sags_node.vision.onnx_depth import NetworkDepth
+from sags_node.vision.pair_watch import PairWatch
 from sags_node.vision.rectify import Rectifier
 from sags_node.vision.stereo import StereoDepth
 from sags_node.vision.tissue import TissueMask
@@ -81,6 +82,7 @@ class Pipeline:
             self._tracker = CameraTracker(self.mapper, self._draw_model)
         self.anchors = Anchors()
         self._still = StillScene()
+        self._eyes = PairWatch()
         self._mapped: FrameResult | None = None  # the last frame that was really mapped
 
     def reset(self) -> None:
@@ -106,6 +108,8 @@ class Pipeline:
             found["network"] = self._network.problem
         if self.tissue.problem:
             found["mask"] = self.tissue.problem
+        if self._eyes.warning:
+            found["eyes"] = self._eyes.warning
         if self._refiner.problem:
             found["device"] = self._refiner.problem
         return found
@@ -121,6 +125,7 @@ class Pipeline:
         watch = Stopwatch()
         with watch("rectify"):
             pair = self._placed(frame)
+        self._eyes(frame, pair)
         self._on_rectified(pair, self._epoch(frame))
         if self._mapped is not None and self._config.mapping.skip_duplicates:
             if _rms_difference(pair, self._mapped.pair) < DUPLICATE_RMS:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
+from rich.text import Text
 
 from sags_node.apps import text
 from sags_node.node import Node
@@ -58,4 +59,6 @@ def health_table(health: NodeHealth) -> Table:
     if health.skipped:
         table.add_row("skipped", "  ".join(f"{k} {v}" for k, v in health.skipped.items()))
     table.add_row("memory", f"{health.rss_mb:.0f} MB")
+    for stage, warning in health.warnings.items():
+        table.add_row(f"warning: {stage}", Text(warning))
     return table

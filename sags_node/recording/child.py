@@ -74,7 +74,7 @@ class RecorderProcess:
         child = self._child
         try:
             if child is not None:
-                self._finish(self.stop(), child)
+                self._wait_for(self._worker.submit(self._stop_if_running), child)
         except BaseException:
             if child is not None:
                 child.kill()
@@ -82,18 +82,15 @@ class RecorderProcess:
         finally:
             self._worker.shutdown(wait=False)  # each of its requests has its time limit
 
-    def _finish(self, stopped: Future[Any], child: _Child) -> None:
-        waiting = [(PATIENCE, f"waiting for the recorder of {child.folder}; Ctrl-C breaks off")]
-        waiting += [(FINISH_SECONDS + SNAPSHOT_SECONDS, f"the recorder of {child.folder} does not answer")]
-        for seconds, said in waiting:
+    def _wait_for(self, stopped: Future[Any], child: _Child) -> None:
+        try:
             try:
-                stopped.result(seconds)
-                return
+                stopped.result(PATIENCE)
             except TimeoutError:
-                log.warning(said)
-            except SagsError as error:
-                log.warning("%s", error)
-                return
+                log.warning("waiting for the recorder of %s; Ctrl-C breaks off", child.folder)
+                stopped.result(SNAPSHOT_SECONDS + FINISH_SECONDS + KILL_SECONDS)  # what waits before it, too
+        except (SagsError, TimeoutError) as error:
+            log.warning("%s", error)
 
     def _start(self, args: Mapping[str, Any]) -> Any:
         if self._child is not None and self._child.is_running:
@@ -155,6 +152,10 @@ class RecorderProcess:
                 f"with: sags bag recover {child.folder} -o OUT"
             ) from None
 
+    def _stop_if_running(self) -> None:
+        if self._child is not None:  # a request that came before may have stopped it
+            self._stop()
+
     def _running(self) -> _Child:
         if self._child is None:
             raise SagsError("nothing is being recorded; start_recording {path} begins")
@@ -174,7 +175,7 @@ class _Child:
 
     def __init__(self, command: list[str], folder: Path, has_ring: bool) -> None:
         if any("\0" in part for part in command):
-            raise SagsError("start_recording: path and topics cannot hold a zero character")
+            raise SagsError("path and topics cannot hold a zero character")
         self.folder = folder
         self.has_ring = has_ring
         self._errors = tempfile.TemporaryFile("w+")  # a pipe that is full would stop the child
