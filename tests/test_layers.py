@@ -5,7 +5,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parent.parent / "sags_node"
 LAYERS = [
-    {"errors", "types", "latest"},
+    {"errors", "types", "latest", "kernels"},
     {"geometry", "config"},
     {"launch_file"},
     {"calibration"},
