@@ -25,9 +25,9 @@ from typing import Any
 import numpy as np
 
 from sags_node.config import LaunchConfig, V4l2Source
-from sags_node.engine.threads import configure_threads
 from sags_node.errors import SagsError
 from sags_node.health import Statistics
+from sags_node.kernels.threads import configure_threads
 from sags_node.latest import Latest
 from sags_node.launch_file import with_parameters
 from sags_node.mapping.budget import make_budget

@@ -15,9 +15,9 @@ from dataclasses import dataclass, field
 
 from sags_node.engine.interface import Rasterizer
 from sags_node.engine.rasterize import make_rasterizer, to_view
-from sags_node.engine.threads import configure_threads
 from sags_node.errors import SagsError
 from sags_node.geometry import scale_intrinsics
+from sags_node.kernels.threads import configure_threads
 from sags_node.messaging.requests import ViewRequest
 from sags_node.types import Camera, DrawnView, FrameResult, ViewStatus
 

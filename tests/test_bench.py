@@ -26,7 +26,7 @@ from sags_node.engine import compositing
 from sags_node.engine.interface import MIN_ALPHA
 from sags_node.engine.layout import PAIR
 from sags_node.engine.rasterize import make_rasterizer
-from sags_node.engine.threads import thread_count
+from sags_node.kernels.threads import thread_count
 
 Table = dict[str, Any]
 COMMITTED = Path(__file__).parent.parent / "benchmarks/results/kernels.json"

@@ -20,10 +20,10 @@ from engine_scenes import (
 
 from sags_node import geometry
 from sags_node.engine import numba_rasterizer, projector
-from sags_node.engine.jit import parallel_kernel, take
 from sags_node.engine.rasterize import TILE_HEIGHT, TILE_WIDTH, Gradients, Rasterizer, make_rasterizer
-from sags_node.engine.threads import configure_threads
 from sags_node.errors import UsageError
+from sags_node.kernels.jit import parallel_kernel, take
+from sags_node.kernels.threads import configure_threads
 from sags_node.types import F32, I64, Bool, Camera, Gaussians
 
 WIDTH, HEIGHT = 100, 77  # no whole number of tiles

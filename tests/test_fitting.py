@@ -13,7 +13,6 @@ import pytest
 from click.testing import CliRunner
 
 from sags_node.cli import main
-from sags_node.engine.threads import configure_threads
 from sags_node.errors import SagsError, UsageError
 from sags_node.fitting import checkpoint, start
 from sags_node.fitting.clip import Clip, read_clip
@@ -21,6 +20,7 @@ from sags_node.fitting.fit import Fit
 from sags_node.fitting.score import score, score_depth, score_tracks
 from sags_node.fitting.settings import FitSettings
 from sags_node.fitting.start import follow_online
+from sags_node.kernels.threads import configure_threads
 from sags_node.model import columns
 from sags_node.model.deformable import FADE_NS, LOOK_BACK_NS
 from sags_node.session import open_session

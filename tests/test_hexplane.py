@@ -13,8 +13,8 @@ from sags_node.engine import hexplane_reference as reference
 from sags_node.engine.adam import adam_step
 from sags_node.engine.hexplane import Grid, HexPlane, Moment
 from sags_node.engine.hexplane_kernels import BLOCK
-from sags_node.engine.threads import configure_threads
 from sags_node.errors import SagsError, UsageError
+from sags_node.kernels.threads import configure_threads
 from sags_node.model import hexplane as model
 from sags_node.model.hexplane import HexPlaneField
 from sags_node.types import F32, F64

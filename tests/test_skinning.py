@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from sags_node.engine.threads import configure_threads
+from sags_node.kernels.threads import configure_threads
 from sags_node.model import columns
 from sags_node.model.skinning import skin, skin_backward
 

@@ -13,11 +13,11 @@ from click.testing import CliRunner
 
 from sags_node.cli import main
 from sags_node.engine.rasterize import to_view
-from sags_node.engine.threads import configure_threads
 from sags_node.errors import SagsError
 from sags_node.evaluation.metrics import as_float, psnr
 from sags_node.fitting.clip import ClipFrame, play
 from sags_node.fitting.stream import MOST_KEPT, QUICK, StreamFit, StreamSettings
+from sags_node.kernels.threads import configure_threads
 from sags_node.session import open_session
 from sags_node.types import F32
 

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sags_node.engine.threads import configure_threads
+from sags_node.kernels.threads import configure_threads
 from sags_node.model import columns
 from sags_node.model.decoder import Decoder, DecoderConfig
 from sags_node.model.deformation import spread_nodes

@@ -12,12 +12,12 @@ from zipfile import BadZipFile
 import msgspec
 import numpy as np
 
-from sags_node.engine.threads import configure_threads
 from sags_node.errors import SagsError, UsageError
 from sags_node.fitting import checkpoint
 from sags_node.fitting.clip import read_clip
 from sags_node.fitting.fit import Fit
 from sags_node.fitting.settings import FitSettings
+from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import make_budget
 from sags_node.messaging.address import ClientKeys
 from sags_node.messaging.content import SH_DEGREE_0, SPLAT_FIELDS

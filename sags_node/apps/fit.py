@@ -13,7 +13,6 @@ from rich.table import Table
 
 from sags_node.apps import text
 from sags_node.engine.smoothing import folded
-from sags_node.engine.threads import configure_threads
 from sags_node.errors import UsageError
 from sags_node.evaluation.lpips import BACKBONE, Lpips
 from sags_node.evaluation.machine import machine_name
@@ -23,6 +22,7 @@ from sags_node.fitting.clip import read_clip
 from sags_node.fitting.fit import Fit
 from sags_node.fitting.score import PUBLISHED, score, score_depth, score_tracks
 from sags_node.fitting.settings import FitSettings
+from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.devices import device_of
 from sags_node.model.ply import write_ply
 from sags_node.session import Session

@@ -19,8 +19,8 @@ import numpy as np
 from sags_node.apps.overlay_frame import TissueFrame
 from sags_node.apps.overlay_mesh import Mesh
 from sags_node.apps.overlay_raster import fill, hide, key_out
-from sags_node.engine.jit import read_only
 from sags_node.geometry import invert, transform
+from sags_node.kernels.jit import read_only
 from sags_node.types import F32, F64, U8, Bool, Camera
 
 UNDER = 0.35

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from sags_node.engine.jit import kernel
+from sags_node.kernels.jit import kernel
 from sags_node.types import F32, F64, I32, U8, Bool
 
 NEAR = 1e-3  # m; a triangle that reaches nearer to the eye's plane is left out

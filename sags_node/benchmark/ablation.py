@@ -12,7 +12,6 @@ from typing import Any
 
 from rich.table import Table
 
-from sags_node.engine.threads import configure_threads
 from sags_node.errors import SagsError
 from sags_node.evaluation.lpips import Lpips
 from sags_node.evaluation.machine import machine_name
@@ -21,6 +20,7 @@ from sags_node.fitting.clip import Clip, ClipFrame, read_clip
 from sags_node.fitting.fit import Fit
 from sags_node.fitting.score import score, score_depth, score_tracks
 from sags_node.fitting.settings import FitSettings
+from sags_node.kernels.threads import configure_threads
 from sags_node.session import Session
 
 AHEAD = 3  # last frames that nothing is learnt from

@@ -10,7 +10,7 @@ from sags_node.benchmark.peak import Peak
 from sags_node.benchmark.timing import median_ms
 from sags_node.benchmark.work import Work, bytes_of, share_of_peak, stage_rows
 from sags_node.engine.decoder_layout import Sizes
-from sags_node.engine.threads import thread_count
+from sags_node.kernels.threads import thread_count
 from sags_node.model.decoder import Decoder, DecoderConfig
 from sags_node.types import F32
 

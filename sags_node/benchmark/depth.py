@@ -13,11 +13,11 @@ import cv2
 import numpy as np
 
 from sags_node.config import PhantomSource, StereoConfig
-from sags_node.engine.threads import configure_threads
 from sags_node.errors import SagsError
 from sags_node.evaluation import metrics
 from sags_node.evaluation.machine import machine_name
 from sags_node.geometry import disparity_to_depth
+from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import StepBudget
 from sags_node.phantom.scene import Phantom
 from sags_node.pipeline import Pipeline

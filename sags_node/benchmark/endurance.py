@@ -16,11 +16,11 @@ from typing import Any, Literal
 import numpy as np
 from rich.table import Table
 
-from sags_node.engine.threads import configure_threads
 from sags_node.errors import SagsError
 from sags_node.evaluation.machine import machine_name
 from sags_node.evaluation.metrics import psnr
 from sags_node.health import resident_mb
+from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import Budget, make_budget
 from sags_node.mapping.mapper import SETTLED
 from sags_node.pipeline import Pipeline

@@ -11,7 +11,7 @@ from sags_node.benchmark.scenes import surface
 from sags_node.benchmark.timing import median_ms
 from sags_node.benchmark.work import Work, bytes_of, share_of_peak, stage_rows
 from sags_node.engine.hexplane import Grid, HexPlane, Moment
-from sags_node.engine.threads import thread_count
+from sags_node.kernels.threads import thread_count
 from sags_node.types import F32
 
 NODES = ((64, 64, 64), (128, 128, 128))

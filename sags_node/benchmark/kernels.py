@@ -15,8 +15,8 @@ from sags_node.benchmark.peak import Peak, measure_peak, peak_row
 from sags_node.benchmark.pictures import measure_losses
 from sags_node.benchmark.rasterizing import RasterCase, measure_rasterizer
 from sags_node.benchmark.step import measure_step
-from sags_node.engine.threads import configure_threads
 from sags_node.evaluation.machine import machine_name
+from sags_node.kernels.threads import configure_threads
 from sags_node.model.decoder import TOKEN_CHOICES
 
 Advance = Callable[[int, int, str], None]  # done, total, what comes next

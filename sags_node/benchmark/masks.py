@@ -9,9 +9,9 @@ import numpy as np
 from rich.table import Table
 
 from sags_node.config import TissueConfig
-from sags_node.engine.threads import configure_threads
 from sags_node.errors import SagsError
 from sags_node.evaluation import metrics
+from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import StepBudget
 from sags_node.pipeline import Pipeline
 from sags_node.session import Session

@@ -19,8 +19,8 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from sags_node.engine.jit import aligned, kernel, parallel_kernel
-from sags_node.engine.threads import configure_threads
+from sags_node.kernels.jit import aligned, kernel, parallel_kernel
+from sags_node.kernels.threads import configure_threads
 from sags_node.types import F32
 
 f4 = np.float32

@@ -15,7 +15,7 @@ from sags_node.engine import losses, photometric, photometric_kernels, views
 from sags_node.engine.photometric import LossWeights, PhotometricLoss
 from sags_node.engine.rasterize import make_rasterizer
 from sags_node.engine.ssim import Dissimilarity
-from sags_node.engine.threads import thread_count
+from sags_node.kernels.threads import thread_count
 from sags_node.types import F32, Bool
 
 STAGES: Stages = {

@@ -16,12 +16,12 @@ import numpy as np
 from rich.table import Table
 
 from sags_node.engine.rasterize import to_view
-from sags_node.engine.threads import configure_threads
 from sags_node.evaluation.machine import machine_name
 from sags_node.evaluation.metrics import as_float, psnr
 from sags_node.fitting.clip import ClipFrame, play
 from sags_node.fitting.stream import StreamFit, StreamSettings
 from sags_node.health import resident_mb
+from sags_node.kernels.threads import configure_threads
 from sags_node.session import Session
 from sags_node.types import F32
 

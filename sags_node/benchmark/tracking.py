@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 from rich.table import Table
 
-from sags_node.engine.threads import configure_threads
 from sags_node.errors import SagsError
 from sags_node.evaluation.metrics import percentiles
 from sags_node.geometry import project
+from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.motion import BEHIND_TOLERANCE
 from sags_node.pipeline import Pipeline

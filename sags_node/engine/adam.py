@@ -14,7 +14,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from sags_node.engine.jit import aligned, kernel, parallel_kernel, read_only, square_root
+from sags_node.kernels.jit import aligned, kernel, parallel_kernel, read_only, square_root
 from sags_node.types import F32, I32, I64, Bool
 
 f4 = np.float32

@@ -23,7 +23,7 @@ from sags_node.engine.dense import (
     multiply,
     stays_a_call,
 )
-from sags_node.engine.jit import inlined, kernel
+from sags_node.kernels.jit import inlined, kernel
 from sags_node.types import F32
 
 f4 = np.float32

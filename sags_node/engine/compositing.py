@@ -23,7 +23,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from sags_node.engine.jit import (
+from sags_node.kernels.jit import (
     copy,
     inlined,
     kernel,

@@ -14,8 +14,8 @@ from sags_node.engine.decoder_block import Weights, Workspace
 from sags_node.engine.decoder_layout import Sizes, make_gradients, make_nodes, make_workspace
 from sags_node.engine.decoder_nodes import Nodes
 from sags_node.engine.dense import COLUMNS
-from sags_node.engine.jit import aligned, read_only
-from sags_node.engine.threads import thread_count
+from sags_node.kernels.jit import aligned, read_only
+from sags_node.kernels.threads import thread_count
 from sags_node.types import F32
 
 _GROUPS = 32  # of blocks of points: more would cost memory traffic, fewer would leave cores without work

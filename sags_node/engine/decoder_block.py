@@ -35,7 +35,7 @@ from sags_node.engine.dense import (
     multiply_by,
     scale_rows,
 )
-from sags_node.engine.jit import kernel
+from sags_node.kernels.jit import kernel
 from sags_node.types import F32, I64
 
 f4 = np.float32

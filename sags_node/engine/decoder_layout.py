@@ -10,7 +10,7 @@ from sags_node.engine import decoder_block as block
 from sags_node.engine.decoder_block import Weights, Workspace
 from sags_node.engine.decoder_nodes import Nodes
 from sags_node.engine.dense import COLUMNS
-from sags_node.engine.jit import aligned
+from sags_node.kernels.jit import aligned
 from sags_node.types import F32
 
 _VECTORS = {

@@ -21,7 +21,7 @@ from sags_node.engine.decoder_block import (
     Workspace,
 )
 from sags_node.engine.dense import load_points, store_points
-from sags_node.engine.jit import kernel
+from sags_node.kernels.jit import kernel
 from sags_node.types import F32
 
 

@@ -26,7 +26,7 @@ from sags_node.engine.decoder_block import (
 )
 from sags_node.engine.decoder_nodes import Nodes
 from sags_node.engine.dense import store_points
-from sags_node.engine.jit import kernel, parallel_kernel, take
+from sags_node.kernels.jit import kernel, parallel_kernel, take
 from sags_node.types import F32, I64
 
 # Points: one piece is a block forward, or a group of blocks backward.

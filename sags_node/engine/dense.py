@@ -15,7 +15,7 @@ import numpy as np
 from numba import types
 from numba.extending import intrinsic
 
-from sags_node.engine.jit import inlined, kernel, round_to_even, scale_by_power_of_two
+from sags_node.kernels.jit import inlined, kernel, round_to_even, scale_by_power_of_two
 from sags_node.types import F32
 
 f4 = np.float32

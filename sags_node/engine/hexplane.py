@@ -18,8 +18,8 @@ import numpy as np
 
 from sags_node.engine import hexplane_kernels as kernels
 from sags_node.engine.hexplane_kernels import BLOCK, CHUNK, INNER, LANES, OUTER, RECORDS
-from sags_node.engine.jit import aligned, read_only
 from sags_node.errors import UsageError
+from sags_node.kernels.jit import aligned, read_only
 from sags_node.types import F32, I64
 
 

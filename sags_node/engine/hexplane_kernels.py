@@ -20,8 +20,8 @@ from typing import Any
 import numba
 import numpy as np
 
-from sags_node.engine.jit import inlined, kernel, parallel_kernel
 from sags_node.engine.lanes import make_add_lanes, read_input, write_output
+from sags_node.kernels.jit import inlined, kernel, parallel_kernel
 from sags_node.types import F32, I64, U8
 
 f4 = np.float32

@@ -7,9 +7,9 @@ from typing import Any
 import numba
 import numpy as np
 
-from sags_node.engine.jit import aligned, kernel, parallel_kernel, read_only
 from sags_node.engine.pieces import clear, load_frame, store
-from sags_node.engine.threads import thread_count
+from sags_node.kernels.jit import aligned, kernel, parallel_kernel, read_only
+from sags_node.kernels.threads import thread_count
 from sags_node.types import F32, Bool
 
 f4 = np.float32

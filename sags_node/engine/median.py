@@ -29,7 +29,7 @@ from sags_node.engine.compositing import (
     store,
     write_rows,
 )
-from sags_node.engine.jit import kernel, parallel_kernel, prefetch_read, take
+from sags_node.kernels.jit import kernel, parallel_kernel, prefetch_read, take
 from sags_node.types import F32, I32, I64
 
 f4 = np.float32

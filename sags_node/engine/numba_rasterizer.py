@@ -9,10 +9,10 @@ import numpy as np
 from sags_node.engine import binning, compositing, layout, median, pair_sums
 from sags_node.engine.compositing import TILE_HEIGHT, TILE_HEIGHT_BITS, TILE_WIDTH, TILE_WIDTH_BITS
 from sags_node.engine.interface import Gradients, Pinhole
-from sags_node.engine.jit import aligned, read_only
 from sags_node.engine.projector import Projector
-from sags_node.engine.threads import thread_count
 from sags_node.errors import SagsError
+from sags_node.kernels.jit import aligned, read_only
+from sags_node.kernels.threads import thread_count
 from sags_node.types import F32, I32, Bool, Gaussians
 
 MAX_PAIRS = 1 << 25  # 2 GiB of gradients

@@ -7,7 +7,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from sags_node.engine.jit import inlined, kernel, parallel_kernel, prefetch_read, take
+from sags_node.kernels.jit import inlined, kernel, parallel_kernel, prefetch_read, take
 from sags_node.types import F32, I64
 
 ZERO = np.float32(0.0)

@@ -23,10 +23,10 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from sags_node.engine import photometric_kernels as kernels
-from sags_node.engine.jit import aligned, read_only
 from sags_node.engine.smoothness import add_total_variation
 from sags_node.engine.ssim import Dissimilarity
-from sags_node.engine.threads import thread_count
+from sags_node.kernels.jit import aligned, read_only
+from sags_node.kernels.threads import thread_count
 from sags_node.types import F32, F64, Bool
 
 COVERED, DEPTH_COVERED = 0.05, 0.3  # least coverage with a meaning, normalised planes

@@ -7,8 +7,8 @@ from typing import Any
 import numba
 import numpy as np
 
-from sags_node.engine.jit import inlined, kernel, parallel_kernel
 from sags_node.engine.pieces import clear, load, load_frame, load_mask, store
+from sags_node.kernels.jit import inlined, kernel, parallel_kernel
 from sags_node.types import F32, Bool
 
 f4 = np.float32

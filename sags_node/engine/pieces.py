@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from sags_node.engine.jit import inlined
+from sags_node.kernels.jit import inlined
 from sags_node.types import F32, Bool
 
 u8 = np.uint64

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from sags_node.engine.jit import kernel
+from sags_node.kernels.jit import kernel
 from sags_node.types import F32, Camera
 
 

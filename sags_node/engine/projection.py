@@ -23,7 +23,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from sags_node.engine.jit import inlined, parallel_kernel, square_root
+from sags_node.kernels.jit import inlined, parallel_kernel, square_root
 from sags_node.types import F32
 
 f4 = np.float32

@@ -15,7 +15,6 @@ from typing import Any
 import numba
 import numpy as np
 
-from sags_node.engine.jit import inlined, kernel, parallel_kernel, square_root, take
 from sags_node.engine.projection import (
     BLOCK,
     HALF,
@@ -49,6 +48,7 @@ from sags_node.engine.projection import (
     to_camera,
     whitening,
 )
+from sags_node.kernels.jit import inlined, kernel, parallel_kernel, square_root, take
 from sags_node.types import F32, F64, I64
 
 f4 = np.float32

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from sags_node.engine import projection, projection_backward, smoothing, spherical_harmonics
 from sags_node.engine.interface import DILATION_VARIANCE, MIP_VARIANCE, Pinhole
-from sags_node.engine.jit import aligned, read_only
-from sags_node.engine.threads import thread_count
+from sags_node.kernels.jit import aligned, read_only
+from sags_node.kernels.threads import thread_count
 from sags_node.types import F32, F64, Gaussians
 
 SPARE = 1.25  # what is asked for beyond the need when memory grows

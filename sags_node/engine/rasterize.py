@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from sags_node.engine.compositing import TILE_HEIGHT, TILE_WIDTH
 from sags_node.engine.interface import Backend, Gradients, Pinhole, Rasterizer
-from sags_node.engine.jit import read_only
 from sags_node.engine.views import to_view
 from sags_node.errors import UsageError
+from sags_node.kernels.jit import read_only
 from sags_node.types import F32, I32, Bool, Camera, Gaussians, RenderedView
 
 SH_TERMS = (0, 3, 8, 15)  # spherical harmonics of degree 0 to 3 without the constant

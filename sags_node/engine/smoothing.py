@@ -20,7 +20,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from sags_node.engine.jit import inlined, parallel_kernel, read_only, square_root
+from sags_node.kernels.jit import inlined, parallel_kernel, read_only, square_root
 from sags_node.types import F32, Gaussians
 
 f4 = np.float32

@@ -23,8 +23,8 @@ from typing import Any
 import numba
 import numpy as np
 
-from sags_node.engine.jit import aligned, inlined, kernel, parallel_kernel, read_only
-from sags_node.engine.threads import thread_count
+from sags_node.kernels.jit import aligned, inlined, kernel, parallel_kernel, read_only
+from sags_node.kernels.threads import thread_count
 from sags_node.types import F32, I64
 
 f4 = np.float32

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from sags_node.engine.jit import aligned, parallel_kernel, read_only
+from sags_node.kernels.jit import aligned, parallel_kernel, read_only
 from sags_node.types import F32, Camera, RenderedView
 
 f4 = np.float32

@@ -10,12 +10,12 @@ from types import TracebackType
 from typing import Any, Literal, Self
 
 from sags_node.config import LaunchConfig, V4l2Source
-from sags_node.engine.threads import configure_threads
 from sags_node.errors import SagsError, UsageError
 from sags_node.evaluation.gallery import Picture
 from sags_node.evaluation.measure import FrameRow, Measurer, Options, Progress
 from sags_node.evaluation.spool import Spool
 from sags_node.evaluation.summary import GROUPS, summarise
+from sags_node.kernels.threads import configure_threads
 from sags_node.launch_file import load_launch
 from sags_node.mapping.budget import make_budget
 from sags_node.mapping.devices import affordable, device_of

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from sags_node.engine.jit import inlined, kernel
 from sags_node.geometry import invert
+from sags_node.kernels.jit import inlined, kernel
 from sags_node.types import F32, F64, Camera
 
 ROUNDS = 8

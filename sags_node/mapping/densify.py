@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numba import prange
 
-from sags_node.engine.jit import inlined, kernel, parallel_kernel
 from sags_node.engine.pinhole import pack, to_camera, to_pixel
+from sags_node.kernels.jit import inlined, kernel, parallel_kernel
 from sags_node.mapping.initialise import nearest_depth
 from sags_node.model.gaussians import GaussianModel
 from sags_node.types import F32, I32, Bool, Observation

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sags_node.engine.jit import kernel
+from sags_node.kernels.jit import kernel
 from sags_node.types import F32, Bool
 
 EVERY = 8  # px

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numba import prange
 
-from sags_node.engine.jit import kernel, parallel_kernel
 from sags_node.engine.rasterize import TILE_HEIGHT, TILE_WIDTH
+from sags_node.kernels.jit import kernel, parallel_kernel
 from sags_node.types import F32, U8, Bool
 
 EVERY = 2  # px: a quarter of the pixels tells enough

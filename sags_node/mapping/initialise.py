@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from sags_node.engine.jit import kernel
 from sags_node.geometry import unproject
+from sags_node.kernels.jit import kernel
 from sags_node.model.alias_free import smoothing_variances
 from sags_node.model.gaussians import GaussianModel
 from sags_node.types import F32, I32, Observation

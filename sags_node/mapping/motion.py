@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numba import prange
 
-from sags_node.engine.jit import inlined, kernel, parallel_kernel
 from sags_node.engine.pinhole import pack, to_camera, to_pixel
+from sags_node.kernels.jit import inlined, kernel, parallel_kernel
 from sags_node.types import F32, U8, Bool, Observation, RenderedView
 
 DEPTH_GATE = 0.13  # of the depth: a larger innovation is another surface, not this one

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numba import prange
 
-from sags_node.engine.jit import kernel, parallel_kernel
 from sags_node.engine.rasterize import Gradients
+from sags_node.kernels.jit import kernel, parallel_kernel
 from sags_node.model.gaussians import ADAM_PARAMETERS, GaussianModel
 from sags_node.types import F32, Camera
 

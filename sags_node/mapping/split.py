@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numba import prange
 
-from sags_node.engine.jit import kernel, parallel_kernel
 from sags_node.engine.pinhole import pack, to_camera, to_pixel
 from sags_node.geometry import quat_to_matrix
+from sags_node.kernels.jit import kernel, parallel_kernel
 from sags_node.mapping.densify import mean_contribution
 from sags_node.model.gaussians import GaussianModel
 from sags_node.types import F32, I64, Bool, Observation, RenderedView

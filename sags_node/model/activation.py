@@ -8,7 +8,7 @@ import numpy as np
 from numba import prange
 
 from sags_node.engine.interface import Gradients
-from sags_node.engine.jit import parallel_kernel, read_only
+from sags_node.kernels.jit import parallel_kernel, read_only
 from sags_node.model import columns
 from sags_node.types import F32, I64, Gaussians
 

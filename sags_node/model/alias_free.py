@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numba import prange
 
-from sags_node.engine.jit import kernel, parallel_kernel
 from sags_node.engine.pinhole import pack, to_camera, to_pixel
+from sags_node.kernels.jit import kernel, parallel_kernel
 from sags_node.types import F32, Camera
 
 FILTER_VARIANCE = 0.2  # of the squared sampling interval

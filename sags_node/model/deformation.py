@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numba import prange
 
-from sags_node.engine.jit import inlined, kernel, parallel_kernel
+from sags_node.kernels.jit import inlined, kernel, parallel_kernel
 from sags_node.model.gaussians import NEIGHBOURS, GaussianModel
 from sags_node.types import F32, I32
 

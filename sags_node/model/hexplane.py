@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from sags_node.engine.adam import AdamState
 from sags_node.engine.hexplane import FieldGradients, Grid, HexPlane, Moment
 from sags_node.engine.hexplane_kernels import INNER, OUTER
-from sags_node.engine.jit import aligned
 from sags_node.errors import SagsError, UsageError
+from sags_node.kernels.jit import aligned
 from sags_node.types import F32, F64, I64
 
 MAX_BYTES = 1 << 28  # of the cells; their optimiser's state takes twice as much again, their gradients once

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from sags_node.engine.adam import AdamState, adam_step
-from sags_node.engine.jit import aligned
 from sags_node.errors import SagsError
+from sags_node.kernels.jit import aligned
 from sags_node.model import columns
 from sags_node.types import F32, I64, Bool
 

@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 from numba import prange
 
-from sags_node.engine.jit import inlined, kernel, parallel_kernel, read_only, square_root, stack_floats
 from sags_node.engine.projection import rotation
+from sags_node.kernels.jit import inlined, kernel, parallel_kernel, read_only, square_root, stack_floats
 from sags_node.model import columns
 from sags_node.types import F32, I32
 

@@ -42,7 +42,7 @@ from numba.extending import intrinsic
 from numba.np.arrayobj import populate_array
 from numpy.typing import DTypeLike, NDArray
 
-from sags_node.engine import threads  # noqa: F401  (fixes the threading layer before the first kernel)
+from sags_node.kernels import threads  # noqa: F401  (fixes the threading layer before the first kernel)
 
 # Not "fast": that also promises the absence of NaN and infinity, and comparisons must reject those here.
 _FASTMATH = {"reassoc", "contract", "arcp", "nsz", "afn"}

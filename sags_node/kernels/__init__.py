@@ -1,0 +1,1 @@
+"""What every compiled kernel of the package stands on: its compiler's options and its threads."""
