@@ -22,6 +22,7 @@ from sags_node.node import Node
 from sags_node.session import open_session
 from sags_node.sources import v4l2
 from sags_node.sources.device import Picture
+from sags_node.warm_up import warm_up
 
 pytestmark = pytest.mark.live
 
@@ -62,6 +63,7 @@ def test_a_node_whose_publishing_fails_ends_with_that_error(
     monkeypatch.setattr(Publisher, "publish_result", fail)
     overrides = ["source.pace:=step", f"publish.run_dir:={tmp_path / 'run'}", *FREE_PORTS]
     session = open_session(SESSION, [*overrides, "mapping.max_gaussians:=2000"])
+    warm_up(session.config)  # compiles, once on a machine
     node = Node(session.config, session.rig, session.source)
     node.start()
     try:
