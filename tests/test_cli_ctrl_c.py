@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import signal
 import threading
@@ -13,6 +14,7 @@ import pytest
 from click.testing import CliRunner
 from command_line import start, stopped, wait_for
 
+from sags_node.apps import terminal
 from sags_node.apps.terminal import interrupt, on_stop_signals
 from sags_node.cli import main
 
@@ -89,6 +91,22 @@ def test_a_ctrl_c_in_a_finaliser_comes_through_after_it() -> None:
         with pytest.raises(KeyboardInterrupt):
             Binding()
             time.sleep(10)
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_an_import_that_hangs_is_broken_off_in_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "hanging.py").write_text(
+        "import signal, time\nsignal.raise_signal(signal.SIGINT)\ntime.sleep(10)\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(terminal, "LONGEST_WAIT", 0.1)
+    before = signal.signal(signal.SIGINT, interrupt)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            importlib.import_module("hanging")
     finally:
         signal.signal(signal.SIGINT, before)
 

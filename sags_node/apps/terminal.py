@@ -7,6 +7,7 @@ import signal
 import sys
 import tempfile
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,6 +24,7 @@ from sags_node.errors import SagsError
 WIDE = 200  # columns of a table that goes to a file or another program, and so is not cut to a screen
 
 LOOK_AGAIN = 0.02  # s until a Ctrl-C that could not come through is tried again
+LONGEST_WAIT = 10.0  # s, after which it is tried whatever becomes of it
 _IMPORT = "<frozen importlib._bootstrap>"  # where the frames of an import are
 
 console = Console(stderr=True, highlight=False)
@@ -79,20 +81,37 @@ def check_file(file: Path) -> None:
             file.open("r+b").close()
 
 
-def interrupt(number: int, frame: FrameType | None) -> None:
+class _Interrupt:
     """Handler of Ctrl-C: `KeyboardInterrupt`, as soon as it can come through.
 
     In the middle of an import it may come out of C code as an `ImportError`; a finaliser loses it.
     """
-    while frame is not None:
-        if frame.f_code.co_filename == _IMPORT or frame.f_code.co_name == "__del__":
+
+    def __init__(self) -> None:
+        self._waits_until: float | None = None
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        now = time.monotonic()
+        if _loses_exceptions(frame) and (self._waits_until is None or now < self._waits_until):
+            self._waits_until = self._waits_until or now + LONGEST_WAIT
             # To this thread, the main one: it may be waiting by then, and must wake.
             again = threading.Timer(LOOK_AGAIN, signal.pthread_kill, (threading.get_ident(), number))
             again.daemon = True
             again.start()
             return
+        self._waits_until = None
+        raise KeyboardInterrupt
+
+
+def _loses_exceptions(frame: FrameType | None) -> bool:
+    while frame is not None:
+        if frame.f_code.co_filename == _IMPORT or frame.f_code.co_name == "__del__":
+            return True
         frame = frame.f_back
-    raise KeyboardInterrupt
+    return False
+
+
+interrupt = _Interrupt()
 
 
 def on_stop_signals(stop: Callable[[], None]) -> None:

@@ -80,7 +80,7 @@ def measure_crowd(launch: Sequence[str], alone: float, crowded: float, many: int
 @contextmanager
 def _node(launch: Sequence[str], folder: Path) -> Iterator[subprocess.Popen[bytes]]:
     command = [sys.executable, "-m", "sags_node", "run", *launch, *PHASE, f"publish.run_dir:={folder}"]
-    with tempfile.TemporaryFile("w+") as errors:  # a pipe that is full would stop the node
+    with tempfile.TemporaryFile("w+", errors="replace") as errors:  # a pipe that is full would stop the node
         node = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=errors)
         try:
             deadline = time.monotonic() + STARTING

@@ -178,7 +178,9 @@ class _Child:
             raise SagsError("path and topics cannot hold a zero character")
         self.folder = folder
         self.has_ring = has_ring
-        self._errors = tempfile.TemporaryFile("w+")  # a pipe that is full would stop the child
+        self._errors = tempfile.TemporaryFile(
+            "w+", errors="replace"
+        )  # a pipe that is full would stop the child
         self._lines: SimpleQueue[str | None] = SimpleQueue()  # None: there will be no more
         pipe = subprocess.PIPE
         try:

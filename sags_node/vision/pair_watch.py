@@ -28,7 +28,7 @@ CLEARLY_BETTER = 0.2  # of a match the wrong way round, against the best the rig
 _MENDS = {
     "black": "see to the light, the lens cap and the cable",
     "white": "lower the light or the exposure",
-    "of one colour": "see to the cable and the capture card",
+    "of one colour": "see to the lens, the cable and the capture card",
 }
 
 
