@@ -2,6 +2,7 @@
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
+PIP := $(BIN)/pip install -q --disable-pip-version-check -c constraints.txt
 STAMP := $(VENV)/.installed
 # Shared libraries that Open3D needs and its wheel does not bring.
 DEBIAN := libusb-1.0-0 libgl1 libegl1 libgomp1 libx11-6
@@ -10,7 +11,7 @@ DEBIAN_TESTS := chromium g++ cmake pkg-config cppzmq-dev libmsgpack-cxx-dev
 missing = $(shell for p in $(1); do dpkg -s $$p >/dev/null 2>&1 || echo $$p; done)
 apt_install = apt-get update -qq && apt-get install -y -qq --no-install-recommends $(1) >/dev/null
 
-.PHONY: setup run test computed test-tools lint golden clean
+.PHONY: setup run test computed test-targets test-tools lint golden clean
 
 setup: $(STAMP)
 
@@ -21,9 +22,12 @@ $(STAMP): pyproject.toml constraints.txt
 	       echo "  sudo apt-get install --no-install-recommends $(call missing,$(DEBIAN))"; exit 1; fi; fi
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "Python 3.11 or newer is needed: make PYTHON=/path/to/python3.11"; exit 1; }
-	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install -q --disable-pip-version-check -c constraints.txt torch
-	$(BIN)/pip install -q --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	@echo "Installing Python packages into $(VENV): a minute or two, by the network"
+	@$(PYTHON) -m venv $(VENV)
+	@$(PIP) torch uv
+	@# uv takes a fifth of pip's time; it does not know pip's configuration, so where it fails pip goes on.
+	@$(BIN)/uv pip install -q --python $(BIN)/python -c constraints.txt -e '.[dev]' || \
+	  { echo "uv could not; pip goes on"; $(PIP) -e '.[dev]'; }
 	@touch $@
 
 # A live session of the built-in phantom, published and consumed over real sockets, and a report in out/demo.
@@ -37,6 +41,10 @@ test: setup test-tools
 
 computed: setup
 	$(BIN)/python -m pytest -m 'not live' -n 2 --dist loadfile
+
+# The kernels' tests for other processors than this one, on one and on two threads: a quarter of an hour.
+test-targets: setup
+	$(BIN)/python tests/targets.py
 
 # Tests whose tools are missing are skipped, and say so.
 test-tools:

@@ -75,6 +75,9 @@ for command in (
     show_default=True,
     help="How many times slower than in --check's table is too slow.",
 )
+@file_option(
+    "--yardstick", "FILE.cpp", "Only compare the rasteriser with this C++ program, call by call; needs g++."
+)
 @as_json
 def bench_kernels(
     device: str,
@@ -85,6 +88,7 @@ def bench_kernels(
     out: Path | None,
     check: Path | None,
     tolerance: float,
+    yardstick: Path | None,
     json_out: bool,
 ) -> None:
     """Time every kernel of the engine beside the machine's peak.
@@ -101,11 +105,17 @@ def bench_kernels(
     sags bench kernels --out benchmarks/results/kernels.json
     sags bench kernels --check benchmarks/results/kernels.json
     sags bench kernels --device cuda --out gpu.json
+    sags bench kernels --yardstick splat.cpp
     """
     from sags_node.benchmark import check as guard
     from sags_node.benchmark import device_report, report
 
     on_gpu = device == "cuda"
+    if yardstick is not None:
+        if on_gpu or large or contention or no_twin or check is not None:
+            raise UsageError("with --yardstick give --quick, --out and --json only")
+        _compare_with(yardstick, quick, out, json_out)
+        return
     if on_gpu and (large or contention or no_twin):
         raise UsageError("--large, --contention and --no-twin are about the CPU's table; leave them out")
     if check is not None and out is not None:
@@ -168,6 +178,19 @@ def _device_kernels(quick: bool, checks: bool) -> Measure:
     settings = device_kernels.QUICK if quick else device_kernels.DeviceSettings()
     settings = replace(settings, gsplat=not checks)
     return lambda advance: device_kernels.measure_device_kernels(settings, advance)
+
+
+def _compare_with(yardstick: Path, quick: bool, out: Path | None, json_out: bool) -> None:
+    from sags_node.benchmark import report
+    from sags_node.benchmark.yardstick import QUICK, YardstickSettings, measure_yardstick
+
+    if not yardstick.is_file():
+        raise UsageError(f"there is no file {yardstick}; --yardstick takes the C++ program to compare with")
+    check_files(out)
+    with progress("measuring") as advance:
+        measured = measure_yardstick(yardstick, QUICK if quick else YardstickSettings(), advance)
+    show(measured if json_out else report.yardstick_table(measured))
+    write_json(out, measured)
 
 
 @bench.command("alias")

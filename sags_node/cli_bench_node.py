@@ -27,7 +27,11 @@ if TYPE_CHECKING:
 
 @click.command("pareto")
 @click.argument("launch", nargs=-1, metavar="[LAUNCH.yaml | SESSION]... [key:=value ...]")
-@click.option("--only", metavar="PARTS", help="Some of budgets,resolutions,gaussians,skips.")
+@click.option(
+    "--only",
+    metavar="PARTS",
+    help="Some of budgets,resolutions,gaussians,skips (all by default), rungs, hosts.",
+)
 @click.option("--frames", type=click.IntRange(1), help="Of each recording; default: all.")
 @click.option(
     "--repeat",
@@ -66,6 +70,11 @@ def bench_pareto(
 
     A smaller working size is measured at that size, and once more at the launch file's, for which its
     Gaussians are drawn there: the figure to compare. Takes three to five seconds per frame.
+
+    The part rungs is each rung of the ladder of quality, with one step a frame: its price, and what it gives.
+    The part hosts plays live, sockets included: with the machine for itself; on one of its cores; beside a
+    busy process, the overlay, a reader of everything and the viewer (with a browser, where there is one). How
+    many frames it shows after the first second, in which time and how well.
 
     \b
     sags bench pareto launch/d4d_pull.yaml launch/phantom.yaml source.start:=2 --frames 50 \\

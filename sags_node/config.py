@@ -305,8 +305,13 @@ class EngineConfig(Section):
 class MappingConfig(Section):
     budget_ms: float = Field(33.0, gt=0, description="wall time of one frame, all stages")
     iterations: int | None = Field(None, ge=0, description="fixed steps per frame instead of the budget")
+    rung: int | None = Field(
+        None,
+        ge=0,
+        description="of the ladder of quality, 0 the cheapest; default: what the machine affords",
+    )
     max_gaussians: int | None = Field(
-        None, ge=100, le=2_000_000, description="default: as many as two cores refine within the budget"
+        None, ge=100, le=2_000_000, description="default: as many as the machine refines within the budget"
     )
     right_eye: bool = Field(
         False,
@@ -315,7 +320,7 @@ class MappingConfig(Section):
     )
     smoothing: bool = Field(True, description="the 3D filter of Mip-Splatting: nothing finer than was seen")
     skip_duplicates: bool = Field(True, description="a frame equal to its predecessor is not mapped again")
-    skip_depth: bool = Field(True, description="when time is short, match depth in every other frame only")
+    skip_depth: bool = Field(True, description="when time is short, match depth in some of the frames only")
     skip_fitted: bool = Field(True, description="when time is short, refine where it fits worst only")
     skip_still: bool = Field(True, description="while nothing moves: no matching, a step where it pays most")
 

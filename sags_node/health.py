@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sags_node.types import FrameResult, NodeHealth, ViewStatus
+from sags_node.types import FrameResult, NodeHealth, RungState, ViewStatus
 
 WAITING_AFTER = 1.0  # s without a frame
 WINDOW = 150  # frames behind the published rates and latencies
@@ -27,6 +27,7 @@ class Statistics:
         self._stages: dict[str, deque[float]] = {}
         self._skipped: dict[str, int] = {}
         self._gaussians = 0
+        self._rung: RungState | None = None
         self._started = False
 
     def add(self, result: FrameResult, latency_ms: float) -> None:
@@ -39,6 +40,7 @@ class Statistics:
             for what in result.skipped:
                 self._skipped[what] = self._skipped.get(what, 0) + 1
             self._gaussians = len(result.snapshot.gaussians)
+            self._rung = result.rung
 
     def forget_rate(self) -> None:
         """After a pause the time without frames says nothing."""
@@ -88,6 +90,7 @@ class Statistics:
                 warnings=warnings,
                 connections=connections,
                 views=views,
+                rung=self._rung,
             )
 
 

@@ -30,7 +30,6 @@ from sags_node.health import Statistics
 from sags_node.kernels.threads import configure_threads
 from sags_node.latest import Latest
 from sags_node.launch_file import with_parameters
-from sags_node.mapping.budget import make_budget
 from sags_node.messaging import content
 from sags_node.messaging.masks import MaskSubscriber
 from sags_node.messaging.publisher import Publisher
@@ -83,7 +82,7 @@ class Node:
         else:
             self._pipeline = Pipeline(config, rig)
         self._pictures: Latest[tuple[RectifiedPair, int]] = Latest(on_put=self._wake_publishing)  # and epoch
-        self._budget = make_budget(config.mapping)
+        self._budget = self._pipeline.make_budget()
         self._live = isinstance(config.source, V4l2Source) or config.source.pace == "realtime"
         self._wake = os.eventfd(0, os.EFD_NONBLOCK)
         self._frames: Latest[tuple[StereoFrame, float]] = Latest()  # and when it came
@@ -323,7 +322,7 @@ class Node:
             )
         self.config = with_parameters(self.config, args)
         self._pipeline.reconfigure(self.config)
-        self._budget = make_budget(self.config.mapping)
+        self._budget = self._pipeline.make_budget(self._budget.speed)
         self._parameters_changed.set()
         return self.config.model_dump(mode="json")
 

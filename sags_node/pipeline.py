@@ -14,8 +14,8 @@ from sags_node.engine.rasterize import to_view
 from sags_node.mapping.anchors import Anchors
 from sags_node.mapping.budget import Budget
 from sags_node.mapping.camera_tracker import CameraTracker
-from sags_node.mapping.devices import affordable, make_refiner
-from sags_node.mapping.mapper import Mapper
+from sags_node.mapping.devices import affordable, make_budget, make_refiner
+from sags_node.mapping.mapper import Mapped, Mapper
 from sags_node.types import (
     F32,
     NO_TIME,
@@ -26,11 +26,10 @@ from sags_node.types import (
     Observation,
     RectifiedPair,
     RenderedView,
-    Snapshot,
     StereoFrame,
     StereoRig,
 )
-from sags_node.vision.change import StillScene
+from sags_node.vision.change import StillScene, rms_difference
 from sags_node.vision.observe import observe
 from sags_node.vision.onnx_depth import NetworkDepth
 from sags_node.vision.pair_watch import PairWatch
@@ -119,16 +118,23 @@ class Pipeline:
         self._config = config
         self.mapper.pace(config.mapping.budget_ms >= UNHURRIED_MS)
 
+    def make_budget(self, speed: float | None = None) -> Budget:
+        """What frames get, by the configuration and how long this machine takes (`Ladder.speed`); None: it is
+        measured now, which takes less than a tenth of a second."""
+        camera = self.rectifier.camera
+        return make_budget(self._config, camera.width, camera.height, speed)
+
     def process(self, frame: StereoFrame, budget: Budget, waited: float = 0.0) -> FrameResult:
         """Everything that happens to one frame, `waited` seconds after it came."""
         budget.start(waited)
+        rung = budget.state
         watch = Stopwatch()
         with watch("rectify"):
             pair = self._placed(frame)
         self._eyes(frame, pair)
         self._on_rectified(pair, self._epoch(frame))
         if self._mapped is not None and self._config.mapping.skip_duplicates:
-            if _rms_difference(pair, self._mapped.pair) < DUPLICATE_RMS:
+            if rms_difference(pair, self._mapped.pair) < DUPLICATE_RMS:
                 anchors = self.anchors.at(pair.t_capture_ns)
                 return _repeat(self._mapped, pair, self._epoch(frame), watch.timings_ms, anchors)
         still = self._still_frames(pair)
@@ -159,20 +165,22 @@ class Pipeline:
             if not tracked and self._mapped is not None:
                 return self._held(self._mapped, pair, observation, self._epoch(frame), watch.timings_ms)
         with watch("map"):
-            snapshot = self.mapper.update(observation, budget, still)
-        with watch("render"):
-            views = self._draw_eyes(snapshot, pair.baseline)
-            self.mapper.drawn(observation, views["left"])
+            mapped = self.mapper.update(observation, budget, still)
+            snapshot = mapped.snapshot
             if self._tracker is not None:
-                self._tracker.mapped(observation, views["left"])
+                self._tracker.mapped(observation, mapped.view)
+        with watch("render"):
+            views = {"left": mapped.view}
+            if self._config.publish.right:
+                views["right"] = self._right_eye(mapped, pair.baseline)
         with watch("anchors"):
-            self.anchors.update(observation, snapshot, views["left"])
+            self.anchors.update(observation, snapshot, mapped.view)
             anchors = self.anchors.at(pair.t_capture_ns)
         if not still:  # which tells nothing of what a moving frame costs
-            budget.finish()
+            budget.finish(self.mapper.model.count)
         epoch = self._epoch(frame)
         self._mapped = FrameResult(
-            pair, observation, snapshot, views, epoch, watch.timings_ms, skipped, anchors
+            pair, observation, snapshot, views, epoch, watch.timings_ms, skipped, anchors, rung
         )
         return self._mapped
 
@@ -236,23 +244,18 @@ class Pipeline:
         """Grows with the source's epochs and with every new model: ids then mean other Gaussians."""
         return frame.epoch + self.mapper.restarts
 
-    def _draw_eyes(self, snapshot: Snapshot, baseline: float) -> dict[str, RenderedView]:
-        """The left eye is drawn last: the refiner looks at what it drew last."""
-        stale, before = self.mapper.stale_tiles, self._mapped
-        if before is not None and stale is not None and not stale.any():
-            return _restamped(before.views, snapshot.frame_id, snapshot.t_capture_ns)
-        if not self._config.publish.right:
-            return {"left": self._draw(snapshot, snapshot.camera, stale)}
-        right = self._draw(snapshot, snapshot.camera.moved_right(baseline))
-        return {"left": self._draw(snapshot, snapshot.camera), "right": right}
+    def _right_eye(self, mapped: Mapped, baseline: float) -> RenderedView:
+        """The model drawn for the right eye."""
+        before, stamp = self._mapped, mapped.view.t_capture_ns
+        if before is not None and "right" in before.views and before.views["left"].rgb is mapped.view.rgb:
+            return replace(before.views["right"], frame_id=mapped.view.frame_id, t_capture_ns=stamp)
+        camera = mapped.snapshot.camera.moved_right(baseline)
+        planes = self._refiner.show(mapped.snapshot.gaussians, camera)
+        return to_view(planes, camera, mapped.view.frame_id, stamp)
 
     def _draw_model(self, camera: Camera) -> RenderedView:
         """The model as it is now."""
         return to_view(self._refiner.show(self.mapper.model.gaussians(), camera), camera, 0, 0)
-
-    def _draw(self, snapshot: Snapshot, camera: Camera, tiles: Bool | None = None) -> RenderedView:
-        planes = self._refiner.show(snapshot.gaussians, camera, tiles)
-        return to_view(planes, camera, snapshot.frame_id, snapshot.t_capture_ns)
 
 
 class Stopwatch:
@@ -266,16 +269,6 @@ class Stopwatch:
         started = time.perf_counter()
         yield
         self.timings_ms[stage] = (time.perf_counter() - started) * 1e3
-
-
-def _rms_difference(a: RectifiedPair, b: RectifiedPair) -> float:
-    """Grey levels, over every eighth pixel of both eyes: enough to tell a repeated frame from a moved one."""
-    squares = [
-        np.mean(np.square(x[::8, ::8].astype(np.float32) - y[::8, ::8]))
-        for x, y in ((a.left, b.left), (a.right, b.right))
-        if x is not None and y is not None
-    ]
-    return float(np.sqrt(max(squares)))
 
 
 def _restamped(views: Mapping[str, RenderedView], frame_id: int, stamp: int) -> dict[str, RenderedView]:

@@ -19,6 +19,7 @@ Conventions
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -31,6 +32,8 @@ U8 = NDArray[np.uint8]
 I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
 Bool = NDArray[np.bool_]
+
+SH_DEGREE_0 = 0.5 / math.sqrt(math.pi)  # Y_00, the constant spherical harmonic: rgb = 0.5 + Y_00 f_dc
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,6 +122,14 @@ class StereoFrame:
 
 
 @dataclass(frozen=True, slots=True)
+class GrayPyramid:
+    """A gray picture, and smaller ones of it; see `vision.pyramid`."""
+
+    full: U8  # [H, W]
+    halves: tuple[F32, ...]  # grey levels 0..255; [k] has (H >> k + 1) x (W >> k + 1) px and a border around
+
+
+@dataclass(frozen=True, slots=True)
 class RectifiedPair:
     """Row-aligned, undistorted pictures at the working size."""
 
@@ -128,6 +139,7 @@ class RectifiedPair:
     baseline: float  # m
     left: U8  # [H, W, 3] RGB
     right: U8 | None  # [H, W, 3] RGB; None where the session has no right eye
+    gray: tuple[GrayPyramid, GrayPyramid | None] | None = None  # of both, where they are made already
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,6 +156,7 @@ class Observation:
     depth_confidence: F32  # [H, W] 0..1
     right: F32 | None = None  # [H, W, 3] RGB 0..1, the right eye, if the mapper is to learn from it
     baseline: float = 0.0  # m, to the right eye
+    pyramid: GrayPyramid | None = None  # of `gray`, where it is made already
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,6 +224,18 @@ class AnchorStates:
         return AnchorStates(np.empty(0, np.int64), empty(3), empty(2), empty(), empty(), empty())
 
 
+@dataclass(frozen=True, slots=True)
+class RungState:
+    """On which rung of the ladder of quality the frames are worked (`mapping.ladder`)."""
+
+    number: int  # 0: the cheapest
+    of: int  # how many there are
+    reason: str  # why it is that one
+    gaussians: int  # at most
+    scale: float  # of the working size, at which the model is drawn and refined
+    depth_every: int  # frames: how often depth is matched
+
+
 NO_TIME = "no time"  # why something was left out, in `FrameResult.skipped`
 
 
@@ -226,6 +251,7 @@ class FrameResult:
     timings_ms: Mapping[str, float]  # stage -> ms
     skipped: Mapping[str, str] = field(default_factory=dict)  # what was left out, and why
     anchors: AnchorStates = field(default_factory=AnchorStates.none)
+    rung: RungState | None = None  # None: fixed steps, no ladder
 
     @property
     def camera_lost(self) -> bool:
@@ -271,3 +297,4 @@ class NodeHealth:
     warnings: Mapping[str, str] = field(default_factory=dict)  # stage -> what is wrong and how to mend it
     connections: Mapping[str, Mapping[str, int]] = field(default_factory=dict)  # socket -> open, refused
     views: Mapping[str, ViewStatus] = field(default_factory=dict)  # those that consumers asked for, by name
+    rung: RungState | None = None  # None: fixed steps, or no frame yet

@@ -3,12 +3,17 @@
 import dataclasses
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+import pytest
+import torch
 from numpy.typing import NDArray
+from rounding import U, after, moved, roughly
 
+from sags_node.engine.interface import MAX_OPACITY
 from sags_node.engine.rasterize import Gradients, make_rasterizer
-from sags_node.types import F32, Camera, Gaussians
+from sags_node.types import F32, F64, Camera, Gaussians
 
 INPUTS = ("means", "quats", "scales", "opacities", "colors")
 DERIVATIVES = tuple(field.name for field in dataclasses.fields(Gradients))
@@ -104,6 +109,84 @@ def draw_and_differentiate(
     planes = rasterizer.forward(gaussians, views).copy()
     gradients = rasterizer.backward(*cotangents(views, seed))
     return planes, {name: getattr(gradients, name).copy() for name in DERIVATIVES}
+
+
+@dataclasses.dataclass(frozen=True)
+class Truth:
+    """What the float64 twin draws, and how near to it float32 must come."""
+
+    planes: F32  # [C, 5, H, W]
+    gradients: dict[str, NDArray[np.floating]]
+    off: F64  # [C, 5, H, W] how far values moved that were computed from inputs a little off
+    gradients_within: dict[str, float]  # of the norm of all values
+
+    def check(
+        self, planes: F32, gradients: dict[str, NDArray[np.floating]], names: Sequence[str] = DERIVATIVES
+    ) -> None:
+        np.testing.assert_allclose(planes, self.planes, rtol=0, atol=self.off.max(initial=0))
+        for name in names:
+            self.check_gradient(name, gradients[name])
+
+    def check_gradient(self, name: str, found: NDArray[np.floating], part: Any = ...) -> None:
+        assert found.shape == self.gradients[name].shape
+        error = np.linalg.norm(found[part] - self.gradients[name][part])
+        assert error <= self.gradients_within[name], name
+
+
+EXPONENTIAL = 2.7e-6  # relative error of `compositing`'s 2^x
+SUMMED = 60  # additions one after the other: the pixels of a tile's column, its columns, and tiles
+
+
+def truth(
+    gaussians: Gaussians,
+    views: Sequence[Camera],
+    seed: int = 0,
+    antialias: bool = True,
+    moves: int = 3,
+    given: tuple[F32, F32] | None = None,
+) -> Truth:
+    """Of a scene and `given` v_planes and weights; None: the random ones of `draw_and_differentiate`.
+
+    As `rounding.exact`: the twin draws `moves` times more from inputs that are a little off, with an
+    exponential that is off by `EXPONENTIAL`, anew for each pixel of each Gaussian or always the same way.
+    """
+    rasterizer = make_rasterizer("reference", views[0].width, views[0].height, antialias)
+
+    def draw(
+        gaussians: Gaussians, views: Sequence[Camera], v_planes: F32, weight: F32
+    ) -> tuple[F32, dict[str, NDArray[np.floating]]]:
+        planes = rasterizer.forward(gaussians, views).copy()
+        gradients = rasterizer.backward(v_planes, weight)
+        return planes, {name: getattr(gradients, name).copy() for name in DERIVATIVES}
+
+    given = given or cotangents(views, seed)
+    planes, gradients = draw(gaussians, views, *given)
+    off = np.zeros(planes.shape)
+    within = dict.fromkeys(gradients, 0.0)
+    for move in range(moves):
+        rng = np.random.default_rng([seed, move])
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(torch, "exp", roughly(torch.exp, rng, EXPONENTIAL))
+            near, near_gradients = draw(
+                _moved_gaussians(gaussians, rng),
+                [Camera(v.width, v.height, moved(v.K, rng), moved(v.T_world_cam, rng)) for v in views],
+                *(moved(array, rng) for array in given),
+            )
+        off = np.maximum(off, np.abs(near - planes))
+        for name, values in gradients.items():
+            within[name] = max(within[name], float(np.linalg.norm(near_gradients[name] - values)))
+    for name, values in gradients.items():
+        within[name] += (EXPONENTIAL + after(SUMMED)) * float(np.linalg.norm(values))
+    if len(gaussians):
+        # what is behind a splat comes by subtraction from all that a pixel shows, and is divided by 1 - alpha
+        shown = np.linalg.norm((given[0] * planes).sum(1))
+        within["opacities"] += U * float(shown) / (1 - min(gaussians.opacities.max(), MAX_OPACITY))
+    return Truth(planes, gradients, off + EXPONENTIAL * np.abs(planes).max(initial=0), within)
+
+
+def _moved_gaussians(gaussians: Gaussians, rng: np.random.Generator) -> Gaussians:
+    names = (*INPUTS, "sh_rest", "smoothing")
+    return dataclasses.replace(gaussians, **{name: moved(getattr(gaussians, name), rng) for name in names})
 
 
 def relative_error(found: NDArray[np.floating], true: NDArray[np.floating]) -> float:

@@ -1,52 +1,50 @@
-"""How long a frame is refined and how many Gaussians are afforded, on a clock that only the tests move."""
+"""What a frame gets while its time lasts, on a clock that only the tests move."""
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from sags_node.config import MappingConfig
+from sags_node.config import LaunchConfig, MappingConfig
 from sags_node.launch_file import with_parameters
 from sags_node.mapping.budget import (
-    GAUSSIANS_PER_MS,
-    LEAST_SHARE,
-    MOST_PARTLY,
-    PIXELS_PER_GAUSSIAN,
+    FIRST_SECONDS,
+    LEAST_FIRST_STEPS,
+    WHOLE_EVERY,
     StepBudget,
     TimeBudget,
-    capacity,
-    make_budget,
 )
-from sags_node.mapping.densify import SHED
+from sags_node.mapping.devices import make_budget
+from sags_node.mapping.ladder import FULL, Ladder, Rung
 from sags_node.pipeline import Pipeline
 from sags_node.session import open_session
 
 BUDGET, PERIOD = 0.033, 1 / 30  # s
+USUAL = Rung(10_000)
 SESSION = Path(__file__).parent.parent / "replay/phantom_pull"
 
 
 @dataclass
 class Machine:
-    """Frames on a made-up clock: `before`, the first step and `after` must be, depth every other time, what a
-    first step on the whole picture costs more (`rest`) where there is time, and further steps may be."""
+    """Frames on a made-up clock, on one rung: `before`, the first step and `after` must be, depth as often as
+    the rung says, and further steps may be."""
 
+    rung: Rung = USUAL
     seconds: float = BUDGET
     before: float = 0.010
     depth: float = 0.0
     step: float = 0.004
-    rest: float = 0.0
     after: float = 0.005
     now: float = 0.0
     budget: TimeBudget = field(init=False)
-    matched: list[bool] = field(default_factory=list)  # whether there was time for depth, frame by frame
-    whole: list[bool] = field(default_factory=list)  # and for a first step on the whole picture
+    matched: list[bool] = field(default_factory=list)  # whether depth was, frame by frame
+    shares: list[float] = field(default_factory=list)  # of the picture, in the first step
 
     def __post_init__(self) -> None:
-        self.budget = TimeBudget(self.seconds, clock=lambda: self.now)
+        self.budget = TimeBudget(Ladder((self.rung,), FULL, self.seconds), clock=lambda: self.now)
 
     def frame(self, waited: float = 0.0, spike: str = "") -> tuple[int, float]:
         """One frame, in the named part of which another process takes 80 ms: its steps and its time, s."""
@@ -59,11 +57,10 @@ class Machine:
         while self.budget.more():
             steps += 1
             if steps == 1:
-                self.whole.append(self.budget.affords_whole())
-                self.now += self.rest * self.whole[-1]
+                self.shares.append(self.budget.first_share())
             self.now += self.step + 0.080 * (spike == "step" and steps == 2)
         self.now += self.after + 0.080 * (spike == "after")
-        self.budget.finish()
+        self.budget.finish(8000)
         return steps, self.now - started
 
     def play(self, frames: int, spike_at: int = -1, spike: str = "") -> list[tuple[int, int, float]]:
@@ -106,26 +103,10 @@ def test_a_first_frame_that_never_asks_teaches_nothing() -> None:
     fresh, machine = Machine(), Machine()
     machine.budget.start()
     machine.now += 1.0
-    machine.budget.finish()
-    assert machine.budget.share == 1.0
+    machine.budget.finish(8000)
+    assert machine.budget.speed == fresh.budget.speed
     for _ in range(3):
         assert machine.frame()[0] == fresh.frame()[0] > 1
-
-
-def test_two_frames_in_a_row_are_never_without_depth_whatever_came_of_the_first() -> None:
-    machine = Machine(before=0.050)
-    for _ in range(5):
-        machine.budget.start()
-        machine.budget.affords_depth()
-        machine.now += machine.before
-        machine.budget.more()
-        machine.budget.finish()
-    answers = []
-    for _ in range(6):
-        machine.budget.start()
-        answers.append(machine.budget.affords_depth())
-        machine.budget.finish()  # no step was asked for: there was no model to refine
-    assert set(itertools.pairwise(answers)) == {(True, False), (False, True)}
 
 
 def test_the_time_that_a_frame_waited_is_gone() -> None:
@@ -148,7 +129,6 @@ def test_one_spike_delays_no_frame_for_long_and_leaves_no_trace(part: str) -> No
     late = [number for number, _, age in done[spiked + 1 :] if age > PERIOD]
     assert len(late) <= 2, late
     assert done[-1][1] == usual, [steps for _, steps, _ in done]
-    assert machine.budget.share == 1.0
 
 
 def test_under_lasting_overload_every_newest_frame_is_taken_without_waiting_longer_and_longer() -> None:
@@ -158,88 +138,49 @@ def test_under_lasting_overload_every_newest_frame_is_taken_without_waiting_long
     assert {steps for _, steps, _ in done[1:]} == {1}
 
 
-def test_depth_is_matched_where_it_fits_else_in_every_other_frame_and_again_when_it_fits() -> None:
-    machine = Machine(before=0.010, depth=0.008)
+def test_depth_is_matched_as_often_as_the_rung_says_and_a_frame_later_where_one_is_late() -> None:
+    machine = Machine(Rung(10_000, depth_every=2), depth=0.008)
     machine.play(20)
-    assert all(machine.matched)
-    machine.before = 0.020  # 37 ms with depth, 29 without
+    assert machine.matched == [True, False] * 10
     machine.matched.clear()
-    done = machine.play(60)
-    assert 28 <= sum(machine.matched) <= 40
-    assert all(any(pair) for pair in zip(machine.matched, machine.matched[1:], strict=False))
-    assert np.median([age for _, _, age in done[20:]]) < PERIOD + machine.depth
-    machine.before = 0.010
-    machine.play(30)
-    assert all(machine.matched[-10:])
+    for waited in (0.0, 0.030, 0.030, 0.0, 0.0, 0.0):
+        machine.frame(waited)
+    assert machine.matched == [True, False, False, True, False, True]
 
 
-def test_the_first_step_is_on_the_whole_picture_where_that_fits_and_again_when_it_fits() -> None:
-    machine = Machine(before=0.015, rest=0.006)
-    machine.play(20)
-    assert all(machine.whole[5:])
-    machine.before = 0.021  # 36 ms with all of it, 30 without
-    machine.whole.clear()
-    done = machine.play(60)
-    assert sum(machine.whole) < 20  # it is tried now and then, as a further step is
-    assert np.mean([age for _, _, age in done[10:]]) < 0.035
-    machine.before = 0.015
-    machine.play(30)
-    assert all(machine.whole[-10:])
-
-
-def test_a_machine_that_is_always_late_still_steps_on_the_whole_picture_now_and_then() -> None:
+def test_a_rung_with_steps_on_part_of_the_picture_has_one_on_all_of_it_now_and_then() -> None:
     """Else nobody knows which Gaussians show, and the model loses 0.14 dB in 1000 frames."""
-    machine = Machine(before=0.050, rest=0.006)
-    machine.play(200)
-    between = np.diff(np.flatnonzero(machine.whole))
-    assert len(between) > 5 and set(between[1:]) == {MOST_PARTLY + 1}
+    machine = Machine(Rung(10_000, step=0.6))
+    machine.play(100)
+    whole = np.flatnonzero(np.array(machine.shares) == 1)
+    assert set(machine.shares) == {0.6, 1.0} and set(np.diff(whole)) == {WHOLE_EVERY}
+    steps = StepBudget(1, Rung(10_000, step=0.6))
+    shares = []
+    for _ in range(3 * WHOLE_EVERY):
+        steps.start()
+        shares.append(steps.first_share())
+    assert shares.count(1.0) == 3
 
 
-def test_the_rule_that_leaves_out_what_fits_can_be_switched_off() -> None:
-    machine = Machine(before=0.050, rest=0.006)
-    machine.budget = TimeBudget(BUDGET, skip_fitted=False, clock=lambda: machine.now)
-    machine.play(20)
-    assert all(machine.whole)
-
-
-@pytest.mark.parametrize("floor", [0.004, 0.030])
-def test_the_share_falls_to_what_fits_and_recovers(floor: float) -> None:
-    """A frame costs `floor` and up to 20 ms for the Gaussians, which are shed as fast as the mapper does."""
-    machine = Machine(seconds=0.025, after=0.003)
-    gaussians, shares = 1.0, []
-
-    def play(frames: int, slowness: float) -> None:
-        nonlocal gaussians
-        for _ in range(frames):
-            gaussians = max(min(gaussians, machine.budget.share), gaussians * (1 - SHED))
-            machine.before = slowness * (floor + 0.017 * gaussians)
-            machine.step = slowness * 0.003 * gaussians
-            machine.frame()
-            shares.append(machine.budget.share)
-
-    play(400, slowness=1.0)
-    if floor < 0.025:
-        fits = (0.025 - 0.003 - floor) / 0.020
-        assert LEAST_SHARE < 0.9 * fits < gaussians <= 1.02 * fits, (gaussians, fits)
-    else:  # nothing fits: it goes no lower than that
-        assert gaussians == pytest.approx(LEAST_SHARE)
-    settled = shares[-100:]
-    assert max(settled) - min(settled) < 0.05
-    play(600, slowness=0.4)
-    assert machine.budget.share == 1.0
-
-
-def test_capacity_follows_budget_and_picture_but_never_beats_what_is_asked_for() -> None:
-    assert capacity(MappingConfig(budget_ms=20), 4000, 4000) == GAUSSIANS_PER_MS * 20
-    assert capacity(MappingConfig(budget_ms=1000), 300, 200) == 300 * 200 // PIXELS_PER_GAUSSIAN
-    assert capacity(MappingConfig(budget_ms=0.01), 64, 64) == 100
-    assert capacity(MappingConfig(budget_ms=20, max_gaussians=777), 4000, 4000) == 777
+def test_a_new_model_gets_its_first_steps_in_one_frame_or_leaves_them_to_the_next() -> None:
+    """30 steps of a slow machine would keep the first picture back for a second."""
+    for cost, expected in ((0.030, 1 + int(FIRST_SECONDS / 0.030)), (0.5, LEAST_FIRST_STEPS)):
+        machine, steps = Machine(), 0
+        machine.budget.start()
+        while machine.budget.more_at_first(steps):
+            steps += 1
+            machine.now += cost
+        assert steps == expected
+    assert all(StepBudget(1).more_at_first(steps) for steps in range(30))
 
 
 def test_fixed_steps_go_before_time() -> None:
-    steps = make_budget(MappingConfig(iterations=2, budget_ms=1))
-    assert [steps.more() for _ in range(4)] == [True, True, False, False] and steps.share == 1.0
-    assert isinstance(make_budget(MappingConfig(budget_ms=1)), TimeBudget)
+    def budget(**mapping: object) -> object:
+        return make_budget(LaunchConfig(mapping=MappingConfig.model_validate(mapping)), 640, 512, 1.0)
+
+    steps, timed = budget(iterations=2, budget_ms=1), budget(budget_ms=1)
+    assert isinstance(steps, StepBudget) and isinstance(timed, TimeBudget)
+    assert [steps.more() for _ in range(4)] == [True, True, False, False]
 
 
 def test_a_budget_that_is_changed_while_running_is_as_if_it_had_been_so() -> None:

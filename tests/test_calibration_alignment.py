@@ -20,13 +20,13 @@ from sags_node.sources.pictures import read_picture
 from sags_node.types import F32, U8, Bool, StereoFrame, StereoRig
 from sags_node.vision.alignment import FEWEST_FIELDS, WINDOW, RowMonitor
 from sags_node.vision.matchers import InverseSearch
+from sags_node.vision.pyramid import gray_pyramid
 from sags_node.vision.rectify import Rectifier
 from sags_node.vision.row_error import measure_rows
 
 SIZE = 640, 512
-MATCHING = 320, 256
 DISPARITIES = 8.0, 60.0  # px at the matching size
-Field = tuple[F32, Bool]
+Field = tuple[F32, Bool, int]  # row errors, where they are known, and the width of the picture they are of
 SESSION = Path(__file__).parent.parent / "replay/phantom_pull"
 
 
@@ -42,11 +42,8 @@ def rectified(session: Path, degrees: tuple[float, float, float]) -> tuple[U8, U
 
 
 def field(session: Path, degrees: tuple[float, float, float]) -> Field:
-    gray = [
-        cv2.resize(cv2.cvtColor(eye, cv2.COLOR_RGB2GRAY), MATCHING) for eye in rectified(session, degrees)
-    ]
-    _, row_error, known = InverseSearch(*DISPARITIES, MATCHING)(*gray)
-    return row_error, known
+    patches = InverseSearch(*DISPARITIES, halvings=1)(*map(gray_pyramid, rectified(session, degrees)))
+    return patches.field[..., 1], patches.good, SIZE[0] // 2
 
 
 def monitor_after(fields: Field, count: int = FEWEST_FIELDS) -> RowMonitor:
@@ -80,9 +77,9 @@ def test_an_eye_turned_about_its_axis(phantom_session: Path) -> None:
 
 @pytest.mark.parametrize("degrees", [0.6, 1.0])
 def test_an_eye_turned_beyond_what_can_be_matched(phantom_session: Path, degrees: float) -> None:
-    row_error, known = field(phantom_session, (degrees, 0, 0))
+    row_error, known, width = field(phantom_session, (degrees, 0, 0))
     assert known.mean() < 0.2  # the scene is what the test is for
-    alignment = monitor_after((row_error, known)).alignment
+    alignment = monitor_after((row_error, known, width)).alignment
     assert alignment is not None and alignment.warning
 
 
@@ -106,7 +103,7 @@ def test_slow_and_robust(phantom_session: Path) -> None:
 
 def flat(pixels: float) -> Field:
     """The same row error everywhere; px of the working size."""
-    return np.full((256, 320), pixels / 2, np.float32), np.ones((256, 320), np.bool_)
+    return np.full((256, 320), pixels / 2, np.float32), np.ones((256, 320), np.bool_), SIZE[0] // 2
 
 
 def test_a_warning_does_not_flicker() -> None:
@@ -120,7 +117,7 @@ def test_a_warning_does_not_flicker() -> None:
 
 def test_pictures_without_any_match_say_nothing_of_spread() -> None:
     noise = np.random.default_rng(0).normal(0, 1, (256, 320)).astype(np.float32)
-    alignment = monitor_after((noise, np.zeros((256, 320), np.bool_))).alignment
+    alignment = monitor_after((noise, np.zeros((256, 320), np.bool_), SIZE[0] // 2)).alignment
     assert alignment is not None and alignment.spread == 0 and alignment.warning == ""
 
 

@@ -16,6 +16,7 @@ from sags_node.apps.calib_pictures import pairs_of_files
 from sags_node.calibration import Finding, check_rig, load_rig, read_rig, rectify_eyes, save_rig
 from sags_node.calibration.check import size_made_for
 from sags_node.calibration.matches import match_eyes
+from sags_node.calibration.rows import rectified_rows
 from sags_node.cli import main
 from sags_node.errors import SagsError
 from sags_node.sources.pictures import read_picture
@@ -103,8 +104,13 @@ def test_a_right_calibration_passes(subject: tuple[StereoRig, Pairs]) -> None:
 
 
 def test_rows_of_a_real_unrectified_pair(f7: tuple[StereoRig, Pairs]) -> None:
-    front, rows = check_pictures(*f7)
-    assert rows.figures["row_median_px"] < 0.5 and rows.figures["row_p90_px"] < 1
+    """This rig's rows are off by 1.5 px at the top of the picture, and agree in its middle. Features, found
+    without the dense search, say so too: to half a pixel, since there are few of them at the edges."""
+    rig, pairs = f7
+    front, rows = check_pictures(rig, pairs)
+    features = rectified_rows(rig, match_eyes(*pairs[0]))
+    assert rows.figures["row_median_px"] == pytest.approx(features.median, abs=0.5)
+    assert rows.figures["row_p90_px"] == pytest.approx(features.p90, abs=0.5)
     assert rows.figures["matched"] > 0.4
     assert front.figures["row_error_median_px"] < 0.5
     assert 0.05 < front.figures["depth_median_m"] < 0.09

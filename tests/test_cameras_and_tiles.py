@@ -11,12 +11,14 @@ import numpy as np
 import pytest
 from engine_scenes import (
     DERIVATIVES,
+    EXPONENTIAL,
     camera,
     cotangents,
     random_gaussians,
-    relative_error,
+    truth,
     with_view_dependence,
 )
+from rounding import after
 
 from sags_node import geometry
 from sags_node.engine import numba_rasterizer, projector
@@ -62,16 +64,19 @@ def test_cameras_together_draw_what_each_draws_alone() -> None:
     planes = together.forward(gaussians, CAMERAS)
     both = together.backward(v_planes, weight)
     sums: dict[str, Any] = dict.fromkeys(DERIVATIVES, 0.0)
+    sizes = dict.fromkeys(DERIVATIVES, 0.0)
     for c, view in enumerate(CAMERAS):
         alone = new_rasterizer()
         np.testing.assert_array_equal(alone.forward(gaussians, [view])[0], planes[c])
         assert planes[c, 4].mean() > 0.3
         found = alone.backward(v_planes[c : c + 1], weight[c : c + 1])
         for name in set(DERIVATIVES) - {"poses"}:
-            sums[name] = sums[name] + getattr(found, name)
+            sums[name] = sums[name] + getattr(found, name).astype(np.float64)
+            sizes[name] += float(np.linalg.norm(getattr(found, name)))
         np.testing.assert_array_equal(found.poses[0], both.poses[c])
     for name in set(DERIVATIVES) - {"poses"}:
-        assert relative_error(getattr(both, name), sums[name]) < 1e-6, name
+        error = np.linalg.norm(getattr(both, name) - sums[name])
+        assert error <= after(2 * len(CAMERAS)) * sizes[name], name
 
 
 def test_cameras_of_one_rasterizer_may_become_more_and_fewer() -> None:
@@ -115,16 +120,15 @@ def test_active_tiles_are_those_of_the_whole_drawing(seed: int) -> None:
 
 def test_tiles_agree_with_the_twin() -> None:
     gaussians = scene(80)
-    tiles, _ = some_tiles(3)
-    pictures, gradients = [], []
-    for backend in ("numba", "reference"):
-        rasterizer = new_rasterizer(backend)
-        rasterizer.forward(random_gaussians(9, 30, LEFT), CAMERAS)
-        pictures.append(rasterizer.forward(gaussians, CAMERAS, tiles).copy())
-        gradients.append(copies(rasterizer.backward(*cotangents(CAMERAS, 0))))
-    np.testing.assert_allclose(pictures[0], pictures[1], atol=1e-5)
-    for name in DERIVATIVES:
-        assert relative_error(gradients[0][name], gradients[1][name]) < 1e-4, name
+    tiles, drawn = some_tiles(3)
+    v_planes, weight = cotangents(CAMERAS, 0)
+    rasterizer = new_rasterizer()
+    rasterizer.forward(random_gaussians(9, 30, LEFT), CAMERAS)
+    planes = rasterizer.forward(gaussians, CAMERAS, tiles).copy()
+    asked = np.where(drawn[:, None], v_planes, 0), np.where(drawn, weight, 0)
+    true = truth(gaussians, CAMERAS, given=asked)
+    planes = np.where(drawn[:, None], planes, true.planes)  # elsewhere is what was there before
+    true.check(planes, copies(rasterizer.backward(v_planes, weight)))
 
 
 def test_without_active_tiles_nothing_happens() -> None:
@@ -167,7 +171,8 @@ def test_nothing_to_draw_for_several_cameras(backend: str) -> None:
 
 
 def test_median_agrees_with_the_twin() -> None:
-    """A pixel whose transmittance passes 1/2 by less than rounding may name the next Gaussian: a few may."""
+    """A pixel whose transmittance passes 1/2 by less than rounding may name the next Gaussian: transmittances
+    are off by 1e-5 of themselves, so this is one pixel in 100,000."""
     gaussians = scene()
     results = []
     for backend in ("numba", "reference"):
@@ -176,9 +181,9 @@ def test_median_agrees_with_the_twin() -> None:
         results.append(rasterizer.median())
     (depths, rows), (true_depths, true_rows) = results
     assert 0.2 < (true_rows >= 0).mean() < 0.99
-    assert (rows != true_rows).mean() < 1e-3
+    assert np.count_nonzero(rows != true_rows) <= 2
     same = rows == true_rows
-    np.testing.assert_allclose(depths[same], true_depths[same], rtol=1e-6)
+    np.testing.assert_allclose(depths[same], true_depths[same], rtol=after(8))
     assert not depths[rows < 0].any()
 
 
@@ -194,7 +199,7 @@ def test_median_is_the_surface_that_is_seen() -> None:
         rasterizer.forward(two, [TURNED])
         depths, rows = rasterizer.median()
         assert rows[0, 38, 50] == row
-        assert depths[0, 38, 50] == pytest.approx([0.05, 0.08][row], rel=1e-5)
+        assert depths[0, 38, 50] == pytest.approx([0.05, 0.08][row], rel=after(8))
 
 
 def test_median_leaves_the_other_tiles_alone() -> None:
@@ -272,7 +277,8 @@ def test_a_crowd_in_one_corner(corner: tuple[float, float]) -> None:
     planes = new_rasterizer().forward(gaussians, [LEFT]).copy()
     assert planes[0, 4].max() > 0.99
     true = new_rasterizer("reference").forward(gaussians, [LEFT])
-    np.testing.assert_allclose(planes, true, atol=3e-4)
+    # a tile stops at a transmittance of 1e-4
+    np.testing.assert_allclose(planes, true, rtol=0, atol=1e-4 + 2 * EXPONENTIAL)
     order = np.random.default_rng(5).permutation(2000)
     shuffled = Gaussians(
         *(

@@ -11,6 +11,7 @@ import test_losses
 import test_photometric
 import torch
 from engine_scenes import relative_error
+from rounding import after, exact
 from test_photometric import ALL, OFF, TERMS
 
 pytest.importorskip("triton", reason="Triton comes with torch's CUDA builds, or by `pip install triton`")
@@ -20,9 +21,11 @@ from sags_node.engine.cuda import photometric as photometric_loss
 from sags_node.engine.cuda.backend import default_device
 from sags_node.engine.cuda.photometric import PhotometricLoss
 from sags_node.engine.cuda.ssim import Dissimilarity
+from sags_node.engine.losses import COVERED
 from sags_node.engine.photometric import LossTerms, LossWeights
+from sags_node.engine.pieces import PIECE
 from sags_node.engine.rasterize import TILE_HEIGHT, TILE_WIDTH
-from sags_node.mapping.focus import EVERY, LEAST_COVERAGE, worst_tiles
+from sags_node.mapping.focus import EVERY, worst_tiles
 from sags_node.types import F32, Bool
 
 # the kernels divide by a coverage of zero and select afterwards; a GPU says nothing of it
@@ -71,10 +74,11 @@ def test_tissue_loss_is_the_cpu_engines() -> None:
     inputs = test_losses.frame()
     expected, v_expected, expected_weight = test_losses.run(inputs)
     mean, v_planes, weight = tissue_loss(inputs)
-    assert mean == pytest.approx(expected, rel=1e-6)
-    for plane in range(5):
-        assert relative_error(v_planes[plane], v_expected[plane]) < 1e-6, plane
-    np.testing.assert_allclose(weight, expected_weight, rtol=1e-6)
+    assert mean == pytest.approx(expected, rel=2 * after(3 * PIECE))
+    for plane, true in enumerate(exact(test_losses.twin, inputs)):
+        true.check(v_planes[plane], plane)
+        true.check(v_expected[plane], plane)
+    np.testing.assert_allclose(weight, expected_weight, rtol=after(2))
 
 
 def test_tissue_loss_of_the_right_eye_counts_less() -> None:
@@ -83,8 +87,8 @@ def test_tissue_loss_of_the_right_eye_counts_less() -> None:
     mean, v_planes, weight = tissue_loss(inputs)
     shared_mean, v_shared, shared_weight = tissue_loss(inputs, share=0.3)
     assert shared_mean == mean
-    assert relative_error(v_shared, 0.3 * v_planes) < 1e-6
-    np.testing.assert_allclose(shared_weight, 0.3 * weight, rtol=1e-6)
+    assert relative_error(v_shared, 0.3 * v_planes) < after(8)  # the factor comes first or last
+    np.testing.assert_allclose(shared_weight, 0.3 * weight, rtol=after(4))
 
 
 @pytest.mark.parametrize("where", ["image", "depth", 0, 3, 4])
@@ -95,9 +99,10 @@ def test_tissue_loss_leaves_broken_pixels_out(where: str | int, value: float) ->
     (inputs["planes"][where] if isinstance(where, int) else inputs[where])[4, 5] = value
     expected, v_expected, expected_weight = test_losses.run(inputs)
     mean, v_planes, weight = tissue_loss(inputs)
-    assert mean == pytest.approx(expected, rel=1e-6)
-    np.testing.assert_allclose(v_planes, v_expected, rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(weight, expected_weight, rtol=1e-6)
+    assert mean == pytest.approx(expected, rel=2 * after(3 * PIECE))
+    for plane, true in enumerate(exact(test_losses.twin, test_losses.frame())):
+        np.testing.assert_allclose(v_planes[plane], v_expected[plane], rtol=0, atol=2 * true.within)
+    np.testing.assert_allclose(weight, expected_weight, rtol=after(2))
 
 
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (1, losses.BLOCK), (losses.BLOCK + 1, 1)])
@@ -116,8 +121,10 @@ def test_tissue_loss_of_every_size(height: int, width: int) -> None:
     scales = {"depth_weight": test_losses.DEPTH_WEIGHT, "depth_scale": test_losses.DEPTH_SCALE}
     expected = test_losses.tissue_loss(**inputs, v_planes=v_expected, weight=expected_weight, **scales)
     mean, v_planes, _ = tissue_loss(inputs)
-    assert mean == pytest.approx(expected, rel=1e-6)
-    assert relative_error(v_planes, v_expected) < 1e-6
+    assert mean == pytest.approx(expected, rel=2 * after(3 * PIECE))
+    for plane, true in enumerate(exact(test_losses.twin, inputs)):
+        true.check(v_planes[plane], plane)
+        true.check(v_expected[plane], plane)
 
 
 def test_no_tissue_no_loss() -> None:
@@ -137,25 +144,17 @@ def test_photometric_loss_is_the_stated_one(normalised: bool) -> None:
     """All terms together, each heavy enough to be seen in the gradient."""
     inputs = test_photometric.frame(*SMALL)
     terms, v_planes, _ = photometric(inputs, ALL, normalised)
-    planes, expected = test_photometric.twin(inputs, normalised)
-    for name in TERMS:
-        assert getattr(terms, name) == pytest.approx(expected[name].item(), rel=1e-5), name
-    (gradient,) = torch.autograd.grad(sum(getattr(ALL, name) * expected[name] for name in TERMS), planes)
-    for plane in range(5):
-        assert relative_error(v_planes[plane], gradient[plane].numpy()) < 1e-4, plane
+    for name, true in test_photometric.exact_terms(inputs, normalised, TERMS).items():
+        true.check(getattr(terms, name), name)
+    test_photometric.check(inputs, ALL, normalised, TERMS, terms.total(ALL), v_planes)
 
 
 @pytest.mark.parametrize("name", TERMS)
 def test_gradient_of_each_term(name: str) -> None:
     inputs = test_photometric.frame(*SMALL)
-    _, v_planes, _ = photometric(inputs, replace(OFF, **{name: 1.0}))
-    planes, expected = test_photometric.twin(inputs, True)
-    (gradient,) = torch.autograd.grad(expected[name], planes)
-    for plane, true in enumerate(gradient.numpy()):
-        if true.any():
-            assert relative_error(v_planes[plane], true) < 1e-4, plane
-        else:
-            assert not v_planes[plane].any(), plane
+    weights = replace(OFF, **{name: 1.0})
+    terms, v_planes, _ = photometric(inputs, weights)
+    test_photometric.check(inputs, weights, True, [name], getattr(terms, name), v_planes)
 
 
 def test_photometric_loss_is_the_cpu_engines_over_many_programs(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -163,11 +162,16 @@ def test_photometric_loss_is_the_cpu_engines_over_many_programs(monkeypatch: pyt
     monkeypatch.setattr(photometric_loss, "PROGRAMS", 2)
     inputs = test_photometric.frame(50, 53) | {"unseen": None}
     weights = replace(ALL, similarity=0.0)
-    expected, v_expected, expected_weight = test_photometric.run(inputs, weights)
-    terms, v_planes, weight = photometric(inputs, weights)
-    np.testing.assert_allclose(astuple(terms), astuple(expected), rtol=1e-6)
-    assert relative_error(v_planes, v_expected) < 1e-4
-    np.testing.assert_allclose(weight, expected_weight, rtol=1e-6)
+    everywhere = inputs | {"unseen": np.ones((50, 53), np.bool_)}
+    true_terms = test_photometric.exact_terms(everywhere, True, TERMS)
+    for loss in (photometric, test_photometric.run):
+        terms, v_planes, weight = loss(inputs, weights)
+        for name, true in true_terms.items():
+            if getattr(weights, name) != 0:
+                true.check(getattr(terms, name), name)
+        test_photometric.check(everywhere, weights, True, TERMS, terms.total(weights), v_planes)
+        counts = weight != 0
+        np.testing.assert_allclose(weight[counts], 1 / inputs["planes"][4][counts], rtol=after(2))
 
 
 @pytest.mark.parametrize(
@@ -180,9 +184,12 @@ def test_photometric_loss_leaves_broken_pixels_out(where: str | int, value: floa
     (inputs["planes"][where] if isinstance(where, int) else inputs[where])[4, 5] = value
     expected, v_expected, expected_weight = test_photometric.run(inputs, ALL)
     terms, v_planes, weight = photometric(inputs, ALL)
-    np.testing.assert_allclose(astuple(terms), astuple(expected), rtol=1e-5)
-    assert relative_error(v_planes, v_expected) < 1e-4
-    np.testing.assert_allclose(weight, expected_weight, rtol=1e-6)
+    clean = test_photometric.frame(9, 13)
+    for name, true in test_photometric.exact_terms(clean, True, TERMS).items():
+        assert getattr(terms, name) == pytest.approx(getattr(expected, name), abs=2 * true.within), name
+    for plane, true in enumerate(test_photometric.exact_gradients(clean, ALL, True, TERMS)[1:]):
+        assert np.linalg.norm(v_planes[plane] - v_expected[plane]) <= 2 * true.within, plane
+    np.testing.assert_allclose(weight, expected_weight, rtol=after(2))
 
 
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (1, 2), (2, 1), (3, 70), (17, 4)])
@@ -192,10 +199,13 @@ def test_photometric_loss_of_every_size(height: int, width: int) -> None:
     inputs["tissue"][:] = True
     inputs["planes"][4] += np.float32(0.5)
     weights = replace(ALL, correlation=0.0)  # of one pixel, or two, there is none
-    expected, v_expected, _ = test_photometric.run(inputs, weights)
-    terms, v_planes, _ = photometric(inputs, weights)
-    np.testing.assert_allclose(astuple(terms), astuple(expected), rtol=1e-5, atol=1e-5)
-    assert relative_error(v_planes, v_expected) < 1e-4
+    names = [name for name in TERMS if name != "correlation"]
+    true_terms = test_photometric.exact_terms(inputs, True, names)
+    for loss in (photometric, test_photometric.run):
+        terms, v_planes, _ = loss(inputs, weights)
+        for name, true in true_terms.items():
+            true.check(getattr(terms, name), name)
+        test_photometric.check(inputs, weights, True, names, terms.total(weights), v_planes)
 
 
 def test_losses_give_the_same_bits_again() -> None:
@@ -229,7 +239,7 @@ def tile_scene() -> tuple[F32, F32, Bool]:
 
 def chosen(scene: tuple[F32, F32, Bool], share: float) -> Bool:
     given = [torch.tensor(array, device=DEVICE) for array in scene]
-    tiles = focus.worst_tiles(*given, share, every=EVERY, least_coverage=LEAST_COVERAGE)
+    tiles = focus.worst_tiles(*given, share, every=EVERY, least_coverage=float(COVERED))
     found: Bool = tiles.cpu().numpy()
     return found
 

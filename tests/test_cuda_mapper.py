@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import cv2
@@ -18,14 +19,14 @@ from sags_node.calibration import rectified_rig
 from sags_node.config import LaunchConfig, MappingConfig
 from sags_node.engine.cuda.rasterizer import CudaRasterizer
 from sags_node.engine.device import DeviceMemoryError
-from sags_node.engine.rasterize import make_rasterizer, to_view
+from sags_node.engine.rasterize import make_rasterizer
 from sags_node.errors import UsageError
 from sags_node.mapping import cuda_refiner, densify, exposure, guarded_refiner, mapper
 from sags_node.mapping.anchors import Anchors
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.cuda_refiner import REFINED, CudaRefiner
 from sags_node.mapping.guarded_refiner import LOWERED, GuardedRefiner
-from sags_node.mapping.mapper import HURRIED_SHARE, Mapper
+from sags_node.mapping.mapper import Mapper
 from sags_node.mapping.optimiser import Rates
 from sags_node.mapping.refiner import CpuRefiner, Refiner
 from sags_node.pipeline import Pipeline
@@ -45,7 +46,7 @@ CUDA_ERROR = RuntimeError("CUDA error: an illegal memory access was encountered\
 
 @pytest.fixture(autouse=True)
 def small_mapper(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mapper, "INITIAL_STEPS", 1)
+    monkeypatch.setattr(mapper, "FIRST_STEPS", 1)
     monkeypatch.setattr(mapper, "CONTROL_NODES", 8)
     monkeypatch.setattr(exposure, "LEAST_PIXELS", 8)
     rule = replace(cuda_refiner.EXPOSURE, least_pixels=8)
@@ -94,11 +95,8 @@ class Played:
         return cls(refiner, Mapper(refiner, capacity))
 
     def take(self, observation: Observation, steps: int = 1, still: int = 0) -> tuple[Snapshot, RenderedView]:
-        snapshot = self.mapper.update(observation, started(StepBudget(steps)), still)
-        planes = self.refiner.show(snapshot.gaussians, snapshot.camera, self.mapper.stale_tiles)
-        view = to_view(planes, snapshot.camera, snapshot.frame_id, snapshot.t_capture_ns)
-        self.mapper.drawn(observation, view)
-        return snapshot, view
+        mapped = self.mapper.update(observation, started(StepBudget(steps)), still)
+        return mapped.snapshot, mapped.view
 
     def row(self, name: str) -> np.ndarray:
         return np.array(getattr(self.mapper.model, name))
@@ -110,11 +108,11 @@ def started(budget: Any) -> Any:
 
 
 def on_cpu(capacity: int = CAPACITY) -> Played:
-    return Played.on(CpuRefiner(make_rasterizer("numba", WIDTH, HEIGHT)), capacity)
+    return Played.on(CpuRefiner(partial(make_rasterizer, "numba")), capacity)
 
 
 def on_device(capacity: int = CAPACITY) -> Played:
-    return Played.on(CudaRefiner(WIDTH, HEIGHT), capacity)
+    return Played.on(CudaRefiner(), capacity)
 
 
 # ---- the same as on the CPU --------------------------------------------------------------------------------
@@ -157,7 +155,7 @@ def test_a_step_is_the_cpus(right: bool) -> None:
 
 
 def test_a_hurried_step_is_the_cpus(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mapper, "INITIAL_STEPS", 0)
+    monkeypatch.setattr(mapper, "FIRST_STEPS", 0)
     both = on_cpu(), on_device()
     for played in both:
         played.mapper.update(frame(0), StepBudget(0))
@@ -165,7 +163,7 @@ def test_a_hurried_step_is_the_cpus(monkeypatch: pytest.MonkeyPatch) -> None:
         played.mapper.model.contribution[:] = 7.0
         colors = played.row("colors").copy()
         played.refiner.take(slice(0, played.mapper.model.count))
-        played.refiner.refine(Rates(), HURRIED_SHARE)
+        played.refiner.refine(Rates(), 0.6)
         played.refiner.give_back()
     assert_same_rows(*both)
     assert (both[1].row("contribution") == 7.0).all()
@@ -229,20 +227,18 @@ def test_still_frames_touch_the_same_tiles() -> None:
     for played in (on_cpu(), on_device()):
         played.take(frame(0))
         played.take(frame(0), steps=1, still=1)
-        stale = played.mapper.stale_tiles
-        assert stale is not None and 0 < stale.sum()
-        found.append((stale, played.refiner.touched()))
-    assert found[0][1].sum() == 1
+        found.append(played.refiner.touched())
+    assert found[0].sum() == 1
     np.testing.assert_array_equal(found[1], found[0])
 
 
 def test_a_still_frame_that_rests_changes_nothing() -> None:
     played = on_device()
     played.take(frame(0))
-    before = played.row("means")
-    snapshot, _ = played.take(frame(0), steps=0, still=1)
+    before, shown = played.row("means"), played.take(frame(0), steps=0, still=1)[1]
+    snapshot, view = played.take(frame(0), steps=0, still=2)
     assert snapshot.counts["iterations"] == 0 and np.array_equal(before, played.row("means"))
-    assert played.mapper.stale_tiles is not None and not played.mapper.stale_tiles.any()
+    assert view.rgb is shown.rgb  # it was not drawn anew
 
 
 def test_a_cut_begins_a_new_model_on_the_device() -> None:
@@ -313,8 +309,8 @@ def test_tissue_that_comes_into_view_gets_nodes_on_the_device_too() -> None:
 
 
 def guarded(cpu_share: float = 0.5) -> Played:
-    cpu = CpuRefiner(make_rasterizer("numba", WIDTH, HEIGHT))
-    return Played.on(GuardedRefiner(CudaRefiner(WIDTH, HEIGHT), cpu, cpu_share))
+    cpu = CpuRefiner(partial(make_rasterizer, "numba"))
+    return Played.on(GuardedRefiner(CudaRefiner(), cpu, cpu_share))
 
 
 @dataclass
@@ -342,7 +338,7 @@ class Fault:
 FAULTS = [
     (CudaRasterizer, "draw", 1), (CudaRasterizer, "draw", 2), (CudaRasterizer, "pull_back", 2),
     (CudaRefiner, "begin", 1), (CudaRefiner, "take", 2), (CudaRefiner, "give_back", 1),
-    (CudaRefiner, "show", 1),
+    (CudaRefiner, "redraw", 1),
 ]  # fmt: skip
 
 

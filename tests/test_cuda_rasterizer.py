@@ -21,15 +21,17 @@ from engine_scenes import (
     random_gaussians,
     relative_error,
     rows,
+    truth,
     with_filter,
     with_view_dependence,
 )
+from rounding import after
 
 from sags_node import geometry
 from sags_node.engine.interface import MAX_OPACITY, NEAR_PLANE, Pinhole
 from sags_node.engine.rasterize import TILE_HEIGHT, TILE_WIDTH, Rasterizer, make_rasterizer
 from sags_node.errors import SagsError, UsageError
-from sags_node.mapping.optimiser import COLOUR_DAMPING, COLOUR_RELAXATION, MIN_CONTRIBUTION
+from sags_node.mapping.optimiser import COLOR_RANGE, COLOUR_DAMPING, COLOUR_RELAXATION, MIN_CONTRIBUTION
 from sags_node.types import Bool, Camera, Gaussians
 
 pytest.importorskip("triton", reason="Triton comes with torch's CUDA builds, or by `pip install triton`")
@@ -69,18 +71,13 @@ def copies(gradients: Any) -> dict[str, Any]:
 def assert_agrees(
     gaussians: Gaussians,
     views: list[Camera],
-    planes_within: float = 5e-6,
-    gradients_within: float = 2e-5,
     **options: Any,
 ) -> dict[str, Any]:
     """Planes, and gradients of a random cotangent, against the float64 twin."""
     planes, found = draw_and_differentiate(gaussians, views, "cuda", **options)
-    true_planes, true = draw_and_differentiate(gaussians, views, "reference", **options)
-    assert true_planes[:, 4].max() > 0.05  # there is something to see
-    np.testing.assert_allclose(planes, true_planes, atol=planes_within)
-    for name in DERIVATIVES:
-        error = np.linalg.norm(found[name] - true[name])
-        assert error <= gradients_within * np.linalg.norm(true[name]), (name, error)
+    true = truth(gaussians, views, **options)
+    assert true.planes[:, 4].max() > 0.05  # there is something to see
+    true.check(planes, found)
     return found
 
 
@@ -104,12 +101,10 @@ def test_agrees_with_the_float64_twin(degree: int, filtered: bool, antialias: bo
 def test_agrees_with_the_cpu_engine_on_a_larger_scene() -> None:
     view = camera(width=64, height=48, focal=80.0)
     gaussians = with_filter(random_gaussians(4, 110, view, spread=0.7))
-    planes, found = draw_and_differentiate(gaussians, [view], "cuda")
-    expected, true = draw_and_differentiate(gaussians, [view], "numba")
-    assert expected[0, 4].mean() > 0.3
-    np.testing.assert_allclose(planes, expected, atol=2e-5)
-    for name in PER_GAUSSIAN:
-        assert np.linalg.norm(found[name] - true[name]) <= 5e-5 * np.linalg.norm(true[name]), name
+    true = truth(gaussians, [view])
+    assert true.planes[0, 4].mean() > 0.3
+    for backend in ("cuda", "numba"):
+        true.check(*draw_and_differentiate(gaussians, [view], backend))
 
 
 def test_a_jacobian_held_within_the_frustum() -> None:
@@ -121,7 +116,7 @@ def test_a_jacobian_held_within_the_frustum() -> None:
         means=geometry.unproject(EYES[0], pixels, rng.uniform(0.05, 0.09, 6)).astype(np.float32),
         scales=rng.uniform(0.02, 0.05, (6, 3)).astype(np.float32),
     )
-    assert_agrees(gaussians, EYES[:1], planes_within=1e-5)
+    assert_agrees(gaussians, EYES[:1])
 
 
 def test_scales_from_a_vanishing_dot_to_a_wall() -> None:
@@ -133,13 +128,12 @@ def test_scales_from_a_vanishing_dot_to_a_wall() -> None:
     )
     for scene in (gaussians, dataclasses.replace(gaussians, smoothing=0.01 * sizes**2)):
         planes, found = draw_and_differentiate(scene, [view], "cuda")
-        expected, true = draw_and_differentiate(scene, [view], "reference")
-        assert expected[0, 4].max() > 0.05
-        np.testing.assert_allclose(planes, expected, atol=2e-5)
+        true = truth(scene, [view])
+        assert true.planes[0, 4].max() > 0.05
+        np.testing.assert_allclose(planes, true.planes, rtol=0, atol=true.off.max())
         for name in ("colors", "contribution", "opacities", "means", "scales", "quats"):
-            for row in range(6):
-                error = np.linalg.norm(found[name][row] - true[name][row])
-                assert error <= 5e-4 * np.linalg.norm(true[name][row]), (name, row)
+            for row in range(6):  # the gradients of a dot are far larger than those of a wall
+                true.check_gradient(name, found[name], row)
 
 
 @pytest.mark.parametrize("filtered", [False, True])
@@ -153,28 +147,26 @@ def test_flat_as_paper_and_thin_as_a_thread(filtered: bool) -> None:
         opacities=np.full(8, 0.97, np.float32),
         smoothing=np.full(8, 1e-12, np.float32) if filtered else None,
     )
-    assert_agrees(gaussians, [VIEW], planes_within=2e-5, gradients_within=1e-3)
+    assert_agrees(gaussians, [VIEW])
 
 
 def test_opacities_from_nothing_to_everything() -> None:
     opacities = np.array([1e-6, 1 / 255, 0.0045, 0.5, 0.9985, 0.9995, 1 - 1e-6, 1.0], np.float32)
     gaussians = dataclasses.replace(random_gaussians(5, 8, VIEW, spread=2.0), opacities=opacities)
-    found = assert_agrees(gaussians, [VIEW], planes_within=1e-5, gradients_within=1e-4)
+    found = assert_agrees(gaussians, [VIEW])
     assert not any(found[name][:2].any() for name in PER_GAUSSIAN)
     wall, _ = draw_and_differentiate(one_gaussian(np.array([0, 0, 0.07]), 1.0, 1.0), [VIEW], "cuda")
-    assert wall[0, 4].max() == pytest.approx(MAX_OPACITY, abs=1e-6)
+    assert wall[0, 4].max() == pytest.approx(MAX_OPACITY, rel=after(8))
 
 
 def test_quaternions_of_any_length_are_the_same_turn() -> None:
     gaussians = with_filter(random_gaussians(8, 8, VIEW))
     unit = gaussians.quats / np.linalg.norm(gaussians.quats, axis=1)[:, None]
     lengths = np.array([1e-11, 1e-6, 1e-3, 1, 1e3, 1e6, 1e15, 7], np.float32)
-    expected, true = draw_and_differentiate(dataclasses.replace(gaussians, quats=unit), [VIEW], "cuda")
+    true = truth(dataclasses.replace(gaussians, quats=unit), [VIEW])
     scaled = dataclasses.replace(gaussians, quats=unit * lengths[:, None])
     planes, found = draw_and_differentiate(scaled, [VIEW], "cuda")
-    np.testing.assert_allclose(planes, expected, atol=5e-6)
-    assert relative_error(found["quats"].astype(np.float64) * lengths[:, None], true["quats"]) < 1e-4
-    assert relative_error(found["scales"], true["scales"]) < 1e-4
+    true.check(planes, found | {"quats": found["quats"].astype(np.float64) * lengths[:, None]})
 
 
 def test_just_in_front_of_the_near_plane_and_not_behind_it() -> None:
@@ -186,13 +178,13 @@ def test_just_in_front_of_the_near_plane_and_not_behind_it() -> None:
         means=means.astype(np.float32),
         scales=np.tile(np.array([[1e-4, 5e-5, 7e-5]], np.float32), (8, 1)),
     )
-    found = assert_agrees(gaussians, [VIEW], planes_within=2e-5, gradients_within=2e-4)
+    found = assert_agrees(gaussians, [VIEW])
     assert not any(found[name][3:].any() for name in PER_GAUSSIAN)
 
 
 def test_a_larger_world_further_away_looks_the_same() -> None:
     gaussians = with_filter(with_view_dependence(random_gaussians(8, 8, VIEW), 1))
-    expected, _ = draw_and_differentiate(gaussians, [VIEW], "cuda")
+    true = truth(gaussians, [VIEW])
     for factor in (np.float32(0.03), np.float32(1e9)):
         larger = dataclasses.replace(
             gaussians,
@@ -201,8 +193,8 @@ def test_a_larger_world_further_away_looks_the_same() -> None:
             smoothing=gaussians.smoothing * factor**2,
         )
         planes, _ = draw_and_differentiate(larger, [VIEW], "cuda")
-        np.testing.assert_allclose(planes[0, [0, 1, 2, 4]], expected[0, [0, 1, 2, 4]], atol=2e-5)
-        np.testing.assert_allclose(planes[0, 3] / factor, expected[0, 3], atol=2e-6)
+        unit = np.array([1, 1, 1, factor, 1])[:, None, None]
+        np.testing.assert_allclose(planes[0] / unit, true.planes[0], rtol=0, atol=true.off.max())
 
 
 def test_a_crowd_on_one_pixel_follows_the_law_of_absorption() -> None:
@@ -216,12 +208,13 @@ def test_a_crowd_on_one_pixel_follows_the_law_of_absorption() -> None:
     assert ends[0] < bins.tile_starts[1] == 40
     alpha, _ = draw_and_differentiate(one, [view], "cuda")
     left = np.maximum((1 - alpha[0, 4].astype(np.float64)) ** 40, 1e-4)
-    np.testing.assert_allclose(1 - planes[0, 4], left, atol=1e-4)
-    np.testing.assert_allclose(planes[0, 0], 0.8 * planes[0, 4], rtol=1e-4)
+    drawn = int(ends[0])
+    np.testing.assert_allclose(1 - planes[0, 4], left, rtol=0, atol=1e-4 + after(8 * drawn) * left.max())
+    np.testing.assert_allclose(planes[0, 0], 0.8 * planes[0, 4], rtol=after(2 * drawn))
     v_planes, weight = cotangents([view], 0)
     found = crowd.backward(v_planes, weight)
     total = found.contribution.astype(np.float64).sum()
-    assert total == pytest.approx((weight * planes[:, 4]).sum(), rel=1e-4)
+    assert total == pytest.approx((weight * planes[:, 4]).sum(), rel=after(2 * drawn))
     assert (np.diff(found.contribution) <= 0).all()  # the nearest are the first of equals
     assert found.means[0].all() and not found.means[int(ends[0]) :].any()
 
@@ -255,7 +248,8 @@ def test_a_spoilt_gaussian_is_left_out_and_harms_no_other(kinds: list[tuple[str,
     for name in PER_GAUSSIAN:
         np.testing.assert_array_equal(found[name][sound], true[name], err_msg=name)
         assert not found[name][~sound].any(), name
-    assert relative_error(found["poses"], true["poses"]) < 1e-5
+    # the same sum, cut into other pieces
+    assert relative_error(found["poses"], true["poses"]) < after(len(spoilt))
 
 
 def test_a_machine_without_triton_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -305,7 +299,7 @@ def test_nothing_to_draw() -> None:
 def test_pictures_of_odd_sizes_from_two_cameras(size: tuple[int, int]) -> None:
     views = [camera(*size, focal=30.0), camera(*size, focal=30.0, moved=True)]
     gaussians = with_filter(with_view_dependence(random_gaussians(3, 10, views[0], spread=2.0), 1))
-    assert_agrees(gaussians, views, planes_within=1e-5, gradients_within=1e-4)
+    assert_agrees(gaussians, views)
 
 
 def test_too_many_pairs_and_too_little_memory_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -408,9 +402,10 @@ def test_median_agrees_with_the_cpu_engine() -> None:
         results.append([array.copy() for array in drawing.median()])
     (depths, found), (true_depths, true) = results
     assert 0.2 < (true >= 0).mean() < 0.99
-    assert (found != true).mean() < 1e-3  # one that passes 1/2 by less than rounding may be the next one
+    # one that passes 1/2 by less than rounding may be the next one: 4400 pixels, each by chance 1e-5 of 1/2
+    assert np.count_nonzero(found != true) <= 1
     same = found == true
-    np.testing.assert_allclose(depths[same], true_depths[same], rtol=1e-6)
+    np.testing.assert_allclose(depths[same], true_depths[same], rtol=2 * after(8))
 
 
 # ---- repeatable; what stays on the device ------------------------------------------------------------------
@@ -453,7 +448,7 @@ def test_colour_step_moves_colours_as_the_optimiser_does() -> None:
     inside, drawn, v_planes, weight = drawn_on_device(gaussians)
     v_planes *= 3
     weight[0, 5, 20] = np.nan
-    step = ColourStep(COLOUR_RELAXATION, COLOUR_DAMPING, MIN_CONTRIBUTION, -0.5, 1.5)
+    step = ColourStep(COLOUR_RELAXATION, COLOUR_DAMPING, MIN_CONTRIBUTION, *COLOR_RANGE)
     before = drawn.colors.clone()
     found = inside.pull_back(v_planes, weight, geometry=False, colour_step=step)
     contribution = found.contribution.cpu().numpy()
@@ -462,9 +457,12 @@ def test_colour_step_moves_colours_as_the_optimiser_does() -> None:
     free = before.cpu().numpy() - (COLOUR_RELAXATION / (contribution + COLOUR_DAMPING))[:, None] * (
         found.colors.cpu().numpy()
     )
-    assert (free[moves] < -0.5).any() and (free[moves] > 1.5).any()
-    expected = np.where(moves[:, None], np.clip(free, -0.5, 1.5), before.cpu().numpy())
-    np.testing.assert_allclose(drawn.colors.cpu().numpy(), expected, rtol=1e-5, atol=1e-6)
+    low, high = COLOR_RANGE
+    assert (free[moves] < low).any() and (free[moves] > high).any()
+    expected = np.where(moves[:, None], np.clip(free, low, high), before.cpu().numpy())
+    # a step is a quotient and a sum of four roundings
+    step = np.abs(free - before.cpu().numpy())[moves].max()
+    np.testing.assert_allclose(drawn.colors.cpu().numpy(), expected, rtol=0, atol=after(4) * (high + step))
 
 
 def test_wrong_tensors_are_explained() -> None:

@@ -32,7 +32,8 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.geometry import unproject
 from sags_node.session import open_session
 from sags_node.types import F32, U8, Bool, Camera, RectifiedPair
-from sags_node.vision.matchers import _smooth
+from sags_node.vision.dense_depth import SMOOTHING_VARIANCE
+from sags_node.vision.smoothing import guided
 from sags_node.vision.stereo import StereoDepth
 
 SESSION = Path(__file__).parent.parent / "replay/phantom_pull"
@@ -81,23 +82,29 @@ def stepped() -> F32:
 # ---- the smoothing of the stereo stage -------------------------------------------------------------------
 
 
+def smoothed(disparity: F32) -> F32:
+    result = np.empty_like(disparity)
+    guided(np.ascontiguousarray(disparity), 3, SMOOTHING_VARIANCE, result)
+    return result
+
+
 def test_smoothing_is_the_guided_filter() -> None:
     disparity = (slanted() + np.random.default_rng(0).normal(size=(HEIGHT, WIDTH))).astype(np.float32)
     windows = np.lib.stride_tricks.sliding_window_view
     patches = windows(disparity.astype(np.float64), (7, 7))
     mean, variance = patches.mean((-1, -2)), patches.var((-1, -2))
-    kept = variance / (variance + 0.2)
+    kept = variance / (variance + SMOOTHING_VARIANCE)
     slope, offset = (windows(part, (7, 7)).mean((-1, -2)) for part in (kept, mean * (1 - kept)))
     expected = slope * disparity[6:-6, 6:-6] + offset
-    np.testing.assert_allclose(_smooth(disparity, 3)[6:-6, 6:-6], expected, atol=2e-3)
+    np.testing.assert_allclose(smoothed(disparity)[6:-6, 6:-6], expected, atol=2e-3)
 
 
 def test_smoothing_keeps_planes_and_steps_and_takes_noise() -> None:
     inner = np.s_[8:-8, 8:-8]
-    np.testing.assert_allclose(_smooth(slanted(), 3)[inner], slanted()[inner], atol=2e-3)
-    assert np.abs(_smooth(stepped(), 3) - stepped()).max() < 0.2  # of 8 px
+    np.testing.assert_allclose(smoothed(slanted())[inner], slanted()[inner], atol=2e-3)
+    assert np.abs(smoothed(stepped()) - stepped()).max() < 0.2  # of 8 px
     noise = np.random.default_rng(1).normal(scale=0.2, size=(HEIGHT, WIDTH)).astype(np.float32)
-    assert (_smooth(slanted() + noise, 3) - slanted())[inner].std() < 0.4 * noise.std()
+    assert (smoothed(slanted() + noise) - slanted())[inner].std() < 0.4 * noise.std()
 
 
 @pytest.mark.parametrize(

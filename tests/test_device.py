@@ -131,8 +131,8 @@ def test_a_usable_gpu_is_chosen_and_gets_more_gaussians(machine: pytest.MonkeyPa
     assert choose_device("auto").name == choose_device("cuda").name == "NVIDIA H100"
     assert choose_device("cpu").kind == "cpu"
     assert doctor._gpu(LaunchConfig()).level == "ok" and "H100" in doctor._gpu(LaunchConfig()).found
-    cpu = mapping_devices.affordable(LaunchConfig(device="cpu"), 640, 512)
-    gpu = mapping_devices.affordable(LaunchConfig(), 640, 512)
+    cpu = mapping_devices.affordable(LaunchConfig(device="cpu"), 1280, 1024)
+    gpu = mapping_devices.affordable(LaunchConfig(), 1280, 1024)
     assert gpu > 2 * cpu
     fixed = LaunchConfig(mapping=MappingConfig(max_gaussians=5000))
     assert mapping_devices.affordable(fixed, 640, 512) == 5000

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from engine_scenes import (
     DERIVATIVES,
+    EXPONENTIAL,
     INPUTS,
     PER_GAUSSIAN,
     camera,
@@ -18,9 +19,11 @@ from engine_scenes import (
     random_gaussians,
     relative_error,
     rows,
+    truth,
     with_filter,
     with_view_dependence,
 )
+from rounding import after
 
 from sags_node import geometry
 from sags_node.engine.interface import MAX_OPACITY, NEAR_PLANE
@@ -39,7 +42,7 @@ def changed(gaussians: Gaussians, name: str, row: int, value: float) -> Gaussian
 
 def assert_finite(planes: np.ndarray, found: dict[str, np.ndarray]) -> None:
     assert np.isfinite(planes).all()
-    assert (planes[:, 4] >= 0).all() and planes[:, 4].max() <= 1 + 1e-6
+    assert (planes[:, 4] >= 0).all() and planes[:, 4].max() <= 1 + after(1000)
     for name in DERIVATIVES:
         assert np.isfinite(found[name]).all(), name
 
@@ -58,21 +61,17 @@ def test_a_larger_world_further_away_looks_the_same(factor: float) -> None:
     )
     planes, _ = draw_and_differentiate(gaussians, [VIEW])
     expected, _ = draw_and_differentiate(FULL, [VIEW])
-    np.testing.assert_allclose(planes[0, [0, 1, 2, 4]], expected[0, [0, 1, 2, 4]], atol=2e-5)
-    np.testing.assert_allclose(planes[0, 3] / factor, expected[0, 3], atol=2e-6)
-    rasterizer = make_rasterizer("numba", VIEW.width, VIEW.height)
     v_planes, weight = cotangents([VIEW], 0)
     v_planes[:, 3] = 0
-    found = []
-    for scene in (gaussians, FULL):
-        rasterizer.forward(scene, [VIEW])
-        gradients = rasterizer.backward(v_planes, weight)
-        found.append({name: getattr(gradients, name).astype(np.float64) for name in DERIVATIVES})
-    for name in ("means", "scales"):
-        assert relative_error(found[0][name] * factor, found[1][name]) < 1e-4, name
-    for name in ("quats", "opacities", "colors", "sh_rest", "contribution"):
-        assert relative_error(found[0][name], found[1][name]) < 1e-4, name
-    assert relative_error(found[0]["poses"] * [[factor] * 3 + [1.0] * 3], found[1]["poses"]) < 1e-4
+    true = truth(FULL, [VIEW], given=(v_planes, weight))
+    unit = np.array([1, 1, 1, factor, 1])[:, None, None]
+    np.testing.assert_allclose(planes[0] / unit, expected[0], rtol=0, atol=2 * true.off.max())
+    rasterizer = make_rasterizer("numba", VIEW.width, VIEW.height)
+    rasterizer.forward(gaussians, [VIEW])
+    gradients = rasterizer.backward(v_planes, weight)
+    lengths = {"means": factor, "scales": factor, "poses": np.array([[factor] * 3 + [1.0] * 3])}
+    for name in DERIVATIVES:
+        true.check_gradient(name, getattr(gradients, name).astype(np.float64) * lengths.get(name, 1.0))
 
 
 @pytest.mark.parametrize("scale", [1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0])
@@ -86,12 +85,10 @@ def test_scales_from_a_vanishing_dot_to_a_wall(scale: float, filtered: bool) -> 
     if filtered:
         gaussians = dataclasses.replace(gaussians, smoothing=np.full(6, 0.01 * scale**2, np.float32))
     planes, found = draw_and_differentiate(gaussians, [view])
-    true_planes, true = draw_and_differentiate(gaussians, [view], "reference")
+    true = truth(gaussians, [view])
     assert_finite(planes, found)
-    assert true_planes[0, 4].max() > 0.05
-    np.testing.assert_allclose(planes, true_planes, atol=2e-5)
-    for name in ("colors", "contribution", "opacities", "means", "scales", "quats"):
-        assert np.linalg.norm(found[name] - true[name]) <= 1e-4 * np.linalg.norm(true[name]), name
+    assert true.planes[0, 4].max() > 0.05
+    true.check(planes, found)
 
 
 @pytest.mark.parametrize("filtered", [False, True])
@@ -104,12 +101,9 @@ def test_flat_as_paper_and_thin_as_a_thread(filtered: bool) -> None:
     if filtered:
         gaussians = dataclasses.replace(gaussians, smoothing=np.full(12, 1e-12, np.float32))
     planes, found = draw_and_differentiate(gaussians, [VIEW])
-    true_planes, true = draw_and_differentiate(gaussians, [VIEW], "reference")
-    assert true_planes[0, 4].max() > 0.05
-    np.testing.assert_allclose(planes, true_planes, atol=2e-5)
-    for name in DERIVATIVES:
-        if name != "sh_rest":
-            assert relative_error(found[name], true[name]) < 1e-3, name
+    true = truth(gaussians, [VIEW])
+    assert true.planes[0, 4].max() > 0.05
+    true.check(planes, found)
 
 
 @pytest.mark.parametrize("opacity", [1e-6, 1 / 255, 0.0045, 0.5, 0.9985, 0.9995, 1 - 1e-6, 1.0])
@@ -117,22 +111,17 @@ def test_opacities_from_nothing_to_everything(opacity: float) -> None:
     gaussians = random_gaussians(5, 8, VIEW, spread=3.0)
     gaussians = dataclasses.replace(gaussians, opacities=np.full(8, opacity, np.float32))
     planes, found = draw_and_differentiate(gaussians, [VIEW])
-    true_planes, true = draw_and_differentiate(gaussians, [VIEW], "reference")
-    np.testing.assert_allclose(planes, true_planes, atol=1e-5)
     assert planes[0, 4].any() == (opacity > 1 / 255)
-    for name in DERIVATIVES:
-        assert np.linalg.norm(found[name] - true[name]) <= 1e-4 * np.linalg.norm(true[name]), name
+    truth(gaussians, [VIEW]).check(planes, found)
 
 
 @pytest.mark.parametrize("length", [1e-11, 1e-6, 1e6, 1e15])
 def test_quaternions_of_any_length_are_the_same_turn(length: float) -> None:
     unit = FULL.quats / np.linalg.norm(FULL.quats, axis=1)[:, None]
-    expected, true = draw_and_differentiate(dataclasses.replace(FULL, quats=unit), [VIEW])
+    true = truth(dataclasses.replace(FULL, quats=unit), [VIEW])
     scaled = dataclasses.replace(FULL, quats=unit * np.float32(length))
     planes, found = draw_and_differentiate(scaled, [VIEW])
-    np.testing.assert_allclose(planes, expected, atol=5e-6)
-    assert relative_error(found["quats"].astype(np.float64) * length, true["quats"]) < 1e-4
-    assert relative_error(found["scales"], true["scales"]) < 1e-4
+    true.check(planes, found | {"quats": found["quats"].astype(np.float64) * length})
 
 
 @pytest.mark.parametrize("length", [1e-13, 1e-30, 1e19])
@@ -155,11 +144,8 @@ def test_just_in_front_of_the_near_plane(height: float, scale: float) -> None:
         scales=np.full((3, 3), scale, np.float32) * np.array([1, 0.5, 0.7], np.float32),
     )
     planes, found = draw_and_differentiate(gaussians, [VIEW])
-    true_planes, true = draw_and_differentiate(gaussians, [VIEW], "reference")
     assert_finite(planes, found)
-    np.testing.assert_allclose(planes, true_planes, atol=2e-5)
-    for name in DERIVATIVES:
-        assert np.linalg.norm(found[name] - true[name]) <= 2e-4 * np.linalg.norm(true[name]), name
+    truth(gaussians, [VIEW]).check(planes, found)
 
 
 @pytest.mark.parametrize("z", [NEAR_PLANE, 1e-6, 0.0, -1e-6, -0.05, -1e9])
@@ -175,11 +161,9 @@ def test_a_principal_point_far_outside_and_a_telephoto_lens() -> None:
     view = Camera(31, 29, K, np.eye(4))
     gaussians = random_gaussians(2, 40, view)
     planes, found = draw_and_differentiate(gaussians, [view])
-    true_planes, true = draw_and_differentiate(gaussians, [view], "reference")
-    assert true_planes[0, 4].mean() > 0.2
-    # 20,000 px of focal length times the rounding of a mean: a thousandth of a pixel
-    np.testing.assert_allclose(planes, true_planes, atol=5e-3)
-    assert relative_error(found["means"], true["means"]) < 1e-2
+    true = truth(gaussians, [view])
+    assert true.planes[0, 4].mean() > 0.2
+    true.check(planes, found)
 
 
 # ---- crowds and empty places -------------------------------------------------------------------------------
@@ -196,11 +180,12 @@ def test_a_crowd_on_one_pixel_follows_the_law_of_absorption(count: int, opacity:
     single, _ = draw_and_differentiate(one, [view])
     assert_finite(planes, found)
     left = np.maximum((1 - single[0, 4].astype(np.float64)) ** count, 1e-4)
-    np.testing.assert_allclose(1 - planes[0, 4], left, atol=1e-4)
-    np.testing.assert_allclose(planes[0, 0], 0.8 * planes[0, 4], rtol=1e-4)
+    drawn = int(np.count_nonzero(found["contribution"]))  # until the tile stops
+    np.testing.assert_allclose(1 - planes[0, 4], left, atol=1e-4 + drawn * EXPONENTIAL * opacity * left.max())
+    np.testing.assert_allclose(planes[0, 0], 0.8 * planes[0, 4], rtol=after(2 * drawn))
     weight = cotangents([view], 0)[1]
     total = found["contribution"].astype(np.float64).sum()
-    assert total == pytest.approx((weight * planes[:, 4]).sum(), rel=1e-4)
+    assert total == pytest.approx((weight * planes[:, 4]).sum(), rel=after(2 * drawn))
     assert (np.diff(found["contribution"]) <= 0).all()  # the nearest are the first of equals
 
 
@@ -222,11 +207,9 @@ def test_pictures_of_odd_sizes_from_two_cameras(size: tuple[int, int]) -> None:
     views = [camera(*size, focal=30.0), camera(*size, focal=30.0, moved=True)]
     gaussians = with_filter(with_view_dependence(random_gaussians(3, 25, views[0], spread=2.0), 1))
     planes, found = draw_and_differentiate(gaussians, views)
-    true_planes, true = draw_and_differentiate(gaussians, views, "reference")
-    assert (true_planes[:, 4].max((1, 2)) > 0.05).all()
-    np.testing.assert_allclose(planes, true_planes, atol=1e-5)
-    for name in DERIVATIVES:
-        assert relative_error(found[name], true[name]) < 1e-4, name
+    true = truth(gaussians, views)
+    assert (true.planes[:, 4].max((1, 2)) > 0.05).all()
+    true.check(planes, found)
 
 
 # ---- what is not a number ----------------------------------------------------------------------------------
@@ -251,7 +234,8 @@ def test_a_spoilt_value_costs_one_gaussian_and_no_other(name: str, value: float)
     for key in PER_GAUSSIAN:
         np.testing.assert_array_equal(found[key][others], true[key], err_msg=key)
         assert not found[key][~others].any(), key
-    assert relative_error(found["poses"], true["poses"]) < 1e-5
+    # the sum of 30 Gaussians in blocks, one of which is now made up of others
+    assert relative_error(found["poses"], true["poses"]) < after(30)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
@@ -281,4 +265,4 @@ def test_opacity_is_held_below_one() -> None:
     """What keeps 1 - alpha away from zero: even a wall lets a thousandth through."""
     view = camera(width=3, height=3, focal=30.0)
     planes, _ = draw_and_differentiate(one_gaussian(np.array([0, 0, 0.07]), 1.0, 1.0), [view])
-    assert planes[0, 4].max() == pytest.approx(MAX_OPACITY, abs=1e-6)
+    assert planes[0, 4].max() == pytest.approx(MAX_OPACITY, rel=EXPONENTIAL)

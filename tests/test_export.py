@@ -24,10 +24,10 @@ from sags_node.geometry import project, unproject
 from sags_node.messaging.control import ControlClient
 from sags_node.messaging.received import ReceivedImage, TopicName
 from sags_node.messaging.subscriber import Subscriber
-from sags_node.model.ply import SH_C0
 from sags_node.phantom.scene import Phantom
 from sags_node.pipeline import Pipeline
 from sags_node.session import open_session
+from sags_node.types import SH_DEGREE_0
 
 pytestmark = pytest.mark.usefixtures("run_dir")
 
@@ -127,7 +127,7 @@ def test_splats_are_read_by_their_names_and_by_another_program(
     assert np.array_equal(means, gaussians.means)
     assert np.allclose(np.exp([columns[f"scale_{i}"] for i in range(3)]).T, gaussians.scales, rtol=1e-5)
     assert np.allclose(1 / (1 + np.exp(-columns["opacity"])), gaussians.opacities, atol=1e-5)
-    colors = 0.5 + SH_C0 * np.stack([columns[f"f_dc_{i}"] for i in range(3)], axis=1)
+    colors = 0.5 + SH_DEGREE_0 * np.stack([columns[f"f_dc_{i}"] for i in range(3)], axis=1)
     assert np.allclose(colors, gaussians.colors, atol=1e-5)
     assert np.array_equal(np.asarray(open3d.io.read_point_cloud(file).points, np.float32), means)
 
@@ -237,7 +237,8 @@ def test_all_cameras_of_the_video_look_at_the_same_point(scene: Scene) -> None:
 def test_a_running_node_is_exported_as_it_is_now(
     phantom_session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    node = RunningNode(phantom_session, tmp_path)
+    # Where time is short, a part of the picture is as it was before the frame's step.
+    node = RunningNode(phantom_session, tmp_path, "mapping.iterations:=1")
     depth = TopicName("left/render/depth", ReceivedImage)
     try:
         with Subscriber([depth], run_dir=node.run_dir) as subscriber:

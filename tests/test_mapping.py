@@ -170,10 +170,23 @@ def test_where_the_machine_affords_fewer_those_that_show_least_go_but_none_that_
     old = model.count
     model.contribution[:] = np.random.default_rng(0).uniform(2, 20, old)
     model.append(points, size, grey, 0.9)
-    doomed = densify.doomed(model, observation(), old // 2)
-    assert 0 < doomed.sum() <= densify.SHED * model.count
-    assert not doomed[old:].any()
-    assert model.contribution[:old][doomed[:old]].max() <= np.sort(model.contribution[:old])[doomed.sum() - 1]
+    ids, shown, area = model.ids.copy(), model.contribution.copy(), shown_area(model)
+    assert densify.shed(model, len(ids)) == 0
+    removed = densify.shed(model, old // 2)
+    assert removed == len(ids) - model.count == int(densify.SHED * len(ids))
+    gone = ~np.isin(ids, model.ids)
+    assert not gone[old:].any()
+    assert shown[:old][gone[:old]].max() <= np.sort(shown[:old])[removed - 1]
+    # What is left covers as much as all did, in the share that each one shows of its area.
+    assert shown_area(model) == pytest.approx(area, rel=1e-3)
+    np.testing.assert_allclose(model.log_scales, np.log(model.scales), atol=1e-5)
+    assert densify.shed(model, model.count - 1) == 1
+
+
+def shown_area(model: GaussianModel) -> float:
+    """Of those whose contribution is known: px that they would show at their size of now."""
+    known = model.contribution < np.inf
+    return float((model.contribution * model.scales[:, 0] ** 2)[known].sum())
 
 
 def test_a_full_model_gives_up_what_shows_least_and_nothing_that_shows_much() -> None:

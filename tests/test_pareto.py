@@ -6,6 +6,7 @@ import json
 import shutil
 from pathlib import Path
 from typing import Any
+from unittest.mock import ANY
 
 import cv2
 import numpy as np
@@ -21,6 +22,7 @@ from sags_node.cli import main
 from sags_node.config import MappingConfig
 from sags_node.evaluation import metrics
 from sags_node.launch_file import load_launch
+from sags_node.mapping.ladder import RUNGS
 from sags_node.sources.source import open_source
 from sags_node.vision.rectify import Rectifier
 
@@ -52,6 +54,12 @@ def test_why_the_default_says_what_was_measured() -> None:
     assert "though it takes 60.0 of the camera's 33.3 ms" in why_default([slow, default], 33.3)
 
 
+def test_each_rung_is_a_setting() -> None:
+    pinned = [load_launch(None, setting.overrides).mapping for setting in pareto_settings.rung_settings()]
+    assert [mapping.rung for mapping in pinned] == list(range(len(RUNGS)))
+    assert {mapping.iterations for mapping in pinned} == {1}
+
+
 def test_each_setting_is_played_once_and_the_default_first() -> None:
     config = load_launch(None, ["mapping.budget_ms:=40"])
     settings = time_settings(config, (640, 512), pareto_settings.PARTS)
@@ -68,12 +76,12 @@ def test_each_setting_is_played_once_and_the_default_first() -> None:
 def test_every_skip_rule_of_the_mapper_is_turned_round() -> None:
     switches = [name for name in MappingConfig.model_fields if name.startswith("skip_")]
     assert "skip_duplicates" in switches and skip_rules() == switches
-    pairs = skip_settings(MappingConfig(), 20_000)
+    pairs = skip_settings(MappingConfig())
     assert list(pairs) == switches
     for rule, (as_is, turned) in pairs.items():
         *base, change = turned.overrides
         assert as_is.overrides == tuple(base)
-        assert (load_launch(None, base).mapping.iterations is None) == (rule in HURRIED_RULES)
+        assert (load_launch(None, base).mapping.rung is not None) == (rule in HURRIED_RULES)
         changed = load_launch(None, [change]).mapping
         assert [name for name in MappingConfig.model_fields
                 if getattr(changed, name) != getattr(MappingConfig(), name)] == [rule]  # fmt: skip
@@ -144,10 +152,11 @@ def test_everything_is_measured_on_a_tiny_session(phantom_session: Path, tmp_pat
     (tmp_path / "fit.json").write_text(json.dumps(fit))
     out, plot = tmp_path / "pareto.json", tmp_path / "pareto.png"
     files = ["--fit", tmp_path / "fit.json", "--out", out, "--plot", plot]
-    result = bench(phantom_session, "mapping.max_gaussians:=3000", "--frames", 10, *files, "--json")
+    asked = ["mapping.max_gaussians:=3000", "mapping.rung:=8", "--frames", 10]  # whatever the machine affords
+    result = bench(phantom_session, *asked, *files, "--json")
     assert result.exit_code == 0, result.output
     found = json.loads(result.stdout)
-    assert found == json.loads(out.read_text())
+    assert json.loads(out.read_text()) == {"provenance": ANY} | found
     (session,) = found["sessions"]
     rows = {tuple(each["overrides"]): each for each in session["settings"]}
     default = rows[()]

@@ -18,10 +18,12 @@ from engine_scenes import (
     one_gaussian,
     random_gaussians,
     relative_error,
+    truth,
     with_filter,
     with_view_dependence,
 )
 from numpy.typing import NDArray
+from rounding import after
 
 from sags_node import geometry
 from sags_node.engine import numba_rasterizer, projection, projection_backward, projector, smoothing
@@ -63,16 +65,9 @@ def test_every_gradient_agrees_with_the_float64_twin(
     if filtered:
         gaussians = with_filter(gaussians, seed)
     planes, found = draw_and_differentiate(gaussians, views, "numba", seed)
-    true_planes, true = draw_and_differentiate(gaussians, views, "reference", seed)
-    assert true_planes[:, 4].mean() > 0.25  # the scene does cover the pictures
-    np.testing.assert_allclose(planes, true_planes, atol=1e-5)
-    for name in DERIVATIVES:
-        assert found[name].shape == true[name].shape
-        if name == "sh_rest" and degree == 0:
-            continue
-        assert relative_error(found[name], true[name]) < 1e-4, name
-    for half in (slice(0, 3), slice(3, 6)):  # rotations are an order of magnitude smaller than translations
-        assert relative_error(found["poses"][:, half], true["poses"][:, half]) < 1e-4, half
+    true = truth(gaussians, views, seed)
+    assert true.planes[:, 4].mean() > 0.25  # the scene does cover the pictures
+    true.check(planes, found)
 
 
 def smooth_scene() -> tuple[Camera, list[F64], F64]:
@@ -126,13 +121,14 @@ def test_twin_agrees_with_finite_differences() -> None:
             down[index][at] -= step
             differences[at] = (loss(view, up) - loss(view, down)) / (2 * step)
         assert np.abs(differences[-1]).max() > 0, name  # the one with the held Jacobian takes part
-        assert relative_error(found[index].numpy(), differences) < 1e-5, name
+        # steps of 1e-6 leave ten digits of a float64 loss, and the square of 1e-6 of its third derivative
+        assert relative_error(found[index].numpy(), differences) < 1e-6, name
 
     steps = 1e-6 * np.eye(6)
     differences = np.array(
         [(loss(moved_by(view, s), inputs) - loss(moved_by(view, -s), inputs)) / 2e-6 for s in steps]
     )
-    np.testing.assert_allclose(found[-1].numpy(), differences, rtol=1e-5)
+    np.testing.assert_allclose(found[-1].numpy(), differences, rtol=1e-6)
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2, 3])
@@ -164,14 +160,16 @@ def test_cameras_add_up() -> None:
     together.forward(gaussians, EYES)
     both = together.backward(v_planes, weight)
     sums: dict[str, Any] = dict.fromkeys(DERIVATIVES, 0.0)
+    sizes = dict.fromkeys(DERIVATIVES, 0.0)
     for c, view in enumerate(EYES):
         alone.forward(gaussians, [view])
         found = alone.backward(v_planes[c : c + 1], weight[c : c + 1])
         np.testing.assert_array_equal(both.poses[c], found.poses[0])
         for name in DERIVATIVES:
-            sums[name] = sums[name] + getattr(found, name)
+            sums[name] = sums[name] + getattr(found, name).astype(np.float64)
+            sizes[name] += float(np.linalg.norm(getattr(found, name)))
     for name in set(DERIVATIVES) - {"poses"}:
-        assert relative_error(getattr(both, name), sums[name]) < 1e-6, name
+        assert np.linalg.norm(getattr(both, name) - sums[name]) < after(4) * sizes[name], name
 
 
 @pytest.mark.parametrize("pieces", [1, 3, 64])
@@ -258,8 +256,9 @@ def test_basis_is_orthonormal_on_the_sphere() -> None:
     flat = np.sqrt(1 - z**2)
     found = basis(np.stack([flat * np.cos(angle), flat * np.sin(angle), z], 1)).astype(np.float64)
     areas = weights.repeat(16) * (2 * np.pi / 16)
-    np.testing.assert_allclose(found.T * areas @ found, np.eye(15), atol=2e-6)
-    np.testing.assert_allclose(areas @ found, 0, atol=2e-6)  # nor do they touch the constant
+    # a harmonic has ten roundings, and values up to 1.8: as many as the sphere has in its area
+    np.testing.assert_allclose(found.T * areas @ found, np.eye(15), atol=2 * 1.8 * after(10))
+    np.testing.assert_allclose(areas @ found, 0, atol=1.8 * 4 * np.pi * after(10))  # nor the constant
 
 
 def test_basis_has_the_order_and_the_signs_of_3d_gaussian_splatting() -> None:
@@ -279,7 +278,7 @@ def test_basis_has_the_order_and_the_signs_of_3d_gaussian_splatting() -> None:
             scale = (-1) ** m * math.sqrt((2 - (m == 0)) * (2 * degree + 1) / (4 * math.pi) * share)
             turn = np.sin(m * angle) if order < 0 else np.cos(m * angle)
             expected.append(scale * flat**m * height * turn)
-    np.testing.assert_allclose(basis(directions), np.stack(expected, 1), atol=2e-6)
+    np.testing.assert_allclose(basis(directions), np.stack(expected, 1), atol=1.8 * after(12))
 
 
 def test_direction_runs_from_the_camera_to_the_gaussian_in_the_world() -> None:
@@ -293,7 +292,7 @@ def test_direction_runs_from_the_camera_to_the_gaussian_in_the_world() -> None:
         view = Camera(41, 41, np.array([[60.0, 0, 20], [0, 60, 20], [0, 0, 1]]), T)
         seen = rasterize(gaussians, view).rgb[20, 20]
         green = 0.5 + side * 0.3 * math.sqrt(3 / (4 * math.pi))
-        np.testing.assert_allclose(seen, [0.8, green, 0.2], rtol=1e-4)
+        np.testing.assert_allclose(seen, [0.8, green, 0.2], rtol=after(12))
 
 
 def test_colour_is_linear_beyond_its_range() -> None:
@@ -306,7 +305,9 @@ def test_colour_is_linear_beyond_its_range() -> None:
         for scene in (gaussians, dataclasses.replace(strong, sh_rest=strong.sh_rest / 2), strong)
     )
     assert whole.min() < -0.5
-    np.testing.assert_allclose(whole - plain, 2 * (half - plain), atol=1e-5)
+    # three sums over the Gaussians of a pixel, whose colours reach 20
+    largest = np.abs(strong.sh_rest).sum(1).max()
+    np.testing.assert_allclose(whole - plain, 2 * (half - plain), atol=4 * largest * after(40))
 
 
 def test_no_view_dependence_and_no_filter_change_nothing() -> None:
@@ -347,7 +348,8 @@ def test_filter_enlarges_the_covariance_and_keeps_the_mass_on_the_surface() -> N
     rasterizer = make_rasterizer("numba", VIEW.width, VIEW.height)
     expected = rasterizer.forward(enlarged, [VIEW]).copy()
     assert expected[0, 4].mean() > 0.1
-    np.testing.assert_allclose(rasterizer.forward(gaussians, [VIEW]), expected, atol=2e-5)
+    within = truth(gaussians, [VIEW]).off.max() + truth(enlarged, [VIEW]).off.max()
+    np.testing.assert_allclose(rasterizer.forward(gaussians, [VIEW]), expected, rtol=0, atol=within)
 
 
 def test_what_is_exported_draws_the_same() -> None:
@@ -366,8 +368,8 @@ def test_filter_of_vanishing_scales() -> None:
     found_scales, found_opacities = smoothing.smoothed(scales, opacities, variance)
     true_scales = np.sqrt(scales.astype(np.float64) ** 2 + variance[:, None])
     true_opacities = opacities * np.sort(scales / true_scales)[:, 1:].prod(1)
-    np.testing.assert_allclose(found_scales, true_scales, rtol=1e-6)
-    np.testing.assert_allclose(found_opacities, true_opacities, rtol=1e-6)
+    np.testing.assert_allclose(found_scales, true_scales, rtol=after(3))
+    np.testing.assert_allclose(found_opacities, true_opacities, rtol=after(8))
     np.testing.assert_array_equal(found_scales[2], scales[2])
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from sags_node.evaluation.metrics import psnr
 from sags_node.geometry import project, unproject
-from sags_node.mapping import mapper, split
+from sags_node.mapping import initialise, mapper, split
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.split import split_worst
 from sags_node.model.gaussians import GaussianModel
@@ -52,7 +52,9 @@ class Scene:
         alpha = np.ones((HEIGHT, WIDTH), np.float32)
         gray = np.zeros((HEIGHT, WIDTH), np.uint8)
         observation = Observation(0, 0, CAMERA, self.image, gray, self.tissue, self.depth, alpha)
-        return split_worst(self.model, observation, RenderedView(0, 0, CAMERA, self.drawn, self.depth, alpha))
+        return split_worst(
+            self.model, observation, RenderedView(0, 0, CAMERA, self.drawn, self.depth, alpha), 0
+        )
 
 
 @pytest.fixture
@@ -146,10 +148,24 @@ def played(monkeypatch: pytest.MonkeyPatch) -> Callable[[int, bool], tuple[F64, 
     return play
 
 
-def test_the_same_number_of_gaussians_shows_more(played: Callable[[int, bool], tuple[F64, int]]) -> None:
+def test_the_same_number_of_gaussians_shows_more(
+    played: Callable[[int, bool], tuple[F64, int]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mapper, "GROWN", 0.0)  # else splitting adds some as well
     (errors, count), (plain, count_plain) = played(20_000, True), played(20_000, False)
     assert errors[5:].mean() > plain[5:].mean() + 0.15
     assert count < 1.02 * count_plain
+
+
+def test_a_model_grows_by_splitting_to_what_it_may_have(
+    played: Callable[[int, bool], tuple[F64, int]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As it does when the machine turns out to afford more: no hole asks for Gaussians then."""
+    monkeypatch.setattr(initialise, "INITIAL_SHARE", 0.2)
+    (errors, count), (plain, few) = played(10_000, True), played(10_000, False)
+    assert mapper.GROWN * 10_000 - 2 <= count <= 10_000  # splits stop there; what appears may go on
+    assert (1 + 2 * split.GROWTH) ** len(errors) * few > count  # two more for each that is split
+    assert errors[-5:].mean() > plain[-5:].mean() + 0.2
 
 
 def test_a_full_model_keeps_what_holes_need(played: Callable[[int, bool], tuple[F64, int]]) -> None:

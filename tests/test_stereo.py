@@ -16,10 +16,11 @@ from sags_node.config import StereoConfig, TissueConfig
 from sags_node.errors import UsageError
 from sags_node.sources.pictures import read_picture
 from sags_node.types import F32, U8, Bool, Camera, RectifiedPair
+from sags_node.vision.margin import EDGE_MARGIN
 from sags_node.vision.matchers import SemiGlobal
 from sags_node.vision.observe import observe
 from sags_node.vision.rectify import Rectifier
-from sags_node.vision.stereo import EDGE_MARGIN, StereoDepth
+from sags_node.vision.stereo import StereoDepth
 from sags_node.vision.tissue import TissueMask
 
 ROOT = Path(__file__).parent.parent
@@ -114,7 +115,7 @@ def test_rows_off_by_the_calibration_still_match() -> None:
 
 def test_sgbm_says_where_it_found_nothing() -> None:
     flat = np.full((128, 160), 90, np.uint8)
-    _, _, known = SemiGlobal(10.0, 40.0)(flat, flat)
+    _, known = SemiGlobal(10.0, 40.0)(flat, flat)
     assert not known.any()
 
 

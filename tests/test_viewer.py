@@ -22,11 +22,11 @@ from click.testing import CliRunner
 from sags_node.cli import main
 from sags_node.config import PhantomSource
 from sags_node.evaluation.gallery import Picture
-from sags_node.messaging.content import SH_DEGREE_0, SPLAT_FIELDS
+from sags_node.messaging.content import SPLAT_FIELDS
 from sags_node.messaging.received import ReceivedCloud
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.phantom import write_session
-from sags_node.types import Camera
+from sags_node.types import SH_DEGREE_0, Camera
 from sags_node.viewer import splats as viewer_splats
 from sags_node.viewer.feed import Moment, Status
 from sags_node.viewer.history import GAP, History

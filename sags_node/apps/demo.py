@@ -54,7 +54,7 @@ def run_demo(session: Session, out: Path, progress: Callable[[int, int | None, s
     out.mkdir(parents=True, exist_ok=True)
     frames = session.source.frame_count
     seconds = (frames or 0) / session.source.rate
-    with Spool(session.config.engine.backend) as spool:
+    with Spool() as spool:
 
         def keep(result: FrameResult, latency_ms: float) -> None:
             spool.add(result, sum(result.timings_ms.values()), time.monotonic_ns(), latency_ms)

@@ -8,7 +8,6 @@ import importlib.metadata
 import os
 import platform
 import socket
-import tempfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
@@ -16,6 +15,7 @@ from typing import Literal
 from sags_node.config import LaunchConfig, PublishConfig
 from sags_node.engine.device import find_gpu, has_gpu
 from sags_node.errors import UsageError
+from sags_node.kernels.cache import cache_root
 from sags_node.messaging.security import check_endpoint, read_allow_list, read_key_pair
 
 Level = Literal["ok", "warning", "error"]
@@ -110,18 +110,15 @@ def _gsplat(config: LaunchConfig) -> list[Check]:
 
 
 def _kernel_cache() -> Check:
-    """Numba keeps compiled kernels beside the sources, or in NUMBA_CACHE_DIR."""
-    folder = Path(os.environ.get("NUMBA_CACHE_DIR", Path(__file__).parent.parent / "engine"))
-    try:
-        with tempfile.TemporaryFile(dir=folder):
-            return Check("kernel cache", "ok", "writable")
-    except OSError as error:
-        return Check(
-            "kernel cache",
-            "warning",
-            f"{folder}: {error.strerror}",
-            "kernels will be compiled at every start; set NUMBA_CACHE_DIR to a folder you can write",
-        )
+    root = cache_root()
+    if root is not None:
+        return Check("kernel cache", "ok", str(root))
+    return Check(
+        "kernel cache",
+        "warning",
+        "no folder can be written",
+        "kernels will be compiled at every start; set NUMBA_CACHE_DIR to a folder of yours",
+    )
 
 
 def _ports(config: PublishConfig) -> list[Check]:

@@ -18,14 +18,13 @@ from sags_node.fitting.clip import read_clip
 from sags_node.fitting.fit import Fit
 from sags_node.fitting.settings import FitSettings
 from sags_node.kernels.threads import configure_threads
-from sags_node.mapping.budget import make_budget
 from sags_node.messaging.address import ClientKeys
-from sags_node.messaging.content import SH_DEGREE_0, SPLAT_FIELDS
+from sags_node.messaging.content import SPLAT_FIELDS
 from sags_node.messaging.received import ReceivedCameraInfo, ReceivedCloud, ReceivedRos, TopicName
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.pipeline import Pipeline
 from sags_node.session import Session
-from sags_node.types import F32, Camera, FrameResult, Gaussians
+from sags_node.types import F32, SH_DEGREE_0, Camera, FrameResult, Gaussians
 
 SPLATS = TopicName("splats", ReceivedCloud)
 INFO = TopicName("left/camera_info", ReceivedCameraInfo)
@@ -105,7 +104,8 @@ def from_session(session: Session, at: float | None, advance: Advance) -> Scene:
         SagsError: it cannot be read, or shows nothing to make a model of.
     """
     configure_threads(session.config.engine.threads)
-    pipeline, budget = Pipeline(session.config, session.rig), make_budget(session.config.mapping)
+    pipeline = Pipeline(session.config, session.rig)
+    budget = pipeline.make_budget()
     count = session.source.frame_count
     result: FrameResult | None = None
     first_ns = last_ns = 0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable
 from dataclasses import asdict
@@ -12,6 +11,7 @@ from typing import Any
 from rich.table import Table
 
 from sags_node.apps import text
+from sags_node.apps.launching import write_json
 from sags_node.engine.smoothing import folded
 from sags_node.errors import UsageError
 from sags_node.evaluation.lpips import BACKBONE, Lpips
@@ -105,7 +105,7 @@ def fit_session(
     ply = out / "model.ply"
     ply.unlink(missing_ok=True)
     write_ply(ply, folded(last))
-    (out / "figures.json").write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    write_json(out / "figures.json", found)
     return found
 
 

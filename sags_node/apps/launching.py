@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -98,12 +98,17 @@ def check_files(*files: Path | None) -> None:
             check_file(file)
 
 
-def write_json(file: Path | None, figures: Any) -> None:
-    """Keep figures, if a file was asked for.
+def write_json(file: Path | None, figures: Mapping[str, Any] | list[Any]) -> None:
+    """Keep figures, if a file was asked for, and under `provenance` where they come from. A list of them is
+    kept under `rows`.
 
     Raises:
         SagsError: it cannot be written.
     """
     if file is not None:
+        from sags_node.benchmark.provenance import provenance
+
+        rows = {"rows": figures} if isinstance(figures, list) else figures
         with writing(file):
-            file.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+            text = json.dumps({"provenance": provenance()} | dict(rows), indent=1)
+            file.write_text(text + "\n", encoding="utf-8")

@@ -54,6 +54,8 @@ def health_table(health: NodeHealth) -> Table:
     table.add_row("published", f"{health.rate_hz:.1f} Hz")
     table.add_row("latency p50 / p99", f"{latency['p50']:.0f} / {latency['p99']:.0f} ms")
     table.add_row("Gaussians", f"{health.gaussians:,}")
+    if health.rung is not None:
+        table.add_row("quality", text.rung_text(health.rung))
     table.add_row("stages (ms)", "  ".join(f"{k} {v:.1f}" for k, v in health.stage_ms.items()))
     table.add_row("dropped", "  ".join(f"{k} {v}" for k, v in health.dropped.items()))
     if health.skipped:

@@ -8,6 +8,8 @@ from typing import Any
 import yaml
 from rich.table import Table
 
+from sags_node.types import RungState
+
 Record = Mapping[str, Any]
 
 
@@ -77,6 +79,15 @@ def overlay_table(summary: Record) -> Table:
     if summary["saved"] is not None:
         made.add_row("saved", summary["saved"])
     return made
+
+
+def rung_text(rung: RungState) -> str:
+    """The ladder's rung in one line."""
+    depth = "every frame" if rung.depth_every == 1 else f"one frame in {rung.depth_every}"
+    return (
+        f"rung {rung.number} of 0 to {rung.of - 1}: up to {rung.gaussians:,} Gaussians, "
+        f"drawn at {rung.scale:g} of the size, depth in {depth} ({rung.reason})"
+    )
 
 
 def byte_text(count: float) -> str:

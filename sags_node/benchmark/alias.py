@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -77,9 +78,8 @@ class Trained:
 
 def train(observation: Observation, filters: Filters, settings: Settings) -> Trained:
     """A model of one still picture, by the node's own mapper."""
-    camera = observation.camera
-    rasterizer = make_rasterizer("numba", camera.width, camera.height, filters.screen)
-    mapper = Mapper(CpuRefiner(rasterizer), settings.max_gaussians, filters.world, focus=1.0)
+    refiner = CpuRefiner(partial(make_rasterizer, "numba", antialias=filters.screen))
+    mapper = Mapper(refiner, settings.max_gaussians, filters.world, focus=1.0)
     for _ in range(1 + settings.rounds):  # the first places the Gaussians
         mapper.update(observation, StepBudget(STEPS_PER_ROUND))
     return Trained(mapper.model.gaussians(), filters.screen)

@@ -176,7 +176,7 @@ def _take(folder: Path, seconds: float, ending: Event, there: Connection) -> Non
 def _read(folder: Path, _: float, ending: Event, there: Connection) -> None:
     """Take everything there is, as fast as it comes."""
     taken = 0
-    with _everything(folder) as socket:
+    with everything(folder) as socket:
         while not _is_over(ending):
             if socket.poll(100):
                 socket.recv_multipart(copy=False)
@@ -186,14 +186,14 @@ def _read(folder: Path, _: float, ending: Event, there: Connection) -> None:
 
 def _sleep(folder: Path, _: float, ending: Event, there: Connection) -> None:
     """Be connected to everything and never read."""
-    with _everything(folder):
+    with everything(folder):
         while not _is_over(ending):
             ending.wait(1.0)
     there.send({})
 
 
 @contextmanager
-def _everything(folder: Path) -> Iterator[zmq.Socket[bytes]]:
+def everything(folder: Path) -> Iterator[zmq.Socket[bytes]]:
     """A socket that is sent all topics."""
     context = zmq.Context()
     socket = context.socket(zmq.SUB)

@@ -31,7 +31,7 @@ def measure_contention(case: RasterCase, runs: int) -> dict[str, Any]:
     """Alone, and beside another process that burns one core."""
     function = Drawing(case).forward_backward
     alone = _spread(times_ms(function, runs))
-    with _burning_core():
+    with burning_core():
         beside = _spread(times_ms(function, runs))
     return {**_named(case), "alone_ms": alone, "beside_busy_process_ms": beside}
 
@@ -41,7 +41,7 @@ def _named(case: RasterCase) -> dict[str, Any]:
 
 
 @contextmanager
-def _burning_core() -> Iterator[subprocess.Popen[bytes]]:
+def burning_core() -> Iterator[subprocess.Popen[bytes]]:
     process = subprocess.Popen([sys.executable, "-c", "while True: pass"])
     try:
         yield process

@@ -21,7 +21,7 @@ from sags_node.evaluation.machine import machine_name
 from sags_node.evaluation.metrics import psnr
 from sags_node.health import resident_mb
 from sags_node.kernels.threads import configure_threads
-from sags_node.mapping.budget import Budget, make_budget
+from sags_node.mapping.budget import Budget
 from sags_node.mapping.mapper import SETTLED
 from sags_node.pipeline import Pipeline
 from sags_node.session import Session
@@ -71,7 +71,7 @@ class _Run:
     def __init__(self, session: Session) -> None:
         configure_threads(session.config.engine.threads)
         self.pipeline = Pipeline(session.config, session.rig)
-        self._budget: Budget = make_budget(session.config.mapping)
+        self._budget: Budget = self.pipeline.make_budget()
         self._rate = session.source.rate
         self._number = 0
 

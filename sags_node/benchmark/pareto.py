@@ -12,8 +12,17 @@ from typing import Any
 
 import cv2
 
+from sags_node.benchmark.hosts import measure_hosts
 from sags_node.benchmark.pareto_baselines import baselines_of_run, measured_baselines
-from sags_node.benchmark.pareto_settings import Setting, Sweep, skip_settings, time_settings
+from sags_node.benchmark.pareto_settings import (
+    HOSTS,
+    RUNG_PART,
+    Setting,
+    Sweep,
+    rung_settings,
+    skip_settings,
+    time_settings,
+)
 from sags_node.engine.rasterize import make_rasterizer, to_view
 from sags_node.errors import SagsError
 from sags_node.evaluation import metrics
@@ -22,7 +31,6 @@ from sags_node.evaluation.measure import FrameRow, Progress
 from sags_node.evaluation.session import measure, run_step
 from sags_node.evaluation.spool import Spool
 from sags_node.evaluation.summary import summarise
-from sags_node.mapping.devices import affordable
 from sags_node.session import Session, open_session
 from sags_node.sources.source import open_source
 from sags_node.vision.rectify import Rectifier
@@ -113,9 +121,8 @@ class _Comparison:
     def measure(self, fits: Mapping[str, Row]) -> Row:
         session, parts = self._session, self._sweep.parts
         timed = time_settings(session.config, self._size, parts)
-        mapping = session.config.mapping
-        most = affordable(session.config, *self._size)
-        skips = skip_settings(mapping, most) if "skips" in parts else {}
+        timed += rung_settings() if RUNG_PART in parts else []
+        skips = skip_settings(session.config.mapping) if "skips" in parts else {}
         pairs = [setting for pair in skips.values() for setting in pair]
         runs: dict[Setting, list[Row]] = {setting: [] for setting in (*timed, *pairs)}
         turns = [setting for _ in range(self._sweep.repeat) for setting in runs]
@@ -146,7 +153,13 @@ class _Comparison:
                 self._skip(rule, _middle(runs[as_is]), _middle(runs[turned]))
                 for rule, (as_is, turned) in skips.items()
             ],
+            "hosts": self._hosts(frames or 0, rate) if HOSTS in parts else [],
         }
+
+    def _hosts(self, frames: int, rate: float) -> list[Row]:
+        return measure_hosts(
+            self._launch, self._overrides, frames / rate, lambda what: self._progress(what)("", 0)
+        )
 
     def _skip(self, rule: str, as_is: Row, turned: Row) -> Row:
         """What a rule changes."""
@@ -157,7 +170,7 @@ class _Comparison:
     @contextmanager
     def _played(self, setting: Setting, progress: Progress) -> Iterator[tuple[Session, Spool]]:
         session = self._open(setting.overrides)
-        with Spool(session.config.engine.backend) as spool:
+        with Spool() as spool:
             run_step(session, self._sweep.options, spool, progress)
             if len(spool) < SHORTEST:
                 raise SagsError(

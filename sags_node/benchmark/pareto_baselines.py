@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import numba
 import numpy as np
 
 from sags_node.config import Box
@@ -20,6 +19,7 @@ from sags_node.evaluation import metrics
 from sags_node.evaluation.measure import FrameRow, Options, Progress
 from sags_node.evaluation.spool import Spool, SpooledFrame
 from sags_node.evaluation.summary import summarise
+from sags_node.kernels.jit import kernel
 from sags_node.mapping.right_eye import right_eye_mask
 from sags_node.session import Session
 from sags_node.sources.source import open_source
@@ -175,7 +175,7 @@ def warp_to_right(left: F32, depth: F32, focal_px: float, baseline: float) -> tu
     return np.where(known[..., None], warped, np.float32(0)), known
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _left_columns(disparity: F32) -> F32:
     """The left column that each right pixel shows, -1 unknown, [H, W]."""
     height, width = disparity.shape

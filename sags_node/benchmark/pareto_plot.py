@@ -20,6 +20,8 @@ COLOURS = {  # RGB
     "budgets": (33, 102, 172),
     "resolutions": (178, 24, 43),
     "gaussians": (27, 120, 55),
+    "rungs": (153, 79, 161),
+    "hosts": (230, 97, 1),
 }
 TICKS_MS = (5, 10, 15, 20, 25, 30, 40, 50, 75, 100, 150, 200, 300, 500, 1000)
 
@@ -49,7 +51,8 @@ class _Axes:
 
 
 def _panel(session: Row) -> U8:
-    rows = session["settings"]
+    live = [row | {"online_at_full_size": row["online"], "non_dominated": False} for row in session["hosts"]]
+    rows = [*session["settings"], *live]
     points = [(row["frame_ms"]["p50"], row["online_at_full_size"]["psnr"]) for row in rows]
     period_ms = 1e3 / session["rate_hz"]
     axes = _Axes([*(ms for ms, _ in points), period_ms], [psnr for _, psnr in points])
@@ -87,7 +90,7 @@ def _frame(panel: U8, axes: _Axes, session: Row, period_ms: float) -> None:
     title = f"{session['session']}, {session['frames']} frames: online PSNR* (dB) over ms per frame (median)"
     _text(panel, title, (LEFT, 24), BLACK, LARGE)
     x = LEFT
-    for part in dict.fromkeys(row["part"] for row in session["settings"]):
+    for part in dict.fromkeys(row["part"] for row in [*session["settings"], *session["hosts"]]):
         cv2.circle(panel, (x + 6, 42), 5, COLOURS[part], cv2.FILLED, cv2.LINE_AA)
         _text(panel, part, (x + 16, 46), COLOURS[part])
         x += 110

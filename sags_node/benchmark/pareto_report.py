@@ -16,6 +16,8 @@ def tables(measured: Row) -> Iterator[Table]:
         yield _settings(session)
         if session["skips"]:
             yield _skips(session)
+        if session["hosts"]:
+            yield _hosts(session)
 
 
 def _settings(session: Row) -> Table:
@@ -64,6 +66,27 @@ def _skips(session: Row) -> Table:
             *(_number((each["depth"] or {}).get("median_mm"), ".3f") for each in (on, off)),
             _number(row["depth_mm"], "+.3f"),
             _number(row["saved_ms"], ".2f"),
+        )
+    return made
+
+
+def _hosts(session: Row) -> Table:
+    made = _table(
+        session, "host", "frames after the first second", "first render, ms", "frame, ms: p50", "p99",
+        "latency, ms: p50", "p99", "online, dB", "N",
+    )  # fmt: skip
+    for row in session["hosts"]:
+        made.add_row(
+            row["name"],
+            _number(row["share_after_first_second"], ".1%"),
+            _number(row["first_render_ms"], ".0f"),
+            *(
+                _number(row[key][place], ".1f")
+                for key in ("frame_ms", "latency_ms")
+                for place in ("p50", "p99")
+            ),
+            _decibels(row["online"], list(session["segments"])),
+            _number(row["gaussians"]["mean"], ",.0f"),
         )
     return made
 

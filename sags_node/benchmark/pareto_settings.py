@@ -8,15 +8,17 @@ from dataclasses import dataclass
 from sags_node.config import LaunchConfig, MappingConfig
 from sags_node.errors import UsageError
 from sags_node.evaluation.measure import Options
+from sags_node.mapping.ladder import RUNGS
 
 PARTS = ("budgets", "resolutions", "gaussians", "skips")
+# Parts for those who ask: each rung of the ladder, one step a frame; and live on hosts with less to give.
+RUNG_PART, HOSTS = "rungs", "hosts"
 BUDGETS_MS = (25.0, 33.0, 50.0, 100.0, 200.0)
 SIZES = (0.75, 0.5)  # of the launch file's working size
 COUNTS = (10_000, 20_000, 30_000, 50_000, 70_000)
 COUNT_BUDGETS_MS = (33.0, 100.0)
 SKIP_STEPS = 2  # per frame, where rules that leave work out are compared
-HURRIED_RULES = ("skip_depth", "skip_fitted")  # that act when time is short
-HURRY_MS = 1.0  # a budget that no frame keeps
+HURRIED_RULES = ("skip_depth", "skip_fitted")  # that act on rungs of the ladder where time is short
 
 BUDGET, COUNT = "mapping.budget_ms", "mapping.max_gaussians"
 WIDTH, HEIGHT = "vision.width", "vision.height"
@@ -46,9 +48,10 @@ class Sweep:
     options: Options = DEFAULT_OPTIONS
 
     def __post_init__(self) -> None:
-        unknown = [part for part in self.parts if part not in PARTS]
+        known = (*PARTS, RUNG_PART, HOSTS)
+        unknown = [part for part in self.parts if part not in known]
         if unknown or not self.parts:
-            raise UsageError(f"unknown part '{', '.join(unknown)}'; choose from {', '.join(PARTS)}")
+            raise UsageError(f"unknown part '{', '.join(unknown)}'; choose from {', '.join(known)}")
 
 
 def time_settings(config: LaunchConfig, size: tuple[int, int], parts: Sequence[str]) -> list[Setting]:
@@ -74,14 +77,21 @@ def time_settings(config: LaunchConfig, size: tuple[int, int], parts: Sequence[s
     return list(settings.values())
 
 
-def skip_settings(mapping: MappingConfig, gaussians: int) -> dict[str, tuple[Setting, Setting]]:
+def rung_settings() -> list[Setting]:
+    """Each rung of the ladder, one step a frame."""
+    step = "mapping.iterations:=1"
+    return [Setting(RUNG_PART, f"rung {i}", (step, f"mapping.rung:={i}")) for i in range(len(RUNGS))]
+
+
+def skip_settings(mapping: MappingConfig) -> dict[str, tuple[Setting, Setting]]:
     """For each rule of `skip_rules`: all rules as they are, and this one turned round.
 
-    Both at a fixed number of steps. A rule for when time is short would never act there: it is compared where
-    time is always short, with the default's number of `gaussians`.
+    Both at a fixed number of steps. A rule for when time is short is compared on the highest rung of the
+    ladder on which it acts.
     """
     steps = Setting("skips", "all rules as they are", (f"mapping.iterations:={SKIP_STEPS}",))
-    hurry = Setting("skips", "in a hurry", (f"{BUDGET}:={HURRY_MS}", f"{COUNT}:={gaussians}"))
+    rung = max(i for i, each in enumerate(RUNGS) if each.step < 1 and each.depth_every > 1)
+    hurry = Setting("skips", "in a hurry", ("mapping.iterations:=1", f"mapping.rung:={rung}"))
     pairs = {}
     for rule in skip_rules():
         base = hurry if rule in HURRIED_RULES else steps

@@ -15,13 +15,13 @@ from sags_node.benchmark.work import Work, share_of_peak, stage_rows
 from sags_node.engine import (
     binning,
     compositing,
-    pair_sums,
     projection,
     projection_backward,
     spherical_harmonics,
 )
 from sags_node.engine.compositing import TILE_HEIGHT, TILE_WIDTH
 from sags_node.engine.rasterize import make_rasterizer
+from sags_node.kernels.vectors import BLOCK_WIDTH, RECORD
 from sags_node.types import F32, Bool, Camera, Gaussians
 
 STAGES: Stages = {
@@ -32,7 +32,6 @@ STAGES: Stages = {
     (binning, "sort_into_tiles"): "bin",
     (compositing, "composite"): "composite",
     (compositing, "composite_backward"): "composite backward",
-    (pair_sums, "sum_pairs"): "sum",
     (projection_backward, "project_backward"): "project backward",
     (spherical_harmonics, "color_backward"): "color backward",
 }
@@ -168,19 +167,20 @@ def _active_tiles(case: RasterCase) -> Bool | None:
 
 
 def evaluated_pairs(arguments: Mapping[str, Any]) -> int:
-    """Pixel-Gaussian pairs that `composite` evaluated: whole rows of a tile, until the tile was finished.
+    """Pixel-Gaussian pairs that `composite` evaluated: all that a splat touches of a tile's columns, until
+    the tile was finished.
 
     Args:
         arguments: `pairs`, `tile_starts`, `tile_ends` and `drawn` as `composite` left them.
     """
     pairs, starts, drawn = arguments["pairs"], arguments["tile_starts"], arguments["drawn"]
-    rows = (pairs["row_end"] - pairs["row_begin"])[: starts[-1]]
-    rows_before = np.concatenate([[0], np.cumsum(rows, dtype=np.int64)])
+    begin, end = (pairs[name][: starts[-1]].astype(np.int64) for name in ("begin", "end"))
+    rows_before = np.concatenate([[0], np.maximum(end - begin, 0).sum(1).cumsum()])
     ends = arguments["tile_ends"][drawn]
-    return int((rows_before[ends] - rows_before[starts[drawn]]).sum()) * TILE_WIDTH
+    return int((rows_before[ends] - rows_before[starts[drawn]]).sum()) * BLOCK_WIDTH
 
 
-_PER_PAIR = {"emitted", "pairs", "v_pairs"}  # buffers larger than what is used of them
+_PER_PAIR = {"emitted": 1, "pairs": 1, "v_pairs": RECORD}  # items, in buffers larger than what is used
 _PICTURES = {"planes", "v_planes", "weight"}  # only read and written where drawn
 _IN_CACHE = {"scratch"}
 
@@ -192,7 +192,8 @@ def _work(stage: str, times: StageTimes) -> Work:
     touched = 0.0
     for name, value in arrays_of(stage, STAGES, times):
         if name not in _IN_CACHE:
-            used = tile_pairs * value.itemsize if name in _PER_PAIR else value.nbytes
+            items = tile_pairs * _PER_PAIR[name] if name in _PER_PAIR else value.size
+            used = items * value.itemsize
             touched += used * drawn_share if name in _PICTURES else used
     if stage in OPERATIONS_PER_PAIR:
         pairs = evaluated_pairs(drawing)

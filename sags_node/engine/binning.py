@@ -11,6 +11,7 @@ from typing import Any
 import numba
 import numpy as np
 
+from sags_node.engine.layout import COLUMNS
 from sags_node.kernels.jit import (
     inlined,
     kernel,
@@ -19,8 +20,19 @@ from sags_node.kernels.jit import (
     prefetch_write,
     round_down,
     round_up,
-    square_root,
     take,
+)
+from sags_node.kernels.vectors import (
+    BLOCK_WIDTH,
+    LANES,
+    half_lanes,
+    half_signs,
+    larger,
+    round_downs,
+    select,
+    smaller,
+    square_roots,
+    store_integers,
 )
 from sags_node.types import F32, I32, I64, Bool
 
@@ -28,6 +40,7 @@ f4 = np.float32
 ZERO, HALF, ONE = f4(0.0), f4(0.5), f4(1.0)
 ROW_SLACK = f4(0.001)  # px: rounding must not lose a row
 BLOCK = 64  # splats that are looked at in one go
+AT_ONCE = LANES // 2  # 8 px wide columns of a splat that are looked at in one go
 CHUNK = 1024  # slots that a worker reserves at a time
 AHEAD = 12  # how far ahead records are prefetched
 DIGIT_BITS = 12
@@ -53,19 +66,15 @@ def _pixels(mean: Any, radius: Any, size: int) -> Any:
 
 
 @inlined
-def _box(splat: Any, width: int, height: int, tile_width_bits: int, tile_height_bits: int) -> Any:
-    """Half the width and height, px, of the ellipse on which a splat's alpha is 1/255, and the tiles that its
-    box touches: first column and one after the last, then rows; none where the box lies outside."""
-    a, b, c = splat.whiten_xx, splat.whiten_xy, splat.whiten_yy
-    radius_x = square_root(splat.extent * (b * b + c * c)) / (a * c)
-    radius_y = square_root(splat.extent) / c
-    x_first, x_last = _pixels(splat.mean_x, radius_x, width)
-    y_first, y_last = _pixels(splat.mean_y, radius_y, height)
+def _box(splat: Any, width: int, height: int, tile_width_bits: int) -> Any:
+    """What a splat's box touches: the columns of tiles, first and one after the last; the first and last row
+    of pixels. No column and no row where the box lies outside."""
+    x_first, x_last = _pixels(splat.mean_x, splat.reach_x, width)
+    y_first, y_last = _pixels(splat.mean_y, splat.reach_y, height)
     left, right = x_first >> tile_width_bits, (x_last >> tile_width_bits) + 1
-    top, bottom = y_first >> tile_height_bits, (y_last >> tile_height_bits) + 1
     if x_first > x_last or y_first > y_last:
-        right, bottom = left, top
-    return radius_x, radius_y, left, right, top, bottom
+        right, y_last = left, y_first - 1
+    return left, right, y_first, y_last
 
 
 @kernel
@@ -77,7 +86,8 @@ def _drop_block(
     for i in range(first, last):
         splat = splats[i]
         if splat.extent > ZERO:
-            _, _, left, right, top, bottom = _box(splat, width, height, tile_width_bits, tile_height_bits)
+            left, right, y_first, y_last = _box(splat, width, height, tile_width_bits)
+            top, bottom = y_first >> tile_height_bits, (y_last >> tile_height_bits) + 1
             upper, lower = first_sum + top * row, first_sum + bottom * row
             if sums[lower + right] - sums[lower + left] == sums[upper + right] - sums[upper + left]:
                 splat.extent = ZERO
@@ -107,9 +117,10 @@ def drop_untouched(
 
 
 @kernel
-def sort_by_depth(depths: F32, order: I32, spare_order: I32, keys: I32, spare_keys: I32) -> int:
+def sort_by_depth(depths: F32, slots: Any, order: I32, spare_order: I32, keys: I32, spare_keys: I32) -> int:
     """Stable radix sort: `order` begins with the indices of the `depths` [C N] above 0, from near to far.
-    Returns how many those are. Positive floats sort like their bits."""
+    Returns how many those are. Positive floats sort like their bits. The others' `slots` [C N] SLOTS are
+    made empty."""
     bits = depths.view(np.int32)
     kept = 0
     smallest, largest = np.int32(0x7FFFFFFF), np.int32(0)
@@ -120,6 +131,8 @@ def sort_by_depth(depths: F32, order: I32, spare_order: I32, keys: I32, spare_ke
             kept += 1
             smallest = min(smallest, bits[i])
             largest = max(largest, bits[i])
+        else:
+            slots[i].first = slots[i].count = 0
     span = largest - smallest
     starts = np.empty(DIGITS + 1, np.int32)
     shift = 0
@@ -148,47 +161,48 @@ def sort_by_depth(depths: F32, order: I32, spare_order: I32, keys: I32, spare_ke
 
 
 @inlined
-def _find_spans(
-    splat: Any, width: int, height: int, tile_width_bits: int, tile_height_bits: int, spans: I32, n: int
-) -> Any:
-    """Write the first and last row of a splat in each column of tiles to `spans` [n:, 2]. Returns the first
-    column, one after the last, and the number of tiles that its box touches."""
-    radius_x, radius_y, left, right, top, bottom = _box(
-        splat, width, height, tile_width_bits, tile_height_bits
-    )
-    tile_width = 1 << tile_width_bits
-    mean_x, mean_y, extent = splat.mean_x, splat.mean_y, splat.extent
-    y_first, y_last = _pixels(mean_y, radius_y, height)
-    # u^2 + v^2 <= extent with u = a dx + b dy, v = c dy
-    a, b, c = splat.whiten_xx, splat.whiten_xy, splat.whiten_yy
-    ab, ac, bb_cc = a * b, a * c, b * b + c * c
-    inverse = ONE / bb_cc
-    lowest_dx = -b / a * radius_y  # where the ellipse reaches dy = radius_y
-    for column in range(left, right):
-        low = max(f4(column * tile_width) + HALF - mean_x, -radius_x)
-        high = min(f4((column + 1) * tile_width) - HALF - mean_x, radius_x)
-        # the largest and smallest dy of the ellipse over this column of tiles
-        dx = min(max(lowest_dx, low), high)
-        below = (square_root(max(bb_cc * extent - ac * ac * dx * dx, ZERO)) - ab * dx) * inverse
-        dx = min(max(-lowest_dx, low), high)
-        above = -(square_root(max(bb_cc * extent - ac * ac * dx * dx, ZERO)) + ab * dx) * inverse
-        spans[n, 0] = max(y_first, _up(mean_y + above - HALF - ROW_SLACK, 0, height))
-        spans[n, 1] = min(y_last, _down(mean_y + below - HALF + ROW_SLACK, -1, height - 1))
-        n += 1
-    return left, right, (right - left) * (bottom - top)
+def _find_rows(splat: Any, box: Any, height: int, tile_width_bits: int, rows: I32, n: int) -> Any:
+    """Find which rows of the picture a splat touches in each 8 px wide column of its box. Returns where those
+    of the next splat may stand.
+
+    Turned by half a turn, the splat's upper end is its lower end. So one half of a vector's lanes look for
+    the lower ends in AT_ONCE columns, the other half for the upper ends in the same columns. From `n` on
+    `rows` holds for as many columns one after the last row of each, and then their first rows, with a minus
+    sign; their sum is the number of rows, or not above 0.
+    """
+    left, right, y_first, y_last = box
+    side = half_signs()
+    low = half_lanes() * f4(BLOCK_WIDTH) + (f4(left << tile_width_bits) + HALF - splat.mean_x)
+    most = select(side > ZERO, f4(y_last + 1), f4(-y_first))
+    for _ in range(0, (right - left) * COLUMNS, AT_ONCE):
+        begin, end = larger(low, -splat.reach_x), smaller(low + f4(BLOCK_WIDTH - 1), splat.reach_x)
+        dx = smaller(larger(side * splat.lowest_x, begin), end)
+        half_chord = square_roots(larger((splat.reach_x - dx) * (splat.reach_x + dx), ZERO)) * splat.chord
+        dy = half_chord - side * dx * splat.shear
+        last = round_downs(side * splat.mean_y + dy + (HALF + ROW_SLACK))
+        store_integers(rows, n, smaller(select(begin <= end, larger(last, f4(-height)), f4(-height)), most))
+        low += f4(BLOCK_WIDTH * AT_ONCE)
+        n += LANES
+    return n
+
+
+@inlined
+def _row_in_tile(row: int, first: int, tile_height: int) -> int:
+    return min(max(row - first, 0), tile_height)
 
 
 @kernel
 def _emit_parts(
     splats: Any, order: I32, cameras: int, active: Bool, width: int, height: int, tile_width_bits: int,
-    tile_height_bits: int, emitted: Any, slots: Any, reserved: I64, histogram: I32, next_part: I64,
+    tile_height_bits: int, emitted: Any, slots: Any, runs: Any, reserved: I64, histogram: I32, next_part: I64,
 ) -> None:  # fmt: skip
     """First all of a block's rows, then its pairs: with both in one loop the processor would wait for every
     square root before it knows where to go on."""
     count, tiles = splats.size // cameras, active.size // cameras
     tile_height = 1 << tile_height_bits
     tiles_x = (width + (1 << tile_width_bits) - 1) >> tile_width_bits
-    boxes, spans = np.empty((BLOCK, 3), np.int32), np.empty((BLOCK * tiles_x, 2), np.int32)
+    boxes = np.empty((BLOCK, 2), np.int32)
+    rows = np.empty(BLOCK * (tiles_x * COLUMNS // AT_ONCE + 1) * LANES, np.int32)
     slot: Any = 0
     limit: Any = 0
     while True:
@@ -197,55 +211,68 @@ def _emit_parts(
             break
         counts = histogram[part]
         counts[:] = 0
-        end = order.size * (part + 1) // histogram.shape[0]
-        for begin in range(order.size * part // histogram.shape[0], end, BLOCK):
-            last = min(begin + BLOCK, end)
-            n = 0
-            for position in range(begin, last):
-                if position + AHEAD < end:
-                    prefetch_read(splats, order[position + AHEAD])
-                    prefetch_write(slots, order[position + AHEAD])
-                left, right, touched = _find_spans(
-                    splats[order[position]], width, height, tile_width_bits, tile_height_bits, spans, n
-                )
+        first_block, end_block = blocks_of(part, histogram.shape[0], order.size)
+        for block in range(first_block, end_block):
+            begin, end = block * BLOCK, min((block + 1) * BLOCK, order.size)
+            n, needed = 0, 0
+            for position in range(begin, end):
+                soon = order[min(position + AHEAD, order.size - 1)]
+                prefetch_read(splats, soon)
+                prefetch_write(slots, soon)
+                splat = splats[order[position]]
+                box = _box(splat, width, height, tile_width_bits)
+                n = _find_rows(splat, box, height, tile_width_bits, rows, n)
+                left, right, y_first, y_last = box
                 boxes[position - begin, 0] = left
                 boxes[position - begin, 1] = right
-                boxes[position - begin, 2] = touched
-                n += right - left
+                needed += (right - left) * ((y_last >> tile_height_bits) - (y_first >> tile_height_bits) + 1)
+            if slot + needed > limit:
+                # where a worker's slots lie depends on who comes first; what becomes of them does not
+                limit = needed if needed > CHUNK else CHUNK
+                slot = take(reserved, limit)
+                limit += slot
+            if limit > emitted.size:  # no room: only go on counting what is needed
+                slot += needed
+                continue
+            runs[block].first = slot
             n = 0
-            for position in range(begin, last):
+            for position in range(begin, end):
                 i = order[position]
                 left, right = boxes[position - begin, 0], boxes[position - begin, 1]
-                needed = boxes[position - begin, 2]
-                if slot + needed > limit:
-                    # where a worker's slots lie depends on who comes first; what becomes of them does not
-                    limit = needed if needed > CHUNK else CHUNK
-                    slot = take(reserved, limit)
-                    limit += slot
-                if limit > emitted.size:  # no room: only go on counting what is needed
-                    slot += needed
-                    n += right - left
-                    continue
                 first = slot
                 first_tile = i // count * tiles
                 for column in range(left, right):
-                    row_first, row_last = spans[n, 0], spans[n, 1]
-                    n += 1
-                    if row_first > row_last:
-                        continue
-                    for row in range(row_first >> tile_height_bits, (row_last >> tile_height_bits) + 1):
+                    k = (column - left) * COLUMNS
+                    at = n + k // AT_ONCE * LANES + k % AT_ONCE
+                    end0, end1 = rows[at], rows[at + 1]
+                    begin0, begin1 = -rows[at + AT_ONCE], -rows[at + AT_ONCE + 1]
+                    row_first, row_end = min(begin0, begin1), max(end0, end1)
+                    for row in range(row_first >> tile_height_bits, (row_end - 1 >> tile_height_bits) + 1):
                         tile = first_tile + row * tiles_x + column
                         if active[tile]:
                             pair = emitted[slot]
+                            top = row * tile_height
+                            pair.splat = i
                             pair.tile = tile
-                            pair.row_begin = max(row_first - row * tile_height, 0)
-                            pair.row_end = min(row_last - row * tile_height + 1, tile_height)
+                            pair.begin[0] = _row_in_tile(begin0, top, tile_height)
+                            pair.end[0] = _row_in_tile(end0, top, tile_height)
+                            pair.begin[1] = _row_in_tile(begin1, top, tile_height)
+                            pair.end[1] = _row_in_tile(end1, top, tile_height)
                             counts[tile] += 1
                             slot += 1
+                n += ((right - left) * COLUMNS + AT_ONCE - 1) // AT_ONCE * LANES
                 slots[i].first = first
                 slots[i].count = slot - first
                 if slot == first:
                     splats[i].extent = ZERO
+            runs[block].count = slot - runs[block].first
+
+
+@inlined
+def blocks_of(part: int, parts: int, size: int) -> Any:
+    """The first block of a part of the order, and that of the next part."""
+    blocks = (size + BLOCK - 1) // BLOCK
+    return blocks * part // parts, blocks * (part + 1) // parts
 
 
 @parallel_kernel
@@ -261,6 +288,7 @@ def emit_pairs(
     workers: int,
     emitted: Any,  # EMITTED, written, with gaps
     slots: Any,  # [C N] SLOTS, written for what is drawn: where a splat's pairs stand
+    runs: Any,  # [ceil(C N / BLOCK)] SLOTS, written: where the pairs of a block of the order stand
     reserved: I64,  # [1] written: how many of `emitted` are needed; if that is more than it has, call again
     histogram: I32,  # [parts, C tiles] pairs per tile of each part of the order, written
     next_part: I64,  # [1] for the workers
@@ -271,41 +299,37 @@ def emit_pairs(
     for _ in numba.prange(workers):
         _emit_parts(
             splats, order, cameras, active, width, height, tile_width_bits, tile_height_bits, emitted, slots,
-            reserved, histogram, next_part,
+            runs, reserved, histogram, next_part,
         )  # fmt: skip
 
 
 @kernel
-def _place_parts(emitted: Any, slots: Any, order: I32, histogram: I32, pairs: Any, next_part: I64) -> None:
+def _place_parts(emitted: Any, runs: Any, size: int, histogram: I32, pairs: Any, next_part: I64) -> None:
     parts = histogram.shape[0]
     while True:
         part = take(next_part, 1)
         if part >= parts:
             break
         places = histogram[part]
-        end = order.size * (part + 1) // parts
-        for position in range(order.size * part // parts, end):
-            if position + AHEAD < end:
-                prefetch_read(slots, order[position + AHEAD])
-            i = order[position]
-            first = slots[i].first
-            for slot in range(first, first + slots[i].count):
+        first_block, end_block = blocks_of(part, parts, size)
+        for block in range(first_block, end_block):
+            first = runs[block].first
+            for slot in range(first, first + runs[block].count):
                 source = emitted[slot]
                 place = places[source.tile]
                 places[source.tile] = place + 1
                 pair = pairs[place]
-                pair.splat = i
+                pair.splat = source.splat
                 pair.slot = slot
-                pair.row_begin = source.row_begin
-                pair.row_end = source.row_end
+                pair.rows = source.rows
 
 
 @parallel_kernel
 def sort_into_tiles(
     workers: int,
-    order: I32,
+    size: int,  # of the order
     emitted: Any,  # EMITTED, of `emit_pairs`, as the next two
-    slots: Any,
+    runs: Any,
     histogram: I32,  # used up
     pairs: Any,  # PAIR, written: tile after tile, near to far within each
     tile_starts: I32,  # [C tiles + 1] written
@@ -323,4 +347,4 @@ def sort_into_tiles(
     tile_starts[tiles] = total
     next_part[0] = 0
     for _ in numba.prange(workers):
-        _place_parts(emitted, slots, order, histogram, pairs, next_part)
+        _place_parts(emitted, runs, size, histogram, pairs, next_part)

@@ -6,75 +6,91 @@ R_i = sum over j > i of w_j s_j, starting from out . g, so that
 
     dL/dlog alpha_i = w_i s_i - alpha_i R_i / (1 - alpha_i).
 
-Nothing is recovered by dividing, so saturated pixels cannot underflow.
+Nothing is recovered by dividing, so saturated pixels cannot underflow. A tile stops when all its pixels have
+T <= 1e-4.
 
-A tile stops when all its pixels have T <= 1e-4. With d = pixel - mean2d, u = a dx + b dy and v = c dy
-(see `layout`): what depends on the row alone is worked out for all rows of the tile at once.
+A tile is two columns of blocks (see `vectors`); a pair says which rows of each column its splat touches. With
+d = pixel - mean2d a block's u = a dx + b dy and v = c dy (see `layout`) follow from those of the block above
+by adding a constant. The scratch of a worker holds a tile block by block, and of each block its planes.
 
-`median` compiles the constants and helpers of this file into its own kernel: after editing them, delete the
-caches (see `jit`). Tile sizes stand here only: see `jit` on the disk cache.
+`median` uses the constants and helpers of this file. Tile sizes stand here only.
 """
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numba
 import numpy as np
 
+from sags_node.engine.layout import COLUMNS
+from sags_node.engine.projection import LOG2_MIN_ALPHA
 from sags_node.kernels.jit import (
-    copy,
     inlined,
     kernel,
     parallel_kernel,
+    prefetch_far,
     prefetch_read,
     prefetch_write,
-    round_to_even,
-    scale_by_power_of_two,
-    stack_floats,
     take,
+)
+from sags_node.kernels.vectors import (
+    BLOCK_WIDTH,
+    LANES,
+    RECORD,
+    any_of,
+    block_x,
+    block_y,
+    load,
+    load_block,
+    multiply_add,
+    select,
+    spread,
+    store,
+    store_block,
+    store_sums,
+    times_power_of_two,
 )
 from sags_node.types import F32, I32, I64
 
 f4 = np.float32
-u8 = np.uint64
 
 TILE_WIDTH_BITS, TILE_HEIGHT_BITS = 4, 5
 TILE_WIDTH, TILE_HEIGHT = 1 << TILE_WIDTH_BITS, 1 << TILE_HEIGHT_BITS  # 16x32 px
-TILE_PIXELS = TILE_WIDTH * TILE_HEIGHT
-PLANE = TILE_PIXELS + 16  # 64 bytes of padding: planes 4 KiB apart would evict each other
+BLOCK_HEIGHT = LANES // BLOCK_WIDTH
+BLOCKS = TILE_HEIGHT // BLOCK_HEIGHT  # in a column
 
-# planes of the scratch array
-TRANSMITTANCE, RED, GREEN, BLUE, DEPTH, COVERAGE, REMAINING, WEIGHT, STAGED = (
-    u8(k * PLANE) for k in range(9)
-)
-# and then one number per row of the tile: u at dx = 0 left of the tile, v, and the exponent where u = 0
-ROW_U, ROW_V, ROW_EXPONENT = (u8(9 * PLANE + k * TILE_HEIGHT) for k in range(3))
-SCRATCH = 9 * PLANE + 4 * TILE_HEIGHT  # floats per worker
-
-# sums of the backward pass, each with one number per column of the tile
-SUM, SUM_U, SUM_V, SUM_UU, SUM_UV, SUM_VV = (u8(k * TILE_WIDTH) for k in range(6))
-SUM_RED, SUM_GREEN, SUM_BLUE, SUM_DEPTH, SUM_WEIGHT = (u8(k * TILE_WIDTH) for k in range(6, 11))
-SUMS = 11 * TILE_WIDTH
+# Planes of a block in the scratch
+TRANSMITTANCE, RED, GREEN, BLUE, DEPTH, COVERAGE, REMAINING, WEIGHT = (k * LANES for k in range(8))
+DRAWN = 5 * LANES  # floats from one block to the next when drawing, which needs the first five,
+DERIVED = 9 * LANES  # and for the derivative; one is spare: blocks 512 bytes apart would share few cache sets
+SCRATCH = COLUMNS * BLOCKS * DERIVED  # floats per worker
 
 ZERO, HALF, ONE = f4(0.0), f4(0.5), f4(1.0)
 OPAQUE = f4(1e-4)  # transmittance at which a pixel is finished
-LOG2_MIN_ALPHA = f4(math.log2(1.0 / 255.0))
 TEST_EVERY = 8  # pairs between two looks at the transmittance
 AHEAD = 8  # pairs between prefetch and use
 
 # 2^x on -1/2 <= x <= 1/2, relative error 2.6e-6
 P0, P1, P2, P3, P4 = f4(0.999999285), f4(0.693121791), f4(0.240247443), f4(0.0559179001), f4(0.00957010966)
+ROUNDING = f4(1.5 * 2**23)  # a float32 this large has no place for fractions: adding it rounds to an integer
 
 
 @inlined
 def alpha_of(exponent: Any) -> Any:
-    """2**exponent, and 0 where that is below 1/255."""
-    whole = round_to_even(exponent)
-    x = exponent - whole
-    power = scale_by_power_of_two((((P4 * x + P3) * x + P2) * x + P1) * x + P0, whole)
-    return power if exponent >= LOG2_MIN_ALPHA else ZERO
+    """2**exponent, and 0 where that is below 1/255; of a vector."""
+    rounded = exponent + ROUNDING
+    x = exponent - (rounded - ROUNDING)
+    power = times_power_of_two((((x * P4 + P3) * x + P2) * x + P1) * x + P0, rounded)
+    return select(exponent >= LOG2_MIN_ALPHA, power, ZERO)
+
+
+@inlined
+def whitened(a: Any, b: Any, c: Any, dx: Any, dy: Any) -> Any:
+    """a dx, u and v; rounded alike in every kernel, or one would cut a splat at a pixel where another draws
+    it."""
+    along = dx * a
+    return along, multiply_add(dy, b, along), dy * c
 
 
 @inlined
@@ -86,55 +102,52 @@ def place_of(t: int, width: int, height: int) -> Any:
 
 
 @inlined
-def open_tile(tile: F32, columns: int, rows: int) -> None:
+def is_whole(columns: int, rows: int) -> bool:
+    """Whether all of a tile lies in the picture."""
+    return columns == TILE_WIDTH and rows == TILE_HEIGHT
+
+
+@inlined
+def place_in_scratch(x: int, y: int, stride: int) -> int:
+    """Of a pixel of the tile, in the first plane."""
+    block = x // BLOCK_WIDTH * BLOCKS + y // BLOCK_HEIGHT
+    return block * stride + y % BLOCK_HEIGHT * BLOCK_WIDTH + x % BLOCK_WIDTH
+
+
+@inlined
+def open_tile(tile: F32, stride: int, columns: int, rows: int) -> None:
     """Transmittance 1 inside the picture, 0 outside: pixels outside neither draw nor keep a tile open."""
-    for i in range(TILE_PIXELS):
-        x, y = i % TILE_WIDTH, i // TILE_WIDTH
-        tile[TRANSMITTANCE + u8(i)] = ONE if x < columns and y < rows else ZERO
+    for block in range(COLUMNS * BLOCKS):
+        store(tile, block * stride + TRANSMITTANCE, spread(ONE))
+    if not is_whole(columns, rows):
+        for y in range(TILE_HEIGHT):
+            for x in range(TILE_WIDTH):
+                if x >= columns or y >= rows:
+                    tile[place_in_scratch(x, y, stride) + TRANSMITTANCE] = ZERO
 
 
 @inlined
-def _load(tile: F32, plane: Any, picture: F32, start: int, width: int, columns: int, rows: int) -> None:
-    """Copy the tile's part of a picture [H W] into a plane of the scratch; `start` is its first pixel."""
-    if columns == TILE_WIDTH:  # a constant length is one instruction
-        for y in range(rows):
-            copy(tile, plane + u8(y * TILE_WIDTH), picture, start + y * width, TILE_WIDTH)
-    else:
-        for y in range(rows):
-            copy(tile, plane + u8(y * TILE_WIDTH), picture, start + y * width, columns)
-
-
-@inlined
-def store(tile: Any, plane: Any, picture: Any, start: int, width: int, columns: int, rows: int) -> None:
-    """Copy a plane of the scratch into the tile's part of a picture [H W]."""
-    if columns == TILE_WIDTH:
-        for y in range(rows):
-            copy(picture, start + y * width, tile, plane + u8(y * TILE_WIDTH), TILE_WIDTH)
-    else:
-        for y in range(rows):
-            copy(picture, start + y * width, tile, plane + u8(y * TILE_WIDTH), columns)
-
-
-@inlined
-def any_above(tile: F32, transmittance: Any) -> Any:
+def any_above(tile: F32, stride: int, transmittance: Any) -> Any:
     """Whether a pixel of the tile still has more than this transmittance."""
-    above = ZERO  # counted in float: an integer or a maximum would not vectorise
-    for k in range(TILE_PIXELS):
-        above += ONE if tile[TRANSMITTANCE + u8(k)] > transmittance else ZERO
-    return above > ZERO
+    above = load(tile, TRANSMITTANCE) > transmittance
+    for block in range(1, COLUMNS * BLOCKS):
+        above |= load(tile, block * stride + TRANSMITTANCE) > transmittance
+    return any_of(above)
 
 
 @inlined
-def write_rows(tile: F32, splat: Any, x0: int, y0: int) -> None:
-    """What depends on the row alone."""
-    a, b, c = splat.whiten_xx, splat.whiten_xy, splat.whiten_yy
-    from_x, from_y = f4(x0) - splat.mean_x, f4(y0) - splat.mean_y + HALF
-    for y in range(TILE_HEIGHT):
-        dy = f4(y) + from_y
-        v = c * dy
-        tile[ROW_U + u8(y)] = a * from_x + b * dy
-        tile[ROW_V + u8(y)] = v
-        tile[ROW_EXPONENT + u8(y)] = splat.log2_opacity - v * v
+def write_plane(
+    tile: Any, plane: int, stride: int, picture: Any, start: int, width: int, columns: int, rows: int
+) -> None:
+    """Copy a plane of the scratch into the tile's part of a picture [H W]; `start` is its first pixel."""
+    if is_whole(columns, rows):
+        for block in range(COLUMNS * BLOCKS):
+            y, x = block % BLOCKS * BLOCK_HEIGHT, block // BLOCKS * BLOCK_WIDTH
+            store_block(picture, start + y * width + x, width, load(tile, block * stride + plane))
+    else:
+        for y in range(rows):
+            for x in range(columns):
+                picture[start + y * width + x] = tile[place_in_scratch(x, y, stride) + plane]
 
 
 @kernel
@@ -142,49 +155,64 @@ def _composite_tiles(
     splats: Any, pairs: Any, tile_starts: I32, drawn: I32, next_tile: I64, tile: F32, width: int, height: int,
     planes: F32, tile_ends: I32,
 ) -> None:  # fmt: skip
+    area, last = width * height, tile_starts[tile_starts.size - 1]
     while True:
         turn = take(next_tile, 1)
         if turn >= drawn.size:
             break
         t = drawn[turn]
         camera, x0, y0, columns, rows = place_of(t, width, height)
-        open_tile(tile, columns, rows)
-        for k in range(4 * PLANE):
-            tile[RED + u8(k)] = ZERO
+        start = (camera * 5 * height + y0) * width + x0
+        open_tile(tile, DRAWN, columns, rows)
+        for block in range(COLUMNS * BLOCKS):
+            for plane in range(RED, DRAWN, LANES):
+                store(tile, block * DRAWN + plane, spread(ZERO))
         p, end = tile_starts[t], tile_starts[t + 1]
-        until_test = TEST_EVERY
+        row_to_come, until_test = 0, TEST_EVERY
         while p < end:
-            if p + AHEAD < end:
+            if row_to_come < rows:  # what is written in the end, row by row
+                for k in range(5):
+                    prefetch_write(planes, start + k * area + row_to_come * width)
+                row_to_come += 1
+            if p + AHEAD < last:
                 prefetch_read(splats, pairs[p + AHEAD].splat)
             pair = pairs[p]
             splat = splats[pair.splat]
-            a, red, green, blue, depth = splat.whiten_xx, splat.red, splat.green, splat.blue, splat.depth
-            write_rows(tile, splat, x0, y0)
-            for row in range(pair.row_begin, pair.row_end):
-                row_u, row_exponent = tile[ROW_U + u8(row)], tile[ROW_EXPONENT + u8(row)]
-                first = u8(row * TILE_WIDTH)
-                for k in range(TILE_WIDTH):
-                    i = first + u8(k)
-                    u = a * (f4(k) + HALF) + row_u
-                    transmittance = tile[TRANSMITTANCE + i]
-                    w = alpha_of(row_exponent - u * u) * transmittance
-                    tile[RED + i] += w * red
-                    tile[GREEN + i] += w * green
-                    tile[BLUE + i] += w * blue
-                    tile[DEPTH + i] += w * depth
-                    tile[TRANSMITTANCE + i] = transmittance - w
+            a, b, c, log2_opacity = splat.whiten_xx, splat.whiten_xy, splat.whiten_yy, splat.log2_opacity
+            red, green, blue, depth = splat.red, splat.green, splat.blue, splat.depth
+            for column in range(COLUMNS):
+                first, beyond = pair.begin[column] // BLOCK_HEIGHT, pair.end[column]
+                blocks = (beyond + BLOCK_HEIGHT - 1) // BLOCK_HEIGHT - first
+                if blocks <= 0:
+                    continue
+                dx = block_x() + (f4(x0 + column * BLOCK_WIDTH) + HALF - splat.mean_x)
+                dy = block_y() + (f4(y0 + first * BLOCK_HEIGHT) + HALF - splat.mean_y)
+                _, u, v = whitened(a, b, c, dx, dy)
+                at = (column * BLOCKS + first) * DRAWN
+                for _ in range(blocks):
+                    transmittance = load(tile, at + TRANSMITTANCE)
+                    w = alpha_of(log2_opacity - v * v - u * u) * transmittance
+                    store(tile, at + RED, load(tile, at + RED) + w * red)
+                    store(tile, at + GREEN, load(tile, at + GREEN) + w * green)
+                    store(tile, at + BLUE, load(tile, at + BLUE) + w * blue)
+                    store(tile, at + DEPTH, load(tile, at + DEPTH) + w * depth)
+                    store(tile, at + TRANSMITTANCE, transmittance - w)
+                    u += b * f4(BLOCK_HEIGHT)
+                    v += c * f4(BLOCK_HEIGHT)
+                    at += DRAWN
             p += 1
             until_test -= 1
             if until_test == 0:
                 until_test = TEST_EVERY
-                if not any_above(tile, OPAQUE):
+                if not any_above(tile, DRAWN, OPAQUE):
                     break
         tile_ends[t] = p
-        for k in range(TILE_PIXELS):
-            tile[COVERAGE + u8(k)] = ONE - tile[TRANSMITTANCE + u8(k)]
+        for block in range(COLUMNS * BLOCKS):
+            at = block * DRAWN + TRANSMITTANCE
+            store(tile, at, ONE - load(tile, at))
         for k in range(5):
-            start = ((camera * 5 + k) * height + y0) * width + x0
-            store(tile, RED + u8(k * PLANE), planes, start, width, columns, rows)
+            plane = (RED, GREEN, BLUE, DEPTH, TRANSMITTANCE)[k]
+            write_plane(tile, plane, DRAWN, planes, start + k * area, width, columns, rows)
 
 
 @parallel_kernel
@@ -208,118 +236,145 @@ def composite(
 
 
 @inlined
-def _is_zero(tile: F32) -> bool:
-    """Whether no pixel has a cotangent or a weight; NaN is not zero."""
-    size = ZERO
-    for plane in range(5):
-        for n in range(TILE_PIXELS):
-            size += abs(tile[RED + u8(plane * PLANE) + u8(n)])
-    for n in range(TILE_PIXELS):
-        size += abs(tile[WEIGHT + u8(n)])
-    return bool(size == ZERO)
+def _read_tile(
+    tile: F32, planes: F32, v_planes: F32, weight: F32, start: int, first_weight: int, width: int, area: int,
+    columns: int, rows: int,
+) -> Any:  # fmt: skip
+    """Fill the scratch: cotangents, what remains to be seen of them, weights. Whether any of it is not 0; NaN
+    is not."""
+    if is_whole(columns, rows):
+        asked = spread(ZERO) != ZERO
+        for block in range(COLUMNS * BLOCKS):
+            at, y, x = block * DERIVED, block % BLOCKS * BLOCK_HEIGHT, block // BLOCKS * BLOCK_WIDTH
+            remaining = spread(ZERO)
+            for k in range(5):
+                pixel = start + k * area + y * width + x
+                cotangent = load_block(v_planes, pixel, width)
+                remaining += cotangent * load_block(planes, pixel, width)
+                asked |= cotangent != ZERO
+                store(tile, at + RED + k * LANES, cotangent)
+            store(tile, at + REMAINING, remaining)
+            weights = load_block(weight, first_weight + y * width + x, width)
+            asked |= weights != ZERO
+            store(tile, at + WEIGHT, weights)
+        return any_of(asked)
+    asked_at_edge = False
+    tile[:] = ZERO
+    for y in range(rows):
+        for x in range(columns):
+            at, pixel = place_in_scratch(x, y, DERIVED), start + y * width + x
+            for k in range(5):
+                value = v_planes[pixel + k * area]
+                tile[at + RED + k * LANES] = value
+                tile[at + REMAINING] += value * planes[pixel + k * area]
+                asked_at_edge |= value != ZERO
+            tile[at + WEIGHT] = weight[first_weight + y * width + x]
+            asked_at_edge |= tile[at + WEIGHT] != ZERO
+    return asked_at_edge
+
+
+@inlined
+def _prefetch_row(
+    planes: F32, v_planes: F32, weight: F32, place: Any, y: int, width: int, height: int
+) -> None:
+    """One row of what `_read_tile` reads of a tile."""
+    camera, x0, y0, _, rows = place
+    if y < rows:
+        pixel = (y0 + y) * width + x0
+        prefetch_far(weight, camera * height * width + pixel)
+        for k in range(5):
+            plane = (camera * 5 + k) * height * width
+            prefetch_far(v_planes, plane + pixel)
+            prefetch_far(planes, plane + pixel)
 
 
 @kernel
 def _composite_tiles_backward(
     splats: Any, pairs: Any, tile_starts: I32, tile_ends: I32, drawn: I32, next_tile: I64, tile: F32,
-    width: int, height: int, planes: F32, v_planes: F32, weight: F32, v_pairs: Any,
+    width: int, height: int, planes: F32, v_planes: F32, weight: F32, v_pairs: F32,
 ) -> None:  # fmt: skip
-    sums = stack_floats(SUMS)
-    while True:
-        turn = take(next_tile, 1)
-        if turn >= drawn.size:
-            break
-        t = drawn[turn]
+    area, last = width * height, tile_starts[tile_starts.size - 1]
+    turn = take(next_tile, 1)
+    while turn < drawn.size:
+        t, turn = drawn[turn], take(next_tile, 1)
         camera, x0, y0, columns, rows = place_of(t, width, height)
-        open_tile(tile, columns, rows)
-        if columns < TILE_WIDTH or rows < TILE_HEIGHT:
-            for k in range(8 * PLANE):
-                tile[RED + u8(k)] = ZERO
-        for k in range(TILE_PIXELS):
-            tile[REMAINING + u8(k)] = ZERO
-        for k in range(5):
-            plane = RED + u8(k * PLANE)
-            start = ((camera * 5 + k) * height + y0) * width + x0
-            _load(tile, plane, v_planes, start, width, columns, rows)
-            _load(tile, STAGED, planes, start, width, columns, rows)
-            for n in range(TILE_PIXELS):
-                tile[REMAINING + u8(n)] += tile[plane + u8(n)] * tile[STAGED + u8(n)]
-        _load(tile, WEIGHT, weight, (camera * height + y0) * width + x0, width, columns, rows)
+        start, first_weight = (camera * 5 * height + y0) * width + x0, (camera * height + y0) * width + x0
         end = tile_ends[t]
-        if _is_zero(tile):
+        if not _read_tile(tile, planes, v_planes, weight, start, first_weight, width, area, columns, rows):
             end = tile_starts[t]
+        open_tile(tile, DERIVED, columns, rows)
+        following = place_of(drawn[min(turn, drawn.size - 1)], width, height)
+        row_to_come = 0
         for p in range(tile_starts[t], end):
-            if p + AHEAD < end:
+            if row_to_come < TILE_HEIGHT:
+                _prefetch_row(planes, v_planes, weight, following, row_to_come, width, height)
+                row_to_come += 1
+            if p + AHEAD < last:
                 prefetch_read(splats, pairs[p + AHEAD].splat)
-                prefetch_write(v_pairs, pairs[p + 2].slot)
+                prefetch_write(v_pairs, pairs[p + AHEAD].slot * RECORD)
             pair = pairs[p]
             splat = splats[pair.splat]
-            a, red, green, blue, depth = splat.whiten_xx, splat.red, splat.green, splat.blue, splat.depth
-            write_rows(tile, splat, x0, y0)
-            for k in range(SUMS):
-                sums[u8(k)] = ZERO
-            for row in range(pair.row_begin, pair.row_end):
-                row_u, row_exponent = tile[ROW_U + u8(row)], tile[ROW_EXPONENT + u8(row)]
-                v = tile[ROW_V + u8(row)]
-                first = u8(row * TILE_WIDTH)
-                for k in range(TILE_WIDTH):
-                    j = u8(k)
-                    i = first + j
-                    u = a * (f4(k) + HALF) + row_u
-                    alpha = alpha_of(row_exponent - u * u)
-                    transmittance = tile[TRANSMITTANCE + i]
+            a, b, c, log2_opacity = splat.whiten_xx, splat.whiten_xy, splat.whiten_yy, splat.log2_opacity
+            red, green, blue, depth = splat.red, splat.green, splat.blue, splat.depth
+            g_sum = g_u = g_v = g_uu = g_uv = g_vv = spread(ZERO)
+            w_red = w_green = w_blue = w_depth = w_weight = spread(ZERO)
+            for column in range(COLUMNS):
+                first, beyond = pair.begin[column] // BLOCK_HEIGHT, pair.end[column]
+                blocks = (beyond + BLOCK_HEIGHT - 1) // BLOCK_HEIGHT - first
+                if blocks <= 0:
+                    continue
+                dx = block_x() + (f4(x0 + column * BLOCK_WIDTH) + HALF - splat.mean_x)
+                dy = block_y() + (f4(y0 + first * BLOCK_HEIGHT) + HALF - splat.mean_y)
+                along, u, v = whitened(a, b, c, dx, dy)
+                at = (column * BLOCKS + first) * DERIVED
+                g_here = gv_here = gvv_here = spread(ZERO)
+                for _ in range(blocks):
+                    alpha = alpha_of(log2_opacity - v * v - u * u)
+                    transmittance = load(tile, at + TRANSMITTANCE)
                     w = alpha * transmittance
-                    tile[TRANSMITTANCE + i] = transmittance - w
-                    v_red, v_green, v_blue = tile[RED + i], tile[GREEN + i], tile[BLUE + i]
-                    v_depth = tile[DEPTH + i]
-                    ws = w * (
-                        red * v_red + green * v_green + blue * v_blue + depth * v_depth + tile[COVERAGE + i]
+                    store(tile, at + TRANSMITTANCE, transmittance - w)
+                    v_red, v_green, v_blue = (
+                        load(tile, at + RED),
+                        load(tile, at + GREEN),
+                        load(tile, at + BLUE),
                     )
-                    remaining = tile[REMAINING + i] - ws
-                    tile[REMAINING + i] = remaining
-                    g = ws - alpha * remaining / (ONE - alpha)
-                    gu, gv = g * u, g * v
-                    sums[SUM + j] += g
-                    sums[SUM_U + j] += gu
-                    sums[SUM_V + j] += gv
-                    sums[SUM_UU + j] += gu * u
-                    sums[SUM_UV + j] += gu * v
-                    sums[SUM_VV + j] += gv * v
-                    sums[SUM_RED + j] += w * v_red
-                    sums[SUM_GREEN + j] += w * v_green
-                    sums[SUM_BLUE + j] += w * v_blue
-                    sums[SUM_DEPTH + j] += w * v_depth
-                    sums[SUM_WEIGHT + j] += w * tile[WEIGHT + i]
-            sum_g = sum_u = sum_v = sum_uu = sum_uv = sum_vv = ZERO
-            sum_red = sum_green = sum_blue = sum_depth = sum_weight = ZERO
-            for k in range(TILE_WIDTH):  # one loop: short ones would be unrolled instead of vectorised
-                sum_g += sums[SUM + u8(k)]
-                sum_u += sums[SUM_U + u8(k)]
-                sum_v += sums[SUM_V + u8(k)]
-                sum_uu += sums[SUM_UU + u8(k)]
-                sum_uv += sums[SUM_UV + u8(k)]
-                sum_vv += sums[SUM_VV + u8(k)]
-                sum_red += sums[SUM_RED + u8(k)]
-                sum_green += sums[SUM_GREEN + u8(k)]
-                sum_blue += sums[SUM_BLUE + u8(k)]
-                sum_depth += sums[SUM_DEPTH + u8(k)]
-                sum_weight += sums[SUM_WEIGHT + u8(k)]
-            v_pair = v_pairs[pair.slot]
-            v_pair.sum = sum_g
-            v_pair.u = sum_u
-            v_pair.v = sum_v
-            v_pair.uu = sum_uu
-            v_pair.uv = sum_uv
-            v_pair.vv = sum_vv
-            v_pair.red = sum_red
-            v_pair.green = sum_green
-            v_pair.blue = sum_blue
-            v_pair.depth = sum_depth
-            v_pair.contribution = sum_weight
+                    v_depth = load(tile, at + DEPTH)
+                    ws = w * (
+                        v_red * red
+                        + (v_green * green + (v_blue * blue + (v_depth * depth + load(tile, at + COVERAGE))))
+                    )
+                    remaining = load(tile, at + REMAINING) - ws
+                    store(tile, at + REMAINING, remaining)
+                    g = ws - alpha / (ONE - alpha) * remaining
+                    gv = g * v
+                    g_here += g
+                    gv_here += gv
+                    gvv_here += gv * v
+                    w_red += w * v_red
+                    w_green += w * v_green
+                    w_blue += w * v_blue
+                    w_depth += w * v_depth
+                    w_weight += w * load(tile, at + WEIGHT)
+                    u += b * f4(BLOCK_HEIGHT)
+                    v += c * f4(BLOCK_HEIGHT)
+                    at += DERIVED
+                # u = a dx + (b / c) v, and a dx is the same all the way down a lane
+                slope = b / c
+                gu_here, guv_here = g_here * along + gv_here * slope, gv_here * along + gvv_here * slope
+                g_sum += g_here
+                g_u += gu_here
+                g_v += gv_here
+                g_uu += gu_here * along + guv_here * slope
+                g_uv += guv_here
+                g_vv += gvv_here
+            store_sums(
+                v_pairs,
+                pair.slot * RECORD,
+                (g_sum, g_u, g_v, g_uu, g_uv, g_vv, w_red, w_green, w_blue, w_depth, w_weight),
+            )
         for p in range(end, tile_starts[t + 1]):  # hidden behind a finished tile, or nothing is asked of it
-            v_pair = v_pairs[pairs[p].slot]
-            v_pair.sum = v_pair.u = v_pair.v = v_pair.uu = v_pair.uv = v_pair.vv = ZERO
-            v_pair.red = v_pair.green = v_pair.blue = v_pair.depth = v_pair.contribution = ZERO
+            for part in range(0, RECORD, LANES):
+                store(v_pairs, pairs[p].slot * RECORD + part, spread(ZERO))
 
 
 @parallel_kernel
@@ -336,7 +391,7 @@ def composite_backward(
     planes: F32,  # [C 5 H W] of `composite`
     v_planes: F32,  # [C 5 H W]
     weight: F32,  # [C H W]
-    v_pairs: Any,  # SPLAT_GRADIENT per slot, written
+    v_pairs: F32,  # [16 slots] written: a SPLAT_GRADIENT per slot
 ) -> None:
     next_tile[0] = 0
     for worker in numba.prange(scratch.shape[0]):

@@ -9,7 +9,7 @@ The mean of y over a point's tokens goes to five heads Linear(GELU(Linear(GELU(y
 the deltas. Forward: `embed`, `attend` (or the attention of `decoder_nodes`), `finish`.
 
 Almost everything has the decoder's width, so few arrays hold it, by the indices below: a kernel that takes
-dozens of arrays compiles for half a minute. After editing an index delete the caches (see `jit`).
+dozens of arrays compiles for half a minute.
 """
 
 from __future__ import annotations

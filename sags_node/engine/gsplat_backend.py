@@ -10,7 +10,7 @@ import importlib.util
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
-from math import pi, sqrt
+from math import sqrt
 
 import numpy as np
 import torch
@@ -28,8 +28,7 @@ from sags_node.engine.interface import (
     Pinhole,
 )
 from sags_node.errors import UsageError
-
-SH_CONSTANT = 0.5 / sqrt(pi)  # the harmonic of degree 0: gsplat's colours are coefficients of it
+from sags_node.types import SH_DEGREE_0
 
 
 def gsplat_backend(width: int, height: int, antialias: bool) -> DeviceBackend:
@@ -186,7 +185,7 @@ class GsplatRasterizer:
         import gsplat
 
         directions = self._means - torch.linalg.inv(self._views)[:, None, :3, 3]
-        coefficients = torch.cat([self._colors[:, None] / SH_CONSTANT, self._sh_rest], 1)
+        coefficients = torch.cat([self._colors[:, None] / SH_DEGREE_0, self._sh_rest], 1)
         degree = round(sqrt(terms + 1)) - 1
         seen: Tensor = gsplat.spherical_harmonics(
             degree, directions, coefficients.expand(cameras, n, terms + 1, 3)

@@ -3,8 +3,6 @@
 A loop that reads many rows and writes others is not vectorised: LLVM would have to test at run time whether
 any two of them overlap. `read_input` and `write_output` promise that they do not (LLVM's alias scopes);
 `make_add_lanes` makes an addition that is one vector instruction whatever LLVM thinks.
-
-After editing this file, delete the caches (`__pycache__`): see `jit`.
 """
 
 from __future__ import annotations

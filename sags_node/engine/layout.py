@@ -1,8 +1,4 @@
-"""Records that the CPU kernels hand to each other. Each fills one or a quarter of a 64-byte cache line.
-
-They are structured dtypes so that a changed layout changes the type of the kernels' arguments and with it
-the key of Numba's disk cache.
-"""
+"""Records that the CPU kernels hand to each other. Each fills one or a quarter of a 64-byte cache line."""
 
 from __future__ import annotations
 
@@ -25,26 +21,44 @@ SPLAT = np.dtype(
             "green",
             "blue",
             "depth",  # m
+            # The ellipse on which u^2 + v^2 = extent reaches so far from the mean, px,
+            "reach_x",
+            "reach_y",
+            "lowest_x",  # reaches the largest dy at this dx,
+            "chord",  # and over any dx lies between dy = -shear dx +- chord sqrt(reach_x^2 - dx^2)
+            "shear",
         ],
-        "formats": ["f4"] * 11,
-        "itemsize": 64,
+        "formats": ["f4"] * 16,
     }
 )
 
-# One splat in one tile.
+COLUMNS = 2  # of a tile, each 8 px wide
+
+# One splat in one tile
 PAIR = np.dtype(
-    [
-        ("splat", "i4"),
-        ("slot", "i4"),  # where this pair's gradient goes: pairs of one splat are neighbours there
-        ("row_begin", "i4"),  # rows of the tile that the splat touches
-        ("row_end", "i4"),
-    ]
+    {
+        "names": [
+            "splat",
+            "slot",  # where this pair's gradient goes: pairs of one splat are neighbours there
+            "begin",  # first row that the splat touches in each column, from the tile's first,
+            "end",  # and one after the last; not above the first: none
+            "rows",  # both at once, to be copied
+        ],
+        "formats": ["i4", "i4", ("u1", COLUMNS), ("u1", COLUMNS), "i4"],
+        "offsets": [0, 4, 8, 10, 8],
+    }
 )
 
 # A pair before it is sorted into its tile; it stands at its slot.
-EMITTED = np.dtype([("tile", "i4"), ("row_begin", "i2"), ("row_end", "i2")])
+EMITTED = np.dtype(
+    {
+        "names": ["splat", "tile", "begin", "end", "rows"],
+        "formats": ["i4", "i4", ("u1", COLUMNS), ("u1", COLUMNS), "i4"],
+        "offsets": [0, 4, 8, 10, 8],
+    }
+)
 
-# The slots of one splat's pairs.
+# The slots of one splat's pairs, or of those of a block of splats.
 SLOTS = np.dtype([("first", "i4"), ("count", "i4")])
 
 # Sums over pixels of g = dL/d(log alpha): moments in the whitened coordinates u, v of the Gaussian.

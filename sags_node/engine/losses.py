@@ -7,7 +7,24 @@ from typing import Any
 import numba
 import numpy as np
 
-from sags_node.engine.pieces import clear, load_frame, store
+from sags_node.engine.pieces import (
+    BLUE,
+    COVERAGE,
+    DEPTH,
+    FREE,
+    GREEN,
+    PIECE,
+    PLANE,
+    RED,
+    TISSUE,
+    TRUE_BLUE,
+    TRUE_DEPTH,
+    TRUE_GREEN,
+    TRUE_RED,
+    clear,
+    load_frame,
+    store,
+)
 from sags_node.kernels.jit import aligned, kernel, parallel_kernel, read_only
 from sags_node.kernels.threads import thread_count
 from sags_node.types import F32, Bool
@@ -20,14 +37,9 @@ DEPTH_COVERED = f4(0.3)  # the same for depth
 FULL = f4(0.9)  # coverage that tissue should reach
 MAX_RESIDUAL = f4(1e3)  # also rejects NaN in the picture
 
-# Pixels are taken in pieces; a piece stands in planes of a scratch array.
-PIECE = 256
-PLANE = PIECE + 16  # 64 bytes of padding
-SCRATCH = 11 * PLANE  # floats per worker
-RED, GREEN, BLUE, DEPTH, COVERAGE = u8(0), u8(PLANE), u8(2 * PLANE), u8(3 * PLANE), u8(4 * PLANE)
-TRUE_RED, TRUE_GREEN, TRUE_BLUE, TRUE_DEPTH = u8(5 * PLANE), u8(6 * PLANE), u8(7 * PLANE), u8(8 * PLANE)
-TISSUE, WEIGHT = u8(9 * PLANE), u8(10 * PLANE)
+WEIGHT = u8(FREE * PLANE)  # planes beyond those of `pieces`
 RESIDUAL, USED = TRUE_RED, TISSUE  # results stand where the inputs stood
+SCRATCH = (FREE + 1) * PLANE  # floats per worker
 
 
 @kernel
@@ -47,9 +59,9 @@ def _piece_loss(
     sums: F32,  # [2] written
 ) -> None:
     if count == PIECE:  # a constant length vectorises
-        load_frame(scratch, PLANE, planes, image, tissue, depth, start, PIECE)
+        load_frame(scratch, planes, image, tissue, depth, start, PIECE)
     else:
-        load_frame(scratch, PLANE, planes, image, tissue, depth, start, count)
+        load_frame(scratch, planes, image, tissue, depth, start, count)
         clear(scratch, TISSUE, count, PIECE)
     depth_slope = depth_weight * inverse_scale
     for k in range(PIECE):

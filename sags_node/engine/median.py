@@ -12,29 +12,39 @@ import numpy as np
 
 from sags_node.engine.compositing import (
     AHEAD,
+    BLOCK_HEIGHT,
+    BLOCKS,
     DEPTH,
+    DRAWN,
     HALF,
-    REMAINING,
-    ROW_EXPONENT,
-    ROW_U,
     TEST_EVERY,
-    TILE_PIXELS,
-    TILE_WIDTH,
     TRANSMITTANCE,
     ZERO,
     alpha_of,
     any_above,
     open_tile,
     place_of,
-    store,
-    write_rows,
+    whitened,
+    write_plane,
 )
+from sags_node.engine.layout import COLUMNS
 from sags_node.kernels.jit import kernel, parallel_kernel, prefetch_read, take
+from sags_node.kernels.vectors import (
+    BLOCK_WIDTH,
+    LANES,
+    block_x,
+    block_y,
+    load,
+    select,
+    spread,
+    spread_bits,
+    store,
+)
 from sags_node.types import F32, I32, I64
 
 f4 = np.float32
-u8 = np.uint64
-FOUND = REMAINING  # the plane of the scratch that holds rows of Gaussians, as integers
+NOBODY = np.int32(-1)
+FOUND = 2 * LANES  # the plane of a block that holds rows of Gaussians
 
 
 @kernel
@@ -43,46 +53,49 @@ def _median_tiles(
     width: int, height: int, depths: F32, rows_of: I32,
 ) -> None:  # fmt: skip
     count = splats.size // (depths.size // (width * height))  # Gaussians
-    gaussians = tile.view(np.int32)
     while True:
         turn = take(next_tile, 1)
         if turn >= drawn.size:
             break
         t = drawn[turn]
         camera, x0, y0, columns, rows = place_of(t, width, height)
-        open_tile(tile, columns, rows)
-        for k in range(TILE_PIXELS):
-            tile[DEPTH + u8(k)] = ZERO
-            gaussians[FOUND + u8(k)] = -1
+        open_tile(tile, DRAWN, columns, rows)
+        for block in range(COLUMNS * BLOCKS):
+            store(tile, block * DRAWN + DEPTH, spread(ZERO))
+            store(tile, block * DRAWN + FOUND, spread_bits(NOBODY))
         until_test = TEST_EVERY
         for p in range(tile_starts[t], tile_ends[t]):
             if p + AHEAD < tile_ends[t]:
                 prefetch_read(splats, pairs[p + AHEAD].splat)
             pair = pairs[p]
             splat = splats[pair.splat]
-            a, depth = splat.whiten_xx, splat.depth
-            gaussian = np.int32(pair.splat - camera * count)
-            write_rows(tile, splat, x0, y0)
-            for row in range(pair.row_begin, pair.row_end):
-                row_u, row_exponent = tile[ROW_U + u8(row)], tile[ROW_EXPONENT + u8(row)]
-                first = u8(row * TILE_WIDTH)
-                for k in range(TILE_WIDTH):
-                    i = first + u8(k)
-                    u = a * (f4(k) + HALF) + row_u
-                    before = tile[TRANSMITTANCE + i]
-                    after = before - alpha_of(row_exponent - u * u) * before
+            a, b, c, log2_opacity = splat.whiten_xx, splat.whiten_xy, splat.whiten_yy, splat.log2_opacity
+            depth, gaussian = splat.depth, spread_bits(np.int32(pair.splat - camera * count))
+            for column in range(COLUMNS):
+                first, beyond = pair.begin[column] // BLOCK_HEIGHT, pair.end[column]
+                blocks = (beyond + BLOCK_HEIGHT - 1) // BLOCK_HEIGHT - first
+                dx = block_x() + (f4(x0 + column * BLOCK_WIDTH) + HALF - splat.mean_x)
+                dy = block_y() + (f4(y0 + first * BLOCK_HEIGHT) + HALF - splat.mean_y)
+                _, u, v = whitened(a, b, c, dx, dy)
+                at = (column * BLOCKS + first) * DRAWN
+                for _ in range(blocks):
+                    before = load(tile, at + TRANSMITTANCE)
+                    after = before - alpha_of(log2_opacity - v * v - u * u) * before
                     crossed = (before > HALF) & (after <= HALF)
-                    tile[TRANSMITTANCE + i] = after
-                    tile[DEPTH + i] = depth if crossed else tile[DEPTH + i]
-                    gaussians[FOUND + i] = gaussian if crossed else gaussians[FOUND + i]
+                    store(tile, at + TRANSMITTANCE, after)
+                    store(tile, at + DEPTH, select(crossed, depth, load(tile, at + DEPTH)))
+                    store(tile, at + FOUND, select(crossed, gaussian, load(tile, at + FOUND)))
+                    u += b * f4(BLOCK_HEIGHT)
+                    v += c * f4(BLOCK_HEIGHT)
+                    at += DRAWN
             until_test -= 1
             if until_test == 0:
                 until_test = TEST_EVERY
-                if not any_above(tile, HALF):
+                if not any_above(tile, DRAWN, HALF):
                     break
         start = (camera * height + y0) * width + x0
-        store(tile, DEPTH, depths, start, width, columns, rows)
-        store(gaussians, FOUND, rows_of, start, width, columns, rows)
+        write_plane(tile, DEPTH, DRAWN, depths, start, width, columns, rows)
+        write_plane(tile.view(np.int32), FOUND, DRAWN, rows_of, start, width, columns, rows)
 
 
 @parallel_kernel

@@ -6,16 +6,18 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sags_node.engine import binning, compositing, layout, median, pair_sums
+from sags_node.engine import binning, compositing, layout, median
 from sags_node.engine.compositing import TILE_HEIGHT, TILE_HEIGHT_BITS, TILE_WIDTH, TILE_WIDTH_BITS
 from sags_node.engine.interface import Gradients, Pinhole
-from sags_node.engine.projector import Projector
+from sags_node.engine.projector import Projector, Records
 from sags_node.errors import SagsError
 from sags_node.kernels.jit import aligned, read_only
 from sags_node.kernels.threads import thread_count
+from sags_node.kernels.vectors import RECORD
 from sags_node.types import F32, I32, Bool, Gaussians
 
 MAX_PAIRS = 1 << 25  # 2 GiB of gradients
+PARTS = 4  # of the splats, for each worker
 SPARE = 1.25  # what is asked for beyond the need when a buffer grows
 
 
@@ -29,23 +31,29 @@ class NumbaRasterizer:
         self._projector = Projector(antialias)
         self._next = aligned((1,), np.int64)  # shared counter of the workers
         self._reserved = aligned((1,), np.int64)
-        self._allocate_scratch(thread_count())
+        self._allocate_tiles(1, thread_count())
         self._allocate_splats(1024)
         self._emitted = aligned((4096,), layout.EMITTED)
         self._pairs = aligned((4096,), layout.PAIR)
-        self._v_pairs = aligned((0,), layout.SPLAT_GRADIENT)
+        self._v_pairs = aligned((0,))
         self._planes = aligned((0, 5, height, width))
         self._median_depths = aligned((0, height, width))
         self._median_rows = aligned((0, height, width), np.int32)
 
-    def _allocate_scratch(self, workers: int) -> None:
-        self._workers = workers
+    def _allocate_tiles(self, cameras: int, workers: int) -> None:
+        """What depends on how many tiles there are and how many work on them."""
+        self._cameras, self._workers = cameras, workers
+        tiles = cameras * self._tiles
         self._scratch = aligned((workers, compositing.SCRATCH))
+        self._histogram = aligned((PARTS * workers, tiles), np.int32)
+        self._tile_starts, self._tile_ends = aligned((tiles + 1,), np.int32), aligned((tiles,), np.int32)
+        self._all_active = read_only(np.ones(tiles, np.bool_))
+        self._all_drawn = np.arange(tiles, dtype=np.int32)
 
     def _allocate_splats(self, room: int) -> None:
         self._splats = aligned((room,), layout.SPLAT)
-        self._v_splats = aligned((room,), layout.SPLAT_GRADIENT)
         self._slots = aligned((room,), layout.SLOTS)
+        self._runs = aligned((-(-room // binning.BLOCK),), layout.SLOTS)
         self._depths = aligned((room,))
         self._order, self._spare_order, self._keys, self._spare_keys = (
             aligned((room,), np.int32) for _ in range(4)
@@ -59,28 +67,28 @@ class NumbaRasterizer:
         self._planes = aligned((cameras, 5, self._height, self._width))
         self._median_depths = aligned((cameras, self._height, self._width))
         self._median_rows = aligned((cameras, self._height, self._width), np.int32)
-        self._all_active = read_only(np.ones((cameras, self._tiles), np.bool_))
         self._median_rows[:] = -1
         self._planes[: len(planes)] = planes
         self._median_depths[: len(planes)] = depths
         self._median_rows[: len(planes)] = rows
 
     def forward(self, gaussians: Gaussians, pinholes: Sequence[Pinhole], tiles: Bool | None) -> F32:
-        n, cameras = self._count, self._cameras = len(gaussians), len(pinholes)
-        self._pinholes = pinholes
+        n, cameras, workers = len(gaussians), len(pinholes), thread_count()
+        self._count = n
         if n * cameras > len(self._splats):
             self._allocate_splats(int(n * cameras * SPARE))
         if cameras > len(self._planes):
             self._allocate_pictures(cameras)
-        if self._workers != thread_count():
-            self._allocate_scratch(thread_count())
-        self._projector.load(gaussians)
-        for camera, pinhole in enumerate(pinholes):
+        if (cameras, workers) != (self._cameras, self._workers):
+            self._allocate_tiles(cameras, workers)
+        self._projector.load(gaussians, pinholes)
+        for camera in range(cameras):
             rows = slice(camera * n, (camera + 1) * n)
-            self._projector.project(pinhole, self._splats[rows], self._depths[rows])
-        self._bin(tiles)
+            self._projector.project(camera, self._splats[rows], self._depths[rows])
+        splats = self._splats[: n * cameras]
+        self._bin(splats, tiles)
         compositing.composite(
-            self._splats[: n * cameras],
+            splats,
             self._pairs,
             self._tile_starts,
             self._drawn,
@@ -93,32 +101,31 @@ class NumbaRasterizer:
         )
         return self._planes[:cameras]
 
-    def _bin(self, tiles: Bool | None) -> None:
+    def _bin(self, splats: Records, tiles: Bool | None) -> None:
         """Lists of splats, near to far, for the tiles to draw."""
-        splats = self._splats[: self._count * self._cameras]
-        depths = self._depths[: len(splats)]
-        slots = self._slots[: len(splats)]
-        slots.view(np.int64)[:] = 0
-        if tiles is None:
-            active = self._all_active[: self._cameras]
-        else:
-            active = read_only(tiles.reshape(self._cameras, -1))
+        depths, slots = self._depths[: len(splats)], self._slots[: len(splats)]
+        active, self._drawn = self._all_active, self._all_drawn
+        if tiles is not None:
+            active = read_only(tiles.reshape(-1))
+            self._drawn = np.flatnonzero(active).astype(np.int32)
             binning.drop_untouched(splats, depths, self._cameras, _integral(tiles).reshape(-1), *self._shape)
-        self._drawn = np.flatnonzero(active).astype(np.int32)
-        kept = binning.sort_by_depth(depths, self._order, self._spare_order, self._keys, self._spare_keys)
-        histogram = aligned((4 * self._workers, active.size), np.int32)
+        kept = binning.sort_by_depth(
+            depths, slots, self._order, self._spare_order, self._keys, self._spare_keys
+        )
+        order = self._order[:kept]
         while True:
             binning.emit_pairs(
                 splats,
-                self._order[:kept],
+                order,
                 self._cameras,
-                active.reshape(-1),
+                active,
                 *self._shape,
                 self._workers,
                 self._emitted,
                 slots,
+                self._runs,
                 self._reserved,
-                histogram,
+                self._histogram,
                 self._next,
             )
             needed = int(self._reserved[0])
@@ -131,14 +138,12 @@ class NumbaRasterizer:
                 break
             self._emitted = aligned((int(needed * SPARE),), layout.EMITTED)
             self._pairs = aligned((int(needed * SPARE),), layout.PAIR)
-        self._tile_starts = aligned((active.size + 1,), np.int32)
-        self._tile_ends = aligned((active.size,), np.int32)
         binning.sort_into_tiles(
             self._workers,
-            self._order[:kept],
+            kept,
             self._emitted,
-            slots,
-            histogram,
+            self._runs,
+            self._histogram,
             self._pairs,
             self._tile_starts,
             self._next,
@@ -146,8 +151,8 @@ class NumbaRasterizer:
 
     def backward(self, v_planes: F32, weight: F32, geometry: bool) -> Gradients:
         n, cameras = self._count, self._cameras
-        if len(self._v_pairs) < len(self._emitted):
-            self._v_pairs = aligned((len(self._emitted),), layout.SPLAT_GRADIENT)
+        if len(self._v_pairs) < RECORD * len(self._emitted):
+            self._v_pairs = aligned((RECORD * len(self._emitted),))
         compositing.composite_backward(
             self._splats[: n * cameras],
             self._pairs,
@@ -163,16 +168,18 @@ class NumbaRasterizer:
             weight.reshape(-1),
             self._v_pairs,
         )
-        pair_sums.sum_pairs(
-            self._workers,
-            self._slots[: n * cameras],
-            self._v_pairs,
-            self._v_splats[: n * cameras],
-            self._v_view_colors[: n * cameras],
-            self._v_colors[:n],
-            self._contribution[:n],
-            self._next,
-        )
+        v_colors, contribution, poses = self._v_colors[:n], self._contribution[:n], np.empty((cameras, 6))
+        for camera in range(cameras):
+            poses[camera] = self._projector.backward(
+                camera,
+                self._slots[camera * n : (camera + 1) * n],
+                self._v_pairs,
+                geometry,
+                accumulate=camera > 0,
+                v_view_colors=self._v_view_colors[:n] if cameras > 1 else v_colors,
+                v_colors=v_colors,
+                contribution=contribution,
+            )
         if not geometry:
             nothing = np.zeros((0, 0), np.float32)
             return Gradients(
@@ -180,25 +187,13 @@ class NumbaRasterizer:
                 quats=nothing,
                 scales=nothing,
                 opacities=nothing,
-                colors=self._v_colors[:n],
+                colors=v_colors,
                 sh_rest=nothing,
                 poses=np.zeros((0, 6)),
-                contribution=self._contribution[:n],
-            )
-        poses = np.empty((cameras, 6))
-        for camera, pinhole in enumerate(self._pinholes):
-            rows = slice(camera * n, (camera + 1) * n)
-            poses[camera] = self._projector.backward(
-                pinhole,
-                self._splats[rows],
-                self._v_splats[rows],
-                self._v_view_colors[rows],
-                accumulate=camera > 0,
+                contribution=contribution,
             )
         means, quats, scales, opacities, sh_rest = self._projector.gradients()
-        return Gradients(
-            means, quats, scales, opacities, self._v_colors[:n], sh_rest, poses, self._contribution[:n]
-        )
+        return Gradients(means, quats, scales, opacities, v_colors, sh_rest, poses, contribution)
 
     def median(self) -> tuple[F32, I32]:
         cameras = self._cameras

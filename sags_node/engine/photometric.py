@@ -23,13 +23,14 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from sags_node.engine import photometric_kernels as kernels
+from sags_node.engine.losses import COVERED, DEPTH_COVERED
+from sags_node.engine.pieces import PIECE
 from sags_node.engine.smoothness import add_total_variation
 from sags_node.engine.ssim import Dissimilarity
 from sags_node.kernels.jit import aligned, read_only
 from sags_node.kernels.threads import thread_count
 from sags_node.types import F32, F64, Bool
 
-COVERED, DEPTH_COVERED = 0.05, 0.3  # least coverage with a meaning, normalised planes
 NO_LEAST = -1.0  # plain planes mean something everywhere
 FLAT = 1e-6  # inverse depths whose relative spread is below this have no correlation
 
@@ -80,14 +81,10 @@ class PhotometricLoss:
         pixels = width * height
         self.weights = weights
         self._normalised = normalised
-        self._least = (
-            (np.float32(COVERED), np.float32(DEPTH_COVERED))
-            if normalised
-            else (np.float32(NO_LEAST), np.float32(NO_LEAST))
-        )
+        self._least = (COVERED, DEPTH_COVERED) if normalised else (np.float32(NO_LEAST), np.float32(NO_LEAST))
         self._drawn, self._v_drawn = aligned((4, height, width)), aligned((4, height, width))
         self._truth, self._depth_residual = aligned((3, height, width)), aligned((pixels,))
-        self._sums = np.zeros((-(-pixels // kernels.PIECE), kernels.SUMS), np.float32)
+        self._sums = np.zeros((-(-pixels // PIECE), kernels.SUMS), np.float32)
         self._everywhere = np.ones((height, width), np.bool_)
         self._scratch = aligned((thread_count(), kernels.SCRATCH))
         self._dissimilarity = Dissimilarity(width, height)

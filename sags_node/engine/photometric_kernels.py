@@ -7,29 +7,44 @@ from typing import Any
 import numba
 import numpy as np
 
-from sags_node.engine.pieces import clear, load, load_frame, load_mask, store
+from sags_node.engine import interface
+from sags_node.engine.losses import FULL, MAX_RESIDUAL
+from sags_node.engine.pieces import (
+    BLUE,
+    COVERAGE,
+    DEPTH,
+    FREE,
+    GREEN,
+    PIECE,
+    PLANE,
+    RED,
+    TISSUE,
+    TRUE_BLUE,
+    TRUE_DEPTH,
+    TRUE_GREEN,
+    TRUE_RED,
+    clear,
+    load,
+    load_frame,
+    load_mask,
+    store,
+)
 from sags_node.kernels.jit import inlined, kernel, parallel_kernel
 from sags_node.types import F32, Bool
 
 f4 = np.float32
 u8 = np.uint64
 ZERO, ONE, INFINITY, NAN = f4(0.0), f4(1.0), f4(np.inf), f4(np.nan)
-MAX_RESIDUAL = f4(1e3)  # also rejects NaN in the picture
-MIN_DEPTH = f4(1e-3)  # m; nothing is drawn nearer
-FULL = f4(0.9)  # coverage that tissue should reach
+MIN_DEPTH = f4(interface.NEAR_PLANE)  # m; nothing is drawn nearer
 
-# Pixels are taken in pieces; a piece stands in planes of a scratch array.
-PIECE = 256
-PLANE = PIECE + 16  # 64 bytes of padding
-SCRATCH = 16 * PLANE  # floats per worker
-RED, GREEN, BLUE, DEPTH, COVERAGE = u8(0), u8(PLANE), u8(2 * PLANE), u8(3 * PLANE), u8(4 * PLANE)
-TRUE_RED, TRUE_GREEN, TRUE_BLUE, TRUE_DEPTH = u8(5 * PLANE), u8(6 * PLANE), u8(7 * PLANE), u8(8 * PLANE)
-TISSUE, WEIGHT, DEPTH_RESIDUAL = u8(9 * PLANE), u8(10 * PLANE), u8(11 * PLANE)
+# planes beyond those of `pieces`
+WEIGHT, DEPTH_RESIDUAL = (u8((FREE + k) * PLANE) for k in range(2))
 # of `_compare_piece`; some results stand where inputs stood
-RESIDUAL, USED, MEASURED = u8(12 * PLANE), u8(13 * PLANE), u8(14 * PLANE)
-DRAWN_INVERSE, GIVEN_INVERSE, LACK = u8(15 * PLANE), TRUE_DEPTH, COVERAGE
+RESIDUAL, USED, MEASURED, DRAWN_INVERSE = (u8((FREE + k) * PLANE) for k in range(2, 6))
+GIVEN_INVERSE, LACK = TRUE_DEPTH, COVERAGE
 # of `_pull_back_piece`
-V_RED, V_GREEN, V_BLUE, V_DEPTH = TRUE_DEPTH, u8(12 * PLANE), u8(13 * PLANE), u8(14 * PLANE)
+V_RED, V_GREEN, V_BLUE, V_DEPTH = TRUE_DEPTH, RESIDUAL, USED, MEASURED
+SCRATCH = (FREE + 6) * PLANE  # floats per worker
 
 # what the pixels of a piece add up to, and statistics of their inverse depths, centred for precision
 RESIDUALS, PIXELS, DEPTH_RESIDUALS, DEPTHS, LACKS, TISSUES = range(6)
@@ -92,9 +107,9 @@ def _compare_piece(
     sums: F32,  # [SUMS] written
 ) -> None:
     if count == PIECE:  # a constant length vectorises
-        load_frame(scratch, PLANE, planes, image, tissue, depth, start, PIECE)
+        load_frame(scratch, planes, image, tissue, depth, start, PIECE)
     else:
-        load_frame(scratch, PLANE, planes, image, tissue, depth, start, count)
+        load_frame(scratch, planes, image, tissue, depth, start, count)
         clear(scratch, TISSUE, count, PIECE)
     for k in range(PIECE):
         i = u8(k)

@@ -17,6 +17,13 @@ from sags_node.types import F32, Bool
 u8 = np.uint64
 ZERO, ONE = np.float32(0.0), np.float32(1.0)
 
+PIECE = 256  # pixels that a kernel takes at a time
+PLANE = PIECE + 16  # floats; 64 bytes of padding
+# The planes that `load_frame` fills. A kernel's own follow from `FREE` on.
+RED, GREEN, BLUE, DEPTH, COVERAGE = (u8(k * PLANE) for k in range(5))
+TRUE_RED, TRUE_GREEN, TRUE_BLUE, TRUE_DEPTH, TISSUE = (u8(k * PLANE) for k in range(5, 10))
+FREE = 10
+
 
 @inlined
 def load(scratch: F32, plane: Any, picture: F32, start: Any, count: int) -> None:
@@ -33,20 +40,18 @@ def load_mask(scratch: F32, plane: Any, mask: Bool, start: Any, count: int) -> N
 
 @inlined
 def load_frame(
-    scratch: F32, stride: int, planes: F32, image: F32, tissue: Bool, depth: F32, start: Any, count: int
+    scratch: F32, planes: F32, image: F32, tissue: Bool, depth: F32, start: Any, count: int
 ) -> None:
-    """What was drawn and what was seen, into the first ten planes, `stride` apart: red, green, blue, depth
-    and coverage of `planes` [5, P]; red, green, blue of `image` [3 P], interleaved; `depth`; `tissue`."""
+    """What was drawn, `planes` [5, P], and what was seen: `image` [3 P] interleaved, `depth`, `tissue`."""
     for plane in range(5):
-        load(scratch, u8(plane * stride), planes[plane], start, count)
-    red, green, blue = u8(5 * stride), u8(6 * stride), u8(7 * stride)
+        load(scratch, u8(plane * PLANE), planes[plane], start, count)
     for k in range(count):
         i = u8(3) * (start + u8(k))
-        scratch[red + u8(k)] = image[i]
-        scratch[green + u8(k)] = image[i + u8(1)]
-        scratch[blue + u8(k)] = image[i + u8(2)]
-    load(scratch, u8(8 * stride), depth, start, count)
-    load_mask(scratch, u8(9 * stride), tissue, start, count)
+        scratch[TRUE_RED + u8(k)] = image[i]
+        scratch[TRUE_GREEN + u8(k)] = image[i + u8(1)]
+        scratch[TRUE_BLUE + u8(k)] = image[i + u8(2)]
+    load(scratch, TRUE_DEPTH, depth, start, count)
+    load_mask(scratch, TISSUE, tissue, start, count)
 
 
 @inlined

@@ -10,9 +10,9 @@ else 0.
 det cov0 is the sum of the squared 2x2 minors of V (Cauchy-Binet): no cancellation for flat Gaussians. J is
 taken at x/z, y/z held within the widened frustum, as Mip-Splatting and gsplat do.
 
-The kernel copies blocks of Gaussians into planes of a small scratch array so that the arithmetic vectorises.
-`projection_backward` differentiates it and compiles the helpers and constants of this file into its own
-kernel: after editing them, delete the caches (see `jit`).
+The kernel takes Gaussians in blocks: it copies their parameters into planes of a small scratch array, works
+on LANES of them at a time, one in each lane of a vector, and copies the finished records out.
+`projection_backward` differentiates it with the same helpers.
 """
 
 from __future__ import annotations
@@ -23,32 +23,58 @@ from typing import Any
 import numba
 import numpy as np
 
-from sags_node.kernels.jit import inlined, parallel_kernel, square_root
-from sags_node.types import F32
+from sags_node.engine import interface
+from sags_node.kernels.jit import copy, inlined, kernel, parallel_kernel, take
+from sags_node.kernels.vectors import (
+    LANES,
+    RECORD,
+    larger,
+    load,
+    magnitudes,
+    select,
+    smaller,
+    split_powers,
+    spread,
+    square_roots,
+    store,
+    store_records,
+)
+from sags_node.types import F32, I64
 
 f4 = np.float32
-u8 = np.uint64
 BLOCK = 64  # Gaussians per block
+GRAIN = 16  # blocks that a worker takes at a time: neighbours in memory
 
-# Planes of a block's scratch: the inputs, then what the kernel works out.
-MEAN_X, MEAN_Y, MEAN_Z, SCALE_X, SCALE_Y, SCALE_Z = (u8(k * BLOCK) for k in range(6))
-QUAT_W, QUAT_X, QUAT_Y, QUAT_Z, OPACITY = (u8(k * BLOCK) for k in range(6, 11))
-MEAN2D_X, MEAN2D_Y, WHITEN_XX, WHITEN_XY, WHITEN_YY, FILTERED, DEPTH = (u8(k * BLOCK) for k in range(11, 18))
-SCRATCH = 18 * BLOCK  # floats per worker
+# Planes of a block's scratch
+MEAN_X, MEAN_Y, MEAN_Z, SCALE_X, SCALE_Y, SCALE_Z = (k * BLOCK for k in range(6))
+QUAT_W, QUAT_X, QUAT_Y, QUAT_Z, OPACITY = (k * BLOCK for k in range(6, 11))
+RED, GREEN, BLUE, DEPTH = (k * BLOCK for k in range(11, 15))
+RECORDS = 15 * BLOCK  # finished splats, one after the other
+SCRATCH = (15 + RECORD) * BLOCK  # floats per worker
 
-# The values of `engine.interface`, repeated because Numba's disk cache does not see other files.
-NEAR_PLANE = f4(1e-3)
-MAX_OPACITY = f4(0.999)
-MIN_QUAT_NORM2, MAX_QUAT_NORM2 = f4(1e-24), f4(1e36)  # where float32 can still square
-LOG2_MIN_ALPHA = f4(math.log2(1.0 / 255.0))
+NEAR_PLANE, MAX_OPACITY = f4(interface.NEAR_PLANE), f4(interface.MAX_OPACITY)
+LOG2_MIN_ALPHA = f4(math.log2(interface.MIN_ALPHA))
+MIN_QUAT_NORM2, MAX_QUAT_NORM2 = f4(interface.MIN_QUAT_NORM**2), f4(1e36)  # where float32 can still square
 
 ZERO, HALF, ONE, TWO = f4(0.0), f4(0.5), f4(1.0), f4(2.0)
 MAX_COORDINATE = f4(1e9)  # px; a comparison with it also rejects NaN and infinity
 MAX_VALUE = f4(1e18)  # its square is still finite
 TWO_LN2 = f4(2.0 * math.log(2.0))
 WHITEN2 = f4(0.5 / math.log(2.0))  # exponents of base e and 1/2 to base 2
+# log2 m = 2 / ln 2 artanh s with s = (m - 1) / (m + 1); for |s| <= 0.172 these terms of its series suffice
+L1, L3, L5, L7, L9 = (f4(2.0 / math.log(2.0) / k) for k in (1, 3, 5, 7, 9))
 
 Row = tuple[Any, ...]
+VIEW = 20  # numbers of a camera: 9 rows of its world-to-camera rotation, 3 of its translation, fx, fy, cx, cy
+# and the limits of x/z and y/z in the Jacobian: low, high, low, high
+
+
+@inlined
+def unpack(view: F32) -> Row:
+    """Rotation, translation, intrinsics and limits: tuples travel in registers."""
+    R = view[0], view[1], view[2], view[3], view[4], view[5], view[6], view[7], view[8]
+    t, intrinsics = (view[9], view[10], view[11]), (view[12], view[13], view[14], view[15])
+    return R, t, intrinsics, (view[16], view[17], view[18], view[19])
 
 
 @inlined
@@ -117,31 +143,126 @@ def whitening(xx: Any, xy: Any, yy: Any, det0: Any, screen_filter: Row) -> Row:
     det = det0 + variance * (xx + yy) + variance * variance
     filtered_yy = yy + variance
     inverse_yy = ONE / filtered_yy
-    along = square_root(WHITEN2 * filtered_yy / det)
-    kept = square_root(det0 / det) if compensates > ZERO else ONE
-    return along, -along * xy * inverse_yy, square_root(WHITEN2 * inverse_yy), kept
+    along = square_roots(WHITEN2 * filtered_yy / det)
+    kept = square_roots(det0 / det) if compensates > ZERO else spread(ONE)
+    return along, -along * xy * inverse_yy, square_roots(WHITEN2 * inverse_yy), kept
 
 
 @inlined
 def clamp(value: Any, low: Any, high: Any) -> Any:
-    return min(max(value, low), high)
+    return smaller(larger(value, low), high)
+
+
+@inlined
+def unit_quaternion(w: Any, x: Any, y: Any, z: Any) -> Row:
+    """The same with length 1, what it was divided by, and whether it has a direction."""
+    norm2 = w * w + x * x + y * y + z * z
+    has_direction = (norm2 > MIN_QUAT_NORM2) & (norm2 < MAX_QUAT_NORM2)
+    n = ONE / square_roots(select(has_direction, norm2, ONE))
+    return w * n, x * n, y * n, z * n, n, has_direction
+
+
+@inlined
+def log2_of(x: Any) -> Any:
+    """Of positive numbers; relative error 1e-7."""
+    m, n = split_powers(x)
+    s = (m - ONE) / (m + ONE)
+    ss = s * s
+    return s * ((((ss * L9 + L7) * ss + L5) * ss + L3) * ss + L1) + n
+
+
+@inlined
+def ellipse(a: Any, b: Any, c: Any, extent: Any) -> Row:
+    """How far a splat reaches: the last five fields of its record."""
+    bb_cc = b * b + c * c
+    inverse, inverse_a = ONE / bb_cc, ONE / a
+    reach_y = square_roots(extent) / c
+    reach_x = square_roots(extent * bb_cc) * inverse_a / c
+    return reach_x, reach_y, -b * inverse_a * reach_y, a * c * inverse, a * b * inverse
 
 
 @inlined
 def load_block(S: F32, means: F32, quats: F32, scales: F32, opacities: F32, first: int, filled: int) -> None:
     for lane in range(filled):
-        i, j = first + lane, u8(lane)
-        S[MEAN_X + j] = means[i, 0]
-        S[MEAN_Y + j] = means[i, 1]
-        S[MEAN_Z + j] = means[i, 2]
-        S[SCALE_X + j] = scales[i, 0]
-        S[SCALE_Y + j] = scales[i, 1]
-        S[SCALE_Z + j] = scales[i, 2]
-        S[QUAT_W + j] = quats[i, 0]
-        S[QUAT_X + j] = quats[i, 1]
-        S[QUAT_Y + j] = quats[i, 2]
-        S[QUAT_Z + j] = quats[i, 3]
-        S[OPACITY + j] = opacities[i]
+        i = first + lane
+        S[MEAN_X + lane] = means[i, 0]
+        S[MEAN_Y + lane] = means[i, 1]
+        S[MEAN_Z + lane] = means[i, 2]
+        S[SCALE_X + lane] = scales[i, 0]
+        S[SCALE_Y + lane] = scales[i, 1]
+        S[SCALE_Z + lane] = scales[i, 2]
+        S[QUAT_W + lane] = quats[i, 0]
+        S[QUAT_X + lane] = quats[i, 1]
+        S[QUAT_Y + lane] = quats[i, 2]
+        S[QUAT_Z + lane] = quats[i, 3]
+        S[OPACITY + lane] = opacities[i]
+
+
+@kernel
+def _project_blocks(
+    means: F32, quats: F32, scales: F32, opacities: F32, colors: F32, view: F32, screen_filter: Row, S: F32,
+    next_block: I64, splats: F32, depths: F32,
+) -> None:  # fmt: skip
+    count, blocks = means.shape[0], (means.shape[0] + BLOCK - 1) // BLOCK
+    R, t, (fx, fy, cx, cy), limits = unpack(view)
+    block, end = 0, 0
+    while True:
+        block += 1
+        if block >= end:
+            block = take(next_block, GRAIN)
+            end = block + GRAIN
+        if block >= blocks:
+            break
+        first = block * BLOCK
+        filled = min(BLOCK, count - first)
+        load_block(S, means, quats, scales, opacities, first, filled)
+        for lane in range(filled):
+            S[RED + lane] = colors[first + lane, 0]
+            S[GREEN + lane] = colors[first + lane, 1]
+            S[BLUE + lane] = colors[first + lane, 2]
+        for j in range(0, filled, LANES):
+            x, y, z = to_camera(R, t, load(S, MEAN_X + j), load(S, MEAN_Y + j), load(S, MEAN_Z + j))
+            in_front = z > NEAR_PLANE
+            inverse_z = ONE / select(in_front, z, ONE)
+            slope_x, slope_y = x * inverse_z, y * inverse_z
+            held_x = clamp(slope_x, limits[0], limits[1])
+            held_y = clamp(slope_y, limits[2], limits[3])
+            qw, qx, qy, qz, _, has_direction = unit_quaternion(
+                load(S, QUAT_W + j), load(S, QUAT_X + j), load(S, QUAT_Y + j), load(S, QUAT_Z + j)
+            )
+            Q = rotation(qw, qx, qy, qz)
+            j00, j11 = fx * inverse_z, fy * inverse_z
+            A = screen_axes(R, j00, -j00 * held_x, j11, -j11 * held_y)
+            U = times_rotation(A, Q)
+            V = scale_axes(U, load(S, SCALE_X + j), load(S, SCALE_Y + j), load(S, SCALE_Z + j))
+            xx, xy, yy, det0, _, _, _ = covariance(V)
+            along, across, down, kept = whitening(xx, xy, yy, det0, screen_filter)
+            mean_x, mean_y = fx * slope_x + cx, fy * slope_y + cy
+            given, red, green, blue = (
+                load(S, OPACITY + j),
+                load(S, RED + j),
+                load(S, GREEN + j),
+                load(S, BLUE + j),
+            )
+            drawn = in_front & has_direction & (xx + yy < MAX_VALUE) & (given < MAX_VALUE)
+            drawn &= magnitudes(mean_x) + magnitudes(mean_y) < MAX_COORDINATE
+            drawn &= magnitudes(red) + magnitudes(green) + magnitudes(blue) < MAX_VALUE
+            opacity = smaller(given * kept, MAX_OPACITY)
+            drawn &= opacity > ZERO
+            log2_opacity = log2_of(select(drawn, opacity, ONE))
+            extent = select(drawn, larger(log2_opacity - LOG2_MIN_ALPHA, ZERO), ZERO)
+            reach_x, reach_y, lowest_x, chord, shear = ellipse(along, across, down, extent)
+            store(S, DEPTH + j, select(extent > ZERO, z, ZERO))
+            store_records(
+                S,
+                RECORDS + j * RECORD,
+                (
+                    mean_x, mean_y, along, across, down, log2_opacity, extent, red, green, blue, z,
+                    reach_x, reach_y, lowest_x, chord, shear,
+                ),
+            )  # fmt: skip
+        copy(splats, first * RECORD, S, RECORDS, filled * RECORD)
+        copy(depths, first, S, DEPTH, filled)
 
 
 @parallel_kernel
@@ -151,72 +272,16 @@ def project(
     scales: F32,
     opacities: F32,
     colors: F32,
-    R: Row,  # 9 rows of the world-to-camera rotation
-    t: Row,  # 3
-    intrinsics: Row,  # fx, fy, cx, cy
-    limits: Row,  # of x/z and y/z in the Jacobian: low, high, low, high
+    view: F32,  # [VIEW]
     screen_filter: Row,
     scratch: F32,  # [workers, SCRATCH]
-    splats: Any,  # [N] SPLAT, written
+    next_block: I64,  # [1] for the workers
+    splats: F32,  # [16 N] written: SPLAT records
     depths: F32,  # [N] written; 0 where not drawn
 ) -> None:
-    count = means.shape[0]
-    blocks = (count + BLOCK - 1) // BLOCK
-    workers = scratch.shape[0]
-    fx, fy, cx, cy = intrinsics
-    for worker in numba.prange(workers):
-        S = scratch[worker]
-        for block in range(worker * blocks // workers, (worker + 1) * blocks // workers):
-            first = block * BLOCK
-            filled = min(BLOCK, count - first)
-            load_block(S, means, quats, scales, opacities, first, filled)
-            for lane in range(BLOCK):
-                j = u8(lane)
-                x, y, z = to_camera(R, t, S[MEAN_X + j], S[MEAN_Y + j], S[MEAN_Z + j])
-                in_front = z > NEAR_PLANE
-                inverse_z = ONE / (z if in_front else ONE)
-                slope_x, slope_y = x * inverse_z, y * inverse_z
-                held_x = clamp(slope_x, limits[0], limits[1])
-                held_y = clamp(slope_y, limits[2], limits[3])
-                qw, qx, qy, qz = S[QUAT_W + j], S[QUAT_X + j], S[QUAT_Y + j], S[QUAT_Z + j]
-                norm2 = qw * qw + qx * qx + qy * qy + qz * qz
-                has_direction = norm2 > MIN_QUAT_NORM2 and norm2 < MAX_QUAT_NORM2
-                n = ONE / square_root(norm2 if has_direction else ONE)
-                Q = rotation(qw * n, qx * n, qy * n, qz * n)
-                j00, j11 = fx * inverse_z, fy * inverse_z
-                A = screen_axes(R, j00, -j00 * held_x, j11, -j11 * held_y)
-                V = scale_axes(times_rotation(A, Q), S[SCALE_X + j], S[SCALE_Y + j], S[SCALE_Z + j])
-                xx, xy, yy, det0, _, _, _ = covariance(V)
-                along, across, down, kept = whitening(xx, xy, yy, det0, screen_filter)
-                mean_x, mean_y = fx * slope_x + cx, fy * slope_y + cy
-                given = S[OPACITY + j]
-                in_range = abs(mean_x) + abs(mean_y) < MAX_COORDINATE and xx + yy < MAX_VALUE
-                in_range = in_range and given < MAX_VALUE
-                opacity = min(given * kept, MAX_OPACITY)
-                S[MEAN2D_X + j] = mean_x
-                S[MEAN2D_Y + j] = mean_y
-                S[WHITEN_XX + j] = along
-                S[WHITEN_XY + j] = across
-                S[WHITEN_YY + j] = down
-                S[FILTERED + j] = opacity if in_front and has_direction and in_range else ZERO
-                S[DEPTH + j] = z
-            for lane in range(filled):
-                i, j = first + lane, u8(lane)
-                splat = splats[i]
-                opacity = S[FILTERED + j]
-                log2_opacity = f4(math.log2(opacity)) if opacity > ZERO else TWO * LOG2_MIN_ALPHA
-                extent = max(log2_opacity - LOG2_MIN_ALPHA, ZERO)
-                if not abs(colors[i, 0]) + abs(colors[i, 1]) + abs(colors[i, 2]) < MAX_VALUE:
-                    extent = ZERO
-                splat.mean_x = S[MEAN2D_X + j]
-                splat.mean_y = S[MEAN2D_Y + j]
-                splat.whiten_xx = S[WHITEN_XX + j]
-                splat.whiten_xy = S[WHITEN_XY + j]
-                splat.whiten_yy = S[WHITEN_YY + j]
-                splat.log2_opacity = log2_opacity
-                splat.extent = extent
-                splat.red = colors[i, 0]
-                splat.green = colors[i, 1]
-                splat.blue = colors[i, 2]
-                splat.depth = S[DEPTH + j]
-                depths[i] = S[DEPTH + j] if extent > ZERO else ZERO
+    next_block[0] = 0
+    for worker in numba.prange(scratch.shape[0]):
+        _project_blocks(
+            means, quats, scales, opacities, colors, view, screen_filter, scratch[worker], next_block, splats,
+            depths,
+        )  # fmt: skip

@@ -3,6 +3,7 @@ the camera's place, the projection. Its memory grows with the Gaussians and is n
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -41,8 +42,9 @@ class Projector:
         self._v_twists = aligned((-(-room // projection.BLOCK), 6), np.float64)
         self._v_centres = aligned((-(-room // spherical_harmonics.BLOCK), 3), np.float64)
 
-    def load(self, gaussians: Gaussians) -> None:
-        """Keeps them, checked and contiguous, until the next call; applies their 3D filter."""
+    def load(self, gaussians: Gaussians, pinholes: Sequence[Pinhole]) -> None:
+        """Keeps the Gaussians, checked and contiguous, and the cameras until the next call; applies the 3D
+        filter."""
         n = self._count = len(gaussians)
         terms = 0 if gaussians.sh_rest is None else gaussians.sh_rest.shape[1]
         if n > self._room or terms != self._terms:
@@ -50,18 +52,21 @@ class Projector:
             self._allocate(max(self._room, int(n * SPARE)))
         if len(self._scratch) != thread_count():
             self._scratch = aligned((thread_count(), projection_backward.SCRATCH))
+        self._pinholes, self._views = pinholes, [_view_of(pinhole) for pinhole in pinholes]
         self._given = self._smoothed = gaussians
         if gaussians.smoothing is not None:
             scales, opacities = self._scales[:n], self._opacities[:n]
             smoothing.smooth(gaussians.scales, gaussians.opacities, gaussians.smoothing, scales, opacities)
             self._smoothed = replace(gaussians, scales=read_only(scales), opacities=read_only(opacities))
 
-    def project(self, pinhole: Pinhole, splats: Records, depths: F32) -> None:
+    def project(self, camera: int, splats: Records, depths: F32) -> None:
         """Writes `splats` [N] SPLAT and `depths` [N] m (0 where not drawn)."""
         gaussians, colors = self._smoothed, self._smoothed.colors
         if gaussians.sh_rest is not None:
             seen = self._colors[: self._count]
-            spherical_harmonics.color(gaussians.means, colors, gaussians.sh_rest, _centre(pinhole), seen)
+            spherical_harmonics.color(
+                gaussians.means, colors, gaussians.sh_rest, _centre(self._pinholes[camera]), seen
+            )
             colors = read_only(seen)
         projection.project(
             gaussians.means,
@@ -69,23 +74,35 @@ class Projector:
             gaussians.scales,
             gaussians.opacities,
             colors,
-            *_as_tuples(pinhole),
+            self._views[camera],
             self._screen_filter,
             self._scratch,
-            splats,
+            self._next_block,
+            splats.view(np.float32),
             depths,
         )
 
     def backward(
-        self, pinhole: Pinhole, splats: Records, v_splats: Records, v_colors: F32, accumulate: bool
+        self,
+        camera: int,
+        slots: Records,
+        v_pairs: F32,
+        geometry: bool,
+        accumulate: bool,
+        v_view_colors: F32,
+        v_colors: F32,
+        contribution: F32,
     ) -> F64:
         """Gradient of this camera's pose [6]. Those of the Gaussians are added to the cameras' before where
         `accumulate` is set.
 
         Args:
-            splats: of `project`.
-            v_splats: [N] SPLAT_GRADIENT of this camera's picture.
-            v_colors: [N, 3] of this camera's picture, 0 where not drawn.
+            slots: [N] SLOTS of this camera.
+            v_pairs: [16 slots] a SPLAT_GRADIENT per slot.
+            geometry: False: only the next three are written.
+            v_view_colors: [N, 3] written: of this camera's picture, 0 where not drawn.
+            v_colors: [N, 3] written or added to; with one camera it may be the same.
+            contribution: [N] written or added to.
         """
         n, gaussians = self._count, self._smoothed
         v_twists = self._v_twists[: -(-n // projection.BLOCK)]
@@ -94,33 +111,41 @@ class Projector:
             gaussians.quats,
             gaussians.scales,
             gaussians.opacities,
-            *_as_tuples(pinhole),
+            self._views[camera],
             self._screen_filter,
             self._scratch,
             self._next_block,
-            splats,
-            v_splats,
+            slots,
+            v_pairs,
+            geometry,
             accumulate,
+            v_view_colors,
+            v_colors,
+            contribution,
             self._v_means[:n],
             self._v_quats[:n],
             self._v_scales[:n],
             self._v_opacities[:n],
             v_twists,
         )
+        if not geometry:
+            return np.zeros(6)
         v_pose: F64 = v_twists.sum(0)
         if gaussians.sh_rest is not None:
             v_centres = self._v_centres[: -(-n // spherical_harmonics.BLOCK)]
             spherical_harmonics.color_backward(
                 gaussians.means,
                 gaussians.sh_rest,
-                _centre(pinhole),
-                v_colors,
+                _centre(self._pinholes[camera]),
+                v_view_colors,
                 accumulate,
                 self._v_sh_rest[:n],
                 self._v_means[:n],
                 v_centres,
             )
-            v_pose[:3] -= pinhole.R @ v_centres.sum(0)  # the twist moves the centre by -R^T translation
+            v_pose[:3] -= self._pinholes[camera].R @ v_centres.sum(
+                0
+            )  # the twist moves the centre by -R^T translation
         return v_pose
 
     def gradients(self) -> tuple[F32, F32, F32, F32, F32]:
@@ -137,12 +162,8 @@ def _centre(pinhole: Pinhole) -> Row:
     return tuple(np.float32(v) for v in -pinhole.R.T @ pinhole.t)
 
 
-def _as_tuples(pinhole: Pinhole) -> tuple[Row, Row, Row, Row]:
-    """Rotation, translation, intrinsics and limits as kernels take them: tuples travel in registers."""
-    f4 = np.float32
-    return (
-        tuple(f4(v) for v in pinhole.R.ravel()),
-        tuple(f4(v) for v in pinhole.t),
-        (f4(pinhole.fx), f4(pinhole.fy), f4(pinhole.cx), f4(pinhole.cy)),
-        tuple(f4(v) for v in pinhole.limits),
-    )
+def _view_of(pinhole: Pinhole) -> F32:
+    """[VIEW]: a camera as kernels take it."""
+    fx, fy, cx, cy = pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy
+    pose = [*pinhole.R.ravel().tolist(), *pinhole.t.tolist()]
+    return np.array([*pose, fx, fy, cx, cy, *pinhole.limits], np.float32)

@@ -6,6 +6,7 @@ those of the rasterisers (first pixel at (0.5, 0.5)).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -119,26 +120,19 @@ class _CheckedRasterizer:
 
 def as_pinhole(camera: Camera) -> Pinhole:
     """A camera as the rasterisers see it. UsageError: it has the wrong shape, or is no pinhole."""
-    K, view = camera.K, camera.viewmat
-    if K.shape != (3, 3) or view.shape != (4, 4):
-        raise UsageError(f"a camera needs K [3, 3] and T_world_cam [4, 4], got {K.shape} and {view.shape}")
-    if not (K[0, 0] > 0 and K[1, 1] > 0 and K[0, 1] == 0):
+    K, T = camera.K, camera.T_world_cam
+    if K.shape != (3, 3) or T.shape != (4, 4):
+        raise UsageError(f"a camera needs K [3, 3] and T_world_cam [4, 4], got {K.shape} and {T.shape}")
+    (fx, skew, cx), (_, fy, cy), _ = K.tolist()
+    if not (fx > 0 and fy > 0 and skew == 0):
         raise UsageError(
             "a camera needs positive focal lengths and no skew, "
-            f"got fx {K[0, 0]}, fy {K[1, 1]}, skew {K[0, 1]}; check the calibration"
+            f"got fx {fx}, fy {fy}, skew {skew}; check the calibration"
         )
-    if not (np.isfinite(K).all() and np.isfinite(view).all()):
+    if not all(map(math.isfinite, K.ravel().tolist() + T.ravel().tolist())):
         raise UsageError("the camera's K or pose holds NaN or infinity; check the calibration and the pose")
-    return Pinhole(
-        camera.width,
-        camera.height,
-        fx=float(K[0, 0]),
-        fy=float(K[1, 1]),
-        cx=float(K[0, 2]) + 0.5,
-        cy=float(K[1, 2]) + 0.5,
-        R=view[:3, :3],
-        t=view[:3, 3],
-    )
+    R = np.ascontiguousarray(T[:3, :3].T)
+    return Pinhole(camera.width, camera.height, fx, fy, cx + 0.5, cy + 0.5, R, t=-(R @ T[:3, 3]))
 
 
 def _checked(gaussians: Gaussians) -> Gaussians:

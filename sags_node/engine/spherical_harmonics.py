@@ -15,6 +15,7 @@ from typing import Any
 import numba
 import numpy as np
 
+from sags_node.engine.projection import MAX_VALUE
 from sags_node.kernels.jit import inlined, kernel, parallel_kernel, square_root
 from sags_node.types import F32, F64
 
@@ -23,7 +24,6 @@ BLOCK = 64  # Gaussians per piece of work
 DEGREE_2, DEGREE_3, MOST = 3, 8, 15  # where these degrees begin in the basis, and its end
 
 ZERO, ONE, TWO, THREE, FOUR, SIX, EIGHT = f4(0.0), f4(1.0), f4(2.0), f4(3.0), f4(4.0), f4(6.0), f4(8.0)
-MAX_VALUE = f4(1e18)
 C1 = f4(math.sqrt(3 / (4 * math.pi)))
 C2_XY, C2_ZZ = f4(math.sqrt(15 / (4 * math.pi))), f4(math.sqrt(5 / (16 * math.pi)))
 C2_XX = f4(math.sqrt(15 / (16 * math.pi)))

@@ -12,7 +12,7 @@ That is the published formula written in sums and differences. It takes four blu
 Borders are mirrored without repeating the edge (OpenCV's default). With G that blur in one direction and
 D = diag(1/2, 1, ..., 1, 1/2), the transposed blur is G' = D G D^-1: the same blur between two scalings.
 
-The picture is cut into tiles with a halo. Tile sizes stand here only: see `jit` on the disk cache.
+The picture is cut into tiles with a halo. Tile sizes stand here only.
 """
 
 from __future__ import annotations

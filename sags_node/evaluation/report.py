@@ -139,6 +139,9 @@ def _plots(rows: Sequence[FrameRow], spans: Mapping[str, tuple[int, int]]) -> st
         ),
         line_plot("Gaussians", [run("Gaussians", BLUE, lambda facts: facts.gaussians)], spans),
     ]
+    rungs = run("rung", BLUE, lambda facts: facts.rung)
+    if rungs.points:
+        plots.append(line_plot("rung of the ladder of quality", [rungs], spans))
     return f'<div class="plots">{"".join(plots)}</div>'
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
 
-from sags_node.config import LaunchConfig, V4l2Source
+from sags_node.config import LaunchConfig, PublishConfig, V4l2Source
 from sags_node.errors import SagsError, UsageError
 from sags_node.evaluation.gallery import Picture
 from sags_node.evaluation.measure import FrameRow, Measurer, Options, Progress
@@ -17,7 +17,6 @@ from sags_node.evaluation.spool import Spool
 from sags_node.evaluation.summary import GROUPS, summarise
 from sags_node.kernels.threads import configure_threads
 from sags_node.launch_file import load_launch
-from sags_node.mapping.budget import make_budget
 from sags_node.mapping.devices import affordable, device_of
 from sags_node.node import Node
 from sags_node.pipeline import Pipeline
@@ -77,9 +76,12 @@ def evaluate(
     config = session.config
     progress("loading kernels", 0)
     warm_up(config)
-    with Spool(config.engine.backend) as spool:
+    with Spool() as spool:
         if pace == "realtime":
-            run_realtime(session, options, spool, progress)
+            # Its own sockets, away from those of a node that may be running on this machine.
+            private = {"data": (), "ipc": True, "control": None, "run_dir": spool.folder / "run"}
+            publish = config.publish.model_copy(update=private)
+            run_realtime(session, publish, options, spool, progress)
         else:
             run_step(session, options, spool, progress)
         return measure(session, spool, options, overrides, progress)
@@ -131,7 +133,7 @@ def run_step(session: Session, options: Options, spool: Spool, progress: Progres
     """Every frame in turn, none lost; only the pipeline's own work is timed."""
     configure_threads(session.config.engine.threads)
     pipeline = Pipeline(session.config, session.rig)
-    budget = make_budget(session.config.mapping)
+    budget = pipeline.make_budget()
     with session.source as source:
         for frame in source:
             if options.holds_out(frame.frame_id):
@@ -143,15 +145,14 @@ def run_step(session: Session, options: Options, spool: Spool, progress: Progres
             progress("playing", len(spool))
 
 
-def run_realtime(session: Session, options: Options, spool: Spool, progress: Progress) -> None:
+def run_realtime(
+    session: Session, publish: PublishConfig, options: Options, spool: Spool, progress: Progress
+) -> None:
     """The node itself, threads and sockets included, on the recording's clock."""
 
     def keep(result: FrameResult, latency_ms: float) -> None:
         spool.add(result, sum(result.timings_ms.values()), time.monotonic_ns(), latency_ms)
 
-    # Its own sockets, away from those of a node that may be running on this machine.
-    private = {"data": (), "ipc": True, "control": None, "run_dir": spool.folder / "run"}
-    publish = session.config.publish.model_copy(update=private)
     config = session.config.model_copy(update={"publish": publish})
     node = Node(config, session.rig, _WithoutHeldOut(session.source, options), on_result=keep)
     node.start()

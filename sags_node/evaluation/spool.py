@@ -16,12 +16,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from sags_node.engine.rasterize import Rasterizer, make_rasterizer, to_view
 from sags_node.errors import SagsError
 from sags_node.health import resident_mb
-from sags_node.types import F32, U8, Bool, Camera, FrameResult, Gaussians, RenderedView, Snapshot
+from sags_node.types import F32, U8, Bool, Camera, FrameResult, Gaussians, Snapshot
 
-_ARRAYS = 11  # in a frame's file
+_ARRAYS = 13  # in a frame's file
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +35,7 @@ class RunFacts:
     skipped: dict[str, str]
     gaussians: int
     counts: dict[str, int]  # inserted, removed, iterations, ...
+    rung: int | None = None  # of the ladder of quality; None: fixed steps
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,10 +54,7 @@ class SpooledFrame:
 class Spool:
     """A temporary folder of frames; gone when the `with` block ends, for whatever reason."""
 
-    def __init__(self, backend: str = "numba") -> None:
-        """`backend`: the engine that drew, to draw again."""
-        self._backend = backend
-        self._rasterizer: Rasterizer | None = None
+    def __init__(self) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="sags-eval-")
         self.folder = Path(self._folder.name)
         self.frame_ids: list[int] = []
@@ -79,12 +76,12 @@ class Spool:
     def add(
         self, result: FrameResult, frame_ms: float, t_shown_ns: int, latency_ms: float | None = None
     ) -> None:
-        """Keep one frame: about 3.5 MB and 1 to 2 ms at 640x512 with 30,000 Gaussians.
+        """Keep one frame: about 6 MB and 2 to 3 ms at 640x512 with 30,000 Gaussians.
 
         Raises:
             SagsError: the disk is full.
         """
-        snapshot, seen = result.snapshot, result.observation
+        snapshot, seen, view = result.snapshot, result.observation, result.views["left"]
         gaussians = snapshot.gaussians
         facts = RunFacts(
             t_shown_ns,
@@ -95,6 +92,7 @@ class Spool:
             dict(result.skipped),
             len(gaussians),
             dict(snapshot.counts),
+            None if result.rung is None else result.rung.number,
         )
         header = {
             "facts": asdict(facts),
@@ -116,6 +114,8 @@ class Spool:
             gaussians.colors,
             gaussians.ids,
             snapshot.velocities,
+            cv2.convertScaleAbs(view.rgb, alpha=255),  # rounds and clips at 255, as on the wire
+            view.depth,
         )
         try:
             with self._file(len(self)).open("wb") as file:
@@ -125,7 +125,7 @@ class Spool:
         except OSError as error:
             raise SagsError(
                 f"cannot keep frame {snapshot.frame_id} in {self.folder}: {error.strerror}; "
-                "set TMPDIR to a folder with room (about 3.5 MB per frame) or play fewer frames"
+                "set TMPDIR to a folder with room (about 6 MB per frame) or play fewer frames"
             ) from None
         self.frame_ids.append(snapshot.frame_id)
 
@@ -133,7 +133,7 @@ class Spool:
         """The frame that was added as number `place`."""
         with self._file(place).open("rb") as file:
             header: dict[str, Any] = json.loads(file.readline())
-            K, T_world_cam, tissue, measured_depth, *splats, velocities = (
+            K, T_world_cam, tissue, measured_depth, *splats, velocities, rgb, depth = (
                 np.load(file, allow_pickle=False) for _ in range(_ARRAYS)
             )
         facts = RunFacts(**header["facts"])
@@ -148,24 +148,15 @@ class Spool:
             loss=header["loss"],
             counts=facts.counts,
         )
-        view = self._draw(snapshot)
         return SpooledFrame(
             facts=facts,
             snapshot=snapshot,
             baseline=header["baseline"],
-            rgb=cv2.convertScaleAbs(view.rgb, alpha=255),  # rounds and clips at 255, as on the wire
-            depth=view.depth,
+            rgb=rgb,
+            depth=depth,
             tissue=np.unpackbits(tissue, count=width * height).reshape(height, width).view(bool),
             measured_depth=measured_depth,
         )
-
-    def _draw(self, snapshot: Snapshot) -> RenderedView:
-        """What was shown: drawing depends on nothing but the snapshot, so it need not be kept."""
-        camera = snapshot.camera
-        if self._rasterizer is None:
-            self._rasterizer = make_rasterizer(self._backend, camera.width, camera.height)
-        planes = self._rasterizer.forward(snapshot.gaussians, [camera])
-        return to_view(planes[0], camera, snapshot.frame_id, snapshot.t_capture_ns)
 
     def _file(self, place: int) -> Path:
         return self.folder / f"{place:06d}.frame"

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sags_node.engine.rasterize import Rasterizer, to_view
+from sags_node.engine.rasterize import Rasterizer
 from sags_node.errors import SagsError
 from sags_node.fitting.clip import Clip, ClipFrame
 from sags_node.fitting.learner import Learner
@@ -115,15 +115,14 @@ def follow_online(
     """
     slots = {*range(0, len(clip.train), FRAMES_PER_SLOT), len(clip.train) - 1}
     check_size(len(slots), settings.max_gaussians)
-    mapper, budget = Mapper(CpuRefiner(rasterizer), settings.max_gaussians), StepBudget(ONLINE_STEPS)
+    refiner = CpuRefiner(lambda width, height: rasterizer)  # all frames have its size
+    mapper, budget = Mapper(refiner, settings.max_gaussians), StepBudget(ONLINE_STEPS)
     seen: list[tuple[I64, F32]] = []
     first = _Places()
     for done, frame in enumerate(clip.train):
         observation = frame.observation()
         budget.start()
-        snapshot = mapper.update(observation, budget)
-        planes = rasterizer.forward(snapshot.gaussians, [frame.camera])[0]
-        mapper.drawn(observation, to_view(planes, frame.camera, frame.frame_id, frame.t_capture_ns))
+        mapper.update(observation, budget)
         gaussians = mapper.model.gaussians()  # before the 3D filter: the fit applies its own
         first.add(gaussians.ids, gaussians.means)
         if done in slots:

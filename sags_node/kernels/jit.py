@@ -23,36 +23,39 @@ The rules; breaking one costs up to 5 times without any error, so time a kernel 
 9. A function with branches or loops that takes arrays counts references to them with atomic instructions,
    5 ns each, even when inlined: in the innermost loops arrays go to intrinsics only.
 
-Numba's disk cache only sees the file a kernel stands in and the types of its arguments. So constants that
-shape a kernel stand in the same file as every kernel that uses them, and layouts shared between files are
-structured dtypes (part of the argument type). After editing this file, delete the caches (`__pycache__`).
+Machine code is kept on disk (`cache`) under a name that changes with the kernel's file, with every file that
+it imports from and with the compile target (`digest`). So helpers, constants and layouts stand once, in the
+file they belong to, and are imported.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numba
 import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
+from numba.core.dispatcher import Dispatcher
 from numba.extending import intrinsic
 from numba.np.arrayobj import populate_array
 from numpy.typing import DTypeLike, NDArray
 
 from sags_node.kernels import threads  # noqa: F401  (fixes the threading layer before the first kernel)
+from sags_node.kernels.cache import cache_for
 
 # Not "fast": that also promises the absence of NaN and infinity, and comparisons must reject those here.
 _FASTMATH = {"reassoc", "contract", "arcp", "nsz", "afn"}
 _OPTIONS: dict[str, Any] = {
-    "cache": True,
     "fastmath": _FASTMATH,
     "error_model": "numpy",
     "boundscheck": False,
     "nogil": True,
 }
+
+PIECE = 1024  # rows a thread takes at a time: a call for each row would count references to every array
 
 F = TypeVar("F", bound=Callable[..., Any])
 T = TypeVar("T", bound=np.generic)
@@ -60,20 +63,25 @@ T = TypeVar("T", bound=np.generic)
 
 def inlined(function: F) -> F:
     """Compile a function into every kernel that calls it: a call left in a loop keeps it from vectorising."""
-    compiled: F = numba.njit(forceinline=True, **_OPTIONS)(function)
-    return compiled
+    return _compile(function, forceinline=True)
 
 
 def kernel(function: F) -> F:
     """Compile a serial kernel."""
-    compiled: F = numba.njit(**_OPTIONS)(function)
-    return compiled
+    return _compile(function)
 
 
 def parallel_kernel(function: F) -> F:
     """Compile a kernel whose `numba.prange` loops are shared between threads."""
-    compiled: F = numba.njit(parallel=True, **_OPTIONS)(function)
-    return compiled
+    return _compile(function, parallel=True)
+
+
+def _compile(function: F, **options: bool) -> F:
+    compiled: Any = numba.njit(**_OPTIONS, **options)(function)
+    cache = cache_for(function) if isinstance(compiled, Dispatcher) else None  # not with NUMBA_DISABLE_JIT
+    if cache is not None:
+        compiled._cache = cache
+    return cast(F, compiled)
 
 
 def aligned(shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> NDArray[Any]:
@@ -179,7 +187,7 @@ def stack_floats(typing_context: Any, size: Any) -> Any:
     return array(size), generate
 
 
-def _make_prefetch(write: int) -> Any:
+def _make_prefetch(write: int, closeness: int) -> Any:
     def prefetch(typing_context: Any, array: Any, index: Any) -> Any:
         def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
             i64, pointer = ir.IntType(64), ir.IntType(8).as_pointer()
@@ -189,7 +197,7 @@ def _make_prefetch(write: int) -> Any:
             address = builder.add(builder.ptrtoint(struct.data, i64), builder.mul(stride, position))
             signature_ir = ir.FunctionType(ir.VoidType(), [pointer, _I32, _I32, _I32])
             function = cgutils.get_or_insert_function(builder.module, signature_ir, "llvm.prefetch.p0")
-            flags = [ir.Constant(_I32, value) for value in (write, 3, 1)]  # keep in all caches, data
+            flags = [ir.Constant(_I32, value) for value in (write, closeness, 1)]  # data
             builder.call(function, [builder.inttoptr(address, pointer), *flags])
             return context.get_dummy_value()
 
@@ -198,5 +206,8 @@ def _make_prefetch(write: int) -> Any:
     return prefetch
 
 
-prefetch_read = intrinsic(_make_prefetch(0))  # (array, index of its first axis)
-prefetch_write = intrinsic(_make_prefetch(1))
+# Each of (array, index of its first axis), into all caches; the last into all but the innermost, for what is
+# read so much later that it would only push other things out of it.
+prefetch_read = intrinsic(_make_prefetch(0, 3))
+prefetch_write = intrinsic(_make_prefetch(1, 3))
+prefetch_far = intrinsic(_make_prefetch(0, 2))

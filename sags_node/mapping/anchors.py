@@ -14,6 +14,7 @@ import numpy as np
 
 from sags_node.errors import SagsError
 from sags_node.geometry import project, unproject
+from sags_node.mapping.motion import BEHIND_TOLERANCE
 from sags_node.types import (
     F32,
     F64,
@@ -35,7 +36,6 @@ RENEW_BELOW = 0.8  # share of the weight still there: below it new neighbours ar
 RENEWED_PER_FRAME = 8  # anchors; taking neighbours costs a third of a millisecond
 
 SEEN_RADIUS = 2  # px around the anchor that must be free for it to be fully visible
-BEHIND = 0.035  # of the depth: an anchor this far behind the drawn surface is hidden by it
 PATCH_RADIUS = 10  # px
 SEARCH_RADIUS = 4  # px, of an anchor found in the frame before
 SEARCH_GROWTH = 30.0  # px/s since it was found last
@@ -284,7 +284,7 @@ def _seen(pixels: F64, depths: F64, tissue: Bool, drawn: F32) -> F64:
     inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
     places = np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)
     surface = drawn[places]
-    free = (surface == 0) | (surface > (1 - BEHIND) * depths[:, None, None])
+    free = (surface == 0) | (surface > (1 - BEHIND_TOLERANCE) * depths[:, None, None])
     return np.asarray(np.mean(inside & tissue[places] & free, axis=(1, 2)), np.float64)
 
 

@@ -1,5 +1,5 @@
-"""How long a frame may be refined, and how many Gaussians the machine can afford. The clock is an argument,
-so that results are reproducible."""
+"""What a frame gets: a rung of quality, and steps while its time lasts. The clock is an argument, so that
+results are reproducible."""
 
 from __future__ import annotations
 
@@ -7,119 +7,141 @@ import time
 from collections.abc import Callable
 from typing import Protocol
 
-from sags_node.config import MappingConfig
+from sags_node.mapping.ladder import EVERYTHING, Ladder, Rung
+from sags_node.types import RungState
 
-PLANNED = 0.92  # of the budget: costs vary, and half of all frames would take longer than what is planned
 LEARNING = 0.2  # share of a new measurement in a running mean
 FORGET = 0.95  # of the cost of a step, per frame in which it seemed not to fit
-LEAST_SHARE = 0.7  # of the model's capacity: fewer would save little, most of a frame does not depend on them
-SHRINK, GROW = 0.995, 1.002  # per frame
-GAUSSIANS_PER_MS = 1100  # of the budget; measured, see benchmarks/mapping.md
-PIXELS_PER_GAUSSIAN = 2  # fewer pixels have no more to tell
-MOST_PARTLY = 7  # frames in a row with a first step on part of the picture: a whole one tells what shows
-COMFORT = 0.9  # of the time: below it there is room for more Gaussians
+LEAST_FIRST_STEPS = 3  # of a new model in its first frame, whatever the time
+FIRST_SECONDS = 0.1  # of its first frame, after which the rest is left to those that follow
+WHOLE_EVERY = 8  # frames: a first step on the whole picture tells what each Gaussian shows
 
 
 class Budget(Protocol):
-    """Asked once before every refinement step."""
+    """What a frame gets; asked by the mapper."""
 
     @property
-    def share(self) -> float:
-        """How much of the model's capacity may be used, 0..1."""
+    def rung(self) -> Rung:
+        """What this frame gets at most. Changes between frames only."""
+
+    @property
+    def speed(self) -> float:
+        """How long this machine takes, see `Ladder`."""
+
+    @property
+    def state(self) -> RungState | None:
+        """Which rung that is and why; None: it is none of a ladder."""
 
     def start(self, waited: float = 0.0) -> None:
         """A new frame begins, `waited` seconds after it came."""
 
     def affords_depth(self) -> bool:
-        """True when depth may be matched in this frame; False never twice in a row."""
+        """True when depth may be matched in this frame."""
+
+    def first_share(self) -> float:
+        """Share of the picture, where it is worst, that the first step is on. Often enough 1: only a step on
+        all of it tells the model which Gaussians show."""
+
+    def more_at_first(self, steps: int) -> bool:
+        """True when a new model that has had so many steps may have one more in its first frame."""
 
     def more(self) -> bool:
-        """True when one more step may be taken."""
+        """True when one more step may be taken. Asked once before every step."""
 
-    def affords_whole(self) -> bool:
-        """True when the first step, about to be taken, may be one on the whole picture; often enough for the
-        model to know which Gaussians show."""
-
-    def finish(self) -> None:
-        """The frame is done."""
+    def finish(self, gaussians: int) -> None:
+        """The frame is done; the model has so many."""
 
 
 class StepBudget:
     """A fixed number of steps per frame: deterministic."""
 
-    share = 1.0
+    speed = 1.0
+    state: RungState | None = None
 
-    def __init__(self, steps: int) -> None:
+    def __init__(self, steps: int, rung: Rung = EVERYTHING) -> None:
+        self.rung = rung
         self._steps = steps
         self._left = steps
+        self._frames = 0
 
     def start(self, waited: float = 0.0) -> None:
         self._left = self._steps
+        self._frames += 1
 
     def affords_depth(self) -> bool:
-        return True
+        return self._frames % self.rung.depth_every == 0
+
+    def first_share(self) -> float:
+        return 1.0 if self._frames % WHOLE_EVERY == 0 else self.rung.step
 
     def more(self) -> bool:
         self._left -= 1
         return self._left >= 0
 
-    def affords_whole(self) -> bool:
+    def more_at_first(self, steps: int) -> bool:
         return True
 
-    def finish(self) -> None:
+    def finish(self, gaussians: int) -> None:
         pass
 
 
 class TimeBudget:
     """Wall time per frame, at least one step.
 
-    The first step is part of what a frame cannot do without. A further one is taken when its cost and that of
-    what follows the last step (drawing), both learnt from the frames before, still fit. The time that a frame
-    waited is gone, so that one late frame does not make the next late.
-
-    What does not fit is left out in this order: further steps; depth in every other frame, which the model's
-    own depth bridges; the part of the picture, in this frame, that needs the first step least; and while that
-    is not enough, the share of Gaussians falls. All recover when there is room: the machine may be slow, or
-    busy with something else.
+    The rung says what a frame cannot do without. A further step is taken when its cost and that of what
+    follows the last step (drawing), both learnt from the frames before, still fit. The time that a frame
+    waited is gone, so that one late frame does not make the next late; a late frame may also leave depth to
+    the next one.
     """
 
-    def __init__(
-        self, seconds: float, skip_fitted: bool = True, clock: Callable[[], float] = time.perf_counter
-    ) -> None:
-        """
-        Args:
-            skip_fitted: False: the first step is on the whole picture, whatever the time.
-        """
-        self.seconds = seconds
-        self._skip_fitted = skip_fitted
-        self.share = 1.0
+    def __init__(self, ladder: Ladder, clock: Callable[[], float] = time.perf_counter) -> None:
+        self.ladder = ladder
+        self.rung = ladder.rung
         self._clock = clock
         self._step_cost = _RunningMean()
-        self._whole_cost = _RunningMean()  # of a first step on the whole picture, until the second may begin
         self._after_cost = _RunningMean()
-        self._essential = _RunningMean()
         self._cost_with_depth = _RunningMean()
-        self._had_depth = False
-        self._partly = 0  # frames in a row whose first step was on part of the picture
+        self._since_depth = 0  # frames, this one included
+        self._since_whole = 0
         self.start()
 
+    @property
+    def speed(self) -> float:
+        return self.ladder.speed
+
+    @property
+    def state(self) -> RungState:
+        return self.ladder.state
+
     def start(self, waited: float = 0.0) -> None:
+        self.rung = self.ladder.rung
         self._started = self._asked = self._clock()
-        self._deadline = self._started + max(0.0, self.seconds - waited)
+        self._deadline = self._started + max(0.0, self.ladder.seconds - waited)
         self._asks = 0
-        self._depth: bool | None = None  # whether it is matched; None: nobody asked
-        self._whole = True  # the first step
+        self._depth = False  # whether it is matched
+        self._since_depth += 1
+        self._since_whole += 1
         self._optional = 0.0  # s, spent on all steps but the first
 
     def affords_depth(self) -> bool:
-        fits = self._started + self._cost_with_depth.value <= self._deadline
-        self._depth = fits or not self._had_depth
+        every = self.rung.depth_every
+        late = self._started + self._cost_with_depth.value > self._deadline
+        self._depth = self._since_depth >= (every + 1 if late else every)
+        if self._depth:
+            self._since_depth = 0
         return self._depth
+
+    def first_share(self) -> float:
+        if self._since_whole >= WHOLE_EVERY or self.rung.step == 1:
+            self._since_whole = 0
+            return 1.0
+        return self.rung.step
+
+    def more_at_first(self, steps: int) -> bool:
+        return steps < LEAST_FIRST_STEPS or self._clock() - self._started <= FIRST_SECONDS
 
     def more(self) -> bool:
         now = self._clock()
-        if self._asks == 1 and self._whole:
-            self._whole_cost.add(now - self._asked)
         if self._asks > 1:  # what came before the first step, and the first, are no measure of a further one
             self._step_cost.add(now - self._asked)
             self._optional += now - self._asked
@@ -131,29 +153,16 @@ class TimeBudget:
             self._step_cost.value *= FORGET
         return False
 
-    def affords_whole(self) -> bool:
-        needed = self._whole_cost.value + self._after_cost.value
-        fits = self._clock() + needed <= self._deadline
-        self._whole = fits or not self._skip_fitted or self._partly == MOST_PARTLY
-        self._partly = 0 if self._whole else self._partly + 1
-        return self._whole
-
-    def finish(self) -> None:
+    def finish(self, gaussians: int) -> None:
         """Learn from this frame. One that never asked, since it made a new model, tells nothing."""
-        if self._depth is not None:
-            self._had_depth = self._depth
         if self._asks == 0:
             return
         now = self._clock()
         self._after_cost.add(now - self._asked)
         essential = now - self._started - self._optional
-        self._essential.add(essential)
         if self._depth:
             self._cost_with_depth.add(essential)
-        if self._essential.value > self.seconds:
-            self.share = max(LEAST_SHARE, SHRINK * self.share)
-        elif self._essential.value + self._step_cost.value < COMFORT * self.seconds:
-            self.share = min(1.0, GROW * self.share)
+        self.ladder.learn(essential, gaussians)
 
 
 class _RunningMean:
@@ -166,17 +175,3 @@ class _RunningMean:
     def add(self, value: float) -> None:
         self.value += (1.0 if self._empty else LEARNING) * (value - self.value)
         self._empty = False
-
-
-def capacity(config: MappingConfig, width: int, height: int) -> int:
-    """How many Gaussians a model of pictures of this size may have; a slow machine uses a share of them."""
-    if config.max_gaussians is not None:
-        return config.max_gaussians
-    return max(100, round(min(GAUSSIANS_PER_MS * config.budget_ms, width * height / PIXELS_PER_GAUSSIAN)))
-
-
-def make_budget(config: MappingConfig) -> Budget:
-    """Fixed steps where the configuration names them, else its time."""
-    if config.iterations is not None:
-        return StepBudget(config.iterations)
-    return TimeBudget(PLANNED * config.budget_ms * 1e-3, config.skip_fitted)

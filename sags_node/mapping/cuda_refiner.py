@@ -21,6 +21,7 @@ from sags_node.engine.cuda.nodes import Followers, Nodes, descend
 from sags_node.engine.cuda.optimiser import Constants, Model, Optimiser, Slopes
 from sags_node.engine.cuda.rasterizer import CudaRasterizer
 from sags_node.engine.cuda.scene import DeviceGaussians, DeviceGradients
+from sags_node.engine.losses import COVERED
 from sags_node.engine.rasterize import TILE_HEIGHT, TILE_WIDTH, as_pinhole
 from sags_node.mapping import exposure, focus, optimiser, right_eye
 from sags_node.mapping.optimiser import Rates
@@ -51,6 +52,8 @@ STEP = Constants(
     beta1=optimiser.BETA1,
     beta2=optimiser.BETA2,
     least_contribution=optimiser.MIN_CONTRIBUTION,
+    eps=optimiser.EPS,
+    color_range=optimiser.COLOR_RANGE,
     log_scale_range=optimiser.LOG_SCALE_RANGE,
     logit_range=optimiser.LOGIT_RANGE,
     largest=optimiser.LARGEST,
@@ -67,12 +70,13 @@ class CudaRefiner:
     share = 1.0
     problem: str | None = None
 
-    def __init__(self, width: int, height: int) -> None:
+    def __init__(self) -> None:
         self.loss = 0.0
-        self._rasterizer = CudaRasterizer(width, height, True, default_device())
-        self._device = self._rasterizer.device
+        self._device = default_device()
+        self._rasterizers: dict[tuple[int, int], CudaRasterizer] = {}  # by the size of their pictures
+        self._viewers: dict[tuple[int, int], CudaRasterizer] = {}  # those of `show`
         self._optimiser = Optimiser(STEP)
-        self._planes = torch.zeros((1, 5, height, width), device=self._device)
+        self._planes = torch.zeros((1, 5, 1, 1), device=self._device)
         self._v_planes, self._weight = torch.zeros_like(self._planes), torch.zeros_like(self._planes[:, 0])
         self._last_loss = torch.zeros((), device=self._device)
         self._host: GaussianModel | None = None
@@ -91,6 +95,7 @@ class CudaRefiner:
         else:
             known = len(self._nodes.places)
             self._nodes.places.copy_(torch.from_numpy(deformation.nodes[:known]))
+        self._rasterizer = self._rasterizer_for(observation.camera, self._rasterizers)
         if observation is not self._observation:
             self._look_at(observation)
         self._node_step = node_step
@@ -164,17 +169,29 @@ class CudaRefiner:
         found: Bool = self._touched.cpu().numpy()
         return found
 
-    def show(self, gaussians: Gaussians, camera: Camera, tiles: Bool | None = None) -> F32:
-        self._planes = self._rasterizer.draw(
-            DeviceGaussians.from_host(gaussians, self._device),
-            [as_pinhole(camera)],
-            None if tiles is None else self._sent(tiles),
-        )
-        return self.planes()
+    def redraw(self, share: float, tiles: Bool) -> None:
+        some = None
+        if share < 1.0:
+            some = self._sent(tiles) | self._touched
+            if share > 0:
+                some |= self._worst_tiles(share)
+        self._planes = self._rasterizer.draw(self._gaussians, self._pinholes[:1], some)
+
+    def show(self, gaussians: Gaussians, camera: Camera) -> F32:
+        drawn = DeviceGaussians.from_host(gaussians, self._device)
+        planes = self._rasterizer_for(camera, self._viewers).draw(drawn, [as_pinhole(camera)])
+        found: F32 = planes[0].cpu().numpy()
+        return found
+
+    def _rasterizer_for(self, camera: Camera, made: dict[tuple[int, int], CudaRasterizer]) -> CudaRasterizer:
+        size = camera.width, camera.height
+        if size not in made:
+            made[size] = CudaRasterizer(*size, True, self._device)
+        return made[size]
 
     def _step(self, tissue: Tensor, rates: Rates, nodes: bool = True) -> DeviceGradients:
         planes, eyes = self._planes, len(self._planes)
-        if len(self._weight) < eyes:
+        if len(self._weight) < eyes or self._weight.shape[1:] != planes.shape[2:]:
             self._v_planes, self._weight = torch.zeros_like(planes), torch.zeros_like(planes[:, 0])
         v_planes, weight = self._v_planes[:eyes], self._weight[:eyes]
         self._last_loss = tissue_loss(
@@ -203,7 +220,7 @@ class CudaRefiner:
     def _worst_tiles(self, share: float) -> Tensor:
         return device_focus.worst_tiles(
             self._planes[0], self._image, self._tissue, share,
-            every=focus.EVERY, least_coverage=focus.LEAST_COVERAGE,
+            every=focus.EVERY, least_coverage=float(COVERED),
         )  # fmt: skip
 
     def _look_at(self, observation: Observation) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from numba import prange
 
 from sags_node.engine.pinhole import pack, to_camera, to_pixel
-from sags_node.kernels.jit import inlined, kernel, parallel_kernel
+from sags_node.kernels.jit import PIECE, inlined, kernel, parallel_kernel
 from sags_node.mapping.initialise import nearest_depth
 from sags_node.model.gaussians import GaussianModel
 from sags_node.types import F32, I32, Bool, Observation
@@ -23,10 +23,9 @@ FRONT_TOLERANCE = 0.065  # of the depth: so far in front of the measured surface
 FRONT_FRAMES = 3  # in a row, since stereo is wrong now and then
 MIN_OPACITY = 0.03
 CROWDED = 0.9  # share of the cap above which what does not show is given up
-SHED = 0.01  # of all, per frame: so many are given up while there are more than the machine can afford
+SHED = 0.03  # of all, per frame: so many are given up while there are more than the machine can afford
 LITTLE = 0.35  # of the mean contribution: what shows more would leave a hole
 IDLE = 0.1  # px of coverage: less does not show
-PIECE = 1024  # rows a thread takes at a time: a call for each row would count references to every array
 LARGEST = 1e6  # metres, colours, quaternions: no honest value comes near
 
 
@@ -52,9 +51,8 @@ def candidates(planes: F32, observation: Observation, phase: int) -> tuple[I32, 
 
 def doomed(model: GaussianModel, observation: Observation, limit: int) -> Bool:
     """[N] what to remove: in free space for several frames in a row, transparent or not finite; when N nears
-    its `limit` also what left the view, and what lies on the visible surface without showing; beyond it
-    what shows little. What an instrument or other tissue hides is kept. Counts the frames in free space
-    (`in_front`)."""
+    its `limit` also what left the view, and what lies on the visible surface without showing. What an
+    instrument or other tissue hides is kept. Counts the frames in free space (`in_front`)."""
     remove = np.zeros(model.count, np.bool_)
     _inspect(
         model.means, model.quats, model.scales, model.smoothing, model.node_weight,
@@ -62,10 +60,28 @@ def doomed(model: GaussianModel, observation: Observation, limit: int) -> Bool:
         pack(observation.camera), observation.tissue, observation.depth,
         model.count > CROWDED * limit, model.in_front, remove,
     )  # fmt: skip
-    excess = min(model.count - limit, int(SHED * model.count))
-    if excess > 0:
-        remove |= least_shown(model, excess)
     return remove
+
+
+def shed(model: GaussianModel, limit: int) -> int:
+    """While there are more than `limit`, give up some of those that show least; returns how many.
+
+    The others grow by the area that is given up, so that the tissue stays covered.
+    """
+    excess = min(model.count - limit, int(SHED * model.count))
+    if excess <= 0:
+        return 0
+    contribution = model.contribution
+    least = np.argpartition(contribution, excess)[:excess]
+    known = contribution[contribution < np.inf].sum()
+    given_up = contribution[least]
+    share = float(given_up[given_up < np.inf].sum() / known) if known > 0 else 0.0
+    remove = np.zeros(model.count, np.bool_)
+    remove[least] = True
+    removed = model.remove(remove)
+    if share < 1:
+        model.grow(1 / np.sqrt(1 - share))
+    return removed
 
 
 def least_shown(model: GaussianModel, count: int) -> Bool:

@@ -1,14 +1,22 @@
-"""What a launch's device means for the mapper: who refines, and how many Gaussians."""
+"""What a launch means for the mapper: who refines, on which rungs, with how many Gaussians."""
 
 from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
 
 from sags_node.config import LaunchConfig
 from sags_node.engine.device import Device, choose_device
 from sags_node.engine.rasterize import make_rasterizer
-from sags_node.mapping.budget import capacity
+from sags_node.errors import UsageError
+from sags_node.mapping.budget import Budget, StepBudget, TimeBudget
+from sags_node.mapping.ladder import EVERYTHING, RUNGS, Ladder, Rung
 from sags_node.mapping.refiner import CpuRefiner, Refiner
+from sags_node.mapping.speed import SAMPLE_SIZE, measured_speed
 
-GPU_SPEED = 10.0  # times two CPU cores, in Gaussians per ms of the budget: an ESTIMATE, never run on a GPU
+GPU_SPEED = 10.0  # times two CPU cores, in Gaussians of a rung: an ESTIMATE, never run on a GPU
+GAUSSIANS_PER_MS = 1100  # of the budget, where the number of steps is fixed; see benchmarks/mapping.md
+PIXELS_PER_GAUSSIAN = 2  # fewer pixels have no more to tell
 
 
 def device_of(config: LaunchConfig) -> Device:
@@ -18,23 +26,65 @@ def device_of(config: LaunchConfig) -> Device:
 
 def affordable(config: LaunchConfig, width: int, height: int) -> int:
     """How many Gaussians a model of pictures of this size may have on the launch's device."""
+    if config.mapping.max_gaussians is not None:
+        return config.mapping.max_gaussians
+    most = max(100, width * height // PIXELS_PER_GAUSSIAN)
+    if config.mapping.iterations is None or config.mapping.rung is not None:
+        return min(most, max(rung.gaussians for rung in rungs_of(config)))
+    return max(100, min(most, round(_speed(config) * GAUSSIANS_PER_MS * config.mapping.budget_ms)))
+
+
+def rungs_of(config: LaunchConfig) -> tuple[Rung, ...]:
+    """Those that the mapper may be on, from the cheapest to the best.
+
+    Raises:
+        UsageError: `mapping.rung` names none.
+    """
     mapping = config.mapping
-    if device_of(config).kind == "cuda":
-        mapping = mapping.model_copy(update={"budget_ms": GPU_SPEED * mapping.budget_ms})
-    return capacity(mapping, width, height)
+    if mapping.rung is not None and mapping.rung >= len(RUNGS):
+        raise UsageError(f"mapping.rung {mapping.rung}: the ladder's rungs are 0 to {len(RUNGS) - 1}")
+    rungs = RUNGS if mapping.rung is None else (RUNGS[mapping.rung],)
+    return tuple(
+        replace(
+            rung,
+            gaussians=round(_speed(config) * rung.gaussians),
+            depth_every=rung.depth_every if mapping.skip_depth else 1,
+            step=rung.step if mapping.skip_fitted else 1.0,
+        )
+        for rung in rungs
+    )
+
+
+def make_budget(config: LaunchConfig, width: int, height: int, speed: float | None = None) -> Budget:
+    """Fixed steps where the configuration names them, else its time.
+
+    Args:
+        width, height: px of the working size.
+        speed: see `Ladder`; None: it is measured.
+    """
+    mapping = config.mapping
+    if mapping.iterations is not None:
+        return StepBudget(mapping.iterations, EVERYTHING if mapping.rung is None else rungs_of(config)[0])
+    if speed is None:
+        speed = measured_speed(make_rasterizer(config.engine.backend, *SAMPLE_SIZE))
+    return TimeBudget(Ladder(rungs_of(config), width * height, 1e-3 * mapping.budget_ms, speed))
 
 
 def make_refiner(config: LaunchConfig, width: int, height: int) -> Refiner:
-    """The refiner for pictures of this size (px).
+    """The refiner of a launch whose working size is this (px).
 
     Raises:
         UsageError: a GPU is wanted and none can be used.
     """
-    cpu = CpuRefiner(make_rasterizer(config.engine.backend, width, height))
+    cpu = CpuRefiner(partial(make_rasterizer, config.engine.backend))
     if device_of(config).kind == "cpu":
         return cpu
     from sags_node.mapping.cuda_refiner import CudaRefiner
     from sags_node.mapping.guarded_refiner import GuardedRefiner
 
-    cpu_share = capacity(config.mapping, width, height) / affordable(config, width, height)
-    return GuardedRefiner(CudaRefiner(width, height), cpu, cpu_share)
+    on_cpu = affordable(config.model_copy(update={"device": "cpu"}), width, height)
+    return GuardedRefiner(CudaRefiner(), cpu, on_cpu / affordable(config, width, height))
+
+
+def _speed(config: LaunchConfig) -> float:
+    return GPU_SPEED if device_of(config).kind == "cuda" else 1.0

@@ -8,13 +8,13 @@ import cv2
 import numpy as np
 from numba import prange
 
-from sags_node.engine.rasterize import TILE_HEIGHT, TILE_WIDTH
+from sags_node.engine.compositing import TILE_HEIGHT, TILE_WIDTH
+from sags_node.engine.losses import COVERED
 from sags_node.kernels.jit import kernel, parallel_kernel
-from sags_node.types import F32, U8, Bool
+from sags_node.types import F32, I32, U8, Bool
 
 EVERY = 2  # px: a quarter of the pixels tells enough
 REACH = 32  # px: few Gaussians are larger, and those are faint out there
-LEAST_COVERAGE = 0.05  # where less is drawn, the colour means nothing
 
 
 def worst_tiles(planes: F32, image: F32, tissue: Bool, share: float) -> Bool:
@@ -43,6 +43,13 @@ def tile_grid(mask: Bool) -> Bool:
     return np.zeros((1, -(-height // TILE_HEIGHT), -(-width // TILE_WIDTH)), np.bool_)
 
 
+def tiles_of(pixels: I32, mask: Bool) -> Bool:
+    """The tiles [1, rows, columns] of a picture as large as `mask` in which the pixels [M, 2] (x, y) lie."""
+    tiles = tile_grid(mask)
+    tiles[0, pixels[:, 1] // TILE_HEIGHT, pixels[:, 0] // TILE_WIDTH] = True
+    return tiles
+
+
 def pixels_of(tiles: Bool, shape: tuple[int, ...]) -> Bool:
     """The pixels [H, W] of the tiles [1, rows, columns] of a picture of that shape."""
     rows = np.repeat(tiles[0], TILE_HEIGHT, axis=0)[: shape[0]]
@@ -69,7 +76,7 @@ def _sum_row(planes: F32, image: F32, tissue: Bool, sums: F32, row: Any) -> None
     for y in range(row * TILE_HEIGHT, min((row + 1) * TILE_HEIGHT, height), EVERY):
         for x in range(0, width, EVERY):
             coverage = planes[4, y, x]
-            if tissue[y, x] and coverage > np.float32(LEAST_COVERAGE):
+            if tissue[y, x] and coverage > COVERED:
                 for k in range(3):
                     residual = planes[k, y, x] / coverage - image[y, x, k]
                     if abs(residual) < np.float32(1):

@@ -79,8 +79,11 @@ class GuardedRefiner:
     def touched(self) -> Bool:
         return self._do(lambda refiner: refiner.touched())
 
-    def show(self, gaussians: Gaussians, camera: Camera, tiles: Bool | None = None) -> F32:
-        return self._do(lambda refiner: refiner.show(gaussians, camera, tiles))
+    def redraw(self, share: float, tiles: Bool) -> None:
+        self._do(lambda refiner: refiner.redraw(share, tiles))
+
+    def show(self, gaussians: Gaussians, camera: Camera) -> F32:
+        return self._do(lambda refiner: refiner.show(gaussians, camera))
 
     def _do(self, work: Callable[[Refiner], Result]) -> Result:
         if self._working is self._gpu:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sags_node.engine.views import to_view
 from sags_node.mapping import densify, initialise
 from sags_node.mapping.budget import Budget
-from sags_node.mapping.focus import with_neighbours
-from sags_node.mapping.motion import OpticalFlow, depth_pull, found_again, scene_flow
+from sags_node.mapping.focus import tile_grid, tiles_of, with_neighbours
+from sags_node.mapping.motion import depth_pull, found_again, scene_flow
 from sags_node.mapping.optimiser import Rates
 from sags_node.mapping.refiner import Refiner
 from sags_node.mapping.split import split_worst
@@ -17,31 +18,43 @@ from sags_node.model.alias_free import smoothing_variances
 from sags_node.model.deformation import NodeDeformation
 from sags_node.model.gaussians import GaussianModel
 from sags_node.types import F32, U8, Bool, Observation, RenderedView, Snapshot
+from sags_node.vision.flow import OpticalFlow
+from sags_node.vision.observe import resized
+from sags_node.vision.pyramid import pyramid_of
 
 CONTROL_NODES = 512
-INITIAL_STEPS = 30
+FIRST_STEPS = 30  # of a new model: long ones, in its first frame or, where time is short, in the next ones
 HOLES = 200  # Gaussians per frame that are exchanged for new ones when the model is full
+GROWN = 0.8  # of the Gaussians that are allowed: up to there splitting adds some
 ADDED = 500  # Gaussians per frame that may be added even when there are as many as the machine affords
 TORN = 0.02  # of the Gaussians: where more are removed at once, they leave holes
 EXPOSURE_JUMP = 0.01  # smaller changes of the gain are left to the colour steps
 SETTLED = 10  # frames: a model that has not changed for so long has little more to learn
 SETTLED_EVERY = 5  # frames: then it is refined so rarely
 FOCUS = 0.15  # of the picture; measured: half the gain of a whole step in a quarter of its time
-HURRIED_SHARE = 0.6  # of the picture, in the first step of a frame that is late
 MIN_FIRST_DEPTHS = 200  # px
 LOST_RESIDUAL = 0.08  # mean over RGB and tissue, 0..1; a beating heart stays below half of it
 LOST_COVERAGE = 0.3  # of the tissue
-INITIAL_RATES = Rates().scaled(4.0)
+FIRST_RATES = Rates().scaled(4.0)
 UNHURRIED_RATES = 0.6  # measured with six steps: +0.3 dB; with one step a frame it loses as much
 NODE_STEP_PX = 0.08
+FINE_FLOW, COARSE_FLOW = 4, 6  # px between patches
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class Drawn:
     """A frame and the model drawn for it: what the next frame's motion starts from."""
 
     observation: Observation
     view: RenderedView
+
+
+@dataclass(frozen=True, slots=True)
+class Mapped:
+    """What the mapper made of one frame."""
+
+    snapshot: Snapshot
+    view: RenderedView  # the model drawn for the left eye
 
 
 class Mapper:
@@ -63,7 +76,7 @@ class Mapper:
     ) -> None:
         """
         Args:
-            refiner: draws and refines the model; it must be drawn with `refiner.show` for `drawn`.
+            refiner: draws and refines the model.
             smoothing: draw the Gaussians with the 3D filter (`model.alias_free`).
             unhurried: see `pace`.
             focus: share of the picture, where it is worst, for the steps after the first of a frame.
@@ -78,32 +91,33 @@ class Mapper:
         self._deformation: NodeDeformation | None = None
         self._last: Drawn | None = None
         self._found: tuple[U8, F32] | None = None  # a picture, and the pixels where the Gaussians are in it
-        self._still = False  # whether nothing moved in the frame taken in last
-        self.stale_tiles: Bool | None = None  # [1, rows, columns] to be drawn anew after `update`; None: all
+        self._view: RenderedView | None = None  # the model as it was drawn last
+        self._scale = 1.0  # of the pictures' size: at which the model was drawn last
+        self._first_steps = 0  # that a new model has had
+        self._split = False  # whether Gaussians were, since the model was drawn
         self._frames = 0
         self._frames_to_depth = 0  # since depth was known last
         self._metres_per_px = 0.0  # at the tissue's median depth
 
-    def update(self, observation: Observation, budget: Budget, still: int = 0) -> Snapshot:
-        """Take one frame in. Call `drawn` with the picture of the snapshot before the next update.
+    def update(self, observation: Observation, budget: Budget, still: int = 0) -> Mapped:
+        """Take one frame in.
 
         Args:
             still: for how many frames, this one included, nothing has moved.
         """
         self._frames += 1
-        self._still = still > 0
-        self.stale_tiles = None
+        before, self._scale = self._scale, budget.rung.scale
         known = observation.depth[::8, ::8]
         known = known[known > 0]
         if known.size:
             self._metres_per_px = float(np.median(known)) / observation.camera.K[0, 0]
         if self._deformation is None:
-            counts = self._initialise(observation)
-        elif still:
+            counts = self._initialise(observation, budget)
+        elif still and self._scale == before:
             counts = self._touch_up(observation, budget, settled=still > SETTLED)
         else:
             counts = self._follow(observation, budget)
-        return Snapshot(
+        snapshot = Snapshot(
             frame_id=observation.frame_id,
             t_capture_ns=observation.t_capture_ns,
             step=self.step,
@@ -113,10 +127,19 @@ class Mapper:
             loss=self._refiner.loss,
             counts=counts,
         )
+        assert self._view is not None
+        drawn = Drawn(observation, self._view)
+        if not still or self._last is None:  # a still frame is passed over: slow motion adds up until seen
+            self.start_from(drawn)
+            room = self._limit(budget) - self.model.count
+            if room > HOLES:  # else what hardly shows is needed to fill holes
+                grown = round(GROWN * self._limit(budget)) - self.model.count
+                self._split = split_worst(self.model, observation, drawn.view, max(0, grown)) > 0
+        return Mapped(snapshot, drawn.view)
 
     def pace(self, unhurried: bool) -> None:
         """Whether there is time for several steps a frame. They are shorter then, and the flow is finer."""
-        self._flow = OpticalFlow(fine=unhurried)
+        self._flow = OpticalFlow(FINE_FLOW if unhurried else COARSE_FLOW)
         self._rates = Rates().scaled(UNHURRIED_RATES) if unhurried else Rates()
 
     def restart(self) -> None:
@@ -133,20 +156,12 @@ class Mapper:
             pixels = np.full((self.model.count, 2), np.float32(np.nan))
             if self._last is not None:
                 before = self._last.observation
-                flow = self._flow(before.gray, observation.gray)
+                flow = self._flow(pyramid_of(before), pyramid_of(observation))
                 pixels = found_again(
                     self.model.means, self._last.view, before.tissue, flow, observation.tissue
                 )
             self._found = observation.gray, pixels
         return self._found[1]
-
-    def drawn(self, observation: Observation, view: RenderedView) -> None:
-        """Remember how the model looked at `observation`: the next frame's motion starts from there, and what
-        is worst in it is split. A still frame is passed over: slow motion adds up until it is seen."""
-        if not self._still or self._last is None:
-            self.start_from(Drawn(observation, view))
-            if self.model.free > HOLES:  # else what hardly shows is needed to fill holes
-                split_worst(self.model, observation, view)
 
     @property
     def last(self) -> Drawn | None:
@@ -158,31 +173,39 @@ class Mapper:
         before, self._last, self._found = self._last, last, None
         return before
 
-    def _initialise(self, observation: Observation) -> dict[str, int]:
-        if not self._can_start(observation):
-            return {"inserted": 0}  # a black or covered picture: try again with the next frame
-        limit = int(initialise.INITIAL_SHARE * self.model.capacity)
-        pixels, depths, spacing = initialise.first_pixels(observation, limit)
-        rows = initialise.insert(self.model, observation, pixels, depths, spacing, self._smoothing)
+    def _initialise(self, observation: Observation, budget: Budget) -> dict[str, int]:
+        if not self._can_start(observation):  # a black or covered picture: try again with the next frame
+            planes = self._refiner.show(self.model.gaussians(), observation.camera)
+            self._view = _as_view(planes, observation)
+            return {"inserted": 0}
+        drawn = resized(observation, self._scale)
+        limit = int(initialise.INITIAL_SHARE * self._limit(budget))
+        pixels, depths, spacing = initialise.first_pixels(drawn, limit)
+        rows = initialise.insert(self.model, drawn, pixels, depths, spacing, self._smoothing)
         self._deformation = NodeDeformation(self.model.means, CONTROL_NODES)
         self._deformation.attach(self.model, rows)
-        self._begin(observation)
-        for _ in range(INITIAL_STEPS):
+        self._begin(drawn)
+        self._first_steps = 0
+        while self._first_steps < FIRST_STEPS and budget.more_at_first(self._first_steps):
             self._refiner.draw()
-            self._refiner.refine(INITIAL_RATES)
+            self._refiner.refine(FIRST_RATES)
+            self._first_steps += 1
         self._refiner.give_back()
-        self.step += INITIAL_STEPS
-        return {"inserted": len(pixels), "iterations": INITIAL_STEPS}
+        self._show(observation, 1.0, tile_grid(drawn.tissue))
+        self.step += self._first_steps
+        return {"inserted": len(pixels), "iterations": self._first_steps}
 
     def _follow(self, observation: Observation, budget: Budget) -> dict[str, int]:
         assert self._deformation is not None
         self._predict(observation)
         limit = self._limit(budget)
         removed = self.model.remove(densify.doomed(self.model, observation, limit))
+        removed += densify.shed(self.model, limit)
         if self._smoothing:
             self._sharpen(observation)
 
-        self._begin(observation)
+        drawn = resized(observation, self._scale)
+        self._begin(drawn)
         self._refiner.draw()
         gain = self._refiner.exposure_gain()
         if np.abs(gain - 1).max() > EXPOSURE_JUMP:
@@ -190,28 +213,29 @@ class Mapper:
             self._refiner.take(self._all_rows)
             self._refiner.draw()
         planes = self._refiner.planes()
-        if _is_lost(planes, observation) and self._can_start(observation):
+        if _is_lost(planes, drawn) and self._can_start(observation):
             self.restart()
-            return self._initialise(observation) | {"restarted": 1}
-        pixels, depths = densify.candidates(planes, observation, phase=7 * self._frames)
+            return self._initialise(observation, budget) | {"restarted": 1}
+        pixels, depths = densify.candidates(planes, drawn, phase=7 * self._frames)
         iterations = 0
         if budget.more():  # before inserting, so that the drawing above serves both
-            self._refiner.refine(self._rates, 1.0 if budget.affords_whole() else HURRIED_SHARE)
+            self._refiner.refine(self._next_rates(), budget.first_share())
             iterations = 1
         room = max(ADDED, limit - self.model.count)
         pixels, depths = pixels[:room], depths[:room]
-        lacking = min(len(pixels), HOLES) - self.model.free
+        lacking = min(len(pixels), HOLES) - max(0, limit - self.model.count)
         if 0 < lacking < self.model.count:  # the view has grown: what is in it gives way
             self._refiner.give_back()
             removed += self.model.remove(densify.least_shown(self.model, lacking))
             self._refiner.take(self._all_rows)
-        rows = initialise.insert(self.model, observation, pixels, depths, densify.GRID, self._smoothing)
+        rows = initialise.insert(self.model, drawn, pixels, depths, densify.GRID, self._smoothing)
         self._deformation.attach(self.model, rows)
         self._refiner.take(rows)
         while budget.more():
-            self._refiner.refine_worst(self._focus, self._rates)
+            self._refiner.refine_worst(self._focus, self._next_rates())
             iterations += 1
         self._refiner.give_back()
+        self._show(observation, budget.rung.redraw, tiles_of(pixels, drawn.tissue))
         self.step += iterations
         return {"inserted": rows.stop - rows.start, "removed": removed, "iterations": iterations}
 
@@ -224,20 +248,37 @@ class Mapper:
         removed = self.model.remove(doomed)
         rests = settled and self._frames % SETTLED_EVERY > 0
         iterations = 0
-        self._begin(observation)
+        self._begin(resized(observation, self._scale))
         while not (rests or (settled and iterations)) and budget.more():
-            self._refiner.refine_worst(self._focus, self._rates, nodes=False)
+            self._refiner.refine_worst(self._focus, self._next_rates(), nodes=False)
             iterations += 1
         self._refiner.give_back()
+        stale = with_neighbours(self._refiner.touched())
+        if removed or self._split:
+            self._show(observation, 1.0, stale)
+        elif stale.any():
+            self._show(observation, 0.0, stale)
+        elif self._view is not None:
+            stamp = observation.t_capture_ns
+            self._view = replace(self._view, frame_id=observation.frame_id, t_capture_ns=stamp)
         self.step += iterations
-        if removed == 0:
-            self.stale_tiles = with_neighbours(self._refiner.touched())
         return {"inserted": 0, "removed": removed, "iterations": iterations}
 
     def _begin(self, observation: Observation) -> None:
         assert self._deformation is not None
         step = NODE_STEP_PX * self._metres_per_px
         self._refiner.begin(self.model, self._deformation, observation, step)
+
+    def _next_rates(self) -> Rates:
+        """Of the next step."""
+        self._first_steps += 1
+        return FIRST_RATES if self._first_steps <= FIRST_STEPS else self._rates
+
+    def _show(self, observation: Observation, share: float, tiles: Bool) -> None:
+        """Draw the model to be shown; see `Refiner.redraw`."""
+        self._refiner.redraw(share, tiles)
+        self._split = False
+        self._view = _as_view(self._refiner.planes(), observation)
 
     @property
     def _all_rows(self) -> slice:
@@ -269,11 +310,15 @@ class Mapper:
 
     def _limit(self, budget: Budget) -> int:
         """How many Gaussians this machine can afford."""
-        return round(min(budget.share, self._refiner.share) * self.model.capacity)
+        return min(budget.rung.gaussians, round(self._refiner.share * self.model.capacity))
 
     def _can_start(self, observation: Observation) -> bool:
         """Whether this frame has depth enough for a first model."""
         return bool(np.count_nonzero(observation.depth) >= MIN_FIRST_DEPTHS)
+
+
+def _as_view(planes: F32, observation: Observation) -> RenderedView:
+    return to_view(planes, observation.camera, observation.frame_id, observation.t_capture_ns)
 
 
 def _is_lost(planes: F32, observation: Observation) -> bool:

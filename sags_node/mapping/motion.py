@@ -4,44 +4,20 @@ from __future__ import annotations
 
 from typing import Any
 
-import cv2
 import numpy as np
 from numba import prange
 
 from sags_node.engine.pinhole import pack, to_camera, to_pixel
-from sags_node.kernels.jit import inlined, kernel, parallel_kernel
-from sags_node.types import F32, U8, Bool, Observation, RenderedView
+from sags_node.kernels.jit import PIECE, inlined, kernel, parallel_kernel
+from sags_node.types import F32, Bool, Observation, RenderedView
+from sags_node.vision.margin import clear_of_instruments
 
 DEPTH_GATE = 0.13  # of the depth: a larger innovation is another surface, not this one
-BEHIND_TOLERANCE = 0.035  # of the depth: a Gaussian this far behind the drawn surface is hidden by it
+BEHIND_TOLERANCE = 0.035  # of the depth: what is this far behind the drawn surface is hidden by it
 SEEN_ALPHA = 0.3
-FLOW_MARGIN = 20 / 640  # of the width: flow smears an instrument's motion that far into the tissue
-PIECE = 1024  # rows a thread takes at a time: a call for each row would count references to every array
+HALVINGS = 1  # of the masks: finer than the flow that they guard
 DEPTH_PULL = 0.4  # share of the depth innovation taken per frame; measured best 0.3-0.5
 MOST_FRAMES = 4  # without depth, after which the pull is not stronger any more
-
-
-class OpticalFlow:
-    """Dense inverse search flow (Kroeger et al., ECCV 2016) between consecutive left pictures.
-
-    It searches at half of the pictures' size. OpenCV's preset `FAST` searches whole pictures, only to stop
-    two octaves above them as this does: the same flow for 1.6 times the work.
-    """
-
-    def __init__(self, fine: bool) -> None:
-        """`fine`: an octave finer, for 2.5 times the work; the model gains 0.1 dB, 0.25 dB in fast motion."""
-        self._dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
-        self._dis.setFinestScale(0 if fine else 1)
-        self._dis.setVariationalRefinementIterations(0 if fine else 2)
-
-    def __call__(self, before: U8, after: U8) -> F32:
-        """Flow [H / 2, W / 2, 2], in px of the whole pictures, from `before` to `after`, both gray [H, W]."""
-        height, width = before.shape
-        half = (width + 1) // 2, (height + 1) // 2
-        small = [cv2.resize(picture, half, interpolation=cv2.INTER_AREA) for picture in (before, after)]
-        flow = self._dis.calc(small[0], small[1], None)
-        flow *= np.array([width / half[0], height / half[1]], np.float32)
-        return np.asarray(flow)
 
 
 def depth_pull(frames: int) -> float:
@@ -62,10 +38,9 @@ def found_again(means: F32, before: RenderedView, tissue_before: Bool, flow: F32
     Returns:
         Pixels [N, 2], also beyond the picture's edges; NaN: not seen, or covered by an instrument now.
     """
-    margin = 2 * round(FLOW_MARGIN * before.alpha.shape[1]) + 1
-    kernel_size = np.ones((margin, margin), np.uint8)
-    clear_before = cv2.erode(tissue_before.view(np.uint8), kernel_size).view(np.bool_)
-    clear_after = cv2.erode(tissue_after.view(np.uint8), kernel_size).view(np.bool_)
+    clear_before, clear_after = (
+        clear_of_instruments(mask, HALVINGS) for mask in (tissue_before, tissue_after)
+    )
     pixels = np.full((len(means), 2), np.float32(np.nan))
     _find(
         means, pack(before.camera), before.depth, before.alpha, clear_before, flow, clear_after, pixels
@@ -112,6 +87,7 @@ def _find_rows(
     height, width = alpha.shape
     half = np.float32(0.5)
     across, down = np.float32(flow.shape[1] / width), np.float32(flow.shape[0] / height)
+    last_row, last_column = tissue0.shape[0] - 1, tissue0.shape[1] - 1
     for i in range(first, end):
         x, y, z = to_camera(cam0, means[i, 0], means[i, 1], means[i, 2])
         if not z > 1e-3:
@@ -120,7 +96,10 @@ def _find_rows(
         if not (u >= 0 and v >= 0 and u <= width - 1 and v <= height - 1):
             continue
         px, py = int(u + 0.5), int(v + 0.5)
-        if not tissue0[py, px] or alpha[py, px] < SEEN_ALPHA:
+        if (
+            not tissue0[min(py >> HALVINGS, last_row), min(px >> HALVINGS, last_column)]
+            or alpha[py, px] < SEEN_ALPHA
+        ):
             continue
         if drawn_depth[py, px] > 0 and z - drawn_depth[py, px] > BEHIND_TOLERANCE * z:
             continue
@@ -129,7 +108,8 @@ def _find_rows(
         u += du
         v += dv
         if u >= 0 and v >= 0 and u <= width - 1 and v <= height - 1:
-            if not tissue1[int(v + 0.5), int(u + 0.5)]:
+            row, column = int(v + 0.5) >> HALVINGS, int(u + 0.5) >> HALVINGS
+            if not tissue1[min(row, last_row), min(column, last_column)]:
                 continue  # flow into an instrument is the instrument's motion
         pixels[i, 0] = u
         pixels[i, 1] = v

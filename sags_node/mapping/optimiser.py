@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numba import prange
 
-from sags_node.engine.rasterize import Gradients
-from sags_node.kernels.jit import kernel, parallel_kernel
+from sags_node.engine.interface import MAX_OPACITY, Gradients
+from sags_node.kernels.jit import PIECE, kernel, parallel_kernel
 from sags_node.model.gaussians import ADAM_PARAMETERS, GaussianModel
 from sags_node.types import F32, Camera
 
@@ -34,11 +34,12 @@ COLOUR_RELAXATION = 1.6  # SIRT over-relaxation; 0 < value < 2 converges
 COLOUR_DAMPING = 0.3  # px of coverage: a barely seen Gaussian changes its colour slowly
 BETA1, BETA2 = 0.5, 0.99  # low momentum: a few steps per frame must not coast
 MIN_CONTRIBUTION = 1e-3  # px: rows that were not seen are not touched
+EPS = 1e-8  # of Adam
+COLOR_RANGE = (-0.5, 1.5)  # wider than what can be shown
 LOG_SCALE_RANGE = (math.log(1e-6), math.log(5e-3))  # m
 LOGIT_RANGE = (-6.0, 6.0)
 LARGEST = 1e20  # sum of a row's gradients, momenta and variances
 LARGEST_RAW = 100.0  # sum of a row's log scales and logit: no honest value comes near
-PIECE = 1024  # rows a thread takes at a time: a call for each row would count references to every array
 
 
 class Optimiser:
@@ -116,12 +117,12 @@ def _step_rows(
         gain = np.float32(COLOUR_RELAXATION) / (contribution[i] + np.float32(COLOUR_DAMPING))
         for k in range(3):
             color = colors[i, k] - gain * v_colors[i, k]
-            colors[i, k] = min(max(color, np.float32(-0.5)), np.float32(1.5))
+            colors[i, k] = min(max(color, np.float32(COLOR_RANGE[0])), np.float32(COLOR_RANGE[1]))
         for k in range(ADAM_PARAMETERS):
             adam_m[i, k] += np.float32(1 - BETA1) * (g[k] - adam_m[i, k])
             adam_v[i, k] += np.float32(1 - BETA2) * (g[k] * g[k] - adam_v[i, k])
             g[k] = lengths[k] * adam_m[i, k] * corrections[0]
-            g[k] /= np.sqrt(adam_v[i, k] * corrections[1]) + np.float32(1e-8)
+            g[k] /= np.sqrt(adam_v[i, k] * corrections[1]) + np.float32(EPS)
         z = view_z[0] * means[i, 0] + view_z[1] * means[i, 1] + view_z[2] * means[i, 2] + view_z[3]
         pixel = np.float32(abs(z) / focal)  # metres that a pixel spans at the Gaussian's depth
         for k in range(3):
@@ -148,5 +149,5 @@ def _mend(
         adam_v[k] = g[k] * g[k] if abs(g[k]) < np.inf else np.float32(0)
     for k in range(3):
         log_scale[k] = math.log(scale[k])
-    opacity = min(opacities[i], np.float32(0.999))
+    opacity = min(opacities[i], np.float32(MAX_OPACITY))
     opacity_logits[i] = math.log(opacity / (np.float32(1) - opacity))

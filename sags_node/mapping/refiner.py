@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Protocol
 
@@ -58,6 +59,15 @@ class Refiner(Protocol):
     def draw(self) -> None:
         """Draw the model for the frame's camera; the right eye too where it is learnt from."""
 
+    def redraw(self, share: float, tiles: Bool) -> None:
+        """Draw the left eye as it is after the steps, to be shown.
+
+        Args:
+            share: of the picture, where it was worst before the steps. What else the steps changed, they
+                changed little: it keeps what was drawn before them. 1: all of it.
+            tiles: [1, rows, columns] that are drawn in any case, as those are that `refine_worst` drew.
+        """
+
     def planes(self) -> F32:
         """[5, H, W] of the left eye, as they were drawn last; overwritten by the next drawing."""
 
@@ -82,8 +92,12 @@ class Refiner(Protocol):
     def touched(self) -> Bool:
         """The tiles [1, rows, columns] that `refine_worst` drew since `begin`."""
 
-    def show(self, gaussians: Gaussians, camera: Camera, tiles: Bool | None = None) -> F32:
-        """Planes [5, H, W] of any Gaussians: what was drawn last from then on. As `Rasterizer.forward`."""
+    def show(self, gaussians: Gaussians, camera: Camera) -> F32:
+        """Planes [5, H, W] of any Gaussians for any camera, in memory of their own; overwritten by the next
+        `show`. As `Rasterizer.forward`."""
+
+
+MakeRasterizer = Callable[[int, int], Rasterizer]
 
 
 class CpuRefiner:
@@ -92,9 +106,12 @@ class CpuRefiner:
     share = 1.0
     problem: str | None = None
 
-    def __init__(self, rasterizer: Rasterizer) -> None:
+    def __init__(self, make_rasterizer: MakeRasterizer) -> None:
+        """`make_rasterizer`: one for pictures of that width and height, px."""
         self.loss = 0.0
-        self._rasterizer = rasterizer
+        self._make_rasterizer = make_rasterizer
+        self._rasterizers: dict[tuple[int, int], Rasterizer] = {}  # by the size of their pictures
+        self._viewers: dict[tuple[int, int], Rasterizer] = {}  # those of `show`
         self._optimiser = Optimiser()
         # [eyes, 5, H, W] and [eyes, H, W]; the planes are the rasteriser's memory: what it drew last
         self._planes: F32 = np.zeros((1, 5, 1, 1), np.float32)
@@ -105,6 +122,7 @@ class CpuRefiner:
     ) -> None:
         self._model, self._deformation, self._observation = model, deformation, observation
         self._node_step = node_step
+        self._rasterizer = self._rasterizer_for(observation.camera, self._rasterizers)
         self._touched = tile_grid(observation.tissue)
 
     def take(self, rows: slice) -> None:
@@ -145,9 +163,23 @@ class CpuRefiner:
     def touched(self) -> Bool:
         return self._touched
 
-    def show(self, gaussians: Gaussians, camera: Camera, tiles: Bool | None = None) -> F32:
-        self._planes = self._rasterizer.forward(gaussians, [camera], tiles)
-        return self.planes()
+    def redraw(self, share: float, tiles: Bool) -> None:
+        observation, some = self._observation, None
+        if share < 1.0:
+            some = tiles | self._touched
+            if share > 0:
+                some |= worst_tiles(self._planes[0], observation.image, observation.tissue, share)
+        self._planes = self._rasterizer.forward(self._model.gaussians(), [observation.camera], some)
+
+    def show(self, gaussians: Gaussians, camera: Camera) -> F32:
+        planes: F32 = self._rasterizer_for(camera, self._viewers).forward(gaussians, [camera])[0]
+        return planes
+
+    def _rasterizer_for(self, camera: Camera, made: dict[tuple[int, int], Rasterizer]) -> Rasterizer:
+        size = camera.width, camera.height
+        if size not in made:
+            made[size] = self._make_rasterizer(*size)
+        return made[size]
 
     def _step(self, observation: Observation, rates: Rates, nodes: bool = True) -> Gradients:
         planes = self._planes

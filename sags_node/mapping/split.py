@@ -14,27 +14,27 @@ from numba import prange
 
 from sags_node.engine.pinhole import pack, to_camera, to_pixel
 from sags_node.geometry import quat_to_matrix
-from sags_node.kernels.jit import kernel, parallel_kernel
-from sags_node.mapping.densify import mean_contribution
+from sags_node.kernels.jit import PIECE, kernel, parallel_kernel
+from sags_node.mapping.densify import FRONT_TOLERANCE, mean_contribution
 from sags_node.model.gaussians import GaussianModel
 from sags_node.types import F32, I64, Bool, Observation, RenderedView
 
-SPLIT = 0.005  # of all, per frame: at most so many are split
+SPLIT = 0.005  # of all, per frame: at most so many are split, where the parts take others' rows
+GROWTH = 0.03  # of all, per frame: the same where there is room
 HARDLY = 0.15  # of the mean contribution: less hardly shows
 ENOUGH = 0.8  # of the mean contribution: what shows less is no worse than its neighbours
 APART = 1.1  # standard deviations of the whole, from its middle to that of an outer part
 PART_SIZE = 0.4  # of the whole, along its longest axis
-NEAR = 0.065  # of the depth: so near the drawn surface it lies on it, and would show
-PIECE = 1024  # rows a thread takes at a time: a call for each row would count references to every array
 
 
-def split_worst(model: GaussianModel, observation: Observation, view: RenderedView) -> int:
+def split_worst(model: GaussianModel, observation: Observation, view: RenderedView, room: int) -> int:
     """Split what shows most where the picture is worst.
 
     What is hidden, by an instrument or other tissue, or out of view is not given up for it.
 
     Args:
         model: as it was drawn in `view`, for `observation`.
+        room: so many Gaussians may be added; without it the outer parts take rows of what hardly shows.
 
     Returns:
         How many were split.
@@ -48,11 +48,16 @@ def split_worst(model: GaussianModel, observation: Observation, view: RenderedVi
         observation.tissue, np.float32(HARDLY * mean), np.float32(ENOUGH * mean), score, spare,
     )  # fmt: skip
     spare_rows, wholes = np.flatnonzero(spare), np.flatnonzero(score)
-    count = min(int(SPLIT * model.count), len(spare_rows) // 2, len(wholes))
+    exchanged = min(int(SPLIT * model.count), len(spare_rows) // 2)
+    grown = min(int(GROWTH * model.count), room // 2)
+    count = min(max(exchanged, grown), len(wholes))
     if count > 0:
-        least = np.argpartition(contribution[spare_rows], 2 * count - 1)[: 2 * count]
-        worst = np.argpartition(-score[wholes], count - 1)[:count]
-        _split(model, wholes[worst], spare_rows[least])
+        worst = wholes[np.argpartition(-score[wholes], count - 1)[:count]]
+        if grown >= exchanged:
+            rows = model.extend(2 * count)
+        else:
+            rows = spare_rows[np.argpartition(contribution[spare_rows], 2 * count - 1)[: 2 * count]]
+        _split(model, worst, rows)
     return count
 
 
@@ -105,7 +110,7 @@ def _look_at_rows(
         if not (u > -0.5 and v > -0.5 and u < width - 0.5 and v < height - 0.5):
             continue
         px, py = int(u + 0.5), int(v + 0.5)
-        if not (tissue[py, px] and abs(z - drawn[py, px]) < np.float32(NEAR) * z):
+        if not (tissue[py, px] and abs(z - drawn[py, px]) < np.float32(FRONT_TOLERANCE) * z):
             continue
         if not much:
             spare[i] = True

@@ -15,6 +15,7 @@ from sags_node.messaging.cdr import Content, Status
 from sags_node.types import (
     F32,
     NO_TIME,
+    SH_DEGREE_0,
     U8,
     Bool,
     DrawnView,
@@ -24,7 +25,6 @@ from sags_node.types import (
     RenderedView,
 )
 
-SH_DEGREE_0 = 0.28209479  # Y_00: rgb = 0.5 + Y_00 f_dc
 SPLAT_FIELDS = (
     *("x", "y", "z"),
     *("scale_0", "scale_1", "scale_2"),

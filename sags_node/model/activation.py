@@ -12,8 +12,8 @@ from sags_node.kernels.jit import parallel_kernel, read_only
 from sags_node.model import columns
 from sags_node.types import F32, I64, Gaussians
 
-# Numba's disk cache does not see another file's constants: the kernels spell the columns out.
-assert (columns.LOG_SCALE.start, columns.QUAT.start, columns.COLOR.start, columns.LOGIT) == (3, 6, 10, 13)
+LOG_SCALE, QUAT, COLOR = columns.LOG_SCALE.start, columns.QUAT.start, columns.COLOR.start
+LOGIT = columns.LOGIT
 
 
 def activate(rows: F32, ids: I64, smoothing: F32 | None) -> Gaussians:
@@ -56,11 +56,11 @@ def _activate(rows: F32, means: F32, scales: F32, quats: F32, colors: F32, opaci
     for i in prange(len(rows)):
         for k in range(3):
             means[i, k] = rows[i, k]
-            scales[i, k] = math.exp(rows[i, 3 + k])
-            colors[i, k] = rows[i, 10 + k]
+            scales[i, k] = math.exp(rows[i, LOG_SCALE + k])
+            colors[i, k] = rows[i, COLOR + k]
         for k in range(4):
-            quats[i, k] = rows[i, 6 + k]
-        opacities[i] = np.float32(1) / (np.float32(1) + math.exp(-rows[i, 13]))
+            quats[i, k] = rows[i, QUAT + k]
+        opacities[i] = np.float32(1) / (np.float32(1) + math.exp(-rows[i, LOGIT]))
 
 
 @parallel_kernel
@@ -71,8 +71,8 @@ def _activate_backward(
     for i in prange(len(v_rows)):
         for k in range(3):
             v_rows[i, k] = v_means[i, k]
-            v_rows[i, 3 + k] = v_scales[i, k] * scales[i, k]
-            v_rows[i, 10 + k] = v_colors[i, k]
+            v_rows[i, LOG_SCALE + k] = v_scales[i, k] * scales[i, k]
+            v_rows[i, COLOR + k] = v_colors[i, k]
         for k in range(4):
-            v_rows[i, 6 + k] = v_quats[i, k]
-        v_rows[i, 13] = v_opacities[i] * opacities[i] * (np.float32(1) - opacities[i])
+            v_rows[i, QUAT + k] = v_quats[i, k]
+        v_rows[i, LOGIT] = v_opacities[i] * opacities[i] * (np.float32(1) - opacities[i])

@@ -8,15 +8,17 @@ from typing import Any
 import numpy as np
 from numba import prange
 
-from sags_node.kernels.jit import inlined, kernel, parallel_kernel
+from sags_node.kernels.jit import PIECE, inlined, kernel, parallel_kernel
 from sags_node.model.gaussians import NEIGHBOURS, GaussianModel
-from sags_node.types import F32, I32
+from sags_node.types import F32, I32, I64
 
 _SMOOTHING_ROUNDS = 3  # how far, in nodes, motion spreads into hidden tissue per frame
 _LEAST_SEEN = 0.5  # weight of what was seen around a node: below it nothing is known of it
 _LEAST_STIFFNESS = 0.2  # in squared node spacings: what little is known of a gradient is not believed
+# No gradients give more momentum than 1.57 times the root of the variance (Cauchy-Schwarz over both running
+# means), where that is far above the smallest float.
+_STEEPEST = 2.0
 _NEW_NODE_DISTANCE = 1.5  # in node spacings: farther new tissue gets nodes of its own
-_PIECE = 1024  # rows a thread takes at a time: a call for each row would count references to every array
 
 
 class NodeDeformation:
@@ -86,9 +88,10 @@ class NodeDeformation:
         )
         self._momentum += 0.2 * (gradient - self._momentum)
         self._variance += 0.05 * (gradient * gradient - self._variance)
-        damaged = ~np.isfinite(self._momentum + self._variance)
-        self._momentum[damaged] = self._variance[damaged] = 0
-        motion = (-step * self._momentum / (np.sqrt(self._variance) + 1e-12)).astype(np.float32)
+        size = np.sqrt(self._variance)
+        damaged = ~((np.abs(self._momentum) <= _STEEPEST * size) & np.isfinite(size))
+        self._momentum[damaged] = self._variance[damaged] = size[damaged] = 0
+        motion = (-step * self._momentum / (size + 1e-12)).astype(np.float32)
         self.nodes += motion
         _skin(motion, model.node_index, model.node_weight, model.means)
 
@@ -112,21 +115,30 @@ def spread_nodes(means: F32, count: int) -> F32:
 
 def _spacing_for(means: F32, count: int) -> float:
     """Cell size that gives about `count` occupied cells (bisection: the surface may have any shape)."""
-    low, high = 1e-5, float(np.ptp(means, axis=0).max()) + 1e-5
+    extent = float(np.ptp(means, axis=0).max()) + 1e-5
+    low, high = 1e-4 * extent, extent
     for _ in range(20):
         middle = (low * high) ** 0.5
-        occupied = len(np.unique(np.floor(means / middle).astype(np.int64), axis=0))
+        occupied = len(np.unique(_cells(means, middle)))
         low, high = (middle, high) if occupied > count else (low, middle)
     return high
 
 
 def _cell_centres(means: F32, cell: float) -> F32:
     """Mean of the points in each occupied cell of a cubic grid, [M, 3]."""
-    _, inverse, counts = np.unique(
-        np.floor(means / cell).astype(np.int64), axis=0, return_inverse=True, return_counts=True
-    )
-    sums = np.stack([np.bincount(inverse.ravel(), means[:, k]) for k in range(3)], 1)
+    _, inverse, counts = np.unique(_cells(means, cell), return_inverse=True, return_counts=True)
+    sums = np.stack([np.bincount(inverse, means[:, k]) for k in range(3)], 1)
     return (sums / counts[:, None]).astype(np.float32)
+
+
+def _cells(means: F32, cell: float) -> I64:
+    """The number [N] of the cell of a cubic grid that each point is in: sorting them is twenty times as fast
+    as sorting three coordinates."""
+    places = np.floor(means / cell).astype(np.int64)
+    places -= places.min(axis=0)
+    sizes = places.max(axis=0) + 1
+    numbers: I64 = (places[:, 0] * sizes[1] + places[:, 1]) * sizes[2] + places[:, 2]
+    return numbers
 
 
 def nearest_nodes(points: F32, nodes: F32) -> tuple[I32, F32, F32]:
@@ -264,10 +276,10 @@ def _divide(products: F32, moments: F32, quotient: F32) -> None:
 def _carry(
     places: F32, motion: F32, gradients: F32, index: I32, weight: F32, means: F32, quats: F32
 ) -> None:  # fmt: skip
-    for piece in prange(-(-len(means) // _PIECE)):
-        first = np.int64(piece) * _PIECE
+    for piece in prange(-(-len(means) // PIECE)):
+        first = np.int64(piece) * PIECE
         _carry_rows(
-            places, motion, gradients, index, weight, means, quats, first, min(first + _PIECE, len(means))
+            places, motion, gradients, index, weight, means, quats, first, min(first + PIECE, len(means))
         )
 
 

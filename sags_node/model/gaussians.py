@@ -85,6 +85,13 @@ class GaussianModel:
         self.count += fits
         return added
 
+    def extend(self, count: int) -> I64:
+        """Rows for so many Gaussians, or as many as fit; what is in them must be written at once, by
+        `replace`."""
+        rows = np.arange(self.count, self.count + min(count, self.free))
+        self.count += len(rows)
+        return rows
+
     def replace(self, rows: I64, others: I64) -> None:
         """Forget the Gaussians in `rows`; copies of those in `others` take their place, under new ids."""
         for name, values in self._rows.items():
@@ -106,6 +113,11 @@ class GaussianModel:
             values[holes] = values[movers]
         self.count = kept
         return removed
+
+    def grow(self, factor: float) -> None:
+        """Make all as much larger."""
+        self.scales[:] *= np.float32(factor)
+        self.log_scales[:] += np.float32(np.log(factor))
 
     def gaussians(self) -> Gaussians:
         """Views of the live rows, for drawing now."""

@@ -8,9 +8,8 @@ import numpy as np
 
 from sags_node.engine.smoothing import folded
 from sags_node.errors import SagsError
-from sags_node.types import Gaussians
+from sags_node.types import SH_DEGREE_0, Gaussians
 
-SH_C0 = 0.28209479177387814  # the constant spherical harmonic
 _FIELDS = (
     "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3".split()
 )
@@ -31,7 +30,7 @@ def write_ply(path: Path, gaussians: Gaussians) -> None:
         [
             gaussians.means,
             np.zeros_like(gaussians.means),
-            (gaussians.colors - 0.5) / SH_C0,
+            (gaussians.colors - 0.5) / SH_DEGREE_0,
             np.log(opacities / (1 - opacities))[:, None],
             np.log(gaussians.scales),
             quats,

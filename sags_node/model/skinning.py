@@ -22,12 +22,12 @@ from numba import prange
 from sags_node.engine.projection import rotation
 from sags_node.kernels.jit import inlined, kernel, parallel_kernel, read_only, square_root, stack_floats
 from sags_node.model import columns
+from sags_node.model.rotation import SHORTEST
 from sags_node.types import F32, I32
 
 f4 = np.float32
 u8 = np.uint64
 ZERO, ONE, TWO = f4(0), f4(1), f4(2)
-SHORTEST = f4(1e-12)  # a shorter quaternion has no direction
 
 BLOCK = 64  # Gaussians that are blended before the blends are applied
 GROUPS = 16  # of Gaussians, whose sums over nodes are added in order: the same bits on any number of threads
@@ -36,7 +36,8 @@ COUNT = columns.COUNT
 # A record: three rows of [A | t - A n], the deltas from log scale to logit, and a 0 that fills the vectors.
 RECORD = 24
 OTHERS = u8(9)  # column c >= 3 of `columns` stands at c + OTHERS
-W, X, Y, Z = (u8(15 + k) for k in range(4))  # dq
+QW, QX, QY, QZ = (u8(columns.QUAT.start + k) for k in range(4))  # dq in a row
+W, X, Y, Z = QW + OTHERS, QX + OTHERS, QY + OTHERS, QZ + OTHERS  # and in a record
 
 Quat = tuple[Any, Any, Any, Any]
 
@@ -99,7 +100,7 @@ def _conjugate(q: Quat) -> Quat:
 @inlined
 def _unit(w: Any, x: Any, y: Any, z: Any) -> tuple[Any, ...]:
     """The unit quaternion, and 1 / the length before."""
-    scale = ONE / max(square_root(w * w + x * x + y * y + z * z), SHORTEST)
+    scale = ONE / max(square_root(w * w + x * x + y * y + z * z), f4(SHORTEST))
     return w * scale, x * scale, y * scale, z * scale, scale
 
 
@@ -107,7 +108,7 @@ def _unit(w: Any, x: Any, y: Any, z: Any) -> tuple[Any, ...]:
 def _write_records(places: F32, deltas: F32, records: F32) -> None:
     for node in range(len(places)):
         n = u8(node)
-        w, x, y, z, _ = _unit(ONE + deltas[n, 6], deltas[n, 7], deltas[n, 8], deltas[n, 9])
+        w, x, y, z, _ = _unit(ONE + deltas[n, QW], deltas[n, QX], deltas[n, QY], deltas[n, QZ])
         R = rotation(w, x, y, z)
         records[n, 0], records[n, 1], records[n, 2] = R[0] - ONE, R[1], R[2]
         records[n, 4], records[n, 5], records[n, 6] = R[3], R[4] - ONE, R[5]
@@ -175,8 +176,8 @@ def _skin_block(
             c = u8(column)
             skinned[i, c] = rows[i, c] + blends[at + c + OTHERS]
         turn = ONE + blends[at + W], blends[at + X], blends[at + Y], blends[at + Z]
-        quat = _product(turn, (rows[i, 6], rows[i, 7], rows[i, 8], rows[i, 9]))
-        skinned[i, 6], skinned[i, 7], skinned[i, 8], skinned[i, 9] = quat
+        quat = _product(turn, (rows[i, QW], rows[i, QX], rows[i, QY], rows[i, QZ]))
+        skinned[i, QW], skinned[i, QX], skinned[i, QY], skinned[i, QZ] = quat
 
 
 @parallel_kernel
@@ -212,11 +213,11 @@ def _skin_group_backward(
                 v_rows[i, c] = v_blends[at + c + OTHERS] = v_skinned[i, c]
             v_blends[at + u8(RECORD - 1)] = ZERO
             turn = ONE + blends[at + W], blends[at + X], blends[at + Y], blends[at + Z]
-            quat = rows[i, 6], rows[i, 7], rows[i, 8], rows[i, 9]
-            v_quat = v_skinned[i, 6], v_skinned[i, 7], v_skinned[i, 8], v_skinned[i, 9]
+            quat = rows[i, QW], rows[i, QX], rows[i, QY], rows[i, QZ]
+            v_quat = v_skinned[i, QW], v_skinned[i, QX], v_skinned[i, QY], v_skinned[i, QZ]
             v_turn = _product(v_quat, _conjugate(quat))
             v_blends[at + W], v_blends[at + X], v_blends[at + Y], v_blends[at + Z] = v_turn
-            v_rows[i, 6], v_rows[i, 7], v_rows[i, 8], v_rows[i, 9] = _product(_conjugate(turn), v_quat)
+            v_rows[i, QW], v_rows[i, QX], v_rows[i, QY], v_rows[i, QZ] = _product(_conjugate(turn), v_quat)
         _scatter(v_blends, index, weight, first, end, group, v_records)
 
 
@@ -244,7 +245,7 @@ def _records_backward(places: F32, deltas: F32, v_records: F32, v_deltas: F32) -
         for column in range(3, COUNT):
             c = u8(column)
             v_deltas[n, c] = v_records[n, c + OTHERS]
-        w, x, y, z, scale = _unit(ONE + deltas[n, 6], deltas[n, 7], deltas[n, 8], deltas[n, 9])
+        w, x, y, z, scale = _unit(ONE + deltas[n, QW], deltas[n, QX], deltas[n, QY], deltas[n, QZ])
         # through the rotation of the unit quaternion: the skew and the symmetric parts of v_A, its diagonal
         skew_x, skew_y, skew_z = v_A[7] - v_A[5], v_A[2] - v_A[6], v_A[3] - v_A[1]
         yz, xz, xy = v_A[7] + v_A[5], v_A[2] + v_A[6], v_A[3] + v_A[1]
@@ -255,7 +256,7 @@ def _records_backward(places: F32, deltas: F32, v_records: F32, v_deltas: F32) -
         v_z = TWO * (w * skew_z + x * xz + y * yz - z * (xx + yy))
         # through its length
         along = v_w * w + v_x * x + v_y * y + v_z * z
-        v_deltas[n, 6] += (v_w - along * w) * scale
-        v_deltas[n, 7] += (v_x - along * x) * scale
-        v_deltas[n, 8] += (v_y - along * y) * scale
-        v_deltas[n, 9] += (v_z - along * z) * scale
+        v_deltas[n, QW] += (v_w - along * w) * scale
+        v_deltas[n, QX] += (v_x - along * x) * scale
+        v_deltas[n, QY] += (v_y - along * y) * scale
+        v_deltas[n, QZ] += (v_z - along * z) * scale

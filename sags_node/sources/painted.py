@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import cv2
-import numba
 import numpy as np
 
+from sags_node.kernels.jit import kernel
 from sags_node.types import U8, Bool
 
 # The paint is blended at 30 %: painted pixels gain about 70 counts of green against the mean of blue and red,
@@ -30,7 +30,7 @@ def unpainted(pane: U8, left: U8) -> Bool:
     return tissue
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _find_paint(pane: U8, left: U8, painted: U8) -> None:
     """Write 1 where green was gained, else 0; in one pass, since pictures in between cost four times that."""
     for y in range(painted.shape[0]):

@@ -50,6 +50,13 @@ _STATES = {
 }
 
 
+class Rung(msgspec.Struct, frozen=True):
+    """Of the ladder of quality."""
+
+    number: int
+    of: int
+
+
 class Status(msgspec.Struct, frozen=True):
     """What the node says of itself, as far as it is shown."""
 
@@ -57,6 +64,7 @@ class Status(msgspec.Struct, frozen=True):
     rate_hz: float = 0.0
     latency_ms: dict[str, float] = {}
     gaussians: int = 0
+    rung: Rung | None = None
     last_error: str | None = None
 
 

@@ -216,6 +216,8 @@ def _status_line(moment: Moment) -> str:
     else:
         latency = status.latency_ms.get("p50", np.nan)
         figures = f"{status.rate_hz:.1f} Hz, {latency:.0f} ms, {status.gaussians} Gaussians"
+        if status.rung is not None:
+            figures += f", rung {status.rung.number} of 0 to {status.rung.of - 1}"
         color, text = "#51cf66", f"{status.state}: {figures}"
     if status.last_error is not None:
         text += f" ({status.last_error})"

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sags_node.geometry import quat_to_matrix
-from sags_node.messaging.content import SH_DEGREE_0
-from sags_node.types import F32, F64
+from sags_node.types import F32, F64, SH_DEGREE_0
 
 MAX_SPLATS = 60_000  # that a browser draws smoothly; of more, those that cover most
 REACH = 3.0  # standard deviations within which a Gaussian is met

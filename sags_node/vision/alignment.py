@@ -44,10 +44,15 @@ class RowMonitor:
         self._spreads: deque[float] = deque(maxlen=WINDOW)
         self._warns = False
 
-    def update(self, row_error: F32, known: Bool) -> None:
-        """Take the field [h, w] of one frame: row errors in px of the matching size, and where it matched."""
-        step = max(1, row_error.shape[1] // SAMPLES)
-        scale = self._width / row_error.shape[1]
+    def update(self, row_error: F32, known: Bool, width: int) -> None:
+        """Take the field [h, w] of one frame.
+
+        Args:
+            row_error: px of a picture that is `width` px wide.
+            known: where it matched.
+        """
+        step = -(-row_error.shape[1] // SAMPLES)
+        scale = self._width / width
         errors, matched = (
             row_error[step // 2 :: step, step // 2 :: step],
             known[step // 2 :: step, step // 2 :: step],

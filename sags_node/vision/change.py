@@ -5,7 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from sags_node.types import F64, U8, RectifiedPair
+from sags_node.types import F32, F64, RectifiedPair
+from sags_node.vision.pyramid import inner, level, pyramids
 
 HALVINGS = 3  # 8x8 px are averaged: camera noise up to 4 grey levels stays below the limit
 BLOCK = 4  # shrunk px: 32 px, the length over which something moves or does not
@@ -18,7 +19,7 @@ class StillScene:
     slow motion adds up and is seen."""
 
     def __init__(self) -> None:
-        self._eyes: list[U8] | None = None
+        self._eyes: list[F32] | None = None
         self._pose: F64 = np.eye(4)
         self._frames = 0
 
@@ -28,7 +29,7 @@ class StillScene:
 
     def __call__(self, pair: RectifiedPair) -> int:
         """For how many frames, this one included, pictures and pose are the same; 0: something moved."""
-        eyes = [_shrunk(eye) for eye in (pair.left, pair.right) if eye is not None]
+        eyes = [level(eye, min(HALVINGS, len(eye.halves))) for eye in pyramids(pair) if eye is not None]
         before, pose = self._eyes, pair.camera.T_world_cam
         stays = np.array_equal(pose, self._pose)
         if stays and before is not None and len(before) == len(eyes) and all(map(_alike, eyes, before)):
@@ -38,17 +39,19 @@ class StillScene:
         return self._frames
 
 
-def _shrunk(image: U8) -> U8:
-    """In halves: averaging 2x2 px is so much faster than 8x8 at once that all three are."""
-    for _ in range(HALVINGS):
-        height, width = image.shape[:2]
-        image = cv2.resize(image, (max(1, width // 2), max(1, height // 2)), interpolation=cv2.INTER_AREA)
-    return image
-
-
-def _alike(a: U8, b: U8) -> bool:
-    difference = cv2.absdiff(a, b).astype(np.float32).mean(-1)
+def _alike(a: F32, b: F32) -> bool:
+    difference = cv2.absdiff(inner(a), inner(b))
     height, width = difference.shape
     blocks = max(1, width // BLOCK), max(1, height // BLOCK)
     mean = cv2.resize(difference, blocks, interpolation=cv2.INTER_AREA)
     return bool(np.mean(mean > LARGEST_DIFFERENCE) <= LARGEST_SHARE)
+
+
+def rms_difference(a: RectifiedPair, b: RectifiedPair) -> float:
+    """Grey levels, over every eighth pixel of both eyes: enough to tell a repeated frame from a moved one."""
+    squares = [
+        np.mean(np.square(x.full[::8, ::8].astype(np.float32) - y.full[::8, ::8]))
+        for x, y in zip(pyramids(a), pyramids(b), strict=True)
+        if x is not None and y is not None
+    ]
+    return float(np.sqrt(max(squares)))

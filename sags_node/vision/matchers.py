@@ -1,26 +1,29 @@
-"""Two stereo matchers. Both take rectified grey pictures [h, w] of one size and give three arrays [h, w]:
-disparity (px), row error (px, how far below its own row the match lies) and where a match was found.
-"""
+"""Two stereo matchers. Both take rectified gray pictures, see `pyramid`, and work in one of their halves."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from sags_node.types import F32, U8, Bool
-
-Match = tuple[F32, F32, Bool]
+from sags_node.types import F32, U8, Bool, GrayPyramid
+from sags_node.vision.coarse_stereo import coarse_disparity
+from sags_node.vision.inverse_search import CENTRE, search, start
+from sags_node.vision.pyramid import level
 
 SGBM_BLOCK = 5  # px
-PATCH_STRIDE = 6  # px, of patches of 8
-SMALL_WIDTH = 320  # px
-SEARCH_STEPS = 8
-GUESS_WIDTH = 160  # px: coarse matching wide enough for the folds of an organ
+PATCH_STRIDE = 4  # px, of patches of 8
+COARSE_STRIDE = 4  # px, in smaller pictures than the last
+SEARCH_STEPS = 3
+WINDOW = 5  # patches, over which row errors differ little, and disparities seldom alone
+SMALL_WIDTH = 320  # px: a smaller whole picture is searched at half of its size, for the noise in it
+GUESS_WIDTH = 120  # px: at most so wide is the picture in which a guess is made
 LARGEST_ROW_ERROR = 2.0  # px
 LARGEST_ROW_STEP = 0.35  # px beside the mean row error around
-ROW_WINDOW = 21  # px
-SMOOTHING_RADIUS = 1 / 100  # of the width
-SMOOTHING_VARIANCE = 0.2  # px squared: where disparity varies less around, it is noise on a smooth surface
+LARGEST_STEP = 1.5  # px beside the median disparity around: a wrong match stands alone
+MOST_ALONE = 0.35  # of the patches around: where more stand alone, none is right
+TETHER = 0.7  # of the texture along rows: how firmly a patch is held to that mean
 
 
 class SemiGlobal:
@@ -43,82 +46,85 @@ class SemiGlobal:
             mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
         )
 
-    def __call__(self, left: U8, right: U8) -> Match:
+    def __call__(self, left: U8, right: U8) -> tuple[F32, Bool]:
+        """Disparity (px) of gray pictures [h, w], and where a match was found."""
         # OpenCV leaves out the columns that the largest disparity would push out of the picture: pad them.
         padded = [cv2.copyMakeBorder(eye, 0, 0, self._pad, 0, cv2.BORDER_REPLICATE) for eye in (left, right)]
         sixteenths = self._matcher.compute(padded[0], padded[1])[:, self._pad :]
         disparity = sixteenths.astype(np.float32) / np.float32(16)
         # A pixel without a match is marked by (minDisparity - 1) * 16.
-        return disparity, np.zeros_like(disparity), sixteenths >= self._smallest * 16
+        return disparity, sixteenths >= self._smallest * 16
+
+
+class Patches(NamedTuple):
+    """Where patches of the left picture lie in the right one; see `inverse_search`."""
+
+    left: F32  # the pictures they were searched in, with their borders
+    right: F32
+    stride: int  # px from patch to patch
+    field: F32  # [rows, columns, 2] px to the right, which is minus the disparity, and down, the row error
+    good: Bool  # [rows, columns] the match is like those of the patches around
 
 
 class InverseSearch:
-    """Dense inverse search (Kroeger et al., ECCV 2016), an optical flow, from left to right.
+    """Inverse search from a guess in a small picture up to the one wanted.
 
-    On the smooth surface of organs it is more accurate than `SemiGlobal` in the same time, but it only
-    refines a guess that is right to a few pixels. A coarse `SemiGlobal` gives it afresh for every frame: that
-    takes a millisecond, is as accurate as starting from the previous frame's disparity, and keeps no memory
-    that could lock in an error.
+    On the smooth surface of organs it is more accurate than `SemiGlobal` in less time, but it only
+    refines a guess that is right to a few pixels. That is made afresh for every frame: it costs little
+    and keeps no memory that could lock in an error.
     """
 
-    def __init__(self, smallest: float, largest: float, size: tuple[int, int]) -> None:
-        shrink = max(1, round(size[0] / GUESS_WIDTH))
-        self._size = size
-        self._guess_size = size[0] // shrink, size[1] // shrink
-        self._guess_shrink = size[0] / self._guess_size[0]
-        self._guess = SemiGlobal(smallest / self._guess_shrink, largest / self._guess_shrink)
-        self._dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-        # The guess is good at its own resolution: no need to search at coarser ones.
-        if size[0] >= SMALL_WIDTH:
-            # Fewer patches at the finest resolution cost as much as many at half of it, and halve the error
-            # at edges. In smaller pictures, whose patches span more, refinement matters more.
-            self._dis.setFinestScale(0)
-            self._dis.setPatchStride(PATCH_STRIDE)
-            self._dis.setGradientDescentIterations(SEARCH_STEPS)
-            self._smoothing_radius = round(SMOOTHING_RADIUS * size[0])
-        else:
-            self._smoothing_radius = 0  # refinement has smoothed as much as these few pixels bear
-        self._dis.setCoarsestScale(max(self._dis.getFinestScale(), shrink.bit_length() - 2))
-        self._dis.setVariationalRefinementIterations(1 if size[0] >= SMALL_WIDTH else 2)
+    def __init__(self, smallest: float, largest: float, halvings: int, stride: int = PATCH_STRIDE) -> None:
+        """
+        Args:
+            smallest, largest: disparities to search, px of the matching picture.
+            halvings: which picture that is.
+            stride: px between its patches, at most 8.
+        """
+        self._range = smallest, largest
+        self._halvings = halvings
+        self._stride = stride
 
-    def __call__(self, left: U8, right: U8) -> Match:
-        small = [cv2.resize(eye, self._guess_size, interpolation=cv2.INTER_AREA) for eye in (left, right)]
-        guess, _, known = self._guess(small[0], small[1])
-        flow = np.zeros((*left.shape, 2), np.float32)
-        flow[..., 0] = cv2.resize(_fill(guess, known), self._size) * -self._guess_shrink
-        flow = self._dis.calc(left, right, flow)
+    def __call__(self, left: GrayPyramid, right: GrayPyramid) -> Patches:
+        finest = self._halvings
+        if finest == 0 and left.full.shape[1] < SMALL_WIDTH and left.halves:
+            finest = 1
+        field, good = self._find(left, right, finest)
+        pictures = level(left, self._halvings), level(right, self._halvings)
+        if finest > self._halvings:
+            both = np.dstack([field, good.astype(np.float32) / 2])
+            both = start(pictures[0], self._stride, both, self._stride, CENTRE, 2)
+            field, good = np.ascontiguousarray(both[..., :2]), both[..., 2] > 0.5
+        return Patches(*pictures, self._stride, field, good)
+
+    def _find(self, left: GrayPyramid, right: GrayPyramid, finest: int) -> tuple[F32, Bool]:
+        """Patches of the picture after `finest` halvings."""
+        top = finest
+        while top < len(left.halves) and left.full.shape[1] >> top > GUESS_WIDTH:
+            top += 1
+        smallest, largest = (disparity / 2 ** (top - self._halvings) for disparity in self._range)
+        guess = coarse_disparity(level(left, top), level(right, top), smallest, largest)
+        field, stride, corner, k = np.stack([-guess, np.zeros_like(guess)], -1), 1, 0.0, top
+        while k > finest + 1 or stride == 1:
+            scale = 2 if k > finest else 1
+            k = max(k - 1, finest)
+            pictures = level(left, k), level(right, k)
+            field = start(pictures[0], COARSE_STRIDE, field, stride, corner, scale)
+            for _ in range(2):  # the second time places spread from the right and from below
+                field = search(*pictures, COARSE_STRIDE, field, SEARCH_STEPS)
+            stride, corner = COARSE_STRIDE, CENTRE
         # Calibrations are off by a row or so, smoothly over the picture. A wrong match jumps to another row.
-        row_error = np.clip(flow[..., 1], -LARGEST_ROW_ERROR, LARGEST_ROW_ERROR)
-        step = np.abs(row_error - cv2.blur(row_error, (ROW_WINDOW, ROW_WINDOW)))
-        known = (step < LARGEST_ROW_STEP) & (np.abs(row_error) < LARGEST_ROW_ERROR)
-        disparity = -flow[..., 0]
-        if self._smoothing_radius > 0:
-            disparity = _smooth(disparity, self._smoothing_radius)
-        return disparity, row_error, known
-
-
-def _smooth(disparity: F32, radius: int) -> F32:
-    """The guided filter (He et al., PAMI 2013) with the picture as its own guide.
-
-    Planes and steps larger than the noise stay as they are.
-    """
-    window = 2 * radius + 1, 2 * radius + 1
-    mean = cv2.blur(disparity, window)
-    variance = cv2.blur(disparity * disparity, window) - mean * mean
-    kept = variance / (variance + np.float32(SMOOTHING_VARIANCE))
-    smooth: F32 = cv2.blur(kept, window) * disparity + cv2.blur(mean * (1 - kept), window)
-    return smooth
-
-
-def _fill(disparity: F32, known: Bool) -> F32:
-    """Unknown pixels become the mean of the known ones around, near ones before those farther off."""
-    filled = np.where(known, disparity, np.float32(0))
-    weight = known.astype(np.float32)
-    for window in (7, 31, 127):
-        near = cv2.blur(weight, (window, window))
-        mean = cv2.blur(filled, (window, window)) / np.maximum(near, np.float32(1e-6))
-        empty = (weight == 0) & (near > 1e-3)
-        filled[empty] = mean[empty]
-        weight[empty] = 1
-    filled[weight == 0] = np.median(disparity[known]) if known.any() else 0
-    return filled
+        scale = 2 if k > finest else 1
+        limit = LARGEST_ROW_ERROR / scale
+        rows = cv2.blur(np.clip(field[..., 1], -limit, limit), (WINDOW, WINDOW))
+        pictures = level(left, finest), level(right, finest)
+        begin = start(pictures[0], self._stride, np.dstack([field, rows]), stride, corner, scale)
+        field = search(*pictures, self._stride, begin, SEARCH_STEPS, TETHER)
+        down, rows = field[..., 1], begin[..., 2]
+        good = (np.abs(down - rows) < LARGEST_ROW_STEP) & (np.abs(down) < LARGEST_ROW_ERROR)
+        across = np.ascontiguousarray(field[..., 0])
+        around = cv2.medianBlur(across, WINDOW)
+        alone = np.abs(across - around) > LARGEST_STEP
+        field[..., 0] = np.where(alone, around, across)
+        good &= cv2.blur(alone.astype(np.float32), (WINDOW, WINDOW)) < MOST_ALONE
+        return field, good

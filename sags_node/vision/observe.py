@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 
-from sags_node.types import F32, Bool, Observation, RectifiedPair
+from sags_node.geometry import scale_intrinsics
+from sags_node.types import F32, Bool, Camera, Observation, RectifiedPair
+from sags_node.vision.pyramid import pyramids
 
 
 def observe(
@@ -17,15 +21,42 @@ def observe(
         depth, confidence: [H, W] those of `StereoDepth`.
         right_eye: with the right eye's picture, where there is one.
     """
+    pyramid, _ = pyramids(pair)
     return Observation(
         frame_id=pair.frame_id,
         t_capture_ns=pair.t_capture_ns,
         camera=pair.camera,
         image=pair.left * np.float32(1 / 255),
-        gray=cv2.cvtColor(pair.left, cv2.COLOR_RGB2GRAY),
+        gray=pyramid.full,
         tissue=tissue,
         depth=depth,
         depth_confidence=confidence,
         right=pair.right * np.float32(1 / 255) if right_eye and pair.right is not None else None,
         baseline=pair.baseline,
+        pyramid=pyramid,
+    )
+
+
+def resized(observation: Observation, scale: float) -> Observation:
+    """The observation with pictures of `scale` times the size. Masks and depths are not interpolated: a mean
+    across an edge is a surface that does not exist."""
+    if scale == 1:
+        return observation
+    camera = observation.camera
+    full = camera.width, camera.height
+    size = max(1, round(scale * camera.width)), max(1, round(scale * camera.height))
+
+    def nearest(array: F32) -> F32:
+        return np.asarray(cv2.resize(array, size, interpolation=cv2.INTER_NEAREST_EXACT))
+
+    right = observation.right
+    return replace(
+        observation,
+        camera=Camera(*size, scale_intrinsics(camera.K, full, size), camera.T_world_cam),
+        image=cv2.resize(observation.image, size),
+        gray=cv2.resize(observation.gray, size),
+        tissue=nearest(observation.tissue.view(np.uint8)).view(np.bool_),
+        depth=nearest(observation.depth),
+        depth_confidence=nearest(observation.depth_confidence),
+        right=None if right is None else cv2.resize(right, size),
     )

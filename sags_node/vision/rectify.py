@@ -9,6 +9,7 @@ from sags_node import geometry
 from sags_node.calibration import rectified_camera
 from sags_node.errors import SagsError
 from sags_node.types import F32, F64, U8, Bool, Camera, Eye, RectifiedPair, StereoFrame, StereoRig
+from sags_node.vision.pyramid import gray_pyramid
 
 
 class _EyeMap:
@@ -83,7 +84,8 @@ class Rectifier:
         self._right = _EyeMap(rig.right, K_rectified, self.camera)
 
     def __call__(self, frame: StereoFrame) -> RectifiedPair:
-        """Rectify one frame; the camera takes the frame's pose, or stays at the world's origin.
+        """Rectify one frame, and make its gray pictures; the camera takes the frame's pose, or stays at the
+        world's origin.
 
         Raises:
             SagsError: the pictures do not have the calibration's size.
@@ -94,13 +96,16 @@ class Rectifier:
         camera = self.camera
         if frame.T_world_cam is not None:
             camera = Camera(camera.width, camera.height, camera.K, frame.T_world_cam)
+        left = self._left.image(frame.left)
+        right = None if frame.right is None else self._right.image(frame.right)
         return RectifiedPair(
             frame_id=frame.frame_id,
             t_capture_ns=frame.t_capture_ns,
             camera=camera,
             baseline=self.baseline,
-            left=self._left.image(frame.left),
-            right=None if frame.right is None else self._right.image(frame.right),
+            left=left,
+            right=right,
+            gray=(gray_pyramid(left), None if right is None else gray_pyramid(right)),
         )
 
     def mask(self, mask: Bool) -> Bool:

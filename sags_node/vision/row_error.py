@@ -7,11 +7,13 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from sags_node.types import F32, U8, Bool
-from sags_node.vision.matchers import InverseSearch
+from sags_node.types import U8, Bool
+from sags_node.vision.inverse_search import at_pixels, centres
+from sags_node.vision.matchers import InverseSearch, Patches
+from sags_node.vision.pyramid import gray_pyramid
 from sags_node.vision.stereo import FULL_SIZE_BELOW
 
-FEWEST_KNOWN = 0.1  # of the picture
+FEWEST_KNOWN = 0.1  # of the patches
 FOUND_BACK = 0.7  # px
 
 
@@ -24,34 +26,29 @@ class RowError(NamedTuple):
 
 
 def measure_rows(left: U8, right: U8, smallest: float, largest: float) -> RowError | None:
-    """Dense row errors of a rectified pair [H, W, 3] (RGB); None where next to nothing matches.
+    """Row errors all over a rectified pair [H, W, 3] (RGB); None where next to nothing matches.
 
     Args:
         smallest, largest: disparities to search, px.
     """
-    width, height = left.shape[1], left.shape[0]
-    shrink = 2 if width >= FULL_SIZE_BELOW else 1
-    size = width // shrink, height // shrink
-    gray = [
-        cv2.resize(cv2.cvtColor(eye, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)
-        for eye in (left, right)
-    ]
-    match = InverseSearch(smallest / shrink, largest / shrink, size)
-    disparity, row_error, known = match(*gray)
-    known &= _found_back(match, gray[0], gray[1], disparity, row_error)
+    halvings = 1 if left.shape[1] >= FULL_SIZE_BELOW else 0
+    match = InverseSearch(smallest / 2**halvings, largest / 2**halvings, halvings)
+    found = match(gray_pyramid(left), gray_pyramid(right))
+    mirrored = match(*(gray_pyramid(np.ascontiguousarray(eye[:, ::-1])) for eye in (right, left)))
+    known = found.good & _found_back(found, mirrored)
     if np.mean(known) < FEWEST_KNOWN:
         return None
-    median, p90 = np.percentile(np.abs(row_error[known]), [50, 90]) * shrink
+    errors = np.abs(found.field[..., 1][known]) * 2**halvings
+    median, p90 = np.percentile(errors, [50, 90])
     return RowError(float(median), float(p90), float(np.mean(known)))
 
 
-def _found_back(match: InverseSearch, left: U8, right: U8, disparity: F32, row_error: F32) -> Bool:
-    """Where the match of a left pixel is matched back to it, [h, w]: anything is matched to something."""
-    mirrored = match(np.ascontiguousarray(right[:, ::-1]), np.ascontiguousarray(left[:, ::-1]))
-    back_disparity, back_error, _ = (np.ascontiguousarray(field[:, ::-1]) for field in mirrored)
-    rows, columns = np.indices(left.shape, np.float32)
-    there = columns - disparity, rows + row_error
-    x = cv2.remap(back_disparity, *there, cv2.INTER_LINEAR, borderValue=np.inf)
-    y = cv2.remap(back_error, *there, cv2.INTER_LINEAR, borderValue=np.inf)
-    back: Bool = np.hypot(x - disparity, y + row_error) < FOUND_BACK
-    return back
+def _found_back(found: Patches, mirrored: Patches) -> Bool:
+    """Where the match of a left patch is matched back to it: anything is matched to something."""
+    flow = at_pixels(mirrored.left, mirrored.right, mirrored.stride, mirrored.field)
+    back = np.ascontiguousarray(flow[:, ::-1])  # to the right in the mirror is to the left
+    columns, rows = centres(found.left, found.stride)
+    there = columns + found.field[..., 0], rows + found.field[..., 1]
+    x, y = (cv2.remap(back[..., k], *there, cv2.INTER_LINEAR, borderValue=np.inf) for k in (0, 1))
+    near: Bool = np.hypot(x - found.field[..., 0], y + found.field[..., 1]) < FOUND_BACK
+    return near

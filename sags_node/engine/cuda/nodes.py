@@ -24,6 +24,7 @@ BLOCK = 128  # followers that a program takes at a time, or Gaussians of a progr
 NEIGHBOURS = tl.constexpr(4)  # nodes that a Gaussian follows
 LEAST_MASS = tl.constexpr(0.5)  # Gaussians: from fewer a node learns nothing
 INERTIA, CALM = tl.constexpr(0.2), tl.constexpr(0.05)  # how fast momentum and variance follow the gradient
+STEEPEST = tl.constexpr(2.0)  # see `NodeDeformation`
 EPS = tl.constexpr(1e-12)
 INFINITY = tl.constexpr(float("inf"))
 
@@ -96,9 +97,10 @@ def _descend(
     m, v = tl.load(momentum + at, ok, other=0.0), tl.load(variance + at, ok, other=0.0)
     m += INERTIA * (gradient - m)
     v += CALM * (gradient * gradient - v)
-    sound = tl.abs(m + v) < INFINITY
-    m, v = tl.where(sound, m, 0.0), tl.where(sound, v, 0.0)
-    moved = -step * m / (tl.sqrt_rn(v) + EPS)
+    size = tl.sqrt_rn(v)
+    sound = (tl.abs(m) <= STEEPEST * size) & (size < INFINITY)
+    m, v, size = tl.where(sound, m, 0.0), tl.where(sound, v, 0.0), tl.where(sound, size, 0.0)
+    moved = -step * m / (size + EPS)
     tl.store(momentum + at, m, ok)
     tl.store(variance + at, v, ok)
     tl.store(motion + at, moved, ok)

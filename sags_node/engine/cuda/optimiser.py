@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import triton
 import triton.language as tl
 
+from sags_node.engine import interface
 from sags_node.engine.cuda.signatures import Compiled
 
 if TYPE_CHECKING:
@@ -22,9 +23,7 @@ PARAMETERS = 11  # columns of Adam's moments
 MEAN, QUAT, SCALE, LOGIT = (tl.constexpr(first) for first in (0, 3, 7, 10))  # where each parameter's begin
 STATE = tl.constexpr(PARAMETERS)
 INFINITY = tl.constexpr(float("inf"))
-EPS = tl.constexpr(1e-8)
-COLOR_LOW, COLOR_HIGH = tl.constexpr(-0.5), tl.constexpr(1.5)
-MAX_OPACITY = tl.constexpr(0.999)
+MAX_OPACITY = tl.constexpr(interface.MAX_OPACITY)
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +62,8 @@ class Constants:
     beta1: float
     beta2: float
     least_contribution: float  # px: rows that were seen less are not touched
+    eps: float  # of Adam
+    color_range: tuple[float, float]
     log_scale_range: tuple[float, float]
     logit_range: tuple[float, float]
     largest: float  # sum of a sound row's gradients, momenta and variances
@@ -127,6 +128,7 @@ def _move(
     move_v: tl.tensor,
     correction_m: tl.tensor,
     correction_v: tl.tensor,
+    eps: tl.tensor,
     FIRST: tl.constexpr,
     COUNT: tl.constexpr,
 ) -> tl.tensor:
@@ -139,7 +141,7 @@ def _move(
     written = moves | broken
     _store(m, tl.where(broken[:, None], 0.0, state_m), row, written, STATE, FIRST, COUNT)
     _store(v, tl.where(broken[:, None], anew, state_v), row, written, STATE, FIRST, COUNT)
-    return length * state_m * correction_m / (tl.sqrt_rn(state_v * correction_v) + EPS)
+    return length * state_m * correction_m / (tl.sqrt_rn(state_v * correction_v) + eps)
 
 
 @triton.jit(do_not_specialize=("count",))
@@ -176,6 +178,9 @@ def _step(
     relaxation: tl.tensor,
     damping: tl.tensor,
     least_contribution: tl.tensor,
+    eps: tl.tensor,
+    color_low: tl.tensor,
+    color_high: tl.tensor,
     log_scale_low: tl.tensor,
     log_scale_high: tl.tensor,
     logit_low: tl.tensor,
@@ -204,7 +209,7 @@ def _step(
 
     gain = (relaxation / (seen + damping))[:, None]
     color = _load(colors, row, moves, 3, 0, 3) - gain * g_color
-    _store(colors, tl.minimum(tl.maximum(color, COLOR_LOW), COLOR_HIGH), row, moves, 3, 0, 3)
+    _store(colors, tl.minimum(tl.maximum(color, color_low), color_high), row, moves, 3, 0, 3)
 
     mean = _load(means, row, moves, 3, 0, 3)
     axis = tl.arange(0, 4)[None, :]
@@ -212,21 +217,21 @@ def _step(
     z = tl.sum(view * mean, axis=1) + view_shift
     pixel = (tl.abs(z) / focal)[:, None]  # metres that a pixel spans at the Gaussian's depth
     step = _move(g_mean, adam_m, adam_v, row, moves, broken, mean_px,
-                 move_m, move_v, correction_m, correction_v, MEAN, 3)  # fmt: skip
+                 move_m, move_v, correction_m, correction_v, eps, MEAN, 3)  # fmt: skip
     _store(means, mean - pixel * step, row, moves, 3, 0, 3)
     step = _move(g_quat, adam_m, adam_v, row, moves, broken, quat_length,
-                 move_m, move_v, correction_m, correction_v, QUAT, 4)  # fmt: skip
+                 move_m, move_v, correction_m, correction_v, eps, QUAT, 4)  # fmt: skip
     _store(quats, _load(quats, row, moves, 4, 0, 4) - step, row, moves, 4, 0, 4)
 
     # what is drawn of a broken row is known to be sound: its raw values are made anew from that
     written = moves | broken
     step = _move(g_scale, adam_m, adam_v, row, moves, broken, log_scale_length,
-                 move_m, move_v, correction_m, correction_v, SCALE, 3)  # fmt: skip
+                 move_m, move_v, correction_m, correction_v, eps, SCALE, 3)  # fmt: skip
     log_scale = tl.minimum(tl.maximum(log_scale - step, log_scale_low), log_scale_high)
     _store(scales, tl.exp(log_scale), row, moves, 3, 0, 3)
     _store(log_scales, tl.where(broken[:, None], tl.log(scale), log_scale), row, written, 3, 0, 3)
     step = _move(g_logit, adam_m, adam_v, row, moves, broken, logit_length,
-                 move_m, move_v, correction_m, correction_v, LOGIT, 1)  # fmt: skip
+                 move_m, move_v, correction_m, correction_v, eps, LOGIT, 1)  # fmt: skip
     logit = tl.minimum(tl.maximum(logit - step, logit_low), logit_high)
     _store(opacities, 1.0 / (1.0 + tl.exp(-logit)), row, moves, 1, 0, 1)
     opacity = tl.minimum(opacity, MAX_OPACITY)
@@ -268,8 +273,9 @@ class Optimiser:
             slopes.means, slopes.quats, slopes.scales, slopes.opacities, slopes.colors, slopes.contribution,
             count, *lengths, *view_z, focal_px,
             1.0 - beta1, 1.0 - beta2, 1.0 / (1.0 - beta1**self._steps), 1.0 / (1.0 - beta2**self._steps),
-            constants.relaxation, constants.damping, constants.least_contribution,
-            *constants.log_scale_range, *constants.logit_range, constants.largest, constants.largest_raw,
+            constants.relaxation, constants.damping, constants.least_contribution, constants.eps,
+            *constants.color_range, *constants.log_scale_range, *constants.logit_range,
+            constants.largest, constants.largest_raw,
             BLOCK=BLOCK,
         )  # fmt: skip
 
@@ -281,8 +287,8 @@ _TABLES = (
 _NUMBERS = (
     "mean_px", "quat_length", "log_scale_length", "logit_length",
     "view_x", "view_y", "view_z", "view_shift", "focal", "move_m", "move_v", "correction_m", "correction_v",
-    "relaxation", "damping", "least_contribution", "log_scale_low", "log_scale_high", "logit_low",
-    "logit_high", "largest", "largest_raw",
+    "relaxation", "damping", "least_contribution", "eps", "color_low", "color_high",
+    "log_scale_low", "log_scale_high", "logit_low", "logit_high", "largest", "largest_raw",
 )  # fmt: skip
 SIGNATURES = (
     Compiled(

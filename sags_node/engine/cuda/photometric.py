@@ -13,7 +13,8 @@ import triton
 from sags_node.engine.cuda import photometric_kernels as kernels
 from sags_node.engine.cuda.photometric_kernels import BLOCK, PROGRAMS
 from sags_node.engine.cuda.ssim import Dissimilarity
-from sags_node.engine.photometric import COVERED, DEPTH_COVERED, NO_LEAST, LossTerms, LossWeights
+from sags_node.engine.losses import COVERED, DEPTH_COVERED
+from sags_node.engine.photometric import NO_LEAST, LossTerms, LossWeights
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -39,7 +40,7 @@ class PhotometricLoss:
     ) -> None:
         self.weights = weights
         self._normalised = normalised
-        self._least = (COVERED, DEPTH_COVERED) if normalised else (NO_LEAST, NO_LEAST)
+        self._least = (float(COVERED), float(DEPTH_COVERED)) if normalised else (NO_LEAST, NO_LEAST)
         self._size = height, width
         self._pixels = height * width
         self._programs = triton.cdiv(self._pixels, BLOCK)

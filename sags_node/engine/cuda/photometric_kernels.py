@@ -5,14 +5,14 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from sags_node.engine import photometric, photometric_kernels, smoothness
+from sags_node.engine import losses, photometric, photometric_kernels, smoothness
 from sags_node.engine.cuda.signatures import Compiled
 
 BLOCK = 512  # pixels of a program
 PROGRAMS = 256  # whose sums `combine` takes at a time
-MAX_RESIDUAL = tl.constexpr(float(photometric_kernels.MAX_RESIDUAL))
+MAX_RESIDUAL = tl.constexpr(float(losses.MAX_RESIDUAL))
 MIN_DEPTH = tl.constexpr(float(photometric_kernels.MIN_DEPTH))
-FULL = tl.constexpr(float(photometric_kernels.FULL))
+FULL = tl.constexpr(float(losses.FULL))
 MAX_DIFFERENCE = tl.constexpr(float(smoothness.MAX_DIFFERENCE))
 FLAT = tl.constexpr(photometric.FLAT)
 INFINITY, NAN = tl.constexpr(float("inf")), tl.constexpr(float("nan"))

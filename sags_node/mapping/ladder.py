@@ -1,0 +1,173 @@
+"""The rungs of quality on which a frame can be worked, what each costs, and which one a machine affords.
+
+A rung says how much of everything a frame gets. Gaussians do not care for the size of the picture that they
+are drawn in, so a model goes on when the rung changes. Prices are times on one machine; only their ratios
+count, since every machine measures how long its own frames take. `benchmarks/ladder.md` has each rung's price
+and what it gives.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from sags_node.types import RungState
+
+
+@dataclass(frozen=True, slots=True)
+class Rung:
+    """What a frame gets."""
+
+    gaussians: int  # at most
+    scale: float = 1.0  # of the working size: at which the model is drawn and refined
+    depth_every: int = 1  # frames: how often depth is matched
+    step: float = 1.0  # share of the picture, where it is worst, that the first step is on
+    redraw: float = 1.0  # share of the picture, where it was worst, that is drawn anew after the steps
+
+
+EVERYTHING = Rung(gaussians=2**31)
+
+RUNGS = (
+    Rung(5_000, scale=0.5, depth_every=3, redraw=0.4),
+    Rung(8_000, scale=0.5, depth_every=3, redraw=0.4),
+    Rung(12_000, scale=0.5, depth_every=3, redraw=0.4),
+    Rung(16_000, scale=0.5, depth_every=2, redraw=0.4),
+    Rung(16_000, scale=0.75, depth_every=2, step=0.6, redraw=0.4),
+    Rung(20_000, scale=0.75, depth_every=2, redraw=0.4),
+    Rung(25_000, scale=0.75, depth_every=2, redraw=0.4),
+    Rung(30_000, scale=0.75, depth_every=2, redraw=0.4),
+    Rung(30_000, depth_every=2, redraw=0.4),
+    Rung(36_000, depth_every=2, redraw=0.4),
+    Rung(44_000, depth_every=2, redraw=0.4),
+    Rung(54_000, depth_every=2, redraw=0.6),
+    Rung(70_000),
+    Rung(90_000),
+    Rung(115_000),
+    Rung(150_000),
+)
+
+
+USED = 0.82  # of the Gaussians that a rung allows: so many a model has, the rest is room for what appears
+# Prices, ms on two cores of the machine in `benchmarks/results/ladder.json`, at 640x512 px.
+EVERY_FRAME = 9.8  # what depends on neither: pictures, flow, masks
+DEPTH = 2.9  # matched once
+DRAWN = 2.8  # a whole picture drawn
+STEPPED = 1.9  # a step on a whole picture
+PER_THOUSAND = 0.31  # Gaussians
+FULL = 640 * 512  # px
+
+AVERAGED = 12  # frames behind the measured speed; the two slowest of them are left out
+FIRST_AIM = 0.8  # of the frame's time: what the first rung may take, by a guess before the first frame
+AIM = 0.92  # of the frame's time: what a rung may take, since costs vary
+CLIMB = 0.85  # of the frame's time: what a higher rung may take before it is tried
+SETTLING = 8  # frames after a change of the rung before the next
+PATIENCE = 10  # frames in which a higher rung would have fitted before it is tried; doubled when it did not
+LONGEST_PATIENCE = 960
+FIRST_LOOKS = (4, 8, 16, 30)  # frames after which the rung may jump; later it goes by single steps
+FIRST_FRAMES = FIRST_LOOKS[-1]
+
+
+def price(rung: Rung, gaussians: float, pixels: int) -> float:
+    """What a frame costs, ms on the machine of the constants.
+
+    Args:
+        gaussians: that the model has.
+        pixels: of the working size.
+    """
+    pictures = pixels / FULL
+    drawn = rung.scale**2 * pictures
+    vision = pictures * (EVERY_FRAME + DEPTH / rung.depth_every)
+    return (
+        vision + drawn * (DRAWN * (1 + rung.redraw) + STEPPED * rung.step) + PER_THOUSAND * 1e-3 * gaussians
+    )
+
+
+class Ladder:
+    """Finds the rung that fills a frame's time, by what frames take.
+
+    In the first frames it jumps to where the measured speed says; then it goes down by one when frames take
+    too long, and up by one when the next rung has seemed to fit for a while. A climb that did not hold makes
+    it more patient.
+
+    Attributes:
+        rung: of the next frame.
+        speed: how long the machine takes, in units of the prices' machine.
+        reason: why it is that one, for people.
+    """
+
+    def __init__(self, rungs: Sequence[Rung], pixels: int, seconds: float, speed: float = 1.0) -> None:
+        """
+        Args:
+            rungs: from the cheapest to the best.
+            pixels: of the working size.
+            seconds: that a frame may take.
+            speed: how long the machine takes, in units of the prices' machine.
+        """
+        self._rungs = rungs
+        self._pixels = pixels
+        self.speed = speed
+        self._took: deque[float] = deque(maxlen=AVERAGED)  # frames, in units of their prices
+        self._frames = 0
+        self._since = 0  # frames since the rung changed
+        self._fitted = 0  # frames in a row in which the next rung would have fitted
+        self._patience = PATIENCE
+        self._climbed = False  # whether the last change was up
+        self.seconds = seconds
+        self.place = self._best(FIRST_AIM)
+        self.reason = "by the machine's speed"
+
+    @property
+    def rung(self) -> Rung:
+        return self._rungs[self.place]
+
+    @property
+    def state(self) -> RungState:
+        """For people."""
+        rung = self.rung
+        return RungState(
+            self.place, len(self._rungs), self.reason, rung.gaussians, rung.scale, rung.depth_every
+        )
+
+    def learn(self, seconds: float, gaussians: int) -> None:
+        """A frame took so long, further steps left out, with so many Gaussians."""
+        took = 1e3 * seconds / price(self.rung, gaussians, self._pixels)
+        self._frames += 1
+        self._since += 1
+        self._took.append(took)
+        usual = sorted(self._took)[:-2] or [took]
+        self.speed = sum(usual) / len(usual)
+        if self._frames <= FIRST_FRAMES:
+            if self._frames in FIRST_LOOKS:
+                self._go(self._best(AIM), "by the time of the first frames")
+            return
+        expected = self._expected(self.place)
+        if self._since < SETTLING:
+            return
+        if expected > 1e3 * self.seconds and self.place > 0:
+            if self._climbed:
+                self._patience = min(2 * self._patience, LONGEST_PATIENCE)
+            self._go(self.place - 1, f"frames took {expected:.0f} of {1e3 * self.seconds:.0f} ms")
+            return
+        higher = self.place + 1
+        fits = higher < len(self._rungs) and self._expected(higher) < CLIMB * 1e3 * self.seconds
+        self._fitted = self._fitted + 1 if fits else 0
+        if self._fitted >= self._patience:
+            self._go(higher, f"frames took {expected:.0f} of {1e3 * self.seconds:.0f} ms")
+
+    def _expected(self, place: int) -> float:
+        """ms that a frame takes on that rung."""
+        rung = self._rungs[place]
+        return self.speed * price(rung, USED * rung.gaussians, self._pixels)
+
+    def _best(self, share: float) -> int:
+        """The highest rung that takes no more than this share of the time."""
+        fitting = [i for i in range(len(self._rungs)) if self._expected(i) <= share * 1e3 * self.seconds]
+        return max(fitting, default=0)
+
+    def _go(self, place: int, reason: str) -> None:
+        if place == self.place:
+            return
+        self._climbed = place > self.place
+        self.place, self.reason = place, reason
+        self._since = self._fitted = 0

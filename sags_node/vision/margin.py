@@ -1,0 +1,20 @@
+"""Tissue that is far enough from instruments: what is measured beside one may be its own."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from sags_node.types import U8, Bool
+
+EDGE_MARGIN = 20 / 640  # of the width: depths and flow smear that far across an instrument's edge
+
+
+def clear_of_instruments(tissue: Bool, halvings: int) -> Bool:
+    """Where a mask [H, W] is tissue, and all around it, in a picture after so many halvings."""
+    height, width = (side >> halvings for side in tissue.shape)
+    step = 1 << halvings
+    small = np.ascontiguousarray(tissue[: height * step : step, : width * step : step])
+    side = 2 * round(EDGE_MARGIN * width) + 1
+    clear: U8 = cv2.erode(small.view(np.uint8), np.ones((side, side), np.uint8))
+    return clear.view(np.bool_)

@@ -1,0 +1,109 @@
+"""Gray pictures in halves, made once a frame for all who compare pictures: stereo, optical flow, and what
+tells whether anything moved."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+
+from sags_node.kernels.jit import kernel
+from sags_node.types import F32, U8, GrayPyramid, Observation, RectifiedPair
+
+BORDER = 16  # px around every half: so far outside the picture a patch may lie
+SMALLEST_SIDE = 16  # px of the last half: two patches of the inverse search
+
+
+def gray_pyramid(picture: U8) -> GrayPyramid:
+    """Of an RGB picture [H, W, 3] or a gray one [H, W]."""
+    gray: U8 = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) if picture.ndim == 3 else picture
+    height, width = gray.shape
+    halves: list[F32] = []
+    for _ in range(level_count(width, height)):
+        height, width = height // 2, width // 2
+        half = np.empty((height + 2 * BORDER, width + 2 * BORDER), np.float32)
+        if halves:
+            _halve_inner(halves[-1], half)
+        else:
+            _halve(gray, half)
+        halves.append(half)
+    return GrayPyramid(gray, tuple(halves))
+
+
+def pyramids(pair: RectifiedPair) -> tuple[GrayPyramid, GrayPyramid | None]:
+    """Those of the left and the right picture that came with the pair, or else made now."""
+    if pair.gray is not None:
+        return pair.gray
+    return gray_pyramid(pair.left), None if pair.right is None else gray_pyramid(pair.right)
+
+
+def pyramid_of(observation: Observation) -> GrayPyramid:
+    """That of its gray picture which came with it, or else made now."""
+    pyramid = observation.pyramid
+    made = pyramid is not None and pyramid.full is observation.gray  # another picture may have been put in
+    return pyramid if pyramid is not None and made else gray_pyramid(observation.gray)
+
+
+def level_count(width: int, height: int) -> int:
+    """How many halves a picture of this size has: at least one."""
+    count = 1
+    while min(width, height) >> count >= 2 * SMALLEST_SIDE:
+        count += 1
+    return count
+
+
+def with_border(gray: U8) -> F32:
+    """The whole picture [H, W] in the form of a half."""
+    return np.asarray(
+        cv2.copyMakeBorder(gray, BORDER, BORDER, BORDER, BORDER, cv2.BORDER_REPLICATE), np.float32
+    )
+
+
+def level(pyramid: GrayPyramid, halvings: int) -> F32:
+    """The picture after so many halvings, with its border."""
+    return pyramid.halves[halvings - 1] if halvings > 0 else with_border(pyramid.full)
+
+
+def inner(bordered: F32) -> F32:
+    """A picture without its border, a view."""
+    return bordered[BORDER:-BORDER, BORDER:-BORDER]
+
+
+@kernel
+def _halve(picture: U8, half: F32) -> None:
+    """Means of 2x2 px. An odd last row or column is left out: so every half has exactly half the scale."""
+    for y in range(half.shape[0] - 2 * BORDER):
+        _mean_row(picture[2 * y], picture[2 * y + 1], half[y + BORDER])
+    _repeat_edges(half)
+
+
+@kernel
+def _halve_inner(picture: F32, half: F32) -> None:
+    for y in range(half.shape[0] - 2 * BORDER):
+        upper, lower = picture[2 * y + BORDER], picture[2 * y + 1 + BORDER]
+        _mean_row(upper[BORDER:], lower[BORDER:], half[y + BORDER])
+    _repeat_edges(half)
+
+
+@kernel
+def _mean_row(upper: Any, lower: Any, row: F32) -> None:
+    quarter, two, one, border = np.float32(0.25), np.uint64(2), np.uint64(1), np.uint64(BORDER)
+    for i in range(row.size - 2 * BORDER):
+        x = np.uint64(i)
+        total = (
+            np.float32(upper[two * x]) + np.float32(upper[two * x + one])
+            + (np.float32(lower[two * x]) + np.float32(lower[two * x + one]))
+        )  # fmt: skip
+        row[x + border] = quarter * total
+
+
+@kernel
+def _repeat_edges(half: F32) -> None:
+    height, width = half.shape
+    for y in range(BORDER, height - BORDER):
+        half[y, :BORDER] = half[y, BORDER]
+        half[y, width - BORDER :] = half[y, width - BORDER - 1]
+    for y in range(BORDER):
+        half[y] = half[BORDER]
+        half[height - 1 - y] = half[height - 1 - BORDER]

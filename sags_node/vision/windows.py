@@ -1,0 +1,48 @@
+"""Sums over square windows of a picture, a vector of pixels at a time, for kernels that need several at once.
+
+A row of sums over columns is gathered first, then summed along: `window_row` reads it. Pictures are at least
+16 px wide; the last pixels of a row may be done twice. Beyond a picture's edge its edge is repeated.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sags_node.kernels.jit import inlined, kernel
+from sags_node.kernels.vectors import LANES, load_anywhere
+from sags_node.types import F32
+
+
+@inlined
+def chunks(width: int) -> Any:
+    """How many vectors cover a row."""
+    return (width + LANES - 1) // LANES
+
+
+@inlined
+def chunk(i: int, width: int) -> Any:
+    """The first pixel of one of them."""
+    return min(i * LANES, width - LANES)
+
+
+@inlined
+def inside(y: Any, height: int) -> Any:
+    return min(max(y, 0), height - 1)
+
+
+@kernel
+def repeat_ends(line: F32, at: int, width: int, radius: int) -> None:
+    """`width` sums stand in `line` from `at` + `radius` on: repeat the first and last in the `radius` places
+    before and after them."""
+    for k in range(radius):
+        line[at + k] = line[at + radius]
+        line[at + radius + width + k] = line[at + radius + width - 1]
+
+
+@inlined
+def window_row(line: F32, at: int, radius: int) -> Any:
+    """A vector of sums over 2 radius + 1 places, the first from `at` on."""
+    found = load_anywhere(line, at)
+    for k in range(1, 2 * radius + 1):
+        found = found + load_anywhere(line, at + k)
+    return found

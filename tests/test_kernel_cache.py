@@ -1,0 +1,272 @@
+"""Compiled kernels on disk: never stale, never mixed, never in the way."""
+
+from __future__ import annotations
+
+import ast
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numba
+import numpy as np
+import pytest
+
+from sags_node.kernels import cache, digest
+from sags_node.kernels.cache import cache_root
+from sags_node.kernels.jit import kernel
+
+PACKAGE = Path(digest.__file__).parents[1]
+# What one point's sampling interval is, and how many kernels were compiled for it or loaded.
+SAMPLING = """
+import json, numpy as np
+from sags_node.engine import pinhole
+from sags_node.model import alias_free
+cam = np.concatenate([np.eye(4, dtype=np.float32)[:3].ravel(), np.float32([100, 100, 50, 50])])
+intervals = np.full(1, np.inf, np.float32)
+alias_free._sampling_intervals(np.float32([[0, 0, 2]]), cam, 100, 100, intervals)
+used = [alias_free._sampling_intervals, alias_free._sampling_interval, pinhole.to_camera, pinhole.to_pixel]
+"""
+# A constant that comes through two files, a helper through one, and a kernel made around a function.
+MADE = {
+    "__init__": "",
+    "deep": "FACTOR = 2.0",
+    "constants": "from sags_node.made import deep\nSCALE = deep.FACTOR",
+    "names": "from sags_node.made.helper import helper",
+    "maker": """
+from sags_node.kernels.jit import kernel
+def make(helper):
+    @kernel
+    def made(x):
+        return helper(x)
+    return made
+""",
+    "helper": """
+from sags_node.kernels.jit import inlined
+@inlined
+def helper(x):
+    return x + 1.0
+""",
+    "caller": """
+from sags_node.kernels.jit import kernel
+from sags_node.made import maker, names
+from sags_node.made.constants import SCALE
+helped = names.helper
+made = maker.make(helped)
+@kernel
+def scaled(x):
+    return SCALE * helped(x)
+""",
+}
+CALLED = """
+import json
+from sags_node.made import caller
+intervals = [caller.scaled(9.0), caller.made(9.0)]
+used = [caller.made, caller.scaled]
+"""
+COUNTED = """
+found = [sum(sum(counted.values()) for counted in
+             (getattr(kernel.stats, name) for kernel in used)) for name in ("cache_misses", "cache_hits")]
+print(json.dumps([*map(float, intervals), *found]))
+"""
+
+
+@pytest.fixture(scope="module")
+def whole_copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    copy = tmp_path_factory.mktemp("copy")
+    shutil.copytree(PACKAGE, copy / "sags_node", ignore=shutil.ignore_patterns("__pycache__"))
+    (copy / "sags_node/made").mkdir()
+    for name, text in MADE.items():
+        (copy / f"sags_node/made/{name}.py").write_text(text)
+    return copy
+
+
+def start(copy: Path, code: str, **environment: str) -> subprocess.Popen[str]:
+    own = {"PYTHONPATH": str(copy), "NUMBA_CACHE_DIR": str(copy / "cache"), "PYTHONDONTWRITEBYTECODE": "1"}
+    return subprocess.Popen(
+        [sys.executable, "-c", code],
+        env=os.environ | own | environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=copy,
+    )
+
+
+def run(copy: Path, code: str, **environment: str) -> list[float]:
+    """What the code found in a process of its own, then the numbers of kernels compiled and loaded."""
+    process = start(copy, code + COUNTED, **environment)
+    stdout, stderr = process.communicate(timeout=120)
+    assert process.returncode == 0, stderr
+    numbers: list[float] = json.loads(stdout)
+    return numbers
+
+
+def edit(file: Path, old: str, new: str) -> None:
+    text = file.read_text()
+    assert text.count(old) == 1
+    file.write_text(text.replace(old, new))
+
+
+# ---- never stale -------------------------------------------------------------------------------------------
+
+
+def test_a_changed_helper_recompiles_the_kernels_that_call_it(whole_copy: Path) -> None:
+    """The interval is z / f. The helper stands in another file than its caller, which is left alone."""
+    helper = whole_copy / "sags_node/engine/pinhole.py"
+    assert run(whole_copy, SAMPLING)[:2] == [np.float32(0.02), 4]
+    assert run(whole_copy, SAMPLING)[1] == 0  # of an unchanged package all is loaded
+    edit(helper, "cam[10] * z + cam[11]", "3 * cam[10] * z + cam[11]")
+    assert run(whole_copy, SAMPLING)[:2] == [np.float32(0.06), 4]
+    assert run(whole_copy, SAMPLING)[:2] == [np.float32(0.06), 0]
+    edit(helper, "3 * cam[10] * z + cam[11]", "cam[10] * z + cam[11]")
+    assert run(whole_copy, SAMPLING)[:2] == [np.float32(0.02), 0]  # the former state is still there
+
+
+def test_constants_and_helpers_are_followed_through_any_number_of_files(whole_copy: Path) -> None:
+    """A kernel made around a function is never kept, because that function may come from anywhere."""
+    both_compiled, one_compiled = [2, 0], [1, 1]
+    assert run(whole_copy, CALLED) == [20, 10, *both_compiled]
+    assert run(whole_copy, CALLED) == [20, 10, *one_compiled]
+    edit(whole_copy / "sags_node/made/deep.py", "2.0", "7.25")
+    assert run(whole_copy, CALLED) == [72.5, 10, *both_compiled]
+    edit(whole_copy / "sags_node/made/helper.py", "x + 1.0", "x + 11.0")
+    assert run(whole_copy, CALLED) == [145, 20, *both_compiled]
+
+
+def test_what_changes_while_a_process_runs_is_not_taken_for_what_it_imported(whole_copy: Path) -> None:
+    """Lazy imports in a node that runs while the package is updated."""
+    file = whole_copy / "sags_node/made/deep.py"
+    before = run(whole_copy, CALLED)[0]
+    update = (
+        f"import pathlib, sags_node.kernels.jit, sags_node.made.constants\np = pathlib.Path({str(file)!r})\n"
+    )
+    update += "p.write_text(p.read_text() + ' * 100')\n"
+    assert run(whole_copy, update + CALLED)[0] == before
+    assert run(whole_copy, CALLED)[0] == 100 * before
+
+
+def test_kernels_outside_the_package_are_not_kept() -> None:
+    """What they import is not known."""
+
+    @kernel
+    def here(x: float) -> float:
+        return x + 1
+
+    assert here(1.0) == 2.0
+    assert here._cache.cache_path is None  # type: ignore[attr-defined]
+    assert digest.kernel_name(here.py_func) is None  # type: ignore[attr-defined]
+
+
+def test_every_kernel_is_compiled_by_the_decorators_that_know_the_cache() -> None:
+    """And no import is relative: those are found by their full names."""
+    compilers = {"jit", "njit", "vectorize", "guvectorize", "cfunc", "stencil", "generated_jit"}
+    wrong = []
+    for file in PACKAGE.rglob("*.py"):
+        if file.is_relative_to(PACKAGE / "kernels"):
+            continue
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.ImportFrom):
+                names = {alias.name for alias in node.names} if node.module == "numba" else set()
+                if node.level or names & compilers:
+                    wrong.append(f"{file.relative_to(PACKAGE)}:{node.lineno}")
+            elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+                if node.value.id == "numba" and node.attr in compilers:
+                    wrong.append(f"{file.relative_to(PACKAGE)}:{node.lineno}")
+    assert not wrong, wrong
+
+
+# ---- never mixed -------------------------------------------------------------------------------------------
+
+
+def test_compile_targets_and_settings_lie_side_by_side(whole_copy: Path) -> None:
+    target = {"NUMBA_CPU_NAME": "x86-64", "NUMBA_CPU_FEATURES": ""}
+    run(whole_copy, SAMPLING)
+    assert run(whole_copy, SAMPLING, **target)[1] == 4
+    assert run(whole_copy, SAMPLING, NUMBA_OPT="1")[1] == 4
+    assert run(whole_copy, SAMPLING, **target)[1] == 0
+    assert run(whole_copy, SAMPLING, NUMBA_NUM_THREADS="1")[1] == 0  # the same machine code
+
+
+def test_processes_that_compile_one_kernel_for_several_types_at_once(whole_copy: Path) -> None:
+    """Each reads the index, adds its entry and writes it: all must be there in the end."""
+    types = ["float32", "float64", "int32", "int64"]
+    code = """
+import json, time, numpy as np
+from numba.core.caching import IndexDataCacheFile
+from sags_node.made.caller import scaled
+write = IndexDataCacheFile._save_index
+IndexDataCacheFile._save_index = lambda *index: (time.sleep(0.3), write(*index))
+used = [scaled]
+intervals = [scaled(getattr(np, kind)(4)) for kind in {}]
+"""
+    edit(whole_copy / "sags_node/made/deep.py", "FACTOR = ", "FACTOR = 1.5 * ")  # nothing of it on disk yet
+    processes = [start(whole_copy, code.format([kind]) + COUNTED) for kind in types]
+    alone = [json.loads(process.communicate(timeout=120)[0]) for process in processes]
+    together = run(whole_copy, code.format(types))
+    assert together == [*(found[0] for found in alone), 0, len(types)]
+
+
+# ---- never in the way --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("ending", [".nbi", ".nbc"])
+def test_damaged_files_are_compiled_anew(whole_copy: Path, ending: str) -> None:
+    """As after a power cut."""
+    before = run(whole_copy, SAMPLING)
+    for file in (whole_copy / "cache").rglob(f"*{ending}"):
+        file.write_bytes(file.read_bytes()[:40] if ending == ".nbc" else b"")
+    assert run(whole_copy, SAMPLING)[:2] == [before[0], 4]
+    assert run(whole_copy, SAMPLING)[1] == 0
+
+
+def test_a_full_disk_costs_the_cache_and_nothing_else(
+    whole_copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    full = "import resource, signal\nsignal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+    full += "resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))\n"
+    for _ in range(2):
+        process = start(whole_copy, full + SAMPLING + COUNTED, NUMBA_CACHE_DIR=str(tmp_path))
+        stdout, stderr = process.communicate(timeout=120)
+        assert json.loads(stdout)[:2] == [np.float32(0.02), 4], stderr
+        assert stderr.count("cannot be kept") == 1
+
+
+def test_place_of_the_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first place that can be written, by this user only."""
+    find = cache_root.__wrapped__
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "chosen"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
+    assert find() == tmp_path / "chosen/sags"
+    (tmp_path / "chosen/sags").chmod(0o777)
+    assert find() == tmp_path / "home/sags/kernels"
+    monkeypatch.setattr(numba.config, "CACHE_DIR", "")
+    assert find() == tmp_path / "home/sags/kernels"
+    monkeypatch.setenv("XDG_CACHE_HOME", "/dev/null")
+    own = find()
+    assert own is not None and own.name == f"sags-kernels-{os.getuid()}" and own.stat().st_mode & 0o077 == 0
+
+
+def test_folders_that_were_not_used_for_longest_are_cleared(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cache, "KEPT", 3)
+    for age, name in enumerate("abcde"):
+        (tmp_path / f"engine.{name}-1").mkdir()
+        (tmp_path / f"engine.{name}-1/index").touch()
+        os.utime(tmp_path / f"engine.{name}-1", (1e9 - age, 1e9 - age))
+    cache._used.__wrapped__(tmp_path / "engine.e-1")
+    cache._clear_old(tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["engine.a-1", "engine.b-1", "engine.e-1"]
+
+
+def test_a_kernel_is_cold_until_it_was_compiled_once(whole_copy: Path) -> None:
+    cold = "\nfrom sags_node.kernels.cache import is_cold\nbefore = is_cold(pinhole.to_pixel)"
+    imported, called = SAMPLING.split("cam = ")
+    code = f"{imported}{cold}\ncam = {called}\nprint(json.dumps([before, is_cold(pinhole.to_pixel)]))\n"
+    environment = {"NUMBA_CACHE_DIR": str(whole_copy / "another cache")}
+    for expected in ([True, False], [False, False]):
+        stdout, stderr = start(whole_copy, code, **environment).communicate(timeout=120)
+        assert json.loads(stdout or "null") == expected, stderr

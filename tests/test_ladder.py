@@ -1,0 +1,154 @@
+"""The ladder of quality, on machines that only the tests know: which rung it finds, and how it changes."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from sags_node.config import LaunchConfig, MappingConfig
+from sags_node.errors import UsageError
+from sags_node.mapping.devices import affordable, make_budget, rungs_of
+from sags_node.mapping.ladder import (
+    FIRST_FRAMES,
+    FULL,
+    RUNGS,
+    SETTLING,
+    USED,
+    Ladder,
+    Rung,
+    price,
+)
+
+SECONDS, PERIOD = 0.033, 1 / 30
+FIRST_SECOND = round(1 / PERIOD)
+
+
+@dataclass
+class Played:
+    """One frame that was taken."""
+
+    number: int
+    place: int
+    seconds: float
+
+
+def play(
+    slowness: Callable[[float], float],
+    frames: int = 900,
+    seed: int = 0,
+    start: float = 1.0,
+    shape: tuple[float, float] = (1.0, 1.0),
+) -> list[Played]:
+    """A camera of 30 Hz, the newest picture wins. A frame takes what its rung costs, times `slowness` of the
+    time (s), with 8 % of noise; the model has as many Gaussians as the rung allows some frames later.
+
+    Args:
+        shape: how much dearer than the prices say Gaussians and pictures are on this machine.
+    """
+    rng = np.random.default_rng(seed)
+    ladder = Ladder(RUNGS, FULL, SECONDS, start)
+    gaussians, now, number, done = USED * ladder.rung.gaussians, 0.0, 0, []
+    while number < frames:
+        now = max(now, number * PERIOD)
+        rung = ladder.rung
+        gaussians += np.clip(USED * rung.gaussians - gaussians, -0.01 * gaussians, 0.01 * gaussians)
+        of_pictures = price(rung, 0, FULL)
+        of_gaussians = price(rung, gaussians, FULL) - of_pictures
+        ms = shape[0] * of_gaussians + shape[1] * of_pictures
+        seconds = 1e-3 * ms * slowness(number * PERIOD) * np.exp(0.08 * rng.normal())
+        now += seconds
+        ladder.learn(seconds, round(gaussians))
+        done.append(Played(number, ladder.place, seconds))
+        number = max(number + 1, int(now / PERIOD))
+    return done
+
+
+def share_taken(done: list[Played], first: int = FIRST_SECOND, frames: int = 900) -> float:
+    return sum(first <= each.number < frames for each in done) / (frames - first)
+
+
+def changes(done: list[Played]) -> list[tuple[int, int]]:
+    """Frame number and size of each change after the first frames."""
+    late = [each for each in done if each.number > FIRST_FRAMES]
+    return [(b.number, b.place - a.place) for a, b in itertools.pairwise(late) if a.place != b.place]
+
+
+def test_every_rung_costs_more_than_the_one_below() -> None:
+    prices = [price(rung, USED * rung.gaussians, FULL) for rung in RUNGS]
+    assert all(a < b for a, b in itertools.pairwise(prices)), prices
+    assert RUNGS[0].gaussians <= 5000 and RUNGS[0].scale == 0.5 and RUNGS[-1] == Rung(RUNGS[-1].gaussians)
+
+
+@pytest.mark.parametrize("slow", [0.3, 0.7, 1.0, 1.3, 1.6, 2.0])
+@pytest.mark.parametrize("start", [0.5, 1.0, 2.0])
+def test_the_cameras_rate_is_held_after_the_first_second_on_any_machine(slow: float, start: float) -> None:
+    """Also where the first guess of the machine's speed is off by a factor of two."""
+    done = play(lambda now: slow, start=start * slow)
+    assert share_taken(done) >= 0.97
+    place = done[-1].place
+    if place + 1 < len(RUNGS):  # and no more is given away than needed
+        rung = RUNGS[min(place + 2, len(RUNGS) - 1)]
+        assert slow * price(rung, USED * rung.gaussians, FULL) > 0.8 * 1e3 * SECONDS
+
+
+@pytest.mark.parametrize("shape", [(2.0, 0.8), (0.5, 1.2)])
+def test_a_machine_on_which_other_things_are_dear_holds_the_rate_too(shape: tuple[float, float]) -> None:
+    assert share_taken(play(lambda now: 1.0, shape=shape)) >= 0.97
+
+
+def test_a_machine_at_the_edge_of_two_rungs_does_not_swing() -> None:
+    rung = RUNGS[5]
+    edge = 1e3 * SECONDS / price(rung, USED * rung.gaussians, FULL)
+    for slow in np.linspace(0.85, 1.1, 11) * edge:
+        done = play(lambda now, slow=slow: slow, frames=3600)  # two minutes
+        assert len(changes(done)) <= 6, (slow, changes(done))
+
+
+def test_another_process_costs_rungs_while_it_runs_and_none_after() -> None:
+    done = play(lambda now: 2.0 if 10 < now < 20 else 1.0, frames=1800)
+    before = next(each.place for each in done if each.number >= 290)
+    during = next(each.place for each in done if each.number >= 590)
+    assert during < before and abs(done[-1].place - before) <= 1
+    assert share_taken(done, first=300, frames=600) >= 0.9
+    assert all(abs(step) == 1 for _, step in changes(done))
+    assert min(b - a for (a, _), (b, _) in itertools.pairwise(changes(done))) >= SETTLING
+
+
+def test_one_slow_frame_changes_nothing() -> None:
+    done = play(lambda now: 3.0 if 10 <= now < 10.03 else 1.0)
+    assert not [frame for frame, _ in changes(done) if 300 <= frame <= 330]
+
+
+def test_what_a_launch_pins_and_switches_off() -> None:
+    def rungs(**mapping: object) -> tuple[Rung, ...]:
+        return rungs_of(LaunchConfig(device="cpu", mapping=MappingConfig.model_validate(mapping)))
+
+    assert rungs() == RUNGS
+    assert rungs(rung=3) == (RUNGS[3],)
+    assert {rung.depth_every for rung in rungs(skip_depth=False)} == {1}
+    assert {rung.step for rung in rungs(skip_fitted=False)} == {1.0}
+    with pytest.raises(UsageError, match=r"mapping\.rung 99: the ladder's rungs are 0 to \d+"):
+        rungs(rung=99)
+
+
+def test_how_many_gaussians_a_model_may_have() -> None:
+    def most(width: int = 640, height: int = 512, **mapping: object) -> int:
+        config = LaunchConfig(device="cpu", mapping=MappingConfig.model_validate(mapping))
+        return affordable(config, width, height)
+
+    assert most() == RUNGS[-1].gaussians
+    assert most(100, 100) == 100 * 100 // 2
+    assert most(max_gaussians=777) == 777
+    assert most(rung=2) == RUNGS[2].gaussians
+    assert most(iterations=1, budget_ms=20) == 22_000
+    assert most(iterations=1, budget_ms=0.01) == 100
+
+
+def test_a_new_budget_goes_on_at_the_speed_of_the_one_before() -> None:
+    config = LaunchConfig(device="cpu")
+    fast, slow = (make_budget(config, 640, 512, speed).state for speed in (0.5, 2.0))
+    assert fast is not None and slow is not None and fast.number > slow.number

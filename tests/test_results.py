@@ -1,0 +1,77 @@
+"""Where committed figures come from: a result that nobody can place is not one."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sags_node.apps.launching import write_json
+from sags_node.benchmark.provenance import WHAT_COUNTS, provenance, revision
+
+ROOT = Path(__file__).parent.parent
+RESULTS = sorted((ROOT / "benchmarks/results").glob("*.json"))
+# Measured before results named where they come from. A file leaves this list when it is measured anew.
+EARLIER = {
+    "ablation_d4d", "ablation_phantom", "alias", "crowd", "d4d_100ms", "depth_d4d", "depth_phantom",
+    "depth_tmi", "endurance_walk", "fit_d4d", "fit_phantom", "kernels", "masks", "pareto", "skips_d4d",
+    "stream", "tracking_d4d",
+}  # fmt: skip
+
+
+def check(found: Any) -> None:
+    """A committed result's origin."""
+    origin = found["provenance"]
+    assert re.fullmatch("[0-9a-f]{12}", origin["revision"])  # not `-changed`
+    assert datetime.fromisoformat(origin["date"]).tzinfo is not None
+    assert origin["machine"] and origin["peak"]["operations_per_s"] > 1e9
+    assert origin["command"].startswith("sags ") and not re.search(r"(^|[ =])/", origin["command"])
+
+
+@pytest.mark.parametrize("file", RESULTS, ids=lambda file: file.stem)
+def test_every_result_says_where_it_comes_from(file: Path) -> None:
+    found = json.loads(file.read_text())
+    if file.stem in EARLIER:
+        assert "provenance" not in found, "take it out of EARLIER"
+    else:
+        check(found)
+
+
+def test_every_result_is_explained() -> None:
+    explained = (ROOT / "benchmarks/README.md").read_text()
+    kinds = {re.sub("^depth_.*", "depth_", file.stem) for file in RESULTS}
+    assert [kind for kind in kinds if f"results/{kind}" not in explained] == []
+
+
+def test_results_are_written_with_their_origin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.argv", ["/somewhere/bin/sags", "bench", "masks", "a b"])
+    write_json(tmp_path / "rows.json", [{"a": 1}])
+    found = json.loads((tmp_path / "rows.json").read_text())
+    assert found.pop("provenance")["command"] == "sags bench masks 'a b'" and found == {"rows": [{"a": 1}]}
+    assert set(provenance()) == {"revision", "date", "machine", "peak", "command"}
+
+
+def test_changed_sources_are_told_from_committed_ones(tmp_path: Path) -> None:
+    def git(*arguments: str) -> None:
+        who = ["-c", "user.name=a", "-c", "user.email=a@b", "-c", "commit.gpgsign=false"]
+        subprocess.run(["git", *who, *arguments], cwd=tmp_path, check=True, capture_output=True)
+
+    for name in WHAT_COUNTS:
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "file").write_text("")
+    git("init", "-q")
+    git("add", ".")
+    git("commit", "-qm", "first")
+    clean = revision(tmp_path)
+    assert re.fullmatch("[0-9a-f]{12}", clean)
+    (tmp_path / "result.json").write_text("{}")
+    revision.cache_clear()
+    assert revision(tmp_path) == clean
+    (tmp_path / "launch/file").write_text("changed")
+    revision.cache_clear()
+    assert revision(tmp_path) == f"{clean}-changed"
