@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from bag_files import KINDS, MS, ROS1, ROS2, START, picture, play
 from mcap.records import Schema
+from mcap.writer import Writer as McapWriter
 
 from sags_node.calibration import save_rig
 from sags_node.config import BagSource
@@ -19,6 +20,7 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.launch_file import load_launch
 from sags_node.messaging import cdr
 from sags_node.recording import rosbag1_check
+from sags_node.recording.bag import read_messages
 from sags_node.recording.bag_writer import BagWriter, Limits
 from sags_node.recording.info import bag_info
 from sags_node.session import open_session
@@ -93,6 +95,21 @@ def test_playing_from_anywhere_again_and_again(tmp_path: Path) -> None:
     steps = np.diff([frame.t_capture_ns for frame in looped])
     assert (steps == 40 * MS).all() and [frame.epoch for frame in looped] == [0] * 60 + [1] * 10
     assert np.array_equal(looped[61].left, picture(1, 0))
+
+
+def test_a_schema_that_stands_only_in_a_chunk_that_is_passed_over(tmp_path: Path) -> None:
+    """A channel that begins late may use the schema of an early one."""
+    file = tmp_path / "bag.mcap"
+    with file.open("wb") as opened:
+        writer = McapWriter(opened, chunk_size=1)  # a chunk for every message
+        writer.start()
+        schema = writer.register_schema("std_msgs/msg/Byte", "ros2msg", b"byte data")
+        for turn, topic in enumerate(("/early", "/late")):
+            channel = writer.register_channel(topic, "cdr", schema)
+            writer.add_message(channel, turn * MS, b"\0\1\0\0\7", turn * MS)
+        writer.finish()
+    found = [(message.topic, message.type) for message in read_messages(file, start_ns=MS)]
+    assert found == [("/late", "std_msgs/msg/Byte")]
 
 
 def test_the_recordings_own_clock_and_a_gap_in_it(tmp_path: Path) -> None:

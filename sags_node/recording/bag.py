@@ -143,7 +143,7 @@ def _read_mcap(file: Path, topics: Collection[str] | None, start_ns: int) -> Ite
                 if not isinstance(record, Entry):
                     channels.add(record)
                     continue
-                if record.channel_id not in channels:
+                if not channels.describe(record.channel_id):
                     channels.read_missed(opened)
                 channel, schema = channels.of(record, head.position)
                 if record.log_ns >= start_ns and (topics is None or channel.topic in topics):
@@ -198,8 +198,10 @@ class Channels:
                     self.add(record)
         self.missed.clear()
 
-    def __contains__(self, channel_id: int) -> bool:
-        return channel_id in self._channels
+    def describe(self, channel_id: int) -> bool:
+        """Whether channel and schema are known; a schema stands only where the first of its channels does."""
+        channel = self._channels.get(channel_id)
+        return channel is not None and channel.schema_id in self._schemas
 
     def of(self, entry: Entry, position: int) -> tuple[Channel, Schema]:
         """Channel and schema of a message.
