@@ -87,8 +87,8 @@ class Ladder:
     """Finds the rung that fills a frame's time, by what frames take.
 
     In the first frames it jumps to where the measured speed says; then it goes down by one when frames take
-    too long, and up by one when higher rungs have seemed to fit for a while, the sooner the more of them. A climb that did not hold makes
-    it more patient.
+    too long, and up by one when higher rungs have seemed to fit for a while: the more of them, the sooner. A
+    climb that did not hold makes it more patient.
 
     Attributes:
         rung: of the next frame.
