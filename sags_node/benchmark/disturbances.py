@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -18,7 +19,7 @@ from sags_node.mapping.budget import StepBudget
 from sags_node.pipeline import Pipeline
 from sags_node.session import Session
 from sags_node.sources.source import open_source
-from sags_node.types import F32, F64, I64, U8, Bool, FrameResult, RenderedView, StereoFrame
+from sags_node.types import F32, F64, I64, U8, AnchorStates, Bool, FrameResult, RenderedView, StereoFrame
 from sags_node.vision.tissue import TissueMask
 
 LEAD = 10  # frames: how long before it begins the anchors are pinned
@@ -31,6 +32,7 @@ CONFIDENT = 0.5
 SUPPORTED_SECONDS = 0.5  # a depth that was measured in this time is not borrowed
 ANCHORS = 24
 ANCHOR_WRONG = 2e-3  # m: an instrument led to such a target misses it
+ANCHOR_WRONG_PX = 8 / 640  # of the width, where depth has no truth: 1.1 mm sideways at 80 mm
 
 Advance = Callable[[int, int | None, str], None]  # frames done, of, what
 Row = dict[str, Any]
@@ -234,7 +236,11 @@ class _Run:
             if first <= frame < stop + RECOVERY and shown.depth is not None
         ]
         psnr_before = _mean([shown.psnr for shown in before])
-        warned, cleared, of = self._warned(before)
+        psnr = {frame: shown.psnr for frame, shown in self._shown.items()}
+        clean_psnr = {frame: shown.psnr for frame, shown in self._clean._shown.items()}
+        known = frozenset[str]().union(*(shown.warnings for shown in before))
+        fresh = {frame: shown.warnings - known for frame, shown in self._shown.items() if frame >= first}
+        warned, cleared = warning_times(fresh, self.during, self._rate)
         anchors = self._anchors.judge(stop + RECOVERY - 1, self._clean._anchors)
         last = max(self._shown)
         return {
@@ -249,42 +255,53 @@ class _Run:
             "confident_coverage": _least([depth.confident.coverage for depth in depths]),
             "borrowed_share": _mean([shown.borrowed for shown in within]),
             "confident_borrowed_share": _mean([shown.confident_borrowed for shown in within]),
-            "warned_after_s": warned,
-            "cleared_after_s": cleared,
-            "warned_of": of,
-            "frames_to_recover": self._recovered(psnr_before),
+            "warned_after_s": _round(warned),
+            "cleared_after_s": _round(cleared),
+            "warned_of": sorted(frozenset[str]().union(*fresh.values())),
+            "frames_to_recover": frames_to_recover(psnr, clean_psnr, stop, psnr_before),
             "restarts": self._shown[last].restarts - before[-1].restarts,
             **anchors,
         }
 
-    def _recovered(self, psnr_before: float | None) -> int | None:
-        """Frames after its end until the picture is as good as before, or as the undisturbed run's of the
-        same frame, if that is less."""
-        if psnr_before is None:
-            return None
-        good = []
-        for frame in sorted(frame for frame in self._shown if frame >= self.during.stop):
-            wanted = min(psnr_before, self._clean._shown[frame].psnr) - WITHIN_DB
-            good.append(self._shown[frame].psnr >= wanted)
-        starts = range(len(good) - STEADY + 1)
-        return next((k for k in starts if all(good[k : k + STEADY])), None)
 
-    def _warned(self, before: Sequence[_Shown]) -> tuple[float | None, float | None, list[str]]:
-        """Seconds until there is a warning that was not there before, and from the end of the disturbance
-        until there is none; and of which stages."""
-        known = frozenset[str]().union(*(shown.warnings for shown in before))
-        fresh = {
-            frame: shown.warnings - known
-            for frame, shown in self._shown.items()
-            if frame >= self.during.start and shown.warnings - known
-        }
-        if not fresh:
-            return None, None, []
-        warned = (min(fresh) - self.during.start) / self._rate
-        cleared = None
-        if max(fresh) < max(self._shown):
-            cleared = max(0, max(fresh) + 1 - self.during.stop) / self._rate
-        return _round(warned), _round(cleared), sorted(set().union(*fresh.values()))
+def frames_to_recover(
+    psnr: Mapping[int, float], clean: Mapping[int, float], stop: int, before: float | None
+) -> int | None:
+    """Frames from the end of a disturbance until `STEADY` frames in a row are within `WITHIN_DB` of what it
+    was before, or of the undisturbed run's same frames, where those are worse; None: never.
+
+    Args:
+        psnr: frame_id -> dB, of the run; lost frames are not in it.
+        clean: the same of the undisturbed run.
+        stop: the first frame after the disturbance.
+        before: dB.
+    """
+    if before is None:
+        return None
+    frames = sorted(frame for frame in psnr if frame >= stop)
+    good = [psnr[frame] >= min(before, clean[frame]) - WITHIN_DB for frame in frames]
+    starts = range(len(good) - STEADY + 1)
+    return next((k for k in starts if all(good[k : k + STEADY])), None)
+
+
+def warning_times(
+    warnings: Mapping[int, frozenset[str]], during: range, rate: float
+) -> tuple[float | None, float | None]:
+    """Seconds from the begin of a disturbance to the first warning, and from its end until there is none;
+    None: never.
+
+    Args:
+        warnings: frame_id -> the stages that warn, without those that warned before.
+        during: frames of the disturbance.
+        rate: frames per second.
+    """
+    warned = [frame for frame, stages in warnings.items() if stages and frame >= during.start]
+    if not warned:
+        return None, None
+    after = (min(warned) - during.start) / rate
+    if max(warned) == max(warnings):
+        return after, None
+    return after, max(0, max(warned) + 1 - during.stop) / rate
 
 
 class _PinnedAnchors:
@@ -292,9 +309,9 @@ class _PinnedAnchors:
 
     def __init__(self, pipeline: Pipeline) -> None:
         self.pinned = False
-        self._pipeline = pipeline
-        self._tracks: dict[int, int] = {}  # id of an anchor -> which of the recording's true points it is on
-        self._states: dict[int, tuple[F64, F64]] = {}  # frame_id -> points [A, 3] (m, world), confidence [A]
+        self._anchors, self._width = pipeline.anchors, pipeline.rectifier.camera.width
+        self._tracks: list[int] = []  # which of the recording's true points each is on, in the order of ids
+        self._states: dict[int, AnchorStates] = {}  # by frame_id
         self._truth: dict[int, F64] = {}  # frame_id -> points [A, 3] (m, world), where the recording has any
 
     def pin(self, frame: StereoFrame, result: FrameResult) -> None:
@@ -304,14 +321,13 @@ class _PinnedAnchors:
             SagsError: nothing can be pinned.
         """
         self.pinned = True
-        add = self._pipeline.anchors
         shown = result.observation, result.snapshot, result.views["left"]
         points = _true_points(frame, result)
         if points is not None:
             assert frame.reference is not None and frame.reference.points_visible is not None
             visible = np.flatnonzero(frame.reference.points_visible)
             for track in visible[:: max(1, len(visible) // ANCHORS)][:ANCHORS]:
-                self._try(int(track), partial(add.add_point, points[track], *shown))
+                self._try(int(track), partial(self._anchors.add_point, points[track], *shown))
         else:
             height, width = result.observation.tissue.shape
             columns = round((ANCHORS * width / height) ** 0.5)
@@ -319,41 +335,36 @@ class _PinnedAnchors:
             for place in range(ANCHORS):
                 u = (place % columns + 0.5) * width / columns
                 v = (place // columns + 0.5) * height / rows
-                self._try(place, partial(add.add_pixel, u, v, *shown))
+                self._try(place, partial(self._anchors.add_pixel, u, v, *shown))
         if not self._tracks:
             raise SagsError(f"nothing can be pinned in frame {frame.frame_id}; choose another --from")
 
     def _try(self, track: int, add: Callable[[], int]) -> None:
-        try:
-            self._tracks[add()] = track
-        except SagsError:
-            pass  # an instrument, or no depth there
+        with suppress(SagsError):  # an instrument, or no depth there
+            add()
+            self._tracks.append(track)
 
     def follow(self, frame: StereoFrame, result: FrameResult) -> None:
         """Note where they are said to be, and where they are."""
-        rows = {int(anchor): row for row, anchor in enumerate(result.anchors.ids)}
-        if not all(anchor in rows for anchor in self._tracks):
-            return  # pinned in this frame: stated from the next one on
-        order = [rows[anchor] for anchor in self._tracks]
-        self._states[frame.frame_id] = (
-            result.anchors.points[order].astype(np.float64),
-            result.anchors.confidence[order].astype(np.float64),
-        )
+        self._states[frame.frame_id] = result.anchors
         points = _true_points(frame, result)
         if points is not None:
-            self._truth[frame.frame_id] = points[list(self._tracks.values())]
+            self._truth[frame.frame_id] = points[self._tracks]
 
     def judge(self, frame_id: int, clean: _PinnedAnchors) -> Row:
         """Shares 0..1 of the anchors in a frame, or the first after it that came: those confident and within
         `ANCHOR_WRONG` of the truth, and those confident and farther away. The rest say that they are unsure,
-        or are lost. Without true points the truth is where the undisturbed run has them."""
+        or are lost. Without true points the truth is where the undisturbed run has them in the picture."""
         frame_id = min(frame for frame in self._states if frame >= frame_id)
-        points, confidence = self._states[frame_id]
-        truth = self._truth.get(frame_id, clean._states[frame_id][0])
-        sure = (confidence >= CONFIDENT) & np.isfinite(points).all(1)
-        right = np.linalg.norm(points - truth, axis=1) <= ANCHOR_WRONG  # NaN: not
+        states = self._states[frame_id]
+        if frame_id in self._truth:
+            offsets, most = (states.points - self._truth[frame_id]).astype(np.float32), ANCHOR_WRONG
+        else:
+            offsets, most = states.pixels - clean._states[frame_id].pixels, ANCHOR_WRONG_PX * self._width
+        sure = (states.confidence >= CONFIDENT) & np.isfinite(offsets).all(1)
+        right = np.linalg.norm(offsets, axis=1) <= most  # NaN: not
         return {
-            "anchors": len(points),
+            "anchors": len(states),
             "anchors_back": _round(float(np.mean(sure & right))),
             "anchors_wrong": _round(float(np.mean(sure & ~right))),
         }

@@ -53,6 +53,14 @@ class Scene:
             seen[..., 0] += np.float32(self.rig.baseline) / self.depths(frame_id)[1]
         return seen
 
+    def rectified_left(self, picture: F32) -> F32:
+        """A raw left picture [H, W], rectified at the calibration's size; 0 beyond its edges."""
+        eye = self.rig.left
+        x, y = cv2.initUndistortRectifyMap(
+            eye.K, eye.distortion, eye.R, eye.P[:, :3], (eye.width, eye.height), cv2.CV_32FC1
+        )
+        return np.asarray(cv2.remap(picture, x, y, cv2.INTER_LINEAR))
+
     @property
     def mirrors(self) -> tuple[F32, F32]:
         """Raw pixel [H, W, 2] of either eye that shows what would be at each pixel if the world stood upside

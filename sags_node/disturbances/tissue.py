@@ -56,6 +56,8 @@ def blood(moment: Moment) -> StereoFrame:
     frame = moment.frame
     P, height, width = moment.scene.rig.left.P, *frame.left.shape[:2]
     front = np.float32(1 - BLOOD_COVERS * moment.swell())
+    everywhere = np.ones((height, width), np.bool_) if frame.tissue is None else frame.tissue
+    tissue = moment.scene.rectified_left(everywhere.astype(np.float32))
 
     def covered(picture: U8, eye: int) -> U8:
         seen = moment.scene.in_left(eye, frame.frame_id)
@@ -65,9 +67,7 @@ def blood(moment: Moment) -> StereoFrame:
         fingers = cv2.remap(_fingers(), *pattern, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
         behind = y / height + np.float32(BLOOD_FINGERS) * fingers - front
         thick = np.clip(behind / np.float32(BLOOD_FILM), 0, 1)[..., None]
-        if frame.tissue is not None:
-            tissue = frame.tissue.astype(np.float32)
-            thick *= cv2.remap(tissue, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[..., None]
+        thick *= cv2.remap(tissue, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[..., None]
         linear = to_linear(picture)
         light = cv2.GaussianBlur(linear.mean(-1), (0, 0), 0.05 * width)[..., None]
         passes = np.exp(-BLOOD_ABSORBS * thick)
