@@ -25,7 +25,7 @@ from sags_node.disturbances import DISTURBANCES
     multiple=True,
     type=click.Choice(list(DISTURBANCES)),
     metavar="NAME",
-    help="Of these alone; may be given several times. Default: all.",
+    help="These alone; may be given several times. Default: all. The undisturbed run is always played.",
 )
 @click.option(
     "--from",
@@ -74,7 +74,7 @@ def bench_disturbances(
     cut           another scene for ten frames
     lost_frames, jpeg               a fifth of the frames; a capture card that compresses too much
 
-    Takes some ten seconds each. Keys: benchmarks/disturbances.md.
+    Takes ten to thirty seconds each. Keys: benchmarks/disturbances.md.
 
     \b
     sags bench disturbances launch/d4d_pull.yaml --json disturbances.json --pictures out/disturbances
