@@ -302,7 +302,7 @@ class NodeHealth:
     rss_mb: float
     skipped: Mapping[str, int]  # rule -> frames
     last_error: str | None = None
-    warnings: Mapping[str, str] = field(default_factory=dict)  # stage -> what is wrong and how to mend it
+    warnings: Mapping[str, tuple[Finding, ...]] = field(default_factory=dict)  # by stage, `findings`
     connections: Mapping[str, Mapping[str, int]] = field(default_factory=dict)  # socket -> open, refused
     views: Mapping[str, ViewStatus] = field(default_factory=dict)  # those that consumers asked for, by name
     rung: RungState | None = None  # None: fixed steps, or no frame yet

@@ -7,7 +7,7 @@ import numpy as np
 
 from sags_node.config import StereoConfig
 from sags_node.errors import UsageError
-from sags_node.types import F32, U8, Bool, Camera, GrayPyramid, RectifiedPair
+from sags_node.types import F32, U8, Bool, Camera, Finding, GrayPyramid, RectifiedPair
 from sags_node.vision.alignment import RowMonitor
 from sags_node.vision.dense_depth import depth_of_patches, depth_of_pixels
 from sags_node.vision.margin import clear_of_instruments
@@ -77,6 +77,16 @@ class StereoDepth:
             (self._smallest, self._largest),
             round(SMOOTHING_RADIUS * self._size[0]),
             self._focal_baseline,
+        )
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What is wrong with the rig, as far as matching tells. May be read from any thread."""
+        alignment = self.rows.alignment
+        return (
+            (Finding("rows_differ", alignment.warning),)
+            if alignment is not None and alignment.warning
+            else ()
         )
 
     def judge(self, pair: RectifiedPair, disparity: F32, tissue: Bool) -> tuple[F32, F32]:
