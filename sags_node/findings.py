@@ -39,6 +39,8 @@ STAGES: Mapping[str, str] = {  # code -> which stage of the work it is about
     "frames_missed": "capture",
 }
 
+OF_THE_FLOW = frozenset({"source", "capture"})  # stages whose warnings make nothing that is shown less sure
+
 Findings = Mapping[str, tuple[Finding, ...]]  # by stage; a stage without any is left out
 NOTHING: Findings = {}
 

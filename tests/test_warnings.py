@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import io
 import json
 import re
 from collections.abc import Iterator
@@ -11,15 +12,25 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from synthetic import health
+from rich.console import Console
+from synthetic import health, plane_result, publisher, stream
 
 from sags_node.apps.notices import Notices
+from sags_node.apps.overlay_draw import color_key, draw
+from sags_node.apps.overlay_frame import TissueFrame
 from sags_node.apps.overlay_mark import draw_mark, headlines
+from sags_node.apps.run import run_node
+from sags_node.apps.topic import topic_echo
+from sags_node.evaluation.measure import FrameRow, Options
+from sags_node.evaluation.report import _warning_table
+from sags_node.evaluation.spool import RunFacts
+from sags_node.evaluation.summary import summarise
 from sags_node.findings import STAGES, by_code, by_stage, in_words
 from sags_node.health import MOST_LEFT_OUT, WINDOW, Statistics
 from sags_node.messaging.cdr import decode
 from sags_node.messaging.content import diagnostics, status
-from sags_node.types import Finding
+from sags_node.types import Camera, Finding, NodeHealth
+from sags_node.viewer.feed import Moment, Status
 
 ROOT = Path(__file__).parent.parent
 BLACK = Finding("right_eye_black", "the right picture is black: see to the light")
@@ -105,8 +116,6 @@ def test_codes_stand_beside_the_words() -> None:
 
 def flowing(statistics: Statistics, frames: int, dropped: int, slot: str, before: int = 0) -> set[str]:
     """Codes after so many frames more, over which so many were left out."""
-    from synthetic import plane_result
-
     result = plane_result()
     for number in range(frames):
         statistics.add(result, 1.0, {slot: before + dropped * (number + 1) // frames})
@@ -163,3 +172,75 @@ def test_the_mark_lies_farther_left_in_the_right_eye(shift: int) -> None:
     draw_mark(left, by_code({"eyes": (BLACK,)}))
     draw_mark(right, by_code({"eyes": (BLACK,)}), shift)
     assert left.any() and np.array_equal(left[:, shift:], right[:, :-shift])
+
+
+def test_the_mark_is_drawn_over_instruments_in_both_eyes_and_survives_the_colour_key() -> None:
+    size = (240, 320)
+    K = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
+    frame = TissueFrame(
+        1, 1, "s", 0, Camera(320, 240, K, np.eye(4)), 0.004, np.full(size, 0.06, np.float32),
+        np.zeros(size, np.bool_), {},
+    )  # fmt: skip
+    for baseline in (0.0, 0.004):
+        assert not draw(frame, [], baseline).any()
+        rgba = draw(frame, [], baseline, warnings=by_code({"eyes": (BLACK,)}))
+        shown = rgba[..., 3] == 255
+        assert shown.any() and np.array_equal(color_key(rgba, (0, 0, 255))[shown], rgba[shown][:, :3])
+
+
+class Playing:
+    """A node as `sags run` sees it: what it warns of at each look."""
+
+    def __init__(self, *looks: tuple[Finding, ...]) -> None:
+        self._looks = list(looks)
+
+    def start(self) -> None: ...
+
+    def stop(self) -> None: ...
+
+    def wait(self, timeout: float) -> bool:
+        return not self._looks
+
+    def health(self) -> NodeHealth:
+        found = self._looks.pop(0) if self._looks else ()
+        return replace(health(), warnings=by_stage(found))
+
+
+def test_sags_run_says_when_a_warning_begins_and_ends() -> None:
+    said = io.StringIO()
+    run_node(Playing((), (BLACK,), (BLACK,), ()), None, Console(file=said, width=60))  # type: ignore[arg-type]
+    began, over = said.getvalue().splitlines()
+    assert BLACK.text in began and "over" in over and BLACK.code in over
+
+
+def test_the_report_says_when_and_what_to_do() -> None:
+    facts = RunFacts(0, 1.0, None, 1.0, {}, {}, 1, {})
+    warned = replace(facts, warnings={BLACK.code: "<" + BLACK.text})
+    rows = [FrameRow(k, k / 30, {}, warned if 3 <= k < 8 else facts) for k in range(10)]
+    table = _warning_table(rows)
+    assert "5 frames, 3 to 7" in table and "&lt;" + BLACK.text in table and BLACK.code in table
+    assert _warning_table(rows[:3]) == ""
+    assert summarise("s", rows, Options(hold_out=0), {}, None)["warnings"] == {BLACK.code: 5}
+
+
+@pytest.mark.live
+def test_topic_echo_tells_of_warnings_whatever_the_topic(tmp_path: Path) -> None:
+    warned = replace(health(), warnings=by_stage([BLACK]))
+    told: list[dict[str, str]] = []
+    with publisher(tmp_path / "run") as running:
+        with stream(running, said=lambda: warned):
+            where = running.connection.data[-1]
+            records = []
+            for record in topic_echo("tf", where, seconds=20, warned=lambda found: told.append(dict(found))):
+                records.append(record["topic"])
+                if told:
+                    break
+    assert set(records) == {"sags/tf"} and told[0] == {BLACK.code: BLACK.text}
+
+
+def test_the_viewer_shows_them_below_the_status() -> None:
+    panel = pytest.importorskip("sags_node.viewer.panel", reason="viser is not installed (extra: viewer)")
+    status = Status("running", warning_codes={BLACK.code: f"<b>{BLACK.text}"})
+    shown = panel._status_line(Moment(None, status))
+    assert f"&lt;b&gt;{BLACK.text}" in shown and BLACK.code in shown and "sags-warning" in shown
+    assert "sags-warning" not in panel._status_line(Moment(None, Status("running")))

@@ -27,6 +27,7 @@ from sags_node.apps.overlay_save import Output
 from sags_node.apps.overlay_scene import SceneSpec, built_in, read_scene
 from sags_node.apps.overlay_stream import OverlayStream
 from sags_node.errors import SagsError, UsageError
+from sags_node.findings import OF_THE_FLOW, STAGES
 from sags_node.messaging.address import ClientKeys, find_control
 from sags_node.messaging.control import ControlClient
 from sags_node.messaging.received import Received, ReceivedImage, ReceivedText, TopicName
@@ -264,7 +265,9 @@ class _Overlay:
         if (frame.session, frame.epoch) != self._source:
             self._source, self._epoch = (frame.session, frame.epoch), self._epoch + 1
         began = time.perf_counter()
-        warnings = self._warnings
+        warnings = {
+            code: said for code, said in self._warnings.items() if STAGES.get(code) not in OF_THE_FLOW
+        }
         pictures = {"left": overlay_draw.draw(frame, placed, note=self._note(), warnings=warnings)}
         if frame.baseline is not None and self._stream.wants("right"):
             pictures["right"] = overlay_draw.draw(frame, placed, frame.baseline, warnings=warnings)

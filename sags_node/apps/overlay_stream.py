@@ -90,7 +90,8 @@ class OverlayStream:
 
     def tell(self, facts: dict[str, Any]) -> None:
         """Send `status` when it is due, and at once when the state or a warning changes."""
-        state = ("running" if self.reason is None else "blank", self.reason, tuple(facts["warning_codes"]))
+        warned = tuple(facts.get("warning_codes", ()))
+        state = ("running" if self.reason is None else "blank", self.reason, warned)
         if state == self._state and time.monotonic() < self._status_due:
             return
         self._state, self._status_due = state, time.monotonic() + STATUS_PERIOD
