@@ -65,4 +65,4 @@ def _fitted(text: str, width: int, scale: float, thickness: int) -> str:
 
 def _width(text: str, scale: float, thickness: int) -> int:
     (across, _), _ = cv2.getTextSize(text, FONT, scale, thickness)
-    return across
+    return int(across)
