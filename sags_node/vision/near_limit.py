@@ -87,11 +87,11 @@ class NearLimit:
         there = columns - disparity
         seen = cv2.remap(second, there, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         small = tissue[scale // 2 :: scale, scale // 2 :: scale][:height, :width]
-        known = small & (there >= 0) & (_agreement(first, seen) > MATCHES)
         both = small & (there >= 0)
+        known = both & (_agreement(first, seen) > MATCHES)
         count = round(LEAST_SHARE * np.count_nonzero(both))
-        found = disparity[known]
-        if count == 0 or len(found) <= count:
+        found = disparity[known & (disparity > 0)]
+        if count == 0 or len(found) < count:
             return np.inf
         return float(self._focal_baseline / scale / np.partition(found, -count)[-count])
 
