@@ -6,6 +6,7 @@ import ast
 import io
 import json
 import re
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -29,6 +30,11 @@ from sags_node.findings import STAGES, by_code, by_stage, in_words
 from sags_node.health import MOST_LEFT_OUT, WINDOW, Statistics
 from sags_node.messaging.cdr import decode
 from sags_node.messaging.content import diagnostics, status
+from sags_node.messaging.received import ReceivedText
+from sags_node.messaging.subscriber import Subscriber
+from sags_node.node import Node
+from sags_node.pipeline import Pipeline
+from sags_node.session import open_session
 from sags_node.types import Camera, Finding, NodeHealth
 from sags_node.viewer.feed import Moment, Status
 
@@ -109,6 +115,35 @@ def test_codes_stand_beside_the_words() -> None:
         black.code: black.text,
         other.code: other.text,
     }
+
+
+@pytest.mark.live
+def test_a_node_says_at_once_what_begins_and_what_ends(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between two of the messages that come every second."""
+    found: list[Finding] = []
+    monkeypatch.setattr(Pipeline, "warnings", property(lambda self: by_stage(found)))
+    overrides = ["source.loop:=true", "source.rate:=10", "mapping.iterations:=0", "publish.control:=null"]
+    overrides += ["publish.data:=[tcp://127.0.0.1:*]", f"publish.run_dir:={tmp_path / 'run'}"]
+    session = open_session(ROOT / "replay/phantom_pull", overrides)
+    node = Node(session.config, session.rig, session.source)
+    node.start()
+    try:
+        with Subscriber(["status"], run_dir=tmp_path / "run") as subscriber:
+            last = subscriber.wait("status", 30)
+            delays = []
+            for wanted in 3 * ([BLACK], []):
+                last = subscriber.wait("status", 5, after=last)  # the next is due in a second
+                changed = time.time_ns()
+                found[:] = wanted
+                while not isinstance(last, ReceivedText) or last.warnings() != by_code(by_stage(wanted)):
+                    last = subscriber.wait("status", 5, after=last)
+                    assert last is not None
+                delays.append((last.meta.publish_ns - changed) * 1e-9)
+    finally:
+        node.stop()
+    assert np.median(delays) < 0.5
 
 
 # ---- the flow of frames ----------------------------------------------------------------------------------
