@@ -114,6 +114,21 @@ def test_the_limit_comes_at_once_and_goes_slowly(monkeypatch: pytest.MonkeyPatch
     assert set(limits[came:-1]) == {limits[came]} and limits[-1] == USUAL_NEAREST
 
 
+@pytest.mark.usefixtures("data_folder")
+@pytest.mark.parametrize("source", [PHANTOM, ROOT / "launch/d4d_pull.yaml"])
+def test_pictures_that_do_not_belong_together_move_nothing(source: Path) -> None:
+    for pair, _ in shown(source, 1.0, 3):
+        assert pair.right is not None
+        other = replace(pair, right=np.ascontiguousarray(pair.right[::-1]), gray=None)
+        exchanged = replace(pair, left=pair.right, right=pair.left, gray=None)
+        for wrong in (other, exchanged):
+            left, right = pyramids(wrong)
+            assert right is not None
+            limit = NearLimit(StereoConfig(), float(pair.camera.K[0, 0]) * pair.baseline)
+            limit.look(0, left, right, everywhere(pair))
+            assert limit.limit == USUAL_NEAREST
+
+
 def test_what_is_nearer_than_a_scope_sees_is_not_searched() -> None:
     pairs = shown(PHANTOM, NEAR / 2)
     pair, _ = pairs[0]

@@ -9,9 +9,7 @@ from sags_node.errors import UsageError
 from sags_node.types import U8
 
 WIDTH = 80  # px of the pictures that are compared: noise and compression are averaged away in them
-SURELY = (
-    0.25  # of what a shift by one of their pixels changes; the eyes of a scope differ by 1 to 5 of it
-)
+SURELY = 0.25  # of what a shift by one of their pixels changes; the eyes of a scope differ by 1 to 5 of it
 LEAST = 1.0  # grey levels, of such a shift: less is a picture of nothing, which tells nothing
 
 
