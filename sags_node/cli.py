@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import signal
 import tempfile
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -96,6 +95,7 @@ def run(launch: tuple[str, ...], seconds: float | None, json_out: bool) -> None:
     from sags_node.apps.run import health_table, run_node
     from sags_node.config import PhantomSource
     from sags_node.launch_file import load_launch
+    from sags_node.messaging.content import health_fields
     from sags_node.node import Node
 
     path, overrides = split(launch)
@@ -106,7 +106,7 @@ def run(launch: tuple[str, ...], seconds: float | None, json_out: bool) -> None:
     where = escape(", ".join(node.endpoints))
     console.print(f"publishing on {where} as [bold]{session.config.ns}/...[/]  (Ctrl-C ends)", soft_wrap=True)
     health = run_node(node, seconds, console)
-    show(asdict(health) if json_out else health_table(health))
+    show(health_fields(health) if json_out else health_table(health))
 
 
 @main.command()

@@ -154,6 +154,7 @@ def convert(path: Path, output: Path, size: tuple[int, int] | None, unit: str | 
 @click.option("--square-mm", type=positive, required=True, help="Side of a square.")
 @click.option("--marker-mm", type=positive, help="Side of a marker; charuco only.")
 @click.option("--dictionary", metavar="NAME", help="Of the markers, e.g. 4X4_50; charuco only.")
+@click.option("--legacy", is_flag=True, help="Printed by an OpenCV before 4.6; charuco only.")
 @click.option(
     "--coefficients",
     type=click.Choice(["2", "3", "6"]),
@@ -201,21 +202,26 @@ def stereo(
 
 
 def _board(
-    squares: tuple[int, int], board: str, square_mm: float, marker_mm: float | None, dictionary: str | None
+    squares: tuple[int, int],
+    board: str,
+    square_mm: float,
+    marker_mm: float | None,
+    dictionary: str | None,
+    legacy: bool,
 ) -> Board:
     from sags_node.calibration.boards import Charuco, Chessboard
 
     if min(squares) < 4:
         raise UsageError(f"--squares {squares[0]}x{squares[1]}: a board needs 4 squares along each side")
     if board == "chessboard":
-        if marker_mm is not None or dictionary is not None:
-            raise UsageError("--marker-mm and --dictionary belong to --board charuco")
+        if marker_mm is not None or dictionary is not None or legacy:
+            raise UsageError("--marker-mm, --dictionary and --legacy belong to --board charuco")
         return Chessboard(squares, square_mm * 1e-3)
     if marker_mm is None or dictionary is None:
         raise UsageError("--board charuco needs --marker-mm and --dictionary")
     if marker_mm >= square_mm:
         raise UsageError(f"--marker-mm {marker_mm:g} must be below --square-mm {square_mm:g}")
-    return Charuco(squares, square_mm * 1e-3, marker_mm * 1e-3, dictionary)
+    return Charuco(squares, square_mm * 1e-3, marker_mm * 1e-3, dictionary, legacy)
 
 
 def _grab(live: Path, board: Board, folder: Path, count: int) -> tuple[Path, Path]:

@@ -130,10 +130,14 @@ def topic_list(endpoint: str | None, ns: str, seconds: float, json_out: bool, ke
 def topic_echo(
     name: str, endpoint: str | None, ns: str, count: int | None, json_out: bool, keys: Any
 ) -> None:
-    """Print the messages of topic NAME; bulk data as shape and range."""
+    """Print the messages of topic NAME; bulk data as shape and range, warnings on stderr."""
     from sags_node.apps import topic as tool
+    from sags_node.apps.notices import Notices
 
-    for message in tool.topic_echo(name, endpoint=endpoint, ns=ns, count=count, keys=keys):
+    notices = Notices(lambda line: console.print(line, markup=False, soft_wrap=True))
+    for message in tool.topic_echo(
+        name, endpoint=endpoint, ns=ns, count=count, keys=keys, warned=notices.update
+    ):
         show(message if json_out else text.echo_text(message))
 
 

@@ -176,6 +176,9 @@ Source = Annotated[
 # ---- the stages ------------------------------------------------------------------------------------------
 
 
+USUAL_NEAREST = 0.03  # m: scopes work at 50 to 100 mm, an organ that swells towards one comes to 30
+
+
 class StereoConfig(Section):
     """Depth from the rectified pair."""
 
@@ -183,14 +186,21 @@ class StereoConfig(Section):
     scale: Literal[1, 2, 4] | None = Field(
         None, description="divide the working size by this for matching; default: 2 from 480 px width, else 1"
     )
-    min_depth: float = Field(0.03, gt=0, description="m")
+    min_depth: float | None = Field(
+        None, gt=0, description="m; default: 0.03, and down to 0.01 where the pictures show something so near"
+    )
     max_depth: float = Field(0.30, gt=0, description="m")
 
     @model_validator(mode="after")
     def _ordered(self) -> StereoConfig:
-        if self.min_depth >= self.max_depth:
-            raise ValueError(f"min_depth {self.min_depth} must be below max_depth {self.max_depth}")
+        if self.nearest >= self.max_depth:
+            raise ValueError(f"min_depth {self.nearest} must be below max_depth {self.max_depth}")
         return self
+
+    @property
+    def nearest(self) -> float:
+        """m: what nothing is nearer than, as long as no picture says otherwise."""
+        return USUAL_NEAREST if self.min_depth is None else self.min_depth
 
 
 class Normalization(Section):

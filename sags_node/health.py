@@ -11,10 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
-from sags_node.types import FrameResult, NodeHealth, RungState, ViewStatus
+from sags_node.findings import Findings, by_stage
+from sags_node.types import Finding, FrameResult, NodeHealth, RungState, ViewStatus
 
 WAITING_AFTER = 1.0  # s without a frame
 WINDOW = 150  # frames behind the published rates and latencies
+MOST_LEFT_OUT = 0.1  # of the frames; a strict reader refuses what comes less often (`messaging.freshness`)
+BACK_AT = 0.8  # of that: a warning ends
 
 
 class Statistics:
@@ -29,9 +32,13 @@ class Statistics:
         self._gaussians = 0
         self._rung: RungState | None = None
         self._started = False
+        self._left_out: deque[Mapping[str, int]] = deque(maxlen=WINDOW)  # slot -> frames, since the start
+        self._too_many: set[str] = set()  # slots that leave out too much
 
-    def add(self, result: FrameResult, latency_ms: float) -> None:
+    def add(self, result: FrameResult, latency_ms: float, dropped: Mapping[str, int]) -> None:
+        """Take a published frame; `dropped`: how many each slot has left out until now."""
         with self._lock:
+            self._left_out.append(dropped)
             self._started = True
             self._published.append(time.monotonic())
             self._latency.append(latency_ms)
@@ -53,7 +60,7 @@ class Statistics:
         stopping: bool,
         paused: bool,
         error: BaseException | None,
-        warnings: dict[str, str],
+        warnings: Findings,
         connections: dict[str, dict[str, int]],
         views: Mapping[str, ViewStatus],
     ) -> NodeHealth:
@@ -87,11 +94,34 @@ class Statistics:
                 rss_mb=resident_mb(),
                 skipped=dict(self._skipped),
                 last_error=str(error) if error else None,
-                warnings=warnings,
+                warnings={**warnings, **by_stage(self._findings(state, now))},
                 connections=connections,
                 views=views,
                 rung=self._rung,
             )
+
+    def _findings(self, state: str, now: float) -> list[Finding]:
+        """What the flow of frames says; asked with the lock held."""
+        found = []
+        if state == "waiting":
+            said = f"no frame for {now - self._published[-1]:.0f} s" if self._published else "no frame comes"
+            mend = "see to the camera, its cable and the capture card"
+            found.append(Finding("no_frames", f"{said}: {mend}"))
+        if self._leaves_out_too_many("source"):
+            mend = "is one camera away, source.pair_tolerance_ms too small, or the disk slow?"
+            found.append(Finding("source_drops", f"the source leaves out over a tenth of its frames: {mend}"))
+        if self._leaves_out_too_many("capture"):
+            mend = "end other programs, or lower mapping.max_gaussians, vision.width and vision.height"
+            said = "over a tenth of the frames is left out, as this machine is too slow for them"
+            found.append(Finding("frames_missed", f"{said}: {mend}"))
+        return found
+
+    def _leaves_out_too_many(self, slot: str) -> bool:
+        if len(self._left_out) == WINDOW:
+            count = self._left_out[-1].get(slot, 0) - self._left_out[0].get(slot, 0)
+            limit = MOST_LEFT_OUT * (BACK_AT if slot in self._too_many else 1.0)
+            (self._too_many.add if count > limit * (count + WINDOW - 1) else self._too_many.discard)(slot)
+        return slot in self._too_many
 
 
 def resident_mb() -> float:

@@ -23,6 +23,7 @@ _PATH_KEYS = (
 MOST_MISTAKES = 10  # named at once
 DEFAULT_DATA = "../shared/data"
 BAG_SUFFIXES = (".mcap", ".db3", ".bag")
+VIDEO_SUFFIXES = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".ts", ".wmv")
 SIDECAR_TYPE = "dvrk_data:video_sidecar@"
 SIDECAR_LOOK = 65536  # bytes at either end; jsoncpp sorts the keys, so the type comes after the frames
 
@@ -44,6 +45,12 @@ def load_launch(path: Path | str | None = None, overrides: Sequence[str] = ()) -
         recording = _known_recording(file)
         if file.is_dir() and recording is None:
             file = file / "launch.yaml"
+        elif file.suffix.lower() in VIDEO_SUFFIXES:
+            raise UsageError(
+                f"{file} is a video, not a launch file; write source.kind:=side_by_side source.video:={file} "
+                f"(both eyes in it), or source.kind:=videos source.left:={file} source.right:=OTHER, and "
+                "rig:=CALIBRATION"
+            )
         name = str(file)
         if recording is not None:
             tree = recording
@@ -58,8 +65,9 @@ def load_launch(path: Path | str | None = None, overrides: Sequence[str] = ()) -
         raise UsageError(_explain(error, name)) from None
     if config.one_camera and config.vision.onnx.path is None:
         raise UsageError(
-            f"{name}: source.right is missing; with one camera alone depth comes from a monocular network: "
-            "set vision.onnx.path"
+            f"{name}: source.right is missing: name the right eye's pictures. With one camera alone depth "
+            "comes from a monocular network: set vision.onnx.path, and vision.onnx.declared_depth to the "
+            "distance to the middle of the first picture, m; docs/depth.md has an example under 'One eye'"
         )
     return config
 

@@ -26,6 +26,7 @@ import numpy as np
 
 from sags_node.config import LaunchConfig, V4l2Source
 from sags_node.errors import SagsError
+from sags_node.findings import by_code
 from sags_node.health import Statistics
 from sags_node.kernels.threads import configure_threads
 from sags_node.latest import Latest
@@ -158,11 +159,7 @@ class Node:
     def health(self) -> NodeHealth:
         """What is true now; may be called from any thread."""
         return self._stats.health(
-            dropped={
-                "source": self._source.dropped,
-                "capture": self._frames.dropped,
-                "publish": self._results.dropped,
-            },
+            dropped=self._dropped(),
             stopping=self._stopping.is_set(),
             paused=self._paused.is_set(),
             error=self._error,
@@ -170,6 +167,14 @@ class Node:
             connections=self._publisher.connections,
             views=self._views.status,
         )
+
+    def _dropped(self) -> dict[str, int]:
+        """Slot -> frames left out since the start."""
+        return {
+            "source": self._source.dropped,
+            "capture": self._frames.dropped,
+            "publish": self._results.dropped,
+        }
 
     def _guard(self, name: str, work: Callable[[], None], after: Callable[[], None]) -> None:
         """Run one thread's work; its failure ends the node in order, and is raised by `wait`."""
@@ -254,6 +259,7 @@ class Node:
     def _publish(self) -> None:
         self._parameters_changed.set()
         next_health = time.monotonic()
+        warned: tuple[str, ...] = ()
         while not self._results.closed:
             if self._publisher.poll(timeout_ms=100, wake_fd=self._wake):
                 os.eventfd_read(self._wake)
@@ -267,7 +273,8 @@ class Node:
             if picture is not None:
                 self._publisher.publish_picture(*picture)
             self._send_views()
-            if time.monotonic() >= next_health or self._state_changed.is_set():
+            before, warned = warned, tuple(by_code(self._pipeline.warnings))
+            if time.monotonic() >= next_health or self._state_changed.is_set() or warned != before:
                 self._state_changed.clear()
                 next_health = time.monotonic() + HEALTH_PERIOD
                 self._publisher.publish_health(self.health())
@@ -279,7 +286,7 @@ class Node:
         publish_ms = (time.perf_counter() - started) * 1e3
         latency_ms = (time.time_ns() - result.pair.t_capture_ns) * 1e-6
         result = replace(result, timings_ms={**result.timings_ms, "publish": publish_ms})
-        self._stats.add(result, latency_ms)
+        self._stats.add(result, latency_ms, self._dropped())
         self._last_sent = result
         if self._on_result is not None:
             self._on_result(result, latency_ms)

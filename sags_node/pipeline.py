@@ -11,6 +11,7 @@ import numpy as np
 
 from sags_node.config import LaunchConfig
 from sags_node.engine.rasterize import to_view
+from sags_node.findings import Findings, by_stage
 from sags_node.mapping.anchors import Anchors
 from sags_node.mapping.budget import Budget
 from sags_node.mapping.camera_tracker import CameraTracker
@@ -22,6 +23,7 @@ from sags_node.types import (
     AnchorStates,
     Bool,
     Camera,
+    Finding,
     FrameResult,
     Observation,
     RectifiedPair,
@@ -96,22 +98,20 @@ class Pipeline:
         return self._mapped
 
     @property
-    def warnings(self) -> dict[str, str]:
-        """Stage -> what is wrong and how to mend it. May be read from any thread."""
-        alignment = self.stereo.rows.alignment
-        found = {"calibration": alignment.warning} if alignment is not None and alignment.warning else {}
+    def warnings(self) -> Findings:
+        """What is wrong and how to mend it. May be read from any thread."""
+        found = [*self._eyes.findings, *self.stereo.findings]
         lost = None if self._tracker is None else self._tracker.lost
         if lost is not None:
-            found["pose"] = f"the camera is lost: {lost}"
+            back = "bring the scope back to tissue that it saw before"
+            found.append(Finding("camera_lost", f"the camera is lost: {lost}; {back}"))
         if self._network is not None and self._network.problem:
-            found["network"] = self._network.problem
+            found.append(Finding("network_failed", self._network.problem))
         if self.tissue.problem:
-            found["mask"] = self.tissue.problem
-        if self._eyes.warning:
-            found["eyes"] = self._eyes.warning
-        if self._refiner.problem:
-            found["device"] = self._refiner.problem
-        return found
+            found.append(Finding("mask_missing", self.tissue.problem))
+        if self._refiner.problem is not None:
+            found.append(self._refiner.problem)
+        return by_stage(found)
 
     def reconfigure(self, config: LaunchConfig) -> None:
         """Take changed parameters over; the model stays."""

@@ -22,6 +22,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -224,6 +225,13 @@ class AnchorStates:
         return AnchorStates(np.empty(0, np.int64), empty(3), empty(2), empty(), empty(), empty())
 
 
+class Finding(NamedTuple):
+    """Something a person should know of: a warning."""
+
+    code: str  # stable, e.g. right_eye_dark; explained in docs/warnings.md
+    text: str  # what is wrong and how to mend it
+
+
 @dataclass(frozen=True, slots=True)
 class RungState:
     """On which rung of the ladder of quality the frames are worked (`mapping.ladder`)."""
@@ -294,7 +302,7 @@ class NodeHealth:
     rss_mb: float
     skipped: Mapping[str, int]  # rule -> frames
     last_error: str | None = None
-    warnings: Mapping[str, str] = field(default_factory=dict)  # stage -> what is wrong and how to mend it
+    warnings: Mapping[str, tuple[Finding, ...]] = field(default_factory=dict)  # by stage, `findings`
     connections: Mapping[str, Mapping[str, int]] = field(default_factory=dict)  # socket -> open, refused
     views: Mapping[str, ViewStatus] = field(default_factory=dict)  # those that consumers asked for, by name
     rung: RungState | None = None  # None: fixed steps, or no frame yet

@@ -124,7 +124,10 @@ def publisher(run_dir: Path, **config: Any) -> Iterator[Publisher]:
 
 @contextmanager
 def stream(
-    running: Publisher, frame: Callable[[int], FrameResult] | None = None, rate: float = 30.0
+    running: Publisher,
+    frame: Callable[[int], FrameResult] | None = None,
+    rate: float = 30.0,
+    said: Callable[[], NodeHealth] = health,
 ) -> Iterator[None]:
     """Publish `frame(i)` (default: the plane, now) and every third time health, from one thread."""
     plane = plane_result()
@@ -136,7 +139,7 @@ def stream(
         while not stop.is_set():
             running.publish_result(make(i), dropped=i // 2)
             if i % 3 == 0:
-                running.publish_health(health())
+                running.publish_health(said())
             running.poll(int(1000 / rate))
             i += 1
 

@@ -68,10 +68,11 @@ def chessboard_print(squares: tuple[int, int] = SQUARES) -> Print:
     return Print(cv2.copyMakeBorder(board, *[TEXELS] * 4, cv2.BORDER_CONSTANT, value=235), 2 * TEXELS - 0.5)
 
 
-def charuco_print() -> Print:
+def charuco_print(squares: tuple[int, int] = SQUARES, legacy: bool = False) -> Print:
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
-    board = cv2.aruco.CharucoBoard(SQUARES, SQUARE, 0.75 * SQUARE, dictionary)
-    picture = board.generateImage((SQUARES[0] * TEXELS, SQUARES[1] * TEXELS))
+    board = cv2.aruco.CharucoBoard(squares, SQUARE, 0.75 * SQUARE, dictionary)
+    board.setLegacyPattern(legacy)
+    picture = board.generateImage((squares[0] * TEXELS, squares[1] * TEXELS))
     return Print(cv2.copyMakeBorder(picture, *[TEXELS] * 4, cv2.BORDER_CONSTANT, value=235), 2 * TEXELS - 0.5)
 
 
@@ -251,6 +252,19 @@ def test_wrong_number_of_squares(chess_pairs: list[tuple[U8, U8]], tmp_path: Pat
     assert code == 1 and "a board of 10x7 squares is seen" in err
 
 
+@pytest.mark.parametrize("legacy", [False, True])
+def test_charuco_of_the_legacy_pattern(legacy: bool) -> None:
+    """A board with an even number of rows: its markers lie on the other squares."""
+    squares = SQUARES[0], SQUARES[1] - SQUARES[1] % 2
+    picture = charuco_print(squares, legacy).picture
+    corners = (squares[0] - 1) * (squares[1] - 1)
+    seen, other = (
+        Charuco(squares, SQUARE, 0.75 * SQUARE, "4X4_50", said).find(picture) for said in (legacy, not legacy)
+    )
+    assert seen is not None and len(seen.ids) == corners
+    assert other is None or len(other.ids) < corners / 2
+
+
 def test_wrong_dictionary_and_wrong_charuco(tmp_path: Path) -> None:
     left, right = draw_pairs(charuco_print(), poses()[:1])[0]
     gray = left[..., 0]
@@ -279,6 +293,7 @@ def test_counts_that_differ(chess_folders: tuple[Path, Path], tmp_path: Path, ch
         ),
         (["left", "right", "--board", "charuco", "--marker-mm", "3", "--dictionary", "9X9"], "known are"),
         (["left", "right", "--marker-mm", "3"], "belong to --board charuco"),
+        (["left", "right", "--legacy"], "belong to --board charuco"),
         (["gone_left", "gone_right"], "picture folder gone_left does not exist"),
     ],
 )

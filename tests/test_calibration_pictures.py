@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,7 +21,8 @@ from sags_node.calibration.rows import rectified_rows
 from sags_node.cli import main
 from sags_node.errors import SagsError
 from sags_node.sources.pictures import read_picture
-from sags_node.types import U8, StereoRig
+from sags_node.types import U8, Eye, StereoFrame, StereoRig
+from sags_node.vision.rectify import Rectifier
 
 Pairs = list[tuple[U8, U8]]
 F7 = "hamlyn_f7_pair"
@@ -216,6 +218,40 @@ def test_rectified_pictures_swapped(data_folder: Path) -> None:
     rig = load_rig(Path(__file__).parent.parent / "calib/hamlyn_heart")
     assert worst(check_pictures(rig, pairs)).level == "ok"
     assert "the pictures are swapped" in worst(check_pictures(rig, swapped(pairs))).what
+
+
+def test_principal_points_far_apart_are_not_taken_for_a_swap(phantom: tuple[StereoRig, Pairs]) -> None:
+    """Rectified pictures whose right one is cut out farther to the right than the calibration says: points
+    seem to lie behind the eyes, as in exchanged ones. Only whoever covers a lens can tell which it is."""
+    rig, pairs = phantom
+    rectifier = Rectifier(rig, rig.left.width, rig.left.height)
+    left, right = rectified(rectifier, pairs[0])
+    shift = rig.left.width * 97 // 640
+    moved = np.zeros_like(right)
+    moved[:, shift:] = right[:, :-shift]
+    said = worst(check_pictures(plain_rig(rectifier, 0.0), [(left, moved)]))
+    assert said.level == "error" and "or their principal points differ by at least" in said.what
+    least = int(re.findall(r"at least (\d+) px", said.what)[0])
+    assert 0 < least < shift and "cover the left eye's lens" in said.mend
+    # A calibration that says so is in order.
+    assert worst(check_pictures(plain_rig(rectifier, shift), [(left, moved)])).level == "ok"
+
+
+def plain_rig(rectifier: Rectifier, shift: float) -> StereoRig:
+    """Of rectified pictures; the right eye's principal point lies `shift` px farther to the right."""
+    K, none = rectifier.camera.K, np.zeros(5)
+    K_right = K + np.array([[0, 0, shift], [0, 0, 0], [0, 0, 0]])
+    size = rectifier.camera.width, rectifier.camera.height
+    P, P_right = (np.column_stack([K, [-K[0, 0] * baseline, 0, 0]]) for baseline in (0.0, rectifier.baseline))
+    return StereoRig(
+        "plain", Eye(*size, K, none, np.eye(3), P), Eye(*size, K_right, none, np.eye(3), P_right)
+    )
+
+
+def rectified(rectifier: Rectifier, pair: tuple[U8, U8]) -> tuple[U8, U8]:
+    made = rectifier(StereoFrame(0, 0, 0, *pair))
+    assert made.right is not None
+    return made.left, made.right
 
 
 def test_highlights_are_no_points_of_the_tissue(phantom: tuple[StereoRig, Pairs]) -> None:

@@ -30,7 +30,11 @@ ROOT = Path(__file__).parent.parent
         (["budget_ms:=25"], ("'budget_ms'", "did you mean 'mapping.budget_ms'")),
         (["mapping.budget_ms:=soon"], ("mapping.budget_ms", "valid number", "'soon'")),
         (["publish.data:=tcp://127.0.0.1:5"], ("publish.data", "a list", "'tcp://127.0.0.1:5'")),
-        (["source.kind:=videos", "source.left:=a.mp4"], ("source.right is missing",)),
+        (
+            ["source.kind:=videos", "source.left:=a.mp4"],
+            ("source.right is missing", "vision.onnx.declared_depth", "docs/depth.md"),
+        ),
+        (["clip.MP4"], ("clip.MP4 is a video", "source.video:=clip.MP4", "source.left:=clip.MP4", "rig:=")),
         (["mapping.budget_ms=25"], ("'mapping.budget_ms=25'", "write mapping.budget_ms:=25")),
         ([":=25"], ("':=25'", "write key:=value")),
     ],

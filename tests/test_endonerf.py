@@ -140,7 +140,7 @@ def test_right_pictures_are_used_when_the_baseline_is_known(clip: Path) -> None:
 
 def test_stereo_replaces_missing_depth(clip: Path) -> None:
     for number in range(FRAMES):
-        write(clip / f"images_right/{number:06d}.png", left_picture(number))
+        write(clip / f"images_right/{number:06d}.png", left_picture(number + 3))
     for file in (clip / "depth").iterdir():
         file.unlink()
     (clip / "depth").rmdir()

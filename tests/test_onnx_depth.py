@@ -307,12 +307,12 @@ def test_where_it_fails_the_matcher_takes_over_and_says_so(
     )
     assert result.observation.depth.any()
     statistics = Statistics()
-    statistics.add(result, 1.0)
+    statistics.add(result, 1.0, {})
     health = statistics.health(
         dropped={}, stopping=False, paused=False, error=None, warnings=pipeline.warnings, connections={},
         views={},
     )  # fmt: skip
-    assert health.skipped == {"network": 1} and health.warnings["network"].startswith("network.onnx")
+    assert health.skipped == {"network": 1} and health.warnings["network"][0].text.startswith("network.onnx")
     reason = status(health, result)["last_frame"]["skipped"]["network"]
     assert reason.startswith("network.onnx") and "\n" not in reason
     assert [record.levelname for record in caplog.records] == ["WARNING"] * 3  # twice news, once the end

@@ -44,7 +44,7 @@ def watched(session: Session, frames: list[StereoFrame], step_ns: int = STEP_NS)
     for number, frame in enumerate(frames):
         stamped = replace(frame, t_capture_ns=10**18 + number * step_ns)
         watch(stamped, rectify(stamped))
-        yield watch.warning
+        yield "; ".join(finding.text for finding in watch.findings)
 
 
 def both(change: Callable[[U8], U8]) -> Spoil:

@@ -200,10 +200,10 @@ def frames_until_error(config: Recording) -> tuple[list[StereoFrame], str]:
 
 @pytest.mark.parametrize("suffix", ["jpg", "png"])
 def test_damaged_picture_in_the_middle_is_named(tmp_path: Path, suffix: str) -> None:
-    noise = np.random.default_rng(1).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
+    left, right = np.random.default_rng(1).integers(0, 255, (2, HEIGHT, WIDTH, 3), np.uint8)
     for n in range(5):
-        write_png(tmp_path / f"l/{n}.{suffix}", noise)
-        write_png(tmp_path / f"r/{n}.{suffix}", noise)
+        write_png(tmp_path / f"l/{n}.{suffix}", left)
+        write_png(tmp_path / f"r/{n}.{suffix}", right)
     broken = tmp_path / f"r/3.{suffix}"
     broken.write_bytes(broken.read_bytes()[:-200])
     frames, message = frames_until_error(

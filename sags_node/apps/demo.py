@@ -57,7 +57,8 @@ def run_demo(session: Session, out: Path, progress: Callable[[int, int | None, s
     with Spool() as spool:
 
         def keep(result: FrameResult, latency_ms: float) -> None:
-            spool.add(result, sum(result.timings_ms.values()), time.monotonic_ns(), latency_ms)
+            frame_ms, warnings = sum(result.timings_ms.values()), node.health().warnings
+            spool.add(result, frame_ms, time.monotonic_ns(), latency_ms, warnings)
 
         node = Node(session.config, session.rig, session.source, on_result=keep)
         overlay = _start_overlay(session.config, seconds, out / "overlay.mp4")

@@ -27,9 +27,10 @@ from sags_node.apps.overlay_save import Output
 from sags_node.apps.overlay_scene import SceneSpec, built_in, read_scene
 from sags_node.apps.overlay_stream import OverlayStream
 from sags_node.errors import SagsError, UsageError
+from sags_node.findings import OF_THE_FLOW, STAGES
 from sags_node.messaging.address import ClientKeys, find_control
 from sags_node.messaging.control import ControlClient
-from sags_node.messaging.received import Received, ReceivedImage, TopicName
+from sags_node.messaging.received import Received, ReceivedImage, ReceivedText, TopicName
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.types import U8
 
@@ -264,9 +265,12 @@ class _Overlay:
         if (frame.session, frame.epoch) != self._source:
             self._source, self._epoch = (frame.session, frame.epoch), self._epoch + 1
         began = time.perf_counter()
-        pictures = {"left": overlay_draw.draw(frame, placed, note=self._note())}
+        warnings = {
+            code: said for code, said in self._warnings.items() if STAGES.get(code) not in OF_THE_FLOW
+        }
+        pictures = {"left": overlay_draw.draw(frame, placed, note=self._note(), warnings=warnings)}
         if frame.baseline is not None and self._stream.wants("right"):
-            pictures["right"] = overlay_draw.draw(frame, placed, frame.baseline)
+            pictures["right"] = overlay_draw.draw(frame, placed, frame.baseline, warnings=warnings)
         self._stream.show(pictures, frame.frame_id, frame.stamp_ns, self._epoch)
         self._draw_ms.append(1e3 * (time.perf_counter() - began))
         self._latency_ms.append(1e-6 * (time.time_ns() - frame.stamp_ns))
@@ -307,7 +311,14 @@ class _Overlay:
             "max_age": self._options.max_age,
             "no_right_eye": self._right or None,
             "objects": [held.status() for held in self._objects],
+            "warning_codes": self._warnings,
         }
+
+    @property
+    def _warnings(self) -> dict[str, str]:
+        """What the node warned of last."""
+        status = None if self._subscriber is None else self._subscriber.latest("status")
+        return status.warnings() if isinstance(status, ReceivedText) else {}
 
     def _note(self) -> str:
         if not self._options.show_latency or not self._latency_ms:

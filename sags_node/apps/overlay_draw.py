@@ -10,13 +10,14 @@ tissue and `NEAREST`; all of that stays free.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from sags_node.apps.overlay_frame import TissueFrame
+from sags_node.apps.overlay_mark import draw_mark
 from sags_node.apps.overlay_mesh import Mesh
 from sags_node.apps.overlay_raster import fill, hide, key_out
 from sags_node.geometry import invert, transform
@@ -29,6 +30,7 @@ NEAREST = 0.03  # m; no instrument is nearer to the right eye
 DARKEST = 0.45  # of a colour, where the surface is seen edge on
 LABEL_ASIDE = 6  # px to the right of the middle
 FONT = cv2.FONT_HERSHEY_SIMPLEX
+NOTHING: Mapping[str, str] = {}  # to warn of
 
 
 class Body:
@@ -78,10 +80,16 @@ class Placed:
     T_world_body: F64  # [4, 4]
 
 
-def draw(frame: TissueFrame, objects: Sequence[Placed], baseline: float = 0.0, note: str = "") -> U8:
+def draw(
+    frame: TissueFrame,
+    objects: Sequence[Placed],
+    baseline: float = 0.0,
+    note: str = "",
+    warnings: Mapping[str, str] = NOTHING,
+) -> U8:
     """The overlay [H, W, 4] RGBA, not premultiplied, of the eye `baseline` (m) to the right of the left one.
 
-    `note` is written small into the upper right corner.
+    `note` is written small into the upper right corner, `warnings` (code -> text) on the lower edge.
     """
     height, width = frame.depth.shape
     camera = frame.camera.moved_right(baseline)
@@ -95,6 +103,10 @@ def draw(frame: TissueFrame, objects: Sequence[Placed], baseline: float = 0.0, n
     if note:
         (across, down), _ = cv2.getTextSize(note, FONT, _text_scale(height), 1)
         _write(rgba, frame, note, (width - across - 6, down + 6), NEAREST, baseline)
+    if warnings:
+        known = frame.depth[::8, ::8][frame.depth[::8, ::8] > 0]
+        shift = float(camera.K[0, 0]) * baseline / float(np.median(known)) if known.size else 0.0
+        draw_mark(rgba, warnings, round(shift))
     return rgba
 
 

@@ -44,7 +44,7 @@ class OverlayStream:
         self._size: tuple[int, int] | None = None  # height and width of what was shown last
         self._blank_due = 0.0
         self._status_due = 0.0
-        self._state: tuple[str, str | None] | None = None
+        self._state: tuple[str, str | None, tuple[str, ...]] | None = None
         self._epoch = 0
         self.reason: str | None = (
             "waiting for the node"  # why nothing is shown; None: the last picture sent is an overlay
@@ -89,8 +89,9 @@ class OverlayStream:
                 self._send(eye, self._empty(), -1, time.time_ns())
 
     def tell(self, facts: dict[str, Any]) -> None:
-        """Send `status` when it is due, and at once when the state changes."""
-        state = ("running" if self.reason is None else "blank", self.reason)
+        """Send `status` when it is due, and at once when the state or a warning changes."""
+        warned = tuple(facts.get("warning_codes", ()))
+        state = ("running" if self.reason is None else "blank", self.reason, warned)
         if state == self._state and time.monotonic() < self._status_due:
             return
         self._state, self._status_due = state, time.monotonic() + STATUS_PERIOD

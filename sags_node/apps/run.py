@@ -11,6 +11,8 @@ from rich.table import Table
 from rich.text import Text
 
 from sags_node.apps import text
+from sags_node.apps.notices import Notices
+from sags_node.findings import by_code, in_words
 from sags_node.node import Node
 from sags_node.types import NodeHealth
 
@@ -20,6 +22,8 @@ REFRESH = 4.0  # per second
 def run_node(node: Node, seconds: float | None, console: Console) -> NodeHealth:
     """Run until the source ends, `seconds` have passed or Ctrl-C; returns the last health.
 
+    Tells of every warning that holds for `1 / REFRESH` s, when it begins and when it ends.
+
     Raises:
         SagsError: what ended the node, if something did.
     """
@@ -28,9 +32,9 @@ def run_node(node: Node, seconds: float | None, console: Console) -> NodeHealth:
     try:
         if console.is_terminal:
             with Live(console=console, refresh_per_second=REFRESH, transient=True) as live:
-                _watch(node, deadline, lambda: live.update(health_table(node.health())))
+                _watch(node, deadline, console, lambda health: live.update(health_table(health)))
         else:
-            _watch(node, deadline, lambda: None)
+            _watch(node, deadline, console, lambda health: None)
     except KeyboardInterrupt:
         console.print("stopping")
     finally:
@@ -39,9 +43,12 @@ def run_node(node: Node, seconds: float | None, console: Console) -> NodeHealth:
     return health
 
 
-def _watch(node: Node, deadline: float | None, show: Callable[[], None]) -> None:
+def _watch(node: Node, deadline: float | None, console: Console, show: Callable[[NodeHealth], None]) -> None:
+    notices = Notices(lambda line: console.print(line, markup=False, soft_wrap=True))
     while not node.wait(timeout=1 / REFRESH):
-        show()
+        health = node.health()
+        notices.update(by_code(health.warnings))
+        show(health)
         if deadline is not None and time.monotonic() >= deadline:
             return
 
@@ -61,6 +68,6 @@ def health_table(health: NodeHealth) -> Table:
     if health.skipped:
         table.add_row("skipped", "  ".join(f"{k} {v}" for k, v in health.skipped.items()))
     table.add_row("memory", f"{health.rss_mb:.0f} MB")
-    for stage, warning in health.warnings.items():
+    for stage, warning in in_words(health.warnings).items():
         table.add_row(f"warning: {stage}", Text(warning))
     return table

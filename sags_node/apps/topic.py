@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import msgspec
@@ -83,8 +83,12 @@ def topic_echo(
     seconds: float | None = None,
     count: int | None = None,
     keys: ClientKeys | None = None,
+    warned: Callable[[Mapping[str, str]], object] = lambda warnings: None,
 ) -> Iterator[Record]:
     """Each message of a topic: who, when, and its content (arrays as their range).
+
+    Args:
+        warned: told all that the sender's `status` warns of, code -> text, whenever one comes.
 
     Raises:
         UsageError: there is no such topic.
@@ -92,13 +96,19 @@ def topic_echo(
     """
     shown = 0
     began = time.monotonic()
-    for arrived in listen([topic], endpoint, ns, seconds, keys=keys):
-        if arrived is None:
+    status = topics.full_name(ns, "status")
+    for arrived in listen([topic, "status"], endpoint, ns, seconds, keys=keys):
+        received = None if arrived is None else interpret(*arrived)
+        if received is not None and received.topic == status:
+            assert isinstance(received, ReceivedText)  # so says its topic
+            warned(received.warnings())
+            if topic.lstrip("/").removeprefix(f"{ns}/") != "status":
+                received = None
+        if received is None:
             if not shown and time.monotonic() - began > PATIENCE:
                 raise _silence(topic, endpoint, ns, PATIENCE, keys)
             continue
-        message, arrival_ns = arrived
-        yield _echo(interpret(message, arrival_ns))
+        yield _echo(received)
         shown += 1
         if shown == count:
             return

@@ -52,7 +52,7 @@ class PlainSGBM:
         self._focal = float(camera.K[0, 0]) * self._size[0] / camera.width
         self._baseline = baseline
         self._smallest = int(self._focal * baseline / config.max_depth)
-        count = 16 * int(np.ceil((self._focal * baseline / config.min_depth - self._smallest) / 16))
+        count = 16 * int(np.ceil((self._focal * baseline / config.nearest - self._smallest) / 16))
         block = 5  # px
         self._matcher = cv2.StereoSGBM.create(
             minDisparity=self._smallest,

@@ -80,12 +80,15 @@ class Charuco:
     Args:
         square, marker: m, sides of a square and of a marker.
         dictionary: of the markers, as OpenCV names it, with or without `DICT_`.
+        legacy: laid out as OpenCV did before 4.6: a board with an even number of rows begins with a marker.
 
     Raises:
         UsageError: there is no such dictionary, or it has too few markers.
     """
 
-    def __init__(self, squares: tuple[int, int], square: float, marker: float, dictionary: str) -> None:
+    def __init__(
+        self, squares: tuple[int, int], square: float, marker: float, dictionary: str, legacy: bool = False
+    ) -> None:
         name = dictionary.upper().removeprefix(PREFIX)
         number = getattr(cv2.aruco, PREFIX + name, None)
         if number is None:
@@ -99,7 +102,9 @@ class Charuco:
                 f"{squares[1]} squares {self._markers}; name the one that the board was printed with"
             )
         self._name = name
-        self._detector = cv2.aruco.CharucoDetector(cv2.aruco.CharucoBoard(squares, square, marker, markers))
+        board = cv2.aruco.CharucoBoard(squares, square, marker, markers)
+        board.setLegacyPattern(legacy)
+        self._detector = cv2.aruco.CharucoDetector(board)
         self.points = _grid((squares[0] - 1, squares[1] - 1), square)
 
     def find(self, gray: U8) -> Seen | None:
@@ -114,7 +119,7 @@ class Charuco:
             return f"no marker of {self._name} is seen"
         if ids.max() >= self._markers:
             return f"marker {ids.max()} is seen, the board has 0 to {self._markers - 1}"
-        return f"{len(ids)} markers are seen, but they do not lie as on this board"
+        return f"{len(ids)} markers are seen, but they do not lie as on this board (an old print: --legacy)"
 
 
 def find_in_both(board: Board, name: str, left: U8, right: U8) -> StereoView | None:

@@ -23,6 +23,7 @@ IN_FRONT = 0.8  # of the matches: fewer are no scene seen by two eyes
 CLEARLY = 1.5  # times the row error, and
 CLEARLY_PX = 0.3  # px: a reading that is worse by more does not fit
 WRONG_MATCH = 4.0  # times the median distance from the median row error
+PICTURES_SWAPPED = "the pictures are swapped: the left ones come from the right camera"
 PLAUSIBLE_DEPTH = (0.005, 1.0)  # m, the median: in an endoscope's view
 
 
@@ -73,6 +74,8 @@ def judge_matches(rig: StereoRig, matches: F64) -> list[Finding]:
     if best <= limit:
         enough = max(CLEARLY * best, best + CLEARLY_PX)
         named = next(reading for reading in fitting if reading.rows.median <= enough)
+        if named.what == PICTURES_SWAPPED and as_is.rows.median <= enough:
+            return [_swapped_or_shifted(as_is.rows)]
         if named is not as_is or _signed_baseline(rig) < 0:
             return [Finding("error", named.what, named.mend, _figures(named.rows))]
     if as_is.rows.median > limit:
@@ -102,7 +105,7 @@ def _readings(rig: StereoRig, matches: F64) -> Iterator[Reading]:
         yield Reading(rows, "", "")
         yield Reading(
             exchanged,
-            "the pictures are swapped: the left ones come from the right camera",
+            PICTURES_SWAPPED,
             "exchange left and right of the source; the calibration is in order",
         )
         yield wrong_sign
@@ -120,6 +123,20 @@ def _readings(rig: StereoRig, matches: F64) -> Iterator[Reading]:
             f"camera_matrix is for pictures of {size:.3g} times the size that the calibration states",
             f"multiply camera_matrix and projection_matrix by {1 / size:.3g}, or calibrate at full size",
         )
+
+
+def _swapped_or_shifted(rows: Rows) -> Finding:
+    """Rows fit either way, as in rectified pictures: points behind the eyes then have two causes."""
+    shift = float(np.percentile(-rows.disparities, 98))
+    what = (
+        f"{PICTURES_SWAPPED}; or their principal points differ by at least {shift:.0f} px more than the "
+        "calibration says"
+    )
+    mend = (
+        "cover the left eye's lens: if the right picture goes dark, exchange left and right of the source; "
+        "if not, calibrate again with pictures as they come now"
+    )
+    return Finding("error", what, mend, _figures(rows))
 
 
 def _other_size(rig: StereoRig, factor: float) -> StereoRig:

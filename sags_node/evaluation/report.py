@@ -32,6 +32,7 @@ table.figures td { border-top: 1px solid #ddd } .number { font-variant-numeric: 
 table.pictures img { width: 100%; display: block } table.pictures td { padding: 2px; width: 25% }
 .plots { display: grid; grid-template-columns: repeat(auto-fit, minmax(520px, 1fr)); gap: 8px }
 .quiet { color: #666 }
+h3 { font-size: 15px; margin: 12px 0 4px; color: #b35c00 }
 svg { width: 100%; background: #fafafa } .grid { stroke: #ddd } .span { fill: #f2e3c6 }
 svg text { font: 11px system-ui, sans-serif; fill: #444 } svg .title { font-weight: 600; font-size: 12px }
 svg .value { text-anchor: end } svg .frame { text-anchor: middle }
@@ -63,6 +64,7 @@ def write_report(
             f"<h1>{title}</h1>",
             f'<p class="quiet">{escape(_circumstances(summary))}</p>',
             "<h2>What it showed</h2>",
+            _warning_table(rows),
             _picture_table(pictures, sheet),
             f'<p class="quiet">Grey: not tissue, or nothing known. Depth from {near * 1e3:.0f} to '
             f"{far * 1e3:.0f} mm; the error is brightest at {ERROR_AT_TOP:.0%} of full scale.</p>",
@@ -105,6 +107,22 @@ def _picture_table(pictures: Sequence[Picture], sheet: Sequence[Sequence[U8]]) -
         )
         lines.append(f'<tr>{cells}</tr><tr><td colspan="4" class="quiet">{caption}</td></tr>')
     return "\n".join([*lines, "</table>"])
+
+
+def _warning_table(rows: Sequence[FrameRow]) -> str:
+    """What the run warned of, when, and what to do; nothing where it did not."""
+    frames: dict[str, list[int]] = {}
+    said: dict[str, str] = {}
+    for row in rows:
+        for code, text in ({} if row.facts is None else row.facts.warnings).items():
+            frames.setdefault(code, []).append(row.frame_id)
+            said[code] = text
+    lines = [
+        f"<tr><td>{escape(said[code])}</td><td>{len(shown)} frames, {shown[0]} to {shown[-1]}</td>"
+        f'<td class="quiet">{escape(code)}, see docs/warnings.md</td></tr>'
+        for code, shown in frames.items()
+    ]
+    return f'<h3>Warnings</h3><table class="warnings">{"".join(lines)}</table>' if lines else ""
 
 
 def _plots(rows: Sequence[FrameRow], spans: Mapping[str, tuple[int, int]]) -> str:

@@ -141,7 +141,7 @@ def run_step(session: Session, options: Options, spool: Spool, progress: Progres
             started = time.perf_counter()
             result = pipeline.process(frame, budget)
             frame_ms = (time.perf_counter() - started) * 1e3
-            spool.add(result, frame_ms, time.monotonic_ns())
+            spool.add(result, frame_ms, time.monotonic_ns(), warnings=pipeline.warnings)
             progress("playing", len(spool))
 
 
@@ -151,7 +151,8 @@ def run_realtime(
     """The node itself, threads and sockets included, on the recording's clock."""
 
     def keep(result: FrameResult, latency_ms: float) -> None:
-        spool.add(result, sum(result.timings_ms.values()), time.monotonic_ns(), latency_ms)
+        frame_ms, warnings = sum(result.timings_ms.values()), node.health().warnings
+        spool.add(result, frame_ms, time.monotonic_ns(), latency_ms, warnings)
 
     config = session.config.model_copy(update={"publish": publish})
     node = Node(config, session.rig, _WithoutHeldOut(session.source, options), on_result=keep)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import tempfile
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 
 from sags_node.errors import SagsError
+from sags_node.findings import NOTHING, Findings, by_code
 from sags_node.health import resident_mb
 from sags_node.types import F32, U8, Bool, Camera, FrameResult, Gaussians, Snapshot
 
@@ -36,6 +37,7 @@ class RunFacts:
     gaussians: int
     counts: dict[str, int]  # inserted, removed, iterations, ...
     rung: int | None = None  # of the ladder of quality; None: fixed steps
+    warnings: dict[str, str] = field(default_factory=dict)  # code -> what is wrong and how to mend it
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +76,12 @@ class Spool:
         return (self.read(place) for place in range(len(self)))
 
     def add(
-        self, result: FrameResult, frame_ms: float, t_shown_ns: int, latency_ms: float | None = None
+        self,
+        result: FrameResult,
+        frame_ms: float,
+        t_shown_ns: int,
+        latency_ms: float | None = None,
+        warnings: Findings = NOTHING,
     ) -> None:
         """Keep one frame: about 6 MB and 2 to 3 ms at 640x512 with 30,000 Gaussians.
 
@@ -93,6 +100,7 @@ class Spool:
             len(gaussians),
             dict(snapshot.counts),
             None if result.rung is None else result.rung.number,
+            by_code(warnings),
         )
         header = {
             "facts": asdict(facts),

@@ -59,6 +59,7 @@ def summarise(
         "gaussians": _mean_and_max([run.gaussians for run in facts]),
         "rss_mb": _memory(facts),
         "skipped": dict(Counter(what for run in facts for what in run.skipped)),
+        "warnings": dict(Counter(code for run in facts for code in run.warnings)),
         "rungs": dict(sorted(Counter(run.rung for run in facts if run.rung is not None).items())),
         "psnr_convention": "tissue",
         "lpips_backbone": BACKBONE if options.lpips_weights else None,

@@ -28,7 +28,7 @@ from sags_node.mapping.optimiser import Rates
 from sags_node.mapping.refiner import DEPTH_SCALE, DEPTH_WEIGHT
 from sags_node.model.deformation import NodeDeformation
 from sags_node.model.gaussians import GaussianModel
-from sags_node.types import F32, Bool, Camera, Gaussians, Observation
+from sags_node.types import F32, Bool, Camera, Finding, Gaussians, Observation
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -68,7 +68,7 @@ class CudaRefiner:
     """
 
     share = 1.0
-    problem: str | None = None
+    problem: Finding | None = None
 
     def __init__(self) -> None:
         self.loss = 0.0

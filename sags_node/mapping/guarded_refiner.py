@@ -11,7 +11,7 @@ from sags_node.mapping.optimiser import Rates
 from sags_node.mapping.refiner import Refiner
 from sags_node.model.deformation import NodeDeformation
 from sags_node.model.gaussians import GaussianModel
-from sags_node.types import F32, Bool, Camera, Gaussians, Observation
+from sags_node.types import F32, Bool, Camera, Finding, Gaussians, Observation
 
 log = logging.getLogger(__name__)
 
@@ -32,7 +32,7 @@ class GuardedRefiner:
     def __init__(self, gpu: Refiner, cpu: Refiner, cpu_share: float) -> None:
         """`cpu_share`: how much of the model's capacity the CPU can refine, 0..1."""
         self.share = 1.0
-        self.problem: str | None = None
+        self.problem: Finding | None = None
         self._gpu, self._cpu, self._cpu_share = gpu, cpu, cpu_share
         self._working = gpu
         self._failed = False
@@ -104,15 +104,18 @@ class GuardedRefiner:
         used = 1.0 if self._frame is None else self._frame[0].count / self._frame[0].capacity
         self.share = LOWERED * min(self.share, used)
         self._pause = PAUSE
-        self.problem = (
+        self.problem = Finding(
+            "gpu_memory",
             f"the GPU's memory was too small; the model may hold {self.share:.0%} of its Gaussians now; "
-            "end what else uses the GPU, or lower mapping.max_gaussians"
+            "end what else uses the GPU, or lower mapping.max_gaussians",
         )
-        log.info("%s", self.problem, exc_info=error)
+        log.info("%s", self.problem.text, exc_info=error)
 
     def _give_up(self, error: BaseException) -> None:
         self._failed = True
         self.share = self._cpu_share
         said = (str(error).strip() or type(error).__name__).splitlines()[0]
-        self.problem = f"the GPU failed and the CPU goes on: {said}; restart the node to use the GPU again"
-        log.info("%s", self.problem, exc_info=error)
+        self.problem = Finding(
+            "gpu_failed", f"the GPU failed and the CPU goes on: {said}; restart the node to use the GPU again"
+        )
+        log.info("%s", self.problem.text, exc_info=error)

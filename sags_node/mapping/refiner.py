@@ -16,7 +16,7 @@ from sags_node.mapping.optimiser import Optimiser, Rates
 from sags_node.mapping.right_eye import right_eye_loss
 from sags_node.model.deformation import NodeDeformation
 from sags_node.model.gaussians import GaussianModel
-from sags_node.types import F32, Bool, Camera, Gaussians, Observation
+from sags_node.types import F32, Bool, Camera, Finding, Gaussians, Observation
 
 DEPTH_WEIGHT = 2e-3  # of a depth residual of DEPTH_SCALE, against colours 0..1
 DEPTH_SCALE = 1e-3  # m: beyond this a depth residual counts linearly
@@ -38,7 +38,7 @@ class Refiner(Protocol):
         """How much of the model's capacity it can refine, 0..1."""
 
     @property
-    def problem(self) -> str | None:
+    def problem(self) -> Finding | None:
         """What is wrong with it and how to mend it; None: nothing. May be read from any thread."""
 
     def begin(
@@ -104,7 +104,7 @@ class CpuRefiner:
     """The refiner that works on the model's own arrays."""
 
     share = 1.0
-    problem: str | None = None
+    problem: Finding | None = None
 
     def __init__(self, make_rasterizer: MakeRasterizer) -> None:
         """`make_rasterizer`: one for pictures of that width and height, px."""

@@ -9,6 +9,7 @@ import cv2
 import msgspec
 import numpy as np
 
+from sags_node.findings import by_code, in_words
 from sags_node.geometry import project
 from sags_node.messaging import cdr
 from sags_node.messaging.cdr import Content, Status
@@ -173,9 +174,15 @@ def tells_of(result: FrameResult, topic: str) -> bool:
     return topic != "left/depth" or result.skipped.get("depth") != NO_TIME
 
 
-def status(health: NodeHealth, last: FrameResult | None) -> dict[str, Any]:
-    """The fields of `NodeHealth`, and under `last_frame` its loss, counts and what was skipped."""
+def health_fields(health: NodeHealth) -> dict[str, Any]:
+    """The fields of `NodeHealth`, its warnings by stage and by code."""
     fields: dict[str, Any] = msgspec.to_builtins(health)
+    return fields | {"warnings": in_words(health.warnings), "warning_codes": by_code(health.warnings)}
+
+
+def status(health: NodeHealth, last: FrameResult | None) -> dict[str, Any]:
+    """As `health_fields`, and under `last_frame` its loss, counts and what was skipped."""
+    fields = health_fields(health)
     fields["last_frame"] = (
         {}
         if last is None
@@ -213,5 +220,8 @@ def diagnostics(health: NodeHealth, stamp_ns: int) -> Content:
     running = health.state in ("running", "degraded")
     for stage, ms in health.stage_ms.items():
         statuses.append(Status(stage, 0 if running else 3, f"{ms:.1f} ms", {"ms": f"{ms:.3f}"}))
-    statuses += [Status(stage, 1, warning, {}) for stage, warning in health.warnings.items()]
+    statuses += [
+        Status(stage, 1, warning, by_code({stage: health.warnings[stage]}))
+        for stage, warning in in_words(health.warnings).items()
+    ]
     return cdr.diagnostics(statuses, stamp_ns)

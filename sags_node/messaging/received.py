@@ -6,6 +6,7 @@ import time
 from dataclasses import dataclass
 from typing import Any, Generic, Self, TypeVar, overload
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -60,6 +61,17 @@ class ReceivedCameraInfo(Received):
 @dataclass(frozen=True, slots=True)
 class ReceivedText(Received):
     text: str
+
+    def warnings(self) -> dict[str, str]:
+        """Of a `status`: code -> what is wrong and how to mend it."""
+        try:
+            return msgspec.json.decode(self.text, type=_Warnings).warning_codes
+        except (msgspec.MsgspecError, RecursionError):
+            return {}
+
+
+class _Warnings(msgspec.Struct):
+    warning_codes: dict[str, str] = {}
 
 
 @dataclass(frozen=True, slots=True)

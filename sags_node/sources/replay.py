@@ -15,6 +15,7 @@ from sags_node.errors import UsageError
 from sags_node.sources.bags import BagPairs
 from sags_node.sources.dvrk import DvrkPairs
 from sags_node.sources.endonerf import EndoNerfPairs
+from sags_node.sources.one_eye import refuse_one_eye_twice
 from sags_node.sources.pictures import FolderPairs, RawPair
 from sags_node.sources.scared import ScaredPairs
 from sags_node.sources.truth import Poses, References
@@ -134,6 +135,7 @@ class Replay:
         """Play from the start.
 
         Raises:
+            UsageError: both eyes begin with the same picture.
             SagsError: a picture is damaged, or the right eye ends before the left one.
         """
         stride = self._config.stride
@@ -167,6 +169,8 @@ class Replay:
                 stamp = self._wait_for_turn(frame_id)
                 if self._stopped.is_set():
                     return
+                if frame_id == self._first and pair.depth is None:
+                    refuse_one_eye_twice(pair.left, pair.right)
                 yield StereoFrame(
                     frame_id,
                     t_capture_ns=stamp,

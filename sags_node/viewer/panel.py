@@ -15,7 +15,7 @@ from viser import uplot
 from sags_node.errors import SagsError
 from sags_node.messaging.address import ClientKeys
 from sags_node.messaging.control import ControlClient
-from sags_node.viewer.feed import Moment
+from sags_node.viewer.feed import Moment, Status
 from sags_node.viewer.history import LENGTH, PERIOD, History
 from sags_node.viewer.pictures import Sheet
 from sags_node.viewer.scene import UNIT, Scene
@@ -209,7 +209,7 @@ def _in_words(answer: Any) -> str:
 
 
 def _status_line(moment: Moment) -> str:
-    """One line: why nothing is shown, or how the node does."""
+    """One line: why nothing is shown, or how the node does; below it what it warns of."""
     status = moment.status
     if moment.problem is not None:
         color, text = "#ff922b", moment.problem
@@ -222,7 +222,17 @@ def _status_line(moment: Moment) -> str:
     if status.last_error is not None:
         text += f" ({status.last_error})"
     style = f"padding:0.4em 1em;font-size:0.9em;color:{color}"
-    return f'<div id="sags-status" style="{style}">{html.escape(text)}</div>'
+    return f'<div id="sags-status" style="{style}">{html.escape(text)}</div>{_warnings(status)}'
+
+
+def _warnings(status: Status) -> str:
+    """One line for each."""
+    style = f"margin:0.2em 1em;padding-left:0.5em;font-size:0.9em;border-left:3px solid;color:{ORANGE}"
+    return "".join(
+        f'<div class="sags-warning" style="{style}">{html.escape(said)} '
+        f'<span style="opacity:0.6">({html.escape(code)})</span></div>'
+        for code, said in status.warning_codes.items()
+    )
 
 
 def _anchor_table(rows: list[Any]) -> str:

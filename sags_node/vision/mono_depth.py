@@ -38,7 +38,7 @@ class MonoDepth:
 
     def __init__(self, declared_depth: float | None, config: StereoConfig) -> None:
         self._declared = declared_depth
-        self._nearest, self._farthest = config.min_depth, config.max_depth
+        self._nearest, self._farthest = config.nearest, config.max_depth
         self._line: ScaleShift | None = None
         self._before: F32 | None = None  # [H, W] m, depth of the frame before, 0 unknown
         self._frames_to_measure = 0
@@ -88,7 +88,7 @@ class MonoDepth:
         if self._declared is None:
             raise UsageError(
                 "one camera alone does not tell how far things are; set vision.onnx.declared_depth to the "
-                "distance to the middle of the first picture, m"
+                "distance to the middle of the first picture, m (docs/depth.md, 'One eye')"
             )
         values = relative[tissue & np.isfinite(relative)]
         middle = float(np.median(values)) if values.size else 0.0

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from sags_node.types import F32, U8, RectifiedPair, StereoFrame
+from sags_node.types import F32, U8, Finding, RectifiedPair, StereoFrame
 
 PERIOD_NS = 150_000_000  # between two looks
 LOOKS, NEEDED = 5, 4  # so many of the last looks must find the same
@@ -25,6 +25,7 @@ EQUAL = 0.5  # of what a shift by one small pixel makes; true pairs 1 to 5
 LOCAL = 15  # small px: shading wider than that is no structure
 LEAST_MATCH = 0.35  # correlation; nothing matches below
 CLEARLY_BETTER = 0.2  # of a match the wrong way round, against the best the right way round
+_CODES = {"black": "black", "white": "white", "of one colour": "plain"}
 _MENDS = {
     "black": "see to the light, the lens cap and the cable",
     "white": "lower the light or the exposure",
@@ -43,13 +44,13 @@ class PairWatch:
     """Looks at the pairs of a source.
 
     Attributes:
-        warning: what is wrong with the eyes, and how to mend it; empty: nothing. May be read from any thread.
+        findings: what is wrong with the eyes, and how to mend it. May be read from any thread.
     """
 
     def __init__(self) -> None:
-        self.warning = ""
+        self.findings: tuple[Finding, ...] = ()
         self._looked_ns: int | None = None
-        self._found: deque[list[str]] = deque(maxlen=LOOKS)
+        self._found: deque[list[Finding]] = deque(maxlen=LOOKS)
 
     def __call__(self, frame: StereoFrame, pair: RectifiedPair) -> None:
         """Take one frame, raw and rectified; most of them are let pass unseen."""
@@ -59,26 +60,31 @@ class PairWatch:
         self._looked_ns = now
         self._found.append(_look(frame, pair))
         often = Counter(finding for findings in self._found for finding in findings)
-        self.warning = "; ".join(finding for finding, count in often.items() if count >= NEEDED)
+        self.findings = tuple(finding for finding, count in often.items() if count >= NEEDED)
 
 
-def _look(frame: StereoFrame, pair: RectifiedPair) -> list[str]:
-    """What is wrong in one frame, in words."""
+def _look(frame: StereoFrame, pair: RectifiedPair) -> list[Finding]:
+    """What is wrong in one frame."""
     eyes = {"left": _small(frame.left)}
     if frame.right is not None:
         eyes["right"] = _small(frame.right)
     empty = {name: kind for name, eye in eyes.items() if (kind := _emptiness(eye.rgb))}
     if empty:
-        return [f"the {name} picture is {kind}: {_MENDS[kind]}" for name, kind in empty.items()]
+        return [
+            Finding(f"{name}_eye_{_CODES[kind]}", f"the {name} picture is {kind}: {_MENDS[kind]}")
+            for name, kind in empty.items()
+        ]
     if frame.right is None or pair.right is None:
         return []
     if _are_equal(eyes["left"].gray, eyes["right"].gray):
-        return ["both eyes show the same picture, so there is no depth: connect the other eye"]
+        said = "both eyes show the same picture, so there is no depth: connect the other eye"
+        return [Finding("eyes_equal", said)]
     # A source that is rectified already hands its pictures through.
     left = eyes["left"] if pair.left is frame.left else _small(pair.left)
     right = eyes["right"] if pair.right is frame.right else _small(pair.right)
     if _are_exchanged(left.gray, right.gray):
-        return ["left and right seem to be exchanged: swap source.left and source.right, or LR and RL"]
+        said = "left and right seem to be exchanged: swap source.left and source.right, or LR and RL"
+        return [Finding("eyes_exchanged", said)]
     return []
 
 

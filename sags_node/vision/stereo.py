@@ -7,11 +7,12 @@ import numpy as np
 
 from sags_node.config import StereoConfig
 from sags_node.errors import UsageError
-from sags_node.types import F32, U8, Bool, Camera, GrayPyramid, RectifiedPair
+from sags_node.types import F32, U8, Bool, Camera, Finding, GrayPyramid, RectifiedPair
 from sags_node.vision.alignment import RowMonitor
 from sags_node.vision.dense_depth import depth_of_patches, depth_of_pixels
 from sags_node.vision.margin import clear_of_instruments
 from sags_node.vision.matchers import InverseSearch, SemiGlobal
+from sags_node.vision.near_limit import NearLimit
 from sags_node.vision.pyramid import inner, level, pyramids
 
 FULL_SIZE_BELOW = 480  # px width: matching at half of less costs half of the accuracy and saves little
@@ -20,7 +21,8 @@ SMOOTHING_RADIUS = 1 / 100  # of the matching picture's width
 
 
 class StereoDepth:
-    """Depth of the left rectified picture. Keeps nothing from frame to frame that changes it.
+    """Depth of the left rectified picture. Keeps nothing from frame to frame that changes it but how near
+    tissue can be, see `NearLimit`.
 
     Matching runs at the working size divided by the scale. A match is trusted as far as its
     neighbourhood agrees with the place in the right picture that it was matched to: the confidence is 0 at a
@@ -42,18 +44,15 @@ class StereoDepth:
         self._size = width, height
         self._focal_baseline = float(camera.K[0, 0]) / scale * baseline
         self._smallest = self._focal_baseline / config.max_depth
-        self._largest = min(self._focal_baseline / config.min_depth, width - 1.0)
+        self._near = NearLimit(config, float(camera.K[0, 0]) * baseline)
+        self._method = config.method
+        self._end_at(self._near.limit)
         if self._smallest >= self._largest:
             raise UsageError(
                 f"the eyes' pictures do not overlap at vision.stereo.max_depth {config.max_depth} m; raise "
                 f"it or check the calibration's baseline, {baseline * 1e3:.3g} mm"
             )
         self.rows = RowMonitor(camera.width)
-        self._match: SemiGlobal | InverseSearch
-        if config.method == "sgbm":
-            self._match = SemiGlobal(self._smallest, self._largest)
-        else:
-            self._match = InverseSearch(self._smallest, self._largest, self._halvings)
 
     def __call__(self, pair: RectifiedPair, tissue: Bool) -> tuple[F32, F32]:
         """Depth [H, W] (m, 0 unknown) and confidence [H, W] (0..1, 0 where the depth is unknown).
@@ -62,6 +61,7 @@ class StereoDepth:
         """
         left, right = pyramids(pair)
         assert right is not None  # a frame without a right eye brings its depth
+        self._look_how_near(pair, left, right, tissue)
         if isinstance(self._match, SemiGlobal):
             pictures = (level(eye, self._halvings) for eye in (left, right))
             disparity, known = self._match(*(_bytes(picture) for picture in pictures))
@@ -79,16 +79,46 @@ class StereoDepth:
             self._focal_baseline,
         )
 
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What is wrong with the rig, as far as matching tells. May be read from any thread."""
+        found = []
+        alignment = self.rows.alignment
+        if alignment is not None and alignment.warning:
+            found.append(Finding("rows_differ", alignment.warning))
+        if self._near.too_near > 0:
+            said = f"tissue lies at {1e3 * self._near.too_near:.0f} mm, nearer than vision.stereo.min_depth"
+            found.append(Finding("tissue_too_near", f"{said}: lower it, or leave it out"))
+        return tuple(found)
+
     def judge(self, pair: RectifiedPair, disparity: F32, tissue: Bool) -> tuple[F32, F32]:
         """Depth and confidence of a disparity [H, W] (px; NaN or <= 0: unknown) that something else found,
         trusted only as far as the pictures agree, as its own is."""
         left, right = pyramids(pair)
         assert right is not None  # there is no disparity without
+        self._look_how_near(pair, left, right, tissue)
         small = disparity
         if self._size != disparity.shape[1::-1]:
             small = cv2.resize(disparity, self._size, interpolation=cv2.INTER_AREA)
             small *= np.float32(self._size[0] / disparity.shape[1])
         return self._judge(left, right, small, small > 0, tissue)
+
+    def _look_how_near(
+        self, pair: RectifiedPair, left: GrayPyramid, right: GrayPyramid, tissue: Bool
+    ) -> None:
+        before = self._near.limit
+        self._near.look(pair.t_capture_ns, left, right, tissue)
+        if self._near.limit != before:
+            self._end_at(self._near.limit)
+
+    def _end_at(self, nearest: float) -> None:
+        """Match down to a depth, m."""
+        self._largest = min(self._focal_baseline / nearest, self._size[0] - 1.0)
+        self._match = (
+            SemiGlobal(self._smallest, self._largest)
+            if self._method == "sgbm"
+            else InverseSearch(self._smallest, self._largest, self._halvings)
+        )
 
     def _judge(
         self, left: GrayPyramid, right: GrayPyramid, disparity: F32, known: Bool, tissue: Bool

@@ -1,0 +1,68 @@
+"""The mark at the rim of an overlay: what the node warns of while the overlay is shown.
+
+It lies on the lower edge, over whatever is there: a warning must be seen just where nothing else is sure.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+
+import cv2
+import numpy as np
+
+from sags_node.types import U8
+
+FONT = cv2.FONT_HERSHEY_SIMPLEX
+MARGIN = 4  # px around the words
+MOST_LINES = 2  # more would hide the picture
+COLOR = (255, 170, 0)  # of warnings
+ENDS = "..."
+
+
+def headlines(warnings: Mapping[str, str]) -> list[str]:
+    """What is wrong in a few words each; how to mend it stands in `status`.
+
+    Args:
+        warnings: code -> what is wrong, up to the first colon or semicolon, and how to mend it.
+    """
+    said = [re.split(r"[:;] ", text, maxsplit=1)[0] for text in warnings.values()]
+    rest = len(said) - MOST_LINES
+    return said if rest <= 0 else [*said[: MOST_LINES - 1], f"{said[MOST_LINES - 1]} (and {rest} more)"]
+
+
+def draw_mark(rgba: U8, warnings: Mapping[str, str], shift: int = 0) -> None:
+    """Write the warnings on the lower edge of an overlay [H, W, 4] RGBA, in place.
+
+    Args:
+        shift: px to the left, of the right eye: so that it lies at the tissue's depth.
+    """
+    height, width = rgba.shape[:2]
+    scale = max(height / 1000, 0.4)
+    thickness = max(1, round(2 * scale))
+    for number, line in enumerate(reversed(headlines(warnings))):
+        text = _fitted(line, width - 4 * MARGIN - 2 * shift, scale, thickness)
+        (across, above), below = cv2.getTextSize(text, FONT, scale, thickness)
+        tall = above + below + 2 * MARGIN
+        top = max(0, height - (number + 1) * tall)
+        strip = np.zeros((tall, across + 3 * MARGIN, 3), np.uint8)
+        left = max(0, (width - strip.shape[1]) // 2 - shift)
+        strip[:, :MARGIN] = COLOR
+        cv2.putText(strip, text, (2 * MARGIN, MARGIN + above), FONT, scale, COLOR, thickness, cv2.LINE_AA)
+        shown = rgba[top : top + tall, left : left + strip.shape[1]]
+        shown[..., :3] = strip[: shown.shape[0], : shown.shape[1]]
+        shown[..., 3] = 255
+
+
+def _fitted(text: str, width: int, scale: float, thickness: int) -> str:
+    """As much of it as fits into so many px."""
+    if _width(text, scale, thickness) <= width:
+        return text
+    while text and _width(text + ENDS, scale, thickness) > width:
+        text = text[:-1]
+    return text + ENDS
+
+
+def _width(text: str, scale: float, thickness: int) -> int:
+    (across, _), _ = cv2.getTextSize(text, FONT, scale, thickness)
+    return int(across)

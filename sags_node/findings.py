@@ -1,0 +1,64 @@
+"""Every warning that there is. docs/warnings.md says of each what causes it and how to mend it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+from sags_node.types import Finding
+
+STAGES: Mapping[str, str] = {  # code -> which stage of the work it is about
+    "left_eye_black": "eyes",
+    "right_eye_black": "eyes",
+    "left_eye_white": "eyes",
+    "right_eye_white": "eyes",
+    "left_eye_plain": "eyes",
+    "right_eye_plain": "eyes",
+    "left_eye_fogged": "eyes",
+    "right_eye_fogged": "eyes",
+    "left_eye_frozen": "eyes",
+    "right_eye_frozen": "eyes",
+    "eyes_late": "eyes",
+    "eyes_equal": "eyes",
+    "eyes_exchanged": "eyes",
+    "eyes_knocked": "eyes",
+    "rows_differ": "calibration",
+    "tissue_too_near": "depth",
+    "picture_dark": "picture",
+    "picture_bright": "picture",
+    "picture_blood": "picture",
+    "picture_smoke": "picture",
+    "picture_blurred": "picture",
+    "picture_unknown_scene": "picture",
+    "camera_lost": "pose",
+    "mask_missing": "mask",
+    "network_failed": "network",
+    "gpu_memory": "device",
+    "gpu_failed": "device",
+    "no_frames": "source",
+    "source_drops": "source",
+    "frames_missed": "capture",
+}
+
+OF_THE_FLOW = frozenset({"source", "capture"})  # stages whose warnings make nothing that is shown less sure
+
+Findings = Mapping[str, tuple[Finding, ...]]  # by stage; a stage without any is left out
+NOTHING: Findings = {}
+
+
+def by_stage(findings: Iterable[Finding]) -> Findings:
+    """Raises KeyError for a code that is not in `STAGES`: nobody could look it up."""
+    sorted_out: dict[str, tuple[Finding, ...]] = {}
+    for finding in findings:
+        stage = STAGES[finding.code]
+        sorted_out[stage] = (*sorted_out.get(stage, ()), finding)
+    return sorted_out
+
+
+def by_code(findings: Findings) -> dict[str, str]:
+    """Code -> what is wrong and how to mend it."""
+    return {finding.code: finding.text for found in findings.values() for finding in found}
+
+
+def in_words(findings: Findings) -> dict[str, str]:
+    """Stage -> what is wrong with it and how to mend it."""
+    return {stage: "; ".join(finding.text for finding in found) for stage, found in findings.items()}

@@ -1,0 +1,108 @@
+"""How near tissue can be: the end of the disparities that are worth searching, found from the pictures.
+
+A wide search costs time and accuracy where nothing is near, a narrow one gives near tissue the depth of what
+lies behind it. So now and then a small picture is searched as far as a scope can come, and the limit follows
+what is found there.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import cv2
+import numpy as np
+
+from sags_node.config import StereoConfig
+from sags_node.types import F32, Bool, GrayPyramid
+from sags_node.vision.coarse_stereo import coarse_disparity
+from sags_node.vision.matchers import GUESS_WIDTH
+from sags_node.vision.pyramid import BORDER, inner, level
+
+NEAREST = 0.01  # m: nearer, most endoscopes cannot focus, and the eyes hardly share a view
+PERIOD_NS = 500_000_000  # between two looks
+AGREED = 2  # looks in a row that show something nearer
+RETREAT = 10  # looks in a row without anything near, after which the limit goes back
+ROOM = 0.7  # of the nearest depth that was found: tissue moves between two looks
+LEAST_SHARE = 0.02  # of the tissue that both eyes see: fewer pixels may be wrong matches, or an instrument's
+WINDOW = 9  # px of the small picture
+MATCHES = 0.8  # correlation of two windows; 99 % stay below in pictures that do not belong together
+PLAIN = 2.0  # grey levels, standard deviation in a window: less cannot be matched
+
+
+class NearLimit:
+    """Where matching may end.
+
+    Attributes:
+        limit: m, no tissue is nearer as far as is known.
+        too_near: m, the depth of what is nearer than a limit that was set; 0: nothing is. May be read from
+            any thread.
+    """
+
+    def __init__(self, config: StereoConfig, focal_baseline: float) -> None:
+        """
+        Args:
+            config: a `min_depth` that it sets stays, whatever the pictures show.
+            focal_baseline: px m, of the whole picture.
+        """
+        self.limit = self._usual = config.nearest
+        self.too_near = 0.0
+        self._is_set = config.min_depth is not None
+        self._focal_baseline = focal_baseline
+        self._looked_ns: int | None = None
+        self._found: deque[float] = deque(maxlen=RETREAT)
+
+    def look(self, t_capture_ns: int, left: GrayPyramid, right: GrayPyramid, tissue: Bool) -> None:
+        """Take the pictures of one frame and its tissue [H, W]; most of them are let pass unseen."""
+        first = self._looked_ns is None
+        if self._is_set and self.limit <= NEAREST:
+            return
+        if self._looked_ns is not None and 0 <= t_capture_ns - self._looked_ns < PERIOD_NS:
+            return
+        self._looked_ns = t_capture_ns
+        self._found.append(self._nearest(left, right, tissue))
+        latest = list(self._found)[-AGREED:]
+        agrees = len(latest) == AGREED or first  # before there is a model nothing can be spoilt
+        if self._is_set:
+            if agrees and max(latest) < self.limit:
+                self.too_near = min(latest)
+            elif min(latest) >= self.limit:
+                self.too_near = 0.0
+        elif agrees and max(latest) < self.limit:
+            self.limit = max(NEAREST, ROOM * min(latest))
+        elif len(self._found) == RETREAT and ROOM * min(self._found) > self.limit:
+            self.limit = min(self._usual, ROOM * min(self._found))
+
+    def _nearest(self, left: GrayPyramid, right: GrayPyramid, tissue: Bool) -> float:
+        """Depth of the nearest tissue, m; that of the nearest `LEAST_SHARE` of it."""
+        halvings = 0
+        while halvings < len(left.halves) and left.full.shape[1] >> halvings > GUESS_WIDTH:
+            halvings += 1
+        scale = 1 << halvings
+        eyes = level(left, halvings), level(right, halvings)
+        height, width = (side - 2 * BORDER for side in eyes[0].shape)
+        most = min(self._focal_baseline / scale / NEAREST, width - 1.0)
+        disparity = coarse_disparity(*eyes, 0.0, most)
+        first, second = (np.ascontiguousarray(inner(eye)) for eye in eyes)
+        columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+        there = columns - disparity
+        seen = cv2.remap(second, there, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        small = tissue[scale // 2 :: scale, scale // 2 :: scale][:height, :width]
+        both = small & (there >= 0)
+        known = both & (_agreement(first, seen) > MATCHES)
+        count = round(LEAST_SHARE * np.count_nonzero(both))
+        found = disparity[known & (disparity > 0)]
+        if count == 0 or len(found) < count:
+            return np.inf
+        return float(self._focal_baseline / scale / np.partition(found, -count)[-count])
+
+
+def _agreement(first: F32, second: F32) -> F32:
+    """Correlation of the windows around each pixel; 0 where there is nothing to compare."""
+
+    def mean(picture: F32) -> F32:
+        return np.asarray(cv2.blur(picture, (WINDOW, WINDOW)), np.float32)
+
+    a, b = first - mean(first), second - mean(second)
+    aa, bb, ab = mean(a * a), mean(b * b), mean(a * b)
+    correlation: F32 = np.where(np.minimum(aa, bb) > PLAIN**2, ab / np.sqrt(aa * bb + 1e-6), np.float32(0))
+    return correlation
