@@ -286,7 +286,7 @@ def test_the_bench_measures_the_phantom(tmp_path: Path) -> None:
     assert clean["psnr_before"] == black["psnr_before"]  # the same until then
     assert clean["frames_to_recover"] == 0 and clean["warned_after_s"] is None and clean["anchors"] >= 12
     assert clean["anchors_back"] >= 0.5 and clean["anchors_wrong"] <= 0.1
-    assert black["warned_after_s"] is not None and black["warned_of"] == ["eyes"]
+    assert black["warned_after_s"] is not None and black["warned_of"] == ["right_eye_black"]
     assert black["borrowed_share"] > clean["borrowed_share"] + 0.2  # nothing is measured after half a second
     assert black["depth_median_mm"] is not None and 0 < black["coverage"] <= 1
     for name in ("clean", "black_right"):

@@ -13,6 +13,7 @@ import numpy as np
 from sags_node.disturbances import DISTURBANCES, Disturbance, Scene, Taken, disturbed
 from sags_node.errors import SagsError, UsageError
 from sags_node.evaluation import metrics
+from sags_node.findings import by_code
 from sags_node.geometry import transform
 from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import StepBudget
@@ -204,7 +205,7 @@ class _Run:
             borrowed=_share(borrowed, published),
             confident_borrowed=_share(borrowed, confident),
             depth=_depth_errors(frame, view, confident, tissue),
-            warnings=frozenset(self._pipeline.warnings),
+            warnings=frozenset(by_code(self._pipeline.warnings)),
             restarts=self._pipeline.mapper.restarts,
         )
         if not self._anchors.pinned and frame.frame_id >= self.during.start - LEAD:
@@ -291,11 +292,11 @@ def warning_times(
     None: never.
 
     Args:
-        warnings: frame_id -> the stages that warn, without those that warned before.
+        warnings: frame_id -> the codes of the warnings, without those that warned before.
         during: frames of the disturbance.
         rate: frames per second.
     """
-    warned = [frame for frame, stages in warnings.items() if stages and frame >= during.start]
+    warned = [frame for frame, codes in warnings.items() if codes and frame >= during.start]
     if not warned:
         return None, None
     after = (min(warned) - during.start) / rate
