@@ -24,6 +24,8 @@ SPACING = 34  # px between anchors
 BORDER = 60  # px: what is nearer to the picture's edge soon leaves it
 CONSISTENT = 1.0  # px between a point and where the flow there and back takes it
 
+AT_ONCE = 1 << 14  # places: OpenCV takes no picture of more than 32,766 rows
+
 Advance = Callable[[int, int | None, str], None]  # frames done, of, what
 
 
@@ -110,9 +112,11 @@ def _follow(places: F64, there: F32, back: F32, tissue: Bool) -> tuple[F64, Bool
 
 
 def _sample(flow: F32, places: F64) -> F64:
-    x, y = places.astype(np.float32).T
-    taken = cv2.remap(flow, x.copy(), y.copy(), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(taken.reshape(-1, 2), np.float64)
+    taken = [
+        cv2.remap(flow, some[:, None], None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0]
+        for some in np.array_split(places.astype(np.float32), len(places) // AT_ONCE + 1)
+    ]
+    return np.concatenate(taken).astype(np.float64)
 
 
 def _common_gaussians(first: FrameResult, result: FrameResult) -> tuple[F64, F64]:
