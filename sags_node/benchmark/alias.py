@@ -80,9 +80,10 @@ def train(observation: Observation, filters: Filters, settings: Settings) -> Tra
     """A model of one still picture, by the node's own mapper."""
     refiner = CpuRefiner(partial(make_rasterizer, "numba", antialias=filters.screen))
     mapper = Mapper(refiner, settings.max_gaussians, filters.world, focus=1.0)
-    for _ in range(1 + settings.rounds):  # the first places the Gaussians
-        mapper.update(observation, StepBudget(STEPS_PER_ROUND))
-    return Trained(mapper.model.gaussians(), filters.screen)
+    mapped = mapper.update(observation, StepBudget(STEPS_PER_ROUND))  # places the Gaussians
+    for _ in range(settings.rounds):
+        mapped = mapper.update(observation, StepBudget(STEPS_PER_ROUND))
+    return Trained(mapped.snapshot.gaussians, filters.screen)  # the mapper's own has new, untrained splits
 
 
 @dataclass(frozen=True, slots=True)
