@@ -19,8 +19,7 @@ RESULTS = sorted((ROOT / "benchmarks/results").glob("*.json"))
 # Measured before results named where they come from. A file leaves this list when it is measured anew.
 EARLIER = {
     "ablation_d4d", "ablation_phantom", "alias", "crowd", "d4d_100ms", "depth_d4d", "depth_phantom",
-    "depth_tmi", "endurance_walk", "fit_d4d", "fit_phantom", "kernels", "masks", "pareto", "skips_d4d",
-    "stream", "tracking_d4d",
+    "endurance_walk", "kernels", "pareto", "skips_d4d", "tracking_d4d",
 }  # fmt: skip
 
 
