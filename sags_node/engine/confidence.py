@@ -1,0 +1,130 @@
+"""How far to trust a drawn depth: one number from 0 to 1, from the predicted errors of what was drawn.
+
+    confidence = 2 ** (-error / 3 mm)        error = 3 mm * log2(1 / confidence)
+
+`error` is the predicted one: nine of ten real ones are smaller. So 0.5 says within 3 mm, 0.8 within 1 mm,
+0.25 within 6 mm; below 1/16, 12 mm, no depth is stated.
+
+The errors are averaged on a coarse grid, weighted by what each Gaussian covers of the surface that is drawn.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+from numba import prange
+
+from sags_node.engine.pinhole import pack, to_camera, to_pixel
+from sags_node.kernels.jit import kernel, parallel_kernel, read_only
+from sags_node.types import F32, F64, Gaussians, RenderedView
+
+HALVING = 3e-3  # m of error
+LEAST = 1 / 16  # of confidence, with which a depth is still stated
+SURE = 0.5  # of confidence, with which a depth may decide something
+FAINTEST = 1e-30  # of confidence: 0.3 m
+CELLS = 80  # across the picture
+BEHIND = 0.035  # of the depth: what is so far behind the drawn surface is hidden by it
+SHARES = 4  # of the Gaussians, each added up by itself
+
+
+def confidence_of(error: F32 | F64) -> F32:
+    """Confidence 0..1 of depths with predicted errors (m)."""
+    return np.asarray(np.exp2(-error / HALVING), np.float32)
+
+
+def error_of(confidence: F32) -> F32:
+    """The predicted errors (m) that these confidences stand for."""
+    return np.asarray(-HALVING * np.log2(np.maximum(confidence, FAINTEST)), np.float32)
+
+
+def with_confidence(view: RenderedView, gaussians: Gaussians) -> RenderedView:
+    """The view of these Gaussians with its confidence; a depth below `LEAST` is taken out, in place."""
+    if gaussians.depth_errors is None:
+        return view
+    height, width = view.depth.shape
+    side = max(1, round(width / CELLS))
+    rows, columns = -(-height // side), -(-width // side)
+    sums = np.zeros((SHARES, 2, rows, columns), np.float32)
+    _add_up(
+        read_only(gaussians.means), read_only(gaussians.scales), read_only(gaussians.opacities),
+        read_only(gaussians.depth_errors), pack(view.camera), view.depth, side, sums,
+    )  # fmt: skip
+    coarse = np.empty((rows, columns), np.float32)
+    _average(sums, np.float32(HALVING), coarse)
+    confidence = cv2.resize(coarse, (columns * side, rows * side), interpolation=cv2.INTER_LINEAR)
+    confidence = np.ascontiguousarray(confidence[:height, :width])
+    _leave_out(np.float32(LEAST), view.depth, confidence)
+    return replace(view, confidence=confidence)
+
+
+@parallel_kernel
+def _add_up(
+    means: F32, scales: F32, opacities: F32, errors: F32, cam: F32, depth: F32, side: int, sums: F32
+) -> None:
+    for share in prange(SHARES):
+        number = np.int64(share)
+        first, end = len(means) * number // SHARES, len(means) * (number + 1) // SHARES
+        _add_up_rows(means, scales, opacities, errors, cam, depth, side, sums[number], first, end)
+
+
+@kernel
+def _add_up_rows(
+    means: F32, scales: F32, opacities: F32, errors: F32, cam: F32, depth: F32, side: int, sums: F32,
+    first: Any, end: Any,
+) -> None:  # fmt: skip
+    """Of each cell, what the Gaussians in it cover of the drawn surface, and that times the squared error."""
+    height, width = depth.shape
+    for i in range(first, end):
+        x, y, z = to_camera(cam, means[i, 0], means[i, 1], means[i, 2])
+        if not z > 0:
+            continue
+        u, v = to_pixel(cam, x, y, z)
+        if not (u > -0.5 and v > -0.5 and u < width - 0.5 and v < height - 0.5):
+            continue
+        column, row = int(u + 0.5), int(v + 0.5)
+        if depth[row, column] * np.float32(1 + BEHIND) < z:
+            continue
+        covered = opacities[i] * scales[i, 0] * scales[i, 1] / (z * z)
+        row //= side
+        column //= side
+        sums[0, row, column] += covered
+        sums[1, row, column] += covered * errors[i] * errors[i]
+
+
+@kernel
+def _average(sums: F32, halving: Any, confidence: F32) -> None:
+    """Over each cell and, by half, its neighbours."""
+    shares, _, rows, columns = sums.shape
+    for share in range(1, shares):
+        for row in range(rows):
+            for column in range(columns):
+                sums[0, 0, row, column] += sums[share, 0, row, column]
+                sums[0, 1, row, column] += sums[share, 1, row, column]
+    for row in range(rows):
+        for column in range(columns):
+            covered, squares = np.float32(0), np.float32(0)
+            for y in range(max(row - 1, 0), min(row + 2, rows)):
+                for x in range(max(column - 1, 0), min(column + 2, columns)):
+                    weight = np.float32(1) / np.float32((1 + abs(y - row)) * (1 + abs(x - column)))
+                    covered += weight * sums[0, 0, y, x]
+                    squares += weight * sums[0, 1, y, x]
+            confidence[row, column] = np.float32(0)
+            if covered > 0:
+                confidence[row, column] = np.float32(2) ** (-np.sqrt(squares / covered) / halving)
+
+
+@parallel_kernel
+def _leave_out(least: Any, depth: F32, confidence: F32) -> None:
+    for row in prange(depth.shape[0]):
+        _leave_out_row(least, depth[np.int64(row)], confidence[np.int64(row)])
+
+
+@kernel
+def _leave_out_row(least: Any, depth: F32, confidence: F32) -> None:
+    for x in range(depth.size):
+        if confidence[x] < least or depth[x] == 0:
+            depth[x] = 0
+            confidence[x] = 0
