@@ -168,10 +168,13 @@ def test_a_hole_is_filled_with_what_it_does_not_know_for_sure() -> None:
     depth = np.full(SHAPE, DEPTH, np.float32)
     depth[80:180, 100:220] = 0
     frame = observation(depth, np.ones(SHAPE, bool))
-    pixels, depths, errors = densify.candidates(np.zeros((5, *SHAPE), np.float32), frame, 0)
+    planes = np.full((5, *SHAPE), 0.5, np.float32)
+    planes[3:] = [[[DEPTH]], [[1.0]]]
+    planes[:, 70:190, 90:230] = 0
+    pixels, depths, errors = densify.candidates(planes, frame, 0)
     inside = (depth == 0)[pixels[:, 1], pixels[:, 0]]
-    assert inside.any() and np.allclose(depths, DEPTH, atol=1e-4)
-    assert errors[inside].min() > JUMP * DEPTH > errors[~inside].mean()
+    assert inside.any() and not inside.all() and np.allclose(depths, DEPTH, atol=1e-4)
+    assert np.median(errors[inside]) > JUMP * DEPTH > np.median(errors[~inside])
 
 
 # ---- drawn -------------------------------------------------------------------------------------------------

@@ -16,6 +16,7 @@ from numba import prange
 
 from sags_node.engine.pinhole import pack, to_camera, to_pixel
 from sags_node.kernels.jit import PIECE, kernel, parallel_kernel
+from sags_node.mapping.initialise import LARGEST_ERROR
 from sags_node.mapping.motion import BEHIND_TOLERANCE, DEPTH_GATE
 from sags_node.model.gaussians import GaussianModel
 from sags_node.types import F32, Bool, Observation
@@ -23,7 +24,6 @@ from sags_node.vision.depth_grid import depth_at, grid_of
 
 DRIFT = 0.5  # of the way that tissue is taken: so much of it may lie along the ray, where nothing shows it
 UNSEEN = 1e-3  # m/s: what tissue moves by itself
-LARGEST = 1.0  # m
 
 
 def remember(model: GaussianModel, observation: Observation, pull: float, seconds: float) -> None:
@@ -82,4 +82,4 @@ def _remember_rows(
         else:
             way = velocities[i, 0] ** 2 + velocities[i, 1] ** 2 + velocities[i, 2] ** 2
             error += (np.float32(DRIFT) * np.sqrt(way) + np.float32(UNSEEN)) * seconds
-        errors[i] = min(error, np.float32(LARGEST))
+        errors[i] = min(error, np.float32(LARGEST_ERROR))

@@ -18,6 +18,7 @@ LEAST_SIZE = 0.8  # px: the filters take so much opacity from smaller ones that 
 FLATNESS = 0.5  # the extent along the ray against the extent across it
 OPACITY = 0.9
 LEAST_SHARE = 0.3  # of the drawn scale that is left when the 3D filter's share is taken off
+LARGEST_ERROR = 0.05  # m of depth: more says no more
 INITIAL_SHARE = 0.75  # of the cap used by the first frame; the rest is for what appears later
 
 
@@ -33,7 +34,7 @@ def insert(
     """Add one Gaussian for each pixel [M, 2] (x, y), coloured by the picture, at depth `z` [M] m.
 
     Args:
-        errors: [M] m, predicted, of the depths.
+        errors: [M] m, predicted, of the depths; infinite: as large as the model's are on the whole.
         spacing: px between neighbouring pixels of the list; it sets the scales as they are drawn.
         smoothing: give them the 3D filter.
 
@@ -49,7 +50,9 @@ def insert(
     scales = np.sqrt(np.maximum(scales**2 - variances[:, None], (LEAST_SHARE * scales) ** 2))
     rows = model.append(means, scales, observation.image[y, x], OPACITY)
     model.smoothing[rows] = variances[: rows.stop - rows.start]
-    model.depth_errors[rows] = errors[: rows.stop - rows.start]
+    known = model.depth_errors[: rows.start]
+    usual = np.median(known) if len(known) else LARGEST_ERROR
+    model.depth_errors[rows] = np.where(np.isfinite(errors), errors, usual)[: rows.stop - rows.start]
     return rows
 
 
