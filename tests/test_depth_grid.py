@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sags_node.config import PhantomSource, StereoConfig
-from sags_node.engine.confidence import HALVING, LEAST, SURE, confidence_of, error_of, with_confidence
+from sags_node.engine.confidence import HALVING, SURE, confidence_of, error_of, with_confidence
 from sags_node.evaluation import calibration
 from sags_node.geometry import unproject
 from sags_node.mapping import densify
@@ -17,7 +17,7 @@ from sags_node.mapping.depth_memory import DRIFT, UNSEEN, remember
 from sags_node.model.gaussians import GaussianModel
 from sags_node.phantom.scene import Phantom
 from sags_node.types import Camera, DepthGrid, Observation, RectifiedPair, RenderedView, StereoFrame
-from sags_node.vision.depth_grid import JUMP, depth_grid
+from sags_node.vision.depth_grid import JUMP, SLOPE, depth_grid
 from sags_node.vision.rectify import Rectifier
 from sags_node.vision.stereo import StereoDepth
 
@@ -106,9 +106,9 @@ def test_borrowed_depth_is_marked_and_fades_with_the_distance() -> None:
     assert (confidence_of(row[: border - 5]) > SURE).all()
     assert (confidence_of(row[border + 1 :]) < SURE).all()
     assert (np.diff(row[border:]) > -1e-6).all() and row[border + 1] > JUMP * DEPTH
-    far = 100 / FOCAL * DEPTH  # m aside, at 45 degrees as much deeper
-    assert row[border + int(100 / grid.side)] >= far
-    assert confidence_of(row)[-1] < LEAST
+    aside = 100 / FOCAL * DEPTH  # m
+    assert row[border + int(100 / grid.side)] >= SLOPE * aside
+    assert confidence_of(row)[-1] < confidence_of(row)[border + 1] / 8
 
 
 def test_without_any_depth_nothing_is_known() -> None:

@@ -3,7 +3,7 @@
     confidence = 2 ** (-error / 3 mm)        error = 3 mm * log2(1 / confidence)
 
 `error` is the predicted one: nine of ten real ones are smaller. So 0.5 says within 3 mm, 0.8 within 1 mm,
-0.25 within 6 mm; below 1/16, 12 mm, no depth is stated.
+0.25 within 6 mm; below 1/64, 18 mm, no depth is stated.
 
 The errors are averaged on a coarse grid, weighted by what each Gaussian covers of the surface that is drawn.
 """
@@ -22,12 +22,13 @@ from sags_node.kernels.jit import kernel, parallel_kernel, read_only
 from sags_node.types import F32, F64, Gaussians, RenderedView
 
 HALVING = 3e-3  # m of error
-LEAST = 1 / 16  # of confidence, with which a depth is still stated
+LEAST = 1 / 64  # of confidence, with which a depth is still stated
 SURE = 0.5  # of confidence, with which a depth may decide something
 FAINTEST = 1e-30  # of confidence: 0.3 m
 CELLS = 80  # across the picture
 BEHIND = 0.035  # of the depth: what is so far behind the drawn surface is hidden by it
 SHARES = 4  # of the Gaussians, each added up by itself
+ENOUGH = 3  # Gaussians in a cell, on the average: of more not all are looked at
 
 
 def confidence_of(error: F32 | F64) -> F32:
@@ -48,9 +49,10 @@ def with_confidence(view: RenderedView, gaussians: Gaussians) -> RenderedView:
     side = max(1, round(width / CELLS))
     rows, columns = -(-height // side), -(-width // side)
     sums = np.zeros((SHARES, 2, rows, columns), np.float32)
+    every = max(1, len(gaussians) // (ENOUGH * rows * columns))
     _add_up(
         read_only(gaussians.means), read_only(gaussians.scales), read_only(gaussians.opacities),
-        read_only(gaussians.depth_errors), pack(view.camera), view.depth, side, sums,
+        read_only(gaussians.depth_errors), tuple(pack(view.camera)), view.depth, side, every, sums,
     )  # fmt: skip
     coarse = np.empty((rows, columns), np.float32)
     _average(sums, np.float32(HALVING), coarse)
@@ -62,22 +64,23 @@ def with_confidence(view: RenderedView, gaussians: Gaussians) -> RenderedView:
 
 @parallel_kernel
 def _add_up(
-    means: F32, scales: F32, opacities: F32, errors: F32, cam: F32, depth: F32, side: int, sums: F32
-) -> None:
+    means: F32, scales: F32, opacities: F32, errors: F32, cam: Any, depth: F32, side: int, every: int,
+    sums: F32,
+) -> None:  # fmt: skip
     for share in prange(SHARES):
         number = np.int64(share)
         first, end = len(means) * number // SHARES, len(means) * (number + 1) // SHARES
-        _add_up_rows(means, scales, opacities, errors, cam, depth, side, sums[number], first, end)
+        _add_up_rows(means, scales, opacities, errors, cam, depth, side, every, sums[number], first, end)
 
 
 @kernel
 def _add_up_rows(
-    means: F32, scales: F32, opacities: F32, errors: F32, cam: F32, depth: F32, side: int, sums: F32,
-    first: Any, end: Any,
+    means: F32, scales: F32, opacities: F32, errors: F32, cam: Any, depth: F32, side: int, every: int,
+    sums: F32, first: Any, end: Any,
 ) -> None:  # fmt: skip
     """Of each cell, what the Gaussians in it cover of the drawn surface, and that times the squared error."""
     height, width = depth.shape
-    for i in range(first, end):
+    for i in range(first, end, every):
         x, y, z = to_camera(cam, means[i, 0], means[i, 1], means[i, 2])
         if not z > 0:
             continue
@@ -98,6 +101,7 @@ def _add_up_rows(
 def _average(sums: F32, halving: Any, confidence: F32) -> None:
     """Over each cell and, by half, its neighbours."""
     shares, _, rows, columns = sums.shape
+    one, half = np.float32(1), np.float32(0.5)
     for share in range(1, shares):
         for row in range(rows):
             for column in range(columns):
@@ -107,8 +111,9 @@ def _average(sums: F32, halving: Any, confidence: F32) -> None:
         for column in range(columns):
             covered, squares = np.float32(0), np.float32(0)
             for y in range(max(row - 1, 0), min(row + 2, rows)):
+                by_row = one if y == row else half
                 for x in range(max(column - 1, 0), min(column + 2, columns)):
-                    weight = np.float32(1) / np.float32((1 + abs(y - row)) * (1 + abs(x - column)))
+                    weight = by_row if x == column else by_row * half
                     covered += weight * sums[0, 0, y, x]
                     squares += weight * sums[0, 1, y, x]
             confidence[row, column] = np.float32(0)
@@ -124,7 +129,9 @@ def _leave_out(least: Any, depth: F32, confidence: F32) -> None:
 
 @kernel
 def _leave_out_row(least: Any, depth: F32, confidence: F32) -> None:
-    for x in range(depth.size):
-        if confidence[x] < least or depth[x] == 0:
-            depth[x] = 0
-            confidence[x] = 0
+    zero = np.float32(0)
+    for i in range(depth.size):
+        x = np.uint64(i)
+        stated = (confidence[x] >= least) & (depth[x] > zero)
+        depth[x] = depth[x] if stated else zero
+        confidence[x] = confidence[x] if stated else zero

@@ -11,7 +11,19 @@ import numpy as np
 from sags_node.engine.confidence import error_of
 from sags_node.types import F32, F64, I64, Bool
 
-PREDICTED_MM = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.1)  # edges of the groups; 3: confidence 0.5
+PREDICTED_MM = (
+    0.0,
+    0.5,
+    1.0,
+    1.5,
+    2.0,
+    3.0,
+    4.0,
+    6.0,
+    8.0,
+    12.0,
+    18.1,
+)  # edges of the groups; 3: confidence 0.5
 STEP_MM, MOST_MM = 0.05, 40.0  # of the real errors, which are counted and not kept
 SURE_GROUPS = PREDICTED_MM.index(3.0)  # below it: confidence of at least `SURE`
 

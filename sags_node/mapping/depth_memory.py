@@ -20,7 +20,7 @@ from sags_node.mapping.initialise import LARGEST_ERROR
 from sags_node.mapping.motion import BEHIND_TOLERANCE, DEPTH_GATE
 from sags_node.model.gaussians import GaussianModel
 from sags_node.types import F32, Bool, Observation
-from sags_node.vision.depth_grid import depth_at, grid_of
+from sags_node.vision.depth_grid import grid_of
 
 DRIFT = 0.5  # of the way that tissue is taken: so much of it may lie along the ray, where nothing shows it
 UNSEEN = 1e-3  # m/s: what tissue moves by itself
@@ -36,28 +36,28 @@ def remember(model: GaussianModel, observation: Observation, pull: float, second
     """
     grid = grid_of(observation)
     _remember(
-        model.means, model.velocities, pack(observation.camera), observation.tissue, observation.depth,
-        grid.inverse, grid.error, np.float32(grid.side), np.float32(pull), np.float32(seconds),
+        model.means, model.velocities, tuple(pack(observation.camera)), observation.tissue, observation.depth,
+        grid.error, np.float32(1 / grid.side), np.float32(pull), np.float32(seconds),
         model.depth_errors,
     )  # fmt: skip
 
 
 @parallel_kernel
 def _remember(
-    means: F32, velocities: F32, cam: F32, tissue: Bool, depth: F32, inverse: F32, grid_error: F32, side: Any,
+    means: F32, velocities: F32, cam: Any, tissue: Bool, depth: F32, grid_error: F32, per_px: Any,
     pull: Any, seconds: Any, errors: F32,
 ) -> None:  # fmt: skip
     for piece in prange(-(-len(means) // PIECE)):
         first = np.int64(piece) * PIECE
         _remember_rows(
-            means, velocities, cam, tissue, depth, inverse, grid_error, side, pull, seconds, errors,
+            means, velocities, cam, tissue, depth, grid_error, per_px, pull, seconds, errors,
             first, min(first + PIECE, len(means)),
         )  # fmt: skip
 
 
 @kernel
 def _remember_rows(
-    means: F32, velocities: F32, cam: F32, tissue: Bool, depth: F32, inverse: F32, grid_error: F32, side: Any,
+    means: F32, velocities: F32, cam: Any, tissue: Bool, depth: F32, grid_error: F32, per_px: Any,
     pull: Any, seconds: Any, errors: F32, first: Any, end: Any,
 ) -> None:  # fmt: skip
     height, width = depth.shape
@@ -71,7 +71,8 @@ def _remember_rows(
             if u > -0.5 and v > -0.5 and u < width - 0.5 and v < height - 0.5:
                 px, py = int(u + 0.5), int(v + 0.5)
                 if tissue[py, px] and depth[py, px] > 0:
-                    measured, its_error = depth_at(depth, inverse, grid_error, side, px, py)
+                    measured = depth[py, px]
+                    its_error = grid_error[int(py * per_px), int(px * per_px)] * measured * measured
         apart = measured - z
         if measured > 0 and abs(apart) < np.float32(BEHIND_TOLERANCE) * z:
             expected = error * error + its_error * its_error

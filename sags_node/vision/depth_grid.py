@@ -29,7 +29,8 @@ FLOOR = 0.25  # px of disparity: calibration, of which no match tells (principal
 UNSUPPORTED = 1.0  # px: a match that no neighbour agrees with
 ROUGHNESS = 3.5  # times how far cells lie from the mean of their neighbours: nine of ten errors are smaller
 AGREEING = 1.0  # px, beside what a slope explains: two cells of one surface
-SLOPE = 1.0  # of tissue, m deeper per m aside, 45 degrees
+STEEPEST = 1.0  # m deeper per m aside, 45 degrees: more is another surface
+SLOPE = 0.5  # m deeper per m aside: tissue mostly lies flatter
 LEAST_SUPPORT = 0.1  # of the tissue around, measured to be the same surface: less is a speck
 NOMINAL_BASELINE = 4e-3  # m: of depth that no pair of eyes measured; endoscopes have about that
 JUMP = 0.06  # of the depth: what was not measured lies behind an edge or an instrument often enough
@@ -51,8 +52,8 @@ def depth_grid(depth: F32, confidence: F32, tissue: Bool, focal: float, baseline
     sums = np.zeros((3, rows, columns), np.float32)
     _gather(depth, confidence, tissue, side, sums)
     around = np.zeros((4, rows, columns), np.float32)
-    slope = np.float32(SLOPE * side / focal)
-    _compare(sums, np.float32(AGREEING) * px, slope, around)
+    aside = side / focal  # of a cell at a distance of 1
+    _compare(sums, np.float32(AGREEING) * px, np.float32(STEEPEST * aside), around)
     _judge(sums, px, around)
     _drop_specks(around[3], side, depth, confidence)
     inverse, error = around[2:]
@@ -60,7 +61,7 @@ def depth_grid(depth: F32, confidence: F32, tissue: Bool, focal: float, baseline
     weight = np.where(known, np.square(np.float32(2 * FLOOR) * px / np.where(known, error, 1)), np.float32(0))
     lent, square = _borrowed(np.stack([weight, weight * inverse, weight * error * error]))
     away = cv2.distanceTransform((~known).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_3)
-    square += np.square((slope * away + np.float32(JUMP)) * lent)
+    square += np.square((np.float32(SLOPE * aside) * away + np.float32(JUMP)) * lent)
     lent_error = np.where(lent > 0, np.sqrt(square), np.float32(np.inf))
     return DepthGrid(float(side), np.where(known, inverse, lent), np.where(known, error, lent_error))
 
