@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
+from sags_node.confidence import HALVING, SURE, confidence_of, error_of
 from sags_node.config import PhantomSource, StereoConfig
-from sags_node.engine.confidence import HALVING, SURE, confidence_of, error_of, with_confidence
+from sags_node.engine.confidence import with_confidence
 from sags_node.evaluation import calibration
 from sags_node.geometry import unproject
 from sags_node.mapping import densify

@@ -12,7 +12,7 @@ from zipfile import BadZipFile
 import msgspec
 import numpy as np
 
-from sags_node.engine.confidence import error_of
+from sags_node.confidence import error_of
 from sags_node.errors import SagsError, UsageError
 from sags_node.fitting import checkpoint
 from sags_node.fitting.clip import read_clip

@@ -3,7 +3,7 @@
 The mesh is a fusion (Curless and Levoy, 1996, by Open3D) of the depth drawn from the left camera and from
 others around it. A pixel counts only where the mean depth of its ray is also the depth at which half of the
 light is gone: rays that meet two surfaces, or none, say nothing. Nor does depth that was borrowed, or
-measured too badly to be sure of (`engine.confidence`).
+measured too badly to be sure of (`sags_node.confidence`).
 
 On the phantom at its lift, median, p90 and p99:
 
@@ -25,7 +25,8 @@ import numpy as np
 
 from sags_node.apps.export_orbit import orbit
 from sags_node.apps.export_scene import Scene
-from sags_node.engine.confidence import SURE, with_confidence
+from sags_node.confidence import SURE
+from sags_node.engine.confidence import with_confidence
 from sags_node.engine.rasterize import make_rasterizer, to_view
 from sags_node.errors import SagsError
 from sags_node.geometry import unproject

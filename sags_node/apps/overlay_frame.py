@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sags_node.engine.confidence import SURE
+from sags_node.confidence import SURE
 from sags_node.geometry import quat_to_matrix
 from sags_node.messaging.received import (
     Frame,

@@ -11,7 +11,7 @@ import numpy as np
 from sags_node.apps.overlay_frame import Anchor, TissueFrame
 from sags_node.apps.overlay_pose import on_a_line, on_surface, rigid_fit, surface_normal
 from sags_node.apps.overlay_scene import ObjectSpec
-from sags_node.engine.confidence import LEAST
+from sags_node.confidence import LEAST
 from sags_node.errors import SagsError, UsageError
 from sags_node.geometry import invert, transform
 from sags_node.messaging.control import ControlClient

@@ -1,9 +1,4 @@
-"""How far to trust a drawn depth: one number from 0 to 1, from the predicted errors of what was drawn.
-
-    confidence = 2 ** (-error / 3 mm)        error = 3 mm * log2(1 / confidence)
-
-`error` is the predicted one: nine of ten real ones are smaller. So 0.5 says within 3 mm, 0.8 within 1 mm,
-0.25 within 6 mm; below 1/64, 18 mm, no depth is stated.
+"""The confidence of a drawn depth, from the predicted errors of what was drawn.
 
 The errors are averaged on a coarse grid, weighted by what each Gaussian covers of the surface that is drawn.
 """
@@ -17,28 +12,15 @@ import cv2
 import numpy as np
 from numba import prange
 
+from sags_node.confidence import HALVING, LEAST
 from sags_node.engine.pinhole import pack, to_camera, to_pixel
 from sags_node.kernels.jit import kernel, parallel_kernel, read_only
-from sags_node.types import F32, F64, Gaussians, RenderedView
+from sags_node.types import F32, Gaussians, RenderedView
 
-HALVING = 3e-3  # m of error
-LEAST = 1 / 64  # of confidence, with which a depth is still stated
-SURE = 0.5  # of confidence, with which a depth may decide something
-FAINTEST = 1e-30  # of confidence: 0.3 m
 CELLS = 80  # across the picture
 BEHIND = 0.035  # of the depth: what is so far behind the drawn surface is hidden by it
 SHARES = 4  # of the Gaussians, each added up by itself
 ENOUGH = 3  # Gaussians in a cell, on the average: of more not all are looked at
-
-
-def confidence_of(error: F32 | F64) -> F32:
-    """Confidence 0..1 of depths with predicted errors (m)."""
-    return np.asarray(np.exp2(-error / HALVING), np.float32)
-
-
-def error_of(confidence: F32) -> F32:
-    """The predicted errors (m) that these confidences stand for."""
-    return np.asarray(-HALVING * np.log2(np.maximum(confidence, FAINTEST)), np.float32)
 
 
 def with_confidence(view: RenderedView, gaussians: Gaussians) -> RenderedView:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sags_node.engine.confidence import error_of
+from sags_node.confidence import error_of
 from sags_node.types import F32, F64, I64, Bool
 
 PREDICTED_MM = (

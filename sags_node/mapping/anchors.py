@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields, replace
 import cv2
 import numpy as np
 
-from sags_node.engine.confidence import confidence_of
+from sags_node.confidence import confidence_of
 from sags_node.errors import SagsError
 from sags_node.geometry import project, unproject
 from sags_node.mapping.motion import BEHIND_TOLERANCE

@@ -9,7 +9,7 @@ import cv2
 import msgspec
 import numpy as np
 
-from sags_node.engine.confidence import confidence_of
+from sags_node.confidence import confidence_of
 from sags_node.geometry import project
 from sags_node.messaging import cdr
 from sags_node.messaging.cdr import Content, Status

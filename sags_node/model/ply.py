@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sags_node.engine.confidence import confidence_of
+from sags_node.confidence import confidence_of
 from sags_node.engine.smoothing import folded
 from sags_node.errors import SagsError
 from sags_node.types import SH_DEGREE_0, Gaussians
@@ -20,7 +20,7 @@ def write_ply(path: Path, gaussians: Gaussians) -> None:
     """Write a binary PLY in the layout of 3D Gaussian Splatting (Kerbl et al., 2023): log scales, opacity
     logits, quaternions wxyz, colours as degree-0 spherical harmonics; metres. The 3D filter is folded in:
     viewers do not know it. Where the errors of depth are known, `confidence` comes last, see
-    `engine.confidence`; readers take properties by name.
+    `sags_node.confidence`; readers take properties by name.
 
     Raises:
         SagsError: the file exists already (nothing is overwritten) or cannot be written.
