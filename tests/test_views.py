@@ -57,7 +57,7 @@ def collect(node: RunningNode, names: list[str], count: int = 1, timeout: float 
 def anchor_rows(message: client.Received) -> dict[int, np.ndarray]:
     """Rows by anchor id."""
     client.check_meta(message, "sensor_msgs/msg/PointCloud2")
-    assert message.meta["encoding"].split(",") == ANCHOR_FIELDS
+    assert message.meta["encoding"].split(",")[: len(ANCHOR_FIELDS)] == ANCHOR_FIELDS
     rows = message.array()
     ids = rows.view(np.uint32)[:, ANCHOR_FIELDS.index("id")]
     return {int(one): row for one, row in zip(ids, rows, strict=True)}
