@@ -363,7 +363,8 @@ class Node:
         else:
             point = np.array([request.x, request.y, request.z], np.float64)
             anchor = self._pipeline.anchors.add_point(point, *frame)
-        return {"id": anchor, "frame_id": newest.pair.frame_id}
+        sure = self._pipeline.anchors.depth_confidence(anchor)
+        return {"id": anchor, "frame_id": newest.pair.frame_id, "depth_confidence": round(sure, 3)}
 
     def _remove_anchor(self, args: dict[str, Any]) -> dict[str, Any]:
         self._pipeline.anchors.remove(parse(AnchorName, args).id)

@@ -144,6 +144,18 @@ class RectifiedPair:
 
 
 @dataclass(frozen=True, slots=True)
+class DepthGrid:
+    """The depth that a frame tells of, coarse and everywhere; see `vision.depth_grid`.
+
+    Errors are predicted: nine of ten real ones are smaller. A depth z has the error `error * z * z`.
+    """
+
+    side: float  # px of a cell
+    inverse: F32  # [h, w] 1/m, of the inverse depth: measured, else borrowed from around; 0: unknown
+    error: F32  # [h, w] 1/m, of the inverse depth; it grows with the distance to what was measured
+
+
+@dataclass(frozen=True, slots=True)
 class Observation:
     """All that the mapper may know of one frame."""
 
@@ -158,6 +170,7 @@ class Observation:
     right: F32 | None = None  # [H, W, 3] RGB 0..1, the right eye, if the mapper is to learn from it
     baseline: float = 0.0  # m, to the right eye
     pyramid: GrayPyramid | None = None  # of `gray`, where it is made already
+    grid: DepthGrid | None = None  # of `depth`, where it is made already
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,6 +185,7 @@ class Gaussians:
     ids: I64  # [N] stable over the life of a Gaussian
     sh_rest: F32 | None = None  # [N, K - 1, 3] real spherical harmonics of degree 1 to 3 without the constant
     smoothing: F32 | None = None  # [N] m^2, variance of the 3D filter (Mip-Splatting), still to be applied
+    depth_errors: F32 | None = None  # [N] m, predicted: nine of ten real ones are smaller; None: unknown
 
     def __len__(self) -> int:
         return len(self.means)
@@ -199,8 +213,9 @@ class RenderedView:
     t_capture_ns: int
     camera: Camera
     rgb: F32  # [H, W, 3] 0..1, normalised by coverage
-    depth: F32  # [H, W] m along z, 0 where the model says nothing
+    depth: F32  # [H, W] m along z, 0 where the model says nothing, or nothing sure enough
     alpha: F32  # [H, W] coverage 0..1
+    confidence: F32 | None = None  # [H, W] 0..1 of the depth, see `engine.confidence`; None: unknown
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,6 +228,7 @@ class AnchorStates:
     visibility: F32  # [A] 0..1, seen by the left eye: neither behind an instrument nor behind other tissue
     confidence: F32  # [A] 0..1; falls while the anchor is not seen, 0: lost
     ages: F32  # [A] s since it was pinned
+    depth_confidence: F32  # [A] 0..1, of the tissue that carries it, see `engine.confidence`
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -222,7 +238,7 @@ class AnchorStates:
         def empty(*shape: int) -> F32:
             return np.empty((0, *shape), np.float32)
 
-        return AnchorStates(np.empty(0, np.int64), empty(3), empty(2), empty(), empty(), empty())
+        return AnchorStates(np.empty(0, np.int64), empty(3), empty(2), *(empty() for _ in range(4)))
 
 
 class Finding(NamedTuple):

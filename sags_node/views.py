@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 
+from sags_node.engine.confidence import with_confidence
 from sags_node.engine.interface import Rasterizer
 from sags_node.engine.rasterize import make_rasterizer, to_view
 from sags_node.errors import SagsError
@@ -143,7 +144,9 @@ class Views:
             eyes = {"left": camera, "right": camera.moved_right(scene.pair.baseline)}
         planes = self._rasterizers[size].forward(snapshot.gaussians, list(eyes.values()))
         pictures = {
-            eye: to_view(planes[i], eyes[eye], snapshot.frame_id, snapshot.t_capture_ns)
+            eye: with_confidence(
+                to_view(planes[i], eyes[eye], snapshot.frame_id, snapshot.t_capture_ns), snapshot.gaussians
+            )
             for i, eye in enumerate(eyes)
         }
         spent = self._processor_clock() - started

@@ -142,8 +142,9 @@ def camera_info(message: Received) -> dict[str, Any]:
 def check_splats(message: Received) -> dict[str, np.ndarray]:
     """Columns of the splats by name, with values that a renderer can use as they are."""
     check_meta(message, "sensor_msgs/msg/PointCloud2")
-    assert message.meta["encoding"].split(",") == SPLAT_FIELDS
-    rows = message.array()
+    named = message.meta["encoding"].split(",")
+    assert named[: len(SPLAT_FIELDS)] == SPLAT_FIELDS, "what came later stands after what was there"
+    rows = message.array()[:, : len(SPLAT_FIELDS)].copy()
     columns = {name: rows[:, i] for i, name in enumerate(SPLAT_FIELDS)}
     columns["id"] = rows.view(np.uint32)[:, SPLAT_FIELDS.index("id")]
     assert np.isfinite(rows[:, :-1]).all()
@@ -164,7 +165,7 @@ def splat_colors(columns: Mapping[str, np.ndarray]) -> np.ndarray:
 def point_colors(message: Received) -> np.ndarray:
     """RGB 0..255 [N, 3] of the packed column of `points`."""
     check_meta(message, "sensor_msgs/msg/PointCloud2")
-    assert message.meta["encoding"].split(",") == ["x", "y", "z", "rgb"]
+    assert message.meta["encoding"].split(",")[:4] == ["x", "y", "z", "rgb"]
     packed = message.array().view(np.uint32)[:, 3]
     return np.stack([packed >> 16 & 255, packed >> 8 & 255, packed & 255], axis=1)
 

@@ -69,8 +69,10 @@ def plane_result(
         opacities=np.linspace(0.2, 0.99, count, dtype=np.float32),
         colors=colors[rows, columns],
         ids=np.arange(count, dtype=np.int64) * 7 + 1000,
+        depth_errors=np.linspace(0.0005, 0.009, count, dtype=np.float32),
     )
     alpha = np.full((HEIGHT, WIDTH), 0.75, np.float32)
+    sure = np.where(known > 0, np.float32(0.8), np.float32(0))
     return FrameResult(
         pair=RectifiedPair(frame_id, stamp, camera, BASELINE, picture, picture[:, ::-1].copy()),
         observation=Observation(
@@ -80,8 +82,8 @@ def plane_result(
             frame_id, stamp, step, gaussians, np.zeros_like(gaussians.means), camera, 0.01, {"inserted": 3}
         ),
         views={
-            "left": RenderedView(frame_id, stamp, camera, colors, known, alpha),
-            "right": RenderedView(frame_id, stamp, camera.moved_right(BASELINE), colors, known, alpha),
+            "left": RenderedView(frame_id, stamp, camera, colors, known, alpha, sure),
+            "right": RenderedView(frame_id, stamp, camera.moved_right(BASELINE), colors, known, alpha, sure),
         },
         epoch=epoch,
         timings_ms={"map": 12.0},

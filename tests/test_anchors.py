@@ -100,6 +100,20 @@ def test_an_anchor_moves_with_the_gaussians_around_it() -> None:
     assert np.allclose(pixel, [40.3 + 1.5, 50.6 - 3], atol=1e-2)
 
 
+def test_it_knows_its_depth_as_well_as_the_tissue_that_carries_it() -> None:
+    """Said when it is pinned and while it is followed: a guess does not look like a measurement."""
+    observation, snapshot, view = flat(0)
+    for error, expected in ((0.0, 1.0), (3e-3, 0.5), (9e-3, 0.125)):
+        errors = np.full(len(snapshot.gaussians), error, np.float32)
+        known = replace(snapshot, gaussians=replace(snapshot.gaussians, depth_errors=errors))
+        anchors = Anchors()
+        pinned = anchors.add_pixel(40, 50, observation, known, view)
+        assert anchors.depth_confidence(pinned) == pytest.approx(expected, rel=1e-3)
+        better = replace(known.gaussians, depth_errors=np.full_like(errors, 1e-3))
+        anchors.update(observation, replace(known, gaussians=better), view)
+        assert anchors.at(PERIOD_NS).depth_confidence[0] == pytest.approx(2 ** (-1 / 3), rel=1e-3)
+
+
 def test_gaussians_far_away_do_not_move_it() -> None:
     anchors = Anchors()
     anchors.add_pixel(30, 50, *flat(0))

@@ -103,10 +103,11 @@ def splats_of(path: Path) -> dict[str, np.ndarray]:
     head, _, body = path.read_bytes().partition(b"end_header\n")
     lines = head.decode().splitlines()
     assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
-    assert lines[3:] == [f"property float {name}" for name in FIELDS]
+    named = [line.removeprefix("property float ") for line in lines[3:]]
+    assert named[: len(FIELDS)] == list(FIELDS), "what came later stands after what was there"
     count = int(lines[2].removeprefix("element vertex "))
-    rows = np.frombuffer(body, "<f4").reshape(count, len(FIELDS))
-    return dict(zip(FIELDS, rows.T, strict=True))
+    rows = np.frombuffer(body, "<f4").reshape(count, len(named))
+    return dict(zip(named, rows.T, strict=True))
 
 
 # ---- what is written -------------------------------------------------------------------------------------

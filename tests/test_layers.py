@@ -6,7 +6,7 @@ from pathlib import Path
 ROOT = Path(__file__).parent.parent / "sags_node"
 LAYERS = [
     {"errors", "types", "latest", "processes", "native_output", "kernels"},
-    {"files", "findings", "geometry", "config", "picture_file"},
+    {"files", "findings", "geometry", "confidence", "config", "picture_file"},
     {"yaml_reader"},
     {"launch_file"},
     {"calibration"},

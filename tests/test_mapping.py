@@ -107,7 +107,7 @@ def test_candidates_fill_holes_first() -> None:
     planes[3], planes[4] = DEPTH, 1.0
     assert len(densify.candidates(planes, frame, 0)[0]) == 0
     planes[:, 10:30, 20:40] = 0
-    pixels, _ = densify.candidates(planes, frame, 0)
+    pixels, _, _ = densify.candidates(planes, frame, 0)
     assert len(pixels) == 25
     assert pixels.min(0).tolist() == [20, 12] and pixels.max(0).tolist() == [36, 28]
 
@@ -116,7 +116,7 @@ def test_a_hole_without_depth_takes_that_of_its_neighbours() -> None:
     frame = observation()
     frame.depth[:, :20] = 0
     frame.depth[:, 20:] = 0.09
-    pixels, depths = densify.candidates(np.zeros((5, HEIGHT, WIDTH), np.float32), frame, 0)
+    pixels, depths, _ = densify.candidates(np.zeros((5, HEIGHT, WIDTH), np.float32), frame, 0)
     assert len(pixels) == (WIDTH // 4) * (HEIGHT // 4)
     assert np.allclose(depths, 0.09)
     frame.depth[:] = 0
@@ -206,7 +206,7 @@ def test_first_pixels_respect_the_limit_and_the_mask_and_fill_gaps() -> None:
     frame.tissue[:, :16] = False
     frame.depth[10:20, 30:] = 0
     frame.depth[:, 60:] = 0
-    pixels, depths, spacing = initialise.first_pixels(frame, 100)
+    pixels, depths, _, spacing = initialise.first_pixels(frame, 100)
     assert spacing == pytest.approx(np.sqrt(48 * 48 / 100))
     assert 80 <= len(pixels) <= 120
     assert pixels[:, 0].min() >= 16

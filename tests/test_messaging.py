@@ -128,6 +128,22 @@ def test_splats_hold_activated_values(received: dict[str, list[client.Received]]
     assert np.array_equal(splats["id"], gaussians.ids)
 
 
+def test_what_is_told_of_depth_says_how_sure_it_is(received: dict[str, list[client.Received]]) -> None:
+    """error = 3 mm * log2(1 / confidence), in every topic that tells of depth."""
+    truth = plane_result()
+    errors = truth.snapshot.gaussians.depth_errors
+    assert errors is not None
+    for name in ("splats", "points"):
+        message = received[name][0]
+        column = message.meta["encoding"].split(",").index("confidence")
+        told = 0.003 * np.log2(1 / message.array()[:, column])
+        nearest = np.abs(told[:, None] - errors).argmin(1)
+        assert np.allclose(told, errors[nearest], atol=1e-6) and len(np.unique(nearest)) == len(told), name
+    drawn = client.check_image(received["left/render/depth"][0], "32FC1", WIDTH, HEIGHT)
+    sure = client.check_image(received["left/render/depth_confidence"][0], "32FC1", WIDTH, HEIGHT)
+    assert np.array_equal(sure > 0, np.isfinite(drawn)) and sure.max() <= 1
+
+
 def test_points_are_coloured(received: dict[str, list[client.Received]]) -> None:
     truth = plane_result()
     message = received["points"][0]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -42,6 +44,16 @@ def centre(rgba: np.ndarray) -> np.ndarray:
 
 
 # ---- drawing ---------------------------------------------------------------------------------------------
+
+
+def test_where_the_depth_is_not_sure_all_is_as_faint_as_what_lies_under_the_tissue() -> None:
+    """Neither before it nor behind it: nobody knows."""
+    sure = np.ones(SIZE, bool)
+    sure[:, 80:] = False
+    drawn = draw(replace(wall(), sure=sure), [ball(0.04, radius=0.004)])[..., 3]
+    left, right = drawn[:, :80], drawn[:, 80:]
+    assert left.any() and right.any()
+    assert set(np.unique(left)) == {0, 255} and set(np.unique(right)) == {0, round(UNDER * 255)}
 
 
 def test_triangles_are_drawn_as_rays_see_them() -> None:

@@ -93,18 +93,18 @@ def test_point_cloud_fields_describe_the_rows() -> None:
     said = contents()["splats"]
     ros = STORE.deserialize_cdr(message_of(said).cdr(), said.type)
     assert [field.name for field in ros.fields] == list(content.SPLAT_FIELDS)
-    assert [field.offset for field in ros.fields] == list(range(0, 60, 4))
+    assert [field.offset for field in ros.fields] == list(range(0, 64, 4))
     assert {field.name: field.datatype for field in ros.fields}["id"] == 6  # UINT32
-    assert (ros.height, ros.width, ros.point_step, ros.row_step) == (1, said.shape[0], 60, 60 * said.shape[0])
-    rows = ros.data.view(np.float32).reshape(-1, 15)
+    assert (ros.height, ros.width, ros.point_step, ros.row_step) == (1, said.shape[0], 64, 64 * said.shape[0])
+    rows = ros.data.view(np.float32).reshape(-1, 16)
     assert np.allclose(rows[:, :3], plane_result().snapshot.gaussians.means)
 
 
 def test_an_empty_cloud_and_an_empty_model_are_messages() -> None:
-    said = cdr.point_cloud(np.empty((0, 4), np.float32), content.POINT_FIELDS, STAMP)
+    said = cdr.point_cloud(np.empty((0, 5), np.float32), content.POINT_FIELDS, STAMP)
     ros = STORE.deserialize_cdr(message_of(said).cdr(), said.type)
     assert ros.width == 0 and len(ros.data) == 0
-    assert interpret(message_of(said), 0).meta.shape == [0, 4]
+    assert interpret(message_of(said), 0).meta.shape == [0, 5]
 
 
 def test_right_camera_info_holds_the_baseline() -> None:
@@ -119,12 +119,12 @@ def test_points_leave_out_what_is_hidden_or_outside() -> None:
     shown = content.points(result)
     gaussians = result.snapshot.gaussians
     row_with_depth = int((gaussians.opacities >= content.POINT_MIN_OPACITY).sum())
-    assert shown.shape == (row_with_depth, 4)
+    assert shown.shape == (row_with_depth, 5)
     camera = result.pair.camera
     gaussians.means[0] = camera.T_world_cam[:3, 3] - camera.T_world_cam[:3, 2] * 0.01  # behind the camera
     gaussians.means[1] += camera.T_world_cam[:3, 2].astype(np.float32) * 0.02  # under the surface
     gaussians.means[2] += camera.T_world_cam[:3, 0].astype(np.float32) * 10  # far to the right
-    assert content.points(result).shape == (row_with_depth - 3, 4)
+    assert content.points(result).shape == (row_with_depth - 3, 5)
 
 
 # ---- strangers -----------------------------------------------------------------------------------------

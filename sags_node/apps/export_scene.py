@@ -12,6 +12,7 @@ from zipfile import BadZipFile
 import msgspec
 import numpy as np
 
+from sags_node.confidence import error_of
 from sags_node.errors import SagsError, UsageError
 from sags_node.fitting import checkpoint
 from sags_node.fitting.clip import read_clip
@@ -72,7 +73,8 @@ def from_node(
 
 
 def _gaussians(cloud: ReceivedCloud) -> Gaussians:
-    if not set(SPLAT_FIELDS) <= set(cloud.points.dtype.names or ()):
+    fields = cloud.points.dtype.names or ()
+    if not set(SPLAT_FIELDS) - {"confidence"} <= set(fields):
         raise SagsError(f"{cloud.topic} is not what this version reads: {cloud.meta.encoding}")
 
     def columns(*names: str) -> F32:
@@ -85,6 +87,7 @@ def _gaussians(cloud: ReceivedCloud) -> Gaussians:
         opacities=np.ascontiguousarray(cloud.points["opacity"]),
         colors=0.5 + np.float32(SH_DEGREE_0) * columns("f_dc_0", "f_dc_1", "f_dc_2"),
         ids=cloud.points["id"].astype(np.int64),
+        depth_errors=error_of(cloud.points["confidence"]) if "confidence" in fields else None,
     )
 
 

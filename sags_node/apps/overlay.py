@@ -20,7 +20,7 @@ import numpy as np
 
 from sags_node.apps import overlay_draw
 from sags_node.apps.overlay_draw import Body, Placed
-from sags_node.apps.overlay_frame import NEEDED, RIGHT_INFO, TISSUE, TissueFrame, tissue_frame
+from sags_node.apps.overlay_frame import CONFIDENCE, NEEDED, RIGHT_INFO, TISSUE, TissueFrame, tissue_frame
 from sags_node.apps.overlay_held import HeldObject, Pinner
 from sags_node.apps.overlay_mesh import mesh_of
 from sags_node.apps.overlay_save import Output
@@ -175,7 +175,7 @@ class _Overlay:
             SagsError: none came until `end`, or the endpoint is malformed.
         """
         options = self._options
-        wanted: list[str] = [*NEEDED, RIGHT_INFO, *([] if options.save is None else [PICTURE])]
+        wanted: list[str] = [*NEEDED, CONFIDENCE, RIGHT_INFO, *([] if options.save is None else [PICTURE])]
         while True:
             try:
                 return Subscriber(wanted, options.endpoint, options.ns, options.run_dir, keys=options.keys)
@@ -250,7 +250,12 @@ class _Overlay:
         if (stale := self._stale()) is not None:
             self._stream.blank(stale)
             return None, stale
-        frame = None if messages is None else tissue_frame(messages, self._right_info())
+        confidence = self._node.aligned([CONFIDENCE], stamp_ns)
+        told = self._node.latest(CONFIDENCE) is not None  # else this node or recording never tells
+        frame = None
+        if messages is not None and (confidence is not None or not told):
+            sure = None if confidence is None else confidence[CONFIDENCE]
+            frame = tissue_frame(messages, self._right_info(), sure)
         if frame is None:  # the next one may be whole; if not, the clock takes the overlay away
             return None, "incomplete frame"
         poses = [held.place(frame) for held in self._objects]

@@ -1,7 +1,8 @@
 """Draws placed objects for one eye, tested against tissue and instruments.
 
 What is in front of the tissue or on it is drawn in full. What lies under it shows through: `UNDER` of its
-opacity. Over instruments, and where no depth is known, nothing is drawn.
+opacity, and so does all where the tissue's depth is not sure enough to tell. Over instruments, and where no
+depth is known, nothing is drawn.
 
 Depth and instruments are known for the left eye. For the right eye each point is looked up where the left
 eye sees it. How near an instrument is, is not known, so in the right eye its place is anywhere between the
@@ -22,7 +23,7 @@ from sags_node.apps.overlay_mesh import Mesh
 from sags_node.apps.overlay_raster import fill, hide, key_out
 from sags_node.geometry import invert, transform
 from sags_node.kernels.jit import read_only
-from sags_node.types import F32, F64, U8, Bool, Camera
+from sags_node.types import F32, F64, U8, Camera
 
 UNDER = 0.35
 ON_SURFACE = 0.001  # m; what lies this little under the surface lies on it
@@ -96,7 +97,7 @@ def draw(
     z, rgba = np.full((height, width), np.inf, np.float32), np.zeros((height, width, 4), np.uint8)
     for placed in objects:
         placed.body.draw(camera, placed.T_world_body, z, rgba)
-    _hide(z, rgba, frame.depth, frame.tissue, camera, baseline, UNDER)
+    _hide(z, rgba, frame, slice(None), camera, baseline, UNDER)
     for placed in objects:
         if placed.body.label is not None:
             _label(rgba, frame, camera, placed, baseline)
@@ -142,9 +143,13 @@ def warm_up() -> None:
     color_key(draw(frame, [Placed(Body(mesh, 1.0, None), np.eye(4))]), (0, 0, 0))
 
 
-def _hide(z: F32, rgba: U8, depth: F32, tissue: Bool, camera: Camera, baseline: float, under: float) -> None:
+def _hide(
+    z: F32, rgba: U8, frame: TissueFrame, lines: slice, camera: Camera, baseline: float, under: float
+) -> None:
     shift = float(camera.K[0, 0] * baseline)
-    hide(z, rgba, read_only(depth), read_only(tissue), shift, NEAREST, ON_SURFACE, under)
+    sure = np.ones_like(frame.tissue) if frame.sure is None else frame.sure
+    depth, tissue = read_only(frame.depth[lines]), read_only(frame.tissue[lines])
+    hide(z, rgba, depth, tissue, read_only(sure[lines]), shift, NEAREST, ON_SURFACE, under)
 
 
 def _label(rgba: U8, frame: TissueFrame, camera: Camera, placed: Placed, baseline: float) -> None:
@@ -173,7 +178,7 @@ def _write(
     written[..., :3] = letters[..., None]
     written[..., 3] = cv2.dilate(letters, np.ones((3, 3), np.uint8))
     lines = slice(top, bottom)
-    _hide(z, written, frame.depth[lines], frame.tissue[lines], frame.camera, baseline, under=1.0)
+    _hide(z, written, frame, lines, frame.camera, baseline, under=1.0)
     free = written[..., 3] > 0
     rgba[lines][free] = written[free]
 

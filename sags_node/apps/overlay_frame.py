@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sags_node.confidence import SURE
 from sags_node.geometry import quat_to_matrix
 from sags_node.messaging.received import (
     Frame,
@@ -24,6 +25,7 @@ POSE = TopicName("tf", ReceivedRos)
 ANCHORS = TopicName("anchors", ReceivedCloud)
 RIGHT_INFO = TopicName("right/camera_info", ReceivedCameraInfo)
 NEEDED = (DEPTH, TISSUE, INFO, POSE, ANCHORS)
+CONFIDENCE = TopicName("left/render/depth_confidence", ReceivedImage)  # recordings of before have none
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +35,7 @@ class Anchor:
     place: F64  # [3] m, world; NaN: lost
     visibility: float  # 0..1
     confidence: float  # 0..1
+    depth_confidence: float = 1.0  # 0..1; low: where it lies in depth is a guess
 
     @property
     def sure(self) -> float:
@@ -53,10 +56,17 @@ class TissueFrame:
     depth: F32  # [H, W] m, NaN unknown
     tissue: Bool  # [H, W], False: instrument
     anchors: dict[int, Anchor]
+    sure: Bool | None = None  # [H, W] where the depth may decide what hides what; None: everywhere
 
 
-def tissue_frame(messages: Frame, right: ReceivedCameraInfo | None) -> TissueFrame | None:
-    """The messages `NEEDED` of one frame joined; None when they do not fit together."""
+def tissue_frame(
+    messages: Frame, right: ReceivedCameraInfo | None, confidence: ReceivedImage | None = None
+) -> TissueFrame | None:
+    """The messages `NEEDED` of one frame joined; None when they do not fit together.
+
+    Args:
+        confidence: of its depth; None: from a node or a recording that does not tell.
+    """
     depth, tissue, info, anchors = messages[DEPTH], messages[TISSUE], messages[INFO], messages[ANCHORS]
     size = (info.height, info.width)
     poses = messages[POSE].message.transforms
@@ -65,6 +75,8 @@ def tissue_frame(messages: Frame, right: ReceivedCameraInfo | None) -> TissueFra
     if not depth.array.shape == tissue.array.shape == size or len(poses) != 1 or len(said) != 1:
         return None
     if not {"id", "visibility", "confidence"} <= set(fields):
+        return None
+    if confidence is not None and confidence.array.shape != size:
         return None
     moved = poses[0].transform
     T = np.eye(4)
@@ -82,7 +94,13 @@ def tissue_frame(messages: Frame, right: ReceivedCameraInfo | None) -> TissueFra
         depth=depth.array,
         tissue=tissue.array > 0,
         anchors={
-            int(row["id"]): Anchor(place, float(row["visibility"]), float(row["confidence"]))
+            int(row["id"]): Anchor(
+                place,
+                float(row["visibility"]),
+                float(row["confidence"]),
+                float(row["depth_confidence"]) if "depth_confidence" in fields else 1.0,
+            )
             for row, place in zip(rows, places, strict=True)
         },
+        sure=None if confidence is None else confidence.array >= SURE,
     )

@@ -11,6 +11,7 @@ import numpy as np
 from sags_node.apps.overlay_frame import Anchor, TissueFrame
 from sags_node.apps.overlay_pose import on_a_line, on_surface, rigid_fit, surface_normal
 from sags_node.apps.overlay_scene import ObjectSpec
+from sags_node.confidence import LEAST
 from sags_node.errors import SagsError, UsageError
 from sags_node.geometry import invert, transform
 from sags_node.messaging.control import ControlClient
@@ -152,6 +153,7 @@ class HeldObject:
                     "id": anchor,
                     "visibility": round(state.visibility, 2),
                     "confidence": round(state.confidence, 2),
+                    "depth_confidence": round(state.depth_confidence, 2),
                 }
                 for anchor, state in zip(self._ids, self._states, strict=False)
             ],
@@ -225,6 +227,10 @@ class HeldObject:
             for i, state in enumerate(states)
             if state is not None and np.isfinite(state.place).all() and state.sure >= LEAST_SURE
         ]
+        guessed = [i for i in sure if (state := states[i]) is not None and state.depth_confidence < LEAST]
+        if guessed and len(sure) - len(guessed) < min(len(states), LEAST_ANCHORS):
+            return None, "the depth at its anchors is not known well enough"
+        sure = [i for i in sure if i not in guessed]
         chosen = [state for i in sure if (state := states[i]) is not None]
         if len(states) < LEAST_ANCHORS:
             return self._on_surface(frame, chosen)
@@ -233,7 +239,7 @@ class HeldObject:
             return None, f"{len(sure)} of its {len(states)} anchors are sure, {LEAST_ANCHORS} are needed"
         if on_a_line(model):
             return None, "its sure anchors lie on a line"
-        weights = np.array([state.sure for state in chosen])
+        weights = np.array([state.sure * state.depth_confidence for state in chosen])
         T, self.error = rigid_fit(model, np.stack([state.place for state in chosen]), weights)
         return T, None
 

@@ -57,8 +57,9 @@ def fill(pixels: F64, depths: F64, triangles: I32, colors: U8, z: F32, rgba: U8)
 
 @kernel
 def hide(
-    z: F32, rgba: U8, depth: F32, tissue: Bool, shift: float, nearest: float, slack: float, under: float
-) -> None:
+    z: F32, rgba: U8, depth: F32, tissue: Bool, sure: Bool, shift: float, nearest: float, slack: float,
+    under: float,
+) -> None:  # fmt: skip
     """Take from a drawn eye what must not be seen of it, in place.
 
     A point at depth z in column x of this eye is where the left eye sees column x + shift / z. There the
@@ -70,6 +71,7 @@ def hide(
         rgba: [H, W, 4]; the opacity becomes 0 over instruments and where no depth is known.
         depth: [H, W] m, of the tissue, left eye, NaN unknown.
         tissue: [H, W], left eye, False: instrument.
+        sure: [H, W], left eye; where the depth is not, all is drawn as if under the tissue.
         shift: px m, focal length times the distance of this eye from the left one.
         nearest: m.
         slack: m; what is deeper than this under the tissue keeps `under` of its opacity.
@@ -86,7 +88,7 @@ def hide(
             last = math.ceil(x + shift / min(z[y, x], nearest))
             if next_instrument[at] <= last or not depth[y, min(at, width - 1)] > 0:
                 rgba[y, x, 3] = 0
-            elif z[y, x] > depth[y, at] + slack:
+            elif z[y, x] > depth[y, at] + slack or not sure[y, at]:
                 rgba[y, x, 3] = round(under * rgba[y, x, 3])
 
 

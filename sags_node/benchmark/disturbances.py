@@ -383,8 +383,9 @@ def _true_points(frame: StereoFrame, result: FrameResult) -> F64 | None:
 
 def _is_confident(view: RenderedView) -> Bool:
     """[H, W]; all of it, where the view does not say."""
-    confidence: F32 | None = getattr(view, "confidence", None)
-    return np.ones(view.depth.shape, np.bool_) if confidence is None else confidence >= CONFIDENT
+    if view.confidence is None:
+        return np.ones(view.depth.shape, np.bool_)
+    return np.asarray(view.confidence >= CONFIDENT)
 
 
 def _depth_errors(frame: StereoFrame, view: RenderedView, confident: Bool, tissue: Bool) -> _Depth | None:

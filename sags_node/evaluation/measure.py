@@ -12,7 +12,7 @@ import numpy as np
 from sags_node.config import Box
 from sags_node.engine.rasterize import make_rasterizer, to_view
 from sags_node.errors import UsageError
-from sags_node.evaluation import metrics
+from sags_node.evaluation import calibration, metrics
 from sags_node.evaluation.gallery import Gallery
 from sags_node.evaluation.lpips import Lpips
 from sags_node.evaluation.spool import RunFacts, Spool, SpooledFrame
@@ -21,7 +21,7 @@ from sags_node.evaluation.trajectory import RigidOdometry
 from sags_node.evaluation.views import between, extrapolated
 from sags_node.geometry import transform
 from sags_node.mapping.right_eye import right_eye_mask
-from sags_node.types import F32, F64, U8, Bool, Camera, Gaussians, RectifiedPair, Reference, StereoFrame
+from sags_node.types import F32, F64, I64, U8, Bool, Camera, Gaussians, RectifiedPair, Reference, StereoFrame
 from sags_node.vision.rectify import Rectifier
 
 Figures = dict[str, float]
@@ -74,6 +74,7 @@ class FrameRow:
     facts: RunFacts | None = None  # None: held out, or dropped by the run
     track: TrackErrors | None = None
     poses: Poses | None = None  # None: the session has none, or the run was given them
+    calibration: I64 | None = None  # of the depth's confidence, see `calibration.tally`
 
 
 @dataclass(slots=True)
@@ -163,11 +164,12 @@ class Measurer:
             figures["predict"] = self._predict(self._before, shown, truth, seconds)
         if costly and pair.right is not None:
             figures["novel"] = {"psnr": self._novel(shown, pair.right, frame)}
-        track = None
+        track, counts = None, None
         if frame.reference is not None:
             if frame.reference.depth is not None:
                 self.depth_kind = frame.reference.depth_kind
                 figures |= _depth_figures(shown, frame.reference.depth)
+                counts = _calibration(shown, frame.reference.depth)
             track = self._follow(shown, frame.reference, pair.camera)
         self.gallery.offer(place, shown, pair.left, figures["online"]["psnr"])
         after = _Before(shown, pair.camera, truth, seconds)
@@ -175,7 +177,7 @@ class Measurer:
             self._held.row.figures["between"] = self._between(self._before, self._held, after)
         self._held, self._before = None, after
         poses = self._poses(frame, pair, shown)
-        return FrameRow(frame.frame_id, seconds, figures, shown.facts, track, poses)
+        return FrameRow(frame.frame_id, seconds, figures, shown.facts, track, poses, counts)
 
     def _poses(self, frame: StereoFrame, pair: RectifiedPair, shown: SpooledFrame) -> Poses | None:
         if self._pose == "session" or frame.T_world_cam is None:
@@ -271,6 +273,14 @@ class Measurer:
         if self._pose != "session":
             points = np.asarray(transform(self._in_world_of_run(given, shown), points), np.float64)
         return self._tracks.update(snapshot.gaussians, points, reference.points_visible, snapshot.camera)
+
+
+def _calibration(shown: SpooledFrame, reference: F32) -> I64 | None:
+    height, width = shown.depth.shape
+    truth = metrics.resample_nearest(reference, width, height)
+    if np.isnan(shown.confidence).any():
+        return None
+    return calibration.tally(shown.depth, shown.confidence, truth, shown.tissue)
 
 
 def _depth_figures(shown: SpooledFrame, reference: F32) -> dict[str, Figures]:

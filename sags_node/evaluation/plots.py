@@ -13,11 +13,11 @@ LEFT, RIGHT, TOP, BOTTOM = 52, 12, 26, 24  # margins
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """Points (frame, value) in frame order; NaN breaks the line."""
+    """Points (frame, or what else lies across, and value) in order; NaN breaks the line."""
 
     label: str
     colour: str
-    points: Sequence[tuple[int, float]]
+    points: Sequence[tuple[float, float]]
     dots: bool = False  # single points, not joined
 
 

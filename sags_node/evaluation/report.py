@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from rich.table import Table
 
+from sags_node.evaluation import calibration
 from sags_node.evaluation.gallery import Picture
 from sags_node.evaluation.measure import FrameRow
 from sags_node.evaluation.plots import Series, line_plot
@@ -160,6 +161,19 @@ def _plots(rows: Sequence[FrameRow], spans: Mapping[str, tuple[int, int]]) -> st
     rungs = run("rung", BLUE, lambda facts: facts.rung)
     if rungs.points:
         plots.append(line_plot("rung of the ladder of quality", [rungs], spans))
+    tallies = [row.calibration for row in rows if row.calibration is not None]
+    sure = calibration.points(tallies, 0.9)
+    plots.append(
+        line_plot(
+            "nine of ten real errors of depth are below (mm), over the predicted error (mm)",
+            [
+                Series("real", BLUE, sure),
+                Series("half of them", GREEN, calibration.points(tallies, 0.5)),
+                Series("as predicted", ORANGE, [(middle, middle) for middle, _ in sure]),
+            ],
+            {},
+        )
+    )
     return f'<div class="plots">{"".join(plots)}</div>'
 
 

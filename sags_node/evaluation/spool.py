@@ -21,7 +21,7 @@ from sags_node.findings import NOTHING, Findings, by_code
 from sags_node.health import resident_mb
 from sags_node.types import F32, U8, Bool, Camera, FrameResult, Gaussians, Snapshot
 
-_ARRAYS = 13  # in a frame's file
+_ARRAYS = 14  # in a frame's file
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +51,7 @@ class SpooledFrame:
     depth: F32  # [H, W] m, the same, 0 where the model says nothing
     tissue: Bool  # [H, W]
     measured_depth: F32  # [H, W] m, the stereo stage's own, 0 unknown
+    confidence: F32  # [H, W] 0..1, of `depth`; NaN: unknown
 
 
 class Spool:
@@ -124,6 +125,7 @@ class Spool:
             snapshot.velocities,
             cv2.convertScaleAbs(view.rgb, alpha=255),  # rounds and clips at 255, as on the wire
             view.depth,
+            np.full_like(view.depth, np.nan) if view.confidence is None else view.confidence,
         )
         try:
             with self._file(len(self)).open("wb") as file:
@@ -141,7 +143,7 @@ class Spool:
         """The frame that was added as number `place`."""
         with self._file(place).open("rb") as file:
             header: dict[str, Any] = json.loads(file.readline())
-            K, T_world_cam, tissue, measured_depth, *splats, velocities, rgb, depth = (
+            K, T_world_cam, tissue, measured_depth, *splats, velocities, rgb, depth, confidence = (
                 np.load(file, allow_pickle=False) for _ in range(_ARRAYS)
             )
         facts = RunFacts(**header["facts"])
@@ -164,6 +166,7 @@ class Spool:
             depth=depth,
             tissue=np.unpackbits(tissue, count=width * height).reshape(height, width).view(bool),
             measured_depth=measured_depth,
+            confidence=confidence,
         )
 
     def _file(self, place: int) -> Path:

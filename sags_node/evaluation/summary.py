@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from sags_node.evaluation import calibration
 from sags_node.evaluation.lpips import BACKBONE
 from sags_node.evaluation.machine import machine_name
 from sags_node.evaluation.measure import FrameRow, Options
@@ -120,6 +121,8 @@ def _quality(rows: Sequence[FrameRow], options: Options) -> dict[str, dict[str, 
             groups[group] = {
                 key: _mean([each[key] for each in figures if key in each]) for key in (*keys, *extra)
             }
+    tallies = [row.calibration for row in rows if row.calibration is not None]
+    groups["depth_confidence"] = calibration.figures(tallies) if tallies else None
     groups["track"] = _track(rows)
     groups["pose"] = _pose(rows)
     return groups

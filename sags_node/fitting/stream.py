@@ -134,8 +134,8 @@ class StreamFit:
             return  # a black or covered picture: try again with the next frame
         observation = frame.observation()
         limit = int(initialise.INITIAL_SHARE * self.settings.max_gaussians)
-        pixels, depths, spacing = initialise.first_pixels(observation, limit)
-        rows = _rows(observation, pixels, depths, spacing)
+        pixels, depths, errors, spacing = initialise.first_pixels(observation, limit)
+        rows = _rows(observation, pixels, depths, errors, spacing)
         self._drawn_ns = np.full(len(rows), frame.t_capture_ns)
         self._model = WindowModel(rows, self._make_field(rows[:, columns.MEAN], frame.t_capture_ns))
         pixel = float(np.median(depths)) / float(frame.camera.K[0, 0])  # m
@@ -186,17 +186,17 @@ class StreamFit:
             self._drawn_ns = self._drawn_ns[kept]
         observation = frame.observation()
         planes = self.draw(frame.t_capture_ns, frame.camera)
-        pixels, depths = densify.candidates(planes, observation, phase=7 * self._frames)
+        pixels, depths, errors = densify.candidates(planes, observation, phase=7 * self._frames)
         room = cap - len(model)
         if min(room, len(pixels)) > 0:
-            rows = _rows(observation, pixels[:room], depths[:room], densify.GRID)
+            rows = _rows(observation, pixels[:room], depths[:room], errors[:room], densify.GRID)
             model.insert(rows, frame.t_capture_ns)
             self._drawn_ns = np.concatenate([self._drawn_ns, np.full(len(rows), frame.t_capture_ns)])
             self.inserted += len(rows)
 
 
-def _rows(observation: Observation, pixels: I32, depths: F32, spacing: float) -> F32:
+def _rows(observation: Observation, pixels: I32, depths: F32, errors: F32, spacing: float) -> F32:
     """New Gaussians [M, 14] at pixels [M, 2] and depths [M] m, as the mapper makes them."""
     made = GaussianModel(len(pixels))
-    initialise.insert(made, observation, pixels, depths, spacing, smoothing=True)
+    initialise.insert(made, observation, pixels, depths, errors, spacing, smoothing=True)
     return deactivate(made.gaussians())

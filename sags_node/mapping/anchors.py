@@ -12,6 +12,7 @@ from dataclasses import dataclass, fields, replace
 import cv2
 import numpy as np
 
+from sags_node.confidence import confidence_of
 from sags_node.errors import SagsError
 from sags_node.geometry import project, unproject
 from sags_node.mapping.motion import BEHIND_TOLERANCE
@@ -68,6 +69,7 @@ class _Table:
     unseen: F64  # [A] s since it was found last
     searched: I64  # [A] number of the frame in which it was searched last
     ages: F64  # [A] s since it was pinned
+    depth_confidence: F64  # [A] 0..1, of the depth of its carriers
 
 
 class Anchors:
@@ -100,7 +102,10 @@ class Anchors:
             raise SagsError(f"pixel ({u:g}, {v:g}) shows an instrument, not tissue; choose another")
         depth = float(view.depth[row, column]) or float(observation.depth[row, column])
         if depth <= 0:
-            raise SagsError(f"there is no depth at pixel ({u:g}, {v:g}) in this frame; choose another")
+            raise SagsError(
+                f"there is no depth at pixel ({u:g}, {v:g}) in this frame, or only one borrowed from afar; "
+                "choose another"
+            )
         point = unproject(observation.camera, np.array([u, v], np.float64), np.array(depth))
         return self.add_point(np.asarray(point), observation, snapshot, view)
 
@@ -120,10 +125,15 @@ class Anchors:
             raise SagsError(f"the model has no tissue within {REACH * 1e3:g} mm of ({place}) m, world")
         anchor_id = self._next_id
         row = _row(anchor_id, point, carriers)
+        _carry(row, snapshot.gaussians)
         _look(row, observation, view)
         self._table = _joined(self._table, row)
         self._next_id += 1
         return anchor_id
+
+    def depth_confidence(self, anchor_id: int) -> float:
+        """How far to trust the depth of an anchor that is there, 0..1."""
+        return float(self._table.depth_confidence[self._table.ids == anchor_id][0])
 
     def remove(self, anchor_id: int) -> None:
         """Forget an anchor.
@@ -165,6 +175,7 @@ class Anchors:
             visibility=table.visibility.astype(np.float32),
             confidence=(table.agreement * 0.5 ** (table.unseen / HALF_LIFE)).astype(np.float32),
             ages=table.ages.astype(np.float32),
+            depth_confidence=table.depth_confidence.astype(np.float32),
         )
 
     def _find(self, observation: Observation) -> None:
@@ -184,7 +195,8 @@ class Anchors:
 
 
 def _carry(table: _Table, gaussians: Gaussians) -> None:
-    """Move each anchor by the mean displacement of its Gaussians since the last snapshot."""
+    """Move each anchor by the mean displacement of its Gaussians since the last snapshot. It knows its depth
+    as well as they do."""
     order = np.argsort(gaussians.ids, kind="stable")  # nearly sorted already: cheap
     ids = np.append(gaussians.ids[order], np.iinfo(np.int64).max)
     places = np.searchsorted(ids, table.carriers)
@@ -197,6 +209,9 @@ def _carry(table: _Table, gaussians: Gaussians) -> None:
     displacements = (table.weights[..., None] * (means - table.means)).sum(1)
     table.points[:] += displacements / np.where(lost, np.nan, share)[:, None]
     table.means[:] = means
+    if gaussians.depth_errors is not None and len(gaussians):
+        errors = (table.weights * gaussians.depth_errors[rows]).sum(1) / np.where(lost, np.nan, share)
+        table.depth_confidence[:] = np.where(lost, 0, confidence_of(errors))
     table.agreement[lost] = 0
     thin = np.flatnonzero(~lost & (share < RENEW_BELOW))
     for i in thin[np.argsort(share[thin])][:RENEWED_PER_FRAME]:
@@ -259,6 +274,7 @@ def _row(anchor_id: int, point: F64, carriers: tuple[I64, F64, F64]) -> _Table:
         unseen=np.zeros(1),
         searched=np.zeros(1, np.int64),
         ages=np.zeros(1),
+        depth_confidence=np.ones(1),
     )
     _hold(table, 0, carriers)
     return table

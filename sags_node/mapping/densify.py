@@ -9,9 +9,9 @@ from numba import prange
 
 from sags_node.engine.pinhole import pack, to_camera, to_pixel
 from sags_node.kernels.jit import PIECE, inlined, kernel, parallel_kernel
-from sags_node.mapping.initialise import nearest_depth
 from sags_node.model.gaussians import GaussianModel
 from sags_node.types import F32, I32, Bool, Observation
+from sags_node.vision.depth_grid import depth_at, grid_of
 
 HOLE_ALPHA = 0.4  # below this a tissue pixel is a hole; 0.8 would count the gaps between small Gaussians
 RESIDUAL_NEW_SURFACE = 0.2  # summed over RGB: with a surface in front of the model, content is new
@@ -29,24 +29,25 @@ IDLE = 0.1  # px of coverage: less does not show
 LARGEST = 1e6  # metres, colours, quaternions: no honest value comes near
 
 
-def candidates(planes: F32, observation: Observation, phase: int) -> tuple[I32, F32]:
-    """Pixels [M, 2] (x, y) that want a Gaussian, and their depths [M] m: holes, then new surfaces, then
-    missing detail.
+def candidates(planes: F32, observation: Observation, phase: int) -> tuple[I32, F32, F32]:
+    """Pixels [M, 2] (x, y) that want a Gaussian, their depths and the errors of those [M] m: holes, then new
+    surfaces, then missing detail.
 
-    A hole beside an instrument or in the strip that one eye does not see has no depth of its own; it takes
-    that of a near pixel in its row or column that has one. Missing detail takes that of the model.
+    A hole beside an instrument or in the strip that one eye does not see has no depth of its own; it borrows
+    that from around. Missing detail takes that of the model, and is no surer than if it were borrowed.
 
     Args:
         planes: [5, H, W] of the rasteriser: sums of w*rgb, w*z, w.
         phase: shifts the candidate grid, so that every pixel has its turn over the frames.
     """
     pixels = np.empty((MAX_INSERTED, 2), np.int32)
-    depths = np.empty(MAX_INSERTED, np.float32)
-    depth = observation.depth
+    depths, errors = np.empty((2, MAX_INSERTED), np.float32)
+    depth, grid = observation.depth, grid_of(observation)
     count = _candidates(
-        planes, observation.image, observation.tissue, depth, bool(depth.any()), phase % GRID, pixels, depths
-    )
-    return pixels[:count], depths[:count]
+        planes, observation.image, observation.tissue, depth, grid.inverse, grid.error, np.float32(grid.side),
+        phase % GRID, pixels, depths, errors,
+    )  # fmt: skip
+    return pixels[:count], depths[:count], errors[:count]
 
 
 def doomed(model: GaussianModel, observation: Observation, limit: int) -> Bool:
@@ -102,8 +103,9 @@ def mean_contribution(model: GaussianModel) -> float:
 
 @kernel
 def _candidates(
-    planes: F32, image: F32, tissue: Bool, depth: F32, any_depth: bool, phase: int, pixels: I32, depths: F32
-) -> int:
+    planes: F32, image: F32, tissue: Bool, depth: F32, inverse: F32, grid_error: F32, side: Any,
+    phase: int, pixels: I32, depths: F32, errors: F32,
+) -> int:  # fmt: skip
     height, width = tissue.shape
     n = 0
     for rank in range(3):
@@ -114,8 +116,8 @@ def _candidates(
                 z = depth[y, x]
                 alpha = planes[4, y, x]
                 if alpha < HOLE_ALPHA:
-                    if z <= 0 and rank == 0 and any_depth:
-                        z = nearest_depth(depth, x, y)
+                    if rank == 0:
+                        z, _ = depth_at(depth, inverse, grid_error, side, x, y)
                     wanted = rank == 0 and z > 0
                 elif rank == 0 or (rank == 1 and z <= 0):
                     wanted = False
@@ -137,6 +139,7 @@ def _candidates(
                     pixels[n, 0] = x
                     pixels[n, 1] = y
                     depths[n] = z
+                    errors[n] = depth_at(depth, inverse, grid_error, side, x, y)[1]
                     n += 1
     return n
 

@@ -11,21 +11,30 @@ from sags_node.kernels.jit import kernel
 from sags_node.model.alias_free import smoothing_variances
 from sags_node.model.gaussians import GaussianModel
 from sags_node.types import F32, I32, Observation
+from sags_node.vision.depth_grid import depth_at, grid_of
 
 SCALE_PER_SPACING = 0.4  # of the distance between neighbours; measured best (0.3-0.5), 0.8 loses 4 dB
 LEAST_SIZE = 0.8  # px: the filters take so much opacity from smaller ones that the first pictures have gaps
 FLATNESS = 0.5  # the extent along the ray against the extent across it
 OPACITY = 0.9
 LEAST_SHARE = 0.3  # of the drawn scale that is left when the 3D filter's share is taken off
+LARGEST_ERROR = 0.05  # m of depth: more says no more
 INITIAL_SHARE = 0.75  # of the cap used by the first frame; the rest is for what appears later
 
 
 def insert(
-    model: GaussianModel, observation: Observation, pixels: I32, z: F32, spacing: float, smoothing: bool
+    model: GaussianModel,
+    observation: Observation,
+    pixels: I32,
+    z: F32,
+    errors: F32,
+    spacing: float,
+    smoothing: bool,
 ) -> slice:
     """Add one Gaussian for each pixel [M, 2] (x, y), coloured by the picture, at depth `z` [M] m.
 
     Args:
+        errors: [M] m, predicted, of the depths; infinite: as large as the model's are on the whole.
         spacing: px between neighbouring pixels of the list; it sets the scales as they are drawn.
         smoothing: give them the 3D filter.
 
@@ -41,13 +50,17 @@ def insert(
     scales = np.sqrt(np.maximum(scales**2 - variances[:, None], (LEAST_SHARE * scales) ** 2))
     rows = model.append(means, scales, observation.image[y, x], OPACITY)
     model.smoothing[rows] = variances[: rows.stop - rows.start]
+    known = model.depth_errors[: rows.start]
+    usual = np.median(known) if len(known) else LARGEST_ERROR
+    model.depth_errors[rows] = np.where(np.isfinite(errors), errors, usual)[: rows.stop - rows.start]
     return rows
 
 
-def first_pixels(observation: Observation, limit: int) -> tuple[I32, F32, float]:
-    """A regular grid of at most about `limit` tissue pixels: pixels [M, 2], depths [M] m, spacing px.
+def first_pixels(observation: Observation, limit: int) -> tuple[I32, F32, F32, float]:
+    """A regular grid of at most about `limit` tissue pixels: pixels [M, 2], depths and their predicted errors
+    [M] m, spacing px.
 
-    Pixels without depth take that of others in their row or column; without any they are left out.
+    Pixels without depth borrow it from around; without any they are left out.
     """
     tissue = observation.tissue
     spacing = max(1.0, float(np.sqrt(np.count_nonzero(tissue) / limit)))
@@ -56,37 +69,16 @@ def first_pixels(observation: Observation, limit: int) -> tuple[I32, F32, float]
     xs = np.arange(0.5 * (spacing - 1), width - 0.5, spacing)
     x, y = np.meshgrid(np.rint(xs).astype(np.int32), np.rint(ys).astype(np.int32))
     pixels = np.stack([x[tissue[y, x]], y[tissue[y, x]]], 1)
-    depths = _depths_at(observation.depth, pixels)
+    grid = grid_of(observation)
+    depths, errors = np.empty((2, len(pixels)), np.float32)
+    _depths_at(observation.depth, grid.inverse, grid.error, np.float32(grid.side), pixels, depths, errors)
     known = depths > 0
-    return pixels[known], depths[known], spacing
+    return pixels[known], depths[known], errors[known], spacing
 
 
 @kernel
-def _depths_at(depth: F32, pixels: I32) -> F32:
-    depths = np.empty(len(pixels), np.float32)
+def _depths_at(
+    depth: F32, inverse: F32, error: F32, side: Any, pixels: I32, depths: F32, errors: F32
+) -> None:
     for i in range(len(pixels)):
-        depths[i] = nearest_depth(depth, pixels[i, 0], pixels[i, 1])
-    return depths
-
-
-@kernel
-def nearest_depth(depth: F32, x: int, y: int) -> Any:
-    """Depth [H, W] at a pixel, else of the nearest known pixels in its row and column the farthest, else 0.
-
-    Depth is missing beside what stands in front: where the other eye sees past an edge, and around
-    instruments. What is seen there belongs to the surface behind.
-    """
-    if depth[y, x] > 0:
-        return depth[y, x]
-    height, width = depth.shape
-    farthest = np.float32(0)
-    for side in range(4):
-        dx, dy = (1, 0) if side == 0 else (-1, 0) if side == 1 else (0, 1) if side == 2 else (0, -1)
-        u, v = x + dx, y + dy
-        while u >= 0 and v >= 0 and u < width and v < height:
-            if depth[v, u] > 0:
-                farthest = max(farthest, depth[v, u])
-                break
-            u += dx
-            v += dy
-    return farthest
+        depths[i], errors[i] = depth_at(depth, inverse, error, side, pixels[i, 0], pixels[i, 1])

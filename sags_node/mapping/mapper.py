@@ -6,9 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sags_node.engine.confidence import with_confidence
 from sags_node.engine.views import to_view
 from sags_node.mapping import densify, initialise
 from sags_node.mapping.budget import Budget
+from sags_node.mapping.depth_memory import remember
 from sags_node.mapping.focus import tile_grid, tiles_of, with_neighbours
 from sags_node.mapping.motion import depth_pull, found_again, scene_flow
 from sags_node.mapping.optimiser import Rates
@@ -176,12 +178,12 @@ class Mapper:
     def _initialise(self, observation: Observation, budget: Budget) -> dict[str, int]:
         if not self._can_start(observation):  # a black or covered picture: try again with the next frame
             planes = self._refiner.show(self.model.gaussians(), observation.camera)
-            self._view = _as_view(planes, observation)
+            self._view = self._as_view(planes, observation)
             return {"inserted": 0}
         drawn = resized(observation, self._scale)
         limit = int(initialise.INITIAL_SHARE * self._limit(budget))
-        pixels, depths, spacing = initialise.first_pixels(drawn, limit)
-        rows = initialise.insert(self.model, drawn, pixels, depths, spacing, self._smoothing)
+        pixels, depths, errors, spacing = initialise.first_pixels(drawn, limit)
+        rows = initialise.insert(self.model, drawn, pixels, depths, errors, spacing, self._smoothing)
         self._deformation = NodeDeformation(self.model.means, CONTROL_NODES)
         self._deformation.attach(self.model, rows)
         self._begin(drawn)
@@ -216,19 +218,19 @@ class Mapper:
         if _is_lost(planes, drawn) and self._can_start(observation):
             self.restart()
             return self._initialise(observation, budget) | {"restarted": 1}
-        pixels, depths = densify.candidates(planes, drawn, phase=7 * self._frames)
+        pixels, depths, errors = densify.candidates(planes, drawn, phase=7 * self._frames)
         iterations = 0
         if budget.more():  # before inserting, so that the drawing above serves both
             self._refiner.refine(self._next_rates(), budget.first_share())
             iterations = 1
         room = max(ADDED, limit - self.model.count)
-        pixels, depths = pixels[:room], depths[:room]
+        pixels, depths, errors = pixels[:room], depths[:room], errors[:room]
         lacking = min(len(pixels), HOLES) - max(0, limit - self.model.count)
         if 0 < lacking < self.model.count:  # the view has grown: what is in it gives way
             self._refiner.give_back()
             removed += self.model.remove(densify.least_shown(self.model, lacking))
             self._refiner.take(self._all_rows)
-        rows = initialise.insert(self.model, drawn, pixels, depths, densify.GRID, self._smoothing)
+        rows = initialise.insert(self.model, drawn, pixels, depths, errors, densify.GRID, self._smoothing)
         self._deformation.attach(self.model, rows)
         self._refiner.take(rows)
         while budget.more():
@@ -278,7 +280,11 @@ class Mapper:
         """Draw the model to be shown; see `Refiner.redraw`."""
         self._refiner.redraw(share, tiles)
         self._split = False
-        self._view = _as_view(self._refiner.planes(), observation)
+        self._view = self._as_view(self._refiner.planes(), observation)
+
+    def _as_view(self, planes: F32, observation: Observation) -> RenderedView:
+        view = to_view(planes, observation.camera, observation.frame_id, observation.t_capture_ns)
+        return with_confidence(view, self.model.gaussians())
 
     @property
     def _all_rows(self) -> slice:
@@ -291,9 +297,8 @@ class Mapper:
             return
         before = self._last.observation
         self._frames_to_depth += 1
-        displacements, seen = scene_flow(
-            self.model.means, self.found_again(observation), observation, depth_pull(self._frames_to_depth)
-        )
+        pull = depth_pull(self._frames_to_depth)
+        displacements, seen = scene_flow(self.model.means, self.found_again(observation), observation, pull)
         if observation.depth.any():
             self._frames_to_depth = 0
         start = self.model.means.copy()
@@ -301,6 +306,7 @@ class Mapper:
         seconds = (observation.t_capture_ns - before.t_capture_ns) * 1e-9
         if seconds > 0:
             self.model.velocities[:] = (self.model.means - start) / np.float32(seconds)
+        remember(self.model, observation, pull, max(seconds, 0.0))
 
     def _sharpen(self, observation: Observation) -> None:
         """Narrow the 3D filter of what this camera sees finer than any before. What is out of view keeps its
@@ -315,10 +321,6 @@ class Mapper:
     def _can_start(self, observation: Observation) -> bool:
         """Whether this frame has depth enough for a first model."""
         return bool(np.count_nonzero(observation.depth) >= MIN_FIRST_DEPTHS)
-
-
-def _as_view(planes: F32, observation: Observation) -> RenderedView:
-    return to_view(planes, observation.camera, observation.frame_id, observation.t_capture_ns)
 
 
 def _is_lost(planes: F32, observation: Observation) -> bool:

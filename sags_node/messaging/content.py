@@ -9,6 +9,7 @@ import cv2
 import msgspec
 import numpy as np
 
+from sags_node.confidence import confidence_of
 from sags_node.findings import by_code, in_words
 from sags_node.geometry import project
 from sags_node.messaging import cdr
@@ -21,6 +22,7 @@ from sags_node.types import (
     Bool,
     DrawnView,
     FrameResult,
+    Gaussians,
     NodeHealth,
     RectifiedPair,
     RenderedView,
@@ -31,10 +33,10 @@ SPLAT_FIELDS = (
     *("scale_0", "scale_1", "scale_2"),
     *("rot_w", "rot_x", "rot_y", "rot_z"),
     *("f_dc_0", "f_dc_1", "f_dc_2"),
-    *("opacity", "id"),
+    *("opacity", "id", "confidence"),
 )
-POINT_FIELDS = ("x", "y", "z", "rgb")
-ANCHOR_FIELDS = ("x", "y", "z", "id", "u", "v", "visibility", "age", "confidence")
+POINT_FIELDS = ("x", "y", "z", "rgb", "confidence")
+ANCHOR_FIELDS = ("x", "y", "z", "id", "u", "v", "visibility", "age", "confidence", "depth_confidence")
 POINT_MIN_OPACITY = 0.1
 POINT_BEHIND_SURFACE = 0.003  # m; a Gaussian deeper than this under the drawn surface is not visible
 
@@ -49,6 +51,7 @@ def splats(result: FrameResult) -> Content:
     rows[:, 10:13] = (gaussians.colors - 0.5) / SH_DEGREE_0
     rows[:, 13] = gaussians.opacities
     rows.view(np.uint32)[:, 14] = gaussians.ids.astype(np.uint32)
+    rows[:, 15] = _confidence(gaussians)
     return cdr.point_cloud(rows, SPLAT_FIELDS, result.pair.t_capture_ns)
 
 
@@ -60,6 +63,7 @@ def points(result: FrameResult) -> Content:
     rows = np.empty((len(rgb), len(POINT_FIELDS)), np.float32)
     rows[:, 0:3] = gaussians.means[seen]
     rows.view(np.uint32)[:, 3] = rgb[:, 0] << 16 | rgb[:, 1] << 8 | rgb[:, 2]
+    rows[:, 4] = _confidence(gaussians)[seen]
     return cdr.point_cloud(rows, POINT_FIELDS, result.pair.t_capture_ns)
 
 
@@ -71,13 +75,14 @@ def anchors(result: FrameResult) -> Content:
     rows.view(np.uint32)[:, 3] = states.ids.astype(np.uint32)
     rows[:, 4:6] = states.pixels
     rows[:, 6], rows[:, 7], rows[:, 8] = states.visibility, states.ages, states.confidence
+    rows[:, 9] = states.depth_confidence
     dense = bool(np.isfinite(states.points).all())
     return cdr.point_cloud(rows, ANCHOR_FIELDS, result.pair.t_capture_ns, dense)
 
 
 def view_topics(name: str, stereo: bool, depth: bool) -> list[str]:
     """The topics of a view, without the namespace."""
-    kinds = ("image", "camera_info", *(("depth",) if depth else ()))
+    kinds = ("image", "camera_info", *(("depth", "depth_confidence") if depth else ()))
     return [
         f"view/{name}/{eye}{kind}" for eye in (("left/", "right/") if stereo else ("",)) for kind in kinds
     ]
@@ -94,6 +99,9 @@ def view(name: str, drawn: DrawnView) -> dict[str, Content]:
         said[f"{topic}image"] = cdr.image(_rgba(picture), "rgba8", stamp_ns, frame)
         if drawn.depth:
             said[f"{topic}depth"] = cdr.image(_depth(picture.depth), "32FC1", stamp_ns, frame)
+            if picture.confidence is not None:
+                confidence = cdr.image(picture.confidence, "32FC1", stamp_ns, frame)
+                said[f"{topic}depth_confidence"] = confidence
     return said
 
 
@@ -117,6 +125,19 @@ def _rgba(picture: RenderedView) -> U8:
     rgba[..., :3] = cv2.convertScaleAbs(picture.rgb, alpha=255.0)  # scales, rounds and saturates in one pass
     rgba[..., 3] = cv2.convertScaleAbs(picture.alpha, alpha=255.0)
     return rgba
+
+
+def _confidence(gaussians: Gaussians) -> F32:
+    """[N] 0..1 of the depth of each; NaN: unknown."""
+    if gaussians.depth_errors is None:
+        return np.full(len(gaussians), np.float32(np.nan))
+    return confidence_of(gaussians.depth_errors)
+
+
+def _depth_confidence(result: FrameResult) -> Content:
+    confidence = result.views["left"].confidence
+    assert confidence is not None  # else it is not told of
+    return cdr.image(confidence, "32FC1", result.pair.t_capture_ns)
 
 
 def _depth(depth: F32) -> F32:
@@ -149,6 +170,7 @@ FRAME_CONTENT: Mapping[str, Callable[[FrameResult], Content]] = {
         _rgba(r.views["right"]), "rgba8", r.pair.t_capture_ns, cdr.RIGHT_FRAME
     ),
     "left/render/depth": lambda r: cdr.image(_depth(r.views["left"].depth), "32FC1", r.pair.t_capture_ns),
+    "left/render/depth_confidence": _depth_confidence,
     "left/depth": lambda r: cdr.image(_depth(r.observation.depth), "32FC1", r.pair.t_capture_ns),
     "left/tissue_mask": lambda r: cdr.image(
         r.observation.tissue.view(np.uint8) * np.uint8(255), "mono8", r.pair.t_capture_ns
@@ -161,7 +183,7 @@ FRAME_CONTENT: Mapping[str, Callable[[FrameResult], Content]] = {
 
 
 OF_THE_MODEL = (
-    *("left/render/image", "right/render/image", "left/render/depth"),
+    *("left/render/image", "right/render/image", "left/render/depth", "left/render/depth_confidence"),
     *("points", "splats", "anchors", "tf"),
 )
 
@@ -170,6 +192,8 @@ def tells_of(result: FrameResult, topic: str) -> bool:
     """Whether a frame has something for a topic: there may have been no time to measure its depth, and while
     the camera is lost nothing of the model belongs to the frame."""
     if result.camera_lost and topic in OF_THE_MODEL:
+        return False
+    if topic == "left/render/depth_confidence" and result.views["left"].confidence is None:
         return False
     return topic != "left/depth" or result.skipped.get("depth") != NO_TIME
 

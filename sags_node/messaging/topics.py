@@ -37,10 +37,11 @@ TOPICS = (
     Topic("right/camera_info", CAMERA_INFO, "rectified camera, P[3] = -f B (m)", right=True, cached=True),
     Topic("left/render/image", IMAGE, "rgba8, the model drawn for that eye, alpha = coverage"),
     Topic("right/render/image", IMAGE, "rgba8, the model drawn for that eye, alpha = coverage", right=True),
-    Topic("left/render/depth", IMAGE, "32FC1, metres along z, NaN where the model says nothing"),
+    Topic("left/render/depth", IMAGE, "32FC1, metres along z, NaN where the model says nothing sure enough"),
+    Topic("left/render/depth_confidence", IMAGE, "32FC1, 0..1, how far to trust each depth; 0.5: 3 mm"),
     Topic("left/depth", IMAGE, "32FC1, this frame's measured depth (m), NaN unknown"),
     Topic("left/tissue_mask", IMAGE, "mono8, 255 = tissue"),
-    Topic("points", POINT_CLOUD, "x y z (m, world) rgb: the visible Gaussians"),
+    Topic("points", POINT_CLOUD, "x y z (m, world) rgb confidence: the visible Gaussians"),
     Topic("splats", POINT_CLOUD, "every Gaussian: linear scales (m), opacity 0..1, world", cached=True),
     Topic("anchors", POINT_CLOUD, "points pinned to the tissue: x y z (m, world), pixel, visibility, age"),
     Topic("tf", TF, "world -> left optical frame"),
@@ -65,10 +66,13 @@ OVERLAY_TOPICS = (
 _OF_OTHERS = {topic.name: topic for topic in (*PLAYER_TOPICS, *OVERLAY_TOPICS)}
 
 VIEW_NAME = re.compile(r"[A-Za-z0-9_]{1,64}")
-_VIEW_TOPIC = re.compile(rf"view/{VIEW_NAME.pattern}/(?:(?:left|right)/)?(image|depth|camera_info)")
+_VIEW_TOPIC = re.compile(
+    rf"view/{VIEW_NAME.pattern}/(?:(?:left|right)/)?(image|depth|depth_confidence|camera_info)"
+)
 _VIEW_KINDS = {
     "image": (IMAGE, "rgba8, the model from a viewpoint that a consumer asked for"),
-    "depth": (IMAGE, "32FC1, metres along z of that viewpoint, NaN where the model says nothing"),
+    "depth": (IMAGE, "32FC1, metres along z of that viewpoint, NaN where the model says nothing sure enough"),
+    "depth_confidence": (IMAGE, "32FC1, 0..1, how far to trust each depth of that viewpoint"),
     "camera_info": (CAMERA_INFO, "the camera of that viewpoint"),
 }
 

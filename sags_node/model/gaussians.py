@@ -38,6 +38,7 @@ class GaussianModel:
             "opacities": rows(),  # before the 3D filter
             "colors": rows(3),
             "velocities": rows(3),  # m/s, world
+            "depth_errors": rows(),  # m, predicted, see `mapping.depth_memory`
             "ids": np.zeros(capacity, np.int64),
             "contribution": rows(),  # px, in the last step on a whole picture
             "in_front": np.zeros(capacity, np.int32),  # frames in a row in front of the measured surface
@@ -130,6 +131,7 @@ class GaussianModel:
             self._ids(),
             None,
             self.smoothing,
+            self.depth_errors,
         )
 
     def frozen(self) -> Gaussians:
@@ -143,6 +145,7 @@ class GaussianModel:
             drawn.opacities,
             self.colors.copy(),
             self._ids().copy(),
+            depth_errors=self.depth_errors.copy(),
         )
 
     def _new_ids(self, count: int) -> I64:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sags_node.confidence import confidence_of
 from sags_node.engine.smoothing import folded
 from sags_node.errors import SagsError
 from sags_node.types import SH_DEGREE_0, Gaussians
@@ -18,7 +19,8 @@ _FIELDS = (
 def write_ply(path: Path, gaussians: Gaussians) -> None:
     """Write a binary PLY in the layout of 3D Gaussian Splatting (Kerbl et al., 2023): log scales, opacity
     logits, quaternions wxyz, colours as degree-0 spherical harmonics; metres. The 3D filter is folded in:
-    viewers do not know it.
+    viewers do not know it. Where the errors of depth are known, `confidence` comes last, see
+    `sags_node.confidence`; readers take properties by name.
 
     Raises:
         SagsError: the file exists already (nothing is overwritten) or cannot be written.
@@ -37,8 +39,12 @@ def write_ply(path: Path, gaussians: Gaussians) -> None:
         ],
         axis=1,
     )
+    fields = _FIELDS
+    if gaussians.depth_errors is not None:
+        fields = [*_FIELDS, "confidence"]
+        columns = np.column_stack([columns, confidence_of(gaussians.depth_errors)])
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(gaussians)}"]
-    header += [f"property float {name}" for name in _FIELDS]
+    header += [f"property float {name}" for name in fields]
     header += ["end_header", ""]
     try:
         with path.open("xb") as file:

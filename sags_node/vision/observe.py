@@ -9,6 +9,7 @@ import numpy as np
 
 from sags_node.geometry import scale_intrinsics
 from sags_node.types import F32, Bool, Camera, Observation, RectifiedPair
+from sags_node.vision.depth_grid import depth_grid
 from sags_node.vision.pyramid import pyramids
 
 
@@ -18,10 +19,11 @@ def observe(
     """Gather one frame's observation.
 
     Args:
-        depth, confidence: [H, W] those of `StereoDepth`.
+        depth, confidence: [H, W] those of `StereoDepth`; specks of depth are taken out of both.
         right_eye: with the right eye's picture, where there is one.
     """
     pyramid, _ = pyramids(pair)
+    grid = depth_grid(depth, confidence, tissue, float(pair.camera.K[0, 0]), pair.baseline)
     return Observation(
         frame_id=pair.frame_id,
         t_capture_ns=pair.t_capture_ns,
@@ -34,6 +36,7 @@ def observe(
         right=pair.right * np.float32(1 / 255) if right_eye and pair.right is not None else None,
         baseline=pair.baseline,
         pyramid=pyramid,
+        grid=grid,
     )
 
 
@@ -49,7 +52,7 @@ def resized(observation: Observation, scale: float) -> Observation:
     def nearest(array: F32) -> F32:
         return np.asarray(cv2.resize(array, size, interpolation=cv2.INTER_NEAREST_EXACT))
 
-    right = observation.right
+    right, grid = observation.right, observation.grid
     return replace(
         observation,
         camera=Camera(*size, scale_intrinsics(camera.K, full, size), camera.T_world_cam),
@@ -59,4 +62,5 @@ def resized(observation: Observation, scale: float) -> Observation:
         depth=nearest(observation.depth),
         depth_confidence=nearest(observation.depth_confidence),
         right=None if right is None else cv2.resize(right, size),
+        grid=None if grid is None else replace(grid, side=grid.side * size[0] / full[0]),
     )

@@ -1,0 +1,86 @@
+"""How wrong the depth of each Gaussian may be: by when it was measured, how well, and what moved since.
+
+A Gaussian begins with the error of the depth that it was placed at. Where a frame measures the surface that
+it lies on, it is moved there by a part (`motion.depth_pull`), and its error comes as near to that of the
+measurement. It comes no lower: the errors of frames after each other are those of the same texture and of the
+same calibration, and do not average out. Measurements that contradict it raise its error to the
+contradiction. While it is not measured, its error grows with the way that it is taken unseen.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import prange
+
+from sags_node.engine.pinhole import pack, to_camera, to_pixel
+from sags_node.kernels.jit import PIECE, kernel, parallel_kernel
+from sags_node.mapping.initialise import LARGEST_ERROR
+from sags_node.mapping.motion import BEHIND_TOLERANCE, DEPTH_GATE
+from sags_node.model.gaussians import GaussianModel
+from sags_node.types import F32, Bool, Observation
+from sags_node.vision.depth_grid import grid_of
+
+DRIFT = 0.5  # of the way that tissue is taken: so much of it may lie along the ray, where nothing shows it
+UNSEEN = 1e-3  # m/s: what tissue moves by itself
+
+
+def remember(model: GaussianModel, observation: Observation, pull: float, seconds: float) -> None:
+    """Carry the predicted errors on to a frame to which the Gaussians were moved already.
+
+    Args:
+        observation: its depth; 0 everywhere: not measured.
+        pull: share of the difference in depth by which the Gaussians were moved.
+        seconds: since the frame before.
+    """
+    grid = grid_of(observation)
+    _remember(
+        model.means, model.velocities, tuple(pack(observation.camera)), observation.tissue, observation.depth,
+        grid.error, np.float32(1 / grid.side), np.float32(pull), np.float32(seconds),
+        model.depth_errors,
+    )  # fmt: skip
+
+
+@parallel_kernel
+def _remember(
+    means: F32, velocities: F32, cam: Any, tissue: Bool, depth: F32, grid_error: F32, per_px: Any,
+    pull: Any, seconds: Any, errors: F32,
+) -> None:  # fmt: skip
+    for piece in prange(-(-len(means) // PIECE)):
+        first = np.int64(piece) * PIECE
+        _remember_rows(
+            means, velocities, cam, tissue, depth, grid_error, per_px, pull, seconds, errors,
+            first, min(first + PIECE, len(means)),
+        )  # fmt: skip
+
+
+@kernel
+def _remember_rows(
+    means: F32, velocities: F32, cam: Any, tissue: Bool, depth: F32, grid_error: F32, per_px: Any,
+    pull: Any, seconds: Any, errors: F32, first: Any, end: Any,
+) -> None:  # fmt: skip
+    height, width = depth.shape
+    left = (np.float32(1) - pull) ** 2  # of the old squared error
+    for i in range(first, end):
+        error = errors[i]
+        x, y, z = to_camera(cam, means[i, 0], means[i, 1], means[i, 2])
+        measured = np.float32(0)
+        if z > 0:
+            u, v = to_pixel(cam, x, y, z)
+            if u > -0.5 and v > -0.5 and u < width - 0.5 and v < height - 0.5:
+                px, py = int(u + 0.5), int(v + 0.5)
+                if tissue[py, px] and depth[py, px] > 0:
+                    measured = depth[py, px]
+                    its_error = grid_error[int(py * per_px), int(px * per_px)] * measured * measured
+        apart = measured - z
+        if measured > 0 and abs(apart) < np.float32(BEHIND_TOLERANCE) * z:
+            expected = error * error + its_error * its_error
+            square = left * error * error + (np.float32(1) - left) * its_error * its_error
+            error = np.sqrt(square + pull * max(apart * apart - expected, np.float32(0)))
+        elif measured > 0 and apart > -np.float32(DEPTH_GATE) * z:
+            error = max(error, abs(apart))  # before the surface, or not quite hidden by it
+        else:
+            way = velocities[i, 0] ** 2 + velocities[i, 1] ** 2 + velocities[i, 2] ** 2
+            error += (np.float32(DRIFT) * np.sqrt(way) + np.float32(UNSEEN)) * seconds
+        errors[i] = min(error, np.float32(LARGEST_ERROR))

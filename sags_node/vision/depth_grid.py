@@ -1,0 +1,256 @@
+"""What is known of the depth around each place: how good a measurement is, and what stands in for one.
+
+On a coarse grid, in inverse depth, in which stereo errs alike near and far. A measurement is as good as it
+agrees with those around it. Where matches are good, neighbouring cells lie on a smooth surface; where they
+are not, as in fog, on a wet spot or at a fold, neighbours differ, and on recordings with true depth the
+errors are in proportion to that. Few matches in a place where the tissue around has none are worth little,
+whatever their own windows look like.
+
+What was not measured is borrowed: from the cells around it that were, the better and nearer the more, by
+pushing and pulling through a pyramid (Gortler et al., The Lumigraph, 1996). A stray match so has no more say
+than the little that it is trusted.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numba import prange
+
+from sags_node.kernels.jit import kernel, parallel_kernel
+from sags_node.types import F32, Bool, DepthGrid, Observation
+
+CELLS = 80  # across the picture
+EVERY = 2  # px between those that are looked at; depth is matched on no more
+WIDTH = 640  # px: the errors below are those of a picture so wide
+FLOOR = 0.25  # px of disparity: calibration, of which no match tells (principal points, rows, lenses)
+UNSUPPORTED = 1.0  # px: a match that no neighbour agrees with
+ROUGHNESS = 3.5  # times how far cells lie from the mean of their neighbours: nine of ten errors are smaller
+AGREEING = 1.0  # px, beside what a slope explains: two cells of one surface
+STEEPEST = 1.0  # m deeper per m aside, 45 degrees: more is another surface
+SLOPE = 0.5  # m deeper per m aside: tissue mostly lies flatter
+LEAST_SUPPORT = 0.1  # of the tissue around, measured to be the same surface: less is a speck
+NOMINAL_BASELINE = 4e-3  # m: of depth that no pair of eyes measured; endoscopes have about that
+JUMP = 0.06  # of the depth: what was not measured lies behind an edge or an instrument often enough
+
+
+def depth_grid(depth: F32, confidence: F32, tissue: Bool, focal: float, baseline: float) -> DepthGrid:
+    """The grid of a measured depth [H, W] (m, 0 unknown); specks are set to 0 in place, in the confidence
+    too.
+
+    Args:
+        confidence: [H, W] 0..1, how far each depth is trusted by itself.
+        focal: px.
+        baseline: m between the eyes; 0: there was one.
+    """
+    height, width = depth.shape
+    side = max(1, round(width / CELLS))
+    rows, columns = -(-height // side), -(-width // side)
+    px = np.float32(width / WIDTH / (focal * (baseline or NOMINAL_BASELINE)))  # 1/m of one px of disparity
+    sums = np.zeros((3, rows, columns), np.float32)
+    _gather(depth, confidence, tissue, side, sums)
+    around = np.zeros((4, rows, columns), np.float32)
+    aside = side / focal  # of a cell at a distance of 1
+    _compare(sums, np.float32(AGREEING) * px, np.float32(STEEPEST * aside), around)
+    _judge(sums, px, around)
+    _drop_specks(around[3], side, depth, confidence)
+    inverse, error = around[2:]
+    known = error > 0
+    weight = np.where(known, np.square(np.float32(2 * FLOOR) * px / np.where(known, error, 1)), np.float32(0))
+    lent, square = _borrowed(np.stack([weight, weight * inverse, weight * error * error]))
+    away = cv2.distanceTransform((~known).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_3)
+    square += np.square((np.float32(SLOPE * aside) * away + np.float32(JUMP)) * lent)
+    lent_error = np.where(lent > 0, np.sqrt(square), np.float32(np.inf))
+    return DepthGrid(float(side), np.where(known, inverse, lent), np.where(known, error, lent_error))
+
+
+@kernel
+def depth_at(depth: F32, inverse: F32, error: F32, side: Any, x: int, y: int) -> Any:
+    """Depth and its error (m) at a pixel of the depth [H, W]: measured, else borrowed; (0, inf): unknown.
+
+    Args:
+        inverse, error, side: of the `DepthGrid`.
+    """
+    half = np.float32(0.5)
+    rows, columns = inverse.shape
+    v = min(max((np.float32(y) + half) / side - half, np.float32(0)), np.float32(rows - 1))
+    u = min(max((np.float32(x) + half) / side - half, np.float32(0)), np.float32(columns - 1))
+    z = depth[y, x]
+    if not z > 0:
+        j, i = int(v), int(u)
+        b, a = v - np.float32(j), u - np.float32(i)
+        below, right = min(j + 1, rows - 1), min(i + 1, columns - 1)
+        upper = (1 - a) * inverse[j, i] + a * inverse[j, right]
+        lower = (1 - a) * inverse[below, i] + a * inverse[below, right]
+        between = (1 - b) * upper + b * lower
+        if not between > 0:
+            return np.float32(0), np.float32(np.inf)
+        z = np.float32(1) / np.float32(between)
+    return z, error[int(v + half), int(u + half)] * z * z
+
+
+def grid_of(observation: Observation) -> DepthGrid:
+    """That of a frame, made now where it does not bring one; then no speck is dropped."""
+    if observation.grid is not None:
+        return observation.grid
+    depth, confidence = observation.depth.copy(), observation.depth_confidence.copy()
+    focal = float(observation.camera.K[0, 0])
+    return depth_grid(depth, confidence, observation.tissue, focal, observation.baseline)
+
+
+def _borrowed(sums: F32) -> F32:
+    """Inverse depth and its squared error, [2, h, w], everywhere, from the weights of what is known, and
+    those times each, [3, h, w]; weight 1 is all that anybody asks for. 0: nothing is known at all."""
+    _, rows, columns = sums.shape
+    filled = np.empty((2, rows, columns), np.float32)
+    if rows == columns == 1:
+        _mix(sums, np.zeros((2, 1, 1), np.float32), filled)
+        return filled
+    half = np.zeros((3, (rows + 1) // 2, (columns + 1) // 2), np.float32)
+    _halve(sums, half)
+    _mix(sums, _borrowed(half), filled)
+    return filled
+
+
+@kernel
+def _halve(sums: F32, half: F32) -> None:
+    for k in range(3):
+        for y in range(sums.shape[1]):
+            for x in range(sums.shape[2]):
+                half[k, y // 2, x // 2] += sums[k, y, x]
+
+
+@kernel
+def _mix(sums: F32, coarse: F32, filled: F32) -> None:
+    """What the sums know themselves, and for what is missing of a weight of 1 what lies between the cells of
+    half the size."""
+    _, height, width = filled.shape
+    _, rows, columns = coarse.shape
+    one, near, far = np.float32(1), np.float32(0.75), np.float32(0.25)
+    for y in range(height):
+        j = y // 2
+        other_j = min(max(j + (1 if y % 2 else -1), 0), rows - 1)
+        for x in range(width):
+            i = x // 2
+            other_i = min(max(i + (1 if x % 2 else -1), 0), columns - 1)
+            weight = sums[0, y, x]
+            missing = max(one - weight, np.float32(0)) if height * width > 1 else np.float32(0)
+            scale = (one - missing) / weight if weight > 0 else np.float32(0)
+            for k in range(2):
+                value = scale * sums[k + 1, y, x]
+                if missing > 0:
+                    nearer = near * coarse[k, j, i] + far * coarse[k, j, other_i]
+                    farther = near * coarse[k, other_j, i] + far * coarse[k, other_j, other_i]
+                    value += missing * (near * nearer + far * farther)
+                filled[k, y, x] = value
+
+
+@parallel_kernel
+def _gather(depth: F32, confidence: F32, tissue: Bool, side: int, sums: F32) -> None:
+    for row in prange(sums.shape[1]):
+        _gather_row(depth, confidence, tissue, side, np.int64(row), sums)
+
+
+@kernel
+def _gather_row(depth: F32, confidence: F32, tissue: Bool, side: int, row: Any, sums: F32) -> None:
+    """Of the cells in one row: the share of pixels that show tissue, that times trust, and the mean inverse
+    depth."""
+    height, width = depth.shape
+    zero, one = np.float32(0), np.float32(1)
+    for column in range(sums.shape[2]):
+        shown, trust, inverse, count = zero, zero, zero, zero
+        for y in range(row * side, min((row + 1) * side, height), EVERY):
+            for x in range(column * side, min((column + 1) * side, width), EVERY):
+                count += one
+                if tissue[y, x]:
+                    shown += one
+                if depth[y, x] > 0:
+                    trust += confidence[y, x]
+                    inverse += confidence[y, x] / depth[y, x]
+        sums[0, row, column] = shown / count
+        sums[1, row, column] = trust / count
+        sums[2, row, column] = inverse / trust if trust > 0 else zero
+
+
+@parallel_kernel
+def _compare(sums: F32, tolerance: Any, slope: Any, around: F32) -> None:
+    for row in prange(sums.shape[1]):
+        _compare_row(sums, tolerance, slope, np.int64(row), around)
+
+
+@kernel
+def _compare_row(sums: F32, tolerance: Any, slope: Any, row: Any, around: F32) -> None:
+    """Of the measured cells in one row: the squared distance from the mean of their neighbours, and the share
+    of the tissue up to four cells around that was measured to be the same surface."""
+    _, rows, columns = sums.shape
+    weight, mean, shown, agreeing = np.zeros((4, columns), np.float32)
+    zero = np.float32(0)
+    for y in range(max(row - 1, 0), min(row + 2, rows)):
+        for i in range(-1, 2):
+            if y != row or i != 0:
+                for x in range(max(-i, 0), columns - max(i, 0)):
+                    weight[x] += sums[1, y, x + i]
+                    mean[x] += sums[1, y, x + i] * sums[2, y, x + i]
+    for y in range(row - 4, row + 5, 2):
+        if y < 0 or y >= rows:
+            continue
+        for i in range(-4, 5, 2):
+            steep = slope * np.float32(max(abs(y - row), abs(i)))
+            for x in range(max(-i, 0), columns - max(i, 0)):
+                own = sums[2, row, x]
+                same = abs(sums[2, y, x + i] - own) < tolerance + steep * own
+                shown[x] += sums[0, y, x + i]
+                agreeing[x] += sums[1, y, x + i] if same else zero
+    for x in range(columns):
+        if sums[1, row, x] > 0:
+            if weight[x] > 0:
+                around[0, row, x] = (mean[x] / weight[x] - sums[2, row, x]) ** 2
+            if shown[x] > 0:
+                around[1, row, x] = min(agreeing[x] / shown[x], np.float32(1))
+
+
+@parallel_kernel
+def _judge(sums: F32, px: Any, around: F32) -> None:
+    for row in prange(sums.shape[1]):
+        _judge_row(sums, px, np.int64(row), around)
+
+
+@kernel
+def _judge_row(sums: F32, px: Any, row: Any, around: F32) -> None:
+    """Inverse depth and error of the cells in one row that are believed; of the others both are 0, and the
+    error -1 where something was measured."""
+    _, rows, columns = sums.shape
+    weight, squares = np.zeros((2, columns), np.float32)
+    for y in range(max(row - 2, 0), min(row + 3, rows)):
+        for i in range(-2, 3):
+            for x in range(max(-i, 0), columns - max(i, 0)):
+                weight[x] += sums[1, y, x + i]
+                squares[x] += sums[1, y, x + i] * around[0, y, x + i]
+    floor, unsupported = np.float32(FLOOR) * px, np.float32(UNSUPPORTED) * px
+    for x in range(columns):
+        if not sums[1, row, x] > 0:
+            continue
+        support = around[1, row, x]
+        if support < np.float32(LEAST_SUPPORT):
+            around[3, row, x] = -1
+            continue
+        rough = np.float32(ROUGHNESS**2) * squares[x] / weight[x]
+        alone = unsupported * (np.float32(1) - support)
+        around[2, row, x] = sums[2, row, x]
+        around[3, row, x] = np.sqrt(floor * floor + alone * alone + rough)
+
+
+@kernel
+def _drop_specks(error: F32, side: int, depth: F32, confidence: F32) -> None:
+    """Forget the depth in cells of error -1, which becomes 0."""
+    height, width = depth.shape
+    for row in range(error.shape[0]):
+        for column in range(error.shape[1]):
+            if error[row, column] < 0:
+                error[row, column] = 0
+                for y in range(row * side, min((row + 1) * side, height)):
+                    for x in range(column * side, min((column + 1) * side, width)):
+                        depth[y, x] = 0
+                        confidence[y, x] = 0
