@@ -2,8 +2,8 @@
 
 The mesh is a fusion (Curless and Levoy, 1996, by Open3D) of the depth drawn from the left camera and from
 others around it. A pixel counts only where the mean depth of its ray is also the depth at which half of the
-light is gone: rays that meet two surfaces, or none, say nothing. Nor does depth that was borrowed, or
-measured too badly to be sure of (`sags_node.confidence`).
+light is gone: rays that meet two surfaces, or none, say nothing. Nor does depth
+that is a guess (`sags_node.confidence`).
 
 On the phantom at its lift, median, p90 and p99:
 
@@ -25,7 +25,6 @@ import numpy as np
 
 from sags_node.apps.export_orbit import orbit
 from sags_node.apps.export_scene import Scene
-from sags_node.confidence import SURE
 from sags_node.engine.confidence import with_confidence
 from sags_node.engine.rasterize import make_rasterizer, to_view
 from sags_node.errors import SagsError
@@ -100,10 +99,8 @@ def _drawn(scene: Scene, cameras: list[Camera]) -> Iterator[tuple[F32, F32]]:
         view = with_confidence(view, scene.gaussians)
         apart = np.abs(view.depth - rasterizer.median()[0][0])
         agree = apart < AGREEMENT_PX * view.depth / np.float32(camera.K[0, 0])
-        if view.confidence is not None:
-            agree &= view.confidence >= SURE
         if camera is first and not agree.any():
-            raise SagsError("the left camera sees nothing sure of the model; export another moment")
+            raise SagsError("the left camera sees nothing of the model; export another moment")
         yield view.rgb, np.where(agree, view.depth, np.float32(0))
 
 
