@@ -22,6 +22,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -222,6 +223,13 @@ class AnchorStates:
             return np.empty((0, *shape), np.float32)
 
         return AnchorStates(np.empty(0, np.int64), empty(3), empty(2), empty(), empty(), empty())
+
+
+class Finding(NamedTuple):
+    """Something a person should know of: a warning."""
+
+    code: str  # stable, e.g. right_eye_dark; explained in docs/warnings.md
+    text: str  # what is wrong and how to mend it
 
 
 @dataclass(frozen=True, slots=True)
