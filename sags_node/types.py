@@ -262,9 +262,9 @@ class FrameResult:
     rung: RungState | None = None  # None: fixed steps, no ladder
 
     @property
-    def camera_lost(self) -> bool:
-        """Whether nobody knows from where the picture was taken: the model is that of an older frame."""
-        return "pose" in self.skipped
+    def held(self) -> str:
+        """Why the frame was not taken in, so that the model is that of an older one; empty: it was."""
+        return self.skipped.get("pose", "") or self.skipped.get("picture", "")
 
 
 @dataclass(frozen=True, slots=True)
