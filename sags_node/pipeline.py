@@ -154,14 +154,16 @@ class Pipeline:
                 anchors = self.anchors.at(pair.t_capture_ns)
                 return _repeat(self._mapped, pair, self._epoch(frame), watch.timings_ms, anchors)
         advice = Advice()
-        if self._mapped is not None:
+        if self._mapped is not None and verdict.left:
+            advice = Advice(verdict.left)
+        elif self._mapped is not None:
             with watch("watch"):
-                advice = Advice(verdict.left) if verdict.left else self._scene(pair, self._mapped)
-            if advice.is_new:
-                self.reset()
-            elif advice.held:
-                held = self._held(pair, self._epoch(frame), watch.timings_ms, "picture", advice.held)
-                return replace(held, observation=_unseen(pair))
+                advice = self._scene(pair, self._mapped, not verdict.learn)
+        if advice.is_new:
+            self.reset()
+        elif advice.held:
+            held = self._held(pair, self._epoch(frame), watch.timings_ms, "picture", advice.held)
+            return replace(held, observation=_unseen(pair))
         seen = pair if advice.gain is None else exposed(pair, advice.gain)
         still = self._still_frames(pair)
         skipped: dict[str, str] = {}
@@ -204,7 +206,7 @@ class Pipeline:
                 held = self._held(pair, self._epoch(frame), watch.timings_ms, "pose", lost)
                 return replace(held, observation=observation)
         with watch("map"):
-            learn = advice.learn and not verdict.blurred
+            learn = advice.learn and verdict.learn
             mapped = self.mapper.update(observation, budget, still, learn)
             snapshot = mapped.snapshot
             if self._tracker is not None:

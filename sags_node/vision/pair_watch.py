@@ -12,8 +12,9 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from sags_node.types import F32, U8, Finding, GrayPyramid, RectifiedPair, StereoFrame
-from sags_node.vision.pyramid import inner, pyramids
+from sags_node.types import F32, U8, Finding, RectifiedPair, StereoFrame
+from sags_node.vision.clarity import LENS, SMOKE, Clarity, small_level
+from sags_node.vision.pyramid import pyramids
 from sags_node.vision.standing import Standing
 
 WIDTH = 80  # px of the small pictures
@@ -26,25 +27,15 @@ LOCAL = 15  # small px: shading wider than that is no structure
 LEAST_MATCH = 0.35  # correlation; nothing matches below
 CLEARLY_BETTER = 0.2  # of a match the wrong way round, against the best the right way round
 
-# Contrast and sharpness of the eyes differ by less than half an octave on a heart, by 0.1 on other tissue. A
-# fogged lens takes away one and a half or more.
-USUAL_DIFFERENCE = 0.6  # octaves: what eyes may differ by for good
-LOST_CONTRAST = 0.8  # octaves beside what they usually differ by
-LOST_SHARPNESS = 1.5  # octaves of what is finer than a blur, of one eye beside the other
-BLURRED = 1.5  # octaves, of both eyes beside what they usually have: a quarter of the fine detail is left
-FINEST = 0.005  # of the detail: below is rounding
-REMEMBERED_S = 3.0  # s over which what is usual follows
-
 HISTORY = 12  # frames among which an eye is looked at for standing still
 MOVED = 1.0  # grey levels, mean: the other eye has moved for sure
 UNMOVED = 1 / 8  # of what changes in the other eye; clear pairs change alike to 1/2, fog leaves 1/4
 
-_LENS = "clean the lens, and see to focus and cable"
 _TEXTS = {
     "black": "the {eye} picture is black: see to the light, the lens cap and the cable",
     "white": "the {eye} picture is white: lower the light or the exposure",
     "plain": "the {eye} picture is of one colour: see to the lens, the cable and the capture card",
-    "fogged": f"the {{eye}} picture is fogged or out of focus beside the other: {_LENS}",
+    "fogged": f"the {{eye}} picture is fogged or out of focus beside the other: {LENS}",
     "frozen": "the {eye} picture stands still while the other moves: see to its cable and capture card",
 }
 _EQUAL = Finding("eyes_equal", "both eyes show the same picture, so there is no depth: connect the other eye")
@@ -52,7 +43,11 @@ _EXCHANGED = Finding(
     "eyes_exchanged",
     "left and right seem to be exchanged: swap source.left and source.right, or LR and RL",
 )
-_BLURRED = Finding("picture_blurred", f"the picture is blurred, and is not learnt: {_LENS}")
+_UNCLEAR = {
+    "": [],
+    "blurred": [Finding("picture_blurred", f"the picture is blurred, and is not learnt: {LENS}")],
+    "veiled": [SMOKE],
+}
 
 
 class Verdict(NamedTuple):
@@ -60,7 +55,7 @@ class Verdict(NamedTuple):
 
     left: str = ""  # why its left picture may not; empty: it may
     right: str = ""  # why there may be no stereo
-    blurred: bool = False  # what it shows may be followed, and not learnt
+    learn: bool = True  # else what it shows may be followed, and not learnt
 
 
 class Small(NamedTuple):
@@ -75,7 +70,7 @@ class PairWatch:
 
     def __init__(self) -> None:
         self._standing = Standing()
-        self._usual = _Usual()
+        self._clarity = Clarity()
         self._history: deque[tuple[F32, F32]] = deque(maxlen=HISTORY)
 
     @property
@@ -91,9 +86,9 @@ class PairWatch:
         for code, text in found:
             if code.startswith("left") or code == _EXCHANGED.code:
                 left = left or text
-            if code != _BLURRED.code:
+            if not code.startswith("picture"):
                 right = right or text
-        return Verdict(left, right, _BLURRED in found)
+        return Verdict(left, right, not any(code.startswith("picture") for code, _ in found))
 
     def _look(self, frame: StereoFrame, pair: RectifiedPair) -> list[Finding]:
         """What is wrong in one frame."""
@@ -106,18 +101,16 @@ class PairWatch:
             return empty
         left, right = pyramids(pair)
         if frame.right is None or right is None:
-            return [_BLURRED] if self._usual.judge(frame.t_capture_ns, left, None)[1] else []
+            return _UNCLEAR[self._clarity(frame.t_capture_ns, left, None).all]
         if _are_equal(eyes["left"].gray, eyes["right"].gray):
             return [_EQUAL]
-        if _are_exchanged(_small_level(left), _small_level(right)):
+        if _are_exchanged(small_level(left), small_level(right)):
             return [_EXCHANGED]
         frozen = self._frozen(eyes["left"].gray, eyes["right"].gray)
-        fogged, blurred = self._usual.judge(frame.t_capture_ns, left, right)
-        if fogged:
-            return [_finding(fogged, "fogged")]
-        if frozen:
-            return [_finding(frozen, "frozen")]
-        return [_BLURRED] if blurred else []
+        unclear = self._clarity(frame.t_capture_ns, left, right)
+        if unclear.eye:
+            return [_finding(unclear.eye, "fogged")]
+        return [_finding(frozen, "frozen")] if frozen else _UNCLEAR[unclear.all]
 
     def _frozen(self, left: F32, right: F32) -> str:
         """Which eye shows what it showed before, while the other has moved since; empty: none."""
@@ -133,45 +126,6 @@ class PairWatch:
         return frozen
 
 
-class _Usual:
-    """What contrast and sharpness of the eyes usually are, and what falls behind that."""
-
-    def __init__(self) -> None:
-        self._stamp_ns: int | None = None
-        self._contrast = 0.0  # octaves, of the right eye over the left
-        self._sharpness: float | None = None  # the same of the fine detail
-        self._detail: float | None = None  # octaves, of the sharper eye
-
-    def judge(self, stamp_ns: int, left: GrayPyramid, right: GrayPyramid | None) -> tuple[str, bool]:
-        """Which eye is fogged (left, right or empty), and whether all that there are is blurred."""
-        passed = 0.0 if self._stamp_ns is None else max(0.0, (stamp_ns - self._stamp_ns) * 1e-9)
-        self._stamp_ns = stamp_ns
-        share = min(1.0, passed / REMEMBERED_S)
-        details = [_detail(eye) for eye in (left, right) if eye is not None]
-        detail = max(details)
-        blurred = self._detail is not None and detail < self._detail - BLURRED
-        if self._detail is None:
-            self._detail = detail
-        if right is None:
-            self._detail += 0.0 if blurred else share * (detail - self._detail)
-            return "", blurred
-        contrast = _contrast(right) - _contrast(left)
-        sharpness = details[1] - details[0]
-        if self._sharpness is None:
-            self._sharpness = float(np.clip(sharpness, -USUAL_DIFFERENCE, USUAL_DIFFERENCE))
-        beyond = contrast - self._contrast, sharpness - self._sharpness
-        if abs(beyond[0]) > LOST_CONTRAST:
-            return ("right" if beyond[0] < 0 else "left"), False
-        if abs(beyond[1]) > LOST_SHARPNESS and not blurred:
-            return ("right" if beyond[1] < 0 else "left"), False
-        if not blurred:
-            self._detail += share * (detail - self._detail)
-            self._sharpness += share * beyond[1]
-            contrast = self._contrast + share * beyond[0]
-            self._contrast = float(np.clip(contrast, -USUAL_DIFFERENCE, USUAL_DIFFERENCE))
-        return "", blurred
-
-
 def _finding(eye: str, kind: str) -> Finding:
     return Finding(f"{eye}_eye_{kind}", _TEXTS[kind].format(eye=eye))
 
@@ -182,29 +136,6 @@ def _small(image: U8) -> Small:
         image = cv2.resize(image, (2 * WIDTH, 2 * height), interpolation=cv2.INTER_LINEAR)
     rgb = cv2.resize(image, (WIDTH, height), interpolation=cv2.INTER_AREA)
     return Small(rgb.astype(np.float32), cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32))
-
-
-def _small_level(pyramid: GrayPyramid) -> F32:
-    """The first half that is about as wide as the small pictures."""
-    return next(
-        (inner(half) for half in pyramid.halves if half.shape[1] <= 2 * WIDTH), inner(pyramid.halves[-1])
-    )
-
-
-def _contrast(pyramid: GrayPyramid) -> float:
-    """Octaves of local contrast over brightness."""
-    gray = _small_level(pyramid)
-    structure = float(np.square(gray - cv2.blur(gray, (LOCAL, LOCAL))).mean())
-    return 0.5 * float(np.log2((structure + 1e-3) / (float(gray.mean()) ** 2 + 1e-3)))
-
-
-def _detail(pyramid: GrayPyramid) -> float:
-    """Octaves of what is finer than a blur: steps between the pixels of the first half over those of a picture
-    of half its size, which are half of them when there is nothing finer."""
-    fine = inner(pyramid.halves[0])[::4]
-    coarse = inner(pyramid.halves[min(1, len(pyramid.halves) - 1)])[::2]
-    steps = [float(np.abs(rows[:, 1:] - rows[:, :-1]).mean()) for rows in (fine, coarse)]
-    return float(np.log2(max(steps[0] / (steps[1] + 1e-3) - 0.5, FINEST)))
 
 
 def _emptiness(rgb: F32) -> str:

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from sags_node.types import F32, U8, Bool, Finding, FrameResult, RectifiedPair
+from sags_node.vision.clarity import SMOKE
 from sags_node.vision.flow import OpticalFlow
 from sags_node.vision.pyramid import gray_pyramid, inner, narrowed, pyramid_of, pyramids
 from sags_node.vision.standing import Standing
@@ -23,15 +24,21 @@ WIDTH = 80  # px of the small pictures
 SEEN_ALPHA = 0.5
 FEWEST = 50  # small px of the model in the picture, to judge it by
 DARK, BRIGHT = 0.03, 0.95  # beyond, a channel tells noise or saturation
-LEAST_USABLE = 0.3  # of the channels of all px: with less the picture is dark or overexposed
+LEAST_USABLE = (
+    0.5  # of the channels of the model that can be compared: with less the picture is overexposed or dark
+)
 MISFIT = 0.1  # of the range of colours, mean over the channels
 STARTLING = 0.08  # of the px misfit: then motion is looked for that explains it
 COVERED = (
     0.15  # of the px misfit: then something covers them; a beating heart stays below, motion not explained
 )
 ANOTHER = 0.5  # of the px misfit: then it is not the scene
-LOST_RESIDUAL = 0.08  # mean over RGB of what is not covered; a beating heart stays below half of it
-LEAST_MATCH = 0.25  # correlation of the structure, where much is misfit; the same tissue has 0.4 and more
+# Where much is misfit, the rest tells a cover from another scene. Tissue after a second of motion, or half under
+# blood, against other scenes and mirrored ones: residuals to 0.043 and from 0.044, correlations from 0.5 and to
+# 0.5, casts to 1.24 and from 1.2 to 2.3. Each alone overlaps.
+LARGEST_REST = 0.045  # mean residual of what is not misfit; chance makes 0.05
+LEAST_MATCH = 0.3  # correlation of the structure
+LARGEST_CAST = 1.3  # of one channel's gain over another's
 VEILED, HIDDEN = 0.6, 0.15  # of the model's contrast; clear pictures have 0.9 and more
 FINE, LOCAL = 3, 15  # small px: structure is coarser than noise and finer than shading
 GREEN = 1  # the channel with most of the structure, and seldom saturated
@@ -39,6 +46,10 @@ LEAST_KEPT = 0.3  # of what is known, in view after motion
 LARGEST_GAIN = 1.5  # from one frame to the next; beyond, a picture is brought to the model's exposure
 STEADY = 1.2  # of the gain before: the exposure has changed for good when it stays so
 FOLLOWED = 0.9  # of the gain's logarithm, per frame, is still taken out of a picture after that
+BINS = 32  # of the share of red in a colour, and of green
+NOVEL = 0.002  # of the tissue had a colour like this, or less: it is new
+STRANGE = 0.05  # of the px have new colours: clear pictures have 0.005
+REMEMBERED_S = 3.0  # s over which the usual colours follow
 LONGEST_NS = {"cover": 3_000_000_000, "veil": 10_000_000_000, "gain": 1_000_000_000}
 NEW_SCENE_NS = 3_000_000_000
 
@@ -47,9 +58,6 @@ _FLOW = OpticalFlow(stride=4)
 _DARK = Finding("picture_dark", "the picture is too dark, and is not learnt: see to the light")
 _BRIGHT = Finding(
     "picture_bright", "the picture is overexposed, and is not learnt: lower the light or the exposure"
-)
-_SMOKE = Finding(
-    "picture_smoke", "smoke or a fogged lens veils the picture, and it is not learnt: clear the view"
 )
 _COVERED = Finding(
     "picture_covered", "blood or something else covers some of the tissue, and is not learnt: clear the view"
@@ -91,6 +99,9 @@ class SceneWatch:
         self._since: dict[str, int] = {}  # stamps: how long something has lasted
         self._gain: F32 = np.ones(3, np.float32)  # of the frame before
         self._taken_out: F32 = np.ones(3, np.float32)
+        self._palette = _Palette()
+        self._tissue: Bool | None = None  # [h, w] of the last clear frame
+        self._is_clear = True  # the last frame was
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -100,28 +111,51 @@ class SceneWatch:
     def forget(self) -> None:
         """There is a new model."""
         self._since.clear()
+        self._tissue = None
         self._gain = self._taken_out = np.ones(3, np.float32)
 
-    def __call__(self, pair: RectifiedPair, last: FrameResult) -> Advice:
-        """Take one frame."""
+    def __call__(self, pair: RectifiedPair, last: FrameResult, veiled: bool = False) -> Advice:
+        """Take one frame.
+
+        Args:
+            veiled: it is known to be blurred or veiled: colours tell nothing.
+        """
         now = pair.t_capture_ns
-        seen = look(pair, last)
-        covered = seen.covered is not None
-        found = [
-            finding
-            for finding, is_so in ((_SMOKE, seen.veiled), (_COVERED, covered and not seen.veiled))
-            if is_so and seen.wrong is None
-        ]
-        self._standing.update(now, found if seen.wrong is None else [seen.wrong])
+        step = max(1, pair.camera.width // WIDTH)
+        if self._tissue is None or self._is_clear:
+            self._tissue = last.observation.tissue[::step, ::step]
+        seen = look(pair, last, self._tissue)
         if seen.wrong is not None:
+            self._is_clear = False
+            self._standing.update(now, [seen.wrong])
             lasts = self._lasts("scene", seen.wrong is _UNKNOWN and seen.clear, now)
             return Advice(seen.wrong.text, is_new=lasts >= NEW_SCENE_NS)
         self._lasts("scene", False, now)
-        veiled = seen.veiled and self._lasts("veil", seen.veiled, now) < LONGEST_NS["veil"]
-        lasts = self._lasts("cover", covered, now)
-        cover = seen.covered if lasts < LONGEST_NS["cover"] else None
-        gain = None if veiled else self._exposure(seen.gain, now)
-        return Advice("", False, not veiled and gain is None, cover, gain, seen.shift)
+        if veiled or (seen.veiled and self._lasts("veil", True, now) < LONGEST_NS["veil"]):
+            self._is_clear = False
+            self._standing.update(now, [] if veiled else [SMOKE])
+            return Advice(learn=False, shift=seen.shift)
+        self._lasts("veil", False, now)
+        cover = self._cover(seen, pair.left[::step, ::step], now)
+        self._is_clear = cover is None
+        self._standing.update(now, [] if cover is None else [_COVERED])
+        gain = self._exposure(seen.gain, now)
+        return Advice(learn=gain is None, covered=cover, gain=gain, shift=seen.shift)
+
+    def _cover(self, seen: Look, picture: U8, now: int) -> Bool | None:
+        """[h, w] what lies over the tissue: what the model does not explain, and colours that are new. What
+        stays so long is taken for tissue."""
+        assert self._tissue is not None
+        new = self._palette.new(picture, self._tissue, now)
+        is_strange = np.count_nonzero(new) > STRANGE * np.count_nonzero(self._tissue)
+        lasts = self._lasts("cover", seen.covered is not None or is_strange, now)
+        if lasts >= LONGEST_NS["cover"]:
+            is_strange = False
+        self._palette.take(except_new=is_strange)
+        if lasts >= LONGEST_NS["cover"] or not (seen.covered is not None or is_strange):
+            return None
+        cover: Bool = new if seen.covered is None else seen.covered | new
+        return cv2.dilate(cover.view(np.uint8), np.ones((FINE, FINE), np.uint8)).view(np.bool_)
 
     def _exposure(self, gain: F32, now: int) -> F32 | None:
         """What to take out of the pictures; None: the model follows their exposure by itself."""
@@ -147,6 +181,43 @@ class SceneWatch:
         return now - since
 
 
+class _Palette:
+    """The colours that the tissue usually has, whatever the exposure."""
+
+    def __init__(self) -> None:
+        self._usual: F32 | None = None  # [BINS, BINS] share of the tissue, by share of red and of green
+        self._share = 1.0
+        self._colors = self._counted = self._is_new = np.zeros((1, 1), np.bool_)
+        self._stamp_ns = 0
+
+    def new(self, picture: U8, tissue: Bool, now: int) -> Bool:
+        """Which pixels [h, w] of a small picture [h, w, 3] have colours that tissue did not have before."""
+        red, green, blue = cv2.split(cv2.blur(picture, (FINE, FINE)).astype(np.float32))
+        light = red + green + blue
+        fair = (light > 3 * 255 * DARK) & (cv2.max(red, cv2.max(green, blue)) < 255 * BRIGHT)
+        places = [(BINS * channel / (light + 1)).astype(np.intp) for channel in (red, green)]
+        self._colors, self._counted = BINS * places[0] + places[1], fair & tissue
+        if self._usual is None:
+            self._stamp_ns, self._share = now, 1.0
+            self._is_new = np.zeros_like(tissue)
+            return self._is_new
+        self._share = min(1.0, max(0.0, (now - self._stamp_ns) * 1e-9) / REMEMBERED_S)
+        self._stamp_ns = now
+        around = cv2.boxFilter(self._usual, -1, (FINE, FINE), normalize=False)
+        self._is_new = (around.ravel()[self._colors] < NOVEL) & self._counted
+        return self._is_new
+
+    def take(self, except_new: bool) -> None:
+        """Learn the colours of that picture."""
+        counted = self._counted & ~self._is_new if except_new else self._counted
+        if not counted.any():
+            return
+        found = np.bincount(self._colors[counted], minlength=BINS**2).reshape(BINS, BINS).astype(np.float32)
+        found /= np.float32(np.count_nonzero(counted))
+        before = found if self._usual is None else self._usual
+        self._usual = before + np.float32(self._share) * (found - before)
+
+
 def exposed(pair: RectifiedPair, gain: F32) -> RectifiedPair:
     """The pair as it would be with 1 / `gain` [3] of its exposure."""
     factors = (1 / gain).astype(np.float64)
@@ -166,29 +237,32 @@ def enlarged(small: Bool, shape: tuple[int, ...]) -> Bool:
     return large.view(np.bool_)
 
 
-def look(pair: RectifiedPair, last: FrameResult) -> Look:
-    """What a picture is, beside the frame mapped last."""
+def look(pair: RectifiedPair, last: FrameResult, tissue: Bool) -> Look:
+    """What a picture is, beside the frame mapped last.
+
+    Args:
+        tissue: [h, w] small, where that frame would have shown tissue but for what covers it.
+    """
     step = max(1, pair.camera.width // WIDTH)
     view = last.views["left"]
     seen = pair.left[::step, ::step] * np.float32(1 / 255)
     drawn = np.ascontiguousarray(view.rgb[::step, ::step])
-    known: Bool = (view.alpha[::step, ::step] > SEEN_ALPHA) & last.observation.tissue[::step, ::step]
+    known = (view.alpha[::step, ::step] > SEEN_ALPHA) & tissue
     if np.count_nonzero(known) < FEWEST:
         return Look()
     fit = _Fit(seen, drawn, known)
     if fit.usable < LEAST_USABLE:
         return Look(_DARK if seen[known].mean() < drawn[known].mean() else _BRIGHT)
-    if fit.contrast < VEILED:
-        return Look(_SMOKE if fit.contrast < HIDDEN else None, veiled=True)
+    if fit.contrast < VEILED and fit.match > LEAST_MATCH:
+        return Look(SMOKE if fit.contrast < HIDDEN else None, veiled=True)
     shift = (0.0, 0.0)
     if fit.misfit > STARTLING:
         fit, shift = _found_again(pair, last, step, seen, drawn, known, fit)
-    if fit.misfit > COVERED and (fit.misfit > ANOTHER or fit.match < LEAST_MATCH or fit.rest > LOST_RESIDUAL):
+    if fit.is_another:
         return Look(_UNKNOWN, clear=fit.contrast * float(fit.gain[GREEN]) > VEILED)
     if fit.misfit <= COVERED:
         return Look(gain=fit.gain, shift=shift)
-    covered: Bool = cv2.dilate(fit.wrong.view(np.uint8), np.ones((FINE, FINE), np.uint8)).view(np.bool_)
-    return Look(covered=covered, gain=fit.gain, shift=shift)
+    return Look(covered=fit.wrong, gain=fit.gain, shift=shift)
 
 
 class _Fit:
@@ -205,9 +279,10 @@ class _Fit:
     """
 
     def __init__(self, seen: F32, drawn: F32, known: Bool) -> None:
-        fair = (seen > DARK) & (seen < BRIGHT) & (drawn > DARK) & (drawn < BRIGHT) & known[..., None]
-        count = max(1, np.count_nonzero(known))
-        self.usable = np.count_nonzero(fair) / (3 * count)
+        fair = (drawn > DARK) & (drawn < BRIGHT) & known[..., None]
+        count, channels = max(1, np.count_nonzero(known)), max(1, np.count_nonzero(fair))
+        fair &= (seen > DARK) & (seen < BRIGHT)
+        self.usable = np.count_nonzero(fair) / channels
         ratios = [seen[..., k][fair[..., k]] / drawn[..., k][fair[..., k]] for k in range(3)]
         found = [float(np.median(ratio)) if len(ratio) >= FEWEST else np.nan for ratio in ratios]
         mean = float(np.nanmean(found)) if np.isfinite(found).any() else 1.0
@@ -225,10 +300,19 @@ class _Fit:
                 self.gain = unchanged
         right = known & ~self.wrong
         self.rest = float(residual[right].mean()) if right.any() else 1.0
-        a, b = (_structure(picture[..., GREEN])[fair[..., GREEN]] for picture in (seen, drawn))
+        counts, model = fair[..., GREEN], drawn[..., GREEN]
+        picture = np.where(counts, seen[..., GREEN] / self.gain[GREEN], model)  # no edges where it is clipped
+        a, b = _structure(picture)[counts], _structure(model)[counts]
         energy_a, energy_b = float(a @ a), float(b @ b)
-        self.contrast = float(np.sqrt(energy_a / max(energy_b, 1e-9))) / float(self.gain[GREEN])
+        self.contrast = float(np.sqrt(energy_a / max(energy_b, 1e-9)))
         self.match = float(a @ b) / max(np.sqrt(energy_a * energy_b), 1e-9)
+
+    @property
+    def is_another(self) -> bool:
+        """Whether they show different scenes."""
+        cast = float(self.gain.max() / self.gain.min())
+        differs = self.rest > LARGEST_REST or self.match < LEAST_MATCH or cast > LARGEST_CAST
+        return self.misfit > COVERED and (self.misfit > ANOTHER or differs)
 
     def _residual(self, seen: F32, drawn: F32, fair: Bool) -> F32:
         """[h, w] mean over the channels that can be compared, less noise."""
