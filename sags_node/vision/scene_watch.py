@@ -41,6 +41,7 @@ LEAST_MATCH = 0.3  # correlation of the structure
 LARGEST_CAST = 1.3  # of one channel's gain over another's
 VEILED, HIDDEN = 0.6, 0.15  # of the model's contrast; clear pictures have 0.9 and more
 FINE, LOCAL = 3, 15  # small px: structure is coarser than noise and finer than shading
+RIM = 5  # small px: what lies over the tissue has a soft edge, and grows
 GREEN = 1  # the channel with most of the structure, and seldom saturated
 LEAST_KEPT = 0.3  # of what is known, in view after motion
 LARGEST_GAIN = 1.5  # from one frame to the next; beyond, a picture is brought to the model's exposure
@@ -48,7 +49,7 @@ STEADY = 1.2  # of the gain before: the exposure has changed for good when it st
 FOLLOWED = 0.9  # of the gain's logarithm, per frame, is still taken out of a picture after that
 BINS = 32  # of the share of red in a colour, and of green
 NOVEL = 0.002  # of the tissue had a colour like this, or less: it is new
-STRANGE = 0.05  # of the px have new colours: clear pictures have 0.005
+STRANGE = 0.02  # of the tissue has new colours: clear pictures have 0.005
 REMEMBERED_S = 3.0  # s over which the usual colours follow
 LONGEST_NS = {"cover": 3_000_000_000, "veil": 10_000_000_000, "gain": 1_000_000_000}
 NEW_SCENE_NS = 3_000_000_000
@@ -155,7 +156,7 @@ class SceneWatch:
         if lasts >= LONGEST_NS["cover"] or not (seen.covered is not None or is_strange):
             return None
         cover: Bool = new if seen.covered is None else seen.covered | new
-        return cv2.dilate(cover.view(np.uint8), np.ones((FINE, FINE), np.uint8)).view(np.bool_)
+        return cv2.dilate(cover.view(np.uint8), np.ones((RIM, RIM), np.uint8)).view(np.bool_)
 
     def _exposure(self, gain: F32, now: int) -> F32 | None:
         """What to take out of the pictures; None: the model follows their exposure by itself."""
