@@ -24,6 +24,7 @@ from sags_node.apps.launching import (
 )
 from sags_node.apps.terminal import progress, show, writing
 from sags_node.cli_bench_depth import bench_depth
+from sags_node.cli_bench_disturbances import bench_disturbances
 from sags_node.cli_bench_masks import bench_masks
 from sags_node.cli_bench_node import (
     bench_crowd,
@@ -43,6 +44,7 @@ def bench() -> None:
 for command in (
     bench_depth,
     bench_masks,
+    bench_disturbances,
     bench_pareto,
     bench_endurance,
     bench_tracking,

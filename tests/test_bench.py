@@ -15,7 +15,7 @@ import pytest
 from click.testing import CliRunner, Result
 from engine_scenes import camera, one_gaussian
 
-from sags_node.benchmark import disturbance, kernels, peak, rasterizing
+from sags_node.benchmark import contention, kernels, peak, rasterizing
 from sags_node.benchmark.check import SECTIONS, check, compare
 from sags_node.benchmark.peak import Peak
 from sags_node.benchmark.plot import stacked_bars
@@ -153,7 +153,7 @@ def test_scenes_lie_in_the_picture(name: str) -> None:
 
 
 def test_the_busy_process_ends_with_the_measurement() -> None:
-    with pytest.raises(ZeroDivisionError), disturbance.burning_core() as process:
+    with pytest.raises(ZeroDivisionError), contention.burning_core() as process:
         assert process.poll() is None
         _ = 1 / 0
     assert process.poll() is not None

@@ -22,8 +22,8 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+from sags_node.benchmark.contention import burning_core
 from sags_node.benchmark.crowd import LOWEST_PRIORITY, everything
-from sags_node.benchmark.disturbance import burning_core
 from sags_node.errors import SagsError
 from sags_node.evaluation.measure import Options
 from sags_node.evaluation.session import measure, run_realtime

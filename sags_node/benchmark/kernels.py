@@ -8,8 +8,8 @@ from functools import partial
 from typing import Any
 
 from sags_node.benchmark.adam import measure_adam
+from sags_node.benchmark.contention import measure_contention, measure_rhythm
 from sags_node.benchmark.decoding import CONTROL_NODES, measure_decoder
-from sags_node.benchmark.disturbance import measure_contention, measure_rhythm
 from sags_node.benchmark.fields import measure_hexplane
 from sags_node.benchmark.peak import Peak, measure_peak, peak_row
 from sags_node.benchmark.pictures import measure_losses

@@ -22,7 +22,7 @@ def tables(measured: Row) -> Iterator[Table]:
     yield _stages(measured)
     yield _twins(measured)
     yield _steps(measured)
-    yield from _disturbances(measured)
+    yield from _contention(measured)
 
 
 def check_table(compared: Sequence[Compared], tolerance: float) -> Table:
@@ -155,7 +155,7 @@ def _steps(measured: Row) -> Table:
     return made
 
 
-def _disturbances(measured: Row) -> Iterator[Table]:
+def _contention(measured: Row) -> Iterator[Table]:
     """Rows whose timings are maps from p50 and p90 to ms."""
     for section in ("rhythm", "contention"):
         for row in measured.get(section, []):

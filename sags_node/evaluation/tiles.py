@@ -29,22 +29,23 @@ def depth_range(pictures: Sequence[Picture]) -> tuple[float, float]:
 def tiles(picture: Picture, near: float, far: float) -> list[U8]:
     """Input, render, depth and error of one frame, each `TILE_WIDTH` wide, RGB."""
     return [
-        _shrunk(picture.truth),
-        _shrunk(picture.render),
-        _depth_tile(picture, near, far),
+        shrunk(picture.truth),
+        shrunk(picture.render),
+        depth_tile(picture, near, far),
         _error_tile(picture),
     ]
 
 
-def _depth_tile(picture: Picture, near: float, far: float) -> U8:
-    share = 1 - (picture.depth - near) / (far - near)  # near is warm
-    tile = _shrunk(_coloured(share, cv2.COLORMAP_TURBO, picture.tissue & (picture.depth > 0)))
+def depth_tile(picture: Picture, near: float, far: float) -> U8:
+    """Depth of one frame, near is warm."""
+    share = 1 - (picture.depth - near) / (far - near)
+    tile = shrunk(_coloured(share, cv2.COLORMAP_TURBO, picture.tissue & (picture.depth > 0)))
     return _with_bar(tile, cv2.COLORMAP_TURBO, f"{far * 1e3:.0f} mm", f"{near * 1e3:.0f} mm")
 
 
 def _error_tile(picture: Picture) -> U8:
     difference = cv2.absdiff(picture.truth, picture.render).astype(np.float32).mean(-1) / 255
-    tile = _shrunk(_coloured(difference / ERROR_AT_TOP, cv2.COLORMAP_INFERNO, picture.tissue))
+    tile = shrunk(_coloured(difference / ERROR_AT_TOP, cv2.COLORMAP_INFERNO, picture.tissue))
     return _with_bar(tile, cv2.COLORMAP_INFERNO, "0", f"{ERROR_AT_TOP:.0%}")
 
 
@@ -55,10 +56,11 @@ def _coloured(share: F32, colormap: int, known: Bool) -> U8:
     return coloured
 
 
-def _shrunk(picture: U8) -> U8:
+def shrunk(picture: U8) -> U8:
+    """`TILE_WIDTH` wide."""
     height = max(1, round(picture.shape[0] * TILE_WIDTH / picture.shape[1]))
-    shrunk: U8 = cv2.resize(picture, (TILE_WIDTH, height), interpolation=cv2.INTER_AREA)
-    return shrunk
+    resized: U8 = cv2.resize(picture, (TILE_WIDTH, height), interpolation=cv2.INTER_AREA)
+    return resized
 
 
 def _with_bar(tile: U8, colormap: int, low: str, high: str) -> U8:

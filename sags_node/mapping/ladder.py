@@ -61,8 +61,8 @@ AVERAGED = 12  # frames behind the measured speed; the two slowest of them are l
 FIRST_AIM = 0.8  # of the frame's time: what the first rung may take, by a guess before the first frame
 AIM = 0.92  # of the frame's time: what a rung may take, since costs vary
 CLIMB = 0.85  # of the frame's time: what a higher rung may take before it is tried
-SETTLING = 8  # frames after a change of the rung before the next
-PATIENCE = 10  # frames in which a higher rung would have fitted before it is tried; doubled when it did not
+SETTLING = 4  # frames after a change of the rung before the next
+PATIENCE = 10  # frames times higher rungs that would have fitted before one is tried; doubled when it did not
 LONGEST_PATIENCE = 960
 FIRST_LOOKS = (4, 8, 16, 30)  # frames after which the rung may jump; later it goes by single steps
 FIRST_FRAMES = FIRST_LOOKS[-1]
@@ -87,8 +87,8 @@ class Ladder:
     """Finds the rung that fills a frame's time, by what frames take.
 
     In the first frames it jumps to where the measured speed says; then it goes down by one when frames take
-    too long, and up by one when the next rung has seemed to fit for a while. A climb that did not hold makes
-    it more patient.
+    too long, and up by one when higher rungs have seemed to fit for a while: the more of them, the sooner. A
+    climb that did not hold makes it more patient.
 
     Attributes:
         rung: of the next frame.
@@ -110,7 +110,7 @@ class Ladder:
         self._took: deque[float] = deque(maxlen=AVERAGED)  # frames, in units of their prices
         self._frames = 0
         self._since = 0  # frames since the rung changed
-        self._fitted = 0  # frames in a row in which the next rung would have fitted
+        self._fitted = 0  # higher rungs that would have fitted, over frames in a row
         self._patience = PATIENCE
         self._climbed = False  # whether the last change was up
         self.seconds = seconds
@@ -149,11 +149,10 @@ class Ladder:
                 self._patience = min(2 * self._patience, LONGEST_PATIENCE)
             self._go(self.place - 1, f"frames took {expected:.0f} of {1e3 * self.seconds:.0f} ms")
             return
-        higher = self.place + 1
-        fits = higher < len(self._rungs) and self._expected(higher) < CLIMB * 1e3 * self.seconds
-        self._fitted = self._fitted + 1 if fits else 0
+        room = self._best(CLIMB) - self.place
+        self._fitted = self._fitted + room if room > 0 else 0
         if self._fitted >= self._patience:
-            self._go(higher, f"frames took {expected:.0f} of {1e3 * self.seconds:.0f} ms")
+            self._go(self.place + 1, f"frames took {expected:.0f} of {1e3 * self.seconds:.0f} ms")
 
     def _expected(self, place: int) -> float:
         """ms that a frame takes on that rung."""
