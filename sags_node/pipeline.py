@@ -243,8 +243,8 @@ class Pipeline:
     def _held(
         self, pair: RectifiedPair, epoch: int, timings: dict[str, float], what: str, reason: str
     ) -> FrameResult:
-        """For a frame of which something (`what`) forbids to take it in: the last model, and nothing is learnt
-        from the picture."""
+        """For a frame that something (`what`) forbids to take in: the last model, and nothing is learnt from
+        the picture."""
         assert self._mapped is not None
         self._still.forget()
         held = _repeat(self._mapped, pair, epoch, timings, self.anchors.at(pair.t_capture_ns))

@@ -166,8 +166,8 @@ OF_THE_MODEL = (
 
 
 def tells_of(result: FrameResult, topic: str) -> bool:
-    """Whether a frame has something for a topic: there may have been no time to measure its depth, and nothing of
-    the model belongs to a frame that was not taken in."""
+    """Whether a frame has something for a topic: there may have been no time to measure its depth, and
+    nothing of the model belongs to a frame that was not taken in."""
     if result.held and topic in OF_THE_MODEL:
         return False
     return topic != "left/depth" or result.skipped.get("depth") != NO_TIME

@@ -13,8 +13,8 @@ from sags_node.vision.pyramid import inner
 WIDTH = 160  # px, at most, of the picture in which contrast is measured, with its border
 LOCAL = 15  # px of it: shading wider than that is no structure
 
-# Octaves. Contrast and detail of a heart's two pictures differ by half an octave and one, on other tissue by 0.1,
-# and change by 0.2 while it moves. A fogged lens takes one and a half, and all of the detail.
+# Octaves. Contrast and detail of a heart's two pictures differ by half an octave and one, on other tissue by
+# 0.1, and change by 0.2 while it moves. A fogged lens takes one and a half, and all of the detail.
 USUAL_DIFFERENCE = 0.6  # what eyes may differ by for good
 LOST_CONTRAST = 0.8  # beside what they usually differ by
 LOST_DETAIL = 1.5  # of one eye beside the other, and of both beside what they usually have

@@ -1,8 +1,8 @@
 """Whether the eyes are at one time and in one place: what the matched rows tell of it.
 
 Where tissue moves up or down, an eye that is late shows it on another row than the other eye does. Row errors
-that grow with the vertical motion are lateness; those that jump all over the picture are a knock at the scope.
-Both mean that disparities are off by as much.
+that grow with the vertical motion are lateness; those that jump all over the picture are a knock at the
+scope. Both mean that disparities are off by as much.
 """
 
 from __future__ import annotations
@@ -32,12 +32,13 @@ REMEMBERED_S = 5.0  # s over which what is usual follows: a lasting loss of matc
 
 _LATE = Finding(
     "eyes_late",
-    "one eye is late beside the other, so there is no depth: see to the capture cards and how they are paired",
+    "one eye is late beside the other, so there is no depth: see to the capture cards and how frames are "
+    "paired",
 )
 _KNOCKED = Finding(
     "eyes_knocked",
-    "rows of the eyes have moved apart, so there is no depth: the scope was knocked or turned; run sags calib "
-    "check with --session",
+    "rows of the eyes have moved apart, so there is no depth: the scope was knocked or turned; run sags "
+    "calib check with --session",
 )
 
 

@@ -1,7 +1,7 @@
 """Whether both eyes show what they should: what no stage notices by itself, because it fails quietly.
 
-Looked for in small pictures of every frame, whatever else is left out of it. An eye is compared with the other
-one and with what it showed a moment ago: a scene that gets smooth or stands still does so in both.
+Looked for in small pictures of every frame, whatever else is left out of it. An eye is compared with the
+other one and with what it showed a moment ago: a scene that gets smooth or stands still does so in both.
 """
 
 from __future__ import annotations

@@ -72,7 +72,7 @@ def inner(bordered: F32) -> F32:
 
 
 def narrowed(pyramid: GrayPyramid) -> GrayPyramid:
-    """Only its halves that are not much wider than `NARROW`: motion in them costs a quarter of a millisecond."""
+    """Only its halves that are not much wider than `NARROW`: motion in them costs little."""
     wide = [k for k, half in enumerate(pyramid.halves) if inner(half).shape[1] >= NARROW]
     return GrayPyramid(pyramid.full, pyramid.halves[max(wide, default=0) :])
 

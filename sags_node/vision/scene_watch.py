@@ -1,5 +1,5 @@
-"""Whether a picture shows the model's scene: what is too dark, too bright, veiled, covered or another scene is
-not to be learnt, and is no reason for a new model.
+"""Whether a picture shows the model's scene: what is too dark, too bright, veiled, covered or another scene
+is not to be learnt, and is no reason for a new model.
 
 Looked at in small pictures, before anything else is done with a frame. The exposure is one gain for each
 channel. A veil, as smoke is, takes contrast away all over. Blood and other cover changes some of the picture.
@@ -148,7 +148,7 @@ class SceneWatch:
         stays so long is taken for tissue."""
         assert self._tissue is not None
         new = self._palette.new(picture, self._tissue, now)
-        is_strange = np.count_nonzero(new) > STRANGE * np.count_nonzero(self._tissue)
+        is_strange = np.count_nonzero(new & self._tissue) > STRANGE * np.count_nonzero(self._tissue)
         lasts = self._lasts("cover", seen.covered is not None or is_strange, now)
         if lasts >= LONGEST_NS["cover"]:
             is_strange = False
@@ -192,7 +192,7 @@ class _Palette:
         self._stamp_ns = 0
 
     def new(self, picture: U8, tissue: Bool, now: int) -> Bool:
-        """Which pixels [h, w] of a small picture [h, w, 3] have colours that tissue did not have before."""
+        """Which pixels [h, w] of a small picture [h, w, 3] have colours that tissue has not had before."""
         red, green, blue = cv2.split(cv2.blur(picture, (FINE, FINE)).astype(np.float32))
         light = red + green + blue
         fair = (light > 3 * 255 * DARK) & (cv2.max(red, cv2.max(green, blue)) < 255 * BRIGHT)
@@ -205,7 +205,7 @@ class _Palette:
         self._share = min(1.0, max(0.0, (now - self._stamp_ns) * 1e-9) / REMEMBERED_S)
         self._stamp_ns = now
         around = cv2.boxFilter(self._usual, -1, (FINE, FINE), normalize=False)
-        self._is_new = (around.ravel()[self._colors] < NOVEL) & self._counted
+        self._is_new = (around.ravel()[self._colors] < NOVEL) & fair
         return self._is_new
 
     def take(self, except_new: bool) -> None:
