@@ -29,13 +29,11 @@ LEAST_USABLE = (
 )
 MISFIT = 0.1  # of the range of colours, mean over the channels
 STARTLING = 0.08  # of the px misfit: then motion is looked for that explains it
-COVERED = (
-    0.15  # of the px misfit: then something covers them; a beating heart stays below, motion not explained
-)
+COVERED = 0.15  # of the px misfit: then something covers them; a beating heart stays below
 ANOTHER = 0.5  # of the px misfit: then it is not the scene
-# Where much is misfit, the rest tells a cover from another scene. Tissue after a second of motion, or half under
-# blood, against other scenes and mirrored ones: residuals to 0.043 and from 0.044, correlations from 0.5 and to
-# 0.5, casts to 1.24 and from 1.2 to 2.3. Each alone overlaps.
+# Where much is misfit, the rest tells a cover from another scene. Tissue after a second of motion, or half
+# under blood, against other scenes and mirrored ones: residuals to 0.043 and from 0.044, correlations from 0.5
+# and to 0.6, casts to 1.24 and from 1.2 to 2.3. Each alone overlaps.
 LARGEST_REST = 0.045  # mean residual of what is not misfit; chance makes 0.05
 LEAST_MATCH = 0.3  # correlation of the structure
 LARGEST_CAST = 1.3  # of one channel's gain over another's
