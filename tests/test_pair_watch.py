@@ -174,7 +174,11 @@ def _fogged(picture: U8) -> U8:
 
 
 LASTING: dict[str, tuple[Callable[[StereoFrame, StereoFrame], StereoFrame], str, Verdict]] = {
-    "right fogged": (lambda f, before: replace(f, right=_fogged(_right(f))), "right_eye_fogged", Verdict("", "x")),
+    "right fogged": (
+        lambda f, before: replace(f, right=_fogged(_right(f))),
+        "right_eye_fogged",
+        Verdict("", "x"),
+    ),
     "left fogged": (lambda f, before: replace(f, left=_fogged(f.left)), "left_eye_fogged", Verdict("x", "x")),
     "right frozen": (lambda f, before: replace(f, right=before.right), "right_eye_frozen", Verdict("", "x")),
     "left frozen": (lambda f, before: replace(f, left=before.left), "left_eye_frozen", Verdict("x", "x")),
@@ -205,7 +209,7 @@ def test_an_eye_is_compared_with_the_other_and_with_a_moment_ago(
         if 11 <= number < 20:  # the first may be taken for the other eye's fault
             assert bool(verdict.left) == bool(expected.left) and bool(verdict.right) == bool(expected.right)
             assert verdict.learn == expected.learn
-        elif number != 10 and number != 20:
+        elif number not in (10, 20):
             assert verdict == Verdict()
         assert codes == ([code] if 14 <= number < 20 else codes)
         if number < 10 or number >= 24:

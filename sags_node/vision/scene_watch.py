@@ -32,8 +32,8 @@ STARTLING = 0.08  # of the px misfit: then motion is looked for that explains it
 COVERED = 0.15  # of the px misfit: then something covers them; a beating heart stays below
 ANOTHER = 0.5  # of the px misfit: then it is not the scene
 # Where much is misfit, the rest tells a cover from another scene. Tissue after a second of motion, or half
-# under blood, against other scenes and mirrored ones: residuals to 0.043 and from 0.044, correlations from 0.5
-# and to 0.6, casts to 1.24 and from 1.2 to 2.3. Each alone overlaps.
+# under blood, against other scenes and mirrored ones: residuals to 0.043 and from 0.044, correlations from
+# 0.5 and to 0.6, casts to 1.24 and from 1.2 to 2.3. Each alone overlaps.
 LARGEST_REST = 0.045  # mean residual of what is not misfit; chance makes 0.05
 LEAST_MATCH = 0.3  # correlation of the structure
 LARGEST_CAST = 1.3  # of one channel's gain over another's
@@ -279,22 +279,24 @@ class _Fit:
 
     def __init__(self, seen: F32, drawn: F32, known: Bool) -> None:
         fair = (drawn > DARK) & (drawn < BRIGHT) & known[..., None]
-        count, channels = max(1, np.count_nonzero(known)), max(1, np.count_nonzero(fair))
+        count: int = max(1, int(np.count_nonzero(known)))
+        channels: int = max(1, int(np.count_nonzero(fair)))
         fair &= (seen > DARK) & (seen < BRIGHT)
-        self.usable = np.count_nonzero(fair) / channels
+        self.usable = float(np.count_nonzero(fair)) / channels
         ratios = [seen[..., k][fair[..., k]] / drawn[..., k][fair[..., k]] for k in range(3)]
         found = [float(np.median(ratio)) if len(ratio) >= FEWEST else np.nan for ratio in ratios]
         mean = float(np.nanmean(found)) if np.isfinite(found).any() else 1.0
         self.gain: F32 = np.where(np.isfinite(found), found, mean).astype(np.float32)
         residual = self._residual(seen, drawn, fair)
         self.wrong: Bool = (residual > MISFIT) & known
-        self.misfit = np.count_nonzero(self.wrong) / count
+        self.misfit = float(np.count_nonzero(self.wrong)) / count
         if self.misfit > COVERED:  # most may be covered, and the exposure what it was
             unchanged, self.gain = self.gain, np.ones(3, np.float32)
             other = self._residual(seen, drawn, fair)
             wrong = (other > MISFIT) & known
             if np.count_nonzero(wrong) < np.count_nonzero(self.wrong):
-                residual, self.wrong, self.misfit = other, wrong, np.count_nonzero(wrong) / count
+                residual, self.wrong = other, wrong
+                self.misfit = float(np.count_nonzero(wrong)) / count
             else:
                 self.gain = unchanged
         right = known & ~self.wrong
