@@ -114,7 +114,7 @@ class PairWatch:
 
     def _frozen(self, left: F32, right: F32) -> str:
         """Which eye shows what it showed before, while the other has moved since; empty: none."""
-        pictures = left[::2, ::2], right[::2, ::2]
+        pictures = left[::4, ::4].copy(), right[::4, ::4].copy()
         frozen = ""
         for before in reversed(self._history):
             changes = [float(np.abs(now - then).mean()) for now, then in zip(pictures, before, strict=True)]

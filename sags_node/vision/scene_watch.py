@@ -38,6 +38,7 @@ LARGEST_REST = 0.045  # mean residual of what is not misfit; chance makes 0.05
 LEAST_MATCH = 0.3  # correlation of the structure
 LARGEST_CAST = 1.3  # of one channel's gain over another's
 VEILED, HIDDEN = 0.6, 0.15  # of the model's contrast; clear pictures have 0.9 and more
+SOME = 3  # every so many px tell the exposure
 FINE, LOCAL = 3, 15  # small px: structure is coarser than noise and finer than shading
 RIM = 5  # small px: what lies over the tissue has a soft edge, and grows
 GREEN = 1  # the channel with most of the structure, and seldom saturated
@@ -146,7 +147,7 @@ class SceneWatch:
         stays so long is taken for tissue."""
         assert self._tissue is not None
         new = self._palette.new(picture, self._tissue, now)
-        is_strange = np.count_nonzero(new & self._tissue) > STRANGE * np.count_nonzero(self._tissue)
+        is_strange = bool(np.count_nonzero(new & self._tissue) > STRANGE * np.count_nonzero(self._tissue))
         lasts = self._lasts("cover", seen.covered is not None or is_strange, now)
         if lasts >= LONGEST_NS["cover"]:
             is_strange = False
@@ -154,7 +155,8 @@ class SceneWatch:
         if lasts >= LONGEST_NS["cover"] or not (seen.covered is not None or is_strange):
             return None
         cover: Bool = new if seen.covered is None else seen.covered | new
-        return cv2.dilate(cover.view(np.uint8), np.ones((RIM, RIM), np.uint8)).view(np.bool_)
+        grown: U8 = cv2.dilate(cover.view(np.uint8), np.ones((RIM, RIM), np.uint8))
+        return grown.view(np.bool_)
 
     def _exposure(self, gain: F32, now: int) -> F32 | None:
         """What to take out of the pictures; None: the model follows their exposure by itself."""
@@ -283,7 +285,8 @@ class _Fit:
         channels: int = max(1, int(np.count_nonzero(fair)))
         fair &= (seen > DARK) & (seen < BRIGHT)
         self.usable = float(np.count_nonzero(fair)) / channels
-        ratios = [seen[..., k][fair[..., k]] / drawn[..., k][fair[..., k]] for k in range(3)]
+        some = [(picture[..., k][fair[..., k]][::SOME] for picture in (seen, drawn)) for k in range(3)]
+        ratios = [a / b for a, b in some]
         found = [float(np.median(ratio)) if len(ratio) >= FEWEST else np.nan for ratio in ratios]
         mean = float(np.nanmean(found)) if np.isfinite(found).any() else 1.0
         self.gain: F32 = np.where(np.isfinite(found), found, mean).astype(np.float32)
@@ -318,7 +321,13 @@ class _Fit:
     def _residual(self, seen: F32, drawn: F32, fair: Bool) -> F32:
         """[h, w] mean over the channels that can be compared, less noise."""
         difference = cv2.blur(np.where(fair, seen / self.gain - drawn, np.float32(0)), (FINE, FINE))
-        mean: F32 = np.abs(difference).sum(-1) / np.maximum(fair.sum(-1), 1)
+        total, count = (
+            planes[..., 0]
+            + planes[..., 1]
+            + planes[..., 2]  # five times as fast as a sum over an axis of three
+            for planes in (np.abs(difference), fair.view(np.uint8))
+        )
+        mean: F32 = np.divide(total, np.maximum(count, 1), dtype=np.float32)
         return mean
 
 
