@@ -55,7 +55,7 @@ FAULTS: dict[str, tuple[Spoil, str]] = {
     "eyes_exchanged": (lambda f, i: replace(f, left=f.right, right=f.left), "picture"),
     "eyes_equal": (lambda f, i: replace(f, right=f.left), "depth"),
     "picture_unknown_scene": (lambda f, i: both(f, lambda p: 255 - p[::-1]), "picture"),
-    "picture_bright": (lambda f, i: both(f, lambda p: p * 1.5 + 200.0), "picture"),
+    "picture_bright": (lambda f, i: both(f, lambda p: p * 4.0), "picture"),
     "picture_smoke": (lambda f, i: both(f, lambda p: p * 0.3 + 120.0), ""),
     "picture_covered": (lambda f, i: both(f, bleeding), ""),
     "": (lambda f, i: both(f, lambda p: p * (3.0 if i % 2 else 1 / 3)), ""),  # flicker is no event

@@ -111,6 +111,7 @@ class SceneWatch:
     def forget(self) -> None:
         """There is a new model."""
         self._since.clear()
+        self._palette = _Palette()
         self._tissue = None
         self._gain = self._taken_out = np.ones(3, np.float32)
 
