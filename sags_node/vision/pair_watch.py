@@ -139,7 +139,7 @@ def _small(image: U8) -> Small:
 
 
 def _emptiness(rgb: F32) -> str:
-    """Black, white or of one colour in the middle, where every scope shows something; empty: none of them."""
+    """Black, white or plain (of one colour) in the middle, where every scope shows something; empty: none of them."""
     height, width = rgb.shape[:2]
     middle = rgb[height // 4 : height - height // 4, width // 4 : width - width // 4].reshape(-1, 3)
     outliers = round(OUTLIERS * len(middle))
@@ -149,7 +149,7 @@ def _emptiness(rgb: F32) -> str:
         return "black"
     if dark.min() > WHITE:
         return "white"
-    return "of one colour" if (bright - dark).max() < ONE_COLOR else ""
+    return "plain" if (bright - dark).max() < ONE_COLOR else ""
 
 
 def _are_equal(left: F32, right: F32) -> bool:
