@@ -139,7 +139,7 @@ def _small(image: U8) -> Small:
 
 
 def _emptiness(rgb: F32) -> str:
-    """Black, white or plain (of one colour) in the middle, where every scope shows something; empty: none of them."""
+    """Black, white or plain, of one colour, in the middle, where every scope shows something; else empty."""
     height, width = rgb.shape[:2]
     middle = rgb[height // 4 : height - height // 4, width // 4 : width - width // 4].reshape(-1, 3)
     outliers = round(OUTLIERS * len(middle))
