@@ -25,7 +25,7 @@ STAGES: Mapping[str, str] = {  # code -> which stage of the work it is about
     "tissue_too_near": "depth",
     "picture_dark": "picture",
     "picture_bright": "picture",
-    "picture_blood": "picture",
+    "picture_covered": "picture",
     "picture_smoke": "picture",
     "picture_blurred": "picture",
     "picture_unknown_scene": "picture",

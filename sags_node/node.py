@@ -220,7 +220,7 @@ class Node:
                 result = self._pipeline.process(frame, self._budget, waited)
                 give(result)
                 dropped, before = self._frames.dropped, dropped
-                if not result.camera_lost:
+                if not result.held:
                     self._scenes.put((result, dropped > before))
         self._mapping_requests.serve()
 

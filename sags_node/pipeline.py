@@ -32,10 +32,13 @@ from sags_node.types import (
     StereoRig,
 )
 from sags_node.vision.change import StillScene, rms_difference
+from sags_node.vision.match_watch import MatchWatch
 from sags_node.vision.observe import observe
 from sags_node.vision.onnx_depth import NetworkDepth
 from sags_node.vision.pair_watch import PairWatch
+from sags_node.vision.pyramid import pyramids
 from sags_node.vision.rectify import Rectifier
+from sags_node.vision.scene_watch import Advice, SceneWatch, enlarged, exposed
 from sags_node.vision.stereo import StereoDepth
 from sags_node.vision.tissue import TissueMask
 from sags_node.vision.tissue_topic import NearestMask
@@ -84,11 +87,15 @@ class Pipeline:
         self.anchors = Anchors()
         self._still = StillScene()
         self._eyes = PairWatch()
+        self._matches = MatchWatch()
+        self._scene = SceneWatch()
+        self._unmatched = ""  # why what was measured last is no depth; empty: it is
         self._mapped: FrameResult | None = None  # the last frame that was really mapped
 
     def reset(self) -> None:
         """Forget the model; the next frame makes a new one, in a new epoch."""
         self.mapper.restart()
+        self._scene.forget()
         self._still.forget()
         self._mapped = None
 
@@ -100,7 +107,8 @@ class Pipeline:
     @property
     def warnings(self) -> Findings:
         """What is wrong and how to mend it. May be read from any thread."""
-        found = [*self._eyes.findings, *self.stereo.findings]
+        watches = self._eyes, self._matches, self._scene, self.stereo
+        found = [finding for watch in watches for finding in watch.findings]
         lost = None if self._tracker is None else self._tracker.lost
         if lost is not None:
             back = "bring the scope back to tissue that it saw before"
@@ -131,41 +139,67 @@ class Pipeline:
         watch = Stopwatch()
         with watch("rectify"):
             pair = self._placed(frame)
-        self._eyes(frame, pair)
+        verdict = self._eyes(frame, pair)
         self._on_rectified(pair, self._epoch(frame))
         if self._mapped is not None and self._config.mapping.skip_duplicates:
             if rms_difference(pair, self._mapped.pair) < DUPLICATE_RMS:
                 anchors = self.anchors.at(pair.t_capture_ns)
                 return _repeat(self._mapped, pair, self._epoch(frame), watch.timings_ms, anchors)
+        advice = Advice()
+        if self._mapped is not None and verdict.left:
+            advice = Advice(verdict.left)
+        elif self._mapped is not None:
+            with watch("watch"):
+                advice = self._scene(pair, self._mapped, not verdict.learn)
+        if advice.is_new:
+            self.reset()
+        elif advice.held:
+            held = self._held(pair, self._epoch(frame), watch.timings_ms, "picture", advice.held)
+            return replace(held, observation=_unseen(pair))
+        seen = pair if advice.gain is None else exposed(pair, advice.gain)
         still = self._still_frames(pair)
         skipped: dict[str, str] = {}
         with watch("mask"):
             drawn = None if self._mapped is None else self._mapped.views["left"]
-            tissue = self.tissue(frame, pair, drawn)
+            tissue = self.tissue(frame, seen, drawn)
+            if advice.covered is not None:
+                tissue = tissue & ~enlarged(advice.covered, tissue.shape)
             if self.tissue.problem:
                 skipped["mask"] = self.tissue.problem
         with watch("depth"):
             known = self._mapped.observation if still and self._mapped is not None else None
             if known is not None and known.depth.any():
                 depth, confidence = known.depth * tissue, known.depth_confidence * tissue
+                self.stereo.rows.stay()
                 skipped |= dict.fromkeys(("depth", "motion"), "nothing moves")
             elif self._lacks_time_for_depth(frame, budget):
                 depth, confidence = np.zeros((2, *tissue.shape), np.float32)
                 skipped["depth"] = NO_TIME
             else:
-                depth, confidence = self.depth(frame, pair, tissue)
+                self._unmatched = ""
+                unpaired = verdict.right if frame.depth is None and pair.right is not None else ""
+                if not unpaired:
+                    depth, confidence = self.depth(frame, seen, tissue)
+                if unpaired or self._unmatched:
+                    depth, confidence = np.zeros((2, *tissue.shape), np.float32)
+                    skipped["depth"] = unpaired or self._unmatched
                 if self._network is not None and self._network.problem:
                     skipped["network"] = self._network.problem
-            observation = observe(pair, tissue, depth, confidence, self._config.mapping.right_eye)
+            observation = observe(seen, tissue, depth, confidence, self._config.mapping.right_eye)
+        if any(advice.shift):
+            self.mapper.found_again(observation, advice.shift)
         if self._tracker is not None and not still:
             with watch("pose"):
                 tracked = self._tracker.track(observation)
                 camera = replace(pair.camera, T_world_cam=self._tracker.pose)
                 pair, observation = replace(pair, camera=camera), replace(observation, camera=camera)
-            if not tracked and self._mapped is not None:
-                return self._held(self._mapped, pair, observation, self._epoch(frame), watch.timings_ms)
+            lost = self._tracker.lost
+            if not tracked and lost is not None and self._mapped is not None:
+                held = self._held(pair, self._epoch(frame), watch.timings_ms, "pose", lost)
+                return replace(held, observation=observation)
         with watch("map"):
-            mapped = self.mapper.update(observation, budget, still)
+            learn = advice.learn and verdict.learn
+            mapped = self.mapper.update(observation, budget, still, learn)
             snapshot = mapped.snapshot
             if self._tracker is not None:
                 self._tracker.mapped(observation, mapped.view)
@@ -199,18 +233,14 @@ class Pipeline:
         return self._still(pair)
 
     def _held(
-        self,
-        mapped: FrameResult,
-        pair: RectifiedPair,
-        observation: Observation,
-        epoch: int,
-        timings: dict[str, float],
+        self, pair: RectifiedPair, epoch: int, timings: dict[str, float], what: str, reason: str
     ) -> FrameResult:
-        """While the camera is lost: the last model, and nothing is learnt from the picture."""
-        assert self._tracker is not None and self._tracker.lost is not None
+        """For a frame that something (`what`) forbids to take in: the last model, and nothing is learnt from
+        the picture."""
+        assert self._mapped is not None
         self._still.forget()
-        held = _repeat(mapped, pair, epoch, timings, self.anchors.at(pair.t_capture_ns))
-        return replace(held, observation=observation, skipped={"pose": self._tracker.lost})
+        held = _repeat(self._mapped, pair, epoch, timings, self.anchors.at(pair.t_capture_ns))
+        return replace(held, skipped={what: reason})
 
     def _lacks_time_for_depth(self, frame: StereoFrame, budget: Budget) -> bool:
         costs = frame.depth is None or self._network is not None
@@ -238,7 +268,10 @@ class Pipeline:
             return np.where(known, given, np.float32(0)), known.astype(np.float32)
         if pair.right is None:
             return np.zeros(tissue.shape, np.float32), np.zeros(tissue.shape, np.float32)
-        return self.stereo(pair, tissue)
+        measured = self.stereo(pair, tissue)
+        if self.stereo.rows.newest is not None:
+            self._unmatched = self._matches(pair.t_capture_ns, pyramids(pair)[0], self.stereo.rows.newest)
+        return measured
 
     def _epoch(self, frame: StereoFrame) -> int:
         """Grows with the source's epochs and with every new model: ids then mean other Gaussians."""
@@ -274,6 +307,13 @@ class Stopwatch:
 def _restamped(views: Mapping[str, RenderedView], frame_id: int, stamp: int) -> dict[str, RenderedView]:
     """Pictures of what has not changed since."""
     return {eye: replace(view, frame_id=frame_id, t_capture_ns=stamp) for eye, view in views.items()}
+
+
+def _unseen(pair: RectifiedPair) -> Observation:
+    """Of a picture of which nothing may be used."""
+    shape = pair.left.shape[:2]
+    nothing = np.zeros(shape, np.float32)
+    return observe(pair, np.zeros(shape, np.bool_), nothing, nothing)
 
 
 def _repeat(

@@ -215,7 +215,7 @@ class RenderedView:
     rgb: F32  # [H, W, 3] 0..1, normalised by coverage
     depth: F32  # [H, W] m along z, 0 where the model says nothing, or nothing sure enough
     alpha: F32  # [H, W] coverage 0..1
-    confidence: F32 | None = None  # [H, W] 0..1 of the depth, see `engine.confidence`; None: unknown
+    confidence: F32 | None = None  # [H, W] 0..1 of the depth, see `sags_node.confidence`; None: unknown
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,7 +228,7 @@ class AnchorStates:
     visibility: F32  # [A] 0..1, seen by the left eye: neither behind an instrument nor behind other tissue
     confidence: F32  # [A] 0..1; falls while the anchor is not seen, 0: lost
     ages: F32  # [A] s since it was pinned
-    depth_confidence: F32  # [A] 0..1, of the tissue that carries it, see `engine.confidence`
+    depth_confidence: F32  # [A] 0..1, of the tissue that carries it, see `sags_node.confidence`
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -278,9 +278,9 @@ class FrameResult:
     rung: RungState | None = None  # None: fixed steps, no ladder
 
     @property
-    def camera_lost(self) -> bool:
-        """Whether nobody knows from where the picture was taken: the model is that of an older frame."""
-        return "pose" in self.skipped
+    def held(self) -> str:
+        """Why the frame was not taken in, so that the model is that of an older one; empty: it was."""
+        return self.skipped.get("pose", "") or self.skipped.get("picture", "")
 
 
 @dataclass(frozen=True, slots=True)

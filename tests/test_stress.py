@@ -120,10 +120,12 @@ def test_a_cut_begins_a_new_model_in_a_new_epoch(session: Session, frames: list[
     negative = [replace(f, left=255 - f.left, right=255 - f.right) for f in frames]
     pipeline = Pipeline(session.config, session.rig)
     before = play(pipeline, frames[:4])[-1]
-    after = play(pipeline, negative[4:6])
-    assert after[0].epoch == before.epoch + 1
-    assert psnr(after[0]) > 30
-    assert before.snapshot.gaussians.ids.max() < after[0].snapshot.gaussians.ids.min()
+    during = play(pipeline, [negative[4]] * 30)  # three seconds
+    assert {result.epoch for result in during} == {before.epoch} and all(result.held for result in during)
+    after = play(pipeline, negative[5:7])[-1]
+    assert after.epoch == before.epoch + 1 and not after.held
+    assert psnr(after) > 30
+    assert before.snapshot.gaussians.ids.max() < after.snapshot.gaussians.ids.min()
 
 
 def test_motion_alone_never_restarts_the_model(session: Session, frames: list[StereoFrame]) -> None:

@@ -35,7 +35,6 @@ SETTLED = 10  # frames: a model that has not changed for so long has little more
 SETTLED_EVERY = 5  # frames: then it is refined so rarely
 FOCUS = 0.15  # of the picture; measured: half the gain of a whole step in a quarter of its time
 MIN_FIRST_DEPTHS = 200  # px
-LOST_RESIDUAL = 0.08  # mean over RGB and tissue, 0..1; a beating heart stays below half of it
 LOST_COVERAGE = 0.3  # of the tissue
 FIRST_RATES = Rates().scaled(4.0)
 UNHURRIED_RATES = 0.6  # measured with six steps: +0.3 dB; with one step a frame it loses as much
@@ -101,11 +100,12 @@ class Mapper:
         self._frames_to_depth = 0  # since depth was known last
         self._metres_per_px = 0.0  # at the tissue's median depth
 
-    def update(self, observation: Observation, budget: Budget, still: int = 0) -> Mapped:
+    def update(self, observation: Observation, budget: Budget, still: int = 0, learn: bool = True) -> Mapped:
         """Take one frame in.
 
         Args:
             still: for how many frames, this one included, nothing has moved.
+            learn: else the model only follows the motion: the picture's colours are not the tissue's.
         """
         self._frames += 1
         before, self._scale = self._scale, budget.rung.scale
@@ -115,6 +115,8 @@ class Mapper:
             self._metres_per_px = float(np.median(known)) / observation.camera.K[0, 0]
         if self._deformation is None:
             counts = self._initialise(observation, budget)
+        elif not learn:
+            counts = self._follow_only(observation)
         elif still and self._scale == before:
             counts = self._touch_up(observation, budget, settled=still > SETTLED)
         else:
@@ -133,6 +135,8 @@ class Mapper:
         drawn = Drawn(observation, self._view)
         if not still or self._last is None:  # a still frame is passed over: slow motion adds up until seen
             self.start_from(drawn)
+            if not learn:
+                return Mapped(snapshot, drawn.view)
             room = self._limit(budget) - self.model.count
             if room > HOLES:  # else what hardly shows is needed to fill holes
                 grown = round(GROWN * self._limit(budget)) - self.model.count
@@ -151,14 +155,18 @@ class Mapper:
         self._last = None
         self.restarts += 1
 
-    def found_again(self, observation: Observation) -> F32:
+    def found_again(self, observation: Observation, shift: tuple[float, float] = (0.0, 0.0)) -> F32:
         """Pixels [N, 2] where the Gaussians are found in a frame that is not taken in yet, see
-        `motion.found_again`; all NaN where there is no frame before."""
+        `motion.found_again`; all NaN where there is no frame before.
+
+        Args:
+            shift: px right and down, from where to search.
+        """
         if self._found is None or self._found[0] is not observation.gray:
             pixels = np.full((self.model.count, 2), np.float32(np.nan))
             if self._last is not None:
                 before = self._last.observation
-                flow = self._flow(pyramid_of(before), pyramid_of(observation))
+                flow = self._flow(pyramid_of(before), pyramid_of(observation), shift)
                 pixels = found_again(
                     self.model.means, self._last.view, before.tissue, flow, observation.tissue
                 )
@@ -240,6 +248,14 @@ class Mapper:
         self._show(observation, budget.rung.redraw, tiles_of(pixels, drawn.tissue))
         self.step += iterations
         return {"inserted": rows.stop - rows.start, "removed": removed, "iterations": iterations}
+
+    def _follow_only(self, observation: Observation) -> dict[str, int]:
+        self._predict(observation)
+        drawn = resized(observation, self._scale)
+        self._begin(drawn)
+        self._show(observation, 1.0, tile_grid(drawn.tissue))
+        self._refiner.give_back()
+        return {"inserted": 0, "removed": 0, "iterations": 0}
 
     def _touch_up(self, observation: Observation, budget: Budget, settled: bool) -> dict[str, int]:
         """Nothing moved: what was drawn last shows where steps pay, and only there the picture changes."""
@@ -324,16 +340,9 @@ class Mapper:
 
 
 def _is_lost(planes: F32, observation: Observation) -> bool:
-    """Whether the model, moved to this frame, shows another scene: after a cut, a blackout or damage. Looking
-    at every eighth pixel is enough."""
+    """Whether the model, moved to this frame, hardly covers it: after damage, or where the camera is known to
+    be in another place. Looking at every eighth pixel is enough. What the picture shows is judged before, see
+    `vision.scene_watch`."""
     tissue = observation.tissue[::8, ::8]
-    alpha = planes[4, ::8, ::8]
-    covered = tissue & (alpha > densify.HOLE_ALPHA)
-    tissue_pixels, covered_pixels = np.count_nonzero(tissue), np.count_nonzero(covered)
-    if tissue_pixels == 0:
-        return False  # all is instrument: nothing to judge by
-    if covered_pixels < LOST_COVERAGE * tissue_pixels:
-        return True
-    drawn = planes[:3, ::8, ::8][:, covered] / alpha[covered]
-    residual = np.abs(drawn - observation.image[::8, ::8][covered].T).mean()
-    return bool(residual > LOST_RESIDUAL)
+    covered = tissue & (planes[4, ::8, ::8] > densify.HOLE_ALPHA)
+    return bool(np.count_nonzero(covered) < LOST_COVERAGE * np.count_nonzero(tissue))

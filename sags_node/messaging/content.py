@@ -189,9 +189,9 @@ OF_THE_MODEL = (
 
 
 def tells_of(result: FrameResult, topic: str) -> bool:
-    """Whether a frame has something for a topic: there may have been no time to measure its depth, and while
-    the camera is lost nothing of the model belongs to the frame."""
-    if result.camera_lost and topic in OF_THE_MODEL:
+    """Whether a frame has something for a topic: there may have been no time to measure its depth, and
+    nothing of the model belongs to a frame that was not taken in."""
+    if result.held and topic in OF_THE_MODEL:
         return False
     if topic == "left/render/depth_confidence" and result.views["left"].confidence is None:
         return False

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,16 +30,25 @@ class Alignment:
     warning: str  # empty: they agree
 
 
+class RowErrors(NamedTuple):
+    """Some row errors of one frame, evenly over its picture."""
+
+    errors: F32  # [h, w] px of the working size
+    matched: Bool  # [h, w]
+
+
 class RowMonitor:
     """A slow, robust look at the row errors that `InverseSearch` finds anyway.
 
     Attributes:
         alignment: None before enough was seen. May be read from any thread.
+        newest: of the last field.
     """
 
     def __init__(self, width: int) -> None:
         """`width`: of the working size, px."""
         self.alignment: Alignment | None = None
+        self.newest: RowErrors | None = None
         self._width = width
         self._medians: deque[float] = deque(maxlen=WINDOW)
         self._spreads: deque[float] = deque(maxlen=WINDOW)
@@ -52,17 +62,26 @@ class RowMonitor:
             known: where it matched.
         """
         step = -(-row_error.shape[1] // SAMPLES)
-        scale = self._width / width
+        scale = np.float32(self._width / width)
         errors, matched = (
-            row_error[step // 2 :: step, step // 2 :: step],
+            scale * row_error[step // 2 :: step, step // 2 :: step],
             known[step // 2 :: step, step // 2 :: step],
         )
+        self.newest = RowErrors(errors, matched)
         # Errors beyond what can be matched stand at the limit, unmatched: the median must see them.
         every = np.sort(errors, axis=None)
-        self._medians.append(scale * float(every[every.size // 2]))
+        self._medians.append(float(every[every.size // 2]))
         some = np.sort(errors[matched])
         if some.size >= FEWEST_KNOWN * every.size:
-            self._spreads.append(scale * float(some[9 * some.size // 10] - some[some.size // 10]))
+            self._spreads.append(float(some[9 * some.size // 10] - some[some.size // 10]))
+        if len(self._medians) >= FEWEST_FIELDS:
+            self.alignment = self._judge()
+
+    def stay(self) -> None:
+        """Take a frame in which nothing has moved: its rows are those of the last field."""
+        for values in (self._medians, self._spreads):
+            if values:
+                values.append(values[-1])
         if len(self._medians) >= FEWEST_FIELDS:
             self.alignment = self._judge()
 

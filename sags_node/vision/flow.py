@@ -19,9 +19,16 @@ class OpticalFlow:
         """`stride`: px between patches in the pictures of half the size, at most 8."""
         self._stride = stride
 
-    def __call__(self, before: GrayPyramid, after: GrayPyramid) -> F32:
-        """Flow [H // 2, W // 2, 2], in px of the whole pictures, from `before` to `after`."""
-        field, stride = np.zeros((1, 1, 2), np.float32), COARSE_STRIDE
+    def __call__(
+        self, before: GrayPyramid, after: GrayPyramid, shift: tuple[float, float] = (0.0, 0.0)
+    ) -> F32:
+        """Flow [H // 2, W // 2, 2], in px of the whole pictures, from `before` to `after`.
+
+        Args:
+            shift: px right and down, from where to search.
+        """
+        field = np.array([[shift]], np.float32) / np.float32(2 ** (len(before.halves) + 1))
+        stride = COARSE_STRIDE
         for k in reversed(range(len(before.halves))):
             first, second = before.halves[k], after.halves[k]
             coarse, stride = stride, self._stride if k == 0 else COARSE_STRIDE

@@ -1,21 +1,22 @@
 """Whether both eyes show what they should: what no stage notices by itself, because it fails quietly.
 
-A picture without content, one eye fed to both inputs, and exchanged eyes. Looked for in small pictures, a few
-times a second, whatever else is left out of a frame.
+Looked for in small pictures of every frame, whatever else is left out of it. An eye is compared with the
+other one and with what it showed a moment ago: a scene that gets smooth or stands still does so in both.
 """
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import deque
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
 from sags_node.types import F32, U8, Finding, RectifiedPair, StereoFrame
+from sags_node.vision.clarity import LENS, SMOKE, Clarity, small_level
+from sags_node.vision.pyramid import pyramids
+from sags_node.vision.standing import Standing
 
-PERIOD_NS = 150_000_000  # between two looks
-LOOKS, NEEDED = 5, 4  # so many of the last looks must find the same
 WIDTH = 80  # px of the small pictures
 BLACK = 20.0  # grey levels; video that keeps its black at 16 too
 WHITE = 235.0  # and its white at 235
@@ -25,12 +26,36 @@ EQUAL = 0.5  # of what a shift by one small pixel makes; true pairs 1 to 5
 LOCAL = 15  # small px: shading wider than that is no structure
 LEAST_MATCH = 0.35  # correlation; nothing matches below
 CLEARLY_BETTER = 0.2  # of a match the wrong way round, against the best the right way round
-_CODES = {"black": "black", "white": "white", "of one colour": "plain"}
-_MENDS = {
-    "black": "see to the light, the lens cap and the cable",
-    "white": "lower the light or the exposure",
-    "of one colour": "see to the lens, the cable and the capture card",
+
+HISTORY = 12  # frames among which an eye is looked at for standing still
+MOVED = 1.0  # grey levels, mean: the other eye has moved for sure
+UNMOVED = 1 / 8  # of what changes in the other eye; clear pairs change alike to 1/2, fog leaves 1/4
+
+_TEXTS = {
+    "black": "the {eye} picture is black: see to the light, the lens cap and the cable",
+    "white": "the {eye} picture is white: lower the light or the exposure",
+    "plain": "the {eye} picture is of one colour: see to the lens, the cable and the capture card",
+    "fogged": f"the {{eye}} picture is fogged or out of focus beside the other: {LENS}",
+    "frozen": "the {eye} picture stands still while the other moves: see to its cable and capture card",
 }
+_EQUAL = Finding("eyes_equal", "both eyes show the same picture, so there is no depth: connect the other eye")
+_EXCHANGED = Finding(
+    "eyes_exchanged",
+    "left and right seem to be exchanged: swap source.left and source.right, or LR and RL",
+)
+_UNCLEAR = {
+    "": [],
+    "blurred": [Finding("picture_blurred", f"the picture is blurred, and is not learnt: {LENS}")],
+    "veiled": [SMOKE],
+}
+
+
+class Verdict(NamedTuple):
+    """What of one frame may be used."""
+
+    left: str = ""  # why its left picture may not; empty: it may
+    right: str = ""  # why there may be no stereo
+    learn: bool = True  # else what it shows may be followed, and not learnt
 
 
 class Small(NamedTuple):
@@ -41,51 +66,68 @@ class Small(NamedTuple):
 
 
 class PairWatch:
-    """Looks at the pairs of a source.
-
-    Attributes:
-        findings: what is wrong with the eyes, and how to mend it. May be read from any thread.
-    """
+    """Looks at every pair of a source."""
 
     def __init__(self) -> None:
-        self.findings: tuple[Finding, ...] = ()
-        self._looked_ns: int | None = None
-        self._found: deque[list[Finding]] = deque(maxlen=LOOKS)
+        self._standing = Standing()
+        self._clarity = Clarity()
+        self._history: deque[tuple[F32, F32]] = deque(maxlen=HISTORY)
 
-    def __call__(self, frame: StereoFrame, pair: RectifiedPair) -> None:
-        """Take one frame, raw and rectified; most of them are let pass unseen."""
-        now = frame.t_capture_ns
-        if self._looked_ns is not None and 0 <= now - self._looked_ns < PERIOD_NS:
-            return
-        self._looked_ns = now
-        self._found.append(_look(frame, pair))
-        often = Counter(finding for findings in self._found for finding in findings)
-        self.findings = tuple(finding for finding, count in often.items() if count >= NEEDED)
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What is wrong with the eyes, and how to mend it. May be read from any thread."""
+        return self._standing.findings
+
+    def __call__(self, frame: StereoFrame, pair: RectifiedPair) -> Verdict:
+        """Take one frame, raw and rectified."""
+        found = self._look(frame, pair)
+        self._standing.update(frame.t_capture_ns, found)
+        left = right = ""
+        for code, text in found:
+            if code.startswith("left") or code == _EXCHANGED.code:
+                left = left or text
+            if not code.startswith("picture"):
+                right = right or text
+        return Verdict(left, right, not any(code.startswith("picture") for code, _ in found))
+
+    def _look(self, frame: StereoFrame, pair: RectifiedPair) -> list[Finding]:
+        """What is wrong in one frame."""
+        eyes = {"left": _small(frame.left)}
+        if frame.right is not None:
+            eyes["right"] = _small(frame.right)
+        empty = [_finding(name, kind) for name, eye in eyes.items() if (kind := _emptiness(eye.rgb))]
+        if empty:
+            self._history.clear()
+            return empty
+        left, right = pyramids(pair)
+        if frame.right is None or right is None:
+            return _UNCLEAR[self._clarity(frame.t_capture_ns, left, None).all]
+        if _are_equal(eyes["left"].gray, eyes["right"].gray):
+            return [_EQUAL]
+        if _are_exchanged(small_level(left), small_level(right)):
+            return [_EXCHANGED]
+        frozen = self._frozen(eyes["left"].gray, eyes["right"].gray)
+        unclear = self._clarity(frame.t_capture_ns, left, right)
+        if unclear.eye:
+            return [_finding(unclear.eye, "fogged")]
+        return [_finding(frozen, "frozen")] if frozen else _UNCLEAR[unclear.all]
+
+    def _frozen(self, left: F32, right: F32) -> str:
+        """Which eye shows what it showed before, while the other has moved since; empty: none."""
+        pictures = left[::4, ::4].copy(), right[::4, ::4].copy()
+        frozen = ""
+        for before in reversed(self._history):
+            changes = [float(np.abs(now - then).mean()) for now, then in zip(pictures, before, strict=True)]
+            if max(changes) > MOVED:  # what is older tells of longer motion, not more clearly
+                if min(changes) < UNMOVED * max(changes):
+                    frozen = "left" if changes[0] < changes[1] else "right"
+                break
+        self._history.append(pictures)
+        return frozen
 
 
-def _look(frame: StereoFrame, pair: RectifiedPair) -> list[Finding]:
-    """What is wrong in one frame."""
-    eyes = {"left": _small(frame.left)}
-    if frame.right is not None:
-        eyes["right"] = _small(frame.right)
-    empty = {name: kind for name, eye in eyes.items() if (kind := _emptiness(eye.rgb))}
-    if empty:
-        return [
-            Finding(f"{name}_eye_{_CODES[kind]}", f"the {name} picture is {kind}: {_MENDS[kind]}")
-            for name, kind in empty.items()
-        ]
-    if frame.right is None or pair.right is None:
-        return []
-    if _are_equal(eyes["left"].gray, eyes["right"].gray):
-        said = "both eyes show the same picture, so there is no depth: connect the other eye"
-        return [Finding("eyes_equal", said)]
-    # A source that is rectified already hands its pictures through.
-    left = eyes["left"] if pair.left is frame.left else _small(pair.left)
-    right = eyes["right"] if pair.right is frame.right else _small(pair.right)
-    if _are_exchanged(left.gray, right.gray):
-        said = "left and right seem to be exchanged: swap source.left and source.right, or LR and RL"
-        return [Finding("eyes_exchanged", said)]
-    return []
+def _finding(eye: str, kind: str) -> Finding:
+    return Finding(f"{eye}_eye_{kind}", _TEXTS[kind].format(eye=eye))
 
 
 def _small(image: U8) -> Small:
@@ -97,7 +139,7 @@ def _small(image: U8) -> Small:
 
 
 def _emptiness(rgb: F32) -> str:
-    """Black, white or of one colour in the middle, where every scope shows something; empty: none of them."""
+    """Black, white or plain, of one colour, in the middle, where every scope shows something; else empty."""
     height, width = rgb.shape[:2]
     middle = rgb[height // 4 : height - height // 4, width // 4 : width - width // 4].reshape(-1, 3)
     outliers = round(OUTLIERS * len(middle))
@@ -107,7 +149,7 @@ def _emptiness(rgb: F32) -> str:
         return "black"
     if dark.min() > WHITE:
         return "white"
-    return "of one colour" if (bright - dark).max() < ONE_COLOR else ""
+    return "plain" if (bright - dark).max() < ONE_COLOR else ""
 
 
 def _are_equal(left: F32, right: F32) -> bool:

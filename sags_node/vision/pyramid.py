@@ -13,6 +13,7 @@ from sags_node.types import F32, U8, GrayPyramid, Observation, RectifiedPair
 
 BORDER = 16  # px around every half: so far outside the picture a patch may lie
 SMALLEST_SIDE = 16  # px of the last half: two patches of the inverse search
+NARROW = 60  # px, at least, of the pictures in which motion is only looked at
 
 
 def gray_pyramid(picture: U8) -> GrayPyramid:
@@ -68,6 +69,12 @@ def level(pyramid: GrayPyramid, halvings: int) -> F32:
 def inner(bordered: F32) -> F32:
     """A picture without its border, a view."""
     return bordered[BORDER:-BORDER, BORDER:-BORDER]
+
+
+def narrowed(pyramid: GrayPyramid) -> GrayPyramid:
+    """Only its halves that are not much wider than `NARROW`: motion in them costs little."""
+    wide = [k for k, half in enumerate(pyramid.halves) if inner(half).shape[1] >= NARROW]
+    return GrayPyramid(pyramid.full, pyramid.halves[max(wide, default=0) :])
 
 
 @kernel

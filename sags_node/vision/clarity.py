@@ -1,0 +1,101 @@
+"""How clear the eyes see: contrast and fine detail, beside what they usually have and beside each other."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from sags_node.types import F32, Finding, GrayPyramid
+from sags_node.vision.pyramid import inner
+
+WIDTH = 160  # px, at most, of the picture in which contrast is measured, with its border
+LOCAL = 15  # px of it: shading wider than that is no structure
+
+# Octaves. Contrast and detail of a heart's two pictures differ by half an octave and one, on other tissue by
+# 0.1, and change by 0.2 while it moves. A fogged lens takes one and a half, and all of the detail.
+USUAL_DIFFERENCE = 0.6  # what eyes may differ by for good
+LOST_CONTRAST = 0.8  # beside what they usually differ by
+LOST_DETAIL = 1.5  # of one eye beside the other, and of both beside what they usually have
+VEILED = 0.5  # of the contrast of both eyes, beside what they usually have
+FINEST = 0.005  # of the detail: below is rounding
+REMEMBERED_S = 3.0  # s over which what is usual follows
+LASTING_S = 10.0  # s: what has been unclear for so long is how the scene looks now
+
+LENS = "clean the lens, and see to focus and cable"
+SMOKE = Finding(
+    "picture_smoke", "smoke or a fogged lens veils the picture, and it is not learnt: clear the view"
+)
+
+
+class Unclear(NamedTuple):
+    """What one frame lacks."""
+
+    eye: str = ""  # the one that is fogged: left or right
+    all: str = ""  # what all eyes are: blurred or veiled
+
+
+class Clarity:
+    """Compares frames with what is usual. A scene that gets smooth does so in both eyes."""
+
+    def __init__(self) -> None:
+        self._stamp_ns: int | None = None
+        self._unclear_s = 0.0  # for how long both eyes have been
+        self._contrast = self._detail = 0.0  # octaves, of the better eye
+        self._contrasts = self._details = 0.0  # octaves, of the right eye over the left
+
+    def __call__(self, stamp_ns: int, left: GrayPyramid, right: GrayPyramid | None) -> Unclear:
+        """Take the pictures of one frame."""
+        eyes = [left] if right is None else [left, right]
+        contrasts, details = [_contrast(eye) for eye in eyes], [_detail(eye) for eye in eyes]
+        contrast, detail = max(contrasts), max(details)
+        apart = contrasts[-1] - contrasts[0], details[-1] - details[0]
+        if self._stamp_ns is None:
+            self._contrast, self._detail = contrast, detail
+            self._details = _usual(apart[1])
+        passed = 0.0 if self._stamp_ns is None else max(0.0, (stamp_ns - self._stamp_ns) * 1e-9)
+        self._stamp_ns = stamp_ns
+        is_blurred = detail < self._detail - LOST_DETAIL
+        for lost, limit in (
+            (apart[0] - self._contrasts, LOST_CONTRAST),
+            (apart[1] - self._details, np.inf if is_blurred else LOST_DETAIL),
+        ):
+            if abs(lost) > limit:
+                return Unclear(eye="right" if lost < 0 else "left")
+        is_veiled = contrast < self._contrast - VEILED
+        self._unclear_s = self._unclear_s + passed if is_blurred or is_veiled else 0.0
+        if 0 < self._unclear_s < LASTING_S:
+            return Unclear(all="blurred" if is_blurred else "veiled")
+        share = 1.0 if self._unclear_s else min(1.0, passed / REMEMBERED_S)
+        self._contrast += share * (contrast - self._contrast)
+        self._detail += share * (detail - self._detail)
+        self._contrasts = _usual(self._contrasts + share * (apart[0] - self._contrasts))
+        self._details += share * (apart[1] - self._details)
+        return Unclear()
+
+
+def small_level(pyramid: GrayPyramid) -> F32:
+    """The first half that is small enough."""
+    fitting = (inner(half) for half in pyramid.halves if half.shape[1] <= WIDTH)
+    return next(fitting, inner(pyramid.halves[-1]))
+
+
+def _usual(octaves: float) -> float:
+    return min(max(octaves, -USUAL_DIFFERENCE), USUAL_DIFFERENCE)
+
+
+def _contrast(pyramid: GrayPyramid) -> float:
+    """Octaves of local contrast over brightness."""
+    gray = small_level(pyramid)
+    structure = float(np.square(gray - cv2.blur(gray, (LOCAL, LOCAL))).mean())
+    return 0.5 * float(np.log2((structure + 1e-3) / (float(gray.mean()) ** 2 + 1e-3)))
+
+
+def _detail(pyramid: GrayPyramid) -> float:
+    """Octaves of what is finer than a blur: steps between the pixels of the first half over those of a
+    picture of half its size, which are half of them when there is nothing finer."""
+    fine = inner(pyramid.halves[0])[::4]
+    coarse = inner(pyramid.halves[min(1, len(pyramid.halves) - 1)])[::2]
+    steps = [float(np.abs(rows[:, 1:] - rows[:, :-1]).mean()) for rows in (fine, coarse)]
+    return float(np.log2(max(steps[0] / (steps[1] + 1e-3) - 0.5, FINEST)))

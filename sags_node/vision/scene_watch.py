@@ -1,0 +1,370 @@
+"""Whether a picture shows the model's scene: what is too dark, too bright, veiled, covered or another scene
+is not to be learnt, and is no reason for a new model.
+
+Looked at in small pictures, before anything else is done with a frame. The exposure is one gain for each
+channel. A veil, as smoke is, takes contrast away all over. Blood and other cover changes some of the picture.
+Another scene changes most of it, and no motion explains it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from sags_node.types import F32, U8, Bool, Finding, FrameResult, RectifiedPair
+from sags_node.vision.clarity import SMOKE
+from sags_node.vision.flow import OpticalFlow
+from sags_node.vision.pyramid import gray_pyramid, inner, narrowed, pyramid_of, pyramids
+from sags_node.vision.standing import Standing
+
+WIDTH = 80  # px of the small pictures
+SEEN_ALPHA = 0.5
+FEWEST = 50  # small px of the model in the picture, to judge it by
+DARK, BRIGHT = 0.03, 0.95  # beyond, a channel tells noise or saturation
+LEAST_USABLE = (
+    0.5  # of the channels of the model that can be compared: with less the picture is overexposed or dark
+)
+MISFIT = 0.1  # of the range of colours, mean over the channels
+STARTLING = 0.08  # of the px misfit: then motion is looked for that explains it
+COVERED = 0.15  # of the px misfit: then something covers them; a beating heart stays below
+ANOTHER = 0.5  # of the px misfit: then it is not the scene
+# Where much is misfit, the rest tells a cover from another scene. Tissue after a second of motion, or half
+# under blood, against other scenes and mirrored ones: residuals to 0.043 and from 0.044, correlations from
+# 0.5 and to 0.6, casts to 1.24 and from 1.2 to 2.3. Each alone overlaps.
+LARGEST_REST = 0.045  # mean residual of what is not misfit; chance makes 0.05
+LEAST_MATCH = 0.3  # correlation of the structure
+LARGEST_CAST = 1.3  # of one channel's gain over another's
+VEILED, HIDDEN = 0.6, 0.15  # of the model's contrast; clear pictures have 0.9 and more
+SOME = 3  # every so many px tell the exposure
+FINE, LOCAL = 3, 15  # small px: structure is coarser than noise and finer than shading
+RIM = 5  # small px: what lies over the tissue has a soft edge, and grows
+GREEN = 1  # the channel with most of the structure, and seldom saturated
+LEAST_KEPT = 0.3  # of what is known, in view after motion
+LARGEST_GAIN = 1.5  # from one frame to the next; beyond, a picture is brought to the model's exposure
+STEADY = 1.2  # of the gain before: the exposure has changed for good when it stays so
+FOLLOWED = 0.9  # of the gain's logarithm, per frame, is still taken out of a picture after that
+BINS = 32  # of the share of red in a colour, and of green
+NOVEL = 0.002  # of the tissue had a colour like this, or less: it is new
+STRANGE = 0.02  # of the tissue has new colours: clear pictures have 0.005
+REMEMBERED_S = 3.0  # s over which the usual colours follow
+LONGEST_NS = {"cover": 3_000_000_000, "veil": 10_000_000_000, "gain": 1_000_000_000}
+NEW_SCENE_NS = 3_000_000_000
+
+_FLOW = OpticalFlow(stride=4)
+
+_DARK = Finding("picture_dark", "the picture is too dark, and is not learnt: see to the light")
+_BRIGHT = Finding(
+    "picture_bright", "the picture is overexposed, and is not learnt: lower the light or the exposure"
+)
+_COVERED = Finding(
+    "picture_covered", "blood or something else covers some of the tissue, and is not learnt: clear the view"
+)
+_UNKNOWN = Finding(
+    "picture_unknown_scene",
+    "the picture does not show the model's scene: go back to it, or wait; what lasts three seconds begins a "
+    "new model",
+)
+
+
+class Look(NamedTuple):
+    """What one picture is, beside the model as it was drawn last."""
+
+    wrong: Finding | None = None  # why it cannot be followed
+    veiled: bool = False  # its colours and contrast are not the scene's
+    covered: Bool | None = None  # [h, w] where something lies over the scene; None: nowhere
+    gain: F32 = np.ones(3, np.float32)  # [3] its exposure over the model's
+    shift: tuple[float, float] = (0.0, 0.0)  # px right and down: where the scene is found again, about
+    clear: bool = True  # it is good in itself
+
+
+class Advice(NamedTuple):
+    """What to do with a frame."""
+
+    held: str = ""  # why it is not taken in; empty: it is
+    is_new: bool = False  # it shows another scene for good: begin a new model
+    learn: bool = True  # else it is only followed
+    covered: Bool | None = None  # [h, w] a small picture of what is not tissue now
+    gain: F32 | None = None  # [3] to be taken out of the pictures
+    shift: tuple[float, float] = (0.0, 0.0)  # px, where the motion search is to begin
+
+
+class SceneWatch:
+    """Compares every picture with the frame mapped last."""
+
+    def __init__(self) -> None:
+        self._standing = Standing()
+        self._since: dict[str, int] = {}  # stamps: how long something has lasted
+        self._gain: F32 = np.ones(3, np.float32)  # of the frame before
+        self._taken_out: F32 = np.ones(3, np.float32)
+        self._palette = _Palette()
+        self._tissue: Bool | None = None  # [h, w] of the last clear frame
+        self._is_clear = True  # the last frame was
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What is wrong with the pictures. May be read from any thread."""
+        return self._standing.findings
+
+    def forget(self) -> None:
+        """There is a new model."""
+        self._since.clear()
+        self._palette = _Palette()
+        self._tissue = None
+        self._gain = self._taken_out = np.ones(3, np.float32)
+
+    def __call__(self, pair: RectifiedPair, last: FrameResult, veiled: bool = False) -> Advice:
+        """Take one frame.
+
+        Args:
+            veiled: it is known to be blurred or veiled: colours tell nothing.
+        """
+        now = pair.t_capture_ns
+        step = max(1, pair.camera.width // WIDTH)
+        if self._tissue is None or self._is_clear:
+            self._tissue = last.observation.tissue[::step, ::step]
+        seen = look(pair, last, self._tissue)
+        if seen.wrong is not None:
+            self._is_clear = False
+            self._standing.update(now, [seen.wrong])
+            lasts = self._lasts("scene", seen.wrong is _UNKNOWN and seen.clear, now)
+            return Advice(seen.wrong.text, is_new=lasts >= NEW_SCENE_NS)
+        self._lasts("scene", False, now)
+        if veiled or (seen.veiled and self._lasts("veil", True, now) < LONGEST_NS["veil"]):
+            self._is_clear = False
+            self._standing.update(now, [] if veiled else [SMOKE])
+            return Advice(learn=False, shift=seen.shift)
+        self._lasts("veil", False, now)
+        cover = self._cover(seen, pair.left[::step, ::step], now)
+        self._is_clear = cover is None
+        self._standing.update(now, [] if cover is None else [_COVERED])
+        gain = self._exposure(seen.gain, now)
+        return Advice(learn=gain is None, covered=cover, gain=gain, shift=seen.shift)
+
+    def _cover(self, seen: Look, picture: U8, now: int) -> Bool | None:
+        """[h, w] what lies over the tissue: what the model does not explain, and colours that are new. What
+        stays so long is taken for tissue."""
+        assert self._tissue is not None
+        new = self._palette.new(picture, self._tissue, now)
+        is_strange = bool(np.count_nonzero(new & self._tissue) > STRANGE * np.count_nonzero(self._tissue))
+        lasts = self._lasts("cover", seen.covered is not None or is_strange, now)
+        if lasts >= LONGEST_NS["cover"]:
+            is_strange = False
+        self._palette.take(except_new=is_strange)
+        if lasts >= LONGEST_NS["cover"] or not (seen.covered is not None or is_strange):
+            return None
+        cover: Bool = new if seen.covered is None else seen.covered | new
+        grown: U8 = cv2.dilate(cover.view(np.uint8), np.ones((RIM, RIM), np.uint8))
+        return grown.view(np.bool_)
+
+    def _exposure(self, gain: F32, now: int) -> F32 | None:
+        """What to take out of the pictures; None: the model follows their exposure by itself."""
+        steady = float(np.abs(np.log(gain / self._gain)).max()) < np.log(STEADY)
+        self._gain = gain
+        if _strength(gain) <= LARGEST_GAIN:
+            self._lasts("gain", False, now)
+            return None
+        if self._lasts("gain", steady, now) < LONGEST_NS["gain"]:
+            self._taken_out = gain
+        else:
+            self._taken_out = self._taken_out**FOLLOWED
+        return self._taken_out
+
+    def _lasts(self, what: str, is_so: bool, now: int) -> int:
+        """For how long it has been so, ns."""
+        if not is_so:
+            self._since.pop(what, None)
+            return 0
+        since = self._since.setdefault(what, now)
+        if now < since:  # the clock has jumped back
+            since = self._since[what] = now
+        return now - since
+
+
+class _Palette:
+    """The colours that the tissue usually has, whatever the exposure."""
+
+    def __init__(self) -> None:
+        self._usual: F32 | None = None  # [BINS, BINS] share of the tissue, by share of red and of green
+        self._share = 1.0
+        self._colors = self._counted = self._is_new = np.zeros((1, 1), np.bool_)
+        self._stamp_ns = 0
+
+    def new(self, picture: U8, tissue: Bool, now: int) -> Bool:
+        """Which pixels [h, w] of a small picture [h, w, 3] have colours that tissue has not had before."""
+        red, green, blue = cv2.split(cv2.blur(picture, (FINE, FINE)).astype(np.float32))
+        light = red + green + blue
+        fair = (light > 3 * 255 * DARK) & (cv2.max(red, cv2.max(green, blue)) < 255 * BRIGHT)
+        places = [(BINS * channel / (light + 1)).astype(np.intp) for channel in (red, green)]
+        self._colors, self._counted = BINS * places[0] + places[1], fair & tissue
+        if self._usual is None:
+            self._stamp_ns, self._share = now, 1.0
+            self._is_new = np.zeros_like(tissue)
+            return self._is_new
+        self._share = min(1.0, max(0.0, (now - self._stamp_ns) * 1e-9) / REMEMBERED_S)
+        self._stamp_ns = now
+        around = cv2.boxFilter(self._usual, -1, (FINE, FINE), normalize=False)
+        self._is_new = (around.ravel()[self._colors] < NOVEL) & fair
+        return self._is_new
+
+    def take(self, except_new: bool) -> None:
+        """Learn the colours of that picture."""
+        counted = self._counted & ~self._is_new if except_new else self._counted
+        if not counted.any():
+            return
+        found = np.bincount(self._colors[counted], minlength=BINS**2).reshape(BINS, BINS).astype(np.float32)
+        found /= np.float32(np.count_nonzero(counted))
+        before = found if self._usual is None else self._usual
+        self._usual = before + np.float32(self._share) * (found - before)
+
+
+def exposed(pair: RectifiedPair, gain: F32) -> RectifiedPair:
+    """The pair as it would be with 1 / `gain` [3] of its exposure."""
+    factors = (1 / gain).astype(np.float64)
+
+    def change(picture: U8) -> U8:
+        return np.asarray(cv2.multiply(picture, (*factors, 1.0)))
+
+    left = change(pair.left)
+    right = None if pair.right is None else change(pair.right)
+    gray = gray_pyramid(left), None if right is None else gray_pyramid(right)
+    return replace(pair, left=left, right=right, gray=gray)
+
+
+def enlarged(small: Bool, shape: tuple[int, ...]) -> Bool:
+    """A mask of a small picture for one of `shape`."""
+    large: U8 = cv2.resize(small.view(np.uint8), shape[1::-1], interpolation=cv2.INTER_NEAREST)
+    return large.view(np.bool_)
+
+
+def look(pair: RectifiedPair, last: FrameResult, tissue: Bool) -> Look:
+    """What a picture is, beside the frame mapped last.
+
+    Args:
+        tissue: [h, w] small, where that frame would have shown tissue but for what covers it.
+    """
+    step = max(1, pair.camera.width // WIDTH)
+    view = last.views["left"]
+    seen = pair.left[::step, ::step] * np.float32(1 / 255)
+    drawn = np.ascontiguousarray(view.rgb[::step, ::step])
+    known = (view.alpha[::step, ::step] > SEEN_ALPHA) & tissue
+    if np.count_nonzero(known) < FEWEST:
+        return Look()
+    fit = _Fit(seen, drawn, known)
+    if fit.usable < LEAST_USABLE:
+        return Look(_DARK if seen[known].mean() < drawn[known].mean() else _BRIGHT)
+    if fit.contrast < VEILED and fit.match > LEAST_MATCH:
+        return Look(SMOKE if fit.contrast < HIDDEN else None, veiled=True)
+    shift = (0.0, 0.0)
+    if fit.misfit > STARTLING:
+        fit, shift = _found_again(pair, last, step, seen, drawn, known, fit)
+    if fit.is_another:
+        return Look(_UNKNOWN, clear=fit.contrast * float(fit.gain[GREEN]) > VEILED)
+    if fit.misfit <= COVERED:
+        return Look(gain=fit.gain, shift=shift)
+    return Look(covered=fit.wrong, gain=fit.gain, shift=shift)
+
+
+class _Fit:
+    """How well small pictures [h, w, 3] agree where something is known [h, w].
+
+    Attributes:
+        usable: share of the channels that can be compared.
+        gain: [3] of the exposure.
+        wrong: [h, w] where they do not agree.
+        misfit: share of what is known there.
+        rest: mean residual elsewhere.
+        contrast: of what is seen over that of the model, after the gain.
+        match: correlation of their structure.
+    """
+
+    def __init__(self, seen: F32, drawn: F32, known: Bool) -> None:
+        fair = (drawn > DARK) & (drawn < BRIGHT) & known[..., None]
+        count: int = max(1, int(np.count_nonzero(known)))
+        channels: int = max(1, int(np.count_nonzero(fair)))
+        fair &= (seen > DARK) & (seen < BRIGHT)
+        self.usable = float(np.count_nonzero(fair)) / channels
+        some = [(picture[..., k][fair[..., k]][::SOME] for picture in (seen, drawn)) for k in range(3)]
+        ratios = [a / b for a, b in some]
+        found = [float(np.median(ratio)) if len(ratio) >= FEWEST else np.nan for ratio in ratios]
+        mean = float(np.nanmean(found)) if np.isfinite(found).any() else 1.0
+        self.gain: F32 = np.where(np.isfinite(found), found, mean).astype(np.float32)
+        residual = self._residual(seen, drawn, fair)
+        self.wrong: Bool = (residual > MISFIT) & known
+        self.misfit = float(np.count_nonzero(self.wrong)) / count
+        if self.misfit > COVERED:  # most may be covered, and the exposure what it was
+            unchanged, self.gain = self.gain, np.ones(3, np.float32)
+            other = self._residual(seen, drawn, fair)
+            wrong = (other > MISFIT) & known
+            if np.count_nonzero(wrong) < np.count_nonzero(self.wrong):
+                residual, self.wrong = other, wrong
+                self.misfit = float(np.count_nonzero(wrong)) / count
+            else:
+                self.gain = unchanged
+        right = known & ~self.wrong
+        self.rest = float(residual[right].mean()) if right.any() else 1.0
+        counts, model = fair[..., GREEN], drawn[..., GREEN]
+        picture = np.where(counts, seen[..., GREEN] / self.gain[GREEN], model)  # no edges where it is clipped
+        a, b = _structure(picture)[counts], _structure(model)[counts]
+        energy_a, energy_b = float(a @ a), float(b @ b)
+        self.contrast = float(np.sqrt(energy_a / max(energy_b, 1e-9)))
+        self.match = float(a @ b) / max(np.sqrt(energy_a * energy_b), 1e-9)
+
+    @property
+    def is_another(self) -> bool:
+        """Whether they show different scenes."""
+        cast = float(self.gain.max() / self.gain.min())
+        differs = self.rest > LARGEST_REST or self.match < LEAST_MATCH or cast > LARGEST_CAST
+        return self.misfit > COVERED and (self.misfit > ANOTHER or differs)
+
+    def _residual(self, seen: F32, drawn: F32, fair: Bool) -> F32:
+        """[h, w] mean over the channels that can be compared, less noise."""
+        difference = cv2.blur(np.where(fair, seen / self.gain - drawn, np.float32(0)), (FINE, FINE))
+        total, count = (
+            planes[..., 0]
+            + planes[..., 1]
+            + planes[..., 2]  # five times as fast as a sum over an axis of three
+            for planes in (np.abs(difference), fair.view(np.uint8))
+        )
+        mean: F32 = np.divide(total, np.maximum(count, 1), dtype=np.float32)
+        return mean
+
+
+def _structure(gray: F32) -> F32:
+    gray = np.ascontiguousarray(gray)
+    structure: F32 = cv2.blur(gray, (FINE, FINE)) - cv2.blur(gray, (LOCAL, LOCAL))
+    return structure
+
+
+def _found_again(
+    pair: RectifiedPair, last: FrameResult, step: int, seen: F32, drawn: F32, known: Bool, fit: _Fit
+) -> tuple[_Fit, tuple[float, float]]:
+    """The best fit after motion that the pictures show, from where they lie and from where they lie best as a
+    whole; and that common shift, px."""
+    now = narrowed(pyramids(exposed(pair, fit.gain) if _strength(fit.gain) > LARGEST_GAIN else pair)[0])
+    before = narrowed(pyramid_of(last.observation))
+    whole = pair.camera.width / (2 * inner(now.halves[0]).shape[1])  # px of the picture in one of the flow's
+    (x, y), _ = cv2.phaseCorrelate(_structure(drawn[..., GREEN]), _structure(seen[..., GREEN]))
+    columns, rows = np.meshgrid(*(np.arange(side, dtype=np.float32) for side in known.shape[::-1]))
+    best, best_shift = fit, (0.0, 0.0)
+    for shift in ((0.0, 0.0), (step * x, step * y)):
+        back = _FLOW(now, before, (-shift[0] / whole, -shift[1] / whole))
+        back = cv2.resize(back, known.shape[::-1], interpolation=cv2.INTER_AREA) * np.float32(whole / step)
+        there = columns + back[..., 0], rows + back[..., 1]
+        moved = cv2.remap(drawn, *there, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        tissue = cv2.remap(known.view(np.uint8), *there, cv2.INTER_NEAREST).view(np.bool_)
+        if np.count_nonzero(tissue) < LEAST_KEPT * np.count_nonzero(known):
+            continue
+        found = _Fit(seen, moved, tissue)
+        if found.misfit < best.misfit:
+            best, best_shift = found, shift
+        if best.misfit <= STARTLING:
+            break
+    return best, best_shift
+
+
+def _strength(gain: F32) -> float:
+    """How far a gain is from one, as a factor."""
+    return float(np.exp(np.abs(np.log(np.maximum(gain, 1e-6))).max()))

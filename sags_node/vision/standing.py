@@ -1,0 +1,42 @@
+"""Which findings stand: one bad frame is none, and a warning ends soon after its cause."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Sequence
+
+from sags_node.types import Finding
+
+WINDOW_NS = 250_000_000  # half of the time in which a person is to be warned
+BEGINS, ENDS = 0.6, 0.3  # of the frames in that time: a finding stands, and it stands no more
+FEWEST = 2  # frames
+
+
+class Standing:
+    """The findings of the last frames, and those of them that last.
+
+    Attributes:
+        findings: those that stand. May be read from any thread.
+    """
+
+    def __init__(self) -> None:
+        self.findings: tuple[Finding, ...] = ()
+        self._frames: deque[tuple[int, tuple[Finding, ...]]] = deque()  # stamp, and what was found
+
+    def update(self, stamp_ns: int, found: Sequence[Finding]) -> None:
+        """Take what was found in one frame."""
+        frames = self._frames
+        if frames and stamp_ns < frames[-1][0]:  # the clock has jumped back
+            frames.clear()
+        frames.append((stamp_ns, tuple(found)))
+        while len(frames) > FEWEST and stamp_ns - frames[0][0] > WINDOW_NS:
+            frames.popleft()
+        newest = {finding.code: finding for _, findings in frames for finding in findings}
+        counts = Counter(code for _, findings in frames for code in {finding.code for finding in findings})
+        stood = {finding.code for finding in self.findings}
+        self.findings = tuple(
+            newest[code]
+            for code, count in counts.items()
+            if (code in stood and count >= ENDS * len(frames))
+            or (count >= FEWEST and count >= BEGINS * len(frames))
+        )
