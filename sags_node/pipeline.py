@@ -88,7 +88,7 @@ class Pipeline:
         self._still = StillScene()
         self._eyes = PairWatch()
         self._matches = MatchWatch()
-        self._scene = SceneWatch()
+        self._scene = SceneWatch(moving=vision.pose == "estimate")
         self._unmatched = ""  # why what was measured last is no depth; empty: it is
         self._mapped: FrameResult | None = None  # the last frame that was really mapped
 

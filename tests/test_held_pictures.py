@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sags_node.findings import by_code
 from sags_node.mapping.budget import StepBudget
 from sags_node.pipeline import Pipeline
 from sags_node.session import Session, open_session
@@ -67,7 +68,7 @@ def play(session: Session, frames: list[StereoFrame]) -> tuple[list[FrameResult]
     results, codes = [], []
     for frame in frames:
         results.append(pipeline.process(frame, StepBudget(2)))
-        codes.append({finding.code for finding in pipeline.findings})
+        codes.append(set(by_code(pipeline.warnings)))
     return results, codes, pipeline
 
 

@@ -94,7 +94,12 @@ class Advice(NamedTuple):
 class SceneWatch:
     """Compares every picture with the frame mapped last."""
 
-    def __init__(self) -> None:
+    def __init__(self, moving: bool = False) -> None:
+        """
+        Args:
+            moving: the camera's pose is estimated: what shows another scene is left to that.
+        """
+        self._moving = moving
         self._standing = Standing()
         self._since: dict[str, int] = {}  # stamps: how long something has lasted
         self._gain: F32 = np.ones(3, np.float32)  # of the frame before
@@ -126,6 +131,10 @@ class SceneWatch:
         if self._tissue is None or self._is_clear:
             self._tissue = last.observation.tissue[::step, ::step]
         seen = look(pair, last, self._tissue)
+        if seen.wrong is _UNKNOWN and self._moving:
+            self._is_clear = False
+            self._standing.update(now, [])
+            return Advice()
         if seen.wrong is not None:
             self._is_clear = False
             self._standing.update(now, [seen.wrong])
