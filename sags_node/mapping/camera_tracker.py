@@ -74,6 +74,7 @@ class CameraTracker:
         self._looked_ns = 0
         self._disagreed = 0  # looks in a row
         self._stamp_ns: int | None = None  # of the last frame that was mapped
+        self._seconds = 0.0  # that the model has been learnt for
 
     @property
     def pose(self) -> F64:
@@ -138,7 +139,7 @@ class CameraTracker:
         self._mapper.start_from(tried.drawn)
         if self._passed < TRIAL:
             return False
-        self._pose, self._motion = tried.drawn.view.camera.T_world_cam, np.eye(4)
+        self._pose, self._motion = tried.T_world_rest, np.eye(4)
         self.lost, self._trial, self._passed, self._unknown = None, None, 0, []
         self._found_ns, self._before = observation.t_capture_ns, self._mapper.learnt()
         self._looked_ns, self._disagreed = observation.t_capture_ns, 0
@@ -166,19 +167,24 @@ class CameraTracker:
             self._restarts = self._mapper.restarts
             self._keyframes.clear()
             self._found_ns = self._before = None
+            self._seconds = 0.0
         before, self._stamp_ns = self._stamp_ns, observation.t_capture_ns
         passed = 0.0 if before is None else max(0.0, (self._stamp_ns - before) * 1e-9)
         model = self._mapper.model
         new = np.isnan(model.rest[:, 0])
         model.rest[new] = model.means[new]
-        model.rest[:] += np.float32(min(1.0, passed / REST_SECONDS)) * (model.means - model.rest)
+        # A model that is younger than a breath rests where it was on average until now.
+        self._seconds = min(self._seconds + passed, REST_SECONDS)
+        share = passed / max(self._seconds, passed, 1e-9)
+        model.rest[:] += np.float32(share) * (model.means - model.rest)
         if self._found_ns is not None and not 0 <= self._stamp_ns - self._found_ns < PROBATION_NS:
             self._found_ns = self._before = None
         if self._found_ns is None:
             self._keyframes.offer(observation, view)
 
-    def _fit(self, observation: Observation, start: F64) -> PoseFit | str:
-        """The pose, or why there is none."""
+    def _fit(self, observation: Observation, start: F64, pull: float = PULL) -> PoseFit | str:
+        """The pose, or why there is none; `pull` is the share of the way back to its place at rest at which
+        tissue is taken to be."""
         model, camera, last = self._mapper.model, observation.camera, self._mapper.last
         pixels = self._mapper.found_again(observation)
         rows = np.flatnonzero(_is_inside(pixels, observation.gray))
@@ -197,7 +203,7 @@ class CameraTracker:
         rows = rows[chosen[found]]
         if len(rows) < LEAST_POINTS:
             return "too little texture to follow"
-        points = model.means[rows] + np.float32(PULL) * (model.rest[rows] - model.means[rows])
+        points = model.means[rows] + np.float32(pull) * (model.rest[rows] - model.means[rows])
         # The formula is its own inverse.
         disparities = disparity_to_depth(
             _values(observation.depth, pixels), float(camera.K[0, 0]), observation.baseline
@@ -225,11 +231,11 @@ class CameraTracker:
         if isinstance(fit, str):
             self.lost = fit
             return None
+        rest = self._fit(observation, fit.T_world_cam, pull=1.0)
         now = self._seen_from(observation, fit.T_world_cam)
         frame = small_frame(observation)
-        return _Candidate(
-            now, agreement(small_view(now.view), frame, observation.camera, observation.baseline)
-        )
+        agrees = agreement(small_view(now.view), frame, observation.camera, observation.baseline)
+        return _Candidate(now, agrees, (fit if isinstance(rest, str) else rest).T_world_cam)
 
     def _seen_from(self, observation: Observation, pose: F64) -> Drawn:
         """The model as a frame that was taken from there would have shown it."""
@@ -245,6 +251,7 @@ class _Candidate:
 
     drawn: Drawn
     agreement: Agreement
+    T_world_rest: F64  # [4, 4] the pose against the tissue at rest: it may have moved since it was seen
 
 
 def _is_inside(pixels: F32, picture: U8) -> Bool:

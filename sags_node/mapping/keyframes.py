@@ -74,7 +74,7 @@ class Keyframes:
             return []
         found = [_pose_from(each, pixels, features, observation.camera) for each in self._kept]
         poses = [pose for pose in found if pose is not None]
-        return [pose for _, pose in sorted(poses, key=lambda pose: -pose[0])]
+        return [pose for _, pose in sorted(poses, key=lambda pose: pose[0], reverse=True)]
 
     def agree(self, observation: Observation) -> Agreement | None:
         """How well a frame agrees with the keyframe that it agrees with best, where its pose says that the

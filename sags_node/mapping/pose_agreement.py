@@ -12,7 +12,7 @@ from sags_node.types import F32, U8, Bool, Camera, Observation, RenderedView
 WIDTH = 160  # px, about: of the shrunk pictures that are compared
 WINDOW = 9  # shrunk px: shading wider than that is the light's, which moves with the scope
 LEAST_VARIANCE = 1.0  # grey levels squared: less texture is noise
-LEAST_COVERED = 0.3  # of the tissue in view
+LEAST_COVERED = 0.4  # of the tissue in view
 LEAST_CORRELATION = 0.5
 STEREO_ERROR = 0.35  # px: of disparities that are believed
 SPREAD = 3.0  # of these errors: what differs by more is another surface
@@ -63,12 +63,10 @@ def shrunk(gray: U8 | F32, depth: F32, where: Bool) -> Small:
     step = max(1, round(gray.shape[1] / WIDTH))
     rows, columns = gray.shape[0] // step, gray.shape[1] // step
 
-    def picked(picture: F32 | Bool) -> F32 | Bool:
-        return picture[step // 2 :: step, step // 2 :: step][:rows, :columns]
-
+    inside = slice(step // 2, rows * step, step), slice(step // 2, columns * step, step)
     cut = np.asarray(gray[: rows * step, : columns * step], np.float32)
     small = cv2.resize(cut, (columns, rows), interpolation=cv2.INTER_AREA)
-    return Small(small, picked(depth), picked(where))
+    return Small(small, depth[inside], where[inside])
 
 
 def small_frame(observation: Observation) -> Small:
