@@ -165,9 +165,9 @@ def test_the_light_moves_with_the_scope(folder: Path) -> None:
         ours.take(frame)
     pipeline = ours.pipeline
     gains = {}
-    plain = np.eye(4)
-    plain[0, 3] = 0.012
-    places = {"12": aside(0.012), "12 up": aside(0, 0.012), "19": aside(-0.019), "12 unturned": plain}
+    places = {"12 mm": aside(0.012), "12 mm up": aside(0, 0.012), "19 mm": aside(-0.019)}
+    for metres in (0.012, 0.019):
+        places[f"{metres * 1e3:.0f} mm, not turned"] = exponential(np.array([metres, 0, 0, 0, 0, 0]))
     for name, T in places.items():
         there = ours.look(T)
         pair = pipeline.rectifier(there)
@@ -178,7 +178,10 @@ def test_the_light_moves_with_the_scope(folder: Path) -> None:
             wrong = (view.rgb - pair.left / np.float32(255))[tissue & (view.alpha > 0.9)]
             psnr.append(-10 * np.log10(np.mean(np.square(wrong))))
         gains[name] = psnr[1] - psnr[0]
-    assert min(gains.values()) > 4 and np.mean(list(gains.values())) > 5, gains
+    # Seen from elsewhere tissue has its broad gleam elsewhere too, which is left out: turned, there is less
+    # to gain.
+    assert min(gain for name, gain in gains.items() if "not turned" in name) > 6, gains
+    assert min(gains.values()) > 2.5, gains
 
 
 def test_light_falls_off_with_the_square_of_the_distance_and_the_angle() -> None:

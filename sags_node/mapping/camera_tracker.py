@@ -116,7 +116,8 @@ class CameraTracker:
             return False
         self._looked_ns = now
         found = self._keyframes.agree(observation)
-        self._disagreed = self._disagreed + 1 if found is not None and found.problem else 0
+        contradicted = found is not None and found.is_contradiction
+        self._disagreed = self._disagreed + 1 if contradicted else 0
         if self._disagreed < DISAGREEING:
             return False
         self._disagreed = 0

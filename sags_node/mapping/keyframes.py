@@ -21,6 +21,8 @@ FAST_THRESHOLD = 7  # grey levels: tissue has few corners
 DISTINCT = 0.8  # of the next best match's distance (D. Lowe, IJCV 2004)
 REPROJECTION = 4 / 640  # of the width
 LEAST_MATCHES = 15
+WITNESSES = 2  # keyframes, the nearest, that a frame is compared with
+EVERY = 2  # shrunk px that are compared
 LEAST_OVERLAP = 0.4  # of a keyframe in a frame: what shows less of it says nothing
 
 
@@ -32,9 +34,15 @@ class _Keyframe:
         self.depth = depth  # [H, W] m, of the model drawn there
 
     @cached_property
-    def small(self) -> Small:
+    def small(self) -> tuple[Small, F32]:
+        """A few pixels of it, and where [h, w, 3] (m, world) the tissue in them was."""
         there = self.observation
-        return shrunk(there.gray, self.depth, there.tissue & (self.depth > 0))
+        fine = shrunk(there.gray, self.depth, there.tissue & (self.depth > 0))
+        small = Small(fine.gray[::EVERY, ::EVERY], fine.depth[::EVERY, ::EVERY], fine.where[::EVERY, ::EVERY])
+        step = there.gray.shape[1] // fine.gray.shape[1]
+        rows, columns = (EVERY * step * np.arange(side, dtype=np.float32) for side in small.gray.shape)
+        pixels = np.stack(np.meshgrid(columns, rows), -1) + np.float32(0.5 * (step - 1))
+        return small, np.asarray(unproject(there.camera, pixels, small.depth), np.float32)
 
     @cached_property
     def features(self) -> tuple[F32, U8 | None]:
@@ -77,28 +85,28 @@ class Keyframes:
         return [pose for _, pose in sorted(poses, key=lambda pose: pose[0], reverse=True)]
 
     def agree(self, observation: Observation) -> Agreement | None:
-        """How well a frame agrees with the keyframe that it agrees with best, where its pose says that the
-        tissue of the keyframe is; None: it shows too little of all of them."""
+        """How well a frame agrees with the better of the nearest keyframes, where its pose says that their
+        tissue is; None: it shows too little of them."""
         frame = small_frame(observation)
+        near = sorted(self._kept, key=lambda each: distance(observation.camera, each.observation.camera))
         best: Agreement | None = None
-        for keyframe in self._kept:
-            found = _warped(keyframe.small, keyframe.observation.camera, frame, observation)
+        for keyframe in near[:WITNESSES]:
+            found = _warped(*keyframe.small, frame, observation)
             if found is not None and (best is None or found.rank > best.rank):
                 best = found
         return best
 
 
-def _warped(there: Small, camera: Camera, frame: Small, observation: Observation) -> Agreement | None:
+def _warped(there: Small, points: F32, frame: Small, observation: Observation) -> Agreement | None:
     """Of a frame with a keyframe, pixel by pixel of the keyframe."""
-    height, width = there.gray.shape
-    step = round(camera.width / width)
-    u, v = np.meshgrid(np.arange(width), np.arange(height))
-    centres = np.stack([u, v], -1) * float(step) + 0.5 * (step - 1)
-    points = unproject(camera, centres, there.depth.astype(np.float64))
+    step = observation.gray.shape[1] // frame.gray.shape[1]
+    height, width = frame.gray.shape
     pixels, depth = project(observation.camera, points)
-    places = np.nan_to_num((pixels - 0.5 * (step - 1)) / step, nan=-1.0).astype(np.float32)
+    places = np.nan_to_num((pixels - np.float32(0.5 * (step - 1))) / np.float32(step), nan=-1.0)
+    places = np.asarray(places, np.float32)
     inside = there.where & (places >= 0).all(-1) & (places <= [width - 1, height - 1]).all(-1)
-    if np.count_nonzero(inside) < LEAST_OVERLAP * max(1, np.count_nonzero(there.where)):
+    known = int(np.count_nonzero(there.where))
+    if known == 0 or int(np.count_nonzero(inside)) < LEAST_OVERLAP * known:
         return None
 
     def at(picture: F32, how: int) -> F32:

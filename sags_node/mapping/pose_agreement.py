@@ -40,6 +40,12 @@ class Agreement:
     offset: float  # px of disparity that all depths differ by
 
     @property
+    def is_contradiction(self) -> bool:
+        """Whether it is not half as good as it must be at first: moved tissue agrees better."""
+        unlike = self.correlation < LEAST_CORRELATION / 2
+        return unlike or (self.near is not None and self.near < LEAST_NEAR / 2)
+
+    @property
     def rank(self) -> tuple[bool, float]:
         """Larger is better."""
         return not self.problem, self.correlation
