@@ -91,6 +91,7 @@ class CameraTracker:
         fit = self._follow(observation)
         if isinstance(fit, str):
             self.lost, self._motion = fit, np.eye(4)
+            self._trial, self._passed, self._unknown = None, 0, []
             return False
         self._pose, self._motion = fit, invert(self._pose) @ fit
         return True
@@ -141,7 +142,7 @@ class CameraTracker:
         if self._passed < TRIAL:
             return False
         self._pose, self._motion = tried.T_world_rest, np.eye(4)
-        self.lost, self._trial, self._passed, self._unknown = None, None, 0, []
+        self.lost = None
         self._found_ns, self._before = observation.t_capture_ns, self._mapper.learnt()
         self._looked_ns, self._disagreed = observation.t_capture_ns, 0
         return True
@@ -159,7 +160,7 @@ class CameraTracker:
         if observation.t_capture_ns - self._unknown[0].t_capture_ns < GIVE_UP_NS:
             return False
         self._mapper.restart()
-        self.lost, self._unknown, self._found_ns, self._before = None, [], None, None
+        self.lost = None
         return True
 
     def mapped(self, observation: Observation, view: RenderedView) -> None:
