@@ -287,8 +287,8 @@ class Pipeline:
         return to_view(planes, camera, mapped.view.frame_id, stamp)
 
     def _draw_model(self, camera: Camera) -> RenderedView:
-        """The model as it is now."""
-        return to_view(self._refiner.show(self.mapper.model.gaussians(), camera), camera, 0, 0)
+        """The model as it is now, in the light of a scope that is there."""
+        return to_view(self._refiner.show(self.mapper.lit_from(camera), camera), camera, 0, 0)
 
 
 class Stopwatch:

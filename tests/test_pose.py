@@ -14,10 +14,11 @@ from sags_node.engine.rasterize import rasterize
 from sags_node.evaluation.measure import Options
 from sags_node.evaluation.session import evaluate
 from sags_node.evaluation.trajectory import RigidOdometry, trajectory_errors
+from sags_node.findings import by_code
 from sags_node.geometry import invert, project
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.camera_pose import exponential, fit_pose
-from sags_node.mapping.camera_tracker import GIVE_UP
+from sags_node.mapping.camera_tracker import GIVE_UP_NS, TRIAL
 from sags_node.mapping.keyframes import Keyframes
 from sags_node.phantom import write_session
 from sags_node.pipeline import Pipeline
@@ -230,21 +231,23 @@ def test_after_a_blackout_of_a_second_the_same_model_goes_on(deforming: Path) ->
         for frame in frames[first:last]
     ]
     pipeline, results = play(session, [*frames[:first], *dark])
-    lost = results[first:]
-    assert all("pose" in result.skipped for result in lost)
-    assert "does not show" in pipeline.warnings["pose"][0].text
-    for result in lost:
+    held = results[first:]
+    assert all("black" in result.held for result in held) and "left_eye_black" in by_code(pipeline.warnings)
+    for result in held:
         assert np.array_equal(result.pair.camera.T_world_cam, results[first - 1].pair.camera.T_world_cam)
         assert np.array_equal(result.snapshot.gaussians.means, results[first - 1].snapshot.gaussians.means)
         assert not result.observation.depth.any() and not result.snapshot.velocities.any()
         assert result.snapshot.frame_id == result.pair.frame_id
     budget = StepBudget(1)
-    after = [pipeline.process(frame, budget) for frame in frames[last:]]
-    assert {result.epoch for result in after} == {0} and "pose" not in pipeline.warnings
-    assert np.isin(after[0].snapshot.gaussians.ids, lost[0].snapshot.gaussians.ids).mean() > 0.9
+    back = [pipeline.process(frame, budget) for frame in frames[last:]]
+    after = [result for result in back if not result.held]
+    assert len(back) - len(after) <= TRIAL  # it may have to be verified first
+    assert {result.epoch for result in back} == {0} and "pose" not in pipeline.warnings
+    assert np.isin(after[0].snapshot.gaussians.ids, held[0].snapshot.gaussians.ids).mean() > 0.9
     assert max(psnr(result) for result in after) > psnr(results[first - 1]) - 1
     shown = results[:first] + after
-    assert errors(shown, [*frames[:first], *frames[last:]])["max_mm"] < 3.5
+    taken = [frame for frame, result in zip(frames[last:], back, strict=True) if not result.held]
+    assert errors(shown, [*frames[:first], *taken])["max_mm"] < 3.5
 
 
 def test_another_scene_begins_a_new_model_at_the_last_pose(still: Path) -> None:
@@ -258,13 +261,15 @@ def test_another_scene_begins_a_new_model_at_the_last_pose(still: Path) -> None:
     )
     pipeline, before = play(session, frames[:4])
     budget = StepBudget(1)
-    stamps = [frame.t_capture_ns for frame in frames[4 : 4 + GIVE_UP + 2]]
+    # The first frame finds the camera lost, the next is the first of those that show something else.
+    stamps = frames[4].t_capture_ns + np.arange(0, GIVE_UP_NS + 2e9 / RATE, 1e9 / RATE).astype(np.int64)
     results = [
-        pipeline.process(replace(upside_down, frame_id=4 + k, t_capture_ns=stamp), budget)
+        pipeline.process(replace(upside_down, frame_id=4 + k, t_capture_ns=int(stamp)), budget)
         for k, stamp in enumerate(stamps)
     ]
-    assert all("pose" in result.skipped and result.epoch == 0 for result in results[: GIVE_UP - 1])
-    new = results[GIVE_UP - 1]
+    given_up = int(np.searchsorted(stamps - stamps[1], GIVE_UP_NS))
+    assert all("pose" in result.skipped and result.epoch == 0 for result in results[:given_up])
+    new = results[given_up]
     assert new.epoch == 1 and "pose" not in new.skipped and psnr(new) > 25
     assert np.array_equal(new.pair.camera.T_world_cam, before[-1].pair.camera.T_world_cam)
 
@@ -280,10 +285,9 @@ def test_a_keyframe_finds_the_camera_again_where_flow_cannot(still: Path) -> Non
     picture = cv2.cvtColor(cv2.convertScaleAbs(there.rgb, alpha=255), cv2.COLOR_RGB2GRAY)
     seen = replace(result.observation, gray=picture, tissue=there.alpha > 0.5)
     found = keyframes.find(seen)
-    assert found is not None
-    mm, degrees = error_mm_deg(found, far)
+    mm, degrees = error_mm_deg(found[0], far)
     assert mm < 2 and degrees < 2
-    assert keyframes.find(replace(seen, gray=np.full_like(picture, 128))) is None
+    assert not keyframes.find(replace(seen, gray=np.full_like(picture, 128)))
 
 
 def test_a_scope_known_to_be_fixed_changes_nothing_where_it_is() -> None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
+from functools import cached_property
 
 import cv2
 import numpy as np
 
-from sags_node.geometry import invert, unproject
+from sags_node.geometry import invert, project, unproject
+from sags_node.mapping.pose_agreement import Agreement, Small, agreement, shrunk, small_frame
 from sags_node.types import F32, F64, U8, Bool, Camera, Observation, RenderedView
 
 MOST = 8
@@ -19,12 +21,32 @@ FAST_THRESHOLD = 7  # grey levels: tissue has few corners
 DISTINCT = 0.8  # of the next best match's distance (D. Lowe, IJCV 2004)
 REPROJECTION = 4 / 640  # of the width
 LEAST_MATCHES = 15
+WITNESSES = 2  # keyframes, the nearest, that a frame is compared with
+EVERY = 2  # shrunk px that are compared
+LEAST_OVERLAP = 0.4  # of a keyframe in a frame: what shows less of it says nothing
 
 
-@dataclass(frozen=True, slots=True)
 class _Keyframe:
-    observation: Observation
-    depth: F32  # [H, W] m, of the model drawn there
+    """A frame whose pose was known, with what is computed from it when it is first needed."""
+
+    def __init__(self, observation: Observation, depth: F32) -> None:
+        self.observation = observation
+        self.depth = depth  # [H, W] m, of the model drawn there
+
+    @cached_property
+    def small(self) -> tuple[Small, F32]:
+        """A few pixels of it, and where [h, w, 3] (m, world) the tissue in them was."""
+        there = self.observation
+        fine = shrunk(there.gray, self.depth, there.tissue & (self.depth > 0))
+        small = Small(fine.gray[::EVERY, ::EVERY], fine.depth[::EVERY, ::EVERY], fine.where[::EVERY, ::EVERY])
+        step = there.gray.shape[1] // fine.gray.shape[1]
+        rows, columns = (EVERY * step * np.arange(side, dtype=np.float32) for side in small.gray.shape)
+        pixels = np.stack(np.meshgrid(columns, rows), -1) + np.float32(0.5 * (step - 1))
+        return small, np.asarray(unproject(there.camera, pixels, small.depth), np.float32)
+
+    @cached_property
+    def features(self) -> tuple[F32, U8 | None]:
+        return _features(self.observation.gray, self.observation.tissue & (self.depth > 0))
 
 
 class Keyframes:
@@ -32,7 +54,6 @@ class Keyframes:
 
     def __init__(self) -> None:
         self._kept: list[_Keyframe] = []  # oldest first
-        self._orb = cv2.ORB.create(FEATURES, fastThreshold=FAST_THRESHOLD)
 
     def clear(self) -> None:
         self._kept.clear()
@@ -44,7 +65,7 @@ class Keyframes:
             if 0 <= passed < PERIOD_NS:
                 return
         camera = observation.camera
-        distances = [_distance(camera, each.observation.camera) for each in self._kept]
+        distances = [distance(camera, each.observation.camera) for each in self._kept]
         nearest = int(np.argmin(distances)) if distances else -1
         if distances and distances[nearest] < APART:
             del self._kept[nearest]
@@ -52,53 +73,84 @@ class Keyframes:
             del self._kept[0]
         self._kept.append(_Keyframe(observation, view.depth))
 
-    def find(self, observation: Observation) -> F64 | None:
-        """`T_world_cam` [4, 4] from which the picture was taken, by the keyframe with most matching features
-        that agree (ORB; perspective from points in RANSAC); None: it shows none of them."""
-        pixels, features = self._features(observation.gray, observation.tissue)
+    def find(self, observation: Observation) -> list[F64]:
+        """`T_world_cam` [4, 4] from which the picture may have been taken: one for each keyframe that
+        shows some of it, that with most matching features that agree first (ORB; perspective from points in
+        RANSAC)."""
+        pixels, features = _features(observation.gray, observation.tissue)
         if features is None:
-            return None
-        best: tuple[int, F64] | None = None
-        for keyframe in self._kept:
-            found = self._pose_from(keyframe, pixels, features, observation.camera)
-            if found is not None and (best is None or found[0] > best[0]):
+            return []
+        found = [_pose_from(each, pixels, features, observation.camera) for each in self._kept]
+        poses = [pose for pose in found if pose is not None]
+        return [pose for _, pose in sorted(poses, key=lambda pose: pose[0], reverse=True)]
+
+    def agree(self, observation: Observation) -> Agreement | None:
+        """How well a frame agrees with the better of the nearest keyframes, where its pose says that their
+        tissue is; None: it shows too little of them."""
+        frame = small_frame(observation)
+        near = sorted(self._kept, key=lambda each: distance(observation.camera, each.observation.camera))
+        best: Agreement | None = None
+        for keyframe in near[:WITNESSES]:
+            found = _warped(*keyframe.small, frame, observation)
+            if found is not None and (best is None or found.rank > best.rank):
                 best = found
-        return None if best is None else best[1]
-
-    def _pose_from(
-        self, keyframe: _Keyframe, pixels: F32, features: U8, camera: Camera
-    ) -> tuple[int, F64] | None:
-        there = keyframe.observation
-        known = there.tissue & (keyframe.depth > 0)
-        places, described = self._features(there.gray, known)
-        if described is None:
-            return None
-        pairs = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(described, features, k=2)
-        good = [p[0] for p in pairs if len(p) == 2 and p[0].distance < DISTINCT * p[1].distance]
-        if len(good) < LEAST_MATCHES:
-            return None
-        ours = places[[match.queryIdx for match in good]]
-        columns, rows = np.rint(ours).astype(np.intp).T
-        points = unproject(there.camera, ours.astype(np.float64), keyframe.depth[rows, columns].astype(float))
-        found, rotation, translation, inliers = cv2.solvePnPRansac(
-            points, pixels[[match.trainIdx for match in good]].astype(np.float64), camera.K, None,
-            reprojectionError=REPROJECTION * camera.width, iterationsCount=300,
-        )  # fmt: skip
-        if not found or inliers is None or len(inliers) < LEAST_MATCHES:
-            return None
-        view = np.eye(4)
-        view[:3, :3], view[:3, 3] = cv2.Rodrigues(rotation)[0], translation[:, 0]
-        return len(inliers), invert(view)
-
-    def _features(self, gray: U8, where: Bool) -> tuple[F32, U8 | None]:
-        """Pixels [F, 2] and descriptors [F, 32], None where there are fewer than needed."""
-        corners, described = self._orb.detectAndCompute(gray, where.view(np.uint8))
-        if described is None or len(corners) < LEAST_MATCHES:
-            return np.zeros((0, 2), np.float32), None
-        return np.array([corner.pt for corner in corners], np.float32), np.asarray(described)
+        return best
 
 
-def _distance(a: Camera, b: Camera) -> float:
+def _warped(there: Small, points: F32, frame: Small, observation: Observation) -> Agreement | None:
+    """Of a frame with a keyframe, pixel by pixel of the keyframe."""
+    step = observation.gray.shape[1] // frame.gray.shape[1]
+    height, width = frame.gray.shape
+    pixels, depth = project(observation.camera, points)
+    places = np.nan_to_num((pixels - np.float32(0.5 * (step - 1))) / np.float32(step), nan=-1.0)
+    places = np.asarray(places, np.float32)
+    inside = there.where & (places >= 0).all(-1) & (places <= [width - 1, height - 1]).all(-1)
+    known = int(np.count_nonzero(there.where))
+    if known == 0 or int(np.count_nonzero(inside)) < LEAST_OVERLAP * known:
+        return None
+
+    def at(picture: F32, how: int) -> F32:
+        return np.asarray(cv2.remap(picture, places, None, how))
+
+    tissue = at(frame.where.astype(np.float32), cv2.INTER_NEAREST) > 0
+    found = Small(at(frame.gray, cv2.INTER_LINEAR), at(frame.depth, cv2.INTER_NEAREST), inside & tissue)
+    expected = replace(there, depth=np.where(inside, depth, 0).astype(np.float32), where=inside)
+    return agreement(expected, found, observation.camera, observation.baseline)
+
+
+def _pose_from(keyframe: _Keyframe, pixels: F32, features: U8, camera: Camera) -> tuple[int, F64] | None:
+    there = keyframe.observation
+    places, described = keyframe.features
+    if described is None:
+        return None
+    pairs = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(described, features, k=2)
+    good = [p[0] for p in pairs if len(p) == 2 and p[0].distance < DISTINCT * p[1].distance]
+    if len(good) < LEAST_MATCHES:
+        return None
+    ours = places[[match.queryIdx for match in good]]
+    columns, rows = np.rint(ours).astype(np.intp).T
+    points = unproject(there.camera, ours.astype(np.float64), keyframe.depth[rows, columns].astype(float))
+    found, rotation, translation, inliers = cv2.solvePnPRansac(
+        points, pixels[[match.trainIdx for match in good]].astype(np.float64), camera.K, None,
+        reprojectionError=REPROJECTION * camera.width, iterationsCount=300,
+    )  # fmt: skip
+    if not found or inliers is None or len(inliers) < LEAST_MATCHES:
+        return None
+    view = np.eye(4)
+    view[:3, :3], view[:3, 3] = cv2.Rodrigues(rotation)[0], translation[:, 0]
+    return len(inliers), invert(view)
+
+
+def _features(gray: U8, where: Bool) -> tuple[F32, U8 | None]:
+    """Pixels [F, 2] and descriptors [F, 32], None where there are fewer than needed."""
+    orb = cv2.ORB.create(FEATURES, fastThreshold=FAST_THRESHOLD)
+    corners, described = orb.detectAndCompute(gray, where.view(np.uint8))
+    if described is None or len(corners) < LEAST_MATCHES:
+        return np.zeros((0, 2), np.float32), None
+    return np.array([corner.pt for corner in corners], np.float32), np.asarray(described)
+
+
+def distance(a: Camera, b: Camera) -> float:
     """How far apart two cameras are, m: what they look at shifts by about as much."""
     motion = invert(a.T_world_cam) @ b.T_world_cam
     turn = cv2.Rodrigues(motion[:3, :3])[0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,7 +20,8 @@ from sags_node.mapping.split import split_worst
 from sags_node.model.alias_free import smoothing_variances
 from sags_node.model.deformation import NodeDeformation
 from sags_node.model.gaussians import GaussianModel
-from sags_node.types import F32, U8, Bool, Observation, RenderedView, Snapshot
+from sags_node.model.light import carried, is_near
+from sags_node.types import F32, F64, U8, Bool, Camera, Gaussians, Observation, RenderedView, Snapshot
 from sags_node.vision.flow import OpticalFlow
 from sags_node.vision.observe import resized
 from sags_node.vision.pyramid import pyramid_of
@@ -48,6 +50,15 @@ class Drawn:
 
     observation: Observation
     view: RenderedView
+
+
+@dataclass(frozen=True, slots=True)
+class Learnt:
+    """A copy of the model and of how it moves, to go back to."""
+
+    model: GaussianModel
+    deformation: NodeDeformation | None
+    lamp: F64 | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +101,7 @@ class Mapper:
         self._focus = focus
         self.pace(unhurried)
         self._deformation: NodeDeformation | None = None
+        self._lamp: F64 | None = None  # T_world_cam of the scope whose light the colours show
         self._last: Drawn | None = None
         self._found: tuple[U8, F32] | None = None  # a picture, and the pixels where the Gaussians are in it
         self._view: RenderedView | None = None  # the model as it was drawn last
@@ -155,6 +167,33 @@ class Mapper:
         self._last = None
         self.restarts += 1
 
+    def learnt(self) -> Learnt:
+        """What is known now."""
+        return Learnt(*deepcopy((self.model, self._deformation)), self._lamp)
+
+    def go_back(self, learnt: Learnt) -> None:
+        """Forget what was learnt since. The next frame's motion has nothing to start from (`start_from`)."""
+        learnt.model.never_reuse(self.model)
+        self.model, self._deformation, self._lamp = learnt.model, learnt.deformation, learnt.lamp
+        self.start_from(None)
+
+    def lit_from(self, camera: Camera) -> Gaussians:
+        """The model as the scope's light shows it when its left eye is there; views, for drawing now."""
+        gaussians, lamp = self.model.gaussians(), self._lamp
+        if lamp is None or self._deformation is None or np.array_equal(lamp, camera.T_world_cam):
+            return gaussians
+        model, normals = self.model, self._deformation.normals(lamp[:3, 3])
+        colors = carried(
+            model.colors, model.means, normals, model.node_index, model.node_weight, lamp, camera.T_world_cam
+        )
+        return replace(gaussians, colors=colors)
+
+    def _move_light(self, camera: Camera) -> None:
+        """Let the colours be those that the scope's light shows from where it is now."""
+        if self._lamp is None or not is_near(self._lamp, camera.T_world_cam):
+            self.model.colors[:] = self.lit_from(camera).colors
+            self._lamp = camera.T_world_cam
+
     def found_again(self, observation: Observation, shift: tuple[float, float] = (0.0, 0.0)) -> F32:
         """Pixels [N, 2] where the Gaussians are found in a frame that is not taken in yet, see
         `motion.found_again`; all NaN where there is no frame before.
@@ -194,6 +233,7 @@ class Mapper:
         rows = initialise.insert(self.model, drawn, pixels, depths, errors, spacing, self._smoothing)
         self._deformation = NodeDeformation(self.model.means, CONTROL_NODES)
         self._deformation.attach(self.model, rows)
+        self._lamp = observation.camera.T_world_cam
         self._begin(drawn)
         self._first_steps = 0
         while self._first_steps < FIRST_STEPS and budget.more_at_first(self._first_steps):
@@ -208,6 +248,7 @@ class Mapper:
     def _follow(self, observation: Observation, budget: Budget) -> dict[str, int]:
         assert self._deformation is not None
         self._predict(observation)
+        self._move_light(observation.camera)
         limit = self._limit(budget)
         removed = self.model.remove(densify.doomed(self.model, observation, limit))
         removed += densify.shed(self.model, limit)

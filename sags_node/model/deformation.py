@@ -10,7 +10,7 @@ from numba import prange
 
 from sags_node.kernels.jit import PIECE, inlined, kernel, parallel_kernel
 from sags_node.model.gaussians import NEIGHBOURS, GaussianModel
-from sags_node.types import F32, I32, I64
+from sags_node.types import F32, F64, I32, I64
 
 _SMOOTHING_ROUNDS = 3  # how far, in nodes, motion spreads into hidden tissue per frame
 _LEAST_SEEN = 0.5  # weight of what was seen around a node: below it nothing is known of it
@@ -94,6 +94,16 @@ class NodeDeformation:
         motion = (-step * self._momentum / (size + 1e-12)).astype(np.float32)
         self.nodes += motion
         _skin(motion, model.node_index, model.node_weight, model.means)
+
+    def normals(self, towards: F64) -> F32:
+        """Unit normals [M, 3] of the tissue at the nodes, to the side of a place [3] (m, world): of the plane
+        through each node's neighbours."""
+        around = self.nodes[self._neighbours] - self.nodes[:, None]
+        spread = np.einsum("mka,mkb->mab", around, around)
+        normals = np.linalg.eigh(spread)[1][:, :, 0]
+        away = np.einsum("ma,ma->m", normals, towards.astype(np.float32) - self.nodes) < 0
+        normals[away] *= -1
+        return np.asarray(normals, np.float32)
 
     def _add_nodes(self, nodes: F32) -> None:
         zeros = np.zeros_like(nodes)

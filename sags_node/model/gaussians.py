@@ -98,6 +98,10 @@ class GaussianModel:
         for name, values in self._rows.items():
             values[rows] = self._new_ids(len(rows)) if name == "ids" else values[others]
 
+    def never_reuse(self, later: GaussianModel) -> None:
+        """Give new ids after those of a model that was in use since this one."""
+        self._next_id = max(self._next_id, later._next_id)
+
     def clear(self) -> None:
         """Forget all rows; ids go on."""
         self.count = 0

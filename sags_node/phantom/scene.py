@@ -64,10 +64,12 @@ class Phantom:
         self._tracks = self._tissue.track_indices(tracks, self._half_view, TRACKS)
         self._cloud = fractal_noise(smoke, (512, 512), 70, 4)
 
-    def frame(self, index: int, count: int) -> PhantomFrame:
-        """Frame `index` of a session of `count` frames."""
+    def frame(self, index: int, count: int, T_world_cam: F64 | None = None) -> PhantomFrame:
+        """Frame `index` of a session of `count` frames; `T_world_cam` [4, 4]: where the scope is then, if not
+        on its path."""
         phase = index / count
-        T_world_cam = scope_pose(phase, self._config.camera_motion)
+        if T_world_cam is None:
+            T_world_cam = scope_pose(phase, self._config.camera_motion)
         vertices = self._tissue.vertices(0.0 if self._config.still_tissue else phase)
         hook_view = HOOK_DEPTH * np.array(self._half_view)
         tools = self._instruments.mesh(self._clock.action(phase), self._tissue.grip(vertices), hook_view)
