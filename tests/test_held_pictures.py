@@ -16,7 +16,7 @@ from sags_node.session import Session, open_session
 from sags_node.types import U8, FrameResult, StereoFrame
 
 SESSION = Path(__file__).parent.parent / "replay/phantom_pull"
-FIRST, COUNT, ALL = 8, 8, 26  # frames, at 10 Hz
+FIRST, COUNT, AFTER = 8, 8, 11  # frames, at 10 Hz: before, with the fault, and until the tenth after it
 WITHIN = 5  # frames: half a second
 
 
@@ -28,7 +28,7 @@ def session() -> Session:
 @pytest.fixture(scope="module")
 def frames(session: Session) -> list[StereoFrame]:
     with session.source as source:
-        return [frame for frame, _ in zip(source, range(ALL), strict=False)]
+        return [frame for frame, _ in zip(source, range(FIRST + COUNT + AFTER), strict=False)]
 
 
 def both(frame: StereoFrame, change: Callable[[U8], np.ndarray]) -> StereoFrame:

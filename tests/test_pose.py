@@ -225,7 +225,7 @@ def test_instruments_in_nearly_half_of_the_picture_do_not_pull_the_pose(still: P
 
 def test_after_a_blackout_of_a_second_the_same_model_goes_on(deforming: Path) -> None:
     session, frames = opened(deforming)
-    first, last = 8, 8 + round(RATE)
+    first, last = 4, 4 + round(RATE)
     dark = [
         replace(frame, left=np.zeros_like(frame.left), right=np.zeros_like(frame.left))
         for frame in frames[first:last]
@@ -253,18 +253,14 @@ def test_after_a_blackout_of_a_second_the_same_model_goes_on(deforming: Path) ->
 def test_another_scene_begins_a_new_model_at_the_last_pose(still: Path) -> None:
     session, frames = opened(still)
     assert frames[0].right is not None
-    upside_down = replace(
-        frames[0],
-        left=255 - frames[0].left[::-1].copy(),
-        right=255 - frames[0].right[::-1].copy(),
-        tissue=np.ones(frames[0].left.shape[:2], bool),
-    )
+    tissue = np.ones(frames[0].left.shape[:2], bool)
+    other = replace(frames[0], left=255 - frames[0].left, right=255 - frames[0].right, tissue=tissue)
     pipeline, before = play(session, frames[:4])
     budget = StepBudget(1)
     # The first frame finds the camera lost, the next is the first of those that show something else.
     stamps = frames[4].t_capture_ns + np.arange(0, GIVE_UP_NS + 2e9 / RATE, 1e9 / RATE).astype(np.int64)
     results = [
-        pipeline.process(replace(upside_down, frame_id=4 + k, t_capture_ns=int(stamp)), budget)
+        pipeline.process(replace(other, frame_id=4 + k, t_capture_ns=int(stamp)), budget)
         for k, stamp in enumerate(stamps)
     ]
     given_up = int(np.searchsorted(stamps - stamps[1], GIVE_UP_NS))

@@ -15,6 +15,7 @@ from sags_node.calibration import rectified_rig
 from sags_node.engine.rasterize import make_rasterizer, to_view
 from sags_node.evaluation.metrics import psnr
 from sags_node.launch_file import load_launch
+from sags_node.mapping import mapper
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.mapper import SETTLED, SETTLED_EVERY
 from sags_node.mapping.refiner import CpuRefiner
@@ -22,7 +23,6 @@ from sags_node.messaging.content import tells_of
 from sags_node.pipeline import Pipeline
 from sags_node.session import Session, open_session
 from sags_node.types import F32, Camera, FrameResult, RectifiedPair, RenderedView, StereoFrame
-from sags_node.vision import scene_watch
 from sags_node.vision.change import StillScene
 from sags_node.vision.flow import OpticalFlow
 from sags_node.vision.scene_watch import NEW_SCENE_NS
@@ -179,20 +179,24 @@ class Player:
 
 @pytest.fixture
 def calls(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
-    """How often depth and flow were asked for; that of the watch on the scene does not count."""
+    """How often depth was asked for, and the mapper's flow."""
     counts = {"depth": 0, "flow": 0}
 
     def count(owner: type, name: str) -> None:
         original = owner.__call__
 
         def counted(*arguments: Any) -> Any:
-            counts[name] += arguments[0] is not scene_watch._FLOW
+            counts[name] += 1
             return original(*arguments)
 
         monkeypatch.setattr(owner, "__call__", counted)
 
+    class Flow(OpticalFlow):
+        """That of the mapper; the watches have their own, of smaller pictures."""
+
+    monkeypatch.setattr(mapper, "OpticalFlow", Flow)
     count(StereoDepth, "depth")
-    count(OpticalFlow, "flow")
+    count(Flow, "flow")
     return counts
 
 

@@ -11,20 +11,10 @@ import numpy as np
 from sags_node.confidence import error_of
 from sags_node.types import F32, F64, I64, Bool
 
-PREDICTED_MM = (
-    0.0,
-    0.5,
-    1.0,
-    1.5,
-    2.0,
-    3.0,
-    4.0,
-    6.0,
-    8.0,
-    12.0,
-    18.1,
-)  # edges of the groups; 3: confidence 0.5
+# Edges of the groups; 3: confidence 0.5.
+PREDICTED_MM = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 18.1)
 STEP_MM, MOST_MM = 0.05, 40.0  # of the real errors, which are counted and not kept
+LEAST_SHARE = 5e-3  # of all pixels: the percentiles of a smaller group say nothing
 SURE_GROUPS = PREDICTED_MM.index(3.0)  # below it: confidence of at least `SURE`
 
 
@@ -47,10 +37,12 @@ def tally(depth: F32, confidence: F32, truth: F32, tissue: Bool) -> I64:
 
 def figures(tallies: Sequence[I64]) -> dict[str, Any]:
     """Of all frames: how much is sure (confidence of at least 0.5, so 3 mm) and how right that is, and for
-    each group of predicted errors its share and the real ones."""
+    each group of predicted errors its share and the real ones. A group below `LEAST_SHARE` counts as
+    empty."""
     counts = np.sum(tallies, axis=0)
     total = max(int(counts.sum()), 1)
     sure = counts[:SURE_GROUPS].sum(0)
+    counts[counts.sum(1) < LEAST_SHARE * total] = 0
     return {
         "sure_share": float(sure.sum() / total),
         "sure_p90_mm": _percentile(sure, 0.9),
