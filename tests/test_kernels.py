@@ -12,6 +12,7 @@ from sags_node.engine.pinhole import pack
 from sags_node.mapping import densify, motion, optimiser, split
 from sags_node.model import deformation
 from sags_node.types import Camera
+from sags_node.vision.depth_grid import depth_grid
 
 N, WIDTH, HEIGHT = 3000, 160, 120
 
@@ -96,12 +97,14 @@ def test_candidates(scene: dict[str, np.ndarray]) -> None:
     rng = np.random.default_rng(6)
     planes = rng.random((5, HEIGHT, WIDTH)).astype(np.float32)
     image = rng.random((HEIGHT, WIDTH, 3)).astype(np.float32)
-    pixels, depths = np.zeros((2, 400, 2), np.int32), np.zeros((2, 400), np.float32)
-    arguments = (planes, image, scene["tissue"], scene["depth"], True, 1)
-    count = densify._candidates(*arguments, pixels[0], depths[0])
-    assert count == densify._candidates.py_func(*arguments, pixels[1], depths[1]) == 400
+    grid = depth_grid(scene["depth"], np.ones_like(scene["depth"]), scene["tissue"], 150.0, 4e-3)
+    pixels, (depths, errors) = np.zeros((2, 400, 2), np.int32), np.zeros((2, 2, 400), np.float32)
+    arguments = (planes, image, scene["tissue"], scene["depth"], grid.inverse, grid.error,
+                 np.float32(grid.side), 1)  # fmt: skip
+    count = densify._candidates(*arguments, pixels[0], depths[0], errors[0])
+    assert count == densify._candidates.py_func(*arguments, pixels[1], depths[1], errors[1]) == 400
     assert np.array_equal(pixels[0], pixels[1])
-    assert np.array_equal(depths[0], depths[1])
+    assert np.allclose(depths[0], depths[1], rtol=1e-6) and np.allclose(errors[0], errors[1], rtol=1e-5)
 
 
 def test_optimiser_step(scene: dict[str, np.ndarray]) -> None:

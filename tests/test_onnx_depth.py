@@ -29,7 +29,9 @@ from sags_node.vision.mono_scale import fit_scale_shift
 from sags_node.vision.onnx_network import DepthNetwork
 from sags_node.vision.onnx_session import DepthNetworkError
 from sags_node.vision.onnx_test_pair import make_pair
+from sags_node.vision.pair_watch import PairWatch, Verdict
 from sags_node.vision.rectify import Rectifier
+from sags_node.vision.scene_watch import Advice, SceneWatch
 from sags_node.vision.stereo import StereoDepth
 
 WIDTH, HEIGHT = 320, 256
@@ -273,6 +275,7 @@ def depth_error(result: FrameResult, frame: StereoFrame) -> tuple[float, float]:
 
 
 def dark(frame: StereoFrame) -> StereoFrame:
+    """Where a network of these tests fails; see `unwatched`."""
     assert frame.right is not None
     return replace(frame, left=frame.left // 8, right=frame.right // 8)
 
@@ -290,6 +293,14 @@ def test_a_network_replaces_the_matcher(
         assert ((confidence > 0) <= (result.observation.depth > 0)).all() and confidence.max() <= 1
 
 
+@pytest.fixture
+def unwatched(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Dark pictures are taken in: else no network would ever see one."""
+    monkeypatch.setattr(PairWatch, "__call__", lambda self, frame, pair: Verdict())
+    monkeypatch.setattr(SceneWatch, "__call__", lambda self, pair, last, veiled: Advice())
+
+
+@pytest.mark.usefixtures("unwatched")
 @pytest.mark.parametrize(("fault", "words"), [("nan", "not finite"), ("error", "failed: .*(Gather|indices)")])
 def test_where_it_fails_the_matcher_takes_over_and_says_so(
     fault: str, words: str, phantom_session: Path, frames: list[StereoFrame], tmp_path: Path,
@@ -302,10 +313,10 @@ def test_where_it_fails_the_matcher_takes_over_and_says_so(
     failed = [bool(result.skipped.get("network")) for result in results]
     assert failed == [False, True, False, True, True, True, True, True]  # the last: not tried any more
     result = results[1]
-    assert np.array_equal(
-        result.observation.depth, pipeline.stereo(result.pair, result.observation.tissue)[0]
-    )
-    assert result.observation.depth.any()
+    matched, _ = pipeline.stereo(result.pair, result.observation.tissue)
+    kept = result.observation.depth > 0  # all but specks
+    assert np.array_equal(result.observation.depth[kept], matched[kept])
+    assert np.count_nonzero(kept) > 0.95 * np.count_nonzero(matched)
     statistics = Statistics()
     statistics.add(result, 1.0, {})
     health = statistics.health(
@@ -319,6 +330,7 @@ def test_where_it_fails_the_matcher_takes_over_and_says_so(
     assert "3 times in a row: not tried again" in results[-1].skipped["network"]
 
 
+@pytest.mark.usefixtures("unwatched")
 def test_without_fallback_a_failure_ends_the_run(
     phantom_session: Path, frames: list[StereoFrame], tmp_path: Path
 ) -> None:
@@ -489,7 +501,7 @@ def test_a_recording_of_one_camera_is_played(
         assert result.pair.right is None and not result.skipped
         assert np.median(depth[depth > 0]) == pytest.approx(0.07, rel=0.02)
         assert len(result.snapshot.gaussians) > 200
-    with pytest.raises(UsageError, match=r"source\.right is missing; .*vision\.onnx\.path"):
+    with pytest.raises(UsageError, match=r"source\.right is missing: .*vision\.onnx\.path"):
         open_session(launch, ["vision.onnx.path:=null"])
     with pytest.raises(UsageError, match=r"publish\.right: there is no right eye"):
         open_session(launch, ["publish.right:=true"])

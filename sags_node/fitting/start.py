@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from sags_node.engine.rasterize import Rasterizer
@@ -31,6 +32,7 @@ from sags_node.types import F32, I64, Bool, Gaussians
 POOLED_SHARE = 0.01  # of a frame's pixels
 FIRST_OPACITY = 0.1
 ONLINE_STEPS = 2  # of the mapper per frame
+CUT = 0.08  # mean difference of two frames, 0..1; a beating heart stays below half of it
 PATH_POINTS = 8192  # Gaussians per step of the regression
 PATH_STEPS = 1500
 FRAMES_PER_SLOT = 3  # training frames from one time of the paths to the next
@@ -102,6 +104,13 @@ def _nearest(points: F32, queries: F32, count: int) -> tuple[I64, F32]:
     return found.numpy(), squared.numpy()
 
 
+def _is_cut(before: ClipFrame, after: ClipFrame) -> bool:
+    """Whether two frames show different scenes. Every eighth pixel is enough."""
+    both = (before.tissue & after.tissue)[::8, ::8]
+    apart = cv2.absdiff(before.image, after.image)[::8, ::8][both]
+    return bool(apart.size > 0 and apart.mean() > CUT * 255)
+
+
 def follow_online(
     clip: Clip, rasterizer: Rasterizer, exposure: Exposure, settings: FitSettings, progress: Progress
 ) -> tuple[F32, Paths]:
@@ -121,6 +130,8 @@ def follow_online(
     first = _Places()
     for done, frame in enumerate(clip.train):
         observation = frame.observation()
+        if done and _is_cut(clip.train[done - 1], frame):
+            mapper.restart()
         budget.start()
         mapper.update(observation, budget)
         gaussians = mapper.model.gaussians()  # before the 3D filter: the fit applies its own

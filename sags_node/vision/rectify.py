@@ -7,7 +7,7 @@ import numpy as np
 
 from sags_node import geometry
 from sags_node.calibration import rectified_camera
-from sags_node.errors import SagsError
+from sags_node.errors import SagsError, UsageError
 from sags_node.types import F32, F64, U8, Bool, Camera, Eye, RectifiedPair, StereoFrame, StereoRig
 from sags_node.vision.pyramid import gray_pyramid
 
@@ -89,12 +89,18 @@ class Rectifier:
 
         Raises:
             SagsError: the pictures do not have the calibration's size.
+            UsageError: the pose is none.
         """
         self._check(frame.left, "left")
         if frame.right is not None:
             self._check(frame.right, "right")
         camera = self.camera
         if frame.T_world_cam is not None:
+            if not np.isfinite(frame.T_world_cam).all():
+                number = frame.frame_id
+                raise UsageError(
+                    f"the pose of frame {number} holds NaN or infinity; check the source's poses"
+                )
             camera = Camera(camera.width, camera.height, camera.K, frame.T_world_cam)
         left = self._left.image(frame.left)
         right = None if frame.right is None else self._right.image(frame.right)
