@@ -57,7 +57,8 @@ def collect(endpoint: str, topics: Sequence[str], count: int, timeout: float) ->
                 continue
             topic, meta, *parts = socket.recv_multipart()
             message = Received(topic.decode(), msgpack.unpackb(meta), parts)
-            if len(received[message.topic]) < count:
+            # A subscription is a prefix: that to a depth brings its confidence too.
+            if message.topic in received and len(received[message.topic]) < count:
                 received[message.topic].append(message)
     finally:
         context.destroy(linger=0)

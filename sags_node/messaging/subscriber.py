@@ -78,7 +78,7 @@ class Receiver:
         self._arrived = threading.Condition()
         self._wakes: list[Callable[[], None]] = []
         self._stopping = threading.Event()
-        self._prefixes = {topics.full_name(ns, name): name for name in self._kept}
+        self._names = {topics.full_name(ns, name): name for name in self._kept}
         self._find = partial(find_data, endpoint, ns, run_dir, keys)
         self._resources = ExitStack()  # holds the socket; only the receiver thread uses it once it runs
         self._connect(self._find())
@@ -197,7 +197,7 @@ class Receiver:
 
     def _connect(self, address: Address) -> None:
         resources = ExitStack()
-        self._socket, self._watch = resources.enter_context(data_socket(address, list(self._prefixes)))
+        self._socket, self._watch = resources.enter_context(data_socket(address, list(self._names)))
         self._resources.close()
         self._resources, self._address = resources, address
 
@@ -223,8 +223,10 @@ class Receiver:
     def _receive_one(self) -> None:
         try:
             message = receive(self._socket)
-            name = self._prefixes.get(message.topic)
-            if name is None or message.meta.type != self._types[name]:
+            name = self._names.get(message.topic)
+            if name is None:  # a subscription is a prefix: that to a depth brings its confidence too
+                return
+            if message.meta.type != self._types[name]:
                 raise WireError(f"{message.topic}: not what was subscribed to")
             received = interpret(message, self._clock_ns())
         except WireError:
