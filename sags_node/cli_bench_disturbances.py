@@ -56,7 +56,7 @@ def bench_disturbances(
     pictures: Path | None,
     json_out: str | None,
 ) -> None:
-    """What the node makes of pictures that something is wrong with.
+    """What bad pictures do to the node.
 
     Plays a recording with both eyes, by default the built-in phantom, once for each disturbance, frame by
     frame with one step of the mapper: undisturbed, disturbed for a second, undisturbed again. The picture is

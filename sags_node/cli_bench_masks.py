@@ -22,7 +22,7 @@ from sags_node.apps.terminal import progress, show
 @table_option
 @as_json
 def bench_masks(launch: tuple[str, ...], out: Path | None, json_out: bool) -> None:
-    """How right masks are that were not given, and what they are worth.
+    """How right masks are that were found, and what they bring.
 
     Plays recordings that have masks of their own, by default the built-in phantom, once with these, once with
     those found without them (classical), once with none, and with a network's where vision.tissue.path is
