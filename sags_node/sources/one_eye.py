@@ -1,4 +1,8 @@
-"""One eye that is fed to both inputs: no depth can come of it, so nothing should begin with it."""
+"""One eye for both inputs of a recording: no depth can come of it, so nothing should begin with it.
+
+Live cameras are not refused: both may send a test picture until the scope is plugged in. There the watch on
+both eyes warns (`eyes_equal`).
+"""
 
 from __future__ import annotations
 
@@ -14,7 +18,7 @@ LEAST = 1.0  # grey levels, of such a shift: less is a picture of nothing, which
 
 
 def refuse_one_eye_twice(left: U8, right: U8 | None) -> None:
-    """Look at the first pair [H, W, 3] of a source.
+    """Look at the first pair [H, W, 3] of a recording.
 
     Raises:
         UsageError: both pictures are surely of the same eye.

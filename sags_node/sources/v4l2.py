@@ -16,7 +16,6 @@ from typing import Protocol, Self
 from sags_node.config import V4l2Source
 from sags_node.errors import SagsError, UsageError
 from sags_node.sources.device import Device, Picture
-from sags_node.sources.one_eye import refuse_one_eye_twice
 from sags_node.sources.pairing import Pairing
 from sags_node.sources.videos import side_by_side_boxes
 from sags_node.types import StereoFrame
@@ -104,12 +103,8 @@ class StereoCameras:
             self._arrived.notify_all()
 
     def __iter__(self) -> Iterator[StereoFrame]:
-        """Pairs as they arrive, until `stop`; silent while a camera is away.
-
-        Raises:
-            UsageError: both cameras begin with the same picture.
-        """
-        epoch, last_ns, first = 0, 0, True
+        """Pairs as they arrive, until `stop`; silent while a camera is away."""
+        epoch, last_ns = 0, 0
         while True:
             with self._arrived:
                 while (pair := self._pairing.take()) is None and not self._stopped.is_set():
@@ -119,9 +114,6 @@ class StereoCameras:
             frame_id, left, right = pair
             epoch += left.t_ns < last_ns
             last_ns = left.t_ns
-            if first:
-                refuse_one_eye_twice(left.image, right.image)
-            first = False
             yield StereoFrame(frame_id, left.t_ns, right.t_ns, left.image, right.image, epoch)
 
     def _put_left(self, picture: Picture) -> None:
