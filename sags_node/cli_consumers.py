@@ -130,7 +130,10 @@ def topic_list(endpoint: str | None, ns: str, seconds: float, json_out: bool, ke
 def topic_echo(
     name: str, endpoint: str | None, ns: str, count: int | None, json_out: bool, keys: Any
 ) -> None:
-    """Print the messages of topic NAME; bulk data as shape and range, warnings on stderr."""
+    """Print the messages of topic NAME, bulk data as shape and range.
+
+    Warnings of its sender go to stderr.
+    """
     from sags_node.apps import topic as tool
     from sags_node.apps.notices import Notices
 

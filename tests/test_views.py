@@ -17,6 +17,7 @@ from test_node import START_SECONDS, RunningNode
 
 from sags_node.engine.rasterize import rasterize
 from sags_node.errors import SagsError
+from sags_node.mapping.ladder import RUNGS
 from sags_node.messaging.control import ControlClient
 from sags_node.messaging.requests import AnchorRequest, ViewRequest, parse
 from sags_node.types import Camera, Gaussians
@@ -24,6 +25,7 @@ from sags_node.views import LEAST_SHARE, MAX_VIEWS, SHARE, Views, view_camera
 
 pytestmark = pytest.mark.live
 
+WHOLE = next(number for number, rung in enumerate(RUNGS) if rung.scale == 1)
 ANCHOR_FIELDS = ["x", "y", "z", "id", "u", "v", "visibility", "age", "confidence"]
 CLOSE_UP = [[0.995, 0, 0.1, -0.003], [0, 1, 0, 0.002], [-0.1, 0, 0.995, 0.012], [0, 0, 0, 1]]
 
@@ -33,8 +35,10 @@ CLOSE_UP = [[0.995, 0, 0.1, -0.003], [0, 1, 0, 0.002], [-0.1, 0, 0.995, 0.012], 
 
 @pytest.fixture(scope="module")
 def node(phantom_session: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningNode]:
-    # No frame is left out, so what is shown does not depend on how busy the machine is.
-    running = RunningNode(phantom_session, tmp_path_factory.mktemp("node"), "source.pace:=fast")
+    # No frame is left out and the rung is given, so what is shown does not depend on how busy the machine is.
+    # On this rung the node's renders are drawn at full size, as views always are.
+    options = ["source.pace:=fast", f"mapping.rung:={WHOLE}"]
+    running = RunningNode(phantom_session, tmp_path_factory.mktemp("node"), *options)
     yield running
     assert running.stop() == 0, running.said()
 

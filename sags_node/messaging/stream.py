@@ -80,15 +80,16 @@ def listen(
     Topics may be named with or without `ns`; naming none means all. Up to `high_water` messages wait when the
     caller is slow.
 
-    Yields None at least every `POLL_MS` while nothing arrives, so that a caller can keep time. What is no
-    message is left out.
+    Yields None at least every `POLL_MS` while none of them arrives, so that a caller can keep time. What
+    is no message is left out.
 
     Raises:
         UsageError: an unknown topic.
         SagsError: no endpoint is known, or the node refuses this client.
     """
     known = [check_topic(name.lstrip("/").removeprefix(f"{ns}/")) for name in names]
-    prefixes = [topics.full_name(ns, topic.name) for topic in known] or [f"{ns}/"]
+    wanted = {topics.full_name(ns, topic.name) for topic in known}
+    prefixes = sorted(wanted) or [f"{ns}/"]
     deadline = None if seconds is None else time.monotonic() + seconds
     address = find_data(endpoint, ns, run_dir, keys)
     with data_socket(address, prefixes, high_water) as (socket, watch):
@@ -99,6 +100,8 @@ def listen(
                 yield None
                 continue
             try:
-                yield receive(socket), time.time_ns()
+                message = receive(socket)
             except wire.WireError:
                 continue
+            # A subscription is a prefix: that to a depth brings its confidence too.
+            yield None if wanted and message.topic not in wanted else (message, time.time_ns())
