@@ -18,7 +18,7 @@ SURE = 0.5  # of confidence, with which a depth may decide something
 FAINTEST = 1e-30  # of confidence: 0.3 m
 
 
-def confidence_of(error: F32 | F64) -> F32:
+def confidence_of(error: F32 | F64 | np.float32) -> F32:
     """Confidence 0..1 of depths with predicted errors (m)."""
     return np.asarray(np.exp2(-error / HALVING), np.float32)
 

@@ -9,12 +9,15 @@ from dataclasses import replace
 
 import numpy as np
 
+from sags_node.confidence import HALVING, confidence_of
 from sags_node.config import LaunchConfig
+from sags_node.engine.confidence import doubted
 from sags_node.engine.rasterize import to_view
 from sags_node.findings import Findings, by_stage
 from sags_node.mapping.anchors import Anchors
 from sags_node.mapping.budget import Budget
 from sags_node.mapping.camera_tracker import CameraTracker
+from sags_node.mapping.depth_memory import UNWATCHED
 from sags_node.mapping.devices import affordable, make_budget, make_refiner
 from sags_node.mapping.mapper import Mapped, Mapper
 from sags_node.types import (
@@ -45,6 +48,7 @@ from sags_node.vision.tissue_topic import NearestMask
 
 UNHURRIED_MS = 60.0  # a budget that has room for several steps and a finer flow
 FARTHEST = 10.0  # m: what a session says to be beyond is no depth
+NOTICED_LATE = HALVING  # m: what was measured before matches are found to be wrong may be wrong by so much
 DUPLICATE_RMS = 0.6  # grey levels: below a video codec's own noise (PSNR > 52 dB)
 
 
@@ -91,6 +95,7 @@ class Pipeline:
         self._scene = SceneWatch(moving=vision.pose == "estimate")
         self._unmatched = ""  # why what was measured last is no depth; empty: it is
         self._mapped: FrameResult | None = None  # the last frame that was really mapped
+        self._unwatched = 0.0  # m: how far tissue may have moved in frames that were held since
 
     def reset(self) -> None:
         """Forget the model; the next frame makes a new one, in a new epoch."""
@@ -98,6 +103,7 @@ class Pipeline:
         self._scene.forget()
         self._still.forget()
         self._mapped = None
+        self._unwatched = 0.0
 
     @property
     def newest(self) -> FrameResult | None:
@@ -176,18 +182,20 @@ class Pipeline:
                 depth, confidence = np.zeros((2, *tissue.shape), np.float32)
                 skipped["depth"] = NO_TIME
             else:
-                self._unmatched = ""
+                matched, self._unmatched = not self._unmatched, ""
                 unpaired = verdict.right if frame.depth is None and pair.right is not None else ""
                 if not unpaired:
                     depth, confidence = self.depth(frame, seen, tissue)
+                if self._unmatched and matched:
+                    self.mapper.doubt(NOTICED_LATE)
                 if unpaired or self._unmatched:
                     depth, confidence = np.zeros((2, *tissue.shape), np.float32)
                     skipped["depth"] = unpaired or self._unmatched
                 if self._network is not None and self._network.problem:
                     skipped["network"] = self._network.problem
             observation = observe(seen, tissue, depth, confidence, self._config.mapping.right_eye)
-        if any(advice.shift):
-            self.mapper.found_again(observation, advice.shift)
+        if advice.guess is not None:
+            self.mapper.found_again(observation, advice.guess)
         if self._tracker is not None and not still:
             with watch("pose"):
                 tracked = self._tracker.track(observation)
@@ -199,6 +207,9 @@ class Pipeline:
                 return replace(held, observation=observation)
         with watch("map"):
             learn = advice.learn and verdict.learn
+            if self._unwatched:
+                self.mapper.doubt(self._unwatched)
+                self._unwatched = 0.0
             mapped = self.mapper.update(observation, budget, still, learn)
             snapshot = mapped.snapshot
             if self._tracker is not None:
@@ -208,7 +219,7 @@ class Pipeline:
             if self._config.publish.right:
                 views["right"] = self._right_eye(mapped, pair.baseline)
         with watch("anchors"):
-            self.anchors.update(observation, snapshot, mapped.view)
+            self.anchors.update(observation, snapshot, mapped.view, learn)
             anchors = self.anchors.at(pair.t_capture_ns)
         if not still:  # which tells nothing of what a moving frame costs
             budget.finish(self.mapper.model.count)
@@ -236,10 +247,13 @@ class Pipeline:
         self, pair: RectifiedPair, epoch: int, timings: dict[str, float], what: str, reason: str
     ) -> FrameResult:
         """For a frame that something (`what`) forbids to take in: the last model, and nothing is learnt from
-        the picture."""
+        the picture. The tissue moves meanwhile, and the depth is less and less sure."""
         assert self._mapped is not None
         self._still.forget()
-        held = _repeat(self._mapped, pair, epoch, timings, self.anchors.at(pair.t_capture_ns))
+        seconds = max(0, pair.t_capture_ns - self._mapped.pair.t_capture_ns) * 1e-9
+        self._unwatched = UNWATCHED * seconds
+        anchors = self.anchors.at(pair.t_capture_ns, held=True)
+        held = _doubted(_repeat(self._mapped, pair, epoch, timings, anchors), self._unwatched)
         return replace(held, skipped={what: reason})
 
     def _lacks_time_for_depth(self, frame: StereoFrame, budget: Budget) -> bool:
@@ -302,6 +316,20 @@ class Stopwatch:
         started = time.perf_counter()
         yield
         self.timings_ms[stage] = (time.perf_counter() - started) * 1e3
+
+
+def _doubted(held: FrameResult, error: float) -> FrameResult:
+    """A result whose depth may be wrong by so much more, m."""
+    gaussians, anchors = held.snapshot.gaussians, held.anchors
+    if gaussians.depth_errors is not None:
+        gaussians = replace(gaussians, depth_errors=gaussians.depth_errors + np.float32(error))
+    sure = anchors.depth_confidence * confidence_of(np.float32(error))
+    return replace(
+        held,
+        snapshot=replace(held.snapshot, gaussians=gaussians),
+        views={eye: doubted(view, error) for eye, view in held.views.items()},
+        anchors=replace(anchors, depth_confidence=sure),
+    )
 
 
 def _restamped(views: Mapping[str, RenderedView], frame_id: int, stamp: int) -> dict[str, RenderedView]:

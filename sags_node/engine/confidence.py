@@ -44,6 +44,15 @@ def with_confidence(view: RenderedView, gaussians: Gaussians) -> RenderedView:
     return replace(view, confidence=confidence)
 
 
+def doubted(view: RenderedView, error: float) -> RenderedView:
+    """The view when its depth may be wrong by so much more, m; what falls below `LEAST` is taken out."""
+    if view.confidence is None:
+        return view
+    confidence = view.confidence * np.float32(2 ** (-error / HALVING))
+    _leave_out(np.float32(LEAST), depth := view.depth.copy(), confidence)
+    return replace(view, depth=depth, confidence=confidence)
+
+
 @parallel_kernel
 def _add_up(
     means: F32, scales: F32, opacities: F32, errors: F32, cam: Any, depth: F32, side: int, every: int,

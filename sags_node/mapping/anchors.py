@@ -46,6 +46,9 @@ SEARCHED_PER_FRAME = 32  # anchors, in turn
 DEPTH_PULL = 0.1  # share of the depth error taken per frame
 DEPTH_GATE = 0.05  # of the depth: a larger error is another surface
 HALF_LIFE = 2.0  # s: confidence halves in so long without a sight of the patch
+HALF_WAY = 0.005  # m: and as often as it is carried so far out of sight
+IN_SIGHT = 0.1  # of that way where the picture shows the tissue moving, though the patch is not found
+UNWATCHED = 10.0  # times as fast while no frame is taken in: nothing carries an anchor then
 
 _NOBODY = -1  # in the place of a Gaussian's id
 _SIDE = 2 * PATCH_RADIUS + 1
@@ -66,7 +69,7 @@ class _Table:
     patches: U8  # [A, _SIDE, _SIDE] gray, around the anchor when it was first seen clearly
     depth_offsets: F64  # [A] m, drawn surface minus anchor at that time; NaN: there was none yet
     agreement: F64  # [A] 0..1, of the patch when it was found last
-    unseen: F64  # [A] s since it was found last
+    unseen: F64  # [A] s since it was found last; more, the farther it was carried
     searched: I64  # [A] number of the frame in which it was searched last
     ages: F64  # [A] s since it was pinned
     depth_confidence: F64  # [A] 0..1, of the depth of its carriers
@@ -146,7 +149,9 @@ class Anchors:
             raise SagsError(f"there is no anchor {anchor_id}; it was removed, or never added")
         self._table = _selected(self._table, kept)
 
-    def update(self, observation: Observation, snapshot: Snapshot, view: RenderedView) -> None:
+    def update(
+        self, observation: Observation, snapshot: Snapshot, view: RenderedView, clear: bool = True
+    ) -> None:
         """Follow the tissue to the next frame.
 
         An anchor whose Gaussians are all gone at once, as after a restart of the model, is lost for good.
@@ -154,20 +159,24 @@ class Anchors:
         Args:
             snapshot: the model at that frame.
             view: it drawn for the left eye.
+            clear: the picture shows well how the tissue moves.
         """
         self._frames += 1
         if len(self):
-            _carry(self._table, snapshot.gaussians)
+            ways = _carry(self._table, snapshot.gaussians)
             _look(self._table, observation, view)
+            in_sight = clear & (self._table.visibility == 1)
+            self._table.unseen[:] += HALF_LIFE / HALF_WAY * np.where(in_sight, IN_SIGHT, 1.0) * ways
             self._find(observation)
 
-    def at(self, stamp_ns: int) -> AnchorStates:
-        """All anchors as they are now, as part of the frame captured at `stamp_ns`."""
+    def at(self, stamp_ns: int, held: bool = False) -> AnchorStates:
+        """All anchors as they are now, as part of the frame captured at `stamp_ns`; `held`: one that is not
+        taken in."""
         before, self._stamp_ns = self._stamp_ns, stamp_ns
         passed = 0.0 if before is None else max(0.0, (stamp_ns - before) * 1e-9)
         table = self._table
         table.ages[:] += passed
-        table.unseen[:] += passed
+        table.unseen[:] += UNWATCHED * passed if held else passed
         return AnchorStates(
             ids=table.ids.copy(),
             points=table.points.astype(np.float32),
@@ -194,9 +203,9 @@ class Anchors:
                 table.unseen[i] = 0.0
 
 
-def _carry(table: _Table, gaussians: Gaussians) -> None:
-    """Move each anchor by the mean displacement of its Gaussians since the last snapshot. It knows its depth
-    as well as they do."""
+def _carry(table: _Table, gaussians: Gaussians) -> F64:
+    """Move each anchor by the mean displacement of its Gaussians since the last snapshot; how far [A], m. It
+    knows its depth as well as they do."""
     order = np.argsort(gaussians.ids, kind="stable")  # nearly sorted already: cheap
     ids = np.append(gaussians.ids[order], np.iinfo(np.int64).max)
     places = np.searchsorted(ids, table.carriers)
@@ -207,7 +216,8 @@ def _carry(table: _Table, gaussians: Gaussians) -> None:
     lost = share == 0
     means = gaussians.means[rows].astype(np.float64) if len(gaussians) else table.means
     displacements = (table.weights[..., None] * (means - table.means)).sum(1)
-    table.points[:] += displacements / np.where(lost, np.nan, share)[:, None]
+    displacements /= np.where(lost, np.nan, share)[:, None]
+    table.points[:] += displacements
     table.means[:] = means
     if gaussians.depth_errors is not None and len(gaussians):
         errors = (table.weights * gaussians.depth_errors[rows]).sum(1) / np.where(lost, np.nan, share)
@@ -216,6 +226,7 @@ def _carry(table: _Table, gaussians: Gaussians) -> None:
     thin = np.flatnonzero(~lost & (share < RENEW_BELOW))
     for i in thin[np.argsort(share[thin])][:RENEWED_PER_FRAME]:
         _hold(table, i, _carriers(table.points[i], gaussians))
+    return np.asarray(np.linalg.norm(np.nan_to_num(displacements), axis=1))
 
 
 def _look(table: _Table, observation: Observation, view: RenderedView) -> None:

@@ -24,6 +24,7 @@ from sags_node.vision.depth_grid import grid_of
 
 DRIFT = 0.5  # of the way that tissue is taken: so much of it may lie along the ray, where nothing shows it
 UNSEEN = 1e-3  # m/s: what tissue moves by itself
+UNWATCHED = 2e-2  # m/s: what tissue moves at when it is pulled, and nobody looks
 
 
 def remember(model: GaussianModel, observation: Observation, pull: float, seconds: float) -> None:

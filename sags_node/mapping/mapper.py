@@ -194,23 +194,29 @@ class Mapper:
             self.model.colors[:] = self.lit_from(camera).colors
             self._lamp = camera.T_world_cam
 
-    def found_again(self, observation: Observation, shift: tuple[float, float] = (0.0, 0.0)) -> F32:
+    def found_again(self, observation: Observation, guess: F32 | None = None) -> F32:
         """Pixels [N, 2] where the Gaussians are found in a frame that is not taken in yet, see
         `motion.found_again`; all NaN where there is no frame before.
 
         Args:
-            shift: px right and down, from where to search.
+            guess: [rows, columns, 2] px, of square cells over the picture, from where to search.
         """
         if self._found is None or self._found[0] is not observation.gray:
             pixels = np.full((self.model.count, 2), np.float32(np.nan))
             if self._last is not None:
                 before = self._last.observation
-                flow = self._flow(pyramid_of(before), pyramid_of(observation), shift)
+                flow = self._flow(pyramid_of(before), pyramid_of(observation), guess)
                 pixels = found_again(
                     self.model.means, self._last.view, before.tissue, flow, observation.tissue
                 )
             self._found = observation.gray, pixels
         return self._found[1]
+
+    def doubt(self, error: float) -> None:
+        """The depth of all Gaussians may be wrong by so much more, m, until it is measured again."""
+        self.model.depth_errors[:] = np.minimum(
+            self.model.depth_errors + np.float32(error), initialise.LARGEST_ERROR
+        )
 
     @property
     def last(self) -> Drawn | None:

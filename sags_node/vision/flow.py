@@ -6,6 +6,7 @@ import numpy as np
 
 from sags_node.types import F32, GrayPyramid
 from sags_node.vision import inverse_search
+from sags_node.vision.pyramid import inner
 
 STEPS = 4  # of a patch
 COARSE_STRIDE = 4  # px, of patches in all but the largest of the pictures
@@ -19,21 +20,24 @@ class OpticalFlow:
         """`stride`: px between patches in the pictures of half the size, at most 8."""
         self._stride = stride
 
-    def __call__(
-        self, before: GrayPyramid, after: GrayPyramid, shift: tuple[float, float] = (0.0, 0.0)
-    ) -> F32:
+    def __call__(self, before: GrayPyramid, after: GrayPyramid, guess: F32 | None = None) -> F32:
         """Flow [H // 2, W // 2, 2], in px of the whole pictures, from `before` to `after`.
 
         Args:
-            shift: px right and down, from where to search.
+            guess: [rows, columns, 2] px, of square cells over the picture, from where to search; None: from
+                the same places.
         """
-        field = np.array([[shift]], np.float32) / np.float32(2 ** (len(before.halves) + 1))
-        stride = COARSE_STRIDE
+        guess = np.zeros((1, 1, 2), np.float32) if guess is None else guess
+        scale = 0.5 ** (len(before.halves) + 1)
+        field = guess * np.float32(scale)
+        spacing = scale * 2 * inner(before.halves[0]).shape[1] / guess.shape[1]
+        corner = (spacing - 1) / 2
         for k in reversed(range(len(before.halves))):
             first, second = before.halves[k], after.halves[k]
-            coarse, stride = stride, self._stride if k == 0 else COARSE_STRIDE
-            field = inverse_search.start(first, stride, field, coarse, inverse_search.CENTRE, 2)
+            stride = self._stride if k == 0 else COARSE_STRIDE
+            field = inverse_search.start(first, stride, field, spacing, corner, 2)
             field = inverse_search.search(first, second, stride, field, STEPS)
-        flow = inverse_search.at_pixels(before.halves[0], after.halves[0], stride, field)
+            spacing, corner = float(stride), inverse_search.CENTRE
+        flow = inverse_search.at_pixels(before.halves[0], after.halves[0], self._stride, field)
         flow *= np.float32(2)
         return flow

@@ -58,7 +58,7 @@ def centres(picture: F32, stride: int) -> tuple[F32, F32]:
     return across, down
 
 
-def start(picture: F32, stride: int, coarse: F32, coarse_stride: int, corner: float, scale: int) -> F32:
+def start(picture: F32, stride: int, coarse: F32, coarse_stride: float, corner: float, scale: int) -> F32:
     """A field to search from, taken from a coarser one.
 
     Args:
@@ -70,7 +70,7 @@ def start(picture: F32, stride: int, coarse: F32, coarse_stride: int, corner: fl
         [rows, columns, channels] px.
     """
     field = np.empty((*grid_shape(picture, stride), coarse.shape[2]), np.float32)
-    _start(picture, stride, coarse, coarse_stride, np.float32(corner), scale, field)
+    _start(picture, stride, coarse, np.float32(coarse_stride), np.float32(corner), scale, field)
     return field
 
 
@@ -105,16 +105,16 @@ def at_pixels(first: F32, second: F32, stride: int, field: F32) -> F32:
 
 @kernel
 def _start(
-    picture: F32, stride: int, coarse: F32, coarse_stride: int, corner: Any, scale: int, field: F32
+    picture: F32, stride: int, coarse: F32, coarse_stride: Any, corner: Any, scale: int, field: F32
 ) -> None:
     height, width = picture.shape[0] - 2 * BORDER, picture.shape[1] - 2 * BORDER
     half, one = np.float32(0.5), np.float32(1)
     for row in range(field.shape[0]):
         y = (min(row * stride, height - PATCH) + np.float32(CENTRE) + half) / np.float32(scale) - half
-        j, b = _between((y - corner) / np.float32(coarse_stride), coarse.shape[0])
+        j, b = _between((y - corner) / coarse_stride, coarse.shape[0])
         for column in range(field.shape[1]):
             x = (min(column * stride, width - PATCH) + np.float32(CENTRE) + half) / np.float32(scale) - half
-            i, a = _between((x - corner) / np.float32(coarse_stride), coarse.shape[1])
+            i, a = _between((x - corner) / coarse_stride, coarse.shape[1])
             right, below = min(i + 1, coarse.shape[1] - 1), min(j + 1, coarse.shape[0] - 1)
             for k in range(coarse.shape[2]):
                 upper = (one - a) * coarse[j, i, k] + a * coarse[j, right, k]

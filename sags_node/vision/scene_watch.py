@@ -14,9 +14,10 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from sags_node.types import F32, U8, Bool, Finding, FrameResult, RectifiedPair
+from sags_node.types import F32, U8, Bool, Finding, FrameResult, GrayPyramid, RectifiedPair
 from sags_node.vision.clarity import SMOKE
 from sags_node.vision.flow import OpticalFlow
+from sags_node.vision.landmarks import Landmarks, find_again, motion
 from sags_node.vision.pyramid import gray_pyramid, inner, narrowed, pyramid_of, pyramids
 from sags_node.vision.standing import Standing
 
@@ -27,16 +28,13 @@ DARK, BRIGHT = 0.03, 0.95  # beyond, a channel tells noise or saturation
 LEAST_USABLE = (
     0.5  # of the channels of the model that can be compared: with less the picture is overexposed or dark
 )
+WHOLE = 0.98  # with so much, it may be learnt in another exposure than the model's
 MISFIT = 0.1  # of the range of colours, mean over the channels
 STARTLING = 0.08  # of the px misfit: then motion is looked for that explains it
-COVERED = 0.15  # of the px misfit: then something covers them; a beating heart stays below
-ANOTHER = 0.5  # of the px misfit: then it is not the scene
-# Where much is misfit, the rest tells a cover from another scene. Tissue after a second of motion, or half
-# under blood, against other scenes and mirrored ones: residuals to 0.043 and from 0.044, correlations from
-# 0.5 and to 0.6, casts to 1.24 and from 1.2 to 2.3. Each alone overlaps.
-LARGEST_REST = 0.045  # mean residual of what is not misfit; chance makes 0.05
+COVERED = (
+    0.15  # of the px misfit after that: something covers them, or it is another scene; a heart stays below
+)
 LEAST_MATCH = 0.3  # correlation of the structure
-LARGEST_CAST = 1.3  # of one channel's gain over another's
 VEILED, HIDDEN = 0.6, 0.15  # of the model's contrast; clear pictures have 0.9 and more
 SOME = 3  # every so many px tell the exposure
 FINE, LOCAL = 3, 15  # small px: structure is coarser than noise and finer than shading
@@ -47,8 +45,9 @@ LARGEST_GAIN = 1.5  # from one frame to the next; beyond, a picture is brought t
 STEADY = 1.2  # of the gain before: the exposure has changed for good when it stays so
 FOLLOWED = 0.9  # of the gain's logarithm, per frame, is still taken out of a picture after that
 BINS = 32  # of the share of red in a colour, and of green
-NOVEL = 0.002  # of the tissue had a colour like this, or less: it is new
-STRANGE = 0.02  # of the tissue has new colours: clear pictures have 0.005
+RARE = 0.002  # of the tissue has a colour like this, or less
+NOVEL = 4.0  # times as much of it as usual, or as is rare: the colour is new
+STRANGE = 0.02  # of the tissue has new colours: clear pictures have 0.001, a bleeding 0.04 in its first frame
 REMEMBERED_S = 3.0  # s over which the usual colours follow
 LONGEST_NS = {"cover": 3_000_000_000, "veil": 10_000_000_000, "gain": 1_000_000_000}
 NEW_SCENE_NS = 3_000_000_000
@@ -76,7 +75,8 @@ class Look(NamedTuple):
     veiled: bool = False  # its colours and contrast are not the scene's
     covered: Bool | None = None  # [h, w] where something lies over the scene; None: nowhere
     gain: F32 = np.ones(3, np.float32)  # [3] its exposure over the model's
-    shift: tuple[float, float] = (0.0, 0.0)  # px right and down: where the scene is found again, about
+    whole: bool = True  # next to nothing of it is clipped
+    guess: F32 | None = None  # [rows, columns, 2] px: where the scene is found again, about
     clear: bool = True  # it is good in itself
 
 
@@ -88,7 +88,7 @@ class Advice(NamedTuple):
     learn: bool = True  # else it is only followed
     covered: Bool | None = None  # [h, w] a small picture of what is not tissue now
     gain: F32 | None = None  # [3] to be taken out of the pictures
-    shift: tuple[float, float] = (0.0, 0.0)  # px, where the motion search is to begin
+    guess: F32 | None = None  # [rows, columns, 2] px of square cells, where the motion search is to begin
 
 
 class SceneWatch:
@@ -144,13 +144,13 @@ class SceneWatch:
         if veiled or (seen.veiled and self._lasts("veil", True, now) < LONGEST_NS["veil"]):
             self._is_clear = False
             self._standing.update(now, [] if veiled else [SMOKE])
-            return Advice(learn=False, shift=seen.shift)
+            return Advice(learn=False, guess=seen.guess)
         self._lasts("veil", False, now)
         cover = self._cover(seen, pair.left[::step, ::step], now)
         self._is_clear = cover is None
         self._standing.update(now, [] if cover is None else [_COVERED])
         gain = self._exposure(seen.gain, now)
-        return Advice(learn=gain is None, covered=cover, gain=gain, shift=seen.shift)
+        return Advice(learn=gain is None or seen.whole, covered=cover, gain=gain, guess=seen.guess)
 
     def _cover(self, seen: Look, picture: U8, now: int) -> Bool | None:
         """[h, w] what lies over the tissue: what the model does not explain, and colours that are new. What
@@ -214,8 +214,11 @@ class _Palette:
             return self._is_new
         self._share = min(1.0, max(0.0, (now - self._stamp_ns) * 1e-9) / REMEMBERED_S)
         self._stamp_ns = now
-        around = cv2.boxFilter(self._usual, -1, (FINE, FINE), normalize=False)
-        self._is_new = (around.ravel()[self._colors] < NOVEL) & fair
+        usual, found = (
+            cv2.boxFilter(shares, -1, (FINE, FINE), normalize=False)
+            for shares in (self._usual, self._shares(self._counted))
+        )
+        self._is_new = (found > NOVEL * np.maximum(usual, RARE)).ravel()[self._colors] & fair
         return self._is_new
 
     def take(self, except_new: bool) -> None:
@@ -223,10 +226,14 @@ class _Palette:
         counted = self._counted & ~self._is_new if except_new else self._counted
         if not counted.any():
             return
-        found = np.bincount(self._colors[counted], minlength=BINS**2).reshape(BINS, BINS).astype(np.float32)
-        found /= np.float32(np.count_nonzero(counted))
+        found = self._shares(counted)
         before = found if self._usual is None else self._usual
         self._usual = before + np.float32(self._share) * (found - before)
+
+    def _shares(self, counted: Bool) -> F32:
+        """How much [BINS, BINS] of what is counted [h, w] has each colour."""
+        found = np.bincount(self._colors[counted], minlength=BINS**2).reshape(BINS, BINS)
+        return (found / max(1, int(np.count_nonzero(counted)))).astype(np.float32)
 
 
 def exposed(pair: RectifiedPair, gain: F32) -> RectifiedPair:
@@ -266,14 +273,30 @@ def look(pair: RectifiedPair, last: FrameResult, tissue: Bool) -> Look:
         return Look(_DARK if seen[known].mean() < drawn[known].mean() else _BRIGHT)
     if fit.contrast < VEILED and fit.match > LEAST_MATCH:
         return Look(SMOKE if fit.contrast < HIDDEN else None, veiled=True)
-    shift = (0.0, 0.0)
-    if fit.misfit > STARTLING:
-        fit, shift = _found_again(pair, last, step, seen, drawn, known, fit)
-    if fit.is_another:
-        return Look(_UNKNOWN, clear=fit.contrast * float(fit.gain[GREEN]) > VEILED)
+    if fit.misfit <= STARTLING:
+        return Look(gain=fit.gain, whole=fit.usable > WHOLE)
+    return _closer_look(pair, last, step, seen, drawn, known, fit)
+
+
+def _closer_look(
+    pair: RectifiedPair, last: FrameResult, step: int, seen: F32, drawn: F32, known: Bool, fit: _Fit
+) -> Look:
+    """Why picture and model differ: the tissue has moved, something covers it, or it is other tissue."""
+    now = pyramids(exposed(pair, fit.gain) if _strength(fit.gain) > LARGEST_GAIN else pair)[0]
+    before = pyramid_of(last.observation)
+    fit = _after_motion(now, before, None, step, seen, drawn, known, fit)
     if fit.misfit <= COVERED:
-        return Look(gain=fit.gain, shift=shift)
-    return Look(covered=fit.wrong, gain=fit.gain, shift=shift)
+        return Look(gain=fit.gain, whole=fit.usable > WHOLE)
+    landmarks = find_again(before, now, last.observation.tissue)
+    if landmarks is None:
+        return Look(_UNKNOWN, clear=fit.contrast * float(fit.gain[GREEN]) > VEILED)
+    height, width = now.full.shape
+    back = motion(landmarks.after, landmarks.before, width, height)
+    fit = _after_motion(now, before, back, step, seen, drawn, known, fit)
+    guess = motion(landmarks.before, landmarks.after, width, height)
+    if fit.misfit <= COVERED:
+        return Look(gain=fit.gain, whole=fit.usable > WHOLE, guess=guess)
+    return Look(covered=fit.wrong & ~_around(landmarks, step, known.shape), gain=fit.gain, guess=guess)
 
 
 class _Fit:
@@ -284,7 +307,6 @@ class _Fit:
         gain: [3] of the exposure.
         wrong: [h, w] where they do not agree.
         misfit: share of what is known there.
-        rest: mean residual elsewhere.
         contrast: of what is seen over that of the model, after the gain.
         match: correlation of their structure.
     """
@@ -312,21 +334,12 @@ class _Fit:
                 self.misfit = float(np.count_nonzero(wrong)) / count
             else:
                 self.gain = unchanged
-        right = known & ~self.wrong
-        self.rest = float(residual[right].mean()) if right.any() else 1.0
         counts, model = fair[..., GREEN], drawn[..., GREEN]
         picture = np.where(counts, seen[..., GREEN] / self.gain[GREEN], model)  # no edges where it is clipped
         a, b = _structure(picture)[counts], _structure(model)[counts]
         energy_a, energy_b = float(a @ a), float(b @ b)
         self.contrast = float(np.sqrt(energy_a / max(energy_b, 1e-9)))
         self.match = float(a @ b) / max(np.sqrt(energy_a * energy_b), 1e-9)
-
-    @property
-    def is_another(self) -> bool:
-        """Whether they show different scenes."""
-        cast = float(self.gain.max() / self.gain.min())
-        differs = self.rest > LARGEST_REST or self.match < LEAST_MATCH or cast > LARGEST_CAST
-        return self.misfit > COVERED and (self.misfit > ANOTHER or differs)
 
     def _residual(self, seen: F32, drawn: F32, fair: Bool) -> F32:
         """[h, w] mean over the channels that can be compared, less noise."""
@@ -347,31 +360,33 @@ def _structure(gray: F32) -> F32:
     return structure
 
 
-def _found_again(
-    pair: RectifiedPair, last: FrameResult, step: int, seen: F32, drawn: F32, known: Bool, fit: _Fit
-) -> tuple[_Fit, tuple[float, float]]:
-    """The best fit after motion that the pictures show, from where they lie and from where they lie best as a
-    whole; and that common shift, px."""
-    now = narrowed(pyramids(exposed(pair, fit.gain) if _strength(fit.gain) > LARGEST_GAIN else pair)[0])
-    before = narrowed(pyramid_of(last.observation))
-    whole = pair.camera.width / (2 * inner(now.halves[0]).shape[1])  # px of the picture in one of the flow's
-    (x, y), _ = cv2.phaseCorrelate(_structure(drawn[..., GREEN]), _structure(seen[..., GREEN]))
+def _after_motion(
+    now: GrayPyramid, before: GrayPyramid, guess: F32 | None, step: int, seen: F32, drawn: F32, known: Bool,
+    fit: _Fit,
+) -> _Fit:  # fmt: skip
+    """The fit after the motion that the pictures show, searched from a guess [rows, columns, 2] px of the way
+    back; `fit` where that is worse."""
+    few = narrowed(now)
+    px = np.float32(now.full.shape[1] / (2 * inner(few.halves[0]).shape[1]))  # of the picture in one of these
+    flow = _FLOW(few, narrowed(before), None if guess is None else guess / px)
+    flow = cv2.resize(flow, known.shape[::-1], interpolation=cv2.INTER_AREA) * (px / np.float32(step))
     columns, rows = np.meshgrid(*(np.arange(side, dtype=np.float32) for side in known.shape[::-1]))
-    best, best_shift = fit, (0.0, 0.0)
-    for shift in ((0.0, 0.0), (step * x, step * y)):
-        back = _FLOW(now, before, (-shift[0] / whole, -shift[1] / whole))
-        back = cv2.resize(back, known.shape[::-1], interpolation=cv2.INTER_AREA) * np.float32(whole / step)
-        there = columns + back[..., 0], rows + back[..., 1]
-        moved = cv2.remap(drawn, *there, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        tissue = cv2.remap(known.view(np.uint8), *there, cv2.INTER_NEAREST).view(np.bool_)
-        if np.count_nonzero(tissue) < LEAST_KEPT * np.count_nonzero(known):
-            continue
-        found = _Fit(seen, moved, tissue)
-        if found.misfit < best.misfit:
-            best, best_shift = found, shift
-        if best.misfit <= STARTLING:
-            break
-    return best, best_shift
+    there = columns + flow[..., 0], rows + flow[..., 1]
+    moved = cv2.remap(drawn, *there, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    tissue = cv2.remap(known.view(np.uint8), *there, cv2.INTER_NEAREST).view(np.bool_)
+    if np.count_nonzero(tissue) < LEAST_KEPT * np.count_nonzero(known):
+        return fit
+    found = _Fit(seen, moved, tissue)
+    return found if found.misfit < fit.misfit else fit
+
+
+def _around(landmarks: Landmarks, step: int, shape: tuple[int, ...]) -> Bool:
+    """Where [h, w] of a small picture tissue was found again: nothing covers it."""
+    found = np.zeros(shape, np.uint8)
+    columns, rows = np.rint(landmarks.after / step).astype(np.intp).T
+    found[rows.clip(0, shape[0] - 1), columns.clip(0, shape[1] - 1)] = 1
+    grown: U8 = cv2.dilate(found, np.ones((2 * RIM + 1, 2 * RIM + 1), np.uint8))
+    return grown.view(np.bool_)
 
 
 def _strength(gain: F32) -> float:

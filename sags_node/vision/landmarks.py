@@ -1,0 +1,100 @@
+"""Places of the tissue that are found in a later picture, however far they moved: what tells a scene that
+was lost from sight from another one.
+
+Oriented binary features (Rublee et al., "ORB: an efficient alternative to SIFT or SURF", ICCV 2011), matched
+where the best is clearly better than the second (Lowe, IJCV 2004). Tissue bends, so there is no common motion
+to vote for: a match counts when it moves as those around it do.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from sags_node.types import F32, U8, Bool, GrayPyramid
+from sags_node.vision.pyramid import inner
+
+WIDTH = 360  # px, at most, of the picture in which they are looked for
+COUNT = 600  # features of a picture
+FAST_THRESHOLD = 5  # grey levels: tissue is smooth, and smoke takes contrast away
+RATIO = 0.8  # of the distance to the second best match
+LARGEST_TURN = 40.0  # degrees
+FARTHEST = 0.3  # of the width
+AROUND = 5  # matches nearby, whose median motion a match must follow
+APART = 0.03  # of the width, from that motion
+# Of 600: the same tissue after up to two seconds of pulling, veiled, or covered by six tenths, has 12 to 390
+# such matches; other tissue, and the same turned or mirrored, up to 3.
+FEWEST = 8
+CELLS = 16  # across the picture, of a field of motion
+NEAREST = 4  # matches that tell the motion of a cell
+
+
+class Landmarks(NamedTuple):
+    """Places in two pictures."""
+
+    before: F32  # [K, 2] px of the whole picture
+    after: F32  # [K, 2]
+
+
+def find_again(before: GrayPyramid, after: GrayPyramid, tissue: Bool) -> Landmarks | None:
+    """Landmarks of the earlier picture in the later one; None: so few that it may be another scene.
+
+    Args:
+        tissue: [H, W] of the earlier picture.
+    """
+    (first, per_px), (second, _) = _small(before), _small(after)
+    orb = cv2.ORB.create(COUNT, fastThreshold=FAST_THRESHOLD)
+    mask: U8 = cv2.resize(tissue.view(np.uint8), first.shape[::-1], interpolation=cv2.INTER_NEAREST)
+    points_a, features_a = orb.detectAndCompute(first, mask)
+    points_b, features_b = orb.detectAndCompute(second, None)
+    if min(len(points_a), len(points_b)) < FEWEST:
+        return None
+    pairs = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(features_a, features_b, 2)
+    clear = [pair[0] for pair in pairs if len(pair) == 2 and pair[0].distance < RATIO * pair[1].distance]
+    a, b = [points_a[match.queryIdx] for match in clear], [points_b[match.trainIdx] for match in clear]
+    places = np.array([[p.pt, q.pt] for p, q in zip(a, b, strict=True)], np.float32).reshape(-1, 2, 2)
+    turns = np.array([q.angle - p.angle for p, q in zip(a, b, strict=True)])
+    width = first.shape[1]
+    near = np.hypot(*(places[:, 1] - places[:, 0]).T) < FARTHEST * width
+    places = places[near & (np.abs((turns + 180) % 360 - 180) < LARGEST_TURN)]
+    places = places[_agreeing(places, APART * width)]
+    if len(places) < FEWEST:
+        return None
+    places = (places + np.float32(0.5)) * np.float32(per_px) - np.float32(0.5)
+    return Landmarks(places[:, 0], places[:, 1])
+
+
+def motion(start: F32, end: F32, width: int, height: int) -> F32:
+    """The motion from places [K, 2] to others [K, 2] as a field [rows, CELLS, 2] px of square cells over a
+    picture: in each the mean of the nearest ones, by nearness."""
+    side = width / CELLS
+    columns, rows = (
+        np.arange(count) * side + (side - 1) / 2 for count in (CELLS, max(1, round(height / side)))
+    )
+    cells = np.stack(np.meshgrid(columns, rows), 2).astype(np.float32)
+    squares = np.square(cells[:, :, None] - start).sum(3) + np.float32(side**2)
+    nearest = np.argpartition(squares, min(NEAREST, len(start)) - 1, axis=2)[..., :NEAREST]
+    weights = 1 / np.take_along_axis(squares, nearest, 2)[..., None]
+    field: F32 = (weights * (end - start)[nearest]).sum(2) / weights.sum(2)
+    return field
+
+
+def _small(pyramid: GrayPyramid) -> tuple[U8, float]:
+    """The first half that is small enough, and how many px of the whole picture one of it is wide."""
+    halves = [inner(half) for half in pyramid.halves]
+    half = next((half for half in halves if half.shape[1] <= WIDTH), halves[-1])
+    return half.astype(np.uint8), pyramid.full.shape[1] / half.shape[1]
+
+
+def _agreeing(places: F32, apart: float) -> Bool:
+    """Which matches [K, 2, 2] move as those around them do."""
+    if len(places) <= AROUND:
+        return np.zeros(len(places), np.bool_)
+    moves = places[:, 1] - places[:, 0]
+    squares = np.square(places[:, None, 0] - places[None, :, 0]).sum(2)
+    np.fill_diagonal(squares, np.inf)
+    around = np.argpartition(squares, AROUND - 1, axis=1)[:, :AROUND]
+    agrees: Bool = np.hypot(*(moves - np.median(moves[around], axis=1)).T) < apart
+    return agrees
