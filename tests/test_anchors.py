@@ -278,3 +278,17 @@ def test_skipped_and_repeated_frames_keep_the_anchors(phantom_session: Path) -> 
     pipeline.reset()
     fresh = pipeline.process(later, budget)
     assert fresh.epoch > jumped.epoch and np.isnan(fresh.anchors.points).all()
+
+
+def test_the_farther_it_is_carried_out_of_sight_the_less_sure_it_is() -> None:
+    """Also where it is in the picture, but the picture is no good."""
+    ways = {}
+    for step in (0.0, 1e-3):
+        anchors = Anchors()
+        anchors.add_pixel(64, 48, *flat(0))
+        anchors.at(0)
+        for frame in range(1, 6):
+            anchors.update(*moved(flat(frame), np.array([frame * step, 0, 0])), clear=False)
+            ways[step] = anchors.at(frame * PERIOD_NS)
+    assert ways[0.0].confidence[0] > 0.8
+    assert ways[1e-3].confidence[0] == pytest.approx(0.5 * ways[0.0].confidence[0], rel=0.05)  # 5 mm

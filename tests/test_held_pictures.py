@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sags_node.confidence import SURE
 from sags_node.findings import by_code
 from sags_node.mapping.budget import StepBudget
 from sags_node.pipeline import Pipeline
@@ -105,3 +106,54 @@ def test_a_fault_is_said_and_leaves_no_trace(
     kept = np.isin(clean[FIRST - 1].snapshot.gaussians.ids, results[-1].snapshot.gaussians.ids)
     assert kept.mean() > 0.8
     assert psnr(results[-1], clean[-1]) > psnr(clean[-1], clean[-1]) - 1.0
+
+
+def test_what_nobody_watches_is_less_sure(session: Session, frames: list[StereoFrame]) -> None:
+    """Depth and anchors of a model that waits: tissue may be pulled meanwhile. A second after, at most a tenth
+    of what is measured is still in doubt."""
+    pipeline = Pipeline(session.config, session.rig)
+    before = [pipeline.process(frame, StepBudget(2)) for frame in frames[:FIRST]][-1]
+    pipeline.anchors.add_pixel(160, 100, before.observation, before.snapshot, before.views["left"])
+    sure, errors, held = [], [], []
+    for frame in frames[FIRST : FIRST + COUNT]:
+        held.append(pipeline.process(replace(frame, left=black(frame.left)), StepBudget(2)))
+        view, gaussians = held[-1].views["left"], held[-1].snapshot.gaussians
+        assert view.confidence is not None and gaussians.depth_errors is not None
+        assert ((view.depth > 0) == (view.confidence > 0)).all()
+        sure.append(float((view.confidence >= SURE).mean()))
+        errors.append(float(np.median(gaussians.depth_errors)))
+    assert all(result.held for result in held)
+    assert np.all(np.diff(errors) > 0)
+    assert sure[-1] == 0 and sure[0] > 0  # 8 frames of 100 ms at 20 mm/s: 16 mm
+    assert held[-1].anchors.confidence[0] < SURE
+    after = [pipeline.process(frame, StepBudget(2)) for frame in frames[FIRST + COUNT :]][-1]
+    shares = []
+    for result in (before, after):
+        confidence, measured = result.views["left"].confidence, result.observation.depth > 0
+        assert confidence is not None and measured.mean() > 0.3
+        shares.append(float((confidence[measured] >= SURE).mean()))
+    assert shares[1] > 0.9 * shares[0]
+
+
+def test_blood_is_seen_where_the_scene_has_its_colour_already(
+    session: Session, frames: list[StereoFrame]
+) -> None:
+    """It rises slowly, and a corner of the picture was as red before."""
+
+    def corner(picture: U8) -> U8:
+        marked = picture.copy()
+        marked[: len(picture) // 6, -picture.shape[1] // 6 :] = (95, 8, 8)
+        return marked
+
+    def rising(picture: U8, share: float) -> U8:
+        covered = picture.copy()
+        covered[round(len(picture) * (1 - share)) :] = (95, 8, 8)
+        return covered
+
+    given = [both(frame, corner) for frame in frames[: FIRST + COUNT]]
+    for i in range(FIRST, FIRST + COUNT):
+        given[i] = both(given[i], lambda picture, i=i: rising(picture, 0.05 * (i - FIRST + 1)))
+    _, codes, pipeline = play(session, given)
+    assert not set().union(*codes[:FIRST])
+    assert any("picture_covered" in code for code in codes[FIRST : FIRST + WITHIN])
+    assert pipeline.mapper.restarts == 0

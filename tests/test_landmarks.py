@@ -1,0 +1,116 @@
+"""Tissue is found again however far it was pulled; other tissue, or the same turned or mirrored, is not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+import pytest
+
+from sags_node.config import PhantomSource
+from sags_node.sources.source import open_source
+from sags_node.types import F32, U8, GrayPyramid
+from sags_node.vision.landmarks import find_again, motion
+from sags_node.vision.pyramid import gray_pyramid
+
+WIDTH, HEIGHT = 640, 512
+
+
+def first_picture(seed: int) -> U8:
+    """Of a phantom."""
+    config = PhantomSource(seconds=0.2, width=WIDTH, height=HEIGHT, seed=seed, pace="step", loop=False)
+    with open_source(config) as source:
+        return next(iter(source)).left
+
+
+@pytest.fixture(scope="module")
+def tissue() -> U8:
+    return first_picture(seed=3)
+
+
+def pulled(picture: U8, by: float) -> tuple[U8, F32]:
+    """The picture bent: its middle moved by so many px right and up, its rim held. And where each pixel comes
+    from, [H, W, 2]."""
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
+    share = np.exp(-(((columns - WIDTH / 2) / (WIDTH / 4)) ** 2) - ((rows - HEIGHT / 2) / (HEIGHT / 4)) ** 2)
+    origin = np.dstack([columns - by * share, rows + by * share]).astype(np.float32)
+    return np.asarray(
+        cv2.remap(picture, origin, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+    ), origin
+
+
+def everywhere(pyramid: GrayPyramid) -> np.ndarray:
+    return np.ones(pyramid.full.shape, np.bool_)
+
+
+def test_pulled_tissue_is_found_where_it_went(tissue: U8) -> None:
+    """By a tenth of the picture, far beyond what a search from the same place finds."""
+    after, origin = pulled(tissue, WIDTH / 10)
+    first, second = gray_pyramid(tissue), gray_pyramid(after)
+    found = find_again(first, second, everywhere(first))
+    assert found is not None
+    columns, rows = np.rint(found.after).astype(int).T
+    errors = np.linalg.norm(origin[rows, columns] - found.before, axis=1)
+    assert np.percentile(errors, 90) < 2 * 1.2**7  # px: one of ORB's smallest picture, of half the size
+    back = motion(found.after, found.before, WIDTH, HEIGHT)
+    here = np.dstack(np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))).astype(np.float32)
+    truth = cv2.resize(origin - here, back.shape[1::-1], interpolation=cv2.INTER_AREA)
+    moved = np.linalg.norm(truth, axis=2) > WIDTH / 20
+    assert moved.any()
+    assert (
+        np.linalg.norm((back - truth)[moved], axis=1).mean()
+        < 0.25 * np.linalg.norm(truth[moved], axis=1).mean()
+    )
+
+
+def covered(picture: U8) -> U8:
+    half = picture.copy()
+    half[HEIGHT // 2 :] = (95, 8, 8)
+    return half
+
+
+def veiled(picture: U8) -> U8:
+    return (0.25 * picture + 150).astype(np.uint8)
+
+
+def darker(picture: U8) -> U8:
+    return (picture / 3).astype(np.uint8)
+
+
+@pytest.mark.parametrize("change", [covered, veiled, darker])
+def test_the_same_tissue_is_known_in_a_bad_picture(tissue: U8, change: Callable[[U8], U8]) -> None:
+    first, second = gray_pyramid(tissue), gray_pyramid(change(tissue))
+    assert find_again(first, second, everywhere(first)) is not None
+
+
+def other(picture: U8) -> U8:
+    return first_picture(seed=8)
+
+
+def upside_down(picture: U8) -> U8:
+    return picture[::-1, ::-1].copy()
+
+
+def mirrored(picture: U8) -> U8:
+    return picture[:, ::-1].copy()
+
+
+def plain(picture: U8) -> U8:
+    return np.full_like(picture, 120)
+
+
+@pytest.mark.parametrize("change", [other, upside_down, mirrored, plain])
+def test_another_scene_is_not(tissue: U8, change: Callable[[U8], U8]) -> None:
+    first, second = gray_pyramid(tissue), gray_pyramid(change(tissue))
+    assert find_again(first, second, everywhere(first)) is None
+
+
+def test_what_is_no_tissue_is_not_looked_for(tissue: U8) -> None:
+    """An instrument that stays is no proof that the tissue does."""
+    first = gray_pyramid(tissue)
+    left = everywhere(first)
+    left[:, WIDTH // 2 :] = False
+    found = find_again(first, first, left)
+    assert found is not None and found.before[:, 0].max() < WIDTH / 2 + 16
+    assert find_again(first, first, ~everywhere(first)) is None
