@@ -109,8 +109,8 @@ def test_a_fault_is_said_and_leaves_no_trace(
 
 
 def test_what_nobody_watches_is_less_sure(session: Session, frames: list[StereoFrame]) -> None:
-    """Depth and anchors of a model that waits: tissue may be pulled meanwhile. A second after, at most a tenth
-    of what is measured is still in doubt."""
+    """Depth and anchors of a model that waits: tissue may be pulled meanwhile. A second later at most
+    a tenth of what is measured is in doubt."""
     pipeline = Pipeline(session.config, session.rig)
     before = [pipeline.process(frame, StepBudget(2)) for frame in frames[:FIRST]][-1]
     pipeline.anchors.add_pixel(160, 100, before.observation, before.snapshot, before.views["left"])
