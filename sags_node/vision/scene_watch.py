@@ -9,39 +9,37 @@ Another scene changes most of it, and no motion explains it.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 
-from sags_node.types import F32, U8, Bool, Finding, FrameResult, RectifiedPair
+from sags_node.kernels.jit import kernel
+from sags_node.types import F32, I64, U8, Bool, Finding, FrameResult, RectifiedPair
 from sags_node.vision.clarity import SMOKE
 from sags_node.vision.flow import OpticalFlow
+from sags_node.vision.picture_fit import (
+    BRIGHT,
+    COVERED,
+    DARK,
+    FEWEST,
+    FINE,
+    GREEN,
+    LEAST_MATCH,
+    Fit,
+    structure,
+)
 from sags_node.vision.pyramid import gray_pyramid, inner, narrowed, pyramid_of, pyramids
 from sags_node.vision.standing import Standing
 
 WIDTH = 80  # px of the small pictures
 SEEN_ALPHA = 0.5
-FEWEST = 50  # small px of the model in the picture, to judge it by
-DARK, BRIGHT = 0.03, 0.95  # beyond, a channel tells noise or saturation
 LEAST_USABLE = (
     0.5  # of the channels of the model that can be compared: with less the picture is overexposed or dark
 )
-MISFIT = 0.1  # of the range of colours, mean over the channels
 STARTLING = 0.08  # of the px misfit: then motion is looked for that explains it
-COVERED = 0.15  # of the px misfit: then something covers them; a beating heart stays below
-ANOTHER = 0.5  # of the px misfit: then it is not the scene
-# Where much is misfit, the rest tells a cover from another scene. Tissue after a second of motion, or half
-# under blood, against other scenes and mirrored ones: residuals to 0.043 and from 0.044, correlations from
-# 0.5 and to 0.6, casts to 1.24 and from 1.2 to 2.3. Each alone overlaps.
-LARGEST_REST = 0.045  # mean residual of what is not misfit; chance makes 0.05
-LEAST_MATCH = 0.3  # correlation of the structure
-LARGEST_CAST = 1.3  # of one channel's gain over another's
 VEILED, HIDDEN = 0.6, 0.15  # of the model's contrast; clear pictures have 0.9 and more
-SOME = 3  # every so many px tell the exposure
-FINE, LOCAL = 3, 15  # small px: structure is coarser than noise and finer than shading
 RIM = 5  # small px: what lies over the tissue has a soft edge, and grows
-GREEN = 1  # the channel with most of the structure, and seldom saturated
 LEAST_KEPT = 0.3  # of what is known, in view after motion
 LARGEST_GAIN = 1.5  # from one frame to the next; beyond, a picture is brought to the model's exposure
 STEADY = 1.2  # of the gain before: the exposure has changed for good when it stays so
@@ -129,8 +127,10 @@ class SceneWatch:
         now = pair.t_capture_ns
         step = max(1, pair.camera.width // WIDTH)
         if self._tissue is None or self._is_clear:
-            self._tissue = last.observation.tissue[::step, ::step]
-        seen = look(pair, last, self._tissue)
+            self._tissue = np.ascontiguousarray(last.observation.tissue[::step, ::step])
+        picture = np.empty((*self._tissue.shape, 3), np.uint8)
+        _every(step, pair.left, picture)
+        seen = look(pair, last, picture, self._tissue)
         if seen.wrong is _UNKNOWN and self._moving:
             self._is_clear = False
             self._standing.update(now, [])
@@ -146,7 +146,7 @@ class SceneWatch:
             self._standing.update(now, [] if veiled else [SMOKE])
             return Advice(learn=False, shift=seen.shift)
         self._lasts("veil", False, now)
-        cover = self._cover(seen, pair.left[::step, ::step], now)
+        cover = self._cover(seen, picture, now)
         self._is_clear = cover is None
         self._standing.update(now, [] if cover is None else [_COVERED])
         gain = self._exposure(seen.gain, now)
@@ -170,7 +170,7 @@ class SceneWatch:
 
     def _exposure(self, gain: F32, now: int) -> F32 | None:
         """What to take out of the pictures; None: the model follows their exposure by itself."""
-        steady = float(np.abs(np.log(gain / self._gain)).max()) < np.log(STEADY)
+        steady = _strength(gain / self._gain) < STEADY
         self._gain = gain
         if _strength(gain) <= LARGEST_GAIN:
             self._lasts("gain", False, now)
@@ -198,35 +198,72 @@ class _Palette:
     def __init__(self) -> None:
         self._usual: F32 | None = None  # [BINS, BINS] share of the tissue, by share of red and of green
         self._share = 1.0
-        self._colors = self._counted = self._is_new = np.zeros((1, 1), np.bool_)
+        self._colors = np.zeros((1, 1), np.int64)  # [h, w] bins of the newest picture, -1: too dark or bright
+        self._counted = self._is_new = np.zeros((1, 1), np.bool_)
         self._stamp_ns = 0
 
     def new(self, picture: U8, tissue: Bool, now: int) -> Bool:
         """Which pixels [h, w] of a small picture [h, w, 3] have colours that tissue has not had before."""
-        red, green, blue = cv2.split(cv2.blur(picture, (FINE, FINE)).astype(np.float32))
-        light = red + green + blue
-        fair = (light > 3 * 255 * DARK) & (cv2.max(red, cv2.max(green, blue)) < 255 * BRIGHT)
-        places = [(BINS * channel / (light + 1)).astype(np.intp) for channel in (red, green)]
-        self._colors, self._counted = BINS * places[0] + places[1], fair & tissue
+        self._colors, self._is_new = np.empty(tissue.shape, np.int64), np.empty(tissue.shape, np.bool_)
         if self._usual is None:
-            self._stamp_ns, self._share = now, 1.0
-            self._is_new = np.zeros_like(tissue)
-            return self._is_new
-        self._share = min(1.0, max(0.0, (now - self._stamp_ns) * 1e-9) / REMEMBERED_S)
+            self._share, around = 1.0, np.ones((BINS, BINS), np.float32)
+        else:
+            self._share = min(1.0, max(0.0, (now - self._stamp_ns) * 1e-9) / REMEMBERED_S)
+            around = cv2.boxFilter(self._usual, -1, (FINE, FINE), normalize=False)
         self._stamp_ns = now
-        around = cv2.boxFilter(self._usual, -1, (FINE, FINE), normalize=False)
-        self._is_new = (around.ravel()[self._colors] < NOVEL) & fair
+        _sort_colors(cv2.blur(picture, (FINE, FINE)), around, self._colors, self._is_new)
+        self._counted = tissue
         return self._is_new
 
     def take(self, except_new: bool) -> None:
         """Learn the colours of that picture."""
         counted = self._counted & ~self._is_new if except_new else self._counted
-        if not counted.any():
+        found = np.zeros((BINS, BINS), np.float32)
+        count = _count_colors(self._colors, counted, found)
+        if count == 0:
             return
-        found = np.bincount(self._colors[counted], minlength=BINS**2).reshape(BINS, BINS).astype(np.float32)
-        found /= np.float32(np.count_nonzero(counted))
+        found /= np.float32(count)
         before = found if self._usual is None else self._usual
         self._usual = before + np.float32(self._share) * (found - before)
+
+
+@kernel
+def _sort_colors(picture: U8, around: F32, colors: I64, is_new: Bool) -> None:
+    """The bin of each pixel's colour, or -1 where it is too dark or too bright to tell, and whether there is
+    next to nothing in the bins `around` it."""
+    for y in range(colors.shape[0]):
+        for x in range(colors.shape[1]):
+            red, green, blue = (
+                np.int64(picture[y, x, 0]),
+                np.int64(picture[y, x, 1]),
+                np.int64(picture[y, x, 2]),
+            )
+            light = red + green + blue
+            fair = light > 3 * 255 * DARK and max(red, green, blue) < 255 * BRIGHT
+            row, column = BINS * red // (light + 1), BINS * green // (light + 1)
+            colors[y, x] = BINS * row + column if fair else -1
+            is_new[y, x] = fair and around[row, column] < np.float32(NOVEL)
+
+
+@kernel
+def _count_colors(colors: I64, counted: Bool, found: F32) -> Any:
+    """How often there is each colour. Returns how often any."""
+    count = 0
+    for y in range(colors.shape[0]):
+        for x in range(colors.shape[1]):
+            if counted[y, x] and colors[y, x] >= 0:
+                found[colors[y, x] // BINS, colors[y, x] % BINS] += 1
+                count += 1
+    return count
+
+
+@kernel
+def _every(step: int, picture: Any, small: Any) -> None:
+    """Every `step` th pixel of every `step` th row."""
+    for y in range(small.shape[0]):
+        for x in range(small.shape[1]):
+            for k in range(3):
+                small[y, x, k] = picture[y * step, x * step, k]
 
 
 def exposed(pair: RectifiedPair, gain: F32) -> RectifiedPair:
@@ -248,20 +285,22 @@ def enlarged(small: Bool, shape: tuple[int, ...]) -> Bool:
     return large.view(np.bool_)
 
 
-def look(pair: RectifiedPair, last: FrameResult, tissue: Bool) -> Look:
+def look(pair: RectifiedPair, last: FrameResult, picture: U8, tissue: Bool) -> Look:
     """What a picture is, beside the frame mapped last.
 
     Args:
+        picture: [h, w, 3] the left one, small.
         tissue: [h, w] small, where that frame would have shown tissue but for what covers it.
     """
     step = max(1, pair.camera.width // WIDTH)
     view = last.views["left"]
-    seen = pair.left[::step, ::step] * np.float32(1 / 255)
-    drawn = np.ascontiguousarray(view.rgb[::step, ::step])
+    seen = picture * np.float32(1 / 255)
+    drawn = np.empty(picture.shape, np.float32)
+    _every(step, view.rgb, drawn)
     known = (view.alpha[::step, ::step] > SEEN_ALPHA) & tissue
     if np.count_nonzero(known) < FEWEST:
         return Look()
-    fit = _Fit(seen, drawn, known)
+    fit = Fit(seen, drawn, known)
     if fit.usable < LEAST_USABLE:
         return Look(_DARK if seen[known].mean() < drawn[known].mean() else _BRIGHT)
     if fit.contrast < VEILED and fit.match > LEAST_MATCH:
@@ -276,86 +315,16 @@ def look(pair: RectifiedPair, last: FrameResult, tissue: Bool) -> Look:
     return Look(covered=fit.wrong, gain=fit.gain, shift=shift)
 
 
-class _Fit:
-    """How well small pictures [h, w, 3] agree where something is known [h, w].
-
-    Attributes:
-        usable: share of the channels that can be compared.
-        gain: [3] of the exposure.
-        wrong: [h, w] where they do not agree.
-        misfit: share of what is known there.
-        rest: mean residual elsewhere.
-        contrast: of what is seen over that of the model, after the gain.
-        match: correlation of their structure.
-    """
-
-    def __init__(self, seen: F32, drawn: F32, known: Bool) -> None:
-        fair = (drawn > DARK) & (drawn < BRIGHT) & known[..., None]
-        count: int = max(1, int(np.count_nonzero(known)))
-        channels: int = max(1, int(np.count_nonzero(fair)))
-        fair &= (seen > DARK) & (seen < BRIGHT)
-        self.usable = float(np.count_nonzero(fair)) / channels
-        some = [(picture[..., k][fair[..., k]][::SOME] for picture in (seen, drawn)) for k in range(3)]
-        ratios = [a / b for a, b in some]
-        found = [float(np.median(ratio)) if len(ratio) >= FEWEST else np.nan for ratio in ratios]
-        mean = float(np.nanmean(found)) if np.isfinite(found).any() else 1.0
-        self.gain: F32 = np.where(np.isfinite(found), found, mean).astype(np.float32)
-        residual = self._residual(seen, drawn, fair)
-        self.wrong: Bool = (residual > MISFIT) & known
-        self.misfit = float(np.count_nonzero(self.wrong)) / count
-        if self.misfit > COVERED:  # most may be covered, and the exposure what it was
-            unchanged, self.gain = self.gain, np.ones(3, np.float32)
-            other = self._residual(seen, drawn, fair)
-            wrong = (other > MISFIT) & known
-            if np.count_nonzero(wrong) < np.count_nonzero(self.wrong):
-                residual, self.wrong = other, wrong
-                self.misfit = float(np.count_nonzero(wrong)) / count
-            else:
-                self.gain = unchanged
-        right = known & ~self.wrong
-        self.rest = float(residual[right].mean()) if right.any() else 1.0
-        counts, model = fair[..., GREEN], drawn[..., GREEN]
-        picture = np.where(counts, seen[..., GREEN] / self.gain[GREEN], model)  # no edges where it is clipped
-        a, b = _structure(picture)[counts], _structure(model)[counts]
-        energy_a, energy_b = float(a @ a), float(b @ b)
-        self.contrast = float(np.sqrt(energy_a / max(energy_b, 1e-9)))
-        self.match = float(a @ b) / max(np.sqrt(energy_a * energy_b), 1e-9)
-
-    @property
-    def is_another(self) -> bool:
-        """Whether they show different scenes."""
-        cast = float(self.gain.max() / self.gain.min())
-        differs = self.rest > LARGEST_REST or self.match < LEAST_MATCH or cast > LARGEST_CAST
-        return self.misfit > COVERED and (self.misfit > ANOTHER or differs)
-
-    def _residual(self, seen: F32, drawn: F32, fair: Bool) -> F32:
-        """[h, w] mean over the channels that can be compared, less noise."""
-        difference = cv2.blur(np.where(fair, seen / self.gain - drawn, np.float32(0)), (FINE, FINE))
-        total, count = (
-            planes[..., 0]
-            + planes[..., 1]
-            + planes[..., 2]  # five times as fast as a sum over an axis of three
-            for planes in (np.abs(difference), fair.view(np.uint8))
-        )
-        mean: F32 = np.divide(total, np.maximum(count, 1), dtype=np.float32)
-        return mean
-
-
-def _structure(gray: F32) -> F32:
-    gray = np.ascontiguousarray(gray)
-    structure: F32 = cv2.blur(gray, (FINE, FINE)) - cv2.blur(gray, (LOCAL, LOCAL))
-    return structure
-
-
 def _found_again(
-    pair: RectifiedPair, last: FrameResult, step: int, seen: F32, drawn: F32, known: Bool, fit: _Fit
-) -> tuple[_Fit, tuple[float, float]]:
+    pair: RectifiedPair, last: FrameResult, step: int, seen: F32, drawn: F32, known: Bool, fit: Fit
+) -> tuple[Fit, tuple[float, float]]:
     """The best fit after motion that the pictures show, from where they lie and from where they lie best as a
     whole; and that common shift, px."""
     now = narrowed(pyramids(exposed(pair, fit.gain) if _strength(fit.gain) > LARGEST_GAIN else pair)[0])
     before = narrowed(pyramid_of(last.observation))
     whole = pair.camera.width / (2 * inner(now.halves[0]).shape[1])  # px of the picture in one of the flow's
-    (x, y), _ = cv2.phaseCorrelate(_structure(drawn[..., GREEN]), _structure(seen[..., GREEN]))
+    greens = (structure(np.ascontiguousarray(each[..., GREEN])) for each in (drawn, seen))
+    (x, y), _ = cv2.phaseCorrelate(*greens)
     columns, rows = np.meshgrid(*(np.arange(side, dtype=np.float32) for side in known.shape[::-1]))
     best, best_shift = fit, (0.0, 0.0)
     for shift in ((0.0, 0.0), (step * x, step * y)):
@@ -366,7 +335,7 @@ def _found_again(
         tissue = cv2.remap(known.view(np.uint8), *there, cv2.INTER_NEAREST).view(np.bool_)
         if np.count_nonzero(tissue) < LEAST_KEPT * np.count_nonzero(known):
             continue
-        found = _Fit(seen, moved, tissue)
+        found = Fit(seen, moved, tissue)
         if found.misfit < best.misfit:
             best, best_shift = found, shift
         if best.misfit <= STARTLING:
@@ -376,4 +345,4 @@ def _found_again(
 
 def _strength(gain: F32) -> float:
     """How far a gain is from one, as a factor."""
-    return float(np.exp(np.abs(np.log(np.maximum(gain, 1e-6))).max()))
+    return float(max(max(each, 1 / max(each, 1e-6)) for each in gain.tolist()))
