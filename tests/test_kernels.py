@@ -13,6 +13,7 @@ from sags_node.engine.pinhole import pack
 from sags_node.mapping import densify, motion, optimiser, split
 from sags_node.model import deformation
 from sags_node.types import Camera
+from sags_node.vision import depth_grid as grids
 from sags_node.vision import pair_watch, picture_fit, scene_watch
 from sags_node.vision.depth_grid import depth_grid
 
@@ -256,3 +257,53 @@ def test_colors() -> None:
     assert np.array_equal(colors[0], colors[1]) and np.array_equal(is_new[0], is_new[1])
     assert counts[0] == counts[1] > 100 and np.array_equal(found[0], found[1])
     assert np.array_equal(small[0], picture[::3, ::3]) and np.array_equal(small[0], small[1])
+
+
+@pytest.mark.parametrize("side", [2, 3])
+def test_depth_grid(scene: dict[str, np.ndarray], side: int) -> None:
+    s, around, lanes = scene, grids.AROUND, grids.LANES
+    confidence = np.ascontiguousarray(s["alpha"])
+    rows, columns = -(-HEIGHT // side), -(-WIDTH // side)
+    line = -(-columns // lanes) * lanes + 2 * around
+    sums = np.zeros((3, rows + 2 * around, line), np.float32)
+    grids._gather(s["depth"], confidence, s["tissue"], side, columns, sums)
+    expected = np.zeros_like(sums)
+    for row in range(rows):
+        for column in range(columns):
+            cell = np.s_[row * side : (row + 1) * side : 2, column * side : (column + 1) * side : 2]
+            depth, trust = s["depth"][cell], confidence[cell] * (s["depth"][cell] > 0)
+            inverse = (trust / np.where(depth > 0, depth, 1)).sum() / trust.sum() if trust.any() else 0
+            expected[:, row + around, column + around] = s["tissue"][cell].mean(), trust.mean(), inverse
+    assert np.allclose(sums, expected, rtol=1e-5)
+    # Vectors know no Python: what they compute is written out here.
+    found, px = np.zeros((4, *sums.shape[1:]), np.float32), np.float32(0.3)
+    tolerance, slope = np.float32(2.0), np.float32(0.05)
+    grids._compare(sums, tolerance, slope, found)
+    grids._judge(sums, px, found)
+    shown, trust, inverse = sums.astype(np.float64)
+
+    def shifted(plane: np.ndarray, j: int, i: int) -> np.ndarray:
+        return np.roll(plane, (-j, -i), (0, 1))
+
+    with np.errstate(all="ignore"):
+        near = [(j, i) for j in (-1, 0, 1) for i in (-1, 0, 1) if i or j]
+        weight = sum(shifted(trust, *at) for at in near)
+        off = (sum(shifted(trust * inverse, *at) for at in near) / weight - inverse) ** 2
+        off[~((trust > 0) & (weight > 0))] = 0
+        agreeing = total = 0.0
+        for j in range(-4, 5, 2):
+            for i in range(-4, 5, 2):
+                limit = tolerance + slope * max(abs(j), abs(i)) * inverse
+                same = abs(shifted(inverse, j, i) - inverse) < limit
+                agreeing, total = agreeing + same * shifted(trust, j, i), total + shifted(shown, j, i)
+        support = np.where((trust > 0) & (total > 0), np.minimum(agreeing / total, 1), 0)
+        wide = [(j, i) for j in range(-2, 3) for i in range(-2, 3)]
+        rough = sum(shifted(trust * off, *at) for at in wide) / sum(shifted(trust, *at) for at in wide)
+        floor, alone = grids.FLOOR * px, grids.UNSUPPORTED * px * (1 - support)
+        error = np.sqrt(floor**2 + alone**2 + grids.ROUGHNESS**2 * rough)
+    believed = (trust > 0) & (support >= grids.LEAST_SUPPORT)
+    assert 100 < believed.sum()
+    assert np.allclose(found[0], off, rtol=1e-3, atol=1e-3)
+    assert np.allclose(found[1], support, rtol=1e-4)
+    assert np.allclose(found[2], np.where(believed, inverse, 0))
+    assert np.allclose(found[3], np.where(believed, error, np.where(trust > 0, -1, 0)), rtol=1e-3)
