@@ -25,7 +25,8 @@ from sags_node.vision.stereo import StereoDepth
 from sags_node.vision.tissue_classical import InstrumentFinder
 
 COMPILING = 600.0  # s that the vision's kernels may take on a slow machine
-_WIDTH, _HEIGHT, _FOCAL, _BASELINE, _DISPARITY = 160, 128, 150.0, 0.0043, 8
+# Large enough for work that is shared between threads: smaller pictures take other kernels.
+_WIDTH, _HEIGHT, _FOCAL, _BASELINE, _DISPARITY = 240, 192, 225.0, 0.0043, 12
 
 
 def warm_up(config: LaunchConfig) -> None:

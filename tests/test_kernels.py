@@ -8,10 +8,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sags_node.engine import confidence
 from sags_node.engine.pinhole import pack
 from sags_node.mapping import densify, motion, optimiser, split
 from sags_node.model import deformation
 from sags_node.types import Camera
+from sags_node.vision import depth_grid as grids
+from sags_node.vision import pair_watch, picture_fit, scene_watch
 from sags_node.vision.depth_grid import depth_grid
 
 N, WIDTH, HEIGHT = 3000, 160, 120
@@ -154,3 +157,156 @@ def test_average_at_nodes(scene: dict[str, np.ndarray]) -> None:
     )
     assert np.allclose(compiled[0], source[0], atol=1e-4)
     assert np.allclose(compiled[1], source[1], rtol=1e-5)
+
+
+def test_confidence(scene: dict[str, np.ndarray]) -> None:
+    s, r = scene, np.abs(scene["rows"])
+    scales, errors = np.ascontiguousarray(r[:, :3]), r[:, 3].copy() * np.float32(1e-3)
+    side = 7  # which divides neither the width nor the height
+    rows, columns = -(-HEIGHT // side), -(-WIDTH // side)
+    sums = np.zeros((2, confidence.SHARES, 2, rows, columns), np.float32)
+    coarse = np.empty((2, rows, columns), np.float32)
+    wide = np.random.default_rng(9).random((rows, columns * side), np.float32)
+    depths, found = np.stack([s["depth"]] * 2), np.zeros((2, HEIGHT, WIDTH), np.float32)
+    arguments = (s["means"], scales, s["opacities"], errors, tuple(s["cam0"]), s["depth"],
+                 np.float32(1 / side), 2)  # fmt: skip
+    for k, source in enumerate((False, True)):
+        add_up, average, state = (
+            each.py_func if source else each
+            for each in (confidence._add_up, confidence._average, confidence._state)
+        )
+        add_up(*arguments, sums[k])
+        average(sums[k], np.float32(3e-3), coarse[k])
+        state(wide, np.float32(1 / side), np.float32(0.2), depths[k], found[k])
+    assert np.count_nonzero(sums[0, :, 0]) > 100
+    assert np.allclose(sums[0], sums[1], rtol=1e-5)
+    assert np.allclose(coarse[0], coarse[1], rtol=1e-4)
+    assert np.allclose(found[0], found[1], atol=1e-6) and np.array_equal(depths[0], depths[1])
+    assert 0 < np.count_nonzero(depths[0]) < np.count_nonzero(s["depth"])
+
+
+def test_ends_and_correlate() -> None:
+    rng = np.random.default_rng(10)
+    picture = rng.integers(0, 256, (30, 40, 3), np.uint8)
+    assert np.array_equal(pair_watch._ends(picture, 12), pair_watch._ends.py_func(picture, 12))
+    a, b = rng.normal(0, 1, (2, 8, 30)).astype(np.float32)
+    a[:, 20:] = b[:, 20:] = a[[0, -1]] = b[[0, -1]] = 0
+    found = np.empty((2, 21), np.float32)
+    pair_watch._correlate(a, b, 20, found[0])
+    pair_watch._correlate.py_func(a, b, 20, found[1])
+    assert np.allclose(found[0], found[1], atol=1e-5)
+
+
+def test_fit() -> None:
+    rng = np.random.default_rng(11)
+    seen, drawn = rng.random((2, 30, 40, 3), np.float32)
+    known = rng.random((30, 40)) > 0.3
+    results = []
+    for source in (False, True):
+        compare, gain, subtract, judge, take, energies = (
+            each.py_func if source else each
+            for each in (
+                picture_fit._compare, picture_fit._gain, picture_fit._subtract, picture_fit._judge,
+                picture_fit._take_green, picture_fit._energies,
+            )
+        )  # fmt: skip
+        fair, ratios, counts = np.empty((30, 40, 3), bool), np.zeros((3, 400), np.float32), np.zeros(3, int)
+        difference, wrong = np.empty((30, 40, 3), np.float32), np.empty((30, 40), bool)
+        picture, model = np.empty((2, 30, 40), np.float32)
+        channels = compare(seen, drawn, known, fair, ratios, counts)
+        gains = gain(ratios, counts)
+        subtract(seen, drawn, fair, 1 / gains, difference)
+        judged = judge(difference, known, fair, wrong)
+        take(seen, drawn, fair, gains[1], picture, model)
+        results.append(
+            [
+                channels,
+                fair,
+                ratios,
+                counts,
+                gains,
+                difference,
+                wrong,
+                *judged,
+                picture,
+                model,
+                *energies(picture, model, fair),
+            ]
+        )
+    for compiled, source_s in zip(*results, strict=True):
+        assert np.allclose(compiled, source_s, rtol=1e-5, atol=1e-6)
+
+
+def test_colors() -> None:
+    rng = np.random.default_rng(12)
+    picture, tissue = rng.integers(0, 256, (30, 40, 3), np.uint8), rng.random((30, 40)) > 0.3
+    bins = scene_watch.BINS
+    of_bins = rng.random((bins, bins)) > 0.5
+    colors, of_pixels = np.empty((2, 30, 40), np.int64), np.empty((2, 30, 40), bool)
+    found = np.zeros((2, bins, bins), np.float32)
+    small = np.zeros((2, 10, 14, 3), np.uint8)
+    counts = []
+    for k, source in enumerate((False, True)):
+        sort, look_up, count, every = (
+            each.py_func if source else each
+            for each in (
+                scene_watch._sort_colors, scene_watch._look_up, scene_watch._count_colors, scene_watch._every
+            )
+        )  # fmt: skip
+        sort(picture, colors[k])
+        look_up(colors[k], of_bins, of_pixels[k])
+        counts.append(count(colors[k], tissue, found[k]))
+        every(3, picture, small[k])
+    assert np.array_equal(colors[0], colors[1]) and np.array_equal(of_pixels[0], of_pixels[1])
+    assert counts[0] == counts[1] > 100 and np.array_equal(found[0], found[1])
+    assert np.array_equal(small[0], picture[::3, ::3]) and np.array_equal(small[0], small[1])
+
+
+@pytest.mark.parametrize("side", [2, 3])
+def test_depth_grid(scene: dict[str, np.ndarray], side: int) -> None:
+    s, around, lanes = scene, grids.AROUND, grids.LANES
+    confidence = np.ascontiguousarray(s["alpha"])
+    rows, columns = -(-HEIGHT // side), -(-WIDTH // side)
+    line = -(-columns // lanes) * lanes + 2 * around
+    sums = np.zeros((3, rows + 2 * around, line), np.float32)
+    grids._gather(s["depth"], confidence, s["tissue"], side, columns, sums)
+    expected = np.zeros_like(sums)
+    for row in range(rows):
+        for column in range(columns):
+            cell = np.s_[row * side : (row + 1) * side : 2, column * side : (column + 1) * side : 2]
+            depth, trust = s["depth"][cell], confidence[cell] * (s["depth"][cell] > 0)
+            inverse = (trust / np.where(depth > 0, depth, 1)).sum() / trust.sum() if trust.any() else 0
+            expected[:, row + around, column + around] = s["tissue"][cell].mean(), trust.mean(), inverse
+    assert np.allclose(sums, expected, rtol=1e-5)
+    # Vectors know no Python: what they compute is written out here.
+    found, px = np.zeros((4, *sums.shape[1:]), np.float32), np.float32(0.3)
+    tolerance, slope = np.float32(2.0), np.float32(0.05)
+    grids._compare(sums, tolerance, slope, found)
+    grids._judge(sums, px, found)
+    shown, trust, inverse = sums.astype(np.float64)
+
+    def shifted(plane: np.ndarray, j: int, i: int) -> np.ndarray:
+        return np.roll(plane, (-j, -i), (0, 1))
+
+    with np.errstate(all="ignore"):
+        near = [(j, i) for j in (-1, 0, 1) for i in (-1, 0, 1) if i or j]
+        weight = sum(shifted(trust, *at) for at in near)
+        off = (sum(shifted(trust * inverse, *at) for at in near) / weight - inverse) ** 2
+        off[~((trust > 0) & (weight > 0))] = 0
+        agreeing = total = 0.0
+        for j in range(-4, 5, 2):
+            for i in range(-4, 5, 2):
+                limit = tolerance + slope * max(abs(j), abs(i)) * inverse
+                same = abs(shifted(inverse, j, i) - inverse) < limit
+                agreeing, total = agreeing + same * shifted(trust, j, i), total + shifted(shown, j, i)
+        support = np.where((trust > 0) & (total > 0), np.minimum(agreeing / total, 1), 0)
+        wide = [(j, i) for j in range(-2, 3) for i in range(-2, 3)]
+        rough = sum(shifted(trust * off, *at) for at in wide) / sum(shifted(trust, *at) for at in wide)
+        floor, alone = grids.FLOOR * px, grids.UNSUPPORTED * px * (1 - support)
+        error = np.sqrt(floor**2 + alone**2 + grids.ROUGHNESS**2 * rough)
+    believed = (trust > 0) & (support >= grids.LEAST_SUPPORT)
+    assert 100 < believed.sum()
+    assert np.allclose(found[0], off, rtol=1e-3, atol=1e-3)
+    assert np.allclose(found[1], support, rtol=1e-4)
+    assert np.allclose(found[2], np.where(believed, inverse, 0))
+    assert np.allclose(found[3], np.where(believed, error, np.where(trust > 0, -1, 0)), rtol=1e-3)

@@ -34,13 +34,14 @@ def with_confidence(view: RenderedView, gaussians: Gaussians) -> RenderedView:
     every = max(1, len(gaussians) // (ENOUGH * rows * columns))
     _add_up(
         read_only(gaussians.means), read_only(gaussians.scales), read_only(gaussians.opacities),
-        read_only(gaussians.depth_errors), tuple(pack(view.camera)), view.depth, side, every, sums,
+        read_only(gaussians.depth_errors), tuple(pack(view.camera)), view.depth, np.float32(1 / side), every,
+        sums,
     )  # fmt: skip
     coarse = np.empty((rows, columns), np.float32)
     _average(sums, np.float32(HALVING), coarse)
-    confidence = cv2.resize(coarse, (columns * side, rows * side), interpolation=cv2.INTER_LINEAR)
-    confidence = np.ascontiguousarray(confidence[:height, :width])
-    _leave_out(np.float32(LEAST), view.depth, confidence)
+    wide = cv2.resize(coarse, (columns * side, rows), interpolation=cv2.INTER_LINEAR)
+    confidence = np.empty((height, width), np.float32)
+    _state(wide, np.float32(1 / side), np.float32(LEAST), view.depth, confidence)
     return replace(view, confidence=confidence)
 
 
@@ -49,28 +50,34 @@ def doubted(view: RenderedView, error: float) -> RenderedView:
     if view.confidence is None:
         return view
     confidence = view.confidence * np.float32(2 ** (-error / HALVING))
-    _leave_out(np.float32(LEAST), depth := view.depth.copy(), confidence)
-    return replace(view, depth=depth, confidence=confidence)
+    nothing = np.float32(0)
+    stated = confidence >= np.float32(LEAST)
+    return replace(
+        view,
+        depth=np.where(stated, view.depth, nothing),
+        confidence=np.where(stated, confidence, nothing),
+    )
 
 
 @parallel_kernel
 def _add_up(
-    means: F32, scales: F32, opacities: F32, errors: F32, cam: Any, depth: F32, side: int, every: int,
+    means: F32, scales: F32, opacities: F32, errors: F32, cam: Any, depth: F32, per_px: Any, every: int,
     sums: F32,
 ) -> None:  # fmt: skip
     for share in prange(SHARES):
         number = np.int64(share)
         first, end = len(means) * number // SHARES, len(means) * (number + 1) // SHARES
-        _add_up_rows(means, scales, opacities, errors, cam, depth, side, every, sums[number], first, end)
+        _add_up_rows(means, scales, opacities, errors, cam, depth, per_px, every, sums[number], first, end)
 
 
 @kernel
 def _add_up_rows(
-    means: F32, scales: F32, opacities: F32, errors: F32, cam: Any, depth: F32, side: int, every: int,
+    means: F32, scales: F32, opacities: F32, errors: F32, cam: Any, depth: F32, per_px: Any, every: int,
     sums: F32, first: Any, end: Any,
 ) -> None:  # fmt: skip
     """Of each cell, what the Gaussians in it cover of the drawn surface, and that times the squared error."""
     height, width = depth.shape
+    half = np.float32(0.5)
     for i in range(first, end, every):
         x, y, z = to_camera(cam, means[i, 0], means[i, 1], means[i, 2])
         if not z > 0:
@@ -78,12 +85,11 @@ def _add_up_rows(
         u, v = to_pixel(cam, x, y, z)
         if not (u > -0.5 and v > -0.5 and u < width - 0.5 and v < height - 0.5):
             continue
-        column, row = int(u + 0.5), int(v + 0.5)
+        column, row = int(u + half), int(v + half)
         if depth[row, column] * np.float32(1 + BEHIND) < z:
             continue
         covered = opacities[i] * scales[i, 0] * scales[i, 1] / (z * z)
-        row //= side
-        column //= side
+        row, column = int((row + half) * per_px), int((column + half) * per_px)
         sums[0, row, column] += covered
         sums[1, row, column] += covered * errors[i] * errors[i]
 
@@ -92,37 +98,55 @@ def _add_up_rows(
 def _average(sums: F32, halving: Any, confidence: F32) -> None:
     """Over each cell and, by half, its neighbours."""
     shares, _, rows, columns = sums.shape
-    one, half = np.float32(1), np.float32(0.5)
-    for share in range(1, shares):
-        for row in range(rows):
-            for column in range(columns):
-                sums[0, 0, row, column] += sums[share, 0, row, column]
-                sums[0, 1, row, column] += sums[share, 1, row, column]
+    half = np.float32(0.5)
+    total = np.zeros((2, rows + 2, columns + 2), np.float32)  # none beyond the edges
+    for k in range(2):
+        for share in range(shares):
+            for row in range(rows):
+                _add(sums[share, k, row], total[k, row + 1, 1:])
+    line = np.empty((2, columns + 2), np.float32)
     for row in range(rows):
+        for k in range(2):
+            for i in range(columns + 2):
+                x = np.uint64(i)
+                line[k, x] = half * (total[k, row, x] + total[k, row + 2, x]) + total[k, row + 1, x]
         for column in range(columns):
-            covered, squares = np.float32(0), np.float32(0)
-            for y in range(max(row - 1, 0), min(row + 2, rows)):
-                by_row = one if y == row else half
-                for x in range(max(column - 1, 0), min(column + 2, columns)):
-                    weight = by_row if x == column else by_row * half
-                    covered += weight * sums[0, 0, y, x]
-                    squares += weight * sums[0, 1, y, x]
+            covered = half * (line[0, column] + line[0, column + 2]) + line[0, column + 1]
+            squares = half * (line[1, column] + line[1, column + 2]) + line[1, column + 1]
             confidence[row, column] = np.float32(0)
             if covered > 0:
                 confidence[row, column] = np.float32(2) ** (-np.sqrt(squares / covered) / halving)
 
 
+@kernel
+def _add(values: F32, to: F32) -> None:
+    for i in range(values.size):
+        x = np.uint64(i)
+        to[x] += values[x]
+
+
 @parallel_kernel
-def _leave_out(least: Any, depth: F32, confidence: F32) -> None:
+def _state(wide: F32, per_px: Any, least: Any, depth: F32, confidence: F32) -> None:
     for row in prange(depth.shape[0]):
-        _leave_out_row(least, depth[np.int64(row)], confidence[np.int64(row)])
+        _state_row(wide, per_px, least, np.int64(row), depth, confidence)
 
 
 @kernel
-def _leave_out_row(least: Any, depth: F32, confidence: F32) -> None:
+def _state_row(wide: F32, per_px: Any, least: Any, row: Any, depth: F32, confidence: F32) -> None:
+    """Confidence between two rows of cells, where it and a depth are stated; elsewhere both are 0."""
+    zero, half = np.float32(0), np.float32(0.5)
+    v = min(max((np.float32(row) + half) * per_px - half, zero), np.float32(len(wide) - 1))
+    before = int(v)
+    after, share = min(before + 1, len(wide) - 1), v - np.float32(before)
+    _state_between(wide[before], wide[after], share, least, depth[row], confidence[row])
+
+
+@kernel
+def _state_between(upper: F32, lower: F32, share: Any, least: Any, depth: F32, confidence: F32) -> None:
     zero = np.float32(0)
     for i in range(depth.size):
         x = np.uint64(i)
-        stated = (confidence[x] >= least) & (depth[x] > zero)
+        between = upper[x] + share * (lower[x] - upper[x])
+        stated = (between >= least) & (depth[x] > zero)
         depth[x] = depth[x] if stated else zero
-        confidence[x] = confidence[x] if stated else zero
+        confidence[x] = between if stated else zero

@@ -35,6 +35,7 @@ class RowErrors(NamedTuple):
 
     errors: F32  # [h, w] px of the working size
     matched: Bool  # [h, w]
+    median: float  # px, of all errors
 
 
 class RowMonitor:
@@ -67,10 +68,10 @@ class RowMonitor:
             scale * row_error[step // 2 :: step, step // 2 :: step],
             known[step // 2 :: step, step // 2 :: step],
         )
-        self.newest = RowErrors(errors, matched)
         # Errors beyond what can be matched stand at the limit, unmatched: the median must see them.
         every = np.sort(errors, axis=None)
-        self._medians.append(float(every[every.size // 2]))
+        self.newest = RowErrors(errors, matched, float(every[every.size // 2]))
+        self._medians.append(self.newest.median)
         some = np.sort(errors[matched])
         if some.size >= FEWEST_KNOWN * every.size:
             self._spreads.append(float(some[9 * some.size // 10] - some[some.size // 10]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import cv2
@@ -45,10 +46,9 @@ class Clarity:
         self._contrast = self._detail = 0.0  # octaves, of the better eye
         self._contrasts = self._details = 0.0  # octaves, of the right eye over the left
 
-    def __call__(self, stamp_ns: int, left: GrayPyramid, right: GrayPyramid | None) -> Unclear:
-        """Take the pictures of one frame."""
-        eyes = [left] if right is None else [left, right]
-        contrasts, details = [_contrast(eye) for eye in eyes], [_detail(eye) for eye in eyes]
+    def __call__(self, stamp_ns: int, eyes: Sequence[GrayPyramid], structures: Sequence[F32]) -> Unclear:
+        """Take one frame: its picture, or the left and the right one, and the `structure` of each."""
+        contrasts, details = list(map(_contrast, eyes, structures)), list(map(_detail, eyes))
         contrast, detail = max(contrasts), max(details)
         apart = contrasts[-1] - contrasts[0], details[-1] - details[0]
         if self._stamp_ns is None:
@@ -75,7 +75,18 @@ class Clarity:
         return Unclear()
 
 
-def small_level(pyramid: GrayPyramid) -> F32:
+def structure(pyramid: GrayPyramid) -> F32:
+    """What is no shading, in a small picture [h, w]."""
+    small = _small_level(pyramid)
+    return np.asarray(small - cv2.blur(small, (LOCAL, LOCAL)))
+
+
+def mean_difference(a: F32, b: F32) -> float:
+    """Mean of the absolute differences of two small pictures."""
+    return cv2.norm(a, b, cv2.NORM_L1) / a.size
+
+
+def _small_level(pyramid: GrayPyramid) -> F32:
     """The first half that is small enough."""
     fitting = (inner(half) for half in pyramid.halves if half.shape[1] <= WIDTH)
     return next(fitting, inner(pyramid.halves[-1]))
@@ -85,11 +96,11 @@ def _usual(octaves: float) -> float:
     return min(max(octaves, -USUAL_DIFFERENCE), USUAL_DIFFERENCE)
 
 
-def _contrast(pyramid: GrayPyramid) -> float:
+def _contrast(pyramid: GrayPyramid, structure: F32) -> float:
     """Octaves of local contrast over brightness."""
-    gray = small_level(pyramid)
-    structure = float(np.square(gray - cv2.blur(gray, (LOCAL, LOCAL))).mean())
-    return 0.5 * float(np.log2((structure + 1e-3) / (float(gray.mean()) ** 2 + 1e-3)))
+    energy = cv2.norm(structure, cv2.NORM_L2SQR) / structure.size
+    brightness = cv2.mean(_small_level(pyramid))[0]
+    return 0.5 * float(np.log2((energy + 1e-3) / (brightness**2 + 1e-3)))
 
 
 def _detail(pyramid: GrayPyramid) -> float:
@@ -97,5 +108,5 @@ def _detail(pyramid: GrayPyramid) -> float:
     picture of half its size, which are half of them when there is nothing finer."""
     fine = inner(pyramid.halves[0])[::4]
     coarse = inner(pyramid.halves[min(1, len(pyramid.halves) - 1)])[::2]
-    steps = [float(np.abs(rows[:, 1:] - rows[:, :-1]).mean()) for rows in (fine, coarse)]
+    steps = [mean_difference(rows[:, 1:], rows[:, :-1]) for rows in (fine, coarse)]
     return float(np.log2(max(steps[0] / (steps[1] + 1e-3) - 0.5, FINEST)))

@@ -17,12 +17,21 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numba import prange
 
-from sags_node.kernels.jit import kernel, parallel_kernel
+from sags_node.kernels.jit import kernel
+from sags_node.kernels.vectors import (
+    LANES,
+    load_anywhere,
+    select,
+    smaller,
+    spread,
+    square_roots,
+    store_anywhere,
+)
 from sags_node.types import F32, Bool, DepthGrid, Observation
 
 CELLS = 80  # across the picture
+AROUND = 4  # cells around one that are looked at
 EVERY = 2  # px between those that are looked at; depth is matched on no more
 WIDTH = 640  # px: the errors below are those of a picture so wide
 FLOOR = 0.25  # px of disparity: calibration, of which no match tells (principal points, rows, lenses)
@@ -49,14 +58,15 @@ def depth_grid(depth: F32, confidence: F32, tissue: Bool, focal: float, baseline
     side = max(1, round(width / CELLS))
     rows, columns = -(-height // side), -(-width // side)
     px = np.float32(width / WIDTH / (focal * (baseline or NOMINAL_BASELINE)))  # 1/m of one px of disparity
-    sums = np.zeros((3, rows, columns), np.float32)
-    _gather(depth, confidence, tissue, side, sums)
-    around = np.zeros((4, rows, columns), np.float32)
+    line = -(-columns // LANES) * LANES + 2 * AROUND
+    sums = np.zeros((3, rows + 2 * AROUND, line), np.float32)  # nothing beyond the picture's edges
+    _gather(depth, confidence, tissue, side, columns, sums)
+    around = np.zeros((4, *sums.shape[1:]), np.float32)
     aside = side / focal  # of a cell at a distance of 1
     _compare(sums, np.float32(AGREEING) * px, np.float32(STEEPEST * aside), around)
     _judge(sums, px, around)
-    _drop_specks(around[3], side, depth, confidence)
-    inverse, error = around[2:]
+    inverse, error = around[2:, AROUND:-AROUND, AROUND : AROUND + columns]
+    _drop_specks(error, side, depth, confidence)
     known = error > 0
     weight = np.where(known, np.square(np.float32(2 * FLOOR) * px / np.where(known, error, 1)), np.float32(0))
     lent, square = _borrowed(np.stack([weight, weight * inverse, weight * error * error]))
@@ -147,99 +157,112 @@ def _mix(sums: F32, coarse: F32, filled: F32) -> None:
                 filled[k, y, x] = value
 
 
-@parallel_kernel
-def _gather(depth: F32, confidence: F32, tissue: Bool, side: int, sums: F32) -> None:
-    for row in prange(sums.shape[1]):
-        _gather_row(depth, confidence, tissue, side, np.int64(row), sums)
-
-
 @kernel
-def _gather_row(depth: F32, confidence: F32, tissue: Bool, side: int, row: Any, sums: F32) -> None:
-    """Of the cells in one row: the share of pixels that show tissue, that times trust, and the mean inverse
-    depth."""
+def _gather(depth: F32, confidence: F32, tissue: Bool, side: int, columns: int, sums: F32) -> None:
+    """Of each cell the share of pixels that show tissue, that times trust, and the mean inverse depth."""
     height, width = depth.shape
-    zero, one = np.float32(0), np.float32(1)
-    for column in range(sums.shape[2]):
-        shown, trust, inverse, count = zero, zero, zero, zero
-        for y in range(row * side, min((row + 1) * side, height), EVERY):
-            for x in range(column * side, min((column + 1) * side, width), EVERY):
-                count += one
-                if tissue[y, x]:
-                    shown += one
-                if depth[y, x] > 0:
-                    trust += confidence[y, x]
-                    inverse += confidence[y, x] / depth[y, x]
-        sums[0, row, column] = shown / count
-        sums[1, row, column] = trust / count
-        sums[2, row, column] = inverse / trust if trust > 0 else zero
-
-
-@parallel_kernel
-def _compare(sums: F32, tolerance: Any, slope: Any, around: F32) -> None:
-    for row in prange(sums.shape[1]):
-        _compare_row(sums, tolerance, slope, np.int64(row), around)
+    line = np.empty((3, width), np.float32)  # sums over the pixels below each other in one row of cells
+    for row in range(sums.shape[1] - 2 * AROUND):
+        line[:] = np.float32(0)
+        top, bottom = row * side, min((row + 1) * side, height)
+        for y in range(top, bottom, EVERY):
+            _add_shown(tissue[y], line[0])
+            _add_depth(depth[y], confidence[y], line[1], line[2])
+        _add_cells(line, -((top - bottom) // EVERY), side, columns, row + AROUND, sums)
 
 
 @kernel
-def _compare_row(sums: F32, tolerance: Any, slope: Any, row: Any, around: F32) -> None:
-    """Of the measured cells in one row: the squared distance from the mean of their neighbours, and the share
-    of the tissue up to four cells around that was measured to be the same surface."""
-    _, rows, columns = sums.shape
-    weight, mean, shown, agreeing = np.zeros((4, columns), np.float32)
+def _add_cells(line: F32, deep: int, side: int, columns: int, row: int, sums: F32) -> None:
     zero = np.float32(0)
-    for y in range(max(row - 1, 0), min(row + 2, rows)):
-        for i in range(-1, 2):
-            if y != row or i != 0:
-                for x in range(max(-i, 0), columns - max(i, 0)):
-                    weight[x] += sums[1, y, x + i]
-                    mean[x] += sums[1, y, x + i] * sums[2, y, x + i]
-    for y in range(row - 4, row + 5, 2):
-        if y < 0 or y >= rows:
-            continue
-        for i in range(-4, 5, 2):
-            steep = slope * np.float32(max(abs(y - row), abs(i)))
-            for x in range(max(-i, 0), columns - max(i, 0)):
-                own = sums[2, row, x]
-                same = abs(sums[2, y, x + i] - own) < tolerance + steep * own
-                shown[x] += sums[0, y, x + i]
-                agreeing[x] += sums[1, y, x + i] if same else zero
-    for x in range(columns):
-        if sums[1, row, x] > 0:
-            if weight[x] > 0:
-                around[0, row, x] = (mean[x] / weight[x] - sums[2, row, x]) ** 2
-            if shown[x] > 0:
-                around[1, row, x] = min(agreeing[x] / shown[x], np.float32(1))
-
-
-@parallel_kernel
-def _judge(sums: F32, px: Any, around: F32) -> None:
-    for row in prange(sums.shape[1]):
-        _judge_row(sums, px, np.int64(row), around)
+    for column in range(columns):
+        first, end = column * side, min((column + 1) * side, line.shape[1])
+        shown, trust, inverse = zero, zero, zero
+        for x in range(first, end, EVERY):
+            shown, trust, inverse = shown + line[0, x], trust + line[1, x], inverse + line[2, x]
+        count = np.float32(-((first - end) // EVERY) * deep)
+        sums[0, row, AROUND + column] = shown / count
+        sums[1, row, AROUND + column] = trust / count
+        sums[2, row, AROUND + column] = inverse / trust if trust > zero else zero
 
 
 @kernel
-def _judge_row(sums: F32, px: Any, row: Any, around: F32) -> None:
-    """Inverse depth and error of the cells in one row that are believed; of the others both are 0, and the
-    error -1 where something was measured."""
-    _, rows, columns = sums.shape
-    weight, squares = np.zeros((2, columns), np.float32)
-    for y in range(max(row - 2, 0), min(row + 3, rows)):
-        for i in range(-2, 3):
-            for x in range(max(-i, 0), columns - max(i, 0)):
-                weight[x] += sums[1, y, x + i]
-                squares[x] += sums[1, y, x + i] * around[0, y, x + i]
+def _add_shown(tissue: Bool, shown: F32) -> None:
+    for i in range(shown.size):
+        x = np.uint64(i)
+        shown[x] += np.float32(tissue[x])
+
+
+@kernel
+def _add_depth(depth: F32, confidence: F32, trust: F32, inverse: F32) -> None:
+    zero, one = np.float32(0), np.float32(1)
+    for i in range(trust.size):
+        x = np.uint64(i)
+        known = depth[x] > zero
+        share, distance = confidence[x] if known else zero, depth[x] if known else one
+        trust[x] += share
+        inverse[x] += share / distance
+
+
+@kernel
+def _compare(sums: F32, tolerance: Any, slope: Any, around: F32) -> None:
+    """Of the measured cells: the squared distance from the mean of their neighbours, and the share of the
+    tissue up to four cells around that was measured to be the same surface."""
+    _, high, line = sums.shape
+    trusts, inverses = high * line, 2 * high * line
+    zero, none = spread(np.float32(0)), np.float32(0)
+    for y in range(AROUND, high - AROUND):
+        for x in range(AROUND, line - AROUND, LANES):
+            at = y * line + x
+            own = load_anywhere(sums, inverses + at)
+            weight, mean, shown, agreeing = zero, zero, zero, zero
+            for j in range(-1, 2):
+                for i in range(-1, 2):
+                    near = at + j * line + i
+                    if near != at:
+                        trust = load_anywhere(sums, trusts + near)
+                        weight, mean = weight + trust, mean + trust * load_anywhere(sums, inverses + near)
+            for j in range(-AROUND, AROUND + 1, 2):
+                for i in range(-AROUND, AROUND + 1, 2):
+                    near = at + j * line + i
+                    most = own * (slope * np.float32(max(abs(j), abs(i)))) + tolerance
+                    apart = load_anywhere(sums, inverses + near) - own
+                    same = (apart < most) & (-apart < most)
+                    shown = shown + load_anywhere(sums, near)
+                    agreeing = agreeing + select(same, load_anywhere(sums, trusts + near), zero)
+            is_measured = load_anywhere(sums, trusts + at) > none
+            off = mean / weight - own
+            store_anywhere(around, at, select(is_measured & (weight > none), off * off, zero))
+            support = smaller(agreeing / shown, np.float32(1))
+            store_anywhere(around, trusts + at, select(is_measured & (shown > none), support, zero))
+
+
+@kernel
+def _judge(sums: F32, px: Any, around: F32) -> None:
+    """Inverse depth and error of the cells that are believed; of the others both are 0, and the error -1
+    where something was measured."""
+    _, high, line = sums.shape
+    plane = high * line
+    zero, one, none = spread(np.float32(0)), spread(np.float32(1)), np.float32(0)
     floor, unsupported = np.float32(FLOOR) * px, np.float32(UNSUPPORTED) * px
-    for x in range(columns):
-        if not sums[1, row, x] > 0:
-            continue
-        support = around[1, row, x]
-        if support < np.float32(LEAST_SUPPORT):
-            around[3, row, x] = -1
-            continue
-        rough = np.float32(ROUGHNESS**2) * squares[x] / weight[x]
-        alone = unsupported * (np.float32(1) - support)
-        around[2, row, x] = sums[2, row, x]
-        around[3, row, x] = np.sqrt(floor * floor + alone * alone + rough)
+    for y in range(AROUND, high - AROUND):
+        for x in range(AROUND, line - AROUND, LANES):
+            at = y * line + x
+            weight, squares = zero, zero
+            for j in range(-2, 3):
+                for i in range(-2, 3):
+                    near = at + j * line + i
+                    trust = load_anywhere(sums, plane + near)
+                    weight, squares = weight + trust, squares + trust * load_anywhere(around, near)
+            support = load_anywhere(around, plane + at)
+            is_measured = load_anywhere(sums, plane + at) > none
+            is_believed = is_measured & (support >= np.float32(LEAST_SUPPORT))
+            rough = np.float32(ROUGHNESS**2) * squares / weight
+            alone = unsupported * (one - support)
+            error = square_roots(alone * alone + rough + floor * floor)
+            inverse = load_anywhere(sums, 2 * plane + at)
+            unbelieved = select(is_measured, -one, zero)
+            store_anywhere(around, 2 * plane + at, select(is_believed, inverse, zero))
+            store_anywhere(around, 3 * plane + at, select(is_believed, error, unbelieved))
 
 
 @kernel

@@ -33,6 +33,7 @@ PATCH = BLOCK_WIDTH  # px, 8: rows of a patch are those of a vector's block
 COUNT = PATCH * PATCH  # px
 ACROSS, DOWN = COUNT, 2 * COUNT  # where a patch's gradients stand behind it
 BAND = 5  # rows of patches that are searched as one piece of work: places do not spread beyond it
+FEWEST_PATCHES = 300  # for a thread to take: waking it takes as long as searching them
 FEWEST_ROWS = 32  # of pixels, for a thread to take when patches are spread over them
 CENTRE = (PATCH - 1) / 2  # px, of a patch, from its first pixel
 AREA = np.float32(COUNT)
@@ -88,7 +89,7 @@ def search(first: F32, second: F32, stride: int, begin: F32, steps: int, tether:
     """
     field = np.empty((*begin.shape[:2], 2), np.float32)
     settings = stride, np.float32(tether), steps
-    if len(field) <= 2 * BAND:  # too little work to wake another thread
+    if field[..., 0].size < 2 * FEWEST_PATCHES:
         _search_bands(first, second, begin, *settings, 0, -(-len(field) // BAND), field)
     else:
         _search(first, second, begin, *settings, field)

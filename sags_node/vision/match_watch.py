@@ -73,7 +73,7 @@ class MatchWatch:
         passed = 0 if self._stamp_ns is None else max(0, stamp_ns - self._stamp_ns)
         self._stamp_ns = stamp_ns
         share = min(1.0, passed * 1e-9 / REMEMBERED_S)
-        median, matched = float(np.median(rows.errors)), float(np.mean(rows.matched))
+        median, matched = rows.median, np.count_nonzero(rows.matched) / rows.matched.size
         if self._median is None or self._matched is None:
             self._median, self._matched = median, matched
         found = []

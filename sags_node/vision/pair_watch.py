@@ -12,8 +12,9 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from sags_node.types import F32, U8, Finding, RectifiedPair, StereoFrame
-from sags_node.vision.clarity import LENS, SMOKE, Clarity, small_level
+from sags_node.kernels.jit import kernel
+from sags_node.types import F32, I64, U8, Finding, RectifiedPair, StereoFrame
+from sags_node.vision.clarity import LENS, SMOKE, Clarity, mean_difference, structure
 from sags_node.vision.pyramid import pyramids
 from sags_node.vision.standing import Standing
 
@@ -23,7 +24,6 @@ WHITE = 235.0  # and its white at 235
 ONE_COLOR = 6.0  # grey levels between the darkest and the brightest of a picture of one colour
 OUTLIERS = 0.01  # of the pixels at either end: a caption, dead pixels
 EQUAL = 0.5  # of what a shift by one small pixel makes; true pairs 1 to 5
-LOCAL = 15  # small px: shading wider than that is no structure
 LEAST_MATCH = 0.35  # correlation; nothing matches below
 CLEARLY_BETTER = 0.2  # of a match the wrong way round, against the best the right way round
 
@@ -61,7 +61,7 @@ class Verdict(NamedTuple):
 class Small(NamedTuple):
     """One picture, shrunk."""
 
-    rgb: F32  # [h, w, 3]
+    rgb: U8  # [h, w, 3]
     gray: F32  # [h, w]
 
 
@@ -101,13 +101,14 @@ class PairWatch:
             return empty
         left, right = pyramids(pair)
         if frame.right is None or right is None:
-            return _UNCLEAR[self._clarity(frame.t_capture_ns, left, None).all]
+            return _UNCLEAR[self._clarity(frame.t_capture_ns, [left], [structure(left)]).all]
         if _are_equal(eyes["left"].gray, eyes["right"].gray):
             return [_EQUAL]
-        if _are_exchanged(small_level(left), small_level(right)):
+        structures = [structure(left), structure(right)]
+        if _are_exchanged(*structures):
             return [_EXCHANGED]
         frozen = self._frozen(eyes["left"].gray, eyes["right"].gray)
-        unclear = self._clarity(frame.t_capture_ns, left, right)
+        unclear = self._clarity(frame.t_capture_ns, [left, right], structures)
         if unclear.eye:
             return [_finding(unclear.eye, "fogged")]
         return [_finding(frozen, "frozen")] if frozen else _UNCLEAR[unclear.all]
@@ -117,7 +118,7 @@ class PairWatch:
         pictures = left[::4, ::4].copy(), right[::4, ::4].copy()
         frozen = ""
         for before in reversed(self._history):
-            changes = [float(np.abs(now - then).mean()) for now, then in zip(pictures, before, strict=True)]
+            changes = [mean_difference(now, then) for now, then in zip(pictures, before, strict=True)]
             if max(changes) > MOVED:  # what is older tells of longer motion, not more clearly
                 if min(changes) < UNMOVED * max(changes):
                     frozen = "left" if changes[0] < changes[1] else "right"
@@ -135,28 +136,46 @@ def _small(image: U8) -> Small:
     if image.shape[1] > 4 * WIDTH:  # 16 pixels for each small one do: all of them take three times as long
         image = cv2.resize(image, (2 * WIDTH, 2 * height), interpolation=cv2.INTER_LINEAR)
     rgb = cv2.resize(image, (WIDTH, height), interpolation=cv2.INTER_AREA)
-    return Small(rgb.astype(np.float32), cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32))
+    return Small(rgb, cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32))
 
 
-def _emptiness(rgb: F32) -> str:
+def _emptiness(rgb: U8) -> str:
     """Black, white or plain, of one colour, in the middle, where every scope shows something; else empty."""
     height, width = rgb.shape[:2]
-    middle = rgb[height // 4 : height - height // 4, width // 4 : width - width // 4].reshape(-1, 3)
-    outliers = round(OUTLIERS * len(middle))
-    ordered = np.partition(middle, (outliers, -1 - outliers), axis=0)
-    dark, bright = ordered[outliers], ordered[-1 - outliers]
-    if bright.max() < BLACK:
+    middle = rgb[height // 4 : height - height // 4, width // 4 : width - width // 4]
+    dark, bright = _ends(middle, round(OUTLIERS * middle.shape[0] * middle.shape[1])).tolist()
+    if max(bright) < BLACK:
         return "black"
-    if dark.min() > WHITE:
+    if min(dark) > WHITE:
         return "white"
-    return "plain" if (bright - dark).max() < ONE_COLOR else ""
+    return "plain" if max(b - a for a, b in zip(dark, bright, strict=True)) < ONE_COLOR else ""
+
+
+@kernel
+def _ends(rgb: U8, outliers: int) -> I64:
+    """The darkest and the brightest of each channel, [2, 3], but for so many pixels at either end."""
+    counts, ends = np.zeros((3, 256), np.int64), np.empty((2, 3), np.int64)
+    for y in range(rgb.shape[0]):
+        for x in range(rgb.shape[1]):
+            for k in range(3):
+                counts[k, rgb[y, x, k]] += 1
+    for k in range(3):
+        dark, bright = 0, 255
+        left = right = outliers
+        while left >= counts[k, dark]:
+            left -= counts[k, dark]
+            dark += 1
+        while right >= counts[k, bright]:
+            right -= counts[k, bright]
+            bright -= 1
+        ends[0, k], ends[1, k] = dark, bright
+    return ends
 
 
 def _are_equal(left: F32, right: F32) -> bool:
     """Two captures of one picture differ by noise and brightness, far less than by a small shift."""
-    right = right * (left.mean() / right.mean())
-    shifted = np.abs(left[:, 1:] - left[:, :-1]).mean()
-    return bool(np.abs(left - right).mean() < EQUAL * shifted)
+    right = right * np.float32(cv2.mean(left)[0] / cv2.mean(right)[0])
+    return mean_difference(left, right) < EQUAL * mean_difference(left[:, 1:], left[:, :-1])
 
 
 def _are_exchanged(left: F32, right: F32) -> bool:
@@ -170,15 +189,36 @@ def _are_exchanged(left: F32, right: F32) -> bool:
 
 def _row_correlation(left: F32, right: F32) -> F32:
     """Correlation of the rows for disparities from minus to plus half of the width, [2 * (w // 2) + 1]."""
-    a, b = (eye - cv2.blur(eye, (LOCAL, LOCAL)) for eye in (left, right))
     width = left.shape[1]
-    spectrum = np.fft.rfft(a, 2 * width) * np.conj(np.fft.rfft(b, 2 * width))
-    products = np.fft.irfft(spectrum.sum(0), 2 * width)
-    disparities = np.arange(-(width // 2), width // 2 + 1)
-    # Energy of the columns that overlap: of the left picture from d on, of the right one up to w - d.
-    energy_a, energy_b = (np.concatenate([[0.0], np.cumsum(np.square(eye).sum(0))]) for eye in (a, b))
-    starts, ends = np.maximum(disparities, 0), np.minimum(width + disparities, width)
-    within_a = energy_a[ends] - energy_a[starts]
-    within_b = energy_b[ends - disparities] - energy_b[starts - disparities]
-    correlation: F32 = products[disparities] / np.sqrt(np.maximum(within_a * within_b, 1.0))
+    reach = width // 2
+    # Row after row, with so many zeros between them that a shift brings no row beside another.
+    a, b = (cv2.copyMakeBorder(eye, 1, 1, 0, reach, cv2.BORDER_CONSTANT) for eye in (left, right))
+    correlation = np.empty(2 * reach + 1, np.float32)
+    _correlate(a, b, width, correlation)
     return correlation
+
+
+@kernel
+def _correlate(a: F32, b: F32, width: int, correlation: F32) -> None:
+    height, line = a.shape
+    reach = line - width
+    energy = np.zeros((2, width + 1), np.float32)  # of the columns before each
+    for y in range(height):
+        for x in range(width):
+            energy[0, x + 1] += a[y, x] * a[y, x]
+            energy[1, x + 1] += b[y, x] * b[y, x]
+    for x in range(width):
+        energy[0, x + 1] += energy[0, x]
+        energy[1, x + 1] += energy[1, x]
+    all_a, all_b = a.ravel(), b.ravel()
+    inner_b = all_b[line : all_b.size - line]
+    for k in range(2 * reach + 1):
+        disparity = k - reach
+        shifted, product = all_a[line + disparity :], np.float32(0)
+        for j in range(inner_b.size):
+            i = np.uint64(j)
+            product += shifted[i] * inner_b[i]
+        start, end = max(disparity, 0), min(width + disparity, width)  # of the columns that overlap
+        within_a = energy[0, end] - energy[0, start]
+        within_b = energy[1, end - disparity] - energy[1, start - disparity]
+        correlation[k] = product / np.sqrt(max(within_a * within_b, np.float32(1)))

@@ -9,37 +9,38 @@ Another scene changes most of it, and no motion explains it.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 
-from sags_node.types import F32, U8, Bool, Finding, FrameResult, GrayPyramid, RectifiedPair
+from sags_node.kernels.jit import kernel
+from sags_node.types import F32, I64, U8, Bool, Finding, FrameResult, GrayPyramid, RectifiedPair
 from sags_node.vision.clarity import SMOKE
 from sags_node.vision.flow import OpticalFlow
 from sags_node.vision.landmarks import Landmarks, find_again, motion
+from sags_node.vision.picture_fit import (
+    BRIGHT,
+    COVERED,
+    DARK,
+    FEWEST,
+    FINE,
+    GREEN,
+    LEAST_MATCH,
+    Fit,
+)
 from sags_node.vision.pyramid import gray_pyramid, inner, narrowed, pyramid_of, pyramids
 from sags_node.vision.standing import Standing
 
 WIDTH = 80  # px of the small pictures
 SEEN_ALPHA = 0.5
-FEWEST = 50  # small px of the model in the picture, to judge it by
-DARK, BRIGHT = 0.03, 0.95  # beyond, a channel tells noise or saturation
 LEAST_USABLE = (
     0.5  # of the channels of the model that can be compared: with less the picture is overexposed or dark
 )
 WHOLE = 0.98  # with so much, it may be learnt in another exposure than the model's
-MISFIT = 0.1  # of the range of colours, mean over the channels
 STARTLING = 0.08  # of the px misfit: then motion is looked for that explains it
-COVERED = (
-    0.15  # of the px misfit after that: something covers them, or it is another scene; a heart stays below
-)
-LEAST_MATCH = 0.3  # correlation of the structure
 VEILED, HIDDEN = 0.6, 0.15  # of the model's contrast; clear pictures have 0.9 and more
-SOME = 3  # every so many px tell the exposure
-FINE, LOCAL = 3, 15  # small px: structure is coarser than noise and finer than shading
 RIM = 5  # small px: what lies over the tissue has a soft edge, and grows
-GREEN = 1  # the channel with most of the structure, and seldom saturated
 LEAST_KEPT = 0.3  # of what is known, in view after motion
 LARGEST_GAIN = 1.5  # from one frame to the next; beyond, a picture is brought to the model's exposure
 STEADY = 1.2  # of the gain before: the exposure has changed for good when it stays so
@@ -129,8 +130,10 @@ class SceneWatch:
         now = pair.t_capture_ns
         step = max(1, pair.camera.width // WIDTH)
         if self._tissue is None or self._is_clear:
-            self._tissue = last.observation.tissue[::step, ::step]
-        seen = look(pair, last, self._tissue)
+            self._tissue = np.ascontiguousarray(last.observation.tissue[::step, ::step])
+        picture = np.empty((*self._tissue.shape, 3), np.uint8)
+        _every(step, pair.left, picture)
+        seen = look(pair, last, picture, self._tissue)
         if seen.wrong is _UNKNOWN and self._moving:
             self._is_clear = False
             self._standing.update(now, [])
@@ -146,7 +149,7 @@ class SceneWatch:
             self._standing.update(now, [] if veiled else [SMOKE])
             return Advice(learn=False, guess=seen.guess)
         self._lasts("veil", False, now)
-        cover = self._cover(seen, pair.left[::step, ::step], now)
+        cover = self._cover(seen, picture, now)
         self._is_clear = cover is None
         self._standing.update(now, [] if cover is None else [_COVERED])
         gain = self._exposure(seen.gain, now)
@@ -170,7 +173,7 @@ class SceneWatch:
 
     def _exposure(self, gain: F32, now: int) -> F32 | None:
         """What to take out of the pictures; None: the model follows their exposure by itself."""
-        steady = float(np.abs(np.log(gain / self._gain)).max()) < np.log(STEADY)
+        steady = _strength(gain / self._gain) < STEADY
         self._gain = gain
         if _strength(gain) <= LARGEST_GAIN:
             self._lasts("gain", False, now)
@@ -198,42 +201,86 @@ class _Palette:
     def __init__(self) -> None:
         self._usual: F32 | None = None  # [BINS, BINS] share of the tissue, by share of red and of green
         self._share = 1.0
-        self._colors = self._counted = self._is_new = np.zeros((1, 1), np.bool_)
+        self._colors: I64 = np.zeros((1, 1), np.int64)  # [h, w] bin of each pixel, -1: too dark or too bright
+        self._counted = self._is_new = np.zeros((1, 1), np.bool_)
         self._stamp_ns = 0
 
     def new(self, picture: U8, tissue: Bool, now: int) -> Bool:
-        """Which pixels [h, w] of a small picture [h, w, 3] have colours that tissue has not had before."""
-        red, green, blue = cv2.split(cv2.blur(picture, (FINE, FINE)).astype(np.float32))
-        light = red + green + blue
-        fair = (light > 3 * 255 * DARK) & (cv2.max(red, cv2.max(green, blue)) < 255 * BRIGHT)
-        places = [(BINS * channel / (light + 1)).astype(np.intp) for channel in (red, green)]
-        self._colors, self._counted = BINS * places[0] + places[1], fair & tissue
+        """Where [h, w] a small picture [h, w, 3] has colours that the tissue has far more of than usual."""
+        self._colors, self._is_new = np.empty(tissue.shape, np.int64), np.zeros(tissue.shape, np.bool_)
+        self._counted = tissue
+        _sort_colors(cv2.blur(picture, (FINE, FINE)), self._colors)
+        passed, self._stamp_ns = max(0, now - self._stamp_ns) * 1e-9, now
         if self._usual is None:
-            self._stamp_ns, self._share = now, 1.0
-            self._is_new = np.zeros_like(tissue)
+            self._share = 1.0
             return self._is_new
-        self._share = min(1.0, max(0.0, (now - self._stamp_ns) * 1e-9) / REMEMBERED_S)
-        self._stamp_ns = now
+        self._share = min(1.0, passed / REMEMBERED_S)
         usual, found = (
             cv2.boxFilter(shares, -1, (FINE, FINE), normalize=False)
-            for shares in (self._usual, self._shares(self._counted))
+            for shares in (self._usual, self._shares(tissue))
         )
-        self._is_new = (found > NOVEL * np.maximum(usual, RARE)).ravel()[self._colors] & fair
+        is_new = found > np.float32(NOVEL) * np.maximum(usual, np.float32(RARE))
+        _look_up(self._colors, is_new, self._is_new)
         return self._is_new
 
     def take(self, except_new: bool) -> None:
         """Learn the colours of that picture."""
-        counted = self._counted & ~self._is_new if except_new else self._counted
-        if not counted.any():
-            return
-        found = self._shares(counted)
-        before = found if self._usual is None else self._usual
-        self._usual = before + np.float32(self._share) * (found - before)
+        found = self._shares(self._counted & ~self._is_new if except_new else self._counted)
+        if found.any():
+            before = found if self._usual is None else self._usual
+            self._usual = before + np.float32(self._share) * (found - before)
 
     def _shares(self, counted: Bool) -> F32:
         """How much [BINS, BINS] of what is counted [h, w] has each colour."""
-        found = np.bincount(self._colors[counted], minlength=BINS**2).reshape(BINS, BINS)
-        return (found / max(1, int(np.count_nonzero(counted)))).astype(np.float32)
+        found = np.zeros((BINS, BINS), np.float32)
+        found /= np.float32(max(1, _count_colors(self._colors, counted, found)))
+        return found
+
+
+@kernel
+def _sort_colors(picture: U8, colors: I64) -> None:
+    """The bin of each pixel's colour, or -1 where it is too dark or too bright to tell."""
+    for y in range(colors.shape[0]):
+        for x in range(colors.shape[1]):
+            red, green, blue = (
+                np.int64(picture[y, x, 0]),
+                np.int64(picture[y, x, 1]),
+                np.int64(picture[y, x, 2]),
+            )
+            light = red + green + blue
+            fair = light > 3 * 255 * DARK and max(red, green, blue) < 255 * BRIGHT
+            row, column = BINS * red // (light + 1), BINS * green // (light + 1)
+            colors[y, x] = BINS * row + column if fair else -1
+
+
+@kernel
+def _look_up(colors: I64, of_bins: Bool, of_pixels: Bool) -> None:
+    """What is said of each pixel's colour; nothing of those without."""
+    for y in range(colors.shape[0]):
+        for x in range(colors.shape[1]):
+            color = colors[y, x]
+            of_pixels[y, x] = color >= 0 and of_bins[color // BINS, color % BINS]
+
+
+@kernel
+def _count_colors(colors: I64, counted: Bool, found: F32) -> Any:
+    """How often there is each colour. Returns how often any."""
+    count = 0
+    for y in range(colors.shape[0]):
+        for x in range(colors.shape[1]):
+            if counted[y, x] and colors[y, x] >= 0:
+                found[colors[y, x] // BINS, colors[y, x] % BINS] += 1
+                count += 1
+    return count
+
+
+@kernel
+def _every(step: int, picture: Any, small: Any) -> None:
+    """Every `step` th pixel of every `step` th row."""
+    for y in range(small.shape[0]):
+        for x in range(small.shape[1]):
+            for k in range(3):
+                small[y, x, k] = picture[y * step, x * step, k]
 
 
 def exposed(pair: RectifiedPair, gain: F32) -> RectifiedPair:
@@ -255,20 +302,22 @@ def enlarged(small: Bool, shape: tuple[int, ...]) -> Bool:
     return large.view(np.bool_)
 
 
-def look(pair: RectifiedPair, last: FrameResult, tissue: Bool) -> Look:
+def look(pair: RectifiedPair, last: FrameResult, picture: U8, tissue: Bool) -> Look:
     """What a picture is, beside the frame mapped last.
 
     Args:
+        picture: [h, w, 3] the left one, small.
         tissue: [h, w] small, where that frame would have shown tissue but for what covers it.
     """
     step = max(1, pair.camera.width // WIDTH)
     view = last.views["left"]
-    seen = pair.left[::step, ::step] * np.float32(1 / 255)
-    drawn = np.ascontiguousarray(view.rgb[::step, ::step])
+    seen = picture * np.float32(1 / 255)
+    drawn = np.empty(picture.shape, np.float32)
+    _every(step, view.rgb, drawn)
     known = (view.alpha[::step, ::step] > SEEN_ALPHA) & tissue
     if np.count_nonzero(known) < FEWEST:
         return Look()
-    fit = _Fit(seen, drawn, known)
+    fit = Fit(seen, drawn, known)
     if fit.usable < LEAST_USABLE:
         return Look(_DARK if seen[known].mean() < drawn[known].mean() else _BRIGHT)
     if fit.contrast < VEILED and fit.match > LEAST_MATCH:
@@ -279,7 +328,7 @@ def look(pair: RectifiedPair, last: FrameResult, tissue: Bool) -> Look:
 
 
 def _closer_look(
-    pair: RectifiedPair, last: FrameResult, step: int, seen: F32, drawn: F32, known: Bool, fit: _Fit
+    pair: RectifiedPair, last: FrameResult, step: int, seen: F32, drawn: F32, known: Bool, fit: Fit
 ) -> Look:
     """Why picture and model differ: the tissue has moved, something covers it, or it is other tissue."""
     now = pyramids(exposed(pair, fit.gain) if _strength(fit.gain) > LARGEST_GAIN else pair)[0]
@@ -299,71 +348,10 @@ def _closer_look(
     return Look(covered=fit.wrong & ~_around(landmarks, step, known.shape), gain=fit.gain, guess=guess)
 
 
-class _Fit:
-    """How well small pictures [h, w, 3] agree where something is known [h, w].
-
-    Attributes:
-        usable: share of the channels that can be compared.
-        gain: [3] of the exposure.
-        wrong: [h, w] where they do not agree.
-        misfit: share of what is known there.
-        contrast: of what is seen over that of the model, after the gain.
-        match: correlation of their structure.
-    """
-
-    def __init__(self, seen: F32, drawn: F32, known: Bool) -> None:
-        fair = (drawn > DARK) & (drawn < BRIGHT) & known[..., None]
-        count: int = max(1, int(np.count_nonzero(known)))
-        channels: int = max(1, int(np.count_nonzero(fair)))
-        fair &= (seen > DARK) & (seen < BRIGHT)
-        self.usable = float(np.count_nonzero(fair)) / channels
-        some = [(picture[..., k][fair[..., k]][::SOME] for picture in (seen, drawn)) for k in range(3)]
-        ratios = [a / b for a, b in some]
-        found = [float(np.median(ratio)) if len(ratio) >= FEWEST else np.nan for ratio in ratios]
-        mean = float(np.nanmean(found)) if np.isfinite(found).any() else 1.0
-        self.gain: F32 = np.where(np.isfinite(found), found, mean).astype(np.float32)
-        residual = self._residual(seen, drawn, fair)
-        self.wrong: Bool = (residual > MISFIT) & known
-        self.misfit = float(np.count_nonzero(self.wrong)) / count
-        if self.misfit > COVERED:  # most may be covered, and the exposure what it was
-            unchanged, self.gain = self.gain, np.ones(3, np.float32)
-            other = self._residual(seen, drawn, fair)
-            wrong = (other > MISFIT) & known
-            if np.count_nonzero(wrong) < np.count_nonzero(self.wrong):
-                residual, self.wrong = other, wrong
-                self.misfit = float(np.count_nonzero(wrong)) / count
-            else:
-                self.gain = unchanged
-        counts, model = fair[..., GREEN], drawn[..., GREEN]
-        picture = np.where(counts, seen[..., GREEN] / self.gain[GREEN], model)  # no edges where it is clipped
-        a, b = _structure(picture)[counts], _structure(model)[counts]
-        energy_a, energy_b = float(a @ a), float(b @ b)
-        self.contrast = float(np.sqrt(energy_a / max(energy_b, 1e-9)))
-        self.match = float(a @ b) / max(np.sqrt(energy_a * energy_b), 1e-9)
-
-    def _residual(self, seen: F32, drawn: F32, fair: Bool) -> F32:
-        """[h, w] mean over the channels that can be compared, less noise."""
-        difference = cv2.blur(np.where(fair, seen / self.gain - drawn, np.float32(0)), (FINE, FINE))
-        total, count = (
-            planes[..., 0]
-            + planes[..., 1]
-            + planes[..., 2]  # five times as fast as a sum over an axis of three
-            for planes in (np.abs(difference), fair.view(np.uint8))
-        )
-        mean: F32 = np.divide(total, np.maximum(count, 1), dtype=np.float32)
-        return mean
-
-
-def _structure(gray: F32) -> F32:
-    gray = np.ascontiguousarray(gray)
-    structure: F32 = cv2.blur(gray, (FINE, FINE)) - cv2.blur(gray, (LOCAL, LOCAL))
-    return structure
-
-
 def _after_motion(
     now: GrayPyramid, before: GrayPyramid, guess: F32 | None, step: int, seen: F32, drawn: F32, known: Bool,
-    fit: _Fit,
-) -> _Fit:  # fmt: skip
+    fit: Fit,
+) -> Fit:  # fmt: skip
     """The fit after the motion that the pictures show, searched from a guess [rows, columns, 2] px of the way
     back; `fit` where that is worse."""
     few = narrowed(now)
@@ -376,7 +364,7 @@ def _after_motion(
     tissue = cv2.remap(known.view(np.uint8), *there, cv2.INTER_NEAREST).view(np.bool_)
     if np.count_nonzero(tissue) < LEAST_KEPT * np.count_nonzero(known):
         return fit
-    found = _Fit(seen, moved, tissue)
+    found = Fit(seen, moved, tissue)
     return found if found.misfit < fit.misfit else fit
 
 
@@ -391,4 +379,4 @@ def _around(landmarks: Landmarks, step: int, shape: tuple[int, ...]) -> Bool:
 
 def _strength(gain: F32) -> float:
     """How far a gain is from one, as a factor."""
-    return float(np.exp(np.abs(np.log(np.maximum(gain, 1e-6))).max()))
+    return float(max(max(each, 1 / max(each, 1e-6)) for each in gain.tolist()))

@@ -32,6 +32,9 @@ class Standing:
         while len(frames) > FEWEST and stamp_ns - frames[0][0] > WINDOW_NS:
             frames.popleft()
         newest = {finding.code: finding for _, findings in frames for finding in findings}
+        if not newest:  # nearly always
+            self.findings = ()
+            return
         counts = Counter(code for _, findings in frames for code in dict.fromkeys(f.code for f in findings))
         stood = {finding.code for finding in self.findings}
         self.findings = tuple(

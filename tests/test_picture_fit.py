@@ -1,0 +1,51 @@
+"""How well a picture agrees with the model: exposure, misfit and structure."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from sags_node.vision.pair_watch import _row_correlation
+from sags_node.vision.picture_fit import Fit
+
+GAIN = np.array([1.2, 1.0, 0.8], np.float32)
+
+
+@pytest.fixture
+def drawn() -> np.ndarray:
+    """[64, 80, 3] with structure, no channel of it near black or white."""
+    noise = np.random.default_rng(3).random((64, 80, 3), np.float32)
+    return 0.3 + 0.4 * cv2.blur(noise, (5, 5))
+
+
+def test_each_channel_has_an_exposure_of_its_own(drawn: np.ndarray) -> None:
+    fit = Fit(drawn * GAIN, drawn, np.ones((64, 80), bool))
+    assert fit.gain == pytest.approx(GAIN, rel=1e-5)
+    assert fit.usable == 1 and fit.misfit == 0
+    assert fit.contrast == pytest.approx(1, abs=1e-4) and fit.match == pytest.approx(1, abs=1e-4)
+
+
+def test_a_channel_that_tells_nothing_has_the_exposure_of_the_others(drawn: np.ndarray) -> None:
+    seen = drawn * GAIN
+    seen[..., 2] = 1.0
+    fit = Fit(seen, drawn, np.ones((64, 80), bool))
+    assert fit.gain == pytest.approx([1.2, 1.0, 1.1], rel=1e-5)
+    assert fit.usable == pytest.approx(2 / 3)
+
+
+def test_what_covers_a_part_is_found_and_leaves_the_exposure(drawn: np.ndarray) -> None:
+    seen = drawn.copy()
+    seen[:24] = 0.9
+    fit = Fit(seen, drawn, np.ones((64, 80), bool))
+    assert fit.gain == pytest.approx(np.ones(3), rel=1e-5)
+    assert fit.wrong[:23].all() and not fit.wrong[25:].any()  # the residual is blurred by a pixel
+
+
+@pytest.mark.parametrize("shift", [-7, 0, 12])
+def test_rows_correlate_where_they_lie(shift: int) -> None:
+    scene = np.random.default_rng(4).normal(0, 20, (64, 120)).astype(np.float32)
+    left, right = scene[:, 20:100], scene[:, 20 + shift : 100 + shift]
+    match = _row_correlation(left, right)
+    assert len(match) == 81 and np.argmax(match) == 40 + shift
+    assert match.max() == pytest.approx(1, abs=1e-5)
