@@ -10,11 +10,10 @@ import uuid
 
 import numpy as np
 
+from sags_node.client import ReceivedImage, Subscriber, TopicName
 from sags_node.config import PublishConfig
 from sags_node.messaging import cdr
 from sags_node.messaging.publisher import Publisher
-from sags_node.messaging.received import ReceivedImage, TopicName
-from sags_node.messaging.subscriber import Subscriber
 from sags_node.types import U8
 
 PICTURE, MASK = TopicName("left/image_rect_color", ReceivedImage), "left/tissue_mask"

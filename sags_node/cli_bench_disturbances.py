@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from pathlib import Path
 
 import click
@@ -15,7 +16,7 @@ from sags_node.apps.launching import (
     write_json,
 )
 from sags_node.apps.terminal import check_folder, progress, show, writing
-from sags_node.disturbances import DISTURBANCES
+from sags_node.errors import UsageError
 
 
 @click.command("disturbances")
@@ -23,7 +24,6 @@ from sags_node.disturbances import DISTURBANCES
 @click.option(
     "--only",
     multiple=True,
-    type=click.Choice(list(DISTURBANCES)),
     metavar="NAME",
     help="These alone; may be given several times. Default: all. The undisturbed run is always played.",
 )
@@ -81,7 +81,12 @@ def bench_disturbances(
     sags bench disturbances --only fog_right --only late_right
     """
     from sags_node.benchmark import disturbances, disturbances_report
+    from sags_node.disturbances import DISTURBANCES
 
+    for name in set(only) - set(DISTURBANCES):
+        near = difflib.get_close_matches(name, DISTURBANCES, n=1)
+        hint = f"did you mean '{near[0]}'?" if near else f"there are {', '.join(DISTURBANCES)}"
+        raise UsageError(f"--only: unknown disturbance '{name}'; {hint}")
     no_cameras = "sags bench disturbances plays recordings; record the cameras first"
     found = "vision.tissue.method:=classical"
     path, overrides = split_recording(launch, no_cameras)

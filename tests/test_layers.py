@@ -12,7 +12,7 @@ LAYERS = [
     {"calibration"},
     {"phantom"},
     {"vision", "engine", "messaging", "disturbances"},
-    {"recording"},
+    {"recording", "client"},
     {"sources"},
     {"model"},
     {"mapping"},

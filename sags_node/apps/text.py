@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import yaml
 from rich.table import Table
 
-from sags_node.types import RungState
+if TYPE_CHECKING:
+    from sags_node.types import RungState
 
 Record = Mapping[str, Any]
 

@@ -16,14 +16,17 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import zmq
 from zmq.auth import load_certificate
 from zmq.auth.thread import ThreadAuthenticator
 from zmq.utils import z85
 
-from sags_node.config import PublishConfig
 from sags_node.errors import SagsError, UsageError
+
+if TYPE_CHECKING:
+    from sags_node.config import PublishConfig  # whose validation a client need not load
 
 KEY_CHARACTERS = 40  # a CURVE key in Z85
 MAX_KEY_FILE_BYTES = 4096

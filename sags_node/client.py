@@ -1,0 +1,39 @@
+"""The front door for programs that use a node: a subscriber, what it receives, and requests.
+
+Importing this loads numpy, ZeroMQ and the message formats, and none of what maps: no Numba, torch, OpenCV
+or Open3D.
+"""
+
+from sags_node.errors import SagsError
+from sags_node.messaging.address import ClientKeys
+from sags_node.messaging.async_subscriber import AsyncSubscriber
+from sags_node.messaging.control import ControlClient
+from sags_node.messaging.freshness import StaleError
+from sags_node.messaging.received import (
+    Frame,
+    Received,
+    ReceivedCameraInfo,
+    ReceivedCloud,
+    ReceivedImage,
+    ReceivedRos,
+    ReceivedText,
+    TopicName,
+)
+from sags_node.messaging.subscriber import Subscriber
+
+__all__ = [
+    "AsyncSubscriber",
+    "ClientKeys",
+    "ControlClient",
+    "Frame",
+    "Received",
+    "ReceivedCameraInfo",
+    "ReceivedCloud",
+    "ReceivedImage",
+    "ReceivedRos",
+    "ReceivedText",
+    "SagsError",
+    "StaleError",
+    "Subscriber",
+    "TopicName",
+]
