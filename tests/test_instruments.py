@@ -69,6 +69,34 @@ def test_highlights_stay_tissue_also_beside_an_instrument() -> None:
         assert found[SHAFT].mean() > 0.9
 
 
+def test_a_shaft_so_bright_that_it_is_white_is_an_instrument() -> None:
+    """It blooms into the tissue beside it. Nothing of a surface shows there; small highlights are another
+    matter."""
+    tissue = textured_tissue()
+    light = np.zeros((HEIGHT, WIDTH), np.float32)
+    cv2.line(light, (250, -10), (210, 110), 1.0, 34)
+    cv2.circle(light, (60, 150), 7, 1.0, -1)
+    shaft = light > 0
+    shaft[120:] = False
+    bloom = cv2.GaussianBlur(light, (0, 0), 5) + light
+    picture = np.clip(tissue + 300 * bloom[..., None], 0, 255).astype(np.uint8)
+    for expected in (None, drawn(tissue)):
+        found = InstrumentFinder()(picture, expected)
+        assert found[shaft].mean() > 0.85
+        assert not found[130:].any()
+
+
+def test_a_dark_cavity_is_tissue_and_a_black_shaft_is_not() -> None:
+    """A cavity sends back a sixth of the light, and what it sends is red."""
+    picture = textured_tissue()
+    cavity, shaft = np.s_[140:, 40:130], np.s_[:90, 200:240]
+    picture[cavity] = (picture[cavity] * (0.16, 0.10, 0.09)).astype(np.uint8)
+    picture[shaft] = (10, 10, 11)
+    found = InstrumentFinder()(picture)
+    assert not found[cavity].any()
+    assert found[shaft].mean() > 0.85  # its rim is averaged with the tissue beside it
+
+
 def test_a_pale_patch_inside_and_a_dark_picture() -> None:
     picture = textured_tissue()
     picture[60:120, 100:180] = (190, 170, 160)  # gauze

@@ -11,8 +11,11 @@ from sags_node.types import F32, U8, Bool, RenderedView
 WIDTH = 320  # px that a picture is shrunk to; all px below are of that
 WINDOW = 3  # px: means against noise
 DARK = 12  # grey level below which colour says nothing: the black border, shafts in shadow
+DARK_RED = 0.3  # of R + G + B, by which red exceeds green: a cavity, no shaft
 CLIPPED = 240  # grey level of the brightest channel above which any surface looks pale
 CLIPPED_WINDOW = 20  # px around a highlight that say what it lies on
+WHITE = 230  # grey level of the darkest channel above which nothing of a surface shows
+WHITEOUT = 0.5  # of that window is white: no highlight, but a shaft in the light
 COARSE = 4  # px of a mean over so many
 
 # How much each sign counts: from 1 on their sum means instrument. Rounded from a logistic regression on D4D,
@@ -122,18 +125,22 @@ def _evidence(red: U8, green: U8, blue: U8) -> tuple[F32, F32]:
     if not is_open.all():
         around = _around(evidence, is_open)
         evidence = np.where(is_open > 0, evidence, around)
+        white = (cv2.min(red, cv2.min(green, blue)) > WHITE).astype(np.float32)
+        evidence[(white > 0) & (_widely(white) > WHITEOUT)] = SURE
     return _mean(evidence, WINDOW), is_open
 
 
 def _around(evidence: F32, is_open: F32) -> F32:
     """The mean evidence of the open pixels within CLIPPED_WINDOW, [h, w]."""
-    height, width = evidence.shape
+    return np.asarray(_widely(evidence * is_open) / (_widely(is_open) + np.float32(1e-3)))
+
+
+def _widely(plane: F32) -> F32:
+    """The mean within `CLIPPED_WINDOW`, [h, w]."""
+    height, width = plane.shape
     coarse = max(1, width // COARSE), max(1, height // COARSE)
-    total, weight = (
-        _mean(_shrunk(plane, coarse), CLIPPED_WINDOW // COARSE) for plane in (evidence * is_open, is_open)
-    )
-    around: F32 = cv2.resize(total / (weight + np.float32(1e-3)), (width, height))
-    return around
+    wide: F32 = cv2.resize(_mean(_shrunk(plane, coarse), CLIPPED_WINDOW // COARSE), (width, height))
+    return wide
 
 
 @kernel
@@ -149,7 +156,8 @@ def _colorless(red: U8, green: U8, blue: U8, typical_redness: float) -> tuple[F3
             gold = (min(r, g) - b) / (light + 1)
             total = PALENESS * max(paleness, LEAST_PALENESS) + GOLD * min(max(gold, 0.0), LARGEST_GOLD)
             total += SHADE if brightest < SHADE_LEVEL else 0.0
-            evidence[y, x] = SURE if light <= 3 * DARK else total
+            says_nothing = light <= 3 * DARK and r - g <= DARK_RED * light
+            evidence[y, x] = SURE if says_nothing else total
             is_open[y, x] = 1.0 if brightest <= CLIPPED else 0.0
     return evidence, is_open
 
