@@ -12,9 +12,10 @@ import pytest
 from sags_node.confidence import SURE
 from sags_node.findings import by_code
 from sags_node.mapping.budget import StepBudget
-from sags_node.pipeline import Pipeline
+from sags_node.pipeline import NOTICED_LATE, Pipeline
 from sags_node.session import Session, open_session
 from sags_node.types import U8, FrameResult, StereoFrame
+from sags_node.vision.match_watch import MatchWatch
 
 SESSION = Path(__file__).parent.parent / "replay/phantom_pull"
 FIRST, COUNT, AFTER = 8, 8, 11  # frames, at 10 Hz: before, with the fault, and until the tenth after it
@@ -157,3 +158,20 @@ def test_blood_is_seen_where_the_scene_has_its_colour_already(
     assert not set().union(*codes[:FIRST])
     assert any("picture_covered" in code for code in codes[FIRST : FIRST + WITHIN])
     assert pipeline.mapper.restarts == 0
+
+
+def test_what_was_measured_before_a_late_eye_was_noticed_is_doubted_once(
+    session: Session, frames: list[StereoFrame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pipeline = Pipeline(session.config, session.rig)
+    errors = []
+    for i, frame in enumerate(frames[: FIRST + 4]):
+        if i == FIRST:
+            monkeypatch.setattr(MatchWatch, "__call__", lambda *_: "one eye is late")
+        result = pipeline.process(frame, StepBudget(2))
+        assert bool(result.skipped.get("depth")) == (i >= FIRST)
+        assert result.snapshot.gaussians.depth_errors is not None
+        errors.append(float(np.median(result.snapshot.gaussians.depth_errors)))
+    steps = np.diff(errors[FIRST - 1 :])
+    assert steps[0] >= NOTICED_LATE
+    assert (steps[1:] < NOTICED_LATE / 3).all()  # 10 Hz: what tissue moves by unseen

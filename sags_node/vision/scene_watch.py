@@ -233,8 +233,8 @@ class _Palette:
     def _shares(self, counted: Bool) -> F32:
         """How much [BINS, BINS] of what is counted [h, w] has each colour."""
         found = np.zeros((BINS, BINS), np.float32)
-        found /= np.float32(max(1, _count_colors(self._colors, counted, found)))
-        return found
+        count = _count_colors(self._colors, counted, found)
+        return found / np.float32(max(1, count))
 
 
 @kernel
