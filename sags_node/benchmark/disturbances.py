@@ -363,6 +363,8 @@ class _PinnedAnchors:
         else:
             offsets, most = states.pixels - clean._states[frame_id].pixels, ANCHOR_WRONG_PX * self._width
         sure = (states.confidence >= CONFIDENT) & np.isfinite(offsets).all(1)
+        if frame_id in self._truth:
+            sure &= states.depth_confidence >= CONFIDENT  # it says that it may be 3 mm off along the ray
         right = np.linalg.norm(offsets, axis=1) <= most  # NaN: not
         return {
             "anchors": len(states),
