@@ -14,7 +14,7 @@ from sags_node.mapping import densify, motion, optimiser, split
 from sags_node.model import deformation
 from sags_node.types import Camera
 from sags_node.vision import depth_grid as grids
-from sags_node.vision import pair_watch, picture_fit, scene_watch
+from sags_node.vision import pair_watch, palette, picture_fit, scene_watch
 from sags_node.vision.depth_grid import depth_grid
 
 N, WIDTH, HEIGHT = 3000, 160, 120
@@ -240,7 +240,7 @@ def test_fit() -> None:
 def test_colors() -> None:
     rng = np.random.default_rng(12)
     picture, tissue = rng.integers(0, 256, (30, 40, 3), np.uint8), rng.random((30, 40)) > 0.3
-    bins = scene_watch.BINS
+    bins = palette.BINS
     of_bins = rng.random((bins, bins)) > 0.5
     colors, of_pixels = np.empty((2, 30, 40), np.int64), np.empty((2, 30, 40), bool)
     found = np.zeros((2, bins, bins), np.float32)
@@ -250,7 +250,7 @@ def test_colors() -> None:
         sort, look_up, count, every = (
             each.py_func if source else each
             for each in (
-                scene_watch._sort_colors, scene_watch._look_up, scene_watch._count_colors, scene_watch._every
+                palette._sort_colors, palette._look_up, palette._count_colors, scene_watch._every
             )
         )  # fmt: skip
         sort(picture, colors[k])

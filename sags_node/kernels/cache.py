@@ -74,7 +74,7 @@ def _used(folder: Path) -> Path:
     return folder
 
 
-class _Locator(_CacheLocator):  # type: ignore[misc]
+class _Locator(_CacheLocator):  # type: ignore[misc]  # Numba has no types
     """Tells Numba where a kernel's files are."""
 
     def __init__(self, function: Callable[..., Any], folder: Path) -> None:
@@ -97,11 +97,11 @@ class _Locator(_CacheLocator):  # type: ignore[misc]
         return str(self._line)
 
 
-class _Files(CompileResultCacheImpl):  # type: ignore[misc]
+class _Files(CompileResultCacheImpl):  # type: ignore[misc]  # Numba has no types
     _locator_classes: ClassVar = [_Locator]
 
 
-class _KernelCache(FunctionCache):  # type: ignore[misc]
+class _KernelCache(FunctionCache):  # type: ignore[misc]  # Numba has no types
     """Numba's cache of one function, made safe for damaged files, full disks and several processes."""
 
     _impl_class = _Files

@@ -56,14 +56,14 @@ _BITS, _ROW = ir.VectorType(ir.IntType(1), LANES), ir.VectorType(_F32, BLOCK_WID
 _FLAGS = ("contract",)
 
 
-class Vector(types.Type):  # type: ignore[misc]
+class Vector(types.Type):  # type: ignore[misc]  # Numba has no types
     """LANES float32."""
 
     def __init__(self) -> None:
         super().__init__(f"Vector({LANES})")
 
 
-class Mask(types.Type):  # type: ignore[misc]
+class Mask(types.Type):  # type: ignore[misc]  # Numba has no types
     """LANES truths."""
 
     def __init__(self) -> None:
@@ -74,13 +74,13 @@ vector, mask = Vector(), Mask()
 
 
 @register_model(Vector)
-class _VectorModel(models.PrimitiveModel):  # type: ignore[misc]
+class _VectorModel(models.PrimitiveModel):  # type: ignore[misc]  # Numba has no types
     def __init__(self, manager: Any, fe_type: Any) -> None:
         super().__init__(manager, fe_type, _FLOATS)
 
 
 @register_model(Mask)
-class _MaskModel(models.PrimitiveModel):  # type: ignore[misc]
+class _MaskModel(models.PrimitiveModel):  # type: ignore[misc]  # Numba has no types
     def __init__(self, manager: Any, fe_type: Any) -> None:
         super().__init__(manager, fe_type, _BITS)
 
@@ -106,7 +106,7 @@ def _define(function: Any, result: Any, generate: Generate) -> None:
     """Let kernels apply an operator of Python to two vectors, or to a vector and a float32."""
 
     @infer_global(function)
-    class _Typing(AbstractTemplate):  # type: ignore[misc]
+    class _Typing(AbstractTemplate):  # type: ignore[misc]  # Numba has no types
         def generic(self, args: Any, kws: Any) -> Any:
             if len(args) == 2 and vector in args and all(a in (vector, types.float32) for a in args):
                 return signature(result, *args)
@@ -146,7 +146,7 @@ for _function, _sign in (
 
 def _define_on_masks(function: Any, name: str) -> None:
     @infer_global(function)
-    class _Typing(AbstractTemplate):  # type: ignore[misc]
+    class _Typing(AbstractTemplate):  # type: ignore[misc]  # Numba has no types
         def generic(self, args: Any, kws: Any) -> Any:
             return signature(mask, mask, mask) if tuple(args) == (mask, mask) else None
 
@@ -162,7 +162,7 @@ for _function, _name in (
 
 
 @infer_global(operator.neg)
-class _NegationTyping(AbstractTemplate):  # type: ignore[misc]
+class _NegationTyping(AbstractTemplate):  # type: ignore[misc]  # Numba has no types
     def generic(self, args: Any, kws: Any) -> Any:
         return signature(vector, vector) if tuple(args) == (vector,) else None
 

@@ -47,9 +47,7 @@ DEPTH_PULL = 0.1  # share of the depth error taken per frame
 DEPTH_GATE = 0.05  # of the depth: a larger error is another surface
 HALF_LIFE = 2.0  # s: confidence halves in so long without a sight of the patch
 HALF_WAY = 0.005  # m: and as often as it is carried so far out of sight
-IN_SIGHT = (
-    0.02  # of that way counts where the picture shows how the tissue moves: optical flow errs by so much
-)
+IN_SIGHT = 0.02  # of that way counts where the picture shows it: optical flow errs by so much
 UNWATCHED = 10.0  # times as fast while no frame is taken in: nothing carries an anchor then
 
 _NOBODY = -1  # in the place of a Gaussian's id

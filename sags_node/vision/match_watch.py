@@ -22,9 +22,7 @@ from sags_node.vision.standing import Standing
 STRIDE = 4  # px
 WINDOW_NS = 200_000_000  # of the motion that is compared with row errors
 LONGEST_STEP_NS = 150_000_000  # between two frames: longer motion is not followed in so small pictures
-LATE_ERROR = (
-    0.2  # px of the working size, explained by motion: depth is off by 1 % where disparities are 20 px
-)
+LATE_ERROR = 0.2  # px of the working size, explained by motion: 1 % of the depth where disparities are 20 px
 LEAST_SLOPE = 0.1  # of the motion in a frame: less is chance
 KNOCKED = 1.0  # px of the working size beside the usual row error; clear pairs stay within 0.1
 LEAST_MATCHED = 0.6  # of the usual share of matches

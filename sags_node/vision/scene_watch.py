@@ -15,16 +15,14 @@ import cv2
 import numpy as np
 
 from sags_node.kernels.jit import kernel
-from sags_node.types import F32, I64, U8, Bool, Finding, FrameResult, GrayPyramid, RectifiedPair
+from sags_node.types import F32, U8, Bool, Finding, FrameResult, GrayPyramid, RectifiedPair
 from sags_node.vision.clarity import SMOKE
 from sags_node.vision.flow import OpticalFlow
 from sags_node.vision.landmarks import Landmarks, find_again, motion
+from sags_node.vision.palette import Palette
 from sags_node.vision.picture_fit import (
-    BRIGHT,
     COVERED,
-    DARK,
     FEWEST,
-    FINE,
     GREEN,
     LEAST_MATCH,
     Fit,
@@ -34,9 +32,7 @@ from sags_node.vision.standing import Standing
 
 WIDTH = 80  # px of the small pictures
 SEEN_ALPHA = 0.5
-LEAST_USABLE = (
-    0.5  # of the channels of the model that can be compared: with less the picture is overexposed or dark
-)
+LEAST_USABLE = 0.5  # of the model's channels can be compared: with less the picture is overexposed or dark
 WHOLE = 0.98  # with so much, it may be learnt in another exposure than the model's
 STARTLING = 0.08  # of the px misfit: then motion is looked for that explains it
 VEILED, HIDDEN = 0.6, 0.15  # of the model's contrast; clear pictures have 0.9 and more
@@ -45,11 +41,7 @@ LEAST_KEPT = 0.3  # of what is known, in view after motion
 LARGEST_GAIN = 1.5  # from one frame to the next; beyond, a picture is brought to the model's exposure
 STEADY = 1.2  # of the gain before: the exposure has changed for good when it stays so
 FOLLOWED = 0.9  # of the gain's logarithm, per frame, is still taken out of a picture after that
-BINS = 32  # of the share of red in a colour, and of green
-RARE = 0.002  # of the tissue has a colour like this, or less
-NOVEL = 4.0  # times as much of it as usual, or as is rare: the colour is new
 STRANGE = 0.02  # of the tissue has new colours: clear pictures have 0.001, a bleeding 0.04 in its first frame
-REMEMBERED_S = 3.0  # s over which the usual colours follow
 LONGEST_NS = {"cover": 3_000_000_000, "veil": 10_000_000_000, "gain": 1_000_000_000}
 NEW_SCENE_NS = 3_000_000_000
 
@@ -105,7 +97,7 @@ class SceneWatch:
         self._since: dict[str, int] = {}  # stamps: how long something has lasted
         self._gain: F32 = np.ones(3, np.float32)  # of the frame before
         self._taken_out: F32 = np.ones(3, np.float32)
-        self._palette = _Palette()
+        self._palette = Palette()
         self._tissue: Bool | None = None  # [h, w] of the last clear frame
         self._is_clear = True  # the last frame was
 
@@ -117,7 +109,7 @@ class SceneWatch:
     def forget(self) -> None:
         """There is a new model."""
         self._since.clear()
-        self._palette = _Palette()
+        self._palette = Palette()
         self._tissue = None
         self._gain = self._taken_out = np.ones(3, np.float32)
 
@@ -193,85 +185,6 @@ class SceneWatch:
         if now < since:  # the clock has jumped back
             since = self._since[what] = now
         return now - since
-
-
-class _Palette:
-    """The colours that the tissue usually has, whatever the exposure."""
-
-    def __init__(self) -> None:
-        self._usual: F32 | None = None  # [BINS, BINS] share of the tissue, by share of red and of green
-        self._share = 1.0
-        self._colors: I64 = np.zeros((1, 1), np.int64)  # [h, w] bin of each pixel, -1: too dark or too bright
-        self._counted = self._is_new = np.zeros((1, 1), np.bool_)
-        self._stamp_ns = 0
-
-    def new(self, picture: U8, tissue: Bool, now: int) -> Bool:
-        """Where [h, w] a small picture [h, w, 3] has colours that the tissue has far more of than usual."""
-        self._colors, self._is_new = np.empty(tissue.shape, np.int64), np.zeros(tissue.shape, np.bool_)
-        self._counted = tissue
-        _sort_colors(cv2.blur(picture, (FINE, FINE)), self._colors)
-        passed, self._stamp_ns = max(0, now - self._stamp_ns) * 1e-9, now
-        if self._usual is None:
-            self._share = 1.0
-            return self._is_new
-        self._share = min(1.0, passed / REMEMBERED_S)
-        usual, found = (
-            cv2.boxFilter(shares, -1, (FINE, FINE), normalize=False)
-            for shares in (self._usual, self._shares(tissue))
-        )
-        is_new = found > np.float32(NOVEL) * np.maximum(usual, np.float32(RARE))
-        _look_up(self._colors, is_new, self._is_new)
-        return self._is_new
-
-    def take(self, except_new: bool) -> None:
-        """Learn the colours of that picture."""
-        found = self._shares(self._counted & ~self._is_new if except_new else self._counted)
-        if found.any():
-            before = found if self._usual is None else self._usual
-            self._usual = before + np.float32(self._share) * (found - before)
-
-    def _shares(self, counted: Bool) -> F32:
-        """How much [BINS, BINS] of what is counted [h, w] has each colour."""
-        found = np.zeros((BINS, BINS), np.float32)
-        count = _count_colors(self._colors, counted, found)
-        return found / np.float32(max(1, count))
-
-
-@kernel
-def _sort_colors(picture: U8, colors: I64) -> None:
-    """The bin of each pixel's colour, or -1 where it is too dark or too bright to tell."""
-    for y in range(colors.shape[0]):
-        for x in range(colors.shape[1]):
-            red, green, blue = (
-                np.int64(picture[y, x, 0]),
-                np.int64(picture[y, x, 1]),
-                np.int64(picture[y, x, 2]),
-            )
-            light = red + green + blue
-            fair = light > 3 * 255 * DARK and max(red, green, blue) < 255 * BRIGHT
-            row, column = BINS * red // (light + 1), BINS * green // (light + 1)
-            colors[y, x] = BINS * row + column if fair else -1
-
-
-@kernel
-def _look_up(colors: I64, of_bins: Bool, of_pixels: Bool) -> None:
-    """What is said of each pixel's colour; nothing of those without."""
-    for y in range(colors.shape[0]):
-        for x in range(colors.shape[1]):
-            color = colors[y, x]
-            of_pixels[y, x] = color >= 0 and of_bins[color // BINS, color % BINS]
-
-
-@kernel
-def _count_colors(colors: I64, counted: Bool, found: F32) -> Any:
-    """How often there is each colour. Returns how often any."""
-    count = 0
-    for y in range(colors.shape[0]):
-        for x in range(colors.shape[1]):
-            if counted[y, x] and colors[y, x] >= 0:
-                found[colors[y, x] // BINS, colors[y, x] % BINS] += 1
-                count += 1
-    return count
 
 
 @kernel
