@@ -8,7 +8,7 @@ def main() -> None:
     """Run the command. A Ctrl-C while it is being loaded ends it at once: nothing has begun yet."""
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # else it is ignored, as after nohup
         signal.signal(signal.SIGINT, _leave)
-    from sags_node.cli import main as sags
+    from sags_node.cli.main import main as sags
 
     sags()
 

@@ -11,8 +11,8 @@ import numpy as np
 
 from sags_node.confidence import HALVING, confidence_of
 from sags_node.config import LaunchConfig
-from sags_node.engine.confidence import doubted
-from sags_node.engine.rasterize import to_view
+from sags_node.engine.rasterizer.confidence import doubted
+from sags_node.engine.rasterizer.rasterize import to_view
 from sags_node.findings import Findings, by_stage
 from sags_node.mapping.anchors import Anchors
 from sags_node.mapping.budget import Budget

@@ -6,7 +6,7 @@ Conventions
   (`time.time_ns`) for live sources and of the recording for deterministic ones.
 - Images are uint8 RGB `[H, W, 3]` at the edges (sources, messages), float32 0..1 inside.
 - OpenCV camera axes: x right, y down, z forward. The centre of the first pixel is (0, 0), as in `K` of
-  OpenCV and ROS. The rasterisers sample at +0.5; `engine.rasterize` shifts once.
+  OpenCV and ROS. The rasterisers sample at +0.5; `engine.rasterizer.rasterize` shifts once.
 - Depth is camera z, never ray length. 0 means unknown (NaN on the wire, REP 117/118).
 - A `tissue` mask is True where the pixel shows tissue and may be used. (EndoNeRF's files are the opposite.)
 - The world is the left rectified camera of the first frame unless a pose comes with the frame.

@@ -13,9 +13,9 @@ from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 
-from sags_node.engine.confidence import with_confidence
 from sags_node.engine.interface import Rasterizer
-from sags_node.engine.rasterize import make_rasterizer, to_view
+from sags_node.engine.rasterizer.confidence import with_confidence
+from sags_node.engine.rasterizer.rasterize import make_rasterizer, to_view
 from sags_node.errors import SagsError
 from sags_node.geometry import scale_intrinsics
 from sags_node.kernels.threads import configure_threads

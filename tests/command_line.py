@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 from click.testing import CliRunner, Result
 
-from sags_node.cli import main
+from sags_node.cli.main import main
 
 START_SECONDS = 120  # the first start on a machine compiles kernels
 PROMPT_SECONDS = 5  # to end after Ctrl-C

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rounding import U, after, moved, roughly
 
 from sags_node.engine.interface import MAX_OPACITY
-from sags_node.engine.rasterize import Gradients, make_rasterizer
+from sags_node.engine.rasterizer.rasterize import Gradients, make_rasterizer
 from sags_node.types import F32, F64, Camera, Gaussians
 
 INPUTS = ("means", "quats", "scales", "opacities", "colors")

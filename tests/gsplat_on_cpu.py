@@ -16,7 +16,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sags_node.engine import gsplat_backend
+from sags_node.engine.cuda import gsplat as gsplat_backend
 
 ALPHA_THRESHOLD, MAX_ALPHA, OPAQUE = 1 / 255, 0.999, 1e-4  # of gsplat's kernels
 

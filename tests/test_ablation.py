@@ -11,8 +11,8 @@ from unittest.mock import ANY
 import pytest
 from click.testing import CliRunner
 
-from sags_node.benchmark import ablation
-from sags_node.cli import main
+from sags_node.benchmark.quality import ablation
+from sags_node.cli.main import main
 from sags_node.fitting import start
 from sags_node.fitting.fit import Fit
 

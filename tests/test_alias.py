@@ -13,11 +13,11 @@ import pytest
 from click.testing import CliRunner
 from engine_scenes import DERIVATIVES, camera, draw_and_differentiate, random_gaussians, relative_error
 
-from sags_node.benchmark.alias import VARIANTS, Settings, Trained, train
-from sags_node.benchmark.alias_truth import moved, resized
-from sags_node.cli import main
-from sags_node.engine.rasterize import make_rasterizer, rasterize
-from sags_node.engine.smoothing import folded
+from sags_node.benchmark.quality.alias import VARIANTS, Settings, Trained, train
+from sags_node.benchmark.quality.alias_truth import moved, resized
+from sags_node.cli.main import main
+from sags_node.engine.rasterizer.rasterize import make_rasterizer, rasterize
+from sags_node.engine.rasterizer.smoothing import folded
 from sags_node.evaluation.metrics import psnr
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.mapper import Mapped, Mapper

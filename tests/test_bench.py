@@ -15,18 +15,19 @@ import pytest
 from click.testing import CliRunner, Result
 from engine_scenes import camera, one_gaussian
 
-from sags_node.benchmark import contention, kernels, peak, rasterizing
-from sags_node.benchmark.check import SECTIONS, check, compare
-from sags_node.benchmark.peak import Peak
-from sags_node.benchmark.plot import stacked_bars
-from sags_node.benchmark.scenes import SCENES
-from sags_node.benchmark.timing import stage_clock
-from sags_node.benchmark.work import Work, stage_rows
-from sags_node.cli import main
-from sags_node.engine import compositing
+from sags_node.benchmark.kernels import contention, peak, rasterizing
+from sags_node.benchmark.kernels import measure as kernels
+from sags_node.benchmark.kernels.check import SECTIONS, check, compare
+from sags_node.benchmark.kernels.peak import Peak
+from sags_node.benchmark.kernels.plot import stacked_bars
+from sags_node.benchmark.kernels.scenes import SCENES
+from sags_node.benchmark.kernels.timing import stage_clock
+from sags_node.benchmark.kernels.work import Work, stage_rows
+from sags_node.cli.main import main
 from sags_node.engine.interface import MIN_ALPHA
-from sags_node.engine.layout import PAIR
-from sags_node.engine.rasterize import make_rasterizer
+from sags_node.engine.rasterizer import compositing
+from sags_node.engine.rasterizer.layout import PAIR
+from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.kernels.threads import thread_count
 from sags_node.kernels.vectors import BLOCK_WIDTH
 

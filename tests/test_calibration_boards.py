@@ -17,7 +17,7 @@ from sags_node.calibration import load_rig, rectify_eyes
 from sags_node.calibration.boards import Charuco, Chessboard, StereoView, find_in_both
 from sags_node.calibration.coverage import coverage_hints
 from sags_node.calibration.solve import Solution, calibrate
-from sags_node.cli import main
+from sags_node.cli.main import main
 from sags_node.errors import SagsError, UsageError
 from sags_node.types import F32, F64, U8, Eye, StereoRig
 

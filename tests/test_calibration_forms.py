@@ -15,7 +15,7 @@ import yaml
 from click.testing import CliRunner
 
 from sags_node.calibration import check_rig, load_rig, read_rig, rectify_eyes, resized_rig, save_rig
-from sags_node.cli import main
+from sags_node.cli.main import main
 from sags_node.errors import UsageError
 from sags_node.geometry import scale_intrinsics
 from sags_node.types import F64, StereoRig

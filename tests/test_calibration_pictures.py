@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from sags_node.apps.calib_check import check_pictures
-from sags_node.apps.calib_pictures import pairs_of_files
+from sags_node.calibrate.check import check_pictures
+from sags_node.calibrate.pictures import pairs_of_files
 from sags_node.calibration import Finding, check_rig, load_rig, read_rig, rectify_eyes, save_rig
 from sags_node.calibration.check import size_made_for
 from sags_node.calibration.matches import match_eyes
 from sags_node.calibration.rows import rectified_rows
-from sags_node.cli import main
+from sags_node.cli.main import main
 from sags_node.errors import SagsError
 from sags_node.sources.pictures import read_picture
 from sags_node.types import U8, Eye, StereoFrame, StereoRig

@@ -21,8 +21,15 @@ from engine_scenes import (
 from rounding import after
 
 from sags_node import geometry
-from sags_node.engine import numba_rasterizer, projector
-from sags_node.engine.rasterize import TILE_HEIGHT, TILE_WIDTH, Gradients, Rasterizer, make_rasterizer
+from sags_node.engine.rasterizer import cpu as numba_rasterizer
+from sags_node.engine.rasterizer import projector
+from sags_node.engine.rasterizer.rasterize import (
+    TILE_HEIGHT,
+    TILE_WIDTH,
+    Gradients,
+    Rasterizer,
+    make_rasterizer,
+)
 from sags_node.errors import UsageError
 from sags_node.kernels.jit import parallel_kernel, take
 from sags_node.kernels.threads import configure_threads

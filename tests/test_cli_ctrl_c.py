@@ -14,9 +14,9 @@ import pytest
 from click.testing import CliRunner
 from command_line import start, stopped, wait_for
 
-from sags_node.apps import terminal
-from sags_node.apps.terminal import interrupt, on_stop_signals
-from sags_node.cli import main
+from sags_node.cli.main import main
+from sags_node.terminal import console as terminal
+from sags_node.terminal.console import interrupt, on_stop_signals
 
 pytestmark = [pytest.mark.live, pytest.mark.usefixtures("run_dir")]
 
@@ -46,9 +46,9 @@ def test_a_ctrl_c_that_comes_while_a_kernel_is_loaded_is_one_too(monkeypatch: py
     def broken(*arguments: object) -> None:
         raise SystemError("broken")
 
-    monkeypatch.setattr("sags_node.apps.doctor.examine", interrupted)
+    monkeypatch.setattr("sags_node.doctor.examine", interrupted)
     assert CliRunner().invoke(main, ["doctor"]).exit_code == 130
-    monkeypatch.setattr("sags_node.apps.doctor.examine", broken)
+    monkeypatch.setattr("sags_node.doctor.examine", broken)
     assert isinstance(CliRunner().invoke(main, ["doctor"]).exception, SystemError)
 
 

@@ -14,7 +14,7 @@ import pytest
 from command_line import pure_json, refused, sags
 from user_files import videos
 
-from sags_node.cli import main
+from sags_node.cli.main import main
 
 pytestmark = [pytest.mark.live, pytest.mark.usefixtures("run_dir")]
 
@@ -151,9 +151,9 @@ def test_torch_and_open3d_stay_out_of_the_start(user_files: Path) -> None:
     session = videos(user_files)
     commands = [["run", *session, "source.frames:=2"], ["eval", *session, "source.frames:=2"]]
     code = (
-        f"import sys; from sags_node.cli import main\n"
+        f"import sys; from sags_node.cli.main import main\n"
         f"for command in {commands}: main(command, standalone_mode=False)\n"
-        f"import sags_node.apps.overlay, sags_node.apps.topic, sags_node.apps.demo\n"
+        f"import sags_node.overlay.run, sags_node.topic, sags_node.demo\n"
         f"print(sorted({{'torch', 'open3d', 'onnxruntime'}} & set(sys.modules)))"
     )
     process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

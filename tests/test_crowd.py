@@ -2,7 +2,7 @@
 
 import pytest
 
-from sags_node.benchmark import crowd
+from sags_node.benchmark.node import crowd
 from sags_node.errors import SagsError
 
 pytestmark = pytest.mark.live

@@ -14,12 +14,14 @@ from numpy.typing import NDArray
 pytest.importorskip("triton", reason="Triton comes with torch's CUDA builds, or by `pip install triton`")
 
 from sags_node.engine import adam as engine_adam
-from sags_node.engine.cuda import adam, nodes, optimiser
+from sags_node.engine.cuda import adam
 from sags_node.engine.cuda.backend import default_device
 from sags_node.engine.interface import Gradients
 from sags_node.mapping import optimiser as mapping_optimiser
-from sags_node.mapping.cuda_refiner import STEP
+from sags_node.mapping.cuda import optimiser
+from sags_node.mapping.cuda.refiner import STEP
 from sags_node.mapping.optimiser import Rates
+from sags_node.model.cuda import nodes
 from sags_node.model.deformation import NodeDeformation
 from sags_node.model.gaussians import GaussianModel
 from sags_node.types import F32, Bool

@@ -28,16 +28,18 @@ if torch.cuda.is_available():
 
 from gsplat_on_cpu import use_gsplat_on_cpu
 
-from sags_node.benchmark import device_kernels, device_peak, device_rasterizing, gsplat_rasterizing
-from sags_node.benchmark.check import check
-from sags_node.benchmark.device_rasterizing import DeviceDrawing, measure_device_rasterizer
-from sags_node.benchmark.peak import MIB, Peak
-from sags_node.benchmark.rasterizing import RasterCase
-from sags_node.benchmark.timing import WALL, EventClock, median_ms, stage_clock
+from sags_node.benchmark.kernels import device as device_kernels
+from sags_node.benchmark.kernels import device_peak, device_rasterizing
+from sags_node.benchmark.kernels import gsplat as gsplat_rasterizing
+from sags_node.benchmark.kernels.check import check
+from sags_node.benchmark.kernels.device_rasterizing import DeviceDrawing, measure_device_rasterizer
+from sags_node.benchmark.kernels.peak import MIB, Peak
+from sags_node.benchmark.kernels.rasterizing import RasterCase
+from sags_node.benchmark.kernels.timing import WALL, EventClock, median_ms, stage_clock
 from sags_node.engine import device as devices
 from sags_node.engine.cuda import layout
+from sags_node.engine.cuda.gsplat import GsplatRasterizer
 from sags_node.engine.cuda.rasterizer import CudaRasterizer
-from sags_node.engine.gsplat_backend import GsplatRasterizer
 from sags_node.errors import UsageError
 
 # what the interpreter says of lanes without a Gaussian
@@ -121,7 +123,7 @@ def test_the_compiler_leaves_every_multiply_add_in_the_loop() -> None:
 import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
-from sags_node.benchmark.device_peak import SIGNATURES
+from sags_node.benchmark.kernels.device_peak import SIGNATURES
 for variant in SIGNATURES:
     names = variant.kernel.arg_names
     assert set(names) == set(variant.signature) | set(variant.constexprs)

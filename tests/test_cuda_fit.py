@@ -18,15 +18,17 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 pytest.importorskip("triton", reason="Triton comes with torch's CUDA builds, or by `pip install triton`")
 
-from sags_node.cli import main
+from sags_node.cli.main import main
 from sags_node.engine import device as devices
 from sags_node.engine.cuda import adam, hexplane
 from sags_node.engine.cuda.rasterizer import CudaRasterizer
-from sags_node.engine.device import Device, DeviceMemoryError
+from sags_node.engine.device import Device
+from sags_node.engine.failures import DeviceMemoryError
 from sags_node.errors import SagsError
-from sags_node.fitting import checkpoint, cuda_learner, field, fit, start
+from sags_node.fitting import checkpoint, field, fit, start
 from sags_node.fitting.clip import Clip, ClipFrame
-from sags_node.fitting.cuda_field import Loan
+from sags_node.fitting.cuda import learner as cuda_learner
+from sags_node.fitting.cuda.field import Loan
 from sags_node.fitting.fit import Fit
 from sags_node.fitting.learner import DeviceKind
 from sags_node.fitting.settings import FitSettings

@@ -12,13 +12,14 @@ from test_skinning import scene, twin_and_gradients
 
 pytest.importorskip("triton", reason="Triton comes with torch's CUDA builds, or by `pip install triton`")
 
-from sags_node.engine.cuda import hexplane, skinning
+from sags_node.engine.cuda import hexplane
 from sags_node.engine.cuda.backend import default_device
-from sags_node.engine.cuda.nodes import Followers
-from sags_node.fitting.cuda_field import DeviceField, Loan
-from sags_node.fitting.cuda_model import smoothing_variances
+from sags_node.fitting.cuda.field import DeviceField, Loan
+from sags_node.fitting.cuda.model import smoothing_variances
 from sags_node.fitting.field import make_box, make_decoder, make_field
 from sags_node.model import alias_free, columns
+from sags_node.model.cuda import skinning
+from sags_node.model.cuda.nodes import Followers
 from sags_node.model.field import Deltas, Field, FieldRates
 from sags_node.model.hexplane import HexPlaneField
 from sags_node.types import F32

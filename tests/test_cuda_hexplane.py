@@ -12,12 +12,12 @@ from test_hexplane import BOX, dense, error, random_cells, random_points, twin
 
 pytest.importorskip("triton", reason="Triton comes with torch's CUDA builds, or by `pip install triton`")
 
-from sags_node.engine import decoder_reference
 from sags_node.engine.cuda import hexplane as cuda
 from sags_node.engine.cuda.backend import default_device
 from sags_node.engine.cuda.hexplane import FieldGradients
 from sags_node.engine.cuda.hexplane_kernels import PART
-from sags_node.engine.hexplane import Grid, HexPlane, Moment
+from sags_node.engine.field.hexplane import Grid, HexPlane, Moment
+from sags_node.engine.reference import decoder as decoder_reference
 from sags_node.errors import UsageError
 from sags_node.model.decoder import DecoderConfig
 from sags_node.types import F32

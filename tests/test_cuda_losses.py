@@ -16,15 +16,16 @@ from test_photometric import ALL, OFF, TERMS
 
 pytest.importorskip("triton", reason="Triton comes with torch's CUDA builds, or by `pip install triton`")
 
-from sags_node.engine.cuda import focus, losses
+from sags_node.engine.cuda import losses
 from sags_node.engine.cuda import photometric as photometric_loss
 from sags_node.engine.cuda.backend import default_device
 from sags_node.engine.cuda.photometric import PhotometricLoss
 from sags_node.engine.cuda.ssim import Dissimilarity
-from sags_node.engine.losses import COVERED
-from sags_node.engine.photometric import LossTerms, LossWeights
-from sags_node.engine.pieces import PIECE
-from sags_node.engine.rasterize import TILE_HEIGHT, TILE_WIDTH
+from sags_node.engine.losses.photometric import LossTerms, LossWeights
+from sags_node.engine.losses.pieces import PIECE
+from sags_node.engine.losses.tissue import COVERED
+from sags_node.engine.rasterizer.rasterize import TILE_HEIGHT, TILE_WIDTH
+from sags_node.mapping.cuda import focus
 from sags_node.mapping.focus import EVERY, worst_tiles
 from sags_node.types import F32, Bool
 

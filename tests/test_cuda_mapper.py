@@ -18,14 +18,15 @@ pytest.importorskip("triton", reason="Triton comes with torch's CUDA builds, or 
 from sags_node.calibration import rectified_rig
 from sags_node.config import LaunchConfig, MappingConfig
 from sags_node.engine.cuda.rasterizer import CudaRasterizer
-from sags_node.engine.device import DeviceMemoryError
-from sags_node.engine.rasterize import make_rasterizer
+from sags_node.engine.failures import DeviceMemoryError
+from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.errors import UsageError
-from sags_node.mapping import cuda_refiner, densify, exposure, guarded_refiner, mapper
+from sags_node.mapping import densify, exposure, fallback_refiner, mapper
 from sags_node.mapping.anchors import Anchors
 from sags_node.mapping.budget import StepBudget
-from sags_node.mapping.cuda_refiner import REFINED, CudaRefiner
-from sags_node.mapping.guarded_refiner import LOWERED, GuardedRefiner
+from sags_node.mapping.cuda import refiner as cuda_refiner
+from sags_node.mapping.cuda.refiner import REFINED, CudaRefiner
+from sags_node.mapping.fallback_refiner import LOWERED, FallbackRefiner
 from sags_node.mapping.mapper import Mapper
 from sags_node.mapping.optimiser import Rates
 from sags_node.mapping.refiner import CpuRefiner, Refiner
@@ -309,9 +310,9 @@ def test_tissue_that_comes_into_view_gets_nodes_on_the_device_too() -> None:
 # ---- when the device fails ---------------------------------------------------------------------------------
 
 
-def guarded(cpu_share: float = 0.5) -> Played:
+def with_fallback(cpu_share: float = 0.5) -> Played:
     cpu = CpuRefiner(partial(make_rasterizer, "numba"))
-    return Played.on(GuardedRefiner(CudaRefiner(), cpu, cpu_share))
+    return Played.on(FallbackRefiner(CudaRefiner(), cpu, cpu_share))
 
 
 @dataclass
@@ -347,7 +348,7 @@ FAULTS = [
 def test_a_cuda_error_anywhere_leaves_the_cpu_to_go_on(
     owner: type, method: str, call: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    played = guarded()
+    played = with_fallback()
     first, _ = played.take(frame(0))
     fault = Fault(CUDA_ERROR, call, for_good=True).break_(monkeypatch, owner, method)
     snapshot, view = played.take(frame(1), steps=2)
@@ -366,8 +367,8 @@ def test_a_cuda_error_anywhere_leaves_the_cpu_to_go_on(
 def test_a_lack_of_memory_lowers_the_limit_and_the_gpu_is_tried_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(guarded_refiner, "PAUSE", 2)
-    played = guarded()
+    monkeypatch.setattr(fallback_refiner, "PAUSE", 2)
+    played = with_fallback()
     played.take(frame(0))
     count = played.mapper.model.count
     fault = Fault(torch.OutOfMemoryError("CUDA out of memory"), 2).break_(monkeypatch, CudaRasterizer, "draw")
@@ -388,7 +389,7 @@ def test_a_lack_of_memory_lowers_the_limit_and_the_gpu_is_tried_again(
 
 def test_a_lack_of_memory_before_the_first_frame(monkeypatch: pytest.MonkeyPatch) -> None:
     """There is no model yet whose size could have been too large."""
-    played = guarded()
+    played = with_fallback()
     Fault(DeviceMemoryError("full"), 1).break_(monkeypatch, CudaRasterizer, "draw")
     played.refiner.show(played.mapper.model.gaussians(), frame(0).camera)
     assert played.refiner.share == LOWERED
@@ -398,20 +399,20 @@ def test_a_lack_of_memory_before_the_first_frame(monkeypatch: pytest.MonkeyPatch
 
 def test_after_the_pause_the_gpu_begins_with_a_drawing_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     """What it drew last is of long ago, and still frames are judged by it."""
-    monkeypatch.setattr(guarded_refiner, "PAUSE", 1)
-    played = guarded()
+    monkeypatch.setattr(fallback_refiner, "PAUSE", 1)
+    played = with_fallback()
     played.take(frame(0))
     Fault(DeviceMemoryError("full"), 1).break_(monkeypatch, CudaRefiner, "begin")
     played.take(frame(6))
     played.mapper._begin(frame(6))
     rasterizer = make_rasterizer("numba", WIDTH, HEIGHT)
     expected = rasterizer.forward(played.mapper.model.gaussians(), [frame(6).camera])[0]
-    assert isinstance(played.refiner, GuardedRefiner) and played.refiner._working is played.refiner._gpu
+    assert isinstance(played.refiner, FallbackRefiner) and played.refiner._working is played.refiner._gpu
     np.testing.assert_allclose(played.refiner.planes(), expected, atol=1e-4)
 
 
 def test_a_request_that_is_wrong_is_no_fault_of_the_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    played = guarded()
+    played = with_fallback()
     Fault(UsageError("tiles have another shape"), 1).break_(monkeypatch, CudaRasterizer, "draw")
     with pytest.raises(UsageError):
         played.take(frame(0))
@@ -437,7 +438,7 @@ def pipeline_on(device: str, steps: int) -> tuple[Pipeline, Callable[[int], Any]
 def test_the_pipeline_runs_on_the_device_and_says_when_it_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sags_node.vision.stereo.SMALLEST_SIDE", 16)  # the frames bring their depth
     pipeline, take = pipeline_on("cuda", 1)
-    assert isinstance(pipeline._refiner, GuardedRefiner)
+    assert isinstance(pipeline._refiner, FallbackRefiner)
     assert psnr(take(0).views["left"], frame(0)) > 19
     take(1)
     assert "device" not in pipeline.warnings

@@ -29,7 +29,7 @@ from rounding import after
 
 from sags_node import geometry
 from sags_node.engine.interface import MAX_OPACITY, NEAR_PLANE, Pinhole
-from sags_node.engine.rasterize import TILE_HEIGHT, TILE_WIDTH, Rasterizer, make_rasterizer
+from sags_node.engine.rasterizer.rasterize import TILE_HEIGHT, TILE_WIDTH, Rasterizer, make_rasterizer
 from sags_node.errors import SagsError, UsageError
 from sags_node.mapping.optimiser import COLOR_RANGE, COLOUR_DAMPING, COLOUR_RELAXATION, MIN_CONTRIBUTION
 from sags_node.types import Bool, Camera, Gaussians

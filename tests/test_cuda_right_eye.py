@@ -12,9 +12,9 @@ from engine_scenes import camera, relative_error
 pytest.importorskip("triton", reason="Triton comes with torch's CUDA builds, or by `pip install triton`")
 
 from sags_node.engine.cuda.backend import default_device
-from sags_node.engine.cuda.exposure import ExposureRule, exposure_gain
-from sags_node.engine.cuda.right_eye import RightEyeRule, right_eye_loss, right_eye_mask
 from sags_node.mapping import exposure, right_eye
+from sags_node.mapping.cuda.exposure import ExposureRule, exposure_gain
+from sags_node.mapping.cuda.right_eye import RightEyeRule, right_eye_loss, right_eye_mask
 from sags_node.types import F32, Observation
 
 # the kernels divide by a coverage of zero and select afterwards; a GPU says nothing of it

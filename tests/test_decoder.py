@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from engine_scenes import relative_error
 
-from sags_node.engine import decoder_reference
+from sags_node.engine.reference import decoder as decoder_reference
 from sags_node.errors import UsageError
 from sags_node.model.decoder import Decoder, DecoderConfig
 from sags_node.types import F32

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from sags_node.benchmark import depth_report
-from sags_node.benchmark.depth import (
+from sags_node.benchmark.quality import depth_report
+from sags_node.benchmark.quality.depth import (
     MODEL,
     Comparison,
     PlainSGBM,
@@ -18,7 +18,7 @@ from sags_node.benchmark.depth import (
     measure_faults,
     measure_recording,
 )
-from sags_node.benchmark.depth_ct import (
+from sags_node.benchmark.quality.depth_ct import (
     CTPair,
     distances_to_surface,
     errors_along_z,
@@ -26,7 +26,7 @@ from sags_node.benchmark.depth_ct import (
     picture,
     read_ct_pair,
 )
-from sags_node.cli import main
+from sags_node.cli.main import main
 from sags_node.config import StereoConfig
 from sags_node.errors import SagsError, UsageError
 from sags_node.geometry import unproject

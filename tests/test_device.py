@@ -16,11 +16,11 @@ from click.testing import CliRunner
 
 pytest.importorskip("triton", reason="Triton comes with torch's CUDA builds, or by `pip install triton`")
 
-from sags_node.apps import doctor
-from sags_node.cli import main
+from sags_node import doctor
+from sags_node.cli.main import main
 from sags_node.config import LaunchConfig, MappingConfig
 from sags_node.engine import device as devices
-from sags_node.engine.cuda import probe
+from sags_node.engine import probe
 from sags_node.engine.cuda.rasterizer import CudaRasterizer
 from sags_node.engine.device import choose_device, find_gpu
 from sags_node.errors import UsageError

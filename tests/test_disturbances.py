@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from sags_node.benchmark.disturbances import frames_to_recover, warning_times
+from sags_node.benchmark.quality.disturbances import frames_to_recover, warning_times
 from sags_node.calibration import rectified_rig
-from sags_node.cli import main
+from sags_node.cli.main import main
 from sags_node.disturbances import DISTURBANCES, Scene, disturbed
 from sags_node.disturbances.light import GRAIN, to_linear
 from sags_node.disturbances.tissue import SMOKE_VEIL

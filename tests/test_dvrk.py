@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from bag_files import MS, START, picture
 
-from sags_node.apps.launching import split
+from sags_node.cli.launching import split
 from sags_node.config import DvrkSource, LaunchConfig
 from sags_node.errors import UsageError
 from sags_node.launch_file import load_launch

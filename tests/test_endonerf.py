@@ -14,7 +14,7 @@ import pytest
 from click.testing import CliRunner
 
 from sags_node import config as cfg
-from sags_node.cli import main
+from sags_node.cli.main import main
 from sags_node.errors import SagsError, UsageError
 from sags_node.launch_file import load_launch
 from sags_node.mapping.budget import StepBudget

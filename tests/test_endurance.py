@@ -13,9 +13,16 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from sags_node.benchmark import endurance
-from sags_node.benchmark.endurance import FIGURES, STILL_FRAMES, Window, measure_endurance, slope, statement
-from sags_node.cli import main
+from sags_node.benchmark.node import endurance
+from sags_node.benchmark.node.endurance import (
+    FIGURES,
+    STILL_FRAMES,
+    Window,
+    measure_endurance,
+    slope,
+    statement,
+)
+from sags_node.cli.main import main
 from sags_node.session import Session, open_session
 
 SESSION = Path(__file__).parent.parent / "replay/phantom_pull"

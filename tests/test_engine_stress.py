@@ -27,7 +27,7 @@ from rounding import after
 
 from sags_node import geometry
 from sags_node.engine.interface import MAX_OPACITY, NEAR_PLANE
-from sags_node.engine.rasterize import make_rasterizer
+from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.types import Camera, Gaussians
 
 VIEW = camera()

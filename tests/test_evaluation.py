@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from sags_node.calibration import save_rig
-from sags_node.engine.rasterize import rasterize
+from sags_node.engine.rasterizer.rasterize import rasterize
 from sags_node.errors import SagsError, UsageError
 from sags_node.evaluation.golden import Golden, Tolerance, compare, read_golden, write_golden
 from sags_node.evaluation.measure import Measurer, Options

@@ -14,12 +14,14 @@ import pytest
 from command_line import refused, sags
 from test_node import RunningNode
 
-from sags_node.apps import export, export_scene, export_surface
-from sags_node.apps.export_orbit import orbit
-from sags_node.apps.export_scene import Scene, from_node, from_session
 from sags_node.config import PhantomSource
-from sags_node.engine.rasterize import rasterize
+from sags_node.engine.rasterizer.rasterize import rasterize
 from sags_node.errors import SagsError
+from sags_node.export import export
+from sags_node.export import scene as export_scene
+from sags_node.export import surface as export_surface
+from sags_node.export.orbit import orbit
+from sags_node.export.scene import Scene, from_node, from_session
 from sags_node.geometry import project, unproject
 from sags_node.messaging.control import ControlClient
 from sags_node.messaging.received import ReceivedImage, TopicName

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from sags_node.cli import main
+from sags_node.cli.main import main
 from sags_node.errors import SagsError, UsageError
 from sags_node.fitting import checkpoint, start
 from sags_node.fitting.clip import Clip, read_clip

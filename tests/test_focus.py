@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sags_node.engine.losses import COVERED
-from sags_node.engine.rasterize import TILE_HEIGHT, TILE_WIDTH
+from sags_node.engine.losses.tissue import COVERED
+from sags_node.engine.rasterizer.rasterize import TILE_HEIGHT, TILE_WIDTH
 from sags_node.mapping import focus
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.focus import EVERY, with_neighbours, worst_tiles

@@ -33,9 +33,9 @@ from engine_scenes import (
 from rounding import after
 
 from sags_node import geometry
-from sags_node.apps.doctor import examine
+from sags_node.doctor import examine
 from sags_node.engine.interface import MAX_OPACITY, MIN_ALPHA, NEAR_PLANE
-from sags_node.engine.rasterize import TILE_HEIGHT, TILE_WIDTH, make_rasterizer
+from sags_node.engine.rasterizer.rasterize import TILE_HEIGHT, TILE_WIDTH, make_rasterizer
 from sags_node.errors import SagsError, UsageError
 from sags_node.launch_file import load_launch
 from sags_node.mapping import mapper
@@ -48,7 +48,7 @@ pytest.importorskip("triton", reason="Triton comes with torch's CUDA builds, or 
 
 from gsplat_on_cpu import use_gsplat_on_cpu
 
-from sags_node.engine import gsplat_backend
+from sags_node.engine.cuda import gsplat as gsplat_backend
 
 VIEW = camera(width=50, height=44, focal=60.0, moved=True)
 EYES = [VIEW, VIEW.moved_right(0.004)]

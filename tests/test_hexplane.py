@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from sags_node.engine import hexplane_reference as reference
 from sags_node.engine.adam import adam_step
-from sags_node.engine.hexplane import Grid, HexPlane, Moment
-from sags_node.engine.hexplane_kernels import BLOCK
+from sags_node.engine.field.hexplane import Grid, HexPlane, Moment
+from sags_node.engine.field.hexplane_kernels import BLOCK
+from sags_node.engine.reference import hexplane as reference
 from sags_node.errors import SagsError, UsageError
 from sags_node.kernels.threads import configure_threads
 from sags_node.model import hexplane as model

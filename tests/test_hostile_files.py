@@ -16,12 +16,12 @@ import pytest
 from numbered_pictures import HEIGHT, WIDTH, picture, recordings
 
 from sags_node import config as cfg
-from sags_node.apps.overlay_mesh import mesh_of
-from sags_node.apps.overlay_save import Output
-from sags_node.apps.overlay_scene import ObjectSpec
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import open_file
 from sags_node.native_output import native_output
+from sags_node.overlay.mesh import mesh_of
+from sags_node.overlay.save import Output
+from sags_node.overlay.scene import ObjectSpec
 from sags_node.picture_file import claimed_size
 from sags_node.recording.pictures import decode_file
 from sags_node.sources.numbered import open_numbered

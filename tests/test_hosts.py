@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from sags_node.benchmark import hosts
+from sags_node.benchmark.node import hosts
 from sags_node.errors import SagsError
 
 pytestmark = pytest.mark.live

@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sags_node.engine import confidence
 from sags_node.engine.pinhole import pack
+from sags_node.engine.rasterizer import confidence
 from sags_node.mapping import densify, motion, optimiser, split
 from sags_node.model import deformation
 from sags_node.types import Camera

@@ -10,9 +10,9 @@ import pytest
 from engine_scenes import camera, random_gaussians
 from rounding import after, exact
 
-from sags_node.engine.losses import tissue_loss
-from sags_node.engine.pieces import PIECE
-from sags_node.engine.rasterize import make_rasterizer
+from sags_node.engine.losses.pieces import PIECE
+from sags_node.engine.losses.tissue import tissue_loss
+from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.types import F32
 
 HEIGHT, WIDTH = 23, 31
@@ -50,7 +50,7 @@ def twin(planes: Any, image: Any, tissue: Any, depth: Any) -> list[Any]:
     """The gradient of the stated loss by each of the planes, in float64."""
     import torch
 
-    from sags_node.engine import reference
+    from sags_node.engine.reference import rasterizer as reference
 
     drawn = torch.tensor(planes, dtype=torch.float64, requires_grad=True)
     seen = (torch.tensor(array) for array in (image, tissue, depth))

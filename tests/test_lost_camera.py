@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sags_node.config import PhantomSource
-from sags_node.engine.views import to_view
+from sags_node.engine.rasterizer.views import to_view
 from sags_node.geometry import invert, transform
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.camera_pose import exponential

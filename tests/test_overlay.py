@@ -17,12 +17,12 @@ import numpy as np
 import pytest
 from test_overlay_drawing import KEY, centre
 
-from sags_node.apps.overlay_draw import color_key
 from sags_node.geometry import project
 from sags_node.messaging.control import ControlClient
 from sags_node.messaging.received import ReceivedCloud, ReceivedImage, ReceivedText
 from sags_node.messaging.rundir import connection_path
 from sags_node.messaging.subscriber import Subscriber
+from sags_node.overlay.draw import color_key
 from sags_node.types import Camera
 
 pytestmark = pytest.mark.live

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sags_node.apps.overlay_draw import NEAREST, UNDER, Body, Placed, color_key, draw, over
-from sags_node.apps.overlay_frame import TissueFrame
-from sags_node.apps.overlay_mesh import Mesh
-from sags_node.apps.overlay_raster import fill
 from sags_node.geometry import quat_to_matrix
+from sags_node.overlay.draw import NEAREST, UNDER, Body, Placed, color_key, draw, over
+from sags_node.overlay.frame import TissueFrame
+from sags_node.overlay.mesh import Mesh
+from sags_node.overlay.raster import fill
 from sags_node.types import Camera
 
 K = np.array([[300.0, 0, 80], [0, 300, 60], [0, 0, 1]])

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from synthetic import BASELINE, NORMAL, plane_depth, plane_result
 
-from sags_node.apps.overlay_frame import Anchor, TissueFrame
-from sags_node.apps.overlay_held import HeldObject, Pinner, Request
-from sags_node.apps.overlay_pose import on_a_line, on_surface, rigid_fit, surface_normal
-from sags_node.apps.overlay_scene import ObjectSpec
 from sags_node.errors import SagsError, UsageError
 from sags_node.geometry import invert, quat_to_matrix, transform
+from sags_node.overlay.frame import Anchor, TissueFrame
+from sags_node.overlay.held import HeldObject, Pinner, Request
+from sags_node.overlay.pose import on_a_line, on_surface, rigid_fit, surface_normal
+from sags_node.overlay.scene import ObjectSpec
 
 # ---- poses -----------------------------------------------------------------------------------------------
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from command_line import refused
 
-from sags_node.apps.overlay_mesh import mesh_of
-from sags_node.apps.overlay_scene import SHAPES, ObjectSpec, built_in
+from sags_node.overlay.mesh import mesh_of
+from sags_node.overlay.scene import SHAPES, ObjectSpec, built_in
 
 
 @pytest.mark.parametrize("shape", SHAPES)

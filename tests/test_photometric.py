@@ -13,9 +13,9 @@ from engine_scenes import camera, random_gaussians, relative_error
 from rounding import Exact, after, exact
 
 from sags_node.engine.adam import AdamState, adam_step
-from sags_node.engine.photometric import LossTerms, LossWeights, PhotometricLoss
-from sags_node.engine.pieces import PIECE
-from sags_node.engine.rasterize import make_rasterizer
+from sags_node.engine.losses.photometric import LossTerms, LossWeights, PhotometricLoss
+from sags_node.engine.losses.pieces import PIECE
+from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.types import F32
 
 HEIGHT, WIDTH = 37, 53
@@ -55,7 +55,7 @@ def run(inputs: dict[str, Any], weights: LossWeights, normalised: bool = True) -
 
 
 def twin(inputs: dict[str, Any], normalised: bool) -> tuple[Any, dict[str, Any]]:
-    from sags_node.engine import losses_reference
+    from sags_node.engine.reference import losses as losses_reference
 
     planes = torch.tensor(inputs["planes"], dtype=torch.float64, requires_grad=True)
     image, depth = (torch.tensor(inputs[name]).double() for name in ("image", "depth"))
@@ -137,7 +137,7 @@ def test_gradient_of_the_weighted_sum(normalised: bool) -> None:
 
 @pytest.mark.parametrize("normalised", [True, False])
 def test_twin_by_finite_differences(normalised: bool) -> None:
-    from sags_node.engine import losses_reference
+    from sags_node.engine.reference import losses as losses_reference
 
     inputs = {name: torch.tensor(array) for name, array in frame(5, 7).items()}
     inputs = {name: value.double() if value.is_floating_point() else value for name, value in inputs.items()}

@@ -20,7 +20,6 @@ from recorded_plane import by_topic, record_plane
 from synthetic import HEIGHT, WIDTH, plane_result
 from waiting import until
 
-from sags_node.apps.topic import topic_hz
 from sags_node.config import PublishConfig
 from sags_node.errors import SagsError
 from sags_node.messaging import cdr
@@ -31,6 +30,7 @@ from sags_node.messaging.subscriber import Subscriber
 from sags_node.recording.info import bag_info
 from sags_node.recording.player import Options as PlayOptions
 from sags_node.recording.player import Player
+from sags_node.topic import topic_hz
 
 pytestmark = pytest.mark.live
 

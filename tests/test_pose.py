@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sags_node.config import PhantomSource
-from sags_node.engine.rasterize import rasterize
+from sags_node.engine.rasterizer.rasterize import rasterize
 from sags_node.evaluation.measure import Options
 from sags_node.evaluation.session import evaluate
 from sags_node.evaluation.trajectory import RigidOdometry, trajectory_errors

@@ -26,9 +26,10 @@ from numpy.typing import NDArray
 from rounding import after
 
 from sags_node import geometry
-from sags_node.engine import numba_rasterizer, projection, projection_backward, projector, smoothing
-from sags_node.engine import spherical_harmonics as harmonics
-from sags_node.engine.rasterize import make_rasterizer, rasterize
+from sags_node.engine.rasterizer import cpu as numba_rasterizer
+from sags_node.engine.rasterizer import projection, projection_backward, projector, smoothing
+from sags_node.engine.rasterizer import spherical_harmonics as harmonics
+from sags_node.engine.rasterizer.rasterize import make_rasterizer, rasterize
 from sags_node.errors import UsageError
 from sags_node.types import F64, Camera, Gaussians
 
@@ -90,8 +91,8 @@ def smooth_scene() -> tuple[Camera, list[F64], F64]:
 def twin_planes(view: Camera, inputs: Sequence[Any], variance: F64, twist: Any = None) -> Any:
     import torch
 
-    from sags_node.engine import reference
-    from sags_node.engine.rasterize import as_pinhole
+    from sags_node.engine.rasterizer.rasterize import as_pinhole
+    from sags_node.engine.reference import rasterizer as reference
 
     tensors = [torch.as_tensor(array) for array in inputs]
     splats = reference.project(as_pinhole(view), tensors, torch.tensor(variance), twist)

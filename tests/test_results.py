@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
-from sags_node.apps.launching import write_json
 from sags_node.benchmark.provenance import WHAT_COUNTS, provenance, revision
+from sags_node.cli.launching import write_json
 
 ROOT = Path(__file__).parent.parent
 RESULTS = sorted((ROOT / "benchmarks/results").glob("*.json"))

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sags_node.engine.rasterize import make_rasterizer
+from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.evaluation.metrics import psnr
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.right_eye import WEIGHT, right_eye_loss, right_eye_mask

@@ -24,7 +24,7 @@ from synthetic import publisher, stream
 from waiting import until
 from zmq.auth import load_certificate
 
-from sags_node.cli import main
+from sags_node.cli.main import main
 from sags_node.errors import SagsError, UsageError
 from sags_node.launch_file import load_launch
 from sags_node.messaging.address import ClientKeys, client_keys

@@ -11,7 +11,7 @@ import pytest
 import torch
 from rounding import after, exact
 
-from sags_node.engine.ssim import TILE_HEIGHT, TILE_WIDTH, Dissimilarity
+from sags_node.engine.losses.ssim import TILE_HEIGHT, TILE_WIDTH, Dissimilarity
 from sags_node.evaluation import metrics
 from sags_node.types import F32, Bool
 
@@ -46,7 +46,7 @@ SIZES = [
 
 @pytest.mark.parametrize(("height", "width"), SIZES)
 def test_value_and_gradient_of_the_published_formula(height: int, width: int) -> None:
-    from sags_node.engine import losses_reference
+    from sags_node.engine.reference import losses as losses_reference
 
     drawn, truth, weight = pictures(height, width)
     total, v_drawn = run(drawn, truth, weight)
@@ -65,7 +65,7 @@ def test_value_and_gradient_of_the_published_formula(height: int, width: int) ->
 
 
 def test_twin_by_finite_differences() -> None:
-    from sags_node.engine import losses_reference
+    from sags_node.engine.reference import losses as losses_reference
 
     drawn, truth, weight = (torch.tensor(array).double() for array in pictures(7, 13))
     drawn.requires_grad_(True)

@@ -27,6 +27,6 @@ def test_a_client_loads_nothing_that_maps() -> None:
 
 @pytest.mark.parametrize("asked", [["--help"], ["topic", "--help"], ["bench", "--help"]], ids=" ".join)
 def test_help_loads_no_numerics(asked: list[str]) -> None:
-    found = loaded(f"from sags_node.cli import main\nmain({asked}, standalone_mode=False)")
+    found = loaded(f"from sags_node.cli.main import main\nmain({asked}, standalone_mode=False)")
     assert "click" in found
     assert not found & (HEAVY | {"numpy"})

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from sags_node.calibration import rectified_rig
-from sags_node.engine.rasterize import make_rasterizer, to_view
+from sags_node.engine.rasterizer.rasterize import make_rasterizer, to_view
 from sags_node.evaluation.metrics import psnr
 from sags_node.launch_file import load_launch
 from sags_node.mapping import mapper

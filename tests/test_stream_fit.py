@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from sags_node.cli import main
-from sags_node.engine.rasterize import to_view
+from sags_node.cli.main import main
+from sags_node.engine.rasterizer.rasterize import to_view
 from sags_node.errors import SagsError
 from sags_node.evaluation.metrics import as_float, psnr
 from sags_node.fitting.clip import ClipFrame, play

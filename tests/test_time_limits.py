@@ -14,7 +14,7 @@ import pytest
 from command_line import FREE_PORTS
 
 from sags_node import processes
-from sags_node.benchmark import transport
+from sags_node.benchmark.node import transport
 from sags_node.config import V4l2Source
 from sags_node.errors import SagsError
 from sags_node.messaging.publisher import Publisher

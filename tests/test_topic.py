@@ -13,11 +13,11 @@ import pytest
 from click.testing import CliRunner
 from synthetic import HEIGHT, WIDTH, health, publisher, stream
 
-from sags_node.apps.overlay_stream import OverlayStream
-from sags_node.apps.topic import topic_bw, topic_delay, topic_echo, topic_hz, topic_list
-from sags_node.cli import main
+from sags_node.cli.main import main
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import cdr, topics
+from sags_node.overlay.stream import OverlayStream
+from sags_node.topic import topic_bw, topic_delay, topic_echo, topic_hz, topic_list
 
 pytestmark = pytest.mark.live
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sags_node.benchmark.tracking import _sample, measure_tracking, table
+from sags_node.benchmark.quality.tracking import _sample, measure_tracking, table
 from sags_node.errors import SagsError
 from sags_node.mapping.anchors import Anchors
 from sags_node.session import Session, open_session

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from sags_node.cli import main
+from sags_node.cli.main import main
 from sags_node.config import PhantomSource
 from sags_node.evaluation.gallery import Picture
 from sags_node.messaging.content import SPLAT_FIELDS

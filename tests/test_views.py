@@ -15,7 +15,7 @@ import zmq
 from synthetic import at_frame, plane_result
 from test_node import START_SECONDS, RunningNode
 
-from sags_node.engine.rasterize import rasterize
+from sags_node.engine.rasterizer.rasterize import rasterize
 from sags_node.errors import SagsError
 from sags_node.mapping.ladder import RUNGS
 from sags_node.messaging.control import ControlClient

@@ -131,7 +131,7 @@ def as_opencv(text: str, folder: Path) -> object:
 
 
 def as_scene(text: str, folder: Path) -> object:
-    from sags_node.apps.overlay_scene import read_scene
+    from sags_node.overlay.scene import read_scene
 
     (folder / "scene.yaml").write_text(text)
     return read_scene(folder / "scene.yaml")

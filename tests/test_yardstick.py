@@ -13,11 +13,11 @@ from click.testing import CliRunner, Result
 from engine_scenes import EXPONENTIAL
 from rounding import after
 
-from sags_node.benchmark import yardstick
-from sags_node.benchmark.rasterizing import Drawing, RasterCase
-from sags_node.cli import main
-from sags_node.engine import projector
+from sags_node.benchmark.kernels import yardstick
+from sags_node.benchmark.kernels.rasterizing import Drawing, RasterCase
+from sags_node.cli.main import main
 from sags_node.engine.interface import MIN_ALPHA
+from sags_node.engine.rasterizer import projector
 
 PROGRAM = Path(__file__).parent.parent.parent / "shared/experiments/raster/splat.cpp"
 needs_program = pytest.mark.skipif(not PROGRAM.exists(), reason="the program is not part of the project")

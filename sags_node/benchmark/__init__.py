@@ -1,1 +1,5 @@
-"""How fast the kernels are on this machine, measured against what it can do at best."""
+"""`sags bench`: run time and error, measured.
+
+Imports calibration, disturbances, engine, evaluation, fitting, kernels, mapping, messaging, model, phantom,
+sources and vision.
+"""

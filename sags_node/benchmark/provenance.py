@@ -19,8 +19,8 @@ GIT_SECONDS = 10.0
 
 
 def provenance() -> dict[str, Any]:
-    """`revision` of the sources, `date` (UTC), `machine`, its `peak` at this moment (`benchmark.peak`, once a
-    process), and `command`: with the defaults of that revision it says all settings."""
+    """`revision` of the sources, `date` (UTC), `machine`, its `peak` at this moment (see
+    `benchmark.kernels.peak`; once a process), and `command`: with the defaults of that revision it says all settings."""
     return {
         "revision": revision(),
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -42,7 +42,7 @@ def revision(root: Path = ROOT) -> str:
 
 @cache
 def _peak() -> dict[str, Any]:
-    from sags_node.benchmark.peak import measure_peak, peak_row
+    from sags_node.benchmark.kernels.peak import measure_peak, peak_row
     from sags_node.kernels.threads import configure_threads
 
     return peak_row(measure_peak(configure_threads(None)))

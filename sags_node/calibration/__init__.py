@@ -1,4 +1,7 @@
-"""Stereo calibrations: files of any usual form read into a checked `StereoRig`, and rigs made from boards."""
+"""Stereo calibrations: files of any usual form read into a checked `StereoRig`, and rigs made from boards.
+
+Imports no other folder.
+"""
 
 from sags_node.calibration.check import (
     Finding,

@@ -15,19 +15,8 @@ from pathlib import Path
 from typing import Literal
 
 from sags_node.config import DeviceName
-from sags_node.errors import SagsError, UsageError
-
-
-class DeviceMemoryError(SagsError):
-    """The GPU has not enough memory for what was asked of it; with fewer Gaussians it might."""
-
-
-class UnusableError(Exception):
-    """Why no GPU can be used, and how to mend it."""
-
-    def __init__(self, reason: str, mend: str) -> None:
-        super().__init__(reason)
-        self.reason, self.mend = reason, mend
+from sags_node.engine.failures import UnusableError
+from sags_node.errors import UsageError
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,4 @@
+"""How right a run was: metrics, truth, summaries, reports.
+
+Imports engine, kernels, mapping, sources and vision.
+"""

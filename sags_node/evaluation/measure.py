@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from sags_node.config import Box
-from sags_node.engine.rasterize import make_rasterizer, to_view
+from sags_node.engine.rasterizer.rasterize import make_rasterizer, to_view
 from sags_node.errors import UsageError
 from sags_node.evaluation import calibration, metrics
 from sags_node.evaluation.gallery import Gallery

@@ -15,11 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sags_node.engine.adam import AdamState
-from sags_node.engine.rasterize import make_rasterizer
+from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.fitting.clip import Clip, ClipFrame
 from sags_node.fitting.density import EVERY, Density
+from sags_node.fitting.devices import make_learner
 from sags_node.fitting.field import make_box, make_decoder, make_field, row_rates
-from sags_node.fitting.learner import DeviceKind, make_learner
+from sags_node.fitting.learner import DeviceKind
 from sags_node.fitting.settings import FitSettings
 from sags_node.fitting.start import Progress, follow_online, learn_paths, pooled_rows, remainder
 from sags_node.mapping.optimiser import COLOUR_RELAXATION, Rates

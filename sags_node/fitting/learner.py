@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal, Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 
-from sags_node.engine.losses import tissue_loss
-from sags_node.engine.photometric import PhotometricLoss
-from sags_node.engine.rasterize import Rasterizer
+from sags_node.engine.losses.photometric import PhotometricLoss
+from sags_node.engine.losses.tissue import tissue_loss
+from sags_node.engine.rasterizer.rasterize import Rasterizer
 from sags_node.fitting.clip import ClipFrame
 from sags_node.fitting.density import Density
+from sags_node.fitting.paths import Paths
 from sags_node.fitting.settings import FitSettings
 from sags_node.mapping.refiner import DEPTH_SCALE, DEPTH_WEIGHT
 from sags_node.model import columns
 from sags_node.model.deformable import DeformableModel
 from sags_node.model.field import Field, FieldRates
 from sags_node.types import F32, I64, Bool
-
-if TYPE_CHECKING:
-    from sags_node.fitting.start import Paths
 
 DeviceKind = Literal["cpu", "cuda"]
 
@@ -76,24 +74,6 @@ class Learner(Protocol):
         Raises:
             SagsError: it is lost.
         """
-
-
-def make_learner(device: DeviceKind, rasterizer: Rasterizer, settings: FitSettings, unseen: Bool) -> Learner:
-    """A learner for pictures of the size of `unseen` [H, W]: the pixels that no frame shows.
-
-    Args:
-        device: where it works; a GPU must be usable, see `engine.device.choose_device`.
-        rasterizer: on the CPU, for pictures of that size.
-        settings: of the fit.
-        unseen: where smoothness applies.
-    """
-    cpu = CpuLearner(rasterizer, settings, unseen)
-    if device == "cpu":
-        return cpu
-    from sags_node.fitting.cuda_learner import CudaLearner
-    from sags_node.fitting.guarded_learner import GuardedLearner
-
-    return GuardedLearner(CudaLearner(settings, unseen), cpu)
 
 
 class CpuLearner:

@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from sags_node.engine.rasterize import to_view
+from sags_node.engine.rasterizer.rasterize import to_view
 from sags_node.errors import SagsError
 from sags_node.evaluation import metrics
 from sags_node.evaluation.lpips import Lpips

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from sags_node.engine.photometric import LossWeights
+from sags_node.engine.losses.photometric import LossWeights
 from sags_node.model.field import FieldRates
 
 Tokens = Literal["self", "planes", "nodes"]

@@ -8,15 +8,15 @@ learns these paths by regression, which needs no drawing and so is fast. What it
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-from sags_node.engine.rasterize import Rasterizer
+from sags_node.engine.rasterizer.rasterize import Rasterizer
 from sags_node.errors import SagsError
 from sags_node.fitting.clip import Clip, ClipFrame
 from sags_node.fitting.learner import Learner
+from sags_node.fitting.paths import Paths
 from sags_node.fitting.settings import FitSettings
 from sags_node.geometry import unproject
 from sags_node.mapping.budget import StepBudget
@@ -27,7 +27,7 @@ from sags_node.model.activation import deactivate
 from sags_node.model.exposure import Exposure
 from sags_node.model.field import Field
 from sags_node.model.residuals import Residuals, check_size
-from sags_node.types import F32, I64, Bool, Gaussians
+from sags_node.types import F32, I64, Gaussians
 
 POOLED_SHARE = 0.01  # of a frame's pixels
 FIRST_OPACITY = 0.1
@@ -40,15 +40,6 @@ CARRIERS = 8  # Gaussians that tell a new one where it lay before
 HIDDEN = -5.0  # of an opacity logit
 
 Progress = Callable[[str, int, int], None]  # what, done, of
-
-
-@dataclass(frozen=True, slots=True)
-class Paths:
-    """How the online mapper saw each Gaussian at some times."""
-
-    times_ns: I64  # [K]
-    states: F32  # [K, N, 14], see `columns`
-    known: Bool  # [K, N]
 
 
 def pooled_rows(clip: Clip, exposure: Exposure, settings: FitSettings) -> F32:

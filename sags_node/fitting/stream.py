@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sags_node.engine.photometric import LossWeights, PhotometricLoss
-from sags_node.engine.rasterize import make_rasterizer
+from sags_node.engine.losses.photometric import LossWeights, PhotometricLoss
+from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.errors import SagsError
 from sags_node.fitting.clip import ClipFrame
 from sags_node.fitting.field import make_box, make_decoder, make_field, row_rates

@@ -41,7 +41,7 @@ _HARMLESS = {
 
 
 def kernel_name(function: Callable[..., Any]) -> str | None:
-    """Module and digest, as in `engine.binning-31b9...`, shared by the kernels of one file.
+    """Module and digest, as in `engine.rasterizer.binning-31b9...`, shared by the kernels of one file.
 
     None: what the function stands on is not known. It stands outside the package (in a test, say), or it was
     made around functions that were handed to its maker; or a source changed while this process ran, which

@@ -7,7 +7,7 @@ from functools import partial
 
 from sags_node.config import LaunchConfig
 from sags_node.engine.device import Device, choose_device
-from sags_node.engine.rasterize import make_rasterizer
+from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.errors import UsageError
 from sags_node.mapping.budget import Budget, StepBudget, TimeBudget
 from sags_node.mapping.ladder import EVERYTHING, RUNGS, Ladder, Rung
@@ -79,11 +79,11 @@ def make_refiner(config: LaunchConfig, width: int, height: int) -> Refiner:
     cpu = CpuRefiner(partial(make_rasterizer, config.engine.backend))
     if device_of(config).kind == "cpu":
         return cpu
-    from sags_node.mapping.cuda_refiner import CudaRefiner
-    from sags_node.mapping.guarded_refiner import GuardedRefiner
+    from sags_node.mapping.cuda.refiner import CudaRefiner
+    from sags_node.mapping.fallback_refiner import FallbackRefiner
 
     on_cpu = affordable(config.model_copy(update={"device": "cpu"}), width, height)
-    return GuardedRefiner(CudaRefiner(), cpu, on_cpu / affordable(config, width, height))
+    return FallbackRefiner(CudaRefiner(), cpu, on_cpu / affordable(config, width, height))
 
 
 def _speed(config: LaunchConfig) -> float:

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numba import prange
 
-from sags_node.engine.compositing import TILE_HEIGHT, TILE_WIDTH
-from sags_node.engine.losses import COVERED
+from sags_node.engine.losses.tissue import COVERED
+from sags_node.engine.rasterizer.compositing import TILE_HEIGHT, TILE_WIDTH
 from sags_node.kernels.jit import kernel, parallel_kernel
 from sags_node.types import F32, I32, U8, Bool
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sags_node.engine.confidence import with_confidence
-from sags_node.engine.views import to_view
+from sags_node.engine.rasterizer.confidence import with_confidence
+from sags_node.engine.rasterizer.views import to_view
 from sags_node.mapping import densify, initialise
 from sags_node.mapping.budget import Budget
 from sags_node.mapping.depth_memory import remember

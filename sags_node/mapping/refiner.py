@@ -8,8 +8,8 @@ from typing import Protocol
 
 import numpy as np
 
-from sags_node.engine.losses import tissue_loss
-from sags_node.engine.rasterize import Gradients, Rasterizer
+from sags_node.engine.losses.tissue import tissue_loss
+from sags_node.engine.rasterizer.rasterize import Gradients, Rasterizer
 from sags_node.mapping.exposure import exposure_gain
 from sags_node.mapping.focus import pixels_of, tile_grid, worst_tiles
 from sags_node.mapping.optimiser import Optimiser, Rates

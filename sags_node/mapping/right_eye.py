@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sags_node.engine.losses import tissue_loss
+from sags_node.engine.losses.tissue import tissue_loss
 from sags_node.mapping.exposure import exposure_gain
 from sags_node.types import F32, Bool, Observation
 

@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 
-from sags_node.engine.rasterize import Rasterizer
+from sags_node.engine.rasterizer.rasterize import Rasterizer
 from sags_node.geometry import unproject
 from sags_node.types import Camera, Gaussians
 

@@ -1,0 +1,4 @@
+"""The wire: topics, messages, sockets, keys, publisher and subscribers.
+
+Imports no other folder.
+"""

@@ -4,7 +4,7 @@
 
 nu is the sampling rate, samples per metre, at the Gaussian's depth. (The paper prints 0.2 / nu; the square is
 what has the unit of a variance.) In a deforming scene it belongs after the deformation, where z is known.
-`engine.smoothing` applies the variance; the 2D filter is part of the projection.
+`engine.rasterizer.smoothing` applies the variance; the 2D filter is part of the projection.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The self-adaptive deformation decoder as a model: its parameters, and what its tokens are.
 
 Features of the space-time field become changes of the Gaussians' raw parameters (SAGS, arXiv 2510.27318; the
-formulas stand in `engine.decoder_block`). There are three choices of tokens for its attention:
+formulas stand in `engine.field.decoder_block`). There are three choices of tokens for its attention:
 
 - `self`: a Gaussian is a sequence of length one, as in the authors' code. Softmax over one key is 1, so the
   attention is a value layer times an output layer, folded into one matrix. It has no queries and keys.
@@ -15,9 +15,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sags_node.engine.decoder import NodeDecoder, PointDecoder
-from sags_node.engine.decoder_block import ATTENTION_BIAS, ATTENTION_WEIGHT, VALUE_BIAS, VALUE_WEIGHT, Weights
-from sags_node.engine.decoder_layout import Sizes, flat_weights, named_weights
+from sags_node.engine.field.decoder import NodeDecoder, PointDecoder
+from sags_node.engine.field.decoder_block import (
+    ATTENTION_BIAS,
+    ATTENTION_WEIGHT,
+    VALUE_BIAS,
+    VALUE_WEIGHT,
+    Weights,
+)
+from sags_node.engine.field.decoder_layout import Sizes, flat_weights, named_weights
 from sags_node.errors import UsageError
 from sags_node.types import F32
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sags_node.engine.smoothing import folded
+from sags_node.engine.rasterizer.smoothing import folded
 from sags_node.types import F32, I64, Gaussians
 
 NEIGHBOURS = 4  # control nodes a Gaussian follows

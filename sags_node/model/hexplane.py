@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sags_node.engine.adam import AdamState
-from sags_node.engine.hexplane import FieldGradients, Grid, HexPlane, Moment
-from sags_node.engine.hexplane_kernels import INNER, OUTER
+from sags_node.engine.field.hexplane import FieldGradients, Grid, HexPlane, Moment
+from sags_node.engine.field.hexplane_kernels import INNER, OUTER
 from sags_node.errors import SagsError, UsageError
 from sags_node.kernels.jit import aligned
 from sags_node.types import F32, F64, I64

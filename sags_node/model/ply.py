@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from sags_node.confidence import confidence_of
-from sags_node.engine.smoothing import folded
+from sags_node.engine.rasterizer.smoothing import folded
 from sags_node.errors import SagsError
 from sags_node.types import SH_DEGREE_0, Gaussians
 

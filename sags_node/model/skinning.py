@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numba import prange
 
-from sags_node.engine.projection import rotation
+from sags_node.engine.rasterizer.projection import rotation
 from sags_node.kernels.jit import inlined, kernel, parallel_kernel, read_only, square_root, stack_floats
 from sags_node.model import columns
 from sags_node.model.rotation import SHORTEST

@@ -1,4 +1,7 @@
-"""A synthetic stereo endoscope session: deforming tissue, instruments, and the exact truth of both."""
+"""A synthetic stereo endoscope session: deforming tissue, instruments, and the exact truth of both.
+
+Imports calibration.
+"""
 
 from sags_node.phantom.session import cached_session, write_session
 

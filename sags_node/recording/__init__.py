@@ -1,0 +1,4 @@
+"""Recordings in MCAP: written, read, played, recovered.
+
+Imports calibration and messaging.
+"""

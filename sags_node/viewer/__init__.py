@@ -1,1 +1,4 @@
-"""`sags view`: a running node in a web browser on this machine (extra `viewer`: viser)."""
+"""`sags view`: a running node in a web browser on this machine (extra `viewer`: viser).
+
+Imports evaluation and messaging.
+"""

@@ -1,6 +1,6 @@
 """The GPU backend: Triton kernels and what calls them.
 
-torch and triton are imported only here, so only who chooses this backend pays for them. All functions take
+triton is imported only in the folders `cuda`, and where a GPU is measured. All functions take
 contiguous tensors of one device: a CUDA GPU, or the CPU where TRITON_INTERPRET=1 was set before the kernels
 were imported. Under Triton's interpreter the kernels run anywhere, slowly, and are tested so.
 

@@ -1,5 +1,5 @@
 """Front-to-back blending of the splats of each tile, its derivative, and the median depth: the sums of
-`engine.compositing` and `engine.median`.
+`engine.rasterizer.compositing` and `engine.rasterizer.median`.
 
 A program of one warp walks through the list of its tile. The backward pass walks front to back too and
 writes the sums of each pair to the pair's slot, which nobody else writes: no atomics, so the same bits every

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from triton.errors import TritonError
 
-from sags_node.engine.device import DeviceMemoryError
+from sags_node.engine.failures import DeviceMemoryError
 
 SHORTAGES = (DeviceMemoryError, torch.OutOfMemoryError)
 FAILURES = (RuntimeError, TritonError)  # torch raises the driver's errors as RuntimeError

@@ -1,4 +1,4 @@
-"""The HexPlane field on the device; `engine.hexplane` says what it computes, and how cells lie in memory."""
+"""The HexPlane field on the device; `engine.field.hexplane` says what it computes, and how cells lie."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import triton
 
 from sags_node.engine.cuda import hexplane_kernels as kernels
 from sags_node.engine.cuda.hexplane_kernels import CHUNK, NODES, PART, POINTS
-from sags_node.engine.hexplane import Grid, Moment
+from sags_node.engine.field.hexplane import Grid, Moment
 from sags_node.errors import UsageError
 
 if TYPE_CHECKING:

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import triton.language as tl
 
-# A Gaussian projected to one camera, as `engine.layout.SPLAT` has it: alpha is 2**(log2_opacity - u^2 - v^2)
-# with u = whiten_xx dx + whiten_xy dy and v = whiten_yy dy.
+# A Gaussian projected to one camera, as `engine.rasterizer.layout.SPLAT` has it: alpha is
+# 2**(log2_opacity - u^2 - v^2) with u = whiten_xx dx + whiten_xy dy and v = whiten_yy dy.
 MEAN_X, MEAN_Y = tl.constexpr(0), tl.constexpr(1)  # px, first pixel's centre at 0.5
 WHITEN_XX, WHITEN_XY, WHITEN_YY = tl.constexpr(2), tl.constexpr(3), tl.constexpr(4)
 LOG2_OPACITY = tl.constexpr(5)  # after the filters

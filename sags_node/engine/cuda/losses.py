@@ -1,7 +1,7 @@
 """What a drawn picture should have been, on the device: one fused pass from planes to their cotangent.
 
-The loss of `engine.losses`, pixel by pixel the same. Each program adds its pixels up by itself, and torch
-adds up the programs' sums, both in a fixed order: the same bits every time.
+The loss of `engine.losses.tissue`, pixel by pixel the same. Each program adds its pixels up by itself, and
+torch adds up the programs' sums, both in a fixed order: the same bits every time.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ import torch
 import triton
 import triton.language as tl
 
-from sags_node.engine import losses
 from sags_node.engine.cuda.signatures import Compiled
+from sags_node.engine.losses import tissue as losses
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -90,7 +90,7 @@ def tissue_loss(
     coverage_weight: float = 2e-3,
     share: float = 1.0,
 ) -> Tensor:
-    """Compare planes with a frame and write the loss's gradient; `engine.losses.tissue_loss` states the loss.
+    """Compare planes with a frame and write the gradient of the loss, `engine.losses.tissue.tissue_loss`.
 
     All tensors lie contiguous on one device, float32 where nothing else is said.
 

@@ -1,4 +1,4 @@
-"""The training loss of SAGS and EndoGaussian on the device; `engine.photometric` states its terms.
+"""The training loss of SAGS and EndoGaussian on the device; `engine.losses.photometric` states its terms.
 
 From planes to their cotangent nothing is read back to the host: sums become factors in a kernel of their own.
 """
@@ -13,8 +13,8 @@ import triton
 from sags_node.engine.cuda import photometric_kernels as kernels
 from sags_node.engine.cuda.photometric_kernels import BLOCK, PROGRAMS
 from sags_node.engine.cuda.ssim import Dissimilarity
-from sags_node.engine.losses import COVERED, DEPTH_COVERED
-from sags_node.engine.photometric import NO_LEAST, LossTerms, LossWeights
+from sags_node.engine.losses.photometric import NO_LEAST, LossTerms, LossWeights
+from sags_node.engine.losses.tissue import COVERED, DEPTH_COVERED
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -27,7 +27,7 @@ class PhotometricLoss:
         width, height: px.
         weights: of the terms.
         device: where all tensors lie.
-        normalised: how planes become colour and depth; see `engine.photometric`.
+        normalised: how planes become colour and depth; see `engine.losses.photometric`.
     """
 
     def __init__(

@@ -5,8 +5,9 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from sags_node.engine import losses, photometric, photometric_kernels, smoothness
 from sags_node.engine.cuda.signatures import Compiled
+from sags_node.engine.losses import photometric, photometric_kernels, smoothness
+from sags_node.engine.losses import tissue as losses
 
 BLOCK = 512  # pixels of a program
 PROGRAMS = 256  # whose sums `combine` takes at a time

@@ -6,9 +6,9 @@ import numpy as np
 import torch
 import triton
 
-from sags_node.engine.device import UnusableError
+from sags_node.engine.failures import UnusableError
 from sags_node.engine.interface import Gradients
-from sags_node.engine.rasterize import make_rasterizer
+from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.types import F32, Camera, Gaussians
 
 TOLERANCE = 1e-3  # of the largest value: a hundred times what rounding makes of it

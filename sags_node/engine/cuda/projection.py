@@ -1,5 +1,6 @@
 """Projection of Gaussians to splats (EWA, Zwicker et al. 2001) with both filters of Mip-Splatting (Yu et al.
-2024): the formulas of `engine.smoothing` and `engine.projection`, with the covariance's two rows as vectors.
+2024): the formulas of `engine.rasterizer.smoothing` and `.projection`, with the covariance's two rows as
+vectors.
 
     V = J R_cam R_q S, rows V_x and V_y      xx, xy, yy = V V^T      det cov0 = |V_x x V_y|^2 (Cauchy-Binet)
 

@@ -1,5 +1,5 @@
 """The derivative of the projection, of every parameter and of the cameras' poses:
-`engine.projection_backward` in vectors.
+`engine.rasterizer.projection_backward` in vectors.
 
 Quaternion: turning a Gaussian by a small vector d in its own axes moves a row a of J R_cam, seen there as
 U = R_q^T a, by U x d, so dL/dd = sum v_U x U. The unit quaternion q then moves by q (0, d) / 2, across q and

@@ -10,7 +10,6 @@ import triton
 from torch import Tensor
 
 from sags_node.engine import interface
-from sags_node.engine.compositing import TILE_HEIGHT as GIVEN_TILE_HEIGHT
 from sags_node.engine.cuda import compositing, layout, pair_sums, projection, projection_backward
 from sags_node.engine.cuda import spherical_harmonics as harmonics
 from sags_node.engine.cuda.binning import bin_splats
@@ -21,7 +20,8 @@ from sags_node.engine.cuda.scene import (
     camera_table,
     check_tensor,
 )
-from sags_node.engine.device import DeviceMemoryError
+from sags_node.engine.failures import DeviceMemoryError
+from sags_node.engine.rasterizer.compositing import TILE_HEIGHT as GIVEN_TILE_HEIGHT
 from sags_node.errors import UsageError
 
 MAX_PAIRS = 1 << 26  # 3 GiB of gradients

@@ -1,4 +1,4 @@
-"""Colour that depends on where one looks from: `engine.spherical_harmonics` on the GPU, in the same order."""
+"""Colour that depends on where one looks from: as `engine.rasterizer.spherical_harmonics`, in its order."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Structural similarity (SSIM) and its gradient on the device; `engine.ssim` has the formulas.
+"""Structural similarity (SSIM) and its gradient on the device; `engine.losses.ssim` has the formulas.
 
 The window is separable: each blur runs along y into planes that stay in the device's L2 cache, and along x
 out of them, 11 taps each. So forward and backward are two kernels each. A program is a tile of one channel:
@@ -13,8 +13,8 @@ import torch
 import triton
 import triton.language as tl
 
-from sags_node.engine import ssim
 from sags_node.engine.cuda.signatures import Compiled
+from sags_node.engine.losses import ssim
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -35,7 +35,7 @@ def _mirror(i: tl.tensor, size: tl.tensor) -> tl.tensor:
 
 @triton.jit
 def _edge(i: tl.tensor, size: tl.tensor) -> tl.tensor:
-    """D^-1 of `engine.ssim`."""
+    """D^-1 of `engine.losses.ssim`."""
     return tl.where((size > 1) & ((i == 0) | (i == size - 1)), 2.0, 1.0)
 
 
@@ -176,8 +176,8 @@ def _pull_back(
 
 class Dissimilarity:
     """1 - SSIM between pictures [3, H, W] of one size on one device, with its gradient; the same bits every
-    time. What counts, and how borders are taken, is that of `engine.ssim.Dissimilarity`. Memory is taken
-    once, 84 bytes per pixel."""
+    time. What counts, and how borders are taken, is that of `engine.losses.ssim.Dissimilarity`. Memory is
+    taken once, 84 bytes per pixel."""
 
     def __init__(self, width: int, height: int, device: torch.device) -> None:
         window = [ssim.W5, ssim.W4, ssim.W3, ssim.W2, ssim.W1, ssim.W0]

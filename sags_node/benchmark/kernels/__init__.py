@@ -1,0 +1,1 @@
+"""How fast the kernels are, beside what the machine can do at best."""

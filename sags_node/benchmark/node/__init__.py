@@ -1,0 +1,1 @@
+"""The whole node: hosts, crowds of consumers, days of running, streams."""

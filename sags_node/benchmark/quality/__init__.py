@@ -1,0 +1,1 @@
+"""How right pictures, depth, masks and poses are, whatever the time."""

@@ -1,0 +1,143 @@
+"""`sags calib check`: a calibration, alone or against the pictures it is for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from sags_node.calibrate.pictures import Pair, pairs_of_files, pairs_of_session
+from sags_node.calibration import Finding, check_eyes, check_pair, find_form, read_rig, unknown_form
+from sags_node.calibration.matches import match_eyes
+from sags_node.calibration.rows import judge_matches, rectified_rows
+from sags_node.config import LaunchConfig, PhantomSource
+from sags_node.errors import UsageError
+from sags_node.launch_file import load_launch
+from sags_node.phantom import cached_session
+from sags_node.sources.pictures import size_text
+from sags_node.sources.source import recorded_rig
+from sags_node.types import F64, StereoFrame, StereoRig
+from sags_node.vision.rectify import Rectifier
+from sags_node.vision.row_error import measure_rows
+
+Progress = Callable[[int, int], None]
+GOOD_ROWS = (0.7, 2.0)  # px of the full picture, median and 90 %
+DISPARITY_MARGIN = 4.0  # px beyond those of matched points
+
+
+def check_calibration(
+    path: Path,
+    session: Path | None = None,
+    images: Sequence[tuple[Path, Path]] = (),
+    overrides: Sequence[str] = (),
+    size: tuple[int, int] | None = None,
+    metres: float | None = None,
+    progress: Progress | None = None,
+) -> list[Finding]:
+    """Look over a calibration, or the one a session uses, and compare it with pictures where there are some.
+
+    Args:
+        path: a calibration of any known form, or a session, which is then compared with its own pictures.
+        session: launch file or session folder whose pictures are used.
+        images: pairs of files or of folders.
+        overrides: `key:=value` of the session.
+        size, metres: as in `read_rig`.
+
+    Raises:
+        UsageError: a path is wrong, or nothing known is there.
+        SagsError: pictures cannot be read.
+    """
+    own = None if find_form(path) is not None else _launched(path, overrides)
+    config = own if session is None else load_launch(session, overrides)
+    pairs: list[Pair] = []
+    if images:
+        pairs = pairs_of_files(images)
+    elif config is not None:
+        pairs = pairs_of_session(config, progress)
+    if pairs and size is None:
+        size = pairs[0][0].shape[1], pairs[0][0].shape[0]
+    rig = read_rig(path, size, metres) if own is None else _rig_of(own, size, metres)
+    findings = check_eyes(rig)
+    if _broken(findings):
+        return findings
+    findings += check_pair(rig)
+    return findings + (check_pictures(rig, pairs) if pairs else [])
+
+
+def check_pictures(rig: StereoRig, pairs: Sequence[Pair]) -> list[Finding]:
+    """What raw pictures say of a rig whose numbers are sound."""
+    size = pairs[0][0].shape[1], pairs[0][0].shape[0]
+    if size != (rig.left.width, rig.left.height):
+        return [_wrong_size(rig, size)]
+    matches = np.concatenate([match_eyes(*pair) for pair in pairs])
+    findings = judge_matches(rig, matches)
+    if findings[0].level == "ok":
+        findings.append(_check_rows(rig, pairs, matches))
+    return findings
+
+
+def _launched(path: Path, overrides: Sequence[str]) -> LaunchConfig:
+    if not path.exists():
+        raise UsageError(unknown_form(path))
+    try:
+        return load_launch(path, overrides)
+    except UsageError as error:
+        if (path / "launch.yaml").exists():
+            raise
+        raise UsageError(f"{unknown_form(path)}. Nor is it a session: {error}") from None
+
+
+def _rig_of(config: LaunchConfig, size: tuple[int, int] | None, metres: float | None) -> StereoRig:
+    """The calibration that a session would use, not judged yet."""
+    if isinstance(config.source, PhantomSource) and config.rig is None:
+        return read_rig(cached_session(config.source) / "calib")
+    if config.rig is not None:
+        return read_rig(config.rig, size, metres)
+    rig = recorded_rig(config.source)
+    if rig is None:
+        raise UsageError("the session names no calibration: set rig, e.g. rig:=calib/d4d")
+    return rig
+
+
+def _broken(findings: Sequence[Finding]) -> bool:
+    return any(finding.level == "error" for finding in findings)
+
+
+def _wrong_size(rig: StereoRig, size: tuple[int, int]) -> Finding:
+    calibrated = rig.left.width, rig.left.height
+    ratio = size[0] / calibrated[0]
+    what = f"the calibration is for {size_text(*calibrated)} px, the pictures are {size_text(*size)}"
+    if ratio != size[1] / calibrated[1]:
+        mend = "the pictures have another shape (cropped?): calibrate with pictures as they come now"
+        return Finding("error", what, mend)
+    mend = (
+        f"calibrate at {size_text(*size)}, or if the pictures are only resized, not cropped: "
+        f"sags calib convert PATH -o FOLDER --scale {ratio:g}"
+    )
+    return Finding("error", f"{what}, {ratio:.3g} times as large", mend, {"scale": ratio})
+
+
+def _check_rows(rig: StereoRig, pairs: Sequence[Pair], matches: F64) -> Finding:
+    """Dense rows of the rectified pictures: finer than those of matched points, where these fit roughly."""
+    rectifier = Rectifier(rig, rig.left.width, rig.left.height)
+    rows = rectified_rows(rig, matches)
+    smallest, largest = np.percentile(rows.disparities, [2, 98])
+    measured = []
+    for left, right in pairs:
+        pair = rectifier(StereoFrame(0, 0, 0, left, right))
+        assert pair.right is not None  # this frame has one
+        error = measure_rows(pair.left, pair.right, smallest - DISPARITY_MARGIN, largest + DISPARITY_MARGIN)
+        if error is not None:
+            measured.append(error)
+    if not measured:
+        return Finding("warning", "too little matches densely to measure rows", "give sharper pictures")
+    median, p90, matched = (float(figure) for figure in np.median(measured, axis=0))
+    figures = {"row_median_px": round(median, 3), "row_p90_px": round(p90, 3), "matched": round(matched, 3)}
+    what = f"rows agree to {median:.2f} px (median), {p90:.2f} px (90 %), over {matched:.0%} of the picture"
+    if median <= GOOD_ROWS[0] and p90 <= GOOD_ROWS[1]:
+        return Finding("ok", what, "", figures)
+    pitch, roll = rows.turn
+    turned = f"; as if one eye were turned by {pitch:.2f} degrees up or down, {roll:.2f} about its axis"
+    mend = "depth suffers: calibrate again, with the scope as it is used"
+    return Finding("warning", what + turned, mend, figures | {"pitch_deg": pitch, "roll_deg": roll})

@@ -1,0 +1,260 @@
+"""`sags bag`: record what a node publishes, look at recordings, mend them and play them again."""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, cast
+
+import click
+from rich.markup import escape
+
+from sags_node.cli import bag_text as say
+from sags_node.cli.launching import as_json, positive
+from sags_node.cli.node_options import endpoint_option, keys_options, ns_option
+from sags_node.terminal.console import console, on_stop_signals, show
+
+DATA_LOST = 3  # exit code
+
+recording = click.argument("path", metavar="RECORDING", type=click.Path(path_type=Path))
+
+
+@click.group()
+def bag() -> None:
+    """Record and play, as `ros2 bag` does: rosbag2 folders with MCAP."""
+
+
+@bag.command()
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path), help="New folder; default: sags_<date>_<time>."
+)
+@click.option("--topics", multiple=True, metavar="NAME", help="Record only this; may be repeated.")
+@click.option(
+    "--compression",
+    type=click.Choice(["none", "jpeg", "png"]),
+    default="none",
+    show_default=True,
+    help="Of 8-bit pictures. jpeg: alpha and masks become png, so that they stay exact.",
+)
+@click.option(
+    "--max-cache",
+    type=positive,
+    default=256.0,
+    show_default=True,
+    metavar="MB",
+    help="What may wait for the disk; beyond it messages are dropped and counted.",
+)
+@click.option(
+    "-b",
+    "--max-bag-size",
+    type=click.IntRange(0),
+    default=0,
+    show_default=True,
+    metavar="BYTES",
+    help="Go on in a new file of the folder when one is so large; 0: never.",
+)
+@click.option(
+    "-d",
+    "--max-bag-duration",
+    type=click.FloatRange(0),
+    default=0.0,
+    show_default=True,
+    metavar="SECONDS",
+    help="Go on in a new file of the folder when one is so long; 0: never.",
+)
+@click.option(
+    "--snapshot-mode",
+    type=positive,
+    metavar="SECONDS",
+    help="Keep only the last seconds in memory; write them on SIGUSR1.",
+)
+@click.option("--stdin", "from_stdin", is_flag=True, help="A line on stdin saves the ring; its end ends it.")
+@endpoint_option
+@ns_option
+@keys_options
+@click.option("--seconds", type=positive, help="Stop after so long; default: Ctrl-C.")
+@as_json
+def record(
+    output: Path | None,
+    topics: tuple[str, ...],
+    compression: str,
+    max_cache: float,
+    max_bag_size: int,
+    max_bag_duration: float,
+    snapshot_mode: float | None,
+    from_stdin: bool,
+    endpoint: str | None,
+    ns: str,
+    seconds: float | None,
+    json_out: bool,
+    keys: Any,
+) -> None:
+    """Record what a running node publishes until Ctrl-C.
+
+    Leaves a rosbag2 folder: MCAP files that Foxglove, PlotJuggler and `ros2 bag` open, and metadata.yaml.
+    Calibration and parameters are attached. Messages that the disk was too slow for are counted as dropped,
+    those that never arrived as lost. A killed recorder's file is mended by `sags bag recover`.
+
+    \b
+    sags bag record -o out/case1 --compression jpeg
+    sags bag record --topics left/image_rect_color --topics right/image_rect_color
+    sags bag record -o out/case2 --max-bag-size 4000000000
+    sags bag record -o out/last --snapshot-mode 20 & kill -USR1 $!
+    """
+    from datetime import datetime
+
+    from sags_node.messaging.stream import check_topic
+    from sags_node.recording.bag_writer import Limits
+    from sags_node.recording.message_writer import Compression
+    from sags_node.recording.recorder import Options, Recorder
+
+    names = tuple(check_topic(say.plain(name, ns)).name for name in topics)
+    folder = output or Path(f"sags_{datetime.now():%Y%m%d_%H%M%S}")
+    recorder = Recorder(
+        Options(
+            folder=folder,
+            topics=names,
+            compression=cast(Compression, compression),
+            max_cache_mb=max_cache,
+            snapshot_seconds=snapshot_mode,
+            limits=Limits(max_bag_size, max_bag_duration),
+            ns=ns,
+            endpoint=endpoint,
+            keys=keys,
+        )
+    )
+    on_stop_signals(recorder.stop)
+    signal.signal(signal.SIGUSR1, lambda *_: recorder.snapshot())
+    if from_stdin:
+        _on_lines(recorder.snapshot, at_the_end=recorder.stop)
+    if seconds is not None:
+        timer = threading.Timer(seconds, recorder.stop)
+        timer.daemon = True
+        timer.start()
+
+    def tell(said: dict[str, Any]) -> None:
+        if from_stdin:
+            click.echo(json.dumps(said))
+            sys.stdout.flush()
+        else:
+            console.print(
+                escape(" ".join(f"{what}: {value}" for what, value in said.items())), soft_wrap=True
+            )
+
+    summary = recorder.run(tell)
+    show(summary if json_out else say.recorded_table(summary))
+
+
+@bag.command()
+@recording
+@click.option("-r", "--rate", type=positive, default=1.0, show_default=True, help="Times as fast.")
+@click.option("-l", "--loop", is_flag=True, help="Begin anew at the end.")
+@click.option("-d", "--delay", type=click.FloatRange(0), default=0.0, help="Seconds to wait before.")
+@click.option(
+    "--clock",
+    "clock_hz",
+    is_flag=False,
+    flag_value=40.0,  # as in ros2 bag play
+    type=positive,
+    metavar="[HZ]",
+    help="Publish the recording's time on the topic clock, so often; without a number 40 Hz.",
+)
+@click.option("-p", "--start-paused", is_flag=True, help="Wait for the first Enter.")
+@click.option("--start-offset", type=click.FloatRange(0), default=0.0, help="Seconds to leave out.")
+@click.option("--playback-duration", type=positive, help="Seconds of the recording to play.")
+@click.option("--topics", multiple=True, metavar="NAME", help="Play only this; may be repeated.")
+@click.option("-x", "--exclude", multiple=True, metavar="NAME", help="Do not play this; may be repeated.")
+@click.option("-m", "--remap", multiple=True, metavar="OLD:=NEW", help="Publish under another name.")
+@click.option("--endpoint", default="tcp://127.0.0.1:5556", show_default=True, help="Where to publish.")
+@ns_option
+@as_json
+def play(
+    path: Path,
+    rate: float,
+    loop: bool,
+    delay: float,
+    clock_hz: float | None,
+    start_paused: bool,
+    start_offset: float,
+    playback_duration: float | None,
+    topics: tuple[str, ...],
+    exclude: tuple[str, ...],
+    remap: tuple[str, ...],
+    endpoint: str,
+    ns: str,
+    json_out: bool,
+) -> None:
+    """Publish a recording again; Enter pauses and goes on.
+
+    Consumers cannot tell it from a node: stamps are moved to now, compressed pictures are sent raw.
+
+    \b
+    sags bag play out/case1 --rate 0.5 --loop
+    sags bag play out/case1 --clock 100
+    """
+    from sags_node.config import PublishConfig
+    from sags_node.recording.player import Options, Player
+
+    options = Options(
+        rate=rate,
+        loop=loop,
+        delay=delay,
+        start_offset=start_offset,
+        playback_duration=playback_duration,
+        topics=tuple(say.plain(name, ns) for name in topics),
+        exclude=tuple(say.plain(name, ns) for name in exclude),
+        remap=say.remappings(remap, ns),
+        clock_hz=clock_hz,
+    )
+    player = Player(path, options, PublishConfig(data=(endpoint,), control=None), ns, start_paused)
+    on_stop_signals(player.stop)
+    _on_lines(player.toggle_pause)
+    console.print(escape(f"publishing {path} on {endpoint} as {ns}/...  (Ctrl-C ends)"), soft_wrap=True)
+    summary = player.play()
+    show(summary if json_out else f"{summary['messages']} messages in {summary['seconds']} s")
+
+
+@bag.command()
+@recording
+@as_json
+def info(path: Path, json_out: bool) -> None:
+    """What a recording holds: topics, types, counts, rates, gaps.
+
+    Reads it through, so a damaged file is found here: rosbag2 folders, .mcap, .db3 and ROS 1 .bag files.
+    """
+    from sags_node.recording.info import bag_info
+
+    found = bag_info(path)
+    show(found if json_out else say.info_table(found))
+
+
+@bag.command()
+@recording
+@click.option("-o", "--output", type=click.Path(path_type=Path), required=True, help="New folder.")
+@as_json
+def recover(path: Path, output: Path, json_out: bool) -> None:
+    """Save what is whole of a damaged MCAP file or folder.
+
+    Everything up to the damage, and every intact chunk after it. Exit code 3 when something was lost.
+    """
+    from sags_node.recording.recover import recover as save
+
+    done = save(path, output)
+    show(done if json_out else say.recovered_text(done))
+    if done["lost"]:
+        click.get_current_context().exit(DATA_LOST)
+
+
+def _on_lines(call: Callable[[], None], at_the_end: Callable[[], None] = lambda: None) -> None:
+    """Call for each line that comes on stdin, from a thread of its own."""
+
+    def read() -> None:
+        for _ in sys.stdin:
+            call()
+        at_the_end()
+
+    threading.Thread(target=read, name="stdin", daemon=True).start()

@@ -1,0 +1,65 @@
+"""`sags bag`: what its commands say to people."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from rich.table import Table
+
+from sags_node.errors import UsageError
+from sags_node.terminal import text
+
+
+def remappings(said: Sequence[str], ns: str) -> dict[str, str]:
+    """`old:=new` of `--remap`.
+
+    Raises:
+        UsageError: one is written otherwise.
+    """
+    pairs = [item.partition(":=") for item in said]
+    for old, assigned, new in pairs:
+        if not (old and assigned and new):
+            raise UsageError(f"--remap {old}{assigned}{new}: write old:=new")
+    return {plain(old, ns): plain(new, ns) for old, _, new in pairs}
+
+
+def plain(name: str, ns: str) -> str:
+    """A topic without leading slash and namespace."""
+    return name.lstrip("/").removeprefix(f"{ns}/")
+
+
+def recorded_table(summary: Mapping[str, Any]) -> Table:
+    """What a recorder wrote and what it could not."""
+    table = text.table("topic", "messages", "dropped", "lost")
+    for name, row in summary["topics"].items():
+        table.add_row(name, str(row["messages"]), str(row["dropped"]), str(row["lost"]))
+    table.add_row("in all", str(summary["messages"]), str(summary["dropped"]), str(summary["lost"]))
+    table.caption = f"{summary['folder']}: {summary['bytes'] / 1e6:.1f} MB at {summary['mb_per_s']} MB/s"
+    return table
+
+
+def info_table(info: Mapping[str, Any]) -> Table:
+    """What a bag holds."""
+    table = text.table("topic", "type", "messages", "Hz", "lost", "longest gap (s)")
+    for row in info["topics"]:
+        cells = (row[key] for key in ("topic", "type", "messages", "rate_hz", "lost", "longest_gap_s"))
+        table.add_row(*("-" if cell is None else str(cell) for cell in cells))
+    files = f" in {len(info['files'])} files" if len(info["files"]) > 1 else ""
+    held = f"{info['duration_s']} s, {info['messages']} messages, {info['size'] / 1e6:.1f} MB{files}"
+    table.caption = f"{info['path']}: {held}"
+    return table
+
+
+def recovered_text(done: Mapping[str, Any]) -> str:
+    """What was saved and what was not."""
+    saved = f"{done['messages']} messages saved to {done['folder']}"
+    if not done["lost"]:
+        return f"{saved}; nothing was lost"
+    parts = {
+        "damaged chunks": done["chunks_damaged"],
+        "messages without a topic": done["messages_lost"],
+        "bytes that are no records": done["bytes_skipped"],
+        "files cut off or never closed": done["unclosed_files"],
+    }
+    return f"{saved}; not whole: " + ", ".join(f"{what} {count}" for what, count in parts.items() if count)

@@ -1,0 +1,85 @@
+"""`sags bench depth`: how right the depth is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from sags_node.cli.launching import (
+    as_json,
+    check_files,
+    file_option,
+    launch_argument,
+    open_launched,
+    split_recording,
+    table_option,
+    write_json,
+)
+from sags_node.errors import UsageError
+from sags_node.terminal.console import progress, show, writing
+
+FAULT_SIZE = (640, 512)  # px
+FAULT_FRAMES = 4
+
+
+@click.command("depth")
+@launch_argument
+@click.option(
+    "--ct",
+    type=click.Path(path_type=Path, file_okay=False),
+    metavar="FOLDER",
+    help="One pair of the Open-CAS set against its CT surface, instead of a recording.",
+)
+@click.option("--faults", is_flag=True, help="The phantom with noise, blur, smoke and highlights rising.")
+@table_option
+@file_option("--picture", "FILE.jpg", "With --ct: draw the left picture, the depth and its error.")
+@as_json
+def bench_depth(
+    launch: tuple[str, ...],
+    ct: Path | None,
+    faults: bool,
+    out: Path | None,
+    picture: Path | None,
+    json_out: bool,
+) -> None:
+    """How right the depth is, and how much there is of it.
+
+    The stereo stage with both methods at every scale, beside OpenCV's SGBM as its own sample sets it up.
+    Median, 90th percentile and median signed error (below 0: too near), the share of the tissue that has a
+    depth, the time of one pair, and whether the confidence orders the errors.
+
+    A recording, by default the built-in phantom, is played with one step of the mapper a frame; at
+    most every tenth frame is compared with its reference depth, and so is the depth of the drawn model.
+
+    \b
+    sags bench depth launch/d4d_pull.yaml --out benchmarks/results/depth_d4d.json
+    sags bench depth --ct $SAGS_DATA/tmi_ct_pair --out benchmarks/results/depth_tmi.json
+    sags bench depth --faults --out benchmarks/results/depth_phantom.json
+    """
+    from sags_node.benchmark.quality import depth, depth_ct, depth_report
+
+    if (ct is not None) + faults + bool(launch) > 1:
+        raise UsageError("a recording, --ct or --faults: give one of them")
+    if picture is not None and ct is None:
+        raise UsageError("--picture draws what --ct measures; add --ct FOLDER")
+    check_files(out, picture)
+    if ct is not None:
+        pair = depth_ct.read_ct_pair(ct)
+        with progress("measuring") as advance:
+            measured = depth_ct.measure_ct(pair, advance)
+        if picture is not None:
+            with writing(picture):
+                picture.write_bytes(depth_ct.picture(pair))
+    elif faults:
+        with progress("measuring") as advance:
+            measured = depth.measure_faults(FAULT_SIZE, FAULT_FRAMES, depth.FAULTS, advance)
+    else:
+        no_cameras = "sags bench depth needs a recording with reference depth; live cameras have none"
+        path, overrides = split_recording(launch, no_cameras)
+        session = open_launched(path, [*overrides, "source.loop:=false", "source.pace:=step"])
+        with progress("playing") as advance:
+            measured = depth.measure_recording(session, advance)
+    for table in [measured] if json_out else depth_report.tables(measured):
+        show(table)
+    write_json(out, measured)

@@ -1,0 +1,233 @@
+"""`sags bench`, the running node: time against error, endurance, tracking, subscribers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from sags_node.cli.launching import (
+    as_json,
+    check_files,
+    file_option,
+    launch_argument,
+    open_launched,
+    positive,
+    split_recording,
+    table_option,
+    write_json,
+)
+from sags_node.errors import UsageError
+from sags_node.terminal.console import progress, show, writing
+
+if TYPE_CHECKING:
+    from sags_node.benchmark.node.endurance import Order
+
+
+@click.command("pareto")
+@click.argument("launch", nargs=-1, metavar="[LAUNCH.yaml | SESSION]... [key:=value ...]")
+@click.option(
+    "--only",
+    metavar="PARTS",
+    help="Some of budgets,resolutions,gaussians,skips (all by default), rungs, hosts.",
+)
+@click.option("--frames", type=click.IntRange(1), help="Of each recording; default: all.")
+@click.option(
+    "--repeat",
+    type=click.IntRange(1),
+    default=1,
+    show_default=True,
+    help="Play each setting so often; the run of middle speed counts.",
+)
+@click.option(
+    "--fit",
+    "fits",
+    multiple=True,
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE.json",
+    help="Figures of sags fit, for the session they name. Default: benchmarks/results/fit_*.json.",
+)
+@table_option
+@file_option("--plot", "FILE.png", "Draw the picture's quality over the time of a frame.")
+@as_json
+def bench_pareto(
+    launch: tuple[str, ...],
+    only: str | None,
+    frames: int | None,
+    repeat: int,
+    fits: tuple[Path, ...],
+    out: Path | None,
+    plot: Path | None,
+    json_out: bool,
+) -> None:
+    """Run time against error of the online mapper.
+
+    Plays recordings, by default the built-in phantom, with other time budgets, working sizes and numbers of
+    Gaussians than their launch files say, and with each rule that skips work on and off. Settings that no
+    other beats in both time and picture are marked. Beside them: the previous picture shown again, the left
+    picture warped into the right eye, stereo alone, and the offline fit.
+
+    A smaller working size is measured at that size, and once more at the launch file's, for which its
+    Gaussians are drawn there: the figure to compare. Takes three to five seconds per frame.
+
+    The part rungs is each rung of the ladder of quality, with one step a frame: its price, and what it gives.
+    The part hosts plays live, sockets included: with the machine for itself; on one of its cores; beside a
+    busy process, the overlay, a reader of everything and the viewer (with a browser, where there is one). How
+    many frames it shows after the first second, in which time and how well.
+
+    \b
+    sags bench pareto launch/d4d_pull.yaml launch/phantom.yaml source.start:=2 --frames 50 \\
+        --out benchmarks/results/pareto.json --plot docs/pareto.png
+    """
+    from sags_node.benchmark.pareto import plot as pareto_plot
+    from sags_node.benchmark.pareto import report as pareto_report
+    from sags_node.benchmark.pareto.baselines import read_fits
+    from sags_node.benchmark.pareto.measure import measure_pareto
+    from sags_node.benchmark.pareto.settings import PARTS, Sweep
+
+    overrides = [argument for argument in launch if ":=" in argument]
+    if frames is not None:
+        overrides.append(f"source.frames:={frames}")
+    alone = [[path, *overrides] for path in launch if ":=" not in path] or [overrides]
+    no_cameras = "sags bench pareto plays recordings; live cameras do not come twice alike"
+    paths = [split_recording(arguments, no_cameras)[0] for arguments in alone]
+    sweep = Sweep(PARTS if only is None else tuple(only.split(",")), repeat)
+    known_fits = read_fits(fits or sorted(Path("benchmarks/results").glob("fit_*.json")))
+    check_files(out, plot)
+    with progress("measuring") as advance:
+        measured = measure_pareto(paths, overrides, sweep, known_fits, advance)
+    for table in [measured] if json_out else pareto_report.tables(measured):
+        show(table)
+    write_json(out, measured)
+    if plot is not None:
+        with writing(plot):
+            plot.write_bytes(pareto_plot.picture(measured))
+
+
+@click.command("endurance")
+@launch_argument
+@click.option("--frames", type=click.IntRange(1), default=10_000, show_default=True, help="To be played.")
+@click.option(
+    "--window", type=click.IntRange(2), default=500, show_default=True, help="Frames of a line of the table."
+)
+@click.option(
+    "--order",
+    type=click.Choice(["there-and-back", "wrap", "walk"]),
+    default="there-and-back",
+    show_default=True,
+    help="Without a jump; from the start again after the last frame; or a random walk that never repeats.",
+)
+@table_option
+@as_json
+def bench_endurance(
+    launch: tuple[str, ...], frames: int, window: int, order: Order, out: Path | None, json_out: bool
+) -> None:
+    """Whether the node lasts: thousands of frames in a row.
+
+    Plays a recording, by default the built-in phantom, over and over, with the launch file's time budget and
+    each frame in turn. Window by window: times, PSNR on tissue against each frame, Gaussians, nodes and
+    memory; at the end how they change per 1000 frames, and what a scene costs in which nothing moves. Takes
+    the budget for each frame, so six minutes for 10,000 at 33 ms; Ctrl-C ends it with the table so far.
+
+    \b
+    sags bench endurance launch/d4d_pull.yaml --order walk --out benchmarks/results/endurance_d4d.json
+    """
+    from sags_node.benchmark.node import endurance
+
+    no_cameras = "sags bench endurance plays recordings; record the cameras first"
+    path, overrides = split_recording(launch, no_cameras)
+    check_files(out)
+    session = open_launched(path, [*overrides, "source.loop:=false", "source.pace:=step"])
+    with progress("playing") as advance:
+        measured = endurance.measure_endurance(session, frames, window, order, advance)
+    if json_out:
+        show(measured)
+    else:
+        show(endurance.table(measured))
+        show(endurance.statement(measured))
+    write_json(out, measured)
+
+
+@click.command("tracking")
+@launch_argument
+@click.option(
+    "--frames", "numbers", default="10,40,70,90", show_default=True, help="After how many frames to measure."
+)
+@table_option
+@as_json
+def bench_tracking(launch: tuple[str, ...], numbers: str, out: Path | None, json_out: bool) -> None:
+    """How well anchors stay on the tissue.
+
+    Pins anchors all over the first frame of a recording, follows them with one step of the mapper a frame,
+    and compares with direct optical flow between the first and a later frame, where that is consistent.
+    The model's Gaussians beside them.
+
+    \b
+    sags bench tracking launch/d4d_pull.yaml --out benchmarks/results/tracking_d4d.json
+    """
+    from sags_node.benchmark.quality import tracking
+
+    if not all(number.strip().isdigit() and int(number) > 0 for number in numbers.split(",")):
+        raise UsageError(f"--frames {numbers}: give numbers above 0 with commas between, e.g. 10,40")
+    path, overrides = split_recording(
+        launch, "sags bench tracking plays recordings; record the cameras first"
+    )
+    check_files(out)
+    session = open_launched(path, [*overrides, "source.loop:=false", "source.pace:=step"])
+    with progress("following") as advance:
+        measured = tracking.measure_tracking(session, [int(n) for n in numbers.split(",")], advance)
+    show(measured if json_out else tracking.table(measured))
+    write_json(out, measured)
+
+
+@click.command("crowd")
+@launch_argument
+@click.option(
+    "--seconds",
+    type=positive,
+    default=60.0,
+    show_default=True,
+    help="With the crowd; a quarter for each of the others.",
+)
+@click.option(
+    "--many", type=click.IntRange(0, 50), default=20, show_default=True, help="Further subscribers."
+)
+@table_option
+@as_json
+def bench_crowd(launch: tuple[str, ...], seconds: float, many: int, out: Path | None, json_out: bool) -> None:
+    """Whether subscribers disturb the node.
+
+    Runs a node, by default of the built-in phantom, in a process of its own: alone; with one reader of
+    everything; and with a fast subscriber, a slow one (200 ms a frame), a dead one (never reads) and many
+    more, each group in its own process. The node's rate, latency and memory, and how old the frames are that
+    the subscribers take.
+
+    \b
+    sags bench crowd --seconds 600 --out benchmarks/results/crowd.json
+    """
+    from sags_node.benchmark.node import crowd
+
+    check_files(out)
+    path, overrides = split_recording(launch, "sags bench crowd plays recordings; record the cameras first")
+    open_launched(path, overrides)  # what takes long is not part of the node's start
+    with progress("listening") as advance:
+        measured = crowd.measure_crowd(launch, seconds / 4, seconds, many, advance)
+    show(measured if json_out else crowd.table(measured))
+    write_json(out, measured)
+
+
+@click.command("transport")
+@click.option("--frames", type=click.IntRange(1), default=150, show_default=True, help="Of each transport.")
+@as_json
+def bench_transport(frames: int, json_out: bool) -> None:
+    """What sending a picture costs.
+
+    A 4 MB picture goes to another process over ipc, tcp, and tcp with encryption. Milliseconds from the send
+    call to the arrival, at 30 frames per second. Takes 20 seconds.
+    """
+    from sags_node.benchmark.node.transport import measure_transport
+    from sags_node.terminal.text import rows_table
+
+    rows = measure_transport(frames)
+    show(rows if json_out else rows_table(rows))

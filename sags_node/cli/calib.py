@@ -1,0 +1,236 @@
+"""`sags calib`: make, check and convert camera calibrations."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+from rich.markup import escape
+
+from sags_node.cli.launching import as_json, positive, split
+from sags_node.errors import SagsError, UsageError
+from sags_node.terminal import text
+from sags_node.terminal.console import check_folder, console, progress, show, writing
+
+if TYPE_CHECKING:
+    from sags_node.calibration.boards import Board
+
+UNITS = {"m": 1.0, "mm": 1e-3}
+
+path_argument = click.argument("path", type=click.Path(path_type=Path))
+output_option = click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    required=True,
+    metavar="FOLDER",
+    help="Gets left.yaml and right.yaml; older ones are replaced.",
+)
+
+
+def _sides(ctx: click.Context, option: click.Parameter, value: str | None) -> tuple[int, int] | None:
+    """Two numbers as people write sizes: 720x576."""
+    if value is None:
+        return None
+    found = re.fullmatch(r"([1-9]\d{0,4})[xX×]([1-9]\d{0,4})", value)
+    if found is None:
+        raise click.BadParameter(f"'{value}' is not like 720x576", ctx, option)
+    return int(found[1]), int(found[2])
+
+
+def reading_options(command: Callable[..., None]) -> Callable[..., None]:
+    """For forms of calibration that leave something out."""
+    size = click.option(
+        "--size",
+        callback=_sides,
+        metavar="WxH",
+        help="Picture size, for forms that do not say it; default: the pictures'.",
+    )
+    unit = click.option(
+        "--unit",
+        type=click.Choice(list(UNITS)),
+        help="Of lengths in the files; default: mm for text matrices, else m.",
+    )
+    return size(unit(command))
+
+
+@click.group()
+def calib() -> None:
+    """Make, check and convert camera calibrations."""
+
+
+@calib.command()
+@path_argument
+@click.argument("overrides", nargs=-1, metavar="[key:=value ...]")
+@click.option("--session", type=click.Path(path_type=Path), help="Launch file or session to compare with.")
+@click.option(
+    "--images",
+    type=(click.Path(path_type=Path), click.Path(path_type=Path)),
+    multiple=True,
+    metavar="LEFT RIGHT",
+    help="Pictures, or folders of them, to compare with; may be repeated.",
+)
+@reading_options
+@as_json
+def check(
+    path: Path,
+    overrides: tuple[str, ...],
+    session: Path | None,
+    images: tuple[tuple[Path, Path], ...],
+    size: tuple[int, int] | None,
+    unit: str | None,
+    json_out: bool,
+) -> None:
+    """Look over a calibration for what usually goes wrong.
+
+    PATH is a calibration of any known form, or a session, whose calibration is compared with its own
+    pictures. With pictures the rows of both eyes are measured, and the check tells which end is wrong: the
+    calibration or the pictures. docs/calibration.md lists the forms.
+
+    \b
+    sags calib check calib/d4d
+    sags calib check calib/d4d --session launch/d4d_pull.yaml
+    sags calib check /data/pair --images /data/pair/left.png /data/pair/right.png
+    sags calib check launch/v4l2.yaml source.left:=/dev/video-left
+    """
+    from sags_node.calibrate.check import check_calibration
+
+    if session is not None and images:
+        raise UsageError("--session and --images: one of them is enough")
+    stray, overrides_only = split(overrides)
+    if stray is not None:
+        raise UsageError(f"'{stray}': one calibration at a time; pictures come after --images or --session")
+    with progress("comparing") as advance:
+        findings = check_calibration(
+            path, session, images, overrides_only, size, UNITS.get(unit or ""), advance
+        )
+    rows = [asdict(finding) for finding in findings]
+    people = [{key: row[key] for key in ("level", "what", "mend")} for row in rows]
+    show(rows if json_out else text.rows_table(people))
+    if any(finding.level == "error" for finding in findings):
+        raise SagsError(f"{path} cannot be used as it is; see the mends above")
+
+
+@calib.command()
+@path_argument
+@output_option
+@reading_options
+@click.option("--scale", type=positive, default=1.0, help="Of pictures that are resized after calibration.")
+def convert(path: Path, output: Path, size: tuple[int, int] | None, unit: str | None, scale: float) -> None:
+    """Write a calibration of any known form as left.yaml and right.yaml.
+
+    \b
+    sags calib convert stereo_calib/ -o calib/mine --size 1280x720 --unit mm
+    sags calib convert calibrationdata.tar.gz -o calib/mine
+    """
+    from sags_node.calibration import check_rig, read_rig, refuse_errors, resized_rig, save_rig
+
+    rig = resized_rig(read_rig(path, size, UNITS.get(unit or "")), scale)
+    refuse_errors(check_rig(rig), path)
+    with writing(output):
+        save_rig(rig, output)
+    console.print(
+        f"calibration: [bold]{escape(str(output))}[/], {rig.left.width}x{rig.left.height} px, baseline "
+        f"{rig.baseline * 1e3:.3g} mm",
+        soft_wrap=True,
+    )
+
+
+@calib.command()
+@click.argument("folders", nargs=-1, type=click.Path(path_type=Path), metavar="[LEFT_FOLDER RIGHT_FOLDER]")
+@click.option("--live", type=click.Path(path_type=Path), metavar="LAUNCH", help="Take the pictures here.")
+@click.option(
+    "--board",
+    type=click.Choice(["chessboard", "charuco"]),
+    default="chessboard",
+    show_default=True,
+    help="What is printed on it.",
+)
+@click.option("--squares", callback=_sides, required=True, metavar="CxR", help="Columns and rows of squares.")
+@click.option("--square-mm", type=positive, required=True, help="Side of a square.")
+@click.option("--marker-mm", type=positive, help="Side of a marker; charuco only.")
+@click.option("--dictionary", metavar="NAME", help="Of the markers, e.g. 4X4_50; charuco only.")
+@click.option("--legacy", is_flag=True, help="Printed by an OpenCV before 4.6; charuco only.")
+@click.option(
+    "--coefficients",
+    type=click.Choice(["2", "3", "6"]),
+    default="2",
+    show_default=True,
+    help="Of radial distortion: 2 and 3 plumb_bob, 6 rational_polynomial.",
+)
+@click.option("--views", type=click.IntRange(6), default=25, show_default=True, help="To take; --live only.")
+@output_option
+@as_json
+def stereo(
+    folders: tuple[Path, ...],
+    live: Path | None,
+    squares: tuple[int, int],
+    coefficients: str,
+    views: int,
+    output: Path,
+    json_out: bool,
+    **board_options: Any,
+) -> None:
+    """Calibrate a stereo rig from pictures of a board.
+
+    Pictures are paired by sorted name. Views that fit far worse than the rest are left out and named. With
+    --live they are taken from a source as the board is moved about, and kept in FOLDER/views.
+
+    \b
+    sags calib stereo left/ right/ --squares 10x7 --square-mm 4.5 -o calib/my_rig
+    sags calib stereo left/ right/ --board charuco --squares 11x8 --square-mm 5 \\
+        --marker-mm 3.7 --dictionary 4X4_50 -o calib/my_rig
+    sags calib stereo --live launch/v4l2.yaml --squares 10x7 --square-mm 4.5 -o calib/my_rig
+    """
+    from sags_node.calibrate.stereo import calibrate_folders, report_table, save, summarise
+
+    if (live is None) != (len(folders) == 2) or (live is not None and folders):
+        raise UsageError("give two folders, LEFT_FOLDER RIGHT_FOLDER, or --live LAUNCH")
+    board = _board(squares, **board_options)
+    check_folder(output)
+    left, right = folders if live is None else _grab(live, board, output / "views", views)
+    with progress("looking for the board") as advance:
+        calibrated = calibrate_folders(left, right, board, output.name, int(coefficients), advance)
+    save(calibrated, output)
+    summary = summarise(calibrated)
+    show(summary if json_out else report_table(summary))
+    console.print(f"calibration: [bold]{escape(str(output))}[/]", soft_wrap=True)
+
+
+def _board(
+    squares: tuple[int, int],
+    board: str,
+    square_mm: float,
+    marker_mm: float | None,
+    dictionary: str | None,
+    legacy: bool,
+) -> Board:
+    from sags_node.calibration.boards import Charuco, Chessboard
+
+    if min(squares) < 4:
+        raise UsageError(f"--squares {squares[0]}x{squares[1]}: a board needs 4 squares along each side")
+    if board == "chessboard":
+        if marker_mm is not None or dictionary is not None or legacy:
+            raise UsageError("--marker-mm, --dictionary and --legacy belong to --board charuco")
+        return Chessboard(squares, square_mm * 1e-3)
+    if marker_mm is None or dictionary is None:
+        raise UsageError("--board charuco needs --marker-mm and --dictionary")
+    if marker_mm >= square_mm:
+        raise UsageError(f"--marker-mm {marker_mm:g} must be below --square-mm {square_mm:g}")
+    return Charuco(squares, square_mm * 1e-3, marker_mm * 1e-3, dictionary, legacy)
+
+
+def _grab(live: Path, board: Board, folder: Path, count: int) -> tuple[Path, Path]:
+    from sags_node.calibrate.live import grab_views
+    from sags_node.launch_file import load_launch
+
+    with console.status("starting the source (Ctrl-C: enough views)") as status:
+
+        def tell(taken: int, what: str) -> None:
+            status.update(f"{taken} of {count} views: {what}  (Ctrl-C: enough)")
+
+        return grab_views(load_launch(live), board, folder, count, tell)

@@ -1,0 +1,95 @@
+"""`sags export`: the model at one moment as splats, points, a mesh or a video around it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from sags_node.cli.launching import as_json, file_option, open_launched, positive, split_recording
+from sags_node.cli.node_options import endpoint_option, keys_options, ns_option
+from sags_node.errors import UsageError
+from sags_node.terminal import text
+from sags_node.terminal.console import progress, show
+
+NO_CAMERAS = "live cameras are exported from the running node; leave out --session"
+
+
+@click.command()
+@click.argument("overrides", nargs=-1, metavar="[key:=value ...]")
+@click.option(
+    "--session",
+    metavar="LAUNCH.yaml",
+    help="Play this recording instead, as fast as it goes; key:=value changes it, as for sags run.",
+)
+@click.option("--at", type=click.FloatRange(min=0), help="Seconds into the session; default: its end.")
+@click.option(
+    "--fit",
+    metavar="FOLDER",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="What sags fit made of that session, in place of the online model.",
+)
+@file_option("--splats", "F.ply", "All Gaussians with the fields of 3D Gaussian Splatting.")
+@file_option("--points", "F.ply|.pcd", "The surface that the left camera sees, x y z (m) and rgb.")
+@file_option("--mesh", "F.ply|.obj|.stl", "The same surface as triangles; where nothing is known is a hole.")
+@file_option("--orbit", "F.mp4", "A video around the tissue.")
+@click.option(
+    "--orbit-degrees",
+    type=click.FloatRange(0, 60),
+    default=12.0,
+    show_default=True,
+    help="How far the camera of the video tilts from where it was.",
+)
+@click.option("--orbit-seconds", type=positive, default=6.0, show_default=True, help="Length of the video.")
+@click.option("--force", is_flag=True, help="Replace files that exist.")
+@endpoint_option
+@ns_option
+@keys_options
+@as_json
+def export(
+    overrides: tuple[str, ...],
+    session: str | None,
+    at: float | None,
+    fit: Path | None,
+    splats: Path | None,
+    points: Path | None,
+    mesh: Path | None,
+    orbit: Path | None,
+    orbit_degrees: float,
+    orbit_seconds: float,
+    force: bool,
+    endpoint: str | None,
+    ns: str,
+    keys: Any,
+    json_out: bool,
+) -> None:
+    """Write the model at one moment for other programs, in metres.
+
+    Of the running node, its newest frame; or of a recording at any time, with no node running.
+
+    \b
+    sags export --mesh now.ply --points now.pcd
+    sags export --session launch/d4d_pull.yaml --at 3 --mesh lift.obj --orbit lift.mp4
+    sags export --session launch/d4d_pull.yaml --fit out/d4d --at 3 --splats lift.ply
+    """
+    from sags_node.export import export as work
+    from sags_node.export import scene as source
+
+    asked = {"splats": splats, "points": points, "mesh": mesh, "orbit": orbit}
+    targets = {kind: path for kind, path in asked.items() if path is not None}
+    work.check_targets(targets, force)
+    if session is None and (overrides or at is not None or fit is not None):
+        raise UsageError("--at, --fit and key:=value need --session LAUNCH.yaml")
+    if session is not None:
+        path, changed = split_recording((session, *overrides), NO_CAMERAS)
+        opened = open_launched(path, [*changed, "source.loop:=false", "source.pace:=step"])
+    with progress("exporting") as advance:
+        if session is None:
+            scene = source.from_node(endpoint, ns, keys=keys)
+        elif fit is None:
+            scene = source.from_session(opened, at, advance)
+        else:
+            scene = source.from_fit(fit, opened, at, advance)
+        rows = work.export(scene, targets, work.Orbit(orbit_degrees, orbit_seconds), advance)
+    show(rows if json_out else text.rows_table(rows))

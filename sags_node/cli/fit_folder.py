@@ -1,0 +1,159 @@
+"""`sags fit`: the offline fit of a recording, from its folder to a model, drawn test frames and figures."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from sags_node.cli.launching import write_json
+from sags_node.engine.rasterizer.smoothing import folded
+from sags_node.errors import UsageError
+from sags_node.evaluation.lpips import BACKBONE, Lpips
+from sags_node.evaluation.machine import machine_name
+from sags_node.evaluation.measure import Options
+from sags_node.fitting import checkpoint
+from sags_node.fitting.clip import read_clip
+from sags_node.fitting.fit import Fit
+from sags_node.fitting.score import PUBLISHED, score, score_depth, score_tracks
+from sags_node.fitting.settings import FitSettings
+from sags_node.kernels.threads import configure_threads
+from sags_node.mapping.devices import device_of
+from sags_node.model.ply import write_ply
+from sags_node.session import Session
+from sags_node.terminal import text
+
+CHECKPOINT_PERIOD = 60.0  # s; it holds hundreds of MB
+SHOWN_EVERY = 5  # iterations: what is shown waits for the GPU
+
+Advance = Callable[[int, int | None, str], None]  # done, of, what
+
+
+def fit_session(
+    session: Session,
+    settings: FitSettings,
+    options: Options,
+    out: Path,
+    resume: bool,
+    advance: Advance,
+) -> dict[str, Any]:
+    """Fit a recording and leave `checkpoint.npz`, `model.ply`, `test/` and `figures.json` in `out`.
+
+    Args:
+        session: a recording; its launch's device is what iterates.
+        settings: of the fit.
+        options: hold-out and LPIPS weights.
+        out: an existing folder. An earlier result there is replaced.
+        resume: go on from its checkpoint.
+        advance: called with what is going on.
+
+    Returns:
+        The figures.
+
+    Raises:
+        UsageError: nothing to resume, or made with other settings or frames.
+        SagsError: the recording cannot be used, a file cannot be written, or the GPU failed.
+    """
+    stored = out / "checkpoint.npz"
+    if resume and not stored.is_file():
+        raise UsageError(f"there is no {stored} to resume from; start without --resume")
+    lpips = None if options.lpips_weights is None else Lpips(options.lpips_weights)
+    configure_threads(session.config.engine.threads)
+    count = session.source.frame_count
+    clip = read_clip(session, options.holds_out, lambda done: advance(done, count, "reading"))
+    fit = Fit(clip, settings, device_of(session.config).kind)
+    if resume:
+        advance(0, None, "reading the checkpoint")
+        checkpoint.load(fit, stored)
+    else:
+        advance(0, None, "starting; the first time, kernels are compiled for a minute")
+        fit.start(lambda what, done, of: advance(done, of, what))
+    _iterate(fit, stored, advance)
+
+    drawn = out / "test"
+    drawn.mkdir(exist_ok=True)
+    advance(0, len(clip.test), "measuring")
+    segments = session.config.segments
+    everything = sorted((*clip.train, *clip.test), key=lambda frame: frame.frame_id)
+    found = {
+        "session": session.name,
+        "settings": asdict(settings),
+        "machine": machine_name(),
+        "device": fit.device,
+        "device_problem": fit.problem,
+        "seconds": round(fit.seconds, 1),
+        "gaussians": len(fit.model),
+        "cap": settings.max_gaussians,
+        "pruned": fit.pruned,
+        "split": fit.split,
+        "heldout": score(
+            fit, clip.test, segments, lpips, drawn,
+            lambda done: advance(done, len(clip.test), "measuring"),
+        ),
+        "depth": score_depth(fit, everything, segments),
+        "track": score_tracks(fit, everything),
+        "train": score(fit, clip.train[:: max(1, options.hold_out)], segments),
+        "psnr_convention": "tissue",
+        "lpips_backbone": BACKBONE if lpips is not None else None,
+        "published": PUBLISHED,
+    }  # fmt: skip
+    last = fit.gaussians(clip.train[-1])
+    ply = out / "model.ply"
+    ply.unlink(missing_ok=True)
+    write_ply(ply, folded(last))
+    write_json(out / "figures.json", found)
+    return found
+
+
+def _iterate(fit: Fit, stored: Path, advance: Advance) -> None:
+    """All iterations that are left. Ctrl-C leaves a checkpoint, too."""
+    saved = time.monotonic()
+    try:
+        while not fit.done:
+            fit.iterate()
+            if fit.iteration % SHOWN_EVERY == 0 or fit.done:
+                what = f"fitting, L1 {fit.residual:.4f}, {fit.count} Gaussians"
+                advance(fit.iteration, fit.total, what)
+            if time.monotonic() - saved > CHECKPOINT_PERIOD:
+                checkpoint.save(fit, stored)
+                saved = time.monotonic()
+    finally:
+        checkpoint.save(fit, stored)
+
+
+def figures_table(found: dict[str, Any]) -> Table:
+    """Figures of the fit beside the published ones."""
+    table = text.table("", "frames", "PSNR* (tissue)", "PSNR (masked)", "SSIM", "LPIPS")
+    for name in ("heldout", "train"):
+        row = found[name]
+        table.add_row(
+            name,
+            str(row["frames"]),
+            _number(row.get("psnr"), "dB"),
+            _number(row.get("paper_psnr"), "dB"),
+            _number(row.get("ssim")),
+            _number(row.get("lpips")),
+        )
+    for name, row in found["published"].items():
+        table.add_row(
+            name,
+            "28",
+            "–",
+            _number(row["paper_psnr"], "dB"),
+            _number(row["ssim"]),
+            _number(row["lpips"]),
+        )
+    depth = found["depth"]
+    depths = f", depth {depth['median_mm']:.2f} mm off (median, {depth['frames']} frames)" if depth else ""
+    table.caption = (
+        f"{found['gaussians']} Gaussians (at most {found['cap']}), {found['seconds']:.0f} s{depths}"
+    )
+    return table
+
+
+def _number(value: float | None, unit: str = "") -> str:
+    return "–" if value is None else f"{value:.3f} {unit}".strip() if not unit else f"{value:.2f} {unit}"

@@ -1,0 +1,218 @@
+"""The `sags` command. Exit codes: 0 ok, 1 failure, 2 usage, 130 stopped with Ctrl-C."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.logging import RichHandler
+from rich.markup import escape
+
+from sags_node import __version__
+from sags_node.cli.bag import bag
+from sags_node.cli.bench import bench
+from sags_node.cli.calib import calib
+from sags_node.cli.export import export
+from sags_node.cli.launching import (
+    as_json,
+    count_frames,
+    launch_argument,
+    open_launched,
+    positive,
+    split,
+    split_recording,
+)
+from sags_node.cli.offline import evaluate, fit
+from sags_node.cli.overlay import overlay
+from sags_node.cli.topic import topic
+from sags_node.cli.view import view
+from sags_node.errors import SagsError, UsageError
+from sags_node.terminal import text
+from sags_node.terminal.console import check_folder, console, interrupt, progress, show
+
+
+class Sags(click.Group):
+    """Turns expected errors into one message and an exit code."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        try:
+            return self._invoke(ctx)
+        except (KeyboardInterrupt, SystemError) as error:
+            # A Ctrl-C becomes a SystemError in C code that calls Python: loading a kernel.
+            cause = error.__cause__ if isinstance(error, SystemError) else error
+            if not isinstance(cause, KeyboardInterrupt):
+                raise
+            console.print("stopped")
+            ctx.exit(130)
+
+    def _invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except SagsError as error:
+            console.print(f"[red]error:[/] {escape(str(error))}", soft_wrap=True)
+            ctx.exit(error.exit_code)
+
+
+@click.group(cls=Sags, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__)
+@click.option("--verbose", "-v", is_flag=True, help="Show what happens inside.")
+def main(verbose: bool) -> None:
+    """SAGS node: an online, deformable Gaussian model of tissue from stereo endoscope video.
+
+    Frames come from a recording or from cameras; rendered views, metric depth, points and splats go out over
+    ZeroMQ on this machine. Start with `sags demo`.
+
+    Research software, not a medical device.
+    """
+    level = logging.INFO if verbose else logging.WARNING
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+        signal.signal(signal.SIGINT, interrupt)
+    signal.signal(signal.SIGTERM, interrupt)  # a service manager's stop is a Ctrl-C
+    logging.basicConfig(
+        level=level, format="%(message)s", handlers=[RichHandler(console=console, show_path=False)]
+    )
+
+
+# ---- run, demo -------------------------------------------------------------------------------------------
+
+
+@main.command()
+@launch_argument
+@click.option("--seconds", type=positive, help="Stop after so long; default: when the source ends or Ctrl-C.")
+@as_json
+def run(launch: tuple[str, ...], seconds: float | None, json_out: bool) -> None:
+    """Run the node: map the source and publish until it ends.
+
+    Without a launch file the built-in phantom session plays in a loop.
+
+    \b
+    sags run launch/d4d_pull.yaml
+    sags run launch/v4l2.yaml source.left:=/dev/video-left mapping.budget_ms:=25
+    """
+    from sags_node.config import PhantomSource
+    from sags_node.foreground import health_table, run_node
+    from sags_node.launch_file import load_launch
+    from sags_node.messaging.content import health_fields
+    from sags_node.node import Node
+
+    path, overrides = split(launch)
+    if path is None and isinstance(load_launch(None, overrides).source, PhantomSource):
+        overrides = ["source.loop:=true", *overrides]
+    session = open_launched(path, overrides)
+    node = Node(session.config, session.rig, session.source)
+    where = escape(", ".join(node.endpoints))
+    console.print(f"publishing on {where} as [bold]{session.config.ns}/...[/]  (Ctrl-C ends)", soft_wrap=True)
+    health = run_node(node, seconds, console)
+    show(health_fields(health) if json_out else health_table(health))
+
+
+@main.command()
+@launch_argument
+@click.option("--seconds", type=positive, default=10.0, show_default=True, help="How long it plays.")
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    default=Path("out/demo"),
+    show_default=True,
+    help="Folder for report.html, sheet.png and overlay.mp4; older ones are replaced.",
+)
+@as_json
+def demo(launch: tuple[str, ...], seconds: float, out: Path, json_out: bool) -> None:
+    """Play a session live beside an overlay subscriber; leave a report.
+
+    The node publishes over real sockets; `sags overlay` runs as its own process and consumes. The report
+    shows input, render, depth and error side by side and figures over time. Default: the built-in phantom.
+    """
+    from sags_node.demo import run_demo
+    from sags_node.session import open_session
+
+    no_cameras = "sags demo plays recordings; for cameras use sags run and sags overlay"
+    path, overrides = split_recording(launch, no_cameras)
+    check_folder(out)
+    frames = count_frames(path, overrides, seconds)
+    # Its own sockets and run directory, so that a demo does not meet a node that is already running.
+    with tempfile.TemporaryDirectory(prefix="sags-demo-") as private:
+        forced = ["source.loop:=true", "source.pace:=realtime", f"source.frames:={frames}"]
+        forced += [
+            "publish.data:=[tcp://127.0.0.1:*]",
+            "publish.control:=tcp://127.0.0.1:*",
+            f"publish.run_dir:={private}",
+        ]
+        session = open_session(path, [*forced, *overrides])
+        with progress("playing") as advance:
+            outcome = run_demo(session, out, advance)
+    show(outcome.summary if json_out else outcome.table)
+    console.print(f"report: [bold]{escape(str(outcome.report))}[/], overlay video beside it", soft_wrap=True)
+
+
+# ---- tools -----------------------------------------------------------------------------------------------
+
+
+@main.command()
+@click.argument("folder", type=click.Path(path_type=Path))
+@click.argument("overrides", nargs=-1, metavar="[key:=value ...]")
+def phantom(folder: Path, overrides: tuple[str, ...]) -> None:
+    """Write a synthetic stereo session with exact truth.
+
+    FOLDER must be new or empty. Keys: seconds, rate, width, height, seed, camera_motion, smoke, noise, blur.
+
+    \b
+    sags phantom out/session seconds:=8 seed:=3 camera_motion:=true smoke:=0.3
+    """
+    from sags_node.config import PhantomSource
+    from sags_node.launch_file import load_launch
+    from sags_node.phantom import write_session
+
+    config = load_launch(None, [f"source.{override}" for override in overrides]).source
+    if not isinstance(config, PhantomSource):
+        raise UsageError(f"sags phantom writes phantom sessions; kind:={config.kind} is something else")
+    with progress("rendering") as advance:
+        write_session(config, folder, rate=config.rate or 30.0, progress=advance)
+    console.print(f"session: [bold]{escape(str(folder))}[/]; play it with: sags run {escape(str(folder))}")
+
+
+@main.command()
+@click.argument("name")
+@click.option(
+    "--out", type=click.Path(path_type=Path), default=Path(), show_default=True, help="Folder for both files."
+)
+def keygen(name: str, out: Path) -> None:
+    """Make a key pair for a node or for a client.
+
+    NAME.key is secret: it stays with whoever runs the node or the client. NAME.pub is for the other side. A
+    node with keys encrypts its tcp sockets and lets in only clients whose .pub it has.
+
+    \b
+    sags keygen node --out keys
+    sags keygen viewer --out keys/clients
+    sags run publish.key:=keys/node.key publish.allow:=keys/clients 'publish.data:=[tcp://*:5556]'
+    sags topic hz tf --endpoint tcp://HOST:5556 --key keys/clients/viewer.key --server-key keys/node.pub
+    """
+    from sags_node.messaging.security import write_key_pair
+
+    secret, public = write_key_pair(out, name)
+    console.print(f"secret, stays here: [bold]{escape(str(secret))}[/]", soft_wrap=True)
+    console.print(f"public, give it to the other side: [bold]{escape(str(public))}[/]", soft_wrap=True)
+
+
+@main.command()
+@click.argument("launch", nargs=-1, metavar="[LAUNCH.yaml] [key:=value ...]")
+@as_json
+def doctor(launch: tuple[str, ...], json_out: bool) -> None:
+    """Check that everything the node needs is here."""
+    from sags_node.doctor import as_rows, examine
+    from sags_node.launch_file import load_launch
+
+    checks = examine(load_launch(*split(launch)))
+    rows = as_rows(checks)
+    show(rows if json_out else text.rows_table(rows))
+    if any(check.level == "error" for check in checks):
+        raise SagsError("something the node needs is missing; see the mends above")
+
+
+for command in (evaluate, fit, export, bag, bench, calib, overlay, view, topic):
+    main.add_command(command)

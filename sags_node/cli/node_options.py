@@ -1,0 +1,38 @@
+"""Options of commands that look for a running node."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import wraps
+from pathlib import Path
+from typing import Any
+
+import click
+
+endpoint_option = click.option(
+    "--endpoint", help="Data socket of the node; default: the connection file of the node on this machine."
+)
+ns_option = click.option("--ns", default="sags", show_default=True, help="Namespace of the topics.")
+
+
+def keys_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Options for a node that wants keys; the command gets them as `keys`."""
+
+    @click.option(
+        "--key",
+        metavar="FILE.key",
+        type=click.Path(path_type=Path),
+        help="Your secret key file (sags keygen), for a node that wants one.",
+    )
+    @click.option(
+        "--server-key",
+        metavar="KEY",
+        help="The node's .pub file or the key itself; default: the connection file.",
+    )
+    @wraps(command)
+    def with_keys(*args: Any, key: Path | None, server_key: str | None, **rest: Any) -> None:
+        from sags_node.messaging.address import client_keys
+
+        command(*args, keys=client_keys(key, server_key), **rest)
+
+    return with_keys

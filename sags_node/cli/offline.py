@@ -1,0 +1,206 @@
+"""`sags eval` and `sags fit`: what a recording, not a running node, is asked for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import cast
+
+import click
+from rich.markup import escape
+
+from sags_node.cli.launching import (
+    as_json,
+    check_files,
+    launch_argument,
+    lpips_option,
+    open_launched,
+    split,
+    split_recording,
+    write_json,
+)
+from sags_node.errors import UsageError
+from sags_node.terminal.console import check_folder, console, progress, show, writing
+
+
+@click.command("eval")
+@launch_argument
+@click.option(
+    "--pace",
+    type=click.Choice(["realtime", "step"]),
+    default="realtime",
+    show_default=True,
+    help="realtime: the recording's clock, late frames are dropped; step: every frame, no threads.",
+)
+@click.option(
+    "--iterations", type=click.IntRange(0), help="Fixed steps per frame: reproducible with --pace step."
+)
+@click.option(
+    "--hold-out",
+    type=click.IntRange(0),
+    default=8,
+    show_default=True,
+    help="Leave out every so manieth frame; 0: none.",
+)
+@click.option(
+    "--every",
+    type=click.IntRange(1),
+    default=5,
+    show_default=True,
+    help="Right eye and LPIPS on every so manieth frame.",
+)
+@lpips_option
+@click.option("--paper-psnr", is_flag=True, help="Also PSNR with masked pixels counted as perfect.")
+@click.option("--report", type=click.Path(path_type=Path), help="Folder for an HTML report.")
+@click.option("--json", "json_out", metavar="FILE", help="Write the figures as JSON to FILE, - for stdout.")
+def evaluate(
+    launch: tuple[str, ...],
+    pace: str,
+    iterations: int | None,
+    hold_out: int,
+    every: int,
+    lpips_weights: Path | None,
+    paper_psnr: bool,
+    report: Path | None,
+    json_out: str | None,
+) -> None:
+    """Measure a recorded session: run time against error.
+
+    It is played through the node's own pipeline, then read once more and compared with what was shown.
+
+    \b
+    sags eval launch/d4d_pull.yaml --json out.json
+    sags eval launch/d4d_pull.yaml --pace step --iterations 2 --report out/d4d
+    """
+    from sags_node.evaluation.measure import Options
+    from sags_node.evaluation.report import summary_table, write_report
+    from sags_node.evaluation.session import Pace
+    from sags_node.evaluation.session import evaluate as measure
+
+    path, overrides = split(launch)
+    options = Options(hold_out, every, lpips_weights, paper_psnr)
+    file = Path(json_out) if json_out is not None and json_out != "-" else None
+    if report is not None:
+        check_folder(report)
+    check_files(file)
+    with progress("measuring") as advance:
+        outcome = measure(
+            path,
+            overrides,
+            options,
+            cast(Pace, pace),
+            iterations,
+            lambda what, frames: advance(frames, None, what),
+        )
+    if report is not None:
+        with writing(report):
+            page = write_report(report, outcome.summary, outcome.rows, outcome.pictures)
+        console.print(f"report: [bold]{escape(str(page))}[/]", soft_wrap=True)
+    if json_out is None:
+        show(summary_table(outcome.summary))
+    elif json_out == "-":
+        show(outcome.summary)
+    write_json(file, outcome.summary)
+
+
+@click.command()
+@click.argument("dataset", nargs=-1, metavar="[DATASET | LAUNCH.yaml] [key:=value ...]")
+@click.option(
+    "--out", type=click.Path(path_type=Path), default=Path("out/fit"), show_default=True, help="Folder."
+)
+@click.option("--resume", is_flag=True, help="Go on from the checkpoint in the folder; same settings.")
+@click.option(
+    "--schedule",
+    type=click.Choice(["paper", "online"]),
+    default="online",
+    show_default=True,
+    help="paper: random points, warm-up on the first frame; online: one pass of the mapper.",
+)
+@click.option(
+    "--warm-up", type=click.IntRange(0), default=1000, show_default=True, help="Iterations; paper only."
+)
+@click.option(
+    "--iterations", type=click.IntRange(0), default=3000, show_default=True, help="With deformation."
+)
+@click.option(
+    "--tokens",
+    type=click.Choice(["self", "planes", "nodes"]),
+    default="nodes",
+    show_default=True,
+    help="What the attention sees: the Gaussian alone, its levels, or all control nodes.",
+)
+@click.option(
+    "--monocular",
+    is_flag=True,
+    help="The depth is an estimate from one picture, true up to scale and shift; paper only.",
+)
+@click.option("--no-adaptive", is_flag=True, help="Without the self-adaptive block of the decoder.")
+@click.option("--no-alias-free", is_flag=True, help="Without both filters.")
+@click.option(
+    "--max-gaussians",
+    type=click.IntRange(100, 2_000_000),
+    default=60_000,
+    show_default=True,
+    help="Cap on N.",
+)
+@click.option("--seed", type=int, default=0, show_default=True, help="Of everything random.")
+@click.option(
+    "--hold-out", type=click.IntRange(0), default=8, show_default=True, help="Test on every so manieth."
+)
+@lpips_option
+@as_json
+def fit(
+    dataset: tuple[str, ...],
+    out: Path,
+    resume: bool,
+    schedule: str,
+    warm_up: int,
+    iterations: int,
+    tokens: str,
+    monocular: bool,
+    no_adaptive: bool,
+    no_alias_free: bool,
+    max_gaussians: int,
+    seed: int,
+    hold_out: int,
+    lpips_weights: Path | None,
+    json_out: bool,
+) -> None:
+    """Fit the SAGS model offline to a whole recording.
+
+    Every eighth frame is for testing. By default the online mapper plays the recording once, and what it saw
+    is refined jointly; --schedule paper is the protocol of the paper: warm-up on the first frame, then all
+    parameters together (with --tokens self: its decoder).
+
+    DATASET is a folder in EndoNeRF or SCARED layout, or any session the node can play. Leaves a checkpoint,
+    the model as PLY (standard 3DGS fields, filters folded in), the drawn test frames and figures.json. It
+    iterates on the device that the launch names (device:=cpu, cuda or auto); --resume may name another.
+
+    \b
+    sags fit launch/d4d_pull.yaml --out out/d4d
+    sags fit /data/endonerf/pulling_soft_tissues --schedule paper --tokens self
+    """
+    from sags_node.cli.fit_folder import figures_table, fit_session
+    from sags_node.evaluation.measure import Options
+    from sags_node.fitting.settings import MONOCULAR, STEREO, FitSettings, Schedule, Tokens
+
+    no_cameras = "live cameras cannot be fitted; record them first, then fit the recording"
+    path, overrides = split_recording(dataset, no_cameras)
+    if monocular and schedule != "paper":
+        raise UsageError("--monocular needs --schedule paper: the online start measures distances")
+    options = Options(hold_out, 1, lpips_weights)
+    settings = FitSettings(
+        schedule=cast(Schedule, schedule),
+        warm_up=warm_up,
+        iterations=iterations,
+        tokens=cast(Tokens, tokens),
+        adaptive=not no_adaptive,
+        antialias=not no_alias_free,
+        max_gaussians=max_gaussians,
+        seed=seed,
+        weights=MONOCULAR if monocular else STEREO,
+    )
+    check_folder(out)
+    session = open_launched(path, [*overrides, "source.loop:=false", "source.pace:=step"])
+    with progress("fitting") as advance:
+        found = fit_session(session, settings, options, out, resume, advance)
+    show(found if json_out else figures_table(found))

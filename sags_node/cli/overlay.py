@@ -1,0 +1,64 @@
+"""`sags overlay`: meshes held by the tissue, over the live picture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.markup import escape
+
+from sags_node.cli.launching import as_json, positive
+from sags_node.cli.node_options import endpoint_option, keys_options, ns_option
+from sags_node.terminal import text
+from sags_node.terminal.console import console, show
+
+
+@click.command()
+@endpoint_option
+@click.option("--control", metavar="ENDPOINT", help="Control socket of the node; needed with --endpoint.")
+@ns_option
+@keys_options
+@click.option(
+    "--scene",
+    metavar="FILE.yaml",
+    type=click.Path(path_type=Path),
+    help="Meshes, points and labels, and the anchors that hold them; default: a built-in target.",
+)
+@click.option(
+    "--pin", type=(float, float), metavar="U V", help="Pixel of the target; default: middle of tissue."
+)
+@click.option("--repin", is_flag=True, help="Pin again where it was after the model was started anew.")
+@click.option(
+    "--max-age",
+    type=positive,
+    default=0.5,
+    show_default=True,
+    help="Seconds after which an overlay is blanked.",
+)
+@click.option(
+    "--show-latency", is_flag=True, help="Write the time from capture to overlay into the left eye."
+)
+@click.option("--own-ns", default="overlay", show_default=True, help="Namespace of what is published here.")
+@click.option(
+    "--run-dir",
+    type=click.Path(path_type=Path),
+    help="Of the connection files, the node's and this overlay's; default: that of the node.",
+)
+@click.option("--seconds", type=positive, help="Stop after so long; default: Ctrl-C.")
+@click.option("--save", type=click.Path(path_type=Path), help="Write what is shown: .mp4, or .png.")
+@as_json
+def overlay(json_out: bool, **options: Any) -> None:
+    """Publish geometry held by the tissue, for both eyes.
+
+    It is tested against the depth of the tissue, hidden behind instruments, and blank as soon as anything it
+    needs is stale. The node may be started later and restarted. docs/wire.md says what is published and how a
+    scene file looks.
+    """
+    from sags_node.overlay.run import Options, run_overlay
+
+    def tell(said: str) -> None:
+        console.print(escape(said), soft_wrap=True)
+
+    summary = run_overlay(Options(**options), tell)
+    show(summary if json_out else text.overlay_table(summary))

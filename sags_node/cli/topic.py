@@ -1,0 +1,88 @@
+"""`sags topic`: look at what a running node publishes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import click
+
+from sags_node.cli.launching import as_json, positive
+from sags_node.cli.node_options import endpoint_option, keys_options, ns_option
+from sags_node.terminal import text
+from sags_node.terminal.console import console, show
+
+
+@click.group()
+def topic() -> None:
+    """Look at what a running node publishes, as `ros2 topic` does.
+
+    An overlay, a player and others are found by their namespace: --ns overlay.
+    """
+
+
+@topic.command("list")
+@endpoint_option
+@ns_option
+@keys_options
+@click.option("--seconds", type=positive, default=3.0, show_default=True, help="How long to listen.")
+@as_json
+def topic_list(endpoint: str | None, ns: str, seconds: float, json_out: bool, keys: Any) -> None:
+    """Every topic with its type, and the rate and size of what was heard.
+
+    \b
+    sags topic list
+    sags topic list --ns overlay
+    """
+    from sags_node import topic as tool
+
+    rows = tool.topic_list(endpoint=endpoint, ns=ns, seconds=seconds, keys=keys)
+    show(rows if json_out else text.topics_table(rows))
+
+
+@topic.command("echo")
+@click.argument("name")
+@endpoint_option
+@ns_option
+@keys_options
+@click.option("--count", type=click.IntRange(1), help="Stop after so many messages; default: Ctrl-C.")
+@as_json
+def topic_echo(
+    name: str, endpoint: str | None, ns: str, count: int | None, json_out: bool, keys: Any
+) -> None:
+    """Print the messages of topic NAME, bulk data as shape and range.
+
+    Warnings of its sender go to stderr.
+    """
+    from sags_node import topic as tool
+    from sags_node.terminal.notices import Notices
+
+    notices = Notices(lambda line: console.print(line, markup=False, soft_wrap=True))
+    for message in tool.topic_echo(
+        name, endpoint=endpoint, ns=ns, count=count, keys=keys, warned=notices.update
+    ):
+        show(message if json_out else text.echo_text(message))
+
+
+def _measuring(name: str, doc: str) -> None:
+    """The commands that listen to one topic for a while."""
+
+    @topic.command(name, help=doc)
+    @click.argument("topic_name", metavar="NAME")
+    @endpoint_option
+    @ns_option
+    @keys_options
+    @click.option("--seconds", type=positive, default=5.0, show_default=True, help="How long to listen.")
+    @as_json
+    def command(
+        topic_name: str, endpoint: str | None, ns: str, seconds: float, json_out: bool, keys: Any
+    ) -> None:
+        from sags_node import topic as tool
+
+        measure = getattr(tool, f"topic_{name}")
+        figures = measure(topic_name, endpoint=endpoint, ns=ns, seconds=seconds, keys=keys)
+        show(figures if json_out else getattr(text, f"{name}_text")(figures))
+
+
+_measuring("hz", "Rate of topic NAME, and min, max and std dev of the intervals.")
+_measuring("bw", "Bytes per second and per message of topic NAME.")
+_measuring("delay", "Age of the messages of topic NAME: now minus the capture stamp.")

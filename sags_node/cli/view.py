@@ -1,0 +1,74 @@
+"""`sags view`: the running node in a web browser."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import threading
+from typing import Any
+
+import click
+from rich.markup import escape
+
+from sags_node.cli.launching import as_json
+from sags_node.cli.node_options import endpoint_option, keys_options, ns_option
+from sags_node.errors import UsageError
+from sags_node.terminal.console import console, on_stop_signals, show
+
+NICENESS = 19  # the node goes first, where both want the same cores
+
+
+@click.command()
+@endpoint_option
+@click.option("--control", help="Control socket of the node; default: its connection file.")
+@ns_option
+@keys_options
+@click.option(
+    "--port", type=click.IntRange(0, 65535), default=8080, show_default=True, help="0: any free one."
+)
+@click.option("--host", default="127.0.0.1", show_default=True, help="Address to serve on.")
+@click.option("--insecure", is_flag=True, help="Serve also to other machines: there are no keys.")
+@as_json
+def view(
+    endpoint: str | None,
+    control: str | None,
+    ns: str,
+    port: int,
+    host: str,
+    insecure: bool,
+    json_out: bool,
+    keys: Any,
+) -> None:
+    """Show a running node in a web browser on this machine.
+
+    A page with the live model in 3D (drag turns, wheel zooms, right drag moves), the left camera and its
+    picture; beside it input, render, depth and error, rates and latencies; buttons to pause, reset and
+    record. A click on the tissue pins an anchor, which follows it.
+
+    Nothing old is shown as new: what stops coming disappears within a second, and the line at the top right
+    says why. The node may be started later and restarted.
+
+    It is a process of its own. While no browser is open it takes nothing from the node.
+
+    \b
+    sags run launch/d4d_pull.yaml &
+    sags view                           # then open the printed address
+    ssh -L 8080:127.0.0.1:8080 HOST     # to look from another machine: the same port on both
+
+    Needs: pip install 'sags-node[viewer]'
+    """
+    if importlib.util.find_spec("viser") is None:
+        raise UsageError("sags view needs viser; install it with: pip install 'sags-node[viewer]'")
+    from sags_node.viewer.run import run_viewer
+
+    os.nice(NICENESS)
+
+    def ready(url: str, bound: int) -> None:
+        if json_out:
+            show({"url": url, "port": bound})
+        else:
+            console.print(f"open [bold]{escape(url)}[/] in a browser  (Ctrl-C ends)", soft_wrap=True)
+
+    stop = threading.Event()
+    on_stop_signals(stop.set)
+    run_viewer(host, port, insecure, endpoint, control, ns, keys, ready, stop=stop)

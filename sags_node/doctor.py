@@ -1,0 +1,172 @@
+"""`sags doctor`: is everything here that the node needs, and what would stand in its way."""
+
+from __future__ import annotations
+
+import ctypes.util
+import glob
+import importlib.metadata
+import os
+import platform
+import socket
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Literal
+
+from sags_node.config import LaunchConfig, PublishConfig
+from sags_node.engine.device import find_gpu, has_gpu
+from sags_node.errors import UsageError
+from sags_node.kernels.cache import cache_root
+from sags_node.messaging.security import check_endpoint, read_allow_list, read_key_pair
+
+Level = Literal["ok", "warning", "error"]
+REQUIRED = (
+    "numpy torch opencv-contrib-python-headless pyzmq open3d onnxruntime numba rosbags mcap msgspec "
+    "pydantic pyyaml click rich"
+).split()
+OPEN3D_LIBRARIES = {
+    "usb-1.0": "libusb-1.0-0",
+    "GL": "libgl1",
+    "EGL": "libegl1",
+    "gomp": "libgomp1",
+    "X11": "libx11-6",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    name: str
+    level: Level
+    found: str
+    mend: str = ""
+
+
+def examine(config: LaunchConfig) -> list[Check]:
+    """All checks, in the order a newcomer meets the problems."""
+    return [
+        _python(),
+        *(_package(name) for name in REQUIRED),
+        *(_library(name, package) for name, package in OPEN3D_LIBRARIES.items()),
+        _cores(),
+        _gpu(config),
+        *_gsplat(config),
+        _kernel_cache(),
+        *_ports(config.publish),
+        *_keys(config.publish),
+        _cameras(),
+        _recordings(),
+    ]
+
+
+def as_rows(checks: list[Check]) -> list[dict[str, str]]:
+    return [asdict(check) for check in checks]
+
+
+def _python() -> Check:
+    return Check("Python", "ok", platform.python_version())
+
+
+def _package(name: str) -> Check:
+    try:
+        return Check(name, "ok", importlib.metadata.version(name))
+    except importlib.metadata.PackageNotFoundError:
+        return Check(name, "error", "not installed", "run `make setup`")
+
+
+def _library(name: str, package: str) -> Check:
+    if ctypes.util.find_library(name):
+        return Check(package, "ok", "installed")
+    return Check(package, "warning", "missing", f"Open3D needs it: sudo apt-get install {package}")
+
+
+def _cores() -> Check:
+    cores = len(os.sched_getaffinity(0))
+    if cores < 2:
+        return Check("CPU", "warning", f"{cores} core", "camera rate needs two cores")
+    return Check("CPU", "ok", f"{cores} cores, {platform.machine()}")
+
+
+def _gpu(config: LaunchConfig) -> Check:
+    """What the GPU's test drawing says. A machine without one is no worse for it, unless one is wanted."""
+    if config.device == "cpu":
+        return Check("GPU", "ok", "not used: device is cpu")
+    found = find_gpu()
+    if found.kind == "cuda":
+        return Check("GPU", "ok", f"{found.name}: draws what the CPU draws")
+    level: Level = "error" if config.device == "cuda" else "warning" if has_gpu() else "ok"
+    return Check("GPU", level, f"not used: {found.reason}", found.mend if level != "ok" else "")
+
+
+def _gsplat(config: LaunchConfig) -> list[Check]:
+    """Only where it was chosen: looking for it may build its kernels."""
+    if config.engine.backend != "gsplat":
+        return []
+    from sags_node.engine.cuda import gsplat as gsplat_backend
+
+    try:
+        gsplat_backend.usable_device()
+    except UsageError as error:
+        return [Check("gsplat", "error", "cannot be used", str(error))]
+    return [Check("gsplat", "ok", importlib.metadata.version("gsplat"))]
+
+
+def _kernel_cache() -> Check:
+    root = cache_root()
+    if root is not None:
+        return Check("kernel cache", "ok", str(root))
+    return Check(
+        "kernel cache",
+        "warning",
+        "no folder can be written",
+        "kernels will be compiled at every start; set NUMBA_CACHE_DIR to a folder of yours",
+    )
+
+
+def _ports(config: PublishConfig) -> list[Check]:
+    endpoints = [endpoint for endpoint in (*config.data, config.control) if endpoint]
+    return [_port(endpoint, config) for endpoint in endpoints]
+
+
+def _port(endpoint: str, config: PublishConfig) -> Check:
+    try:
+        check_endpoint(endpoint, config)
+    except UsageError as error:
+        return Check(endpoint, "error", "cannot be used", str(error))
+    host, _, port = endpoint.removeprefix("tcp://").rpartition(":")
+    if endpoint.startswith("ipc:") or port == "*":
+        return Check(endpoint, "ok", "needs no port of its own")
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host.replace("*", ""), int(port)))
+            return Check(endpoint, "ok", "free")
+        except (OSError, ValueError, OverflowError) as error:  # taken, not a number, not a port
+            mend = "stop the other node, or set publish.data and publish.control to other ports"
+            return Check(endpoint, "warning", str(error), mend)
+
+
+def _keys(config: PublishConfig) -> list[Check]:
+    if config.key is None:
+        return []
+    try:
+        read_key_pair(config.key)
+        allowed = read_allow_list(config.allow)
+    except UsageError as error:
+        return [Check("keys", "error", "cannot be used", str(error))]
+    return [Check("keys", "ok", f"{config.key}; may connect: {', '.join(allowed.values())}")]
+
+
+def _cameras() -> Check:
+    devices = sorted(glob.glob("/dev/video*"))
+    if not devices:
+        return Check("cameras", "ok", "none (replay needs none)")
+    return Check("cameras", "ok", ", ".join(devices))
+
+
+def _recordings() -> Check:
+    folder = os.environ.get("SAGS_DATA")
+    if folder is None:
+        return Check("SAGS_DATA", "ok", "not set: launch files look in ../shared/data beside the checkout")
+    if Path(folder).is_dir():
+        return Check("SAGS_DATA", "ok", folder)
+    mend = "set it to the folder of your recordings; without any, sags run plays the phantom"
+    return Check("SAGS_DATA", "warning", f"{folder} is no folder", mend)

@@ -1,0 +1,1 @@
+"""HexPlane field and self-adaptive decoder as kernels for the CPU."""

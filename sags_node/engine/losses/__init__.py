@@ -1,0 +1,1 @@
+"""What a drawn picture lacks, and its derivative, for the CPU."""

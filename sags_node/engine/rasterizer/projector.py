@@ -1,0 +1,169 @@
+"""First stage of the CPU backend, from Gaussians to splats, and its derivative: the 3D filter, the colour for
+the camera's place, the projection. Its memory grows with the Gaussians and is never given back."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sags_node.engine.interface import DILATION_VARIANCE, MIP_VARIANCE, Pinhole
+from sags_node.engine.rasterizer import projection, projection_backward, smoothing, spherical_harmonics
+from sags_node.kernels.jit import aligned, read_only
+from sags_node.kernels.threads import thread_count
+from sags_node.types import F32, F64, Gaussians
+
+SPARE = 1.25  # what is asked for beyond the need when memory grows
+
+Row = tuple[np.float32, ...]
+Records = NDArray[Any]  # of a structured type of `layout`
+
+
+class Projector:
+    """`load` once per drawing, `project` once per camera; then `backward` once per camera and `gradients`."""
+
+    def __init__(self, antialias: bool) -> None:
+        variance = MIP_VARIANCE if antialias else DILATION_VARIANCE
+        self._screen_filter = np.float32(variance), np.float32(antialias)
+        self._scratch = aligned((0, projection_backward.SCRATCH))
+        self._next_block = aligned((1,), np.int64)
+        self._terms = 0
+        self._allocate(1024)
+
+    def _allocate(self, room: int) -> None:
+        self._room = room
+        self._scales, self._colors, self._v_means, self._v_scales = (aligned((room, 3)) for _ in range(4))
+        self._opacities, self._v_opacities = aligned((room,)), aligned((room,))
+        self._v_quats = aligned((room, 4))
+        self._v_sh_rest = aligned((room, self._terms, 3))
+        self._v_twists = aligned((-(-room // projection.BLOCK), 6), np.float64)
+        self._v_centres = aligned((-(-room // spherical_harmonics.BLOCK), 3), np.float64)
+
+    def load(self, gaussians: Gaussians, pinholes: Sequence[Pinhole]) -> None:
+        """Keeps the Gaussians, checked and contiguous, and the cameras until the next call; applies the 3D
+        filter."""
+        n = self._count = len(gaussians)
+        terms = 0 if gaussians.sh_rest is None else gaussians.sh_rest.shape[1]
+        if n > self._room or terms != self._terms:
+            self._terms = terms
+            self._allocate(max(self._room, int(n * SPARE)))
+        if len(self._scratch) != thread_count():
+            self._scratch = aligned((thread_count(), projection_backward.SCRATCH))
+        self._pinholes, self._views = pinholes, [_view_of(pinhole) for pinhole in pinholes]
+        self._given = self._smoothed = gaussians
+        if gaussians.smoothing is not None:
+            scales, opacities = self._scales[:n], self._opacities[:n]
+            smoothing.smooth(gaussians.scales, gaussians.opacities, gaussians.smoothing, scales, opacities)
+            self._smoothed = replace(gaussians, scales=read_only(scales), opacities=read_only(opacities))
+
+    def project(self, camera: int, splats: Records, depths: F32) -> None:
+        """Writes `splats` [N] SPLAT and `depths` [N] m (0 where not drawn)."""
+        gaussians, colors = self._smoothed, self._smoothed.colors
+        if gaussians.sh_rest is not None:
+            seen = self._colors[: self._count]
+            spherical_harmonics.color(
+                gaussians.means, colors, gaussians.sh_rest, _centre(self._pinholes[camera]), seen
+            )
+            colors = read_only(seen)
+        projection.project(
+            gaussians.means,
+            gaussians.quats,
+            gaussians.scales,
+            gaussians.opacities,
+            colors,
+            self._views[camera],
+            self._screen_filter,
+            self._scratch,
+            self._next_block,
+            splats.view(np.float32),
+            depths,
+        )
+
+    def backward(
+        self,
+        camera: int,
+        slots: Records,
+        v_pairs: F32,
+        geometry: bool,
+        accumulate: bool,
+        v_view_colors: F32,
+        v_colors: F32,
+        contribution: F32,
+    ) -> F64:
+        """Gradient of this camera's pose [6]. Those of the Gaussians are added to the cameras' before where
+        `accumulate` is set.
+
+        Args:
+            slots: [N] SLOTS of this camera.
+            v_pairs: [16 slots] a SPLAT_GRADIENT per slot.
+            geometry: False: only the next three are written.
+            v_view_colors: [N, 3] written: of this camera's picture, 0 where not drawn.
+            v_colors: [N, 3] written or added to; with one camera it may be the same.
+            contribution: [N] written or added to.
+        """
+        n, gaussians = self._count, self._smoothed
+        v_twists = self._v_twists[: -(-n // projection.BLOCK)]
+        projection_backward.project_backward(
+            gaussians.means,
+            gaussians.quats,
+            gaussians.scales,
+            gaussians.opacities,
+            self._views[camera],
+            self._screen_filter,
+            self._scratch,
+            self._next_block,
+            slots,
+            v_pairs,
+            geometry,
+            accumulate,
+            v_view_colors,
+            v_colors,
+            contribution,
+            self._v_means[:n],
+            self._v_quats[:n],
+            self._v_scales[:n],
+            self._v_opacities[:n],
+            v_twists,
+        )
+        if not geometry:
+            return np.zeros(6)
+        v_pose: F64 = v_twists.sum(0)
+        if gaussians.sh_rest is not None:
+            v_centres = self._v_centres[: -(-n // spherical_harmonics.BLOCK)]
+            spherical_harmonics.color_backward(
+                gaussians.means,
+                gaussians.sh_rest,
+                _centre(self._pinholes[camera]),
+                v_view_colors,
+                accumulate,
+                self._v_sh_rest[:n],
+                self._v_means[:n],
+                v_centres,
+            )
+            v_pose[:3] -= self._pinholes[camera].R @ v_centres.sum(
+                0
+            )  # the twist moves the centre by -R^T translation
+        return v_pose
+
+    def gradients(self) -> tuple[F32, F32, F32, F32, F32]:
+        """Of means, quats, scales, opacities and sh_rest, after the last camera's `backward`; call once."""
+        n, given = self._count, self._given
+        v_scales, v_opacities = self._v_scales[:n], self._v_opacities[:n]
+        if given.smoothing is not None:
+            smoothing.smooth_backward(given.scales, given.opacities, given.smoothing, v_scales, v_opacities)
+        return self._v_means[:n], self._v_quats[:n], v_scales, v_opacities, self._v_sh_rest[:n]
+
+
+def _centre(pinhole: Pinhole) -> Row:
+    """The camera's place in the world."""
+    return tuple(np.float32(v) for v in -pinhole.R.T @ pinhole.t)
+
+
+def _view_of(pinhole: Pinhole) -> F32:
+    """[VIEW]: a camera as kernels take it."""
+    fx, fy, cx, cy = pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy
+    pose = [*pinhole.R.ravel().tolist(), *pinhole.t.tolist()]
+    return np.array([*pose, fx, fy, cx, cy, *pinhole.limits], np.float32)

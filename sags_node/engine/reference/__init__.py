@@ -1,0 +1,1 @@
+"""Slow readable twins in torch, which tests compare the kernels to."""

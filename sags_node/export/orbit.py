@@ -1,0 +1,57 @@
+"""A video around the tissue: the camera circles its own axis, turned towards the middle of the surface."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from sags_node.engine.rasterizer.rasterize import make_rasterizer, to_view
+from sags_node.errors import SagsError
+from sags_node.export.scene import Advance, Scene
+from sags_node.types import U8, Camera
+from sags_node.video_file import VideoFile
+
+RATE = 30.0  # pictures per second
+BACKGROUND = 0.12  # grey, where the model says nothing
+
+
+def orbit(camera: Camera, distance: float, degrees: float, count: int) -> Iterator[Camera]:
+    """`count` cameras on a circle that closes; all look at the point `distance` (m) in front of `camera`,
+    from directions tilted by `degrees` against its own."""
+    middle = np.array([0.0, 0.0, distance])
+    for angle in np.linspace(0, 2 * np.pi, count, endpoint=False):
+        axis = np.deg2rad(degrees) * np.array([np.cos(angle), np.sin(angle), 0.0])
+        T = np.eye(4)
+        T[:3, :3] = cv2.Rodrigues(axis)[0]
+        T[:3, 3] = middle - T[:3, :3] @ middle
+        yield replace(camera, T_world_cam=camera.T_world_cam @ T)
+
+
+def write_orbit(path: Path, scene: Scene, degrees: float, seconds: float, advance: Advance) -> int:
+    """Write a video that can be played in a loop; returns the number of pictures.
+
+    Raises:
+        SagsError: the camera sees nothing of the model, or the video cannot be written.
+    """
+    camera, count = scene.camera, max(1, round(seconds * RATE))
+    rasterizer = make_rasterizer("numba", camera.width, camera.height)
+
+    def draw(eye: Camera) -> tuple[U8, np.ndarray]:
+        view = to_view(rasterizer.forward(scene.gaussians, [eye])[0], eye, 0, scene.t_capture_ns)
+        alpha = view.alpha[..., None]
+        rgb = view.rgb * alpha + np.float32(BACKGROUND) * (1 - alpha)
+        return cv2.convertScaleAbs(rgb, alpha=255.0), view.depth
+
+    depth = draw(camera)[1]
+    if not (depth > 0).any():
+        raise SagsError("the left camera sees nothing of the model; export another moment")
+    with closing(VideoFile(path, RATE, (camera.width, camera.height))) as video:
+        for done, eye in enumerate(orbit(camera, float(np.median(depth[depth > 0])), degrees, count)):
+            video.add(draw(eye)[0])
+            advance(done + 1, count, "drawing")
+    return count

@@ -1,0 +1,1 @@
+"""The offline fit on a GPU."""

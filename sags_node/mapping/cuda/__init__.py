@@ -1,0 +1,1 @@
+"""The mapper's refinement on a GPU."""

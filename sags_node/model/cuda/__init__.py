@@ -1,0 +1,1 @@
+"""Skinning and control nodes on a GPU."""

@@ -1,0 +1,266 @@
+"""Objects held by anchors: pinned once, then placed in every frame by where the node says its anchors are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+
+from sags_node.confidence import LEAST
+from sags_node.errors import SagsError, UsageError
+from sags_node.geometry import invert, transform
+from sags_node.messaging.control import ControlClient
+from sags_node.overlay.frame import Anchor, TissueFrame
+from sags_node.overlay.pose import on_a_line, on_surface, rigid_fit, surface_normal
+from sags_node.overlay.scene import ObjectSpec
+from sags_node.types import F64
+
+LEAST_SURE = 0.1  # of an anchor that holds an object: about 6 s hidden
+LEAST_ANCHORS = 3  # for a rigid fit
+NORMAL_MEMORY = 0.8  # of the last normal; the depth of one frame is noisy
+GOODBYE = 0.5  # s for the node to take anchors back at the end
+
+Request = dict[str, float]
+
+
+class Pinner:
+    """Asks the node for anchors in the background: an answer takes a frame or longer.
+
+    Args:
+        connect: a new connection to the node's control socket; raises `SagsError`.
+    """
+
+    def __init__(self, connect: Callable[[], ControlClient]) -> None:
+        self._connect = connect
+        self._worker = ThreadPoolExecutor(1, "sags-pinner")
+        self._held: list[int] = []  # ids of anchors that are ours; only the worker uses it
+
+    def pin(self, requests: Sequence[Request]) -> Future[list[int]]:
+        """Ids of new anchors, all or none; or the node's `SagsError`."""
+        return self._worker.submit(self._pin, requests)
+
+    def remove(self, ids: Sequence[int]) -> None:
+        """Give anchors back, as far as the node is still there."""
+        self._worker.submit(self._remove, list(ids))
+
+    def forget(self, ids: Sequence[int]) -> None:
+        """The node that had these anchors is gone; in another one they may be somebody else's."""
+        self._worker.submit(self._disown, list(ids))
+
+    def close(self) -> None:
+        """Give all anchors back, and wait for that."""
+        self._worker.submit(lambda: self._remove(self._held.copy()))
+        self._worker.shutdown()
+
+    def _pin(self, requests: Sequence[Request]) -> list[int]:
+        added: list[int] = []
+        with self._connect() as client:
+            try:
+                for request in requests:
+                    added.append(int(client.request("add_anchor", request)["id"]))
+            except SagsError:
+                for anchor in added:
+                    client.request("remove_anchor", {"id": anchor}, GOODBYE)
+                raise
+        self._held += added
+        return added
+
+    def _remove(self, ids: list[int]) -> None:
+        self._disown(ids)
+        if not ids:
+            return
+        try:
+            with self._connect() as client:
+                for anchor in ids:
+                    client.request("remove_anchor", {"id": anchor}, GOODBYE)
+        except SagsError:
+            return  # the node is gone, and its anchors with it
+
+    def _disown(self, ids: list[int]) -> None:
+        self._held = [anchor for anchor in self._held if anchor not in ids]
+
+
+class HeldObject:
+    """One object of a scene.
+
+    Attributes:
+        reason: why it has no place in the newest frame; None: it has.
+        error: how badly its anchors fit its rigid shape (m, RMS); 0 with one anchor.
+
+    Args:
+        repin: after the model or the node was started anew, pin it once more at the same pixels and places.
+    """
+
+    def __init__(self, spec: ObjectSpec, where: str, pinner: Pinner, repin: bool) -> None:
+        self.spec = spec
+        self.reason: str | None = None
+        self.error = 0.0
+        self.times_pinned = 0
+        self._where = where  # what its anchors are called in messages
+        self._pinner = pinner
+        self._repin = repin
+        self._pinning: Future[list[int]] | None = None
+        self._ids: list[int] = []
+        self._session = ""  # of the node in which it was pinned
+        self._states: list[Anchor] = []
+        self._model: F64 | None = None  # [k, 3] m, points of the object that lie at the anchors
+        self._right = np.zeros(3)  # where the picture's x axis pointed when it was pinned
+        self._normal: F64 | None = None
+        self._lost: str | None = None
+
+    def place(self, frame: TissueFrame) -> F64 | None:
+        """The pose [4, 4] of the object in the world, or None and a `reason`. Pins it when it is not yet.
+
+        Raises:
+            UsageError: a pixel to pin it to lies outside the picture.
+        """
+        if self._lost is not None and not self._repin:
+            self.reason = self._lost
+            return None
+        if self._ids and frame.session != self._session:
+            self._pinner.forget(self._ids)
+            self._lose("the node was started anew")
+            return None
+        if not self._ids:
+            self.reason = self._pin(frame)
+            return None
+        states = [frame.anchors.get(anchor) for anchor in self._ids]
+        known = [state for state in states if state is not None]
+        if self._model is None and len(known) < len(states):
+            self.reason = "being pinned"  # the anchors come with one of the next frames
+            return None
+        self._states = known
+        if not any(np.isfinite(state.place).all() for state in known):
+            self._pinner.remove(self._ids)
+            self._lose("the model was started anew" if known else "its anchors were removed")
+            return None
+        if self._model is None:
+            self._begin(frame, known)
+        T, self.reason = self._held(frame, states)
+        return T
+
+    def status(self) -> dict[str, Any]:
+        """For people and programs: what it is, why it is not drawn, and how its anchors do."""
+        return {
+            "name": self.spec.name,
+            "reason": self.reason,
+            "pinned": self.times_pinned,
+            "error_mm": round(1e3 * self.error, 3),
+            "anchors": [
+                {
+                    "id": anchor,
+                    "visibility": round(state.visibility, 2),
+                    "confidence": round(state.confidence, 2),
+                    "depth_confidence": round(state.depth_confidence, 2),
+                }
+                for anchor, state in zip(self._ids, self._states, strict=False)
+            ],
+        }
+
+    # ---- pinning -------------------------------------------------------------------------------------------
+
+    def _lose(self, why: str) -> None:
+        self._ids, self._states, self._model, self._normal = [], [], None, None
+        self._lost = f"lost: {why}"
+        self.reason = self._lost
+
+    def _pin(self, frame: TissueFrame) -> str:
+        if self._pinning is None:
+            requests = self._requests(frame)
+            if isinstance(requests, str):
+                return requests
+            self._pinning, self._session = self._pinner.pin(requests), frame.session
+        elif self._pinning.done():
+            done, self._pinning = self._pinning, None
+            error = done.exception()
+            if isinstance(error, SagsError):
+                return str(error)
+            self._ids, self._lost = done.result(), None
+            self.times_pinned += 1
+        return "being pinned"
+
+    def _requests(self, frame: TissueFrame) -> list[Request] | str:
+        """What to ask the node for, or why not in this frame."""
+        height, width = frame.depth.shape
+        if not self.spec.anchors:
+            pixel = _middle(frame)
+            return "no tissue in the picture" if pixel is None else [{"u": pixel[0], "v": pixel[1]}]
+        requests: list[Request] = []
+        for anchor in self.spec.anchors:
+            if anchor.pixel is None:
+                requests.append(dict(zip("xyz", anchor.place or (), strict=True)))
+                continue
+            u, v = anchor.pixel
+            if not (-0.5 <= u < width - 0.5 and -0.5 <= v < height - 0.5):
+                raise UsageError(
+                    f"{self._where} {u:g} {v:g} lies outside the left picture of {width}x{height} px"
+                )
+            if not frame.tissue[round(v), round(u)]:
+                return f"pixel {u:g} {v:g} shows an instrument"
+            if not np.isfinite(frame.depth[round(v), round(u)]):
+                return f"no depth at pixel {u:g} {v:g}"
+            requests.append({"u": u, "v": v})
+        return requests
+
+    # ---- placing -------------------------------------------------------------------------------------------
+
+    def _begin(self, frame: TissueFrame, states: Sequence[Anchor]) -> None:
+        """From this frame on the object is fixed to its anchors."""
+        T_world_cam = frame.camera.T_world_cam
+        self._right = T_world_cam[:3, 0].copy()
+        said = [anchor.at for anchor in self.spec.anchors]
+        if len(states) < LEAST_ANCHORS:
+            self._model = np.array([said[0] if said and said[0] is not None else (0.0, 0.0, 0.0)])
+        elif said[0] is not None:
+            self._model = np.array(said, np.float64)
+        else:
+            places = np.stack([state.place for state in states])
+            in_camera = self.spec.coordinates == "camera"
+            self._model = np.asarray(transform(invert(T_world_cam), places)) if in_camera else places
+
+    def _held(self, frame: TissueFrame, states: Sequence[Anchor | None]) -> tuple[F64 | None, str | None]:
+        assert self._model is not None
+        sure = [
+            i
+            for i, state in enumerate(states)
+            if state is not None and np.isfinite(state.place).all() and state.sure >= LEAST_SURE
+        ]
+        guessed = [i for i in sure if (state := states[i]) is not None and state.depth_confidence < LEAST]
+        if guessed and len(sure) - len(guessed) < min(len(states), LEAST_ANCHORS):
+            return None, "the depth at its anchors is not known well enough"
+        sure = [i for i in sure if i not in guessed]
+        chosen = [state for i in sure if (state := states[i]) is not None]
+        if len(states) < LEAST_ANCHORS:
+            return self._on_surface(frame, chosen)
+        model = self._model[sure]
+        if len(sure) < LEAST_ANCHORS:
+            return None, f"{len(sure)} of its {len(states)} anchors are sure, {LEAST_ANCHORS} are needed"
+        if on_a_line(model):
+            return None, "its sure anchors lie on a line"
+        weights = np.array([state.sure * state.depth_confidence for state in chosen])
+        T, self.error = rigid_fit(model, np.stack([state.place for state in chosen]), weights)
+        return T, None
+
+    def _on_surface(self, frame: TissueFrame, sure: Sequence[Anchor]) -> tuple[F64 | None, str | None]:
+        assert self._model is not None
+        if not sure:
+            return None, "its anchor was not seen for too long"
+        normal = surface_normal(frame, sure[0].place)
+        if normal is not None and self._normal is not None:
+            normal = NORMAL_MEMORY * self._normal + (1 - NORMAL_MEMORY) * normal
+            normal /= np.linalg.norm(normal)
+        self._normal = self._normal if normal is None else normal
+        if self._normal is None:
+            return None, "no surface at its anchor"
+        return on_surface(sure[0].place, self._model[0], self._normal, self._right), None
+
+
+def _middle(frame: TissueFrame) -> tuple[float, float] | None:
+    """The pixel (u, v) with tissue and depth nearest to the middle of the tissue."""
+    rows, columns = np.nonzero(frame.tissue & np.isfinite(frame.depth))
+    if len(rows) == 0:
+        return None
+    best = int(np.argmin(np.hypot(columns - np.median(columns), rows - np.median(rows))))
+    return float(columns[best]), float(rows[best])

@@ -1,0 +1,177 @@
+"""Meshes and point clouds from files, checked before anything is drawn with them, and the built-in shapes.
+
+Everything ends as one triangle mesh in metres; a point becomes a small octahedron.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sags_node.errors import UsageError
+from sags_node.files import open_file
+from sags_node.native_output import native_output
+from sags_node.overlay.scene import ObjectSpec
+from sags_node.types import F32, F64, I32
+
+MAX_FILE_BYTES = 64 << 20
+MAX_TRIANGLES = 200_000
+MAX_POINTS = 20_000
+LARGEST = 1.0  # m across: nothing in a body is larger
+HEADER_BYTES = 1 << 16
+STL_START, STL_TRIANGLE = 84, 50  # bytes of a binary STL file
+GREEN = (60, 230, 120)  # RGB
+LEAN = np.radians(35)  # of the target's arrow: along the line of sight it would be a dot
+
+_MESHES, _POINTS = (".ply", ".obj", ".stl"), (".ply", ".pcd", ".xyz")
+_KINDS = " ".join(dict.fromkeys(_MESHES + _POINTS))
+
+
+@dataclass(frozen=True, slots=True)
+class Mesh:
+    vertices: F32  # [V, 3] m
+    triangles: I32  # [T, 3]
+    colors: F32  # [T, 3] RGB 0..255
+
+
+def mesh_of(spec: ObjectSpec) -> Mesh | None:
+    """The surface of an object; None for a mere label.
+
+    Raises:
+        UsageError: its file cannot be read, or holds nothing that can be drawn.
+    """
+    if spec.shape is not None:
+        return _target(spec.color) if spec.shape == "target" else _marker(spec.color)
+    return None if spec.file is None else _load(spec, spec.file)
+
+
+# ---- files -----------------------------------------------------------------------------------------------
+
+
+def _load(spec: ObjectSpec, file: Path) -> Mesh:
+    _check_file(file)
+    import open3d
+
+    points: F64 = np.zeros((0, 3))
+    triangles: I32 = np.zeros((0, 3), np.int32)
+    verbosity = open3d.utility.VerbosityLevel.Error
+    with open3d.utility.VerbosityContextManager(verbosity), native_output() as said:
+        if file.suffix.lower() in _MESHES:
+            read = open3d.io.read_triangle_mesh(file)
+            points, triangles = np.asarray(read.vertices), np.asarray(read.triangles, np.int32)
+        if len(triangles) == 0 and file.suffix.lower() in _POINTS:
+            points = np.asarray(open3d.io.read_point_cloud(file).points)
+    if said:  # what it read until then, or never read, would be drawn
+        raise UsageError(f"{file} is damaged: {said[0]}; open it in a mesh viewer")
+    what = "triangles" if len(triangles) or file.suffix.lower() not in _POINTS else "points"
+    count, most = (len(triangles), MAX_TRIANGLES) if what == "triangles" else (len(points), MAX_POINTS)
+    if count == 0:
+        raise UsageError(f"{file} holds no {what}, or is damaged; open it in a mesh viewer")
+    if count > most:
+        raise UsageError(f"{file} holds {count} {what}, {most} at most can be drawn; simplify it")
+    points = points * spec.scale
+    _check_vertices(file, points, triangles)
+    if what == "points":
+        points, triangles = _octahedra(points, spec.point_size)
+    return Mesh(points.astype(np.float32), triangles, _painted(len(triangles), spec.color))
+
+
+def _check_file(file: Path) -> None:
+    """Refuse what is no such file, or would take too much memory, before a reader sees it."""
+    kind = file.suffix.lower()
+    if f"{kind} " not in f"{_KINDS} ":
+        raise UsageError(f"cannot draw {file}: the name must end in one of {_KINDS}")
+    try:
+        size = file.stat().st_size
+        with open_file(file) as opened:
+            start = opened.read(HEADER_BYTES)
+    except OSError as error:
+        raise UsageError(f"cannot read {file}: {error.strerror}; check the path") from None
+    if size > MAX_FILE_BYTES:
+        raise UsageError(f"{file} has {size >> 20} MiB, {MAX_FILE_BYTES >> 20} at most are read; simplify it")
+    claimed = 0
+    if kind == ".ply":
+        header, ended, _ = start.partition(b"end_header")
+        if not header.startswith(b"ply") or not ended:
+            raise UsageError(f"{file} is no PLY file, or is damaged: it has no PLY header")
+        claimed = sum(int(number) for number in re.findall(rb"element\s+\S+\s+(\d+)", header))
+    elif kind == ".pcd":
+        header, ended, _ = start.partition(b"\nDATA ")
+        if not ended:
+            raise UsageError(f"{file} is no PCD file, or is damaged: it has no PCD header")
+        if start.startswith(b"binary_compressed", len(header) + len(ended)):
+            raise UsageError(f"{file} is a compressed PCD file; save it as ascii or binary")
+        claimed = max(
+            (int(number) for number in re.findall(rb"\n(?:POINTS|WIDTH)\s+(\d+)", header)), default=0
+        )
+    elif kind == ".stl" and not start.startswith(b"solid"):
+        claimed = int.from_bytes(start[STL_START - 4 : STL_START], "little")
+        if size != STL_START + claimed * STL_TRIANGLE:
+            raise UsageError(f"{file} is damaged: its size does not fit its {claimed} triangles")
+    if claimed > size:  # each takes at least a byte
+        raise UsageError(f"{file} is damaged: it claims {claimed} elements in {size} bytes")
+
+
+def _check_vertices(file: Path, vertices: F64, triangles: I32) -> None:
+    if not np.isfinite(vertices).all():
+        bad = int((~np.isfinite(vertices).all(1)).sum())
+        raise UsageError(f"{file}: {bad} of its {len(vertices)} vertices are not finite (NaN); mend the file")
+    if len(triangles) and not (triangles.min() >= 0 and triangles.max() < len(vertices)):
+        raise UsageError(f"{file} is damaged: a triangle names a vertex that is not there")
+    across = float(np.ptp(vertices, axis=0).max())
+    if across > LARGEST:
+        raise UsageError(
+            f"{file} is {across:.3g} m across, {LARGEST:g} m at most makes sense; "
+            "for millimetres set scale: 0.001"
+        )
+
+
+def _octahedra(points: F64, radius: float) -> tuple[F64, I32]:
+    corners = radius * np.concatenate([np.eye(3), -np.eye(3)])
+    faces = np.array([[i, j, k] for i in (0, 3) for j in (1, 4) for k in (2, 5)], np.int32)
+    starts = 6 * np.arange(len(points), dtype=np.int32)[:, None, None]
+    return (points[:, None] + corners).reshape(-1, 3), (starts + faces).reshape(-1, 3)
+
+
+# ---- built-in shapes: the anchor is the origin, z points away from the tissue ------------------------------
+
+
+def _target(color: tuple[int, int, int]) -> Mesh:
+    """A ring on the surface and an arrow that points at its middle."""
+    import open3d
+
+    create = open3d.geometry.TriangleMesh
+    ring = create.create_torus(0.0035, 0.0005, 48, 10)
+    arrow = create.create_arrow(
+        cylinder_radius=0.0004, cone_radius=0.0012, cylinder_height=0.0065, cone_height=0.0035
+    )
+    turned = create.get_rotation_matrix_from_xyz((np.pi - LEAN, 0.0, 0.0))
+    arrow.translate((0.0, 0.0, -0.010)).rotate(turned, center=(0.0, 0.0, 0.0)).translate((0.0, 0.0, 0.001))
+    return _joined([(ring, GREEN), (arrow, color)])
+
+
+def _marker(color: tuple[int, int, int]) -> Mesh:
+    """A ball of 2 mm in the surface."""
+    import open3d
+
+    return _joined([(open3d.geometry.TriangleMesh.create_sphere(0.002, 16), color)])
+
+
+def _joined(parts: list[tuple[Any, tuple[int, int, int]]]) -> Mesh:
+    starts = np.cumsum([0, *(len(mesh.vertices) for mesh, _ in parts)])
+    numbered = zip(parts, starts, strict=False)
+    return Mesh(
+        np.concatenate([np.asarray(mesh.vertices, np.float32) for mesh, _ in parts]),
+        np.concatenate(
+            [np.asarray(mesh.triangles, np.int32) + np.int32(start) for (mesh, _), start in numbered]
+        ),
+        np.concatenate([_painted(len(mesh.triangles), color) for mesh, color in parts]),
+    )
+
+
+def _painted(count: int, color: tuple[int, int, int]) -> F32:
+    return np.tile(np.array(color, np.float32), (count, 1))

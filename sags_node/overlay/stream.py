@@ -1,0 +1,119 @@
+"""What the overlay publishes on its own socket: both eyes' pictures, and what it says of itself.
+
+A picture is never left standing: when nothing fresh can be drawn, an empty one is sent at once and again
+every `BLANK_PERIOD`.
+"""
+
+from __future__ import annotations
+
+import time
+import uuid
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from sags_node.config import PublishConfig
+from sags_node.messaging import cdr, content
+from sags_node.messaging.publisher import Publisher
+from sags_node.messaging.topics import OVERLAY_TOPICS
+from sags_node.overlay.draw import color_key
+from sags_node.types import U8
+
+BLANK_PERIOD = 0.5  # s
+STATUS_PERIOD = 1.0  # s
+EYES = {"left": cdr.LEFT_FRAME, "right": cdr.RIGHT_FRAME}
+
+
+class OverlayStream:
+    """The overlay's socket, in a namespace of its own: ipc, and a free port of this machine.
+
+    Args:
+        ns: of its topics and its connection file.
+        key: RGB of what shows no overlay in the `color_key` topics.
+
+    Raises:
+        SagsError: another overlay has this namespace.
+    """
+
+    def __init__(self, ns: str, run_dir: Path | None, key: tuple[int, int, int]) -> None:
+        config = PublishConfig(data=("tcp://127.0.0.1:*",), control=None, run_dir=run_dir, right=True)
+        self._publisher = Publisher(config, ns, uuid.uuid4().hex, offered=OVERLAY_TOPICS)
+        self._key = key
+        self._size: tuple[int, int] | None = None  # height and width of what was shown last
+        self._blank_due = 0.0
+        self._status_due = 0.0
+        self._state: tuple[str, str | None, tuple[str, ...]] | None = None
+        self._epoch = 0
+        self.reason: str | None = (
+            "waiting for the node"  # why nothing is shown; None: the last picture sent is an overlay
+        )
+        self.shown_ns: int | None = None  # capture time of the frame shown last, while it is shown
+
+    @property
+    def endpoints(self) -> list[str]:
+        return self._publisher.connection.data
+
+    def serve(self) -> None:
+        """Take note of who has come and gone."""
+        self._publisher.poll(0)
+
+    def wants(self, eye: str) -> bool:
+        """True while somebody looks at this eye."""
+        return any(self._publisher.wanted(f"{eye}/overlay/{kind}") for kind in ("image", "color_key"))
+
+    def show(self, pictures: dict[str, U8], frame_id: int, stamp_ns: int, epoch: int) -> None:
+        """Send the overlay [H, W, 4] of each eye that is looked at, for the frame captured at `stamp_ns`.
+
+        An eye that has no picture gets an empty one.
+        """
+        self.reason, self.shown_ns, self._epoch = None, stamp_ns, epoch
+        self._size = next(iter(pictures.values())).shape[:2]
+        for eye in EYES:
+            if self.wants(eye):
+                self._send(eye, pictures.get(eye, self._empty()), frame_id, stamp_ns)
+
+    def blank(self, reason: str) -> None:
+        """Show nothing, because of `reason`; to be called again and again while that is so.
+
+        An empty picture shows no frame: its stamp is the time at which it is true.
+        """
+        new = self.reason is None
+        self.reason, self.shown_ns = reason, None
+        if self._size is None or not (new or time.monotonic() >= self._blank_due):
+            return
+        self._blank_due = time.monotonic() + BLANK_PERIOD
+        for eye in EYES:
+            if self.wants(eye):
+                self._send(eye, self._empty(), -1, time.time_ns())
+
+    def tell(self, facts: dict[str, Any]) -> None:
+        """Send `status` when it is due, and at once when the state or a warning changes."""
+        warned = tuple(facts.get("warning_codes", ()))
+        state = ("running" if self.reason is None else "blank", self.reason, warned)
+        if state == self._state and time.monotonic() < self._status_due:
+            return
+        self._state, self._status_due = state, time.monotonic() + STATUS_PERIOD
+        said = {"state": state[0], "reason": state[1], "color_key": self._key, **facts}
+        self._publisher.publish_content("status", content.json_text(said), -1, time.time_ns(), self._epoch)
+
+    def _empty(self) -> U8:
+        assert self._size is not None
+        return np.zeros((*self._size, 4), np.uint8)
+
+    def _send(self, eye: str, rgba: U8, frame_id: int, stamp_ns: int) -> None:
+        for kind, encoding in (("image", "rgba8"), ("color_key", "rgb8")):
+            topic = f"{eye}/overlay/{kind}"
+            if self._publisher.wanted(topic):
+                picture = rgba if kind == "image" else color_key(rgba, self._key)
+                body = cdr.image(picture, encoding, stamp_ns, EYES[eye])
+                self._publisher.publish_content(topic, body, frame_id, stamp_ns, self._epoch)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._publisher.close()
