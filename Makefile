@@ -59,7 +59,7 @@ lint: setup
 
 # Rewrite the golden results of replay/ and print what changed.
 golden: setup
-	$(BIN)/python -m pytest tests/test_replay.py --update-golden -s
+	$(BIN)/python -m pytest tests/evaluation/test_replay.py --update-golden -s
 
 clean:
 	rm -rf $(VENV) out build *.egg-info .pytest_cache .mypy_cache .ruff_cache

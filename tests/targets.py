@@ -83,7 +83,7 @@ def _passes(name: str, threads: int) -> bool:
     print(f"\n{name} on {threads} thread{'s' * (threads > 1)}", flush=True)
     environment = os.environ | TARGETS[name].environment | {"NUMBA_NUM_THREADS": str(threads)}
     start = time.monotonic()
-    files = [f"tests/test_{test}.py" for test in TESTS]
+    files = [str(file) for test in TESTS for file in (ROOT / "tests").rglob(f"test_{test}.py")]
     command = [sys.executable, "-m", "pytest", "-n", "2", "--dist", "loadfile", *files]
     code = subprocess.run(command, cwd=ROOT, env=environment, check=False).returncode
     print(f"{name} on {threads}: {time.monotonic() - start:.0f} s", flush=True)

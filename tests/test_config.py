@@ -3,12 +3,11 @@
 from pathlib import Path
 
 import pytest
+from places import ROOT
 
 from sags_node.config import FoldersSource, LaunchConfig, PanesSource
 from sags_node.errors import UsageError
 from sags_node.launch_file import load_launch, with_parameters
-
-ROOT = Path(__file__).parent.parent
 
 
 @pytest.mark.parametrize("file", sorted((ROOT / "launch").glob("*.yaml")), ids=lambda f: f.stem)

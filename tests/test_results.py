@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from places import ROOT
 
 from sags_node.benchmark.provenance import WHAT_COUNTS, provenance, revision
 from sags_node.cli.launching import write_json
 
-ROOT = Path(__file__).parent.parent
 RESULTS = sorted((ROOT / "benchmarks/results").glob("*.json"))
 # Measured before results named where they come from. A file leaves this list when it is measured anew.
 EARLIER = {

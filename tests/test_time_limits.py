@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 from command_line import FREE_PORTS
+from places import SESSION
 
 from sags_node import processes
 from sags_node.benchmark.node import transport
@@ -26,7 +27,6 @@ from sags_node.warm_up import warm_up
 
 pytestmark = pytest.mark.live
 
-SESSION = Path(__file__).parent.parent / "replay/phantom_pull"
 DEAF = """
 import signal, time
 signal.signal(signal.SIGTERM, signal.SIG_IGN)

@@ -12,8 +12,8 @@ import msgpack
 import numpy as np
 import pytest
 import zmq
+from running_node import START_SECONDS, RunningNode
 from synthetic import at_frame, plane_result
-from test_node import START_SECONDS, RunningNode
 
 from sags_node.engine.rasterizer.rasterize import rasterize
 from sags_node.errors import SagsError

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import yaml
+from places import ROOT
 
 from sags_node.calibration import load_rig, read_rig
 from sags_node.errors import UsageError
@@ -17,7 +18,6 @@ from sags_node.launch_file import load_launch
 from sags_node.recording.bag import storage_files
 from sags_node.yaml_reader import MOST_VALUES, parse_yaml, read_yaml
 
-ROOT = Path(__file__).parent.parent
 LONGEST = 300  # characters of a message, without the name of the file
 
 BOMB = "a: &a [x, x, x, x, x, x, x, x, x, x]\n" + "".join(

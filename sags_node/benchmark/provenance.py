@@ -20,7 +20,8 @@ GIT_SECONDS = 10.0
 
 def provenance() -> dict[str, Any]:
     """`revision` of the sources, `date` (UTC), `machine`, its `peak` at this moment (see
-    `benchmark.kernels.peak`; once a process), and `command`: with the defaults of that revision it says all settings."""
+    `benchmark.kernels.peak`; once a process), and `command`: with the defaults of that revision it says all
+    settings."""
     return {
         "revision": revision(),
         "date": datetime.now(UTC).isoformat(timespec="seconds"),

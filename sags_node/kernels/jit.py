@@ -17,8 +17,8 @@ The rules; breaking one costs up to 5 times without any error, so time a kernel 
    does which piece is left open (`take`): pieces differ in cost, and another process may hold a core.
 7. The body of a `prange` loop branches little and unpacks no tuples: it calls a serial kernel for one item.
    With `continue` and `x, y = f()` in the body, Numba 0.68 shares `x` and `y` between threads, silently.
-   `tests/test_kernels.py` compares every kernel of the mapper with its own Python source. The index of the
-   loop becomes `np.int64` before it is handed on, or all that is called compiles twice.
+   `tests/engine/test_kernels.py` compares every kernel of the mapper with its own Python source. The index
+   of the loop becomes `np.int64` before it is handed on, or all that is called compiles twice.
 8. Two conditional sums in one loop do not vectorise: write what was selected to planes, and add those up.
 9. A function with branches or loops that takes arrays counts references to them with atomic instructions,
    5 ns each, even when inlined: in the innermost loops arrays go to intrinsics only.

@@ -1,6 +1,6 @@
 """Runs inside the guest, as root, with two vivid cameras: prints one line `RESULT {json}` on the console.
 
-tests/test_v4l2_vivid.py holds what must be true of it.
+tests/sources/test_v4l2_vivid.py holds what must be true of it.
 """
 
 from __future__ import annotations

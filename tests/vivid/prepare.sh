@@ -1,5 +1,5 @@
 #!/bin/sh
-# Builds what tests/test_v4l2_vivid.py boots: a Debian kernel with the `vivid` test cameras, and an initramfs.
+# Builds what tests/sources/test_v4l2_vivid.py boots: a Debian kernel with the `vivid` test cameras, and an initramfs.
 # The kernel package is unpacked into a cache folder, never installed. Safe to call again: it then only
 # renews the initramfs. Needs Debian's apt; missing tools are installed when run as root.
 set -eu

@@ -1,0 +1,228 @@
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from places import ROOT
+
+from sags_node.calibration import check_rig, load_rig, read_rig, rectified_camera, save_rig
+from sags_node.errors import UsageError
+from sags_node.types import Eye, StereoRig
+
+CALIB = ROOT / "calib"
+
+
+def make_rig() -> StereoRig:
+    """A rig with lens distortion and eyes turned against each other, rectified by OpenCV."""
+    K_left = np.array([[552.3, 0, 318.2], [0, 551.1, 243.6], [0, 0, 1]])
+    K_right = np.array([[549.8, 0, 323.9], [0, 548.9, 239.4], [0, 0, 1]])
+    left_distortion = np.array([-0.18, 0.09, 4e-4, -7e-4, 0.01])
+    right_distortion = np.array([-0.17, 0.08, -3e-4, 5e-4, 0.02])
+    R = cv2.Rodrigues(np.array([0.004, -0.011, 0.006]))[0]
+    t = np.array([[-5.2e-3], [4e-5], [6e-5]])
+    R_left, R_right, P_left, P_right, *_ = cv2.stereoRectify(
+        K_left, left_distortion, K_right, right_distortion, (640, 480), R, t, flags=cv2.CALIB_ZERO_DISPARITY
+    )
+    return StereoRig(
+        "rig",
+        Eye(640, 480, K_left, left_distortion, R_left, P_left),
+        Eye(640, 480, K_right, right_distortion, R_right, P_right),
+    )
+
+
+def edit(folder: Path, side: str, change: dict[str, Any]) -> None:
+    """Change a saved file; a value of None removes the key."""
+    file = folder / f"{side}.yaml"
+    tree = yaml.safe_load(file.read_text())
+    for key, value in change.items():
+        if value is None:
+            del tree[key]
+        else:
+            tree[key] = value
+    file.write_text(yaml.safe_dump(tree))
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    path = tmp_path / "rig"
+    save_rig(make_rig(), path)
+    return path
+
+
+def refusal(folder: Path) -> str:
+    with pytest.raises(UsageError) as caught:
+        load_rig(folder)
+    return str(caught.value)
+
+
+def test_round_trip(folder: Path) -> None:
+    rig, loaded = make_rig(), load_rig(folder)
+    assert loaded.name == "rig"
+    for before, after in ((rig.left, loaded.left), (rig.right, loaded.right)):
+        assert (after.width, after.height) == (640, 480)
+        for field in ("K", "distortion", "R", "P"):
+            np.testing.assert_array_equal(getattr(after, field), getattr(before, field))
+
+
+def test_baseline_and_pose_come_back_from_the_rectification(folder: Path) -> None:
+    rig = load_rig(folder)
+    t = np.array([-5.2e-3, 4e-5, 6e-5])
+    assert rig.baseline == pytest.approx(np.linalg.norm(t))
+    R = cv2.Rodrigues(np.array([0.004, -0.011, 0.006]))[0]
+    np.testing.assert_allclose(rig.T_right_left[:3, :3], R, atol=1e-9)
+    np.testing.assert_allclose(rig.T_right_left[:3, 3], t, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["d4d", "hamlyn_heart", "v4l2_example"])
+def test_shipped_calibrations_have_no_finding(name: str) -> None:
+    assert {finding.level for finding in check_rig(load_rig(CALIB / name))} == {"ok"}
+
+
+def test_ros_file_without_a_model_and_with_four_coefficients(folder: Path) -> None:
+    four = {"rows": 1, "cols": 4, "data": [-0.1, 0.02, 0.0, 0.001]}
+    edit(folder, "left", {"distortion_model": None, "distortion_coefficients": four, "binning_x": 0})
+    np.testing.assert_array_equal(load_rig(folder).left.distortion, [-0.1, 0.02, 0.0, 0.001, 0.0])
+
+
+def test_python_style_exponents_are_numbers(folder: Path) -> None:
+    """ROS writes 1e-05, which YAML 1.1 reads as a string."""
+    file = folder / "left.yaml"
+    tree = yaml.safe_load(file.read_text())
+    tree["distortion_coefficients"]["data"] = "PLACE"
+    file.write_text(yaml.safe_dump(tree).replace("PLACE", "[1e-05, 0.0, 0.0, 0.0, 0.0]"))
+    assert load_rig(folder).left.distortion[0] == 1e-5
+
+
+def test_missing_file(folder: Path) -> None:
+    (folder / "right.yaml").unlink()
+    message = refusal(folder)
+    assert str(folder / "right.yaml") in message
+    assert "left.yaml and right.yaml" in message
+
+
+@pytest.mark.parametrize("text", ["- 1\n- 2\n", "", "a: [1, 2", "%YAML:1.0\n---\nM: 1\n", "\x00"])
+def test_not_a_camera_info_file(folder: Path, text: str) -> None:
+    (folder / "left.yaml").write_text(text)
+    assert str(folder / "left.yaml") in refusal(folder)
+
+
+def test_binary_file(folder: Path) -> None:
+    (folder / "left.yaml").write_bytes(bytes(range(256)))
+    assert "not valid YAML" in refusal(folder)
+
+
+@pytest.mark.parametrize(
+    "key", ["image_width", "camera_matrix", "distortion_coefficients", "projection_matrix"]
+)
+def test_missing_field_is_named(folder: Path, key: str) -> None:
+    edit(folder, "right", {key: None})
+    message = refusal(folder)
+    assert "right.yaml" in message
+    assert f"{key} is missing" in message
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("image_width", 0),
+        ("image_width", "640"),
+        ("image_width", True),
+        ("image_height", 10**9),
+        ("distortion_model", "rational_polynomial"),
+        ("distortion_coefficients", {"data": [0.1] * 8}),
+        ("camera_matrix", {"data": [1.0] * 8}),
+        ("camera_matrix", [1.0] * 9),
+        ("rectification_matrix", {"data": ["a"] * 9}),
+        ("projection_matrix", {"data": [[1.0, 2.0], 3.0] + [0.0] * 10}),
+    ],
+)
+def test_wrong_value_is_named(folder: Path, key: str, value: Any) -> None:
+    edit(folder, "left", {key: value})
+    message = refusal(folder)
+    assert "left.yaml" in message
+    assert key in message
+
+
+def with_P(folder: Path, side: str, row: int, column: int, value: float) -> None:
+    eye = getattr(make_rig(), side)
+    P = eye.P.copy()
+    P[row, column] = value
+    edit(folder, side, {"projection_matrix": {"data": [float(p) for p in P.ravel()]}})
+
+
+def test_swapped_eyes(folder: Path) -> None:
+    left, right = (folder / "left.yaml").read_text(), (folder / "right.yaml").read_text()
+    (folder / "left.yaml").write_text(right)
+    (folder / "right.yaml").write_text(left)
+    assert "swapped" in refusal(folder)
+
+
+def test_baseline_of_the_wrong_sign(folder: Path) -> None:
+    with_P(folder, "right", 0, 3, -make_rig().right.P[0, 3])
+    assert "must be -fx * baseline" in refusal(folder)
+
+
+def test_no_baseline(folder: Path) -> None:
+    with_P(folder, "right", 0, 3, 0.0)
+    assert "no baseline" in refusal(folder)
+
+
+def test_baseline_in_millimetres(folder: Path) -> None:
+    with_P(folder, "right", 0, 3, make_rig().right.P[0, 3] * 1000)
+    message = refusal(folder)
+    assert "looks like millimetres" in message
+    assert "divide" in message
+    assert check_rig(read_rig(folder))[-1].level == "error"  # it can be read, to be reported on
+
+
+def test_unusual_baseline_is_only_a_warning(folder: Path) -> None:
+    with_P(folder, "right", 0, 3, make_rig().right.P[0, 3] * 10)
+    findings = check_rig(load_rig(folder))
+    assert [finding.what for finding in findings if finding.level == "warning"] == [
+        "a baseline of 52 mm is unusual for a stereo endoscope (3 to 10 mm)"
+    ]
+
+
+@pytest.mark.parametrize(("row", "column", "name"), [(1, 1, "fy"), (1, 2, "cy"), (0, 0, "fx")])
+def test_rows_that_do_not_agree(folder: Path, row: int, column: int, name: str) -> None:
+    with_P(folder, "right", row, column, make_rig().right.P[row, column] + 2)
+    assert f"rectified {name} differs" in refusal(folder)
+
+
+def test_eyes_of_different_size(folder: Path) -> None:
+    edit(folder, "right", {"image_width": 720})
+    assert "same picture size" in refusal(folder)
+
+
+def test_rectification_that_is_not_a_rotation(folder: Path) -> None:
+    edit(folder, "left", {"rectification_matrix": {"data": [1.0, 0, 0, 0, 1.0, 0, 0, 0, -1.0]}})
+    assert "not a rotation" in refusal(folder)
+
+
+@pytest.mark.parametrize("planted", [float("nan"), float("inf")])
+@pytest.mark.parametrize("field", ["K", "distortion", "R", "P"])
+def test_numbers_that_are_not_finite(field: str, planted: float) -> None:
+    rig = make_rig()
+    values = getattr(rig.left, field).copy()
+    values.flat[0] = planted
+    bad = dataclasses.replace(rig, left=dataclasses.replace(rig.left, **{field: values}))
+    assert [finding.level for finding in check_rig(bad)] == ["error"]
+
+
+def test_focal_length_in_another_unit(folder: Path) -> None:
+    K = make_rig().left.K.copy()
+    K[:2] /= 640
+    edit(folder, "left", {"camera_matrix": {"data": [float(k) for k in K.ravel()]}})
+    assert "not plausible" in refusal(folder)
+
+
+def test_rectified_camera_at_the_working_size() -> None:
+    rig = make_rig()
+    camera = rectified_camera(rig, 320, 240)
+    assert (camera.width, camera.height) == (320, 240)
+    assert camera.K[0, 0] == pytest.approx(rig.left.P[0, 0] / 2)
+    assert camera.K[0, 2] == pytest.approx((rig.left.P[0, 2] + 0.5) / 2 - 0.5)
+    np.testing.assert_array_equal(camera.T_world_cam, np.eye(4))

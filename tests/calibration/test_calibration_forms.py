@@ -1,0 +1,337 @@
+"""Every form of calibration file is written here by others' means, and read back."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import tarfile
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from click.testing import CliRunner
+from tests.test_calibration import make_rig
+
+from sags_node.calibration import check_rig, load_rig, read_rig, rectify_eyes, resized_rig, save_rig
+from sags_node.cli.main import main
+from sags_node.errors import UsageError
+from sags_node.geometry import scale_intrinsics
+from sags_node.types import F64, StereoRig
+
+SIZE = 640, 480
+K = (
+    np.array([[552.3, 0, 318.2], [0, 551.1, 243.6], [0, 0, 1]]),
+    np.array([[549.8, 0, 323.9], [0, 548.9, 239.4], [0, 0, 1]]),
+)
+PLUMB_BOB = np.array([-0.18, 0.09, 4e-4, -7e-4, 0.01]), np.array([-0.17, 0.08, -3e-4, 5e-4, 0.02])
+RATIONAL = (
+    np.array([0.3, 0.1, 1e-3, -5e-4, 0.02, 0.5, 0.2, 0.01]),
+    np.array([0.2, 0.1, -1e-3, 4e-4, 0.01, 0.4, 0.2, 0.02]),
+)
+R = cv2.Rodrigues(np.array([0.004, -0.011, 0.006]))[0]
+T = np.array([-5.2e-3, 4e-5, 6e-5])  # m
+
+
+def expected(distortion: tuple[F64, F64] = PLUMB_BOB) -> StereoRig:
+    return rectify_eyes("rig", SIZE, K, distortion, R, T)
+
+
+def assert_same(read: StereoRig, rig: StereoRig, tolerance: float = 1e-9) -> None:
+    for side in ("left", "right"):
+        a, b = getattr(read, side), getattr(rig, side)
+        assert (a.width, a.height) == (b.width, b.height)
+        for field in ("K", "distortion", "R", "P"):
+            np.testing.assert_allclose(getattr(a, field), getattr(b, field), atol=tolerance, err_msg=field)
+
+
+def write(file: Path, matrices: dict[str, object]) -> Path:
+    storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
+    for key, value in matrices.items():
+        storage.write(key, value)
+    storage.release()
+    return file
+
+
+def write_pair(folder: Path, suffix: str, distortion: tuple[F64, F64], T_file: F64) -> Path:
+    """As OpenCV's sample stereo_calib does."""
+    folder.mkdir()
+    names = "M1", "D1", "M2", "D2"
+    values = K[0], distortion[0][None], K[1], distortion[1][None]
+    write(folder / f"intrinsics{suffix}", dict(zip(names, values, strict=True)))
+    write(folder / f"extrinsics{suffix}", {"R": R, "T": T_file[:, None]})
+    return folder
+
+
+def archive(file: Path, members: dict[str, bytes]) -> Path:
+    with tarfile.open(file, "w:gz") as tar:
+        for name, content in members.items():
+            info = tarfile.TarInfo(name)
+            info.size = len(content)
+            tar.addfile(info, io.BytesIO(content))
+    return file
+
+
+def refusal(path: Path, size: tuple[int, int] | None = None) -> str:
+    with pytest.raises(UsageError) as caught:
+        read_rig(path, size)
+    return str(caught.value)
+
+
+# ---- ROS -------------------------------------------------------------------------------------------------
+
+
+def test_rational_polynomial_in_ros_files(tmp_path: Path) -> None:
+    save_rig(expected(RATIONAL), tmp_path / "rig")
+    tree = yaml.safe_load((tmp_path / "rig/left.yaml").read_text())
+    assert tree["distortion_model"] == "rational_polynomial"
+    assert_same(load_rig(tmp_path / "rig"), expected(RATIONAL), 0)
+
+
+def test_a_file_of_the_folder_stands_for_it(tmp_path: Path) -> None:
+    save_rig(make_rig(), tmp_path / "rig")
+    assert_same(load_rig(tmp_path / "rig/right.yaml"), make_rig(), 0)
+
+
+def test_ros_files_in_millimetres(tmp_path: Path) -> None:
+    rig = make_rig()
+    in_mm = replace(rig.right, P=rig.right.P * [1, 1, 1, 1000])
+    save_rig(StereoRig("rig", rig.left, in_mm), tmp_path)
+    (error,) = [finding for finding in check_rig(read_rig(tmp_path)) if finding.level == "error"]
+    assert "--unit mm" in error.mend
+    assert_same(read_rig(tmp_path, metres=1e-3), rig)
+
+
+@pytest.mark.parametrize("model", ["equidistant", "thin_prism", 7])
+def test_models_that_are_not_read(tmp_path: Path, model: object) -> None:
+    save_rig(make_rig(), tmp_path)
+    tree = yaml.safe_load((tmp_path / "left.yaml").read_text()) | {"distortion_model": model}
+    (tmp_path / "left.yaml").write_text(yaml.safe_dump(tree))
+    assert f"distortion_model: {model!r} is not supported" in refusal(tmp_path)
+
+
+@pytest.fixture
+def ros_files(tmp_path: Path) -> dict[str, bytes]:
+    save_rig(make_rig(), tmp_path / "written")
+    return {name: (tmp_path / "written" / name).read_bytes() for name in ("left.yaml", "right.yaml")}
+
+
+def test_archive_of_ros_camera_calibration(tmp_path: Path, ros_files: dict[str, bytes]) -> None:
+    pictures = {f"left-{index:04d}.png": bytes(5000) for index in range(3)}
+    file = archive(tmp_path / "calibrationdata.tar.gz", pictures | ros_files | {"ost.txt": b"# oST"})
+    for path in (file, tmp_path):  # the file, and the folder that holds it
+        read = load_rig(path)
+        assert_same(read, make_rig(), 0)
+    assert load_rig(file).name == "calibrationdata"
+
+
+def test_an_archive_writes_nothing_outside(tmp_path: Path, ros_files: dict[str, bytes]) -> None:
+    inside = tmp_path / "deep/er"
+    inside.mkdir(parents=True)
+    file = archive(inside / "data.tgz", {f"../../{name}": text for name, text in ros_files.items()})
+    before = sorted(tmp_path.rglob("*"))
+    assert_same(load_rig(file), make_rig(), 0)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_archives_that_are_refused(tmp_path: Path, ros_files: dict[str, bytes]) -> None:
+    one_eye = archive(tmp_path / "one.tar.gz", {"left.yaml": ros_files["left.yaml"]})
+    assert "holds no right.yaml" in refusal(one_eye)
+    large = archive(tmp_path / "large.tar.gz", {"left.yaml": b" " * (2**20 + 1)})
+    assert "larger than" in refusal(large)
+    (tmp_path / "cut.tar.gz").write_bytes(archive(tmp_path / "whole.tar.gz", ros_files).read_bytes()[:200])
+    assert "cut.tar.gz is not a readable tar.gz" in refusal(tmp_path / "cut.tar.gz")
+    assert "is not a readable tar.gz" in refusal(tmp_path / "gone.tar.gz")
+
+
+@pytest.mark.parametrize("kind", [tarfile.XHDTYPE, tarfile.GNUTYPE_LONGNAME, tarfile.REGTYPE])
+def test_an_archive_that_claims_to_be_huge_takes_no_memory(tmp_path: Path, kind: bytes) -> None:
+    info = tarfile.TarInfo("left-0000.png")
+    info.type, info.size = kind, 2**40
+    with gzip.open(tmp_path / "forged.tar.gz", "wb") as file:
+        file.write(info.tobuf(tarfile.GNU_FORMAT) + bytes(4096))
+    assert "not a readable tar.gz" in refusal(tmp_path / "forged.tar.gz")
+
+
+# ---- OpenCV ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("distortion", [PLUMB_BOB, RATIONAL])
+@pytest.mark.parametrize("suffix", [".yml", ".xml"])
+def test_the_pair_of_opencv_files(tmp_path: Path, suffix: str, distortion: tuple[F64, F64]) -> None:
+    folder = write_pair(tmp_path / "rig", suffix, distortion, T * 1000)
+    assert_same(read_rig(folder, SIZE, 1e-3), expected(distortion))
+    assert_same(read_rig(folder / f"extrinsics{suffix}", SIZE, 1e-3), expected(distortion))
+
+
+def test_millimetres_must_be_said(tmp_path: Path) -> None:
+    folder = write_pair(tmp_path / "rig", ".yml", PLUMB_BOB, T * 1000)
+    findings = check_rig(read_rig(folder, SIZE))
+    assert findings[-1].level == "error"
+    assert "looks like millimetres" in findings[-1].what and "--unit mm" in findings[-1].mend
+
+
+def test_the_size_must_be_said(tmp_path: Path) -> None:
+    folder = write_pair(tmp_path / "rig", ".yml", PLUMB_BOB, T)
+    message = refusal(folder)
+    assert "does not say the size" in message and "--size" in message
+
+
+@pytest.mark.parametrize(
+    ("names", "size"),
+    [
+        (("M1", "D1", "M2", "D2"), {"image_width": 640, "image_height": 480}),
+        (("K1", "D1", "K2", "D2"), {"imageSize": (640, 480)}),
+        (("cameraMatrix1", "distCoeffs1", "cameraMatrix2", "distCoeffs2"), {"image_size": (640, 480)}),
+        (("KL", "DL", "KR", "DR"), {"width": 640, "height": 480}),
+    ],
+)
+def test_one_opencv_file(tmp_path: Path, names: tuple[str, ...], size: dict[str, object]) -> None:
+    values = K[0], PLUMB_BOB[0], K[1], PLUMB_BOB[1]
+    matrices = dict(zip(names, values, strict=True)) | {"R": R, "T": T} | size
+    read = read_rig(write(tmp_path / "scope_a.yaml", matrices))
+    assert read.name == "scope_a"
+    assert_same(read, expected())
+
+
+def test_the_size_as_a_sequence(tmp_path: Path) -> None:
+    """As C++ programs write a cv::Size."""
+    matrices = {"M1": K[0], "D1": PLUMB_BOB[0], "M2": K[1], "D2": PLUMB_BOB[1], "R": R, "T": T}
+    file = write(tmp_path / "rig.yml", matrices)
+    text = file.read_text()
+    file.write_text(text.replace("---", "---\nimageSize: [ 640, 480 ]", 1))
+    assert_same(read_rig(file), expected())
+    for wrong in ("[ 640, 0 ]", "[ 640, 1000000000 ]", "[ .Nan, 480 ]"):
+        file.write_text(text.replace("---", f"---\nimageSize: {wrong}", 1))
+        assert "is not possible" in refusal(file)
+
+
+def test_a_rectification_in_the_files_is_kept(tmp_path: Path) -> None:
+    whole = cv2.stereoRectify(
+        K[0], PLUMB_BOB[0], K[1], PLUMB_BOB[1], SIZE, R, T[:, None] * 1000, alpha=1
+    )  # another one than is made here
+    names = "R1", "R2", "P1", "P2"
+    matrices = {"M1": K[0], "D1": PLUMB_BOB[0], "M2": K[1], "D2": PLUMB_BOB[1], "R": R, "T": T * 1000}
+    file = write(tmp_path / "rig.yml", matrices | dict(zip(names, whole[:4], strict=True)))
+    rig = read_rig(file, SIZE, 1e-3)
+    np.testing.assert_allclose(rig.right.R, whole[1])
+    np.testing.assert_allclose(rig.right.P[:, :3], whole[3][:, :3])
+    assert rig.baseline == pytest.approx(np.linalg.norm(T))
+    assert abs(rig.left.P[0, 0] - expected().left.P[0, 0]) > 1
+
+
+def test_zeros_after_the_coefficients_do_not_count(tmp_path: Path) -> None:
+    """OpenCV writes 14 where fewer were fitted."""
+    padded = tuple(np.pad(part, (0, 14 - len(part))) for part in RATIONAL)
+    folder = write_pair(tmp_path / "rig", ".yml", (padded[0], padded[1]), T)
+    assert_same(read_rig(folder, SIZE), expected(RATIONAL))
+    padded[0][9] = 0.01
+    folder = write_pair(tmp_path / "prism", ".yml", (padded[0], padded[1]), T)
+    assert "10 distortion coefficients" in refusal(folder, SIZE)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"M2": None}, "looked for a matrix named M2, K2"),
+        ({"R": np.eye(2)}, "R is not a matrix of 9 numbers"),
+        ({"R": np.diag([1.0, 1, -1])}, "is not a rotation"),
+        ({"T": np.zeros(3)}, "no baseline"),
+        ({"T": np.array([np.nan, 0, 0])}, "NaN"),
+        ({"T": "five"}, "T is not a matrix of 3 numbers"),
+    ],
+)
+def test_wrong_matrices_are_named(tmp_path: Path, change: dict[str, object], said: str) -> None:
+    matrices = {"M1": K[0], "D1": PLUMB_BOB[0], "M2": K[1], "D2": PLUMB_BOB[1], "R": R, "T": T} | change
+    kept = {key: value for key, value in matrices.items() if value is not None}
+    message = refusal(write(tmp_path / "rig.yml", kept), SIZE)
+    assert "rig" in message and said in message
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "%YAML:1.0\n---\nM1: !!opencv-matrix\n   rows: 100000\n   cols: 1000000\n   dt: d\n   data: [ 1. ]\n",
+        "%YAML:1.0\n---\nM1: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n   data: [ 1., 2. ]\n",
+        "%YAML:1.0\n---\nM1: [ 1, 2\n",
+        "<?xml version='1.0'?><opencv_storage><M1>",
+    ],
+)
+def test_damaged_opencv_files(tmp_path: Path, text: str) -> None:
+    file = tmp_path / ("rig.xml" if text.startswith("<") else "rig.yml")
+    file.write_text(text)
+    assert str(file) in refusal(file, SIZE)
+
+
+# ---- text ------------------------------------------------------------------------------------------------
+
+
+def write_text(folder: Path, prefix: str = "calib.", plural: str = "s", l2r: str = "l2r.txt") -> Path:
+    folder.mkdir()
+    for side, matrix, distortion in zip(("left", "right"), K, PLUMB_BOB, strict=True):
+        np.savetxt(folder / f"{prefix}{side}.intrinsic{plural}.txt", matrix)
+        np.savetxt(folder / f"{prefix}{side}.distortion.txt", distortion[None])
+    transform = np.eye(4)
+    transform[:3, :3], transform[:3, 3] = R, T * 1000
+    np.savetxt(folder / f"{prefix}{l2r}", transform)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("prefix", "plural", "l2r"), [("calib.", "s", "l2r.txt"), ("calib.", "", "l2r.4x4"), ("", "s", "l2r.txt")]
+)
+def test_text_matrices_are_millimetres(tmp_path: Path, prefix: str, plural: str, l2r: str) -> None:
+    folder = write_text(tmp_path / "rig", prefix, plural, l2r)
+    assert_same(read_rig(folder, SIZE), expected())
+
+
+def test_text_matrices_that_are_refused(tmp_path: Path) -> None:
+    folder = write_text(tmp_path / "rig")
+    assert "--size" in refusal(folder)
+    (folder / "calib.left.distortion.txt").write_text("a b c d e")
+    assert "calib.left.distortion.txt holds something else than numbers" in refusal(folder, SIZE)
+    (folder / "calib.left.distortion.txt").unlink()
+    assert "*left.distortion*.txt is needed, found: none" in refusal(folder, SIZE)
+    np.savetxt(folder / "calib.left.distortion.txt", np.zeros(3))
+    assert "holds 3 numbers" in refusal(folder, SIZE)
+    np.savetxt(folder / "old.left.intrinsics.txt", K[0])
+    assert "calib.left.intrinsics.txt, old.left.intrinsics.txt" in refusal(folder, SIZE)
+
+
+# ---- which form, and from one to another -----------------------------------------------------------------
+
+
+def test_what_was_looked_for_is_said(tmp_path: Path) -> None:
+    message = refusal(tmp_path)
+    for name in ("left.yaml and right.yaml", "calibrationdata.tar.gz", "intrinsics", "scikit-surgery"):
+        assert name in message
+    assert "gone/left.yaml" in refusal(tmp_path / "gone")
+
+
+def test_resized() -> None:
+    rig, half = make_rig(), resized_rig(make_rig(), 0.5)
+    assert (half.left.width, half.left.height) == (320, 240)
+    assert half.baseline == pytest.approx(rig.baseline)
+    np.testing.assert_allclose(half.right.K, scale_intrinsics(rig.right.K, (640, 480), (320, 240)))
+    np.testing.assert_allclose(half.T_right_left, rig.T_right_left)
+
+
+def sags(*arguments: object) -> tuple[int, str]:
+    result = CliRunner().invoke(main, [str(argument) for argument in arguments])
+    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
+    return result.exit_code, result.output
+
+
+def test_convert(tmp_path: Path) -> None:
+    folder = write_pair(tmp_path / "scope", ".yml", PLUMB_BOB, T * 1000)
+    code, said = sags("calib", "convert", folder, "-o", tmp_path / "out", "--size", "640x480", "--unit", "mm")
+    assert code == 0 and "baseline 5.2 mm" in said
+    assert_same(load_rig(tmp_path / "out"), expected())
+    code, said = sags("calib", "convert", folder, "-o", tmp_path / "no", "--size", "640x480")
+    assert code == 2 and "looks like millimetres" in said and not (tmp_path / "no").exists()
+    code, said = sags("calib", "convert", folder, "-o", tmp_path / "no", "--size", "640")
+    assert code == 2 and "'640' is not like 720x576" in said
+    code, _ = sags("calib", "convert", tmp_path / "out", "-o", tmp_path / "double", "--scale", "2")
+    assert code == 0 and load_rig(tmp_path / "double").left.width == 1280

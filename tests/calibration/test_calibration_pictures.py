@@ -1,0 +1,384 @@
+"""Planted errors, and pictures that tell them."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from places import ROOT
+
+from sags_node.calibrate.check import check_pictures
+from sags_node.calibrate.pictures import pairs_of_files
+from sags_node.calibration import Finding, check_rig, load_rig, read_rig, rectify_eyes, save_rig
+from sags_node.calibration.check import size_made_for
+from sags_node.calibration.matches import match_eyes
+from sags_node.calibration.rows import rectified_rows
+from sags_node.cli.main import main
+from sags_node.errors import SagsError
+from sags_node.sources.pictures import read_picture
+from sags_node.types import U8, Eye, StereoFrame, StereoRig
+from sags_node.vision.rectify import Rectifier
+
+Pairs = list[tuple[U8, U8]]
+F7 = "hamlyn_f7_pair"
+F7_SIZE = 360, 288
+
+
+@pytest.fixture(scope="module")
+def phantom(phantom_session: Path) -> tuple[StereoRig, Pairs]:
+    names = [f"{index:04d}.jpg" for index in (0, 15, 30)]
+    pairs = [
+        (read_picture(phantom_session / "left" / name), read_picture(phantom_session / "right" / name))
+        for name in names
+    ]
+    return load_rig(phantom_session / "calib"), pairs
+
+
+@pytest.fixture(scope="module")
+def f7(data_folder: Path) -> tuple[StereoRig, Pairs]:
+    folder = data_folder / F7
+    if not folder.is_dir():
+        pytest.skip(f"recording {F7} is not under SAGS_DATA ({data_folder})")
+    left, right = (read_picture(folder / f"f7_dynamic_deint_{side}_0100.png") for side in "LR")
+    return read_rig(folder, F7_SIZE), [(left, right)]
+
+
+def swapped(pairs: Pairs) -> Pairs:
+    return [(right, left) for left, right in pairs]
+
+
+def swapped_files(rig: StereoRig) -> StereoRig:
+    return StereoRig(rig.name, rig.right, rig.left)
+
+
+def with_T_negated(rig: StereoRig) -> StereoRig:
+    """As files with the wrong sign are rectified."""
+    return from_matrices(rig, -1.0)
+
+
+def in_millimetres(rig: StereoRig) -> StereoRig:
+    return from_matrices(rig, 1000.0)
+
+
+def from_matrices(rig: StereoRig, factor: float) -> StereoRig:
+    left, right, T = rig.left, rig.right, rig.T_right_left
+    size, K, distortion = (left.width, left.height), (left.K, right.K), (left.distortion, right.distortion)
+    return rectify_eyes(rig.name, size, K, distortion, T[:3, :3], factor * T[:3, 3])
+
+
+def half_size(rig: StereoRig) -> StereoRig:
+    """Calibrated with pictures of half the size; only the size in the files was edited."""
+    half = np.diag([0.5, 0.5, 1])
+    left, right = (replace(eye, K=half @ eye.K) for eye in (rig.left, rig.right))
+    return from_matrices(StereoRig(rig.name, left, right), 1.0)
+
+
+def with_right_turned(rig: StereoRig, degrees: tuple[float, float, float]) -> StereoRig:
+    turn = cv2.Rodrigues(np.radians(degrees))[0]
+    return StereoRig(rig.name, rig.left, replace(rig.right, R=turn @ rig.right.R))
+
+
+@pytest.fixture
+def subject(request: pytest.FixtureRequest) -> tuple[StereoRig, Pairs]:
+    rig_and_pairs: tuple[StereoRig, Pairs] = request.getfixturevalue(request.param)
+    return rig_and_pairs
+
+
+every_subject = pytest.mark.parametrize("subject", ["phantom", "f7"], indirect=True)
+
+
+def worst(findings: list[Finding]) -> Finding:
+    return max(findings, key=lambda finding: ("ok", "warning", "error").index(finding.level))
+
+
+# ---- what is right stays right ---------------------------------------------------------------------------
+
+
+@every_subject
+def test_a_right_calibration_passes(subject: tuple[StereoRig, Pairs]) -> None:
+    findings = check_rig(subject[0]) + check_pictures(*subject)
+    assert {finding.level for finding in findings} == {"ok"}, findings
+
+
+def test_rows_of_a_real_unrectified_pair(f7: tuple[StereoRig, Pairs]) -> None:
+    """This rig's rows are off by 1.5 px at the top of the picture, and agree in its middle. Features, found
+    without the dense search, say so too: to half a pixel, since there are few of them at the edges."""
+    rig, pairs = f7
+    front, rows = check_pictures(rig, pairs)
+    features = rectified_rows(rig, match_eyes(*pairs[0]))
+    assert rows.figures["row_median_px"] == pytest.approx(features.median, abs=0.5)
+    assert rows.figures["row_p90_px"] == pytest.approx(features.p90, abs=0.5)
+    assert rows.figures["matched"] > 0.4
+    assert front.figures["row_error_median_px"] < 0.5
+    assert 0.05 < front.figures["depth_median_m"] < 0.09
+
+
+def test_rows_of_the_phantom_are_exact(phantom: tuple[StereoRig, Pairs]) -> None:
+    _, rows = check_pictures(*phantom)
+    assert rows.figures["row_median_px"] < 0.1
+
+
+# ---- planted errors --------------------------------------------------------------------------------------
+
+
+@every_subject
+def test_swapped_pictures(subject: tuple[StereoRig, Pairs]) -> None:
+    rig, pairs = subject
+    finding = worst(check_pictures(rig, swapped(pairs)))
+    assert finding.level == "error"
+    assert "the pictures are swapped" in finding.what and "calibration is in order" in finding.mend
+
+
+@every_subject
+def test_swapped_files(subject: tuple[StereoRig, Pairs]) -> None:
+    rig, pairs = subject
+    finding = worst(check_pictures(swapped_files(rig), pairs))
+    assert finding.level == "error"
+    assert "swapped in the calibration" in finding.what and "pictures are in order" in finding.mend
+
+
+@every_subject
+def test_wrong_sign(subject: tuple[StereoRig, Pairs]) -> None:
+    rig, pairs = subject
+    wrong = with_T_negated(rig)
+    assert any(finding.level == "error" for finding in check_rig(wrong))
+    finding = worst(check_pictures(wrong, pairs))
+    assert finding.level == "error"
+    assert "has the wrong sign" in finding.what and "pictures are in order" in finding.mend
+
+
+@every_subject
+def test_both_ends_swapped(subject: tuple[StereoRig, Pairs]) -> None:
+    rig, pairs = subject
+    finding = worst(check_pictures(swapped_files(rig), swapped(pairs)))
+    assert finding.level == "error" and "pictures and calibration agree" in finding.what
+
+
+@every_subject
+def test_millimetres(subject: tuple[StereoRig, Pairs]) -> None:
+    rig, pairs = subject
+    assert "looks like millimetres" in worst(check_rig(in_millimetres(rig))).what
+    finding = worst(check_pictures(in_millimetres(rig), pairs))
+    assert finding.level == "error" and "millimetres" in finding.mend
+
+
+@every_subject
+def test_half_size_matrices(subject: tuple[StereoRig, Pairs]) -> None:
+    rig, pairs = subject
+    wrong = half_size(rig)
+    warned = worst(check_rig(wrong))
+    assert "camera_matrix is of" in warned.what and "by 2" in warned.mend
+    finding = worst(check_pictures(wrong, pairs))
+    assert finding.level == "error" and "0.5 times the size" in finding.what
+
+
+@every_subject
+def test_another_picture_size(subject: tuple[StereoRig, Pairs]) -> None:
+    rig, pairs = subject
+    double = [
+        (cv2.resize(left, None, fx=2, fy=2), cv2.resize(right, None, fx=2, fy=2)) for left, right in pairs
+    ]
+    (finding,) = check_pictures(rig, double)
+    assert finding.level == "error" and "2 times as large" in finding.what and "--scale 2" in finding.mend
+    (finding,) = check_pictures(rig, [(left[:-20], right[:-20]) for left, right in pairs])
+    assert "cropped" in finding.mend
+
+
+@pytest.mark.parametrize(
+    ("turned", "figure"), [((0.3, 0.0, 0.0), "pitch_deg"), ((0.0, 0.0, 0.6), "roll_deg")]
+)
+def test_a_turned_eye_is_a_warning_with_its_angle(
+    phantom: tuple[StereoRig, Pairs], turned: tuple[float, float, float], figure: str
+) -> None:
+    rig, pairs = phantom
+    finding = worst(check_pictures(with_right_turned(rig, turned), pairs))
+    assert finding.level == "warning" and "one eye were turned" in finding.what
+    assert abs(finding.figures[figure]) == pytest.approx(max(turned), abs=0.05)
+    other = "roll_deg" if figure == "pitch_deg" else "pitch_deg"
+    assert abs(finding.figures[other]) < 0.1
+
+
+def test_the_calibration_of_another_scope(phantom: tuple[StereoRig, Pairs]) -> None:
+    rig, pairs = phantom
+    finding = worst(check_pictures(with_right_turned(rig, (3.0, 0.0, 1.0)), pairs))
+    assert finding.level == "error" and "not of these pictures" in finding.mend
+
+
+def test_rectified_pictures_swapped(data_folder: Path) -> None:
+    """Rows tell nothing here; on which side the points lie does."""
+    left, right = (
+        sorted((data_folder / "hamlyn_invivo_001_100" / side).iterdir())[:1] for side in ("left", "right")
+    )
+    pairs = [(read_picture(left[0]), read_picture(right[0]))]
+    rig = load_rig(ROOT / "calib/hamlyn_heart")
+    assert worst(check_pictures(rig, pairs)).level == "ok"
+    assert "the pictures are swapped" in worst(check_pictures(rig, swapped(pairs))).what
+
+
+def test_principal_points_far_apart_are_not_taken_for_a_swap(phantom: tuple[StereoRig, Pairs]) -> None:
+    """Rectified pictures whose right one is cut out farther to the right than the calibration says: points
+    seem to lie behind the eyes, as in exchanged ones. Only whoever covers a lens can tell which it is."""
+    rig, pairs = phantom
+    rectifier = Rectifier(rig, rig.left.width, rig.left.height)
+    left, right = rectified(rectifier, pairs[0])
+    shift = rig.left.width * 97 // 640
+    moved = np.zeros_like(right)
+    moved[:, shift:] = right[:, :-shift]
+    said = worst(check_pictures(plain_rig(rectifier, 0.0), [(left, moved)]))
+    assert said.level == "error" and "or their principal points differ by at least" in said.what
+    least = int(re.findall(r"at least (\d+) px", said.what)[0])
+    assert 0 < least < shift and "cover the left eye's lens" in said.mend
+    # A calibration that says so is in order.
+    assert worst(check_pictures(plain_rig(rectifier, shift), [(left, moved)])).level == "ok"
+
+
+def plain_rig(rectifier: Rectifier, shift: float) -> StereoRig:
+    """Of rectified pictures; the right eye's principal point lies `shift` px farther to the right."""
+    K, none = rectifier.camera.K, np.zeros(5)
+    K_right = K + np.array([[0, 0, shift], [0, 0, 0], [0, 0, 0]])
+    size = rectifier.camera.width, rectifier.camera.height
+    P, P_right = (np.column_stack([K, [-K[0, 0] * baseline, 0, 0]]) for baseline in (0.0, rectifier.baseline))
+    return StereoRig(
+        "plain", Eye(*size, K, none, np.eye(3), P), Eye(*size, K_right, none, np.eye(3), P_right)
+    )
+
+
+def rectified(rectifier: Rectifier, pair: tuple[U8, U8]) -> tuple[U8, U8]:
+    made = rectifier(StereoFrame(0, 0, 0, *pair))
+    assert made.right is not None
+    return made.left, made.right
+
+
+def test_highlights_are_no_points_of_the_tissue(phantom: tuple[StereoRig, Pairs]) -> None:
+    """They are the sharpest thing in both pictures, and lie on the epipolar lines, but at another depth."""
+    _, pairs = phantom
+    left, right = (eye.copy() for eye in pairs[0])
+    clean = match_eyes(left, right)
+    down = round(float(np.median(clean[:, 3] - clean[:, 1])))  # raw pictures: rows differ
+    rng = np.random.default_rng(3)
+    shining = rng.uniform((60, 20), (290, 230), (25, 2)).astype(int)
+    for x, y in np.repeat(shining, 4, axis=0) + rng.integers(-5, 6, (100, 2)):  # in clusters
+        shape = tuple(int(side) for side in rng.integers(1, 5, 2)), int(rng.integers(0, 180))
+        for eye, (dx, dy) in ((left, (0, 0)), (right, (-14, down))):
+            cv2.ellipse(eye, (int(x + dx), int(y + dy)), *shape, 0, 360, (255, 255, 255), -1)
+    matches = match_eyes(left, right)
+    assert len(matches) > 200
+    distances = np.linalg.norm(matches[:, None, :2] - shining, axis=-1)
+    assert distances.min() > 4
+
+
+def test_pictures_that_show_nothing(phantom: tuple[StereoRig, Pairs]) -> None:
+    rig, _ = phantom
+    grey = np.full((rig.left.height, rig.left.width, 3), 90, np.uint8)
+    (finding,) = check_pictures(rig, [(grey, grey)])
+    assert finding.level == "warning" and "too few to judge" in finding.what
+
+
+# ---- numbers alone ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("factor", [0.25, 0.5, 2.0])
+def test_size_made_for(phantom: tuple[StereoRig, Pairs], factor: float) -> None:
+    rig, _ = phantom
+    assert size_made_for(rig) is None
+    scale = np.diag([factor, factor, 1])
+    left, right = (replace(eye, K=scale @ eye.K) for eye in (rig.left, rig.right))
+    assert size_made_for(StereoRig("scaled", left, right)) == factor
+    assert size_made_for(StereoRig("one eye", left, rig.right)) is None
+
+
+def test_distortion_that_turns_back(phantom: tuple[StereoRig, Pairs]) -> None:
+    rig, _ = phantom
+    folded = replace(rig.left, distortion=np.array([-0.089, 0.94, 0, 0, -14.8]))
+    findings = check_rig(StereoRig("folded", folded, rig.right))
+    (warned,) = [finding for finding in findings if finding.level == "warning"]
+    radius = np.linspace(0, 1, 100_000)  # where the model's radius stops growing, by brute force
+    reached = (radius * (1 - 0.089 * radius**2 + 0.94 * radius**4 - 14.8 * radius**6)).max() * rig.left.K[
+        0, 0
+    ]
+    assert f"left.yaml: the distortion turns back {reached:.0f} px" in warned.what
+
+
+# ---- the command -----------------------------------------------------------------------------------------
+
+
+def sags(*arguments: object) -> tuple[int, str, str]:
+    result = CliRunner().invoke(main, ["calib", "check", *map(str, arguments)])
+    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
+    return result.exit_code, result.stdout, result.stderr
+
+
+def test_check_of_a_session_against_itself(phantom_session: Path) -> None:
+    code, out, _ = sags(phantom_session, "--json")
+    findings = json.loads(out)
+    assert code == 0 and findings[-1]["figures"]["row_median_px"] < 0.2
+    assert findings[-2]["figures"]["matches"] > 300
+
+
+def test_check_against_a_session_with_another_key(phantom_session: Path) -> None:
+    swapped_source = [
+        f"source.left:={phantom_session / 'right'}",
+        f"source.right:={phantom_session / 'left'}",
+    ]
+    code, out, err = sags(phantom_session / "calib", "--session", phantom_session, *swapped_source)
+    assert code == 1 and "the pictures are swapped" in out and "cannot be used" in err
+
+
+def test_a_broken_calibration_is_checked_against_a_session(phantom_session: Path, tmp_path: Path) -> None:
+    """A session does not open with it, but this command must."""
+    rig = load_rig(phantom_session / "calib")
+    save_rig(with_T_negated(rig), tmp_path / "wrong")
+    code, out, _ = sags(tmp_path / "wrong", "--session", phantom_session)
+    assert code == 1 and "must be -fx * baseline" in out and "has the wrong sign" in out
+
+
+def test_check_with_files_and_folders(phantom_session: Path) -> None:
+    first = phantom_session / "left/0000.jpg", phantom_session / "right/0000.jpg"
+    code, out, _ = sags(phantom_session / "calib", "--images", *first, "--images", *first)
+    assert code == 0 and "rows agree" in out
+    code, out, _ = sags(
+        phantom_session / "calib", "--images", phantom_session / "left", phantom_session / "right"
+    )
+    assert code == 0 and "rows agree" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["{session}/calib", "other"], "one calibration at a time"),
+        (["{session}/calib", "--session", "gone"], "gone"),
+        (["{session}/calib", "--session", "{session}", "source.lefd:=x"], "source.lefd"),
+        (["{session}/calib", "--session", "{session}", "--images", "a", "b"], "one of them is enough"),
+        (["{session}/left"], "is no calibration; looked for"),
+        (["{session}/calib", "--images", "{session}/left", "{session}/calib"], "holds no .jpg or .png"),
+    ],
+)
+def test_usage(phantom_session: Path, arguments: list[str], said: str) -> None:
+    code, out, err = sags(*(argument.format(session=phantom_session) for argument in arguments))
+    assert code == 2 and out == "" and said in err, err
+
+
+def test_pictures_of_several_sizes(phantom_session: Path, tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "small.png"), np.zeros((64, 64, 3), np.uint8))
+    with pytest.raises(SagsError, match="64x64 and 320x256"):
+        pairs_of_files([(phantom_session / "left/0000.jpg", tmp_path / "small.png")])
+
+
+def test_a_session_without_a_right_eye(tmp_path: Path) -> None:
+    (tmp_path / "images").mkdir()
+    (tmp_path / "masks").mkdir()
+    (tmp_path / "depth").mkdir()
+    for folder, value in (("images", 90), ("masks", 0), ("depth", 50)):
+        shape = (48, 64, 3) if folder == "images" else (48, 64)
+        for index in range(2):
+            cv2.imwrite(str(tmp_path / folder / f"{index}.png"), np.full(shape, value, np.uint8))
+    pose = np.hstack([np.eye(3), np.zeros((3, 1)), [[48.0], [64.0], [60.0]]]).ravel()
+    np.save(tmp_path / "poses_bounds.npy", np.tile(np.append(pose, [0.0, 1.0]), (2, 1)))
+    code, _, err = sags(tmp_path)
+    assert code == 2 and "no right eye" in err

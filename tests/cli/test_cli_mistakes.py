@@ -1,0 +1,171 @@
+"""What a user gives a command, with every mistake: one clear message and the right exit code."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from command_line import START_SECONDS, refused, sags, start
+from places import ROOT
+from user_files import SHORT, videos
+
+from sags_node.messaging.subscriber import Subscriber
+
+pytestmark = [pytest.mark.live, pytest.mark.usefixtures("run_dir")]
+
+
+# ---- launch files and overrides --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("command", ["run", "demo", "eval", "doctor"])
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["nowhere.yaml"], ("nowhere.yaml", "No such file", "check the path")),
+        (["[/bold].yaml"], ("[/bold].yaml", "check the path")),  # is not taken for rich's markup
+        (["a.yaml", "b.yaml"], ("one launch file", "a.yaml, b.yaml")),
+        (["mapping.budgt_ms:=25"], ("mapping.budgt_ms", "did you mean 'budget_ms'")),
+        (["budget_ms:=25"], ("'budget_ms'", "did you mean 'mapping.budget_ms'")),
+        (["mapping.budget_ms:=soon"], ("mapping.budget_ms", "valid number", "'soon'")),
+        (["publish.data:=tcp://127.0.0.1:5"], ("publish.data", "a list", "'tcp://127.0.0.1:5'")),
+        (
+            ["source.kind:=videos", "source.left:=a.mp4"],
+            ("source.right is missing", "vision.onnx.declared_depth", "docs/depth.md"),
+        ),
+        (["clip.MP4"], ("clip.MP4 is a video", "source.video:=clip.MP4", "source.left:=clip.MP4", "rig:=")),
+        (["mapping.budget_ms=25"], ("'mapping.budget_ms=25'", "write mapping.budget_ms:=25")),
+        ([":=25"], ("':=25'", "write key:=value")),
+    ],
+)
+def test_a_wrong_launch(command: str, arguments: list[str], said: tuple[str, ...]) -> None:
+    refused(2, command, *arguments, said=said)
+
+
+def test_a_folder_that_is_no_session(user_files: Path) -> None:
+    refused(2, "run", user_files / "empty", said=(str(user_files / "empty/launch.yaml"), "check the path"))
+
+
+def test_every_mistake_of_a_launch_file_is_named(tmp_path: Path) -> None:
+    file = tmp_path / "two.yaml"
+    file.write_text("mapping: {budget_ms: fast}\nvison: {}\n")
+    refused(2, "run", file, said=("two.yaml: mapping.budget_ms", "did you mean 'vision'"))
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["run", "--seconds", "0"],
+        ["topic", "hz", "tf", "--seconds", "-1"],
+        ["topic", "echo", "tf", "--count", "0"],
+        ["eval", "--every", "0"],
+        ["eval", "--hold-out", "-1"],
+        ["eval", "--iterations", "-1"],
+    ],
+)
+def test_numbers_out_of_range(arguments: list[str]) -> None:
+    refused(2, *arguments, said=(arguments[-2], "is not in the range"))
+
+
+# ---- recordings and calibrations -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("code", "overrides", "said"),
+    [
+        (2, {"left": "gone.mp4"}, ("gone.mp4", "does not exist", "check the path")),
+        (2, {"left": "garbage.mp4"}, ("garbage.mp4", "cannot be read as a video")),
+        (2, {"right": "small.mp4"}, ("320x256", "160x128", "left.mp4", "small.mp4")),
+        (2, {"rig": "gone"}, ("gone/left.yaml", "a rig is a folder with left.yaml and right.yaml")),
+        (2, {"rig": "one_eyed"}, ("one_eyed/right.yaml", "No such file")),
+        (2, {"rig": "millimetres"}, ("millimetres", "projection_matrix[3]", "by 1000")),
+        (2, {"rig": "positive"}, ("projection_matrix[3]", "negative")),
+        (1, {"rig": "double"}, ("320x256", "640x512")),
+    ],
+)
+def test_a_wrong_recording_or_calibration(
+    user_files: Path, code: int, overrides: dict[str, str], said: tuple[str, ...]
+) -> None:
+    refused(code, "run", *videos(user_files, **overrides), said=said)
+    refused(code, "eval", "--pace", "step", *videos(user_files, **overrides), said=said)
+
+
+def test_no_library_adds_lines_of_its_own(user_files: Path) -> None:
+    process = start(["run", *videos(user_files, left="garbage.mp4")])
+    _, stderr = process.communicate(timeout=START_SECONDS)
+    assert process.returncode == 2
+    assert stderr == f"error: {user_files / 'garbage.mp4'} cannot be read as a video; is it complete?\n"
+
+
+@pytest.mark.parametrize(
+    ("code", "overrides", "said"),
+    [
+        (2, ["source.left:=gone"], ("picture folder gone", "does not exist")),
+        (2, ["source.left:=empty"], ("picture folder empty", "no .jpg or .png")),
+        (1, ["source.right:=small"], ("320x256", "160x128", "small/0000.jpg")),
+        (2, ["rig:=null"], ("no calibration", "set rig")),
+        (2, ["source.start:=1000"], ("source.start", "behind the recording's end", "4.00 s")),
+    ],
+)
+def test_wrong_picture_folders(
+    user_files: Path,
+    phantom_session: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    code: int,
+    overrides: list[str],
+    said: tuple[str, ...],
+) -> None:
+    monkeypatch.chdir(user_files)
+    refused(code, "run", phantom_session, "source.tools:=null", *overrides, said=said)
+
+
+def test_a_crop_outside_the_picture(user_files: Path) -> None:
+    boxes = ["source.left:=[0, 0, 200, 256]", "source.right:=[200, 0, 200, 256]"]
+    source = [
+        "source.kind:=panes",
+        f"source.video:={user_files / 'left.mp4'}",
+        f"rig:={user_files / 'calib'}",
+    ]
+    refused(2, "run", *source, *boxes, said=("pane 'right'", "leaves the picture", "320x256"))
+
+
+def test_a_camera_that_is_not_there() -> None:
+    camera = "source.left:=/dev/no-camera"
+    refused(1, "run", ROOT / "launch/v4l2.yaml", camera, said=("/dev/no-camera", "does not exist"))
+    refused(2, "demo", ROOT / "launch/v4l2.yaml", said=("plays recordings", "sags run"))
+    refused(2, "eval", ROOT / "launch/v4l2.yaml", said=("live cameras", "record them first"))
+
+
+def test_a_right_video_that_ends_too_early_ends_the_node_at_that_frame(
+    user_files: Path, run_dir: Path
+) -> None:
+    """What comes before is processed and published; following the message's advice mends it."""
+    session = videos(user_files, right="short.mp4")
+    depth = "left/render/depth"
+    with Subscriber([depth], endpoint=f"ipc://{run_dir}/sags.ipc") as subscriber:
+        result = sags("run", *session, "source.rate:=5")
+        last = subscriber.latest(depth)
+        while last is not None and last.meta.frame_id < SHORT - 1:
+            last = subscriber.wait(depth, timeout=30, after=last)
+    assert last is not None, "the last good frame never came"
+    assert result.exit_code == 1
+    assert f"short.mp4 ends at frame {SHORT}" in result.stderr and "set source.frames" in result.stderr
+    assert sags("run", *session, f"source.frames:={SHORT}").exit_code == 0
+
+
+def test_a_right_video_that_ends_too_early_cannot_be_measured_to_its_end(
+    user_files: Path, tmp_path: Path
+) -> None:
+    session = videos(user_files, right="short.mp4")
+    file = tmp_path / "out.json"
+    for pace in ("realtime", "step"):
+        command = ["eval", *session, "--hold-out", "0", "--pace", pace, "--json", file]
+        refused(1, *command, said=(f"short.mp4 ends at frame {SHORT}", "set source.frames"))
+        assert not file.exists()
+    result = sags("eval", *session, f"source.frames:={SHORT}", *command[-6:])
+    assert result.exit_code == 0 and json.loads(file.read_text())["processed"] == SHORT
+
+
+def test_lpips_weights_that_are_not_there(user_files: Path) -> None:
+    session = [*videos(user_files), "source.frames:=2", "--pace", "step", "--lpips-weights", "gone.npz"]
+    refused(2, "eval", *session, said=("gone.npz",))

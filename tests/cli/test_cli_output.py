@@ -1,0 +1,159 @@
+"""What a command says and writes: nothing of the user's is lost, tables are whole, JSON is JSON."""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import click
+import pytest
+from command_line import pure_json, refused, sags
+from places import ROOT
+from user_files import videos
+
+from sags_node.cli.main import main
+
+pytestmark = [pytest.mark.live, pytest.mark.usefixtures("run_dir")]
+
+
+# ---- where results go ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("option", ["--json", "--report"])
+def test_a_result_that_cannot_be_kept_is_noticed_before_the_run(user_files: Path, option: str) -> None:
+    target = user_files / "file/inside"
+    refused(1, "eval", "nowhere.yaml", option, target, said=(f"cannot write {user_files / 'file'}",))
+    assert (user_files / "file").read_text() == "mine"
+
+
+def test_a_folder_is_no_json_file_and_a_file_no_folder(user_files: Path) -> None:
+    refused(
+        1,
+        "eval",
+        "nowhere.yaml",
+        "--json",
+        user_files / "empty",
+        said=(f"cannot write {user_files / 'empty'}",),
+    )
+    refused(1, "eval", "nowhere.yaml", "--report", user_files / "file", said=("cannot write",))
+    refused(1, "demo", "--out", user_files / "file", said=("cannot write",))
+    assert not any((user_files / "empty").iterdir()) and (user_files / "file").read_text() == "mine"
+
+
+def test_older_figures_stay_when_the_run_fails(tmp_path: Path) -> None:
+    file = tmp_path / "out.json"
+    file.write_text("older figures")
+    refused(2, "eval", "nowhere.yaml", "--json", file, said=("nowhere.yaml",))
+    assert file.read_text() == "older figures"
+
+
+def test_phantom_overwrites_nothing(tmp_path: Path, user_files: Path) -> None:
+    mine = tmp_path / "full"
+    mine.mkdir()
+    (mine / "mine.txt").write_text("mine")
+    refused(2, "phantom", mine, "seconds:=0.1", said=(str(mine), "not empty", "another folder"))
+    assert [file.name for file in mine.iterdir()] == ["mine.txt"]
+    refused(2, "phantom", user_files / "file", said=(str(user_files / "file"), "exists"))
+    refused(2, "phantom", tmp_path / "new", "secnds:=1", said=("secnds", "did you mean 'seconds'"))
+    refused(2, "phantom", tmp_path / "new", "kind:=v4l2", said=("kind:=v4l2",))
+    assert not (tmp_path / "new").exists()
+
+
+# ---- reports ---------------------------------------------------------------------------------------------
+
+
+def test_calib_check_tells_good_from_bad(user_files: Path) -> None:
+    good = sags("calib", "check", ROOT / "calib/d4d")
+    assert good.exit_code == 0 and "baseline 4.27 mm" in good.stdout and good.stderr == ""
+    bad = sags("calib", "check", user_files / "millimetres", "--json")
+    assert bad.exit_code == 1 and "cannot be used" in bad.stderr
+    assert pure_json(bad.stdout)[-1]["level"] == "error"
+    refused(2, "calib", "check", user_files / "gone", said=("gone/left.yaml",))
+
+
+def test_doctor_finds_what_the_node_needs(user_files: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SAGS_DATA", str(user_files / "gone"))
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        mine = f"tcp://127.0.0.1:{taken.getsockname()[1]}"
+        result = sags("doctor", "--json", f"publish.data:=[{mine}]", "publish.control:=null")
+    checks = {check["name"]: check for check in pure_json(result.stdout)}
+    assert result.exit_code == 0 and checks["numba"]["level"] == "ok"
+    assert checks[mine]["level"] == "warning" and "in use" in checks[mine]["found"]
+    assert (
+        checks["SAGS_DATA"]["level"] == "warning" and str(user_files / "gone") in checks["SAGS_DATA"]["found"]
+    )
+    assert sags("doctor", "publish.data:=[nonsense]").exit_code == 1
+
+
+def test_a_table_for_another_program_is_not_cut(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "40")
+    assert (
+        "rotations, focal lengths and principal points are plausible"
+        in sags("calib", "check", ROOT / "calib/d4d").stdout
+    )
+
+
+def every_command(group: click.Group, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    for name, command in group.commands.items():
+        yield (*path, name)
+        if isinstance(command, click.Group):
+            yield from every_command(command, (*path, name))
+
+
+@pytest.mark.parametrize("path", [(), *every_command(main)], ids=" ".join)
+def test_help_mentions_every_argument_and_option(path: tuple[str, ...]) -> None:
+    command: Any = main
+    for name in path:
+        command = command.commands[name]
+    result = sags(*path, "--help")
+    assert result.exit_code == 0
+    if isinstance(command, click.Group):
+        assert "..." not in result.stdout.split("Commands:")[1], "a summary is cut off"
+    for parameter in command.params:
+        if isinstance(parameter, click.Option):
+            assert parameter.help, f"{parameter.opts} says nothing of itself"
+            assert all(option in result.stdout for option in parameter.opts)
+        else:
+            unwrapped = " ".join(result.stdout.split())
+            assert parameter.make_metavar(click.Context(command)) in unwrapped
+
+
+@pytest.mark.parametrize("pace", ["realtime", "step"])
+def test_eval_prints_nothing_but_json(user_files: Path, pace: str) -> None:
+    session = [*videos(user_files), "source.frames:=4", "--pace", pace, "--json", "-"]
+    assert pure_json(sags("eval", *session).stdout)["settings"]["pace"] == pace
+
+
+def test_run_prints_nothing_but_json(user_files: Path) -> None:
+    result = sags("run", *videos(user_files), "source.frames:=3", "--json")
+    assert result.exit_code == 0 and pure_json(result.stdout)["gaussians"] > 100
+    assert "state" in sags("run", *videos(user_files), "--seconds", "0.3").stdout
+
+
+def test_demo_prints_nothing_but_json(user_files: Path, tmp_path: Path) -> None:
+    """It plays for as long as asked, at the recording's own rate."""
+    result = sags("demo", *videos(user_files), "--seconds", "3.5", "--out", tmp_path / "demo", "--json")
+    assert result.exit_code == 0, result.stderr
+    summary = pure_json(result.stdout)
+    assert summary["frames"] == 35 and summary["overlay"]["frames"] > 0
+    assert {file.name for file in (tmp_path / "demo").iterdir()} >= {"report.html", "overlay.mp4"}
+
+
+def test_torch_and_open3d_stay_out_of_the_start(user_files: Path) -> None:
+    """Together they cost seconds, and nothing but LPIPS, the reference engine and meshes needs them."""
+    session = videos(user_files)
+    commands = [["run", *session, "source.frames:=2"], ["eval", *session, "source.frames:=2"]]
+    code = (
+        f"import sys; from sags_node.cli.main import main\n"
+        f"for command in {commands}: main(command, standalone_mode=False)\n"
+        f"import sags_node.overlay.run, sags_node.topic, sags_node.demo\n"
+        f"print(sorted({{'torch', 'open3d', 'onnxruntime'}} & set(sys.modules)))"
+    )
+    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert process.stdout.splitlines()[-1] == "[]"

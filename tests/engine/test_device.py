@@ -1,0 +1,187 @@
+"""Which device a launch gets, and what is said of a GPU that cannot be used."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from click.testing import CliRunner
+
+pytest.importorskip("triton", reason="Triton comes with torch's CUDA builds, or by `pip install triton`")
+
+from sags_node import doctor
+from sags_node.cli.main import main
+from sags_node.config import LaunchConfig, MappingConfig
+from sags_node.engine import device as devices
+from sags_node.engine.cuda import probe
+from sags_node.engine.cuda.rasterizer import CudaRasterizer
+from sags_node.engine.device import choose_device, find_gpu
+from sags_node.errors import UsageError
+from sags_node.launch_file import load_launch
+from sags_node.mapping import devices as mapping_devices
+
+# kernels divide by a coverage of zero and select afterwards; a GPU says nothing of it
+pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
+
+
+@pytest.fixture
+def machine(monkeypatch: pytest.MonkeyPatch) -> Iterator[pytest.MonkeyPatch]:
+    """A machine with a GPU, as far as can be seen without torch, and kernels that are compiled."""
+    monkeypatch.delenv("TRITON_INTERPRET", raising=False)
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    monkeypatch.setattr(devices, "has_gpu", lambda: True)
+    find_gpu.cache_clear()
+    yield monkeypatch
+    find_gpu.cache_clear()
+
+
+def without_hardware(machine: pytest.MonkeyPatch) -> None:
+    machine.setattr(devices, "has_gpu", lambda: False)
+
+
+def hidden(machine: pytest.MonkeyPatch) -> None:
+    machine.setenv("CUDA_VISIBLE_DEVICES", "-1")
+
+
+def without_triton(machine: pytest.MonkeyPatch) -> None:
+    machine.setattr("importlib.util.find_spec", lambda name: None if name == "triton" else name)
+
+
+def without_cuda_build(machine: pytest.MonkeyPatch) -> None:
+    machine.setattr(torch.version, "cuda", None)
+
+
+def without_driver(machine: pytest.MonkeyPatch) -> None:
+    machine.setattr(torch.version, "cuda", "12.8")
+    machine.setattr(torch.cuda, "is_available", lambda: False)
+
+
+def usable(machine: pytest.MonkeyPatch) -> None:
+    machine.setattr(torch.version, "cuda", "12.8")
+    machine.setattr(torch.cuda, "is_available", lambda: True)
+    machine.setattr(torch.cuda, "get_device_name", lambda: "NVIDIA H100")
+
+
+def without_compiler(machine: pytest.MonkeyPatch) -> None:
+    def fails() -> float:
+        raise RuntimeError("Failed to find C compiler. Please specify via CC environment variable.\nmore")
+
+    usable(machine)
+    machine.setattr(probe, "_largest_difference", fails)
+
+
+def drawing_wrongly(machine: pytest.MonkeyPatch) -> None:
+    usable(machine)
+    machine.setattr(probe, "_largest_difference", lambda: 0.25)
+
+
+def drawing_nothing(machine: pytest.MonkeyPatch) -> None:
+    usable(machine)
+    machine.setattr(probe, "_largest_difference", lambda: float("nan"))
+
+
+UNUSABLE = [
+    (without_hardware, "no NVIDIA GPU", "nvidia-smi"),
+    (hidden, "CUDA_VISIBLE_DEVICES hides every GPU", "unset it"),
+    (without_triton, "triton is not installed", "pip install triton"),
+    (without_cuda_build, "build without CUDA", "pip install --force-reinstall torch"),
+    (without_driver, "finds no GPU that its driver can use", "newer driver"),
+    (without_compiler, "Failed to find C compiler", "gcc"),
+    (drawing_wrongly, "apart by 0.25", "report this"),
+    (drawing_nothing, "apart by nan", "report this"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("lacks", "reason", "mend"), UNUSABLE)
+def test_a_gpu_that_cannot_be_used_is_explained(
+    lacks: Callable[[pytest.MonkeyPatch], None], reason: str, mend: str, machine: pytest.MonkeyPatch
+) -> None:
+    """auto: the CPU, and why; cuda: an error that says how to mend it; doctor: the same."""
+    lacks(machine)
+    found = choose_device("auto")
+    assert found.kind == "cpu" and reason in found.reason
+    with pytest.raises(UsageError) as raised:
+        choose_device("cuda")
+    said = str(raised.value)
+    assert reason in said and mend in said and "\n" not in said and "device:=cpu" in said
+    check = doctor._gpu(LaunchConfig(device="cuda"))
+    assert check.level == "error" and reason in check.found and mend in check.mend
+
+
+def test_a_missing_gpu_ends_the_command_with_one_message(
+    machine: pytest.MonkeyPatch, phantom_session: Path
+) -> None:
+    without_hardware(machine)
+    for command in (["run"], ["eval", "--pace", "step"], ["fit"]):
+        result = CliRunner().invoke(main, [*command, str(phantom_session), "device:=cuda"])
+        assert result.exit_code == 2 and result.stdout == ""
+        assert result.stderr.startswith("error: device: cuda cannot be used: this machine has no NVIDIA GPU")
+
+
+def test_a_usable_gpu_is_chosen_and_gets_more_gaussians(machine: pytest.MonkeyPatch) -> None:
+    usable(machine)
+    machine.setattr(probe, "_largest_difference", lambda: 1e-5)
+    assert choose_device("auto").name == choose_device("cuda").name == "NVIDIA H100"
+    assert choose_device("cpu").kind == "cpu"
+    assert doctor._gpu(LaunchConfig()).level == "ok" and "H100" in doctor._gpu(LaunchConfig()).found
+    cpu = mapping_devices.affordable(LaunchConfig(device="cpu"), 1280, 1024)
+    gpu = mapping_devices.affordable(LaunchConfig(), 1280, 1024)
+    assert gpu > 2 * cpu
+    fixed = LaunchConfig(mapping=MappingConfig(max_gaussians=5000))
+    assert mapping_devices.affordable(fixed, 640, 512) == 5000
+
+
+def test_the_gpu_is_tried_out_once(machine: pytest.MonkeyPatch) -> None:
+    tried = []
+    usable(machine)
+    machine.setattr(probe, "_largest_difference", lambda: tried.append(1) or 1e-5)
+    for _ in range(3):
+        choose_device("auto")
+    assert len(tried) == 1
+
+
+def test_the_probe_compares_a_drawing_and_its_gradients(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert probe._largest_difference() < 0.1 * probe.TOLERANCE
+    real = CudaRasterizer.pull_back
+
+    def wrong(*args: Any, **names: Any) -> Any:
+        found = real(*args, **names)
+        return replace(found, means=found.means * 1.01)
+
+    monkeypatch.setattr(CudaRasterizer, "pull_back", wrong)
+    assert probe._largest_difference() > probe.TOLERANCE
+
+
+def test_machines_without_a_gpu_never_wait_for_torch() -> None:
+    """`auto` looks for the hardware first, and the frame path needs no torch."""
+    code = """
+import sys
+from sags_node.engine import device
+device.has_gpu = lambda: False
+from sags_node.config import LaunchConfig
+from sags_node.warm_up import warm_up
+warm_up(LaunchConfig())
+assert "sags_node.mapping.mapper" in sys.modules
+print([name for name in ("torch", "triton") if name in sys.modules])
+"""
+    environment = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "[]\n"
+
+
+@pytest.mark.parametrize(
+    ("override", "said"), [("device:=gpu", "device"), ("engine.backend:=reference", "choose one of them")]
+)
+def test_device_is_a_launch_key(override: str, said: str) -> None:
+    assert load_launch().device == "auto"
+    with pytest.raises(UsageError, match=said):
+        load_launch(None, ["device:=cuda", override])

@@ -1,0 +1,130 @@
+"""Which tiles are worst, against numpy, and what may stand in the pictures."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from places import SESSION
+
+from sags_node.engine.losses.tissue import COVERED
+from sags_node.engine.rasterizer.rasterize import TILE_HEIGHT, TILE_WIDTH
+from sags_node.mapping import focus
+from sags_node.mapping.budget import StepBudget
+from sags_node.mapping.focus import EVERY, with_neighbours, worst_tiles
+from sags_node.mapping.ladder import Rung
+from sags_node.mapping.split import SPLIT
+from sags_node.pipeline import Pipeline
+from sags_node.session import open_session
+from sags_node.types import F32, Bool
+
+HEIGHT, WIDTH = 3 * TILE_HEIGHT + 7, 5 * TILE_WIDTH + 3  # no tile divides it
+SHAPE = -(-HEIGHT // TILE_HEIGHT), -(-WIDTH // TILE_WIDTH)
+
+
+@pytest.fixture
+def scene() -> tuple[F32, F32, Bool]:
+    """Planes that show the picture well in some tiles and badly in others, with holes and instruments."""
+    rng = np.random.default_rng(0)
+    image = rng.uniform(0.1, 0.9, (HEIGHT, WIDTH, 3)).astype(np.float32)
+    planes = np.empty((5, HEIGHT, WIDTH), np.float32)
+    planes[4] = rng.uniform(0, 1, (HEIGHT, WIDTH))
+    planes[3] = 0.08 * planes[4]
+    badness = np.kron(rng.uniform(0, 0.3, SHAPE), np.ones((TILE_HEIGHT, TILE_WIDTH)))[:HEIGHT, :WIDTH]
+    shown = np.moveaxis(image, -1, 0) + badness * rng.normal(0, 1, (3, HEIGHT, WIDTH))
+    planes[:3] = shown * planes[4]
+    return planes, image, rng.random((HEIGHT, WIDTH)) > 0.3
+
+
+def numpy_sums(planes: F32, image: F32, tissue: Bool) -> F32:
+    """Squared residuals of every second pixel, added up by tile."""
+    with np.errstate(all="ignore"):
+        squares = np.square(planes[:3] / planes[4] - np.moveaxis(image, -1, 0))
+    counts = tissue & (planes[4] > COVERED) & (squares < 1)
+    picture = np.where(counts, squares, 0).sum(0)
+    sums = np.zeros(SHAPE, np.float32)
+    for y in range(0, HEIGHT, EVERY):
+        for x in range(0, WIDTH, EVERY):
+            sums[y // TILE_HEIGHT, x // TILE_WIDTH] += picture[y, x]
+    return sums
+
+
+def test_the_kernel_its_source_and_numpy_agree(scene: tuple[F32, F32, Bool]) -> None:
+    compiled, source = np.zeros((2, *SHAPE), np.float32)
+    focus._sum_residuals(*scene, compiled)
+    focus._sum_residuals.py_func(*scene, source)
+    assert compiled.min() >= 0 and compiled.max() > 10
+    assert np.allclose(compiled, source, rtol=1e-5)
+    assert np.allclose(compiled, numpy_sums(*scene), rtol=1e-4)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.15, 0.5, 1.0])
+def test_the_worst_are_chosen_and_no_more_than_asked_for(scene: tuple[F32, F32, Bool], share: float) -> None:
+    tiles = worst_tiles(*scene, share)
+    assert tiles.shape == (1, *SHAPE) and tiles.dtype == np.bool_
+    assert tiles.sum() == max(1, round(share * tiles.size))
+    sums = numpy_sums(*scene)
+    assert sums[tiles[0]].min() >= sums[~tiles[0]].max(initial=0.0)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e30])
+@pytest.mark.parametrize("where", ["colour", "image", "everywhere"])
+def test_what_is_not_finite_chooses_no_tile(scene: tuple[F32, F32, Bool], where: str, value: float) -> None:
+    """A damaged tile is not taken for the worst, and the worst are still found."""
+    planes, image, tissue = scene
+    tissue[:] = True
+    planes[:3] = np.moveaxis(image, -1, 0) * planes[4]
+    bad, damaged = np.s_[TILE_HEIGHT : 2 * TILE_HEIGHT, : 2 * TILE_WIDTH], np.s_[:TILE_HEIGHT, -TILE_WIDTH:]
+    planes[0][bad] += 0.3 * planes[4][bad]
+    if where != "image":
+        planes[:3][:, *damaged] = value
+    if where != "colour":
+        image[damaged] = value
+    if where == "everywhere":
+        planes[4][damaged] = value
+    tiles = worst_tiles(planes, image, tissue, 2 / (SHAPE[0] * SHAPE[1]))
+    assert np.argwhere(tiles[0]).tolist() == [[1, 0], [1, 1]]
+
+
+def test_a_picture_without_tissue_still_names_tiles(scene: tuple[F32, F32, Bool]) -> None:
+    planes, image, _ = scene
+    assert worst_tiles(planes, image, np.zeros((HEIGHT, WIDTH), bool), 0.2).sum() == round(
+        0.2 * SHAPE[0] * SHAPE[1]
+    )
+
+
+@pytest.mark.parametrize("place", [(3, 4), (0, 0), (6, 8), (0, 8)])
+def test_neighbours_are_all_around_and_stay_inside(place: tuple[int, int]) -> None:
+    tiles = np.zeros((1, 7, 9), bool)
+    tiles[0][place] = True
+    grown = with_neighbours(tiles)
+    y, x = np.indices((7, 9))
+    touching = np.maximum(abs(y - place[0]), abs(x - place[1])) <= 1
+    assert tiles.sum() == 1 and grown.shape == tiles.shape and grown.dtype == np.bool_
+    assert grown[0][touching].all()
+    reach = np.argwhere(grown[0])
+    assert (reach.max(0) - reach.min(0) <= [2, 4]).all()  # tiles are twice as high as wide
+
+
+def test_in_a_hurry_the_first_step_leaves_alone_what_fits_best() -> None:
+    """The rest of the model keeps its colours. How much a Gaussian shows beyond the part is not told by a
+    step on it: who stands on the edge would be given up for showing little."""
+    session = open_session(SESSION, ["source.pace:=step", "mapping.max_gaussians:=4000"])
+    pipeline, budget = Pipeline(session.config, session.rig), StepBudget(1)
+    with session.source as source:
+        first, second, third = (frame for frame, _ in zip(source, range(3), strict=False))
+    pipeline.process(first, budget)
+    model = pipeline.mapper.model
+
+    def rows() -> dict[int, tuple[F32, float]]:
+        found = zip(model.ids, model.colors.copy(), model.contribution, strict=True)
+        return {int(i): (color, float(shown)) for i, color, shown in found}
+
+    before = rows()
+    pipeline.process(second, StepBudget(1, Rung(4000, step=0.4)))
+    hurried = rows()
+    common = before.keys() & hurried.keys()
+    assert np.mean([before[i][1] != hurried[i][1] for i in common]) <= SPLIT  # what is split shows less
+    assert 0.1 < np.mean([np.array_equal(before[i][0], hurried[i][0]) for i in common]) < 0.6
+    pipeline.process(third, budget)
+    whole = rows()
+    assert np.mean([hurried[i][1] == whole[i][1] for i in hurried.keys() & whole.keys()]) < 0.01

@@ -1,0 +1,176 @@
+"""A bad picture is not a new scene: the model waits, says why, and is the same afterwards."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from places import SESSION
+
+from sags_node.confidence import SURE
+from sags_node.findings import by_code
+from sags_node.mapping.budget import StepBudget
+from sags_node.pipeline import NOTICED_LATE, Pipeline
+from sags_node.session import Session, open_session
+from sags_node.types import U8, FrameResult, StereoFrame
+from sags_node.vision.match_watch import MatchWatch
+
+FIRST, COUNT, AFTER = 8, 8, 11  # frames, at 10 Hz: before, with the fault, and until the tenth after it
+WITHIN = 5  # frames: half a second
+
+
+@pytest.fixture(scope="module")
+def session() -> Session:
+    return open_session(SESSION, ["source.pace:=step", "mapping.max_gaussians:=4000"])
+
+
+@pytest.fixture(scope="module")
+def frames(session: Session) -> list[StereoFrame]:
+    with session.source as source:
+        return [frame for frame, _ in zip(source, range(FIRST + COUNT + AFTER), strict=False)]
+
+
+def both(frame: StereoFrame, change: Callable[[U8], np.ndarray]) -> StereoFrame:
+    assert frame.right is not None
+    left, right = (np.clip(change(eye), 0, 255).astype(np.uint8) for eye in (frame.left, frame.right))
+    return replace(frame, left=left, right=right)
+
+
+def bleeding(picture: U8) -> np.ndarray:
+    covered = picture.astype(np.float32)
+    half = len(picture) // 2
+    covered[half:] = 0.05 * covered[half:] + 0.95 * np.array([95, 8, 8], np.float32)
+    return covered
+
+
+def black(picture: U8 | None) -> U8:
+    assert picture is not None
+    return np.zeros_like(picture)
+
+
+Spoil = Callable[[StereoFrame, int], StereoFrame]
+FAULTS: dict[str, tuple[Spoil, str]] = {
+    "right_eye_black": (lambda f, i: replace(f, right=black(f.right)), "depth"),
+    "left_eye_black": (lambda f, i: replace(f, left=black(f.left)), "picture"),
+    "eyes_exchanged": (lambda f, i: replace(f, left=f.right, right=f.left), "picture"),
+    "eyes_equal": (lambda f, i: replace(f, right=f.left), "depth"),
+    "picture_unknown_scene": (lambda f, i: both(f, lambda p: 255 - p[::-1]), "picture"),
+    "picture_bright": (lambda f, i: both(f, lambda p: p * 4.0), "picture"),
+    "picture_smoke": (lambda f, i: both(f, lambda p: p * 0.3 + 120.0), ""),
+    "picture_covered": (lambda f, i: both(f, bleeding), ""),
+    "": (lambda f, i: both(f, lambda p: p * (3.0 if i % 2 else 1 / 3)), ""),  # flicker is no event
+}
+
+
+def play(session: Session, frames: list[StereoFrame]) -> tuple[list[FrameResult], list[set[str]], Pipeline]:
+    pipeline = Pipeline(session.config, session.rig)
+    results, codes = [], []
+    for frame in frames:
+        results.append(pipeline.process(frame, StepBudget(2)))
+        codes.append(set(by_code(pipeline.warnings)))
+    return results, codes, pipeline
+
+
+def psnr(result: FrameResult, clean: FrameResult) -> float:
+    error = (result.views["left"].rgb - clean.observation.image)[clean.observation.tissue]
+    return float(-10 * np.log10(np.mean(np.square(error))))
+
+
+@pytest.fixture(scope="module")
+def clean(session: Session, frames: list[StereoFrame]) -> list[FrameResult]:
+    results, codes, pipeline = play(session, frames)
+    assert set().union(*codes) == set() and pipeline.mapper.restarts == 0
+    assert not any(result.held or result.skipped for result in results)
+    return results
+
+
+@pytest.mark.parametrize("code", FAULTS)
+def test_a_fault_is_said_and_leaves_no_trace(
+    code: str, session: Session, frames: list[StereoFrame], clean: list[FrameResult]
+) -> None:
+    spoil, what = FAULTS[code]
+    during = range(FIRST, FIRST + COUNT)
+    given = [spoil(frame, i) if i in during else frame for i, frame in enumerate(frames)]
+    results, codes, pipeline = play(session, given)
+    assert pipeline.mapper.restarts == 0
+    if code:
+        assert any(code in codes[i] for i in range(FIRST, FIRST + WITHIN))
+    assert not set().union(*codes[:FIRST], *codes[during.stop + WITHIN :])
+    if what:
+        assert all(what in results[i].skipped for i in during)
+        assert all(bool(results[i].held) == (what == "picture") for i in during)
+    for i in during:  # of a frame that is held nothing is measured, and nothing old is said to be
+        assert not results[i].skipped.get(what, "") or not results[i].observation.depth.any()
+    kept = np.isin(clean[FIRST - 1].snapshot.gaussians.ids, results[-1].snapshot.gaussians.ids)
+    assert kept.mean() > 0.8
+    assert psnr(results[-1], clean[-1]) > psnr(clean[-1], clean[-1]) - 1.0
+
+
+def test_what_nobody_watches_is_less_sure(session: Session, frames: list[StereoFrame]) -> None:
+    """Depth and anchors of a model that waits: tissue may be pulled meanwhile. A second later at most
+    a tenth of what is measured is in doubt."""
+    pipeline = Pipeline(session.config, session.rig)
+    before = [pipeline.process(frame, StepBudget(2)) for frame in frames[:FIRST]][-1]
+    pipeline.anchors.add_pixel(160, 100, before.observation, before.snapshot, before.views["left"])
+    sure, errors, held = [], [], []
+    for frame in frames[FIRST : FIRST + COUNT]:
+        held.append(pipeline.process(replace(frame, left=black(frame.left)), StepBudget(2)))
+        view, gaussians = held[-1].views["left"], held[-1].snapshot.gaussians
+        assert view.confidence is not None and gaussians.depth_errors is not None
+        assert ((view.depth > 0) == (view.confidence > 0)).all()
+        sure.append(float((view.confidence >= SURE).mean()))
+        errors.append(float(np.median(gaussians.depth_errors)))
+    assert all(result.held for result in held)
+    assert np.all(np.diff(errors) > 0)
+    assert sure[-1] == 0 and sure[0] > 0  # 8 frames of 100 ms at 20 mm/s: 16 mm
+    assert held[-1].anchors.confidence[0] < SURE
+    after = [pipeline.process(frame, StepBudget(2)) for frame in frames[FIRST + COUNT :]][-1]
+    shares = []
+    for result in (before, after):
+        confidence, measured = result.views["left"].confidence, result.observation.depth > 0
+        assert confidence is not None and measured.mean() > 0.3
+        shares.append(float((confidence[measured] >= SURE).mean()))
+    assert shares[1] > 0.9 * shares[0]
+
+
+def test_blood_is_seen_where_the_scene_has_its_colour_already(
+    session: Session, frames: list[StereoFrame]
+) -> None:
+    """It rises slowly, and a corner of the picture was as red before."""
+
+    def corner(picture: U8) -> U8:
+        marked = picture.copy()
+        marked[: len(picture) // 6, -picture.shape[1] // 6 :] = (95, 8, 8)
+        return marked
+
+    def rising(picture: U8, share: float) -> U8:
+        covered = picture.copy()
+        covered[round(len(picture) * (1 - share)) :] = (95, 8, 8)
+        return covered
+
+    given = [both(frame, corner) for frame in frames[: FIRST + COUNT]]
+    for i in range(FIRST, FIRST + COUNT):
+        given[i] = both(given[i], lambda picture, i=i: rising(picture, 0.05 * (i - FIRST + 1)))
+    _, codes, pipeline = play(session, given)
+    assert not set().union(*codes[:FIRST])
+    assert any("picture_covered" in code for code in codes[FIRST : FIRST + WITHIN])
+    assert pipeline.mapper.restarts == 0
+
+
+def test_what_was_measured_before_a_late_eye_was_noticed_is_doubted_once(
+    session: Session, frames: list[StereoFrame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pipeline = Pipeline(session.config, session.rig)
+    errors = []
+    for i, frame in enumerate(frames[: FIRST + 4]):
+        if i == FIRST:
+            monkeypatch.setattr(MatchWatch, "__call__", lambda *_: "one eye is late")
+        result = pipeline.process(frame, StepBudget(2))
+        assert bool(result.skipped.get("depth")) == (i >= FIRST)
+        assert result.snapshot.gaussians.depth_errors is not None
+        errors.append(float(np.median(result.snapshot.gaussians.depth_errors)))
+    steps = np.diff(errors[FIRST - 1 :])
+    assert steps[0] >= NOTICED_LATE
+    assert (steps[1:] < NOTICED_LATE / 3).all()  # 10 Hz: what tissue moves by unseen

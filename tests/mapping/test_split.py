@@ -1,0 +1,187 @@
+"""Splitting: identity stays, numbers stay, what is hidden stays, and the picture gets better."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from places import SESSION
+
+from sags_node.evaluation.metrics import psnr
+from sags_node.geometry import project, unproject
+from sags_node.mapping import densify, initialise, mapper, split
+from sags_node.mapping.budget import StepBudget
+from sags_node.mapping.split import split_worst
+from sags_node.model.gaussians import GaussianModel
+from sags_node.pipeline import Pipeline
+from sags_node.session import open_session
+from sags_node.types import F32, F64, Bool, Camera, FrameResult, Observation, RenderedView
+
+HEIGHT, WIDTH, DEPTH = 60, 80, 0.08
+CAMERA = Camera(WIDTH, HEIGHT, np.array([[90.0, 0, 40], [0, 90.0, 30], [0, 0, 1]]), np.eye(4))
+Played = Callable[[int, bool], tuple[F64, list[FrameResult]]]
+COUNT, LARGE = 400, 7  # Gaussians, and the row of a large one in the middle of the picture
+
+
+class Scene:
+    """A grid of small Gaussians on a plane, every tenth of which hardly shows, and a large one, turned, where
+    the picture is wrong."""
+
+    def __init__(self) -> None:
+        grid = np.stack(np.meshgrid(np.arange(2, WIDTH, 4), np.arange(2, HEIGHT, 3)), -1).reshape(-1, 2)
+        pixels = grid[:COUNT].astype(np.float32)
+        pixels[LARGE] = 40, 30
+        means = unproject(CAMERA, pixels, np.full(COUNT, DEPTH, np.float32)).astype(np.float32)
+        scales = np.full((COUNT, 3), 1e-3, np.float32)
+        scales[LARGE] = 1e-3, 5e-3, 1e-3
+        self.model = GaussianModel(COUNT + 50)
+        self.model.append(means, scales, np.full((COUNT, 3), 0.5, np.float32), 0.9)
+        self.model.quats[LARGE] = np.cos(np.pi / 8), 0, 0, np.sin(np.pi / 8)  # 45 degrees around z
+        self.model.contribution[:] = 10.0
+        self.model.contribution[::10] = 0.1
+        self.model.contribution[LARGE] = 60.0
+        self.model.rest[:] = means + np.float32(1e-3)
+        self.image = np.full((HEIGHT, WIDTH, 3), 0.5, np.float32)
+        self.drawn = self.image.copy()
+        self.drawn[20:41, 30:51] += 0.1
+        self.tissue: Bool = np.ones((HEIGHT, WIDTH), np.bool_)
+        self.depth: F32 = np.full((HEIGHT, WIDTH), DEPTH, np.float32)
+
+    def split(self) -> int:
+        alpha = np.ones((HEIGHT, WIDTH), np.float32)
+        gray = np.zeros((HEIGHT, WIDTH), np.uint8)
+        observation = Observation(0, 0, CAMERA, self.image, gray, self.tissue, self.depth, alpha)
+        return split_worst(
+            self.model, observation, RenderedView(0, 0, CAMERA, self.drawn, self.depth, alpha), 0
+        )
+
+
+@pytest.fixture
+def scene() -> Scene:
+    return Scene()
+
+
+def test_the_parts_cover_what_the_whole_did_and_the_middle_one_keeps_its_identity(scene: Scene) -> None:
+    model = scene.model
+    means, ids, rest = model.means.copy(), model.ids.copy(), model.rest.copy()
+    assert scene.split() == int(split.SPLIT * COUNT) == 2
+    assert model.count == COUNT and len(np.unique(model.ids)) == COUNT
+    assert model.ids[LARGE] == ids[LARGE] and np.array_equal(model.means[LARGE], means[LARGE])
+    assert model.scales[LARGE] == pytest.approx([1e-3, split.PART_SIZE * 5e-3, 1e-3], rel=1e-5)
+    outer = np.flatnonzero((model.ids >= COUNT) & np.isclose(model.scales[:, 1], model.scales[LARGE, 1]))
+    assert len(outer) == 2 and (outer % 10 == 0).all()  # in the rows of what hardly showed
+    longest = np.array([-np.sin(np.pi / 4), np.cos(np.pi / 4), 0])  # the y axis, turned by 45 degrees
+    away = (model.means[outer] - means[LARGE]) @ longest
+    assert sorted(away) == pytest.approx([-split.APART * 5e-3, split.APART * 5e-3], rel=1e-4)
+    assert model.means[outer].mean(0) == pytest.approx(means[LARGE], abs=1e-7)
+    assert model.rest[outer].mean(0) == pytest.approx(rest[LARGE], abs=1e-7)
+    assert np.allclose(np.exp(model.log_scales), model.scales, rtol=1e-5)
+    assert model.contribution[[LARGE, *outer]].sum() == pytest.approx(60.0)
+
+
+def test_who_shows_is_not_given_up(scene: Scene) -> None:
+    before = scene.model.ids.copy()
+    for _ in range(200):
+        scene.split()
+    gone = np.setdiff1d(before, scene.model.ids)
+    assert 0 < len(gone) and (gone % 10 == 0).all()
+
+
+@pytest.mark.parametrize("why", ["instrument", "other tissue", "out of view", "behind", "new"])
+def test_what_does_not_show_for_a_reason_is_not_given_up(scene: Scene, why: str) -> None:
+    model = scene.model
+    if why == "instrument":
+        pixels = project(CAMERA, model.means[::10])[0].round().astype(int)
+        scene.tissue[pixels[:, 1], pixels[:, 0]] = False
+    elif why == "other tissue":
+        model.means[::10] *= np.float32(1.2)  # along the ray
+    elif why == "out of view":
+        model.means[::10, 0] += 1.0
+    elif why == "behind":
+        model.means[::10] *= -1
+    else:
+        model.contribution[::10] = np.inf
+    assert scene.split() == 0
+
+
+def test_where_the_picture_is_right_nothing_is_split(scene: Scene) -> None:
+    scene.drawn[:] = scene.image
+    assert scene.split() == 0
+
+
+def test_a_model_of_which_nothing_is_known_yet_is_left_alone(scene: Scene) -> None:
+    scene.model.contribution[:] = np.inf
+    assert scene.split() == 0
+    scene.model.clear()
+    assert scene.split() == 0
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e30])
+@pytest.mark.parametrize("name", ["means", "image", "drawn"])
+def test_damage_is_neither_split_nor_spread(scene: Scene, name: str, value: float) -> None:
+    if name == "means":
+        scene.model.means[LARGE] = value
+    else:
+        getattr(scene, name)[30, 40] = value
+    scene.split()
+    assert scene.model.scales[LARGE, 1] == pytest.approx(5e-3)
+    others = np.arange(COUNT) != LARGE
+    assert np.isfinite(scene.model.means[others]).all()
+
+
+def count(results: list[FrameResult]) -> int:
+    """Gaussians at last."""
+    return len(results[-1].snapshot.gaussians)
+
+
+@pytest.fixture
+def played(monkeypatch: pytest.MonkeyPatch) -> Played:
+    """Plays a recording with so many Gaussians: PSNR* and all else, frame by frame."""
+
+    def play(most: int, splits: bool) -> tuple[F64, list[FrameResult]]:
+        monkeypatch.setattr(mapper, "split_worst", split_worst if splits else lambda *args: 0)
+        session = open_session(SESSION, ["source.pace:=step", f"mapping.max_gaussians:={most}"])
+        pipeline, budget = Pipeline(session.config, session.rig), StepBudget(1)
+        errors, results = [], []
+        with session.source as source:
+            for frame in source:
+                result = pipeline.process(frame, budget)
+                view, seen = result.views["left"], result.observation
+                errors.append(psnr(view.rgb, seen.image, seen.tissue))
+                results.append(result)
+        return np.array(errors), results
+
+    return play
+
+
+def test_the_same_number_of_gaussians_shows_more(played: Played, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mapper, "GROWN", 0.0)  # else splitting adds some as well
+    (errors, results), (plain, others) = played(20_000, True), played(20_000, False)
+    assert errors[5:].mean() > plain[5:].mean() + 0.15
+    assert count(results) < 1.02 * count(others)
+
+
+def test_a_model_grows_by_splitting_to_what_it_may_have(
+    played: Played, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As it does when the machine turns out to afford more: no hole asks for Gaussians then."""
+    monkeypatch.setattr(initialise, "INITIAL_SHARE", 0.2)
+    (errors, results), (plain, others) = played(10_000, True), played(10_000, False)
+    assert mapper.GROWN * 10_000 - 2 <= count(results) <= 10_000  # splits stop there; what appears may go on
+    assert (1 + 2 * split.GROWTH) ** len(errors) * count(others) > count(
+        results
+    )  # two more for each that is split
+    assert errors[-5:].mean() > plain[-5:].mean() + 0.2
+
+
+def test_a_full_model_fills_what_is_uncovered(played: Played) -> None:
+    """When an instrument leaves, new Gaussians take the place of those that hardly show; and what splitting
+    brought before is not lost by it."""
+    (errors, results), (plain, _) = played(2500, True), played(2500, False)
+    earlier, last = results[-6], results[-1]
+    assert count(results) == 2500
+    uncovered = last.observation.tissue & ~earlier.observation.tissue
+    holes = last.views["left"].alpha[uncovered] < densify.HOLE_ALPHA
+    assert np.count_nonzero(uncovered) > 1000 and holes.mean() < 0.1
+    assert errors[5:].mean() > plain[5:].mean() - 0.1

@@ -1,0 +1,171 @@
+"""The C++ example, written from docs/wire.md alone: it sees what the Python subscriber sees."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import msgpack
+import pytest
+import zmq
+from places import ROOT
+from running_node import RunningNode
+from synthetic import plane_result
+
+from sags_node.messaging import cdr, content
+from sags_node.messaging.control import ControlClient
+from sags_node.messaging.received import ReceivedImage, TopicName
+from sags_node.messaging.subscriber import Subscriber
+from sags_node.messaging.wire import Message, Meta, encode
+from sags_node.types import FrameResult
+
+pytestmark = pytest.mark.live
+
+SOURCE = ROOT / "examples/cpp"
+HEADERS = "#include <zmq_addon.hpp>\n#include <msgpack.hpp>\n"
+IMAGE = TopicName("left/render/image", ReceivedImage)
+DEPTH = TopicName("left/render/depth", ReceivedImage)
+LINE = re.compile(
+    r"stamp_ns=(\d+) age_ms=(-?\d+) shape=(\d+)x(\d+) depth_mm=(\S+) rgba=(\d+),(\d+),(\d+),(\d+)\n"
+)
+
+
+@pytest.fixture(scope="module")
+def read_depth(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The program, freshly built."""
+    missing = [tool for tool in ("g++", "cmake", "pkg-config") if shutil.which(tool) is None]
+    if missing:
+        pytest.skip(f"no C++ example without {', '.join(missing)}")
+    compiler = ["g++", "-std=c++17", "-DMSGPACK_NO_BOOST", "-fsyntax-only", "-x", "c++", "-"]
+    if subprocess.run(compiler, input=HEADERS, text=True, check=False, capture_output=True).returncode:
+        pytest.skip("no C++ example without the Debian packages cppzmq-dev and libmsgpack-cxx-dev")
+    folder = tmp_path_factory.mktemp("cpp")
+    for command in (
+        ["cmake", "-S", SOURCE, "-B", folder, "-DCMAKE_CXX_FLAGS=-Werror"],
+        ["cmake", "--build", folder],
+    ):
+        built = subprocess.run(command, check=False, capture_output=True, text=True)
+        assert built.returncode == 0, built.stdout + built.stderr
+    return folder / "read_depth"
+
+
+@contextmanager
+def running(*command: str | Path) -> Iterator[subprocess.Popen[str]]:
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+@pytest.fixture(scope="module")
+def node(phantom_session: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningNode]:
+    one = RunningNode(phantom_session, tmp_path_factory.mktemp("node"))
+    yield one
+    one.stop()
+
+
+def test_it_shows_what_the_python_subscriber_shows(read_depth: Path, node: RunningNode) -> None:
+    seen: dict[int, tuple[ReceivedImage, ReceivedImage]] = {}
+    with Subscriber([IMAGE, DEPTH], run_dir=node.run_dir) as subscriber:
+        depth = subscriber.wait(DEPTH, 30)
+        with running(read_depth, node.data, "10") as process:
+            while process.poll() is None and depth is not None:
+                frame = subscriber.aligned([IMAGE, DEPTH], depth.stamp_ns, timeout=1)
+                if frame is not None:
+                    seen[depth.stamp_ns] = frame[IMAGE], frame[DEPTH]
+                depth = subscriber.wait(DEPTH, 30, after=depth)
+            assert process.wait(30) == 0
+            said, complaints = process.communicate()
+    assert complaints == ""
+    shown = LINE.findall(said)
+    assert len(shown) == 10
+    stamps = [int(row[0]) for row in shown]
+    assert stamps == sorted(set(stamps))
+    both = [row for row in shown if int(row[0]) in seen]
+    assert len(both) >= 5
+    for stamp, age_ms, height, width, depth_mm, *rgba in both:
+        image, depth = seen[int(stamp)]
+        assert (int(height), int(width)) == depth.array.shape == (256, 320)
+        assert float(depth_mm) == pytest.approx(1000 * depth.array[128, 160], abs=1e-3)
+        assert [int(channel) for channel in rgba] == image.array[128, 160].tolist()
+        assert 0 <= int(age_ms) < 2000
+
+
+def test_it_says_stale_and_shows_nothing_while_no_frames_come(read_depth: Path, node: RunningNode) -> None:
+    with (
+        ControlClient(run_dir=node.run_dir) as control,
+        running(read_depth, node.data) as process,
+    ):
+        assert process.stdout is not None
+        while not LINE.match(process.stdout.readline()):
+            assert process.poll() is None
+        control.request("pause")
+        try:
+            while not (line := process.stdout.readline()).startswith("stale: too old"):
+                assert LINE.match(line)  # what was fresh still
+            paused = time.time_ns()
+        finally:
+            control.request("resume")
+        after = LINE.match(process.stdout.readline())
+        while after is None:  # a little late at first, perhaps
+            after = LINE.match(process.stdout.readline())
+        assert int(after[1]) > paused - 1_000_000_000
+
+
+def test_hostile_messages_are_left_out(read_depth: Path) -> None:
+    result = plane_result()
+    depth = result.views["left"].depth.copy()
+    depth[32, 48] = 0  # the centre is unknown
+    result = replace(result, views={"left": replace(result.views["left"], depth=depth)})
+    context = zmq.Context()
+    socket = context.socket(zmq.XPUB)
+    port = socket.bind_to_random_port("tcp://127.0.0.1")
+    try:
+        with running(read_depth, f"tcp://127.0.0.1:{port}", "1") as process:
+            for _ in range(2):
+                assert socket.poll(5000) and socket.recv()[:1] == b"\x01"
+            good = {name: message(name, result) for name in (IMAGE, DEPTH)}
+            topic, meta, head, pixels = good[DEPTH]
+            bad = [
+                [topic, b"\xc1", head, pixels],
+                [topic, b"\xdd\xff\xff\xff\xff", head, pixels],  # an array of four thousand million
+                [topic, b"\x91" * 4000, head, pixels],
+                [topic, meta, head, pixels[:-4]],
+                [topic, meta],
+                [topic, changed(meta, shape=[2**31, 2**31]), head, pixels],
+                [topic, changed(meta, shape=[-64, -96]), head, pixels],
+                [topic, changed(meta, seq="one"), head, pixels],
+                [topic, good[IMAGE][1], head, pixels],
+                [topic + b"/more", meta, head, pixels],  # what else begins like that; not a mistake
+            ]
+            for parts in (*bad, good[IMAGE], good[DEPTH]):
+                socket.send_multipart(parts)
+            said, complaints = process.communicate(timeout=30)
+        assert process.returncode == 0
+        assert complaints.count("left out: ") == len(bad) - 1
+        assert [row[4] for row in LINE.findall(said)] == ["unknown"]
+    finally:
+        context.destroy(linger=0)
+
+
+def message(name: str, result: FrameResult) -> list[bytes]:
+    """The parts of a message, with everything that belongs there."""
+    said = content.FRAME_CONTENT[name](result)
+    meta = Meta(
+        type=said.type, type_hash=cdr.type_hash(said.type), seq=1, frame_id=1, session="s", epoch=0, step=0,
+        stamp_ns=result.pair.t_capture_ns, publish_ns=time.time_ns(), dropped=0,
+        encoding=said.encoding, shape=list(said.shape), dtype=said.dtype,
+    )  # fmt: skip
+    return [bytes(part) for part in encode(Message(f"sags/{name}", meta, said.parts))]
+
+
+def changed(meta: bytes, **fields: object) -> bytes:
+    return msgpack.packb(msgpack.unpackb(meta) | fields)

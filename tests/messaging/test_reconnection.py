@@ -1,0 +1,171 @@
+"""A node that restarts, dies or falls silent is followed as soon as it is back."""
+
+from __future__ import annotations
+
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Self
+
+import msgspec
+import pytest
+from places import HELPERS
+from synthetic import publisher, stream
+from waiting import until
+
+from sags_node.messaging import stream as data_stream
+from sags_node.messaging.subscriber import Subscriber
+
+pytestmark = pytest.mark.live
+
+
+def test_a_restarted_node_is_followed(tmp_path: Path) -> None:
+    run_dir = tmp_path / "run"
+    with publisher(run_dir) as running:
+        port = running.connection.data[-1]
+        subscriber = Subscriber(["tf"], endpoint=port)
+        with stream(running):
+            first = subscriber.wait("tf", 30)
+        assert first is not None
+    with publisher(run_dir, data=(port,)) as running:
+        running.session = "session-2"
+        with stream(running):
+            deadline = time.monotonic() + 30
+            newest = first
+            while newest.meta.session != "session-2" and time.monotonic() < deadline:
+                newest = subscriber.wait("tf", 1, after=newest) or newest
+            assert newest.meta.session == "session-2"
+            assert newest.meta.seq >= 1 and subscriber.lost("tf") == 0
+    subscriber.close()
+
+
+@contextmanager
+def _node(run_dir: Path, session: str, port: int, ipc: bool = False) -> Iterator[subprocess.Popen[bytes]]:
+    """A publisher in its own process, which ends with SIGKILL and so leaves its files behind."""
+    program = (
+        "import time; from pathlib import Path; from synthetic import publisher, stream\n"
+        f"data = ('tcp://127.0.0.1:{port or '*'}',)\n"
+        f"with publisher(Path({str(run_dir)!r}), data=data, ipc={ipc}) as running:\n"
+        f"    running.session = {session!r}\n"
+        "    with stream(running):\n"
+        "        time.sleep(60)\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", program], cwd=HELPERS)
+    try:
+        yield process
+    finally:
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@pytest.mark.parametrize(
+    ("by_file", "ipc", "moves"),
+    [(False, False, False), (True, True, False), (True, False, True)],
+    ids=["same port", "ipc", "another port"],
+)
+def test_a_killed_node_is_followed(tmp_path: Path, by_file: bool, ipc: bool, moves: bool) -> None:
+    run_dir, port = tmp_path / "run", _free_port()
+    where = {} if by_file else {"endpoint": f"tcp://127.0.0.1:{port}"}
+    with _node(run_dir, "first", port, ipc):
+        until((run_dir / "sags.json").exists)
+        subscriber = Subscriber(["tf"], run_dir=run_dir, **where)
+        found = subscriber.wait("tf", 30)
+        assert found is not None and found.meta.session == "first"
+    with subscriber:
+        until(lambda: not subscriber.ok("tf"))
+        before = subscriber.endpoint
+        with _node(run_dir, "second", _free_port() if moves else port, ipc):
+            until(lambda: (newest := subscriber.latest("tf")) is not None and newest.meta.session == "second")
+            until(lambda: subscriber.ok("tf"))
+        assert (subscriber.endpoint != before) == moves
+        assert subscriber.lost("tf") == 0
+
+
+def test_a_connection_that_died_without_a_word_is_made_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A machine that lost its power closes nothing: only a missing heartbeat tells."""
+    monkeypatch.setattr(data_stream, "HEARTBEAT_MS", 100)
+    monkeypatch.setattr(data_stream, "HEARTBEAT_TIMEOUT_MS", 300)
+    with publisher(tmp_path / "run", ipc=False) as running, stream(running):
+        with Cable(running.connection.data[0]) as cable:
+            with Subscriber(["tf"], endpoint=cable.endpoint) as subscriber:
+                assert subscriber.wait("tf", 30) is not None
+                cable.cut()
+                until(lambda: not subscriber.ok("tf"))
+                until(lambda: subscriber.ok("tf"))
+                assert cable.connections == 2
+
+
+class Cable:
+    """Passes connections on. Those that are open when it is cut stay open, and silent."""
+
+    def __init__(self, endpoint: str) -> None:
+        host, port = endpoint.removeprefix("tcp://").split(":")
+        self._far = (host, int(port))
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.endpoint = f"tcp://127.0.0.1:{self._listener.getsockname()[1]}"
+        self.connections = 0
+        self._open: list[socket.socket] = []
+        self._cut = threading.Event()
+        self._threads = [threading.Thread(target=self._accept)]
+        self._threads[0].start()
+
+    def cut(self) -> None:
+        self._cut.set()
+        self._cut = threading.Event()
+
+    def _accept(self) -> None:
+        while True:
+            try:
+                near, _ = self._listener.accept()
+            except OSError:
+                return
+            far = socket.create_connection(self._far)
+            self.connections += 1
+            self._open += [near, far]
+            for source, target in ((near, far), (far, near)):
+                passing = threading.Thread(target=self._pass, args=(source, target, self._cut))
+                self._threads.append(passing)
+                passing.start()
+
+    @staticmethod
+    def _pass(source: socket.socket, target: socket.socket, cut: threading.Event) -> None:
+        try:
+            while (data := source.recv(65536)) and not cut.is_set():
+                target.sendall(data)
+        except OSError:
+            return
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for one in (self._listener, *self._open):
+            with suppress(OSError):
+                one.shutdown(socket.SHUT_RDWR)
+            one.close()
+        for thread in self._threads:
+            thread.join()
+
+
+def test_a_node_that_wants_keys_after_its_restart_says_so(tmp_path: Path) -> None:
+    run_dir = tmp_path / "run"
+    with publisher(run_dir, ipc=False) as running:
+        known, subscriber = running.connection, Subscriber(["tf"], run_dir=run_dir)
+    with subscriber:
+        with_keys = msgspec.json.encode(msgspec.structs.replace(known, public_key="k" * 40))
+        (run_dir / "sags.json").write_bytes(with_keys)
+        until(lambda: "wants a key" in str(subscriber.problem("tf")))

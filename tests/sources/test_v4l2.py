@@ -1,0 +1,393 @@
+"""Live cameras with a camera made of Python: pairing, unplugging, silence, frozen pictures.
+
+tests/sources/test_v4l2_vivid.py checks the same source against a real kernel driver.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import ClassVar
+
+import cv2
+import numpy as np
+import pytest
+
+from sags_node.config import V4l2Source
+from sags_node.errors import SagsError, UsageError
+from sags_node.sources import v4l2
+from sags_node.sources.device import Device, Picture, wall_stamp
+from sags_node.sources.pairing import QUEUE_LENGTH, Pairing
+from sags_node.sources.v4l2 import StereoCameras
+from sags_node.types import StereoFrame
+
+pytestmark = pytest.mark.live
+
+MS = 1_000_000
+CONFIG = V4l2Source(left="/dev/left", right="/dev/right", width=8, height=4, rate=50, deadline=0.15)
+
+
+def shot(t_ms: float, value: int = 0, width: int = 8) -> Picture:
+    return Picture(round(t_ms * MS), np.full((4, width, 3), value, np.uint8))
+
+
+class FakeCamera:
+    """Delivers what the test puts in; `None` unplugs it, silence is an empty queue."""
+
+    rate = 50.0
+
+    def __init__(self) -> None:
+        self.pictures: queue.Queue[Picture | None] = queue.Queue()
+        self.closed = False
+
+    def read(self, timeout: float) -> Picture | None:
+        try:
+            picture = self.pictures.get(timeout=timeout)
+        except queue.Empty:
+            return None
+        if picture is None:
+            raise SagsError("camera is gone")
+        return picture
+
+    def close(self) -> None:
+        self.closed = True
+
+
+class Plugs:
+    """Opens fake cameras by path and remembers each one; a path in `absent` cannot be opened."""
+
+    def __init__(self) -> None:
+        self.opened: dict[str, list[FakeCamera]] = {"/dev/left": [], "/dev/right": []}
+        self.absent: set[str] = set()
+        self.attempts = 0
+
+    def __call__(self, path: str, config: V4l2Source) -> FakeCamera:
+        self.attempts += 1
+        if path in self.absent:
+            raise SagsError(f"camera {path} does not exist")
+        self.opened[path].append(FakeCamera())
+        return self.opened[path][-1]
+
+    def put(self, t_ms: float, value: int = 0, skew_ms: float = 0.0) -> None:
+        """One moment in front of both newest cameras."""
+        self.opened["/dev/left"][-1].pictures.put(shot(t_ms, value))
+        self.opened["/dev/right"][-1].pictures.put(shot(t_ms + skew_ms, value))
+
+
+def eventually(condition: Callable[[], bool]) -> None:
+    """Wait for another thread; fails after far longer than that takes."""
+    end = time.monotonic() + 10
+    while not condition():
+        assert time.monotonic() < end, "it never happened"
+        time.sleep(0.005)
+
+
+@pytest.fixture
+def plugs(monkeypatch: pytest.MonkeyPatch) -> Plugs:
+    monkeypatch.setattr(v4l2, "FIRST_PAUSE_S", 0.01)
+    monkeypatch.setattr(v4l2, "LONGEST_PAUSE_S", 0.04)
+    return Plugs()
+
+
+class Collector:
+    """Takes frames in a thread, as a node does."""
+
+    def __init__(self, source: StereoCameras) -> None:
+        self.frames: list[StereoFrame] = []
+        self.thread = threading.Thread(target=self._take, args=(source,))
+        self.thread.start()
+
+    def _take(self, source: StereoCameras) -> None:
+        for frame in source:
+            self.frames.append(frame)
+
+    def wait_for(self, count: int) -> None:
+        eventually(lambda: len(self.frames) >= count)
+
+    def values(self) -> list[int]:
+        return [int(frame.left[0, 0, 0]) for frame in self.frames]
+
+
+# ---- pairing ---------------------------------------------------------------------------------------------
+
+
+def drain(pairing: Pairing) -> list[tuple[int, int, int]]:
+    pairs = []
+    while (pair := pairing.take()) is not None:
+        pairs.append((pair[0], round(pair[1].t_ns / MS), round(pair[2].t_ns / MS)))
+    return pairs
+
+
+def test_pairs_by_nearest_stamp_and_counts_the_rest() -> None:
+    pairing = Pairing(20 * MS)
+    for t in (0, 33, 66):
+        pairing.add_left(shot(t))
+    for t in (30, 70, 101):
+        pairing.add_right(shot(t))
+    # Left 0 has right 30 only, which is too far and nearer to left 33.
+    assert drain(pairing) == [(1, 33, 30), (2, 66, 70)]
+    assert pairing.unpaired == 1
+    pairing.add_left(shot(99))
+    assert drain(pairing) == [(3, 99, 101)]
+
+
+def test_prefers_a_nearer_successor_within_the_tolerance() -> None:
+    pairing = Pairing(20 * MS)
+    pairing.add_left(shot(0))
+    pairing.add_left(shot(16))
+    pairing.add_right(shot(15))
+    assert drain(pairing) == [(1, 16, 15)]
+    assert pairing.unpaired == 1
+
+
+def test_one_eye_alone_neither_pairs_nor_grows() -> None:
+    pairing = Pairing(20 * MS)
+    for n in range(100):
+        pairing.add_left(shot(33 * n))
+    assert drain(pairing) == []
+    assert pairing.unpaired == 100 - QUEUE_LENGTH
+
+
+@pytest.mark.parametrize("phase_ms", [-16.0, -7.0, 0.0, 9.0, 16.0])
+def test_free_running_cameras_pair_from_the_first_moment(phase_ms: float) -> None:
+    """Two 30 Hz cameras, any phase, some jitter: all but the odd picture at the start find a partner."""
+    rng = np.random.default_rng(3)
+    moments = [(1000 / 30 * n + rng.normal(0, 0.2), "left") for n in range(200)]
+    moments += [(1000 / 30 * n + phase_ms + rng.normal(0, 0.2), "right") for n in range(200)]
+    pairing = Pairing(20 * MS)
+    pairs = []
+    for t, eye in sorted(moments):
+        (pairing.add_left if eye == "left" else pairing.add_right)(shot(t))
+        pairs += drain(pairing)
+    assert len(pairs) >= 199
+    assert max(abs(left - right) for _, left, right in pairs) <= 20
+
+
+def test_recovers_when_the_wall_clock_is_set_back() -> None:
+    pairing = Pairing(20 * MS)
+    pairing.add_right(shot(3_600_000))  # its partner came after the clock was set back one hour
+    pairs = []
+    for n in range(10):
+        pairing.add_left(shot(33 * n))
+        pairing.add_right(shot(33 * n + 1))
+        pairs += drain(pairing)
+    assert len(pairs) >= 10 - QUEUE_LENGTH
+
+
+@pytest.mark.parametrize(
+    ("driver_ns", "expected"),
+    [
+        (95_000_000_000, 1_000_000_000_000),  # 5 s old: not a stamp of this picture
+        (99_980_000_000, 999_980_000_000),  # 20 ms old
+        (100_060_000_000, 1_000_000_000_000),  # ahead of its arrival
+        (0, 1_000_000_000_000),  # the driver gives none
+        (1_000_000_000_000, 1_000_000_000_000),  # a wall clock stamp
+    ],
+)
+def test_wall_stamp(driver_ns: int, expected: int) -> None:
+    assert wall_stamp(driver_ns, 100_000_000_000, 1_000_000_000_000) == expected
+
+
+# ---- the source ------------------------------------------------------------------------------------------
+
+
+def test_delivers_pairs_with_both_stamps(plugs: Plugs) -> None:
+    with StereoCameras(CONFIG, plugs) as source:
+        collector = Collector(source)
+        for n in range(5):
+            plugs.put(20 * n, value=n, skew_ms=3)
+            collector.wait_for(n + 1)
+    collector.thread.join(30)
+    assert not collector.thread.is_alive()
+    assert collector.values() == [0, 1, 2, 3, 4]
+    assert [frame.frame_id for frame in collector.frames] == [0, 1, 2, 3, 4]
+    assert [frame.t_capture_ns for frame in collector.frames] == [20 * MS * n for n in range(5)]
+    assert {f.t_capture_right_ns - f.t_capture_ns for f in collector.frames} == {3 * MS}
+    assert source.dropped == 0 and source.frame_count is None and source.rate == 50
+    assert all(camera.closed for cameras in plugs.opened.values() for camera in cameras)
+
+
+def test_unplugged_camera_comes_back(plugs: Plugs) -> None:
+    with StereoCameras(CONFIG, plugs) as source:
+        collector = Collector(source)
+        plugs.put(0, value=1)
+        collector.wait_for(1)
+
+        plugs.absent.add("/dev/right")
+        attempts = plugs.attempts
+        plugs.opened["/dev/right"][0].pictures.put(None)
+        eventually(lambda: plugs.attempts >= attempts + 3)  # it tries again and again
+        assert plugs.opened["/dev/right"][0].closed
+
+        plugs.absent.clear()
+        eventually(lambda: len(plugs.opened["/dev/right"]) == 2)
+        plugs.put(5000, value=2)
+        collector.wait_for(2)
+    assert collector.values() == [1, 2]
+
+
+def test_silent_camera_is_opened_again(plugs: Plugs) -> None:
+    """A camera that neither delivers nor fails, as unplugged USB cameras may do."""
+    with StereoCameras(CONFIG, plugs) as source:
+        collector = Collector(source)
+        plugs.put(0, value=1)
+        eventually(lambda: all(len(cameras) >= 2 for cameras in plugs.opened.values()))
+        assert plugs.opened["/dev/left"][0].closed
+        stop = threading.Event()
+
+        def film() -> None:
+            t = 1000.0
+            while not stop.wait(0.02):
+                plugs.put(t, value=2)
+                t += 20
+
+        filming = threading.Thread(target=film)
+        filming.start()
+        eventually(lambda: 2 in collector.values())
+        stop.set()
+        filming.join()
+
+
+def test_stop_ends_the_wait_for_absent_cameras(plugs: Plugs) -> None:
+    with StereoCameras(CONFIG, plugs) as source:
+        collector = Collector(source)
+        source.stop()
+        collector.thread.join(30)
+        assert not collector.thread.is_alive()
+    assert collector.frames == []
+
+
+def test_clock_set_back_grows_the_epoch(plugs: Plugs) -> None:
+    with StereoCameras(CONFIG, plugs) as source:
+        collector = Collector(source)
+        for n, t in enumerate((10_000, 10_020, 5_000, 5_020)):
+            plugs.put(t)
+            collector.wait_for(n + 1)
+    assert [frame.epoch for frame in collector.frames] == [0, 0, 1, 1]
+
+
+@pytest.mark.parametrize(("order", "left_value"), [("LR", 10), ("RL", 20)])
+def test_side_by_side(plugs: Plugs, order: str, left_value: int) -> None:
+    config = CONFIG.model_copy(update={"side_by_side": order, "right": None, "width": 16})
+    halves = np.concatenate([shot(0, 10).image, shot(0, 20).image], axis=1)
+    with StereoCameras(config, plugs) as source:
+        collector = Collector(source)
+        plugs.opened["/dev/left"][0].pictures.put(Picture(7 * MS, halves))
+        collector.wait_for(1)
+    frame = collector.frames[0]
+    assert frame.left.shape == frame.right.shape == (4, 8, 3)
+    assert (frame.left == left_value).all() and (frame.right == 30 - left_value).all()
+    assert frame.t_capture_ns == frame.t_capture_right_ns == 7 * MS
+    assert source.dropped == 0
+
+
+def test_mistakes_at_opening(plugs: Plugs) -> None:
+    with pytest.raises(UsageError, match=r"source\.right names no camera"):
+        StereoCameras(CONFIG.model_copy(update={"right": None}), plugs)
+    with pytest.raises(UsageError, match="same camera, /dev/left"):
+        StereoCameras(CONFIG.model_copy(update={"right": "/dev/left"}), plugs)
+    with pytest.raises(UsageError, match="9 px wide, which is odd"):
+        StereoCameras(CONFIG.model_copy(update={"side_by_side": "LR", "width": 9}), plugs)
+    plugs.absent.add("/dev/right")
+    with pytest.raises(SagsError, match="/dev/right does not exist"):
+        StereoCameras(CONFIG, plugs)
+    assert plugs.opened["/dev/left"][-1].closed  # nothing stays open after a failed start
+
+
+# ---- one device ------------------------------------------------------------------------------------------
+
+
+class FakeCapture:
+    """Stands for cv2.VideoCapture: one picture per entry of `stamps_ms`, then silence or an error."""
+
+    stamps_ms: ClassVar[list[float]] = []
+    gone_at_the_end: ClassVar[bool] = False
+    set_by_driver: ClassVar[dict[int, float]] = {}
+
+    def __init__(self, path: str, backend: int) -> None:
+        assert backend == cv2.CAP_V4L2
+        self.values: dict[int, float] = {}
+        self.shots = list(self.stamps_ms)
+        self.stamp = 0.0
+
+    def isOpened(self) -> bool:
+        return True
+
+    def set(self, key: int, value: float) -> bool:
+        self.values[key] = self.set_by_driver.get(key, value)
+        return key not in self.set_by_driver
+
+    def get(self, key: int) -> float:
+        return self.stamp if key == cv2.CAP_PROP_POS_MSEC else self.values.get(key, 0.0)
+
+    @staticmethod
+    def waitAny(streams: list[FakeCapture], timeout_ns: int) -> tuple[bool, list[int]]:
+        if streams[0].shots:
+            return True, [0]
+        if streams[0].gone_at_the_end:
+            raise cv2.error("Error is reported for camera stream")
+        return False, []
+
+    def read(self) -> tuple[bool, np.ndarray]:
+        self.stamp = self.shots.pop(0)
+        return True, np.full((4, 8, 3), (255, 0, 0), np.uint8)
+
+    def release(self) -> None:
+        pass
+
+    @staticmethod
+    def fourcc(*letters: str) -> int:
+        return int.from_bytes("".join(letters).encode(), "little")
+
+
+@pytest.fixture
+def device(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., Device]:
+    def build(stamps_ms: list[float], gone: bool = False, **asked: object) -> Device:
+        monkeypatch.setattr(FakeCapture, "stamps_ms", stamps_ms)
+        monkeypatch.setattr(FakeCapture, "gone_at_the_end", gone)
+        monkeypatch.setattr(cv2, "VideoCapture", FakeCapture)
+        (tmp_path / "video0").touch()
+        return Device(str(tmp_path / "video0"), CONFIG.model_copy(update=asked))
+
+    return build
+
+
+def test_frozen_picture_is_no_picture(device: Callable[..., Device]) -> None:
+    now = time.monotonic() * 1e3
+    camera = device([now, now, now, now + 1])
+    pictures = [camera.read(0.1) for _ in range(5)]
+    assert [picture is not None for picture in pictures] == [True, False, False, True, False]
+    assert pictures[0] is not None and (pictures[0].image == (0, 0, 255)).all()  # RGB from OpenCV's BGR
+
+
+def test_driver_without_stamps_gets_the_arrival_time(device: Callable[..., Device]) -> None:
+    camera = device([0.0, 0.0])
+    before = time.time_ns()
+    first, second = camera.read(0.1), camera.read(0.1)
+    assert first is not None and second is not None
+    assert before <= first.t_ns <= second.t_ns <= time.time_ns()
+
+
+def test_device_that_fails_says_so(device: Callable[..., Device]) -> None:
+    camera = device([], gone=True)
+    with pytest.raises(SagsError, match="video0 stopped delivering pictures"):
+        camera.read(0.1)
+
+
+def test_refused_controls_warn_but_do_not_stop(
+    device: Callable[..., Device], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    mjpg = float(FakeCapture.fourcc(*"MJPG"))
+    monkeypatch.setattr(FakeCapture, "set_by_driver", {cv2.CAP_PROP_FPS: 15.0, cv2.CAP_PROP_FOURCC: mjpg})
+    camera = device([], fourcc="YUYV")
+    assert camera.rate == 15
+    assert "wanted 50 frames/s, the driver gives 15" in caplog.text
+    assert "wanted pixel format YUYV, the driver gives MJPG" in caplog.text
+
+
+def test_missing_device_is_named_with_what_is_there() -> None:
+    with pytest.raises(SagsError, match=r"camera /dev/video-none does not exist; (present: |there is no)"):
+        Device("/dev/video-none", CONFIG)

@@ -1,0 +1,138 @@
+"""How near tissue may be follows the pictures: an organ at 15 mm gets its own depth, not the background's."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pytest
+from places import ROOT
+
+from sags_node.config import USUAL_NEAREST, StereoConfig
+from sags_node.session import open_session
+from sags_node.sources.source import open_source
+from sags_node.types import F32, RectifiedPair, StereoRig
+from sags_node.vision import near_limit
+from sags_node.vision.near_limit import AGREED, NEAREST, PERIOD_NS, RETREAT, ROOM, NearLimit
+from sags_node.vision.pyramid import pyramids
+from sags_node.vision.rectify import Rectifier
+from sags_node.vision.stereo import StereoDepth
+
+PHANTOM = ROOT / "replay/phantom_pull"
+NEAR = 0.25  # of the phantom's true distance: its tissue then lies at 15 to 22 mm
+
+Shown = list[tuple[RectifiedPair, F32 | None]]
+
+
+def shown(source: Path, scale: float, count: int = 3, *overrides: str) -> Shown:
+    """Pairs half a second apart, and their true depth: a rig whose baseline is `scale` times as long as it
+    was sees the same pictures of tissue that is so much nearer."""
+    session = open_session(source, ["source.pace:=step", *overrides])
+    right = session.rig.right
+    P = right.P.copy()
+    P[0, 3] *= scale
+    rig = StereoRig("scaled", session.rig.left, replace(right, P=P))
+    rectify = Rectifier(rig, *session.working_size)
+    pairs: Shown = []
+    with open_source(session.config.source) as frames:
+        for number, frame in enumerate(islice(frames, count)):
+            truth = None if frame.reference is None else frame.reference.depth
+            stamped = replace(frame, t_capture_ns=number * PERIOD_NS)
+            pairs.append((rectify(stamped), None if truth is None else scale * rectify.depth(truth)))
+    return pairs
+
+
+def everywhere(pair: RectifiedPair) -> np.ndarray:
+    return np.ones(pair.left.shape[:2], np.bool_)
+
+
+@pytest.mark.parametrize("method", ["dis", "sgbm"])
+def test_near_tissue_gets_its_own_depth(method: str) -> None:
+    """As right as the same pictures are at their usual distance, from the first frame on."""
+    errors, coverage = {}, {}
+    for scale in (1.0, NEAR):
+        (pair, truth), *_ = shown(PHANTOM, scale, 1)
+        assert truth is not None
+        depth, _ = StereoDepth(StereoConfig(method=method), pair.camera, pair.baseline)(
+            pair, everywhere(pair)
+        )
+        known = (depth > 0) & (truth > 0)
+        errors[scale] = float(np.percentile(np.abs(depth - truth)[known] / truth[known], 90))
+        coverage[scale] = float(known.mean())
+    assert errors[NEAR] < 1.2 * errors[1.0] + 0.005
+    assert coverage[NEAR] > coverage[1.0] - 0.03
+
+
+def test_a_limit_that_is_set_stays_and_is_told_of() -> None:
+    pairs = shown(PHANTOM, NEAR)
+    pair, truth = pairs[0]
+    assert truth is not None and np.percentile(truth[truth > 0], 10) < USUAL_NEAREST
+    stereo = StereoDepth(StereoConfig(min_depth=USUAL_NEAREST), pair.camera, pair.baseline)
+    for pair, _ in pairs:
+        depth, _ = stereo(pair, everywhere(pair))
+        assert np.all(depth[depth > 0] >= 0.99 * USUAL_NEAREST)
+    (said,) = (found for found in stereo.findings if found.code == "tissue_too_near")
+    assert "vision.stereo.min_depth" in said.text
+    wide = StereoDepth(StereoConfig(min_depth=NEAREST), pair.camera, pair.baseline)
+    wide(pair, everywhere(pair))
+    assert "tissue_too_near" not in {found.code for found in wide.findings}
+
+
+@pytest.mark.usefixtures("data_folder")
+def test_on_a_usual_clip_nothing_changes() -> None:
+    """Bit for bit what a limit of 30 mm gives."""
+    pairs = shown(ROOT / "launch/d4d_pull.yaml", 1.0, 6, "source.stride:=30")
+    pair, _ = pairs[0]
+    found, usual = (
+        StereoDepth(StereoConfig(min_depth=said), pair.camera, pair.baseline)
+        for said in (None, USUAL_NEAREST)
+    )
+    for pair, _ in pairs:
+        for one, other in zip(found(pair, everywhere(pair)), usual(pair, everywhere(pair)), strict=True):
+            assert np.array_equal(one, other)
+    assert not found.findings and not usual.findings
+
+
+def test_the_limit_comes_at_once_and_goes_slowly(monkeypatch: pytest.MonkeyPatch) -> None:
+    (pair, _), *_ = shown(PHANTOM, 1.0, 1)
+    left, right = pyramids(pair)
+    assert right is not None
+    far, near = 0.06, 0.02
+    limits = []
+    limit = NearLimit(StereoConfig(), 1000.0)
+    looks = [far, near, far, *[near] * AGREED, *[far] * RETREAT]
+    for number, nearest in enumerate(looks):
+        monkeypatch.setattr(near_limit.NearLimit, "_nearest", lambda *_, nearest=nearest: nearest)
+        for part in range(3):  # of a period: only one look each
+            limit.look(number * PERIOD_NS + part * PERIOD_NS // 3, left, right, everywhere(pair))
+        limits.append(limit.limit)
+    came = 2 + AGREED
+    assert limits[:came] == [USUAL_NEAREST] * came  # one look alone may be wrong
+    assert limits[came] == pytest.approx(ROOM * near)
+    assert set(limits[came:-1]) == {limits[came]} and limits[-1] == USUAL_NEAREST
+
+
+@pytest.mark.usefixtures("data_folder")
+@pytest.mark.parametrize("source", [PHANTOM, ROOT / "launch/d4d_pull.yaml"])
+def test_pictures_that_do_not_belong_together_move_nothing(source: Path) -> None:
+    for pair, _ in shown(source, 1.0, 3):
+        assert pair.right is not None
+        other = replace(pair, right=np.ascontiguousarray(pair.right[::-1]), gray=None)
+        exchanged = replace(pair, left=pair.right, right=pair.left, gray=None)
+        for wrong in (other, exchanged):
+            left, right = pyramids(wrong)
+            assert right is not None
+            limit = NearLimit(StereoConfig(), float(pair.camera.K[0, 0]) * pair.baseline)
+            limit.look(0, left, right, everywhere(pair))
+            assert limit.limit == USUAL_NEAREST
+
+
+def test_what_is_nearer_than_a_scope_sees_is_not_searched() -> None:
+    pairs = shown(PHANTOM, NEAR / 2)
+    pair, _ = pairs[0]
+    stereo = StereoDepth(StereoConfig(), pair.camera, pair.baseline)
+    for pair, _ in pairs:
+        depth, _ = stereo(pair, everywhere(pair))
+    assert np.all(depth[depth > 0] >= 0.99 * NEAREST)

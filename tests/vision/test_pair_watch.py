@@ -1,0 +1,244 @@
+"""Whether both eyes show what they should: empty, equal and exchanged pictures are noticed, others not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from places import ROOT
+from synthetic import health
+
+from sags_node.mapping.budget import StepBudget
+from sags_node.messaging.cdr import decode
+from sags_node.messaging.content import diagnostics
+from sags_node.pipeline import Pipeline
+from sags_node.session import Session, open_session
+from sags_node.types import U8, StereoFrame
+from sags_node.vision.pair_watch import PairWatch, Verdict
+from sags_node.vision.rectify import Rectifier
+
+STEP_NS = 100_000_000
+NEEDED = 2  # frames, at that rate
+Spoil = Callable[[StereoFrame], StereoFrame]
+
+
+@pytest.fixture(scope="module")
+def session(phantom_session: Path) -> Session:
+    return open_session(phantom_session, ["source.pace:=step"])
+
+
+@pytest.fixture(scope="module")
+def frames(session: Session) -> list[StereoFrame]:
+    with session.source as source:
+        return list(islice(source, 6))
+
+
+def watched(session: Session, frames: list[StereoFrame], step_ns: int = STEP_NS) -> Iterator[str]:
+    """What is said after each frame."""
+    watch = PairWatch()
+    rectify = Rectifier(session.rig, *session.working_size)
+    for number, frame in enumerate(frames):
+        stamped = replace(frame, t_capture_ns=10**18 + number * step_ns)
+        watch(stamped, rectify(stamped))
+        yield "; ".join(finding.text for finding in watch.findings)
+
+
+def both(change: Callable[[U8], U8]) -> Spoil:
+    return lambda frame: replace(frame, left=change(frame.left), right=change(_right(frame)))
+
+
+def _right(frame: StereoFrame) -> U8:
+    assert frame.right is not None
+    return frame.right
+
+
+def _noisy(picture: np.ndarray, sigma: float = 4.0) -> U8:
+    noise = np.random.default_rng(int(picture.sum()) % 1000).normal(0, sigma, picture.shape)
+    return np.clip(picture + noise, 0, 255).round().astype(np.uint8)
+
+
+def _jpeg(picture: U8) -> U8:
+    return cv2.imdecode(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 50])[1], cv2.IMREAD_COLOR)
+
+
+def _plain(frame: StereoFrame, color: tuple[int, int, int], sigma: float = 2.0) -> U8:
+    return _noisy(np.full(frame.left.shape, color, np.float32), sigma)
+
+
+@pytest.fixture(scope="module")
+def moving(session: Session) -> list[StereoFrame]:
+    """Three seconds at 10 Hz."""
+    with session.source as source:
+        return list(islice(source, 30))
+
+
+# ---- sound pairs -----------------------------------------------------------------------------------------
+
+SOUND: dict[str, Spoil] = {
+    "as it is": lambda frame: frame,
+    "dim": both(lambda picture: (picture * 0.2).astype(np.uint8)),
+    "bright": both(lambda picture: np.clip(picture * 1.8, 0, 255).astype(np.uint8)),
+    "noise": both(lambda picture: _noisy(picture, 12.0)),
+    "smoke": both(lambda picture: (picture * 0.25 + 150).astype(np.uint8)),
+    "out of focus": both(lambda picture: cv2.GaussianBlur(picture, (0, 0), 6)),
+    "jpeg": both(_jpeg),
+    "one eye darker": lambda frame: replace(frame, right=(_right(frame) * 0.6).astype(np.uint8)),
+    "one camera": lambda frame: replace(frame, right=None),
+}
+
+
+@pytest.mark.parametrize("name", SOUND)
+def test_sound_pairs_are_let_pass(name: str, session: Session, frames: list[StereoFrame]) -> None:
+    assert set(watched(session, [SOUND[name](frame) for frame in frames])) == {""}
+
+
+@pytest.mark.parametrize("launch", ["d4d_pull", "hamlyn_heart"])
+def test_real_recordings_are_let_pass_and_exchanged_ones_noticed(launch: str, data_folder: Path) -> None:
+    overrides = ["source.pace:=step", "source.stride:=5"]
+    session = open_session(ROOT / f"launch/{launch}.yaml", overrides)
+    with session.source as source:
+        frames = list(islice(source, 20))
+    assert set(watched(session, frames)) == {""}
+    said = list(watched(session, [_exchanged(frame) for frame in frames]))
+    assert all("exchanged" in warning for warning in said[NEEDED - 1 :])
+    said = list(watched(session, [replace(frame, right=frame.left) for frame in frames]))
+    assert all("the same picture" in warning for warning in said[NEEDED - 1 :])
+
+
+# ---- what is wrong ---------------------------------------------------------------------------------------
+
+
+def _exchanged(frame: StereoFrame) -> StereoFrame:
+    return replace(frame, left=_right(frame), right=frame.left)
+
+
+WRONG: dict[str, tuple[Spoil, str]] = {
+    "black left": (lambda f: replace(f, left=np.zeros_like(f.left)), "the left picture is black: see to"),
+    "noisy black": (lambda f: replace(f, right=_plain(f, (4, 4, 4), 6.0)), "the right picture is black"),
+    "video black": (lambda f: replace(f, right=_plain(f, (16, 16, 16))), "the right picture is black"),
+    "white": (lambda f: replace(f, right=_plain(f, (255, 255, 255))), "the right picture is white: lower"),
+    "blue": (lambda f: replace(f, left=_plain(f, (0, 0, 200))), "the left picture is of one colour: see to"),
+    "grey": (lambda f: replace(f, right=_plain(f, (128, 128, 128))), "the right picture is of one colour"),
+    "both black": (both(np.zeros_like), "the left picture is black"),
+    "one eye twice": (lambda f: replace(f, right=f.left), "both eyes show the same picture"),
+    "captured twice": (
+        lambda f: replace(f, left=_noisy(f.left), right=_jpeg(_noisy(f.left * 0.8 + 10))),
+        "both eyes show the same picture",
+    ),
+    "exchanged": (_exchanged, "left and right seem to be exchanged: swap"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_what_is_wrong_is_said_and_how_to_mend_it(
+    name: str, session: Session, frames: list[StereoFrame]
+) -> None:
+    spoil, said = WRONG[name]
+    warnings = list(watched(session, [spoil(frame) for frame in frames]))
+    assert warnings[: NEEDED - 1] == [""] * (NEEDED - 1)  # one bad frame is none
+    assert all(warning.startswith(said) for warning in warnings[NEEDED - 1 :]), warnings
+    if name == "both black":
+        assert "the right picture is black" in warnings[-1]
+    else:
+        assert len(set(warnings[NEEDED - 1 :])) == 1 and ";" not in warnings[-1]
+
+
+@pytest.mark.parametrize("rate", [10, 30, 60])
+def test_a_warning_begins_and_ends_within_half_a_second(
+    rate: int, session: Session, frames: list[StereoFrame]
+) -> None:
+    black = replace(frames[0], left=np.zeros_like(frames[0].left))
+    said = list(watched(session, [frames[0]] * rate + [black] * rate + [frames[0]] * rate, 10**9 // rate))
+    warned = [number for number, text in enumerate(said) if text]
+    assert rate < warned[0] <= 1.5 * rate and 2 * rate <= warned[-1] < 2.5 * rate
+    assert warned == list(range(warned[0], warned[-1] + 1))
+
+
+def test_a_clock_may_jump_back(session: Session, frames: list[StereoFrame]) -> None:
+    black = [replace(frame, left=np.zeros_like(frame.left)) for frame in frames]
+    watch = PairWatch()
+    rectify = Rectifier(session.rig, *session.working_size)
+    for number, frame in enumerate([*black, *black]):
+        stamped = replace(frame, t_capture_ns=number % len(black) * STEP_NS)
+        watch(stamped, rectify(stamped))
+    assert [finding.code for finding in watch.findings] == ["left_eye_black"]
+
+
+def _fogged(picture: U8) -> U8:
+    return (cv2.GaussianBlur(picture, (0, 0), 4) * 0.4 + 100).astype(np.uint8)
+
+
+LASTING: dict[str, tuple[Callable[[StereoFrame, StereoFrame], StereoFrame], str, Verdict]] = {
+    "right fogged": (
+        lambda f, before: replace(f, right=_fogged(_right(f))),
+        "right_eye_fogged",
+        Verdict("", "x"),
+    ),
+    "left fogged": (lambda f, before: replace(f, left=_fogged(f.left)), "left_eye_fogged", Verdict("x", "x")),
+    "right frozen": (lambda f, before: replace(f, right=before.right), "right_eye_frozen", Verdict("", "x")),
+    "left frozen": (lambda f, before: replace(f, left=before.left), "left_eye_frozen", Verdict("x", "x")),
+    "both blurred": (
+        lambda f, before: both(lambda picture: cv2.GaussianBlur(picture, (0, 0), 4))(f),
+        "picture_blurred",
+        Verdict("", "", False),
+    ),
+    "both veiled": (
+        lambda f, before: both(lambda picture: (picture * 0.3 + 120).astype(np.uint8))(f),
+        "picture_smoke",
+        Verdict("", "", False),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", LASTING)
+def test_an_eye_is_compared_with_the_other_and_with_a_moment_ago(
+    name: str, session: Session, moving: list[StereoFrame]
+) -> None:
+    """At once it is not used; and it is said when it lasts."""
+    spoil, code, expected = LASTING[name]
+    watch, rectify = PairWatch(), Rectifier(session.rig, *session.working_size)
+    for number, frame in enumerate(moving):
+        given = spoil(frame, moving[9]) if 10 <= number < 20 else frame
+        verdict = watch(given, rectify(given))
+        codes = [finding.code for finding in watch.findings]
+        if 11 <= number < 20:  # the first may be taken for the other eye's fault
+            assert bool(verdict.left) == bool(expected.left) and bool(verdict.right) == bool(expected.right)
+            assert verdict.learn == expected.learn
+        elif number not in (10, 20):
+            assert verdict == Verdict()
+        assert codes == ([code] if 14 <= number < 20 else codes)
+        if number < 10 or number >= 24:
+            assert codes == []
+
+
+# ---- in the node -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("noise", [0.0, 2.0, 12.0], ids=["duplicates", "still", "all mapped"])
+def test_the_pipeline_warns_also_while_frames_are_skipped(
+    noise: float, session: Session, frames: list[StereoFrame]
+) -> None:
+    """A cable is pulled, and nothing moves any more: equal pictures are left out, and where depth comes with
+    the session those that are equal but for noise are not matched."""
+    pipeline = Pipeline(session.config, session.rig)
+    rng = np.random.default_rng(0)
+    shown = [*frames[:2], *[frames[2]] * 8]
+    skipped = set()
+    for number, frame in enumerate(shown):
+        pulled = number >= 2
+        right = np.zeros_like(frame.left) if pulled else frame.right
+        noisy = np.clip(frame.left + rng.normal(0, noise, frame.left.shape), 0, 255).astype(np.uint8)
+        depth = np.full(frame.left.shape[:2], 0.08, np.float32)
+        spoilt = replace(frame, left=noisy, right=right, depth=depth)
+        stamped = replace(spoilt, frame_id=number, t_capture_ns=number * STEP_NS)
+        skipped |= set(pipeline.process(stamped, StepBudget(0)).skipped)
+        assert ("eyes" in pipeline.warnings) == (number >= 2 + NEEDED - 1)
+    assert skipped == {0.0: {"frame"}, 2.0: {"depth", "motion"}, 12.0: set()}[noise]
+    content = diagnostics(replace(health(), warnings=pipeline.warnings), 0)
+    statuses = decode(b"".join(content.parts), "diagnostic_msgs/msg/DiagnosticArray").status
+    assert "the right picture is black" in " ".join(status.message for status in statuses)

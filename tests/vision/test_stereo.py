@@ -1,0 +1,322 @@
+"""Stereo depth: scenes with exact truth, and real recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from frames import make_frame
+from places import ROOT
+
+from sags_node import geometry
+from sags_node.calibration import load_rig, read_rig
+from sags_node.config import StereoConfig, TissueConfig
+from sags_node.errors import UsageError
+from sags_node.sources.pictures import read_picture
+from sags_node.types import F32, U8, Bool, Camera, RectifiedPair
+from sags_node.vision.margin import EDGE_MARGIN
+from sags_node.vision.matchers import SemiGlobal
+from sags_node.vision.observe import observe
+from sags_node.vision.rectify import Rectifier
+from sags_node.vision.stereo import StereoDepth
+from sags_node.vision.tissue import TissueMask
+
+METHODS = ["dis", "sgbm"]
+
+
+# ---- stereo: scenes with exact truth ---------------------------------------------------------------------
+
+WIDTH, HEIGHT, BASELINE = 640, 512, 0.0043
+CAMERA = Camera(WIDTH, HEIGHT, np.array([[570.0, 0, 319.5], [0, 570.0, 255.5], [0, 0, 1]]), np.eye(4))
+ALL = np.ones((HEIGHT, WIDTH), np.bool_)
+
+
+def make_pair(left: U8, right: U8) -> RectifiedPair:
+    return RectifiedPair(0, 0, CAMERA, BASELINE, left, right)
+
+
+def texture(width: int, seed: int = 0) -> U8:
+    """Red spots of several sizes, 30 to 220 grey levels."""
+    rng = np.random.default_rng(seed)
+    spots = sum(
+        sigma * cv2.GaussianBlur(rng.normal(size=(HEIGHT, width)), (0, 0), sigma) for sigma in (1.5, 3, 8)
+    )
+    gray = np.clip(125 + 35 * spots / spots.std(), 30, 220).astype(np.uint8)
+    return np.stack([gray, gray // 2, gray // 2], -1)
+
+
+def plane_pair(a: float, b: float, c: float) -> tuple[RectifiedPair, F32]:
+    """A textured plane of disparity a + b x + c y (px) in the left picture, and that disparity."""
+    left = texture(WIDTH)
+    y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
+    source = (x + a + c * y) / (1 - b)  # the left column that the right column x shows
+    right = cv2.remap(left, source, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    return make_pair(left, right), (a + b * x + c * y).astype(np.float32)
+
+
+def to_disparity(depth: F32) -> F32:
+    """The formula is its own inverse; unknown stays 0."""
+    return geometry.disparity_to_depth(depth, CAMERA.K[0, 0], BASELINE)
+
+
+@pytest.mark.parametrize(
+    ("method", "scale", "median_px", "p99_px"),
+    [  # SGBM prefers whole pixels of the matching picture
+        ("dis", 1, 0.05, 0.4),
+        ("dis", 2, 0.1, 0.6),
+        ("dis", 4, 0.2, 1.8),
+        ("sgbm", 1, 0.2, 0.5),
+        ("sgbm", 2, 0.4, 1.0),
+        ("sgbm", 4, 0.8, 2.0),
+    ],
+)
+def test_slanted_plane(method: str, scale: int, median_px: float, p99_px: float) -> None:
+    pair, truth = plane_pair(28.0, 0.02, -0.01)
+    stereo = StereoDepth(StereoConfig(method=method, scale=scale), CAMERA, BASELINE)
+    depth, confidence = stereo(pair, ALL)
+    known = depth > 0
+    error = np.abs(to_disparity(depth) - truth)[known]
+    visible = np.s_[:, 60:]  # columns whose match lies inside the right picture
+    assert known[visible].mean() > 0.95
+    assert np.median(error) < median_px
+    assert np.percentile(error, 99) < p99_px
+    unseen = np.arange(WIDTH) + 2 * scale < truth  # left of what the right picture shows
+    assert known[unseen].mean() < 0.01
+    assert depth.dtype == confidence.dtype == np.float32
+    assert depth.shape == confidence.shape == (HEIGHT, WIDTH)
+    assert np.median(confidence[visible]) > 0.8
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_size_that_the_scale_does_not_divide(method: str) -> None:
+    pair, truth = plane_pair(28.0, 0.02, -0.01)
+    width, height = 637, 509
+    camera = Camera(width, height, CAMERA.K, np.eye(4))
+    cropped = RectifiedPair(0, 0, camera, BASELINE, pair.left[:height, :width], pair.right[:height, :width])
+    depth, _ = StereoDepth(StereoConfig(method=method), camera, BASELINE)(cropped, ALL[:height, :width])
+    error = np.abs(to_disparity(depth) - truth[:height, :width])[depth > 0]
+    assert np.median(error) < 0.4
+    assert (depth > 0).mean() > 0.9
+
+
+def test_rows_off_by_the_calibration_still_match() -> None:
+    pair, truth = plane_pair(28.0, 0.02, -0.01)
+    lower = cv2.warpAffine(pair.right, np.array([[1.0, 0, 0], [0, 1, 2.5]]), (WIDTH, HEIGHT))
+    depth, confidence = StereoDepth(StereoConfig(), CAMERA, BASELINE)(make_pair(pair.left, lower), ALL)
+    inside = np.s_[10:-10, 60:]
+    known = (depth > 0)[inside]
+    assert known.mean() > 0.95
+    assert np.median(confidence[inside]) > 0.8
+    assert np.median(np.abs(to_disparity(depth) - truth)[inside][known]) < 0.2
+
+
+def test_sgbm_says_where_it_found_nothing() -> None:
+    flat = np.full((128, 160), 90, np.uint8)
+    _, known = SemiGlobal(10.0, 40.0)(flat, flat)
+    assert not known.any()
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_cut_to_another_scene_leaves_no_trace(method: str) -> None:
+    near, _ = plane_pair(70.0, 0.0, 0.0)
+    far, _ = plane_pair(15.0, 0.01, 0.0)
+    stereo = StereoDepth(StereoConfig(method=method), CAMERA, BASELINE)
+    first, _ = stereo(far, ALL)
+    stereo(near, ALL)
+    again, _ = stereo(far, ALL)
+    np.testing.assert_array_equal(again, first)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("noise", [0.0, 3.0])
+def test_no_texture_no_depth(method: str, noise: float) -> None:
+    rng = np.random.default_rng(0)
+    left, right = (
+        np.clip(rng.normal(128, noise, (HEIGHT, WIDTH, 3)), 0, 255).astype(np.uint8) for _ in range(2)
+    )
+    depth, confidence = StereoDepth(StereoConfig(method=method), CAMERA, BASELINE)(
+        make_pair(left, right), ALL
+    )
+    assert np.isfinite(depth).all()
+    assert np.isfinite(confidence).all()
+    assert (depth > 0).mean() < (0.1 if noise else 1e-9)
+    assert confidence.mean() < 0.02
+
+
+@pytest.mark.parametrize(("method", "share"), [("dis", 0.05), ("sgbm", 0.15)])
+def test_eyes_that_see_different_things_are_seldom_matched(method: str, share: float) -> None:
+    pair = make_pair(texture(WIDTH, seed=1), texture(WIDTH, seed=2))
+    depth, confidence = StereoDepth(StereoConfig(method=method), CAMERA, BASELINE)(pair, ALL)
+    assert (depth > 0).mean() < share
+    assert confidence.mean() < share / 4
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_depth_ends_at_the_tissue_edge_and_at_the_range(method: str) -> None:
+    pair, truth = plane_pair(28.0, 0.02, -0.01)
+    tissue = ALL.copy()
+    tissue[200:300, 300:] = False
+    config = StereoConfig(method=method, max_depth=0.08)
+    depth, confidence = StereoDepth(config, CAMERA, BASELINE)(pair, tissue)
+    assert not depth[195:305, 295:].any()
+    assert depth[:190, 300:].any()
+    assert depth.max() <= 0.08 * 1.01
+    assert depth[depth > 0].min() >= 0.03 * 0.99
+    assert not confidence[depth == 0].any()
+    assert (to_disparity(truth) > 0.08).any()  # there was something to cut off
+
+
+@pytest.mark.parametrize(
+    ("config", "camera", "baseline", "words"),
+    [
+        (StereoConfig(scale=4), Camera(100, 100, CAMERA.K, np.eye(4)), BASELINE, "too few"),
+        (StereoConfig(), CAMERA, 4.3, "baseline"),
+    ],
+)
+def test_what_cannot_be_matched_is_refused(
+    config: StereoConfig, camera: Camera, baseline: float, words: str
+) -> None:
+    with pytest.raises(UsageError, match=words):
+        StereoDepth(config, camera, baseline)
+
+
+def test_observation_carries_the_frame() -> None:
+    pair, truth = plane_pair(28.0, 0.0, 0.0)
+    confidence = np.full_like(truth, 0.5)
+    observation = observe(pair, ALL, truth, confidence)
+    assert observation.camera is pair.camera
+    assert observation.image.dtype == np.float32
+    np.testing.assert_allclose(observation.image, pair.left / 255, atol=1e-6)
+    expected = pair.left @ np.array([0.299, 0.587, 0.114])
+    np.testing.assert_allclose(observation.gray, expected, atol=1)
+    assert observation.depth is truth
+    assert observation.depth_confidence is confidence
+
+
+# ---- stereo and tissue: real recordings ------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def d4d(data_folder: Path) -> list[tuple[U8, U8, Bool, F32]]:
+    """Left, right, tissue and reference depth (m) of every 20th frame."""
+    folder = data_folder / "d4d_pull"
+    frames = []
+    for index, picture in decode(folder / "2025_03_06-16_49_40_combined_2x2.mp4", every=20):
+        tool = cv2.imread(str(folder / f"toolmask/{index:04d}.png"), cv2.IMREAD_GRAYSCALE) > 127
+        depth = cv2.imread(str(folder / f"depth_mm_x100/{index:04d}.png"), cv2.IMREAD_UNCHANGED) * 1e-5
+        frames.append((picture[:540, :675], picture[:540, 675:], ~tool, depth.astype(np.float32)))
+    return frames
+
+
+def decode(video: Path, every: int) -> Iterator[tuple[int, U8]]:
+    capture = cv2.VideoCapture(str(video))
+    index = 0
+    while capture.grab():
+        if index % every == 0:
+            yield index, cv2.cvtColor(capture.retrieve()[1], cv2.COLOR_BGR2RGB)
+        index += 1
+    capture.release()
+
+
+@pytest.mark.parametrize(
+    ("method", "median_mm", "p90_mm"),
+    [("dis", 1.05, 3.6), ("sgbm", 2.2, 5.0)],  # the reference itself is good to about 1 mm
+)
+def test_depth_of_a_real_session(
+    d4d: list[tuple[U8, U8, Bool, F32]], method: str, median_mm: float, p90_mm: float
+) -> None:
+    rectifier = Rectifier(load_rig(ROOT / "calib/d4d"), 640, 512)
+    find_tissue = TissueMask(TissueConfig(exclude=((0, 0, 367, 37),)), rectifier)
+    stereo = StereoDepth(StereoConfig(method=method), rectifier.camera, rectifier.baseline)
+    errors, wanted = [], 0
+    for left, right, tissue, reference in d4d:
+        frame = make_frame(left, right, tissue)
+        pair = rectifier(frame)
+        mask = find_tissue(frame, pair)
+        depth, _ = stereo(pair, mask)
+        truth = cv2.resize(reference, (640, 512), interpolation=cv2.INTER_NEAREST)
+        errors.append(np.abs(depth - truth)[mask & (truth > 0) & (depth > 0)] * 1e3)
+        side = 2 * round(EDGE_MARGIN * 640) + 1  # so near to an instrument depth is not asked for
+        inner = cv2.erode(mask.view(np.uint8), np.ones((side, side), np.uint8)) > 0
+        wanted += int((inner & (truth > 0)).sum())
+    error = np.concatenate(errors)
+    assert np.median(error) < median_mm
+    assert np.percentile(error, 90) < p90_mm
+    assert len(error) / wanted > 0.89  # the strip that the right eye does not see is 4 %
+
+
+def test_confidence_tells_good_depth_from_bad(d4d: list[tuple[U8, U8, Bool, F32]]) -> None:
+    rectifier = Rectifier(load_rig(ROOT / "calib/d4d"), 640, 512)
+    stereo = StereoDepth(StereoConfig(), rectifier.camera, rectifier.baseline)
+    errors, confidences = [], []
+    for left, right, tissue, reference in d4d:
+        depth, confidence = stereo(rectifier(make_frame(left, right)), rectifier.mask(tissue))
+        truth = cv2.resize(reference, (640, 512), interpolation=cv2.INTER_NEAREST)
+        known = (depth > 0) & (truth > 0)
+        errors.append(np.abs(depth - truth)[known])
+        confidences.append(confidence[known])
+    error, confidence = np.concatenate(errors), np.concatenate(confidences)
+    medians = [
+        np.median(error[(confidence > low) & (confidence <= low + 0.25)]) for low in (0, 0.25, 0.5, 0.75)
+    ]
+    assert medians == sorted(medians, reverse=True)
+    assert medians[0] > 3 * medians[-1]  # where it is worst, beside instruments, there is no depth at all
+
+
+@pytest.mark.parametrize(("method", "coverage"), [("dis", 0.9), ("sgbm", 0.9)])
+def test_metric_depth_against_a_ct_surface(data_folder: Path, method: str, coverage: float) -> None:
+    """Maier-Hein et al., TMI 2014: the CT surface is given in the left raw camera's frame, millimetres."""
+    folder = data_folder / "tmi_ct_pair"
+    rig = read_rig(folder, (720, 576))
+    rectifier = Rectifier(rig, 720, 576)
+    pair = rectifier(make_frame(read_picture(folder / "left.png"), read_picture(folder / "right.png")))
+    stereo = StereoDepth(StereoConfig(method=method), rectifier.camera, rectifier.baseline)
+    depth, _ = stereo(pair, np.ones((576, 720), np.bool_))
+    surface = np.loadtxt(folder / "Stereo_SD_d_complete_22_CT_cut.xyz") * 1e-3
+    pixels, truth = seen_points(rectifier.camera, surface @ rig.left.R.T)
+    measured = depth[pixels[:, 1], pixels[:, 0]]
+    known = measured > 0
+    error_mm = (measured - truth)[known] * 1e3
+    assert known.mean() > coverage
+    assert abs(np.median(error_mm)) < 1.0
+    assert np.median(np.abs(error_mm)) < 1.0
+    assert np.percentile(np.abs(error_mm), 90) < 2.0
+
+
+def seen_points(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels and depths of the points that no other point within 6 px hides: the organ is folded."""
+    projected, depths = geometry.project(camera, points)
+    pixels = np.rint(projected).astype(int)
+    front = np.full((camera.height, camera.width), np.inf, np.float32)
+    np.minimum.at(front, (pixels[:, 1], pixels[:, 0]), depths)
+    front = cv2.erode(front, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (13, 13)))
+    seen = depths < front[pixels[:, 1], pixels[:, 0]] + 2e-3
+    return pixels[seen], depths[seen]
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_large_disparities_and_highlights_of_a_beating_heart(data_folder: Path, method: str) -> None:
+    """No reference here: the right picture, fetched by the depth found, must look like the left one.
+
+    Rows above 70 hold instruments; columns left of 100 are not in the right picture.
+    """
+    folder = data_folder / "hamlyn_invivo_001_100"
+    rectifier = Rectifier(load_rig(ROOT / "calib/hamlyn_heart"), 360, 288)
+    stereo = StereoDepth(StereoConfig(method=method, scale=2), rectifier.camera, rectifier.baseline)
+    columns, rows = np.meshgrid(np.arange(360, dtype=np.float32), np.arange(288, dtype=np.float32))
+    for index in (1, 50, 100):
+        left, right = (read_picture(folder / side / f"{index:04d}.jpg") for side in ("left", "right"))
+        depth, _ = stereo(rectifier(make_frame(left, right)), np.ones((288, 360), np.bool_))
+        known = depth > 0
+        disparity = geometry.disparity_to_depth(depth, rectifier.camera.K[0, 0], rectifier.baseline)
+        heart = np.s_[70:, 100:]
+        low, high = np.percentile(disparity[heart][known[heart]], [1, 99])
+        assert 56 < low < high < 100
+        assert known[heart].mean() > 0.85
+        fetched = cv2.remap(right, columns - disparity, rows, cv2.INTER_LINEAR)
+        matched = np.abs(fetched.astype(np.float32) - left)[known].mean()
+        unmatched = np.abs(right.astype(np.float32) - left)[known].mean()
+        assert matched < 0.25 * unmatched

@@ -1,0 +1,181 @@
+"""Tissue masks from another process: a real node, and the example that this repository gives."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from places import ROOT
+
+from sags_node.messaging.control import ControlClient
+from sags_node.messaging.received import ReceivedImage, TopicName
+from sags_node.messaging.stream import listen
+from sags_node.messaging.subscriber import Subscriber
+
+pytestmark = pytest.mark.live
+
+EXAMPLES = ROOT / "examples"
+START_SECONDS = 120  # the first start on a machine compiles kernels
+PICTURE, MASK = (TopicName(f"left/{name}", ReceivedImage) for name in ("image_rect_color", "tissue_mask"))
+DEPTH = TopicName("left/render/depth", ReceivedImage)
+TOLERANCE = 0.25  # s
+
+
+def segment(picture: np.ndarray) -> np.ndarray:
+    sys.path.insert(0, str(EXAMPLES))
+    try:
+        from tissue_masks import segment
+    finally:
+        sys.path.remove(str(EXAMPLES))
+    return np.asarray(segment(picture))
+
+
+@contextmanager
+def process(home: Path, *command: str) -> Iterator[subprocess.Popen[str]]:
+    environment = {**os.environ, "XDG_RUNTIME_DIR": str(home)}
+    with subprocess.Popen(
+        [sys.executable, *command],
+        env=environment,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as running:
+        try:
+            yield running
+        finally:
+            running.send_signal(signal.SIGINT)
+            running.wait(30)
+
+
+def until(ready: Callable[[], Any], seconds: float = 20.0) -> Any:
+    deadline = time.monotonic() + seconds
+    while not (found := ready()):
+        assert time.monotonic() < deadline, "it did not come"
+        time.sleep(0.02)
+    return found
+
+
+def node_command(session: Path, home: Path, **changes: str) -> list[str]:
+    settings = {
+        "method": "topic",
+        "endpoint": f"ipc://{home}/sags/masks.ipc",
+        "tissue_is": "white",
+        "tolerance": str(TOLERANCE),
+        "dilate": "0",
+        **changes,
+    }
+    return [
+        *("-m", "sags_node", "run", str(session), "source.loop:=true", "mapping.budget_ms:=20"),
+        *("publish.data:=[tcp://127.0.0.1:*]", "publish.control:=tcp://127.0.0.1:*"),
+        *(f"vision.tissue.{key}:={value}" for key, value in settings.items()),
+    ]
+
+
+@pytest.fixture(scope="module")
+def home(phantom_session: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A running node that takes masks from a topic on which nobody is yet."""
+    home = tmp_path_factory.mktemp("masks")
+    with process(home, *node_command(phantom_session, home)):
+        until((home / "sags/sags.json").exists, START_SECONDS)
+        with Subscriber(["tf"], run_dir=home / "sags") as subscriber:
+            assert subscriber.wait("tf", START_SECONDS) is not None
+        yield home
+
+
+def warning(client: ControlClient) -> str:
+    return str(client.request("get_status", timeout=30)["warnings"].get("mask", ""))
+
+
+def masker(home: Path) -> Any:
+    return process(home, str(EXAMPLES / "tissue_masks.py"), "tcp://127.0.0.1:*")
+
+
+def test_masks_come_and_go_and_the_frames_go_on(home: Path) -> None:
+    run_dir = home / "sags"
+    with ControlClient(run_dir=run_dir) as client, Subscriber([PICTURE, MASK], run_dir=run_dir) as subscriber:
+        assert "no mask has come on masks/left/tissue_mask" in until(lambda: warning(client))
+        with masker(home):
+            until(lambda: not warning(client))
+            assert fits(subscriber, frames=20) > 15  # the phantom is played at 10 Hz
+            began, first = time.monotonic(), subscriber.wait(MASK, 30)
+        assert "older than the picture" in until(lambda: warning(client))
+        assert fits(subscriber, frames=10) < 5  # found without: other pixels
+        last = subscriber.wait(MASK, 30)
+        assert first is not None and last is not None
+        rate = (last.meta.frame_id - first.meta.frame_id) / (time.monotonic() - began)
+        assert 9 < rate < 11 and subscriber.ok(MASK)
+        with masker(home):
+            until(lambda: not warning(client))
+            assert fits(subscriber, frames=10) > 7
+
+
+def fits(subscriber: Subscriber, frames: int) -> int:
+    """In how many of so many frames the node's mask is the example's, made of a picture not long before."""
+    pictures: list[np.ndarray] = []
+    last, count = None, 0
+    for _ in range(frames):
+        last = subscriber.wait(MASK, 30, after=last)
+        assert last is not None
+        picture = subscriber.latest(PICTURE)
+        assert picture is not None
+        pictures = [*pictures, picture.array][-4:]
+        made = [segment(shown) > 0 for shown in pictures]
+        count += any(np.array_equal(mask, last.array > 0) for mask in made)
+    return count
+
+
+def test_the_picture_goes_out_before_its_frame_is_mapped(home: Path) -> None:
+    """Once, and every frame's: so that a mask of it is there for the next frame."""
+    sent: dict[str, dict[int, int]] = {PICTURE: {}, DEPTH: {}}
+    sequence: list[int] = []
+    for arrived in listen([PICTURE, DEPTH], None, "sags", 3.0, run_dir=home / "sags"):
+        if arrived is not None:
+            message, _ = arrived
+            name = message.topic.removeprefix("sags/")
+            assert message.meta.frame_id not in sent[name]
+            sent[name][message.meta.frame_id] = message.meta.publish_ns
+            if name == PICTURE:
+                sequence.append(message.meta.seq)
+    both = sorted(set(sent[PICTURE]) & set(sent[DEPTH]))
+    assert len(both) > 20 and np.diff(sequence).max() == 1
+    ahead_ms = [(sent[DEPTH][frame] - sent[PICTURE][frame]) * 1e-6 for frame in both]
+    assert np.median(ahead_ms) > 5
+
+
+def test_the_overlays_video_is_whole_all_the_same(home: Path, tmp_path: Path) -> None:
+    """It must not take a picture that is ahead for a frame whose rest is missing."""
+    video = tmp_path / "overlay.mp4"
+    command = ["-m", "sags_node", "overlay", "--run-dir", str(home / "sags"), "--seconds", "3", "--json"]
+    environment = {**os.environ, "XDG_RUNTIME_DIR": str(home)}
+    done = subprocess.run(
+        [sys.executable, *command, "--save", str(video)],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    summary = json.loads(done.stdout)
+    assert summary["frames"] > 20 and summary["blanked"].get("incomplete frame", 0) <= 2
+    assert cv2.VideoCapture(str(video)).get(cv2.CAP_PROP_FRAME_COUNT) >= summary["frames"] - 5
+
+
+def test_masks_upside_down_end_the_node_with_a_hint(phantom_session: Path, tmp_path: Path) -> None:
+    home = tmp_path / "home"
+    home.mkdir(mode=0o700)
+    with process(home, *node_command(phantom_session, home, tissue_is="black")) as node:
+        until((home / "sags/sags.json").exists, START_SECONDS)
+        with masker(home):
+            _, errors = node.communicate(timeout=60)
+        assert node.returncode == 2
+        assert "the topic's masks call over half" in errors and "tissue_is to white, it is black" in errors

@@ -1,0 +1,281 @@
+"""Warnings reach people, and every one of them can be looked up."""
+
+from __future__ import annotations
+
+import ast
+import io
+import json
+import re
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from places import ROOT
+from rich.console import Console
+from synthetic import health, plane_result, publisher, stream
+
+from sags_node.evaluation.measure import FrameRow, Options
+from sags_node.evaluation.report import _warning_table
+from sags_node.evaluation.spool import RunFacts
+from sags_node.evaluation.summary import summarise
+from sags_node.findings import STAGES, by_code, by_stage, in_words
+from sags_node.foreground import run_node
+from sags_node.health import MOST_LEFT_OUT, WINDOW, Statistics
+from sags_node.messaging.cdr import decode
+from sags_node.messaging.content import diagnostics, status
+from sags_node.messaging.received import ReceivedText
+from sags_node.messaging.subscriber import Subscriber
+from sags_node.node import Node
+from sags_node.overlay.draw import color_key, draw
+from sags_node.overlay.frame import TissueFrame
+from sags_node.overlay.mark import draw_mark, headlines
+from sags_node.pipeline import Pipeline
+from sags_node.session import open_session
+from sags_node.terminal.notices import Notices
+from sags_node.topic import topic_echo
+from sags_node.types import Camera, Finding, NodeHealth
+from sags_node.viewer.feed import Moment, Status
+
+BLACK = Finding("right_eye_black", "the right picture is black: see to the light")
+ROWS = Finding("rows_differ", "rows of the eyes differ by 1.2 px: the calibration no longer fits")
+
+
+# ---- every code is known and explained -------------------------------------------------------------------
+
+
+def documented() -> dict[str, list[str]]:
+    """Code -> cause and remedy, of the tables in the document."""
+    found: dict[str, list[str]] = {}
+    for line in (ROOT / "docs/warnings.md").read_text(encoding="utf-8").splitlines():
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        codes = re.findall(r"`([a-z_]+)`", cells[0])
+        if len(cells) == 3 and codes and re.sub(r"`[a-z_]+`", "", cells[0]).strip() == "":
+            for code in codes:
+                assert code not in found, f"{code} stands in two rows"
+                found[code] = cells[1:]
+    return found
+
+
+def emitted() -> Iterator[tuple[str, str]]:
+    """A regular expression for the code of every `Finding` that the package makes, and where."""
+    for file in (ROOT / "sags_node").rglob("*.py"):
+        text = file.read_text(encoding="utf-8")
+        if "sags_node.types import" not in text:
+            continue
+        for node in ast.walk(ast.parse(text)):
+            if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.args):
+                continue
+            if node.func.id == "Finding" and "calibration" not in file.parts and "calib" not in file.name:
+                yield _pattern(node.args[0]), f"{file.name}:{node.lineno}"
+
+
+def _pattern(code: ast.expr) -> str:
+    if isinstance(code, ast.Constant):
+        return re.escape(str(code.value))
+    if isinstance(code, ast.JoinedStr):
+        return "".join(_pattern(part) if isinstance(part, ast.Constant) else "[a-z]+" for part in code.values)
+    return "[a-z_]+"  # a variable: `by_stage` refuses what is unknown
+
+
+def test_the_document_explains_every_warning_and_no_other() -> None:
+    rows = documented()
+    assert set(rows) == set(STAGES)
+    assert all(len(cell) > 10 for cells in rows.values() for cell in cells)
+
+
+def test_every_code_that_is_made_is_known() -> None:
+    made = list(emitted())
+    assert len(made) >= 8  # or the search has lost them
+    for pattern, where in made:
+        assert any(re.fullmatch(pattern, code) for code in STAGES), f"{where}: {pattern}"
+
+
+def test_a_code_that_nobody_could_look_up_is_refused() -> None:
+    with pytest.raises(KeyError, match="unheard_of"):
+        by_stage([Finding("unheard_of", "something is wrong")])
+
+
+# ---- on the wire -----------------------------------------------------------------------------------------
+
+
+def test_codes_stand_beside_the_words() -> None:
+    black, other = BLACK, Finding("left_eye_plain", "the left picture is of one colour: see to the lens")
+    said = replace(health(), warnings=by_stage([black, ROWS, other]))
+    fields = json.loads(json.dumps(status(said, None)))
+    assert fields["warnings"] == {"eyes": f"{black.text}; {other.text}", "calibration": ROWS.text}
+    assert fields["warning_codes"] == {found.code: found.text for found in (black, other, ROWS)}
+    content = diagnostics(said, 0)
+    statuses = decode(b"".join(content.parts), "diagnostic_msgs/msg/DiagnosticArray").status
+    (eyes,) = (each for each in statuses if each.name == "eyes")
+    assert eyes.level in (1, b"\x01")
+    assert {value.key: value.value for value in eyes.values} == {
+        black.code: black.text,
+        other.code: other.text,
+    }
+
+
+@pytest.mark.live
+def test_a_node_says_at_once_what_begins_and_what_ends(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between two of the messages that come every second."""
+    found: list[Finding] = []
+    monkeypatch.setattr(Pipeline, "warnings", property(lambda self: by_stage(found)))
+    overrides = ["source.loop:=true", "source.rate:=10", "mapping.iterations:=0", "publish.control:=null"]
+    overrides += ["publish.data:=[tcp://127.0.0.1:*]", f"publish.run_dir:={tmp_path / 'run'}"]
+    session = open_session(ROOT / "replay/phantom_pull", overrides)
+    node = Node(session.config, session.rig, session.source)
+    node.start()
+    try:
+        with Subscriber(["status"], run_dir=tmp_path / "run") as subscriber:
+            last = subscriber.wait("status", 30)
+            delays = []
+            for wanted in 3 * ([BLACK], []):
+                last = subscriber.wait("status", 5, after=last)  # the next is due in a second
+                changed = time.time_ns()
+                found[:] = wanted
+                while not isinstance(last, ReceivedText) or last.warnings() != by_code(by_stage(wanted)):
+                    last = subscriber.wait("status", 5, after=last)
+                    assert last is not None
+                delays.append((last.meta.publish_ns - changed) * 1e-9)
+    finally:
+        node.stop()
+    assert np.median(delays) < 0.5
+
+
+# ---- the flow of frames ----------------------------------------------------------------------------------
+
+
+def flowing(statistics: Statistics, frames: int, dropped: int, slot: str, before: int = 0) -> set[str]:
+    """Codes after so many frames more, over which so many were left out."""
+    result = plane_result()
+    for number in range(frames):
+        statistics.add(result, 1.0, {slot: before + dropped * (number + 1) // frames})
+    said = statistics.health(
+        dropped={}, stopping=False, paused=False, error=None, warnings={}, connections={}, views={}
+    )
+    return set(by_code(said.warnings))
+
+
+@pytest.mark.parametrize(("slot", "code"), [("capture", "frames_missed"), ("source", "source_drops")])
+def test_frames_that_are_left_out_are_told_of(slot: str, code: str) -> None:
+    count = round(2 * MOST_LEFT_OUT * WINDOW)
+    statistics = Statistics()
+    assert flowing(statistics, WINDOW, count, slot) == {code}
+    assert flowing(statistics, WINDOW, 0, slot, before=count) == set()
+
+
+def test_a_few_frames_left_out_are_no_warning() -> None:
+    assert flowing(Statistics(), WINDOW, round(0.5 * MOST_LEFT_OUT * WINDOW), "capture") == set()
+
+
+# ---- people ----------------------------------------------------------------------------------------------
+
+
+def test_a_line_when_it_begins_and_one_when_it_is_over() -> None:
+    lines: list[str] = []
+    notices = Notices(lines.append)
+    moving = ROWS._replace(text="rows of the eyes differ by 1.3 px")
+    for found in ([], [BLACK], [BLACK, ROWS], [BLACK, moving], [moving], []):
+        notices.update(by_code(by_stage(found)))
+    began, more, over, last = lines
+    assert BLACK.text in began and BLACK.code in began and "docs/warnings.md" in began
+    assert ROWS.text in more and ROWS.code in more
+    assert over.startswith("over after") and BLACK.code in over and ROWS.code in last
+
+
+def test_the_mark_says_what_is_wrong_and_stays_on_the_rim() -> None:
+    assert headlines(by_code({"eyes": (BLACK,)})) == ["the right picture is black"]
+    many = {str(number): f"number {number}: mend it" for number in range(5)}
+    assert headlines(many) == ["number 0", "number 1 (and 3 more)"]
+    rgba = np.zeros((512, 640, 4), np.uint8)
+    draw_mark(rgba, in_words({"eyes": (BLACK,)}))
+    rows = np.flatnonzero(rgba[..., 3].any(1))
+    assert rows.max() == 511 and rows.min() > 0.9 * 512
+    assert set(np.unique(rgba[..., 3])) == {0, 255}
+    small = np.zeros((120, 160, 4), np.uint8)
+    draw_mark(small, {"rows_differ": 3 * ROWS.text.replace(":", "")})
+    assert small[-1, :, 3].any()
+
+
+@pytest.mark.parametrize("shift", [7, 25])
+def test_the_mark_lies_farther_left_in_the_right_eye(shift: int) -> None:
+    left, right = np.zeros((2, 240, 320, 4), np.uint8)
+    draw_mark(left, by_code({"eyes": (BLACK,)}))
+    draw_mark(right, by_code({"eyes": (BLACK,)}), shift)
+    assert left.any() and np.array_equal(left[:, shift:], right[:, :-shift])
+
+
+def test_the_mark_is_drawn_over_instruments_in_both_eyes_and_survives_the_colour_key() -> None:
+    size = (240, 320)
+    K = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
+    frame = TissueFrame(
+        1, 1, "s", 0, Camera(320, 240, K, np.eye(4)), 0.004, np.full(size, 0.06, np.float32),
+        np.zeros(size, np.bool_), {},
+    )  # fmt: skip
+    for baseline in (0.0, 0.004):
+        assert not draw(frame, [], baseline).any()
+        rgba = draw(frame, [], baseline, warnings=by_code({"eyes": (BLACK,)}))
+        shown = rgba[..., 3] == 255
+        assert shown.any() and np.array_equal(color_key(rgba, (0, 0, 255))[shown], rgba[shown][:, :3])
+
+
+class Playing:
+    """A node as `sags run` sees it: what it warns of at each look."""
+
+    def __init__(self, *looks: tuple[Finding, ...]) -> None:
+        self._looks = list(looks)
+
+    def start(self) -> None: ...
+
+    def stop(self) -> None: ...
+
+    def wait(self, timeout: float) -> bool:
+        return not self._looks
+
+    def health(self) -> NodeHealth:
+        found = self._looks.pop(0) if self._looks else ()
+        return replace(health(), warnings=by_stage(found))
+
+
+def test_sags_run_says_when_a_warning_begins_and_ends() -> None:
+    said = io.StringIO()
+    run_node(Playing((), (BLACK,), (BLACK,), ()), None, Console(file=said, width=60))  # type: ignore[arg-type]
+    began, over = said.getvalue().splitlines()
+    assert BLACK.text in began and "over" in over and BLACK.code in over
+
+
+def test_the_report_says_when_and_what_to_do() -> None:
+    facts = RunFacts(0, 1.0, None, 1.0, {}, {}, 1, {})
+    warned = replace(facts, warnings={BLACK.code: "<" + BLACK.text})
+    rows = [FrameRow(k, k / 30, {}, warned if 3 <= k < 8 else facts) for k in range(10)]
+    table = _warning_table(rows)
+    assert "5 frames, 3 to 7" in table and "&lt;" + BLACK.text in table and BLACK.code in table
+    assert _warning_table(rows[:3]) == ""
+    assert summarise("s", rows, Options(hold_out=0), {}, None)["warnings"] == {BLACK.code: 5}
+
+
+@pytest.mark.live
+def test_topic_echo_tells_of_warnings_whatever_the_topic(tmp_path: Path) -> None:
+    warned = replace(health(), warnings=by_stage([BLACK]))
+    told: list[dict[str, str]] = []
+    with publisher(tmp_path / "run") as running:
+        with stream(running, said=lambda: warned):
+            where = running.connection.data[-1]
+            records = []
+            for record in topic_echo("tf", where, seconds=20, warned=lambda found: told.append(dict(found))):
+                records.append(record["topic"])
+                if told:
+                    break
+    assert set(records) == {"sags/tf"} and told[0] == {BLACK.code: BLACK.text}
+
+
+def test_the_viewer_shows_them_below_the_status() -> None:
+    panel = pytest.importorskip("sags_node.viewer.panel", reason="viser is not installed (extra: viewer)")
+    status = Status("running", warning_codes={BLACK.code: f"<b>{BLACK.text}"})
+    shown = panel._status_line(Moment(None, status))
+    assert f"&lt;b&gt;{BLACK.text}" in shown and BLACK.code in shown and "sags-warning" in shown
+    assert "sags-warning" not in panel._status_line(Moment(None, Status("running")))
