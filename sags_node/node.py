@@ -1,4 +1,4 @@
-r"""The running node: four threads and the slots between them. The only file that knows threads.
+r"""The running node: four threads and the slots between them.
 
     capture --frames--> mapping --results--> publishing
                            \--scenes--> drawing --views--/
@@ -17,25 +17,18 @@ import time
 import uuid
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import asdict, replace
-from pathlib import Path
-from queue import Empty, SimpleQueue
+from dataclasses import replace
 from typing import Any
-
-import numpy as np
 
 from sags_node.config import LaunchConfig, V4l2Source
 from sags_node.errors import SagsError
 from sags_node.findings import by_code
-from sags_node.health import Statistics
 from sags_node.kernels.threads import configure_threads
 from sags_node.latest import Latest
-from sags_node.launch_file import with_parameters
 from sags_node.messaging import content
 from sags_node.messaging.masks import MaskSubscriber
 from sags_node.messaging.publisher import Publisher
-from sags_node.messaging.requests import AnchorName, AnchorRequest, ViewName, ViewRequest, parse
-from sags_node.model.ply import write_ply
+from sags_node.node_operations import NodeState, Operations
 from sags_node.pipeline import Pipeline
 from sags_node.recording.child import RecorderProcess
 from sags_node.sources.source import Source
@@ -47,13 +40,6 @@ log = logging.getLogger(__name__)
 HEALTH_PERIOD = 1.0  # s
 STOP_SECONDS = 10.0  # longest wait for each thread to end
 REQUEST_WAIT = 0.05  # s: how soon a request is served while no frames come
-LIVE_PARAMETERS = (
-    "mapping.budget_ms",
-    "mapping.skip_duplicates",
-    "mapping.skip_depth",
-    "mapping.skip_fitted",
-    "mapping.skip_still",
-)
 
 OnResult = Callable[[FrameResult, float], None]  # a published result and its latency, ms
 
@@ -72,18 +58,17 @@ class Node:
         Raises:
             SagsError: an endpoint cannot be bound, or the configuration does not fit the rig.
         """
-        self.config = config
-        self._rig = rig
         self._source = source
         self._on_result = on_result
         self._masks: MaskSubscriber | None = None
         if config.vision.tissue.endpoint is not None and config.vision.tissue.method == "topic":
             self._masks = MaskSubscriber(config.vision.tissue.endpoint, config.vision.tissue.ns)
-            self._pipeline = Pipeline(config, rig, self._masks.nearest, self._offer_picture)
+            pipeline = Pipeline(config, rig, self._masks.nearest, self._offer_picture)
         else:
-            self._pipeline = Pipeline(config, rig)
+            pipeline = Pipeline(config, rig)
+        self._state = NodeState(config, pipeline, pipeline.make_budget(), Views(config.engine.backend))
+        self._operations = Operations(self._state, self._hand_over_view)
         self._pictures: Latest[tuple[RectifiedPair, int]] = Latest(on_put=self._wake_publishing)  # and epoch
-        self._budget = self._pipeline.make_budget()
         self._live = isinstance(config.source, V4l2Source) or config.source.pace == "realtime"
         self._wake = os.eventfd(0, os.EFD_NONBLOCK)
         self._frames: Latest[tuple[StereoFrame, float]] = Latest()  # and when it came
@@ -91,19 +76,17 @@ class Node:
         self._scenes: Latest[tuple[FrameResult, bool]] = Latest()  # and whether frames were missed
         # By name, the newest only; None: closed. Single operations on a dict need no lock.
         self._drawn: dict[str, DrawnView | None] = {}
-        self._views = Views(config.engine.backend)
         self._watched: frozenset[str] = frozenset()  # views that somebody subscribes to
-        self._mapping_requests = _Requests()
-        self._view_requests = _Requests()
         self._error: BaseException | None = None
         self._stopping = threading.Event()
-        self._paused = threading.Event()
-        self._parameters_changed = threading.Event()
-        self._state_changed = threading.Event()  # status is due at once
-        self._stats = Statistics()
         self._last_sent: FrameResult | None = None
-        self._scene: FrameResult | None = None  # drawn last; of the drawing thread
-        self._publisher = Publisher(config.publish, config.ns, uuid.uuid4().hex, self._handlers())
+        handlers = self._operations.handlers() | {
+            "get_status": lambda args: content.status(self.health(), self._last_sent),
+            "start_recording": self._start_recording,
+            "stop_recording": lambda args: self._recorder.stop(),
+            "take_snapshot": lambda args: self._recorder.snapshot(),
+        }
+        self._publisher = Publisher(config.publish, config.ns, uuid.uuid4().hex, handlers)
         ipc = [endpoint for endpoint in self.endpoints if endpoint.startswith("ipc:")]
         self._recorder = RecorderProcess(config.ns, ipc[0] if ipc else None)
         work = {
@@ -152,20 +135,25 @@ class Node:
             self._masks.close()
 
     @property
+    def config(self) -> LaunchConfig:
+        """As it is now: some parameters change while the node runs."""
+        return self._state.config
+
+    @property
     def endpoints(self) -> list[str]:
         """Where the data socket is bound."""
         return self._publisher.connection.data
 
     def health(self) -> NodeHealth:
         """What is true now; may be called from any thread."""
-        return self._stats.health(
+        return self._state.statistics.health(
             dropped=self._dropped(),
             stopping=self._stopping.is_set(),
-            paused=self._paused.is_set(),
+            paused=self._state.paused.is_set(),
             error=self._error,
-            warnings=self._pipeline.warnings,
+            warnings=self._state.pipeline.warnings,
             connections=self._publisher.connections,
-            views=self._views.status,
+            views=self._state.views.status,
         )
 
     def _dropped(self) -> dict[str, int]:
@@ -204,25 +192,25 @@ class Node:
                 give((frame, time.monotonic()))
 
     def _map(self) -> None:
-        configure_threads(self.config.engine.threads)
+        configure_threads(self._state.config.engine.threads)
         give = self._results.put if self._live else self._results.hand_over
         dropped = 0
         while not self._frames.closed:
-            self._mapping_requests.serve()
+            self._operations.for_mapping.serve()
             ending = self._stopping.is_set() or self._error is not None
-            if self._paused.is_set() and not self._live and not ending:
+            if self._state.paused.is_set() and not self._live and not ending:
                 self._stopping.wait(REQUEST_WAIT)  # the recording waits; live frames are taken and left out
                 continue
             came = self._frames.get(timeout=REQUEST_WAIT)
-            if came is not None and not self._paused.is_set():
+            if came is not None and not self._state.paused.is_set():
                 frame, at = came
                 waited = time.monotonic() - at if self._live else 0.0
-                result = self._pipeline.process(frame, self._budget, waited)
+                result = self._state.pipeline.process(frame, self._state.budget, waited)
                 give(result)
                 dropped, before = self._frames.dropped, dropped
                 if not result.held:
                     self._scenes.put((result, dropped > before))
-        self._mapping_requests.serve()
+        self._operations.for_mapping.serve()
 
     def _draw_views(self) -> None:
         prepare_thread()
@@ -231,11 +219,11 @@ class Node:
             came = self._scenes.get(timeout=REQUEST_WAIT)
             if came is not None:
                 newest, missed = came
-                for name, drawn in self._views.draw_due(newest, self._watched, missed):
+                for name, drawn in self._state.views.draw_due(newest, self._watched, missed):
                     self._hand_over_view(name, drawn)
-            self._scene = newest
-            self._view_requests.serve()
-        self._view_requests.serve()
+            self._state.scene = newest
+            self._operations.for_drawing.serve()
+        self._operations.for_drawing.serve()
 
     def _hand_over_view(self, name: str, drawn: DrawnView | None) -> None:
         self._drawn[name] = drawn
@@ -257,15 +245,15 @@ class Node:
         self._publisher.close()
 
     def _publish(self) -> None:
-        self._parameters_changed.set()
+        self._state.parameters_changed.set()
         next_health = time.monotonic()
         warned: tuple[str, ...] = ()
         while not self._results.closed:
             if self._publisher.poll(timeout_ms=100, wake_fd=self._wake):
                 os.eventfd_read(self._wake)
-            if self._parameters_changed.is_set():
-                self._parameters_changed.clear()
-                self._publisher.publish_parameters(self.config.model_dump(mode="json"))
+            if self._state.parameters_changed.is_set():
+                self._state.parameters_changed.clear()
+                self._publisher.publish_parameters(self._state.config.model_dump(mode="json"))
             result = self._results.get(timeout=0)
             if result is not None:
                 self._send(result)
@@ -273,9 +261,9 @@ class Node:
             if picture is not None:
                 self._publisher.publish_picture(*picture)
             self._send_views()
-            before, warned = warned, tuple(by_code(self._pipeline.warnings))
-            if time.monotonic() >= next_health or self._state_changed.is_set() or warned != before:
-                self._state_changed.clear()
+            before, warned = warned, tuple(by_code(self._state.pipeline.warnings))
+            if time.monotonic() >= next_health or self._state.status_due.is_set() or warned != before:
+                self._state.status_due.clear()
                 next_health = time.monotonic() + HEALTH_PERIOD
                 self._publisher.publish_health(self.health())
         self._publisher.publish_health(self.health())
@@ -286,7 +274,7 @@ class Node:
         publish_ms = (time.perf_counter() - started) * 1e3
         latency_ms = (time.time_ns() - result.pair.t_capture_ns) * 1e-6
         result = replace(result, timings_ms={**result.timings_ms, "publish": publish_ms})
-        self._stats.add(result, latency_ms, self._dropped())
+        self._state.statistics.add(result, latency_ms, self._dropped())
         self._last_sent = result
         if self._on_result is not None:
             self._on_result(result, latency_ms)
@@ -298,125 +286,8 @@ class Node:
                 self._publisher.forget_view(name)
             else:
                 self._publisher.publish_view(name, drawn)
-        self._watched = frozenset(name for name in self._views.status if self._publisher.watches_view(name))
-
-    # ---- control -------------------------------------------------------------------------------------
-
-    def _handlers(self) -> dict[str, Callable[[dict[str, Any]], Any]]:
-        return {
-            "get_status": lambda args: content.status(self.health(), self._last_sent),
-            "get_parameters": lambda args: self.config.model_dump(mode="json"),
-            "set_parameters": lambda args: self._mapping_requests.post(lambda: self._set_parameters(args)),
-            "reset_model": lambda args: self._mapping_requests.post(self._reset_model),
-            "pause": lambda args: self._mapping_requests.post(self._pause),
-            "resume": lambda args: self._mapping_requests.post(self._resume),
-            "add_anchor": lambda args: self._mapping_requests.post(lambda: self._add_anchor(args)),
-            "remove_anchor": lambda args: self._mapping_requests.post(lambda: self._remove_anchor(args)),
-            "open_view": lambda args: self._view_requests.post(lambda: self._open_view(args)),
-            "close_view": lambda args: self._view_requests.post(lambda: self._close_view(args)),
-            "start_recording": self._start_recording,
-            "stop_recording": lambda args: self._recorder.stop(),
-            "take_snapshot": lambda args: self._recorder.snapshot(),
-            "save_model": lambda args: self._mapping_requests.post(lambda: self._save_model(args)),
-        }
-
-    def _set_parameters(self, args: dict[str, Any]) -> dict[str, Any]:
-        refused = [key for key in args if key not in LIVE_PARAMETERS]
-        if refused:
-            raise SagsError(
-                f"{', '.join(refused)} cannot be changed while running; "
-                f"what can: {', '.join(LIVE_PARAMETERS)}"
-            )
-        self.config = with_parameters(self.config, args)
-        self._pipeline.reconfigure(self.config)
-        self._budget = self._pipeline.make_budget(self._budget.speed)
-        self._parameters_changed.set()
-        return self.config.model_dump(mode="json")
+        names = self._state.views.status
+        self._watched = frozenset(name for name in names if self._publisher.watches_view(name))
 
     def _start_recording(self, args: dict[str, Any]) -> Future[Any]:
         return self._recorder.start(args)
-
-    def _reset_model(self) -> dict[str, Any]:
-        self._pipeline.reset()
-        return {}
-
-    def _pause(self) -> dict[str, Any]:
-        self._paused.set()
-        self._state_changed.set()
-        return {"paused": True}
-
-    def _resume(self) -> dict[str, Any]:
-        if self._paused.is_set():
-            self._stats.forget_rate()
-            self._paused.clear()
-            self._state_changed.set()
-        return {"paused": False}
-
-    def _add_anchor(self, args: dict[str, Any]) -> dict[str, Any]:
-        request = parse(AnchorRequest, args)
-        newest = self._pipeline.newest
-        if newest is None:
-            raise SagsError("there is no model yet; wait for the first frame")
-        frame = newest.observation, newest.snapshot, newest.views["left"]
-        if request.u is not None and request.v is not None:
-            anchor = self._pipeline.anchors.add_pixel(request.u, request.v, *frame)
-        else:
-            point = np.array([request.x, request.y, request.z], np.float64)
-            anchor = self._pipeline.anchors.add_point(point, *frame)
-        sure = self._pipeline.anchors.depth_confidence(anchor)
-        return {"id": anchor, "frame_id": newest.pair.frame_id, "depth_confidence": round(sure, 3)}
-
-    def _remove_anchor(self, args: dict[str, Any]) -> dict[str, Any]:
-        self._pipeline.anchors.remove(parse(AnchorName, args).id)
-        return {}
-
-    def _open_view(self, args: dict[str, Any]) -> dict[str, Any]:
-        request = parse(ViewRequest, args)
-        drawn = self._views.open(request, self._scene)
-        if drawn is not None:
-            self._hand_over_view(request.name, drawn)
-        status = self._views.status[request.name]
-        return {"topics": content.view_topics(request.name, request.stereo, request.depth), **asdict(status)}
-
-    def _close_view(self, args: dict[str, Any]) -> dict[str, Any]:
-        name = parse(ViewName, args).name
-        self._views.close(name)
-        self._hand_over_view(name, None)
-        return {}
-
-    def _save_model(self, args: dict[str, Any]) -> dict[str, Any]:
-        path = args.get("path")
-        if not isinstance(path, str) or not path.endswith(".ply"):
-            raise SagsError("save_model needs a path that ends in .ply")
-        if "\0" in path:
-            raise SagsError("a path cannot hold a zero character")
-        gaussians = self._pipeline.mapper.model.frozen()
-        if len(gaussians) == 0:
-            raise SagsError("there is no model yet; wait for the first frame")
-        file = Path(path).absolute()
-        write_ply(file, gaussians)
-        return {"path": str(file), "gaussians": len(gaussians)}
-
-
-class _Requests:
-    """Work that other threads leave for one thread to do."""
-
-    def __init__(self) -> None:
-        self._waiting: SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = SimpleQueue()
-
-    def post(self, work: Callable[[], Any]) -> Future[Any]:
-        future: Future[Any] = Future()
-        self._waiting.put((work, future))
-        return future
-
-    def serve(self) -> None:
-        """Do all that waits; its failure is the answer, and does not end the thread."""
-        while True:
-            try:
-                work, future = self._waiting.get_nowait()
-            except Empty:
-                return
-            try:
-                future.set_result(work())
-            except Exception as error:  # a client's request must not end the node; it is the answer
-                future.set_exception(error)

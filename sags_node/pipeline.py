@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 
-import numpy as np
-
-from sags_node.confidence import HALVING, confidence_of
+from sags_node.confidence import HALVING
 from sags_node.config import LaunchConfig
-from sags_node.engine.rasterizer.confidence import doubted
 from sags_node.engine.rasterizer.rasterize import to_view
 from sags_node.findings import Findings, by_stage
 from sags_node.mapping.anchors import Anchors
@@ -20,10 +17,8 @@ from sags_node.mapping.camera_tracker import CameraTracker
 from sags_node.mapping.depth_memory import UNWATCHED
 from sags_node.mapping.devices import affordable, make_budget, make_refiner
 from sags_node.mapping.mapper import Mapped, Mapper
+from sags_node.repeats import doubted, repeated, unseen
 from sags_node.types import (
-    F32,
-    NO_TIME,
-    AnchorStates,
     Bool,
     Camera,
     Finding,
@@ -35,19 +30,15 @@ from sags_node.types import (
     StereoRig,
 )
 from sags_node.vision.change import StillScene, rms_difference
-from sags_node.vision.match_watch import MatchWatch
+from sags_node.vision.depth import DepthChoice, Measured
 from sags_node.vision.observe import observe
-from sags_node.vision.onnx_depth import NetworkDepth
-from sags_node.vision.pair_watch import PairWatch
-from sags_node.vision.pyramid import pyramids
+from sags_node.vision.pair_watch import PairWatch, Verdict
 from sags_node.vision.rectify import Rectifier
 from sags_node.vision.scene_watch import Advice, SceneWatch, enlarged, exposed
-from sags_node.vision.stereo import StereoDepth
 from sags_node.vision.tissue import TissueMask
 from sags_node.vision.tissue_topic import NearestMask
 
 UNHURRIED_MS = 60.0  # a budget that has room for several steps and a finer flow
-FARTHEST = 10.0  # m: what a session says to be beyond is no depth
 NOTICED_LATE = HALVING  # m: what was measured before matches are found to be wrong may be wrong by so much
 DUPLICATE_RMS = 0.6  # grey levels: below a video codec's own noise (PSNR > 52 dB)
 
@@ -72,11 +63,7 @@ class Pipeline:
         self.rectifier = Rectifier(rig, width, height)
         self.tissue = TissueMask(vision.tissue, self.rectifier, masks)
         self._on_rectified = on_rectified
-        camera, baseline = self.rectifier.camera, self.rectifier.baseline
-        self.stereo = StereoDepth(vision.stereo, camera, baseline)
-        self._network: NetworkDepth | None = None
-        if vision.onnx.path is not None:
-            self._network = NetworkDepth(vision, self.stereo, camera, baseline)
+        self.depth = DepthChoice(vision, self.rectifier)
         self._refiner = make_refiner(config, width, height)
         self._config = config
         self.mapper = Mapper(
@@ -91,9 +78,8 @@ class Pipeline:
         self.anchors = Anchors()
         self._still = StillScene()
         self._eyes = PairWatch()
-        self._matches = MatchWatch()
         self._scene = SceneWatch(moving=vision.pose == "estimate")
-        self._unmatched = ""  # why what was measured last is no depth; empty: it is
+        self._is_sound = True  # what was matched last is depth
         self._mapped: FrameResult | None = None  # the last frame that was really mapped
         self._unwatched = 0.0  # m: how far tissue may have moved in frames that were held since
 
@@ -113,14 +99,12 @@ class Pipeline:
     @property
     def warnings(self) -> Findings:
         """What is wrong and how to mend it. May be read from any thread."""
-        watches = self._eyes, self._matches, self._scene, self.stereo
+        watches = self._eyes, self.depth, self._scene
         found = [finding for watch in watches for finding in watch.findings]
         lost = None if self._tracker is None else self._tracker.lost
         if lost is not None:
             back = "bring the scope back to tissue that it saw before"
             found.append(Finding("camera_lost", f"the camera is lost: {lost}; {back}"))
-        if self._network is not None and self._network.problem:
-            found.append(Finding("network_failed", self._network.problem))
         if self.tissue.problem:
             found.append(Finding("mask_missing", self.tissue.problem))
         if self._refiner.problem is not None:
@@ -146,88 +130,49 @@ class Pipeline:
         with watch("rectify"):
             pair = self._placed(frame)
         with watch("watch"):
-            verdict = self._eyes(frame, pair)
+            eyes = self._eyes(frame, pair)
         self._on_rectified(pair, self._epoch(frame))
-        if self._mapped is not None and self._config.mapping.skip_duplicates:
-            if rms_difference(pair, self._mapped.pair) < DUPLICATE_RMS:
-                anchors = self.anchors.at(pair.t_capture_ns)
-                return _repeat(self._mapped, pair, self._epoch(frame), watch.timings_ms, anchors)
-        advice = Advice()
-        if self._mapped is not None and verdict.left:
-            advice = Advice(verdict.left)
-        elif self._mapped is not None:
-            with watch("watch"):
-                advice = self._scene(pair, self._mapped, not verdict.learn)
-        if advice.is_new:
+        if self._equals_the_last(pair):
+            return self._repeated(frame, pair, watch)
+        with watch("watch"):
+            scene = self._compared(pair, eyes)
+        if scene.is_new:
             self.reset()
-        elif advice.held:
-            held = self._held(pair, self._epoch(frame), watch.timings_ms, "picture", advice.held)
-            return replace(held, observation=_unseen(pair))
-        seen = pair if advice.gain is None else exposed(pair, advice.gain)
+        elif scene.held:
+            return self._held(frame, pair, watch, "picture", scene.held, unseen(pair))
+        seen = pair if scene.gain is None else exposed(pair, scene.gain)
         still = self._still_frames(pair)
-        skipped: dict[str, str] = {}
         with watch("mask"):
-            drawn = None if self._mapped is None else self._mapped.views["left"]
-            tissue = self.tissue(frame, seen, drawn)
-            if advice.covered is not None:
-                tissue = tissue & ~enlarged(advice.covered, tissue.shape)
-            if self.tissue.problem:
-                skipped["mask"] = self.tissue.problem
+            tissue = self._tissue_in(frame, seen, scene)
         with watch("depth"):
-            known = self._mapped.observation if still and self._mapped is not None else None
-            if known is not None and known.depth.any():
-                depth, confidence = known.depth * tissue, known.depth_confidence * tissue
-                self.stereo.rows.stay()
-                skipped |= dict.fromkeys(("depth", "motion"), "nothing moves")
-            elif self._lacks_time_for_depth(frame, budget):
-                depth, confidence = np.zeros((2, *tissue.shape), np.float32)
-                skipped["depth"] = NO_TIME
-            else:
-                matched, self._unmatched = not self._unmatched, ""
-                unpaired = verdict.right if frame.depth is None and pair.right is not None else ""
-                if not unpaired:
-                    depth, confidence = self.depth(frame, seen, tissue)
-                if self._unmatched and matched:
-                    self.mapper.doubt(NOTICED_LATE)
-                if unpaired or self._unmatched:
-                    depth, confidence = np.zeros((2, *tissue.shape), np.float32)
-                    skipped["depth"] = unpaired or self._unmatched
-                if self._network is not None and self._network.problem:
-                    skipped["network"] = self._network.problem
+            measured = self._measured(frame, seen, tissue, still, budget, eyes)
+            depth, confidence = measured.depth, measured.confidence
             observation = observe(seen, tissue, depth, confidence, self._config.mapping.right_eye)
-        if advice.guess is not None:
-            self.mapper.found_again(observation, advice.guess)
+        if scene.guess is not None:
+            self.mapper.found_again(observation, scene.guess)
         if self._tracker is not None and not still:
             with watch("pose"):
                 tracked = self._tracker.track(observation)
                 camera = replace(pair.camera, T_world_cam=self._tracker.pose)
                 pair, observation = replace(pair, camera=camera), replace(observation, camera=camera)
-            lost = self._tracker.lost
-            if not tracked and lost is not None and self._mapped is not None:
-                held = self._held(pair, self._epoch(frame), watch.timings_ms, "pose", lost)
-                return replace(held, observation=observation)
+            if not tracked and self._tracker.lost is not None and self._mapped is not None:
+                return self._held(frame, pair, watch, "pose", self._tracker.lost, observation)
+        learn = scene.learn and eyes.learn
         with watch("map"):
-            learn = advice.learn and verdict.learn
-            if self._unwatched:
-                self.mapper.doubt(self._unwatched)
-                self._unwatched = 0.0
-            mapped = self.mapper.update(observation, budget, still, learn)
-            snapshot = mapped.snapshot
-            if self._tracker is not None:
-                self._tracker.mapped(observation, mapped.view)
+            mapped = self._map(observation, budget, still, learn)
         with watch("render"):
             views = {"left": mapped.view}
             if self._config.publish.right:
                 views["right"] = self._right_eye(mapped, pair.baseline)
         with watch("anchors"):
-            self.anchors.update(observation, snapshot, mapped.view, learn)
+            self.anchors.update(observation, mapped.snapshot, mapped.view, learn)
             anchors = self.anchors.at(pair.t_capture_ns)
         if not still:  # which tells nothing of what a moving frame costs
             budget.finish(self.mapper.model.count)
-        epoch = self._epoch(frame)
         self._mapped = FrameResult(
-            pair, observation, snapshot, views, epoch, watch.timings_ms, skipped, anchors, rung
-        )
+            pair, observation, mapped.snapshot, views, self._epoch(frame), watch.timings_ms,
+            {**self._without_mask(), **measured.skipped}, anchors, rung, hurried=measured.hurried,
+        )  # fmt: skip
         return self._mapped
 
     def _placed(self, frame: StereoFrame) -> RectifiedPair:
@@ -237,16 +182,26 @@ class Pipeline:
         pose = None if self._tracker is None else self._tracker.pose
         return self.rectifier(replace(frame, T_world_cam=pose))
 
-    def _still_frames(self, pair: RectifiedPair) -> int:
-        if not self._config.mapping.skip_still:
-            return 0
-        if self._tracker is not None:  # an estimated pose tells nothing that the pictures do not
-            pair = replace(pair, camera=self.rectifier.camera)
-        return self._still(pair)
+    def _equals_the_last(self, pair: RectifiedPair) -> bool:
+        if self._mapped is None or not self._config.mapping.skip_duplicates:
+            return False
+        return rms_difference(pair, self._mapped.pair) < DUPLICATE_RMS
+
+    def _repeated(self, frame: StereoFrame, pair: RectifiedPair, watch: Stopwatch) -> FrameResult:
+        assert self._mapped is not None
+        anchors = self.anchors.at(pair.t_capture_ns)
+        return repeated(self._mapped, pair, self._epoch(frame), watch.timings_ms, anchors)
+
+    def _compared(self, pair: RectifiedPair, eyes: Verdict) -> Advice:
+        """What to do with a frame, by how it fits the last one."""
+        if self._mapped is None:
+            return Advice()
+        return Advice(eyes.left) if eyes.left else self._scene(pair, self._mapped, not eyes.learn)
 
     def _held(
-        self, pair: RectifiedPair, epoch: int, timings: dict[str, float], what: str, reason: str
-    ) -> FrameResult:
+        self, frame: StereoFrame, pair: RectifiedPair, watch: Stopwatch, what: str, why: str,
+        observation: Observation,
+    ) -> FrameResult:  # fmt: skip
         """For a frame that something (`what`) forbids to take in: the last model, and nothing is learnt from
         the picture. The tissue moves meanwhile, and the depth is less and less sure."""
         assert self._mapped is not None
@@ -254,39 +209,57 @@ class Pipeline:
         seconds = max(0, pair.t_capture_ns - self._mapped.pair.t_capture_ns) * 1e-9
         self._unwatched = UNWATCHED * seconds
         anchors = self.anchors.at(pair.t_capture_ns, held=True)
-        held = _doubted(_repeat(self._mapped, pair, epoch, timings, anchors), self._unwatched)
-        return replace(held, skipped={what: reason})
+        last = repeated(self._mapped, pair, self._epoch(frame), watch.timings_ms, anchors)
+        held = doubted(last, self._unwatched)
+        return replace(held, observation=observation, skipped={what: why}, held=why, hurried=False)
+
+    def _still_frames(self, pair: RectifiedPair) -> int:
+        if not self._config.mapping.skip_still:
+            return 0
+        if self._tracker is not None:  # an estimated pose tells nothing that the pictures do not
+            pair = replace(pair, camera=self.rectifier.camera)
+        return self._still(pair)
+
+    def _tissue_in(self, frame: StereoFrame, pair: RectifiedPair, scene: Advice) -> Bool:
+        drawn = None if self._mapped is None else self._mapped.views["left"]
+        tissue = self.tissue(frame, pair, drawn)
+        return tissue if scene.covered is None else tissue & ~enlarged(scene.covered, tissue.shape)
+
+    def _without_mask(self) -> dict[str, str]:
+        return {"mask": self.tissue.problem} if self.tissue.problem else {}
+
+    def _measured(
+        self, frame: StereoFrame, pair: RectifiedPair, tissue: Bool, still: int, budget: Budget, eyes: Verdict
+    ) -> Measured:
+        """The depth of a frame: of the last one where nothing moves, none where there is no time."""
+        known = self._mapped.observation if still and self._mapped is not None else None
+        if known is not None and known.depth.any():
+            self.depth.stereo.rows.stay()
+            skipped = dict.fromkeys(("depth", "motion"), "nothing moves")
+            return Measured(known.depth * tissue, known.depth_confidence * tissue, skipped)
+        if self._lacks_time_for_depth(frame, budget):
+            return Measured.nothing(tissue.shape, "no time", hurried=True)
+        was_sound, self._is_sound = self._is_sound, True
+        if eyes.right and frame.depth is None and pair.right is not None:
+            return Measured.nothing(tissue.shape, eyes.right)
+        measured = self.depth(frame, pair, tissue)
+        self._is_sound = measured.is_sound
+        if was_sound and not measured.is_sound:
+            self.mapper.doubt(NOTICED_LATE)
+        return measured
 
     def _lacks_time_for_depth(self, frame: StereoFrame, budget: Budget) -> bool:
-        costs = frame.depth is None or self._network is not None
-        needs_matching = costs and self.mapper.model.count > 0  # a first model needs depth
+        needs_matching = self.depth.takes_time(frame) and self.mapper.model.count > 0  # the first needs depth
         return needs_matching and self._config.mapping.skip_depth and not budget.affords_depth()
 
-    def depth(self, frame: StereoFrame, pair: RectifiedPair, tissue: Bool) -> tuple[F32, F32]:
-        """Depth and confidence [H, W]: the network's where one delivers, else what is measured."""
-        if self._network is not None:
-
-            def measure() -> F32 | None:
-                can = frame.depth is not None or pair.right is not None
-                return self._measured(frame, pair, tissue)[0] if can else None
-
-            found = self._network(pair, tissue, measure)
-            if found is not None:
-                return found
-        return self._measured(frame, pair, tissue)
-
-    def _measured(self, frame: StereoFrame, pair: RectifiedPair, tissue: Bool) -> tuple[F32, F32]:
-        """The session's own depth, fully trusted, or else stereo; all unknown for one camera alone."""
-        if frame.depth is not None:
-            given = self.rectifier.depth(frame.depth)
-            known = tissue & (given > 0) & (given < FARTHEST)
-            return np.where(known, given, np.float32(0)), known.astype(np.float32)
-        if pair.right is None:
-            return np.zeros(tissue.shape, np.float32), np.zeros(tissue.shape, np.float32)
-        measured = self.stereo(pair, tissue)
-        if self.stereo.rows.newest is not None:
-            self._unmatched = self._matches(pair.t_capture_ns, pyramids(pair)[0], self.stereo.rows.newest)
-        return measured
+    def _map(self, observation: Observation, budget: Budget, still: int, learn: bool) -> Mapped:
+        if self._unwatched:
+            self.mapper.doubt(self._unwatched)
+            self._unwatched = 0.0
+        mapped = self.mapper.update(observation, budget, still, learn)
+        if self._tracker is not None:
+            self._tracker.mapped(observation, mapped.view)
+        return mapped
 
     def _epoch(self, frame: StereoFrame) -> int:
         """Grows with the source's epochs and with every new model: ids then mean other Gaussians."""
@@ -318,54 +291,3 @@ class Stopwatch:
         yield
         passed = (time.perf_counter() - started) * 1e3
         self.timings_ms[stage] = self.timings_ms.get(stage, 0.0) + passed
-
-
-def _doubted(held: FrameResult, error: float) -> FrameResult:
-    """A result whose depth may be wrong by so much more, m."""
-    gaussians, anchors = held.snapshot.gaussians, held.anchors
-    if gaussians.depth_errors is not None:
-        gaussians = replace(gaussians, depth_errors=gaussians.depth_errors + np.float32(error))
-    sure = anchors.depth_confidence * confidence_of(np.float32(error))
-    return replace(
-        held,
-        snapshot=replace(held.snapshot, gaussians=gaussians),
-        views={eye: doubted(view, error) for eye, view in held.views.items()},
-        anchors=replace(anchors, depth_confidence=sure),
-    )
-
-
-def _restamped(views: Mapping[str, RenderedView], frame_id: int, stamp: int) -> dict[str, RenderedView]:
-    """Pictures of what has not changed since."""
-    return {eye: replace(view, frame_id=frame_id, t_capture_ns=stamp) for eye, view in views.items()}
-
-
-def _unseen(pair: RectifiedPair) -> Observation:
-    """Of a picture of which nothing may be used."""
-    shape = pair.left.shape[:2]
-    nothing = np.zeros(shape, np.float32)
-    return observe(pair, np.zeros(shape, np.bool_), nothing, nothing)
-
-
-def _repeat(
-    mapped: FrameResult, pair: RectifiedPair, epoch: int, timings: dict[str, float], anchors: AnchorStates
-) -> FrameResult:
-    """The last mapped result under the ids of a frame that equals it."""
-    frame_id, stamp = pair.frame_id, pair.t_capture_ns
-    still = np.zeros_like(mapped.snapshot.velocities)
-    return replace(
-        mapped,
-        pair=pair,
-        observation=replace(mapped.observation, frame_id=frame_id, t_capture_ns=stamp),
-        snapshot=replace(
-            mapped.snapshot,
-            frame_id=frame_id,
-            t_capture_ns=stamp,
-            velocities=still,
-            counts={"iterations": 0},
-        ),
-        views=_restamped(mapped.views, frame_id, stamp),
-        epoch=epoch,
-        timings_ms=timings,
-        skipped={**mapped.skipped, "frame": "equals its predecessor"},
-        anchors=anchors,
-    )

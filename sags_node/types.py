@@ -260,9 +260,6 @@ class RungState:
     depth_every: int  # frames: how often depth is matched
 
 
-NO_TIME = "no time"  # why something was left out, in `FrameResult.skipped`
-
-
 @dataclass(frozen=True, slots=True)
 class FrameResult:
     """One frame's whole story."""
@@ -276,11 +273,8 @@ class FrameResult:
     skipped: Mapping[str, str] = field(default_factory=dict)  # what was left out, and why
     anchors: AnchorStates = field(default_factory=AnchorStates.none)
     rung: RungState | None = None  # None: fixed steps, no ladder
-
-    @property
-    def held(self) -> str:
-        """Why the frame was not taken in, so that the model is that of an older one; empty: it was."""
-        return self.skipped.get("pose", "") or self.skipped.get("picture", "")
+    held: str = ""  # why the frame was not taken in, so that the model is that of an older one; empty: it was
+    hurried: bool = False  # there was no time to measure its depth
 
 
 @dataclass(frozen=True, slots=True)

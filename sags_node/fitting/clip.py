@@ -67,7 +67,7 @@ def play(session: Session, references: bool) -> Iterator[ClipFrame]:
         for frame in source:
             pair = pipeline.rectifier(frame)
             tissue = pipeline.tissue(frame, pair)
-            depth, _ = pipeline.depth(frame, pair, tissue)
+            depth = pipeline.depth(frame, pair, tissue).depth
             yield ClipFrame(
                 pair.frame_id, pair.t_capture_ns, pair.camera, pair.left, tissue, depth, frame.reference
             )

@@ -16,7 +16,6 @@ from sags_node.messaging import cdr
 from sags_node.messaging.cdr import Content, Status
 from sags_node.types import (
     F32,
-    NO_TIME,
     SH_DEGREE_0,
     U8,
     Bool,
@@ -195,7 +194,7 @@ def tells_of(result: FrameResult, topic: str) -> bool:
         return False
     if topic == "left/render/depth_confidence" and result.views["left"].confidence is None:
         return False
-    return topic != "left/depth" or result.skipped.get("depth") != NO_TIME
+    return topic != "left/depth" or not result.hurried
 
 
 def health_fields(health: NodeHealth) -> dict[str, Any]:

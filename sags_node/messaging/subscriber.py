@@ -21,6 +21,7 @@ from types import TracebackType
 from typing import Self, overload
 
 import msgspec
+import zmq
 
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import topics
@@ -78,6 +79,7 @@ class Receiver:
         self._arrived = threading.Condition()
         self._wakes: list[Callable[[], None]] = []
         self._stopping = threading.Event()
+        self._paused = threading.Event()
         self._names = {topics.full_name(ns, name): name for name in self._kept}
         self._find = partial(find_data, endpoint, ns, run_dir, keys)
         self._resources = ExitStack()  # holds the socket; only the receiver thread uses it once it runs
@@ -159,6 +161,15 @@ class Receiver:
             with self._arrived:
                 self._wakes.remove(wake)
 
+    def pause(self) -> None:
+        """Let nothing but `status` come, until `resume`: the node makes and sends nothing else for this client
+        then. Takes effect within `POLL_MS`. A topic with a rate of its own (`rates`) counts nothing as lost."""
+        self._paused.set()
+
+    def resume(self) -> None:
+        """Let everything come again, in the order of the names that were given."""
+        self._paused.clear()
+
     def _newest(self, name: str) -> Received | None:
         kept = self._kept[name]
         return kept[-1] if kept else None
@@ -200,13 +211,25 @@ class Receiver:
         self._socket, self._watch = resources.enter_context(data_socket(address, list(self._names)))
         self._resources.close()
         self._resources, self._address = resources, address
+        self._is_subscribed = True
 
     def _receive_all(self) -> None:
         while not self._stopping.is_set():
+            self._subscribe()
             if self._socket.poll(POLL_MS):
                 self._receive_one()
             else:
                 self._look_for_node()
+
+    def _subscribe(self) -> None:
+        """As it is asked for now; a socket is used by one thread alone."""
+        wanted = not self._paused.is_set()
+        if wanted != self._is_subscribed:
+            option = zmq.SUBSCRIBE if wanted else zmq.UNSUBSCRIBE
+            for full, name in self._names.items():
+                if name != "status":
+                    self._socket.setsockopt_string(option, full)
+            self._is_subscribed = wanted
 
     def _look_for_node(self) -> None:
         """Nothing comes: the node may have been restarted elsewhere, or not let this client in."""

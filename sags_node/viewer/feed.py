@@ -31,15 +31,16 @@ from sags_node.messaging.wire import WireError
 from sags_node.types import U8, Camera
 
 PICTURE = "left/image_rect_color"
-FRAME = (PICTURE, "left/render/image", "left/render/depth", "left/tissue_mask", "left/camera_info", "tf")
+FRAME = ("left/render/image", "left/render/depth", "left/tissue_mask", "left/camera_info", "tf", PICTURE)
 SPLATS, ANCHORS = "splats", "anchors"
-TOPICS = (*FRAME, SPLATS, ANCHORS)
+TOPICS = (SPLATS, ANCHORS, *FRAME)  # the picture is asked for last: where it comes, all comes
 SPLAT_FIELDS = {"scale_0", "rot_w", "f_dc_0", "opacity", "id"}
 ANCHOR_FIELDS = {"id", "visibility", "confidence", "age"}
 
 MAX_AGE = 1.0  # s; older content is not shown
 LEAST_HZ = 0.5  # the viewer shows a few frames of many, so losing some of them is no fault; age is
-WAIT_FOR_REST = 0.05  # s for what belongs to a picture
+WAIT_FOR_PICTURE = 0.3  # s: for a subscription to arrive, and a camera of 10 Hz
+WAIT_FOR_REST = 0.1  # s for what belongs to a picture
 SILENT_AFTER = 2.5  # s without a `status`, which comes every second
 
 _STATES = {
@@ -110,11 +111,22 @@ class Feed:
             self._absent = str(error)
 
     def now(self) -> Moment:
-        """What may be shown now; waits up to `WAIT_FOR_REST` for the rest of the newest frame."""
+        """What may be shown now. The node sends one frame for it, and nothing until the next `now`; it is
+        waited for up to `WAIT_FOR_PICTURE` and `WAIT_FOR_REST`."""
         self._follow()
         subscriber = self._subscriber
         if subscriber is None:
             return Moment(self._absent)
+        subscriber.resume()
+        try:
+            picture = subscriber.wait(PICTURE, WAIT_FOR_PICTURE, after=subscriber.latest(PICTURE))
+            if picture is not None:
+                subscriber.aligned(TOPICS, picture.stamp_ns, WAIT_FOR_REST)
+            return self._seen(subscriber)
+        finally:
+            subscriber.pause()
+
+    def _seen(self, subscriber: Subscriber) -> Moment:
         status = _status_of(subscriber)
         problem = self._problem(subscriber, status)
         if problem is not None:
@@ -176,7 +188,7 @@ class Feed:
         self, subscriber: Subscriber, picture: ReceivedImage
     ) -> tuple[Picture | None, Camera | None]:
         """The newest frame of which everything came, while it is not too old."""
-        self._frame = subscriber.aligned(FRAME, picture.stamp_ns, WAIT_FOR_REST) or self._frame
+        self._frame = subscriber.aligned(FRAME, picture.stamp_ns) or self._frame
         if self._frame is None:
             return None, None
         shown = self._frame[PICTURE]
@@ -212,7 +224,7 @@ def _records(subscriber: Subscriber, name: str, fields: set[str]) -> NDArray[Any
 
 def _unpack(frame: Mapping[str, Received]) -> tuple[Picture | None, Camera | None]:
     """The messages of one frame as pictures and camera; None when they do not fit together."""
-    picture, render, depth, tissue, info, pose = (frame[name] for name in FRAME)
+    render, depth, tissue, info, pose, picture = (frame[name] for name in FRAME)
     assert isinstance(picture, ReceivedImage) and isinstance(render, ReceivedImage)
     assert isinstance(depth, ReceivedImage) and isinstance(tissue, ReceivedImage)
     assert isinstance(info, ReceivedCameraInfo) and isinstance(pose, ReceivedRos)

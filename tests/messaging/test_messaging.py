@@ -33,7 +33,7 @@ from sags_node.geometry import project
 from sags_node.messaging import topics
 from sags_node.messaging.content import OF_THE_MODEL
 from sags_node.messaging.publisher import Publisher
-from sags_node.types import NO_TIME, FrameResult
+from sags_node.types import FrameResult
 
 pytestmark = pytest.mark.live
 
@@ -237,8 +237,7 @@ def test_a_frame_without_time_for_depth_sends_none_and_leaves_no_gap(tmp_path: P
     plane = plane_result()
 
     def every_other(i: int) -> FrameResult:
-        skipped = {"depth": NO_TIME} if i % 2 else {}
-        return replace(at_frame(plane, i, time.time_ns()), skipped=skipped)
+        return replace(at_frame(plane, i, time.time_ns()), hurried=bool(i % 2))
 
     wanted = ["sags/left/depth", "sags/tf"]
     with publisher(tmp_path / "run") as running, stream(running, every_other):
@@ -253,7 +252,7 @@ def test_while_the_camera_is_lost_no_model_goes_out_under_a_new_stamp(tmp_path: 
     result = plane_result()
     with publisher(tmp_path / "run") as running:
         running.publish_result(at_frame(result, 0, time.time_ns()), dropped=0)
-        lost = replace(at_frame(result, 1, time.time_ns()), skipped={"pose": "too dark"})
+        lost = replace(at_frame(result, 1, time.time_ns()), held="too dark")
         running.publish_result(lost, dropped=0)
         peer, context = _subscriber(running.connection.data[0], "sags/")
         _poll_until(running, lambda: running.wanted("splats"))

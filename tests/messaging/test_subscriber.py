@@ -66,6 +66,22 @@ def test_typed_values_of_one_frame(tmp_path: Path) -> None:
             assert subscriber.lost("splats") == 0 and subscriber.rejected == 0
 
 
+def test_a_paused_subscriber_costs_the_node_nothing_and_goes_on_with_what_is_new(tmp_path: Path) -> None:
+    name = "left/render/depth"
+    with publisher(tmp_path / "run") as running, stream(running):
+        with Subscriber([name], run_dir=tmp_path / "run", rates={name: 0.5}) as subscriber:
+            assert subscriber.wait(name, 30)
+            subscriber.pause()
+            until(lambda: not running.wanted(name))
+            newest, status = subscriber.latest(name), subscriber.latest("status")
+            assert subscriber.wait("status", 30, after=status)
+            assert subscriber.latest(name) is newest
+            subscriber.resume()
+            later = subscriber.wait(name, 30, after=newest)
+            assert later is not None and later.age() < 1.0
+            assert subscriber.ok(name), "what was not asked for is not lost"
+
+
 def test_strict_read_raises_when_the_frames_stop(tmp_path: Path) -> None:
     with publisher(tmp_path / "run") as running:
         with Subscriber(["left/depth"], run_dir=tmp_path / "run") as subscriber:

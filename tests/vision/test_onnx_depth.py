@@ -287,7 +287,7 @@ def test_a_network_replaces_the_matcher(
     for result, frame in zip(play(pipeline, frames[:3]), frames, strict=False):
         off, share = depth_error(result, frame)
         assert off < 0.02 and share > 0.6 and not result.skipped
-        matched, _ = pipeline.stereo(result.pair, result.observation.tissue)
+        matched, _ = pipeline.depth.stereo(result.pair, result.observation.tissue)
         assert not np.array_equal(matched, result.observation.depth)
         confidence = result.observation.depth_confidence
         assert ((confidence > 0) <= (result.observation.depth > 0)).all() and confidence.max() <= 1
@@ -313,7 +313,7 @@ def test_where_it_fails_the_matcher_takes_over_and_says_so(
     failed = [bool(result.skipped.get("network")) for result in results]
     assert failed == [False, True, False, True, True, True, True, True]  # the last: not tried any more
     result = results[1]
-    matched, _ = pipeline.stereo(result.pair, result.observation.tissue)
+    matched, _ = pipeline.depth.stereo(result.pair, result.observation.tissue)
     kept = result.observation.depth > 0  # all but specks, of which so dark a picture has some
     assert np.array_equal(result.observation.depth[kept], matched[kept])
     assert np.count_nonzero(kept) > 0.5 * np.count_nonzero(matched)

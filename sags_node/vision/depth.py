@@ -1,0 +1,98 @@
+"""Depth of every frame: the session's own, a network's, or matched between the eyes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple, Self
+
+import numpy as np
+
+from sags_node.config import VisionConfig
+from sags_node.types import F32, Bool, Finding, RectifiedPair, StereoFrame
+from sags_node.vision.match_watch import MatchWatch
+from sags_node.vision.onnx_depth import NetworkDepth
+from sags_node.vision.pyramid import pyramids
+from sags_node.vision.rectify import Rectifier
+from sags_node.vision.stereo import StereoDepth
+
+FARTHEST = 10.0  # m: what a session says to be beyond is no depth
+
+
+class Measured(NamedTuple):
+    """What is known of one frame's depth."""
+
+    depth: F32  # [H, W] m, 0 unknown
+    confidence: F32  # [H, W] 0..1
+    skipped: Mapping[str, str] = {}  # what was left out, and why
+    is_sound: bool = True  # False: what was matched is no depth
+    hurried: bool = False  # there was no time
+
+    @classmethod
+    def nothing(cls, shape: tuple[int, ...], why: str, is_sound: bool = True, hurried: bool = False) -> Self:
+        """No depth at all."""
+        depth, confidence = np.zeros((2, *shape), np.float32)
+        return cls(depth, confidence, {"depth": why} if why else {}, is_sound, hurried)
+
+
+class DepthChoice:
+    """Takes the depth that is the best to be had.
+
+    Attributes:
+        stereo: matches the eyes, and judges a network's disparities.
+
+    Raises:
+        UsageError: the pictures cannot be matched, or the network cannot be used.
+    """
+
+    def __init__(self, config: VisionConfig, rectifier: Rectifier) -> None:
+        camera, baseline = rectifier.camera, rectifier.baseline
+        self._rectifier = rectifier
+        self.stereo = StereoDepth(config.stereo, camera, baseline)
+        self._network: NetworkDepth | None = None
+        if config.onnx.path is not None:
+            self._network = NetworkDepth(config, self.stereo, camera, baseline)
+        self._matches = MatchWatch()
+        self._unsound = ""  # why what was matched in this frame is no depth; empty: it is
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What is wrong with the eyes, the rig and the network. May be read from any thread."""
+        problem = "" if self._network is None else self._network.problem
+        failed = (Finding("network_failed", problem),) if problem else ()
+        return (*self._matches.findings, *self.stereo.findings, *failed)
+
+    def takes_time(self, frame: StereoFrame) -> bool:
+        """Whether a frame's depth has to be computed."""
+        return frame.depth is None or self._network is not None
+
+    def __call__(self, frame: StereoFrame, pair: RectifiedPair, tissue: Bool) -> Measured:
+        """The depth of a frame and its rectified pair where there is `tissue` [H, W]."""
+        self._unsound, skipped = "", {}
+        found = None
+        if self._network is not None:
+
+            def measure() -> F32 | None:
+                can = frame.depth is not None or pair.right is not None
+                return self._measured(frame, pair, tissue)[0] if can else None
+
+            found = self._network(pair, tissue, measure)
+            if self._network.problem:
+                skipped["network"] = self._network.problem
+        depth, confidence = found or self._measured(frame, pair, tissue)
+        if self._unsound:
+            depth, confidence = np.zeros((2, *tissue.shape), np.float32)
+            skipped["depth"] = self._unsound
+        return Measured(depth, confidence, skipped, is_sound=not self._unsound)
+
+    def _measured(self, frame: StereoFrame, pair: RectifiedPair, tissue: Bool) -> tuple[F32, F32]:
+        """The session's own depth, fully trusted, or else stereo; all unknown for one camera alone."""
+        if frame.depth is not None:
+            given = self._rectifier.depth(frame.depth)
+            known = tissue & (given > 0) & (given < FARTHEST)
+            return np.where(known, given, np.float32(0)), known.astype(np.float32)
+        if pair.right is None:
+            return np.zeros(tissue.shape, np.float32), np.zeros(tissue.shape, np.float32)
+        measured = self.stereo(pair, tissue)
+        if self.stereo.rows.newest is not None:
+            self._unsound = self._matches(pair.t_capture_ns, pyramids(pair)[0], self.stereo.rows.newest)
+        return measured

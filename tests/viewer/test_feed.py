@@ -1,0 +1,29 @@
+"""What the viewer takes from a node, over real sockets."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from synthetic import publisher, stream
+from waiting import until
+
+from sags_node.viewer.feed import TOPICS, Feed
+
+pytestmark = pytest.mark.live
+
+
+def test_the_node_makes_one_frame_for_each_update_and_nothing_between(tmp_path: Path) -> None:
+    run_dir = tmp_path / "run"
+    with publisher(run_dir) as running, stream(running):
+        feed = Feed(None, "sags", run_dir=run_dir)
+        until(lambda: feed.now().model is not None)
+        shown = []
+        for _ in range(3):
+            until(lambda: not any(running.wanted(name) for name in TOPICS))
+            moment = feed.now()
+            assert moment.problem is None and moment.model is not None, "the whole frame came"
+            assert moment.splats is not None and moment.anchors is not None
+            shown.append(moment.model.frame_id)
+        feed.rest()
+    assert shown == sorted(set(shown)), "a new one each time"
