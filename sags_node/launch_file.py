@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from string import Template
 from typing import Any, get_args
@@ -16,16 +16,28 @@ from sags_node.errors import UsageError, brief
 from sags_node.files import open_file
 from sags_node.yaml_reader import parse_yaml, read_yaml
 
-_PATH_KEYS = (
-    *("rig", "folder", "path", "video", "left", "right", "tools"),
-    *("poses", "depth", "tracks", "key", "allow"),
-)
 MOST_MISTAKES = 10  # named at once
 DEFAULT_DATA = "../shared/data"
 BAG_SUFFIXES = (".mcap", ".db3", ".bag")
 VIDEO_SUFFIXES = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".ts", ".wmv")
 SIDECAR_TYPE = "dvrk_data:video_sidecar@"
 SIDECAR_LOOK = 65536  # bytes at either end; jsoncpp sorts the keys, so the type comes after the frames
+
+
+def _path_keys(section: type[Section]) -> Iterator[str]:
+    """The keys whose values are paths, of a section and of all that are in it."""
+    for name, field in section.model_fields.items():
+        kinds = [field.annotation]
+        for kind in kinds:  # grows
+            kinds += get_args(kind)
+        if Path in kinds:
+            yield name
+        for kind in kinds:
+            if isinstance(kind, type) and issubclass(kind, Section):
+                yield from _path_keys(kind)
+
+
+_PATH_KEYS = frozenset(_path_keys(LaunchConfig))
 
 
 def load_launch(path: Path | str | None = None, overrides: Sequence[str] = ()) -> LaunchConfig:

@@ -80,13 +80,7 @@ class Node:
         self._error: BaseException | None = None
         self._stopping = threading.Event()
         self._last_sent: FrameResult | None = None
-        handlers = self._operations.handlers() | {
-            "get_status": lambda args: content.status(self.health(), self._last_sent),
-            "start_recording": self._start_recording,
-            "stop_recording": lambda args: self._recorder.stop(),
-            "take_snapshot": lambda args: self._recorder.snapshot(),
-        }
-        self._publisher = Publisher(config.publish, config.ns, uuid.uuid4().hex, handlers)
+        self._publisher = Publisher(config.publish, config.ns, uuid.uuid4().hex, self._handlers())
         ipc = [endpoint for endpoint in self.endpoints if endpoint.startswith("ipc:")]
         self._recorder = RecorderProcess(config.ns, ipc[0] if ipc else None)
         work = {
@@ -288,6 +282,16 @@ class Node:
                 self._publisher.publish_view(name, drawn)
         names = self._state.views.status
         self._watched = frozenset(name for name in names if self._publisher.watches_view(name))
+
+    # ---- control -------------------------------------------------------------------------------------
+
+    def _handlers(self) -> dict[str, Callable[[dict[str, Any]], Any]]:
+        return self._operations.handlers() | {
+            "get_status": lambda args: content.status(self.health(), self._last_sent),
+            "start_recording": self._start_recording,
+            "stop_recording": lambda args: self._recorder.stop(),
+            "take_snapshot": lambda args: self._recorder.snapshot(),
+        }
 
     def _start_recording(self, args: dict[str, Any]) -> Future[Any]:
         return self._recorder.start(args)

@@ -202,7 +202,7 @@ class Snapshot:
     velocities: F32  # [N, 3] m/s, world: the last observed motion
     camera: Camera
     loss: float  # mean absolute colour residual over tissue, last step
-    counts: Mapping[str, int] = field(default_factory=dict)  # inserted, pruned, iterations, ...
+    counts: Mapping[str, int] = field(default_factory=dict)  # inserted, removed, iterations, ...
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,16 @@ ROOT = Path(__file__).parent.parent / "sags_node"
 # Folders, and files that stand beside them. Each may import what stands in lines above its own.
 LAYERS = [
     {"types", "errors", "config", "files", "latest", "native_output", "processes", "kernels"},
-    {"confidence", "findings", "geometry", "picture_file", "terminal", "video_file", "yaml_reader"},
+    {
+        "confidence",
+        "findings",
+        "geometry",
+        "picture_file",
+        "plotting",
+        "terminal",
+        "video_file",
+        "yaml_reader",
+    },
     {"calibration", "engine", "health", "launch_file", "messaging"},
     {"client", "doctor", "model", "overlay", "phantom", "recording", "topic", "views"},
     {"disturbances", "sources", "vision"},

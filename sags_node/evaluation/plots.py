@@ -1,14 +1,14 @@
-"""Line plots over time as plain SVG text."""
+"""Plots of a report: values over the frame, or over what else lies across."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
 
-WIDTH, HEIGHT = 720, 190  # px
-LEFT, RIGHT, TOP, BOTTOM = 52, 12, 26, 24  # margins
+from sags_node.plotting import as_svg, new_figure
+
+WIDTH, HEIGHT = 720, 200  # px
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,92 +22,27 @@ class Series:
 
 
 def line_plot(title: str, series: Sequence[Series], spans: Mapping[str, tuple[int, int]]) -> str:
-    """An SVG of several series over the frame number; `spans` are shaded and named.
+    """An SVG file of several series; `spans` (first and last frame) are shaded and named.
 
     Empty text when there is nothing to draw.
     """
     series = [each for each in series if any(math.isfinite(value) for _, value in each.points)]
     if not series:
         return ""
-    values = [value for each in series for _, value in each.points if math.isfinite(value)]
-    frames = [frame for each in series for frame, _ in each.points]
-    scale = _Scale(min(frames), max(frames), *_widened(min(values), max(values)))
-    parts = [
-        f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(title)}">',
-        f'<text x="{LEFT}" y="15" class="title">{escape(title)}</text>',
-    ]
-    for name, (first, last) in spans.items():
-        parts.append(_span(scale, name, first, last))
-    for tick in _ticks(scale.low, scale.high):
-        y = scale.y(tick)
-        parts.append(f'<line x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{y:.1f}" y2="{y:.1f}" class="grid"/>')
-        parts.append(f'<text x="{LEFT - 6}" y="{y + 4:.1f}" class="value">{tick:g}</text>')
-    for tick in _ticks(scale.first, scale.last):
-        parts.append(f'<text x="{scale.x(tick):.1f}" y="{HEIGHT - 6}" class="frame">{tick:g}</text>')
-    for place, each in enumerate(series):
-        parts.append(_drawn(scale, each))
-        if len(series) == 1:
-            break
-        x = WIDTH - RIGHT - 110 * (len(series) - place)
-        parts.append(f'<rect x="{x}" y="7" width="10" height="10" fill="{each.colour}"/>')
-        parts.append(f'<text x="{x + 14}" y="16" class="label">{escape(each.label)}</text>')
-    return "\n".join([*parts, "</svg>"])
-
-
-@dataclass(frozen=True, slots=True)
-class _Scale:
-    """Frames and values to pixels."""
-
-    first: float
-    last: float
-    low: float
-    high: float
-
-    def x(self, frame: float) -> float:
-        span = max(self.last - self.first, 1)
-        return LEFT + (frame - self.first) / span * (WIDTH - LEFT - RIGHT)
-
-    def y(self, value: float) -> float:
-        return HEIGHT - BOTTOM - (value - self.low) / (self.high - self.low) * (HEIGHT - TOP - BOTTOM)
-
-
-def _widened(low: float, high: float) -> tuple[float, float]:
-    margin = 0.05 * (high - low) or max(abs(high) * 0.05, 0.5)
-    return (max(0.0, low - margin) if low >= 0 else low - margin), high + margin
-
-
-def _ticks(low: float, high: float, about: int = 5) -> list[float]:
-    """Round numbers between `low` and `high`: steps of 1, 2 or 5 times a power of ten."""
-    raw = (high - low) / about
-    if raw <= 0:
-        return [low]
-    power = 10.0 ** math.floor(math.log10(raw))
-    step = next(factor * power for factor in (1, 2, 5, 10) if factor * power >= raw)
-    return [step * index for index in range(math.ceil(low / step), math.floor(high / step) + 1)]
-
-
-def _span(scale: _Scale, name: str, first: int, last: int) -> str:
-    start, end = max(first, scale.first), min(last, scale.last)
-    if start > end:
-        return ""
-    x = scale.x(start)
-    return (
-        f'<rect x="{x:.1f}" y="{TOP}" width="{scale.x(end) - x:.1f}" height="{HEIGHT - TOP - BOTTOM}"'
-        f' class="span"/><text x="{x + 4:.1f}" y="{TOP + 12}" class="label">{escape(name)}</text>'
-    )
-
-
-def _drawn(scale: _Scale, series: Series) -> str:
-    known = [(scale.x(frame), scale.y(value), value) for frame, value in series.points]
-    if series.dots:
-        return "".join(
-            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="2.5" fill="{series.colour}"/>'
-            for x, y, value in known
-            if math.isfinite(value)
-        )
-    path, pen_down = [], False
-    for x, y, value in known:
-        if math.isfinite(value):
-            path.append(f"{'L' if pen_down else 'M'}{x:.1f} {y:.1f}")
-        pen_down = math.isfinite(value)
-    return f'<path d="{" ".join(path)}" fill="none" stroke="{series.colour}" stroke-width="1.5"/>'
+    figure = new_figure(WIDTH, HEIGHT)
+    axes = figure.subplots()
+    axes.set_title(title, loc="left", fontweight="bold", fontsize=9)
+    for each in series:
+        across, values = zip(*each.points, strict=True)
+        style = {"linestyle": "", "marker": "o", "markersize": 3} if each.dots else {"linewidth": 1.2}
+        axes.plot(across, values, color=each.colour, label=each.label, **style)
+    first, last = axes.get_xlim()
+    for name, (begin, end) in spans.items():
+        if begin <= last and first <= end:
+            axes.axvspan(max(begin, first), min(end, last), color="#f2e3c6", zorder=0)
+            corner = max(begin, first), 1
+            axes.annotate(name, corner, (3, -9), ("data", "axes fraction"), "offset points")
+    axes.set_xlim(first, last)
+    if len(series) > 1:
+        axes.legend(loc="upper left", bbox_to_anchor=(1, 1))
+    return as_svg(figure)

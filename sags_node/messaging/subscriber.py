@@ -162,8 +162,8 @@ class Receiver:
                 self._wakes.remove(wake)
 
     def pause(self) -> None:
-        """Let nothing but `status` come, until `resume`: the node makes and sends nothing else for this client
-        then. Takes effect within `POLL_MS`. A topic with a rate of its own (`rates`) counts nothing as lost."""
+        """Let nothing but `status` come, until `resume`: the node makes and sends nothing else for this
+        client then. Takes effect within `POLL_MS`. Topics with `rates` count nothing as lost."""
         self._paused.set()
 
     def resume(self) -> None:

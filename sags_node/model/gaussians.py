@@ -2,13 +2,32 @@
 
 from __future__ import annotations
 
+from typing import Any, Generic, TypeVar
+
 import numpy as np
+from numpy.typing import NDArray
 
 from sags_node.engine.rasterizer.smoothing import folded
 from sags_node.types import F32, I64, Gaussians
 
 NEIGHBOURS = 4  # control nodes a Gaussian follows
 ADAM_PARAMETERS = 11  # mean 3, quat 4, log scale 3, opacity logit 1
+
+Row = TypeVar("Row", np.float32, np.int32, np.int64)
+
+
+class _Column(Generic[Row]):
+    """An array with one row for each Gaussian; reading it gives the live rows, as a view."""
+
+    def __init__(self, kind: type[Row], *shape: int) -> None:
+        self.kind: type[Row] = kind
+        self.shape = shape
+
+    def __set_name__(self, owner: type[GaussianModel], name: str) -> None:
+        self._name = name
+
+    def __get__(self, model: GaussianModel, owner: type[GaussianModel]) -> NDArray[Row]:
+        return model.rows[self._name][: model.count]
 
 
 class GaussianModel:
@@ -19,41 +38,34 @@ class GaussianModel:
     activates anything. `ids` are never reused.
     """
 
+    means = _Column(np.float32, 3)  # m, world
+    rest = _Column(np.float32, 3)  # m, world: where it is most of the time; NaN: not known yet
+    quats = _Column(np.float32, 4)  # wxyz
+    log_scales = _Column(np.float32, 3)
+    scales = _Column(np.float32, 3)  # m, before the 3D filter
+    smoothing = _Column(np.float32)  # m^2, variance of the 3D filter; 0: off
+    opacity_logits = _Column(np.float32)
+    opacities = _Column(np.float32)  # before the 3D filter
+    colors = _Column(np.float32, 3)
+    velocities = _Column(np.float32, 3)  # m/s, world
+    depth_errors = _Column(np.float32)  # m, predicted, see `mapping.depth_memory`
+    ids = _Column(np.int64)
+    contribution = _Column(np.float32)  # px, in the last step on a whole picture
+    in_front = _Column(np.int32)  # frames in a row in front of the measured surface
+    node_index = _Column(np.int32, NEIGHBOURS)
+    node_weight = _Column(np.float32, NEIGHBOURS)
+    adam_m = _Column(np.float32, ADAM_PARAMETERS)
+    adam_v = _Column(np.float32, ADAM_PARAMETERS)
+
     def __init__(self, capacity: int) -> None:
         self.capacity = capacity
         self.count = 0
         self._next_id = 0
-
-        def rows(*shape: int) -> F32:
-            return np.zeros((capacity, *shape), np.float32)
-
-        self._rows: dict[str, np.ndarray] = {
-            "means": rows(3),  # m, world
-            "rest": rows(3),  # m, world: where it is most of the time; NaN: not known yet
-            "quats": rows(4),  # wxyz
-            "log_scales": rows(3),
-            "scales": rows(3),  # m, before the 3D filter
-            "smoothing": rows(),  # m^2, variance of the 3D filter; 0: off
-            "opacity_logits": rows(),
-            "opacities": rows(),  # before the 3D filter
-            "colors": rows(3),
-            "velocities": rows(3),  # m/s, world
-            "depth_errors": rows(),  # m, predicted, see `mapping.depth_memory`
-            "ids": np.zeros(capacity, np.int64),
-            "contribution": rows(),  # px, in the last step on a whole picture
-            "in_front": np.zeros(capacity, np.int32),  # frames in a row in front of the measured surface
-            "node_index": np.zeros((capacity, NEIGHBOURS), np.int32),
-            "node_weight": rows(NEIGHBOURS),
-            "adam_m": rows(ADAM_PARAMETERS),
-            "adam_v": rows(ADAM_PARAMETERS),
+        columns = ((name, column) for name, column in vars(type(self)).items() if isinstance(column, _Column))
+        # [capacity, ...] by the column's name: also the rows that hold nothing now.
+        self.rows: dict[str, NDArray[Any]] = {
+            name: np.zeros((capacity, *column.shape), column.kind) for name, column in columns
         }
-
-    def __getattr__(self, name: str) -> np.ndarray:
-        """The live rows of one array, as a view."""
-        rows: dict[str, np.ndarray] = self.__dict__.get("_rows", {})
-        if name not in rows:
-            raise AttributeError(name)
-        return rows[name][: self.count]
 
     @property
     def free(self) -> int:
@@ -70,9 +82,9 @@ class GaussianModel:
         """
         fits = min(len(means), self.free)
         added = slice(self.count, self.count + fits)
-        for values in self._rows.values():
+        rows = self.rows
+        for values in rows.values():
             values[added] = 0
-        rows = self._rows
         rows["means"][added] = means[:fits]
         rows["rest"][added] = np.nan
         rows["quats"][added, 0] = 1.0
@@ -95,7 +107,7 @@ class GaussianModel:
 
     def replace(self, rows: I64, others: I64) -> None:
         """Forget the Gaussians in `rows`; copies of those in `others` take their place, under new ids."""
-        for name, values in self._rows.items():
+        for name, values in self.rows.items():
             values[rows] = self._new_ids(len(rows)) if name == "ids" else values[others]
 
     def never_reuse(self, later: GaussianModel) -> None:
@@ -114,7 +126,7 @@ class GaussianModel:
         kept = self.count - removed
         holes = np.flatnonzero(doomed[:kept])
         movers = kept + np.flatnonzero(~doomed[kept:])
-        for values in self._rows.values():
+        for values in self.rows.values():
             values[holes] = values[movers]
         self.count = kept
         return removed
@@ -132,7 +144,7 @@ class GaussianModel:
             self.scales,
             self.opacities,
             self.colors,
-            self._ids(),
+            self.ids,
             None,
             self.smoothing,
             self.depth_errors,
@@ -148,14 +160,10 @@ class GaussianModel:
             drawn.scales,
             drawn.opacities,
             self.colors.copy(),
-            self._ids().copy(),
+            self.ids.copy(),
             depth_errors=self.depth_errors.copy(),
         )
 
     def _new_ids(self, count: int) -> I64:
         self._next_id += count
         return np.arange(self._next_id - count, self._next_id)
-
-    def _ids(self) -> I64:
-        ids: I64 = self._rows["ids"][: self.count]
-        return ids
