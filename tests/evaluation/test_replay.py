@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
-from places import SESSION
+from places import ROOT, SESSION
 
 from sags_node.evaluation.calibration import STEP_MM
 from sags_node.evaluation.golden import Golden, Tolerance, compare, read_golden, write_golden
@@ -15,7 +18,6 @@ from sags_node.pipeline import Pipeline
 from sags_node.session import open_session
 from sags_node.types import Snapshot
 
-GOLDEN = SESSION.with_suffix(".golden.json")
 # Another CPU rounds otherwise, and rounding decides now and then whether a Gaussian is inserted.
 NEW_GOLDEN = Golden(
     command="make golden",
@@ -35,11 +37,26 @@ NEW_GOLDEN = Golden(
 
 def test_the_phantom_session_gives_its_golden_figures(request: pytest.FixtureRequest) -> None:
     outcome = evaluate(SESSION, options=Options(every=10), pace="step", iterations=2)
+    _check(request, outcome.summary, SESSION.with_suffix(".golden.json"))
+
+
+def test_the_lift_of_a_real_recording_gives_its_golden_figures(
+    request: pytest.FixtureRequest, data_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Real tissue, pulled by 20 mm in a second; depth beside a stereo network's."""
+    monkeypatch.setenv("SAGS_DATA", str(data_folder))
+    lift = ["source.start:=2", "source.frames:=50", "vision.width:=320", "vision.height:=256"]
+    launch = ROOT / "launch/d4d_pull.yaml"
+    outcome = evaluate(launch, lift, options=Options(every=10), pace="step", iterations=2)
+    _check(request, outcome.summary, ROOT / "replay/d4d_lift.golden.json")
+
+
+def _check(request: pytest.FixtureRequest, figures: dict[str, Any], golden: Path) -> None:
     if request.config.getoption("--update-golden"):
-        before = read_golden(GOLDEN) if GOLDEN.exists() else NEW_GOLDEN
-        print("\n".join(compare(outcome.summary, before)) or "nothing changed")
-        write_golden(GOLDEN, NEW_GOLDEN, outcome.summary)
-    differences = compare(outcome.summary, read_golden(GOLDEN))
+        before = read_golden(golden) if golden.exists() else NEW_GOLDEN
+        print("\n".join(compare(figures, before)) or "nothing changed")
+        write_golden(golden, NEW_GOLDEN, figures)
+    differences = compare(figures, read_golden(golden))
     assert not differences, "\n".join(differences)
 
 

@@ -25,6 +25,7 @@ from sags_node.kernels.threads import configure_threads
 from sags_node.model import columns
 from sags_node.model.deformable import FADE_NS, LOOK_BACK_NS
 from sags_node.session import open_session
+from sags_node.types import F32
 
 SMALL = FitSettings(iterations=120, max_gaussians=3000, cells=16, slots=8, channels=16)
 PAPER = dataclasses.replace(SMALL, schedule="paper", warm_up=60)
@@ -78,6 +79,20 @@ def test_a_fit_learns_frames_it_never_saw(clip: Clip, tokens: Any) -> None:
     assert after["psnr"] > before["psnr"] + 2
     assert after["ssim"] > before["ssim"]
     assert after["paper_psnr"] > after["psnr"]  # masked pixels count as perfect
+
+
+def test_each_part_of_the_method_has_its_share_in_the_result(clip: Clip) -> None:
+    """The self-adaptive block, and both filters. The same settings twice give the same picture."""
+    frame = clip.test[0]
+
+    def drawn(**changed: bool) -> F32:
+        fit = fitted(clip, dataclasses.replace(PAPER, **changed))
+        return fit.rasterizer.forward(fit.gaussians(frame), [frame.camera])[0, :3, frame.tissue]
+
+    whole = drawn()
+    assert np.array_equal(drawn(), whole)
+    for part in ("adaptive", "antialias"):
+        assert np.abs(drawn(**{part: False}) - whole).mean() > 0.5 / 255, f"{part} changes what is seen"
 
 
 @pytest.mark.parametrize("tokens", ["self", "nodes"])
