@@ -1,0 +1,88 @@
+"""docs/architecture.md names files, threads and layers as they are."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+PACKAGE = ROOT / "sags_node"
+PAGE = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
+SOURCES = {file.relative_to(ROOT).as_posix(): file.read_text("utf-8") for file in PACKAGE.rglob("*.py")}
+STARTS = {
+    "Thread", "Timer", "Process", "Popen", "ThreadPoolExecutor", "ProcessPoolExecutor", "Pool", "to_thread",
+    "run_in_executor", "ThreadAuthenticator",
+}  # fmt: skip
+
+
+def section(title: str) -> str:
+    """Of the page, up to the next title of any level."""
+    found = re.search(rf"^#+ {title}$(.*?)(?=^##|\Z)", PAGE, re.MULTILINE | re.DOTALL)
+    assert found is not None, f"no section '{title}'"
+    return found[1]
+
+
+def paths(text: str) -> set[str]:
+    return set(re.findall(r"`([\w./-]+(?:\.py|/))`", text))
+
+
+def starts_one(source: str) -> bool:
+    """Whether a module starts a thread or a process."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Call):
+            *module, name = ast.unparse(node.func).split(".")
+            if name in STARTS or (module == ["subprocess"] and name in {"run", "call", "check_output"}):
+                return True
+    return False
+
+
+def test_every_path_exists() -> None:
+    named = paths(PAGE)
+    assert len(named) > 60  # they were found
+    assert sorted(path for path in named if not (ROOT / path).exists()) == []
+
+
+def test_every_name_stands_in_the_file_that_is_named_before_it() -> None:
+    named = re.findall(r"`([\w./]+\.py)` \(((?:`[\w.]+`(?:, )?)+)\)", PAGE)
+    assert len(named) > 20
+    missing = []
+    for path, names in named:
+        for name in re.findall(r"\w+(?=`|\.)", names):
+            if not re.search(rf"^\s*(def|class) {name}\b|^{name}\b.* = ", SOURCES[path], re.MULTILINE):
+                missing.append(f"{path}: {name}")
+    assert missing == []
+
+
+def test_every_thread_and_process_is_named() -> None:
+    named = set[str]()
+    for title in ("Threads of a running node", "Threads of commands and clients", "Processes"):
+        named |= paths(section(title))
+    assert named == {path for path, source in SOURCES.items() if starts_one(source)}
+
+
+def test_names_of_threads_are_as_they_are_started() -> None:
+    rows = section("Threads of a running node") + section("Threads of commands and clients")
+    for path, source in SOURCES.items():
+        for node in ast.walk(ast.parse(source)):
+            if isinstance(node, ast.Call) and ast.unparse(node.func).endswith(
+                ("Thread", "ThreadPoolExecutor")
+            ):
+                for said in node.keywords:
+                    if said.arg in ("name", "thread_name_prefix") and isinstance(said.value, ast.Constant):
+                        assert f"`{said.value.value}`" in rows, f"{path} starts {said.value.value}"
+
+
+def test_layers_are_as_files_import_each_other() -> None:
+    lines = section("Layers").split("```")[1].splitlines()
+    lines = [re.split(r" {3,}", line.strip())[0] for line in lines if line.strip()]
+    level = {part: -number for number, line in enumerate(lines) for part in line.split()}
+    found = {path.split("/")[1].removesuffix(".py") for path in SOURCES} - {"__init__", "__main__"}
+    assert level.keys() == found
+    upwards = []
+    for path, source in SOURCES.items():
+        part = path.split("/")[1].removesuffix(".py")
+        for other in re.findall(r"^\s*(?:from|import) sags_node(?:\.| import )(\w+)", source, re.MULTILINE):
+            if part in level and level.get(other, -len(lines)) > level[part]:
+                upwards.append(f"{path} imports {other}")
+    assert upwards == []
