@@ -21,7 +21,7 @@ from sags_node.evaluation.plots import Series, line_plot
 from sags_node.evaluation.report import write_report
 from sags_node.evaluation.session import evaluate
 from sags_node.evaluation.spool import Spool
-from sags_node.evaluation.summary import STAGES, summarise
+from sags_node.evaluation.summary import GROUPS, STAGES, summarise
 from sags_node.types import (
     Camera,
     Eye,
@@ -444,3 +444,9 @@ def test_live_cameras_and_ambiguous_segments_are_refused(tmp_path: Path) -> None
     launch.write_text("segments: {psnr: [1, 2]}")
     with pytest.raises(UsageError, match=r"segments\.psnr"):
         evaluate(launch)
+
+
+def test_the_page_of_figures_explains_every_group() -> None:
+    page = (Path(__file__).parent.parent / "docs/results.md").read_text(encoding="utf-8")
+    groups = [*GROUPS, "depth_confidence", "track", "pose"]
+    assert [group for group in groups if f"`{group}`" not in page] == []

@@ -1,4 +1,4 @@
-"""docs/architecture.md names files, threads and layers as they are."""
+"""Documents name files, threads and layers as they are."""
 
 from __future__ import annotations
 
@@ -6,10 +6,14 @@ import ast
 import re
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "sags_node"
-PAGE = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
+PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("benchmarks/*.md")])
+ARCHITECTURE = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
 SOURCES = {file.relative_to(ROOT).as_posix(): file.read_text("utf-8") for file in PACKAGE.rglob("*.py")}
+FOLDERS = {"sags_node", "tests", "docs", "benchmarks", "launch", "calib", "replay", "examples", ".ci"}
 STARTS = {
     "Thread", "Timer", "Process", "Popen", "ThreadPoolExecutor", "ProcessPoolExecutor", "Pool", "to_thread",
     "run_in_executor", "ThreadAuthenticator",
@@ -17,8 +21,8 @@ STARTS = {
 
 
 def section(title: str) -> str:
-    """Of the page, up to the next title of any level."""
-    found = re.search(rf"^#+ {title}$(.*?)(?=^##|\Z)", PAGE, re.MULTILINE | re.DOTALL)
+    """Of docs/architecture.md, up to the next title of any level."""
+    found = re.search(rf"^#+ {title}$(.*?)(?=^##|\Z)", ARCHITECTURE, re.MULTILINE | re.DOTALL)
     assert found is not None, f"no section '{title}'"
     return found[1]
 
@@ -37,14 +41,19 @@ def starts_one(source: str) -> bool:
     return False
 
 
-def test_every_path_exists() -> None:
-    named = paths(PAGE)
-    assert len(named) > 60  # they were found
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_file_that_is_named_exists(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    named = {path for path in paths(text) if path.partition("/")[0] in FOLDERS}
     assert sorted(path for path in named if not (ROOT / path).exists()) == []
+    links = re.findall(r"\]\((?!https?:|#)([^)#\s]+)", text)
+    assert sorted(link for link in links if not (page.parent / link).exists()) == []
 
 
 def test_every_name_stands_in_the_file_that_is_named_before_it() -> None:
-    named = re.findall(r"`([\w./]+\.py)` \(((?:`[\w.]+`(?:, )?)+)\)", PAGE)
+    assert len(paths(ARCHITECTURE)) > 60  # they were found
+    text = ARCHITECTURE + (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    named = re.findall(r"`([\w./]+\.py)` \(((?:`[\w.]+`(?:, )?)+)\)", text)
     assert len(named) > 20
     missing = []
     for path, names in named:
