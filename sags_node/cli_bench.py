@@ -281,7 +281,7 @@ def bench_stream(
     "--iterations", type=click.IntRange(1), default=1500, show_default=True, help="With deformation."
 )
 @click.option(
-    "--hold-out", type=click.IntRange(2), default=8, show_default=True, help="Test on every so manieth."
+    "--hold-out", type=click.IntRange(2), default=8, show_default=True, help="Test on every N-th frame."
 )
 @lpips_option
 @table_option

@@ -39,14 +39,14 @@ from sags_node.errors import UsageError
     type=click.IntRange(0),
     default=8,
     show_default=True,
-    help="Leave out every so manieth frame; 0: none.",
+    help="Leave out every N-th frame; 0: none.",
 )
 @click.option(
     "--every",
     type=click.IntRange(1),
     default=5,
     show_default=True,
-    help="Right eye and LPIPS on every so manieth frame.",
+    help="Right eye and LPIPS on every N-th frame.",
 )
 @lpips_option
 @click.option("--paper-psnr", is_flag=True, help="Also PSNR with masked pixels counted as perfect.")
@@ -144,7 +144,11 @@ def evaluate(
 )
 @click.option("--seed", type=int, default=0, show_default=True, help="Of everything random.")
 @click.option(
-    "--hold-out", type=click.IntRange(0), default=8, show_default=True, help="Test on every so manieth."
+    "--hold-out",
+    type=click.IntRange(0),
+    default=8,
+    show_default=True,
+    help="Test on every N-th frame; 0: none.",
 )
 @lpips_option
 @as_json
