@@ -11,7 +11,7 @@ DEBIAN_TESTS := chromium g++ cmake pkg-config cppzmq-dev libmsgpack-cxx-dev
 missing = $(shell for p in $(1); do dpkg -s $$p >/dev/null 2>&1 || echo $$p; done)
 apt_install = apt-get update -qq && apt-get install -y -qq --no-install-recommends $(1) >/dev/null
 
-.PHONY: setup run test computed test-targets test-tools lint golden clean
+.PHONY: setup run test computed test-targets test-tools lint golden docs clean
 
 setup: $(STAMP)
 
@@ -60,6 +60,10 @@ lint: setup
 # Rewrite the golden results of replay/ and print what changed.
 golden: setup
 	$(BIN)/python -m pytest tests/evaluation/test_replay.py --update-golden -s
+
+# Rewrite the pages that are made from the source: docs/launch.md from the configuration.
+docs: setup
+	$(BIN)/python docs/launch_page.py
 
 clean:
 	rm -rf $(VENV) out build *.egg-info .pytest_cache .mypy_cache .ruff_cache

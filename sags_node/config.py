@@ -28,7 +28,9 @@ class ReferenceConfig(Section):
 
     depth: Path | None = Field(None, description="folder of 16-bit PNGs named by frame number")
     depth_unit: float = Field(1e-5, gt=0, description="metres per count")
-    depth_kind: Literal["exact", "structured_light", "ct", "stereo_network"] = "exact"
+    depth_kind: Literal["exact", "structured_light", "ct", "stereo_network"] = Field(
+        "exact", description="how the depth became known; reports name it"
+    )
     tracks: Path | None = Field(None, description="npz with points [T, P, 3] (m) and visible [T, P]")
 
 
@@ -41,9 +43,9 @@ class RecordedSource(Section):
         "takes frames, none lost, stamped at release; step: the same with the recording's own stamps",
     )
     rate: float | None = Field(None, gt=0, description="frames per second; default: the recording's own")
-    loop: bool = False
+    loop: bool = Field(False, description="begin again at the end")
     start: float = Field(0.0, ge=0, description="seconds to skip at the beginning")
-    frames: int | None = Field(None, gt=0, description="stop after this many frames")
+    frames: int | None = Field(None, gt=0, description="stop after this many frames; default: all")
     stride: int = Field(1, ge=1, description="play only each stride-th frame")
     poses: Path | None = Field(None, description="npz with T_world_cam [T, 4, 4] (m)")
     reference: ReferenceConfig = ReferenceConfig()
@@ -53,8 +55,10 @@ class FoldersSource(RecordedSource):
     """Two folders of pictures, paired by sorted file name, or one of a single camera's."""
 
     kind: Literal["folders"] = "folders"
-    left: Path
-    right: Path | None = Field(None, description="null: one camera, with a monocular vision.onnx")
+    left: Path = Field(description="folder of the left eye's pictures")
+    right: Path | None = Field(
+        None, description="folder of the right eye's; null: one camera, with a monocular vision.onnx"
+    )
     tools: Path | None = Field(None, description="folder of mask PNGs, 255 = instrument (not tissue)")
 
 
@@ -62,26 +66,28 @@ class VideosSource(RecordedSource):
     """Two video files, paired by frame number, or one of a single camera's."""
 
     kind: Literal["videos"] = "videos"
-    left: Path
-    right: Path | None = Field(None, description="null: one camera, with a monocular vision.onnx")
+    left: Path = Field(description="video of the left eye")
+    right: Path | None = Field(
+        None, description="video of the right eye; null: one camera, with a monocular vision.onnx"
+    )
 
 
 class SideBySideSource(RecordedSource):
     """One video with both eyes side by side."""
 
     kind: Literal["side_by_side"] = "side_by_side"
-    video: Path
-    order: Literal["LR", "RL"] = "LR"
+    video: Path = Field(description="the file")
+    order: Literal["LR", "RL"] = Field("LR", description="LR: the left eye is in the left half")
 
 
 class PanesSource(RecordedSource):
     """One video of several panes; each eye is a crop of it."""
 
     kind: Literal["panes"] = "panes"
-    video: Path
-    left: Box
-    right: Box
-    tools: Box | None = Field(None, description="pane showing the left eye with instruments painted green")
+    video: Path = Field(description="the file")
+    left: Box = Field(description="pane of the left eye")
+    right: Box = Field(description="pane of the right eye")
+    tools: Box | None = Field(None, description="pane of the left eye with the instruments painted green")
 
 
 class EndoNerfSource(RecordedSource):
@@ -112,10 +118,16 @@ class BagSource(RecordedSource):
 
     kind: Literal["bag"] = "bag"
     path: Path = Field(description="folder with metadata.yaml, or a .mcap, .db3 or .bag file")
-    left: str | None = Field(None, description="picture topic; default: guessed, e.g. /<rig>/left/image_raw")
-    right: str | None = None
-    left_info: str | None = Field(None, description="camera_info topic; default: beside the pictures'")
-    right_info: str | None = None
+    left: str | None = Field(
+        None, description="picture topic of the left eye; default: guessed, e.g. /RIG/left/image_raw"
+    )
+    right: str | None = Field(None, description="picture topic of the right eye; default: guessed")
+    left_info: str | None = Field(
+        None, description="camera_info topic of the left eye; default: beside its pictures"
+    )
+    right_info: str | None = Field(
+        None, description="camera_info topic of the right eye; default: beside its pictures"
+    )
     tolerance: float = Field(0.02, gt=0, description="s; how far the stamps of a pair may lie apart")
 
 
@@ -124,24 +136,28 @@ class DvrkSource(RecordedSource):
 
     kind: Literal["dvrk"] = "dvrk"
     path: Path = Field(description="the sidecar .json, or a folder with one stereo video in it")
-    side_by_side: Literal["LR", "RL"] | None = Field(None, description="default: what the sidecar says")
+    side_by_side: Literal["LR", "RL"] | None = Field(
+        None, description="LR: the left eye is in the left half; default: what the sidecar says"
+    )
 
 
 class PhantomSource(RecordedSource):
     """The built-in synthetic session; rendered once into the cache folder, then replayed."""
 
     kind: Literal["phantom"] = "phantom"
-    seconds: float = Field(4.0, gt=0, le=600)
-    width: int = Field(640, ge=64, le=4096)
-    height: int = Field(512, ge=64, le=4096)
-    seed: int = 0
-    camera_motion: bool = False
-    smoke: float = Field(0.0, ge=0, le=1)
-    noise: float = Field(0.01, ge=0, le=0.2, description="standard deviation, 0..1 scale")
-    blur: float = Field(0.0, ge=0, le=5, description="px")
+    seconds: float = Field(4.0, gt=0, le=600, description="length of the session")
+    width: int = Field(640, ge=64, le=4096, description="of a picture, px")
+    height: int = Field(512, ge=64, le=4096, description="of a picture, px")
+    seed: int = Field(0, description="another number gives another tissue")
+    camera_motion: bool = Field(False, description="the scope moves")
+    smoke: float = Field(0.0, ge=0, le=1, description="density")
+    noise: float = Field(0.01, ge=0, le=0.2, description="of a pixel: standard deviation, in units of white")
+    blur: float = Field(0.0, ge=0, le=5, description="of the lens: standard deviation, px")
     gloss: float = Field(1.0, ge=0, le=100, description="strength of the wet highlights")
     still_tissue: bool = Field(False, description="only the instruments move, and the scope if it is to")
-    blackout: tuple[float, float] | None = Field(None, description="s: without light from, until")
+    blackout: tuple[float, float] | None = Field(
+        None, description="s: without light from, until; null: never"
+    )
 
 
 class V4l2Source(Section):
@@ -149,14 +165,21 @@ class V4l2Source(Section):
 
     kind: Literal["v4l2"] = "v4l2"
     left: str = Field("/dev/video0", description="device; the only one when side_by_side is set")
-    right: str | None = Field("/dev/video2")
-    side_by_side: Literal["LR", "RL"] | None = None
-    width: int = Field(640, gt=0, description="of one device's picture")
-    height: int = Field(480, gt=0)
-    rate: float = Field(30.0, gt=0)
-    fourcc: str | None = Field(None, min_length=4, max_length=4, description="pixel format, e.g. YUYV, MJPG")
+    right: str | None = Field("/dev/video2", description="device of the right eye")
+    side_by_side: Literal["LR", "RL"] | None = Field(
+        None,
+        description="one device delivers both eyes, LR: the left one in the left half; null: two devices",
+    )
+    width: int = Field(640, gt=0, description="of one device's picture, px")
+    height: int = Field(480, gt=0, description="of one device's picture, px")
+    rate: float = Field(30.0, gt=0, description="frames per second")
+    fourcc: str | None = Field(
+        None, min_length=4, max_length=4, description="pixel format, e.g. YUYV, MJPG; default: the device's"
+    )
     deadline: float = Field(1.0, gt=0, description="seconds without a picture before the device is reopened")
-    pair_tolerance_ms: float = Field(20.0, gt=0)
+    pair_tolerance_ms: float = Field(
+        20.0, gt=0, description="how far the stamps of a pair may lie apart, two devices"
+    )
 
 
 Source = Annotated[
@@ -187,9 +210,12 @@ class StereoConfig(Section):
         None, description="divide the working size by this for matching; default: 2 from 480 px width, else 1"
     )
     min_depth: float | None = Field(
-        None, gt=0, description="m; default: 0.03, and down to 0.01 where the pictures show something so near"
+        None,
+        gt=0,
+        description="m; nothing is looked for nearer; default: 0.03, and down to 0.01 where the pictures "
+        "show something so near",
     )
-    max_depth: float = Field(0.30, gt=0, description="m")
+    max_depth: float = Field(0.30, gt=0, description="m; nothing is looked for beyond")
 
     @model_validator(mode="after")
     def _ordered(self) -> StereoConfig:
@@ -229,29 +255,46 @@ def _by_name(said: object) -> object:
 class NetworkFormat(Section):
     """How a depth network takes pictures and what it gives. What is not said is found out."""
 
-    inputs: tuple[str, ...] | None = Field(None, description="names: left eye, right eye")
-    layout: Literal["nchw", "nhwc"] | None = None
-    color: Literal["rgb", "bgr"] | None = Field(None, description="default: rgb")
+    inputs: tuple[str, ...] | None = Field(None, description="names: left eye, right eye; default: found out")
+    layout: Literal["nchw", "nhwc"] | None = Field(
+        None, description="order of the inputs' axes; default: found out"
+    )
+    color: Literal["rgb", "bgr"] | None = Field(None, description="order of the channels; default: rgb")
     normalization: Annotated[Normalization | None, BeforeValidator(_by_name)] = Field(
-        None, description="unit, bytes, imagenet, symmetric, or mean and std"
+        None,
+        description="`unit` (0..1), `bytes` (0..255), `imagenet`, `symmetric` (-1..1), or "
+        "`{mean: [], std: []}`; default: found out",
     )
     size: tuple[Side, Side] | None = Field(
         None, description="width and height for a network that takes any; default: the working size"
     )
-    multiple: int | None = Field(None, ge=1, le=512, description="px that width and height are padded to")
-    output: str | None = Field(None, description="name of the output to use")
-    meaning: Literal["disparity", "negative_disparity", "depth", "inverse_depth"] | None = None
+    multiple: int | None = Field(
+        None,
+        ge=1,
+        le=512,
+        description="px; width and height are padded to multiples of it; default: found out",
+    )
+    output: str | None = Field(None, description="name of the output to use; default: found out")
+    meaning: Literal["disparity", "negative_disparity", "depth", "inverse_depth"] | None = Field(
+        None, description="of the output's numbers; default: found out"
+    )
 
 
 class OnnxConfig(NetworkFormat):
     """Depth from a network of the user's; docs/depth.md says what is recognised."""
 
     path: Path | None = Field(
-        None, description="the .onnx file; null: depth is matched as vision.stereo says"
+        None, description="the .onnx file; null: depth is matched, as vision.stereo says"
     )
-    providers: tuple[Literal["cuda", "cpu"], ...] = Field(("cuda", "cpu"), min_length=1)
-    threads: int | None = Field(None, ge=1, le=64, description="default: all cores of this process")
-    fallback: bool = Field(True, description="match where the network fails while running; false: end")
+    providers: tuple[Literal["cuda", "cpu"], ...] = Field(
+        ("cuda", "cpu"), min_length=1, description="processors; the first that ONNX Runtime has here is used"
+    )
+    threads: int | None = Field(
+        None, ge=1, le=64, description="of the network; default: all cores of this process"
+    )
+    fallback: bool = Field(
+        True, description="true: depth is matched where the network fails; false: the run ends"
+    )
     declared_depth: float | None = Field(
         None, gt=0, description="m to the middle of the first picture: the scale of one camera alone"
     )
@@ -289,15 +332,19 @@ class TissueConfig(Section):
 
 
 class VisionConfig(Section):
-    width: int | None = Field(None, ge=16, le=4096, description="working size; default: the calibration's")
-    height: int | None = Field(None, ge=16, le=4096)
+    """The pictures that are worked on, and where the camera is."""
+
+    width: int | None = Field(
+        None, ge=16, le=4096, description="px; pictures are brought to this size; default: the calibration's"
+    )
+    height: int | None = Field(None, ge=16, le=4096, description="px; default: the calibration's")
     stereo: StereoConfig = StereoConfig()
     onnx: OnnxConfig = OnnxConfig()
     tissue: TissueConfig = TissueConfig()
     pose: Literal["session", "fixed", "estimate"] = Field(
         "session",
-        description="of the camera: the session's, fixed where it has none; always fixed; or estimated from "
-        "the pictures, by the motion that most of the tissue shares",
+        description="of the camera. session: the session's, fixed where it has none; fixed: it never moves; "
+        "estimate: from the pictures, by the motion that most of the tissue shares",
     )
 
     def working_size(self, width: int, height: int) -> tuple[int, int]:
@@ -306,22 +353,34 @@ class VisionConfig(Section):
 
 
 class EngineConfig(Section):
+    """What draws the Gaussians."""
+
     backend: Literal["numba", "gsplat", "reference"] = Field(
-        "numba", description="numba: the CPU, or a GPU by device; gsplat: that package on a GPU, docs/gpu.md"
+        "numba",
+        description="numba: the CPU, or a GPU by `device`; gsplat: that package on a GPU, docs/gpu.md; "
+        "reference: the slow readable twin, for tests",
     )
-    threads: int | None = Field(None, ge=1, le=64, description="default: all cores of this process")
+    threads: int | None = Field(
+        None, ge=1, le=64, description="of the kernels; default: all cores of this process"
+    )
 
 
 class MappingConfig(Section):
+    """How the model is built, and what it may cost."""
+
     budget_ms: float = Field(33.0, gt=0, description="wall time of one frame, all stages")
     iterations: int | None = Field(None, ge=0, description="fixed steps per frame instead of the budget")
     rung: int | None = Field(
         None,
         ge=0,
-        description="of the ladder of quality, 0 the cheapest; default: what the machine affords",
+        description="stay on this rung of the ladder of quality, 0 the cheapest; default: what the machine "
+        "affords",
     )
     max_gaussians: int | None = Field(
-        None, ge=100, le=2_000_000, description="default: as many as the machine refines within the budget"
+        None,
+        ge=100,
+        le=2_000_000,
+        description="the model has no more; default: as many as the machine refines within the budget",
     )
     right_eye: bool = Field(
         False,
@@ -336,10 +395,16 @@ class MappingConfig(Section):
 
 
 class PublishConfig(Section):
+    """Sockets, and who may use them; docs/wire.md and docs/security.md say more."""
+
     data: tuple[str, ...] = Field(("tcp://127.0.0.1:5556",), description="XPUB endpoints")
     ipc: bool = Field(True, description="also bind an ipc socket in the run directory")
     control: str | None = Field("tcp://127.0.0.1:5557", description="ROUTER endpoint; null: none")
-    run_dir: Path | None = Field(None, description="default: $XDG_RUNTIME_DIR/sags or /tmp/sags-<uid>")
+    run_dir: Path | None = Field(
+        None,
+        description="of the ipc socket and the connection file; default: `$XDG_RUNTIME_DIR/sags`, else "
+        "`/tmp/sags-UID`",
+    )
     key: Path | None = Field(None, description="the node's secret key file (sags keygen): encrypt all tcp")
     allow: Paths = Field((), description="who may connect: .pub files, and folders of them")
     insecure: bool = Field(False, description="allow other addresses than loopback and ipc without keys")
@@ -358,20 +423,25 @@ DeviceName = Literal["auto", "cpu", "cuda"]
 class LaunchConfig(Section):
     """One way to run the node."""
 
-    ns: str = Field("sags", pattern=NAMESPACE)
-    seed: int = 0
+    ns: str = Field("sags", pattern=NAMESPACE, description="namespace of all topics")
+    seed: int = Field(0, description="of the random numbers of `sags bench endurance`")
     device: DeviceName = Field(
-        "auto", description="auto: a GPU where one can be used, else the CPU; cuda: a GPU; docs/gpu.md"
+        "auto",
+        description="auto: a GPU where one can be used, else the CPU; cuda: a GPU, or an error; docs/gpu.md",
     )
     rig: Path | None = Field(
-        None, description="a calibration in any form of docs/calibration.md; the phantom has its own"
+        None,
+        description="the calibration, in any form of docs/calibration.md; needed unless the recording brings "
+        "one",
     )
     source: Source = PhantomSource()
     vision: VisionConfig = VisionConfig()
     engine: EngineConfig = EngineConfig()
     mapping: MappingConfig = MappingConfig()
     publish: PublishConfig = PublishConfig()
-    segments: dict[str, tuple[int, int]] = Field({}, description="name: [first, last] frame, for sags eval")
+    segments: dict[str, tuple[int, int]] = Field(
+        {}, description="stretches that `sags eval` measures apart, `{name: [first, last frame]}`"
+    )
 
     @model_validator(mode="after")
     def _one_engine(self) -> LaunchConfig:

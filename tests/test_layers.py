@@ -9,43 +9,21 @@ from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
+from places import ROOT
 
-ROOT = Path(__file__).parent.parent / "sags_node"
-# Folders, and files that stand beside them. Each may import what stands in lines above its own.
-LAYERS = [
-    {"types", "errors", "config", "files", "latest", "native_output", "processes", "kernels"},
-    {
-        "confidence",
-        "findings",
-        "geometry",
-        "picture_file",
-        "plotting",
-        "terminal",
-        "video_file",
-        "yaml_reader",
-    },
-    {"calibration", "engine", "health", "launch_file", "messaging"},
-    {"client", "doctor", "model", "overlay", "phantom", "recording", "topic", "views"},
-    {"disturbances", "sources", "vision"},
-    {"calibrate", "mapping", "repeats", "session"},
-    {"pipeline"},
-    {"node_operations", "warm_up"},
-    {"node"},
-    {"evaluation", "foreground"},
-    {"demo", "fitting", "viewer"},
-    {"benchmark", "export"},
-    {"cli"},
-    {"__main__"},
-]
+PACKAGE = ROOT / "sags_node"
+PICTURE = (ROOT / "docs/architecture.md").read_text(encoding="utf-8").split("## Layers")[1].split("```")[1]
+# Folders, and files that stand beside them, the lowest first.
+LAYERS = [line.split("   ")[0].split() for line in reversed(PICTURE.strip().splitlines())]
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
-FOLDERS = sorted(init.parent.name for init in ROOT.glob("*/__init__.py"))
+FOLDERS = sorted(init.parent.name for init in PACKAGE.glob("*/__init__.py"))
 
 
 def name_of(file: Path) -> str:
-    return ".".join(("sags_node", *file.relative_to(ROOT).with_suffix("").parts)).removesuffix(".__init__")
+    return ".".join(("sags_node", *file.relative_to(PACKAGE).with_suffix("").parts)).removesuffix(".__init__")
 
 
-FILES = {name_of(file): file for file in ROOT.rglob("*.py")}
+FILES = {name_of(file): file for file in PACKAGE.rglob("*.py")}
 
 
 def imported(code: str) -> set[str]:
@@ -102,19 +80,19 @@ def test_modules_import_each_other_in_no_circle() -> None:
         pytest.fail(" -> ".join(error.args[1]))
 
 
+def said_in(folder: Path) -> str:
+    return ast.get_docstring(ast.parse((folder / "__init__.py").read_text())) or ""
+
+
 @pytest.mark.parametrize("folder", FOLDERS)
 def test_a_folder_says_which_it_imports(folder: str) -> None:
-    said = (ast.get_docstring(ast.parse((ROOT / folder / "__init__.py").read_text())) or "").split("\n\n")[-1]
-    assert said.startswith("Imports ")
+    last = said_in(PACKAGE / folder).split("\n\n")[-1]
+    assert last.startswith("Imports ")
     inside = [others for name, others in IMPORTS.items() if name.startswith(f"sags_node.{folder}.")]
     used = {part(other) for others in inside for other in others} - {folder}
-    assert set(re.findall(r"\w+", said)) & set(FOLDERS) == used & set(FOLDERS)
+    assert set(re.findall(r"\w+", last)) & set(FOLDERS) == used & set(FOLDERS)
 
 
 def test_every_folder_says_in_a_line_what_it_holds() -> None:
-    said = {
-        init.parent.name: ast.get_docstring(ast.parse(init.read_text())) for init in ROOT.rglob("__init__.py")
-    }
-    assert [
-        name for name, text in said.items() if not text or not text.split("\n")[0].endswith((".", ":"))
-    ] == []
+    firsts = {init.parent: said_in(init.parent).split("\n")[0] for init in PACKAGE.rglob("__init__.py")}
+    assert [str(folder) for folder, first in firsts.items() if not first.endswith((".", ":"))] == []

@@ -33,6 +33,7 @@ from sags_node.cli.launching import (
     write_json,
 )
 from sags_node.errors import SagsError, UsageError
+from sags_node.plotting import check_plots
 from sags_node.terminal.console import progress, show, writing
 
 
@@ -128,6 +129,8 @@ def bench_kernels(
     )
     if check is None:
         check_files(out)
+        if out is not None:
+            check_plots()
         with progress("measuring") as advance:
             measured = measure(advance)
         reporter = device_report if on_gpu else report
@@ -281,7 +284,7 @@ def bench_stream(
     "--iterations", type=click.IntRange(1), default=1500, show_default=True, help="With deformation."
 )
 @click.option(
-    "--hold-out", type=click.IntRange(2), default=8, show_default=True, help="Test on every so manieth."
+    "--hold-out", type=click.IntRange(2), default=8, show_default=True, help="Test on every N-th frame."
 )
 @lpips_option
 @table_option

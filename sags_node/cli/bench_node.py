@@ -19,6 +19,7 @@ from sags_node.cli.launching import (
     write_json,
 )
 from sags_node.errors import UsageError
+from sags_node.plotting import check_plots
 from sags_node.terminal.console import progress, show, writing
 
 if TYPE_CHECKING:
@@ -95,6 +96,8 @@ def bench_pareto(
     sweep = Sweep(PARTS if only is None else tuple(only.split(",")), repeat)
     known_fits = read_fits(fits or sorted(Path("benchmarks/results").glob("fit_*.json")))
     check_files(out, plot)
+    if plot is not None:
+        check_plots()
     with progress("measuring") as advance:
         measured = measure_pareto(paths, overrides, sweep, known_fits, advance)
     for table in [measured] if json_out else pareto_report.tables(measured):

@@ -31,6 +31,7 @@ from sags_node.cli.overlay import overlay
 from sags_node.cli.topic import topic
 from sags_node.cli.view import view
 from sags_node.errors import SagsError, UsageError
+from sags_node.plotting import check_plots
 from sags_node.terminal import text
 from sags_node.terminal.console import check_folder, console, interrupt, progress, show
 
@@ -132,6 +133,7 @@ def demo(launch: tuple[str, ...], seconds: float, out: Path, json_out: bool) -> 
 
     no_cameras = "sags demo plays recordings; for cameras use sags run and sags overlay"
     path, overrides = split_recording(launch, no_cameras)
+    check_plots()
     check_folder(out)
     frames = count_frames(path, overrides, seconds)
     # Its own sockets and run directory, so that a demo does not meet a node that is already running.

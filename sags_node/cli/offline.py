@@ -19,6 +19,7 @@ from sags_node.cli.launching import (
     write_json,
 )
 from sags_node.errors import UsageError
+from sags_node.plotting import check_plots
 from sags_node.terminal.console import check_folder, console, progress, show, writing
 
 
@@ -39,14 +40,14 @@ from sags_node.terminal.console import check_folder, console, progress, show, wr
     type=click.IntRange(0),
     default=8,
     show_default=True,
-    help="Leave out every so manieth frame; 0: none.",
+    help="Leave out every N-th frame; 0: none.",
 )
 @click.option(
     "--every",
     type=click.IntRange(1),
     default=5,
     show_default=True,
-    help="Right eye and LPIPS on every so manieth frame.",
+    help="Right eye and LPIPS on every N-th frame.",
 )
 @lpips_option
 @click.option("--paper-psnr", is_flag=True, help="Also PSNR with masked pixels counted as perfect.")
@@ -80,6 +81,7 @@ def evaluate(
     options = Options(hold_out, every, lpips_weights, paper_psnr)
     file = Path(json_out) if json_out is not None and json_out != "-" else None
     if report is not None:
+        check_plots()
         check_folder(report)
     check_files(file)
     with progress("measuring") as advance:
@@ -144,7 +146,11 @@ def evaluate(
 )
 @click.option("--seed", type=int, default=0, show_default=True, help="Of everything random.")
 @click.option(
-    "--hold-out", type=click.IntRange(0), default=8, show_default=True, help="Test on every so manieth."
+    "--hold-out",
+    type=click.IntRange(0),
+    default=8,
+    show_default=True,
+    help="Test on every N-th frame; 0: none.",
 )
 @lpips_option
 @as_json

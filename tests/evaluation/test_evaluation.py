@@ -12,8 +12,11 @@ from xml.etree import ElementTree
 import cv2
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from sags_node import plotting
 from sags_node.calibration import save_rig
+from sags_node.cli.main import main
 from sags_node.engine.rasterizer.rasterize import rasterize
 from sags_node.errors import SagsError, UsageError
 from sags_node.evaluation.golden import Golden, Tolerance, compare, read_golden, write_golden
@@ -22,7 +25,7 @@ from sags_node.evaluation.plots import Series, line_plot
 from sags_node.evaluation.report import write_report
 from sags_node.evaluation.session import evaluate
 from sags_node.evaluation.spool import Spool
-from sags_node.evaluation.summary import STAGES, summarise
+from sags_node.evaluation.summary import GROUPS, STAGES, summarise
 from sags_node.types import (
     Camera,
     Eye,
@@ -377,6 +380,16 @@ def test_a_plot_is_valid_svg_with_a_gap_where_nothing_is_known() -> None:
     assert line_plot("empty", [Series("one", "#123456", [])], {}) == ""
 
 
+def test_without_matplotlib_it_says_at_once_what_to_install(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(plotting, "find_spec", lambda name: None)
+    for command in (["eval", "--report", str(tmp_path / "out")], ["demo", "--out", str(tmp_path / "out")]):
+        result = CliRunner().invoke(main, command)
+        assert result.exit_code == 2 and "pip install 'sags-node[report]'" in result.stderr
+    assert not (tmp_path / "out").exists()
+
+
 # ---- whole sessions --------------------------------------------------------------------------------------
 
 
@@ -448,3 +461,9 @@ def test_live_cameras_and_ambiguous_segments_are_refused(tmp_path: Path) -> None
     launch.write_text("segments: {psnr: [1, 2]}")
     with pytest.raises(UsageError, match=r"segments\.psnr"):
         evaluate(launch)
+
+
+def test_the_page_of_figures_explains_every_group() -> None:
+    page = (Path(__file__).parent.parent / "docs/results.md").read_text(encoding="utf-8")
+    groups = [*GROUPS, "depth_confidence", "track", "pose"]
+    assert [group for group in groups if f"`{group}`" not in page] == []

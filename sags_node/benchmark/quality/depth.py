@@ -186,7 +186,7 @@ class Comparison:
 
 
 def measure_recording(session: Session, advance: Advance, every: int = EVERY) -> dict[str, Any]:
-    """Frames of a recording that have a reference depth, at most every so manieth, against it, on tissue.
+    """Frames of a recording that have a reference depth, at most one in `every`, against it, on tissue.
 
     The whole recording is played with one step of the mapper a frame, so that the depth of the drawn model is
     measured beside.

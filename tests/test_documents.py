@@ -1,0 +1,84 @@
+"""Documents name files, threads and layers as they are."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+from places import ROOT
+
+PACKAGE = ROOT / "sags_node"
+PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("benchmarks/*.md")])
+ARCHITECTURE = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
+SOURCES = {file.relative_to(ROOT).as_posix(): file.read_text("utf-8") for file in PACKAGE.rglob("*.py")}
+FOLDERS = {"sags_node", "tests", "docs", "benchmarks", "launch", "calib", "replay", "examples", ".ci"}
+STARTS = {
+    "Thread", "Timer", "Process", "Popen", "ThreadPoolExecutor", "ProcessPoolExecutor", "Pool", "to_thread",
+    "run_in_executor", "ThreadAuthenticator",
+}  # fmt: skip
+
+
+def section(title: str) -> str:
+    """Of docs/architecture.md, up to the next title of any level."""
+    found = re.search(rf"^#+ {title}$(.*?)(?=^##|\Z)", ARCHITECTURE, re.MULTILINE | re.DOTALL)
+    assert found is not None, f"no section '{title}'"
+    return found[1]
+
+
+def paths(text: str) -> set[str]:
+    return set(re.findall(r"`([\w./-]+(?:\.py|/))`", text))
+
+
+def starts_one(source: str) -> bool:
+    """Whether a module starts a thread or a process."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Call):
+            *module, name = ast.unparse(node.func).split(".")
+            if name in STARTS or (module == ["subprocess"] and name in {"run", "call", "check_output"}):
+                return True
+    return False
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_file_that_is_named_exists(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    named = {path for path in paths(text) if path.partition("/")[0] in FOLDERS}
+    assert sorted(path for path in named if not (ROOT / path).exists()) == []
+    links = re.findall(r"\]\((?!https?:|#)([^)#\s]+)", text)
+    assert sorted(link for link in links if not (page.parent / link).exists()) == []
+
+
+def test_every_name_stands_in_the_file_that_is_named_before_it() -> None:
+    assert len(paths(ARCHITECTURE)) > 60  # they were found
+    text = ARCHITECTURE + (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    named = re.findall(r"`([\w./]+\.py)` \(((?:`[\w.]+`(?:, )?)+)\)", text)
+    assert len(named) > 20
+    missing = []
+    for path, names in named:
+        for name in re.findall(r"\w+(?=`|\.)", names):
+            if not re.search(
+                rf"^\s*(def|class) {name}\b|^{name}\b.* = ", SOURCES.get(path, ""), re.MULTILINE
+            ):
+                missing.append(f"{path}: {name}")
+    assert missing == []
+
+
+def test_every_thread_and_process_is_named() -> None:
+    named = set[str]()
+    for title in ("Threads of a running node", "Threads of commands and clients", "Processes"):
+        named |= paths(section(title))
+    assert named == {path for path, source in SOURCES.items() if starts_one(source)}
+
+
+def test_names_of_threads_are_as_they_are_started() -> None:
+    rows = section("Threads of a running node") + section("Threads of commands and clients")
+    for path, source in SOURCES.items():
+        for node in ast.walk(ast.parse(source if "Thread" in source else "")):
+            if isinstance(node, ast.Call) and ast.unparse(node.func).endswith(
+                ("Thread", "ThreadPoolExecutor")
+            ):
+                said = [*node.args, *(keyword.value for keyword in node.keywords)]
+                for name in (one.value for one in said if isinstance(one, ast.Constant)):
+                    assert not isinstance(name, str) or f"`{name}`" in rows, f"{path} starts {name}"
