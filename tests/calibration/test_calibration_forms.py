@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import yaml
 from click.testing import CliRunner
-from tests.test_calibration import make_rig
+from test_calibration import make_rig
 
 from sags_node.calibration import check_rig, load_rig, read_rig, rectify_eyes, resized_rig, save_rig
 from sags_node.cli.main import main

@@ -16,7 +16,7 @@ import tempfile
 from typing import Any
 
 import pytest
-from places import ROOT
+from places import HELPERS, ROOT
 
 pytest.importorskip("triton", reason="Triton comes with torch's CUDA builds, or by `pip install triton`")
 
@@ -82,6 +82,7 @@ def compile_one(variant: Any, architecture: int) -> dict[str, int]:
 def compiled() -> dict[int, list[dict[str, Any]]]:
     """What `compile_all` prints, by architecture; both at once."""
     environment = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
+    environment["PYTHONPATH"] = os.pathsep.join([str(HELPERS), environment.get("PYTHONPATH", "")])
     running = {
         architecture: subprocess.Popen(
             [sys.executable, __file__, str(architecture)],

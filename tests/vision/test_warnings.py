@@ -62,13 +62,15 @@ def documented() -> dict[str, list[str]]:
 def emitted() -> Iterator[tuple[str, str]]:
     """A regular expression for the code of every `Finding` that the package makes, and where."""
     for file in (ROOT / "sags_node").rglob("*.py"):
-        text = file.read_text(encoding="utf-8")
-        if "sags_node.types import" not in text:
+        nodes = list(ast.walk(ast.parse(file.read_text(encoding="utf-8"))))
+        modules = [node for node in nodes if isinstance(node, ast.ImportFrom) and node.module]
+        if not any(
+            node.module == "sags_node.types" and "Finding" in {alias.name for alias in node.names}
+            for node in modules
+        ):  # a calibration's findings are others
             continue
-        for node in ast.walk(ast.parse(text)):
-            if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.args):
-                continue
-            if node.func.id == "Finding" and "calibration" not in file.parts and "calib" not in file.name:
+        for node in nodes:
+            if isinstance(node, ast.Call) and ast.unparse(node.func) == "Finding" and node.args:
                 yield _pattern(node.args[0]), f"{file.name}:{node.lineno}"
 
 
