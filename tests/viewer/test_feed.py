@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from synthetic import publisher, stream
+from synthetic import health, publisher, stream
 from waiting import until
 
 from sags_node.viewer.feed import TOPICS, Feed
@@ -15,7 +16,8 @@ pytestmark = pytest.mark.live
 
 def test_the_node_makes_one_frame_for_each_update_and_nothing_between(tmp_path: Path) -> None:
     run_dir = tmp_path / "run"
-    with publisher(run_dir) as running, stream(running):
+    running_well = replace(health(), latency_ms={"p50": 40.0})
+    with publisher(run_dir) as running, stream(running, said=lambda: running_well):
         feed = Feed(None, "sags", run_dir=run_dir)
         until(lambda: feed.now().model is not None)
         shown = []
