@@ -47,7 +47,7 @@ def examine(config: LaunchConfig) -> list[Check]:
         *(_package(name) for name in REQUIRED),
         *(_library(name, package) for name, package in OPEN3D_LIBRARIES.items()),
         _cores(),
-        _gpu(config),
+        check_gpu(config),
         *_gsplat(config),
         _kernel_cache(),
         *_ports(config.publish),
@@ -85,7 +85,7 @@ def _cores() -> Check:
     return Check("CPU", "ok", f"{cores} cores, {platform.machine()}")
 
 
-def _gpu(config: LaunchConfig) -> Check:
+def check_gpu(config: LaunchConfig) -> Check:
     """What the GPU's test drawing says. A machine without one is no worse for it, unless one is wanted."""
     if config.device == "cpu":
         return Check("GPU", "ok", "not used: device is cpu")

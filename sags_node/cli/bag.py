@@ -6,7 +6,8 @@ import json
 import signal
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, cast
 
@@ -16,6 +17,7 @@ from rich.markup import escape
 from sags_node.cli import bag_text as say
 from sags_node.cli.launching import as_json, positive
 from sags_node.cli.node_options import endpoint_option, keys_options, ns_option
+from sags_node.errors import SagsError
 from sags_node.terminal.console import console, on_stop_signals, show
 
 DATA_LOST = 3  # exit code
@@ -112,30 +114,6 @@ def record(
     from sags_node.recording.message_writer import Compression
     from sags_node.recording.recorder import Options, Recorder
 
-    names = tuple(check_topic(say.plain(name, ns)).name for name in topics)
-    folder = output or Path(f"sags_{datetime.now():%Y%m%d_%H%M%S}")
-    recorder = Recorder(
-        Options(
-            folder=folder,
-            topics=names,
-            compression=cast(Compression, compression),
-            max_cache_mb=max_cache,
-            snapshot_seconds=snapshot_mode,
-            limits=Limits(max_bag_size, max_bag_duration),
-            ns=ns,
-            endpoint=endpoint,
-            keys=keys,
-        )
-    )
-    on_stop_signals(recorder.stop)
-    signal.signal(signal.SIGUSR1, lambda *_: recorder.snapshot())
-    if from_stdin:
-        _on_lines(recorder.snapshot, at_the_end=recorder.stop)
-    if seconds is not None:
-        timer = threading.Timer(seconds, recorder.stop)
-        timer.daemon = True
-        timer.start()
-
     def tell(said: dict[str, Any]) -> None:
         if from_stdin:
             click.echo(json.dumps(said))
@@ -145,7 +123,30 @@ def record(
                 escape(" ".join(f"{what}: {value}" for what, value in said.items())), soft_wrap=True
             )
 
-    summary = recorder.run(tell)
+    with _failure_told(tell if from_stdin else None):
+        names = tuple(check_topic(say.plain(name, ns)).name for name in topics)
+        recorder = Recorder(
+            Options(
+                folder=output or Path(f"sags_{datetime.now():%Y%m%d_%H%M%S}"),
+                topics=names,
+                compression=cast(Compression, compression),
+                max_cache_mb=max_cache,
+                snapshot_seconds=snapshot_mode,
+                limits=Limits(max_bag_size, max_bag_duration),
+                ns=ns,
+                endpoint=endpoint,
+                keys=keys,
+            )
+        )
+        on_stop_signals(recorder.stop)
+        signal.signal(signal.SIGUSR1, lambda *_: recorder.snapshot())
+        if from_stdin:
+            _on_lines(recorder.snapshot, at_the_end=recorder.stop)
+        if seconds is not None:
+            timer = threading.Timer(seconds, recorder.stop)
+            timer.daemon = True
+            timer.start()
+        summary = recorder.run(tell)
     show(summary if json_out else say.recorded_table(summary))
 
 
@@ -247,6 +248,17 @@ def recover(path: Path, output: Path, json_out: bool) -> None:
     show(done if json_out else say.recovered_text(done))
     if done["lost"]:
         click.get_current_context().exit(DATA_LOST)
+
+
+@contextmanager
+def _failure_told(tell: Callable[[dict[str, Any]], None] | None) -> Iterator[None]:
+    """Also say a failure where a program reads it: `{"error": text}`; None: nobody reads."""
+    try:
+        yield
+    except SagsError as error:
+        if tell is not None:
+            tell({"error": str(error)})
+        raise
 
 
 def _on_lines(call: Callable[[], None], at_the_end: Callable[[], None] = lambda: None) -> None:

@@ -63,7 +63,7 @@ def write_report(
             f"<h1>{title}</h1>",
             f'<p class="quiet">{escape(_circumstances(summary))}</p>',
             "<h2>What it showed</h2>",
-            _warning_table(rows),
+            warning_table(rows),
             _picture_table(pictures, sheet),
             f'<p class="quiet">Grey: not tissue, or nothing known. Depth from {near * 1e3:.0f} to '
             f"{far * 1e3:.0f} mm; the error is brightest at {ERROR_AT_TOP:.0%} of full scale.</p>",
@@ -108,7 +108,7 @@ def _picture_table(pictures: Sequence[Picture], sheet: Sequence[Sequence[U8]]) -
     return "\n".join([*lines, "</table>"])
 
 
-def _warning_table(rows: Sequence[FrameRow]) -> str:
+def warning_table(rows: Sequence[FrameRow]) -> str:
     """What the run warned of, when, and what to do; nothing where it did not."""
     frames: dict[str, list[int]] = {}
     said: dict[str, str] = {}

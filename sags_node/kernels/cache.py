@@ -123,7 +123,7 @@ class _KernelCache(FunctionCache):  # type: ignore[misc]  # Numba has no types
                 is_new = not folder.exists()
                 super().save_overload(signature, compiled)
                 if is_new:
-                    _clear_old(folder.parent)
+                    clear_old(folder.parent)
         except OSError as error:
             _warn(f"compiled kernels cannot be kept in {folder.parent}: {error.strerror or error}")
 
@@ -143,7 +143,7 @@ def _lock(root: Path) -> Iterator[None]:
         yield
 
 
-def _clear_old(root: Path) -> None:
+def clear_old(root: Path) -> None:
     """Leave the `KEPT` folders that were used last. A process that misses one compiles again."""
     used = {}
     for folder in root.glob("*-*"):

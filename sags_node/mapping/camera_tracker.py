@@ -30,9 +30,7 @@ TRIAL = 6  # frames in which a pose that was found again must agree with picture
 TRIED = 3  # candidates for such a pose per frame
 LOOK_NS = 150_000_000  # between two looks whether a frame agrees with the keyframes
 DISAGREEING = 5  # looks in a row: then the pose that was found again was wrong
-PROBATION_NS = (
-    3_000_000_000  # after a pose was found again: no keyframes are made, what is learnt can be undone
-)
+PROBATION_NS = 3_000_000_000  # after a pose was found again: no new keyframes, what is learnt can be undone
 GIVE_UP_NS = 3_000_000_000  # of lit frames that show one scene: then a new model is begun
 SAME_SCENE = 0.7  # correlation of a lit frame with the one before, shrunk
 LIT = 4.0  # grey levels, standard deviation over the tissue: a covered or dark picture has less

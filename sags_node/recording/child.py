@@ -211,10 +211,7 @@ class _Child:
             SagsError: it has ended instead.
             TimeoutError: it says nothing.
         """
-        line = self._next_line(seconds)
-        if line is None:
-            raise SagsError(self._last_words())
-        return json.loads(line)
+        return self._said(self._next_line(seconds))
 
     def finish(self, seconds: float) -> Any:
         """Let it end; the last line it says.
@@ -235,9 +232,10 @@ class _Child:
         said = None
         while (line := self._next_line(KILL_SECONDS)) is not None:
             said = line
-        if self._process.returncode != 0 or said is None:
+        summary = self._said(said)
+        if self._process.returncode != 0:
             raise SagsError(self._last_words())
-        return json.loads(said)
+        return summary
 
     def kill(self) -> None:
         """End it at once. What it wrote can be recovered."""
@@ -260,12 +258,21 @@ class _Child:
             self._lines.put(None)
         return line
 
+    def _said(self, line: str | None) -> Any:
+        """What a line says; a failure where it says `error`, or there is none."""
+        if line is None:
+            raise SagsError(self._last_words())
+        said = json.loads(line)
+        if "error" in said:
+            raise SagsError(said["error"])
+        return said
+
     def _last_words(self) -> str:
-        """The message of a command that failed."""
+        """Of a recorder that ended without a line on stdout."""
         try:
             self._process.wait(KILL_SECONDS)
         except subprocess.TimeoutExpired:
             return "the recorder closed its output and did not end"
         self._errors.seek(0)
         said = " ".join(self._errors.read().split())
-        return said.partition("error: ")[2] or said or "the recorder ended without a word"
+        return f"the recorder failed: {said}" if said else "the recorder ended without a word"

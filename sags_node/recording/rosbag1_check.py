@@ -44,7 +44,7 @@ def _chunk_positions(file: Path, size: int, changed: int) -> frozenset[int]:
             fields = _fields(header, position)
             if fields.get(b"op") == CHUNK_OP:
                 positions.add(position)
-                _check_chunk(bag, length, fields, position)
+                check_chunk(bag, length, fields, position)
             bag.seek(position + 8 + len(header) + length)
     return frozenset(positions)
 
@@ -75,7 +75,7 @@ def _fields(header: bytes, position: int) -> dict[bytes, bytes]:
     return fields
 
 
-def _check_chunk(bag: BinaryIO, length: int, fields: dict[bytes, bytes], position: int) -> None:
+def check_chunk(bag: BinaryIO, length: int, fields: dict[bytes, bytes], position: int) -> None:
     """The packed data is unpacked once here, with a limit that the reader itself does not have."""
     said = fields.get(b"size", b"")
     size = int(_LENGTH.unpack(said)[0]) if len(said) == _LENGTH.size else MAX_CHUNK_BYTES + 1

@@ -65,7 +65,7 @@ class Panel:
         server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         server.gui.set_panel_label(f"sags view · {ns}")
         server.gui.main_panel.dock_right()
-        self._status = server.gui.add_html(_status_line(Moment("connecting")))
+        self._status = server.gui.add_html(status_line(Moment("connecting")))
         self._build_view(rate)
         self._build_anchors()
         self._build_node()
@@ -79,7 +79,7 @@ class Panel:
 
     def show(self, moment: Moment) -> None:
         """Bring status, pictures, plots and the list of anchors up to date."""
-        self._status.content = _status_line(moment)
+        self._status.content = status_line(moment)
         self._pictures.image = self._sheet.draw(moment)
         if self._history.add(moment):
             for plot, figures in self._plots:
@@ -208,7 +208,7 @@ def _in_words(answer: Any) -> str:
     return ", ".join(f"{key}: {value}" for key, value in answer.items()) or "done"
 
 
-def _status_line(moment: Moment) -> str:
+def status_line(moment: Moment) -> str:
     """One line: why nothing is shown, or how the node does; below it what it warns of."""
     status = moment.status
     if moment.problem is not None:

@@ -181,13 +181,13 @@ def _are_equal(left: F32, right: F32) -> bool:
 def _are_exchanged(left: F32, right: F32) -> bool:
     """In a rectified pair everything lies farther left in the right picture. In an exchanged one it lies
     farther right, unless the eyes converge so much that the calibration shifts it back."""
-    match = _row_correlation(left, right)
+    match = row_correlation(left, right)
     reach = len(match) // 2
     wrong, true = match[:reach].max(), match[reach + 1 :].max()
     return bool(wrong > LEAST_MATCH and wrong > true + CLEARLY_BETTER)
 
 
-def _row_correlation(left: F32, right: F32) -> F32:
+def row_correlation(left: F32, right: F32) -> F32:
     """Correlation of the rows for disparities from minus to plus half of the width, [2 * (w // 2) + 1]."""
     width = left.shape[1]
     reach = width // 2

@@ -226,7 +226,7 @@ def test_gsplat_draws_the_same_scene_and_a_wrong_one_is_seen(with_gsplat: None) 
         assert torch.allclose(own, getattr(same, name), rtol=1e-4, atol=1e-3), name
     drawing.gaussians.colors[3] += 0.5
     ours = DeviceDrawing(CASE, CudaRasterizer(CASE.width, CASE.height, True, CPU))
-    apart = gsplat_rasterizing._apart(ours, drawing)
+    apart = gsplat_rasterizing.apart(ours, drawing)
     assert apart["planes_apart"] > 0.05 and apart["gradients_apart"] > 1e-3
 
 
@@ -247,7 +247,7 @@ def test_without_gsplat_a_line_says_so(
         raise UsageError("it is not installed: pip install 'sags-node[gsplat]'")
 
     monkeypatch.setattr(device_kernels.gsplat_backend, "usable_device", missing)
-    wanted, said = device_kernels._gsplat(wanted=True)
+    wanted, said = device_kernels.find_gsplat(wanted=True)
     assert not wanted
     table = copy.deepcopy(quick[0]) | {"gsplat": said}
     del table["rasterize"][0]["gsplat"]

@@ -47,7 +47,7 @@ def ignore(done: int, total: int, what: str) -> None:
 
 
 def visits(count: int, order: Any, length: int, seed: int = 0) -> list[int]:
-    return list(itertools.islice(endurance._visits(count, order, seed), length))
+    return list(itertools.islice(endurance.visits(count, order, seed), length))
 
 
 def test_there_and_back_never_jumps_and_shows_no_frame_twice_in_a_row() -> None:

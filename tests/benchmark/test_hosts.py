@@ -17,8 +17,8 @@ SHORT = ["source.frames:=20"]  # at 10 Hz
 def test_hosts_are_played_and_leave_the_machine_as_it_was(
     phantom_session: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    chosen = {"one core": None, "with a reader of everything": hosts._reader}
-    monkeypatch.setattr(hosts, "_neighbours", lambda: chosen)
+    chosen = {"one core": None, "with a reader of everything": hosts.reader}
+    monkeypatch.setattr(hosts, "neighbours", lambda: chosen)
     mine, said = os.sched_getaffinity(0), []
     rows = hosts.measure_hosts(str(phantom_session), SHORT, 2.0, said.append)
     assert [row["name"] for row in rows] == list(chosen) and len(said) == 2
@@ -29,6 +29,6 @@ def test_hosts_are_played_and_leave_the_machine_as_it_was(
 
 
 def test_a_run_that_fails_says_why(phantom_session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(hosts, "_neighbours", lambda: {"alone": None})
+    monkeypatch.setattr(hosts, "neighbours", lambda: {"alone": None})
     with pytest.raises(SagsError, match=r"mapping\.rung 99"):
         hosts.measure_hosts(str(phantom_session), [*SHORT, "mapping.rung:=99"], 2.0, lambda what: None)

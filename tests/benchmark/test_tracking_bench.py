@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from places import SESSION
 
-from sags_node.benchmark.quality.tracking import _sample, measure_tracking, table
+from sags_node.benchmark.quality.tracking import measure_tracking, sample, table
 from sags_node.errors import SagsError
 from sags_node.mapping.anchors import Anchors
 from sags_node.session import Session, open_session
@@ -28,7 +28,7 @@ def test_a_model_of_any_size_is_followed() -> None:
     flow = np.zeros((30, 40, 2), np.float32)
     flow[..., 0], flow[..., 1] = np.arange(40), np.arange(30)[:, None]
     places = np.random.default_rng(0).uniform(0, [39, 29], (70_000, 2))
-    assert _sample(flow, places) == pytest.approx(places, abs=1 / 32)  # px: what OpenCV rounds places to
+    assert sample(flow, places) == pytest.approx(places, abs=1 / 32)  # px: what OpenCV rounds places to
 
 
 def test_anchors_that_stand_still_are_seen_to_be_wrong(monkeypatch: pytest.MonkeyPatch) -> None:

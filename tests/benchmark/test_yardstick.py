@@ -54,7 +54,7 @@ def test_both_draw_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(projector, "MIP_VARIANCE", 0.3)
     case = RasterCase(500, 64, 64, 1)
     ours = Drawing(case).forward()[0, :3]
-    with yardstick._compiled(PROGRAM, 1) as library:
+    with yardstick.compiled(PROGRAM, 1) as library:
         program = yardstick._Program(library, case)
         program.forward_backward()
     # 2^x of both is off by 2.6e-6, and colours are below 1; a splat cut at 1/255 may show in a few pixels

@@ -74,17 +74,17 @@ def without_compiler(machine: pytest.MonkeyPatch) -> None:
         raise RuntimeError("Failed to find C compiler. Please specify via CC environment variable.\nmore")
 
     usable(machine)
-    machine.setattr(probe, "_largest_difference", fails)
+    machine.setattr(probe, "largest_difference", fails)
 
 
 def drawing_wrongly(machine: pytest.MonkeyPatch) -> None:
     usable(machine)
-    machine.setattr(probe, "_largest_difference", lambda: 0.25)
+    machine.setattr(probe, "largest_difference", lambda: 0.25)
 
 
 def drawing_nothing(machine: pytest.MonkeyPatch) -> None:
     usable(machine)
-    machine.setattr(probe, "_largest_difference", lambda: float("nan"))
+    machine.setattr(probe, "largest_difference", lambda: float("nan"))
 
 
 UNUSABLE = [
@@ -111,7 +111,7 @@ def test_a_gpu_that_cannot_be_used_is_explained(
         choose_device("cuda")
     said = str(raised.value)
     assert reason in said and mend in said and "\n" not in said and "device:=cpu" in said
-    check = doctor._gpu(LaunchConfig(device="cuda"))
+    check = doctor.check_gpu(LaunchConfig(device="cuda"))
     assert check.level == "error" and reason in check.found and mend in check.mend
 
 
@@ -127,10 +127,10 @@ def test_a_missing_gpu_ends_the_command_with_one_message(
 
 def test_a_usable_gpu_is_chosen_and_gets_more_gaussians(machine: pytest.MonkeyPatch) -> None:
     usable(machine)
-    machine.setattr(probe, "_largest_difference", lambda: 1e-5)
+    machine.setattr(probe, "largest_difference", lambda: 1e-5)
     assert choose_device("auto").name == choose_device("cuda").name == "NVIDIA H100"
     assert choose_device("cpu").kind == "cpu"
-    assert doctor._gpu(LaunchConfig()).level == "ok" and "H100" in doctor._gpu(LaunchConfig()).found
+    assert doctor.check_gpu(LaunchConfig()).level == "ok" and "H100" in doctor.check_gpu(LaunchConfig()).found
     cpu = mapping_devices.affordable(LaunchConfig(device="cpu"), 1280, 1024)
     gpu = mapping_devices.affordable(LaunchConfig(), 1280, 1024)
     assert gpu > 2 * cpu
@@ -141,14 +141,14 @@ def test_a_usable_gpu_is_chosen_and_gets_more_gaussians(machine: pytest.MonkeyPa
 def test_the_gpu_is_tried_out_once(machine: pytest.MonkeyPatch) -> None:
     tried = []
     usable(machine)
-    machine.setattr(probe, "_largest_difference", lambda: tried.append(1) or 1e-5)
+    machine.setattr(probe, "largest_difference", lambda: tried.append(1) or 1e-5)
     for _ in range(3):
         choose_device("auto")
     assert len(tried) == 1
 
 
 def test_the_probe_compares_a_drawing_and_its_gradients(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert probe._largest_difference() < 0.1 * probe.TOLERANCE
+    assert probe.largest_difference() < 0.1 * probe.TOLERANCE
     real = CudaRasterizer.pull_back
 
     def wrong(*args: Any, **names: Any) -> Any:
@@ -156,7 +156,7 @@ def test_the_probe_compares_a_drawing_and_its_gradients(monkeypatch: pytest.Monk
         return replace(found, means=found.means * 1.01)
 
     monkeypatch.setattr(CudaRasterizer, "pull_back", wrong)
-    assert probe._largest_difference() > probe.TOLERANCE
+    assert probe.largest_difference() > probe.TOLERANCE
 
 
 def test_machines_without_a_gpu_never_wait_for_torch() -> None:

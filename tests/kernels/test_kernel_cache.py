@@ -258,7 +258,7 @@ def test_folders_that_were_not_used_for_longest_are_cleared(
         (tmp_path / f"engine.{name}-1/index").touch()
         os.utime(tmp_path / f"engine.{name}-1", (1e9 - age, 1e9 - age))
     cache._used.__wrapped__(tmp_path / "engine.e-1")
-    cache._clear_old(tmp_path)
+    cache.clear_old(tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["engine.a-1", "engine.b-1", "engine.e-1"]
 
 

@@ -160,8 +160,8 @@ def test_opening_a_large_bag_takes_little_memory(tmp_path: Path) -> None:
 def test_a_ros1_bag_is_checked_once_until_it_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A loop must not wait until all of it was unpacked again."""
     checked: list[int] = []
-    check = rosbag1_check._check_chunk
-    monkeypatch.setattr(rosbag1_check, "_check_chunk", lambda *chunk: (checked.append(1), check(*chunk)))
+    check = rosbag1_check.check_chunk
+    monkeypatch.setattr(rosbag1_check, "check_chunk", lambda *chunk: (checked.append(1), check(*chunk)))
     path = KINDS["ros1 lz4"](tmp_path)
     assert len(play(path, loop=True, frames=3 * COUNT)) == 3 * COUNT
     once = len(checked)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sags_node.vision.pair_watch import _row_correlation
+from sags_node.vision.pair_watch import row_correlation
 from sags_node.vision.picture_fit import Fit
 
 GAIN = np.array([1.2, 1.0, 0.8], np.float32)
@@ -46,6 +46,6 @@ def test_what_covers_a_part_is_found_and_leaves_the_exposure(drawn: np.ndarray) 
 def test_rows_correlate_where_they_lie(shift: int) -> None:
     scene = np.random.default_rng(4).normal(0, 20, (64, 120)).astype(np.float32)
     left, right = scene[:, 20:100], scene[:, 20 + shift : 100 + shift]
-    match = _row_correlation(left, right)
+    match = row_correlation(left, right)
     assert len(match) == 81 and np.argmax(match) == 40 + shift
     assert match.max() == pytest.approx(1, abs=1e-5)

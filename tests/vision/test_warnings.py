@@ -18,7 +18,7 @@ from rich.console import Console
 from synthetic import health, plane_result, publisher, stream
 
 from sags_node.evaluation.measure import FrameRow, Options
-from sags_node.evaluation.report import _warning_table
+from sags_node.evaluation.report import warning_table
 from sags_node.evaluation.spool import RunFacts
 from sags_node.evaluation.summary import summarise
 from sags_node.findings import STAGES, by_code, by_stage, in_words
@@ -254,9 +254,9 @@ def test_the_report_says_when_and_what_to_do() -> None:
     facts = RunFacts(0, 1.0, None, 1.0, {}, {}, 1, {})
     warned = replace(facts, warnings={BLACK.code: "<" + BLACK.text})
     rows = [FrameRow(k, k / 30, {}, warned if 3 <= k < 8 else facts) for k in range(10)]
-    table = _warning_table(rows)
+    table = warning_table(rows)
     assert "5 frames, 3 to 7" in table and "&lt;" + BLACK.text in table and BLACK.code in table
-    assert _warning_table(rows[:3]) == ""
+    assert warning_table(rows[:3]) == ""
     assert summarise("s", rows, Options(hold_out=0), {}, None)["warnings"] == {BLACK.code: 5}
 
 
@@ -278,6 +278,6 @@ def test_topic_echo_tells_of_warnings_whatever_the_topic(tmp_path: Path) -> None
 def test_the_viewer_shows_them_below_the_status() -> None:
     panel = pytest.importorskip("sags_node.viewer.panel", reason="viser is not installed (extra: viewer)")
     status = Status("running", warning_codes={BLACK.code: f"<b>{BLACK.text}"})
-    shown = panel._status_line(Moment(None, status))
+    shown = panel.status_line(Moment(None, status))
     assert f"&lt;b&gt;{BLACK.text}" in shown and BLACK.code in shown and "sags-warning" in shown
-    assert "sags-warning" not in panel._status_line(Moment(None, Status("running")))
+    assert "sags-warning" not in panel.status_line(Moment(None, Status("running")))

@@ -56,7 +56,7 @@ def measure_device_kernels(settings: DeviceSettings, advance: Advance) -> dict[s
         )
     clock: Clock = WALL if interpreted else EventClock()
     peak = measure_device_peak(device, SMALL_PROBE if interpreted else full_probe(device), clock)
-    beside, gsplat_is = _gsplat(settings.gsplat)
+    beside, gsplat_is = find_gsplat(settings.gsplat)
     table: dict[str, Any] = {
         "machine": machine_name(),
         "device": found.name,
@@ -77,7 +77,7 @@ def measure_device_kernels(settings: DeviceSettings, advance: Advance) -> dict[s
     return table
 
 
-def _gsplat(wanted: bool) -> tuple[bool, str]:
+def find_gsplat(wanted: bool) -> tuple[bool, str]:
     """Whether gsplat is measured, and its version, or why it is not."""
     if not wanted:
         return False, "not asked for"

@@ -33,7 +33,7 @@ def measure_gsplat(case: RasterCase, runs: int, clock: Clock, device: torch.devi
         "forward_backward_ms": median_ms(plain.forward_backward, runs, clock=clock),
         "same_outputs_forward_ms": median_ms(same.forward, runs, clock=clock),
         "same_outputs_forward_backward_ms": median_ms(same.forward_backward, runs, clock=clock),
-        **_apart(ours, same),
+        **apart(ours, same),
     }
 
 
@@ -58,7 +58,7 @@ class PlainCall:
         return torch.autograd.grad(self.forward(), self._leaves, self._cotangents)
 
 
-def _apart(ours: DeviceDrawing, theirs: DeviceDrawing) -> dict[str, float]:
+def apart(ours: DeviceDrawing, theirs: DeviceDrawing) -> dict[str, float]:
     planes, their_planes = ours.forward(), theirs.forward()
     largest = planes.abs().amax((0, 2, 3))
     gradients: list[Any] = [drawing.forward_backward() for drawing in (ours, theirs)]

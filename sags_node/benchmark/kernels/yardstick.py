@@ -61,7 +61,7 @@ def measure_yardstick(source: Path, settings: YardstickSettings, advance: Advanc
     """
     threads = configure_threads(MAX_THREADS)
     rows = []
-    with _compiled(source, threads) as library:
+    with compiled(source, threads) as library:
         for done, count in enumerate(settings.counts):
             advance(done, len(settings.counts), f"{count} Gaussians")
             rows.append(
@@ -105,7 +105,7 @@ def _alternate(one: Callable[[], object], other: Callable[[], object], runs: int
 
 
 @contextmanager
-def _compiled(source: Path, threads: int) -> Iterator[ctypes.CDLL]:
+def compiled(source: Path, threads: int) -> Iterator[ctypes.CDLL]:
     compiler = shutil.which("g++")
     if compiler is None:
         raise SagsError("the yardstick is a C++ program and needs g++, which is not here; install it")

@@ -129,9 +129,7 @@ def measure_endurance(
     still: list[_Taken] = []
     interrupted = False
     try:
-        for done, index in enumerate(
-            itertools.islice(_visits(len(kept), order, session.config.seed), frames)
-        ):
+        for done, index in enumerate(itertools.islice(visits(len(kept), order, session.config.seed), frames)):
             if len(moving) == per_window:
                 moving.clear()
             moving.append(run.take(kept[index]))
@@ -192,7 +190,7 @@ def _kept(session: Session) -> list[StereoFrame]:
     return kept
 
 
-def _visits(count: int, order: Order, seed: int) -> Iterator[int]:
+def visits(count: int, order: Order, seed: int) -> Iterator[int]:
     """Which frame comes next, for ever."""
     if order == "wrap":
         yield from itertools.cycle(range(count))

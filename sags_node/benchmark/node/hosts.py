@@ -55,13 +55,13 @@ def measure_hosts(
         SagsError: a node or a neighbour does not run.
     """
     rows = []
-    for name, beside in _neighbours().items():
+    for name, beside in neighbours().items():
         progress(f"live: {name}")
-        with tempfile.TemporaryDirectory(prefix="sags-hosts-") as folder, ExitStack() as neighbours:
+        with tempfile.TemporaryDirectory(prefix="sags-hosts-") as folder, ExitStack() as stack:
             run_dir = Path(folder) / "sags"  # where a process with this XDG_RUNTIME_DIR looks for it
             run_dir.mkdir(mode=0o700)
             if beside is not None:
-                neighbours.enter_context(beside(run_dir))
+                stack.enter_context(beside(run_dir))
             cores = 1 if name == "one core" else None
             rows.append(
                 {"name": name, "part": "hosts", **_played(launch, overrides, run_dir, cores, seconds)}
@@ -69,14 +69,14 @@ def measure_hosts(
     return rows
 
 
-def _neighbours() -> dict[str, Beside | None]:
+def neighbours() -> dict[str, Beside | None]:
     """By the host's name. Without a browser a viewer takes nothing, so that host is left out."""
     hosts: dict[str, Beside | None] = {
         "alone": None,
         "one core": None,
         "beside a busy process": lambda run_dir: burning_core(),
         "with the overlay": _overlay,
-        "with a reader of everything": _reader,
+        "with a reader of everything": reader,
     }
     if _browser() is not None:
         hosts["with the viewer"] = _viewer
@@ -186,7 +186,7 @@ def _viewer(run_dir: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _reader(run_dir: Path) -> Iterator[None]:
+def reader(run_dir: Path) -> Iterator[None]:
     process = multiprocessing.get_context("spawn").Process(target=_read, args=(str(run_dir),), daemon=True)
     process.start()
     try:

@@ -102,8 +102,8 @@ def _measured(
 
 def _follow(places: F64, there: F32, back: F32, tissue: Bool) -> tuple[F64, Bool]:
     """Where the flow takes places [M, 2] px, and whether to believe it [M]."""
-    ends = places + _sample(there, places)
-    error = np.linalg.norm(ends + _sample(back, ends) - places, axis=1)
+    ends = places + sample(there, places)
+    error = np.linalg.norm(ends + sample(back, ends) - places, axis=1)
     height, width = tissue.shape
     x, y = np.rint(ends).astype(int).T
     inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)
@@ -111,7 +111,7 @@ def _follow(places: F64, there: F32, back: F32, tissue: Bool) -> tuple[F64, Bool
     return ends, on_tissue & (error < CONSISTENT)
 
 
-def _sample(flow: F32, places: F64) -> F64:
+def sample(flow: F32, places: F64) -> F64:
     taken = [
         cv2.remap(flow, some[:, None], None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0]
         for some in np.array_split(places.astype(np.float32), len(places) // AT_ONCE + 1)

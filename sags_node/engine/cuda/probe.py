@@ -33,7 +33,7 @@ def probe() -> str:
             "look at nvidia-smi and install a newer driver",
         )
     try:
-        apart = _largest_difference()
+        apart = largest_difference()
         name = "CPU (Triton's interpreter)" if interpreted else torch.cuda.get_device_name()
     except Exception as error:  # the driver, Triton and the C compiler that it calls fail in many ways
         first = (str(error).strip() or type(error).__name__).splitlines()[0]
@@ -48,7 +48,7 @@ def probe() -> str:
     return name
 
 
-def _largest_difference() -> float:
+def largest_difference() -> float:
     """Of planes and gradients, relative to the largest value of each."""
     rng = np.random.default_rng(0)
     scene = Gaussians(
