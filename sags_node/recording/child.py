@@ -118,6 +118,10 @@ class RecorderProcess:
         self._child = _Child(command, folder, has_ring=request.snapshot_seconds is not None)
         try:
             return self._child.answer(START_SECONDS)
+        except SagsError:  # it has said why, and ends
+            self._child.kill()
+            self._child = None
+            raise
         except TimeoutError:
             self._child.kill()
             raise SagsError(

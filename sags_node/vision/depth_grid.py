@@ -57,6 +57,10 @@ def depth_grid(depth: F32, confidence: F32, tissue: Bool, focal: float, baseline
     height, width = depth.shape
     side = max(1, round(width / CELLS))
     rows, columns = -(-height // side), -(-width // side)
+    if not depth.any():
+        return DepthGrid(
+            float(side), np.zeros((rows, columns), np.float32), np.full((rows, columns), np.inf, np.float32)
+        )
     px = np.float32(width / WIDTH / (focal * (baseline or NOMINAL_BASELINE)))  # 1/m of one px of disparity
     line = -(-columns // LANES) * LANES + 2 * AROUND
     sums = np.zeros((3, rows + 2 * AROUND, line), np.float32)  # nothing beyond the picture's edges

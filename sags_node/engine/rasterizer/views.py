@@ -6,7 +6,7 @@ import cv2
 import numba
 import numpy as np
 
-from sags_node.kernels.jit import aligned, parallel_kernel, read_only
+from sags_node.kernels.jit import parallel_kernel, read_only
 from sags_node.types import F32, Camera, RenderedView
 
 f4 = np.float32
@@ -42,11 +42,11 @@ def to_view(planes: F32, camera: Camera, frame_id: int, t_capture_ns: int) -> Re
     solid = planes[4]
     if planes.shape[1:] != (height, width):
         size, small = (width, height), planes
-        planes = aligned((5, height, width))
+        planes = np.empty((5, height, width), f4)
         for k in (0, 1, 2, 4):
             cv2.resize(small[k], size, planes[k], interpolation=cv2.INTER_CUBIC)
         cv2.resize(small[3], size, planes[3], interpolation=cv2.INTER_LINEAR)
         solid = cv2.resize(solid, size, interpolation=cv2.INTER_LINEAR)
-    rgb, depth, alpha = aligned((height, width, 3)), aligned((height, width)), aligned((height, width))
+    rgb, (depth, alpha) = np.empty((height, width, 3), f4), np.empty((2, height, width), f4)
     _normalise(read_only(planes), read_only(solid), rgb, depth, alpha)
     return RenderedView(frame_id, t_capture_ns, camera, rgb, depth, alpha)
