@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from sags_node.plotting import as_png, new_figure
@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 WIDTH, HEIGHT = 1100, 520  # px of a panel
+BESIDE, LETTER, LINE = 11, 6, 12  # px: of a name to its point, of a letter, of a line
 COLOURS = {
     "default": "#1e1e1e",
     "budgets": "#2166ac",
@@ -58,14 +59,33 @@ def _panel(axes: Axes, session: Row) -> None:
             label=None if part in named else part,
         )  # fmt: skip
         named.add(part)
-        said = _difference(row["name"], rows[0]["name"])
-        axes.annotate(said, place, (8, -3), textcoords="offset points", color=colour)
     axes.margins(x=0.15)  # names stand right of their points
     low, high = axes.get_xlim()
     axes.set_xticks([ms for ms in TICKS_MS if low <= ms <= high])
     axes.xaxis.set_major_formatter("{x:g}")
     axes.minorticks_off()
     axes.legend(loc="best")
+    _label(axes, rows)
+
+
+def _label(axes: Axes, rows: Sequence[Row]) -> None:
+    """The name of each point beside it, or above or below its neighbours' names."""
+    axes.get_figure(root=True).draw_without_rendering()  # it settles where points lie
+    taken: list[tuple[float, float, float]] = []  # left, right, bottom, px
+    for row in rows:
+        said = _difference(row["name"], rows[0]["name"])
+        x, y = axes.transData.transform(_place(row))
+        left, right = x + BESIDE, x + BESIDE + LETTER * len(said)
+        rooms = [
+            down
+            for down in (-4, 8, -16, 20, -28, 32)
+            if not any(left < b and a < right and abs(y + down - c) < LINE for a, b, c in taken)
+        ]
+        down = rooms[0] if rooms else -4
+        taken.append((left, right, y + down))
+        axes.annotate(
+            said, _place(row), (BESIDE, down), textcoords="offset pixels", color=COLOURS[row["part"]]
+        )
 
 
 def _place(row: Row) -> tuple[float, float]:
