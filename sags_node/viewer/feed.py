@@ -39,8 +39,8 @@ ANCHOR_FIELDS = {"id", "visibility", "confidence", "age"}
 
 MAX_AGE = 1.0  # s; older content is not shown
 LEAST_HZ = 0.5  # the viewer shows a few frames of many, so losing some of them is no fault; age is
-WAIT_FOR_PICTURE = 0.3  # s: for a subscription to arrive, and a camera of 10 Hz
-WAIT_FOR_REST = 0.1  # s for what belongs to a picture
+WAIT_FOR_PICTURE = MAX_AGE  # s: later none is new
+WAIT_FOR_REST = 0.3  # s for what belongs to a picture
 SILENT_AFTER = 2.5  # s without a `status`, which comes every second
 
 _STATES = {
@@ -119,7 +119,9 @@ class Feed:
             return Moment(self._absent)
         subscriber.resume()
         try:
-            picture = subscriber.wait(PICTURE, WAIT_FOR_PICTURE, after=subscriber.latest(PICTURE))
+            sends = _status_of(subscriber).state not in _STATES
+            before = subscriber.latest(PICTURE)
+            picture = subscriber.wait(PICTURE, WAIT_FOR_PICTURE, after=before) if sends else None
             if picture is not None:
                 subscriber.aligned(TOPICS, picture.stamp_ns, WAIT_FOR_REST)
             return self._seen(subscriber)

@@ -29,3 +29,15 @@ def test_the_node_makes_one_frame_for_each_update_and_nothing_between(tmp_path: 
             shown.append(moment.model.frame_id)
         feed.rest()
     assert shown == sorted(set(shown)), "a new one each time"
+
+
+def test_a_node_of_two_frames_a_second_is_shown_too(tmp_path: Path) -> None:
+    run_dir = tmp_path / "run"
+    running_well = replace(health(), latency_ms={"p50": 40.0})
+    with publisher(run_dir) as running, stream(running, rate=2.0, said=lambda: running_well):
+        feed = Feed(None, "sags", run_dir=run_dir)
+        until(lambda: feed.now().model is not None)
+        for _ in range(3):
+            moment = feed.now()
+            assert moment.problem is None and moment.model is not None
+        feed.rest()
