@@ -17,9 +17,7 @@ from sags_node.cli.launching import write_json
 
 RESULTS = sorted((ROOT / "benchmarks/results").glob("*.json"))
 # Measured before results named where they come from. A file leaves this list when it is measured anew.
-EARLIER = {
-    "ablation_d4d", "ablation_phantom", "crowd", "endurance_walk", "pareto", "skips_d4d",
-}  # fmt: skip
+EARLIER = {"ablation_d4d"}
 
 
 def check(found: Any) -> None:
