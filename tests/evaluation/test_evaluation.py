@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from places import ROOT
 
 from sags_node import plotting
 from sags_node.calibration import save_rig
@@ -464,6 +465,6 @@ def test_live_cameras_and_ambiguous_segments_are_refused(tmp_path: Path) -> None
 
 
 def test_the_page_of_figures_explains_every_group() -> None:
-    page = (Path(__file__).parent.parent / "docs/results.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs/results.md").read_text(encoding="utf-8")
     groups = [*GROUPS, "depth_confidence", "track", "pose"]
     assert [group for group in groups if f"`{group}`" not in page] == []
