@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import click
-from rich.logging import RichHandler
 from rich.markup import escape
 
 from sags_node import __version__
@@ -69,6 +68,8 @@ def main(verbose: bool) -> None:
 
     Research software, not a medical device.
     """
+    from rich.logging import RichHandler  # --help needs none
+
     level = logging.INFO if verbose else logging.WARNING
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
         signal.signal(signal.SIGINT, interrupt)

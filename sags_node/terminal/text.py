@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-import yaml
 from rich.table import Table
 
 if TYPE_CHECKING:
@@ -60,6 +59,8 @@ def bw_text(figures: Record) -> str:
 
 def echo_text(record: Record) -> str:
     """One message as YAML, ended by a line of dashes."""
+    import yaml  # only here: all commands load this file
+
     return yaml.safe_dump(_short(record), sort_keys=False, default_flow_style=None, width=100) + "---"
 
 

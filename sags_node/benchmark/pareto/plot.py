@@ -9,6 +9,7 @@ from sags_node.plotting import as_png, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 WIDTH, HEIGHT = 1100, 520  # px of a panel
 BESIDE, LETTER, LINE = 11, 6, 12  # px: of a name to its point, of a letter, of a line
@@ -30,11 +31,12 @@ def picture(measured: Row) -> bytes:
     sessions = measured["sessions"]
     figure = new_figure(WIDTH, HEIGHT * len(sessions))
     for axes, session in zip(figure.subplots(len(sessions), 1, squeeze=False)[:, 0], sessions, strict=True):
-        _panel(axes, session)
+        _label(figure, axes, _panel(axes, session))
     return as_png(figure)
 
 
-def _panel(axes: Axes, session: Row) -> None:
+def _panel(axes: Axes, session: Row) -> list[Row]:
+    """Draws the points of a recording; returns their rows."""
     live = [row | {"online_at_full_size": row["online"], "non_dominated": False} for row in session["hosts"]]
     rows = [*session["settings"], *live]
     rate = session["rate_hz"]
@@ -65,12 +67,12 @@ def _panel(axes: Axes, session: Row) -> None:
     axes.xaxis.set_major_formatter("{x:g}")
     axes.minorticks_off()
     axes.legend(loc="best")
-    _label(axes, rows)
+    return rows
 
 
-def _label(axes: Axes, rows: Sequence[Row]) -> None:
+def _label(figure: Figure, axes: Axes, rows: Sequence[Row]) -> None:
     """The name of each point beside it, or above or below its neighbours' names."""
-    axes.get_figure(root=True).draw_without_rendering()  # it settles where points lie
+    figure.draw_without_rendering()  # it settles where points lie
     taken: list[tuple[float, float, float]] = []  # left, right, bottom, px
     for row in rows:
         said = _difference(row["name"], rows[0]["name"])
