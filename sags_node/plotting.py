@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.util import find_spec
 from io import BytesIO, StringIO
 from typing import TYPE_CHECKING, Any
@@ -37,14 +39,15 @@ def check_plots() -> None:
         raise UsageError("plots need matplotlib, which is not installed: pip install 'sags-node[report]'")
 
 
-def new_figure(width: float, height: float) -> Figure:
-    """An empty figure of a size in px. `check_plots` says what it raises."""
+@contextmanager
+def new_figure(width: float, height: float) -> Iterator[Figure]:
+    """An empty figure of a size in px, to be filled and written within. `check_plots` says what it raises."""
     check_plots()
     import matplotlib
     from matplotlib.figure import Figure
 
-    matplotlib.rcParams.update(_STYLE)
-    return Figure((width / DPI, height / DPI), dpi=DPI)
+    with matplotlib.rc_context(_STYLE):  # whoever else plots in this process keeps their own style
+        yield Figure((width / DPI, height / DPI), dpi=DPI)
 
 
 def as_svg(figure: Figure) -> str:

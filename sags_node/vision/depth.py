@@ -28,10 +28,10 @@ class Measured(NamedTuple):
     hurried: bool = False  # there was no time
 
     @classmethod
-    def nothing(cls, shape: tuple[int, ...], why: str, is_sound: bool = True, hurried: bool = False) -> Self:
+    def nothing(cls, shape: tuple[int, ...], why: str, hurried: bool = False) -> Self:
         """No depth at all."""
         depth, confidence = np.zeros((2, *shape), np.float32)
-        return cls(depth, confidence, {"depth": why} if why else {}, is_sound, hurried)
+        return cls(depth, confidence, {"depth": why}, hurried=hurried)
 
 
 class DepthChoice:

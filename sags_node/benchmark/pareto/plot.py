@@ -29,10 +29,11 @@ Row = Mapping[str, Any]
 def picture(measured: Row) -> bytes:
     """PNG of `measured` as `measure_pareto` returns it."""
     sessions = measured["sessions"]
-    figure = new_figure(WIDTH, HEIGHT * len(sessions))
-    for axes, session in zip(figure.subplots(len(sessions), 1, squeeze=False)[:, 0], sessions, strict=True):
-        _label(figure, axes, _panel(axes, session))
-    return as_png(figure)
+    with new_figure(WIDTH, HEIGHT * len(sessions)) as figure:
+        panels = figure.subplots(len(sessions), 1, squeeze=False)[:, 0]
+        for axes, session in zip(panels, sessions, strict=True):
+            _label(figure, axes, _panel(axes, session))
+        return as_png(figure)
 
 
 def _panel(axes: Axes, session: Row) -> list[Row]:
@@ -51,7 +52,7 @@ def _panel(axes: Axes, session: Row) -> list[Row]:
     axes.axvline(1e3 / rate, color="#828282", linewidth=1)
     axes.annotate(f"camera: {rate:g} Hz", (1e3 / rate, 0), (3, 4), ("data", "axes fraction"), "offset points")
     front = sorted(_place(row) for row in rows if row["non_dominated"])
-    axes.plot(*zip(*front, strict=True), color="#828282", linewidth=1) if front else None
+    axes.plot(*zip(*front, strict=True), color="#828282", linewidth=1)
     named = set()
     for row in rows:
         part, place = row["part"], _place(row)
