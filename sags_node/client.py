@@ -9,6 +9,7 @@ from sags_node.messaging.address import ClientKeys
 from sags_node.messaging.async_subscriber import AsyncSubscriber
 from sags_node.messaging.control import ControlClient
 from sags_node.messaging.freshness import StaleError
+from sags_node.messaging.node_clock import NodeClock, Offset
 from sags_node.messaging.received import (
     Frame,
     Received,
@@ -26,6 +27,8 @@ __all__ = [
     "ClientKeys",
     "ControlClient",
     "Frame",
+    "NodeClock",
+    "Offset",
     "Received",
     "ReceivedCameraInfo",
     "ReceivedCloud",

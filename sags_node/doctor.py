@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import ctypes
 import ctypes.util
 import glob
 import importlib.metadata
 import os
 import platform
 import socket
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
@@ -23,6 +25,8 @@ REQUIRED = (
     "numpy torch opencv-contrib-python-headless pyzmq open3d onnxruntime numba rosbags mcap msgspec "
     "pydantic pyyaml click rich"
 ).split()
+TIME_ERROR = 5  # of adjtimex(2): the clock is not synchronised
+TIME_KEEPERS = {"chronyd", "ntpd", "phc2sys", "ptp4l", "systemd-timesyn"}  # as far as /proc tells names
 OPEN3D_LIBRARIES = {
     "usb-1.0": "libusb-1.0-0",
     "GL": "libgl1",
@@ -52,6 +56,7 @@ def examine(config: LaunchConfig) -> list[Check]:
         _kernel_cache(),
         *_ports(config.publish),
         *_keys(config.publish),
+        _clock(),
         _cameras(),
         _recordings(),
     ]
@@ -153,6 +158,39 @@ def _keys(config: PublishConfig) -> list[Check]:
     except UsageError as error:
         return [Check("keys", "error", "cannot be used", str(error))]
     return [Check("keys", "ok", f"{config.key}; may connect: {', '.join(allowed.values())}")]
+
+
+class _Timex(ctypes.Structure):
+    """The head of what adjtimex(2) tells; the kernel writes 208 bytes."""
+
+    _fields_ = (
+        ("modes", ctypes.c_uint),
+        ("offset", ctypes.c_long),
+        ("freq", ctypes.c_long),
+        ("maxerror", ctypes.c_long),  # us
+        ("esterror", ctypes.c_long),
+        ("status", ctypes.c_int),
+        ("rest", ctypes.c_char * 256),
+    )
+
+
+def _clock() -> Check:
+    """Whether anything sets this machine's clock right. Clients on other machines ask the node for its clock,
+    so one that nobody keeps is no fault."""
+    by = ", ".join(sorted(_running() & TIME_KEEPERS)) or "no program here"
+    timex = _Timex()
+    if ctypes.CDLL(None).adjtimex(ctypes.byref(timex)) in (-1, TIME_ERROR):
+        return Check("clock", "ok", f"kept by {by}; not synchronised")
+    return Check("clock", "ok", f"kept by {by}; synchronised to within {timex.maxerror * 1e-3:.0f} ms")
+
+
+def _running() -> set[str]:
+    """Names of the processes here."""
+    names = set()
+    for comm in Path("/proc").glob("[0-9]*/comm"):
+        with suppress(OSError):  # it has ended meanwhile
+            names.add(comm.read_text().strip())
+    return names
 
 
 def _cameras() -> Check:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from sags_node.errors import SagsError
 from sags_node.messaging import topics, wire
 from sags_node.messaging.address import ClientKeys, find_data
+from sags_node.messaging.node_clock import NodeClock
 from sags_node.messaging.received import (
     Received,
     ReceivedCameraInfo,
@@ -171,16 +172,31 @@ def topic_delay(
     ns: str = "sags",
     seconds: float = 5.0,
     keys: ClientKeys | None = None,
+    control: str | None = None,
 ) -> Record:
-    """How long after their frame's capture the messages of `seconds` arrived.
+    """How long after their frame's capture the messages of `seconds` arrived, by the node's clock.
+
+    Args:
+        control: where to ask for that clock; default: it is taken to be this machine's.
 
     Raises:
         UsageError: there is no such topic.
-        SagsError: no node is known, or fewer than two messages came.
+        SagsError: no node is known, fewer than two messages came, or the node's clock was not told.
     """
-    samples = _listen_to(topic, endpoint, ns, seconds, keys)
-    delays = np.array([sample.arrival_ns - sample.stamp_ns for sample in samples]) * 1e-9
+    offset = None
+    if control is None:
+        samples = _listen_to(topic, endpoint, ns, seconds, keys)
+    else:
+        with NodeClock(control, ns, keys=keys) as clock:
+            samples = _listen_to(topic, endpoint, ns, seconds, keys)
+            offset, problem = clock.offset, clock.problem
+        if offset is None:
+            raise SagsError(f"{control}: {problem}")
+    ahead = 0.0 if offset is None else offset.seconds
+    delays = np.array([sample.arrival_ns - sample.stamp_ns for sample in samples]) * 1e-9 + ahead
     return {
+        "clock_offset_s": None if offset is None else offset.seconds,
+        "clock_bound_s": None if offset is None else offset.bound,
         "average_delay_s": float(delays.mean()),
         "min_s": float(delays.min()),
         "max_s": float(delays.max()),

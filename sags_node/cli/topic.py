@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import click
@@ -63,8 +64,8 @@ def topic_echo(
         show(message if json_out else text.echo_text(message))
 
 
-def _measuring(name: str, doc: str) -> None:
-    """The commands that listen to one topic for a while."""
+def _measuring(name: str, doc: str, *more: Callable[..., Any]) -> None:
+    """The commands that listen to one topic for a while; `more` are options of one alone."""
 
     @topic.command(name, help=doc)
     @click.argument("topic_name", metavar="NAME")
@@ -73,16 +74,21 @@ def _measuring(name: str, doc: str) -> None:
     @keys_options
     @click.option("--seconds", type=positive, default=5.0, show_default=True, help="How long to listen.")
     @as_json
-    def command(
-        topic_name: str, endpoint: str | None, ns: str, seconds: float, json_out: bool, keys: Any
-    ) -> None:
+    def command(topic_name: str, json_out: bool, **asked: Any) -> None:
         from sags_node import topic as tool
 
-        measure = getattr(tool, f"topic_{name}")
-        figures = measure(topic_name, endpoint=endpoint, ns=ns, seconds=seconds, keys=keys)
+        figures = getattr(tool, f"topic_{name}")(topic_name, **asked)
         show(figures if json_out else getattr(text, f"{name}_text")(figures))
+
+    for option in more:
+        option(command)
 
 
 _measuring("hz", "Rate of topic NAME, and min, max and std dev of the intervals.")
 _measuring("bw", "Bytes per second and per message of topic NAME.")
-_measuring("delay", "Age of the messages of topic NAME: now minus the capture stamp.")
+_measuring(
+    "delay",
+    "Age of the messages of topic NAME: now minus the capture stamp. Of a node on another machine, --control "
+    "lets its clock be asked for; else both clocks are taken to be equal.",
+    click.option("--control", metavar="ENDPOINT", help="Control socket of the node."),
+)

@@ -17,6 +17,7 @@ from sags_node.config import PublishConfig
 from sags_node.errors import SagsError
 from sags_node.messaging import content, control, topics
 from sags_node.messaging.cdr import Content, type_hash
+from sags_node.messaging.node_clock import stamps
 from sags_node.messaging.peers import Peers
 from sags_node.messaging.rundir import Connection, RunDirectory
 from sags_node.messaging.security import KeyPair, Seldom, authenticated, check_endpoint
@@ -93,7 +94,8 @@ class Publisher:
         self._context = zmq.Context()
         try:
             keys = self._resources.enter_context(authenticated(self._context, config))
-            self._bind(config, keys, {"ping": lambda args: "pong", **(handlers or {})})
+            always = {"ping": lambda args: "pong", "get_clock": lambda args: stamps()}
+            self._bind(config, keys, {**always, **(handlers or {})})
         except BaseException:
             self.close()
             raise

@@ -27,6 +27,7 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import topics
 from sags_node.messaging.address import Address, ClientKeys, find_data
 from sags_node.messaging.freshness import Freshness, StaleError
+from sags_node.messaging.node_clock import NodeClock
 from sags_node.messaging.received import Frame, R, Received, ReceivedText, TopicName, interpret
 from sags_node.messaging.stream import POLL_MS, check_topic, data_socket, receive
 from sags_node.messaging.wire import WireError
@@ -51,6 +52,8 @@ class Receiver:
         rates: Hz a topic must keep; default: every message that its sender sends.
         clock_ns: the wall clock that capture stamps are compared with.
         keys: for a node that wants them.
+        clock: of the node's machine, where that is another one; in place of `clock_ns`. While it is not known
+            every topic is stale.
 
     Raises:
         UsageError: an unknown topic, or the node wants keys that are not given.
@@ -66,13 +69,15 @@ class Receiver:
         rates: Mapping[str, float] | None = None,
         clock_ns: Callable[[], int] = time.time_ns,
         keys: ClientKeys | None = None,
+        clock: NodeClock | None = None,
     ) -> None:
         wanted = [check_topic(name) for name in dict.fromkeys([*names, "status"])]
         rates = rates or {}
         self.refusal: str | None = None  # why the node does not let this client in
         self.rejected = 0  # messages that were none, or whose content does not fit its description
         self._ns = ns
-        self._clock_ns = clock_ns
+        self._clock = clock
+        self._clock_ns = clock_ns if clock is None else clock.latest_ns
         self._fresh = {topic.name: Freshness(rates.get(topic.name), topic.periodic) for topic in wanted}
         self._types = {topic.name: topic.type for topic in wanted}
         self._kept: dict[str, deque[Received]] = {topic.name: deque(maxlen=KEPT) for topic in wanted}
@@ -150,6 +155,10 @@ class Receiver:
         with self._arrived:
             return self._fresh[name].period
 
+    def now_ns(self) -> int:
+        """What the clock that stamped the messages shows now, at the latest: for `Received.age`."""
+        return self._clock_ns()
+
     @contextmanager
     def notified(self, wake: Callable[[], None]) -> Iterator[None]:
         """Within, the receiver thread calls `wake` for every message that comes; it must be quick."""
@@ -187,7 +196,8 @@ class Receiver:
         problem = self._fresh[name].problem(self._clock_ns(), max_age)
         if problem is not None and self.refusal is not None:
             return self.refusal
-        return problem or self._sender_problem(name)
+        unknown = None if self._clock is None else self._clock.problem
+        return problem or unknown or self._sender_problem(name)
 
     def _sender_problem(self, name: str) -> str | None:
         """What the newest `status` says against the newest message of a topic."""

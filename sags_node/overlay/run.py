@@ -22,6 +22,7 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.findings import OF_THE_FLOW, STAGES
 from sags_node.messaging.address import ClientKeys, find_control
 from sags_node.messaging.control import ControlClient
+from sags_node.messaging.node_clock import NodeClock
 from sags_node.messaging.received import Received, ReceivedImage, ReceivedText, TopicName
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.overlay import draw as overlay_draw
@@ -115,6 +116,7 @@ class _Overlay:
         self._options = options
         self._bodies = bodies
         self._subscriber: Subscriber | None = None  # before there is a node
+        self._clock: NodeClock | None = None  # of a node that may be on another machine
         self._tell = tell
         self._waiting_because = ""
         self._stream = stream
@@ -178,7 +180,10 @@ class _Overlay:
         wanted: list[str] = [*NEEDED, CONFIDENCE, RIGHT_INFO, *([] if options.save is None else [PICTURE])]
         while True:
             try:
-                return Subscriber(wanted, options.endpoint, options.ns, options.run_dir, keys=options.keys)
+                if options.endpoint is not None and self._clock is None:
+                    self._clock = NodeClock(options.control, keys=options.keys)
+                where = options.endpoint, options.ns, options.run_dir
+                return Subscriber(wanted, *where, keys=options.keys, clock=self._clock)
             except SagsError as error:
                 is_absent = not isinstance(error, UsageError) and options.endpoint is None
                 if not is_absent or time.monotonic() > end:
@@ -207,6 +212,8 @@ class _Overlay:
         """Leave nothing standing: neither the last overlay nor anchors in the node."""
         if self._subscriber is not None:
             self._subscriber.close()  # what has come stays readable
+        if self._clock is not None:
+            self._clock.close()
         self._stream.blank("the overlay was stopped")
         self._stream.tell(self._facts())
         self._pinner.close()
@@ -278,7 +285,7 @@ class _Overlay:
             pictures["right"] = overlay_draw.draw(frame, placed, frame.baseline, warnings=warnings)
         self._stream.show(pictures, frame.frame_id, frame.stamp_ns, self._epoch)
         self._draw_ms.append(1e3 * (time.perf_counter() - began))
-        self._latency_ms.append(1e-6 * (time.time_ns() - frame.stamp_ns))
+        self._latency_ms.append(1e-6 * (self._node.now_ns() - frame.stamp_ns))
         return pictures["left"]
 
     def _right_info(self) -> Any:
@@ -290,6 +297,8 @@ class _Overlay:
 
     def _stale(self) -> str | None:
         """What may not be shown as new any more, of all that is needed."""
+        if self._clock is not None and self._clock.problem is not None:
+            return "the node's clock is not known"
         for name in NEEDED:
             if self._node.problem(name, self._options.max_age) is not None:
                 return f"stale {name}"
@@ -300,7 +309,7 @@ class _Overlay:
         shown_ns = self._stream.shown_ns
         if shown_ns is None:
             self._stream.blank(self._stream.reason or "waiting for the node")
-        elif (time.time_ns() - shown_ns) * 1e-9 > self._options.max_age:
+        elif (self._node.now_ns() - shown_ns) * 1e-9 > self._options.max_age:
             self._stream.blank(self._stale() or "no whole frame came")
 
     # ---- what is said --------------------------------------------------------------------------------------
@@ -314,6 +323,7 @@ class _Overlay:
             "latency_ms": _percentiles(recent),
             "draw_ms": _percentiles(list(self._draw_ms)[-RECENT:]),
             "max_age": self._options.max_age,
+            "clock": None if self._clock is None else self._clock.status(),
             "no_right_eye": self._right or None,
             "objects": [held.status() for held in self._objects],
             "warning_codes": self._warnings,

@@ -46,7 +46,11 @@ def hz_text(figures: Record) -> str:
 
 
 def delay_text(figures: Record) -> str:
-    return f"average delay: {_ms(figures['average_delay_s'])}\n  {_spread(figures)}"
+    lines = [f"average delay: {_ms(figures['average_delay_s'])}", f"  {_spread(figures)}"]
+    if figures["clock_offset_s"] is not None:
+        ahead, bound = _ms(figures["clock_offset_s"]), _ms(figures["clock_bound_s"])
+        lines.append(f"  the node's clock is {ahead} ahead, to within {bound}")
+    return "\n".join(lines)
 
 
 def bw_text(figures: Record) -> str:

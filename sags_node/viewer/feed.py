@@ -5,7 +5,6 @@ The node may come, go and come back: the feed connects by itself and lets go of 
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 from sags_node.errors import SagsError, UsageError
 from sags_node.evaluation.gallery import Picture
 from sags_node.messaging.address import ClientKeys, find_data
+from sags_node.messaging.node_clock import NodeClock
 from sags_node.messaging.received import (
     Received,
     ReceivedCameraInfo,
@@ -95,8 +95,14 @@ class Feed:
     """
 
     def __init__(
-        self, endpoint: str | None, ns: str, keys: ClientKeys | None = None, run_dir: Path | None = None
+        self,
+        endpoint: str | None,
+        ns: str,
+        keys: ClientKeys | None = None,
+        run_dir: Path | None = None,
+        clock: NodeClock | None = None,
     ) -> None:
+        self._clock = clock
         self._where = (endpoint, ns, run_dir, keys)
         self._subscriber: Subscriber | None = None
         self._frame: dict[str, Received] | None = None  # the newest that came as a whole
@@ -152,10 +158,16 @@ class Feed:
             self._subscriber.close()
         self._subscriber = self._frame = None
 
+    def close(self) -> None:
+        """Follow no node any more."""
+        self.rest()
+        if self._clock is not None:
+            self._clock.close()
+
     def _connect(self) -> None:
         endpoint, ns, run_dir, keys = self._where
         self._subscriber = Subscriber(
-            TOPICS, endpoint, ns, run_dir, rates=dict.fromkeys(TOPICS, LEAST_HZ), keys=keys
+            TOPICS, endpoint, ns, run_dir, rates=dict.fromkeys(TOPICS, LEAST_HZ), keys=keys, clock=self._clock
         )
         self._absent = None
 
@@ -182,8 +194,8 @@ class Feed:
         newest = subscriber.latest(PICTURE)
         if newest is None:
             return "waiting for the left camera"
-        if newest.age() > MAX_AGE:
-            return f"stale for {newest.age():.1f} s: no picture comes"
+        if (age := newest.age(subscriber.now_ns())) > MAX_AGE:
+            return f"stale for {age:.1f} s: no picture comes"
         return subscriber.problem(PICTURE, MAX_AGE)
 
     def _whole_frame(
@@ -194,8 +206,8 @@ class Feed:
         if self._frame is None:
             return None, None
         shown = self._frame[PICTURE]
-        generation = (shown.meta.session, shown.meta.epoch)
-        if shown.age() > MAX_AGE or generation != (picture.meta.session, picture.meta.epoch):
+        is_old = shown.age(subscriber.now_ns()) > MAX_AGE
+        if is_old or (shown.meta.session, shown.meta.epoch) != (picture.meta.session, picture.meta.epoch):
             return None, None
         return _unpack(self._frame)
 
@@ -203,7 +215,7 @@ class Feed:
 def _silence(subscriber: Subscriber) -> float:
     """Seconds since the node last spoke of itself; 0 where it has not spoken yet."""
     status = subscriber.latest("status")
-    return 0.0 if status is None else (time.time_ns() - status.meta.publish_ns) * 1e-9
+    return 0.0 if status is None else (subscriber.now_ns() - status.meta.publish_ns) * 1e-9
 
 
 def _status_of(subscriber: Subscriber) -> Status:

@@ -11,6 +11,7 @@ from contextlib import redirect_stdout
 import viser
 
 from sags_node.messaging.address import ClientKeys
+from sags_node.messaging.node_clock import NodeClock
 from sags_node.viewer.feed import Feed, Moment
 from sags_node.viewer.panel import Asker, Panel
 from sags_node.viewer.scene import Scene
@@ -37,14 +38,16 @@ def run_viewer(
 
     Args:
         endpoint: data socket of the node; default: its connection file. No node need run yet.
-        control: its control socket; default: its connection file.
+        control: its control socket; default: its connection file. With `endpoint` the node's clock is
+            asked for there, too.
         ready: told the address and the port once browsers can connect.
 
     Raises:
         UsageError: `host` is no loopback address and `insecure` is not given, or the node's keys do not fit.
         SagsError: the port cannot be bound, or `endpoint` is malformed.
     """
-    feed = Feed(endpoint, ns, keys)
+    remote = endpoint is not None and control is not None
+    feed = Feed(endpoint, ns, keys, clock=NodeClock(control, keys=keys) if remote else None)
     try:
         with serving(host, port, insecure) as (server, url):
             scene = Scene(server)
@@ -54,7 +57,7 @@ def run_viewer(
             with redirect_stdout(sys.stderr):  # what viser has to say; stdout is for machines
                 _follow(server, feed, scene, panel, stop)
     finally:
-        feed.rest()
+        feed.close()
 
 
 def _follow(server: viser.ViserServer, feed: Feed, scene: Scene, panel: Panel, stop: threading.Event) -> None:

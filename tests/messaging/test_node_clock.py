@@ -1,0 +1,230 @@
+"""The clock of another machine: by arithmetic, and over real sockets with a clock that is off."""
+
+from __future__ import annotations
+
+import random
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from synthetic import at_frame, plane_result, publisher, stream
+from waiting import until
+
+from sags_node.config import PublishConfig
+from sags_node.errors import SagsError
+from sags_node.messaging.node_clock import DRIFT, Exchange, NodeClock, OffsetEstimate
+from sags_node.messaging.publisher import Publisher
+from sags_node.messaging.subscriber import Subscriber
+from sags_node.topic import topic_delay
+
+AHEAD = 0.08  # s
+JITTER = 0.02  # s, at most, each way
+
+
+# ---- by arithmetic ---------------------------------------------------------------------------------------
+
+
+def exchanged(now: float, ahead: float, there: float, back: float) -> Exchange:
+    """Stamps of an exchange whose answer comes `now`, with delays of `there` and `back` seconds."""
+    asked, met = now - there - back, now - back + ahead
+    return Exchange(*(round(1e9 * t) for t in (asked, met, met, now)))
+
+
+@pytest.mark.parametrize("drift", [0.0, 200e-6, -DRIFT])
+def test_the_offset_lies_within_its_bound_whatever_the_delays(drift: float) -> None:
+    rng = random.Random(0)
+    estimate = OffsetEstimate()
+    assert estimate.at(0.0) is None
+    for step in range(600):
+        now = 1.0 + 0.25 * step
+        ahead = AHEAD + drift * now
+        estimate.add(exchanged(now, ahead, rng.uniform(0, JITTER), rng.uniform(0, 3 * JITTER)), now)
+        found = estimate.at(now)
+        assert found is not None and abs(found.seconds - ahead) <= found.bound + 2e-9  # ns, rounded
+        if step > 40:  # the chance that no delay of 40 is in the shortest tenth is 1.5 %, and it costs 2 ms
+            assert found.bound < 5e-3
+    assert estimate.jumps == 0
+    late = estimate.at(now + 10.0)
+    assert late is not None and late.bound == pytest.approx(found.bound + 10 * DRIFT)
+
+
+@pytest.mark.parametrize("by", [0.05, -0.05])
+def test_a_clock_that_is_set_is_noticed_at_once(by: float) -> None:
+    estimate = OffsetEstimate()
+    for now in range(10):
+        estimate.add(exchanged(now, AHEAD, 1e-3, 1e-3), now)
+    estimate.add(exchanged(10, AHEAD + by, 1e-3, 1e-3), 10)
+    found = estimate.at(10)
+    assert estimate.jumps == 1
+    assert found is not None and abs(found.seconds - AHEAD - by) <= found.bound <= 1e-3 + 1e-9
+
+
+def test_an_exchange_during_which_a_clock_was_set_says_nothing() -> None:
+    estimate = OffsetEstimate()
+    estimate.add(Exchange(asked=1000, received=500, answered=2000, came=1400), 1.0)
+    assert estimate.at(1.0) is None and estimate.jumps == 0
+
+
+# ---- over sockets ----------------------------------------------------------------------------------------
+
+
+@contextmanager
+def answering(run_dir: Path, clock_ns: Callable[[], int]) -> Iterator[Publisher]:
+    """A node on a machine with that clock."""
+
+    def stamps(args: object) -> dict[str, int]:
+        return {"received_ns": clock_ns(), "answered_ns": clock_ns()}
+
+    config = PublishConfig(data=("tcp://127.0.0.1:*",), control="tcp://127.0.0.1:*", run_dir=run_dir)
+    with Publisher(config, "sags", "session-1", {"get_clock": stamps}) as running:
+        stop = threading.Event()
+        plane = plane_result()
+
+        def serve() -> None:
+            frame = 0
+            while not stop.is_set():
+                running.publish_result(at_frame(plane, frame, clock_ns()), dropped=0)
+                running.poll(20)
+                frame += 1
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        try:
+            yield running
+        finally:
+            stop.set()
+            thread.join()
+
+
+@contextmanager
+def jittered(endpoint: str) -> Iterator[str]:
+    """The way to a socket with up to `JITTER` more delay, each way, in order."""
+    port = int(endpoint.rpartition(":")[2])
+    listener = socket.create_server(("127.0.0.1", 0))
+    rng = random.Random(1)
+
+    def pump(source: socket.socket, sink: socket.socket) -> None:
+        try:
+            while data := source.recv(65536):
+                time.sleep(rng.uniform(0, JITTER))
+                sink.sendall(data)
+        except OSError:  # an end of it was closed
+            pass
+
+    def serve() -> None:
+        try:
+            while True:
+                near, _ = listener.accept()
+                far = socket.create_connection(("127.0.0.1", port))
+                opened.extend((near, far))
+                for pair in ((near, far), (far, near)):
+                    threading.Thread(target=pump, args=pair, daemon=True).start()
+        except OSError:  # closed
+            pass
+
+    opened = [listener]
+    threading.Thread(target=serve, daemon=True).start()
+    try:
+        yield f"tcp://127.0.0.1:{listener.getsockname()[1]}"
+    finally:
+        for end in opened:
+            end.shutdown(socket.SHUT_RDWR)
+            end.close()
+
+
+def ahead_and_drifting() -> int:
+    """80 ms ahead, and 100 ppm too fast."""
+    return time.time_ns() + round(1e9 * AHEAD + 1e-4 * (time.monotonic_ns() - BEGAN))
+
+
+BEGAN = time.monotonic_ns()
+
+
+def true_offset() -> float:
+    return 1e-9 * (ahead_and_drifting() - time.time_ns())
+
+
+@pytest.mark.live
+def test_a_drifting_clock_is_known_to_a_millisecond(tmp_path: Path) -> None:
+    with answering(tmp_path, ahead_and_drifting) as running, NodeClock(run_dir=tmp_path) as clock:
+        until(lambda: clock.offset is not None and clock.offset.bound < 1e-3)
+        for _ in range(20):
+            found = clock.offset
+            assert found is not None and abs(found.seconds - true_offset()) <= found.bound + 1e-4
+            assert clock.latest_ns() >= ahead_and_drifting() - 100_000  # stamps are not taken at one moment
+            time.sleep(0.05)
+        delay = topic_delay(
+            "left/depth", running.connection.data[0], seconds=1, control=clock_endpoint(running)
+        )
+    assert delay["clock_offset_s"] == pytest.approx(AHEAD, abs=0.02)
+    assert -delay["clock_bound_s"] <= delay["min_s"] < AHEAD, "not stamped in the future any more"
+
+
+@pytest.mark.live
+def test_jitter_widens_the_bound_and_does_not_mislead(tmp_path: Path) -> None:
+    with answering(tmp_path, ahead_and_drifting) as running, jittered(clock_endpoint(running)) as far:
+        with NodeClock(far) as clock:
+            until(lambda: clock.offset is not None and clock.offset.bound < 5e-3)
+            found = clock.offset
+            assert found is not None and abs(found.seconds - true_offset()) <= found.bound + 1e-4
+
+
+@pytest.mark.live
+def test_a_clock_that_is_set_while_it_is_followed(tmp_path: Path) -> None:
+    shift = [0]
+    with answering(tmp_path, lambda: time.time_ns() + shift[0]), NodeClock(run_dir=tmp_path) as clock:
+        until(lambda: clock.offset is not None and clock.offset.bound < 1e-2)
+        shift[0] = 3_000_000_000
+        until(lambda: clock.jumps == 1, seconds=10)
+        found = clock.offset
+        assert found is not None and abs(found.seconds - 3) <= found.bound
+
+
+@pytest.mark.live
+def test_ages_are_by_the_nodes_clock_and_nothing_is_fresh_without_it(tmp_path: Path) -> None:
+    name = "left/render/depth"
+    ahead = 5_000_000_000
+    with answering(tmp_path, lambda: time.time_ns() + ahead) as running:
+        with Subscriber([name], run_dir=tmp_path) as guessing:
+            assert guessing.wait(name, 30)
+            assert "ahead of this machine's clock" in str(guessing.problem(name))
+        with NodeClock(run_dir=tmp_path) as clock, Subscriber([name], run_dir=tmp_path, clock=clock) as sure:
+            until(lambda: sure.ok(name))
+            shown = sure.read(name)
+            assert 0 < shown.age(sure.now_ns()) < 1
+        silent = "tcp://127.0.0.1:1"
+        with NodeClock(silent) as unknown, Subscriber([name], run_dir=tmp_path, clock=unknown) as unsure:
+            assert unsure.wait(name, 30)
+            assert unknown.offset is None and not unsure.ok(name)
+        with pytest.raises(SagsError, match=r"not known: no answer"):
+            topic_delay(name, running.connection.data[0], seconds=1.5, control=silent)
+
+
+@pytest.mark.live
+def test_a_node_of_before_says_what_it_lacks(tmp_path: Path) -> None:
+    def lacks(args: object) -> object:
+        raise SagsError("unknown op 'get_clock'")
+
+    config = PublishConfig(data=("tcp://127.0.0.1:*",), control="tcp://127.0.0.1:*", run_dir=tmp_path)
+    with Publisher(config, "sags", "session-1", {"get_clock": lacks}) as running, stream(running):
+        with NodeClock(run_dir=tmp_path) as clock:
+            until(lambda: "unknown op" in str(clock.problem))
+            assert clock.status()["offset_ms"] is None
+
+
+@pytest.mark.live
+def test_every_node_tells_its_clock(tmp_path: Path) -> None:
+    with publisher(tmp_path) as running, stream(running), NodeClock(run_dir=tmp_path) as clock:
+        until(lambda: clock.offset is not None)
+        found = clock.offset
+        assert found is not None and abs(found.seconds) <= found.bound, "it is this machine's"
+        assert clock.problem is None and clock.status()["jumps"] == 0
+
+
+def clock_endpoint(running: Publisher) -> str:
+    assert running.connection.control is not None
+    return running.connection.control
