@@ -393,8 +393,8 @@ class MappingConfig(Section):
     skip_fitted: bool = Field(True, description="when time is short, refine where it fits worst only")
     field: bool = Field(
         True,
-        description="remember how tissue moves: hidden tissue goes on as it did before, and motion is predicted "
-        "to the moment of a display",
+        description="remember how tissue moves: hidden tissue goes on as it did before, and motion is "
+        "predicted to the moment of a display",
     )
     skip_still: bool = Field(True, description="while nothing moves: no matching, a step where it pays most")
 

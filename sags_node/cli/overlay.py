@@ -57,7 +57,7 @@ class Ahead(click.ParamType):
     "--ahead",
     type=Ahead(),
     default=0.0,
-    help="Place it where the tissue is expected so many ms after its frame; auto: when the node publishes it.",
+    help="Place it where tissue is expected so long after its frame; auto: when that is published.",
 )
 @click.option("--own-ns", default="overlay", show_default=True, help="Namespace of what is published here.")
 @click.option(

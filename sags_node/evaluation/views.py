@@ -14,8 +14,8 @@ ROUNDING = 1e-3  # s, of stamps
 
 
 def extrapolated(snapshot: Snapshot, seconds: float) -> Gaussians:
-    """The Gaussians `seconds` after the snapshot, by the motion field where that has skill so far ahead, else by
-    0.8 times their last observed velocity."""
+    """The Gaussians `seconds` after the snapshot: by the motion field where that has skill so far ahead, else
+    by 0.8 times their last observed velocity."""
     if 0 < seconds <= reached(snapshot, seconds) + ROUNDING:
         return gaussians_ahead(snapshot, seconds)
     means = snapshot.gaussians.means + snapshot.velocities * np.float32(VELOCITY_SHARE * seconds)

@@ -21,8 +21,8 @@ from sags_node.types import F64
 
 Segments = dict[str, tuple[int, int]]  # first and last frame
 
-# EndoNeRF's two public clips: their frames, and what was published for their test frames. Pictures are multiplied
-# by the tissue mask and averaged over all pixels (`paper_psnr`, dB).
+# EndoNeRF's two public clips: how many frames they have, and what was published for the held-out ones.
+# Pictures are multiplied by the tissue mask and averaged over all pixels (`paper_psnr`, dB).
 CLIPS: dict[str, tuple[int, dict[str, float]]] = {
     "pulling": (63, {"SAGS": 38.3, "EndoGaussian": 37.2}),
     "cutting": (156, {"SAGS": 39.5, "EndoGaussian": 38.4}),

@@ -98,8 +98,8 @@ class MotionField:
         self._add(nodes, seen)
 
     def forecast(self) -> tuple[F32, float, MotionState] | None:
-        """How far [HORIZONS, M, 3] m each node will have moved after 1, 2, ... frames, the time (s) from one to
-        the next, and how far to believe it; None: too little is known yet."""
+        """How far [HORIZONS, M, 3] m each node will have moved after 1, 2, ... frames, the time of one (s),
+        and how far to believe it; None: too little is known yet."""
         if self._count <= MATCHED or self._frame_s == 0:
             return None
         skill = self._skill
@@ -129,22 +129,21 @@ class MotionField:
 
     @property
     def _period(self) -> float | None:
-        """s after which the tissue moves as before."""
-        if self._trust < 0.5 or not self._lags.any():
+        """s after which the tissue moves as before, if most of the moments like now lie so far back."""
+        lags = np.arange(len(self._lags))
+        peak = int(np.argmax(self._lags))
+        near = np.abs(lags - peak) <= max(1.0, 0.05 * peak)
+        weight = float(self._lags[near].sum())
+        if self._trust < 0.5 or not weight > 0.5 * float(self._lags.sum()):
             return None
-        often = self._lags >= 0.5 * self._lags.max()
-        first = int(np.argmax(often))
-        last = first + int(np.argmin(np.append(often[first:], False)))
-        share = self._lags[first:last]
-        return float((share * np.arange(first, last)).sum() / share.sum() * self._frame_s)
+        return float((self._lags[near] * lags[near]).sum() / weight * self._frame_s)
 
     def _grow(self, nodes: F32) -> None:
         """New nodes have always moved as their nearest neighbour did."""
         old = self._places.shape[1]
-        last = self._places[self._count - 1]
-        far = np.square(nodes[old:, None] - last[None]).sum(2)
+        far = np.square(nodes[old:, None] - nodes[:old]).sum(2)
         like = np.concatenate([np.arange(old), far.argmin(1)])
-        offset = np.concatenate([np.zeros((old, 3), np.float32), nodes[old:] - last[like[old:]]])
+        offset = nodes - nodes[like]
         self._places = self._places[:, like] + offset
         self._steps = np.ascontiguousarray(self._steps[:, like])
         self._energy[: self._count] = np.square(self._steps[: self._count]).sum((1, 2))
@@ -190,8 +189,10 @@ class MotionField:
         basis = np.zeros((HORIZONS, 3, nodes, 3), np.float32)
         basis[:, 0] = frames * self._steps[last]
         basis[:, 1] = frames * self._steps[last - 1]
+        basis[:, 2] = STEADY * basis[:, 0]
         if self._has_memory:
-            basis[:, 2] = self._followed(last)
+            followed, trust = self._followed(last)
+            basis[:, 2] = followed + np.float32(1 - trust) * basis[:, 2]
         mixed = np.empty((HORIZONS, nodes, 3), np.float32)
         for h in range(HORIZONS):
             flat = basis[h].reshape(3, -1)
@@ -203,23 +204,25 @@ class MotionField:
         self._bases.appendleft(basis)
         self._mixed.appendleft(mixed)
 
-    def _followed(self, last: int) -> F32:
-        """[HORIZONS, M, 3] m: how far nodes went after moments like this one. Less, the less alike they were."""
+    def _followed(self, last: int) -> tuple[F32, float]:
+        """[HORIZONS, M, 3] m: how far nodes went after moments like this one, less, the less alike; and how
+        alike they were, 0..1."""
         nodes = self._places.shape[1]
         weights = self._likeness(last, self._steps[last], np.arange(nodes))
         weights = weights[: last - HORIZONS]  # what came after must be known
         used = np.flatnonzero(weights > LEAST_WEIGHT)
-        self._trust = SKILL_MEMORY * self._trust + (1 - SKILL_MEMORY) * float(weights.sum())
+        trust = float(weights.sum())
+        self._trust = SKILL_MEMORY * self._trust + (1 - SKILL_MEMORY) * trust
         self._lags *= SKILL_MEMORY
         self._lags[last - used] += weights[used]
         followed = np.zeros((HORIZONS, nodes, 3), np.float32)
         for h in range(HORIZONS if len(used) else 0):
             followed[h] = followed[h - 1] + np.tensordot(weights[used], self._steps[used + 1 + h], 1)
-        return followed
+        return followed, trust
 
     def _likeness(self, newest: int, motion: F32, known: I64) -> F32:
-        """Weight [newest] of each past frame, by how alike the nodes moved in it and in those just before. All
-        together weigh less than 1: resting takes part.
+        """Weight [newest] of each past frame, by how alike the nodes moved in it and in those just before.
+        Together they weigh less than 1: resting takes part.
 
         Args:
             newest: number of the frame that is compared, which need not be in the history yet.

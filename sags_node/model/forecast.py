@@ -11,8 +11,8 @@ from sags_node.types import F32, F64, Forecast, Gaussians, Snapshot
 
 
 def reached(snapshot: Snapshot, seconds: float) -> float:
-    """How far ahead, s, a snapshot can be moved when `seconds` are wanted: never further than the forecast has
-    skill for; 0: not at all."""
+    """How far ahead, s, a snapshot can be moved when `seconds` are wanted: never further than the forecast
+    has skill for; 0: not at all."""
     forecast = snapshot.forecast
     return 0.0 if forecast is None else float(min(max(seconds, 0.0), forecast.state.reach))
 
@@ -29,9 +29,11 @@ def gaussians_ahead(snapshot: Snapshot, seconds: float) -> Gaussians:
 
 def points_ahead(forecast: Forecast, points: F32 | F64, seconds: float) -> F32:
     """Points [A, 3] m of the tissue, world, `seconds` later; NaN stays NaN."""
-    means = np.ascontiguousarray(points, np.float32)
-    index, weight, _ = nearest_nodes(means, forecast.nodes)
-    return skinned(_moves(forecast, seconds), index, weight, means)
+    moved = np.array(points, np.float32)
+    known = np.isfinite(moved).all(1)
+    index, weight, _ = nearest_nodes(moved[known], forecast.nodes)
+    moved[known] = skinned(_moves(forecast, seconds), index, weight, moved[known])
+    return moved
 
 
 def _moves(forecast: Forecast, seconds: float) -> F32:
