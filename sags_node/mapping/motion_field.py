@@ -129,14 +129,22 @@ class MotionField:
 
     @property
     def _period(self) -> float | None:
-        """s after which the tissue moves as before, if most of the moments like now lie so far back."""
-        lags = np.arange(len(self._lags))
-        peak = int(np.argmax(self._lags))
-        near = np.abs(lags - peak) <= max(1.0, 0.05 * peak)
-        weight = float(self._lags[near].sum())
-        if self._trust < 0.5 or not weight > 0.5 * float(self._lags.sum()):
+        """s after which the tissue moves as before, if most of the moments like now lie so far back, or a
+        multiple of it."""
+        often, total = self._lags, float(self._lags.sum())
+        if self._trust < 0.5 or not total > 0:
             return None
-        return float((self._lags[near] * lags[near]).sum() / weight * self._frame_s)
+        lags = np.arange(len(often))
+        peaks = 1 + np.flatnonzero((often[1:-1] >= often[:-2]) & (often[1:-1] > often[2:]))
+        longest, most = None, 0.5 * total
+        for lag in peaks[often[peaks] > 0.3 * often.max()]:
+            near = (np.abs(lags - lag * np.rint(lags / lag)) <= max(1.0, 0.05 * lag)) & (2 * lags > lag)
+            if (
+                often[near].sum() >= most
+            ):  # of two that explain as much, the longer: it holds the other's cycles
+                once = near & (2 * lags < 3 * lag)
+                longest, most = float((often[once] * lags[once]).sum() / often[once].sum()), often[near].sum()
+        return None if longest is None else longest * self._frame_s
 
     def _grow(self, nodes: F32) -> None:
         """New nodes have always moved as their nearest neighbour did."""
