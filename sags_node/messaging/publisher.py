@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Self
 
+import msgspec
 import zmq
 
 from sags_node.config import PublishConfig
@@ -241,7 +242,7 @@ class Publisher:
             shape=list(body.shape),
             dtype=body.dtype,
             dropped=self._dropped,
-            ahead_ns=ahead_ns,
+            ahead_ns=ahead_ns or msgspec.UNSET,
         )
         frames = encode(Message(topics.full_name(self.ns, name), meta, body.parts))
         # An XPUB socket drops for a full peer instead of blocking. Arrays are never written again, so
