@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from sags_node.findings import Findings, by_stage
-from sags_node.types import Finding, FrameResult, NodeHealth, RungState, ViewStatus
+from sags_node.types import Finding, FrameResult, MotionState, NodeHealth, RungState, ViewStatus
 
 WAITING_AFTER = 1.0  # s without a frame
 WINDOW = 150  # frames behind the published rates and latencies
@@ -31,6 +31,7 @@ class Statistics:
         self._skipped: dict[str, int] = {}
         self._gaussians = 0
         self._rung: RungState | None = None
+        self._motion: MotionState | None = None
         self._started = False
         self._left_out: deque[Mapping[str, int]] = deque(maxlen=WINDOW)  # slot -> frames, since the start
         self._too_many: set[str] = set()  # slots that leave out too much
@@ -48,6 +49,8 @@ class Statistics:
                 self._skipped[what] = self._skipped.get(what, 0) + 1
             self._gaussians = len(result.snapshot.gaussians)
             self._rung = result.rung
+            forecast = result.snapshot.forecast
+            self._motion = None if forecast is None else forecast.state
 
     def forget_rate(self) -> None:
         """After a pause the time without frames says nothing."""
@@ -98,7 +101,14 @@ class Statistics:
                 connections=connections,
                 views=views,
                 rung=self._rung,
+                motion=self._motion,
             )
+
+    @property
+    def latency_s(self) -> float:
+        """Median time from capture to published; 0 before the first frame."""
+        with self._lock:
+            return float(np.median(self._latency)) * 1e-3 if self._latency else 0.0
 
     def _findings(self, state: str, now: float) -> list[Finding]:
         """What the flow of frames says; asked with the lock held."""

@@ -23,6 +23,7 @@ from typing import Any
 from sags_node.config import LaunchConfig, V4l2Source
 from sags_node.errors import SagsError
 from sags_node.findings import by_code
+from sags_node.health import Statistics
 from sags_node.kernels.threads import configure_threads
 from sags_node.latest import Latest
 from sags_node.messaging import content
@@ -66,7 +67,9 @@ class Node:
             pipeline = Pipeline(config, rig, self._masks.nearest, self._offer_picture)
         else:
             pipeline = Pipeline(config, rig)
-        self._state = NodeState(config, pipeline, pipeline.make_budget(), Views(config.engine.backend))
+        statistics = Statistics()
+        views = Views(config.engine.backend, latency=lambda: statistics.latency_s)
+        self._state = NodeState(config, pipeline, pipeline.make_budget(), views, statistics=statistics)
         self._operations = Operations(self._state, self._hand_over_view)
         self._pictures: Latest[tuple[RectifiedPair, int]] = Latest(on_put=self._wake_publishing)  # and epoch
         self._live = isinstance(config.source, V4l2Source) or config.source.pace == "realtime"
@@ -199,6 +202,7 @@ class Node:
             if came is not None and not self._state.paused.is_set():
                 frame, at = came
                 waited = time.monotonic() - at if self._live else 0.0
+                self._state.pipeline.anchors.latency_s = self._state.statistics.latency_s
                 result = self._state.pipeline.process(frame, self._state.budget, waited)
                 give(result)
                 dropped, before = self._frames.dropped, dropped

@@ -117,6 +117,9 @@ class Operations:
         else:
             point = np.array([request.x, request.y, request.z], np.float64)
             anchor = self._state.pipeline.anchors.add_point(point, *frame)
+        if request.ahead_ms:
+            seconds = None if request.ahead_ms == "auto" else request.ahead_ms * 1e-3
+            self._state.pipeline.anchors.look_ahead(anchor, seconds)
         sure = self._state.pipeline.anchors.depth_confidence(anchor)
         return {"id": anchor, "frame_id": newest.pair.frame_id, "depth_confidence": round(sure, 3)}
 

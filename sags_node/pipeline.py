@@ -71,6 +71,7 @@ class Pipeline:
             affordable(config, width, height),
             config.mapping.smoothing,
             unhurried=config.mapping.budget_ms >= UNHURRIED_MS,
+            field=config.mapping.field,
         )
         self._tracker: CameraTracker | None = None
         if vision.pose == "estimate":
@@ -166,7 +167,7 @@ class Pipeline:
                 views["right"] = self._right_eye(mapped, pair.baseline)
         with watch("anchors"):
             self.anchors.update(observation, mapped.snapshot, mapped.view, learn)
-            anchors = self.anchors.at(pair.t_capture_ns)
+            anchors = self.anchors.ahead(self.anchors.at(pair.t_capture_ns), mapped.snapshot)
         if not still:  # which tells nothing of what a moving frame costs
             budget.finish(self.mapper.model.count)
         self._mapped = FrameResult(

@@ -192,6 +192,27 @@ class Gaussians:
 
 
 @dataclass(frozen=True, slots=True)
+class MotionState:
+    """How well motion is predicted lately (`mapping.motion_field`)."""
+
+    period: float | None  # s after which the tissue moves as before; None: it does not
+    skill: float  # share of the motion's energy that was said right one frame ahead: 1 all, 0 none
+    reach: float  # s: so far ahead of a frame motion is predicted; 0: not at all
+
+
+@dataclass(frozen=True, slots=True)
+class Forecast:
+    """Where the tissue is expected after a frame; `model.forecast` applies it."""
+
+    state: MotionState
+    frame_s: float  # s from one frame to the next
+    nodes: F32  # [M, 3] m, world: the control nodes in that frame
+    moves: F32  # [H, M, 3] m, of the control nodes, after 1, 2, ... frames
+    node_index: I32  # [N, 4] the nodes that each Gaussian of the snapshot follows
+    node_weight: F32  # [N, 4]
+
+
+@dataclass(frozen=True, slots=True)
 class Snapshot:
     """The model at the time of one frame; immutable."""
 
@@ -203,6 +224,7 @@ class Snapshot:
     camera: Camera
     loss: float  # mean absolute colour residual over tissue, last step
     counts: Mapping[str, int] = field(default_factory=dict)  # inserted, removed, iterations, ...
+    forecast: Forecast | None = None  # None: `mapping.field` is off, or too little is known yet
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,6 +241,15 @@ class RenderedView:
 
 
 @dataclass(frozen=True, slots=True)
+class AnchorsAhead:
+    """Where anchors are expected some time after a frame."""
+
+    seconds: F32  # [A] after the frame; 0: not predicted
+    points: F32  # [A, 3] m, world
+    pixels: F32  # [A, 2]
+
+
+@dataclass(frozen=True, slots=True)
 class AnchorStates:
     """The points that users pinned to the tissue, at one time."""
 
@@ -229,6 +260,7 @@ class AnchorStates:
     confidence: F32  # [A] 0..1; falls while the anchor is not seen, 0: lost
     ages: F32  # [A] s since it was pinned
     depth_confidence: F32  # [A] 0..1, of the tissue that carries it, see `sags_node.confidence`
+    ahead: AnchorsAhead | None = None  # None: nobody asked, or motion is not predicted
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -286,6 +318,7 @@ class DrawnView:
     depth: bool  # also publish the depth
     still: bool  # drawn once: sent again to who subscribes later
     epoch: int
+    ahead_s: float = 0.0  # it shows where the tissue is expected so long after its frame; 0: where it was
 
 
 @dataclass(frozen=True, slots=True)
@@ -316,3 +349,4 @@ class NodeHealth:
     connections: Mapping[str, Mapping[str, int]] = field(default_factory=dict)  # socket -> open, refused
     views: Mapping[str, ViewStatus] = field(default_factory=dict)  # those that consumers asked for, by name
     rung: RungState | None = None  # None: fixed steps, or no frame yet
+    motion: MotionState | None = None  # None: `mapping.field` is off, or too little is known yet

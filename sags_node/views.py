@@ -20,6 +20,7 @@ from sags_node.errors import SagsError
 from sags_node.geometry import scale_intrinsics
 from sags_node.kernels.threads import configure_threads
 from sags_node.messaging.requests import ViewRequest
+from sags_node.model.forecast import gaussians_ahead, reached
 from sags_node.types import Camera, DrawnView, FrameResult, ViewStatus
 
 MAX_VIEWS = 8
@@ -61,12 +62,18 @@ class Views:
     """
 
     def __init__(
-        self, backend: str, clock: Clock = time.monotonic, processor_clock: Clock = time.thread_time
+        self,
+        backend: str,
+        clock: Clock = time.monotonic,
+        processor_clock: Clock = time.thread_time,
+        latency: Clock = lambda: 0.0,
     ) -> None:
+        """`latency`: s from capture to published, as it was lately."""
         self.status: Mapping[str, ViewStatus] = {}
         self._backend = backend
         self._clock = clock
         self._processor_clock = processor_clock
+        self._latency = latency
         self._views: dict[str, _View] = {}
         self._rasterizers: dict[tuple[int, int], Rasterizer] = {}
         self._watched: Collection[str] = ()
@@ -142,10 +149,13 @@ class Views:
         eyes = {"": camera}
         if request.stereo:
             eyes = {"left": camera, "right": camera.moved_right(scene.pair.baseline)}
-        planes = self._rasterizers[size].forward(snapshot.gaussians, list(eyes.values()))
+        wanted = self._latency() + view.cost if request.ahead_ms == "auto" else 1e-3 * request.ahead_ms
+        ahead = reached(snapshot, wanted)
+        gaussians = gaussians_ahead(snapshot, ahead) if ahead > 0 else snapshot.gaussians
+        planes = self._rasterizers[size].forward(gaussians, list(eyes.values()))
         pictures = {
             eye: with_confidence(
-                to_view(planes[i], eyes[eye], snapshot.frame_id, snapshot.t_capture_ns), snapshot.gaussians
+                to_view(planes[i], eyes[eye], snapshot.frame_id, snapshot.t_capture_ns), gaussians
             )
             for i, eye in enumerate(eyes)
         }
@@ -153,7 +163,7 @@ class Views:
         view.cost = spent if view.cost == 0 else view.cost + LEARNING * (spent - view.cost)
         view.failure = ""
         view.drawn_at.append(self._clock())
-        return DrawnView(pictures, scene.pair.baseline, request.depth, request.static, scene.epoch)
+        return DrawnView(pictures, scene.pair.baseline, request.depth, request.static, scene.epoch, ahead)
 
     # ---- rates -----------------------------------------------------------------------------------------
 

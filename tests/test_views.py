@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from sags_node.errors import SagsError
 from sags_node.mapping.ladder import RUNGS
 from sags_node.messaging.control import ControlClient
 from sags_node.messaging.requests import AnchorRequest, ViewRequest, parse
-from sags_node.types import Camera, Gaussians
+from sags_node.types import Camera, Forecast, Gaussians, MotionState
 from sags_node.views import LEAST_SHARE, MAX_VIEWS, SHARE, Views, view_camera
 
 pytestmark = pytest.mark.live
@@ -355,3 +356,27 @@ def test_a_view_opened_before_the_first_frame_is_drawn_with_it() -> None:
     assert views.open(parse(ViewRequest, {"name": "a", "width": 32, "height": 32}), None) is None
     assert views.status["a"].limited_by == "no frame has come yet"
     assert run(views, clocks, 0.1, set()) == ["a"]
+
+
+def test_a_view_ahead_is_drawn_where_the_tissue_is_expected_and_says_so() -> None:
+    plane = plane_result()
+    gaussians = plane.snapshot.gaussians
+    count = len(gaussians)
+    step = np.full((1, 3), [1e-3, 0, 0], np.float32)
+    forecast = Forecast(
+        MotionState(None, 0.9, 0.1), 0.05, np.zeros((1, 3), np.float32), np.stack([step, 2 * step]),
+        np.zeros((count, 4), np.int32), np.full((count, 4), 0.25, np.float32),
+    )  # fmt: skip
+    scene = replace(plane, snapshot=replace(plane.snapshot, forecast=forecast))
+    there = replace(gaussians, means=gaussians.means + 2 * step)
+    views = Views("numba", lambda: 0.0, lambda: 0.0, latency=lambda: 0.05)
+    asked = {"width": 64, "height": 48}
+    for name, ahead_ms, seconds in (("now", 0, 0.0), ("far", 500, 0.1), ("own", "auto", 0.05)):
+        drawn = views.open(parse(ViewRequest, {"name": name, "ahead_ms": ahead_ms, **asked}), scene)
+        assert drawn is not None and drawn.ahead_s == pytest.approx(seconds)
+        assert drawn.eyes[""].t_capture_ns == plane.snapshot.t_capture_ns
+        if name == "far":
+            camera = drawn.eyes[""].camera
+            np.testing.assert_allclose(drawn.eyes[""].rgb, rasterize(there, camera).rgb, atol=1e-5)
+    with pytest.raises(SagsError, match="ahead_ms"):
+        parse(ViewRequest, {"name": "a", "ahead_ms": "soon"})

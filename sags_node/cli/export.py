@@ -35,6 +35,13 @@ NO_CAMERAS = "live cameras are exported from the running node; leave out --sessi
 @file_option("--mesh", "F.ply|.obj|.stl", "The same surface as triangles; where nothing is known is a hole.")
 @file_option("--orbit", "F.mp4", "A video around the tissue.")
 @click.option(
+    "--sequence",
+    metavar="FOLDER",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="All Gaussians of every frame of --session, a .ply each, and a video that plays in a loop. The same "
+    "command again goes on where it was ended.",
+)
+@click.option(
     "--orbit-degrees",
     type=click.FloatRange(0, 60),
     default=12.0,
@@ -56,6 +63,7 @@ def export(
     points: Path | None,
     mesh: Path | None,
     orbit: Path | None,
+    sequence: Path | None,
     orbit_degrees: float,
     orbit_seconds: float,
     force: bool,
@@ -72,18 +80,37 @@ def export(
     sags export --mesh now.ply --points now.pcd
     sags export --session launch/d4d_pull.yaml --at 3 --mesh lift.obj --orbit lift.mp4
     sags export --session launch/d4d_pull.yaml --fit out/d4d --at 3 --splats lift.ply
+    sags export --session launch/d4d_pull.yaml --sequence out/frames
     """
     from sags_node.export import export as work
     from sags_node.export import scene as source
+    from sags_node.export import sequence as many
 
     asked = {"splats": splats, "points": points, "mesh": mesh, "orbit": orbit}
     targets = {kind: path for kind, path in asked.items() if path is not None}
-    work.check_targets(targets, force)
+    if sequence is None:
+        work.check_targets(targets, force)
+    elif targets or at is not None or session is None:
+        raise UsageError("--sequence needs --session LAUNCH.yaml, and neither --at nor other files beside it")
     if session is None and (overrides or at is not None or fit is not None):
         raise UsageError("--at, --fit and key:=value need --session LAUNCH.yaml")
     if session is not None:
         path, changed = split_recording((session, *overrides), NO_CAMERAS)
         opened = open_launched(path, [*changed, "source.loop:=false", "source.pace:=step"])
+    if sequence is not None and session is not None:
+        fitted = None if fit is None else str(fit.resolve())
+        about = {"session": opened.name, "overrides": changed, "fit": fitted}
+        many.check_sequence(sequence, about, force)
+        with progress("exporting") as advance:
+            scenes = (
+                source.scenes_of_session(opened)
+                if fit is None
+                else source.scenes_of_fit(fit, opened, advance)
+            )
+            played = opened.source
+            rows = many.write_sequence(sequence, scenes, played.rate, played.frame_count, advance)
+        show(rows if json_out else text.rows_table(rows))
+        return
     with progress("exporting") as advance:
         if session is None:
             scene = source.from_node(endpoint, ns, keys=keys)

@@ -11,6 +11,7 @@ from typing import Any
 from rich.table import Table
 
 from sags_node.cli.launching import write_json
+from sags_node.config import EndoNerfSource
 from sags_node.engine.rasterizer.smoothing import folded
 from sags_node.errors import UsageError
 from sags_node.evaluation.lpips import BACKBONE, Lpips
@@ -19,7 +20,7 @@ from sags_node.evaluation.measure import Options
 from sags_node.fitting import checkpoint
 from sags_node.fitting.clip import read_clip
 from sags_node.fitting.fit import Fit
-from sags_node.fitting.score import PUBLISHED, score, score_depth, score_tracks
+from sags_node.fitting.score import published, score, score_depth, score_tracks
 from sags_node.fitting.settings import FitSettings
 from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.devices import device_of
@@ -99,7 +100,10 @@ def fit_session(
         "train": score(fit, clip.train[:: max(1, options.hold_out)], segments),
         "psnr_convention": "tissue",
         "lpips_backbone": BACKBONE if lpips is not None else None,
-        "published": PUBLISHED,
+        "published": published(
+            session.config.source.folder if isinstance(session.config.source, EndoNerfSource) else None,
+            len(everything),
+        ),
     }  # fmt: skip
     last = fit.gaussians(clip.train[-1])
     ply = out / "model.ply"
@@ -126,7 +130,7 @@ def _iterate(fit: Fit, stored: Path, advance: Advance) -> None:
 
 
 def figures_table(found: dict[str, Any]) -> Table:
-    """Figures of the fit beside the published ones."""
+    """Figures of the fit; beside them those published for the same clip."""
     table = text.table("", "frames", "PSNR* (tissue)", "PSNR (masked)", "SSIM", "LPIPS")
     for name in ("heldout", "train"):
         row = found[name]
@@ -138,15 +142,8 @@ def figures_table(found: dict[str, Any]) -> Table:
             _number(row.get("ssim")),
             _number(row.get("lpips")),
         )
-    for name, row in found["published"].items():
-        table.add_row(
-            name,
-            "28",
-            "–",
-            _number(row["paper_psnr"], "dB"),
-            _number(row["ssim"]),
-            _number(row["lpips"]),
-        )
+    for name, psnr in found["published"].items():
+        table.add_row(f"{name}, published", "–", "–", _number(psnr, "dB"), "–", "–")
     depth = found["depth"]
     depths = f", depth {depth['median_mm']:.2f} mm off (median, {depth['frames']} frames)" if depth else ""
     table.caption = (

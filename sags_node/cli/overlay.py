@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import click
 from rich.markup import escape
@@ -12,6 +12,20 @@ from sags_node.cli.launching import as_json, positive
 from sags_node.cli.node_options import endpoint_option, keys_options, ns_option
 from sags_node.terminal import text
 from sags_node.terminal.console import console, show
+
+
+class Ahead(click.ParamType):
+    """Milliseconds, or `auto`."""
+
+    name = "MS|auto"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float | Literal["auto"]:
+        if value == "auto":
+            return "auto"
+        ms: float = click.FloatRange(0, 1000).convert(value, param, ctx)
+        return ms
 
 
 @click.command()
@@ -38,6 +52,12 @@ from sags_node.terminal.console import console, show
 )
 @click.option(
     "--show-latency", is_flag=True, help="Write the time from capture to overlay into the left eye."
+)
+@click.option(
+    "--ahead",
+    type=Ahead(),
+    default=0.0,
+    help="Place it where tissue is expected so long after its frame; auto: when that is published.",
 )
 @click.option("--own-ns", default="overlay", show_default=True, help="Namespace of what is published here.")
 @click.option(

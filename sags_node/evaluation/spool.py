@@ -19,9 +19,21 @@ import numpy as np
 from sags_node.errors import SagsError
 from sags_node.findings import NOTHING, Findings, by_code
 from sags_node.health import resident_mb
-from sags_node.types import F32, U8, Bool, Camera, FrameResult, Gaussians, Snapshot
+from sags_node.types import (
+    F32,
+    I32,
+    U8,
+    Bool,
+    Camera,
+    Forecast,
+    FrameResult,
+    Gaussians,
+    MotionState,
+    Snapshot,
+)
 
-_ARRAYS = 14  # in a frame's file
+_ARRAYS = 18  # in a frame's file
+_NO_FORECAST = (np.empty(0, np.float32),) * 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +102,7 @@ class Spool:
             SagsError: the disk is full.
         """
         snapshot, seen, view = result.snapshot, result.observation, result.views["left"]
-        gaussians = snapshot.gaussians
+        gaussians, forecast = snapshot.gaussians, snapshot.forecast
         facts = RunFacts(
             t_shown_ns,
             frame_ms,
@@ -110,6 +122,7 @@ class Spool:
             "step": snapshot.step,
             "loss": float(snapshot.loss),
             "baseline": result.pair.baseline,
+            "forecast": None if forecast is None else [forecast.frame_s, *asdict(forecast.state).values()],
         }
         arrays = (
             snapshot.camera.K,
@@ -126,6 +139,7 @@ class Spool:
             cv2.convertScaleAbs(view.rgb, alpha=255),  # rounds and clips at 255, as on the wire
             view.depth,
             np.full_like(view.depth, np.nan) if view.confidence is None else view.confidence,
+            *(_NO_FORECAST if forecast is None else _forecast_arrays(forecast)),
         )
         try:
             with self._file(len(self)).open("wb") as file:
@@ -143,9 +157,14 @@ class Spool:
         """The frame that was added as number `place`."""
         with self._file(place).open("rb") as file:
             header: dict[str, Any] = json.loads(file.readline())
-            K, T_world_cam, tissue, measured_depth, *splats, velocities, rgb, depth, confidence = (
-                np.load(file, allow_pickle=False) for _ in range(_ARRAYS)
-            )
+            arrays = [np.load(file, allow_pickle=False) for _ in range(_ARRAYS)]
+        forecast = None
+        if header["forecast"] is not None:
+            frame_s, *state = header["forecast"]
+            forecast = Forecast(MotionState(*state), frame_s, *arrays[-len(_NO_FORECAST) :])
+        K, T_world_cam, tissue, measured_depth, *splats, velocities, rgb, depth, confidence = arrays[
+            : -len(_NO_FORECAST)
+        ]
         facts = RunFacts(**header["facts"])
         height, width = measured_depth.shape
         snapshot = Snapshot(
@@ -157,6 +176,7 @@ class Spool:
             camera=Camera(width, height, K, T_world_cam),
             loss=header["loss"],
             counts=facts.counts,
+            forecast=forecast,
         )
         return SpooledFrame(
             facts=facts,
@@ -171,3 +191,7 @@ class Spool:
 
     def _file(self, place: int) -> Path:
         return self.folder / f"{place:06d}.frame"
+
+
+def _forecast_arrays(forecast: Forecast) -> tuple[F32, F32, I32, F32]:
+    return forecast.nodes, forecast.moves, forecast.node_index, forecast.node_weight

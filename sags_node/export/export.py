@@ -69,7 +69,7 @@ def export(scene: Scene, targets: Mapping[str, Path], orbit: Orbit, advance: Adv
     rows = []
     for kind, path in targets.items():
         advance(0, None, f"writing {path.name}")
-        with writing(path), _whole(path) as partial:
+        with writing(path), whole(path) as partial:
             match kind:
                 case "splats":
                     write_ply(partial, scene.gaussians)
@@ -85,7 +85,7 @@ def export(scene: Scene, targets: Mapping[str, Path], orbit: Orbit, advance: Adv
 
 
 @contextmanager
-def _whole(path: Path) -> Iterator[Path]:
+def whole(path: Path) -> Iterator[Path]:
     """Another place on the same disk to write to; what is there becomes `path` when nothing went wrong."""
     with tempfile.TemporaryDirectory(prefix=".sags-export-", dir=path.parent) as folder:
         partial = Path(folder) / path.name

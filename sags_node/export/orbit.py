@@ -10,10 +10,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from sags_node.engine.interface import Rasterizer
 from sags_node.engine.rasterizer.rasterize import make_rasterizer, to_view
 from sags_node.errors import SagsError
 from sags_node.export.scene import Advance, Scene
-from sags_node.types import U8, Camera
+from sags_node.types import F32, U8, Camera, Gaussians
 from sags_node.video_file import VideoFile
 
 RATE = 30.0  # pictures per second
@@ -32,6 +33,14 @@ def orbit(camera: Camera, distance: float, degrees: float, count: int) -> Iterat
         yield replace(camera, T_world_cam=camera.T_world_cam @ T)
 
 
+def picture_of(rasterizer: Rasterizer, gaussians: Gaussians, eye: Camera) -> tuple[U8, F32]:
+    """Gaussians as a camera sees them, RGB [H, W, 3], and their depth [H, W] m."""
+    view = to_view(rasterizer.forward(gaussians, [eye])[0], eye, 0, 0)
+    alpha = view.alpha[..., None]
+    rgb = view.rgb * alpha + np.float32(BACKGROUND) * (1 - alpha)
+    return cv2.convertScaleAbs(rgb, alpha=255.0), view.depth
+
+
 def write_orbit(path: Path, scene: Scene, degrees: float, seconds: float, advance: Advance) -> int:
     """Write a video that can be played in a loop; returns the number of pictures.
 
@@ -41,11 +50,8 @@ def write_orbit(path: Path, scene: Scene, degrees: float, seconds: float, advanc
     camera, count = scene.camera, max(1, round(seconds * RATE))
     rasterizer = make_rasterizer("numba", camera.width, camera.height)
 
-    def draw(eye: Camera) -> tuple[U8, np.ndarray]:
-        view = to_view(rasterizer.forward(scene.gaussians, [eye])[0], eye, 0, scene.t_capture_ns)
-        alpha = view.alpha[..., None]
-        rgb = view.rgb * alpha + np.float32(BACKGROUND) * (1 - alpha)
-        return cv2.convertScaleAbs(rgb, alpha=255.0), view.depth
+    def draw(eye: Camera) -> tuple[U8, F32]:
+        return picture_of(rasterizer, scene.gaussians, eye)
 
     depth = draw(camera)[1]
     if not (depth > 0).any():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from zipfile import BadZipFile
@@ -15,7 +15,7 @@ import numpy as np
 from sags_node.confidence import error_of
 from sags_node.errors import SagsError, UsageError
 from sags_node.fitting import checkpoint
-from sags_node.fitting.clip import read_clip
+from sags_node.fitting.clip import ClipFrame, read_clip
 from sags_node.fitting.fit import Fit
 from sags_node.fitting.settings import FitSettings
 from sags_node.kernels.threads import configure_threads
@@ -25,7 +25,7 @@ from sags_node.messaging.received import ReceivedCameraInfo, ReceivedCloud, Rece
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.pipeline import Pipeline
 from sags_node.session import Session
-from sags_node.types import F32, SH_DEGREE_0, Camera, FrameResult, Gaussians
+from sags_node.types import F32, SH_DEGREE_0, Camera, Gaussians
 
 SPLATS = TopicName("splats", ReceivedCloud)
 INFO = TopicName("left/camera_info", ReceivedCameraInfo)
@@ -106,23 +106,33 @@ def from_session(session: Session, at: float | None, advance: Advance) -> Scene:
         UsageError: the recording ends before.
         SagsError: it cannot be read, or shows nothing to make a model of.
     """
+    count = session.source.frame_count
+    scene: Scene | None = None
+    first_ns = last_ns = 0
+    for done, scene in enumerate(scenes_of_session(session)):
+        first_ns, last_ns = (scene.t_capture_ns if done == 0 else first_ns), scene.t_capture_ns
+        advance(done + 1, count, "playing")
+        if at is not None and last_ns - first_ns >= at * 1e9:
+            break
+    if scene is None or len(scene.gaussians) == 0:
+        raise SagsError(f"{session.name}: no frame shows anything to make a model of")
+    _check_time(session, at, first_ns, last_ns)
+    return scene
+
+
+def scenes_of_session(session: Session) -> Iterator[Scene]:
+    """The online model after each frame of a recording; without Gaussians where nothing is known yet.
+
+    Args:
+        session: a recording with `source.pace` step.
+    """
     configure_threads(session.config.engine.threads)
     pipeline = Pipeline(session.config, session.rig)
     budget = pipeline.make_budget()
-    count = session.source.frame_count
-    result: FrameResult | None = None
-    first_ns = last_ns = 0
     with session.source as source:
-        for done, frame in enumerate(source):
-            first_ns, last_ns = (frame.t_capture_ns if done == 0 else first_ns), frame.t_capture_ns
-            result = pipeline.process(frame, budget)
-            advance(done + 1, count, "playing")
-            if at is not None and last_ns - first_ns >= at * 1e9:
-                break
-    if result is None or len(result.snapshot.gaussians) == 0:
-        raise SagsError(f"{session.name}: no frame shows anything to make a model of")
-    _check_time(session, at, first_ns, last_ns)
-    return Scene(result.snapshot.gaussians, result.snapshot.camera, last_ns)
+        for frame in source:
+            snapshot = pipeline.process(frame, budget).snapshot
+            yield Scene(snapshot.gaussians, snapshot.camera, frame.t_capture_ns)
 
 
 # ---- a fit -----------------------------------------------------------------------------------------------
@@ -141,6 +151,22 @@ def from_fit(folder: Path, session: Session, at: float | None, advance: Advance)
         UsageError: there is no fit, it is one of another recording, or the recording ends before.
         SagsError: the recording or the checkpoint cannot be read.
     """
+    fit, frames = _read_fit(folder, session, advance)
+    first_ns, last_ns = frames[0].t_capture_ns, frames[-1].t_capture_ns
+    _check_time(session, at, first_ns, last_ns)
+    frame = next((f for f in frames if at is not None and f.t_capture_ns - first_ns >= at * 1e9), frames[-1])
+    return Scene(fit.gaussians(frame), frame.camera, frame.t_capture_ns)
+
+
+def scenes_of_fit(folder: Path, session: Session, advance: Advance) -> Iterator[Scene]:
+    """What `sags fit` made of a recording, at the time of each of its frames; as `from_fit`."""
+    fit, frames = _read_fit(folder, session, advance)
+    for frame in frames:
+        yield Scene(fit.gaussians(frame), frame.camera, frame.t_capture_ns)
+
+
+def _read_fit(folder: Path, session: Session, advance: Advance) -> tuple[Fit, list[ClipFrame]]:
+    """A fit, and all frames of its recording in order; as `from_fit`."""
     stored, figures = folder / "checkpoint.npz", folder / "figures.json"
     for file in (stored, figures):
         if not file.is_file():
@@ -164,11 +190,7 @@ def from_fit(folder: Path, session: Session, at: float | None, advance: Advance)
     advance(0, None, "reading the fit")
     fit = Fit(clip, settings)
     checkpoint.load(fit, stored)
-    frames = sorted((*clip.train, *clip.test), key=lambda frame: frame.t_capture_ns)
-    first_ns, last_ns = frames[0].t_capture_ns, frames[-1].t_capture_ns
-    _check_time(session, at, first_ns, last_ns)
-    frame = next((f for f in frames if at is not None and f.t_capture_ns - first_ns >= at * 1e9), frames[-1])
-    return Scene(fit.gaussians(frame), frame.camera, frame.t_capture_ns)
+    return fit, sorted((*clip.train, *clip.test), key=lambda frame: frame.t_capture_ns)
 
 
 def _check_time(session: Session, at: float | None, first_ns: int, last_ns: int) -> None:

@@ -16,11 +16,13 @@ from sags_node.confidence import confidence_of
 from sags_node.errors import SagsError
 from sags_node.geometry import project, unproject
 from sags_node.mapping.motion import BEHIND_TOLERANCE
+from sags_node.model.forecast import points_ahead, reached
 from sags_node.types import (
     F32,
     F64,
     I64,
     U8,
+    AnchorsAhead,
     AnchorStates,
     Bool,
     Gaussians,
@@ -84,6 +86,8 @@ class Anchors:
         self._next_id = 1
         self._frames = 0
         self._stamp_ns: int | None = None  # of the last frame
+        self._wanted: dict[int, float | None] = {}  # s ahead, by id; None: as `latency_s`
+        self.latency_s = 0.0  # from capture to what shows it, as it was lately
 
     def __len__(self) -> int:
         return len(self._table.ids)
@@ -134,6 +138,25 @@ class Anchors:
         self._next_id += 1
         return anchor_id
 
+    def look_ahead(self, anchor_id: int, seconds: float | None) -> None:
+        """Say of an anchor also where it is expected so much later; None: later by `latency_s`."""
+        self._wanted[anchor_id] = seconds
+
+    def ahead(self, states: AnchorStates, snapshot: Snapshot) -> AnchorStates:
+        """The states with where those who want it are expected, as far ahead as motion is predicted."""
+        if not self._wanted or snapshot.forecast is None or len(states) == 0:
+            return states
+        wanted = [self._wanted.get(int(anchor), 0.0) for anchor in states.ids]
+        seconds = np.array(
+            [reached(snapshot, self.latency_s if s is None else s) for s in wanted], np.float32
+        )
+        points, pixels = states.points.copy(), states.pixels.copy()
+        for s in np.unique(seconds[seconds > 0]):
+            rows = seconds == s
+            points[rows] = points_ahead(snapshot.forecast, points[rows], float(s))
+            pixels[rows] = project(snapshot.camera, points[rows].astype(np.float64))[0]
+        return replace(states, ahead=AnchorsAhead(seconds, points, pixels))
+
     def depth_confidence(self, anchor_id: int) -> float:
         """How far to trust the depth of an anchor that is there, 0..1."""
         return float(self._table.depth_confidence[self._table.ids == anchor_id][0])
@@ -148,6 +171,7 @@ class Anchors:
         if kept.all():
             raise SagsError(f"there is no anchor {anchor_id}; it was removed, or never added")
         self._table = _selected(self._table, kept)
+        self._wanted.pop(anchor_id, None)
 
     def update(
         self, observation: Observation, snapshot: Snapshot, view: RenderedView, clear: bool = True

@@ -14,6 +14,7 @@ from sags_node.mapping.budget import Budget
 from sags_node.mapping.depth_memory import remember
 from sags_node.mapping.focus import tile_grid, tiles_of, with_neighbours
 from sags_node.mapping.motion import depth_pull, found_again, scene_flow
+from sags_node.mapping.motion_field import MotionField
 from sags_node.mapping.optimiser import Rates
 from sags_node.mapping.refiner import Refiner
 from sags_node.mapping.split import split_worst
@@ -21,7 +22,18 @@ from sags_node.model.alias_free import smoothing_variances
 from sags_node.model.deformation import NodeDeformation
 from sags_node.model.gaussians import GaussianModel
 from sags_node.model.light import carried, is_near
-from sags_node.types import F32, F64, U8, Bool, Camera, Gaussians, Observation, RenderedView, Snapshot
+from sags_node.types import (
+    F32,
+    F64,
+    U8,
+    Bool,
+    Camera,
+    Forecast,
+    Gaussians,
+    Observation,
+    RenderedView,
+    Snapshot,
+)
 from sags_node.vision.flow import OpticalFlow
 from sags_node.vision.observe import resized
 from sags_node.vision.pyramid import pyramid_of
@@ -85,6 +97,7 @@ class Mapper:
         smoothing: bool = True,
         unhurried: bool = False,
         focus: float = FOCUS,
+        field: bool = False,
     ) -> None:
         """
         Args:
@@ -92,6 +105,7 @@ class Mapper:
             smoothing: draw the Gaussians with the 3D filter (`model.alias_free`).
             unhurried: see `pace`.
             focus: share of the picture, where it is worst, for the steps after the first of a frame.
+            field: remember motion (`mapping.motion_field`), for hidden tissue and to predict.
         """
         self.model = GaussianModel(max_gaussians)
         self.step = 0
@@ -101,6 +115,7 @@ class Mapper:
         self._focus = focus
         self.pace(unhurried)
         self._deformation: NodeDeformation | None = None
+        self._field = MotionField() if field else None
         self._lamp: F64 | None = None  # T_world_cam of the scope whose light the colours show
         self._last: Drawn | None = None
         self._found: tuple[U8, F32] | None = None  # a picture, and the pixels where the Gaussians are in it
@@ -133,6 +148,7 @@ class Mapper:
             counts = self._touch_up(observation, budget, settled=still > SETTLED)
         else:
             counts = self._follow(observation, budget)
+        forecast = self._remember(observation.t_capture_ns, still > 0)
         snapshot = Snapshot(
             frame_id=observation.frame_id,
             t_capture_ns=observation.t_capture_ns,
@@ -142,6 +158,7 @@ class Mapper:
             camera=observation.camera,
             loss=self._refiner.loss,
             counts=counts,
+            forecast=forecast,
         )
         assert self._view is not None
         drawn = Drawn(observation, self._view)
@@ -164,6 +181,7 @@ class Mapper:
         """Forget the model; the next frame, or this one if it is being taken in, makes a new one."""
         self.model.clear()
         self._deformation = None
+        self._forget_motion()
         self._last = None
         self.restarts += 1
 
@@ -175,6 +193,7 @@ class Mapper:
         """Forget what was learnt since. The next frame's motion has nothing to start from (`start_from`)."""
         learnt.model.never_reuse(self.model)
         self.model, self._deformation, self._lamp = learnt.model, learnt.deformation, learnt.lamp
+        self._forget_motion()
         self.start_from(None)
 
     def lit_from(self, camera: Camera) -> Gaussians:
@@ -365,11 +384,32 @@ class Mapper:
         if observation.depth.any():
             self._frames_to_depth = 0
         start = self.model.means.copy()
-        self._deformation.follow(self.model, displacements, seen)
+        if self._field is None:
+            self._deformation.follow(self.model, displacements, seen)
+        else:
+            self._deformation.follow(self.model, displacements, seen, self._field.recalled)
         seconds = (observation.t_capture_ns - before.t_capture_ns) * 1e-9
         if seconds > 0:
             self.model.velocities[:] = (self.model.means - start) / np.float32(seconds)
         remember(self.model, observation, pull, max(seconds, 0.0))
+
+    def _remember(self, t_ns: int, still: bool) -> Forecast | None:
+        """Take the nodes' places at the end of a frame into the field; what it expects next."""
+        deformation, model = self._deformation, self.model
+        if self._field is None or deformation is None:
+            return None
+        self._field.take(deformation.nodes, deformation.seen, t_ns)
+        expected = self._field.forecast()
+        if expected is None or still:
+            return None
+        moves, frame_s, state = expected
+        return Forecast(
+            state, frame_s, deformation.nodes.copy(), moves, model.node_index.copy(), model.node_weight.copy()
+        )
+
+    def _forget_motion(self) -> None:
+        if self._field is not None:
+            self._field.forget()
 
     def _sharpen(self, observation: Observation) -> None:
         """Narrow the 3D filter of what this camera sees finer than any before. What is out of view keeps its

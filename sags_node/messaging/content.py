@@ -35,7 +35,10 @@ SPLAT_FIELDS = (
     *("opacity", "id", "confidence"),
 )
 POINT_FIELDS = ("x", "y", "z", "rgb", "confidence")
-ANCHOR_FIELDS = ("x", "y", "z", "id", "u", "v", "visibility", "age", "confidence", "depth_confidence")
+ANCHOR_FIELDS = (
+    *("x", "y", "z", "id", "u", "v", "visibility", "age", "confidence", "depth_confidence"),
+    *("ahead", "x_ahead", "y_ahead", "z_ahead", "u_ahead", "v_ahead"),
+)
 POINT_MIN_OPACITY = 0.1
 POINT_BEHIND_SURFACE = 0.003  # m; a Gaussian deeper than this under the drawn surface is not visible
 
@@ -75,6 +78,10 @@ def anchors(result: FrameResult) -> Content:
     rows[:, 4:6] = states.pixels
     rows[:, 6], rows[:, 7], rows[:, 8] = states.visibility, states.ages, states.confidence
     rows[:, 9] = states.depth_confidence
+    ahead = states.ahead
+    rows[:, 10] = 0 if ahead is None else ahead.seconds
+    rows[:, 11:14] = states.points if ahead is None else ahead.points
+    rows[:, 14:16] = states.pixels if ahead is None else ahead.pixels
     dense = bool(np.isfinite(states.points).all())
     return cdr.point_cloud(rows, ANCHOR_FIELDS, result.pair.t_capture_ns, dense)
 

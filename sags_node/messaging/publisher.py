@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Self
 
+import msgspec
 import zmq
 
 from sags_node.config import PublishConfig
@@ -48,6 +49,7 @@ class _Kept:
     stamp_ns: int
     frame_id: int = -1
     epoch: int | None = None
+    ahead_ns: int = 0
 
 
 class Publisher:
@@ -171,23 +173,25 @@ class Publisher:
         """Send the configuration in force; it is kept for those who subscribe later."""
         self._publish_text("parameters", content.json_text(parameters), time.time_ns())
 
-    def publish_content(self, name: str, body: Content, frame_id: int, stamp_ns: int, epoch: int) -> None:
+    def publish_content(
+        self, name: str, body: Content, frame_id: int, stamp_ns: int, epoch: int, ahead_ns: int = 0
+    ) -> None:
         """Send what was made elsewhere, e.g. recorded; the topic `name` (without namespace) may be any."""
         self._seq[name] = self._seq.get(name, 0) + 1
         topic = topics.find(name)
         if topic is not None and topic.cached:
-            self._kept[name] = _Kept(body, stamp_ns, frame_id, epoch)
-        self._send(name, body, frame_id, stamp_ns, epoch)
+            self._kept[name] = _Kept(body, stamp_ns, frame_id, epoch, ahead_ns)
+        self._send(name, body, frame_id, stamp_ns, epoch, ahead_ns)
 
     def publish_view(self, name: str, drawn: DrawnView) -> None:
         """Send the topics of the view `name` to those who asked for them."""
-        shown = next(iter(drawn.eyes.values()))
+        shown, ahead_ns = next(iter(drawn.eyes.values())), round(drawn.ahead_s * 1e9)
         for topic, body in content.view(name, drawn).items():
             self._seq[topic] = self._seq.get(topic, 0) + 1
             if drawn.still or body.type == topics.CAMERA_INFO:
-                self._kept[topic] = _Kept(body, shown.t_capture_ns, shown.frame_id, drawn.epoch)
+                self._kept[topic] = _Kept(body, shown.t_capture_ns, shown.frame_id, drawn.epoch, ahead_ns)
             if self.wanted(topic):
-                self._send(topic, body, shown.frame_id, shown.t_capture_ns, drawn.epoch)
+                self._send(topic, body, shown.frame_id, shown.t_capture_ns, drawn.epoch, ahead_ns)
 
     def forget_view(self, name: str) -> None:
         """Nothing is sent again of a view that was closed."""
@@ -215,7 +219,15 @@ class Publisher:
         pair = self._last.pair
         self._send(name, content.FRAME_CONTENT[name](self._last), pair.frame_id, pair.t_capture_ns)
 
-    def _send(self, name: str, body: Content, frame_id: int, stamp_ns: int, epoch: int | None = None) -> None:
+    def _send(
+        self,
+        name: str,
+        body: Content,
+        frame_id: int,
+        stamp_ns: int,
+        epoch: int | None = None,
+        ahead_ns: int = 0,
+    ) -> None:
         if epoch is None:
             epoch = 0 if self._last is None else self._last.epoch
         meta = Meta(
@@ -232,6 +244,7 @@ class Publisher:
             shape=list(body.shape),
             dtype=body.dtype,
             dropped=self._dropped,
+            ahead_ns=ahead_ns or msgspec.UNSET,
         )
         frames = encode(Message(topics.full_name(self.ns, name), meta, body.parts))
         # An XPUB socket drops for a full peer instead of blocking. Arrays are never written again, so
@@ -277,7 +290,7 @@ class Publisher:
         for name in sorted(resend):
             if name in self._kept:
                 kept = self._kept[name]
-                self._send(name, kept.body, kept.frame_id, kept.stamp_ns, kept.epoch)
+                self._send(name, kept.body, kept.frame_id, kept.stamp_ns, kept.epoch, kept.ahead_ns)
             elif self._last is not None and name in content.FRAME_CONTENT:
                 if content.tells_of(self._last, name):
                     self._send_frame_topic(name)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 import numpy as np
@@ -17,12 +17,16 @@ from sags_node.types import F64
 MAX_VIEW_SIDE = 1920  # px
 MAX_VIEW_PIXELS = 1920 * 1200  # of each eye
 MAX_VIEW_HZ = 60.0
+MAX_AHEAD_MS = 1000.0
 MAX_DISTANCE = 10.0  # m from the world's origin or the left camera
 
 Row = tuple[float, ...]
 Name = Annotated[str, msgspec.Meta(pattern=f"^{VIEW_NAME.pattern}$")]
 Side = Annotated[int, msgspec.Meta(ge=16, le=MAX_VIEW_SIDE)]
 R = TypeVar("R", bound=msgspec.Struct)
+
+
+AheadMs = Annotated[float, msgspec.Meta(ge=0, le=MAX_AHEAD_MS)] | Literal["auto"]
 
 
 class AnchorRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -33,9 +37,10 @@ class AnchorRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     x: float | None = None  # m
     y: float | None = None
     z: float | None = None
+    ahead_ms: AheadMs = 0.0  # say also where it is expected so much later; auto: when it is published
 
     def __post_init__(self) -> None:
-        given = {name for name in self.__struct_fields__ if getattr(self, name) is not None}
+        given = {name for name in "uvxyz" if getattr(self, name) is not None}
         if given not in ({"u", "v"}, {"x", "y", "z"}):
             raise ValueError("give either a pixel {u, v} of the left picture or a point {x, y, z} in metres")
         if not all(math.isfinite(getattr(self, name)) for name in given):
@@ -62,6 +67,7 @@ class ViewRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     depth: bool = False
     static: bool = False  # draw once
     stereo: bool = False  # and the right eye, at the rig's baseline
+    ahead_ms: AheadMs = 0.0  # draw the tissue where it is expected so much later; auto: when it is drawn
 
     def __post_init__(self) -> None:
         if self.width * self.height > MAX_VIEW_PIXELS:

@@ -50,6 +50,7 @@ class Meta(msgspec.Struct, frozen=True, kw_only=True):
     shape: Annotated[list[Annotated[int, msgspec.Meta(ge=0, lt=2**31)]], msgspec.Meta(max_length=4)]
     dtype: DType  # of part 1, little-endian; empty: no bulk part
     dropped: Count  # frames the node dropped so far
+    ahead_ns: Count | msgspec.UnsetType = msgspec.UNSET  # shown is what is expected so long after `stamp_ns`
 
 
 @dataclass(frozen=True, slots=True)

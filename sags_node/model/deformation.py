@@ -3,6 +3,7 @@ too."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,8 @@ _LEAST_STIFFNESS = 0.2  # in squared node spacings: what little is known of a gr
 # means), where that is far above the smallest float.
 _STEEPEST = 2.0
 _NEW_NODE_DISTANCE = 1.5  # in node spacings: farther new tissue gets nodes of its own
+
+Recall = Callable[[F32, F32], F32 | None]  # motion [M, 3] m and the weight [M] behind it -> all nodes' motion
 
 
 class NodeDeformation:
@@ -38,6 +41,7 @@ class NodeDeformation:
         self._momentum = np.zeros_like(self.nodes)
         self._variance = np.zeros_like(self.nodes)
         self._neighbours = self._find_neighbours()
+        self.seen = np.zeros(len(self.nodes), np.float32)  # [M] weight of what was seen of each in `follow`
 
     def attach(self, model: GaussianModel, rows: slice) -> None:
         """Let the Gaussians in `rows` follow the nodes."""
@@ -52,16 +56,33 @@ class NodeDeformation:
         model.node_index[rows] = index
         model.node_weight[rows] = weight
 
-    def follow(self, model: GaussianModel, displacements: F32, seen: F32) -> None:
+    def follow(
+        self,
+        model: GaussianModel,
+        displacements: F32,
+        seen: F32,
+        recall: Recall = lambda motion, weight: None,
+    ) -> None:
         """Move and turn all Gaussians by what was observed.
 
         Args:
             model: its `means` and `quats` are changed.
             displacements: [N, 3] m, observed where `seen`.
             seen: [N] weight of the observation, 0 = not seen.
+            recall: what all nodes are expected to do, given the motion of those that were seen. What that
+                misses of the seen ones is spread to the hidden ones.
         """
         motion, weight = _average(displacements, seen, model.node_index, model.node_weight, len(self.nodes))
-        _spread(motion, weight, self._neighbours, _SMOOTHING_ROUNDS)
+        self.seen = weight
+        hidden = weight <= _LEAST_SEEN
+        expected = recall(motion, weight) if hidden.any() else None
+        if expected is None:
+            _spread(motion, weight, self._neighbours, _SMOOTHING_ROUNDS)
+        else:
+            motion -= expected
+            motion[hidden] = 0
+            _spread(motion, weight, self._neighbours, _SMOOTHING_ROUNDS)
+            motion += expected
         # The motion is that of the middle of what was seen around a node, not of the node itself.
         places, _ = _average(model.means, seen, model.node_index, model.node_weight, len(self.nodes))
         places = np.where(weight[:, None] > _LEAST_SEEN, places, self.nodes)
@@ -108,6 +129,7 @@ class NodeDeformation:
     def _add_nodes(self, nodes: F32) -> None:
         zeros = np.zeros_like(nodes)
         self.nodes = np.concatenate([self.nodes, nodes])
+        self.seen = np.concatenate([self.seen, zeros[:, 0]])
         self._momentum = np.concatenate([self._momentum, zeros])
         self._variance = np.concatenate([self._variance, zeros])
         self._neighbours = self._find_neighbours()
@@ -116,6 +138,13 @@ class NodeDeformation:
         """[M, 6] nearest other nodes."""
         k = min(6, max(len(self.nodes) - 1, 1))
         return _nearest(self.nodes, self.nodes, k + 1)[0][:, 1:]
+
+
+def skinned(moves: F32, index: I32, weight: F32, points: F32) -> F32:
+    """Points [N, 3] m moved by the weighted motion [M, 3] m of their nodes, in a fresh array."""
+    moved = points.copy()
+    _skin(np.ascontiguousarray(moves), index, weight, moved)
+    return moved
 
 
 def spread_nodes(means: F32, count: int) -> F32:

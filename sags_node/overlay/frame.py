@@ -36,6 +36,7 @@ class Anchor:
     visibility: float  # 0..1
     confidence: float  # 0..1
     depth_confidence: float = 1.0  # 0..1; low: where it lies in depth is a guess
+    ahead: float = 0.0  # s after the frame at which it is expected at `place`; 0: it was there
 
     @property
     def sure(self) -> float:
@@ -84,6 +85,8 @@ def tissue_frame(
     T[:3, 3] = [getattr(moved.translation, axis) for axis in "xyz"]
     rows = anchors.points
     places = anchors.xyz().astype(np.float64)
+    if "ahead" in fields:
+        places = np.stack([rows[f"{axis}_ahead"] for axis in "xyz"], axis=-1).astype(np.float64)
     return TissueFrame(
         frame_id=depth.meta.frame_id,
         stamp_ns=depth.stamp_ns,
@@ -99,6 +102,7 @@ def tissue_frame(
                 float(row["visibility"]),
                 float(row["confidence"]),
                 float(row["depth_confidence"]) if "depth_confidence" in fields else 1.0,
+                float(row["ahead"]) if "ahead" in fields else 0.0,
             )
             for row, place in zip(rows, places, strict=True)
         },

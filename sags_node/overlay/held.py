@@ -22,7 +22,7 @@ LEAST_ANCHORS = 3  # for a rigid fit
 NORMAL_MEMORY = 0.8  # of the last normal; the depth of one frame is noisy
 GOODBYE = 0.5  # s for the node to take anchors back at the end
 
-Request = dict[str, float]
+Request = dict[str, Any]
 
 
 class Pinner:
@@ -91,9 +91,12 @@ class HeldObject:
 
     Args:
         repin: after the model or the node was started anew, pin it once more at the same pixels and places.
+        ahead: how far ahead of its frames it is placed, ms or `auto`, see `add_anchor`.
     """
 
-    def __init__(self, spec: ObjectSpec, where: str, pinner: Pinner, repin: bool) -> None:
+    def __init__(
+        self, spec: ObjectSpec, where: str, pinner: Pinner, repin: bool, ahead: float | str = 0.0
+    ) -> None:
         self.spec = spec
         self.reason: str | None = None
         self.error = 0.0
@@ -101,6 +104,7 @@ class HeldObject:
         self._where = where  # what its anchors are called in messages
         self._pinner = pinner
         self._repin = repin
+        self._asked = {} if ahead == 0 else {"ahead_ms": ahead}
         self._pinning: Future[list[int]] | None = None
         self._ids: list[int] = []
         self._session = ""  # of the node in which it was pinned
@@ -141,6 +145,11 @@ class HeldObject:
         T, self.reason = self._held(frame, states)
         return T
 
+    @property
+    def ahead_s(self) -> float:
+        """How far ahead of the frame it was placed last."""
+        return max((state.ahead for state in self._states), default=0.0)
+
     def status(self) -> dict[str, Any]:
         """For people and programs: what it is, why it is not drawn, and how its anchors do."""
         return {
@@ -171,6 +180,7 @@ class HeldObject:
             requests = self._requests(frame)
             if isinstance(requests, str):
                 return requests
+            requests = [request | self._asked for request in requests]
             self._pinning, self._session = self._pinner.pin(requests), frame.session
         elif self._pinning.done():
             done, self._pinning = self._pinning, None

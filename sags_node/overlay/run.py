@@ -65,6 +65,7 @@ class Options:
     max_age: float = MAX_AGE
     repin: bool = False
     show_latency: bool = False
+    ahead: float | str = 0.0  # ms, or auto
 
 
 def run_overlay(options: Options, tell: Callable[[str], object] = log.warning) -> dict[str, Any]:
@@ -124,7 +125,11 @@ class _Overlay:
         self._pinner = Pinner(connect)
         self._objects = [
             HeldObject(
-                spec, "pin" if options.scene is None else f"{spec.name}: pixel", self._pinner, options.repin
+                spec,
+                "pin" if options.scene is None else f"{spec.name}: pixel",
+                self._pinner,
+                options.repin,
+                options.ahead,
             )
             for spec in scene.objects
         ]
@@ -283,7 +288,8 @@ class _Overlay:
         pictures = {"left": overlay_draw.draw(frame, placed, note=self._note(), warnings=warnings)}
         if frame.baseline is not None and self._stream.wants("right"):
             pictures["right"] = overlay_draw.draw(frame, placed, frame.baseline, warnings=warnings)
-        self._stream.show(pictures, frame.frame_id, frame.stamp_ns, self._epoch)
+        ahead = max(held.ahead_s for held in self._objects)
+        self._stream.show(pictures, frame.frame_id, frame.stamp_ns, self._epoch, round(ahead * 1e9))
         self._draw_ms.append(1e3 * (time.perf_counter() - began))
         self._latency_ms.append(1e-6 * (self._node.now_ns() - frame.stamp_ns))
         return pictures["left"]

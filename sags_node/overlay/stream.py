@@ -63,8 +63,11 @@ class OverlayStream:
         """True while somebody looks at this eye."""
         return any(self._publisher.wanted(f"{eye}/overlay/{kind}") for kind in ("image", "color_key"))
 
-    def show(self, pictures: dict[str, U8], frame_id: int, stamp_ns: int, epoch: int) -> None:
-        """Send the overlay [H, W, 4] of each eye that is looked at, for the frame captured at `stamp_ns`.
+    def show(
+        self, pictures: dict[str, U8], frame_id: int, stamp_ns: int, epoch: int, ahead_ns: int = 0
+    ) -> None:
+        """Send the overlay [H, W, 4] of each eye that is looked at, for the frame captured at `stamp_ns`, or
+        for what is expected `ahead_ns` later.
 
         An eye that has no picture gets an empty one.
         """
@@ -72,7 +75,7 @@ class OverlayStream:
         self._size = next(iter(pictures.values())).shape[:2]
         for eye in EYES:
             if self.wants(eye):
-                self._send(eye, pictures.get(eye, self._empty()), frame_id, stamp_ns)
+                self._send(eye, pictures.get(eye, self._empty()), frame_id, stamp_ns, ahead_ns)
 
     def blank(self, reason: str) -> None:
         """Show nothing, because of `reason`; to be called again and again while that is so.
@@ -102,13 +105,13 @@ class OverlayStream:
         assert self._size is not None
         return np.zeros((*self._size, 4), np.uint8)
 
-    def _send(self, eye: str, rgba: U8, frame_id: int, stamp_ns: int) -> None:
+    def _send(self, eye: str, rgba: U8, frame_id: int, stamp_ns: int, ahead_ns: int = 0) -> None:
         for kind, encoding in (("image", "rgba8"), ("color_key", "rgb8")):
             topic = f"{eye}/overlay/{kind}"
             if self._publisher.wanted(topic):
                 picture = rgba if kind == "image" else color_key(rgba, self._key)
                 body = cdr.image(picture, encoding, stamp_ns, EYES[eye])
-                self._publisher.publish_content(topic, body, frame_id, stamp_ns, self._epoch)
+                self._publisher.publish_content(topic, body, frame_id, stamp_ns, self._epoch, ahead_ns)
 
     def __enter__(self) -> Self:
         return self

@@ -17,7 +17,16 @@ from sags_node.mapping.budget import StepBudget
 from sags_node.pipeline import Pipeline
 from sags_node.session import open_session
 from sags_node.sources.source import open_source
-from sags_node.types import AnchorStates, Camera, Gaussians, Observation, RenderedView, Snapshot
+from sags_node.types import (
+    AnchorStates,
+    Camera,
+    Forecast,
+    Gaussians,
+    MotionState,
+    Observation,
+    RenderedView,
+    Snapshot,
+)
 
 WIDTH, HEIGHT, FOCAL, DEPTH = 128, 96, 100.0, 0.08
 CENTRE = (WIDTH - 1) / 2, (HEIGHT - 1) / 2
@@ -215,6 +224,35 @@ def test_what_cannot_be_pinned_is_a_clear_error() -> None:
     with pytest.raises(SagsError, match="no anchor 1"):
         anchors.remove(1)
     assert len(anchors) == 0
+
+
+def test_who_wants_it_learns_also_where_an_anchor_is_expected() -> None:
+    """Never further ahead than motion is predicted, and beside where it was seen, not in its place."""
+    observation, snapshot, view = scene()
+    nodes = snapshot.gaussians.means[::100].copy()
+    moves = np.arange(1, 5, dtype=np.float32)[:, None, None] * np.full(
+        (len(nodes), 3), [1e-3, 0, 0], np.float32
+    )
+    rows = np.zeros((1, 4))
+    forecast = Forecast(
+        MotionState(None, 0.9, 0.1), 0.05, nodes, moves, rows.astype(np.int32), rows.astype(np.float32)
+    )
+    snapshot = replace(snapshot, forecast=forecast)
+    anchors = Anchors()
+    asked, silent, soon = (anchors.add_pixel(u, 48, observation, snapshot, view) for u in (40, 60, 80))
+    anchors.look_ahead(asked, 0.5)  # far beyond 0.1 s
+    anchors.look_ahead(soon, None)
+    anchors.latency_s = 0.025
+    anchors.update(observation, snapshot, view)
+    states = anchors.ahead(anchors.at(0), snapshot)
+    assert states.ahead is not None and list(states.ids) == [asked, silent, soon]
+    np.testing.assert_allclose(states.ahead.seconds, [0.1, 0, 0.025], atol=1e-6)
+    np.testing.assert_allclose((states.ahead.points - states.points)[:, 0], [2e-3, 0, 5e-4], atol=1e-6)
+    px = FOCAL / DEPTH
+    np.testing.assert_allclose(
+        (states.ahead.pixels - states.pixels)[:, 0], [2e-3 * px, 0, 5e-4 * px], atol=1e-2
+    )
+    assert anchors.ahead(anchors.at(0), replace(snapshot, forecast=None)).ahead is None
 
 
 def test_ids_are_never_used_again_and_their_number_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:

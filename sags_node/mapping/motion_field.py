@@ -1,0 +1,257 @@
+"""How tissue moves again and again: what followed the last times that it moved as it does now.
+
+The method of analogues (E. N. Lorenz, J. Atmos. Sci. 1969), on the motion of the control nodes: past moments
+at which all nodes moved as in the last frames say what comes next. Heart and breathing need no model of their
+own and no period for that; tissue that never moved so before has no such moments. What is recalled is mixed
+with the last velocities by weights that the last half second of predictions would have wanted. A HexPlane
+field learnt beside the video was compared; see `benchmarks/motion_field.md`.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from sags_node.types import F32, F64, I64, MotionState
+
+HISTORY = 300  # frames: two breaths at 30 Hz
+HORIZONS = 4  # frames ahead
+MATCHED = 3  # frames in a row that are compared
+NEAREST = 0.3  # s: what lies less far back is this motion itself; no heart beats faster
+LIKENESS = 0.1  # of the motion's energy: a moment that differs by so much more counts 1/e of another
+UNLIKE = float(np.exp(-1 / LIKENESS))  # weight of resting, which differs by all of it
+MEMORY = 0.93  # of the mixing weights, per frame: half a second
+SKILL_MEMORY = 0.97  # a second
+PRIOR = 0.5  # pulls the mixing weights to equal shares, in energies of one frame's motion
+SHARE = 0.3  # of each: together a little less than all, since tissue slows down
+STEADY = 0.8  # times the last velocity: what is said without a memory
+LEAST_SKILL = 0.2  # of the motion's energy: what explains less does not pay for being wrong
+LONGEST_GAP = 4  # frames that may be missing: a straight line fills them
+LEAST_NODES = 32  # that must be seen: fewer say little of the rest
+LEAST_WEIGHT = 1e-3  # of a past frame
+KNOWN = 0.5  # weight of what was seen around a node: below it nothing is known of it
+
+
+class MotionField:
+    """The motion of control nodes, remembered, and what it says of the next frames."""
+
+    def __init__(self) -> None:
+        self.forget()
+
+    def forget(self) -> None:
+        """The nodes are others now, or have moved unseen."""
+        self._count = 0  # frames in the history
+        self._places: F32 = np.zeros((0, 0, 3), np.float32)  # [2 HISTORY, M, 3] m
+        self._steps: F32 = self._places  # from the frame before
+        self._energy = np.zeros(2 * HISTORY, np.float32)  # of the steps, m^2
+        self._stamp_ns = 0
+        self._frame_s = 0.0
+        self._bases: deque[F32] = deque(maxlen=HORIZONS)  # newest first: [HORIZONS, 3, M, 3]
+        self._mixed: deque[F32] = deque(maxlen=HORIZONS)  # [HORIZONS, M, 3]
+        self._normal = np.zeros((HORIZONS, 3, 3))
+        self._wanted = np.zeros((HORIZONS, 3))
+        self._errors = np.zeros((HORIZONS, 3))  # m^2, running: of the mix, of resting, of the last velocity
+        self._lags = np.zeros(2 * HISTORY)  # frames -> how often the tissue moved as so long ago
+        self._trust = 0.0  # 0..1: lately there were such moments
+
+    def recalled(self, motion: F32, seen: F32) -> F32 | None:
+        """The motion [M, 3] m of all nodes in this frame, hidden ones too, as it was when the seen ones moved
+        so before; None: they never did.
+
+        Args:
+            motion: [M, 3] m since the last frame, where it is known.
+            seen: [M] weight of what was seen around each node.
+        """
+        nodes = self._places.shape[1]
+        known = np.flatnonzero(seen[:nodes] > KNOWN)
+        if not self._has_memory or len(known) < LEAST_NODES:
+            return None
+        weights = self._likeness(self._count, motion[:nodes], known)
+        used = np.flatnonzero(weights > LEAST_WEIGHT)
+        if len(used) == 0:
+            return None
+        prior = np.zeros_like(motion)
+        prior[:nodes] = np.tensordot(weights[used], self._steps[used], 1)
+        return prior
+
+    def take(self, nodes: F32, seen: F32, t_ns: int) -> None:
+        """The places [M, 3] m of all nodes at the end of a frame; new ones come last."""
+        seconds = (t_ns - self._stamp_ns) * 1e-9
+        self._stamp_ns = t_ns
+        if self._count and len(nodes) > self._places.shape[1]:
+            self._grow(nodes)
+        missing = 0 if self._frame_s == 0 else round(seconds / self._frame_s) - 1
+        if self._count and (seconds <= 0 or missing > LONGEST_GAP or len(nodes) < self._places.shape[1]):
+            self.forget()
+            self._stamp_ns = t_ns
+        if self._count == 0:
+            self._places = np.zeros((2 * HISTORY, *nodes.shape), np.float32)
+            self._steps = np.zeros_like(self._places)
+        elif missing <= 0:
+            self._frame_s = seconds if self._frame_s == 0 else 0.9 * self._frame_s + 0.1 * seconds
+        if self._count:
+            before = self._places[self._count - 1].copy()
+            for number in range(1, max(missing, 0) + 1):
+                share = np.float32(number / (missing + 1))
+                self._add(before + share * (nodes - before), np.zeros(len(nodes), np.float32))
+        self._add(nodes, seen)
+
+    def forecast(self) -> tuple[F32, float, MotionState] | None:
+        """How far [HORIZONS, M, 3] m each node will have moved after 1, 2, ... frames, the time of one (s),
+        and how far to believe it; None: too little is known yet."""
+        if self._count <= MATCHED or self._frame_s == 0:
+            return None
+        skill = self._skill
+        frames = int(np.argmin(skill > LEAST_SKILL)) if (skill <= LEAST_SKILL).any() else HORIZONS
+        state = MotionState(self._period, float(max(skill[0], 0.0)), frames * self._frame_s)
+        mixed, _, steady = self._errors.T
+        worse = (mixed > steady)[:, None, None]  # lately the last velocity alone said it better
+        moves = np.where(worse, np.float32(STEADY) * self._bases[0][:, 0], self._mixed[0])
+        return moves, self._frame_s, state
+
+    # ---- inside --------------------------------------------------------------------------------------------
+
+    @property
+    def _has_memory(self) -> bool:
+        return self._frame_s > 0 and self._count > MATCHED + HORIZONS + self._nearest
+
+    @property
+    def _nearest(self) -> int:
+        """Frames."""
+        return int(np.ceil(NEAREST / self._frame_s))
+
+    @property
+    def _skill(self) -> F64:
+        """[HORIZONS] share of the motion's energy that was said right."""
+        mixed, rested, steady = self._errors.T
+        return np.where(rested > 0, 1 - np.minimum(mixed, steady) / np.maximum(rested, 1e-20), 0.0)
+
+    @property
+    def _period(self) -> float | None:
+        """s after which the tissue moves as before, if most of the moments like now lie so far back, or a
+        multiple of it."""
+        often, total = self._lags, float(self._lags.sum())
+        if self._trust < 0.5 or not total > 0:
+            return None
+        lags = np.arange(len(often))
+        peaks = 1 + np.flatnonzero((often[1:-1] >= often[:-2]) & (often[1:-1] > often[2:]))
+        longest, most = None, 0.5 * total
+        for lag in peaks[often[peaks] > 0.3 * often.max()]:
+            near = (np.abs(lags - lag * np.rint(lags / lag)) <= max(1.0, 0.05 * lag)) & (2 * lags > lag)
+            if (
+                often[near].sum() >= most
+            ):  # of two that explain as much, the longer: it holds the other's cycles
+                once = near & (2 * lags < 3 * lag)
+                longest, most = float((often[once] * lags[once]).sum() / often[once].sum()), often[near].sum()
+        return None if longest is None else longest * self._frame_s
+
+    def _grow(self, nodes: F32) -> None:
+        """New nodes have always moved as their nearest neighbour did."""
+        old = self._places.shape[1]
+        far = np.square(nodes[old:, None] - nodes[:old]).sum(2)
+        like = np.concatenate([np.arange(old), far.argmin(1)])
+        offset = nodes - nodes[like]
+        self._places = self._places[:, like] + offset
+        self._steps = np.ascontiguousarray(self._steps[:, like])
+        self._energy[: self._count] = np.square(self._steps[: self._count]).sum((1, 2))
+        self._bases = deque((basis[:, :, like] for basis in self._bases), maxlen=HORIZONS)
+        self._mixed = deque((mixed[:, like] for mixed in self._mixed), maxlen=HORIZONS)
+
+    def _add(self, nodes: F32, seen: F32) -> None:
+        if self._count == 2 * HISTORY:
+            for rows in (self._places, self._steps, self._energy):
+                rows[:HISTORY] = rows[HISTORY:]
+            self._count = HISTORY
+        k = self._count
+        self._places[k] = nodes
+        self._steps[k] = nodes - self._places[k - 1] if k else 0
+        self._energy[k] = np.square(self._steps[k]).sum()
+        self._count += 1
+        self._learn(np.flatnonzero(seen > KNOWN))
+        if k >= MATCHED and self._frame_s > 0:
+            self._say()
+
+    def _learn(self, known: I64) -> None:
+        """What was said of this frame against what came, at the nodes [K] that were seen."""
+        if len(known) == 0:
+            return
+        now = self._count - 1
+        for back, (basis, mixed) in enumerate(zip(self._bases, self._mixed, strict=True)):
+            if now - 1 - back < 0:
+                return
+            moved = (self._places[now, known] - self._places[now - 1 - back, known]).ravel()
+            parts = basis[back][:, known].reshape(3, -1)
+            self._normal[back] = MEMORY * self._normal[back] + parts @ parts.T
+            self._wanted[back] = MEMORY * self._wanted[back] + parts @ moved
+            steady = STEADY * parts[0]
+            errors = [np.square(mixed[back, known].ravel() - moved).sum(), np.square(moved).sum()]
+            errors.append(np.square(steady - moved).sum())
+            self._errors[back] = SKILL_MEMORY * self._errors[back] + np.array(errors) / len(known)
+
+    def _say(self) -> None:
+        """Of the next frames, from all that is remembered."""
+        last = self._count - 1
+        nodes = self._places.shape[1]
+        frames = np.arange(1, HORIZONS + 1, dtype=np.float32)[:, None, None]
+        basis = np.zeros((HORIZONS, 3, nodes, 3), np.float32)
+        basis[:, 0] = frames * self._steps[last]
+        basis[:, 1] = frames * self._steps[last - 1]
+        basis[:, 2] = STEADY * basis[:, 0]
+        if self._has_memory:
+            followed, trust = self._followed(last)
+            basis[:, 2] = followed + np.float32(1 - trust) * basis[:, 2]
+        mixed = np.empty((HORIZONS, nodes, 3), np.float32)
+        for h in range(HORIZONS):
+            flat = basis[h].reshape(3, -1)
+            pull = PRIOR * float(np.square(flat).sum()) + 1e-15
+            shares = np.linalg.solve(
+                self._normal[h] + pull * np.eye(3), self._wanted[h] + pull * SHARE
+            ).astype(np.float32)
+            mixed[h] = np.tensordot(shares, basis[h], 1)
+        self._bases.appendleft(basis)
+        self._mixed.appendleft(mixed)
+
+    def _followed(self, last: int) -> tuple[F32, float]:
+        """[HORIZONS, M, 3] m: how far nodes went after moments like this one, less, the less alike; and how
+        alike they were, 0..1."""
+        nodes = self._places.shape[1]
+        weights = self._likeness(last, self._steps[last], np.arange(nodes))
+        weights = weights[: last - HORIZONS]  # what came after must be known
+        used = np.flatnonzero(weights > LEAST_WEIGHT)
+        trust = float(weights.sum())
+        self._trust = SKILL_MEMORY * self._trust + (1 - SKILL_MEMORY) * trust
+        self._lags *= SKILL_MEMORY
+        self._lags[last - used] += weights[used]
+        followed = np.zeros((HORIZONS, nodes, 3), np.float32)
+        for h in range(HORIZONS if len(used) else 0):
+            followed[h] = followed[h - 1] + np.tensordot(weights[used], self._steps[used + 1 + h], 1)
+        return followed, trust
+
+    def _likeness(self, newest: int, motion: F32, known: I64) -> F32:
+        """Weight [newest] of each past frame, by how alike the nodes moved in it and in those just before.
+        Together they weigh less than 1: resting takes part.
+
+        Args:
+            newest: number of the frame that is compared, which need not be in the history yet.
+            motion: [M, 3] m, in that frame.
+            known: nodes that count in it; in the frames before all do.
+        """
+        first = max(MATCHED, newest - HISTORY)
+        weights = np.zeros(newest, np.float32)
+        apart = np.zeros(newest - first, np.float32)
+        energy = 0.0
+        for i in range(MATCHED):
+            rows = slice(first - i, newest - i)
+            now = self._steps[newest - i] if i else motion
+            past, norms = self._steps[rows], self._energy[rows]
+            if i == 0 and len(known) < len(motion):
+                now, past = now[known], past[:, known]
+                norms = np.square(past).sum((1, 2))
+            own = float(np.square(now).sum())
+            energy += own
+            apart += norms + own - 2 * (past.reshape(len(past), -1) @ now.ravel())
+        likeness = np.exp(-np.clip(apart / max(energy, 1e-15) / LIKENESS, 0, 80))
+        likeness[newest - self._nearest - first :] = 0
+        weights[first:] = likeness / (likeness.sum() + UNLIKE)
+        return weights
