@@ -29,19 +29,20 @@ OF_PART: dict[Part, slice] = {
 
 def row_rates(rates: RowRates, pixel: float) -> F32:
     """Learning rates [14] of canonical rows, where a pixel is as wide as `pixel` m."""
+    return _row((rates.mean_px * pixel, rates.log_scale, rates.quat, rates.color, rates.logit))
+
+
+def _row(values: Sequence[float]) -> F32:
+    """[14] one value for each of `PARTS`."""
     found = np.empty(columns.COUNT, np.float32)
-    each = (rates.mean_px * pixel, rates.log_scale, rates.quat, rates.color, rates.logit)
-    for part, rate in zip(PARTS, each, strict=True):
-        found[OF_PART[part]] = rate
+    for part, value in zip(PARTS, values, strict=True):
+        found[OF_PART[part]] = value
     return found
 
 
-def of_parts(parts: Sequence[Part], inside: float, outside: float) -> F32:
-    """[14] one value in the columns of some parts, another in the rest."""
-    found = np.full(columns.COUNT, outside, np.float32)
-    for part in parts:
-        found[OF_PART[part]] = inside
-    return found
+def marked(parts: Sequence[Part]) -> F32:
+    """[14] 1 in the columns of some parts, 0 in the rest."""
+    return _row([float(part in parts) for part in PARTS])
 
 
 def make_box(means: F32) -> F64:
@@ -64,9 +65,9 @@ def make_deltas(
     hexplane: HexPlaneField, shape: FieldShape, tokens: Tokens, block: Block, seed: int
 ) -> Deltas:
     """HexPlane and a fresh decoder, in the shape's units."""
-    units = of_parts(shape.deformed, 1.0, 0.0)
-    units[columns.MEAN] *= shape.unit
-    return Deltas(hexplane, make_decoder(hexplane, tokens, seed, block, shape.xavier), block, units)
+    units = shape.units
+    row = _row((units.mean, units.log_scale, units.quat, units.color, units.logit))
+    return Deltas(hexplane, make_decoder(hexplane, tokens, seed, block, shape.xavier), block, row)
 
 
 def make_field(deltas: Deltas, means: F32, tokens: Tokens) -> Field:

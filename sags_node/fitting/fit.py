@@ -19,7 +19,7 @@ from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.fitting.clip import Clip, ClipFrame
 from sags_node.fitting.density import Density
 from sags_node.fitting.devices import make_learner
-from sags_node.fitting.field import make_box, make_deltas, make_field, of_parts, row_rates
+from sags_node.fitting.field import make_box, make_deltas, make_field, marked, row_rates
 from sags_node.fitting.learner import DeviceKind
 from sags_node.fitting.settings import FitSettings
 from sags_node.fitting.start import Progress, follow_online, learn_paths, pooled_rows, remainder
@@ -62,7 +62,7 @@ class Fit:
         known = first.depth[first.depth > 0]
         pixel = float(np.median(known)) / float(first.camera.K[0, 0]) if known.size else 1e-4
         self._rates = row_rates(settings.rates, pixel)
-        self._decays = of_parts(settings.rates.decaying, 1.0, 0.0)
+        self._decays = marked(settings.rates.decaying)
         self._refine_rates = self._rates.copy()
         self._refine_rates[columns.QUAT] = REFINE_RATES.quat
         self._refine_rates[columns.COLOR] = 0  # which has its closed form

@@ -26,6 +26,18 @@ MONOCULAR = LossWeights(inverse_depth=0.0, correlation=1e-3, coverage=0.1)  # de
 
 
 @dataclass(frozen=True, slots=True)
+class Units:
+    """What an output of 1 of the decoder is. A step of Adam has a fixed length in these, so they say how fast
+    each part is learnt, and how restless it is. 0: that part is not deformed."""
+
+    mean: float = 0.01  # m
+    log_scale: float = 1.0
+    quat: float = 1.0
+    color: float = 1.0
+    logit: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
 class FieldShape:
     """Of the HexPlane and of what its decoder says."""
 
@@ -34,8 +46,7 @@ class FieldShape:
     channels: int = 32  # of each level
     frames_per_slot: float = 3.0  # how many of the clip's frames from one slot of time to the next
     first_values: tuple[float, float] = (0.7, 1.3)  # of the planes in space, at random between these
-    deformed: tuple[Part, ...] = PARTS
-    unit: float = 0.01  # m that an output of 1 moves a mean; a step of Adam is as long in it
+    units: Units = Units()
     xavier: bool = False  # whether the last layers start at random, rather than at 0
 
     def slots(self, frames: int) -> int:
@@ -116,8 +127,7 @@ RELEASED = FitSettings(
         channels=64,
         frames_per_slot=1.26,  # 63 frames on the used half of 100 rows
         first_values=(0.1, 0.5),
-        deformed=("means", "log_scales", "quats"),
-        unit=1e-3,
+        units=Units(mean=1e-3, color=0.0, logit=0.0),
         xavier=True,
     ),
     rates=RowRates(mean_px=0.015, color=7.05e-4, decaying=("means",)),  # 1.6e-3 mm at 60 mm and 569 px

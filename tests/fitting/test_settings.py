@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from sags_node.errors import UsageError
-from sags_node.fitting.field import of_parts, row_rates
-from sags_node.fitting.settings import ONLINE, PRESETS, RELEASED, FieldShape, RowRates, with_changes
+from sags_node.fitting.field import marked, row_rates
+from sags_node.fitting.settings import ONLINE, PRESETS, RELEASED, FieldShape, RowRates, Units, with_changes
 from sags_node.model import columns
 
 SH_0 = 0.28209479  # of a spherical harmonic of degree 0, which their colour rate is of
@@ -18,8 +18,8 @@ def test_the_released_preset_has_the_numbers_of_the_released_code() -> None:
     assert (RELEASED.warm_up, RELEASED.iterations, RELEASED.tokens) == (1000, 3000, "self")
     assert (shape.levels, shape.cells, shape.channels) == (4, 64, 64)
     assert shape.slots(63) == pytest.approx(50, abs=1)
-    assert shape.first_values == (0.1, 0.5) and shape.xavier and shape.unit == 1e-3
-    assert shape.deformed == ("means", "log_scales", "quats")
+    assert shape.first_values == (0.1, 0.5) and shape.xavier
+    assert shape.units == Units(mean=1e-3, log_scale=1, quat=1, color=0, logit=0)  # 1 mm; not deformed: 0
     assert (RELEASED.field_rates.cells, RELEASED.field_rates.decoder) == (1.6e-2, 1.6e-3)
     pixel = 60e-3 / 569.468  # m, where their clip's tissue is
     assert rates.mean_px * pixel == pytest.approx(1.6e-6, rel=0.02)
@@ -74,5 +74,5 @@ def test_slots_of_time_grow_with_the_clip() -> None:
 def test_parts_of_a_row_have_their_own_rates() -> None:
     rates = row_rates(RowRates(mean_px=0.5, color=7.0), pixel=0.25)
     assert (rates[columns.MEAN] == 0.125).all() and (rates[columns.COLOR] == 7).all()
-    marked = of_parts(("quats", "logits"), 2.0, 1.0)
-    assert (marked[columns.QUAT] == 2).all() and marked[columns.LOGIT] == 2 and marked.sum() == 14 + 5
+    found = marked(("quats", "logits"))
+    assert found[columns.QUAT].all() and found[columns.LOGIT] == 1 and found.sum() == 5
