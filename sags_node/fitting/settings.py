@@ -113,7 +113,15 @@ class FitSettings:
 
 ONLINE = FitSettings()
 # The paper's schedule, with what is better here: benchmarks/fit.md says by how much.
-PAPER = FitSettings(schedule="paper", tokens="self", iterations=3000)
+PAPER = FitSettings(
+    schedule="paper",
+    tokens="self",
+    iterations=3000,
+    field_rates=FieldRates(cells=5e-2),
+    exposure_rate=0.0,
+    decay=0.03,
+    growth=Growth(opacity=0.9, scale=0.6, share=0.15),
+)
 # Each number as in the authors' code for EndoNeRF (H-Wenfeng/SAGS and EndoGaussian, which it is built on).
 # Their SH degree is 3: with one camera that stands still this is a second rate for the same colours, and is
 # left out; their colour rate is of an SH coefficient, 0.282 of which is a colour. Their unit is 1 mm.
@@ -131,6 +139,7 @@ RELEASED = FitSettings(
         xavier=True,
     ),
     rates=RowRates(mean_px=0.015, color=7.05e-4, decaying=("means",)),  # 1.6e-3 mm at 60 mm and 569 px
+    exposure_rate=0.0,  # they have no exposure
     decay_over=4000,
     growth=Growth(share=1.0),
     weights=LossWeights(),
