@@ -286,6 +286,8 @@ def bench_stream(
 @click.option(
     "--hold-out", type=click.IntRange(2), default=8, show_default=True, help="Test on every N-th frame."
 )
+@click.option("--seeds", type=click.IntRange(1), default=3, show_default=True, help="Fits of each variant.")
+@click.option("--variant", "only", multiple=True, metavar="NAME", help="Only this one; may be given again.")
 @lpips_option
 @table_option
 @as_json
@@ -294,15 +296,18 @@ def bench_ablation(
     warm_up: int,
     iterations: int,
     hold_out: int,
+    seeds: int,
+    only: tuple[str, ...],
     lpips_weights: Path | None,
     out: Path | None,
     json_out: bool,
 ) -> None:
     """What each part of the SAGS model brings, offline.
 
-    Fits a recording, by default the built-in phantom, with and without the self-adaptive decoder, the
-    alias-free filters and the online start, and with each choice of tokens; measures every eighth frame and
-    the last three, from which nothing is learnt. Takes some fifteen minutes.
+    Fits a recording, by default the built-in phantom, with and without the self-adaptive decoder (an MLP of
+    its size in its place), the alias-free filters and the online start, and with each choice of tokens, each
+    from several seeds. Measures every eighth frame and the last three, from which nothing is learnt, training
+    frames, and smaller pictures. Takes some fifteen minutes for each seed.
 
     \b
     sags bench ablation launch/d4d_pull.yaml --out benchmarks/results/ablation_d4d.json
@@ -316,6 +321,7 @@ def bench_ablation(
     check_files(out)
     session = open_launched(path, [*overrides, "source.loop:=false", "source.pace:=step"])
     with progress("measuring") as advance:
-        measured = ablation.measure_ablation(session, warm_up, iterations, options, advance)
-    show(measured if json_out else ablation.table(measured))
+        measured = ablation.measure_ablation(session, warm_up, iterations, options, advance, seeds, only)
+    for table in [measured] if json_out else ablation.tables(measured):
+        show(table)
     write_json(out, measured)

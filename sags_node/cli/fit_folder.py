@@ -20,7 +20,7 @@ from sags_node.evaluation.measure import Options
 from sags_node.fitting import checkpoint
 from sags_node.fitting.clip import read_clip
 from sags_node.fitting.fit import Fit
-from sags_node.fitting.score import published, score, score_depth, score_tracks
+from sags_node.fitting.score import published, score, score_between, score_depth, score_tracks
 from sags_node.fitting.settings import FitSettings
 from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.devices import device_of
@@ -95,6 +95,7 @@ def fit_session(
             fit, clip.test, segments, lpips, drawn,
             lambda done: advance(done, len(clip.test), "measuring"),
         ),
+        "between": score_between(fit, clip.test, segments, lpips),
         "depth": score_depth(fit, everything, segments),
         "track": score_tracks(fit, everything),
         "train": score(fit, clip.train[:: max(1, options.hold_out)], segments),
@@ -132,8 +133,16 @@ def _iterate(fit: Fit, stored: Path, advance: Advance) -> None:
 def figures_table(found: dict[str, Any]) -> Table:
     """Figures of the fit; beside them those published for the same clip."""
     table = text.table("", "frames", "PSNR* (tissue)", "PSNR (masked)", "SSIM", "LPIPS")
-    for name in ("heldout", "train"):
-        row = found[name]
+    between = found["between"] or {}
+    rows = {
+        "heldout": found["heldout"],
+        "  pictures around, carried": between.get("carried"),
+        "  their mean as they are": between.get("mean"),
+        "train": found["train"],
+    }
+    for name, row in rows.items():
+        if row is None:
+            continue
         table.add_row(
             name,
             str(row["frames"]),

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import click
 from rich.markup import escape
@@ -112,37 +113,40 @@ def evaluate(
 @click.option("--resume", is_flag=True, help="Go on from the checkpoint in the folder; same settings.")
 @click.option(
     "--schedule",
-    type=click.Choice(["paper", "online"]),
+    type=click.Choice(["online", "paper", "released"]),
     default="online",
     show_default=True,
-    help="paper: random points, warm-up on the first frame; online: one pass of the mapper.",
+    help="online: one pass of the mapper, then refining; paper: random points, warm-up on the first frame, "
+    "then all together; released: paper, with each number as in the authors' code.",
 )
+@click.option("--warm-up", type=click.IntRange(0), help="Iterations; not for online.  [default: 1000]")
 @click.option(
-    "--warm-up", type=click.IntRange(0), default=1000, show_default=True, help="Iterations; paper only."
-)
-@click.option(
-    "--iterations", type=click.IntRange(0), default=3000, show_default=True, help="With deformation."
+    "--iterations", type=click.IntRange(0), help="With deformation.  [default: 2000; not online: 3000]"
 )
 @click.option(
     "--tokens",
     type=click.Choice(["self", "planes", "nodes"]),
-    default="nodes",
-    show_default=True,
-    help="What the attention sees: the Gaussian alone, its levels, or all control nodes.",
+    help="What the attention sees: the Gaussian alone, its levels, or all control nodes.  "
+    "[default: nodes; not online: self]",
 )
 @click.option(
     "--monocular",
     is_flag=True,
-    help="The depth is an estimate from one picture, true up to scale and shift; paper only.",
+    help="The depth is an estimate from one picture, true up to scale and shift; not for online.",
 )
-@click.option("--no-adaptive", is_flag=True, help="Without the self-adaptive block of the decoder.")
+@click.option(
+    "--block",
+    type=click.Choice(["adaptive", "mlp", "none"]),
+    help="Of the decoder: the self-adaptive one, an MLP of its size, or none.  [default: adaptive]",
+)
 @click.option("--no-alias-free", is_flag=True, help="Without both filters.")
 @click.option(
     "--max-gaussians",
     type=click.IntRange(100, 2_000_000),
-    default=60_000,
-    show_default=True,
-    help="Cap on N.",
+    help="Cap on N.  [default: 60000; released: 960000]",
+)
+@click.option(
+    "--set", "changes", multiple=True, metavar="KEY=VALUE", help="Any other setting, say shape.levels=4."
 )
 @click.option("--seed", type=int, default=0, show_default=True, help="Of everything random.")
 @click.option(
@@ -159,13 +163,14 @@ def fit(
     out: Path,
     resume: bool,
     schedule: str,
-    warm_up: int,
-    iterations: int,
-    tokens: str,
+    warm_up: int | None,
+    iterations: int | None,
+    tokens: str | None,
     monocular: bool,
-    no_adaptive: bool,
+    block: str | None,
     no_alias_free: bool,
-    max_gaussians: int,
+    max_gaussians: int | None,
+    changes: tuple[str, ...],
     seed: int,
     hold_out: int,
     lpips_weights: Path | None,
@@ -175,7 +180,7 @@ def fit(
 
     Every eighth frame is for testing. By default the online mapper plays the recording once, and what it saw
     is refined jointly; --schedule paper is the protocol of the paper: warm-up on the first frame, then all
-    parameters together (with --tokens self: its decoder).
+    parameters together. --schedule released is the same with each number as in the authors' code.
 
     DATASET is a folder in EndoNeRF or SCARED layout, or any session the node can play. Leaves a checkpoint,
     the model as PLY (standard 3DGS fields, filters folded in), the drawn test frames and figures.json. It
@@ -183,28 +188,29 @@ def fit(
 
     \b
     sags fit launch/d4d_pull.yaml --out out/d4d
-    sags fit /data/endonerf/pulling_soft_tissues --schedule paper --tokens self
+    sags fit /data/endonerf/pulling_soft_tissues --schedule paper
     """
     from sags_node.cli.fit_folder import figures_table, fit_session
     from sags_node.evaluation.measure import Options
-    from sags_node.fitting.settings import MONOCULAR, STEREO, FitSettings, Schedule, Tokens
+    from sags_node.fitting.settings import MONOCULAR, PRESETS, with_changes
 
     no_cameras = "live cameras cannot be fitted; record them first, then fit the recording"
     path, overrides = split_recording(dataset, no_cameras)
-    if monocular and schedule != "paper":
+    settings = PRESETS[schedule]
+    if monocular and settings.schedule == "online":
         raise UsageError("--monocular needs --schedule paper: the online start measures distances")
     options = Options(hold_out, 1, lpips_weights)
-    settings = FitSettings(
-        schedule=cast(Schedule, schedule),
-        warm_up=warm_up,
-        iterations=iterations,
-        tokens=cast(Tokens, tokens),
-        adaptive=not no_adaptive,
-        antialias=not no_alias_free,
-        max_gaussians=max_gaussians,
-        seed=seed,
-        weights=MONOCULAR if monocular else STEREO,
-    )
+    asked = {
+        "warm_up": warm_up,
+        "iterations": iterations,
+        "tokens": tokens,
+        "block": block,
+        "max_gaussians": max_gaussians,
+        "weights": MONOCULAR if monocular else None,
+    }
+    given: dict[str, Any] = {name: value for name, value in asked.items() if value is not None}
+    settings = replace(settings, antialias=not no_alias_free, seed=seed, **given)
+    settings = with_changes(settings, changes)
     check_folder(out)
     session = open_launched(path, [*overrides, "source.loop:=false", "source.pace:=step"])
     with progress("fitting") as advance:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from bisect import bisect_left
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -50,6 +51,13 @@ class Clip:
 
     train: Sequence[ClipFrame]
     test: Sequence[ClipFrame]
+
+    def around(self, t_ns: int) -> tuple[ClipFrame, ClipFrame] | None:
+        """The training frames around a time; None: it is that of one, or there is none before or after."""
+        place = bisect_left(self.train, t_ns, key=lambda frame: frame.t_capture_ns)
+        if place in {0, len(self.train)} or self.train[place].t_capture_ns == t_ns:
+            return None
+        return self.train[place - 1], self.train[place]
 
 
 def play(session: Session, references: bool) -> Iterator[ClipFrame]:

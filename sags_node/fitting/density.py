@@ -9,17 +9,17 @@ from sags_node.model import columns
 from sags_node.model.deformable import DeformableModel
 from sags_node.types import F32
 
-EVERY = 300  # iterations
 MIN_OPACITY_LOGIT = float(np.log(0.005 / 0.995))
-MOST_SPLIT = 0.1  # of the Gaussians, at a time
 SHRINK = 1.6  # a Gaussian's scale against that of the two it is split into
 
 
 class Density:
     """Collects how hard the pictures pull at each Gaussian; now and then splits those pulled hardest."""
 
-    def __init__(self, model: DeformableModel, cap: int) -> None:
+    def __init__(self, model: DeformableModel, cap: int, share: float) -> None:
+        """At most `cap` Gaussians, of which at most this share is split at a time."""
         self._model = model
+        self._share = share
         self._cap = cap
         self._forget()
 
@@ -36,7 +36,7 @@ class Density:
         pull = (self.pull / np.maximum(self.seen, 1))[kept]
         pruned = int(np.count_nonzero(~kept))
         model.keep(kept)
-        room = min(self._cap - len(model), int(MOST_SPLIT * len(model)))
+        room = min(self._cap - len(model), int(self._share * len(model)))
         split = np.argsort(-pull, kind="stable")[: max(room, 0)]
         split = split[pull[split] > 0]
         if len(split) > 0:

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from sags_node.engine.adam import AdamState
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.fitting.clip import Clip, ClipFrame
-from sags_node.fitting.density import EVERY, Density
+from sags_node.fitting.density import Density
 from sags_node.fitting.devices import make_learner
-from sags_node.fitting.field import make_box, make_decoder, make_field, row_rates
+from sags_node.fitting.field import make_box, make_deltas, make_field, marked, row_rates
 from sags_node.fitting.learner import DeviceKind
 from sags_node.fitting.settings import FitSettings
 from sags_node.fitting.start import Progress, follow_online, learn_paths, pooled_rows, remainder
@@ -27,13 +27,11 @@ from sags_node.mapping.optimiser import COLOUR_RELAXATION, Rates
 from sags_node.model import columns
 from sags_node.model.deformable import DeformableModel
 from sags_node.model.exposure import Exposure
-from sags_node.model.field import Deltas, Field, NodeField
+from sags_node.model.field import Field, NodeField
 from sags_node.model.hexplane import HexPlaneField
 from sags_node.model.residuals import Residuals
 from sags_node.types import F32, Gaussians
 
-EXPOSURE_RATE = 2e-3
-DENSIFY_UNTIL = 0.5  # of the iterations
 REFINE_RATES = Rates()  # the mapper's, gentle: the start is good
 REFINE_FIELD_SHARE = 0.003  # of the field's rates, which are for learning from nothing
 REFINE_DECAY = 0.1
@@ -57,13 +55,14 @@ class Fit:
         first = clip.train[0]
         height, width = first.tissue.shape
         self.rasterizer = make_rasterizer("numba", width, height, antialias=settings.antialias)
-        unseen = ~np.any([frame.tissue for frame in clip.train], axis=0)
+        unseen = ~np.any([frame.tissue for frame in clip.train], axis=0) | settings.smooth_everywhere
         self._learner = make_learner(device, self.rasterizer, settings, unseen)
         self._rng = np.random.default_rng(settings.seed)
         self._order: list[int] = []
         known = first.depth[first.depth > 0]
         pixel = float(np.median(known)) / float(first.camera.K[0, 0]) if known.size else 1e-4
-        self._rates = row_rates(settings.mean_px * pixel)
+        self._rates = row_rates(settings.rates, pixel)
+        self._decays = marked(settings.rates.decaying)
         self._refine_rates = self._rates.copy()
         self._refine_rates[columns.QUAT] = REFINE_RATES.quat
         self._refine_rates[columns.COLOR] = 0  # which has its closed form
@@ -87,7 +86,7 @@ class Fit:
             residuals = remainder(field, rows, paths)
         self._start_means = np.ascontiguousarray(rows[:, columns.MEAN])
         model = DeformableModel(rows, field, exposure, settings.antialias, residuals)
-        self._begin(model, Density(model, settings.max_gaussians))
+        self._begin(model, self._make_density(model))
         self.seconds += time.perf_counter() - started
 
     @property
@@ -151,16 +150,18 @@ class Fit:
         """A step of the paper's schedule."""
         deformed = self.iteration >= self.warm_up
         frame = self._next_frame() if deformed else self.clip.train[0]
-        share = self.settings.decay ** self._progress()
+        done, of = self._stage
+        share = self.settings.decay ** (done / (self.settings.decay_over or max(1, of)))
         self._learner.descend(
             frame,
-            self._rates * np.float32(share),
+            self._rates * np.float32(share) ** self._decays,
             self.settings.field_rates.scaled(share),
-            EXPOSURE_RATE * share,
+            self.settings.exposure_rate * share,
             deformed,
         )
         self.iteration += 1
-        if self.iteration % EVERY == 0 and self._progress() < DENSIFY_UNTIL:
+        growth = self.settings.growth
+        if self.iteration % growth.every == 0 and self._progress() < growth.until:
             self._learner.give_back()
             pruned, split = self._density.adapt(self._rng)
             self.pruned, self.split = self.pruned + pruned, self.split + split
@@ -178,10 +179,14 @@ class Fit:
 
     def gaussians(self, frame: ClipFrame) -> Gaussians:
         """The model at the time of a frame; after the last training frame it is a prediction."""
-        last_ns = self.clip.train[-1].t_capture_ns
-        if frame.t_capture_ns > last_ns:
-            return self.model.predict(frame.t_capture_ns, last_ns, [frame.camera])
-        return self.model.at(frame.t_capture_ns, [frame.camera])
+        t_ns, last_ns = frame.t_capture_ns, self.clip.train[-1].t_capture_ns
+        if t_ns > last_ns:
+            return self.model.predict(t_ns, last_ns, [frame.camera])
+        around = self.clip.around(t_ns)
+        if around is None or self.settings.schedule == "paper":
+            return self.model.at(t_ns, [frame.camera])
+        before, after = around
+        return self.model.between(t_ns, before.t_capture_ns, after.t_capture_ns, [frame.camera])
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """All arrays that `restore` needs."""
@@ -245,7 +250,7 @@ class Fit:
         deltas.hexplane.adam = AdamState(arrays["cells.moments"], arrays["cells.shares"])
         deltas.adam = AdamState(arrays["decoder.moments"], arrays["decoder.shares"])
         model.ids, model.next_id = arrays["ids"], int(state["next_id"])
-        density = Density(model, self.settings.max_gaussians)
+        density = self._make_density(model)
         density.pull, density.seen = arrays["pull"], arrays["seen"]
         self._begin(model, density)
         self.iteration, self._order = int(state["iteration"]), list(state["order"])
@@ -259,9 +264,15 @@ class Fit:
 
     def _progress(self) -> float:
         """How far the stage is, 0..1; each stage has its own schedule."""
+        done, of = self._stage
+        return done / max(1, of)
+
+    @property
+    def _stage(self) -> tuple[int, int]:
+        """Iterations of the stage that are done, and all it has."""
         if self.iteration < self.warm_up:
-            return self.iteration / self.warm_up
-        return (self.iteration - self.warm_up) / max(1, self.settings.iterations)
+            return self.iteration, self.warm_up
+        return self.iteration - self.warm_up, self.settings.iterations
 
     def _next_frame(self) -> ClipFrame:
         """Every training frame once, in random order, then again."""
@@ -281,9 +292,13 @@ class Fit:
         """A new field over canonical means [N, 3] m, which decide where its box and its nodes are."""
         settings = self.settings
         times = [frame.t_capture_ns for frame in (*self.clip.train, *self.clip.test)]
+        shape = settings.shape
         hexplane = HexPlaneField.for_clip(
-            make_box(means), min(times), max(times), settings.slots,
-            cells=settings.cells, levels=settings.levels, channels=settings.channels, seed=settings.seed,
+            make_box(means), min(times), max(times), shape.slots(len(times)), cells=shape.cells,
+            levels=shape.levels, channels=shape.channels, seed=settings.seed, space_range=shape.first_values,
         )  # fmt: skip
-        decoder = make_decoder(hexplane, settings.tokens, settings.seed)
-        return make_field(Deltas(hexplane, decoder, settings.adaptive), means, settings.tokens)
+        deltas = make_deltas(hexplane, shape, settings.tokens, settings.block, settings.seed)
+        return make_field(deltas, means, settings.tokens)
+
+    def _make_density(self, model: DeformableModel) -> Density:
+        return Density(model, self.settings.max_gaussians, self.settings.growth.share)

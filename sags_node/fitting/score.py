@@ -13,11 +13,12 @@ import numpy as np
 from sags_node.engine.rasterizer.rasterize import to_view
 from sags_node.errors import SagsError
 from sags_node.evaluation import metrics
+from sags_node.evaluation.carried import Seen, carried
 from sags_node.evaluation.lpips import Lpips
 from sags_node.evaluation.tracking import PointTracks
 from sags_node.fitting.clip import ClipFrame
 from sags_node.fitting.fit import Fit
-from sags_node.types import F64
+from sags_node.types import F32, F64
 
 Segments = dict[str, tuple[int, int]]  # first and last frame
 
@@ -71,20 +72,48 @@ def score(
     for done, frame in enumerate(frames):
         planes = fit.rasterizer.forward(fit.gaussians(frame), [frame.camera])[0]
         view = to_view(planes, frame.camera, frame.frame_id, frame.t_capture_ns)
-        truth = metrics.as_float(frame.image)
-        figures: dict[str, float] = {
-            "frame_id": frame.frame_id,
-            "psnr": metrics.psnr(view.rgb, truth, frame.tissue),
-            "paper_psnr": metrics.paper_psnr(view.rgb, truth, frame.tissue),
-            "ssim": metrics.ssim(view.rgb, truth, frame.tissue),
-        }
-        if lpips is not None:
-            figures["lpips"] = lpips(view.rgb, truth, frame.tissue)
-        rows.append(figures)
+        rows.append(_figures(view.rgb, frame, lpips))
         if pictures is not None:
             _write(pictures / f"{frame.frame_id:06d}.png", view.rgb)
         progress(done + 1)
     return _summary(rows, segments)
+
+
+def score_between(
+    fit: Fit, frames: Iterable[ClipFrame], segments: Segments, lpips: Lpips | None = None
+) -> dict[str, Any] | None:
+    """What the two training pictures around a frame say of it.
+
+    Args:
+        fit: started.
+        frames: those between two training frames count.
+        segments: named stretches, whose means are given too.
+        lpips: measures LPIPS; None: it is left out.
+
+    Returns:
+        `carried`: both pictures carried along the model's motion, and their mean; `mean`: the mean of both as
+        they are, the baseline of everything that is shown between two frames. Each as `score` has it. None:
+        no frame lies between two.
+    """
+    rows: dict[str, list[dict[str, float]]] = {"carried": [], "mean": []}
+    for frame in frames:
+        around = fit.clip.around(frame.t_capture_ns)
+        if around is None:
+            continue
+        before, after = around
+        span = after.t_capture_ns - before.t_capture_ns
+        share = (frame.t_capture_ns - before.t_capture_ns) / span
+        seen = [
+            Seen(fit.gaussians(near), near.camera, metrics.as_float(near.image), near.tissue, weight)
+            for near, weight in ((before, 1 - share), (after, share))
+        ]
+        shown = carried(fit.rasterizer, fit.gaussians(frame), frame.camera, seen)
+        mean = sum(np.float32(each.weight) * each.picture for each in seen)
+        rows["carried"].append(_figures(shown, frame, lpips))
+        rows["mean"].append(_figures(np.asarray(mean), frame, lpips))
+    if not rows["mean"]:
+        return None
+    return {name: _summary(each, segments) for name, each in rows.items()}
 
 
 def score_depth(fit: Fit, frames: Iterable[ClipFrame], segments: Segments) -> dict[str, Any] | None:
@@ -137,6 +166,19 @@ def score_tracks(fit: Fit, frames: Iterable[ClipFrame]) -> dict[str, Any] | None
         "median_px": round(float(np.median(px)), 4),
         "lost": lost,
     }
+
+
+def _figures(shown: F32, frame: ClipFrame, lpips: Lpips | None) -> dict[str, float]:
+    truth = metrics.as_float(frame.image)
+    figures: dict[str, float] = {
+        "frame_id": frame.frame_id,
+        "psnr": metrics.psnr(shown, truth, frame.tissue),
+        "paper_psnr": metrics.paper_psnr(shown, truth, frame.tissue),
+        "ssim": metrics.ssim(shown, truth, frame.tissue),
+    }
+    if lpips is not None:
+        figures["lpips"] = lpips(shown, truth, frame.tissue)
+    return figures
 
 
 def _summary(rows: list[dict[str, float]], segments: Segments) -> dict[str, Any]:

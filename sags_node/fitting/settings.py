@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Literal
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
+
+from pydantic import TypeAdapter, ValidationError
 
 from sags_node.engine.losses.photometric import LossWeights
-from sags_node.model.field import FieldRates
+from sags_node.errors import UsageError
+from sags_node.model.field import Block, FieldRates
+from sags_node.yaml_reader import parse_yaml
 
 Tokens = Literal["self", "planes", "nodes"]
 Schedule = Literal["paper", "online"]
+Part = Literal["means", "log_scales", "quats", "colors", "logits"]  # of a Gaussian's parameters
+
+PARTS: tuple[Part, ...] = ("means", "log_scales", "quats", "colors", "logits")
 
 
 STEREO = LossWeights(coverage=0.1)
@@ -17,22 +26,161 @@ MONOCULAR = LossWeights(inverse_depth=0.0, correlation=1e-3, coverage=0.1)  # de
 
 
 @dataclass(frozen=True, slots=True)
+class Units:
+    """What an output of 1 of the decoder is. A step of Adam has a fixed length in these, so they say how fast
+    each part is learnt, and how restless it is. 0: that part is not deformed."""
+
+    mean: float = 0.01  # m
+    log_scale: float = 1.0
+    quat: float = 1.0
+    color: float = 1.0
+    logit: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class FieldShape:
+    """Of the HexPlane and of what its decoder says."""
+
+    levels: int = 2
+    cells: int = 64  # along each axis, coarsest level
+    channels: int = 32  # of each level
+    frames_per_slot: float = 3.0  # how many of the clip's frames from one slot of time to the next
+    first_values: tuple[float, float] = (0.7, 1.3)  # of the planes in space, at random between these
+    units: Units = Units()
+    xavier: bool = False  # whether the last layers start at random, rather than at 0
+
+    def slots(self, frames: int) -> int:
+        """Slots of time for a clip of so many frames."""
+        return max(2, math.ceil(frames / self.frames_per_slot) + 1)
+
+
+@dataclass(frozen=True, slots=True)
+class RowRates:
+    """Learning rates of canonical Gaussians."""
+
+    mean_px: float = 0.08  # in px at the tissue's median depth
+    log_scale: float = 5e-3
+    quat: float = 1e-3
+    color: float = 2.5e-3  # of RGB 0..1
+    logit: float = 0.05
+    decaying: tuple[Part, ...] = PARTS  # those that fall with the field's; the others stay
+
+
+@dataclass(frozen=True, slots=True)
+class Growth:
+    """How the canonical Gaussians begin and become more; only with schedule = paper."""
+
+    first: int = 30_000  # Gaussians to begin with
+    opacity: float = 0.1  # of those
+    scale: float = 1.0  # of those, in distances to their neighbours
+    every: int = 300  # iterations
+    until: float = 0.5  # of a stage's iterations
+    share: float = 0.1  # of the Gaussians that are split at a time, at most
+
+
+@dataclass(frozen=True, slots=True)
 class FitSettings:
-    """Defaults are the paper's where it says (arXiv 2510.27318), the released code's where it does not."""
+    """The defaults are those of the online start; `PRESETS` has the others."""
 
     schedule: Schedule = "online"  # how it starts: see `fitting.start`
     warm_up: int = 1000  # iterations on the first frame without deformation; only with schedule = paper
-    iterations: int = 3000  # on all training frames, with deformation
+    iterations: int = 2000  # on all training frames, with deformation
     tokens: Tokens = "nodes"
-    adaptive: bool = True  # False: without the self-adaptive block, as EndoGaussian
+    block: Block = "adaptive"  # what stands before the decoder's heads
     antialias: bool = True  # both filters
     max_gaussians: int = 60_000
     seed: int = 0
-    levels: int = 2  # of the HexPlane
-    cells: int = 64  # along each axis, coarsest level
-    slots: int = 25  # of time
-    channels: int = 32
-    mean_px: float = 0.08  # learning rate of canonical means, in px at the tissue's median depth
-    decay: float = 0.01  # learning rates fall to this share of their first values
+    shape: FieldShape = FieldShape()
+    rates: RowRates = RowRates()  # only with schedule = paper
     field_rates: FieldRates = field(default_factory=FieldRates)
+    exposure_rate: float = 2e-3  # of the gains
+    decay: float = 0.01  # rates that decay fall to this share of their first values
+    decay_over: int | None = None  # in so many iterations of a stage; None: in all that it has
+    growth: Growth = Growth()
     weights: LossWeights = STEREO  # only with schedule = paper
+    smooth_everywhere: bool = False  # False: the two kinds of smoothness are for what no frame shows
+
+    def __post_init__(self) -> None:
+        """
+        Raises:
+            UsageError: the block is an MLP, but its tokens attend to each other.
+        """
+        if self.block == "mlp" and self.tokens != "self":
+            raise UsageError(
+                f"an MLP in the place of the block has no attention; use tokens self, not {self.tokens}"
+            )
+
+
+ONLINE = FitSettings()
+# The paper's schedule, with what is better here: benchmarks/fit.md says by how much.
+PAPER = FitSettings(
+    schedule="paper",
+    tokens="self",
+    iterations=3000,
+    field_rates=FieldRates(cells=5e-2),
+    exposure_rate=0.0,
+    decay=0.03,
+    growth=Growth(opacity=0.9, scale=0.6, share=0.15),
+)
+# Each number as in the authors' code for EndoNeRF (H-Wenfeng/SAGS and EndoGaussian, which it is built on).
+# Their SH degree is 3: with one camera that stands still this is a second rate for the same colours, and is
+# left out; their colour rate is of an SH coefficient, 0.282 of which is a colour. Their unit is 1 mm.
+RELEASED = FitSettings(
+    schedule="paper",
+    tokens="self",
+    iterations=3000,
+    max_gaussians=960_000,  # doubled five times
+    shape=FieldShape(
+        levels=4,
+        channels=64,
+        frames_per_slot=1.26,  # 63 frames on the used half of 100 rows
+        first_values=(0.1, 0.5),
+        units=Units(mean=1e-3, color=0.0, logit=0.0),
+        xavier=True,
+    ),
+    rates=RowRates(mean_px=0.015, color=7.05e-4, decaying=("means",)),  # 1.6e-3 mm at 60 mm and 569 px
+    exposure_rate=0.0,  # they have no exposure
+    decay_over=4000,
+    growth=Growth(share=1.0),
+    weights=LossWeights(),
+    smooth_everywhere=True,
+)
+PRESETS = {"online": ONLINE, "paper": PAPER, "released": RELEASED}
+
+
+def with_changes(settings: FitSettings, changes: Sequence[str]) -> FitSettings:
+    """Settings with some values of one's own.
+
+    Args:
+        settings: that all else is taken from.
+        changes: each a key, with dots between the names, "=", and a value as in YAML: "shape.levels=4".
+
+    Raises:
+        UsageError: there is no such key, or it takes no such value.
+    """
+    tree: dict[str, Any] = asdict(settings)
+    for change in changes:
+        key, given, value = change.partition("=")
+        *path, last = key.split(".")
+        branch: Any = tree
+        for name in path:
+            branch = branch.get(name) if isinstance(branch, dict) else None
+        if not given or not isinstance(branch, dict) or isinstance(branch.get(last, {}), dict):
+            raise UsageError(
+                f"--set {change}: give KEY=VALUE with one of these keys: {', '.join(_keys(tree))}"
+            )
+        branch[last] = parse_yaml(value, f"--set {change}")
+    try:
+        return TypeAdapter(FitSettings).validate_python(tree)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        raise UsageError(f"--set {key}: {first['msg'].lower()}, not {first['input']!r}") from None
+
+
+def _keys(tree: dict[str, Any], before: str = "") -> list[str]:
+    """All that can be set, as `with_changes` takes it."""
+    found = []
+    for name, value in tree.items():
+        found += _keys(value, f"{before}{name}.") if isinstance(value, dict) else [before + name]
+    return found

@@ -30,7 +30,6 @@ from sags_node.model.residuals import Residuals, check_size
 from sags_node.types import F32, I64, Gaussians
 
 POOLED_SHARE = 0.01  # of a frame's pixels
-FIRST_OPACITY = 0.1
 ONLINE_STEPS = 2  # of the mapper per frame
 CUT = 0.08  # mean difference of two frames, 0..1; a beating heart stays below half of it
 PATH_POINTS = 8192  # Gaussians per step of the regression
@@ -53,14 +52,14 @@ def pooled_rows(clip: Clip, exposure: Exposure, settings: FitSettings) -> F32:
     means, colors = (np.concatenate(parts) for parts in zip(*pools, strict=True))
     if len(means) == 0:
         raise SagsError("no training frame has a depth on tissue; check vision.stereo and the masks")
-    picked = rng.choice(len(means), min(settings.max_gaussians, len(means)), replace=False)
+    count = min(settings.growth.first, settings.max_gaussians, len(means))
+    picked = rng.choice(len(means), count, replace=False)
     means, colors = means[picked], colors[picked]
-    count = len(means)
     gaussians = Gaussians(
         means,
         np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
-        np.repeat(_neighbour_distance(means)[:, None], 3, axis=1),
-        np.full(count, FIRST_OPACITY, np.float32),
+        np.repeat(np.float32(settings.growth.scale) * _neighbour_distance(means)[:, None], 3, axis=1),
+        np.full(count, settings.growth.opacity, np.float32),
         colors,
         np.arange(count),
     )

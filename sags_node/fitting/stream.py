@@ -17,7 +17,7 @@ from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.errors import SagsError
 from sags_node.fitting.clip import ClipFrame
 from sags_node.fitting.field import make_box, make_decoder, make_field, row_rates
-from sags_node.fitting.settings import Tokens
+from sags_node.fitting.settings import RowRates, Tokens
 from sags_node.mapping import densify, initialise
 from sags_node.mapping.mapper import MIN_FIRST_DEPTHS
 from sags_node.model import columns
@@ -32,7 +32,6 @@ MOST_KEPT = 64  # frames, at any frame rate
 FIRST_STEPS, FIRST_SPEED = 30, 4.0  # on the first frame, without deformation; times the learning rates
 TIDY_EVERY = 3  # frames between two looks for holes and for what is transparent
 MIN_LOGIT = float(np.log(densify.MIN_OPACITY / (1 - densify.MIN_OPACITY)))
-MEAN_PX = 0.08  # learning rate of the means, in px at the tissue's median depth
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +138,7 @@ class StreamFit:
         self._drawn_ns = np.full(len(rows), frame.t_capture_ns)
         self._model = WindowModel(rows, self._make_field(rows[:, columns.MEAN], frame.t_capture_ns))
         pixel = float(np.median(depths)) / float(frame.camera.K[0, 0])  # m
-        self._rates = row_rates(MEAN_PX * pixel)
+        self._rates = row_rates(RowRates(), pixel)
         for _ in range(FIRST_STEPS):
             self._step(frame, FIRST_SPEED, deformed=False)
 

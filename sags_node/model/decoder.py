@@ -91,11 +91,20 @@ class Decoder:
 
     `values` holds all parameters in one array [P], and `gradients` what `backward` found for them, so that
     one optimiser step moves all; `parameters` and `parameter_gradients` are views into them by name.
-    A new decoder gives deltas of exactly 0. Not for use by two threads at once.
+    Not for use by two threads at once.
     """
 
-    def __init__(self, config: DecoderConfig, seed: int = 0) -> None:
-        """Xavier-uniform weights from `seed`; last layers and biases 0."""
+    def __init__(
+        self, config: DecoderConfig, seed: int = 0, gate: float = INITIAL_GATE, xavier: bool = False
+    ) -> None:
+        """Xavier-uniform weights from `seed`, biases 0.
+
+        Args:
+            config: how it is built.
+            seed: of the weights.
+            gate: of the block's attention and MLP.
+            xavier: False: last layers are 0 instead, so that all deltas are.
+        """
         self.config = config
         self.columns = config.columns
         attends = config.tokens != "self"
@@ -105,7 +114,7 @@ class Decoder:
         self.parameter_gradients = named_weights(self._weight_gradients, attends)
         self._decoded: F32 = np.zeros((0, sum(config.sizes.deltas)), np.float32)
         self._engine = (NodeDecoder if config.tokens == "nodes" else PointDecoder)(config.sizes)
-        self._initialise(np.random.default_rng(seed))
+        self._initialise(np.random.default_rng(seed), gate, xavier)
 
     def forward(self, features: F32) -> F32:
         """Decode.
@@ -167,13 +176,13 @@ class Decoder:
         v_matrices[ATTENTION_WEIGHT] = v_weight @ matrices[VALUE_WEIGHT].T
         v_matrices[ATTENTION_WEIGHT] += np.outer(v_bias, vectors[VALUE_BIAS])
 
-    def _initialise(self, rng: np.random.Generator) -> None:
+    def _initialise(self, rng: np.random.Generator, gate: float, xavier: bool) -> None:
         for name, parameter in self.parameters.items():
             if name.endswith("_scale"):
                 parameter[:] = 1.0
             elif name.endswith("_gate"):
-                parameter[:] = INITIAL_GATE
-            elif name.endswith("_weight") and name != "head_out_weight":
+                parameter[:] = gate
+            elif name.endswith("_weight") and (xavier or name != "head_out_weight"):
                 fan_in, fan_out = parameter.shape[-1], self.config.width
                 limit = (6.0 / (fan_in + fan_out)) ** 0.5
                 parameter[:] = rng.uniform(-limit, limit, parameter.shape)

@@ -66,10 +66,21 @@ class DeformableModel:
             deformed: False leaves the field out.
         """
         self._t_ns, self._deformed = t_ns, deformed
-        rows = self.field.deform(self.rows, t_ns) if deformed else self.rows.copy()
-        if deformed and self.residuals is not None:
-            rows += self.residuals.at(t_ns)
+        rows = self._rows_at(t_ns) if deformed else self.rows.copy()
         return self._finished(rows, t_ns, cameras)
+
+    def between(self, t_ns: int, before_ns: int, after_ns: int, cameras: Sequence[Camera]) -> Gaussians:
+        """The Gaussians at a time between two that were learnt, on straight lines from the one to the other:
+        in between nothing told the field what to say.
+
+        Args:
+            t_ns: the time.
+            before_ns, after_ns: the times learnt around it.
+            cameras: those it was fitted to, for the 3D filter.
+        """
+        share = np.float32((t_ns - before_ns) / (after_ns - before_ns))
+        before, after = self._rows_at(before_ns), self._rows_at(after_ns)
+        return self._finished(before + share * (after - before), t_ns, cameras)
 
     def predict(self, t_ns: int, last_ns: int, cameras: Sequence[Camera]) -> Gaussians:
         """The Gaussians at a time after all that was learnt.
@@ -90,6 +101,12 @@ class DeformableModel:
         ahead = FADE_NS * -math.expm1((last_ns - t_ns) / FADE_NS)
         rows[:, columns.MEAN] += np.float32(ahead) * velocity
         return self._finished(rows, last_ns, cameras)
+
+    def _rows_at(self, t_ns: int) -> F32:
+        rows = self.field.deform(self.rows, t_ns)
+        if self.residuals is not None:
+            rows += self.residuals.at(t_ns)
+        return rows
 
     def _finished(self, rows: F32, t_ns: int, cameras: Sequence[Camera]) -> Gaussians:
         """As they are drawn: with the exposure of a time, and filtered."""

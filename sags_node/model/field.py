@@ -8,7 +8,7 @@ Two ways to ask it. `PointField`: every Gaussian samples it at its own canonical
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 
@@ -25,7 +25,18 @@ from sags_node.types import F32, I64
 DELTA_UNITS = np.ones(columns.COUNT, np.float32)
 DELTA_UNITS[columns.MEAN] = 0.01  # m
 
-BLOCK = ("pre_", "attention_", "post_", "mlp_")  # names of the decoder's self-adaptive block begin so
+# What stands between the decoder's first layer and its heads. `adaptive`: the block of SAGS. `mlp`: only its
+# linear layers learn, an MLP of its size with residual connections: the gates stay 1, the adaptations hand
+# on. `none`: nothing is learnt there, as in EndoGaussian.
+Block = Literal["adaptive", "mlp", "none"]
+BLOCK = ("pre_", "attention_", "post_", "mlp_")  # names of the block's parameters begin so
+ADAPTATION = ("_scale", "_shift", "_gate")  # of those, names of what adapts end so
+
+
+def is_still(parameter: str, block: Block) -> bool:
+    """Whether a parameter of the decoder is not learnt."""
+    in_block = parameter.startswith(BLOCK)
+    return in_block and (block == "none" or (block == "mlp" and parameter.endswith(ADAPTATION)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,22 +71,30 @@ class Field(Protocol):
 class Deltas:
     """HexPlane and decoder, one after the other: deltas of points at one time."""
 
-    def __init__(self, hexplane: HexPlaneField, decoder: Decoder, adaptive: bool = True) -> None:
-        """`adaptive`: whether the decoder's self-adaptive block learns. Otherwise it hands its input on, and
-        what is left is EndoGaussian's decoder."""
+    def __init__(
+        self, hexplane: HexPlaneField, decoder: Decoder, block: Block = "adaptive", units: F32 = DELTA_UNITS
+    ) -> None:
+        """
+        Args:
+            hexplane: gives features.
+            decoder: turns them into deltas.
+            block: which of its parameters are learnt.
+            units: [14] what an output of 1 means; 0: that parameter is not deformed.
+        """
         self.hexplane = hexplane
         self.decoder = decoder
-        self.adaptive = adaptive
+        self.units = units
+        self.still = tuple(name for name in decoder.parameters if is_still(name, block))
         self._aside: tuple[I64, F32, F32] | None = None
         self.adam = AdamState.new(1, len(decoder.values))
 
     def forward(self, points: F32, t_ns: int) -> F32:
         """[N, 14] of points [N, 3] m, a fresh array."""
-        return self.decoder.forward(self.hexplane.sample(points, t_ns)) * DELTA_UNITS
+        return self.decoder.forward(self.hexplane.sample(points, t_ns)) * self.units
 
     def backward(self, v_deltas: F32) -> F32:
         """Gradient by the points, [N, 3]."""
-        self._found = self.hexplane.backward(self.decoder.backward(v_deltas * DELTA_UNITS))
+        self._found = self.hexplane.backward(self.decoder.backward(v_deltas * self.units))
         return self._found.v_points
 
     def set_aside(self) -> None:
@@ -89,10 +108,8 @@ class Deltas:
             self._add(*self._aside)
             self._aside = None
         decoder, hexplane, found = self.decoder, self.hexplane, self._found
-        if not self.adaptive:
-            for name, gradient in decoder.parameter_gradients.items():
-                if name.startswith(BLOCK):
-                    gradient[:] = 0
+        for name in self.still:
+            decoder.parameter_gradients[name][:] = 0
         adam_step(
             decoder.values[None], decoder.gradients[None], self.adam,
             np.full(len(decoder.values), rates.decoder, np.float32),

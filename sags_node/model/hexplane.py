@@ -25,7 +25,7 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.kernels.jit import aligned
 from sags_node.types import F32, F64, I64
 
-MAX_BYTES = 1 << 28  # of the cells; their optimiser's state takes twice as much again, their gradients once
+MAX_BYTES = 1 << 29  # of the cells; their optimiser's state takes twice as much again, their gradients once
 MAX_LEVELS = 8
 GROWTH_MARGIN = 4  # coarsest cells added beyond the need, so that a box does not grow every frame
 
@@ -52,6 +52,7 @@ class HexPlaneField:
         levels: int = 2,
         channels: int = 32,
         seed: int = 0,
+        space_range: tuple[float, float] = SPACE_RANGE,
     ) -> None:
         """Start a stream's window: it holds slot 0 and grows up to `slots`.
 
@@ -64,6 +65,7 @@ class HexPlaneField:
             levels: how many there are.
             channels: of each level, a multiple of 16.
             seed: of the first values.
+            space_range: lowest and highest first value of the planes in space.
 
         Raises:
             UsageError: the box is empty or not finite, or a number is out of range.
@@ -86,7 +88,7 @@ class HexPlaneField:
         self.cells: F32 = aligned((self.grid.rows, channels))
         self.cells[:] = 1.0
         in_space = self.cells[: self.grid.space_rows]
-        in_space[:] = np.random.default_rng(seed).uniform(*SPACE_RANGE, in_space.shape)
+        in_space[:] = np.random.default_rng(seed).uniform(*space_range, in_space.shape)
         self.adam = AdamState.new(*self.cells.shape)
         self._sampler = HexPlane(self.grid)
 

@@ -15,13 +15,14 @@ from sags_node.benchmark.quality import ablation
 from sags_node.cli.main import main
 from sags_node.fitting import start
 from sags_node.fitting.fit import Fit
+from sags_node.fitting.settings import FieldShape
 
 
 def test_all_variants_are_measured_on_the_same_frames(
     phantom_session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     small = {
-        name: dataclasses.replace(settings, max_gaussians=800, cells=8, slots=4, channels=16)
+        name: dataclasses.replace(settings, max_gaussians=800, shape=FieldShape(cells=8, channels=16))
         for name, settings in ablation.VARIANTS.items()
     }
     monkeypatch.setattr(ablation, "VARIANTS", small)
@@ -35,21 +36,35 @@ def test_all_variants_are_measured_on_the_same_frames(
 
     monkeypatch.setattr(Fit, "start", noted)
     out = tmp_path / "ablation.json"
-    arguments = ["source.frames:=12", "--warm-up", "2", "--iterations", "3", "--out", str(out), "--json"]
+    arguments = ["source.frames:=12", "--warm-up", "2", "--iterations", "3", "--seeds", "2"]
+    arguments += [f"--variant={name}" for name in small if name != "nodes"] + ["--out", str(out), "--json"]
     result = CliRunner().invoke(main, ["bench", "ablation", str(phantom_session), *arguments])
     assert result.exit_code == 0, result.output
     found = json.loads(result.stdout)
     assert json.loads(out.read_text()) == {"provenance": ANY} | found
-    assert list(found["variants"]) == list(ablation.VARIANTS)
-    assert learnt == [[0, 2, 3, 4, 5, 6, 7, 8]] * len(small)
-    for name, row in found["variants"].items():
+    del small["nodes"]
+    assert list(found["variants"]) == list(small)
+    assert learnt == [[0, 2, 3, 4, 5, 6, 7, 8]] * len(small) * 2
+    for name, rows in found["variants"].items():
+        assert len(rows) == 2 and rows[0]["heldout"] != rows[1]["heldout"], name  # of other seeds
+        row = rows[0]
         assert row["heldout"]["frames"] == 1 and row["ahead"]["frames"] == ablation.AHEAD, name
         assert row["gaussians"] <= 800
         used = found["settings"][name]
         assert used["iterations"] == 3 and used["warm_up"] == (0 if used["schedule"] == "online" else 2)
         assert row["track"]["median_mm"] > 0 and row["track_with_ahead"]["median_mm"] > 0
-    base, online = found["variants"]["base"]["heldout"], found["variants"]["online"]["heldout"]
-    assert online["psnr"] > base["psnr"]
+        assert row["train"]["frames"] >= 1 and row["between"]["mean"]["frames"] == 1
+        assert row["smaller"].keys() == {"half", "quarter"}
+    base, online = (found["variants"][name][0]["heldout"]["psnr"] for name in ("base", "online"))
+    assert online > base
+    filters = found["parts"]["both filters, without the block"]
+    gains = [
+        a["heldout"]["psnr"] - b["heldout"]["psnr"]
+        for a, b in zip(found["variants"]["no_adaptive"], found["variants"]["base"], strict=True)
+    ]
+    assert filters["paper_db"] == 0.9
+    assert filters["heldout"]["lowest"] == pytest.approx(min(gains), abs=1e-3)
+    assert filters["heldout"]["mean"] == pytest.approx(sum(gains) / 2, abs=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -59,6 +74,7 @@ def test_all_variants_are_measured_on_the_same_frames(
         (["source.frames:=4"], 1, ("4 frames", "1 are left to learn from and 0 to test on", "source.frames")),
         (["source.start:=0.2", "source.frames:=9"], 1, ("6 are left", "0 to test on", "--hold-out")),
         (["--lpips-weights", "gone.npz"], 2, ("gone.npz", "check the path")),
+        (["--variant", "fuller"], 2, ("fuller", "full, no_block")),
     ],
 )
 def test_an_ablation_that_cannot_be_says_why(

@@ -25,13 +25,13 @@ from sags_node.engine.cuda.rasterizer import CudaRasterizer
 from sags_node.engine.device import Device
 from sags_node.engine.failures import DeviceMemoryError
 from sags_node.errors import SagsError
-from sags_node.fitting import checkpoint, field, fit, start
+from sags_node.fitting import checkpoint, field, start
 from sags_node.fitting.clip import Clip, ClipFrame
 from sags_node.fitting.cuda import learner as cuda_learner
 from sags_node.fitting.cuda.field import Loan
 from sags_node.fitting.fit import Fit
 from sags_node.fitting.learner import DeviceKind
-from sags_node.fitting.settings import FitSettings
+from sags_node.fitting.settings import FieldShape, FitSettings, Growth
 from sags_node.model import columns
 from sags_node.types import Camera
 
@@ -42,13 +42,15 @@ pytestmark = [
 ]
 
 WIDTH, HEIGHT = 32, 16
-SMALL = FitSettings(warm_up=2, iterations=40, max_gaussians=60, cells=1, levels=2, slots=3, channels=16)
+SMALL = FitSettings(
+    warm_up=2, iterations=40, max_gaussians=60, shape=FieldShape(cells=1, channels=16, frames_per_slot=2.5)
+)
 PAPER = dataclasses.replace(SMALL, schedule="paper")
 KINDS = {
     "paper, warming up": dataclasses.replace(PAPER, warm_up=20),
     "paper, nodes": PAPER,
     "paper, self": dataclasses.replace(PAPER, tokens="self", antialias=False),
-    "paper, planes, no block": dataclasses.replace(PAPER, tokens="planes", adaptive=False),
+    "paper, planes, no block": dataclasses.replace(PAPER, tokens="planes", block="none"),
     "online, nodes": SMALL,
     "online, self": dataclasses.replace(SMALL, tokens="self"),
 }
@@ -158,8 +160,7 @@ def test_density_control_and_a_checkpoint_go_between_devices(
     clip: Clip, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Gaussians are removed and split on the host; then the device goes on, and so does a CPU."""
-    monkeypatch.setattr(fit, "EVERY", 3)
-    settings = dataclasses.replace(PAPER, warm_up=1, max_gaussians=80)
+    settings = dataclasses.replace(PAPER, warm_up=1, max_gaussians=80, growth=Growth(every=3))
     base = started(clip, dataclasses.replace(settings, max_gaussians=60))
     base.model.rows[:5, columns.LOGIT] = -9  # transparent
     found, state = arrays_of(base), base.state()

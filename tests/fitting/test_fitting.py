@@ -15,11 +15,12 @@ from click.testing import CliRunner
 
 from sags_node.cli.main import main
 from sags_node.errors import SagsError, UsageError
+from sags_node.evaluation.metrics import psnr
 from sags_node.fitting import checkpoint, start
 from sags_node.fitting.clip import Clip, read_clip
 from sags_node.fitting.fit import Fit
-from sags_node.fitting.score import score, score_depth, score_tracks
-from sags_node.fitting.settings import FitSettings
+from sags_node.fitting.score import score, score_between, score_depth, score_tracks
+from sags_node.fitting.settings import FieldShape, FitSettings
 from sags_node.fitting.start import follow_online
 from sags_node.kernels.threads import configure_threads
 from sags_node.model import columns
@@ -27,7 +28,9 @@ from sags_node.model.deformable import FADE_NS, LOOK_BACK_NS
 from sags_node.session import open_session
 from sags_node.types import F32
 
-SMALL = FitSettings(iterations=120, max_gaussians=3000, cells=16, slots=8, channels=16)
+SMALL = FitSettings(
+    iterations=120, max_gaussians=3000, shape=FieldShape(cells=16, channels=16, frames_per_slot=12 / 7)
+)
 PAPER = dataclasses.replace(SMALL, schedule="paper", warm_up=60)
 FRAMES = ["source.pace:=step", "source.loop:=false", "source.frames:=12"]
 
@@ -85,15 +88,15 @@ def test_each_part_of_the_method_has_its_share_in_the_result(clip: Clip) -> None
     """The self-adaptive block, and both filters. The same settings twice give the same picture."""
     frame = clip.test[0]
 
-    def drawn(**changed: bool) -> F32:
+    def drawn(**changed: Any) -> F32:
         fit = fitted(clip, dataclasses.replace(PAPER, **changed))
         return fit.rasterizer.forward(fit.gaussians(frame), [frame.camera])[0, :3, frame.tissue]
 
     whole = drawn()
     assert np.array_equal(drawn(), whole)
-    for part in ("adaptive", "antialias"):
+    for without in ({"block": "none"}, {"block": "mlp"}, {"antialias": False}):
         beyond_rounding = 100 * np.finfo(np.float32).eps
-        assert np.abs(drawn(**{part: False}) - whole).mean() > beyond_rounding, part
+        assert np.abs(drawn(**without) - whole).mean() > beyond_rounding, without
 
 
 @pytest.mark.parametrize("tokens", ["self", "nodes"])
@@ -141,6 +144,36 @@ def test_gaussians_stay_on_their_tissue(clip: Clip) -> None:
     assert 0 < tracks["median_mm"] < 0.5
     bare = [dataclasses.replace(frame, reference=None) for frame in frames]
     assert score_tracks(fit, bare) is None
+
+
+def test_between_two_frames_the_model_goes_straight(clip: Clip) -> None:
+    fit = fitted(clip, SMALL, iterations=20)
+    frame = clip.test[0]
+    around = clip.around(frame.t_capture_ns)
+    assert around is not None and [near.frame_id for near in around] == [2, 4]
+    before, after = (fit.gaussians(near).means for near in around)
+    span = around[1].t_capture_ns - around[0].t_capture_ns
+    share = (frame.t_capture_ns - around[0].t_capture_ns) / span
+    np.testing.assert_allclose(
+        fit.gaussians(frame).means, before + share * (after - before), rtol=0, atol=1e-7
+    )
+    assert clip.around(clip.train[3].t_capture_ns) is None
+    assert clip.around(clip.train[0].t_capture_ns - 1) is None
+    assert clip.around(clip.train[-1].t_capture_ns + 1) is None
+
+
+def test_pictures_carried_along_the_motion_beat_their_mean(clip: Clip) -> None:
+    """The phantom's tissue moves all the time, so that the mean of two pictures is blurred."""
+    found = score_between(fitted(clip, SMALL), clip.test, {"first": (0, 5)})
+    assert found is not None
+    carried, mean = found["carried"], found["mean"]
+    assert carried["frames"] == mean["frames"] == 2 and carried["first"]["frames"] == 1
+    assert carried["psnr"] > mean["psnr"] + 0.5
+    before, after = (frame.image / np.float32(255) for frame in (clip.train[2], clip.train[3]))
+    frame = clip.test[0]
+    by_hand = psnr(before / 2 + after / 2, frame.image / np.float32(255), frame.tissue)
+    assert mean["first"]["psnr"] == pytest.approx(by_hand, abs=0.01)
+    assert score_between(fitted(clip, SMALL, iterations=0), clip.train, {}) is None
 
 
 def test_the_number_of_gaussians_stays_under_its_cap(clip: Clip) -> None:

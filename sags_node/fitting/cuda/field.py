@@ -16,7 +16,7 @@ from sags_node.model import columns
 from sags_node.model.cuda.nodes import Followers
 from sags_node.model.cuda.skinning import skin
 from sags_node.model.decoder import Decoder
-from sags_node.model.field import BLOCK, DELTA_UNITS, Deltas, Field, FieldRates, NodeField
+from sags_node.model.field import Deltas, Field, FieldRates, NodeField
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -68,10 +68,8 @@ class DeviceDeltas:
             name: view.detach().requires_grad_() for name, view in _named(self._values, decoder).items()
         }
         self._weight_gradients = _named(self._gradients, decoder)
-        self._still = (
-            () if deltas.adaptive else tuple(name for name in self._weights if name.startswith(BLOCK))
-        )
-        self._units = loan.copy(DELTA_UNITS)
+        self._still = deltas.still
+        self._units = loan.copy(deltas.units)
 
     def forward(self, points: Tensor, t_ns: int) -> Tensor:
         """[N, 14] of points [N, 3] m, differentiable in the features and the decoder's weights. As on the

@@ -1,0 +1,78 @@
+"""What can be set about a fit, and the numbers of the authors' code."""
+
+from __future__ import annotations
+
+import pytest
+
+from sags_node.errors import UsageError
+from sags_node.fitting.field import marked, row_rates
+from sags_node.fitting.settings import ONLINE, PRESETS, RELEASED, FieldShape, RowRates, Units, with_changes
+from sags_node.model import columns
+
+SH_0 = 0.28209479  # of a spherical harmonic of degree 0, which their colour rate is of
+
+
+def test_the_released_preset_has_the_numbers_of_the_released_code() -> None:
+    """H-Wenfeng/SAGS and CUHK-AIM-Group/EndoGaussian, settings for EndoNeRF."""
+    shape, rates, growth = RELEASED.shape, RELEASED.rates, RELEASED.growth
+    assert (RELEASED.warm_up, RELEASED.iterations, RELEASED.tokens) == (1000, 3000, "self")
+    assert (shape.levels, shape.cells, shape.channels) == (4, 64, 64)
+    assert shape.slots(63) == pytest.approx(50, abs=1)
+    assert shape.first_values == (0.1, 0.5) and shape.xavier
+    assert shape.units == Units(mean=1e-3, log_scale=1, quat=1, color=0, logit=0)  # 1 mm; not deformed: 0
+    assert (RELEASED.field_rates.cells, RELEASED.field_rates.decoder) == (1.6e-2, 1.6e-3)
+    pixel = 60e-3 / 569.468  # m, where their clip's tissue is
+    assert rates.mean_px * pixel == pytest.approx(1.6e-6, rel=0.02)
+    assert rates.color == pytest.approx(2.5e-3 * SH_0, rel=1e-3)
+    assert (rates.logit, rates.log_scale, rates.quat) == (0.05, 5e-3, 1e-3)
+    assert rates.decaying == ("means",)
+    assert RELEASED.decay ** (RELEASED.iterations / 4000) == pytest.approx(0.0316, rel=1e-2)
+    assert RELEASED.decay_over == 4000
+    assert (growth.first, growth.every, growth.share) == (30_000, 300, 1.0)
+    weights = RELEASED.weights
+    assert (weights.color, weights.smoothness, weights.similarity) == (1, 0.03, 0)
+    assert weights.inverse_depth == 1e-3  # of 1/m: 1 of 1/mm
+
+
+def test_any_setting_can_be_changed() -> None:
+    changes = [
+        "shape.levels=4",
+        "rates.decaying=[means, colors]",
+        "decay=5e-2",
+        "block=mlp",
+        "weights.color=2",
+    ]
+    found = with_changes(ONLINE, changes)
+    assert found.shape.levels == 4 and found.rates.decaying == ("means", "colors")
+    assert found.decay == 0.05 and found.block == "mlp" and found.weights.color == 2
+    assert with_changes(ONLINE, []) == ONLINE
+    for preset in PRESETS.values():
+        assert with_changes(preset, []) == preset
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ("shape.level=4", "shape.levels"),
+        ("shape=4", "shape.levels"),
+        ("levels", "KEY=VALUE"),
+        ("shape.levels=many", "shape.levels"),
+        ("rates.decaying=[everything]", "means"),
+        ("block=big", "adaptive"),
+    ],
+)
+def test_a_change_that_cannot_be_says_why(change: str, said: str) -> None:
+    with pytest.raises(UsageError, match=said):
+        with_changes(ONLINE, [change])
+
+
+def test_slots_of_time_grow_with_the_clip() -> None:
+    shape = FieldShape(frames_per_slot=3.0)
+    assert [shape.slots(frames) for frames in (1, 3, 30, 300)] == [2, 2, 11, 101]
+
+
+def test_parts_of_a_row_have_their_own_rates() -> None:
+    rates = row_rates(RowRates(mean_px=0.5, color=7.0), pixel=0.25)
+    assert (rates[columns.MEAN] == 0.125).all() and (rates[columns.COLOR] == 7).all()
+    found = marked(("quats", "logits"))
+    assert found[columns.QUAT].all() and found[columns.LOGIT] == 1 and found.sum() == 5
