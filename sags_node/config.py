@@ -62,14 +62,65 @@ class FoldersSource(RecordedSource):
     tools: Path | None = Field(None, description="folder of mask PNGs, 255 = instrument (not tissue)")
 
 
+class GeometryConfig(Section):
+    """How pictures become those of the two eyes: taken apart; each eye deinterlaced, cropped, turned."""
+
+    layout: Literal["separate", "side_by_side", "over_under", "row_interleaved", "frame_sequential"] = Field(
+        "separate",
+        description="separate: a picture shows one eye; side_by_side: both, in its left and right half; "
+        "over_under: in the upper and lower half; row_interleaved: in every other row, as the two fields of "
+        "field-sequential stereo are; frame_sequential: each eye in every other picture",
+    )
+    first: Literal["left", "right"] = Field(
+        "left", description="whose is the left or upper half, the first row, the first picture"
+    )
+    deinterlace: Literal["none", "top", "bottom"] = Field(
+        "none",
+        description="of interlaced pictures, keep the field of the first (top) or second (bottom) row and "
+        "fill the rows between from their neighbours",
+    )
+    crop: Box | None = Field(None, description="what is used of each eye's picture; default: all")
+    crop_right: Box | None = Field(None, description="of the right eye's; default: as source.geometry.crop")
+    flip: Literal["none", "horizontal", "vertical", "both"] = Field(
+        "none", description="of each eye's picture: mirrored, upside down, or turned by 180 degrees (both)"
+    )
+    levels: tuple[float, float] = Field(
+        (0.0, 1.0),
+        description="what becomes black and white, in units of the brightest value; of 10, 12 and 16 bit "
+        "pictures the eight bits that are used then lie where the picture has its tones",
+    )
+
+    @model_validator(mode="after")
+    def _possible(self) -> GeometryConfig:
+        if self.layout == "row_interleaved" and self.deinterlace != "none":
+            raise ValueError("row_interleaved takes the fields apart itself: leave deinterlace out")
+        for box in (self.crop, self.crop_right):
+            if box is not None and (min(box) < 0 or min(box[2:]) < 1):
+                raise ValueError(
+                    f"{list(box)} is no box [x, y, width, height]: it needs a width and a height"
+                )
+        if not 0 <= self.levels[0] < self.levels[1] <= 1:
+            raise ValueError(f"levels {list(self.levels)} should be 0 <= black < white <= 1")
+        return self
+
+
 class VideosSource(RecordedSource):
-    """Two video files, paired by frame number, or one of a single camera's."""
+    """Two video files, paired by frame number; one with both eyes; or one of a single camera's."""
 
     kind: Literal["videos"] = "videos"
-    left: Path = Field(description="video of the left eye")
+    left: Path = Field(description="video of the left eye, or of both where source.geometry.layout says so")
     right: Path | None = Field(
         None, description="video of the right eye; null: one camera, with a monocular vision.onnx"
     )
+    geometry: GeometryConfig = GeometryConfig()
+
+    @model_validator(mode="after")
+    def _one_file_of_both(self) -> VideosSource:
+        if self.geometry.layout != "separate" and self.right is not None:
+            raise ValueError(
+                f"geometry.layout {self.geometry.layout}: source.left shows both, leave right out"
+            )
+        return self
 
 
 class SideBySideSource(RecordedSource):
@@ -160,26 +211,76 @@ class PhantomSource(RecordedSource):
     )
 
 
-class V4l2Source(Section):
-    """Live cameras: two devices, or one that delivers both eyes side by side."""
+class LiveSource(Section):
+    """What cameras have in common: no pace, no end."""
+
+    geometry: GeometryConfig = GeometryConfig()
+
+
+class V4l2Source(LiveSource):
+    """Live cameras: two devices, or one whose pictures show both eyes."""
 
     kind: Literal["v4l2"] = "v4l2"
-    left: str = Field("/dev/video0", description="device; the only one when side_by_side is set")
-    right: str | None = Field("/dev/video2", description="device of the right eye")
-    side_by_side: Literal["LR", "RL"] | None = Field(
-        None,
-        description="one device delivers both eyes, LR: the left one in the left half; null: two devices",
+    left: str = Field(
+        "/dev/video0", description="device; the only one where source.geometry.layout says it shows both eyes"
     )
+    right: str | None = Field("/dev/video2", description="device of the right eye")
     width: int = Field(640, gt=0, description="of one device's picture, px")
     height: int = Field(480, gt=0, description="of one device's picture, px")
     rate: float = Field(30.0, gt=0, description="frames per second")
     fourcc: str | None = Field(
-        None, min_length=4, max_length=4, description="pixel format, e.g. YUYV, MJPG; default: the device's"
+        None,
+        min_length=3,
+        max_length=4,
+        description="pixel format, e.g. YUYV, MJPG, or with more than 8 bit Y10, Y12, Y16; default: the "
+        "device's",
     )
     deadline: float = Field(1.0, gt=0, description="seconds without a picture before the device is reopened")
     pair_tolerance_ms: float = Field(
         20.0, gt=0, description="how far the stamps of a pair may lie apart, two devices"
     )
+
+
+class GstSource(LiveSource):
+    """Live pictures from GStreamer, in a process of its own; docs/inputs.md has examples."""
+
+    kind: Literal["gst"] = "gst"
+    launch: str | None = Field(
+        None,
+        description="launch string of both eyes. It ends open where a picture shows both "
+        "(source.geometry.layout), else in one branch to `left.` and one to `right.`",
+    )
+    left: str | None = Field(
+        None, description="launch string of the left eye, ending open; instead of source.launch"
+    )
+    right: str | None = Field(None, description="launch string of the right eye, ending open")
+    start: float = Field(15.0, gt=0, description="seconds until the first picture of each eye, at most")
+    deadline: float = Field(2.0, gt=0, description="seconds without a picture before it is started again")
+    pair_tolerance_ms: float = Field(
+        5.0,
+        gt=0,
+        description="how far the stamps of a pair may lie apart; cameras that are not synchronised need half "
+        "a frame",
+    )
+
+    @model_validator(mode="after")
+    def _both_eyes(self) -> GstSource:
+        separate = self.geometry.layout == "separate"
+        if self.launch is None and (self.left is None or self.right is None):
+            raise ValueError("name launch (both eyes), or left and right (a launch string of each)")
+        if self.launch is not None and (self.left is not None or self.right is not None):
+            raise ValueError("launch is of both eyes: leave left and right out")
+        if self.launch is None and not separate:
+            raise ValueError(f"geometry.layout {self.geometry.layout} needs launch, one string of both eyes")
+        led = [name for name in ("left.", "right.") if name in (self.launch or "").split()]
+        if self.launch is not None and len(led) != (2 if separate else 0):
+            raise ValueError(
+                "launch needs one branch that ends in '! left.' and one in '! right.' (see tee), or "
+                "geometry.layout where its pictures show both eyes"
+                if separate
+                else f"geometry.layout {self.geometry.layout}: launch ends open, without left. and right."
+            )
+        return self
 
 
 Source = Annotated[
@@ -192,7 +293,8 @@ Source = Annotated[
     | BagSource
     | DvrkSource
     | PhantomSource
-    | V4l2Source,
+    | V4l2Source
+    | GstSource,
     Field(discriminator="kind"),
 ]
 
@@ -457,4 +559,6 @@ class LaunchConfig(Section):
     @property
     def one_camera(self) -> bool:
         """There is no right eye, and nothing in its place."""
+        if isinstance(self.source, VideosSource) and self.source.geometry.layout != "separate":
+            return False
         return isinstance(self.source, FoldersSource | VideosSource) and self.source.right is None

@@ -14,11 +14,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
-from sags_node.config import LaunchConfig, PublishConfig
+from sags_node.config import GstSource, LaunchConfig, PublishConfig
 from sags_node.engine.device import find_gpu, has_gpu
-from sags_node.errors import UsageError
+from sags_node.errors import SagsError, UsageError
 from sags_node.kernels.cache import cache_root
 from sags_node.messaging.security import check_endpoint, read_allow_list, read_key_pair
+from sags_node.sources.gst_process import ELEMENTS, installed
 
 Level = Literal["ok", "warning", "error"]
 REQUIRED = (
@@ -58,6 +59,7 @@ def examine(config: LaunchConfig) -> list[Check]:
         *_keys(config.publish),
         _clock(),
         _cameras(),
+        _gstreamer(config),
         _recordings(),
     ]
 
@@ -198,6 +200,24 @@ def _cameras() -> Check:
     if not devices:
         return Check("cameras", "ok", "none (replay needs none)")
     return Check("cameras", "ok", ", ".join(devices))
+
+
+def _gstreamer(config: LaunchConfig) -> Check:
+    """Which elements are there; it starts GStreamer, in a process of its own."""
+    wanted: Level = "error" if isinstance(config.source, GstSource) else "ok"
+    if ctypes.util.find_library("gstapp-1.0") is None:
+        packages = " ".join(sorted(name for name in set(ELEMENTS.values()) if " " not in name))
+        mend = f"for source.kind gst: sudo apt-get install gstreamer1.0-tools {packages}"
+        return Check("GStreamer", wanted, "not installed", mend)
+    try:
+        version, missing = installed()
+    except SagsError as error:
+        return Check("GStreamer", wanted, "does not start", str(error))
+    if not missing:
+        return Check("GStreamer", "ok", version)
+    without = ", ".join(missing)
+    mend = "; ".join(f"{name}: {package}" for name, package in missing.items())
+    return Check("GStreamer", "ok", f"{version}, without {without}", mend)
 
 
 def _recordings() -> Check:

@@ -11,11 +11,12 @@ from typing import Any, get_args
 
 from pydantic import ValidationError
 
-from sags_node.config import LaunchConfig, Section, Source
+from sags_node.config import LaunchConfig, LiveSource, Section, Source
 from sags_node.errors import UsageError, brief
 from sags_node.files import open_file
 from sags_node.yaml_reader import parse_yaml, read_yaml
 
+LIVE_KINDS = {kind.model_fields["kind"].default for kind in LiveSource.__subclasses__()}
 MOST_MISTAKES = 10  # named at once
 DEFAULT_DATA = "../shared/data"
 BAG_SUFFIXES = (".mcap", ".db3", ".bag")
@@ -144,8 +145,10 @@ def _resolve_paths(tree: dict[str, Any], folder: Path) -> None:
     """Expand variables in every string and make the known path keys relative to the launch file."""
     variables = {"SAGS_DATA": str((folder / ".." / DEFAULT_DATA).resolve()), **os.environ}
     for key, value in tree.items():
-        if isinstance(value, dict) and value.get("kind") != "v4l2":
+        if isinstance(value, dict):
             _resolve_paths(value, folder)
+        elif isinstance(value, str) and tree.get("kind") in LIVE_KINDS:  # devices and launch strings
+            tree[key] = Template(value).safe_substitute(variables)
         elif isinstance(value, str):
             tree[key] = _resolve(key, value, folder, variables)
         elif isinstance(value, list):

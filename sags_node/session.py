@@ -56,7 +56,9 @@ def open_session(
         rig = load_rig(config.rig or folder / "calib")
     else:
         rig = _rig(config)
-    return Session(_name(launch), config, rig, open_source(config.source, references=False))
+    size = rig.left.width, rig.left.height
+    source = open_source(config.source, references=False, size=size)
+    return Session(_name(launch), config, rig, source)
 
 
 def _name(launch: Path | str | None) -> str:

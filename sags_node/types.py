@@ -22,7 +22,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,8 @@ U8 = NDArray[np.uint8]
 I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
 Bool = NDArray[np.bool_]
+Samples = NDArray[np.uint8] | NDArray[np.uint16]  # of a picture as a camera gives it
+Side = Literal["left", "right"]
 
 SH_DEGREE_0 = 0.5 / math.sqrt(math.pi)  # Y_00, the constant spherical harmonic: rgb = 0.5 + Y_00 f_dc
 

@@ -21,8 +21,9 @@ from sags_node.errors import SagsError
 from sags_node.messaging.publisher import Publisher
 from sags_node.node import Node
 from sags_node.session import open_session
-from sags_node.sources import v4l2
-from sags_node.sources.device import Picture
+from sags_node.sources import live
+from sags_node.sources.device import Shot
+from sags_node.sources.v4l2 import open_cameras
 from sags_node.warm_up import warm_up
 
 pytestmark = pytest.mark.live
@@ -77,9 +78,10 @@ class HungCamera:
     """A driver that does not come back."""
 
     rate = 30.0
+    size = 640, 480
     released = threading.Event()
 
-    def read(self, timeout: float) -> Picture | None:
+    def read(self, timeout: float) -> Shot | None:
         self.released.wait(60)
         return None
 
@@ -90,10 +92,10 @@ class HungCamera:
 def test_a_driver_that_does_not_come_back_does_not_keep_the_node(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(v4l2, "CLOSE_S", 0.1)
+    monkeypatch.setattr(live, "CLOSE_S", 0.1)
     config = V4l2Source(left="/dev/left", right="/dev/right")
     try:
-        with v4l2.StereoCameras(config, lambda path, config: HungCamera()) as source:
+        with open_cameras(config, open_device=lambda path, config: HungCamera()) as source:
             source.stop()
             assert list(source) == []
     finally:

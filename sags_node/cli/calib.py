@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 import click
 from rich.markup import escape
 
-from sags_node.cli.launching import as_json, positive, split
+from sags_node.cli.launching import as_json, launch_argument, positive, split
 from sags_node.errors import SagsError, UsageError
 from sags_node.terminal import text
-from sags_node.terminal.console import check_folder, console, progress, show, writing
+from sags_node.terminal.console import check_file, check_folder, console, progress, show, writing
 
 if TYPE_CHECKING:
     from sags_node.calibration.boards import Board
@@ -138,6 +138,52 @@ def convert(path: Path, output: Path, size: tuple[int, int] | None, unit: str | 
         f"{rig.baseline * 1e3:.3g} mm",
         soft_wrap=True,
     )
+
+
+@calib.command("live")
+@launch_argument
+@click.option("--seconds", type=positive, default=2.0, show_default=True, help="To watch.")
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path, dir_okay=False),
+    default=Path("eyes.png"),
+    show_default=True,
+    metavar="FILE.png",
+    help="The picture; an older one is replaced.",
+)
+@as_json
+def look_at_eyes(launch: tuple[str, ...], seconds: float, output: Path, json_out: bool) -> None:
+    """Show what the source gives for each eye.
+
+    Watches cameras, or any other source, and writes a picture of both eyes side by side: is each eye whole,
+    upright, and on its own side? Lines across both help to compare heights. Also size, rate, skew and age of
+    the pictures. No calibration is needed; where the launch file names one, its size is compared.
+
+    \b
+    sags calib live launch/v4l2.yaml
+    sags calib live launch/gst_over_under.yaml source.geometry.first:=right -o swapped.png
+    """
+    import cv2
+
+    from sags_node.calibrate.eyes import look
+    from sags_node.calibration import load_rig
+    from sags_node.launch_file import load_launch
+
+    config = load_launch(*split(launch))
+    check_file(output)
+    picture, found = look(config, seconds)
+    with writing(output):
+        output.write_bytes(cv2.imencode(".png", picture[..., ::-1])[1].tobytes())
+    show(found if json_out else text.rows_table([found]))
+    console.print(f"both eyes: [bold]{escape(str(output))}[/]", soft_wrap=True)
+    if config.rig is not None and not config.one_camera:
+        eye = load_rig(config.rig).left
+        if (eye.width, eye.height) != (found["width"], found["height"]):
+            raise SagsError(
+                f"the calibration {config.rig} is for {eye.width}x{eye.height} px, the pictures are "
+                f"{found['width']}x{found['height']}; set source.geometry.crop, or calibrate at this size"
+            )
 
 
 @calib.command()

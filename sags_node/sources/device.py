@@ -10,22 +10,32 @@ from pathlib import Path
 from typing import NamedTuple
 
 import cv2
+import numpy as np
 
 from sags_node.config import V4l2Source
 from sags_node.errors import SagsError
-from sags_node.types import U8
+from sags_node.types import U8, Samples, Side
 
 log = logging.getLogger(__name__)
 
 FIRST_PICTURE_S = 3  # cameras need this long to start; OpenCV waits for the first picture in one piece
+DEEP = {"Y10 ": 6, "Y12 ": 4, "Y16 ": 0}  # pixel formats of 16 bit words: bits that they leave free
 PLAUSIBLE_AGE_NS = 1_000_000_000  # of a driver stamp against its arrival
 
 
 class Picture(NamedTuple):
-    """What a device delivers."""
+    """Of one eye."""
 
     t_ns: int  # wall clock
     image: U8  # [H, W, 3] RGB
+
+
+class Shot(NamedTuple):
+    """What a device delivers."""
+
+    t_ns: int  # wall clock
+    image: Samples  # [H, W, 3] RGB
+    side: Side | None = None  # whose it is, where one device delivers either eye's
 
 
 class Device:
@@ -41,6 +51,7 @@ class Device:
 
     def __init__(self, path: str, config: V4l2Source) -> None:
         self._path = path
+        self.size = config.width, config.height
         self._last_stamp_ms = 0.0
         if not os.path.exists(path):
             raise SagsError(f"camera {path} does not exist; {_present()}")
@@ -61,8 +72,9 @@ class Device:
     def _configure(self, config: V4l2Source) -> float:
         """Ask for size, rate and format; the rate that the driver set. Drivers may refuse any of them."""
         capture = self._capture
-        if config.fourcc is not None:
-            capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*config.fourcc))
+        asked = None if config.fourcc is None else config.fourcc.ljust(4)
+        if asked is not None:
+            capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*asked))
         capture.set(cv2.CAP_PROP_FRAME_WIDTH, config.width)
         capture.set(cv2.CAP_PROP_FRAME_HEIGHT, config.height)
         capture.set(cv2.CAP_PROP_FPS, config.rate)
@@ -75,8 +87,11 @@ class Device:
                 "set source.width and source.height to a size of this camera"
             )
         fourcc = int(capture.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little").decode("ascii", "replace")
-        if config.fourcc is not None and fourcc != config.fourcc:
-            log.warning("%s: wanted pixel format %s, the driver gives %s", self._path, config.fourcc, fourcc)
+        if asked is not None and fourcc != asked:
+            log.warning("%s: wanted pixel format %s, the driver gives %s", self._path, asked, fourcc)
+        self._shift = DEEP.get(fourcc)
+        if self._shift is not None:
+            capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)  # OpenCV would cut it to 8 bit
         rate = float(capture.get(cv2.CAP_PROP_FPS))
         if rate <= 0:
             return config.rate
@@ -84,7 +99,7 @@ class Device:
             log.warning("%s: wanted %g frames/s, the driver gives %g", self._path, config.rate, rate)
         return rate
 
-    def read(self, timeout: float) -> Picture | None:
+    def read(self, timeout: float) -> Shot | None:
         """The next picture; None when none comes within `timeout` seconds or its stamp stands still.
 
         Raises:
@@ -104,10 +119,19 @@ class Device:
             return None
         self._last_stamp_ms = stamp_ms
         t_ns = wall_stamp(round(stamp_ms * 1e6), time.monotonic_ns(), time.time_ns())
-        return Picture(t_ns, cv2.cvtColor(picture, cv2.COLOR_BGR2RGB))
+        if self._shift is None:
+            return Shot(t_ns, cv2.cvtColor(picture, cv2.COLOR_BGR2RGB))
+        return Shot(t_ns, _deep(picture, self._shift, self.size))
 
     def close(self) -> None:
         self._capture.release()
+
+
+def _deep(picture: Samples, shift: int, size: tuple[int, int]) -> Samples:
+    """Gray counts of 10 to 16 bit, as bytes or as OpenCV reads them, as three equal channels of 16 bit."""
+    gray = picture.reshape(-1).view(np.uint16).reshape(size[1], size[0])
+    rgb: Samples = cv2.merge([cv2.multiply(gray, 1 << shift)] * 3)
+    return rgb
 
 
 def wall_stamp(driver_ns: int, monotonic_ns: int, wall_ns: int) -> int:

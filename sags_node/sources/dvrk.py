@@ -17,9 +17,10 @@ from sags_node.config import DvrkSource
 from sags_node.errors import UsageError
 from sags_node.files import read_file
 from sags_node.launch_file import SIDECAR_TYPE
+from sags_node.sources.layout import side_by_side
 from sags_node.sources.pictures import RawPair
 from sags_node.sources.stamps import nearest
-from sags_node.sources.videos import PanePairs, Video, side_by_side_boxes
+from sags_node.sources.videos import OneVideoPairs, Video
 from sags_node.types import I64
 
 MAX_SIDECAR_BYTES = 512 << 20  # hours at 60 Hz
@@ -83,12 +84,11 @@ class DvrkPairs:
             )
         video = Video(file.parent / Path(sidecar.video_file).name)  # a name cannot lead out of the folder
         try:
-            halves = side_by_side_boxes(*video.size, order, str(video.path))
+            self._pairs = OneVideoPairs(video, side_by_side(order))
             self.stamps = _stamps(file, sidecar, video)
         except UsageError:
             video.close()
             raise
-        self._pairs = PanePairs(video, *halves)
         self.count = len(self.stamps)
         steps = np.diff(self.stamps[:, 0])
         self.rate = float(1e9 / np.median(steps)) if len(steps) and np.median(steps) > 0 else video.rate

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections import deque
 
-from sags_node.sources.device import Picture
+from sags_node.sources.device import Picture, Shot
 
 log = logging.getLogger(__name__)
 
@@ -20,6 +20,7 @@ class Pairing:
         self._tolerance_ns = tolerance_ns
         self._left: deque[tuple[int, Picture]] = deque()  # with the count of left pictures before it
         self._right: deque[tuple[int, Picture]] = deque()
+        self._pairs: deque[tuple[int, Picture, Picture]] = deque()
         self._counts = [0, 0]
         self._skew_ns = 0
         self.unpaired = 0
@@ -29,6 +30,14 @@ class Pairing:
 
     def add_right(self, picture: Picture) -> None:
         self._add(1, self._right, picture)
+
+    def add_pair(self, left: Picture, right: Picture) -> None:
+        """Two pictures that belong together, whatever their stamps."""
+        if len(self._pairs) == QUEUE_LENGTH:
+            self._pairs.popleft()
+            self.unpaired += 1
+        self._pairs.append((self._counts[0], left, right))
+        self._counts = [count + 1 for count in self._counts]
 
     def _add(self, eye: int, queue: deque[tuple[int, Picture]], picture: Picture) -> None:
         if len(queue) == QUEUE_LENGTH:
@@ -41,6 +50,8 @@ class Pairing:
 
         The older of two pictures is dropped when they are too far apart, or when its successor is nearer.
         """
+        if self._pairs:
+            return self._pairs.popleft()
         while self._left and self._right:
             left, right = self._left[0][1], self._right[0][1]
             self._skew_ns = left.t_ns - right.t_ns
@@ -62,3 +73,33 @@ class Pairing:
                 "is one camera away, or source.pair_tolerance_ms too small?",
                 *(self.unpaired, *self._counts, self._skew_ns / 1e6),
             )
+
+
+class Alternation:
+    """Joins the pictures of one camera that shows the eyes in turn. Not safe for threads by itself.
+
+    How much time has passed since the picture before tells which eye one shows, so a picture that is lost
+    does not exchange the eyes.
+
+    Args:
+        period_ns: from picture to picture.
+    """
+
+    def __init__(self, period_ns: float) -> None:
+        self._period_ns = period_ns
+        self._before: Shot | None = None
+        self._turn = -1  # of the picture before; even: the first eye's
+        self.alone = 0
+
+    def add(self, picture: Shot) -> tuple[Shot, Shot] | None:
+        """The first and the second eye's pictures when this one completes a pair."""
+        before, turn = self._before, self._turn
+        self._turn, self._before = turn + self._steps(before, picture), picture
+        is_second = self._turn % 2 == 1
+        if is_second and before is not None and self._turn == turn + 1:
+            return before, picture
+        self.alone += is_second + (before is not None and turn % 2 == 0)
+        return None
+
+    def _steps(self, before: Shot | None, picture: Shot) -> int:
+        return 1 if before is None else max(1, round((picture.t_ns - before.t_ns) / self._period_ns))

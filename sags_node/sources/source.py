@@ -47,6 +47,7 @@ def open_source(
     config: cfg.Source,
     references: bool = True,
     progress: Callable[[int, int], None] | None = None,
+    size: tuple[int, int] | None = None,
 ) -> Source:
     """Open the source a launch file describes.
 
@@ -54,15 +55,20 @@ def open_source(
         config: the `source` section.
         references: read the recording's truth with each frame. Only measuring needs it.
         progress: called with (done, total) while a phantom session is rendered.
+        size: width and height of the calibration's pictures, px: a live source of others is refused.
 
     Raises:
         UsageError: a file, folder or device is missing or does not fit the rest.
         SagsError: a device or file cannot be read.
     """
     if isinstance(config, cfg.V4l2Source):
-        from sags_node.sources.v4l2 import StereoCameras
+        from sags_node.sources.v4l2 import open_cameras
 
-        return StereoCameras(config)
+        return open_cameras(config, size)
+    if isinstance(config, cfg.GstSource):
+        from sags_node.sources.gst import open_pipeline
+
+        return open_pipeline(config, size)
 
     from sags_node.sources.replay import Replay
 

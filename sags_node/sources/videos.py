@@ -10,6 +10,7 @@ import cv2
 
 from sags_node.config import Box
 from sags_node.errors import SagsError, UsageError
+from sags_node.sources.layout import Layout
 from sags_node.sources.pictures import RawPair, size_text
 from sags_node.types import U8
 
@@ -86,17 +87,26 @@ class Video:
 class VideoPairs:
     """Two videos, paired by frame number, or the left one alone, which says how long it is.
 
+    Args:
+        layout: what is used of each eye's picture.
+
     Raises:
         UsageError: a file is missing or not a video, or the two differ in size or rate.
     """
 
-    def __init__(self, left: Path, right: Path | None) -> None:
+    def __init__(self, left: Path, right: Path | None, layout: Layout) -> None:
         self._left = Video(left)
         self._right = None if right is None else Video(right)
+        self._layout = layout
         self.rate, self.count = self._left.rate, self._left.count
         self._next = 0
         if self._right is not None:
             self._check(self._left, self._right)
+        try:
+            layout.size(*self._left.size, str(left))
+        except UsageError:
+            self.close()
+            raise
 
     def _check(self, one: Video, other: Video) -> None:
         for what, fits, values in (
@@ -135,7 +145,8 @@ class VideoPairs:
         if self._right is not None and right is None:
             raise self._right_ended(self._right)
         self._next += 1
-        return RawPair(_rgb(left), None if right is None else _rgb(right), None)
+        left = _rgb(self._layout.eye(left, "left"))
+        return RawPair(left, None if right is None else _rgb(self._layout.eye(right, "right")), None)
 
     def close(self) -> None:
         for video in self._videos:
@@ -150,6 +161,48 @@ class VideoPairs:
             f"{right.path} ends at frame {self._next} but {self._left.path} goes on; "
             f"set source.frames to stop there"
         )
+
+
+class OneVideoPairs:
+    """One video of both eyes: in halves of a picture, in rows, or one after the other.
+
+    Raises:
+        UsageError: its pictures cannot be split as asked.
+    """
+
+    def __init__(self, video: Video, layout: Layout) -> None:
+        self._video = video
+        self._layout = layout
+        self._pictures = 2 if layout.is_sequential else 1  # that make a pair
+        self.rate = None if video.rate is None else video.rate / self._pictures
+        self.count = video.count // self._pictures
+        try:
+            layout.size(*video.size, str(video.path))
+        except UsageError:
+            self.close()
+            raise
+
+    def seek(self, index: int) -> None:
+        self._video.seek(index * self._pictures)
+
+    def skip(self) -> bool:
+        return all(self._video.skip() for _ in range(self._pictures))
+
+    def read(self) -> RawPair | None:
+        """The next pair, None at the end."""
+        pictures = [self._video.read() for _ in range(self._pictures)]
+        first, last = pictures[0], pictures[-1]
+        if first is None or last is None:
+            return None
+        if self._layout.is_sequential:
+            of = dict(zip(self._layout.order, (first, last), strict=True))
+            left, right = self._layout.eye(of["left"], "left"), self._layout.eye(of["right"], "right")
+        else:
+            left, right = self._layout.eyes(first)
+        return RawPair(_rgb(left), _rgb(right), None)
+
+    def close(self) -> None:
+        self._video.close()
 
 
 class PanePairs:
@@ -208,18 +261,6 @@ class PanePairs:
 
     def close(self) -> None:
         self._video.close()
-
-
-def side_by_side_boxes(width: int, height: int, order: str, name: str) -> tuple[Box, Box]:
-    """The left and the right eye's half of a picture; `order` is LR or RL.
-
-    Raises:
-        UsageError: the width is odd.
-    """
-    if width % 2:
-        raise UsageError(f"{name} is {width} px wide, which is odd: it cannot hold two eyes side by side")
-    first, second = (0, 0, width // 2, height), (width // 2, 0, width // 2, height)
-    return (first, second) if order == "LR" else (second, first)
 
 
 def _rgb(bgr: U8) -> U8:

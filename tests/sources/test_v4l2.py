@@ -16,12 +16,13 @@ import cv2
 import numpy as np
 import pytest
 
-from sags_node.config import V4l2Source
+from sags_node.config import GeometryConfig, V4l2Source
 from sags_node.errors import SagsError, UsageError
-from sags_node.sources import v4l2
-from sags_node.sources.device import Device, Picture, wall_stamp
+from sags_node.sources import live
+from sags_node.sources.device import Device, Picture, Shot, wall_stamp
+from sags_node.sources.live import LiveStereo
 from sags_node.sources.pairing import QUEUE_LENGTH, Pairing
-from sags_node.sources.v4l2 import StereoCameras
+from sags_node.sources.v4l2 import open_cameras
 from sags_node.types import StereoFrame
 
 pytestmark = pytest.mark.live
@@ -39,18 +40,19 @@ class FakeCamera:
 
     rate = 50.0
 
-    def __init__(self) -> None:
+    def __init__(self, size: tuple[int, int]) -> None:
+        self.size = size
         self.pictures: queue.Queue[Picture | None] = queue.Queue()
         self.closed = False
 
-    def read(self, timeout: float) -> Picture | None:
+    def read(self, timeout: float) -> Shot | None:
         try:
             picture = self.pictures.get(timeout=timeout)
         except queue.Empty:
             return None
         if picture is None:
             raise SagsError("camera is gone")
-        return picture
+        return Shot(*picture)
 
     def close(self) -> None:
         self.closed = True
@@ -68,7 +70,7 @@ class Plugs:
         self.attempts += 1
         if path in self.absent:
             raise SagsError(f"camera {path} does not exist")
-        self.opened[path].append(FakeCamera())
+        self.opened[path].append(FakeCamera((config.width, config.height)))
         return self.opened[path][-1]
 
     def put(self, t_ms: float, value: int = 0, skew_ms: float = 0.0) -> None:
@@ -87,20 +89,20 @@ def eventually(condition: Callable[[], bool]) -> None:
 
 @pytest.fixture
 def plugs(monkeypatch: pytest.MonkeyPatch) -> Plugs:
-    monkeypatch.setattr(v4l2, "FIRST_PAUSE_S", 0.01)
-    monkeypatch.setattr(v4l2, "LONGEST_PAUSE_S", 0.04)
+    monkeypatch.setattr(live, "FIRST_PAUSE_S", 0.01)
+    monkeypatch.setattr(live, "LONGEST_PAUSE_S", 0.04)
     return Plugs()
 
 
 class Collector:
     """Takes frames in a thread, as a node does."""
 
-    def __init__(self, source: StereoCameras) -> None:
+    def __init__(self, source: LiveStereo) -> None:
         self.frames: list[StereoFrame] = []
         self.thread = threading.Thread(target=self._take, args=(source,))
         self.thread.start()
 
-    def _take(self, source: StereoCameras) -> None:
+    def _take(self, source: LiveStereo) -> None:
         for frame in source:
             self.frames.append(frame)
 
@@ -195,7 +197,7 @@ def test_wall_stamp(driver_ns: int, expected: int) -> None:
 
 
 def test_delivers_pairs_with_both_stamps(plugs: Plugs) -> None:
-    with StereoCameras(CONFIG, plugs) as source:
+    with open_cameras(CONFIG, open_device=plugs) as source:
         collector = Collector(source)
         for n in range(5):
             plugs.put(20 * n, value=n, skew_ms=3)
@@ -211,7 +213,7 @@ def test_delivers_pairs_with_both_stamps(plugs: Plugs) -> None:
 
 
 def test_unplugged_camera_comes_back(plugs: Plugs) -> None:
-    with StereoCameras(CONFIG, plugs) as source:
+    with open_cameras(CONFIG, open_device=plugs) as source:
         collector = Collector(source)
         plugs.put(0, value=1)
         collector.wait_for(1)
@@ -231,7 +233,7 @@ def test_unplugged_camera_comes_back(plugs: Plugs) -> None:
 
 def test_silent_camera_is_opened_again(plugs: Plugs) -> None:
     """A camera that neither delivers nor fails, as unplugged USB cameras may do."""
-    with StereoCameras(CONFIG, plugs) as source:
+    with open_cameras(CONFIG, open_device=plugs) as source:
         collector = Collector(source)
         plugs.put(0, value=1)
         eventually(lambda: all(len(cameras) >= 2 for cameras in plugs.opened.values()))
@@ -252,7 +254,7 @@ def test_silent_camera_is_opened_again(plugs: Plugs) -> None:
 
 
 def test_stop_ends_the_wait_for_absent_cameras(plugs: Plugs) -> None:
-    with StereoCameras(CONFIG, plugs) as source:
+    with open_cameras(CONFIG, open_device=plugs) as source:
         collector = Collector(source)
         source.stop()
         collector.thread.join(30)
@@ -261,7 +263,7 @@ def test_stop_ends_the_wait_for_absent_cameras(plugs: Plugs) -> None:
 
 
 def test_clock_set_back_grows_the_epoch(plugs: Plugs) -> None:
-    with StereoCameras(CONFIG, plugs) as source:
+    with open_cameras(CONFIG, open_device=plugs) as source:
         collector = Collector(source)
         for n, t in enumerate((10_000, 10_020, 5_000, 5_020)):
             plugs.put(t)
@@ -269,11 +271,12 @@ def test_clock_set_back_grows_the_epoch(plugs: Plugs) -> None:
     assert [frame.epoch for frame in collector.frames] == [0, 0, 1, 1]
 
 
-@pytest.mark.parametrize(("order", "left_value"), [("LR", 10), ("RL", 20)])
-def test_side_by_side(plugs: Plugs, order: str, left_value: int) -> None:
-    config = CONFIG.model_copy(update={"side_by_side": order, "right": None, "width": 16})
+@pytest.mark.parametrize(("first", "left_value"), [("left", 10), ("right", 20)])
+def test_side_by_side(plugs: Plugs, first: str, left_value: int) -> None:
+    geometry = GeometryConfig(layout="side_by_side", first=first)
+    config = CONFIG.model_copy(update={"geometry": geometry, "right": None, "width": 16})
     halves = np.concatenate([shot(0, 10).image, shot(0, 20).image], axis=1)
-    with StereoCameras(config, plugs) as source:
+    with open_cameras(config, open_device=plugs) as source:
         collector = Collector(source)
         plugs.opened["/dev/left"][0].pictures.put(Picture(7 * MS, halves))
         collector.wait_for(1)
@@ -286,14 +289,15 @@ def test_side_by_side(plugs: Plugs, order: str, left_value: int) -> None:
 
 def test_mistakes_at_opening(plugs: Plugs) -> None:
     with pytest.raises(UsageError, match=r"source\.right names no camera"):
-        StereoCameras(CONFIG.model_copy(update={"right": None}), plugs)
+        open_cameras(CONFIG.model_copy(update={"right": None}), open_device=plugs)
     with pytest.raises(UsageError, match="same camera, /dev/left"):
-        StereoCameras(CONFIG.model_copy(update={"right": "/dev/left"}), plugs)
+        open_cameras(CONFIG.model_copy(update={"right": "/dev/left"}), open_device=plugs)
     with pytest.raises(UsageError, match="9 px wide, which is odd"):
-        StereoCameras(CONFIG.model_copy(update={"side_by_side": "LR", "width": 9}), plugs)
+        halves = GeometryConfig(layout="side_by_side")
+        open_cameras(CONFIG.model_copy(update={"geometry": halves, "width": 9}), open_device=plugs)
     plugs.absent.add("/dev/right")
     with pytest.raises(SagsError, match="/dev/right does not exist"):
-        StereoCameras(CONFIG, plugs)
+        open_cameras(CONFIG, open_device=plugs)
     assert plugs.opened["/dev/left"][-1].closed  # nothing stays open after a failed start
 
 

@@ -14,14 +14,15 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from sags_node.config import V4l2Source
+from sags_node.config import GeometryConfig, V4l2Source
 from sags_node.errors import SagsError
 from sags_node.sources.source import open_source
 from sags_node.types import StereoFrame
 
 DRIVER = Path("/sys/bus/platform/drivers/vivid")
 TWO = V4l2Source(left="/dev/video0", right="/dev/video1", width=320, height=180, rate=30, deadline=0.5)
-ONE = V4l2Source(left="/dev/video0", right=None, side_by_side="LR", width=640, height=360, rate=15)
+HALVES = GeometryConfig(layout="side_by_side")
+ONE = V4l2Source(left="/dev/video0", right=None, geometry=HALVES, width=640, height=360, rate=15)
 
 
 def facts(frames: list[StereoFrame]) -> dict[str, Any]:

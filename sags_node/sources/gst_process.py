@@ -1,0 +1,181 @@
+"""The parent's end of `gst_child`: starts it, hears it, and says in words why it failed."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import select
+import socket
+import subprocess
+import sys
+from typing import Any
+
+from sags_node.errors import SagsError
+from sags_node.processes import end
+from sags_node.sources.gst_child import START
+
+ASK_S = 30.0  # for the list of elements: the first time, GStreamer looks through all its plugins
+GRACE_S = 1.0  # for the process to end by itself
+LONGEST_MESSAGE = 1 << 16  # bytes
+KEPT = 2000  # bytes of what plugins print
+PLAIN, GOOD, BAD = (f"gstreamer1.0-plugins-{name}" for name in ("base", "good", "bad"))
+ELEMENTS = {  # what the launch files use, and the Debian package that brings it
+    "appsink": PLAIN,
+    "videoconvert": PLAIN,
+    "videotestsrc": PLAIN,
+    "decodebin": PLAIN,
+    "deinterlace": GOOD,
+    "videocrop": GOOD,
+    "v4l2src": GOOD,
+    "rtspsrc": GOOD,
+    "h264parse": BAD,
+    "decklinkvideosrc": BAD,
+    "unixfdsrc": f"{BAD} of GStreamer 1.24",
+    "avdec_h264": "gstreamer1.0-libav",
+}
+SEE_PLACE = "see to the path, address or device in the launch string"
+SEE_STRING = "try the string with gst-launch-1.0; gst-inspect-1.0 ELEMENT lists what an element takes"
+MENDS = (  # what GStreamer says, and what helps
+    (r"no element \"(\w+)\"", "install {package}"),
+    (r"not-negotiated|could not link|can't handle caps", "neighbours do not agree on format, size or rate"),
+    (r"busy|in use", "another program uses it"),
+    (r"No such|not found|Could not (open|connect|resolve|read)|Cannot identify", SEE_PLACE),
+    (r"syntax error|unexpected|no property|could not set property|erroneous", SEE_STRING),
+    (r"plug-?in|no decoder", "install gstreamer1.0-libav, or the plugin it names"),
+)
+
+
+class GstProcess:
+    """A child and its socket.
+
+    Args:
+        request: what it is to do, see `gst_child`.
+    """
+
+    def __init__(self, request: dict[str, Any]) -> None:
+        self._here, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        command = [sys.executable, "-P", "-m", "sags_node.sources.gst_child"]
+        command += [json.dumps(request), str(there.fileno())]
+        self._printed = b""
+        try:
+            self._process = subprocess.Popen(
+                command,
+                pass_fds=[there.fileno()],
+                stdin=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
+                env={"GST_DEBUG": "1", **os.environ, "GST_DEBUG_NO_COLOR": "1"},  # 1: errors
+            )
+        finally:
+            there.close()
+        assert self._process.stderr is not None
+        self._stderr = self._process.stderr.fileno()
+        os.set_blocking(self._stderr, False)
+        self._events = select.poll()
+        self._events.register(self._here, select.POLLIN)
+        self._events.register(self._stderr, select.POLLIN)
+
+    def hear(self, seconds: float) -> tuple[dict[str, Any], list[int]] | None:
+        """The next message and the descriptors with it; None when none comes in time.
+
+        Raises:
+            SagsError: it has failed.
+        """
+        for descriptor, _ in self._events.poll(seconds * 1e3):
+            if descriptor == self._stderr:
+                self._keep()
+            else:
+                message, descriptors, _, _ = socket.recv_fds(self._here, LONGEST_MESSAGE, 1)
+                if not message:
+                    raise SagsError(self._last_words())
+                said = json.loads(message)
+                if "error" in said:
+                    self._keep()
+                    raise SagsError(in_words(said["error"], said["debug"] or self._logged()))
+                return said, descriptors
+        return None
+
+    def start(self) -> None:
+        """Play a file from its first picture on; live pipelines play anyway."""
+        self._tell(START)
+
+    def give_back(self, sink: int, slot: int) -> None:
+        """A picture has been copied."""
+        self._tell(bytes((sink, slot)))
+
+    def _tell(self, message: bytes) -> None:
+        try:
+            self._here.send(message)
+        except OSError:
+            pass  # it has ended; `hear` says why
+
+    def close(self) -> None:
+        self._here.close()
+        end(self._process, GRACE_S)
+        assert self._process.stderr is not None
+        self._process.stderr.close()
+
+    def _keep(self) -> None:
+        """What plugins print: a pipe that is full would stop them."""
+        try:
+            printed = os.read(self._stderr, LONGEST_MESSAGE)
+        except BlockingIOError:
+            return
+        if not printed:
+            self._events.unregister(self._stderr)
+        self._printed = (self._printed + printed)[-KEPT:]
+
+    def _logged(self) -> str:
+        """The last error in its log, for elements that tell nobody else; empty where there is none."""
+        found = re.findall(r" ERROR .*?:<(\S+)> (.*)", self._printed.decode(errors="replace"))
+        return ": ".join(found[-1]) if found else ""
+
+    def _last_words(self) -> str:
+        """Of a child that ended without a message."""
+        ended = end(self._process, GRACE_S)
+        self._keep()
+        lines = self._printed.decode(errors="replace").strip().splitlines()
+        said = f": {lines[-1].strip()}" if lines else ""
+        code = self._process.returncode if ended else None
+        how = f"was ended by signal {-code}" if code is not None and code < 0 else "ended"
+        return f"GStreamer: its process {how}{said}"
+
+
+def in_words(message: str, debug: str) -> str:
+    """One line for a person: what failed, in which element, and what helps.
+
+    Args:
+        message: the text of the error.
+        debug: its further text: where in the source, the element's path, and lines of detail.
+    """
+    path = re.search(r"/GstPipeline:\S*?:(\w+):?\s*$", debug, re.MULTILINE)
+    detail = debug.strip().splitlines()[-1].strip() if debug.strip() else ""
+    is_place = bool(path and path[0].strip() in detail)
+    said = message.strip().rstrip(".")
+    where = f"{path[1]}: " if path else ""
+    more = "" if is_place or not detail or detail in said else f" ({detail.rstrip('.')})"
+    for pattern, mend in MENDS:
+        found = re.search(pattern, f"{said} {detail}", re.IGNORECASE)
+        if found is not None:
+            named = found[1] if "{" in mend else ""
+            help = mend.format(package=ELEMENTS.get(named, "the plugin that has it"))
+            return f"GStreamer: {where}{said}{more}; {help}"
+    return f"GStreamer: {where}{said}{more}"
+
+
+def installed() -> tuple[str, dict[str, str]]:
+    """GStreamer's version, and those of `ELEMENTS` that are missing with the packages that bring them.
+
+    Raises:
+        SagsError: GStreamer is not installed, or does not answer.
+    """
+    child = GstProcess({"elements": list(ELEMENTS)})
+    try:
+        heard = None
+        for _ in range(10):
+            heard = heard or child.hear(ASK_S / 10)
+    finally:
+        child.close()
+    if heard is None:
+        raise SagsError(f"GStreamer does not answer within {ASK_S:g} s")
+    return heard[0]["version"], {name: ELEMENTS[name] for name in heard[0]["missing"]}

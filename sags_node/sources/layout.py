@@ -1,0 +1,131 @@
+"""From pictures as a device or file gives them to those of the two eyes, as `source.geometry` says."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+import cv2
+import numpy as np
+
+from sags_node.config import Box, GeometryConfig
+from sags_node.errors import UsageError
+from sags_node.types import U8, Samples, Side
+
+if TYPE_CHECKING:
+    from sags_node.sources.tones import Tones
+
+
+_FLIPS = {"horizontal": 1, "vertical": 0, "both": -1}  # OpenCV's codes
+FIELD_ROWS = {"top": 0, "bottom": 1}
+
+
+class Layout:
+    """Takes both eyes of a picture apart, then keeps one field, crops and turns each eye; leaves eight bits.
+
+    Args:
+        config: `source.geometry`.
+    """
+
+    def __init__(self, config: GeometryConfig) -> None:
+        self._config = config
+        self._crops = {"left": config.crop, "right": config.crop_right or config.crop}
+        self._tones: Tones | None = None  # for the depth of the last picture
+        self.is_sequential = config.layout == "frame_sequential"
+        self.shows_both = config.layout not in ("separate", "frame_sequential")
+        self.order: tuple[Side, Side] = ("right", "left") if config.first == "right" else ("left", "right")
+
+    def size(self, width: int, height: int, name: str) -> tuple[int, int]:
+        """Width and height of an eye's picture, from those of what `name` delivers, px.
+
+        Raises:
+            UsageError: it cannot be split or cropped as asked.
+        """
+        layout = self._config.layout
+        if layout == "side_by_side" and width % 2:
+            raise UsageError(f"{name} is {width} px wide, which is odd: it cannot hold two eyes side by side")
+        if layout in ("over_under", "row_interleaved") and height % 2:
+            raise UsageError(f"{name} is {height} px high, which is odd: it cannot hold two eyes, {layout}")
+        if layout == "side_by_side":
+            width //= 2
+        elif layout in ("over_under", "row_interleaved"):
+            height //= 2
+        sizes = [_cropped(width, height, crop, name) for crop in self._crops.values()]
+        if sizes[0] != sizes[1]:
+            raise UsageError(
+                f"source.geometry.crop is {sizes[0][0]}x{sizes[0][1]} px but crop_right "
+                f"{sizes[1][0]}x{sizes[1][1]}; both eyes need one size"
+            )
+        return sizes[0]
+
+    def eye(self, picture: Samples, side: Side) -> U8:
+        """The picture [H, W, 3] of one eye; the argument itself where there is nothing to do."""
+        return self._finish(picture, 0, side)
+
+    def eyes(self, picture: Samples) -> tuple[U8, U8]:
+        """Left and right of a picture [H, W, 3] that shows both; views of it where that does."""
+        of = dict(zip(self.order, self._apart(picture), strict=True))
+        return self._finish(*of["left"], "left"), self._finish(*of["right"], "right")
+
+    def _apart(self, picture: Samples) -> tuple[tuple[Samples, int], tuple[Samples, int]]:
+        """First and second eye, as views, and in which row of the picture each begins."""
+        height, width = picture.shape[:2]
+        match self._config.layout:
+            case "side_by_side":
+                return (picture[:, : width // 2], 0), (picture[:, width // 2 :], 0)
+            case "over_under":
+                return (picture[: height // 2], 0), (picture[height // 2 :], height // 2)
+            case _:
+                return (picture[0::2], 0), (picture[1::2], 1)
+
+    def _finish(self, picture: Samples, row: int, side: Side) -> U8:
+        crop, flip, keep = self._crops[side], self._config.flip, self._config.deinterlace
+        if keep != "none":
+            picture = _one_field(picture, (FIELD_ROWS[keep] - row) % 2)
+        if crop is not None:
+            x, y, w, h = crop
+            picture = picture[y : y + h, x : x + w]
+        if flip != "none":
+            picture = cv2.flip(picture, _FLIPS[flip])
+        return self._eight_bits(picture)
+
+    def _eight_bits(self, picture: Samples) -> U8:
+        if picture.dtype == np.uint8 and self._config.levels == (0.0, 1.0):
+            return np.ascontiguousarray(picture, np.uint8)
+        from sags_node.sources.tones import Tones  # a kernel: other pictures need no place for one
+
+        if self._tones is None or self._tones.dtype != picture.dtype:
+            self._tones = Tones(self._config.levels, picture.dtype)
+        return self._tones(picture)
+
+
+def side_by_side(order: Literal["LR", "RL"]) -> Layout:
+    """Both eyes in the halves of a picture; LR: the left one in the left half."""
+    return Layout(GeometryConfig(layout="side_by_side", first="left" if order == "LR" else "right"))
+
+
+def _cropped(width: int, height: int, crop: Box | None, name: str) -> tuple[int, int]:
+    if crop is None:
+        return width, height
+    x, y, w, h = crop
+    if x + w > width or y + h > height:
+        raise UsageError(
+            f"source.geometry: the box {list(crop)} (x, y, width, height) leaves the picture: an eye "
+            f"of {name} is {width}x{height} px"
+        )
+    return w, h
+
+
+def _one_field(picture: Samples, first_row: int) -> Samples:
+    """Every other row, and between them the mean of both neighbours; at the edge, the only neighbour."""
+    field = picture[first_row::2]
+    whole = np.empty_like(picture)
+    whole[first_row::2] = field
+    between = whole[1 - first_row :: 2]
+    inside = cv2.addWeighted(field[:-1], 0.5, field[1:], 0.5, 0.0)
+    before = 1 if first_row else 0  # missing rows above the first row of the field
+    between[before : before + len(inside)] = inside
+    if first_row:
+        between[0] = field[0]
+    if len(between) > before + len(inside):
+        between[-1] = field[-1]
+    return whole

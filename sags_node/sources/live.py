@@ -1,0 +1,280 @@
+"""Live stereo: keeps what delivers pictures open, takes the eyes apart, and pairs them by their stamps.
+
+Cameras come and go: what fails or falls silent is closed and opened again, until `stop`.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from types import TracebackType
+from typing import NamedTuple, Protocol, Self
+
+from sags_node.config import GeometryConfig
+from sags_node.errors import SagsError, UsageError
+from sags_node.sources.device import Picture, Shot
+from sags_node.sources.layout import Layout
+from sags_node.sources.pairing import Alternation, Pairing
+from sags_node.types import Side, StereoFrame
+
+log = logging.getLogger(__name__)
+
+POLL_S = 0.1  # how soon a reading thread notices `stop`
+CLOSE_S = 5.0  # a driver may take to give a reading thread back
+FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 5.0  # between attempts to open a device again
+
+
+class EndedError(Exception):
+    """There are no more pictures, and there is nothing to wait for: a file was played to its end."""
+
+
+class CaptureDevice(Protocol):
+    """What delivers pictures.
+
+    Attributes:
+        rate: pictures per second.
+        size: of a picture, width and height, px.
+    """
+
+    rate: float
+    size: tuple[int, int]
+
+    def read(self, timeout: float) -> Shot | None:
+        """The next picture; None when none comes within `timeout` seconds.
+
+        Raises:
+            SagsError: it is lost, and should be opened again.
+            EndedError: it was a file.
+        """
+
+    def close(self) -> None: ...
+
+
+class Input(NamedTuple):
+    """One device of a live source."""
+
+    name: str
+    side: Side | None  # whose pictures it delivers; None: both eyes'
+    open: Callable[[], CaptureDevice]
+    deadline: float  # s without a picture before it is opened again
+
+
+class LiveStereo:
+    """A `Source` of live stereo frames.
+
+    `frame_id` counts the left eye's pictures, so a left picture that found no partner leaves a gap. `epoch`
+    grows when the wall clock is set back.
+
+    Args:
+        inputs: one that delivers both eyes, or one for each.
+        geometry: how pictures become those of the eyes.
+        tolerance_ms: how far apart the stamps of a pair may be.
+        size: width and height that an eye's pictures must have, px; None: as they come.
+
+    Raises:
+        UsageError: the pictures do not fit `geometry` or `size`.
+        SagsError: a device is missing or cannot be opened.
+    """
+
+    frame_count: int | None = None
+
+    def __init__(
+        self,
+        inputs: Sequence[Input],
+        geometry: GeometryConfig,
+        tolerance_ms: float,
+        size: tuple[int, int] | None = None,
+    ) -> None:
+        self._stopped = threading.Event()
+        self._ended = False
+        self._arrived = threading.Condition()
+        self._pairing = Pairing(round(tolerance_ms * 1e6))
+        self._layout = Layout(geometry)
+        self._size = size
+        self._alternation: Alternation | None = None
+        self._readers: list[DeviceReader] = []
+        try:
+            for one in inputs:
+                opened = self._checked(one)
+                self._readers.append(DeviceReader(one, self._checked, opened, self._put, self._stopped))
+        except SagsError:
+            self._close()
+            raise
+        self.rate = self._readers[0].rate
+        if self._layout.is_sequential:
+            self._alternation = Alternation(1e9 / self.rate)
+            self.rate /= 2
+            log.warning(
+                "source.geometry.layout frame_sequential: nothing tells which eye the first picture shows; "
+                "look at them with sags calib live, and exchange them with source.geometry.first"
+            )
+
+    @property
+    def dropped(self) -> int:
+        """Pictures of either eye that found no partner."""
+        return self._pairing.unpaired + (self._alternation.alone if self._alternation else 0)
+
+    def __enter__(self) -> Self:
+        for reader in self._readers:
+            reader.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+        self._close()
+
+    def _close(self) -> None:
+        for reader in self._readers:
+            reader.close()
+
+    def stop(self) -> None:
+        """End the iteration; any thread may call this."""
+        with self._arrived:
+            self._stopped.set()
+            self._arrived.notify_all()
+
+    def __iter__(self) -> Iterator[StereoFrame]:
+        """Pairs as they arrive, until `stop` or the end of a file; silent while a camera is away."""
+        epoch, last_ns = 0, 0
+        while True:
+            with self._arrived:
+                while (pair := self._pairing.take()) is None and not (self._stopped.is_set() or self._ended):
+                    self._arrived.wait(POLL_S)
+            if pair is None or self._stopped.is_set():
+                return
+            frame_id, left, right = pair
+            epoch += left.t_ns < last_ns
+            last_ns = left.t_ns
+            yield StereoFrame(frame_id, left.t_ns, right.t_ns, left.image, right.image, epoch)
+
+    def _checked(self, one: Input) -> CaptureDevice:
+        """Open a device whose pictures have the right size: those of the rig, or as they were at first."""
+        device = one.open()
+        try:
+            size = self._layout.size(*device.size, one.name)
+            if self._size is not None and self._size != size:
+                raise UsageError(
+                    f"{one.name}: the pictures of an eye are {size[0]}x{size[1]} px but should be "
+                    f"{self._size[0]}x{self._size[1]}, as the calibration and the other eye are; set the "
+                    "size at the source, or source.geometry.crop"
+                )
+        except SagsError:
+            device.close()
+            raise
+        self._size = size
+        return device
+
+    def _put(self, picture: Shot | None, side: Side | None) -> None:
+        """Take a picture in; None: there are no more."""
+        if picture is None:
+            with self._arrived:
+                self._ended = True
+                self._arrived.notify_all()
+            return
+        side = picture.side or side
+        if side is not None:
+            eye = Picture(picture.t_ns, self._layout.eye(picture.image, side))
+            with self._arrived:
+                (self._pairing.add_left if side == "left" else self._pairing.add_right)(eye)
+                self._arrived.notify_all()
+        elif (pair := self._both(picture)) is not None:
+            with self._arrived:
+                self._pairing.add_pair(*pair)
+                self._arrived.notify_all()
+
+    def _both(self, picture: Shot) -> tuple[Picture, Picture] | None:
+        """Left and right of an input that shows both, once they are there."""
+        if self._alternation is None:
+            images = self._layout.eyes(picture.image)
+            return Picture(picture.t_ns, images[0]), Picture(picture.t_ns, images[1])
+        joined = self._alternation.add(picture)
+        if joined is None:
+            return None
+        of = dict(zip(self._layout.order, joined, strict=True))
+        left, right = (Picture(of[side].t_ns, self._layout.eye(of[side].image, side)) for side in SIDES)
+        return left, right
+
+
+SIDES: tuple[Side, Side] = ("left", "right")
+
+
+class DeviceReader:
+    """Keeps one device read in a thread of its own, and opens it again whenever it is lost."""
+
+    def __init__(
+        self,
+        one: Input,
+        open_device: Callable[[Input], CaptureDevice],
+        device: CaptureDevice,
+        put: Callable[[Shot | None, Side | None], None],
+        stopped: threading.Event,
+    ) -> None:
+        self._input = one
+        self._open_device = open_device
+        self._device: CaptureDevice | None = device
+        self._put = put
+        self._stopped = stopped
+        self._thread = threading.Thread(target=self._run, name=f"read {one.name}", daemon=True)
+        self.rate = device.rate
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def close(self) -> None:
+        """Wait for the thread, which `stopped` ends, and close the device."""
+        if self._thread.ident is not None:
+            self._thread.join(CLOSE_S)
+        if self._thread.is_alive():  # to close a device under its reader would crash
+            log.warning(
+                "%s: its driver does not answer; it is left open until this process ends", self._input.name
+            )
+            return
+        self._close_device()
+
+    def _close_device(self) -> None:
+        if self._device is not None:
+            self._device.close()
+            self._device = None
+
+    def _run(self) -> None:
+        pause = FIRST_PAUSE_S
+        while not self._stopped.is_set():
+            if self._device is not None:
+                try:
+                    if self._read_until_lost(self._device) > 0:
+                        pause = FIRST_PAUSE_S
+                except EndedError:
+                    self._put(None, None)
+                    return
+                self._close_device()
+            if self._stopped.wait(pause):
+                return
+            pause = min(2 * pause, LONGEST_PAUSE_S)
+            try:
+                self._device = self._open_device(self._input)
+                log.warning("%s is open again", self._input.name)
+            except SagsError as error:
+                log.warning("%s; next attempt in %.1f s", error, pause)
+
+    def _read_until_lost(self, device: CaptureDevice) -> int:
+        """Hand on pictures until the device fails or falls silent, or `stopped`; how many there were."""
+        count, name, deadline = 0, self._input.name, self._input.deadline
+        last = time.monotonic()
+        while not self._stopped.is_set():
+            try:
+                picture = device.read(min(POLL_S, deadline))
+            except SagsError as error:
+                log.warning("%s; it will be opened again", error)
+                break
+            if picture is not None:
+                self._put(picture, self._input.side)
+                count += 1
+                last = time.monotonic()
+            elif time.monotonic() - last > deadline:
+                log.warning("%s: no new picture for %g s; it will be opened again", name, deadline)
+                break
+        return count

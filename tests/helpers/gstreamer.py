@@ -1,0 +1,55 @@
+"""GStreamer on this machine: is it there, and files that it can play to the pixel."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sags_node.errors import SagsError
+from sags_node.sources.gst_process import installed
+
+NEEDED = ("appsink", "videoconvert", "videotestsrc", "deinterlace")
+
+
+def need_gstreamer() -> None:
+    """Skip where the packages of the Makefile's DEBIAN_TESTS are missing."""
+    try:
+        version, missing = installed()
+    except SagsError as error:
+        pytest.skip(str(error))
+    absent = [name for name in NEEDED if name in missing]
+    if absent:
+        pytest.skip(f"{version} has no {', '.join(absent)}; install gstreamer1.0-plugins-{{base,good}}")
+
+
+def raw_file(file: Path, pictures: np.ndarray, rate: int, interlaced: bool = False) -> str:
+    """Write pictures [T, H, W, 3] (or gray [T, H, W] uint16) and return the launch string that plays them."""
+    height, width = pictures.shape[1:3]
+    rows = np.ascontiguousarray(pictures).view(np.uint8).reshape(len(pictures), height, -1)
+    padding = -rows.shape[2] % 4  # GStreamer's rows end at multiples of 4 bytes
+    file.write_bytes(np.pad(rows, ((0, 0), (0, 0), (0, padding))).tobytes())
+    kind = "gray16-le" if pictures.dtype == np.uint16 else "rgb"
+    fields = "interlaced=true top-field-first=true" if interlaced else ""
+    return (
+        f"filesrc location={file} ! rawvideoparse format={kind} width={width} height={height} "
+        f"framerate={rate}/1 {fields}"
+    )
+
+
+def pipelines() -> list[int]:
+    """Process ids of the pipelines that this process runs."""
+    found = []
+    for task in Path("/proc/self/task").iterdir():
+        for child in (task / "children").read_text().split():
+            if b"gst_child" in Path(f"/proc/{child}/cmdline").read_bytes():
+                found.append(int(child))
+    return found
+
+
+def kill_pipelines() -> None:
+    for process in pipelines():
+        os.kill(process, signal.SIGKILL)

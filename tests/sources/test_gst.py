@@ -1,0 +1,351 @@
+"""Live pictures from the real GStreamer: pairs, lag, death and return, mistakes; split to the pixel."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from gstreamer import kill_pipelines, need_gstreamer, pipelines, raw_file
+from pydantic import ValidationError
+from waiting import until
+
+from sags_node.config import GeometryConfig, GstSource, LaunchConfig
+from sags_node.doctor import examine
+from sags_node.errors import SagsError, UsageError
+from sags_node.sources import gst_child, gst_library
+from sags_node.sources.gst import Sink, open_pipeline
+from sags_node.sources.gst_process import GstProcess, in_words
+from sags_node.sources.pairing import QUEUE_LENGTH
+from sags_node.types import StereoFrame
+
+pytestmark = pytest.mark.live
+
+CAMERA = (
+    "videotestsrc is-live=true pattern=ball "
+    "! video/x-raw,format=RGB,width={width},height={height},framerate=30/1"
+)
+SMALL = CAMERA.format(width=320, height=240)
+# The right eye sees the mirrored picture: a pair that is none would not fit.
+TWO_EYES = "{camera} ! tee name=t  t. ! left.  t. ! queue ! {more} videoflip video-direction=horiz ! right."
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _gstreamer() -> None:
+    need_gstreamer()
+
+
+@pytest.fixture(autouse=True)
+def _no_pipeline_is_left() -> Iterator[None]:
+    yield
+    until(lambda: not pipelines(), 10)
+
+
+def two_eyes(camera: str = SMALL, more: str = "", **said: Any) -> GstSource:
+    return GstSource(launch=TWO_EYES.format(camera=camera, more=more), **said)
+
+
+def take(config: GstSource, count: int, **said: Any) -> tuple[list[StereoFrame], list[int]]:
+    """Frames, and when each came."""
+    frames, came = [], []
+    with open_pipeline(config, **said) as source:
+        timer = threading.Timer(30.0, source.stop)
+        timer.daemon = True
+        timer.start()
+        for frame in source:
+            frames.append(frame)
+            came.append(time.time_ns())
+            if len(frames) == count:
+                break
+        timer.cancel()
+    return frames, came
+
+
+# ---- live ------------------------------------------------------------------------------------------------
+
+
+def test_no_pair_is_mismatched_also_where_pictures_are_lost() -> None:
+    """2 x 1280x1024 at 30 Hz; a quarter of the right pictures is lost."""
+    camera = CAMERA.format(width=1280, height=1024)
+    lossy = "identity drop-probability=0.25 !"
+    config = two_eyes(camera, more=f"{lossy} queue !")
+    frames, came = take(config, 45, size=(1280, 1024))
+    for frame in frames:
+        assert frame.right is not None and (frame.left == frame.right[:, ::-1]).all()
+        assert frame.t_capture_ns == frame.t_capture_right_ns
+    assert any((a.left != b.left).any() for a, b in pairwise(frames))  # the ball moves
+    steps = np.diff([frame.t_capture_ns for frame in frames]) * 30e-9  # camera periods
+    assert (steps > 0.9).all() and np.abs(steps - np.round(steps)).max() < 0.1  # the camera's clock, not ours
+    assert frames[-1].frame_id - frames[0].frame_id >= 44  # gaps where a left picture found no partner
+    ages = np.array(came) - [frame.t_capture_ns for frame in frames]
+    assert (ages >= 0).all() and np.median(ages) < 1e9
+
+
+def test_a_stalled_mapper_meets_no_old_pictures() -> None:
+    """Three seconds are 90 pictures. What waits in all places together is a fraction of a second."""
+    frames, ages = [], []
+    with open_pipeline(two_eyes()) as source:
+        for frame in source:
+            ages.append((time.time_ns() - frame.t_capture_ns) * 1e-9)
+            frames.append(frame)
+            if len(frames) == 10 + QUEUE_LENGTH:
+                break
+            if len(frames) == 8:
+                time.sleep(3.0)
+    assert max(ages[8:]) < 1.0
+    assert source.dropped > 60  # in pairs or single pictures: they were not kept
+
+
+def test_a_killed_pipeline_is_back_within_five_seconds(caplog: pytest.LogCaptureFixture) -> None:
+    frames: list[StereoFrame] = []
+    with open_pipeline(two_eyes()) as source:
+
+        def keep() -> None:
+            frames.extend(source)
+
+        taking = threading.Thread(target=keep)
+        taking.start()
+        until(lambda: len(frames) > 5)
+        killed = time.monotonic()
+        kill_pipelines()
+        before = time.time_ns()
+        until(lambda: frames[-1].t_capture_ns > before + 500_000_000, 30)
+        assert time.monotonic() - killed < 5.0
+        source.stop()
+        taking.join(10)
+        assert not taking.is_alive()
+    assert "its process was ended by signal 9" in caplog.text and "GStreamer is open again" in caplog.text
+    stamps = [frame.t_capture_ns for frame in frames]
+    assert all(b > a for a, b in pairwise(stamps))
+    assert [frame.epoch for frame in frames] == [0] * len(frames)
+
+
+def test_an_eye_that_falls_silent_starts_it_again(caplog: pytest.LogCaptureFixture) -> None:
+    """`eos-after` ends one eye's branch; the other goes on."""
+    right = f"{SMALL} ! identity eos-after=10"
+    config = GstSource(left=SMALL, right=right, deadline=0.5, pair_tolerance_ms=17)
+    with open_pipeline(config) as source:
+        taking = threading.Thread(target=lambda: list(source))
+        taking.start()
+        until(lambda: "GStreamer is open again" in caplog.text)
+        source.stop()
+        taking.join(10)
+    assert "no new picture of right for 0.5 s" in caplog.text
+
+
+def test_a_camera_that_ends_comes_again(caplog: pytest.LogCaptureFixture) -> None:
+    camera = SMALL.replace("videotestsrc", "videotestsrc num-buffers=15")
+    frames, _ = take(two_eyes(camera), 25)
+    assert len(frames) == 25
+    assert "the stream has ended" in caplog.text
+
+
+# ---- mistakes --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("left", "words"),
+    [
+        ("unheardsrc", 'no element "unheardsrc"; install the plugin that has it'),
+        ("v4l2src device=/dev/none", "v4l2src0: Cannot identify device '/dev/none'"),
+        ("filesrc location=/none ! decodebin", 'filesrc0: Resource not found .No such file "/none"'),
+        ("videotestsrc bogus=1", 'no property "bogus" in element "videotestsrc"; try the string with'),
+        ("videotestsrc ! ! x", "syntax error; try the string with gst-launch-1.0"),
+        ("videotestsrc ! audioconvert", "could not link videotestsrc0 to audioconvert0; neighbours"),
+        ("fakesrc is-live=true", "fakesrc0: Internal data stream error .*not-negotiated.*; neighbours"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_is_said_in_a_line(left: str, words: str) -> None:
+    with pytest.raises(SagsError, match=words) as raised:
+        open_pipeline(GstSource(left=left, right=SMALL))
+    assert "\n" not in str(raised.value)
+
+
+def test_wrong_sizes_are_refused() -> None:
+    with pytest.raises(UsageError, match="are 320x240 px but should be 640x480, as the calibration"):
+        open_pipeline(two_eyes(), size=(640, 480))
+    other = SMALL.replace("width=320", "width=160")
+    with pytest.raises(SagsError, match="left eye's pictures are 320x240 px but the right eye's 160x240"):
+        open_pipeline(GstSource(left=SMALL, right=other))
+    crop = GeometryConfig(crop=(100, 0, 300, 240))
+    with pytest.raises(UsageError, match="leaves the picture: an eye of GStreamer is 320x240"):
+        open_pipeline(two_eyes(geometry=crop))
+
+
+class Unstamped:
+    """Stands for GStreamer: sinks that give pictures without a stamp."""
+
+    def bin_get_by_name(self, pipeline: int, name: bytes) -> int:
+        return 1
+
+    def app_sink_try_pull_preroll(self, element: int, wait_ns: int) -> int:
+        return 1
+
+    def picture(self, sample: int) -> gst_library.Picture:
+        return gst_library.Picture(gst_library.NONE, gst_library.NONE, 9216)
+
+
+def test_pictures_without_stamps_are_refused() -> None:
+    sink = gst_child.Sink(Unstamped(), 1, gst_child.WallClock(), "left", 0, None)
+    with pytest.raises(gst_library.GstError, match="pictures of left carry no time stamp") as raised:
+        sink.show_first()
+    assert "add do-timestamp=true" in in_words(str(raised.value), raised.value.debug)
+
+
+def test_stamps_that_do_not_rise_are_left_out(caplog: pytest.LogCaptureFixture) -> None:
+    said = {"slot": 0, "t_ns": 0, "age_ns": 0}
+    sink = Sink("left")
+    sink.running_ns = 5
+    assert sink.take({**said, "running_ns": 5}) is None
+    assert sink.take({**said, "running_ns": 4}) is None
+    assert caplog.text.count("the stamps of left do not rise") == 1
+
+
+def test_pictures_that_come_late_are_told_of(caplog: pytest.LogCaptureFixture) -> None:
+    slow = (
+        f"{SMALL} ! queue min-threshold-time=1500000000 max-size-time=0 max-size-bytes=0 max-size-buffers=0"
+    )
+    frames, came = take(two_eyes(slow), 3)
+    assert came[0] - frames[0].t_capture_ns > 1.2e9  # an old picture keeps its old stamp
+    assert "are 1.5 s old when they come" in caplog.text
+
+
+def test_a_source_that_gives_nothing_is_not_waited_for_long() -> None:
+    began = time.monotonic()
+    silent = "appsrc is-live=true caps=video/x-raw,format=RGB,width=64,height=48,framerate=30/1"
+    with pytest.raises(SagsError, match=r"no picture of left and right within 1 s.*source\.start"):
+        open_pipeline(GstSource(left=silent, right=silent, start=1.0))
+    assert time.monotonic() - began < 10
+
+
+@pytest.mark.parametrize(
+    ("said", "words"),
+    [
+        ({}, "name launch"),
+        ({"left": "a"}, "name launch"),
+        ({"launch": "a ! left.", "left": "b"}, "leave left and right out"),
+        ({"launch": "a"}, "needs one branch that ends in '! left.'"),
+        ({"launch": "a ! left.  b ! right.", "geometry": {"layout": "over_under"}}, "launch ends open"),
+        ({"left": "a", "right": "b", "geometry": {"layout": "over_under"}}, "needs launch, one string"),
+    ],
+)
+def test_strings_that_cannot_be_two_eyes_are_refused(said: Any, words: str) -> None:
+    with pytest.raises(ValidationError, match=words):
+        GstSource(**said)
+
+
+def test_a_child_that_crashes_is_told_of() -> None:
+    child = GstProcess({"launch": SMALL, "sinks": []})
+    kill_pipelines()
+    try:
+        with pytest.raises(SagsError, match="its process was ended by signal 9"):
+            for _ in range(100):
+                child.hear(0.1)
+    finally:
+        child.close()
+
+
+def test_what_only_the_log_says_is_said() -> None:
+    said = in_words("the pipeline does not start", "decklinkvideosrc0: Failed to acquire input")
+    assert said == "GStreamer: the pipeline does not start (decklinkvideosrc0: Failed to acquire input)"
+
+
+def test_the_doctor_knows_what_is_installed() -> None:
+    check = next(check for check in examine(LaunchConfig()) if check.name == "GStreamer")
+    assert check.level == "ok" and check.found.startswith("GStreamer 1.")
+
+
+# ---- to the pixel ----------------------------------------------------------------------------------------
+
+
+def pictures(count: int, height: int, width: int) -> np.ndarray:
+    return np.random.default_rng(2).integers(0, 256, (count, height, width, 3), np.uint8)
+
+
+def test_a_file_is_played_to_its_end(tmp_path: Path) -> None:
+    shown = pictures(6, 48, 62)  # rows of 186 bytes, which GStreamer pads
+    left = raw_file(tmp_path / "left.raw", shown, rate=60)
+    right = raw_file(tmp_path / "right.raw", shown[:, ::-1], rate=60)
+    frames, came = take(GstSource(left=left, right=right), 99)
+    assert len(frames) == 6
+    for frame, picture in zip(frames, shown, strict=True):
+        assert (frame.left == picture).all() and (frame.right == picture[::-1]).all()
+    assert came[-1] - came[0] > 4 / 60 * 1e9  # at its own rate
+
+
+def test_interlaced_over_under_in_full_hd(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """1080i: each eye's top field to the pixel, and the rows between from it."""
+    shown = pictures(2, 1080, 1920)
+    launch = raw_file(tmp_path / "both.raw", shown, rate=30, interlaced=True)
+    geometry = GeometryConfig(layout="over_under", deinterlace="top", crop=(320, 14, 1280, 512))
+    frames, _ = take(GstSource(launch=launch, geometry=geometry), 99, size=(1280, 512))
+    assert len(frames) == 2
+    for frame, picture in zip(frames, shown, strict=True):
+        for eye, half in ((frame.left, picture[:540]), (frame.right, picture[540:])):
+            assert eye is not None
+            cut = half[14:527, 320:1600]  # a row more
+            assert (eye[0::2] == cut[0:512:2]).all()
+            mean = (cut[0:512:2].astype(int) + cut[2:513:2]) / 2
+            assert np.abs(eye[1::2] - mean).max() <= 0.5
+    assert "interlaced" not in caplog.text
+
+
+def test_interlaced_pictures_that_nobody_deinterlaces_are_told_of(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    launch = raw_file(tmp_path / "both.raw", pictures(2, 48, 64), rate=30, interlaced=True)
+    take(GstSource(launch=launch, geometry=GeometryConfig(layout="side_by_side")), 99)
+    assert "the pictures are interlaced, so what moves is torn; add ! deinterlace" in caplog.text
+
+
+def test_fields_are_the_eyes(tmp_path: Path) -> None:
+    """Field-sequential stereo: an eye in each field of an interlaced picture."""
+    shown = pictures(3, 48, 64)
+    launch = raw_file(tmp_path / "both.raw", shown, rate=30, interlaced=True)
+    geometry = GeometryConfig(layout="row_interleaved", first="right")
+    frames, _ = take(GstSource(launch=launch, geometry=geometry), 99)
+    assert [f.frame_id for f in frames] == [0, 1, 2]
+    for frame, picture in zip(frames, shown, strict=True):
+        assert (frame.right == picture[0::2]).all() and (frame.left == picture[1::2]).all()
+
+
+def test_eyes_in_turn(tmp_path: Path) -> None:
+    shown = pictures(12, 48, 64)
+    launch = raw_file(tmp_path / "turns.raw", shown, rate=60)
+    geometry = GeometryConfig(layout="frame_sequential")
+    frames, _ = take(GstSource(launch=launch, geometry=geometry), 99)
+    assert len(frames) == 6
+    for n, frame in enumerate(frames):
+        assert (frame.left == shown[2 * n]).all() and (frame.right == shown[2 * n + 1]).all()
+        assert abs(frame.t_capture_right_ns - frame.t_capture_ns - 1e9 / 60) < 1e5
+
+
+def test_sixteen_bit_pictures_keep_the_tones_that_are_chosen(tmp_path: Path) -> None:
+    """Gray of which the scope fills a quarter of the range: 8 bit would leave 64 tones, and here are 256."""
+    ramp = np.linspace(16384, 32768, 64 * 32).astype(np.uint16).reshape(1, 32, 64)
+    launch = raw_file(tmp_path / "deep.raw", np.repeat(ramp, 2, axis=0), rate=30)
+    geometry = GeometryConfig(layout="side_by_side", levels=(0.25, 0.5))
+    frames, _ = take(GstSource(launch=launch, geometry=geometry), 99)
+    both = np.concatenate([frames[0].left, frames[0].right], axis=1)
+    expected = (ramp[0] / 65535 - 0.25) / 0.25 * 255
+    assert np.abs(both - expected[..., None]).max() < 2.0  # what 8 bit would be off, with steps of 4
+    assert len(np.unique(both)) > 250
+
+
+def test_encoded_files_are_decoded(tmp_path: Path) -> None:
+    """As launch/gst_file.yaml does."""
+    smooth = cv2.resize(pictures(1, 6, 8)[0], (320, 240), interpolation=cv2.INTER_CUBIC)
+    writer = cv2.VideoWriter(str(tmp_path / "eye.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 30, (320, 240))
+    for _ in range(5):
+        writer.write(smooth[..., ::-1])
+    writer.release()
+    file = f"filesrc location={tmp_path / 'eye.avi'} ! decodebin"
+    frames, _ = take(GstSource(left=file, right=file), 99)
+    assert len(frames) == 5
+    assert np.abs(frames[0].left.astype(int) - smooth).mean() < 4  # JPEG's loss; exchanged colours: 80

@@ -1,0 +1,253 @@
+"""One geometry for all sources: pictures are split, cropped and turned to the pixel."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from sags_node.config import GeometryConfig, VideosSource
+from sags_node.errors import UsageError
+from sags_node.sources.device import Shot
+from sags_node.sources.layout import Layout
+from sags_node.sources.pairing import Alternation
+from sags_node.sources.replay import Replay
+
+RNG = np.random.default_rng(5)
+LEFT, RIGHT = RNG.integers(0, 256, (2, 24, 32, 3), np.uint8)
+
+
+def layout(**said: Any) -> Layout:
+    return Layout(GeometryConfig(**said))
+
+
+def interleaved(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    rows = np.empty((2 * len(one), *one.shape[1:]), one.dtype)
+    rows[0::2], rows[1::2] = one, other
+    return rows
+
+
+TOGETHER = {
+    "side_by_side": lambda one, other: np.concatenate([one, other], axis=1),
+    "over_under": lambda one, other: np.concatenate([one, other], axis=0),
+    "row_interleaved": interleaved,
+}
+
+
+@pytest.mark.parametrize("kind", TOGETHER)
+@pytest.mark.parametrize("first", ["left", "right"])
+def test_a_picture_of_both_eyes_is_split_to_the_pixel(kind: str, first: str) -> None:
+    eyes = (LEFT, RIGHT) if first == "left" else (RIGHT, LEFT)
+    both = TOGETHER[kind](*eyes)
+    split = layout(layout=kind, first=first)
+    assert split.size(both.shape[1], both.shape[0], "it") == (32, 24)
+    left, right = split.eyes(both)
+    assert (left == LEFT).all() and (right == RIGHT).all()
+    assert left.flags.c_contiguous and right.flags.c_contiguous
+
+
+@pytest.mark.parametrize(
+    ("flip", "turned"),
+    [
+        ("none", lambda p: p),
+        ("horizontal", lambda p: p[:, ::-1]),
+        ("vertical", lambda p: p[::-1]),
+        ("both", lambda p: p[::-1, ::-1]),
+    ],
+)
+def test_each_eye_is_cropped_and_then_turned(flip: str, turned: Any) -> None:
+    split = layout(layout="over_under", crop=(3, 2, 20, 10), crop_right=(5, 1, 20, 10), flip=flip)
+    left, right = split.eyes(TOGETHER["over_under"](LEFT, RIGHT))
+    assert (left == turned(LEFT[2:12, 3:23])).all()
+    assert (right == turned(RIGHT[1:11, 5:25])).all()
+    assert split.size(32, 48, "it") == (20, 10)
+
+
+@pytest.mark.parametrize("height", [24, 23])
+@pytest.mark.parametrize("field", ["top", "bottom"])
+def test_one_field_is_kept_and_the_rows_between_are_means(field: str, height: int) -> None:
+    picture = LEFT[:height]
+    whole = layout(deinterlace=field).eye(picture, "left")
+    for y in range(height):
+        if y % 2 == (field == "bottom"):
+            assert (whole[y] == picture[y]).all()
+        else:
+            around = [picture[k].astype(float) for k in (y - 1, y + 1) if 0 <= k < height]
+            assert np.abs(whole[y] - np.mean(around, axis=0)).max() <= 0.5
+
+
+def test_what_moves_between_the_fields_is_torn_no_more() -> None:
+    """Over-under, interlaced: an edge that moves 6 px from field to field is one straight edge again."""
+    eye = np.zeros((24, 32, 3), np.uint8)
+    eye[0::2, :10] = eye[1::2, :16] = 200
+    left, right = layout(layout="over_under", deinterlace="top").eyes(TOGETHER["over_under"](eye, eye))
+    for picture in (left, right):
+        assert (picture[:, :10] == 200).all() and (picture[:, 10:] == 0).all()
+
+
+def test_the_lower_eye_may_begin_with_the_other_field() -> None:
+    eye = np.zeros((9, 32, 3), np.uint8)
+    both = np.concatenate([eye, eye])
+    both[0::2] = 7  # the first field, of the whole picture
+    for picture in layout(layout="over_under", deinterlace="top").eyes(both):
+        assert (picture == 7).all()
+
+
+@pytest.mark.parametrize("levels", [(0.0, 1.0), (0.25, 0.5)])
+def test_ten_bits_keep_their_tones(levels: tuple[float, float]) -> None:
+    """Counts of 10 bit in 16: between black and white each of 256 tones is there, and right."""
+    counts = np.arange(1024)
+    picture = np.repeat((counts << 6).astype(np.uint16).reshape(32, 32, 1), 3, axis=2)
+    found = layout(levels=levels).eye(picture, "left")[..., 0].ravel()
+    black, white = levels
+    expected = np.clip(255 * ((counts << 6) / 65535 - black) / (white - black), 0, 255)
+    assert np.abs(found - expected).max() <= 0.5 + 1e-9
+    assert len(np.unique(found)) == 256
+
+
+def test_levels_of_eight_bits() -> None:
+    found = layout(levels=(0.2, 0.6)).eye(LEFT, "left")
+    assert np.abs(found - np.clip((LEFT / 255.0 - 0.2) / 0.4 * 255, 0, 255)).max() <= 0.5 + 1e-9
+
+
+def test_nothing_to_do_costs_no_copy() -> None:
+    assert layout().eye(LEFT, "left") is LEFT
+
+
+@pytest.mark.parametrize(
+    ("said", "size", "words"),
+    [
+        ({"layout": "side_by_side"}, (33, 24), "33 px wide, which is odd"),
+        ({"layout": "row_interleaved"}, (32, 25), "25 px high, which is odd"),
+        ({"crop": (10, 0, 30, 24)}, (32, 24), "leaves the picture: an eye of it is 32x24 px"),
+        ({"crop": (0, 0, 8, 8), "crop_right": (0, 0, 8, 9)}, (32, 24), "8x8 px but crop_right 8x9"),
+    ],
+)
+def test_what_does_not_fit_is_refused(said: Any, size: tuple[int, int], words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        layout(**said).size(*size, "it")
+
+
+@pytest.mark.parametrize(
+    ("said", "words"),
+    [
+        ({"layout": "row_interleaved", "deinterlace": "top"}, "leave deinterlace out"),
+        ({"crop": (0, 0, 0, 5)}, "is no box"),
+        ({"levels": (0.5, 0.5)}, "black < white"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(said: Any, words: str) -> None:
+    with pytest.raises(ValidationError, match=words):
+        GeometryConfig(**said)
+
+
+# ---- eyes in turn ----------------------------------------------------------------------------------------
+
+
+def shots(indices: list[int], jitter_ms: float = 0.0) -> list[Shot]:
+    """Pictures of a camera of 60 Hz, by number; even ones are of the first eye."""
+    noise = np.random.default_rng(1).uniform(-jitter_ms, jitter_ms, len(indices))
+    return [
+        Shot(round((1000 / 60 * i + late) * 1e6), np.full((2, 2, 3), i, np.uint8))
+        for i, late in zip(indices, noise, strict=True)
+    ]
+
+
+def pairs_of(indices: list[int], jitter_ms: float = 0.0) -> tuple[list[tuple[int, int]], int]:
+    joining = Alternation(1e9 / 60)
+    found = [pair for shot in shots(indices, jitter_ms) if (pair := joining.add(shot)) is not None]
+    return [(int(a.image[0, 0, 0]), int(b.image[0, 0, 0])) for a, b in found], joining.alone
+
+
+def test_eyes_in_turn_are_paired_in_order() -> None:
+    assert pairs_of(list(range(6)), jitter_ms=4) == ([(0, 1), (2, 3), (4, 5)], 0)
+
+
+def test_a_lost_picture_does_not_exchange_the_eyes() -> None:
+    kept = [i for i in range(20) if i not in (3, 8, 12, 13)]
+    pairs, alone = pairs_of(kept, jitter_ms=4)
+    assert pairs == [(0, 1), (4, 5), (6, 7), (10, 11), (14, 15), (16, 17), (18, 19)]
+    assert alone == 2  # 2 and 9: 3 and 8 are missing
+
+
+# ---- files -----------------------------------------------------------------------------------------------
+
+
+def write_video(file: Path, pictures: np.ndarray) -> None:
+    """Lossless."""
+    height, width = pictures.shape[1:3]
+    writer = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"FFV1"), 20, (width, height))
+    if not writer.isOpened():
+        pytest.skip("OpenCV here cannot write FFV1")
+    for picture in pictures:
+        writer.write(picture[..., ::-1])
+    writer.release()
+
+
+def played(config: VideosSource) -> tuple[list[tuple[np.ndarray, np.ndarray]], float]:
+    with Replay(config) as source:
+        return [(frame.left, frame.right) for frame in source], source.rate
+
+
+SMOOTH = np.stack([cv2.resize(p, (64, 48), interpolation=cv2.INTER_LINEAR) for p in (LEFT, RIGHT)])
+NEAR = 3  # grey levels: RGB in YUV 4:4:4 or BGR0 of the codec
+
+
+def movie(count: int) -> np.ndarray:
+    """[count, 2, 48, 64, 3]: both eyes, another picture each time."""
+    return np.stack([np.roll(SMOOTH, 3 * n, axis=2) for n in range(count)])
+
+
+def test_a_video_of_both_eyes_over_under(tmp_path: Path) -> None:
+    eyes = movie(4)
+    write_video(tmp_path / "both.avi", np.concatenate([eyes[:, 1], eyes[:, 0]], axis=1))
+    geometry = GeometryConfig(layout="over_under", first="right")
+    frames, rate = played(VideosSource(left=tmp_path / "both.avi", geometry=geometry, pace="step"))
+    assert len(frames) == 4 and rate == 20
+    for (left, right), expected in zip(frames, eyes, strict=True):
+        assert np.abs(left.astype(int) - expected[0]).max() <= NEAR
+        assert np.abs(right.astype(int) - expected[1]).max() <= NEAR
+
+
+@pytest.mark.parametrize("start", [0.0, 0.2])
+def test_a_video_of_the_eyes_in_turn(tmp_path: Path, start: float) -> None:
+    eyes = movie(5)
+    write_video(tmp_path / "turns.avi", eyes.reshape(10, 48, 64, 3))
+    geometry = GeometryConfig(layout="frame_sequential")
+    config = VideosSource(left=tmp_path / "turns.avi", geometry=geometry, pace="step", start=start)
+    frames, rate = played(config)
+    assert rate == 10  # pairs a second
+    assert len(frames) == 5 - start * rate
+    for (left, right), expected in zip(frames, eyes[round(start * rate) :], strict=True):
+        assert np.abs(left.astype(int) - expected[0]).max() <= NEAR
+        assert np.abs(right.astype(int) - expected[1]).max() <= NEAR
+
+
+def test_two_videos_are_cropped_alike(tmp_path: Path) -> None:
+    eyes = movie(2)
+    for side, name in enumerate(("left", "right")):
+        write_video(tmp_path / f"{name}.avi", eyes[:, side])
+    geometry = GeometryConfig(crop=(8, 4, 32, 24), flip="both")
+    config = VideosSource(
+        left=tmp_path / "left.avi", right=tmp_path / "right.avi", geometry=geometry, pace="step"
+    )
+    frames, _ = played(config)
+    for found, expected in zip(frames[1], eyes[1], strict=True):
+        assert np.abs(found.astype(int) - expected[4:28, 8:40][::-1, ::-1]).max() <= NEAR
+
+
+def test_a_video_that_cannot_be_split_is_refused(tmp_path: Path) -> None:
+    write_video(tmp_path / "left.avi", movie(2)[:, 0])
+    geometry = GeometryConfig(layout="side_by_side", crop=(0, 0, 64, 48))
+    with pytest.raises(UsageError, match="leaves the picture"):
+        Replay(VideosSource(left=tmp_path / "left.avi", geometry=geometry))
+    with pytest.raises(ValidationError, match="leave right out"):
+        VideosSource(
+            left=tmp_path / "left.avi",
+            right=tmp_path / "left.avi",
+            geometry=GeometryConfig(layout="over_under"),
+        )
