@@ -31,6 +31,7 @@ from sags_node.types import (
 )
 from sags_node.vision.change import StillScene, rms_difference
 from sags_node.vision.depth import DepthChoice, Measured
+from sags_node.vision.lens_watch import LensWatch, OnLenses
 from sags_node.vision.observe import observe
 from sags_node.vision.pair_watch import PairWatch, Verdict
 from sags_node.vision.rectify import Rectifier
@@ -79,6 +80,7 @@ class Pipeline:
         self.anchors = Anchors()
         self._still = StillScene()
         self._eyes = PairWatch()
+        self._lenses = LensWatch()
         self._scene = SceneWatch(moving=vision.pose == "estimate")
         self._is_sound = True  # what was matched last is depth
         self._mapped: FrameResult | None = None  # the last frame that was really mapped
@@ -100,7 +102,7 @@ class Pipeline:
     @property
     def warnings(self) -> Findings:
         """What is wrong and how to mend it. May be read from any thread."""
-        watches = self._eyes, self.depth, self._scene
+        watches = self._eyes, self._lenses, self.depth, self._scene
         found = [finding for watch in watches for finding in watch.findings]
         lost = None if self._tracker is None else self._tracker.lost
         if lost is not None:
@@ -137,6 +139,7 @@ class Pipeline:
             return self._repeated(frame, pair, watch)
         with watch("watch"):
             scene = self._compared(pair, eyes)
+            hidden = self._hidden(pair, eyes, scene)
         if scene.is_new:
             self.reset()
         elif scene.held:
@@ -144,9 +147,10 @@ class Pipeline:
         seen = pair if scene.gain is None else exposed(pair, scene.gain)
         still = self._still_frames(pair)
         with watch("mask"):
-            tissue = self._tissue_in(frame, seen, scene)
+            tissue = self._tissue_in(frame, seen, scene.covered, hidden.left)
         with watch("depth"):
-            measured = self._measured(frame, seen, tissue, still, budget, eyes)
+            seen_by_both = _without(tissue, hidden.right)
+            measured = self._measured(frame, seen, seen_by_both, still, budget, eyes)
             depth, confidence = measured.depth, measured.confidence
             observation = observe(seen, tissue, depth, confidence, self._config.mapping.right_eye)
         if scene.guess is not None:
@@ -199,6 +203,13 @@ class Pipeline:
             return Advice()
         return Advice(eyes.left) if eyes.left else self._scene(pair, self._mapped, not eyes.learn)
 
+    def _hidden(self, pair: RectifiedPair, eyes: Verdict, scene: Advice) -> OnLenses:
+        """What sits on the lenses, where both eyes can be compared."""
+        if self._mapped is None:
+            return OnLenses()
+        sound = eyes.learn and not (eyes.left or eyes.right or scene.held)
+        return self._lenses(pair, self._mapped, sound)
+
     def _held(
         self, frame: StereoFrame, pair: RectifiedPair, watch: Stopwatch, what: str, why: str,
         observation: Observation,
@@ -221,10 +232,12 @@ class Pipeline:
             pair = replace(pair, camera=self.rectifier.camera)
         return self._still(pair)
 
-    def _tissue_in(self, frame: StereoFrame, pair: RectifiedPair, scene: Advice) -> Bool:
+    def _tissue_in(self, frame: StereoFrame, pair: RectifiedPair, *covers: Bool | None) -> Bool:
         drawn = None if self._mapped is None else self._mapped.views["left"]
         tissue = self.tissue(frame, pair, drawn)
-        return tissue if scene.covered is None else tissue & ~enlarged(scene.covered, tissue.shape)
+        for cover in covers:
+            tissue = _without(tissue, cover)
+        return tissue
 
     def _without_mask(self) -> dict[str, str]:
         return {"mask": self.tissue.problem} if self.tissue.problem else {}
@@ -278,6 +291,11 @@ class Pipeline:
     def _draw_model(self, camera: Camera) -> RenderedView:
         """The model as it is now, in the light of a scope that is there."""
         return to_view(self._refiner.show(self.mapper.lit_from(camera), camera), camera, 0, 0)
+
+
+def _without(tissue: Bool, cover: Bool | None) -> Bool:
+    """The mask less what a small mask says is covered."""
+    return tissue if cover is None else tissue & ~enlarged(cover, tissue.shape)
 
 
 class Stopwatch:

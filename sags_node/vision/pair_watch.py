@@ -14,6 +14,7 @@ import numpy as np
 
 from sags_node.kernels.jit import kernel
 from sags_node.types import F32, I64, U8, Finding, RectifiedPair, StereoFrame
+from sags_node.vision.blocks import CompressionWatch
 from sags_node.vision.clarity import LENS, SMOKE, Clarity, mean_difference, structure
 from sags_node.vision.pyramid import pyramids
 from sags_node.vision.standing import Standing
@@ -48,6 +49,10 @@ _UNCLEAR = {
     "blurred": [Finding("picture_blurred", f"the picture is blurred, and is not learnt: {LENS}")],
     "veiled": [SMOKE],
 }
+_COMPRESSED = Finding(
+    "picture_compressed",
+    "the picture is compressed so hard that blocks show: raise the bit rate or the quality of the capture",
+)
 
 
 class Verdict(NamedTuple):
@@ -71,6 +76,7 @@ class PairWatch:
     def __init__(self) -> None:
         self._standing = Standing()
         self._clarity = Clarity()
+        self._compression = CompressionWatch()
         self._history: deque[tuple[F32, F32]] = deque(maxlen=HISTORY)
 
     @property
@@ -81,6 +87,10 @@ class PairWatch:
     def __call__(self, frame: StereoFrame, pair: RectifiedPair) -> Verdict:
         """Take one frame, raw and rectified."""
         found = self._look(frame, pair)
+        learn = not any(code.startswith("picture") for code, _ in found)
+        compression = self._compression(frame.t_capture_ns, frame.left)
+        if compression.is_hard:
+            found = [*found, _COMPRESSED]
         self._standing.update(frame.t_capture_ns, found)
         left = right = ""
         for code, text in found:
@@ -88,7 +98,7 @@ class PairWatch:
                 left = left or text
             if not code.startswith("picture"):
                 right = right or text
-        return Verdict(left, right, not any(code.startswith("picture") for code, _ in found))
+        return Verdict(left, right, learn and compression.is_usual)
 
     def _look(self, frame: StereoFrame, pair: RectifiedPair) -> list[Finding]:
         """What is wrong in one frame."""

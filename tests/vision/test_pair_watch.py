@@ -19,6 +19,7 @@ from sags_node.messaging.content import diagnostics
 from sags_node.pipeline import Pipeline
 from sags_node.session import Session, open_session
 from sags_node.types import U8, StereoFrame
+from sags_node.vision.blocks import is_blocky
 from sags_node.vision.pair_watch import PairWatch, Verdict
 from sags_node.vision.rectify import Rectifier
 
@@ -62,8 +63,9 @@ def _noisy(picture: np.ndarray, sigma: float = 4.0) -> U8:
     return np.clip(picture + noise, 0, 255).round().astype(np.uint8)
 
 
-def _jpeg(picture: U8) -> U8:
-    return cv2.imdecode(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 50])[1], cv2.IMREAD_COLOR)
+def _jpeg(picture: U8, quality: int = 50) -> U8:
+    data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+    return cv2.imdecode(data, cv2.IMREAD_COLOR)
 
 
 def _plain(frame: StereoFrame, color: tuple[int, int, int], sigma: float = 2.0) -> U8:
@@ -192,6 +194,11 @@ LASTING: dict[str, tuple[Callable[[StereoFrame, StereoFrame], StereoFrame], str,
         "picture_smoke",
         Verdict("", "", False),
     ),
+    "both compressed": (
+        lambda f, before: both(lambda picture: _jpeg(picture, 6))(f),
+        "picture_compressed",
+        Verdict("", "", False),
+    ),
 }  # fmt: skip
 
 
@@ -214,6 +221,23 @@ def test_an_eye_is_compared_with_the_other_and_with_a_moment_ago(
         assert codes == ([code] if 14 <= number < 20 else codes)
         if number < 10 or number >= 24:
             assert codes == []
+
+
+def test_what_is_compressed_hard_from_the_first_picture_on_is_learnt(
+    session: Session, moving: list[StereoFrame]
+) -> None:
+    watch, rectify = PairWatch(), Rectifier(session.rig, *session.working_size)
+    for frame in moving[:10]:
+        given = both(lambda picture: _jpeg(picture, 6))(frame)
+        assert watch(given, rectify(given)) == Verdict()
+    assert [finding.code for finding in watch.findings] == ["picture_compressed"]
+
+
+@pytest.mark.parametrize("across", [2, 4])
+def test_a_picture_that_was_enlarged_has_no_blocks(across: int, frames: list[StereoFrame]) -> None:
+    small = np.ascontiguousarray(frames[0].left[::across, ::across])
+    large = small.repeat(across, 0).repeat(across, 1)
+    assert not is_blocky(large) and is_blocky(_jpeg(large, 6))
 
 
 # ---- in the node -----------------------------------------------------------------------------------------

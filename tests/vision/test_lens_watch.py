@@ -1,0 +1,122 @@
+"""A drop on one lens is noticed, held out of the model, and soon over; what both eyes see is no drop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from places import SESSION
+
+from sags_node.findings import by_code
+from sags_node.mapping.budget import StepBudget
+from sags_node.pipeline import Pipeline
+from sags_node.session import Session, open_session
+from sags_node.types import F32, U8, Bool, FrameResult, StereoFrame
+
+FIRST, COUNT, AFTER = 6, 8, 6  # frames, at 10 Hz: before, with a drop, after
+WITHIN = 5  # frames: half a second
+RADIUS = 36  # px of 320
+CENTRE = 180, 130
+
+
+@pytest.fixture(scope="module")
+def session() -> Session:
+    return open_session(SESSION, ["source.pace:=step", "mapping.max_gaussians:=4000"])
+
+
+@pytest.fixture(scope="module")
+def frames(session: Session) -> list[StereoFrame]:
+    with session.source as source:
+        return [frame for frame, _ in zip(source, range(FIRST + COUNT + AFTER), strict=False)]
+
+
+def _disc(shape: tuple[int, ...], radius: float) -> Bool:
+    y, x = np.indices(shape[:2])
+    return np.asarray(np.hypot(x - CENTRE[0], y - CENTRE[1]) < radius)
+
+
+def _wet(picture: U8 | None) -> U8:
+    """Blurred, and turned upside down, as through a drop."""
+    assert picture is not None
+    blurred = cv2.GaussianBlur(picture[::-1, ::-1], (0, 0), 5).astype(np.float32)
+    inside: F32 = cv2.GaussianBlur(_disc(picture.shape, RADIUS).astype(np.float32), (0, 0), 2)
+    return np.asarray(np.rint(picture + inside[..., None] * (blurred - picture)), np.uint8)
+
+
+def _play(
+    session: Session, frames: list[StereoFrame], spoil: Callable[[StereoFrame], StereoFrame]
+) -> tuple[list[FrameResult], list[set[str]]]:
+    pipeline = Pipeline(session.config, session.rig)
+    results, codes = [], []
+    for number, frame in enumerate(frames):
+        given = spoil(frame) if FIRST <= number < FIRST + COUNT else frame
+        results.append(pipeline.process(given, StepBudget(1)))
+        codes.append(set(by_code(pipeline.warnings)))
+    assert pipeline.mapper.restarts == 0
+    return results, codes
+
+
+@pytest.fixture(scope="module")
+def clean(session: Session, frames: list[StereoFrame]) -> list[FrameResult]:
+    results, codes = _play(session, frames, lambda frame: frame)
+    assert not set().union(*codes)
+    return results
+
+
+def test_a_drop_on_the_left_lens_is_no_tissue(
+    session: Session, frames: list[StereoFrame], clean: list[FrameResult]
+) -> None:
+    results, codes = _play(session, frames, lambda frame: replace(frame, left=_wet(frame.left)))
+    assert any("left_eye_drops" in found for found in codes[FIRST : FIRST + WITHIN])
+    assert not set().union(*codes[:FIRST], *codes[FIRST + COUNT + WITHIN :])
+    for i in range(FIRST + 1, FIRST + COUNT):
+        tissue, true = results[i].observation.tissue, clean[i].observation.tissue
+        far = ~_disc(tissue.shape, 2 * RADIUS)
+        assert tissue[_disc(tissue.shape, RADIUS)].mean() < 0.1
+        assert tissue[far].mean() > 0.95 * true[far].mean()
+    truth = frames[FIRST + COUNT - 1].left.astype(np.float32) / 255
+    drawn = results[FIRST + COUNT - 1].views["left"].rgb
+    inner = _disc(truth.shape, 0.7 * RADIUS)
+    wet = _wet(frames[FIRST + COUNT - 1].left).astype(np.float32) / 255
+    assert np.square(drawn - truth)[inner].mean() < 0.5 * np.square(drawn - wet)[inner].mean()
+
+
+def test_where_a_drop_on_the_right_lens_hides_it_no_depth_is_measured(
+    session: Session, frames: list[StereoFrame]
+) -> None:
+    results, codes = _play(session, frames, lambda frame: replace(frame, right=_wet(frame.right)))
+    assert any("right_eye_drops" in found for found in codes[FIRST : FIRST + WITHIN])
+    assert not set().union(*codes[:FIRST], *codes[FIRST + COUNT + WITHIN :])
+    before, now = results[FIRST - 1], results[FIRST + COUNT - 1]
+    camera, baseline = before.observation.camera, before.pair.baseline
+    depth = before.views["left"].depth
+    rows, columns = np.nonzero(depth > 0)
+    there = columns - camera.K[0, 0] * baseline / depth[rows, columns], rows
+    hidden = np.hypot(there[0] - CENTRE[0], there[1] - CENTRE[1]) < 0.8 * RADIUS
+    rows, columns = rows[hidden], columns[hidden]
+    assert len(rows) > 1000
+    assert (before.observation.depth[rows, columns] > 0).mean() > 0.5
+    assert (now.observation.depth[rows, columns] > 0).mean() < 0.1
+    assert now.observation.tissue[rows, columns].mean() > 0.9
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda picture: cv2.blur(picture, (9, 1)),  # it shakes
+        lambda picture: (picture * 0.5).astype(np.uint8),
+    ],
+    ids=["shaken", "darker"],
+)
+def test_what_both_eyes_lose_is_no_drop(
+    change: Callable[[U8], U8], session: Session, frames: list[StereoFrame]
+) -> None:
+    def spoil(frame: StereoFrame) -> StereoFrame:
+        assert frame.right is not None
+        return replace(frame, left=change(frame.left), right=change(frame.right))
+
+    _, codes = _play(session, frames, spoil)
+    assert not {code for found in codes for code in found if code.endswith("drops")}
