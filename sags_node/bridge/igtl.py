@@ -1,7 +1,6 @@
 """Messages of OpenIGTLink (http://openigtlink.org/protocols/v2), version 1 of the header.
 
-pyigtl packs and reads them. Here is what it has not: STATUS, lists without points, and a check of what
-strangers send.
+pyigtl packs and reads them. Here is what it has not: STATUS, and a check of what strangers send.
 """
 
 from __future__ import annotations
@@ -28,6 +27,7 @@ from sags_node.types import F64, U8
 HEADER_BYTES = 58
 MAX_BODY_BYTES = 65536  # of what peers send: requests and points
 OK, NOT_READY = 1, 13  # codes of STATUS
+NONE = "none"  # the name of the point that stands for none
 _HEADER = struct.Struct(">H12s20sIIQQ")
 _BAD_BYTES = (struct.error, ValueError, TypeError, IndexError)  # what pyigtl raises for a stranger's body
 
@@ -45,14 +45,6 @@ class _Status(MessageBase):  # type: ignore[misc]  # pyigtl has no types
         return struct.pack(">Hq20s", self._code, 0, name) + _ascii(self._words).encode() + b"\0"
 
 
-class _Empty(MessageBase):  # type: ignore[misc]
-    """A message of any type without content: a list of no points."""
-
-    def __init__(self, kind: str, seconds: float, device: str) -> None:
-        super().__init__(timestamp=seconds, device_name=device)
-        self._message_type, self._valid_message = kind, True
-
-
 def image(device: str, seconds: float, picture: U8, T_ras_pixel: F64) -> bytes:
     """IMAGE of a picture [H, W, C] uint8; `T_ras_pixel` [4, 4] takes (column, row, 0, 1) to mm."""
     return _packed(ImageMessage(picture[None], T_ras_pixel, "ras", seconds, device))
@@ -66,9 +58,12 @@ def transform(device: str, seconds: float, T: F64) -> bytes:
 def points(
     device: str, seconds: float, places: F64, names: Sequence[str], colors: Sequence[Sequence[int]]
 ) -> bytes:
-    """POINT: named places [N, 3] (mm) with colours RGBA; N may be 0."""
+    """POINT: named places [N, 3] (mm) with colours RGBA; of none, one that cannot be seen.
+
+    A list without points has no body, and receivers pass over it: what they showed would stand.
+    """
     if len(places) == 0:
-        return _packed(_Empty("POINT", seconds, device))
+        places, names, colors = np.zeros((1, 3)), (NONE,), ((0, 0, 0, 0),)
     message = PointMessage(places, list(names), colors, timestamp=seconds, device_name=device)
     message.groups = "SAGS"
     return _packed(message)

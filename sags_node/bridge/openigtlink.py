@@ -91,7 +91,7 @@ def outputs(options: Options) -> list[Output]:
     offered = {
         "picture": Output("Picture", of_node(PICTURE, INFO), often),
         "render": Output("Render", of_node(RENDER, INFO), often),
-        "overlay": Output("Overlay", overlaid, often),
+        "overlay": Output("Overlay", overlaid, often, optional=True),
         "surface": Output("Surface", surface, seldom, pulse=Source(node, POSE)),
         "anchors": Output("Anchors", of_node(ANCHORS), often),
         "camera": Output("LeftCamera", of_node(POSE), often),

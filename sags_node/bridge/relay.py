@@ -40,12 +40,14 @@ class Output:
         period: s between two, at least.
         pulse: for an output with a long period: a small topic of the same sender that comes with every frame.
             Between two of this output only that is asked for, and tells that the sender goes on.
+        optional: it is not missed before it has come once.
     """
 
     name: str
     sources: tuple[Source, ...]
     period: float = 0.0
     pulse: Source | None = None
+    optional: bool = False
 
 
 class Outlet(Protocol):
@@ -155,7 +157,7 @@ class Relay:
             course.shown_ns = course.sent = None
             self._outlet.blank(output, problem)
             course.reason = problem
-        elif course.shown_ns is None and now - course.since > GRACE:
+        elif course.shown_ns is None and not output.optional and now - course.since > GRACE:
             course.reason = problem or "no whole frame came"
 
     def _problem(self, output: Output, course: _Course) -> str | None:
