@@ -14,6 +14,7 @@ from rich.markup import escape
 from sags_node import __version__
 from sags_node.cli.bag import bag
 from sags_node.cli.bench import bench
+from sags_node.cli.bridge import bridge
 from sags_node.cli.calib import calib
 from sags_node.cli.export import export
 from sags_node.cli.launching import (
@@ -217,5 +218,5 @@ def doctor(launch: tuple[str, ...], json_out: bool) -> None:
         raise SagsError("something the node needs is missing; see the mends above")
 
 
-for command in (evaluate, fit, export, bag, bench, calib, overlay, view, topic):
+for command in (evaluate, fit, export, bag, bench, bridge, calib, overlay, view, topic):
     main.add_command(command)

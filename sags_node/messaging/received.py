@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Generic, Self, TypeVar, overload
 
 import msgspec
@@ -14,7 +14,7 @@ from sags_node.errors import UsageError
 from sags_node.geometry import quat_to_matrix
 from sags_node.messaging import cdr, topics
 from sags_node.messaging.stream import check_topic
-from sags_node.messaging.wire import Message, Meta, WireError
+from sags_node.messaging.wire import Buffer, Message, Meta, WireError
 from sags_node.types import F64
 
 
@@ -25,6 +25,7 @@ class Received:
     topic: str  # with the namespace
     meta: Meta
     received_ns: int
+    parts: tuple[Buffer, ...] = field(repr=False, compare=False)  # as they came
 
     @property
     def stamp_ns(self) -> int:
@@ -34,6 +35,10 @@ class Received:
     def age(self, now_ns: int | None = None) -> float:
         """Seconds since what it shows was captured."""
         return ((time.time_ns() if now_ns is None else now_ns) - self.meta.stamp_ns) * 1e-9
+
+    def cdr(self) -> bytes:
+        """The ROS 2 message that came, byte for byte."""
+        return b"".join(self.parts)
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,7 +143,7 @@ def interpret(message: Message, received_ns: int) -> Received:
     Raises:
         WireError: content and description do not fit, or the type is not one of this protocol.
     """
-    head = (message.topic, message.meta, received_ns)
+    head = (message.topic, message.meta, received_ns, message.parts)
     kind = message.meta.type
     if kind == topics.IMAGE:
         return ReceivedImage(*head, array=_image(message))

@@ -188,11 +188,11 @@ def check_endpoint(endpoint: str, config: PublishConfig) -> None:
 def is_local(endpoint: str) -> bool:
     """Whether only this machine can be at the other end."""
     transport, _, address = endpoint.partition("://")
-    return transport == "ipc" or (transport == "tcp" and _is_loopback(address))
+    return transport == "ipc" or (transport == "tcp" and is_loopback(address.rpartition(":")[0].strip("[]")))
 
 
-def _is_loopback(address: str) -> bool:
-    host = address.rpartition(":")[0].strip("[]")
+def is_loopback(host: str) -> bool:
+    """Whether only this machine can reach a server on this address."""
     try:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:

@@ -34,6 +34,7 @@ from sags_node.messaging.wire import WireError
 
 KEPT = 4  # newest messages of a topic, so that topics of one frame can be joined by stamp
 VALID_STATES = ("running", "degraded")  # of the node, in `status`
+_ALWAYS = frozenset({"status"})
 
 
 class _Status(msgspec.Struct):
@@ -54,6 +55,7 @@ class Receiver:
         keys: for a node that wants them.
         clock: of the node's machine, where that is another one; in place of `clock_ns`. While it is not known
             every topic is stale.
+        paused: begin as after `pause`.
 
     Raises:
         UsageError: an unknown topic, or the node wants keys that are not given.
@@ -70,6 +72,7 @@ class Receiver:
         clock_ns: Callable[[], int] = time.time_ns,
         keys: ClientKeys | None = None,
         clock: NodeClock | None = None,
+        paused: bool = False,
     ) -> None:
         wanted = [check_topic(name) for name in dict.fromkeys([*names, "status"])]
         rates = rates or {}
@@ -84,8 +87,8 @@ class Receiver:
         self._arrived = threading.Condition()
         self._wakes: list[Callable[[], None]] = []
         self._stopping = threading.Event()
-        self._paused = threading.Event()
         self._names = {topics.full_name(ns, name): name for name in self._kept}
+        self._asked = _ALWAYS if paused else frozenset(self._kept)
         self._find = partial(find_data, endpoint, ns, run_dir, keys)
         self._resources = ExitStack()  # holds the socket; only the receiver thread uses it once it runs
         self._connect(self._find())
@@ -170,14 +173,18 @@ class Receiver:
             with self._arrived:
                 self._wakes.remove(wake)
 
-    def pause(self) -> None:
-        """Let nothing but `status` come, until `resume`: the node makes and sends nothing else for this
+    def ask(self, names: Iterable[str]) -> None:
+        """Let only these of the topics come, and `status`: the node makes and sends nothing else for this
         client then. Takes effect within `POLL_MS`. Topics with `rates` count nothing as lost."""
-        self._paused.set()
+        self._asked = _ALWAYS | frozenset(names)
+
+    def pause(self) -> None:
+        """Let nothing but `status` come, until `resume` or `ask`."""
+        self.ask(())
 
     def resume(self) -> None:
         """Let everything come again, in the order of the names that were given."""
-        self._paused.clear()
+        self.ask(self._kept)
 
     def _newest(self, name: str) -> Received | None:
         kept = self._kept[name]
@@ -217,11 +224,11 @@ class Receiver:
     # ---- the receiver thread ---------------------------------------------------------------------------
 
     def _connect(self, address: Address) -> None:
-        resources = ExitStack()
-        self._socket, self._watch = resources.enter_context(data_socket(address, list(self._names)))
+        resources, asked = ExitStack(), self._asked
+        prefixes = [full for full, name in self._names.items() if name in asked]
+        self._socket, self._watch = resources.enter_context(data_socket(address, prefixes))
         self._resources.close()
-        self._resources, self._address = resources, address
-        self._is_subscribed = True
+        self._resources, self._address, self._subscribed = resources, address, asked
 
     def _receive_all(self) -> None:
         while not self._stopping.is_set():
@@ -233,13 +240,14 @@ class Receiver:
 
     def _subscribe(self) -> None:
         """As it is asked for now; a socket is used by one thread alone."""
-        wanted = not self._paused.is_set()
-        if wanted != self._is_subscribed:
-            option = zmq.SUBSCRIBE if wanted else zmq.UNSUBSCRIBE
-            for full, name in self._names.items():
-                if name != "status":
-                    self._socket.setsockopt_string(option, full)
-            self._is_subscribed = wanted
+        asked = self._asked
+        if asked == self._subscribed:
+            return
+        for full, name in self._names.items():
+            if (name in asked) != (name in self._subscribed):
+                option = zmq.SUBSCRIBE if name in asked else zmq.UNSUBSCRIBE
+                self._socket.setsockopt_string(option, full)
+        self._subscribed = asked
 
     def _look_for_node(self) -> None:
         """Nothing comes: the node may have been restarted elsewhere, or not let this client in."""

@@ -81,7 +81,7 @@ class Message:
 
     def cdr(self) -> bytes:
         """The parts joined: one ROS 2 CDR message."""
-        return b"".join(bytes(part) for part in self.parts)
+        return b"".join(self.parts)
 
 
 _encoder = msgspec.msgpack.Encoder()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ipaddress
 import re
 import socket
 from collections.abc import Iterator
@@ -14,6 +13,7 @@ import viser
 import websockets.asyncio.server
 
 from sags_node.errors import SagsError, UsageError
+from sags_node.messaging.security import is_loopback
 
 
 class _LocalServer(viser.ViserServer):
@@ -35,7 +35,7 @@ def serving(host: str, port: int, insecure: bool) -> Iterator[tuple[viser.ViserS
         UsageError: `host` is not loopback and `insecure` is not given.
         SagsError: the address cannot be bound.
     """
-    if not _is_loopback(host) and not insecure:
+    if not is_loopback(host) and not insecure:
         raise UsageError(
             f"--host {host} would show the video to all who reach it and obey their clicks, without keys; "
             "leave it out and look from elsewhere through ssh -L, or give --insecure"
@@ -53,13 +53,6 @@ def serving(host: str, port: int, insecure: bool) -> Iterator[tuple[viser.ViserS
     finally:
         with redirect_stdout(StringIO()):
             server.stop()
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return host == "localhost" or ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 def _bindable(host: str, port: int) -> int:

@@ -1,0 +1,149 @@
+"""Messages of OpenIGTLink (http://openigtlink.org/protocols/v2), version 1 of the header.
+
+pyigtl packs and reads them. Here is what it has not: STATUS, and a check of what strangers send.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pyigtl.messages import (
+    CRC64,
+    ImageMessage,
+    MessageBase,
+    PointMessage,
+    PolyDataMessage,
+    StringMessage,
+    TransformMessage,
+)
+
+from sags_node.types import F64, U8
+
+HEADER_BYTES = 58
+MAX_BODY_BYTES = 65536  # of what peers send: requests and points
+OK, NOT_READY = 1, 13  # codes of STATUS
+NONE = "none"  # the name of the point that stands for none
+_HEADER = struct.Struct(">H12s20sIIQQ")
+_BAD_BYTES = (struct.error, ValueError, TypeError, IndexError)  # what pyigtl raises for a stranger's body
+
+
+class _Status(MessageBase):  # type: ignore[misc]  # pyigtl has no types
+    """STATUS: a code, and the words for it."""
+
+    def __init__(self, code: int, words: str, seconds: float, device: str) -> None:
+        super().__init__(timestamp=seconds, device_name=device)
+        self._message_type, self._valid_message = "STATUS", True
+        self._code, self._words = code, words
+
+    def _pack_content(self) -> bytes:
+        name = b"" if self._code == OK else b"not ready"
+        return struct.pack(">Hq20s", self._code, 0, name) + _ascii(self._words).encode() + b"\0"
+
+
+def image(device: str, seconds: float, picture: U8, T_ras_pixel: F64) -> bytes:
+    """IMAGE of a picture [H, W, C] uint8; `T_ras_pixel` [4, 4] takes (column, row, 0, 1) to mm."""
+    return _packed(ImageMessage(picture[None], T_ras_pixel, "ras", seconds, device))
+
+
+def transform(device: str, seconds: float, T: F64) -> bytes:
+    """TRANSFORM of a pose [4, 4], mm."""
+    return _packed(TransformMessage(T, seconds, device))
+
+
+def points(
+    device: str, seconds: float, places: F64, names: Sequence[str], colors: Sequence[Sequence[int]]
+) -> bytes:
+    """POINT: named places [N, 3] (mm) with colours RGBA; of none, one that cannot be seen.
+
+    A list without points has no body, and receivers pass over it: what they showed would stand.
+    """
+    if len(places) == 0:
+        places, names, colors = np.zeros((1, 3)), (NONE,), ((0, 0, 0, 0),)
+    message = PointMessage(places, list(names), colors, timestamp=seconds, device_name=device)
+    message.groups = "SAGS"
+    return _packed(message)
+
+
+def surface(device: str, seconds: float, places: F64, triangles: NDArray[np.int64]) -> bytes:
+    """POLYDATA: corners [N, 3] (mm) and triangles [M, 3]; both may be empty."""
+    polygons = np.insert(triangles, 0, 3, axis=1).ravel().astype(np.uint32)
+    return _packed(PolyDataMessage(points=places, polygons=polygons, timestamp=seconds, device_name=device))
+
+
+def status(device: str, seconds: float, code: int, words: str) -> bytes:
+    """STATUS with a code and its words."""
+    return _packed(_Status(code, words, seconds, device))
+
+
+def string(device: str, seconds: float, words: str) -> bytes:
+    """STRING."""
+    return _packed(StringMessage(_ascii(words), seconds, device))
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """What comes before each message."""
+
+    version: int
+    kind: str
+    device: str
+    body_bytes: int
+    crc: int
+
+
+@dataclass(frozen=True, slots=True)
+class Said:
+    """What a peer sent."""
+
+    kind: str
+    device: str
+    text: str = ""  # of STRING
+    points: tuple[tuple[str, F64], ...] = ()  # of POINT: name, place [3] mm
+
+
+def header(raw: bytes) -> Header | None:
+    """The header in 58 bytes from anybody; None when it is none, or announces too much."""
+    version, kind, device, _, _, body_bytes, crc = _HEADER.unpack(raw)
+    if not 1 <= version <= 3 or body_bytes > MAX_BODY_BYTES:
+        return None
+    try:
+        names = [name.rstrip(b"\0 ").decode("ascii") for name in (kind, device)]
+    except UnicodeDecodeError:
+        return None
+    return Header(version, names[0], names[1], body_bytes, crc)
+
+
+def said(head: Header, body: bytes) -> Said | None:
+    """What a message says, if it is a STRING or a POINT; None for other kinds and for damaged ones."""
+    if head.kind not in ("STRING", "POINT") or CRC64(body) != head.crc:
+        return None
+    message: Any = StringMessage() if head.kind == "STRING" else PointMessage()
+    fields = {
+        "header_version": head.version,
+        "message_type": head.kind,
+        "device_name": head.device,
+        "timestamp": 0.0,
+    }
+    try:
+        message.unpack(fields, body)
+    except _BAD_BYTES:
+        return None
+    if head.kind == "STRING":
+        return Said(head.kind, head.device, text=message.string)
+    places = [np.array(place, np.float64) for place in message.positions]
+    named = zip(message.names, places, strict=True)
+    return Said(head.kind, head.device, points=tuple((n, p) for n, p in named if np.isfinite(p).all()))
+
+
+def _packed(message: MessageBase) -> bytes:
+    return bytes(message.pack())
+
+
+def _ascii(words: str) -> str:
+    """pyigtl cannot pack others, and Slicer shows these."""
+    return words.encode("ascii", "replace").decode()

@@ -1,0 +1,76 @@
+"""A list of named points that a peer keeps, mirrored as anchors: each is pinned where it has come to rest."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from sags_node.types import F64
+
+REST = 0.5  # s that a point must lie still: one that is dragged is sent again and again
+STILL = 0.1  # mm; a point that moves less has not moved
+MOST = 64  # points of a list
+
+
+class Pin(NamedTuple):
+    """Pin this point."""
+
+    name: str
+    place: F64  # [3] mm, as the peer said it
+
+
+class Release(NamedTuple):
+    """Give this anchor back."""
+
+    anchor: int
+
+
+@dataclass(slots=True)
+class _Point:
+    place: F64
+    since: float  # monotonic s; when it was put there
+    asked: bool = False  # for an anchor at that place
+    anchor: int | None = None
+
+
+class Pins:
+    """Compares the list that came with what is pinned; used from one thread."""
+
+    def __init__(self) -> None:
+        self._points: dict[str, _Point] = {}
+
+    def hear(self, points: Iterable[tuple[str, F64]], now: float) -> list[Release]:
+        """The list as it is now; returns what is to be given back, since its point has gone or moved."""
+        listed = dict(list(points)[:MOST])
+        released: list[Release] = []
+        for name in list(self._points):
+            point = self._points[name]
+            if name not in listed or float(np.abs(listed[name] - point.place).max()) > STILL:
+                if point.anchor is not None:
+                    released.append(Release(point.anchor))
+                del self._points[name]
+        for name, place in listed.items():
+            self._points.setdefault(name, _Point(place, now))
+        return released
+
+    def due(self, now: float) -> list[Pin]:
+        """The points that have come to rest; each is said once."""
+        resting = [
+            (name, point)
+            for name, point in self._points.items()
+            if not point.asked and now - point.since >= REST
+        ]
+        for _, point in resting:
+            point.asked = True
+        return [Pin(name, point.place) for name, point in resting]
+
+    def pinned(self, pin: Pin, anchor: int) -> list[Release]:
+        """The anchor of a point; it is given back at once if the point has gone or moved meanwhile."""
+        point = self._points.get(pin.name)
+        if point is None or point.place is not pin.place:
+            return [Release(anchor)]
+        point.anchor = anchor
+        return []

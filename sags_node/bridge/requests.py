@@ -1,0 +1,64 @@
+"""What peers of a bridge ask of the node: one after the other, in the background."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from sags_node.errors import SagsError
+from sags_node.messaging.address import ClientKeys
+from sags_node.messaging.control import ControlClient
+
+MOST_WAITING = 32
+ANSWER_TIME = 2.0  # s
+
+Answer = Callable[[dict[str, Any] | None, str], None]  # the node's answer, or None; and that in words
+
+
+class Requests:
+    """Asks the node; it may be restarted meanwhile.
+
+    Args:
+        control: its control socket; default: its connection file.
+    """
+
+    def __init__(
+        self,
+        control: str | None = None,
+        ns: str = "sags",
+        run_dir: Path | None = None,
+        keys: ClientKeys | None = None,
+    ) -> None:
+        self._where = (control, ns, run_dir, keys)
+        self._worker = ThreadPoolExecutor(1, "sags-bridge-requests")
+        self._places = threading.Semaphore(MOST_WAITING)
+
+    def ask(self, op: str, args: Mapping[str, Any], answer: Answer) -> None:
+        """Ask without waiting. `answer` is called from another thread, at once when too many wait."""
+        if not self._places.acquire(blocking=False):
+            answer(None, f"{op}: too many requests are waiting for an answer; try again later")
+            return
+        self._worker.submit(self._ask, op, args, answer)
+
+    def close(self) -> None:
+        """Forget what waits, and wait for what has begun."""
+        self._worker.shutdown(cancel_futures=True)
+
+    def _ask(self, op: str, args: Mapping[str, Any], answer: Answer) -> None:
+        try:
+            result, words = self.now(op, args)
+        finally:
+            self._places.release()
+        answer(result, words)
+
+    def now(self, op: str, args: Mapping[str, Any]) -> tuple[dict[str, Any] | None, str]:
+        """Ask, and wait for the answer for up to `ANSWER_TIME` s; from any thread."""
+        try:
+            with ControlClient(*self._where) as client:
+                result = client.request(op, args, ANSWER_TIME)
+        except SagsError as error:
+            return None, str(error)
+        return (result if isinstance(result, dict) else {}), f"{op}: {result}"

@@ -1,0 +1,192 @@
+"""`sags bridge`: what a node sends, in the words of other systems."""
+
+from __future__ import annotations
+
+import importlib.util
+import logging
+import os
+import threading
+from collections.abc import Callable
+from functools import wraps
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.markup import escape
+
+from sags_node.cli.launching import as_json, positive
+from sags_node.cli.node_options import endpoint_option, keys_options, ns_option
+from sags_node.errors import UsageError
+from sags_node.terminal.console import check_file, console, on_stop_signals, show
+
+NICENESS = 19  # the node goes first, where both want the same cores
+INSTALL = "install it with: pip install 'sags-node[bridges]'"
+
+log = logging.getLogger(__name__)
+
+
+@click.group()
+def bridge() -> None:
+    """Bring a running node into another system: one process for each.
+
+    \b
+    3D Slicer, PLUS, a navigation system     sags bridge openigtlink
+    looking from a desk, plots, layouts      sags bridge foxglove
+    a browser on this machine, no set-up     sags view
+    a program of your own                    none: docs/clients.md
+
+    A bridge asks the node only for what its peers take, and the node never waits for it. What becomes too old
+    is taken back, with the reason. Node and bridge may be started in any order, and restarted.
+
+    These protocols know no keys and no encryption: a bridge listens on this machine only, unless --insecure
+    is given. docs/bridges.md says what each carries, how fast, and what it costs.
+    """
+
+
+def _common(port: int) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Options of every bridge; the command gets them as `node`, `overlay`, `control`, `host`, `port`,
+    `max_age` and `run`, which runs it."""
+
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        @endpoint_option
+        @click.option("--control", metavar="ENDPOINT", help="Control socket of the node; with --endpoint.")
+        @ns_option
+        @keys_options
+        @click.option(
+            "--overlay-ns", default="overlay", show_default=True, help="Namespace of a sags overlay."
+        )
+        @click.option("--run-dir", type=click.Path(path_type=Path), help="Of the connection files.")
+        @click.option("--host", default="127.0.0.1", show_default=True, help="Address to serve on.")
+        @click.option(
+            "--port", type=click.IntRange(0, 65535), default=port, show_default=True, help="0: any free one."
+        )
+        @click.option("--insecure", is_flag=True, help="Serve also to other machines: there are no keys.")
+        @click.option(
+            "--max-age",
+            type=positive,
+            default=0.4,
+            show_default=True,
+            help="Seconds since capture after which a picture is taken back.",
+        )
+        @as_json
+        @wraps(command)
+        def with_common(
+            endpoint: str | None, ns: str, overlay_ns: str, run_dir: Path | None, keys: Any, insecure: bool,
+            json_out: bool, host: str, **rest: Any,
+        ) -> None:  # fmt: skip
+            from sags_node.bridge.feed import Place
+
+            _check_host(host, insecure)
+            node, overlay = Place(ns, endpoint, run_dir, keys), Place(overlay_ns, None, run_dir)
+            stop = threading.Event()
+
+            def ready(host: str, bound: int) -> None:
+                if json_out:
+                    show({"host": host, "port": bound})
+                else:
+                    console.print(f"listening on [bold]{escape(host)}:{bound}[/]  (Ctrl-C ends)")
+
+            os.nice(NICENESS)
+            on_stop_signals(stop.set)
+            command(node=node, overlay=overlay, host=host, ready=ready, stop=stop, **rest)
+
+        return with_common
+
+    return decorate
+
+
+def _check_host(host: str, insecure: bool) -> None:
+    from sags_node.messaging.security import is_loopback
+
+    if is_loopback(host):
+        return
+    if not insecure:
+        raise UsageError(
+            f"--host {host} would show the video to all who reach it, without keys or encryption; leave it "
+            "out and look from elsewhere through ssh -L, or give --insecure"
+        )
+    log.warning("%s is open: anybody who reaches it sees the video and can pin anchors", host)
+
+
+def _check_installed(module: str, package: str, command: str) -> None:
+    if importlib.util.find_spec(module) is None:
+        raise UsageError(f"sags bridge {command} needs {package}; {INSTALL}")
+
+
+@bridge.command()
+@_common(port=18944)
+@click.option(
+    "--send",
+    metavar="NAMES",
+    default="",
+    help="Some of picture,render,overlay,surface,anchors,camera; default: all.",
+)
+@click.option("--rate", type=positive, default=10.0, show_default=True, help="Hz of all but the surface.")
+@click.option("--surface-rate", type=positive, default=2.0, show_default=True, help="Hz of the surface.")
+@click.option(
+    "--surface-step",
+    type=click.IntRange(2, 128),
+    default=16,
+    show_default=True,
+    help="Pixels between two corners of the surface.",
+)
+def openigtlink(send: str, **options: Any) -> None:
+    """Serve 3D Slicer, PLUS and others that speak OpenIGTLink.
+
+    Devices SagsPicture, SagsRender, SagsOverlay (IMAGE), SagsSurface (POLYDATA), SagsAnchors (POINT),
+    SagsLeftCamera (TRANSFORM), SagsState (STATUS). Millimetres; R = -x, A = -y, S = z of the optical frame.
+
+    \b
+    sags run launch/d4d_pull.yaml &
+    sags bridge openigtlink
+    Slicer examples/slicer/sags.mrml
+
+    A list of points sent to the device SagsPin is pinned to the tissue.
+
+    Needs: pip install 'sags-node[bridges]'
+    """
+    _check_installed("pyigtl", "pyigtl", "openigtlink")
+    from sags_node.bridge.openigtlink import Options, run_openigtlink
+
+    ready, stop = options.pop("ready"), options.pop("stop")
+    chosen = tuple(name for name in send.split(",") if name)
+    run_openigtlink(Options(send=chosen, **options), ready, stop)
+
+
+@bridge.command()
+@_common(port=8765)
+@click.option("--rate", type=positive, help="Hz of each topic, at most; default: all that come.")
+@click.option("--pin", is_flag=True, help="Let peers pin anchors: a click in the 3D panel.")
+@click.option(
+    "--layout",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE.json",
+    help="Write the layout for this namespace, and end.",
+)
+def foxglove(layout: Path | None, **options: Any) -> None:
+    """Serve Foxglove: every topic live, on ws://127.0.0.1:8765.
+
+    Topics come as the node sends them, and pictures as H.264 too where PyAV is there (.../h264): for a thin
+    link, look at those. Only what a panel shows is asked of the node.
+
+    \b
+    sags run launch/d4d_pull.yaml &
+    sags bridge foxglove
+    Foxglove: Open connection, ws://127.0.0.1:8765; Layout, Import: examples/foxglove/sags.json
+
+    Any web page that is open in a browser of this machine can connect too. So peers can look, and do nothing
+    else unless --pin is given.
+
+    Needs: pip install 'sags-node[bridges]'
+    """
+    _check_installed("foxglove", "foxglove-sdk", "foxglove")
+    ready, stop = options.pop("ready"), options.pop("stop")
+    if layout is not None:
+        from sags_node.bridge.foxglove_layout import layout_of
+
+        check_file(layout)
+        layout.write_text(layout_of(options["node"].ns, options["overlay"].ns), encoding="utf-8")
+        return
+    from sags_node.bridge.foxglove import Options, run_foxglove
+
+    run_foxglove(Options(**options), ready, stop)

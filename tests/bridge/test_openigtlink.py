@@ -1,0 +1,385 @@
+"""What a peer with OpenIGTLink's own library gets, and asks for; and what strangers can do."""
+
+from __future__ import annotations
+
+import shutil
+import socket
+import subprocess
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from bridging import HIDDEN, LOST, SEEN, anchored, anchored_at, bridged, sockets
+from places import ROOT
+from synthetic import HEIGHT, WIDTH, at_frame, plane_camera, plane_result, stream
+from waiting import until
+
+pytest.importorskip("pyigtl", reason="no OpenIGTLink without: pip install 'sags-node[bridges]'")
+
+from sags_node.bridge.feed import Place
+from sags_node.bridge.igtl import MAX_BODY_BYTES
+from sags_node.bridge.openigtlink import Options, request_of, run_openigtlink
+from sags_node.geometry import invert, transform, unproject
+from sags_node.overlay.stream import OverlayStream
+
+pytestmark = pytest.mark.live
+
+RECEIVE_CLIENT = Path("/usr/share/doc/openigtlink-examples/examples/Receiver/ReceiveClient.cxx")
+BLANK_WITHIN = 0.5  # s, that are promised
+RAS = np.diag([-1.0, -1.0, 1.0])
+NO_ANCHOR = "none;0.0000;0.0000;0.0000;0;0"  # a point that cannot be seen
+
+
+def built(source: Path, folder: Path) -> Path:
+    """A C++ program with Debian's library."""
+    if shutil.which("g++") is None or not Path("/usr/include/openigtlink/igtlImageMessage.h").exists():
+        pytest.skip("no peer without the Debian packages g++ and libopenigtlink-dev")
+    program = folder / source.stem
+    made = subprocess.run(
+        ["g++", "-o", program, source, "-I/usr/include/openigtlink", "-lOpenIGTLink"],
+        check=False, capture_output=True, text=True, timeout=120,
+    )  # fmt: skip
+    assert made.returncode == 0, made.stderr
+    return program
+
+
+@pytest.fixture(scope="module")
+def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return built(ROOT / "tests/bridge/igtl_peer.cxx", tmp_path_factory.mktemp("peer"))
+
+
+class Peer:
+    """The program; what it prints is taken in as it comes: device -> (fields, when it came)."""
+
+    def __init__(self, program: Path, port: int, *order: object) -> None:
+        self.came: list[tuple[list[str], float]] = []
+        self._process = subprocess.Popen(
+            [program, "127.0.0.1", str(port), *map(str, order)], stdout=subprocess.PIPE, text=True
+        )
+        self._thread = threading.Thread(target=self._read)
+        self._thread.start()
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            self.came.append((line.split(), time.time()))
+
+    def newest(self, device: str) -> list[str] | None:
+        """The fields after kind, device and stamp."""
+        return next((fields[3:] for fields, _ in reversed(self.came) if fields[1] == device), None)
+
+    def close(self) -> None:
+        self._process.kill()
+        self._process.wait(10)
+        self._thread.join(10)
+
+
+@contextmanager
+def peer(program: Path, port: int, *order: object) -> Iterator[Peer]:
+    joined = Peer(program, port, *order)
+    try:
+        yield joined
+    finally:
+        joined.close()
+
+
+def options(run_dir: Path, **changes: Any) -> Options:
+    settings = {"node": Place(run_dir=run_dir), "overlay": Place("overlay", run_dir=run_dir), "port": 0}
+    return Options(**{**settings, **changes})
+
+
+def weighted(picture: np.ndarray) -> int:
+    """As the peer sums pixels up."""
+    flat = picture.ravel().astype(np.int64)
+    return int((flat * (np.arange(len(flat)) % 251 + 1)).sum())
+
+
+def matrix(fields: list[str]) -> np.ndarray:
+    return np.array(fields, np.float64).reshape(3, 4)
+
+
+# ---- what comes ------------------------------------------------------------------------------------------
+
+
+def test_every_device_says_in_millimetres_what_the_node_says(tmp_path: Path, program: Path) -> None:
+    truth, camera = plane_result(), plane_camera()
+    with sockets(tmp_path) as running, stream(running, anchored_at):
+        with (
+            bridged(run_openigtlink, options(tmp_path, surface_step=8)) as port,
+            peer(program, port) as joined,
+        ):
+            devices = ("SagsPicture", "SagsRender", "SagsSurface", "SagsAnchors", "SagsLeftCamera")
+            until(lambda: all(joined.newest(device) for device in devices))
+            picture, render, surface, anchors, pose = (joined.newest(device) or [] for device in devices)
+
+    assert picture[:4] == [str(WIDTH), str(HEIGHT), "3", "1"], "RGB, and the numbers are said to be RAS"
+    assert int(picture[4]) == weighted(truth.pair.left)
+    assert render[:4] == [str(WIDTH), str(HEIGHT), "3", "1"]
+
+    # A pixel of the picture lies on the ray that it shows, 100 mm before the camera, turned as the world is.
+    T_picture = matrix(picture[5:])  # of pixels counted from the middle, as OpenIGTLink does
+    pixel = np.array([70.0, 12.0])
+    at = T_picture @ [pixel[0] - (WIDTH - 1) / 2, pixel[1] - (HEIGHT - 1) / 2, 0, 1]
+    ray = unproject(replace(camera, T_world_cam=np.eye(4)), pixel, np.float64(0.1))
+    assert np.allclose(at, RAS @ ray * 1e3, atol=1e-3)
+
+    T = matrix(pose)
+    point = np.array([0.002, -0.003, 0.05])  # m, in the camera's frame
+    assert np.allclose(
+        T[:, :3] @ (RAS @ point * 1e3) + T[:, 3], RAS @ transform(camera.T_world_cam, point) * 1e3, atol=1e-3
+    )
+
+    said = {
+        point.split(";")[0]: point.split(";")[1:]
+        for point in " ".join(anchors).replace("anchor ", "anchor-").split()
+    }
+    assert said.keys() == {f"anchor-{SEEN}", f"anchor-{HIDDEN}"}, f"{LOST} is lost: it has no place"
+    assert np.allclose([float(x) for x in said[f"anchor-{SEEN}"][:3]], [-10, -20, 70], atol=1e-3)
+    assert int(said[f"anchor-{SEEN}"][3]) > int(said[f"anchor-{HIDDEN}"][3]), "green where it is seen"
+
+    corners, triangles = int(surface[0]), int(surface[1])
+    places = np.array([corner.split(";") for corner in surface[2 : 2 + corners]], np.float64)
+    normal, distance = np.array([-0.2, 0.1, 1.0]), 60.0  # of the plane, camera, mm
+    in_camera = transform(invert(camera.T_world_cam), places @ RAS * 1e-3) * 1e3
+    assert corners > 60 and np.allclose(in_camera @ normal, distance, atol=0.01)
+    joined_corners = np.array(surface[2 + corners :], int).reshape(triangles, 3)
+    a, b, c = (in_camera[joined_corners[:, i]] for i in range(3))
+    assert (np.cross(b - a, c - a)[:, 2] < 0).all(), "every triangle turns its front to the camera"
+
+
+def test_debians_own_example_receives_it_unchanged(tmp_path: Path) -> None:
+    if not RECEIVE_CLIENT.exists():
+        pytest.skip("no example without the Debian package openigtlink-examples")
+    client = built(RECEIVE_CLIENT, tmp_path)
+    with sockets(tmp_path) as running, stream(running, anchored_at):
+        with bridged(run_openigtlink, options(tmp_path)) as port:
+            shown = subprocess.run(
+                ["timeout", "3", client, "127.0.0.1", str(port)],
+                check=False,
+                capture_output=True,
+                text=True,
+                timeout=20,
+            ).stderr
+    assert f"({WIDTH}, {HEIGHT}, 1)" in shown and "SagsPicture" in shown
+    assert "Receiving TRANSFORM data type." in shown
+    assert f"anchor {SEEN}" in shown and "( -10.000000, -20.000000, 70.000000 )" in shown
+    assert "Status    : all is new" in shown
+    assert "Receiving : POLYDATA" in shown
+
+
+def test_a_surface_has_holes_where_the_depth_is_not_sure_or_jumps(tmp_path: Path, program: Path) -> None:
+    plane = plane_result()
+    view = plane.views["left"]
+    assert view.confidence is not None
+    depth, confidence = view.depth.copy(), view.confidence.copy()
+    depth[:, : WIDTH // 3] += 0.05  # a step of 50 mm between two neighbours, 8 px or 5 mm apart
+    confidence[:, 2 * WIDTH // 3 :] = 0.49
+    torn = replace(plane, views=plane.views | {"left": replace(view, depth=depth, confidence=confidence)})
+    with sockets(tmp_path) as running, stream(running, lambda i: at_frame(torn, i, time.time_ns())):
+        with bridged(run_openigtlink, options(tmp_path, send=("surface",), surface_step=8)) as port:
+            with peer(program, port) as joined:
+                until(lambda: joined.newest("SagsSurface"))
+                surface = joined.newest("SagsSurface") or []
+    corners = int(surface[0])
+    camera = plane_camera()
+    places = np.array([corner.split(";") for corner in surface[2 : 2 + corners]], np.float64) @ RAS * 1e-3
+    in_camera = transform(invert(camera.T_world_cam), places)
+    columns = in_camera[:, 0] / in_camera[:, 2] * camera.K[0, 0] + camera.K[0, 2]
+    assert (columns < 2 * WIDTH / 3).all() and (columns < WIDTH / 3).any() and (columns > WIDTH / 3).any()
+    triangles = np.array(surface[2 + corners :], int).reshape(-1, 3)
+    left = columns[triangles] < WIDTH // 3
+    assert (left.all(axis=1) | ~left.any(axis=1)).all(), "no triangle spans the step"
+
+
+def test_the_overlay_comes_over_its_picture(tmp_path: Path, program: Path) -> None:
+    rgba = np.zeros((HEIGHT, WIDTH, 4), np.uint8)
+    rgba[10:20, 30:50] = (0, 255, 0, 255)
+    expected = plane_result().pair.left.copy()
+    expected[10:20, 30:50] = (0, 255, 0)
+    overlay = OverlayStream("overlay", tmp_path, (0, 0, 255))
+    newest: list[tuple[int, int]] = []
+
+    def frame(number: int) -> Any:
+        result = anchored_at(number)
+        newest.append((number, result.pair.t_capture_ns))
+        return result
+
+    try:
+        with sockets(tmp_path) as running, stream(running, frame):
+            with (
+                bridged(run_openigtlink, options(tmp_path, send=("overlay",))) as port,
+                peer(program, port) as joined,
+            ):
+
+                def drawn() -> bool:
+                    overlay.serve()
+                    overlay.show({"left": rgba}, *newest[-1], 0)
+                    return joined.newest("SagsOverlay") is not None
+
+                until(drawn)
+                assert int((joined.newest("SagsOverlay") or [])[4]) == weighted(expected)
+    finally:
+        overlay._publisher.close()
+
+
+# ---- nothing old is shown as new -------------------------------------------------------------------------
+
+
+def test_what_stops_is_dark_and_empty_within_half_a_second_and_comes_back(
+    tmp_path: Path, program: Path
+) -> None:
+    with bridged(run_openigtlink, options(tmp_path)) as port, peer(program, port) as joined:
+        until(lambda: (joined.newest("SagsState") or ["1"])[0] == "13")
+        assert "no node" in " ".join(joined.newest("SagsState") or []).lower()
+        with sockets(tmp_path) as running:
+            with stream(running, anchored_at):
+                until(lambda: joined.newest("SagsAnchors") and joined.newest("SagsSurface"))
+                until(lambda: joined.newest("SagsPicture"))
+                bright = int((joined.newest("SagsPicture") or [])[4])
+            stopped = time.time()  # the node is there, and silent
+            until(lambda: joined.newest("SagsAnchors") == [NO_ANCHOR])
+            until(lambda: joined.newest("SagsSurface") == ["0", "0"])
+            until(lambda: int((joined.newest("SagsPicture") or [])[4]) < bright / 3)
+            until(lambda: (joined.newest("SagsState") or [])[0] == "13")
+            blanks = [when for fields, when in joined.came if fields[0] in ("POINT", "IMAGE", "POLYDATA")]
+            assert max(blanks) - stopped < BLANK_WITHIN + 0.25  # the time a loaded machine takes to print it
+            shown = len(joined.came)
+        with sockets(tmp_path) as running, stream(running, anchored_at):  # another node, on other ports
+            until(lambda: joined.newest("SagsAnchors"))
+            until(lambda: int((joined.newest("SagsPicture") or [])[4]) == bright)
+            until(lambda: (joined.newest("SagsState") or [])[:1] == ["1"], seconds=10)
+            assert len(joined.came) > shown
+
+
+def test_a_slow_peer_gets_the_newest_and_holds_nobody_up(tmp_path: Path, program: Path) -> None:
+    with sockets(tmp_path) as running, stream(running, anchored_at):
+        with bridged(run_openigtlink, options(tmp_path, send=("camera",), rate=30.0)) as port:
+            with peer(program, port, "slow", 200) as slow, peer(program, port) as quick:
+                until(lambda: len(slow.came) > 15)
+                ages = [when - float(fields[2]) for fields, when in quick.came if fields[0] == "TRANSFORM"]
+                assert len(ages) > 3 * len(slow.came), "it is not slowed down by the other"
+                assert np.median(ages) < 0.2
+
+
+def test_nothing_is_asked_of_the_node_while_nobody_is_connected(tmp_path: Path, program: Path) -> None:
+    asked = ("left/image_rect_color", "left/render/image", "left/render/depth", "anchors", "tf")
+    with sockets(tmp_path) as running, stream(running, anchored_at):
+        with bridged(run_openigtlink, options(tmp_path, send=("picture", "anchors"))) as port:
+            time.sleep(0.5)
+            assert not any(running.wanted(name) for name in asked)
+            with peer(program, port) as joined:
+                until(lambda: joined.newest("SagsPicture"))
+                assert [name for name in asked if running.wanted(name)] == [
+                    "left/image_rect_color",
+                    "anchors",
+                ]
+            until(lambda: not any(running.wanted(name) for name in asked))
+
+
+def test_depth_is_asked_for_only_when_a_surface_is_due(tmp_path: Path, program: Path) -> None:
+    with sockets(tmp_path) as running, stream(running, anchored_at):
+        with bridged(run_openigtlink, options(tmp_path, send=("surface",), surface_rate=0.5)) as port:
+            with peer(program, port) as joined:
+                until(lambda: joined.newest("SagsSurface"))
+                until(lambda: not running.wanted("left/render/depth"), seconds=1.0)
+                assert running.wanted("tf"), "it tells that the node goes on"
+                time.sleep(1.0)
+                assert joined.newest("SagsSurface") != ["0", "0"], "it is not old before the next is due"
+                assert (joined.newest("SagsState") or [])[0] == "1"
+
+
+# ---- requests --------------------------------------------------------------------------------------------
+
+
+class Node:
+    """The control operations that bridges use."""
+
+    def __init__(self) -> None:
+        self.pinned: list[dict[str, Any]] = []
+        self.removed: list[int] = []
+
+    def add(self, args: dict[str, Any]) -> dict[str, Any]:
+        self.pinned.append(args)
+        return {"id": len(self.pinned), "frame_id": 7, "depth_confidence": 0.9}
+
+    def remove(self, args: dict[str, Any]) -> None:
+        self.removed.append(args["id"])
+
+
+def test_a_peer_pins_anchors_by_point_and_by_pixel(tmp_path: Path, program: Path) -> None:
+    node = Node()
+    with sockets(tmp_path, {"add_anchor": node.add, "remove_anchor": node.remove}) as running, stream(running):
+        with bridged(run_openigtlink, options(tmp_path)) as port:
+            with peer(program, port, "point", "SagsPin", -10, -20, 70) as joined:
+                until(lambda: node.pinned)
+                assert np.allclose([node.pinned[0][axis] for axis in "xyz"], [0.01, 0.02, 0.07])
+                until(lambda: joined.newest("SagsAnswer"))
+                assert "depth_confidence" in " ".join(joined.newest("SagsAnswer") or [])
+            with peer(program, port, "point", "SagsPin", -10, -20, 70):  # the same list again: nothing new
+                time.sleep(1.0)
+            with peer(program, port, "point", "SagsPin", -10, -20, 71):  # moved
+                until(lambda: len(node.pinned) == 2 and node.removed == [1])
+            with peer(program, port, "say", "SagsRequest", "pin 320 256.5"):
+                until(lambda: len(node.pinned) == 3)
+            with peer(program, port, "say", "SagsRequest", "dance"):
+                pass
+    assert node.pinned[2] == {"u": 320.0, "v": 256.5}
+
+
+@pytest.mark.parametrize(
+    "text", ["", "pin", "pin 1", "pin 1 2 3", "pin nan 1", "remove -1", "remove 1; pin 1 2", "pin 1e9 1"]
+)
+def test_other_words_are_no_request(text: str) -> None:
+    assert request_of(text) is None
+
+
+# ---- strangers -------------------------------------------------------------------------------------------
+
+
+def test_strangers_are_cut_off_and_disturb_nobody(tmp_path: Path, program: Path) -> None:
+    large = (1).to_bytes(2, "big") + b"STRING".ljust(12, b"\0") + b"x".ljust(20, b"\0") + bytes(8)
+    large += (MAX_BODY_BYTES + 1).to_bytes(8, "big") + bytes(8)
+    damaged = large[:42] + (40).to_bytes(8, "big") + bytes(8) + b"\xff" * 40  # its CRC is wrong
+    with sockets(tmp_path) as running, stream(running, anchored_at):
+        with bridged(run_openigtlink, options(tmp_path)) as port, peer(program, port) as joined:
+            for attack in (
+                b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nOrigin: http://evil.example\r\n\r\n",
+                large,
+                b"\xff" * 4096,
+            ):
+                with socket.create_connection(("127.0.0.1", port), timeout=5) as stranger:
+                    stranger.sendall(attack)
+                    stranger.settimeout(5)
+                    with pytest.raises((ConnectionError, EOFError)):
+                        while stranger.recv(1 << 16):
+                            pass
+                        raise EOFError
+            with socket.create_connection(("127.0.0.1", port), timeout=5) as stranger:
+                stranger.sendall(damaged)  # passed over
+                assert stranger.recv(10)
+            crowd = [socket.create_connection(("127.0.0.1", port), timeout=5) for _ in range(20)]
+            before = len(joined.came)
+            until(lambda: len(joined.came) > before + 20)
+            for stranger in crowd:
+                stranger.close()
+
+
+def test_a_taken_port_and_an_unknown_output_are_said(tmp_path: Path) -> None:
+    from sags_node.errors import SagsError, UsageError
+
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(SagsError, match=f"port {port}.*choose another --port"):
+            run_openigtlink(options(tmp_path, port=port), lambda *_: None, threading.Event())
+    with pytest.raises(UsageError, match="--send depth: there is picture"):
+        run_openigtlink(options(tmp_path, send=("depth",)), lambda *_: None, threading.Event())
+
+
+def test_the_plane_with_anchors_is_what_it_says() -> None:
+    assert len(anchored().anchors) == 3

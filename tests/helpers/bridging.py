@@ -1,0 +1,86 @@
+"""A node that is only its sockets, and a bridge beside it in this process."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from synthetic import at_frame, plane_result
+
+from sags_node.config import PublishConfig
+from sags_node.messaging.publisher import Publisher
+from sags_node.types import AnchorStates, FrameResult
+
+SEEN, HIDDEN, LOST = 3, 5, 8  # numbers of the anchors in `anchored`
+STARTING = 30.0  # s
+
+
+@contextmanager
+def sockets(
+    run_dir: Path, handlers: Mapping[str, Callable[[dict[str, Any]], Any]] | None = None
+) -> Iterator[Publisher]:
+    """The sockets of a node named `sags`, on free ports."""
+    config = PublishConfig(
+        data=("tcp://127.0.0.1:*",), control="tcp://127.0.0.1:*", run_dir=run_dir, right=True
+    )
+    with Publisher(config, "sags", f"session-{time.time_ns()}", handlers) as running:
+        yield running
+
+
+def anchored(result: FrameResult | None = None) -> FrameResult:
+    """The plane with three anchors on it: one seen, one hidden, one lost."""
+    result = result or plane_result()
+    places = np.array([[0.01, 0.02, 0.07], [-0.01, 0.0, 0.08], [np.nan] * 3], np.float32)
+    ones = np.ones(3, np.float32)
+    states = AnchorStates(
+        np.array([SEEN, HIDDEN, LOST]),
+        places,
+        places[:, :2].copy(),
+        np.array([1, 0, 0], np.float32),
+        ones,
+        ones,
+        ones,
+    )
+    return replace(result, anchors=states)
+
+
+def anchored_at(number: int) -> FrameResult:
+    """A frame of `stream` that is captured now."""
+    return at_frame(_ANCHORED, number, time.time_ns())
+
+
+_ANCHORED = anchored()
+
+
+@contextmanager
+def bridged(
+    run: Callable[[Any, Callable[[str, int], None], threading.Event], None], options: Any
+) -> Iterator[int]:
+    """A bridge on a thread; gives its port."""
+    stop, ports, failed = threading.Event(), [], []
+
+    def work() -> None:
+        try:
+            run(options, lambda _, port: ports.append(port), stop)
+        except BaseException as error:  # told to the test below
+            failed.append(error)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    deadline = time.monotonic() + STARTING
+    while not ports:
+        assert not failed, failed
+        assert time.monotonic() < deadline, "the bridge did not start"
+        time.sleep(0.01)
+    try:
+        yield ports[0]
+    finally:
+        stop.set()
+        thread.join(10)
+        assert not thread.is_alive() and not failed, failed
