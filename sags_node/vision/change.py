@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 
-from sags_node.types import F32, F64, RectifiedPair
+from sags_node.kernels.jit import kernel
+from sags_node.types import F32, F64, U8, RectifiedPair
 from sags_node.vision.pyramid import inner, level, pyramids
 
 HALVINGS = 3  # 8x8 px are averaged: camera noise up to 4 grey levels stays below the limit
 BLOCK = 4  # shrunk px: 32 px, the length over which something moves or does not
 LARGEST_DIFFERENCE = 1.0  # grey levels, mean over a block
+EVERY = 8  # px
 LARGEST_SHARE = 0.005  # of the blocks that may differ more: a highlight flickers
 
 
@@ -50,8 +54,20 @@ def _alike(a: F32, b: F32) -> bool:
 def rms_difference(a: RectifiedPair, b: RectifiedPair) -> float:
     """Grey levels, over every eighth pixel of both eyes: enough to tell a repeated frame from a moved one."""
     squares = [
-        np.mean(np.square(x.full[::8, ::8].astype(np.float32) - y.full[::8, ::8]))
+        _mean_square(x.full, y.full)
         for x, y in zip(pyramids(a), pyramids(b), strict=True)
         if x is not None and y is not None
     ]
     return float(np.sqrt(max(squares)))
+
+
+@kernel
+def _mean_square(a: U8, b: U8) -> Any:
+    """Of the differences of every eighth pixel of every eighth row."""
+    total, count = np.int64(0), 0
+    for y in range(0, a.shape[0], EVERY):
+        for x in range(0, a.shape[1], EVERY):
+            difference = np.int64(a[y, x]) - np.int64(b[y, x])
+            total += difference * difference
+            count += 1
+    return total / count

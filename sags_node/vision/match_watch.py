@@ -21,6 +21,7 @@ from sags_node.vision.standing import Standing
 
 STRIDE = 4  # px
 WINDOW_NS = 200_000_000  # of the motion that is compared with row errors
+SHORTEST_STEP_NS = 50_000_000  # between two frames: in less time tissue moves less than flow errs
 LONGEST_STEP_NS = 150_000_000  # between two frames: longer motion is not followed in so small pictures
 LATE_ERROR = 0.2  # px of the working size, explained by motion: 1 % of the depth where disparities are 20 px
 LEAST_SLOPE = 0.1  # of the motion in a frame: less is chance
@@ -89,12 +90,12 @@ class MatchWatch:
 
     def _is_late(self, stamp_ns: int, left: GrayPyramid, rows: RowErrors) -> bool:
         """Row errors follow the vertical motion of the last frames."""
-        small = narrowed(left)
-        before, self._before = self._before, (stamp_ns, small)
-        sums = self._sums
+        small, before, sums = narrowed(left), self._before, self._sums
+        if before is None or not 0 <= stamp_ns - before[0] < SHORTEST_STEP_NS:
+            self._before = stamp_ns, small
         while sums and not 0 <= stamp_ns - sums[0].stamp_ns < WINDOW_NS:
             sums.popleft()
-        if before is not None and 0 < stamp_ns - before[0] <= LONGEST_STEP_NS:
+        if before is not None and SHORTEST_STEP_NS <= stamp_ns - before[0] <= LONGEST_STEP_NS:
             assert self._median is not None
             height, width = rows.errors.shape
             down = self._flow(before[1], small)[..., 1]
