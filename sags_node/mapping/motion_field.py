@@ -3,8 +3,8 @@
 The method of analogues (E. N. Lorenz, J. Atmos. Sci. 1969), on the motion of the control nodes: past moments
 at which all nodes moved as in the last frames say what comes next. Heart and breathing need no model of their
 own for that. What is recalled is mixed with the last velocities by weights that the last half second of
-predictions would have wanted. Where such moments do not come periodically, only the last velocity is believed.
-A HexPlane field learnt beside the video was compared; see `benchmarks/motion_field.md`.
+predictions would have wanted. Where such moments do not come again and again, only the last velocity is
+believed. A HexPlane field learnt beside the video was compared; see `benchmarks/motion_field.md`.
 """
 
 from __future__ import annotations
@@ -135,9 +135,8 @@ class MotionField:
         longest, most = None, 0.5 * total
         for lag in peaks[often[peaks] > 0.3 * often.max()]:
             near = (np.abs(lags - lag * np.rint(lags / lag)) <= max(1.0, 0.05 * lag)) & (2 * lags > lag)
-            if (
-                often[near].sum() >= most
-            ):  # of two that explain as much, the longer: it holds the other's cycles
+            # Of two periods that explain as much it is the longer one: it holds whole cycles of the other.
+            if often[near].sum() >= most:
                 once = near & (2 * lags < 3 * lag)
                 longest, most = float((often[once] * lags[once]).sum() / often[once].sum()), often[near].sum()
         return None if longest is None else longest * self._frame_s
