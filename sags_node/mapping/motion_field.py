@@ -2,9 +2,9 @@
 
 The method of analogues (E. N. Lorenz, J. Atmos. Sci. 1969), on the motion of the control nodes: past moments
 at which all nodes moved as in the last frames say what comes next. Heart and breathing need no model of their
-own and no period for that; tissue that never moved so before has no such moments. What is recalled is mixed
-with the last velocities by weights that the last half second of predictions would have wanted. A HexPlane
-field learnt beside the video was compared; see `benchmarks/motion_field.md`.
+own for that. What is recalled is mixed with the last velocities by weights that the last half second of
+predictions would have wanted. Where such moments do not come again and again, only the last velocity is
+believed. A HexPlane field learnt beside the video was compared; see `benchmarks/motion_field.md`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from collections import deque
 
 import numpy as np
 
-from sags_node.types import F32, F64, I64, MotionState
+from sags_node.types import F32, I64, MotionState
 
 HISTORY = 300  # frames: two breaths at 30 Hz
 HORIZONS = 4  # frames ahead
@@ -21,7 +21,7 @@ MATCHED = 3  # frames in a row that are compared
 NEAREST = 0.3  # s: what lies less far back is this motion itself; no heart beats faster
 LIKENESS = 0.1  # of the motion's energy: a moment that differs by so much more counts 1/e of another
 UNLIKE = float(np.exp(-1 / LIKENESS))  # weight of resting, which differs by all of it
-MEMORY = 0.93  # of the mixing weights, per frame: half a second
+MEMORY = 0.93  # of the mixing weights and of how long ago moments like now were, per frame: half a second
 SKILL_MEMORY = 0.97  # a second
 PRIOR = 0.5  # pulls the mixing weights to equal shares, in energies of one frame's motion
 SHARE = 0.3  # of each: together a little less than all, since tissue slows down
@@ -57,7 +57,7 @@ class MotionField:
 
     def recalled(self, motion: F32, seen: F32) -> F32 | None:
         """The motion [M, 3] m of all nodes in this frame, hidden ones too, as it was when the seen ones moved
-        so before; None: they never did.
+        so before; None: they never did, or not again and again.
 
         Args:
             motion: [M, 3] m since the last frame, where it is known.
@@ -65,7 +65,7 @@ class MotionField:
         """
         nodes = self._places.shape[1]
         known = np.flatnonzero(seen[:nodes] > KNOWN)
-        if not self._has_memory or len(known) < LEAST_NODES:
+        if self._period is None or len(known) < LEAST_NODES:
             return None
         weights = self._likeness(self._count, motion[:nodes], known)
         used = np.flatnonzero(weights > LEAST_WEIGHT)
@@ -102,12 +102,14 @@ class MotionField:
         and how far to believe it; None: too little is known yet."""
         if self._count <= MATCHED or self._frame_s == 0:
             return None
-        skill = self._skill
+        mixed, rested, steady = self._errors.T
+        period = self._period
+        trusted = (mixed <= steady) & (period is not None)  # else the last velocity, as without a memory
+        moves = np.where(trusted[:, None, None], self._mixed[0], np.float32(STEADY) * self._bases[0][:, 0])
+        skill = 1 - np.where(trusted, mixed, steady) / np.maximum(rested, 1e-20)
+        skill[rested <= 0] = 0
         frames = int(np.argmin(skill > LEAST_SKILL)) if (skill <= LEAST_SKILL).any() else HORIZONS
-        state = MotionState(self._period, float(max(skill[0], 0.0)), frames * self._frame_s)
-        mixed, _, steady = self._errors.T
-        worse = (mixed > steady)[:, None, None]  # lately the last velocity alone said it better
-        moves = np.where(worse, np.float32(STEADY) * self._bases[0][:, 0], self._mixed[0])
+        state = MotionState(period, float(max(skill[0], 0.0)), frames * self._frame_s)
         return moves, self._frame_s, state
 
     # ---- inside --------------------------------------------------------------------------------------------
@@ -122,12 +124,6 @@ class MotionField:
         return int(np.ceil(NEAREST / self._frame_s))
 
     @property
-    def _skill(self) -> F64:
-        """[HORIZONS] share of the motion's energy that was said right."""
-        mixed, rested, steady = self._errors.T
-        return np.where(rested > 0, 1 - np.minimum(mixed, steady) / np.maximum(rested, 1e-20), 0.0)
-
-    @property
     def _period(self) -> float | None:
         """s after which the tissue moves as before, if most of the moments like now lie so far back, or a
         multiple of it."""
@@ -139,9 +135,8 @@ class MotionField:
         longest, most = None, 0.5 * total
         for lag in peaks[often[peaks] > 0.3 * often.max()]:
             near = (np.abs(lags - lag * np.rint(lags / lag)) <= max(1.0, 0.05 * lag)) & (2 * lags > lag)
-            if (
-                often[near].sum() >= most
-            ):  # of two that explain as much, the longer: it holds the other's cycles
+            # Of two periods that explain as much it is the longer one: it holds whole cycles of the other.
+            if often[near].sum() >= most:
                 once = near & (2 * lags < 3 * lag)
                 longest, most = float((often[once] * lags[once]).sum() / often[once].sum()), often[near].sum()
         return None if longest is None else longest * self._frame_s
@@ -220,8 +215,8 @@ class MotionField:
         weights = weights[: last - HORIZONS]  # what came after must be known
         used = np.flatnonzero(weights > LEAST_WEIGHT)
         trust = float(weights.sum())
-        self._trust = SKILL_MEMORY * self._trust + (1 - SKILL_MEMORY) * trust
-        self._lags *= SKILL_MEMORY
+        self._trust = MEMORY * self._trust + (1 - MEMORY) * trust
+        self._lags *= MEMORY
         self._lags[last - used] += weights[used]
         followed = np.zeros((HORIZONS, nodes, 3), np.float32)
         for h in range(HORIZONS if len(used) else 0):

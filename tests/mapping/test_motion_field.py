@@ -66,12 +66,12 @@ def test_what_never_repeats_is_not_said_to_be_foreseen() -> None:
     assert found[2].period is None
 
 
-def test_steady_motion_needs_no_memory() -> None:
+def test_motion_that_does_not_repeat_is_said_as_without_a_memory() -> None:
     pull = np.array([1e-3, 0, -5e-4], np.float32)
     found = played(lambda frame: NODES + np.float32(frame) * pull, 20).forecast()
     assert found is not None
     for ahead in range(HORIZONS):
-        np.testing.assert_allclose(found[0][ahead], (ahead + 1) * np.tile(pull, (200, 1)), atol=3e-4)
+        np.testing.assert_allclose(found[0][ahead], STEADY * (ahead + 1) * np.tile(pull, (200, 1)), atol=1e-6)
 
 
 def test_hidden_nodes_move_as_they_did_when_the_others_moved_so() -> None:
