@@ -20,10 +20,11 @@ from sags_node.fitting import checkpoint, start
 from sags_node.fitting.clip import Clip, read_clip
 from sags_node.fitting.fit import Fit
 from sags_node.fitting.score import score, score_between, score_depth, score_tracks
-from sags_node.fitting.settings import FieldShape, FitSettings
+from sags_node.fitting.settings import FieldShape, FitSettings, Units
 from sags_node.fitting.start import follow_online
 from sags_node.kernels.threads import configure_threads
 from sags_node.model import columns
+from sags_node.model.decoder import Decoder
 from sags_node.model.deformable import FADE_NS, LOOK_BACK_NS
 from sags_node.session import open_session
 from sags_node.types import F32
@@ -97,6 +98,30 @@ def test_each_part_of_the_method_has_its_share_in_the_result(clip: Clip) -> None
     for without in ({"block": "none"}, {"block": "mlp"}, {"antialias": False}):
         beyond_rounding = 100 * np.finfo(np.float32).eps
         assert np.abs(drawn(**without) - whole).mean() > beyond_rounding, without
+
+
+def test_an_mlp_in_the_place_of_the_block_learns_and_adapts_nothing(clip: Clip) -> None:
+    settings = dataclasses.replace(PAPER, tokens="self", block="mlp", warm_up=1, iterations=5)
+    decoder = fitted(clip, settings).model.field.deltas.decoder
+    fresh = Decoder(decoder.config, settings.seed).parameters
+    for name, learnt in decoder.parameters.items():
+        if name.endswith(("_gate", "_scale")):
+            np.testing.assert_array_equal(learnt, 1, err_msg=name)
+        elif name.endswith("_shift"):
+            np.testing.assert_array_equal(learnt, 0, err_msg=name)
+        elif name.startswith("mlp_"):
+            assert not np.array_equal(learnt, fresh[name]), name
+
+
+def test_a_part_without_a_unit_is_not_deformed(clip: Clip) -> None:
+    """Last layers that start at random deform from the first step on."""
+    shape = dataclasses.replace(SMALL.shape, units=Units(color=0), xavier=True)
+    fit = Fit(clip, dataclasses.replace(PAPER, shape=shape))
+    fit.start(quietly)
+    change = fit.model.field.deform(fit.model.rows, clip.train[3].t_capture_ns) - fit.model.rows
+    assert np.abs(change[:, columns.MEAN]).max() > 1e-5  # m
+    assert np.abs(change[:, columns.LOGIT]).max() > 1e-3
+    assert not change[:, columns.COLOR].any()
 
 
 @pytest.mark.parametrize("tokens", ["self", "nodes"])
