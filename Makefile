@@ -6,8 +6,8 @@ PIP := $(BIN)/pip install -q --disable-pip-version-check -c constraints.txt
 STAMP := $(VENV)/.installed
 # Shared libraries that Open3D needs and its wheel does not bring.
 DEBIAN := libusb-1.0-0 libgl1 libegl1 libgomp1 libx11-6
-# What tests use beyond that: a browser for the viewer, a compiler for the C++ client.
-DEBIAN_TESTS := chromium g++ cmake pkg-config cppzmq-dev libmsgpack-cxx-dev
+# What tests use beyond that: a browser for the viewer, a compiler for the C++ client and OpenIGTLink's peers.
+DEBIAN_TESTS := chromium g++ cmake pkg-config cppzmq-dev libmsgpack-cxx-dev libopenigtlink-dev openigtlink-examples
 missing = $(shell for p in $(1); do dpkg -s $$p >/dev/null 2>&1 || echo $$p; done)
 apt_install = apt-get update -qq && apt-get install -y -qq --no-install-recommends $(1) >/dev/null
 

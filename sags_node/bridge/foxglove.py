@@ -109,9 +109,9 @@ class Foxglove:
         self._told: set[str] = set()
         self._shown: dict[str, Received] = {}  # by output
         self._audience = _Audience(self._pin if options.pin else None)
-        context = foxglove.Context()
-        self._ways = {output.name: _way(output, context) for output in offered}
-        self._server = _served(options, context, self._audience, backlog=len(offered))
+        self._context = foxglove.Context()  # channels vanish with the last name for it
+        self._ways = {output.name: _way(output, self._context) for output in offered}
+        self._server = _served(options, self._context, self._audience, backlog=len(offered))
 
     @property
     def port(self) -> int:

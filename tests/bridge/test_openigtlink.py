@@ -314,7 +314,10 @@ class Node:
 
 def test_a_peer_pins_anchors_by_point_and_by_pixel(tmp_path: Path, program: Path) -> None:
     node = Node()
-    with sockets(tmp_path, {"add_anchor": node.add, "remove_anchor": node.remove}) as running, stream(running):
+    with (
+        sockets(tmp_path, {"add_anchor": node.add, "remove_anchor": node.remove}) as running,
+        stream(running),
+    ):
         with bridged(run_openigtlink, options(tmp_path)) as port:
             with peer(program, port, "point", "SagsPin", -10, -20, 70) as joined:
                 until(lambda: node.pinned)
