@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import shutil
 import socket
 import subprocess
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from bridging import HIDDEN, LOST, SEEN, anchored, anchored_at, bridged, sockets
-from places import ROOT
+from igtl_peer import PEER, built, peer
 from synthetic import HEIGHT, WIDTH, at_frame, plane_camera, plane_result, stream
 from waiting import until
 
@@ -36,57 +33,9 @@ RAS = np.diag([-1.0, -1.0, 1.0])
 NO_ANCHOR = "none;0.0000;0.0000;0.0000;0;0"  # a point that cannot be seen
 
 
-def built(source: Path, folder: Path) -> Path:
-    """A C++ program with Debian's library."""
-    if shutil.which("g++") is None or not Path("/usr/include/openigtlink/igtlImageMessage.h").exists():
-        pytest.skip("no peer without the Debian packages g++ and libopenigtlink-dev")
-    program = folder / source.stem
-    made = subprocess.run(
-        ["g++", "-o", program, source, "-I/usr/include/openigtlink", "-lOpenIGTLink"],
-        check=False, capture_output=True, text=True, timeout=120,
-    )  # fmt: skip
-    assert made.returncode == 0, made.stderr
-    return program
-
-
 @pytest.fixture(scope="module")
 def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return built(ROOT / "tests/bridge/igtl_peer.cxx", tmp_path_factory.mktemp("peer"))
-
-
-class Peer:
-    """The program; what it prints is taken in as it comes: device -> (fields, when it came)."""
-
-    def __init__(self, program: Path, port: int, *order: object) -> None:
-        self.came: list[tuple[list[str], float]] = []
-        self._process = subprocess.Popen(
-            [program, "127.0.0.1", str(port), *map(str, order)], stdout=subprocess.PIPE, text=True
-        )
-        self._thread = threading.Thread(target=self._read)
-        self._thread.start()
-
-    def _read(self) -> None:
-        assert self._process.stdout is not None
-        for line in self._process.stdout:
-            self.came.append((line.split(), time.time()))
-
-    def newest(self, device: str) -> list[str] | None:
-        """The fields after kind, device and stamp."""
-        return next((fields[3:] for fields, _ in reversed(self.came) if fields[1] == device), None)
-
-    def close(self) -> None:
-        self._process.kill()
-        self._process.wait(10)
-        self._thread.join(10)
-
-
-@contextmanager
-def peer(program: Path, port: int, *order: object) -> Iterator[Peer]:
-    joined = Peer(program, port, *order)
-    try:
-        yield joined
-    finally:
-        joined.close()
+    return built(PEER, tmp_path_factory.mktemp("peer"))
 
 
 def options(run_dir: Path, **changes: Any) -> Options:
