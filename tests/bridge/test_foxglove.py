@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import struct
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -26,7 +27,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from sags_node.bridge.feed import Place
-from sags_node.bridge.foxglove import CLICKED, Options, clicked, run_foxglove
+from sags_node.bridge.foxglove import CLICKED, Options, clicked, outputs, run_foxglove
 from sags_node.bridge.foxglove_layout import layout_of
 from sags_node.messaging import cdr, topics
 from sags_node.messaging.subscriber import Subscriber
@@ -185,6 +186,22 @@ def test_what_stops_is_empty_within_half_a_second_and_comes_back(tmp_path: Path)
         with sockets(tmp_path) as running, stream(running, anchored_at):  # another node, on other ports
             until(lambda: ros(joined, image).data.any() and ros(joined, anchors).width == 3)
             until(lambda: joined.said[-1]["op"] == "removeStatus")
+
+
+def test_who_comes_later_is_told_what_is_missing_too(tmp_path: Path) -> None:
+    with bridged(run_foxglove, options(tmp_path)) as port, client(port) as first:
+        first.subscribe("/sags/tf")
+        until(lambda: first.said)
+        with client(port) as second:
+            second.subscribe("/sags/tf")
+            until(lambda: any("no node" in said.get("message", "").lower() for said in second.said))
+
+
+def test_without_pyav_there_is_no_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("av", reason="no H.264 without PyAV")
+    assert any(output.name.endswith("/h264") for output in outputs(options(tmp_path)))
+    monkeypatch.setitem(sys.modules, "av", None)
+    assert not any(output.name.endswith("/h264") for output in outputs(options(tmp_path)))
 
 
 def test_a_bridge_that_is_started_anew_goes_on_on_the_same_port(tmp_path: Path) -> None:
