@@ -106,19 +106,19 @@ class Foxglove:
     def __init__(self, options: Options, offered: Sequence[Output]) -> None:
         place = options.node
         self._requests = Requests(options.control, place.ns, place.run_dir, place.keys)
-        self._told: set[str] = set()
+        self._missing: dict[str, str] = {}
+        self._server: WebSocketServer | None = None
         self._shown: dict[str, Received] = {}  # by output
-        self._audience = _Audience(self._pin if options.pin else None)
-        context = foxglove.Context()
-        self._ways = {output.name: _way(output, context) for output in offered}
-        self._server = _served(options, context, self._audience, backlog=len(offered))
+        self._audience = _Audience(self._welcome, self._pin if options.pin else None)
+        self._context = foxglove.Context()  # channels vanish with the last name for it
+        self._ways = {output.name: _way(output, self._context) for output in offered}
+        self._server = _served(options, self._context, self._audience, backlog=len(offered))
 
-    @property
-    def port(self) -> int:
-        return self._server.port
+        self.port = self._server.port
 
     def close(self) -> None:
-        self._server.stop()
+        if self._server is not None:
+            self._server.stop()
         self._requests.close()
 
     # ---- out -----------------------------------------------------------------------------------------------
@@ -136,12 +136,12 @@ class Foxglove:
         """Foxglove goes on showing what came last, so something empty must come."""
         self._ways[output.name].blank(self._shown.pop(output.name), reason)
 
-    def tell(self, missing: Mapping[str, str]) -> None:
-        for name in self._told - missing.keys():
-            self._server.remove_status([name])
-        for name, reason in missing.items():
-            self._server.publish_status(f"{name}: {reason}", foxglove.StatusLevel.Warning, name)
-        self._told = set(missing)
+    def tell(self, missing: Mapping[str, str], shows: bool) -> None:
+        gone = self._missing.keys() - missing.keys()
+        self._missing = dict(missing)
+        if self._server is not None and gone:
+            self._server.remove_status(list(gone))
+        self._welcome()
 
     # ---- in ------------------------------------------------------------------------------------------------
 
@@ -154,19 +154,29 @@ class Foxglove:
             self._requests.ask("add_anchor", dict(zip("xyz", place, strict=True)), self._say)
 
     def _say(self, result: dict[str, Any] | None, words: str) -> None:
-        level = foxglove.StatusLevel.Warning if result is None else foxglove.StatusLevel.Info
-        self._server.publish_status(words, level, "request")
+        self._publish(words, is_problem=result is None, about="request")
+
+    def _welcome(self) -> None:
+        """Tell everybody what is missing: who comes later has not heard it."""
+        for name, reason in self._missing.items():
+            self._publish(f"{name}: {reason}", is_problem=True, about=name)
+
+    def _publish(self, words: str, is_problem: bool, about: str) -> None:
+        level = foxglove.StatusLevel.Warning if is_problem else foxglove.StatusLevel.Info
+        if self._server is not None:
+            self._server.publish_status(words, level, about)
 
 
 class _Audience(ServerListener):
     """Who looks at what; called from threads of the server.
 
     Args:
+        welcome: called when a client has begun to look at something.
         pin: told what clients publish on `CLICKED`; None: they may not.
     """
 
-    def __init__(self, pin: Callable[[bytes], None] | None) -> None:
-        self.pin = pin
+    def __init__(self, welcome: Callable[[], None], pin: Callable[[bytes], None] | None) -> None:
+        self._welcome, self._pin = welcome, pin
         self._lock = threading.Lock()
         self._looking: Counter[str] = Counter()
         self._grown: set[str] = set()
@@ -187,6 +197,7 @@ class _Audience(ServerListener):
         with self._lock:
             self._looking[channel.topic] += 1
             self._grown.add(channel.topic)
+        self._welcome()
 
     def on_unsubscribe(self, client: Client, channel: ChannelView) -> None:
         with self._lock:
@@ -200,8 +211,8 @@ class _Audience(ServerListener):
         self._clicks.discard((client.id, client_channel_id))
 
     def on_message_data(self, client: Client, client_channel_id: int, data: bytes) -> None:
-        if self.pin is not None and (client.id, client_channel_id) in self._clicks:
-            self.pin(data)
+        if self._pin is not None and (client.id, client_channel_id) in self._clicks:
+            self._pin(data)
 
 
 class _Way(Protocol):

@@ -7,6 +7,7 @@ for the world and for the camera; they are no directions of a patient.
 
 from __future__ import annotations
 
+import importlib.util
 import logging
 import re
 import threading
@@ -113,6 +114,10 @@ def run_openigtlink(options: Options, ready: Callable[[str, int], None], stop: t
         SagsError: the port cannot be bound, or an endpoint is malformed.
     """
     offered = outputs(options)
+    if importlib.util.find_spec("crcmod._crcfunext") is None:
+        log.warning(
+            "crcmod was installed without a C compiler: pictures take seconds; install gcc, then crcmod anew"
+        )
     bridge = OpenIgtLink(options)
     try:
         relay = Relay((options.node, options.overlay), offered, bridge, options.max_age)
@@ -181,10 +186,13 @@ class OpenIgtLink:
         elif output.name == "Anchors":
             self._peers.send(device, igtl.points(device, seconds, np.empty((0, 3)), [], []))
 
-    def tell(self, missing: Mapping[str, str]) -> None:
+    def tell(self, missing: Mapping[str, str], shows: bool) -> None:
         words = "; ".join(f"{name}: {reason}" for name, reason in missing.items())
-        code = igtl.NOT_READY if missing else igtl.OK
-        self._peers.greet(STATE, igtl.status(STATE, time.time(), code, words or "all is new"))
+        if missing or not shows:
+            code, words = igtl.NOT_READY, words or "waiting for the node's first message"
+        else:
+            code, words = igtl.OK, "all is new"
+        self._peers.greet(STATE, igtl.status(STATE, time.time(), code, words))
 
     def _made(self, name: str, frame: Frame, device: str, seconds: float) -> bytes | None:
         """The message of an output; None when what came does not fit together."""

@@ -65,8 +65,9 @@ class Outlet(Protocol):
         """Take back what was sent: it is not new any more."""
         ...
 
-    def tell(self, missing: Mapping[str, str]) -> None:
-        """What is asked for and does not come, output -> reason; called when that changes."""
+    def tell(self, missing: Mapping[str, str], shows: bool) -> None:
+        """What is asked for and does not come, output -> reason, and whether anything does; called when that
+        changes."""
         ...
 
 
@@ -103,7 +104,7 @@ class Relay:
         self._outputs, self._outlet, self._max_age = outputs, outlet, max_age
         self._arrived = threading.Event()
         self._courses: dict[str, _Course] = {}
-        self._told: Mapping[str, str] | None = None
+        self._told: tuple[dict[str, str], bool] | None = None
         self._feeds: dict[str, Feed] = {}
         try:
             for place in senders:
@@ -133,9 +134,10 @@ class Relay:
         for output in wanted:
             self._pass_on(output, self._courses[output.name], now)
         missing = {name: course.reason for name, course in self._courses.items() if course.reason is not None}
-        if missing != self._told:
-            self._told = missing
-            self._outlet.tell(missing)
+        shows = any(course.shown_ns is not None for course in self._courses.values())
+        if self._told != (missing, shows):
+            self._told = missing, shows
+            self._outlet.tell(missing, shows)
 
     def close(self) -> None:
         for feed in self._feeds.values():

@@ -13,6 +13,7 @@ from sags_node.cli.bench_depth import bench_depth
 from sags_node.cli.bench_disturbances import bench_disturbances
 from sags_node.cli.bench_masks import bench_masks
 from sags_node.cli.bench_node import (
+    bench_bridges,
     bench_crowd,
     bench_endurance,
     bench_pareto,
@@ -50,6 +51,7 @@ for command in (
     bench_endurance,
     bench_tracking,
     bench_crowd,
+    bench_bridges,
     bench_transport,
 ):
     bench.add_command(command)

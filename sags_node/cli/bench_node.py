@@ -220,6 +220,32 @@ def bench_crowd(launch: tuple[str, ...], seconds: float, many: int, out: Path | 
     write_json(out, measured)
 
 
+@click.command("bridges")
+@launch_argument
+@click.option("--seconds", type=positive, default=30.0, show_default=True, help="Of each bridge.")
+@table_option
+@as_json
+def bench_bridges(launch: tuple[str, ...], seconds: float, out: Path | None, json_out: bool) -> None:
+    """What each bridge gives and costs.
+
+    Runs a node, by default of the built-in phantom, in a process of its own: alone, and beside each bridge of
+    sags bridge with one peer that reads all it gets. Per bridge: rate and bytes, the age of what the peer
+    gets, CPU time of the bridge for each frame of the node, and the node's own rate and latency.
+
+    \b
+    sags bench bridges launch/d4d_pull.yaml --out benchmarks/results/bridges.json
+    """
+    from sags_node.benchmark.node import bridges
+
+    check_files(out)
+    path, overrides = split_recording(launch, "sags bench bridges plays recordings; record the cameras first")
+    open_launched(path, overrides)  # what takes long is not part of the node's start
+    with progress("listening") as advance:
+        rows = bridges.measure_bridges(launch, seconds, advance)
+    show(rows if json_out else bridges.table(rows))
+    write_json(out, rows)
+
+
 @click.command("transport")
 @click.option("--frames", type=click.IntRange(1), default=150, show_default=True, help="Of each transport.")
 @as_json

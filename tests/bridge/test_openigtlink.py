@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import shutil
 import socket
 import subprocess
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,12 +13,15 @@ from typing import Any
 import numpy as np
 import pytest
 from bridging import HIDDEN, LOST, SEEN, anchored, anchored_at, bridged, sockets
-from places import ROOT
+from igtl_peer import PEER, built, peer
 from synthetic import HEIGHT, WIDTH, at_frame, plane_camera, plane_result, stream
 from waiting import until
 
 pytest.importorskip("pyigtl", reason="no OpenIGTLink without: pip install 'sags-node[bridges]'")
 
+from pyigtl.messages import PointMessage
+
+from sags_node.bridge import igtl
 from sags_node.bridge.feed import Place
 from sags_node.bridge.igtl import MAX_BODY_BYTES
 from sags_node.bridge.openigtlink import Options, request_of, run_openigtlink
@@ -36,57 +36,9 @@ RAS = np.diag([-1.0, -1.0, 1.0])
 NO_ANCHOR = "none;0.0000;0.0000;0.0000;0;0"  # a point that cannot be seen
 
 
-def built(source: Path, folder: Path) -> Path:
-    """A C++ program with Debian's library."""
-    if shutil.which("g++") is None or not Path("/usr/include/openigtlink/igtlImageMessage.h").exists():
-        pytest.skip("no peer without the Debian packages g++ and libopenigtlink-dev")
-    program = folder / source.stem
-    made = subprocess.run(
-        ["g++", "-o", program, source, "-I/usr/include/openigtlink", "-lOpenIGTLink"],
-        check=False, capture_output=True, text=True, timeout=120,
-    )  # fmt: skip
-    assert made.returncode == 0, made.stderr
-    return program
-
-
 @pytest.fixture(scope="module")
 def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return built(ROOT / "tests/bridge/igtl_peer.cxx", tmp_path_factory.mktemp("peer"))
-
-
-class Peer:
-    """The program; what it prints is taken in as it comes: device -> (fields, when it came)."""
-
-    def __init__(self, program: Path, port: int, *order: object) -> None:
-        self.came: list[tuple[list[str], float]] = []
-        self._process = subprocess.Popen(
-            [program, "127.0.0.1", str(port), *map(str, order)], stdout=subprocess.PIPE, text=True
-        )
-        self._thread = threading.Thread(target=self._read)
-        self._thread.start()
-
-    def _read(self) -> None:
-        assert self._process.stdout is not None
-        for line in self._process.stdout:
-            self.came.append((line.split(), time.time()))
-
-    def newest(self, device: str) -> list[str] | None:
-        """The fields after kind, device and stamp."""
-        return next((fields[3:] for fields, _ in reversed(self.came) if fields[1] == device), None)
-
-    def close(self) -> None:
-        self._process.kill()
-        self._process.wait(10)
-        self._thread.join(10)
-
-
-@contextmanager
-def peer(program: Path, port: int, *order: object) -> Iterator[Peer]:
-    joined = Peer(program, port, *order)
-    try:
-        yield joined
-    finally:
-        joined.close()
+    return built(PEER, tmp_path_factory.mktemp("peer"))
 
 
 def options(run_dir: Path, **changes: Any) -> Options:
@@ -235,8 +187,8 @@ def test_what_stops_is_dark_and_empty_within_half_a_second_and_comes_back(
     tmp_path: Path, program: Path
 ) -> None:
     with bridged(run_openigtlink, options(tmp_path)) as port, peer(program, port) as joined:
-        until(lambda: (joined.newest("SagsState") or ["1"])[0] == "13")
-        assert "no node" in " ".join(joined.newest("SagsState") or []).lower()
+        until(lambda: "no node" in " ".join(joined.newest("SagsState") or []).lower())
+        assert {fields[3] for fields, _ in joined.came if fields[1] == "SagsState"} == {"13"}
         with sockets(tmp_path) as running:
             with stream(running, anchored_at):
                 until(lambda: joined.newest("SagsAnchors") and joined.newest("SagsSurface"))
@@ -257,7 +209,7 @@ def test_what_stops_is_dark_and_empty_within_half_a_second_and_comes_back(
             assert len(joined.came) > shown
 
 
-def test_a_slow_peer_gets_the_newest_and_holds_nobody_up(tmp_path: Path, program: Path) -> None:
+def test_a_slow_peer_holds_nobody_up(tmp_path: Path, program: Path) -> None:
     with sockets(tmp_path) as running, stream(running, anchored_at):
         with bridged(run_openigtlink, options(tmp_path, send=("camera",), rate=30.0)) as port:
             with peer(program, port, "slow", 200) as slow, peer(program, port) as quick:
@@ -314,7 +266,10 @@ class Node:
 
 def test_a_peer_pins_anchors_by_point_and_by_pixel(tmp_path: Path, program: Path) -> None:
     node = Node()
-    with sockets(tmp_path, {"add_anchor": node.add, "remove_anchor": node.remove}) as running, stream(running):
+    with (
+        sockets(tmp_path, {"add_anchor": node.add, "remove_anchor": node.remove}) as running,
+        stream(running),
+    ):
         with bridged(run_openigtlink, options(tmp_path)) as port:
             with peer(program, port, "point", "SagsPin", -10, -20, 70) as joined:
                 until(lambda: node.pinned)
@@ -337,6 +292,20 @@ def test_a_peer_pins_anchors_by_point_and_by_pixel(tmp_path: Path, program: Path
 )
 def test_other_words_are_no_request(text: str) -> None:
     assert request_of(text) is None
+
+
+def test_messages_of_the_newer_header_are_read_too() -> None:
+    """Slicer sends these to peers that have not said which they know."""
+    sent = PointMessage(np.array([[1.0, 2.0, 3.0]]), ["F-1"], device_name="SagsPin")
+    sent.header_version, sent.metadata = 2, {"key": "value"}
+    raw = sent.pack()
+    head = igtl.header(raw[: igtl.HEADER_BYTES])
+    assert head is not None
+    heard = igtl.said(head, raw[igtl.HEADER_BYTES :])
+    assert heard is not None and heard.device == "SagsPin"
+    ((name, place),) = heard.points
+    assert name == "F-1" and place.tolist() == [1.0, 2.0, 3.0]
+    assert igtl.said(head, raw[igtl.HEADER_BYTES : -1] + b"!") is None, "damaged on the way"
 
 
 # ---- strangers -------------------------------------------------------------------------------------------

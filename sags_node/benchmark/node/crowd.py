@@ -58,7 +58,7 @@ def measure_crowd(launch: Sequence[str], alone: float, crowded: float, many: int
     Raises:
         SagsError: the node does not run.
     """
-    with tempfile.TemporaryDirectory() as folder, _node(launch, Path(folder)) as node:
+    with tempfile.TemporaryDirectory() as folder, node_beside(launch, Path(folder)) as node:
         with Subscriber([STATUS], run_dir=Path(folder)) as observer:
             phases = []
             for name, seconds, work in (
@@ -69,7 +69,7 @@ def measure_crowd(launch: Sequence[str], alone: float, crowded: float, many: int
             ):
                 with _peers(Path(folder), work) as stop:
                     seen = []
-                    for status in _watch(observer, seconds, node):
+                    for status in watched(observer, seconds, node):
                         seen.append(status)
                         advance(len(seen), None, name)
                     peers = stop()
@@ -78,7 +78,8 @@ def measure_crowd(launch: Sequence[str], alone: float, crowded: float, many: int
 
 
 @contextmanager
-def _node(launch: Sequence[str], folder: Path) -> Iterator[subprocess.Popen[bytes]]:
+def node_beside(launch: Sequence[str], folder: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """A node in its own process, with its files in `folder`."""
     command = [sys.executable, "-m", "sags_node", "run", *launch, *PHASE, f"publish.run_dir:={folder}"]
     with tempfile.TemporaryFile("w+", errors="replace") as errors:  # a pipe that is full would stop the node
         node = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=errors)
@@ -96,7 +97,7 @@ def _node(launch: Sequence[str], folder: Path) -> Iterator[subprocess.Popen[byte
             end(node, grace=STOPPING)
 
 
-def _watch(observer: Subscriber, seconds: float, node: subprocess.Popen[bytes]) -> Iterator[dict[str, Any]]:
+def watched(observer: Subscriber, seconds: float, node: subprocess.Popen[bytes]) -> Iterator[dict[str, Any]]:
     """The node's own status, once a second, without that of the first seconds."""
     begun = time.monotonic()
     newest: ReceivedText | None = None

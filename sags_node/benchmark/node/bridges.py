@@ -1,0 +1,236 @@
+"""`sags bench bridges`: what each bridge gives its peer, how old that is, and what it costs."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import socket
+import struct
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+
+from sags_node.benchmark.node.crowd import STARTING, STATUS, STOPPING, Advance, node_beside, watched
+from sags_node.errors import SagsError
+from sags_node.evaluation.metrics import percentiles
+from sags_node.messaging.subscriber import Subscriber
+from sags_node.processes import end
+
+TICKS = os.sysconf("SC_CLK_TCK")  # of CPU time in a second
+PICTURES = ("/sags/left/image_rect_color", "/sags/left/render/image")
+LAYOUT = (*PICTURES, "/sags/points", "/sags/anchors", "/sags/tf", "/sags/figures")  # what the layout shows
+THIN = tuple(f"{picture}/h264" for picture in PICTURES)
+
+
+@dataclass(slots=True)
+class Heard:
+    """What a peer got, by device or channel."""
+
+    ages_ms: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
+    count: int = 0
+    size: int = 0
+
+    def note(self, name: str, stamp: float, size: int) -> None:
+        self.ages_ms[name].append(1e3 * (time.time() - stamp))
+        self.count += 1
+        self.size += size
+
+
+Listen = Callable[[int, Heard, threading.Event], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One bridge with one peer."""
+
+    name: str
+    command: tuple[str, ...]  # of `sags bridge`
+    leading: str  # the device or channel whose age counts
+    listen: Listen
+
+
+def measure_bridges(launch: Sequence[str], seconds: float, advance: Advance) -> list[dict[str, Any]]:
+    """One row for the node alone, and one for each bridge.
+
+    Raises:
+        SagsError: a node or a bridge does not run, or a peer gets nothing.
+    """
+    with tempfile.TemporaryDirectory() as folder, node_beside(launch, Path(folder)) as node:
+        with Subscriber([STATUS], run_dir=Path(folder)) as observer:
+            alone = _node_figures(_seen(observer, seconds, node, advance, "node alone"))
+            rows: list[dict[str, Any]] = [{"bridge": "none", **alone}]
+            for case in CASES:
+                with _bridge(case, Path(folder)) as (process, heard):
+                    began = time.monotonic()
+                    before, frames = _cpu_seconds(process.pid), _frames(observer)
+                    seen = _seen(observer, seconds, node, advance, case.name)
+                    spent, shown = _cpu_seconds(process.pid) - before, _frames(observer) - frames
+                    took = time.monotonic() - began
+                    ages = percentiles(heard.ages_ms[case.leading])
+                    if ages is None or shown <= 0:
+                        raise SagsError(f"{case.name}: its peer got no {case.leading}")
+                rows.append(
+                    {
+                        "bridge": case.name,
+                        "messages_hz": heard.count / took,
+                        "pictures_hz": len(heard.ages_ms[case.leading]) / took,
+                        "mb_per_s": heard.size / took * 1e-6,
+                        "age_ms": ages,
+                        "cpu_ms_per_frame": 1e3 * spent / shown,
+                        **_node_figures(seen),
+                    }
+                )
+    return rows
+
+
+def table(rows: Sequence[dict[str, Any]]) -> Table:
+    """For people; `rows` as `measure_bridges` returns them."""
+    made = Table(
+        "bridge", "pictures, Hz", "MB/s", "age p50, p90, ms", "CPU ms a frame", "node: Hz", "p50, p99, ms"
+    )
+    for row in rows:
+        given = ["", "", "", ""]
+        if "age_ms" in row:
+            ages = row["age_ms"]
+            given = [
+                f"{row['pictures_hz']:.1f}",
+                f"{row['mb_per_s']:.1f}",
+                f"{ages['p50']:.0f}, {ages['p90']:.0f}",
+            ]
+            given.append(f"{row['cpu_ms_per_frame']:.1f}")
+        node = [f"{row['node_rate_hz']:.1f}", f"{row['node_p50_ms']:.0f}, {row['node_p99_ms']:.0f}"]
+        made.add_row(row["bridge"], *given, *node)
+    return made
+
+
+# ---- the node ----------------------------------------------------------------------------------------------
+
+
+def _seen(
+    observer: Subscriber, seconds: float, node: subprocess.Popen[bytes], advance: Advance, what: str
+) -> list[dict[str, Any]]:
+    seen: list[dict[str, Any]] = []
+    for status in watched(observer, seconds, node):
+        seen.append(status)
+        advance(len(seen), None, what)
+    if len(seen) < 3:
+        raise SagsError("too little was heard of the node; measure longer")
+    return seen
+
+
+def _node_figures(seen: Sequence[dict[str, Any]]) -> dict[str, float]:
+    return {
+        "node_rate_hz": float(np.median([each["rate_hz"] for each in seen])),
+        "node_p50_ms": float(np.median([each["latency_ms"]["p50"] for each in seen])),
+        "node_p99_ms": float(np.median([each["latency_ms"]["p99"] for each in seen])),
+    }
+
+
+def _frames(observer: Subscriber) -> int:
+    """The number of the node's last frame; a recording that loops goes on counting."""
+    status = observer.latest(STATUS)
+    return 0 if status is None else int(json.loads(status.text)["last_frame"].get("frame_id", 0))
+
+
+def _cpu_seconds(process: int) -> float:
+    """Of a process and its threads."""
+    fields = Path(f"/proc/{process}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / TICKS
+
+
+# ---- a bridge and its peer ---------------------------------------------------------------------------------
+
+
+@contextmanager
+def _bridge(case: Case, folder: Path) -> Iterator[tuple[subprocess.Popen[str], Heard]]:
+    """A bridge in its own process, and a peer on a thread."""
+    command = [sys.executable, "-m", "sags_node", "bridge", *case.command, "--port", "0", "--json"]
+    process = subprocess.Popen([*command, "--run-dir", str(folder)], stdout=subprocess.PIPE, text=True)
+    stop, heard = threading.Event(), Heard()
+    peer: threading.Thread | None = None
+    try:
+        assert process.stdout is not None
+        said, _, _ = select.select([process.stdout], [], [], STARTING)
+        line = process.stdout.readline() if said else ""
+        if not line:
+            raise SagsError(
+                f"{case.name}: the bridge did not start; try: sags bridge {' '.join(case.command)}"
+            )
+        peer = threading.Thread(target=case.listen, args=(json.loads(line)["port"], heard, stop))
+        peer.start()
+        deadline = time.monotonic() + STARTING
+        while not heard.ages_ms.get(case.leading):
+            if time.monotonic() > deadline or process.poll() is not None:
+                raise SagsError(f"{case.name}: its peer got nothing within {STARTING:g} s")
+            time.sleep(0.1)
+        heard.ages_ms.clear()
+        heard.count = heard.size = 0
+        yield process, heard
+    finally:
+        stop.set()
+        end(process, grace=STOPPING)
+        if peer is not None:
+            peer.join(STOPPING)
+
+
+def _listen_igtl(port: int, heard: Heard, stop: threading.Event) -> None:
+    """Read every OpenIGTLink message, and no more of it than its header."""
+    header = struct.Struct(">H12s20sIIQQ")
+    with socket.create_connection(("127.0.0.1", port), timeout=STOPPING) as joined:
+        with joined.makefile("rb", buffering=1 << 20) as stream:
+            while not stop.is_set():
+                try:
+                    _, _, device, seconds, fraction, size, _ = header.unpack(stream.read(header.size))
+                    stream.read(size)
+                except (TimeoutError, struct.error, OSError):
+                    return
+                name = device.rstrip(b"\0").decode()
+                heard.note(name, seconds + fraction / 2**32, header.size + size)
+
+
+def _listen_foxglove(names: Sequence[str]) -> Listen:
+    """A client that looks at these channels."""
+
+    def listen(port: int, heard: Heard, stop: threading.Event) -> None:
+        known: dict[str, int] = {}
+        with connect(f"ws://127.0.0.1:{port}", subprotocols=["foxglove.sdk.v1"], max_size=None) as joined:  # type: ignore[list-item]  # a plain name
+            while not stop.is_set() and len(known) < len(names):
+                said = joined.recv(timeout=STARTING)
+                if isinstance(said, str):
+                    known |= {each["topic"]: each["id"] for each in json.loads(said).get("channels", ())}
+                    known = {name: number for name, number in known.items() if name in names}
+            wanted = [{"id": i, "channelId": known[name]} for i, name in enumerate(names)]
+            joined.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
+            while not stop.is_set():
+                try:
+                    message = joined.recv(timeout=1.0)
+                except TimeoutError:
+                    continue
+                except ConnectionClosed:
+                    return
+                if isinstance(message, bytes) and message[0] == 1:
+                    number, stamp_ns = struct.unpack_from("<IQ", message, 1)
+                    heard.note(names[number], stamp_ns * 1e-9, len(message))
+
+    return listen
+
+
+CASES = (
+    Case("openigtlink", ("openigtlink",), "SagsPicture", _listen_igtl),
+    Case("foxglove", ("foxglove",), PICTURES[1], _listen_foxglove(LAYOUT)),
+    Case("foxglove, H.264", ("foxglove",), THIN[1], _listen_foxglove(THIN)),
+)

@@ -1,0 +1,104 @@
+"""The command: a node, a bridge and a peer, each a process of its own; and what the command refuses."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from command_line import refused, sags
+from igtl_peer import PEER, Peer, built, peer
+from running_node import RunningNode
+from waiting import until
+
+pytestmark = pytest.mark.live
+
+BLANK_WITHIN = 0.5  # s, that are promised
+NOTICE = 0.5  # s more, that a loaded machine may take to print it
+
+
+@contextmanager
+def bridge(run_dir: Path, *command: str) -> Iterator[tuple[subprocess.Popen[str], int]]:
+    """`sags bridge` and its port."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "sags_node", "bridge", *command, "--json", "--run-dir", str(run_dir)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert process.stdout is not None and process.stderr is not None
+        line = process.stdout.readline()  # ends with the process
+        assert line, process.stderr.read()
+        yield process, json.loads(line)["port"]
+    finally:
+        process.kill()
+        process.wait(10)
+
+
+def state(joined: Peer) -> str:
+    return (joined.newest("SagsState") or ["0"])[0]
+
+
+def test_a_pinned_anchor_comes_back_and_a_killed_node_leaves_nothing_standing(
+    phantom_session: Path, tmp_path: Path
+) -> None:
+    pytest.importorskip("pyigtl", reason="no OpenIGTLink without: pip install 'sags-node[bridges]'")
+    program = built(PEER, tmp_path)
+    run_dir = tmp_path / "run"
+    with bridge(run_dir, "openigtlink", "--port", "0") as (first, port):
+        with peer(program, port, "say", "SagsRequest", "pin 150 120") as early:
+            until(lambda: "no node" in " ".join(early.newest("SagsAnswer") or []).lower())
+        node = RunningNode(phantom_session, tmp_path)
+        try:
+            with peer(program, port) as joined:
+                until(lambda: state(joined) == "1")
+                with peer(program, port, "say", "SagsRequest", "pin 150 120"):
+                    until(lambda: "anchor" in " ".join(joined.newest("SagsAnchors") or []))
+                first.send_signal(signal.SIGKILL)  # the node goes on
+            with (
+                bridge(run_dir, "openigtlink", "--port", str(port)) as (second, _),
+                peer(program, port) as joined,
+            ):
+                until(lambda: "anchor" in " ".join(joined.newest("SagsAnchors") or []))
+                until(lambda: state(joined) == "1")
+                os.kill(node.process.pid, signal.SIGKILL)
+                killed = time.time()
+                until(lambda: (joined.newest("SagsAnchors") or [""])[0].startswith("none"))
+                assert time.time() - killed < BLANK_WITHIN + NOTICE
+                until(lambda: state(joined) == "13")
+                second.send_signal(signal.SIGINT)
+                assert second.wait(10) == 0
+                assert second.stderr is not None and "Traceback" not in second.stderr.read()
+        finally:
+            node.process.kill()
+            node.process.wait(10)
+
+
+@pytest.mark.parametrize("command", ["openigtlink", "foxglove"])
+def test_other_machines_are_let_in_only_when_it_is_said(command: str) -> None:
+    refused(2, "bridge", command, "--host", "0.0.0.0", said=("without keys or encryption", "--insecure"))
+
+
+@pytest.mark.parametrize(
+    ("command", "module", "package"),
+    [("openigtlink", "pyigtl", "pyigtl"), ("foxglove", "foxglove", "foxglove-sdk")],
+)
+def test_a_missing_extra_is_named_with_the_way_to_get_it(
+    command: str, module: str, package: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, module, None)
+    refused(2, "bridge", command, said=(f"needs {package}", "pip install 'sags-node[bridges]'"))
+
+
+def test_the_help_says_when_to_use_which() -> None:
+    text = sags("bridge", "--help").stdout
+    assert "3D Slicer" in text and "sags bridge openigtlink" in text
+    assert "sags bridge foxglove" in text and "sags view" in text

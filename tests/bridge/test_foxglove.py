@@ -1,0 +1,374 @@
+"""What a client of Foxglove's WebSocket protocol gets, and what it may ask for."""
+
+from __future__ import annotations
+
+import base64
+import json
+import struct
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from bridging import anchored_at, bridged, sockets
+from places import ROOT
+from synthetic import HEIGHT, WIDTH, plane_result, stream
+from waiting import until
+
+pytest.importorskip("foxglove", reason="no Foxglove without: pip install 'sags-node[bridges]'")
+pytest.importorskip("websockets", reason="no peer without the package websockets")
+
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+
+from sags_node.bridge.feed import Place
+from sags_node.bridge.foxglove import CLICKED, Options, clicked, outputs, run_foxglove
+from sags_node.bridge.foxglove_layout import layout_of
+from sags_node.messaging import cdr, topics
+from sags_node.messaging.subscriber import Subscriber
+
+pytestmark = pytest.mark.live
+
+SUBPROTOCOL = "foxglove.sdk.v1"
+MESSAGE_DATA = 1  # opcode
+BLANK_WITHIN = 0.5  # s, that are promised
+FRAME_TOPICS = [topic.name for topic in topics.TOPICS if topic.name != "parameters"]
+
+
+class Client:
+    """Speaks the protocol from its description alone: channel -> messages (log time ns, bytes, arrival)."""
+
+    def __init__(self, port: int) -> None:
+        self.info: dict[str, Any] = {}
+        self.channels: dict[str, dict[str, Any]] = {}
+        self.came: dict[str, list[tuple[int, bytes, float]]] = {}
+        self.said: list[dict[str, Any]] = []  # status and removeStatus
+        self.reading = threading.Event()
+        self.reading.set()
+        self._subscribed: dict[int, str] = {}
+        self._socket = connect(
+            f"ws://127.0.0.1:{port}", subprotocols=[SUBPROTOCOL], max_size=1 << 26, open_timeout=10
+        )  # type: ignore[list-item]
+        self._thread = threading.Thread(target=self._read)
+        self._thread.start()
+
+    def _read(self) -> None:
+        try:
+            while True:
+                self.reading.wait(30)
+                self._take(self._socket.recv())
+        except ConnectionClosed:
+            return
+
+    def _take(self, message: str | bytes) -> None:
+        if isinstance(message, bytes):
+            if message[0] == MESSAGE_DATA:
+                number, log_time = struct.unpack_from("<IQ", message, 1)
+                self.came[self._subscribed[number]].append((log_time, message[13:], time.time()))
+            return
+        said = json.loads(message)
+        if said["op"] == "serverInfo":
+            self.info = said
+        elif said["op"] == "advertise":
+            self.channels |= {channel["topic"]: channel for channel in said["channels"]}
+        elif said["op"] in ("status", "removeStatus"):
+            self.said.append(said)
+
+    def subscribe(self, *names: str) -> None:
+        until(lambda: all(name in self.channels for name in names))
+        new = {len(self._subscribed) + i: name for i, name in enumerate(names)}
+        self._subscribed |= new
+        self.came |= {name: [] for name in names}
+        wanted = [{"id": number, "channelId": self.channels[name]["id"]} for number, name in new.items()]
+        self._socket.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
+
+    def send(self, message: str | bytes) -> None:
+        self._socket.send(message)
+
+    def close(self) -> None:
+        self.reading.set()
+        self._socket.close()
+        self._thread.join(10)
+
+
+@contextmanager
+def client(port: int) -> Iterator[Client]:
+    joined = Client(port)
+    try:
+        yield joined
+    finally:
+        joined.close()
+
+
+def options(run_dir: Path, **changes: Any) -> Options:
+    settings = {"node": Place(run_dir=run_dir), "overlay": Place("overlay", run_dir=run_dir), "port": 0}
+    return Options(**{**settings, **changes})
+
+
+def ros(joined: Client, name: str, number: int = -1) -> Any:
+    """The ROS message that came on a channel, read by its own schema's name."""
+    return cdr.decode(joined.came[name][number][1], joined.channels[name]["schemaName"])
+
+
+def test_every_topic_comes_byte_for_byte_with_its_schema(tmp_path: Path) -> None:
+    names = [f"/sags/{name}" for name in FRAME_TOPICS]
+    with sockets(tmp_path) as running, stream(running, anchored_at):
+        with bridged(run_foxglove, options(tmp_path)) as port, client(port) as joined:
+            joined.subscribe(*names)
+            with Subscriber(FRAME_TOPICS, run_dir=tmp_path) as beside:
+                until(
+                    lambda: all(
+                        len(joined.came[name]) > (0 if name in ("/sags/status", "/sags/diagnostics") else 8)
+                        for name in names
+                    )
+                )
+                kept = {
+                    (name, m.stamp_ns): m.cdr()
+                    for name in FRAME_TOPICS
+                    for m in [beside.latest(name)]
+                    if m is not None
+                }
+                time.sleep(0.3)  # what was just sent comes there too
+    assert joined.info["name"] == "SAGS sags" and joined.info["capabilities"] == []
+    for topic in topics.TOPICS:
+        channel = joined.channels[f"/sags/{topic.name}"]
+        assert channel["encoding"] == "cdr" and channel["schemaEncoding"] == "ros2msg"
+        assert channel["schemaName"] == topic.type and channel["schema"] == cdr.definition(topic.type)
+    same = 0
+    for name in FRAME_TOPICS:
+        for log_time, data, _ in joined.came[f"/sags/{name}"]:
+            if (name, log_time) in kept:
+                assert data == kept[name, log_time], name
+                same += 1
+    assert same >= len(FRAME_TOPICS) - 2  # of each topic the newest; status may have come between
+    picture = ros(joined, "/sags/left/image_rect_color")
+    assert np.array_equal(picture.data.reshape(HEIGHT, WIDTH, 3), plane_result().pair.left)
+    assert all(
+        0 <= when - log_time * 1e-9 < 1.0 for log_time, _, when in joined.came["/sags/left/render/depth"][-3:]
+    )
+
+
+def test_only_what_is_looked_at_is_asked_of_the_node(tmp_path: Path) -> None:
+    with sockets(tmp_path) as running, stream(running, anchored_at):
+        with bridged(run_foxglove, options(tmp_path)) as port:
+            time.sleep(0.4)
+            assert [name for name in FRAME_TOPICS if running.wanted(name)] == ["status"]
+            with client(port) as joined:
+                joined.subscribe("/sags/anchors")
+                until(lambda: joined.came["/sags/anchors"])
+                assert [name for name in FRAME_TOPICS if running.wanted(name)] == ["anchors", "status"]
+            until(lambda: not running.wanted("anchors"))
+
+
+def test_what_stops_is_empty_within_half_a_second_and_comes_back(tmp_path: Path) -> None:
+    image, depth, anchors = "/sags/left/render/image", "/sags/left/render/depth", "/sags/anchors"
+    with bridged(run_foxglove, options(tmp_path)) as port, client(port) as joined:
+        joined.subscribe(image, depth, anchors)
+        until(lambda: any("no node" in said.get("message", "").lower() for said in joined.said))
+        with sockets(tmp_path) as running:
+            with stream(running, anchored_at):
+                until(lambda: all(joined.came[name] for name in (image, depth, anchors)))
+            stopped = time.time()
+            until(lambda: not ros(joined, image).data.any())
+            until(lambda: np.isnan(ros(joined, depth).data.view(np.float32)).all())
+            until(lambda: ros(joined, anchors).width == 0)
+            last = max(joined.came[name][-1][2] for name in (image, depth, anchors))
+            assert last - stopped < BLANK_WITHIN + 0.25  # the time a loaded machine takes to read it
+            until(lambda: any("too old" in said.get("message", "") for said in joined.said))
+            counts = {name: len(joined.came[name]) for name in (image, depth, anchors)}
+            time.sleep(0.3)
+            assert counts == {name: len(joined.came[name]) for name in counts}, "nothing more comes"
+        with sockets(tmp_path) as running, stream(running, anchored_at):  # another node, on other ports
+            until(lambda: ros(joined, image).data.any() and ros(joined, anchors).width == 3)
+            until(lambda: joined.said[-1]["op"] == "removeStatus")
+
+
+def test_who_comes_later_is_told_what_is_missing_too(tmp_path: Path) -> None:
+    with bridged(run_foxglove, options(tmp_path)) as port, client(port) as first:
+        first.subscribe("/sags/tf")
+        until(lambda: first.said)
+        with client(port) as second:
+            second.subscribe("/sags/tf")
+            until(lambda: any("no node" in said.get("message", "").lower() for said in second.said))
+
+
+def test_without_pyav_there_is_no_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("av", reason="no H.264 without PyAV")
+    assert any(output.name.endswith("/h264") for output in outputs(options(tmp_path)))
+    monkeypatch.setitem(sys.modules, "av", None)
+    assert not any(output.name.endswith("/h264") for output in outputs(options(tmp_path)))
+
+
+def test_a_bridge_that_is_started_anew_goes_on_on_the_same_port(tmp_path: Path) -> None:
+    with sockets(tmp_path) as running, stream(running, anchored_at):
+        port = 0
+        for _ in range(2):
+            with bridged(run_foxglove, options(tmp_path, port=port)) as port, client(port) as joined:
+                joined.subscribe("/sags/tf")
+                until(lambda: joined.came["/sags/tf"])
+
+
+def test_a_client_that_does_not_read_holds_nobody_up_and_goes_on_with_what_is_new(tmp_path: Path) -> None:
+    name = "/sags/left/render/image"
+    with sockets(tmp_path) as running, stream(running, anchored_at):
+        with bridged(run_foxglove, options(tmp_path)) as port, client(port) as quick, client(port) as slow:
+            for each in (quick, slow):
+                each.subscribe(name)
+                until(lambda each=each: each.came[name])
+            slow.reading.clear()
+            before = len(quick.came[name])
+            until(lambda: len(quick.came[name]) > before + 60)
+            assert np.median([when - stamp * 1e-9 for stamp, _, when in quick.came[name][-30:]]) < 0.2
+            slow.reading.set()
+            until(lambda: time.time_ns() - slow.came[name][-1][0] < 200_000_000, seconds=5)
+
+
+def test_pictures_come_as_h264_that_anybody_can_begin_with(tmp_path: Path) -> None:
+    av = pytest.importorskip("av", reason="no H.264 without PyAV")
+    name = "/sags/left/image_rect_color/h264"
+    truth = plane_result().pair.left
+    with sockets(tmp_path) as running, stream(running, anchored_at):
+        with bridged(run_foxglove, options(tmp_path)) as port:
+            with client(port) as first:
+                first.subscribe(name)
+                until(lambda: len(first.came[name]) > 5)
+                with client(port) as second:
+                    second.subscribe(name)
+                    until(lambda: len(second.came[name]) > 5)
+                    schema = base64.b64decode(second.channels[name]["schema"])
+                    assert second.channels[name]["schemaName"] == "foxglove.CompressedVideo" and schema
+    decoder = av.CodecContext.create("h264", "r")
+    pictures = []
+    for _, message, _ in second.came[name][:6]:
+        fields = protobuf_bytes(message)
+        assert fields[4] == b"h264" and fields[3].startswith(b"\x00\x00\x00\x01")
+        pictures += decoder.decode(av.Packet(fields[3]))
+    assert len(pictures) == 6, "a picture for each message, from the very first on"
+    error = np.abs(pictures[-1].to_ndarray(format="rgb24").astype(int) - truth)
+    assert np.median(error) <= 12  # colour at half size, in a picture whose colour changes with every pixel
+    raw = WIDTH * HEIGHT * 3
+    assert np.mean([len(message) for _, message, _ in second.came[name][1:6]]) < raw / 10
+
+
+def protobuf_bytes(message: bytes) -> dict[int, bytes]:
+    """The fields of a protobuf message that hold bytes."""
+    fields, at = {}, 0
+
+    def number() -> int:
+        nonlocal at
+        value = shift = 0
+        while True:
+            byte = message[at]
+            at += 1
+            value |= (byte & 127) << shift
+            shift += 7
+            if byte < 128:
+                return value
+
+    while at < len(message):
+        key = number()
+        assert key & 7 == 2, "only fields with a length"
+        size = number()
+        fields[key >> 3] = message[at : at + size]
+        at += size
+    return fields
+
+
+def test_status_comes_as_figures_for_plots(tmp_path: Path) -> None:
+    with sockets(tmp_path) as running, stream(running, anchored_at):
+        with bridged(run_foxglove, options(tmp_path)) as port, client(port) as joined:
+            joined.subscribe("/sags/figures")
+            until(lambda: joined.came["/sags/figures"])
+    said = json.loads(joined.came["/sags/figures"][-1][1])
+    assert said["rate_hz"] == 30.0 and said["latency_ms"]["p50"] == 40.0 and said["gaussians"] == 384
+
+
+# ---- requests --------------------------------------------------------------------------------------------
+
+
+def click(joined: Client, frame: str = "world") -> None:
+    channel = {"id": 1, "topic": CLICKED, "encoding": "json", "schemaName": "geometry_msgs/PointStamped"}
+    joined.send(json.dumps({"op": "advertise", "channels": [channel]}))
+    point = {
+        "header": {"stamp": {"sec": 0, "nsec": 0}, "frame_id": frame},
+        "point": {"x": 0.01, "y": 0.02, "z": 0.07},
+    }
+    joined.send(struct.pack("<BI", 1, 1) + json.dumps(point).encode())
+
+
+def pinning(run_dir: Path, pinned: list[dict[str, Any]]) -> Any:
+    def add(args: dict[str, Any]) -> dict[str, Any]:
+        pinned.append(args)
+        return {"id": 1, "frame_id": 7, "depth_confidence": 0.9}
+
+    return sockets(run_dir, {"add_anchor": add})
+
+
+def test_a_click_pins_an_anchor_where_that_is_allowed(tmp_path: Path) -> None:
+    pinned: list[dict[str, Any]] = []
+    with pinning(tmp_path, pinned) as running, stream(running):
+        with bridged(run_foxglove, options(tmp_path, pin=True)) as port, client(port) as joined:
+            until(lambda: joined.info)
+            assert joined.info["capabilities"] == ["clientPublish"]
+            click(joined, frame="left_optical_frame")
+            until(lambda: any("'world'" in said.get("message", "") for said in joined.said))
+            click(joined)
+            until(lambda: pinned)
+            until(lambda: any("depth_confidence" in said.get("message", "") for said in joined.said))
+        assert pinned == [{"x": 0.01, "y": 0.02, "z": 0.07}]
+        with bridged(run_foxglove, options(tmp_path)) as port, client(port) as joined:
+            click(joined)
+            joined.subscribe("/sags/tf")
+            until(lambda: len(joined.came["/sags/tf"]) > 10)
+    assert len(pinned) == 1, "nobody may without --pin"
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        *(b"", b"{}", b"[1]", b"\xff", b'{"header": 3}', b"[" * 100_000),
+        b'{"header": {"frame_id": "world"}, "point": {"x": NaN, "y": 0, "z": 0}}',
+    ],
+)
+def test_what_is_no_point_pins_nothing(data: bytes) -> None:
+    assert clicked(data) is None
+
+
+def test_the_layout_that_is_kept_names_the_channels_there_are(tmp_path: Path) -> None:
+    text = (ROOT / "examples/foxglove/sags.json").read_text()
+    assert text == layout_of("sags", "overlay"), (
+        "write it again: sags bridge foxglove --layout examples/foxglove/sags.json"
+    )
+    named = {
+        part.partition(".")[0]
+        for part in _strings(json.loads(text))
+        if part.startswith(("/sags/", "/overlay/"))
+    }
+    with bridged(run_foxglove, options(tmp_path)) as port, client(port) as joined:
+        until(lambda: joined.channels)
+        until(lambda: named <= joined.channels.keys(), seconds=5)
+    shown = {
+        "/sags/left/image_rect_color",
+        "/sags/left/render/image",
+        "/sags/points",
+        "/sags/anchors",
+        "/sags/figures",
+    }
+    assert shown <= named
+
+
+def _strings(value: Any) -> Iterator[str]:
+    if isinstance(value, dict):
+        for key, each in value.items():
+            yield key
+            yield from _strings(each)
+    elif isinstance(value, list):
+        for each in value:
+            yield from _strings(each)
+    elif isinstance(value, str):
+        yield value
