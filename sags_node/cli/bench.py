@@ -15,6 +15,7 @@ from sags_node.cli.bench_masks import bench_masks
 from sags_node.cli.bench_node import (
     bench_crowd,
     bench_endurance,
+    bench_inputs,
     bench_pareto,
     bench_tracking,
     bench_transport,
@@ -51,6 +52,7 @@ for command in (
     bench_tracking,
     bench_crowd,
     bench_transport,
+    bench_inputs,
 ):
     bench.add_command(command)
 
