@@ -23,8 +23,9 @@ Opener = Callable[[], AbstractContextManager[Source]]  # of a live source of tha
 
 
 def _camera(height: int) -> str:
+    """Black is made at once; a moving picture of this size takes 18 ms of a core, and falls behind."""
     return (
-        "videotestsrc is-live=true pattern=ball "
+        "videotestsrc is-live=true pattern=black "
         f"! video/x-raw,format=UYVY,width={WIDTH},height={height},framerate={RATE}/1"
     )
 
@@ -47,7 +48,7 @@ def measure_inputs(
     """A row for each way: `way`, `pairs`, `unequal` (pairs of unequal stamps), `dropped` (pictures without
     a partner); `node_ms`, the CPU time of a pair in the node's process; `sender_ms`, that of the process
     that makes, converts and sends the pictures; `latency_ms_p50` and `_p99` from the stamp until the pair is
-    there. On a busy machine the test picture itself is made late.
+    there.
 
     Args:
         seconds: to measure, each.
