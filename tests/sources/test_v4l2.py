@@ -367,6 +367,21 @@ def test_frozen_picture_is_no_picture(device: Callable[..., Device]) -> None:
     assert pictures[0] is not None and (pictures[0].image == (0, 0, 255)).all()  # RGB from OpenCV's BGR
 
 
+@pytest.mark.parametrize(("fourcc", "bits"), [("Y10", 10), ("Y12", 12), ("Y16", 16)])
+def test_more_than_eight_bits_are_kept(
+    device: Callable[..., Device], monkeypatch: pytest.MonkeyPatch, fourcc: str, bits: int
+) -> None:
+    """OpenCV hands such pictures over as bytes in a row when it is not to convert them."""
+    counts = np.linspace(0, 2**bits - 1, 32).astype(np.uint16)
+    monkeypatch.setattr(FakeCapture, "read", lambda self: (True, counts.view(np.uint8)[None]))
+    camera = device([0.0], fourcc=fourcc)
+    assert camera._capture.values[cv2.CAP_PROP_CONVERT_RGB] == 0
+    picture = camera.read(0.1)
+    assert picture is not None and picture.image.shape == (4, 8, 3)
+    bright = picture.image[..., 1].ravel() / 65535
+    assert np.abs(bright - counts / (2**bits - 1)).max() < 2.0**-bits
+
+
 def test_driver_without_stamps_gets_the_arrival_time(device: Callable[..., Device]) -> None:
     camera = device([0.0, 0.0])
     before = time.time_ns()
