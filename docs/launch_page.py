@@ -11,7 +11,16 @@ from typing import Annotated, Any, Literal, TypeGuard, Union, get_args, get_orig
 from annotated_types import Ge, Gt, Le
 from pydantic.fields import FieldInfo
 
-from sags_node.config import Box, LaunchConfig, RecordedSource, Section
+from sags_node.config import (
+    Box,
+    Guarded,
+    LaunchConfig,
+    LiveSource,
+    RecordedSource,
+    RosGraph,
+    Section,
+    SentSource,
+)
 
 PAGE = Path(__file__).with_name("launch.md")
 HEAD = """# Launch files
@@ -75,7 +84,12 @@ def _kinds(prefix: str, sections: tuple[type[Section], ...]) -> Iterator[str]:
     yield f"## `{prefix.removesuffix('.')}`: where the pictures come from\n"
     yield "`source.kind` says which kind of source it is, and so which other keys there are."
     yield "Without `source` it is the `phantom`.\n"
-    yield from _tables(RecordedSource, prefix, "Every kind but `v4l2`")
+    yield from _tables(RecordedSource, prefix, "Every recording")
+    yield from _tables(LiveSource, prefix, "Every live kind")
+    sent = [name for name in SentSource.__annotations__]
+    yield from _table(SentSource, prefix, "`ros2` and `push`", sent)
+    yield from _table(RosGraph, prefix, "`ros2`", list(RosGraph.model_fields))
+    yield from _table(Guarded, prefix, "`push`", list(Guarded.model_fields))
     for section in sections:
         own = [name for name in section.__annotations__ if name != "kind"]  # what is inherited stands above
         yield from _table(section, prefix, f"`kind: {section.model_fields['kind'].default}`", own)

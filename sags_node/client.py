@@ -1,4 +1,5 @@
-"""The front door for programs that use a node: a subscriber, what it receives, and requests.
+"""The front door for programs that use a node: a subscriber, what it receives, requests, and what hands
+pictures in.
 
 Importing this loads numpy, ZeroMQ and the message formats, and none of what maps: no Numba, torch, OpenCV
 or Open3D.
@@ -19,6 +20,7 @@ from sags_node.messaging.received import (
     ReceivedText,
     TopicName,
 )
+from sags_node.messaging.sender import FrameSender
 from sags_node.messaging.subscriber import Subscriber
 
 __all__ = [
@@ -26,6 +28,7 @@ __all__ = [
     "ClientKeys",
     "ControlClient",
     "Frame",
+    "FrameSender",
     "Received",
     "ReceivedCameraInfo",
     "ReceivedCloud",

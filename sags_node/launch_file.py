@@ -20,6 +20,7 @@ MOST_MISTAKES = 10  # named at once
 DEFAULT_DATA = "../shared/data"
 BAG_SUFFIXES = (".mcap", ".db3", ".bag")
 VIDEO_SUFFIXES = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".ts", ".wmv")
+_WITHOUT_PATHS = ("v4l2", "ros2")  # kinds of sources whose left and right are devices or topics
 SIDECAR_TYPE = "dvrk_data:video_sidecar@"
 SIDECAR_LOOK = 65536  # bytes at either end; jsoncpp sorts the keys, so the type comes after the frames
 
@@ -144,8 +145,9 @@ def _resolve_paths(tree: dict[str, Any], folder: Path) -> None:
     """Expand variables in every string and make the known path keys relative to the launch file."""
     variables = {"SAGS_DATA": str((folder / ".." / DEFAULT_DATA).resolve()), **os.environ}
     for key, value in tree.items():
-        if isinstance(value, dict) and value.get("kind") != "v4l2":
-            _resolve_paths(value, folder)
+        if isinstance(value, dict):
+            if not (key == "source" and value.get("kind") in _WITHOUT_PATHS):
+                _resolve_paths(value, folder)
         elif isinstance(value, str):
             tree[key] = _resolve(key, value, folder, variables)
         elif isinstance(value, list):

@@ -20,7 +20,7 @@ from concurrent.futures import Future
 from dataclasses import replace
 from typing import Any
 
-from sags_node.config import LaunchConfig, V4l2Source
+from sags_node.config import LaunchConfig, LiveSource
 from sags_node.errors import SagsError
 from sags_node.findings import by_code
 from sags_node.kernels.threads import configure_threads
@@ -69,7 +69,7 @@ class Node:
         self._state = NodeState(config, pipeline, pipeline.make_budget(), Views(config.engine.backend))
         self._operations = Operations(self._state, self._hand_over_view)
         self._pictures: Latest[tuple[RectifiedPair, int]] = Latest(on_put=self._wake_publishing)  # and epoch
-        self._live = isinstance(config.source, V4l2Source) or config.source.pace == "realtime"
+        self._live = isinstance(config.source, LiveSource) or config.source.pace == "realtime"
         self._wake = os.eventfd(0, os.EFD_NONBLOCK)
         self._frames: Latest[tuple[StereoFrame, float]] = Latest()  # and when it came
         self._results: Latest[FrameResult] = Latest(on_put=self._wake_publishing)

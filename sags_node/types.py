@@ -120,6 +120,8 @@ class StereoFrame:
     tissue: Bool | None = None  # [H, W] raw left picture, when the session knows it
     reference: Reference | None = None
     depth: F32 | None = None  # [H, W] m, 0 unknown, left rectified, at calibration size; instead of stereo
+    t_device_ns: int = 0  # left eye, as the device, sender or recording stamped it by its own clock; 0: none
+    t_arrival_ns: int = 0  # left eye, wall clock; 0: not a live picture
 
 
 @dataclass(frozen=True, slots=True)
@@ -300,6 +302,15 @@ class ViewStatus:
 
 
 @dataclass(frozen=True, slots=True)
+class ClockStatus:
+    """The clock that stamps live pictures, against this machine's wall clock."""
+
+    offset_ms: float  # wall clock - that clock, and the shortest way that pictures take
+    drift_ppm: float | None  # how fast the offset grows, us/s; None: it is not known yet
+    seconds: float  # that it was watched
+
+
+@dataclass(frozen=True, slots=True)
 class NodeHealth:
     """What the node says of itself once a second, also when no frames come."""
 
@@ -316,3 +327,4 @@ class NodeHealth:
     connections: Mapping[str, Mapping[str, int]] = field(default_factory=dict)  # socket -> open, refused
     views: Mapping[str, ViewStatus] = field(default_factory=dict)  # those that consumers asked for, by name
     rung: RungState | None = None  # None: fixed steps, or no frame yet
+    clock: ClockStatus | None = None  # None: a recording, or pictures without stamps

@@ -54,11 +54,11 @@ def split_recording(arguments: Sequence[str], no_cameras: str) -> tuple[str | No
     Raises:
         UsageError: the source is live cameras, or the launch is wrong.
     """
-    from sags_node.config import V4l2Source
+    from sags_node.config import LiveSource
     from sags_node.launch_file import load_launch
 
     path, overrides = split(arguments)
-    if isinstance(load_launch(path, overrides).source, V4l2Source):
+    if isinstance(load_launch(path, overrides).source, LiveSource):
         raise UsageError(no_cameras)
     return path, overrides
 

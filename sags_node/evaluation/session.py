@@ -9,7 +9,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
 
-from sags_node.config import LaunchConfig, PublishConfig, V4l2Source
+from sags_node.config import LaunchConfig, LiveSource, PublishConfig
 from sags_node.errors import SagsError, UsageError
 from sags_node.evaluation.gallery import Picture
 from sags_node.evaluation.measure import FrameRow, Measurer, Options, Progress
@@ -64,7 +64,7 @@ def evaluate(
         SagsError: the recording cannot be used, the disk is full, or nothing was processed.
     """
     asked = load_launch(launch, overrides)
-    if isinstance(asked.source, V4l2Source):
+    if isinstance(asked.source, LiveSource):
         raise UsageError("live cameras cannot be measured; record them first, then evaluate the recording")
     _check_segments(asked)
     forced = ["source.loop:=false", f"source.pace:={pace}"]
@@ -112,7 +112,7 @@ def measure(
     )
     summary["settings"] = {
         "overrides": list(overrides),
-        "pace": None if isinstance(config.source, V4l2Source) else config.source.pace,
+        "pace": None if isinstance(config.source, LiveSource) else config.source.pace,
         "iterations": config.mapping.iterations,
         "right_eye": config.mapping.right_eye,
         "max_gaussians": affordable(config, *session.working_size),

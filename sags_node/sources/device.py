@@ -26,6 +26,8 @@ class Picture(NamedTuple):
 
     t_ns: int  # wall clock
     image: U8  # [H, W, 3] RGB
+    device_ns: int = 0  # by the clock of what took or sent it; 0: it gave none
+    arrival_ns: int = 0  # wall clock; 0: not known
 
 
 class Device:
@@ -103,8 +105,9 @@ class Device:
         if stamp_ms and stamp_ms == self._last_stamp_ms:
             return None
         self._last_stamp_ms = stamp_ms
-        t_ns = wall_stamp(round(stamp_ms * 1e6), time.monotonic_ns(), time.time_ns())
-        return Picture(t_ns, cv2.cvtColor(picture, cv2.COLOR_BGR2RGB))
+        device_ns, arrival_ns = round(stamp_ms * 1e6), time.time_ns()
+        t_ns = wall_stamp(device_ns, time.monotonic_ns(), arrival_ns)
+        return Picture(t_ns, cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), device_ns, arrival_ns)
 
     def close(self) -> None:
         self._capture.release()

@@ -10,13 +10,14 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from types import TracebackType
 from typing import Protocol, Self
 
 from sags_node.config import V4l2Source
 from sags_node.errors import SagsError, UsageError
 from sags_node.sources.device import Device, Picture
-from sags_node.sources.pairing import Pairing
+from sags_node.sources.live_pairs import LivePairs
 from sags_node.sources.videos import side_by_side_boxes
 from sags_node.types import StereoFrame
 
@@ -57,20 +58,22 @@ class StereoCameras:
     def __init__(
         self, config: V4l2Source, open_device: Callable[[str, V4l2Source], CaptureDevice] = Device
     ) -> None:
-        self._config = config
-        self._stopped = threading.Event()
-        self._arrived = threading.Condition()
-        self._pairing = Pairing(round(config.pair_tolerance_ms * 1e6))
+        self._pairs = LivePairs(config.pair_tolerance_ms, config.latency_ms)
         self._readers: list[DeviceReader] = []
         if config.side_by_side is not None:
             self._halves = side_by_side_boxes(config.width, config.height, config.side_by_side, config.left)
             eyes = [(config.left, self._put_halves)]
         else:
-            eyes = [(config.left, self._put_left), (_right_path(config), self._put_right)]
+            eyes = [
+                (config.left, partial(self._pairs.put, "left")),
+                (_right_path(config), partial(self._pairs.put, "right")),
+            ]
         try:
             for path, put in eyes:
                 device = open_device(path, config)
-                self._readers.append(DeviceReader(path, config, open_device, device, put, self._stopped))
+                self._readers.append(
+                    DeviceReader(path, config, open_device, device, put, self._pairs.stopped)
+                )
         except SagsError:
             self._close()
             raise
@@ -79,7 +82,7 @@ class StereoCameras:
     @property
     def dropped(self) -> int:
         """Pictures of either eye that found no partner."""
-        return self._pairing.unpaired
+        return self._pairs.unpaired
 
     def __enter__(self) -> Self:
         for reader in self._readers:
@@ -98,40 +101,15 @@ class StereoCameras:
 
     def stop(self) -> None:
         """End the iteration; any thread may call this."""
-        with self._arrived:
-            self._stopped.set()
-            self._arrived.notify_all()
+        self._pairs.stop()
 
     def __iter__(self) -> Iterator[StereoFrame]:
         """Pairs as they arrive, until `stop`; silent while a camera is away."""
-        epoch, last_ns = 0, 0
-        while True:
-            with self._arrived:
-                while (pair := self._pairing.take()) is None and not self._stopped.is_set():
-                    self._arrived.wait(POLL_S)
-            if pair is None or self._stopped.is_set():
-                return
-            frame_id, left, right = pair
-            epoch += left.t_ns < last_ns
-            last_ns = left.t_ns
-            yield StereoFrame(frame_id, left.t_ns, right.t_ns, left.image, right.image, epoch)
-
-    def _put_left(self, picture: Picture) -> None:
-        with self._arrived:
-            self._pairing.add_left(picture)
-            self._arrived.notify_all()
-
-    def _put_right(self, picture: Picture) -> None:
-        with self._arrived:
-            self._pairing.add_right(picture)
-            self._arrived.notify_all()
+        return iter(self._pairs)
 
     def _put_halves(self, picture: Picture) -> None:
         left, right = (picture.image[y : y + h, x : x + w].copy() for x, y, w, h in self._halves)
-        with self._arrived:
-            self._pairing.add_left(Picture(picture.t_ns, left))
-            self._pairing.add_right(Picture(picture.t_ns, right))
-            self._arrived.notify_all()
+        self._pairs.put_both(picture._replace(image=left), picture._replace(image=right))
 
 
 class DeviceReader:
