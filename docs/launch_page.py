@@ -12,11 +12,15 @@ from annotated_types import Ge, Gt, Le
 from pydantic.fields import FieldInfo
 
 from sags_node.config import (
+    BagRobot,
     Box,
     Guarded,
     LaunchConfig,
     LiveSource,
+    PushRobot,
     RecordedSource,
+    RobotPoses,
+    Ros2Robot,
     RosGraph,
     Section,
     SentSource,
@@ -77,6 +81,8 @@ def _tables(section: type[Section], prefix: str, title: str) -> Iterator[str]:
             yield from _kinds(f"{prefix}{name}.", get_args(field.annotation))
         elif _is_section(field.annotation):
             yield from _tables(field.annotation, f"{prefix}{name}.", f"`{prefix}{name}`")
+        elif name == "robot":
+            yield from _robot(f"{prefix}{name}.")
 
 
 def _kinds(prefix: str, sections: tuple[type[Section], ...]) -> Iterator[str]:
@@ -86,8 +92,7 @@ def _kinds(prefix: str, sections: tuple[type[Section], ...]) -> Iterator[str]:
     yield "Without `source` it is the `phantom`.\n"
     yield from _tables(RecordedSource, prefix, "Every recording")
     yield from _tables(LiveSource, prefix, "Every live kind")
-    sent = [name for name in SentSource.__annotations__]
-    yield from _table(SentSource, prefix, "`ros2` and `push`", sent)
+    yield from _table(SentSource, prefix, "`ros2` and `push`", list(SentSource.__annotations__))
     yield from _table(RosGraph, prefix, "`ros2`", list(RosGraph.model_fields))
     yield from _table(Guarded, prefix, "`push`", list(Guarded.model_fields))
     for section in sections:
@@ -95,8 +100,18 @@ def _kinds(prefix: str, sections: tuple[type[Section], ...]) -> Iterator[str]:
         yield from _table(section, prefix, f"`kind: {section.model_fields['kind'].default}`", own)
 
 
+def _robot(prefix: str) -> Iterator[str]:
+    """What all robots have in common, then what each kind has beyond it."""
+    yield "## `robot`: who says where the scope is\n"
+    yield "`robot.kind` says which way poses come. Without `robot` nobody says it, or the recording does.\n"
+    yield from _table(RobotPoses, prefix, "Every kind of robot", list(RobotPoses.model_fields))
+    for section in (Ros2Robot, PushRobot, BagRobot):
+        own = [name for name in section.model_fields if name not in {"kind", *RobotPoses.model_fields}]
+        yield from _table(section, prefix, f"`robot.kind: {section.model_fields['kind'].default}`", own)
+
+
 def _table(section: type[Section], prefix: str, title: str, names: list[str]) -> Iterator[str]:
-    level = "##" if prefix.count(".") <= 1 and not prefix.startswith("source.") else "###"
+    level = "##" if prefix.count(".") <= 1 and not prefix.startswith(("source.", "robot.")) else "###"
     yield f"{level} {title}\n"
     if section.__doc__:
         yield f"{_linked(section.__doc__)}\n"

@@ -18,8 +18,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sags_node.calibration import load_rig
-from sags_node.client import FrameSender
+from sags_node.calibration import load_rig, save_rig
+from sags_node.calibration.hand_eye import HandEye, save_hand_eye
+from sags_node.client import FrameSender, PoseSender
 from sags_node.config import PhantomSource
 from sags_node.messaging import cdr
 from sags_node.phantom import cached_session
@@ -32,11 +33,11 @@ Send = Callable[[Picture, Picture, NDArray[np.float64], int], None]  # left, rig
 def pushed(endpoint: str, jpeg: int | None, pose_endpoint: str | None) -> Send:
     """Over ZeroMQ."""
     frames = FrameSender(endpoint)
-    poses = None if pose_endpoint is None else FrameSender(pose_endpoint)
+    poses = None if pose_endpoint is None else PoseSender(pose_endpoint)
 
     def send(left: Picture, right: Picture, pose: NDArray[np.float64], stamp_ns: int) -> None:
         if poses is not None:
-            poses.send_pose(pose, stamp_ns)
+            poses.send(pose, stamp_ns)
         if jpeg is None:
             frames.send(left, right, stamp_ns)
         else:
@@ -108,9 +109,10 @@ def main() -> None:
     folder = cached_session(config)
     rig = load_rig(folder / "calib")
     if said.rig is not None:
-        from sags_node.calibration import save_rig
-
         save_rig(rig, said.rig)
+        T = np.eye(4)
+        T[:3, :3] = rig.left.R  # the phantom tells the pose of its left rectified camera
+        save_hand_eye(HandEye(T), said.rig, {})
         return
     pairs = [
         [cv2.imread(str(folder / eye / f"{index:04d}.jpg"))[..., ::-1].copy() for eye in ("left", "right")]

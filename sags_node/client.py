@@ -20,7 +20,7 @@ from sags_node.messaging.received import (
     ReceivedText,
     TopicName,
 )
-from sags_node.messaging.sender import FrameSender
+from sags_node.messaging.sender import FrameSender, PoseSender
 from sags_node.messaging.subscriber import Subscriber
 
 __all__ = [
@@ -29,6 +29,7 @@ __all__ = [
     "ControlClient",
     "Frame",
     "FrameSender",
+    "PoseSender",
     "Received",
     "ReceivedCameraInfo",
     "ReceivedCloud",

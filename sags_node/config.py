@@ -205,7 +205,9 @@ class SentSource(LiveSource):
 class RosGraph(Section):
     """Where a ROS 2 graph is; needs `pip install 'sags-node[ros2]'`, and no ROS."""
 
-    domain: int | None = Field(None, ge=0, le=232, description="number of the graph; default: `$ROS_DOMAIN_ID`, else 0")
+    domain: int | None = Field(
+        None, ge=0, le=232, description="number of the graph; default: `$ROS_DOMAIN_ID`, else 0"
+    )
     interface: str = Field(
         "lo", pattern=r"^[A-Za-z0-9_.:-]+$", description="network interface; lo: this machine only"
     )
@@ -261,6 +263,46 @@ Source = Annotated[
     | PushSource,
     Field(discriminator="kind"),
 ]
+
+# ---- the robot -------------------------------------------------------------------------------------------
+
+
+class RobotPoses(Section):
+    """What all poses of a robot have in common."""
+
+    base: str | None = Field(None, description="frame of tf that is the world; not for topics of poses")
+    hand: str | None = Field(None, description="frame of tf that carries the camera")
+    hand_eye: Path | None = Field(
+        None, description="how the camera sits on it (sags calib hand-eye); default: hand_eye.yaml in rig"
+    )
+    offset_ms: float | None = Field(
+        None, ge=-1000, le=1000, description="the robot's stamp minus the picture's, of one moment; default: "
+        "what the hand-eye calibration found",
+    )  # fmt: skip
+
+
+class Ros2Robot(RobotPoses, RosGraph):
+    """Live poses of a ROS 2 graph."""
+
+    kind: Literal["ros2"] = "ros2"
+    topic: str = Field("/tf", description="of TFMessage, PoseStamped or TransformStamped")
+
+
+class PushRobot(RobotPoses, Guarded):
+    """Live poses that another program hands in over ZeroMQ."""
+
+    kind: Literal["push"] = "push"
+    endpoint: str = Field("tcp://127.0.0.1:5559", description="ROUTER socket that the node binds")
+
+
+class BagRobot(RobotPoses):
+    """Poses of a ROS recording, beside its pictures."""
+
+    kind: Literal["bag"] = "bag"
+    topic: str = Field("/tf", description="of TFMessage, PoseStamped or TransformStamped")
+
+
+Robot = Annotated[Ros2Robot | PushRobot | BagRobot, Field(discriminator="kind")]
 
 # ---- the stages ------------------------------------------------------------------------------------------
 
@@ -492,6 +534,9 @@ class LaunchConfig(Section):
         "one",
     )
     source: Source = PhantomSource()
+    robot: Robot | None = Field(
+        None, description="who says where the scope is; null: nobody, or the recording. docs/inputs.md"
+    )
     vision: VisionConfig = VisionConfig()
     engine: EngineConfig = EngineConfig()
     mapping: MappingConfig = MappingConfig()

@@ -63,6 +63,8 @@ def health_table(health: NodeHealth) -> Table:
     table.add_row("Gaussians", f"{health.gaussians:,}")
     if health.rung is not None:
         table.add_row("quality", text.rung_text(health.rung))
+    if health.clock is not None and health.clock.drift_ppm is not None:
+        table.add_row("capture clock", f"drifts by {health.clock.drift_ppm:+.0f} us/s from this machine's")
     table.add_row("stages (ms)", "  ".join(f"{k} {v:.1f}" for k, v in health.stage_ms.items()))
     table.add_row("dropped", "  ".join(f"{k} {v}" for k, v in health.dropped.items()))
     if health.skipped:

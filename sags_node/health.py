@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from sags_node.findings import Findings, by_stage
-from sags_node.types import Finding, FrameResult, NodeHealth, RungState, ViewStatus
+from sags_node.types import ClockStatus, Finding, FrameResult, NodeHealth, RungState, ViewStatus
 
 WAITING_AFTER = 1.0  # s without a frame
 WINDOW = 150  # frames behind the published rates and latencies
@@ -63,6 +63,7 @@ class Statistics:
         warnings: Findings,
         connections: dict[str, dict[str, int]],
         views: Mapping[str, ViewStatus],
+        clock: ClockStatus | None = None,
     ) -> NodeHealth:
         with self._lock:
             now = time.monotonic()
@@ -98,6 +99,7 @@ class Statistics:
                 connections=connections,
                 views=views,
                 rung=self._rung,
+                clock=clock,
             )
 
     def _findings(self, state: str, now: float) -> list[Finding]:

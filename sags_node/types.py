@@ -122,6 +122,7 @@ class StereoFrame:
     depth: F32 | None = None  # [H, W] m, 0 unknown, left rectified, at calibration size; instead of stereo
     t_device_ns: int = 0  # left eye, as the device, sender or recording stamped it by its own clock; 0: none
     t_arrival_ns: int = 0  # left eye, wall clock; 0: not a live picture
+    pose_problem: Finding | None = None  # why `T_world_cam` is an older pose; such a frame is not taken in
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,7 +3,7 @@
 with FrameSender() as sender:
     sender.send(left, right)  # [H, W, 3] uint8 RGB
 
-The node must have `source.kind: push` (or `robot.kind: push` for poses).
+The node must have `source.kind: push`; for poses `robot.kind: push`.
 """
 
 from __future__ import annotations
@@ -30,12 +30,11 @@ from sags_node.types import F64
 log = logging.getLogger(__name__)
 
 Picture = NDArray[Any] | bytes  # [H, W] or [H, W, C] uint8; or the bytes of a JPEG or PNG file
-QUEUED = 6  # messages that may wait for the network: two pairs, and poses
 MAX_RECEIPT_BYTES = 1 << 16
 
 
-class FrameSender:
-    """Sends without ever waiting: what does not fit into the queue is left out and counted.
+class Sender:
+    """Sends to a node without ever waiting: what does not fit into the queue is left out and counted.
 
     Used from one thread. A node that is away or restarted gets what is sent from then on.
 
@@ -44,7 +43,7 @@ class FrameSender:
         left_out: messages that did not fit.
 
     Args:
-        endpoint: the node's `source.endpoint` (for poses alone: `robot.endpoint`).
+        endpoint: of the node.
         ns: namespace of the topics.
         keys: for a node that wants them.
 
@@ -52,9 +51,9 @@ class FrameSender:
         SagsError: the endpoint is malformed.
     """
 
-    def __init__(
-        self, endpoint: str = "tcp://127.0.0.1:5558", ns: str = "camera", keys: ClientKeys | None = None
-    ) -> None:
+    _queued: int  # messages that may wait for the network
+
+    def __init__(self, endpoint: str, ns: str, keys: ClientKeys | None) -> None:
         self.receipt: Receipt | None = None
         self.left_out = 0
         self._ns = ns
@@ -64,66 +63,18 @@ class FrameSender:
         self._said: str | None = None
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.DEALER)
-        self._socket.setsockopt(zmq.SNDHWM, QUEUED)
+        self._socket.setsockopt(zmq.SNDHWM, self._queued)
         try:
             self._watch = connect(self._socket, Address(endpoint, keys), MAX_RECEIPT_BYTES)
         except SagsError:
             self.close()
             raise
 
-    def send(
-        self, left: Picture, right: Picture, stamp_ns: int | None = None, encoding: str | None = None
-    ) -> bool:
-        """Both eyes' pictures of one moment; False when one of them was left out.
-
-        Args:
-            stamp_ns: when they were taken, wall clock (`time.time_ns`); default: now.
-            encoding: of arrays, one of `cdr.IMAGE_ENCODINGS`; default: by the channels mono8, rgb8 or rgba8.
-
-        Raises:
-            ValueError: an array is not uint8 [H, W] or [H, W, C], or does not fit the encoding.
-        """
-        stamp_ns = time.time_ns() if stamp_ns is None else stamp_ns
-        went = [self.send_eye("left", left, stamp_ns, encoding)]
-        went.append(self.send_eye("right", right, stamp_ns, encoding))
-        return all(went)
-
-    def send_eye(
-        self, eye: Literal["left", "right"], picture: Picture, stamp_ns: int, encoding: str | None = None
-    ) -> bool:
-        """One eye's picture: for eyes that two programs hold. Stamps say which belong together."""
-        return self._send_picture(eye, picture, stamp_ns, encoding)
-
-    def send_side_by_side(
-        self, picture: Picture, stamp_ns: int | None = None, encoding: str | None = None
-    ) -> bool:
-        """One picture of both eyes, the left one in its left half; see `send`."""
-        return self._send_picture("stereo", picture, stamp_ns, encoding)
-
-    def send_pose(self, T_base_hand: F64, stamp_ns: int | None = None) -> bool:
-        """Where what carries the camera was at a moment, [4, 4], m; see `send`."""
-        stamp_ns = time.time_ns() if stamp_ns is None else stamp_ns
-        return self._send("pose", cdr.pose(T_base_hand, stamp_ns), stamp_ns)
-
     @property
     def problem(self) -> str | None:
         """What the node has against what is sent, or that it is not there; None: all is well."""
         self._listen()
         return self._watch.refusal() or (None if self.receipt is None else self.receipt.problem)
-
-    def _send_picture(self, whose: str, picture: Picture, stamp_ns: int | None, encoding: str | None) -> bool:
-        stamp_ns = time.time_ns() if stamp_ns is None else stamp_ns
-        frame = cdr.RIGHT_FRAME if whose == "right" else cdr.LEFT_FRAME
-        if isinstance(picture, bytes):
-            return self._send(
-                f"{whose}/image_raw/compressed", cdr.picture_file(picture, stamp_ns, frame), stamp_ns
-            )
-        encoding = encoding or _usual_encoding(picture)
-        fits = cdr.IMAGE_ENCODINGS.get(encoding)
-        shape = picture.shape[2:] or (1,)
-        if fits is None or picture.dtype != fits[0] or shape != (fits[1],):
-            raise ValueError(f"a picture {picture.shape} of {picture.dtype} is not {encoding}")
-        return self._send(f"{whose}/image_raw", cdr.image(picture, encoding, stamp_ns, frame), stamp_ns)
 
     def _send(self, name: str, body: Content, stamp_ns: int) -> bool:
         self._seq[name] += 1
@@ -165,6 +116,80 @@ class FrameSender:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+class FrameSender(Sender):
+    """Hands pictures in to a node with `source.kind: push`, at its `source.endpoint`; see `Sender`."""
+
+    _queued = 4  # two pairs: a slow node gets new pictures, not old ones
+
+    def __init__(
+        self, endpoint: str = "tcp://127.0.0.1:5558", ns: str = "camera", keys: ClientKeys | None = None
+    ) -> None:
+        super().__init__(endpoint, ns, keys)
+
+    def send(
+        self, left: Picture, right: Picture, stamp_ns: int | None = None, encoding: str | None = None
+    ) -> bool:
+        """Both eyes' pictures of one moment; False when one of them was left out.
+
+        Args:
+            stamp_ns: when they were taken, wall clock (`time.time_ns`); default: now.
+            encoding: of arrays, one of `cdr.IMAGE_ENCODINGS`; default: by the channels mono8, rgb8 or rgba8.
+
+        Raises:
+            ValueError: an array is not uint8 [H, W] or [H, W, C], or does not fit the encoding.
+        """
+        stamp_ns = time.time_ns() if stamp_ns is None else stamp_ns
+        went = [self.send_eye("left", left, stamp_ns, encoding)]
+        went.append(self.send_eye("right", right, stamp_ns, encoding))
+        return all(went)
+
+    def send_eye(
+        self, eye: Literal["left", "right"], picture: Picture, stamp_ns: int, encoding: str | None = None
+    ) -> bool:
+        """One eye's picture: for eyes that two programs hold. Stamps say which belong together."""
+        return self._send_picture(eye, picture, stamp_ns, encoding)
+
+    def send_side_by_side(
+        self, picture: Picture, stamp_ns: int | None = None, encoding: str | None = None
+    ) -> bool:
+        """One picture of both eyes, the left one in its left half; see `send`."""
+        return self._send_picture("stereo", picture, stamp_ns, encoding)
+
+    def _send_picture(self, whose: str, picture: Picture, stamp_ns: int | None, encoding: str | None) -> bool:
+        stamp_ns = time.time_ns() if stamp_ns is None else stamp_ns
+        frame = cdr.RIGHT_FRAME if whose == "right" else cdr.LEFT_FRAME
+        if isinstance(picture, bytes):
+            return self._send(
+                f"{whose}/image_raw/compressed", cdr.picture_file(picture, stamp_ns, frame), stamp_ns
+            )
+        encoding = encoding or _usual_encoding(picture)
+        fits = cdr.IMAGE_ENCODINGS.get(encoding)
+        shape = picture.shape[2:] or (1,)
+        if fits is None or picture.dtype != fits[0] or shape != (fits[1],):
+            raise ValueError(f"a picture {picture.shape} of {picture.dtype} is not {encoding}")
+        return self._send(f"{whose}/image_raw", cdr.image(picture, encoding, stamp_ns, frame), stamp_ns)
+
+
+class PoseSender(Sender):
+    """Hands poses in to a node with `robot.kind: push`, at its `robot.endpoint`; see `Sender`."""
+
+    _queued = 1000  # poses are small, and each of them counts
+
+    def __init__(
+        self, endpoint: str = "tcp://127.0.0.1:5559", ns: str = "robot", keys: ClientKeys | None = None
+    ) -> None:
+        super().__init__(endpoint, ns, keys)
+
+    def send(self, T_base_hand: F64, stamp_ns: int | None = None) -> bool:
+        """Where what carries the camera was at a moment, [4, 4], m.
+
+        Args:
+            stamp_ns: wall clock (`time.time_ns`); default: now.
+        """
+        stamp_ns = time.time_ns() if stamp_ns is None else stamp_ns
+        return self._send("pose", cdr.pose(T_base_hand, stamp_ns), stamp_ns)
 
 
 def _usual_encoding(picture: NDArray[Any]) -> str:

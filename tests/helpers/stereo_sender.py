@@ -14,6 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import cv2
+import numpy as np
 
 from sags_node.calibration import load_rig, resized_rig
 from sags_node.types import U8
@@ -55,7 +56,7 @@ def dds(domain: int, compressed: bool, scale: float, session: Path) -> Callable[
 
     from sags_node.config import RosGraph
     from sags_node.messaging import cdr
-    from sags_node.messaging.topics import CAMERA_INFO, IMAGE
+    from sags_node.messaging.topics import CAMERA_INFO, IMAGE, TF
     from sags_node.sources.ros_graph import Graph, raw_type
 
     graph = Graph(RosGraph(domain=domain))
@@ -73,9 +74,13 @@ def dds(domain: int, compressed: bool, scale: float, session: Path) -> Callable[
     kind, suffix = (cdr.COMPRESSED, "/compressed") if compressed else (IMAGE, "")
     pictures = [writer(f"{eye}/image_raw{suffix}", kind) for eye in ("left", "right")]
     calibrations = [writer(f"{eye}/camera_info", CAMERA_INFO) for eye in ("left", "right")]
+    tf = DataWriter(graph.participant, Topic(graph.participant, "rt/tf", raw_type(TF)), qos)
+    pose = np.eye(4)
+    pose[:3, 3] = 0.1, 0.2, 0.3
     rig = resized_rig(load_rig(session / "calib"), scale)
 
     def send(left: U8, right: U8, stamp_ns: int) -> None:
+        ddspy_write_ts(tf._ref, bytes(cdr.transform(pose, stamp_ns).parts[0]), stamp_ns)
         for write, eye in zip(calibrations, (rig.left, rig.right), strict=True):
             write(cdr.eye_info(eye, stamp_ns), stamp_ns)
         for write, picture in zip(pictures, (left, right), strict=True):

@@ -15,9 +15,10 @@ from live_taking import Taker
 from places import HELPERS, ROOT
 from waiting import until
 
-from sags_node.config import Ros2Source, RosGraph
+from sags_node.config import LaunchConfig, Ros2Robot, Ros2Source, RosGraph
 from sags_node.errors import UsageError
 from sags_node.sources import ros2
+from sags_node.sources.robot import open_robot
 from sags_node.sources.ros2 import RosCameras, read_rig
 from sags_node.sources.ros_graph import domain_of
 
@@ -135,3 +136,29 @@ def test_a_real_ros_node_is_heard(rclpy_camera: list[object]) -> None:
             until(lambda: len(taker.numbers) >= 60, seconds=20)
     assert rig is not None and rig.baseline == pytest.approx(0.004)
     assert taker.mismatched == 0
+
+
+def test_the_pose_of_a_real_ros_node_is_heard(rclpy_camera: list[object]) -> None:
+    """PoseStamped of rclpy, one millimetre further with each of its pictures."""
+    robot = open_robot(LaunchConfig(robot=Ros2Robot(domain=DOMAIN, topic="scope/measured_cp")))
+    source = RosCameras(config(), SIZE)
+    try:
+        with publishing([*rclpy_camera, 30, 30, *SIZE], ROS_DOMAIN_ID=str(DOMAIN)), Taker(source) as taker:
+            until(lambda: len(taker.numbers) >= 30, seconds=20)
+            assert taker.newest is not None
+            number, stamp = taker.numbers[-1][0], taker.newest.t_device_ns
+            place = robot.track.at(stamp, timeout=1.0)[0, 3]
+    finally:
+        robot.close()
+    assert place == pytest.approx(0.001 * number, abs=0.0011)  # a frame may come between the two lines
+
+
+def test_tf_of_a_graph_is_followed(phantom_session: Path) -> None:
+    robot = open_robot(LaunchConfig(robot=Ros2Robot(domain=DOMAIN, base="world", hand="left_optical_frame")))
+    try:
+        with publishing(dds(phantom_session, 60, "size=64x48")):
+            until(lambda: robot.track.newest_ns > 0, seconds=20)
+            stamp = robot.track.newest_ns
+            assert robot.track.at(stamp)[:3, 3] == pytest.approx([0.1, 0.2, 0.3])
+    finally:
+        robot.close()
