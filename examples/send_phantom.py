@@ -105,7 +105,8 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, help="default: until Ctrl-C")
     parser.add_argument("--rig", type=Path, help="write the calibration here, for the node, and end")
     said = parser.parse_args()
-    config = PhantomSource(width=said.size[0], height=said.size[1], camera_motion=True, seconds=4.0)
+    print("rendering the phantom (once)", flush=True)
+    config = PhantomSource(width=said.size[0], height=said.size[1], camera_motion=True, seconds=2.0)
     folder = cached_session(config)
     rig = load_rig(folder / "calib")
     if said.rig is not None:
@@ -116,13 +117,14 @@ def main() -> None:
         return
     pairs = [
         [cv2.imread(str(folder / eye / f"{index:04d}.jpg"))[..., ::-1].copy() for eye in ("left", "right")]
-        for index in range(0, 120, 2)
+        for index in range(60)
     ]
-    poses = np.load(folder / "poses.npz")["T_world_cam"][::2]
+    poses = np.load(folder / "poses.npz")["T_world_cam"]
     if said.way == "push":
         send = pushed(said.endpoint, said.jpeg, said.pose_endpoint)
     else:
         send = published(said.domain, said.name, (rig.left, rig.right), said.jpeg is not None)
+    print("sending", flush=True)
     begun = time.monotonic()
     for number in itertools.count():
         if said.seconds is not None and number >= said.seconds * said.rate:

@@ -10,8 +10,10 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from sags_node.config import LaunchConfig, PushRobot, PushSource, Ros2Robot, Ros2Source
 from sags_node.findings import by_code, in_words
 from sags_node.node import Node
+from sags_node.sources.ros_graph import domain_of, where
 from sags_node.terminal import text
 from sags_node.terminal.notices import Notices
 from sags_node.types import NodeHealth
@@ -41,6 +43,18 @@ def run_node(node: Node, seconds: float | None, console: Console) -> NodeHealth:
         health = node.health()
         node.stop()
     return health
+
+
+def inputs_text(config: LaunchConfig) -> list[str]:
+    """Where other programs hand in what the node takes; a line each."""
+    lines = []
+    for what, part in (("pictures", config.source), ("poses", config.robot)):
+        if isinstance(part, PushSource | PushRobot):
+            lines.append(f"taking {what} at {part.endpoint}")
+        elif isinstance(part, Ros2Source | Ros2Robot):
+            topics = f"{part.left} and {part.right}" if isinstance(part, Ros2Source) else part.topic
+            lines.append(f"taking {what} from {where(domain_of(part), part.interface)}: {topics}")
+    return lines
 
 
 def _watch(node: Node, deadline: float | None, console: Console, show: Callable[[NodeHealth], None]) -> None:

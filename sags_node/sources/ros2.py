@@ -61,7 +61,6 @@ class RosCameras:
         return self._sent.dropped
 
     def __enter__(self) -> Self:
-        log.info("%s: %s", self._graph.where(), " and ".join(self._names.values()))
         self._thread.start()
         return self
 

@@ -94,7 +94,12 @@ class Graph:
 
     def where(self) -> str:
         """Which graph this is, for messages."""
-        return f"ROS 2 domain {self.domain}, interface {self.interface}"
+        return where(self.domain, self.interface)
+
+
+def where(domain: int, interface: str) -> str:
+    """A graph, for messages."""
+    return f"ROS 2 domain {domain}, interface {interface}"
 
 
 class Reader:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sags_node.config import PushSource
+from sags_node.config import LaunchConfig, PushRobot, PushSource, Ros2Source
 from sags_node.errors import SagsError
+from sags_node.foreground import inputs_text
 from sags_node.sources.clock import KEPT, CaptureClock
 from sags_node.sources.sent import WINDOW, Arrivals, SentPictures
 from sags_node.types import U8
@@ -114,3 +115,12 @@ def test_the_watch_is_bounded() -> None:
     watched(clock, KEPT + 30, 0)
     status = clock.status()
     assert status is not None and status.seconds <= KEPT * 1.05  # a second's bin begins with a picture
+
+
+def test_it_is_said_where_pictures_and_poses_are_taken_from() -> None:
+    ros = LaunchConfig(source=Ros2Source(domain=7, left="/a", right="/b"), robot=PushRobot())
+    assert inputs_text(ros) == [
+        "taking pictures from ROS 2 domain 7, interface lo: /a and /b",
+        "taking poses at tcp://127.0.0.1:5559",
+    ]
+    assert inputs_text(LaunchConfig()) == []
