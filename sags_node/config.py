@@ -276,9 +276,12 @@ class RobotPoses(Section):
         None, description="how the camera sits on it (sags calib hand-eye); default: hand_eye.yaml in rig"
     )
     offset_ms: float | None = Field(
-        None, ge=-1000, le=1000, description="the robot's stamp minus the picture's, of one moment; default: "
-        "what the hand-eye calibration found",
-    )  # fmt: skip
+        None,
+        ge=-1000,
+        le=1000,
+        description="the robot's stamp minus the picture's (before latency_ms), of one moment; default: what "
+        "the hand-eye calibration found",
+    )
 
 
 class Ros2Robot(RobotPoses, RosGraph):
@@ -549,6 +552,12 @@ class LaunchConfig(Section):
     def _one_engine(self) -> LaunchConfig:
         if self.device == "cuda" and self.engine.backend != "numba":
             raise ValueError(f"device cuda and engine.backend {self.engine.backend}: choose one of them")
+        return self
+
+    @model_validator(mode="after")
+    def _one_pose(self) -> Self:
+        if self.robot is not None and self.vision.pose != "session":
+            raise ValueError(f"robot says where the scope is, vision.pose {self.vision.pose} too: choose one")
         return self
 
     @property

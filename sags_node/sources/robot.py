@@ -13,7 +13,7 @@ from typing import Protocol, Self
 import numpy as np
 
 from sags_node.calibration.hand_eye import FILE, read_hand_eye
-from sags_node.config import BagRobot, BagSource, LaunchConfig, PushRobot, Ros2Robot
+from sags_node.config import BagRobot, BagSource, LaunchConfig, LiveSource, PushRobot, Ros2Robot
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging.inbox import Inbox
 from sags_node.messaging.security import Seldom
@@ -173,6 +173,10 @@ class Posed:
         self._offset_ns = hand_eye.offset_ns
         if config.robot.offset_ms is not None:
             self._offset_ns = round(config.robot.offset_ms * 1e6)
+        if isinstance(
+            config.source, LiveSource
+        ):  # the offset is to the stamp, which had no latency taken off
+            self._offset_ns += round(config.source.latency_ms * 1e6)
         self._robot = open_robot(config)
         self._recorded = isinstance(config.robot, BagRobot)
         self._source = source

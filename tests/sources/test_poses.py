@@ -16,12 +16,13 @@ from waiting import until
 
 from sags_node.calibration.hand_eye import HandEye, save_hand_eye
 from sags_node.client import PoseSender
-from sags_node.config import LaunchConfig, PushRobot
+from sags_node.config import LaunchConfig, PushRobot, PushSource, VisionConfig
 from sags_node.errors import SagsError
 from sags_node.findings import by_code
 from sags_node.mapping.budget import StepBudget
 from sags_node.messaging import cdr, topics
 from sags_node.phantom.motion import scope_pose
+from sags_node.phantom.rig import phantom_rig
 from sags_node.pipeline import Pipeline
 from sags_node.session import open_session
 from sags_node.sources.pose_track import JUMP_HELD_NS, NoPoseError, PoseTrack
@@ -181,6 +182,26 @@ def test_a_frame_without_a_pose_is_held_and_said(tmp_path: Path, monkeypatch: py
         warned.append("pose_missing" in by_code(pipeline.warnings))
     assert held == warned == [code is not None for code in codes]
     assert pipeline.mapper.restarts == 0
+
+
+def test_the_offset_is_to_the_stamp_before_its_latency_is_taken_off(tmp_path: Path) -> None:
+    """The robot's clock is 30 ms ahead, and a picture is stamped 40 ms after its exposure."""
+    save_hand_eye(HandEye(np.eye(4), 30 * MS), tmp_path, {})
+    rig = phantom_rig(64, 48)
+    robot = PushRobot(endpoint="tcp://127.0.0.1:*", hand_eye=tmp_path / "hand_eye.yaml")
+    config = LaunchConfig(source=PushSource(latency_ms=40), robot=robot)
+    picture = np.zeros((48, 64, 3), np.uint8)
+    frame = StereoFrame(0, S - 40 * MS, S - 40 * MS, picture, picture, t_device_ns=S)
+    with Posed(Frames([frame]), config, rig) as posed:
+        for number in range(90, 111):
+            told(posed._robot.track, shifted(0.001 * number), number * 10 * MS)
+        (came,) = list(posed)
+    assert came.T_world_cam is not None and came.T_world_cam[0, 3] == pytest.approx(0.103)
+
+
+def test_two_who_say_where_the_scope_is_are_one_too_many() -> None:
+    with pytest.raises(ValueError, match="choose one"):
+        LaunchConfig(robot=PushRobot(), vision=VisionConfig(pose="estimate"))
 
 
 @pytest.mark.live

@@ -8,9 +8,11 @@ import pytest
 from sags_node.config import LaunchConfig, PushRobot, PushSource, Ros2Source
 from sags_node.errors import SagsError
 from sags_node.foreground import inputs_text
+from sags_node.health import Statistics
+from sags_node.messaging import cdr, content, topics
 from sags_node.sources.clock import KEPT, CaptureClock
 from sags_node.sources.sent import WINDOW, Arrivals, SentPictures
-from sags_node.types import U8
+from sags_node.types import U8, ClockStatus
 
 MS, S = 1_000_000, 1_000_000_000
 PERIOD = 33 * MS
@@ -124,3 +126,12 @@ def test_it_is_said_where_pictures_and_poses_are_taken_from() -> None:
         "taking poses at tcp://127.0.0.1:5559",
     ]
     assert inputs_text(LaunchConfig()) == []
+
+
+def test_the_clock_is_told_in_status_and_diagnostics() -> None:
+    clock = ClockStatus(offset_ms=12.5, drift_ppm=-31.0, seconds=40.0)
+    health = Statistics().health({}, False, False, None, {}, {}, {}, clock)
+    assert content.status(health, None)["clock"] == {"offset_ms": 12.5, "drift_ppm": -31.0, "seconds": 40.0}
+    (part,) = content.diagnostics(health, 0).parts
+    values = cdr.decode(bytes(part), topics.DIAGNOSTICS).status[0].values
+    assert {"capture_clock_drift_ppm": "-31.0"}.items() <= {v.key: v.value for v in values}.items()
