@@ -11,7 +11,21 @@ from typing import Annotated, Any, Literal, TypeGuard, Union, get_args, get_orig
 from annotated_types import Ge, Gt, Le
 from pydantic.fields import FieldInfo
 
-from sags_node.config import Box, GeometryConfig, LaunchConfig, RecordedSource, Section
+from sags_node.config import (
+    BagRobot,
+    Box,
+    GeometryConfig,
+    Guarded,
+    LaunchConfig,
+    LiveSource,
+    PushRobot,
+    RecordedSource,
+    RobotPoses,
+    Ros2Robot,
+    RosGraph,
+    Section,
+    SentSource,
+)
 
 PAGE = Path(__file__).with_name("launch.md")
 HEAD = """# Launch files
@@ -68,6 +82,8 @@ def _tables(section: type[Section], prefix: str, title: str) -> Iterator[str]:
             yield from _kinds(f"{prefix}{name}.", get_args(field.annotation))
         elif _is_section(field.annotation):
             yield from _tables(field.annotation, f"{prefix}{name}.", f"`{prefix}{name}`")
+        elif name == "robot":
+            yield from _robot(f"{prefix}{name}.")
 
 
 def _kinds(prefix: str, sections: tuple[type[Section], ...]) -> Iterator[str]:
@@ -75,16 +91,30 @@ def _kinds(prefix: str, sections: tuple[type[Section], ...]) -> Iterator[str]:
     yield f"## `{prefix.removesuffix('.')}`: where the pictures come from\n"
     yield "`source.kind` says which kind of source it is, and so which other keys there are."
     yield "Without `source` it is the `phantom`.\n"
-    yield from _tables(RecordedSource, prefix, "Recordings")
+    yield from _tables(RecordedSource, prefix, "Every recording")
+    yield from _tables(LiveSource, prefix, "Every live kind")
     geometry = f"{prefix}geometry"
-    yield from _tables(GeometryConfig, f"{geometry}.", f"`{geometry}`: videos and cameras")
+    yield from _tables(GeometryConfig, f"{geometry}.", f"`{geometry}`: videos, cameras and GStreamer")
+    yield from _table(SentSource, prefix, "`ros2` and `push`", list(SentSource.__annotations__))
+    yield from _table(RosGraph, prefix, "`ros2`", list(RosGraph.model_fields))
+    yield from _table(Guarded, prefix, "`push`", list(Guarded.model_fields))
     for section in sections:
         own = [name for name in section.__annotations__ if name != "kind"]  # what is inherited stands above
         yield from _table(section, prefix, f"`kind: {section.model_fields['kind'].default}`", own)
 
 
+def _robot(prefix: str) -> Iterator[str]:
+    """What all robots have in common, then what each kind has beyond it."""
+    yield "## `robot`: who says where the scope is\n"
+    yield "`robot.kind` says which way poses come. Without `robot` nobody says it, or the recording does.\n"
+    yield from _table(RobotPoses, prefix, "Every kind of robot", list(RobotPoses.model_fields))
+    for section in (Ros2Robot, PushRobot, BagRobot):
+        own = [name for name in section.model_fields if name not in {"kind", *RobotPoses.model_fields}]
+        yield from _table(section, prefix, f"`robot.kind: {section.model_fields['kind'].default}`", own)
+
+
 def _table(section: type[Section], prefix: str, title: str, names: list[str]) -> Iterator[str]:
-    level = "##" if prefix.count(".") <= 1 and not prefix.startswith("source.") else "###"
+    level = "##" if prefix.count(".") <= 1 and not prefix.startswith(("source.", "robot.")) else "###"
     yield f"{level} {title}\n"
     if section.__doc__:
         yield f"{_linked(section.__doc__)}\n"

@@ -1,4 +1,5 @@
-"""The front door for programs that use a node: a subscriber, what it receives, and requests.
+"""The front door for programs that use a node: a subscriber, what it receives, requests, and what hands
+pictures in.
 
 Importing this loads numpy, ZeroMQ and the message formats, and none of what maps: no Numba, torch, OpenCV
 or Open3D.
@@ -20,6 +21,7 @@ from sags_node.messaging.received import (
     ReceivedText,
     TopicName,
 )
+from sags_node.messaging.sender import FrameSender, PoseSender
 from sags_node.messaging.subscriber import Subscriber
 
 __all__ = [
@@ -27,8 +29,10 @@ __all__ = [
     "ClientKeys",
     "ControlClient",
     "Frame",
+    "FrameSender",
     "NodeClock",
     "Offset",
+    "PoseSender",
     "Received",
     "ReceivedCameraInfo",
     "ReceivedCloud",

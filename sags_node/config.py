@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
@@ -212,12 +212,20 @@ class PhantomSource(RecordedSource):
 
 
 class LiveSource(Section):
-    """What cameras have in common: no pace, no end."""
+    """What every live source has in common."""
+
+    latency_ms: float = Field(
+        0.0, ge=-1000, le=1000, description="from the exposure to the stamp; taken off every stamp"
+    )
+
+
+class CameraSource(LiveSource):
+    """What live sources have in common whose devices are opened here."""
 
     geometry: GeometryConfig = GeometryConfig()
 
 
-class V4l2Source(LiveSource):
+class V4l2Source(CameraSource):
     """Live cameras: two devices, or one whose pictures show both eyes."""
 
     kind: Literal["v4l2"] = "v4l2"
@@ -241,7 +249,7 @@ class V4l2Source(LiveSource):
     )
 
 
-class GstSource(LiveSource):
+class GstSource(CameraSource):
     """Live pictures from GStreamer, in a process of its own; docs/inputs.md has examples."""
 
     kind: Literal["gst"] = "gst"
@@ -283,6 +291,64 @@ class GstSource(LiveSource):
         return self
 
 
+class SentSource(LiveSource):
+    """What all live pictures have in common that another program stamps and sends."""
+
+    rate: float = Field(30.0, gt=0, description="pictures per second that each eye should come with")
+    pair_tolerance_ms: float = Field(5.0, gt=0, description="how far the stamps of a pair may lie apart")
+    stamps: Literal["wall", "own"] = Field(
+        "wall",
+        description="wall: of this machine's clock, or one that is set by it; own: of another clock, brought "
+        "to ours by the shortest way that pictures take",
+    )
+
+
+class RosGraph(Section):
+    """Where a ROS 2 graph is; needs `pip install 'sags-node[ros2]'`, and no ROS."""
+
+    domain: int | None = Field(
+        None, ge=0, le=232, description="number of the graph; default: `$ROS_DOMAIN_ID`, else 0"
+    )
+    interface: str = Field(
+        "lo", pattern=r"^[A-Za-z0-9_.:-]+$", description="network interface; lo: this machine only"
+    )
+
+
+class Ros2Source(SentSource, RosGraph):
+    """Two picture topics (Image or CompressedImage) of a ROS 2 graph; docs/inputs.md says more."""
+
+    kind: Literal["ros2"] = "ros2"
+    left: str = Field("/stereo/left/image_raw", description="picture topic of the left eye")
+    right: str = Field("/stereo/right/image_raw", description="picture topic of the right eye")
+    left_info: str | None = Field(
+        None, description="camera_info topic of the left eye; default: beside its pictures; not used with rig"
+    )
+    right_info: str | None = Field(
+        None, description="camera_info topic of the right eye; default: beside its pictures"
+    )
+
+
+class Guarded(Section):
+    """Who may use the sockets that a node binds; docs/security.md says more."""
+
+    key: Path | None = Field(None, description="the node's secret key file (sags keygen): encrypt all tcp")
+    allow: Paths = Field((), description="who may connect: .pub files, and folders of them")
+    insecure: bool = Field(False, description="allow other addresses than loopback and ipc without keys")
+
+    @model_validator(mode="after")
+    def _keys_together(self) -> Self:
+        if (self.key is None) != (not self.allow):
+            raise ValueError("key and allow belong together: who the node is, and who may connect")
+        return self
+
+
+class PushSource(SentSource, Guarded):
+    """Pictures that another program hands in over ZeroMQ; docs/inputs.md says how."""
+
+    kind: Literal["push"] = "push"
+    endpoint: str = Field("tcp://127.0.0.1:5558", description="ROUTER socket that the node binds")
+
+
 Source = Annotated[
     FoldersSource
     | VideosSource
@@ -294,9 +360,54 @@ Source = Annotated[
     | DvrkSource
     | PhantomSource
     | V4l2Source
-    | GstSource,
+    | GstSource
+    | Ros2Source
+    | PushSource,
     Field(discriminator="kind"),
 ]
+
+# ---- the robot -------------------------------------------------------------------------------------------
+
+
+class RobotPoses(Section):
+    """What all poses of a robot have in common."""
+
+    base: str | None = Field(None, description="frame of tf that is the world; not for topics of poses")
+    hand: str | None = Field(None, description="frame of tf that carries the camera")
+    hand_eye: Path | None = Field(
+        None, description="how the camera sits on it (sags calib hand-eye); default: hand_eye.yaml in rig"
+    )
+    offset_ms: float | None = Field(
+        None,
+        ge=-1000,
+        le=1000,
+        description="the robot's stamp minus the picture's (before latency_ms), of one moment; default: what "
+        "the hand-eye calibration found",
+    )
+
+
+class Ros2Robot(RobotPoses, RosGraph):
+    """Live poses of a ROS 2 graph."""
+
+    kind: Literal["ros2"] = "ros2"
+    topic: str = Field("/tf", description="of TFMessage, PoseStamped or TransformStamped")
+
+
+class PushRobot(RobotPoses, Guarded):
+    """Live poses that another program hands in over ZeroMQ."""
+
+    kind: Literal["push"] = "push"
+    endpoint: str = Field("tcp://127.0.0.1:5559", description="ROUTER socket that the node binds")
+
+
+class BagRobot(RobotPoses):
+    """Poses of a ROS recording, beside its pictures."""
+
+    kind: Literal["bag"] = "bag"
+    topic: str = Field("/tf", description="of TFMessage, PoseStamped or TransformStamped")
+
+
+Robot = Annotated[Ros2Robot | PushRobot | BagRobot, Field(discriminator="kind")]
 
 # ---- the stages ------------------------------------------------------------------------------------------
 
@@ -501,7 +612,7 @@ class MappingConfig(Section):
     skip_still: bool = Field(True, description="while nothing moves: no matching, a step where it pays most")
 
 
-class PublishConfig(Section):
+class PublishConfig(Guarded):
     """Sockets, and who may use them; docs/wire.md and docs/security.md say more."""
 
     data: tuple[str, ...] = Field(("tcp://127.0.0.1:5556",), description="XPUB endpoints")
@@ -512,16 +623,7 @@ class PublishConfig(Section):
         description="of the ipc socket and the connection file; default: `$XDG_RUNTIME_DIR/sags`, else "
         "`/tmp/sags-UID`",
     )
-    key: Path | None = Field(None, description="the node's secret key file (sags keygen): encrypt all tcp")
-    allow: Paths = Field((), description="who may connect: .pub files, and folders of them")
-    insecure: bool = Field(False, description="allow other addresses than loopback and ipc without keys")
     right: bool = Field(False, description="also publish the right eye's input and render")
-
-    @model_validator(mode="after")
-    def _keys_together(self) -> PublishConfig:
-        if (self.key is None) != (not self.allow):
-            raise ValueError("key and allow belong together: who the node is, and who may connect")
-        return self
 
 
 DeviceName = Literal["auto", "cpu", "cuda"]
@@ -542,6 +644,9 @@ class LaunchConfig(Section):
         "one",
     )
     source: Source = PhantomSource()
+    robot: Robot | None = Field(
+        None, description="who says where the scope is; null: nobody, or the recording. docs/inputs.md"
+    )
     vision: VisionConfig = VisionConfig()
     engine: EngineConfig = EngineConfig()
     mapping: MappingConfig = MappingConfig()
@@ -554,6 +659,12 @@ class LaunchConfig(Section):
     def _one_engine(self) -> LaunchConfig:
         if self.device == "cuda" and self.engine.backend != "numba":
             raise ValueError(f"device cuda and engine.backend {self.engine.backend}: choose one of them")
+        return self
+
+    @model_validator(mode="after")
+    def _one_pose(self) -> Self:
+        if self.robot is not None and self.vision.pose != "session":
+            raise ValueError(f"robot says where the scope is, vision.pose {self.vision.pose} too: choose one")
         return self
 
     @property

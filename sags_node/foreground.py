@@ -10,8 +10,10 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from sags_node.config import LaunchConfig, PushRobot, PushSource, Ros2Robot, Ros2Source
 from sags_node.findings import by_code, in_words
 from sags_node.node import Node
+from sags_node.sources.ros_graph import domain_of, where
 from sags_node.terminal import text
 from sags_node.terminal.notices import Notices
 from sags_node.types import NodeHealth
@@ -43,6 +45,18 @@ def run_node(node: Node, seconds: float | None, console: Console) -> NodeHealth:
     return health
 
 
+def inputs_text(config: LaunchConfig) -> list[str]:
+    """Where other programs hand in what the node takes; a line each."""
+    lines = []
+    for what, part in (("pictures", config.source), ("poses", config.robot)):
+        if isinstance(part, PushSource | PushRobot):
+            lines.append(f"taking {what} at {part.endpoint}")
+        elif isinstance(part, Ros2Source | Ros2Robot):
+            topics = f"{part.left} and {part.right}" if isinstance(part, Ros2Source) else part.topic
+            lines.append(f"taking {what} from {where(domain_of(part), part.interface)}: {topics}")
+    return lines
+
+
 def _watch(node: Node, deadline: float | None, console: Console, show: Callable[[NodeHealth], None]) -> None:
     notices = Notices(lambda line: console.print(line, markup=False, soft_wrap=True))
     while not node.wait(timeout=1 / REFRESH):
@@ -63,6 +77,8 @@ def health_table(health: NodeHealth) -> Table:
     table.add_row("Gaussians", f"{health.gaussians:,}")
     if health.rung is not None:
         table.add_row("quality", text.rung_text(health.rung))
+    if health.clock is not None and health.clock.drift_ppm is not None:
+        table.add_row("capture clock", f"drifts by {health.clock.drift_ppm:+.0f} us/s from this machine's")
     table.add_row("stages (ms)", "  ".join(f"{k} {v:.1f}" for k, v in health.stage_ms.items()))
     table.add_row("dropped", "  ".join(f"{k} {v}" for k, v in health.dropped.items()))
     if health.skipped:

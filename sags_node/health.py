@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from sags_node.findings import Findings, by_stage
-from sags_node.types import Finding, FrameResult, MotionState, NodeHealth, RungState, ViewStatus
+from sags_node.types import ClockStatus, Finding, FrameResult, MotionState, NodeHealth, RungState, ViewStatus
 
 WAITING_AFTER = 1.0  # s without a frame
 WINDOW = 150  # frames behind the published rates and latencies
@@ -66,6 +66,7 @@ class Statistics:
         warnings: Findings,
         connections: dict[str, dict[str, int]],
         views: Mapping[str, ViewStatus],
+        clock: ClockStatus | None = None,
     ) -> NodeHealth:
         with self._lock:
             now = time.monotonic()
@@ -102,6 +103,7 @@ class Statistics:
                 views=views,
                 rung=self._rung,
                 motion=self._motion,
+                clock=clock,
             )
 
     @property

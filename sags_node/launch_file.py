@@ -16,7 +16,6 @@ from sags_node.errors import UsageError, brief
 from sags_node.files import open_file
 from sags_node.yaml_reader import parse_yaml, read_yaml
 
-LIVE_KINDS = {kind.model_fields["kind"].default for kind in LiveSource.__subclasses__()}
 MOST_MISTAKES = 10  # named at once
 DEFAULT_DATA = "../shared/data"
 BAG_SUFFIXES = (".mcap", ".db3", ".bag")
@@ -39,6 +38,12 @@ def _path_keys(section: type[Section]) -> Iterator[str]:
 
 
 _PATH_KEYS = frozenset(_path_keys(LaunchConfig))
+_SOURCES: dict[str, type[Section]] = {
+    source.model_fields["kind"].default: source for source in get_args(get_args(Source)[0])
+}
+_LIVE_PATHS = {  # of sources whose other keys are devices, topics and launch strings
+    kind: frozenset(_path_keys(source)) for kind, source in _SOURCES.items() if issubclass(source, LiveSource)
+}
 
 
 def load_launch(path: Path | str | None = None, overrides: Sequence[str] = ()) -> LaunchConfig:
@@ -141,27 +146,29 @@ def _read_yaml(file: Path) -> dict[str, Any]:
     return tree
 
 
-def _resolve_paths(tree: dict[str, Any], folder: Path) -> None:
-    """Expand variables in every string and make the known path keys relative to the launch file."""
+def _resolve_paths(tree: dict[str, Any], folder: Path, path_keys: frozenset[str] = _PATH_KEYS) -> None:
+    """Expand variables in every string and make `path_keys` relative to the launch file."""
     variables = {"SAGS_DATA": str((folder / ".." / DEFAULT_DATA).resolve()), **os.environ}
     for key, value in tree.items():
         if isinstance(value, dict):
-            _resolve_paths(value, folder)
-        elif isinstance(value, str) and tree.get("kind") in LIVE_KINDS:  # devices and launch strings
-            tree[key] = Template(value).safe_substitute(variables)
+            is_live = key == "source" and value.get("kind") in _LIVE_PATHS
+            _resolve_paths(value, folder, _LIVE_PATHS[value["kind"]] if is_live else path_keys)
         elif isinstance(value, str):
-            tree[key] = _resolve(key, value, folder, variables)
+            tree[key] = _resolve(key, value, folder, variables, path_keys)
         elif isinstance(value, list):
             tree[key] = [
-                _resolve(key, item, folder, variables) if isinstance(item, str) else item for item in value
+                _resolve(key, item, folder, variables, path_keys) if isinstance(item, str) else item
+                for item in value
             ]
 
 
-def _resolve(key: str, value: str, folder: Path, variables: Mapping[str, str]) -> str:
+def _resolve(
+    key: str, value: str, folder: Path, variables: Mapping[str, str], path_keys: frozenset[str]
+) -> str:
     expanded = Template(value).safe_substitute(variables)
-    if "$" in expanded and key in _PATH_KEYS:
+    if "$" in expanded and key in path_keys:
         raise UsageError(f"{key}: {value} uses a variable that is not set; export it first")
-    return str(folder / expanded) if key in _PATH_KEYS else expanded
+    return str(folder / expanded) if key in path_keys else expanded
 
 
 def _apply_override(tree: dict[str, Any], override: str) -> None:
@@ -233,6 +240,3 @@ def _known_keys(path: Sequence[str]) -> list[str]:
 
 
 _SECTIONS = ("vision", "engine", "mapping", "publish")
-_SOURCES: dict[str, type[Section]] = {
-    source.model_fields["kind"].default: source for source in get_args(get_args(Source)[0])
-}

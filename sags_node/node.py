@@ -32,6 +32,7 @@ from sags_node.messaging.publisher import Publisher
 from sags_node.node_operations import NodeState, Operations
 from sags_node.pipeline import Pipeline
 from sags_node.recording.child import RecorderProcess
+from sags_node.sources.clock import CaptureClock
 from sags_node.sources.source import Source
 from sags_node.types import DrawnView, FrameResult, NodeHealth, RectifiedPair, StereoFrame, StereoRig
 from sags_node.views import Views, prepare_thread
@@ -73,6 +74,7 @@ class Node:
         self._operations = Operations(self._state, self._hand_over_view)
         self._pictures: Latest[tuple[RectifiedPair, int]] = Latest(on_put=self._wake_publishing)  # and epoch
         self._live = isinstance(config.source, LiveSource) or config.source.pace == "realtime"
+        self._clock = CaptureClock()  # of live pictures
         self._wake = os.eventfd(0, os.EFD_NONBLOCK)
         self._frames: Latest[tuple[StereoFrame, float]] = Latest()  # and when it came
         self._results: Latest[FrameResult] = Latest(on_put=self._wake_publishing)
@@ -151,6 +153,7 @@ class Node:
             warnings=self._state.pipeline.warnings,
             connections=self._publisher.connections,
             views=self._state.views.status,
+            clock=self._clock.status(),
         )
 
     def _dropped(self) -> dict[str, int]:
@@ -186,6 +189,8 @@ class Node:
             for frame in self._source:
                 if self._stopping.is_set():
                     return
+                if frame.t_device_ns and frame.t_arrival_ns:
+                    self._clock.add(frame.t_device_ns, frame.t_arrival_ns)
                 give((frame, time.monotonic()))
 
     def _map(self) -> None:

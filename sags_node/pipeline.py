@@ -83,6 +83,7 @@ class Pipeline:
         self._lenses = LensWatch()
         self._scene = SceneWatch(moving=vision.pose == "estimate")
         self._is_sound = True  # what was matched last is depth
+        self._unposed: Finding | None = None  # why the newest frame's pose is not known
         self._mapped: FrameResult | None = None  # the last frame that was really mapped
         self._unwatched = 0.0  # m: how far tissue may have moved in frames that were held since
 
@@ -108,6 +109,8 @@ class Pipeline:
         if lost is not None:
             back = "bring the scope back to tissue that it saw before"
             found.append(Finding("camera_lost", f"the camera is lost: {lost}; {back}"))
+        if self._unposed is not None:
+            found.append(self._unposed)
         if self.tissue.problem:
             found.append(Finding("mask_missing", self.tissue.problem))
         if self._refiner.problem is not None:
@@ -135,6 +138,9 @@ class Pipeline:
         with watch("watch"):
             eyes = self._eyes(frame, pair)
         self._on_rectified(pair, self._epoch(frame))
+        self._unposed = frame.pose_problem if self._config.vision.pose == "session" else None
+        if self._unposed is not None and self._mapped is not None:
+            return self._held(frame, pair, watch, "pose", self._unposed.text, unseen(pair))
         if self._equals_the_last(pair):
             return self._repeated(frame, pair, watch)
         with watch("watch"):

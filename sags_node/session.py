@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sags_node.calibration import load_camera, load_rig
-from sags_node.config import BagSource, EndoNerfSource, LaunchConfig, PhantomSource
+from sags_node.config import BagSource, EndoNerfSource, LaunchConfig, PhantomSource, Ros2Source
 from sags_node.errors import UsageError
 from sags_node.launch_file import load_launch
+from sags_node.sources.robot import Posed
 from sags_node.sources.source import Source, open_source, recorded_rig
 from sags_node.types import StereoRig
 
@@ -55,9 +56,11 @@ def open_session(
         folder = cached_session(config.source, progress)
         rig = load_rig(config.rig or folder / "calib")
     else:
-        rig = _rig(config)
+        rig = rig_of(config)
     size = rig.left.width, rig.left.height
     source = open_source(config.source, references=False, size=size)
+    if config.robot is not None:
+        source = Posed(source, config, rig)
     return Session(_name(launch), config, rig, source)
 
 
@@ -68,10 +71,10 @@ def _name(launch: Path | str | None) -> str:
     return path.name if path.is_dir() else path.stem
 
 
-def _rig(config: LaunchConfig) -> StereoRig:
-    """The calibration that comes with the recording, or the one that the launch file names."""
-    if config.rig is not None and isinstance(config.source, BagSource):
-        return load_rig(config.rig)  # what drivers write into bags is often uncalibrated, or of another day
+def rig_of(config: LaunchConfig) -> StereoRig:
+    """The calibration that comes with the pictures, or the one that the launch file names."""
+    if config.rig is not None and isinstance(config.source, BagSource | Ros2Source):
+        return load_rig(config.rig)  # what drivers say is often uncalibrated, or of another day
     recorded = recorded_rig(config.source)
     if recorded is not None and config.rig is not None:
         raise UsageError(f"rig: {config.rig} is one calibration too many: the recording brings its own")

@@ -123,6 +123,9 @@ class StereoFrame:
     tissue: Bool | None = None  # [H, W] raw left picture, when the session knows it
     reference: Reference | None = None
     depth: F32 | None = None  # [H, W] m, 0 unknown, left rectified, at calibration size; instead of stereo
+    t_device_ns: int = 0  # left eye, as the device, sender or recording stamped it by its own clock; 0: none
+    t_arrival_ns: int = 0  # left eye, wall clock; 0: not a live picture
+    pose_problem: Finding | None = None  # why `T_world_cam` is an older pose; such a frame is not taken in
 
 
 @dataclass(frozen=True, slots=True)
@@ -336,6 +339,15 @@ class ViewStatus:
 
 
 @dataclass(frozen=True, slots=True)
+class ClockStatus:
+    """The clock that stamps live pictures, against this machine's wall clock."""
+
+    offset_ms: float  # wall clock - that clock, and the shortest way that pictures take
+    drift_ppm: float | None  # how fast the offset grows, us/s; None: it is not known yet
+    seconds: float  # that it was watched
+
+
+@dataclass(frozen=True, slots=True)
 class NodeHealth:
     """What the node says of itself once a second, also when no frames come."""
 
@@ -353,3 +365,4 @@ class NodeHealth:
     views: Mapping[str, ViewStatus] = field(default_factory=dict)  # those that consumers asked for, by name
     rung: RungState | None = None  # None: fixed steps, or no frame yet
     motion: MotionState | None = None  # None: `mapping.field` is off, or too little is known yet
+    clock: ClockStatus | None = None  # None: a recording, or pictures without stamps

@@ -143,6 +143,11 @@ def _same_way_up(view: StereoView) -> StereoView:
     return StereoView(view.name, view.ids, view.left, view.right[::-1])
 
 
+def turned(view: StereoView) -> StereoView:
+    """A chessboard seen whole, its corners counted from the other end."""
+    return StereoView(view.name, view.ids, view.left[::-1], view.right[::-1])
+
+
 def _grid(inner: tuple[int, int], square: float) -> F32:
     x, y = np.meshgrid(np.arange(inner[0]), np.arange(inner[1]))
     return np.stack([x * square, y * square, 0 * x], -1).reshape(-1, 3).astype(np.float32)

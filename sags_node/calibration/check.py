@@ -31,8 +31,8 @@ class Finding:
     figures: Mapping[str, float] = field(default_factory=dict)  # what was measured, for programs
 
 
-def refuse_errors(findings: list[Finding], where: Path) -> None:
-    """End with the errors among the findings on a file or folder.
+def refuse_errors(findings: list[Finding], where: Path | str) -> None:
+    """End with the errors among the findings on a file, folder or anything else.
 
     Raises:
         UsageError: there are some.

@@ -58,6 +58,29 @@ def reading_options(command: Callable[..., None]) -> Callable[..., None]:
     return size(unit(command))
 
 
+def board_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Which board is seen; as `_board` takes them."""
+    options = (
+        click.option(
+            "--board",
+            type=click.Choice(["chessboard", "charuco"]),
+            default="chessboard",
+            show_default=True,
+            help="What is printed on it.",
+        ),
+        click.option(
+            "--squares", callback=_sides, required=True, metavar="CxR", help="Columns and rows of squares."
+        ),
+        click.option("--square-mm", type=positive, required=True, help="Side of a square."),
+        click.option("--marker-mm", type=positive, help="Side of a marker; charuco only."),
+        click.option("--dictionary", metavar="NAME", help="Of the markers, e.g. 4X4_50; charuco only."),
+        click.option("--legacy", is_flag=True, help="Printed by an OpenCV before 4.6; charuco only."),
+    )
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
 @click.group()
 def calib() -> None:
     """Make, check and convert camera calibrations."""
@@ -189,18 +212,7 @@ def look_at_eyes(launch: tuple[str, ...], seconds: float, output: Path, json_out
 @calib.command()
 @click.argument("folders", nargs=-1, type=click.Path(path_type=Path), metavar="[LEFT_FOLDER RIGHT_FOLDER]")
 @click.option("--live", type=click.Path(path_type=Path), metavar="LAUNCH", help="Take the pictures here.")
-@click.option(
-    "--board",
-    type=click.Choice(["chessboard", "charuco"]),
-    default="chessboard",
-    show_default=True,
-    help="What is printed on it.",
-)
-@click.option("--squares", callback=_sides, required=True, metavar="CxR", help="Columns and rows of squares.")
-@click.option("--square-mm", type=positive, required=True, help="Side of a square.")
-@click.option("--marker-mm", type=positive, help="Side of a marker; charuco only.")
-@click.option("--dictionary", metavar="NAME", help="Of the markers, e.g. 4X4_50; charuco only.")
-@click.option("--legacy", is_flag=True, help="Printed by an OpenCV before 4.6; charuco only.")
+@board_options
 @click.option(
     "--coefficients",
     type=click.Choice(["2", "3", "6"]),
@@ -219,7 +231,7 @@ def stereo(
     views: int,
     output: Path,
     json_out: bool,
-    **board_options: Any,
+    **board_of: Any,
 ) -> None:
     """Calibrate a stereo rig from pictures of a board.
 
@@ -236,7 +248,7 @@ def stereo(
 
     if (live is None) != (len(folders) == 2) or (live is not None and folders):
         raise UsageError("give two folders, LEFT_FOLDER RIGHT_FOLDER, or --live LAUNCH")
-    board = _board(squares, **board_options)
+    board = _board(squares, **board_of)
     check_folder(output)
     left, right = folders if live is None else _grab(live, board, output / "views", views)
     with progress("looking for the board") as advance:
@@ -245,6 +257,56 @@ def stereo(
     summary = summarise(calibrated)
     show(summary if json_out else report_table(summary))
     console.print(f"calibration: [bold]{escape(str(output))}[/]", soft_wrap=True)
+
+
+@calib.command("hand-eye")
+@launch_argument
+@board_options
+@click.option(
+    "--views", type=click.IntRange(10, 1000), default=80, show_default=True, help="Spread over the recording."
+)
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    required=True,
+    metavar="FOLDER",
+    help="The rig's folder; gets hand_eye.yaml, an older one is replaced.",
+)
+@as_json
+def hand_eye(
+    launch: tuple[str, ...],
+    squares: tuple[int, int],
+    views: int,
+    output: Path,
+    json_out: bool,
+    **board_of: Any,
+) -> None:
+    """Find how the camera sits on the robot, from a recording of a board and of the robot's poses.
+
+    The board lies still. The robot moves and turns the scope about, at different speeds: from that the offset
+    between the robot's clock and the pictures' is found, too. docs/inputs.md says more.
+
+    \b
+    sags calib hand-eye case.mcap rig:=calib/my_rig robot.kind:=bag robot.topic:=/ECM/measured_cp \\
+        --squares 10x7 --square-mm 4.5 -o calib/my_rig
+    """  # fmt: skip
+    from sags_node.calibrate.hand_eye import calibrate_hand_eye, hand_eye_table, summarise_hand_eye
+    from sags_node.calibration.hand_eye import FILE, save_hand_eye
+    from sags_node.launch_file import load_launch
+    from sags_node.session import rig_of
+
+    path, overrides = split(launch)
+    config = load_launch(path, overrides)
+    board = _board(squares, **board_of)
+    check_folder(output)
+    with progress("looking for the board") as advance:
+        solution = calibrate_hand_eye(config, rig_of(config), board, views, advance)
+    summary = summarise_hand_eye(solution)
+    with writing(output):
+        save_hand_eye(solution.hand_eye, output, summary)
+    show(summary if json_out else hand_eye_table(summary))
+    console.print(f"hand-eye calibration: [bold]{escape(str(output / FILE))}[/]", soft_wrap=True)
 
 
 def _board(

@@ -97,7 +97,7 @@ def run(launch: tuple[str, ...], seconds: float | None, json_out: bool) -> None:
     sags run launch/v4l2.yaml source.left:=/dev/video-left mapping.budget_ms:=25
     """
     from sags_node.config import PhantomSource
-    from sags_node.foreground import health_table, run_node
+    from sags_node.foreground import health_table, inputs_text, run_node
     from sags_node.launch_file import load_launch
     from sags_node.messaging.content import health_fields
     from sags_node.node import Node
@@ -109,6 +109,8 @@ def run(launch: tuple[str, ...], seconds: float | None, json_out: bool) -> None:
     node = Node(session.config, session.rig, session.source)
     where = escape(", ".join(node.endpoints))
     console.print(f"publishing on {where} as [bold]{session.config.ns}/...[/]  (Ctrl-C ends)", soft_wrap=True)
+    for line in inputs_text(session.config):
+        console.print(line, markup=False, soft_wrap=True)
     health = run_node(node, seconds, console)
     show(health_fields(health) if json_out else health_table(health))
 

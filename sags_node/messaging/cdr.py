@@ -19,7 +19,7 @@ from rosbags.typesys import Stores, get_typestore
 from sags_node.geometry import matrix_to_quat
 from sags_node.messaging import topics
 from sags_node.messaging.wire import Buffer, DType, Message, WireError
-from sags_node.types import F64, Camera
+from sags_node.types import F64, Camera, Eye
 
 WORLD_FRAME = "world"
 LEFT_FRAME = "left_optical_frame"
@@ -27,10 +27,13 @@ RIGHT_FRAME = "right_optical_frame"
 IMAGE_ENCODINGS: dict[str, tuple[DType, int]] = {  # ROS name: dtype, channels
     "rgb8": ("uint8", 3),
     "rgba8": ("uint8", 4),
+    "bgr8": ("uint8", 3),
+    "bgra8": ("uint8", 4),
     "mono8": ("uint8", 1),
     "32FC1": ("float32", 1),
 }
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
+POSE = "geometry_msgs/msg/PoseStamped"
 PACKED_FIELDS = ("id", "rgb")  # 32-bit words that are no numbers on a scale
 _POINT_FIELD_UINT32, _POINT_FIELD_FLOAT32 = 6, 7
 
@@ -119,6 +122,13 @@ def compressed_image(data: bytes, kind: str, encoding: str, header: Any) -> byte
     return _serialize(_ros[COMPRESSED](header, form, np.frombuffer(data, np.uint8)))
 
 
+def picture_file(data: bytes, stamp_ns: int, frame: str = LEFT_FRAME) -> Content:
+    """`sensor_msgs/CompressedImage` of a JPEG or PNG file."""
+    kind = "png" if data.startswith(b"\x89PNG") else "jpeg"
+    message = _ros[COMPRESSED](_header(stamp_ns, frame), kind, np.frombuffer(data, np.uint8))
+    return Content(COMPRESSED, (_serialize(message),))
+
+
 def image(array: NDArray[Any], encoding: str, stamp_ns: int, frame: str = LEFT_FRAME) -> Content:
     """`sensor_msgs/Image` of a picture [H, W] or [H, W, C] in one of `IMAGE_ENCODINGS`."""
     dtype, channels = IMAGE_ENCODINGS[encoding]
@@ -137,21 +147,21 @@ def camera_info(camera: Camera, stamp_ns: int, frame: str = LEFT_FRAME, baseline
     P = np.zeros((3, 4))
     P[:, :3] = camera.K
     P[0, 3] = -camera.K[0, 0] * baseline
+    return _camera_info(camera.width, camera.height, np.zeros(5), camera.K, np.eye(3), P, stamp_ns, frame)
+
+
+def eye_info(eye: Eye, stamp_ns: int, frame: str = LEFT_FRAME) -> Content:
+    """`sensor_msgs/CameraInfo` of a calibrated camera that gives raw pictures."""
+    return _camera_info(eye.width, eye.height, eye.distortion, eye.K, eye.R, eye.P, stamp_ns, frame)
+
+
+def _camera_info(
+    width: int, height: int, distortion: F64, K: F64, R: F64, P: F64, stamp_ns: int, frame: str
+) -> Content:
     roi = _ros["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
-    K, R = np.asarray(camera.K, np.float64).ravel(), np.eye(3).ravel()
-    message = _ros[topics.CAMERA_INFO](
-        _header(stamp_ns, frame),
-        camera.height,
-        camera.width,
-        "plumb_bob",
-        np.zeros(5),
-        K,
-        R,
-        P.ravel(),
-        0,
-        0,
-        roi,
-    )
+    model = "rational_polynomial" if len(distortion) > 5 else "plumb_bob"
+    numbers = (np.asarray(matrix, np.float64).ravel() for matrix in (distortion, K, R, P))
+    message = _ros[topics.CAMERA_INFO](_header(stamp_ns, frame), height, width, model, *numbers, 0, 0, roi)
     return Content(topics.CAMERA_INFO, (_serialize(message),))
 
 
@@ -188,6 +198,14 @@ def transform(T_world_cam: F64, stamp_ns: int) -> Content:
     pose = _ros["geometry_msgs/msg/Transform"](translation, rotation)
     stamped = _ros["geometry_msgs/msg/TransformStamped"](_header(stamp_ns, WORLD_FRAME), LEFT_FRAME, pose)
     return Content(topics.TF, (_serialize(_ros[topics.TF]([stamped])),))
+
+
+def pose(T: F64, stamp_ns: int, frame: str = WORLD_FRAME) -> Content:
+    """`geometry_msgs/PoseStamped` of a pose [4, 4] (m) in `frame`."""
+    w, x, y, z = (float(q) for q in matrix_to_quat(T[:3, :3]))
+    position = _ros["geometry_msgs/msg/Point"](*(float(t) for t in T[:3, 3]))
+    there = _ros["geometry_msgs/msg/Pose"](position, _ros["geometry_msgs/msg/Quaternion"](x, y, z, w))
+    return Content(POSE, (_serialize(_ros[POSE](_header(stamp_ns, frame), there)),))
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,6 +19,7 @@ from sags_node.types import (
     SH_DEGREE_0,
     U8,
     Bool,
+    ClockStatus,
     DrawnView,
     FrameResult,
     Gaussians,
@@ -231,6 +232,15 @@ def json_text(value: Mapping[str, Any]) -> Content:
     return cdr.string(msgspec.json.encode(value).decode())
 
 
+def _clock_values(clock: ClockStatus | None) -> dict[str, str]:
+    if clock is None:
+        return {}
+    values = {"capture_clock_offset_ms": f"{clock.offset_ms:.1f}"}
+    return (
+        values if clock.drift_ppm is None else values | {"capture_clock_drift_ppm": f"{clock.drift_ppm:.1f}"}
+    )
+
+
 def diagnostics(health: NodeHealth, stamp_ns: int) -> Content:
     """One status for the node, one per stage."""
     level = {"running": 0, "stopping": 0}.get(health.state, 1)
@@ -239,6 +249,7 @@ def diagnostics(health: NodeHealth, stamp_ns: int) -> Content:
         "gaussians": str(health.gaussians),
         "rss_mb": f"{health.rss_mb:.0f}",
         **{f"latency_{name}_ms": f"{ms:.1f}" for name, ms in health.latency_ms.items()},
+        **_clock_values(health.clock),
         **{f"dropped_{slot}": str(count) for slot, count in health.dropped.items()},
         **{
             f"{socket}_connections_{what}": str(count)

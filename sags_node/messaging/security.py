@@ -26,7 +26,7 @@ from zmq.utils import z85
 from sags_node.errors import SagsError, UsageError
 
 if TYPE_CHECKING:
-    from sags_node.config import PublishConfig  # whose validation a client need not load
+    from sags_node.config import Guarded  # whose validation a client need not load
 
 KEY_CHARACTERS = 40  # a CURVE key in Z85
 MAX_KEY_FILE_BYTES = 4096
@@ -122,7 +122,7 @@ def public_key(said: str) -> bytes:
     return said.encode() if _is_key(said.encode()) else read_public_key(Path(said))
 
 
-def read_allow_list(places: Sequence[Path]) -> dict[bytes, str]:
+def read_allow_list(places: Sequence[Path], section: str = "publish") -> dict[bytes, str]:
     """The clients that may connect, public key (Z85) -> name, from `.pub` files and folders of them.
 
     Raises:
@@ -133,9 +133,11 @@ def read_allow_list(places: Sequence[Path]) -> dict[bytes, str]:
     ]
     if not files:
         where = ", ".join(str(place) for place in places)
-        raise UsageError(f"publish.allow: no .pub file in {where}; put the public keys of the clients there")
+        raise UsageError(
+            f"{section}.allow: no .pub file in {where}; put the public keys of the clients there"
+        )
     if len(files) > MAX_ALLOWED:
-        raise UsageError(f"publish.allow: {len(files)} keys; at most {MAX_ALLOWED} are allowed")
+        raise UsageError(f"{section}.allow: {len(files)} keys; at most {MAX_ALLOWED} are allowed")
     return {read_public_key(file): file.stem for file in files}
 
 
@@ -161,14 +163,23 @@ def _is_key(key: bytes) -> bool:
         return False
 
 
+_OPEN = {
+    "publish": "anybody who reaches it sees the video and controls the node",
+    "source": "anybody who reaches it says what the scope sees",
+    "robot": "anybody who reaches it says where the scope is",
+}
+
 # ---- the node's side -------------------------------------------------------------------------------------
 
 
-def check_endpoint(endpoint: str, config: PublishConfig) -> None:
+def check_endpoint(endpoint: str, config: Guarded, section: str = "publish") -> None:
     """Refuse to listen where other machines can reach, unless only listed keys get in.
 
+    Args:
+        section: of the launch file that `config` is, for the message.
+
     Raises:
-        UsageError: not tcp or ipc, or not loopback while neither keys are set nor `publish.insecure`.
+        UsageError: not tcp or ipc, or not loopback while neither keys are set nor `insecure`.
     """
     transport, separator, address = endpoint.partition("://")
     if not separator or transport not in ("tcp", "ipc") or not address:
@@ -179,10 +190,10 @@ def check_endpoint(endpoint: str, config: PublishConfig) -> None:
         return
     if not config.insecure:
         raise UsageError(
-            f"{endpoint} can be reached from other machines: set publish.key and publish.allow (see sags "
-            "keygen), or publish.insecure:=true (anybody who reaches it sees the video and controls the node)"
+            f"{endpoint} can be reached from other machines: set {section}.key and {section}.allow (see "
+            f"sags keygen), or {section}.insecure:=true ({_OPEN[section]})"
         )
-    log.warning("%s is open: anybody who reaches it sees the video and controls the node", endpoint)
+    log.warning("%s is open: %s", endpoint, _OPEN[section])
 
 
 def is_local(endpoint: str) -> bool:
@@ -218,19 +229,27 @@ class Seldom:
 class _AllowList:
     """Answers the authenticator whether a key may come in."""
 
-    def __init__(self, allowed: Mapping[bytes, str]) -> None:
+    def __init__(self, allowed: Mapping[bytes, str], section: str) -> None:
         self._allowed = allowed
+        self._section = section
         self._seldom = Seldom()
 
     def callback(self, domain: str, key: bytes) -> bool:
         if key not in self._allowed and self._seldom.due():
-            log.warning("refused a client with the key %s, which is not in publish.allow", key.decode())
+            log.warning(
+                "refused a client with the key %s, which is not in %s.allow", key.decode(), self._section
+            )
         return key in self._allowed
 
 
 @contextmanager
-def authenticated(context: zmq.Context[zmq.Socket[bytes]], config: PublishConfig) -> Iterator[KeyPair | None]:
-    """The node's key pair while only the keys of `publish.allow` are let in; None without `publish.key`.
+def authenticated(
+    context: zmq.Context[zmq.Socket[bytes]], config: Guarded, section: str = "publish"
+) -> Iterator[KeyPair | None]:
+    """The node's key pair while only the keys of `allow` are let in; None without `key`.
+
+    Args:
+        section: of the launch file that `config` is, for messages.
 
     Raises:
         UsageError: a key file is missing, damaged or open to others, or nobody is allowed.
@@ -243,7 +262,9 @@ def authenticated(context: zmq.Context[zmq.Socket[bytes]], config: PublishConfig
         raise SagsError("this ZeroMQ library has no CURVE; install pyzmq from its wheel")
     keys = read_key_pair(config.key)
     authenticator = ThreadAuthenticator(context)
-    authenticator.configure_curve_callback(ZAP_DOMAIN.decode(), _AllowList(read_allow_list(config.allow)))
+    authenticator.configure_curve_callback(
+        ZAP_DOMAIN.decode(), _AllowList(read_allow_list(config.allow, section), section)
+    )
     authenticator.start()
     try:
         yield keys

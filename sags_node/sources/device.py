@@ -28,6 +28,8 @@ class Picture(NamedTuple):
 
     t_ns: int  # wall clock
     image: U8  # [H, W, 3] RGB
+    device_ns: int = 0  # by the clock of what took or sent it; 0: it gave none
+    arrival_ns: int = 0  # wall clock; 0: not known
 
 
 class Shot(NamedTuple):
@@ -36,6 +38,8 @@ class Shot(NamedTuple):
     t_ns: int  # wall clock
     image: Samples  # [H, W, 3] RGB
     side: Side | None = None  # whose it is, where one device delivers either eye's
+    device_ns: int = 0  # by the clock of the device; 0: it gave none
+    arrival_ns: int = 0  # wall clock; 0: not known
 
 
 class Device:
@@ -118,10 +122,13 @@ class Device:
         if stamp_ms and stamp_ms == self._last_stamp_ms:
             return None
         self._last_stamp_ms = stamp_ms
-        t_ns = wall_stamp(round(stamp_ms * 1e6), time.monotonic_ns(), time.time_ns())
+        device_ns, arrival_ns = round(stamp_ms * 1e6), time.time_ns()
+        t_ns = wall_stamp(device_ns, time.monotonic_ns(), arrival_ns)
         if self._shift is None:
-            return Shot(t_ns, cv2.cvtColor(picture, cv2.COLOR_BGR2RGB))
-        return Shot(t_ns, _deep(picture, self._shift, self.size))
+            image: Samples = cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+        else:
+            image = _deep(picture, self._shift, self.size)
+        return Shot(t_ns, image, device_ns=device_ns, arrival_ns=arrival_ns)
 
     def close(self) -> None:
         self._capture.release()

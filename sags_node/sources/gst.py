@@ -21,6 +21,7 @@ from sags_node.errors import SagsError
 from sags_node.sources.device import Shot
 from sags_node.sources.gst_process import GstProcess
 from sags_node.sources.live import EndedError, Input, LiveStereo
+from sags_node.sources.live_pairs import LivePairs
 from sags_node.types import Samples, Side
 
 log = logging.getLogger(__name__)
@@ -50,7 +51,8 @@ def open_pipeline(config: GstSource, size: tuple[int, int] | None = None) -> Liv
         SagsError: GStreamer is not installed, the pipeline is wrong, or no picture comes in time.
     """
     only = Input("GStreamer", None, lambda: Pipeline(config), config.deadline)
-    return LiveStereo([only], config.geometry, config.pair_tolerance_ms, size)
+    pairs = LivePairs(config.pair_tolerance_ms, config.latency_ms)
+    return LiveStereo([only], config.geometry, pairs, size)
 
 
 def whole_launch(config: GstSource) -> tuple[str, list[str]]:
@@ -204,4 +206,4 @@ class Sink:
             strides=(self._row, self._channels * bytes_each, bytes_each),
         )
         rgb = whole[..., self._channels - 3 :].copy()
-        return Shot(said["t_ns"], rgb, SIDES[self.name])
+        return Shot(said["t_ns"], rgb, SIDES[self.name], said["running_ns"], said["t_ns"] + said["age_ns"])

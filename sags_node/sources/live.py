@@ -16,8 +16,9 @@ from sags_node.config import GeometryConfig
 from sags_node.errors import SagsError, UsageError
 from sags_node.sources.device import Picture, Shot
 from sags_node.sources.layout import Layout
-from sags_node.sources.pairing import Alternation, Pairing
-from sags_node.types import Side, StereoFrame
+from sags_node.sources.live_pairs import LivePairs
+from sags_node.sources.pairing import Alternation
+from sags_node.types import U8, Side, StereoFrame
 
 log = logging.getLogger(__name__)
 
@@ -70,7 +71,7 @@ class LiveStereo:
     Args:
         inputs: one that delivers both eyes, or one for each.
         geometry: how pictures become those of the eyes.
-        tolerance_ms: how far apart the stamps of a pair may be.
+        pairs: where the pictures go in.
         size: width and height that an eye's pictures must have, px; None: as they come.
 
     Raises:
@@ -84,13 +85,10 @@ class LiveStereo:
         self,
         inputs: Sequence[Input],
         geometry: GeometryConfig,
-        tolerance_ms: float,
+        pairs: LivePairs,
         size: tuple[int, int] | None = None,
     ) -> None:
-        self._stopped = threading.Event()
-        self._ended = False
-        self._arrived = threading.Condition()
-        self._pairing = Pairing(round(tolerance_ms * 1e6))
+        self._pairs = pairs
         self._layout = Layout(geometry)
         self._size = size
         self._alternation: Alternation | None = None
@@ -98,7 +96,7 @@ class LiveStereo:
         try:
             for one in inputs:
                 opened = self._checked(one)
-                self._readers.append(DeviceReader(one, self._checked, opened, self._put, self._stopped))
+                self._readers.append(DeviceReader(one, self._checked, opened, self._put, pairs.stopped))
         except SagsError:
             self._close()
             raise
@@ -114,7 +112,7 @@ class LiveStereo:
     @property
     def dropped(self) -> int:
         """Pictures of either eye that found no partner."""
-        return self._pairing.unpaired + (self._alternation.alone if self._alternation else 0)
+        return self._pairs.unpaired + (self._alternation.alone if self._alternation else 0)
 
     def __enter__(self) -> Self:
         for reader in self._readers:
@@ -133,23 +131,11 @@ class LiveStereo:
 
     def stop(self) -> None:
         """End the iteration; any thread may call this."""
-        with self._arrived:
-            self._stopped.set()
-            self._arrived.notify_all()
+        self._pairs.stop()
 
     def __iter__(self) -> Iterator[StereoFrame]:
         """Pairs as they arrive, until `stop` or the end of a file; silent while a camera is away."""
-        epoch, last_ns = 0, 0
-        while True:
-            with self._arrived:
-                while (pair := self._pairing.take()) is None and not (self._stopped.is_set() or self._ended):
-                    self._arrived.wait(POLL_S)
-            if pair is None or self._stopped.is_set():
-                return
-            frame_id, left, right = pair
-            epoch += left.t_ns < last_ns
-            last_ns = left.t_ns
-            yield StereoFrame(frame_id, left.t_ns, right.t_ns, left.image, right.image, epoch)
+        return iter(self._pairs)
 
     def _checked(self, one: Input) -> CaptureDevice:
         """Open a device whose pictures have the right size: those of the rig, or as they were at first."""
@@ -171,35 +157,33 @@ class LiveStereo:
     def _put(self, picture: Shot | None, side: Side | None) -> None:
         """Take a picture in; None: there are no more."""
         if picture is None:
-            with self._arrived:
-                self._ended = True
-                self._arrived.notify_all()
+            self._pairs.end()
             return
         side = picture.side or side
         if side is not None:
-            eye = Picture(picture.t_ns, self._layout.eye(picture.image, side))
-            with self._arrived:
-                (self._pairing.add_left if side == "left" else self._pairing.add_right)(eye)
-                self._arrived.notify_all()
+            self._pairs.put(side, _of(picture, self._layout.eye(picture.image, side)))
         elif (pair := self._both(picture)) is not None:
-            with self._arrived:
-                self._pairing.add_pair(*pair)
-                self._arrived.notify_all()
+            self._pairs.put_both(*pair)
 
     def _both(self, picture: Shot) -> tuple[Picture, Picture] | None:
         """Left and right of an input that shows both, once they are there."""
         if self._alternation is None:
             images = self._layout.eyes(picture.image)
-            return Picture(picture.t_ns, images[0]), Picture(picture.t_ns, images[1])
+            return _of(picture, images[0]), _of(picture, images[1])
         joined = self._alternation.add(picture)
         if joined is None:
             return None
         of = dict(zip(self._layout.order, joined, strict=True))
-        left, right = (Picture(of[side].t_ns, self._layout.eye(of[side].image, side)) for side in SIDES)
+        left, right = (_of(of[side], self._layout.eye(of[side].image, side)) for side in SIDES)
         return left, right
 
 
 SIDES: tuple[Side, Side] = ("left", "right")
+
+
+def _of(shot: Shot, image: U8) -> Picture:
+    """One eye's picture of what a device delivered."""
+    return Picture(shot.t_ns, image, shot.device_ns, shot.arrival_ns)
 
 
 class DeviceReader:

@@ -97,6 +97,10 @@ class Replay:
         self._stamps: I64 | None = None  # [turns, 2] ns, of the left and the right picture
         if isinstance(self._pairs, BagPairs | DvrkPairs) and config.rate is None:
             self._stamps = self._pairs.stamps[:: config.stride]
+        # The recording's own stamps of the left pictures, ns: by them poses of the same recording are found.
+        self._recorded = (
+            self._pairs.stamps[:: config.stride, 0] if isinstance(self._pairs, BagPairs) else None
+        )
         self.dropped = 0
         self._began: tuple[float, int] | None = None  # monotonic seconds and wall clock of the first turn
         self._dropped_in_a_row = 0
@@ -183,6 +187,7 @@ class Replay:
                     tissue=pair.tissue,
                     reference=reference,
                     depth=pair.depth,
+                    t_device_ns=0 if self._recorded is None else int(self._recorded[index]),
                 )
             for _ in range(stride - 1):
                 self._pairs.skip()

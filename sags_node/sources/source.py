@@ -55,7 +55,7 @@ def open_source(
         config: the `source` section.
         references: read the recording's truth with each frame. Only measuring needs it.
         progress: called with (done, total) while a phantom session is rendered.
-        size: width and height of the calibration's pictures, px: a live source of others is refused.
+        size: width and height that an eye's live pictures must have, px; None: those of the first.
 
     Raises:
         UsageError: a file, folder or device is missing or does not fit the rest.
@@ -69,6 +69,14 @@ def open_source(
         from sags_node.sources.gst import open_pipeline
 
         return open_pipeline(config, size)
+    if isinstance(config, cfg.Ros2Source):
+        from sags_node.sources.ros2 import RosCameras
+
+        return RosCameras(config, size)
+    if isinstance(config, cfg.PushSource):
+        from sags_node.sources.push import PushedPictures
+
+        return PushedPictures(config, size)
 
     from sags_node.sources.replay import Replay
 
@@ -78,10 +86,10 @@ def open_source(
 
 
 def recorded_rig(config: cfg.Source) -> StereoRig | None:
-    """The calibration that comes with a research recording; None where the launch file must name one.
+    """The calibration that comes with the pictures; None where the launch file must name one.
 
     Raises:
-        UsageError: its files are missing, damaged or implausible.
+        UsageError: it is missing, damaged or implausible.
     """
     if isinstance(config, cfg.EndoNerfSource):
         from sags_node.sources import endonerf
@@ -95,6 +103,10 @@ def recorded_rig(config: cfg.Source) -> StereoRig | None:
         from sags_node.sources import bags
 
         return bags.read_rig(config)
+    if isinstance(config, cfg.Ros2Source):
+        from sags_node.sources import ros2
+
+        return ros2.read_rig(config)
     return None
 
 

@@ -10,6 +10,7 @@ from sags_node.config import V4l2Source
 from sags_node.errors import UsageError
 from sags_node.sources.device import Device
 from sags_node.sources.live import CaptureDevice, Input, LiveStereo
+from sags_node.sources.live_pairs import LivePairs
 from sags_node.types import Side
 
 
@@ -35,7 +36,8 @@ def open_cameras(
     inputs = [
         Input(path, side, partial(open_device, path, config), config.deadline) for path, side in sides.items()
     ]
-    return LiveStereo(inputs, config.geometry, config.pair_tolerance_ms, size)
+    pairs = LivePairs(config.pair_tolerance_ms, config.latency_ms)
+    return LiveStereo(inputs, config.geometry, pairs, size)
 
 
 def _right_path(config: V4l2Source) -> str:

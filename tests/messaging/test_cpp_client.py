@@ -1,4 +1,4 @@
-"""The C++ example, written from docs/wire.md alone: it sees what the Python subscriber sees."""
+"""The C++ examples, written from the documents alone: one sees what the Python subscriber sees, one sends."""
 
 from __future__ import annotations
 
@@ -9,20 +9,24 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
 import msgpack
+import numpy as np
 import pytest
 import zmq
 from places import ROOT
 from running_node import RunningNode
 from synthetic import plane_result
 
+from sags_node.config import PushSource
 from sags_node.messaging import cdr, content
 from sags_node.messaging.control import ControlClient
 from sags_node.messaging.received import ReceivedImage, TopicName
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.messaging.wire import Message, Meta, encode
+from sags_node.sources.push import PushedPictures
 from sags_node.types import FrameResult
 
 pytestmark = pytest.mark.live
@@ -37,8 +41,8 @@ LINE = re.compile(
 
 
 @pytest.fixture(scope="module")
-def read_depth(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The program, freshly built."""
+def examples(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the programs, freshly built."""
     missing = [tool for tool in ("g++", "cmake", "pkg-config") if shutil.which(tool) is None]
     if missing:
         pytest.skip(f"no C++ example without {', '.join(missing)}")
@@ -52,7 +56,12 @@ def read_depth(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ):
         built = subprocess.run(command, check=False, capture_output=True, text=True)
         assert built.returncode == 0, built.stdout + built.stderr
-    return folder / "read_depth"
+    return folder
+
+
+@pytest.fixture(scope="module")
+def read_depth(examples: Path) -> Path:
+    return examples / "read_depth"
 
 
 @contextmanager
@@ -154,6 +163,22 @@ def test_hostile_messages_are_left_out(read_depth: Path) -> None:
         assert [row[4] for row in LINE.findall(said)] == ["unknown"]
     finally:
         context.destroy(linger=0)
+
+
+def test_pictures_are_handed_in_and_a_wrong_size_is_told(examples: Path) -> None:
+    """push_frames, written from docs/inputs.md alone."""
+    source = PushedPictures(PushSource(endpoint="tcp://127.0.0.1:*"), (320, 240))
+    with source:
+        with running(examples / "push_frames", source.endpoint, "5", "320", "240") as process:
+            frames = list(islice(source, 3))
+            assert process.wait(30) == 0
+        with running(examples / "push_frames", source.endpoint, "-1", "64", "48") as process:
+            assert process.stdout is not None
+            assert "64x48 px, it must be 320x240" in process.stdout.readline()
+    column, row = np.meshgrid(np.arange(320), np.arange(240))
+    drawn = int(frames[0].left[0, 0, 0])
+    assert np.array_equal(frames[0].left[..., 0], ((column + drawn) ^ row) & 255)
+    assert frames[0].right is not None and frames[0].right[0, 0, 0] == drawn + 12
 
 
 def message(name: str, result: FrameResult) -> list[bytes]:

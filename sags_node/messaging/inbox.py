@@ -1,0 +1,177 @@
+"""A socket that takes in what other programs hand over, in the form of `wire`, and tells them what is wrong.
+
+A sender connects with DEALER, and sends messages as the node itself publishes them. Once a second it gets a
+`receipt.Receipt`. Nobody is waited for: of what came too fast the newest is taken.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import msgspec
+import zmq
+
+from sags_node.errors import SagsError
+from sags_node.messaging import wire
+from sags_node.messaging.peers import Peers
+from sags_node.messaging.receipt import Receipt
+from sags_node.messaging.security import Seldom, authenticated, check_endpoint
+from sags_node.messaging.sockets import bind, limit, receive_frames
+
+if TYPE_CHECKING:
+    from sags_node.config import Guarded
+
+log = logging.getLogger(__name__)
+
+MAX_PART_BYTES = 64 << 20  # a picture of 4096 x 4096 px, 4 bytes each
+MAX_UNTAKEN_BYTES = 4 * MAX_PART_BYTES  # that a peer may have sent and we not read
+RECEIVE_HIGH_WATER = 8  # messages of a sender that wait in the socket
+SEND_HIGH_WATER = 4
+MOST_AT_ONCE = 64  # messages read in one go
+POLL_MS = 100  # how soon the thread notices that it should end
+RECEIPT_S = 1.0
+FORGOTTEN_S = 10.0  # a sender that is silent for so long
+
+Take = Callable[[wire.Message, int], None]
+
+
+@dataclass(slots=True)
+class _Sender:
+    heard: float
+    due: float
+    taken: int = 0
+    refused: int = 0
+    overtaken: int = 0
+    problem: str | None = None
+
+
+class Inbox:
+    """Receives in a thread of its own, from the start to `close`.
+
+    Args:
+        endpoint: to bind.
+        config: who may send.
+        section: of the launch file that both stand in.
+        take: called with each message and its arrival (wall clock, ns); what it refuses it raises as
+            `SagsError`, which the sender is told.
+        advice: what else its sender should be told; None: nothing.
+        newest: of each topic so many messages are taken from what waits; 0: all.
+
+    Raises:
+        UsageError: the endpoint is open to other machines without keys, or a key file cannot be used.
+        SagsError: the endpoint is taken.
+    """
+
+    def __init__(
+        self,
+        endpoint: str,
+        config: Guarded,
+        section: str,
+        take: Take,
+        advice: Callable[[], str | None] = lambda: None,
+        newest: int = 0,
+    ) -> None:
+        check_endpoint(endpoint, config, section)
+        self._section = section
+        self._take, self._advice, self._newest = take, advice, newest
+        self._senders: dict[bytes, _Sender] = {}
+        self._seldom = Seldom()
+        self._stopping = threading.Event()
+        self._resources = ExitStack()
+        context = zmq.Context()
+        self._resources.callback(context.destroy, linger=0)
+        try:
+            keys = self._resources.enter_context(authenticated(context, config, section))
+            self._socket = context.socket(zmq.ROUTER)
+            limit(self._socket, SEND_HIGH_WATER, RECEIVE_HIGH_WATER, MAX_PART_BYTES)
+            self._socket.setsockopt(zmq.RCVBUF, -1)  # the system's: pictures are large
+            self._peers = Peers(self._socket, section, MAX_UNTAKEN_BYTES)
+            self._resources.callback(self._peers.close)
+            self.endpoint = bind(self._socket, endpoint, f"{section}.endpoint", keys)
+        except BaseException:
+            self._resources.close()
+            raise
+        self._thread = threading.Thread(target=self._receive, name="inbox", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the thread and close the socket."""
+        self._stopping.set()
+        self._thread.join()
+        self._resources.close()
+
+    # ---- the receiving thread --------------------------------------------------------------------------
+
+    def _receive(self) -> None:
+        while not self._stopping.is_set():
+            if self._socket.poll(POLL_MS):
+                for sender, message, arrival_ns in self._waiting():
+                    try:
+                        self._take(message, arrival_ns)
+                        sender.taken += 1
+                    except SagsError as error:
+                        self._refuse(sender, str(error))
+            self._tell()
+
+    def _waiting(self) -> list[tuple[_Sender, wire.Message, int]]:
+        """What has come, in its order; of each sender's topics the newest."""
+        came: list[tuple[_Sender, wire.Message, int]] = []
+        while len(came) < MOST_AT_ONCE:
+            try:
+                identity, *frames = receive_frames(self._socket, wire.MAX_PARTS + 1)
+            except zmq.Again:
+                break
+            arrival_ns = time.time_ns()
+            sender = self._sender(identity.bytes)
+            if frames:
+                size = sum(len(frame.buffer) for frame in frames)
+                self._peers.took(int(frames[-1].get(zmq.SRCFD)), size)
+            try:
+                came.append((sender, wire.decode([frame.buffer for frame in frames]), arrival_ns))
+            except wire.WireError as error:
+                self._refuse(sender, str(error))
+        if not self._newest:
+            return came
+        kept, counts = [], dict[tuple[int, str], int]()
+        for one in reversed(came):
+            topic = id(one[0]), one[1].topic
+            counts[topic] = counts.get(topic, 0) + 1
+            if counts[topic] <= self._newest:
+                kept.append(one)
+            else:
+                one[0].overtaken += 1
+        return kept[::-1]
+
+    def _sender(self, identity: bytes) -> _Sender:
+        now = time.monotonic()
+        sender = self._senders.setdefault(identity, _Sender(now, now + RECEIPT_S))
+        sender.heard = now
+        return sender
+
+    def _refuse(self, sender: _Sender, why: str) -> None:
+        sender.refused += 1
+        sender.problem = why
+        if self._seldom.due():
+            log.warning("%s %s: left out: %s", self._section, self.endpoint, why)
+
+    def _tell(self) -> None:
+        now = time.monotonic()
+        for identity, sender in list(self._senders.items()):
+            if now - sender.heard > FORGOTTEN_S:
+                del self._senders[identity]
+            elif now >= sender.due:
+                sender.due = now + RECEIPT_S
+                problem, sender.problem = sender.problem or self._advice(), None
+                receipt = Receipt(
+                    taken=sender.taken, refused=sender.refused, overtaken=sender.overtaken, problem=problem
+                )
+                try:
+                    self._socket.send_multipart([identity, msgspec.msgpack.encode(receipt)], zmq.NOBLOCK)
+                except zmq.ZMQError as error:  # it is gone or does not read: its loss
+                    log.debug("a receipt was not sent: %s", error)

@@ -1,0 +1,196 @@
+"""Handing pictures and poses to a node, from a simulator or any program that holds them.
+
+with FrameSender() as sender:
+    sender.send(left, right)  # [H, W, 3] uint8 RGB
+
+The node must have `source.kind: push`; for poses `robot.kind: push`.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+import uuid
+from collections import Counter
+from types import TracebackType
+from typing import Any, Literal, Self
+
+import msgspec
+import zmq
+from numpy.typing import NDArray
+
+from sags_node.errors import SagsError
+from sags_node.messaging import cdr
+from sags_node.messaging.address import Address, ClientKeys, connect
+from sags_node.messaging.cdr import Content
+from sags_node.messaging.receipt import Receipt
+from sags_node.messaging.wire import Message, Meta, encode
+from sags_node.types import F64
+
+log = logging.getLogger(__name__)
+
+Picture = NDArray[Any] | bytes  # [H, W] or [H, W, C] uint8; or the bytes of a JPEG or PNG file
+MAX_RECEIPT_BYTES = 1 << 16
+
+
+class Sender:
+    """Sends to a node without ever waiting: what does not fit into the queue is left out and counted.
+
+    Used from one thread. A node that is away or restarted gets what is sent from then on.
+
+    Attributes:
+        receipt: the node's last words; None before the first, which comes after a second.
+        left_out: messages that did not fit.
+
+    Args:
+        endpoint: of the node.
+        ns: namespace of the topics.
+        keys: for a node that wants them.
+
+    Raises:
+        SagsError: the endpoint is malformed.
+    """
+
+    _queued: int  # messages that may wait for the network
+
+    def __init__(self, endpoint: str, ns: str, keys: ClientKeys | None) -> None:
+        self.receipt: Receipt | None = None
+        self.left_out = 0
+        self._ns = ns
+        self._endpoint = endpoint
+        self._session = uuid.uuid4().hex
+        self._seq: Counter[str] = Counter()
+        self._said: str | None = None
+        self._context = zmq.Context()
+        self._socket = self._context.socket(zmq.DEALER)
+        self._socket.setsockopt(zmq.SNDHWM, self._queued)
+        try:
+            self._watch = connect(self._socket, Address(endpoint, keys), MAX_RECEIPT_BYTES)
+        except SagsError:
+            self.close()
+            raise
+
+    @property
+    def problem(self) -> str | None:
+        """What the node has against what is sent, or that it is not there; None: all is well."""
+        self._listen()
+        return self._watch.refusal() or (None if self.receipt is None else self.receipt.problem)
+
+    def _send(self, name: str, body: Content, stamp_ns: int) -> bool:
+        self._seq[name] += 1
+        meta = Meta(
+            type=body.type, type_hash=cdr.type_hash(body.type), seq=self._seq[name], frame_id=self._seq[name],
+            stamp_ns=stamp_ns, publish_ns=time.time_ns(), session=self._session, epoch=0, step=0,
+            encoding=body.encoding, shape=list(body.shape), dtype=body.dtype, dropped=self.left_out,
+        )  # fmt: skip
+        self._complain()
+        try:
+            # Copied: whoever sends may draw the next picture into the same memory.
+            self._socket.send_multipart(encode(Message(f"{self._ns}/{name}", meta, body.parts)), zmq.NOBLOCK)
+        except zmq.Again:
+            self.left_out += 1
+            return False
+        return True
+
+    def _listen(self) -> None:
+        while self._socket.poll(0):
+            try:
+                self.receipt = msgspec.msgpack.decode(self._socket.recv(), type=Receipt)
+            except msgspec.MsgspecError:
+                continue
+
+    def _complain(self) -> None:
+        """Each problem once in the log, when it begins."""
+        problem = self.problem
+        if problem is not None and problem != self._said:
+            log.warning("%s: %s", self._endpoint, problem)
+        self._said = problem
+
+    def close(self) -> None:
+        self._context.destroy(linger=0)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class FrameSender(Sender):
+    """Hands pictures in to a node with `source.kind: push`, at its `source.endpoint`; see `Sender`."""
+
+    _queued = 4  # two pairs: a slow node gets new pictures, not old ones
+
+    def __init__(
+        self, endpoint: str = "tcp://127.0.0.1:5558", ns: str = "camera", keys: ClientKeys | None = None
+    ) -> None:
+        super().__init__(endpoint, ns, keys)
+
+    def send(
+        self, left: Picture, right: Picture, stamp_ns: int | None = None, encoding: str | None = None
+    ) -> bool:
+        """Both eyes' pictures of one moment; False when one of them was left out.
+
+        Args:
+            stamp_ns: when they were taken, wall clock (`time.time_ns`); default: now.
+            encoding: of arrays, one of `cdr.IMAGE_ENCODINGS`; default: by the channels mono8, rgb8 or rgba8.
+
+        Raises:
+            ValueError: an array is not uint8 [H, W] or [H, W, C], or does not fit the encoding.
+        """
+        stamp_ns = time.time_ns() if stamp_ns is None else stamp_ns
+        went = [self.send_eye("left", left, stamp_ns, encoding)]
+        went.append(self.send_eye("right", right, stamp_ns, encoding))
+        return all(went)
+
+    def send_eye(
+        self, eye: Literal["left", "right"], picture: Picture, stamp_ns: int, encoding: str | None = None
+    ) -> bool:
+        """One eye's picture: for eyes that two programs hold. Stamps say which belong together."""
+        return self._send_picture(eye, picture, stamp_ns, encoding)
+
+    def send_side_by_side(
+        self, picture: Picture, stamp_ns: int | None = None, encoding: str | None = None
+    ) -> bool:
+        """One picture of both eyes, the left one in its left half; see `send`."""
+        return self._send_picture("stereo", picture, stamp_ns, encoding)
+
+    def _send_picture(self, whose: str, picture: Picture, stamp_ns: int | None, encoding: str | None) -> bool:
+        stamp_ns = time.time_ns() if stamp_ns is None else stamp_ns
+        frame = cdr.RIGHT_FRAME if whose == "right" else cdr.LEFT_FRAME
+        if isinstance(picture, bytes):
+            return self._send(
+                f"{whose}/image_raw/compressed", cdr.picture_file(picture, stamp_ns, frame), stamp_ns
+            )
+        encoding = encoding or _usual_encoding(picture)
+        fits = cdr.IMAGE_ENCODINGS.get(encoding)
+        shape = picture.shape[2:] or (1,)
+        if fits is None or picture.dtype != fits[0] or shape != (fits[1],):
+            raise ValueError(f"a picture {picture.shape} of {picture.dtype} is not {encoding}")
+        return self._send(f"{whose}/image_raw", cdr.image(picture, encoding, stamp_ns, frame), stamp_ns)
+
+
+class PoseSender(Sender):
+    """Hands poses in to a node with `robot.kind: push`, at its `robot.endpoint`; see `Sender`."""
+
+    _queued = 1000  # poses are small, and each of them counts
+
+    def __init__(
+        self, endpoint: str = "tcp://127.0.0.1:5559", ns: str = "robot", keys: ClientKeys | None = None
+    ) -> None:
+        super().__init__(endpoint, ns, keys)
+
+    def send(self, T_base_hand: F64, stamp_ns: int | None = None) -> bool:
+        """Where what carries the camera was at a moment, [4, 4], m.
+
+        Args:
+            stamp_ns: wall clock (`time.time_ns`); default: now.
+        """
+        stamp_ns = time.time_ns() if stamp_ns is None else stamp_ns
+        return self._send("pose", cdr.pose(T_base_hand, stamp_ns), stamp_ns)
+
+
+def _usual_encoding(picture: NDArray[Any]) -> str:
+    return {2: "mono8", 3: {3: "rgb8", 4: "rgba8"}.get(picture.shape[-1], "")}.get(picture.ndim, "")

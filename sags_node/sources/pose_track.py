@@ -1,0 +1,264 @@
+"""Where a robot says that things are, over time: a tree of frames whose transforms are interpolated.
+
+A pose is only given where it is known: between two samples that are close together. Nothing is carried on
+beyond the newest one.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from bisect import bisect_left, bisect_right
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sags_node.errors import SagsError
+from sags_node.geometry import invert, quat_to_matrix
+from sags_node.messaging import cdr, topics
+from sags_node.types import F64, Finding
+
+TRANSFORM = "geometry_msgs/msg/TransformStamped"
+POSE_TYPES = (topics.TF, cdr.POSE, TRANSFORM)
+BASE, HAND = "base", "hand"  # the two frames of a topic that holds the pose itself
+
+# A scope that a person moves is accelerated by about 1 m/s^2: between two poses so far apart in time a
+# straight line is wrong by less than 2 mm (a t^2 / 8).
+LARGEST_GAP_NS = 120_000_000
+IN_VAIN_NS = 4 * LARGEST_GAP_NS  # poses that are so late are not waited for
+FASTEST = 1.0  # m/s: a person pulls a scope out of a trocar with less
+FASTEST_TURN = 2 * np.pi  # rad/s
+SMALLEST_JUMP = 0.002  # m, and 1 degree: below it fast samples only jitter
+SMALLEST_TURN = np.radians(1)
+JUMP_HELD_NS = 1_000_000_000  # so long a track must be smooth again after a jump
+MOST_FRAMES = 1000  # of a tf tree
+
+
+class NoPoseError(SagsError):
+    """There is no pose for that time."""
+
+    def __init__(self, finding: Finding) -> None:
+        super().__init__(finding.text)
+        self.finding = finding
+
+
+class Sample(NamedTuple):
+    quat: F64  # [4] wxyz, unit
+    position: F64  # [3] m
+
+
+class _Edge:
+    """One frame in its parent, over time."""
+
+    def __init__(self, parent: str, kept: int) -> None:
+        self.parent = parent
+        self._kept = kept
+        self._stamps: list[int] = []
+        self._samples: list[Sample] = []
+        self._jumps: list[int] = []
+
+    @property
+    def newest(self) -> int | None:
+        return self._stamps[-1] if self._stamps else None
+
+    def add(self, stamp_ns: int, sample: Sample) -> None:
+        if self._stamps and stamp_ns <= self._stamps[-1]:
+            if stamp_ns == self._stamps[-1]:
+                return
+            self._stamps, self._samples, self._jumps = [], [], []  # the robot was started anew
+        if self._stamps and _jumps(self._samples[-1], sample, stamp_ns - self._stamps[-1]):
+            self._jumps.append(stamp_ns)
+        self._stamps.append(stamp_ns)
+        self._samples.append(sample)
+        if len(self._stamps) > 2 * self._kept:
+            del self._stamps[: -self._kept], self._samples[: -self._kept]
+            self._jumps = [stamp for stamp in self._jumps if stamp >= self._stamps[0]]
+
+    def at(self, t_ns: int) -> F64:
+        """[4, 4] m.
+
+        Raises:
+            NoPoseError: it is not known for this time.
+        """
+        after = bisect_left(self._stamps, t_ns)
+        if after == len(self._stamps):
+            age = (t_ns - self._stamps[-1]) * 1e-9
+            raise NoPoseError(
+                Finding(
+                    "pose_stopped",
+                    f"the robot's pose has stopped: the newest is {age:.2f} s older than the picture; see to "
+                    "the robot's program, its clock and robot.offset_ms",
+                )
+            )
+        if after == 0 and self._stamps[0] > t_ns:
+            raise NoPoseError(Finding("pose_missing", "the picture is older than all poses of the robot"))
+        before = after if self._stamps[after] == t_ns else after - 1
+        gap = self._stamps[after] - self._stamps[before]
+        if gap > LARGEST_GAP_NS:
+            raise NoPoseError(
+                Finding(
+                    "pose_missing",
+                    f"the robot's poses are {gap * 1e-9:.2f} s apart: more than "
+                    f"{1e9 / LARGEST_GAP_NS:.0f} a second are needed",
+                )
+            )
+        jump = bisect_right(self._jumps, self._stamps[after])
+        if jump and self._jumps[jump - 1] > t_ns - JUMP_HELD_NS:
+            raise NoPoseError(
+                Finding(
+                    "pose_jumped",
+                    "the robot's pose jumps faster than a scope can move: see to its joints' sensors and its "
+                    "base frame",
+                )
+            )
+        share = 0.0 if gap == 0 else (t_ns - self._stamps[before]) / gap
+        return between(self._samples[before], self._samples[after], share)
+
+
+class _Fixed(NamedTuple):
+    parent: str
+    T: F64
+
+    def at(self, t_ns: int) -> F64:
+        return self.T
+
+    @property
+    def newest(self) -> None:
+        return None
+
+
+class PoseTrack:
+    """The poses that came so far. Any threads may add and ask.
+
+    Args:
+        base, hand: frames between which the pose is asked for; None: of a topic that holds the pose.
+        kept: samples of each frame that are kept.
+    """
+
+    def __init__(self, base: str | None = None, hand: str | None = None, kept: int = 20_000) -> None:
+        self._base, self._hand = _plain(base or BASE), _plain(hand or HAND)
+        self._kept = kept
+        self._edges: dict[str, _Edge | _Fixed] = {}
+        self._came = threading.Condition()
+
+    def add(self, data: bytes | memoryview, kind: str, fixed: bool = False) -> None:
+        """A message of one of `POSE_TYPES`, as CDR; `fixed`: from `tf_static`.
+
+        Raises:
+            SagsError: it is damaged, or no pose.
+        """
+        message: Any = cdr.decode(data, kind)
+        with self._came:
+            if kind == cdr.POSE:
+                there = message.pose
+                self._add(BASE, HAND, message.header, there.orientation, there.position, fixed)
+            else:
+                for one in message.transforms if kind == topics.TF else [message]:
+                    parent, child = _plain(one.header.frame_id), _plain(one.child_frame_id)
+                    if kind == TRANSFORM:
+                        parent, child = BASE, HAND
+                    there = one.transform
+                    self._add(parent, child, one.header, there.rotation, there.translation, fixed)
+            self._came.notify_all()
+
+    def _add(self, parent: str, child: str, header: Any, turn: Any, place: Any, fixed: bool) -> None:
+        quat = np.array([turn.w, turn.x, turn.y, turn.z], np.float64)
+        position = np.array([place.x, place.y, place.z], np.float64)
+        length = float(np.linalg.norm(quat))
+        if not (np.isfinite(position).all() and 0.9 < length < 1.1):
+            raise SagsError(f"the pose of {child} holds numbers that are no pose")
+        if child not in self._edges and len(self._edges) >= MOST_FRAMES:
+            raise SagsError(f"tf holds more than {MOST_FRAMES} frames")
+        sample = Sample(quat / length, position)
+        if fixed:
+            self._edges[child] = _Fixed(parent, to_matrix(sample))
+            return
+        edge = self._edges.get(child)
+        if not isinstance(edge, _Edge) or edge.parent != parent:
+            edge = self._edges[child] = _Edge(parent, self._kept)
+        edge.add(header.stamp.sec * 1_000_000_000 + header.stamp.nanosec, sample)
+
+    def at(self, t_ns: int, timeout: float = 0.0) -> F64:
+        """The hand in the base at a time, [4, 4] m. While newer poses come, one that is on its way is waited
+        for, up to `timeout` seconds.
+
+        Raises:
+            NoPoseError: it is not known for this time.
+        """
+        deadline = time.monotonic() + timeout
+        with self._came:
+            while True:
+                try:
+                    return self._at(t_ns)
+                except NoPoseError as error:
+                    left = deadline - time.monotonic()
+                    if (
+                        error.finding.code != "pose_stopped"
+                        or left <= 0
+                        or t_ns - self.newest_ns > IN_VAIN_NS
+                    ):
+                        raise
+                    self._came.wait(left)
+
+    @property
+    def newest_ns(self) -> int:
+        """Stamp of the newest sample; 0 before the first."""
+        return max((edge.newest or 0 for edge in self._edges.values()), default=0)
+
+    def _at(self, t_ns: int) -> F64:
+        base, hand = self._chain(self._base), self._chain(self._hand)
+        if base[-1] != hand[-1] or len(base) == len(hand) == 1:
+            there = ", ".join(sorted(self._edges)) or "none"
+            raise NoPoseError(
+                Finding(
+                    "pose_missing",
+                    f"no pose of '{self._hand}' in '{self._base}' came yet; frames: {there[:200]}; see to "
+                    "robot.topic, robot.base and robot.hand",
+                )
+            )
+        return invert(self._in_root(base, t_ns)) @ self._in_root(hand, t_ns)
+
+    def _chain(self, frame: str) -> list[str]:
+        """A frame, its parent and so on, up to the root."""
+        chain = [frame]
+        while chain[-1] in self._edges and len(chain) <= MOST_FRAMES:
+            chain.append(self._edges[chain[-1]].parent)
+        return chain
+
+    def _in_root(self, chain: list[str], t_ns: int) -> F64:
+        T = np.eye(4)
+        for frame in chain[:-1]:
+            T = self._edges[frame].at(t_ns) @ T
+        return T
+
+
+def to_matrix(sample: Sample) -> F64:
+    T = np.eye(4)
+    T[:3, :3] = quat_to_matrix(sample.quat)
+    T[:3, 3] = sample.position
+    return T
+
+
+def between(one: Sample, other: Sample, share: float) -> F64:
+    """The pose at a share 0..1 of the way: the shortest turn (slerp), a straight line. [4, 4] m."""
+    cosine = float(one.quat @ other.quat)
+    end = other.quat if cosine >= 0 else -other.quat
+    angle = np.arccos(min(abs(cosine), 1.0))
+    if angle < 1e-6:
+        quat = (1 - share) * one.quat + share * end
+    else:
+        quat = (np.sin((1 - share) * angle) * one.quat + np.sin(share * angle) * end) / np.sin(angle)
+    position = (1 - share) * one.position + share * other.position
+    return to_matrix(Sample(quat, position))
+
+
+def _jumps(one: Sample, other: Sample, ns: int) -> bool:
+    seconds = ns * 1e-9
+    way = float(np.linalg.norm(other.position - one.position))
+    turn = 2 * float(np.arccos(min(abs(float(one.quat @ other.quat)), 1.0)))
+    return way > max(FASTEST * seconds, SMALLEST_JUMP) or turn > max(FASTEST_TURN * seconds, SMALLEST_TURN)
+
+
+def _plain(name: str) -> str:
+    """ROS 1 wrote frames with a leading slash."""
+    return name.strip("/")

@@ -1,0 +1,111 @@
+"""Live stereo that another program hands in over ZeroMQ: a simulator, an engine, a capture program."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from types import TracebackType
+from typing import Self
+
+import cv2
+
+from sags_node.config import PushSource
+from sags_node.errors import SagsError
+from sags_node.messaging.cdr import COMPRESSED
+from sags_node.messaging.inbox import Inbox
+from sags_node.messaging.topics import IMAGE
+from sags_node.messaging.wire import Message, WireError
+from sags_node.recording.pictures import ENCODINGS, decode_picture
+from sags_node.sources.sent import SentPictures
+from sags_node.types import U8, StereoFrame
+
+NEWEST = 2  # of each eye's waiting pictures: what is older will not be shown
+
+
+class PushedPictures:
+    """A `Source` of live stereo frames; see `LivePairs` for their numbers and epochs.
+
+    Args:
+        size: width and height that pictures must have, px; None: those of the first.
+
+    Raises:
+        UsageError, SagsError: see `Inbox`.
+    """
+
+    frame_count: int | None = None
+
+    def __init__(self, config: PushSource, size: tuple[int, int] | None = None) -> None:
+        self.rate = config.rate
+        self._sent = SentPictures(config, size)
+        self._inbox = Inbox(config.endpoint, config, "source", self._take, self._sent.slowness, NEWEST)
+        self.endpoint = self._inbox.endpoint
+
+    @property
+    def dropped(self) -> int:
+        """Pairs that are missing: lost on the way, or without the other eye's picture."""
+        return self._sent.dropped
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+        self._inbox.close()
+
+    def stop(self) -> None:
+        """End the iteration; any thread may call this."""
+        self._sent.pairs.stop()
+
+    def __iter__(self) -> Iterator[StereoFrame]:
+        """Pairs as they arrive, until `stop`; silent while nobody sends."""
+        return iter(self._sent.pairs)
+
+    def _take(self, message: Message, arrival_ns: int) -> None:
+        name = message.topic.removesuffix("/compressed")
+        whose, _, last = name.rpartition("/")
+        eye = whose.rpartition("/")[2]
+        stamp_ns = message.meta.stamp_ns
+        if last == "image_raw" and eye in ("left", "right"):
+            self._sent.put(
+                "left" if eye == "left" else "right", stamp_ns, arrival_ns, partial(_picture, message)
+            )
+        elif last == "image_raw" and eye == "stereo":
+            self._sent.put_both(stamp_ns, arrival_ns, partial(_halves, message))
+        else:
+            raise SagsError(
+                f"topic {message.topic}: pictures come on NAME/left/image_raw, NAME/right/image_raw or "
+                "NAME/stereo/image_raw, files of pictures with /compressed behind"
+            )
+
+
+def _picture(message: Message) -> U8:
+    """RGB [H, W, 3]; over the received memory where that holds RGB.
+
+    Raises:
+        SagsError: the message is damaged, or no picture that is read.
+    """
+    meta, where = message.meta, message.topic
+    if meta.type == COMPRESSED:
+        return decode_picture(message.cdr(), COMPRESSED, where)
+    encoding = ENCODINGS.get(meta.encoding)
+    if meta.type != IMAGE or encoding is None:
+        known = ", ".join(ENCODINGS)
+        raise WireError(f"{where}: {meta.type} of {meta.encoding!r} is not read; known encodings: {known}")
+    channels = meta.shape[2:] or [1]
+    if meta.dtype != "uint8" or len(meta.shape) < 2 or channels != [encoding.bytes_per_pixel]:
+        raise WireError(f"{where}: {meta.encoding} does not fit {meta.dtype} {meta.shape}")
+    picture: U8 = message.array()
+    try:
+        return picture if encoding.to_rgb is None else cv2.cvtColor(picture, encoding.to_rgb)
+    except cv2.error:
+        raise WireError(f"{where}: {meta.shape} cannot be {meta.encoding}") from None
+
+
+def _halves(message: Message) -> tuple[U8, U8]:
+    both = _picture(message)
+    if both.shape[1] % 2:
+        raise WireError(f"{message.topic}: {both.shape[1]} px wide, which is odd: it cannot hold two eyes")
+    half = both.shape[1] // 2
+    return both[:, :half].copy(), both[:, half:].copy()

@@ -1,0 +1,245 @@
+"""Where the robot says that the scope is, for each frame: from ROS 2, from another program, or from a bag."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from types import TracebackType
+from typing import Protocol, Self
+
+import numpy as np
+
+from sags_node.calibration.hand_eye import FILE, read_hand_eye
+from sags_node.config import BagRobot, BagSource, LaunchConfig, LiveSource, PushRobot, Ros2Robot
+from sags_node.errors import SagsError, UsageError
+from sags_node.messaging.inbox import Inbox
+from sags_node.messaging.security import Seldom
+from sags_node.messaging.wire import Message
+from sags_node.recording.bag import read_messages
+from sags_node.sources.pose_track import POSE_TYPES, NoPoseError, PoseTrack
+from sags_node.sources.ros2 import absolute
+from sags_node.sources.ros_graph import Graph, Reader
+from sags_node.sources.source import Source
+from sags_node.types import F64, StereoFrame, StereoRig
+
+log = logging.getLogger(__name__)
+
+WAIT_S = 0.1  # for a pose that is on its way: robots tell theirs sooner than cameras their picture
+POLL_S = 0.1
+CLOSE_S = 5.0
+STATIC = "/tf_static"
+WHOLE = 10_000_000  # samples of a bag: all
+
+
+class Robot(Protocol):
+    """Where poses come from, from its making to `close`."""
+
+    track: PoseTrack
+
+    def close(self) -> None: ...
+
+
+class _BagPoses:
+    """All poses of a bag.
+
+    Raises:
+        UsageError: the source is no bag, or the topic is not there or holds no poses.
+        SagsError: it is damaged.
+    """
+
+    def __init__(self, config: BagRobot, source: object) -> None:
+        if not isinstance(source, BagSource):
+            raise UsageError("robot.kind bag takes poses from the bag of the pictures: set source.kind:=bag")
+        self.track = PoseTrack(config.base, config.hand, kept=WHOLE)
+        wanted = absolute(config.topic)
+        seen: dict[str, str] = {}
+        for message in read_messages(source.path):
+            topic = absolute(message.topic)
+            seen[topic] = message.type
+            if topic in (wanted, STATIC) and message.type in POSE_TYPES:
+                self.track.add(message.data, message.type, fixed=topic == STATIC)
+        if seen.get(wanted) not in POSE_TYPES:
+            there = ", ".join(sorted(name for name, kind in seen.items() if kind in POSE_TYPES)) or "none"
+            raise UsageError(
+                f"{source.path} has no poses on {wanted}; topics with poses: {there}; set robot.topic"
+            )
+
+    def close(self) -> None:
+        pass
+
+
+class _PushedPoses:
+    """Poses that another program hands in; see `Inbox`."""
+
+    def __init__(self, config: PushRobot) -> None:
+        self.track = PoseTrack(config.base, config.hand)
+        self._inbox = Inbox(config.endpoint, config, "robot", self._take)
+        self.endpoint = self._inbox.endpoint
+
+    def _take(self, message: Message, arrival_ns: int) -> None:
+        if message.meta.type not in POSE_TYPES:
+            raise SagsError(
+                f"{message.topic}: {message.meta.type} is no pose; known: {', '.join(POSE_TYPES)}"
+            )
+        self.track.add(message.cdr(), message.meta.type, fixed=message.topic.endswith("tf_static"))
+
+    def close(self) -> None:
+        self._inbox.close()
+
+
+class _RosPoses:
+    """Poses of a ROS 2 graph; see `Graph`."""
+
+    def __init__(self, config: Ros2Robot) -> None:
+        self.track = PoseTrack(config.base, config.hand)
+        self._topic = absolute(config.topic)
+        self._graph = Graph(config)
+        self._readers: dict[str, Reader] = {}
+        self._seldom = Seldom()
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._read, name="ros2-poses", daemon=True)
+        self._thread.start()
+
+    def _read(self) -> None:
+        while not self._stopping.is_set():
+            self._subscribe()
+            self._graph.wait(POLL_S)
+            for topic, reader in self._readers.items():
+                while messages := list(reader.take()):
+                    for data in messages:
+                        self._add(topic, reader.kind, data)
+
+    def _subscribe(self) -> None:
+        """As soon as somebody publishes: only then the type is known."""
+        if self._topic in self._readers and STATIC in self._readers:
+            return
+        there = self._graph.publications()
+        for topic in {self._topic, STATIC} - self._readers.keys():
+            kinds = there.get(topic, set()) & set(POSE_TYPES)
+            if kinds:
+                self._readers[topic] = self._graph.reader(topic, min(kinds), depth=100, kept=topic == STATIC)
+
+    def _add(self, topic: str, kind: str, data: bytes) -> None:
+        try:
+            self.track.add(data, kind, fixed=topic == STATIC)
+        except SagsError as error:
+            if self._seldom.due():
+                log.warning("%s: left out: %s", topic, error)
+
+    def close(self) -> None:
+        self._stopping.set()
+        self._thread.join(CLOSE_S)
+
+
+def open_robot(config: LaunchConfig) -> Robot:
+    """The poses that a launch file asks for.
+
+    Raises:
+        UsageError: it asks for none, or they are not there; a socket that is open to others.
+        SagsError: they cannot be read.
+    """
+    match config.robot:
+        case BagRobot():
+            return _BagPoses(config.robot, config.source)
+        case PushRobot():
+            return _PushedPoses(config.robot)
+        case Ros2Robot():
+            return _RosPoses(config.robot)
+    raise UsageError("there is no robot in the launch file: set robot.kind to ros2, push or bag")
+
+
+class Posed:
+    """A `Source` whose frames know where the robot says that the left rectified camera is.
+
+    Nothing is delivered before the first pose. Later a frame without one keeps the last pose, and says why
+    (`StereoFrame.pose_problem`).
+
+    Args:
+        source: of the pictures.
+        config: its `robot` says where the poses come from.
+
+    Raises:
+        UsageError: there is no hand-eye calibration, or see `open_robot`.
+        SagsError: the poses cannot be read.
+    """
+
+    def __init__(self, source: Source, config: LaunchConfig, rig: StereoRig) -> None:
+        assert config.robot is not None
+        hand_eye = read_hand_eye(_hand_eye_file(config))
+        self._T_hand_cam = rectified(hand_eye.T_hand_cam, rig)
+        self._offset_ns = hand_eye.offset_ns
+        if config.robot.offset_ms is not None:
+            self._offset_ns = round(config.robot.offset_ms * 1e6)
+        if isinstance(
+            config.source, LiveSource
+        ):  # the offset is to the stamp, which had no latency taken off
+            self._offset_ns += round(config.source.latency_ms * 1e6)
+        self._robot = open_robot(config)
+        self._recorded = isinstance(config.robot, BagRobot)
+        self._source = source
+        self._without = 0  # frames before the first pose
+        self._seldom = Seldom()
+
+    @property
+    def rate(self) -> float:
+        return self._source.rate
+
+    @property
+    def frame_count(self) -> int | None:
+        return self._source.frame_count
+
+    @property
+    def dropped(self) -> int:
+        """Those of the pictures' source, and frames before the first pose."""
+        return self._source.dropped + self._without
+
+    def __enter__(self) -> Self:
+        self._source.__enter__()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._source.__exit__(kind, error, trace)
+        self._robot.close()
+
+    def stop(self) -> None:
+        self._source.stop()
+
+    def __iter__(self) -> Iterator[StereoFrame]:
+        last: F64 | None = None
+        for frame in self._source:
+            t_ns = frame.t_device_ns if self._recorded else frame.t_capture_ns
+            problem = None
+            try:
+                last = self._robot.track.at(t_ns + self._offset_ns, WAIT_S) @ self._T_hand_cam
+            except NoPoseError as error:
+                problem = error.finding
+            if last is None:
+                self._without += 1
+                if self._seldom.due():
+                    log.warning("no frame is taken before the first pose: %s", problem and problem.text)
+                continue
+            yield replace(frame, T_world_cam=last, pose_problem=problem)
+
+
+def rectified(T_hand_cam: F64, rig: StereoRig) -> F64:
+    """The left rectified camera on the hand [4, 4], of the raw one."""
+    turn = np.eye(4)
+    turn[:3, :3] = rig.left.R.T
+    moved: F64 = T_hand_cam @ turn
+    return moved
+
+
+def _hand_eye_file(config: LaunchConfig) -> Path:
+    assert config.robot is not None
+    if config.robot.hand_eye is not None:
+        return config.robot.hand_eye
+    if config.rig is None or not config.rig.is_dir():
+        raise UsageError(
+            "robot.hand_eye is missing: name the file of sags calib hand-eye, or set rig to its folder"
+        )
+    return config.rig / FILE

@@ -1,0 +1,145 @@
+"""What other programs stamp and send: checked, brought to this machine's clock, paired and counted."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+
+import numpy as np
+
+from sags_node.config import SentSource
+from sags_node.errors import SagsError
+from sags_node.sources.clock import CaptureClock
+from sags_node.sources.device import Picture
+from sags_node.sources.live_pairs import LivePairs
+from sags_node.sources.pictures import size_text
+from sags_node.types import U8, Side
+
+OLDEST_NS = 1_000_000_000  # what is older is of no use, or of another clock
+AHEAD_NS = 100_000_000  # beyond what clocks that are set by each other differ
+LATE_NS = 200_000_000  # on the way: a hand that is shown so late misses
+SMOOTHED = 0.1  # share of the newest picture in what is said of the last ones
+ENOUGH = 0.9  # of the pictures that should come
+WINDOW = 90  # stamps that the loss is counted over: three seconds
+
+
+class Arrivals:
+    """What came of one eye's pictures, and what was lost on the way, by the gaps between stamps."""
+
+    def __init__(self) -> None:
+        self._stamps: deque[int] = deque(maxlen=WINDOW + 1)  # with the one before
+        self._count = 0
+        self._lost_before = 0  # the last stretch of `WINDOW` pictures began
+
+    def add(self, stamp_ns: int) -> None:
+        if self._stamps and stamp_ns <= self._stamps[-1]:
+            self._stamps.clear()
+            self._count = 0
+        self._stamps.append(stamp_ns)
+        self._count += 1
+        if self._count % WINDOW == 0:
+            self._lost_before += round(self._lost_now())
+
+    @property
+    def lost(self) -> int:
+        """Since the start, up to the last full stretch."""
+        return self._lost_before
+
+    @property
+    def share_lost(self) -> float:
+        """Of the last seconds' pictures; 0 until there are enough to tell."""
+        if len(self._stamps) < WINDOW:
+            return 0.0
+        return self._lost_now() / (self._lost_now() + len(self._stamps))
+
+    @property
+    def rate(self) -> float:
+        """Hz, by the stamps of the last seconds; infinite until there are enough to tell."""
+        if len(self._stamps) < WINDOW // 3:
+            return float("inf")
+        return (len(self._stamps) - 1) * 1e9 / (self._stamps[-1] - self._stamps[0])
+
+    def _lost_now(self) -> float:
+        """In the last stretch: pictures that the usual step between two leaves room for, and did not come."""
+        steps = np.diff(np.array(self._stamps))
+        return max(0.0, float(steps.sum() / np.median(steps)) - len(steps))
+
+
+class SentPictures:
+    """Both eyes' pictures from another program. Used by one receiving thread.
+
+    Attributes:
+        pairs: where they come out.
+        arrivals: of each eye.
+
+    Args:
+        size: width and height that pictures must have, px; None: those of the first.
+    """
+
+    def __init__(self, config: SentSource, size: tuple[int, int] | None) -> None:
+        self.pairs = LivePairs(config.pair_tolerance_ms, config.latency_ms)
+        self.arrivals: dict[Side, Arrivals] = {"left": Arrivals(), "right": Arrivals()}
+        self._size = size
+        self._own = config.stamps == "own"
+        self._clock = CaptureClock()
+        self._rate = config.rate
+        self._age_ns = 0.0  # of pictures when they come
+
+    @property
+    def dropped(self) -> int:
+        """Pairs that are missing: lost on the way, or without the other eye's picture."""
+        return max(self.pairs.unpaired, *(eye.lost for eye in self.arrivals.values()))
+
+    def slowness(self) -> str | None:
+        """What is wrong with how pictures come, for who sends them; None: nothing."""
+        rate = min(arrivals.rate for arrivals in self.arrivals.values())
+        if rate < ENOUGH * self._rate:
+            return f"{rate:.1f} of {self._rate:g} pictures a second come (source.rate): send faster"
+        if not self._own and self._age_ns > LATE_NS:
+            return (
+                f"pictures are {self._age_ns * 1e-6:.0f} ms old when they come: send smaller ones, or JPEG; "
+                "stamp them when they are taken"
+            )
+        return None
+
+    def put(self, eye: Side, stamp_ns: int, arrival_ns: int, decode: Callable[[], U8]) -> None:
+        """Take one picture in.
+
+        Raises:
+            SagsError: it is refused; why, and how to mend it.
+        """
+        t_ns = self._on_wall(stamp_ns, arrival_ns)
+        self.arrivals[eye].add(stamp_ns)
+        self.pairs.put(eye, Picture(t_ns, self._checked(decode()), stamp_ns, arrival_ns))
+
+    def put_both(self, stamp_ns: int, arrival_ns: int, decode: Callable[[], tuple[U8, U8]]) -> None:
+        """Take both eyes' pictures of one moment in; see `put`."""
+        t_ns = self._on_wall(stamp_ns, arrival_ns)
+        for arrivals in self.arrivals.values():
+            arrivals.add(stamp_ns)
+        left, right = (Picture(t_ns, self._checked(eye), stamp_ns, arrival_ns) for eye in decode())
+        self.pairs.put_both(left, right)
+
+    def _on_wall(self, stamp_ns: int, arrival_ns: int) -> int:
+        if self._own:
+            self._clock.add(stamp_ns, arrival_ns)
+            return self._clock.to_wall(stamp_ns)
+        age = arrival_ns - stamp_ns
+        self._age_ns += SMOOTHED * (age - self._age_ns)
+        if -AHEAD_NS <= age <= OLDEST_NS:
+            return stamp_ns
+        way = "old" if age > 0 else "ahead of this machine's clock"
+        raise SagsError(
+            f"a picture's stamp is {abs(age) * 1e-9:.1f} s {way}: stamp it by the wall clock when it is "
+            "taken and set both clocks by each other, or set source.stamps:=own"
+        )
+
+    def _checked(self, picture: U8) -> U8:
+        size = picture.shape[1], picture.shape[0]
+        self._size = self._size or size
+        if size != self._size:
+            raise SagsError(
+                f"a picture is {size_text(*size)} px, it must be {size_text(*self._size)} as in the "
+                "calibration; send that size, or name the right calibration in rig"
+            )
+        return picture

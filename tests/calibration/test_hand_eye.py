@@ -1,0 +1,257 @@
+"""The camera on the robot's hand, found again: by the phantom's poses, and in a bag with drawn boards."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from bag_files import ROS2, Row, image, write_rosbag2
+from click.testing import CliRunner
+from drawn_boards import charuco_print, draw, fine_rays, known_rig
+
+from sags_node.calibration import save_rig
+from sags_node.calibration.boards import StereoView
+from sags_node.calibration.hand_eye import HandEye, read_hand_eye, save_hand_eye
+from sags_node.calibration.hand_eye_solve import solve_hand_eye
+from sags_node.cli.main import main
+from sags_node.errors import SagsError, UsageError
+from sags_node.geometry import invert, matrix_to_quat
+from sags_node.launch_file import load_launch
+from sags_node.messaging import cdr, topics
+from sags_node.phantom.motion import scope_pose
+from sags_node.phantom.rig import phantom_rig
+from sags_node.session import open_session
+from sags_node.sources.pose_track import NoPoseError, PoseTrack
+from sags_node.sources.robot import open_robot
+from sags_node.types import F32, F64, StereoRig
+
+S, MS = 1_000_000_000, 1_000_000
+START = 1_700_000_000 * S
+RIG = phantom_rig(640, 512)
+PERIOD = 4.0  # s, of the phantom's sway
+
+
+def rigid(turn: tuple[float, float, float], place: tuple[float, float, float]) -> F64:
+    T = np.eye(4)
+    T[:3, :3] = cv2.Rodrigues(np.radians(turn))[0]
+    T[:3, 3] = place
+    return T
+
+
+X = rigid((8, -25, 70), (0.012, -0.031, 0.22))  # the left raw camera on the hand: a scope of 22 cm
+T_BASE_WORLD = rigid((30, 10, -50), (0.4, -0.2, 0.6))
+T_RAW_RECTIFIED = np.eye(4)
+T_RAW_RECTIFIED[:3, :3] = RIG.left.R.T
+
+
+def camera_at(t: float, scale: float = 1.0) -> F64:
+    """The left raw camera in the robot's base, where the phantom's scope is after t seconds.
+
+    `scale`: of its sway; its own is 1.7 degrees."""
+    sway = scope_pose((t / PERIOD) % 1.0, moving=True)
+    sway[:3, :3] = cv2.Rodrigues(scale * cv2.Rodrigues(sway[:3, :3])[0])[0]
+    return T_BASE_WORLD @ sway @ invert(T_RAW_RECTIFIED)
+
+
+def hand_at(t: float, scale: float = 1.0) -> F64:
+    return camera_at(t, scale) @ invert(X)
+
+
+def tracked(offset_ms: float, seconds: float, scale: float = 1.0, rate: int = 100) -> PoseTrack:
+    """The robot's poses; its clock is `offset_ms` ahead of the pictures'."""
+    track = PoseTrack()
+    for number in range(round((seconds + 1) * rate)):
+        t = number / rate - 0.5
+        stamp = START + round((t * 1e3 + offset_ms) * MS)
+        (part,) = cdr.pose(hand_at(t, scale), stamp).parts
+        track.add(bytes(part), cdr.POSE)
+    return track
+
+
+def grid() -> F32:
+    x, y = np.meshgrid(np.arange(9), np.arange(6))
+    return (np.stack([x - 4, y - 2.5, 0 * x], -1).reshape(-1, 3) * 0.0045).astype(np.float32)
+
+
+def seen(
+    rig: StereoRig, seconds: float, rate: float, noise: float, scale: float
+) -> tuple[list[StereoView], list[int]]:
+    """The corners of a board 70 mm before the scope, with a detector's noise (px)."""
+    rng = np.random.default_rng(8)
+    board = camera_at(0) @ rigid((12, -8, 3), (0, 0, 0.07))
+    views, stamps = [], []
+    for number in range(round(seconds * rate)):
+        left = invert(camera_at(number / rate, scale)) @ board
+        corners = []
+        for eye, T in ((rig.left, left), (rig.right, rig.T_right_left @ left)):
+            drawn, _ = cv2.projectPoints(grid(), T[:3, :3], T[:3, 3], eye.K, eye.distortion)
+            corners.append((drawn.reshape(-1, 2) + rng.normal(0, noise, (54, 2))).astype(np.float32))
+        views.append(StereoView(str(number), np.arange(54), *corners))
+        stamps.append(START + round(number / rate * S))
+    return views, stamps
+
+
+def pose_at(track: PoseTrack, t_ns: int) -> F64 | None:
+    try:
+        return track.at(t_ns)
+    except NoPoseError:
+        return None
+
+
+def errors(found: F64) -> tuple[float, float]:
+    """mm and degrees."""
+    apart = invert(X) @ found
+    turn = np.linalg.norm(cv2.Rodrigues(apart[:3, :3])[0])
+    return float(np.linalg.norm(found[:3, 3] - X[:3, 3]) * 1e3), float(np.degrees(turn))
+
+
+@pytest.mark.parametrize(("scale", "offset_ms"), [(1.0, 37.0), (6.0, -120.0), (6.0, 0.0)])
+def test_it_is_found_on_the_phantoms_path(scale: float, offset_ms: float) -> None:
+    """Also from its own sway of 1.7 degrees alone, with the corners' usual noise of 0.1 px."""
+    track = tracked(offset_ms, PERIOD, scale)
+    views, stamps = seen(RIG, PERIOD, 10, 0.1, scale)
+    solution = solve_hand_eye(views, stamps, grid(), RIG, lambda t_ns: pose_at(track, t_ns))
+    place, turn = errors(solution.hand_eye.T_hand_cam)
+    assert place < 0.3 and turn < 0.2
+    assert solution.hand_eye.offset_ns * 1e-6 == pytest.approx(offset_ms, abs=5)
+    # What it says of itself: a deviation of 0.1 px along each axis, and its own error within four of them.
+    assert np.sqrt(np.mean(solution.errors**2)) == pytest.approx(0.1 * np.sqrt(2), rel=0.1)
+    assert place < 4e3 * solution.position_error
+    assert turn < 4 * np.degrees(solution.rotation_error)
+
+
+def test_a_motion_that_tells_nothing_is_said() -> None:
+    track = tracked(0, PERIOD, 0.0)  # the scope shifts and is never turned
+    views, stamps = seen(RIG, PERIOD, 10, 0.1, 0.0)
+    with pytest.raises(SagsError, match="turn the scope about two different axes"):
+        solve_hand_eye(views, stamps, grid(), RIG, lambda t_ns: pose_at(track, t_ns))
+
+
+def test_poses_of_another_time_are_said() -> None:
+    views, stamps = seen(RIG, PERIOD, 10, 0.1, 1.0)
+    with pytest.raises(SagsError, match="0 of 40 views of the board have a pose"):
+        solve_hand_eye(views, stamps, grid(), RIG, lambda t_ns: None)
+
+
+# ---- the file --------------------------------------------------------------------------------------------
+
+
+def test_the_file_says_what_was_saved(tmp_path: Path) -> None:
+    save_hand_eye(HandEye(X, -12_345_678), tmp_path, {"views": 3})
+    read = read_hand_eye(tmp_path / "hand_eye.yaml")
+    assert np.allclose(read.T_hand_cam, X, atol=1e-12) and read.offset_ns == -12_345_678
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("{}", "4 rows of 4"),
+        ("T_hand_cam: [[1, 0], [0, 1]]", "no rotation"),
+        (f"T_hand_cam: {(2 * np.eye(4)).tolist()}", "no rotation"),
+        (f"T_hand_cam: {rigid((0, 0, 0), (0, 0, 220)).tolist()}", "220 m from the hand"),
+        (f"T_hand_cam: {np.eye(4).tolist()}\noffset_ms: .inf", "offset_ms a number"),
+    ],
+)
+def test_a_wrong_file_is_said(tmp_path: Path, content: str, said: str) -> None:
+    file = tmp_path / "hand_eye.yaml"
+    file.write_text(content)
+    with pytest.raises(UsageError, match=said):
+        read_hand_eye(file)
+
+
+def test_a_missing_file_names_the_command(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="sags calib hand-eye"):
+        read_hand_eye(tmp_path / "hand_eye.yaml")
+
+
+# ---- a recording -----------------------------------------------------------------------------------------
+
+VIEWS, RATE = 24, 10
+BOARD = ("--board", "charuco", "--squares", "10x7", "--square-mm", "4.5", "--marker-mm", "3.375")
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A board drawn through the exact model of a rig, and the robot's poses, 60 ms ahead, in two ways."""
+    rig = known_rig()
+    left, right, printed = fine_rays(rig.left), fine_rays(rig.right), charuco_print()
+    board = camera_at(0) @ rigid((12, -8, 3), (-0.018, -0.012, 0.065))
+    rows: list[Row] = []
+    for number in range(VIEWS):
+        view = invert(camera_at(number / RATE, 5.0)) @ board
+        stamp = START + round(number * S / RATE)
+        for eye, rays, T in (("left", left, view), ("right", right, rig.T_right_left @ view)):
+            rows.append((f"/rig/{eye}/image_raw", image(ROS2, draw(printed, rays, T), stamp), stamp))
+    turned_arm = rigid((0, 0, 90), (0.1, 0.2, 0.3))
+    for number in range(-50, 100 * VIEWS // RATE + 50):
+        stamp, hand = START + number * 10 * MS + 60 * MS, hand_at(number / 100, 5.0)
+        rows.append(("/ECM/measured_cp", pose_message(hand, stamp), stamp))
+        rows.append(("/tf", transform_message("base", "arm", hand @ invert(turned_arm), stamp), stamp))
+    rows.append(("/tf_static", transform_message("arm", "tip", turned_arm, START), START))
+    rows.sort(key=lambda row: row[2])
+    folder = tmp_path_factory.mktemp("hand_eye")
+    save_rig(rig, folder / "rig")
+    return write_rosbag2(folder / "bag", rows)
+
+
+def header_of(stamp: int, frame: str) -> Any:
+    types = ROS2.types
+    return types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](*divmod(stamp, S)), frame)
+
+
+def parts_of(T: F64) -> tuple[list[float], Any]:
+    w, x, y, z = (float(q) for q in matrix_to_quat(T[:3, :3]))
+    return [float(t) for t in T[:3, 3]], ROS2.types["geometry_msgs/msg/Quaternion"](x, y, z, w)
+
+
+def pose_message(T: F64, stamp: int) -> Any:
+    place, turn = parts_of(T)
+    pose = ROS2.types["geometry_msgs/msg/Pose"](ROS2.types["geometry_msgs/msg/Point"](*place), turn)
+    return ROS2.types[cdr.POSE](header_of(stamp, "base"), pose)
+
+
+def transform_message(parent: str, child: str, T: F64, stamp: int) -> Any:
+    place, turn = parts_of(T)
+    moved = ROS2.types["geometry_msgs/msg/Transform"](ROS2.types["geometry_msgs/msg/Vector3"](*place), turn)
+    one = ROS2.types["geometry_msgs/msg/TransformStamped"](header_of(stamp, parent), child, moved)
+    return ROS2.types[topics.TF]([one])
+
+
+def test_from_a_bag_to_poses_of_the_camera(recording: Path) -> None:
+    """`sags calib hand-eye` writes what makes each frame's pose right, from `measured_cp` and from `tf`."""
+    rig = recording.parent / "rig"
+    command = [
+        "calib", "hand-eye", str(recording), f"rig:={rig}", "robot.kind:=bag",
+        "robot.topic:=/ECM/measured_cp", *BOARD, "--dictionary", "4X4_50", "-o", str(rig), "--json",
+    ]  # fmt: skip
+    result = CliRunner().invoke(main, command)
+    assert result.exit_code == 0, result.output
+    summary = json.loads(result.stdout)
+    assert summary["views"] >= VIEWS - 2 and summary["error_px"] < 0.3
+    hand_eye = read_hand_eye(rig / "hand_eye.yaml")
+    place, turn = errors(hand_eye.T_hand_cam)
+    assert place < 0.3 and turn < 0.2
+    assert hand_eye.offset_ns * 1e-6 == pytest.approx(60, abs=5)
+
+    for robot in (["robot.topic:=/ECM/measured_cp"], ["robot.base:=base", "robot.hand:=tip"]):
+        played = [f"rig:={rig}", "robot.kind:=bag", *robot, "source.pace:=step", "source.rate:=5"]
+        session = open_session(recording, played)
+        with session.source as source:
+            frames = list(source)
+        assert len(frames) == VIEWS
+        for number, frame in enumerate(frames):
+            assert frame.pose_problem is None and frame.T_world_cam is not None
+            exact = camera_at(number / RATE, 5.0)
+            exact[:3, :3] = exact[:3, :3] @ session.rig.left.R.T
+            assert np.linalg.norm(frame.T_world_cam[:3, 3] - exact[:3, 3]) < 0.3e-3
+            assert np.abs(frame.T_world_cam[:3, :3] - exact[:3, :3]).max() < np.radians(0.2)
+
+
+def test_topics_that_hold_no_pose_are_named(recording: Path) -> None:
+    config = load_launch(recording, ["robot.kind:=bag", "robot.topic:=/ECM/measured_js"])
+    with pytest.raises(UsageError, match="on /ECM/measured_js; topics with poses: /ECM/measured_cp, /tf"):
+        open_robot(config)

@@ -1,0 +1,48 @@
+"""Taking frames of a live source in a thread, as a node does."""
+
+from __future__ import annotations
+
+import threading
+import time
+from types import TracebackType
+from typing import Self
+
+from stereo_sender import read_number
+
+from sags_node.sources.source import Source
+from sags_node.types import StereoFrame
+
+
+class Taker:
+    """Of each frame: number painted into the left and the right picture, and its age (ms) when taken."""
+
+    def __init__(self, source: Source, pause: float = 0.0) -> None:
+        self.numbers: list[tuple[int, int]] = []
+        self.ages: list[float] = []
+        self.newest: StereoFrame | None = None
+        self._source, self._pause = source, pause
+        self._thread = threading.Thread(target=self._take)
+
+    def _take(self) -> None:
+        with self._source:
+            for frame in self._source:
+                self.ages.append((time.time_ns() - frame.t_capture_ns) * 1e-6)
+                assert frame.right is not None
+                self.numbers.append((read_number(frame.left), read_number(frame.right)))
+                self.newest = frame
+                time.sleep(self._pause)
+
+    @property
+    def mismatched(self) -> int:
+        return sum(left != right for left, right in self.numbers)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._source.stop()
+        self._thread.join(10)
+        assert not self._thread.is_alive()

@@ -1,0 +1,123 @@
+"""A process that sends pairs of phantom pictures, for the tests of sources that other programs feed.
+
+    python stereo_sender.py push ENDPOINT SESSION SECONDS [key=value ...]
+    python stereo_sender.py dds DOMAIN SESSION SECONDS [key=value ...]
+
+The number of each pair is painted into both pictures (`read_number`), so that a mismatch shows.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from sags_node.calibration import load_rig, resized_rig
+from sags_node.types import U8
+
+BITS, BLOCK = 16, 8  # of the painted number, and px of one
+
+
+def paint_number(picture: U8, number: int) -> None:
+    for bit in range(BITS):
+        picture[:BLOCK, BLOCK * bit : BLOCK * (bit + 1)] = 255 * (number >> bit & 1)
+
+
+def read_number(picture: U8) -> int:
+    middles = picture[BLOCK // 2, BLOCK // 2 : BLOCK * BITS : BLOCK, 0]
+    return sum(int(value > 127) << bit for bit, value in enumerate(middles))
+
+
+def push(endpoint: str, jpeg: bool) -> Callable[[U8, U8, int], None]:
+    from sags_node.client import FrameSender
+
+    sender = FrameSender(endpoint)
+
+    def send(left: U8, right: U8, stamp_ns: int) -> None:
+        if jpeg:
+            sender.send(
+                *(cv2.imencode(".jpg", eye[..., ::-1])[1].tobytes() for eye in (left, right)), stamp_ns
+            )
+        else:
+            sender.send(left, right, stamp_ns)
+
+    return send
+
+
+def dds(domain: int, compressed: bool, scale: float, session: Path) -> Callable[[U8, U8, int], None]:
+    from cyclonedds._clayer import ddspy_write_ts
+    from cyclonedds.core import Policy, Qos
+    from cyclonedds.pub import DataWriter
+    from cyclonedds.topic import Topic
+
+    from sags_node.config import RosGraph
+    from sags_node.messaging import cdr
+    from sags_node.messaging.topics import CAMERA_INFO, IMAGE, TF
+    from sags_node.sources.ros_graph import Graph, raw_type
+
+    graph = Graph(RosGraph(domain=domain))
+    form = Policy.DataRepresentation(use_cdrv0_representation=True, use_xcdrv2_representation=False)
+    qos = Qos(Policy.Reliability.BestEffort, Policy.History.KeepLast(2), form)
+
+    def writer(topic: str, kind: str) -> Callable[[cdr.Content, int], None]:
+        made = DataWriter(
+            graph.participant, Topic(graph.participant, f"rt/stereo/{topic}", raw_type(kind)), qos
+        )
+        return lambda body, stamp_ns: ddspy_write_ts(
+            made._ref, b"".join(bytes(part) for part in body.parts), stamp_ns
+        )
+
+    kind, suffix = (cdr.COMPRESSED, "/compressed") if compressed else (IMAGE, "")
+    pictures = [writer(f"{eye}/image_raw{suffix}", kind) for eye in ("left", "right")]
+    calibrations = [writer(f"{eye}/camera_info", CAMERA_INFO) for eye in ("left", "right")]
+    tf = DataWriter(graph.participant, Topic(graph.participant, "rt/tf", raw_type(TF)), qos)
+    pose = np.eye(4)
+    pose[:3, 3] = 0.1, 0.2, 0.3
+    rig = resized_rig(load_rig(session / "calib"), scale)
+
+    def send(left: U8, right: U8, stamp_ns: int) -> None:
+        ddspy_write_ts(tf._ref, bytes(cdr.transform(pose, stamp_ns).parts[0]), stamp_ns)
+        for write, eye in zip(calibrations, (rig.left, rig.right), strict=True):
+            write(cdr.eye_info(eye, stamp_ns), stamp_ns)
+        for write, picture in zip(pictures, (left, right), strict=True):
+            if compressed:
+                file = cv2.imencode(".jpg", picture[..., ::-1])[1].tobytes()
+                write(cdr.picture_file(file, stamp_ns), stamp_ns)
+            else:
+                write(cdr.image(picture, "rgb8", stamp_ns), stamp_ns)
+
+    return send
+
+
+def main() -> None:
+    way, where, folder, seconds, *settings = sys.argv[1:]
+    said = dict(setting.split("=") for setting in settings)
+    session, rate = Path(folder), float(said.get("rate", 30))
+    width, height = (int(side) for side in said.get("size", "1280x1024").split("x"))
+    pairs = [
+        [
+            cv2.resize(cv2.imread(str(session / eye / f"{index:04d}.jpg"))[..., ::-1], (width, height))
+            for eye in ("left", "right")
+        ]
+        for index in range(4)
+    ]
+    compressed = "jpeg" in said
+    send = push(where, compressed) if way == "push" else dds(int(where), compressed, width / 320, session)
+    late_ns = round(1e9 * float(said.get("late", 0)))
+    print("sending", flush=True)
+    begun = time.monotonic()
+    for number in range(round(float(seconds) * rate)):
+        time.sleep(max(0.0, begun + number / rate - time.monotonic()))
+        left, right = pairs[number % len(pairs)]
+        for picture in (left, right):
+            paint_number(picture, number % 2**BITS)
+        send(left, right, time.time_ns() - late_ns)
+    time.sleep(0.5)
+
+
+if __name__ == "__main__":
+    main()

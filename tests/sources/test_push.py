@@ -1,0 +1,185 @@
+"""Pictures handed in over ZeroMQ, by processes and by hand."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import zmq
+from live_taking import Taker
+from places import HELPERS
+from stereo_sender import paint_number
+from waiting import until
+
+from sags_node.client import ClientKeys, FrameSender
+from sags_node.config import PushSource
+from sags_node.errors import UsageError
+from sags_node.messaging.security import read_key_pair, write_key_pair
+from sags_node.sources.push import PushedPictures
+from sags_node.types import U8
+
+pytestmark = pytest.mark.live
+
+ANYWHERE = "tcp://127.0.0.1:*"
+SIZE = 1280, 1024
+
+
+@contextmanager
+def simulator(
+    source: PushedPictures, session: Path, seconds: float, *settings: str
+) -> Iterator[subprocess.Popen[str]]:
+    """Another process that sends; has begun when this returns."""
+    command = [sys.executable, HELPERS / "stereo_sender.py", "push", source.endpoint, session, str(seconds)]
+    process = subprocess.Popen([*command, *settings], stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None and process.stdout.readline() == "sending\n"
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+@pytest.mark.parametrize("settings", [(), ("jpeg=1", "rate=15")], ids=["raw", "jpeg"])
+def test_no_pair_is_mismatched_at_camera_rate(phantom_session: Path, settings: tuple[str, ...]) -> None:
+    source = PushedPictures(PushSource(endpoint=ANYWHERE), SIZE)
+    with Taker(source) as taker, simulator(source, phantom_session, 2.0, *settings) as process:
+        assert process.wait(30) == 0
+    due = 30 if settings else 60
+    assert taker.mismatched == 0
+    assert len(taker.numbers) + source.dropped >= due - 4  # on the way when the process ended
+    assert len(taker.numbers) >= 0.8 * due
+    assert taker.newest is not None and taker.newest.left.shape == (1024, 1280, 3)
+
+
+def test_lag_stays_bounded_with_a_stalled_taker(phantom_session: Path) -> None:
+    """Whoever takes four frames a second of thirty gets new ones: at most what two short queues hold."""
+    source = PushedPictures(PushSource(endpoint=ANYWHERE), SIZE)
+    with Taker(source, pause=0.25) as taker, simulator(source, phantom_session, 3.0):
+        time.sleep(3.0)
+    assert len(taker.ages) >= 6
+    # Four pairs wait for a taker, one is in its hands for 250 ms: 400 ms, and as much for a busy machine.
+    assert max(taker.ages[2:]) < 800
+
+
+def test_a_sender_that_was_killed_is_back_within_five_seconds(phantom_session: Path) -> None:
+    source = PushedPictures(PushSource(endpoint=ANYWHERE), SIZE)
+    with Taker(source) as taker:
+        with simulator(source, phantom_session, 60):
+            until(lambda: len(taker.numbers) > 5)
+        count = len(taker.numbers)
+        with simulator(source, phantom_session, 60):
+            until(lambda: len(taker.numbers) > count + 5, seconds=5)
+    assert taker.mismatched == 0
+
+
+@pytest.fixture
+def source() -> Iterator[PushedPictures]:
+    made = PushedPictures(PushSource(endpoint=ANYWHERE), (160, 120))
+    with made:
+        yield made
+
+
+def numbered(number: int, width: int = 160) -> U8:
+    picture = np.full((120, width, 3), 90, np.uint8)
+    for half in np.split(picture, width // 160, axis=1):
+        paint_number(half, number)
+    return picture
+
+
+def sent_until_told(sender: FrameSender, *pictures: U8 | bytes, stamp_ns: int | None = None) -> str:
+    """What the node says of a few pairs."""
+    deadline = time.monotonic() + 10
+    while sender.problem is None:
+        assert time.monotonic() < deadline, "the sender was never told"
+        sender.send(*pictures, stamp_ns)
+        time.sleep(0.05)
+    return sender.problem
+
+
+def test_one_eye_by_one_and_side_by_side_make_pairs() -> None:
+    source = PushedPictures(PushSource(endpoint=ANYWHERE, rate=1), (160, 120))
+    with Taker(source) as taker, FrameSender(source.endpoint) as one, FrameSender(source.endpoint) as other:
+        stamp = time.time_ns()
+        one.send_eye("left", numbered(5), stamp)
+        other.send_eye("right", numbered(5), stamp)
+        until(lambda: len(taker.numbers) == 1)
+        one.send_side_by_side(numbered(6, 320))
+        until(lambda: len(taker.numbers) == 2)
+        files = [cv2.imencode(".png", numbered(7))[1].tobytes()] * 2
+        one.send(*files)
+        until(lambda: len(taker.numbers) == 3)
+        one.send(*[cv2.cvtColor(numbered(8), cv2.COLOR_RGB2BGRA)] * 2, encoding="bgra8")
+        until(lambda: len(taker.numbers) == 4)
+        assert taker.numbers == [(n, n) for n in (5, 6, 7, 8)]
+
+
+def test_a_wrong_size_is_told(source: PushedPictures) -> None:
+    with FrameSender(source.endpoint) as sender:
+        said = sent_until_told(sender, numbered(1, 320), numbered(1, 320))
+        assert "320x120 px" in said and "160x120" in said
+        assert sender.receipt is not None and sender.receipt.refused > 0 and sender.receipt.taken == 0
+
+
+def test_a_wrong_stamp_is_told(source: PushedPictures) -> None:
+    with FrameSender(source.endpoint) as sender:
+        assert "source.stamps:=own" in sent_until_told(sender, numbered(1), numbered(1), stamp_ns=1)
+
+
+def test_damaged_files_and_messages_are_told_and_do_no_harm(source: PushedPictures) -> None:
+    context = zmq.Context()
+    stranger = context.socket(zmq.DEALER)
+    stranger.connect(source.endpoint)
+    try:
+        for parts in ([b""], [b"x"] * 9, [b"a/left/image_raw", b"\xc1", b"data"], [b"t"] * 100):
+            stranger.send_multipart(parts)
+        with FrameSender(source.endpoint) as sender:
+            assert "damaged" in sent_until_told(sender, b"\xff\xd8 no JPEG", b"\xff\xd8 no JPEG")
+        assert stranger.poll(5000)
+    finally:
+        context.destroy(linger=0)
+
+
+def test_only_listed_keys_get_in(tmp_path: Path) -> None:
+    for name in ("node", "friend", "stranger"):
+        write_key_pair(tmp_path / name, name)
+    config = PushSource(
+        endpoint=ANYWHERE, key=tmp_path / "node/node.key", allow=(tmp_path / "friend/friend.pub",)
+    )
+    node = read_key_pair(tmp_path / "node/node.key").public
+    source = PushedPictures(config, (160, 120))
+
+    def keys(name: str) -> ClientKeys:
+        return ClientKeys(read_key_pair(tmp_path / name / f"{name}.key"), node)
+
+    with Taker(source) as taker:
+        with FrameSender(source.endpoint, keys=keys("stranger")) as sender:
+            assert "refuses this key" in sent_until_told(sender, numbered(1), numbered(1))
+        with FrameSender(source.endpoint) as sender:
+            assert (
+                "wants a key" in sent_until_told(sender, numbered(1), numbered(1)) or sender.receipt is None
+            )
+        assert taker.numbers == []
+        with FrameSender(source.endpoint, keys=keys("friend")) as sender:
+            sender.send(numbered(3), numbered(3))
+            until(lambda: taker.numbers == [(3, 3)])
+
+
+def test_other_machines_need_keys() -> None:
+    with pytest.raises(UsageError, match=r"source\.key and source\.allow"):
+        PushedPictures(PushSource(endpoint="tcp://*:5558"))
+
+
+def test_a_sender_never_waits_for_a_node_that_is_away() -> None:
+    with FrameSender("tcp://127.0.0.1:1") as sender:
+        begun = time.monotonic()
+        for _ in range(100):
+            sender.send(numbered(1), numbered(1))
+        assert time.monotonic() - begun < 2
+        assert sender.left_out >= 200 - 4

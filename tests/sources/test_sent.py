@@ -1,0 +1,137 @@
+"""What is common to pictures that other programs send: their stamps, their loss, their clock."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sags_node.config import LaunchConfig, PushRobot, PushSource, Ros2Source
+from sags_node.errors import SagsError
+from sags_node.foreground import inputs_text
+from sags_node.health import Statistics
+from sags_node.messaging import cdr, content, topics
+from sags_node.sources.clock import KEPT, CaptureClock
+from sags_node.sources.sent import WINDOW, Arrivals, SentPictures
+from sags_node.types import U8, ClockStatus
+
+MS, S = 1_000_000, 1_000_000_000
+PERIOD = 33 * MS
+
+
+def picture() -> U8:
+    return np.zeros((4, 8, 3), np.uint8)
+
+
+@pytest.mark.parametrize("lost", [0, 1, 3])
+def test_loss_is_counted_by_the_gaps(lost: int) -> None:
+    """Of every eight pictures `lost` do not come."""
+    rng = np.random.default_rng(3)
+    arrivals = Arrivals()
+    for number in range(16 * WINDOW):
+        if number % 8 >= lost:
+            arrivals.add(number * PERIOD + int(rng.integers(-4 * MS, 4 * MS)))
+    assert arrivals.share_lost == pytest.approx(lost / 8, abs=0.04)  # 4 of 33 ms jitter on the median step
+    assert arrivals.rate == pytest.approx((8 - lost) / 8 / 0.033, rel=0.03)
+    assert arrivals.lost == pytest.approx(16 * WINDOW * lost / 8, abs=16 * WINDOW * 0.04)
+
+
+@pytest.mark.parametrize(("age", "said"), [(3.2, "3.2 s old"), (-0.5, "0.5 s ahead")])
+def test_a_wrong_stamp_is_refused_with_its_age(age: float, said: str) -> None:
+    sent = SentPictures(PushSource(), None)
+    with pytest.raises(SagsError, match=f"{said}.*source.stamps:=own"):
+        sent.put("left", 100 * S, round((100 + age) * S), picture)
+
+
+def test_another_size_is_refused_with_both_sizes() -> None:
+    sent = SentPictures(PushSource(), (640, 512))
+    with pytest.raises(SagsError, match=r"8x4 px.*640x512"):
+        sent.put("left", S, S, picture)
+
+
+def test_the_latency_is_taken_off_and_all_stamps_are_kept() -> None:
+    sent = SentPictures(PushSource(latency_ms=40), None)
+    for eye in ("left", "right"):
+        sent.put(eye, 100 * S, 100 * S + 5 * MS, picture)
+    frame = next(iter(sent.pairs))
+    assert frame.t_capture_ns == frame.t_capture_right_ns == 100 * S - 40 * MS
+    assert (frame.t_device_ns, frame.t_arrival_ns) == (100 * S, 100 * S + 5 * MS)
+
+
+def test_who_sends_too_slowly_is_told() -> None:
+    sent = SentPictures(PushSource(rate=30), None)
+    for number in range(WINDOW):
+        for eye in ("left", "right"):
+            sent.put(eye, number * 2 * PERIOD, number * 2 * PERIOD, picture)
+    assert "15.2 of 30 pictures a second" in (sent.slowness() or "")
+
+
+def test_who_sends_late_is_told() -> None:
+    sent = SentPictures(PushSource(rate=30), None)
+    for number in range(WINDOW):
+        for eye in ("left", "right"):
+            sent.put(eye, number * PERIOD, number * PERIOD + 300 * MS, picture)
+    assert "300 ms old" in (sent.slowness() or "")
+
+
+# ---- clocks ----------------------------------------------------------------------------------------------
+
+
+def watched(clock: CaptureClock, seconds: float, drift: float, offset: int = 7 * S, begun: int = 0) -> int:
+    """Thirty pictures a second; each is 2 ms on the way, and up to 20 ms more. The last difference, ns."""
+    rng = np.random.default_rng(4)
+    for stamp in range(begun, begun + round(seconds * S), S // 30):
+        difference = offset + round(drift * (stamp - begun))
+        clock.add(stamp, stamp + difference + 2 * MS + int(rng.exponential(5 * MS)))
+    return difference
+
+
+@pytest.mark.parametrize("drift", [0.0, 100e-6, -40e-6])
+def test_the_drift_is_found_under_the_jitter(drift: float) -> None:
+    clock = CaptureClock()
+    difference = watched(clock, 60, drift)
+    status = clock.status()
+    assert status is not None and status.drift_ppm is not None
+    # The smallest of thirty exponential delays is 5/30 ms: over a minute that bounds the slope to some ppm.
+    assert status.drift_ppm == pytest.approx(drift * 1e6, abs=5)
+    assert clock.to_wall(60 * S) == pytest.approx(60 * S + difference + 2 * MS, abs=MS)
+
+
+def test_a_short_watch_says_no_drift() -> None:
+    clock = CaptureClock()
+    assert clock.status() is None
+    watched(clock, 5, 0)
+    status = clock.status()
+    assert status is not None and status.drift_ppm is None
+
+
+@pytest.mark.parametrize("jump", [3 * S, -3 * S])
+def test_a_clock_that_was_set_is_followed_within_three_seconds(jump: int) -> None:
+    clock = CaptureClock()
+    watched(clock, 30, 0)
+    watched(clock, 3, 0, offset=7 * S + jump, begun=30 * S)
+    assert clock.to_wall(33 * S) == pytest.approx(40 * S + jump + 2 * MS, abs=MS)
+
+
+def test_the_watch_is_bounded() -> None:
+    clock = CaptureClock()
+    watched(clock, KEPT + 30, 0)
+    status = clock.status()
+    assert status is not None and status.seconds <= KEPT * 1.05  # a second's bin begins with a picture
+
+
+def test_it_is_said_where_pictures_and_poses_are_taken_from() -> None:
+    ros = LaunchConfig(source=Ros2Source(domain=7, left="/a", right="/b"), robot=PushRobot())
+    assert inputs_text(ros) == [
+        "taking pictures from ROS 2 domain 7, interface lo: /a and /b",
+        "taking poses at tcp://127.0.0.1:5559",
+    ]
+    assert inputs_text(LaunchConfig()) == []
+
+
+def test_the_clock_is_told_in_status_and_diagnostics() -> None:
+    clock = ClockStatus(offset_ms=12.5, drift_ppm=-31.0, seconds=40.0)
+    health = Statistics().health({}, False, False, None, {}, {}, {}, clock)
+    assert content.status(health, None)["clock"] == {"offset_ms": 12.5, "drift_ppm": -31.0, "seconds": 40.0}
+    (part,) = content.diagnostics(health, 0).parts
+    values = cdr.decode(bytes(part), topics.DIAGNOSTICS).status[0].values
+    assert {"capture_clock_drift_ppm": "-31.0"}.items() <= {v.key: v.value for v in values}.items()
