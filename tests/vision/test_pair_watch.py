@@ -234,8 +234,8 @@ def test_what_is_compressed_hard_from_the_first_picture_on_is_learnt(
 
 
 @pytest.mark.parametrize("across", [2, 4])
-def test_a_picture_that_was_enlarged_has_no_blocks(across: int, frames: list[StereoFrame]) -> None:
-    small = np.ascontiguousarray(frames[0].left[::across, ::across])
+def test_a_picture_that_was_enlarged_has_no_blocks(across: int, moving: list[StereoFrame]) -> None:
+    small = np.ascontiguousarray(moving[0].left[::across, ::across])
     large = small.repeat(across, 0).repeat(across, 1)
     assert not is_blocky(large) and is_blocky(_jpeg(large, 6))
 
