@@ -276,7 +276,7 @@ class AnchorStates:
         def empty(*shape: int) -> F32:
             return np.empty((0, *shape), np.float32)
 
-        return AnchorStates(np.empty(0, np.int64), empty(3), empty(2), *(empty() for _ in range(4)))
+        return AnchorStates(np.empty(0, np.int64), empty(3), empty(2), empty(), empty(), empty(), empty())
 
 
 class Finding(NamedTuple):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import click
 from rich.markup import escape
@@ -14,17 +14,22 @@ from sags_node.terminal import text
 from sags_node.terminal.console import console, show
 
 
-class Ahead(click.ParamType):
+class Ahead(click.ParamType["float | str"]):
     """Milliseconds, or `auto`."""
 
     name = "MS|auto"
 
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> float | Literal["auto"]:
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float | str:
+        from sags_node.messaging.requests import MAX_AHEAD_MS
+
         if value == "auto":
             return "auto"
-        ms: float = click.FloatRange(0, 1000).convert(value, param, ctx)
+        try:
+            ms = float(value)
+        except ValueError:
+            ms = -1.0
+        if not 0 <= ms <= MAX_AHEAD_MS:
+            self.fail(f"{value!r}: give 0 to {MAX_AHEAD_MS:g} milliseconds, or auto", param, ctx)
         return ms
 
 

@@ -14,9 +14,10 @@ ROUNDING = 1e-3  # s, of stamps
 
 
 def extrapolated(snapshot: Snapshot, seconds: float) -> Gaussians:
-    """The Gaussians `seconds` after the snapshot: by the motion field where that has skill so far ahead, else
-    by 0.8 times their last observed velocity."""
-    if 0 < seconds <= reached(snapshot, seconds) + ROUNDING:
+    """The Gaussians `seconds` after the snapshot: by the motion field where motion comes again and that has
+    skill so far ahead, else by 0.8 times their last observed velocity."""
+    comes_again = snapshot.forecast is not None and snapshot.forecast.state.period is not None
+    if comes_again and 0 < seconds <= reached(snapshot, seconds) + ROUNDING:
         return gaussians_ahead(snapshot, seconds)
     means = snapshot.gaussians.means + snapshot.velocities * np.float32(VELOCITY_SHARE * seconds)
     return replace(snapshot.gaussians, means=means)

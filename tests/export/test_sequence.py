@@ -15,6 +15,7 @@ import pytest
 from sags_node.errors import SagsError, UsageError
 from sags_node.export import sequence
 from sags_node.export.scene import Scene
+from sags_node.model.ply import write_ply
 from sags_node.types import Camera, Gaussians
 
 CAMERA = Camera(64, 48, np.array([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]), np.eye(4))
@@ -30,7 +31,7 @@ def scenes(count: int = FRAMES) -> Iterator[Scene]:
         yield Scene(
             Gaussians(
                 (places[:size] + np.array([0.004 * frame, 0, 0])).astype(np.float32),
-                np.tile(np.float32([1, 0, 0, 0]), (size, 1)),
+                np.tile(np.array([1, 0, 0, 0], np.float32), (size, 1)),
                 np.full((size, 3), 6e-4, np.float32),
                 np.full(size, 0.9, np.float32),
                 np.full((size, 3), 0.9, np.float32),
@@ -50,7 +51,7 @@ def test_every_frame_that_shows_something_is_a_file_and_the_video_comes_back(tmp
     frames, loop = written(tmp_path / "out")
     assert frames["holds"] == FRAMES - 1 and loop["holds"] == 2 * (FRAMES - 1) - 2
     for frame in range(1, FRAMES):
-        cloud = open3d.io.read_point_cloud(str(tmp_path / f"out/frame_{frame:05d}.ply"))
+        cloud = open3d.io.read_point_cloud(tmp_path / f"out/frame_{frame:05d}.ply")
         assert np.asarray(cloud.points)[:, 0].mean() == pytest.approx(0.004 * frame, abs=1e-3)
     capture, middles = cv2.VideoCapture(str(tmp_path / "out/loop.mp4")), []
     while (read := capture.read())[0]:
@@ -62,7 +63,7 @@ def test_every_frame_that_shows_something_is_a_file_and_the_video_comes_back(tmp
 
 
 def test_an_export_that_a_full_disk_ended_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    real = sequence.write_ply
+    real = write_ply
     left = [3]
 
     def full(path: Path, gaussians: Gaussians) -> None:

@@ -22,7 +22,7 @@ def beating(frame: float) -> F32:
     """Places [M, 3] of nodes that a heart with a quick stroke moves: three harmonics."""
     angle = 2 * np.pi * frame / PERIOD
     moved = sum(PULL[k] * np.sin((k + 1) * angle + k) for k in range(3))
-    return (NODES + moved).astype(np.float32)
+    return np.asarray(NODES + moved, np.float32)
 
 
 def stamp(frame: int) -> int:
@@ -121,7 +121,8 @@ def snapshot(reach: float) -> Snapshot:
         np.zeros((5, 4), np.int32), np.full((5, 4), 0.25, np.float32),
     )  # fmt: skip
     gaussians = Gaussians(
-        np.zeros((5, 3), np.float32), np.tile(np.float32([1, 0, 0, 0]), (5, 1)), np.ones((5, 3), np.float32),
+        np.zeros((5, 3), np.float32), np.tile(np.eye(1, 4, dtype=np.float32), (5, 1)),
+        np.ones((5, 3), np.float32),
         np.ones(5, np.float32), np.ones((5, 3), np.float32), np.arange(5),
     )  # fmt: skip
     camera = Camera(64, 48, np.eye(3), np.eye(4))
