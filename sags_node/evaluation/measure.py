@@ -13,7 +13,6 @@ from sags_node.config import Box
 from sags_node.engine.rasterizer.rasterize import make_rasterizer, to_view
 from sags_node.errors import UsageError
 from sags_node.evaluation import calibration, metrics
-from sags_node.evaluation.carried import Seen, carried
 from sags_node.evaluation.gallery import Gallery
 from sags_node.evaluation.lpips import Lpips
 from sags_node.evaluation.spool import RunFacts, Spool, SpooledFrame
@@ -86,11 +85,6 @@ class _Before:
     given: Camera  # as the session says
     truth: F32
     seconds: float  # on the recording's clock
-
-    def seen(self, weight: float) -> Seen:
-        """As a part of the mean of several, with a share of `weight`."""
-        snapshot = self.shown.snapshot
-        return Seen(snapshot.gaussians, snapshot.camera, self.truth, self.shown.tissue, weight)
 
 
 @dataclass(slots=True)
@@ -223,27 +217,13 @@ class Measurer:
         return row
 
     def _between(self, before: _Before, held: _HeldOut, after: _Before) -> Figures:
-        """A held-out frame, drawn when the next one is known; beside it both pictures carried there, and the
-        mean of both as they are."""
+        """A held-out frame, drawn when the next one is known; beside it the mean of both pictures."""
         share = (held.row.seconds - before.seconds) / (after.seconds - before.seconds)
         states = before.shown.snapshot.gaussians, after.shown.snapshot.gaussians
-        middle = between(*states, share)
-        guess = self._draw(middle, held.camera)
-        around = [
-            Seen(
-                each.shown.snapshot.gaussians,
-                each.shown.snapshot.camera,
-                each.truth,
-                each.shown.tissue,
-                weight,
-            )
-            for each, weight in ((before, 1 - share), (after, share))
-        ]
-        brought = carried(self._rasterizer, middle, held.camera, around)
+        guess = self._draw(between(*states, share), held.camera)
         mean = before.truth + np.float32(share) * (after.truth - before.truth)
         return {
             "psnr": metrics.psnr(guess, held.truth, held.tissue),
-            "carried_psnr": metrics.psnr(brought, held.truth, held.tissue),
             "mean_psnr": metrics.psnr(mean, held.truth, held.tissue),
         }
 

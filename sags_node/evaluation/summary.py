@@ -21,7 +21,7 @@ GROUPS = {
     "online": ("psnr", "ssim", "lpips"),
     "predict": ("psnr", "copy_psnr"),
     "heldout": ("psnr", "ssim", "lpips"),
-    "between": ("psnr", "carried_psnr", "mean_psnr"),
+    "between": ("psnr", "mean_psnr"),
     "novel": ("psnr",),
     "depth": ("median_mm", "p90_mm", "rmse_mm", "coverage"),
     "measured_depth": ("median_mm", "p90_mm", "rmse_mm", "coverage"),
@@ -41,8 +41,7 @@ def summarise(
     A figure of quality is the mean over the frames that have it, and again over each named segment
     (`online.motion.psnr`; first and last frame belong to it). Track errors are pooled over points and frames.
     `predict.copy_psnr` is the picture before, shown again: on tissue that hardly moves it is hard to beat.
-    `between` is `heldout` once the next frame is known; `between.mean_psnr` the mean of the pictures around,
-    `between.carried_psnr` the same with both carried along the model's motion, see `carried`.
+    `between` is `heldout` once the next frame is known; `between.mean_psnr` the mean of the pictures around.
     `pose` compares with the session's poses those of a run that was not given them; `pose.rigid_...` are
     those of the baseline, see `RigidOdometry`.
     """
