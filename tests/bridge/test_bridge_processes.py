@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 from command_line import refused, sags
 from igtl_peer import PEER, Peer, built, peer
+from places import SESSION
 from running_node import RunningNode
 from waiting import until
 
@@ -48,7 +49,7 @@ def state(joined: Peer) -> str:
 
 
 def test_a_pinned_anchor_comes_back_and_a_killed_node_leaves_nothing_standing(
-    phantom_session: Path, tmp_path: Path
+    tmp_path: Path,
 ) -> None:
     pytest.importorskip("pyigtl", reason="no OpenIGTLink without: pip install 'sags-node[bridges]'")
     program = built(PEER, tmp_path)
@@ -56,7 +57,7 @@ def test_a_pinned_anchor_comes_back_and_a_killed_node_leaves_nothing_standing(
     with bridge(run_dir, "openigtlink", "--port", "0") as (first, port):
         with peer(program, port, "say", "SagsRequest", "pin 150 120") as early:
             until(lambda: "no node" in " ".join(early.newest("SagsAnswer") or []).lower())
-        node = RunningNode(phantom_session, tmp_path)
+        node = RunningNode(SESSION, tmp_path, "source.pace:=realtime")
         try:
             with peer(program, port) as joined:
                 until(lambda: state(joined) == "1")
