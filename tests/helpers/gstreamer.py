@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 import signal
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
+from waiting import until
 
 from sags_node.errors import SagsError
 from sags_node.sources.gst_process import installed
@@ -44,12 +46,15 @@ def pipelines() -> list[int]:
     """Process ids of the pipelines that this process runs."""
     found = []
     for task in Path("/proc/self/task").iterdir():
-        for child in (task / "children").read_text().split():
-            if b"gst_child" in Path(f"/proc/{child}/cmdline").read_bytes():
-                found.append(int(child))
+        with suppress(OSError):  # a thread or a process that ends meanwhile
+            for child in (task / "children").read_text().split():
+                if b"gst_child" in Path(f"/proc/{child}/cmdline").read_bytes():
+                    found.append(int(child))
     return found
 
 
 def kill_pipelines() -> None:
+    """Wait for one, since it may have been started this moment, and kill all."""
+    until(pipelines)
     for process in pipelines():
         os.kill(process, signal.SIGKILL)
