@@ -248,6 +248,15 @@ class V4l2Source(CameraSource):
         20.0, gt=0, description="how far the stamps of a pair may lie apart, two devices"
     )
 
+    @model_validator(mode="before")
+    @classmethod
+    def _halves(cls, said: object) -> object:
+        if isinstance(said, dict) and "side_by_side" in said:
+            raise ValueError(
+                "instead of side_by_side set geometry.layout: side_by_side (RL: geometry.first: right)"
+            )
+        return said
+
 
 class GstSource(CameraSource):
     """Live pictures from GStreamer, in a process of its own; docs/inputs.md has examples."""

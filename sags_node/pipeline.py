@@ -84,11 +84,21 @@ class Pipeline:
         self._scene = SceneWatch(moving=vision.pose == "estimate")
         self._is_sound = True  # what was matched last is depth
         self._unposed: Finding | None = None  # why the newest frame's pose is not known
+        self._reset_due = False
         self._mapped: FrameResult | None = None  # the last frame that was really mapped
         self._unwatched = 0.0  # m: how far tissue may have moved in frames that were held since
 
     def reset(self) -> None:
-        """Forget the model; the next frame makes a new one, in a new epoch."""
+        """Forget the model; the next frame makes a new one, in a new epoch.
+
+        While the scope's pose is not known no frame can: it is forgotten when one comes whose pose is.
+        """
+        self._reset_due = True
+        if self._unposed is None:
+            self._forget()
+
+    def _forget(self) -> None:
+        self._reset_due = False
         self.mapper.restart()
         self._scene.forget()
         self._still.forget()
@@ -141,13 +151,15 @@ class Pipeline:
         self._unposed = frame.pose_problem if self._config.vision.pose == "session" else None
         if self._unposed is not None and self._mapped is not None:
             return self._held(frame, pair, watch, "pose", self._unposed.text, unseen(pair))
+        if self._reset_due:
+            self._forget()
         if self._equals_the_last(pair):
             return self._repeated(frame, pair, watch)
         with watch("watch"):
             scene = self._compared(pair, eyes)
             hidden = self._hidden(pair, eyes, scene)
         if scene.is_new:
-            self.reset()
+            self._forget()
         elif scene.held:
             return self._held(frame, pair, watch, "picture", scene.held, unseen(pair))
         seen = pair if scene.gain is None else exposed(pair, scene.gain)

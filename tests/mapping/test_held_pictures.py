@@ -14,7 +14,7 @@ from sags_node.findings import by_code
 from sags_node.mapping.budget import StepBudget
 from sags_node.pipeline import NOTICED_LATE, Pipeline
 from sags_node.session import Session, open_session
-from sags_node.types import U8, FrameResult, StereoFrame
+from sags_node.types import U8, Finding, FrameResult, StereoFrame
 from sags_node.vision.match_watch import MatchWatch
 
 FIRST, COUNT, AFTER = 8, 8, 11  # frames, at 10 Hz: before, with the fault, and until the tenth after it
@@ -174,3 +174,20 @@ def test_what_was_measured_before_a_late_eye_was_noticed_is_doubted_once(
     steps = np.diff(errors[FIRST - 1 :])
     assert steps[0] >= NOTICED_LATE
     assert (steps[1:] < NOTICED_LATE / 3).all()  # 10 Hz: what tissue moves by unseen
+
+
+def test_a_frame_without_its_pose_is_shown_by_no_new_model(
+    session: Session, frames: list[StereoFrame]
+) -> None:
+    """Also when the model is reset meanwhile: then the next frame that has its pose makes the new one."""
+    pipeline = Pipeline(session.config, session.rig)
+    problem = Finding("pose_stopped", "no pose comes")
+    first = pipeline.process(frames[0], StepBudget(2))
+    held = pipeline.process(replace(frames[1], pose_problem=problem), StepBudget(2))
+    pipeline.reset()
+    after_reset = pipeline.process(replace(frames[2], pose_problem=problem), StepBudget(2))
+    for result in (held, after_reset):
+        assert result.held == problem.text and result.epoch == first.epoch
+        assert result.views["left"].rgb is first.views["left"].rgb
+    again = pipeline.process(frames[3], StepBudget(2))
+    assert not again.held and again.epoch == first.epoch + 1
