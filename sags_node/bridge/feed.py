@@ -10,6 +10,7 @@ from pathlib import Path
 
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging.address import ClientKeys
+from sags_node.messaging.node_clock import NodeClock
 from sags_node.messaging.received import Frame, Received
 from sags_node.messaging.subscriber import Subscriber
 
@@ -21,12 +22,21 @@ LOOK = 0.2  # s between looks for a sender that is not there
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where a sender is; without an `endpoint`, in the connection file of `ns`."""
+    """Where a sender is; without an `endpoint`, in the connection file of `ns`.
+
+    Attributes:
+        clock: that stamped what it sends, where that is another machine's.
+    """
 
     ns: str = "sags"
     endpoint: str | None = None
     run_dir: Path | None = None
     keys: ClientKeys | None = None
+    clock: NodeClock | None = None
+
+    def now_ns(self) -> int:
+        """What that clock shows now, at the latest."""
+        return time.time_ns() if self.clock is None else self.clock.latest_ns()
 
 
 class Feed:
@@ -89,6 +99,7 @@ class Feed:
                 place.run_dir,
                 rates=dict.fromkeys(self._topics, LEAST_HZ),
                 keys=place.keys,
+                clock=place.clock,
                 paused=True,
             )
         except UsageError:

@@ -145,6 +145,7 @@ class OpenIgtLink:
         ] = {}  # of pictures that are shown: one without light, and its place
         self._pins = Pins()
         self._answers: deque[Callable[[], list[Release]]] = deque()  # for the peers' thread
+        self._now_ns = place.now_ns
         self._requests = Requests(options.control, place.ns, place.run_dir, place.keys)
         self._peers = Peers(options.host, options.port, self._hear, self._idle)
         self._peers.start()
@@ -171,7 +172,7 @@ class OpenIgtLink:
         except WireError:
             made = None
         if made is not None:
-            self._peers.send(device, made, valid=self._max_age - (time.time_ns() - stamp_ns) * 1e-9)
+            self._peers.send(device, made, valid=self._max_age - (self._now_ns() - stamp_ns) * 1e-9)
         return made is not None
 
     def blank(self, output: Output, reason: str) -> None:

@@ -105,6 +105,7 @@ class Relay:
         self._arrived = threading.Event()
         self._courses: dict[str, _Course] = {}
         self._told: tuple[dict[str, str], bool] | None = None
+        self._places = {place.ns: place for place in senders}
         self._feeds: dict[str, Feed] = {}
         try:
             for place in senders:
@@ -172,7 +173,7 @@ class Relay:
             return None
         seconds = any(source.topic in EVERY_SECOND for source in output.sources)
         limit = output.period + LEAD + (SILENT_AFTER if seconds else self._max_age)
-        age = (time.time_ns() - course.shown_ns) * 1e-9
+        age = (self._places[output.sources[0].ns].now_ns() - course.shown_ns) * 1e-9
         return f"no whole frame for {age:.1f} s" if age > limit else None
 
     def _frame(self, output: Output) -> Frame | None:

@@ -7,6 +7,7 @@ import logging
 import os
 import threading
 from collections.abc import Callable
+from contextlib import nullcontext
 from functools import wraps
 from pathlib import Path
 from typing import Any
@@ -75,9 +76,13 @@ def _common(port: int) -> Callable[[Callable[..., None]], Callable[..., None]]:
             json_out: bool, host: str, **rest: Any,
         ) -> None:  # fmt: skip
             from sags_node.bridge.feed import Place
+            from sags_node.messaging.node_clock import NodeClock
 
             _check_host(host, insecure)
-            node, overlay = Place(ns, endpoint, run_dir, keys), Place(overlay_ns, None, run_dir)
+            remote = endpoint is not None and rest["control"] is not None
+            clock = NodeClock(rest["control"], keys=keys) if remote else None
+            node = Place(ns, endpoint, run_dir, keys, clock)
+            overlay = Place(overlay_ns, None, run_dir, clock=clock)  # its stamps are the node's
             stop = threading.Event()
 
             def ready(host: str, bound: int) -> None:
@@ -88,7 +93,8 @@ def _common(port: int) -> Callable[[Callable[..., None]], Callable[..., None]]:
 
             os.nice(NICENESS)
             on_stop_signals(stop.set)
-            command(node=node, overlay=overlay, host=host, ready=ready, stop=stop, **rest)
+            with clock or nullcontext():
+                command(node=node, overlay=overlay, host=host, ready=ready, stop=stop, **rest)
 
         return with_common
 

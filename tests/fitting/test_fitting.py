@@ -93,11 +93,12 @@ def test_each_part_of_the_method_has_its_share_in_the_result(clip: Clip) -> None
         fit = fitted(clip, dataclasses.replace(PAPER, **changed))
         return fit.rasterizer.forward(fit.gaussians(frame), [frame.camera])[0, :3, frame.tissue]
 
-    whole = drawn()
+    whole, alone = drawn(), drawn(tokens="self")
     assert np.array_equal(drawn(), whole)
-    for without in ({"block": "none"}, {"block": "mlp"}, {"antialias": False}):
-        beyond_rounding = 100 * np.finfo(np.float32).eps
+    beyond_rounding = 100 * np.finfo(np.float32).eps
+    for without in ({"block": "none"}, {"antialias": False}):
         assert np.abs(drawn(**without) - whole).mean() > beyond_rounding, without
+    assert np.abs(drawn(tokens="self", block="mlp") - alone).mean() > beyond_rounding
 
 
 def test_an_mlp_in_the_place_of_the_block_learns_and_adapts_nothing(clip: Clip) -> None:

@@ -40,6 +40,7 @@ def test_any_setting_can_be_changed() -> None:
         "rates.decaying=[means, colors]",
         "decay=5e-2",
         "block=mlp",
+        "tokens=self",
         "weights.color=2",
     ]
     found = with_changes(ONLINE, changes)

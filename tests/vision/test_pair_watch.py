@@ -34,9 +34,15 @@ def session(phantom_session: Path) -> Session:
 
 
 @pytest.fixture(scope="module")
-def frames(session: Session) -> list[StereoFrame]:
+def moving(session: Session) -> list[StereoFrame]:
+    """Three seconds at 10 Hz."""
     with session.source as source:
-        return list(islice(source, 6))
+        return list(islice(source, 30))
+
+
+@pytest.fixture(scope="module")
+def frames(moving: list[StereoFrame]) -> list[StereoFrame]:
+    return moving[:6]
 
 
 def watched(session: Session, frames: list[StereoFrame], step_ns: int = STEP_NS) -> Iterator[str]:
@@ -70,13 +76,6 @@ def _jpeg(picture: U8, quality: int = 50) -> U8:
 
 def _plain(frame: StereoFrame, color: tuple[int, int, int], sigma: float = 2.0) -> U8:
     return _noisy(np.full(frame.left.shape, color, np.float32), sigma)
-
-
-@pytest.fixture(scope="module")
-def moving(session: Session) -> list[StereoFrame]:
-    """Three seconds at 10 Hz."""
-    with session.source as source:
-        return list(islice(source, 30))
 
 
 # ---- sound pairs -----------------------------------------------------------------------------------------
