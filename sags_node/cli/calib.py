@@ -282,7 +282,9 @@ def hand_eye(
     json_out: bool,
     **board_of: Any,
 ) -> None:
-    """Find how the camera sits on the robot, from a recording of a board and of the robot's poses.
+    """Find how the camera sits on the robot.
+
+    From a recording of a board and of the robot's poses.
 
     The board lies still. The robot moves and turns the scope about, at different speeds: from that the offset
     between the robot's clock and the pictures' is found, too. docs/inputs.md says more.
