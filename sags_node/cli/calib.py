@@ -144,7 +144,7 @@ def check(
 @reading_options
 @click.option("--scale", type=positive, default=1.0, help="Of pictures that are resized after calibration.")
 def convert(path: Path, output: Path, size: tuple[int, int] | None, unit: str | None, scale: float) -> None:
-    """Write a calibration of any known form as left.yaml and right.yaml.
+    """Write any known calibration as left.yaml and right.yaml.
 
     \b
     sags calib convert stereo_calib/ -o calib/mine --size 1280x720 --unit mm
