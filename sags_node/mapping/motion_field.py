@@ -28,8 +28,10 @@ SHARE = 0.3  # of each: together a little less than all, since tissue slows down
 STEADY = 0.8  # times the last velocity: what is said without a memory
 LEAST_SKILL = 0.2  # of the motion's energy: what explains less does not pay for being wrong
 LONGEST_GAP = 4  # frames that may be missing: a straight line fills them
-LEAST_NODES = 32  # that must be seen: fewer say little of the rest
+LEAST_PROBES = 8  # probed nodes that must be seen: fewer say little of the rest
+PERIOD_EVERY = 10  # frames: a period does not change faster
 LEAST_WEIGHT = 1e-3  # of a past frame
+PROBED = 4  # one of so many nodes is compared and learnt from: over a hundred tell what all do
 KNOWN = 0.5  # weight of what was seen around a node: below it nothing is known of it
 
 
@@ -44,7 +46,9 @@ class MotionField:
         self._count = 0  # frames in the history
         self._places: F32 = np.zeros((0, 0, 3), np.float32)  # [2 HISTORY, M, 3] m
         self._steps: F32 = self._places  # from the frame before
+        self._probes: F32 = self._places  # of one in `PROBED` nodes
         self._energy = np.zeros(2 * HISTORY, np.float32)  # of the steps, m^2
+        self._period: float | None = None  # s, see `_found_period`
         self._stamp_ns = 0
         self._frame_s = 0.0
         self._bases: deque[F32] = deque(maxlen=HORIZONS)  # newest first: [HORIZONS, 3, M, 3]
@@ -64,10 +68,12 @@ class MotionField:
             seen: [M] weight of what was seen around each node.
         """
         nodes = self._places.shape[1]
-        known = np.flatnonzero(seen[:nodes] > KNOWN)
-        if self._period is None or len(known) < LEAST_NODES:
+        if self._period is None:
             return None
-        weights = self._likeness(self._count, motion[:nodes], known)
+        known = np.flatnonzero(seen[:nodes:PROBED] > KNOWN)
+        if len(known) < LEAST_PROBES:
+            return None
+        weights = self._likeness(self._count, motion[:nodes:PROBED], known)
         used = np.flatnonzero(weights > LEAST_WEIGHT)
         if len(used) == 0:
             return None
@@ -88,6 +94,7 @@ class MotionField:
         if self._count == 0:
             self._places = np.zeros((2 * HISTORY, *nodes.shape), np.float32)
             self._steps = np.zeros_like(self._places)
+            self._probes = np.zeros_like(self._steps[:, ::PROBED])
         elif missing <= 0:
             self._frame_s = seconds if self._frame_s == 0 else 0.9 * self._frame_s + 0.1 * seconds
         if self._count:
@@ -123,8 +130,7 @@ class MotionField:
         """Frames."""
         return int(np.ceil(NEAREST / self._frame_s))
 
-    @property
-    def _period(self) -> float | None:
+    def _found_period(self) -> float | None:
         """s after which the tissue moves as before, if most of the moments like now lie so far back, or a
         multiple of it."""
         often, total = self._lags, float(self._lags.sum())
@@ -147,28 +153,31 @@ class MotionField:
         far = np.square(nodes[old:, None] - nodes[:old]).sum(2)
         like = np.concatenate([np.arange(old), far.argmin(1)])
         offset = nodes - nodes[like]
-        self._places = self._places[:, like] + offset
-        self._steps = np.ascontiguousarray(self._steps[:, like])
-        self._energy[: self._count] = np.square(self._steps[: self._count]).sum((1, 2))
+        new = like[old:]
+        self._places = np.concatenate([self._places, self._places[:, new] + offset[old:]], axis=1)
+        self._steps = np.concatenate([self._steps, self._steps[:, new]], axis=1)
+        self._probes = np.ascontiguousarray(self._steps[:, ::PROBED])
+        self._energy[: self._count] = np.square(self._probes[: self._count]).sum((1, 2))
         self._bases = deque((basis[:, :, like] for basis in self._bases), maxlen=HORIZONS)
         self._mixed = deque((mixed[:, like] for mixed in self._mixed), maxlen=HORIZONS)
 
     def _add(self, nodes: F32, seen: F32) -> None:
         if self._count == 2 * HISTORY:
-            for rows in (self._places, self._steps, self._energy):
+            for rows in (self._places, self._steps, self._probes, self._energy):
                 rows[:HISTORY] = rows[HISTORY:]
             self._count = HISTORY
         k = self._count
         self._places[k] = nodes
         self._steps[k] = nodes - self._places[k - 1] if k else 0
-        self._energy[k] = np.square(self._steps[k]).sum()
+        self._probes[k] = self._steps[k, ::PROBED]
+        self._energy[k] = np.square(self._probes[k]).sum()
         self._count += 1
-        self._learn(np.flatnonzero(seen > KNOWN))
+        self._learn(PROBED * np.flatnonzero(seen[::PROBED] > KNOWN))
         if k >= MATCHED and self._frame_s > 0:
             self._say()
 
     def _learn(self, known: I64) -> None:
-        """What was said of this frame against what came, at the nodes [K] that were seen."""
+        """What was said of this frame against what came, at probed nodes [K] that were seen."""
         if len(known) == 0:
             return
         now = self._count - 1
@@ -198,8 +207,7 @@ class MotionField:
             basis[:, 2] = followed + np.float32(1 - trust) * basis[:, 2]
         mixed = np.empty((HORIZONS, nodes, 3), np.float32)
         for h in range(HORIZONS):
-            flat = basis[h].reshape(3, -1)
-            pull = PRIOR * float(np.square(flat).sum()) + 1e-15
+            pull = PRIOR * float(np.square(basis[h, :, ::PROBED]).sum()) + 1e-15
             shares = np.linalg.solve(
                 self._normal[h] + pull * np.eye(3), self._wanted[h] + pull * SHARE
             ).astype(np.float32)
@@ -211,26 +219,28 @@ class MotionField:
         """[HORIZONS, M, 3] m: how far nodes went after moments like this one, less, the less alike; and how
         alike they were, 0..1."""
         nodes = self._places.shape[1]
-        weights = self._likeness(last, self._steps[last], np.arange(nodes))
+        weights = self._likeness(last, self._probes[last], None)
         weights = weights[: last - HORIZONS]  # what came after must be known
         used = np.flatnonzero(weights > LEAST_WEIGHT)
         trust = float(weights.sum())
         self._trust = MEMORY * self._trust + (1 - MEMORY) * trust
         self._lags *= MEMORY
         self._lags[last - used] += weights[used]
+        if last % PERIOD_EVERY == 0:
+            self._period = self._found_period()
         followed = np.zeros((HORIZONS, nodes, 3), np.float32)
         for h in range(HORIZONS if len(used) else 0):
             followed[h] = followed[h - 1] + np.tensordot(weights[used], self._steps[used + 1 + h], 1)
         return followed, trust
 
-    def _likeness(self, newest: int, motion: F32, known: I64) -> F32:
+    def _likeness(self, newest: int, motion: F32, known: I64 | None) -> F32:
         """Weight [newest] of each past frame, by how alike the nodes moved in it and in those just before.
         Together they weigh less than 1: resting takes part.
 
         Args:
             newest: number of the frame that is compared, which need not be in the history yet.
-            motion: [M, 3] m, in that frame.
-            known: nodes that count in it; in the frames before all do.
+            motion: [P, 3] m, of the probed nodes in that frame.
+            known: those of them that count in it, None: all; in the frames before all do.
         """
         first = max(MATCHED, newest - HISTORY)
         weights = np.zeros(newest, np.float32)
@@ -238,9 +248,9 @@ class MotionField:
         energy = 0.0
         for i in range(MATCHED):
             rows = slice(first - i, newest - i)
-            now = self._steps[newest - i] if i else motion
-            past, norms = self._steps[rows], self._energy[rows]
-            if i == 0 and len(known) < len(motion):
+            now = self._probes[newest - i] if i else motion
+            past, norms = self._probes[rows], self._energy[rows]
+            if i == 0 and known is not None:
                 now, past = now[known], past[:, known]
                 norms = np.square(past).sum((1, 2))
             own = float(np.square(now).sum())
