@@ -22,12 +22,13 @@ def provenance() -> dict[str, Any]:
     """`revision` of the sources, `date` (UTC), `machine`, its `peak` at this moment (see
     `benchmark.kernels.peak`; once a process), and `command`: with the defaults of that revision it says all
     settings."""
+    name = Path(sys.argv[0]).name
     return {
         "revision": revision(),
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "machine": machine_name(),
         "peak": _peak(),
-        "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+        "command": shlex.join(["sags" if name == "__main__.py" else name, *sys.argv[1:]]),
     }
 
 
