@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from sags_node.kernels.jit import kernel
 from sags_node.types import U8
-from sags_node.vision.clarity import LASTING_S
 from sags_node.vision.picture_fit import GREEN
 
 BLOCK = 8  # px: of JPEG and its kin
@@ -19,34 +18,8 @@ EVERY = 16  # rows
 BLOCKY = 1.0
 
 
-class Compression(NamedTuple):
-    """Of one frame."""
-
-    is_hard: bool = False  # blocks show
-    is_usual: bool = True  # it is as it has been from the first frame on, or for long
-
-
-class CompressionWatch:
-    """Follows how the pictures of one camera are compressed."""
-
-    def __init__(self) -> None:
-        self._since_ns: int | None = None  # blocks show
-        self._is_first = True
-
-    def __call__(self, stamp_ns: int, picture: U8) -> Compression:
-        """Take a picture [H, W, 3] as it came: resized or rectified, it has no borders of blocks."""
-        is_first, self._is_first = self._is_first, False
-        if not is_blocky(picture):
-            self._since_ns = None
-            return Compression()
-        lasting_ns = round(LASTING_S * 1e9)
-        if self._since_ns is None or stamp_ns < self._since_ns:
-            self._since_ns = stamp_ns - lasting_ns if is_first else stamp_ns
-        return Compression(True, stamp_ns - self._since_ns >= lasting_ns)
-
-
 def is_blocky(picture: U8) -> bool:
-    """Whether blocks show in a picture [H, W, 3]."""
+    """Whether blocks show in a picture [H, W, 3] as it came. Resizing and rectifying hide them."""
     return bool(_excess(picture) > BLOCKY)
 
 

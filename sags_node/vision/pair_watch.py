@@ -14,7 +14,7 @@ import numpy as np
 
 from sags_node.kernels.jit import kernel
 from sags_node.types import F32, I64, U8, Finding, RectifiedPair, StereoFrame
-from sags_node.vision.blocks import CompressionWatch
+from sags_node.vision.blocks import is_blocky
 from sags_node.vision.clarity import LENS, SMOKE, Clarity, mean_difference, structure
 from sags_node.vision.pyramid import pyramids
 from sags_node.vision.standing import Standing
@@ -76,7 +76,6 @@ class PairWatch:
     def __init__(self) -> None:
         self._standing = Standing()
         self._clarity = Clarity()
-        self._compression = CompressionWatch()
         self._history: deque[tuple[F32, F32]] = deque(maxlen=HISTORY)
 
     @property
@@ -88,8 +87,7 @@ class PairWatch:
         """Take one frame, raw and rectified."""
         found = self._look(frame, pair)
         learn = not any(code.startswith("picture") for code, _ in found)
-        compression = self._compression(frame.t_capture_ns, frame.left)
-        if compression.is_hard:
+        if is_blocky(frame.left):  # learnt all the same: on D4D leaving it out cost more than it spared
             found = [*found, _COMPRESSED]
         self._standing.update(frame.t_capture_ns, found)
         left = right = ""
@@ -98,7 +96,7 @@ class PairWatch:
                 left = left or text
             if not code.startswith("picture"):
                 right = right or text
-        return Verdict(left, right, learn and compression.is_usual)
+        return Verdict(left, right, learn)
 
     def _look(self, frame: StereoFrame, pair: RectifiedPair) -> list[Finding]:
         """What is wrong in one frame."""

@@ -196,7 +196,7 @@ LASTING: dict[str, tuple[Callable[[StereoFrame, StereoFrame], StereoFrame], str,
     "both compressed": (
         lambda f, before: both(lambda picture: _jpeg(picture, 6))(f),
         "picture_compressed",
-        Verdict("", "", False),
+        Verdict(),
     ),
 }  # fmt: skip
 
@@ -222,7 +222,7 @@ def test_an_eye_is_compared_with_the_other_and_with_a_moment_ago(
             assert codes == []
 
 
-def test_what_is_compressed_hard_from_the_first_picture_on_is_learnt(
+def test_what_is_compressed_hard_from_the_first_picture_on_is_said_too(
     session: Session, moving: list[StereoFrame]
 ) -> None:
     watch, rectify = PairWatch(), Rectifier(session.rig, *session.working_size)
