@@ -613,10 +613,10 @@ class MappingConfig(Section):
     skip_duplicates: bool = Field(True, description="a frame equal to its predecessor is not mapped again")
     skip_depth: bool = Field(True, description="when time is short, match depth in some of the frames only")
     skip_fitted: bool = Field(True, description="when time is short, refine where it fits worst only")
-    field: bool = Field(
-        True,
+    field: bool | None = Field(
+        None,
         description="remember how tissue moves: hidden tissue goes on as it did before, and motion is "
-        "predicted to the moment of a display",
+        "predicted to the moment of a display; default: once an anchor or a view asks for `ahead_ms`",
     )
     skip_still: bool = Field(True, description="while nothing moves: no matching, a step where it pays most")
 

@@ -72,7 +72,7 @@ class Pipeline:
             affordable(config, width, height),
             config.mapping.smoothing,
             unhurried=config.mapping.budget_ms >= UNHURRIED_MS,
-            field=config.mapping.field,
+            field=config.mapping.field is True,
         )
         self._tracker: CameraTracker | None = None
         if vision.pose == "estimate":
@@ -104,6 +104,11 @@ class Pipeline:
         self._still.forget()
         self._mapped = None
         self._unwatched = 0.0
+
+    def foresee(self) -> None:
+        """Somebody wants motion predicted. Any thread may call this."""
+        if self._config.mapping.field is not False:
+            self.mapper.remember_motion()
 
     @property
     def newest(self) -> FrameResult | None:

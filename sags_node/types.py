@@ -230,7 +230,7 @@ class Snapshot:
     camera: Camera
     loss: float  # mean absolute colour residual over tissue, last step
     counts: Mapping[str, int] = field(default_factory=dict)  # inserted, removed, iterations, ...
-    forecast: Forecast | None = None  # None: `mapping.field` is off, or too little is known yet
+    forecast: Forecast | None = None  # None: nobody asks for it, or too little is known yet
 
 
 @dataclass(frozen=True, slots=True)
@@ -364,5 +364,5 @@ class NodeHealth:
     connections: Mapping[str, Mapping[str, int]] = field(default_factory=dict)  # socket -> open, refused
     views: Mapping[str, ViewStatus] = field(default_factory=dict)  # those that consumers asked for, by name
     rung: RungState | None = None  # None: fixed steps, or no frame yet
-    motion: MotionState | None = None  # None: `mapping.field` is off, or too little is known yet
+    motion: MotionState | None = None  # None: nobody asks for it, or too little is known yet
     clock: ClockStatus | None = None  # None: a recording, or pictures without stamps

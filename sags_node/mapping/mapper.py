@@ -53,7 +53,6 @@ LOST_COVERAGE = 0.3  # of the tissue
 FIRST_RATES = Rates().scaled(4.0)
 UNHURRIED_RATES = 0.6  # measured with six steps: +0.3 dB; with one step a frame it loses as much
 NODE_STEP_PX = 0.08
-REMEMBERED_SCALE = 0.75  # of the working size: who must draw smaller has no time to remember motion
 FINE_FLOW, COARSE_FLOW = 4, 6  # px between patches
 
 
@@ -177,6 +176,11 @@ class Mapper:
         """Whether there is time for several steps a frame. They are shorter then, and the flow is finer."""
         self._flow = OpticalFlow(FINE_FLOW if unhurried else COARSE_FLOW)
         self._rates = Rates().scaled(UNHURRIED_RATES) if unhurried else Rates()
+
+    def remember_motion(self) -> None:
+        """From now on, see `mapping.motion_field`. Any thread may call this."""
+        if self._field is None:
+            self._field = MotionField()
 
     def restart(self) -> None:
         """Forget the model; the next frame, or this one if it is being taken in, makes a new one."""
@@ -398,9 +402,6 @@ class Mapper:
         """Take the nodes' places at the end of a frame into the field; what it expects next."""
         deformation, model = self._deformation, self.model
         if self._field is None or deformation is None:
-            return None
-        if self._scale < REMEMBERED_SCALE:
-            self._field.forget()
             return None
         self._field.take(deformation.nodes, deformation.seen, t_ns)
         expected = self._field.forecast()
