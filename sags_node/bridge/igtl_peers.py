@@ -90,7 +90,7 @@ class Peers:
         with self._lock:
             for peer in self._peers.values():
                 peer.waiting[device] = (message, limit)
-        self._wake()
+            self._wake()
 
     def greet(self, device: str, message: bytes) -> None:
         """Give a message to all peers, and to each who comes later."""
@@ -98,14 +98,19 @@ class Peers:
         self.send(device, message)
 
     def close(self) -> None:
-        """Cut all connections."""
-        self._stopping = True
-        self._wake()
-        self._thread.join()
+        """Cut all connections. What is sent from now on goes nowhere."""
+        with self._lock:
+            self._stopping = True
+        self._thread.join()  # it looks every `LOOK` s
+        self._bell.close()
+        self._ring.close()
 
     # ---- the thread ----------------------------------------------------------------------------------------
 
     def _wake(self) -> None:
+        """Under the lock: after `_stopping` the bell may be gone."""
+        if self._stopping:
+            return
         try:
             self._ring.send(b"\0")
         except BlockingIOError:
@@ -129,8 +134,7 @@ class Peers:
             self._watch_writable()
         for peer in list(self._peers.values()):
             self._drop(peer)
-        for opened in (self._listener, self._bell, self._ring):
-            opened.close()
+        self._listener.close()
         self._selector.close()
 
     def _accept(self) -> None:

@@ -24,6 +24,7 @@ from pyigtl.messages import PointMessage
 from sags_node.bridge import igtl
 from sags_node.bridge.feed import Place
 from sags_node.bridge.igtl import MAX_BODY_BYTES
+from sags_node.bridge.igtl_peers import Peers
 from sags_node.bridge.openigtlink import Options, request_of, run_openigtlink
 from sags_node.geometry import invert, transform, unproject
 from sags_node.overlay.stream import OverlayStream
@@ -337,6 +338,14 @@ def test_strangers_are_cut_off_and_disturb_nobody(tmp_path: Path, program: Path)
             until(lambda: len(joined.came) > before + 20)
             for stranger in crowd:
                 stranger.close()
+
+
+def test_an_answer_that_comes_after_the_end_goes_nowhere() -> None:
+    """The requests' thread may still say something while the bridge ends."""
+    peers = Peers("127.0.0.1", 0, lambda _: None, lambda: None)
+    peers.start()
+    peers.close()
+    peers.send("SagsAnswer", b"late")
 
 
 def test_a_taken_port_and_an_unknown_output_are_said(tmp_path: Path) -> None:
