@@ -292,6 +292,9 @@ def bench_stream(
 )
 @click.option("--seeds", type=click.IntRange(1), default=3, show_default=True, help="Fits of each variant.")
 @click.option("--variant", "only", multiple=True, metavar="NAME", help="Only this one; may be given again.")
+@click.option(
+    "--set", "changes", multiple=True, metavar="KEY=VALUE", help="A setting of every variant, as in sags fit."
+)
 @lpips_option
 @table_option
 @as_json
@@ -302,6 +305,7 @@ def bench_ablation(
     hold_out: int,
     seeds: int,
     only: tuple[str, ...],
+    changes: tuple[str, ...],
     lpips_weights: Path | None,
     out: Path | None,
     json_out: bool,
@@ -325,7 +329,9 @@ def bench_ablation(
     check_files(out)
     session = open_launched(path, [*overrides, "source.loop:=false", "source.pace:=step"])
     with progress("measuring") as advance:
-        measured = ablation.measure_ablation(session, warm_up, iterations, options, advance, seeds, only)
+        measured = ablation.measure_ablation(
+            session, warm_up, iterations, options, advance, seeds, only, changes
+        )
     for table in [measured] if json_out else ablation.tables(measured):
         show(table)
     write_json(out, measured)

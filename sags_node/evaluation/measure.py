@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -13,6 +14,7 @@ from sags_node.config import Box
 from sags_node.engine.rasterizer.rasterize import make_rasterizer, to_view
 from sags_node.errors import UsageError
 from sags_node.evaluation import calibration, metrics
+from sags_node.evaluation.carried import Seen, carried
 from sags_node.evaluation.gallery import Gallery
 from sags_node.evaluation.lpips import Lpips
 from sags_node.evaluation.spool import RunFacts, Spool, SpooledFrame
@@ -23,6 +25,8 @@ from sags_node.geometry import transform
 from sags_node.mapping.right_eye import right_eye_mask
 from sags_node.types import F32, F64, I64, U8, Bool, Camera, Gaussians, RectifiedPair, Reference, StereoFrame
 from sags_node.vision.rectify import Rectifier
+
+PREDICTED = 3  # frames ahead, at most
 
 Figures = dict[str, float]
 Progress = Callable[[str, int], None]  # what is going on, frames done
@@ -68,9 +72,7 @@ class FrameRow:
 
     frame_id: int
     seconds: float  # on the recording's clock
-    figures: dict[
-        str, Figures
-    ]  # online, predict, heldout, between, novel, depth, measured_depth: those that apply
+    figures: dict[str, Figures]  # those of `summary.GROUPS` that apply
     facts: RunFacts | None = None  # None: held out, or dropped by the run
     track: TrackErrors | None = None
     poses: Poses | None = None  # None: the session has none, or the run was given them
@@ -79,12 +81,17 @@ class FrameRow:
 
 @dataclass(slots=True)
 class _Before:
-    """The last processed frame, from which the next one is predicted."""
+    """A processed frame, from which later ones are predicted."""
 
     shown: SpooledFrame
     given: Camera  # as the session says
     truth: F32
     seconds: float  # on the recording's clock
+
+    def seen(self, weight: float) -> Seen:
+        """As a part of the mean of several, with a share of `weight`."""
+        snapshot = self.shown.snapshot
+        return Seen(snapshot.gaussians, snapshot.camera, self.truth, self.shown.tissue, weight)
 
 
 @dataclass(slots=True)
@@ -138,7 +145,7 @@ class Measurer:
         self._tracks: PointTracks | None = None
         self._pose = pose
         self._rigid = RigidOdometry()
-        self._before: _Before | None = None
+        self._earlier: deque[_Before] = deque(maxlen=PREDICTED)  # the latest first
         self._held: _HeldOut | None = None
 
     def run(self, frames: Iterable[StereoFrame], progress: Progress) -> None:
@@ -149,8 +156,8 @@ class Measurer:
             place = self._places.get(frame.frame_id)
             if place is not None:
                 self.rows.append(self._processed(frame, pair, seconds, place))
-            elif self._options.holds_out(frame.frame_id) and self._before is not None:
-                self.rows.append(self._held_out(frame, pair, seconds, self._before))
+            elif self._options.holds_out(frame.frame_id) and self._earlier:
+                self.rows.append(self._held_out(frame, pair, seconds, self._earlier[0]))
             else:
                 self.rows.append(FrameRow(frame.frame_id, seconds, {}))
             progress("measuring", len(self.rows))
@@ -160,8 +167,9 @@ class Measurer:
         truth = metrics.as_float(pair.left)
         costly = place % self._options.every == 0
         figures = {"online": self._quality(metrics.as_float(shown.rgb), truth, shown.tissue, costly)}
-        if self._before is not None:
-            figures["predict"] = self._predict(self._before, shown, truth, seconds)
+        for frames, before in enumerate(self._earlier, 1):
+            group = "predict" if frames == 1 else f"predict_{frames}"
+            figures[group] = self._predict(before, shown, truth, seconds)
         if costly and pair.right is not None:
             figures["novel"] = {"psnr": self._novel(shown, pair.right, frame)}
         track, counts = None, None
@@ -173,9 +181,10 @@ class Measurer:
             track = self._follow(shown, frame.reference, pair.camera)
         self.gallery.offer(place, shown, pair.left, figures["online"]["psnr"])
         after = _Before(shown, pair.camera, truth, seconds)
-        if self._held is not None and self._before is not None and seconds > self._before.seconds:
-            self._held.row.figures["between"] = self._between(self._before, self._held, after)
-        self._held, self._before = None, after
+        if self._held is not None and seconds > self._earlier[0].seconds:
+            self._held.row.figures["between"] = self._between(self._earlier[0], self._held, after)
+        self._held = None
+        self._earlier.appendleft(after)
         poses = self._poses(frame, pair, shown)
         return FrameRow(frame.frame_id, seconds, figures, shown.facts, track, poses, counts)
 
@@ -212,18 +221,24 @@ class Measurer:
         guess = self._draw(extrapolated(before.shown.snapshot, seconds - before.seconds), camera)
         tissue, truth = self._tissue_of(frame, pair), metrics.as_float(pair.left)
         quality = self._quality(guess, truth, tissue, costly=True)
+        quality["copy_psnr"] = metrics.psnr(before.truth, truth, tissue)
         row = FrameRow(frame.frame_id, seconds, {"heldout": quality})
         self._held = _HeldOut(row, camera, truth, tissue)
         return row
 
     def _between(self, before: _Before, held: _HeldOut, after: _Before) -> Figures:
-        """A held-out frame, drawn when the next one is known; beside it the mean of both pictures."""
+        """A held-out frame, drawn when the next one is known; beside it both pictures carried there, and the
+        mean of both as they are."""
         share = (held.row.seconds - before.seconds) / (after.seconds - before.seconds)
         states = before.shown.snapshot.gaussians, after.shown.snapshot.gaussians
-        guess = self._draw(between(*states, share), held.camera)
+        middle = between(*states, share)
+        guess = self._draw(middle, held.camera)
+        around = [before.seen(1 - share), after.seen(share)]
+        brought = carried(self._rasterizer, middle, held.camera, around)
         mean = before.truth + np.float32(share) * (after.truth - before.truth)
         return {
             "psnr": metrics.psnr(guess, held.truth, held.tissue),
+            "carried_psnr": metrics.psnr(brought, held.truth, held.tissue),
             "mean_psnr": metrics.psnr(mean, held.truth, held.tissue),
         }
 

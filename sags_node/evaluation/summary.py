@@ -20,8 +20,10 @@ from sags_node.evaluation.trajectory import trajectory_errors
 GROUPS = {
     "online": ("psnr", "ssim", "lpips"),
     "predict": ("psnr", "copy_psnr"),
-    "heldout": ("psnr", "ssim", "lpips"),
-    "between": ("psnr", "mean_psnr"),
+    "predict_2": ("psnr", "copy_psnr"),
+    "predict_3": ("psnr", "copy_psnr"),
+    "heldout": ("psnr", "ssim", "lpips", "copy_psnr"),
+    "between": ("psnr", "carried_psnr", "mean_psnr"),
     "novel": ("psnr",),
     "depth": ("median_mm", "p90_mm", "rmse_mm", "coverage"),
     "measured_depth": ("median_mm", "p90_mm", "rmse_mm", "coverage"),
@@ -40,8 +42,10 @@ def summarise(
 
     A figure of quality is the mean over the frames that have it, and again over each named segment
     (`online.motion.psnr`; first and last frame belong to it). Track errors are pooled over points and frames.
-    `predict.copy_psnr` is the picture before, shown again: on tissue that hardly moves it is hard to beat.
-    `between` is `heldout` once the next frame is known; `between.mean_psnr` the mean of the pictures around.
+    `predict` is a frame said by the one before, `predict_2` and `predict_3` by the second and third before;
+    `copy_psnr` is that picture, shown again: on tissue that hardly moves it is hard to beat.
+    `between` is `heldout` once the next frame is known; `between.mean_psnr` the mean of the pictures around,
+    `between.carried_psnr` the same with both carried along the model's motion, see `carried`.
     `pose` compares with the session's poses those of a run that was not given them; `pose.rigid_...` are
     those of the baseline, see `RigidOdometry`.
     """

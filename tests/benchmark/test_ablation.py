@@ -22,7 +22,7 @@ def test_all_variants_are_measured_on_the_same_frames(
     phantom_session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     small = {
-        name: dataclasses.replace(settings, max_gaussians=800, shape=FieldShape(cells=8, channels=16))
+        name: dataclasses.replace(settings, shape=FieldShape(cells=8, channels=16))
         for name, settings in ablation.VARIANTS.items()
     }
     monkeypatch.setattr(ablation, "VARIANTS", small)
@@ -37,6 +37,7 @@ def test_all_variants_are_measured_on_the_same_frames(
     monkeypatch.setattr(Fit, "start", noted)
     out = tmp_path / "ablation.json"
     arguments = ["source.frames:=12", "--warm-up", "2", "--iterations", "3", "--seeds", "2"]
+    arguments += ["--set", "max_gaussians=800"]
     arguments += [f"--variant={name}" for name in small if name != "nodes"] + ["--out", str(out), "--json"]
     result = CliRunner().invoke(main, ["bench", "ablation", str(phantom_session), *arguments])
     assert result.exit_code == 0, result.output

@@ -214,8 +214,12 @@ def test_a_perfect_model_is_measured_as_perfect(frames: list[StereoFrame]) -> No
     assert summary["online"]["psnr"] > 60  # the left pictures are its own renders, to the last bit
     assert summary["online"]["ssim"] > 0.999
     assert summary["predict"]["psnr"] > 45  # rounding to grey levels alone is 58 dB
-    assert summary["heldout"]["psnr"] > 45
-    assert summary["between"]["psnr"] > 45 > summary["between"]["mean_psnr"] + 3
+    assert summary["predict_3"]["psnr"] > 45  # motion is even
+    copies = [summary[group]["copy_psnr"] for group in ("predict", "predict_2", "predict_3")]
+    assert copies == sorted(copies, reverse=True) and copies[0] > copies[2] + 3
+    assert summary["heldout"]["psnr"] > 45 > summary["heldout"]["copy_psnr"] + 3
+    for figure in ("psnr", "carried_psnr"):
+        assert summary["between"][figure] > 45 > summary["between"]["mean_psnr"] + 3
     assert summary["novel"]["psnr"] > 45  # despite the other exposure, and the instrument
     assert summary["depth"]["median_mm"] < 0.01
     assert summary["depth"]["coverage"] > 0.99

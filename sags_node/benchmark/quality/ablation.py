@@ -25,7 +25,7 @@ from sags_node.evaluation.measure import Options
 from sags_node.fitting.clip import Clip, ClipFrame, read_clip
 from sags_node.fitting.fit import Fit
 from sags_node.fitting.score import score, score_between, score_depth, score_tracks
-from sags_node.fitting.settings import ONLINE, PAPER, FitSettings
+from sags_node.fitting.settings import ONLINE, PAPER, FitSettings, with_changes
 from sags_node.geometry import scale_intrinsics
 from sags_node.kernels.threads import configure_threads
 from sags_node.session import Session
@@ -72,6 +72,7 @@ def measure_ablation(
     advance: Advance,
     seeds: int = 3,
     only: Sequence[str] = (),
+    changes: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Fit and measure every variant.
 
@@ -83,12 +84,13 @@ def measure_ablation(
         advance: called with what is going on.
         seeds: how many fits of each variant.
         only: names of variants; none: all.
+        changes: of the settings of every variant, as `with_changes` takes them.
 
     Returns:
         The table, keys as benchmarks/README.md lists them.
 
     Raises:
-        UsageError: there is no such variant.
+        UsageError: there is no such variant, or no such setting.
         SagsError: the recording cannot be read or is too short, or no frame has depth enough.
     """
     unknown = [name for name in only if name not in VARIANTS]
@@ -100,7 +102,11 @@ def measure_ablation(
     clip = read_clip(session, options.holds_out, lambda done: advance(done, count, "reading"))
     known, ahead = _split(clip)
     chosen = {
-        name: replace(settings, warm_up=warm_up if settings.schedule == "paper" else 0, iterations=iterations)
+        name: replace(
+            with_changes(settings, changes),
+            warm_up=warm_up if settings.schedule == "paper" else 0,
+            iterations=iterations,
+        )
         for name, settings in VARIANTS.items()
         if not only or name in only
     }
