@@ -15,6 +15,7 @@ from sags_node.findings import by_code, in_words
 from sags_node.node import Node
 from sags_node.sources.ros_graph import domain_of, where
 from sags_node.terminal import text
+from sags_node.terminal.console import tell
 from sags_node.terminal.notices import Notices
 from sags_node.types import NodeHealth
 
@@ -34,9 +35,9 @@ def run_node(node: Node, seconds: float | None, console: Console) -> NodeHealth:
     try:
         if console.is_terminal:
             with Live(console=console, refresh_per_second=REFRESH, transient=True) as live:
-                _watch(node, deadline, console, lambda health: live.update(health_table(health)))
+                _watch(node, deadline, lambda health: live.update(health_table(health)))
         else:
-            _watch(node, deadline, console, lambda health: None)
+            _watch(node, deadline, lambda health: None)
     except KeyboardInterrupt:
         console.print("stopping")
     finally:
@@ -57,8 +58,8 @@ def inputs_text(config: LaunchConfig) -> list[str]:
     return lines
 
 
-def _watch(node: Node, deadline: float | None, console: Console, show: Callable[[NodeHealth], None]) -> None:
-    notices = Notices(lambda line: console.print(line, markup=False, soft_wrap=True))
+def _watch(node: Node, deadline: float | None, show: Callable[[NodeHealth], None]) -> None:
+    notices = Notices(tell)
     while not node.wait(timeout=1 / REFRESH):
         health = node.health()
         notices.update(by_code(health.warnings))

@@ -23,7 +23,7 @@ from typing import Any
 from sags_node.config import LaunchConfig, LiveSource
 from sags_node.errors import SagsError
 from sags_node.findings import by_code
-from sags_node.health import Statistics
+from sags_node.health import Statistics, in_a_line
 from sags_node.kernels.threads import configure_threads
 from sags_node.latest import Latest
 from sags_node.messaging import content
@@ -32,6 +32,7 @@ from sags_node.messaging.publisher import Publisher
 from sags_node.node_operations import NodeState, Operations
 from sags_node.pipeline import Pipeline
 from sags_node.recording.child import RecorderProcess
+from sags_node.service_manager import ServiceManager
 from sags_node.sources.clock import CaptureClock
 from sags_node.sources.source import Source
 from sags_node.types import DrawnView, FrameResult, NodeHealth, RectifiedPair, StereoFrame, StereoRig
@@ -50,12 +51,18 @@ class Node:
     """Runs a source through the pipeline and publishes the results, until the source ends or `stop`."""
 
     def __init__(
-        self, config: LaunchConfig, rig: StereoRig, source: Source, on_result: OnResult | None = None
+        self,
+        config: LaunchConfig,
+        rig: StereoRig,
+        source: Source,
+        on_result: OnResult | None = None,
+        manager: ServiceManager | None = None,
     ) -> None:
         """Bind the sockets and prepare the pipeline; nothing runs yet.
 
         Args:
             on_result: called on the publishing thread after each result has been sent.
+            manager: told how the node fares.
 
         Raises:
             SagsError: an endpoint cannot be bound, or the configuration does not fit the rig.
@@ -75,6 +82,7 @@ class Node:
         self._pictures: Latest[tuple[RectifiedPair, int]] = Latest(on_put=self._wake_publishing)  # and epoch
         self._live = isinstance(config.source, LiveSource) or config.source.pace == "realtime"
         self._clock = CaptureClock()  # of live pictures
+        self._manager = manager or ServiceManager({})
         self._wake = os.eventfd(0, os.EFD_NONBLOCK)
         self._frames: Latest[tuple[StereoFrame, float]] = Latest()  # and when it came
         self._results: Latest[FrameResult] = Latest(on_put=self._wake_publishing)
@@ -106,6 +114,7 @@ class Node:
     def start(self) -> None:
         for thread in self._threads:
             thread.start()
+        self._manager.ready()
 
     def wait(self, timeout: float | None = None) -> bool:
         """Wait for the end of the source; True when the node has ended.
@@ -123,6 +132,7 @@ class Node:
 
     def stop(self) -> None:
         """End capture first, then mapping, drawing and publishing: the last health message gets out."""
+        self._manager.stopping()
         self._stopping.set()
         self._source.stop()
         self._frames.close()
@@ -198,6 +208,7 @@ class Node:
         give = self._results.put if self._live else self._results.hand_over
         dropped = 0
         while not self._frames.closed:
+            self._manager.turned("mapping")
             self._operations.for_mapping.serve()
             ending = self._stopping.is_set() or self._error is not None
             if self._state.paused.is_set() and not self._live and not ending:
@@ -252,6 +263,7 @@ class Node:
         next_health = time.monotonic()
         warned: tuple[str, ...] = ()
         while not self._results.closed:
+            self._manager.turned("publishing")
             if self._publisher.poll(timeout_ms=100, wake_fd=self._wake):
                 os.eventfd_read(self._wake)
             if self._state.parameters_changed.is_set():
@@ -268,7 +280,9 @@ class Node:
             if time.monotonic() >= next_health or self._state.status_due.is_set() or warned != before:
                 self._state.status_due.clear()
                 next_health = time.monotonic() + HEALTH_PERIOD
-                self._publisher.publish_health(self.health())
+                health = self.health()
+                self._publisher.publish_health(health)
+                self._manager.status(in_a_line(health))
         self._publisher.publish_health(self.health())
 
     def _send(self, result: FrameResult) -> None:
@@ -297,6 +311,7 @@ class Node:
     def _handlers(self) -> dict[str, Callable[[dict[str, Any]], Any]]:
         return self._operations.handlers() | {
             "get_status": lambda args: content.status(self.health(), self._last_sent),
+            "get_health": lambda args: content.health_answer(self.health()),
             "start_recording": self._start_recording,
             "stop_recording": lambda args: self._recorder.stop(),
             "take_snapshot": lambda args: self._recorder.snapshot(),
