@@ -21,7 +21,7 @@ from sags_node.messaging.cdr import Content, type_hash
 from sags_node.messaging.node_clock import stamps
 from sags_node.messaging.peers import Peers
 from sags_node.messaging.rundir import Connection, RunDirectory
-from sags_node.messaging.security import KeyPair, Seldom, authenticated, check_endpoint
+from sags_node.messaging.security import Gate, Seldom, authenticated, check_endpoint
 from sags_node.messaging.sockets import bind, limit, receive_frames
 from sags_node.messaging.wire import PROTOCOL, Message, Meta, encode
 from sags_node.types import DrawnView, FrameResult, NodeHealth, RectifiedPair
@@ -95,20 +95,19 @@ class Publisher:
         self._seldom = Seldom()
         self._context = zmq.Context()
         try:
-            keys = self._resources.enter_context(authenticated(self._context, config))
+            gate = self._resources.enter_context(authenticated(self._context, config))
             always = {"ping": lambda args: "pong", "get_clock": lambda args: stamps()}
-            self._bind(config, keys, {**always, **(handlers or {})})
+            self._bind(config, gate, {**always, **(handlers or {})})
         except BaseException:
             self.close()
             raise
 
-    def _bind(
-        self, config: PublishConfig, keys: KeyPair | None, handlers: Mapping[str, control.Handler]
-    ) -> None:
+    def _bind(self, config: PublishConfig, gate: Gate, handlers: Mapping[str, control.Handler]) -> None:
+        keys = gate.keys
         self._data = self._context.socket(zmq.XPUB)
         limit(self._data, SEND_HIGH_WATER, SUBSCRIPTIONS_HIGH_WATER, MAX_SUBSCRIPTION_BYTES)
         self._poller = zmq.Poller()
-        self._watch("data", self._data, MAX_SUBSCRIPTIONS_BYTES)
+        self._watch("data", self._data, MAX_SUBSCRIPTIONS_BYTES, gate)
         self._data.setsockopt(
             zmq.XPUB_VERBOSE, 1
         )  # each new peer's subscription is seen: the last values are due
@@ -119,7 +118,7 @@ class Publisher:
         if config.control:
             router = self._context.socket(zmq.ROUTER)
             limit(router, control.SEND_HIGH_WATER, control.RECEIVE_HIGH_WATER, control.MAX_REQUEST_BYTES)
-            self._watch("control", router, control.MAX_UNANSWERED_BYTES)
+            self._watch("control", router, control.MAX_UNANSWERED_BYTES, gate)
             control_endpoint = bind(router, config.control, "publish.control", keys)
             self._control = control.ControlServer(router, handlers, self._peers["control"].took)
         self.connection = Connection(
@@ -133,8 +132,8 @@ class Publisher:
         )
         self._run.write_connection(self.connection)
 
-    def _watch(self, name: str, socket: zmq.Socket[bytes], max_untaken: int) -> None:
-        self._peers[name] = Peers(socket, name, max_untaken)
+    def _watch(self, name: str, socket: zmq.Socket[bytes], max_untaken: int, gate: Gate) -> None:
+        self._peers[name] = Peers(socket, name, max_untaken, gate.revocations)
         self._poller.register(socket, zmq.POLLIN)
 
     @property
