@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import socket
 import stat
 import subprocess
 import sys
@@ -386,6 +387,25 @@ def test_random_bytes_on_both_ports_while_a_client_receives(
             assert _resident_mb() - before < 30
         with ControlClient(connection.control, keys=mine) as asker:
             assert asker.request("ping") == "pong"
+
+
+@pytest.mark.parametrize(
+    "said", [b"", b"GET / HTTP/1.1\r\n\r\n", b"\xff" + bytes(8) + b"\x7f"], ids=["nothing", "http", "half"]
+)
+def test_raw_connections_leave_no_descriptor(tmp_path: Path, said: bytes) -> None:
+    def descriptors() -> int:
+        return len(os.listdir("/proc/self/fd"))
+
+    with publisher(tmp_path / "run") as running:
+        before = descriptors()
+        for endpoint in (running.connection.data[-1], str(running.connection.control)):
+            host, port = endpoint.removeprefix("tcp://").split(":")
+            for _ in range(100):
+                with socket.create_connection((host, int(port))) as stranger:
+                    stranger.sendall(said)
+        until(lambda: running.connections["data"]["refused"] == 100)
+        until(lambda: running.connections["control"]["refused"] == 100)
+        until(lambda: descriptors() == before, seconds=10)
 
 
 def test_a_peer_of_the_old_protocol_is_no_subscriber(tmp_path: Path) -> None:
