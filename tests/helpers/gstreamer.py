@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +11,7 @@ import pytest
 from waiting import until
 
 from sags_node.errors import SagsError
+from sags_node.processes import children
 from sags_node.sources.gst_process import installed
 
 NEEDED = ("appsink", "videoconvert", "videotestsrc", "deinterlace")
@@ -44,13 +44,7 @@ def raw_file(file: Path, pictures: np.ndarray, rate: int, interlaced: bool = Fal
 
 def pipelines() -> list[int]:
     """Process ids of the pipelines that this process runs."""
-    found = []
-    for task in Path("/proc/self/task").iterdir():
-        with suppress(OSError):  # a thread or a process that ends meanwhile
-            for child in (task / "children").read_text().split():
-                if b"gst_child" in Path(f"/proc/{child}/cmdline").read_bytes():
-                    found.append(int(child))
-    return found
+    return children("gst_child")
 
 
 def kill_pipelines() -> None:

@@ -17,7 +17,6 @@ from places import ROOT
 from pydantic import ValidationError
 from waiting import until
 
-from sags_node.benchmark.node.inputs import measure_inputs
 from sags_node.calibrate.eyes import look
 from sags_node.config import GeometryConfig, GstSource, LaunchConfig
 from sags_node.doctor import examine
@@ -377,11 +376,3 @@ def test_a_picture_shows_both_eyes(tmp_path: Path) -> None:
     assert np.abs(seen["left"][0].astype(int) - seen["left"][1]).mean() > 20
     assert np.abs(seen["left"][0].astype(int) - seen["right"][1]).mean() < 1
     assert np.abs(seen["left"][1].astype(int) - seen["right"][0]).mean() < 1
-
-
-def test_what_a_pair_costs_is_measured() -> None:
-    (row,) = measure_inputs(0.5, "gst, two", lambda done, total: None)
-    assert row["pairs"] > 0 and row["unequal"] == 0
-    assert row["node_ms"] > 0 and row["sender_ms"] > 0 and row["latency_ms_p99"] >= row["latency_ms_p50"]
-    with pytest.raises(UsageError, match="the ways are gst, two branches, "):
-        measure_inputs(0.5, "telepathy", lambda done, total: None)

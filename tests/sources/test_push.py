@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import cv2
@@ -14,7 +13,7 @@ import numpy as np
 import pytest
 import zmq
 from live_taking import Taker
-from places import HELPERS
+from sending import sending, stereo_sender
 from stereo_sender import paint_number
 from waiting import until
 
@@ -31,19 +30,11 @@ ANYWHERE = "tcp://127.0.0.1:*"
 SIZE = 1280, 1024
 
 
-@contextmanager
 def simulator(
     source: PushedPictures, session: Path, seconds: float, *settings: str
-) -> Iterator[subprocess.Popen[str]]:
-    """Another process that sends; has begun when this returns."""
-    command = [sys.executable, HELPERS / "stereo_sender.py", "push", source.endpoint, session, str(seconds)]
-    process = subprocess.Popen([*command, *settings], stdout=subprocess.PIPE, text=True)
-    try:
-        assert process.stdout is not None and process.stdout.readline() == "sending\n"
-        yield process
-    finally:
-        process.kill()
-        process.communicate()
+) -> AbstractContextManager[subprocess.Popen[bytes]]:
+    """Another process that sends."""
+    return sending(stereo_sender("push", source.endpoint, session, seconds, *settings))
 
 
 @pytest.mark.parametrize("settings", [(), ("jpeg=1", "rate=15")], ids=["raw", "jpeg"])
@@ -56,27 +47,6 @@ def test_no_pair_is_mismatched_at_camera_rate(phantom_session: Path, settings: t
     assert len(taker.numbers) + source.dropped >= due - 4  # on the way when the process ended
     assert len(taker.numbers) >= 0.8 * due
     assert taker.newest is not None and taker.newest.left.shape == (1024, 1280, 3)
-
-
-def test_lag_stays_bounded_with_a_stalled_taker(phantom_session: Path) -> None:
-    """Whoever takes four frames a second of thirty gets new ones: at most what two short queues hold."""
-    source = PushedPictures(PushSource(endpoint=ANYWHERE), SIZE)
-    with Taker(source, pause=0.25) as taker, simulator(source, phantom_session, 3.0):
-        time.sleep(3.0)
-    assert len(taker.ages) >= 6
-    # Four pairs wait for a taker, one is in its hands for 250 ms: 400 ms, and as much for a busy machine.
-    assert max(taker.ages[2:]) < 800
-
-
-def test_a_sender_that_was_killed_is_back_within_five_seconds(phantom_session: Path) -> None:
-    source = PushedPictures(PushSource(endpoint=ANYWHERE), SIZE)
-    with Taker(source) as taker:
-        with simulator(source, phantom_session, 60):
-            until(lambda: len(taker.numbers) > 5)
-        count = len(taker.numbers)
-        with simulator(source, phantom_session, 60):
-            until(lambda: len(taker.numbers) > count + 5, seconds=5)
-    assert taker.mismatched == 0
 
 
 @pytest.fixture
