@@ -92,13 +92,12 @@ def main() -> None:
     ]
     compressed = "jpeg" in said
     send = push(where, compressed) if way == "push" else dds(int(where), compressed, width / 320, session)
-    late_ns = round(1e9 * float(said.get("late", 0)))
     print("sending", flush=True)
     begun = time.monotonic()
     for number in range(round(float(seconds) * rate)):
         time.sleep(max(0.0, begun + number / rate - time.monotonic()))
         left, right = pairs[number % len(pairs)]
-        stamp_ns = time.time_ns() - late_ns
+        stamp_ns = time.time_ns()
         painted = stamp_ns // 1_000_000 % 60_000 if "clock" in said else number
         for picture in (left, right):
             paint_number(picture, painted % 2**BITS)

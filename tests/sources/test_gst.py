@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 from collections.abc import Iterator
@@ -201,6 +202,20 @@ def test_pictures_without_stamps_are_refused() -> None:
     assert "add do-timestamp=true" in in_words(str(raised.value), raised.value.debug)
 
 
+def test_pictures_that_change_their_size_are_refused(caplog: pytest.LogCaptureFixture) -> None:
+    """A camera that is set anew: what comes then would not fit the calibration."""
+    first, then = (SMALL.replace("is-live=true", "num-buffers=9"), SMALL.replace("320", "160"))
+    launch = f"concat name=c ! tee name=t  t. ! left.  t. ! right.  {first} ! c.  {then} ! c."
+    with open_pipeline(GstSource(launch=launch)) as source:
+        taking = threading.Thread(target=lambda: list(source))
+        taking.start()
+        until(lambda: "it will be opened again" in caplog.text)
+        source.stop()
+        taking.join(10)
+    changed = r"GStreamer: the pictures of (left|right) changed from 320x240 RGB to 160x240 RGB"
+    assert re.search(changed, caplog.text)
+
+
 def test_stamps_that_do_not_rise_are_left_out(caplog: pytest.LogCaptureFixture) -> None:
     said = {"slot": 0, "t_ns": 0, "age_ns": 0}
     sink = Sink("left")
@@ -339,6 +354,28 @@ def test_sixteen_bit_pictures_keep_the_tones_that_are_chosen(tmp_path: Path) -> 
     expected = (ramp[0] / 65535 - 0.25) / 0.25 * 255
     assert np.abs(both - expected[..., None]).max() < 2.0  # what 8 bit would be off, with steps of 4
     assert len(np.unique(both)) > 250
+
+
+@pytest.mark.parametrize(
+    ("bits", "through"), [(10, ""), (10, "! videoconvert dither=none ! video/x-raw,format=v210"), (12, "")]
+)
+def test_what_sdi_and_decoders_give_keeps_its_depth(tmp_path: Path, bits: int, through: str) -> None:
+    """YUV of 10 and 12 bit, and v210: 876 and 3504 steps from black to white; a quarter is chosen."""
+    black, steps = 64 << (bits - 10), 876 << (bits - 10)
+    height, width = 32, 64
+    luma = np.linspace(black + steps / 4, black + steps / 2, height * width).round().astype("<u2")
+    neutral = np.full(height * width // 2, 512 << (bits - 10), "<u2")
+    (tmp_path / "deep.raw").write_bytes(2 * (luma.tobytes() + neutral.tobytes()))
+    launch = (
+        f"filesrc location={tmp_path / 'deep.raw'} ! rawvideoparse format=i420-{bits}le width={width} "
+        f"height={height} framerate=30/1 {through}"
+    )
+    geometry = GeometryConfig(layout="side_by_side", levels=(0.25, 0.5))
+    frames, _ = take(GstSource(launch=launch, geometry=geometry), 99)
+    both = np.concatenate([frames[0].left, frames[0].right], axis=1)
+    expected = ((luma - black) / steps - 0.25).reshape(height, width, 1) / 0.25 * 255
+    assert np.abs(both - expected).max() < 2.0  # what 8 bit would be off, with steps of 4
+    assert len(np.unique(both)) > 0.95 * min(256, steps / 4)
 
 
 def test_encoded_files_are_decoded(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import subprocess
 import time
 from collections.abc import Iterator
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
 
 import cv2
@@ -20,6 +20,7 @@ from waiting import until
 from sags_node.client import ClientKeys, FrameSender
 from sags_node.config import PushSource
 from sags_node.errors import UsageError
+from sags_node.messaging import cdr
 from sags_node.messaging.security import read_key_pair, write_key_pair
 from sags_node.sources.push import PushedPictures
 from sags_node.types import U8
@@ -100,6 +101,27 @@ def test_a_wrong_size_is_told(source: PushedPictures) -> None:
 def test_a_wrong_stamp_is_told(source: PushedPictures) -> None:
     with FrameSender(source.endpoint) as sender:
         assert "source.stamps:=own" in sent_until_told(sender, numbered(1), numbered(1), stamp_ns=1)
+
+
+def test_each_sender_is_told_what_is_no_picture_of_an_eye(source: PushedPictures) -> None:
+    wrong = {
+        "pictures come on NAME/left/image_raw": ("middle/image_raw", numbered(1), "rgb8"),
+        "'32FC1' is not read; known encodings": ("left/image_raw", np.zeros((120, 160), np.float32), "32FC1"),
+        "159 px wide, which is odd": ("stereo/image_raw", numbered(1)[:, :159].copy(), "rgb8"),
+    }
+    with ExitStack() as senders:
+        told = {words: senders.enter_context(FrameSender(source.endpoint)) for words in wrong}
+
+        def send() -> bool:
+            stamp = time.time_ns()
+            for words, (name, array, encoding) in wrong.items():
+                told[words]._send(name, cdr.image(array, encoding, stamp), stamp)  # `send` would refuse it
+            time.sleep(0.05)
+            return all(sender.problem for sender in told.values())
+
+        until(send, seconds=10)
+        for words, sender in told.items():
+            assert words in str(sender.problem) and "\n" not in str(sender.problem)
 
 
 def test_damaged_files_and_messages_are_told_and_do_no_harm(source: PushedPictures) -> None:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import logging
 import os
+import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from live_taking import Taker
 from places import ROOT
@@ -14,10 +16,12 @@ from waiting import until
 
 from sags_node.config import LaunchConfig, Ros2Robot, Ros2Source, RosGraph
 from sags_node.errors import UsageError
+from sags_node.messaging import cdr
+from sags_node.messaging.topics import IMAGE, TF
 from sags_node.sources import ros2
 from sags_node.sources.robot import open_robot
 from sags_node.sources.ros2 import RosCameras, read_rig
-from sags_node.sources.ros_graph import domain_of
+from sags_node.sources.ros_graph import Graph, domain_of
 
 pytest.importorskip("cyclonedds", reason="ROS 2 needs: pip install 'sags-node[ros2]'")
 pytestmark = pytest.mark.live
@@ -80,6 +84,42 @@ def test_a_wrong_size_and_a_wrong_name_are_said(
             until(lambda: "nobody publishes /stereo/rihgt/image_raw" in caplog.text)
     assert f"domain {DOMAIN}, interface lo" in caplog.text
     assert taker.numbers == []
+
+
+def test_wrong_encodings_stamps_and_types_are_said(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each in a line of its own, and no picture gets through."""
+    monkeypatch.setattr(ros2, "QUIET_S", 0.3)
+    graph = Graph(RosGraph(domain=DOMAIN))
+    names = "/wrong/encoding", "/wrong/stamp", "/wrong/kind"
+    writers = [graph.writer(name, kind) for name, kind in zip(names, (IMAGE, IMAGE, TF), strict=True)]
+    picture = np.zeros((1024, 1280, 3), np.uint8)
+
+    def lines(*wanted: str) -> list[str]:
+        """Of a source with these two topics."""
+        caplog.clear()
+        said = config().model_copy(update={"left": wanted[0], "right": wanted[1]})
+        with Taker(RosCameras(said, SIZE)) as taker:
+            until(lambda: send() or len(caplog.messages) >= 2, seconds=10)
+        assert taker.numbers == []
+        return caplog.messages
+
+    def send() -> None:
+        now = time.time_ns()
+        writers[0].write(cdr.image(picture[..., 0].astype(np.float32), "32FC1", now), now)
+        writers[1].write(cdr.image(picture, "rgb8", now - 86_400 * 10**9), now)
+        writers[2].write(cdr.transform(np.eye(4), now), now)
+
+    with caplog.at_level(logging.WARNING):
+        both = lines("/wrong/encoding", "/wrong/stamp")
+        assert any(
+            "/wrong/encoding: left out: a picture encoded as '32FC1' is not read" in one for one in both
+        )
+        assert any("/wrong/stamp: left out: a picture's stamp is 86400.0 s old" in one for one in both)
+        silent = lines("/wrong/kind", "/wrong/kind")
+        assert "/wrong/kind is tf2_msgs/msg/TFMessage, not a picture topic; set source.left" in silent
+    assert not any("\n" in line for line in both + silent)
 
 
 def test_the_domain_is_that_of_the_launch_file_or_of_ros(monkeypatch: pytest.MonkeyPatch) -> None:
