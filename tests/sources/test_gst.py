@@ -356,6 +356,23 @@ def test_sixteen_bit_pictures_keep_the_tones_that_are_chosen(tmp_path: Path) -> 
     assert len(np.unique(both)) > 250
 
 
+def test_eyes_in_turn_live_also_where_pictures_are_lost() -> None:
+    """A camera whose pictures are white and black in turn, to the pixel: an exchanged eye would show."""
+    camera = (
+        "videotestsrc is-live=true pattern=blink "
+        "! video/x-raw,format=RGB,width=320,height=240,framerate=60/1 ! identity drop-probability=0.2"
+    )
+    config = GstSource(launch=camera, geometry=GeometryConfig(layout="frame_sequential"))
+    frames, _ = take(config, 40)
+    tones = {(int(frame.left[0, 0, 0]), int(frame.right[0, 0, 0])) for frame in frames}
+    assert tones in ({(0, 255)}, {(255, 0)})  # nothing tells which eye the first picture shows
+    for frame in frames:
+        assert (frame.left == frame.left[0, 0, 0]).all() and (frame.right == frame.right[0, 0, 0]).all()
+        assert abs(frame.t_capture_right_ns - frame.t_capture_ns - 1e9 / 60) < 1e5
+    steps = np.diff([frame.t_capture_ns for frame in frames]) * 30e-9  # pairs
+    assert (np.round(steps) > 1).any()  # some were lost
+
+
 @pytest.mark.parametrize(
     ("bits", "through"), [(10, ""), (10, "! videoconvert dither=none ! video/x-raw,format=v210"), (12, "")]
 )
