@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 from command_line import FREE_PORTS
-from gstreamer import kill_pipelines, need_gstreamer
+from gstreamer import BALL, apart, ball_moment, kill_pipelines, need_gstreamer
 from places import ROOT
 from sending import sending, stereo_sender
 from stereo_sender import read_number
@@ -35,11 +35,7 @@ DOMAIN = 60 + os.getpid() % 40  # away from nodes of this machine, and from test
 SMALL = ["vision.width:=320", "vision.height:=256", "mapping.max_gaussians:=2000"]
 SLOW_S, STALL_S = 0.2, 1.5
 PAUSES = [SLOW_S] * 8 + [STALL_S]  # of the first frames
-CLOCK = "animation-mode=wall-time motion=sweep"  # the ball goes round once a second
-BALL = (
-    f"videotestsrc is-live=true pattern=ball {CLOCK} "
-    "! video/x-raw,format=RGB,width=1280,height=1024,framerate=30/1 ! tee name=t  t. ! left.  t. ! right."
-)
+CAMERA = f"{BALL} ! video/x-raw,format=RGB,width=1280,height=1024,framerate=30/1"
 
 
 class Shown(NamedTuple):
@@ -53,13 +49,6 @@ class Shown(NamedTuple):
         return (self.sent_ns - self.stamp_ns) * 1e-9
 
 
-def ball_moment(picture: U8) -> float:
-    rows, columns = np.nonzero(picture[..., 0] > 100)
-    height, width = picture.shape[:2]
-    turn = np.arctan2(rows.mean() - (height - 1) / 2, columns.mean() - (width - 1) / 2)
-    return float(turn / (2 * np.pi) % 1)
-
-
 def painted_moment(picture: U8) -> float:
     """As `stereo_sender.py` with `clock=1` paints it, at a quarter of the size."""
     return read_number(cv2.resize(picture, None, fx=4, fy=4, interpolation=cv2.INTER_NEAREST)) * 1e-3 % 1
@@ -68,7 +57,7 @@ def painted_moment(picture: U8) -> float:
 def lie_s(one: Shown, other: Shown) -> float:
     """How far two stamps lie from what the pictures show: a half is the most that can be seen."""
     by_stamp = (one.stamp_ns - other.stamp_ns) * 1e-9
-    return abs((by_stamp - (one.moment - other.moment) + 0.5) % 1 - 0.5)
+    return apart(by_stamp, one.moment - other.moment)
 
 
 @contextmanager
@@ -84,7 +73,7 @@ def running(
     }
     save_rig(replace(rig, **eyes), folder / "rig")
     launch, said, moment = {
-        "gst": ("gst_test", [f"source.launch:={BALL}"], ball_moment),
+        "gst": ("gst_test", [f"source.launch:={CAMERA} ! tee name=t  t. ! left.  t. ! right."], ball_moment),
         "push": ("push", ["source.endpoint:=tcp://127.0.0.1:*"], painted_moment),
         "ros2": ("ros2", [f"source.domain:={DOMAIN}"], painted_moment),
     }[way]
