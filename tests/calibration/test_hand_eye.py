@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import runpy
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,8 @@ import numpy as np
 import pytest
 from bag_files import ROS2, Row, image, write_rosbag2
 from click.testing import CliRunner
-from drawn_boards import charuco_print, draw, fine_rays, known_rig
+from drawn_boards import charuco_print, known_rig
+from places import ROOT
 
 from sags_node.calibration import save_rig
 from sags_node.calibration.boards import StereoView
@@ -25,6 +27,7 @@ from sags_node.fitting.clip import read_clip
 from sags_node.geometry import invert, matrix_to_quat
 from sags_node.launch_file import load_launch
 from sags_node.messaging import cdr, topics
+from sags_node.phantom.board import draw, fine_rays
 from sags_node.phantom.motion import scope_pose
 from sags_node.phantom.rig import phantom_rig
 from sags_node.session import open_session
@@ -252,6 +255,22 @@ def test_from_a_bag_to_poses_of_the_camera(recording: Path) -> None:
             exact[:3, :3] = exact[:3, :3] @ session.rig.left.R.T
             assert np.linalg.norm(frame.T_world_cam[:3, 3] - exact[:3, 3]) < 0.3e-3
             assert np.abs(frame.T_world_cam[:3, :3] - exact[:3, :3]).max() < np.radians(0.2)
+
+
+def test_the_example_gives_what_it_says(tmp_path: Path) -> None:
+    """examples/record_board.py, and the command that its first lines name."""
+    folder = tmp_path / "board"
+    example = runpy.run_path(str(ROOT / "examples/record_board.py"))
+    example["record"](folder, seconds=2.0)
+    command = [
+        "calib", "hand-eye", str(folder / "bag"), f"rig:={folder / 'rig'}", "robot.kind:=bag",
+        "robot.topic:=/ECM/measured_cp", "--squares", "10x7", "--square-mm", "4.5", "-o", str(folder / "rig"),
+    ]  # fmt: skip
+    result = CliRunner().invoke(main, command)
+    assert result.exit_code == 0, result.output
+    found = read_hand_eye(folder / "rig/hand_eye.yaml")
+    assert np.linalg.norm(found.T_hand_cam[:3, 3] - example["T_HAND_CAMERA"][:3, 3]) < 0.3e-3
+    assert found.offset_ns * 1e-9 == pytest.approx(example["AHEAD_S"], abs=0.005)
 
 
 def test_fits_and_figures_know_where_the_robot_says_the_scope_is(
