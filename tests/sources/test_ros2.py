@@ -12,9 +12,10 @@ import pytest
 from live_taking import Taker
 from places import ROOT
 from sending import sending, stereo_sender
+from stereo_sender import paint_number
 from waiting import until
 
-from sags_node.config import LaunchConfig, Ros2Robot, Ros2Source, RosGraph
+from sags_node.config import GeometryConfig, LaunchConfig, Ros2Robot, Ros2Source, RosGraph
 from sags_node.errors import UsageError
 from sags_node.messaging import cdr
 from sags_node.messaging.topics import IMAGE, TF
@@ -120,6 +121,25 @@ def test_wrong_encodings_stamps_and_types_are_said(
         silent = lines("/wrong/kind", "/wrong/kind")
         assert "/wrong/kind is tf2_msgs/msg/TFMessage, not a picture topic; set source.left" in silent
     assert not any("\n" in line for line in both + silent)
+
+
+def test_one_topic_may_show_both_eyes() -> None:
+    """Side by side, as simulators publish them."""
+    name, geometry = "/ECM/image_raw", GeometryConfig(layout="side_by_side")
+    writer = Graph(RosGraph(domain=DOMAIN)).writer(name, IMAGE)
+    picture = np.zeros((120, 320, 3), np.uint8)
+    for eye in (picture[:, :160], picture[:, 160:]):
+        paint_number(eye, 7)
+
+    def sent_and_come() -> bool:
+        now = time.time_ns()
+        writer.write(cdr.image(picture, "rgb8", now), now)
+        return len(taker.numbers) >= 3
+
+    said = Ros2Source(domain=DOMAIN, left=name, geometry=geometry)
+    with Taker(RosCameras(said, (160, 120))) as taker:
+        until(sent_and_come, seconds=10)
+    assert set(taker.numbers) == {(7, 7)}
 
 
 def test_the_domain_is_that_of_the_launch_file_or_of_ros(monkeypatch: pytest.MonkeyPatch) -> None:
