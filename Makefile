@@ -11,7 +11,7 @@ DEBIAN := libusb-1.0-0 libgl1 libegl1 libgomp1 libx11-6
 DEBIAN_TESTS := chromium g++ cmake pkg-config cppzmq-dev libmsgpack-cxx-dev faketime iproute2 \
   libopenigtlink-dev openigtlink-examples \
   gstreamer1.0-tools gstreamer1.0-plugins-base gstreamer1.0-plugins-good gstreamer1.0-plugins-bad \
-  gstreamer1.0-libav
+  gstreamer1.0-libav libgstrtspserver-1.0-0
 missing = $(shell for p in $(1); do dpkg -s $$p >/dev/null 2>&1 || echo $$p; done)
 apt_install = apt-get update -qq && apt-get install -y -qq --no-install-recommends $(1) >/dev/null
 

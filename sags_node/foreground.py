@@ -13,6 +13,7 @@ from rich.text import Text
 from sags_node.config import LaunchConfig, PushRobot, PushSource, Ros2Robot, Ros2Source
 from sags_node.findings import by_code, in_words
 from sags_node.node import Node
+from sags_node.sources.ros2 import absolute, picture_topics
 from sags_node.sources.ros_graph import domain_of, where
 from sags_node.terminal import text
 from sags_node.terminal.console import tell
@@ -53,7 +54,8 @@ def inputs_text(config: LaunchConfig) -> list[str]:
         if isinstance(part, PushSource | PushRobot):
             lines.append(f"taking {what} at {part.endpoint}")
         elif isinstance(part, Ros2Source | Ros2Robot):
-            topics = f"{part.left} and {part.right}" if isinstance(part, Ros2Source) else part.topic
+            names = picture_topics(part).values() if isinstance(part, Ros2Source) else [absolute(part.topic)]
+            topics = " and ".join(names)
             lines.append(f"taking {what} from {where(domain_of(part), part.interface)}: {topics}")
     return lines
 

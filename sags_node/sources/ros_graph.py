@@ -16,7 +16,7 @@ from typing import Any
 
 from sags_node.config import RosGraph
 from sags_node.errors import SagsError, UsageError
-from sags_node.messaging.cdr import type_hash
+from sags_node.messaging.cdr import Content, type_hash
 
 log = logging.getLogger(__name__)
 
@@ -86,6 +86,10 @@ class Graph:
         self._waiting.attach(reader.condition)
         return reader
 
+    def writer(self, topic: str, kind: str) -> Writer:
+        """A writer to a topic, told as ROS tells it: what stands in for cameras."""
+        return Writer(self.participant, topic, kind)
+
     def wait(self, seconds: float) -> None:
         """Until something can be taken from one of the readers, or the time is over."""
         from cyclonedds.util import duration
@@ -133,6 +137,25 @@ class Reader:
         for data, info in ddspy_take(self._reader._ref, self._any, MOST_AT_ONCE):
             if info.valid_data:
                 yield data
+
+
+class Writer:
+    """Sends what is CDR already. Best effort: what a reader has no room for is lost."""
+
+    def __init__(self, participant: Any, topic: str, kind: str) -> None:
+        from cyclonedds.core import Policy, Qos
+        from cyclonedds.pub import DataWriter
+        from cyclonedds.topic import Topic
+
+        form = Policy.DataRepresentation(use_cdrv0_representation=True, use_xcdrv2_representation=False)
+        qos = Qos(Policy.Reliability.BestEffort, Policy.History.KeepLast(2), form)
+        self._topic = Topic(participant, f"rt{topic}", raw_type(kind))
+        self._writer = DataWriter(participant, self._topic, qos)
+
+    def write(self, body: Content, stamp_ns: int) -> None:
+        from cyclonedds._clayer import ddspy_write_ts  # see `Reader.take`
+
+        ddspy_write_ts(self._writer._ref, b"".join(bytes(part) for part in body.parts), stamp_ns)
 
 
 def domain_of(config: RosGraph) -> int:

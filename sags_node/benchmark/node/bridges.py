@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import select
 import socket
 import struct
@@ -28,9 +27,8 @@ from sags_node.benchmark.node.crowd import STARTING, STATUS, STOPPING, Advance, 
 from sags_node.errors import SagsError
 from sags_node.evaluation.metrics import percentiles
 from sags_node.messaging.subscriber import Subscriber
-from sags_node.processes import end
+from sags_node.processes import cpu_seconds, end
 
-TICKS = os.sysconf("SC_CLK_TCK")  # of CPU time in a second
 PICTURES = ("/sags/left/image_rect_color", "/sags/left/render/image")
 LAYOUT = (*PICTURES, "/sags/points", "/sags/anchors", "/sags/tf", "/sags/figures")  # what the layout shows
 THIN = tuple(f"{picture}/h264" for picture in PICTURES)
@@ -76,9 +74,9 @@ def measure_bridges(launch: Sequence[str], seconds: float, advance: Advance) -> 
             for case in CASES:
                 with _bridge(case, Path(folder)) as (process, heard):
                     began = time.monotonic()
-                    before, frames = _cpu_seconds(process.pid), _frames(observer)
+                    before, frames = cpu_seconds(process.pid), _frames(observer)
                     seen = _seen(observer, seconds, node, advance, case.name)
-                    spent, shown = _cpu_seconds(process.pid) - before, _frames(observer) - frames
+                    spent, shown = cpu_seconds(process.pid) - before, _frames(observer) - frames
                     took = time.monotonic() - began
                     ages = percentiles(heard.ages_ms[case.leading])
                     if ages is None or shown <= 0:
@@ -144,12 +142,6 @@ def _frames(observer: Subscriber) -> int:
     """The number of the node's last frame; a recording that loops goes on counting."""
     status = observer.latest(STATUS)
     return 0 if status is None else int(json.loads(status.text)["last_frame"].get("frame_id", 0))
-
-
-def _cpu_seconds(process: int) -> float:
-    """Of a process and its threads."""
-    fields = Path(f"/proc/{process}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / TICKS
 
 
 # ---- a bridge and its peer ---------------------------------------------------------------------------------
