@@ -17,6 +17,7 @@ import pytest
 from command_line import FREE_PORTS
 from gstreamer import BALL, apart, ball_moment, kill_pipelines, need_gstreamer
 from places import ROOT
+from running_node import START_SECONDS
 from sending import sending, stereo_sender
 from stereo_sender import read_number
 from waiting import until
@@ -118,6 +119,7 @@ def test_a_stalled_mapper_shows_nothing_old_and_a_killed_source_comes_again(
         pytest.importorskip("cyclonedds", reason="ROS 2 needs: pip install 'sags-node[ros2]'")
     with running(way, tmp_path, phantom_session, monkeypatch) as (node, shown, sender):
         with sender():
+            until(lambda: shown, START_SECONDS)
             until(lambda: len(shown) > len(PAUSES) + 10)
             until_killed = list(shown)
             if way == "gst":
