@@ -52,24 +52,18 @@ def pushed(endpoint: str, jpeg: int | None, pose_endpoint: str | None) -> Send:
 
 def published(domain: int, name: str, infos: tuple[Eye, Eye], compressed: bool) -> Send:
     """As ROS 2 topics `name/left/image_raw` and so on, with camera_info and tf."""
-    from cyclonedds._clayer import ddspy_write_ts
-    from cyclonedds.core import Policy, Qos
-    from cyclonedds.pub import DataWriter
-    from cyclonedds.topic import Topic
-
     from sags_node.config import RosGraph
     from sags_node.messaging.topics import CAMERA_INFO, IMAGE, TF
-    from sags_node.sources.ros_graph import Graph, raw_type
+    from sags_node.ros.endpoints import Delivery
+    from sags_node.ros.graph import Graph
 
     graph = Graph(RosGraph(domain=domain))
-    form = Policy.DataRepresentation(use_cdrv0_representation=True, use_xcdrv2_representation=False)
-    qos = Qos(Policy.Reliability.BestEffort, Policy.History.KeepLast(2), form)
 
     def writer(topic: str, kind: str) -> Callable[[cdr.Content, int], None]:
-        made = DataWriter(graph.participant, Topic(graph.participant, f"rt{topic}", raw_type(kind)), qos)
+        made = graph.writer(topic, kind, Delivery(depth=2))
 
         def write(body: cdr.Content, stamp_ns: int) -> None:
-            ddspy_write_ts(made._ref, b"".join(bytes(part) for part in body.parts), stamp_ns)
+            made.write(body.cdr(), stamp_ns)
 
         return write
 

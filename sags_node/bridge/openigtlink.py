@@ -38,7 +38,7 @@ from sags_node.messaging.received import (
     TopicName,
 )
 from sags_node.messaging.wire import WireError
-from sags_node.overlay.draw import over
+from sags_node.overlay.draw import over, over_black
 from sags_node.types import F64, U8, Camera
 
 PICTURE = TopicName("left/image_rect_color", ReceivedImage)
@@ -267,13 +267,6 @@ def request_of(text: str) -> tuple[str, dict[str, float]] | None:
 # ---- what is sent ----------------------------------------------------------------------------------------
 
 
-def _render(frame: Frame) -> U8:
-    """Over black, where the model shows nothing."""
-    rgba = frame[RENDER].array
-    shown: U8 = cv2.multiply(rgba[..., :3], cv2.merge([rgba[..., 3]] * 3), scale=1 / 255)
-    return shown
-
-
 def _overlaid(frame: Frame) -> U8:
     """The picture with the overlay over it."""
     return over(frame[PICTURE].array, frame[OVERLAY].array)
@@ -301,7 +294,7 @@ class _Picture:
 
 PICTURES = {
     "Picture": _Picture({PICTURE: 3}, lambda frame: frame[PICTURE].array),
-    "Render": _Picture({RENDER: 4}, _render),
+    "Render": _Picture({RENDER: 4}, lambda frame: over_black(frame[RENDER].array)),
     "Overlay": _Picture({PICTURE: 3, OVERLAY: 4}, _overlaid),
 }
 

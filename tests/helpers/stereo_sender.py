@@ -49,38 +49,28 @@ def push(endpoint: str, jpeg: bool) -> Callable[[U8, U8, int], None]:
 
 
 def dds(domain: int, compressed: bool, scale: float, session: Path) -> Callable[[U8, U8, int], None]:
-    from cyclonedds._clayer import ddspy_write_ts
-    from cyclonedds.core import Policy, Qos
-    from cyclonedds.pub import DataWriter
-    from cyclonedds.topic import Topic
-
     from sags_node.config import RosGraph
     from sags_node.messaging import cdr
     from sags_node.messaging.topics import CAMERA_INFO, IMAGE, TF
-    from sags_node.sources.ros_graph import Graph, raw_type
+    from sags_node.ros.endpoints import Delivery
+    from sags_node.ros.graph import Graph
 
     graph = Graph(RosGraph(domain=domain))
-    form = Policy.DataRepresentation(use_cdrv0_representation=True, use_xcdrv2_representation=False)
-    qos = Qos(Policy.Reliability.BestEffort, Policy.History.KeepLast(2), form)
 
     def writer(topic: str, kind: str) -> Callable[[cdr.Content, int], None]:
-        made = DataWriter(
-            graph.participant, Topic(graph.participant, f"rt/stereo/{topic}", raw_type(kind)), qos
-        )
-        return lambda body, stamp_ns: ddspy_write_ts(
-            made._ref, b"".join(bytes(part) for part in body.parts), stamp_ns
-        )
+        made = graph.writer(topic, kind, Delivery(depth=2))
+        return lambda body, stamp_ns: made.write(body.cdr(), stamp_ns)
 
     kind, suffix = (cdr.COMPRESSED, "/compressed") if compressed else (IMAGE, "")
-    pictures = [writer(f"{eye}/image_raw{suffix}", kind) for eye in ("left", "right")]
-    calibrations = [writer(f"{eye}/camera_info", CAMERA_INFO) for eye in ("left", "right")]
-    tf = DataWriter(graph.participant, Topic(graph.participant, "rt/tf", raw_type(TF)), qos)
+    pictures = [writer(f"/stereo/{eye}/image_raw{suffix}", kind) for eye in ("left", "right")]
+    calibrations = [writer(f"/stereo/{eye}/camera_info", CAMERA_INFO) for eye in ("left", "right")]
+    tf = writer("/tf", TF)
     pose = np.eye(4)
     pose[:3, 3] = 0.1, 0.2, 0.3
     rig = resized_rig(load_rig(session / "calib"), scale)
 
     def send(left: U8, right: U8, stamp_ns: int) -> None:
-        ddspy_write_ts(tf._ref, bytes(cdr.transform(pose, stamp_ns).parts[0]), stamp_ns)
+        tf(cdr.transform(pose, stamp_ns), stamp_ns)
         for write, eye in zip(calibrations, (rig.left, rig.right), strict=True):
             write(cdr.eye_info(eye, stamp_ns), stamp_ns)
         for write, picture in zip(pictures, (left, right), strict=True):

@@ -13,23 +13,18 @@ from pathlib import Path
 import pytest
 from live_taking import Taker
 from places import HELPERS, ROOT
+from ros_peers import DOMAIN, rclpy_python
 from waiting import until
 
 from sags_node.config import LaunchConfig, Ros2Robot, Ros2Source, RosGraph
 from sags_node.errors import UsageError
+from sags_node.ros.graph import domain_of
 from sags_node.sources import ros2
 from sags_node.sources.robot import open_robot
 from sags_node.sources.ros2 import RosCameras, read_rig
-from sags_node.sources.ros_graph import domain_of
 
-pytest.importorskip("cyclonedds", reason="ROS 2 needs: pip install 'sags-node[ros2]'")
 pytestmark = pytest.mark.live
 
-CACHE = Path(
-    os.environ.get("SAGS_ROS_CACHE")
-    or Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sags/ros"
-)
-DOMAIN = 60 + os.getpid() % 40  # away from nodes of this machine, and from tests of another checkout
 SIZE = 1280, 1024
 
 
@@ -122,9 +117,7 @@ def test_the_domain_is_that_of_the_launch_file_or_of_ros(monkeypatch: pytest.Mon
 
 @pytest.fixture
 def rclpy_camera() -> list[object]:
-    if not (CACHE / "bin/python").exists():
-        pytest.skip(f"no rclpy in {CACHE}; run tests/ros2/prepare.sh")
-    return [CACHE / "bin/python", ROOT / "tests/ros2/camera.py"]
+    return [rclpy_python(), ROOT / "tests/ros2/camera.py"]
 
 
 def test_a_real_ros_node_is_heard(rclpy_camera: list[object]) -> None:
