@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from sags_node.messaging import cdr, topics
 from sags_node.messaging.received import Received, ReceivedImage
-from sags_node.overlay.draw import over_black
 from sags_node.recording.pictures import encode_file
 from sags_node.types import F32, U8
 
@@ -28,7 +27,7 @@ STEPS = (0.02e-3, 0.04e-3, 0.08e-3, 0.16e-3, 0.32e-3)  # m at `USUAL` that one c
 USUAL = 0.1  # m, of tissue
 FARTHEST = 10.0  # m; what is farther is unknown
 LEVELS = (256, 64, 16, 8)  # of confidence
-PNG_OPTIONS = (cv2.IMWRITE_PNG_COMPRESSION, 1)
+PNG_OPTIONS = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE)
 _INVERSE_DEPTH = 0  # the form of a depth PNG, the only one that ROS has
 
 Pack = Callable[[NDArray[Any]], tuple[bytes, str]]  # the file, and what it is in the words of ROS
@@ -56,6 +55,12 @@ class Compressor:
         if len(file) < SMALL and self._chosen > 0:
             self._chosen -= 1
         return cdr.compressed_image(file, form, cdr.decode(received.cdr(), topics.IMAGE).header)
+
+
+def over_black(rgba: U8) -> U8:
+    """A picture [H, W, 4] over black, [H, W, 3]."""
+    shown: U8 = cv2.cvtColor(cv2.cvtColor(rgba, cv2.COLOR_RGBA2mRGBA), cv2.COLOR_RGBA2RGB)
+    return shown
 
 
 def _ways(topic: topics.Topic) -> Sequence[Pack]:

@@ -22,6 +22,7 @@ import cv2
 import numpy as np
 
 from sags_node.bridge import igtl
+from sags_node.bridge.compressed import over_black
 from sags_node.bridge.feed import Place
 from sags_node.bridge.igtl_peers import Peers
 from sags_node.bridge.pins import Pin, Pins, Release
@@ -38,7 +39,7 @@ from sags_node.messaging.received import (
     TopicName,
 )
 from sags_node.messaging.wire import WireError
-from sags_node.overlay.draw import over, over_black
+from sags_node.overlay.draw import over
 from sags_node.types import F64, U8, Camera
 
 PICTURE = TopicName("left/image_rect_color", ReceivedImage)

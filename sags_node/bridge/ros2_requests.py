@@ -20,14 +20,14 @@ from sags_node.bridge.requests import ANSWER_TIME, Requests
 from sags_node.errors import SagsError
 from sags_node.messaging import cdr, topics
 from sags_node.messaging.topics import VIEW_NAME
-from sags_node.ros.endpoints import Reader, Writer
+from sags_node.ros.endpoints import Delivery, Reader, Writer
 from sags_node.ros.graph import Graph
 
 ASK = "request"  # /sags/request/OPERATION
 ANSWER = "answer"  # /sags/answer
 POINT, PIXEL = "geometry_msgs/msg/PointStamped", "geometry_msgs/msg/Point"
 NUMBER, NOTHING = "std_msgs/msg/UInt32", "std_msgs/msg/Empty"
-DEPTH = 16  # requests that wait, of each kind
+WAITING = Delivery(reliable=True, depth=16)  # of each kind
 RECORDING_TIME = 15.0  # s; it starts and ends slowly
 
 Args = dict[str, Any]
@@ -68,7 +68,7 @@ class Inbox:
     ) -> None:
         self._requests, self._answers = requests, answers
         self._readers: dict[str, tuple[Ask, Reader]] = {
-            name: (ask, graph.reader(f"/{ns}/{ASK}/{name}", ask.kind, DEPTH))
+            name: (ask, graph.reader(f"/{ns}/{ASK}/{name}", ask.kind, WAITING))
             for name, ask in asks(views).items()
         }
 

@@ -131,12 +131,6 @@ def over(picture: U8, rgba: U8) -> U8:
     return shown
 
 
-def over_black(rgba: U8) -> U8:
-    """A picture [H, W, 4] over black, [H, W, 3]."""
-    shown: U8 = cv2.multiply(rgba[..., :3], cv2.merge([rgba[..., 3]] * 3), scale=1 / 255)
-    return shown
-
-
 def warm_up() -> None:
     """Load the kernels, or compile them once: not while frames wait."""
     corner = np.array([[0, 0, 1], [3, 0, 1], [0, 3, 1]], np.float32)

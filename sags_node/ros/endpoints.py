@@ -35,8 +35,11 @@ class Delivery:
     lifespan: float | None = None
 
 
+BEST_EFFORT = Delivery()
+
+
 class Reader:
-    """The raw messages of one topic. Best effort fits every writer; nobody waits for us."""
+    """The raw messages of one topic."""
 
     def __init__(self, participant: Any, topic: str, kind: str, delivery: Delivery) -> None:
         from cyclonedds.core import InstanceState, ReadCondition, SampleState, ViewState
@@ -93,7 +96,8 @@ class Writer:
         """
         from cyclonedds._clayer import ddspy_write_ts  # see `Reader.take`
 
-        code = ddspy_write_ts(self._writer._ref, data, stamp_ns)
+        whole = data + bytes(-len(data) % 4)  # DDS sends words, and would fill the last one from elsewhere
+        code = ddspy_write_ts(self._writer._ref, whole, stamp_ns)
         if code < 0:
             raise SagsError(f"cannot send {self._topic.name} into the ROS 2 graph: DDS error {code}")
 

@@ -12,7 +12,7 @@ from typing import Any, Literal
 from sags_node.config import RosGraph
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import cdr
-from sags_node.ros.endpoints import Delivery, Reader, Writer, ros_type
+from sags_node.ros.endpoints import BEST_EFFORT, Delivery, Reader, Writer, ros_type
 
 log = logging.getLogger(__name__)
 
@@ -74,14 +74,9 @@ class Graph:
             found.setdefault(topic, set()).add(kind)
         return found
 
-    def reader(self, topic: str, kind: str, depth: int = 4, kept: bool = False) -> Reader:
-        """A reader of a topic, told as ROS tells it, e.g. `/a/image_raw`.
-
-        Args:
-            depth: the newest messages that wait to be taken.
-            kept: also what was sent before, by writers that keep it (`tf_static`).
-        """
-        reader = Reader(self.participant, topic, kind, Delivery(reliable=kept, kept=kept, depth=depth))
+    def reader(self, topic: str, kind: str, delivery: Delivery = BEST_EFFORT) -> Reader:
+        """A reader of a topic, told as ROS tells it, e.g. `/a/image_raw`. Best effort fits every writer."""
+        reader = Reader(self.participant, topic, kind, delivery)
         self._waiting.attach(reader.condition)
         self._read.append(reader.guid)
         return reader

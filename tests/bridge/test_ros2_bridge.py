@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from bridging import anchored, anchored_at, bridged, sockets
 from made_messages import meta
-from ros_peers import DOMAIN, Listener, listener
+from ros_peers import DOMAIN, KEPT, Listener, listener
 from synthetic import HEIGHT, WIDTH, plane_camera, plane_depth, stream
 from waiting import until
 
@@ -102,7 +102,7 @@ def stale(joined: Listener) -> list[str]:
 
 def test_what_stops_is_not_sent_again_and_is_called_stale(tmp_path: Path) -> None:
     wanted = [("/tf", TF), ("/sags/left/camera_info", topics.CAMERA_INFO), ("/diagnostics", ARRAY)]
-    with bridged(run_ros2, options(tmp_path)), listener(*wanted, ("/sags/status", TEXT, True)) as joined:
+    with bridged(run_ros2, options(tmp_path)), listener(*wanted, ("/sags/status", TEXT, KEPT)) as joined:
         until(lambda: any("sags: node: " in line and "no node" in line.lower() for line in stale(joined)))
         with sockets(tmp_path) as running:
             with stream(running, anchored_at):
@@ -118,7 +118,7 @@ def test_what_stops_is_not_sent_again_and_is_called_stale(tmp_path: Path) -> Non
                 lambda: json.loads(cdr.decode(joined.newest("/sags/status"), TEXT).data)["state"] == "silent"
             )
             with listener(
-                ("/sags/status", TEXT, True), ("/sags/left/camera_info", topics.CAMERA_INFO, True)
+                ("/sags/status", TEXT, KEPT), ("/sags/left/camera_info", topics.CAMERA_INFO, KEPT)
             ) as late:
                 until(lambda: late.came["/sags/status"])
                 time.sleep(0.3)
@@ -280,7 +280,7 @@ def test_who_asks_for_more_than_a_topic_gives_is_told(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     with bridged(run_ros2, options(tmp_path)):
-        with listener(("/sags/left/depth", topics.IMAGE, True)):  # reliable, and kept
+        with listener(("/sags/left/depth", topics.IMAGE, KEPT)):  # reliable, and kept
             until(lambda: "/sags/left/depth: somebody reads it with stricter settings" in caplog.text)
     assert "net.core.rmem_default" in caplog.text or kernel_buffer("default") >= 4 << 20
 

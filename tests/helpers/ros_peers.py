@@ -19,6 +19,7 @@ from places import ROOT
 from waiting import until
 
 from sags_node.config import RosGraph
+from sags_node.ros.endpoints import Delivery
 from sags_node.ros.graph import Graph
 
 pytest.importorskip("cyclonedds", reason="ROS 2 needs: pip install 'sags-node[ros2]'")
@@ -29,6 +30,8 @@ CACHE = Path(
 )
 DOMAIN = 60 + os.getpid() % 40  # away from nodes of this machine, and from tests of another checkout
 LARGE_BUFFERS = {"FASTDDS_DEFAULT_PROFILES_FILE": str(ROOT / "examples/ros2/fastdds.xml")}
+KEPT = Delivery(reliable=True, kept=True, depth=16)  # what was sent before, too
+Wanted = tuple[str, str] | tuple[str, str, Delivery]
 
 
 def rclpy_python() -> Path:
@@ -40,12 +43,12 @@ def rclpy_python() -> Path:
 
 
 class Listener:
-    """Reads topics (topic -> type, and whether what was sent before is wanted) by DDS alone."""
+    """Reads topics by DDS alone: name, type, and how if not with best effort."""
 
-    def __init__(self, *topics: tuple[str, str] | tuple[str, str, bool]) -> None:
+    def __init__(self, *topics: Wanted) -> None:
         self.graph = Graph(RosGraph(domain=DOMAIN))
         self.came: dict[str, list[tuple[bytes, float]]] = defaultdict(list)
-        self._readers = {name: self.graph.reader(name, kind, 64, *kept) for name, kind, *kept in topics}
+        self._readers = {name: self.graph.reader(name, kind, *how) for name, kind, *how in topics}
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._listen)
         self._thread.start()
@@ -67,7 +70,7 @@ class Listener:
 
 
 @contextmanager
-def listener(*topics: tuple[str, str] | tuple[str, str, bool]) -> Iterator[Listener]:
+def listener(*topics: Wanted) -> Iterator[Listener]:
     joined = Listener(*topics)
     try:
         yield joined

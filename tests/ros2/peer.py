@@ -26,8 +26,12 @@ def type_of(name):
     return getattr(importlib.import_module(f"{package}.msg"), last)
 
 
+lock = threading.Lock()
+
+
 def say(**fields):
-    print(json.dumps(fields), flush=True)
+    with lock:
+        print(json.dumps(fields), flush=True)
 
 
 def heard(topic, kind, data):
@@ -74,6 +78,7 @@ def obey(order):
         deadline = time.monotonic() + 10
         while publishers[topic].get_subscription_count() == 0 and time.monotonic() < deadline:
             time.sleep(0.01)
+        time.sleep(0.5)  # a reader knows a writer a moment later than the other way round
     message = kind()
     for path, value in fields.items():
         *outer, last = path.split(".")
