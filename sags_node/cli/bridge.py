@@ -85,7 +85,6 @@ def _common(command: Callable[..., None]) -> Callable[..., None]:
             else:
                 console.print(f"{words}  (Ctrl-C ends)")
 
-        os.nice(NICENESS)
         on_stop_signals(stop.set)
         with clock or nullcontext():
             command(node=node, overlay=overlay, say=say, stop=stop, **rest)
@@ -172,6 +171,7 @@ def openigtlink(send: str, **options: Any) -> None:
 
     ready, stop = options.pop("ready"), options.pop("stop")
     chosen = tuple(name for name in send.split(",") if name)
+    os.nice(NICENESS)
     run_openigtlink(Options(send=chosen, **options), ready, stop)
 
 
@@ -212,6 +212,7 @@ def foxglove(layout: Path | None, **options: Any) -> None:
         return
     from sags_node.bridge.foxglove import Options, run_foxglove
 
+    os.nice(NICENESS)
     run_foxglove(Options(**options), ready, stop)
 
 
@@ -277,4 +278,5 @@ def ros2(
     def ready(domain: int, interface: str) -> None:
         say(f"in [bold]{escape(where(domain, interface))}[/]", {"domain": domain, "interface": interface})
 
+    os.nice(NICENESS)
     run_ros2(Options(graph=graph, **options), ready, stop)
