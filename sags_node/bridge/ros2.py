@@ -32,7 +32,7 @@ from sags_node.ros.graph import Graph, kernel_buffer
 ALL_POINTS = "/all"
 GLOBAL = {"tf": "/tf", "diagnostics": "/diagnostics"}  # the names by which all of ROS knows them
 BEAT = 1.0  # s between two messages about the bridge itself
-ATTEND = 0.1  # s between looks at requests
+ATTEND = 0.1  # s between looks at who reads
 STALE = 3  # of a diagnostic status
 ENOUGH = 4 << 20  # bytes of a receive buffer: with that much a raw picture and depth get through
 
@@ -173,6 +173,7 @@ class Ros2:
         self._offers = {offer.output.name: offer for offer in offered}
         self._writers = {name: self._writer(name, offer) for name, offer in self._offers.items()}
         self._diagnostics = self._writers[GLOBAL["diagnostics"]]
+        self._read: frozenset[str] = frozenset()  # by somebody
         self._missing: dict[str, str] = {}
         self._stages: list[str] = []  # that the node's diagnostics told of last
         self._silent = False
@@ -199,7 +200,7 @@ class Ros2:
         """What is kept for who comes later must always be new, so it is always wanted."""
         offer = self._offers[output.name]
         lasts = offer.delivery.kept and offer.delivery.lifespan is None
-        return lasts or self._writers[output.name].readers > 0
+        return lasts or output.name in self._read
 
     def send(self, output: Output, frame: Frame) -> bool:
         source = output.sources[0]
@@ -226,6 +227,7 @@ class Ros2:
         while not self._stopping.is_set():
             self.graph.wait(ATTEND)
             self._inbox.take()
+            self._read = frozenset(name for name, writer in self._writers.items() if writer.readers > 0)
             if time.monotonic() >= due:
                 due = time.monotonic() + BEAT
                 self._beat()
@@ -233,9 +235,12 @@ class Ros2:
 
     def _beat(self) -> None:
         """Say how the bridge does, and that the node is silent while it is."""
-        read = sum(writer.readers > 0 for writer in self._writers.values())
         words = "; ".join(dict.fromkeys(self._missing.values()))
-        told = [cdr.Status("bridge", 1 if words else 0, words or "all is new", {"topics_read": str(read)})]
+        told = [
+            cdr.Status(
+                "bridge", 1 if words else 0, words or "all is new", {"topics_read": str(len(self._read))}
+            )
+        ]
         reason = self._missing.get(GLOBAL["diagnostics"])
         if reason is not None and (self._stages or self._silent):  # the first one takes up to a second
             told += [cdr.Status(stage, STALE, reason, {}) for stage in self._stages or ["node"]]

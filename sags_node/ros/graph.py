@@ -42,7 +42,6 @@ class Graph:
 
     def __init__(self, config: RosGraph) -> None:
         try:
-            from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
             from cyclonedds.core import DDSException, Policy, Qos, WaitSet
             from cyclonedds.domain import DomainParticipant
         except ImportError:
@@ -52,17 +51,21 @@ class Graph:
         self._domain = _domain(self.domain, config.interface)
         try:
             self.participant = DomainParticipant(self.domain, Qos(Policy.Userdata(b"enclave=/;")))
-            self._announced = BuiltinDataReader(self.participant, BuiltinTopicDcpsPublication)
             self._waiting = WaitSet(self.participant)
         except DDSException as error:
             raise SagsError(f"cannot join ROS 2 domain {self.domain}: {error.msg}") from None
         self._read: list[bytes] = []  # by GUID
         self._written: list[bytes] = []
         self._said: Writer | None = None  # that says which node this is
+        self._announced: Any = None  # what others publish; nobody may ever ask
         self._publications: dict[Any, tuple[str, str]] = {}  # by writer: topic and type, in ROS' words
 
     def publications(self) -> dict[str, set[str]]:
         """The topics that somebody publishes now, and their types."""
+        if self._announced is None:
+            from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
+
+            self._announced = BuiltinDataReader(self.participant, BuiltinTopicDcpsPublication)
         for said in self._announced.take(4096):
             alive = said.sample_info.instance_state == ALIVE
             if alive and said.topic_name is not None and said.topic_name.startswith("rt/"):

@@ -124,7 +124,7 @@ def test_a_missing_extra_is_named_with_the_way_to_get_it(
 
 
 def test_without_its_extra_the_bridge_to_ros_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "cyclonedds.builtin", None)
+    monkeypatch.setitem(sys.modules, "cyclonedds.domain", None)
     monkeypatch.setattr(os, "nice", lambda by: 0)
     refused(2, "bridge", "ros2", said=("pip install 'sags-node[ros2]'",))
 

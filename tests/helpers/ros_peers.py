@@ -29,7 +29,10 @@ CACHE = Path(
     or Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sags/ros"
 )
 DOMAIN = 60 + os.getpid() % 40  # away from nodes of this machine, and from tests of another checkout
-LARGE_BUFFERS = {"FASTDDS_DEFAULT_PROFILES_FILE": str(ROOT / "examples/ros2/fastdds.xml")}
+LARGE_BUFFERS = dict.fromkeys(
+    ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE"),  # since Kilted; before
+    str(ROOT / "examples/ros2/fastdds.xml"),
+)
 KEPT = Delivery(reliable=True, kept=True, depth=16)  # what was sent before, too
 Wanted = tuple[str, str] | tuple[str, str, Delivery]
 
