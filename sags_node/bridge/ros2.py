@@ -16,7 +16,7 @@ from itertools import chain
 
 import numpy as np
 
-from sags_node.bridge.compressed import Compressor, suffix
+from sags_node.bridge.compressed import LARGEST, Compressor, suffix
 from sags_node.bridge.feed import Place
 from sags_node.bridge.relay import MAX_AGE, Output, Relay, Source, silent
 from sags_node.bridge.requests import Requests
@@ -34,6 +34,7 @@ GLOBAL = {"tf": "/tf", "diagnostics": "/diagnostics"}  # the names by which all 
 BEAT = 1.0  # s between two messages about the bridge itself
 ATTEND = 0.1  # s between looks at who reads
 STALE = 3  # of a diagnostic status
+PACE = 50e6  # bytes/s: so fast a stock receiver on a loaded machine empties its buffer
 ENOUGH = 4 << 20  # bytes of a receive buffer: with that much a raw picture and depth get through
 
 Make = Callable[[Received], bytes]
@@ -173,6 +174,7 @@ class Ros2:
         self._offers = {offer.output.name: offer for offer in offered}
         self._writers = {name: self._writer(name, offer) for name, offer in self._offers.items()}
         self._diagnostics = self._writers[GLOBAL["diagnostics"]]
+        self._pace = Pace()
         self._read: frozenset[str] = frozenset()  # by somebody
         self._missing: dict[str, str] = {}
         self._stages: list[str] = []  # that the node's diagnostics told of last
@@ -209,6 +211,7 @@ class Ros2:
             self._stages = [status.name for status in received.message.status]
         age_ns = self._places[source.ns].now_ns() - received.stamp_ns  # readers compare it with our clock
         data = self._offers[output.name].make(received)
+        self._pace.wait(len(data))
         self._writers[output.name].write(data, time.time_ns() - age_ns)
         return True
 
@@ -257,6 +260,19 @@ class Ros2:
                     "subscribe with qos_profile_sensor_data (best effort, volatile)",
                     name,
                 )
+
+
+class Pace:
+    """Keeps small messages apart: all those of a frame at once do not fit into a stock receive buffer."""
+
+    def __init__(self) -> None:
+        self._free = 0.0  # monotonic s
+
+    def wait(self, size: int) -> None:
+        """Until a message of so many bytes may go; larger ones than fit anyway do not wait."""
+        if size <= LARGEST:
+            time.sleep(max(0.0, self._free - time.monotonic()))
+            self._free = time.monotonic() + size / PACE
 
 
 # ---- what is sent ----------------------------------------------------------------------------------------

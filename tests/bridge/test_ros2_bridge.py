@@ -19,7 +19,7 @@ from waiting import until
 
 from sags_node.bridge.compressed import LARGEST, Compressor
 from sags_node.bridge.feed import Place
-from sags_node.bridge.ros2 import Options, offers, run_ros2
+from sags_node.bridge.ros2 import PACE, Options, Pace, offers, run_ros2
 from sags_node.bridge.ros2_requests import asks
 from sags_node.config import RosGraph
 from sags_node.errors import SagsError, UsageError
@@ -291,6 +291,14 @@ def test_who_asks_for_more_than_a_topic_gives_is_told(
         with listener(("/sags/left/depth", topics.IMAGE, KEPT)):  # reliable, and kept
             until(lambda: "/sags/left/depth: somebody reads it with stricter settings" in caplog.text)
     assert "net.core.rmem_default" in caplog.text or kernel_buffer("default") >= 4 << 20
+
+
+def test_small_messages_of_a_frame_are_kept_apart() -> None:
+    pace = Pace()
+    begun = time.monotonic()
+    for _ in range(4):
+        pace.wait(150_000)
+    assert time.monotonic() - begun >= 3 * 150_000 / PACE
 
 
 def test_names_of_views_are_checked(tmp_path: Path) -> None:
