@@ -244,9 +244,9 @@ def foxglove(layout: Path | None, **options: Any) -> None:
 def ros2(
     domain: int | None, interface: str, insecure: bool, say: Say, stop: threading.Event, **options: Any
 ) -> None:
-    """Publish into a ROS 2 graph: every topic under /sags, and /tf and /diagnostics. No ROS is needed.
+    """Publish every topic into a ROS 2 graph, without ROS.
 
-    Read .../compressed, .../compressedDepth and /sags/points, which are small. A receiver of ROS 2 loses what
+    Topics are under /sags; and there are /tf and /diagnostics. Read .../compressed, .../compressedDepth and /sags/points, which are small. A receiver of ROS 2 loses what
     is larger than 160 kB, until its machine gives it more:
 
     \b

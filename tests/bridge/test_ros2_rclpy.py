@@ -145,6 +145,7 @@ def test_ros_pins_an_anchor_and_outlives_a_killed_bridge_and_a_killed_node(tmp_p
     heard = (
         "sensor_msgs/msg/PointCloud2:/sags/anchors:reliable",
         "std_msgs/msg/String:/sags/answer:reliable",
+        "sensor_msgs/msg/CompressedImage:/sags/view/ros/image/compressed",
     )
     running = RunningNode(SESSION, tmp_path, "source.pace:=realtime")
     try:
@@ -170,14 +171,19 @@ def test_ros_pins_an_anchor_and_outlives_a_killed_bridge_and_a_killed_node(tmp_p
                 first.send_signal(signal.SIGKILL)
                 first.wait(10)
             count = len(placed(node))
-            with bridge(run_dir):
+            with bridge(run_dir) as second:
                 until(lambda: len(placed(node)) > count + 5)
+                view = json.dumps({"name": "ros", "width": 64, "height": 48, "fov": 60})
+                node.publish("std_msgs/msg/String", "/sags/request/open_view", data=view)
+                until(lambda: node.came["/sags/view/ros/image/compressed"])
                 os.kill(running.process.pid, signal.SIGKILL)
                 killed = time.time()
                 until(lambda: any(b"too old" in data for data, _ in joined.came["/diagnostics"]))
                 last = node.came["/sags/anchors"][-1].came * 1e-9
                 assert last - killed < NOTICE, "sent again"
                 until(lambda: stale(joined.newest("/diagnostics")))
+                second.send_signal(signal.SIGINT)
+                assert second.wait(10) == 0
     finally:
         running.process.kill()
         running.process.wait(10)
