@@ -246,8 +246,9 @@ def ros2(
 ) -> None:
     """Publish every topic into a ROS 2 graph, without ROS.
 
-    Topics are under /sags; and there are /tf and /diagnostics. Read .../compressed, .../compressedDepth and /sags/points, which are small. A receiver of ROS 2 loses what
-    is larger than 160 kB, until its machine gives it more:
+    Topics are under /sags; and there are /tf and /diagnostics. Read .../compressed, .../compressedDepth and
+    /sags/points, which are small: a receiver of ROS 2 loses what is larger than 160 kB, until its machine
+    gives it more:
 
     \b
     sudo sysctl -w net.core.rmem_default=16777216
