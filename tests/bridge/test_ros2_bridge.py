@@ -17,6 +17,7 @@ from ros_peers import DOMAIN, KEPT, Listener, listener
 from synthetic import HEIGHT, WIDTH, plane_camera, plane_depth, stream
 from waiting import until
 
+from sags_node.bridge import ros2
 from sags_node.bridge.compressed import LARGEST, Compressor
 from sags_node.bridge.feed import Place
 from sags_node.bridge.ros2 import PACE, Options, Pace, offers, run_ros2
@@ -108,7 +109,10 @@ def stale(joined: Listener) -> list[str]:
     )
 
 
-def test_what_stops_is_not_sent_again_and_is_called_stale(tmp_path: Path) -> None:
+def test_what_stops_is_not_sent_again_and_is_called_stale(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ros2, "BEAT", 0.2)
     wanted = [("/tf", TF), ("/sags/left/camera_info", topics.CAMERA_INFO), ("/diagnostics", ARRAY)]
     with bridged(run_ros2, options(tmp_path)), listener(*wanted, ("/sags/status", TEXT, KEPT)) as joined:
         until(lambda: any("sags: node: " in line and "no node" in line.lower() for line in stale(joined)))

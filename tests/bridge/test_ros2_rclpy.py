@@ -155,24 +155,26 @@ def test_ros_pins_an_anchor_and_outlives_a_killed_bridge_and_a_killed_node(tmp_p
                 until(lambda: beside.latest("splats"))
                 node.publish("geometry_msgs/msg/Point", "/sags/request/add_anchor_at_pixel", x=150.0, y=120.0)
                 until(lambda: node.came["/sags/answer"])
-                until(lambda: len(placed(node)) > 30)
+                begun = len(node.came["/sags/anchors"])
                 same: dict[int, tuple[float, ...]] = {}
 
-                def both() -> set[int]:
+                def seen_for_a_second() -> bool:
                     newest = beside.latest(ANCHORS)
                     if newest is not None and len(newest.points) == 1:
                         same[newest.stamp_ns] = tuple(newest.xyz()[0].tolist())
-                    return placed(node).keys() & same.keys()
+                    return len(node.came["/sags/anchors"]) > begun + 30
 
-                until(lambda: len(both()) > 5)
-                assert all(placed(node)[stamp] == same[stamp] for stamp in both()), "the node's own"
-                path = np.array(list(placed(node).values()))
+                until(seen_for_a_second)
+                seen = placed(node)
+                both = seen.keys() & same.keys()
+                assert len(both) > 5 and all(seen[stamp] == same[stamp] for stamp in both), "the node's own"
+                path = np.array(list(seen.values()))
                 assert np.ptp(path, axis=0).max() > 1e-3, "the phantom's tissue is pulled by millimetres"
                 first.send_signal(signal.SIGKILL)
                 first.wait(10)
-            count = len(placed(node))
+            count = len(node.came["/sags/anchors"])
             with bridge(run_dir) as second:
-                until(lambda: len(placed(node)) > count + 5)
+                until(lambda: len(node.came["/sags/anchors"]) > count + 5)
                 view = json.dumps({"name": "ros", "width": 64, "height": 48, "fov": 60})
                 node.publish("std_msgs/msg/String", "/sags/request/open_view", data=view)
                 until(lambda: node.came["/sags/view/ros/image/compressed"])
