@@ -54,7 +54,7 @@ def published(domain: int, name: str, infos: tuple[Eye, Eye], compressed: bool) 
     """As ROS 2 topics `name/left/image_raw` and so on, with camera_info and tf."""
     from sags_node.config import RosGraph
     from sags_node.messaging.topics import CAMERA_INFO, IMAGE, TF
-    from sags_node.sources.ros_graph import Graph
+    from sags_node.ros.graph import Graph
 
     graph = Graph(RosGraph(domain=domain))
     kind, suffix = (cdr.COMPRESSED, "/compressed") if compressed else (IMAGE, "")
@@ -63,15 +63,15 @@ def published(domain: int, name: str, infos: tuple[Eye, Eye], compressed: bool) 
     tf = graph.writer("/tf", TF)
 
     def send(left: Picture, right: Picture, pose: NDArray[np.float64], stamp_ns: int) -> None:
-        tf.write(cdr.transform(pose, stamp_ns), stamp_ns)
+        tf.write(cdr.transform(pose, stamp_ns).cdr(), stamp_ns)
         for info_writer, info in zip(calibrations, infos, strict=True):
-            info_writer.write(cdr.eye_info(info, stamp_ns), stamp_ns)
+            info_writer.write(cdr.eye_info(info, stamp_ns).cdr(), stamp_ns)
         for writer, eye in zip(pictures, (left, right), strict=True):
             if compressed:
                 file = cv2.imencode(".jpg", eye[..., ::-1])[1].tobytes()
-                writer.write(cdr.picture_file(file, stamp_ns), stamp_ns)
+                writer.write(cdr.picture_file(file, stamp_ns).cdr(), stamp_ns)
             else:
-                writer.write(cdr.image(eye, "rgb8", stamp_ns), stamp_ns)
+                writer.write(cdr.image(eye, "rgb8", stamp_ns).cdr(), stamp_ns)
 
     return send
 

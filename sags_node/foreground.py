@@ -13,8 +13,8 @@ from rich.text import Text
 from sags_node.config import LaunchConfig, PushRobot, PushSource, Ros2Robot, Ros2Source
 from sags_node.findings import by_code, in_words
 from sags_node.node import Node
+from sags_node.ros.graph import domain_of, where
 from sags_node.sources.ros2 import absolute, picture_topics
-from sags_node.sources.ros_graph import domain_of, where
 from sags_node.terminal import text
 from sags_node.terminal.console import tell
 from sags_node.terminal.notices import Notices

@@ -6,6 +6,7 @@ waits for a peer.
 
 from __future__ import annotations
 
+import json
 import threading
 import time
 from collections.abc import Mapping, Sequence
@@ -205,6 +206,11 @@ class Relay:
             for source in (*output.sources, *([] if output.pulse is None else [output.pulse]))
         ]
         return list(dict.fromkeys(source.topic for source in sources if source.ns == ns))
+
+
+def silent(reason: str) -> str:
+    """What a topic of texts says instead of what has been taken back."""
+    return json.dumps({"state": "silent", "reason": reason})
 
 
 def _is_periodic(output: Output) -> bool:

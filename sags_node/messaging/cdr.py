@@ -34,6 +34,7 @@ IMAGE_ENCODINGS: dict[str, tuple[DType, int]] = {  # ROS name: dtype, channels
 }
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
 POSE = "geometry_msgs/msg/PoseStamped"
+NODES = "rmw_dds_common/msg/ParticipantEntitiesInfo"
 PACKED_FIELDS = ("id", "rgb")  # 32-bit words that are no numbers on a scale
 _POINT_FIELD_UINT32, _POINT_FIELD_FLOAT32 = 6, 7
 
@@ -50,6 +51,10 @@ class Content:
     encoding: str = ""
     shape: tuple[int, ...] = ()
     dtype: DType = ""
+
+    def cdr(self) -> bytes:
+        """The whole message."""
+        return b"".join(self.parts)
 
 
 @cache
@@ -112,14 +117,18 @@ def from_ros1(raw: bytes, type_name: str) -> bytes:
         raise WireError(f"damaged {type_name}: {error}") from None
 
 
-def compressed_image(data: bytes, kind: str, encoding: str, header: Any) -> bytes:
-    """`sensor_msgs/CompressedImage` of a JPEG or PNG file (`kind`), with the header of the picture's message.
+def compressed_image(file: bytes, form: str, header: Any) -> bytes:
+    """`sensor_msgs/CompressedImage` of a picture file, with the header of the picture's message."""
+    return _serialize(_ros[COMPRESSED](header, form, np.frombuffer(file, np.uint8)))
 
-    `encoding` is that of the picture; the format says it in the words of ROS's compressed_image_transport.
+
+def file_form(encoding: str, kind: str) -> str:
+    """What a JPEG or PNG file (`kind`) is made of, in the words of ROS's compressed_image_transport.
+
+    `encoding` is that of the picture.
     """
     stored = encoding.replace("rgb", "bgr")  # the channel order of OpenCV, which writes and reads these files
-    form = f"{encoding}; {kind} compressed {stored}"
-    return _serialize(_ros[COMPRESSED](header, form, np.frombuffer(data, np.uint8)))
+    return f"{encoding}; {kind} compressed {stored}"
 
 
 def picture_file(data: bytes, stamp_ns: int, frame: str = LEFT_FRAME) -> Content:
@@ -232,6 +241,19 @@ def diagnostics(statuses: Sequence[Status], stamp_ns: int) -> Content:
 def string(text: str) -> Content:
     """`std_msgs/String`."""
     return Content(topics.STRING, (_serialize(_ros[topics.STRING](text)),))
+
+
+def node_entities(
+    guid: bytes, namespace: str, name: str, readers: Sequence[bytes], writers: Sequence[bytes]
+) -> bytes:
+    """`rmw_dds_common/ParticipantEntitiesInfo` of a process with one node; GUIDs are those of DDS."""
+
+    def gid(each: bytes) -> Any:
+        return _ros["rmw_dds_common/msg/Gid"](np.frombuffer(each, np.uint8))
+
+    node_type = _ros["rmw_dds_common/msg/NodeEntitiesInfo"]
+    node = node_type(namespace, name, [gid(each) for each in readers], [gid(each) for each in writers])
+    return _serialize(_ros[NODES](gid(guid), [node]))
 
 
 def clock(time_ns: int) -> Content:

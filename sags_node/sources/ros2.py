@@ -16,7 +16,8 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.messaging.security import Seldom
 from sags_node.messaging.topics import CAMERA_INFO
 from sags_node.recording.pictures import IMAGE_TYPES, decode_picture, header_stamp, read_eye
-from sags_node.sources.ros_graph import Graph, Reader, receive_buffer
+from sags_node.ros.endpoints import Reader
+from sags_node.ros.graph import Graph, receive_buffer
 from sags_node.sources.sent import SentPictures
 from sags_node.types import Eye as Calibrated
 from sags_node.types import Side, StereoFrame, StereoRig

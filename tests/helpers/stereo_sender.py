@@ -53,7 +53,7 @@ def dds(domain: int, compressed: bool, scale: float, session: Path) -> Callable[
     from sags_node.config import RosGraph
     from sags_node.messaging import cdr
     from sags_node.messaging.topics import CAMERA_INFO, IMAGE, TF
-    from sags_node.sources.ros_graph import Graph
+    from sags_node.ros.graph import Graph
 
     graph = Graph(RosGraph(domain=domain))
     kind, suffix = (cdr.COMPRESSED, "/compressed") if compressed else (IMAGE, "")
@@ -65,15 +65,15 @@ def dds(domain: int, compressed: bool, scale: float, session: Path) -> Callable[
     rig = resized_rig(load_rig(session / "calib"), scale)
 
     def send(left: U8, right: U8, stamp_ns: int) -> None:
-        tf.write(cdr.transform(pose, stamp_ns), stamp_ns)
+        tf.write(cdr.transform(pose, stamp_ns).cdr(), stamp_ns)
         for writer, eye in zip(calibrations, (rig.left, rig.right), strict=True):
-            writer.write(cdr.eye_info(eye, stamp_ns), stamp_ns)
+            writer.write(cdr.eye_info(eye, stamp_ns).cdr(), stamp_ns)
         for writer, picture in zip(pictures, (left, right), strict=True):
             if compressed:
                 file = cv2.imencode(".jpg", picture[..., ::-1])[1].tobytes()
-                writer.write(cdr.picture_file(file, stamp_ns), stamp_ns)
+                writer.write(cdr.picture_file(file, stamp_ns).cdr(), stamp_ns)
             else:
-                writer.write(cdr.image(picture, "rgb8", stamp_ns), stamp_ns)
+                writer.write(cdr.image(picture, "rgb8", stamp_ns).cdr(), stamp_ns)
 
     return send
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import time
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 from live_taking import Taker
 from places import ROOT
+from ros_peers import DOMAIN, rclpy_python
 from sending import sending, stereo_sender
 from stereo_sender import paint_number
 from waiting import until
@@ -19,19 +19,13 @@ from sags_node.config import GeometryConfig, LaunchConfig, Ros2Robot, Ros2Source
 from sags_node.errors import UsageError
 from sags_node.messaging import cdr
 from sags_node.messaging.topics import IMAGE, TF
+from sags_node.ros.graph import Graph, domain_of
 from sags_node.sources import ros2
 from sags_node.sources.robot import open_robot
 from sags_node.sources.ros2 import RosCameras, read_rig
-from sags_node.sources.ros_graph import Graph, domain_of
 
-pytest.importorskip("cyclonedds", reason="ROS 2 needs: pip install 'sags-node[ros2]'")
 pytestmark = pytest.mark.live
 
-CACHE = Path(
-    os.environ.get("SAGS_ROS_CACHE")
-    or Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sags/ros"
-)
-DOMAIN = 60 + os.getpid() % 40  # away from nodes of this machine, and from tests of another checkout
 SIZE = 1280, 1024
 
 
@@ -108,9 +102,9 @@ def test_wrong_encodings_stamps_and_types_are_said(
 
     def send() -> None:
         now = time.time_ns()
-        writers[0].write(cdr.image(picture[..., 0].astype(np.float32), "32FC1", now), now)
-        writers[1].write(cdr.image(picture, "rgb8", now - 86_400 * 10**9), now)
-        writers[2].write(cdr.transform(np.eye(4), now), now)
+        writers[0].write(cdr.image(picture[..., 0].astype(np.float32), "32FC1", now).cdr(), now)
+        writers[1].write(cdr.image(picture, "rgb8", now - 86_400 * 10**9).cdr(), now)
+        writers[2].write(cdr.transform(np.eye(4), now).cdr(), now)
 
     with caplog.at_level(logging.WARNING):
         both = lines("/wrong/encoding", "/wrong/stamp")
@@ -133,7 +127,7 @@ def test_one_topic_may_show_both_eyes() -> None:
 
     def sent_and_come() -> bool:
         now = time.time_ns()
-        writer.write(cdr.image(picture, "rgb8", now), now)
+        writer.write(cdr.image(picture, "rgb8", now).cdr(), now)
         return len(taker.numbers) >= 3
 
     said = Ros2Source(domain=DOMAIN, left=name, geometry=geometry)
@@ -153,9 +147,7 @@ def test_the_domain_is_that_of_the_launch_file_or_of_ros(monkeypatch: pytest.Mon
 
 @pytest.fixture
 def rclpy_camera() -> list[object]:
-    if not (CACHE / "bin/python").exists():
-        pytest.skip(f"no rclpy in {CACHE}; run tests/ros2/prepare.sh")
-    return [CACHE / "bin/python", ROOT / "tests/ros2/camera.py"]
+    return [rclpy_python(), ROOT / "tests/ros2/camera.py"]
 
 
 def test_a_real_ros_node_is_heard(rclpy_camera: list[object]) -> None:

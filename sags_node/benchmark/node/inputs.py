@@ -18,8 +18,8 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import cdr
 from sags_node.messaging.topics import IMAGE
 from sags_node.processes import children, cpu_seconds
+from sags_node.ros.graph import Graph
 from sags_node.sources.push import PushedPictures
-from sags_node.sources.ros_graph import Graph
 from sags_node.sources.source import Source, open_source
 from sags_node.types import U8
 
@@ -95,7 +95,7 @@ def _publishing(domain: int, *names: str) -> None:
 
     def send(picture: U8, stamp_ns: int) -> None:
         for writer in writers:
-            writer.write(cdr.image(picture, "rgb8", stamp_ns), stamp_ns)
+            writer.write(cdr.image(picture, "rgb8", stamp_ns).cdr(), stamp_ns)
 
     _send_always(send)
 
