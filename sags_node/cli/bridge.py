@@ -33,6 +33,7 @@ def bridge() -> None:
     \b
     3D Slicer, PLUS, a navigation system     sags bridge openigtlink
     looking from a desk, plots, layouts      sags bridge foxglove
+    web pages, Unity, no ZeroMQ              sags bridge web
     a browser on this machine, no set-up     sags view
     a program of your own                    none: docs/clients.md
 
@@ -157,6 +158,39 @@ def openigtlink(send: str, **options: Any) -> None:
     ready, stop = options.pop("ready"), options.pop("stop")
     chosen = tuple(name for name in send.split(",") if name)
     run_openigtlink(Options(send=chosen, **options), ready, stop)
+
+
+@bridge.command()
+@_common(port=8766)
+@click.option("--pin", is_flag=True, help="Let peers pin and remove anchors.")
+@click.option(
+    "--origin",
+    "origins",
+    multiple=True,
+    metavar="URL",
+    help="Pages from there may connect too, e.g. https://or.example.org; repeatable.",
+)
+def web(**options: Any) -> None:
+    """Serve web pages, Unity and other programs without ZeroMQ, by WebSocket.
+
+    The messages are the node's own, byte for byte, with their header as JSON. http://127.0.0.1:8766 shows the
+    model, its depth and the anchors; its client /sags.js is one file to take along. A client in C# for Unity
+    is in examples/unity. Peers say which topics they want, thin ones too.
+
+    \b
+    sags run launch/d4d_pull.yaml &
+    sags bridge web
+    xdg-open http://127.0.0.1:8766
+
+    Pages of other origins are refused unless --origin names them.
+
+    Needs: pip install 'sags-node[bridges]'
+    """
+    _check_installed("websockets", "websockets", "web")
+    from sags_node.bridge.web import Options, run_web
+
+    ready, stop = options.pop("ready"), options.pop("stop")
+    run_web(Options(**options), ready, stop)
 
 
 @bridge.command()

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,10 +12,10 @@ from independent_client import collect
 from made_messages import meta
 from places import ROOT
 from running_node import RunningNode
-from synthetic import HEIGHT, WIDTH, at_frame, health, plane_result
+from synthetic import HEIGHT, WIDTH, plane_result
+from thin_sender import making, node_sockets
 from waiting import until
 
-from sags_node.config import PublishConfig
 from sags_node.errors import UsageError
 from sags_node.messaging import content, thin, topics
 from sags_node.messaging.publisher import MAX_THIN, Publisher
@@ -27,7 +23,6 @@ from sags_node.messaging.received import ReceivedCompressed, ReceivedImage, Topi
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.messaging.thin import DEPTH_STEP, thin_pictures
 from sags_node.messaging.wire import WireError
-from sags_node.types import FrameResult
 
 pytestmark = pytest.mark.live
 
@@ -42,41 +37,6 @@ JPEG_ERROR = 3
 
 def thin_name(name: str) -> TopicName[ReceivedCompressed]:
     return TopicName(name, ReceivedCompressed)
-
-
-@contextmanager
-def sockets(run_dir: Path, right: bool = False) -> Iterator[Publisher]:
-    """Those of a node."""
-    endpoints = {"data": ("tcp://127.0.0.1:*",), "control": None}
-    config = PublishConfig(**endpoints, run_dir=run_dir, right=right)
-    with Publisher(config, "sags", "session", thins=True) as running:
-        yield running
-
-
-@contextmanager
-def making(running: Publisher, result: FrameResult) -> Iterator[list[frozenset[str]]]:
-    """A node's publishing and thinning on one thread; gives what was made of each frame."""
-    stop, made = threading.Event(), []
-
-    def publish() -> None:
-        number = 0
-        while not stop.is_set():
-            frame = at_frame(result, number, time.time_ns())
-            running.publish_result(frame, 0)
-            pictures = thin_pictures(frame, running.thin)
-            made.append(frozenset(pictures))
-            running.publish_thin(frame, pictures)
-            running.publish_health(health())
-            running.poll(20)
-            number += 1
-
-    thread = threading.Thread(target=publish)
-    thread.start()
-    try:
-        yield made
-    finally:
-        stop.set()
-        thread.join()
 
 
 def frame_of(running: Publisher, *names: str) -> dict[str, np.ndarray]:
@@ -107,7 +67,7 @@ def test_depth_is_exact_to_half_a_step_and_unknown_stays_unknown(tmp_path: Path)
     whole, half = thin_name("thin/full/left/render/depth/png"), thin_name("thin/half/left/render/depth/png")
     part = thin_name("thin/half/10,20,31,24/left/render/depth/png")
     measured = thin_name("thin/full/left/depth/png")
-    with sockets(tmp_path, right=True) as running, making(running, result):
+    with node_sockets(tmp_path, right=True) as running, making(running, result):
         said = frame_of(running, whole, half, part, measured, DEPTH)
     known = said[DEPTH].copy()
     known[5, 7] = np.nan
@@ -131,7 +91,7 @@ def test_pictures_masks_and_confidence_come_as_they_are(tmp_path: Path) -> None:
     view = result.views["left"]
     ramp = np.linspace(0, 1, WIDTH, dtype=np.float32)[None].repeat(HEIGHT, 0)
     result = replace(result, views={**result.views, "left": replace(view, alpha=ramp)})
-    with sockets(tmp_path, right=True) as running, making(running, result):
+    with node_sockets(tmp_path, right=True) as running, making(running, result):
         said = frame_of(running, *names.values(), IMAGE, SURE, MASK)
     rgba = said[IMAGE].astype(np.float32)
     black = rgba[..., :3] * rgba[..., 3:] / 255
@@ -153,7 +113,7 @@ def test_pictures_masks_and_confidence_come_as_they_are(tmp_path: Path) -> None:
 def test_another_language_finds_file_scale_and_place(tmp_path: Path) -> None:
     """docs/wire.md alone: the file is part 1; `scale` and `window` are in the header."""
     name = "thin/half/10,20,30,24/left/render/depth/png"
-    with sockets(tmp_path) as running, making(running, plane_result()):
+    with node_sockets(tmp_path) as running, making(running, plane_result()):
         (message,) = collect(running.connection.data[-1], [f"sags/{name}"], 1, 10)[f"sags/{name}"]
     assert message.meta["type"] == "sensor_msgs/msg/CompressedImage"
     assert message.meta["window"] == [10, 20, 2] and message.meta["scale"] == DEPTH_STEP
@@ -166,7 +126,7 @@ def test_another_language_finds_file_scale_and_place(tmp_path: Path) -> None:
 
 def test_nothing_is_made_that_nobody_asks_for_by_its_name(tmp_path: Path) -> None:
     name = thin_name("thin/full/left/depth/png")
-    with sockets(tmp_path) as running, making(running, plane_result()) as made:
+    with node_sockets(tmp_path) as running, making(running, plane_result()) as made:
         with Subscriber(["left/depth", "left/render/depth"], running.connection.data[-1]) as others:
             assert others.wait("left/depth", 5) is not None
             with Subscriber([name], running.connection.data[-1]) as one:
@@ -180,7 +140,7 @@ def test_nothing_is_made_that_nobody_asks_for_by_its_name(tmp_path: Path) -> Non
 
 def test_a_pause_loses_no_message_that_comes_after_it(tmp_path: Path) -> None:
     name = thin_name("thin/quarter/left/depth/png")
-    with sockets(tmp_path) as running, making(running, plane_result()):
+    with node_sockets(tmp_path) as running, making(running, plane_result()):
         with Subscriber([name], running.connection.data[-1], rates={name: 1.0}) as one:
             before = one.wait(name, 5)
             assert before is not None
@@ -204,7 +164,7 @@ def test_a_pause_loses_no_message_that_comes_after_it(tmp_path: Path) -> None:
 )
 def test_a_wrong_request_hears_why(name: str, said: str, tmp_path: Path) -> None:
     """From the node, on the topic that was asked for; our own subscriber knows most of it before."""
-    with sockets(tmp_path) as running, making(running, plane_result()) as made:
+    with node_sockets(tmp_path) as running, making(running, plane_result()) as made:
         (answer,) = collect(running.connection.data[-1], [f"sags/{name}"], 1, 10)[f"sags/{name}"]
         assert said in content.cdr.decode(answer.cdr(), "std_msgs/msg/String").data
         try:
@@ -220,7 +180,7 @@ def test_a_wrong_request_hears_why(name: str, said: str, tmp_path: Path) -> None
 
 def test_no_more_are_made_than_may_be(tmp_path: Path) -> None:
     names = [f"thin/full/{x},0,8,8/left/depth/png" for x in range(MAX_THIN + 1)]
-    with sockets(tmp_path) as running, making(running, plane_result()) as made:
+    with node_sockets(tmp_path) as running, making(running, plane_result()) as made:
         with Subscriber(names[:-1], running.connection.data[-1]):
             until(lambda: len(running.thin) == MAX_THIN)
             with Subscriber(names[-1:], running.connection.data[-1]) as late:
