@@ -83,14 +83,18 @@ def test_a_pinned_anchor_comes_back_and_a_killed_node_leaves_nothing_standing(
             node.process.wait(10)
 
 
-@pytest.mark.parametrize("command", ["openigtlink", "foxglove"])
+@pytest.mark.parametrize("command", ["openigtlink", "foxglove", "web"])
 def test_other_machines_are_let_in_only_when_it_is_said(command: str) -> None:
     refused(2, "bridge", command, "--host", "0.0.0.0", said=("without keys or encryption", "--insecure"))
 
 
 @pytest.mark.parametrize(
     ("command", "module", "package"),
-    [("openigtlink", "pyigtl", "pyigtl"), ("foxglove", "foxglove", "foxglove-sdk")],
+    [
+        ("openigtlink", "pyigtl", "pyigtl"),
+        ("foxglove", "foxglove", "foxglove-sdk"),
+        ("web", "websockets", "websockets"),
+    ],
 )
 def test_a_missing_extra_is_named_with_the_way_to_get_it(
     command: str, module: str, package: str, monkeypatch: pytest.MonkeyPatch
@@ -103,3 +107,4 @@ def test_the_help_says_when_to_use_which() -> None:
     text = sags("bridge", "--help").stdout
     assert "3D Slicer" in text and "sags bridge openigtlink" in text
     assert "sags bridge foxglove" in text and "sags view" in text
+    assert "Unity" in text and "sags bridge web" in text

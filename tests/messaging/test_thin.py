@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from independent_client import collect
 from made_messages import meta
-from places import ROOT
+from places import SESSION
 from running_node import RunningNode
 from synthetic import HEIGHT, WIDTH, plane_result
 from thin_sender import making, node_sockets
@@ -211,7 +211,8 @@ def test_a_damaged_file_is_said_and_nothing_is_shown() -> None:
 
 def test_a_running_node_sends_colour_and_depth_over_20_mbit(tmp_path: Path) -> None:
     """At half of 640x512 px and 30 Hz, as docs/wire.md says; and the whole picture comes beside."""
-    node = RunningNode(ROOT / "launch/phantom.yaml", tmp_path, "source.seconds:=0.5", "source.pace:=realtime")
+    size = ("vision.width:=640", "vision.height:=512")
+    node = RunningNode(SESSION, tmp_path, "source.pace:=realtime", *size)
     try:
         jpeg, png = (f"sags/thin/half/left/render/{name}" for name in ("image/jpeg", "depth/png"))
         whole = "sags/left/render/image"

@@ -33,6 +33,8 @@ from sags_node.processes import end
 TICKS = os.sysconf("SC_CLK_TCK")  # of CPU time in a second
 PICTURES = ("/sags/left/image_rect_color", "/sags/left/render/image")
 LAYOUT = (*PICTURES, "/sags/points", "/sags/anchors", "/sags/tf", "/sags/figures")  # what the layout shows
+WHOLE = ("sags/left/render/image", "sags/left/render/depth", "sags/anchors")
+HALF = ("sags/thin/half/left/render/image/jpeg", "sags/thin/half/left/render/depth/png", "sags/anchors")
 THIN = tuple(f"{picture}/h264" for picture in PICTURES)
 
 
@@ -229,8 +231,30 @@ def _listen_foxglove(names: Sequence[str]) -> Listen:
     return listen
 
 
+def _listen_web(names: Sequence[str]) -> Listen:
+    """A WebSocket client that asks for these topics, and reads no more of a message than its header."""
+
+    def listen(port: int, heard: Heard, stop: threading.Event) -> None:
+        with connect(f"ws://127.0.0.1:{port}/ws", max_size=None) as joined:
+            joined.send(json.dumps({"subscribe": names}))
+            while not stop.is_set():
+                try:
+                    message = joined.recv(timeout=1.0)
+                except TimeoutError:
+                    continue
+                except ConnectionClosed:
+                    return
+                if isinstance(message, bytes):
+                    head = json.loads(message[4 : 4 + struct.unpack_from("<I", message)[0]])
+                    heard.note(head["topic"], head["stamp_ns"] * 1e-9, len(message))
+
+    return listen
+
+
 CASES = (
     Case("openigtlink", ("openigtlink",), "SagsPicture", _listen_igtl),
     Case("foxglove", ("foxglove",), PICTURES[1], _listen_foxglove(LAYOUT)),
     Case("foxglove, H.264", ("foxglove",), THIN[1], _listen_foxglove(THIN)),
+    Case("web", ("web",), WHOLE[0], _listen_web(WHOLE)),
+    Case("web, half size", ("web",), HALF[0], _listen_web(HALF)),
 )
