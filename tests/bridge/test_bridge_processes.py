@@ -107,4 +107,4 @@ def test_the_help_says_when_to_use_which() -> None:
     text = sags("bridge", "--help").stdout
     assert "3D Slicer" in text and "sags bridge openigtlink" in text
     assert "sags bridge foxglove" in text and "sags view" in text
-    assert "Unity" in text and "sags bridge web" in text
+    assert "Unity" in text and "sags bridge web" in text and "sags bridge gst" in text
