@@ -26,7 +26,17 @@ DEPTH_STEP = 5e-5  # m: 25 um at most beside the depth, far below what any depth
 CONFIDENCE_STEP = 1 / 255
 QUALITY = 80  # of JPEG; the default of ROS's image transport
 _JPEG = (cv2.IMWRITE_JPEG_QUALITY, QUALITY)
-_PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # further levels take twice the time for a tenth less
+# Smooth numbers with noise: one filter for all rows and runs alone take a third less time than OpenCV's
+# defaults, and give smaller files.
+_FILTER, _PAETH = 19, 128  # cv2.IMWRITE_PNG_FILTER, which older versions have not and pass over
+_PNG = (
+    cv2.IMWRITE_PNG_COMPRESSION,
+    1,
+    cv2.IMWRITE_PNG_STRATEGY,
+    cv2.IMWRITE_PNG_STRATEGY_RLE,
+    _FILTER,
+    _PAETH,
+)
 
 
 def thin_pictures(result: FrameResult, asked: Mapping[str, ThinPicture]) -> dict[str, Content]:
