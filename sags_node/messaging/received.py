@@ -60,7 +60,7 @@ class ReceivedCompressed(Received):
         """
         from sags_node.messaging.thin import decode  # brings OpenCV along, which few clients need
 
-        return decode(self.topic, self.meta, self.parts[1])
+        return decode(self.topic, self.meta.scale or 0.0, self.parts[1])
 
     @property
     def window(self) -> tuple[int, int, int]:

@@ -18,7 +18,7 @@ from sags_node.messaging import cdr
 from sags_node.messaging.cdr import Content
 from sags_node.messaging.content import tells_of
 from sags_node.messaging.topics import ThinPicture
-from sags_node.messaging.wire import Buffer, Meta, WireError
+from sags_node.messaging.wire import Buffer, WireError
 from sags_node.picture_file import decode as decode_file
 from sags_node.types import F32, U8, FrameResult, RenderedView
 
@@ -132,8 +132,8 @@ def _in_steps(depth: F32) -> NDArray[np.uint16]:
     return np.where(steps < 65536, steps, 0).astype(np.uint16)
 
 
-def decode(topic: str, meta: Meta, file: Buffer) -> NDArray[Any]:
-    """The picture in a thin message, see `received.ReceivedCompressed.array`.
+def decode(topic: str, scale: float, file: Buffer) -> NDArray[Any]:
+    """The picture in a thin message, see `received.ReceivedCompressed.array`; `scale` 0: its header has none.
 
     Raises:
         WireError: the file is damaged.
@@ -143,8 +143,8 @@ def decode(topic: str, meta: Meta, file: Buffer) -> NDArray[Any]:
     except SagsError as error:
         raise WireError(str(error)) from None
     picture: NDArray[Any]
-    if meta.scale:
-        picture = stored * np.float32(meta.scale)
+    if scale:
+        picture = stored * np.float32(scale)
         if stored.dtype == np.uint16:
             picture[stored == 0] = np.nan
     else:

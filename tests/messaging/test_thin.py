@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 import pytest
 from independent_client import collect
-from made_messages import meta
 from places import SESSION
 from running_node import RunningNode
 from synthetic import HEIGHT, WIDTH, plane_result
@@ -204,9 +203,9 @@ def test_no_name_begins_with_another() -> None:
 def test_a_damaged_file_is_said_and_nothing_is_shown() -> None:
     made = thin_pictures(plane_result(), {"t": topics.thin_picture("thin/half/left/depth/png")})["t"]
     file = bytes(made.parts[1])
-    assert thin.decode("t", meta(1, 0, scale=DEPTH_STEP), file).shape == (HEIGHT // 2, WIDTH // 2)
+    assert thin.decode("t", DEPTH_STEP, file).shape == (HEIGHT // 2, WIDTH // 2)
     with pytest.raises(WireError, match="damaged"):
-        thin.decode("t", meta(1, 0, scale=DEPTH_STEP), file[: len(file) // 2])
+        thin.decode("t", DEPTH_STEP, file[: len(file) // 2])
 
 
 def test_a_running_node_sends_colour_and_depth_over_20_mbit(tmp_path: Path) -> None:
