@@ -6,6 +6,8 @@
 //
 // A canvas is cleared, transparent, as soon as what it shows is older than `maxAge`, whatever the reason.
 const NEAR = 0.03, FAR = 0.2; // m, of the colours of depth: warm to cold
+const COLOURS = Uint32Array.from({ length: 256 }, (_, far) => // as an ImageData holds them
+  0xff000000 + (far << 16) + ((255 - Math.abs(2 * far - 255)) << 8) + 255 - far);
 const CLOCK_EVERY = 1000, CLOCK_KNOWN = 5000; // ms
 const bytes = (view) => new Uint8Array(view.buffer, view.byteOffset, view.byteLength);
 
@@ -167,12 +169,10 @@ async function decoded(head, data) { // ImageData, or an ImageBitmap
 }
 
 function coloured(metres, width) { // unknown stays transparent; the numbers are not shown, only their order
-  const made = new ImageData(width, metres.length / width);
-  for (let i = 0; i < metres.length; i++) {
-    if (!(metres[i] > 0)) continue;
-    const far = Math.min(Math.max(Math.log(metres[i] / NEAR) / Math.log(FAR / NEAR), 0), 1);
-    made.data.set([255 * (1 - far), 255 * (1 - Math.abs(2 * far - 1)), 255 * far, 255], 4 * i);
-  }
+  const made = new ImageData(width, metres.length / width), pixels = new Uint32Array(made.data.buffer);
+  const steep = 255 / Math.log(FAR / NEAR);
+  for (let i = 0; i < metres.length; i++)
+    if (metres[i] > 0) pixels[i] = COLOURS[Math.min(Math.max(Math.round(steep * Math.log(metres[i] / NEAR)), 0), 255)];
   return made;
 }
 
@@ -193,7 +193,7 @@ async function png(head, data) { // numbers of 8 or 16 bit, which browsers would
       out[to + x] = raw[from + x] + [0, a, b, (a + b) >> 1, paeth][filter];
     }
   }
-  const view = new DataView(out.buffer);
-  const number = (i) => (step === 2 ? view.getUint16(2 * i) : out[i]) * head.scale;
-  return [Float32Array.from({ length: width * height }, (_, i) => number(i)), width];
+  const numbers = new Float32Array(width * height);
+  for (let i = 0; i < numbers.length; i++) numbers[i] = head.scale * (step === 2 ? 256 * out[2 * i] + out[2 * i + 1] : out[i]);
+  return [numbers, width];
 }
