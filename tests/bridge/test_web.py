@@ -281,6 +281,6 @@ def test_a_browser_draws_at_the_nodes_rate_and_goes_blank(page: Any, tmp_path: P
     )
     assert np.array_equal(raw["depth"][..., 3] > 0, view.depth > 0)
     assert half["render"].shape == (HEIGHT // 2, WIDTH // 2, 4)
-    # 25 um are 0.11 of the 255 colours over 1.9 nepers from 30 mm on: at most the next colour, 2 levels beside.
+    # 25 um are 0.11 of the 255 colours over 1.9 nepers from 30 mm on: at most the next colour, by 2 levels.
     assert np.abs(half["depth"].astype(int) - raw["depth"][::2, ::2]).max() <= 2
     assert raw["marks"].shape[:2] == (HEIGHT, WIDTH) and raw["marks"].any()

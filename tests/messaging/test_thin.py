@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from sags_node.messaging.received import ReceivedCompressed, ReceivedImage, Topi
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.messaging.thin import DEPTH_STEP, thin_pictures
 from sags_node.messaging.wire import WireError
+from sags_node.recording.recorder import Options, Recorder
 
 pytestmark = pytest.mark.live
 
@@ -135,6 +137,21 @@ def test_nothing_is_made_that_nobody_asks_for_by_its_name(tmp_path: Path) -> Non
             until(lambda: len(made) > count + 5)
             assert not set().union(*made[count + 1 :])
             assert {asked for frame in made for asked in frame} == {name}
+
+
+def test_a_recording_of_everything_leaves_out_what_others_asked_for(tmp_path: Path) -> None:
+    """It has the whole pictures."""
+    name = thin_name("thin/quarter/left/depth/png")
+    with node_sockets(tmp_path) as running, making(running, plane_result()):
+        recorder = Recorder(Options(tmp_path / "bag", endpoint=running.connection.data[-1]))
+        with Subscriber([name], running.connection.data[-1]) as one, ThreadPoolExecutor(1) as worker:
+            recording = worker.submit(recorder.run)
+            until(lambda: list((tmp_path / "bag").glob("*.mcap")))
+            for _ in range(5):
+                assert one.wait(name, 5, after=one.latest(name)) is not None
+            recorder.stop()
+            written = recording.result(10)["topics"]
+    assert "sags/left/depth" in written and not [each for each in written if "/thin/" in each]
 
 
 def test_a_pause_loses_no_message_that_comes_after_it(tmp_path: Path) -> None:
