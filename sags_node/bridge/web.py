@@ -65,6 +65,7 @@ class _Said(msgspec.Struct):
     args: dict[str, Any] = {}
 
 
+log = logging.getLogger(__name__)
 _unheard = logging.getLogger(f"{__name__}.peers")  # of every stranger that leaves without a word
 _unheard.disabled = True
 _decoder = msgspec.json.Decoder(_Said)
@@ -190,6 +191,9 @@ class Peer:
                     self._relay.wait()
         except ConnectionClosed:
             return
+        except SagsError as error:  # the node wants keys, or has been replaced by one that does
+            log.warning("%s", error)
+            self._connection.close(1011, "the gateway's log says why")
         finally:
             if self._relay is not None:
                 self._relay.close()
