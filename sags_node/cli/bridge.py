@@ -172,7 +172,7 @@ def openigtlink(send: str, **options: Any) -> None:
     help="Pages from there may connect too, e.g. https://or.example.org; repeatable.",
 )
 def web(**options: Any) -> None:
-    """Serve web pages, Unity and other programs without ZeroMQ, by WebSocket.
+    """Serve web pages, Unity and others by WebSocket.
 
     The messages are the node's own, byte for byte, with their header as JSON. http://127.0.0.1:8766 shows the
     model, its depth and the anchors; its client /sags.js is one file to take along. A client in C# for Unity
@@ -208,7 +208,9 @@ def web(**options: Any) -> None:
     help="Seconds since capture after which there is only the key colour.",
 )
 def gst(overlay_ns: str, run_dir: Path | None, **options: Any) -> None:
-    """Write the overlay into GStreamer pipelines, on the key colour: for displays that blend by it.
+    """Write the overlay into GStreamer, on its key colour.
+
+    For displays that blend by that colour, such as dVRK's.
 
     LAUNCH is the rest of a pipeline, as for gst-launch-1.0. It gets BGRx pictures at the display's rate.
     Where nothing fresh is there, they are the key colour alone, which such a display shows as nothing.

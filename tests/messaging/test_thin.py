@@ -24,6 +24,7 @@ from sags_node.messaging.subscriber import Subscriber
 from sags_node.messaging.thin import DEPTH_STEP, thin_pictures
 from sags_node.messaging.wire import WireError
 from sags_node.recording.recorder import Options, Recorder
+from sags_node.topic import topic_echo, topic_hz
 
 pytestmark = pytest.mark.live
 
@@ -137,6 +138,17 @@ def test_nothing_is_made_that_nobody_asks_for_by_its_name(tmp_path: Path) -> Non
             until(lambda: len(made) > count + 5)
             assert not set().union(*made[count + 1 :])
             assert {asked for frame in made for asked in frame} == {name}
+
+
+def test_sags_topic_reads_them_like_the_whole(tmp_path: Path) -> None:
+    depth = plane_result().observation.depth[::2, ::2]
+    with node_sockets(tmp_path) as running, making(running, plane_result()):
+        endpoint = running.connection.data[-1]
+        (said,) = topic_echo("thin/half/left/depth/png", endpoint, count=1, seconds=5)
+        assert topic_hz("thin/half/left/depth/png", endpoint, seconds=0.5)["average_rate"] > 5
+    assert said["content"]["shape"] == list(depth.shape)
+    assert said["content"]["max"] == pytest.approx(depth.max(), abs=DEPTH_STEP)
+    assert said["content"]["unknown"] == pytest.approx(np.mean(depth == 0))
 
 
 def test_a_recording_of_everything_leaves_out_what_others_asked_for(tmp_path: Path) -> None:
