@@ -1,11 +1,12 @@
-r"""The running node: four threads and the slots between them.
+r"""The running node: five threads and the slots between them.
 
-    capture --frames--> mapping --results--> publishing
-                           \--scenes--> drawing --views--/
+    capture --frames--> mapping --results--> publishing --whole--> thinning
+                           \--scenes--> drawing --views--/ \--------thin----/
 
 Slots hold the newest value only (live), or hand every value over (recordings not played in real time).
 The sockets live on the publishing thread; what a client asks of the model runs on the mapping thread,
-between two frames. Consumers' own views are drawn on a thread that gives way to all others.
+between two frames. Consumers' own views are drawn, and thin pictures made, on threads that give way to all
+others.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import os
 import threading
 import time
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from dataclasses import replace
 from typing import Any
@@ -27,8 +28,11 @@ from sags_node.health import Statistics, in_a_line
 from sags_node.kernels.threads import configure_threads
 from sags_node.latest import Latest
 from sags_node.messaging import content
+from sags_node.messaging.cdr import Content
 from sags_node.messaging.masks import MaskSubscriber
 from sags_node.messaging.publisher import Publisher
+from sags_node.messaging.thin import thin_pictures
+from sags_node.messaging.topics import ThinPicture
 from sags_node.node_operations import NodeState, Operations
 from sags_node.pipeline import Pipeline
 from sags_node.recording.child import RecorderProcess
@@ -87,19 +91,22 @@ class Node:
         self._frames: Latest[tuple[StereoFrame, float]] = Latest()  # and when it came
         self._results: Latest[FrameResult] = Latest(on_put=self._wake_publishing)
         self._scenes: Latest[tuple[FrameResult, bool]] = Latest()  # and whether frames were missed
+        self._whole: Latest[tuple[FrameResult, Mapping[str, ThinPicture]]] = Latest()  # and what is asked for
+        self._thin: Latest[tuple[FrameResult, dict[str, Content]]] = Latest(on_put=self._wake_publishing)
         # By name, the newest only; None: closed. Single operations on a dict need no lock.
         self._drawn: dict[str, DrawnView | None] = {}
         self._watched: frozenset[str] = frozenset()  # views that somebody subscribes to
         self._error: BaseException | None = None
         self._stopping = threading.Event()
         self._last_sent: FrameResult | None = None
-        self._publisher = Publisher(config.publish, config.ns, uuid.uuid4().hex, self._handlers())
+        self._publisher = Publisher(config.publish, config.ns, uuid.uuid4().hex, self._handlers(), thins=True)
         ipc = [endpoint for endpoint in self.endpoints if endpoint.startswith("ipc:")]
         self._recorder = RecorderProcess(config.ns, ipc[0] if ipc else None)
         work = {
             "capture": (self._capture, self._frames.close),
             "mapping": (self._map, self._close_results),
             "drawing": (self._draw_views, lambda: None),
+            "thinning": (self._make_thin, lambda: None),
             "publishing": (self._publish, self._close_publisher),
         }
         # Events, not joins: in Python 3.11 a Ctrl-C during a join marks a living thread as ended.
@@ -191,7 +198,7 @@ class Node:
             finally:
                 self._ended[name].set()
 
-    # ---- the four threads ----------------------------------------------------------------------------
+    # ---- the five threads ----------------------------------------------------------------------------
 
     def _capture(self) -> None:
         give = self._frames.put if self._live else self._frames.hand_over
@@ -239,6 +246,14 @@ class Node:
             self._operations.for_drawing.serve()
         self._operations.for_drawing.serve()
 
+    def _make_thin(self) -> None:
+        prepare_thread()
+        while not self._whole.closed:
+            came = self._whole.get(timeout=REQUEST_WAIT)
+            if came is not None:
+                result, asked = came
+                self._thin.put((result, thin_pictures(result, asked)))
+
     def _hand_over_view(self, name: str, drawn: DrawnView | None) -> None:
         self._drawn[name] = drawn
         self._wake_publishing()
@@ -252,6 +267,7 @@ class Node:
 
     def _close_results(self) -> None:
         self._scenes.close()
+        self._whole.close()
         self._results.close()
 
     def _close_publisher(self) -> None:
@@ -276,6 +292,7 @@ class Node:
             if picture is not None:
                 self._publisher.publish_picture(*picture)
             self._send_views()
+            self._send_thin()
             before, warned = warned, tuple(by_code(self._state.pipeline.warnings))
             if time.monotonic() >= next_health or self._state.status_due.is_set() or warned != before:
                 self._state.status_due.clear()
@@ -291,6 +308,8 @@ class Node:
         publish_ms = (time.perf_counter() - started) * 1e3
         latency_ms = (time.time_ns() - result.pair.t_capture_ns) * 1e-6
         result = replace(result, timings_ms={**result.timings_ms, "publish": publish_ms})
+        if self._publisher.thin:
+            self._whole.put((result, self._publisher.thin))
         self._state.statistics.add(result, latency_ms, self._dropped())
         self._last_sent = result
         if self._on_result is not None:
@@ -305,6 +324,11 @@ class Node:
                 self._publisher.publish_view(name, drawn)
         names = self._state.views.status
         self._watched = frozenset(name for name in names if self._publisher.watches_view(name))
+
+    def _send_thin(self) -> None:
+        made = self._thin.get(timeout=0)
+        if made is not None:
+            self._publisher.publish_thin(*made)
 
     # ---- control -------------------------------------------------------------------------------------
 

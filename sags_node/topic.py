@@ -24,6 +24,7 @@ from sags_node.messaging.received import (
     Received,
     ReceivedCameraInfo,
     ReceivedCloud,
+    ReceivedCompressed,
     ReceivedImage,
     ReceivedRos,
     ReceivedText,
@@ -270,7 +271,7 @@ def _echo(received: Received) -> Record:
 
 
 def _content(received: Received) -> Any:
-    if isinstance(received, ReceivedImage):
+    if isinstance(received, ReceivedImage | ReceivedCompressed):
         shape = list(received.array.shape)
         return {"encoding": received.meta.encoding, "shape": shape, **_range(received.array)}
     if isinstance(received, ReceivedCloud):

@@ -119,8 +119,12 @@ class Relay:
         """Pass on until `stop` is set."""
         while not stop.is_set():
             self.step()
-            self._arrived.wait(LOOK)
-            self._arrived.clear()
+            self.wait()
+
+    def wait(self) -> None:
+        """Until something comes, and no longer than `LOOK`."""
+        self._arrived.wait(LOOK)
+        self._arrived.clear()
 
     def step(self) -> None:
         """Ask for what is wanted now, and pass on what is new."""

@@ -8,7 +8,7 @@ import os
 import threading
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
-from functools import wraps
+from functools import partial, wraps
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +36,8 @@ def bridge() -> None:
     3D Slicer, PLUS, a navigation system     sags bridge openigtlink
     looking from a desk, plots, layouts      sags bridge foxglove
     programs of ROS 2, RViz                  sags bridge ros2
+    web pages, Unity, no ZeroMQ              sags bridge web
+    dVRK's and other keyed displays          sags bridge gst
     a browser on this machine, no set-up     sags view
     a program of your own                    none: docs/clients.md
 
@@ -173,6 +175,78 @@ def openigtlink(send: str, **options: Any) -> None:
     chosen = tuple(name for name in send.split(",") if name)
     os.nice(NICENESS)
     run_openigtlink(Options(send=chosen, **options), ready, stop)
+
+
+@bridge.command()
+@_common
+@_listening(port=8766)
+@click.option("--pin", is_flag=True, help="Let peers pin and remove anchors.")
+@click.option(
+    "--origin",
+    "origins",
+    multiple=True,
+    metavar="URL",
+    help="Pages from there may connect too, e.g. https://or.example.org; repeatable.",
+)
+def web(**options: Any) -> None:
+    """Serve web pages, Unity and others by WebSocket.
+
+    The messages are the node's own, byte for byte, with their header as JSON. http://127.0.0.1:8766 shows the
+    model, its depth and the anchors; its client /sags.js is one file to take along. A client in C# for Unity
+    is in examples/unity. Peers say which topics they want, thin ones too.
+
+    \b
+    sags run launch/d4d_pull.yaml &
+    sags bridge web
+    xdg-open http://127.0.0.1:8766
+
+    Pages of other origins are refused unless --origin names them.
+
+    Needs: pip install 'sags-node[bridges]'
+    """
+    _check_installed("websockets", "websockets", "web")
+    from sags_node.bridge.web import Options, run_web
+
+    ready, stop = options.pop("ready"), options.pop("stop")
+    run_web(Options(**options), ready, stop)
+
+
+@bridge.command()
+@click.option("--left", metavar="LAUNCH", help="What comes behind the left eye's pictures.")
+@click.option("--right", metavar="LAUNCH", help="What comes behind the right eye's.")
+@click.option("--rate", type=positive, default=60.0, show_default=True, help="Hz of the display.")
+@click.option("--overlay-ns", default="overlay", show_default=True, help="Namespace of the sags overlay.")
+@click.option("--run-dir", type=click.Path(path_type=Path), help="Of the connection file.")
+@click.option(
+    "--max-age",
+    type=positive,
+    default=0.4,
+    show_default=True,
+    help="Seconds since capture after which there is only the key colour.",
+)
+def gst(overlay_ns: str, run_dir: Path | None, **options: Any) -> None:
+    """Write the overlay into GStreamer, on its key colour.
+
+    For displays that blend by that colour, such as dVRK's.
+
+    LAUNCH is the rest of a pipeline, as for gst-launch-1.0. It gets BGRx pictures at the display's rate.
+    Where nothing fresh is there, they are the key colour alone, which such a display shows as nothing.
+
+    \b
+    sags overlay &
+    sags bridge gst --left 'videoconvert ! autovideosink'
+    sags bridge gst --left 'unixfdsink socket-type=abstract socket-path=dvrk_gst:left_ar:RIG' \
+                    --right 'unixfdsink socket-type=abstract socket-path=dvrk_gst:right_ar:RIG'
+
+    unixfdsink, for dVRK's sockets, needs GStreamer 1.24.
+    """
+    from sags_node.bridge.feed import Place
+    from sags_node.bridge.gst import Options, run_gst
+
+    stop = threading.Event()
+    on_stop_signals(stop.set)
+    ready = partial(console.print, "writing as soon as an overlay is there  (Ctrl-C ends)")
+    run_gst(Options(Place(overlay_ns, None, run_dir), **options), ready, stop)
 
 
 @bridge.command()

@@ -32,7 +32,7 @@ IMAGE_ENCODINGS: dict[str, tuple[DType, int]] = {  # ROS name: dtype, channels
     "mono8": ("uint8", 1),
     "32FC1": ("float32", 1),
 }
-COMPRESSED = "sensor_msgs/msg/CompressedImage"
+COMPRESSED = topics.COMPRESSED_IMAGE
 POSE = "geometry_msgs/msg/PoseStamped"
 NODES = "rmw_dds_common/msg/ParticipantEntitiesInfo"
 PACKED_FIELDS = ("id", "rgb")  # 32-bit words that are no numbers on a scale
@@ -51,6 +51,8 @@ class Content:
     encoding: str = ""
     shape: tuple[int, ...] = ()
     dtype: DType = ""
+    scale: float = 0.0  # of a thin picture whose numbers are whole; 0: none
+    window: tuple[int, ...] = ()  # of a thin picture: x, y, and px of the whole picture for one of its own
 
     def cdr(self) -> bytes:
         """The whole message."""
@@ -129,6 +131,24 @@ def file_form(encoding: str, kind: str) -> str:
     """
     stored = encoding.replace("rgb", "bgr")  # the channel order of OpenCV, which writes and reads these files
     return f"{encoding}; {kind} compressed {stored}"
+
+
+def thin_picture(
+    data: NDArray[np.uint8],
+    kind: str,
+    encoding: str,
+    stamp_ns: int,
+    frame: str,
+    scale: float,
+    window: tuple[int, int, int],
+) -> Content:
+    """`sensor_msgs/CompressedImage` whose file is a part of its own; `scale` 0: the numbers are meant as they
+    are."""
+    form = file_form(encoding, kind)
+    message = _ros[COMPRESSED](_header(stamp_ns, frame), form, np.empty(0, np.uint8))
+    start = _serialize(message)[:-4]  # without the length of the empty data
+    parts = (start + _length(data), data.data)
+    return Content(COMPRESSED, parts, form, data.shape, "uint8", scale, window)
 
 
 def picture_file(data: bytes, stamp_ns: int, frame: str = LEFT_FRAME) -> Content:

@@ -88,6 +88,7 @@ def test_a_pinned_anchor_comes_back_and_a_killed_node_leaves_nothing_standing(
     [
         ("openigtlink", "--host", "0.0.0.0"),
         ("foxglove", "--host", "0.0.0.0"),
+        ("web", "--host", "0.0.0.0"),
         ("ros2", "--interface", "eth0"),
     ],
 )
@@ -114,7 +115,11 @@ def test_a_place_or_a_view_that_cannot_be_is_refused(
 
 @pytest.mark.parametrize(
     ("command", "module", "package"),
-    [("openigtlink", "pyigtl", "pyigtl"), ("foxglove", "foxglove", "foxglove-sdk")],
+    [
+        ("openigtlink", "pyigtl", "pyigtl"),
+        ("foxglove", "foxglove", "foxglove-sdk"),
+        ("web", "websockets", "websockets"),
+    ],
 )
 def test_a_missing_extra_is_named_with_the_way_to_get_it(
     command: str, module: str, package: str, monkeypatch: pytest.MonkeyPatch
@@ -133,3 +138,4 @@ def test_the_help_says_when_to_use_which() -> None:
     text = sags("bridge", "--help").stdout
     assert "3D Slicer" in text and "sags bridge openigtlink" in text
     assert all(command in text for command in ("sags bridge foxglove", "sags bridge ros2", "sags view"))
+    assert "Unity" in text and "sags bridge web" in text and "sags bridge gst" in text

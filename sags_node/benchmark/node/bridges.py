@@ -36,6 +36,8 @@ from sags_node.ros.graph import Graph
 
 PICTURES = ("/sags/left/image_rect_color", "/sags/left/render/image")
 LAYOUT = (*PICTURES, "/sags/points", "/sags/anchors", "/sags/tf", "/sags/figures")  # what the layout shows
+WHOLE = ("sags/left/render/image", "sags/left/render/depth", "sags/anchors")
+HALF = ("sags/thin/half/left/render/image/jpeg", "sags/thin/half/left/render/depth/png", "sags/anchors")
 THIN = tuple(f"{picture}/h264" for picture in PICTURES)
 
 
@@ -243,6 +245,26 @@ def _listen_ros2(topics: Mapping[str, str]) -> Listen:
     return listen
 
 
+def _listen_web(names: Sequence[str]) -> Listen:
+    """A WebSocket client that asks for these topics, and reads no more of a message than its header."""
+
+    def listen(said: Said, heard: Heard, stop: threading.Event) -> None:
+        with connect(f"ws://127.0.0.1:{said['port']}/ws", max_size=None) as joined:
+            joined.send(json.dumps({"subscribe": names}))
+            while not stop.is_set():
+                try:
+                    message = joined.recv(timeout=1.0)
+                except TimeoutError:
+                    continue
+                except ConnectionClosed:
+                    return
+                if isinstance(message, bytes):
+                    head = json.loads(message[4 : 4 + struct.unpack_from("<I", message)[0]])
+                    heard.note(head["topic"], head["stamp_ns"] * 1e-9, len(message))
+
+    return listen
+
+
 ANY_PORT = ("--port", "0")
 RAW = {
     **dict.fromkeys((*PICTURES, "/sags/left/render/depth"), IMAGE),
@@ -261,4 +283,6 @@ CASES = (
     Case("ros2, raw", IN_GRAPH, PICTURES[1], _listen_ros2(RAW)),
     Case("ros2, small", IN_GRAPH, f"{PICTURES[1]}/compressed", _listen_ros2(SMALL)),
     Case("ros2, small depth", IN_GRAPH, next(iter(SMALL_DEPTH)), _listen_ros2(SMALL_DEPTH)),
+    Case("web", ("web", *ANY_PORT), WHOLE[0], _listen_web(WHOLE)),
+    Case("web, half size", ("web", *ANY_PORT), HALF[0], _listen_web(HALF)),
 )
