@@ -44,7 +44,9 @@ class FieldShape:
     levels: int = 2
     cells: int = 64  # along each axis, coarsest level
     channels: int = 32  # of each level
-    frames_per_slot: float = 3.0  # how many of the clip's frames from one slot of time to the next
+    # How many of the clip's frames from one slot of time to the next. The paths are told at every third
+    # training frame: each slot has two of their times, as one without any is left to chance.
+    frames_per_slot: float = 7.0
     first_values: tuple[float, float] = (0.7, 1.3)  # of the planes in space, at random between these
     units: Units = Units()
     xavier: bool = False  # whether the last layers start at random, rather than at 0
@@ -117,6 +119,7 @@ PAPER = FitSettings(
     schedule="paper",
     tokens="self",
     iterations=3000,
+    shape=FieldShape(frames_per_slot=3.0),
     field_rates=FieldRates(cells=5e-2),
     exposure_rate=0.0,
     decay=0.03,

@@ -34,7 +34,7 @@ ONLINE_STEPS = 2  # of the mapper per frame
 CUT = 0.08  # mean difference of two frames, 0..1; a beating heart stays below half of it
 PATH_POINTS = 8192  # Gaussians per step of the regression
 PATH_STEPS = 1500
-FRAMES_PER_SLOT = 3  # training frames from one time of the paths to the next
+PATH_EVERY = 3  # training frames from one time of the paths to the next
 CARRIERS = 8  # Gaussians that tell a new one where it lay before
 HIDDEN = -5.0  # of an opacity logit
 
@@ -112,7 +112,7 @@ def follow_online(
     Raises:
         SagsError: no frame had depth enough to start a model, or the clip is too long for its memory.
     """
-    slots = {*range(0, len(clip.train), FRAMES_PER_SLOT), len(clip.train) - 1}
+    slots = {*range(0, len(clip.train), PATH_EVERY), len(clip.train) - 1}
     check_size(len(slots), settings.max_gaussians)
     refiner = CpuRefiner(lambda width, height: rasterizer)  # all frames have its size
     mapper, budget = Mapper(refiner, settings.max_gaussians), StepBudget(ONLINE_STEPS)

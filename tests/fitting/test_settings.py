@@ -7,6 +7,7 @@ import pytest
 from sags_node.errors import UsageError
 from sags_node.fitting.field import marked, row_rates
 from sags_node.fitting.settings import ONLINE, PRESETS, RELEASED, FieldShape, RowRates, Units, with_changes
+from sags_node.fitting.start import PATH_EVERY
 from sags_node.model import columns
 
 SH_0 = 0.28209479  # of a spherical harmonic of degree 0, which their colour rate is of
@@ -70,6 +71,16 @@ def test_a_change_that_cannot_be_says_why(change: str, said: str) -> None:
 def test_slots_of_time_grow_with_the_clip() -> None:
     shape = FieldShape(frames_per_slot=3.0)
     assert [shape.slots(frames) for frames in (1, 3, 30, 300)] == [2, 2, 11, 101]
+
+
+@pytest.mark.parametrize("frames", [30, 63, 179, 1000])
+def test_the_paths_tell_the_field_of_each_slot_of_time(frames: int) -> None:
+    train = [frame for frame in range(frames) if frame % 8]  # as `sags fit` does
+    told = {*train[::PATH_EVERY], train[-1]}
+    slots = ONLINE.shape.slots(frames)
+    for slot in range(slots - 1):
+        begin, end = (frames - 1) * slot / (slots - 1), (frames - 1) * (slot + 1) / (slots - 1)
+        assert any(begin <= time <= end for time in told)
 
 
 def test_parts_of_a_row_have_their_own_rates() -> None:
