@@ -417,7 +417,7 @@ def test_mistakes_are_named_with_their_mend(
 @pytest.mark.parametrize(
     ("data", "said"),
     [
-        (b"hello", "is no JPEG, PNG or TIFF"),
+        (b"hello", "is no JPEG, PNG, TIFF"),
         (tiff(scene_points(2))[:5000], "or is damaged"),
         (tiff(scene_points(2)[:HEIGHT]), "is no whole float TIFF of 160x256 px"),
     ],
