@@ -110,16 +110,16 @@ _KNOWN: tuple[tuple[Callable[[Path], bool], Contents], ...] = (
         _is_stereomis,
         Contents(
             "a sequence of StereoMIS",
-            "write a launch file: source.kind videos with source.geometry.layout over_under, and rig from "
-            "StereoCalibration.ini (docs/protocols.md)",
+            "sags eval --protocol stereomis FOLDER measures it; to play it, write a launch file with "
+            "source.geometry.layout over_under (docs/protocols.md)",
         ),
     ),
     (
         _is_stir,
         Contents(
             "sequences of STIR",
-            "each leftNN/seqNN/frames/*.mp4 and its rightNN are source.kind videos; points are in "
-            "segmentation/ (docs/protocols.md)",
+            "sags eval --protocol stir FOLDER measures them; each leftNN/seqNN/frames/*.mp4 and its rightNN "
+            "are source.kind videos (docs/protocols.md)",
         ),
     ),
 )
