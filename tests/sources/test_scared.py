@@ -13,8 +13,10 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 from sags_node import config as cfg
+from sags_node.cli.main import main
 from sags_node.errors import SagsError, UsageError
 from sags_node.evaluation.measure import Options
 from sags_node.evaluation.session import evaluate
@@ -326,6 +328,16 @@ def test_a_keyframe_is_measured_by_its_path_alone(keyframe: Path) -> None:
     assert figures["settings"]["depth_reference"] == "structured_light"
     assert figures["depth"]["median_mm"] < 2 and figures["measured_depth"]["median_mm"] < 2  # one pixel: 6 mm
     assert figures["online"]["psnr"] > 38 and figures["novel"]["psnr"] > 32
+
+
+def test_a_keyframe_is_measured_by_its_own_protocol(keyframe: Path) -> None:
+    arguments = ["eval", "--protocol", "scared", str(keyframe), "--iterations", "2", "--json", "-"]
+    result = CliRunner().invoke(main, arguments)
+    assert result.exit_code == 0, result.output
+    found = json.loads(result.stdout)
+    assert found["measured"]["frames"] == found["model"]["frames"] == 6
+    assert found["measured"]["mae_mm"] < 2 and found["model"]["mae_mm"] < 3  # one pixel: 6 mm
+    assert 0.5 < found["measured"]["given"] <= 1
 
 
 # ---- mistakes --------------------------------------------------------------------------------------------
