@@ -26,6 +26,7 @@ from sags_node.types import F64, Camera, Eye, StereoRig
 from sags_node.warm_up import warm_up
 
 STEP = ("source.loop:=false", "source.pace:=step")
+AS_GIVEN = "vision.tissue.dilate:=0"
 HOLD_OUT = 8  # EndoNeRF's split, as EndoGaussian and those after it take it
 PICKED = ("paper_psnr", "paper_ssim", "lpips", "psnr", "ssim", "copy_psnr")
 
@@ -35,12 +36,15 @@ Progress = Callable[[int, str], None]  # frames done, of what
 def measure_endonerf(
     folder: Path, overrides: Sequence[str], lpips: Path | None, progress: Progress
 ) -> dict[str, Any]:
-    """Frames 1, 9, 17, ... are held out; masked pixels are black in both pictures and count.
+    """Frames 1, 9, 17, ... are held out; masked pixels are black in both pictures and count. The masks are
+    taken as they are, without the margin that a node puts around instruments.
 
     Each held-out frame is drawn from those before it. Published fits see those after it, too.
     """
     options = Options(HOLD_OUT, every=1, lpips_weights=lpips, paper_psnr=True)
-    found = evaluate(folder, [*overrides], options, "step", None, lambda what, done: progress(done, what))
+    found = evaluate(
+        folder, [AS_GIVEN, *overrides], options, "step", None, lambda what, done: progress(done, what)
+    )
     heldout = found.summary["heldout"]
     if heldout is None:
         raise SagsError(f"{folder} has no frame to hold out; it needs more than {HOLD_OUT}")
