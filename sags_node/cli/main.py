@@ -268,11 +268,11 @@ def doctor(launch: tuple[str, ...], json_out: bool) -> None:
 )
 @as_json
 def import_folder(folder: Path, json_out: bool) -> None:
-    """Say what a folder of recordings is, what is missing or odd in it, and how to mend it.
+    """Say what a folder is, and what is odd in it.
 
-    Looked at are layout, counts and gaps, sizes, black borders, interlacing, order of the eyes and rows, mask
-    polarity, unit of depth, and the calibration against the pictures. Exit code 1: it cannot be played as it
-    is.
+    Each thing that is odd or missing comes with its mend. Looked at are layout, counts and gaps, sizes, black
+    borders, interlacing, order of the eyes and rows, mask polarity, unit of depth, and the calibration
+    against the pictures. Exit code 1: it cannot be played as it is.
 
     \b
     sags import --check /data/endonerf/pulling_soft_tissues

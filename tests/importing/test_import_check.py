@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from places import SESSION
 
 from sags_node.calibration import Finding
 from sags_node.cli.main import main
@@ -169,12 +170,12 @@ def test_a_dark_picture_has_no_borders() -> None:
     assert lit_box(np.zeros((HEIGHT, WIDTH), np.uint8)) == (0, 0, WIDTH, HEIGHT)
 
 
-def test_a_session_is_checked_with_its_calibration(phantom_session: Path) -> None:
-    found = check_folder(phantom_session)
+def test_a_session_is_checked_with_its_calibration() -> None:
+    found = check_folder(SESSION)
     assert {each.level for each in found} == {"ok"}, found
     said = "\n".join(each.what for each in found)
     assert "40 frames of 320x256 px at 10 Hz" in said and "calibration: " in said
-    assert found[-1].what == f"to play it: sags run {phantom_session}"
+    assert found[-1].what == f"to play it: sags run {SESSION}"
 
 
 def test_folders_that_are_not_played_yet_are_named(tmp_path: Path) -> None:
