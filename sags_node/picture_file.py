@@ -1,10 +1,9 @@
-"""JPEG, PNG and TIFF files of others, decoded: their size is looked at before memory is taken for it."""
+"""Picture files of others, decoded: their size is looked at before memory is taken for it."""
 
 from __future__ import annotations
 
 import logging
 import re
-import struct
 import threading
 from typing import Any
 
@@ -14,15 +13,11 @@ from numpy.typing import NDArray
 
 from sags_node.errors import SagsError
 from sags_node.native_output import native_output
+from sags_node.picture_header import KINDS, claimed_size
 
 log = logging.getLogger(__name__)
 
 MAX_PIXELS = 64 << 20
-_PNG = b"\x89PNG\r\n\x1a\n"
-_JPEG = b"\xff\xd8"
-_NO_FRAMES = (0xC4, 0xC8, 0xCC)  # JPEG markers among those of frames that are none
-_TIFF = {b"II*\0": "<", b"MM\0*": ">"}  # and the order of its bytes
-_TIFF_WIDTH, _TIFF_HEIGHT = 256, 257  # tags
 _MOST_KINDS = 32
 
 
@@ -42,7 +37,7 @@ def decode(data: bytes | NDArray[np.uint8], flags: int, where: str, mend: str) -
     array = np.frombuffer(data, np.uint8)
     size = claimed_size(array.data)
     if size is None:
-        raise SagsError(f"{where} is no JPEG, PNG or TIFF, or is damaged ({array.size} bytes); {mend}")
+        raise SagsError(f"{where} is no {KINDS}, or is damaged ({array.size} bytes); {mend}")
     width, height = size
     if not 0 < width * height <= MAX_PIXELS:
         raise SagsError(
@@ -58,41 +53,6 @@ def decode(data: bytes | NDArray[np.uint8], flags: int, where: str, mend: str) -
         raise SagsError(f"{where} is damaged or cut off ({array.size} bytes){reason}; {mend}")
     _complaints.tell(where, said)
     return picture
-
-
-def claimed_size(data: memoryview) -> tuple[int, int] | None:
-    """Width and height that a file claims; None where it is no JPEG, PNG or TIFF, or claims nothing."""
-    try:
-        if data[:8] == _PNG:
-            width, height = struct.unpack_from(">II", data, 16)
-            return width, height
-        order = _TIFF.get(bytes(data[:4]))
-        return _tiff_size(data, order) if order is not None else _jpeg_size(data)
-    except struct.error:  # it ends before
-        return None
-
-
-def _jpeg_size(data: memoryview) -> tuple[int, int] | None:
-    at = 2 if data[:2] == _JPEG else len(data)
-    while at + 9 <= len(data) and data[at] == 0xFF:
-        marker, length = struct.unpack_from(">BH", data, at + 1)
-        if 0xC0 <= marker <= 0xCF and marker not in _NO_FRAMES:
-            height, width = struct.unpack_from(">HH", data, at + 5)
-            return width, height
-        at += 2 + length
-    return None
-
-
-def _tiff_size(data: memoryview, order: str) -> tuple[int, int] | None:
-    (at,) = struct.unpack_from(f"{order}I", data, 4)
-    (entries,) = struct.unpack_from(f"{order}H", data, at)
-    found: dict[int, int] = {}
-    for entry in range(at + 2, at + 2 + 12 * entries, 12):
-        tag, kind = struct.unpack_from(f"{order}HH", data, entry)
-        (found[tag],) = struct.unpack_from(f"{order}{'H' if kind == 3 else 'I'}", data, entry + 8)
-    if _TIFF_WIDTH not in found or _TIFF_HEIGHT not in found:
-        return None
-    return found[_TIFF_WIDTH], found[_TIFF_HEIGHT]
 
 
 class _Complaints:

@@ -22,7 +22,7 @@ from sags_node.native_output import native_output
 from sags_node.overlay.mesh import mesh_of
 from sags_node.overlay.save import Output
 from sags_node.overlay.scene import ObjectSpec
-from sags_node.picture_file import claimed_size
+from sags_node.picture_header import claimed_size, is_whole
 from sags_node.recording.pictures import decode_file
 from sags_node.sources.numbered import open_numbered
 from sags_node.sources.pictures import read_picture
@@ -61,7 +61,10 @@ BAD = {
     "short.png": (png(data=zlib.compress(ROWS[:500])), "libpng error: Not enough image data"),
     "garbage.png": (png(data=b"garbage" * 30), "libpng error: IDAT: incorrect header check"),
     "flipped.png": (flipped(png(), 80), "libpng error: "),
-    "headless.jpg": (b"\xff\xd8\xff\xd9", "is no JPEG, PNG or TIFF, or is damaged (4 bytes)"),
+    "headless.jpg": (
+        b"\xff\xd8\xff\xd9",
+        "is no JPEG, PNG, TIFF, BMP, WebP or binary PGM/PPM, or is damaged (4 bytes)",
+    ),
 }
 
 
@@ -95,13 +98,41 @@ def test_what_a_decoder_says_of_a_picture_that_it_can_read_is_logged_once(
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.parametrize("suffix", [".png", ".jpg", ".tiff"])
+KINDS = {".png": [], ".jpg": [], ".tiff": [], ".bmp": [], ".ppm": [], ".webp": [cv2.IMWRITE_WEBP_QUALITY, 90]}
+
+
+@pytest.mark.parametrize("suffix", KINDS)
 @pytest.mark.parametrize("size", [(WIDTH, HEIGHT), (1, 700), (1031, 3)])
 def test_sizes_are_read_as_opencv_reads_them(suffix: str, size: tuple[int, int]) -> None:
     file = cv2.imencode(suffix, np.zeros((size[1], size[0], 3), np.uint8))[1]
     assert claimed_size(file.data) == size
     for length in range(60):
         claimed_size(file.data[:length])  # no exception
+
+
+@pytest.mark.parametrize("suffix", KINDS)
+def test_all_kinds_of_pictures_are_read_and_cut_off_ones_are_refused(suffix: str, tmp_path: Path) -> None:
+    """Drawn smooth, so that lossy kinds keep it; lossless WebP has a header of its own."""
+    smooth = cv2.resize(PIXELS[:4, :5], (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC)
+    for options in (KINDS[suffix], [cv2.IMWRITE_WEBP_QUALITY, 101] if suffix == ".webp" else []):
+        content = cv2.imencode(suffix, smooth, options)[1].tobytes()
+        assert claimed_size(memoryview(content)) == (WIDTH, HEIGHT) and is_whole(memoryview(content))
+        file = tmp_path / f"one{suffix}"
+        file.write_bytes(content)
+        assert np.abs(read_picture(file)[..., ::-1].astype(int) - smooth).mean() < 8  # of 255
+        file.write_bytes(content[: len(content) * 2 // 3])
+        with pytest.raises(SagsError, match="damaged or cut off"):
+            read_picture(file)
+
+
+def test_gray_pictures_of_sixteen_bit_in_every_kind_that_has_them(tmp_path: Path) -> None:
+    depth = np.arange(WIDTH * HEIGHT, dtype=np.uint16).reshape(HEIGHT, WIDTH) * 7
+    for suffix in (".png", ".tiff", ".pgm"):
+        cv2.imwrite(str(tmp_path / f"depth{suffix}"), depth)
+        assert np.array_equal(read_picture(tmp_path / f"depth{suffix}", cv2.IMREAD_UNCHANGED), depth)
+    commented = b"P5 # made by hand\n# twice\n3 2\n255\n" + bytes(range(6))
+    assert claimed_size(memoryview(commented)) == (3, 2) and is_whole(memoryview(commented))
+    assert not is_whole(memoryview(commented[:-1]))
 
 
 def test_progressive_jpegs_with_long_profiles_have_a_size() -> None:

@@ -257,5 +257,37 @@ def doctor(launch: tuple[str, ...], json_out: bool) -> None:
         raise SagsError("something the node needs is missing; see the mends above")
 
 
+@main.command("import")
+@click.option(
+    "--check",
+    "folder",
+    type=click.Path(path_type=Path),
+    required=True,
+    metavar="FOLDER",
+    help="Look it over; nothing is changed.",
+)
+@as_json
+def import_folder(folder: Path, json_out: bool) -> None:
+    """Say what a folder is, and what is odd in it.
+
+    Each thing that is odd or missing comes with its mend. Looked at are layout, counts and gaps, sizes, black
+    borders, interlacing, order of the eyes and rows, mask polarity, unit of depth, and the calibration
+    against the pictures. Exit code 1: it cannot be played as it is.
+
+    \b
+    sags import --check /data/endonerf/pulling_soft_tissues
+    """
+    from dataclasses import asdict
+
+    from sags_node.importing.check import check_folder as look_over
+
+    findings = look_over(folder)
+    rows = [asdict(finding) for finding in findings]
+    people = [{key: row[key] for key in ("level", "what", "mend")} for row in rows]
+    show(rows if json_out else text.rows_table(people))
+    if any(finding.level == "error" for finding in findings):
+        raise SagsError(f"{folder} cannot be played as it is; see the mends above")
+
+
 for command in (evaluate, fit, export, bag, bench, bridge, calib, overlay, view, topic):
     main.add_command(command)

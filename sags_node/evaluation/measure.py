@@ -253,6 +253,7 @@ class Measurer:
         }
         if self._options.paper_psnr:
             figures["paper_psnr"] = metrics.paper_psnr(picture, truth, tissue)
+            figures["paper_ssim"] = metrics.paper_ssim(picture, truth, tissue)
         if costly and self._lpips is not None:
             figures["lpips"] = self._lpips(picture, truth, tissue)
         return figures

@@ -33,6 +33,12 @@ def paper_psnr(picture: F32, truth: F32, tissue: Bool) -> float:
     return _decibel(_squared_error(picture, truth, tissue) * float(tissue.mean()))
 
 
+def paper_ssim(picture: F32, truth: F32, tissue: Bool) -> float:
+    """`ssim` in the literature's convention: both pictures are black where masked, and all pixels count."""
+    black = tissue[..., None].astype(np.float32)
+    return ssim(picture * black, truth * black, np.ones_like(tissue))
+
+
 def _squared_error(picture: F32, truth: F32, tissue: Bool) -> float:
     if not tissue.any():
         return float("nan")

@@ -119,7 +119,7 @@ def _quality(rows: Sequence[FrameRow], options: Options) -> dict[str, dict[str, 
     groups: dict[str, dict[str, Any] | None] = {}
     for group, keys in GROUPS.items():
         figures = [row.figures[group] for row in rows if group in row.figures]
-        extra = ("paper_psnr",) if options.paper_psnr and "ssim" in keys else ()
+        extra = ("paper_psnr", "paper_ssim") if options.paper_psnr and "ssim" in keys else ()
         groups[group] = None
         if figures:
             groups[group] = {

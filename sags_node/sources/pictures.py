@@ -12,16 +12,13 @@ import cv2
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import read_file
 from sags_node.picture_file import decode
+from sags_node.picture_header import KINDS, SUFFIXES, is_whole
 from sags_node.types import F32, F64, U8, Bool, Reference
 
 log = logging.getLogger(__name__)
 
-PICTURE_SUFFIXES = {".jpg", ".jpeg", ".png"}
-JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
-PNG_START, PNG_END = b"\x89PNG", b"IEND\xaeB`\x82"
 LARGEST_FILE = 256 << 20  # bytes: more than the largest picture that is decoded can need
 MEND = "replace or remove the pair"
-LONGEST_PADDING = 512  # bytes some cameras write after the end of a picture
 
 
 class RawPair(NamedTuple):
@@ -101,7 +98,7 @@ class FolderPairs:
 
 
 def list_pictures(folder: Path) -> list[Path]:
-    """JPEG and PNG files of a folder in order of their names, numbers compared as numbers.
+    """Picture files of a folder in order of their names, numbers compared as numbers.
 
     Raises:
         UsageError: the folder is missing or holds no picture, or what only has a picture's name.
@@ -109,17 +106,17 @@ def list_pictures(folder: Path) -> list[Path]:
     if not folder.is_dir():
         reason = "is not a folder" if folder.exists() else "does not exist"
         raise UsageError(f"picture folder {folder} {reason}; check the path, or SAGS_DATA if it is used")
-    pictures = [file for file in folder.iterdir() if file.suffix.lower() in PICTURE_SUFFIXES]
+    pictures = [file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES]
     for file in pictures:
         if file.exists() and not file.is_file():
             raise UsageError(f"{file} has a picture's name but is no file; remove it from the folder")
     if not pictures:
-        raise UsageError(f"picture folder {folder} holds no .jpg or .png file")
+        raise UsageError(f"picture folder {folder} holds no picture ({KINDS})")
     return sorted(pictures, key=lambda file: (_natural(file.stem), file.name))
 
 
 def read_picture(file: Path, flags: int = cv2.IMREAD_COLOR) -> U8:
-    """Decode one JPEG or PNG: RGB for `IMREAD_COLOR`, else as OpenCV's flags say.
+    """Decode one picture: RGB for `IMREAD_COLOR`, else as OpenCV's flags say.
 
     OpenCV fills what is missing of a cut-off picture with grey and says nothing, so its end is checked first.
 
@@ -130,18 +127,11 @@ def read_picture(file: Path, flags: int = cv2.IMREAD_COLOR) -> U8:
         data = read_file(file, LARGEST_FILE)
     except OSError as error:
         raise SagsError(f"cannot read picture {file}: {error.strerror}") from None
-    if not _is_whole(data):
+    if not is_whole(memoryview(data)):
         raise SagsError(f"picture {file} is damaged or cut off ({len(data)} bytes); {MEND}")
     picture = decode(data, flags, f"picture {file}", MEND)
     decoded: U8 = cv2.cvtColor(picture, cv2.COLOR_BGR2RGB) if flags == cv2.IMREAD_COLOR else picture
     return decoded
-
-
-def _is_whole(data: bytes) -> bool:
-    end = data[-LONGEST_PADDING:]
-    if data.startswith(JPEG_START):
-        return JPEG_END in end
-    return data.startswith(PNG_START) and PNG_END in end
 
 
 def _natural(name: str) -> list[str | int]:

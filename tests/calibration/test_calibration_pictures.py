@@ -415,7 +415,7 @@ def test_check_with_files_and_folders(phantom_session: Path) -> None:
         (["{session}/calib", "--session", "{session}", "source.lefd:=x"], "source.lefd"),
         (["{session}/calib", "--session", "{session}", "--images", "a", "b"], "one of them is enough"),
         (["{session}/left"], "is no calibration; looked for"),
-        (["{session}/calib", "--images", "{session}/left", "{session}/calib"], "holds no .jpg or .png"),
+        (["{session}/calib", "--images", "{session}/left", "{session}/calib"], "holds no picture"),
     ],
 )
 def test_usage(phantom_session: Path, arguments: list[str], said: str) -> None:

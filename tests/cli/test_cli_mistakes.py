@@ -101,7 +101,7 @@ def test_no_library_adds_lines_of_its_own(user_files: Path) -> None:
     ("code", "overrides", "said"),
     [
         (2, ["source.left:=gone"], ("picture folder gone", "does not exist")),
-        (2, ["source.left:=empty"], ("picture folder empty", "no .jpg or .png")),
+        (2, ["source.left:=empty"], ("picture folder empty", "holds no picture")),
         (1, ["source.right:=small"], ("320x256", "160x128", "small/0000.jpg")),
         (2, ["rig:=null"], ("no calibration", "set rig")),
         (2, ["source.start:=1000"], ("source.start", "behind the recording's end", "4.00 s")),

@@ -13,8 +13,10 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 from sags_node import config as cfg
+from sags_node.cli.main import main
 from sags_node.errors import SagsError, UsageError
 from sags_node.evaluation.measure import Options
 from sags_node.evaluation.session import evaluate
@@ -328,6 +330,16 @@ def test_a_keyframe_is_measured_by_its_path_alone(keyframe: Path) -> None:
     assert figures["online"]["psnr"] > 38 and figures["novel"]["psnr"] > 32
 
 
+def test_a_keyframe_is_measured_by_its_own_protocol(keyframe: Path) -> None:
+    arguments = ["eval", "--protocol", "scared", str(keyframe), "--iterations", "2", "--json", "-"]
+    result = CliRunner().invoke(main, arguments)
+    assert result.exit_code == 0, result.output
+    found = json.loads(result.stdout)
+    assert found["measured"]["frames"] == found["model"]["frames"] == 6
+    assert found["measured"]["mae_mm"] < 2 and found["model"]["mae_mm"] < 3  # one pixel: 6 mm
+    assert 0.5 < found["measured"]["given"] <= 1
+
+
 # ---- mistakes --------------------------------------------------------------------------------------------
 
 
@@ -417,7 +429,7 @@ def test_mistakes_are_named_with_their_mend(
 @pytest.mark.parametrize(
     ("data", "said"),
     [
-        (b"hello", "is no JPEG, PNG or TIFF"),
+        (b"hello", "is no JPEG, PNG, TIFF"),
         (tiff(scene_points(2))[:5000], "or is damaged"),
         (tiff(scene_points(2)[:HEIGHT]), "is no whole float TIFF of 160x256 px"),
     ],

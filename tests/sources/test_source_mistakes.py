@@ -131,7 +131,7 @@ def depth_without_numbers(folder: Path) -> Recording:
     [
         (no_left, "nowhere does not exist; check the path"),
         (left_is_a_file, "000.png is not a folder; check the path"),
-        (empty_folder, "empty holds no .jpg or .png file"),
+        (empty_folder, "empty holds no picture"),
         (fewer_right, "l holds 8 pictures but .*r holds 7; pairing goes by sorted name"),
         (fewer_tools, "l holds 8 pictures but .*tools holds 1; pairing"),
         (

@@ -1,0 +1,114 @@
+"""`sags import --check`: one folder looked over, from what it is to how it is played."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from sags_node.calibrate.check import check_calibration
+from sags_node.calibration import Finding, find_form
+from sags_node.config import EndoNerfSource, RecordedSource
+from sags_node.errors import SagsError
+from sags_node.importing import pictures
+from sags_node.importing.folder import Contents, recognise
+from sags_node.sources.pictures import size_text
+from sags_node.sources.source import open_source
+
+CALIBRATIONS = (".", "calib", "calibration", "camera", "rig")
+
+
+def check_folder(folder: Path) -> list[Finding]:
+    """What a folder is, what is missing or odd, each with a way to mend it; the last says how to play it.
+
+    Raises:
+        UsageError: it is no folder.
+    """
+    contents = recognise(folder)
+    found = [Finding("ok", f"{folder.name or folder} is {contents.what}")]
+    if contents.left is not None:
+        found += _pictures(contents, contents.left)
+    found += _calibration(folder, contents)
+    if contents.config is not None:
+        found += _played(contents)
+    wrong = any(finding.level == "error" for finding in found)
+    how = "when that is mended: " if wrong else ""
+    return [*found, Finding("ok", f"to play it: {how}{contents.play}")]
+
+
+def _pictures(contents: Contents, left_folder: Path) -> list[Finding]:
+    named = {"left": left_folder, "right": contents.right, "masks": contents.masks}
+    there = {what: each for what, each in named.items() if each is not None}
+    source = None if contents.config is None else contents.config.source
+    clip = source if isinstance(source, EndoNerfSource) else None
+    if clip is not None and contents.depth is not None:
+        there["depth"] = contents.depth
+    found = _tried("pictures", lambda: pictures.check_counts(there))
+    try:
+        left = pictures.sample(left_folder)
+        right = [] if contents.right is None else pictures.sample(contents.right)
+    except SagsError as error:
+        return [*found, pictures.refused("pictures", error)]
+    found += pictures.check_eye("left", left)
+    if right:
+        found += pictures.check_eye("right", right) + pictures.check_eyes(left, right)
+    size = left[0][1].shape[1], left[0][1].shape[0]
+    masks, depth = contents.masks, contents.depth
+    if masks is not None:
+        polarity = "white" if clip is None else clip.instruments
+        found += _tried("masks", lambda: pictures.check_masks(masks, size, polarity))
+    if depth is not None:
+        unit = None if clip is None else clip.depth_unit
+        found += _tried("depth", lambda: pictures.check_depth(depth, size, unit))
+    return found
+
+
+def _calibration(folder: Path, contents: Contents) -> list[Finding]:
+    """The calibration beside the pictures, against them; sessions that are played as they are name theirs."""
+    if contents.config is not None and (contents.right is not None or contents.left is None):
+        return _tried("calibration", lambda: _odd_or_last(check_calibration(folder)))
+    if contents.right is None or contents.left is None:
+        return []
+    form = next((folder / name for name in CALIBRATIONS if _has_calibration(folder / name)), None)
+    if form is None:
+        mend = "without one there is no depth in mm: sags calib stereo makes one (docs/calibration.md)"
+        return [Finding("warning", "no calibration lies beside the pictures", mend)]
+    eyes = [(contents.left, contents.right)]
+    return _tried("calibration", lambda: _odd_or_last(check_calibration(form, images=eyes)))
+
+
+def _has_calibration(folder: Path) -> bool:
+    return folder.is_dir() and find_form(folder) is not None
+
+
+def _odd_or_last(found: list[Finding]) -> list[Finding]:
+    """All is well in one line; else what is not."""
+    odd = [finding for finding in found if finding.level != "ok"]
+    return odd or [Finding("ok", f"calibration: {found[-1].what}", "", found[-1].figures)]
+
+
+def _played(contents: Contents) -> list[Finding]:
+    """Whether the first frame comes, as `sags run` would read it."""
+    assert contents.config is not None  # the caller looked
+    source = contents.config.source
+    if not isinstance(source, RecordedSource):
+        return [
+            Finding("ok", f"source.kind {source.kind} is live: sags doctor and sags calib live look at it")
+        ]
+    source = source.model_copy(update={"pace": "step", "loop": False})
+
+    def first() -> list[Finding]:
+        with open_source(source, references=False) as opened:
+            frame = next(iter(opened), None)
+            if frame is None:
+                return [Finding("error", "not one frame can be read", "check the files")]
+            size = size_text(frame.left.shape[1], frame.left.shape[0])
+            return [Finding("ok", f"{opened.frame_count} frames of {size} px at {opened.rate:g} Hz")]
+
+    return _tried("frames", first)
+
+
+def _tried(what: str, look: Callable[[], list[Finding]]) -> list[Finding]:
+    try:
+        return look()
+    except SagsError as error:
+        return [pictures.refused(what, error)]

@@ -1,0 +1,207 @@
+"""What is odd about the pictures of a recording: sizes, gaps, borders, interlacing, masks and depth."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from sags_node.calibration import Finding
+from sags_node.calibration.matches import match_eyes
+from sags_node.errors import SagsError
+from sags_node.sources.pictures import list_pictures, read_picture, size_text
+from sags_node.types import U8, Bool
+
+LOOKED_AT = 8  # pictures, spread over the folder
+COMB_STEP = 12  # grey levels that a row must differ from both neighbours, alike
+COMB_SHARE = 0.02  # of the pixels, and
+COMB_RATIO = 3.0  # times as many as in columns: texture has no favourite direction
+DARK = 12  # grey level of a border
+NARROWEST_BORDER = 4  # px
+POLARITY = 0.5  # share of a mask: instruments cover less
+ENDOSCOPE_DEPTH = (0.01, 0.3)  # m, the median
+DEPTH_UNITS = (1e-3, 1e-4, 1e-5, 1e-6, 1.0)  # m per count, the usual ones first
+FEWEST_MATCHES = 30
+SAME_PICTURE = 1.0  # grey levels: less than two cameras' noise
+
+
+def check_counts(named: dict[str, Path]) -> list[Finding]:
+    """Whether folders that belong together hold equally many pictures, without gaps in their numbers."""
+    found, files = [], {what: list_pictures(folder) for what, folder in named.items()}
+    counts = {what: len(each) for what, each in files.items()}
+    if len(set(counts.values())) > 1:
+        said = ", ".join(f"{what} {count}" for what, count in counts.items())
+        found.append(Finding("error", f"not equally many pictures: {said}", _counts_mend(files)))
+    for what, each in files.items():
+        numbers = [int(part[-1]) for file in each if (part := re.findall(r"\d+", file.stem))]
+        steps = np.diff(numbers)
+        if len(steps) and (odd := np.flatnonzero(steps != np.median(steps))).size:
+            where = f"{each[odd[0]].name} and {each[odd[0] + 1].name}"
+            mend = "frames are paired by order, and played evenly: fill the gap or split the recording there"
+            found.append(
+                Finding("warning", f"{what}: {odd.size} gaps in the numbers, first between {where}", mend)
+            )
+    return found or [Finding("ok", f"{min(counts.values())} pictures each, numbered without gaps")]
+
+
+def _counts_mend(files: dict[str, list[Path]]) -> str:
+    fewest = min(files, key=lambda what: len(files[what]))
+    stems = {file.stem for file in files[fewest]}
+    missing = [file.name for each in files.values() for file in each if file.stem not in stems]
+    named = f", e.g. {missing[0]}" if missing else ""
+    return f"{fewest} lacks some{named}: every picture needs its partner"
+
+
+def sample(folder: Path, flags: int = cv2.IMREAD_COLOR) -> list[tuple[Path, U8]]:
+    """Some pictures of a folder, spread over it.
+
+    Raises:
+        SagsError: one cannot be read.
+    """
+    files = list_pictures(folder)
+    return [(file, read_picture(file, flags)) for file in files[:: max(1, -(-len(files) // LOOKED_AT))]]
+
+
+def check_eye(what: str, pictures: Sequence[tuple[Path, U8]]) -> list[Finding]:
+    """Of one eye's pictures: sizes, black borders, interlacing."""
+    sizes = {picture.shape[1::-1] for _, picture in pictures}
+    if len(sizes) > 1:
+        said = " and ".join(size_text(*size) for size in sorted(sizes))
+        return [Finding("error", f"{what}: pictures of {said} px", "all pictures must have one size")]
+    gray = [cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for _, picture in pictures]
+    found = []
+    x, y, width, height = lit_box(np.max(gray, axis=0))
+    if (width, height) != gray[0].shape[::-1]:
+        mend = (
+            f"set source.geometry.crop:=[{x},{y},{width},{height}] (videos, cameras) or cut both eyes alike"
+        )
+        what_is = f"{what}: black borders; the picture is {size_text(width, height)} px at {x},{y}"
+        found.append(Finding("warning", f"{what_is}, of {size_text(*gray[0].shape[::-1])}", mend))
+    combs = [(combing(each), combing(np.ascontiguousarray(each.T))) for each in gray]
+    rows, columns = np.max([comb[0] for comb in combs]), np.median([comb[1] for comb in combs])
+    if rows > COMB_SHARE and rows > COMB_RATIO * columns:
+        mend = (
+            "videos: source.geometry.deinterlace:=top or bottom; folders: deinterlace before (ffmpeg bwdif)"
+        )
+        found.append(Finding("warning", f"{what}: interlaced, {rows:.0%} of the pixels show combs", mend))
+    return found or [
+        Finding("ok", f"{what}: {size_text(*gray[0].shape[::-1])} px, not interlaced, no borders")
+    ]
+
+
+def combing(gray: U8) -> float:
+    """Share of pixels of [H, W] that differ from the rows above and below alike: two fields in motion."""
+    middle = gray[1:-1].astype(np.int16)
+    above, below = middle - gray[:-2], middle - gray[2:]
+    return float(np.mean((np.minimum(above, below) > COMB_STEP) | (np.maximum(above, below) < -COMB_STEP)))
+
+
+def lit_box(brightest: U8) -> tuple[int, int, int, int]:
+    """x, y, width and height of what is not a black border; all of it where all is dark."""
+    columns, rows = (np.flatnonzero(np.percentile(brightest, 99, axis=axis) > DARK) for axis in (0, 1))
+    height, width = brightest.shape
+    if not len(columns) or not len(rows):
+        return 0, 0, width, height
+    left, right = (0 if edge < NARROWEST_BORDER else edge for edge in (columns[0], width - 1 - columns[-1]))
+    top, bottom = (0 if edge < NARROWEST_BORDER else edge for edge in (rows[0], height - 1 - rows[-1]))
+    return int(left), int(top), int(width - left - right), int(height - top - bottom)
+
+
+def check_eyes(left: Sequence[tuple[Path, U8]], right: Sequence[tuple[Path, U8]]) -> list[Finding]:
+    """Of both eyes without a calibration: are they two pictures, in order, and are rows aligned?"""
+    pairs = [(a, b) for (_, a), (_, b) in zip(left, right, strict=False) if a.shape == b.shape]
+    if not pairs:
+        return [Finding("error", "the eyes' pictures have not one size", "resize both eyes alike")]
+    if np.median([np.mean(cv2.absdiff(a, b)) for a, b in pairs]) < SAME_PICTURE:
+        return [Finding("error", "both eyes show the same picture", "give each eye its own pictures")]
+    matches = np.concatenate([match_eyes(a, b) for a, b in pairs])
+    if len(matches) < FEWEST_MATCHES:
+        mend = "are they of one moment and of one scope? Sharper pictures with more texture tell more"
+        return [Finding("warning", f"only {len(matches)} points are found in both eyes", mend)]
+    across, down = (float(np.median(matches[:, k] - matches[:, k + 2])) for k in (0, 1))
+    rows = float(np.median(np.abs(matches[:, 1] - matches[:, 3])))
+    figures = {"disparity_px": round(across, 2), "rows_px": round(rows, 2)}
+    if np.mean(matches[:, 0] < matches[:, 2]) > 0.8:
+        mend = (
+            "exchange left and right, unless each picture was cut out elsewhere (then calibrate as they are)"
+        )
+        return [
+            Finding(
+                "warning", "points lie farther to the right in the right eye: eyes exchanged?", mend, figures
+            )
+        ]
+    aligned = rows < 1 / 180 * pairs[0][0].shape[1]
+    what = f"disparity {across:.1f} px, rows {'agree' if aligned else 'differ'} ({down:+.1f} px)"
+    mend = "" if aligned else "not rectified: a calibration with distortion and rectification is needed"
+    return [Finding("ok" if aligned else "warning", what, mend, figures)]
+
+
+def check_masks(folder: Path, size: tuple[int, int], instruments: str = "white") -> list[Finding]:
+    """Values, size and polarity of instrument masks; `instruments` as the recording is to be played."""
+    shares = []
+    for file, mask in sample(folder, cv2.IMREAD_GRAYSCALE):
+        if mask.shape[::-1] != size:
+            what = f"masks: {file.name} is {size_text(*mask.shape[::-1])} px, the pictures {size_text(*size)}"
+            return [Finding("error", what, "resize the masks with nearest neighbour")]
+        if 0 < mask.max() < 128:
+            what = f"masks: {file.name} has no value above {mask.max()}"
+            return [Finding("error", what, "a mask holds 0 and 255: multiply it by 255")]
+        shares.append(np.mean((mask >= 128) == (instruments == "white")))
+    share = float(np.median(shares))
+    if share > POLARITY:
+        mend = (
+            f"255 must be the instrument: invert the masks, or for EndoNeRF's layout set "
+            f"source.instruments:={'black' if instruments == 'white' else 'white'}"
+        )
+        return [Finding("error", f"masks: {share:.0%} would be instrument: polarity the other way?", mend)]
+    if share == 0:
+        mend = "leave masks out, and tissue is found by colour (docs/masks.md)"
+        return [Finding("warning", "masks: none marks an instrument", mend)]
+    return [Finding("ok", f"masks: {share:.0%} of the picture is instrument")]
+
+
+def check_depth(folder: Path, size: tuple[int, int], unit: float | None = None) -> list[Finding]:
+    """Kind, size and unit (m per count) of depth pictures."""
+    medians = []
+    for file, depth in sample(folder, cv2.IMREAD_UNCHANGED):
+        if depth.ndim != 2:
+            what = f"depth: {file.name} has {depth.shape[2]} channels: it is coloured for people"
+            return [Finding("error", what, "export depth as grey PNG of 16 bit")]
+        if depth.shape[::-1] != size:
+            what = (
+                f"depth: {file.name} is {size_text(*depth.shape[::-1])} px, the pictures {size_text(*size)}"
+            )
+            return [Finding("error", what, "resize depth with nearest neighbour, never a mean")]
+        known: Bool = depth > 0
+        if known.any():
+            medians.append(float(np.median(depth[known])))
+            coarse = depth.dtype == np.uint8
+    if not medians:
+        return [Finding("error", "depth: no picture knows a pixel", "export it again")]
+    median = float(np.median(medians))
+    fitting = [one for one in DEPTH_UNITS if ENDOSCOPE_DEPTH[0] <= median * one <= ENDOSCOPE_DEPTH[1]]
+    if unit is not None and unit in fitting:
+        return [Finding("ok", f"depth: {median * unit * 1e3:.0f} mm (median) with {unit:g} m per count")]
+    if not fitting:
+        what = f"depth: a median of {median:g} counts is no distance in an endoscope's view in any usual unit"
+        return [Finding("error", what, "is it a disparity, or inverse depth? Convert it to depth")]
+    distance = f"{median * fitting[0] * 1e3:.0f} mm with {fitting[0]:g} m per count"
+    found = [
+        Finding(
+            "ok" if unit is None else "warning",
+            f"depth: {median:g} counts (median): {distance}",
+            f"set source.depth_unit (EndoNeRF's layout) or source.reference.depth_unit to {fitting[0]:g}; "
+            "the files do not say it: ask who made them",
+        )
+    ]
+    if coarse:
+        mend = "steps of a whole count: export 16 bit"
+        found.append(Finding("warning", "depth: only 8 bit", mend))
+    return found
+
+
+def refused(what: str, error: SagsError) -> Finding:
+    return Finding("error", f"{what}: {error}", "mend or remove that file")

@@ -1,0 +1,70 @@
+"""The figures of public evaluators, by their published descriptions. Nothing here knows a layout."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sags_node.types import F32, F64
+
+STIR_PX = (4, 8, 16, 32, 64)  # of the 2D ranking (stir-challenge.github.io, evaluation)
+LEAST_KNOWN = 0.1  # of a picture: SCARED leaves out frames with less true depth (arXiv 2101.01133, III-D)
+
+
+def nearest_distances(points: F64, ends: F64) -> F64:
+    """How far each of `points` [P, D] is from the nearest of `ends` [E, D], [P]: which end belongs to which
+    start is not known in STIR."""
+    distances: F64 = np.linalg.norm(points[:, None] - ends[None], axis=2).min(axis=1)
+    return distances
+
+
+def shares_within(distances: F64, thresholds: Sequence[float] = STIR_PX) -> dict[str, float]:
+    """Share of distances up to each threshold, and the mean of the shares (delta_avg of TAP-Vid)."""
+    shares = {f"within_{threshold:g}": float(np.mean(distances <= threshold)) for threshold in thresholds}
+    return {**shares, "average": float(np.mean(list(shares.values())))}
+
+
+def latency_score(times_ms: Sequence[float]) -> float:
+    """STIR's figure of efficiency: (p99 + p95 + mean) / 3 of the time a frame takes, ms."""
+    return float((np.percentile(times_ms, 99) + np.percentile(times_ms, 95) + np.mean(times_ms)) / 3)
+
+
+def trajectory_figures(estimated: F64, known: F64) -> dict[str, float]:
+    """As StereoMIS is measured, of `T_world_cam` [T, 4, 4] m, both.
+
+    ATE: root mean square distance of the places after the rigid alignment of all of them, without scale
+    (Horn, JOSA A 1987; Umeyama, PAMI 1991). RPE: mean error of the motion from one frame to the next.
+    """
+    R, t = _align(estimated[:, :3, 3], known[:, :3, 3])
+    away = estimated[:, :3, 3] @ R.T + t - known[:, :3, 3]
+    errors = np.linalg.inv(_steps(known)) @ _steps(estimated)
+    cosines = (np.trace(errors[:, :3, :3], axis1=1, axis2=2) - 1) / 2
+    return {
+        "ate_rmse_mm": float(np.sqrt(np.mean(np.sum(away**2, axis=1)))) * 1e3,
+        "rpe_mean_mm": float(np.mean(np.linalg.norm(errors[:, :3, 3], axis=1))) * 1e3,
+        "rpe_mean_deg": float(np.mean(np.degrees(np.arccos(cosines.clip(-1, 1))))),
+    }
+
+
+def _align(points: F64, onto: F64) -> tuple[F64, F64]:
+    """Rotation [3, 3] and translation [3] that bring points [T, 3] nearest to `onto`."""
+    middle, onto_middle = points.mean(0), onto.mean(0)
+    U, _, Vt = np.linalg.svd((onto - onto_middle).T @ (points - middle))
+    R = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+    return R, onto_middle - R @ middle
+
+
+def _steps(poses: F64) -> F64:
+    return np.asarray(np.linalg.inv(poses[:-1]) @ poses[1:])
+
+
+def mean_depth_error(depth: F32, truth: F32) -> tuple[float, float] | None:
+    """Mean absolute error (mm) where both [H, W] (m, 0 unknown) are known, and the share of the true depth
+    that is given; None of a frame that SCARED leaves out, or where nothing is given."""
+    known = truth > 0
+    given = known & (depth > 0)
+    if np.mean(known) < LEAST_KNOWN or not given.any():
+        return None
+    error = np.abs(depth[given].astype(np.float64) - truth[given])
+    return float(np.mean(error)) * 1e3, float(given.sum() / known.sum())

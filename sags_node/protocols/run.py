@@ -1,0 +1,187 @@
+"""Public data sets played through the node's own pipeline, and measured by their own rules."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from sags_node.config import RecordedSource
+from sags_node.errors import SagsError
+from sags_node.evaluation.measure import Options
+from sags_node.evaluation.metrics import resample_nearest
+from sags_node.evaluation.session import evaluate
+from sags_node.kernels.threads import configure_threads
+from sags_node.launch_file import load_launch
+from sags_node.pipeline import Pipeline
+from sags_node.protocols import arithmetic
+from sags_node.protocols.layouts import check_sizes, stereomis_sequence, stir_clips
+from sags_node.session import open_posed, rig_of
+from sags_node.sources.videos import Video
+from sags_node.types import F64, Camera, Eye, StereoRig
+from sags_node.warm_up import warm_up
+
+STEP = ("source.loop:=false", "source.pace:=step")
+AS_GIVEN = "vision.tissue.dilate:=0"
+HOLD_OUT = 8  # EndoNeRF's split, as EndoGaussian and those after it take it
+PICKED = ("paper_psnr", "paper_ssim", "lpips", "psnr", "ssim", "copy_psnr")
+
+Progress = Callable[[int, str], None]  # frames done, of what
+
+
+def measure_endonerf(
+    folder: Path, overrides: Sequence[str], lpips: Path | None, progress: Progress
+) -> dict[str, Any]:
+    """Frames 1, 9, 17, ... are held out; masked pixels are black in both pictures and count. The masks are
+    taken as they are, without the margin that a node puts around instruments.
+
+    Each held-out frame is drawn from those before it. Published fits see those after it, too.
+    """
+    options = Options(HOLD_OUT, every=1, lpips_weights=lpips, paper_psnr=True)
+    found = evaluate(
+        folder, [AS_GIVEN, *overrides], options, "step", None, lambda what, done: progress(done, what)
+    )
+    heldout = found.summary["heldout"]
+    if heldout is None:
+        raise SagsError(f"{folder} has no frame to hold out; it needs more than {HOLD_OUT}")
+    figures = {key: heldout[key] for key in PICKED if heldout.get(key) is not None}
+    settings = found.summary["settings"]
+    return {"held_out": found.summary["held_out"], "causal": figures, "settings": settings}
+
+
+def measure_scared(folder: Path, overrides: Sequence[str], progress: Progress) -> dict[str, Any]:
+    """Mean absolute depth error of each frame, mm, and its mean over frames: of stereo and of the model."""
+    config = load_launch(folder, [*overrides, *STEP])
+    rig = rig_of(config)
+    warm_up(config)
+    configure_threads(config.engine.threads)
+    pipeline = Pipeline(config, rig)
+    budget, size = pipeline.make_budget(), config.vision.working_size(rig.left.width, rig.left.height)
+    errors: dict[str, list[tuple[float, float]]] = {"measured": [], "model": []}
+    with open_posed(config, rig) as frames:
+        for number, frame in enumerate(frames):
+            result = pipeline.process(frame, budget)
+            progress(number + 1, "playing")
+            if frame.reference is None or frame.reference.depth is None:
+                continue
+            truth = resample_nearest(frame.reference.depth, *size)
+            shown = {"measured": result.observation.depth, "model": result.views["left"].depth}
+            for name, depth in shown.items():
+                error = arithmetic.mean_depth_error(depth, truth)
+                if error is not None:
+                    errors[name].append(error)
+    if not errors["model"]:
+        raise SagsError(f"{folder} has no frame with enough true depth; scene_points are needed")
+    return {
+        name: {"frames": len(each), "mae_mm": mean(each, 0), "given": mean(each, 1)}
+        for name, each in errors.items()
+        if each
+    }
+
+
+def mean(rows: Sequence[tuple[float, ...]], column: int) -> float:
+    return float(np.mean([row[column] for row in rows]))
+
+
+def measure_stir(folder: Path, overrides: Sequence[str], progress: Progress) -> dict[str, Any]:
+    """Points pinned in each clip's first frame and followed to its last, in 2D; a point that cannot be pinned
+    or is lost counts where it was last."""
+    clips, distances, unmoved, times, lost = {}, [], [], [], 0
+    for clip in stir_clips(folder):
+        given = ["source.kind:=videos", f"source.left:={clip.left}", f"source.right:={clip.right}"]
+        ends, gone, ms = _follow([*given, *STEP, *overrides], clip.rig, clip.starts, clip.name, progress)
+        clips[clip.name] = arithmetic.nearest_distances(ends, clip.ends)
+        distances.append(clips[clip.name])
+        unmoved.append(arithmetic.nearest_distances(clip.starts, clip.ends))
+        times += ms
+        lost += gone
+    if not distances:
+        raise SagsError(f"no sequence of {folder} has a marked point in its first and last frame")
+    return {
+        "points": int(sum(map(len, distances))),
+        "lost": lost,
+        "tracked": arithmetic.shares_within(np.concatenate(distances)),
+        "unmoved": arithmetic.shares_within(np.concatenate(unmoved)),  # the evaluator's control
+        "latency_ms": arithmetic.latency_score(times),
+        "clips": {name: float(np.mean(each)) for name, each in clips.items()},
+    }
+
+
+def measure_stereomis(folder: Path, overrides: Sequence[str], progress: Progress) -> dict[str, Any]:
+    """The camera's way as the node estimates it, against the robot's."""
+    sequence = stereomis_sequence(folder)
+    check_sizes(Video(sequence.video), sequence.rig)
+    given = ["source.kind:=videos", f"source.left:={sequence.video}", "source.geometry.layout:=over_under"]
+    config = load_launch(None, [*given, "vision.pose:=estimate", *STEP, *overrides])
+    stride = config.source.stride if isinstance(config.source, RecordedSource) else 1
+    warm_up(config)
+    configure_threads(config.engine.threads)
+    pipeline = Pipeline(config, sequence.rig)
+    budget, T_rectified_raw = pipeline.make_budget(), np.eye(4)
+    T_rectified_raw[:3, :3] = sequence.rig.left.R
+    known_at = dict(zip(sequence.frames, sequence.poses, strict=True))
+    estimated, known = [], []
+    with open_posed(config, sequence.rig, references=False) as frames:
+        for number, frame in enumerate(frames):
+            result = pipeline.process(frame, budget)
+            progress(number + 1, "playing")
+            pose = known_at.get(frame.frame_id * stride)
+            if pose is not None:
+                estimated.append(result.snapshot.camera.T_world_cam @ T_rectified_raw)
+                known.append(pose)
+    if len(known) < 3:
+        raise SagsError(f"{folder}: {len(known)} frames have a pose in groundtruth.txt; three are needed")
+    return {"frames": len(known), **arithmetic.trajectory_figures(np.stack(estimated), np.stack(known))}
+
+
+def _follow(
+    launch: Sequence[str], rig: StereoRig, starts: F64, name: str, progress: Progress
+) -> tuple[F64, int, list[float]]:
+    """Last known pixels [P, 2] of points of the first raw left picture, how many were lost, ms of frames."""
+    config = load_launch(None, launch)
+    warm_up(config)
+    configure_threads(config.engine.threads)
+    pipeline = Pipeline(config, rig)
+    budget, camera = pipeline.make_budget(), pipeline.rectifier.camera
+    places, found = starts.copy(), 0
+    times: list[float] = []
+    pinned: dict[int, int] = {}  # anchor -> point
+    with open_posed(config, rig, references=False) as frames:
+        for number, frame in enumerate(frames):
+            started = time.perf_counter()
+            result = pipeline.process(frame, budget)
+            times.append((time.perf_counter() - started) * 1e3)
+            progress(number + 1, name)
+            if number == 0:
+                for point, (u, v) in enumerate(to_working(rig.left, camera, starts)):
+                    try:
+                        view = result.views["left"]
+                        anchor = pipeline.anchors.add_pixel(u, v, result.observation, result.snapshot, view)
+                    except SagsError:
+                        continue  # an instrument, no depth, or outside
+                    pinned[anchor] = point
+            else:
+                known = np.isfinite(result.anchors.pixels).all(1)
+                points = [pinned[int(anchor)] for anchor in result.anchors.ids[known]]
+                pixels = result.anchors.pixels[known].astype(np.float64)
+                found = len(points)
+                if found:
+                    places[points] = to_raw(rig.left, camera, pixels)
+    return places, len(starts) - found, times
+
+
+def to_working(eye: Eye, camera: Camera, pixels: F64) -> F64:
+    """Raw pixels [P, 2] of an eye in the rectified camera at the working size."""
+    there: F64 = cv2.undistortPoints(pixels[:, None], eye.K, eye.distortion, R=eye.R, P=camera.K)[:, 0]
+    return there
+
+
+def to_raw(eye: Eye, camera: Camera, pixels: F64) -> F64:
+    """The inverse of `to_working`."""
+    rays = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(camera.K).T @ eye.R
+    raw: F64 = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), eye.K, eye.distortion)[0][:, 0]
+    return raw

@@ -1,0 +1,200 @@
+"""Folders with one thing wrong each: it is found, and nothing else is."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from places import SESSION
+
+from sags_node.calibration import Finding
+from sags_node.cli.main import main
+from sags_node.importing.check import check_folder
+from sags_node.importing.pictures import combing, lit_box
+from sags_node.types import U8
+
+WIDTH, HEIGHT, FRAMES, DISPARITY = 160, 120, 4, 9
+
+
+def texture(seed: int, shift: int = 0) -> U8:
+    """Smooth spots; `shift` moves them to the right."""
+    rng = np.random.default_rng(seed)
+    small = rng.integers(40, 220, (HEIGHT // 4, WIDTH // 2, 3), np.uint8)
+    wide = cv2.resize(small, (2 * WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC)
+    cut: U8 = np.ascontiguousarray(wide[:, WIDTH // 2 - shift : WIDTH // 2 - shift + WIDTH])
+    return cut
+
+
+def made(folder: Path) -> Path:
+    """A sound recording: rectified pictures of both eyes in two kinds of files, masks and depth in 1e-5 m."""
+    for side in ("left", "right", "masks", "depth"):
+        (folder / side).mkdir(parents=True)
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    mask[:40, :50] = 255
+    depth = np.full((HEIGHT, WIDTH), 8000, np.uint16)
+    for number in range(FRAMES):
+        cv2.imwrite(str(folder / f"left/{number:03}.bmp"), texture(number))
+        cv2.imwrite(str(folder / f"right/{number:03}.tiff"), texture(number, -DISPARITY))
+        cv2.imwrite(str(folder / f"masks/{number:03}.png"), mask)
+        cv2.imwrite(str(folder / f"depth/{number:03}.png"), depth)
+    return folder
+
+
+def odd(folder: Path) -> list[Finding]:
+    """What is not well, but for the calibration that these folders lack."""
+    return [each for each in check_folder(folder) if each.level != "ok" and "no calibration" not in each.what]
+
+
+def edit(folder: Path, change: object) -> None:
+    for file in folder.iterdir():
+        picture = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        assert callable(change)
+        cv2.imwrite(str(file), change(picture))
+
+
+def test_a_sound_folder(tmp_path: Path) -> None:
+    found = check_folder(made(tmp_path / "case"))
+    assert [each.what for each in found if each.level != "ok"] == ["no calibration lies beside the pictures"]
+    said = "\n".join(each.what for each in found)
+    assert "4 pictures each" in said and f"disparity {DISPARITY}.0 px, rows agree" in said
+    assert "80 mm with 1e-05 m per count" in said and "10% of the picture is instrument" in said
+    assert "source.left:=" in found[-1].what and "source.tools:=" in found[-1].what
+
+
+def invert(mask: U8) -> U8:
+    return 255 - mask
+
+
+def interlaced(folder: Path) -> None:
+    for number in range(FRAMES):
+        both = texture(number)
+        both[1::2] = texture(number, 6)[1::2]  # the other field, a sixtieth of a second later
+        cv2.imwrite(str(folder / f"left/{number:03}.bmp"), both)
+
+
+def bordered(folder: Path) -> None:
+    def border(picture: U8) -> U8:
+        picture[:, :20] = 3
+        return picture
+
+    for side in ("left", "right"):
+        edit(folder / side, border)
+
+
+def gap(folder: Path) -> None:
+    for side, suffix in (("left", "bmp"), ("right", "tiff"), ("masks", "png")):
+        (folder / f"{side}/003.{suffix}").rename(folder / f"{side}/007.{suffix}")
+
+
+def exchanged(folder: Path) -> None:
+    (folder / "left").rename(folder / "there")
+    (folder / "right").rename(folder / "left")
+    (folder / "there").rename(folder / "right")
+
+
+PLANTED = {
+    "masks_inverted": (lambda folder: edit(folder / "masks", invert), "polarity", "invert"),
+    "masks_of_ones": (
+        lambda folder: edit(folder / "masks", lambda mask: mask // 255),
+        "no value above 1",
+        "255",
+    ),
+    "masks_small": (
+        lambda folder: edit(folder / "masks", lambda mask: mask[::2, ::2]),
+        "80x60 px, the pictures 160x120",
+        "nearest",
+    ),
+    "depth_is_disparity": (
+        lambda folder: edit(folder / "depth", lambda depth: np.full_like(depth, 2)),
+        "no distance in an endoscope's view",
+        "disparity",
+    ),
+    "depth_coloured": (
+        lambda folder: edit(folder / "depth", lambda depth: np.dstack([depth] * 3)),
+        "has 3 channels",
+        "grey",
+    ),
+    "right_one_missing": (
+        lambda folder: (folder / "right/002.tiff").unlink(),
+        "left 4, right 3",
+        "right lacks some, e.g. 002.bmp",
+    ),
+    "gap": (gap, "gaps in the numbers, first between 002", "gap"),
+    "cut_off": (
+        lambda folder: (folder / "left/000.bmp").write_bytes((folder / "left/000.bmp").read_bytes()[:5000]),
+        "damaged or cut off",
+        "replace",
+    ),
+    "same_picture": (
+        lambda folder: (
+            shutil.copytree(folder / "left", folder / "right", dirs_exist_ok=True)
+            and [file.unlink() for file in (folder / "right").glob("*.tiff")]
+        ),
+        "both eyes show the same picture",
+        "own",
+    ),
+    "exchanged": (exchanged, "eyes exchanged", "exchange left and right"),
+    "interlaced": (interlaced, "left: interlaced", "deinterlace"),
+    "borders": (bordered, "black borders; the picture is 140x120 px at 20,0", "[20,0,140,120]"),
+}
+
+
+@pytest.mark.parametrize("name", PLANTED)
+def test_a_planted_oddity_is_named_with_its_mend(name: str, tmp_path: Path) -> None:
+    folder = made(tmp_path / "case")
+    plant, what, mend = PLANTED[name]
+    plant(folder)
+    found = odd(folder)
+    assert any(what in each.what and mend in each.what + each.mend for each in found), found
+    other = [each.what for each in found if what not in each.what]
+    # One cause may show twice: both eyes have borders, fields in one eye hide its matches.
+    assert name in ("interlaced", "borders", "right_one_missing", "gap") or not other, other
+
+
+def test_noise_is_no_comb_and_fields_are() -> None:
+    fine = np.random.default_rng(0).integers(
+        0, 255, (HEIGHT, WIDTH), np.uint8
+    )  # as much in columns as in rows
+    assert combing(fine) == pytest.approx(combing(np.ascontiguousarray(fine.T)), rel=0.1)
+    alternating = np.zeros((10, 10), np.uint8)
+    alternating[1::2] = 100
+    assert combing(alternating) == 1.0 and combing(np.ascontiguousarray(alternating.T)) == 0.0
+
+
+def test_a_dark_picture_has_no_borders() -> None:
+    assert lit_box(np.zeros((HEIGHT, WIDTH), np.uint8)) == (0, 0, WIDTH, HEIGHT)
+
+
+def test_a_session_is_checked_with_its_calibration() -> None:
+    found = check_folder(SESSION)
+    assert {each.level for each in found} == {"ok"}, found
+    said = "\n".join(each.what for each in found)
+    assert "40 frames of 320x256 px at 10 Hz" in said and "calibration: " in said
+    assert found[-1].what == f"to play it: sags run {SESSION}"
+
+
+def test_folders_that_are_not_played_yet_are_named(tmp_path: Path) -> None:
+    (tmp_path / "P2").mkdir()
+    for name in ("groundtruth.txt", "StereoCalibration.ini"):
+        (tmp_path / "P2" / name).touch()
+    assert "StereoMIS" in check_folder(tmp_path / "P2")[0].what
+    (tmp_path / "stir/01/left01/seq00/segmentation").mkdir(parents=True)
+    assert "STIR" in check_folder(tmp_path / "stir")[0].what
+    assert "nothing that is known" in check_folder(tmp_path)[0].what
+    assert "P2, stir" in check_folder(tmp_path)[-1].what
+
+
+def test_the_command(tmp_path: Path) -> None:
+    folder = made(tmp_path / "case")
+    result = CliRunner().invoke(main, ["import", "--check", str(folder), "--json"])
+    assert result.exit_code == 0 and json.loads(result.stdout)[0]["what"] == "case is two folders of pictures"
+    edit(folder / "masks", invert)
+    result = CliRunner().invoke(main, ["import", "--check", str(folder)])
+    assert result.exit_code == 1 and "cannot be played" in result.stderr and "polarity" in result.stdout
+    missing = CliRunner().invoke(main, ["import", "--check", str(tmp_path / "none")])
+    assert missing.exit_code == 2 and "is not a folder" in missing.stderr
