@@ -66,9 +66,10 @@ lint: setup
 golden: setup
 	$(BIN)/python -m pytest tests/evaluation/test_replay.py --update-golden -s
 
-# Rewrite the pages that are made from the source: docs/launch.md from the configuration.
+# Rewrite the pages that are made: docs/launch.md from the configuration, docs/faults.md from the tests' marks.
 docs: setup
 	$(BIN)/python docs/launch_page.py
+	$(BIN)/python docs/faults_page.py
 
 clean:
 	rm -rf $(VENV) out build *.egg-info .pytest_cache .mypy_cache .ruff_cache

@@ -65,6 +65,11 @@ BAD = {
 }
 
 
+@pytest.mark.fault(
+    "file: a picture is damaged or claims to be huge",
+    says="one line of error that names it",
+    left="no other output",
+)
 @pytest.mark.parametrize("name", BAD)
 def test_a_bad_picture_is_one_message_that_names_it(
     name: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
@@ -130,6 +135,10 @@ Maker = Callable[[Path], None]
 NO_FILES: list[Maker] = [pipe, bound_socket, device, Path.mkdir]
 
 
+@pytest.mark.fault(
+    "file: a pipe, socket, device or folder in its place",
+    says="error: `is no file`",
+)
 @pytest.mark.parametrize("make", NO_FILES, ids=["pipe", "socket", "device", "folder"])
 def test_what_is_no_file_is_not_waited_for(make: Maker, tmp_path: Path) -> None:
     recordings(tmp_path)

@@ -22,6 +22,10 @@ def picture() -> U8:
     return np.zeros((4, 8, 3), np.uint8)
 
 
+@pytest.mark.fault(
+    "network: pictures of a sender are lost",
+    says="the share that is lost, to 4 %",
+)
 @pytest.mark.parametrize("lost", [0, 1, 3])
 def test_loss_is_counted_by_the_gaps(lost: int) -> None:
     """Of every eight pictures `lost` do not come."""
@@ -35,6 +39,11 @@ def test_loss_is_counted_by_the_gaps(lost: int) -> None:
     assert arrivals.lost == pytest.approx(16 * WINDOW * lost / 8, abs=16 * WINDOW * 0.04)
 
 
+@pytest.mark.fault(
+    "stamp: 3.2 s old, or 0.5 s ahead",
+    sees="the picture is refused",
+    says="error with its age",
+)
 @pytest.mark.parametrize(("age", "said"), [(3.2, "3.2 s old"), (-0.5, "0.5 s ahead")])
 def test_a_wrong_stamp_is_refused_with_its_age(age: float, said: str) -> None:
     sent = SentPictures(PushSource(), None)
@@ -42,6 +51,11 @@ def test_a_wrong_stamp_is_refused_with_its_age(age: float, said: str) -> None:
         sent.put("left", 100 * S, round((100 + age) * S), picture)
 
 
+@pytest.mark.fault(
+    "picture: a sender's has the wrong size",
+    sees="the picture is refused",
+    says="error with both sizes",
+)
 def test_another_size_is_refused_with_both_sizes() -> None:
     sent = SentPictures(PushSource(), (640, 512))
     with pytest.raises(SagsError, match=r"8x4 px.*640x512"):
@@ -83,6 +97,10 @@ def test_who_sends_too_slowly_is_told() -> None:
     assert "15.2 of 30 pictures a second" in (sent.slowness() or "")
 
 
+@pytest.mark.fault(
+    "network: a sender is 300 ms late",
+    says="`300 ms old`",
+)
 def test_who_sends_late_is_told() -> None:
     sent = SentPictures(PushSource(rate=30), None)
     for number in range(WINDOW):
@@ -122,6 +140,11 @@ def test_a_short_watch_says_no_drift() -> None:
     assert status is not None and status.drift_ppm is None
 
 
+@pytest.mark.fault(
+    "clock: a camera's is set by 3 s, forward or back",
+    sees="stamps within 1 ms",
+    back="3 s",
+)
 @pytest.mark.parametrize("jump", [3 * S, -3 * S])
 def test_a_clock_that_was_set_is_followed_within_three_seconds(jump: int) -> None:
     clock = CaptureClock()
