@@ -16,7 +16,7 @@ DEBIAN_TESTS := chromium g++ cmake pkg-config cppzmq-dev libmsgpack-cxx-dev fake
 missing = $(shell for p in $(1); do dpkg -s $$p >/dev/null 2>&1 || echo $$p; done)
 apt_install = apt-get update -qq && apt-get install -y -qq --no-install-recommends $(1) >/dev/null
 
-.PHONY: setup run test computed test-targets test-tools lint golden docs clean
+.PHONY: setup run test computed test-targets test-tools simulate lint golden docs clean
 
 setup: $(STAMP)
 
@@ -50,6 +50,11 @@ computed: setup
 # The kernels' tests for other processors than this one, on one and on two threads: a quarter of an hour.
 test-targets: setup
 	$(BIN)/python tests/targets.py
+
+# A node on a virtual clock with seeded faults: SEEDS="count first".
+SEEDS ?= 5000
+simulate: setup
+	PYTHONPATH=tests/helpers $(BIN)/python tests/test_simulation.py $(SEEDS)
 
 # Tests whose tools are missing are skipped, and say so.
 test-tools:

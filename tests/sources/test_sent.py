@@ -80,6 +80,22 @@ def test_pictures_of_both_eyes_are_taken_apart_and_cropped() -> None:
         PushSource(geometry=GeometryConfig(layout="frame_sequential"))
 
 
+@pytest.mark.fault(
+    "stamp: a sender's picture comes twice",
+    sees="each frame once",
+    says="the source's count of dropped frames",
+    back="with the next picture",
+)
+def test_a_pair_that_comes_twice_is_one_frame() -> None:
+    sent = SentPictures(PushSource(), None)
+    for number in (0, 1, 1, 2):
+        for eye in ("left", "right"):
+            sent.put(eye, S + number * PERIOD, S + number * PERIOD, picture)
+    sent.pairs.end()
+    assert [frame.t_capture_ns for frame in sent.pairs] == [S + number * PERIOD for number in range(3)]
+    assert sent.dropped == 1
+
+
 def test_the_latency_is_taken_off_and_all_stamps_are_kept() -> None:
     sent = SentPictures(PushSource(latency_ms=40), None)
     for eye in ("left", "right"):
@@ -130,6 +146,23 @@ def test_the_drift_is_found_under_the_jitter(drift: float) -> None:
     # The smallest of thirty exponential delays is 5/30 ms: over a minute that bounds the slope to some ppm.
     assert status.drift_ppm == pytest.approx(drift * 1e6, abs=5)
     assert clock.to_wall(60 * S) == pytest.approx(60 * S + difference + 2 * MS, abs=MS)
+
+
+@pytest.mark.fault(
+    "camera: away for half a minute soon after the start",
+    sees="stamps that are right to the jitter of the way",
+    back="with its first picture",
+)
+@pytest.mark.parametrize("before", [0.02, 1.5, 2.5])
+def test_few_pictures_long_apart_tell_the_clock_too(before: float) -> None:
+    clock = CaptureClock()
+    watched(clock, before, 0)
+    watched(clock, 1, 0, begun=30 * S)
+    status = clock.status()
+    assert status is not None and status.drift_ppm is not None
+    # The smallest of at least one and of thirty delays, 30 s apart: 20 ms in 30 s.
+    assert abs(status.drift_ppm) < 700
+    assert clock.to_wall(31 * S) == pytest.approx(38 * S + 2 * MS, abs=20 * MS)
 
 
 def test_a_short_watch_says_no_drift() -> None:
