@@ -16,7 +16,7 @@ DEBIAN_TESTS := chromium g++ cmake pkg-config cppzmq-dev libmsgpack-cxx-dev fake
 missing = $(shell for p in $(1); do dpkg -s $$p >/dev/null 2>&1 || echo $$p; done)
 apt_install = apt-get update -qq && apt-get install -y -qq --no-install-recommends $(1) >/dev/null
 
-.PHONY: setup run test computed test-targets test-tools simulate lint golden docs clean
+.PHONY: setup run test computed test-targets test-tools simulate fuzz lint golden docs clean
 
 setup: $(STAMP)
 
@@ -55,6 +55,11 @@ test-targets: setup
 SEEDS ?= 5000
 simulate: setup
 	PYTHONPATH=tests/helpers $(BIN)/python tests/test_simulation.py $(SEEDS)
+
+# Damaged bytes for every reader, for so long; inputs that fail are kept in out/fuzz.
+MINUTES ?= 60
+fuzz: setup
+	PYTHONPATH=tests/helpers $(BIN)/python tests/test_fuzz.py $(MINUTES)
 
 # Tests whose tools are missing are skipped, and say so.
 test-tools:

@@ -35,7 +35,7 @@ def quiet(caplog: pytest.LogCaptureFixture) -> None:
 def test_what_must_hold_holds_for_every_seed() -> None:
     runs = [play(seed) for seed in sorted({*range(SEEDS), *FAILED_ONCE})]
     # They are worth something only if much happened in them.
-    assert sum(run.published for run in runs) > 20 * len(runs)
+    assert sum(run.published for run in runs) > 10 * len(runs)
     assert sum(run.shown.total() for run in runs) > 20 * len(runs)
     assert sum(run.node._frames.dropped for run in runs) > len(runs)
     assert sum(run.source.refused for run in runs) > len(runs)

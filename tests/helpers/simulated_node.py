@@ -2,8 +2,8 @@
 
 Real are `Node` with all its loops, `Latest`, `LivePairs` and `SentPictures`, `Operations`, `TimeBudget`
 and `Ladder`, `Statistics`, `Publisher`, `ControlServer` and, at the consumer, `decode` and `Freshness`.
-Simulated are cameras, the work on a frame (it takes time, and fails now and then), the sockets, and who asks and listens.
-Views, thin pictures and the recorder are there and nobody asks for them.
+Simulated are cameras, the work on a frame (it takes time, and fails now and then), the sockets, and who asks
+and listens. Views, thin pictures and the recorder are there and nobody asks for them.
 """
 
 from __future__ import annotations
