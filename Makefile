@@ -16,7 +16,7 @@ DEBIAN_TESTS := chromium g++ cmake pkg-config cppzmq-dev libmsgpack-cxx-dev fake
 missing = $(shell for p in $(1); do dpkg -s $$p >/dev/null 2>&1 || echo $$p; done)
 apt_install = apt-get update -qq && apt-get install -y -qq --no-install-recommends $(1) >/dev/null
 
-.PHONY: setup run test computed test-targets test-tools simulate fuzz lint golden docs clean
+.PHONY: setup run test computed test-targets test-tools simulate fuzz wheel-test sbom licences lint golden docs clean
 
 setup: $(STAMP)
 
@@ -80,6 +80,19 @@ golden: setup
 docs: setup
 	$(BIN)/python docs/launch_page.py
 	$(BIN)/python docs/faults_page.py
+
+# The wheel in an empty environment, and its demo: some minutes, 2 GB in out/wheel.
+wheel-test: setup
+	$(BIN)/python tests/wheel.py
+
+# What that environment holds, as CycloneDX: out/sbom.json.
+sbom: wheel-test
+	$(PYTHON) -m venv out/tools && out/tools/bin/pip install -q --disable-pip-version-check cyclonedx-bom
+	out/tools/bin/cyclonedx-py environment --pyproject pyproject.toml -o out/sbom.json out/wheel/venv
+
+# Rewrite docs/licences.md from the packages that are installed here.
+licences: setup
+	$(BIN)/python docs/licences_page.py
 
 clean:
 	rm -rf $(VENV) out build *.egg-info .pytest_cache .mypy_cache .ruff_cache
