@@ -43,7 +43,7 @@ def fuzz(target: Target, inputs: int, number: int, folder: Path) -> Counter[bool
     (folder / "sound").mkdir(parents=True)
     sound = target.sound(folder / "sound")
     for whole in sound if len(sound) < 50 else []:
-        target.try_out(whole, folder / "it")
+        outcomes[target.try_out(whole, folder / "it")] += 1
 
     @seed(number)
     @settings(

@@ -198,6 +198,7 @@ def test_a_claimed_size_is_never_allocated() -> None:
         [b"t", b"\x80"],
         [b"t", b"\x80", b""],
         [b"\xff\xfe", b"\x80", b""],
+        [b"sags/tf\nerror: all is lost", encode(message_of(contents()["tf"]))[1], b""],
         [b"t" * 256, b"\x80", b""],
         [b"t", b"\x91" * 5000, b""],
         [b"t", b"\x91" * 4000, b""],
