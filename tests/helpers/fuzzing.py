@@ -332,7 +332,11 @@ def launch_files(_: Path) -> list[bytes]:
 
 def read_launch(data: bytes, folder: Path) -> None:
     (folder / "launch.yaml").write_bytes(data)
-    load_launch(folder)
+    try:
+        load_launch(folder)
+    except SagsError as error:  # a line for each mistake, and not all of a thousand
+        assert len(str(error).splitlines()) < 50
+        raise SagsError(str(error).splitlines()[0]) from None
 
 
 def ros_rigs(_: Path) -> list[bytes]:
