@@ -16,7 +16,7 @@ DEBIAN_TESTS := chromium g++ cmake pkg-config cppzmq-dev libmsgpack-cxx-dev fake
 missing = $(shell for p in $(1); do dpkg -s $$p >/dev/null 2>&1 || echo $$p; done)
 apt_install = apt-get update -qq && apt-get install -y -qq --no-install-recommends $(1) >/dev/null
 
-.PHONY: setup run test computed test-targets test-tools lint golden docs clean
+.PHONY: setup run test computed test-targets test-tools simulate fuzz wheel-test sbom licences lint golden docs clean
 
 setup: $(STAMP)
 
@@ -51,6 +51,16 @@ computed: setup
 test-targets: setup
 	$(BIN)/python tests/targets.py
 
+# A node on a virtual clock with seeded faults: SEEDS="count first".
+SEEDS ?= 5000
+simulate: setup
+	PYTHONPATH=tests/helpers $(BIN)/python tests/test_simulation.py $(SEEDS)
+
+# Damaged bytes for every reader, for so long; inputs that fail are kept in out/fuzz.
+MINUTES ?= 60
+fuzz: setup
+	PYTHONPATH=tests/helpers $(BIN)/python tests/test_fuzz.py $(MINUTES)
+
 # Tests whose tools are missing are skipped, and say so.
 test-tools:
 	@if [ -n "$(call missing,$(DEBIAN_TESTS))" ]; then \
@@ -66,9 +76,23 @@ lint: setup
 golden: setup
 	$(BIN)/python -m pytest tests/evaluation/test_replay.py --update-golden -s
 
-# Rewrite the pages that are made from the source: docs/launch.md from the configuration.
+# Rewrite the pages that are made: docs/launch.md from the configuration, docs/faults.md from the tests' marks.
 docs: setup
 	$(BIN)/python docs/launch_page.py
+	$(BIN)/python docs/faults_page.py
+
+# The wheel in an empty environment, and its demo: some minutes, 2 GB in out/wheel.
+wheel-test: setup
+	$(BIN)/python tests/wheel.py
+
+# What that environment holds, as CycloneDX: out/sbom.json.
+sbom: wheel-test
+	$(PYTHON) -m venv out/tools && out/tools/bin/pip install -q --disable-pip-version-check cyclonedx-bom
+	out/tools/bin/cyclonedx-py environment --pyproject pyproject.toml -o out/sbom.json out/wheel/venv
+
+# Rewrite docs/licences.md from the packages that are installed here.
+licences: setup
+	$(BIN)/python docs/licences_page.py
 
 clean:
 	rm -rf $(VENV) out build *.egg-info .pytest_cache .mypy_cache .ruff_cache

@@ -68,6 +68,11 @@ BAD = {
 }
 
 
+@pytest.mark.fault(
+    "file: a picture is damaged or claims to be huge",
+    says="one line of error that names it",
+    left="no other output",
+)
 @pytest.mark.parametrize("name", BAD)
 def test_a_bad_picture_is_one_message_that_names_it(
     name: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
@@ -161,6 +166,10 @@ Maker = Callable[[Path], None]
 NO_FILES: list[Maker] = [pipe, bound_socket, device, Path.mkdir]
 
 
+@pytest.mark.fault(
+    "file: a pipe, socket, device or folder in its place",
+    says="error: `is no file`",
+)
 @pytest.mark.parametrize("make", NO_FILES, ids=["pipe", "socket", "device", "folder"])
 def test_what_is_no_file_is_not_waited_for(make: Maker, tmp_path: Path) -> None:
     recordings(tmp_path)
@@ -202,6 +211,36 @@ def test_a_damaged_mesh_is_refused_in_one_message(tmp_path: Path, capfd: pytest.
     with pytest.raises(UsageError, match=r"mesh\.ply is damaged: RPly: Error reading 'z'"):
         mesh_of(ObjectSpec(file=file))
     assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.fault("file: a mesh whose faces name corners that there are not", says="error: `is damaged`")
+@pytest.mark.parametrize("corner", [4, 2**31 - 1, -1])
+@pytest.mark.parametrize("sides", [3, 5])
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
+def test_faces_with_missing_corners_are_refused(form: str, sides: int, corner: int, tmp_path: Path) -> None:
+    """Open3D would end the process."""
+    header = f"ply\nformat {form} 1.0\nelement vertex 4\n" + "".join(f"property float {a}\n" for a in "xyz")
+    header += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    face = [*range(sides - 1), corner]
+    if form == "ascii":
+        body = ("0 0 0\n0.01 0 0\n0 0.01 0\n0.01 0.01 0\n" + " ".join(map(str, (sides, *face)))).encode()
+    else:
+        body = struct.pack("<12f", 0, 0, 0, 0.01, 0, 0, 0, 0.01, 0, 0.01, 0.01, 0) + struct.pack(
+            f"<B{sides}i", sides, *face
+        )
+    file = tmp_path / "mesh.ply"
+    file.write_bytes(header.encode() + body)
+    with pytest.raises(UsageError, match=r"mesh\.ply is damaged: a face names a vertex that is not there"):
+        mesh_of(ObjectSpec(file=file))
+
+
+@pytest.mark.parametrize("face", ["0", "2 0 1", "4 0 1 2 1"])
+def test_faces_that_are_none_are_refused(face: str, tmp_path: Path) -> None:
+    header = "ply\nformat ascii 1.0\nelement vertex 3\n" + "".join(f"property float {a}\n" for a in "xyz")
+    header += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    (tmp_path / "mesh.ply").write_text(f"{header}0 0 0\n0.01 0 0\n0 0.01 0\n{face}\n")
+    with pytest.raises(UsageError, match=r"mesh\.ply is damaged: a face has \d different corners"):
+        mesh_of(ObjectSpec(file=tmp_path / "mesh.ply"))
 
 
 def test_a_video_that_cannot_be_written_is_one_message(

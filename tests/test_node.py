@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import socket
 import subprocess
@@ -13,6 +14,7 @@ from pathlib import Path
 import independent_client
 import numpy as np
 import pytest
+from command_line import FREE_PORTS, start
 from rosbags.typesys import Stores, get_typestore
 from running_node import START_SECONDS, RunningNode
 
@@ -142,6 +144,11 @@ def test_reset_makes_a_new_model_and_a_new_epoch(node: RunningNode) -> None:
     assert after["epoch"] > before["epoch"]
 
 
+@pytest.mark.fault(
+    "process: the node is killed",
+    sees="stale; reading raises an error",
+    says="the error",
+)
 def test_a_killed_node_goes_stale_and_reads_fail(phantom_session: Path, tmp_path: Path) -> None:
     """What was received from a dead node must not be taken for the present."""
     running = RunningNode(phantom_session, tmp_path)
@@ -160,6 +167,11 @@ def test_a_killed_node_goes_stale_and_reads_fail(phantom_session: Path, tmp_path
             subscriber.read(name)
 
 
+@pytest.mark.fault(
+    "process: Ctrl-C or SIGTERM to the node",
+    says="exit code 0",
+    left="no connection file",
+)
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
 def test_stopping_is_clean(phantom_session: Path, tmp_path: Path, stop: signal.Signals) -> None:
     running = RunningNode(phantom_session, tmp_path)
@@ -168,6 +180,36 @@ def test_stopping_is_clean(phantom_session: Path, tmp_path: Path, stop: signal.S
     assert running.process.wait(30) == 0
     assert not (running.run_dir / "sags.json").exists()
     assert "Traceback" not in running.said()
+
+
+@pytest.mark.fault(
+    "process: SIGTERM or SIGKILL at any moment of the start",
+    sees="no node, or one that stops",
+    back="the next node starts in the same place",
+    left="no process; after SIGTERM no connection file",
+)
+def test_a_start_may_be_broken_off_at_any_moment(phantom_session: Path, tmp_path: Path) -> None:
+    """From Python's first imports until frames are published, some seconds later."""
+    run_dir = tmp_path / "run"
+    command = ["run", phantom_session, "source.loop:=true", *FREE_PORTS, f"publish.run_dir:={run_dir}"]
+    for ending, moments in ((signal.SIGTERM, (0.2, 1.2, 3.0)), (signal.SIGKILL, (0.7, 3.0))):
+        for moment in moments:
+            process = start(command)
+            time.sleep(moment)
+            process.send_signal(ending)
+            _, stderr = process.communicate(timeout=30)
+            assert process.returncode in (
+                {0, 130, -signal.SIGTERM} if ending == signal.SIGTERM else {-ending}
+            )
+            assert "Traceback" not in stderr
+            with pytest.raises(ProcessLookupError):
+                os.killpg(process.pid, 0)  # of its group
+            assert ending == signal.SIGKILL or not (run_dir / "sags.json").exists()
+    (run_dir / "sags.json").unlink(
+        missing_ok=True
+    )  # what the killed one left; `RunningNode` waits for a new one
+    running = RunningNode(phantom_session, tmp_path)
+    assert running.stop() == 0
 
 
 def test_a_port_in_use_is_one_clear_message(phantom_session: Path, tmp_path: Path) -> None:

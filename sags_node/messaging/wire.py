@@ -115,4 +115,6 @@ def decode(frames: Sequence[Buffer]) -> Message:
         decoded = _decoder.decode(bytes(meta))
     except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
         raise WireError(f"not a message of protocol {PROTOCOL}: {error}") from None
+    if not name.isprintable():  # it is named in messages and in the log
+        raise WireError(f"no topic has the name {name!r}")
     return Message(name, decoded, tuple(parts))

@@ -15,6 +15,7 @@ import numpy as np
 from sags_node.errors import UsageError
 from sags_node.files import open_file
 from sags_node.native_output import native_output
+from sags_node.overlay.ply_faces import check_faces
 from sags_node.overlay.scene import ObjectSpec
 from sags_node.types import F32, F64, I32
 
@@ -54,6 +55,8 @@ def mesh_of(spec: ObjectSpec) -> Mesh | None:
 
 def _load(spec: ObjectSpec, file: Path) -> Mesh:
     _check_file(file)
+    if file.suffix.lower() == ".ply":
+        check_faces(file)
     import open3d
 
     points: F64 = np.zeros((0, 3))

@@ -70,7 +70,7 @@ class CaptureClock:
         at -= at[0]
         self._drift = 0.0
         if at[-1] >= SURE * BIN_NS:
-            i, j = np.triu_indices(len(at), len(at) // 4)
+            i, j = np.triu_indices(len(at), max(1, len(at) // 4))  # few bins: pictures did not come for long
             self._drift = float(np.median((differences[j] - differences[i]) / (at[j] - at[i])))
         self._lowest = float(np.min(differences - self._drift * at))
 

@@ -16,7 +16,7 @@ class LivePairs:
     """Pictures in, frames out, until `stop`, or until all are out after `end`.
 
     `frame_id` counts the left eye's pictures, so a left picture that found no partner leaves a gap. `epoch`
-    grows when the clock is set back.
+    grows when the clock is set back. A pair with the stamp of the one before was sent twice, and is left out.
 
     Args:
         tolerance_ms: how far the stamps of a pair may lie apart.
@@ -28,12 +28,13 @@ class LivePairs:
         self._latency_ns = round(latency_ms * 1e6)
         self._arrived = threading.Condition()
         self._ended = False
+        self._repeated = 0
         self.stopped = threading.Event()
 
     @property
     def unpaired(self) -> int:
-        """Pictures of either eye that found no partner."""
-        return self._pairing.unpaired
+        """Pictures of either eye that found no partner, and pairs that came twice."""
+        return self._pairing.unpaired + self._repeated
 
     def put(self, eye: Side, picture: Picture) -> None:
         with self._arrived:
@@ -60,7 +61,7 @@ class LivePairs:
 
     def __iter__(self) -> Iterator[StereoFrame]:
         """Pairs as they arrive, until `stop`; silent while no pictures come."""
-        epoch, last_ns = 0, 0
+        epoch, last_ns = 0, -1
         while True:
             with self._arrived:
                 while (pair := self._pairing.take()) is None and not (self.stopped.is_set() or self._ended):
@@ -68,6 +69,9 @@ class LivePairs:
             if pair is None or self.stopped.is_set():
                 return
             frame_id, left, right = pair
+            if left.t_ns == last_ns:
+                self._repeated += 1
+                continue
             epoch += left.t_ns < last_ns
             last_ns = left.t_ns
             yield StereoFrame(

@@ -48,6 +48,12 @@ def state(joined: Peer) -> str:
     return (joined.newest("SagsState") or ["0"])[0]
 
 
+@pytest.mark.fault(
+    "process: a bridge is killed; the node is killed under a bridge",
+    sees="no anchors after 1 s",
+    says="the bridge's state",
+    back="when it is started anew",
+)
 def test_a_pinned_anchor_comes_back_and_a_killed_node_leaves_nothing_standing(
     tmp_path: Path,
 ) -> None:

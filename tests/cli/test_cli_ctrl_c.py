@@ -21,6 +21,11 @@ from sags_node.terminal.console import interrupt, on_stop_signals
 pytestmark = [pytest.mark.live, pytest.mark.usefixtures("run_dir")]
 
 
+@pytest.mark.fault(
+    "process: Ctrl-C during a measurement",
+    says="`stopped`, exit code 130",
+    left="no temporary file",
+)
 @pytest.mark.parametrize("command", [["eval", "--json", "-"], ["eval", "--pace", "step"], ["demo", "--json"]])
 def test_ctrl_c_ends_a_measured_run(command: list[str], phantom_session: Path, tmp_path: Path) -> None:
     temporary = tmp_path / "temporary"
@@ -67,6 +72,10 @@ def __getattr__(name):
 """
 
 
+@pytest.mark.fault(
+    "process: Ctrl-C while it starts",
+    says="`stopped`, exit code 130",
+)
 @pytest.mark.parametrize(("module", "command"), [("click", ["doctor"]), ("open3d", ["overlay"])])
 def test_a_ctrl_c_while_modules_are_loaded_is_one_word(
     module: str, command: list[str], run_dir: Path, tmp_path: Path

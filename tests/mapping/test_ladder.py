@@ -108,6 +108,11 @@ def test_a_machine_at_the_edge_of_two_rungs_does_not_swing() -> None:
         assert len(changes(done)) <= 6, (slow, changes(done))
 
 
+@pytest.mark.fault(
+    "CPU: taken for ten seconds (simulated)",
+    sees="at least 90 % of the frames, on a lower rung",
+    back="two seconds after it ends it is within a rung of where it was",
+)
 def test_another_process_costs_rungs_while_it_runs_and_none_after() -> None:
     done = play(lambda now: 2.0 if 10 < now < 20 else 1.0, frames=1800)
     before = next(each.place for each in done if each.number >= 290)

@@ -47,6 +47,12 @@ def test_losses_do_not_stretch_the_period_but_count() -> None:
     assert fresh.period == pytest.approx(0.033) and fresh.lost == 3
 
 
+@pytest.mark.fault(
+    "network: a fifth of the messages is lost",
+    sees="stale",
+    says="reason: `too few`",
+    back="30 messages later",
+)
 @pytest.mark.parametrize(("every", "stale"), [(12, False), (5, True)])
 def test_stale_under_ninety_percent(every: int, stale: bool) -> None:
     """Every fifth lost is 80 %, every twelfth 92 %."""
@@ -64,6 +70,10 @@ def test_a_declared_rate_must_be_kept() -> None:
     assert "too few" in str(followed(list(range(1, 31)), rate_hz=40.0).problem(now))
 
 
+@pytest.mark.fault(
+    "network: messages come twice, or late",
+    sees="they are not news",
+)
 def test_repeats_and_late_ones_are_not_news() -> None:
     fresh = followed([1, 2, 3])
     assert not fresh.accept(meta(3, 99)) and not fresh.accept(meta(2, 99)) and fresh.lost == 0
@@ -72,6 +82,11 @@ def test_repeats_and_late_ones_are_not_news() -> None:
     assert not fresh.accept(meta(3, 2, session="restarted", epoch=0))
 
 
+@pytest.mark.fault(
+    "clock: the node's is 2 s ahead of the consumer's",
+    sees="stale",
+    says="reason: `ahead`",
+)
 def test_a_clock_ahead_is_not_fresh() -> None:
     assert "ahead" in str(followed([1, 2, 3]).problem(-2000 * MS))
 

@@ -70,6 +70,12 @@ def _free_port() -> int:
         return int(probe.getsockname()[1])
 
 
+@pytest.mark.fault(
+    "process: the node is killed, another begins in its place",
+    sees="stale; then the new session only",
+    says="another `session`",
+    back="by itself",
+)
 @pytest.mark.parametrize(
     ("by_file", "ipc", "moves"),
     [(False, False, False), (True, True, False), (True, False, True)],
@@ -93,6 +99,11 @@ def test_a_killed_node_is_followed(tmp_path: Path, by_file: bool, ipc: bool, mov
         assert subscriber.lost("tf") == 0
 
 
+@pytest.mark.fault(
+    "socket: the cable is cut",
+    sees="stale",
+    back="by itself, with a second connection",
+)
 def test_a_connection_that_died_without_a_word_is_made_anew(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

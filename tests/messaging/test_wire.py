@@ -198,6 +198,7 @@ def test_a_claimed_size_is_never_allocated() -> None:
         [b"t", b"\x80"],
         [b"t", b"\x80", b""],
         [b"\xff\xfe", b"\x80", b""],
+        [b"sags/tf\nerror: all is lost", encode(message_of(contents()["tf"]))[1], b""],
         [b"t" * 256, b"\x80", b""],
         [b"t", b"\x91" * 5000, b""],
         [b"t", b"\x91" * 4000, b""],
@@ -207,38 +208,6 @@ def test_a_claimed_size_is_never_allocated() -> None:
 def test_wrong_parts_are_refused(frames: list[bytes]) -> None:
     with pytest.raises(WireError):
         decode(frames)
-
-
-def test_random_bytes_only_ever_raise_wire_error() -> None:
-    rng = np.random.default_rng(1)
-    good = encode(message_of(contents()["left/camera_info"]))
-    for _ in range(3000):
-        frames = [bytes(frame) for frame in good]
-        which = int(rng.integers(1, len(frames)))
-        damaged = bytearray(frames[which])
-        for at in rng.integers(0, len(damaged), int(rng.integers(1, 6))):
-            damaged[at] = rng.integers(256)
-        frames[which] = bytes(damaged[: int(rng.integers(0, len(damaged) + 1))])
-        try:
-            interpret(decode(frames), 0)
-        except WireError:
-            continue
-
-
-@pytest.mark.parametrize("name", ["left/camera_info", "tf", "diagnostics", "status"])
-def test_damaged_cdr_only_ever_raises_wire_error(name: str) -> None:
-    rng = np.random.default_rng(2)
-    said = contents()[name]
-    good = bytes(said.parts[0])
-    for _ in range(1500):
-        damaged = bytearray(good)
-        for at in rng.integers(0, len(damaged), int(rng.integers(1, 9))):
-            damaged[at] = rng.choice([0, 1, 127, 255, int(rng.integers(256))])
-        part = bytes(damaged[: int(rng.integers(0, len(damaged) + 1))])
-        try:
-            interpret(Message("sags/x", meta_of(said), (part,)), 0)
-        except WireError:
-            continue
 
 
 @pytest.mark.parametrize(

@@ -232,6 +232,12 @@ def test_it_leaves_no_anchors_behind(run_dir: Path) -> None:
             until(lambda: anchors() == 0, seconds=5)
 
 
+@pytest.mark.fault(
+    "process: the node is stopped (SIGSTOP), reset or killed under an overlay",
+    sees="a blank overlay",
+    says="its status: `stale` or `lost`",
+    back="when the node goes on",
+)
 def test_it_goes_blank_when_the_node_stops_is_reset_or_dies(
     node: subprocess.Popen[str], run_dir: Path
 ) -> None:

@@ -63,6 +63,13 @@ def start_recorder(home: Path, *arguments: object) -> subprocess.Popen[str]:
     )
 
 
+@pytest.mark.fault(
+    "process: the recorder is killed",
+    sees="pictures of the recovered file are those that were published",
+    says="exit code 3 of `sags bag recover`",
+    back="with `sags bag recover`; no message is lost",
+    left="no metadata.yaml",
+)
 def test_a_killed_recording_is_recovered_and_replayed(node: Path, tmp_path: Path) -> None:
     seen: dict[int, dict[str, np.ndarray]] = {}
     eyes = ["left/image_rect_color", "right/image_rect_color"]

@@ -109,6 +109,12 @@ def running(
         node.stop()
 
 
+@pytest.mark.fault(
+    "process: what sends pictures is killed, the mapping is slow and stalls",
+    sees="each frame's own stamp, rising; nothing older than 1 s after the stall",
+    says="counts of dropped frames",
+    back="5 s",
+)
 @pytest.mark.parametrize("way", ["gst", "push", "ros2"])
 def test_a_stalled_mapper_shows_nothing_old_and_a_killed_source_comes_again(
     way: str, phantom_session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -22,6 +22,10 @@ def picture() -> U8:
     return np.zeros((4, 8, 3), np.uint8)
 
 
+@pytest.mark.fault(
+    "network: pictures of a sender are lost",
+    says="the share that is lost, to 4 %",
+)
 @pytest.mark.parametrize("lost", [0, 1, 3])
 def test_loss_is_counted_by_the_gaps(lost: int) -> None:
     """Of every eight pictures `lost` do not come."""
@@ -35,6 +39,11 @@ def test_loss_is_counted_by_the_gaps(lost: int) -> None:
     assert arrivals.lost == pytest.approx(16 * WINDOW * lost / 8, abs=16 * WINDOW * 0.04)
 
 
+@pytest.mark.fault(
+    "stamp: 3.2 s old, or 0.5 s ahead",
+    sees="the picture is refused",
+    says="error with its age",
+)
 @pytest.mark.parametrize(("age", "said"), [(3.2, "3.2 s old"), (-0.5, "0.5 s ahead")])
 def test_a_wrong_stamp_is_refused_with_its_age(age: float, said: str) -> None:
     sent = SentPictures(PushSource(), None)
@@ -42,6 +51,11 @@ def test_a_wrong_stamp_is_refused_with_its_age(age: float, said: str) -> None:
         sent.put("left", 100 * S, round((100 + age) * S), picture)
 
 
+@pytest.mark.fault(
+    "picture: a sender's has the wrong size",
+    sees="the picture is refused",
+    says="error with both sizes",
+)
 def test_another_size_is_refused_with_both_sizes() -> None:
     sent = SentPictures(PushSource(), (640, 512))
     with pytest.raises(SagsError, match=r"8x4 px.*640x512"):
@@ -66,6 +80,22 @@ def test_pictures_of_both_eyes_are_taken_apart_and_cropped() -> None:
         PushSource(geometry=GeometryConfig(layout="frame_sequential"))
 
 
+@pytest.mark.fault(
+    "stamp: a sender's picture comes twice",
+    sees="each frame once",
+    says="the source's count of dropped frames",
+    back="with the next picture",
+)
+def test_a_pair_that_comes_twice_is_one_frame() -> None:
+    sent = SentPictures(PushSource(), None)
+    for number in (0, 1, 1, 2):
+        for eye in ("left", "right"):
+            sent.put(eye, S + number * PERIOD, S + number * PERIOD, picture)
+    sent.pairs.end()
+    assert [frame.t_capture_ns for frame in sent.pairs] == [S + number * PERIOD for number in range(3)]
+    assert sent.dropped == 1
+
+
 def test_the_latency_is_taken_off_and_all_stamps_are_kept() -> None:
     sent = SentPictures(PushSource(latency_ms=40), None)
     for eye in ("left", "right"):
@@ -83,6 +113,10 @@ def test_who_sends_too_slowly_is_told() -> None:
     assert "15.2 of 30 pictures a second" in (sent.slowness() or "")
 
 
+@pytest.mark.fault(
+    "network: a sender is 300 ms late",
+    says="`300 ms old`",
+)
 def test_who_sends_late_is_told() -> None:
     sent = SentPictures(PushSource(rate=30), None)
     for number in range(WINDOW):
@@ -114,6 +148,23 @@ def test_the_drift_is_found_under_the_jitter(drift: float) -> None:
     assert clock.to_wall(60 * S) == pytest.approx(60 * S + difference + 2 * MS, abs=MS)
 
 
+@pytest.mark.fault(
+    "camera: away for half a minute soon after the start",
+    sees="stamps that are right to the jitter of the way",
+    back="with its first picture",
+)
+@pytest.mark.parametrize("before", [0.02, 1.5, 2.5])
+def test_few_pictures_long_apart_tell_the_clock_too(before: float) -> None:
+    clock = CaptureClock()
+    watched(clock, before, 0)
+    watched(clock, 1, 0, begun=30 * S)
+    status = clock.status()
+    assert status is not None and status.drift_ppm is not None
+    # The smallest of at least one and of thirty delays, 30 s apart: 20 ms in 30 s.
+    assert abs(status.drift_ppm) < 700
+    assert clock.to_wall(31 * S) == pytest.approx(38 * S + 2 * MS, abs=20 * MS)
+
+
 def test_a_short_watch_says_no_drift() -> None:
     clock = CaptureClock()
     assert clock.status() is None
@@ -122,6 +173,11 @@ def test_a_short_watch_says_no_drift() -> None:
     assert status is not None and status.drift_ppm is None
 
 
+@pytest.mark.fault(
+    "clock: a camera's is set by 3 s, forward or back",
+    sees="stamps within 1 ms",
+    back="3 s",
+)
 @pytest.mark.parametrize("jump", [3 * S, -3 * S])
 def test_a_clock_that_was_set_is_followed_within_three_seconds(jump: int) -> None:
     clock = CaptureClock()

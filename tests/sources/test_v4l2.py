@@ -168,6 +168,11 @@ def test_free_running_cameras_pair_from_the_first_moment(phase_ms: float) -> Non
     assert max(abs(left - right) for _, left, right in pairs) <= 20
 
 
+@pytest.mark.fault(
+    "clock: set back by an hour between the eyes",
+    sees="pairs go on",
+    back="after one queue of pictures",
+)
 def test_recovers_when_the_wall_clock_is_set_back() -> None:
     pairing = Pairing(20 * MS)
     pairing.add_right(shot(3_600_000))  # its partner came after the clock was set back one hour
@@ -212,7 +217,14 @@ def test_delivers_pairs_with_both_stamps(plugs: Plugs) -> None:
     assert all(camera.closed for cameras in plugs.opened.values() for camera in cameras)
 
 
-def test_unplugged_camera_comes_back(plugs: Plugs) -> None:
+@pytest.mark.fault(
+    "camera: unplugged",
+    sees="no frame; then only pictures of afterwards",
+    says="log: `it will be opened again`, `is open again`",
+    back="with the first pair after it is plugged in",
+    left="the old device is closed",
+)
+def test_unplugged_camera_comes_back(plugs: Plugs, caplog: pytest.LogCaptureFixture) -> None:
     with open_cameras(CONFIG, open_device=plugs) as source:
         collector = Collector(source)
         plugs.put(0, value=1)
@@ -229,9 +241,17 @@ def test_unplugged_camera_comes_back(plugs: Plugs) -> None:
         plugs.put(5000, value=2)
         collector.wait_for(2)
     assert collector.values() == [1, 2]
+    assert "it will be opened again" in caplog.text and "/dev/right is open again" in caplog.text
 
 
-def test_silent_camera_is_opened_again(plugs: Plugs) -> None:
+@pytest.mark.fault(
+    "camera: neither delivers nor fails",
+    sees="no frame; then only pictures of afterwards",
+    says="log: `no new picture`",
+    back="with the first pair after it is opened again",
+    left="the old device is closed",
+)
+def test_silent_camera_is_opened_again(plugs: Plugs, caplog: pytest.LogCaptureFixture) -> None:
     """A camera that neither delivers nor fails, as unplugged USB cameras may do."""
     with open_cameras(CONFIG, open_device=plugs) as source:
         collector = Collector(source)
@@ -251,8 +271,14 @@ def test_silent_camera_is_opened_again(plugs: Plugs) -> None:
         eventually(lambda: 2 in collector.values())
         stop.set()
         filming.join()
+    assert "no new picture for" in caplog.text
 
 
+@pytest.mark.fault(
+    "camera: absent while the node stops",
+    sees="no frame",
+    left="the reading thread ends",
+)
 def test_stop_ends_the_wait_for_absent_cameras(plugs: Plugs) -> None:
     with open_cameras(CONFIG, open_device=plugs) as source:
         collector = Collector(source)
@@ -262,6 +288,27 @@ def test_stop_ends_the_wait_for_absent_cameras(plugs: Plugs) -> None:
     assert collector.frames == []
 
 
+@pytest.mark.fault(
+    "clock: set forward by an hour under a camera",
+    sees="the same epoch, and later stamps",
+    back="with the next pair",
+)
+def test_clock_set_forward_goes_on(plugs: Plugs) -> None:
+    with open_cameras(CONFIG, open_device=plugs) as source:
+        collector = Collector(source)
+        for n, t in enumerate((10_000, 10_020, 3_610_000, 3_610_020)):
+            plugs.put(t)
+            collector.wait_for(n + 1)
+    assert [frame.epoch for frame in collector.frames] == [0, 0, 0, 0]
+    assert [frame.t_capture_ns // MS for frame in collector.frames] == [10_000, 10_020, 3_610_000, 3_610_020]
+
+
+@pytest.mark.fault(
+    "clock: set back under a camera",
+    sees="a new epoch: nothing of before is mixed in",
+    says="`epoch` of each message",
+    back="with the next pair",
+)
 def test_clock_set_back_grows_the_epoch(plugs: Plugs) -> None:
     with open_cameras(CONFIG, open_device=plugs) as source:
         collector = Collector(source)
@@ -359,6 +406,11 @@ def device(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., Dev
     return build
 
 
+@pytest.mark.fault(
+    "camera: the driver gives one picture again and again",
+    sees="each picture once",
+    back="with the next stamp",
+)
 def test_frozen_picture_is_no_picture(device: Callable[..., Device]) -> None:
     now = time.monotonic() * 1e3
     camera = device([now, now, now, now + 1])

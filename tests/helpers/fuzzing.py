@@ -1,0 +1,446 @@
+"""Bytes of strangers: sound ones with some damage, and what each reader of the product does with them.
+
+A reader gives values or an error of ours in one line, within a few seconds and without much memory. Anything
+else is a fault of the product.
+"""
+
+from __future__ import annotations
+
+import gzip
+import io
+import resource
+import shutil
+import signal
+import struct
+import tarfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import hostile
+import msgpack
+import msgspec
+import numpy as np
+from bag_files import ROS1, ROS2, play, stereo_rows, write_rosbag1, write_rosbag2
+from hypothesis import strategies as st
+from numbered_pictures import write_video
+from places import ROOT
+from simulated_node import Socket
+from synthetic import plane_result
+
+from sags_node import config as cfg
+from sags_node.calibration.check import check_rig
+from sags_node.calibration.read import read_rig
+from sags_node.errors import SagsError
+from sags_node.launch_file import load_launch
+from sags_node.messaging import cdr, content, thin, topics
+from sags_node.messaging.control import ControlServer
+from sags_node.messaging.received import ReceivedImage, interpret
+from sags_node.messaging.requests import AnchorName, AnchorRequest, ViewName, ViewRequest, parse
+from sags_node.messaging.wire import Message, Meta, decode, encode
+from sags_node.overlay.mesh import mesh_of
+from sags_node.overlay.scene import ObjectSpec
+from sags_node.picture_file import claimed_size
+from sags_node.recording.info import bag_info
+from sags_node.recording.pictures import decode_file
+from sags_node.recording.recover import recover
+from sags_node.sources.pose_track import PoseTrack
+from sags_node.sources.source import open_source
+from sags_node.vision.tissue_topic import TopicMasks
+
+LONGEST = 10.0  # s for one input
+MOST_MEMORY = 2 << 30  # bytes beyond those at the beginning: a 64 Mpx picture, decoded, and its copies
+PARTS = b"|~|~"  # between the parts of a message of several
+NUMBERS = [
+    struct.pack(order + kind, value)
+    for order in "<>"
+    for kind, values in (
+        ("H", (0, 1, 0x7FFF, 0xFFFF)),
+        ("I", (0, 1, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF)),
+        ("Q", (0, 1, 2**33, 2**60, 2**63, 2**64 - 1)),
+        ("d", (0.0, 1e300, float("nan"), float("inf"), -1.0)),
+    )
+    for value in values
+]
+WORDS = [
+    b"\n",
+    b"\r",
+    b"\0",
+    b" ",
+    b"-",
+    b"9" * 30,
+    b"nan",
+    b"1e999",
+    b"[" * 50,
+    b"{",
+    b": ",
+    b"&a",
+    b"*a",
+    b"!!",
+]
+
+
+@st.composite
+def damaged(draw: st.DrawFn, sound: Sequence[bytes]) -> bytes:
+    """One of these with up to six changes, of which most are where the structure is: at either end."""
+    data = bytearray(draw(st.sampled_from(sound)))
+    for _ in range(draw(st.integers(1, 6))):
+        size = len(data)
+        where = draw(st.sampled_from(("start", "end", "anywhere")))
+        near = min(size, 400)
+        at = draw(st.integers(0, size if where == "anywhere" else near))
+        at = size - at if where == "end" else at
+        length = draw(st.sampled_from((1, 2, 4, 8, 60)))
+        match draw(st.sampled_from(("flip", "number", "word", "bytes", "delete", "repeat", "cut"))):
+            case "flip" if at < size:
+                data[at] ^= 1 << draw(st.integers(0, 7))
+            case "number":
+                number = draw(st.sampled_from(NUMBERS))
+                data[at : at + len(number)] = number
+            case "word":
+                data[at:at] = draw(st.sampled_from(WORDS))
+            case "bytes":
+                new = draw(st.binary(min_size=1, max_size=8))
+                data[at : at + len(new)] = new
+            case "delete":
+                del data[at : at + length]
+            case "repeat":
+                data[at:at] = data[at : at + length] * draw(st.sampled_from((1, 2, 300)))
+            case "cut":
+                del data[at:]
+    return bytes(data)
+
+
+@dataclass(frozen=True)
+class Target:
+    """A reader.
+
+    Attributes:
+        sound: makes what it reads well, in an empty folder.
+        use: reads what may be damaged, in an empty folder; a `SagsError` is right.
+    """
+
+    sound: Callable[[Path], Sequence[bytes]]
+    use: Callable[[bytes, Path], object]
+
+    def try_out(self, data: bytes, folder: Path) -> bool:
+        """Whether it was read.
+
+        Raises:
+            AssertionError, or what else came: a fault of the reader.
+        """
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir()
+        try:
+            with ended_in_time():
+                self.use(data, folder)
+        except SagsError as error:
+            assert str(error) and "\n" not in str(error), f"not one line: {str(error)!r}"
+            return False
+        return True
+
+
+class HungError(BaseException):
+    """It took too long; no reader may catch this."""
+
+
+@contextmanager
+def ended_in_time() -> Iterator[None]:
+    def hung(*_: object) -> None:
+        raise HungError(f"no end within {LONGEST} s")
+
+    before = signal.signal(signal.SIGALRM, hung)
+    signal.setitimer(signal.ITIMER_REAL, LONGEST)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+@contextmanager
+def bounded_memory() -> Iterator[None]:
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (used + MOST_MEMORY, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+# ---- control -------------------------------------------------------------------------------------------
+
+
+def requests(_: Path) -> list[bytes]:
+    rng = np.random.default_rng(0)
+    good: list[tuple[str, dict[str, Any]]] = [
+        ("echo", {"a": [1, {"b": None}]}),
+        ("add_anchor", {"u": 3, "v": 4.5, "ahead_ms": "auto"}),
+        ("add_anchor", {"x": 0.1, "y": 0.0, "z": -1e-3}),
+        ("remove_anchor", {"id": 5}),
+        ("close_view", {"name": "top"}),
+        (
+            "open_view",
+            {"name": "top", "width": 64, "height": 48, "fov": 60.0, "T_world_cam": np.eye(4).tolist()},
+        ),
+        ("open_view", {"name": "top", "width": 64, "height": 48, "K": np.diag((50, 50, 1)).tolist()}),
+    ]
+    packed = [msgpack.packb({"v": "1.0", "id": 7, "op": op, "args": args}) for op, args in good]
+    return packed + [hostile.random_request(rng) for _ in range(200)]
+
+
+HANDLERS: dict[str, Callable[[dict[str, Any]], Any]] = {
+    "echo": lambda args: args,
+    "add_anchor": lambda args: msgspec.to_builtins(parse(AnchorRequest, args)),
+    "remove_anchor": lambda args: parse(AnchorName, args).id,
+    "close_view": lambda args: parse(ViewName, args).name,
+    "open_view": lambda args: msgspec.to_builtins(parse(ViewRequest, args)),
+}
+
+
+def answer(data: bytes, _: Path) -> None:
+    """Every request is answered once, and none is an error of ours."""
+    socket = Socket()
+    socket.incoming.append([b"peer", data])
+    ControlServer(socket, HANDLERS).serve()  # type: ignore[arg-type]
+    ((envelope, body),) = socket.sent
+    assert envelope == b"peer" and hostile.is_reply(body)
+    assert b"internal error" not in body, body
+
+
+# ---- messages ------------------------------------------------------------------------------------------
+
+
+def messages(_: Path) -> list[bytes]:
+    result = plane_result(stamp_ns=1_000_000)
+    made = {
+        name: make(result) for name, make in content.FRAME_CONTENT.items() if content.tells_of(result, name)
+    }
+    return [PARTS.join(bytes(part) for part in encode(_message(name, body))) for name, body in made.items()]
+
+
+def _message(name: str, body: cdr.Content) -> Message:
+    meta = Meta(
+        type=body.type, type_hash=cdr.type_hash(body.type), encoding=body.encoding, shape=list(body.shape),
+        dtype=body.dtype, seq=1, frame_id=1, stamp_ns=1_000_000, publish_ns=1, session="s", epoch=0, step=0,
+        dropped=0,
+    )  # fmt: skip
+    return Message(f"sags/{name}", meta, body.parts)
+
+
+def read_message(data: bytes, _: Path) -> None:
+    got = interpret(decode(data.split(PARTS)), 0)
+    if isinstance(got, ReceivedImage):
+        assert got.array.nbytes <= len(data)
+
+
+def masks(_: Path) -> list[bytes]:
+    result = plane_result(stamp_ns=1_000_000)
+    body = content.FRAME_CONTENT["left/tissue_mask"](result)
+    return [PARTS.join(bytes(part) for part in encode(_message("left/tissue_mask", body)))]
+
+
+def use_mask(data: bytes, _: Path) -> None:
+    got = interpret(decode(data.split(PARTS)), 0)
+    if isinstance(got, ReceivedImage):
+        pair = plane_result(stamp_ns=1_000_000).pair
+        tissue = TopicMasks(cfg.TissueConfig(), lambda _: (got.stamp_ns, got.array))(pair)
+        assert tissue.shape == pair.left.shape[:2] and tissue.dtype == bool
+
+
+def thin_files(_: Path) -> list[bytes]:
+    names = (
+        "left/depth/png",
+        "left/image_rect_color/jpeg",
+        "left/tissue_mask/png",
+        "left/render/image/alpha",
+    )
+    asked = {name: topics.thin_picture(f"thin/half/{name}") for name in names}
+    return [bytes(made.parts[1]) for made in thin.thin_pictures(plane_result(), asked).values()]
+
+
+def read_thin(data: bytes, _: Path) -> None:
+    thin.decode("sags/thin", 0.01, data)
+
+
+def poses(_: Path) -> list[bytes]:
+    return [
+        bytes(cdr.pose(np.eye(4), 5).parts[0]),
+        bytes(cdr.transform(np.eye(4), 5).parts[0]),
+    ]
+
+
+def read_pose(data: bytes, _: Path) -> None:
+    for kind in (cdr.POSE, topics.TF):
+        track = PoseTrack()
+        try:
+            track.add(data, kind)
+        except SagsError:
+            continue
+        assert np.isfinite(track.at(5)).all()
+
+
+# ---- files ---------------------------------------------------------------------------------------------
+
+
+def pictures(_: Path) -> list[bytes]:
+    rgb = np.random.default_rng(0).integers(0, 255, (24, 32, 3), np.uint8)
+    deep = np.random.default_rng(0).integers(0, 65535, (24, 32), np.uint16)
+    progressive = [cv2.IMWRITE_JPEG_PROGRESSIVE, 1]
+    made = [cv2.imencode(kind, rgb)[1] for kind in (".png", ".jpg", ".tiff")]
+    made += [cv2.imencode(".png", deep)[1], cv2.imencode(".jpg", rgb, progressive)[1]]
+    return [one.tobytes() for one in made]
+
+
+def read_picture(data: bytes, _: Path) -> None:
+    claimed_size(memoryview(data))
+    decode_file(np.frombuffer(data, np.uint8), "picture")
+
+
+def bag(kind: str) -> Target:
+    suffix = ".mcap" if kind == "mcap" else ".db3" if kind == "db3" else ".bag"
+
+    def sound(folder: Path) -> list[bytes]:
+        if kind == "ros1":
+            write_rosbag1(folder / "a.bag", stereo_rows(ROS1, 3), "LZ4")
+        else:
+            plugin, packed = ("MCAP", "STORAGE") if kind == "mcap" else ("SQLITE3", None)
+            write_rosbag2(folder / "bag", stereo_rows(ROS2, 3), plugin, packed)
+        return [next(folder.rglob(f"*{suffix}")).read_bytes()]
+
+    def use(data: bytes, folder: Path) -> None:
+        file = folder / f"x{suffix}"
+        file.write_bytes(data)
+        if kind == "mcap":
+            try:
+                recover(file, folder / "saved")
+            except SagsError as error:
+                assert "\n" not in str(error) and not (folder / "saved").exists()
+        bag_info(file)
+        play(file)
+
+    return Target(sound, use)
+
+
+def launch_files(_: Path) -> list[bytes]:
+    return [file.read_bytes() for file in sorted((ROOT / "launch").glob("*.yaml"))]
+
+
+def read_launch(data: bytes, folder: Path) -> None:
+    (folder / "launch.yaml").write_bytes(data)
+    try:
+        load_launch(folder)
+    except SagsError as error:  # a line for each mistake, and not all of a thousand
+        assert len(str(error).splitlines()) < 50
+        raise SagsError(str(error).splitlines()[0]) from None
+
+
+def ros_rigs(_: Path) -> list[bytes]:
+    return [(ROOT / f"calib/d4d/{side}.yaml").read_bytes() for side in ("left", "right")]
+
+
+def read_ros_rig(data: bytes, folder: Path) -> None:
+    shutil.copy(ROOT / "calib/d4d/right.yaml", folder)
+    (folder / "left.yaml").write_bytes(data)
+    check_rig(read_rig(folder))
+
+
+def archives(_: Path) -> list[bytes]:
+    raw = io.BytesIO()
+    with tarfile.open(fileobj=raw, mode="w") as archive:
+        for side in ("left", "right"):
+            archive.add(ROOT / f"calib/d4d/{side}.yaml", f"{side}.yaml")
+    return [raw.getvalue()]
+
+
+def read_archive(data: bytes, folder: Path) -> None:
+    (folder / "calibrationdata.tar.gz").write_bytes(gzip.compress(data, 1))
+    check_rig(read_rig(folder))
+
+
+def opencv_rigs(folder: Path) -> list[bytes]:
+    made = []
+    for suffix in (".yml", ".xml"):
+        file = cv2.FileStorage(str(folder / f"rig{suffix}"), cv2.FILE_STORAGE_WRITE)
+        K = np.array([[500.0, 0, 320], [0, 500, 256], [0, 0, 1]])
+        for name, matrix in (("M1", K), ("D1", np.zeros((1, 5))), ("M2", K), ("D2", np.zeros((1, 5))),
+                             ("R", np.eye(3)), ("T", np.array([[-0.005], [0], [0]]))):  # fmt: skip
+            file.write(name, matrix)
+        file.release()
+        made.append((folder / f"rig{suffix}").read_bytes())
+    return made
+
+
+def read_opencv_rig(data: bytes, folder: Path) -> None:
+    file = folder / ("rig.xml" if data[:10].count(b"<") else "rig.yml")
+    file.write_bytes(data)
+    check_rig(read_rig(file, (640, 512)))
+
+
+def meshes(_: Path) -> list[bytes]:
+    corners = ["0 0 0", "0.01 0 0", "0 0.01 0", "0 0 0.01"]
+    faces = [(0, 1, 2), (0, 1, 3), (1, 2, 3)]
+    head = "element vertex 4\n" + "".join(f"property float {a}\n" for a in "xyz") + "element face 3\n"
+    head += "property list uchar int vertex_indices\nend_header\n"
+    ply = (
+        "ply\nformat ascii 1.0\n"
+        + head
+        + "\n".join(corners)
+        + "\n"
+        + "\n".join(f"3 {a} {b} {c}" for a, b, c in faces)
+    )
+    binary = b"ply\nformat binary_little_endian 1.0\n" + head.encode()
+    binary += np.array([c.split() for c in corners], "<f4").tobytes()
+    binary += b"".join(struct.pack("<Biii", 3, *face) for face in faces)
+    obj = "".join(f"v {c}\n" for c in corners) + "".join(f"f {a + 1} {b + 1} {c + 1}\n" for a, b, c in faces)
+    return [ply.encode(), binary, obj.encode()]
+
+
+def read_mesh(data: bytes, folder: Path) -> None:
+    file = folder / ("mesh.ply" if data[:1] == b"p" else "mesh.obj")
+    file.write_bytes(data)
+    mesh = mesh_of(ObjectSpec(file=file))
+    assert mesh is not None and np.isfinite(mesh.vertices).all()
+    assert mesh.triangles.min() >= 0 and mesh.triangles.max() < len(mesh.vertices)
+
+
+def films(folder: Path) -> list[bytes]:
+    shown = [np.random.default_rng(n).integers(0, 255, (48, 128, 3), np.uint8) for n in range(4)]
+    made = [write_video(folder / "a.avi", shown).read_bytes()]
+    writer = cv2.VideoWriter(str(folder / "a.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 25.0, (128, 48))
+    for rgb in shown:
+        writer.write(rgb)
+    writer.release()
+    return [*made, (folder / "a.mp4").read_bytes()]
+
+
+def read_film(data: bytes, folder: Path) -> None:
+    file = folder / ("a.avi" if data[:4] == b"RIFF" else "a.mp4")
+    file.write_bytes(data)
+    with open_source(cfg.SideBySideSource(video=file, pace="step", frames=8)) as source:
+        for frame in source:
+            assert frame.right is not None and frame.left.shape == frame.right.shape
+
+
+TARGETS: dict[str, Target] = {
+    "requests": Target(requests, answer),
+    "messages": Target(messages, read_message),
+    "masks": Target(masks, use_mask),
+    "thin pictures": Target(thin_files, read_thin),
+    "poses": Target(poses, read_pose),
+    "pictures": Target(pictures, read_picture),
+    "mcap": bag("mcap"),
+    "db3": bag("db3"),
+    "ros1": bag("ros1"),
+    "launch files": Target(launch_files, read_launch),
+    "ros calibration": Target(ros_rigs, read_ros_rig),
+    "calibration archive": Target(archives, read_archive),
+    "opencv calibration": Target(opencv_rigs, read_opencv_rig),
+    "meshes": Target(meshes, read_mesh),
+    "videos": Target(films, read_film),
+}
+IN_MEMORY = {"requests", "messages", "masks", "thin pictures", "poses", "pictures"}

@@ -1,0 +1,76 @@
+"""The wheel in an empty environment: it is built, installed with what it needs, and shows its demo.
+
+`make wheel-test` takes some minutes and 2 GB in out/wheel, so it is none of the tests that always run.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import venv
+import zipfile
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+OUT = ROOT / "out/wheel"
+NEEDED = ("sags_node/py.typed", "sags_node/bridge/web_page/index.html")
+
+
+def run(*command: object, folder: Path | None = None) -> str:
+    """What a command says on stdout; it sees nothing of this repository but by its arguments."""
+    environment = {
+        name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")
+    }
+    done = subprocess.run(
+        list(map(str, command)),
+        cwd=folder,
+        env=environment,
+        stdout=subprocess.PIPE,
+        text=True,
+        timeout=1800,
+        check=True,
+    )
+    return done.stdout
+
+
+def main() -> None:
+    shutil.rmtree(OUT, ignore_errors=True)
+    home = OUT / "empty"
+    home.mkdir(parents=True)
+    pip = [sys.executable, "-m", "pip", "-q", "--disable-pip-version-check"]
+    run(*pip, "wheel", "--no-deps", "-w", OUT, ROOT)
+    (wheel,) = OUT.glob("sags_node-*.whl")
+    with zipfile.ZipFile(wheel) as packed:
+        names = packed.namelist()
+    missing = [name for name in NEEDED if name not in names]
+    strangers = [name for name in names if not name.startswith(("sags_node/", "sags_node-"))]
+    assert not missing and not strangers, (missing, strangers)
+    print(f"{wheel.name}: {wheel.stat().st_size / 1e6:.1f} MB, {len(names)} files", flush=True)
+
+    venv.create(OUT / "venv", with_pip=True)
+    python, sags = OUT / "venv/bin/python", OUT / "venv/bin/sags"
+    run(
+        python,
+        "-m",
+        "pip",
+        "-q",
+        "--disable-pip-version-check",
+        "install",
+        "-c",
+        ROOT / "constraints.txt",
+        f"{wheel}[report]",
+    )
+    where = run(python, "-c", "import sags_node; print(sags_node.__file__)", folder=home).strip()
+    assert Path(where).is_relative_to(OUT), where
+    print(run(sags, "--version", folder=home).strip(), flush=True)
+    shown = json.loads(run(sags, "demo", "--json", "--seconds", 5, "--out", home / "demo", folder=home))
+    assert shown["processed"] > 0 and shown["overlay"]["frames"] > 0, shown
+    assert {"report.html", "overlay.mp4"} <= {file.name for file in (home / "demo").iterdir()}
+    print(f"sags demo: {shown['processed']} frames, {shown['overlay']['frames']} of the overlay", flush=True)
+
+
+if __name__ == "__main__":
+    main()
