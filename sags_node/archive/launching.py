@@ -78,3 +78,9 @@ def _kind(overrides: Sequence[str]) -> str | None:
 
 def _shows_both(overrides: Sequence[str]) -> bool:
     return any(each.startswith("source.geometry.layout:=") for each in overrides)
+
+
+def split(said: Sequence[str]) -> tuple[str | None, list[str]]:
+    """Arguments as `load_launch` and `open_session` take them: what is launched, and the overrides."""
+    launch = next((each for each in said if ":=" not in each), None)
+    return launch, [each for each in said if ":=" in each]

@@ -12,7 +12,7 @@ import hashlib
 import io
 import re
 import shlex
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 from typing import Any
@@ -143,18 +143,9 @@ def write_manifest(url: str, recordings: Sequence[Recording]) -> None:
         UsageError: another suffix.
         SagsError: it cannot be written.
     """
-    rows = [
-        {
-            "recording": each.name,
-            "rig": each.rig_name or "",
-            "overrides": shlex.join(each.overrides),
-            "weight": each.weight,
-        }
-        for each in recordings
-    ]
     if not url.endswith(SUFFIXES):
         raise UsageError(f"{url}: a manifest is a {' or '.join(SUFFIXES)} file")
-    data = _as_parquet(rows) if url.endswith(PARQUET) else _as_csv(rows)
+    data = _as_parquet(recordings) if url.endswith(PARQUET) else as_csv(recordings)
     try:
         fs, path = url_to_fs(url)
         fs.makedirs(fs._parent(path), exist_ok=True)
@@ -163,18 +154,29 @@ def write_manifest(url: str, recordings: Sequence[Recording]) -> None:
         raise SagsError(f"cannot write {url}: {error}; name another place") from None
 
 
-def _as_csv(rows: Iterable[Mapping[str, Any]]) -> bytes:
+def as_csv(recordings: Sequence[Recording]) -> bytes:
+    """The content of a .csv file."""
     text = io.StringIO(newline="")
     writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
     writer.writeheader()
-    writer.writerows(rows)
+    writer.writerows(map(_row, recordings))
     return text.getvalue().encode()
 
 
-def _as_parquet(rows: Sequence[Mapping[str, Any]]) -> bytes:
+def _row(recording: Recording) -> dict[str, Any]:
+    return {
+        "recording": recording.name,
+        "rig": recording.rig_name or "",
+        "overrides": shlex.join(recording.overrides),
+        "weight": recording.weight,
+    }
+
+
+def _as_parquet(recordings: Sequence[Recording]) -> bytes:
     pq = parquet()
     import pyarrow as pa
 
+    rows = [_row(recording) for recording in recordings]
     file = io.BytesIO()
     columns = {name: [row[name] for row in rows] for name in COLUMNS}
     pq.write_table(pa.table(columns), file)

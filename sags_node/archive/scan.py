@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from sags_node.archive.launching import arguments, counterpart, is_video
+from sags_node.archive.launching import arguments, counterpart, is_video, split
 from sags_node.archive.manifest import Recording
-from sags_node.config import LaunchConfig, LiveSource, PhantomSource
+from sags_node.config import LiveSource, PhantomSource
 from sags_node.errors import SagsError, UsageError
 from sags_node.launch_file import BAG_SUFFIXES, is_sidecar, known_recording, load_launch
 from sags_node.session import open_session
@@ -122,7 +122,7 @@ def _opened(root: Path, name: str, rig: Path | None) -> Recording:
     """
     path = root / name
     overrides = _says_how(path) if is_video(path.name) else []
-    config = _loaded(arguments(path, None, overrides))
+    config = load_launch(*split(arguments(path, None, overrides)))
     if isinstance(config.source, LiveSource):
         raise UsageError("live cameras, no recording; record them first (sags bag record)")
     rig_name = None
@@ -138,21 +138,12 @@ def _opened(root: Path, name: str, rig: Path | None) -> Recording:
         megapixels = config.source.width * config.source.height * 1e-6
     else:
         said = arguments(path, None if rig_name is None else root / rig_name, overrides)
-        session = open_session(*_split(said))
+        session = open_session(*split(said))
         with session.source as source:
             frames = source.frame_count or 1
         megapixels = session.working_size[0] * session.working_size[1] * 1e-6
     weight = float(f"{frames * megapixels:.4g}")
     return Recording(name, str(root), rig_name, tuple(overrides), weight)
-
-
-def _split(said: Sequence[str]) -> tuple[str | None, list[str]]:
-    launch = [each for each in said if ":=" not in each]
-    return (launch[0] if launch else None), [each for each in said if ":=" in each]
-
-
-def _loaded(said: Sequence[str]) -> LaunchConfig:
-    return load_launch(*_split(said))
 
 
 def _says_how(video: Path) -> list[str]:

@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
+import shlex
+import time
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 from rich.markup import escape
+from rich.table import Table
 
-from sags_node.cli.launching import as_json
+from sags_node.archive.jobs import JOBS
+from sags_node.cli.launching import as_json, positive, split
+from sags_node.errors import SagsError, UsageError
+from sags_node.plotting import check_plots
 from sags_node.terminal import text
 from sags_node.terminal.console import console, progress, show
+
+if TYPE_CHECKING:
+    from sags_node.archive.manifest import Recording
+    from sags_node.archive.run import Tally
 
 
 @click.group()
@@ -60,3 +71,192 @@ def scan(folder: Path, out: str, rig: Path | None, json_out: bool) -> None:
         )
     elif refused:
         show(text.rows_table(refused))
+
+
+@archive.command()
+@click.argument("source", nargs=-1, metavar="MANIFEST|FOLDER [key:=value ...]")
+@click.option(
+    "--job",
+    type=click.Choice(sorted(JOBS)),
+    required=True,
+    help="eval: figures and a report; fit: the offline fit.",
+)
+@click.option(
+    "--out", required=True, metavar="FOLDER|URL", help="Where the results lie; the same one goes on."
+)
+@click.option("--ray", "address", metavar="HOST:PORT", help="A Ray cluster; default: --local.")
+@click.option("--local", is_flag=True, help="This machine alone; the default.")
+@click.option("--limit", type=click.IntRange(1), help="Only so many recordings, the first of the list.")
+@click.option("--retry-failed", is_flag=True, help="Also those that are quarantined.")
+@click.option(
+    "--attempts", type=click.IntRange(1), default=3, show_default=True, help="Then one is quarantined."
+)
+@click.option(
+    "--timeout", type=positive, metavar="S", help="Seconds that one recording may take; default: any."
+)
+@click.option(
+    "--memory",
+    type=positive,
+    metavar="GB",
+    help="Memory that one recording may take; Ray starts no more at once than fit.  [default: any]",
+)
+@click.option(
+    "--stage-limit",
+    type=positive,
+    default=50.0,
+    show_default=True,
+    metavar="GB",
+    help="What may be fetched for one recording whose path is a URL.",
+)
+@click.option("--rig", type=click.Path(path_type=Path), help="As for sags archive scan, of a FOLDER.")
+@click.option(
+    "--options", default="", metavar="TEXT", help="More options of the job's command, e.g. '--hold-out 0'."
+)
+@as_json
+def run(
+    source: tuple[str, ...],
+    job: str,
+    out: str,
+    address: str | None,
+    local: bool,
+    limit: int | None,
+    retry_failed: bool,
+    attempts: int,
+    timeout: float | None,
+    memory: float | None,
+    stage_limit: float,
+    rig: Path | None,
+    options: str,
+    json_out: bool,
+) -> None:
+    """Do a job with every recording of a manifest, or of a folder.
+
+    The same command again does what is missing: recordings that are done stay, unless their files, the
+    settings or the version changed. A recording that fails is tried again, then quarantined.
+
+    engine.threads:=N is the number of cores of each recording (default: 1), device:=cuda asks for a GPU.
+
+    \b
+    sags archive run theatre3.csv --job eval --out out/theatre3 --options '--iterations 2'
+    sags archive run s3://lab/all.parquet --job fit --out s3://lab/fits --ray head:6379 --timeout 7200
+    """
+    from sags_node.archive.cluster import check_ray
+    from sags_node.archive.jobs import NEEDS_PLOTS
+    from sags_node.archive.manifest import as_csv, parquet
+    from sags_node.archive.process import Limits
+    from sags_node.archive.results import status as found
+    from sags_node.archive.results import write_results
+    from sags_node.archive.run import describe
+    from sags_node.archive.run import run as work_through
+    from sags_node.archive.store import RESULTS, Store
+    from sags_node.archive.work import Plan, resources
+    from sags_node.benchmark.provenance import revision
+
+    path, overrides = split(source)
+    if path is None:
+        raise UsageError("name a manifest (sags archive scan makes one), or a folder of recordings")
+    if local and address is not None:
+        raise UsageError("--local is this machine alone; leave it out, or leave out --ray")
+    check_ray()
+    parquet()
+    if job in NEEDS_PLOTS:
+        check_plots()
+    recordings = _listed(path, rig)[:limit]
+    cores, _ = resources(overrides)
+    limits = Limits(cores, memory, timeout, stage_limit)
+    plan = Plan(job, tuple(overrides), tuple(shlex.split(options)), out, revision(), limits)
+    store = Store(out)
+    with store.locked():
+        describe(store, recordings, plan, as_csv(recordings))
+        with progress(job) as advance:
+            began = time.monotonic()
+
+            def tell(tally: Tally, line: str) -> None:
+                if line:
+                    console.print(escape(line), soft_wrap=True)
+                advance(tally.kept + tally.done + tally.quarantined, tally.of, _doing(tally, began))
+
+            tally = work_through(store, recordings, plan, attempts, tell, retry_failed, address)
+        write_results(store, recordings)
+    state = found(store)
+    show(state if json_out else _state_table(state))
+    console.print(f"table: [bold]{escape(out)}/{RESULTS}[/]", soft_wrap=True)
+    if tally.stopping.is_set():
+        raise KeyboardInterrupt
+    if state["quarantined"]:
+        raise SagsError(f"{state['quarantined']} recordings failed; sags archive show {out} ID says why")
+
+
+def _listed(path: str, rig: Path | None) -> list[Recording]:
+    """The recordings of a manifest or folder."""
+    from sags_node.archive.manifest import read_manifest
+    from sags_node.archive.scan import scan as look
+
+    if not Path(path).is_dir():
+        return read_manifest(path)
+    with progress("looking") as advance:
+        found = look(Path(path), rig, advance)
+    for refused in found.refused:
+        console.print(f"left out: {escape(refused.path)}: {escape(refused.why)}", soft_wrap=True)
+    if not found.recordings:
+        raise UsageError(f"{path} holds no recording that can be played")
+    return found.recordings
+
+
+def _doing(tally: Tally, began: float) -> str:
+    rate = tally.frames / (time.monotonic() - began)
+    where = ", ".join(f"{host} {count}" for host, count in sorted(tally.hosts.items()))
+    if not tally.hosts and not tally.running:
+        return "starting Ray"
+    parts = [f"{tally.running} handed out", f"{tally.quarantined} failed", f"{rate:.1f} frames/s", where]
+    return ", ".join(part for part in parts if part)
+
+
+def _state_table(state: dict[str, Any]) -> Table:
+    made = text.table()
+    counts = (f"{state[what]} {what}" for what in ("done", "quarantined", "missing"))
+    made.add_row(f"{state['job']}, {state['recordings']} recordings", ", ".join(counts))
+    for each in state["failed"]:
+        what = "quarantined" if each["quarantined"] else "failed"
+        made.add_row(each["id"], f"{what} after {each['attempts']} attempts: {each['reason']}")
+    return made
+
+
+@archive.command()
+@click.argument("out", metavar="OUT")
+@as_json
+def status(out: str, json_out: bool) -> None:
+    """Say how far an archive is, and what failed; also while it runs, from any machine."""
+    from sags_node.archive.results import status as found
+    from sags_node.archive.store import Store
+
+    state = found(Store(out))
+    show(state if json_out else _state_table(state))
+
+
+@archive.command("show")
+@click.argument("out", metavar="OUT")
+@click.argument("id", metavar="ID")
+@as_json
+def show_one(out: str, id: str, json_out: bool) -> None:
+    """Show all about one recording: figures, or failed attempts, their log and the command that repeats them.
+
+    ID may be the beginning of one.
+    """
+    from sags_node.archive.results import of_one
+    from sags_node.archive.store import Store
+
+    found = of_one(Store(out), id)
+    if json_out:
+        show(found)
+        return
+    made = text.table()
+    made.add_row(found["id"], found["state"])
+    for attempt in (found["failed"] or {}).get("attempts", ()):
+        made.add_row("", f"{attempt['reason']} ({attempt['seconds']:.1f} s, {attempt['host']})")
+    if found["failed"] is not None:
+        made.add_row("repeat", found["failed"]["command"])
+    for key, value in (found["figures"] or {}).items():
+        made.add_row(key, "–" if value is None else str(value))
+    show(made)
+    console.print(found["log"], markup=False, soft_wrap=True)

@@ -1,0 +1,43 @@
+"""The jobs: each is a `sags` command for one recording, that leaves a folder and says its figures as JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+FIGURES, LOG = "figures.json", "log.txt"  # of a recording's folder: stdout and stderr of the command
+
+Arguments = Callable[[list[str], Path], list[str]]
+
+JOBS: dict[str, Arguments] = {
+    "eval": lambda said, out: [
+        *("eval", *said),
+        *("--pace", "step", "--report", str(out / "report"), "--json", "-"),
+    ],
+    "fit": lambda said, out: ["fit", *said, "--out", str(out), "--json"],
+}
+NEEDS_PLOTS = frozenset({"eval"})
+
+
+def command(job: str, said: Sequence[str], options: Sequence[str], out: Path) -> list[str]:
+    """What follows `sags`.
+
+    Args:
+        said: launch file or session, and overrides, as `launching.arguments`.
+        options: further ones of that command.
+        out: the folder that it fills.
+    """
+    return [*JOBS[job](list(said), out), *options]
+
+
+def flat(figures: Any, prefix: str = "") -> dict[str, Any]:
+    """All numbers and words of nested figures in one row, named by their way: `online.psnr`. Lists are left
+    out."""
+    row: dict[str, Any] = {}
+    for key, value in figures.items() if isinstance(figures, Mapping) else ():
+        if isinstance(value, Mapping):
+            row |= flat(value, f"{prefix}{key}.")
+        elif not isinstance(value, list):
+            row[f"{prefix}{key}"] = value
+    return row

@@ -1,0 +1,158 @@
+"""What an archive has come to: how far it is, what failed, and all figures in one table."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from sags_node.archive.manifest import Recording, parquet, read_manifest
+from sags_node.archive.store import ABOUT, DONE, FAILED, MANIFEST, RESULTS, Store
+from sags_node.errors import UsageError
+
+BATCH = 2000  # rows that are in memory as text
+
+
+def listed(store: Store) -> tuple[dict[str, Any], list[Recording]]:
+    """The settings of the newest run, and its recordings.
+
+    Raises:
+        UsageError: there was no run.
+    """
+    about = store.read_json(ABOUT)
+    if about is None:
+        raise UsageError(f"{store.url} holds no archive; sags archive run makes one")
+    rows = read_manifest(f"{store.url.rstrip('/')}/{MANIFEST}")
+    return about, [replace(row, folder=about["folder"]) for row in rows]
+
+
+def status(store: Store) -> dict[str, Any]:
+    """Counts, and a row for each recording that failed.
+
+    Raises:
+        UsageError: there was no run.
+    """
+    about, recordings = listed(store)
+    done = store.done()
+    failures = [record for record in failed(store) if record["id"] not in done or record["quarantined"]]
+    ids = {recording.id for recording in recordings}
+    quarantined = [record for record in failures if record["quarantined"] and record["id"] in ids]
+    finished = len(ids & done.keys())
+    return {
+        "job": about["job"],
+        "version": about["version"],
+        "recordings": len(ids),
+        "done": finished,
+        "quarantined": len(quarantined),
+        "missing": len(ids) - len((ids & done.keys()) | {record["id"] for record in quarantined}),
+        "failed": [
+            {
+                "id": record["id"],
+                "attempts": len(record["attempts"]),
+                "quarantined": record["quarantined"],
+                "reason": record["attempts"][-1]["reason"],
+            }
+            for record in failures
+        ],
+    }
+
+
+def failed(store: Store) -> list[dict[str, Any]]:
+    """The records of all recordings whose last attempt failed."""
+    records = [store.read_json(f"{FAILED}/{name}") for name in store.names(FAILED) if name.endswith(".json")]
+    return [record for record in records if record is not None]
+
+
+def of_one(store: Store, id: str) -> dict[str, Any]:
+    """What is known of one recording: its figures, or its failed attempts and what the last one said.
+
+    Args:
+        id: or the beginning of one.
+
+    Raises:
+        UsageError: no recording, or several, are named so.
+    """
+    _, recordings = listed(store)
+    ids = [recording.id for recording in recordings if recording.id.startswith(id)]
+    if id in ids:
+        ids = [id]
+    if len(ids) != 1:
+        there = ", ".join(ids[:5]) or "none"
+        raise UsageError(f"{id}: one recording must be named so, there are: {there}; see results.parquet")
+    record = store.read_json(f"{FAILED}/{ids[0]}.json")
+    key = store.done().get(ids[0])
+    row = None if key is None else store.read_json(f"{DONE}/{ids[0]}.{key}.json")
+    log = store.read(f"{FAILED}/{ids[0]}.log") or store.read(f"recordings/{ids[0]}/log.txt") or b""
+    return {
+        "id": ids[0],
+        "state": _state(row, record),
+        "figures": row,
+        "failed": record,
+        "log": log.decode("utf-8", errors="replace"),
+    }
+
+
+def _state(row: Mapping[str, Any] | None, record: Mapping[str, Any] | None) -> str:
+    if record is not None and record["quarantined"]:
+        return "quarantined"
+    return "missing" if row is None else "done"
+
+
+def write_results(store: Store, recordings: Sequence[Recording]) -> int:
+    """Write `results.parquet`: a row for each recording, by id; columns are the figures that any of them has.
+
+    Returns:
+        How many rows have figures.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    pq = parquet()
+    import pyarrow as pa
+
+    records = {record["id"]: record for record in failed(store)}
+    tables, count = [], 0
+    for rows in _batches(_rows(store, recordings, records)):
+        count += sum(row["state"] == "done" for row in rows)
+        columns = dict.fromkeys(key for row in rows for key in row)
+        tables.append(pa.table({key: _column(pa, [row.get(key) for row in rows]) for key in columns}))
+    file = io.BytesIO()
+    pq.write_table(pa.concat_tables(tables, promote_options="permissive"), file)
+    store.write(RESULTS, file.getvalue())
+    return count
+
+
+def _rows(
+    store: Store, recordings: Sequence[Recording], records: Mapping[str, Mapping[str, Any]]
+) -> Iterator[dict[str, Any]]:
+    done = store.done()
+    for recording in sorted(recordings, key=lambda each: each.id):
+        key, record = done.get(recording.id), records.get(recording.id)
+        row = None if key is None else store.read(f"{DONE}/{recording.id}.{key}.json")
+        figures = None if row is None else json.loads(row)
+        known = {"id": recording.id, "recording": recording.name, "state": _state(figures, record)}
+        reason = None if record is None else record["attempts"][-1]["reason"]
+        yield {**known, "reason": reason, **(figures or {})}
+
+
+def _batches(rows: Iterator[dict[str, Any]]) -> Iterator[list[dict[str, Any]]]:
+    batch: list[dict[str, Any]] = []
+    for row in rows:
+        batch.append(row)
+        if len(batch) == BATCH:
+            yield batch
+            batch = []
+    if batch:
+        yield batch
+
+
+def _column(pa: Any, values: list[Any]) -> Any:
+    """Numbers are numbers, 1 as well as 1.0; what is of several kinds becomes text."""
+    kinds = {type(value) for value in values if value is not None}
+    if kinds == {int, float}:
+        return pa.array(values, pa.float64())
+    if len(kinds) > 1:
+        return pa.array([None if value is None else str(value) for value in values])
+    return pa.array(values)
