@@ -37,7 +37,7 @@ def key_of(recording: Recording, about: Mapping[str, Any]) -> str:
         about: job, options, overrides and version.
     """
     stats = [_stats(place) for place in places(recording)]
-    said = {"files": stats, "overrides": recording.overrides, "rig": recording.rig_name, **about}
+    said = {"files": stats, "own": recording.overrides, "rig": recording.rig_name, "about": about}
     return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()[:16]
 
 

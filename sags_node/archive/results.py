@@ -124,6 +124,16 @@ def write_results(store: Store, recordings: Sequence[Recording]) -> int:
     return count
 
 
+def read_results(store: Store) -> list[dict[str, Any]]:
+    """The rows of `results.parquet`; none where there is no table."""
+    pq = parquet()
+    import pyarrow as pa
+
+    data = store.read(RESULTS)
+    rows: list[dict[str, Any]] = [] if data is None else pq.read_table(pa.BufferReader(data)).to_pylist()
+    return rows
+
+
 def _rows(
     store: Store, recordings: Sequence[Recording], records: Mapping[str, Mapping[str, Any]]
 ) -> Iterator[dict[str, Any]]:

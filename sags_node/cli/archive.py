@@ -14,7 +14,7 @@ from rich.table import Table
 from sags_node.archive.jobs import JOBS
 from sags_node.cli.launching import as_json, positive, split
 from sags_node.errors import SagsError, UsageError
-from sags_node.plotting import check_plots
+from sags_node.plotting import check_plots, has_plots
 from sags_node.terminal import text
 from sags_node.terminal.console import console, progress, show
 
@@ -143,12 +143,13 @@ def run(
     from sags_node.archive.cluster import check_ray
     from sags_node.archive.jobs import NEEDS_PLOTS
     from sags_node.archive.manifest import as_csv, parquet
+    from sags_node.archive.overview import write_overview
     from sags_node.archive.process import Limits
+    from sags_node.archive.results import read_results, write_results
     from sags_node.archive.results import status as found
-    from sags_node.archive.results import write_results
     from sags_node.archive.run import describe
     from sags_node.archive.run import run as work_through
-    from sags_node.archive.store import RESULTS, Store
+    from sags_node.archive.store import REPORT, RESULTS, Store
     from sags_node.archive.work import Plan, resources
     from sags_node.benchmark.provenance import revision
 
@@ -178,9 +179,12 @@ def run(
 
             tally = work_through(store, recordings, plan, attempts, tell, retry_failed, address)
         write_results(store, recordings)
+        if has_plots():
+            write_overview(store, read_results(store))
     state = found(store)
     show(state if json_out else _state_table(state))
-    console.print(f"table: [bold]{escape(out)}/{RESULTS}[/]", soft_wrap=True)
+    page = f", report: [bold]{escape(out)}/{REPORT}[/]" if has_plots() else ""
+    console.print(f"table: [bold]{escape(out)}/{RESULTS}[/]{page}", soft_wrap=True)
     if tally.stopping.is_set():
         raise KeyboardInterrupt
     if state["quarantined"]:

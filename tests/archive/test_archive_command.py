@@ -1,0 +1,59 @@
+"""`sags archive` as users give it, with real recordings and the real job."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from command_line import pure_json, refused, sags
+
+from sags_node.archive.manifest import Recording, write_manifest
+from sags_node.evaluation.measure import Options
+from sags_node.evaluation.session import evaluate
+from sags_node.kernels.threads import configure_threads
+
+pytestmark = pytest.mark.live
+SETTINGS = ("mapping.max_gaussians:=2000", "source.frames:=4")
+
+
+def test_figures_are_those_of_sags_eval(cluster: Any, tiny_session: Path, tmp_path: Path) -> None:
+    recordings = [
+        Recording(str(tiny_session), str(tmp_path)),
+        Recording("nowhere", str(tmp_path)),
+    ]
+    write_manifest(str(tmp_path / "m.csv"), recordings)
+    command = ["archive", "run", tmp_path / "m.csv", "--job", "eval", "--out", tmp_path / "out"]
+    command += ["--ray", cluster.address, "--options", "--iterations 1 --hold-out 2 --every 2", *SETTINGS]
+    result = sags(*command, "--json")
+    assert result.exit_code == 1 and "1 recordings failed" in result.stderr
+    state = pure_json(result.stdout)
+    assert (state["done"], state["quarantined"], state["missing"]) == (1, 1, 0)
+
+    done, poison = (each.id for each in recordings)
+    shown = pure_json(sags("archive", "show", tmp_path / "out", done[:10], "--json").stdout)
+    try:
+        expected = evaluate(tiny_session, ["engine.threads:=1", *SETTINGS], Options(2, 2), "step", 1).summary
+    finally:
+        configure_threads(None)
+    for group in ("online", "heldout", "depth", "track", "novel"):
+        for name, value in expected[group].items():
+            assert shown["figures"][f"{group}.{name}"] == value, (group, name)
+    assert shown["state"] == "done" and shown["figures"]["settings.pace"] == "step"
+    assert (tmp_path / "out/recordings" / done / "report/report.html").is_file()
+
+    why = sags("archive", "show", tmp_path / "out", poison).stdout
+    assert "quarantined" in why and "nowhere" in why and "sags eval engine.threads:=1" in why
+    page = (tmp_path / "out/report.html").read_text()
+    assert poison in page and page.count("data:image/svg") >= 7 and "data:image/jpeg" in page
+    again = sags(*command)
+    assert again.exit_code == 1 and "2 recordings   1 done, 1 quarantined, 0 missing" in again.stdout
+
+
+def test_mistakes_are_said_in_one_line(tmp_path: Path) -> None:
+    out = ("--job", "eval", "--out", tmp_path / "out")
+    refused(2, "archive", "run", *out, said=("name a manifest",))
+    refused(2, "archive", "run", tmp_path / "none.csv", *out, said=("none.csv cannot be read",))
+    refused(2, "archive", "run", tmp_path, *out, said=("holds no recording",))
+    refused(2, "archive", "status", tmp_path, said=("holds no archive",))
+    refused(2, "archive", "status", "nowhere://x", said=("nowhere",))
