@@ -15,6 +15,10 @@ JOBS: dict[str, Arguments] = {
         *("eval", *said),
         *("--pace", "step", "--report", str(out / "report"), "--json", "-"),
     ],
+    "record": lambda said, out: [
+        *("bag", "record", "--session", *said),
+        *("-o", str(out / "bag"), "--compression", "jpeg", "--json"),
+    ],
     "fit": lambda said, out: ["fit", *said, "--out", str(out), "--json"],
 }
 NEEDS_PLOTS = frozenset({"eval"})

@@ -18,7 +18,7 @@ from typing import Any, Literal
 
 from sags_node.archive.inputs import fetched, scratch
 from sags_node.archive.jobs import FIGURES, LOG, command, flat
-from sags_node.archive.launching import arguments
+from sags_node.archive.launching import arguments, split
 from sags_node.archive.manifest import Recording
 from sags_node.archive.process import PROGRAM, Ended, Limits, run_limited
 from sags_node.archive.store import FAILED, Store
@@ -122,10 +122,10 @@ def _work(recording: Recording, plan: Plan, key: str, program: Sequence[str]) ->
 
 
 def _said(place: Path, rig: Path | None, recording: Recording, plan: Plan) -> list[str]:
-    """Resources first, then what all recordings get, then this one's own: the last one counts."""
+    """What is launched; then resources, what all recordings get, and this one's own: the last one counts."""
     threads = [f"engine.threads:={plan.limits.cores}", f"vision.onnx.threads:={plan.limits.cores}"]
-    launch = arguments(place, rig, recording.overrides)
-    return [*threads, "device:=cpu", *plan.overrides, *launch]
+    launch, own = split(arguments(place, rig, recording.overrides))
+    return [*([] if launch is None else [launch]), *threads, "device:=cpu", *plan.overrides, *own]
 
 
 def repeating(recording: Recording, plan: Plan) -> str:

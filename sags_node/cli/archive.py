@@ -79,7 +79,7 @@ def scan(folder: Path, out: str, rig: Path | None, json_out: bool) -> None:
     "--job",
     type=click.Choice(sorted(JOBS)),
     required=True,
-    help="eval: figures and a report; fit: the offline fit.",
+    help="eval: figures and a report; fit: the offline fit; record: a bag of all that a node publishes.",
 )
 @click.option(
     "--out", required=True, metavar="FOLDER|URL", help="Where the results lie; the same one goes on."

@@ -98,7 +98,7 @@ def test_broken_recordings_are_quarantined_and_mended_ones_done(cluster: Any, tm
         record = records[recordings[number].id]
         assert record["quarantined"] and len(record["attempts"]) == attempts
         assert all(reason in each["reason"] for each in record["attempts"])
-        assert record["command"].startswith("sags eval engine.threads:=1")
+        assert record["command"].startswith(f"sags eval {recordings[number].place} ")
     assert {row["state"] for row in table(store)} == {"done", "quarantined"}
 
     again = gone_through(tmp_path / "out", recordings, cluster, plan=plan)[1]
