@@ -15,6 +15,10 @@ JOBS: dict[str, Arguments] = {
         *("eval", *said),
         *("--pace", "step", "--report", str(out / "report"), "--json", "-"),
     ],
+    "depth": lambda said, out: ["export", "--session", *said, "--depth", str(out / "depth"), "--json"],
+    "tracks": lambda said, out: ["export", "--session", *said, "--tracks", str(out / "tracks.npz"), "--json"],
+    "render": lambda said, out: ["export", "--session", *said, "--render", str(out / "model.mp4"), "--json"],
+    "lerobot": lambda said, out: ["export", "--session", *said, "--lerobot", str(out / "lerobot"), "--json"],
     "record": lambda said, out: [
         *("bag", "record", "--session", *said),
         *("-o", str(out / "bag"), "--compression", "jpeg", "--json"),
@@ -36,10 +40,11 @@ def command(job: str, said: Sequence[str], options: Sequence[str], out: Path) ->
 
 
 def flat(figures: Any, prefix: str = "") -> dict[str, Any]:
-    """All numbers and words of nested figures in one row, named by their way: `online.psnr`. Lists are left
-    out."""
+    """All numbers and words of nested figures in one row, named by their way: `online.psnr`."""
     row: dict[str, Any] = {}
-    for key, value in figures.items() if isinstance(figures, Mapping) else ():
+    if isinstance(figures, list):  # of `sags export`: a row for each kind of file
+        figures = {each["kind"]: {"holds": each["holds"], "bytes": each["bytes"]} for each in figures}
+    for key, value in figures.items():
         if isinstance(value, Mapping):
             row |= flat(value, f"{prefix}{key}.")
         elif not isinstance(value, list):

@@ -79,7 +79,8 @@ def scan(folder: Path, out: str, rig: Path | None, json_out: bool) -> None:
     "--job",
     type=click.Choice(sorted(JOBS)),
     required=True,
-    help="eval: figures and a report; fit: the offline fit; record: a bag of all that a node publishes.",
+    help="eval: figures and a report; fit: the offline fit; record: a bag of all that a node publishes; "
+    "depth, tracks, render, lerobot: as sags export.",
 )
 @click.option(
     "--out", required=True, metavar="FOLDER|URL", help="Where the results lie; the same one goes on."
@@ -264,3 +265,34 @@ def show_one(out: str, id: str, json_out: bool) -> None:
         made.add_row(key, "–" if value is None else str(value))
     show(made)
     console.print(found["log"], markup=False, soft_wrap=True)
+
+
+@archive.command()
+@click.argument("out", metavar="OUT")
+@click.argument("folder", type=click.Path(path_type=Path))
+def dataset(out: str, folder: Path) -> None:
+    """Make one LeRobot data set of all that `--job lerobot` has done.
+
+    An episode for each recording, in the order of the manifest. FOLDER must be new or empty.
+
+    \b
+    sags archive run theatre3.csv --job lerobot --out out/theatre3
+    sags archive dataset out/theatre3 out/dataset
+    """
+    from sags_node.archive.results import listed
+    from sags_node.archive.store import RECORDINGS, Store
+    from sags_node.export.lerobot import check_lerobot, merge
+
+    check_lerobot()
+    store = Store(out)
+    if store.local is None:
+        raise UsageError(f"{out} is no folder of this machine; copy it here first")
+    about, recordings = listed(store)
+    done = store.done()
+    if about["job"] != "lerobot" or not done:
+        raise UsageError(f"{out} holds {len(done)} results of {about['job']}; run --job lerobot first")
+    episodes = [each.id for each in recordings if each.id in done]
+    frames = merge([store.local / RECORDINGS / id / "lerobot" for id in episodes], folder)
+    console.print(
+        f"{len(episodes)} episodes, {frames} frames: [bold]{escape(str(folder))}[/]", soft_wrap=True
+    )
