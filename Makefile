@@ -6,12 +6,13 @@ PIP := $(BIN)/pip install -q --disable-pip-version-check -c constraints.txt
 STAMP := $(VENV)/.installed
 # Shared libraries that Open3D needs and its wheel does not bring.
 DEBIAN := libusb-1.0-0 libgl1 libegl1 libgomp1 libx11-6
-# What tests use beyond that: a browser for the viewer, a compiler for the C++ client and OpenIGTLink's peers,
-# two machines in one, GStreamer.
+# What tests use beyond that: a browser for the viewer and the web gateway, compilers for the C++ and C# clients
+# and OpenIGTLink's peers, two machines in one, GStreamer.
 DEBIAN_TESTS := chromium g++ cmake pkg-config cppzmq-dev libmsgpack-cxx-dev faketime iproute2 \
   libopenigtlink-dev openigtlink-examples \
+  mono-mcs mono-runtime libmono-system-runtime-serialization4.0-cil \
   gstreamer1.0-tools gstreamer1.0-plugins-base gstreamer1.0-plugins-good gstreamer1.0-plugins-bad \
-  gstreamer1.0-libav
+  gstreamer1.0-libav libgstrtspserver-1.0-0
 missing = $(shell for p in $(1); do dpkg -s $$p >/dev/null 2>&1 || echo $$p; done)
 apt_install = apt-get update -qq && apt-get install -y -qq --no-install-recommends $(1) >/dev/null
 

@@ -92,9 +92,9 @@ def _kinds(prefix: str, sections: tuple[type[Section], ...]) -> Iterator[str]:
     yield "`source.kind` says which kind of source it is, and so which other keys there are."
     yield "Without `source` it is the `phantom`.\n"
     yield from _tables(RecordedSource, prefix, "Every recording")
-    yield from _tables(LiveSource, prefix, "Every live kind")
+    yield from _table(LiveSource, prefix, "Every live kind", list(LiveSource.model_fields))
     geometry = f"{prefix}geometry"
-    yield from _tables(GeometryConfig, f"{geometry}.", f"`{geometry}`: videos, cameras and GStreamer")
+    yield from _tables(GeometryConfig, f"{geometry}.", f"`{geometry}`: videos and every live kind")
     yield from _table(SentSource, prefix, "`ros2` and `push`", list(SentSource.__annotations__))
     yield from _table(RosGraph, prefix, "`ros2`", list(RosGraph.model_fields))
     yield from _table(Guarded, prefix, "`push`", list(Guarded.model_fields))

@@ -52,42 +52,26 @@ def pushed(endpoint: str, jpeg: int | None, pose_endpoint: str | None) -> Send:
 
 def published(domain: int, name: str, infos: tuple[Eye, Eye], compressed: bool) -> Send:
     """As ROS 2 topics `name/left/image_raw` and so on, with camera_info and tf."""
-    from cyclonedds._clayer import ddspy_write_ts
-    from cyclonedds.core import Policy, Qos
-    from cyclonedds.pub import DataWriter
-    from cyclonedds.topic import Topic
-
     from sags_node.config import RosGraph
     from sags_node.messaging.topics import CAMERA_INFO, IMAGE, TF
-    from sags_node.sources.ros_graph import Graph, raw_type
+    from sags_node.ros.graph import Graph
 
     graph = Graph(RosGraph(domain=domain))
-    form = Policy.DataRepresentation(use_cdrv0_representation=True, use_xcdrv2_representation=False)
-    qos = Qos(Policy.Reliability.BestEffort, Policy.History.KeepLast(2), form)
-
-    def writer(topic: str, kind: str) -> Callable[[cdr.Content, int], None]:
-        made = DataWriter(graph.participant, Topic(graph.participant, f"rt{topic}", raw_type(kind)), qos)
-
-        def write(body: cdr.Content, stamp_ns: int) -> None:
-            ddspy_write_ts(made._ref, b"".join(bytes(part) for part in body.parts), stamp_ns)
-
-        return write
-
     kind, suffix = (cdr.COMPRESSED, "/compressed") if compressed else (IMAGE, "")
-    pictures = [writer(f"{name}/{eye}/image_raw{suffix}", kind) for eye in ("left", "right")]
-    calibrations = [writer(f"{name}/{eye}/camera_info", CAMERA_INFO) for eye in ("left", "right")]
-    tf = writer("/tf", TF)
+    pictures = [graph.writer(f"{name}/{eye}/image_raw{suffix}", kind) for eye in ("left", "right")]
+    calibrations = [graph.writer(f"{name}/{eye}/camera_info", CAMERA_INFO) for eye in ("left", "right")]
+    tf = graph.writer("/tf", TF)
 
     def send(left: Picture, right: Picture, pose: NDArray[np.float64], stamp_ns: int) -> None:
-        tf(cdr.transform(pose, stamp_ns), stamp_ns)
-        for write, info in zip(calibrations, infos, strict=True):
-            write(cdr.eye_info(info, stamp_ns), stamp_ns)
-        for write, eye in zip(pictures, (left, right), strict=True):
+        tf.write(cdr.transform(pose, stamp_ns).cdr(), stamp_ns)
+        for info_writer, info in zip(calibrations, infos, strict=True):
+            info_writer.write(cdr.eye_info(info, stamp_ns).cdr(), stamp_ns)
+        for writer, eye in zip(pictures, (left, right), strict=True):
             if compressed:
                 file = cv2.imencode(".jpg", eye[..., ::-1])[1].tobytes()
-                write(cdr.picture_file(file, stamp_ns), stamp_ns)
+                writer.write(cdr.picture_file(file, stamp_ns).cdr(), stamp_ns)
             else:
-                write(cdr.image(eye, "rgb8", stamp_ns), stamp_ns)
+                writer.write(cdr.image(eye, "rgb8", stamp_ns).cdr(), stamp_ns)
 
     return send
 

@@ -217,15 +217,10 @@ class LiveSource(Section):
     latency_ms: float = Field(
         0.0, ge=-1000, le=1000, description="from the exposure to the stamp; taken off every stamp"
     )
-
-
-class CameraSource(LiveSource):
-    """What live sources have in common whose devices are opened here."""
-
     geometry: GeometryConfig = GeometryConfig()
 
 
-class V4l2Source(CameraSource):
+class V4l2Source(LiveSource):
     """Live cameras: two devices, or one whose pictures show both eyes."""
 
     kind: Literal["v4l2"] = "v4l2"
@@ -258,7 +253,7 @@ class V4l2Source(CameraSource):
         return said
 
 
-class GstSource(CameraSource):
+class GstSource(LiveSource):
     """Live pictures from GStreamer, in a process of its own; docs/inputs.md has examples."""
 
     kind: Literal["gst"] = "gst"
@@ -311,6 +306,12 @@ class SentSource(LiveSource):
         "to ours by the shortest way that pictures take",
     )
 
+    @model_validator(mode="after")
+    def _of_one_moment(self) -> Self:
+        if self.geometry.layout == "frame_sequential":
+            raise ValueError("geometry.layout frame_sequential is for cameras: send each eye by itself")
+        return self
+
 
 class RosGraph(Section):
     """Where a ROS 2 graph is; needs `pip install 'sags-node[ros2]'`, and no ROS."""
@@ -324,10 +325,13 @@ class RosGraph(Section):
 
 
 class Ros2Source(SentSource, RosGraph):
-    """Two picture topics (Image or CompressedImage) of a ROS 2 graph; docs/inputs.md says more."""
+    """Picture topics (Image or CompressedImage) of a ROS 2 graph; docs/inputs.md says more."""
 
     kind: Literal["ros2"] = "ros2"
-    left: str = Field("/stereo/left/image_raw", description="picture topic of the left eye")
+    left: str = Field(
+        "/stereo/left/image_raw",
+        description="picture topic of the left eye; or of both: source.geometry.layout",
+    )
     right: str = Field("/stereo/right/image_raw", description="picture topic of the right eye")
     left_info: str | None = Field(
         None, description="camera_info topic of the left eye; default: beside its pictures; not used with rig"

@@ -13,8 +13,10 @@ from rich.text import Text
 from sags_node.config import LaunchConfig, PushRobot, PushSource, Ros2Robot, Ros2Source
 from sags_node.findings import by_code, in_words
 from sags_node.node import Node
-from sags_node.sources.ros_graph import domain_of, where
+from sags_node.ros.graph import domain_of, where
+from sags_node.sources.ros2 import absolute, picture_topics
 from sags_node.terminal import text
+from sags_node.terminal.console import tell
 from sags_node.terminal.notices import Notices
 from sags_node.types import NodeHealth
 
@@ -34,9 +36,9 @@ def run_node(node: Node, seconds: float | None, console: Console) -> NodeHealth:
     try:
         if console.is_terminal:
             with Live(console=console, refresh_per_second=REFRESH, transient=True) as live:
-                _watch(node, deadline, console, lambda health: live.update(health_table(health)))
+                _watch(node, deadline, lambda health: live.update(health_table(health)))
         else:
-            _watch(node, deadline, console, lambda health: None)
+            _watch(node, deadline, lambda health: None)
     except KeyboardInterrupt:
         console.print("stopping")
     finally:
@@ -52,13 +54,14 @@ def inputs_text(config: LaunchConfig) -> list[str]:
         if isinstance(part, PushSource | PushRobot):
             lines.append(f"taking {what} at {part.endpoint}")
         elif isinstance(part, Ros2Source | Ros2Robot):
-            topics = f"{part.left} and {part.right}" if isinstance(part, Ros2Source) else part.topic
+            names = picture_topics(part).values() if isinstance(part, Ros2Source) else [absolute(part.topic)]
+            topics = " and ".join(names)
             lines.append(f"taking {what} from {where(domain_of(part), part.interface)}: {topics}")
     return lines
 
 
-def _watch(node: Node, deadline: float | None, console: Console, show: Callable[[NodeHealth], None]) -> None:
-    notices = Notices(lambda line: console.print(line, markup=False, soft_wrap=True))
+def _watch(node: Node, deadline: float | None, show: Callable[[NodeHealth], None]) -> None:
+    notices = Notices(tell)
     while not node.wait(timeout=1 / REFRESH):
         health = node.health()
         notices.update(by_code(health.warnings))

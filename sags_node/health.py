@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sags_node.findings import Findings, by_stage
+from sags_node.findings import Findings, by_code, by_stage
 from sags_node.types import ClockStatus, Finding, FrameResult, MotionState, NodeHealth, RungState, ViewStatus
 
 WAITING_AFTER = 1.0  # s without a frame
@@ -134,6 +134,14 @@ class Statistics:
             limit = MOST_LEFT_OUT * (BACK_AT if slot in self._too_many else 1.0)
             (self._too_many.add if count > limit * (count + WINDOW - 1) else self._too_many.discard)(slot)
         return slot in self._too_many
+
+
+def in_a_line(health: NodeHealth) -> str:
+    """State, rate and latency, then the codes of all warnings."""
+    latency = health.latency_ms["p50"]
+    words = f"{health.state}, {health.rate_hz:.1f} Hz, latency {latency:.0f} ms, {health.gaussians} Gaussians"
+    codes = ", ".join(by_code(health.warnings))
+    return f"{words}; warnings: {codes}" if codes else words
 
 
 def resident_mb() -> float:

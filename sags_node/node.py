@@ -1,11 +1,12 @@
-r"""The running node: four threads and the slots between them.
+r"""The running node: five threads and the slots between them.
 
-    capture --frames--> mapping --results--> publishing
-                           \--scenes--> drawing --views--/
+    capture --frames--> mapping --results--> publishing --whole--> thinning
+                           \--scenes--> drawing --views--/ \--------thin----/
 
 Slots hold the newest value only (live), or hand every value over (recordings not played in real time).
 The sockets live on the publishing thread; what a client asks of the model runs on the mapping thread,
-between two frames. Consumers' own views are drawn on a thread that gives way to all others.
+between two frames. Consumers' own views are drawn, and thin pictures made, on threads that give way to all
+others.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import os
 import threading
 import time
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from dataclasses import replace
 from typing import Any
@@ -23,15 +24,19 @@ from typing import Any
 from sags_node.config import LaunchConfig, LiveSource
 from sags_node.errors import SagsError
 from sags_node.findings import by_code
-from sags_node.health import Statistics
+from sags_node.health import Statistics, in_a_line
 from sags_node.kernels.threads import configure_threads
 from sags_node.latest import Latest
 from sags_node.messaging import content
+from sags_node.messaging.cdr import Content
 from sags_node.messaging.masks import MaskSubscriber
 from sags_node.messaging.publisher import Publisher
+from sags_node.messaging.thin import thin_pictures
+from sags_node.messaging.topics import ThinPicture
 from sags_node.node_operations import NodeState, Operations
 from sags_node.pipeline import Pipeline
 from sags_node.recording.child import RecorderProcess
+from sags_node.service_manager import ServiceManager
 from sags_node.sources.clock import CaptureClock
 from sags_node.sources.source import Source
 from sags_node.types import DrawnView, FrameResult, NodeHealth, RectifiedPair, StereoFrame, StereoRig
@@ -50,12 +55,18 @@ class Node:
     """Runs a source through the pipeline and publishes the results, until the source ends or `stop`."""
 
     def __init__(
-        self, config: LaunchConfig, rig: StereoRig, source: Source, on_result: OnResult | None = None
+        self,
+        config: LaunchConfig,
+        rig: StereoRig,
+        source: Source,
+        on_result: OnResult | None = None,
+        manager: ServiceManager | None = None,
     ) -> None:
         """Bind the sockets and prepare the pipeline; nothing runs yet.
 
         Args:
             on_result: called on the publishing thread after each result has been sent.
+            manager: told how the node fares.
 
         Raises:
             SagsError: an endpoint cannot be bound, or the configuration does not fit the rig.
@@ -75,23 +86,27 @@ class Node:
         self._pictures: Latest[tuple[RectifiedPair, int]] = Latest(on_put=self._wake_publishing)  # and epoch
         self._live = isinstance(config.source, LiveSource) or config.source.pace == "realtime"
         self._clock = CaptureClock()  # of live pictures
+        self._manager = manager or ServiceManager({})
         self._wake = os.eventfd(0, os.EFD_NONBLOCK)
         self._frames: Latest[tuple[StereoFrame, float]] = Latest()  # and when it came
         self._results: Latest[FrameResult] = Latest(on_put=self._wake_publishing)
         self._scenes: Latest[tuple[FrameResult, bool]] = Latest()  # and whether frames were missed
+        self._whole: Latest[tuple[FrameResult, Mapping[str, ThinPicture]]] = Latest()  # and what is asked for
+        self._thin: Latest[tuple[FrameResult, dict[str, Content]]] = Latest(on_put=self._wake_publishing)
         # By name, the newest only; None: closed. Single operations on a dict need no lock.
         self._drawn: dict[str, DrawnView | None] = {}
         self._watched: frozenset[str] = frozenset()  # views that somebody subscribes to
         self._error: BaseException | None = None
         self._stopping = threading.Event()
         self._last_sent: FrameResult | None = None
-        self._publisher = Publisher(config.publish, config.ns, uuid.uuid4().hex, self._handlers())
+        self._publisher = Publisher(config.publish, config.ns, uuid.uuid4().hex, self._handlers(), thins=True)
         ipc = [endpoint for endpoint in self.endpoints if endpoint.startswith("ipc:")]
         self._recorder = RecorderProcess(config.ns, ipc[0] if ipc else None)
         work = {
             "capture": (self._capture, self._frames.close),
             "mapping": (self._map, self._close_results),
             "drawing": (self._draw_views, lambda: None),
+            "thinning": (self._make_thin, lambda: None),
             "publishing": (self._publish, self._close_publisher),
         }
         # Events, not joins: in Python 3.11 a Ctrl-C during a join marks a living thread as ended.
@@ -106,6 +121,7 @@ class Node:
     def start(self) -> None:
         for thread in self._threads:
             thread.start()
+        self._manager.ready()
 
     def wait(self, timeout: float | None = None) -> bool:
         """Wait for the end of the source; True when the node has ended.
@@ -123,6 +139,7 @@ class Node:
 
     def stop(self) -> None:
         """End capture first, then mapping, drawing and publishing: the last health message gets out."""
+        self._manager.stopping()
         self._stopping.set()
         self._source.stop()
         self._frames.close()
@@ -181,7 +198,7 @@ class Node:
             finally:
                 self._ended[name].set()
 
-    # ---- the four threads ----------------------------------------------------------------------------
+    # ---- the five threads ----------------------------------------------------------------------------
 
     def _capture(self) -> None:
         give = self._frames.put if self._live else self._frames.hand_over
@@ -198,6 +215,7 @@ class Node:
         give = self._results.put if self._live else self._results.hand_over
         dropped = 0
         while not self._frames.closed:
+            self._manager.turned("mapping")
             self._operations.for_mapping.serve()
             ending = self._stopping.is_set() or self._error is not None
             if self._state.paused.is_set() and not self._live and not ending:
@@ -228,6 +246,14 @@ class Node:
             self._operations.for_drawing.serve()
         self._operations.for_drawing.serve()
 
+    def _make_thin(self) -> None:
+        prepare_thread()
+        while not self._whole.closed:
+            came = self._whole.get(timeout=REQUEST_WAIT)
+            if came is not None:
+                result, asked = came
+                self._thin.put((result, thin_pictures(result, asked)))
+
     def _hand_over_view(self, name: str, drawn: DrawnView | None) -> None:
         self._drawn[name] = drawn
         self._wake_publishing()
@@ -241,6 +267,7 @@ class Node:
 
     def _close_results(self) -> None:
         self._scenes.close()
+        self._whole.close()
         self._results.close()
 
     def _close_publisher(self) -> None:
@@ -252,6 +279,7 @@ class Node:
         next_health = time.monotonic()
         warned: tuple[str, ...] = ()
         while not self._results.closed:
+            self._manager.turned("publishing")
             if self._publisher.poll(timeout_ms=100, wake_fd=self._wake):
                 os.eventfd_read(self._wake)
             if self._state.parameters_changed.is_set():
@@ -264,11 +292,14 @@ class Node:
             if picture is not None:
                 self._publisher.publish_picture(*picture)
             self._send_views()
+            self._send_thin()
             before, warned = warned, tuple(by_code(self._state.pipeline.warnings))
             if time.monotonic() >= next_health or self._state.status_due.is_set() or warned != before:
                 self._state.status_due.clear()
                 next_health = time.monotonic() + HEALTH_PERIOD
-                self._publisher.publish_health(self.health())
+                health = self.health()
+                self._publisher.publish_health(health)
+                self._manager.status(in_a_line(health))
         self._publisher.publish_health(self.health())
 
     def _send(self, result: FrameResult) -> None:
@@ -277,6 +308,8 @@ class Node:
         publish_ms = (time.perf_counter() - started) * 1e3
         latency_ms = (time.time_ns() - result.pair.t_capture_ns) * 1e-6
         result = replace(result, timings_ms={**result.timings_ms, "publish": publish_ms})
+        if self._publisher.thin:
+            self._whole.put((result, self._publisher.thin))
         self._state.statistics.add(result, latency_ms, self._dropped())
         self._last_sent = result
         if self._on_result is not None:
@@ -292,11 +325,17 @@ class Node:
         names = self._state.views.status
         self._watched = frozenset(name for name in names if self._publisher.watches_view(name))
 
+    def _send_thin(self) -> None:
+        made = self._thin.get(timeout=0)
+        if made is not None:
+            self._publisher.publish_thin(*made)
+
     # ---- control -------------------------------------------------------------------------------------
 
     def _handlers(self) -> dict[str, Callable[[dict[str, Any]], Any]]:
         return self._operations.handlers() | {
             "get_status": lambda args: content.status(self.health(), self._last_sent),
+            "get_health": lambda args: content.health_answer(self.health()),
             "start_recording": self._start_recording,
             "stop_recording": lambda args: self._recorder.stop(),
             "take_snapshot": lambda args: self._recorder.snapshot(),

@@ -1,10 +1,14 @@
-"""Ends other processes, with a limit on every wait."""
+"""Other processes: which there are, what they cost, and how they end, with a limit on every wait."""
 
 from __future__ import annotations
 
+import os
 import subprocess
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
+TICKS = os.sysconf("SC_CLK_TCK")  # of CPU time in a second
 KILL_SECONDS = 5.0  # a killed process that waits for a disk ends when the disk answers
 
 
@@ -24,3 +28,24 @@ def _ends(process: subprocess.Popen[Any], seconds: float) -> bool:
     except subprocess.TimeoutExpired:
         return False
     return True
+
+
+def children(named: str = "") -> list[int]:
+    """The processes that this one has started, and whose command holds `named`."""
+    found = []
+    for task in Path("/proc/self/task").iterdir():
+        with suppress(OSError):  # a thread or a process that ends meanwhile
+            for child in (task / "children").read_text(encoding="ascii").split():
+                if named.encode() in Path(f"/proc/{child}/cmdline").read_bytes():
+                    found.append(int(child))
+    return found
+
+
+def cpu_seconds(process: int) -> float:
+    """Of a process and its threads.
+
+    Raises:
+        OSError: it has ended.
+    """
+    fields = Path(f"/proc/{process}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / TICKS

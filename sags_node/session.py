@@ -57,11 +57,21 @@ def open_session(
         rig = load_rig(config.rig or folder / "calib")
     else:
         rig = rig_of(config)
-    size = rig.left.width, rig.left.height
-    source = open_source(config.source, references=False, size=size)
-    if config.robot is not None:
-        source = Posed(source, config, rig)
+    source = open_posed(config, rig, references=False)
     return Session(_name(launch), config, rig, source)
+
+
+def open_posed(config: LaunchConfig, rig: StereoRig, references: bool = True) -> Source:
+    """The frames of a launch file, with the robot's poses where it names one.
+
+    Args:
+        references: read the recording's truth with each frame. Only measuring needs it.
+
+    Raises:
+        UsageError, SagsError: see `open_source` and `Posed`.
+    """
+    source = open_source(config.source, references, size=(rig.left.width, rig.left.height))
+    return source if config.robot is None else Posed(source, config, rig)
 
 
 def _name(launch: Path | str | None) -> str:

@@ -18,11 +18,13 @@ from numpy.typing import NDArray
 from sags_node.errors import SagsError
 from sags_node.messaging import topics, wire
 from sags_node.messaging.address import ClientKeys, find_data
+from sags_node.messaging.freezes import freezes_of
 from sags_node.messaging.node_clock import NodeClock
 from sags_node.messaging.received import (
     Received,
     ReceivedCameraInfo,
     ReceivedCloud,
+    ReceivedCompressed,
     ReceivedImage,
     ReceivedRos,
     ReceivedText,
@@ -124,19 +126,22 @@ def topic_hz(
     seconds: float = 5.0,
     keys: ClientKeys | None = None,
 ) -> Record:
-    """Average rate over `seconds`, and the shortest, longest and standard deviation of the intervals.
+    """Rate over `seconds`; the shortest, longest and standard deviation of the intervals; freezes.
 
     Raises:
         UsageError: there is no such topic.
         SagsError: no node is known, or fewer than two messages came.
     """
     samples = _listen_to(topic, endpoint, ns, seconds, keys)
-    steps = np.diff([sample.arrival_ns for sample in samples]) * 1e-9
+    arrivals = [sample.arrival_ns * 1e-9 for sample in samples]
+    steps, freezes = np.diff(arrivals), freezes_of(arrivals)
     return {
         "average_rate": float(1 / steps.mean()),
         "min_s": float(steps.min()),
         "max_s": float(steps.max()),
         "std_dev_s": float(steps.std()),
+        "freezes": freezes.count,
+        "frozen_s": freezes.seconds,
         "window": len(samples),
     }
 
@@ -266,7 +271,7 @@ def _echo(received: Received) -> Record:
 
 
 def _content(received: Received) -> Any:
-    if isinstance(received, ReceivedImage):
+    if isinstance(received, ReceivedImage | ReceivedCompressed):
         shape = list(received.array.shape)
         return {"encoding": received.meta.encoding, "shape": shape, **_range(received.array)}
     if isinstance(received, ReceivedCloud):

@@ -16,8 +16,6 @@ from sags_node.benchmark.provenance import WHAT_COUNTS, provenance, revision
 from sags_node.cli.launching import write_json
 
 RESULTS = sorted((ROOT / "benchmarks/results").glob("*.json"))
-# Measured before results named where they come from. A file leaves this list when it is measured anew.
-EARLIER = {"ablation_d4d"}
 
 
 def check(found: Any) -> None:
@@ -31,11 +29,7 @@ def check(found: Any) -> None:
 
 @pytest.mark.parametrize("file", RESULTS, ids=lambda file: file.stem)
 def test_every_result_says_where_it_comes_from(file: Path) -> None:
-    found = json.loads(file.read_text())
-    if file.stem in EARLIER:
-        assert "provenance" not in found, "take it out of EARLIER"
-    else:
-        check(found)
+    check(json.loads(file.read_text()))
 
 
 def test_every_result_is_explained() -> None:

@@ -1,5 +1,5 @@
 """`sags bench`: run time and error, measured.
 
 Imports calibration, disturbances, engine, evaluation, fitting, kernels, mapping, messaging, model, phantom,
-sources and vision.
+recording, ros, sources and vision.
 """

@@ -1,6 +1,7 @@
 """`sags bridge`: what a node sends, in the words of other systems (extra `bridges`).
 
-`relay` is the loop that all bridges share; `openigtlink` and `foxglove` are what it speaks to.
+`relay` is the loop that bridges share; `openigtlink`, `foxglove`, `ros2`, `web` and `gst` are what it speaks
+to.
 
-Imports messaging and overlay.
+Imports messaging, overlay, recording, ros and sources.
 """

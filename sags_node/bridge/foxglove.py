@@ -22,7 +22,7 @@ from foxglove.messages import CompressedVideo, Timestamp
 from foxglove.websocket import Capability, ChannelView, Client, ClientChannel, ServerListener, WebSocketServer
 
 from sags_node.bridge.feed import Place
-from sags_node.bridge.relay import MAX_AGE, Output, Relay, Source
+from sags_node.bridge.relay import MAX_AGE, Output, Relay, Source, silent
 from sags_node.bridge.requests import Requests
 from sags_node.errors import SagsError
 from sags_node.messaging import cdr, topics
@@ -258,7 +258,7 @@ class _Figures:
         self._channel.log(received.text, log_time=received.stamp_ns)
 
     def blank(self, shown: Received, reason: str) -> None:
-        self._channel.log(_silent(reason), log_time=time.time_ns())
+        self._channel.log(silent(reason), log_time=time.time_ns())
 
 
 class _Video:
@@ -323,12 +323,12 @@ def empty_of(shown: Received, now_ns: int, reason: str) -> bytes | None:
         fields = shown.meta.encoding.split(",")
         empty = cdr.point_cloud(np.empty((0, len(fields)), np.float32), fields, now_ns)
     elif isinstance(shown, ReceivedText):
-        empty = cdr.string(_silent(reason))
+        empty = cdr.string(silent(reason))
     elif shown.meta.type == topics.DIAGNOSTICS:
         empty = cdr.diagnostics([cdr.Status("node", 3, reason, {})], now_ns)
     else:
         return None
-    return b"".join(empty.parts)
+    return empty.cdr()
 
 
 def clicked(data: bytes) -> tuple[float, float, float] | None:
@@ -341,7 +341,3 @@ def clicked(data: bytes) -> tuple[float, float, float] | None:
     except (ValueError, TypeError, KeyError, RecursionError):
         return None
     return (x, y, z) if np.isfinite((x, y, z)).all() else None
-
-
-def _silent(reason: str) -> str:
-    return json.dumps({"state": "silent", "reason": reason})

@@ -22,6 +22,7 @@ import cv2
 import numpy as np
 
 from sags_node.bridge import igtl
+from sags_node.bridge.compressed import over_black
 from sags_node.bridge.feed import Place
 from sags_node.bridge.igtl_peers import Peers
 from sags_node.bridge.pins import Pin, Pins, Release
@@ -267,13 +268,6 @@ def request_of(text: str) -> tuple[str, dict[str, float]] | None:
 # ---- what is sent ----------------------------------------------------------------------------------------
 
 
-def _render(frame: Frame) -> U8:
-    """Over black, where the model shows nothing."""
-    rgba = frame[RENDER].array
-    shown: U8 = cv2.multiply(rgba[..., :3], cv2.merge([rgba[..., 3]] * 3), scale=1 / 255)
-    return shown
-
-
 def _overlaid(frame: Frame) -> U8:
     """The picture with the overlay over it."""
     return over(frame[PICTURE].array, frame[OVERLAY].array)
@@ -301,7 +295,7 @@ class _Picture:
 
 PICTURES = {
     "Picture": _Picture({PICTURE: 3}, lambda frame: frame[PICTURE].array),
-    "Render": _Picture({RENDER: 4}, _render),
+    "Render": _Picture({RENDER: 4}, lambda frame: over_black(frame[RENDER].array)),
     "Overlay": _Picture({PICTURE: 3, OVERLAY: 4}, _overlaid),
 }
 

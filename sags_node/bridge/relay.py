@@ -6,6 +6,7 @@ waits for a peer.
 
 from __future__ import annotations
 
+import json
 import threading
 import time
 from collections.abc import Mapping, Sequence
@@ -118,8 +119,12 @@ class Relay:
         """Pass on until `stop` is set."""
         while not stop.is_set():
             self.step()
-            self._arrived.wait(LOOK)
-            self._arrived.clear()
+            self.wait()
+
+    def wait(self) -> None:
+        """Until something comes, and no longer than `LOOK`."""
+        self._arrived.wait(LOOK)
+        self._arrived.clear()
 
     def step(self) -> None:
         """Ask for what is wanted now, and pass on what is new."""
@@ -205,6 +210,11 @@ class Relay:
             for source in (*output.sources, *([] if output.pulse is None else [output.pulse]))
         ]
         return list(dict.fromkeys(source.topic for source in sources if source.ns == ns))
+
+
+def silent(reason: str) -> str:
+    """What a topic of texts says instead of what has been taken back."""
+    return json.dumps({"state": "silent", "reason": reason})
 
 
 def _is_periodic(output: Output) -> bool:

@@ -36,29 +36,35 @@ class Requests:
         self._worker = ThreadPoolExecutor(1, "sags-bridge-requests")
         self._places = threading.Semaphore(MOST_WAITING)
 
-    def ask(self, op: str, args: Mapping[str, Any], answer: Answer) -> None:
-        """Ask without waiting. `answer` is called from another thread, at once when too many wait."""
+    def ask(self, op: str, args: Mapping[str, Any], answer: Answer, seconds: float = ANSWER_TIME) -> None:
+        """Ask without waiting. `answer` is called from another thread, at once when too many wait.
+
+        Args:
+            seconds: that the answer may take, counted from when it is this request's turn.
+        """
         if not self._places.acquire(blocking=False):
             answer(None, f"{op}: too many requests are waiting for an answer; try again later")
             return
-        self._worker.submit(self._ask, op, args, answer)
+        self._worker.submit(self._ask, op, args, answer, seconds)
 
     def close(self) -> None:
         """Forget what waits, and wait for what has begun."""
         self._worker.shutdown(cancel_futures=True)
 
-    def _ask(self, op: str, args: Mapping[str, Any], answer: Answer) -> None:
+    def _ask(self, op: str, args: Mapping[str, Any], answer: Answer, seconds: float) -> None:
         try:
-            result, words = self.now(op, args)
+            result, words = self.now(op, args, seconds)
         finally:
             self._places.release()
         answer(result, words)
 
-    def now(self, op: str, args: Mapping[str, Any]) -> tuple[dict[str, Any] | None, str]:
-        """Ask, and wait for the answer for up to `ANSWER_TIME` s; from any thread."""
+    def now(
+        self, op: str, args: Mapping[str, Any], seconds: float = ANSWER_TIME
+    ) -> tuple[dict[str, Any] | None, str]:
+        """Ask, and wait for the answer for up to `seconds`; from any thread."""
         try:
             with ControlClient(*self._where) as client:
-                result = client.request(op, args, ANSWER_TIME)
+                result = client.request(op, args, seconds)
         except SagsError as error:
             return None, str(error)
         return (result if isinstance(result, dict) else {}), f"{op}: {result}"

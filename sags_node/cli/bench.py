@@ -18,6 +18,7 @@ from sags_node.cli.bench_node import (
     bench_endurance,
     bench_inputs,
     bench_pareto,
+    bench_thin,
     bench_tracking,
     bench_transport,
 )
@@ -53,6 +54,7 @@ for command in (
     bench_tracking,
     bench_crowd,
     bench_bridges,
+    bench_thin,
     bench_transport,
     bench_inputs,
 ):

@@ -262,6 +262,32 @@ def bench_transport(frames: int, json_out: bool) -> None:
     show(rows if json_out else rows_table(rows))
 
 
+@click.command("thin")
+@launch_argument
+@click.option("--frames", type=click.IntRange(1), default=60, show_default=True, help="To measure.")
+@table_option
+@as_json
+def bench_thin(launch: tuple[str, ...], frames: int, out: Path | None, json_out: bool) -> None:
+    """What thin pictures cost.
+
+    Plays a recording, by default the built-in phantom, and makes each kind of thin picture of every frame
+    (docs/wire.md). CPU time to make and to decode one, its size, and what it takes of a link at 30 Hz.
+
+    \b
+    sags bench thin launch/d4d_pull.yaml --out benchmarks/results/thin.json
+    """
+    from sags_node.benchmark.node.thin import measure_thin
+    from sags_node.terminal.text import rows_table
+
+    check_files(out)
+    path, overrides = split_recording(launch, "sags bench thin plays recordings; record the cameras first")
+    session = open_launched(path, overrides)
+    with progress("making") as advance:
+        rows = measure_thin(session, frames, advance)
+    show(rows if json_out else rows_table(rows))
+    write_json(out, rows)
+
+
 @click.command("inputs")
 @click.option("--seconds", type=positive, default=10.0, show_default=True, help="Of each way.")
 @click.option("--only", metavar="NAME", help="Ways that begin so, e.g. gst; default: all.")

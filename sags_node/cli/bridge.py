@@ -6,9 +6,9 @@ import importlib.util
 import logging
 import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import nullcontext
-from functools import wraps
+from functools import partial, wraps
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,8 @@ from sags_node.terminal.console import check_file, console, on_stop_signals, sho
 NICENESS = 19  # the node goes first, where both want the same cores
 INSTALL = "install it with: pip install 'sags-node[bridges]'"
 
+Say = Callable[[str, Mapping[str, Any]], None]  # in words, and as fields for machines
+
 log = logging.getLogger(__name__)
 
 
@@ -33,85 +35,99 @@ def bridge() -> None:
     \b
     3D Slicer, PLUS, a navigation system     sags bridge openigtlink
     looking from a desk, plots, layouts      sags bridge foxglove
+    programs of ROS 2, RViz                  sags bridge ros2
+    web pages, Unity, no ZeroMQ              sags bridge web
+    dVRK's and other keyed displays          sags bridge gst
     a browser on this machine, no set-up     sags view
     a program of your own                    none: docs/clients.md
 
     A bridge asks the node only for what its peers take, and the node never waits for it. What becomes too old
     is taken back, with the reason. Node and bridge may be started in any order, and restarted.
 
-    These protocols know no keys and no encryption: a bridge listens on this machine only, unless --insecure
+    These protocols know no keys and no encryption: a bridge serves this machine only, unless --insecure
     is given. docs/bridges.md says what each carries, how fast, and what it costs.
     """
 
 
-def _common(port: int) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Options of every bridge; the command gets them as `node`, `overlay`, `control`, `host`, `port`,
-    `max_age` and `run`, which runs it."""
+def _common(command: Callable[..., None]) -> Callable[..., None]:
+    """Options of every bridge; the command gets them as `node`, `overlay`, `control`, `max_age`, `stop`, and
+    `say`, which tells where it is once peers can come."""
+
+    @endpoint_option
+    @click.option("--control", metavar="ENDPOINT", help="Control socket of the node; with --endpoint.")
+    @ns_option
+    @keys_options
+    @click.option("--overlay-ns", default="overlay", show_default=True, help="Namespace of a sags overlay.")
+    @click.option("--run-dir", type=click.Path(path_type=Path), help="Of the connection files.")
+    @click.option(
+        "--max-age",
+        type=positive,
+        default=0.4,
+        show_default=True,
+        help="Seconds since capture after which a picture is taken back.",
+    )
+    @as_json
+    @wraps(command)
+    def with_common(
+        endpoint: str | None, ns: str, overlay_ns: str, run_dir: Path | None, keys: Any, json_out: bool,
+        **rest: Any,
+    ) -> None:  # fmt: skip
+        from sags_node.bridge.feed import Place
+        from sags_node.messaging.node_clock import NodeClock
+
+        remote = endpoint is not None and rest["control"] is not None
+        clock = NodeClock(rest["control"], keys=keys) if remote else None
+        node = Place(ns, endpoint, run_dir, keys, clock)
+        overlay = Place(overlay_ns, None, run_dir, clock=clock)  # its stamps are the node's
+        stop = threading.Event()
+
+        def say(words: str, fields: Mapping[str, Any]) -> None:
+            if json_out:
+                show(dict(fields))
+            else:
+                console.print(f"{words}  (Ctrl-C ends)")
+
+        on_stop_signals(stop.set)
+        with clock or nullcontext():
+            command(node=node, overlay=overlay, say=say, stop=stop, **rest)
+
+    return with_common
+
+
+def _listening(port: int) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Options of a bridge that peers connect to; the command gets them as `host`, `port` and `ready`."""
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
-        @endpoint_option
-        @click.option("--control", metavar="ENDPOINT", help="Control socket of the node; with --endpoint.")
-        @ns_option
-        @keys_options
-        @click.option(
-            "--overlay-ns", default="overlay", show_default=True, help="Namespace of a sags overlay."
-        )
-        @click.option("--run-dir", type=click.Path(path_type=Path), help="Of the connection files.")
         @click.option("--host", default="127.0.0.1", show_default=True, help="Address to serve on.")
         @click.option(
             "--port", type=click.IntRange(0, 65535), default=port, show_default=True, help="0: any free one."
         )
         @click.option("--insecure", is_flag=True, help="Serve also to other machines: there are no keys.")
-        @click.option(
-            "--max-age",
-            type=positive,
-            default=0.4,
-            show_default=True,
-            help="Seconds since capture after which a picture is taken back.",
-        )
-        @as_json
         @wraps(command)
-        def with_common(
-            endpoint: str | None, ns: str, overlay_ns: str, run_dir: Path | None, keys: Any, insecure: bool,
-            json_out: bool, host: str, **rest: Any,
-        ) -> None:  # fmt: skip
-            from sags_node.bridge.feed import Place
-            from sags_node.messaging.node_clock import NodeClock
+        def with_address(host: str, insecure: bool, say: Say, **rest: Any) -> None:
+            from sags_node.messaging.security import is_loopback
 
-            _check_host(host, insecure)
-            remote = endpoint is not None and rest["control"] is not None
-            clock = NodeClock(rest["control"], keys=keys) if remote else None
-            node = Place(ns, endpoint, run_dir, keys, clock)
-            overlay = Place(overlay_ns, None, run_dir, clock=clock)  # its stamps are the node's
-            stop = threading.Event()
+            if not is_loopback(host):
+                _check_open(f"--host {host}", insecure)
 
             def ready(host: str, bound: int) -> None:
-                if json_out:
-                    show({"host": host, "port": bound})
-                else:
-                    console.print(f"listening on [bold]{escape(host)}:{bound}[/]  (Ctrl-C ends)")
+                say(f"listening on [bold]{escape(host)}:{bound}[/]", {"host": host, "port": bound})
 
-            os.nice(NICENESS)
-            on_stop_signals(stop.set)
-            with clock or nullcontext():
-                command(node=node, overlay=overlay, host=host, ready=ready, stop=stop, **rest)
+            command(host=host, ready=ready, **rest)
 
-        return with_common
+        return with_address
 
     return decorate
 
 
-def _check_host(host: str, insecure: bool) -> None:
-    from sags_node.messaging.security import is_loopback
-
-    if is_loopback(host):
-        return
+def _check_open(option: str, insecure: bool) -> None:
+    """Of an option that lets other machines in."""
     if not insecure:
         raise UsageError(
-            f"--host {host} would show the video to all who reach it, without keys or encryption; leave it "
+            f"{option} would show the video to all who reach it, without keys or encryption; leave it "
             "out and look from elsewhere through ssh -L, or give --insecure"
         )
-    log.warning("%s is open: anybody who reaches it sees the video and can pin anchors", host)
+    log.warning("%s: anybody who reaches it sees the video and can ask things of the node", option)
 
 
 def _check_installed(module: str, package: str, command: str) -> None:
@@ -120,7 +136,8 @@ def _check_installed(module: str, package: str, command: str) -> None:
 
 
 @bridge.command()
-@_common(port=18944)
+@_common
+@_listening(port=18944)
 @click.option(
     "--send",
     metavar="NAMES",
@@ -156,11 +173,85 @@ def openigtlink(send: str, **options: Any) -> None:
 
     ready, stop = options.pop("ready"), options.pop("stop")
     chosen = tuple(name for name in send.split(",") if name)
+    os.nice(NICENESS)
     run_openigtlink(Options(send=chosen, **options), ready, stop)
 
 
 @bridge.command()
-@_common(port=8765)
+@_common
+@_listening(port=8766)
+@click.option("--pin", is_flag=True, help="Let peers pin and remove anchors.")
+@click.option(
+    "--origin",
+    "origins",
+    multiple=True,
+    metavar="URL",
+    help="Pages from there may connect too, e.g. https://or.example.org; repeatable.",
+)
+def web(**options: Any) -> None:
+    """Serve web pages, Unity and others by WebSocket.
+
+    The messages are the node's own, byte for byte, with their header as JSON. http://127.0.0.1:8766 shows the
+    model, its depth and the anchors; its client /sags.js is one file to take along. A client in C# for Unity
+    is in examples/unity. Peers say which topics they want, thin ones too.
+
+    \b
+    sags run launch/d4d_pull.yaml &
+    sags bridge web
+    xdg-open http://127.0.0.1:8766
+
+    Pages of other origins are refused unless --origin names them.
+
+    Needs: pip install 'sags-node[bridges]'
+    """
+    _check_installed("websockets", "websockets", "web")
+    from sags_node.bridge.web import Options, run_web
+
+    ready, stop = options.pop("ready"), options.pop("stop")
+    run_web(Options(**options), ready, stop)
+
+
+@bridge.command()
+@click.option("--left", metavar="LAUNCH", help="What comes behind the left eye's pictures.")
+@click.option("--right", metavar="LAUNCH", help="What comes behind the right eye's.")
+@click.option("--rate", type=positive, default=60.0, show_default=True, help="Hz of the display.")
+@click.option("--overlay-ns", default="overlay", show_default=True, help="Namespace of the sags overlay.")
+@click.option("--run-dir", type=click.Path(path_type=Path), help="Of the connection file.")
+@click.option(
+    "--max-age",
+    type=positive,
+    default=0.4,
+    show_default=True,
+    help="Seconds since capture after which there is only the key colour.",
+)
+def gst(overlay_ns: str, run_dir: Path | None, **options: Any) -> None:
+    """Write the overlay into GStreamer, on its key colour.
+
+    For displays that blend by that colour, such as dVRK's.
+
+    LAUNCH is the rest of a pipeline, as for gst-launch-1.0. It gets BGRx pictures at the display's rate.
+    Where nothing fresh is there, they are the key colour alone, which such a display shows as nothing.
+
+    \b
+    sags overlay &
+    sags bridge gst --left 'videoconvert ! autovideosink'
+    sags bridge gst --left 'unixfdsink socket-type=abstract socket-path=dvrk_gst:left_ar:RIG' \
+                    --right 'unixfdsink socket-type=abstract socket-path=dvrk_gst:right_ar:RIG'
+
+    unixfdsink, for dVRK's sockets, needs GStreamer 1.24.
+    """
+    from sags_node.bridge.feed import Place
+    from sags_node.bridge.gst import Options, run_gst
+
+    stop = threading.Event()
+    on_stop_signals(stop.set)
+    ready = partial(console.print, "writing as soon as an overlay is there  (Ctrl-C ends)")
+    run_gst(Options(Place(overlay_ns, None, run_dir), **options), ready, stop)
+
+
+@bridge.command()
+@_common
+@_listening(port=8765)
 @click.option("--rate", type=positive, help="Hz of each topic, at most; default: all that come.")
 @click.option("--pin", is_flag=True, help="Let peers pin anchors: a click in the 3D panel.")
 @click.option(
@@ -195,4 +286,72 @@ def foxglove(layout: Path | None, **options: Any) -> None:
         return
     from sags_node.bridge.foxglove import Options, run_foxglove
 
+    os.nice(NICENESS)
     run_foxglove(Options(**options), ready, stop)
+
+
+@bridge.command()
+@_common
+@click.option(
+    "--domain", type=click.IntRange(0, 232), help="Number of the graph; default: $ROS_DOMAIN_ID, else 0."
+)
+@click.option(
+    "--interface", default="lo", show_default=True, help="Network interface; lo: this machine only."
+)
+@click.option("--insecure", is_flag=True, help="Serve also to other machines: there are no keys.")
+@click.option(
+    "--view",
+    "views",
+    multiple=True,
+    default=("ros",),
+    show_default=True,
+    metavar="NAME",
+    help="A view that peers may open and see; several times.",
+)
+@click.option(
+    "--points",
+    type=click.IntRange(1),
+    default=8000,
+    show_default=True,
+    help="Of /sags/points, at most; /sags/points/all has all.",
+)
+def ros2(
+    domain: int | None, interface: str, insecure: bool, say: Say, stop: threading.Event, **options: Any
+) -> None:
+    """Publish every topic into a ROS 2 graph, without ROS.
+
+    Topics are under /sags; and there are /tf and /diagnostics. Read .../compressed, .../compressedDepth and
+    /sags/points, which are small: a receiver of ROS 2 loses what is larger than 160 kB, until its machine
+    gives it more:
+
+    \b
+    sudo sysctl -w net.core.rmem_default=16777216
+
+    \b
+    sags run launch/d4d_pull.yaml &
+    sags bridge ros2
+    rviz2: fixed frame world, PointCloud2 /sags/points, Reliability Policy: Best Effort
+
+    Requests are topics under /sags/request; answers come on /sags/answer. RViz's tool Publish Point pins an
+    anchor when its topic is /sags/request/add_anchor.
+
+    Needs: pip install 'sags-node[ros2]'
+    """
+    if interface != "lo":
+        _check_open(f"--interface {interface}", insecure)
+    from pydantic import ValidationError
+
+    from sags_node.bridge.ros2 import Options, run_ros2
+    from sags_node.config import RosGraph
+    from sags_node.ros.graph import where
+
+    try:
+        graph = RosGraph(domain=domain, interface=interface)
+    except ValidationError:
+        raise UsageError(f"--interface {interface!r} is not the name of a network interface") from None
+
+    def ready(domain: int, interface: str) -> None:
+        say(f"in [bold]{escape(where(domain, interface))}[/]", {"domain": domain, "interface": interface})
+
+    os.nice(NICENESS)
+    run_ros2(Options(graph=graph, **options), ready, stop)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import signal
 import tempfile
 from pathlib import Path
@@ -27,6 +28,7 @@ from sags_node.cli.launching import (
     split,
     split_recording,
 )
+from sags_node.cli.node_options import keys_options, ns_option
 from sags_node.cli.offline import evaluate, fit
 from sags_node.cli.overlay import overlay
 from sags_node.cli.topic import topic
@@ -34,7 +36,9 @@ from sags_node.cli.view import view
 from sags_node.errors import SagsError, UsageError
 from sags_node.plotting import check_plots
 from sags_node.terminal import text
-from sags_node.terminal.console import check_folder, console, interrupt, progress, show
+from sags_node.terminal.console import check_folder, console, interrupt, log_handler, progress, show
+
+log = logging.getLogger(__name__)
 
 
 class Sags(click.Group):
@@ -55,6 +59,8 @@ class Sags(click.Group):
         try:
             return super().invoke(ctx)
         except SagsError as error:
+            if console.quiet:
+                log.error("%s", error)
             console.print(f"[red]error:[/] {escape(str(error))}", soft_wrap=True)
             ctx.exit(error.exit_code)
 
@@ -62,7 +68,15 @@ class Sags(click.Group):
 @click.group(cls=Sags, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__)
 @click.option("--verbose", "-v", is_flag=True, help="Show what happens inside.")
-def main(verbose: bool) -> None:
+@click.option(
+    "--log",
+    "form",
+    type=click.Choice(["text", "json"]),
+    default="text",
+    show_default=True,
+    help="What stderr gets: lines for people, or one JSON object for each event.",
+)
+def main(verbose: bool, form: str) -> None:
     """SAGS node: an online, deformable Gaussian model of tissue from stereo endoscope video.
 
     Frames come from a recording or from cameras; rendered views, metric depth, points and splats go out over
@@ -70,15 +84,12 @@ def main(verbose: bool) -> None:
 
     Research software, not a medical device.
     """
-    from rich.logging import RichHandler  # --help needs none
-
     level = logging.INFO if verbose else logging.WARNING
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
         signal.signal(signal.SIGINT, interrupt)
     signal.signal(signal.SIGTERM, interrupt)  # a service manager's stop is a Ctrl-C
-    logging.basicConfig(
-        level=level, format="%(message)s", handlers=[RichHandler(console=console, show_path=False)]
-    )
+    console.quiet = form == "json"
+    logging.basicConfig(level=level, format="%(message)s", handlers=[log_handler()])
 
 
 # ---- run, demo -------------------------------------------------------------------------------------------
@@ -102,12 +113,14 @@ def run(launch: tuple[str, ...], seconds: float | None, json_out: bool) -> None:
     from sags_node.launch_file import load_launch
     from sags_node.messaging.content import health_fields
     from sags_node.node import Node
+    from sags_node.service_manager import ServiceManager
 
+    manager = ServiceManager(os.environ)
     path, overrides = split(launch)
     if path is None and isinstance(load_launch(None, overrides).source, PhantomSource):
         overrides = ["source.loop:=true", *overrides]
     session = open_launched(path, overrides)
-    node = Node(session.config, session.rig, session.source)
+    node = Node(session.config, session.rig, session.source, manager=manager)
     where = escape(", ".join(node.endpoints))
     console.print(f"publishing on {where} as [bold]{session.config.ns}/...[/]  (Ctrl-C ends)", soft_wrap=True)
     for line in inputs_text(session.config):
@@ -204,6 +217,30 @@ def keygen(name: str, out: Path) -> None:
     secret, public = write_key_pair(out, name)
     console.print(f"secret, stays here: [bold]{escape(str(secret))}[/]", soft_wrap=True)
     console.print(f"public, give it to the other side: [bold]{escape(str(public))}[/]", soft_wrap=True)
+
+
+@main.command()
+@click.option("--control", metavar="ENDPOINT", help="Control socket; default: the node's connection file.")
+@ns_option
+@keys_options
+@as_json
+def health(control: str | None, ns: str, json_out: bool, keys: Any) -> None:
+    """Ask a running node whether it does its work.
+
+    Exit code 0: frames come and are shown, or the node was told to pause. 1: it waits for frames, starts,
+    stops, or does not answer within two seconds. For service managers and containers.
+
+    \b
+    sags health || systemctl restart sags
+    """
+    from sags_node.messaging.control import ControlClient
+
+    with ControlClient(control, ns, keys=keys) as client:
+        answer = client.request("get_health")
+    warnings = ", ".join(answer["warnings"])
+    show(answer if json_out else answer["state"] + (f"; warnings: {warnings}" if warnings else ""))
+    if not answer["healthy"]:
+        raise SagsError(f"the node is {answer['state']}: see sags topic echo diagnostics --ns {ns}")
 
 
 @main.command()

@@ -10,7 +10,7 @@ import click
 from sags_node.cli.launching import as_json, positive
 from sags_node.cli.node_options import endpoint_option, keys_options, ns_option
 from sags_node.terminal import text
-from sags_node.terminal.console import console, show
+from sags_node.terminal.console import show, tell
 
 
 @click.group()
@@ -57,7 +57,7 @@ def topic_echo(
     from sags_node import topic as tool
     from sags_node.terminal.notices import Notices
 
-    notices = Notices(lambda line: console.print(line, markup=False, soft_wrap=True))
+    notices = Notices(tell)
     for message in tool.topic_echo(
         name, endpoint=endpoint, ns=ns, count=count, keys=keys, warned=notices.update
     ):

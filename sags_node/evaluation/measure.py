@@ -156,11 +156,15 @@ class Measurer:
             place = self._places.get(frame.frame_id)
             if place is not None:
                 self.rows.append(self._processed(frame, pair, seconds, place))
-            elif self._options.holds_out(frame.frame_id) and self._earlier:
+            elif self._measures_held_out(frame) and self._earlier:
                 self.rows.append(self._held_out(frame, pair, seconds, self._earlier[0]))
             else:
                 self.rows.append(FrameRow(frame.frame_id, seconds, {}))
             progress("measuring", len(self.rows))
+
+    def _measures_held_out(self, frame: StereoFrame) -> bool:
+        """Not where the robot does not tell from where it was seen."""
+        return self._options.holds_out(frame.frame_id) and frame.pose_problem is None
 
     def _processed(self, frame: StereoFrame, pair: RectifiedPair, seconds: float, place: int) -> FrameRow:
         shown = self._spool.read(place)

@@ -20,8 +20,8 @@ from sags_node.launch_file import load_launch
 from sags_node.mapping.devices import affordable, device_of
 from sags_node.node import Node
 from sags_node.pipeline import Pipeline
-from sags_node.session import Session, open_session
-from sags_node.sources.source import Source, open_source
+from sags_node.session import Session, open_posed, open_session
+from sags_node.sources.source import Source
 from sags_node.types import FrameResult, StereoFrame
 from sags_node.vision.rectify import Rectifier
 from sags_node.vision.tissue import TissueMask
@@ -206,7 +206,8 @@ def _measured(session: Session, spool: Spool, options: Options, progress: Progre
     tissue = TissueMask(config.vision.tissue, rectifier)
     exclude = config.vision.tissue.exclude
     measurer = Measurer(spool, rectifier, tissue, options, exclude, config.engine.backend, config.vision.pose)
-    with open_source(config.source.model_copy(update={"pace": "step"})) as frames:
+    played = config.source.model_copy(update={"pace": "step"})
+    with open_posed(config.model_copy(update={"source": played}), session.rig) as frames:
         measurer.run(frames, progress)
     return measurer
 

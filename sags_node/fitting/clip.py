@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from bisect import bisect_left
 from collections.abc import Callable, Iterator, Sequence
@@ -12,9 +13,10 @@ import numpy as np
 
 from sags_node.errors import SagsError
 from sags_node.pipeline import Pipeline
-from sags_node.session import Session
-from sags_node.sources.source import open_source
+from sags_node.session import Session, open_posed
 from sags_node.types import F32, U8, Bool, Camera, Observation, Reference
+
+log = logging.getLogger(__name__)
 
 MEMORY_SHARE = 0.5  # of what is free: the fit itself needs the rest
 
@@ -63,6 +65,8 @@ class Clip:
 def play(session: Session, references: bool) -> Iterator[ClipFrame]:
     """Frames of a session, which is opened anew, through the node's own front end.
 
+    Those whose pose the robot does not tell are left out: nobody knows from where they were seen.
+
     Args:
         session: it is played from its start.
         references: also deliver what it knows to be true.
@@ -71,14 +75,20 @@ def play(session: Session, references: bool) -> Iterator[ClipFrame]:
         SagsError: the recording cannot be read.
     """
     pipeline = Pipeline(session.config, session.rig)
-    with open_source(session.config.source, references) as source:
+    unposed = 0
+    with open_posed(session.config, session.rig, references) as source:
         for frame in source:
+            if frame.pose_problem is not None:
+                unposed += 1
+                continue
             pair = pipeline.rectifier(frame)
             tissue = pipeline.tissue(frame, pair)
             depth = pipeline.depth(frame, pair, tissue).depth
             yield ClipFrame(
                 pair.frame_id, pair.t_capture_ns, pair.camera, pair.left, tissue, depth, frame.reference
             )
+    if unposed:
+        log.warning("%d frames are left out, since the robot tells no pose of them", unposed)
 
 
 def read_clip(

@@ -371,7 +371,7 @@ class Mapper:
 
     def _as_view(self, planes: F32, observation: Observation) -> RenderedView:
         view = to_view(planes, observation.camera, observation.frame_id, observation.t_capture_ns)
-        return with_confidence(view, self.model.gaussians())
+        return with_confidence(view, self.model.gaussians(), observation.grid)
 
     @property
     def _all_rows(self) -> slice:

@@ -32,8 +32,9 @@ IMAGE_ENCODINGS: dict[str, tuple[DType, int]] = {  # ROS name: dtype, channels
     "mono8": ("uint8", 1),
     "32FC1": ("float32", 1),
 }
-COMPRESSED = "sensor_msgs/msg/CompressedImage"
+COMPRESSED = topics.COMPRESSED_IMAGE
 POSE = "geometry_msgs/msg/PoseStamped"
+NODES = "rmw_dds_common/msg/ParticipantEntitiesInfo"
 PACKED_FIELDS = ("id", "rgb")  # 32-bit words that are no numbers on a scale
 _POINT_FIELD_UINT32, _POINT_FIELD_FLOAT32 = 6, 7
 
@@ -50,6 +51,12 @@ class Content:
     encoding: str = ""
     shape: tuple[int, ...] = ()
     dtype: DType = ""
+    scale: float = 0.0  # of a thin picture whose numbers are whole; 0: none
+    window: tuple[int, ...] = ()  # of a thin picture: x, y, and px of the whole picture for one of its own
+
+    def cdr(self) -> bytes:
+        """The whole message."""
+        return b"".join(self.parts)
 
 
 @cache
@@ -112,14 +119,36 @@ def from_ros1(raw: bytes, type_name: str) -> bytes:
         raise WireError(f"damaged {type_name}: {error}") from None
 
 
-def compressed_image(data: bytes, kind: str, encoding: str, header: Any) -> bytes:
-    """`sensor_msgs/CompressedImage` of a JPEG or PNG file (`kind`), with the header of the picture's message.
+def compressed_image(file: bytes, form: str, header: Any) -> bytes:
+    """`sensor_msgs/CompressedImage` of a picture file, with the header of the picture's message."""
+    return _serialize(_ros[COMPRESSED](header, form, np.frombuffer(file, np.uint8)))
 
-    `encoding` is that of the picture; the format says it in the words of ROS's compressed_image_transport.
+
+def file_form(encoding: str, kind: str) -> str:
+    """What a JPEG or PNG file (`kind`) is made of, in the words of ROS's compressed_image_transport.
+
+    `encoding` is that of the picture.
     """
     stored = encoding.replace("rgb", "bgr")  # the channel order of OpenCV, which writes and reads these files
-    form = f"{encoding}; {kind} compressed {stored}"
-    return _serialize(_ros[COMPRESSED](header, form, np.frombuffer(data, np.uint8)))
+    return f"{encoding}; {kind} compressed {stored}"
+
+
+def thin_picture(
+    data: NDArray[np.uint8],
+    kind: str,
+    encoding: str,
+    stamp_ns: int,
+    frame: str,
+    scale: float,
+    window: tuple[int, int, int],
+) -> Content:
+    """`sensor_msgs/CompressedImage` whose file is a part of its own; `scale` 0: the numbers are meant as they
+    are."""
+    form = file_form(encoding, kind)
+    message = _ros[COMPRESSED](_header(stamp_ns, frame), form, np.empty(0, np.uint8))
+    start = _serialize(message)[:-4]  # without the length of the empty data
+    parts = (start + _length(data), data.data)
+    return Content(COMPRESSED, parts, form, data.shape, "uint8", scale, window)
 
 
 def picture_file(data: bytes, stamp_ns: int, frame: str = LEFT_FRAME) -> Content:
@@ -232,6 +261,19 @@ def diagnostics(statuses: Sequence[Status], stamp_ns: int) -> Content:
 def string(text: str) -> Content:
     """`std_msgs/String`."""
     return Content(topics.STRING, (_serialize(_ros[topics.STRING](text)),))
+
+
+def node_entities(
+    guid: bytes, namespace: str, name: str, readers: Sequence[bytes], writers: Sequence[bytes]
+) -> bytes:
+    """`rmw_dds_common/ParticipantEntitiesInfo` of a process with one node; GUIDs are those of DDS."""
+
+    def gid(each: bytes) -> Any:
+        return _ros["rmw_dds_common/msg/Gid"](np.frombuffer(each, np.uint8))
+
+    node_type = _ros["rmw_dds_common/msg/NodeEntitiesInfo"]
+    node = node_type(namespace, name, [gid(each) for each in readers], [gid(each) for each in writers])
+    return _serialize(_ros[NODES](gid(guid), [node]))
 
 
 def clock(time_ns: int) -> Content:

@@ -35,6 +35,7 @@ SPLAT_FIELDS = (
     *("f_dc_0", "f_dc_1", "f_dc_2"),
     *("opacity", "id", "confidence"),
 )
+HEALTHY = ("running", "paused")  # states
 POINT_FIELDS = ("x", "y", "z", "rgb", "confidence")
 ANCHOR_FIELDS = (
     *("x", "y", "z", "id", "u", "v", "visibility", "age", "confidence", "depth_confidence"),
@@ -225,6 +226,12 @@ def status(health: NodeHealth, last: FrameResult | None) -> dict[str, Any]:
         }
     )
     return fields
+
+
+def health_answer(health: NodeHealth) -> dict[str, Any]:
+    """Whether the node does its work: frames come and are shown, or it was told to pause."""
+    codes = list(by_code(health.warnings))
+    return {"healthy": health.state in HEALTHY, "state": health.state, "warnings": codes}
 
 
 def json_text(value: Mapping[str, Any]) -> Content:

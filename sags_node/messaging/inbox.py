@@ -87,13 +87,13 @@ class Inbox:
         context = zmq.Context()
         self._resources.callback(context.destroy, linger=0)
         try:
-            keys = self._resources.enter_context(authenticated(context, config, section))
+            gate = self._resources.enter_context(authenticated(context, config, section))
             self._socket = context.socket(zmq.ROUTER)
             limit(self._socket, SEND_HIGH_WATER, RECEIVE_HIGH_WATER, MAX_PART_BYTES)
             self._socket.setsockopt(zmq.RCVBUF, -1)  # the system's: pictures are large
-            self._peers = Peers(self._socket, section, MAX_UNTAKEN_BYTES)
+            self._peers = Peers(self._socket, section, MAX_UNTAKEN_BYTES, gate.revocations)
             self._resources.callback(self._peers.close)
-            self.endpoint = bind(self._socket, endpoint, f"{section}.endpoint", keys)
+            self.endpoint = bind(self._socket, endpoint, f"{section}.endpoint", gate.keys)
         except BaseException:
             self._resources.close()
             raise

@@ -10,6 +10,7 @@ import struct
 import threading
 import time
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import zmq
@@ -56,13 +57,21 @@ class Peers:
         name: of the socket, for the log.
         max_untaken: bytes a tcp peer may have sent beyond what `took` says was read. This bounds what ZeroMQ
             itself does not: the number of parts of a message, and of subscriptions.
+        revocations: when it grows all tcp peers are cut off. Those who may come in are back at once.
     """
 
-    def __init__(self, socket: zmq.Socket[bytes], name: str, max_untaken: int) -> None:
+    def __init__(
+        self,
+        socket: zmq.Socket[bytes],
+        name: str,
+        max_untaken: int,
+        revocations: Callable[[], int] = lambda: 0,
+    ) -> None:
         self._socket = socket
         self._monitor = socket.get_monitor_socket(_EVENTS)
         self._name = name
         self._max_untaken = max_untaken
+        self._revocations, self._revoked = revocations, revocations()
         self._open: dict[int, _Peer] = {}  # by the file descriptor that libzmq has
         self._count: Counter[str] = Counter()
         self._closed_until = 0.0
@@ -109,6 +118,9 @@ class Peers:
                     break
                 self._note(said["event"], int(said["value"]))
             self._expel_floods()
+            before, self._revoked = self._revoked, self._revocations()
+            if self._revoked != before:
+                self._expel_all()
 
     def _expel_floods(self) -> None:
         now = time.monotonic()
@@ -117,6 +129,12 @@ class Peers:
             if not peer.expelled and _bytes_received(peer.connection) > allowed:
                 self._expel(peer, "flooding")
                 self._closed_until = now + QUARANTINE
+
+    def _expel_all(self) -> None:
+        """Nothing tells which key a connection came with: each has to show it anew."""
+        for peer in self._open.values():
+            if not peer.expelled and peer.connection.family != sockets.AF_UNIX:
+                self._expel(peer, "renewed")
 
     def _note(self, event: int, value: int) -> None:
         """`value` is the descriptor of a connection that begins or ends."""

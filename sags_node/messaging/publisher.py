@@ -15,13 +15,13 @@ import msgspec
 import zmq
 
 from sags_node.config import PublishConfig
-from sags_node.errors import SagsError
-from sags_node.messaging import content, control, topics
+from sags_node.errors import SagsError, UsageError
+from sags_node.messaging import cdr, content, control, topics
 from sags_node.messaging.cdr import Content, type_hash
 from sags_node.messaging.node_clock import stamps
 from sags_node.messaging.peers import Peers
 from sags_node.messaging.rundir import Connection, RunDirectory
-from sags_node.messaging.security import KeyPair, Seldom, authenticated, check_endpoint
+from sags_node.messaging.security import Gate, Seldom, authenticated, check_endpoint
 from sags_node.messaging.sockets import bind, limit, receive_frames
 from sags_node.messaging.wire import PROTOCOL, Message, Meta, encode
 from sags_node.types import DrawnView, FrameResult, NodeHealth, RectifiedPair
@@ -35,6 +35,8 @@ MAX_SUBSCRIPTION_BYTES = 512  # also the longest step of a CURVE handshake
 MAX_SUBSCRIPTIONS_BYTES = 16384  # of one peer, all together: ZeroMQ remembers them until the peer goes
 MAX_PREFIXES = 1024  # noted: a view may be subscribed to before it is opened, so any name may come
 SUBSCRIPTIONS_HIGH_WATER = 64  # that one peer may have waiting
+MAX_THIN = 8  # thin pictures made at once, as many as views
+MAX_THIN_NAME = 120  # bytes; a longer one is none, and is not answered
 PENDING_POLL_MS = 10  # how soon the result of a handler's future is looked for
 EARLY_PICTURE = "left/image_rect_color"
 LOOK_SECONDS = 1.0  # between looks whether a client can still find this node
@@ -61,6 +63,10 @@ class Publisher:
     Args:
         handlers: control op -> function of its args, see `control.ControlServer`; `ping` is always there.
         offered: what may be subscribed to, beside views.
+        thins: whether somebody makes the thin pictures of `thin`.
+
+    Attributes:
+        thin: thin pictures that somebody subscribes to, by topic.
 
     Raises:
         UsageError: an endpoint open to other machines without keys, a key file that cannot be used, or a run
@@ -75,6 +81,7 @@ class Publisher:
         session: str,
         handlers: Mapping[str, control.Handler] | None = None,
         offered: Sequence[topics.Topic] = topics.TOPICS,
+        thins: bool = False,
     ) -> None:
         for endpoint in (*config.data, *([config.control] if config.control else [])):
             check_endpoint(endpoint, config)
@@ -83,6 +90,9 @@ class Publisher:
         self._names = {topics.full_name(ns, t.name): t for t in offered if config.right or not t.right}
         self._seq = dict.fromkeys((t.name for t in self._names.values()), 0)
         self._subscribed: set[str] = set()  # prefixes, only those of our topics and of views
+        self.thin: Mapping[str, topics.ThinPicture] = {}
+        self._thins = thins
+        self._thin_seq = 0  # where the numbers of the next one begin
         self._last: FrameResult | None = None
         self._dropped = 0
         self._pictured = -1  # the newest frame whose picture went before its result
@@ -95,20 +105,19 @@ class Publisher:
         self._seldom = Seldom()
         self._context = zmq.Context()
         try:
-            keys = self._resources.enter_context(authenticated(self._context, config))
+            gate = self._resources.enter_context(authenticated(self._context, config))
             always = {"ping": lambda args: "pong", "get_clock": lambda args: stamps()}
-            self._bind(config, keys, {**always, **(handlers or {})})
+            self._bind(config, gate, {**always, **(handlers or {})})
         except BaseException:
             self.close()
             raise
 
-    def _bind(
-        self, config: PublishConfig, keys: KeyPair | None, handlers: Mapping[str, control.Handler]
-    ) -> None:
+    def _bind(self, config: PublishConfig, gate: Gate, handlers: Mapping[str, control.Handler]) -> None:
+        keys = gate.keys
         self._data = self._context.socket(zmq.XPUB)
         limit(self._data, SEND_HIGH_WATER, SUBSCRIPTIONS_HIGH_WATER, MAX_SUBSCRIPTION_BYTES)
         self._poller = zmq.Poller()
-        self._watch("data", self._data, MAX_SUBSCRIPTIONS_BYTES)
+        self._watch("data", self._data, MAX_SUBSCRIPTIONS_BYTES, gate)
         self._data.setsockopt(
             zmq.XPUB_VERBOSE, 1
         )  # each new peer's subscription is seen: the last values are due
@@ -119,7 +128,7 @@ class Publisher:
         if config.control:
             router = self._context.socket(zmq.ROUTER)
             limit(router, control.SEND_HIGH_WATER, control.RECEIVE_HIGH_WATER, control.MAX_REQUEST_BYTES)
-            self._watch("control", router, control.MAX_UNANSWERED_BYTES)
+            self._watch("control", router, control.MAX_UNANSWERED_BYTES, gate)
             control_endpoint = bind(router, config.control, "publish.control", keys)
             self._control = control.ControlServer(router, handlers, self._peers["control"].took)
         self.connection = Connection(
@@ -133,8 +142,8 @@ class Publisher:
         )
         self._run.write_connection(self.connection)
 
-    def _watch(self, name: str, socket: zmq.Socket[bytes], max_untaken: int) -> None:
-        self._peers[name] = Peers(socket, name, max_untaken)
+    def _watch(self, name: str, socket: zmq.Socket[bytes], max_untaken: int, gate: Gate) -> None:
+        self._peers[name] = Peers(socket, name, max_untaken, gate.revocations)
         self._poller.register(socket, zmq.POLLIN)
 
     @property
@@ -193,6 +202,12 @@ class Publisher:
             if self.wanted(topic):
                 self._send(topic, body, shown.frame_id, shown.t_capture_ns, drawn.epoch, ahead_ns)
 
+    def publish_thin(self, result: FrameResult, pictures: Mapping[str, Content]) -> None:
+        """Send thin pictures of a frame, by topic, to those who still ask for them."""
+        for name in pictures.keys() & self.thin.keys():
+            pair = result.pair
+            self.publish_content(name, pictures[name], pair.frame_id, pair.t_capture_ns, result.epoch)
+
     def forget_view(self, name: str) -> None:
         """Nothing is sent again of a view that was closed."""
         for topic in [kept for kept in self._kept if kept.startswith(f"view/{name}/")]:
@@ -233,7 +248,7 @@ class Publisher:
         meta = Meta(
             type=body.type,
             type_hash=type_hash(body.type),
-            seq=self._seq[name],
+            seq=self._seq.get(name, 0),
             frame_id=frame_id,
             stamp_ns=stamp_ns,
             publish_ns=time.time_ns(),
@@ -245,6 +260,8 @@ class Publisher:
             dtype=body.dtype,
             dropped=self._dropped,
             ahead_ns=ahead_ns or msgspec.UNSET,
+            scale=body.scale or msgspec.UNSET,
+            window=list(body.window) or msgspec.UNSET,
         )
         frames = encode(Message(topics.full_name(self.ns, name), meta, body.parts))
         # An XPUB socket drops for a full peer instead of blocking. Arrays are never written again, so
@@ -301,6 +318,9 @@ class Publisher:
             prefix = message[1:].decode()
         except UnicodeError:
             return
+        if prefix.startswith(topics.full_name(self.ns, topics.THIN)):
+            self._thin_subscription(prefix.removeprefix(f"{self.ns}/"), message[:1] == b"\x01")
+            return
         matching = [topic for full, topic in self._names.items() if full.startswith(prefix)]
         views = topics.full_name(self.ns, "view/")
         of_views = prefix.startswith(views) or views.startswith(prefix)
@@ -311,6 +331,28 @@ class Publisher:
                 resend.update(name for name in self._kept if self._is_kept_view(name, prefix))
         elif message[:1] == b"\x00":
             self._subscribed.discard(prefix)
+
+    def _thin_subscription(self, name: str, begins: bool) -> None:
+        """Who asks for what cannot be made is told so on that very topic."""
+        if not begins:
+            if name in self.thin:  # any number of names may come and go, and a number must not come again
+                self.thin = {asked: thin for asked, thin in self.thin.items() if asked != name}
+                self._thin_seq = max(self._thin_seq, self._seq.pop(name))
+            return
+        try:
+            asked = topics.thin_picture(name)
+            if not self._thins:
+                raise UsageError("thin pictures are made by a running node only")
+            if asked.topic not in self._seq:
+                raise UsageError(f"'{name}': {asked.topic} is not published; set publish.right:=true")
+            if name not in self.thin and len(self.thin) >= MAX_THIN:
+                raise UsageError(f"'{name}': {MAX_THIN} thin pictures are made already, the most at once")
+        except UsageError as error:
+            if len(name) <= MAX_THIN_NAME:
+                self._send(name, cdr.string(str(error)), -1, time.time_ns())
+        else:
+            self.thin = {**self.thin, name: asked}
+            self._seq.setdefault(name, self._thin_seq)
 
     def _is_kept_view(self, name: str, prefix: str) -> bool:
         return name.startswith("view/") and topics.full_name(self.ns, name).startswith(prefix)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Generic, Self, TypeVar, overload
 
 import msgspec
@@ -44,6 +45,28 @@ class Received:
 @dataclass(frozen=True, slots=True)
 class ReceivedImage(Received):
     array: NDArray[Any]  # [H, W] or [H, W, C], read-only; uint8, or float32 metres with NaN unknown
+
+
+@dataclass(frozen=True)
+class ReceivedCompressed(Received):
+    """A thin picture; it is decoded when its `array` is asked for."""
+
+    @cached_property
+    def array(self) -> NDArray[Any]:
+        """[H, W] or [H, W, 3], read-only; uint8, or float32 with NaN unknown: metres, or a confidence.
+
+        Raises:
+            WireError: the file is damaged.
+        """
+        from sags_node.messaging.thin import decode  # brings OpenCV along, which few clients need
+
+        return decode(self.topic, self.meta.scale or 0.0, self.parts[1])
+
+    @property
+    def window(self) -> tuple[int, int, int]:
+        """x and y of its first pixel in the whole picture, and how many px of that are one of this."""
+        x, y, every = self.meta.window or (0, 0, 1)
+        return x, y, every
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +125,7 @@ class ReceivedRos(Received):
 R = TypeVar("R", bound=Received)
 _KINDS: dict[str, type[Received]] = {
     topics.IMAGE: ReceivedImage,
+    topics.COMPRESSED_IMAGE: ReceivedCompressed,
     topics.POINT_CLOUD: ReceivedCloud,
     topics.CAMERA_INFO: ReceivedCameraInfo,
     topics.STRING: ReceivedText,
@@ -147,6 +171,9 @@ def interpret(message: Message, received_ns: int) -> Received:
     kind = message.meta.type
     if kind == topics.IMAGE:
         return ReceivedImage(*head, array=_image(message))
+    if kind == topics.COMPRESSED_IMAGE:
+        message.array()  # is there, and as long as it is said to be
+        return ReceivedCompressed(*head)
     if kind == topics.POINT_CLOUD:
         return ReceivedCloud(*head, points=_records(message))
     ros = cdr.parse(message)

@@ -11,9 +11,10 @@ import logging
 import os
 import re
 import struct
+import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -32,6 +33,7 @@ KEY_CHARACTERS = 40  # a CURVE key in Z85
 MAX_KEY_FILE_BYTES = 4096
 MAX_ALLOWED = 1000
 ZAP_DOMAIN = b"sags"  # set on plain sockets too: libzmq then refuses peers of the old protocols 1 and 2
+LOOK_AGAIN = 1.0  # s, for keys that were added or removed
 LOG_PERIOD = 10.0  # s between two lines about refused connections
 
 log = logging.getLogger(__name__)
@@ -128,9 +130,7 @@ def read_allow_list(places: Sequence[Path], section: str = "publish") -> dict[by
     Raises:
         UsageError: there is none, there are too many, or a file is no public key.
     """
-    files = [
-        file for place in places for file in (sorted(place.glob("*.pub")) if place.is_dir() else [place])
-    ]
+    files = _files(places)
     if not files:
         where = ", ".join(str(place) for place in places)
         raise UsageError(
@@ -226,27 +226,97 @@ class Seldom:
         return True
 
 
-class _AllowList:
-    """Answers the authenticator whether a key may come in."""
+class AllowList:
+    """The keys that may come in, as their files are now; used from several threads.
 
-    def __init__(self, allowed: Mapping[bytes, str], section: str) -> None:
-        self._allowed = allowed
-        self._section = section
+    A file that is added or removed counts within `LOOK_AGAIN` s. While it is read anew a file that cannot be
+    used lets nobody in, and keeps nobody else out.
+
+    Raises:
+        UsageError: at the start, as `read_allow_list`.
+    """
+
+    def __init__(self, places: Sequence[Path], section: str) -> None:
+        self._places, self._section = places, section
+        self._allowed = read_allow_list(places, section)
+        self._lock = threading.Lock()
+        self._seen = _versions(places)
+        self._next_look = 0.0
+        self._revocations = 0
         self._seldom = Seldom()
 
     def callback(self, domain: str, key: bytes) -> bool:
+        """Answers the authenticator whether a key may come in."""
+        self._look()
         if key not in self._allowed and self._seldom.due():
             log.warning(
                 "refused a client with the key %s, which is not in %s.allow", key.decode(), self._section
             )
         return key in self._allowed
 
+    def revocations(self) -> int:
+        """How often keys have been taken off the list since the start."""
+        self._look()
+        return self._revocations
+
+    def _look(self) -> None:
+        with self._lock:
+            if time.monotonic() < self._next_look:
+                return
+            self._next_look = time.monotonic() + LOOK_AGAIN
+            versions = _versions(self._places)
+            if versions == self._seen:
+                return
+            self._seen = versions
+            before, self._allowed = self._allowed, dict(_usable(versions))
+            gone = [name for key, name in before.items() if key not in self._allowed]
+            self._revocations += bool(gone)
+            new = [name for key, name in self._allowed.items() if key not in before]
+        log.warning(
+            "%s.allow has changed; new: %s; no longer let in: %s",
+            self._section, ", ".join(new) or "none", ", ".join(gone) or "none",
+        )  # fmt: skip
+
+
+def _versions(places: Sequence[Path]) -> dict[Path, tuple[int, int]]:
+    """The files of an allow list, and what changes when one is written."""
+    found = {}
+    for file in _files(places):
+        with suppress(OSError):  # it has just gone
+            found[file] = (file.stat().st_mtime_ns, file.stat().st_ino)
+    return found
+
+
+def _usable(files: Iterable[Path]) -> Iterator[tuple[bytes, str]]:
+    for file in files:
+        try:
+            yield read_public_key(file), file.stem
+        except UsageError as error:
+            log.warning("%s", error)
+
+
+def _files(places: Sequence[Path]) -> list[Path]:
+    return [file for place in places for file in (sorted(place.glob("*.pub")) if place.is_dir() else [place])]
+
+
+@dataclass(frozen=True, slots=True)
+class Gate:
+    """Who gets through to bound sockets.
+
+    Attributes:
+        keys: the node's; None: everybody who reaches them does.
+        revocations: how often keys were taken off the list. Who is in must show a key anew then.
+    """
+
+    keys: KeyPair | None = None
+    revocations: Callable[[], int] = lambda: 0
+
 
 @contextmanager
 def authenticated(
     context: zmq.Context[zmq.Socket[bytes]], config: Guarded, section: str = "publish"
-) -> Iterator[KeyPair | None]:
-    """The node's key pair while only the keys of `allow` are let in; None without `key`.
+) -> Iterator[Gate]:
+    """With `key` only the keys of `allow` are let in.
 
     Args:
         section: of the launch file that `config` is, for messages.
@@ -256,17 +326,16 @@ def authenticated(
         SagsError: this ZeroMQ library was built without CURVE.
     """
     if config.key is None:
-        yield None
+        yield Gate()
         return
     if not zmq.has("curve"):
         raise SagsError("this ZeroMQ library has no CURVE; install pyzmq from its wheel")
     keys = read_key_pair(config.key)
+    allowed = AllowList(config.allow, section)
     authenticator = ThreadAuthenticator(context)
-    authenticator.configure_curve_callback(
-        ZAP_DOMAIN.decode(), _AllowList(read_allow_list(config.allow, section), section)
-    )
+    authenticator.configure_curve_callback(ZAP_DOMAIN.decode(), allowed)
     authenticator.start()
     try:
-        yield keys
+        yield Gate(keys, allowed.revocations)
     finally:
         authenticator.stop()

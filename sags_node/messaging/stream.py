@@ -27,6 +27,8 @@ def check_topic(name: str) -> topics.Topic:
         UsageError: there is no such topic.
     """
     topic = topics.find(name)
+    if topic is None and name.startswith(topics.THIN):
+        topics.thin_picture(name)  # says what is wrong with it
     if topic is None:
         near = difflib.get_close_matches(name, topics.BY_NAME, n=1)
         hint = f"did you mean '{near[0]}'?" if near else f"topics: {', '.join(topics.BY_NAME)}"

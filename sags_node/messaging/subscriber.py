@@ -83,6 +83,7 @@ class Receiver:
         self._clock_ns = clock_ns if clock is None else clock.latest_ns
         self._fresh = {topic.name: Freshness(rates.get(topic.name), topic.periodic) for topic in wanted}
         self._types = {topic.name: topic.type for topic in wanted}
+        self._refused: dict[str, str] = {}  # topic: why the node does not make it
         self._kept: dict[str, deque[Received]] = {topic.name: deque(maxlen=KEPT) for topic in wanted}
         self._arrived = threading.Condition()
         self._wakes: list[Callable[[], None]] = []
@@ -200,6 +201,8 @@ class Receiver:
         return matches if len(matches) == len(names) else None
 
     def _problem(self, name: str, max_age: float | None) -> str | None:
+        if name in self._refused:
+            return self._refused[name]
         problem = self._fresh[name].problem(self._clock_ns(), max_age)
         if problem is not None and self.refusal is not None:
             return self.refusal
@@ -267,9 +270,13 @@ class Receiver:
             name = self._names.get(message.topic)
             if name is None:  # a subscription is a prefix: that to a depth brings its confidence too
                 return
+            received = interpret(message, self._clock_ns())
+            if self._types[name] == topics.COMPRESSED_IMAGE and isinstance(received, ReceivedText):
+                self._refused[name] = received.text
+                return
             if message.meta.type != self._types[name]:
                 raise WireError(f"{message.topic}: not what was subscribed to")
-            received = interpret(message, self._clock_ns())
+            self._refused.pop(name, None)
         except WireError:
             with self._arrived:
                 self.rejected += 1

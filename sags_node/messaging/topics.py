@@ -11,7 +11,10 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
+from sags_node.errors import UsageError
+
 IMAGE = "sensor_msgs/msg/Image"
+COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 TF = "tf2_msgs/msg/TFMessage"
@@ -76,13 +79,73 @@ _VIEW_KINDS = {
     "camera_info": (CAMERA_INFO, "the camera of that viewpoint"),
 }
 
+THIN = "thin/"  # how the names of thin pictures begin
+_EVERY = {"full": 1, "half": 2, "quarter": 4}
+THIN_FORMS = {  # of each picture, what may come in its place
+    "left/image_rect_color": ("jpeg",),
+    "right/image_rect_color": ("jpeg",),
+    "left/render/image": ("jpeg", "alpha"),
+    "right/render/image": ("jpeg", "alpha"),
+    "left/render/depth": ("png",),
+    "left/render/depth_confidence": ("png",),
+    "left/depth": ("png",),
+    "left/tissue_mask": ("png",),
+}
+_THIN_NAME = re.compile(r"thin/([a-z]+)/(?:(\d{1,5}),(\d{1,5}),(\d{1,5}),(\d{1,5})/)?(.+)/([a-z]+)")
+
+
+@dataclass(frozen=True, slots=True)
+class ThinPicture:
+    """A smaller form of one of the node's pictures, as the name of its topic asks for it."""
+
+    topic: str  # of the whole picture
+    form: str  # jpeg, png or alpha
+    every: int  # px of the whole picture for one of this
+    region: tuple[int, int, int, int] | None  # x, y, width, height in the whole picture; None: all of it
+
+
+def thin_picture(name: str) -> ThinPicture:
+    """What a name asks for: `thin/SIZE/[X,Y,WIDTH,HEIGHT/]TOPIC/FORM`, without the namespace.
+
+    No such name is the beginning of another, so a subscription to one brings no other.
+
+    Raises:
+        UsageError: there is nothing of that name.
+    """
+    found = _THIN_NAME.fullmatch(name)
+    if found is None:
+        raise UsageError(
+            f"'{name}' is no thin topic: thin/SIZE/TOPIC/FORM or thin/SIZE/X,Y,WIDTH,HEIGHT/TOPIC/FORM, "
+            "e.g. thin/half/left/render/image/jpeg"
+        )
+    size, *sides, topic, form = found.groups()
+    if size not in _EVERY:
+        raise UsageError(f"'{name}': no size '{size}'; there are {', '.join(_EVERY)}")
+    if topic not in THIN_FORMS:
+        raise UsageError(f"'{name}': no thin form of '{topic}'; there are those of {', '.join(THIN_FORMS)}")
+    if form not in THIN_FORMS[topic]:
+        raise UsageError(f"'{name}': {topic} comes as {' or '.join(THIN_FORMS[topic])}, not as {form}")
+    every = _EVERY[size]
+    if sides[0] is None:
+        return ThinPicture(topic, form, every, None)
+    x, y, width, height = (int(side) for side in sides)
+    if min(width, height) < every:
+        raise UsageError(f"'{name}': a region of {width}x{height} px has no pixel at size {size}")
+    return ThinPicture(topic, form, every, (x, y, width, height))
+
 
 def find(name: str) -> Topic | None:
-    """The entry of a topic named without the namespace, also of a player or an overlay, or of a view that a
-    consumer may have opened."""
+    """The entry of a topic named without the namespace, also of a player or an overlay, of a view that a
+    consumer may have opened, or of a thin picture."""
     known = BY_NAME.get(name) or _OF_OTHERS.get(name)
     if known is not None:
         return known
+    if name.startswith(THIN):
+        try:
+            asked = thin_picture(name)
+        except UsageError:
+            return None
+        return Topic(name, COMPRESSED_IMAGE, f"{BY_NAME[asked.topic].content}, thin")
     view = _VIEW_TOPIC.fullmatch(name)
     return None if view is None else Topic(name, *_VIEW_KINDS[view[1]], cached=view[1] == "camera_info")
 

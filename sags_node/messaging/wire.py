@@ -27,6 +27,10 @@ DType = Literal["", "uint8", "float32"]
 Stamp = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 Text = Annotated[str, msgspec.Meta(max_length=512)]
+Scale = Annotated[float, msgspec.Meta(gt=0, le=1)]
+Window = Annotated[
+    list[Annotated[int, msgspec.Meta(ge=0, lt=2**31)]], msgspec.Meta(min_length=3, max_length=3)
+]
 
 
 class WireError(SagsError):
@@ -51,6 +55,8 @@ class Meta(msgspec.Struct, frozen=True, kw_only=True):
     dtype: DType  # of part 1, little-endian; empty: no bulk part
     dropped: Count  # frames the node dropped so far
     ahead_ns: Count | msgspec.UnsetType = msgspec.UNSET  # shown is what is expected so long after `stamp_ns`
+    scale: Scale | msgspec.UnsetType = msgspec.UNSET  # of a thin picture whose numbers are whole
+    window: Window | msgspec.UnsetType = msgspec.UNSET  # of a thin picture: x, y, and px for one of its own
 
 
 @dataclass(frozen=True, slots=True)

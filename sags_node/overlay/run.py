@@ -22,6 +22,7 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.findings import OF_THE_FLOW, STAGES
 from sags_node.messaging.address import ClientKeys, find_control
 from sags_node.messaging.control import ControlClient
+from sags_node.messaging.freezes import Freezes
 from sags_node.messaging.node_clock import NodeClock
 from sags_node.messaging.received import Received, ReceivedImage, ReceivedText, TopicName
 from sags_node.messaging.subscriber import Subscriber
@@ -76,7 +77,8 @@ def run_overlay(options: Options, tell: Callable[[str], object] = log.warning) -
 
     Returns:
         frames, overlay (frames with one), blanked (reason -> frames), latency_ms (capture to published) and
-        draw_ms (p50, p90, p99), objects (see `HeldObject.status`), lost (messages), endpoints, saved (the
+        draw_ms (p50, p90, p99), freezes (count, seconds; see `Freezes`), objects (see
+        `HeldObject.status`), lost (messages), endpoints, saved (the
         file; None when too little was shown to write one).
 
     Raises:
@@ -140,6 +142,7 @@ class _Overlay:
         self._blanked: Counter[str] = Counter()
         self._latency_ms: deque[float] = deque(maxlen=REMEMBERED)
         self._draw_ms: deque[float] = deque(maxlen=REMEMBERED)
+        self._freezes = Freezes()  # of what is not blank
 
     def run(self) -> None:
         """Draw every frame that comes.
@@ -234,6 +237,7 @@ class _Overlay:
             "blanked": dict(self._blanked),
             "latency_ms": _percentiles(self._latency_ms),
             "draw_ms": _percentiles(self._draw_ms),
+            "freezes": self._freezes.status(),
             "objects": [held.status() for held in self._objects],
             "lost": sum(lost),
             "endpoints": self._stream.endpoints,
@@ -291,6 +295,7 @@ class _Overlay:
         ahead = max(held.ahead_s for held in self._objects)
         self._stream.show(pictures, frame.frame_id, frame.stamp_ns, self._epoch, round(ahead * 1e9))
         self._draw_ms.append(1e3 * (time.perf_counter() - began))
+        self._freezes.add(time.monotonic())
         self._latency_ms.append(1e-6 * (self._node.now_ns() - frame.stamp_ns))
         return pictures["left"]
 
@@ -328,6 +333,7 @@ class _Overlay:
             "blanked": dict(self._blanked),
             "latency_ms": _percentiles(recent),
             "draw_ms": _percentiles(list(self._draw_ms)[-RECENT:]),
+            "freezes": self._freezes.status(),
             "max_age": self._options.max_age,
             "clock": None if self._clock is None else self._clock.status(),
             "no_right_eye": self._right or None,

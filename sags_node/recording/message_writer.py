@@ -6,23 +6,22 @@ from pathlib import Path
 from typing import Literal
 
 import cv2
-import numpy as np
 from mcap.records import Schema
-from numpy.typing import NDArray
 
 from sags_node import __version__
 from sags_node.calibration import eye_text
+from sags_node.errors import SagsError
 from sags_node.messaging import cdr, topics
 from sags_node.messaging.topics import CAMERA_INFO, IMAGE
 from sags_node.messaging.wire import PROTOCOL, Message, WireError
 from sags_node.recording.backlog import Arrived
 from sags_node.recording.bag_writer import NO_LIMITS, BagWriter, Limits
-from sags_node.recording.pictures import read_eye
+from sags_node.recording.pictures import encode_file, read_eye
 
 Compression = Literal["none", "jpeg", "png"]
 JPEG_QUALITY = 92
 PNG_LEVEL = 1
-_TO_OPENCV = {"rgb8": cv2.COLOR_RGB2BGR, "rgba8": cv2.COLOR_RGBA2BGRA, "mono8": None}
+_COMPRESSIBLE = ("rgb8", "rgba8", "mono8")
 
 
 class MessageWriter:
@@ -61,7 +60,7 @@ class MessageWriter:
             )
         self._attach(arrived)
         name, kind, data = message.topic, meta.type, b"".join(message.parts)
-        if self._compression != "none" and kind == IMAGE and meta.encoding in _TO_OPENCV:
+        if self._compression != "none" and kind == IMAGE and meta.encoding in _COMPRESSIBLE:
             form = "jpeg" if self._compression == "jpeg" and meta.encoding == "rgb8" else "png"
             name, kind, data = f"{name}/compressed", cdr.COMPRESSED, _compressed(message, data, form)
         if name not in self._channels:
@@ -93,16 +92,15 @@ class MessageWriter:
 
 def _compressed(message: Message, data: bytes, form: str) -> bytes:
     """The CDR of the compressed picture."""
-    code = _TO_OPENCV[message.meta.encoding]
-    picture = message.array()
-    stored: NDArray[np.uint8] = picture if code is None else cv2.cvtColor(picture, code)
+    encoding = message.meta.encoding
     quality = (
-        [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+        (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY)
         if form == "jpeg"
-        else [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL]
+        else (cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL)
     )
-    done, packed = cv2.imencode(f".{form}", stored, quality)
-    if not done:
-        raise WireError(f"{message.topic}: a picture cannot be compressed as {form}")
+    try:
+        file = encode_file(message.array(), encoding, form, quality)
+    except SagsError as error:
+        raise WireError(f"{message.topic}: {error}") from None
     header = cdr.decode(data, IMAGE).header
-    return cdr.compressed_image(packed.tobytes(), form, message.meta.encoding, header)
+    return cdr.compressed_image(file, cdr.file_form(encoding, form), header)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from sags_node.calibration import fit_distortion
 from sags_node.errors import SagsError, UsageError
@@ -21,6 +23,8 @@ _STAMP = struct.Struct("<iI")
 _BIG_STAMP = struct.Struct(">iI")
 
 _FILE_TO_RGB = {1: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGB}  # channels: conversion
+
+_TO_FILE = {"rgb8": cv2.COLOR_RGB2BGR, "rgba8": cv2.COLOR_RGBA2BGRA}  # OpenCV writes BGR
 
 
 class Encoding(NamedTuple):
@@ -113,6 +117,26 @@ def decode_file(file: U8, where: str) -> U8:
     if decoded.dtype != np.uint8:
         raise SagsError(f"{where}: a compressed picture is {decoded.dtype}; what is read is 8 bit")
     return decoded
+
+
+def encode_file(picture: NDArray[Any], encoding: str, form: str, options: Sequence[int]) -> bytes:
+    """A JPEG or PNG file (`form`) of a picture [H, W] or [H, W, C] in one of ROS's encodings.
+
+    Args:
+        options: of `cv2.imencode`.
+
+    Raises:
+        SagsError: it cannot be made, as of a picture without pixels.
+    """
+    code = _TO_FILE.get(encoding)
+    try:
+        stored = picture if code is None else cv2.cvtColor(picture, code)
+        done, file = cv2.imencode(f".{form}", stored, options)
+    except cv2.error:
+        done = False
+    if not done:
+        raise SagsError(f"a picture of {picture.shape} cannot be compressed as {form}")
+    return bytes(file.data)
 
 
 def read_eye(data: bytes | memoryview, where: str) -> Eye:

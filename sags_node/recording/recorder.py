@@ -121,6 +121,7 @@ class Recorder:
     def _messages(self) -> Generator[Arrived | None, None, None]:
         """Every new message once, None now and then while nothing comes; ends after `stop`."""
         options = self._options
+        thin = topics.full_name(options.ns, topics.THIN)
         heard = listen(
             options.topics,
             options.endpoint,
@@ -138,6 +139,8 @@ class Recorder:
                     yield None
                     continue
                 message, received_ns = arrived
+                if not options.topics and message.topic.startswith(thin):  # another's, of a whole one
+                    continue
                 if not cdr.knows(message.meta.type):
                     self._rejected += 1
                     continue

@@ -9,6 +9,7 @@ import select
 import socket
 import subprocess
 import sys
+from collections.abc import Sequence
 from typing import Any
 
 from sags_node.errors import SagsError
@@ -22,6 +23,7 @@ KEPT = 2000  # bytes of what plugins print
 PLAIN, GOOD, BAD = (f"gstreamer1.0-plugins-{name}" for name in ("base", "good", "bad"))
 ELEMENTS = {  # what the launch files use, and the Debian package that brings it
     "appsink": PLAIN,
+    "rawvideoparse": PLAIN,
     "videoconvert": PLAIN,
     "videotestsrc": PLAIN,
     "decodebin": PLAIN,
@@ -51,9 +53,10 @@ class GstProcess:
 
     Args:
         request: what it is to do, see `gst_child`.
+        keep: descriptors that it names, which the child gets too.
     """
 
-    def __init__(self, request: dict[str, Any]) -> None:
+    def __init__(self, request: dict[str, Any], keep: Sequence[int] = ()) -> None:
         self._here, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         command = [sys.executable, "-P", "-m", "sags_node.sources.gst_child"]
         command += [json.dumps(request), str(there.fileno())]
@@ -61,7 +64,7 @@ class GstProcess:
         try:
             self._process = subprocess.Popen(
                 command,
-                pass_fds=[there.fileno()],
+                pass_fds=[there.fileno(), *keep],
                 stdin=subprocess.DEVNULL,
                 stderr=subprocess.PIPE,
                 env={"GST_DEBUG": "1", **os.environ, "GST_DEBUG_NO_COLOR": "1"},  # 1: errors
@@ -85,7 +88,7 @@ class GstProcess:
             if descriptor == self._stderr:
                 self._keep()
             else:
-                message, descriptors, _, _ = socket.recv_fds(self._here, LONGEST_MESSAGE, 1)
+                message, descriptors = self._receive()
                 if not message:
                     raise SagsError(self._last_words())
                 said = json.loads(message)
@@ -94,6 +97,13 @@ class GstProcess:
                     raise SagsError(in_words(said["error"], said["debug"] or self._logged()))
                 return said, descriptors
         return None
+
+    def _receive(self) -> tuple[bytes, list[int]]:
+        try:
+            message, descriptors, _, _ = socket.recv_fds(self._here, LONGEST_MESSAGE, 1)
+        except ConnectionResetError:  # it ended before it read all; what it said comes next
+            message, descriptors, _, _ = socket.recv_fds(self._here, LONGEST_MESSAGE, 1)
+        return message, descriptors
 
     def start(self) -> None:
         """Play a file from its first picture on; live pipelines play anyway."""

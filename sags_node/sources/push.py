@@ -72,7 +72,7 @@ class PushedPictures:
                 "left" if eye == "left" else "right", stamp_ns, arrival_ns, partial(_picture, message)
             )
         elif last == "image_raw" and eye == "stereo":
-            self._sent.put_both(stamp_ns, arrival_ns, partial(_halves, message))
+            self._sent.put_both(stamp_ns, arrival_ns, partial(_picture, message))
         else:
             raise SagsError(
                 f"topic {message.topic}: pictures come on NAME/left/image_raw, NAME/right/image_raw or "
@@ -101,11 +101,3 @@ def _picture(message: Message) -> U8:
         return picture if encoding.to_rgb is None else cv2.cvtColor(picture, encoding.to_rgb)
     except cv2.error:
         raise WireError(f"{where}: {meta.shape} cannot be {meta.encoding}") from None
-
-
-def _halves(message: Message) -> tuple[U8, U8]:
-    both = _picture(message)
-    if both.shape[1] % 2:
-        raise WireError(f"{message.topic}: {both.shape[1]} px wide, which is odd: it cannot hold two eyes")
-    half = both.shape[1] // 2
-    return both[:, :half].copy(), both[:, half:].copy()

@@ -19,9 +19,10 @@ from sags_node.messaging.inbox import Inbox
 from sags_node.messaging.security import Seldom
 from sags_node.messaging.wire import Message
 from sags_node.recording.bag import read_messages
+from sags_node.ros.endpoints import Delivery, Reader
+from sags_node.ros.graph import Graph
 from sags_node.sources.pose_track import POSE_TYPES, NoPoseError, PoseTrack
 from sags_node.sources.ros2 import absolute
-from sags_node.sources.ros_graph import Graph, Reader
 from sags_node.sources.source import Source
 from sags_node.types import F64, StereoFrame, StereoRig
 
@@ -120,7 +121,9 @@ class _RosPoses:
         for topic in {self._topic, STATIC} - self._readers.keys():
             kinds = there.get(topic, set()) & set(POSE_TYPES)
             if kinds:
-                self._readers[topic] = self._graph.reader(topic, min(kinds), depth=100, kept=topic == STATIC)
+                fixed = topic == STATIC
+                delivery = Delivery(reliable=fixed, kept=fixed, depth=100)
+                self._readers[topic] = self._graph.reader(topic, min(kinds), delivery)
 
     def _add(self, topic: str, kind: str, data: bytes) -> None:
         try:

@@ -1,4 +1,4 @@
-"""Live stereo from a ROS 2 graph: two picture topics, paired by their stamps."""
+"""Live stereo from a ROS 2 graph: two picture topics, paired by their stamps, or one that shows both eyes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.messaging.security import Seldom
 from sags_node.messaging.topics import CAMERA_INFO
 from sags_node.recording.pictures import IMAGE_TYPES, decode_picture, header_stamp, read_eye
-from sags_node.sources.ros_graph import Graph, Reader, receive_buffer
+from sags_node.ros.endpoints import Reader
+from sags_node.ros.graph import Graph, receive_buffer
 from sags_node.sources.sent import SentPictures
 from sags_node.types import Eye as Calibrated
 from sags_node.types import Side, StereoFrame, StereoRig
@@ -48,7 +49,7 @@ class RosCameras:
         self.rate = config.rate
         self._sent = SentPictures(config, size)
         self._graph = Graph(config)
-        self._names: Mapping[Side, str] = {"left": absolute(config.left), "right": absolute(config.right)}
+        self._names = picture_topics(config)
         self._readers: dict[Side, Reader] = {}
         self._left_out: Mapping[Side, Seldom] = {"left": Seldom(), "right": Seldom()}
         self._silent: Mapping[Side, Seldom] = {"left": Seldom(), "right": Seldom()}
@@ -105,8 +106,10 @@ class RosCameras:
 
     def _put(self, eye: Side, kind: str, data: bytes) -> None:
         name, arrival_ns = self._names[eye], time.time_ns()
+        decode = partial(decode_picture, data, kind, name)
+        put = partial(self._sent.put, eye) if len(self._names) == 2 else self._sent.put_both
         try:
-            self._sent.put(eye, header_stamp(data), arrival_ns, partial(decode_picture, data, kind, name))
+            put(header_stamp(data), arrival_ns, decode)
         except SagsError as error:
             if self._left_out[eye].due():
                 log.warning("%s: left out: %s", name, str(error).removeprefix(f"{name}: "))
@@ -129,6 +132,13 @@ class RosCameras:
             f"nobody publishes {name} in {where}; picture topics there: {topics or 'none'}. Set "
             f"source.{eye}, source.domain (ROS_DOMAIN_ID of the camera) or source.interface"
         )
+
+
+def picture_topics(config: Ros2Source) -> dict[Side, str]:
+    """Of each eye; of the left one only where its pictures show both."""
+    if config.geometry.layout != "separate":
+        return {"left": absolute(config.left)}
+    return {"left": absolute(config.left), "right": absolute(config.right)}
 
 
 def absolute(name: str) -> str:

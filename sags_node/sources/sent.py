@@ -11,6 +11,7 @@ from sags_node.config import SentSource
 from sags_node.errors import SagsError
 from sags_node.sources.clock import CaptureClock
 from sags_node.sources.device import Picture
+from sags_node.sources.layout import Layout
 from sags_node.sources.live_pairs import LivePairs
 from sags_node.sources.pictures import size_text
 from sags_node.types import U8, Side
@@ -80,6 +81,10 @@ class SentPictures:
         self.pairs = LivePairs(config.pair_tolerance_ms, config.latency_ms)
         self.arrivals: dict[Side, Arrivals] = {"left": Arrivals(), "right": Arrivals()}
         self._size = size
+        self._one = Layout(config.geometry.model_copy(update={"layout": "separate"}))
+        said = config.geometry.layout
+        both = "side_by_side" if said == "separate" else said
+        self._both = Layout(config.geometry.model_copy(update={"layout": both}))
         self._own = config.stamps == "own"
         self._clock = CaptureClock()
         self._rate = config.rate
@@ -103,21 +108,23 @@ class SentPictures:
         return None
 
     def put(self, eye: Side, stamp_ns: int, arrival_ns: int, decode: Callable[[], U8]) -> None:
-        """Take one picture in.
+        """Take one eye's picture in.
 
         Raises:
             SagsError: it is refused; why, and how to mend it.
         """
         t_ns = self._on_wall(stamp_ns, arrival_ns)
         self.arrivals[eye].add(stamp_ns)
-        self.pairs.put(eye, Picture(t_ns, self._checked(decode()), stamp_ns, arrival_ns))
+        picture = self._checked(decode(), self._one)
+        self.pairs.put(eye, Picture(t_ns, self._one.eye(picture, eye), stamp_ns, arrival_ns))
 
-    def put_both(self, stamp_ns: int, arrival_ns: int, decode: Callable[[], tuple[U8, U8]]) -> None:
-        """Take both eyes' pictures of one moment in; see `put`."""
+    def put_both(self, stamp_ns: int, arrival_ns: int, decode: Callable[[], U8]) -> None:
+        """Take one picture of both eyes in, side by side unless the geometry says otherwise; see `put`."""
         t_ns = self._on_wall(stamp_ns, arrival_ns)
         for arrivals in self.arrivals.values():
             arrivals.add(stamp_ns)
-        left, right = (Picture(t_ns, self._checked(eye), stamp_ns, arrival_ns) for eye in decode())
+        eyes = self._both.eyes(self._checked(decode(), self._both))
+        left, right = (Picture(t_ns, eye, stamp_ns, arrival_ns) for eye in eyes)
         self.pairs.put_both(left, right)
 
     def _on_wall(self, stamp_ns: int, arrival_ns: int) -> int:
@@ -134,12 +141,13 @@ class SentPictures:
             "taken and set both clocks by each other, or set source.stamps:=own"
         )
 
-    def _checked(self, picture: U8) -> U8:
-        size = picture.shape[1], picture.shape[0]
+    def _checked(self, picture: U8, layout: Layout) -> U8:
+        """A picture whose eyes have the right size."""
+        size = layout.size(picture.shape[1], picture.shape[0], "a picture")
         self._size = self._size or size
         if size != self._size:
             raise SagsError(
-                f"a picture is {size_text(*size)} px, it must be {size_text(*self._size)} as in the "
+                f"an eye's picture is {size_text(*size)} px, it must be {size_text(*self._size)} as in the "
                 "calibration; send that size, or name the right calibration in rig"
             )
         return picture

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import signal
 import sys
 import tempfile
@@ -10,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from datetime import UTC, datetime
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -28,6 +30,40 @@ LONGEST_WAIT = 10.0  # s, after which it is tried whatever becomes of it
 _IMPORT = "<frozen importlib._bootstrap>"  # where the frames of an import are
 
 console = Console(stderr=True, highlight=False)
+log = logging.getLogger(__name__)
+
+
+class _Json(logging.Formatter):
+    """A line that is one JSON object."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        said = {
+            "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
+            "level": record.levelname.lower(),
+            "logger": record.name,
+            "message": record.getMessage(),
+        }
+        if record.exc_info:
+            said["traceback"] = self.formatException(record.exc_info)
+        return json.dumps(said)
+
+
+def log_handler() -> logging.Handler:
+    """For people; where the console is quiet, for machines."""
+    if console.quiet:
+        handler = logging.StreamHandler()
+        handler.setFormatter(_Json())
+        return handler
+    from rich.logging import RichHandler  # --help needs none
+
+    return RichHandler(console=console, show_path=False)
+
+
+def tell(line: str) -> None:
+    """Something that a person should know: a line, or an event in the log."""
+    if console.quiet:
+        log.warning("%s", line)
+    console.print(line, markup=False, soft_wrap=True)
 
 
 @contextmanager

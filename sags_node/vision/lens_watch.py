@@ -27,6 +27,7 @@ NOISE = 0.5  # grey levels: detail below it is a camera's noise
 LOST, BACK = 1.0, 0.5 * LOST_CONTRAST
 ALIKE = 5  # of a cell and the eight around it have lost it: drops are wider than a cell
 FEWEST = 6  # cells: the area of a drop whose radius is 3.5 % of the width
+VEIL = 0.5 * LOST  # of the median cell: something lies over the whole lens, see `vision.clarity`
 
 _TEXT = "drops or dirt on the {eye} lens hide some of the tissue, which is not learnt: clean the lens"
 _LEFT, _RIGHT = (Finding(f"{eye}_eye_drops", _TEXT.format(eye=eye)) for eye in ("left", "right"))
@@ -79,8 +80,13 @@ class LensWatch:
             self._stamp_ns = pair.t_capture_ns
         passed = max(0, pair.t_capture_ns - self._stamp_ns) * 1e-9
         self._stamp_ns = pair.t_capture_ns
-        covered = np.zeros((2, rows, columns), np.bool_)
         share = np.float32(min(1.0, passed / REMEMBERED_S))
+        off = apart - self._usual
+        if abs(np.median(off[apart != 0])) > VEIL:
+            self._usual = (self._usual + share * off).clip(-USUAL_DIFFERENCE, USUAL_DIFFERENCE)
+            self._standing.update(pair.t_capture_ns, [])
+            return OnLenses()
+        covered = np.zeros((2, rows, columns), np.bool_)
         counts = _judge(apart, last.observation.tissue, 2 * side, share, self._usual, self._hidden, covered)
         many = [count >= FEWEST for count in counts]
         self._standing.update(

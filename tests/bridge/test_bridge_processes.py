@@ -83,14 +83,43 @@ def test_a_pinned_anchor_comes_back_and_a_killed_node_leaves_nothing_standing(
             node.process.wait(10)
 
 
-@pytest.mark.parametrize("command", ["openigtlink", "foxglove"])
-def test_other_machines_are_let_in_only_when_it_is_said(command: str) -> None:
-    refused(2, "bridge", command, "--host", "0.0.0.0", said=("without keys or encryption", "--insecure"))
+@pytest.mark.parametrize(
+    ("command", "option", "place"),
+    [
+        ("openigtlink", "--host", "0.0.0.0"),
+        ("foxglove", "--host", "0.0.0.0"),
+        ("web", "--host", "0.0.0.0"),
+        ("ros2", "--interface", "eth0"),
+    ],
+)
+def test_other_machines_are_let_in_only_when_it_is_said(command: str, option: str, place: str) -> None:
+    said = f"{option} {place} would show", "without keys or encryption", "--insecure"
+    refused(2, "bridge", command, option, place, said=said)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--interface", "no such", "--insecure"), "no such"),
+        (("--interface", "none0", "--insecure"), "there are:"),
+        (("--view", "a/b"), "--view 'a/b'"),
+    ],
+)
+def test_a_place_or_a_view_that_cannot_be_is_refused(
+    options: tuple[str, ...], said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("cyclonedds", reason="ROS 2 needs: pip install 'sags-node[ros2]'")
+    monkeypatch.setattr(os, "nice", lambda by: 0)  # this process goes on
+    refused(2, "bridge", "ros2", *options, said=(said,))
 
 
 @pytest.mark.parametrize(
     ("command", "module", "package"),
-    [("openigtlink", "pyigtl", "pyigtl"), ("foxglove", "foxglove", "foxglove-sdk")],
+    [
+        ("openigtlink", "pyigtl", "pyigtl"),
+        ("foxglove", "foxglove", "foxglove-sdk"),
+        ("web", "websockets", "websockets"),
+    ],
 )
 def test_a_missing_extra_is_named_with_the_way_to_get_it(
     command: str, module: str, package: str, monkeypatch: pytest.MonkeyPatch
@@ -99,7 +128,14 @@ def test_a_missing_extra_is_named_with_the_way_to_get_it(
     refused(2, "bridge", command, said=(f"needs {package}", "pip install 'sags-node[bridges]'"))
 
 
+def test_without_its_extra_the_bridge_to_ros_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "cyclonedds.domain", None)
+    monkeypatch.setattr(os, "nice", lambda by: 0)
+    refused(2, "bridge", "ros2", said=("pip install 'sags-node[ros2]'",))
+
+
 def test_the_help_says_when_to_use_which() -> None:
     text = sags("bridge", "--help").stdout
     assert "3D Slicer" in text and "sags bridge openigtlink" in text
-    assert "sags bridge foxglove" in text and "sags view" in text
+    assert all(command in text for command in ("sags bridge foxglove", "sags bridge ros2", "sags view"))
+    assert "Unity" in text and "sags bridge web" in text and "sags bridge gst" in text

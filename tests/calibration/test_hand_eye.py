@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import runpy
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,8 @@ import numpy as np
 import pytest
 from bag_files import ROS2, Row, image, write_rosbag2
 from click.testing import CliRunner
-from drawn_boards import charuco_print, draw, fine_rays, known_rig
+from drawn_boards import charuco_print, known_rig
+from places import ROOT
 
 from sags_node.calibration import save_rig
 from sags_node.calibration.boards import StereoView
@@ -19,15 +21,19 @@ from sags_node.calibration.hand_eye import HandEye, read_hand_eye, save_hand_eye
 from sags_node.calibration.hand_eye_solve import solve_hand_eye
 from sags_node.cli.main import main
 from sags_node.errors import SagsError, UsageError
+from sags_node.evaluation.measure import Measurer, Options
+from sags_node.evaluation.session import evaluate
+from sags_node.fitting.clip import read_clip
 from sags_node.geometry import invert, matrix_to_quat
 from sags_node.launch_file import load_launch
 from sags_node.messaging import cdr, topics
+from sags_node.phantom.board import draw, fine_rays
 from sags_node.phantom.motion import scope_pose
 from sags_node.phantom.rig import phantom_rig
 from sags_node.session import open_session
 from sags_node.sources.pose_track import NoPoseError, PoseTrack
-from sags_node.sources.robot import open_robot
-from sags_node.types import F32, F64, StereoRig
+from sags_node.sources.robot import open_robot, rectified
+from sags_node.types import F32, F64, Camera, RectifiedPair, StereoFrame, StereoRig
 
 S, MS = 1_000_000_000, 1_000_000
 START = 1_700_000_000 * S
@@ -249,6 +255,54 @@ def test_from_a_bag_to_poses_of_the_camera(recording: Path) -> None:
             exact[:3, :3] = exact[:3, :3] @ session.rig.left.R.T
             assert np.linalg.norm(frame.T_world_cam[:3, 3] - exact[:3, 3]) < 0.3e-3
             assert np.abs(frame.T_world_cam[:3, :3] - exact[:3, :3]).max() < np.radians(0.2)
+
+
+def test_the_example_gives_what_it_says(tmp_path: Path) -> None:
+    """examples/record_board.py, and the command that its first lines name."""
+    folder = tmp_path / "board"
+    example = runpy.run_path(str(ROOT / "examples/record_board.py"))
+    example["record"](folder, seconds=2.0)
+    command = [
+        "calib", "hand-eye", str(folder / "bag"), f"rig:={folder / 'rig'}", "robot.kind:=bag",
+        "robot.topic:=/ECM/measured_cp", "--squares", "10x7", "--square-mm", "4.5", "-o", str(folder / "rig"),
+    ]  # fmt: skip
+    result = CliRunner().invoke(main, command)
+    assert result.exit_code == 0, result.output
+    found = read_hand_eye(folder / "rig/hand_eye.yaml")
+    assert np.linalg.norm(found.T_hand_cam[:3, 3] - example["T_HAND_CAMERA"][:3, 3]) < 0.3e-3
+    assert found.offset_ns * 1e-9 == pytest.approx(example["AHEAD_S"], abs=0.005)
+
+
+def test_fits_and_figures_know_where_the_robot_says_the_scope_is(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    save_hand_eye(HandEye(X, 60 * MS), tmp_path, {})
+    played = [
+        f"rig:={recording.parent / 'rig'}", "robot.kind:=bag", "robot.topic:=/ECM/measured_cp",
+        f"robot.hand_eye:={tmp_path / 'hand_eye.yaml'}", "source.pace:=step", "source.rate:=5",
+        "vision.width:=160", "vision.height:=120", "mapping.max_gaussians:=2000",
+    ]  # fmt: skip
+    seen: dict[int, Camera] = {}  # of what is held out
+    held_out = Measurer._held_out
+
+    def noted(self: Measurer, frame: StereoFrame, pair: RectifiedPair, *rest: Any) -> Any:
+        row = held_out(self, frame, pair, *rest)
+        seen[frame.frame_id] = self._held.camera
+        return row
+
+    monkeypatch.setattr(Measurer, "_held_out", noted)
+    session = open_session(recording, [*played, "source.frames:=4"])
+    clip = read_clip(session, lambda number: number == 1)
+    evaluate(recording, [*played, "source.frames:=4"], Options(hold_out=4), iterations=0)
+    assert list(seen) == [frame.frame_id for frame in clip.test] == [1] and len(clip.train) == 3
+    for number, camera in (*seen.items(), *((f.frame_id, f.camera) for f in (*clip.train, *clip.test))):
+        exact = camera_at(number / RATE, 5.0) @ rectified(np.eye(4), session.rig)
+        assert np.linalg.norm(camera.T_world_cam[:3, 3] - exact[:3, 3]) < 0.1e-3
+
+    # The poses end 2.95 s after the first picture: a second later there is none for the last four.
+    late = open_session(recording, [*played, "robot.offset_ms:=1000"])
+    assert len(read_clip(late, lambda number: False).train) == 20
+    assert "4 frames are left out, since the robot tells no pose of them" in caplog.text
 
 
 def test_topics_that_hold_no_pose_are_named(recording: Path) -> None:

@@ -170,13 +170,15 @@ def test_confidence(scene: dict[str, np.ndarray]) -> None:
     depths, found = np.stack([s["depth"]] * 2), np.zeros((2, HEIGHT, WIDTH), np.float32)
     arguments = (s["means"], scales, s["opacities"], errors, tuple(s["cam0"]), s["depth"],
                  np.float32(1 / side), 2)  # fmt: skip
+    inverse, error = np.random.default_rng(10).uniform(0, 30, (2, rows, columns)).astype(np.float32)
+    inverse[::2], error[::3] = 0, 0  # nothing is measured there, or without an error
     for k, source in enumerate((False, True)):
         add_up, average, state = (
             each.py_func if source else each
             for each in (confidence._add_up, confidence._average, confidence._state)
         )
         add_up(*arguments, sums[k])
-        average(sums[k], np.float32(3e-3), coarse[k])
+        average(sums[k], np.float32(3e-3), s["depth"], side, inverse, error, coarse[k])
         state(wide, np.float32(1 / side), np.float32(0.2), depths[k], found[k])
     assert np.count_nonzero(sums[0, :, 0]) > 100
     assert np.allclose(sums[0], sums[1], rtol=1e-5)

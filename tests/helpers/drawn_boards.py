@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 
 from sags_node.calibration import rectify_eyes
-from sags_node.types import F64, U8, Eye, StereoRig
+from sags_node.phantom.board import TEXELS, PrintedBoard, chessboard, draw, fine_rays, printed
+from sags_node.types import F64, U8, StereoRig
 
 SIZE = 480, 384
 SQUARES = 10, 7
 SQUARE = 0.0045  # m
-TEXELS = 40  # of a square of the printed board
-FINER = 3  # samples along each side of a pixel
 
 
 def known_rig() -> StereoRig:
@@ -42,53 +39,18 @@ def poses() -> list[F64]:
     return made
 
 
-@dataclass(frozen=True)
-class Print:
-    """A printed board: texels, and where its first inner corner lies in them."""
-
-    picture: U8
-    origin: float
+def chessboard_print(squares: tuple[int, int] = SQUARES) -> PrintedBoard:
+    return chessboard(squares, SQUARE)
 
 
-def chessboard_print(squares: tuple[int, int] = SQUARES) -> Print:
-    columns, rows = np.meshgrid(np.arange(squares[0]), np.arange(squares[1]))
-    fields = np.where((columns + rows) % 2, 235, 20).astype(np.uint8)
-    board = np.kron(fields, np.ones((TEXELS, TEXELS), np.uint8))
-    return Print(cv2.copyMakeBorder(board, *[TEXELS] * 4, cv2.BORDER_CONSTANT, value=235), 2 * TEXELS - 0.5)
-
-
-def charuco_print(squares: tuple[int, int] = SQUARES, legacy: bool = False) -> Print:
+def charuco_print(squares: tuple[int, int] = SQUARES, legacy: bool = False) -> PrintedBoard:
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
     board = cv2.aruco.CharucoBoard(squares, SQUARE, 0.75 * SQUARE, dictionary)
     board.setLegacyPattern(legacy)
-    picture = board.generateImage((squares[0] * TEXELS, squares[1] * TEXELS))
-    return Print(cv2.copyMakeBorder(picture, *[TEXELS] * 4, cv2.BORDER_CONSTANT, value=235), 2 * TEXELS - 0.5)
+    return printed(board.generateImage((squares[0] * TEXELS, squares[1] * TEXELS)), SQUARE)
 
 
-def fine_rays(eye: Eye) -> F64:
-    """Rays [H * FINER, W * FINER, 2] at distance 1 of points spread evenly over each raw pixel."""
-    steps = [(np.arange(side * FINER) + 0.5) / FINER - 0.5 for side in SIZE]
-    pixels = np.stack(np.meshgrid(*steps), -1).reshape(-1, 1, 2)
-    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
-    plain = cv2.undistortPoints(pixels, eye.K, eye.distortion, criteria=criteria)
-    return plain.reshape(SIZE[1] * FINER, SIZE[0] * FINER, 2)
-
-
-def draw(printed: Print, rays: F64, camera_from_board: F64) -> U8:
-    """The board on its plane, seen along rays; each pixel is the mean of its samples."""
-    plane_to_ray = np.column_stack(
-        [camera_from_board[:3, 0], camera_from_board[:3, 1], camera_from_board[:3, 3]]
-    )
-    on_board = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], -1) @ np.linalg.inv(plane_to_ray).T
-    texels = (on_board[..., :2] / on_board[..., 2:] / SQUARE * TEXELS + printed.origin).astype(np.float32)
-    fine = cv2.remap(printed.picture, texels, None, cv2.INTER_LINEAR, borderValue=90)
-    gray = cv2.GaussianBlur(cv2.resize(fine, SIZE, interpolation=cv2.INTER_AREA), (0, 0), 0.6)
-    return np.repeat(gray[..., None], 3, -1)
-
-
-def draw_pairs(printed: Print, board_poses: list[F64]) -> list[tuple[U8, U8]]:
+def draw_pairs(board: PrintedBoard, board_poses: list[F64]) -> list[tuple[U8, U8]]:
     rig = known_rig()
     left, right = fine_rays(rig.left), fine_rays(rig.right)
-    return [
-        (draw(printed, left, pose), draw(printed, right, rig.T_right_left @ pose)) for pose in board_poses
-    ]
+    return [(draw(board, left, pose), draw(board, right, rig.T_right_left @ pose)) for pose in board_poses]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -12,20 +11,37 @@ import pytest
 from waiting import until
 
 from sags_node.errors import SagsError
+from sags_node.processes import children
 from sags_node.sources.gst_process import installed
 
 NEEDED = ("appsink", "videoconvert", "videotestsrc", "deinterlace")
+BALL = (
+    "videotestsrc is-live=true pattern=ball animation-mode=wall-time motion=sweep"  # goes round in a second
+)
 
 
-def need_gstreamer() -> None:
-    """Skip where the packages of the Makefile's DEBIAN_TESTS are missing."""
+def need_gstreamer(*more: str) -> None:
+    """Skip where packages of the Makefile's DEBIAN_TESTS are missing; `more`: elements beyond the usual."""
     try:
         version, missing = installed()
     except SagsError as error:
         pytest.skip(str(error))
-    absent = [name for name in NEEDED if name in missing]
+    absent = {missing[name]: name for name in (*NEEDED, *more) if name in missing}
     if absent:
-        pytest.skip(f"{version} has no {', '.join(absent)}; install gstreamer1.0-plugins-{{base,good}}")
+        pytest.skip(f"{version} has no {', '.join(absent.values())}; install {' '.join(absent)}")
+
+
+def ball_moment(picture: np.ndarray) -> float:
+    """The fraction of the wall clock's second at which `BALL` was drawn: one frame before its stamp."""
+    rows, columns = np.nonzero(picture[..., 0] > 100)
+    height, width = picture.shape[:2]
+    turn = np.arctan2(rows.mean() - (height - 1) / 2, columns.mean() - (width - 1) / 2)
+    return float((turn / (2 * np.pi) + 0.25) % 1)
+
+
+def apart(one: float, other: float) -> float:
+    """How long between two fractions of a second, the shorter way, s."""
+    return abs((one - other + 0.5) % 1 - 0.5)
 
 
 def raw_file(file: Path, pictures: np.ndarray, rate: int, interlaced: bool = False) -> str:
@@ -44,13 +60,7 @@ def raw_file(file: Path, pictures: np.ndarray, rate: int, interlaced: bool = Fal
 
 def pipelines() -> list[int]:
     """Process ids of the pipelines that this process runs."""
-    found = []
-    for task in Path("/proc/self/task").iterdir():
-        with suppress(OSError):  # a thread or a process that ends meanwhile
-            for child in (task / "children").read_text().split():
-                if b"gst_child" in Path(f"/proc/{child}/cmdline").read_bytes():
-                    found.append(int(child))
-    return found
+    return children("gst_child")
 
 
 def kill_pipelines() -> None:

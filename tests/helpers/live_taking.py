@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from types import TracebackType
 from typing import Self
 
@@ -14,23 +13,20 @@ from sags_node.types import StereoFrame
 
 
 class Taker:
-    """Of each frame: number painted into the left and the right picture, and its age (ms) when taken."""
+    """Of each frame: number painted into the left and the right picture."""
 
-    def __init__(self, source: Source, pause: float = 0.0) -> None:
+    def __init__(self, source: Source) -> None:
         self.numbers: list[tuple[int, int]] = []
-        self.ages: list[float] = []
         self.newest: StereoFrame | None = None
-        self._source, self._pause = source, pause
+        self._source = source
         self._thread = threading.Thread(target=self._take)
 
     def _take(self) -> None:
         with self._source:
             for frame in self._source:
-                self.ages.append((time.time_ns() - frame.t_capture_ns) * 1e-6)
                 assert frame.right is not None
                 self.numbers.append((read_number(frame.left), read_number(frame.right)))
                 self.newest = frame
-                time.sleep(self._pause)
 
     @property
     def mismatched(self) -> int:

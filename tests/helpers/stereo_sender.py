@@ -3,7 +3,8 @@
     python stereo_sender.py push ENDPOINT SESSION SECONDS [key=value ...]
     python stereo_sender.py dds DOMAIN SESSION SECONDS [key=value ...]
 
-The number of each pair is painted into both pictures (`read_number`), so that a mismatch shows.
+The number of each pair is painted into both pictures (`read_number`), so that a mismatch shows; with
+`clock=1` the milliseconds of its stamp (of a minute), so that a wrong stamp shows.
 """
 
 from __future__ import annotations
@@ -49,46 +50,30 @@ def push(endpoint: str, jpeg: bool) -> Callable[[U8, U8, int], None]:
 
 
 def dds(domain: int, compressed: bool, scale: float, session: Path) -> Callable[[U8, U8, int], None]:
-    from cyclonedds._clayer import ddspy_write_ts
-    from cyclonedds.core import Policy, Qos
-    from cyclonedds.pub import DataWriter
-    from cyclonedds.topic import Topic
-
     from sags_node.config import RosGraph
     from sags_node.messaging import cdr
     from sags_node.messaging.topics import CAMERA_INFO, IMAGE, TF
-    from sags_node.sources.ros_graph import Graph, raw_type
+    from sags_node.ros.graph import Graph
 
     graph = Graph(RosGraph(domain=domain))
-    form = Policy.DataRepresentation(use_cdrv0_representation=True, use_xcdrv2_representation=False)
-    qos = Qos(Policy.Reliability.BestEffort, Policy.History.KeepLast(2), form)
-
-    def writer(topic: str, kind: str) -> Callable[[cdr.Content, int], None]:
-        made = DataWriter(
-            graph.participant, Topic(graph.participant, f"rt/stereo/{topic}", raw_type(kind)), qos
-        )
-        return lambda body, stamp_ns: ddspy_write_ts(
-            made._ref, b"".join(bytes(part) for part in body.parts), stamp_ns
-        )
-
     kind, suffix = (cdr.COMPRESSED, "/compressed") if compressed else (IMAGE, "")
-    pictures = [writer(f"{eye}/image_raw{suffix}", kind) for eye in ("left", "right")]
-    calibrations = [writer(f"{eye}/camera_info", CAMERA_INFO) for eye in ("left", "right")]
-    tf = DataWriter(graph.participant, Topic(graph.participant, "rt/tf", raw_type(TF)), qos)
+    pictures = [graph.writer(f"/stereo/{eye}/image_raw{suffix}", kind) for eye in ("left", "right")]
+    calibrations = [graph.writer(f"/stereo/{eye}/camera_info", CAMERA_INFO) for eye in ("left", "right")]
+    tf = graph.writer("/tf", TF)
     pose = np.eye(4)
     pose[:3, 3] = 0.1, 0.2, 0.3
     rig = resized_rig(load_rig(session / "calib"), scale)
 
     def send(left: U8, right: U8, stamp_ns: int) -> None:
-        ddspy_write_ts(tf._ref, bytes(cdr.transform(pose, stamp_ns).parts[0]), stamp_ns)
-        for write, eye in zip(calibrations, (rig.left, rig.right), strict=True):
-            write(cdr.eye_info(eye, stamp_ns), stamp_ns)
-        for write, picture in zip(pictures, (left, right), strict=True):
+        tf.write(cdr.transform(pose, stamp_ns).cdr(), stamp_ns)
+        for writer, eye in zip(calibrations, (rig.left, rig.right), strict=True):
+            writer.write(cdr.eye_info(eye, stamp_ns).cdr(), stamp_ns)
+        for writer, picture in zip(pictures, (left, right), strict=True):
             if compressed:
                 file = cv2.imencode(".jpg", picture[..., ::-1])[1].tobytes()
-                write(cdr.picture_file(file, stamp_ns), stamp_ns)
+                writer.write(cdr.picture_file(file, stamp_ns).cdr(), stamp_ns)
             else:
-                write(cdr.image(picture, "rgb8", stamp_ns), stamp_ns)
+                writer.write(cdr.image(picture, "rgb8", stamp_ns).cdr(), stamp_ns)
 
     return send
 
@@ -107,15 +92,16 @@ def main() -> None:
     ]
     compressed = "jpeg" in said
     send = push(where, compressed) if way == "push" else dds(int(where), compressed, width / 320, session)
-    late_ns = round(1e9 * float(said.get("late", 0)))
     print("sending", flush=True)
     begun = time.monotonic()
     for number in range(round(float(seconds) * rate)):
         time.sleep(max(0.0, begun + number / rate - time.monotonic()))
         left, right = pairs[number % len(pairs)]
+        stamp_ns = time.time_ns()
+        painted = stamp_ns // 1_000_000 % 60_000 if "clock" in said else number
         for picture in (left, right):
-            paint_number(picture, number % 2**BITS)
-        send(left, right, time.time_ns() - late_ns)
+            paint_number(picture, painted % 2**BITS)
+        send(left, right, stamp_ns)
     time.sleep(0.5)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import socket
 import stat
 import subprocess
 import sys
@@ -31,7 +32,13 @@ from sags_node.messaging.address import ClientKeys, client_keys
 from sags_node.messaging.control import ControlClient, ControlServer
 from sags_node.messaging.peers import MAX_PEERS
 from sags_node.messaging.publisher import Publisher
-from sags_node.messaging.security import read_allow_list, read_key_pair, read_public_key, write_key_pair
+from sags_node.messaging.security import (
+    LOOK_AGAIN,
+    read_allow_list,
+    read_key_pair,
+    read_public_key,
+    write_key_pair,
+)
 from sags_node.messaging.subscriber import Subscriber
 
 pytestmark = pytest.mark.live
@@ -231,6 +238,34 @@ def test_others_are_refused_counted_and_told_why(
         assert not running.wanted(TOPIC)
 
 
+def test_keys_are_revoked_and_added_while_the_node_runs(tmp_path: Path) -> None:
+    keys, clients = tmp_path / "keys", tmp_path / "keys/clients"
+    for folder, name in ((keys, "node"), (clients, "stays"), (clients, "goes"), (keys, "comes")):
+        write_key_pair(folder, name)
+
+    def subscriber(name: str) -> Subscriber:
+        return Subscriber([TOPIC], endpoint=running.connection.data[-1], keys=of(keys, name))
+
+    with secured(tmp_path / "run", keys) as running, stream(running):
+        with subscriber("clients/stays") as stays, subscriber("clients/goes") as goes:
+            assert stays.wait(TOPIC, 10) is not None and goes.wait(TOPIC, 10) is not None
+            (clients / "broken.pub").write_text("no key")  # lets nobody in, and keeps nobody out
+            (clients / "goes.pub").unlink()
+            until(lambda: goes.refusal, seconds=10)
+            before = goes.latest(TOPIC)
+            assert stays.wait(TOPIC, 10) is not None
+            until(lambda: stays.problem(TOPIC) is None, seconds=10)
+            assert goes.latest(TOPIC) is before
+            with subscriber("comes") as early:
+                until(lambda: early.refusal, seconds=10)
+            (keys / "comes.pub").rename(clients / "comes.pub")
+            time.sleep(LOOK_AGAIN)
+            mine = ClientKeys(read_key_pair(keys / "comes.key"), read_public_key(keys / "node.pub"))
+            with ControlClient(running.connection.control, keys=mine) as asker:
+                assert asker.request("ping") == "pong"
+            assert stays.problem(TOPIC) is None
+
+
 def test_ipc_needs_no_key_and_belongs_to_its_user(tmp_path: Path, keys: Path) -> None:
     run_dir = tmp_path / "run"
     with (
@@ -352,6 +387,25 @@ def test_random_bytes_on_both_ports_while_a_client_receives(
             assert _resident_mb() - before < 30
         with ControlClient(connection.control, keys=mine) as asker:
             assert asker.request("ping") == "pong"
+
+
+@pytest.mark.parametrize(
+    "said", [b"", b"GET / HTTP/1.1\r\n\r\n", b"\xff" + bytes(8) + b"\x7f"], ids=["nothing", "http", "half"]
+)
+def test_raw_connections_leave_no_descriptor(tmp_path: Path, said: bytes) -> None:
+    def descriptors() -> int:
+        return len(os.listdir("/proc/self/fd"))
+
+    with publisher(tmp_path / "run") as running:
+        before = descriptors()
+        for endpoint in (running.connection.data[-1], str(running.connection.control)):
+            host, port = endpoint.removeprefix("tcp://").split(":")
+            for _ in range(100):
+                with socket.create_connection((host, int(port))) as stranger:
+                    stranger.sendall(said)
+        until(lambda: running.connections["data"]["refused"] == 100)
+        until(lambda: running.connections["control"]["refused"] == 100)
+        until(lambda: descriptors() == before, seconds=10)
 
 
 def test_a_peer_of_the_old_protocol_is_no_subscriber(tmp_path: Path) -> None:

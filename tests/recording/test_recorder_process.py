@@ -13,6 +13,7 @@ import pytest
 from synthetic import publisher, stream
 
 from sags_node.errors import SagsError
+from sags_node.processes import children
 from sags_node.recording import child
 from sags_node.recording.child import RecorderProcess
 from sags_node.recording.info import bag_info
@@ -36,9 +37,7 @@ def recorder(tmp_path: Path) -> Iterator[RecorderProcess]:
 
 def recorders() -> list[int]:
     """The processes that this one has started to record."""
-    tasks = Path("/proc/self/task").glob("*/children")
-    started = [process for task in tasks for process in task.read_text().split()]
-    return [int(process) for process in started if b"record" in Path(f"/proc/{process}/cmdline").read_bytes()]
+    return children("record")
 
 
 def test_a_snapshot_of_an_ordinary_recording_is_refused_and_the_recording_goes_on(

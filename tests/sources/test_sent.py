@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sags_node.config import LaunchConfig, PushRobot, PushSource, Ros2Source
+from sags_node.config import GeometryConfig, LaunchConfig, PushRobot, PushSource, Ros2Source
 from sags_node.errors import SagsError
 from sags_node.foreground import inputs_text
 from sags_node.health import Statistics
@@ -46,6 +46,24 @@ def test_another_size_is_refused_with_both_sizes() -> None:
     sent = SentPictures(PushSource(), (640, 512))
     with pytest.raises(SagsError, match=r"8x4 px.*640x512"):
         sent.put("left", S, S, picture)
+
+
+def test_pictures_of_both_eyes_are_taken_apart_and_cropped() -> None:
+    both = np.random.default_rng(3).integers(0, 256, (12, 8, 3), np.uint8)
+    geometry = GeometryConfig(layout="over_under", first="right", crop=(2, 1, 5, 4), flip="vertical")
+    sent = SentPictures(PushSource(geometry=geometry), (5, 4))
+    sent.put_both(S, S, lambda: both)
+    for eye, half in (("left", both[6:]), ("right", both[:6])):
+        sent.put(eye, S + PERIOD, S + PERIOD, lambda half=half: half)  # and one eye's in the same way
+    for _, frame in zip(range(2), sent.pairs, strict=False):  # in this order: a third one never comes
+        assert frame.right is not None
+        assert (frame.left == both[7:11, 2:7][::-1]).all() and (frame.right == both[1:5, 2:7][::-1]).all()
+    with pytest.raises(SagsError, match="a picture is 11 px high, which is odd"):
+        sent.put_both(2 * S, 2 * S, lambda: both[:11])
+    with pytest.raises(SagsError, match=r"leaves the picture: an eye of a picture is 6x6 px"):
+        sent.put_both(2 * S, 2 * S, lambda: both[:, :6])
+    with pytest.raises(ValueError, match="frame_sequential is for cameras"):
+        PushSource(geometry=GeometryConfig(layout="frame_sequential"))
 
 
 def test_the_latency_is_taken_off_and_all_stamps_are_kept() -> None:

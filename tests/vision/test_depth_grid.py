@@ -195,6 +195,22 @@ def test_the_drawn_depth_says_how_sure_it_is_and_keeps_silent_where_it_is_a_gues
     assert error_of(shown.confidence[:, :140]) == pytest.approx(1e-3, rel=1e-2)
 
 
+def test_a_drawn_depth_is_no_surer_than_it_agrees_with_what_is_measured() -> None:
+    """The model is sure of a wall, and the frame sees another one nearer in the left half."""
+    apart = 8e-3
+    seen = np.full(SHAPE, DEPTH, np.float32)
+    seen[:, : WIDTH // 2] -= apart
+    grid = grid_of(seen.copy())
+    drawn = np.full(SHAPE, DEPTH, np.float32)
+    view = RenderedView(0, 0, CAMERA, np.zeros((*SHAPE, 3), np.float32), drawn, np.ones(SHAPE, np.float32))
+    shown = with_confidence(view, wall(1e-3).gaussians(), grid)
+    assert shown.confidence is not None
+    its_error = float((grid.error * np.square(DEPTH - apart))[:, :30].max())
+    assert its_error < apart - HALVING  # or the two need not contradict each other
+    assert shown.confidence[:, :120].max() <= confidence_of(np.float32(apart - its_error)) + 1e-3 < SURE
+    assert np.allclose(shown.confidence[:, 200:], confidence_of(np.float32(1e-3)), atol=1e-3)
+
+
 def test_a_model_that_does_not_know_its_errors_has_no_confidence() -> None:
     gaussians = replace(wall(1e-3).gaussians(), depth_errors=None)
     view = RenderedView(

@@ -103,6 +103,22 @@ def test_where_a_drop_on_the_right_lens_hides_it_no_depth_is_measured(
     assert now.observation.tissue[rows, columns].mean() > 0.9
 
 
+@pytest.mark.parametrize("sigma", [0.8, 1.2, 1.6, 2.0])
+def test_a_veil_over_one_lens_is_no_drop(
+    sigma: float, session: Session, frames: list[StereoFrame], clean: list[FrameResult]
+) -> None:
+    """It is told of, and its frames are held; those before that keep their tissue."""
+
+    def veiled(frame: StereoFrame) -> StereoFrame:
+        return replace(frame, left=np.asarray(cv2.GaussianBlur(frame.left, (0, 0), sigma)))
+
+    results, codes = _play(session, frames, veiled)
+    assert not {code for found in codes for code in found if code.endswith("drops")}
+    for result, true in zip(results, clean, strict=True):
+        if not result.held:
+            assert result.observation.tissue.mean() > 0.95 * true.observation.tissue.mean()
+
+
 @pytest.mark.parametrize(
     "change",
     [

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import select
 import socket
 import struct
@@ -13,7 +12,7 @@ import tempfile
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,14 +24,20 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from sags_node.benchmark.node.crowd import STARTING, STATUS, STOPPING, Advance, node_beside, watched
+from sags_node.config import RosGraph
 from sags_node.errors import SagsError
 from sags_node.evaluation.metrics import percentiles
+from sags_node.messaging.cdr import COMPRESSED
 from sags_node.messaging.subscriber import Subscriber
-from sags_node.processes import end
+from sags_node.messaging.topics import IMAGE, POINT_CLOUD
+from sags_node.processes import cpu_seconds, end
+from sags_node.recording.pictures import header_stamp
+from sags_node.ros.graph import Graph
 
-TICKS = os.sysconf("SC_CLK_TCK")  # of CPU time in a second
 PICTURES = ("/sags/left/image_rect_color", "/sags/left/render/image")
 LAYOUT = (*PICTURES, "/sags/points", "/sags/anchors", "/sags/tf", "/sags/figures")  # what the layout shows
+WHOLE = ("sags/left/render/image", "sags/left/render/depth", "sags/anchors")
+HALF = ("sags/thin/half/left/render/image/jpeg", "sags/thin/half/left/render/depth/png", "sags/anchors")
 THIN = tuple(f"{picture}/h264" for picture in PICTURES)
 
 
@@ -50,7 +55,8 @@ class Heard:
         self.size += size
 
 
-Listen = Callable[[int, Heard, threading.Event], None]
+Said = dict[str, Any]  # by a bridge: where its peers find it
+Listen = Callable[[Said, Heard, threading.Event], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,9 +82,9 @@ def measure_bridges(launch: Sequence[str], seconds: float, advance: Advance) -> 
             for case in CASES:
                 with _bridge(case, Path(folder)) as (process, heard):
                     began = time.monotonic()
-                    before, frames = _cpu_seconds(process.pid), _frames(observer)
+                    before, frames = cpu_seconds(process.pid), _frames(observer)
                     seen = _seen(observer, seconds, node, advance, case.name)
-                    spent, shown = _cpu_seconds(process.pid) - before, _frames(observer) - frames
+                    spent, shown = cpu_seconds(process.pid) - before, _frames(observer) - frames
                     took = time.monotonic() - began
                     ages = percentiles(heard.ages_ms[case.leading])
                     if ages is None or shown <= 0:
@@ -146,19 +152,13 @@ def _frames(observer: Subscriber) -> int:
     return 0 if status is None else int(json.loads(status.text)["last_frame"].get("frame_id", 0))
 
 
-def _cpu_seconds(process: int) -> float:
-    """Of a process and its threads."""
-    fields = Path(f"/proc/{process}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / TICKS
-
-
 # ---- a bridge and its peer ---------------------------------------------------------------------------------
 
 
 @contextmanager
 def _bridge(case: Case, folder: Path) -> Iterator[tuple[subprocess.Popen[str], Heard]]:
     """A bridge in its own process, and a peer on a thread."""
-    command = [sys.executable, "-m", "sags_node", "bridge", *case.command, "--port", "0", "--json"]
+    command = [sys.executable, "-m", "sags_node", "bridge", *case.command, "--json"]
     process = subprocess.Popen([*command, "--run-dir", str(folder)], stdout=subprocess.PIPE, text=True)
     stop, heard = threading.Event(), Heard()
     peer: threading.Thread | None = None
@@ -170,7 +170,7 @@ def _bridge(case: Case, folder: Path) -> Iterator[tuple[subprocess.Popen[str], H
             raise SagsError(
                 f"{case.name}: the bridge did not start; try: sags bridge {' '.join(case.command)}"
             )
-        peer = threading.Thread(target=case.listen, args=(json.loads(line)["port"], heard, stop))
+        peer = threading.Thread(target=case.listen, args=(json.loads(line), heard, stop))
         peer.start()
         deadline = time.monotonic() + STARTING
         while not heard.ages_ms.get(case.leading):
@@ -187,10 +187,10 @@ def _bridge(case: Case, folder: Path) -> Iterator[tuple[subprocess.Popen[str], H
             peer.join(STOPPING)
 
 
-def _listen_igtl(port: int, heard: Heard, stop: threading.Event) -> None:
+def _listen_igtl(said: Said, heard: Heard, stop: threading.Event) -> None:
     """Read every OpenIGTLink message, and no more of it than its header."""
     header = struct.Struct(">H12s20sIIQQ")
-    with socket.create_connection(("127.0.0.1", port), timeout=STOPPING) as joined:
+    with socket.create_connection((said["host"], said["port"]), timeout=STOPPING) as joined:
         with joined.makefile("rb", buffering=1 << 20) as stream:
             while not stop.is_set():
                 try:
@@ -205,9 +205,10 @@ def _listen_igtl(port: int, heard: Heard, stop: threading.Event) -> None:
 def _listen_foxglove(names: Sequence[str]) -> Listen:
     """A client that looks at these channels."""
 
-    def listen(port: int, heard: Heard, stop: threading.Event) -> None:
+    def listen(where: Said, heard: Heard, stop: threading.Event) -> None:
         known: dict[str, int] = {}
-        with connect(f"ws://127.0.0.1:{port}", subprotocols=["foxglove.sdk.v1"], max_size=None) as joined:  # type: ignore[list-item]  # a plain name
+        url, plain = f"ws://{where['host']}:{where['port']}", ["foxglove.sdk.v1"]
+        with connect(url, subprotocols=plain, max_size=None) as joined:  # type: ignore[arg-type]  # its own str
             while not stop.is_set() and len(known) < len(names):
                 said = joined.recv(timeout=STARTING)
                 if isinstance(said, str):
@@ -229,8 +230,59 @@ def _listen_foxglove(names: Sequence[str]) -> Listen:
     return listen
 
 
+def _listen_ros2(topics: Mapping[str, str]) -> Listen:
+    """A DDS process that reads these topics, by name and type."""
+
+    def listen(said: Said, heard: Heard, stop: threading.Event) -> None:
+        graph = Graph(RosGraph(domain=said["domain"], interface=said["interface"]))
+        readers = {name: graph.reader(name, kind) for name, kind in topics.items()}
+        while not stop.is_set():
+            graph.wait(0.1)
+            for name, reader in readers.items():
+                for data in reader.take():
+                    heard.note(name, header_stamp(data) * 1e-9, len(data))
+
+    return listen
+
+
+def _listen_web(names: Sequence[str]) -> Listen:
+    """A WebSocket client that asks for these topics, and reads no more of a message than its header."""
+
+    def listen(said: Said, heard: Heard, stop: threading.Event) -> None:
+        with connect(f"ws://127.0.0.1:{said['port']}/ws", max_size=None) as joined:
+            joined.send(json.dumps({"subscribe": names}))
+            while not stop.is_set():
+                try:
+                    message = joined.recv(timeout=1.0)
+                except TimeoutError:
+                    continue
+                except ConnectionClosed:
+                    return
+                if isinstance(message, bytes):
+                    head = json.loads(message[4 : 4 + struct.unpack_from("<I", message)[0]])
+                    heard.note(head["topic"], head["stamp_ns"] * 1e-9, len(message))
+
+    return listen
+
+
+ANY_PORT = ("--port", "0")
+RAW = {
+    **dict.fromkeys((*PICTURES, "/sags/left/render/depth"), IMAGE),
+    **dict.fromkeys(("/sags/points/all", "/sags/anchors"), POINT_CLOUD),
+}
+SMALL = {
+    **dict.fromkeys((f"{picture}/compressed" for picture in PICTURES), COMPRESSED),
+    **dict.fromkeys(("/sags/points", "/sags/anchors"), POINT_CLOUD),
+}
+SMALL_DEPTH = {"/sags/left/render/depth/compressedDepth": COMPRESSED}
+IN_GRAPH = ("ros2", "--domain", "230")  # where nobody else is
 CASES = (
-    Case("openigtlink", ("openigtlink",), "SagsPicture", _listen_igtl),
-    Case("foxglove", ("foxglove",), PICTURES[1], _listen_foxglove(LAYOUT)),
-    Case("foxglove, H.264", ("foxglove",), THIN[1], _listen_foxglove(THIN)),
+    Case("openigtlink", ("openigtlink", *ANY_PORT), "SagsPicture", _listen_igtl),
+    Case("foxglove", ("foxglove", *ANY_PORT), PICTURES[1], _listen_foxglove(LAYOUT)),
+    Case("foxglove, H.264", ("foxglove", *ANY_PORT), THIN[1], _listen_foxglove(THIN)),
+    Case("ros2, raw", IN_GRAPH, PICTURES[1], _listen_ros2(RAW)),
+    Case("ros2, small", IN_GRAPH, f"{PICTURES[1]}/compressed", _listen_ros2(SMALL)),
+    Case("ros2, small depth", IN_GRAPH, next(iter(SMALL_DEPTH)), _listen_ros2(SMALL_DEPTH)),
+    Case("web", ("web", *ANY_PORT), WHOLE[0], _listen_web(WHOLE)),
+    Case("web, half size", ("web", *ANY_PORT), HALF[0], _listen_web(HALF)),
 )

@@ -1,6 +1,8 @@
 """The confidence of a drawn depth, from the predicted errors of what was drawn.
 
 The errors are averaged on a coarse grid, weighted by what each Gaussian covers of the surface that is drawn.
+Where a frame measures another depth than is drawn, the difference is an error of at least that size: surfaces
+that were left behind can be drawn together with new ones.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ from numba import prange
 from sags_node.confidence import HALVING, LEAST
 from sags_node.engine.pinhole import pack, to_camera, to_pixel
 from sags_node.kernels.jit import kernel, parallel_kernel, read_only
-from sags_node.types import F32, Gaussians, RenderedView
+from sags_node.types import F32, DepthGrid, Gaussians, RenderedView
 
 CELLS = 80  # across the picture
 BEHIND = 0.035  # of the depth: what is so far behind the drawn surface is hidden by it
@@ -23,8 +25,14 @@ SHARES = 4  # of the Gaussians, each added up by itself
 ENOUGH = 3  # Gaussians in a cell, on the average: of more not all are looked at
 
 
-def with_confidence(view: RenderedView, gaussians: Gaussians) -> RenderedView:
-    """The view of these Gaussians with its confidence; a depth below `LEAST` is taken out, in place."""
+def with_confidence(
+    view: RenderedView, gaussians: Gaussians, measured: DepthGrid | None = None
+) -> RenderedView:
+    """The view of these Gaussians with its confidence; a depth below `LEAST` is taken out, in place.
+
+    Args:
+        measured: what is known of the depth in the same frame, in cells of the same size.
+    """
     if gaussians.depth_errors is None:
         return view
     height, width = view.depth.shape
@@ -38,7 +46,11 @@ def with_confidence(view: RenderedView, gaussians: Gaussians) -> RenderedView:
         sums,
     )  # fmt: skip
     coarse = np.empty((rows, columns), np.float32)
-    _average(sums, np.float32(HALVING), coarse)
+    nothing = np.zeros((0, 0), np.float32)
+    inverse, error = (nothing, nothing) if measured is None else (measured.inverse, measured.error)
+    if inverse.shape != coarse.shape:
+        inverse = error = nothing
+    _average(sums, np.float32(HALVING), view.depth, side, inverse, error, coarse)
     wide = cv2.resize(coarse, (columns * side, rows), interpolation=cv2.INTER_LINEAR)
     confidence = np.empty((height, width), np.float32)
     _state(wide, np.float32(1 / side), np.float32(LEAST), view.depth, confidence)
@@ -95,9 +107,13 @@ def _add_up_rows(
 
 
 @kernel
-def _average(sums: F32, halving: Any, confidence: F32) -> None:
-    """Over each cell and, by half, its neighbours."""
+def _average(
+    sums: F32, halving: Any, depth: F32, side: int, inverse: F32, error: F32, confidence: F32
+) -> None:
+    """Over each cell and, by half, its neighbours; no less than what it differs from what is measured in it
+    (`inverse` and `error` of a `DepthGrid`, or empty)."""
     shares, _, rows, columns = sums.shape
+    height, width = depth.shape[0] - 1, depth.shape[1] - 1
     half = np.float32(0.5)
     total = np.zeros((2, rows + 2, columns + 2), np.float32)  # none beyond the edges
     for k in range(2):
@@ -115,7 +131,20 @@ def _average(sums: F32, halving: Any, confidence: F32) -> None:
             squares = half * (line[1, column] + line[1, column + 2]) + line[1, column + 1]
             confidence[row, column] = np.float32(0)
             if covered > 0:
-                confidence[row, column] = np.float32(2) ** (-np.sqrt(squares / covered) / halving)
+                wrong = np.sqrt(squares / covered)
+                if inverse.size:
+                    drawn = depth[min(row * side + side // 2, height), min(column * side + side // 2, width)]
+                    wrong = max(wrong, _difference(drawn, inverse[row, column], error[row, column]))
+                confidence[row, column] = np.exp2(-wrong / halving)
+
+
+@kernel
+def _difference(drawn: Any, inverse: Any, error: Any) -> Any:
+    """By how much a drawn depth differs from a measured one beyond the error of that, m."""
+    if not (drawn > 0 and inverse > 0):
+        return np.float32(0)
+    measured = np.float32(1) / inverse
+    return abs(drawn - measured) - error * measured * measured
 
 
 @kernel

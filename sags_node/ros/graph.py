@@ -1,30 +1,26 @@
-"""A ROS 2 graph without ROS: raw messages by DDS, with the `cyclonedds` package.
-
-ROS 2 is DDS with conventions: a topic `/a` is called `rt/a`, a type `pkg/msg/Name` is called
-`pkg::msg::dds_::Name_`, and what travels is CDR. So no message is defined here: bytes come out as they came.
-"""
+"""A ROS 2 graph, joined by DDS with the `cyclonedds` package."""
 
 from __future__ import annotations
 
 import logging
 import os
 import threading
-from collections.abc import Iterator
-from dataclasses import dataclass
+import time
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from sags_node.config import RosGraph
 from sags_node.errors import SagsError, UsageError
-from sags_node.messaging.cdr import type_hash
+from sags_node.messaging import cdr
+from sags_node.ros.endpoints import BEST_EFFORT, Delivery, Reader, Writer, ros_type
 
 log = logging.getLogger(__name__)
 
-MOST_AT_ONCE = 16  # messages or announcements taken in one go
 RECEIVE_BUFFER = 16 << 20  # bytes asked for; the kernel gives no more than net.core.rmem_max
 ANNOUNCED = 0.5  # s between announcements of this process: so soon a node that comes up is found
 PARTICIPANTS = 32  # DDS processes on this machine that are looked for
 ALIVE = 16  # DDS' instance state
+NODES = "ros_discovery_info"  # the topic on which processes say which nodes are theirs
 _CONFIG = """<CycloneDDS><Domain Id="any">
 <General><Interfaces><NetworkInterface name="{interface}"/></Interfaces>{general}</General>
 <Discovery><ParticipantIndex>auto</ParticipantIndex>
@@ -46,8 +42,7 @@ class Graph:
 
     def __init__(self, config: RosGraph) -> None:
         try:
-            from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
-            from cyclonedds.core import DDSException, WaitSet
+            from cyclonedds.core import DDSException, Policy, Qos, WaitSet
             from cyclonedds.domain import DomainParticipant
         except ImportError:
             raise UsageError("ROS 2 needs one more package: pip install 'sags-node[ros2]'") from None
@@ -55,19 +50,26 @@ class Graph:
         self.interface = config.interface
         self._domain = _domain(self.domain, config.interface)
         try:
-            self.participant = DomainParticipant(self.domain)
-            self._announced = BuiltinDataReader(self.participant, BuiltinTopicDcpsPublication)
+            self.participant = DomainParticipant(self.domain, Qos(Policy.Userdata(b"enclave=/;")))
             self._waiting = WaitSet(self.participant)
         except DDSException as error:
             raise SagsError(f"cannot join ROS 2 domain {self.domain}: {error.msg}") from None
+        self._read: list[bytes] = []  # by GUID
+        self._written: list[bytes] = []
+        self._said: Writer | None = None  # that says which node this is
+        self._announced: Any = None  # what others publish; nobody may ever ask
         self._publications: dict[Any, tuple[str, str]] = {}  # by writer: topic and type, in ROS' words
 
     def publications(self) -> dict[str, set[str]]:
         """The topics that somebody publishes now, and their types."""
+        if self._announced is None:
+            from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
+
+            self._announced = BuiltinDataReader(self.participant, BuiltinTopicDcpsPublication)
         for said in self._announced.take(4096):
             alive = said.sample_info.instance_state == ALIVE
             if alive and said.topic_name is not None and said.topic_name.startswith("rt/"):
-                self._publications[said.key] = said.topic_name[2:], _ros_type(said.type_name)
+                self._publications[said.key] = said.topic_name[2:], ros_type(said.type_name)
             elif not alive:
                 self._publications.pop(said.key, None)
         found: dict[str, set[str]] = {}
@@ -75,16 +77,28 @@ class Graph:
             found.setdefault(topic, set()).add(kind)
         return found
 
-    def reader(self, topic: str, kind: str, depth: int = 4, kept: bool = False) -> Reader:
-        """A reader of a topic, told as ROS tells it, e.g. `/a/image_raw`.
-
-        Args:
-            depth: the newest messages that wait to be taken.
-            kept: also what was sent before, by writers that keep it (`tf_static`).
-        """
-        reader = Reader(self.participant, topic, kind, depth, kept)
+    def reader(self, topic: str, kind: str, delivery: Delivery = BEST_EFFORT) -> Reader:
+        """A reader of a topic, told as ROS tells it, e.g. `/a/image_raw`. Best effort fits every writer."""
+        reader = Reader(self.participant, topic, kind, delivery)
         self._waiting.attach(reader.condition)
+        self._read.append(reader.guid)
         return reader
+
+    def writer(self, topic: str, kind: str, delivery: Delivery = BEST_EFFORT) -> Writer:
+        """A writer of a topic, told as ROS tells it."""
+        writer = Writer(self.participant, topic, kind, delivery)
+        self._written.append(writer.guid)
+        return writer
+
+    def call_it(self, node: str) -> None:
+        """Let the graph show what is read and written so far as a node of this name, e.g. `/sags`."""
+        if self._said is None:
+            newest = Delivery(reliable=True, kept=True, depth=1)
+            self._said = Writer(self.participant, NODES, cdr.NODES, newest)
+        guid = self.participant.guid.bytes
+        namespace, _, name = node.rpartition("/")
+        body = cdr.node_entities(guid, namespace or "/", name, self._read, self._written)
+        self._said.write(body, time.time_ns())
 
     def wait(self, seconds: float) -> None:
         """Until something can be taken from one of the readers, or the time is over."""
@@ -100,39 +114,6 @@ class Graph:
 def where(domain: int, interface: str) -> str:
     """A graph, for messages."""
     return f"ROS 2 domain {domain}, interface {interface}"
-
-
-class Reader:
-    """The raw messages of one topic. Best effort fits every writer; nobody waits for us."""
-
-    def __init__(self, participant: Any, topic: str, kind: str, depth: int, kept: bool) -> None:
-        from cyclonedds.core import InstanceState, Policy, Qos, ReadCondition, SampleState, ViewState
-        from cyclonedds.sub import DataReader
-        from cyclonedds.topic import Topic
-        from cyclonedds.util import duration
-
-        self.kind = kind
-        policies = [
-            Policy.Reliability.Reliable(duration(milliseconds=100))
-            if kept
-            else Policy.Reliability.BestEffort,
-            Policy.Durability.TransientLocal if kept else Policy.Durability.Volatile,
-            Policy.History.KeepLast(depth),
-            Policy.DataRepresentation(use_cdrv0_representation=True, use_xcdrv2_representation=False),
-            Policy.Userdata(f"typehash={type_hash(kind)};".encode()),
-        ]
-        self._any = SampleState.Any | ViewState.Any | InstanceState.Any
-        self._topic = Topic(participant, f"rt{topic}", raw_type(kind))
-        self._reader = DataReader(participant, self._topic, Qos(*policies))
-        self.condition = ReadCondition(self._reader, self._any)
-
-    def take(self) -> Iterator[bytes]:
-        """The messages that have come, oldest first, as CDR."""
-        from cyclonedds._clayer import ddspy_take  # the only way to bytes; so the package's version is fixed
-
-        for data, info in ddspy_take(self._reader._ref, self._any, MOST_AT_ONCE):
-            if info.valid_data:
-                yield data
 
 
 def domain_of(config: RosGraph) -> int:
@@ -151,8 +132,14 @@ def domain_of(config: RosGraph) -> int:
 
 def receive_buffer() -> int:
     """The receive buffer that the kernel grants us, bytes."""
-    limit = Path("/proc/sys/net/core/rmem_max")
-    return min(RECEIVE_BUFFER, int(limit.read_text())) if limit.exists() else RECEIVE_BUFFER
+    return min(RECEIVE_BUFFER, kernel_buffer("max") or RECEIVE_BUFFER)
+
+
+def kernel_buffer(which: Literal["default", "max"]) -> int | None:
+    """The receive buffer, in bytes, of a process of this machine that asks for none, or the largest that it
+    may ask for; None: the kernel does not tell."""
+    said = Path(f"/proc/sys/net/core/rmem_{which}")
+    return int(said.read_text()) if said.exists() else None
 
 
 _lock = threading.Lock()
@@ -186,30 +173,3 @@ def _domain(number: int, interface: str) -> Any:
             log.warning("ROS 2 on interface %s is not authenticated: who reaches it is believed", interface)
         _domains[number] = interface, domain
         return domain
-
-
-_types: dict[str, Any] = {}
-
-
-def raw_type(kind: str) -> Any:
-    """A DDS type without fields under the name of a ROS type: CDR goes in and out as it is."""
-    if kind not in _types:
-        from cyclonedds.idl import IdlStruct
-        from cyclonedds.idl.annotations import final
-
-        package, _, name = kind.split("/")
-
-        @dataclass
-        @final
-        class Raw(IdlStruct, typename=f"{package}.msg.dds_.{name}_"):  # type: ignore[misc, call-arg]
-            pass
-
-        Raw.__idl__.populate()
-        _types[kind] = Raw
-    return _types[kind]
-
-
-def _ros_type(name: str) -> str:
-    """`pkg::msg::dds_::Name_` as ROS says it."""
-    package, _, last = name.partition("::")
-    return f"{package}/msg/{last.rpartition('::')[2].removesuffix('_')}"

@@ -1,0 +1,175 @@
+"""The C# client for Unity, compiled and run by Debian's mono: against a real gateway and a false one."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import struct
+import subprocess
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bridging import SEEN, anchored, anchored_at, bridged, sockets
+from places import ROOT
+from synthetic import HEIGHT, WIDTH, stream
+
+pytest.importorskip("websockets", reason="no gateway without: pip install 'sags-node[bridges]'")
+
+from websockets.sync.server import ServerConnection, serve
+
+from sags_node.bridge.feed import Place
+from sags_node.bridge.web import Options, run_web
+
+pytestmark = pytest.mark.live
+
+SOURCE = ROOT / "examples/unity"
+BLANK_WITHIN = 0.5  # s, that are promised
+NOTICE = 0.5  # s more, that a loaded machine may take to print it
+UNITY = """
+namespace UnityEngine {
+    public class MonoBehaviour { public T GetComponent<T>() where T : class { return null; } }
+    public class Texture {}
+    public enum TextureFormat { RGBA32 }
+    public class Texture2D : Texture {
+        public Texture2D(int width, int height, TextureFormat format, bool mipChain) {}
+        public int width, height;
+        public void LoadRawTextureData(byte[] data) {}
+        public void Apply() {}
+    }
+    public struct Rect { public Rect(float x, float y, float width, float height) {} }
+    namespace UI {
+        public class RawImage { public bool enabled; public Texture texture; public Rect uvRect; }
+    }
+}"""
+LINE = re.compile(r"stamp_ns=(\d+) shape=(\d+)x(\d+) depth_mm=(\S+) rgba=(\S+) anchors=(\S*)\n")
+
+
+@pytest.fixture(scope="module")
+def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    missing = [tool for tool in ("mcs", "mono") if shutil.which(tool) is None]
+    if missing:
+        pytest.skip(f"no C# client without {', '.join(missing)} (Debian: mono-mcs mono-runtime)")
+    if not list(Path("/usr/lib/mono").glob("*/System.Runtime.Serialization.dll")):
+        pytest.skip("no C# client without Debian's libmono-system-runtime-serialization4.0-cil")
+    built = tmp_path_factory.mktemp("csharp") / "sags.exe"
+    compiled(SOURCE / "SagsClient.cs", SOURCE / "Program.cs", f"-out:{built}")
+    return built
+
+
+def compiled(*arguments: Path | str) -> None:
+    command = ["mcs", "-warnaserror", "-r:System.Runtime.Serialization.dll", *arguments]
+    told = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    assert told.returncode == 0, told.stdout + told.stderr
+
+
+@contextmanager
+def running(program: Path, port: int) -> Iterator[subprocess.Popen[str]]:
+    process = subprocess.Popen(
+        ["mono", program, f"ws://127.0.0.1:{port}/ws"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def until_line(process: subprocess.Popen[str], start: str) -> str:
+    assert process.stdout is not None
+    while not (line := process.stdout.readline()).startswith(start):
+        assert line, "it ended"  # it is killed by the test's own time limit, at the latest
+    return line
+
+
+def test_it_shows_depth_colour_and_anchors_and_nothing_old(program: Path, tmp_path: Path) -> None:
+    view = anchored().views["left"]
+    options = Options(Place(run_dir=tmp_path), Place("overlay", run_dir=tmp_path), port=0)
+    with sockets(tmp_path) as node, bridged(run_web, options) as port, running(program, port) as process:
+        with stream(node, anchored_at):
+            found = LINE.fullmatch(until_line(process, "stamp_ns="))
+            assert found is not None
+            until_line(process, "stamp_ns=")
+        stopped = time.time()
+        assert "stale: too old" in until_line(process, "stale")
+        assert time.time() - stopped < BLANK_WITHIN + NOTICE
+        with stream(node, anchored_at):  # and comes back
+            until_line(process, "stamp_ns=")
+    middle = (HEIGHT // 2, WIDTH // 2)
+    _, height, width, depth_mm, rgba, anchors = found.groups()
+    assert (int(height), int(width)) == (HEIGHT, WIDTH)
+    assert float(depth_mm) == pytest.approx(1000 * view.depth[middle], abs=1e-3)
+    assert rgba.split(",") == [str(round(255 * value)) for value in (*view.rgb[middle], view.alpha[middle])]
+    first = anchors.split(";")[0].split(":")
+    assert int(first[0]) == SEEN and float(first[1]) == pytest.approx(0.07) and len(anchors.split(";")) == 2
+
+
+def test_the_part_for_unity_compiles(program: Path, tmp_path: Path) -> None:
+    """Against the signatures that Unity's manual names; Unity itself is not here."""
+    (tmp_path / "Unity.cs").write_text(UNITY)
+    compiled("-d:UNITY_5_3_OR_NEWER", "-target:library", SOURCE / "SagsClient.cs", tmp_path / "Unity.cs",
+             f"-out:{tmp_path / 'unity.dll'}")  # fmt: skip
+
+
+def test_a_false_gateway_does_not_end_it(program: Path, tmp_path: Path) -> None:
+    """Broken messages, then a true one over a new connection."""
+    now_ns = time.time_ns
+    attempts: list[int] = []
+    stamp = now_ns()
+
+    def message(topic: str, encoding: str, shape: list[int], data: bytes, **changes: object) -> bytes:
+        head = {
+            "topic": topic,
+            "encoding": encoding,
+            "shape": shape,
+            "stamp_ns": stamp,
+            "parts": [0, len(data)],
+        }
+        text = json.dumps({**head, **changes}).encode()
+        return struct.pack("<I", len(text)) + text + data
+
+    broken = [
+        b"", b"\x01", b"\xff\xff\xff\xff", b"\x00\x00\x00\x7f", struct.pack("<I", 4) + b"none",
+        message("t", "32FC1", [1, 1], bytes(4), parts=[-4, 8]),
+        message("t", "32FC1", [1, 1], bytes(4), parts=[2**31 - 1, 2**31 - 1]),
+    ]  # fmt: skip
+
+    def attend(connection: ServerConnection) -> None:
+        nonlocal stamp
+        attempts.append(len(attempts))
+        if attempts[-1] < len(broken):
+            connection.send(broken[attempts[-1]])
+            connection.recv()
+        else:
+            while True:
+                asked = json.loads(connection.recv())
+                clock = {"received_ns": now_ns(), "answered_ns": now_ns()}
+                if "op" in asked:
+                    connection.send(json.dumps({"id": asked["id"], "ok": True, "result": clock}))
+                stamp = now_ns()
+                pixels = np.full((2, 2, 4), 9, np.uint8).tobytes()
+                connection.send(message("sags/left/render/image", "rgba8", [3, 2, 4], pixels))  # left out
+                connection.send(message("sags/left/render/image", "rgba8", [2, 2, 4], pixels))
+                metres = np.full(4, 0.07, "<f4").tobytes()
+                connection.send(message("sags/left/render/depth", "32FC1", [2, 2], metres))
+                connection.send(message("sags/anchors", "x,y,z,id", [0, 4], b""))
+
+    with serve(attend, "127.0.0.1", 0) as server:
+        serving = threading.Thread(target=server.serve_forever)
+        serving.start()
+        try:
+            with running(program, server.socket.getsockname()[1]) as process:
+                found = LINE.fullmatch(until_line(process, "stamp_ns="))
+        finally:
+            server.shutdown()
+            serving.join(10)
+    assert found is not None and found[4] == "70" and found[5] == "9,9,9,9" and found[6] == ""
+    assert len(attempts) > len(broken)

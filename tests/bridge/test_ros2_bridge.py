@@ -1,0 +1,312 @@
+"""What `sags bridge ros2` sends into a graph, and what may be asked there: read by DDS alone."""
+
+from __future__ import annotations
+
+import json
+import struct
+import time
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from bridging import anchored, anchored_at, bridged, sockets
+from made_messages import meta
+from ros_peers import DOMAIN, KEPT, Listener, listener
+from synthetic import HEIGHT, WIDTH, plane_camera, plane_depth, stream
+from waiting import until
+
+from sags_node.bridge import ros2
+from sags_node.bridge.compressed import LARGEST, Compressor
+from sags_node.bridge.feed import Place
+from sags_node.bridge.ros2 import PACE, Options, Pace, offers, run_ros2
+from sags_node.bridge.ros2_requests import asks
+from sags_node.config import RosGraph
+from sags_node.errors import SagsError, UsageError
+from sags_node.messaging import cdr, topics
+from sags_node.messaging.received import ReceivedImage, interpret
+from sags_node.messaging.subscriber import Subscriber
+from sags_node.messaging.wire import Message
+from sags_node.ros.endpoints import Delivery
+from sags_node.ros.graph import kernel_buffer
+
+pytestmark = pytest.mark.live
+
+SILENT_WITHIN = 0.5  # s, that are promised
+RARE = ("status", "diagnostics")
+FRAME_TOPICS = [topic.name for topic in topics.TOPICS if topic.name != "parameters"]
+TEXT, TF, ARRAY = topics.STRING, topics.TF, topics.DIAGNOSTICS
+
+
+def options(run_dir: Path, **changes: Any) -> Options:
+    settings = {
+        "node": Place(run_dir=run_dir), "overlay": Place("overlay", run_dir=run_dir),
+        "graph": RosGraph(domain=DOMAIN),
+    }  # fmt: skip
+    return Options(**{**settings, **changes})
+
+
+def named(topic: str) -> str:
+    return {"tf": "/tf", "diagnostics": "/diagnostics"}.get(topic, f"/sags/{topic}")
+
+
+def stamp_of(data: bytes, at: int) -> int:
+    seconds, nanoseconds = struct.unpack_from("<iI", data, at)
+    return int(seconds) * 10**9 + int(nanoseconds)
+
+
+def timeless(data: bytes, stamp_ns: int) -> bytes:
+    """A message without its stamp, which is all that changes; in whole words, as DDS sends it."""
+    assert struct.pack("<iI", *divmod(stamp_ns, 10**9)) in data
+    whole = data + bytes(-len(data) % 4)
+    return whole.replace(struct.pack("<iI", *divmod(stamp_ns, 10**9)), bytes(8))
+
+
+def test_every_topic_comes_byte_for_byte(tmp_path: Path) -> None:
+    wanted = [(named(topic.name), topic.type) for topic in topics.TOPICS if topic.name in FRAME_TOPICS]
+    with sockets(tmp_path) as running, stream(running, anchored_at):
+        with bridged(run_ros2, options(tmp_path)), listener(*wanted) as joined:
+            until(lambda: all(len(joined.came[name]) > (0 if kind == TEXT else 1) for name, kind in wanted))
+            with Subscriber(FRAME_TOPICS, run_dir=tmp_path) as beside:
+                until(lambda: all(beside.latest(name) for name in FRAME_TOPICS))
+                sent = {name: beside.latest(name) for name in FRAME_TOPICS if name not in RARE}
+    for name, message in sent.items():
+        assert message is not None
+        expected = timeless(message.cdr(), message.stamp_ns)
+        for data, _ in joined.came[named(name)]:
+            at = 8 if name == "tf" else 4
+            assert timeless(data, stamp_of(data, at)) == expected, name
+    told = cdr.decode(joined.newest("/sags/status"), TEXT).data
+    assert json.loads(told)["state"] == "running"
+    stages = {
+        status.name for data, _ in joined.came["/diagnostics"] for status in cdr.decode(data, ARRAY).status
+    }
+    assert {"sags: node", "sags: map", "sags: bridge"} <= stages
+
+
+def test_only_what_is_read_is_asked_of_the_node(tmp_path: Path) -> None:
+    with sockets(tmp_path) as running, stream(running, anchored_at):
+        with bridged(run_ros2, options(tmp_path)):
+            time.sleep(0.4)
+            assert {name for name in FRAME_TOPICS if running.wanted(name)} == {"status"}
+            with listener(("/sags/anchors", topics.POINT_CLOUD)) as joined:
+                until(lambda: joined.came["/sags/anchors"])
+                assert {name for name in FRAME_TOPICS if running.wanted(name)} == {"anchors", "status"}
+            until(lambda: not running.wanted("anchors"))
+
+
+def stale(joined: Listener) -> list[str]:
+    """The reasons in the newest message that calls something stale."""
+    arrays = [cdr.decode(data, ARRAY).status for data, _ in reversed(joined.came["/diagnostics"])]
+    return next(
+        (
+            [f"{status.name}: {status.message}" for status in array if status.level == 3]
+            for array in arrays
+            if any(status.level == 3 for status in array)
+        ),
+        [],
+    )
+
+
+def test_what_stops_is_not_sent_again_and_is_called_stale(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ros2, "BEAT", 0.2)
+    wanted = [("/tf", TF), ("/sags/left/camera_info", topics.CAMERA_INFO), ("/diagnostics", ARRAY)]
+    with bridged(run_ros2, options(tmp_path)), listener(*wanted, ("/sags/status", TEXT, KEPT)) as joined:
+        until(lambda: any("sags: node: " in line and "no node" in line.lower() for line in stale(joined)))
+        with sockets(tmp_path) as running:
+            with stream(running, anchored_at):
+                until(lambda: all(len(joined.came[name]) > 5 for name, _ in wanted[:2]))
+                until(lambda: json.loads(cdr.decode(joined.newest("/sags/status"), TEXT).data)["rate_hz"])
+                until(lambda: any(b"map" in data for data, _ in joined.came["/diagnostics"]))
+            stopped = time.time()
+            until(lambda: any("sags: map: " in line and "too old" in line for line in stale(joined)))
+            for name, _ in wanted[:2]:
+                _, when = joined.came[name][-1]
+                assert when - stopped < SILENT_WITHIN, f"{name} was sent again"
+            until(
+                lambda: json.loads(cdr.decode(joined.newest("/sags/status"), TEXT).data)["state"] == "silent"
+            )
+            with listener(
+                ("/sags/status", TEXT, KEPT), ("/sags/left/camera_info", topics.CAMERA_INFO, KEPT)
+            ) as late:
+                until(lambda: late.came["/sags/status"])
+                time.sleep(0.3)
+                states = [
+                    json.loads(cdr.decode(data, TEXT).data)["state"] for data, _ in late.came["/sags/status"]
+                ]
+                assert states == ["silent"] and not late.came["/sags/left/camera_info"], "old is given as new"
+        count = len(joined.came["/tf"])
+        with sockets(tmp_path) as running, stream(running, anchored_at):  # another node, on other ports
+            until(lambda: len(joined.came["/tf"]) > count + 5)
+
+
+def test_points_are_thinned_and_pictures_are_small_files(tmp_path: Path) -> None:
+    wanted = [
+        ("/sags/points", topics.POINT_CLOUD), ("/sags/points/all", topics.POINT_CLOUD),
+        ("/sags/left/image_rect_color/compressed", cdr.COMPRESSED),
+        ("/sags/left/tissue_mask/compressed", cdr.COMPRESSED),
+        ("/sags/left/depth/compressedDepth", cdr.COMPRESSED),
+    ]  # fmt: skip
+    with sockets(tmp_path) as running, stream(running, anchored_at):
+        with bridged(run_ros2, options(tmp_path, points=100)), listener(*wanted) as joined:
+            until(lambda: all(len(joined.came[name]) > 1 for name, _ in wanted))
+    few, every = (
+        cdr.decode(joined.newest(name), topics.POINT_CLOUD) for name in ("/sags/points", "/sags/points/all")
+    )
+    rows = every.data.reshape(every.width, every.point_step)
+    assert every.width > 300 and 50 < few.width <= 100
+    assert few.fields == every.fields
+    assert {row.tobytes() for row in few.data.reshape(few.width, -1)} <= {row.tobytes() for row in rows}
+
+    def file(name: str) -> Any:
+        return cdr.decode(joined.newest(f"/sags/left/{name}"), cdr.COMPRESSED)
+
+    picture = file("image_rect_color/compressed")
+    assert picture.format == "rgb8; jpeg compressed bgr8"
+    assert cv2.imdecode(picture.data, cv2.IMREAD_COLOR).shape == (HEIGHT, WIDTH, 3)
+    mask = cv2.imdecode(file("tissue_mask/compressed").data, cv2.IMREAD_UNCHANGED)
+    assert np.array_equal(mask, np.where(anchored().observation.tissue, 255, 0))
+    depth = file("depth/compressedDepth")
+    truth = plane_depth(plane_camera())
+    assert depth.format == "32FC1; compressedDepth png"
+    decoded = as_ros_decodes(depth.data)
+    assert np.isnan(decoded[0]).all(), "what is not known"
+    assert (
+        np.abs(decoded[1:] - truth[1:]).max() < 0.02e-3 * (truth.max() / 0.1) ** 2
+    )  # half a count, and more
+
+
+def as_ros_decodes(data: np.ndarray) -> np.ndarray:
+    """As compressed_depth_image_transport does, from its source: codec.cpp."""
+    form, a, b = struct.unpack_from("<iff", data)
+    assert form == 0
+    counts = cv2.imdecode(data[12:], cv2.IMREAD_UNCHANGED).astype(np.float32)
+    with np.errstate(divide="ignore"):
+        return np.where(counts > 0, np.float32(a) / (counts - np.float32(b)), np.float32(np.nan))
+
+
+@pytest.mark.parametrize(
+    "name", ["left/image_rect_color", "left/render/image", "left/depth", "left/render/depth_confidence"]
+)
+def test_what_compresses_badly_is_made_coarser_until_it_fits(name: str) -> None:
+    """Noise of 1280x1024 px, which no codec makes small without loss."""
+    topic = topics.find(name)
+    assert topic is not None
+    rng = np.random.default_rng(0)
+    if topic.content.startswith("32FC1"):
+        smooth = 0.1 * np.ones((256, 320), np.float32)
+        noisy = smooth * (1 + 0.01 * rng.standard_normal(smooth.shape, np.float32))
+    else:
+        channels = 4 if topic.content.startswith("rgba8") else 3
+        smooth = np.full((480, 640, channels), 200, np.uint8)
+        noisy = rng.integers(0, 256, smooth.shape, np.uint8)
+    compress = Compressor(topic)
+    first = len(compress(received(name, smooth)))
+    assert len(compress(received(name, noisy))) < LARGEST + 200  # and the message around it
+    for _ in range(10):
+        again = len(compress(received(name, smooth)))
+    assert again == first, "fine again"
+
+
+def received(name: str, array: np.ndarray) -> ReceivedImage:
+    encoding = {3: "rgb8", 4: "rgba8"}[array.shape[2]] if array.ndim == 3 else "32FC1"
+    body = cdr.image(array, encoding, 1)
+    said = meta(
+        1, 0, type_hash=cdr.type_hash(body.type), encoding=encoding, shape=list(body.shape), dtype=body.dtype
+    )
+    found = interpret(Message(f"sags/{name}", said, body.parts), 0)
+    assert isinstance(found, ReceivedImage)
+    return found
+
+
+def test_requests_are_passed_on_and_answered(tmp_path: Path) -> None:
+    asked: list[tuple[str, dict[str, Any]]] = []
+
+    def note(name: str) -> Any:
+        def handle(args: dict[str, Any]) -> dict[str, Any]:
+            asked.append((name, args))
+            if name == "reset_model":
+                raise SagsError("not now")
+            return {"id": 7}
+
+        return handle
+
+    operations = {ask.op for ask in asks(["ros"]).values()}
+    with (
+        sockets(tmp_path, {name: note(name) for name in operations}) as running,
+        stream(running, anchored_at),
+    ):
+        with bridged(run_ros2, options(tmp_path)), listener(("/sags/answer", TEXT)) as joined:
+
+            def ask(name: str, content: bytes) -> dict[str, Any]:
+                kind = asks(["ros"])[name].kind
+                count = len(joined.came["/sags/answer"])
+                writer = joined.graph.writer(f"/sags/request/{name}", kind, Delivery(reliable=True))
+                until(lambda: writer.readers)
+                writer.write(content, time.time_ns())
+                until(lambda: len(joined.came["/sags/answer"]) > count)
+                said = json.loads(cdr.decode(joined.newest("/sags/answer"), TEXT).data)
+                assert said.pop("request") == name
+                return said
+
+            assert ask("add_anchor", point("world", 0.01, 0.02, 0.07)) == {"result": {"id": 7}}
+            assert asked.pop() == ("add_anchor", {"x": 0.01, "y": 0.02, "z": 0.07})
+            ask("add_anchor_at_pixel", HEAD + struct.pack("<ddd", 12.5, 3.0, 0.0))
+            assert asked.pop() == ("add_anchor", {"u": 12.5, "v": 3.0})
+            ask("remove_anchor", HEAD + struct.pack("<I", 7))
+            assert asked.pop() == ("remove_anchor", {"id": 7})
+            ask("open_view", cdr.string('{"name": "ros", "width": 64, "height": 48}').cdr())
+            assert asked.pop() == ("open_view", {"name": "ros", "width": 64, "height": 48})
+            ask("start_recording", cdr.string("case_1").cdr())
+            assert asked.pop() == ("start_recording", {"path": "case_1"})
+            ask("pause", HEAD + b"\0")
+            assert asked.pop() == ("pause", {})
+            assert "not now" in ask("reset_model", HEAD + b"\0")["error"]
+            asked.clear()
+            for name, content, reason in (
+                ("add_anchor", point("tool", 0.0, 0.0, 0.0), "frame 'world'"),
+                ("add_anchor", point("world", float("nan"), 0.0, 0.0), "finite"),
+                ("add_anchor", HEAD, "damaged"),
+                ("open_view", cdr.string('{"name": "other"}').cdr(), "--view: ros"),
+                ("open_view", cdr.string("[" * 100_000).cdr(), "JSON object"),
+                ("start_recording", cdr.string("../../etc").cdr(), "letters"),
+            ):
+                assert reason in ask(name, content)["error"]
+            assert asked == []
+
+
+HEAD = b"\0\1\0\0"  # of CDR, little-endian
+
+
+def point(frame: str, x: float, y: float, z: float) -> bytes:
+    """A `geometry_msgs/PointStamped`, written from the description of CDR alone."""
+    name = frame.encode() + b"\0"
+    head = struct.pack("<iII", 0, 0, len(name)) + name
+    return HEAD + head + b"\0" * (-len(head) % 8) + struct.pack("<ddd", x, y, z)
+
+
+def test_who_asks_for_more_than_a_topic_gives_is_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with bridged(run_ros2, options(tmp_path)):
+        with listener(("/sags/left/depth", topics.IMAGE, KEPT)):  # reliable, and kept
+            until(lambda: "/sags/left/depth: somebody reads it with stricter settings" in caplog.text)
+    assert "net.core.rmem_default" in caplog.text or kernel_buffer("default") >= 4 << 20
+
+
+def test_small_messages_of_a_frame_are_kept_apart() -> None:
+    pace = Pace()
+    begun = time.monotonic()
+    for _ in range(4):
+        pace.wait(150_000)
+    assert time.monotonic() - begun >= 3 * 150_000 / PACE
+
+
+def test_names_of_views_are_checked(tmp_path: Path) -> None:
+    names = {offer.output.name for offer in offers(options(tmp_path, views=("a", "b")))}
+    assert {"/sags/view/a/image", "/sags/view/b/left/depth/compressedDepth"} <= names
+    with pytest.raises(UsageError, match="--view 'a/b'"):
+        offers(options(tmp_path, views=("a/b",)))

@@ -1,0 +1,286 @@
+"""The WebSocket gateway: what its peers get and may ask for, and the page in a real browser."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import socket
+import struct
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from bridging import anchored, anchored_at, bridged, sockets
+from synthetic import HEIGHT, WIDTH, at_frame, plane_result, stream
+from thin_sender import making, node_sockets
+from waiting import until
+
+pytest.importorskip("websockets", reason="no gateway without: pip install 'sags-node[bridges]'")
+
+from websockets.exceptions import ConnectionClosed, InvalidMessage, InvalidStatus
+from websockets.sync.client import ClientConnection, connect
+
+from sags_node.bridge.feed import Place
+from sags_node.bridge.web import LONGEST_MESSAGE, MOST_PEERS, Options, run_web
+from sags_node.messaging import content
+
+pytestmark = pytest.mark.live
+
+CHROMIUM = shutil.which("chromium")
+BLANK_WITHIN = 0.5  # s, that are promised
+DEPTH, IMAGE = "sags/left/render/depth", "sags/left/render/image"
+
+
+def options(run_dir: Path, **changes: Any) -> Options:
+    settings = {"node": Place(run_dir=run_dir), "overlay": Place("overlay", run_dir=run_dir), "port": 0}
+    return Options(**{**settings, **changes})
+
+
+@contextmanager
+def peer(port: int, *names: str, origin: str | None = None) -> Iterator[ClientConnection]:
+    with connect(f"ws://127.0.0.1:{port}/ws", origin=origin, max_size=None, open_timeout=10) as joined:  # type: ignore[arg-type]
+        if names:
+            joined.send(json.dumps({"subscribe": names}))
+        yield joined
+
+
+def parts(message: bytes) -> tuple[dict[str, Any], list[bytes]]:
+    """By docs/bridges.md alone."""
+    (length,) = struct.unpack_from("<I", message)
+    head = json.loads(message[4 : 4 + length])
+    at, found = 4 + length, []
+    for size in head["parts"]:
+        found.append(message[at : at + size])
+        at += size
+    assert at == len(message)
+    return head, found
+
+
+def next_of(
+    joined: ClientConnection, topic: str, seconds: float = 10.0
+) -> tuple[dict[str, Any], list[bytes]]:
+    deadline = time.monotonic() + seconds
+    while True:
+        said = joined.recv(timeout=deadline - time.monotonic())
+        if isinstance(said, bytes):
+            head, found = parts(said)
+            if head["topic"] == topic:
+                return head, found
+
+
+def told(joined: ClientConnection, seconds: float = 10.0) -> dict[str, Any]:
+    """The next text."""
+    deadline = time.monotonic() + seconds
+    while True:
+        said = joined.recv(timeout=deadline - time.monotonic())
+        if isinstance(said, str):
+            return json.loads(said)
+
+
+def test_messages_are_the_nodes_own(tmp_path: Path) -> None:
+    thin = "sags/thin/half/left/render/depth/png"
+    with (
+        node_sockets(tmp_path) as running,
+        making(running, anchored()),
+        bridged(run_web, options(tmp_path)) as port,
+        peer(port, DEPTH, thin) as joined,
+    ):
+        head, found = next_of(joined, DEPTH)
+        small, (_, file) = next_of(joined, thin)
+    frame = at_frame(plane_result(), head["frame_id"], head["stamp_ns"])
+    assert found == [bytes(part) for part in content.FRAME_CONTENT["left/render/depth"](frame).parts]
+    assert head["encoding"] == "32FC1" and head["shape"] == [HEIGHT, WIDTH] and head["epoch"] == frame.epoch
+    assert small["window"] == [0, 0, 2] and file[:4] == b"\x89PNG"
+
+
+def test_what_stops_is_taken_back_with_the_reason(tmp_path: Path) -> None:
+    with bridged(run_web, options(tmp_path)) as port, peer(port, DEPTH, "overlay/status") as joined:
+        said = [told(joined), told(joined)]
+        assert {each["topic"] for each in said} == {DEPTH, "overlay/status"} and "no node" in said[0]["stale"]
+        with sockets(tmp_path) as running:
+            with stream(running, anchored_at):
+                next_of(joined, DEPTH)
+            stopped = time.time()
+            said = [told(joined)]
+            assert time.time() - stopped < BLANK_WITHIN
+            assert said[0]["topic"] == DEPTH and "too old" in said[0]["stale"]
+            with stream(running, anchored_at):
+                next_of(joined, DEPTH)
+
+
+def test_only_what_was_let_in_is_asked_of_the_node(tmp_path: Path) -> None:
+    asked = []
+    handlers = {"add_anchor": lambda args: asked.append(args) or {"id": 7}, "reset_model": asked.append}
+    request = {"id": 3, "op": "add_anchor", "args": {"u": 10, "v": 20}}
+    with sockets(tmp_path, handlers), bridged(run_web, options(tmp_path)) as port, peer(port) as joined:
+        joined.send(json.dumps(request))
+        assert "--pin" in told(joined)["error"] and not asked
+        joined.send(json.dumps({"id": 4, "op": "get_clock"}))
+        before, answer, after = time.time_ns(), told(joined), time.time_ns()
+        assert answer["id"] == 4 and answer["ok"]
+        assert before - 1e9 < answer["result"]["received_ns"] <= after
+    with (
+        sockets(tmp_path, handlers) as running,
+        stream(running, anchored_at),
+        bridged(run_web, options(tmp_path, pin=True)) as port,
+        peer(port) as joined,
+    ):
+        joined.send(json.dumps(request))
+        assert told(joined) == {"id": 3, "ok": True, "result": {"id": 7}} and asked == [request["args"]]
+        joined.send(json.dumps({"id": 5, "op": "reset_model"}))
+        assert "not passed on" in told(joined)["error"] and len(asked) == 1
+
+
+@pytest.mark.parametrize(
+    ("said", "why"),
+    [
+        ("{", "neither a subscription nor a request"),
+        ('{"subscribe": "all"}', "neither a subscription nor a request"),
+        ('{"subscribe": ["sags/left/dept"]}', "did you mean 'left/depth'"),
+        ('{"subscribe": ["sags/thin/half/left/depth/jpeg"]}', "comes as png, not as jpeg"),
+        ('{"subscribe": ["other/left/depth"]}', "must begin with sags/"),
+        (json.dumps({"subscribe": [f"sags/view/a{n}/image" for n in range(17)]}), "at most 16"),
+        (b"\xff\xfe", "neither a subscription nor a request"),
+        ("[" * 10_000, "neither a subscription nor a request"),
+    ],
+)
+def test_a_wrong_word_is_answered_and_the_rest_goes_on(said: str | bytes, why: str, web: int) -> None:
+    with peer(web, DEPTH) as joined:
+        next_of(joined, DEPTH)
+        joined.send(said)
+        assert why in told(joined)["error"]
+        next_of(joined, DEPTH)
+
+
+def test_strangers_are_kept_out(web: int) -> None:
+    for origin in ("http://evil.example", f"http://evil.example:{web}", "null", f"https://127.0.0.1:{web}"):
+        with pytest.raises(InvalidStatus, match="403"), peer(web, origin=origin):
+            pass
+    with peer(web, DEPTH, origin=f"http://127.0.0.1:{web}") as joined:
+        next_of(joined, DEPTH)
+        with pytest.raises(ConnectionClosed):
+            joined.send("x" * (LONGEST_MESSAGE + 1))
+            next_of(joined, "none", 10)
+    with ExitStack() as open_ones, pytest.raises((OSError, EOFError, InvalidMessage)):
+        for _ in range(MOST_PEERS + 1):
+            open_ones.enter_context(peer(web))
+    until(lambda: urllib.request.urlopen(f"http://127.0.0.1:{web}/sags.js").read().startswith(b"//"), 10)
+    with pytest.raises(urllib.error.HTTPError, match="404"):
+        urllib.request.urlopen(f"http://127.0.0.1:{web}/../web.py")
+
+
+def test_who_reads_slowly_misses_some_and_nobody_waits_for_him(web: int) -> None:
+    slow = socket.create_connection(("127.0.0.1", web))
+    slow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 17)
+    with (
+        connect(f"ws://127.0.0.1:{web}/ws", sock=slow, max_size=None, max_queue=1) as late,
+        peer(web, IMAGE) as quick,
+    ):
+        late.send(json.dumps({"subscribe": [IMAGE]}))
+        first, _ = next_of(late, IMAGE)
+        numbers = []
+        deadline = time.monotonic() + 2  # and less than `STUCK`
+        while time.monotonic() < deadline:
+            numbers.append(next_of(quick, IMAGE)[0]["seq"])
+        assert len(numbers) > 0.8 * (numbers[-1] - numbers[0])
+        came = [first["seq"]]
+        while came[-1] < numbers[-1]:
+            head, _ = next_of(late, IMAGE)
+            came.append(head["seq"])
+        assert len(came) < 0.8 * (came[-1] - came[0]), "some were left out"
+        head, _ = next_of(late, IMAGE)
+        assert time.time() - head["stamp_ns"] * 1e-9 < BLANK_WITHIN
+
+
+@pytest.fixture
+def web(tmp_path: Path) -> Iterator[int]:
+    """The port of a gateway to a node that sends the plane."""
+    with sockets(tmp_path) as running, stream(running, anchored_at):
+        with bridged(run_web, options(tmp_path)) as port:
+            yield port
+
+
+# ---- the page ----------------------------------------------------------------------------------------------
+
+PIXELS = """(id) => {
+  const canvas = document.getElementById(id);
+  const data = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data;
+  return [canvas.width, canvas.height, Array.from(data)];
+}"""
+ALL_DRAWN = "() => Object.keys(window.sags?.drawn ?? {}).length === 3"
+EMPTY = """() => new Promise((resolve) => {
+  const empty = (canvas) =>
+    !canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data.some((value) => value);
+  const look = () => [...document.querySelectorAll('canvas')].every(empty)
+    ? resolve(performance.timeOrigin + performance.now()) : requestAnimationFrame(look);
+  look();
+})"""
+
+
+@pytest.fixture
+def page() -> Iterator[Any]:
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (extra: dev)")
+    if CHROMIUM is None:
+        pytest.skip("there is no chromium on this machine (Debian: chromium)")
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        try:
+            yield browser.new_page()
+        finally:
+            browser.close()
+
+
+def pixels(page: Any, canvas: str) -> np.ndarray:
+    width, height, data = page.evaluate(PIXELS, canvas)
+    return np.array(data, np.uint8).reshape(height, width, 4)
+
+
+def drawn(page: Any, seconds: float) -> list[float]:
+    """Hz of each topic, by the page's own count."""
+    counts = "() => Object.values(window.sags.drawn)"
+    before, began = page.evaluate(counts), time.monotonic()
+    page.wait_for_timeout(1000 * seconds)
+    after, took = page.evaluate(counts), time.monotonic() - began
+    return [(late - early) / took for early, late in zip(before, after, strict=True)]
+
+
+def test_a_browser_draws_at_the_nodes_rate_and_goes_blank(page: Any, tmp_path: Path) -> None:
+    result = anchored()
+    with node_sockets(tmp_path) as running, bridged(run_web, options(tmp_path)) as port:
+        with making(running, result, rate=30):
+            shown = {}
+            for thin in ("raw", "half"):
+                page.goto(f"http://127.0.0.1:{port}/?thin={thin}")
+                page.wait_for_function(
+                    "() => Object.keys(window.sags?.drawn ?? {}).length === 3", timeout=30_000
+                )
+                shown[thin] = {canvas: pixels(page, canvas) for canvas in ("render", "depth", "marks")}
+            rates = drawn(page, 2.0)
+            assert len(rates) == 3 and min(rates) > 0.8 * 30, rates
+        stopped = time.time()
+        assert page.evaluate(EMPTY) * 1e-3 - stopped < BLANK_WITHIN
+        assert "too old" in page.evaluate("() => Object.values(window.sags.reasons).join()")
+        with making(running, result):  # and comes back by itself
+            page.wait_for_function("() => Object.keys(window.sags.reasons).length === 0", timeout=10_000)
+            page.evaluate("() => { window.sags.socket.onmessage = () => {} }")  # a gateway that hangs
+            hung = time.time()
+            assert page.evaluate(EMPTY) * 1e-3 - hung < BLANK_WITHIN
+    raw, half = shown["raw"], shown["half"]
+    view = result.views["left"]
+    opaque = raw["render"][..., 3]
+    assert np.all(opaque == round(0.75 * 255)), "the video shows through"
+    expected = view.rgb * 255
+    assert np.abs(raw["render"][..., :3] - expected).max() <= 255 / 191 + 1, (
+        "a canvas stores colour times alpha"
+    )
+    assert np.array_equal(raw["depth"][..., 3] > 0, view.depth > 0)
+    assert half["render"].shape == (HEIGHT // 2, WIDTH // 2, 4)
+    # 25 um are 0.11 of the 255 colours over 1.9 nepers from 30 mm on: at most the next colour, by 2 levels.
+    assert np.abs(half["depth"].astype(int) - raw["depth"][::2, ::2]).max() <= 2
+    assert raw["marks"].shape[:2] == (HEIGHT, WIDTH) and raw["marks"].any()

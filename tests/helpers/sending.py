@@ -1,0 +1,31 @@
+"""Processes that send pictures in the place of cameras."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from places import HELPERS
+
+
+@contextmanager
+def sending(command: Sequence[object], **variables: str) -> Iterator[subprocess.Popen[bytes]]:
+    """A process that sends; has begun when this returns, since imports take seconds."""
+    process = subprocess.Popen(
+        [str(word) for word in command], env={**os.environ, **variables}, stdout=subprocess.PIPE
+    )
+    try:
+        assert process.stdout is not None and process.stdout.readline() == b"sending\n"
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def stereo_sender(way: str, where: object, session: Path, seconds: float, *settings: str) -> list[object]:
+    """The command of `stereo_sender.py`."""
+    return [sys.executable, HELPERS / "stereo_sender.py", way, where, session, seconds, *settings]

@@ -1,0 +1,52 @@
+"""A node that is only its sockets and makes thin pictures."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from synthetic import at_frame, health
+
+from sags_node.config import PublishConfig
+from sags_node.messaging.publisher import Publisher
+from sags_node.messaging.thin import thin_pictures
+from sags_node.types import FrameResult
+
+
+@contextmanager
+def node_sockets(run_dir: Path, right: bool = False) -> Iterator[Publisher]:
+    """Those of a node."""
+    endpoints = {"data": ("tcp://127.0.0.1:*",), "control": None}
+    config = PublishConfig(**endpoints, run_dir=run_dir, right=right)
+    with Publisher(config, "sags", "session", thins=True) as running:
+        yield running
+
+
+@contextmanager
+def making(running: Publisher, result: FrameResult, rate: float = 50.0) -> Iterator[list[frozenset[str]]]:
+    """A node's publishing and thinning on one thread; gives what was made of each frame."""
+    stop, made = threading.Event(), []
+
+    def publish() -> None:
+        number, due = 0, time.monotonic()
+        while not stop.is_set():
+            due += 1 / rate
+            frame = at_frame(result, number, time.time_ns())
+            running.publish_result(frame, 0)
+            pictures = thin_pictures(frame, running.thin)
+            made.append(frozenset(pictures))
+            running.publish_thin(frame, pictures)
+            running.publish_health(health())
+            running.poll(max(0, round(1000 * (due - time.monotonic()))))
+            number += 1
+
+    thread = threading.Thread(target=publish)
+    thread.start()
+    try:
+        yield made
+    finally:
+        stop.set()
+        thread.join()

@@ -1,0 +1,256 @@
+"""Thin pictures over real sockets: what comes, how large and exact it is, and what wrong requests hear."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from independent_client import collect
+from places import SESSION
+from running_node import RunningNode
+from synthetic import HEIGHT, WIDTH, plane_result
+from thin_sender import making, node_sockets
+from waiting import until
+
+from sags_node.errors import UsageError
+from sags_node.messaging import content, thin, topics
+from sags_node.messaging.publisher import MAX_THIN, Publisher
+from sags_node.messaging.received import ReceivedCompressed, ReceivedImage, TopicName
+from sags_node.messaging.subscriber import Subscriber
+from sags_node.messaging.thin import DEPTH_STEP, thin_pictures
+from sags_node.messaging.wire import WireError
+from sags_node.recording.recorder import Options, Recorder
+from sags_node.topic import topic_echo, topic_hz
+
+pytestmark = pytest.mark.live
+
+IMAGE = TopicName("left/render/image", ReceivedImage)
+DEPTH = TopicName("left/render/depth", ReceivedImage)
+SURE = TopicName("left/render/depth_confidence", ReceivedImage)
+MASK = TopicName("left/tissue_mask", ReceivedImage)
+# Of the mean of 16 x 16 px, grey levels. At quality 80 means are stored in steps of 6/8 (luma) and 7/8
+# (chroma): blue is at most 0.4 + 1.77 * 0.44 beside. The rest is rounding, and what decoders blend.
+JPEG_ERROR = 3
+
+
+def thin_name(name: str) -> TopicName[ReceivedCompressed]:
+    return TopicName(name, ReceivedCompressed)
+
+
+def frame_of(running: Publisher, *names: str) -> dict[str, np.ndarray]:
+    """The arrays of one frame, as a subscriber decodes them."""
+    with Subscriber(names, running.connection.data[-1]) as subscriber:
+        leading = None
+        for _ in range(50):
+            leading = subscriber.wait(names[0], 5, after=leading)
+            assert leading is not None, subscriber.problem(names[0])
+            frame = subscriber.aligned(names, leading.stamp_ns, timeout=0.2)
+            if frame is not None:
+                assert all(subscriber.ok(name) for name in names)
+                return {name: frame[name].array for name in names}  # type: ignore[attr-defined]
+    raise AssertionError("no whole frame")
+
+
+def smaller(picture: np.ndarray, every: int) -> np.ndarray:
+    """Each pixel the mean of `every` x `every`."""
+    return cv2.resize(picture, None, fx=1 / every, fy=1 / every, interpolation=cv2.INTER_AREA)
+
+
+def test_depth_is_exact_to_half_a_step_and_unknown_stays_unknown(tmp_path: Path) -> None:
+    result = plane_result()
+    view = result.views["left"]
+    depth = view.depth.copy()
+    depth[5, 7] = 3.5  # further than 16 bit say
+    result = replace(result, views={**result.views, "left": replace(view, depth=depth)})
+    whole, half = thin_name("thin/full/left/render/depth/png"), thin_name("thin/half/left/render/depth/png")
+    part = thin_name("thin/half/10,20,31,24/left/render/depth/png")
+    measured = thin_name("thin/full/left/depth/png")
+    with node_sockets(tmp_path, right=True) as running, making(running, result):
+        said = frame_of(running, whole, half, part, measured, DEPTH)
+    known = said[DEPTH].copy()
+    known[5, 7] = np.nan
+    for name, expected in ((whole, known), (half, known[::2, ::2]), (part, known[20:44:2, 10:40:2])):
+        assert said[name].dtype == np.float32 and said[name].shape == expected.shape
+        assert np.array_equal(np.isnan(said[name]), np.isnan(expected))
+        assert np.nanmax(np.abs(said[name] - expected)) <= DEPTH_STEP / 2 + 1e-7  # 1e-7: of float32
+    assert np.array_equal(np.isnan(said[measured]), plane_result().observation.depth == 0)
+
+
+def test_pictures_masks_and_confidence_come_as_they_are(tmp_path: Path) -> None:
+    names = {
+        "camera": thin_name("thin/full/left/image_rect_color/jpeg"),
+        "right": thin_name("thin/half/right/image_rect_color/jpeg"),
+        "drawn": thin_name("thin/half/left/render/image/jpeg"),
+        "alpha": thin_name("thin/half/left/render/image/alpha"),
+        "sure": thin_name("thin/full/left/render/depth_confidence/png"),
+        "mask": thin_name("thin/quarter/8,4,80,60/left/tissue_mask/png"),
+    }
+    result = plane_result()
+    view = result.views["left"]
+    ramp = np.linspace(0, 1, WIDTH, dtype=np.float32)[None].repeat(HEIGHT, 0)
+    result = replace(result, views={**result.views, "left": replace(view, alpha=ramp)})
+    with node_sockets(tmp_path, right=True) as running, making(running, result):
+        said = frame_of(running, *names.values(), IMAGE, SURE, MASK)
+    rgba = said[IMAGE].astype(np.float32)
+    black = rgba[..., :3] * rgba[..., 3:] / 255
+    for name, expected in (
+        ("camera", result.pair.left),
+        ("right", smaller(result.pair.right, 2)),
+        ("drawn", smaller(black, 2)),
+    ):
+        came = said[names[name]]
+        assert came.shape == expected.shape and came.dtype == np.uint8
+        beside = came.astype(np.float32) - expected
+        assert np.abs(smaller(beside, 16)).max() < JPEG_ERROR
+    mean_alpha = smaller(said[IMAGE][..., 3], 2)
+    assert np.array_equal(said[names["alpha"]], mean_alpha)
+    assert np.abs(said[names["sure"]] - said[SURE]).max() <= 0.5 / 255 + 1e-6
+    assert np.array_equal(said[names["mask"]], said[MASK][4:64:4, 8:88:4])
+
+
+def test_another_language_finds_file_scale_and_place(tmp_path: Path) -> None:
+    """docs/wire.md alone: the file is part 1; `scale` and `window` are in the header."""
+    name = "thin/half/10,20,30,24/left/render/depth/png"
+    with node_sockets(tmp_path) as running, making(running, plane_result()):
+        (message,) = collect(running.connection.data[-1], [f"sags/{name}"], 1, 10)[f"sags/{name}"]
+    assert message.meta["type"] == "sensor_msgs/msg/CompressedImage"
+    assert message.meta["window"] == [10, 20, 2] and message.meta["scale"] == DEPTH_STEP
+    stored = cv2.imdecode(np.frombuffer(message.parts[1], np.uint8), cv2.IMREAD_UNCHANGED)
+    assert stored.dtype == np.uint16 and stored.shape == (12, 15)
+    store_reads = content.cdr.decode(message.cdr(), message.meta["type"])
+    assert bytes(store_reads.data) == message.parts[1] and store_reads.format == message.meta["encoding"]
+    assert store_reads.format == "16UC1; png compressed 16UC1"
+
+
+def test_nothing_is_made_that_nobody_asks_for_by_its_name(tmp_path: Path) -> None:
+    name = thin_name("thin/full/left/depth/png")
+    with node_sockets(tmp_path) as running, making(running, plane_result()) as made:
+        with Subscriber(["left/depth", "left/render/depth"], running.connection.data[-1]) as others:
+            assert others.wait("left/depth", 5) is not None
+            with Subscriber([name], running.connection.data[-1]) as one:
+                assert one.wait(name, 5) is not None
+            until(lambda: not running.thin)
+            count = len(made)
+            until(lambda: len(made) > count + 5)
+            assert not set().union(*made[count + 1 :])
+            assert {asked for frame in made for asked in frame} == {name}
+
+
+def test_sags_topic_reads_them_like_the_whole(tmp_path: Path) -> None:
+    depth = plane_result().observation.depth[::2, ::2]
+    with node_sockets(tmp_path) as running, making(running, plane_result()):
+        endpoint = running.connection.data[-1]
+        (said,) = topic_echo("thin/half/left/depth/png", endpoint, count=1, seconds=5)
+        assert topic_hz("thin/half/left/depth/png", endpoint, seconds=0.5)["average_rate"] > 5
+    assert said["content"]["shape"] == list(depth.shape)
+    assert said["content"]["max"] == pytest.approx(depth.max(), abs=DEPTH_STEP)
+    assert said["content"]["unknown"] == pytest.approx(np.mean(depth == 0))
+
+
+def test_a_recording_of_everything_leaves_out_what_others_asked_for(tmp_path: Path) -> None:
+    """It has the whole pictures."""
+    name = thin_name("thin/quarter/left/depth/png")
+    with node_sockets(tmp_path) as running, making(running, plane_result()):
+        recorder = Recorder(Options(tmp_path / "bag", endpoint=running.connection.data[-1]))
+        with Subscriber([name], running.connection.data[-1]) as one, ThreadPoolExecutor(1) as worker:
+            recording = worker.submit(recorder.run)
+            until(lambda: list((tmp_path / "bag").glob("*.mcap")))
+            for _ in range(5):
+                assert one.wait(name, 5, after=one.latest(name)) is not None
+            recorder.stop()
+            written = recording.result(10)["topics"]
+    assert "sags/left/depth" in written and not [each for each in written if "/thin/" in each]
+
+
+def test_a_pause_loses_no_message_that_comes_after_it(tmp_path: Path) -> None:
+    name = thin_name("thin/quarter/left/depth/png")
+    with node_sockets(tmp_path) as running, making(running, plane_result()):
+        with Subscriber([name], running.connection.data[-1], rates={name: 1.0}) as one:
+            before = one.wait(name, 5)
+            assert before is not None
+            one.pause()
+            until(lambda: not running.thin)
+            one.resume()
+            until(lambda: one.latest(name).stamp_ns > before.stamp_ns + 200_000_000)  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("thin/third/left/render/image/jpeg", "no size 'third'; there are full, half, quarter"),
+        ("thin/half/splats/png", "no thin form of 'splats'"),
+        ("thin/half/left/depth/jpeg", "left/depth comes as png, not as jpeg"),
+        ("thin/half/0,0,1,9/left/depth/png", "has no pixel"),
+        ("thin/half", "no thin topic"),
+        ("thin/full/right/image_rect_color/jpeg", "set publish.right:=true"),
+        ("thin/full/90,0,10,10/left/depth/png", f"leaves the picture, which has {WIDTH}x{HEIGHT} px"),
+    ],
+)
+def test_a_wrong_request_hears_why(name: str, said: str, tmp_path: Path) -> None:
+    """From the node, on the topic that was asked for; our own subscriber knows most of it before."""
+    with node_sockets(tmp_path) as running, making(running, plane_result()) as made:
+        (answer,) = collect(running.connection.data[-1], [f"sags/{name}"], 1, 10)[f"sags/{name}"]
+        assert said in content.cdr.decode(answer.cdr(), "std_msgs/msg/String").data
+        try:
+            with Subscriber([name], running.connection.data[-1]) as subscriber:
+                until(lambda: said in (subscriber.problem(name) or ""), 5)
+                assert not subscriber.ok(name)
+        except UsageError as error:
+            assert said in str(error)
+        count = len(made)
+        until(lambda: len(made) > count + 3)
+    assert running.thin == {} or name in running.thin
+
+
+def test_no_more_are_made_than_may_be(tmp_path: Path) -> None:
+    names = [f"thin/full/{x},0,8,8/left/depth/png" for x in range(MAX_THIN + 1)]
+    with node_sockets(tmp_path) as running, making(running, plane_result()) as made:
+        with Subscriber(names[:-1], running.connection.data[-1]):
+            until(lambda: len(running.thin) == MAX_THIN)
+            with Subscriber(names[-1:], running.connection.data[-1]) as late:
+                until(lambda: "made already" in (late.problem(names[-1]) or ""), 5)
+    assert max(len(frame) for frame in made) == MAX_THIN
+
+
+def test_no_name_begins_with_another() -> None:
+    names = [
+        f"thin/{size}/{region}{topic}/{form}"
+        for size in ("full", "half", "quarter")
+        for region in ("", "1,2,3,4/", "1,2,3,40/")
+        for topic, forms in topics.THIN_FORMS.items()
+        for form in forms
+    ] + list(topics.BY_NAME)
+    assert [
+        (a, b) for a in names for b in names if a != b and a.startswith(b) and a.startswith("thin/")
+    ] == []
+
+
+def test_a_damaged_file_is_said_and_nothing_is_shown() -> None:
+    made = thin_pictures(plane_result(), {"t": topics.thin_picture("thin/half/left/depth/png")})["t"]
+    file = bytes(made.parts[1])
+    assert thin.decode("t", DEPTH_STEP, file).shape == (HEIGHT // 2, WIDTH // 2)
+    with pytest.raises(WireError, match="damaged"):
+        thin.decode("t", DEPTH_STEP, file[: len(file) // 2])
+
+
+def test_a_running_node_sends_colour_and_depth_over_20_mbit(tmp_path: Path) -> None:
+    """At half of 640x512 px and 30 Hz, as docs/wire.md says; and the whole picture comes beside."""
+    size = ("vision.width:=640", "vision.height:=512")
+    node = RunningNode(SESSION, tmp_path, "source.pace:=realtime", *size)
+    try:
+        jpeg, png = (f"sags/thin/half/left/render/{name}" for name in ("image/jpeg", "depth/png"))
+        whole = "sags/left/render/image"
+        came = collect(node.data, [jpeg, png, whole], 20, 30)
+    finally:
+        assert node.stop() == 0
+    assert [len(messages) for messages in came.values()] == [20, 20, 20]
+    assert came[whole][0].meta["shape"] == [512, 640, 4]
+    sizes = [sum(len(part) for message in came[name] for part in message.parts) / 20 for name in (jpeg, png)]
+    assert 8 * 30 * sum(sizes) < 20e6, sizes
+    colour, depth = (came[name][-1].parts[1] for name in (jpeg, png))
+    for file in (colour, depth):
+        assert cv2.imdecode(np.frombuffer(file, np.uint8), cv2.IMREAD_UNCHANGED).shape[:2] == (256, 320)

@@ -1,0 +1,144 @@
+"""Whole nodes on live inputs, 2 x 1280x1024 at 30 Hz: the mapper stalls, and whoever sends is killed."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import pytest
+from command_line import FREE_PORTS
+from gstreamer import BALL, apart, ball_moment, kill_pipelines, need_gstreamer
+from places import ROOT
+from running_node import START_SECONDS
+from sending import sending, stereo_sender
+from stereo_sender import read_number
+from waiting import until
+
+from sags_node.calibration import load_rig, resized_rig, save_rig
+from sags_node.node import Node
+from sags_node.pipeline import Pipeline
+from sags_node.session import open_session
+from sags_node.sources.push import PushedPictures
+from sags_node.types import U8, FrameResult
+from sags_node.warm_up import warm_up
+
+pytestmark = pytest.mark.live
+
+DOMAIN = 60 + os.getpid() % 40  # away from nodes of this machine, and from tests of another checkout
+SMALL = ["vision.width:=320", "vision.height:=256", "mapping.max_gaussians:=2000"]
+SLOW_S, STALL_S = 0.2, 1.5
+PAUSES = [SLOW_S] * 8 + [STALL_S]  # of the first frames
+CAMERA = f"{BALL} ! video/x-raw,format=RGB,width=1280,height=1024,framerate=30/1"
+
+
+class Shown(NamedTuple):
+    stamp_ns: int
+    sent_ns: int
+    moment: float  # of the sender's second, as the picture itself shows it
+    right_moment: float
+
+    @property
+    def age_s(self) -> float:
+        return (self.sent_ns - self.stamp_ns) * 1e-9
+
+
+def painted_moment(picture: U8) -> float:
+    """As `stereo_sender.py` with `clock=1` paints it, at a quarter of the size."""
+    return read_number(cv2.resize(picture, None, fx=4, fy=4, interpolation=cv2.INTER_NEAREST)) * 1e-3 % 1
+
+
+def lie_s(one: Shown, other: Shown) -> float:
+    """How far two stamps lie from what the pictures show: a half is the most that can be seen."""
+    by_stamp = (one.stamp_ns - other.stamp_ns) * 1e-9
+    return apart(by_stamp, one.moment - other.moment)
+
+
+@contextmanager
+def running(
+    way: str, folder: Path, session: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[tuple[Node, list[Shown], Callable[[], AbstractContextManager[object]]]]:
+    """A node whose mapper pauses, what it shows, and what sends to it."""
+    rig = resized_rig(load_rig(session / "calib"), 4)
+    plain = {"distortion": np.zeros(5), "R": np.eye(3)}  # so that pictures stay to the pixel
+    eyes = {
+        side: replace(eye, K=eye.P[:, :3], **plain)
+        for side, eye in (("left", rig.left), ("right", rig.right))
+    }
+    save_rig(replace(rig, **eyes), folder / "rig")
+    launch, said, moment = {
+        "gst": ("gst_test", [f"source.launch:={CAMERA} ! tee name=t  t. ! left.  t. ! right."], ball_moment),
+        "push": ("push", ["source.endpoint:=tcp://127.0.0.1:*"], painted_moment),
+        "ros2": ("ros2", [f"source.domain:={DOMAIN}"], painted_moment),
+    }[way]
+    said = [*said, f"rig:={folder / 'rig'}", f"publish.run_dir:={folder / 'run'}", *FREE_PORTS, *SMALL]
+    opened = open_session(ROOT / f"launch/{launch}.yaml", said)
+    warm_up(opened.config)
+    pauses, process = iter(PAUSES), Pipeline.process
+
+    def slowly(pipeline: Pipeline, *arguments: Any) -> FrameResult:
+        time.sleep(next(pauses, 0.0))
+        return process(pipeline, *arguments)
+
+    monkeypatch.setattr(Pipeline, "process", slowly)
+    shown: list[Shown] = []
+
+    def note(result: FrameResult, latency_ms: float) -> None:
+        pair = result.pair
+        assert pair.right is not None
+        shown.append(Shown(pair.t_capture_ns, time.time_ns(), moment(pair.left), moment(pair.right)))
+
+    def sender() -> AbstractContextManager[object]:
+        if way == "gst":
+            return nullcontext()  # the node's own pipeline
+        where = opened.source.endpoint if isinstance(opened.source, PushedPictures) else DOMAIN
+        return sending(stereo_sender("push" if way == "push" else "dds", where, session, 60, "clock=1"))
+
+    node = Node(opened.config, opened.rig, opened.source, note)
+    node.start()
+    try:
+        yield node, shown, sender
+    finally:
+        node.stop()
+
+
+@pytest.mark.parametrize("way", ["gst", "push", "ros2"])
+def test_a_stalled_mapper_shows_nothing_old_and_a_killed_source_comes_again(
+    way: str, phantom_session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if way == "gst":
+        need_gstreamer()
+    if way == "ros2":
+        pytest.importorskip("cyclonedds", reason="ROS 2 needs: pip install 'sags-node[ros2]'")
+    with running(way, tmp_path, phantom_session, monkeypatch) as (node, shown, sender):
+        with sender():
+            until(lambda: shown, START_SECONDS)
+            until(lambda: len(shown) > len(PAUSES) + 10)
+            until_killed = list(shown)
+            if way == "gst":
+                kill_pipelines()
+        killed = time.time_ns()
+        with sender():
+            until(lambda: shown[-1].stamp_ns > killed, seconds=5)
+        dropped = sum(node.health().dropped.values())
+    slow, stalled, after = (
+        until_killed[2 : len(PAUSES) - 1],  # without the first frames, which load kernels
+        until_killed[len(PAUSES) - 1],
+        until_killed[len(PAUSES) :],
+    )
+    # Of a mapper that is too slow the lag does not grow: it would by 0.17 s with each frame, and by 1.5 s at
+    # once. A frame may wait for the one before it (0.2 s); the rest is for a busy machine.
+    assert max(one.age_s for one in slow) < 2 * SLOW_S + 0.6
+    assert stalled.age_s > STALL_S  # an old picture keeps its old stamp
+    assert max(one.age_s for one in after) < 1.0
+    assert all(lie_s(one, until_killed[0]) < 0.25 for one in until_killed)
+    assert all(one.moment == one.right_moment for one in shown)
+    assert all(one.stamp_ns < other.stamp_ns for one, other in pairwise(shown))
+    assert dropped > 30 * STALL_S  # they were left out, and that is said
