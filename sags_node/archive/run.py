@@ -13,7 +13,7 @@ from typing import Any
 from sags_node.archive.cluster import connected
 from sags_node.archive.inputs import key_of
 from sags_node.archive.manifest import Recording
-from sags_node.archive.store import ABOUT, FAILED, MANIFEST, Store
+from sags_node.archive.store import ABOUT, DONE, FAILED, MANIFEST, Store
 from sags_node.archive.work import Outcome, Plan, repeating, resources, work
 from sags_node.errors import SagsError
 from sags_node.terminal.console import on_stop_signals
@@ -177,9 +177,12 @@ def _missing(
     done = store.done()
     for recording in sorted(recordings, key=lambda each: -each.weight):
         key = key_of(recording, about(plan))
-        if done.get(recording.id) == key:
+        before = done.get(recording.id)
+        if before == key:
             tally.kept += 1
             continue
+        if before is not None:
+            store.remove(f"{DONE}/{recording.id}.{before}.json")  # first: its results are about to go
         if recording.id in failed:
             record = store.read_json(f"{FAILED}/{recording.id}.json")
             if retry_failed or record["key"] != key:

@@ -123,10 +123,7 @@ class Store:
         marker = f"{DONE}/{id}.{key}.json"
         if self.read(marker) is not None:
             return  # a worker that was taken for lost has done it
-        for name in self.names(DONE):
-            if name.startswith(f"{id}."):
-                self.remove(f"{DONE}/{name}")  # first: its results are about to go
-        self.remove(f"{RECORDINGS}/{id}")
+        self.remove(f"{RECORDINGS}/{id}")  # of an attempt that was cut off, or from before something changed
         if self.local is None:
             self._fs.put(f"{folder}/", f"{self._root}/{RECORDINGS}/{id}/", recursive=True)
         else:

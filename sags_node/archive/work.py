@@ -174,6 +174,13 @@ def _is_full(folder: Path) -> bool:
 
 
 def resources(overrides: Sequence[str]) -> tuple[int, int]:
-    """Cores and GPUs of a task, as the overrides say: `engine.threads`, and `device:=cuda`."""
+    """Cores and GPUs of a task, as the overrides say: `engine.threads`, and `device:=cuda`.
+
+    Raises:
+        UsageError: `engine.threads` is no number of cores.
+    """
     said = dict(each.split(":=", 1) for each in overrides)
-    return int(said.get("engine.threads", 1)), int(said.get("device") == "cuda")
+    cores = said.get("engine.threads", "1")
+    if not cores.isdecimal() or int(cores) < 1:
+        raise UsageError(f"engine.threads:={cores}: each recording needs a number of cores, 1 or more")
+    return int(cores), int(said.get("device") == "cuda")

@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from sags_node.archive.jobs import JOBS
-from sags_node.cli.launching import as_json, positive, split
+from sags_node.cli.launching import as_json, lerobot_option, positive, split
 from sags_node.errors import SagsError, UsageError
 from sags_node.plotting import check_plots, has_plots
 from sags_node.terminal import text
@@ -21,6 +21,7 @@ from sags_node.terminal.console import console, progress, show
 if TYPE_CHECKING:
     from sags_node.archive.manifest import Recording
     from sags_node.archive.run import Tally
+    from sags_node.export.lerobot_form import Version
 
 
 @click.group()
@@ -270,8 +271,9 @@ def show_one(out: str, id: str, json_out: bool) -> None:
 @archive.command()
 @click.argument("out", metavar="OUT")
 @click.argument("folder", type=click.Path(path_type=Path))
-def dataset(out: str, folder: Path) -> None:
-    """Make one LeRobot data set of all that `--job lerobot` has done.
+@lerobot_option
+def dataset(out: str, folder: Path, lerobot_version: Version) -> None:
+    """Make one LeRobot data set of all that --job lerobot has done.
 
     An episode for each recording, in the order of the manifest. FOLDER must be new or empty.
 
@@ -281,7 +283,8 @@ def dataset(out: str, folder: Path) -> None:
     """
     from sags_node.archive.results import listed
     from sags_node.archive.store import RECORDINGS, Store
-    from sags_node.export.lerobot import check_lerobot, merge
+    from sags_node.export.lerobot import merge
+    from sags_node.export.lerobot_form import check_lerobot
 
     check_lerobot()
     store = Store(out)
@@ -292,7 +295,7 @@ def dataset(out: str, folder: Path) -> None:
     if about["job"] != "lerobot" or not done:
         raise UsageError(f"{out} holds {len(done)} results of {about['job']}; run --job lerobot first")
     episodes = [each.id for each in recordings if each.id in done]
-    frames = merge([store.local / RECORDINGS / id / "lerobot" for id in episodes], folder)
+    frames = merge([store.local / RECORDINGS / id / "lerobot" for id in episodes], folder, lerobot_version)
     console.print(
         f"{len(episodes)} episodes, {frames} frames: [bold]{escape(str(folder))}[/]", soft_wrap=True
     )

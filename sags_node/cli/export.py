@@ -4,15 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from sags_node.cli.launching import as_json, file_option, open_launched, positive, split_recording
+from sags_node.cli.launching import (
+    as_json,
+    file_option,
+    lerobot_option,
+    open_launched,
+    positive,
+    split_recording,
+)
 from sags_node.cli.node_options import endpoint_option, keys_options, ns_option
 from sags_node.errors import UsageError
 from sags_node.terminal import text
 from sags_node.terminal.console import progress, show
+
+if TYPE_CHECKING:
+    from sags_node.export.lerobot_form import Version
 
 NO_CAMERAS = "live cameras are exported from the running node; leave out --session"
 
@@ -54,8 +64,9 @@ NO_CAMERAS = "live cameras are exported from the running node; leave out --sessi
     "--lerobot",
     metavar="FOLDER",
     type=click.Path(path_type=Path, file_okay=False),
-    help="All of that and the pictures, as a data set in the form of LeRobot v3.0.",
+    help="All of that and the pictures, as a data set in the form of LeRobot.",
 )
+@lerobot_option
 @click.option(
     "--orbit-degrees",
     type=click.FloatRange(0, 60),
@@ -83,6 +94,7 @@ def export(
     render: Path | None,
     depth: Path | None,
     lerobot: Path | None,
+    lerobot_version: Version,
     orbit_degrees: float,
     orbit_seconds: float,
     force: bool,
@@ -117,7 +129,7 @@ def export(
             "moment, --sequence, --at or --fit beside it"
         )
     if played and session is not None:
-        _export_played((session, *overrides), played, json_out)
+        _export_played((session, *overrides), played, lerobot_version, json_out)
         return
     if sequence is None:
         work.check_targets(targets, force)
@@ -154,7 +166,9 @@ def export(
     show(rows if json_out else text.rows_table(rows))
 
 
-def _export_played(launch: Sequence[str], played: Mapping[str, Path], json_out: bool) -> None:
+def _export_played(
+    launch: Sequence[str], played: Mapping[str, Path], version: Version, json_out: bool
+) -> None:
     from sags_node.export.lerobot import LeRobot
     from sags_node.export.played import DepthMaps, Product, Renders, Tracks, write_played
 
@@ -165,7 +179,7 @@ def _export_played(launch: Sequence[str], played: Mapping[str, Path], json_out: 
         "depth": DepthMaps,
         "tracks": Tracks,
         "render": lambda file: Renders(file, rate, size),
-        "lerobot": lambda folder: LeRobot(folder, rate),
+        "lerobot": lambda folder: LeRobot(folder, rate, version),
     }
     products = {kind: made[kind](target) for kind, target in played.items()}
     with progress("exporting") as advance:

@@ -127,6 +127,7 @@ def test_what_changed_is_done_anew_and_the_rest_stays(cluster: Any, tmp_path: Pa
     store, _ = gone_through(tmp_path / "out", recordings, cluster)
     change(recordings[2], psnr=12.5)
     assert gone_through(tmp_path / "out", recordings, cluster)[1].kept == 3
+    assert len(list((tmp_path / "out/done").iterdir())) == 4
     assert sorted(row["online.psnr"] for row in table(store))[0] == 12.5
     other = replace(quick_plan(tmp_path / "out"), options=("--hold-out", "0"))
     assert gone_through(tmp_path / "out", recordings, cluster, plan=other)[1].kept == 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,7 +13,19 @@ from command_line import pure_json, refused, sags
 from tiny_archive import TINY_FRAMES, write_tiny_session
 
 from sags_node.calibration import read_rig
-from sags_node.export.lerobot import COARSE, DEPTH, LEFT, POINTS, POSE, RIGHT, TASK, merge
+from sags_node.export.lerobot import merge
+from sags_node.export.lerobot_form import (
+    COARSE,
+    DEPTH,
+    LEFT,
+    POINTS,
+    POSE,
+    RIGHT,
+    TASK,
+    TISSUE,
+    Version,
+)
+from sags_node.export.lerobot_stats import Sums, merged
 from sags_node.export.played import DEPTH_UNIT, TRACKS
 from sags_node.session import open_session
 from sags_node.types import RectifiedPair
@@ -22,6 +35,7 @@ pq = pytest.importorskip("pyarrow.parquet", reason="the extra archive is not ins
 av = pytest.importorskip("av", reason="a second reader of videos")
 
 SESSIONS = 3
+CHUNKS = ("chunk_index", "file_index")
 CODING = 6  # of 255: a video's error; another frame of these sessions differs by 10 and more
 
 
@@ -38,6 +52,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 *("export", "--session", session, "mapping.iterations:=1", "mapping.max_gaussians:=4000"),
                 *("--depth", out / "depth", "--tracks", out / "tracks.npz"),
                 *("--render", out / "model.mp4", "--lerobot", out / "lerobot", "--json"),
+                *("--lerobot-version", "v2.1" if number == 1 else "v3.0"),
             ).stdout
         )
         assert [row["kind"] for row in rows] == ["depth", "tracks", "render", "lerobot"]
@@ -98,22 +113,19 @@ def test_the_video_has_every_frame(exported: Path) -> None:
     assert np.abs(pictures[3].astype(float) - shown)[known].mean() < 16  # of 255: the same scene
 
 
-def test_three_sessions_are_one_data_set(exported: Path, tmp_path: Path) -> None:
-    """In the form of lerobot 0.4, `datasets/utils.py`; Parquet and MP4 are read by others."""
+@pytest.mark.parametrize("version", ["v3.0", "v2.1"])
+def test_three_sessions_are_one_data_set(exported: Path, tmp_path: Path, version: Version) -> None:
+    """In the form of lerobot 0.4.4 and 0.3.3, `datasets/utils.py`; Parquet and MP4 are read by others."""
     out = tmp_path / "all"
-    frames = merge([exported / f"{number}/lerobot" for number in range(SESSIONS)], out)
+    frames = merge([exported / f"{number}/lerobot" for number in range(SESSIONS)], out, version)
     info = json.loads((out / "meta/info.json").read_text())
     assert frames == info["total_frames"] == SESSIONS * TINY_FRAMES
-    assert (info["codebase_version"], info["total_episodes"], info["fps"]) == ("v3.0", SESSIONS, 10)
+    assert (info["codebase_version"], info["total_episodes"], info["fps"]) == (version, SESSIONS, 10)
 
-    episodes = pq.read_table(out / "meta/episodes").to_pylist()
-    tasks = pq.read_table(out / "meta/tasks.parquet").to_pandas() if _has_pandas() else None
-    assert tasks is None or tasks.loc[TASK].task_index == 0
     index = 0
-    for number, episode in enumerate(episodes):
-        assert (episode["dataset_from_index"], episode["length"]) == (index, TINY_FRAMES)
-        where = {"chunk_index": episode["data/chunk_index"], "file_index": episode["data/file_index"]}
-        rows = pq.read_table(out / info["data_path"].format(**where)).to_pylist()
+    for number, places in enumerate(places_v30(out) if version == "v3.0" else places_v21(out)):
+        rows = pq.read_table(out / info["data_path"].format(**places["data"])).to_pylist()
+        assert len(rows) == TINY_FRAMES
         for frame, row in enumerate(rows):
             assert (row["index"], row["frame_index"], row["episode_index"]) == (index, frame, number)
             assert row["timestamp"] == pytest.approx(frame / 10)
@@ -123,17 +135,11 @@ def test_three_sessions_are_one_data_set(exported: Path, tmp_path: Path) -> None
             index += 1
         counts = cv2.imread(str(exported / f"{number}/depth/00002.png"), cv2.IMREAD_UNCHANGED)
         assert np.allclose(rows[2][DEPTH], counts[::COARSE, ::COARSE] * DEPTH_UNIT, atol=DEPTH_UNIT)
-        assert np.array_equal(rows[0][POSE], np.eye(4))
+        assert np.array_equal(rows[0][POSE], np.eye(4)) and np.mean(rows[0][TISSUE]) > 0.5
         with np.load(exported / f"{number}/tracks.npz") as tracks:
             assert np.array_equal(np.float32(rows[4][POINTS]), tracks["points"][4], equal_nan=True)
         for eye, side in ((LEFT, "left"), (RIGHT, "right")):
-            where = {
-                key.rpartition("/")[2]: value
-                for key, value in episode.items()
-                if key.startswith(f"videos/{eye}/")
-            }
-            path = out / info["video_path"].format(video_key=eye, **where)
-            with av.open(str(path)) as video:
+            with av.open(str(out / info["video_path"].format(**places[eye]))) as video:
                 stream = video.streams.video[0]
                 read = [(float(each.pts * stream.time_base), each) for each in video.decode(video=0)]
             assert [at for at, _ in read] == pytest.approx([frame / 10 for frame in range(TINY_FRAMES)])
@@ -142,12 +148,53 @@ def test_three_sessions_are_one_data_set(exported: Path, tmp_path: Path) -> None
     assert index == frames
 
 
-def _has_pandas() -> bool:
-    try:
-        import pandas  # noqa: F401
-    except ImportError:
-        return False
-    return True
+def places_v30(out: Path) -> list[dict[str, dict[str, Any]]]:
+    """Of each episode: what the paths of its data and of each video are made of."""
+    found = []
+    for number, episode in enumerate(pq.read_table(out / "meta/episodes").to_pylist()):
+        span = episode["dataset_from_index"], episode["dataset_to_index"], episode["episode_index"]
+        assert span == (number * TINY_FRAMES, (number + 1) * TINY_FRAMES, number)
+        assert episode[f"stats/{DEPTH}/mean"] != [0.0]
+        kinds = {"data": "data", LEFT: f"videos/{LEFT}", RIGHT: f"videos/{RIGHT}"}
+        found.append(
+            {
+                kind: {"video_key": kind, **{key: episode[f"{column}/{key}"] for key in CHUNKS}}
+                for kind, column in kinds.items()
+            }
+        )
+    tasks = pq.read_table(out / "meta/tasks.parquet").to_pylist()
+    assert tasks == [{"task_index": 0, "__index_level_0__": TASK}]
+    return found
+
+
+def places_v21(out: Path) -> list[dict[str, dict[str, Any]]]:
+    def lines(name: str) -> list[Any]:
+        return [json.loads(line) for line in (out / f"meta/{name}.jsonl").read_text().splitlines()]
+
+    assert lines("tasks") == [{"task_index": 0, "task": TASK}]
+    assert [each["stats"][DEPTH]["mean"] != [0.0] for each in lines("episodes_stats")] == [True] * SESSIONS
+    found = []
+    for number, episode in enumerate(lines("episodes")):
+        assert episode == {"episode_index": number, "tasks": [TASK], "length": TINY_FRAMES}
+        place = {"episode_chunk": 0, "episode_index": number}
+        found.append({kind: place | {"video_key": kind} for kind in ("data", LEFT, RIGHT)})
+    return found
+
+
+def test_statistics_of_several_episodes_are_those_of_all_their_numbers() -> None:
+    random = np.random.default_rng(5)
+    parts = [random.normal(number, 1 + number, (20 + 10 * number, 3)) for number in range(3)]
+    parts[1][4] = np.nan  # a lost point
+    stats = []
+    for part in parts:
+        sums = Sums()
+        sums.add(part[:7])
+        sums.add(part[7:])
+        stats.append(sums.stats((3,)))
+    found, together = merged(stats), np.concatenate(parts)
+    for name, of in {"min": np.nanmin, "max": np.nanmax, "mean": np.nanmean, "std": np.nanstd}.items():
+        assert found[name] == pytest.approx(of(together, axis=0)), name
+    assert found["count"] == [89]
 
 
 def test_what_does_not_go_together_is_refused(exported: Path, tmp_path: Path) -> None:
