@@ -12,7 +12,7 @@ from sags_node.archive.manifest import Recording, parquet, read_manifest
 from sags_node.archive.store import ABOUT, DONE, FAILED, MANIFEST, RESULTS, Store
 from sags_node.errors import UsageError
 
-BATCH = 2000  # rows that are in memory as text
+BATCH = 2000  # rows that are in memory as text, and are read at the same time
 
 
 def listed(store: Store) -> tuple[dict[str, Any], list[Recording]]:
@@ -61,8 +61,8 @@ def status(store: Store) -> dict[str, Any]:
 
 def failed(store: Store) -> list[dict[str, Any]]:
     """The records of all recordings whose last attempt failed."""
-    records = [store.read_json(f"{FAILED}/{name}") for name in store.names(FAILED) if name.endswith(".json")]
-    return [record for record in records if record is not None]
+    names = [f"{FAILED}/{name}" for name in store.names(FAILED) if name.endswith(".json")]
+    return [json.loads(data) for data in store.read_many(names) if data is not None]
 
 
 def of_one(store: Store, id: str) -> dict[str, Any]:
@@ -114,7 +114,7 @@ def write_results(store: Store, recordings: Sequence[Recording]) -> int:
 
     records = {record["id"]: record for record in failed(store)}
     tables, count = [], 0
-    for rows in _batches(_rows(store, recordings, records)):
+    for rows in _batches(store, recordings, records):
         count += sum(row["state"] == "done" for row in rows)
         columns = dict.fromkeys(key for row in rows for key in row)
         tables.append(pa.table({key: _column(pa, [row.get(key) for row in rows]) for key in columns}))
@@ -134,28 +134,26 @@ def read_results(store: Store) -> list[dict[str, Any]]:
     return rows
 
 
-def _rows(
+def _batches(
     store: Store, recordings: Sequence[Recording], records: Mapping[str, Mapping[str, Any]]
-) -> Iterator[dict[str, Any]]:
+) -> Iterator[list[dict[str, Any]]]:
+    """The rows of all, by id, so many at a time."""
     done = store.done()
-    for recording in sorted(recordings, key=lambda each: each.id):
-        key, record = done.get(recording.id), records.get(recording.id)
-        row = None if key is None else store.read(f"{DONE}/{recording.id}.{key}.json")
-        figures = None if row is None else json.loads(row)
-        known = {"id": recording.id, "recording": recording.name, "state": _state(figures, record)}
-        reason = None if record is None else record["attempts"][-1]["reason"]
-        yield {**known, "reason": reason, **(figures or {})}
+    ordered = sorted(recordings, key=lambda each: each.id)
+    for begin in range(0, len(ordered), BATCH):
+        batch = ordered[begin : begin + BATCH]
+        ids = [recording.id for recording in batch if recording.id in done]
+        data = store.read_many([f"{DONE}/{id}.{done[id]}.json" for id in ids])
+        figures = {id: json.loads(row) for id, row in zip(ids, data, strict=True) if row is not None}
+        yield [_row(each, figures.get(each.id), records.get(each.id)) for each in batch]
 
 
-def _batches(rows: Iterator[dict[str, Any]]) -> Iterator[list[dict[str, Any]]]:
-    batch: list[dict[str, Any]] = []
-    for row in rows:
-        batch.append(row)
-        if len(batch) == BATCH:
-            yield batch
-            batch = []
-    if batch:
-        yield batch
+def _row(
+    recording: Recording, figures: Mapping[str, Any] | None, record: Mapping[str, Any] | None
+) -> dict[str, Any]:
+    known = {"id": recording.id, "recording": recording.name, "state": _state(figures, record)}
+    reason = None if record is None else record["attempts"][-1]["reason"]
+    return {**known, "reason": reason, **(figures or {})}
 
 
 def _column(pa: Any, values: list[Any]) -> Any:

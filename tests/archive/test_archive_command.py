@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -50,10 +51,27 @@ def test_figures_are_those_of_sags_eval(cluster: Any, tiny_session: Path, tmp_pa
     assert again.exit_code == 1 and "2 recordings   1 done, 1 quarantined, 0 missing" in again.stdout
 
 
+def test_episodes_become_a_data_set(cluster: Any, tiny_session: Path, tmp_path: Path) -> None:
+    recordings = [Recording(str(tiny_session), str(tmp_path), overrides=("source.frames:=2",))]
+    write_manifest(str(tmp_path / "m.csv"), recordings)
+    out, dataset = tmp_path / "out", tmp_path / "dataset"
+    sags(
+        *("archive", "run", tmp_path / "m.csv", "--job", "lerobot", "--out", out, "--ray", cluster.address),
+        "mapping.iterations:=1",
+    )
+    shown = pure_json(sags("archive", "show", out, recordings[0].id, "--json").stdout)
+    assert (shown["state"], shown["figures"]["lerobot.holds"]) == ("done", 2)
+    sags("archive", "dataset", out, dataset, "--lerobot-version", "v2.1")
+    info = json.loads((dataset / "meta/info.json").read_text())
+    assert (info["codebase_version"], info["total_episodes"], info["total_frames"]) == ("v2.1", 1, 2)
+    refused(2, "archive", "dataset", out, dataset, said=("is not empty",))
+
+
 def test_mistakes_are_said_in_one_line(tmp_path: Path) -> None:
     out = ("--job", "eval", "--out", tmp_path / "out")
     refused(2, "archive", "run", *out, said=("name a manifest",))
     refused(2, "archive", "run", tmp_path / "none.csv", *out, said=("none.csv cannot be read",))
     refused(2, "archive", "run", tmp_path, *out, said=("holds no recording",))
+    refused(2, "archive", "run", tmp_path, *out, "engine.threads:=many", said=("engine.threads:=many",))
     refused(2, "archive", "status", tmp_path, said=("holds no archive",))
     refused(2, "archive", "status", "nowhere://x", said=("nowhere",))

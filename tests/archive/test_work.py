@@ -13,6 +13,7 @@ from tiny_archive import quick_plan, quick_work, write_quick_recordings
 
 from sags_node.archive.inputs import fetched, key_of, scratch
 from sags_node.archive.manifest import Recording
+from sags_node.archive.results import read_results, write_results
 from sags_node.archive.run import about
 from sags_node.archive.store import Store
 from sags_node.archive.work import work
@@ -54,13 +55,19 @@ def test_results_appear_whole_and_are_not_done_twice(tmp_path: Path) -> None:
 
 
 def test_a_store_that_is_no_folder(tmp_path: Path, in_memory: str) -> None:
-    recording = write_quick_recordings(tmp_path / "in", 1)[0]
+    recordings = write_quick_recordings(tmp_path / "in", 2)
     plan = replace(quick_plan(tmp_path), out=in_memory)
-    assert quick_work(recording, plan, "key").state == "done"
+    assert quick_work(recordings[0], plan, "key").state == "done"
     store = Store(in_memory)
-    assert store.done() == {recording.id: "key"}
-    assert store.read(f"recordings/{recording.id}/report/content") == b"r000"
+    assert store.done() == {recordings[0].id: "key"}
+    assert store.read(f"recordings/{recordings[0].id}/report/content") == b"r000"
     assert list((tmp_path / "tmp").iterdir()) == []
+    assert store.read_many(["archive.json"]) == [None]
+    assert write_results(store, recordings) == 1
+    assert [(row["state"], row["online.psnr"]) for row in read_results(store)] == [
+        ("done", 30.0),
+        ("missing", None),
+    ]
 
 
 def test_a_url_is_fetched_and_removed(tmp_path: Path) -> None:
