@@ -12,6 +12,7 @@ from typing import Any
 
 from sags_node.errors import SagsError, UsageError
 
+NEEDED = ("ray", "pyarrow", "fsspec")  # the extra `archive`
 OBJECT_STORE = 80 << 20  # bytes: nothing large is passed; Ray wants 75 MiB at least
 QUIET = {
     "RAY_USAGE_STATS_ENABLED": "0",
@@ -24,14 +25,17 @@ LOCAL = {
 }
 
 
-def check_ray() -> None:
+def check_installed() -> None:
     """To be asked before anything else is done.
 
     Raises:
-        UsageError: it is not installed.
+        UsageError: a package that archives need is not installed.
     """
-    if find_spec("ray") is None:
-        raise UsageError("archives need Ray, which is not installed: pip install 'sags-node[archive]'")
+    missing = [name for name in NEEDED if find_spec(name) is None]
+    if missing:
+        raise UsageError(
+            f"archives need {', '.join(missing)}, which is not installed: pip install 'sags-node[archive]'"
+        )
 
 
 @contextmanager
@@ -45,7 +49,7 @@ def connected(address: str | None) -> Iterator[Any]:
         UsageError: Ray is not installed.
         SagsError: it does not start, or there is no cluster.
     """
-    check_ray()
+    check_installed()
     os.environ.update(QUIET)
     if address is None:
         os.environ.update(LOCAL | {"RAY_AUTH_TOKEN": secrets.token_hex(32)})

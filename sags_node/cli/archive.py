@@ -11,6 +11,7 @@ import click
 from rich.markup import escape
 from rich.table import Table
 
+from sags_node.archive.cluster import check_installed
 from sags_node.archive.jobs import JOBS
 from sags_node.cli.launching import as_json, lerobot_option, positive, split
 from sags_node.errors import SagsError, UsageError
@@ -52,6 +53,7 @@ def scan(folder: Path, out: str, rig: Path | None, json_out: bool) -> None:
     \b
     sags archive scan /data/theatre3 --out theatre3.parquet
     """
+    check_installed()
     from sags_node.archive.manifest import write_manifest
     from sags_node.archive.scan import scan as look
 
@@ -142,9 +144,9 @@ def run(
     sags archive run theatre3.csv --job eval --out out/theatre3 --options '--iterations 2'
     sags archive run s3://lab/all.parquet --job fit --out s3://lab/fits --ray head:6379 --timeout 7200
     """
-    from sags_node.archive.cluster import check_ray
+    check_installed()
     from sags_node.archive.jobs import NEEDS_PLOTS
-    from sags_node.archive.manifest import as_csv, parquet
+    from sags_node.archive.manifest import as_csv
     from sags_node.archive.overview import write_overview
     from sags_node.archive.process import Limits
     from sags_node.archive.results import read_results, write_results
@@ -160,12 +162,10 @@ def run(
         raise UsageError("name a manifest (sags archive scan makes one), or a folder of recordings")
     if local and address is not None:
         raise UsageError("--local is this machine alone; leave it out, or leave out --ray")
-    check_ray()
-    parquet()
     if job in NEEDS_PLOTS:
         check_plots()
-    recordings = _listed(path, rig)[:limit]
     cores, _ = resources(overrides)
+    recordings = _listed(path, rig)[:limit]
     limits = Limits(cores, memory, timeout, stage_limit)
     plan = Plan(job, tuple(overrides), tuple(shlex.split(options)), out, revision(), limits)
     store = Store(out)
@@ -233,6 +233,7 @@ def _state_table(state: dict[str, Any]) -> Table:
 @as_json
 def status(out: str, json_out: bool) -> None:
     """Say how far an archive is, and what failed; also while it runs, from any machine."""
+    check_installed()
     from sags_node.archive.results import status as found
     from sags_node.archive.store import Store
 
@@ -249,6 +250,7 @@ def show_one(out: str, id: str, json_out: bool) -> None:
 
     ID may be the beginning of one.
     """
+    check_installed()
     from sags_node.archive.results import of_one
     from sags_node.archive.store import Store
 
@@ -281,12 +283,11 @@ def dataset(out: str, folder: Path, lerobot_version: Version) -> None:
     sags archive run theatre3.csv --job lerobot --out out/theatre3
     sags archive dataset out/theatre3 out/dataset
     """
+    check_installed()
     from sags_node.archive.results import listed
     from sags_node.archive.store import RECORDINGS, Store
     from sags_node.export.lerobot import merge
-    from sags_node.export.lerobot_form import check_lerobot
 
-    check_lerobot()
     store = Store(out)
     if store.local is None:
         raise UsageError(f"{out} is no folder of this machine; copy it here first")

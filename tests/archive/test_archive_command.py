@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from command_line import pure_json, refused, sags
 
+from sags_node.archive import cluster as cluster_module
 from sags_node.archive.manifest import Recording, write_manifest
 from sags_node.evaluation.measure import Options
 from sags_node.evaluation.session import evaluate
@@ -75,3 +76,14 @@ def test_mistakes_are_said_in_one_line(tmp_path: Path) -> None:
     refused(2, "archive", "run", tmp_path, *out, "engine.threads:=many", said=("engine.threads:=many",))
     refused(2, "archive", "status", tmp_path, said=("holds no archive",))
     refused(2, "archive", "status", "nowhere://x", said=("nowhere",))
+
+
+def test_without_the_extra_the_command_says_how_to_get_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cluster_module, "NEEDED", ("fsspec", "no_such_package"))
+    said = ("archives need no_such_package", "pip install 'sags-node[archive]'")
+    out = tmp_path / "out"
+    refused(2, "archive", "run", tmp_path / "m.csv", "--job", "eval", "--out", out, said=said)
+    refused(2, "archive", "status", out, said=said)
+    assert not out.exists()
