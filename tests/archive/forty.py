@@ -16,9 +16,10 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -42,6 +43,7 @@ from sags_node.config import PhantomSource  # noqa: E402
 from sags_node.evaluation.golden import TIMING_KEYS  # noqa: E402
 from sags_node.phantom import write_session  # noqa: E402
 
+SESSIONS = 12  # that are written
 KINDS: tuple[dict[str, Any], ...] = (
     {}, {"smoke": 0.4}, {"noise": 0.05}, {"blur": 1.5}, {"camera_motion": True}, {"blackout": (0.2, 0.3)},
     {"gloss": 10.0},
@@ -55,19 +57,19 @@ PATIENCE = 240.0  # s
 
 
 def phantoms(folder: Path, count: int) -> list[Recording]:
-    """Of several seeds, lengths and kinds."""
-    for number in range(count):
-        source = PhantomSource(
-            seconds=0.4 + 0.1 * (number % 5), width=160, height=128, seed=number, **KINDS[number % len(KINDS)]
-        )
+    """Of several seeds and kinds, each in several lengths."""
+    for number in range(min(count, SESSIONS)):
+        source = PhantomSource(seconds=0.8, width=160, height=128, seed=number, **KINDS[number % len(KINDS)])
         write_session(source, folder / f"phantom{number:02d}", rate=10.0)
+    said = [(number % SESSIONS, 8 - number // SESSIONS) for number in range(count)]
     return [
-        Recording(f"phantom{number:02d}", str(folder), weight=4.0 + number % 5) for number in range(count)
+        Recording(f"phantom{seed:02d}", str(folder), None, (f"source.frames:={frames}",), frames)
+        for seed, frames in said
     ]
 
 
 def forty(folder: Path) -> list[Recording]:
-    """34 phantoms, four real ones, one that is damaged and one that hangs."""
+    """34 phantoms, four real ones, one that is damaged and one that will hang."""
     recordings = phantoms(folder, 34)
     for name, start in REAL:
         said = (f"source.start:={start}", "source.frames:=6")
@@ -76,10 +78,17 @@ def forty(folder: Path) -> list[Recording]:
         shutil.copytree(folder / "phantom00", folder / name)
         recordings.append(Recording(name, str(folder), weight=9.0))
     sorted((folder / "poison/left").iterdir())[1].write_bytes(b"no picture")
-    picture = sorted((folder / "hangs/left").iterdir())[1]
-    picture.unlink()
-    os.mkfifo(picture)  # reading it never ends
     return recordings
+
+
+def hang(recording: str) -> None:
+    """Stop whatever works on a recording, as a disk that no longer answers would; does not return."""
+    while True:
+        for entry in Path("/proc").glob("[0-9]*"):
+            if "archive.child" in (said := name_of(int(entry.name))) and f"eval {recording} " in said:
+                with suppress(ProcessLookupError):
+                    os.kill(int(entry.name), signal.SIGSTOP)
+        time.sleep(0.2)
 
 
 def command(folder: Path, out: Path) -> list[str]:
@@ -93,6 +102,7 @@ def command(folder: Path, out: Path) -> list[str]:
 def faults(folder: Path) -> None:
     recordings = forty(folder)
     write_manifest(str(folder / "forty.csv"), recordings)
+    threading.Thread(target=hang, args=(str(folder / "hangs"),), daemon=True).start()
     whole = folder / "whole"
     began = time.monotonic()
     subprocess.run(command(folder, whole), check=False, timeout=2 * PATIENCE)

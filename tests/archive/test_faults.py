@@ -86,11 +86,11 @@ def test_broken_recordings_are_quarantined_and_mended_ones_done(cluster: Any, tm
         2: ({"fails": "no such key", "code": 2}, 1, "no such key (exit code 2)"),
         3: ({"seconds": 60}, 2, "it took more than 3 s"),
         4: ({"signal": "SIGSEGV"}, 2, "ended by SIGSEGV"),
-        5: ({"takes_memory": 700}, 2, "GB of memory"),
+        5: ({"takes_memory": 300}, 2, "GB of memory"),
     }
     for number, (said, _, _) in broken.items():
         change(recordings[number], **said)
-    plan = quick_plan(tmp_path / "out", seconds=3.0, memory_gb=0.5)
+    plan = quick_plan(tmp_path / "out", seconds=3.0, memory_gb=0.2)
     store, tally = gone_through(tmp_path / "out", recordings, cluster, plan=plan)
     assert (tally.done, tally.quarantined) == (3, 5)
     records = {record["id"]: record for record in failed(store)}

@@ -18,8 +18,10 @@ def main() -> None:
     report.mkdir()
     if "signs" in said:  # that it began
         (Path(said["signs"]) / f"{recording.stem}.{os.getpid()}").touch()
-    if said.get("waits_for") and not Path(said["waits_for"]).exists():
-        time.sleep(60)
+    if said.get("waits_for"):
+        deadline = time.monotonic() + 60
+        while not Path(said["waits_for"]).exists() and time.monotonic() < deadline:
+            time.sleep(0.05)
     time.sleep(said.get("seconds") or 0)
     if said.get("takes_memory"):
         held = bytearray(os.urandom(1 << 20)) * said["takes_memory"]
