@@ -1,11 +1,12 @@
 """Forty recordings as one archive, with and without faults, and what the archive itself costs.
 
-    python tests/archive/forty.py faults FOLDER       # needs the right to mount a small disk
+    python tests/archive/forty.py whole FOLDER        # without faults
+    python tests/archive/forty.py faults FOLDER       # the same with faults; needs the right to mount a disk
     python tests/archive/forty.py efficiency FOLDER
     python tests/archive/forty.py tiny FOLDER         # 2000 recordings that do next to nothing
     python tests/archive/forty.py large FOLDER        # 100,000 that are done: what the command does with them
 
-Each takes some minutes of two cores; FOLDER must be new. docs/archive.md has what came out.
+Each takes some minutes of two cores; FOLDER must be new, but for `faults`. docs/archive.md has what came out.
 """
 
 from __future__ import annotations
@@ -99,14 +100,17 @@ def command(folder: Path, out: Path) -> list[str]:
     ]
 
 
+def whole(folder: Path) -> None:
+    write_manifest(str(folder / "forty.csv"), forty(folder))
+    threading.Thread(target=hang, args=(str(folder / "hangs"),), daemon=True).start()
+    began = time.monotonic()
+    subprocess.run(command(folder, folder / "whole"), check=False, timeout=2 * PATIENCE)
+    say(f"{time.monotonic() - began:.0f} s")
+
+
 def faults(folder: Path) -> None:
-    recordings = forty(folder)
-    write_manifest(str(folder / "forty.csv"), recordings)
     threading.Thread(target=hang, args=(str(folder / "hangs"),), daemon=True).start()
     whole = folder / "whole"
-    began = time.monotonic()
-    subprocess.run(command(folder, whole), check=False, timeout=2 * PATIENCE)
-    say(f"without faults: {time.monotonic() - began:.0f} s")
     size = sum(file.stat().st_size for file in (whole / RECORDINGS).rglob("*") if file.is_file())
     with small_disk(folder / "disk", size * 2 // 3) as disk:
         out = disk / "out"
@@ -222,10 +226,11 @@ def timed(what: str, count: int) -> Iterator[None]:
 
 
 def without_times(row: dict[str, Any]) -> dict[str, Any]:
+    """A row without what differs from run to run, and the version."""
     return {
         key: value
         for key, value in row.items()
-        if key.partition(".")[0] not in TIMING_KEYS | {"seconds", "finished"}
+        if key.partition(".")[0] not in TIMING_KEYS | {"seconds", "finished", "version"}
     }
 
 
@@ -296,5 +301,5 @@ def say(line: str) -> None:
 
 if __name__ == "__main__":
     what, place = sys.argv[1], Path(sys.argv[2]).resolve()
-    place.mkdir(parents=True)
-    {"faults": faults, "efficiency": efficiency, "tiny": tiny, "large": large}[what](place)
+    place.mkdir(parents=True, exist_ok=what == "faults")
+    {"whole": whole, "faults": faults, "efficiency": efficiency, "tiny": tiny, "large": large}[what](place)
