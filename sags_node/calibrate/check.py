@@ -10,6 +10,7 @@ import numpy as np
 from sags_node.calibrate.pictures import Pair, pairs_of_files, pairs_of_session
 from sags_node.calibration import Finding, check_eyes, check_pair, find_form, read_rig, unknown_form
 from sags_node.calibration.matches import match_eyes
+from sags_node.calibration.principal_points import judge_known_depths
 from sags_node.calibration.rows import judge_matches, rectified_rows
 from sags_node.config import LaunchConfig, PhantomSource
 from sags_node.errors import UsageError
@@ -17,7 +18,7 @@ from sags_node.launch_file import load_launch
 from sags_node.phantom import cached_session
 from sags_node.sources.pictures import size_text
 from sags_node.sources.source import recorded_rig
-from sags_node.types import F64, StereoFrame, StereoRig
+from sags_node.types import F32, F64, StereoFrame, StereoRig
 from sags_node.vision.rectify import Rectifier
 from sags_node.vision.row_error import measure_rows
 
@@ -51,10 +52,11 @@ def check_calibration(
     own = None if find_form(path) is not None else _launched(path, overrides)
     config = own if session is None else load_launch(session, overrides)
     pairs: list[Pair] = []
+    depths: Sequence[F32 | None] = ()
     if images:
         pairs = pairs_of_files(images)
     elif config is not None:
-        pairs = pairs_of_session(config, progress)
+        pairs, depths = pairs_of_session(config, progress)
     if pairs and size is None:
         size = pairs[0][0].shape[1], pairs[0][0].shape[0]
     rig = read_rig(path, size, metres) if own is None else _rig_of(own, size, metres)
@@ -62,18 +64,25 @@ def check_calibration(
     if _broken(findings):
         return findings
     findings += check_pair(rig)
-    return findings + (check_pictures(rig, pairs) if pairs else [])
+    return findings + (check_pictures(rig, pairs, depths) if pairs else [])
 
 
-def check_pictures(rig: StereoRig, pairs: Sequence[Pair]) -> list[Finding]:
-    """What raw pictures say of a rig whose numbers are sound."""
+def check_pictures(rig: StereoRig, pairs: Sequence[Pair], depths: Sequence[F32 | None] = ()) -> list[Finding]:
+    """What raw pictures say of a rig whose numbers are sound.
+
+    Args:
+        depths: what is known of each pair's depth, [H, W] m of the left rectified picture, 0 unknown.
+    """
     size = pairs[0][0].shape[1], pairs[0][0].shape[0]
     if size != (rig.left.width, rig.left.height):
         return [_wrong_size(rig, size)]
-    matches = np.concatenate([match_eyes(*pair) for pair in pairs])
+    found = [match_eyes(*pair) for pair in pairs]
+    matches = np.concatenate(found)
     findings = judge_matches(rig, matches)
     if findings[0].level == "ok":
         findings.append(_check_rows(rig, pairs, matches))
+        if depths:
+            findings += judge_known_depths(rig, found, depths)
     return findings
 
 
@@ -138,6 +147,11 @@ def _check_rows(rig: StereoRig, pairs: Sequence[Pair], matches: F64) -> Finding:
     if median <= GOOD_ROWS[0] and p90 <= GOOD_ROWS[1]:
         return Finding("ok", what, "", figures)
     pitch, roll = rows.turn
-    turned = f"; as if one eye were turned by {pitch:.2f} degrees up or down, {roll:.2f} about its axis"
+    lower = float(np.median(rows.errors))
+    turned = (
+        f"; as if one eye were turned by {pitch:.2f} degrees up or down, {roll:.2f} about its axis, or the "
+        f"right one's principal point lay {abs(lower):.1f} px {'lower' if lower > 0 else 'higher'}"
+    )
     mend = "depth suffers: calibrate again, with the scope as it is used"
-    return Finding("warning", what + turned, mend, figures | {"pitch_deg": pitch, "roll_deg": roll})
+    turn = {"pitch_deg": pitch, "roll_deg": roll, "row_offset_px": round(lower, 3)}
+    return Finding("warning", what + turned, mend, figures | turn)

@@ -9,10 +9,11 @@ from sags_node.config import LaunchConfig, RecordedSource
 from sags_node.errors import SagsError, UsageError
 from sags_node.sources.pictures import check_counts, list_pictures, read_picture, size_text
 from sags_node.sources.source import open_source
-from sags_node.types import U8
+from sags_node.types import F32, U8
 
 Pair = tuple[U8, U8]  # left, right: [H, W, 3] RGB, raw
 PAIRS = 8  # spread over what there is
+REFERENCE_EVERY = 10  # frames: recordings often know the depth of every tenth one only
 LIVE_STRIDE = 15  # frames of cameras, which go on and on
 
 
@@ -38,8 +39,11 @@ def pairs_of_files(named: Sequence[tuple[Path, Path]]) -> list[Pair]:
     return pairs
 
 
-def pairs_of_session(config: LaunchConfig, progress: Callable[[int, int], None] | None = None) -> list[Pair]:
-    """Some frames, spread over a recording; of cameras, one every half second.
+def pairs_of_session(
+    config: LaunchConfig, progress: Callable[[int, int], None] | None = None
+) -> tuple[list[Pair], list[F32 | None]]:
+    """Some frames, spread over a recording, and the depth [H, W] m that it knows of each, if any; of cameras,
+    one every half second.
 
     Raises:
         UsageError: the session has no right eye, or a wrong path.
@@ -49,18 +53,22 @@ def pairs_of_session(config: LaunchConfig, progress: Callable[[int, int], None] 
     if isinstance(source, RecordedSource):
         with open_source(source, references=False, progress=progress) as recording:
             stride = max(1, (recording.frame_count or PAIRS) // PAIRS)
+        if stride > REFERENCE_EVERY:
+            stride -= stride % REFERENCE_EVERY
         playing = {"stride": source.stride * stride, "pace": "step", "loop": False}
         source, stride = source.model_copy(update=playing), 1
-    pairs = []
-    with open_source(source, references=False) as opened:
+    pairs: list[Pair] = []
+    depths: list[F32 | None] = []
+    with open_source(source) as opened:
         for index, frame in enumerate(opened):
             if frame.right is None:
                 raise UsageError("the session has no right eye: there are no rows to compare")
             if index % stride == 0:
                 pairs.append((frame.left, frame.right))
+                depths.append(None if frame.reference is None else frame.reference.depth)
             if len(pairs) == PAIRS:
                 break
-    return pairs
+    return pairs, depths
 
 
 def _spread(files: list[tuple[Path, Path]]) -> Iterator[tuple[Path, Path]]:

@@ -196,6 +196,9 @@ def _depth(rig: StereoRig, rows: Rows) -> list[Finding]:
             "the calibration is in millimetres: divide by 1000, or --unit mm" if thousandth else RECALIBRATE
         )
         return [Finding("error", what, mend, figures)]
-    return [
-        Finding("ok", f"the pictures' points lie in front of both eyes, at {depth * 1e3:.0f} mm", "", figures)
-    ]
+    per_pixel = depth**2 / (rig.left.P[0, 0] * _signed_baseline(rig))
+    what = (
+        f"the pictures' points lie in front of both eyes, at {depth * 1e3:.0f} mm; matches cannot show "
+        f"whether the principal points differ sideways: 0.1 px would be {0.1 * per_pixel * 1e3:.2f} mm there"
+    )
+    return [Finding("ok", what, "", figures)]

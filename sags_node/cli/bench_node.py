@@ -281,7 +281,7 @@ def bench_thin(launch: tuple[str, ...], frames: int, out: Path | None, json_out:
 
     check_files(out)
     path, overrides = split_recording(launch, "sags bench thin plays recordings; record the cameras first")
-    session = open_launched(path, overrides)
+    session = open_launched(path, [*overrides, "source.loop:=false", "source.pace:=step"])
     with progress("making") as advance:
         rows = measure_thin(session, frames, advance)
     show(rows if json_out else rows_table(rows))

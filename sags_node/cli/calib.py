@@ -112,7 +112,8 @@ def check(
 
     PATH is a calibration of any known form, or a session, whose calibration is compared with its own
     pictures. With pictures the rows of both eyes are measured, and the check tells which end is wrong: the
-    calibration or the pictures. docs/calibration.md lists the forms.
+    calibration or the pictures. Where the session knows depths, they show whether the principal points
+    differ sideways. docs/calibration.md lists the forms.
 
     \b
     sags calib check calib/d4d

@@ -14,13 +14,23 @@ from click.testing import CliRunner
 from places import ROOT
 
 from sags_node.calibrate.check import check_pictures
-from sags_node.calibrate.pictures import pairs_of_files
-from sags_node.calibration import Finding, check_rig, load_rig, read_rig, rectify_eyes, save_rig
+from sags_node.calibrate.pictures import pairs_of_files, pairs_of_session
+from sags_node.calibration import (
+    Finding,
+    check_rig,
+    load_rig,
+    read_rig,
+    rectified_rig,
+    rectify_eyes,
+    save_rig,
+)
 from sags_node.calibration.check import size_made_for
 from sags_node.calibration.matches import match_eyes
+from sags_node.calibration.principal_points import judge_known_depths
 from sags_node.calibration.rows import rectified_rows
 from sags_node.cli.main import main
 from sags_node.errors import SagsError
+from sags_node.launch_file import load_launch
 from sags_node.sources.pictures import read_picture
 from sags_node.types import U8, Eye, StereoFrame, StereoRig
 from sags_node.vision.rectify import Rectifier
@@ -204,6 +214,54 @@ def test_a_turned_eye_is_a_warning_with_its_angle(
     assert abs(finding.figures[other]) < 0.1
 
 
+def test_a_principal_point_that_lies_lower_is_said_in_px(phantom: tuple[StereoRig, Pairs]) -> None:
+    rig, pairs = phantom
+    finding = worst(check_pictures(with_principal_point_moved(rig, 0.0, -1.5), pairs))
+    assert finding.level == "warning" and "px lower" in finding.what
+    assert finding.figures["row_offset_px"] == pytest.approx(1.5, abs=0.1)
+
+
+def with_principal_point_moved(rig: StereoRig, x: float, y: float) -> StereoRig:
+    K = rig.right.K + np.array([[0, 0, x], [0, 0, y], [0, 0, 0]])
+    return StereoRig(rig.name, rig.left, replace(rig.right, K=K))
+
+
+def test_known_depths_show_what_matches_cannot(
+    phantom_session: Path, phantom: tuple[StereoRig, Pairs]
+) -> None:
+    """The right principal point moved sideways by half a pixel: rows stay as they are, depths do not."""
+    pairs, depths = pairs_of_session(load_launch(phantom_session))
+    moved = with_principal_point_moved(phantom[0], 0.5, 0.0)
+    matches = [match_eyes(*pair) for pair in pairs]
+    rows = [rectified_rows(rig, np.concatenate(matches)).errors for rig in (phantom[0], moved)]
+    assert np.abs(rows[1] - rows[0]).max() < 0.05
+    right, wrong = (judge_known_depths(rig, matches, depths)[0] for rig in (phantom[0], moved))
+    assert right.level == "ok" and abs(right.figures["offset_px"]) < 0.1
+    assert wrong.level == "warning" and "too near" in wrong.what
+    shift = wrong.figures["offset_px"] - right.figures["offset_px"]
+    assert shift == pytest.approx(0.5, abs=0.02)  # exact but for the lens distortion
+    mended = float(re.findall(r"right.yaml to ([\d.]+)", wrong.mend)[0])
+    assert mended == pytest.approx(moved.right.K[0, 2] - wrong.figures["offset_px"], abs=0.01)
+
+
+@pytest.mark.parametrize(("nearest", "farthest"), [(0.05, 0.12), (0.1, 0.101)])
+def test_an_offset_is_told_from_a_longer_baseline_where_depths_differ(
+    nearest: float, farthest: float
+) -> None:
+    """By arithmetic: disparity = f B / Z + 0.3 px, with noise of 0.2 px, on a leaning plane."""
+    rig = rectified_rig("plane", 640, 512, np.array([[600.0, 0, 319.5], [0, 600, 255.5], [0, 0, 1]]), 0.004)
+    depth = np.tile(1 / np.linspace(1 / nearest, 1 / farthest, 640), (512, 1)).astype(np.float32)
+    rng = np.random.default_rng(0)
+    columns, lines = rng.integers(10, 630, 4000), rng.integers(10, 500, 4000)
+    disparity = 2.4 / depth[lines, columns] + 0.3 + rng.normal(0, 0.2, 4000)
+    matches = np.column_stack([columns, lines, columns - disparity, lines])
+    (finding,) = judge_known_depths(rig, [matches], [depth])
+    assert finding.figures["offset_px"] == pytest.approx(0.3, abs=0.02)
+    assert ("longer" in finding.what) == (farthest - nearest < 0.01)
+    depth[:, 1::2] = 0
+    assert judge_known_depths(rig, [matches], [depth]) == []  # every point lies beside an unknown one
+
+
 def test_the_calibration_of_another_scope(phantom: tuple[StereoRig, Pairs]) -> None:
     rig, pairs = phantom
     finding = worst(check_pictures(with_right_turned(rig, (3.0, 0.0, 1.0)), pairs))
@@ -317,8 +375,9 @@ def sags(*arguments: object) -> tuple[int, str, str]:
 def test_check_of_a_session_against_itself(phantom_session: Path) -> None:
     code, out, _ = sags(phantom_session, "--json")
     findings = json.loads(out)
-    assert code == 0 and findings[-1]["figures"]["row_median_px"] < 0.2
-    assert findings[-2]["figures"]["matches"] > 300
+    points, rows, principal_points = (finding["figures"] for finding in findings[-3:])
+    assert code == 0 and rows["row_median_px"] < 0.2
+    assert points["matches"] > 300 and abs(principal_points["offset_px"]) < 0.1
 
 
 def test_check_against_a_session_with_another_key(phantom_session: Path) -> None:
