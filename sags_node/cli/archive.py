@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 @click.group()
 def archive() -> None:
-    """Work through thousands of recordings, on this machine or on a Ray cluster."""
+    """Work through thousands of recordings, here or on a cluster."""
 
 
 @archive.command()
@@ -46,9 +46,10 @@ def archive() -> None:
 )
 @as_json
 def scan(folder: Path, out: str, rig: Path | None, json_out: bool) -> None:
-    """List all recordings below a folder in a manifest, and say why the others cannot be played.
+    """List the recordings below a folder in a manifest.
 
-    Each one is opened once, as sags run would. The manifest is a table: recording, rig, overrides, weight.
+    It says why others cannot be played. Each one is opened once, as sags run would. The manifest is a
+    table: recording, rig, overrides, weight.
 
     \b
     sags archive scan /data/theatre3 --out theatre3.parquet
@@ -232,7 +233,10 @@ def _state_table(state: dict[str, Any]) -> Table:
 @click.argument("out", metavar="OUT")
 @as_json
 def status(out: str, json_out: bool) -> None:
-    """Say how far an archive is, and what failed; also while it runs, from any machine."""
+    """Say how far an archive is, and what failed.
+
+    Also while it runs, from any machine.
+    """
     check_installed()
     from sags_node.archive.results import status as found
     from sags_node.archive.store import Store
@@ -246,7 +250,9 @@ def status(out: str, json_out: bool) -> None:
 @click.argument("id", metavar="ID")
 @as_json
 def show_one(out: str, id: str, json_out: bool) -> None:
-    """Show all about one recording: figures, or failed attempts, their log and the command that repeats them.
+    """Show all about one recording.
+
+    Its figures, or its failed attempts, their log and the command that repeats them.
 
     ID may be the beginning of one.
     """

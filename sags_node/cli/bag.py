@@ -107,7 +107,9 @@ def record(
     json_out: bool,
     keys: Any,
 ) -> None:
-    """Record what a running node publishes until Ctrl-C, or with --session all that comes of a recording.
+    """Record what a running node publishes until Ctrl-C.
+
+    With --session: all that comes of a recording.
 
     Leaves a rosbag2 folder: MCAP files that Foxglove, PlotJuggler and `ros2 bag` open, and metadata.yaml.
     Calibration and parameters are attached. Messages that the disk was too slow for are counted as dropped,
