@@ -60,7 +60,7 @@ def load_launch(path: Path | str | None = None, overrides: Sequence[str] = ()) -
     name = "defaults"
     if path is not None:
         file = Path(path)
-        recording = _known_recording(file)
+        recording = known_recording(file)
         if file.is_dir() and recording is None:
             file = file / "launch.yaml"
         elif file.suffix.lower() in VIDEO_SUFFIXES:
@@ -90,14 +90,14 @@ def load_launch(path: Path | str | None = None, overrides: Sequence[str] = ()) -
     return config
 
 
-def _known_recording(folder: Path) -> dict[str, Any] | None:
+def known_recording(folder: Path) -> dict[str, Any] | None:
     """How to play what is no session of ours but a ROS bag, or laid out as dVRK or a research data set."""
     if (folder / "launch.yaml").exists():
         return None
     is_folder = folder.is_dir()
     if folder.suffix in BAG_SUFFIXES or (folder / "metadata.yaml").is_file() or any(folder.glob("*.mcap")):
         return {"source": {"kind": "bag", "path": str(folder)}}
-    if any(_is_sidecar(file) for file in (folder.glob("*.json") if is_folder else [folder])):
+    if any(is_sidecar(file) for file in (folder.glob("*.json") if is_folder else [folder])):
         return {"source": {"kind": "dvrk", "path": str(folder)}}
     if (folder / "poses_bounds.npy").is_file() or all(
         (folder / name).is_dir() for name in ("images", "masks")
@@ -112,7 +112,7 @@ def _known_recording(folder: Path) -> dict[str, Any] | None:
     return None
 
 
-def _is_sidecar(file: Path) -> bool:
+def is_sidecar(file: Path) -> bool:
     """Whether this describes a video of dVRK's `record`; its type stands at the beginning or the end."""
     if file.suffix != ".json" or not file.is_file():
         return False

@@ -29,13 +29,18 @@ _STYLE: dict[Any, Any] = {
 }
 
 
+def has_plots() -> bool:
+    """Whether matplotlib is installed."""
+    return find_spec("matplotlib") is not None
+
+
 def check_plots() -> None:
     """To be asked before long work whose result is a plot.
 
     Raises:
         UsageError: matplotlib is not installed.
     """
-    if find_spec("matplotlib") is None:
+    if not has_plots():
         raise UsageError("plots need matplotlib, which is not installed: pip install 'sags-node[report]'")
 
 

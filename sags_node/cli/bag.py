@@ -6,19 +6,22 @@ import json
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import click
 from rich.markup import escape
 
 from sags_node.cli import bag_text as say
-from sags_node.cli.launching import as_json, positive
+from sags_node.cli.launching import as_json, open_launched, positive, split_recording
 from sags_node.cli.node_options import endpoint_option, keys_options, ns_option
-from sags_node.errors import SagsError
-from sags_node.terminal.console import console, on_stop_signals, show
+from sags_node.errors import SagsError, UsageError
+from sags_node.terminal.console import console, on_stop_signals, progress, show
+
+if TYPE_CHECKING:
+    from sags_node.recording.recorder import Options
 
 DATA_LOST = 3  # exit code
 
@@ -31,6 +34,13 @@ def bag() -> None:
 
 
 @bag.command()
+@click.argument("overrides", nargs=-1, metavar="[key:=value ...]")
+@click.option(
+    "--session",
+    metavar="LAUNCH.yaml",
+    help="Play this recording through a node of its own and record all of it; key:=value changes it, as for "
+    "sags run.",
+)
 @click.option(
     "-o", "--output", type=click.Path(path_type=Path), help="New folder; default: sags_<date>_<time>."
 )
@@ -81,6 +91,8 @@ def bag() -> None:
 @click.option("--seconds", type=positive, help="Stop after so long; default: Ctrl-C.")
 @as_json
 def record(
+    overrides: tuple[str, ...],
+    session: str | None,
     output: Path | None,
     topics: tuple[str, ...],
     compression: str,
@@ -97,6 +109,8 @@ def record(
 ) -> None:
     """Record what a running node publishes until Ctrl-C.
 
+    With --session: all that comes of a recording.
+
     Leaves a rosbag2 folder: MCAP files that Foxglove, PlotJuggler and `ros2 bag` open, and metadata.yaml.
     Calibration and parameters are attached. Messages that the disk was too slow for are counted as dropped,
     those that never arrived as lost. A killed recorder's file is mended by `sags bag recover`.
@@ -106,8 +120,16 @@ def record(
     sags bag record --topics left/image_rect_color --topics right/image_rect_color
     sags bag record -o out/case2 --max-bag-size 4000000000
     sags bag record -o out/last --snapshot-mode 20 & kill -USR1 $!
+    sags bag record -o out/case3 --session launch/d4d_pull.yaml mapping.budget_ms:=100
     """
     from datetime import datetime
+
+    if overrides and session is None:
+        raise UsageError(f"{overrides[0]}: key:=value needs --session LAUNCH.yaml")
+    if session is not None and (snapshot_mode is not None or from_stdin or seconds is not None or endpoint):
+        raise UsageError(
+            "--session records a whole recording: no --snapshot-mode, --stdin, --seconds, --endpoint"
+        )
 
     from sags_node.messaging.stream import check_topic
     from sags_node.recording.bag_writer import Limits
@@ -125,19 +147,22 @@ def record(
 
     with _failure_told(tell if from_stdin else None):
         names = tuple(check_topic(say.plain(name, ns)).name for name in topics)
-        recorder = Recorder(
-            Options(
-                folder=output or Path(f"sags_{datetime.now():%Y%m%d_%H%M%S}"),
-                topics=names,
-                compression=cast(Compression, compression),
-                max_cache_mb=max_cache,
-                snapshot_seconds=snapshot_mode,
-                limits=Limits(max_bag_size, max_bag_duration),
-                ns=ns,
-                endpoint=endpoint,
-                keys=keys,
-            )
+        options = Options(
+            folder=output or Path(f"sags_{datetime.now():%Y%m%d_%H%M%S}"),
+            topics=names,
+            compression=cast(Compression, compression),
+            max_cache_mb=max_cache,
+            snapshot_seconds=snapshot_mode,
+            limits=Limits(max_bag_size, max_bag_duration),
+            ns=ns,
+            endpoint=endpoint,
+            keys=keys,
         )
+        if session is not None:
+            summary = _recorded((session, *overrides), options)
+            show(summary if json_out else say.recorded_table(summary))
+            return
+        recorder = Recorder(options)
         on_stop_signals(recorder.stop)
         signal.signal(signal.SIGUSR1, lambda *_: recorder.snapshot())
         if from_stdin:
@@ -148,6 +173,19 @@ def record(
             timer.start()
         summary = recorder.run(tell)
     show(summary if json_out else say.recorded_table(summary))
+
+
+def _recorded(launch: Sequence[str], options: Options) -> dict[str, Any]:
+    from sags_node.played_bag import record_session
+
+    path, overrides = split_recording(
+        launch, "live cameras are recorded from the running node; leave out --session"
+    )
+    if options.folder.exists():
+        raise UsageError(f"{options.folder} exists already; name a new folder")
+    opened = open_launched(path, [*overrides, "source.loop:=false", "source.pace:=step"])
+    with progress("recording") as advance:
+        return record_session(opened, options, advance)
 
 
 @bag.command()

@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from sags_node.cli.launching import as_json, file_option, open_launched, positive, split_recording
+from sags_node.cli.launching import (
+    as_json,
+    file_option,
+    lerobot_option,
+    open_launched,
+    positive,
+    split_recording,
+)
 from sags_node.cli.node_options import endpoint_option, keys_options, ns_option
 from sags_node.errors import UsageError
 from sags_node.terminal import text
 from sags_node.terminal.console import progress, show
+
+if TYPE_CHECKING:
+    from sags_node.export.lerobot_form import Version
 
 NO_CAMERAS = "live cameras are exported from the running node; leave out --session"
 
@@ -41,6 +52,21 @@ NO_CAMERAS = "live cameras are exported from the running node; leave out --sessi
     help="All Gaussians of every frame of --session, a .ply each, and a video that plays in a loop. The same "
     "command again goes on where it was ended.",
 )
+@file_option("--tracks", "F.npz", "64 points that are followed through all of --session, in 3D.")
+@file_option("--render", "F.mp4", "The model as the left eye sees it, every frame of --session.")
+@click.option(
+    "--depth",
+    metavar="FOLDER",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="The model's depth of every frame of --session, 16-bit PNGs in units of 0.01 mm, 0 unknown.",
+)
+@click.option(
+    "--lerobot",
+    metavar="FOLDER",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="All of that and the pictures, as a data set in the form of LeRobot.",
+)
+@lerobot_option
 @click.option(
     "--orbit-degrees",
     type=click.FloatRange(0, 60),
@@ -64,6 +90,11 @@ def export(
     mesh: Path | None,
     orbit: Path | None,
     sequence: Path | None,
+    tracks: Path | None,
+    render: Path | None,
+    depth: Path | None,
+    lerobot: Path | None,
+    lerobot_version: Version,
     orbit_degrees: float,
     orbit_seconds: float,
     force: bool,
@@ -81,13 +112,25 @@ def export(
     sags export --session launch/d4d_pull.yaml --at 3 --mesh lift.obj --orbit lift.mp4
     sags export --session launch/d4d_pull.yaml --fit out/d4d --at 3 --splats lift.ply
     sags export --session launch/d4d_pull.yaml --sequence out/frames
+    sags export --session launch/d4d_pull.yaml --depth out/depth --tracks out/tracks.npz
+    sags export --session launch/d4d_pull.yaml --render out/model.mp4 --lerobot out/dataset
     """
     from sags_node.export import export as work
     from sags_node.export import scene as source
     from sags_node.export import sequence as many
 
+    every = {"depth": depth, "tracks": tracks, "render": render, "lerobot": lerobot}
+    played = {kind: path for kind, path in every.items() if path is not None}
     asked = {"splats": splats, "points": points, "mesh": mesh, "orbit": orbit}
     targets = {kind: path for kind, path in asked.items() if path is not None}
+    if played and (targets or sequence or at is not None or fit is not None or session is None):
+        raise UsageError(
+            f"--{next(iter(played))} is of every frame: it needs --session LAUNCH.yaml, and no files of one "
+            "moment, --sequence, --at or --fit beside it"
+        )
+    if played and session is not None:
+        _export_played((session, *overrides), played, lerobot_version, json_out)
+        return
     if sequence is None:
         work.check_targets(targets, force)
     elif targets or at is not None or session is None:
@@ -107,8 +150,9 @@ def export(
                 if fit is None
                 else source.scenes_of_fit(fit, opened, advance)
             )
-            played = opened.source
-            rows = many.write_sequence(sequence, scenes, played.rate, played.frame_count, advance)
+            rows = many.write_sequence(
+                sequence, scenes, opened.source.rate, opened.source.frame_count, advance
+            )
         show(rows if json_out else text.rows_table(rows))
         return
     with progress("exporting") as advance:
@@ -119,4 +163,25 @@ def export(
         else:
             scene = source.from_fit(fit, opened, at, advance)
         rows = work.export(scene, targets, work.Orbit(orbit_degrees, orbit_seconds), advance)
+    show(rows if json_out else text.rows_table(rows))
+
+
+def _export_played(
+    launch: Sequence[str], played: Mapping[str, Path], version: Version, json_out: bool
+) -> None:
+    from sags_node.export.lerobot import LeRobot
+    from sags_node.export.played import DepthMaps, Product, Renders, Tracks, write_played
+
+    path, overrides = split_recording(launch, NO_CAMERAS)
+    opened = open_launched(path, [*overrides, "source.loop:=false", "source.pace:=step"])
+    rate, size = opened.source.rate, opened.working_size
+    made: dict[str, Callable[[Path], Product]] = {
+        "depth": DepthMaps,
+        "tracks": Tracks,
+        "render": lambda file: Renders(file, rate, size),
+        "lerobot": lambda folder: LeRobot(folder, rate, version),
+    }
+    products = {kind: made[kind](target) for kind, target in played.items()}
+    with progress("exporting") as advance:
+        rows = write_played(opened, products, advance)
     show(rows if json_out else text.rows_table(rows))

@@ -13,6 +13,7 @@ import click
 from rich.markup import escape
 
 from sags_node import __version__
+from sags_node.cli.archive import archive
 from sags_node.cli.bag import bag
 from sags_node.cli.bench import bench
 from sags_node.cli.bridge import bridge
@@ -289,5 +290,5 @@ def import_folder(folder: Path, json_out: bool) -> None:
         raise SagsError(f"{folder} cannot be played as it is; see the mends above")
 
 
-for command in (evaluate, fit, export, bag, bench, bridge, calib, overlay, view, topic):
+for command in (evaluate, fit, export, archive, bag, bench, bridge, calib, overlay, view, topic):
     main.add_command(command)

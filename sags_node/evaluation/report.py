@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Callable, Mapping, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from rich.table import Table
 
 from sags_node.evaluation import calibration
 from sags_node.evaluation.gallery import Picture
 from sags_node.evaluation.measure import FrameRow
+from sags_node.evaluation.page import encoded, page, picture_uri, svg_uri
 from sags_node.evaluation.plots import Series, line_plot
 from sags_node.evaluation.spool import RunFacts
 from sags_node.evaluation.tiles import ERROR_AT_TOP, depth_range, tiles
@@ -22,20 +21,6 @@ from sags_node.types import U8
 
 BLUE, ORANGE, GREEN = "#2166ac", "#d6604d", "#1b7837"
 COLUMNS = ("input", "model", "depth", "error")
-_JPEG_QUALITY = 85
-
-_STYLE = """
-body { font: 15px/1.45 system-ui, sans-serif; color: #222 }
-body { max-width: 1480px; margin: 24px auto; padding: 0 16px }
-h1 { font-size: 22px; margin: 0 } h2 { font-size: 17px; margin: 28px 0 8px } p { margin: 4px 0 }
-table { border-collapse: collapse } td, th { padding: 3px 12px 3px 0; text-align: left; vertical-align: top }
-table.figures td { border-top: 1px solid #ddd } .number { font-variant-numeric: tabular-nums }
-table.pictures img { width: 100%; display: block } table.pictures td { padding: 2px; width: 25% }
-.plots { display: grid; grid-template-columns: repeat(auto-fit, minmax(520px, 1fr)); gap: 8px }
-.quiet { color: #666 }
-h3 { font-size: 15px; margin: 12px 0 4px; color: #b35c00 }
-.plots img { width: 100% }
-"""
 
 
 def write_report(
@@ -54,13 +39,11 @@ def write_report(
     sheet = [tiles(picture, near, far) for picture in pictures]
     if sheet:
         grid = np.concatenate([np.concatenate(line, axis=1) for line in sheet])
-        (folder / "sheet.png").write_bytes(_encoded(".png", grid))
-    title = f"SAGS: {escape(str(summary['session']))}"
-    page = "\n".join(
+        (folder / "sheet.png").write_bytes(encoded(".png", grid))
+    title = f"SAGS: {summary['session']}"
+    text = page(
+        title,
         [
-            f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>',
-            f"<style>{_STYLE}</style></head><body>",
-            f"<h1>{title}</h1>",
             f'<p class="quiet">{escape(_circumstances(summary))}</p>',
             "<h2>What it showed</h2>",
             warning_table(rows),
@@ -71,11 +54,10 @@ def write_report(
             _plots(rows, summary.get("segments") or {}),
             "<h2>Figures</h2>",
             _figure_table(summary),
-            "</body></html>",
-        ]
+        ],
     )
     file = folder / "report.html"
-    file.write_text(page, encoding="utf-8")
+    file.write_text(text, encoding="utf-8")
     return file
 
 
@@ -101,7 +83,7 @@ def _picture_table(pictures: Sequence[Picture], sheet: Sequence[Sequence[U8]]) -
         note = " (the worst)" if picture.psnr == worst and len(pictures) > 1 else ""
         caption = f"frame {picture.frame_id}, {picture.psnr:.1f} dB{note}"
         cells = "".join(
-            f'<td><img alt="{name}" src="{_uri(tile)}"></td>'
+            f'<td><img alt="{name}" src="{picture_uri(tile)}"></td>'
             for name, tile in zip(COLUMNS, line, strict=True)
         )
         lines.append(f'<tr>{cells}</tr><tr><td colspan="4" class="quiet">{caption}</td></tr>')
@@ -172,7 +154,7 @@ def _plots(rows: Sequence[FrameRow], spans: Mapping[str, tuple[int, int]]) -> st
             {},
         )
     )
-    shown = [f'<img alt="plot" src="{_svg_uri(plot)}">' for plot in plots if plot]
+    shown = [f'<img alt="plot" src="{svg_uri(plot)}">' for plot in plots if plot]
     return f'<div class="plots">{"".join(shown)}</div>'
 
 
@@ -197,17 +179,3 @@ def _text(value: Any) -> str:
 
 def _inner(value: Any) -> str:
     return f"({_text(value)})" if isinstance(value, Mapping) else _text(value)
-
-
-def _uri(tile: U8) -> str:
-    return "data:image/jpeg;base64," + base64.b64encode(_encoded(".jpg", tile)).decode()
-
-
-def _svg_uri(plot: str) -> str:
-    return "data:image/svg+xml;base64," + base64.b64encode(plot.encode()).decode()
-
-
-def _encoded(suffix: str, picture: U8) -> bytes:
-    options = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY] if suffix == ".jpg" else []
-    _, data = cv2.imencode(suffix, cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), options)
-    return bytes(data)

@@ -1,0 +1,52 @@
+"""The jobs: each is a `sags` command for one recording, that leaves a folder and says its figures as JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+FIGURES, LOG = "figures.json", "log.txt"  # of a recording's folder: stdout and stderr of the command
+
+Arguments = Callable[[list[str], Path], list[str]]
+
+JOBS: dict[str, Arguments] = {
+    "eval": lambda said, out: [
+        *("eval", *said),
+        *("--pace", "step", "--report", str(out / "report"), "--json", "-"),
+    ],
+    "depth": lambda said, out: ["export", "--session", *said, "--depth", str(out / "depth"), "--json"],
+    "tracks": lambda said, out: ["export", "--session", *said, "--tracks", str(out / "tracks.npz"), "--json"],
+    "render": lambda said, out: ["export", "--session", *said, "--render", str(out / "model.mp4"), "--json"],
+    "lerobot": lambda said, out: ["export", "--session", *said, "--lerobot", str(out / "lerobot"), "--json"],
+    "record": lambda said, out: [
+        *("bag", "record", "--session", *said),
+        *("-o", str(out / "bag"), "--compression", "jpeg", "--json"),
+    ],
+    "fit": lambda said, out: ["fit", *said, "--out", str(out), "--json"],
+}
+NEEDS_PLOTS = frozenset({"eval"})
+
+
+def command(job: str, said: Sequence[str], options: Sequence[str], out: Path) -> list[str]:
+    """What follows `sags`.
+
+    Args:
+        said: launch file or session, and overrides, as `launching.arguments`.
+        options: further ones of that command.
+        out: the folder that it fills.
+    """
+    return [*JOBS[job](list(said), out), *options]
+
+
+def flat(figures: Any, prefix: str = "") -> dict[str, Any]:
+    """All numbers and words of nested figures in one row, named by their way: `online.psnr`."""
+    row: dict[str, Any] = {}
+    if isinstance(figures, list):  # of `sags export`: a row for each kind of file
+        figures = {each["kind"]: {"holds": each["holds"], "bytes": each["bytes"]} for each in figures}
+    for key, value in figures.items():
+        if isinstance(value, Mapping):
+            row |= flat(value, f"{prefix}{key}.")
+        elif not isinstance(value, list):
+            row[f"{prefix}{key}"] = value
+    return row

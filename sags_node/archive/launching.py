@@ -1,0 +1,86 @@
+"""From a row of a manifest to the arguments that `sags eval`, `fit` and `export` take."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from sags_node.errors import UsageError
+from sags_node.launch_file import VIDEO_SUFFIXES, known_recording
+
+
+def counterpart(left: str) -> str | None:
+    """The name of the right eye's file or folder; None where this is not named as a left one.
+
+    The last "left" of the name becomes "right", else an l that stands alone at its end an r.
+    """
+    stem, dot, suffix = left.rpartition(".") if "." in left else (left, "", "")
+    for pattern in (r"^(.*)(left)(.*)$", r"^(.*[_-])(l)()$"):
+        found = re.match(pattern, stem, re.IGNORECASE)
+        if found:
+            said = found[2]
+            right = "right" if len(said) > 1 else "r"
+            right = right.upper() if said.isupper() else right.title() if said[0].isupper() else right
+            return f"{found[1]}{right}{found[3]}{dot}{suffix}"
+    return None
+
+
+def is_video(name: str) -> bool:
+    return name.lower().endswith(VIDEO_SUFFIXES)
+
+
+def belongs(name: str, overrides: Sequence[str]) -> list[str]:
+    """The names (paths or URLs) of all files and folders of a recording: two where each eye has its video."""
+    right = counterpart(name) if is_video(name) and _kind(overrides) == "videos" else None
+    return [name] if right is None or _shows_both(overrides) else [name, right]
+
+
+def arguments(place: Path, rig: Path | None, overrides: Sequence[str]) -> list[str]:
+    """What follows `sags eval`: a launch file or session, and `key:=value`.
+
+    Args:
+        place: of the recording, on this machine.
+        rig: a calibration for it.
+
+    Raises:
+        UsageError: a video whose overrides do not say how it shows the eyes.
+    """
+    said = [*([] if rig is None else [f"rig:={rig}"]), *overrides]
+    if is_video(place.name):
+        return [*_video(place, overrides), *said]
+    pair = place / "left", place / "right"
+    if place.is_dir() and not (place / "launch.yaml").exists() and all(eye.is_dir() for eye in pair):
+        if known_recording(place) is None:
+            return ["source.kind:=folders", f"source.left:={pair[0]}", f"source.right:={pair[1]}", *said]
+    return [str(place), *said]
+
+
+def _video(place: Path, overrides: Sequence[str]) -> list[str]:
+    kind = _kind(overrides)
+    if kind in ("side_by_side", "panes"):
+        return [f"source.video:={place}"]
+    if kind != "videos":
+        raise UsageError(
+            f"{place} is a video: its overrides must say how it shows the eyes, source.kind:=side_by_side or "
+            "source.kind:=videos (docs/archive.md)"
+        )
+    right = counterpart(place.name)
+    if _shows_both(overrides) or right is None:
+        return [f"source.left:={place}"]
+    return [f"source.left:={place}", f"source.right:={place.with_name(right)}"]
+
+
+def _kind(overrides: Sequence[str]) -> str | None:
+    kinds = [each.partition(":=")[2] for each in overrides if each.startswith("source.kind:=")]
+    return kinds[-1] if kinds else None
+
+
+def _shows_both(overrides: Sequence[str]) -> bool:
+    return any(each.startswith("source.geometry.layout:=") for each in overrides)
+
+
+def split(said: Sequence[str]) -> tuple[str | None, list[str]]:
+    """Arguments as `load_launch` and `open_session` take them: what is launched, and the overrides."""
+    launch = next((each for each in said if ":=" not in each), None)
+    return launch, [each for each in said if ":=" in each]

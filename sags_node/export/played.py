@@ -1,0 +1,206 @@
+"""What the node knows of every frame of a recording, as files: depth, tracks, drawn pictures, a data set."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+
+from sags_node.errors import SagsError, UsageError
+from sags_node.export.export import whole
+from sags_node.export.scene import Advance
+from sags_node.kernels.threads import configure_threads
+from sags_node.pipeline import Pipeline
+from sags_node.session import Session
+from sags_node.terminal.console import check_file, check_folder, writing
+from sags_node.types import F32, U8, AnchorStates, FrameResult
+from sags_node.video_file import VideoFile
+
+DEPTH_UNIT = 1e-5  # m for a count, as `source.reference.depth_unit`
+MOST_DEPTH = 65535 * DEPTH_UNIT  # m; 16 bits reach no farther
+TRACKS = 64  # points that are followed, on a grid
+SEEN = 0.5  # visibility from which on a point counts as seen
+
+
+class Product(Protocol):
+    """Takes one frame after the other."""
+
+    def add(self, result: FrameResult, anchors: AnchorStates) -> None: ...
+
+    def finish(self) -> dict[str, Any]:
+        """Complete the files; `holds` counts what is in them, `bytes` their size."""
+
+    def close(self) -> None:
+        """Let go of what is open, also after a failure."""
+
+
+def write_played(session: Session, products: Mapping[str, Product], advance: Advance) -> list[dict[str, Any]]:
+    """Play a recording, every frame in turn, and give all of them what the node knows of it.
+
+    Points to be followed are pinned on a grid, in the first frame that has depth.
+
+    Args:
+        session: a recording with `source.pace` step.
+        products: by kind.
+        advance: called with what is going on.
+
+    Returns:
+        A row for each, as `export.export`.
+
+    Raises:
+        SagsError: it cannot be read, or a file cannot be written.
+    """
+    with ExitStack() as stack:
+        for product in products.values():
+            stack.callback(product.close)
+        count = session.source.frame_count
+        for done, (result, anchors) in enumerate(_played(session), 1):
+            for product in products.values():
+                product.add(result, anchors)
+            advance(done, count, "playing")
+        return [{"kind": kind, **product.finish()} for kind, product in products.items()]
+
+
+def _played(session: Session) -> Iterator[tuple[FrameResult, AnchorStates]]:
+    configure_threads(session.config.engine.threads)
+    pipeline = Pipeline(session.config, session.rig)
+    budget = pipeline.make_budget()
+    with session.source as source:
+        for frame in source:
+            result = pipeline.process(frame, budget)
+            if len(pipeline.anchors) == 0 and not result.held:
+                _pin(pipeline, result)
+                yield result, pipeline.anchors.at(frame.t_capture_ns)
+            else:
+                yield result, result.anchors
+
+
+def _pin(pipeline: Pipeline, result: FrameResult) -> None:
+    """On a grid over the picture; where there is no tissue or no depth, nothing is pinned."""
+    view = result.views["left"]
+    height, width = view.depth.shape
+    side = round(TRACKS**0.5)
+    for row in range(side):
+        for column in range(side):
+            u, v = (column + 0.5) * width / side, (row + 0.5) * height / side
+            try:
+                pipeline.anchors.add_pixel(u, v, result.observation, result.snapshot, view)
+            except SagsError:
+                continue  # an instrument, or no depth
+
+
+def depth_of(result: FrameResult) -> F32:
+    """The model's depth [H, W], m; 0 where it is not known, and everywhere in a frame that was not taken in:
+    the model is that of an older one."""
+    depth = result.views["left"].depth
+    return np.zeros_like(depth) if result.held else depth
+
+
+def points_of(anchors: AnchorStates) -> tuple[F32, F32]:
+    """World points [TRACKS, 3] (m, NaN: lost, or never pinned) and visibility [TRACKS]."""
+    points = np.full((TRACKS, 3), np.nan, np.float32)
+    visibility = np.zeros(TRACKS, np.float32)
+    places = anchors.ids - 1  # they are numbered from 1, and nobody else pins any
+    points[places] = anchors.points
+    visibility[places] = np.where(np.isfinite(anchors.points[:, 0]), anchors.visibility, 0)
+    return points, visibility
+
+
+class DepthMaps:
+    """A 16-bit PNG for each frame, named by its number, as `source.reference.depth` reads them."""
+
+    def __init__(self, folder: Path) -> None:
+        new_folder(folder)
+        self._folder = folder
+        self._holds = self._bytes = 0
+
+    def add(self, result: FrameResult, anchors: AnchorStates) -> None:
+        depth = depth_of(result)
+        counts = np.where(depth < MOST_DEPTH, np.round(depth / DEPTH_UNIT), 0).astype(np.uint16)
+        path = self._folder / f"{result.pair.frame_id:05d}.png"
+        data = cv2.imencode(".png", counts)[1].tobytes()
+        with writing(path), whole(path) as partial:
+            partial.write_bytes(data)
+        self._holds += 1
+        self._bytes += len(data)
+
+    def finish(self) -> dict[str, Any]:
+        return {"file": str(self._folder), "holds": self._holds, "bytes": self._bytes}
+
+    def close(self) -> None:
+        pass
+
+
+class Tracks:
+    """An npz with `points` [T, P, 3] (m), `visible` [T, P] and `frames` [T], as `source.reference.tracks`."""
+
+    def __init__(self, file: Path) -> None:
+        check_file(file)
+        self._file = file
+        self._points: list[F32] = []
+        self._visible: list[F32] = []
+        self._frames: list[int] = []
+
+    def add(self, result: FrameResult, anchors: AnchorStates) -> None:
+        points, visibility = points_of(anchors)
+        self._points.append(points)
+        self._visible.append(visibility)
+        self._frames.append(result.pair.frame_id)
+
+    def finish(self) -> dict[str, Any]:
+        if not self._points:
+            raise SagsError("no frame was played; check source.start and source.frames")
+        points, seen = np.stack(self._points), np.stack(self._visible) >= SEEN
+        with writing(self._file), whole(self._file) as partial, partial.open("wb") as file:
+            np.savez_compressed(file, points=points, visible=seen, frames=np.array(self._frames))
+        pinned = int(np.isfinite(points[..., 0]).any(0).sum())
+        return {"file": str(self._file), "holds": pinned, "bytes": self._file.stat().st_size}
+
+    def close(self) -> None:
+        pass
+
+
+class Renders:
+    """An MP4 of the model as the left eye sees it; black where nothing is known, and in frames that were not
+    taken in."""
+
+    def __init__(self, file: Path, rate: float, size: tuple[int, int]) -> None:
+        check_file(file)
+        self._file = file
+        self._partial = file.with_name(f".partial-{file.name}")
+        self._video = VideoFile(self._partial, rate, size)
+        self._holds = 0
+
+    def add(self, result: FrameResult, anchors: AnchorStates) -> None:
+        view = result.views["left"]
+        shown = view.rgb * (view.alpha[..., None] > 0) * (not result.held)
+        picture: U8 = np.round(np.clip(shown, 0, 1) * 255).astype(np.uint8)
+        self._video.add(picture)
+        self._holds += 1
+
+    def finish(self) -> dict[str, Any]:
+        self._video.close()
+        size = self._partial.stat().st_size
+        if size == 0:
+            raise SagsError(f"cannot write {self._file}: is the disk full?")
+        self._partial.replace(self._file)
+        return {"file": str(self._file), "holds": self._holds, "bytes": size}
+
+    def close(self) -> None:
+        self._video.close()
+        self._partial.unlink(missing_ok=True)
+
+
+def new_folder(folder: Path) -> None:
+    """Make it.
+
+    Raises:
+        UsageError: it holds something.
+    """
+    check_folder(folder)
+    if any(folder.iterdir()):
+        raise UsageError(f"{folder} is not empty; choose another folder")

@@ -1,0 +1,206 @@
+"""What `sags export` writes of every frame: read again by others, and compared with the phantom's truth."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from command_line import pure_json, refused, sags
+from tiny_archive import TINY_FRAMES, write_tiny_session
+
+from sags_node.calibration import read_rig
+from sags_node.export.lerobot import merge
+from sags_node.export.lerobot_form import (
+    COARSE,
+    DEPTH,
+    LEFT,
+    POINTS,
+    POSE,
+    RIGHT,
+    TASK,
+    TISSUE,
+    Version,
+)
+from sags_node.export.lerobot_stats import Sums, merged
+from sags_node.export.played import DEPTH_UNIT, TRACKS
+from sags_node.session import open_session
+from sags_node.types import RectifiedPair
+from sags_node.vision.rectify import Rectifier
+
+pq = pytest.importorskip("pyarrow.parquet", reason="the extra archive is not installed")
+av = pytest.importorskip("av", reason="a second reader of videos")
+
+SESSIONS = 3
+CHUNKS = ("chunk_index", "file_index")
+CODING = 6  # of 255: a video's error; another frame of these sessions differs by 10 and more
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folders session0, session1, session2, and what was exported of each: depth, tracks, render, lerobot."""
+    folder = tmp_path_factory.mktemp("played")
+    for number in range(SESSIONS):
+        session, out = folder / f"session{number}", folder / str(number)
+        write_tiny_session(session, seed=number)
+        out.mkdir()
+        rows = pure_json(
+            sags(
+                *("export", "--session", session, "mapping.iterations:=1", "mapping.max_gaussians:=4000"),
+                *("--depth", out / "depth", "--tracks", out / "tracks.npz"),
+                *("--render", out / "model.mp4", "--lerobot", out / "lerobot", "--json"),
+                *("--lerobot-version", "v2.1" if number == 1 else "v3.0"),
+            ).stdout
+        )
+        assert [row["kind"] for row in rows] == ["depth", "tracks", "render", "lerobot"]
+        assert all(row["bytes"] > 0 for row in rows)
+    return folder
+
+
+def rectified(folder: Path) -> list[RectifiedPair]:
+    session = open_session(folder, ["source.pace:=step"])
+    rectifier = Rectifier(session.rig, *session.working_size)
+    with session.source as source:
+        return [rectifier(frame) for frame in source]
+
+
+def test_depth_is_that_of_the_phantom(exported: Path) -> None:
+    rig = read_rig(exported / "session0/calib")
+    half_a_pixel = 0.5 / (rig.left.P[0, 0] * rig.baseline)  # of disparity, in inverse depth, 1/m
+    for number in range(TINY_FRAMES):
+        said = cv2.imread(str(exported / f"0/depth/{number:05d}.png"), cv2.IMREAD_UNCHANGED)
+        truth = cv2.imread(str(exported / f"session0/depth/{number:04d}.png"), cv2.IMREAD_UNCHANGED)
+        depth, known = said * DEPTH_UNIT, (said > 0) & (truth > 0)
+        assert known.mean() > 0.5
+        error = np.abs(1 / depth[known] - 1 / (truth[known] * 2.5e-6))
+        assert np.median(error) < half_a_pixel
+
+
+def test_points_stay_on_the_surface_and_sags_eval_reads_them(exported: Path) -> None:
+    with np.load(exported / "0/tracks.npz") as tracks:
+        points, visible = tracks["points"], tracks["visible"]
+        assert tracks["frames"].tolist() == list(range(TINY_FRAMES))
+    assert points.shape == (TINY_FRAMES, TRACKS, 3) and visible.shape == (TINY_FRAMES, TRACKS)
+    pinned = np.isfinite(points[0, :, 0])
+    assert pinned.mean() > 0.5 and not visible[:, ~pinned].any()
+    K = read_rig(exported / "session0/calib").left.P[:, :3]
+    pixels = points[0, pinned] @ K.T
+    u, v = (pixels[:, :2] / pixels[:, 2:]).T
+    side = round(TRACKS**0.5)
+    for value, length in ((u, 160), (v, 128)):  # on the grid, where each was pinned
+        place = value * side / length - 0.5
+        assert np.abs(place - np.round(place)).max() < 0.1
+
+    said = pure_json(
+        sags(
+            *("eval", exported / "session0", f"source.reference.tracks:={exported}/0/tracks.npz"),
+            *("--pace", "step", "--iterations", "1", "--hold-out", "0", "--json", "-"),
+        ).stdout
+    )
+    assert said["track"]["median_px"] < 2  # both follow the same tissue
+
+
+def test_the_video_has_every_frame(exported: Path) -> None:
+    with av.open(str(exported / "0/model.mp4")) as video:
+        pictures = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
+    assert len(pictures) == TINY_FRAMES
+    shown = rectified(exported / "session0")[3].left
+    known = pictures[3].max(-1) > 0
+    assert known.mean() > 0.5
+    assert np.abs(pictures[3].astype(float) - shown)[known].mean() < 16  # of 255: the same scene
+
+
+@pytest.mark.parametrize("version", ["v3.0", "v2.1"])
+def test_three_sessions_are_one_data_set(exported: Path, tmp_path: Path, version: Version) -> None:
+    """In the form of lerobot 0.4.4 and 0.3.3, `datasets/utils.py`; Parquet and MP4 are read by others."""
+    out = tmp_path / "all"
+    frames = merge([exported / f"{number}/lerobot" for number in range(SESSIONS)], out, version)
+    info = json.loads((out / "meta/info.json").read_text())
+    assert frames == info["total_frames"] == SESSIONS * TINY_FRAMES
+    assert (info["codebase_version"], info["total_episodes"], info["fps"]) == (version, SESSIONS, 10)
+
+    index = 0
+    for number, places in enumerate(places_v30(out) if version == "v3.0" else places_v21(out)):
+        rows = pq.read_table(out / info["data_path"].format(**places["data"])).to_pylist()
+        assert len(rows) == TINY_FRAMES
+        for frame, row in enumerate(rows):
+            assert (row["index"], row["frame_index"], row["episode_index"]) == (index, frame, number)
+            assert row["timestamp"] == pytest.approx(frame / 10)
+            for name, feature in info["features"].items():
+                if feature["dtype"] != "video" and feature["shape"] != [1]:
+                    assert list(np.shape(row[name])) == feature["shape"], name
+            index += 1
+        counts = cv2.imread(str(exported / f"{number}/depth/00002.png"), cv2.IMREAD_UNCHANGED)
+        assert np.allclose(rows[2][DEPTH], counts[::COARSE, ::COARSE] * DEPTH_UNIT, atol=DEPTH_UNIT)
+        assert np.array_equal(rows[0][POSE], np.eye(4)) and np.mean(rows[0][TISSUE]) > 0.5
+        with np.load(exported / f"{number}/tracks.npz") as tracks:
+            assert np.array_equal(np.float32(rows[4][POINTS]), tracks["points"][4], equal_nan=True)
+        for eye, side in ((LEFT, "left"), (RIGHT, "right")):
+            with av.open(str(out / info["video_path"].format(**places[eye]))) as video:
+                stream = video.streams.video[0]
+                read = [(float(each.pts * stream.time_base), each) for each in video.decode(video=0)]
+            assert [at for at, _ in read] == pytest.approx([frame / 10 for frame in range(TINY_FRAMES)])
+            given = getattr(rectified(exported / f"session{number}")[5], side)
+            assert np.abs(read[5][1].to_ndarray(format="rgb24").astype(float) - given).mean() < CODING
+    assert index == frames
+
+
+def places_v30(out: Path) -> list[dict[str, dict[str, Any]]]:
+    """Of each episode: what the paths of its data and of each video are made of."""
+    found = []
+    for number, episode in enumerate(pq.read_table(out / "meta/episodes").to_pylist()):
+        span = episode["dataset_from_index"], episode["dataset_to_index"], episode["episode_index"]
+        assert span == (number * TINY_FRAMES, (number + 1) * TINY_FRAMES, number)
+        assert episode[f"stats/{DEPTH}/mean"] != [0.0]
+        kinds = {"data": "data", LEFT: f"videos/{LEFT}", RIGHT: f"videos/{RIGHT}"}
+        found.append(
+            {
+                kind: {"video_key": kind, **{key: episode[f"{column}/{key}"] for key in CHUNKS}}
+                for kind, column in kinds.items()
+            }
+        )
+    tasks = pq.read_table(out / "meta/tasks.parquet").to_pylist()
+    assert tasks == [{"task_index": 0, "__index_level_0__": TASK}]
+    return found
+
+
+def places_v21(out: Path) -> list[dict[str, dict[str, Any]]]:
+    def lines(name: str) -> list[Any]:
+        return [json.loads(line) for line in (out / f"meta/{name}.jsonl").read_text().splitlines()]
+
+    assert lines("tasks") == [{"task_index": 0, "task": TASK}]
+    assert [each["stats"][DEPTH]["mean"] != [0.0] for each in lines("episodes_stats")] == [True] * SESSIONS
+    found = []
+    for number, episode in enumerate(lines("episodes")):
+        assert episode == {"episode_index": number, "tasks": [TASK], "length": TINY_FRAMES}
+        place = {"episode_chunk": 0, "episode_index": number}
+        found.append({kind: place | {"video_key": kind} for kind in ("data", LEFT, RIGHT)})
+    return found
+
+
+def test_statistics_of_several_episodes_are_those_of_all_their_numbers() -> None:
+    random = np.random.default_rng(5)
+    parts = [random.normal(number, 1 + number, (20 + 10 * number, 3)) for number in range(3)]
+    parts[1][4] = np.nan  # a lost point
+    stats = []
+    for part in parts:
+        sums = Sums()
+        sums.add(part[:7])
+        sums.add(part[7:])
+        stats.append(sums.stats((3,)))
+    found, together = merged(stats), np.concatenate(parts)
+    for name, of in {"min": np.nanmin, "max": np.nanmax, "mean": np.nanmean, "std": np.nanstd}.items():
+        assert found[name] == pytest.approx(of(together, axis=0)), name
+    assert found["count"] == [89]
+
+
+def test_what_does_not_go_together_is_refused(exported: Path, tmp_path: Path) -> None:
+    session = exported / "session0"
+    refused(2, "export", "--depth", tmp_path / "d", said=("--depth is of every frame",))
+    refused(
+        2, "export", "--session", session, "--at", "0.1", "--tracks", tmp_path / "t.npz", said=("--tracks",)
+    )  # fmt: skip
+    refused(2, "export", "--session", session, "--depth", exported / "0/depth", said=("is not empty",))
