@@ -15,7 +15,6 @@ from sags_node.evaluation.measure import Options
 from sags_node.evaluation.session import evaluate
 from sags_node.kernels.threads import configure_threads
 
-pytestmark = pytest.mark.live
 SETTINGS = ("mapping.max_gaussians:=2000", "source.frames:=4")
 
 

@@ -25,7 +25,6 @@ from sags_node.archive.store import Store
 from sags_node.archive.work import Plan
 from sags_node.errors import SagsError, UsageError
 
-pytestmark = pytest.mark.live
 PATIENCE = 30.0  # s
 
 
