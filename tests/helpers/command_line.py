@@ -81,5 +81,5 @@ def stopped(process: subprocess.Popen[str]) -> tuple[str, str]:
     stdout, stderr = process.communicate(timeout=PROMPT_SECONDS)
     with pytest.raises(ProcessLookupError):
         os.killpg(process.pid, 0)
-    assert "Traceback" not in stderr
+    assert "Traceback" not in stderr, stderr
     return stdout, stderr

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -213,7 +214,7 @@ class RunningView:
             "Connection: Upgrade",
             "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==",
             "Sec-WebSocket-Version: 13",
-            "Sec-WebSocket-Protocol: viser-v0",
+            f"Sec-WebSocket-Protocol: viser-v{version('viser')}",  # viser prints of any other
         )
         with socket.create_connection(("127.0.0.1", self.where["port"]), timeout=10) as peer:
             peer.sendall("\r\n".join((*lines, "", "")).encode())
