@@ -10,7 +10,7 @@ import ast
 from collections.abc import Iterator
 from itertools import groupby
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 PAGE = Path(__file__).with_name("faults.md")
 ROOT = PAGE.parent.parent
@@ -56,13 +56,23 @@ def faults() -> list[Fault]:
 
 
 def _marks(file: Path) -> Iterator[Fault]:
-    for node in ast.parse(file.read_text(encoding="utf-8")).body:
+    body = ast.parse(file.read_text(encoding="utf-8")).body
+    constants = {
+        node.targets[0].id: node.value
+        for node in body
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name)
+    }
+
+    def text(node: ast.expr) -> Any:
+        return ast.literal_eval(constants[node.id] if isinstance(node, ast.Name) else node)
+
+    for node in body:
         if not isinstance(node, ast.FunctionDef):
             continue
         for mark in node.decorator_list:
             if isinstance(mark, ast.Call) and ast.unparse(mark.func) == "pytest.mark.fault":
-                names = [ast.literal_eval(argument) for argument in mark.args]
-                cells = {str(word.arg): ast.literal_eval(word.value) for word in mark.keywords}
+                names = [text(argument) for argument in mark.args]
+                cells = {str(word.arg): text(word.value) for word in mark.keywords}
                 if len(names) != 1 or not cells.keys() <= {"sees", "says", "back", "left"}:
                     raise ValueError(f"{file}: {node.name}: a fault has one name, sees, says, back and left")
                 where = dict(test=node.name, file=file.relative_to(ROOT).as_posix())

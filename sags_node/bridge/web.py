@@ -81,10 +81,7 @@ def run_web(options: Options, ready: Callable[[str, int], None], stop: threading
         UsageError: wrong keys.
         SagsError: the port cannot be bound, or an endpoint is malformed.
     """
-    for place in (
-        options.overlay,
-        options.node,
-    ):  # wrong keys or endpoints are said now, not to the first peer
+    for place in (options.overlay, options.node):  # what is wrong is said now, not to the first peer
         Feed((), place, options.max_age, lambda: None).close()
     requests = Requests(options.control, place.ns, place.run_dir, place.keys)
     try:

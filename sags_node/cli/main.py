@@ -48,8 +48,11 @@ class Sags(click.Group):
         try:
             return self._invoke(ctx)
         except (KeyboardInterrupt, SystemError) as error:
-            # A Ctrl-C becomes a SystemError in C code that calls Python: loading a kernel.
-            cause = error.__cause__ if isinstance(error, SystemError) else error
+            # A Ctrl-C becomes a SystemError in C code that calls Python, and one more in C code around that:
+            # loading a kernel.
+            cause: BaseException | None = error
+            while isinstance(cause, SystemError):
+                cause = cause.__cause__
             if not isinstance(cause, KeyboardInterrupt):
                 raise
             console.print("stopped")

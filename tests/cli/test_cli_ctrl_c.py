@@ -43,10 +43,14 @@ def test_a_ctrl_c_that_comes_while_a_kernel_is_loaded_is_one_too(monkeypatch: py
     """Python turns it into a SystemError when it passes through C code; any other of those is a defect."""
 
     def interrupted(*arguments: object) -> None:
+        said = "returned a result with an exception set"
         try:
-            raise KeyboardInterrupt
-        except KeyboardInterrupt as cause:
-            raise SystemError("returned a result with an exception set") from cause
+            try:
+                raise KeyboardInterrupt
+            except KeyboardInterrupt as cause:
+                raise SystemError(said) from cause
+        except SystemError as inner:
+            raise SystemError(said) from inner
 
     def broken(*arguments: object) -> None:
         raise SystemError("broken")

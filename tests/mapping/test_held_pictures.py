@@ -78,6 +78,13 @@ def psnr(result: FrameResult, clean: FrameResult) -> float:
     return float(-10 * np.log10(np.mean(np.square(error))))
 
 
+# What the marks of faults say more than once.
+AGAIN = "0.5 s after it ends the warning is gone; after 1.1 s the picture is within 1 dB"
+SAME = "no new model; over 80 % of the Gaussians are the same"
+HELD = "the frame is held, and nothing measured"
+ONE_EYE = "no depth is measured; the frame is not held"
+
+
 @pytest.fixture(scope="module")
 def clean(session: Session, frames: list[StereoFrame]) -> list[FrameResult]:
     results, codes, pipeline = play(session, frames)
@@ -88,59 +95,59 @@ def clean(session: Session, frames: list[StereoFrame]) -> list[FrameResult]:
 
 @pytest.mark.fault(
     "picture: the right eye is black",
-    sees="no depth is measured; the frame is not held",
+    sees=ONE_EYE,
     says="warning `right_eye_black` within 0.5 s",
-    back="0.5 s after it ends the warning is gone; after 1.1 s the picture is within 1 dB",
-    left="no new model; over 80 % of the Gaussians are the same",
+    back=AGAIN,
+    left=SAME,
 )
 @pytest.mark.fault(
     "picture: the left eye is black",
-    sees="the frame is held, and nothing measured",
+    sees=HELD,
     says="warning `left_eye_black` within 0.5 s",
-    back="0.5 s after it ends the warning is gone; after 1.1 s the picture is within 1 dB",
-    left="no new model; over 80 % of the Gaussians are the same",
+    back=AGAIN,
+    left=SAME,
 )
 @pytest.mark.fault(
     "picture: the eyes are swapped",
-    sees="the frame is held, and nothing measured",
+    sees=HELD,
     says="warning `eyes_exchanged` within 0.5 s",
-    back="0.5 s after it ends the warning is gone; after 1.1 s the picture is within 1 dB",
-    left="no new model; over 80 % of the Gaussians are the same",
+    back=AGAIN,
+    left=SAME,
 )
 @pytest.mark.fault(
     "picture: one eye twice",
-    sees="no depth is measured; the frame is not held",
+    sees=ONE_EYE,
     says="warning `eyes_equal` within 0.5 s",
-    back="0.5 s after it ends the warning is gone; after 1.1 s the picture is within 1 dB",
-    left="no new model; over 80 % of the Gaussians are the same",
+    back=AGAIN,
+    left=SAME,
 )
 @pytest.mark.fault(
     "picture: of another scene",
-    sees="the frame is held, and nothing measured",
+    sees=HELD,
     says="warning `picture_unknown_scene` within 0.5 s",
-    back="0.5 s after it ends the warning is gone; after 1.1 s the picture is within 1 dB",
-    left="no new model; over 80 % of the Gaussians are the same",
+    back=AGAIN,
+    left=SAME,
 )
 @pytest.mark.fault(
     "picture: far too bright",
-    sees="the frame is held, and nothing measured",
+    sees=HELD,
     says="warning `picture_bright` within 0.5 s",
-    back="0.5 s after it ends the warning is gone; after 1.1 s the picture is within 1 dB",
-    left="no new model; over 80 % of the Gaussians are the same",
+    back=AGAIN,
+    left=SAME,
 )
 @pytest.mark.fault(
     "picture: smoke",
     sees="a result for every frame",
     says="warning `picture_smoke` within 0.5 s",
-    back="0.5 s after it ends the warning is gone; after 1.1 s the picture is within 1 dB",
-    left="no new model; over 80 % of the Gaussians are the same",
+    back=AGAIN,
+    left=SAME,
 )
 @pytest.mark.fault(
     "picture: blood",
     sees="a result for every frame",
     says="warning `picture_covered` within 0.5 s",
-    back="0.5 s after it ends the warning is gone; after 1.1 s the picture is within 1 dB",
-    left="no new model; over 80 % of the Gaussians are the same",
+    back=AGAIN,
+    left=SAME,
 )
 @pytest.mark.parametrize("code", FAULTS)
 def test_a_fault_is_said_and_leaves_no_trace(

@@ -22,6 +22,7 @@ import numpy as np
 from rich.table import Table
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
+from websockets.sync.connection import Connection
 
 from sags_node.benchmark.node.crowd import STARTING, STATUS, STOPPING, Advance, node_beside, watched
 from sags_node.config import RosGraph
@@ -202,6 +203,17 @@ def _listen_igtl(said: Said, heard: Heard, stop: threading.Event) -> None:
                 heard.note(name, seconds + fraction / 2**32, header.size + size)
 
 
+def _messages(joined: Connection, stop: threading.Event) -> Iterator[str | bytes]:
+    """What comes by WebSocket, until either side ends."""
+    while not stop.is_set():
+        try:
+            yield joined.recv(timeout=1.0)
+        except TimeoutError:
+            continue
+        except ConnectionClosed:
+            return
+
+
 def _listen_foxglove(names: Sequence[str]) -> Listen:
     """A client that looks at these channels."""
 
@@ -216,13 +228,7 @@ def _listen_foxglove(names: Sequence[str]) -> Listen:
                     known = {name: number for name, number in known.items() if name in names}
             wanted = [{"id": i, "channelId": known[name]} for i, name in enumerate(names)]
             joined.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
-            while not stop.is_set():
-                try:
-                    message = joined.recv(timeout=1.0)
-                except TimeoutError:
-                    continue
-                except ConnectionClosed:
-                    return
+            for message in _messages(joined, stop):
                 if isinstance(message, bytes) and message[0] == 1:
                     number, stamp_ns = struct.unpack_from("<IQ", message, 1)
                     heard.note(names[number], stamp_ns * 1e-9, len(message))
@@ -251,13 +257,7 @@ def _listen_web(names: Sequence[str]) -> Listen:
     def listen(said: Said, heard: Heard, stop: threading.Event) -> None:
         with connect(f"ws://127.0.0.1:{said['port']}/ws", max_size=None) as joined:
             joined.send(json.dumps({"subscribe": names}))
-            while not stop.is_set():
-                try:
-                    message = joined.recv(timeout=1.0)
-                except TimeoutError:
-                    continue
-                except ConnectionClosed:
-                    return
+            for message in _messages(joined, stop):
                 if isinstance(message, bytes):
                     head = json.loads(message[4 : 4 + struct.unpack_from("<I", message)[0]])
                     heard.note(head["topic"], head["stamp_ns"] * 1e-9, len(message))
