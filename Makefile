@@ -16,7 +16,7 @@ DEBIAN_TESTS := chromium g++ cmake pkg-config cppzmq-dev libmsgpack-cxx-dev fake
 missing = $(shell for p in $(1); do dpkg -s $$p >/dev/null 2>&1 || echo $$p; done)
 apt_install = apt-get update -qq && apt-get install -y -qq --no-install-recommends $(1) >/dev/null
 
-.PHONY: setup run test computed test-targets test-tools simulate fuzz wheel-test sbom licences lint golden docs clean
+.PHONY: setup run test computed test-targets test-tools simulate soak fuzz wheel-test sbom licences lint golden docs clean
 
 setup: $(STAMP)
 
@@ -39,10 +39,12 @@ $(STAMP): pyproject.toml constraints.txt
 run: setup
 	$(BIN)/sags demo
 
-# What only computes runs side by side; what has sockets and clocks has the machine for itself.
+# What only computes runs beside anything; what has sockets and clocks waits a lot, so two such files run at a time;
+# what measures time has the machine for itself.
 test: setup test-tools
 	$(MAKE) --no-print-directory -j2 lint computed
-	$(BIN)/python -m pytest -m live
+	$(BIN)/python -m pytest -m 'live and not alone' -n 2 --dist loadfile
+	$(BIN)/python -m pytest -m alone
 
 computed: setup
 	$(BIN)/python -m pytest -m 'not live' -n 2 --dist loadfile
@@ -55,6 +57,10 @@ test-targets: setup
 SEEDS ?= 5000
 simulate: setup
 	PYTHONPATH=tests/helpers $(BIN)/python tests/test_simulation.py $(SEEDS)
+
+# A live node with all its neighbours, ten minutes: does anything grow?
+soak: setup
+	$(BIN)/sags bench soak --out out/soak.json
 
 # Damaged bytes for every reader, for so long; inputs that fail are kept in out/fuzz.
 MINUTES ?= 60

@@ -18,7 +18,7 @@ import numpy as np
 
 from sags_node.errors import SagsError
 from sags_node.findings import NOTHING, Findings, by_code
-from sags_node.health import resident_mb
+from sags_node.processes import resident_mb
 from sags_node.types import (
     F32,
     I32,
