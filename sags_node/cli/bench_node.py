@@ -221,6 +221,32 @@ def bench_tracking(launch: tuple[str, ...], numbers: str, out: Path | None, json
     write_json(out, measured)
 
 
+@click.command("recall")
+@launch_argument
+@click.option("--seconds", type=positive, default=10.0, show_default=True, help="Out of sight.")
+@table_option
+@as_json
+def bench_recall(launch: tuple[str, ...], seconds: float, out: Path | None, json_out: bool) -> None:
+    """Whether anchors come back after a long time out of sight.
+
+    Pins anchors to the phantom's tissue. Then a cloth covers it, or it is dark and the scope moves, or the
+    scope turns away; meanwhile the tissue moves on. Once it is back: how many anchors are on their points
+    again, how many are sure and wrong, and how many would be right if they had not moved at all.
+
+    \b
+    sags bench recall source.seed:=1 --out benchmarks/results/recall.json
+    """
+    from sags_node.benchmark.quality import recall
+
+    path, overrides = split_recording(launch, "sags bench recall needs the phantom")
+    check_files(out)
+    session = open_launched(path, [*overrides, "source.pace:=step"])
+    with progress("following") as advance:
+        measured = recall.measure_recall(session, seconds, advance)
+    show(measured if json_out else recall.table(measured))
+    write_json(out, measured)
+
+
 @click.command("crowd")
 @launch_argument
 @click.option(
