@@ -142,6 +142,7 @@ def _row(recording: Recording, figures: dict[str, Any], plan: Plan, seconds: flo
     return {
         "id": recording.id,
         "recording": recording.name,
+        "segment": recording.segment,
         "job": plan.job,
         **figures,
         "seconds": round(seconds, 3),

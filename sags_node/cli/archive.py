@@ -44,32 +44,55 @@ def archive() -> None:
     type=click.Path(path_type=Path),
     help="Calibration of recordings that bring none; default: the nearest folder calib beside or above.",
 )
+@click.option(
+    "--segment",
+    type=positive,
+    metavar="SECONDS",
+    help="A row for each part of a recording, equally long and no longer than this; default: one for all.",
+)
+@click.option(
+    "--warm-up",
+    type=click.FloatRange(0),
+    default=2.0,
+    show_default=True,
+    metavar="SECONDS",
+    help="What is played before a segment, so that the model is there when it begins.",
+)
 @as_json
-def scan(folder: Path, out: str, rig: Path | None, json_out: bool) -> None:
+def scan(
+    folder: Path, out: str, rig: Path | None, segment: float | None, warm_up: float, json_out: bool
+) -> None:
     """List the recordings below a folder in a manifest.
 
     It says why others cannot be played. Each one is opened once, as sags run would. The manifest is a
-    table: recording, rig, overrides, weight.
+    table: recording, rig, overrides, weight, segment.
 
     \b
     sags archive scan /data/theatre3 --out theatre3.parquet
+    sags archive scan /data/theatre3 --out theatre3.csv --segment 300
     """
     check_installed()
-    from sags_node.archive.manifest import write_manifest
+    from sags_node.archive.manifest import beside, write_manifest
     from sags_node.archive.scan import scan as look
+    from sags_node.archive.segments import Cut
 
     with progress("looking") as advance:
-        found = look(folder, rig, advance)
-    write_manifest(out, found.recordings)
+        found = look(folder, rig, advance, None if segment is None else Cut(segment, warm_up))
+    listed = [beside(each, out) for each in found.recordings]
+    write_manifest(out, listed)
     refused = [{"path": each.path, "why": each.why} for each in found.refused]
+    rows = "" if segment is None else f" in {len(listed)} rows"
     console.print(
-        f"{len(found.recordings)} recordings: [bold]{escape(out)}[/]; {len(refused)} cannot be played",
+        f"{len({each.name for each in listed})} recordings{rows}: [bold]{escape(out)}[/]; "
+        f"{len(refused)} cannot be played",
         soft_wrap=True,
     )
     if json_out:
         show(
             {
-                "recordings": [{"recording": each.name, "id": each.id} for each in found.recordings],
+                "recordings": [
+                    {"recording": each.name, "segment": each.segment, "id": each.id} for each in listed
+                ],
                 "refused": refused,
             }
         )
@@ -154,6 +177,7 @@ def run(
     from sags_node.archive.results import status as found
     from sags_node.archive.run import describe
     from sags_node.archive.run import run as work_through
+    from sags_node.archive.segments import check_frames
     from sags_node.archive.store import REPORT, RESULTS, Store
     from sags_node.archive.work import Plan, resources
     from sags_node.benchmark.provenance import revision
@@ -167,6 +191,7 @@ def run(
         check_plots()
     cores, _ = resources(overrides)
     recordings = _listed(path, rig)[:limit]
+    check_frames(recordings, overrides)
     limits = Limits(cores, memory, timeout, stage_limit)
     plan = Plan(job, tuple(overrides), tuple(shlex.split(options)), out, revision(), limits)
     store = Store(out)
@@ -283,7 +308,7 @@ def show_one(out: str, id: str, json_out: bool) -> None:
 def dataset(out: str, folder: Path, lerobot_version: Version) -> None:
     """Make one LeRobot data set of all that --job lerobot has done.
 
-    An episode for each recording, in the order of the manifest. FOLDER must be new or empty.
+    An episode for each recording or segment, in the order of the manifest. FOLDER must be new or empty.
 
     \b
     sags archive run theatre3.csv --job lerobot --out out/theatre3
