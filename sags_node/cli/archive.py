@@ -162,7 +162,8 @@ def run(
     The same command again does what is missing: recordings that are done stay, unless their files, the
     settings or the version changed. A recording that fails is tried again, then quarantined.
 
-    engine.threads:=N is the number of cores of each recording (default: 1), device:=cuda asks for a GPU.
+    engine.threads:=N is the number of cores of each recording (default: 1), device:=cuda asks for a GPU; here
+    for all, or in a row of the manifest.
 
     \b
     sags archive run theatre3.csv --job eval --out out/theatre3 --options '--iterations 2'
@@ -179,7 +180,7 @@ def run(
     from sags_node.archive.run import run as work_through
     from sags_node.archive.segments import check_frames
     from sags_node.archive.store import REPORT, RESULTS, Store
-    from sags_node.archive.work import Plan, resources
+    from sags_node.archive.work import Plan, needs
     from sags_node.benchmark.provenance import revision
 
     path, overrides = split(source)
@@ -189,11 +190,11 @@ def run(
         raise UsageError("--local is this machine alone; leave it out, or leave out --ray")
     if job in NEEDS_PLOTS:
         check_plots()
-    cores, _ = resources(overrides)
+    limits = Limits(memory, timeout, stage_limit)
+    plan = Plan(job, tuple(overrides), tuple(shlex.split(options)), out, revision(), limits)
+    needs(plan)
     recordings = _listed(path, rig)[:limit]
     check_frames(recordings, overrides)
-    limits = Limits(cores, memory, timeout, stage_limit)
-    plan = Plan(job, tuple(overrides), tuple(shlex.split(options)), out, revision(), limits)
     store = Store(out)
     with store.locked():
         describe(store, recordings, plan, as_csv(recordings))
@@ -215,6 +216,8 @@ def run(
     console.print(f"table: [bold]{escape(out)}/{RESULTS}[/]{page}", soft_wrap=True)
     if tally.stopping.is_set():
         raise KeyboardInterrupt
+    if tally.waits:
+        raise SagsError(f"{state['missing']} are missing: {tally.waits}")
     if state["quarantined"]:
         raise SagsError(f"{state['quarantined']} recordings failed; sags archive show {out} ID says why")
 
