@@ -13,7 +13,17 @@ from rich.table import Table
 
 from sags_node.archive.cluster import check_installed
 from sags_node.archive.jobs import JOBS
-from sags_node.cli.launching import as_json, lerobot_option, positive, split
+from sags_node.cli.launching import (
+    as_json,
+    check_files,
+    launch_argument,
+    lerobot_option,
+    positive,
+    split,
+    split_recording,
+    table_option,
+    write_json,
+)
 from sags_node.errors import SagsError, UsageError
 from sags_node.plotting import check_plots, has_plots
 from sags_node.terminal import text
@@ -334,3 +344,53 @@ def dataset(out: str, folder: Path, lerobot_version: Version) -> None:
     console.print(
         f"{len(episodes)} episodes, {frames} frames: [bold]{escape(str(folder))}[/]", soft_wrap=True
     )
+
+
+@archive.command()
+@launch_argument
+@click.option(
+    "--job", "jobs", type=click.Choice(sorted(JOBS)), multiple=True, help="May be repeated; default: all."
+)
+@click.option(
+    "--frames",
+    type=click.IntRange(4),
+    default=120,
+    show_default=True,
+    help="That are played; and a fourth of them, to tell what a start costs.",
+)
+@table_option
+@as_json
+def costs(
+    launch: tuple[str, ...], jobs: tuple[str, ...], frames: int, out: Path | None, json_out: bool
+) -> None:
+    """Say what each job costs for an hour of video.
+
+    The beginning of a recording is played twice for each, on one core (engine.threads). CPU seconds, seconds
+    and bytes are extrapolated by frames. A fit holds all its frames in memory: its hour is made of clips.
+
+    \b
+    sags archive costs launch/d4d_pull.yaml mapping.iterations:=2 --job depth --job tracks
+    """
+    check_installed()
+    from sags_node.archive.costs import job_costs
+    from sags_node.session import open_session
+
+    path, overrides = split_recording(launch, "live cameras have no length; name a recording")
+    with open_session(path, [*overrides, "source.loop:=false"]).source as source:
+        rate, count = source.rate, source.frame_count or 0
+    if path is None or count < frames:
+        raise UsageError(f"a recording of {frames} frames is needed, this one has {count}; change --frames")
+    check_files(out)
+    asked = jobs or sorted(JOBS)
+    with progress("measuring") as advance:
+        rows = job_costs(
+            str(Path(path).resolve()), overrides, asked, frames, rate,
+            lambda done, job: advance(done, len(asked), job),
+        )  # fmt: skip
+    show(rows if json_out else text.rows_table([_flat_cost(row) for row in rows]))
+    write_json(out, rows)
+
+
+def _flat_cost(row: dict[str, Any]) -> dict[str, Any]:
+    hour = {f"{name} of an hour": value for name, value in row["of_an_hour"].items()}
+    return {key: value for key, value in row.items() if key != "of_an_hour"} | hour
