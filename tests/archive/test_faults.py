@@ -18,6 +18,7 @@ from typing import Any
 import pytest
 from tiny_archive import quick_plan, quick_work, table, write_quick_recordings
 
+from sags_node.archive.cluster import connected
 from sags_node.archive.manifest import Recording, as_csv
 from sags_node.archive.results import failed, status, write_results
 from sags_node.archive.run import Tally, describe, run
@@ -26,6 +27,14 @@ from sags_node.archive.work import Plan
 from sags_node.errors import SagsError, UsageError
 
 PATIENCE = 30.0  # s
+
+
+@pytest.fixture(scope="module", autouse=True)
+def connection(cluster: Any) -> Iterator[None]:
+    """One for all runs of this file, so that its workers are started once. The driver that is killed has its
+    own."""
+    with connected(cluster.address):
+        yield
 
 
 def gone_through(
