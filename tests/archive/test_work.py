@@ -12,6 +12,7 @@ from fsspec.core import url_to_fs
 from tiny_archive import quick_plan, quick_work, write_quick_recordings
 
 from sags_node.archive.inputs import fetched, key_of, scratch
+from sags_node.archive.jobs import FIGURES, JOBS, LOG, command
 from sags_node.archive.manifest import Recording
 from sags_node.archive.process import Limits
 from sags_node.archive.results import read_results, write_results
@@ -66,6 +67,14 @@ def test_a_rows_own_cores_count(tmp_path: Path) -> None:
     assert Store(plan.out).read_json(f"done/{own.id}.key.json")["threads"] == "2"
     with pytest.raises(UsageError, match=r"r000.*engine\.threads:=0"):
         needs(plan, replace(recording, overrides=("engine.threads:=0",)))
+
+
+@pytest.mark.parametrize("job", JOBS)
+def test_a_job_writes_beside_its_figures(job: str, tmp_path: Path) -> None:
+    """`figures.json` and `log.txt` are its stdout and stderr: a file that it writes itself must not be one."""
+    said = command(job, ["recording"], (), tmp_path)
+    written = [Path(each).relative_to(tmp_path) for each in said if each.startswith(str(tmp_path))]
+    assert written and all(each.name and each.name not in (FIGURES, LOG) for each in written)
 
 
 def test_a_store_that_is_no_folder(tmp_path: Path, in_memory: str) -> None:
