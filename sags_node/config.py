@@ -46,6 +46,12 @@ class RecordedSource(Section):
     loop: bool = Field(False, description="begin again at the end")
     start: float = Field(0.0, ge=0, description="seconds to skip at the beginning")
     frames: int | None = Field(None, gt=0, description="stop after this many frames; default: all")
+    warm_up: int = Field(
+        0,
+        ge=0,
+        description="the first frames of these are played so that the model settles, and then left out: "
+        "nothing of them is published, measured, exported or fitted",
+    )
     stride: int = Field(1, ge=1, description="play only each stride-th frame")
     poses: Path | None = Field(None, description="npz with T_world_cam [T, 4, 4] (m)")
     reference: ReferenceConfig = ReferenceConfig()

@@ -227,6 +227,8 @@ class Node:
                 waited = time.monotonic() - at if self._live else 0.0
                 self._state.pipeline.anchors.latency_s = self._state.statistics.latency_s
                 result = self._state.pipeline.process(frame, self._state.budget, waited)
+                if frame.warm_up:
+                    continue
                 give(result)
                 dropped, before = self._frames.dropped, dropped
                 if not result.held:

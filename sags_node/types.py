@@ -126,6 +126,7 @@ class StereoFrame:
     t_device_ns: int = 0  # left eye, as the device, sender or recording stamped it by its own clock; 0: none
     t_arrival_ns: int = 0  # left eye, wall clock; 0: not a live picture
     pose_problem: Finding | None = None  # why `T_world_cam` is an older pose; such a frame is not taken in
+    warm_up: bool = False  # the model learns from it, and nothing of it is shown or counted
 
 
 @dataclass(frozen=True, slots=True)

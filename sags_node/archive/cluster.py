@@ -42,6 +42,8 @@ def check_installed() -> None:
 def connected(address: str | None) -> Iterator[Any]:
     """Ray, started on this machine for as long as this lasts, or connected to a cluster.
 
+    Where this process is connected already, that connection is used, and stays.
+
     Args:
         address: HOST:PORT of the cluster's head; None: this machine alone, by loopback only.
 
@@ -55,6 +57,9 @@ def connected(address: str | None) -> Iterator[Any]:
         os.environ.update(LOCAL | {"RAY_AUTH_TOKEN": secrets.token_hex(32)})
     import ray  # it reads the environment
 
+    if ray.is_initialized():
+        yield ray
+        return
     where = {"address": address} if address else {"address": "local", "object_store_memory": OBJECT_STORE}
     try:
         ray.init(

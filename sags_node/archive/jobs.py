@@ -23,7 +23,7 @@ JOBS: dict[str, Arguments] = {
         *("bag", "record", "--session", *said),
         *("-o", str(out / "bag"), "--compression", "jpeg", "--json"),
     ],
-    "fit": lambda said, out: ["fit", *said, "--out", str(out), "--json"],
+    "fit": lambda said, out: ["fit", *said, "--out", str(out / "fit"), "--json"],
 }
 NEEDS_PLOTS = frozenset({"eval"})
 

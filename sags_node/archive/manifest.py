@@ -1,8 +1,9 @@
 """The list of an archive's recordings: a CSV or Parquet file, a row for each.
 
 Columns: `recording` (a path or URL; relative ones are beside the file), `rig` (the same, of a calibration;
-empty where the recording brings one), `overrides` (`key:=value`, separated by spaces, quoted as in a shell)
-and `weight` (what it costs, in any unit: the dearest begin first). Only `recording` is needed.
+empty where the recording brings one), `overrides` (`key:=value`, separated by spaces, quoted as in a shell),
+`weight` (what it costs, in any unit: the dearest begin first) and `segment` (a name for the part of it that
+the overrides say; see `segments`). Only `recording` is needed.
 """
 
 from __future__ import annotations
@@ -13,17 +14,18 @@ import io
 import re
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import PurePosixPath
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from fsspec.core import url_to_fs
 
 from sags_node.errors import SagsError, UsageError, brief
 
-COLUMNS = ("recording", "rig", "overrides", "weight")
+COLUMNS = ("recording", "rig", "overrides", "weight", "segment")
 PARQUET = ".parquet"
 SUFFIXES = (".csv", PARQUET)
+SEGMENT = re.compile(r"[A-Za-z0-9_-]{1,40}")  # it becomes a part of file names
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +36,7 @@ class Recording:
         name: path or URL as the manifest says it.
         folder: of the manifest; relative names are in there.
         weight: what it costs, against the others.
+        segment: names the part of it that this is; empty: all of it.
     """
 
     name: str
@@ -41,14 +44,16 @@ class Recording:
     rig_name: str | None = None
     overrides: tuple[str, ...] = ()
     weight: float = 1.0
+    segment: str = ""
 
     @property
     def id(self) -> str:
-        """Names it in files: the end of its path, and a hash of all that makes it another one."""
+        """Names it in files: the end of its path, its segment, and a hash of what makes it another one."""
         parts = [part for part in PurePosixPath(self.name).parts if part not in ("/", "..")]
         end = re.sub(r"[^A-Za-z0-9-]+", "_", "_".join(parts[-2:])).strip("_")
         said = "\n".join((self.name, *self.overrides))
-        return f"{end[-60:]}-{hashlib.sha256(said.encode()).hexdigest()[:8]}"
+        segment = f"-{self.segment}" if self.segment else ""
+        return f"{end[-60:]}{segment}-{hashlib.sha256(said.encode()).hexdigest()[:8]}"
 
     @property
     def place(self) -> str:
@@ -133,7 +138,23 @@ def _recording(row: Mapping[str, Any], number: int, folder: str, url: str) -> Re
     if wrong or not weight > 0:
         what = f"'{wrong[0]}' is not key:=value" if wrong else f"weight {weight} should be above 0"
         raise UsageError(f"{url}, row {number}: {what}")
-    return Recording(str(row["recording"]), folder, row.get("rig") or None, overrides, weight)
+    segment = str(row.get("segment") or "")
+    if segment and not SEGMENT.fullmatch(segment):
+        raise UsageError(f"{url}, row {number}: segment '{segment}' should be letters, digits, - and _")
+    return Recording(str(row["recording"]), folder, row.get("rig") or None, overrides, weight, segment)
+
+
+def beside(recording: Recording, url: str) -> Recording:
+    """The row of a recording of this machine in a manifest at `url`: names are relative to it where they can
+    be, else absolute."""
+    folder = url.rpartition("/")[0] if is_url(url) else str(Path(url).resolve().parent)
+
+    def name(place: str) -> str:
+        inside = Path(place).is_relative_to(folder)
+        return Path(place).relative_to(folder).as_posix() if inside else place
+
+    rig = None if recording.rig is None else name(recording.rig)
+    return replace(recording, name=name(recording.place), folder=folder, rig_name=rig)
 
 
 def write_manifest(url: str, recordings: Sequence[Recording]) -> None:
@@ -169,6 +190,7 @@ def _row(recording: Recording) -> dict[str, Any]:
         "rig": recording.rig_name or "",
         "overrides": shlex.join(recording.overrides),
         "weight": recording.weight,
+        "segment": recording.segment,
     }
 
 

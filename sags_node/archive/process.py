@@ -27,13 +27,11 @@ class Limits:
     """What one recording may take.
 
     Attributes:
-        cores: threads of each library.
         memory_gb: resident, of the process and its children; None: no limit.
         seconds: of wall time; None: no limit.
         staged_gb: bytes that are fetched for it, 10^9.
     """
 
-    cores: int = 1
     memory_gb: float | None = None
     seconds: float | None = None
     staged_gb: float = 50.0
@@ -47,13 +45,16 @@ class Ended:
     limit: str | None = None
 
 
-def run_limited(command: Sequence[str], limits: Limits, stdout: Path, stderr: Path) -> Ended:
+def run_limited(command: Sequence[str], cores: int, limits: Limits, stdout: Path, stderr: Path) -> Ended:
     """Run a command, and all that it starts. It is killed with this process.
+
+    Args:
+        cores: threads of each library.
 
     Raises:
         OSError: it cannot be started.
     """
-    environment = os.environ | dict.fromkeys(THREADS, str(limits.cores))
+    environment = os.environ | dict.fromkeys(THREADS, str(cores))
     with stdout.open("wb") as out, stderr.open("wb") as err:
         process = subprocess.Popen(
             [sys.executable, "-m", "sags_node.archive.child", str(os.getpid()), *command],

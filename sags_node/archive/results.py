@@ -151,7 +151,12 @@ def _batches(
 def _row(
     recording: Recording, figures: Mapping[str, Any] | None, record: Mapping[str, Any] | None
 ) -> dict[str, Any]:
-    known = {"id": recording.id, "recording": recording.name, "state": _state(figures, record)}
+    known = {
+        "id": recording.id,
+        "recording": recording.name,
+        "segment": recording.segment,
+        "state": _state(figures, record),
+    }
     reason = None if record is None else record["attempts"][-1]["reason"]
     return {**known, "reason": reason, **(figures or {})}
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import chain
 from typing import Any
@@ -14,7 +14,7 @@ from sags_node.archive.cluster import connected
 from sags_node.archive.inputs import key_of
 from sags_node.archive.manifest import Recording
 from sags_node.archive.store import ABOUT, DONE, FAILED, MANIFEST, Store
-from sags_node.archive.work import Outcome, Plan, repeating, resources, work
+from sags_node.archive.work import Needs, Outcome, Plan, needs, repeating, work
 from sags_node.errors import SagsError
 from sags_node.terminal.console import on_stop_signals
 
@@ -34,6 +34,7 @@ class Tally:
         kept: done before this run.
         frames: of those done in this run.
         hosts: recordings done, by machine.
+        waits: what recordings that were not begun need, and no machine has; empty: there are none.
         stopping: set by Ctrl-C: what runs is ended, and may be done again later.
     """
 
@@ -46,6 +47,7 @@ class Tally:
     frames: int = 0
     work_seconds: float = 0.0
     hosts: Counter[str] = field(default_factory=Counter)
+    waits: str = ""
     stopping: threading.Event = field(default_factory=threading.Event)
 
 
@@ -53,6 +55,7 @@ class Tally:
 class Todo:
     recording: Recording
     key: str
+    needs: Needs
 
 
 def run(
@@ -75,27 +78,32 @@ def run(
         task: what is done with each.
 
     Raises:
-        UsageError: Ray is not installed.
-        SagsError: Ray does not start, the output is full, or no machine has what a task needs.
+        UsageError: Ray is not installed, or a recording needs what is no number of cores.
+        SagsError: Ray does not start, or the output is full.
     """
     tally = Tally(len(recordings))
     failed = {name.removesuffix(".json") for name in store.names(FAILED) if name.endswith(".json")}
-    todo = _missing(store, recordings, plan, failed, retry_failed, tally)
-    first = next(todo, None)
-    if first is None:
+    alike: dict[Needs, list[Recording]] = {}
+    for recording in sorted(recordings, key=lambda each: -each.weight):
+        alike.setdefault(needs(plan, recording), []).append(recording)
+    todo = {}
+    for what, those in alike.items():
+        missing = _missing(store, those, what, plan, failed, retry_failed, tally)
+        if (first := next(missing, None)) is not None:
+            todo[what] = chain([first], missing)
+    if not todo:
         return tally
     tell(tally, "")
     with connected(address) as ray:
-        _check_fit(ray, plan)
         on_stop_signals(tally.stopping.set)  # after Ray, which has a handler of its own
-        _work_through(ray, store, chain([first], todo), plan, attempts, tell, failed, tally, task)
+        _work_through(ray, store, todo, plan, attempts, tell, failed, tally, task)
     return tally
 
 
 def _work_through(
     ray: Any,
     store: Store,
-    todo: Iterator[Todo],
+    todo: Mapping[Needs, Iterator[Todo]],
     plan: Plan,
     attempts: int,
     tell: Callable[[Tally, str], None],
@@ -103,18 +111,26 @@ def _work_through(
     tally: Tally,
     task: Task,
 ) -> None:
-    cores, gpus = resources(plan.overrides)
-    memory = {} if plan.limits.memory_gb is None else {"memory": int(plan.limits.memory_gb * 1e9)}
-    remote = ray.remote(task).options(num_cpus=cores, num_gpus=gpus, max_retries=0, **memory)
-    again: deque[Todo] = deque()
+    remote = {what: _remote(ray, task, what) for what in todo}
+    again: dict[Needs, deque[Todo]] = {what: deque() for what in todo}
     running: dict[Any, Todo] = {}
     full: str | None = None
-    most, asked = 0, -SLOTS_PERIOD
+    slots: dict[Needs, int] = {}
+    asked = -SLOTS_PERIOD
     while not tally.stopping.is_set() and full is None:
         if time.monotonic() - asked > SLOTS_PERIOD:
-            most, asked = AHEAD * _slots(ray, cores, gpus), time.monotonic()
-        while len(running) < most and (new := next(todo, None) or (again.popleft() if again else None)):
-            running[remote.remote(new.recording, plan, new.key)] = new
+            nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+            slots, asked = {what: _slots(nodes, what) for what in todo}, time.monotonic()
+            before, tally.waits = tally.waits, _unmet(nodes, [what for what in todo if not slots[what]])
+            if tally.waits != before:
+                tell(tally, tally.waits)
+        handed = Counter(each.needs for each in running.values())
+        for what, those in todo.items():
+            while handed[what] < AHEAD * slots[what] and (
+                new := next(those, None) or (again[what].popleft() if again[what] else None)
+            ):
+                running[remote[what].remote(new.recording, plan, new.key)] = new
+                handed[what] += 1
         tally.running = len(running)
         tell(tally, "")
         if not running:
@@ -135,7 +151,7 @@ def _work_through(
                     tally.quarantined += 1
                 else:
                     tally.retried += 1
-                    again.append(ended)
+                    again[ended.needs].append(ended)
                 tell(tally, f"{outcome.id}: {outcome.reason}")
     _end(ray, running)
     if full is not None:
@@ -167,15 +183,16 @@ def forget(store: Store, id: str) -> None:
 def _missing(
     store: Store,
     recordings: Sequence[Recording],
+    what: Needs,
     plan: Plan,
     failed: set[str],
     retry_failed: bool,
     tally: Tally,
 ) -> Iterator[Todo]:
-    """Recordings that are not done as they are now, the dearest first. Files are looked at one recording
-    ahead of the work, not all at once."""
+    """Recordings that are not done as they are now, in this order. Files are looked at one recording ahead of
+    the work, not all at once."""
     done = store.done()
-    for recording in sorted(recordings, key=lambda each: -each.weight):
+    for recording in recordings:
         key = key_of(recording, about(plan))
         before = done.get(recording.id)
         if before == key:
@@ -190,28 +207,34 @@ def _missing(
             elif record["quarantined"]:
                 tally.quarantined += 1
                 continue
-        yield Todo(recording, key)
+        yield Todo(recording, key, what)
 
 
-def _check_fit(ray: Any, plan: Plan) -> None:
-    cores, gpus = resources(plan.overrides)
-    wanted = {"CPU": cores, "GPU": gpus, "memory": (plan.limits.memory_gb or 0) * 1e9}
-    nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
-    if not any(all(node.get(what, 0) >= count for what, count in wanted.items()) for node in nodes):
-        most = max(nodes, key=lambda node: float(node.get("CPU", 0)))
-        raise SagsError(
-            f"no machine has what a recording needs: {cores} cores, {gpus} GPUs, "
-            f"{plan.limits.memory_gb or 0:g} GB of memory. The largest has {most.get('CPU', 0):g} cores, "
-            f"{most.get('GPU', 0):g} GPUs, {most.get('memory', 0) * 1e-9:.1f} GB; lower engine.threads or "
-            "--memory"
-        )
+def _remote(ray: Any, task: Task, what: Needs) -> Any:
+    """The task, as Ray is asked to run it."""
+    memory = {"memory": what.memory} if what.memory else {}
+    return ray.remote(task).options(num_cpus=what.cores, num_gpus=what.gpus, max_retries=0, **memory)
 
 
-def _slots(ray: Any, cores: int, gpus: int) -> int:
-    """How many tasks can run at once."""
-    there = ray.cluster_resources()
-    by_cores = int(there.get("CPU", 0) // cores)
-    return max(1, min(by_cores, int(there.get("GPU", 0) // gpus)) if gpus else by_cores)
+def _slots(nodes: Sequence[Mapping[str, float]], what: Needs) -> int:
+    """How many tasks that need this can run at once; 0: no machine has it."""
+    wanted = {"CPU": what.cores, "GPU": what.gpus, "memory": what.memory}
+    return sum(
+        min(int(node.get(name, 0) // count) for name, count in wanted.items() if count) for node in nodes
+    )
+
+
+def _unmet(nodes: Sequence[Mapping[str, float]], those: Sequence[Needs]) -> str:
+    """What recordings wait for in vain, in a line; empty: for nothing."""
+    if not those:
+        return ""
+    most = {name: max((node.get(name, 0) for node in nodes), default=0) for name in ("CPU", "GPU", "memory")}
+    there = f"{most['CPU']:g} cores, {most['GPU']:g} GPUs, {most['memory'] * 1e-9:.1f} GB"
+    return (
+        f"recordings wait for {'; '.join(map(str, those))}, which no machine has. The most that one has is "
+        f"{there}; lower engine.threads or --memory, leave out device:=cuda, or give the same command again "
+        "where a machine has it (--ray)"
+    )
 
 
 def _outcome(ray: Any, reference: Any, recording: Recording) -> Outcome:

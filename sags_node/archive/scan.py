@@ -8,12 +8,14 @@ from pathlib import Path
 
 from sags_node.archive.launching import arguments, counterpart, is_video, split
 from sags_node.archive.manifest import Recording
-from sags_node.config import LiveSource, PhantomSource
+from sags_node.archive.segments import Cut, segments
+from sags_node.config import LiveSource, PhantomSource, Source
 from sags_node.errors import SagsError, UsageError
 from sags_node.launch_file import BAG_SUFFIXES, is_sidecar, known_recording, load_launch
 from sags_node.session import open_session
 from sags_node.sources.dvrk import read_sidecar
-from sags_node.sources.source import recorded_rig
+from sags_node.sources.replay import Replay
+from sags_node.sources.source import open_source, recorded_rig
 from sags_node.sources.videos import Video
 from sags_node.yaml_reader import read_yaml
 
@@ -35,13 +37,19 @@ class Scan:
     refused: list[Refused]
 
 
-def scan(folder: Path, rig: Path | None = None, progress: Callable[[int], None] = lambda done: None) -> Scan:
+def scan(
+    folder: Path,
+    rig: Path | None = None,
+    progress: Callable[[int], None] = lambda done: None,
+    cut: Cut | None = None,
+) -> Scan:
     """Look for recordings below a folder, and open each.
 
     The weight of a recording is its frames times the megapixels of one eye.
 
     Args:
         rig: the calibration of those that bring none; None: the nearest folder `calib` beside or above.
+        cut: into segments, a row for each; None: recordings stay whole.
         progress: called with how many were looked at.
 
     Raises:
@@ -55,7 +63,7 @@ def scan(folder: Path, rig: Path | None = None, progress: Callable[[int], None] 
     for done, path in enumerate(_candidates(root), 1):
         name = path.relative_to(root).as_posix()
         try:
-            found.recordings.append(_opened(root, name, given))
+            found.recordings.extend(_opened(root, name, given, cut))
         except (SagsError, OSError) as error:
             found.refused.append(Refused(name, str(error)))
         progress(done)
@@ -114,8 +122,8 @@ def _has_sidecar(video: Path) -> bool:
     )
 
 
-def _opened(root: Path, name: str, rig: Path | None) -> Recording:
-    """The row of a recording that can be played.
+def _opened(root: Path, name: str, rig: Path | None, cut: Cut | None) -> list[Recording]:
+    """The row of a recording that can be played, or those of its segments.
 
     Raises:
         SagsError: it cannot.
@@ -125,25 +133,37 @@ def _opened(root: Path, name: str, rig: Path | None) -> Recording:
     config = load_launch(*split(arguments(path, None, overrides)))
     if isinstance(config.source, LiveSource):
         raise UsageError("live cameras, no recording; record them first (sags bag record)")
+    once = config.source.model_copy(update={"loop": False})  # as all jobs play it
+    if isinstance(once, PhantomSource):
+        frames = once.frames or round(once.seconds * (once.rate or PHANTOM_RATE))
+        row = Recording(name, str(root), None, (), _weight(frames, once.width, once.height))
+        return [row] if cut is None else _segments(row, once, cut)
     rig_name = None
-    if config.rig is None and not isinstance(config.source, PhantomSource):
-        if recorded_rig(config.source) is None:
-            found = rig or _nearest_calib(path, root)
-            if found is None:
-                raise UsageError("no calibration: name one with --rig, or put a folder calib beside it")
-            inside = found.is_relative_to(root)
-            rig_name = found.relative_to(root).as_posix() if inside else str(found)
-    if isinstance(config.source, PhantomSource):
-        frames = config.source.frames or round(config.source.seconds * (config.source.rate or PHANTOM_RATE))
-        megapixels = config.source.width * config.source.height * 1e-6
-    else:
-        said = arguments(path, None if rig_name is None else root / rig_name, overrides)
-        session = open_session(*split(said))
-        with session.source as source:
-            frames = source.frame_count or 1
-        megapixels = session.working_size[0] * session.working_size[1] * 1e-6
-    weight = float(f"{frames * megapixels:.4g}")
-    return Recording(name, str(root), rig_name, tuple(overrides), weight)
+    if config.rig is None and recorded_rig(once) is None:
+        found = rig or _nearest_calib(path, root)
+        if found is None:
+            raise UsageError("no calibration: name one with --rig, or put a folder calib beside it")
+        rig_name = found.relative_to(root).as_posix() if found.is_relative_to(root) else str(found)
+    said = arguments(path, None if rig_name is None else root / rig_name, overrides)
+    launch, changed = split(said)
+    session = open_session(launch, [*changed, "source.loop:=false"])
+    with session.source as source:
+        frames = source.frame_count or 1
+        row = Recording(name, str(root), rig_name, tuple(overrides), _weight(frames, *session.working_size))
+        if cut is None:
+            return [row]
+        return segments(row, once, source, cut) if isinstance(source, Replay) else _segments(row, once, cut)
+
+
+def _weight(frames: int, width: int, height: int) -> float:
+    return float(f"{frames * width * height * 1e-6:.4g}")
+
+
+def _segments(row: Recording, config: Source, cut: Cut) -> list[Recording]:
+    """Of a recording that is opened for it; a phantom is rendered then."""
+    with open_source(config, references=False) as source:
+        assert isinstance(source, Replay) and not isinstance(config, LiveSource)
+        return segments(row, config, source, cut)
 
 
 def _says_how(video: Path) -> list[str]:

@@ -54,6 +54,33 @@ class Plan:
 
 
 @dataclass(frozen=True, slots=True)
+class Needs:
+    """What a recording takes of a machine while it runs; memory in bytes."""
+
+    cores: int
+    gpus: int
+    memory: int
+
+    def __str__(self) -> str:
+        return f"{self.cores} cores, {self.gpus} GPUs, {self.memory * 1e-9:g} GB of memory"
+
+
+def needs(plan: Plan, recording: Recording | None = None) -> Needs:
+    """As the overrides say: `engine.threads`, and `device:=cuda`. The recording's own count.
+
+    Raises:
+        UsageError: `engine.threads` is no number of cores.
+    """
+    own = () if recording is None else recording.overrides
+    said = dict(each.split(":=", 1) for each in (*plan.overrides, *own))
+    cores = said.get("engine.threads", "1")
+    if not cores.isdecimal() or int(cores) < 1:
+        where = "" if recording is None else f"{recording.id}: "
+        raise UsageError(f"{where}engine.threads:={cores}: a recording needs a number of cores, 1 or more")
+    return Needs(int(cores), int(said.get("device") == "cuda"), int((plan.limits.memory_gb or 0) * 1e9))
+
+
+@dataclass(frozen=True, slots=True)
 class Outcome:
     """What became of one attempt.
 
@@ -108,7 +135,8 @@ def _work(recording: Recording, plan: Plan, key: str, program: Sequence[str]) ->
     with scratch() as stage, store.partial(recording.id) as out:
         place, rig = fetched(recording, stage, plan.limits.staged_gb)
         said = command(plan.job, _said(place, rig, recording, plan), plan.options, out)
-        ended = run_limited([*program, *said], plan.limits, out / FIGURES, out / LOG)
+        cores = needs(plan, recording).cores
+        ended = run_limited([*program, *said], cores, plan.limits, out / FIGURES, out / LOG)
         if NO_SPACE in _tail(out / LOG) or _is_full(out):  # not all that writes pictures and videos says so
             raise _FailedError("no space", NO_SPACE)
         if ended != Ended(0):
@@ -123,7 +151,8 @@ def _work(recording: Recording, plan: Plan, key: str, program: Sequence[str]) ->
 
 def _said(place: Path, rig: Path | None, recording: Recording, plan: Plan) -> list[str]:
     """What is launched; then resources, what all recordings get, and this one's own: the last one counts."""
-    threads = [f"engine.threads:={plan.limits.cores}", f"vision.onnx.threads:={plan.limits.cores}"]
+    cores = needs(plan, recording).cores
+    threads = [f"engine.threads:={cores}", f"vision.onnx.threads:={cores}"]
     launch, own = split(arguments(place, rig, recording.overrides))
     return [*([] if launch is None else [launch]), *threads, "device:=cpu", *plan.overrides, *own]
 
@@ -142,6 +171,7 @@ def _row(recording: Recording, figures: dict[str, Any], plan: Plan, seconds: flo
     return {
         "id": recording.id,
         "recording": recording.name,
+        "segment": recording.segment,
         "job": plan.job,
         **figures,
         "seconds": round(seconds, 3),
@@ -171,16 +201,3 @@ def _tail(log: Path) -> str:
 
 def _is_full(folder: Path) -> bool:
     return shutil.disk_usage(folder).free < LEAST_FREE
-
-
-def resources(overrides: Sequence[str]) -> tuple[int, int]:
-    """Cores and GPUs of a task, as the overrides say: `engine.threads`, and `device:=cuda`.
-
-    Raises:
-        UsageError: `engine.threads` is no number of cores.
-    """
-    said = dict(each.split(":=", 1) for each in overrides)
-    cores = said.get("engine.threads", "1")
-    if not cores.isdecimal() or int(cores) < 1:
-        raise UsageError(f"engine.threads:={cores}: each recording needs a number of cores, 1 or more")
-    return int(cores), int(said.get("device") == "cuda")

@@ -13,7 +13,17 @@ from rich.table import Table
 
 from sags_node.archive.cluster import check_installed
 from sags_node.archive.jobs import JOBS
-from sags_node.cli.launching import as_json, lerobot_option, positive, split
+from sags_node.cli.launching import (
+    as_json,
+    check_files,
+    launch_argument,
+    lerobot_option,
+    positive,
+    split,
+    split_recording,
+    table_option,
+    write_json,
+)
 from sags_node.errors import SagsError, UsageError
 from sags_node.plotting import check_plots, has_plots
 from sags_node.terminal import text
@@ -44,32 +54,55 @@ def archive() -> None:
     type=click.Path(path_type=Path),
     help="Calibration of recordings that bring none; default: the nearest folder calib beside or above.",
 )
+@click.option(
+    "--segment",
+    type=positive,
+    metavar="SECONDS",
+    help="A row for each part of a recording, equally long and no longer than this; default: one for all.",
+)
+@click.option(
+    "--warm-up",
+    type=click.FloatRange(0),
+    default=2.0,
+    show_default=True,
+    metavar="SECONDS",
+    help="What is played before a segment, so that the model is there when it begins.",
+)
 @as_json
-def scan(folder: Path, out: str, rig: Path | None, json_out: bool) -> None:
+def scan(
+    folder: Path, out: str, rig: Path | None, segment: float | None, warm_up: float, json_out: bool
+) -> None:
     """List the recordings below a folder in a manifest.
 
     It says why others cannot be played. Each one is opened once, as sags run would. The manifest is a
-    table: recording, rig, overrides, weight.
+    table: recording, rig, overrides, weight, segment.
 
     \b
     sags archive scan /data/theatre3 --out theatre3.parquet
+    sags archive scan /data/theatre3 --out theatre3.csv --segment 300
     """
     check_installed()
-    from sags_node.archive.manifest import write_manifest
+    from sags_node.archive.manifest import beside, write_manifest
     from sags_node.archive.scan import scan as look
+    from sags_node.archive.segments import Cut
 
     with progress("looking") as advance:
-        found = look(folder, rig, advance)
-    write_manifest(out, found.recordings)
+        found = look(folder, rig, advance, None if segment is None else Cut(segment, warm_up))
+    listed = [beside(each, out) for each in found.recordings]
+    write_manifest(out, listed)
     refused = [{"path": each.path, "why": each.why} for each in found.refused]
+    rows = "" if segment is None else f" in {len(listed)} rows"
     console.print(
-        f"{len(found.recordings)} recordings: [bold]{escape(out)}[/]; {len(refused)} cannot be played",
+        f"{len({each.name for each in listed})} recordings{rows}: [bold]{escape(out)}[/]; "
+        f"{len(refused)} cannot be played",
         soft_wrap=True,
     )
     if json_out:
         show(
             {
-                "recordings": [{"recording": each.name, "id": each.id} for each in found.recordings],
+                "recordings": [
+                    {"recording": each.name, "segment": each.segment, "id": each.id} for each in listed
+                ],
                 "refused": refused,
             }
         )
@@ -139,7 +172,8 @@ def run(
     The same command again does what is missing: recordings that are done stay, unless their files, the
     settings or the version changed. A recording that fails is tried again, then quarantined.
 
-    engine.threads:=N is the number of cores of each recording (default: 1), device:=cuda asks for a GPU.
+    engine.threads:=N is the number of cores of each recording (default: 1), device:=cuda asks for a GPU; here
+    for all, or in a row of the manifest.
 
     \b
     sags archive run theatre3.csv --job eval --out out/theatre3 --options '--iterations 2'
@@ -154,8 +188,9 @@ def run(
     from sags_node.archive.results import status as found
     from sags_node.archive.run import describe
     from sags_node.archive.run import run as work_through
+    from sags_node.archive.segments import check_frames
     from sags_node.archive.store import REPORT, RESULTS, Store
-    from sags_node.archive.work import Plan, resources
+    from sags_node.archive.work import Plan, needs
     from sags_node.benchmark.provenance import revision
 
     path, overrides = split(source)
@@ -165,10 +200,11 @@ def run(
         raise UsageError("--local is this machine alone; leave it out, or leave out --ray")
     if job in NEEDS_PLOTS:
         check_plots()
-    cores, _ = resources(overrides)
-    recordings = _listed(path, rig)[:limit]
-    limits = Limits(cores, memory, timeout, stage_limit)
+    limits = Limits(memory, timeout, stage_limit)
     plan = Plan(job, tuple(overrides), tuple(shlex.split(options)), out, revision(), limits)
+    needs(plan)
+    recordings = _listed(path, rig)[:limit]
+    check_frames(recordings, overrides)
     store = Store(out)
     with store.locked():
         describe(store, recordings, plan, as_csv(recordings))
@@ -190,6 +226,8 @@ def run(
     console.print(f"table: [bold]{escape(out)}/{RESULTS}[/]{page}", soft_wrap=True)
     if tally.stopping.is_set():
         raise KeyboardInterrupt
+    if tally.waits:
+        raise SagsError(f"{state['missing']} are missing: {tally.waits}")
     if state["quarantined"]:
         raise SagsError(f"{state['quarantined']} recordings failed; sags archive show {out} ID says why")
 
@@ -283,7 +321,7 @@ def show_one(out: str, id: str, json_out: bool) -> None:
 def dataset(out: str, folder: Path, lerobot_version: Version) -> None:
     """Make one LeRobot data set of all that --job lerobot has done.
 
-    An episode for each recording, in the order of the manifest. FOLDER must be new or empty.
+    An episode for each recording or segment, in the order of the manifest. FOLDER must be new or empty.
 
     \b
     sags archive run theatre3.csv --job lerobot --out out/theatre3
@@ -306,3 +344,53 @@ def dataset(out: str, folder: Path, lerobot_version: Version) -> None:
     console.print(
         f"{len(episodes)} episodes, {frames} frames: [bold]{escape(str(folder))}[/]", soft_wrap=True
     )
+
+
+@archive.command()
+@launch_argument
+@click.option(
+    "--job", "jobs", type=click.Choice(sorted(JOBS)), multiple=True, help="May be repeated; default: all."
+)
+@click.option(
+    "--frames",
+    type=click.IntRange(4),
+    default=120,
+    show_default=True,
+    help="That are played; and a fourth of them, to tell what a start costs.",
+)
+@table_option
+@as_json
+def costs(
+    launch: tuple[str, ...], jobs: tuple[str, ...], frames: int, out: Path | None, json_out: bool
+) -> None:
+    """Say what each job costs for an hour of video.
+
+    The beginning of a recording is played twice for each, on one core (engine.threads). CPU seconds, seconds
+    and bytes are extrapolated by frames. A fit holds all its frames in memory: its hour is made of clips.
+
+    \b
+    sags archive costs launch/d4d_pull.yaml mapping.iterations:=2 --job depth --job tracks
+    """
+    check_installed()
+    from sags_node.archive.costs import job_costs
+    from sags_node.session import open_session
+
+    path, overrides = split_recording(launch, "live cameras have no length; name a recording")
+    with open_session(path, [*overrides, "source.loop:=false"]).source as source:
+        rate, count = source.rate, source.frame_count or 0
+    if path is None or count < frames:
+        raise UsageError(f"a recording of {frames} frames is needed, this one has {count}; change --frames")
+    check_files(out)
+    asked = jobs or sorted(JOBS)
+    with progress("measuring") as advance:
+        rows = job_costs(
+            str(Path(path).resolve()), overrides, asked, frames, rate,
+            lambda done, job: advance(done, len(asked), job),
+        )  # fmt: skip
+    show(rows if json_out else text.rows_table([_flat_cost(row) for row in rows]))
+    write_json(out, rows)
+
+
+def _flat_cost(row: dict[str, Any]) -> dict[str, Any]:
+    hour = {f"{name} of an hour": value for name, value in row["of_an_hour"].items()}
+    return {key: value for key, value in row.items() if key != "of_an_hour"} | hour

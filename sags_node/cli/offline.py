@@ -37,6 +37,12 @@ from sags_node.terminal.console import check_folder, console, progress, show, wr
     "--iterations", type=click.IntRange(0), help="Fixed steps per frame: reproducible with --pace step."
 )
 @click.option(
+    "--warm-up",
+    type=click.IntRange(0),
+    metavar="FRAMES",
+    help="The first frames are played and not measured: source.warm_up.",
+)
+@click.option(
     "--hold-out",
     type=click.IntRange(0),
     default=8,
@@ -63,6 +69,7 @@ def evaluate(
     launch: tuple[str, ...],
     pace: str,
     iterations: int | None,
+    warm_up: int | None,
     hold_out: int,
     every: int,
     lpips_weights: Path | None,
@@ -89,6 +96,8 @@ def evaluate(
     from sags_node.evaluation.session import evaluate as measure
 
     path, overrides = split(launch)
+    if warm_up is not None:
+        overrides.append(f"source.warm_up:={warm_up}")
     options = Options(hold_out, every, lpips_weights, paper_psnr)
     file = Path(json_out) if json_out is not None and json_out != "-" else None
     if report is not None:

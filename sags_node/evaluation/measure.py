@@ -149,8 +149,10 @@ class Measurer:
         self._held: _HeldOut | None = None
 
     def run(self, frames: Iterable[StereoFrame], progress: Progress) -> None:
-        """Measure all frames of the recording that the run was played from."""
+        """Measure all frames of the recording that the run was played from, but for those of its warm-up."""
         for frame in frames:
+            if frame.warm_up:
+                continue
             pair = self._rectifier(frame)
             seconds = frame.t_capture_ns * 1e-9
             place = self._places.get(frame.frame_id)

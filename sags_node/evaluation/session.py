@@ -100,7 +100,9 @@ def measure(
         SagsError: nothing was processed, or the recording cannot be read again.
     """
     if len(spool) == 0:
-        raise SagsError("no frame was processed; check source.start, source.frames and the hold-out")
+        raise SagsError(
+            "no frame was processed; check source.start, source.frames, source.warm_up and the hold-out"
+        )
     config = session.config
     measurer = _measured(session, spool, options, progress)
     summary = summarise(
@@ -140,6 +142,8 @@ def run_step(session: Session, options: Options, spool: Spool, progress: Progres
                 continue
             started = time.perf_counter()
             result = pipeline.process(frame, budget)
+            if frame.warm_up:
+                continue
             frame_ms = (time.perf_counter() - started) * 1e3
             spool.add(result, frame_ms, time.monotonic_ns(), warnings=pipeline.warnings)
             progress("playing", len(spool))

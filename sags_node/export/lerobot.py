@@ -117,7 +117,7 @@ class LeRobot:
 
     def finish(self) -> dict[str, Any]:
         if self._count == 0:
-            raise SagsError("no frame was played; check source.start and source.frames")
+            raise SagsError("no frame was played; check source.start, source.frames and source.warm_up")
         with writing(self._folder):
             self._write_rows()
             self.close()

@@ -39,9 +39,10 @@ class Product(Protocol):
 
 
 def write_played(session: Session, products: Mapping[str, Product], advance: Advance) -> list[dict[str, Any]]:
-    """Play a recording, every frame in turn, and give all of them what the node knows of it.
+    """Play a recording, every frame in turn, and give all of them what the node knows of it. Frames of the
+    warm-up are played, not given.
 
-    Points to be followed are pinned on a grid, in the first frame that has depth.
+    Points to be followed are pinned on a grid, in the first frame after the warm-up that has depth.
 
     Args:
         session: a recording with `source.pace` step.
@@ -72,6 +73,8 @@ def _played(session: Session) -> Iterator[tuple[FrameResult, AnchorStates]]:
     with session.source as source:
         for frame in source:
             result = pipeline.process(frame, budget)
+            if frame.warm_up:
+                continue
             if len(pipeline.anchors) == 0 and not result.held:
                 _pin(pipeline, result)
                 yield result, pipeline.anchors.at(frame.t_capture_ns)
@@ -153,7 +156,7 @@ class Tracks:
 
     def finish(self) -> dict[str, Any]:
         if not self._points:
-            raise SagsError("no frame was played; check source.start and source.frames")
+            raise SagsError("no frame was played; check source.start, source.frames and source.warm_up")
         points, seen = np.stack(self._points), np.stack(self._visible) >= SEEN
         with writing(self._file), whole(self._file) as partial, partial.open("wb") as file:
             np.savez_compressed(file, points=points, visible=seen, frames=np.array(self._frames))

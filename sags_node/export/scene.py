@@ -121,7 +121,8 @@ def from_session(session: Session, at: float | None, advance: Advance) -> Scene:
 
 
 def scenes_of_session(session: Session) -> Iterator[Scene]:
-    """The online model after each frame of a recording; without Gaussians where nothing is known yet.
+    """The online model after each frame of a recording but its warm-up; without Gaussians where nothing is
+    known yet.
 
     Args:
         session: a recording with `source.pace` step.
@@ -132,7 +133,8 @@ def scenes_of_session(session: Session) -> Iterator[Scene]:
     with session.source as source:
         for frame in source:
             snapshot = pipeline.process(frame, budget).snapshot
-            yield Scene(snapshot.gaussians, snapshot.camera, frame.t_capture_ns)
+            if not frame.warm_up:
+                yield Scene(snapshot.gaussians, snapshot.camera, frame.t_capture_ns)
 
 
 # ---- a fit -----------------------------------------------------------------------------------------------

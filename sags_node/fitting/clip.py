@@ -65,7 +65,8 @@ class Clip:
 def play(session: Session, references: bool) -> Iterator[ClipFrame]:
     """Frames of a session, which is opened anew, through the node's own front end.
 
-    Those whose pose the robot does not tell are left out: nobody knows from where they were seen.
+    Those whose pose the robot does not tell are left out: nobody knows from where they were seen. So are
+    those of the warm-up: there is no model yet that would settle.
 
     Args:
         session: it is played from its start.
@@ -78,6 +79,8 @@ def play(session: Session, references: bool) -> Iterator[ClipFrame]:
     unposed = 0
     with open_posed(session.config, session.rig, references) as source:
         for frame in source:
+            if frame.warm_up:
+                continue
             if frame.pose_problem is not None:
                 unposed += 1
                 continue
@@ -112,7 +115,9 @@ def read_clip(
         (test if held_out(frame.frame_id) else train).append(frame)
         progress(len(train) + len(test))
     if not train:
-        raise SagsError("no frame to learn from; check source.start, source.frames and the hold-out")
+        raise SagsError(
+            "no frame to learn from; check source.start, source.frames, source.warm_up and the hold-out"
+        )
     return Clip(train, test)
 
 

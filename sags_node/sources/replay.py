@@ -64,6 +64,9 @@ class Replay:
 
     A recording that keeps a stamp of each picture is played by those, unless `config.rate` is set.
 
+    Attributes:
+        first: number of the first frame.
+
     Args:
         config: which recording, and how to play it.
         references: read the recording's truth with each frame.
@@ -104,23 +107,33 @@ class Replay:
         self.dropped = 0
         self._began: tuple[float, int] | None = None  # monotonic seconds and wall clock of the first turn
         self._dropped_in_a_row = 0
-        self._first = round(config.start * self.rate)
-        if self._stamps is not None:
-            start_ns = self._stamps[0, 0] + round(config.start * 1e9)
-            self._first = int(np.searchsorted(self._stamps[:, 0], start_ns))
-        if self._first >= self._count:
+        self.first = self.frame_at(config.start)
+        if self.first >= self._count:
             self._pairs.close()
             seconds = self._count / self.rate
             raise UsageError(
                 f"source.start {config.start} s lies behind the recording's end at {seconds:.2f} s"
             )
 
+    def frame_at(self, start: float) -> int:
+        """Number of the frame that this `source.start` begins with."""
+        if self._stamps is None:
+            return round(start * self.rate)
+        return int(np.searchsorted(self._stamps[:, 0], self._stamps[0, 0] + round(start * 1e9)))
+
+    def seconds_of(self, frame_id: int) -> float:
+        """The `source.start`, to the nanosecond, that begins with this frame of the first pass; of frames
+        with the same stamp it begins with the first."""
+        if self._stamps is None:
+            return round(frame_id / self.rate, 9)
+        return round(int(self._stamps[frame_id, 0] - self._stamps[0, 0]) * 1e-9, 9)
+
     @property
     def frame_count(self) -> int | None:
         """How many turns there will be; None for an endless loop."""
         if self._config.loop:
             return self._config.frames
-        there = self._count - self._first
+        there = self._count - self.first
         return there if self._config.frames is None else min(there, self._config.frames)
 
     def __enter__(self) -> Self:
@@ -144,11 +157,11 @@ class Replay:
             SagsError: a picture is damaged, or the right eye ends before the left one.
         """
         stride = self._config.stride
-        self._pairs.seek(self._first * stride)
+        self._pairs.seek(self.first * stride)
         self._began = None
         self._dropped_in_a_row = 0
-        epoch, index, frame_id = 0, self._first, self._first
-        limit = None if self._config.frames is None else self._first + self._config.frames
+        epoch, index, frame_id = 0, self.first, self.first
+        limit = None if self._config.frames is None else self.first + self._config.frames
         while not self._stopped.is_set() and frame_id != limit:
             pair = None
             if self._is_too_late(frame_id):
@@ -157,10 +170,10 @@ class Replay:
                 pair = self._pairs.read()
                 ended = pair is None
             if ended:
-                if not self._config.loop or index == self._first:
+                if not self._config.loop or index == self.first:
                     return
-                self._pairs.seek(self._first * stride)
-                epoch, index = epoch + 1, self._first
+                self._pairs.seek(self.first * stride)
+                epoch, index = epoch + 1, self.first
                 continue
             if pair is None:
                 self.dropped += 1
@@ -174,7 +187,7 @@ class Replay:
                 stamp = self._wait_for_turn(frame_id)
                 if self._stopped.is_set():
                     return
-                if frame_id == self._first and pair.depth is None:
+                if frame_id == self.first and pair.depth is None:
                     refuse_one_eye_twice(pair.left, pair.right)
                 yield StereoFrame(
                     frame_id,
@@ -188,6 +201,7 @@ class Replay:
                     reference=reference,
                     depth=pair.depth,
                     t_device_ns=0 if self._recorded is None else int(self._recorded[index]),
+                    warm_up=frame_id < self.first + self._config.warm_up,
                 )
             for _ in range(stride - 1):
                 self._pairs.skip()
@@ -202,10 +216,10 @@ class Replay:
 
     def _elapsed(self, frame_id: int) -> int:
         """Time from the first turn to this one, as the recording has it, ns."""
-        turns = frame_id - self._first
+        turns = frame_id - self.first
         if self._stamps is None:
             return round(turns * 1e9 / self.rate)
-        times = self._stamps[self._first :, 0]
+        times = self._stamps[self.first :, 0]
         passes, turn = divmod(turns, len(times))
         one_pass = int(times[-1] - times[0]) + round(1e9 / self.rate)
         return passes * one_pass + int(times[turn] - times[0])
@@ -227,7 +241,7 @@ class Replay:
         """Wait as the pace asks; the capture stamp of this frame, ns."""
         if self._config.pace == "step":
             if self._stamps is not None:
-                return int(self._stamps[self._first, 0]) + self._elapsed(frame_id)
+                return int(self._stamps[self.first, 0]) + self._elapsed(frame_id)
             return round(frame_id * 1e9 / self.rate)
         if self._config.pace == "fast":
             return self._wall_ns()

@@ -119,6 +119,6 @@ def _phantom_recording(
     recorded = load_launch(cached_session(config, progress)).source
     assert isinstance(recorded, cfg.FoldersSource)
     playing = config.model_dump(
-        include={"pace", "rate", "loop", "start", "frames", "stride"}, exclude_unset=True
+        include={"pace", "rate", "loop", "start", "frames", "warm_up", "stride"}, exclude_unset=True
     )
     return recorded.model_copy(update=playing)

@@ -18,6 +18,7 @@ from typing import Any
 import pytest
 from tiny_archive import quick_plan, quick_work, table, write_quick_recordings
 
+from sags_node.archive.cluster import connected
 from sags_node.archive.manifest import Recording, as_csv
 from sags_node.archive.results import failed, status, write_results
 from sags_node.archive.run import Tally, describe, run
@@ -26,6 +27,14 @@ from sags_node.archive.work import Plan
 from sags_node.errors import SagsError, UsageError
 
 PATIENCE = 30.0  # s
+
+
+@pytest.fixture(scope="module", autouse=True)
+def connection(cluster: Any) -> Iterator[None]:
+    """One for all runs of this file, so that its workers are started once. The driver that is killed has its
+    own."""
+    with connected(cluster.address):
+        yield
 
 
 def gone_through(
@@ -259,8 +268,22 @@ def test_a_full_disk_stops_the_run_and_blames_no_recording(
     ]
 
 
-def test_what_no_machine_has_is_said(cluster: Any, tmp_path: Path) -> None:
-    recordings = write_quick_recordings(tmp_path / "in", 1)
-    plan = replace(quick_plan(tmp_path / "out"), overrides=("engine.threads:=64",))
-    with pytest.raises(SagsError, match=r"64 cores, 0 GPUs.*lower engine\.threads"):
-        gone_through(tmp_path / "out", recordings, cluster, plan=plan)
+def test_what_no_machine_has_is_waited_for_by_those_that_need_it(cluster: Any, tmp_path: Path) -> None:
+    """The others are done. A GPU for the test is one that Ray is told of; nobody computes on it."""
+    recordings = write_quick_recordings(tmp_path / "in", 3)
+    recordings[0] = replace(recordings[0], overrides=("device:=cuda",))
+    recordings[1] = replace(recordings[1], overrides=("engine.threads:=64",))
+    store, tally = gone_through(tmp_path / "out", recordings, cluster)
+    assert tally.done == 1 and store.done().keys() == {recordings[2].id}
+    assert "wait for 1 cores, 1 GPUs, 0 GB of memory; 64 cores, 0 GPUs" in tally.waits
+    assert status(store)["missing"] == 2 and failed(store) == []
+
+    more = cluster.add_node(num_cpus=1, num_gpus=1)
+    try:
+        store, tally = gone_through(tmp_path / "out", recordings, cluster)
+    finally:
+        cluster.remove_node(more)
+    assert (tally.kept, tally.done) == (1, 1) and "wait for 64 cores" in tally.waits
+    rows = {row["id"]: row for row in table(store)}
+    assert rows[recordings[0].id]["gpu"] == "0"  # the first of that machine's
+    assert rows[recordings[2].id]["gpu"] is None

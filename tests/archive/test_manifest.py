@@ -13,7 +13,7 @@ from tiny_archive import TINY_FRAMES
 from user_files import write_video
 
 from sags_node.archive.launching import arguments, counterpart
-from sags_node.archive.manifest import Recording, read_manifest, write_manifest
+from sags_node.archive.manifest import Recording, beside, read_manifest, write_manifest
 from sags_node.archive.scan import scan
 from sags_node.errors import UsageError
 from sags_node.session import open_session
@@ -153,7 +153,17 @@ def test_a_video_that_does_not_say_how_is_refused(tmp_path: Path) -> None:
 def test_the_command_leaves_a_manifest(archive: Path, tmp_path: Path) -> None:
     result = sags("archive", "scan", archive, "--out", tmp_path / "m.csv", "--json")
     said = pure_json(result.stdout)
-    assert [each["id"] for each in said["recordings"]] == [
-        each.id for each in read_manifest(str(tmp_path / "m.csv"))
-    ]
+    read = read_manifest(str(tmp_path / "m.csv"))
+    assert [each["id"] for each in said["recordings"]] == [each.id for each in read]
+    assert [each.place for each in read] == [each.place for each in scan(archive).recordings]
+    assert read[0].rig == str(archive / "calib")  # found from where the manifest lies
     assert len(said["refused"]) == 3
+
+
+def test_names_are_relative_to_a_manifest_above_them() -> None:
+    row = Recording("case1/left.mp4", "/data/theatre", "calib")
+    above = beside(row, "/data/m.csv")
+    assert (above.name, above.rig_name) == ("theatre/case1/left.mp4", "theatre/calib")
+    assert (above.place, above.rig) == (row.place, row.rig)
+    assert beside(row, "/data/theatre/m.csv") == row
+    assert beside(row, "s3://lab/m.csv").place == row.place

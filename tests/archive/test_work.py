@@ -12,11 +12,14 @@ from fsspec.core import url_to_fs
 from tiny_archive import quick_plan, quick_work, write_quick_recordings
 
 from sags_node.archive.inputs import fetched, key_of, scratch
+from sags_node.archive.jobs import FIGURES, JOBS, LOG, command
 from sags_node.archive.manifest import Recording
+from sags_node.archive.process import Limits
 from sags_node.archive.results import read_results, write_results
 from sags_node.archive.run import about
 from sags_node.archive.store import Store
-from sags_node.archive.work import work
+from sags_node.archive.work import Needs, needs, work
+from sags_node.errors import UsageError
 
 
 @pytest.fixture
@@ -36,7 +39,7 @@ def own_temporary_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
 
 def test_results_appear_whole_and_are_not_done_twice(tmp_path: Path) -> None:
     recording = write_quick_recordings(tmp_path / "in", 1)[0]
-    plan = quick_plan(tmp_path / "out", cores=3)
+    plan = quick_plan(tmp_path / "out", "engine.threads:=3")
     outcome = quick_work(recording, plan, "key")
     assert (outcome.state, outcome.frames) == ("done", 3)
     store = Store(plan.out)
@@ -52,6 +55,26 @@ def test_results_appear_whole_and_are_not_done_twice(tmp_path: Path) -> None:
     first = (tmp_path / "out/recordings" / recording.id / "figures.json").stat()
     assert quick_work(recording, plan, "key").state == "done"  # one that was taken for lost comes back
     assert (tmp_path / "out/recordings" / recording.id / "figures.json").stat() == first
+
+
+def test_a_rows_own_cores_count(tmp_path: Path) -> None:
+    recording = write_quick_recordings(tmp_path / "in", 1)[0]
+    plan = quick_plan(tmp_path / "out", "engine.threads:=3")
+    assert needs(plan) == Needs(3, 0, 0)
+    own = replace(recording, overrides=("engine.threads:=2", "device:=cuda"))
+    assert needs(replace(plan, limits=Limits(memory_gb=1.5)), own) == Needs(2, 1, 1_500_000_000)
+    assert quick_work(own, plan, "key").state == "done"
+    assert Store(plan.out).read_json(f"done/{own.id}.key.json")["threads"] == "2"
+    with pytest.raises(UsageError, match=r"r000.*engine\.threads:=0"):
+        needs(plan, replace(recording, overrides=("engine.threads:=0",)))
+
+
+@pytest.mark.parametrize("job", JOBS)
+def test_a_job_writes_beside_its_figures(job: str, tmp_path: Path) -> None:
+    """`figures.json` and `log.txt` are its stdout and stderr: a file that it writes itself must not be one."""
+    said = command(job, ["recording"], (), tmp_path)
+    written = [Path(each).relative_to(tmp_path) for each in said if each.startswith(str(tmp_path))]
+    assert written and all(each.name and each.name not in (FIGURES, LOG) for each in written)
 
 
 def test_a_store_that_is_no_folder(tmp_path: Path, in_memory: str) -> None:

@@ -36,7 +36,8 @@ def main() -> None:
         sys.exit(said.get("code", 1))
     (report / "content").write_text(recording.stem)
     figures = {"frames": 3, "online": {"psnr": said["psnr"]}, "warnings": {}}
-    print(json.dumps(figures | {"threads": os.environ["OMP_NUM_THREADS"], "played": str(recording)}))
+    told = {"threads": os.environ["OMP_NUM_THREADS"], "gpu": os.environ.get("CUDA_VISIBLE_DEVICES")}
+    print(json.dumps(figures | told | {"played": str(recording)}))
 
 
 if __name__ == "__main__":

@@ -40,8 +40,8 @@ def write_quick_recordings(folder: Path, count: int, **said: Any) -> list[Record
     return recordings
 
 
-def quick_plan(out: Path, **limits: Any) -> Plan:
-    return Plan("eval", (), (), str(out), revision(), Limits(**limits))
+def quick_plan(out: Path, *overrides: str, **limits: Any) -> Plan:
+    return Plan("eval", overrides, (), str(out), revision(), Limits(**limits))
 
 
 def table(store: Store) -> list[dict[str, Any]]:

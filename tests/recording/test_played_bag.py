@@ -13,20 +13,22 @@ from sags_node.session import open_session
 
 pytestmark = pytest.mark.live
 FRAMES = 6
+WARM_UP = 2  # more, before them
 
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("session") / "played"
-    write_session(PhantomSource(seconds=FRAMES / 10, width=160, height=128, seed=3), folder, rate=10.0)
+    write_session(
+        PhantomSource(seconds=(WARM_UP + FRAMES) / 10, width=160, height=128, seed=3), folder, rate=10.0
+    )
     return folder
 
 
-def test_every_frame_is_recorded_and_plays_again(session: Path, tmp_path: Path) -> None:
+def test_every_frame_after_the_warm_up_is_recorded_and_plays_again(session: Path, tmp_path: Path) -> None:
     bag = tmp_path / "bag"
-    said = pure_json(
-        sags("bag", "record", "-o", bag, "--session", session, "publish.right:=true", "--json").stdout
-    )
+    asked = ("publish.right:=true", f"source.warm_up:={WARM_UP}", "--json")
+    said = pure_json(sags("bag", "record", "-o", bag, "--session", session, *asked).stdout)
     assert (said["frames"], said["lost"], said["dropped"]) == (FRAMES, 0, 0)
     for topic in ("left/image_rect_color", "left/render/depth", "splats"):
         assert said["topics"][f"sags/{topic}"]["messages"] == FRAMES
