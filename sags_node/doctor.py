@@ -159,7 +159,7 @@ def _keys(config: PublishConfig) -> list[Check]:
         allowed = read_allow_list(config.allow)
     except UsageError as error:
         return [Check("keys", "error", "cannot be used", str(error))]
-    return [Check("keys", "ok", f"{config.key}; may connect: {', '.join(allowed.values())}")]
+    return [Check("keys", "ok", f"{config.key}; may connect: {', '.join(map(str, allowed.values()))}")]
 
 
 class _Timex(ctypes.Structure):

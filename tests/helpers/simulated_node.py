@@ -61,8 +61,8 @@ class Frame:
     def __init__(self, data: bytes, more: bool = False) -> None:
         self.bytes, self.more = data, more
 
-    def get(self, option: int) -> int:
-        return 0
+    def get(self, option: int | str) -> int | str:
+        return 0 if isinstance(option, int) else "anonymous"
 
 
 class Socket:
