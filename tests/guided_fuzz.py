@@ -1,7 +1,7 @@
 """Damaged bytes for each reader as in `test_fuzz.py`, changed so that they reach new lines: by atheris.
 
-`make fuzz MINUTES=60 GUIDED=1`. Each reader has a process of its own, which its fault ends; the input is kept in
-`out/fuzz`. What libraries in C do is not seen by the guidance, only by the checks.
+`make fuzz MINUTES=60 GUIDED=1`. Each reader has a process of its own, which its fault ends. The input is kept
+in `out/fuzz`. What libraries in C do is not seen by the guidance, only by the checks.
 """
 
 from __future__ import annotations
@@ -52,18 +52,16 @@ def main(minutes: float, *names: str) -> int:
     for name in chosen:
         seconds = 60 * minutes / len(chosen)
         with tempfile.TemporaryDirectory() as folder:
-            command = [sys.executable, __file__, "--one", name, str(seconds), folder]
             done = subprocess.run(
-                command,
+                [sys.executable, __file__, "--one", name, str(seconds), folder],
                 stderr=subprocess.PIPE,
                 stdout=subprocess.DEVNULL,
                 timeout=seconds + ROOM,
                 check=False,
             )
         said = done.stderr.decode(errors="replace")
-        runs = max(
-            (int(number) for number in re.findall(r"^(?:Done |#)(\d+)", said, re.MULTILINE)), default=0
-        )
+        counts = re.findall(r"^(?:Done |#)(\d+)", said, re.MULTILINE)
+        runs = max(map(int, counts), default=0)
         total += runs
         print(f"{name:20} {runs:9,} inputs{'' if done.returncode == 0 else ', FAILED'}", flush=True)
         if done.returncode != 0:
