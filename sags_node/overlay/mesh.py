@@ -59,7 +59,8 @@ def _load(spec: ObjectSpec, file: Path) -> Mesh:
         raise UsageError(f"{file} holds no {what}, or is damaged; open it in a mesh viewer")
     if count > most:
         raise UsageError(f"{file} holds {count} {what}, {most} at most can be drawn; simplify it")
-    points = points * spec.scale
+    with np.errstate(over="ignore"):
+        points = (points * spec.scale).astype(np.float32).astype(np.float64)  # as they will be drawn
     _check_vertices(file, points)
     if what == "points":
         points, triangles = _octahedra(points, spec.point_size)
@@ -106,7 +107,9 @@ def _content(file: Path) -> bytes:
 def _check_vertices(file: Path, vertices: F64) -> None:
     if not np.isfinite(vertices).all():
         bad = int((~np.isfinite(vertices).all(1)).sum())
-        raise UsageError(f"{file}: {bad} of its {len(vertices)} vertices are not finite (NaN); mend the file")
+        raise UsageError(
+            f"{file}: {bad} of its {len(vertices)} vertices are not finite or far too large; mend the file"
+        )
     across = float(np.ptp(vertices, axis=0).max())
     if across > LARGEST:
         raise UsageError(

@@ -87,6 +87,7 @@ BAD_FILES = {
     "nothing.ply": (ply(0, 0, ""), "holds no points"),
     "nothing.obj": (b"# nothing\n", "holds no triangles"),
     "nan.ply": (ply(body=CORNERS.replace("0.01", "nan", 1) + "3 0 1 2\n"), "1 of its 3 vertices"),
+    "huge.xyz": (b"0 8 5" + b"1" * 40, "1 of its 1 vertices"),
     "far.ply": (ply(body=CORNERS.replace("0.01", "10") + "3 0 1 2\n"), "for millimetres set scale: 0.001"),
     "index.ply": (ply(body=CORNERS + "3 0 1 7\n"), "a vertex that is not there"),
     "twice.ply": (ply(body=CORNERS + "4 0 1 2 1\n"), "3 different corners of 4"),
