@@ -15,6 +15,7 @@ from sags_node.engine.rasterizer.rasterize import make_rasterizer, to_view
 from sags_node.errors import UsageError
 from sags_node.evaluation import calibration, metrics
 from sags_node.evaluation.carried import Seen, carried
+from sags_node.evaluation.flicker import Flicker
 from sags_node.evaluation.gallery import Gallery
 from sags_node.evaluation.lpips import Lpips
 from sags_node.evaluation.spool import RunFacts, Spool, SpooledFrame
@@ -143,6 +144,7 @@ class Measurer:
         self._rasterizer = make_rasterizer(backend, camera.width, camera.height)
         self._lpips = Lpips(options.lpips_weights) if options.lpips_weights else None
         self._usable_right: Bool | None = None
+        self._flicker = Flicker()
         self._tracks: PointTracks | None = None
         self._pose = pose
         self._rigid = RigidOdometry()
@@ -177,6 +179,9 @@ class Measurer:
             figures[group] = self._predict(before, shown, truth, seconds)
         if costly and pair.right is not None:
             figures |= self._right_eye(shown, pair.left, pair.right, frame)
+        flicker = self._flicker(pair.left, shown)
+        if flicker is not None:
+            figures["flicker"] = flicker
         track, counts = None, None
         if frame.reference is not None:
             if frame.reference.depth is not None:
