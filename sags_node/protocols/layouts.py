@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import configparser
 import json
+import sys
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -18,7 +19,7 @@ from sags_node.files import read_file
 from sags_node.protocols.arithmetic import stereo_points_mm
 from sags_node.sources.pictures import read_picture
 from sags_node.sources.videos import Video
-from sags_node.types import F64, I64, StereoRig
+from sags_node.types import F64, I64, Bool, StereoRig
 
 LARGEST_TEXT = 64 << 20  # bytes
 ROWS_APART, LEAST_PX, MOST_PX = 10, 8, 105  # of marks in both eyes of STIR that may be one point
@@ -157,6 +158,25 @@ class StereoMisSequence:
     rig: StereoRig
     frames: tuple[int, ...]  # numbers of frames whose poses are known
     poses: F64  # [len(frames), 4, 4] T_world_cam of the left raw camera, m
+    ranges: tuple[range, ...]  # of frames to be measured, each for itself
+    masks: Path | None  # folder of `NNNNNNl.png`, not black where it is tissue; None: there are none
+
+    def tissue_in(self, frame: int) -> Bool | None:
+        """[H, W] of the raw left picture of a frame; None: it has no mask.
+
+        Raises:
+            SagsError: the mask is damaged, or of another size than the picture.
+        """
+        file = None if self.masks is None else self.masks / f"{frame:06d}l.png"
+        if file is None or not file.is_file():
+            return None
+        mask = read_picture(file, cv2.IMREAD_GRAYSCALE)
+        if mask.shape != (self.rig.left.height, self.rig.left.width):
+            raise SagsError(
+                f"mask {file} is {mask.shape[1]}x{mask.shape[0]} px, its picture "
+                f"{self.rig.left.width}x{self.rig.left.height}; was one of them resized?"
+            )
+        return mask > 0
 
 
 def stereomis_sequence(folder: Path) -> StereoMisSequence:
@@ -170,7 +190,31 @@ def stereomis_sequence(folder: Path) -> StereoMisSequence:
         raise UsageError(f"{folder} holds {len(videos)} .mp4 files; a sequence of StereoMIS has one")
     rig = _stereomis_rig(folder / "StereoCalibration.ini")
     frames, poses = read_tum(folder / "groundtruth.txt")
-    return StereoMisSequence(videos[0], rig, tuple(round(frame) for frame in frames), poses)
+    masks = folder / "masks"
+    return StereoMisSequence(
+        videos[0],
+        rig,
+        tuple(round(frame) for frame in frames),
+        poses,
+        _ranges(folder / "test_split.csv"),
+        masks if masks.is_dir() else None,
+    )
+
+
+def _ranges(file: Path) -> tuple[range, ...]:
+    """Of its table: a line of headings, then the first and last frame of each; without one, all frames."""
+    if not file.is_file():
+        return (range(sys.maxsize),)
+    try:
+        rows = [line.split(",") for line in read_file(file, LARGEST_TEXT).decode().splitlines()[1:] if line]
+        ranges = tuple(range(int(row[0]), int(row[1]) + 1) for row in rows)
+    except (OSError, ValueError, IndexError) as error:
+        raise UsageError(
+            f"{file} is no table of ranges ({error}): a heading, then `first,last` lines"
+        ) from None
+    if not ranges or not all(ranges):
+        raise UsageError(f"{file} holds no frames: a heading, then `first,last` lines")
+    return ranges
 
 
 def read_tum(file: Path) -> tuple[F64, F64]:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
-from sags_node.config import RecordedSource
+from sags_node.config import LaunchConfig, RecordedSource
 from sags_node.errors import SagsError
 from sags_node.evaluation.measure import Options
 from sags_node.evaluation.metrics import resample_nearest
@@ -21,7 +21,7 @@ from sags_node.kernels.threads import configure_threads
 from sags_node.launch_file import load_launch
 from sags_node.pipeline import Pipeline
 from sags_node.protocols import arithmetic
-from sags_node.protocols.layouts import check_sizes, stereomis_sequence, stir_clips
+from sags_node.protocols.layouts import StereoMisSequence, check_sizes, stereomis_sequence, stir_clips
 from sags_node.session import open_posed, rig_of
 from sags_node.sources.videos import Video
 from sags_node.types import F64, Camera, Eye, StereoRig
@@ -29,6 +29,7 @@ from sags_node.warm_up import warm_up
 
 STEP = ("source.loop:=false", "source.pace:=step")
 AS_GIVEN = "vision.tissue.dilate:=0"
+LEAST_POSES = 3  # to align
 HOLD_OUT = 8  # EndoNeRF's split, as EndoGaussian and those after it take it
 PICKED = ("paper_psnr", "paper_ssim", "lpips", "psnr", "ssim", "copy_psnr")
 
@@ -127,30 +128,53 @@ def _within_mm(distances: Sequence[F64]) -> dict[str, float] | None:
 
 
 def measure_stereomis(folder: Path, overrides: Sequence[str], progress: Progress) -> dict[str, Any]:
-    """The camera's way as the node estimates it, against the robot's."""
+    """The camera's way as the node estimates it, against the robot's: the means over the ranges of the
+    sequence's table, each begun anew; without a table all of it."""
     sequence = stereomis_sequence(folder)
     check_sizes(Video(sequence.video), sequence.rig)
     given = ["source.kind:=videos", f"source.left:={sequence.video}", "source.geometry.layout:=over_under"]
     config = load_launch(None, [*given, "vision.pose:=estimate", *STEP, *overrides])
-    stride = config.source.stride if isinstance(config.source, RecordedSource) else 1
     warm_up(config)
     configure_threads(config.engine.threads)
+    ways = [_way(config, sequence, frames, progress) for frames in sequence.ranges]
+    ways = [(estimated, known) for estimated, known in ways if len(known) >= LEAST_POSES]
+    if not ways:
+        raise SagsError(f"{folder}: fewer than {LEAST_POSES} frames played have a pose in groundtruth.txt")
+    figures = [
+        arithmetic.trajectory_figures(np.stack(estimated), np.stack(known)) for estimated, known in ways
+    ]
+    return {
+        "frames": sum(len(known) for _, known in ways),
+        "ranges": len(ways),
+        "masks": sequence.masks is not None,
+        **{key: float(np.mean([each[key] for each in figures])) for key in figures[0]},
+    }
+
+
+def _way(
+    config: LaunchConfig, sequence: StereoMisSequence, frames: range, progress: Progress
+) -> tuple[list[F64], list[F64]]:
+    """Estimated and known poses [4, 4] of the frames of one range whose pose is known."""
+    stride = config.source.stride if isinstance(config.source, RecordedSource) else 1
     pipeline = Pipeline(config, sequence.rig)
     budget, T_rectified_raw = pipeline.make_budget(), np.eye(4)
     T_rectified_raw[:3, :3] = sequence.rig.left.R
     known_at = dict(zip(sequence.frames, sequence.poses, strict=True))
     estimated, known = [], []
-    with open_posed(config, sequence.rig, references=False) as frames:
-        for number, frame in enumerate(frames):
-            result = pipeline.process(frame, budget)
-            progress(number + 1, "playing")
-            pose = known_at.get(frame.frame_id * stride)
+    with open_posed(config, sequence.rig, references=False) as played:
+        for frame in played:
+            number = frame.frame_id * stride
+            if number >= frames.stop:
+                break
+            if number < frames.start:
+                continue
+            result = pipeline.process(replace(frame, tissue=sequence.tissue_in(number)), budget)
+            progress(number - frames.start + 1, "playing")
+            pose = known_at.get(number)
             if pose is not None:
                 estimated.append(result.snapshot.camera.T_world_cam @ T_rectified_raw)
                 known.append(pose)
-    if len(known) < 3:
-        raise SagsError(f"{folder}: {len(known)} frames have a pose in groundtruth.txt; three are needed")
-    return {"frames": len(known), **arithmetic.trajectory_figures(np.stack(estimated), np.stack(known))}
+    return estimated, known
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from places import SESSION
 
 from sags_node.calibration import load_rig, rectify_eyes
 from sags_node.cli.main import main
-from sags_node.errors import UsageError
+from sags_node.errors import SagsError, UsageError
 from sags_node.geometry import project
 from sags_node.launch_file import load_launch
 from sags_node.protocols.layouts import marked_in_both, read_tum, stereomis_sequence, stir_clips
@@ -204,6 +205,34 @@ def test_stereomis_end_to_end(stereomis: Path) -> None:
     found = sags_eval("stereomis", stereomis, *FAST)
     assert found["frames"] == FRAMES - 1
     assert found["ate_rmse_mm"] < 1 and found["rpe_mean_deg"] < 0.5
+
+
+def test_ranges_and_masks_of_stereomis(stereomis: Path, tmp_path: Path) -> None:
+    """Frames 0 to 2 and 4 to 6 are measured, each range from a new beginning; the mask is black where there
+    is an instrument."""
+    folder = tmp_path / "P2_1"
+    shutil.copytree(stereomis, folder)
+    (folder / "test_split.csv").write_text("start,end\n0,2\n4,6\n")
+    (folder / "masks").mkdir()
+    rig = stereomis_sequence(folder).rig
+    mask = np.full((rig.left.height, rig.left.width), 255, np.uint8)
+    mask[:, :100] = 0
+    cv2.imwrite(str(folder / "masks/000004l.png"), mask)
+    sequence = stereomis_sequence(folder)
+    assert sequence.ranges == (range(3), range(4, 7))
+    tissue = sequence.tissue_in(4)
+    assert tissue is not None and not tissue[:, :100].any() and tissue[:, 100:].all()
+    assert sequence.tissue_in(5) is None
+    found = sags_eval("stereomis", folder, *FAST)
+    assert found["ranges"] == 2 and found["frames"] == 6 and found["masks"] is True
+    assert found["ate_rmse_mm"] < 1
+    cv2.imwrite(str(folder / "masks/000004l.png"), mask[:50])
+    with pytest.raises(SagsError, match="000004l"):
+        sequence.tissue_in(4)
+    for text in ("start,end\n", "start,end\n5,x\n", "start,end\n5\n", "start,end\n5,3\n"):
+        (folder / "test_split.csv").write_text(text)
+        with pytest.raises(UsageError, match=r"test_split\.csv"):
+            stereomis_sequence(folder)
 
 
 def test_tum_trajectories(tmp_path: Path) -> None:
