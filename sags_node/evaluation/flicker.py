@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from sags_node.evaluation.spool import SpooledFrame
+from sags_node.mapping.right_eye import right_eye_mask
 from sags_node.types import F32, U8, Bool
 
 FRAMES = 30  # in a row
@@ -38,10 +39,10 @@ class Flicker:
             shown: what the run made of it.
 
         Returns:
-            After thirty frames: `input`, `picture` and, where it was shown, `right`: root mean square over
-            pixels, in grey levels; `depth_mm` of the drawn and `measured_depth_mm` of the stereo stage's
-            depth: medians over the pixels that have it in all frames; `share`: of the tissue that is still.
-            None before, and where hardly anything is still.
+            After thirty frames: `input`, `picture` and, where it was shown, `right` (where it shows the same
+            tissue for certain): root mean square over pixels, in grey levels; `depth_mm` of the drawn and
+            `measured_depth_mm` of the stereo stage's depth: medians over the pixels that have it in all
+            frames; `share`: of the tissue that is still. None before, and where hardly anything is still.
         """
         height, width = picture.shape[:2]
         size = max(1, width // BLOCK), max(1, height // BLOCK)
@@ -57,18 +58,21 @@ class Flicker:
         self._frames += 1
         if self._frames < FRAMES:
             return None
-        figures = self._figures(self._tissue)
+        figures = self._figures(self._tissue, shown)
         self._begin()
         return figures
 
-    def _figures(self, tissue: Bool) -> dict[str, float] | None:
+    def _figures(self, tissue: Bool, shown: SpooledFrame) -> dict[str, float] | None:
         still = (self._blocks.deviation() <= STILL).all(-1).astype(np.uint8)
         where = tissue & (cv2.resize(still, tissue.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0)
         if where.mean() < LEAST:
             return None
+        depths, focal_px = shown.depth[where & (shown.depth > 0)], float(shown.snapshot.camera.K[0, 0])
+        masks = {"right": right_eye_mask(where, depths, focal_px, shown.baseline)}
         figures = {
-            name: float(np.sqrt(np.mean(np.square(spread.deviation()[where]))))
+            name: float(np.sqrt(np.mean(np.square(spread.deviation()[mask]))))
             for name, spread in self._pictures.items()
+            if (mask := masks.get(name, where)).any()
         }
         for name, spread in self._depths.items():
             deviation = spread.deviation()[where]

@@ -9,6 +9,7 @@ import numpy as np
 from sags_node.types import F32, F64
 
 STIR_PX = (4, 8, 16, 32, 64)  # of the 2D ranking (stir-challenge.github.io, evaluation)
+STIR_MM = (2, 4, 8, 16, 32)  # of the 3D ranking
 LEAST_KNOWN = 0.1  # of a picture: SCARED leaves out frames with less true depth (arXiv 2101.01133, III-D)
 
 
@@ -23,6 +24,16 @@ def shares_within(distances: F64, thresholds: Sequence[float] = STIR_PX) -> dict
     """Share of distances up to each threshold, and the mean of the shares (delta_avg of TAP-Vid)."""
     shares = {f"within_{threshold:g}": float(np.mean(distances <= threshold)) for threshold in thresholds}
     return {**shares, "average": float(np.mean(list(shares.values())))}
+
+
+def stereo_points_mm(left: F64, right: F64, K_left: F64, K_right: F64, baseline_mm: float) -> F64:
+    """Points [P, 3] mm of the left camera from raw pixels [P, 2] of both eyes, as STIR makes its 3D truth: as
+    if the raw pictures were rectified, with the left eye's intrinsics [3, 3] and row, but for the distance
+    between the principal points. Behind the camera: infinite."""
+    f, cx, cy = K_left[0, 0], K_left[0, 2], K_left[1, 2]
+    disparity = left[:, 0] + (K_right[0, 2] - cx) - right[:, 0]
+    z = np.divide(f * baseline_mm, disparity, out=np.full(len(left), np.inf), where=disparity > 0)
+    return np.stack([(left[:, 0] - cx) * z / f, (left[:, 1] - cy) * z / f, z], axis=1)
 
 
 def latency_score(times_ms: Sequence[float]) -> float:

@@ -4,22 +4,24 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
-from sags_node.config import RecordedSource
+from sags_node.config import LaunchConfig, RecordedSource
 from sags_node.errors import SagsError
 from sags_node.evaluation.measure import Options
 from sags_node.evaluation.metrics import resample_nearest
 from sags_node.evaluation.session import evaluate
+from sags_node.geometry import transform
 from sags_node.kernels.threads import configure_threads
 from sags_node.launch_file import load_launch
 from sags_node.pipeline import Pipeline
 from sags_node.protocols import arithmetic
-from sags_node.protocols.layouts import check_sizes, stereomis_sequence, stir_clips
+from sags_node.protocols.layouts import StereoMisSequence, check_sizes, stereomis_sequence, stir_clips
 from sags_node.session import open_posed, rig_of
 from sags_node.sources.videos import Video
 from sags_node.types import F64, Camera, Eye, StereoRig
@@ -27,6 +29,7 @@ from sags_node.warm_up import warm_up
 
 STEP = ("source.loop:=false", "source.pace:=step")
 AS_GIVEN = "vision.tissue.dilate:=0"
+LEAST_POSES = 3  # to align
 HOLD_OUT = 8  # EndoNeRF's split, as EndoGaussian and those after it take it
 PICKED = ("paper_psnr", "paper_ssim", "lpips", "psnr", "ssim", "copy_psnr")
 
@@ -88,17 +91,21 @@ def mean(rows: Sequence[tuple[float, ...]], column: int) -> float:
 
 
 def measure_stir(folder: Path, overrides: Sequence[str], progress: Progress) -> dict[str, Any]:
-    """Points pinned in each clip's first frame and followed to its last, in 2D; a point that cannot be pinned
-    or is lost counts where it was last."""
+    """Points pinned in each clip's first frame and followed to its last. In 2D a point that cannot be pinned
+    or is lost counts where it was last; in 3D one that cannot be pinned counts as missed."""
     clips, distances, unmoved, times, lost = {}, [], [], [], 0
+    deep, deep_unmoved = [], []
     for clip in stir_clips(folder):
         given = ["source.kind:=videos", f"source.left:={clip.left}", f"source.right:={clip.right}"]
-        ends, gone, ms = _follow([*given, *STEP, *overrides], clip.rig, clip.starts, clip.name, progress)
-        clips[clip.name] = arithmetic.nearest_distances(ends, clip.ends)
+        tracks = _follow([*given, *STEP, *overrides], clip.rig, clip.starts, clip.name, progress)
+        clips[clip.name] = arithmetic.nearest_distances(tracks.pixels, clip.ends)
         distances.append(clips[clip.name])
         unmoved.append(arithmetic.nearest_distances(clip.starts, clip.ends))
-        times += ms
-        lost += gone
+        if len(clip.starts_mm) and len(clip.ends_mm):
+            deep.append(arithmetic.nearest_distances(tracks.points_mm, clip.ends_mm))
+            deep_unmoved.append(arithmetic.nearest_distances(clip.starts_mm, clip.ends_mm))
+        times += tracks.times_ms
+        lost += tracks.lost
     if not distances:
         raise SagsError(f"no sequence of {folder} has a marked point in its first and last frame")
     return {
@@ -106,48 +113,87 @@ def measure_stir(folder: Path, overrides: Sequence[str], progress: Progress) -> 
         "lost": lost,
         "tracked": arithmetic.shares_within(np.concatenate(distances)),
         "unmoved": arithmetic.shares_within(np.concatenate(unmoved)),  # the evaluator's control
+        "points_3d": int(sum(map(len, deep))),
+        "tracked_mm": _within_mm(deep),
+        "unmoved_mm": _within_mm(deep_unmoved),
         "latency_ms": arithmetic.latency_score(times),
         "clips": {name: float(np.mean(each)) for name, each in clips.items()},
     }
 
 
+def _within_mm(distances: Sequence[F64]) -> dict[str, float] | None:
+    if not distances:
+        return None
+    return arithmetic.shares_within(np.concatenate(distances), arithmetic.STIR_MM)
+
+
 def measure_stereomis(folder: Path, overrides: Sequence[str], progress: Progress) -> dict[str, Any]:
-    """The camera's way as the node estimates it, against the robot's."""
+    """The camera's way as the node estimates it, against the robot's: the means over the ranges of the
+    sequence's table, each begun anew; without a table all of it."""
     sequence = stereomis_sequence(folder)
     check_sizes(Video(sequence.video), sequence.rig)
     given = ["source.kind:=videos", f"source.left:={sequence.video}", "source.geometry.layout:=over_under"]
     config = load_launch(None, [*given, "vision.pose:=estimate", *STEP, *overrides])
-    stride = config.source.stride if isinstance(config.source, RecordedSource) else 1
     warm_up(config)
     configure_threads(config.engine.threads)
+    ways = [_way(config, sequence, frames, progress) for frames in sequence.ranges]
+    ways = [(estimated, known) for estimated, known in ways if len(known) >= LEAST_POSES]
+    if not ways:
+        raise SagsError(f"{folder}: fewer than {LEAST_POSES} frames played have a pose in groundtruth.txt")
+    figures = [
+        arithmetic.trajectory_figures(np.stack(estimated), np.stack(known)) for estimated, known in ways
+    ]
+    return {
+        "frames": sum(len(known) for _, known in ways),
+        "ranges": len(ways),
+        "masks": sequence.masks is not None,
+        **{key: float(np.mean([each[key] for each in figures])) for key in figures[0]},
+    }
+
+
+def _way(
+    config: LaunchConfig, sequence: StereoMisSequence, frames: range, progress: Progress
+) -> tuple[list[F64], list[F64]]:
+    """Estimated and known poses [4, 4] of the frames of one range whose pose is known."""
+    stride = config.source.stride if isinstance(config.source, RecordedSource) else 1
     pipeline = Pipeline(config, sequence.rig)
     budget, T_rectified_raw = pipeline.make_budget(), np.eye(4)
     T_rectified_raw[:3, :3] = sequence.rig.left.R
     known_at = dict(zip(sequence.frames, sequence.poses, strict=True))
     estimated, known = [], []
-    with open_posed(config, sequence.rig, references=False) as frames:
-        for number, frame in enumerate(frames):
-            result = pipeline.process(frame, budget)
-            progress(number + 1, "playing")
-            pose = known_at.get(frame.frame_id * stride)
+    with open_posed(config, sequence.rig, references=False) as played:
+        for frame in played:
+            number = frame.frame_id * stride
+            if number >= frames.stop:
+                break
+            if number < frames.start:
+                continue
+            result = pipeline.process(replace(frame, tissue=sequence.tissue_in(number)), budget)
+            progress(number - frames.start + 1, "playing")
+            pose = known_at.get(number)
             if pose is not None:
                 estimated.append(result.snapshot.camera.T_world_cam @ T_rectified_raw)
                 known.append(pose)
-    if len(known) < 3:
-        raise SagsError(f"{folder}: {len(known)} frames have a pose in groundtruth.txt; three are needed")
-    return {"frames": len(known), **arithmetic.trajectory_figures(np.stack(estimated), np.stack(known))}
+    return estimated, known
 
 
-def _follow(
-    launch: Sequence[str], rig: StereoRig, starts: F64, name: str, progress: Progress
-) -> tuple[F64, int, list[float]]:
-    """Last known pixels [P, 2] of points of the first raw left picture, how many were lost, ms of frames."""
+@dataclass(frozen=True, slots=True)
+class _Tracks:
+    """Points of the first raw left picture, where they were known last."""
+
+    pixels: F64  # [P, 2] raw, left
+    points_mm: F64  # [P, 3] in the raw left camera, as STIR counts; infinite: never pinned
+    lost: int
+    times_ms: list[float]  # of frames
+
+
+def _follow(launch: Sequence[str], rig: StereoRig, starts: F64, name: str, progress: Progress) -> _Tracks:
     config = load_launch(None, launch)
     warm_up(config)
     configure_threads(config.engine.threads)
     pipeline = Pipeline(config, rig)
     budget, camera = pipeline.make_budget(), pipeline.rectifier.camera
-    places, found = starts.copy(), 0
+    places, places_mm, found = starts.copy(), np.full((len(starts), 3), np.inf), 0
     times: list[float] = []
     pinned: dict[int, int] = {}  # anchor -> point
     with open_posed(config, rig, references=False) as frames:
@@ -171,7 +217,22 @@ def _follow(
                 found = len(points)
                 if found:
                     places[points] = to_raw(rig.left, camera, pixels)
-    return places, len(starts) - found, times
+                    seen = transform(result.snapshot.camera.viewmat, result.anchors.points[known])
+                    places_mm[points] = as_stir_counts(rig, np.asarray(seen, np.float64))
+    return _Tracks(places, places_mm, len(starts) - found, times)
+
+
+def as_stir_counts(rig: StereoRig, points: F64) -> F64:
+    """Points [P, 3] (m, of the rectified left camera) where the arithmetic of STIR's truth puts them, mm:
+    each is said as a pixel of both raw pictures first."""
+    left = points @ rig.left.R  # the raw camera's
+    T = rig.T_right_left
+    pixels = [
+        cv2.projectPoints(seen[:, None], np.zeros(3), np.zeros(3), eye.K, eye.distortion)[0][:, 0]
+        for seen, eye in ((left, rig.left), (left @ T[:3, :3].T + T[:3, 3], rig.right))
+    ]
+    baseline_mm = 1e3 * abs(float(T[0, 3]))
+    return arithmetic.stereo_points_mm(pixels[0], pixels[1], rig.left.K, rig.right.K, baseline_mm)
 
 
 def to_working(eye: Eye, camera: Camera, pixels: F64) -> F64:

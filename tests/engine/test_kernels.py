@@ -10,7 +10,7 @@ import pytest
 
 from sags_node.engine.pinhole import pack
 from sags_node.engine.rasterizer import confidence
-from sags_node.mapping import densify, motion, optimiser, split
+from sags_node.mapping import densify, motion, optimiser, right_view, split
 from sags_node.model import deformation
 from sags_node.types import Camera
 from sags_node.vision import depth_grid as grids
@@ -44,6 +44,27 @@ def scene() -> dict[str, np.ndarray]:
         "index": rng.integers(0, 50, (N, 4)).astype(np.int32),
         "weight": rng.uniform(0, 1, (N, 4)).astype(f4),
     }
+
+
+def test_the_right_view(scene: dict[str, np.ndarray]) -> None:
+    s, rng, f4 = scene, np.random.default_rng(6), np.float32
+    picture = rng.integers(0, 256, (HEIGHT, WIDTH, 3)).astype(np.uint8)
+    left = rng.random((HEIGHT, WIDTH, 3)).astype(f4)
+    rights, brought = np.tile(left[::-1], (2, 1, 1, 1)), np.zeros((2, HEIGHT // 4, WIDTH // 4, 3), f4)
+    near = np.full((HEIGHT, WIDTH), f4(0.05))
+    for step, right, found in zip(
+        (right_view._carry, right_view._carry.py_func), rights, brought, strict=True
+    ):
+        step(picture, left, near, s["tissue"], f4(0.5), f4(0.7), right, near, found)
+    assert np.array_equal(rights[0], rights[1]) and np.array_equal(brought[0], brought[1])
+    assert 0.3 < (rights[0] != left[::-1]).mean() < 1 and brought[0].any()
+    colors, same = np.tile(rng.normal(0, 0.1, (N, 3)).astype(f4), (2, 1, 1)), rng.random(N) > 0.1
+    before, sure = colors[0].copy(), s["tissue"][::4, ::4]
+    for step, each in zip((right_view._learn, right_view._learn.py_func), colors, strict=True):
+        for turn in (0, 1):
+            step(s["means"], same, s["cam0"], picture, left, s["depth"], sure, each, turn)
+    assert np.allclose(colors[0], colors[1], atol=1e-6)
+    assert np.array_equal(colors[0][~same], before[~same]) and (colors[0][same] != before[same]).any(1).all()
 
 
 def test_find_and_advect(scene: dict[str, np.ndarray]) -> None:

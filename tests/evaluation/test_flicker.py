@@ -20,7 +20,7 @@ def frame() -> SpooledFrame:
     gaussians = Gaussians(
         nothing, np.zeros((0, 4), np.float32), nothing, nothing[:, 0], nothing, np.zeros(0, np.int64)
     )
-    camera = Camera(WIDTH, HEIGHT, np.eye(3), np.eye(4))
+    camera = Camera(WIDTH, HEIGHT, np.diag([100.0, 100, 1]), np.eye(4))  # 5 px of disparity
     depth = np.full((HEIGHT, WIDTH), 0.1, np.float32)
     return SpooledFrame(
         facts=RunFacts(0, 0, None, 0, {}, {}, 0, {}),
@@ -38,7 +38,8 @@ def frame() -> SpooledFrame:
 def test_flicker_is_the_deviation_where_nothing_moves_and_all_is_tissue() -> None:
     """The view alternates between 100 and 104 (deviation 2), the depth by 1 mm either way, the stereo depth
     by 3; the input has a checkerboard of noise, +-5, whose block means stay. In the left third something
-    passes by, and in the right third an instrument lies in one frame: what happens there does not count."""
+    passes by, and in the right third an instrument lies in one frame: what happens there does not count.
+    The right view shows the same 5 px farther left."""
     flicker, seen = Flicker(), []
     checks = np.indices((HEIGHT, WIDTH)).sum(0) % 2 * 10 - 5
     for number in range(FRAMES):
@@ -46,15 +47,14 @@ def test_flicker_is_the_deviation_where_nothing_moves_and_all_is_tissue() -> Non
         shown = frame()
         shown.rgb[:] = 102 + 2 * sign
         shown.rgb[:, :32] = 8 * number
+        right = np.roll(shown.rgb, -5, axis=1)
         depth, measured = shown.depth + np.float32(1e-3 * sign), shown.depth + np.float32(3e-3 * sign)
         measured[:, 40:48] = 0 if number == 7 else 0.2  # not known in all of them
         tissue = shown.tissue
         tissue[:, 64:] = number != 5
         picture = np.repeat((120 + sign * checks)[..., None], 3, 2).astype(np.uint8)
         picture[:, :32] = 5 * number
-        seen.append(
-            flicker(picture, replace(shown, depth=depth, measured_depth=measured, right_rgb=shown.rgb))
-        )
+        seen.append(flicker(picture, replace(shown, depth=depth, measured_depth=measured, right_rgb=right)))
     assert seen[:-1] == [None] * (FRAMES - 1)
     expected = {"input": 5, "picture": 2, "right": 2, "depth_mm": 1, "measured_depth_mm": 3, "share": 0.5}
     assert seen[-1] == pytest.approx(expected, rel=1e-3)

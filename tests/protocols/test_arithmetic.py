@@ -28,6 +28,18 @@ def test_stir_counts_the_nearest_end_up_to_and_with_each_threshold() -> None:
     assert millimetres["average"] == pytest.approx((0.5 + 4 * 1.0) / 5)
 
 
+def test_stir_makes_points_of_pixels_of_both_eyes() -> None:
+    """f = 1000 px, 5 mm between the eyes, principal points 10 px apart: pixel 600 seen at 560 has a disparity
+    of 600 + 10 - 560 = 50 px, so z = 1000 * 5 / 50 = 100 mm, x = (600 - 500) / 1000 z = 10 mm."""
+    K_left = np.array([[1000.0, 0, 500], [0, 1000, 400], [0, 0, 1]])
+    K_right = K_left + np.array([[0, 0, 10.0], [0, 0, 0], [0, 0, 0]])
+    left, right = np.array([[600.0, 380], [600, 380]]), np.array([[560.0, 381], [610, 380]])
+    points = arithmetic.stereo_points_mm(left, right, K_left, K_right, 5.0)
+    assert points[0] == pytest.approx([10, -2, 100])
+    distances = arithmetic.nearest_distances(points, np.array([[10.0, -2, 103]]))
+    assert arithmetic.shares_within(distances, arithmetic.STIR_MM)["average"] == pytest.approx(4 / 5 / 2)
+
+
 def test_stir_latency() -> None:
     """1 to 101 ms: mean 51, p95 96, p99 100."""
     assert arithmetic.latency_score(list(range(1, 102))) == pytest.approx((51 + 96 + 100) / 3)
