@@ -16,7 +16,7 @@ DEBIAN_TESTS := chromium g++ cmake pkg-config cppzmq-dev libmsgpack-cxx-dev fake
 missing = $(shell for p in $(1); do dpkg -s $$p >/dev/null 2>&1 || echo $$p; done)
 apt_install = apt-get update -qq && apt-get install -y -qq --no-install-recommends $(1) >/dev/null
 
-.PHONY: setup run test computed test-targets test-tools simulate fuzz wheel-test sbom licences lint golden docs clean
+.PHONY: setup run test computed test-targets test-tools simulate soak fuzz wheel-test sbom audit licences lint golden docs clean
 
 setup: $(STAMP)
 
@@ -39,10 +39,12 @@ $(STAMP): pyproject.toml constraints.txt
 run: setup
 	$(BIN)/sags demo
 
-# What only computes runs side by side; what has sockets and clocks has the machine for itself.
+# What only computes runs beside anything; what has sockets and clocks waits a lot, so two such files run at a time;
+# what measures time has the machine for itself.
 test: setup test-tools
 	$(MAKE) --no-print-directory -j2 lint computed
-	$(BIN)/python -m pytest -m live
+	$(BIN)/python -m pytest -m 'live and not alone' -n 2 --dist loadfile
+	$(BIN)/python -m pytest -m alone
 
 computed: setup
 	$(BIN)/python -m pytest -m 'not live' -n 2 --dist loadfile
@@ -56,10 +58,15 @@ SEEDS ?= 5000
 simulate: setup
 	PYTHONPATH=tests/helpers $(BIN)/python tests/test_simulation.py $(SEEDS)
 
-# Damaged bytes for every reader, for so long; inputs that fail are kept in out/fuzz.
+# A live node with all its neighbours, ten minutes: does anything grow?
+soak: setup
+	$(BIN)/sags bench soak --out out/soak.json
+
+# Damaged bytes for every reader, for so long; inputs that fail are kept in out/fuzz. GUIDED=1: changed so that
+# they reach new lines, by atheris.
 MINUTES ?= 60
 fuzz: setup
-	PYTHONPATH=tests/helpers $(BIN)/python tests/test_fuzz.py $(MINUTES)
+	PYTHONPATH=tests/helpers $(BIN)/python tests/$(if $(GUIDED),guided_fuzz,test_fuzz).py $(MINUTES)
 
 # Tests whose tools are missing are skipped, and say so.
 test-tools:
@@ -89,6 +96,12 @@ wheel-test: setup
 sbom: wheel-test
 	$(PYTHON) -m venv out/tools && out/tools/bin/pip install -q --disable-pip-version-check cyclonedx-bom
 	out/tools/bin/cyclonedx-py environment --pyproject pyproject.toml -o out/sbom.json out/wheel/venv
+
+# Whether osv.dev knows a vulnerability of what that environment holds.
+audit: wheel-test
+	$(PYTHON) -m venv out/tools && out/tools/bin/pip install -q --disable-pip-version-check pip-audit
+	out/wheel/venv/bin/pip freeze --exclude sags-node | sed 's/+.*//' > out/installed.txt
+	out/tools/bin/pip-audit -s osv --strict --no-deps --disable-pip -r out/installed.txt
 
 # Rewrite docs/licences.md from the packages that are installed here.
 licences: setup

@@ -351,7 +351,9 @@ class Guarded(Section):
     """Who may use the sockets that a node binds; docs/security.md says more."""
 
     key: Path | None = Field(None, description="the node's secret key file (sags keygen): encrypt all tcp")
-    allow: Paths = Field((), description="who may connect: .pub files, and folders of them")
+    allow: Paths = Field(
+        (), description="who may connect: .pub files, and folders of them; publish: folders in them are roles"
+    )
     insecure: bool = Field(False, description="allow other addresses than loopback and ipc without keys")
 
     @model_validator(mode="after")

@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
+from sags_node import host
 from sags_node.config import GstSource, LaunchConfig, PublishConfig
 from sags_node.engine.device import find_gpu, has_gpu
 from sags_node.errors import SagsError, UsageError
@@ -26,6 +27,8 @@ REQUIRED = (
     "numpy torch opencv-contrib-python-headless pyzmq open3d onnxruntime numba rosbags mcap msgspec "
     "pydantic pyyaml click rich"
 ).split()
+CORES = 2  # for the rate of a camera
+ENOUGH_MEMORY = 2e9  # bytes: about twice what a node takes
 TIME_ERROR = 5  # of adjtimex(2): the clock is not synchronised
 TIME_KEEPERS = {"chronyd", "ntpd", "phc2sys", "ptp4l", "systemd-timesyn"}  # as far as /proc tells names
 OPEN3D_LIBRARIES = {
@@ -52,6 +55,8 @@ def examine(config: LaunchConfig) -> list[Check]:
         *(_package(name) for name in REQUIRED),
         *(_library(name, package) for name, package in OPEN3D_LIBRARIES.items()),
         _cores(),
+        _governor(),
+        _memory(),
         check_gpu(config),
         *_gsplat(config),
         _kernel_cache(),
@@ -85,11 +90,44 @@ def _library(name: str, package: str) -> Check:
     return Check(package, "warning", "missing", f"Open3D needs it: sudo apt-get install {package}")
 
 
-def _cores() -> Check:
-    cores = len(os.sched_getaffinity(0))
-    if cores < 2:
-        return Check("CPU", "warning", f"{cores} core", "camera rate needs two cores")
-    return Check("CPU", "ok", f"{cores} cores, {platform.machine()}")
+def _cores(root: Path = host.ROOT) -> Check:
+    cores, there, quota = len(os.sched_getaffinity(0)), os.cpu_count() or 1, host.core_quota(root)
+    found = f"{cores} core{'s' * (cores != 1)}, {platform.machine()}"
+    if cores < there:
+        found += f"; the machine has {there}"
+    if quota is not None:
+        found += f"; the time of {quota:.3g} granted"
+    if cores < CORES:
+        mend = "camera rate needs two cores" + "; give this process more (taskset, cpuset)" * (cores < there)
+        return Check("CPU", "warning", found, mend)
+    if quota is not None and quota < min(cores, CORES):
+        # Threads use the quota up at once, and then all of them stand still until the next period.
+        mend = "give the container or unit two cores or more (CPUQuota=, --cpus), or none to share"
+        return Check("CPU", "warning", found, mend)
+    return Check("CPU", "ok", found)
+
+
+def _governor(root: Path = host.ROOT) -> Check:
+    found = host.governors(root)
+    if not found:
+        return Check("CPU governor", "ok", "not told by this machine")
+    said = ", ".join(sorted(found))
+    if found == {"performance"}:
+        return Check("CPU governor", "ok", said)
+    level: Level = "warning" if "powersave" in found else "ok"
+    return Check("CPU governor", level, said, "for even times: sudo cpupower frequency-set -g performance")
+
+
+def _memory(root: Path = host.ROOT) -> Check:
+    told = host.memory(root)
+    free = told.get("MemAvailable", 0)
+    swap, used = told.get("SwapTotal", 0), told.get("SwapTotal", 0) - told.get("SwapFree", 0)
+    swapped = f"{used / 1e9:.1f} of {swap / 1e9:.1f} GB swap used" if swap else "no swap"
+    found = f"{free / 1e9:.1f} GB free, {swapped}"
+    if free < ENOUGH_MEMORY or used > free:  # it would not all fit, were it needed again
+        mend = "close other programs" + ": what is swapped out misses frames" * bool(swap)
+        return Check("memory", "warning", found, mend)
+    return Check("memory", "ok", found)
 
 
 def check_gpu(config: LaunchConfig) -> Check:
@@ -138,13 +176,13 @@ def _port(endpoint: str, config: PublishConfig) -> Check:
         check_endpoint(endpoint, config)
     except UsageError as error:
         return Check(endpoint, "error", "cannot be used", str(error))
-    host, _, port = endpoint.removeprefix("tcp://").rpartition(":")
+    address, _, port = endpoint.removeprefix("tcp://").rpartition(":")
     if endpoint.startswith("ipc:") or port == "*":
         return Check(endpoint, "ok", "needs no port of its own")
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            probe.bind((host.replace("*", ""), int(port)))
+            probe.bind((address.replace("*", ""), int(port)))
             return Check(endpoint, "ok", "free")
         except (OSError, ValueError, OverflowError) as error:  # taken, not a number, not a port
             mend = "stop the other node, or set publish.data and publish.control to other ports"
@@ -159,7 +197,7 @@ def _keys(config: PublishConfig) -> list[Check]:
         allowed = read_allow_list(config.allow)
     except UsageError as error:
         return [Check("keys", "error", "cannot be used", str(error))]
-    return [Check("keys", "ok", f"{config.key}; may connect: {', '.join(allowed.values())}")]
+    return [Check("keys", "ok", f"{config.key}; may connect: {', '.join(map(str, allowed.values()))}")]
 
 
 class _Timex(ctypes.Structure):
@@ -182,7 +220,8 @@ def _clock() -> Check:
     by = ", ".join(sorted(_running() & TIME_KEEPERS)) or "no program here"
     timex = _Timex()
     if ctypes.CDLL(None).adjtimex(ctypes.byref(timex)) in (-1, TIME_ERROR):
-        return Check("clock", "ok", f"kept by {by}; not synchronised")
+        mend = "to compare stamps with other machines': sudo apt-get install chrony"
+        return Check("clock", "ok", f"kept by {by}; not synchronised", mend)
     return Check("clock", "ok", f"kept by {by}; synchronised to within {timex.maxerror * 1e-3:.0f} ms")
 
 

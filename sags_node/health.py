@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import os
 import threading
 import time
 from collections import deque
 from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 
 from sags_node.findings import Findings, by_code, by_stage
+from sags_node.processes import resident_mb
 from sags_node.types import ClockStatus, Finding, FrameResult, MotionState, NodeHealth, RungState, ViewStatus
 
 WAITING_AFTER = 1.0  # s without a frame
@@ -142,9 +141,3 @@ def in_a_line(health: NodeHealth) -> str:
     words = f"{health.state}, {health.rate_hz:.1f} Hz, latency {latency:.0f} ms, {health.gaussians} Gaussians"
     codes = ", ".join(by_code(health.warnings))
     return f"{words}; warnings: {codes}" if codes else words
-
-
-def resident_mb() -> float:
-    """Resident memory of this process, MB."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6

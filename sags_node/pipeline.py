@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 
+import numpy as np
+
 from sags_node.confidence import HALVING
 from sags_node.config import LaunchConfig
 from sags_node.engine.rasterizer.rasterize import to_view
@@ -17,6 +19,7 @@ from sags_node.mapping.camera_tracker import CameraTracker
 from sags_node.mapping.depth_memory import UNWATCHED
 from sags_node.mapping.devices import affordable, make_budget, make_refiner
 from sags_node.mapping.mapper import Mapped, Mapper
+from sags_node.mapping.right_view import RightView
 from sags_node.repeats import doubted, repeated, unseen
 from sags_node.types import (
     Bool,
@@ -74,6 +77,7 @@ class Pipeline:
             unhurried=config.mapping.budget_ms >= UNHURRIED_MS,
             field=config.mapping.field is True,
         )
+        self._right = RightView()
         self._tracker: CameraTracker | None = None
         if vision.pose == "estimate":
             self._tracker = CameraTracker(self.mapper, self._draw_model)
@@ -191,7 +195,8 @@ class Pipeline:
         with watch("render"):
             views = {"left": mapped.view}
             if self._config.publish.right:
-                views["right"] = self._right_eye(mapped, pair.baseline)
+                sure = seen_by_both if learn and not eyes.right else np.zeros_like(tissue)
+                views["right"] = self._right_eye(mapped, observation, seen, learn, sure)
         with watch("anchors"):
             self.anchors.update(observation, mapped.snapshot, mapped.view, learn)
             anchors = self.anchors.ahead(self.anchors.at(pair.t_capture_ns), mapped.snapshot)
@@ -302,14 +307,17 @@ class Pipeline:
         """Grows with the source's epochs and with every new model: ids then mean other Gaussians."""
         return frame.epoch + self.mapper.restarts
 
-    def _right_eye(self, mapped: Mapped, baseline: float) -> RenderedView:
-        """The model drawn for the right eye."""
+    def _right_eye(
+        self, mapped: Mapped, observation: Observation, seen: RectifiedPair, learn: bool, sure: Bool
+    ) -> RenderedView:
+        """The model drawn for the right eye, which is learnt from where tissue is `sure`."""
         before, stamp = self._mapped, mapped.view.t_capture_ns
         if before is not None and "right" in before.views and before.views["left"].rgb is mapped.view.rgb:
             return replace(before.views["right"], frame_id=mapped.view.frame_id, t_capture_ns=stamp)
-        camera = mapped.snapshot.camera.moved_right(baseline)
-        planes = self._refiner.show(mapped.snapshot.gaussians, camera)
-        return to_view(planes, camera, mapped.view.frame_id, stamp)
+        drawn = self._right.draw(mapped, observation, seen.left, self._refiner.show, learn)
+        assert seen.right is not None  # publish.right is refused where there is no right eye
+        self._right.learn(drawn, self.mapper.model, seen.right, sure, observation.baseline)
+        return drawn.view
 
     def _draw_model(self, camera: Camera) -> RenderedView:
         """The model as it is now, in the light of a scope that is there."""

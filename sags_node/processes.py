@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 TICKS = os.sysconf("SC_CLK_TCK")  # of CPU time in a second
+PAGE = os.sysconf("SC_PAGE_SIZE")
 KILL_SECONDS = 5.0  # a killed process that waits for a disk ends when the disk answers
 
 
@@ -49,3 +50,31 @@ def cpu_seconds(process: int) -> float:
     """
     fields = Path(f"/proc/{process}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / TICKS
+
+
+def resident_mb(process: int | str = "self") -> float:
+    """Resident memory, MB.
+
+    Raises:
+        OSError: it has ended.
+    """
+    pages = int(Path(f"/proc/{process}/statm").read_text(encoding="ascii").split()[1])
+    return pages * PAGE / 1e6
+
+
+def descriptors(process: int) -> int:
+    """How many files, sockets and pipes it holds open.
+
+    Raises:
+        OSError: it has ended, or is another user's.
+    """
+    return len(os.listdir(f"/proc/{process}/fd"))
+
+
+def threads(process: int) -> int:
+    """How many threads it has.
+
+    Raises:
+        OSError: it has ended.
+    """
+    return len(os.listdir(f"/proc/{process}/task"))

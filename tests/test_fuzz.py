@@ -24,6 +24,11 @@ from sags_node.errors import SagsError
 
 FILES = 40  # inputs of a reader of files, which take some milliseconds each
 QUICK = 200  # of the others
+FAILED_ONCE = {
+    # A line of the header that is too long for a reader's buffer ended the process.
+    "ply": lambda sound: sound[-1].replace(b"end_header", 250 * b"end_header"),
+    "opencv calibration": lambda _: b"%YAML 1.2\n-\nM1: [ 1 ]\n",  # OpenCV looks for names in a list
+}
 AT_ONCE = 300  # inputs of one reader before the next one's turn
 
 
@@ -65,6 +70,13 @@ def test_damaged_bytes_end_in_values_or_in_one_line(name: str, tmp_path: Path) -
     outcomes = fuzz(TARGETS[name], QUICK if name in IN_MEMORY else FILES, 0, tmp_path)
     assert outcomes[True] > 0  # it gets past the first check
     assert outcomes[False] > 0 or name == "requests"  # which are answered, not refused
+
+
+@pytest.mark.parametrize("name", FAILED_ONCE)
+def test_what_once_failed(name: str, tmp_path: Path) -> None:
+    target = TARGETS[name]
+    (tmp_path / "sound").mkdir()
+    target.try_out(FAILED_ONCE[name](target.sound(tmp_path / "sound")), tmp_path / "it")
 
 
 def test_a_reader_that_fails_is_found(tmp_path: Path) -> None:

@@ -208,7 +208,7 @@ def test_a_damaged_mesh_is_refused_in_one_message(tmp_path: Path, capfd: pytest.
     header = "ply\nformat ascii 1.0\nelement vertex 3\n" + "".join(f"property float {a}\n" for a in "xyz")
     faces = "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
     file.write_text(header + faces + "0 0 0\n0.01 0 nonsense\n")
-    with pytest.raises(UsageError, match=r"mesh\.ply is damaged: RPly: Error reading 'z'"):
+    with pytest.raises(UsageError, match=r"mesh\.ply is damaged: could not convert string to float"):
         mesh_of(ObjectSpec(file=file))
     assert capfd.readouterr() == ("", "")
 
@@ -218,7 +218,7 @@ def test_a_damaged_mesh_is_refused_in_one_message(tmp_path: Path, capfd: pytest.
 @pytest.mark.parametrize("sides", [3, 5])
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
 def test_faces_with_missing_corners_are_refused(form: str, sides: int, corner: int, tmp_path: Path) -> None:
-    """Open3D would end the process."""
+    """Open3D's reader would end the process."""
     header = f"ply\nformat {form} 1.0\nelement vertex 4\n" + "".join(f"property float {a}\n" for a in "xyz")
     header += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
     face = [*range(sides - 1), corner]

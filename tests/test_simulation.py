@@ -7,8 +7,10 @@ once failed stays in `FAILED_ONCE`.
 from __future__ import annotations
 
 import logging
+import os
 import sys
 import time
+from concurrent.futures import ProcessPoolExecutor
 
 import pytest
 from simulated_node import Run, play
@@ -18,6 +20,7 @@ SEEDS = 100
 FAILED_ONCE = (
     6,  # a camera that was away for over 20 s after its first pictures ended the node
     61,  # a pair that came twice was two frames of one stamp
+    201914,  # a clock set back while stamps lagged: the bound of this test left the lag out
 )
 
 
@@ -62,16 +65,23 @@ def test_who_waits_for_each_other_is_found() -> None:
 
 def main(count: int, first: int = 0) -> int:
     """Play so many seeds; how many failed."""
-    logging.disable()
     began, failed = time.monotonic(), 0
-    for seed in range(first, first + count):
-        try:
-            play(seed)
-        except Exception as error:
-            failed += 1
-            print(f"seed {seed}: {type(error).__name__}: {error}", flush=True)
+    with ProcessPoolExecutor(len(os.sched_getaffinity(0)), initializer=logging.disable) as pool:
+        for said in pool.map(outcome, range(first, first + count), chunksize=10):
+            failed += bool(said)
+            if said:
+                print(said, flush=True)
     print(f"{count} seeds, {failed} failed, {time.monotonic() - began:.0f} s")
     return failed
+
+
+def outcome(seed: int) -> str:
+    """What went wrong with a seed, in one line; empty: nothing."""
+    try:
+        play(seed)
+    except Exception as error:
+        return f"seed {seed}: {type(error).__name__}: {error}"
+    return ""
 
 
 if __name__ == "__main__":

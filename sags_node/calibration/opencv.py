@@ -100,11 +100,15 @@ def open_storage(file: Path) -> cv2.FileStorage:
         directive, _, document = text.partition("\n")
         if directive.startswith("%YAML"):  # of two keys OpenCV takes the first
             check_dialect(document, str(file))
-        return cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        has_names = storage.root().isMap()
     except OSError as error:
         raise UsageError(f"cannot read calibration {file}: {error.strerror}; check the path") from None
     except (UnicodeDecodeError, cv2.error, SystemError):
         raise UsageError(f"{file} is not a YAML or XML file as OpenCV writes it; save it again") from None
+    if not has_names:
+        raise UsageError(f"{file} holds no matrices with names; save it again")
+    return storage
 
 
 def _find(storages: Storages, key: str) -> tuple[Path, cv2.FileNode] | None:

@@ -152,6 +152,43 @@ def bench_endurance(
     write_json(out, measured)
 
 
+@click.command("soak")
+@launch_argument
+@click.option(
+    "--frames", type=click.IntRange(1), default=18_000, show_default=True, help="To be published; 10 minutes."
+)
+@click.option(
+    "--window", type=click.IntRange(2), default=900, show_default=True, help="Frames of a line of the table."
+)
+@table_option
+@as_json
+def bench_soak(launch: tuple[str, ...], frames: int, window: int, out: Path | None, json_out: bool) -> None:
+    """Whether a live node lasts beside all that uses it.
+
+    Runs a node, by default of the built-in phantom, in a process of its own and in real time, with the
+    overlay, the viewer and a browser, a recorder and three subscribers; the last two come and go. Window by
+    window: rate, latency, PSNR on tissue, memory, open files and threads; at the end how they change per 1000
+    frames, and p99.9 of the latency. 100,000 frames take an hour at 30 Hz; Ctrl-C ends it with the table so
+    far.
+
+    \b
+    sags bench soak --frames 100000 --window 5000 --out benchmarks/results/soak.json
+    """
+    from sags_node.benchmark.node import soak
+
+    check_files(out)
+    path, overrides = split_recording(launch, "sags bench soak plays recordings; record the cameras first")
+    open_launched(path, overrides)  # what takes long is not part of the node's start
+    with progress("running") as advance:
+        measured = soak.measure_soak(launch, frames, window, advance)
+    if json_out:
+        show(measured)
+    else:
+        show(soak.table(measured))
+        show(soak.statement(measured))
+    write_json(out, measured)
+
+
 @click.command("tracking")
 @launch_argument
 @click.option(
@@ -181,6 +218,32 @@ def bench_tracking(launch: tuple[str, ...], numbers: str, out: Path | None, json
     with progress("following") as advance:
         measured = tracking.measure_tracking(session, [int(n) for n in numbers.split(",")], advance)
     show(measured if json_out else tracking.table(measured))
+    write_json(out, measured)
+
+
+@click.command("recall")
+@launch_argument
+@click.option("--seconds", type=positive, default=10.0, show_default=True, help="Out of sight.")
+@table_option
+@as_json
+def bench_recall(launch: tuple[str, ...], seconds: float, out: Path | None, json_out: bool) -> None:
+    """Whether anchors come back after a long time out of sight.
+
+    Pins anchors to the phantom's tissue. Then a cloth covers it, or it is dark and the scope moves, or the
+    scope turns away; meanwhile the tissue moves on. Once it is back: how many anchors are on their points
+    again, how many are sure and wrong, and how many would be right if they had not moved at all.
+
+    \b
+    sags bench recall source.seed:=1 --out benchmarks/results/recall.json
+    """
+    from sags_node.benchmark.quality import recall
+
+    path, overrides = split_recording(launch, "sags bench recall needs the phantom")
+    check_files(out)
+    session = open_launched(path, [*overrides, "source.pace:=step"])
+    with progress("following") as advance:
+        measured = recall.measure_recall(session, seconds, advance)
+    show(measured if json_out else recall.table(measured))
     write_json(out, measured)
 
 

@@ -209,9 +209,13 @@ def keygen(name: str, out: Path) -> None:
     NAME.key is secret: it stays with whoever runs the node or the client. NAME.pub is for the other side. A
     node with keys encrypts its tcp sockets and lets in only clients whose .pub it has.
 
+    Where that .pub is says what the client may do: in a folder named listen it gets data, in one named
+    control it may also pause, reset, pin and open views, elsewhere it may do everything.
+
     \b
     sags keygen node --out keys
     sags keygen viewer --out keys/clients
+    sags keygen display --out keys/clients/listen
     sags run publish.key:=keys/node.key publish.allow:=keys/clients 'publish.data:=[tcp://*:5556]'
     sags topic hz tf --endpoint tcp://HOST:5556 --key keys/clients/viewer.key --server-key keys/node.pub
     """

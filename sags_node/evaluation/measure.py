@@ -15,12 +15,14 @@ from sags_node.engine.rasterizer.rasterize import make_rasterizer, to_view
 from sags_node.errors import UsageError
 from sags_node.evaluation import calibration, metrics
 from sags_node.evaluation.carried import Seen, carried
+from sags_node.evaluation.flicker import Flicker
 from sags_node.evaluation.gallery import Gallery
 from sags_node.evaluation.lpips import Lpips
 from sags_node.evaluation.spool import RunFacts, Spool, SpooledFrame
 from sags_node.evaluation.tracking import PointTracks, TrackErrors
 from sags_node.evaluation.trajectory import RigidOdometry
 from sags_node.evaluation.views import between, extrapolated
+from sags_node.evaluation.warp import warp_to_right
 from sags_node.geometry import transform
 from sags_node.mapping.right_eye import right_eye_mask
 from sags_node.types import F32, F64, I64, U8, Bool, Camera, Gaussians, RectifiedPair, Reference, StereoFrame
@@ -142,6 +144,7 @@ class Measurer:
         self._rasterizer = make_rasterizer(backend, camera.width, camera.height)
         self._lpips = Lpips(options.lpips_weights) if options.lpips_weights else None
         self._usable_right: Bool | None = None
+        self._flicker = Flicker()
         self._tracks: PointTracks | None = None
         self._pose = pose
         self._rigid = RigidOdometry()
@@ -177,7 +180,10 @@ class Measurer:
             group = "predict" if frames == 1 else f"predict_{frames}"
             figures[group] = self._predict(before, shown, truth, seconds)
         if costly and pair.right is not None:
-            figures["novel"] = {"psnr": self._novel(shown, pair.right, frame)}
+            figures |= self._right_eye(shown, pair.left, pair.right, frame)
+        flicker = self._flicker(pair.left, shown)
+        if flicker is not None:
+            figures["flicker"] = flicker
         track, counts = None, None
         if frame.reference is not None:
             if frame.reference.depth is not None:
@@ -263,18 +269,39 @@ class Measurer:
     def _draw(self, gaussians: Gaussians, camera: Camera) -> F32:
         return to_view(self._rasterizer.forward(gaussians, [camera])[0], camera, 0, 0).rgb
 
-    def _novel(self, shown: SpooledFrame, picture: U8, frame: StereoFrame) -> float:
-        """PSNR of the right eye's picture after a fit of gain and offset. The mapper never saw it, unless
-        `mapping.right_eye` is set."""
+    def _right_eye(
+        self, shown: SpooledFrame, left: U8, picture: U8, frame: StereoFrame
+    ) -> dict[str, Figures]:
+        """PSNR of the right eye's picture, each after a fit of gain and offset. `novel`: of the model alone;
+        the mapper never saw it, unless `mapping.right_eye` is set. `right`: of what was shown, and of the
+        left picture warped by the stereo stage's depth, where that is known."""
         if self._usable_right is None:
             self._usable_right = self._right_pixels(frame)
-        camera = shown.snapshot.camera
+        camera, focal_px = shown.snapshot.camera, float(shown.snapshot.camera.K[0, 0])
         known = shown.depth[shown.tissue & (shown.depth > 0)]
-        mask = right_eye_mask(shown.tissue, known, float(camera.K[0, 0]), shown.baseline)
+        mask = right_eye_mask(shown.tissue, known, focal_px, shown.baseline)
         mask &= self._usable_right
-        right = self._draw(shown.snapshot.gaussians, camera.moved_right(shown.baseline))
+        model = self._draw(shown.snapshot.gaussians, camera.moved_right(shown.baseline))
         truth = metrics.as_float(picture)
-        return metrics.psnr(metrics.fit_gain_offset(right, truth, mask), truth, mask)
+
+        def quality(drawn: F32, where: Bool) -> float:
+            return metrics.psnr(metrics.fit_gain_offset(drawn, truth, where), truth, where)
+
+        figures: dict[str, Figures] = {"novel": {"psnr": quality(model, mask)}}
+        if shown.right_rgb is None:
+            return figures
+        warp, known_there = warp_to_right(
+            metrics.as_float(left), shown.measured_depth, focal_px, shown.baseline
+        )
+        both = mask & known_there
+        if both.any():
+            figures["right"] = {
+                "psnr": quality(metrics.as_float(shown.right_rgb), both),
+                "warp_psnr": quality(warp, both),
+                "model_psnr": quality(model, both),
+                "coverage": float(both.sum() / mask.sum()),
+            }
+        return figures
 
     def _right_pixels(self, frame: StereoFrame) -> Bool:
         """Where the rectified right picture shows the raw one, without the boxes left out."""

@@ -18,7 +18,7 @@ import numpy as np
 
 from sags_node.errors import SagsError
 from sags_node.findings import NOTHING, Findings, by_code
-from sags_node.health import resident_mb
+from sags_node.processes import resident_mb
 from sags_node.types import (
     F32,
     I32,
@@ -32,8 +32,9 @@ from sags_node.types import (
     Snapshot,
 )
 
-_ARRAYS = 18  # in a frame's file
+_ARRAYS = 19  # in a frame's file
 _NO_FORECAST = (np.empty(0, np.float32),) * 4
+_SHOWN = 5 + len(_NO_FORECAST)  # of them the last: velocities, what was shown, and the forecast
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +65,7 @@ class SpooledFrame:
     tissue: Bool  # [H, W]
     measured_depth: F32  # [H, W] m, the stereo stage's own, 0 unknown
     confidence: F32  # [H, W] 0..1, of `depth`; NaN: unknown
+    right_rgb: U8 | None  # [H, W, 3] the right view; None: the run showed none
 
 
 class Spool:
@@ -136,9 +138,10 @@ class Spool:
             gaussians.colors,
             gaussians.ids,
             snapshot.velocities,
-            cv2.convertScaleAbs(view.rgb, alpha=255),  # rounds and clips at 255, as on the wire
+            _as_bytes(view.rgb),
             view.depth,
             np.full_like(view.depth, np.nan) if view.confidence is None else view.confidence,
+            _as_bytes(result.views["right"].rgb) if "right" in result.views else np.empty(0, np.uint8),
             *(_NO_FORECAST if forecast is None else _forecast_arrays(forecast)),
         )
         try:
@@ -162,9 +165,9 @@ class Spool:
         if header["forecast"] is not None:
             frame_s, *state = header["forecast"]
             forecast = Forecast(MotionState(*state), frame_s, *arrays[-len(_NO_FORECAST) :])
-        K, T_world_cam, tissue, measured_depth, *splats, velocities, rgb, depth, confidence = arrays[
-            : -len(_NO_FORECAST)
-        ]
+        K, T_world_cam, tissue, measured_depth, *splats, velocities, rgb, depth, confidence, right_rgb = (
+            arrays[: -len(_NO_FORECAST)]
+        )
         facts = RunFacts(**header["facts"])
         height, width = measured_depth.shape
         snapshot = Snapshot(
@@ -187,10 +190,16 @@ class Spool:
             tissue=np.unpackbits(tissue, count=width * height).reshape(height, width).view(bool),
             measured_depth=measured_depth,
             confidence=confidence,
+            right_rgb=right_rgb if right_rgb.size else None,
         )
 
     def _file(self, place: int) -> Path:
         return self.folder / f"{place:06d}.frame"
+
+
+def _as_bytes(rgb: F32) -> U8:
+    """Rounded and clipped at 255, as on the wire."""
+    return np.asarray(cv2.convertScaleAbs(rgb, alpha=255))
 
 
 def _forecast_arrays(forecast: Forecast) -> tuple[F32, F32, I32, F32]:

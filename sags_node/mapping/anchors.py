@@ -2,7 +2,8 @@
 
 An anchor moves with the Gaussians around it, known by their ids: these follow the control nodes, also under
 an instrument. What is seen corrects it. Sideways, the patch of the picture that surrounded it at first is
-found again, so that nothing drifts; along the ray, it keeps its distance to the drawn surface.
+found again, so that nothing drifts; along the ray, it keeps its distance to the drawn surface. One that was
+out of sight for long is found by what surrounded it (`recall`).
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from sags_node.confidence import confidence_of
 from sags_node.errors import SagsError
 from sags_node.geometry import project, unproject
 from sags_node.mapping.motion import BEHIND_TOLERANCE
+from sags_node.mapping.recall import Place, Recall, fits_depth, straightened
 from sags_node.model.forecast import points_ahead, reached
 from sags_node.types import (
     F32,
@@ -30,6 +32,8 @@ from sags_node.types import (
     RenderedView,
     Snapshot,
 )
+from sags_node.vision.landmarks import features_in
+from sags_node.vision.pyramid import pyramid_of
 
 MAX_ANCHORS = 256
 NEIGHBOURS = 16  # Gaussians that carry an anchor
@@ -44,6 +48,7 @@ SEARCH_RADIUS = 4  # px, of an anchor found in the frame before
 SEARCH_GROWTH = 30.0  # px/s since it was found last
 MAX_SEARCH_RADIUS = 16  # px
 FOUND_AGREEMENT = 0.8  # normalised cross-correlation from which on the patch counts as found
+ALONE_AGREEMENT = 0.9  # where nothing else tells that it is the same place: other tissue has reached 0.82
 SEARCHED_PER_FRAME = 32  # anchors, in turn
 DEPTH_PULL = 0.1  # share of the depth error taken per frame
 DEPTH_GATE = 0.05  # of the depth: a larger error is another surface
@@ -51,6 +56,11 @@ HALF_LIFE = 2.0  # s: confidence halves in so long without a sight of the patch
 HALF_WAY = 0.005  # m: and as often as it is carried so far out of sight
 IN_SIGHT = 0.02  # of that way counts where the picture shows it: optical flow errs by so much
 UNWATCHED = 10.0  # times as fast while no frame is taken in: nothing carries an anchor then
+RECALL_EVERY = 0.5  # s, while an anchor is lost: it costs some milliseconds
+REMEMBER_EVERY = 2.0  # s, while none is
+RECALL_RADIUS = 10  # px, around where the tissue around it says that it is
+SURE = 0.3  # s: what was found so lately is remembered
+LOST = 1.0  # s out of sight from which on an anchor is looked for everywhere
 
 _NOBODY = -1  # in the place of a Gaussian's id
 _SIDE = 2 * PATCH_RADIUS + 1
@@ -86,6 +96,8 @@ class Anchors:
         self._next_id = 1
         self._frames = 0
         self._stamp_ns: int | None = None  # of the last frame
+        self._recall = Recall()
+        self._recalled_ns = 0  # stamp of the frame in which it was used last
         self._wanted: dict[int, float | None] = {}  # s ahead, by id; None: as `latency_s`
         self.latency_s = 0.0  # from capture to what shows it, as it was lately
 
@@ -171,6 +183,7 @@ class Anchors:
         if kept.all():
             raise SagsError(f"there is no anchor {anchor_id}; it was removed, or never added")
         self._table = _selected(self._table, kept)
+        self._recall.keep(self._table.ids)
         self._wanted.pop(anchor_id, None)
 
     def update(
@@ -178,7 +191,8 @@ class Anchors:
     ) -> None:
         """Follow the tissue to the next frame.
 
-        An anchor whose Gaussians are all gone at once, as after a restart of the model, is lost for good.
+        An anchor whose Gaussians are all gone at once, as after a restart of the model, is lost until it is
+        recognised.
 
         Args:
             snapshot: the model at that frame.
@@ -192,6 +206,7 @@ class Anchors:
             in_sight = clear & (self._table.visibility == 1)
             self._table.unseen[:] += HALF_LIFE / HALF_WAY * np.where(in_sight, IN_SIGHT, 1.0) * ways
             self._find(observation)
+            self._find_lost(observation, snapshot, view)
 
     def at(self, stamp_ns: int, held: bool = False) -> AnchorStates:
         """All anchors as they are now, as part of the frame captured at `stamp_ns`; `held`: one that is not
@@ -220,11 +235,54 @@ class Anchors:
             radius = int(min(SEARCH_RADIUS + SEARCH_GROWTH * table.unseen[i], MAX_SEARCH_RADIUS))
             window = _patch(observation, table.pixels[i], PATCH_RADIUS + radius)
             found = None if window is None else _match(window, table.patches[i])
-            if found is not None:
+            if found is not None and (table.unseen[i] < LOST or found[1] >= ALONE_AGREEMENT):
                 shift, table.agreement[i] = found
                 table.pixels[i] += shift - radius
                 table.points[i] = unproject(observation.camera, table.pixels[i], table.depths[i])
                 table.unseen[i] = 0.0
+
+    def _find_lost(self, observation: Observation, snapshot: Snapshot, view: RenderedView) -> None:
+        """Now and then remember what surrounds the anchors that are seen, and look everywhere for those that
+        have not been seen for long."""
+        table, stamp = self._table, observation.t_capture_ns
+        seen = (table.visibility == 1) & (table.unseen < SURE) & np.isfinite(table.depth_offsets)
+        lost = (table.unseen > LOST) | np.isnan(table.points).any(1)
+        period = RECALL_EVERY if lost.any() else REMEMBER_EVERY
+        if not (seen.any() or lost.any()) or 0 <= stamp - self._recalled_ns < period * 1e9:
+            return
+        self._recalled_ns = stamp
+        features = features_in(pyramid_of(observation), observation.tissue)
+        for place in self._recall.look(features, table.ids[lost]) if lost.any() else []:
+            _put_back(table, place, observation, snapshot, view)
+        self._recall.remember(
+            features, table.ids[seen], table.pixels[seen], table.depths[seen], table.patches[seen]
+        )
+
+
+def _put_back(
+    table: _Table, place: Place, observation: Observation, snapshot: Snapshot, view: RenderedView
+) -> None:
+    """Move an anchor to where it was recognised, if depth and patch agree; else it stays lost."""
+    i = int(np.flatnonzero(table.ids == place.id)[0])
+    window = straightened(observation.gray, observation.tissue, place, PATCH_RADIUS + RECALL_RADIUS)
+    found = None if window is None else _match(window, place.patch)
+    if found is None:
+        return
+    shift, agreement = found
+    pixel = place.pixel + place.linear @ (shift - RECALL_RADIUS)
+    patch = _patch(observation, pixel, PATCH_RADIUS)
+    column, row = np.rint(pixel).astype(np.intp)
+    depth = float(view.depth[row, column]) - table.depth_offsets[i]
+    if patch is None or view.depth[row, column] <= 0 or not fits_depth(place, depth):
+        return
+    point: F64 = np.asarray(unproject(observation.camera, pixel, np.array(depth)), np.float64)
+    carriers = _carriers(point, snapshot.gaussians)
+    if len(carriers[0]) == 0:
+        return
+    _hold(table, i, carriers)
+    table.points[i], table.pixels[i], table.depths[i] = point, pixel, depth
+    table.visibility[i], table.agreement[i], table.unseen[i] = 1, agreement, 0
+    table.patches[i] = patch
 
 
 def _carry(table: _Table, gaussians: Gaussians) -> F64:

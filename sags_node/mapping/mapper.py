@@ -79,6 +79,7 @@ class Mapped:
 
     snapshot: Snapshot
     view: RenderedView  # the model drawn for the left eye
+    right_colors: F32  # [N, 3] what the right eye sees more than the snapshot's colours
 
 
 class Mapper:
@@ -162,15 +163,16 @@ class Mapper:
         )
         assert self._view is not None
         drawn = Drawn(observation, self._view)
+        mapped = Mapped(snapshot, drawn.view, self.model.right_colors.copy())
         if not still or self._last is None:  # a still frame is passed over: slow motion adds up until seen
             self.start_from(drawn)
             if not learn:
-                return Mapped(snapshot, drawn.view)
+                return mapped
             room = self._limit(budget) - self.model.count
             if room > HOLES:  # else what hardly shows is needed to fill holes
                 grown = round(GROWN * self._limit(budget)) - self.model.count
                 self._split = split_worst(self.model, observation, drawn.view, max(0, grown)) > 0
-        return Mapped(snapshot, drawn.view)
+        return mapped
 
     def pace(self, unhurried: bool) -> None:
         """Whether there is time for several steps a frame. They are shorter then, and the flow is finer."""

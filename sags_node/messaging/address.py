@@ -153,7 +153,7 @@ class HandshakeWatch:
     def _explained(self) -> str | None:
         endpoint, plain = self._address.endpoint, self._address.keys is None
         if self._last[0] == zmq.EVENT_HANDSHAKE_FAILED_AUTH:
-            return f"{endpoint} refuses this key: have its .pub put into publish.allow and the node restarted"
+            return f"{endpoint} refuses this key: have its .pub put into publish.allow, then start this anew"
         if self._last[1] == zmq.PROTOCOL_ERROR_ZMTP_MECHANISM_MISMATCH:
             if plain:
                 return f"{endpoint} wants a key: {_HOW}, and --server-key"

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import logging
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping
 from concurrent.futures import CancelledError, Future
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -16,6 +18,9 @@ import zmq
 
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging.address import Address, ClientKeys, connect, find_control
+from sags_node.messaging.request_rate import RATE, RequestRate
+from sags_node.messaging.roles import Client, needed
+from sags_node.messaging.security import Gate, Seldom
 from sags_node.messaging.sockets import receive_frames
 from sags_node.messaging.wire import PROTOCOL
 
@@ -25,9 +30,12 @@ MAX_REPLY_BYTES = 1 << 20
 MAX_REQUEST_PARTS = 4  # identity, the empty delimiter of REQ, the request
 MAX_REQUESTS_AT_ONCE = 32  # so that a flood cannot keep the publishing thread from its frames
 MAX_PENDING = 64
+MAX_PENDING_OF_ONE = MAX_PENDING // 2  # client, so that the others are still answered
 RECEIVE_HIGH_WATER = 8  # requests one peer may have waiting
 SEND_HIGH_WATER = 2 * MAX_REQUESTS_AT_ONCE  # answers, before a peer that does not read loses some
 LOOK_MS = 100  # how soon a client notices that its node is another one
+ANONYMOUS = "anonymous"  # what ZeroMQ's authenticator calls who has no key
+PLAIN = Client("a client without a key")  # it came in all the same, so it may do everything
 
 Handler = Callable[[dict[str, Any]], Any]
 Took = Callable[[int, int], None]
@@ -49,10 +57,27 @@ class Reply(msgspec.Struct, frozen=True, omit_defaults=True):
     ok: bool
     result: Any = None
     error: str | None = None
+    code: str | None = None  # of some errors: "not_allowed", "too_often"
+    retry_after_s: float | None = None  # of "too_often"
 
 
 # What msgspec raises for bytes of a stranger: too deep, not hashable as a key, bad UTF-8 or a bad value.
 _BAD_BYTES = (msgspec.MsgspecError, UnicodeError, RecursionError, TypeError, ValueError)
+
+
+@dataclass(frozen=True, slots=True)
+class _Sender:
+    """Who asks.
+
+    Attributes:
+        envelope: what leads back to it.
+        id: its key, or where it has none its connection.
+        client: None: its key was taken off the list a moment ago.
+    """
+
+    envelope: list[bytes]
+    id: bytes
+    client: Client | None
 
 
 class ControlServer:
@@ -63,15 +88,27 @@ class ControlServer:
 
     Args:
         took: told the file descriptor of a peer and the bytes of each request read from it.
+        gate: who came through it with which key.
+
+    Attributes:
+        refused: requests that were not looked at further, by why.
     """
 
     def __init__(
-        self, socket: zmq.Socket[bytes], handlers: Mapping[str, Handler], took: Took = lambda *_: None
+        self,
+        socket: zmq.Socket[bytes],
+        handlers: Mapping[str, Handler],
+        took: Took = lambda *_: None,
+        gate: Gate = Gate(),  # noqa: B008  it is frozen
     ) -> None:
         self._socket = socket
         self._handlers = handlers
         self._took = took
-        self._pending: list[tuple[list[bytes], Identifier, Future[Any]]] = []
+        self._gate = gate
+        self._rate = RequestRate()
+        self.refused = Counter[str](requests_not_allowed=0, requests_too_often=0)
+        self._seldom = Seldom()
+        self._pending: list[tuple[_Sender, Identifier, Future[Any]]] = []
         self._request = msgspec.msgpack.Decoder(Request)
 
     @property
@@ -89,48 +126,84 @@ class ControlServer:
             parts = [frame.bytes for frame in frames]
             self._took(int(frames[-1].get(zmq.SRCFD)), sum(map(len, parts)))
             if len(parts) in (2, 3):
-                self._handle(parts[:-1], parts[-1])
+                self._handle(self._sender(frames[-1], parts[:-1]), parts[-1])
         finished = [entry for entry in self._pending if entry[2].done()]
-        for envelope, identifier, future in finished:
-            self._answer(envelope, identifier, future.result)
+        for sender, identifier, future in finished:
+            self._answer(sender, identifier, future.result)
         self._pending = [entry for entry in self._pending if entry not in finished]
 
-    def _handle(self, envelope: list[bytes], body: bytes) -> None:
+    def _sender(self, frame: zmq.Frame, envelope: list[bytes]) -> _Sender:
+        try:
+            key = str(frame.get("User-Id"))  # as the authenticator said it of this connection
+        except zmq.ZMQError:
+            key = ANONYMOUS
+        if key == ANONYMOUS:
+            return _Sender(envelope, envelope[0], PLAIN)
+        return _Sender(envelope, key.encode(), self._gate.client(key.encode()))
+
+    def _handle(self, sender: _Sender, body: bytes) -> None:
         try:
             request = self._request.decode(body)
         except _BAD_BYTES as error:
-            self._send(envelope, Reply(PROTOCOL, None, False, error=f"not a request: {error}"))
+            self._send(sender, Reply(PROTOCOL, None, False, error=f"not a request: {error}"))
             return
-        handler = self._handlers.get(request.op)
-        if handler is None:
-            known = ", ".join(sorted(self._handlers))
-            text = f"unknown op '{request.op}'; this node knows: {known}"
-            self._send(envelope, Reply(PROTOCOL, request.id, False, error=text))
+        refusal = self._refusal(sender, request)
+        if refusal is not None:
+            self._send(sender, refusal)
             return
-        if len(self._pending) >= MAX_PENDING:
-            text = "too many requests are waiting for an answer; try again later"
-            self._send(envelope, Reply(PROTOCOL, request.id, False, error=text))
-            return
-        self._answer(envelope, request.id, lambda: handler(request.args))
+        handler = self._handlers[request.op]
+        self._answer(sender, request.id, lambda: handler(request.args))
 
-    def _answer(self, envelope: list[bytes], identifier: Identifier, work: Callable[[], Any]) -> None:
+    def _refusal(self, sender: _Sender, request: Request) -> Reply | None:
+        """What speaks against a request, before it is looked at further."""
+        refused = partial(Reply, PROTOCOL, request.id, False)
+        wait = self._rate.wait(sender.id)
+        if wait:
+            self._count("requests_too_often", sender, request.op)
+            text = f"{RATE:g} requests a second of one client are answered; ask again in {wait:.3f} s"
+            return refused(error=text, code="too_often", retry_after_s=wait)
+        if request.op not in self._handlers:
+            known = ", ".join(sorted(self._handlers))
+            return refused(error=f"unknown op '{request.op}'; this node knows: {known}")
+        client = sender.client
+        if client is None:
+            return refused(error="this key is no longer in publish.allow", code="not_allowed")
+        if not client.may(request.op):
+            self._count("requests_not_allowed", sender, request.op)
+            role = needed(request.op)
+            text = (
+                f"{request.op} takes the role '{role}', and {client.name} has '{client.role}'; "
+                f"move {client.name}.pub into the folder '{role}' of the node's publish.allow"
+            )
+            return refused(error=text, code="not_allowed")
+        of_sender = sum(waiting.id == sender.id for waiting, _, _ in self._pending)
+        if len(self._pending) >= MAX_PENDING or of_sender >= MAX_PENDING_OF_ONE:
+            return refused(error="too many requests are waiting for an answer; try again later")
+        return None
+
+    def _count(self, why: str, sender: _Sender, op: str) -> None:
+        self.refused[why] += 1
+        if self._seldom.due():
+            log.warning("refused %s of %s; since the start: %s", op, sender.client, dict(self.refused))
+
+    def _answer(self, sender: _Sender, identifier: Identifier, work: Callable[[], Any]) -> None:
         try:
             result = work()
             if isinstance(result, Future):
-                self._pending.append((envelope, identifier, result))
+                self._pending.append((sender, identifier, result))
                 return
-            self._send(envelope, Reply(PROTOCOL, identifier, True, result=result))
+            self._send(sender, Reply(PROTOCOL, identifier, True, result=result))
         except SagsError as error:
-            self._send(envelope, Reply(PROTOCOL, identifier, False, error=str(error)))
+            self._send(sender, Reply(PROTOCOL, identifier, False, error=str(error)))
         except (Exception, CancelledError) as error:  # a request must not end the node
             log.exception("a control request failed")
             text = f"internal error: {type(error).__name__}: {error}"
-            self._send(envelope, Reply(PROTOCOL, identifier, False, error=text))
+            self._send(sender, Reply(PROTOCOL, identifier, False, error=text))
 
-    def _send(self, envelope: list[bytes], reply: Reply) -> None:
+    def _send(self, sender: _Sender, reply: Reply) -> None:
         body = msgspec.msgpack.encode(reply)
         try:
-            self._socket.send_multipart([*envelope, body], zmq.NOBLOCK)
+            self._socket.send_multipart([*sender.envelope, body], zmq.NOBLOCK)
         except zmq.ZMQError as error:  # the peer is gone or does not read: its loss
             log.debug("a reply was not sent: %s", error)
 
@@ -176,8 +249,8 @@ class ControlClient:
         deadline = time.monotonic() + timeout
         self._follow(deadline)
         self._last_id += 1
-        request = Request(PROTOCOL, self._last_id, op, dict(args or {}))
-        self._socket.send(msgspec.msgpack.encode(request), zmq.NOBLOCK)
+        request = msgspec.msgpack.encode(Request(PROTOCOL, self._last_id, op, dict(args or {})))
+        self._socket.send(request, zmq.NOBLOCK)
         while (left := deadline - time.monotonic()) > 0:
             if not self._socket.poll(min(int(left * 1000) + 1, LOOK_MS)):
                 if self._has_moved():
@@ -188,6 +261,11 @@ class ControlClient:
             except _BAD_BYTES:
                 continue
             if reply.id == self._last_id:  # an earlier one came too late for its own request
+                wait = reply.retry_after_s
+                if wait is not None and time.monotonic() + wait < deadline:  # it was not even looked at
+                    time.sleep(max(0.0, wait))
+                    self._socket.send(request, zmq.NOBLOCK)
+                    continue
                 if not reply.ok:
                     raise SagsError(f"{op}: {reply.error}")
                 return reply.result

@@ -14,6 +14,7 @@ STALE_PERIODS = 10
 MIN_RATE = 0.9  # of what the sender sends, or of the declared rate
 ENOUGH = 6  # messages that tell the period
 UNKNOWN_PERIOD = 0.1  # s, at most, until so many have come: who begins slowly must not be believed for long
+SESSIONS = 8  # of nodes that another one followed; each start of a node has a new one
 MAX_CLOCK_AHEAD = 1.0  # s; beyond it an age says nothing
 
 
@@ -35,6 +36,8 @@ class Freshness:
         self._rate_hz = rate_hz
         self._periodic = periodic
         self._window: deque[Meta] = deque(maxlen=WINDOW)
+        self._followed: deque[str] = deque(maxlen=SESSIONS)
+        self._mixed = 0  # messages of one node that are due until it is believed to be the only one
 
     def accept(self, meta: Meta) -> bool:
         """Note a message; False when it is not newer than the last one (a last value sent again)."""
@@ -43,6 +46,12 @@ class Freshness:
             if meta.seq <= last.seq or meta.epoch < last.epoch:
                 return False
             self.lost += meta.seq - last.seq - 1
+        if last is not None and meta.session != last.session:
+            if meta.session in self._followed:  # a node that was started anew never comes back
+                self._mixed = WINDOW
+            self._followed.append(last.session)
+        elif self._mixed:
+            self._mixed -= 1
         if last is None or meta.session != last.session or meta.epoch != last.epoch:
             self._window.clear()
         self.last = meta
@@ -83,8 +92,11 @@ class Freshness:
         """
         if self.last is None:
             return "nothing received yet"
-        if not self._periodic:
-            return None
+        if self._mixed:
+            return "two nodes send under this name; stop one of them, or give it another ns"
+        return self._untimely(now_ns, max_age) if self._periodic else None
+
+    def _untimely(self, now_ns: int, max_age: float | None) -> str | None:
         sure = self._rate_hz is not None or len(self._window) >= ENOUGH
         limit = STALE_PERIODS * (self.period if sure else min(self.period, UNKNOWN_PERIOD))
         if max_age is not None:

@@ -130,7 +130,7 @@ class Publisher:
             limit(router, control.SEND_HIGH_WATER, control.RECEIVE_HIGH_WATER, control.MAX_REQUEST_BYTES)
             self._watch("control", router, control.MAX_UNANSWERED_BYTES, gate)
             control_endpoint = bind(router, config.control, "publish.control", keys)
-            self._control = control.ControlServer(router, handlers, self._peers["control"].took)
+            self._control = control.ControlServer(router, handlers, self._peers["control"].took, gate)
         self.connection = Connection(
             protocol=PROTOCOL,
             ns=self.ns,
@@ -148,8 +148,12 @@ class Publisher:
 
     @property
     def connections(self) -> dict[str, dict[str, int]]:
-        """Of each socket: connections open and refused, see `Peers.counts`."""
-        return {name: peers.counts() for name, peers in self._peers.items()}
+        """Of each socket: connections open and refused, see `Peers.counts`; of the control socket also
+        requests that were refused."""
+        counts = {name: peers.counts() for name, peers in self._peers.items()}
+        if self._control is not None:
+            counts["control"] |= self._control.refused
+        return counts
 
     # ---- out -------------------------------------------------------------------------------------------
 

@@ -25,6 +25,7 @@ from zmq.auth.thread import ThreadAuthenticator
 from zmq.utils import z85
 
 from sags_node.errors import SagsError, UsageError
+from sags_node.messaging.roles import ROLES, Client, client_of, lesser
 
 if TYPE_CHECKING:
     from sags_node.config import Guarded  # whose validation a client need not load
@@ -124,13 +125,13 @@ def public_key(said: str) -> bytes:
     return said.encode() if _is_key(said.encode()) else read_public_key(Path(said))
 
 
-def read_allow_list(places: Sequence[Path], section: str = "publish") -> dict[bytes, str]:
-    """The clients that may connect, public key (Z85) -> name, from `.pub` files and folders of them.
+def read_allow_list(places: Sequence[Path], section: str = "publish") -> dict[bytes, Client]:
+    """The clients that may connect, by public key (Z85), from `.pub` files and folders of them.
 
     Raises:
         UsageError: there is none, there are too many, or a file is no public key.
     """
-    files = _files(places)
+    files = _files(places, section)
     if not files:
         where = ", ".join(str(place) for place in places)
         raise UsageError(
@@ -138,7 +139,14 @@ def read_allow_list(places: Sequence[Path], section: str = "publish") -> dict[by
         )
     if len(files) > MAX_ALLOWED:
         raise UsageError(f"{section}.allow: {len(files)} keys; at most {MAX_ALLOWED} are allowed")
-    return {read_public_key(file): file.stem for file in files}
+    return _by_key((read_public_key(file), client_of(file)) for file in files)
+
+
+def _by_key(listed: Iterable[tuple[bytes, Client]]) -> dict[bytes, Client]:
+    found: dict[bytes, Client] = {}
+    for key, client in listed:
+        found[key] = lesser(client, found.get(key, client))
+    return found
 
 
 def _read(file: Path) -> tuple[bytes, bytes | None]:
@@ -240,7 +248,7 @@ class AllowList:
         self._places, self._section = places, section
         self._allowed = read_allow_list(places, section)
         self._lock = threading.Lock()
-        self._seen = _versions(places)
+        self._seen = _versions(places, section)
         self._next_look = 0.0
         self._revocations = 0
         self._seldom = Seldom()
@@ -254,6 +262,10 @@ class AllowList:
             )
         return key in self._allowed
 
+    def client(self, key: bytes) -> Client | None:
+        """Whose key it is, as it was at the last look."""
+        return self._allowed.get(key)
+
     def revocations(self) -> int:
         """How often keys have been taken off the list since the start."""
         self._look()
@@ -264,39 +276,47 @@ class AllowList:
             if time.monotonic() < self._next_look:
                 return
             self._next_look = time.monotonic() + LOOK_AGAIN
-            versions = _versions(self._places)
+            versions = _versions(self._places, self._section)
             if versions == self._seen:
                 return
             self._seen = versions
-            before, self._allowed = self._allowed, dict(_usable(versions))
-            gone = [name for key, name in before.items() if key not in self._allowed]
+            before, self._allowed = self._allowed, _by_key(_usable(versions))
+            gone = [str(client) for key, client in before.items() if key not in self._allowed]
             self._revocations += bool(gone)
-            new = [name for key, name in self._allowed.items() if key not in before]
+            new = [str(client) for key, client in self._allowed.items() if before.get(key) != client]
         log.warning(
-            "%s.allow has changed; new: %s; no longer let in: %s",
+            "%s.allow has changed; new, or with another role: %s; no longer let in: %s",
             self._section, ", ".join(new) or "none", ", ".join(gone) or "none",
         )  # fmt: skip
 
 
-def _versions(places: Sequence[Path]) -> dict[Path, tuple[int, int]]:
+def _versions(places: Sequence[Path], section: str) -> dict[Path, tuple[int, int]]:
     """The files of an allow list, and what changes when one is written."""
     found = {}
-    for file in _files(places):
+    for file in _files(places, section):
         with suppress(OSError):  # it has just gone
             found[file] = (file.stat().st_mtime_ns, file.stat().st_ino)
     return found
 
 
-def _usable(files: Iterable[Path]) -> Iterator[tuple[bytes, str]]:
+def _usable(files: Iterable[Path]) -> Iterator[tuple[bytes, Client]]:
     for file in files:
         try:
-            yield read_public_key(file), file.stem
+            yield read_public_key(file), client_of(file)
         except UsageError as error:
             log.warning("%s", error)
 
 
-def _files(places: Sequence[Path]) -> list[Path]:
-    return [file for place in places for file in (sorted(place.glob("*.pub")) if place.is_dir() else [place])]
+def _files(places: Sequence[Path], section: str) -> list[Path]:
+    """Those of `publish` also in the folders of roles; who hands pictures or poses in has none."""
+    within = ("", *ROLES) if section == "publish" else ("",)
+    files: list[Path] = []
+    for place in places:
+        if place.is_dir():
+            files += [file for folder in within for file in sorted((place / folder).glob("*.pub"))]
+        else:
+            files.append(place)
+    return files
 
 
 @dataclass(frozen=True, slots=True)
@@ -306,10 +326,12 @@ class Gate:
     Attributes:
         keys: the node's; None: everybody who reaches them does.
         revocations: how often keys were taken off the list. Who is in must show a key anew then.
+        client: whose public key that is; None: it is not on the list.
     """
 
     keys: KeyPair | None = None
     revocations: Callable[[], int] = lambda: 0
+    client: Callable[[bytes], Client | None] = lambda _: None
 
 
 @contextmanager
@@ -336,6 +358,6 @@ def authenticated(
     authenticator.configure_curve_callback(ZAP_DOMAIN.decode(), allowed)
     authenticator.start()
     try:
-        yield Gate(keys, allowed.revocations)
+        yield Gate(keys, allowed.revocations, allowed.client)
     finally:
         authenticator.stop()

@@ -47,6 +47,7 @@ class GaussianModel:
     opacity_logits = _Column(np.float32)
     opacities = _Column(np.float32)  # before the 3D filter
     colors = _Column(np.float32, 3)
+    right_colors = _Column(np.float32, 3)  # what the right eye sees more, see `mapping.right_view`
     velocities = _Column(np.float32, 3)  # m/s, world
     depth_errors = _Column(np.float32)  # m, predicted, see `mapping.depth_memory`
     ids = _Column(np.int64)

@@ -13,9 +13,8 @@ from typing import Any
 import numpy as np
 
 from sags_node.errors import UsageError
-from sags_node.files import open_file
-from sags_node.native_output import native_output
-from sags_node.overlay.ply_faces import check_faces
+from sags_node.files import read_file
+from sags_node.overlay.mesh_files import STL_START, STL_TRIANGLE, parse_mesh, stl_triangles
 from sags_node.overlay.scene import ObjectSpec
 from sags_node.types import F32, F64, I32
 
@@ -24,7 +23,6 @@ MAX_TRIANGLES = 200_000
 MAX_POINTS = 20_000
 LARGEST = 1.0  # m across: nothing in a body is larger
 HEADER_BYTES = 1 << 16
-STL_START, STL_TRIANGLE = 84, 50  # bytes of a binary STL file
 GREEN = (60, 230, 120)  # RGB
 LEAN = np.radians(35)  # of the target's arrow: along the line of sight it would be a dot
 
@@ -54,49 +52,35 @@ def mesh_of(spec: ObjectSpec) -> Mesh | None:
 
 
 def _load(spec: ObjectSpec, file: Path) -> Mesh:
-    _check_file(file)
-    if file.suffix.lower() == ".ply":
-        check_faces(file)
-    import open3d
-
-    points: F64 = np.zeros((0, 3))
-    triangles: I32 = np.zeros((0, 3), np.int32)
-    verbosity = open3d.utility.VerbosityLevel.Error
-    with open3d.utility.VerbosityContextManager(verbosity), native_output() as said:
-        if file.suffix.lower() in _MESHES:
-            read = open3d.io.read_triangle_mesh(file)
-            points, triangles = np.asarray(read.vertices), np.asarray(read.triangles, np.int32)
-        if len(triangles) == 0 and file.suffix.lower() in _POINTS:
-            points = np.asarray(open3d.io.read_point_cloud(file).points)
-    if said:  # what it read until then, or never read, would be drawn
-        raise UsageError(f"{file} is damaged: {said[0]}; open it in a mesh viewer")
+    points, triangles = parse_mesh(file, _content(file))
     what = "triangles" if len(triangles) or file.suffix.lower() not in _POINTS else "points"
     count, most = (len(triangles), MAX_TRIANGLES) if what == "triangles" else (len(points), MAX_POINTS)
     if count == 0:
         raise UsageError(f"{file} holds no {what}, or is damaged; open it in a mesh viewer")
     if count > most:
         raise UsageError(f"{file} holds {count} {what}, {most} at most can be drawn; simplify it")
-    points = points * spec.scale
-    _check_vertices(file, points, triangles)
+    with np.errstate(over="ignore"):
+        points = (points * spec.scale).astype(np.float32).astype(np.float64)  # as they will be drawn
+    _check_vertices(file, points)
     if what == "points":
         points, triangles = _octahedra(points, spec.point_size)
     return Mesh(points.astype(np.float32), triangles, _painted(len(triangles), spec.color))
 
 
-def _check_file(file: Path) -> None:
-    """Refuse what is no such file, or would take too much memory, before a reader sees it."""
+def _content(file: Path) -> bytes:
+    """The bytes of a file; not of one that is no such file, or would take too much memory."""
     kind = file.suffix.lower()
     if f"{kind} " not in f"{_KINDS} ":
         raise UsageError(f"cannot draw {file}: the name must end in one of {_KINDS}")
     try:
         size = file.stat().st_size
-        with open_file(file) as opened:
-            start = opened.read(HEADER_BYTES)
+        if size > MAX_FILE_BYTES:
+            most = MAX_FILE_BYTES >> 20
+            raise UsageError(f"{file} has {size >> 20} MiB, {most} at most are read; simplify it")
+        data = read_file(file, MAX_FILE_BYTES)
     except OSError as error:
         raise UsageError(f"cannot read {file}: {error.strerror}; check the path") from None
-    if size > MAX_FILE_BYTES:
-        raise UsageError(f"{file} has {size >> 20} MiB, {MAX_FILE_BYTES >> 20} at most are read; simplify it")
-    claimed = 0
+    start, size, claimed = data[:HEADER_BYTES], len(data), 0
     if kind == ".ply":
         header, ended, _ = start.partition(b"end_header")
         if not header.startswith(b"ply") or not ended:
@@ -111,20 +95,21 @@ def _check_file(file: Path) -> None:
         claimed = max(
             (int(number) for number in re.findall(rb"\n(?:POINTS|WIDTH)\s+(\d+)", header)), default=0
         )
-    elif kind == ".stl" and not start.startswith(b"solid"):
-        claimed = int.from_bytes(start[STL_START - 4 : STL_START], "little")
-        if size != STL_START + claimed * STL_TRIANGLE:
+    elif kind == ".stl":
+        claimed = stl_triangles(start, size) or 0
+        if claimed and size != STL_START + claimed * STL_TRIANGLE:
             raise UsageError(f"{file} is damaged: its size does not fit its {claimed} triangles")
     if claimed > size:  # each takes at least a byte
         raise UsageError(f"{file} is damaged: it claims {claimed} elements in {size} bytes")
+    return data
 
 
-def _check_vertices(file: Path, vertices: F64, triangles: I32) -> None:
+def _check_vertices(file: Path, vertices: F64) -> None:
     if not np.isfinite(vertices).all():
         bad = int((~np.isfinite(vertices).all(1)).sum())
-        raise UsageError(f"{file}: {bad} of its {len(vertices)} vertices are not finite (NaN); mend the file")
-    if len(triangles) and not (triangles.min() >= 0 and triangles.max() < len(vertices)):
-        raise UsageError(f"{file} is damaged: a triangle names a vertex that is not there")
+        raise UsageError(
+            f"{file}: {bad} of its {len(vertices)} vertices are not finite or far too large; mend the file"
+        )
     across = float(np.ptp(vertices, axis=0).max())
     if across > LARGEST:
         raise UsageError(

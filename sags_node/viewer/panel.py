@@ -191,6 +191,8 @@ class Panel:
     def _list_anchors(self, anchors: NDArray[Any] | None) -> None:
         rows = [] if anchors is None else list(anchors)
         self._anchor_rows.content = _anchor_table(rows)
+        if anchors is None:  # nothing fresh came: what somebody has chosen stays
+            return
         numbers = (NONE, *(str(int(row["id"])) for row in rows))
         if self._chosen.options != numbers:
             self._chosen.options = numbers  # viser keeps the choice while it is there

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from sags_node.types import F32, U8, Bool, GrayPyramid
+from sags_node.types import F32, I64, U8, Bool, GrayPyramid
 from sags_node.vision.pyramid import inner
 
 WIDTH = 360  # px, at most, of the picture in which they are looked for
@@ -38,32 +38,59 @@ class Landmarks(NamedTuple):
     after: F32  # [K, 2]
 
 
+class Features(NamedTuple):
+    """What can be recognised in a picture."""
+
+    places: F32  # [F, 2] px of the whole picture
+    angles: F32  # [F] degrees
+    codes: U8  # [F, 32] ORB
+    width: int  # px of the whole picture
+
+
+def features_in(pyramid: GrayPyramid, tissue: Bool | None = None) -> Features:
+    """Features of a picture, where `tissue` [H, W] is: everywhere by default."""
+    small, per_px = _small(pyramid)
+    mask = None
+    if tissue is not None:
+        mask = cv2.resize(tissue.view(np.uint8), small.shape[::-1], interpolation=cv2.INTER_NEAREST)
+    points, codes = cv2.ORB.create(COUNT, fastThreshold=FAST_THRESHOLD).detectAndCompute(small, mask)
+    places = np.array([point.pt for point in points], np.float32).reshape(-1, 2)
+    angles = np.array([point.angle for point in points], np.float32)
+    codes = np.zeros((0, 32), np.uint8) if codes is None else np.asarray(codes, np.uint8)
+    # The middle of the first pixel is at 0 in both sizes.
+    places = (places + np.float32(0.5)) * np.float32(per_px) - np.float32(0.5)
+    return Features(places, angles, codes, pyramid.full.shape[1])
+
+
+def matched(before: Features, after: Features) -> tuple[I64, I64]:
+    """Rows [K] of both pictures' features that clearly look alike."""
+    none = np.zeros(0, np.int64)
+    if min(len(before.codes), len(after.codes)) < 2:
+        return none, none
+    pairs = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(before.codes, after.codes, 2)
+    clear = [pair[0] for pair in pairs if len(pair) == 2 and pair[0].distance < RATIO * pair[1].distance]
+    rows = np.array([(match.queryIdx, match.trainIdx) for match in clear], np.int64).reshape(-1, 2)
+    return rows[:, 0], rows[:, 1]
+
+
 def find_again(before: GrayPyramid, after: GrayPyramid, tissue: Bool) -> Landmarks | None:
     """Landmarks of the earlier picture in the later one; None: so few that it may be another scene.
 
     Args:
         tissue: [H, W] of the earlier picture.
     """
-    (first, per_px), (second, _) = _small(before), _small(after)
-    orb = cv2.ORB.create(COUNT, fastThreshold=FAST_THRESHOLD)
-    mask: U8 = cv2.resize(tissue.view(np.uint8), first.shape[::-1], interpolation=cv2.INTER_NEAREST)
-    points_a, features_a = orb.detectAndCompute(first, mask)
-    points_b, features_b = orb.detectAndCompute(second, None)
-    if min(len(points_a), len(points_b)) < FEWEST:
+    first, second = features_in(before, tissue), features_in(after)
+    if min(len(first.places), len(second.places)) < FEWEST:
         return None
-    pairs = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(features_a, features_b, 2)
-    clear = [pair[0] for pair in pairs if len(pair) == 2 and pair[0].distance < RATIO * pair[1].distance]
-    a, b = [points_a[match.queryIdx] for match in clear], [points_b[match.trainIdx] for match in clear]
-    places = np.array([[p.pt, q.pt] for p, q in zip(a, b, strict=True)], np.float32).reshape(-1, 2, 2)
-    turns = np.array([q.angle - p.angle for p, q in zip(a, b, strict=True)])
-    width = first.shape[1]
-    near = np.hypot(*(places[:, 1] - places[:, 0]).T) < FARTHEST * width
-    places = places[near & (np.abs((turns + 180) % 360 - 180) < LARGEST_TURN)]
-    places = places[_agreeing(places, APART * width)]
-    if len(places) < FEWEST:
+    a, b = matched(first, second)
+    start, end, turns = first.places[a], second.places[b], second.angles[b] - first.angles[a]
+    near = np.hypot(*(end - start).T) < FARTHEST * first.width
+    near &= np.abs((turns + 180) % 360 - 180) < LARGEST_TURN
+    start, end = start[near], end[near]
+    agreed = agreeing(start, end, APART * first.width)
+    if np.count_nonzero(agreed) < FEWEST:
         return None
-    places = (places + np.float32(0.5)) * np.float32(per_px) - np.float32(0.5)
-    return Landmarks(places[:, 0], places[:, 1])
+    return Landmarks(start[agreed], end[agreed])
 
 
 def motion(start: F32, end: F32, width: int, height: int) -> F32:
@@ -88,12 +115,12 @@ def _small(pyramid: GrayPyramid) -> tuple[U8, float]:
     return half.astype(np.uint8), pyramid.full.shape[1] / half.shape[1]
 
 
-def _agreeing(places: F32, apart: float) -> Bool:
-    """Which matches [K, 2, 2] move as those around them do."""
-    if len(places) <= AROUND:
-        return np.zeros(len(places), np.bool_)
-    moves = places[:, 1] - places[:, 0]
-    squares = np.square(places[:, None, 0] - places[None, :, 0]).sum(2)
+def agreeing(start: F32, end: F32, apart: float) -> Bool:
+    """Which matches, from places [K, 2] to others [K, 2], move as those around them do, to `apart` px."""
+    if len(start) <= AROUND:
+        return np.zeros(len(start), np.bool_)
+    moves = end - start
+    squares = np.square(start[:, None] - start[None, :]).sum(2)
     np.fill_diagonal(squares, np.inf)
     around = np.argpartition(squares, AROUND - 1, axis=1)[:, :AROUND]
     agrees: Bool = np.hypot(*(moves - np.median(moves[around], axis=1)).T) < apart

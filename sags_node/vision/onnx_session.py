@@ -72,16 +72,24 @@ class OnnxSession:
                 "cpu, or install onnxruntime-gpu"
             )
         try:
-            self._session = ort.InferenceSession(str(path), options, providers=wanted)
+            self._session = ort.InferenceSession(
+                str(path),
+                options,
+                providers=wanted,
+                enable_fallback=0,  # it would print to stdout
+            )
+            declared, metadata = self._session.get_inputs(), self._session.get_modelmeta()
+            self._output_names: list[str] = [output.name for output in self._session.get_outputs()]
+            self.metadata: Mapping[str, str] = metadata.custom_metadata_map
+            self.inputs = tuple(self._tensor(tensor) for tensor in declared)
+        except UsageError:
+            raise
         except Exception as error:  # the runtime raises a class of its own for every kind of fault
             raise UsageError(
                 f"{setting}.path: {path} is no ONNX model that can be run: {first_line(error)}"
             ) from None
         self.name = path.name
-        self.inputs = tuple(self._tensor(tensor) for tensor in self._session.get_inputs())
-        self.metadata: Mapping[str, str] = self._session.get_modelmeta().custom_metadata_map
         self.processor = "cuda" if "CUDA" in self._session.get_providers()[0] else "cpu"
-        self._output_names: list[str] = [output.name for output in self._session.get_outputs()]
 
     def run(self, feeds: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
         """All outputs by name.

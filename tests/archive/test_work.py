@@ -71,7 +71,7 @@ def test_a_rows_own_cores_count(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("job", JOBS)
 def test_a_job_writes_beside_its_figures(job: str, tmp_path: Path) -> None:
-    """`figures.json` and `log.txt` are its stdout and stderr: it must not write to them itself."""
+    """`figures.json` and `log.txt` are its stdout and stderr: a file of its own must not be one."""
     said = command(job, ["recording"], (), tmp_path)
     written = [Path(each).relative_to(tmp_path) for each in said if each.startswith(str(tmp_path))]
     assert written and all(each.name and each.name not in (FIGURES, LOG) for each in written)

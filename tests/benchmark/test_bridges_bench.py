@@ -11,7 +11,7 @@ pytest.importorskip("cyclonedds", reason="ROS 2 needs: pip install 'sags-node[ro
 
 from sags_node.benchmark.node import bridges, crowd
 
-pytestmark = pytest.mark.live
+pytestmark = [pytest.mark.live, pytest.mark.alone]
 
 SMALL = ("replay/phantom_pull", "source.pace:=realtime", "mapping.max_gaussians:=2000")
 

@@ -5,7 +5,7 @@ import pytest
 from sags_node.benchmark.node import crowd
 from sags_node.errors import SagsError
 
-pytestmark = pytest.mark.live
+pytestmark = [pytest.mark.live, pytest.mark.alone]
 
 SMALL = ("replay/phantom_pull", "source.pace:=realtime", "mapping.max_gaussians:=2000")
 

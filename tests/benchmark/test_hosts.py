@@ -10,7 +10,7 @@ import pytest
 from sags_node.benchmark.node import hosts
 from sags_node.errors import SagsError
 
-pytestmark = pytest.mark.live
+pytestmark = [pytest.mark.live, pytest.mark.alone]
 SHORT = ["source.frames:=20"]  # at 10 Hz
 
 

@@ -16,13 +16,14 @@ from places import ROOT
 
 from sags_node.benchmark.pareto import measure as pareto
 from sags_node.benchmark.pareto import settings as pareto_settings
-from sags_node.benchmark.pareto.baselines import right_pixels, warp_to_right
+from sags_node.benchmark.pareto.baselines import right_pixels
 from sags_node.benchmark.pareto.measure import non_dominated, why_default
 from sags_node.benchmark.pareto.settings import HURRIED_RULES, skip_rules, skip_settings, time_settings
 from sags_node.calibration import load_rig
 from sags_node.cli.main import main
 from sags_node.config import MappingConfig
 from sags_node.evaluation import metrics
+from sags_node.evaluation.warp import warp_to_right
 from sags_node.launch_file import load_launch
 from sags_node.mapping.ladder import RUNGS
 from sags_node.sources.source import open_source

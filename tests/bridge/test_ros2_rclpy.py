@@ -30,7 +30,7 @@ from sags_node.messaging import cdr, topics
 from sags_node.messaging.received import Received, ReceivedCloud, TopicName
 from sags_node.messaging.subscriber import Subscriber
 
-pytestmark = pytest.mark.live
+pytestmark = [pytest.mark.live, pytest.mark.alone]
 
 WATCHED = 2  # s
 NOTICE = 1.0  # s that a loaded machine may take to stop sending, after the 0.4 s that are promised

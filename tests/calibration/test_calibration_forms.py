@@ -260,6 +260,7 @@ def test_wrong_matrices_are_named(tmp_path: Path, change: dict[str, object], sai
         "%YAML:1.0\n---\nM1: !!opencv-matrix\n   rows: 100000\n   cols: 1000000\n   dt: d\n   data: [ 1. ]\n",
         "%YAML:1.0\n---\nM1: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n   data: [ 1., 2. ]\n",
         "%YAML:1.0\n---\nM1: [ 1, 2\n",
+        "%YAML:1.0\n---\n-\nM1: [ 1, 2 ]\n",  # a list, of which OpenCV asks names all the same
         "<?xml version='1.0'?><opencv_storage><M1>",
     ],
 )

@@ -27,9 +27,10 @@ pytestmark = [pytest.mark.live, pytest.mark.usefixtures("run_dir")]
     left="no temporary file",
 )
 @pytest.mark.parametrize("command", [["eval", "--json", "-"], ["eval", "--pace", "step"], ["demo", "--json"]])
-def test_ctrl_c_ends_a_measured_run(command: list[str], phantom_session: Path, tmp_path: Path) -> None:
-    temporary = tmp_path / "temporary"
-    temporary.mkdir()
+def test_ctrl_c_ends_a_measured_run(
+    command: list[str], phantom_session: Path, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    temporary = tmp_path_factory.mktemp("t")  # short: a socket's path has at most 107 letters
     if command[0] == "demo":
         command = [*command, "--out", str(tmp_path / "demo")]
     process = start([*command, phantom_session, "source.rate:=2"], TMPDIR=temporary)

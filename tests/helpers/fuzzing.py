@@ -27,6 +27,7 @@ import numpy as np
 from bag_files import ROS1, ROS2, play, stereo_rows, write_rosbag1, write_rosbag2
 from hypothesis import strategies as st
 from numbered_pictures import write_video
+from onnx_networks import save_matcher
 from places import ROOT
 from simulated_node import Socket
 from synthetic import plane_result
@@ -49,6 +50,7 @@ from sags_node.recording.pictures import decode_file
 from sags_node.recording.recover import recover
 from sags_node.sources.pose_track import PoseTrack
 from sags_node.sources.source import open_source
+from sags_node.vision.onnx_network import DepthNetwork
 from sags_node.vision.tissue_topic import TopicMasks
 
 LONGEST = 10.0  # s for one input
@@ -381,31 +383,68 @@ def read_opencv_rig(data: bytes, folder: Path) -> None:
     check_rig(read_rig(file, (640, 512)))
 
 
-def meshes(_: Path) -> list[bytes]:
-    corners = ["0 0 0", "0.01 0 0", "0 0.01 0", "0 0 0.01"]
-    faces = [(0, 1, 2), (0, 1, 3), (1, 2, 3)]
+CORNERS = np.array([[0, 0, 0], [0.01, 0, 0], [0.01, 0.01, 0], [0, 0.01, 0]], "<f4")
+FACES = [(0, 1, 2), (0, 1, 3), (0, 1, 2, 3)]
+PLACES = "".join(f"{x:g} {y:g} {z:g}\n" for x, y, z in CORNERS)
+
+
+def ply_files(_: Path) -> list[bytes]:
     head = "element vertex 4\n" + "".join(f"property float {a}\n" for a in "xyz") + "element face 3\n"
     head += "property list uchar int vertex_indices\nend_header\n"
-    ply = (
-        "ply\nformat ascii 1.0\n"
-        + head
-        + "\n".join(corners)
-        + "\n"
-        + "\n".join(f"3 {a} {b} {c}" for a, b, c in faces)
+    lines = "".join(f"{len(face)} {' '.join(map(str, face))}\n" for face in FACES)
+    binary = b"ply\nformat binary_little_endian 1.0\n" + head.encode() + CORNERS.tobytes()
+    binary += b"".join(struct.pack(f"<B{len(face)}i", len(face), *face) for face in FACES)
+    return [f"ply\nformat ascii 1.0\n{head}{PLACES}{lines}".encode(), binary]
+
+
+def obj_files(_: Path) -> list[bytes]:
+    places = "".join(f"v {line}\n" for line in PLACES.splitlines())
+    faces = "".join(f"f {' '.join(str(corner + 1) for corner in face)}\n" for face in FACES)
+    return [(places + faces).encode(), (places + "f 1/1/1 2//2 -1\n").encode()]
+
+
+def stl_files(_: Path) -> list[bytes]:
+    text = "solid a\n"
+    binary = bytes(80) + struct.pack("<I", 2)
+    for face in FACES[:2]:
+        corners = CORNERS[list(face)]
+        text += "facet normal 0 0 1\nouter loop\n"
+        text += "".join(f"vertex {x:g} {y:g} {z:g}\n" for x, y, z in corners) + "endloop\nendfacet\n"
+        binary += bytes(12) + corners.tobytes() + bytes(2)
+    return [f"{text}endsolid a\n".encode(), binary]
+
+
+def pcd_files(_: Path) -> list[bytes]:
+    head = "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 4\nHEIGHT 1\n"
+    head += "VIEWPOINT 0 0 0 1 0 0 0\nPOINTS 4\nDATA "
+    return [f"{head}ascii\n{PLACES}".encode(), f"{head}binary\n".encode() + CORNERS.tobytes()]
+
+
+def mesh_files(sound: Callable[[Path], Sequence[bytes]], suffix: str) -> Target:
+    def use(data: bytes, folder: Path) -> None:
+        file = folder / f"mesh{suffix}"
+        file.write_bytes(data)
+        mesh = mesh_of(ObjectSpec(file=file))
+        assert mesh is not None and np.isfinite(mesh.vertices).all()
+        assert mesh.triangles.min() >= 0 and mesh.triangles.max() < len(mesh.vertices)
+
+    return Target(sound, use)
+
+
+def networks(folder: Path) -> list[bytes]:
+    silent = save_matcher(folder / "a.onnx", size=(64, 48))
+    said = save_matcher(
+        folder / "b.onnx", size=(64, 48), metadata={"normalization": "bytes", "multiple": "16"}
     )
-    binary = b"ply\nformat binary_little_endian 1.0\n" + head.encode()
-    binary += np.array([c.split() for c in corners], "<f4").tobytes()
-    binary += b"".join(struct.pack("<Biii", 3, *face) for face in faces)
-    obj = "".join(f"v {c}\n" for c in corners) + "".join(f"f {a + 1} {b + 1} {c + 1}\n" for a, b, c in faces)
-    return [ply.encode(), binary, obj.encode()]
+    return [silent.read_bytes(), said.read_bytes()]
 
 
-def read_mesh(data: bytes, folder: Path) -> None:
-    file = folder / ("mesh.ply" if data[:1] == b"p" else "mesh.obj")
+def open_network(data: bytes, folder: Path) -> None:
+    file = folder / "network.onnx"
     file.write_bytes(data)
-    mesh = mesh_of(ObjectSpec(file=file))
-    assert mesh is not None and np.isfinite(mesh.vertices).all()
-    assert mesh.triangles.min() >= 0 and mesh.triangles.max() < len(mesh.vertices)
+    network = DepthNetwork(cfg.OnnxConfig(path=file, threads=1), (64, 48), 0.4)
+    picture = np.zeros((48, 64, 3), np.uint8)
+    assert network(picture, picture).shape == (48, 64)
 
 
 def films(folder: Path) -> list[bytes]:
@@ -440,7 +479,12 @@ TARGETS: dict[str, Target] = {
     "ros calibration": Target(ros_rigs, read_ros_rig),
     "calibration archive": Target(archives, read_archive),
     "opencv calibration": Target(opencv_rigs, read_opencv_rig),
-    "meshes": Target(meshes, read_mesh),
+    "ply": mesh_files(ply_files, ".ply"),
+    "obj": mesh_files(obj_files, ".obj"),
+    "stl": mesh_files(stl_files, ".stl"),
+    "pcd": mesh_files(pcd_files, ".pcd"),
+    "xyz": mesh_files(lambda _: [PLACES.encode()], ".xyz"),
+    "networks": Target(networks, open_network),
     "videos": Target(films, read_film),
 }
 IN_MEMORY = {"requests", "messages", "masks", "thin pictures", "poses", "pictures"}

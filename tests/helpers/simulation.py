@@ -75,10 +75,12 @@ class World:
         """
         while not until():
             self._switches += 1
-            self._tasks = [task for task in self._tasks if not task.runs.dead]
             able = [task for task in self._tasks if task.deadline <= self.now or task.ready()]
             if able:
-                self.random.choice(able).runs.switch()
+                chosen = self.random.choice(able)
+                chosen.runs.switch()
+                if chosen.runs.dead:
+                    self._tasks.remove(chosen)
                 continue
             next_due = min((task.deadline for task in self._tasks), default=math.inf)
             if next_due == math.inf or self._switches > MOST_SWITCHES:

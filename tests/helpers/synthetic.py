@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +14,7 @@ import numpy as np
 
 from sags_node.config import PublishConfig
 from sags_node.geometry import quat_to_matrix, unproject
+from sags_node.messaging.control import Handler
 from sags_node.messaging.publisher import Publisher
 from sags_node.types import (
     Camera,
@@ -117,10 +118,12 @@ def health(state: str = "running") -> NodeHealth:
 
 
 @contextmanager
-def publisher(run_dir: Path, **config: Any) -> Iterator[Publisher]:
+def publisher(
+    run_dir: Path, handlers: Mapping[str, Handler] | None = None, **config: Any
+) -> Iterator[Publisher]:
     """A publisher named `sags` on free loopback ports."""
     settings = {"data": ("tcp://127.0.0.1:*",), "control": "tcp://127.0.0.1:*", "run_dir": run_dir, **config}
-    with Publisher(PublishConfig(**settings), "sags", "session-1") as running:
+    with Publisher(PublishConfig(**settings), "sags", "session-1", handlers) as running:
         yield running
 
 

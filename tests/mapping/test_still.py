@@ -286,7 +286,8 @@ def test_motion_is_followed_at_once_after_a_model_was_begun_while_nothing_moved(
 def test_what_is_drawn_in_parts_is_the_whole_model(
     frames: list[StereoFrame], overrides: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Wherever the picture was not drawn anew, the model does not look different either."""
+    """Wherever the picture was not drawn anew, the model does not look different either. The right eye's
+    colours are more than the model's."""
     play = Player(opened(*overrides))
     for frame in frames[:4]:
         play(frame)
@@ -300,10 +301,10 @@ def test_what_is_drawn_in_parts_is_the_whole_model(
     monkeypatch.setattr(CpuRefiner, "redraw", watched)
     for _ in range(25):
         result = play.again(frames[3])
-        for shown in result.views.values():
+        for eye, shown in result.views.items():
             planes = whole.forward(result.snapshot.gaussians, [shown.camera])[0]
             drawn = to_view(planes, shown.camera, shown.frame_id, shown.t_capture_ns)
-            for part in ("rgb", "alpha", "depth"):
+            for part in ("rgb", "alpha", "depth") if eye == "left" else ("alpha", "depth"):
                 difference = np.abs(getattr(shown, part) - getattr(drawn, part)).max()
                 assert difference <= 1e-6, (part, difference)
     assert sum(wholes) <= 5  # where one is removed, all is drawn

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from made_messages import MS, meta
 
-from sags_node.messaging.freshness import Freshness
+from sags_node.messaging.freshness import WINDOW, Freshness
 
 
 def followed(sequence: list[int], period_ms: float = 33.0, **settings: Any) -> Freshness:
@@ -93,3 +93,26 @@ def test_a_clock_ahead_is_not_fresh() -> None:
 
 def test_an_event_topic_never_grows_old() -> None:
     assert followed([1], periodic=False).problem(10**18) is None
+
+
+@pytest.mark.fault(
+    "network: two nodes send under one name",
+    sees="stale",
+    says="reason: `two nodes`",
+    back="20 messages of one of them later",
+)
+def test_two_nodes_under_one_name_are_found_and_a_restart_is_not() -> None:
+    fresh = Freshness()
+
+    def hear(session: str, first: int, count: int) -> str | None:
+        for seq in range(first, first + count):
+            fresh.accept(meta(seq, seq * 33, session=session))
+        return fresh.problem((first + count) * 33 * MS)
+
+    for number, session in enumerate(("a", "b", "c")):  # started anew twice
+        assert hear(session, 1 + 30 * number, 30) is None
+    for seq in range(100, 140):  # another one comes in between
+        problem = hear("cd"[seq % 2], seq, 1)
+        assert seq < 102 or "two nodes" in str(problem)
+    assert "two nodes" in str(hear("c", 140, WINDOW - 1))
+    assert hear("c", 140 + WINDOW, 2) is None

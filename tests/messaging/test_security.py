@@ -32,6 +32,7 @@ from sags_node.messaging.address import ClientKeys, client_keys
 from sags_node.messaging.control import ControlClient
 from sags_node.messaging.peers import MAX_PEERS
 from sags_node.messaging.publisher import Publisher
+from sags_node.messaging.roles import Client
 from sags_node.messaging.security import (
     LOOK_AGAIN,
     read_allow_list,
@@ -150,7 +151,7 @@ def test_one_bad_entry_in_the_allow_list_is_one_clear_error(
 def test_allow_lists(keys: Path, tmp_path: Path) -> None:
     viewer, stranger = (read_key_pair(keys / f"{name}.key") for name in ("clients/viewer", "stranger"))
     listed = read_allow_list([keys / "clients", keys / "stranger.pub"])
-    assert listed == {viewer.public: "viewer", stranger.public: "stranger"}
+    assert listed == {viewer.public: Client("viewer"), stranger.public: Client("stranger")}
     with pytest.raises(UsageError, match=r"no \.pub file"):
         read_allow_list([tmp_path])
     with pytest.raises(UsageError, match="holds a secret key"):

@@ -9,6 +9,7 @@ import pytest
 from command_line import refused
 
 from sags_node.overlay.mesh import mesh_of
+from sags_node.overlay.polygons import triangulate
 from sags_node.overlay.scene import SHAPES, ObjectSpec, built_in
 
 
@@ -52,14 +53,51 @@ def ply(vertices: int = 3, faces: int = 1, body: str = CORNERS + "3 0 1 2\n") ->
     return PLY.format(v=vertices, f=faces, body=body).encode()
 
 
+@pytest.mark.parametrize("corners", [4, 5, 12, 64])
+def test_a_polygon_is_covered_once_by_its_triangles(corners: int) -> None:
+    """Stars with every second corner pulled in, anywhere in space: their area is known."""
+    rng = np.random.default_rng(corners)
+    angles = np.linspace(0, 2 * np.pi, corners, endpoint=False)
+    radii = np.where(np.arange(corners) % 2, 0.2, 1.0)
+    flat = np.column_stack([radii * np.cos(angles), radii * np.sin(angles), np.zeros(corners)])
+    turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    points = flat @ turn.T + rng.normal(size=3)
+    triangles = triangulate(points, [list(range(corners))])
+    assert len(triangles) == corners - 2
+    ends = points[triangles]
+    areas = 0.5 * np.cross(ends[:, 1] - ends[:, 0], ends[:, 2] - ends[:, 0]) @ (turn @ [0, 0, 1])
+    assert (areas > -1e-12).all()  # all turn as the polygon does, so none lies on another or outside
+    neighbours = radii * np.roll(radii, -1) * np.sin(2 * np.pi / corners)
+    assert areas.sum() == pytest.approx(0.5 * neighbours.sum())
+
+
+def test_faces_of_many_corners_and_numbers_from_the_end(tmp_path: Path) -> None:
+    corners = "v 0 0 0\nv 0.01 0 0\nv 0.01 0.01 0\nv 0 0.01 0\n"
+    for number, face in enumerate(("f 1 2 3 4", "f -4 -3 -2 -1", "f 1/1/1 2//2 3/3 \\\n 4")):
+        file = tmp_path / f"{number}.obj"
+        file.write_text(f"{corners}{face}\n")
+        mesh = mesh_of(ObjectSpec(file=file))
+        assert mesh is not None and {*mesh.triangles.ravel().tolist()} == {0, 1, 2, 3}
+        assert len(mesh.triangles) == 2
+
+
 BAD_FILES = {
     "gone.ply": (None, "No such file"),
     "empty.ply": (b"", "no PLY header"),
     "nothing.ply": (ply(0, 0, ""), "holds no points"),
     "nothing.obj": (b"# nothing\n", "holds no triangles"),
     "nan.ply": (ply(body=CORNERS.replace("0.01", "nan", 1) + "3 0 1 2\n"), "1 of its 3 vertices"),
+    "huge.xyz": (b"0 8 5" + b"1" * 40, "1 of its 1 vertices"),
     "far.ply": (ply(body=CORNERS.replace("0.01", "10") + "3 0 1 2\n"), "for millimetres set scale: 0.001"),
     "index.ply": (ply(body=CORNERS + "3 0 1 7\n"), "a vertex that is not there"),
+    "twice.ply": (ply(body=CORNERS + "4 0 1 2 1\n"), "3 different corners of 4"),
+    "short.ply": (ply(faces=2), "it ends too early"),
+    "index.obj": (b"v 0 0 0\nv 1 0 0\nf 1 2 3\n", "a vertex that is not there"),
+    "zero.obj": (b"v 0 0 0\nv 1 0 0\nf 0 1 2\n", "the first one is 1"),
+    "word.obj": (b"v 0 0 zero\n", "could not convert"),
+    "half.stl": (b"solid a\nvertex 0 0 0\nvertex 1 0 0\n", "is damaged"),
+    "less.pcd": (b"# .PCD\nFIELDS x y z\nPOINTS 2\nDATA ascii\n0 0 0\n", "1 points of 2"),
+    "word.xyz": (b"0 0 0\n0 0 zero\n", "could not convert"),
     "claims.ply": (ply(3_000_000_000), "claims 3000000001 elements"),
     "claims.stl": (bytes(80) + (10**9).to_bytes(4, "little"), "1000000000 triangles"),
     "claims.pcd": (b"# .PCD\nFIELDS x y z\nPOINTS 999999999\nDATA binary\n", "claims 999999999"),

@@ -276,7 +276,7 @@ def test_pictures_without_stamps_are_refused() -> None:
 )
 def test_pictures_that_change_their_size_are_refused(caplog: pytest.LogCaptureFixture) -> None:
     """A camera that is set anew: what comes then would not fit the calibration."""
-    first, then = (SMALL.replace("is-live=true", "num-buffers=9"), SMALL.replace("320", "160"))
+    first, then = (SMALL.replace("is-live=true", "num-buffers=45"), SMALL.replace("320", "160"))
     launch = f"concat name=c ! tee name=t  t. ! left.  t. ! right.  {first} ! c.  {then} ! c."
     with open_pipeline(GstSource(launch=launch)) as source:
         taking = threading.Thread(target=lambda: list(source))

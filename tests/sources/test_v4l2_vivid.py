@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 from places import ROOT
 
-pytestmark = pytest.mark.live
+pytestmark = [pytest.mark.live, pytest.mark.alone]
 
 CACHE = Path(
     os.environ.get("SAGS_VIVID_CACHE")

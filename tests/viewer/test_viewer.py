@@ -34,7 +34,7 @@ from sags_node.viewer.history import GAP, History
 from sags_node.viewer.pictures import Sheet
 from sags_node.viewer.splats import Splats, splats_of
 
-pytestmark = pytest.mark.live
+pytestmark = [pytest.mark.live, pytest.mark.alone]
 
 START_SECONDS = 90  # the first start on a machine compiles kernels
 CHROMIUM = shutil.which("chromium")

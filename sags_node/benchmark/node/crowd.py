@@ -20,6 +20,7 @@ import numpy as np
 import zmq
 from rich.table import Table
 
+from sags_node.benchmark.node.neighbours import LOWEST_PRIORITY, everything
 from sags_node.errors import SagsError
 from sags_node.evaluation.metrics import percentiles
 from sags_node.messaging.address import connect, find_data
@@ -34,9 +35,8 @@ STATUS = TopicName("status", ReceivedText)
 WARM_UP = 10.0  # s
 STARTING = 60.0  # s for a node to bind its sockets
 STOPPING = 30.0  # s for it, and for each of the crowd, to end
-LOWEST_PRIORITY = 19
 SLOW = 0.2  # s that the slow subscriber takes for each frame
-PHASE = "publish.data:=[tcp://127.0.0.1:*]", "publish.control:=null", "source.loop:=true"
+PHASE = "publish.data:=[tcp://127.0.0.1:*]", "publish.control:=tcp://127.0.0.1:*", "source.loop:=true"
 
 Advance = Callable[[int, int | None, str], None]  # done, of, what
 Task = Callable[[Path, float, Event, Connection], None]  # of a subscriber
@@ -191,19 +191,6 @@ def _sleep(folder: Path, _: float, ending: Event, there: Connection) -> None:
         while not _is_over(ending):
             ending.wait(1.0)
     there.send({})
-
-
-@contextmanager
-def everything(folder: Path) -> Iterator[zmq.Socket[bytes]]:
-    """A socket that is sent all topics."""
-    context = zmq.Context()
-    socket = context.socket(zmq.SUB)
-    socket.subscribe("")
-    connect(socket, find_data(None, "sags", folder), MAX_MESSAGE_BYTES)
-    try:
-        yield socket
-    finally:
-        context.destroy(linger=0)
 
 
 def _listen(folder: Path, count: float, ending: Event, there: Connection) -> None:

@@ -19,11 +19,11 @@ from rich.table import Table
 from sags_node.errors import SagsError
 from sags_node.evaluation.machine import machine_name
 from sags_node.evaluation.metrics import psnr
-from sags_node.health import resident_mb
 from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import Budget
 from sags_node.mapping.mapper import SETTLED
 from sags_node.pipeline import Pipeline
+from sags_node.processes import resident_mb
 from sags_node.session import Session
 from sags_node.types import U8, StereoFrame
 
@@ -155,10 +155,10 @@ def measure_endurance(
     }
 
 
-def slope(windows: Sequence[Window], figure: str) -> dict[str, float] | None:
+def slope(windows: Sequence[Any], figure: str) -> dict[str, float] | None:
     """How a figure changes in 1000 frames, by least squares over the windows after the first, in which the
     model is still made; with its standard error. None of fewer than three: two always lie on a line."""
-    counted = windows[1:]
+    counted = [window for window in windows[1:] if math.isfinite(getattr(window, figure))]
     if len(counted) < 3:
         return None
     x = np.array([window.frames for window in counted]) / 1000
@@ -273,14 +273,7 @@ def table(measured: Mapping[str, Any]) -> Table:
 def statement(measured: Mapping[str, Any]) -> str:
     """What the table says, in words, and no more than it can say."""
     lines = ["stopped early"] if measured["interrupted"] else []
-    names = dict(zip(FIGURES, HEADINGS[1:], strict=False))
-    for figure, found in measured["per_1000_frames"].items():
-        if found is None:
-            lines.append("too few windows to tell a trend: at least four are needed")
-            break
-        change, error = found["slope"], found["standard_error"]
-        trend = "" if abs(change) > SIGNIFICANT * error else ", no trend beyond the scatter of the windows"
-        lines.append(f"{names[figure]}: {change:+.3g} ± {error:.2g} per 1000 frames{trend}")
+    lines += trends(measured["per_1000_frames"], dict(zip(FIGURES, HEADINGS[1:], strict=False)))
     still = measured["still"]
     if still is not None:
         lines.append(
@@ -289,3 +282,15 @@ def statement(measured: Mapping[str, Any]) -> str:
             f"{still['moving_cpu_ms']:.1f} ms while it moved; PSNR* {still['psnr']:.2f} dB"
         )
     return "\n".join(lines)
+
+
+def trends(slopes: Mapping[str, Mapping[str, float] | None], names: Mapping[str, str]) -> list[str]:
+    """A line for each slope, and whether it is more than scatter."""
+    lines = []
+    for figure, found in slopes.items():
+        if found is None:
+            return ["too few windows to tell a trend: at least four are needed"]
+        change, error = found["slope"], found["standard_error"]
+        trend = "" if abs(change) > SIGNIFICANT * error else ", no trend beyond the scatter of the windows"
+        lines.append(f"{names[figure]}: {change:+.3g} ± {error:.2g} per 1000 frames{trend}")
+    return lines

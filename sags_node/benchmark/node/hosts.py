@@ -7,37 +7,25 @@ takes only what the node leaves of the cores.
 
 from __future__ import annotations
 
-import json
 import multiprocessing
 import os
-import select
-import shutil
-import subprocess
-import sys
 import tempfile
-import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, ExitStack
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
 from sags_node.benchmark.kernels.contention import burning_core
-from sags_node.benchmark.node.crowd import LOWEST_PRIORITY, everything
+from sags_node.benchmark.node.neighbours import NS, STARTING, STOPPING, find_browser, overlay, reader, viewer
 from sags_node.errors import SagsError
 from sags_node.evaluation.measure import Options
 from sags_node.evaluation.session import measure, run_realtime
 from sags_node.evaluation.spool import Spool
-from sags_node.messaging.rundir import connection_path
-from sags_node.processes import end
 from sags_node.session import open_session
 from sags_node.warm_up import warm_up
 
-NS = "sags"
-STARTING = 60.0  # s for a process to be ready
 MEASURING = 600.0  # s to measure a run beyond its length
-STOPPING = 5.0  # s for a neighbour to end
-BROWSERS = "chromium", "chromium-browser", "google-chrome"
 
 Row = dict[str, Any]
 Beside = Callable[[Path], AbstractContextManager[Any]]  # a neighbour of the node in that run directory
@@ -75,11 +63,11 @@ def neighbours() -> dict[str, Beside | None]:
         "alone": None,
         "one core": None,
         "beside a busy process": lambda run_dir: burning_core(),
-        "with the overlay": _overlay,
+        "with the overlay": overlay,
         "with a reader of everything": reader,
     }
-    if _browser() is not None:
-        hosts["with the viewer"] = _viewer
+    if find_browser() is not None:
+        hosts["with the viewer"] = viewer
     return hosts
 
 
@@ -121,7 +109,11 @@ def _play(launch: str | None, overrides: list[str], run_dir: str, there: Connect
 
 
 def _live(launch: str | None, overrides: list[str], run_dir: str) -> Row:
-    sockets = ["publish.data:=[tcp://127.0.0.1:*]", "publish.control:=null", f"publish.run_dir:={run_dir}"]
+    sockets = [
+        "publish.data:=[tcp://127.0.0.1:*]",
+        "publish.control:=tcp://127.0.0.1:*",
+        f"publish.run_dir:={run_dir}",
+    ]
     live = ["source.loop:=false", "source.pace:=realtime", "mapping.iterations:=null", f"ns:={NS}"]
     session = open_session(launch, [*overrides, *sockets, *live])
     warm_up(session.config)
@@ -136,80 +128,3 @@ def _live(launch: str | None, overrides: list[str], run_dir: str) -> Row:
         "share_after_first_second": sum(row.facts is not None for row in after) / max(1, len(after)),
         **{key: summary[key] for key in kept},
     }
-
-
-@contextmanager
-def _overlay(run_dir: Path) -> Iterator[None]:
-    command = [sys.executable, "-m", "sags_node", "overlay", "--run-dir", str(run_dir), "--repin"]
-    overlay = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    try:
-        deadline = time.monotonic() + STARTING
-        while not connection_path(run_dir, "overlay").exists():
-            if overlay.poll() is not None or time.monotonic() > deadline:
-                raise SagsError("the overlay did not start; see sags overlay --help")
-            time.sleep(0.05)
-        yield
-    finally:
-        end(overlay, grace=STOPPING)
-
-
-@contextmanager
-def _viewer(run_dir: Path) -> Iterator[None]:
-    """The viewer and a browser on its page, which stands for one on another machine."""
-    browser = _browser()
-    assert browser is not None
-    environment = os.environ | {"XDG_RUNTIME_DIR": str(run_dir.parent)}
-    command = [sys.executable, "-m", "sags_node", "view", "--port", "0", "--json"]
-    viewer = subprocess.Popen(
-        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-    )
-    shown = None
-    try:
-        assert viewer.stdout is not None
-        ready, _, _ = select.select([viewer.stdout], [], [], STARTING)
-        said = viewer.stdout.readline() if ready else ""  # one line at once, or the process has ended
-        if not said:
-            raise SagsError("the viewer did not start; see sags view --help")
-        url = json.loads(said)["url"]
-        profile = f"--user-data-dir={run_dir.parent}/browser"
-        page = [browser, "--headless=new", "--no-sandbox", "--disable-gpu", profile, url]
-        shown = subprocess.Popen(
-            ["nice", "-n", str(LOWEST_PRIORITY), *page],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-        yield
-    finally:
-        if shown is not None:
-            end(shown, grace=STOPPING)
-        end(viewer, grace=STOPPING)
-
-
-@contextmanager
-def reader(run_dir: Path) -> Iterator[None]:
-    process = multiprocessing.get_context("spawn").Process(target=_read, args=(str(run_dir),), daemon=True)
-    process.start()
-    try:
-        yield
-    finally:
-        process.terminate()
-        process.join(STOPPING)
-        process.kill()
-
-
-def _read(run_dir: str) -> None:
-    """Take everything that the node in this run directory sends, as fast as it comes."""
-    os.nice(LOWEST_PRIORITY)
-    folder, parent = Path(run_dir), multiprocessing.parent_process()
-    while parent is not None and parent.is_alive():
-        if not connection_path(folder, NS).exists():
-            time.sleep(0.05)
-            continue
-        with everything(folder) as socket:
-            while parent.is_alive():
-                if socket.poll(100):
-                    socket.recv_multipart(copy=False)
-
-
-def _browser() -> str | None:
-    return next((found for name in BROWSERS if (found := shutil.which(name))), None)

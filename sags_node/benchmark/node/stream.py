@@ -20,8 +20,8 @@ from sags_node.evaluation.machine import machine_name
 from sags_node.evaluation.metrics import as_float, psnr
 from sags_node.fitting.clip import ClipFrame, play
 from sags_node.fitting.stream import StreamFit, StreamSettings
-from sags_node.health import resident_mb
 from sags_node.kernels.threads import configure_threads
+from sags_node.processes import resident_mb
 from sags_node.session import Session
 from sags_node.types import F32
 

@@ -1,0 +1,131 @@
+"""What stands beside a node: the overlay, the viewer, and who reads. Each is a process of its own.
+
+Who reads stands for another machine, and takes only what the node leaves of the cores.
+"""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import select
+import shutil
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from subprocess import DEVNULL, PIPE, Popen
+from typing import Any
+
+import zmq
+
+from sags_node.errors import SagsError
+from sags_node.messaging.address import connect, find_data
+from sags_node.messaging.rundir import connection_path
+from sags_node.messaging.stream import MAX_MESSAGE_BYTES
+from sags_node.processes import end
+
+NS = "sags"
+LOWEST_PRIORITY = 19
+STARTING = 60.0  # s for a process to be ready
+STOPPING = 5.0  # s for one to end
+BROWSERS = "chromium", "chromium-browser", "google-chrome"
+
+
+@contextmanager
+def everything(folder: Path) -> Iterator[zmq.Socket[bytes]]:
+    """A socket that is sent all topics."""
+    context = zmq.Context()
+    socket = context.socket(zmq.SUB)
+    socket.subscribe("")
+    connect(socket, find_data(None, NS, folder), MAX_MESSAGE_BYTES)
+    try:
+        yield socket
+    finally:
+        context.destroy(linger=0)
+
+
+@contextmanager
+def overlay(run_dir: Path) -> Iterator[int]:
+    """The overlay with its mark; its process id."""
+    command = [sys.executable, "-m", "sags_node", "overlay", "--run-dir", str(run_dir), "--repin"]
+    process = Popen(command, stdout=DEVNULL, stderr=DEVNULL)
+    try:
+        deadline = time.monotonic() + STARTING
+        while not connection_path(run_dir, "overlay").exists():
+            if process.poll() is not None or time.monotonic() > deadline:
+                raise SagsError("the overlay did not start; see sags overlay --help")
+            time.sleep(0.05)
+        yield process.pid
+        _still_runs(process, "overlay")
+    finally:
+        end(process, grace=STOPPING)
+
+
+@contextmanager
+def viewer(run_dir: Path) -> Iterator[int]:
+    """The viewer and a browser on its page, which stands for one on another machine; its process id."""
+    browser = find_browser()
+    assert browser is not None
+    environment = os.environ | {"XDG_RUNTIME_DIR": str(run_dir.parent)}
+    command = [sys.executable, "-m", "sags_node", "view", "--port", "0", "--json"]
+    process = Popen(command, env=environment, stdout=PIPE, stderr=DEVNULL, text=True)
+    shown = None
+    try:
+        assert process.stdout is not None
+        ready, _, _ = select.select([process.stdout], [], [], STARTING)
+        said = process.stdout.readline() if ready else ""  # one line at once, or the process has ended
+        if not said:
+            raise SagsError("the viewer did not start; see sags view --help")
+        url = json.loads(said)["url"]
+        profile = f"--user-data-dir={run_dir.parent}/browser"
+        page = [browser, "--headless=new", "--no-sandbox", "--disable-gpu", profile, url]
+        shown = Popen(
+            ["nice", "-n", str(LOWEST_PRIORITY), *page],
+            stdout=DEVNULL,
+            stderr=DEVNULL,
+        )
+        yield process.pid
+        _still_runs(process, "viewer")
+    finally:
+        if shown is not None:
+            end(shown, grace=STOPPING)
+        end(process, grace=STOPPING)
+
+
+def _still_runs(process: Popen[Any], name: str) -> None:
+    """A neighbour that has ended costs nothing, and its row would say so."""
+    if process.poll() is not None:
+        raise SagsError(f"the {name} ended before its time, exit code {process.returncode}")
+
+
+@contextmanager
+def reader(run_dir: Path) -> Iterator[None]:
+    """Who takes everything, as fast as it comes."""
+    process = multiprocessing.get_context("spawn").Process(target=_read, args=(str(run_dir),), daemon=True)
+    process.start()
+    try:
+        yield
+    finally:
+        process.terminate()
+        process.join(STOPPING)
+        process.kill()
+
+
+def _read(run_dir: str) -> None:
+    """Take everything that the node in this run directory sends, as fast as it comes."""
+    os.nice(LOWEST_PRIORITY)
+    folder, parent = Path(run_dir), multiprocessing.parent_process()
+    while parent is not None and parent.is_alive():
+        if not connection_path(folder, NS).exists():
+            time.sleep(0.05)
+            continue
+        with everything(folder) as socket:
+            while parent.is_alive():
+                if socket.poll(100):
+                    socket.recv_multipart(copy=False)
+
+
+def find_browser() -> str | None:
+    return next((found for name in BROWSERS if (found := shutil.which(name))), None)

@@ -1,0 +1,57 @@
+"""What a client may ask of the node, by the role of its key: the name of the folder of its `.pub` file.
+
+Data may be had in every role. Each role may also do what those before it may.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+Role = Literal["listen", "control", "files"]
+ROLES: tuple[Role, ...] = get_args(Role)
+ALL: Role = "files"  # of keys in a folder of another name, and of everybody where there are no keys
+
+_OPERATIONS: dict[Role, frozenset[str]] = {
+    "listen": frozenset({"ping", "get_clock", "get_status", "get_health", "get_parameters"}),
+    "control": frozenset(
+        {"set_parameters", "reset_model", "pause", "resume", "add_anchor", "remove_anchor"}
+        | {"open_view", "close_view"}
+    ),
+    "files": frozenset({"save_model", "start_recording", "take_snapshot", "stop_recording"}),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Client:
+    """Who has a key.
+
+    Attributes:
+        name: of its file.
+    """
+
+    name: str
+    role: Role = ALL
+
+    def __str__(self) -> str:
+        return self.name if self.role == ALL else f"{self.name} ({self.role})"
+
+    def may(self, op: str) -> bool:
+        return ROLES.index(self.role) >= ROLES.index(needed(op))
+
+
+def needed(op: str) -> Role:
+    """The least role that may ask for an operation; one that is not listed takes the highest."""
+    return next((role for role in ROLES if op in _OPERATIONS[role]), ALL)
+
+
+def client_of(file: Path) -> Client:
+    """Whose key a `.pub` file holds, by its place."""
+    folder = file.absolute().parent.name
+    return Client(file.stem, next((role for role in ROLES if role == folder), ALL))
+
+
+def lesser(one: Client, other: Client) -> Client:
+    """Of two places of one key."""
+    return min(one, other, key=lambda client: ROLES.index(client.role))

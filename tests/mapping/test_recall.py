@@ -1,0 +1,154 @@
+"""Anchors that were out of sight for long: found by what surrounds them, and only there."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import cv2
+import numpy as np
+import pytest
+
+from sags_node.mapping.anchors import Anchors
+from sags_node.types import AnchorStates, Camera, Gaussians, Observation, RenderedView, Snapshot
+
+WIDTH, HEIGHT, FOCAL, DEPTH = 320, 256, 250.0, 0.08
+CENTRE = np.array([(WIDTH - 1) / 2, (HEIGHT - 1) / 2])
+CAMERA = Camera(WIDTH, HEIGHT, np.array([[FOCAL, 0, CENTRE[0]], [0, FOCAL, CENTRE[1]], [0, 0, 1]]), np.eye(4))
+AWAY = 10.0  # s
+PINNED = [(100, 100), (160, 128), (200, 150), (150, 180), (220, 90)]
+
+Scene = tuple[Observation, Snapshot, RenderedView]
+
+
+@cache
+def texture(seed: int) -> np.ndarray:
+    """Random blots of many sizes, on a sheet larger than the picture."""
+    rng = np.random.default_rng(seed)
+    sheet = np.zeros((HEIGHT + 200, WIDTH + 200), np.float32)
+    for size in (1.5, 3, 6, 12):
+        sheet += cv2.normalize(
+            cv2.GaussianBlur(rng.normal(size=sheet.shape), (0, 0), size), None, 0, 60, cv2.NORM_MINMAX
+        )
+    return sheet.clip(0, 255).astype(np.uint8)
+
+
+def motion(turn: float, scale: float, shift: tuple[float, float]) -> np.ndarray:
+    """[2, 3]: pixels of the first picture -> pixels now."""
+    matrix = cv2.getRotationMatrix2D((float(CENTRE[0]), float(CENTRE[1])), turn, scale)
+    matrix[:, 2] += shift
+    return matrix
+
+
+STILL = motion(0, 1, (0, 0))
+
+
+def scene(
+    seconds: float, moved: np.ndarray = STILL, seed: int = 0, depth: float = DEPTH, kept: bool = True
+) -> Scene:
+    """A plane with a texture that was `moved`; its Gaussians stay (`kept`), or are others."""
+    onto = moved.copy()
+    onto[:, 2] -= moved[:, :2] @ [100.0, 100.0]
+    gray = cv2.warpAffine(texture(seed), onto, (WIDTH, HEIGHT), flags=cv2.INTER_AREA)
+    u, v = np.meshgrid(np.arange(0, WIDTH, 3.0), np.arange(0, HEIGHT, 3.0))
+    means = np.stack([(u.ravel() - CENTRE[0]) / FOCAL * depth, (v.ravel() - CENTRE[1]) / FOCAL * depth], 1)
+    means = np.column_stack([means, np.full(u.size, depth)]).astype(np.float32)
+    count = len(means)
+    gaussians = Gaussians(
+        means,
+        np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
+        np.full((count, 3), 1e-3, np.float32),
+        np.ones(count, np.float32),
+        np.ones((count, 3), np.float32),
+        np.arange(count) + (0 if kept else 10**6),
+    )
+    stamp = round((1 + seconds) * 1e9)
+    shape = (HEIGHT, WIDTH)
+    surface = np.full(shape, depth, np.float32)
+    image = np.zeros((*shape, 3), np.float32)
+    observation = Observation(
+        0, stamp, CAMERA, image, gray, np.ones(shape, bool), surface, np.ones_like(surface)
+    )
+    snapshot = Snapshot(0, stamp, 0, gaussians, np.zeros_like(means), CAMERA, 0.0)
+    return observation, snapshot, RenderedView(0, stamp, CAMERA, image, surface, np.ones(shape, np.float32))
+
+
+def follow(anchors: Anchors, *scenes: Scene) -> AnchorStates:
+    for each in scenes:
+        anchors.update(*each)
+        states = anchors.at(each[0].t_capture_ns)
+    return states
+
+
+def pinned() -> Anchors:
+    """Anchors that were seen for a while, and are out of sight now: another tissue is there."""
+    anchors = Anchors()
+    for u, v in PINNED:
+        anchors.add_pixel(u, v, *scene(0))
+    seen = follow(anchors, *(scene(0.1 * i) for i in range(1, 25)))
+    assert (seen.confidence > 0.9).all()
+    gone = follow(anchors, *(scene(2.5 + 0.5 * i, seed=9) for i in range(round(AWAY / 0.5))))
+    assert (gone.confidence < 0.2).all()
+    return anchors
+
+
+def back(anchors: Anchors, seconds: float = 3.0, **how: object) -> AnchorStates:
+    return follow(anchors, *(scene(20 + 0.25 * i, **how) for i in range(round(seconds / 0.25))))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("kept", [True, False], ids=["its Gaussians stayed", "the model is another one"])
+@pytest.mark.parametrize(
+    ("turn", "scale", "shift"),
+    [(0.0, 1.0, (50.0, -30.0)), (20.0, 1.0, (10.0, 20.0)), (-10.0, 1.15, (-20.0, 10.0))],
+)
+def test_they_come_back_wherever_the_tissue_is(
+    turn: float, scale: float, shift: tuple[float, float], kept: bool
+) -> None:
+    moved = motion(turn, scale, shift)
+    states = back(pinned(), moved=moved, depth=DEPTH / scale, kept=kept)
+    truth = np.array(PINNED) @ moved[:, :2].T + moved[:, 2]
+    assert np.linalg.norm(states.pixels - truth, axis=1).max() < 1.0  # px
+    assert (states.confidence > 0.7).all() and (states.visibility == 1).all()
+    assert states.points[:, 2] == pytest.approx(DEPTH / scale, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    "how",
+    [
+        {"seed": 5},
+        {"moved": motion(0, 1, (0, 0)) * [[-1], [1]] + [[0, 0, WIDTH - 1], [0, 0, 0]]},
+        {"moved": motion(0, 1.5, (0, 0))},
+    ],
+    ids=["other tissue", "mirrored", "nearer in the picture and not in depth"],
+)
+def test_what_is_not_the_same_tissue_is_refused(how: dict[str, object]) -> None:
+    """Better no anchor than one on another place."""
+    confidence = back(pinned(), **how).confidence
+    assert (confidence < 0.2).all(), confidence
+
+
+def test_nothing_is_looked_for_while_all_are_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It would cost some milliseconds each time."""
+    anchors = Anchors()
+    anchors.add_pixel(160, 128, *scene(0))
+    monkeypatch.setattr(anchors._recall, "look", lambda *arguments: pytest.fail("looked"))
+    follow(anchors, *(scene(0.2 * i) for i in range(1, 30)))
+
+
+def test_one_that_was_removed_does_not_come_back() -> None:
+    anchors = pinned()
+    for anchor in (1, 2, 3):
+        anchors.remove(anchor)
+    assert back(anchors).ids.tolist() == [4, 5]
+    for anchor in (4, 5):
+        anchors.remove(anchor)
+    assert not anchors._recall._pictures
+
+
+def test_the_first_state_of_the_tissue_is_not_forgotten() -> None:
+    """However many others came after it."""
+    anchors = pinned()
+    for seed in range(20, 40):
+        anchors.add_pixel(160, 128, *scene(30 + 20 * seed, seed=seed))
+        follow(anchors, *(scene(30 + 20 * seed + 0.1 * i, seed=seed) for i in range(1, 4)))
+    states = follow(anchors, *(scene(1000 + 0.6 * i) for i in range(20)))
+    assert (states.confidence[: len(PINNED)] > 0.5).all()

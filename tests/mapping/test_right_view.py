@@ -1,0 +1,144 @@
+"""The right eye of a stereo display: beside the left picture warped there, and what may not come into it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from places import SESSION
+
+from sags_node.engine.rasterizer.rasterize import make_rasterizer
+from sags_node.evaluation import metrics
+from sags_node.evaluation.warp import warp_to_right
+from sags_node.mapping.budget import StepBudget
+from sags_node.mapping.mapper import Mapped
+from sags_node.mapping.right_eye import right_eye_mask
+from sags_node.mapping.right_view import RightView
+from sags_node.pipeline import Pipeline
+from sags_node.session import open_session
+from sags_node.types import F32, Camera, FrameResult, Gaussians
+
+FRAMES = 10
+
+
+@pytest.fixture(scope="module")
+def played() -> tuple[Pipeline, list[FrameResult]]:
+    overrides = ["source.pace:=step", f"source.frames:={FRAMES}", "publish.right:=true"]
+    session = open_session(SESSION, [*overrides, "mapping.max_gaussians:=6000"])
+    pipeline = Pipeline(session.config, session.rig)
+    with session.source as source:
+        return pipeline, [pipeline.process(frame, StepBudget(1)) for frame in source]
+
+
+def qualities(result: FrameResult) -> tuple[float, float]:
+    """PSNR of the right view and of the warped left picture, dB, where both are known."""
+    camera, right = result.pair.camera, result.pair.right
+    assert right is not None
+    known = result.views["left"].depth[result.observation.tissue]
+    mask = right_eye_mask(result.observation.tissue, known[known > 0], camera.K[0, 0], result.pair.baseline)
+    warp, there = warp_to_right(
+        result.observation.image, result.observation.depth, float(camera.K[0, 0]), result.pair.baseline
+    )
+    truth, both = metrics.as_float(right), mask & there
+    shown, warped = (
+        metrics.psnr(metrics.fit_gain_offset(picture, truth, both), truth, both)
+        for picture in (result.views["right"].rgb, warp)
+    )
+    return shown, warped
+
+
+def test_the_right_view_is_better_than_the_left_picture_warped_by_the_same_depth(
+    played: tuple[Pipeline, list[FrameResult]],
+) -> None:
+    shown, warped = np.mean([qualities(result) for result in played[1][FRAMES // 2 :]], axis=0)
+    assert shown > warped + 0.5, (shown, warped)
+
+
+class Scene:
+    """The last frame of the fixture, drawn for the right eye again."""
+
+    def __init__(self, result: FrameResult) -> None:
+        self.result, self.count = result, len(result.snapshot.gaussians)
+        camera = result.pair.camera
+        self._rasterizer = make_rasterizer("numba", camera.width, camera.height)
+
+    def show(self, gaussians: Gaussians, camera: Camera) -> F32:
+        planes: F32 = self._rasterizer.forward(gaussians, [camera])[0]
+        return planes
+
+    def mapped(self, right_colors: float = 0.0) -> Mapped:
+        colors = np.full((self.count, 3), right_colors, np.float32)
+        return Mapped(self.result.snapshot, self.result.views["left"], colors)
+
+
+@pytest.fixture(scope="module")
+def scene(played: tuple[Pipeline, list[FrameResult]]) -> Scene:
+    return Scene(played[1][-1])
+
+
+def test_nothing_of_the_left_picture_comes_over_but_tissue(scene: Scene) -> None:
+    """The left picture turns white. Where that is an instrument, and where nothing may be learnt from the
+    picture, the right view stays as it is."""
+    observation = scene.result.observation
+    white = np.full(observation.image.shape, 255, np.uint8)
+    half = observation.tissue.copy()
+    half[:, 160:] = False
+    plain = RightView().draw(scene.mapped(), observation, white, scene.show, learn=False).view.rgb
+    drawn = (
+        RightView()
+        .draw(scene.mapped(), replace(observation, tissue=half), white, scene.show, learn=True)
+        .view
+    )
+    focal_px, baseline = float(drawn.camera.K[0, 0]), scene.result.pair.baseline
+    disparity = np.divide(
+        focal_px * baseline, drawn.depth, out=np.zeros_like(drawn.depth), where=drawn.depth > 0
+    )
+    shows = np.indices(drawn.depth.shape)[1] + disparity  # the left picture's column
+    changed = (drawn.rgb != plain).any(-1)
+    assert not changed[shows >= 160].any()
+    assert changed.mean() > 0.2 and np.median(drawn.rgb[changed]) > 0.99  # all of it, with the share of 1
+
+
+def test_what_the_right_eye_sees_more_is_learnt_where_it_is_tissue_for_certain(
+    played: tuple[Pipeline, list[FrameResult]], scene: Scene
+) -> None:
+    """A right picture that is brighter by 0.2 everywhere: Gaussians take over half of what lacks, each from
+    every other frame. What is hidden from the right eye learns nothing."""
+    model, baseline = played[0].mapper.model, scene.result.pair.baseline
+    tissue = scene.result.observation.tissue.copy()
+    tissue[:100] = False
+    view = RightView()
+    drawn = view.draw(scene.mapped(), scene.result.observation, scene.result.pair.left, scene.show, False)
+    dim = replace(drawn, view=replace(drawn.view, rgb=np.full_like(drawn.view.rgb, 0.4)))
+    bright = np.full(drawn.view.rgb.shape, 153, np.uint8)  # 0.6
+    model.right_colors[:] = 0
+    view.learn(dim, model, bright, tissue, baseline)
+    first = np.count_nonzero(model.right_colors[:, 0])
+    view.learn(dim, model, bright, tissue, baseline)
+    same = model.ids[: scene.count] == scene.result.snapshot.gaussians.ids[: model.count]
+    learnt = model.right_colors[: len(same)][same]
+    taken = (learnt > 0).all(1)
+    assert 0 < first < taken.sum() and taken.mean() > 0.2
+    np.testing.assert_allclose(learnt[taken], 0.1, atol=1e-4)
+    pixels = drawn.view.camera.K @ (
+        drawn.view.camera.viewmat[:3, :3] @ scene.result.snapshot.gaussians.means[: len(same)][same][taken].T
+        + drawn.view.camera.viewmat[:3, 3:]
+    )
+    assert (pixels[1] / pixels[2]).min() > 100 - 4
+
+
+def test_what_is_not_seen_again_is_gone_after_two_seconds(
+    played: tuple[Pipeline, list[FrameResult]], scene: Scene
+) -> None:
+    """While the right eye is bad nothing is learnt from it, and what it saw before is less and less shown."""
+    model, view = played[0].mapper.model, RightView()
+    drawn = view.draw(scene.mapped(), scene.result.observation, scene.result.pair.left, scene.show, False)
+    right = scene.result.pair.right
+    assert right is not None
+    model.right_colors[:] = 0.2
+    nothing = np.zeros_like(scene.result.observation.tissue)
+    for _ in range(60):
+        view.learn(drawn, model, right, nothing, scene.result.pair.baseline)
+    same = model.ids[: scene.count] == scene.result.snapshot.gaussians.ids[: model.count]
+    assert np.abs(model.right_colors[: len(same)][same]).max() < 0.04

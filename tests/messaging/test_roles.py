@@ -1,0 +1,256 @@
+"""Which client may ask for what, and how often."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures import Future
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import pytest
+import zmq
+from synthetic import publisher, stream
+from waiting import until
+
+from sags_node.errors import SagsError
+from sags_node.mapping.anchors import MAX_ANCHORS
+from sags_node.messaging.address import ClientKeys
+from sags_node.messaging.control import MAX_PENDING_OF_ONE, ControlClient
+from sags_node.messaging.publisher import Publisher
+from sags_node.messaging.request_rate import BURST, FORGET_ABOVE, RATE, RequestRate
+from sags_node.messaging.requests import MAX_VIEW_HZ
+from sags_node.messaging.roles import ROLES, Client, needed
+from sags_node.messaging.security import read_allow_list, read_key_pair, read_public_key, write_key_pair
+from sags_node.messaging.subscriber import Subscriber
+from sags_node.node import Node
+from sags_node.node_operations import Operations
+from sags_node.views import MAX_VIEWS
+
+TOPIC = "left/depth"
+
+# ---- where a role comes from ---------------------------------------------------------------------------
+
+
+def test_the_folder_of_a_key_is_its_role(tmp_path: Path) -> None:
+    clients = tmp_path / "clients"
+    for folder in ("", *ROLES, "others"):
+        write_key_pair(clients / folder, f"in_{folder}")
+    named = {client.name: client.role for client in read_allow_list([clients]).values()}
+    assert named == {"in_": "files", "in_listen": "listen", "in_control": "control", "in_files": "files"}
+    (one,) = read_allow_list([clients / "listen/in_listen.pub"]).values()  # given by itself
+    assert one == Client("in_listen", "listen")
+    # Who may watch may not therefore hand pictures in.
+    assert {client.name for client in read_allow_list([clients], "source").values()} == {"in_"}
+
+
+def test_of_a_key_in_several_folders_the_least_role_counts(tmp_path: Path) -> None:
+    _, public = write_key_pair(tmp_path / "listen", "twice")
+    for folder in (tmp_path, tmp_path / "control"):
+        folder.mkdir(exist_ok=True)
+        (folder / "twice.pub").write_bytes(public.read_bytes())
+    assert list(read_allow_list([tmp_path]).values()) == [Client("twice", "listen")]
+
+
+def test_each_operation_of_a_node_has_its_role() -> None:
+    """One that was forgotten takes the highest role, and no client of a lower one could use it."""
+    node = Node.__new__(Node)
+    node._operations = Operations(None, lambda *_: None)  # type: ignore[arg-type]  # none of them is called
+    reading = {name for name in node._handlers() if name.startswith("get_")}
+    writing = {
+        name for name in node._handlers() if "recording" in name or "save" in name or "snapshot" in name
+    }
+    for name in node._handlers():
+        expected = "listen" if name in reading else "files" if name in writing else "control"
+        assert needed(name) == expected, name
+    assert needed("ping") == needed("get_clock") == "listen"
+    assert needed("of_tomorrow") == "files"
+
+
+# ---- over sockets --------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def keys(tmp_path: Path) -> Path:
+    """node.*, and clients/ROLE/ROLE.*"""
+    write_key_pair(tmp_path / "keys", "node")
+    for role in ROLES:
+        write_key_pair(tmp_path / f"keys/clients/{role}", role)
+    return tmp_path / "keys"
+
+
+@contextmanager
+def answering(run_dir: Path, **config: Any) -> Iterator[Publisher]:
+    """A publisher that answers; `wait` never is."""
+    names = ("get_status", "pause", "save_model")
+    handlers: dict[str, Any] = {name: lambda args: "done" for name in names}
+    with publisher(run_dir, handlers=handlers | {"wait": lambda args: Future()}, **config) as running:
+        with stream(running):
+            yield running
+
+
+def client(running: Publisher, keys: Path, role: str) -> ControlClient:
+    own = read_key_pair(keys / f"clients/{role}/{role}.key")
+    return ControlClient(running.connection.control, keys=ClientKeys(own, read_public_key(keys / "node.pub")))
+
+
+@pytest.mark.live
+def test_each_role_may_do_its_own_and_what_those_before_it_may(
+    tmp_path: Path, keys: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    refused = 0
+    with answering(tmp_path / "run", key=keys / "node.key", allow=(keys / "clients",)) as running:
+        for role in ROLES:
+            with client(running, keys, role) as asker:
+                for op, least in (("get_status", "listen"), ("pause", "control"), ("save_model", "files")):
+                    if ROLES.index(role) >= ROLES.index(least):
+                        assert asker.request(op) == "done"
+                    else:
+                        refused += 1
+                        with pytest.raises(
+                            SagsError, match=f"takes the role '{least}'.*into the folder '{least}'"
+                        ):
+                            asker.request(op)
+        own = ClientKeys(
+            read_key_pair(keys / "clients/listen/listen.key"), read_public_key(keys / "node.pub")
+        )
+        with Subscriber([TOPIC], endpoint=running.connection.data[-1], keys=own) as subscriber:
+            assert subscriber.wait(TOPIC, 10) is not None
+        assert running.connections["control"]["requests_not_allowed"] == refused == 3
+    said = [record for record in caplog.records if "requests_not_allowed" in record.getMessage()]
+    assert len(said) == 1 and "listen" in said[0].getMessage()  # the others came within seconds
+
+
+@pytest.mark.live
+@pytest.mark.fault(
+    "keys: a client's role is changed while it runs",
+    sees="it stays connected",
+    says="the answer: `takes the role`",
+    back="the new role counts within a second",
+)
+def test_a_role_changes_while_a_client_is_connected(tmp_path: Path, keys: Path) -> None:
+    folders = keys / "clients"
+    with answering(tmp_path / "run", key=keys / "node.key", allow=(folders,)) as running:
+        with client(running, keys, "control") as asker:
+            assert asker.request("pause") == "done"
+            (folders / "control/control.pub").rename(folders / "listen/control.pub")
+            until(lambda: "takes the role" in _error(asker, "pause"), 10)
+            assert asker.request("get_status") == "done"
+            (folders / "listen/control.pub").rename(folders / "files/control.pub")
+            until(lambda: not _error(asker, "save_model"), 10)
+
+
+@pytest.mark.live
+@pytest.mark.parametrize("with_keys", [False, True])
+def test_who_needs_no_key_may_do_everything(tmp_path: Path, keys: Path, with_keys: bool) -> None:
+    """On loopback without keys, and by ipc also where there are some."""
+    config = {"key": keys / "node.key", "allow": (keys / "clients",)} if with_keys else {}
+    control = f"ipc://{tmp_path}/control.ipc" if with_keys else "tcp://127.0.0.1:*"
+    with answering(tmp_path / "run", control=control, **config) as running:
+        with ControlClient(running.connection.control) as asker:
+            assert asker.request("save_model") == "done"
+
+
+def _error(asker: ControlClient, op: str) -> str:
+    try:
+        asker.request(op)
+    except SagsError as error:
+        return str(error)
+    return ""
+
+
+# ---- how often -----------------------------------------------------------------------------------------
+
+
+def test_the_limit_is_above_what_a_node_can_be_asked_for() -> None:
+    assert RATE > MAX_VIEWS * MAX_VIEW_HZ
+    assert BURST > MAX_ANCHORS + MAX_VIEWS
+
+
+def test_a_bucket_gives_its_burst_and_then_its_rate() -> None:
+    now = [7.0]
+    rate = RequestRate(rate=10, burst=5, clock=lambda: now[0])
+    assert [rate.wait(b"a") for _ in range(5)] == [0.0] * 5
+    assert rate.wait(b"a") == pytest.approx(0.1)
+    assert rate.wait(b"b") == 0.0  # another one's is its own
+    now[0] += 0.05
+    assert rate.wait(b"a") == pytest.approx(0.05)  # who was refused has lost nothing
+    taken = 0
+    for _ in range(1000):  # 10 s, asked 100 times a second
+        now[0] += 0.01
+        taken += rate.wait(b"a") == 0.0
+    assert taken == pytest.approx(100, abs=1)
+    now[0] += 100.0
+    assert sum(rate.wait(b"a") == 0.0 for _ in range(20)) == 5  # no more than its burst is ever saved up
+
+
+def test_clients_are_forgotten_when_nothing_is_lost_by_it() -> None:
+    now = [0.0]
+    rate = RequestRate(rate=10, burst=2, clock=lambda: now[0])
+    for number in range(3 * FORGET_ABOVE):
+        now[0] += 0.1  # so that those before it are full again
+        assert rate.wait(b"%d" % number) == 0.0
+        assert len(rate._buckets) <= FORGET_ABOVE
+    assert rate.wait(b"%d" % number) == 0.0 and rate.wait(b"%d" % number) > 0.0
+
+
+@pytest.mark.live
+def test_a_client_that_was_refused_asks_again_by_itself(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sags_node.messaging.control.RequestRate", lambda: RequestRate(rate=20, burst=1))
+    with answering(tmp_path / "run") as running, ControlClient(running.connection.control) as asker:
+        began = time.monotonic()
+        assert [asker.request("pause") for _ in range(5)] == ["done"] * 5
+        assert time.monotonic() - began > 0.19  # four waits of 1/20 s
+        with pytest.raises(SagsError, match=r"requests a second of one client"):
+            asker.request("pause", timeout=0.03)
+
+
+@pytest.mark.live
+@pytest.mark.fault(
+    "socket: flooded with requests",
+    sees="another client is answered as always",
+    says="the answer: `too_often`; `connections`: requests_too_often",
+    back="at once, when the flood ends",
+)
+def test_a_flood_of_requests_does_not_slow_others(tmp_path: Path) -> None:
+    with answering(tmp_path / "run") as running:
+        context, stop = zmq.Context(), threading.Event()
+        flooder = context.socket(zmq.DEALER)
+        flooder.setsockopt(zmq.LINGER, 0)
+        flooder.connect(running.connection.control)
+        answers: list[Any] = []
+
+        def flood() -> None:
+            # What is owed to one client leaves room for the others, too.
+            for _ in range(2 * MAX_PENDING_OF_ONE):
+                flooder.send(msgpack.packb({"v": "1.0", "id": 0, "op": "wait"}))
+            ping = msgpack.packb({"v": "1.0", "id": 1, "op": "ping"})
+            while not stop.is_set():
+                if flooder.poll(1, zmq.POLLOUT):
+                    flooder.send(ping)
+                while flooder.poll(0):
+                    answers.append(msgpack.unpackb(flooder.recv()))
+
+        began = time.monotonic()
+        thread = threading.Thread(target=flood)
+        thread.start()
+        try:
+            until(lambda: running.connections["control"]["requests_too_often"])
+            with ControlClient(running.connection.control) as asker:
+                for _ in range(100):
+                    assert asker.request("pause", timeout=1.0) == "done"
+                with pytest.raises(SagsError, match="no answer"):  # it waits, and is not refused
+                    asker.request("wait", timeout=0.2)
+        finally:
+            stop.set()
+            thread.join()
+            context.destroy(linger=0)
+        served = sum(one["ok"] for one in answers)
+        assert served <= BURST + RATE * (time.monotonic() - began)
+        refused = [one for one in answers if one.get("code") == "too_often"]
+        assert refused and all(0 < one["retry_after_s"] <= 1 / RATE for one in refused)

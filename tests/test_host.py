@@ -1,0 +1,104 @@
+"""What `sags doctor` says of the machine, for machines made of a few files."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from sags_node import doctor, host
+
+
+def made(root: Path, **files: str) -> Path:
+    """A machine with these files; `__` stands for `/`."""
+    for name, content in files.items():
+        file = root / name.replace("__", "/")
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(content)
+    return root
+
+
+@pytest.mark.parametrize(
+    ("files", "cores"),
+    [
+        ({}, None),
+        ({"proc__self__cgroup": "0::/a/b\n", "sys__fs__cgroup__a__b__cpu.max": "max 100000\n"}, None),
+        ({"proc__self__cgroup": "0::/a/b\n", "sys__fs__cgroup__a__b__cpu.max": "150000 100000\n"}, 1.5),
+        (  # the least of those above it
+            {
+                "proc__self__cgroup": "0::/a/b\n",
+                "sys__fs__cgroup__a__b__cpu.max": "400000 100000\n",
+                "sys__fs__cgroup__a__cpu.max": "300000 100000\n",
+            },
+            3.0,
+        ),
+        # in a container, which sees its own group as the root
+        ({"proc__self__cgroup": "0::/outside\n", "sys__fs__cgroup__cpu.max": "50000 100000\n"}, 0.5),
+        (
+            {
+                "proc__self__cgroup": "3:memory:/x\n4:cpu,cpuacct:/x\n",
+                "sys__fs__cgroup__cpu__x__cpu.cfs_quota_us": "250000\n",
+                "sys__fs__cgroup__cpu__x__cpu.cfs_period_us": "100000\n",
+            },
+            2.5,
+        ),
+        (
+            {
+                "proc__self__cgroup": "4:cpu:/x\n",
+                "sys__fs__cgroup__cpu__x__cpu.cfs_quota_us": "-1\n",
+                "sys__fs__cgroup__cpu__x__cpu.cfs_period_us": "100000\n",
+            },
+            None,
+        ),
+    ],
+)
+def test_the_quota_of_control_groups(files: dict[str, str], cores: float | None, tmp_path: Path) -> None:
+    assert host.core_quota(made(tmp_path, **files)) == cores
+
+
+def test_a_quota_below_two_cores_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1, 2, 3})
+    monkeypatch.setattr(os, "cpu_count", lambda: 8)
+    files = {"proc__self__cgroup": "0::/\n", "sys__fs__cgroup__cpu.max": "150000 100000\n"}
+    found = doctor._cores(made(tmp_path, **files))
+    assert found.level == "warning" and "CPUQuota" in found.mend
+    assert "the machine has 8" in found.found and "time of 1.5" in found.found
+    assert doctor._cores(made(tmp_path, **{"sys__fs__cgroup__cpu.max": "200000 100000\n"})).level == "ok"
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0})
+    assert "cpuset" in doctor._cores(tmp_path / "nothing").mend
+
+
+@pytest.mark.parametrize(
+    ("governor", "driver", "level", "said"),
+    [
+        ("performance", "acpi-cpufreq", "ok", "performance"),
+        ("powersave", "acpi-cpufreq", "warning", "powersave"),
+        ("powersave", "intel_pstate", "ok", "balanced"),
+        ("schedutil", "intel_cpufreq", "ok", "schedutil"),
+    ],
+)
+def test_governors(governor: str, driver: str, level: str, said: str, tmp_path: Path) -> None:
+    assert doctor._governor(tmp_path).found == "not told by this machine"
+    folder = "sys__devices__system__cpu__cpu3__cpufreq__"
+    files = {f"{folder}scaling_governor": f"{governor}\n", f"{folder}scaling_driver": f"{driver}\n"}
+    found = doctor._governor(made(tmp_path, **files))
+    assert (found.level, found.found) == (level, said)
+    assert bool(found.mend) == (governor != "performance")
+
+
+@pytest.mark.parametrize(
+    ("free", "swap", "unused", "level", "said"),
+    [
+        (8, 0, 0, "ok", "8.0 GB free, no swap"),
+        (8, 4, 3, "ok", "1.0 of 4.0 GB swap used"),
+        (1, 4, 4, "warning", "1.0 GB free"),
+        (3, 9, 4, "warning", "5.0 of 9.0 GB swap used"),
+    ],
+)
+def test_memory(free: int, swap: int, unused: int, level: str, said: str, tmp_path: Path) -> None:
+    amounts = {"MemAvailable": free, "SwapTotal": swap, "SwapFree": unused}
+    lines = "".join(f"{name}:  {amount * 10**9 // 1024} kB\n" for name, amount in amounts.items())
+    found = doctor._memory(made(tmp_path, proc__meminfo=f"{lines}HugePages_Total:  0\n"))
+    assert found.level == level and said in found.found
+    assert bool(found.mend) == (level == "warning")
