@@ -34,6 +34,7 @@ GLOBAL = {"tf": "/tf", "diagnostics": "/diagnostics"}  # the names by which all 
 BEAT = 1.0  # s between two messages about the bridge itself
 ATTEND = 0.1  # s between looks at who reads
 STALE = 3  # of a diagnostic status
+TWO = "two nodes publish in this graph under one name; stop one of them, or give it another ns"
 PACE = 50e6  # bytes/s: so fast a stock receiver on a loaded machine empties its buffer
 ENOUGH = 4 << 20  # bytes of a receive buffer: with that much a raw picture and depth get through
 
@@ -179,6 +180,7 @@ class Ros2:
         self._missing: dict[str, str] = {}
         self._stages: list[str] = []  # that the node's diagnostics told of last
         self._silent = False
+        self._namesake = False
         self._refused: dict[str, int] = {}
         answers = self.graph.writer(f"/{place.ns}/{ANSWER}", topics.STRING, Delivery(reliable=True, depth=10))
         self._requests = Requests(options.control, place.ns, place.run_dir, place.keys)
@@ -238,7 +240,7 @@ class Ros2:
 
     def _beat(self) -> None:
         """Say how the bridge does, and that the node is silent while it is."""
-        words = "; ".join(dict.fromkeys(self._missing.values()))
+        words = "; ".join(dict.fromkeys([*self._missing.values(), *self._namesakes()]))
         told = [
             cdr.Status(
                 "bridge", 1 if words else 0, words or "all is new", {"topics_read": str(len(self._read))}
@@ -250,6 +252,18 @@ class Ros2:
         self._silent = reason is not None
         now_ns = time.time_ns()
         self._diagnostics.write(_array(told, self._ns, now_ns), now_ns)
+
+    def _namesakes(self) -> list[str]:
+        """Who else publishes what only this node should: readers would get both, one after the other."""
+        own = [
+            name
+            for name in self.graph.publications()
+            if name in self._writers and name not in GLOBAL.values()
+        ]
+        if own and not self._namesake:
+            log.warning("%s: %s", ", ".join(own[:3]), TWO)
+        self._namesake = bool(own)
+        return [TWO] if own else []
 
     def _warn_of_refused(self) -> None:
         for name, writer in self._writers.items():

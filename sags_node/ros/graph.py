@@ -61,13 +61,15 @@ class Graph:
         self._publications: dict[Any, tuple[str, str]] = {}  # by writer: topic and type, in ROS' words
 
     def publications(self) -> dict[str, set[str]]:
-        """The topics that somebody publishes now, and their types."""
+        """The topics that somebody else publishes now, and their types."""
         if self._announced is None:
             from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
 
             self._announced = BuiltinDataReader(self.participant, BuiltinTopicDcpsPublication)
         for said in self._announced.take(4096):
             alive = said.sample_info.instance_state == ALIVE
+            if said.key.bytes in self._written:
+                continue
             if alive and said.topic_name is not None and said.topic_name.startswith("rt/"):
                 self._publications[said.key] = said.topic_name[2:], ros_type(said.type_name)
             elif not alive:

@@ -85,6 +85,33 @@ def test_every_topic_comes_byte_for_byte(tmp_path: Path) -> None:
     assert {"sags: node", "sags: map", "sags: bridge"} <= stages
 
 
+@pytest.mark.fault(
+    "network: two nodes publish under one name in a ROS 2 graph",
+    says="`/diagnostics` of the bridge: `two nodes`; one line in the log",
+    back="a second after one of them has gone",
+)
+def test_a_namesake_in_the_graph_is_said_until_it_goes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(ros2, "BEAT", 0.2)
+
+    def said() -> str:
+        newest = joined.came["/diagnostics"][-1:]
+        return " ".join(status.message for data, _ in newest for status in cdr.decode(data, ARRAY).status)
+
+    with bridged(run_ros2, options(tmp_path)), listener(("/diagnostics", ARRAY)) as joined:
+        until(lambda: "no node" in said().lower())
+        shared = joined.graph.writer("/diagnostics", ARRAY)
+        time.sleep(0.6)  # three beats
+        assert "two nodes" not in said()  # all of ROS may publish there
+        namesake = joined.graph.writer("/sags/left/depth", topics.IMAGE)
+        until(lambda: "two nodes" in said(), 10)
+        del namesake
+        until(lambda: "two nodes" not in said(), 10)
+        del shared
+    assert sum("two nodes" in record.getMessage() for record in caplog.records) == 1
+
+
 def test_only_what_is_read_is_asked_of_the_node(tmp_path: Path) -> None:
     with sockets(tmp_path) as running, stream(running, anchored_at):
         with bridged(run_ros2, options(tmp_path)):

@@ -167,7 +167,7 @@ def test_strangers_are_kept_out(web: int) -> None:
         with pytest.raises(ConnectionClosed):
             joined.send("x" * (LONGEST_MESSAGE + 1))
             next_of(joined, "none", 10)
-    with ExitStack() as open_ones, pytest.raises((OSError, EOFError, InvalidMessage)):
+    with ExitStack() as open_ones, pytest.raises((OSError, EOFError, InvalidMessage, ConnectionClosed)):
         for _ in range(MOST_PEERS + 1):
             open_ones.enter_context(peer(web))
     until(lambda: urllib.request.urlopen(f"http://127.0.0.1:{web}/sags.js").read().startswith(b"//"), 10)
