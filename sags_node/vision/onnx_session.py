@@ -71,6 +71,7 @@ class OnnxSession:
                 f"{setting}.providers: none of {', '.join(config.providers)} is in this ONNX Runtime; add "
                 "cpu, or install onnxruntime-gpu"
             )
+        self.name = path.name
         try:
             self._session = ort.InferenceSession(
                 str(path),
@@ -88,7 +89,6 @@ class OnnxSession:
             raise UsageError(
                 f"{setting}.path: {path} is no ONNX model that can be run: {first_line(error)}"
             ) from None
-        self.name = path.name
         self.processor = "cuda" if "CUDA" in self._session.get_providers()[0] else "cpu"
 
     def run(self, feeds: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
