@@ -1,7 +1,8 @@
 """Vertices and triangles of PLY, OBJ and STL files, points of PLY, PCD and XYZ files; nothing else of them.
 
 Such files come from anywhere. Open3D's readers do not look at the length of a line or at the corners of a
-polygon, and end the process where something is wrong. Here Python and numpy read every number.
+polygon, and end the process where something is wrong. trimesh's draw what came until a file broke off, and a
+vertex 0 of OBJ as the last one. Here Python and numpy read every number, and all must be there.
 """
 
 from __future__ import annotations

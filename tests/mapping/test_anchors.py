@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from flat_scene import Scene, camera_in_front, flat_means, flat_scene
 
 from sags_node.errors import SagsError
 from sags_node.geometry import project
@@ -19,20 +20,13 @@ from sags_node.session import open_session
 from sags_node.sources.source import open_source
 from sags_node.types import (
     AnchorStates,
-    Camera,
     Forecast,
-    Gaussians,
     MotionState,
-    Observation,
-    RenderedView,
-    Snapshot,
 )
 
 WIDTH, HEIGHT, FOCAL, DEPTH = 128, 96, 100.0, 0.08
 CENTRE = (WIDTH - 1) / 2, (HEIGHT - 1) / 2
 PERIOD_NS = 100_000_000
-
-Scene = tuple[Observation, Snapshot, RenderedView]
 
 
 def texture(shift: tuple[int, int] = (0, 0)) -> np.ndarray:
@@ -43,35 +37,11 @@ def texture(shift: tuple[int, int] = (0, 0)) -> np.ndarray:
     return smooth[y : y + HEIGHT, x : x + WIDTH].astype(np.uint8)
 
 
-def plane_means() -> np.ndarray:
-    """Gaussians on a plane, one for every second pixel."""
-    u, v = np.meshgrid(np.arange(0, WIDTH, 2.0), np.arange(0, HEIGHT, 2.0))
-    x, y = (u.ravel() - CENTRE[0]) / FOCAL * DEPTH, (v.ravel() - CENTRE[1]) / FOCAL * DEPTH
-    return np.stack([x, y, np.full(x.size, DEPTH)], 1).astype(np.float32)
-
-
 def scene(frame: int = 0, gray: np.ndarray | None = None, drawn: float = DEPTH) -> Scene:
     """The plane, all of it tissue."""
-    camera = Camera(
-        WIDTH, HEIGHT, np.array([[FOCAL, 0, CENTRE[0]], [0, FOCAL, CENTRE[1]], [0, 0, 1]]), np.eye(4)
-    )
-    shape, stamp, means = (HEIGHT, WIDTH), frame * PERIOD_NS, plane_means()
-    count = len(means)
-    gaussians = Gaussians(
-        means,
-        np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
-        np.full((count, 3), 1e-3, np.float32),
-        np.ones(count, np.float32),
-        np.ones((count, 3), np.float32),
-        np.arange(count),
-    )
-    depth = np.full(shape, drawn, np.float32)
-    image = np.zeros((*shape, 3), np.float32)
-    observation = Observation(
-        frame, stamp, camera, image, texture() if gray is None else gray, np.ones(shape, bool), depth, depth
-    )
-    snapshot = Snapshot(frame, stamp, 0, gaussians, np.zeros_like(means), camera, 0.0)
-    return observation, snapshot, RenderedView(frame, stamp, camera, image, depth, np.ones_like(depth))
+    camera = camera_in_front(WIDTH, HEIGHT, FOCAL)
+    picture = texture() if gray is None else gray
+    return flat_scene(camera, flat_means(camera, DEPTH, 2.0), picture, drawn, frame, frame * PERIOD_NS)
 
 
 def moved(one: Scene, by: np.ndarray, kept: np.ndarray | None = None) -> Scene:
@@ -158,7 +128,7 @@ def test_removed_gaussians_are_replaced_by_their_neighbours() -> None:
     anchors.add_pixel(60, 45, *flat(0))
     start = only(anchors.at(0))[0]
     rng = np.random.default_rng(0)
-    kept = np.ones(len(plane_means()), bool)
+    kept = np.ones(len(scene()[1].gaussians), bool)
     for i in range(1, 12):  # of every Gaussian's kind less than one in three is left at the end
         kept &= rng.uniform(size=len(kept)) > 0.1
         anchors.update(*moved(flat(i), np.array([i * 1e-4, 0, 0]), kept))

@@ -7,17 +7,16 @@ from functools import cache
 import cv2
 import numpy as np
 import pytest
+from flat_scene import Scene, camera_in_front, flat_means, flat_scene
 
 from sags_node.mapping.anchors import Anchors
-from sags_node.types import AnchorStates, Camera, Gaussians, Observation, RenderedView, Snapshot
+from sags_node.types import AnchorStates
 
 WIDTH, HEIGHT, FOCAL, DEPTH = 320, 256, 250.0, 0.08
 CENTRE = np.array([(WIDTH - 1) / 2, (HEIGHT - 1) / 2])
-CAMERA = Camera(WIDTH, HEIGHT, np.array([[FOCAL, 0, CENTRE[0]], [0, FOCAL, CENTRE[1]], [0, 0, 1]]), np.eye(4))
+CAMERA = camera_in_front(WIDTH, HEIGHT, FOCAL)
 AWAY = 10.0  # s
 PINNED = [(100, 100), (160, 128), (200, 150), (150, 180), (220, 90)]
-
-Scene = tuple[Observation, Snapshot, RenderedView]
 
 
 @cache
@@ -49,27 +48,9 @@ def scene(
     onto = moved.copy()
     onto[:, 2] -= moved[:, :2] @ [100.0, 100.0]
     gray = cv2.warpAffine(texture(seed), onto, (WIDTH, HEIGHT), flags=cv2.INTER_AREA)
-    u, v = np.meshgrid(np.arange(0, WIDTH, 3.0), np.arange(0, HEIGHT, 3.0))
-    means = np.stack([(u.ravel() - CENTRE[0]) / FOCAL * depth, (v.ravel() - CENTRE[1]) / FOCAL * depth], 1)
-    means = np.column_stack([means, np.full(u.size, depth)]).astype(np.float32)
-    count = len(means)
-    gaussians = Gaussians(
-        means,
-        np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
-        np.full((count, 3), 1e-3, np.float32),
-        np.ones(count, np.float32),
-        np.ones((count, 3), np.float32),
-        np.arange(count) + (0 if kept else 10**6),
-    )
+    first_id = 0 if kept else 10**6
     stamp = round((1 + seconds) * 1e9)
-    shape = (HEIGHT, WIDTH)
-    surface = np.full(shape, depth, np.float32)
-    image = np.zeros((*shape, 3), np.float32)
-    observation = Observation(
-        0, stamp, CAMERA, image, gray, np.ones(shape, bool), surface, np.ones_like(surface)
-    )
-    snapshot = Snapshot(0, stamp, 0, gaussians, np.zeros_like(means), CAMERA, 0.0)
-    return observation, snapshot, RenderedView(0, stamp, CAMERA, image, surface, np.ones(shape, np.float32))
+    return flat_scene(CAMERA, flat_means(CAMERA, depth, 3.0), gray, depth, 0, stamp, first_id)
 
 
 def follow(anchors: Anchors, *scenes: Scene) -> AnchorStates:

@@ -330,11 +330,13 @@ def _record(run_dir: Path, ending: threading.Event, counts: dict[str, int]) -> N
 
 
 def _said(recorder: subprocess.Popen[str], ending: threading.Event) -> str:
-    """All it prints; it is asked to end when `ending` is set."""
+    """All it prints; it is asked to end, once, when `ending` is set."""
     deadline = time.monotonic() + neighbours.STARTING + RECORDING
+    asked = False
     while time.monotonic() < deadline:
-        if ending.is_set():
+        if ending.is_set() and not asked:
             recorder.terminate()
+            asked = True
         try:
             return recorder.communicate(timeout=0.5)[0]
         except subprocess.TimeoutExpired:

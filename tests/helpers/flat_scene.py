@@ -1,0 +1,49 @@
+"""A flat piece of tissue seen straight on: one frame of it, with a model whose Gaussians lie on it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sags_node.types import Camera, Gaussians, Observation, RenderedView, Snapshot
+
+Scene = tuple[Observation, Snapshot, RenderedView]
+
+
+def camera_in_front(width: int, height: int, focal: float) -> Camera:
+    """A camera without a pose that looks along z, its middle in the middle of the picture."""
+    K = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
+    return Camera(width, height, K, np.eye(4))
+
+
+def flat_means(camera: Camera, depth: float, every: float) -> np.ndarray:
+    """Places [N, 3] m on the plane z = depth, one for each `every` px."""
+    u, v = np.meshgrid(np.arange(0, camera.width, every), np.arange(0, camera.height, every))
+    rays = np.stack([u.ravel(), v.ravel(), np.ones(u.size)], 1) @ np.linalg.inv(camera.K).T
+    return (depth * rays).astype(np.float32)
+
+
+def flat_scene(
+    camera: Camera,
+    means: np.ndarray,
+    gray: np.ndarray,
+    drawn: float,
+    frame: int = 0,
+    stamp_ns: int = 0,
+    first_id: int = 0,
+) -> Scene:
+    """What was seen, the model and what it shows: all of it tissue, at the depth `drawn` (m)."""
+    shape, count = (camera.height, camera.width), len(means)
+    gaussians = Gaussians(
+        means,
+        np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
+        np.full((count, 3), 1e-3, np.float32),
+        np.ones(count, np.float32),
+        np.ones((count, 3), np.float32),
+        np.arange(count) + first_id,
+    )
+    depth = np.full(shape, drawn, np.float32)
+    image = np.zeros((*shape, 3), np.float32)
+    tissue = np.ones(shape, bool)
+    observation = Observation(frame, stamp_ns, camera, image, gray, tissue, depth, depth)
+    snapshot = Snapshot(frame, stamp_ns, 0, gaussians, np.zeros_like(means), camera, 0.0)
+    return observation, snapshot, RenderedView(frame, stamp_ns, camera, image, depth, np.ones_like(depth))
