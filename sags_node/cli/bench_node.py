@@ -18,7 +18,7 @@ from sags_node.cli.launching import (
     table_option,
     write_json,
 )
-from sags_node.errors import UsageError
+from sags_node.errors import SagsError, UsageError
 from sags_node.plotting import check_plots
 from sags_node.terminal.console import progress, show, writing
 
@@ -155,14 +155,25 @@ def bench_endurance(
 @click.command("soak")
 @launch_argument
 @click.option(
-    "--frames", type=click.IntRange(1), default=18_000, show_default=True, help="To be published; 10 minutes."
+    "--frames",
+    type=click.IntRange(1),
+    default=18_000,
+    show_default=True,
+    help="Of the camera, published or left out; 10 minutes.",
 )
 @click.option(
     "--window", type=click.IntRange(2), default=900, show_default=True, help="Frames of a line of the table."
 )
+@click.option(
+    "--check",
+    is_flag=True,
+    help="Fail if a figure gets worse beyond its scatter, by a tenth an hour.",
+)
 @table_option
 @as_json
-def bench_soak(launch: tuple[str, ...], frames: int, window: int, out: Path | None, json_out: bool) -> None:
+def bench_soak(
+    launch: tuple[str, ...], frames: int, window: int, check: bool, out: Path | None, json_out: bool
+) -> None:
     """Whether a live node lasts beside all that uses it.
 
     Runs a node, by default of the built-in phantom, in a process of its own and in real time, with the
@@ -187,6 +198,8 @@ def bench_soak(launch: tuple[str, ...], frames: int, window: int, out: Path | No
         show(soak.table(measured))
         show(soak.statement(measured))
     write_json(out, measured)
+    if check and (worse := soak.worsening(measured)):
+        raise SagsError(f"worse with time: {', '.join(worse)}")
 
 
 @click.command("tracking")

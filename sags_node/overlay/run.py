@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -28,6 +28,7 @@ from sags_node.messaging.received import Received, ReceivedImage, ReceivedText, 
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.overlay import draw as overlay_draw
 from sags_node.overlay.draw import Body, Placed
+from sags_node.overlay.durations import Durations
 from sags_node.overlay.frame import CONFIDENCE, NEEDED, RIGHT_INFO, TISSUE, TissueFrame, tissue_frame
 from sags_node.overlay.held import HeldObject, Pinner
 from sags_node.overlay.mesh import mesh_of
@@ -44,8 +45,7 @@ WAIT_FOR_FRAME = 0.05  # s; also how soon a stale picture is noticed
 WAIT_FOR_REST = 0.05  # s for what belongs to the frame
 PATIENCE = 5.0  # s for the very first frame, before it is said that none comes
 LOOK = 0.1  # s between looks for a node
-REMEMBERED = 54_000  # latencies: half an hour at 30 Hz
-RECENT = 300  # of them are behind the figures in `status`
+RECENT = 300  # durations are behind the figures in `status`
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,8 +140,8 @@ class _Overlay:
         self._right = "nothing received yet"  # why there is no right eye
         self._frames = 0
         self._blanked: Counter[str] = Counter()
-        self._latency_ms: deque[float] = deque(maxlen=REMEMBERED)
-        self._draw_ms: deque[float] = deque(maxlen=REMEMBERED)
+        self._latency_ms = Durations()
+        self._draw_ms = Durations()
         self._freezes = Freezes()  # of what is not blank
 
     def run(self) -> None:
@@ -235,8 +235,8 @@ class _Overlay:
             "frames": self._frames,
             "overlay": self._frames - self._blanked.total(),
             "blanked": dict(self._blanked),
-            "latency_ms": _percentiles(self._latency_ms),
-            "draw_ms": _percentiles(self._draw_ms),
+            "latency_ms": self._latency_ms.percentiles(),
+            "draw_ms": self._draw_ms.percentiles(),
             "freezes": self._freezes.status(),
             "objects": [held.status() for held in self._objects],
             "lost": sum(lost),
@@ -294,9 +294,9 @@ class _Overlay:
             pictures["right"] = overlay_draw.draw(frame, placed, frame.baseline, warnings=warnings)
         ahead = max(held.ahead_s for held in self._objects)
         self._stream.show(pictures, frame.frame_id, frame.stamp_ns, self._epoch, round(ahead * 1e9))
-        self._draw_ms.append(1e3 * (time.perf_counter() - began))
+        self._draw_ms.add(1e3 * (time.perf_counter() - began))
         self._freezes.add(time.monotonic())
-        self._latency_ms.append(1e-6 * (self._node.now_ns() - frame.stamp_ns))
+        self._latency_ms.add(1e-6 * (self._node.now_ns() - frame.stamp_ns))
         return pictures["left"]
 
     def _right_info(self) -> Any:
@@ -326,13 +326,12 @@ class _Overlay:
     # ---- what is said --------------------------------------------------------------------------------------
 
     def _facts(self) -> dict[str, Any]:
-        recent = list(self._latency_ms)[-RECENT:]
         return {
             "frames": self._frames,
             "overlay": self._frames - self._blanked.total(),
             "blanked": dict(self._blanked),
-            "latency_ms": _percentiles(recent),
-            "draw_ms": _percentiles(list(self._draw_ms)[-RECENT:]),
+            "latency_ms": self._latency_ms.percentiles(RECENT),
+            "draw_ms": self._draw_ms.percentiles(RECENT),
             "freezes": self._freezes.status(),
             "max_age": self._options.max_age,
             "clock": None if self._clock is None else self._clock.status(),
@@ -348,11 +347,8 @@ class _Overlay:
         return status.warnings() if isinstance(status, ReceivedText) else {}
 
     def _note(self) -> str:
-        if not self._options.show_latency or not self._latency_ms:
+        recent = self._latency_ms.last(RECENT)
+        if not self._options.show_latency or not len(recent):
             return ""
-        p50, p99 = np.percentile(list(self._latency_ms)[-RECENT:], (50, 99))
-        return f"{self._latency_ms[-1]:.0f} ms (p50 {p50:.0f}, p99 {p99:.0f})"
-
-
-def _percentiles(values: Sequence[float] | deque[float]) -> dict[str, float | None]:
-    return {f"p{q}": round(float(np.percentile(values, q)), 2) if values else None for q in (50, 90, 99)}
+        p50, p99 = np.percentile(recent, (50, 99))
+        return f"{recent[-1]:.0f} ms (p50 {p50:.0f}, p99 {p99:.0f})"

@@ -29,7 +29,9 @@ def test_a_node_and_all_its_neighbours_run_and_are_measured(
     assert result.exit_code == 0, result.output
     measured = json.loads(result.stdout)
     assert json.loads(out.read_text()) == {"provenance": ANY} | measured
-    assert [window["frames"] for window in measured["windows"]] == [10, 20, 30, 40, 50]
+    ends = [window["frames"] for window in measured["windows"]]  # with those that the node left out
+    assert len(ends) == 5 and all(end >= due for end, due in zip(ends, range(10, 51, 10), strict=True))
+    assert measured["published"] + measured["dropped"] == measured["frames"] >= 50
     for window in measured["windows"]:
         assert 0 < window["latency_p50_ms"] <= window["latency_p99_ms"]
         assert 20 < window["psnr"] < 60

@@ -29,7 +29,7 @@ from rich.table import Table
 
 from sags_node.benchmark.node import neighbours
 from sags_node.benchmark.node.crowd import Advance, node_beside
-from sags_node.benchmark.node.endurance import slope, trends
+from sags_node.benchmark.node.endurance import SIGNIFICANT, slope, trends
 from sags_node.errors import SagsError
 from sags_node.evaluation.machine import machine_name
 from sags_node.evaluation.metrics import psnr
@@ -61,12 +61,17 @@ HEADINGS = (
 )  # fmt: skip
 
 
+WORSE_WHEN_LESS = ("frames_per_s", "psnr")  # of `FIGURES`; the others are worse when they grow
+AN_HOUR = 108_000  # frames of the camera
+TOLERATED = 0.1  # of a figure's mean, in an hour
+
+
 @dataclass(frozen=True, slots=True)
 class Window:
-    """Some thousand frames in a row."""
+    """Some thousand frames of the camera in a row."""
 
-    frames: int  # published up to its end
-    frames_per_s: float
+    frames: int  # of the camera up to its end
+    frames_per_s: float  # published
     latency_p50_ms: float
     latency_p99_ms: float
     psnr: float  # dB over tissue, median of the pictures that were compared; NaN: none
@@ -89,6 +94,11 @@ class _Heard:
     _first: Meta | None = None
     _last: Meta | None = None
 
+    @property
+    def taken(self) -> int:
+        """Frames of the camera: those that were published, and those that the node left out."""
+        return len(self.latency_ms) + self.dropped
+
     def add(self, message: Message) -> None:
         meta = message.meta
         self._first = self._first or meta
@@ -102,12 +112,12 @@ class _Heard:
 
 
 def measure_soak(launch: Sequence[str], frames: int, per_window: int, advance: Advance) -> dict[str, Any]:
-    """Run a node live until it has published so many frames. Ctrl-C ends it with what is known by then.
+    """Run a node live for so many frames of its camera. Ctrl-C ends it with what is known by then.
 
     Args:
         launch: launch file and overrides of the node.
-        frames: to be published after the first seconds.
-        per_window: frames of one line of the table.
+        frames: of the camera after the first seconds, published or left out.
+        per_window: of them, for one line of the table.
         advance: called with what is going on.
 
     Returns:
@@ -127,15 +137,19 @@ def measure_soak(launch: Sequence[str], frames: int, per_window: int, advance: A
         visits = stack.enter_context(_visitors(run_dir))
         recordings = stack.enter_context(_recordings(run_dir))
         quality: list[float] = []
+        shown = 0  # up to the last window
         try:
-            for count in _frames(run_dir, node, heard):
-                if count % max(1, per_window // COMPARED) == 0:
+            for _ in _frames(run_dir, node, heard):
+                taken = min(heard.taken, frames)
+                advance(taken, frames, "running")
+                in_window = taken - per_window * len(windows)
+                if in_window * COMPARED >= per_window * (len(quality) + 1):
                     quality.append(_compared(run_dir))
-                if count % per_window == 0:
-                    windows.append(_window(heard, per_window, quality, node.pid, overlay, viewer))
+                if in_window >= per_window:
+                    windows.append(_window(heard, shown, quality, node.pid, overlay, viewer))
+                    shown = len(heard.latency_ms)
                     quality.clear()
-                advance(count, frames, "running")
-                if count == frames:
+                if taken == frames:
                     break
         except KeyboardInterrupt:
             interrupted = True
@@ -154,8 +168,8 @@ def measure_soak(launch: Sequence[str], frames: int, per_window: int, advance: A
     }
 
 
-def _frames(run_dir: Path, node: subprocess.Popen[bytes], heard: _Heard) -> Iterator[int]:
-    """Each published frame after the first seconds is added to `heard`; how many those are now."""
+def _frames(run_dir: Path, node: subprocess.Popen[bytes], heard: _Heard) -> Iterator[None]:
+    """Each published frame after the first seconds is added to `heard`."""
     begun = last = time.monotonic()
     messages = listen((EACH_FRAME,), None, neighbours.NS, None, run_dir=run_dir, high_water=HIGH_WATER)
     with closing(messages):
@@ -171,7 +185,7 @@ def _frames(run_dir: Path, node: subprocess.Popen[bytes], heard: _Heard) -> Iter
             if now - begun < WARM_UP:
                 continue
             heard.add(arrived[0])
-            yield len(heard.latency_ms)
+            yield
 
 
 def _compared(run_dir: Path) -> float:
@@ -188,14 +202,15 @@ def _compared(run_dir: Path) -> float:
 
 
 def _window(
-    heard: _Heard, count: int, quality: Sequence[float], node: int, overlay: int, viewer: int | None
+    heard: _Heard, since: int, quality: Sequence[float], node: int, overlay: int, viewer: int | None
 ) -> Window:
-    p50, p99 = np.percentile(heard.latency_ms[-count:], [50, 99])
+    """Of the frames that were published after the first `since`."""
+    p50, p99 = np.percentile(heard.latency_ms[since:], [50, 99])
     known = [each for each in quality if not np.isnan(each)]
-    moments = heard.published[-count:]
+    moments = heard.published[max(0, since - 1) :]
     return Window(
-        frames=len(heard.latency_ms),
-        frames_per_s=(count - 1) / (moments[-1] - moments[0]),
+        frames=heard.taken,
+        frames_per_s=(len(moments) - 1) / (moments[-1] - moments[0]),
         latency_p50_ms=float(p50),
         latency_p99_ms=float(p99),
         psnr=float(np.median(known)) if known else float("nan"),
@@ -212,7 +227,8 @@ def _overall(heard: _Heard) -> dict[str, Any]:
         raise SagsError("stopped before the first frame that counts")
     p50, p99, p999 = np.percentile(heard.latency_ms, [50, 99, 99.9])
     return {
-        "frames": len(heard.latency_ms),
+        "frames": heard.taken,
+        "published": len(heard.latency_ms),
         "seconds": heard.published[-1] - heard.published[0],
         "latency_ms": {
             "p50": float(p50),
@@ -344,15 +360,45 @@ def _said(recorder: subprocess.Popen[str], ending: threading.Event) -> str:
     return ""
 
 
+def worsening(measured: Mapping[str, Any]) -> list[str]:
+    """The figures that get worse beyond their scatter, by more than `TOLERATED` an hour.
+
+    Args:
+        measured: as `measure_soak` returns it.
+
+    Returns:
+        Names of `FIGURES`.
+
+    Raises:
+        SagsError: there are too few windows to tell.
+    """
+    found = []
+    for figure, trend in measured["per_1000_frames"].items():
+        if trend is None:
+            raise SagsError("too few windows to tell a trend: at least four are needed")
+        worse = -trend["slope"] if figure in WORSE_WHEN_LESS else trend["slope"]
+        mean = np.nanmean([window[figure] for window in measured["windows"]])
+        if worse > SIGNIFICANT * trend["standard_error"] and worse * AN_HOUR / 1000 > TOLERATED * mean:
+            found.append(figure)
+    return found
+
+
 # ---- what is told ----------------------------------------------------------------------------------------
 
 
 def table(measured: Mapping[str, Any]) -> Table:
     """For people; `measured` as `measure_soak` returns it."""
-    made = Table("frames", *HEADINGS, title=f"{measured['frames']} frames in {measured['seconds']:.0f} s")
+    made = Table("frames", *HEADINGS, title=_title(measured))
     for row in measured["windows"]:
         made.add_row(str(row["frames"]), *(_figure(row[figure]) for figure in FIGURES))
     return made
+
+
+def _title(measured: Mapping[str, Any]) -> str:
+    return (
+        f"{measured['frames']} frames of the camera in {measured['seconds']:.0f} s, "
+        f"{measured['published']} published"
+    )
 
 
 def _figure(value: float | None) -> str:
