@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from sags_node.messaging import cdr, topics
 from sags_node.messaging.received import Received, ReceivedImage
+from sags_node.picture_file import PNG
 from sags_node.recording.pictures import encode_file
 from sags_node.types import F32, U8
 
@@ -27,7 +28,6 @@ STEPS = (0.02e-3, 0.04e-3, 0.08e-3, 0.16e-3, 0.32e-3)  # m at `USUAL` that one c
 USUAL = 0.1  # m, of tissue
 FARTHEST = 10.0  # m; what is farther is unknown
 LEVELS = (256, 64, 16, 8)  # of confidence
-PNG_OPTIONS = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE)
 _INVERSE_DEPTH = 0  # the form of a depth PNG, the only one that ROS has
 
 Pack = Callable[[NDArray[Any]], tuple[bytes, str]]  # the file, and what it is in the words of ROS
@@ -86,7 +86,7 @@ def _jpeg(picture: U8, quality: int) -> tuple[bytes, str]:
 
 def _exact(picture: U8) -> tuple[bytes, str]:
     encoding = "mono8" if picture.ndim == 2 else "rgba8"
-    return encode_file(picture, encoding, "png", PNG_OPTIONS), cdr.file_form(encoding, "png")
+    return encode_file(picture, encoding, "png", PNG), cdr.file_form(encoding, "png")
 
 
 def _confidence(sure: F32, levels: int) -> tuple[bytes, str]:
@@ -105,5 +105,5 @@ def _depth(z: F32, step: float) -> tuple[bytes, str]:
     with np.errstate(divide="ignore", invalid="ignore"):
         counts = a / z + b
     known = (z > 0) & (counts >= 1) & (counts < 65535.5)  # no comparison with NaN holds
-    file = encode_file(np.where(known, counts + 0.5, 0).astype(np.uint16), "mono16", "png", PNG_OPTIONS)
+    file = encode_file(np.where(known, counts + 0.5, 0).astype(np.uint16), "mono16", "png", PNG)
     return struct.pack("<iff", _INVERSE_DEPTH, a, b) + file, "32FC1; compressedDepth png"

@@ -14,13 +14,13 @@ from sags_node.errors import SagsError
 from sags_node.messaging import cdr, topics
 from sags_node.messaging.topics import CAMERA_INFO, IMAGE
 from sags_node.messaging.wire import PROTOCOL, Message, WireError
+from sags_node.picture_file import PNG
 from sags_node.recording.backlog import Arrived
 from sags_node.recording.bag_writer import NO_LIMITS, BagWriter, Limits
 from sags_node.recording.pictures import encode_file, read_eye
 
 Compression = Literal["none", "jpeg", "png"]
 JPEG_QUALITY = 92
-PNG_LEVEL = 1
 _COMPRESSIBLE = ("rgb8", "rgba8", "mono8")
 
 
@@ -93,13 +93,9 @@ class MessageWriter:
 def _compressed(message: Message, data: bytes, form: str) -> bytes:
     """The CDR of the compressed picture."""
     encoding = message.meta.encoding
-    quality = (
-        (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY)
-        if form == "jpeg"
-        else (cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL)
-    )
+    options = (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY) if form == "jpeg" else PNG
     try:
-        file = encode_file(message.array(), encoding, form, quality)
+        file = encode_file(message.array(), encoding, form, options)
     except SagsError as error:
         raise WireError(f"{message.topic}: {error}") from None
     header = cdr.decode(data, IMAGE).header

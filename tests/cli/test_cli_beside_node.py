@@ -120,7 +120,7 @@ def test_topic_tools_in_words_and_in_json(beside_node: dict[str, Any]) -> None:
     assert "sags/left/depth" in sags("topic", "list", *listen).stdout
     for tool, key, unit in (
         ("hz", "average_rate", " Hz"),
-        ("bw", "bytes_per_s", "MB/s"),
+        ("bw", "bytes_per_s", "B/s from"),
         ("delay", "min_s", " ms"),
     ):
         command = ("topic", tool, "left/depth", *listen)

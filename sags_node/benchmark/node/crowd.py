@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import multiprocessing
-import os
 import subprocess
 import sys
 import tempfile
@@ -20,7 +19,7 @@ import numpy as np
 import zmq
 from rich.table import Table
 
-from sags_node.benchmark.node.neighbours import LOWEST_PRIORITY, everything
+from sags_node.benchmark.node.neighbours import everything, give_way
 from sags_node.errors import SagsError
 from sags_node.evaluation.metrics import percentiles
 from sags_node.messaging.address import connect, find_data
@@ -145,7 +144,7 @@ def _peers(folder: Path, work: Mapping[str, Work]) -> Iterator[Callable[[], dict
 
 def _with_what_is_left(work: Task, *arguments: Any) -> None:
     """Work at the lowest priority: a subscriber stands for another machine."""
-    os.nice(LOWEST_PRIORITY)
+    give_way()
     work(*arguments)
 
 

@@ -27,7 +27,6 @@ from sags_node.messaging.stream import MAX_MESSAGE_BYTES
 from sags_node.processes import end
 
 NS = "sags"
-LOWEST_PRIORITY = 19
 STARTING = 60.0  # s for a process to be ready
 STOPPING = 5.0  # s for one to end
 BROWSERS = "chromium", "chromium-browser", "google-chrome"
@@ -81,11 +80,8 @@ def viewer(run_dir: Path) -> Iterator[int]:
         url = json.loads(said)["url"]
         profile = f"--user-data-dir={run_dir.parent}/browser"
         page = [browser, "--headless=new", "--no-sandbox", "--disable-gpu", profile, url]
-        shown = Popen(
-            ["nice", "-n", str(LOWEST_PRIORITY), *page],
-            stdout=DEVNULL,
-            stderr=DEVNULL,
-        )
+        # Not `nice`: the process of Chromium that draws takes a high priority again, where it may.
+        shown = Popen(["chrt", "--idle", "0", *page], stdout=DEVNULL, stderr=DEVNULL)
         yield process.pid
         _still_runs(process, "viewer")
     finally:
@@ -115,7 +111,7 @@ def reader(run_dir: Path) -> Iterator[None]:
 
 def _read(run_dir: str) -> None:
     """Take everything that the node in this run directory sends, as fast as it comes."""
-    os.nice(LOWEST_PRIORITY)
+    give_way()
     folder, parent = Path(run_dir), multiprocessing.parent_process()
     while parent is not None and parent.is_alive():
         if not connection_path(folder, NS).exists():
@@ -125,6 +121,11 @@ def _read(run_dir: str) -> None:
             while parent.is_alive():
                 if socket.poll(100):
                     socket.recv_multipart(copy=False)
+
+
+def give_way() -> None:
+    """Let this process have only what others leave of the cores, as if it ran on another machine."""
+    os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
 
 
 def find_browser() -> str | None:

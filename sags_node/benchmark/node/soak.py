@@ -271,7 +271,7 @@ def _visitors(run_dir: Path) -> Iterator[Callable[[], dict[str, int]]]:
 
 def _visit(run_dir: Path, ending: Event, there: Connection) -> None:
     there.send(None)  # it runs
-    os.nice(neighbours.LOWEST_PRIORITY)
+    neighbours.give_way()
     counted = [{"visits": 0, "pictures": 0} for _ in range(SUBSCRIBERS)]
     working = [
         threading.Thread(target=_come_and_go, args=(run_dir, ending, random.Random(seed), counts))
