@@ -318,6 +318,7 @@ def test_strangers_are_cut_off_and_disturb_nobody(tmp_path: Path, program: Path)
     damaged = large[:42] + (40).to_bytes(8, "big") + bytes(8) + b"\xff" * 40  # its CRC is wrong
     with sockets(tmp_path) as running, stream(running, anchored_at):
         with bridged(run_openigtlink, options(tmp_path)) as port, peer(program, port) as joined:
+            until(lambda: joined.came)  # it has its place
             for attack in (
                 b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nOrigin: http://evil.example\r\n\r\n",
                 large,

@@ -22,6 +22,7 @@ from sags_node.export import scene as export_scene
 from sags_node.export import surface as export_surface
 from sags_node.export.orbit import orbit
 from sags_node.export.scene import Scene, from_node, from_session
+from sags_node.fitting import start
 from sags_node.geometry import project, unproject
 from sags_node.messaging.control import ControlClient
 from sags_node.messaging.received import ReceivedImage, TopicName
@@ -272,7 +273,10 @@ def test_a_running_node_is_exported_as_it_is_now(
     refused(1, "export", "--mesh", tmp_path / "none.ply", said=("no node runs as 'sags'",))
 
 
-def test_a_fit_is_exported_at_any_time(phantom_session: Path, phantom: Phantom, tmp_path: Path) -> None:
+def test_a_fit_is_exported_at_any_time(
+    phantom_session: Path, phantom: Phantom, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(start, "PATH_STEPS", 600)  # ten frames are learnt sooner than a clip
     session = (phantom_session, "source.frames:=10")
     small = ("--iterations", "3", "--max-gaussians", "6000")
     done = sags("fit", *session, "--out", tmp_path / "fit", *small, "--json")
