@@ -164,9 +164,10 @@ def slope(windows: Sequence[Any], figure: str) -> dict[str, float] | None:
     x = np.array([window.frames for window in counted]) / 1000
     y = np.array([getattr(window, figure) for window in counted], np.float64)
     x -= x.mean()
+    y -= y.mean()  # what never changes has a slope of zero, not of the last bit
     spread = float(np.sum(x * x))
     per_1000 = float(np.sum(x * y)) / spread
-    residuals = y - y.mean() - per_1000 * x
+    residuals = y - per_1000 * x
     error = math.sqrt(float(np.sum(residuals * residuals)) / (len(y) - 2) / spread)
     return {"slope": per_1000, "standard_error": error}
 
