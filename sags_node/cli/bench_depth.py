@@ -32,6 +32,12 @@ FAULT_FRAMES = 4
     help="One pair of the Open-CAS set against its CT surface, instead of a recording.",
 )
 @click.option("--faults", is_flag=True, help="The phantom with noise, blur, smoke and highlights rising.")
+@click.option(
+    "--network",
+    type=click.Path(path_type=Path, dir_okay=False, exists=True),
+    metavar="FILE.onnx",
+    help="A depth network to compare as well.",
+)
 @table_option
 @file_option("--picture", "FILE.jpg", "With --ct: draw the left picture, the depth and its error.")
 @as_json
@@ -39,13 +45,15 @@ def bench_depth(
     launch: tuple[str, ...],
     ct: Path | None,
     faults: bool,
+    network: Path | None,
     out: Path | None,
     picture: Path | None,
     json_out: bool,
 ) -> None:
     """How right the depth is, and how much there is of it.
 
-    The stereo stage with both methods at every scale, beside OpenCV's SGBM as its own sample sets it up.
+    The stereo stage with both methods at every scale, beside OpenCV's SGBM as its own sample sets it up, and
+    a network where one is given.
     Median, 90th percentile and median signed error (below 0: too near), the share of the tissue that has a
     depth, the time of one pair, and whether the confidence orders the errors.
 
@@ -56,6 +64,7 @@ def bench_depth(
     sags bench depth launch/d4d_pull.yaml --out benchmarks/results/depth_d4d.json
     sags bench depth --ct $SAGS_DATA/tmi_ct_pair --out benchmarks/results/depth_tmi.json
     sags bench depth --faults --out benchmarks/results/depth_phantom.json
+    sags bench depth launch/d4d_pull.yaml --network stereo.onnx
     """
     from sags_node.benchmark.quality import depth, depth_ct, depth_report
 
@@ -67,19 +76,19 @@ def bench_depth(
     if ct is not None:
         pair = depth_ct.read_ct_pair(ct)
         with progress("measuring") as advance:
-            measured = depth_ct.measure_ct(pair, advance)
+            measured = depth_ct.measure_ct(pair, advance, network)
         if picture is not None:
             with writing(picture):
                 picture.write_bytes(depth_ct.picture(pair))
     elif faults:
         with progress("measuring") as advance:
-            measured = depth.measure_faults(FAULT_SIZE, FAULT_FRAMES, depth.FAULTS, advance)
+            measured = depth.measure_faults(FAULT_SIZE, FAULT_FRAMES, depth.FAULTS, advance, network)
     else:
         no_cameras = "sags bench depth needs a recording with reference depth; live cameras have none"
         path, overrides = split_recording(launch, no_cameras)
         session = open_launched(path, [*overrides, "source.loop:=false", "source.pace:=step"])
         with progress("playing") as advance:
-            measured = depth.measure_recording(session, advance)
+            measured = depth.measure_recording(session, advance, network=network)
     for table in [measured] if json_out else depth_report.tables(measured):
         show(table)
     write_json(out, measured)
