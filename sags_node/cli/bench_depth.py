@@ -17,6 +17,7 @@ from sags_node.cli.launching import (
     write_json,
 )
 from sags_node.errors import UsageError
+from sags_node.plotting import check_plots
 from sags_node.terminal.console import progress, show, writing
 
 FAULT_SIZE = (640, 512)  # px
@@ -40,6 +41,7 @@ FAULT_FRAMES = 4
 )
 @table_option
 @file_option("--picture", "FILE.jpg", "With --ct: draw the left picture, the depth and its error.")
+@file_option("--plot", "FILE.png", "Draw the errors over run time; not with --faults.")
 @as_json
 def bench_depth(
     launch: tuple[str, ...],
@@ -48,6 +50,7 @@ def bench_depth(
     network: Path | None,
     out: Path | None,
     picture: Path | None,
+    plot: Path | None,
     json_out: bool,
 ) -> None:
     """How right the depth is, and how much there is of it.
@@ -66,13 +69,17 @@ def bench_depth(
     sags bench depth --faults --out benchmarks/results/depth_phantom.json
     sags bench depth launch/d4d_pull.yaml --network stereo.onnx
     """
-    from sags_node.benchmark.quality import depth, depth_ct, depth_report
+    from sags_node.benchmark.quality import depth, depth_ct, depth_plot, depth_report
 
     if (ct is not None) + faults + bool(launch) > 1:
         raise UsageError("a recording, --ct or --faults: give one of them")
     if picture is not None and ct is None:
         raise UsageError("--picture draws what --ct measures; add --ct FOLDER")
-    check_files(out, picture)
+    if plot is not None:
+        if faults:
+            raise UsageError("--plot draws one scene; leave --faults out")
+        check_plots()
+    check_files(out, picture, plot)
     if ct is not None:
         pair = depth_ct.read_ct_pair(ct)
         with progress("measuring") as advance:
@@ -89,6 +96,9 @@ def bench_depth(
         session = open_launched(path, [*overrides, "source.loop:=false", "source.pace:=step"])
         with progress("playing") as advance:
             measured = depth.measure_recording(session, advance, network=network)
+    if plot is not None:
+        with writing(plot):
+            plot.write_bytes(depth_plot.picture(measured))
     for table in [measured] if json_out else depth_report.tables(measured):
         show(table)
     write_json(out, measured)

@@ -6,9 +6,10 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from onnx_networks import save_matcher
 from places import SESSION
 
-from sags_node.benchmark.quality import depth_report
+from sags_node.benchmark.quality import depth_plot, depth_report
 from sags_node.benchmark.quality.depth import (
     MODEL,
     Comparison,
@@ -197,6 +198,8 @@ def test_a_recording_with_exact_depth() -> None:
     medians = [row["median_mm"] for row in measured["confidence"]]
     assert medians == sorted(medians, reverse=True)
     assert [table.row_count for table in depth_report.tables(measured)] == [len(rows), 4]
+    drawn = cv2.imdecode(np.frombuffer(depth_plot.picture(measured), np.uint8), cv2.IMREAD_COLOR)
+    assert drawn is not None and drawn.std() > 5
 
 
 def test_a_recording_without_truth_is_named() -> None:
@@ -205,11 +208,17 @@ def test_a_recording_without_truth_is_named() -> None:
         measure_recording(open_session(SESSION, overrides), silent)
 
 
-def test_faults_make_depth_worse() -> None:
-    measured = measure_faults((256, 192), 1, {"noise": (0.0, 0.08), "gloss": (0.0, 64.0)}, silent)
+def test_faults_make_depth_worse(tmp_path: Path) -> None:
+    network = save_matcher(tmp_path / "blocks.onnx")
+    faults = {"noise": (0.0, 0.08), "gloss": (0.0, 64.0)}
+    measured = measure_faults((256, 192), 1, faults, silent, network)
     clean, noisy, dull, shiny = measured["faults"]
     assert noisy["settings"][0]["median_mm"] > 1.3 * clean["settings"][0]["median_mm"]
     assert dull["white"] < 0.001 and shiny["white"] > 0.01
+    blocks = clean["settings"][-1]
+    assert blocks["name"] == "network blocks.onnx"
+    assert blocks["coverage"] > 0.5
+    assert 0 < blocks["median_mm"] < 3.3  # half a px of disparity at 80 mm, 230 px and 4.3 mm
     assert [made.row_count for made in depth_report.tables(measured)] == [1 + len(clean["settings"])] * 2
 
 
@@ -299,6 +308,7 @@ def test_real_tissue_against_its_ct_surface(data_folder: Path) -> None:
     [
         (["--picture", "a.jpg"], "add --ct FOLDER"),
         (["launch/phantom.yaml", "--faults"], "give one of them"),
+        (["--faults", "--plot", "a.png"], "leave --faults out"),
         (["launch/v4l2.yaml"], "live cameras have none"),
     ],
 )
