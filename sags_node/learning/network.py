@@ -18,6 +18,7 @@ SHIFTS = 16  # disparities that are searched, of COARSEST px each: 0 to 120 px
 REACH = (3, 2)  # px of a refinement's own picture, to both sides
 SECOND, FOURTH, EIGHTH = 16, 24, 32  # channels of the features
 HIDDEN = 8  # channels from one refinement to the next
+SHARPNESS = 20.0  # of a choice among likenesses of -1..1, before it is learnt
 EVEN_WINDOW = 15  # px: brightness and contrast that are even over it do not count
 NOISE = 0.01  # of white: contrast below it is noise
 WINDOWS = (13, 9, 9)  # px, of the steps on the pictures
@@ -34,8 +35,8 @@ class StereoNetwork(nn.Module):
         self.search = _Search()
         self.fourth = _Refinement(FOURTH, EIGHTH, 32, REACH[0])
         self.second = _Refinement(SECOND, HIDDEN, 16, REACH[1])
-        self.finest = nn.Conv2d(HIDDEN, 9 * 4, 1)
-        self.trust = nn.Conv2d(HIDDEN, 2, 1)
+        self.finest = _silent(nn.Conv2d(HIDDEN, 9 * 4, 1))
+        self.trust = _silent(nn.Conv2d(HIDDEN, 2, 1))
 
     def forward(self, left: Tensor, right: Tensor) -> Tensor:
         """Disparity [B, 1, H, W] (px) of pictures [B, 3, H, W] (RGB, 0..1)."""
@@ -73,7 +74,7 @@ class _Features(nn.Module):
     def forward(self, pictures: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         second = self.second(pictures)
         fourth = self.fourth(second)
-        return second, fourth, self.eighth(fourth)
+        return _unit(second), _unit(fourth), _unit(self.eighth(fourth))
 
 
 class _Search(nn.Module):
@@ -84,9 +85,9 @@ class _Search(nn.Module):
         self.mix = nn.Sequential(
             _conv(SHIFTS + EIGHTH, 48), _conv(48, 48, dilation=2), _conv(48, 48, dilation=4), _conv(48, 48)
         )
-        self.score = nn.Conv2d(48, SHIFTS, 3, padding=1)
+        self.score = _silent(nn.Conv2d(48, SHIFTS, 3, padding=1))
         self.hidden = nn.Conv2d(48, EIGHTH, 1)
-        self.sharpness = nn.Parameter(torch.tensor(4.0))
+        self.sharpness = nn.Parameter(torch.tensor(SHARPNESS))
 
     def forward(self, left: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
         alike = _likeness(left, functional.pad(right, (SHIFTS - 1, 0, 0, 0)), SHIFTS)
@@ -104,9 +105,9 @@ class _Refinement(nn.Module):
         self.mix = nn.Sequential(
             _conv(2 * reach + 1 + channels + before + 1, width), _conv(width, width, dilation=2)
         )
-        self.score = nn.Conv2d(width, 2 * reach + 1, 3, padding=1)
+        self.score = _silent(nn.Conv2d(width, 2 * reach + 1, 3, padding=1))
         self.hidden = nn.Conv2d(width, HIDDEN, 1)
-        self.sharpness = nn.Parameter(torch.tensor(4.0))
+        self.sharpness = nn.Parameter(torch.tensor(SHARPNESS))
 
     def forward(self, left: Tensor, right: Tensor, coarse: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
         begin = 2 * functional.interpolate(coarse, scale_factor=2.0, mode="bilinear", align_corners=False)
@@ -127,6 +128,20 @@ def _conv(inputs: int, outputs: int, stride: int = 1, dilation: int = 1) -> nn.S
 def _block(inputs: int, outputs: int) -> nn.Sequential:
     """Half of the size; the last layer has no bend, so that likeness may be of either sign."""
     return nn.Sequential(_conv(inputs, outputs, stride=2), nn.Conv2d(outputs, outputs, 3, padding=1))
+
+
+def _silent(conv: nn.Conv2d) -> nn.Conv2d:
+    """One that says nothing yet: until it learns, likeness alone decides."""
+    nn.init.zeros_(conv.weight)
+    assert conv.bias is not None  # as all of them here
+    nn.init.zeros_(conv.bias)
+    return conv
+
+
+def _unit(features: Tensor) -> Tensor:
+    """Centred, and of mean square 1 over the channels: their mean product is a likeness of -1..1."""
+    features = features - features.mean((2, 3), keepdim=True)
+    return features * torch.rsqrt((features * features).mean(1, keepdim=True) + 1e-6)
 
 
 def _likeness(left: Tensor, right: Tensor, count: int) -> Tensor:
@@ -217,6 +232,7 @@ def _step(
     seen = _seen(right, disparity)
     off = left[:, :1] - seen[:, :1]
     slope = (left[:, 1:] + seen[:, 1:]) / 2
-    trusted = weight / (1 + off * off)
+    columns = torch.arange(disparity.shape[3], dtype=disparity.dtype, device=disparity.device)
+    trusted = weight * (columns >= disparity).to(disparity.dtype) / (1 + off * off)
     down, up = _mean(trusted * slope * off, window), _mean(trusted * slope * slope, window)
     return disparity - (down / (up + 0.01 * doubt)).clamp(-LARGEST_STEP, LARGEST_STEP)

@@ -25,7 +25,7 @@ WARM_UP = 100  # steps, in which it rises
 LARGEST_GRADIENT = 1.0
 SAVE_EVERY = 100  # steps
 SHARPNESS = 0.1  # px: below it an error counts as its square
-STAGE_WEIGHT = 0.8  # of a stage, over that of the next one
+STAGE_WEIGHT = 0.9  # of a stage, over that of the next one
 SLOPE_WEIGHT = 0.5  # of errors of the slope: smooth surfaces are wanted
 HELD_OUT = 2**32 - 1  # the random stream of pairs that are never trained on
 
@@ -63,7 +63,8 @@ def loss(stages: Sequence[Tensor], truth: Tensor) -> Tensor:
     total = truth.new_zeros(())
     for place, found in enumerate(reversed(stages)):
         off = functional.interpolate(found, truth.shape[2:], mode="bilinear", align_corners=False) - truth
-        value = _mean(torch.sqrt(off**2 + SHARPNESS**2) - SHARPNESS, known)
+        share = found.shape[3] / truth.shape[3]  # coarse errors count in coarse px
+        value = share * _mean(torch.sqrt(off**2 + SHARPNESS**2) - SHARPNESS, known)
         if place == 0:
             bend = off[..., 1:] - off[..., :-1]
             value = value + SLOPE_WEIGHT * _mean(bend.abs().clamp(max=1), level)

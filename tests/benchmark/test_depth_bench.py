@@ -28,6 +28,7 @@ from sags_node.benchmark.quality.depth_ct import (
     picture,
     read_ct_pair,
 )
+from sags_node.benchmark.quality.depth_eyes import differences, measure_eyes, mirrored
 from sags_node.cli.main import main
 from sags_node.config import StereoConfig
 from sags_node.errors import SagsError, UsageError
@@ -222,6 +223,38 @@ def test_faults_make_depth_worse(tmp_path: Path) -> None:
     assert [made.row_count for made in depth_report.tables(measured)] == [1 + len(clean["settings"])] * 2
 
 
+# ---- both eyes against each other ------------------------------------------------------------------------
+
+
+def test_eyes_that_see_one_surface_agree() -> None:
+    plane = np.full((HEIGHT, WIDTH), 12.0, np.float32)
+    assert np.nanmax(differences(plane, plane)) == 0
+    assert np.isnan(differences(plane, plane)[:, :12]).all()  # what the right eye does not see
+    np.testing.assert_allclose(differences(plane, plane + 1.5)[:, 12:], 1.5)
+    assert np.isnan(differences(plane, 0 * plane)).all()
+
+
+def test_a_pair_in_a_mirror_has_the_right_eyes_depth() -> None:
+    """The left disparity d of a point at x is that of the right picture at x - d."""
+    pair, _ = shown_pair(slanted())
+    everywhere = StereoDepth(StereoConfig(), CAMERA, BASELINE)
+    depth, _ = everywhere(mirrored(pair), ALL)
+    found = np.divide(FOCAL * BASELINE, depth, where=depth > 0, out=0 * depth)[:, ::-1]
+    known = (found > 0) & (np.arange(WIDTH) < WIDTH - 40)
+    assert known.mean() > 0.7
+    assert np.median(np.abs(found - slanted())[known]) < 0.1
+
+
+def test_a_recording_without_truth_is_measured_by_both_eyes() -> None:
+    overrides = ["source.pace:=step", "source.loop:=false", "source.frames:=1"]
+    measured = measure_eyes(open_session(SESSION, overrides), silent)
+    rows = {row["name"]: row for row in measured["settings"]}
+    assert measured["frames"] == 1
+    assert rows["as configured"]["median_px"] < rows["plain SGBM, scale 2"]["median_px"]
+    assert rows["as configured"]["agree"] > 0.7
+    assert [table.row_count for table in depth_report.tables(measured)] == [len(rows)]
+
+
 # ---- a CT surface ----------------------------------------------------------------------------------------
 
 
@@ -308,8 +341,9 @@ def test_real_tissue_against_its_ct_surface(data_folder: Path) -> None:
     [
         (["--picture", "a.jpg"], "add --ct FOLDER"),
         (["launch/phantom.yaml", "--faults"], "give one of them"),
-        (["--faults", "--plot", "a.png"], "leave --faults out"),
-        (["launch/v4l2.yaml"], "live cameras have none"),
+        (["--faults", "--eyes"], "leave --ct and --faults out"),
+        (["--faults", "--plot", "a.png"], "leave --faults and --eyes out"),
+        (["launch/v4l2.yaml"], "live cameras have no reference depth"),
     ],
 )
 def test_wrong_calls(arguments: list[str], says: str) -> None:

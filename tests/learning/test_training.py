@@ -18,8 +18,8 @@ from sags_node.learning.example import Example
 from sags_node.learning.faults import photographed
 from sags_node.learning.made_up import make_up
 from sags_node.learning.material import Material
-from sags_node.learning.network import StereoNetwork, evened, fit
-from sags_node.learning.training import Trainer, to_batch
+from sags_node.learning.network import evened, fit
+from sags_node.learning.training import Trainer, errors, to_batch
 from sags_node.phantom.noise import fractal_noise
 from sags_node.types import U8
 from sags_node.vision.onnx_network import DepthNetwork
@@ -103,28 +103,29 @@ def test_steps_on_the_pictures_find_parts_of_a_pixel() -> None:
     batch = to_batch([Example(left, right, np.zeros((64, 96), np.float32))])
     sure, guess = torch.ones(1, 1, 64, 96), torch.full((1, 1, 64, 96), 1.45)
     found = fit(evened(batch.left), evened(batch.right), guess, sure, 0.01 * sure)
-    off = [np.median(np.abs(stage[0, 0, 8:-8, 8:-8].numpy() - 0.75)) for stage in found]
-    assert off == sorted(off, reverse=True)
-    assert off[-1] < 0.05
+    assert np.median(np.abs(found[-1][0, 0, 8:-8, 8:-8].numpy() - 0.75)) < 0.05
 
 
 def test_brightness_and_contrast_do_not_matter() -> None:
-    torch.manual_seed(0)
-    network = StereoNetwork().eval()
-    left, right = (torch.from_numpy(texture(seed)[:64, :96] / np.float32(255)) for seed in (0, 1))
-    left, right = (eye.permute(2, 0, 1)[None] for eye in (left, right))
-    with torch.no_grad():
-        found, dimmed = network(left, right), network(left, 0.1 + 0.8 * right)
-    assert (found - dimmed).abs().median() < 0.05
-    assert (found - network(left, right.flip(3))).abs().median() > 0.2
+    picture = torch.from_numpy(texture(0) / np.float32(255)).permute(2, 0, 1)[None]
+    shade = torch.linspace(0.6, 1.0, picture.shape[3])  # ever brighter to the right
+    assert (evened(picture) - evened(0.1 + shade * picture)).abs().mean() < 0.05 * evened(
+        picture
+    ).abs().mean()
 
 
 # ---- training --------------------------------------------------------------------------------------------
 
 
-def test_the_loss_falls(small_material: Material) -> None:
-    losses = Trainer(small_material, 40).train(silent)
-    assert np.mean(losses[-10:]) < 0.7 * np.mean(losses[:10])
+def test_training_makes_errors_small(small_material: Material, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On pairs that are not trained on, median and p90: far from good, but better than a beginner's."""
+    monkeypatch.setattr(training, "WARM_UP", 10)
+    trainer = Trainer(small_material, 40)
+    before = errors(trainer.network, small_material, 6)
+    losses = trainer.train(silent)
+    after = errors(trainer.network, small_material, 6)
+    assert all(late < 0.85 * early for late, early in zip(after, before, strict=True))
+    assert np.mean(losses[-10:]) < 0.85 * np.mean(losses[:10])
 
 
 def test_training_goes_on_where_it_stood(
@@ -171,7 +172,7 @@ def test_from_training_to_the_node(
     trainer.resume(file.with_suffix(".pt"))
     assert trainer.step == 3
     network = trainer.network.eval()
-    assert onnx_file.difference(network, file) < 1e-3
+    assert onnx_file.difference(network, file) < 1e-3  # px: sums are taken in another order
     run = DepthNetwork(OnnxConfig(path=file, providers=("cpu",)), (640, 512), 2.5)
     assert run.is_stereo and run.way.map_name.output == "disparity"
     pair = small_material.rendered[0]
