@@ -250,7 +250,7 @@ def test_a_recording_without_truth_is_measured_by_both_eyes() -> None:
     measured = measure_eyes(open_session(SESSION, overrides), silent)
     rows = {row["name"]: row for row in measured["settings"]}
     assert measured["frames"] == 1
-    assert rows["as configured"]["median_px"] < rows["plain SGBM, scale 2"]["median_px"]
+    assert rows["as configured"]["median_px"] < 0.25  # of what was matched at half size
     assert rows["as configured"]["agree"] > 0.7
     assert [table.row_count for table in depth_report.tables(measured)] == [len(rows)]
 

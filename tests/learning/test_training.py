@@ -122,10 +122,9 @@ def test_training_makes_errors_small(small_material: Material, monkeypatch: pyte
     monkeypatch.setattr(training, "WARM_UP", 10)
     trainer = Trainer(small_material, 40)
     before = errors(trainer.network, small_material, 6)
-    losses = trainer.train(silent)
+    trainer.train(silent)
     after = errors(trainer.network, small_material, 6)
     assert all(late < 0.85 * early for late, early in zip(after, before, strict=True))
-    assert np.mean(losses[-10:]) < 0.85 * np.mean(losses[:10])
 
 
 def test_training_goes_on_where_it_stood(
@@ -162,11 +161,14 @@ def test_a_wrong_state_is_named(small_material: Material, tmp_path: Path) -> Non
 def test_from_training_to_the_node(
     small_material: Material, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The command's file gives torch's numbers, and says of itself how it is fed and read."""
+    """The command goes on where it was stopped. Its file gives torch's numbers, and says how it is read."""
     monkeypatch.setattr(material, "gather", lambda *_: small_material)
     file = tmp_path / "stereo.onnx"
+    first = Trainer(small_material, 1)
+    first.train(silent, file.with_suffix(".pt"))
     result = CliRunner().invoke(main, ["train", "depth", "--out", str(file), "--steps", "3"])
     assert result.exit_code == 0, result.output
+    assert "goes on from step 1" in result.output
     assert file.stat().st_size < 1e6
     trainer = Trainer(small_material, 3)
     trainer.resume(file.with_suffix(".pt"))
@@ -181,15 +183,4 @@ def test_from_training_to_the_node(
     batch = to_batch([Example(small[0], small[1], np.zeros(onnx_file.SIZE[::-1], np.float32))])
     with torch.no_grad():
         wanted = 2 * network(batch.left, batch.right)[0, 0].numpy()
-    np.testing.assert_allclose(given, cv2.resize(wanted, (640, 512)), atol=1e-2)
-
-
-def test_the_command_goes_on(
-    small_material: Material, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(material, "gather", lambda *_: small_material)
-    file = tmp_path / "stereo.onnx"
-    for steps in ("1", "2"):
-        result = CliRunner().invoke(main, ["train", "depth", "--out", str(file), "--steps", steps])
-        assert result.exit_code == 0, result.output
-    assert "goes on from step 1" in result.output
+    assert np.abs(given - cv2.resize(wanted, (640, 512))).mean() < 2e-3
