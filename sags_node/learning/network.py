@@ -21,8 +21,10 @@ HIDDEN = 8  # channels from one refinement to the next
 SHARPNESS = 20.0  # of a choice among likenesses of -1..1, before it is learnt
 EVEN_WINDOW = 15  # px: brightness and contrast that are even over it do not count
 NOISE = 0.01  # of white: contrast below it is noise
-WINDOWS = (13, 9, 9)  # px, of the steps on the pictures
+STEPS = 2  # on the pictures
+WINDOW = 9  # px, of such a step, and of what smooths it
 LARGEST_STEP = 1.0  # px
+LEAST_STEP = 0.2  # px squared: what varies less is smoothed, what varies more is kept
 GRAY = (0.299, 0.587, 0.114)
 
 
@@ -220,19 +222,28 @@ def fit(left: Tensor, right: Tensor, disparity: Tensor, weight: Tensor, doubt: T
     """
     one, other = torch.cat([left, _slope(left)], 1), torch.cat([right, _slope(right)], 1)
     found = [disparity]
-    for window in WINDOWS:
-        found.append(_step(one, other, found[-1], weight, doubt, window))
+    for _ in range(STEPS):
+        found.append(_smoothed(_step(one, other, found[-1], weight, doubt), weight))
     return found[1:]
 
 
-def _step(
-    left: Tensor, right: Tensor, disparity: Tensor, weight: Tensor, doubt: Tensor, window: int
-) -> Tensor:
+def _step(left: Tensor, right: Tensor, disparity: Tensor, weight: Tensor, doubt: Tensor) -> Tensor:
     """A Gauss-Newton step over windows of pixels; the pictures [B, 2, h, w] are gray and their slope."""
     seen = _seen(right, disparity)
     off = left[:, :1] - seen[:, :1]
     slope = (left[:, 1:] + seen[:, 1:]) / 2
     columns = torch.arange(disparity.shape[3], dtype=disparity.dtype, device=disparity.device)
     trusted = weight * (columns >= disparity).to(disparity.dtype) / (1 + off * off)
-    down, up = _mean(trusted * slope * off, window), _mean(trusted * slope * slope, window)
+    down, up = _mean(trusted * slope * off, WINDOW), _mean(trusted * slope * slope, WINDOW)
     return disparity - (down / (up + 0.01 * doubt)).clamp(-LARGEST_STEP, LARGEST_STEP)
+
+
+def _smoothed(disparity: Tensor, weight: Tensor) -> Tensor:
+    """By the guided filter (He et al., PAMI 2013), itself the guide: no step sees what is smaller than its
+    window."""
+    weight = weight + 0.02  # nothing is left without a mean
+    whole = _mean(weight, WINDOW)
+    mean = _mean(weight * disparity, WINDOW) / whole
+    spread = torch.relu(_mean(weight * disparity * disparity, WINDOW) / whole - mean * mean)
+    kept = spread / (spread + LEAST_STEP)
+    return _mean(kept, WINDOW) * disparity + _mean((1 - kept) * mean, WINDOW)
