@@ -16,7 +16,7 @@ from sags_node.learning.example import Example
 from sags_node.phantom.noise import fractal_noise
 from sags_node.types import F32, U8
 
-DISPARITIES = (0.015, 0.26)  # of the width, of the farthest surface: what endoscopes see, and more
+DISPARITIES = (0.015, 0.35)  # of the width, of the farthest surface: what endoscopes see, and more
 RELIEF = (0.02, 0.3)  # of the disparity: hills of the farthest surface
 TILT = 0.15  # px per px, in both directions
 STEEPEST = 0.6  # px per px: from 1 on a surface would fold over itself

@@ -102,7 +102,7 @@ def test_steps_on_the_pictures_find_parts_of_a_pixel() -> None:
     )
     batch = to_batch([Example(left, right, np.zeros((64, 96), np.float32))])
     sure, guess = torch.ones(1, 1, 64, 96), torch.full((1, 1, 64, 96), 1.45)
-    found = fit(evened(batch.left), evened(batch.right), guess, sure, 0.01 * sure)
+    found = fit(evened(batch.left), evened(batch.right), guess, sure, 0.01 * sure, 0.2 * sure)
     assert np.median(np.abs(found[-1][0, 0, 8:-8, 8:-8].numpy() - 0.75)) < 0.05
 
 
