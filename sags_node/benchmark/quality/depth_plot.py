@@ -8,7 +8,7 @@ from typing import Any
 from sags_node.plotting import as_png, new_figure
 
 WIDTH, HEIGHT = 900, 420  # px
-BESIDE = 8  # px, of a name to its point
+BESIDE, ABOVE, BELOW = 8, 4, -11  # px, of a name to its point
 TICKS_MS = (2, 3, 5, 7, 10, 15, 20, 30, 50, 70, 100, 150, 200, 300, 500)
 TICKS_MM = (0.1, 0.2, 0.3, 0.5, 0.7, 1, 1.5, 2, 3, 5, 7, 10, 20)
 STAGE, PLAIN, NETWORK = "#2166ac", "#828282", "#b2182b"
@@ -17,9 +17,8 @@ STAGE, PLAIN, NETWORK = "#2166ac", "#828282", "#b2182b"
 def picture(measured: Mapping[str, Any]) -> bytes:
     """PNG of `measured` as `measure_recording` or `measure_ct` returns it: each setting from its median error
     (a dot) up to the one that nine of ten errors stay below."""
-    rows: Sequence[Mapping[str, Any]] = [
-        row for row in measured["settings"] if row["ms"] and row["median_mm"]
-    ]
+    shown = [row for row in measured["settings"] if row["ms"] and row["median_mm"]]
+    rows: Sequence[Mapping[str, Any]] = sorted(shown, key=lambda row: float(row["ms"]))
     with new_figure(WIDTH, HEIGHT) as figure:
         axes = figure.subplots()
         axes.set_title(
@@ -27,7 +26,7 @@ def picture(measured: Mapping[str, Any]) -> bytes:
         )
         axes.set_xscale("log")
         axes.set_yscale("log")
-        for row in rows:
+        for place, row in enumerate(rows):
             colour = _colour(row["name"])
             axes.plot([row["ms"]] * 2, [row["median_mm"], row["p90_mm"]], color=colour, linewidth=1)
             axes.plot(row["ms"], row["median_mm"], "o", color=colour)
@@ -35,7 +34,7 @@ def picture(measured: Mapping[str, Any]) -> bytes:
             axes.annotate(
                 row["name"],
                 (row["ms"], row["median_mm"]),
-                (BESIDE, -3),
+                (BESIDE, ABOVE if place % 2 else BELOW),  # names of neighbours do not meet
                 textcoords="offset pixels",
                 color=colour,
             )
