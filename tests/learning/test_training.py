@@ -118,13 +118,13 @@ def test_brightness_and_contrast_do_not_matter() -> None:
 
 
 def test_training_makes_errors_small(small_material: Material, monkeypatch: pytest.MonkeyPatch) -> None:
-    """On pairs that are not trained on, median and p90: far from good, but better than a beginner's."""
-    monkeypatch.setattr(training, "WARM_UP", 10)
-    trainer = Trainer(small_material, 40)
-    before = errors(trainer.network, small_material, 6)
+    """On pairs that are not trained on: far from good, but better than before."""
+    monkeypatch.setattr(training, "WARM_UP", 5)
+    trainer = Trainer(small_material, 25)
+    before, _ = errors(trainer.network, small_material, 6)
     trainer.train(silent)
-    after = errors(trainer.network, small_material, 6)
-    assert all(late < 0.85 * early for late, early in zip(after, before, strict=True))
+    after, _ = errors(trainer.network, small_material, 6)
+    assert after < 0.85 * before
 
 
 def test_training_goes_on_where_it_stood(
