@@ -32,6 +32,7 @@ from sags_node.cli.node_options import keys_options, ns_option
 from sags_node.cli.offline import evaluate, fit
 from sags_node.cli.overlay import overlay
 from sags_node.cli.topic import topic
+from sags_node.cli.train import train
 from sags_node.cli.view import view
 from sags_node.errors import SagsError, UsageError
 from sags_node.plotting import check_plots
@@ -297,5 +298,5 @@ def import_folder(folder: Path, json_out: bool) -> None:
         raise SagsError(f"{folder} cannot be played as it is; see the mends above")
 
 
-for command in (evaluate, fit, export, archive, bag, bench, bridge, calib, overlay, view, topic):
+for command in (evaluate, fit, export, archive, bag, bench, bridge, calib, overlay, train, view, topic):
     main.add_command(command)

@@ -6,9 +6,10 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from onnx_networks import save_matcher
 from places import SESSION
 
-from sags_node.benchmark.quality import depth_report
+from sags_node.benchmark.quality import depth_plot, depth_report
 from sags_node.benchmark.quality.depth import (
     MODEL,
     Comparison,
@@ -27,6 +28,7 @@ from sags_node.benchmark.quality.depth_ct import (
     picture,
     read_ct_pair,
 )
+from sags_node.benchmark.quality.depth_eyes import differences, measure_eyes, mirrored
 from sags_node.cli.main import main
 from sags_node.config import StereoConfig
 from sags_node.errors import SagsError, UsageError
@@ -197,6 +199,8 @@ def test_a_recording_with_exact_depth() -> None:
     medians = [row["median_mm"] for row in measured["confidence"]]
     assert medians == sorted(medians, reverse=True)
     assert [table.row_count for table in depth_report.tables(measured)] == [len(rows), 4]
+    drawn = cv2.imdecode(np.frombuffer(depth_plot.picture(measured), np.uint8), cv2.IMREAD_COLOR)
+    assert drawn is not None and drawn.std() > 5
 
 
 def test_a_recording_without_truth_is_named() -> None:
@@ -205,12 +209,50 @@ def test_a_recording_without_truth_is_named() -> None:
         measure_recording(open_session(SESSION, overrides), silent)
 
 
-def test_faults_make_depth_worse() -> None:
-    measured = measure_faults((256, 192), 1, {"noise": (0.0, 0.08), "gloss": (0.0, 64.0)}, silent)
+def test_faults_make_depth_worse(tmp_path: Path) -> None:
+    network = save_matcher(tmp_path / "blocks.onnx")
+    faults = {"noise": (0.0, 0.08), "gloss": (0.0, 64.0)}
+    measured = measure_faults((256, 192), 1, faults, silent, network)
     clean, noisy, dull, shiny = measured["faults"]
     assert noisy["settings"][0]["median_mm"] > 1.3 * clean["settings"][0]["median_mm"]
     assert dull["white"] < 0.001 and shiny["white"] > 0.01
+    blocks = clean["settings"][-1]
+    assert blocks["name"] == "network blocks.onnx"
+    assert blocks["coverage"] > 0.5
+    assert 0 < blocks["median_mm"] < 3.3  # half a px of disparity at 80 mm, 230 px and 4.3 mm
     assert [made.row_count for made in depth_report.tables(measured)] == [1 + len(clean["settings"])] * 2
+
+
+# ---- both eyes against each other ------------------------------------------------------------------------
+
+
+def test_eyes_that_see_one_surface_agree() -> None:
+    plane = np.full((HEIGHT, WIDTH), 12.0, np.float32)
+    assert np.nanmax(differences(plane, plane)) == 0
+    assert np.isnan(differences(plane, plane)[:, :12]).all()  # what the right eye does not see
+    np.testing.assert_allclose(differences(plane, plane + 1.5)[:, 12:], 1.5)
+    assert np.isnan(differences(plane, 0 * plane)).all()
+
+
+def test_a_pair_in_a_mirror_has_the_right_eyes_depth() -> None:
+    """The left disparity d of a point at x is that of the right picture at x - d."""
+    pair, _ = shown_pair(slanted())
+    everywhere = StereoDepth(StereoConfig(), CAMERA, BASELINE)
+    depth, _ = everywhere(mirrored(pair), ALL)
+    found = np.divide(FOCAL * BASELINE, depth, where=depth > 0, out=0 * depth)[:, ::-1]
+    known = (found > 0) & (np.arange(WIDTH) < WIDTH - 40)
+    assert known.mean() > 0.7
+    assert np.median(np.abs(found - slanted())[known]) < 0.1
+
+
+def test_a_recording_without_truth_is_measured_by_both_eyes() -> None:
+    overrides = ["source.pace:=step", "source.loop:=false", "source.frames:=1"]
+    measured = measure_eyes(open_session(SESSION, overrides), silent)
+    rows = {row["name"]: row for row in measured["settings"]}
+    assert measured["frames"] == 1
+    assert rows["as configured"]["median_px"] < 0.25  # of what was matched at half size
+    assert rows["as configured"]["agree"] > 0.7
+    assert [table.row_count for table in depth_report.tables(measured)] == [len(rows)]
 
 
 # ---- a CT surface ----------------------------------------------------------------------------------------
@@ -299,7 +341,9 @@ def test_real_tissue_against_its_ct_surface(data_folder: Path) -> None:
     [
         (["--picture", "a.jpg"], "add --ct FOLDER"),
         (["launch/phantom.yaml", "--faults"], "give one of them"),
-        (["launch/v4l2.yaml"], "live cameras have none"),
+        (["--faults", "--eyes"], "leave --ct and --faults out"),
+        (["--faults", "--plot", "a.png"], "leave --faults and --eyes out"),
+        (["launch/v4l2.yaml"], "live cameras have no reference depth"),
     ],
 )
 def test_wrong_calls(arguments: list[str], says: str) -> None:

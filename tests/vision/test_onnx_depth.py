@@ -91,19 +91,23 @@ def error(network: DepthNetwork, scene: Scene) -> float:
     [
         ({"expects": "bytes"}, "bytes", "disparity"),
         ({"expects": "unit"}, "unit", "disparity"),
-        ({"expects": "imagenet"}, "imagenet", "disparity"),
+        (  # LightStereo's form
+            {"expects": "imagenet", "size": (WIDTH, HEIGHT), "names": ("left_img", "right_img")},
+            "imagenet",
+            "disparity",
+        ),
         ({"expects": "symmetric"}, "symmetric", "disparity"),
         ({"nhwc": True, "uint8": True}, "unit", "disparity"),
         ({"nhwc": True, "expects": "unit"}, "unit", "disparity"),
-        ({"concatenated": True}, "bytes", "disparity"),
+        ({"concatenated": True, "expects": "unit", "size": (WIDTH, HEIGHT)}, "unit", "disparity"),  # HITNet's
         ({"concatenated": True, "channels": 1, "expects": "unit"}, "unit", "disparity"),
         ({"channels": 1}, "bytes", "disparity"),
         ({"size": (WIDTH, HEIGHT)}, "bytes", "disparity"),
         ({"size": (448, 320)}, "bytes", "disparity"),
-        ({"size": (WIDTH, HEIGHT), "guided": True}, "bytes", "disparity"),
+        ({"size": (WIDTH, HEIGHT), "guided": True}, "bytes", "disparity"),  # CREStereo's
         ({"size": (300, "h")}, "bytes", "disparity"),
         ({"names": ("left", "a_right")}, "bytes", "disparity"),  # the file holds the right one first
-        ({"factor": -1.0}, "bytes", "disparity"),
+        ({"factor": -1.0}, "bytes", "disparity"),  # RAFT-Stereo's
         ({"factor": 1 / 320}, "bytes", "disparity"),  # widths of the picture
         ({"output": "half"}, "bytes", "disparity"),
         ({"output": "half", "factor": 0.5}, "bytes", "disparity"),  # px of the smaller map

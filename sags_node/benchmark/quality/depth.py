@@ -7,12 +7,13 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
-from sags_node.config import PhantomSource, StereoConfig
+from sags_node.config import OnnxConfig, PhantomSource, StereoConfig, VisionConfig
 from sags_node.errors import SagsError
 from sags_node.evaluation import metrics
 from sags_node.evaluation.machine import machine_name
@@ -24,6 +25,7 @@ from sags_node.pipeline import Pipeline
 from sags_node.session import Session
 from sags_node.sources.source import open_source
 from sags_node.types import F32, F64, Bool, Camera, RectifiedPair, StereoFrame
+from sags_node.vision.onnx_depth import NetworkDepth
 from sags_node.vision.rectify import Rectifier
 from sags_node.vision.stereo import StereoDepth
 
@@ -80,11 +82,34 @@ class PlainSGBM:
         return depth, (depth > 0).astype(np.float32)
 
 
-def make_matchers(config: StereoConfig, camera: Camera, baseline: float) -> dict[str, Matcher]:
-    """By name; the first is the stage as `config` sets it up, which the others are compared with.
+def network_matcher(file: Path, config: StereoConfig, camera: Camera, baseline: float) -> Matcher:
+    """The stage with a network, as `vision.onnx` sets it up. Nothing is matched where it fails.
 
     Raises:
-        UsageError: the pictures are too small to match at `SCALES`.
+        UsageError: the file is no depth network.
+    """
+    stereo = StereoDepth(config, camera, baseline)
+    onnx = OnnxConfig(path=file, fallback=False)
+    network = NetworkDepth(VisionConfig(stereo=config, onnx=onnx), stereo, camera, baseline)
+
+    def match(pair: RectifiedPair, tissue: Bool) -> tuple[F32, F32]:
+        found = network(pair, tissue, lambda: stereo(pair, tissue)[0])
+        assert found is not None  # without a fallback it raises
+        return found
+
+    return match
+
+
+def make_matchers(
+    config: StereoConfig, camera: Camera, baseline: float, network: Path | None = None
+) -> dict[str, Matcher]:
+    """By name; the first is the stage as `config` sets it up, which the others are compared with.
+
+    Args:
+        network: an ONNX file to compare as well.
+
+    Raises:
+        UsageError: the pictures are too small to match at `SCALES`, or the file is no depth network.
     """
     matchers: dict[str, Matcher] = {"as configured": StereoDepth(config, camera, baseline)}
     for method, name in (("dis", "inverse search"), ("sgbm", "SGBM, judged")):
@@ -93,6 +118,8 @@ def make_matchers(config: StereoConfig, camera: Camera, baseline: float) -> dict
             matchers[f"{name}, scale {scale}"] = StereoDepth(setting, camera, baseline)
     for scale in PLAIN_SCALES:
         matchers[f"plain SGBM, scale {scale}"] = PlainSGBM(config, camera, baseline, scale)
+    if network is not None:
+        matchers[f"network {network.name}"] = network_matcher(network, config, camera, baseline)
     return matchers
 
 
@@ -185,7 +212,9 @@ class Comparison:
         return [{"name": name, **tally.figures()} for name, tally in self.tallies.items()]
 
 
-def measure_recording(session: Session, advance: Advance, every: int = EVERY) -> dict[str, Any]:
+def measure_recording(
+    session: Session, advance: Advance, every: int = EVERY, network: Path | None = None
+) -> dict[str, Any]:
     """Frames of a recording that have a reference depth, at most one in `every`, against it, on tissue.
 
     The whole recording is played with one step of the mapper a frame, so that the depth of the drawn model is
@@ -193,13 +222,13 @@ def measure_recording(session: Session, advance: Advance, every: int = EVERY) ->
 
     Raises:
         SagsError: no frame has a reference depth, or the recording cannot be used.
-        UsageError: the pictures are too small to match at every scale.
+        UsageError: as `make_matchers`.
     """
     config = session.config
     configure_threads(config.engine.threads)
     pipeline, budget = Pipeline(config, session.rig), StepBudget(1)
     camera, size = pipeline.rectifier.camera, session.working_size
-    matchers = make_matchers(config.vision.stereo, camera, pipeline.rectifier.baseline)
+    matchers = make_matchers(config.vision.stereo, camera, pipeline.rectifier.baseline, network)
     comparison, measured, kind, next_number = Comparison(matchers), 0, "", 0
     with open_source(config.source) as frames:
         for number, frame in enumerate(frames):
@@ -227,7 +256,11 @@ def measure_recording(session: Session, advance: Advance, every: int = EVERY) ->
 
 
 def measure_faults(
-    size: tuple[int, int], frames: int, faults: Mapping[str, Sequence[float]], advance: Advance
+    size: tuple[int, int],
+    frames: int,
+    faults: Mapping[str, Sequence[float]],
+    advance: Advance,
+    network: Path | None = None,
 ) -> dict[str, Any]:
     """The phantom, whose depth is known exactly, with one fault of its pictures rising at a time.
 
@@ -235,6 +268,7 @@ def measure_faults(
         size: width and height of the pictures, px.
         frames: of each level, evenly over the whole motion.
         faults: levels by the name of the fault in `PhantomSource`.
+        network: an ONNX file to compare as well.
     """
     levels = [(fault, level) for fault, values in faults.items() for level in values]
     rows = []
@@ -242,7 +276,8 @@ def measure_faults(
         advance(done, len(levels), f"{fault} {level:g}")
         phantom = Phantom(PhantomSource.model_validate({"width": size[0], "height": size[1], fault: level}))
         rectifier = Rectifier(phantom.rig, *size)
-        comparison = Comparison(make_matchers(StereoConfig(), rectifier.camera, rectifier.baseline))
+        matchers = make_matchers(StereoConfig(), rectifier.camera, rectifier.baseline, network)
+        comparison = Comparison(matchers)
         white = []
         for pair, tissue, truth in _phantom_pairs(phantom, rectifier, frames):
             comparison.add(pair, tissue, truth, {})

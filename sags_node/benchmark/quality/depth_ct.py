@@ -137,16 +137,19 @@ def distances_to_surface(ct: CTPair, depth: F32) -> F64:
     return np.asarray(nearest[:, 0], np.float64) * 1e3
 
 
-def measure_ct(ct: CTPair, advance: Advance) -> dict[str, Any]:
+def measure_ct(ct: CTPair, advance: Advance, network: Path | None = None) -> dict[str, Any]:
     """Errors of every setting along z, as everywhere else, and to the nearest surface; share of the region
     that has a depth.
 
     `median_abs_mm`, `p90_abs_mm` and `coverage` are those of the stage as a launch file has it by default.
 
+    Args:
+        network: an ONNX file to compare as well.
+
     Raises:
-        UsageError: the pictures are too small to match at every scale.
+        UsageError: as `make_matchers`.
     """
-    matchers = make_matchers(StereoConfig(), ct.pair.camera, ct.pair.baseline)
+    matchers = make_matchers(StereoConfig(), ct.pair.camera, ct.pair.baseline, network)
     rows = []
     for done, (name, matcher) in enumerate(matchers.items()):
         advance(done, len(matchers), name)
