@@ -131,7 +131,7 @@ def deforming(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def rendered(factory: pytest.TempPathFactory, still_tissue: bool) -> Path:
     folder = factory.mktemp("moving") / "session"
-    shape = PhantomSource(seconds=2, width=320, height=256, camera_motion=True, still_tissue=still_tissue)
+    shape = PhantomSource(seconds=2, width=320, height=256, camera_motion="sway", still_tissue=still_tissue)
     write_session(shape, folder, RATE)
     return folder
 

@@ -27,7 +27,7 @@ LIFTED = 4  # the frame of COUNT in which the fold is held up
 @pytest.fixture(scope="module")
 def swaying() -> Phantom:
     """A clean scene with a moving scope."""
-    return Phantom(PhantomSource(width=320, height=256, noise=0, camera_motion=True))
+    return Phantom(PhantomSource(width=320, height=256, noise=0, camera_motion="sway"))
 
 
 @pytest.fixture(scope="module")
@@ -187,7 +187,7 @@ def test_still_scope_keeps_identity() -> None:
 
 
 def test_still_tissue_stays_where_the_scope_and_the_instruments_move() -> None:
-    phantom = Phantom(TINY.model_copy(update={"still_tissue": True, "camera_motion": True}))
+    phantom = Phantom(TINY.model_copy(update={"still_tissue": True, "camera_motion": "sway"}))
     first, later = phantom.frame(0, 3), phantom.frame(1, 3)
     assert np.array_equal(first.points, later.points)
     assert not np.array_equal(first.T_world_cam, later.T_world_cam)
