@@ -162,7 +162,7 @@ class CameraTracker:
             self._keyframes.clear()
             self._found_ns = self._before = None
         self._tissue.learn(observation.t_capture_ns)
-        if self._found_ns is not None and not 0 <= self._stamp_ns - self._found_ns < PROBATION_NS:
+        if self._found_ns is not None and not 0 <= observation.t_capture_ns - self._found_ns < PROBATION_NS:
             self._found_ns = self._before = None
         if self._found_ns is None:
             self._keyframes.offer(observation, view)
