@@ -9,13 +9,14 @@ import cv2
 import numpy as np
 
 from sags_node.geometry import invert
+from sags_node.mapping.camera_pose import towards
 from sags_node.mapping.keyframes import Keyframes, distance
 from sags_node.mapping.mapper import Drawn, Learnt, Mapper
 from sags_node.mapping.pose_agreement import Agreement, agreement, small_frame, small_view
 from sags_node.mapping.resting_tissue import RestingTissue, correlation
 from sags_node.types import F64, Camera, Observation, RenderedView
 
-PULL = 0.2  # share of the way back to its place at rest, per frame: keeps the pose from drifting
+HOLD = 0.2  # share of the way to the pose against the tissue at rest, per frame: keeps it from drifting
 LARGEST_JUMP = 8e-3  # m, as `keyframes.distance` counts, between frames: faster, it must be verified
 TRIAL = 6  # frames in which a pose that was found again must agree with picture and depth
 TRIED = 3  # candidates for such a pose per frame
@@ -91,16 +92,16 @@ class CameraTracker:
     def _follow(self, observation: Observation) -> F64 | str:
         """The pose of a frame that follows one that was tracked, or why the camera is lost."""
         start = self._pose @ self._motion
-        fit = self._tissue.fit(observation, start, PULL)
+        fit = self._tissue.fit(observation, start)
         if isinstance(fit, str):
             return fit
-        camera = observation.camera
-        moved = replace(camera, T_world_cam=fit.T_world_cam)
+        pose, camera = towards(fit.near, fit.at_rest, HOLD), observation.camera
+        moved = replace(camera, T_world_cam=pose)
         if distance(replace(camera, T_world_cam=start), moved) > LARGEST_JUMP:
             return "the camera jumped"
         if self._is_found_out(replace(observation, camera=moved)):
             return "the camera was taken to be elsewhere"
-        return fit.T_world_cam
+        return pose
 
     def _is_found_out(self, observation: Observation) -> bool:
         """Whether the keyframes have disagreed for long; then what was learnt is undone."""
@@ -161,7 +162,7 @@ class CameraTracker:
             self._restarts = self._mapper.restarts
             self._keyframes.clear()
             self._found_ns = self._before = None
-        self._tissue.learn(observation.t_capture_ns)
+        self._tissue.learn(observation)
         if self._found_ns is not None and not 0 <= observation.t_capture_ns - self._found_ns < PROBATION_NS:
             self._found_ns = self._before = None
         if self._found_ns is None:
@@ -181,15 +182,14 @@ class CameraTracker:
     def _tried(self, observation: Observation, before: Drawn) -> _Candidate | None:
         """Where the camera is if it was there before from where the model is drawn; None: not near it."""
         self._mapper.start_from(before)
-        fit = self._tissue.fit(observation, before.view.camera.T_world_cam, PULL)
+        fit = self._tissue.fit(observation, before.view.camera.T_world_cam)
         if isinstance(fit, str):
             self.lost = fit
             return None
-        rest = self._tissue.fit(observation, fit.T_world_cam, pull=1.0)
-        now = self._seen_from(observation, fit.T_world_cam)
+        now = self._seen_from(observation, fit.near)
         frame = small_frame(observation)
         agrees = agreement(small_view(now.view), frame, observation.camera, observation.baseline)
-        return _Candidate(now, agrees, (fit if isinstance(rest, str) else rest).T_world_cam)
+        return _Candidate(now, agrees, fit.at_rest)
 
     def _seen_from(self, observation: Observation, pose: F64) -> Drawn:
         """The model as a frame that was taken from there would have shown it."""

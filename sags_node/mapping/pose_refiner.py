@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 
 from sags_node.geometry import invert
-from sags_node.mapping.camera_pose import exponential
+from sags_node.mapping.camera_pose import towards
 from sags_node.mapping.mapper import Mapper
 from sags_node.mapping.resting_tissue import RestingTissue
 from sags_node.types import F64, Observation, RenderedView
@@ -53,24 +52,15 @@ class PoseRefiner:
         self._pose, self.unsure = guess, ""
         if before is None or self._mapper.model.count == 0:
             return True
-        fit = self._tissue.fit(observation, guess, pull=1.0)
+        fit = self._tissue.fit(observation, guess)
         if isinstance(fit, str):
             self.unsure = fit
             return True
         seconds = min(max(0.0, (self._stamp_ns - before) * 1e-9), 1.0)
-        self._pose = _towards(guess, fit.T_world_cam, seconds / SECONDS)
+        self._pose = towards(guess, fit.at_rest, seconds / SECONDS)
         self._correction = self._pose @ invert(guess) @ self._correction
         return True
 
     def mapped(self, observation: Observation, view: RenderedView) -> None:
         """Learn from a frame that was taken in."""
-        self._tissue.learn(observation.t_capture_ns)
-
-
-def _towards(start: F64, end: F64, share: float) -> F64:
-    """The pose [4, 4] at a small share of the way."""
-    motion = invert(start) @ end
-    twist = np.concatenate([motion[:3, 3], cv2.Rodrigues(motion[:3, :3])[0][:, 0]])
-    pose: F64 = start @ exponential(share * twist)
-    pose[:3, :3] = cv2.Rodrigues(cv2.Rodrigues(pose[:3, :3])[0])[0]  # poses are chained: no error may grow
-    return pose
+        self._tissue.learn(observation)

@@ -13,7 +13,7 @@ BREATH = 4.0  # s
 _HEARTBEAT = 0.8  # s
 _SCOPE = 7.0  # s: no multiple of a breath, so that all places are seen in all states of the tissue
 _ZOOM = 0.015  # m, in and out
-_CENTRE = np.array([0.0, 0.0, 0.078])  # m: what the scope looks at when it stands still
+CENTRE = np.array([0.0, 0.0, 0.078])  # m: what the scope looks at when it stands still
 _ORBIT = 0.20, 0.15  # rad, sideways and upwards: 16 and 12 mm of way
 
 
@@ -62,7 +62,7 @@ def scope_pose(phase: float, motion: CameraMotion) -> F64:
     elif motion == "orbit":
         sideways, upwards = _ORBIT
         pose[:3, :3] = _turned(0.5 * upwards * (1 - np.cos(once)), sideways * np.sin(once), 0.0)
-        pose[:3, 3] = _CENTRE - pose[:3, :3] @ _CENTRE
+        pose[:3, 3] = CENTRE - pose[:3, :3] @ CENTRE
     return pose
 
 
