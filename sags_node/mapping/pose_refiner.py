@@ -33,6 +33,7 @@ class PoseRefiner:
         self._mapper = mapper
         self._tissue = RestingTissue(mapper)
         self._correction: F64 = np.eye(4)  # of given poses, from the left
+        self._given: F64 = np.eye(4)  # pose of the last frame
         self._pose: F64 = np.eye(4)
         self._stamp_ns: int | None = None  # of the last frame
 
@@ -43,7 +44,10 @@ class PoseRefiner:
 
     def guess(self, given: F64 | None) -> F64 | None:
         """The pose of a frame before it is looked at."""
-        return None if given is None else self._correction @ given
+        if given is None:
+            return None
+        self._given = given
+        return self._correction @ given
 
     def track(self, observation: Observation) -> bool:
         """Find the pose of a frame whose camera is as guessed; it is never lost."""
@@ -58,7 +62,7 @@ class PoseRefiner:
             return True
         seconds = min(max(0.0, (self._stamp_ns - before) * 1e-9), 1.0)
         self._pose = towards(guess, fit.at_rest, seconds / SECONDS)
-        self._correction = self._pose @ invert(guess) @ self._correction
+        self._correction = self._pose @ invert(self._given)
         return True
 
     def mapped(self, observation: Observation, view: RenderedView) -> None:
