@@ -128,7 +128,7 @@ class NodeDeformation:
 
     def away(self, index: I32, weight: F32) -> F32:
         """How far [N, 3] m from where it rests tissue is now, by its nodes [N, 4] and their weights."""
-        return np.einsum("nk,nka->na", weight, (self.nodes - self._rest)[index])
+        return np.asarray(np.einsum("nk,nka->na", weight, (self.nodes - self._rest)[index]), np.float32)
 
     def normals(self, towards: F64) -> F32:
         """Unit normals [M, 3] of the tissue at the nodes, to the side of a place [3] (m, world): of the plane
