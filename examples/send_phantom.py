@@ -90,7 +90,7 @@ def main() -> None:
     parser.add_argument("--rig", type=Path, help="write the calibration here, for the node, and end")
     said = parser.parse_args()
     print("rendering the phantom (once)", flush=True)
-    config = PhantomSource(width=said.size[0], height=said.size[1], camera_motion=True, seconds=2.0)
+    config = PhantomSource(width=said.size[0], height=said.size[1], camera_motion="sway", seconds=2.0)
     folder = cached_session(config)
     rig = load_rig(folder / "calib")
     if said.rig is not None:

@@ -198,6 +198,10 @@ class DvrkSource(RecordedSource):
     )
 
 
+CameraMotion = Literal["none", "sway", "zoom", "orbit"]
+_MOVES = {False: "none", True: "sway"}
+
+
 class PhantomSource(RecordedSource):
     """The built-in synthetic session; rendered once into the cache folder, then replayed."""
 
@@ -206,7 +210,13 @@ class PhantomSource(RecordedSource):
     width: int = Field(640, ge=64, le=4096, description="of a picture, px")
     height: int = Field(512, ge=64, le=4096, description="of a picture, px")
     seed: int = Field(0, description="another number gives another tissue")
-    camera_motion: bool = Field(False, description="the scope moves")
+    camera_motion: Annotated[
+        CameraMotion, BeforeValidator(lambda said: _MOVES.get(said, said) if isinstance(said, bool) else said)
+    ] = Field(
+        "none",
+        description="of the scope, again and again. sway (or true): it looks about; zoom: in and out, 15 mm; "
+        "orbit: round a point of the tissue, 11 degrees to each side",
+    )
     smoke: float = Field(0.0, ge=0, le=1, description="density")
     noise: float = Field(0.01, ge=0, le=0.2, description="of a pixel: standard deviation, in units of white")
     blur: float = Field(0.0, ge=0, le=5, description="of the lens: standard deviation, px")
@@ -565,6 +575,9 @@ class TissueConfig(Section):
         return self
 
 
+PoseWay = Literal["session", "fixed", "estimate", "refine"]
+
+
 class VisionConfig(Section):
     """The pictures that are worked on, and where the camera is."""
 
@@ -575,10 +588,11 @@ class VisionConfig(Section):
     stereo: StereoConfig = StereoConfig()
     onnx: OnnxConfig = OnnxConfig()
     tissue: TissueConfig = TissueConfig()
-    pose: Literal["session", "fixed", "estimate"] = Field(
+    pose: PoseWay = Field(
         "session",
-        description="of the camera. session: the session's, fixed where it has none; fixed: it never moves; "
-        "estimate: from the pictures, by the motion that most of the tissue shares",
+        description="of the camera. session: the session's or the robot's, fixed where there is none; fixed: "
+        "it never moves; estimate: from the pictures, by the motion that most of the tissue shares; refine: "
+        "as session, and the pictures take out what it is slowly off by",
     )
 
     def working_size(self, width: int, height: int) -> tuple[int, int]:
@@ -684,7 +698,7 @@ class LaunchConfig(Section):
 
     @model_validator(mode="after")
     def _one_pose(self) -> Self:
-        if self.robot is not None and self.vision.pose != "session":
+        if self.robot is not None and self.vision.pose not in ("session", "refine"):
             raise ValueError(f"robot says where the scope is, vision.pose {self.vision.pose} too: choose one")
         return self
 

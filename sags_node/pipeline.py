@@ -19,6 +19,7 @@ from sags_node.mapping.camera_tracker import CameraTracker
 from sags_node.mapping.depth_memory import UNWATCHED
 from sags_node.mapping.devices import affordable, make_budget, make_refiner
 from sags_node.mapping.mapper import Mapped, Mapper
+from sags_node.mapping.pose_refiner import PoseRefiner
 from sags_node.mapping.right_view import RightView
 from sags_node.repeats import doubted, repeated, unseen
 from sags_node.types import (
@@ -78,9 +79,11 @@ class Pipeline:
             field=config.mapping.field is True,
         )
         self._right = RightView()
-        self._tracker: CameraTracker | None = None
+        self._tracker: CameraTracker | PoseRefiner | None = None
         if vision.pose == "estimate":
             self._tracker = CameraTracker(self.mapper, self._draw_model)
+        elif vision.pose == "refine":
+            self._tracker = PoseRefiner(self.mapper)
         self.anchors = Anchors()
         self._still = StillScene()
         self._eyes = PairWatch()
@@ -157,7 +160,7 @@ class Pipeline:
         with watch("watch"):
             eyes = self._eyes(frame, pair)
         self._on_rectified(pair, self._epoch(frame))
-        self._unposed = frame.pose_problem if self._config.vision.pose == "session" else None
+        self._unposed = frame.pose_problem if self._config.vision.pose in ("session", "refine") else None
         if self._unposed is not None and self._mapped is not None:
             return self._held(frame, pair, watch, "pose", self._unposed.text, unseen(pair))
         if self._reset_due:
@@ -182,9 +185,9 @@ class Pipeline:
             observation = observe(seen, tissue, depth, confidence, self._config.mapping.right_eye)
         if scene.guess is not None:
             self.mapper.found_again(observation, scene.guess)
-        if self._tracker is not None and not still:
+        if self._tracker is not None:
             with watch("pose"):
-                tracked = self._tracker.track(observation)
+                tracked = still > 0 or self._tracker.track(observation)
                 camera = replace(pair.camera, T_world_cam=self._tracker.pose)
                 pair, observation = replace(pair, camera=camera), replace(observation, camera=camera)
             if not tracked and self._tracker.lost is not None and self._mapped is not None:
@@ -202,17 +205,18 @@ class Pipeline:
             anchors = self.anchors.ahead(self.anchors.at(pair.t_capture_ns), mapped.snapshot)
         if not still:  # which tells nothing of what a moving frame costs
             budget.finish(self.mapper.model.count)
+        skipped = {**self._without_mask(), **self._without_refinement(), **measured.skipped}
         self._mapped = FrameResult(
             pair, observation, mapped.snapshot, views, self._epoch(frame), watch.timings_ms,
-            {**self._without_mask(), **measured.skipped}, anchors, rung, hurried=measured.hurried,
+            skipped, anchors, rung, hurried=measured.hurried,
         )  # fmt: skip
         return self._mapped
 
     def _placed(self, frame: StereoFrame) -> RectifiedPair:
-        """The rectified pair; until its pose is estimated its camera is where it was last."""
+        """The rectified pair; until its pose is found its camera is where it was last, or as it is given."""
         if self._config.vision.pose == "session":
             return self.rectifier(frame)
-        pose = None if self._tracker is None else self._tracker.pose
+        pose = None if self._tracker is None else self._tracker.guess(frame.T_world_cam)
         return self.rectifier(replace(frame, T_world_cam=pose))
 
     def _equals_the_last(self, pair: RectifiedPair) -> bool:
@@ -269,6 +273,10 @@ class Pipeline:
 
     def _without_mask(self) -> dict[str, str]:
         return {"mask": self.tissue.problem} if self.tissue.problem else {}
+
+    def _without_refinement(self) -> dict[str, str]:
+        unsure = self._tracker.unsure if isinstance(self._tracker, PoseRefiner) else ""
+        return {"refine": unsure} if unsure else {}
 
     def _measured(
         self, frame: StereoFrame, pair: RectifiedPair, tissue: Bool, still: int, budget: Budget, eyes: Verdict

@@ -24,6 +24,7 @@ from sags_node.terminal.console import progress, show, writing
 
 if TYPE_CHECKING:
     from sags_node.benchmark.node.endurance import Order
+    from sags_node.benchmark.quality.scope import Motion
 
 
 @click.command("pareto")
@@ -257,6 +258,48 @@ def bench_recall(launch: tuple[str, ...], seconds: float, out: Path | None, json
     with progress("following") as advance:
         measured = recall.measure_recall(session, seconds, advance)
     show(measured if json_out else recall.table(measured))
+    write_json(out, measured)
+
+
+@click.command("scope")
+@launch_argument
+@click.option(
+    "--motion",
+    "motions",
+    multiple=True,
+    type=click.Choice(["sway", "zoom", "orbit"]),
+    help="This one alone; may be given several times. Default: all.",
+)
+@click.option("--seconds", type=positive, default=120.0, show_default=True, help="Of each motion.")
+@table_option
+@as_json
+def bench_scope(
+    launch: tuple[str, ...],
+    motions: tuple[Motion, ...],
+    seconds: float,
+    out: Path | None,
+    json_out: bool,
+) -> None:
+    """How true the pose of a moving scope stays.
+
+    The phantom's scope sways, zooms and orbits over breathing, pulled tissue, at 10 Hz. Its pose is given,
+    estimated from the pictures, given by a robot that is off by some mm and a degree, and refined from that;
+    beside them a camera that takes the scene for rigid, and what fits the true surface points best. Errors of
+    the way, drift over whole breaths, pictures and depth. Takes some minutes for each motion.
+
+    \b
+    sags bench scope --motion orbit source.width:=320 source.height:=256
+    """
+    from sags_node.benchmark.quality import scope
+    from sags_node.launch_file import load_launch
+
+    path, overrides = split_recording(launch, "sags bench scope needs the phantom")
+    check_files(out)
+    with progress("following") as advance:
+        measured = scope.measure_scope(
+            load_launch(path, overrides), motions or scope.MOTIONS, seconds, advance
+        )
+    show(measured if json_out else scope.table(measured))
     write_json(out, measured)
 
 

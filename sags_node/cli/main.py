@@ -185,7 +185,7 @@ def phantom(folder: Path, overrides: tuple[str, ...]) -> None:
     FOLDER must be new or empty. Keys: seconds, rate, width, height, seed, camera_motion, smoke, noise, blur.
 
     \b
-    sags phantom out/session seconds:=8 seed:=3 camera_motion:=true smoke:=0.3
+    sags phantom out/session seconds:=8 seed:=3 camera_motion:=orbit smoke:=0.3
     """
     from sags_node.config import PhantomSource
     from sags_node.launch_file import load_launch

@@ -6,11 +6,10 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
-from sags_node.config import Box
+from sags_node.config import Box, PoseWay
 from sags_node.engine.rasterizer.rasterize import make_rasterizer, to_view
 from sags_node.errors import UsageError
 from sags_node.evaluation import calibration, metrics
@@ -123,7 +122,7 @@ class Measurer:
         options: Options,
         exclude: tuple[Box, ...] = (),
         backend: str = "numba",
-        pose: Literal["session", "fixed", "estimate"] = "session",
+        pose: PoseWay = "session",
     ) -> None:
         """
         Args:

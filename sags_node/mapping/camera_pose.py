@@ -78,6 +78,15 @@ def exponential(twist: F64) -> F64:
     return T
 
 
+def towards(start: F64, end: F64, share: float) -> F64:
+    """The pose [4, 4] at a share of the way to one that is near."""
+    motion = invert(start) @ end
+    twist = np.concatenate([motion[:3, 3], cv2.Rodrigues(motion[:3, :3])[0][:, 0]])
+    pose: F64 = start @ exponential(share * twist)
+    pose[:3, :3] = cv2.Rodrigues(cv2.Rodrigues(pose[:3, :3])[0])[0]  # poses are chained: no error may grow
+    return pose
+
+
 @kernel
 def _normal_equations(
     view: F64, intrinsics: F64, points: F32, pixels: F32, disparities: F32,

@@ -8,23 +8,15 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from sags_node.geometry import disparity_to_depth, invert, project
-from sags_node.mapping.camera_pose import PoseFit, fit_pose
+from sags_node.geometry import invert
+from sags_node.mapping.camera_pose import towards
 from sags_node.mapping.keyframes import Keyframes, distance
 from sags_node.mapping.mapper import Drawn, Learnt, Mapper
 from sags_node.mapping.pose_agreement import Agreement, agreement, small_frame, small_view
-from sags_node.types import F32, F64, I64, U8, Bool, Camera, Observation, RenderedView
+from sags_node.mapping.resting_tissue import RestingTissue, correlation
+from sags_node.types import F64, Camera, Observation, RenderedView
 
-CANDIDATES = 2000  # Gaussians, of those found
-POINTS = 300  # of them, those with most texture; measured: one in each cell of a grid is worse
-WINDOW = (15, 15)  # px
-LARGEST_CORRECTION = 3 / 640  # of the width
-LEAST_POINTS = 40
-PULL = 0.2  # share of the way back to its place at rest, per frame: keeps the pose from drifting
-REST_SECONDS = 10.0  # over which a place at rest follows the tissue: longer than a breath
-LEAST_INLIERS = 0.35  # of the points
-LEAST_AGREEMENT = 0.5  # correlation of the picture with the colours of the Gaussians found in it
-LARGEST_SCALE = 4 / 640  # of the width: of the residuals
+HOLD = 0.2  # share of the way to the pose against the tissue at rest, per frame: keeps it from drifting
 LARGEST_JUMP = 8e-3  # m, as `keyframes.distance` counts, between frames: faster, it must be verified
 TRIAL = 6  # frames in which a pose that was found again must agree with picture and depth
 TRIED = 3  # candidates for such a pose per frame
@@ -60,6 +52,7 @@ class CameraTracker:
         self.lost: str | None = None
         self._mapper = mapper
         self._draw = draw
+        self._tissue = RestingTissue(mapper)
         self._pose: F64 = np.eye(4)
         self._motion: F64 = np.eye(4)  # of the camera in its own axes, from the frame before to the last one
         self._keyframes = Keyframes()
@@ -71,12 +64,14 @@ class CameraTracker:
         self._before: Learnt | None = None  # what was known then
         self._looked_ns = 0
         self._disagreed = 0  # looks in a row
-        self._stamp_ns: int | None = None  # of the last frame that was mapped
-        self._seconds = 0.0  # that the model has been learnt for
 
     @property
     def pose(self) -> F64:
         """`T_world_cam` [4, 4] of the last frame that was tracked."""
+        return self._pose
+
+    def guess(self, given: F64 | None) -> F64 | None:
+        """The pose of a frame before it is looked at, whatever its session says."""
         return self._pose
 
     def track(self, observation: Observation) -> bool:
@@ -97,16 +92,16 @@ class CameraTracker:
     def _follow(self, observation: Observation) -> F64 | str:
         """The pose of a frame that follows one that was tracked, or why the camera is lost."""
         start = self._pose @ self._motion
-        fit = self._fit(observation, start)
+        fit = self._tissue.fit(observation, start)
         if isinstance(fit, str):
             return fit
-        camera = observation.camera
-        moved = replace(camera, T_world_cam=fit.T_world_cam)
+        pose, camera = towards(fit.near, fit.at_rest, HOLD), observation.camera
+        moved = replace(camera, T_world_cam=pose)
         if distance(replace(camera, T_world_cam=start), moved) > LARGEST_JUMP:
             return "the camera jumped"
         if self._is_found_out(replace(observation, camera=moved)):
             return "the camera was taken to be elsewhere"
-        return fit.T_world_cam
+        return pose
 
     def _is_found_out(self, observation: Observation) -> bool:
         """Whether the keyframes have disagreed for long; then what was learnt is undone."""
@@ -167,51 +162,11 @@ class CameraTracker:
             self._restarts = self._mapper.restarts
             self._keyframes.clear()
             self._found_ns = self._before = None
-            self._seconds = 0.0
-        before, self._stamp_ns = self._stamp_ns, observation.t_capture_ns
-        passed = 0.0 if before is None else max(0.0, (self._stamp_ns - before) * 1e-9)
-        model = self._mapper.model
-        new = np.isnan(model.rest[:, 0])
-        model.rest[new] = model.means[new]
-        # A model that is younger than a breath rests where it was on average until now.
-        self._seconds = min(self._seconds + passed, REST_SECONDS)
-        share = passed / max(self._seconds, passed, 1e-9)
-        model.rest[:] += np.float32(share) * (model.means - model.rest)
-        if self._found_ns is not None and not 0 <= self._stamp_ns - self._found_ns < PROBATION_NS:
+        self._tissue.learn(observation)
+        if self._found_ns is not None and not 0 <= observation.t_capture_ns - self._found_ns < PROBATION_NS:
             self._found_ns = self._before = None
         if self._found_ns is None:
             self._keyframes.offer(observation, view)
-
-    def _fit(self, observation: Observation, start: F64, pull: float = PULL) -> PoseFit | str:
-        """The pose, or why there is none; `pull` is the share of the way back to its place at rest at which
-        tissue is taken to be."""
-        model, camera, last = self._mapper.model, observation.camera, self._mapper.last
-        pixels = self._mapper.found_again(observation)
-        rows = np.flatnonzero(_is_inside(pixels, observation.gray))
-        rows = rows[:: max(1, len(rows) // CANDIDATES)]
-        if last is None or len(rows) < LEAST_POINTS:
-            return "hardly any tissue in view"
-        seen = _values(observation.gray, pixels[rows])
-        if _correlation(model.colors[rows].mean(1), seen) < LEAST_AGREEMENT:
-            return "the picture does not show the model's tissue"
-
-        before = project(last.view.camera, model.means[rows])[0].astype(np.float32)
-        chosen = _most_textured(last.observation.gray, before)
-        found, pixels = _refined(
-            last.observation.gray, observation.gray, before[chosen], pixels[rows[chosen]]
-        )
-        rows = rows[chosen[found]]
-        if len(rows) < LEAST_POINTS:
-            return "too little texture to follow"
-        points = model.means[rows] + np.float32(pull) * (model.rest[rows] - model.means[rows])
-        # The formula is its own inverse.
-        disparities = disparity_to_depth(
-            _values(observation.depth, pixels), float(camera.K[0, 0]), observation.baseline
-        )
-        fit = fit_pose(points, pixels, disparities, replace(camera, T_world_cam=start), observation.baseline)
-        if fit.inliers < LEAST_INLIERS * len(rows) or fit.scale > LARGEST_SCALE * camera.width:
-            return "the tissue moved in no common way"
-        return fit
 
     def _best_candidate(self, observation: Observation) -> _Candidate | None:
         """Where the model agrees best with a frame: near the last pose or those by the keyframes."""
@@ -227,15 +182,14 @@ class CameraTracker:
     def _tried(self, observation: Observation, before: Drawn) -> _Candidate | None:
         """Where the camera is if it was there before from where the model is drawn; None: not near it."""
         self._mapper.start_from(before)
-        fit = self._fit(observation, before.view.camera.T_world_cam)
+        fit = self._tissue.fit(observation, before.view.camera.T_world_cam)
         if isinstance(fit, str):
             self.lost = fit
             return None
-        rest = self._fit(observation, fit.T_world_cam, pull=1.0)
-        now = self._seen_from(observation, fit.T_world_cam)
+        now = self._seen_from(observation, fit.near)
         frame = small_frame(observation)
         agrees = agreement(small_view(now.view), frame, observation.camera, observation.baseline)
-        return _Candidate(now, agrees, (fit if isinstance(rest, str) else rest).T_world_cam)
+        return _Candidate(now, agrees, fit.at_rest)
 
     def _seen_from(self, observation: Observation, pose: F64) -> Drawn:
         """The model as a frame that was taken from there would have shown it."""
@@ -254,41 +208,6 @@ class _Candidate:
     T_world_rest: F64  # [4, 4] the pose against the tissue at rest: it may have moved since it was seen
 
 
-def _is_inside(pixels: F32, picture: U8) -> Bool:
-    """Which of the pixels [N, 2] lie in the picture; NaN does not."""
-    height, width = picture.shape
-    u, v = pixels.T
-    inside: Bool = (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
-    return inside
-
-
-def _values(picture: U8 | F32, pixels: F32) -> F32:
-    """Of a picture [H, W] at pixels [N, 2] in it."""
-    columns, rows = (pixels + np.float32(0.5)).astype(np.intp).T
-    return np.asarray(picture[rows, columns], np.float32)
-
-
-def _most_textured(gray: U8, pixels: F32) -> I64:
-    """Indices of those of the pixels [N, 2] that are followed best (J. Shi and C. Tomasi, CVPR 1994), looked
-    for at half the size."""
-    small = cv2.resize(gray, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    texture = np.asarray(cv2.cornerMinEigenVal(small, 3))
-    height, width = texture.shape
-    columns, rows = (0.5 * pixels).astype(np.intp).clip(0, [width - 1, height - 1]).T
-    return np.argsort(-texture[rows, columns], kind="stable")[:POINTS]
-
-
-def _refined(before: U8, after: U8, here: F32, there: F32) -> tuple[I64, F32]:
-    """Follow the pixels `here` [N, 2] once more, from about `there` [N, 2]: dense flow is smooth and coarse.
-    Indices [M] of those found, and where [M, 2] (Lucas-Kanade)."""
-    pixels, status, _ = cv2.calcOpticalFlowPyrLK(
-        before, after, here, there.copy(), winSize=WINDOW, maxLevel=0, flags=cv2.OPTFLOW_USE_INITIAL_FLOW
-    )
-    near = np.abs(pixels - there).max(1) < LARGEST_CORRECTION * before.shape[1]
-    found = np.flatnonzero((status[:, 0] > 0) & near & _is_inside(pixels, after))
-    return found, pixels[found]
-
-
 def _is_lit(observation: Observation) -> bool:
     shown = observation.gray[::8, ::8][observation.tissue[::8, ::8]]
     return bool(shown.size > 0 and shown.std() > LIT)
@@ -300,11 +219,4 @@ def _is_same_scene(before: Observation, now: Observation) -> bool:
         cv2.resize(each.gray, both.shape[::-1], interpolation=cv2.INTER_AREA).astype(np.float32)[both]
         for each in (before, now)
     )
-    return bool(both.any()) and _correlation(*pictures) > SAME_SCENE
-
-
-def _correlation(a: F32, b: F32) -> float:
-    """Of two lists of numbers; 0 where one of them is constant."""
-    a, b = a - a.mean(), b - b.mean()
-    spread = float(np.sqrt((a @ a) * (b @ b)))
-    return float(a @ b) / spread if spread > 0 else 0.0
+    return bool(both.any()) and correlation(*pictures) > SAME_SCENE

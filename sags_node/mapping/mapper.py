@@ -19,12 +19,13 @@ from sags_node.mapping.optimiser import Rates
 from sags_node.mapping.refiner import Refiner
 from sags_node.mapping.split import split_worst
 from sags_node.model.alias_free import smoothing_variances
-from sags_node.model.deformation import NodeDeformation
+from sags_node.model.deformation import NodeDeformation, nearest_nodes
 from sags_node.model.gaussians import GaussianModel
 from sags_node.model.light import carried, is_near
 from sags_node.types import (
     F32,
     F64,
+    I64,
     U8,
     Bool,
     Camera,
@@ -237,6 +238,26 @@ class Mapper:
                 )
             self._found = observation.gray, pixels
         return self._found[1]
+
+    def away(self, rows: I64) -> F32:
+        """How far [K, 3] m from where they rest the Gaussians in `rows` are now."""
+        if self._deformation is None:
+            return np.zeros((len(rows), 3), np.float32)
+        return self._deformation.away(self.model.node_index[rows], self.model.node_weight[rows])
+
+    def away_at(self, points: F32) -> F32:
+        """How far [K, 3] m from where it rests the tissue at places [K, 3] is now."""
+        if self._deformation is None:
+            return np.zeros_like(points)
+        index, weight, _ = nearest_nodes(points, self._deformation.nodes)
+        return self._deformation.away(index, weight)
+
+    def settle(self, share: float, T: F64) -> None:
+        """Let where the tissue rests follow where it is now, by a share of the way, and then move rigidly by
+        T [4, 4]."""
+        if self._deformation is not None:
+            self._deformation.settle(share)
+            self._deformation.shift_rest(T)
 
     def doubt(self, error: float) -> None:
         """The depth of all Gaussians may be wrong by so much more, m, until it is measured again."""

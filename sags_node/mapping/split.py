@@ -75,7 +75,6 @@ def _split(model: GaussianModel, wholes: I64, spare: I64) -> None:
     for rows, away in ((spare[:count], -offsets), (spare[count:], offsets)):
         model.replace(rows, wholes)
         model.means[rows] += away
-        model.rest[rows] += away
 
 
 @parallel_kernel

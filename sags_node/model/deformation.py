@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numba import prange
 
+from sags_node.geometry import transform
 from sags_node.kernels.jit import PIECE, inlined, kernel, parallel_kernel
 from sags_node.model.gaussians import NEIGHBOURS, GaussianModel
 from sags_node.types import F32, F64, I32, I64
@@ -38,6 +39,7 @@ class NodeDeformation:
         self.spacing = _spacing_for(means, count)
         self._most = 4 * count  # beyond this, new tissue follows the nodes there are
         self.nodes = _cell_centres(means, self.spacing)  # [M, 3] m
+        self._rest = self.nodes.copy()  # [M, 3] m: where they are most of the time
         self._momentum = np.zeros_like(self.nodes)
         self._variance = np.zeros_like(self.nodes)
         self._neighbours = self._find_neighbours()
@@ -116,6 +118,18 @@ class NodeDeformation:
         self.nodes += motion
         _skin(motion, model.node_index, model.node_weight, model.means)
 
+    def settle(self, share: float) -> None:
+        """Let where the tissue rests follow where it is now, by a share of the way."""
+        self._rest += np.float32(share) * (self.nodes - self._rest)
+
+    def shift_rest(self, T: F64) -> None:
+        """Let all tissue rest elsewhere, by a rigid motion [4, 4] of the world."""
+        self._rest = transform(T, self._rest).astype(np.float32)
+
+    def away(self, index: I32, weight: F32) -> F32:
+        """How far [N, 3] m from where it rests tissue is now, by its nodes [N, 4] and their weights."""
+        return np.asarray(np.einsum("nk,nka->na", weight, (self.nodes - self._rest)[index]), np.float32)
+
     def normals(self, towards: F64) -> F32:
         """Unit normals [M, 3] of the tissue at the nodes, to the side of a place [3] (m, world): of the plane
         through each node's neighbours."""
@@ -127,7 +141,10 @@ class NodeDeformation:
         return np.asarray(normals, np.float32)
 
     def _add_nodes(self, nodes: F32) -> None:
+        """New tissue is taken to be as far from where it rests as the tissue next to it."""
         zeros = np.zeros_like(nodes)
+        index, weight, _ = nearest_nodes(nodes, self.nodes)
+        self._rest = np.concatenate([self._rest, nodes - self.away(index, weight)])
         self.nodes = np.concatenate([self.nodes, nodes])
         self.seen = np.concatenate([self.seen, zeros[:, 0]])
         self._momentum = np.concatenate([self._momentum, zeros])

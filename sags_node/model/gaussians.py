@@ -39,7 +39,6 @@ class GaussianModel:
     """
 
     means = _Column(np.float32, 3)  # m, world
-    rest = _Column(np.float32, 3)  # m, world: where it is most of the time; NaN: not known yet
     quats = _Column(np.float32, 4)  # wxyz
     log_scales = _Column(np.float32, 3)
     scales = _Column(np.float32, 3)  # m, before the 3D filter
@@ -87,7 +86,6 @@ class GaussianModel:
         for values in rows.values():
             values[added] = 0
         rows["means"][added] = means[:fits]
-        rows["rest"][added] = np.nan
         rows["quats"][added, 0] = 1.0
         rows["scales"][added] = scales[:fits]
         rows["log_scales"][added] = np.log(scales[:fits])

@@ -69,7 +69,7 @@ class Phantom:
         on its path."""
         phase = index / count
         if T_world_cam is None:
-            T_world_cam = scope_pose(phase, self._config.camera_motion)
+            T_world_cam = self._scope(phase)
         vertices = self._tissue.vertices(0.0 if self._config.still_tissue else phase)
         hook_view = HOOK_DEPTH * np.array(self._half_view)
         tools = self._instruments.mesh(self._clock.action(phase), self._tissue.grip(vertices), hook_view)
@@ -100,6 +100,9 @@ class Phantom:
             T_world_cam=T_world_cam,
         )
 
+    def _scope(self, phase: float) -> F64:
+        return scope_pose(self._clock.scope(phase), self._config.camera_motion)
+
     def _is_dark(self, phase: float) -> bool:
         if self._config.blackout is None:
             return False
@@ -108,7 +111,7 @@ class Phantom:
 
     def still(self, phase: float) -> Still:
         """The tissue alone at a phase 0..1 of the session, as the left rectified camera there sees it."""
-        T_world_cam = scope_pose(phase, self._config.camera_motion)
+        T_world_cam = self._scope(phase)
         vertices = self._tissue.vertices(0.0 if self._config.still_tissue else phase)
         bodies = Bodies(self._tissue, vertices, NOTHING)
         lamp = Lamp.at_tip(T_world_cam, self.rig.baseline)

@@ -46,7 +46,7 @@ from sags_node.phantom import write_session  # noqa: E402
 
 SESSIONS = 12  # that are written
 KINDS: tuple[dict[str, Any], ...] = (
-    {}, {"smoke": 0.4}, {"noise": 0.05}, {"blur": 1.5}, {"camera_motion": True}, {"blackout": (0.2, 0.3)},
+    {}, {"smoke": 0.4}, {"noise": 0.05}, {"blur": 1.5}, {"camera_motion": "sway"}, {"blackout": (0.2, 0.3)},
     {"gloss": 10.0},
 )  # fmt: skip
 REAL = (("d4d_pull", 0.0), ("d4d_pull", 3.0), ("hamlyn_heart", 0.0), ("hamlyn_heart", 2.0))

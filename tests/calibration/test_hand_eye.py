@@ -58,7 +58,7 @@ def camera_at(t: float, scale: float = 1.0) -> F64:
     """The left raw camera in the robot's base, where the phantom's scope is after t seconds.
 
     `scale`: of its sway; its own is 1.7 degrees."""
-    sway = scope_pose((t / PERIOD) % 1.0, moving=True)
+    sway = scope_pose((t / PERIOD) % 1.0, "sway")
     sway[:3, :3] = cv2.Rodrigues(scale * cv2.Rodrigues(sway[:3, :3])[0])[0]
     return T_BASE_WORLD @ sway @ invert(T_RAW_RECTIFIED)
 

@@ -135,7 +135,8 @@ def test_a_wrong_place_is_found_out_and_what_was_learnt_there_undone(folder: Pat
     right, ids = mapper.learnt(), mapper.model.ids.copy()
     tracker._found_ns, tracker._before = last.pair.t_capture_ns, right
     wrong = exponential(np.array([0.012, -0.01, 0.004, 0.1, 0.0, 0.1]))  # 16 mm, 8 degrees
-    for places in (mapper.model.means, mapper.model.rest):
+    assert mapper._deformation is not None
+    for places in (mapper.model.means, mapper._deformation.nodes, mapper._deformation._rest):
         places[:] = transform(wrong, places)
     tracker._pose = wrong @ tracker._pose
     assert mapper.last is not None

@@ -20,6 +20,7 @@ from sags_node.geometry import invert, project
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.camera_pose import exponential, fit_pose
 from sags_node.mapping.camera_tracker import GIVE_UP_NS, TRIAL
+from sags_node.mapping.first_views import FirstViews
 from sags_node.mapping.keyframes import Keyframes
 from sags_node.phantom import write_session
 from sags_node.pipeline import Pipeline
@@ -131,7 +132,7 @@ def deforming(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def rendered(factory: pytest.TempPathFactory, still_tissue: bool) -> Path:
     folder = factory.mktemp("moving") / "session"
-    shape = PhantomSource(seconds=2, width=320, height=256, camera_motion=True, still_tissue=still_tissue)
+    shape = PhantomSource(seconds=2, width=320, height=256, camera_motion="sway", still_tissue=still_tissue)
     write_session(shape, folder, RATE)
     return folder
 
@@ -291,6 +292,22 @@ def test_a_keyframe_finds_the_camera_again_where_flow_cannot(still: Path) -> Non
     mm, degrees = error_mm_deg(found[0], far)
     assert mm < 2 and degrees < 2
     assert not keyframes.find(replace(seen, gray=np.full_like(picture, 128)))
+
+
+def test_how_the_tissue_was_seen_first_says_where_the_camera_is_though_places_at_rest_crept(
+    still: Path,
+) -> None:
+    session, frames = opened(still, "session")
+    pipeline, results = play(session, frames[:7])
+    first, last = results[0].observation, results[-1].observation
+    views = FirstViews(pipeline.mapper)
+    assert views.look(first, first.camera.T_world_cam) is None  # it is kept
+    true = last.camera.T_world_cam
+    crept = exponential(np.array([1e-3, 0.5e-3, 0, 0, 0.01, 0]))  # 1.1 mm, 0.6 degrees
+    found = views.look(last, crept @ true)
+    assert found is not None and error_mm_deg(crept @ true, true)[0] > 1
+    mm, degrees = error_mm_deg(found, true)
+    assert mm < 0.3 and degrees < 0.2, (mm, degrees)
 
 
 def test_a_scope_known_to_be_fixed_changes_nothing_where_it_is() -> None:

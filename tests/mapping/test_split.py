@@ -41,7 +41,6 @@ class Scene:
         self.model.contribution[:] = 10.0
         self.model.contribution[::10] = 0.1
         self.model.contribution[LARGE] = 60.0
-        self.model.rest[:] = means + np.float32(1e-3)
         self.image = np.full((HEIGHT, WIDTH, 3), 0.5, np.float32)
         self.drawn = self.image.copy()
         self.drawn[20:41, 30:51] += 0.1
@@ -64,7 +63,7 @@ def scene() -> Scene:
 
 def test_the_parts_cover_what_the_whole_did_and_the_middle_one_keeps_its_identity(scene: Scene) -> None:
     model = scene.model
-    means, ids, rest = model.means.copy(), model.ids.copy(), model.rest.copy()
+    means, ids = model.means.copy(), model.ids.copy()
     assert scene.split() == int(split.SPLIT * COUNT) == 2
     assert model.count == COUNT and len(np.unique(model.ids)) == COUNT
     assert model.ids[LARGE] == ids[LARGE] and np.array_equal(model.means[LARGE], means[LARGE])
@@ -75,7 +74,6 @@ def test_the_parts_cover_what_the_whole_did_and_the_middle_one_keeps_its_identit
     away = (model.means[outer] - means[LARGE]) @ longest
     assert sorted(away) == pytest.approx([-split.APART * 5e-3, split.APART * 5e-3], rel=1e-4)
     assert model.means[outer].mean(0) == pytest.approx(means[LARGE], abs=1e-7)
-    assert model.rest[outer].mean(0) == pytest.approx(rest[LARGE], abs=1e-7)
     assert np.allclose(np.exp(model.log_scales), model.scales, rtol=1e-5)
     assert model.contribution[[LARGE, *outer]].sum() == pytest.approx(60.0)
 

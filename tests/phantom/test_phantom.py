@@ -12,7 +12,7 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.geometry import invert, transform
 from sags_node.launch_file import load_launch
 from sags_node.phantom import cached_session, write_session
-from sags_node.phantom.motion import Clock
+from sags_node.phantom.motion import CENTRE, Clock, scope_pose
 from sags_node.phantom.relief import make_relief
 from sags_node.phantom.rig import phantom_rig, raw_rays
 from sags_node.phantom.scene import Phantom, PhantomFrame
@@ -27,7 +27,7 @@ LIFTED = 4  # the frame of COUNT in which the fold is held up
 @pytest.fixture(scope="module")
 def swaying() -> Phantom:
     """A clean scene with a moving scope."""
-    return Phantom(PhantomSource(width=320, height=256, noise=0, camera_motion=True))
+    return Phantom(PhantomSource(width=320, height=256, noise=0, camera_motion="sway"))
 
 
 @pytest.fixture(scope="module")
@@ -187,7 +187,7 @@ def test_still_scope_keeps_identity() -> None:
 
 
 def test_still_tissue_stays_where_the_scope_and_the_instruments_move() -> None:
-    phantom = Phantom(TINY.model_copy(update={"still_tissue": True, "camera_motion": True}))
+    phantom = Phantom(TINY.model_copy(update={"still_tissue": True, "camera_motion": "sway"}))
     first, later = phantom.frame(0, 3), phantom.frame(1, 3)
     assert np.array_equal(first.points, later.points)
     assert not np.array_equal(first.T_world_cam, later.T_world_cam)
@@ -290,3 +290,26 @@ def test_cache_renders_once_and_keys_on_what_shapes_the_pictures(
     assert cached_session(looped, progress=lambda done, _count: rendered.append(done)) == first
     assert rendered == [1, 2, 3]
     assert cached_session(TINY.model_copy(update={"smoke": 0.5})) != first
+
+
+def test_the_scope_zooms_along_its_axis_and_orbits_round_what_it_looks_at() -> None:
+    for phase in (0.1, 0.25, 0.6):
+        zoomed, orbiting = scope_pose(phase, "zoom"), scope_pose(phase, "orbit")
+        assert np.array_equal(zoomed[:3, :3], np.eye(3)) and zoomed[0, 3] == zoomed[1, 3] == 0
+        before = transform(invert(orbiting), CENTRE)
+        assert before == pytest.approx(CENTRE, abs=1e-12)
+        assert np.linalg.norm(orbiting[:3, 3]) > 5e-3
+    for motion in ("sway", "zoom", "orbit"):
+        assert np.allclose(scope_pose(0.0, motion), np.eye(4)) and np.allclose(
+            scope_pose(1.0, motion), np.eye(4)
+        )
+
+
+def test_the_scope_goes_round_again_in_a_long_session_and_once_in_a_short_one() -> None:
+    assert Clock(120).scope(1 / 17) == pytest.approx(0, abs=1e-9)  # 17 rounds of 7.06 s
+    assert Clock(4).scope(0.3) == pytest.approx(0.3)
+
+
+def test_true_is_a_scope_that_sways() -> None:
+    assert PhantomSource.model_validate({"camera_motion": True}).camera_motion == "sway"
+    assert PhantomSource.model_validate({"camera_motion": False}).camera_motion == "none"

@@ -60,10 +60,10 @@ def test_a_pose_lies_between_its_neighbours() -> None:
     """The phantom's sway (0.02 m/s^2 and 0.31 rad/s^2) from samples 20 ms apart: a t^2 / 8 at most."""
     track = PoseTrack()
     for number in range(201):
-        told(track, scope_pose(number / 200, True), number * 20 * MS)
+        told(track, scope_pose(number / 200, "sway"), number * 20 * MS)
     straight = 0.02**2 / 8
     for t in np.linspace(0, 3.99, 57):
-        off = np.linalg.inv(scope_pose(t / 4, True)) @ track.at(round(t * S))
+        off = np.linalg.inv(scope_pose(t / 4, "sway")) @ track.at(round(t * S))
         assert np.linalg.norm(off[:3, 3]) < 0.021 * straight
         assert np.linalg.norm(cv2.Rodrigues(off[:3, :3])[0]) < 0.35 * straight
 

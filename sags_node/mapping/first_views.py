@@ -1,0 +1,107 @@
+"""What the tissue looked like when it was seen first: places at rest are held to it, or they would creep.
+
+From frame to frame places follow the flow, whose errors add up. So some pictures are kept, with the places
+at rest of what has texture in them. Where that is found again says where the camera is, however long ago the
+picture was taken.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from sags_node.geometry import disparity_to_depth, project, unproject
+from sags_node.mapping.camera_pose import fit_pose
+from sags_node.mapping.keyframes import distance
+from sags_node.mapping.mapper import Mapper
+from sags_node.types import F32, F64, U8, Camera, Observation
+
+MOST = 16  # pictures
+FAR = 0.01  # m, as `keyframes.distance` counts: from there another picture is kept
+CORNERS = 300
+CORNER_QUALITY = 0.005
+CORNER_DISTANCE = 8 / 640  # of the width
+WINDOW = (21, 21)  # px
+ASIDE = 0.02  # of the width, from where it is expected: a corner found farther is another one
+LEAST_CORNERS = 40
+LEAST_INLIERS = 0.5  # of those found
+
+
+@dataclass(frozen=True, slots=True)
+class _View:
+    camera: Camera
+    gray: U8
+    pixels: F32  # [K, 2] of corners
+    rest: F32  # [K, 3] m, world: where their tissue rests
+
+
+class FirstViews:
+    """At most `MOST` pictures, the first one of each place."""
+
+    def __init__(self, mapper: Mapper) -> None:
+        self._mapper = mapper
+        self._kept: list[_View] = []  # oldest first
+
+    def clear(self) -> None:
+        self._kept.clear()
+
+    def look(self, observation: Observation, at_rest: F64) -> F64 | None:
+        """Where the camera is by the nearest picture, [4, 4]; None: that cannot be told. Where there is none
+        near, this one is kept.
+
+        Args:
+            observation: a frame whose pose is known, taken in.
+            at_rest: `T_world_cam` [4, 4] against the tissue at rest.
+        """
+        camera = replace(observation.camera, T_world_cam=at_rest)
+        distances = [distance(view.camera, camera) for view in self._kept]
+        nearest = int(np.argmin(distances)) if distances else -1
+        if distances and distances[nearest] < FAR:
+            return self._pose(self._kept[nearest], observation, camera)
+        if len(self._kept) == MOST:
+            del self._kept[1]  # the first one shows how it all began
+        view = self._seen(observation, camera)
+        if len(view.pixels) >= LEAST_CORNERS:
+            self._kept.append(view)
+        return None
+
+    def _seen(self, observation: Observation, camera: Camera) -> _View:
+        where = (observation.tissue & (observation.depth > 0)).view(np.uint8)
+        apart = CORNER_DISTANCE * camera.width
+        corners = cv2.goodFeaturesToTrack(observation.gray, CORNERS, CORNER_QUALITY, apart, mask=where)
+        pixels = np.zeros((0, 2), np.float32) if corners is None else np.asarray(corners[:, 0], np.float32)
+        points = np.asarray(unproject(observation.camera, pixels, _at(observation.depth, pixels)), np.float32)
+        return _View(camera, observation.gray, pixels, points - self._mapper.away_at(points))
+
+    def _pose(self, view: _View, observation: Observation, camera: Camera) -> F64 | None:
+        now = view.rest + self._mapper.away_at(view.rest)
+        expected = np.asarray(project(observation.camera, now)[0], np.float32)
+        height, width = observation.gray.shape
+        inside = ((expected > 0) & (expected < [width - 1, height - 1])).all(1)
+        expected, rest = expected[inside], view.rest[inside]
+        if len(expected) < LEAST_CORNERS:
+            return None
+        pixels, status, _ = cv2.calcOpticalFlowPyrLK(
+            view.gray, observation.gray, view.pixels[inside], expected.copy(),
+            winSize=WINDOW, maxLevel=1, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        )  # fmt: skip
+        found = (status[:, 0] > 0) & (np.abs(pixels - expected).max(1) < ASIDE * width)
+        found &= ((pixels > 0) & (pixels < [width - 1, height - 1])).all(1)
+        found[found] = _at(observation.tissue, pixels[found])
+        if np.count_nonzero(found) < LEAST_CORNERS:
+            return None
+        pixels, rest = pixels[found], rest[found]
+        depths = _at(observation.depth, pixels)
+        disparities = disparity_to_depth(
+            depths, float(camera.K[0, 0]), observation.baseline
+        )  # its own inverse
+        fit = fit_pose(rest, pixels, disparities, camera, observation.baseline)
+        return fit.T_world_cam if fit.inliers >= LEAST_INLIERS * len(pixels) else None
+
+
+def _at(picture: np.ndarray, pixels: F32) -> np.ndarray:
+    """Of a picture [H, W] at pixels [K, 2] in it."""
+    columns, rows = (pixels + np.float32(0.5)).astype(np.intp).T
+    return np.asarray(picture[rows, columns])

@@ -1,0 +1,70 @@
+"""Given camera poses, put right by the picture where they are off."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sags_node.geometry import invert
+from sags_node.mapping.camera_pose import towards
+from sags_node.mapping.mapper import Mapper
+from sags_node.mapping.resting_tissue import RestingTissue
+from sags_node.types import F64, Observation, RenderedView
+
+SECONDS = 10.0  # over which the correction follows the picture: longer than a breath
+
+
+class PoseRefiner:
+    """Corrects the poses of a robot by where the model's tissue at rest is seen.
+
+    A robot knows well how the scope moves within a second, and less well where it is: joints and trocar give
+    way, and the error grows slowly. Tissue breathes quickly and comes back. So the camera moves as it is
+    given, and a correction of its place follows the picture more slowly than tissue breathes: what is quick
+    is the tissue's motion. Where the picture cannot tell, the correction stays.
+
+    Attributes:
+        lost: never; for a tracker that may be, see `CameraTracker`.
+        unsure: why the picture could not tell in the last frame; empty: it could.
+    """
+
+    lost: str | None = None
+
+    def __init__(self, mapper: Mapper) -> None:
+        self.unsure = ""
+        self._mapper = mapper
+        self._tissue = RestingTissue(mapper)
+        self._correction: F64 = np.eye(4)  # of given poses, from the left
+        self._given: F64 = np.eye(4)  # pose of the last frame
+        self._pose: F64 = np.eye(4)
+        self._stamp_ns: int | None = None  # of the last frame
+
+    @property
+    def pose(self) -> F64:
+        """`T_world_cam` [4, 4] of the last frame."""
+        return self._pose
+
+    def guess(self, given: F64 | None) -> F64 | None:
+        """The pose of a frame before it is looked at."""
+        if given is None:
+            return None
+        self._given = given
+        return self._correction @ given
+
+    def track(self, observation: Observation) -> bool:
+        """Find the pose of a frame whose camera is as guessed; it is never lost."""
+        guess = observation.camera.T_world_cam
+        before, self._stamp_ns = self._stamp_ns, observation.t_capture_ns
+        self._pose, self.unsure = guess, ""
+        if before is None or self._mapper.model.count == 0:
+            return True
+        fit = self._tissue.fit(observation, guess)
+        if isinstance(fit, str):
+            self.unsure = fit
+            return True
+        seconds = min(max(0.0, (self._stamp_ns - before) * 1e-9), 1.0)
+        self._pose = towards(guess, fit.at_rest, seconds / SECONDS)
+        self._correction = self._pose @ invert(self._given)
+        return True
+
+    def mapped(self, observation: Observation, view: RenderedView) -> None:
+        """Learn from a frame that was taken in."""
+        self._tissue.learn(observation)

@@ -1,0 +1,155 @@
+"""The model's tissue where it rests, and the camera's pose against it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from sags_node.geometry import disparity_to_depth, invert, project
+from sags_node.mapping.camera_pose import fit_pose, towards
+from sags_node.mapping.first_views import FirstViews
+from sags_node.mapping.mapper import Mapper
+from sags_node.types import F32, F64, I64, U8, Bool, Observation
+
+CANDIDATES = 2000  # Gaussians, of those found
+POINTS = 300  # of them, those with most texture; measured: one in each cell of a grid is worse
+WINDOW = (15, 15)  # px
+LARGEST_CORRECTION = 3 / 640  # of the width
+LEAST_POINTS = 40
+REST_SECONDS = 60.0  # over which a place at rest follows the tissue: ten breaths and more
+CALM = 3.0  # of the usual way from its place at rest: tissue that is farther from it moves by itself
+LOOK_NS = 200_000_000  # between two looks at how the tissue was seen first
+LOOK_SECONDS = 1.0  # over which places at rest are brought back to that
+LEAST_INLIERS = 0.35  # of the points
+LEAST_AGREEMENT = 0.5  # correlation of the picture with the colours of the Gaussians found in it
+LARGEST_SCALE = 4 / 640  # of the width: of the residuals
+
+
+@dataclass(frozen=True, slots=True)
+class TissueFit:
+    """Where a camera is, `T_world_cam` [4, 4]."""
+
+    near: F64  # by how the tissue moved since the last frame
+    at_rest: F64  # by where it rests; as `near` where too little of it is there
+
+
+class RestingTissue:
+    """The tissue has a place at rest, which follows it slowly."""
+
+    def __init__(self, mapper: Mapper) -> None:
+        self._mapper = mapper
+        self._restarts = mapper.restarts
+        self._stamp_ns: int | None = None  # of the last frame that was mapped
+        self._seconds = 0.0  # that the model has been learnt for
+        self._first_views = FirstViews(mapper)
+        self._at_rest: F64 | None = None  # pose of the last frame against the tissue at rest
+        self._looked_ns = 0
+
+    def fit(self, observation: Observation, start: F64) -> TissueFit | str:
+        """The pose of a frame, or why there is none; `start` [4, 4] is about where it was taken from."""
+        model, camera, last = self._mapper.model, observation.camera, self._mapper.last
+        pixels = self._mapper.found_again(observation)
+        rows = np.flatnonzero(_is_inside(pixels, observation.gray))
+        rows = rows[:: max(1, len(rows) // CANDIDATES)]
+        if last is None or len(rows) < LEAST_POINTS:
+            return "hardly any tissue in view"
+        away = self._mapper.away(rows)
+        ways = np.linalg.norm(away, axis=1)
+        calm = ways <= CALM * np.median(ways)
+        rows, away = rows[calm], away[calm]
+        seen = _values(observation.gray, pixels[rows])
+        if correlation(model.colors[rows].mean(1), seen) < LEAST_AGREEMENT:
+            return "the picture does not show the model's tissue"
+
+        before = project(last.view.camera, model.means[rows])[0].astype(np.float32)
+        chosen = _most_textured(last.observation.gray, before)
+        found, pixels = _refined(
+            last.observation.gray, observation.gray, before[chosen], pixels[rows[chosen]]
+        )
+        rows, away = rows[chosen[found]], away[chosen[found]]
+        if len(rows) < LEAST_POINTS:
+            return "too little texture to follow"
+        points = model.means[rows]
+        # The formula is its own inverse.
+        disparities = disparity_to_depth(
+            _values(observation.depth, pixels), float(camera.K[0, 0]), observation.baseline
+        )
+        start_camera = replace(camera, T_world_cam=start)
+        near = fit_pose(points, pixels, disparities, start_camera, observation.baseline)
+        if near.inliers < LEAST_INLIERS * len(rows) or near.scale > LARGEST_SCALE * camera.width:
+            return "the tissue moved in no common way"
+        near_camera = replace(camera, T_world_cam=near.T_world_cam)
+        at_rest = fit_pose(points - away, pixels, disparities, near_camera, observation.baseline)
+        is_there = at_rest.inliers >= LEAST_INLIERS * len(rows)
+        self._at_rest = at_rest.T_world_cam if is_there else near.T_world_cam
+        return TissueFit(near.T_world_cam, self._at_rest)
+
+    def learn(self, observation: Observation) -> None:
+        """Let the places at rest follow a frame that was taken in."""
+        if self._mapper.restarts != self._restarts:
+            self._restarts = self._mapper.restarts
+            self._seconds = 0.0
+            self._first_views.clear()
+            self._at_rest = None
+        before, self._stamp_ns = self._stamp_ns, observation.t_capture_ns
+        passed = 0.0 if before is None else max(0.0, (self._stamp_ns - before) * 1e-9)
+        # A model that is younger than a breath rests where it was on average until now.
+        self._seconds = min(self._seconds + passed, REST_SECONDS)
+        share = passed / max(self._seconds, passed, 1e-9)
+        self._mapper.settle(share, self._crept(observation))
+
+    def _crept(self, observation: Observation) -> F64:
+        """The motion [4, 4] of the world that brings places at rest back to where they were seen first."""
+        now = observation.t_capture_ns
+        at_rest = observation.camera.T_world_cam if self._at_rest is None else self._at_rest
+        if 0 <= now - self._looked_ns < LOOK_NS:
+            return np.eye(4)
+        self._looked_ns = now
+        found = self._first_views.look(observation, at_rest)
+        if found is None:
+            return np.eye(4)
+        return towards(at_rest, found, LOOK_NS * 1e-9 / LOOK_SECONDS) @ invert(at_rest)
+
+
+def _is_inside(pixels: F32, picture: U8) -> Bool:
+    """Which of the pixels [N, 2] lie in the picture; NaN does not."""
+    height, width = picture.shape
+    u, v = pixels.T
+    inside: Bool = (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
+    return inside
+
+
+def _values(picture: U8 | F32, pixels: F32) -> F32:
+    """Of a picture [H, W] at pixels [N, 2] in it."""
+    columns, rows = (pixels + np.float32(0.5)).astype(np.intp).T
+    return np.asarray(picture[rows, columns], np.float32)
+
+
+def _most_textured(gray: U8, pixels: F32) -> I64:
+    """Indices of those of the pixels [N, 2] that are followed best (J. Shi and C. Tomasi, CVPR 1994), looked
+    for at half the size."""
+    small = cv2.resize(gray, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    texture = np.asarray(cv2.cornerMinEigenVal(small, 3))
+    height, width = texture.shape
+    columns, rows = (0.5 * pixels).astype(np.intp).clip(0, [width - 1, height - 1]).T
+    return np.argsort(-texture[rows, columns], kind="stable")[:POINTS]
+
+
+def _refined(before: U8, after: U8, here: F32, there: F32) -> tuple[I64, F32]:
+    """Follow the pixels `here` [N, 2] once more, from about `there` [N, 2]: dense flow is smooth and coarse.
+    Indices [M] of those found, and where [M, 2] (Lucas-Kanade)."""
+    pixels, status, _ = cv2.calcOpticalFlowPyrLK(
+        before, after, here, there.copy(), winSize=WINDOW, maxLevel=0, flags=cv2.OPTFLOW_USE_INITIAL_FLOW
+    )
+    near = np.abs(pixels - there).max(1) < LARGEST_CORRECTION * before.shape[1]
+    found = np.flatnonzero((status[:, 0] > 0) & near & _is_inside(pixels, after))
+    return found, pixels[found]
+
+
+def correlation(a: F32, b: F32) -> float:
+    """Of two lists of numbers; 0 where one of them is constant."""
+    a, b = a - a.mean(), b - b.mean()
+    spread = float(np.sqrt((a @ a) * (b @ b)))
+    return float(a @ b) / spread if spread > 0 else 0.0
