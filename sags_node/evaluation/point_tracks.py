@@ -4,7 +4,7 @@ TAP-Vid (Doersch et al., NeurIPS 2022); and how often what is said with some con
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -36,7 +36,8 @@ def average_jaccard(
     return float(np.mean(found))
 
 
-class Bin(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class Bin:
     """What came of all that was said with about the same confidence."""
 
     least: float

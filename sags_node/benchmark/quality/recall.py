@@ -81,8 +81,8 @@ def measure_recall(session: Session, away: float, advance: Advance) -> dict[str,
     configure_threads(session.config.engine.threads)
     counts = [round(seconds * RATE) for seconds in (BEFORE, away, AFTER)]
     phantom = Phantom(source.model_copy(update={"seconds": sum(counts) / RATE}))
-    said = _Said()
-    rows = [_played(session, phantom, scenario, counts, said, advance) for scenario in SCENARIOS]
+    said, film = _Said(), _Film(phantom, sum(counts))
+    rows = [_played(session, film, scenario, counts, said, advance) for scenario in SCENARIOS]
     return {"session": session.name, "seed": source.seed, "away_s": away, "rows": rows, **said.reliability()}
 
 
@@ -114,13 +114,13 @@ class _Said:
 
 
 def _played(
-    session: Session, phantom: Phantom, scenario: Scenario, counts: list[int], said: _Said, advance: Advance
+    session: Session, film: _Film, scenario: Scenario, counts: list[int], said: _Said, advance: Advance
 ) -> dict[str, Any]:
     before = counts[0]
-    pipeline, budget = Pipeline(session.config, phantom.rig), StepBudget(STEPS)
+    pipeline, budget = Pipeline(session.config, film.phantom.rig), StepBudget(STEPS)
     pinned: dict[int, int] = {}
     width, _ = session.working_size
-    for number, moment in enumerate(_moments(phantom, scenario, counts)):
+    for number, moment in enumerate(_moments(film, scenario, counts)):
         result = pipeline.process(_stereo(number, moment), budget)
         truth, visible = _truth(result, moment)
         if number == before // 3:
@@ -156,17 +156,34 @@ def _scored(
     }
 
 
-def _moments(phantom: Phantom, scenario: Scenario, counts: list[int]) -> Iterator[_Moment]:
+@dataclass(frozen=True, slots=True)
+class _Film:
+    """The phantom's frames; those of a scope that stays are rendered once for all scenarios."""
+
+    phantom: Phantom
+    count: int
+    still: dict[int, PhantomFrame] = field(default_factory=dict)
+
+    def frame(self, number: int, T_world_cam: F64) -> PhantomFrame:
+        if not np.array_equal(T_world_cam, np.eye(4)):
+            return self.phantom.frame(number, self.count, T_world_cam)
+        if number not in self.still:
+            self.still[number] = self.phantom.frame(number, self.count, T_world_cam)
+        return self.still[number]
+
+
+def _moments(film: _Film, scenario: Scenario, counts: list[int]) -> Iterator[_Moment]:
     before, away, _ = counts
     for number in range(sum(counts)):
         gone = before <= number < before + away
         T_world_cam = _place(scenario, number - before, away)
-        frame = phantom.frame(number, sum(counts), T_world_cam)
+        dark = gone and scenario == "dark"  # then it does not matter where the scope is
+        frame = film.frame(number, np.eye(4) if dark else T_world_cam)
         hidden = None
         if gone and scenario == "covered":
             hidden, width = np.zeros_like(frame.tool), frame.tool.shape[1]
             hidden[:, round(COVERED[0] * width) : round(COVERED[1] * width)] = True
-        elif gone and scenario == "dark":
+        elif dark:
             frame = _dark(frame, number)
         yield _Moment(frame, T_world_cam, hidden)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -30,11 +30,12 @@ from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.motion import BEHIND_TOLERANCE
 from sags_node.pipeline import Pipeline
-from sags_node.session import Session
+from sags_node.session import Session, open_posed
 from sags_node.types import F32, F64, I64, AnchorStates, Bool, FrameResult, StereoFrame
 from sags_node.warm_up import warm_up
 
 SPACING = 34  # px between anchors
+BESIDE = 40  # points, at most, that all methods are compared on: CSRT is slow
 BORDER = 60  # px: what is nearer to the picture's edge soon leaves it
 SURE = 0.5  # confidence
 RIGHT = 4.0 / 640  # of the width: so near to its point a confident anchor should be
@@ -86,7 +87,7 @@ def measure_tracking(
     pipeline, budget, last = Pipeline(session.config, session.rig), StepBudget(1), max(frames)
     run: _Run | None = None
     rows = []
-    with session.source as source:
+    with open_posed(session.config, session.rig) as source:
         for number, frame in enumerate(source):
             result = pipeline.process(frame, budget)
             if run is None:
@@ -125,8 +126,9 @@ class _Run:
             wanted = _visible(frame) & _middle(places, result)
         pinned = _pin(pipeline, result, places, wanted)
         self._rows, self._places, self.count = pinned, places[pinned], len(pinned)
-        picture = result.pair.left
-        self._followers = {name: FOLLOWERS[name](picture, self._places) for name in beside}
+        self._shared = np.unique(np.linspace(0, self.count - 1, BESIDE).round().astype(np.int64))
+        picture, places = result.pair.left, self._places[self._shared]
+        self._followers = {name: FOLLOWERS[name](picture, places) for name in beside}
         names = ["anchors", *beside, *(["direct_flow"] if self._exact else [])]
         self._said = {name: _Said() for name in names}
         self._truths: list[_Truth] = []
@@ -142,8 +144,9 @@ class _Run:
         if measured:
             states = result.anchors
             self._states.append(states)
-            self._said["anchors"].pixels.append(states.pixels.astype(np.float64))
-            self._said["anchors"].seen.append((states.confidence >= SURE) & (states.visibility >= SURE))
+            seen = (states.confidence >= SURE) & (states.visibility >= SURE)
+            self._said["anchors"].pixels.append(states.pixels[self._shared].astype(np.float64))
+            self._said["anchors"].seen.append(seen[self._shared])
 
     def measured(self, number: int, frame: StereoFrame, result: FrameResult) -> dict[str, Any]:
         """One frame; to be asked after it was followed."""
@@ -154,8 +157,8 @@ class _Run:
         if self._exact:
             direct = self._said["direct_flow"]
             direct.times_s.append(time.perf_counter() - started)
-            direct.pixels.append(ends)
-            direct.seen.append(consistent)
+            direct.pixels.append(ends[self._shared])
+            direct.seen.append(consistent[self._shared])
             truth = self._truth(frame, result)
         else:
             truth = _Truth(ends, consistent, consistent)
@@ -182,16 +185,17 @@ class _Run:
 
     def figures(self) -> dict[str, Any]:
         """All methods over all frames that were measured, and whether the anchors' confidence is right."""
-        width = self._first.pair.camera.width
-        methods = {name: self._judged(said, width) for name, said in self._said.items()}
         confidence = np.concatenate([states.confidence for states in self._states]).astype(np.float64)
         known = np.concatenate([truth.known for truth in self._truths])
-        near = _distances(self._said["anchors"], self._truths) < RIGHT * width
+        pixels = np.concatenate([states.pixels for states in self._states])
+        off_px = np.linalg.norm(pixels - np.concatenate([truth.pixels for truth in self._truths]), axis=1)
+        right = off_px < RIGHT * self._first.pair.camera.width
         found = {
             "truth": "exact" if self._exact else "direct flow",
             "frame_ms": float(np.median(self._frame_s)) * 1e3,
-            "methods": methods,
-            "reliability_px": reliability_rows(confidence[known], near.ravel()[known]),
+            "points_beside": len(self._shared),
+            "methods": {name: self._judged(name, said) for name, said in self._said.items()},
+            "reliability_px": reliability_rows(confidence[known], right[known]),
         }
         if self._exact:
             points = np.concatenate([states.points for states in self._states])
@@ -199,17 +203,20 @@ class _Run:
             found["reliability_mm"] = reliability_rows(confidence, off < RIGHT_MM * 1e-3)
         return found
 
-    def _judged(self, said: _Said, width: int) -> dict[str, Any]:
-        visible = np.array([truth.visible for truth in self._truths])
-        seen, off = np.array(said.seen), _distances(said, self._truths)
+    def _judged(self, name: str, said: _Said) -> dict[str, Any]:
+        visible = np.array([truth.visible[self._shared] for truth in self._truths])
+        wanted = np.array([truth.pixels[self._shared] for truth in self._truths])
+        seen, off = np.array(said.seen), np.linalg.norm(np.array(said.pixels) - wanted, axis=2)
+        off = np.where(np.isfinite(off), off, np.inf)  # it does not know at all
+        points = self.count if name in ("anchors", "direct_flow") else len(self._shared)
         return {
             "off_by_px": percentiles(off[visible & np.isfinite(off)]),
             "within": shares_within(off[visible]),
             "sure": float(np.mean(seen[visible])),
-            "wrong": float(np.mean((seen & (off > WRONG * width))[visible])),
+            "wrong": float(np.mean((seen & (off > WRONG * self._first.pair.camera.width))[visible])),
             "average_jaccard": average_jaccard(off, visible, seen) if self._exact else None,
             "visibility_right": float(np.mean(seen == visible)) if self._exact else None,
-            "us_per_point": float(np.median(said.times_s)) * 1e6 / self.count,
+            "us_per_point": float(np.median(said.times_s)) * 1e6 / points,
         }
 
 
@@ -222,16 +229,10 @@ def _show(follower: Follower, said: _Said, result: FrameResult, measured: bool) 
         said.seen.append(seen)
 
 
-def _distances(said: _Said, truths: Sequence[_Truth]) -> F64:
-    """Px [frames, P]; infinite where it does not know at all."""
-    off = np.linalg.norm(np.array(said.pixels) - [truth.pixels for truth in truths], axis=2)
-    return np.where(np.isfinite(off), off, np.inf)
-
-
 def reliability_rows(confidence: F64, right: Bool) -> dict[str, Any]:
     """For JSON: `bins`, each as `Bin`, and the mean distance between confidence and truth (`error`)."""
     bins = reliability(confidence, right)
-    return {"error": calibration_error(bins), "bins": [each._asdict() for each in bins]}
+    return {"error": calibration_error(bins), "bins": [asdict(each) for each in bins]}
 
 
 def true_points(frame: StereoFrame, result: FrameResult) -> F64 | None:

@@ -39,7 +39,7 @@ def _by_method(measured: dict[str, Any]) -> Table:
     made = Table(
         "", "off by p50, p90, px", *(f"<= {key.removeprefix('within_')} px" for key in thresholds),
         "sure", "sure and wrong", "average Jaccard", "us a point",
-        title=f"{measured['anchors']} points in {len(measured['frames'])} frames",
+        title=f"{measured['points_beside']} points in {len(measured['frames'])} frames",
     )  # fmt: skip
     for name, row in measured["methods"].items():
         made.add_row(
