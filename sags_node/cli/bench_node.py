@@ -206,7 +206,11 @@ def bench_soak(
 @click.command("tracking")
 @launch_argument
 @click.option(
-    "--frames", "numbers", default="10,40,70,90", show_default=True, help="After how many frames to measure."
+    "--frames",
+    "numbers",
+    default="10,20,30,40,50,60,70,80,90",
+    show_default=True,
+    help="After how many frames to measure.",
 )
 @table_option
 @as_json
@@ -214,13 +218,14 @@ def bench_tracking(launch: tuple[str, ...], numbers: str, out: Path | None, json
     """How well anchors stay on the tissue.
 
     Pins anchors all over the first frame of a recording, follows them with one step of the mapper a frame,
-    and compares with direct optical flow between the first and a later frame, where that is consistent.
-    The model's Gaussians beside them.
+    and compares with true points, where the recording has them (the phantom), else with direct optical flow
+    between the first and a later frame, where that is consistent. The model's Gaussians beside them, and
+    CSRT, pyramidal Lucas-Kanade and dense flow on the same points. Whether confident anchors are right.
 
     \b
     sags bench tracking launch/d4d_pull.yaml --out benchmarks/results/tracking_d4d.json
     """
-    from sags_node.benchmark.quality import tracking
+    from sags_node.benchmark.quality import tracking, tracking_report
 
     if not all(number.strip().isdigit() and int(number) > 0 for number in numbers.split(",")):
         raise UsageError(f"--frames {numbers}: give numbers above 0 with commas between, e.g. 10,40")
@@ -231,7 +236,8 @@ def bench_tracking(launch: tuple[str, ...], numbers: str, out: Path | None, json
     session = open_launched(path, [*overrides, "source.loop:=false", "source.pace:=step"])
     with progress("following") as advance:
         measured = tracking.measure_tracking(session, [int(n) for n in numbers.split(",")], advance)
-    show(measured if json_out else tracking.table(measured))
+    for table in [measured] if json_out else tracking_report.tables(measured):
+        show(table)
     write_json(out, measured)
 
 
@@ -245,7 +251,8 @@ def bench_recall(launch: tuple[str, ...], seconds: float, out: Path | None, json
 
     Pins anchors to the phantom's tissue. Then a cloth covers it, or it is dark and the scope moves, or the
     scope turns away; meanwhile the tissue moves on. Once it is back: how many anchors are on their points
-    again, how many are sure and wrong, and how many would be right if they had not moved at all.
+    again, how many are sure and wrong, and how many would be right if they had not moved at all. Also how
+    often anchors of some confidence are right, in all frames.
 
     \b
     sags bench recall source.seed:=1 --out benchmarks/results/recall.json
@@ -257,7 +264,8 @@ def bench_recall(launch: tuple[str, ...], seconds: float, out: Path | None, json
     session = open_launched(path, [*overrides, "source.pace:=step"])
     with progress("following") as advance:
         measured = recall.measure_recall(session, seconds, advance)
-    show(measured if json_out else recall.table(measured))
+    for table in [measured] if json_out else recall.tables(measured):
+        show(table)
     write_json(out, measured)
 
 

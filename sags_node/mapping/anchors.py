@@ -32,7 +32,7 @@ from sags_node.types import (
     RenderedView,
     Snapshot,
 )
-from sags_node.vision.landmarks import features_in
+from sags_node.vision.landmarks import RATIO, features_in
 from sags_node.vision.pyramid import pyramid_of
 
 MAX_ANCHORS = 256
@@ -48,6 +48,8 @@ SEARCH_RADIUS = 4  # px, of an anchor found in the frame before
 SEARCH_GROWTH = 30.0  # px/s since it was found last
 MAX_SEARCH_RADIUS = 16  # px
 FOUND_AGREEMENT = 0.8  # normalised cross-correlation from which on the patch counts as found
+APART = 4  # px: a place so far from the best one is another
+CLEARER = RATIO**2  # 1 - agreement is a squared distance: of the best place, to that of the second best
 ALONE_AGREEMENT = 0.9  # where nothing else tells that it is the same place: other tissue has reached 0.82
 SEARCHED_PER_FRAME = 32  # anchors, in turn
 DEPTH_PULL = 0.1  # share of the depth error taken per frame
@@ -233,9 +235,10 @@ class Anchors:
         for i in seen[np.argsort(table.searched[seen], kind="stable")][:SEARCHED_PER_FRAME]:
             table.searched[i] = self._frames
             radius = int(min(SEARCH_RADIUS + SEARCH_GROWTH * table.unseen[i], MAX_SEARCH_RADIUS))
-            window = _patch(observation, table.pixels[i], PATCH_RADIUS + radius)
-            found = None if window is None else _match(window, table.patches[i])
-            if found is not None and (table.unseen[i] < LOST or found[1] >= ALONE_AGREEMENT):
+            window, tissue = _window(observation, table.pixels[i], PATCH_RADIUS + radius)
+            followed = table.unseen[i] < LOST
+            found = _match(window, tissue, table.patches[i], carried=followed)
+            if found is not None and (followed or found[1] >= ALONE_AGREEMENT):
                 shift, table.agreement[i] = found
                 table.pixels[i] += shift - radius
                 table.points[i] = unproject(observation.camera, table.pixels[i], table.depths[i])
@@ -264,16 +267,15 @@ def _put_back(
 ) -> None:
     """Move an anchor to where it was recognised, if depth and patch agree; else it stays lost."""
     i = int(np.flatnonzero(table.ids == place.id)[0])
-    window = straightened(observation.gray, observation.tissue, place, PATCH_RADIUS + RECALL_RADIUS)
-    found = None if window is None else _match(window, place.patch)
+    window, tissue = straightened(observation.gray, observation.tissue, place, PATCH_RADIUS + RECALL_RADIUS)
+    found = _match(window, tissue, place.patch)
     if found is None:
         return
     shift, agreement = found
     pixel = place.pixel + place.linear @ (shift - RECALL_RADIUS)
     patch = _patch(observation, pixel, PATCH_RADIUS)
-    column, row = np.rint(pixel).astype(np.intp)
-    depth = float(view.depth[row, column]) - table.depth_offsets[i]
-    if patch is None or view.depth[row, column] <= 0 or not fits_depth(place, depth):
+    depth = _depth_at(table, i, pixel, observation, view)
+    if patch is None or depth is None or not fits_depth(place, depth):
         return
     point: F64 = np.asarray(unproject(observation.camera, pixel, np.array(depth)), np.float64)
     carriers = _carriers(point, snapshot.gaussians)
@@ -283,6 +285,19 @@ def _put_back(
     table.points[i], table.pixels[i], table.depths[i] = point, pixel, depth
     table.visibility[i], table.agreement[i], table.unseen[i] = 1, agreement, 0
     table.patches[i] = patch
+
+
+def _depth_at(
+    table: _Table, i: int, pixel: F64, observation: Observation, view: RenderedView
+) -> float | None:
+    """Camera z (m) of the anchor in row i at a pixel: by the drawn surface or what is measured there. Where
+    both know nothing, its own, if it was carried to that place; None: unknown."""
+    column, row = np.rint(pixel).astype(np.intp)
+    surface = float(view.depth[row, column]) or float(observation.depth[row, column])
+    if surface > 0:
+        return surface - float(table.depth_offsets[i])
+    carried = np.linalg.norm(table.pixels[i] - pixel) < SEARCH_RADIUS  # NaN: not
+    return float(table.depths[i]) if carried and table.depths[i] > 0 else None
 
 
 def _carry(table: _Table, gaussians: Gaussians) -> F64:
@@ -410,18 +425,44 @@ def _patch(observation: Observation, pixel: F64, radius: int) -> U8 | None:
     return np.asarray(cv2.getRectSubPix(observation.gray, (size, size), (float(pixel[0]), float(pixel[1]))))
 
 
-def _match(window: U8, patch: U8) -> tuple[F64, float] | None:
+def _window(observation: Observation, pixel: F64, radius: int) -> tuple[U8, Bool]:
+    """The gray picture around a place, to a part of a pixel, and where all that it was made of is tissue."""
+    size = 2 * radius + 1
+    gray = cv2.getRectSubPix(observation.gray, (size, size), (float(pixel[0]), float(pixel[1])))
+    height, width = observation.tissue.shape
+    tissue = np.zeros((size, size), np.bool_)
+    left, top = round(float(pixel[0])) - radius, round(float(pixel[1])) - radius
+    rows, columns = slice(max(0, top), min(height, top + size)), slice(max(0, left), min(width, left + size))
+    inner = observation.tissue[rows, columns]
+    tissue[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left] = inner
+    if not tissue.all():  # a part of a pixel beside it
+        tissue = cv2.erode(tissue.view(np.uint8), np.ones((3, 3), np.uint8)).view(np.bool_)
+    return np.asarray(gray, np.uint8), tissue
+
+
+def _match(window: U8, tissue: Bool, patch: U8, carried: bool = False) -> tuple[F64, float] | None:
     """Where [2] (x, y) in the window the patch begins, to a part of a pixel, and how well it fits; None where
-    it is not found."""
+    it is not found on tissue. Nor where it fits nearly as well elsewhere, as along an edge: then one that was
+    `carried` to the middle is there, if it fits nearly as well as anywhere."""
     scores: F32 = np.asarray(cv2.matchTemplate(window, patch, cv2.TM_CCOEFF_NORMED))
+    if not tissue.all():
+        on_tissue = cv2.erode(tissue.view(np.uint8), np.ones((_SIDE, _SIDE), np.uint8))
+        inner = slice(PATCH_RADIUS, len(window) - PATCH_RADIUS)
+        scores[on_tissue[inner, inner] == 0] = -1
     row, column = np.unravel_index(int(np.argmax(scores)), scores.shape)
-    best = float(scores[row, column])
-    inside = 0 < row < len(scores) - 1 and 0 < column < len(scores) - 1
-    if not inside or best < FOUND_AGREEMENT:
+    best, middle = float(scores[row, column]), len(scores) // 2
+    if best < FOUND_AGREEMENT:
         return None
-    x = column + _vertex(scores[row, column - 1 : column + 2])
-    y = row + _vertex(scores[row - 1 : row + 2, column])
-    return np.array([x, y]), min(best, 1.0)
+    fits = float(scores[middle, middle])
+    around = scores[max(0, row - 1) : row + 2, max(0, column - 1) : column + 2].copy()
+    scores[max(0, row - APART) : row + APART + 1, max(0, column - APART) : column + APART + 1] = -1
+    inside = around.shape == (3, 3) and around.min() > -1
+    if inside and 1 - best < CLEARER * (1 - float(scores.max())):
+        x, y = column + _vertex(around[1]), row + _vertex(around[:, 1])
+        return np.array([x, y]), min(best, 1.0)
+    if carried and fits >= FOUND_AGREEMENT and 1 - best > CLEARER * (1 - fits):
+        return np.array([middle, middle], np.float64), min(fits, 1.0)
+    return None
 
 
 def _vertex(values: F32) -> float:

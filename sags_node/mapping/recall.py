@@ -119,17 +119,12 @@ def fits_depth(place: Place, depth: float) -> bool:
     return 1 / SAME_SCALE < ratio < SAME_SCALE
 
 
-def straightened(gray: U8, tissue: Bool, place: Place, radius: int) -> U8 | None:
-    """The picture around a place as it would look turned and scaled back, a square of 2 radius + 1 px; None
-    where not all of it is tissue."""
+def straightened(gray: U8, tissue: Bool, place: Place, radius: int) -> tuple[U8, Bool]:
+    """The picture around a place as it would look turned and scaled back, a square of 2 radius + 1 px; and
+    where all that it was made of is tissue."""
     size = 2 * radius + 1
     back = np.concatenate([place.linear, (place.pixel - place.linear @ [radius, radius])[:, None]], axis=1)
-    corners = back[:, :2] @ np.array([[0, 0, size, size], [0, size, 0, size]]) + back[:, 2:]
-    (left, top), (right, bottom) = np.floor(corners.min(1)).astype(int), np.ceil(corners.max(1)).astype(int)
-    height, width = gray.shape
-    if left < 0 or top < 0 or right >= width or bottom >= height:
-        return None
-    if not tissue[top : bottom + 1, left : right + 1].all():
-        return None
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    return np.asarray(cv2.warpAffine(gray, back, (size, size), flags=flags), np.uint8)
+    turned = cv2.warpAffine(gray, back, (size, size), flags=flags)
+    share = cv2.warpAffine(tissue.view(np.uint8) * np.uint8(255), back, (size, size), flags=flags)
+    return np.asarray(turned, np.uint8), np.asarray(share == 255, np.bool_)

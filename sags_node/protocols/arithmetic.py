@@ -20,12 +20,6 @@ def nearest_distances(points: F64, ends: F64) -> F64:
     return distances
 
 
-def shares_within(distances: F64, thresholds: Sequence[float] = STIR_PX) -> dict[str, float]:
-    """Share of distances up to each threshold, and the mean of the shares (delta_avg of TAP-Vid)."""
-    shares = {f"within_{threshold:g}": float(np.mean(distances <= threshold)) for threshold in thresholds}
-    return {**shares, "average": float(np.mean(list(shares.values())))}
-
-
 def stereo_points_mm(left: F64, right: F64, K_left: F64, K_right: F64, baseline_mm: float) -> F64:
     """Points [P, 3] mm of the left camera from raw pixels [P, 2] of both eyes, as STIR makes its 3D truth: as
     if the raw pictures were rectified, with the left eye's intrinsics [3, 3] and row, but for the distance

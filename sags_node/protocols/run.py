@@ -15,6 +15,7 @@ from sags_node.config import LaunchConfig, RecordedSource
 from sags_node.errors import SagsError
 from sags_node.evaluation.measure import Options
 from sags_node.evaluation.metrics import resample_nearest
+from sags_node.evaluation.point_tracks import shares_within
 from sags_node.evaluation.session import evaluate
 from sags_node.geometry import transform
 from sags_node.kernels.threads import configure_threads
@@ -111,8 +112,8 @@ def measure_stir(folder: Path, overrides: Sequence[str], progress: Progress) -> 
     return {
         "points": int(sum(map(len, distances))),
         "lost": lost,
-        "tracked": arithmetic.shares_within(np.concatenate(distances)),
-        "unmoved": arithmetic.shares_within(np.concatenate(unmoved)),  # the evaluator's control
+        "tracked": shares_within(np.concatenate(distances), arithmetic.STIR_PX),
+        "unmoved": shares_within(np.concatenate(unmoved), arithmetic.STIR_PX),  # the evaluator's control
         "points_3d": int(sum(map(len, deep))),
         "tracked_mm": _within_mm(deep),
         "unmoved_mm": _within_mm(deep_unmoved),
@@ -124,7 +125,7 @@ def measure_stir(folder: Path, overrides: Sequence[str], progress: Progress) -> 
 def _within_mm(distances: Sequence[F64]) -> dict[str, float] | None:
     if not distances:
         return None
-    return arithmetic.shares_within(np.concatenate(distances), arithmetic.STIR_MM)
+    return shares_within(np.concatenate(distances), arithmetic.STIR_MM)
 
 
 def measure_stereomis(folder: Path, overrides: Sequence[str], progress: Progress) -> dict[str, Any]:

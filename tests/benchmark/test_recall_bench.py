@@ -25,7 +25,11 @@ def measured(monkeypatch: pytest.MonkeyPatch, scenario: recall.Scenario) -> dict
     monkeypatch.setattr(recall, "AFTER", 1.2)
     session = open_session("launch/phantom.yaml", SMALL)
     found = recall.measure_recall(session, 2.0, lambda done, of, what: None)
-    assert recall.table(found).row_count == 1
+    assert next(table.row_count for table in recall.tables(found)) == 1
+    for key in ("reliability_px", "reliability_mm"):
+        bins = found[key]["bins"]
+        assert sum(row["count"] for row in bins) > 500
+        assert bins[-1]["right"] > max(0.9, bins[0]["right"])  # who says to be sure is
     return dict(found["rows"][0])
 
 

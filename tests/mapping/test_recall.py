@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import cv2
@@ -79,7 +80,12 @@ def back(anchors: Anchors, seconds: float = 3.0, **how: object) -> AnchorStates:
 @pytest.mark.parametrize("kept", [True, False], ids=["its Gaussians stayed", "the model is another one"])
 @pytest.mark.parametrize(
     ("turn", "scale", "shift"),
-    [(0.0, 1.0, (50.0, -30.0)), (20.0, 1.0, (10.0, 20.0)), (-10.0, 1.15, (-20.0, 10.0))],
+    [
+        (0.0, 1.0, (50.0, -30.0)),
+        (20.0, 1.0, (10.0, 20.0)),
+        (-10.0, 1.15, (-20.0, 10.0)),
+        (0.0, 1.0, (-85.0, 0.0)),  # the first one 15 px from the picture's edge
+    ],
 )
 def test_they_come_back_wherever_the_tissue_is(
     turn: float, scale: float, shift: tuple[float, float], kept: bool
@@ -105,6 +111,50 @@ def test_what_is_not_the_same_tissue_is_refused(how: dict[str, object]) -> None:
     """Better no anchor than one on another place."""
     confidence = back(pinned(), **how).confidence
     assert (confidence < 0.2).all(), confidence
+
+
+def test_along_an_edge_it_could_be_anywhere_and_does_not_say_to_be_sure() -> None:
+    """Folds and vessels look alike along themselves."""
+
+    def edges(seconds: float, moved: float, seed: int = 0) -> Scene:
+        observation, *rest = scene(seconds, motion(0, 1, (moved, 0)), seed)
+        gray = observation.gray.astype(np.float32)
+        if seed == 0:
+            rows = gray.mean(1, keepdims=True)
+            gray = np.float32(128) + 4 * np.repeat(rows - rows.mean(), WIDTH, axis=1)
+        noise = np.random.default_rng(round(seconds * 1e3)).normal(0, 1, gray.shape)  # grey levels
+        return replace(observation, gray=np.rint(gray + noise).clip(0, 255).astype(np.uint8)), *rest
+
+    anchors = Anchors()
+    for u, v in PINNED:
+        anchors.add_pixel(u, v, *edges(0, 0))
+    assert (follow(anchors, *(edges(0.1 * i, 0) for i in range(1, 25))).confidence > 0.9).all()
+    follow(anchors, *(edges(2.5 + 0.5 * i, 0, seed=9) for i in range(round(AWAY / 0.5))))
+    states = follow(anchors, *(edges(20 + 0.25 * i, 8.0) for i in range(12)))
+    away = np.linalg.norm(states.pixels - np.add(PINNED, [8, 0]), axis=1)
+    assert (states.confidence[away > 4] < 0.2).all() and (away > 4).sum() >= 3
+
+
+def test_depth_is_what_the_model_or_the_frame_says_there_and_never_guessed() -> None:
+    """Turned by so much that a patch alone is not found; the second one is in the middle, and stays there."""
+    moved = motion(20, 1, (0, 0))
+
+    def without_depth(seconds: float, measured: float) -> Scene:
+        observation, snapshot, view = scene(seconds, moved)
+        nothing = np.zeros_like(view.depth)
+        return (
+            replace(observation, depth=nothing + np.float32(measured)),
+            snapshot,
+            replace(view, depth=nothing),
+        )
+
+    anchors = pinned()
+    states = follow(anchors, *(without_depth(20 + 0.25 * i, 0) for i in range(12)))
+    assert (states.confidence > 0.7).tolist() == [False, True, False, False, False]
+    assert states.points[1, 2] == pytest.approx(DEPTH, rel=1e-4)
+    states = follow(anchors, *(without_depth(30 + 0.25 * i, DEPTH) for i in range(12)))
+    assert (states.confidence > 0.7).all()
+    assert states.points[:, 2] == pytest.approx(DEPTH, rel=1e-4)
 
 
 def test_nothing_is_looked_for_while_all_are_seen(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from sags_node.evaluation import metrics
+from sags_node.evaluation.point_tracks import shares_within
 from sags_node.protocols import arithmetic
 
 
@@ -15,7 +16,7 @@ def test_stir_counts_the_nearest_end_up_to_and_with_each_threshold() -> None:
     points = np.array([[3.0, 4.0], [100.0, 4.0], [50.0, 0.0], [100.0, 90.0]])  # 5, 4, 50 and 90 px away
     distances = arithmetic.nearest_distances(points, ends)
     assert distances.tolist() == [5.0, 4.0, 50.0, 90.0]
-    shares = arithmetic.shares_within(distances)
+    shares = shares_within(distances, arithmetic.STIR_PX)
     assert shares == {
         "within_4": 0.25,
         "within_8": 0.5,
@@ -24,7 +25,7 @@ def test_stir_counts_the_nearest_end_up_to_and_with_each_threshold() -> None:
         "within_64": 0.75,
         "average": 0.5,
     }
-    millimetres = arithmetic.shares_within(np.array([1.0, 3.0]), (2, 4, 8, 16, 32))
+    millimetres = shares_within(np.array([1.0, 3.0]), (2, 4, 8, 16, 32))
     assert millimetres["average"] == pytest.approx((0.5 + 4 * 1.0) / 5)
 
 
@@ -37,7 +38,7 @@ def test_stir_makes_points_of_pixels_of_both_eyes() -> None:
     points = arithmetic.stereo_points_mm(left, right, K_left, K_right, 5.0)
     assert points[0] == pytest.approx([10, -2, 100])
     distances = arithmetic.nearest_distances(points, np.array([[10.0, -2, 103]]))
-    assert arithmetic.shares_within(distances, arithmetic.STIR_MM)["average"] == pytest.approx(4 / 5 / 2)
+    assert shares_within(distances, arithmetic.STIR_MM)["average"] == pytest.approx(4 / 5 / 2)
 
 
 def test_stir_latency() -> None:

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from sags_node.benchmark.quality.tracking import true_points
 from sags_node.disturbances import DISTURBANCES, Disturbance, Scene, Taken, disturbed
 from sags_node.errors import SagsError, UsageError
 from sags_node.evaluation import metrics
 from sags_node.findings import by_code
-from sags_node.geometry import transform
 from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import StepBudget
 from sags_node.pipeline import Pipeline
@@ -323,7 +323,7 @@ class _PinnedAnchors:
         """
         self.pinned = True
         shown = result.observation, result.snapshot, result.views["left"]
-        points = _true_points(frame, result)
+        points = true_points(frame, result)
         if points is not None:
             assert frame.reference is not None and frame.reference.points_visible is not None
             visible = np.flatnonzero(frame.reference.points_visible)
@@ -348,7 +348,7 @@ class _PinnedAnchors:
     def follow(self, frame: StereoFrame, result: FrameResult) -> None:
         """Note where they are said to be, and where they are."""
         self._states[frame.frame_id] = result.anchors
-        points = _true_points(frame, result)
+        points = true_points(frame, result)
         if points is not None:
             self._truth[frame.frame_id] = points[self._tracks]
 
@@ -371,16 +371,6 @@ class _PinnedAnchors:
             "anchors_back": _round(float(np.mean(sure & right))),
             "anchors_wrong": _round(float(np.mean(sure & ~right))),
         }
-
-
-def _true_points(frame: StereoFrame, result: FrameResult) -> F64 | None:
-    """The recording's true surface points [P, 3] in the world of the run; None where it has none."""
-    if frame.reference is None or frame.reference.points is None:
-        return None
-    if frame.T_world_cam is None:
-        return frame.reference.points
-    world = result.observation.camera.T_world_cam @ np.linalg.inv(frame.T_world_cam)
-    return np.asarray(transform(world, frame.reference.points), np.float64)
 
 
 def _is_confident(view: RenderedView) -> Bool:

@@ -7,13 +7,15 @@ the scope moves. Its pose is told, as by a robot, unless the node is to estimate
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, get_args
 
 import cv2
 import numpy as np
 from rich.table import Table
 
+from sags_node.benchmark.quality.tracking import RIGHT, RIGHT_MM, SURE, reliability_rows
+from sags_node.benchmark.quality.tracking_report import reliability_tables
 from sags_node.config import PhantomSource
 from sags_node.errors import SagsError, UsageError
 from sags_node.geometry import project
@@ -22,7 +24,7 @@ from sags_node.mapping.budget import StepBudget
 from sags_node.phantom.scene import Phantom, PhantomFrame
 from sags_node.pipeline import Pipeline
 from sags_node.session import Session
-from sags_node.types import F64, AnchorStates, Bool, FrameResult, StereoFrame
+from sags_node.types import F64, AnchorStates, Bool, Camera, FrameResult, StereoFrame
 from sags_node.warm_up import warm_up
 
 Scenario = Literal["covered", "dark", "turned away"]
@@ -41,9 +43,7 @@ TURN = 45.0  # degrees: nothing that was seen is in the picture then
 TURNING = 1.5  # s, there and back
 MOVED = np.array([0.006, -0.004, 0.004])  # m, in the dark
 ROLLED = 8.0  # degrees, in the dark
-RIGHT = 4.0 / 640  # of the width: an anchor so near to its point is found
 WRONG = 6.0 / 640  # of the width: one that is farther, and sure, is wrong
-SURE = 0.5  # confidence
 
 Advance = Callable[[int, int | None, str], None]  # frames done, of, what
 
@@ -58,7 +58,7 @@ class _Moment:
 
 
 def measure_recall(session: Session, away: float, advance: Advance) -> dict[str, Any]:
-    """Each scenario once.
+    """Each scenario once. An anchor is found within `RIGHT` of its point.
 
     Args:
         session: of the phantom; its size and seed are used.
@@ -67,7 +67,8 @@ def measure_recall(session: Session, away: float, advance: Advance) -> dict[str,
     Returns:
         `rows`, by scenario: anchors, and shares of those whose points are in sight. `found` and `wrong`:
         sure, and right or not, 2.4 s after they are back, and `before` they went; `unmoved`: right where
-        they were.
+        they were. `reliability_mm`, `reliability_px`: of all anchors in all frames, in pixels of those whose
+        points are in the picture or hidden there.
 
     Raises:
         UsageError: the session is not the phantom's.
@@ -80,18 +81,46 @@ def measure_recall(session: Session, away: float, advance: Advance) -> dict[str,
     configure_threads(session.config.engine.threads)
     counts = [round(seconds * RATE) for seconds in (BEFORE, away, AFTER)]
     phantom = Phantom(source.model_copy(update={"seconds": sum(counts) / RATE}))
-    rows = [_played(session, phantom, scenario, counts, advance) for scenario in SCENARIOS]
-    return {"session": session.name, "seed": source.seed, "away_s": away, "rows": rows}
+    said, film = _Said(), _Film(phantom, sum(counts))
+    rows = [_played(session, film, scenario, counts, said, advance) for scenario in SCENARIOS]
+    return {"session": session.name, "seed": source.seed, "away_s": away, "rows": rows, **said.reliability()}
+
+
+@dataclass(frozen=True, slots=True)
+class _Said:
+    """How sure anchors were in all frames, and whether they were right."""
+
+    confidence: list[F64] = field(default_factory=list)  # [A] of each frame
+    near_px: list[Bool] = field(default_factory=list)
+    near_mm: list[Bool] = field(default_factory=list)
+    inside: list[Bool] = field(default_factory=list)  # the point is in the picture, seen or hidden
+
+    def add(self, result: FrameResult, pinned: dict[int, int], truth: F64, points: F64) -> None:
+        """`truth` [P, 2] px and `points` [P, 3] m of all the phantom's points."""
+        anchors, camera = result.anchors, result.pair.camera
+        rows = [pinned[int(anchor)] for anchor in anchors.ids]
+        pixels = truth[rows]
+        self.confidence.append(anchors.confidence.astype(np.float64))
+        self.near_px.append(np.linalg.norm(anchors.pixels - pixels, axis=1) < RIGHT * camera.width)
+        self.near_mm.append(np.linalg.norm(anchors.points - points[rows], axis=1) < RIGHT_MM * 1e-3)
+        self.inside.append(_inside(pixels, camera))
+
+    def reliability(self) -> dict[str, Any]:
+        confidence, inside = np.concatenate(self.confidence), np.concatenate(self.inside)
+        return {
+            "reliability_px": reliability_rows(confidence[inside], np.concatenate(self.near_px)[inside]),
+            "reliability_mm": reliability_rows(confidence, np.concatenate(self.near_mm)),
+        }
 
 
 def _played(
-    session: Session, phantom: Phantom, scenario: Scenario, counts: list[int], advance: Advance
+    session: Session, film: _Film, scenario: Scenario, counts: list[int], said: _Said, advance: Advance
 ) -> dict[str, Any]:
     before = counts[0]
-    pipeline, budget = Pipeline(session.config, phantom.rig), StepBudget(STEPS)
+    pipeline, budget = Pipeline(session.config, film.phantom.rig), StepBudget(STEPS)
     pinned: dict[int, int] = {}
     width, _ = session.working_size
-    for number, moment in enumerate(_moments(phantom, scenario, counts)):
+    for number, moment in enumerate(_moments(film, scenario, counts)):
         result = pipeline.process(_stereo(number, moment), budget)
         truth, visible = _truth(result, moment)
         if number == before // 3:
@@ -99,6 +128,7 @@ def _played(
         if number == before - 1:
             at_last = _scored(result.anchors, pinned, truth, visible, width)
             standing = result.anchors
+        said.add(result, pinned, truth, moment.frame.points)
         advance(number + 1, sum(counts), scenario)
     there = int(visible[list(pinned.values())].sum())
     unmoved = _scored(standing, pinned, truth, visible, width)
@@ -126,17 +156,34 @@ def _scored(
     }
 
 
-def _moments(phantom: Phantom, scenario: Scenario, counts: list[int]) -> Iterator[_Moment]:
+@dataclass(frozen=True, slots=True)
+class _Film:
+    """The phantom's frames; those of a scope that stays are rendered once for all scenarios."""
+
+    phantom: Phantom
+    count: int
+    still: dict[int, PhantomFrame] = field(default_factory=dict)
+
+    def frame(self, number: int, T_world_cam: F64) -> PhantomFrame:
+        if not np.array_equal(T_world_cam, np.eye(4)):
+            return self.phantom.frame(number, self.count, T_world_cam)
+        if number not in self.still:
+            self.still[number] = self.phantom.frame(number, self.count, T_world_cam)
+        return self.still[number]
+
+
+def _moments(film: _Film, scenario: Scenario, counts: list[int]) -> Iterator[_Moment]:
     before, away, _ = counts
     for number in range(sum(counts)):
         gone = before <= number < before + away
         T_world_cam = _place(scenario, number - before, away)
-        frame = phantom.frame(number, sum(counts), T_world_cam)
+        dark = gone and scenario == "dark"  # then it does not matter where the scope is
+        frame = film.frame(number, np.eye(4) if dark else T_world_cam)
         hidden = None
         if gone and scenario == "covered":
             hidden, width = np.zeros_like(frame.tool), frame.tool.shape[1]
             hidden[:, round(COVERED[0] * width) : round(COVERED[1] * width)] = True
-        elif gone and scenario == "dark":
+        elif dark:
             frame = _dark(frame, number)
         yield _Moment(frame, T_world_cam, hidden)
 
@@ -176,8 +223,12 @@ def _truth(result: FrameResult, moment: _Moment) -> tuple[F64, Bool]:
     """Pixels [P, 2] of the phantom's points, and which are in the picture and not hidden [P]."""
     camera = replace(result.pair.camera, T_world_cam=moment.T_world_cam)
     pixels: F64 = np.asarray(project(camera, moment.frame.points)[0], np.float64)
-    inside = (pixels > 0).all(1) & (pixels < [camera.width - 1, camera.height - 1]).all(1)
-    return pixels, moment.frame.visible & inside
+    return pixels, moment.frame.visible & _inside(pixels, camera)
+
+
+def _inside(pixels: F64, camera: Camera) -> Bool:
+    inside: Bool = (pixels > 0).all(1) & (pixels < [camera.width - 1, camera.height - 1]).all(1)
+    return inside
 
 
 def _pin(pipeline: Pipeline, result: FrameResult, truth: F64, visible: Bool) -> dict[int, int]:
@@ -199,7 +250,7 @@ def _pin(pipeline: Pipeline, result: FrameResult, truth: F64, visible: Bool) -> 
     return pinned
 
 
-def table(measured: dict[str, Any]) -> Table:
+def tables(measured: dict[str, Any]) -> list[Table]:
     """For people; `measured` as `measure_recall` returns it."""
     made = Table(
         "out of sight", "anchors", "right before", "wrong", "found again", "wrong", "had they not moved",
@@ -208,4 +259,4 @@ def table(measured: dict[str, Any]) -> Table:
     for row in measured["rows"]:
         shares = (row["before"]["found"], row["before"]["wrong"], row["found"], row["wrong"], row["unmoved"])
         made.add_row(row["scenario"], str(row["anchors"]), *(f"{share:.0%}" for share in shares))
-    return made
+    return [made, *reliability_tables(measured)]
