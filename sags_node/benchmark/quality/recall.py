@@ -227,8 +227,8 @@ def _truth(result: FrameResult, moment: _Moment) -> tuple[F64, Bool]:
 
 
 def _inside(pixels: F64, camera: Camera) -> Bool:
-    inside: Bool = (pixels > 0).all(1) & (pixels < [camera.width - 1, camera.height - 1]).all(1)
-    return inside
+    inside = (pixels > 0) & (pixels < [camera.width - 1, camera.height - 1])
+    return np.asarray(inside.all(1))
 
 
 def _pin(pipeline: Pipeline, result: FrameResult, truth: F64, visible: Bool) -> dict[int, int]:

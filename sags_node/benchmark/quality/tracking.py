@@ -261,7 +261,8 @@ def _grid(result: FrameResult) -> F64:
 def _middle(places: F64, result: FrameResult) -> Bool:
     """Which of some pixels [P, 2] are not near the picture's edge."""
     height, width = result.observation.tissue.shape
-    return (places >= BORDER).all(1) & (places < [width - BORDER, height - BORDER]).all(1)
+    inside = (places >= BORDER) & (places < [width - BORDER, height - BORDER])
+    return np.asarray(inside.all(1))
 
 
 def _pin(pipeline: Pipeline, result: FrameResult, places: F64, wanted: Bool) -> I64:
