@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from bridging import anchored_at, bridged, sockets
 from places import ROOT
+from ports import free_port
 from synthetic import HEIGHT, WIDTH, plane_result, stream
 from waiting import until
 
@@ -206,9 +207,9 @@ def test_without_pyav_there_is_no_video(tmp_path: Path, monkeypatch: pytest.Monk
 
 def test_a_bridge_that_is_started_anew_goes_on_on_the_same_port(tmp_path: Path) -> None:
     with sockets(tmp_path) as running, stream(running, anchored_at):
-        port = 0
+        port = free_port()
         for _ in range(2):
-            with bridged(run_foxglove, options(tmp_path, port=port)) as port, client(port) as joined:
+            with bridged(run_foxglove, options(tmp_path, port=port)), client(port) as joined:
                 joined.subscribe("/sags/tf")
                 until(lambda: joined.came["/sags/tf"])
 

@@ -16,6 +16,7 @@ from typing import Self
 import msgspec
 import pytest
 from places import HELPERS
+from ports import free_port
 from synthetic import publisher, stream
 from waiting import until
 
@@ -64,12 +65,6 @@ def _node(run_dir: Path, session: str, port: int, ipc: bool = False) -> Iterator
         process.wait()
 
 
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 @pytest.mark.fault(
     "process: the node is killed, another begins in its place",
     sees="stale; then the new session only",
@@ -82,7 +77,7 @@ def _free_port() -> int:
     ids=["same port", "ipc", "another port"],
 )
 def test_a_killed_node_is_followed(tmp_path: Path, by_file: bool, ipc: bool, moves: bool) -> None:
-    run_dir, port = tmp_path / "run", _free_port()
+    run_dir, port = tmp_path / "run", free_port()
     where = {} if by_file else {"endpoint": f"tcp://127.0.0.1:{port}"}
     with _node(run_dir, "first", port, ipc):
         until((run_dir / "sags.json").exists)
@@ -92,7 +87,7 @@ def test_a_killed_node_is_followed(tmp_path: Path, by_file: bool, ipc: bool, mov
     with subscriber:
         until(lambda: not subscriber.ok("tf"))
         before = subscriber.endpoint
-        with _node(run_dir, "second", _free_port() if moves else port, ipc):
+        with _node(run_dir, "second", free_port() if moves else port, ipc):
             until(lambda: (newest := subscriber.latest("tf")) is not None and newest.meta.session == "second")
             until(lambda: subscriber.ok("tf"))
         assert (subscriber.endpoint != before) == moves

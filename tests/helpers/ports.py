@@ -1,0 +1,21 @@
+"""Ports that a test may come back to."""
+
+from __future__ import annotations
+
+import random
+import socket
+
+FIRST, LAST = 20_000, 30_000  # below those that systems give away by themselves
+
+
+def free_port() -> int:
+    """A TCP port on which nobody listens, and which nobody gets by chance."""
+    while True:
+        port = random.SystemRandom().randrange(FIRST, LAST)
+        with socket.socket() as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind(("127.0.0.1", port))
+            except OSError:
+                continue
+            return port
