@@ -46,9 +46,7 @@ def export(network: StereoNetwork, file: Path, trained: str) -> None:
     example = tuple(torch.zeros(1, 3, SIZE[1], SIZE[0]) for _ in INPUTS)
     sides = {2: "height", 3: "width"}
     with warnings.catch_warnings():
-        warnings.simplefilter(
-            "ignore"
-        )  # of the exporter, that another one is newer: that needs one more package
+        warnings.simplefilter("ignore")  # of the exporter: the newer one needs one more package
         torch.onnx.export(
             network.eval(),
             example,

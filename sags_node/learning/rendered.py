@@ -32,7 +32,7 @@ def render(rng: np.random.Generator, tissues: int, advance: Advance) -> list[Exa
             width=SIZE[0],
             height=SIZE[1],
             seed=int(rng.integers(1, 2**31)),
-            camera_motion=True,
+            camera_motion="sway",
             noise=0,
             gloss=float(rng.choice([0.3, 1, 3, 10])),
             smoke=float(rng.choice([0, 0, 0.3])),

@@ -60,10 +60,10 @@ class FirstViews:
         nearest = int(np.argmin(distances)) if distances else -1
         if distances and distances[nearest] < FAR:
             return self._pose(self._kept[nearest], observation, camera)
-        if len(self._kept) == MOST:
-            del self._kept[1]  # the first one shows how it all began
         view = self._seen(observation, camera)
         if len(view.pixels) >= LEAST_CORNERS:
+            if len(self._kept) == MOST:
+                del self._kept[1]  # the first one shows how it all began
             self._kept.append(view)
         return None
 
