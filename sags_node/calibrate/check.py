@@ -11,14 +11,14 @@ from sags_node.calibrate.pictures import Pair, pairs_of_files, pairs_of_session
 from sags_node.calibration import Finding, check_eyes, check_pair, find_form, read_rig, unknown_form
 from sags_node.calibration.matches import match_eyes
 from sags_node.calibration.principal_points import judge_known_depths
-from sags_node.calibration.rows import judge_matches, rectified_rows
+from sags_node.calibration.rows import Rows, judge_matches, judge_scale, rectified_rows
 from sags_node.config import LaunchConfig, PhantomSource
 from sags_node.errors import UsageError
 from sags_node.launch_file import load_launch
 from sags_node.phantom import cached_session
 from sags_node.sources.pictures import size_text
 from sags_node.sources.source import recorded_rig
-from sags_node.types import F32, F64, StereoFrame, StereoRig
+from sags_node.types import F32, StereoFrame, StereoRig
 from sags_node.vision.rectify import Rectifier
 from sags_node.vision.row_error import measure_rows
 
@@ -80,7 +80,9 @@ def check_pictures(rig: StereoRig, pairs: Sequence[Pair], depths: Sequence[F32 |
     matches = np.concatenate(found)
     findings = judge_matches(rig, matches)
     if findings[0].level == "ok":
-        findings.append(_check_rows(rig, pairs, matches))
+        rows = rectified_rows(rig, matches)
+        findings.append(_check_rows(rig, pairs, rows))
+        findings += judge_scale(rig, rows)
         if depths:
             findings += judge_known_depths(rig, found, depths)
     return findings
@@ -127,10 +129,9 @@ def _wrong_size(rig: StereoRig, size: tuple[int, int]) -> Finding:
     return Finding("error", f"{what}, {ratio:.3g} times as large", mend, {"scale": ratio})
 
 
-def _check_rows(rig: StereoRig, pairs: Sequence[Pair], matches: F64) -> Finding:
+def _check_rows(rig: StereoRig, pairs: Sequence[Pair], rows: Rows) -> Finding:
     """Dense rows of the rectified pictures: finer than those of matched points, where these fit roughly."""
     rectifier = Rectifier(rig, rig.left.width, rig.left.height)
-    rows = rectified_rows(rig, matches)
     smallest, largest = np.percentile(rows.disparities, [2, 98])
     measured = []
     for left, right in pairs:
@@ -146,12 +147,14 @@ def _check_rows(rig: StereoRig, pairs: Sequence[Pair], matches: F64) -> Finding:
     what = f"rows agree to {median:.2f} px (median), {p90:.2f} px (90 %), over {matched:.0%} of the picture"
     if median <= GOOD_ROWS[0] and p90 <= GOOD_ROWS[1]:
         return Finding("ok", what, "", figures)
+    mend = "depth suffers: calibrate again, with the scope as it is used"
+    if rows.scale_differs:  # that is said next, and what is left is no turn
+        return Finding("warning", what, mend, figures)
     pitch, roll = rows.turn
     lower = float(np.median(rows.errors))
     turned = (
         f"; as if one eye were turned by {pitch:.2f} degrees up or down, {roll:.2f} about its axis, or the "
         f"right one's principal point lay {abs(lower):.1f} px {'lower' if lower > 0 else 'higher'}"
     )
-    mend = "depth suffers: calibrate again, with the scope as it is used"
     turn = {"pitch_deg": pitch, "roll_deg": roll, "row_offset_px": round(lower, 3)}
     return Finding("warning", what + turned, mend, figures | turn)

@@ -23,6 +23,9 @@ IN_FRONT = 0.8  # of the matches: fewer are no scene seen by two eyes
 CLEARLY = 1.5  # times the row error, and
 CLEARLY_PX = 0.3  # px: a reading that is worse by more does not fit
 WRONG_MATCH = 4.0  # times the median distance from the median row error
+LEAST_SCALE = 0.004  # between the eyes: beyond it depth leans by more than matching errs
+SURE_SCALE = 4.0  # times its standard error
+ROUNDS = 10
 PICTURES_SWAPPED = "the pictures are swapped: the left ones come from the right camera"
 PLAUSIBLE_DEPTH = (0.005, 1.0)  # m, the median: in an endoscope's view
 
@@ -35,7 +38,14 @@ class Rows(NamedTuple):
     in_front: float  # share of points in front of both eyes
     median: float  # px, of the errors without their sign
     p90: float
-    turn: tuple[float, float]  # degrees, pitch and roll of one eye that explain the errors best
+    turn: tuple[float, float]  # degrees, pitch and roll of one eye that explain the errors best, with
+    scale: float  # by how much larger the right picture is than its calibration says, 0.01: 1 %
+    scale_error: float  # standard error of that
+
+    @property
+    def scale_differs(self) -> bool:
+        """Whether one eye's scale is off, beyond doubt."""
+        return abs(self.scale) > max(LEAST_SCALE, SURE_SCALE * self.scale_error)
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,8 +65,7 @@ def rectified_rows(rig: StereoRig, matches: F64) -> Rows:
     disparities = K[0, 0] * (left[:, 0] - right[:, 0])
     in_front = float(np.mean(_signed_baseline(rig) * disparities > 0))
     median, p90 = np.percentile(np.abs(errors), [50, 90])
-    turn = _turn(errors / K[1, 1], left[:, 0])
-    return Rows(errors, disparities, in_front, float(median), float(p90), turn)
+    return Rows(errors, disparities, in_front, float(median), float(p90), *_turn(errors / K[1, 1], left))
 
 
 def judge_matches(rig: StereoRig, matches: F64) -> list[Finding]:
@@ -165,29 +174,72 @@ def _figures(rows: Rows) -> dict[str, float]:
     }
 
 
+def judge_scale(rig: StereoRig, rows: Rows) -> list[Finding]:
+    """Whether one eye's picture is larger than its calibration says: its rows then drift apart over the
+    height, and depth leans over the width. Nothing where both have one scale."""
+    if not rows.scale_differs:
+        return []
+    depth = _median_depth(rig, rows)
+    leans = -rows.scale * 100 * depth**2 / (rig.left.P[0, 0] * _signed_baseline(rig)) * 1e3
+    what = (
+        f"{_scale_said(rows)}. If its columns are like its rows, depth leans by {abs(leans):.1f} mm in "
+        f"100 px at {depth * 1e3:.0f} mm, too {'near' if leans > 0 else 'far'} on the right"
+    )
+    fx, fy = (rig.right.K[k, k] * (1 + rows.scale) for k in (0, 1))
+    mend = (
+        "calibrate again with zoom, focus and picture size as they are used, and the board up to the edges; "
+        f"until then set fx to {fx:.2f} and fy to {fy:.2f} in camera_matrix of right.yaml: rows agree then"
+    )
+    figures = {
+        "scale": round(rows.scale, 4),
+        "scale_standard_error": round(rows.scale_error, 5),
+        "leans_mm_per_100_px": round(float(leans), 3),
+    }
+    return [Finding("warning", what, mend, figures)]
+
+
+def _scale_said(rows: Rows) -> str:
+    return (
+        f"beside the left picture the right one is {abs(rows.scale):.1%} "
+        f"{'larger' if rows.scale > 0 else 'smaller'} than the calibration says: rows drift apart by "
+        f"{100 * abs(rows.scale):.1f} px in 100 px down"
+    )
+
+
 def _rows_differ(rows: Rows) -> Finding:
-    """Rows that no reading explains; the nearest turn of one eye says by how much."""
+    """Rows that no reading explains; the nearest turn and scale of one eye say by how much."""
     pitch, roll = rows.turn
     what = (
         f"rows differ by {rows.median:.2f} px (median), {rows.p90:.2f} px (90 %): as if one eye were turned "
         f"by {pitch:.2f} degrees up or down and {roll:.2f} degrees about its axis"
     )
+    figures = _figures(rows) | {"pitch_deg": pitch, "roll_deg": roll}
+    if rows.scale_differs:
+        what += f"; {_scale_said(rows)}"
+        figures["scale"] = round(rows.scale, 4)
     mend = "the calibration is not of these pictures (another scope, zoom or focus): calibrate again"
-    return Finding("error", what, mend, _figures(rows) | {"pitch_deg": pitch, "roll_deg": roll})
+    return Finding("error", what, mend, figures)
 
 
-def _turn(errors: F64, x: F64) -> tuple[float, float]:
-    """Pitch and roll, degrees, of row errors [M] at columns `x` [M], both at distance 1; wrong matches left
-    out."""
-    away = np.abs(errors - np.median(errors))
-    inner = away <= WRONG_MATCH * np.median(away) + 1e-12
-    design = np.column_stack([np.ones(inner.sum()), x[inner]])
-    pitch, roll = np.degrees(np.linalg.lstsq(design, errors[inner], rcond=None)[0])
-    return round(float(pitch), 3), round(float(roll), 3)
+def _turn(errors: F64, left: F64) -> tuple[tuple[float, float], float, float]:
+    """Pitch and roll (degrees), scale and its standard error, of row errors [M] of points `left` [M, 2] of
+    the left picture, all at distance 1; wrong matches left out."""
+    design, kept = np.column_stack([np.ones(len(errors)), left]), np.ones(len(errors), np.bool_)
+    found = np.zeros(3)
+    for _ in range(ROUNDS):
+        found = np.linalg.lstsq(design[kept], errors[kept], rcond=None)[0]
+        away = np.abs(errors - design @ found)
+        kept = away <= WRONG_MATCH * np.median(away) + 1e-12
+    inner = design[kept]
+    variance = float(np.sum(away[kept] ** 2)) / max(len(inner) - 3, 1)
+    spread = float(np.linalg.pinv(inner.T @ inner)[2, 2])
+    pitch, roll = np.degrees(found[:2])
+    turn = round(float(pitch), 3), round(float(roll), 3)
+    return turn, float(found[2]), float(np.sqrt(variance * spread))
 
 
 def _depth(rig: StereoRig, rows: Rows) -> list[Finding]:
-    depth = float(np.median(_signed_baseline(rig) * rig.left.P[0, 0] / rows.disparities))
+    depth = _median_depth(rig, rows)
     figures = _figures(rows) | {"depth_median_m": round(depth, 4)}
     if not PLAUSIBLE_DEPTH[0] <= depth <= PLAUSIBLE_DEPTH[1]:
         what = f"points would lie at {depth:.3g} m (median); an endoscope sees 0.005 to 1 m"
@@ -202,3 +254,7 @@ def _depth(rig: StereoRig, rows: Rows) -> list[Finding]:
         f"whether the principal points differ sideways: 0.1 px would be {0.1 * per_pixel * 1e3:.2f} mm there"
     )
     return [Finding("ok", what, "", figures)]
+
+
+def _median_depth(rig: StereoRig, rows: Rows) -> float:
+    return float(np.median(_signed_baseline(rig) * rig.left.P[0, 0] / rows.disparities))

@@ -38,6 +38,7 @@ from sags_node.vision.rectify import Rectifier
 Pairs = list[tuple[U8, U8]]
 F7 = "hamlyn_f7_pair"
 F7_SIZE = 360, 288
+BENT = 0.06  # of a scale: what the phantom's lens adds to it, since other rays are looked up
 
 
 @pytest.fixture(scope="module")
@@ -224,6 +225,38 @@ def test_a_principal_point_that_lies_lower_is_said_in_px(phantom: tuple[StereoRi
 def with_principal_point_moved(rig: StereoRig, x: float, y: float) -> StereoRig:
     K = rig.right.K + np.array([[0, 0, x], [0, 0, y], [0, 0, 0]])
     return StereoRig(rig.name, rig.left, replace(rig.right, K=K))
+
+
+@pytest.mark.parametrize("scale", [0.01, -0.01])
+def test_an_eye_of_another_scale_is_said_with_its_mend(
+    phantom: tuple[StereoRig, Pairs], scale: float
+) -> None:
+    """The right picture is so much larger than the calibration says. What is said to set mends it, and depth
+    leans by what follows from disparity = f B / Z."""
+    rig, pairs = phantom
+    assert not [finding for finding in check_pictures(rig, pairs) if "scale" in finding.figures]
+    finding = worst(check_pictures(with_right_focal(rig, 1 / (1 + scale)), pairs)[-1:])
+    assert finding.level == "warning" and ("larger" if scale > 0 else "smaller") in finding.what
+    assert finding.figures["scale"] == pytest.approx(scale, rel=BENT)
+    assert ("far on the right" if scale > 0 else "near on the right") in finding.what
+    depth = check_pictures(rig, pairs)[0].figures["depth_median_m"]
+    per_pixel = depth**2 / (rig.left.P[0, 0] * rig.baseline) * 1e3  # mm
+    assert abs(finding.figures["leans_mm_per_100_px"]) == pytest.approx(per_pixel, rel=2 * BENT)
+    fx, fy = (float(number) for number in re.findall(r"to ([\d.]+)", finding.mend))
+    assert (fx, fy) == pytest.approx((rig.right.K[0, 0], rig.right.K[1, 1]), rel=0.0005)
+
+
+def with_right_focal(rig: StereoRig, factor: float) -> StereoRig:
+    K = rig.right.K * np.array([[factor, 1, 1], [1, factor, 1], [1, 1, 1]])
+    return StereoRig(rig.name, rig.left, replace(rig.right, K=K))
+
+
+def test_a_scale_too_large_for_stereo_is_said_with_the_rows(phantom: tuple[StereoRig, Pairs]) -> None:
+    rig, pairs = phantom
+    (finding,) = check_pictures(with_right_focal(rig, 1 / 1.1), pairs)
+    assert finding.level == "error" and "rows differ" in finding.what
+    assert "larger than the calibration says" in finding.what
+    assert finding.figures["scale"] == pytest.approx(0.1, rel=BENT)
 
 
 def test_known_depths_show_what_matches_cannot(
