@@ -29,6 +29,7 @@ from sags_node.benchmark.quality.depth_ct import (
     read_ct_pair,
 )
 from sags_node.benchmark.quality.depth_eyes import differences, measure_eyes, mirrored
+from sags_node.benchmark.quality.depth_regions import regions_of
 from sags_node.cli.main import main
 from sags_node.config import StereoConfig
 from sags_node.errors import SagsError, UsageError
@@ -198,9 +199,31 @@ def test_a_recording_with_exact_depth() -> None:
     assert rows[MODEL]["coverage"] > 0.95 and rows[MODEL]["median_mm"] < 1.0
     medians = [row["median_mm"] for row in measured["confidence"]]
     assert medians == sorted(medians, reverse=True)
-    assert [table.row_count for table in depth_report.tables(measured)] == [len(rows), 4]
+    assert [table.row_count for table in depth_report.tables(measured)] == [len(rows), 4, 6]
+    regions = {row["region"]: row for row in measured["regions"]}
+    assert (
+        regions["not seen by the right eye"]["stage"]["coverage"] < 0.2
+    )  # what cannot be measured is not given
+    assert regions["not seen by the right eye"]["drawn"]["coverage"] > 0.9
+    assert regions["at edges"]["stage"]["p90_mm"] > 1.5 * regions["elsewhere"]["stage"]["p90_mm"]
     drawn = cv2.imdecode(np.frombuffer(depth_plot.picture(measured), np.uint8), cv2.IMREAD_COLOR)
     assert drawn is not None and drawn.std() > 5
+
+
+def test_regions_of_a_step_beside_an_instrument() -> None:
+    """By hand: 20 px of disparity on the left half, 10 px on the right one, an instrument at the bottom."""
+    disparity = np.where(np.arange(WIDTH) < 160, np.float32(20), np.float32(10)) * np.ones((HEIGHT, 1), "f4")
+    truth, tissue = (FOCAL * BASELINE / disparity).astype(np.float32), ALL.copy()
+    tissue[200:] = False
+    truth[:, 300:] = 0
+    found = regions_of(truth, tissue, FOCAL * BASELINE)
+    columns = {name: np.flatnonzero(mask[50]) for name, mask in found.items()}
+    assert columns["near"].tolist() == list(range(160)) and not found["far"].any()
+    assert columns["at edges"].tolist() == list(range(150, 170))  # 10 px to either side
+    assert columns["not seen by the right eye"].tolist() == list(range(20))
+    assert columns["elsewhere"].tolist() == [*range(20, 150), *range(170, 300)]
+    assert np.flatnonzero(found["beside instruments"][:, 50]).tolist() == list(range(185, 200))
+    assert regions_of(np.zeros_like(truth), tissue, FOCAL * BASELINE) == {}
 
 
 def test_a_recording_without_truth_is_named() -> None:

@@ -13,6 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from sags_node.benchmark.quality.depth_regions import regions_of
 from sags_node.config import OnnxConfig, PhantomSource, StereoConfig, VisionConfig
 from sags_node.errors import SagsError
 from sags_node.evaluation import metrics
@@ -186,30 +187,57 @@ class Comparison:
         self.tallies = {name: Tally() for name in matchers}
         self._warm = False
 
-    def add(self, pair: RectifiedPair, tissue: Bool, truth: F32, extra: Mapping[str, F32]) -> None:
+    def add(self, pair: RectifiedPair, tissue: Bool, truth: F32, extra: Mapping[str, F32]) -> F32:
         """Match one pair with each matcher and compare with `truth` [H, W] (m) on tissue.
 
         Args:
             extra: depths that are there already, by name.
+
+        Returns:
+            What the first matcher gave, [H, W] m.
         """
-        shared: Bool | None = None
+        configured: F32 | None = None
         for name, matcher in self._matchers.items():
             if not self._warm:
                 matcher(pair, tissue)  # buffers are made and code is loaded in the first call
             started = time.perf_counter()
             depth, confidence = matcher(pair, tissue)
             self.tallies[name].times_ms.append((time.perf_counter() - started) * 1e3)
-            if shared is None:
-                shared = depth > 0
-            self.tallies[name].add(depth, confidence, truth, tissue, shared)
+            if configured is None:
+                configured = depth
+            self.tallies[name].add(depth, confidence, truth, tissue, configured > 0)
         self._warm = True
+        assert configured is not None  # there is always a matcher
         for name, depth in extra.items():
-            assert shared is not None  # there is always a matcher
             known = (depth > 0).astype(np.float32)
-            self.tallies.setdefault(name, Tally()).add(depth, known, truth, tissue, shared)
+            self.tallies.setdefault(name, Tally()).add(depth, known, truth, tissue, configured > 0)
+        return configured
 
     def rows(self) -> list[dict[str, Any]]:
         return [{"name": name, **tally.figures()} for name, tally in self.tallies.items()]
+
+
+class Regions:
+    """Errors by `regions_of` the picture, of the stage as configured and of the drawn model."""
+
+    def __init__(self) -> None:
+        self._tallies: dict[str, tuple[Tally, Tally]] = {}
+
+    def add(self, stage: F32, drawn: F32, truth: F32, masks: Mapping[str, Bool]) -> None:
+        for name, mask in masks.items():
+            tallies = self._tallies.setdefault(name, (Tally(), Tally()))
+            for tally, depth in zip(tallies, (stage, drawn), strict=True):
+                tally.add(depth, np.ones_like(depth), truth, mask, stage > 0)
+
+    def rows(self) -> list[dict[str, Any]]:
+        return [
+            {"region": name, "stage": _without_time(stage), "drawn": _without_time(drawn)}
+            for name, (stage, drawn) in self._tallies.items()
+        ]
+
+
+def _without_time(tally: Tally) -> dict[str, Any]:
+    return {key: value for key, value in tally.figures().items() if key != "ms"}
 
 
 def measure_recording(
@@ -229,7 +257,9 @@ def measure_recording(
     pipeline, budget = Pipeline(config, session.rig), StepBudget(1)
     camera, size = pipeline.rectifier.camera, session.working_size
     matchers = make_matchers(config.vision.stereo, camera, pipeline.rectifier.baseline, network)
-    comparison, measured, kind, next_number = Comparison(matchers), 0, "", 0
+    comparison, regions = Comparison(matchers), Regions()
+    measured, kind, next_number = 0, "", 0
+    focal_baseline = float(camera.K[0, 0]) * pipeline.rectifier.baseline
     with open_source(config.source) as frames:
         for number, frame in enumerate(frames):
             result = pipeline.process(frame, budget)
@@ -239,8 +269,9 @@ def measure_recording(
                 continue
             next_number = number + every
             truth, kind = metrics.resample_nearest(reference.depth, *size), reference.depth_kind
-            drawn = {MODEL: result.views["left"].depth}
-            comparison.add(result.pair, result.observation.tissue, truth, drawn)
+            drawn, tissue = result.views["left"].depth, result.observation.tissue
+            stage = comparison.add(result.pair, tissue, truth, {MODEL: drawn})
+            regions.add(stage, drawn, truth, regions_of(truth, tissue, focal_baseline))
             measured += 1
     if measured == 0:
         raise SagsError(f"{session.name} has no reference depth to compare with; set source.reference.depth")
@@ -252,6 +283,7 @@ def measure_recording(
         "machine": machine_name(),
         "settings": comparison.rows(),
         "confidence": comparison.tallies["as configured"].by_confidence(),
+        "regions": regions.rows(),
     }
 
 

@@ -23,6 +23,8 @@ def tables(measured: Mapping[str, Any]) -> Iterator[Table]:
     title = f"{measured['session']}, depth against truth: {measured['truth'].replace('_', ' ')}"
     yield _settings_table(title, measured["settings"])
     yield _confidence_table(measured["confidence"])
+    if "regions" in measured:
+        yield _regions_table(measured["regions"])
 
 
 def _settings_table(title: str, rows: Sequence[Row]) -> Table:
@@ -59,6 +61,21 @@ def _confidence_table(rows: Sequence[Row]) -> Table:
     made = Table("confidence, as configured", "share", "median, mm", "p90", "too far by")
     for row in rows:
         made.add_row(f"{row['above']:g} to {row['up_to']:g}", _number(row["share"], ".1%"), *_errors(row))
+    return made
+
+
+def _regions_table(rows: Sequence[Row]) -> Table:
+    made = Table("region", "stage: median, p90, mm", "too far by", "coverage", title="by region")
+    for head in ("drawn: median, p90, mm", "too far by", "coverage", "too far by, where the stage knows"):
+        made.add_column(head)
+    for row in rows:
+        cells = []
+        for side in (row["stage"], row["drawn"]):
+            coverage = _number(side["coverage"], ".1%")
+            cells += [_two(side["median_mm"], side["p90_mm"]), _number(side["bias_mm"], "+.2f"), coverage]
+        made.add_row(
+            row["region"], *cells, _number(row["drawn"]["where_configured_knows"]["bias_mm"], "+.2f")
+        )
     return made
 
 
