@@ -225,9 +225,9 @@ def _turn(errors: F64, left: F64) -> tuple[tuple[float, float], float, float]:
     """Pitch and roll (degrees), scale and its standard error, of row errors [M] of points `left` [M, 2] of
     the left picture, all at distance 1; wrong matches left out."""
     design, kept = np.column_stack([np.ones(len(errors)), left]), np.ones(len(errors), np.bool_)
-    found = np.zeros(3)
+    found: F64 = np.zeros(3)
     for _ in range(ROUNDS):
-        found = np.linalg.lstsq(design[kept], errors[kept], rcond=None)[0]
+        found = np.linalg.lstsq(design[kept], errors[kept], rcond=None)[0].astype(np.float64)
         away = np.abs(errors - design @ found)
         kept = away <= WRONG_MATCH * np.median(away) + 1e-12
     inner = design[kept]
