@@ -67,8 +67,9 @@ def bench_depth(
     depth, the time of one pair, and whether the confidence orders the errors.
 
     A recording, by default the built-in phantom, is played with one step of the mapper a frame; at
-    most every tenth frame is compared with its reference depth, and so is the depth of the drawn model. With
-    --eyes the depth from the left eye is compared with that from the right one.
+    most every tenth frame is compared with its reference depth, and so is the depth of the drawn model, also
+    by region: near and far, at edges, beside instruments, where the right eye does not see. With --eyes the
+    depth from the left eye is compared with that from the right one.
 
     \b
     sags bench depth launch/d4d_pull.yaml --out benchmarks/results/depth_d4d.json

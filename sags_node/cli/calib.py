@@ -111,9 +111,9 @@ def check(
     """Look over a calibration for what usually goes wrong.
 
     PATH is a calibration of any known form, or a session, whose calibration is compared with its own
-    pictures. With pictures the rows of both eyes are measured, and the check tells which end is wrong: the
-    calibration or the pictures. Where the session knows depths, they show whether the principal points
-    differ sideways. docs/calibration.md lists the forms.
+    pictures. With pictures the rows of both eyes are measured, and the check tells which end is wrong, the
+    calibration or the pictures, and whether one eye's scale is off. Where the session knows depths, they
+    show whether the principal points differ sideways. docs/calibration.md lists the forms.
 
     \b
     sags calib check calib/d4d
