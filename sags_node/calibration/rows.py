@@ -25,6 +25,7 @@ CLEARLY_PX = 0.3  # px: a reading that is worse by more does not fit
 WRONG_MATCH = 4.0  # times the median distance from the median row error
 LEAST_SCALE = 0.004  # between the eyes: beyond it depth leans by more than matching errs
 SURE_SCALE = 4.0  # times its standard error
+EXPLAINED = 0.7  # px: where turn and scale leave more, the lenses are off too, and no scale mends depth
 ROUNDS = 10
 PICTURES_SWAPPED = "the pictures are swapped: the left ones come from the right camera"
 PLAUSIBLE_DEPTH = (0.005, 1.0)  # m, the median: in an endoscope's view
@@ -41,6 +42,7 @@ class Rows(NamedTuple):
     turn: tuple[float, float]  # degrees, pitch and roll of one eye that explain the errors best, with
     scale: float  # by how much larger the right picture is than its calibration says, 0.01: 1 %
     scale_error: float  # standard error of that
+    left_over: float  # px, RMS of the errors that turn and scale leave
 
     @property
     def scale_differs(self) -> bool:
@@ -65,7 +67,9 @@ def rectified_rows(rig: StereoRig, matches: F64) -> Rows:
     disparities = K[0, 0] * (left[:, 0] - right[:, 0])
     in_front = float(np.mean(_signed_baseline(rig) * disparities > 0))
     median, p90 = np.percentile(np.abs(errors), [50, 90])
-    return Rows(errors, disparities, in_front, float(median), float(p90), *_turn(errors / K[1, 1], left))
+    turn, scale, scale_error, left_over = _turn(errors / K[1, 1], left)
+    figures = float(median), float(p90), turn, scale, scale_error, float(K[1, 1]) * left_over
+    return Rows(errors, disparities, in_front, *figures)
 
 
 def judge_matches(rig: StereoRig, matches: F64) -> list[Finding]:
@@ -185,14 +189,16 @@ def judge_scale(rig: StereoRig, rows: Rows) -> list[Finding]:
         f"{_scale_said(rows)}. If its columns are like its rows, depth leans by {abs(leans):.1f} mm in "
         f"100 px at {depth * 1e3:.0f} mm, too {'near' if leans > 0 else 'far'} on the right"
     )
-    fx, fy = (rig.right.K[k, k] * (1 + rows.scale) for k in (0, 1))
-    mend = (
-        "calibrate again with zoom, focus and picture size as they are used, and the board up to the edges; "
-        f"until then set fx to {fx:.2f} and fy to {fy:.2f} in camera_matrix of right.yaml: rows agree then"
-    )
+    mend = "calibrate again with zoom, focus and picture size as they are used, and the board up to the edges"
+    if rows.left_over <= EXPLAINED:
+        fx, fy = (rig.right.K[k, k] * (1 + rows.scale) for k in (0, 1))
+        mend += f"; until then set fx to {fx:.2f} and fy to {fy:.2f} in camera_matrix of right.yaml"
+    else:
+        what += f". Rows are still off by {rows.left_over:.1f} px then: the distortion is wrong, too"
     figures = {
         "scale": round(rows.scale, 4),
         "scale_standard_error": round(rows.scale_error, 5),
+        "rows_left_over_px": round(rows.left_over, 3),
         "leans_mm_per_100_px": round(float(leans), 3),
     }
     return [Finding("warning", what, mend, figures)]
@@ -221,9 +227,9 @@ def _rows_differ(rows: Rows) -> Finding:
     return Finding("error", what, mend, figures)
 
 
-def _turn(errors: F64, left: F64) -> tuple[tuple[float, float], float, float]:
-    """Pitch and roll (degrees), scale and its standard error, of row errors [M] of points `left` [M, 2] of
-    the left picture, all at distance 1; wrong matches left out."""
+def _turn(errors: F64, left: F64) -> tuple[tuple[float, float], float, float, float]:
+    """Pitch and roll (degrees), scale and its standard error, and the RMS that these leave, of row errors [M]
+    of points `left` [M, 2] of the left picture, all at distance 1; wrong matches left out."""
     design, kept = np.column_stack([np.ones(len(errors)), left]), np.ones(len(errors), np.bool_)
     found: F64 = np.zeros(3)
     for _ in range(ROUNDS):
@@ -235,7 +241,7 @@ def _turn(errors: F64, left: F64) -> tuple[tuple[float, float], float, float]:
     spread = float(np.linalg.pinv(inner.T @ inner)[2, 2])
     pitch, roll = np.degrees(found[:2])
     turn = round(float(pitch), 3), round(float(roll), 3)
-    return turn, float(found[2]), float(np.sqrt(variance * spread))
+    return turn, float(found[2]), float(np.sqrt(variance * spread)), float(np.sqrt(variance))
 
 
 def _depth(rig: StereoRig, rows: Rows) -> list[Finding]:

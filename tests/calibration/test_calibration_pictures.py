@@ -27,7 +27,7 @@ from sags_node.calibration import (
 from sags_node.calibration.check import size_made_for
 from sags_node.calibration.matches import match_eyes
 from sags_node.calibration.principal_points import judge_known_depths
-from sags_node.calibration.rows import rectified_rows
+from sags_node.calibration.rows import judge_scale, rectified_rows
 from sags_node.cli.main import main
 from sags_node.errors import SagsError
 from sags_node.launch_file import load_launch
@@ -249,6 +249,21 @@ def test_an_eye_of_another_scale_is_said_with_its_mend(
 def with_right_focal(rig: StereoRig, factor: float) -> StereoRig:
     K = rig.right.K * np.array([[factor, 1, 1], [1, factor, 1], [1, 1, 1]])
     return StereoRig(rig.name, rig.left, replace(rig.right, K=K))
+
+
+@pytest.mark.parametrize("bent", [0.0, 3.0])
+def test_a_scale_is_named_only_where_it_mends_the_rows(bent: float) -> None:
+    """By arithmetic: rows 1 % too large, and bent by so many px to either side."""
+    rig = rectified_rig("plane", 640, 512, np.array([[600.0, 0, 319.5], [0, 600, 255.5], [0, 0, 1]]), 0.004)
+    rng = np.random.default_rng(0)
+    columns, lines = rng.uniform(40, 630, 500), rng.uniform(10, 500, 500)
+    right = 255.5 + 1.01 * (lines - 255.5) + bent * np.cos(columns / 50) + rng.normal(0, 0.2, 500)
+    rows = rectified_rows(rig, np.column_stack([columns, lines, columns - 30, right]))
+    (finding,) = judge_scale(rig, rows)
+    assert finding.figures["scale"] == pytest.approx(0.01, abs=4 * rows.scale_error)
+    assert rows.left_over == pytest.approx(np.hypot(0.2, bent / np.sqrt(2)), rel=0.15)
+    assert ("set fx to" in finding.mend) == (bent == 0)
+    assert ("distortion is wrong" in finding.what) == (bent > 0)
 
 
 def test_a_scale_too_large_for_stereo_is_said_with_the_rows(phantom: tuple[StereoRig, Pairs]) -> None:
