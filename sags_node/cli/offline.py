@@ -60,7 +60,7 @@ from sags_node.terminal.console import check_folder, console, progress, show, wr
 @click.option("--paper-psnr", is_flag=True, help="Also PSNR with masked pixels counted as perfect.")
 @click.option(
     "--protocol",
-    type=click.Choice(["endonerf", "scared", "stereomis", "stir"]),
+    type=click.Choice(["d4d", "endonerf", "scared", "stereomis", "stir"]),
     help="Measure a public data set, in its own layout, by its own rules (docs/protocols.md).",
 )
 @click.option("--report", type=click.Path(path_type=Path), help="Folder for an HTML report.")
@@ -132,6 +132,7 @@ def _evaluate_protocol(
     json_out: str | None,
 ) -> None:
     from sags_node.protocols import run
+    from sags_node.protocols.d4d import measure_d4d
 
     path, overrides = split(launch)
     if path is None:
@@ -149,6 +150,7 @@ def _evaluate_protocol(
             found = run.measure_endonerf(Path(path), overrides, lpips_weights, tell)
         else:
             measures = {
+                "d4d": measure_d4d,
                 "scared": run.measure_scared,
                 "stereomis": run.measure_stereomis,
                 "stir": run.measure_stir,

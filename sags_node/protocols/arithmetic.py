@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sags_node.types import F32, F64
+from sags_node.types import F32, F64, Bool
 
 STIR_PX = (4, 8, 16, 32, 64)  # of the 2D ranking (stir-challenge.github.io, evaluation)
 STIR_MM = (2, 4, 8, 16, 32)  # of the 3D ranking
@@ -73,3 +73,21 @@ def mean_depth_error(depth: F32, truth: F32) -> tuple[float, float] | None:
         return None
     error = np.abs(depth[given].astype(np.float64) - truth[given])
     return float(np.mean(error)) * 1e3, float(given.sum() / known.sum())
+
+
+def depth_figures(depth: F32, truth: F32, where: Bool) -> dict[str, float] | None:
+    """Errors of depth [H, W] where both it and the truth (m, 0 unknown) are known: absolute ones, their mean,
+    median and 90th percentile, and `bias_mm`, the median of the signed ones (negative: too near), mm;
+    `given`: the share of the truth there. None where nothing is."""
+    known = where & (truth > 0)
+    given = known & (depth > 0)
+    if not given.any():
+        return None
+    errors = (depth[given].astype(np.float64) - truth[given]) * 1e3
+    return {
+        "mae_mm": float(np.mean(np.abs(errors))),
+        "median_mm": float(np.median(np.abs(errors))),
+        "p90_mm": float(np.percentile(np.abs(errors), 90)),
+        "bias_mm": float(np.median(errors)),
+        "given": float(given.sum() / known.sum()),
+    }

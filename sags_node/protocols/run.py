@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -17,24 +18,21 @@ from sags_node.evaluation.measure import Options
 from sags_node.evaluation.metrics import resample_nearest
 from sags_node.evaluation.point_tracks import shares_within
 from sags_node.evaluation.session import evaluate
-from sags_node.geometry import transform
 from sags_node.kernels.threads import configure_threads
 from sags_node.launch_file import load_launch
 from sags_node.pipeline import Pipeline
 from sags_node.protocols import arithmetic
 from sags_node.protocols.layouts import StereoMisSequence, check_sizes, stereomis_sequence, stir_clips
+from sags_node.protocols.playing import AS_GIVEN, STEP, Progress
+from sags_node.protocols.point_tracker import Followed, PointTracker
 from sags_node.session import open_posed, rig_of
 from sags_node.sources.videos import Video
-from sags_node.types import F64, Camera, Eye, StereoRig
+from sags_node.types import F64, StereoRig
 from sags_node.warm_up import warm_up
 
-STEP = ("source.loop:=false", "source.pace:=step")
-AS_GIVEN = "vision.tissue.dilate:=0"
 LEAST_POSES = 3  # to align
 HOLD_OUT = 8  # EndoNeRF's split, as EndoGaussian and those after it take it
 PICKED = ("paper_psnr", "paper_ssim", "lpips", "psnr", "ssim", "copy_psnr")
-
-Progress = Callable[[int, str], None]  # frames done, of what
 
 
 def measure_endonerf(
@@ -185,42 +183,27 @@ class _Tracks:
     pixels: F64  # [P, 2] raw, left
     points_mm: F64  # [P, 3] in the raw left camera, as STIR counts; infinite: never pinned
     lost: int
-    times_ms: list[float]  # of frames
+    times_ms: list[float]  # of calls; the first takes two frames
 
 
 def _follow(launch: Sequence[str], rig: StereoRig, starts: F64, name: str, progress: Progress) -> _Tracks:
+    """As STIR's evaluator drives a method: each call is given what the one before it returned."""
     config = load_launch(None, launch)
     warm_up(config)
     configure_threads(config.engine.threads)
-    pipeline = Pipeline(config, rig)
-    budget, camera = pipeline.make_budget(), pipeline.rectifier.camera
-    places, places_mm, found = starts.copy(), np.full((len(starts), 3), np.inf), 0
+    tracker, followed = PointTracker(config, rig), Followed.unknown(starts)
+    points_mm = np.full((len(starts), 3), np.inf)
     times: list[float] = []
-    pinned: dict[int, int] = {}  # anchor -> point
     with open_posed(config, rig, references=False) as frames:
-        for number, frame in enumerate(frames):
+        for number, (now, following) in enumerate(pairwise(frames)):
             started = time.perf_counter()
-            result = pipeline.process(frame, budget)
+            followed = tracker.follow(followed.pixels, now, following)
             times.append((time.perf_counter() - started) * 1e3)
-            progress(number + 1, name)
-            if number == 0:
-                for point, (u, v) in enumerate(to_working(rig.left, camera, starts)):
-                    try:
-                        view = result.views["left"]
-                        anchor = pipeline.anchors.add_pixel(u, v, result.observation, result.snapshot, view)
-                    except SagsError:
-                        continue  # an instrument, no depth, or outside
-                    pinned[anchor] = point
-            else:
-                known = np.isfinite(result.anchors.pixels).all(1)
-                points = [pinned[int(anchor)] for anchor in result.anchors.ids[known]]
-                pixels = result.anchors.pixels[known].astype(np.float64)
-                found = len(points)
-                if found:
-                    places[points] = to_raw(rig.left, camera, pixels)
-                    seen = transform(result.snapshot.camera.viewmat, result.anchors.points[known])
-                    places_mm[points] = as_stir_counts(rig, np.asarray(seen, np.float64))
-    return _Tracks(places, places_mm, len(starts) - found, times)
+            points_mm[followed.found] = as_stir_counts(rig, followed.points[followed.found])
+            progress(number + 2, name)
+    if not times:
+        raise SagsError(f"{name} has fewer than two frames; is its video whole?")
+    return _Tracks(followed.pixels, points_mm, int(np.count_nonzero(~followed.found)), times)
 
 
 def as_stir_counts(rig: StereoRig, points: F64) -> F64:
@@ -234,16 +217,3 @@ def as_stir_counts(rig: StereoRig, points: F64) -> F64:
     ]
     baseline_mm = 1e3 * abs(float(T[0, 3]))
     return arithmetic.stereo_points_mm(pixels[0], pixels[1], rig.left.K, rig.right.K, baseline_mm)
-
-
-def to_working(eye: Eye, camera: Camera, pixels: F64) -> F64:
-    """Raw pixels [P, 2] of an eye in the rectified camera at the working size."""
-    there: F64 = cv2.undistortPoints(pixels[:, None], eye.K, eye.distortion, R=eye.R, P=camera.K)[:, 0]
-    return there
-
-
-def to_raw(eye: Eye, camera: Camera, pixels: F64) -> F64:
-    """The inverse of `to_working`."""
-    rays = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(camera.K).T @ eye.R
-    raw: F64 = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), eye.K, eye.distortion)[0][:, 0]
-    return raw

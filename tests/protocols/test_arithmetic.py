@@ -118,3 +118,18 @@ def test_endonerf_counts_masked_pixels_as_black_in_both() -> None:
     plain = metrics.ssim(picture * black, truth * black, everywhere)
     assert metrics.paper_ssim(picture, truth, tissue) == pytest.approx(plain)
     assert metrics.ssim(picture, truth, tissue) < plain < 1  # black is alike
+
+
+def test_depth_errors_have_a_sign() -> None:
+    """Of ten known pixels eight are given: errors of -1 mm five times, 2 mm twice and 6 mm."""
+    truth, depth = np.zeros((4, 4), np.float32), np.full((4, 4), 0.05, np.float32)
+    truth.flat[:10] = 0.1
+    depth.flat[:10] = [0.099] * 5 + [0.102, 0.102, 0.106, 0, 0]
+    figures = arithmetic.depth_figures(depth, truth, np.ones((4, 4), bool))
+    assert figures is not None
+    assert figures["mae_mm"] == pytest.approx((5 + 4 + 6) / 8, abs=1e-4)
+    assert figures["median_mm"] == pytest.approx(1, abs=1e-4)
+    assert figures["bias_mm"] == pytest.approx(-1, abs=1e-4)
+    assert figures["p90_mm"] == pytest.approx(2 + 0.3 * 4, abs=1e-4)  # between the 7th and the 8th of 8
+    assert figures["given"] == 0.8
+    assert arithmetic.depth_figures(depth, truth, truth == 0) is None

@@ -20,7 +20,8 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.geometry import project
 from sags_node.launch_file import load_launch
 from sags_node.protocols.layouts import marked_in_both, read_tum, stereomis_sequence, stir_clips
-from sags_node.protocols.run import as_stir_counts, to_raw, to_working
+from sags_node.protocols.point_tracker import to_raw, to_working
+from sags_node.protocols.run import as_stir_counts
 from sags_node.sources.source import open_source
 from sags_node.types import F64, StereoFrame, StereoRig
 from sags_node.vision.rectify import Rectifier
@@ -247,7 +248,7 @@ def test_tum_trajectories(tmp_path: Path) -> None:
             read_tum(file)
 
 
-@pytest.mark.parametrize("protocol", ["stir", "stereomis", "endonerf", "scared"])
+@pytest.mark.parametrize("protocol", ["d4d", "stir", "stereomis", "endonerf", "scared"])
 def test_another_folder_is_refused_in_one_line(protocol: str, tmp_path: Path) -> None:
     result = CliRunner().invoke(main, ["eval", "--protocol", protocol, str(tmp_path)])
     assert result.exit_code == 2 and str(tmp_path) in result.stderr
