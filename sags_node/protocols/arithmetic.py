@@ -10,6 +10,8 @@ from sags_node.types import F32, F64, Bool
 
 STIR_PX = (4, 8, 16, 32, 64)  # of the 2D ranking (stir-challenge.github.io, evaluation)
 STIR_MM = (2, 4, 8, 16, 32)  # of the 3D ranking
+STEREOMIS_PX = (1, 2, 4, 8, 16)  # of a picture of 256x256 (github.com/mhayoz/online_endo_track)
+STEREOMIS_LOST = 16  # the same
 LEAST_KNOWN = 0.1  # of a picture: SCARED leaves out frames with less true depth (arXiv 2101.01133, III-D)
 
 
@@ -90,4 +92,27 @@ def depth_figures(depth: F32, truth: F32, where: Bool) -> dict[str, float] | Non
         "p90_mm": float(np.percentile(np.abs(errors), 90)),
         "bias_mm": float(np.median(errors)),
         "given": float(given.sum() / known.sum()),
+    }
+
+
+def stereomis_figures(found: F64, truth: F64, visible: Bool, size: tuple[int, int]) -> dict[str, float]:
+    """Of points [P, T, 2] px and where they are seen [P, T], as StereoMIS-Tracking measures them.
+
+    `mte_px`: of each point the median error where it is seen, and the mean over points. The others count in
+    px of a picture of 256x256. `delta`: share of what is seen after the first frame within 1, 2, 4, 8 and 16,
+    their mean. `survival`: share of all frames of all points before the point is first seen farther than 16
+    away.
+
+    Args:
+        size: width and height of the pictures, px.
+    """
+    errors = np.linalg.norm(found - truth, axis=2)
+    medians = [np.median(error[seen]) for error, seen in zip(errors, visible, strict=True) if seen.any()]
+    scaled = np.linalg.norm((found - truth) * 256 / np.asarray(size), axis=2)
+    later = scaled[:, 1:][visible[:, 1:]]
+    lost = (scaled > STEREOMIS_LOST) & visible
+    return {
+        "mte_px": float(np.mean(medians)),
+        "delta": float(np.mean([np.mean(later < threshold) for threshold in STEREOMIS_PX])),
+        "survival": float(np.mean(np.cumprod(~lost, axis=1))),
     }

@@ -25,6 +25,7 @@ from sags_node.protocols import arithmetic
 from sags_node.protocols.layouts import StereoMisSequence, check_sizes, stereomis_sequence, stir_clips
 from sags_node.protocols.playing import AS_GIVEN, STEP, Progress
 from sags_node.protocols.point_tracker import Followed, PointTracker
+from sags_node.protocols.tracked_points import is_tracked, measure_tracked
 from sags_node.session import open_posed, rig_of
 from sags_node.sources.videos import Video
 from sags_node.types import F64, StereoRig
@@ -128,7 +129,9 @@ def _within_mm(distances: Sequence[F64]) -> dict[str, float] | None:
 
 def measure_stereomis(folder: Path, overrides: Sequence[str], progress: Progress) -> dict[str, Any]:
     """The camera's way as the node estimates it, against the robot's: the means over the ranges of the
-    sequence's table, each begun anew; without a table all of it."""
+    sequence's table, each begun anew; without a table all of it. Of StereoMIS-Tracking the points instead."""
+    if is_tracked(folder):
+        return measure_tracked(folder, overrides, progress)
     sequence = stereomis_sequence(folder)
     check_sizes(Video(sequence.video), sequence.rig)
     given = ["source.kind:=videos", f"source.left:={sequence.video}", "source.geometry.layout:=over_under"]

@@ -133,3 +133,21 @@ def test_depth_errors_have_a_sign() -> None:
     assert figures["p90_mm"] == pytest.approx(2 + 0.3 * 4, abs=1e-4)  # between the 7th and the 8th of 8
     assert figures["given"] == 0.8
     assert arithmetic.depth_figures(depth, truth, truth == 0) is None
+
+
+def test_stereomis_tracks_by_hand() -> None:
+    """Pictures of 512x1024 px: 2 px across and 4 px down are one of 256x256. The first point is right, then 6
+    px off across (3 of theirs), then 40 (20: lost), then not seen. The second is 8 px off downwards (2) once
+    it is measured, and hidden in the third frame, where it is far off."""
+    truth = np.full((2, 4, 2), 200.0)
+    found = truth.copy()
+    found[0, 1, 0] += 6
+    found[0, 2, 0] += 40
+    found[0, 3, 0] += 400
+    found[1, 1:, 1] += [8, 400, 8]
+    visible = np.array([[True, True, True, False], [True, True, False, True]])
+    figures = arithmetic.stereomis_figures(found, truth, visible, (512, 1024))
+    assert figures["mte_px"] == pytest.approx((6 + 8) / 2)  # medians of 0, 6, 40 and of 0, 8, 8
+    # Of 3, 20, 2 and 2: none below 1 or 2, three below 4, 8 and 16.
+    assert figures["delta"] == pytest.approx((0 + 0 + 3 * 0.75) / 5)
+    assert figures["survival"] == pytest.approx((2 + 4) / 8)
