@@ -6,15 +6,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 from sags_node.calibrate.check import check_calibration
-from sags_node.calibration import Finding, find_form
+from sags_node.calibration import Finding
 from sags_node.config import EndoNerfSource, RecordedSource
 from sags_node.errors import SagsError
-from sags_node.importing import pictures
-from sags_node.importing.folder import Contents, recognise
+from sags_node.importing import pictures, videos
+from sags_node.importing.folder import Contents, both_eyes, calibration_of, recognise
 from sags_node.sources.pictures import size_text
 from sags_node.sources.source import open_source
-
-CALIBRATIONS = (".", "calib", "calibration", "camera", "rig")
 
 
 def check_folder(folder: Path) -> list[Finding]:
@@ -27,15 +25,33 @@ def check_folder(folder: Path) -> list[Finding]:
     found = [Finding("ok", f"{folder.name or folder} is {contents.what}")]
     if contents.left is not None:
         found += _pictures(contents, contents.left)
-    found += _calibration(folder, contents)
+    play = contents.play
+    if contents.videos:
+        looked, play = videos.look(contents.videos, calibration_of(folder))
+        found += looked
     if contents.config is not None:
         found += _played(contents)
+    found = _once(found + _calibration(folder, contents))
     wrong = any(finding.level == "error" for finding in found)
     how = "when that is mended: " if wrong else ""
-    return [*found, Finding("ok", f"to play it: {how}{contents.play}")]
+    return [*found, Finding("ok", f"to play it: {how}{play}")]
+
+
+def _once(found: list[Finding]) -> list[Finding]:
+    """One file that cannot be read is met by several who look; the first says it."""
+    said: set[str] = set()
+    kept = []
+    for finding in found:
+        why = finding.what.partition(": ")[2]
+        if finding.level != "error" or not why or why not in said:
+            kept.append(finding)
+        said.add(why)
+    return kept
 
 
 def _pictures(contents: Contents, left_folder: Path) -> list[Finding]:
+    if contents.right is None and contents.config is None:
+        return _tried("pictures", lambda: _in_one_folder(left_folder))
     named = {"left": left_folder, "right": contents.right, "masks": contents.masks}
     there = {what: each for what, each in named.items() if each is not None}
     source = None if contents.config is None else contents.config.source
@@ -62,22 +78,28 @@ def _pictures(contents: Contents, left_folder: Path) -> list[Finding]:
     return found
 
 
+def _in_one_folder(folder: Path) -> list[Finding]:
+    """Where the names tell the eyes both are looked at, else what there is."""
+    apart = both_eyes(folder)
+    if not apart:
+        return pictures.check_eye("pictures", pictures.sample(folder))
+    left, right = (pictures.read_some([pair[eye] for pair in apart]) for eye in (0, 1))
+    eyes = pictures.check_eye("left", left) + pictures.check_eye("right", right)
+    return eyes + pictures.check_eyes(left, right)
+
+
 def _calibration(folder: Path, contents: Contents) -> list[Finding]:
     """The calibration beside the pictures, against them; sessions that are played as they are name theirs."""
     if contents.config is not None and (contents.right is not None or contents.left is None):
         return _tried("calibration", lambda: _odd_or_last(check_calibration(folder)))
     if contents.right is None or contents.left is None:
         return []
-    form = next((folder / name for name in CALIBRATIONS if _has_calibration(folder / name)), None)
+    form = calibration_of(folder)
     if form is None:
         mend = "without one there is no depth in mm: sags calib stereo makes one (docs/calibration.md)"
         return [Finding("warning", "no calibration lies beside the pictures", mend)]
     eyes = [(contents.left, contents.right)]
     return _tried("calibration", lambda: _odd_or_last(check_calibration(form, images=eyes)))
-
-
-def _has_calibration(folder: Path) -> bool:
-    return folder.is_dir() and find_form(folder) is not None
 
 
 def _odd_or_last(found: list[Finding]) -> list[Finding]:

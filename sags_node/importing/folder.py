@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from sags_node.calibration import find_form
 from sags_node.config import LaunchConfig
 from sags_node.errors import UsageError
 from sags_node.launch_file import VIDEO_SUFFIXES, load_launch
@@ -14,6 +16,8 @@ from sags_node.picture_header import SUFFIXES
 EYES = (("left", "right"), ("l", "r"), ("image_left", "image_right"), ("left_rectified", "right_rectified"))
 HAMLYN_EYES = (("image01", "image02"), ("image_0", "image_1"), ("images", "images_right"))
 MASKS = ("masks", "mask", "tools", "toolmask", "tool_mask")
+_EYE = re.compile(r"(?<![a-z])(left|right|l|r)(?![a-z])", re.IGNORECASE)
+CALIBRATIONS = (".", "calib", "calibration", "camera", "rig")
 DEPTHS = ("depth", "depths", "depth01", "depth_mm_x100")
 
 
@@ -28,6 +32,7 @@ class Contents:
     masks: Path | None = None
     depth: Path | None = None
     config: LaunchConfig | None = None  # where it is played as it is
+    videos: tuple[Path, ...] = ()  # of both eyes, or one that may show both
 
 
 def recognise(folder: Path) -> Contents:
@@ -70,35 +75,89 @@ def _playable(folder: Path, config: LaunchConfig) -> Contents:
 
 def _plain(folder: Path) -> Contents:
     masks, depth = _first(folder, MASKS), _first(folder, DEPTHS)
+    eyes = _eye_folders(folder)
+    if eyes is not None:
+        left, right = eyes
+        play = f"sags run source.kind:=folders source.left:={left} source.right:={right}"
+        tools = "" if masks is None else f" source.tools:={masks}"
+        rig = f" rig:={calibration_of(folder) or 'CALIBRATION'}"
+        return Contents("two folders of pictures", f"{play}{tools}{rig}", left, right, masks, depth)
+    videos = sorted(file for file in folder.iterdir() if file.suffix.lower() in VIDEO_SUFFIXES)
+    if videos:
+        what = "one video" if len(videos) == 1 else f"{len(videos)} videos"
+        return Contents(what, "", videos=_eye_videos(videos))
+    if has_pictures(folder):
+        apart = both_eyes(folder)
+        both = f" of both eyes, {len(apart)} pairs," if apart else ""
+        play = "put the pictures of each eye in a folder of its own, left/ and right/, and check again"
+        return Contents(f"pictures{both} in one folder", play, left=folder)
+    below = sorted(each.name for each in folder.iterdir() if each.is_dir())
+    if not below:
+        what = (
+            "a folder without pictures, videos or a recording" if any(folder.iterdir()) else "an empty folder"
+        )
+        return Contents(what, "give the folder that holds the recording")
+    play = f"check one of the folders in it: {', '.join(below[:8])}"
+    return Contents("nothing that is known", play)
+
+
+def _eye_folders(folder: Path) -> tuple[Path, Path] | None:
+    """By the usual names, else by names that differ in the eye only, as `cam_left` and `cam_right`."""
     for left_name, right_name in (*EYES, *HAMLYN_EYES):
         left, right = _first(folder, (left_name,)), _first(folder, (right_name,))
         if left is not None and right is not None:
-            play = f"sags run source.kind:=folders source.left:={left} source.right:={right}"
-            tools = "" if masks is None else f" source.tools:={masks}"
-            return Contents(
-                "two folders of pictures", f"{play}{tools} rig:=CALIBRATION", left, right, masks, depth
-            )
-    videos = sorted(file for file in folder.iterdir() if file.suffix.lower() in VIDEO_SUFFIXES)
-    if len(videos) == 1:
-        play = (
-            f"sags calib live source.kind:=videos source.left:={videos[0]} "
-            "source.geometry.layout:=side_by_side (or over_under) shows whether both eyes are in it"
-        )
-        return Contents("one video", play)
-    if videos:
-        eyes = f"source.left:={videos[0]} source.right:={videos[1]}"
-        play = f"sags run source.kind:=videos {eyes} rig:=CALIBRATION"
-        return Contents(f"{len(videos)} videos", play)
-    if has_pictures(folder):
-        play = "put the pictures of each eye in a folder of its own, left/ and right/, and check again"
-        return Contents("pictures in one folder", play, left=folder)
-    below = sorted(each.name for each in folder.iterdir() if each.is_dir())
-    play = f"check one of the folders in it: {', '.join(below[:8])}" if below else "give another folder"
-    return Contents("nothing that is known", play)
+            return left, right
+    by_name = {each.name: each for each in folder.iterdir() if each.is_dir() and has_pictures(each)}
+    named = [(by_name[left], by_name[right]) for left, right in _pairs(by_name)]
+    return named[0] if len(named) == 1 else None
+
+
+def _eye_videos(videos: list[Path]) -> tuple[Path, ...]:
+    """Left and right one, by their names if these say it."""
+    by_name = {file.stem: file for file in videos}
+    named = [(by_name[left], by_name[right]) for left, right in _pairs(by_name)]
+    return named[0] if len(named) == 1 else tuple(videos[:2])
+
+
+def both_eyes(folder: Path) -> list[tuple[Path, Path]]:
+    """Pictures of left and right eye in one folder, as `left_001.png` and `right_001.png`; no masks."""
+    by_name = {
+        file.name: file
+        for file in sorted(folder.iterdir())
+        if file.suffix.lower() in SUFFIXES and file.is_file() and "mask" not in file.name.lower()
+    }
+    return [(by_name[left], by_name[right]) for left, right in _pairs(by_name)]
+
+
+def _pairs(names: Iterable[str]) -> list[tuple[str, str]]:
+    """Names that differ in nothing but the eye: a word `left` or `l` where the other has `right` or `r`."""
+    eyes: dict[str, dict[str, str]] = {}
+    for name in names:
+        for match in _EYE.finditer(name):
+            rest = f"{name[: match.start()]}*{len(match[0])}*{name[match.end() :]}".replace("*5*", "*4*")
+            eyes.setdefault(rest, {})[match[0][0].lower()] = name
+    return [(found["l"], found["r"]) for found in eyes.values() if len(found) == 2]
+
+
+def calibration_of(folder: Path) -> Path | None:
+    """What lies beside the pictures, in a folder of a usual name or with them."""
+    places = (folder / name for name in CALIBRATIONS)
+    return next((place for place in places if place.is_dir() and find_form(place) is not None), None)
 
 
 def _is_stereomis(folder: Path) -> bool:
     return (folder / "groundtruth.txt").is_file() and (folder / "StereoCalibration.ini").is_file()
+
+
+def _is_stereomis_tracking(folder: Path) -> bool:
+    return (folder / "track_pts.pckl").is_file()
+
+
+def _is_d4d(folder: Path) -> bool:
+    depths = ("", "*/", "*/*/")
+    return (folder / "left_images_rect").is_dir() or any(
+        any(folder.glob(f"{depth}clips/*/left_images_rect")) for depth in depths
+    )
 
 
 def _is_stir(folder: Path) -> bool:
@@ -106,6 +165,21 @@ def _is_stir(folder: Path) -> bool:
 
 
 _KNOWN: tuple[tuple[Callable[[Path], bool], Contents], ...] = (
+    (
+        _is_stereomis_tracking,
+        Contents(
+            "a sequence of StereoMIS-Tracking",
+            "sags eval --protocol stereomis FOLDER follows its points (docs/protocols.md)",
+        ),
+    ),
+    (
+        _is_d4d,
+        Contents(
+            "clips of D4D",
+            "sags eval --protocol d4d FOLDER measures them; to play one, give its left_images_rect and "
+            "right_images_rect as source.kind folders (docs/protocols.md)",
+        ),
+    ),
     (
         _is_stereomis,
         Contents(

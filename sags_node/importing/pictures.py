@@ -56,13 +56,25 @@ def _counts_mend(files: dict[str, list[Path]]) -> str:
 
 
 def sample(folder: Path, flags: int = cv2.IMREAD_COLOR) -> list[tuple[Path, U8]]:
-    """Some pictures of a folder, spread over it.
+    """Some pictures of a folder, see `read_some`.
 
     Raises:
         SagsError: one cannot be read.
     """
-    files = list_pictures(folder)
-    return [(file, read_picture(file, flags)) for file in files[:: max(1, -(-len(files) // LOOKED_AT))]]
+    return read_some(list_pictures(folder), flags)
+
+
+def read_some(files: Sequence[Path], flags: int = cv2.IMREAD_COLOR) -> list[tuple[Path, U8]]:
+    """Pictures spread over the files. The last and the smallest one are read too: there copies break off.
+
+    Raises:
+        SagsError: one cannot be read.
+    """
+    chosen = set(files[:: max(1, -(-len(files) // LOOKED_AT))])
+    suspects = {files[-1], min(files, key=lambda file: file.stat().st_size)} - chosen
+    for file in suspects:
+        read_picture(file, flags)
+    return [(file, read_picture(file, flags)) for file in files if file in chosen]
 
 
 def check_eye(what: str, pictures: Sequence[tuple[Path, U8]]) -> list[Finding]:
@@ -167,14 +179,8 @@ def check_depth(folder: Path, size: tuple[int, int], unit: float | None = None) 
     """Kind, size and unit (m per count) of depth pictures."""
     medians = []
     for file, depth in sample(folder, cv2.IMREAD_UNCHANGED):
-        if depth.ndim != 2:
-            what = f"depth: {file.name} has {depth.shape[2]} channels: it is coloured for people"
-            return [Finding("error", what, "export depth as grey PNG of 16 bit")]
-        if depth.shape[::-1] != size:
-            what = (
-                f"depth: {file.name} is {size_text(*depth.shape[::-1])} px, the pictures {size_text(*size)}"
-            )
-            return [Finding("error", what, "resize depth with nearest neighbour, never a mean")]
+        if (wrong := _no_depth(file, depth, size)) is not None:
+            return [wrong]
         known: Bool = depth > 0
         if known.any():
             medians.append(float(np.median(depth[known])))
@@ -203,5 +209,21 @@ def check_depth(folder: Path, size: tuple[int, int], unit: float | None = None) 
     return found
 
 
+def _no_depth(file: Path, depth: U8, size: tuple[int, int]) -> Finding | None:
+    """Why a picture cannot be depth."""
+    export = "export depth as grey PNG of 16 bit, e.g. in 1e-5 m"
+    if depth.ndim != 2:
+        what = f"depth: {file.name} has {depth.shape[2]} channels: it is coloured for people"
+        return Finding("error", what, export)
+    if depth.dtype.kind == "f":
+        return Finding("error", f"depth: {file.name} holds floating numbers, which are not read", export)
+    if depth.shape[::-1] != size:
+        what = f"depth: {file.name} is {size_text(*depth.shape[::-1])} px, the pictures {size_text(*size)}"
+        return Finding("error", what, "resize depth with nearest neighbour, never a mean")
+    return None
+
+
 def refused(what: str, error: SagsError) -> Finding:
-    return Finding("error", f"{what}: {error}", "mend or remove that file")
+    """Errors say what is wrong, and after a semicolon how to mend it."""
+    why, _, mend = str(error).partition("; ")
+    return Finding("error", f"{what}: {why}", mend or "mend or remove that file")

@@ -68,7 +68,7 @@ def _stir_clip(left: Path) -> StirClip | None:
     if not len(starts) or not len(ends):
         return None
     name = f"{left.parent.name}/{left.name}"
-    rig = _stir_rig(left.parent.parent / "calib.json", Video(left_video).size)
+    rig = stir_rig(left.parent.parent / "calib.json", Video(left_video).size)
     starts_mm, ends_mm = (marked_in_both(left, right, when, rig) for when in ("start", "end"))
     return StirClip(name, left_video, right_video, rig, starts, ends, starts_mm, ends_mm)
 
@@ -134,8 +134,15 @@ def _correlation(a: F64, b: F64) -> float:
     return float(np.mean((a - a.mean()) * (b - b.mean()))) / spread if spread > 0 else 0.0
 
 
-def _stir_rig(file: Path, size: tuple[int, int]) -> StereoRig:
-    """From `calib.json`: metres, from left to right or from right to left; the baseline is what counts."""
+def stir_rig(file: Path, size: tuple[int, int]) -> StereoRig:
+    """From `calib.json`: metres, from left to right or from right to left; the baseline is what counts.
+
+    Args:
+        size: width and height of the pictures, px.
+
+    Raises:
+        UsageError: it is missing or no calibration.
+    """
     try:
         said = json.loads(read_file(file, LARGEST_TEXT))
         K = [np.array(said[f"{side}cameramat"], np.float64).reshape(3, 3) for side in ("left", "right")]

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from numbered_pictures import write_video
 from places import SESSION
 
 from sags_node.calibration import Finding
@@ -119,6 +120,15 @@ PLANTED = {
         "has 3 channels",
         "grey",
     ),
+    "depth_of_floats": (
+        lambda folder: [
+            cv2.imwrite(str(file.with_suffix(".tiff")), np.full((HEIGHT, WIDTH), 0.08, np.float32))
+            and file.unlink()
+            for file in list((folder / "depth").iterdir())
+        ],
+        "holds floating numbers",
+        "16 bit",
+    ),
     "right_one_missing": (
         lambda folder: (folder / "right/002.tiff").unlink(),
         "left 4, right 3",
@@ -156,6 +166,91 @@ def test_a_planted_oddity_is_named_with_its_mend(name: str, tmp_path: Path) -> N
     assert name in ("interlaced", "borders", "right_one_missing", "gap") or not other, other
 
 
+def test_a_copy_that_broke_off_is_found_among_many(tmp_path: Path) -> None:
+    """The last file, or the smallest one, whichever else is looked at."""
+    for broken in ("049.bmp", "023.bmp"):
+        folder = tmp_path / broken
+        folder.mkdir()
+        for number in range(50):
+            cv2.imwrite(str(folder / f"{number:03}.bmp"), texture(0))
+        assert check_folder(folder)[1].level == "ok"
+        file = folder / broken
+        file.write_bytes(file.read_bytes()[:-100])
+        (finding,) = odd(folder)
+        assert broken in finding.what and "cut off" in finding.what and "replace" in finding.mend
+
+
+def test_one_broken_file_is_said_once(tmp_path: Path) -> None:
+    folder = made(tmp_path / "case")
+    (folder / "left/000.bmp").write_bytes(b"")
+    shutil.copytree(SESSION / "calib", folder / "calib")
+    assert sum("000.bmp" in each.what for each in check_folder(folder)) == 1
+    assert f"rig:={folder / 'calib'}" in check_folder(folder)[-1].what
+
+
+def test_eyes_are_told_by_names(tmp_path: Path) -> None:
+    folder = made(tmp_path / "folders")
+    (folder / "left").rename(folder / "cam_left")
+    (folder / "right").rename(folder / "cam_right")
+    found = check_folder(folder)
+    assert "two folders" in found[0].what and f"source.right:={folder / 'cam_right'}" in found[-1].what
+    for left, right in (("{:03}l", "{:03}r"), ("left_{}", "right_{}"), ("a_L_{}", "a_R_{}")):
+        folder = tmp_path / left
+        folder.mkdir()
+        for number in range(FRAMES):
+            cv2.imwrite(str(folder / f"{left.format(number)}.png"), texture(number))
+            cv2.imwrite(str(folder / f"{right.format(number)}.png"), texture(number, -DISPARITY))
+        cv2.imwrite(str(folder / "mask_left.png"), texture(0))
+        found = check_folder(folder)
+        assert f"of both eyes, {FRAMES} pairs, in one folder" in found[0].what
+        assert any(f"disparity {DISPARITY}" in each.what for each in found), found
+
+
+def shown(left: U8, right: U8) -> dict[str, tuple[U8, str]]:
+    """Both eyes in one picture, and how that is played."""
+    rows = left.copy()
+    rows[1::2] = right[1::2]
+    dark = np.full_like(left, 20)
+    return {
+        "side by side": (np.hstack([left, right]), "layout:=side_by_side rig"),
+        "exchanged": (np.hstack([right, left]), "layout:=side_by_side source.geometry.first:=right"),
+        "above": (np.vstack([left, right]), "layout:=over_under rig"),
+        "rows": (rows, "layout:=row_interleaved rig"),
+        "panes": (
+            np.vstack([np.hstack([left, right]), np.hstack([dark, left])]),
+            f"left:=[0,0,{2 * WIDTH},{2 * HEIGHT}] source.right:=[{2 * WIDTH},0,{2 * WIDTH},{2 * HEIGHT}]",
+        ),
+        "one eye": (left, "layout:=side_by_side shows what is in it"),
+    }
+
+
+@pytest.mark.parametrize("name", shown(texture(0), texture(0)))
+def test_a_video_says_how_it_shows_both_eyes(name: str, tmp_path: Path) -> None:
+    pictures = []
+    for number in range(3):
+        eyes = (texture(number), texture(number, -DISPARITY))
+        left, right = (cv2.resize(eye, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC) for eye in eyes)
+        picture, play = shown(left.astype(np.uint8), right.astype(np.uint8))[name]
+        pictures.append(picture)
+    write_video(tmp_path / "case.avi", pictures)
+    found = check_folder(tmp_path)
+    assert play in found[-1].what, found
+    assert ("one eye" in found[1].what) == (name == "one eye")
+    assert ("exchanged" in str(found)) == (name == "exchanged")
+
+
+def test_two_videos_are_looked_at(tmp_path: Path) -> None:
+    for side, shift in (("right", -DISPARITY), ("left", 0)):
+        write_video(tmp_path / f"{side}.avi", [texture(number, shift) for number in range(3)])
+    found = check_folder(tmp_path)
+    assert any("disparity" in each.what for each in found)
+    eyes = f"source.left:={tmp_path / 'left.avi'} source.right:={tmp_path / 'right.avi'}"
+    assert eyes in found[-1].what
+    whole = (tmp_path / "left.avi").read_bytes()
+    (tmp_path / "left.avi").write_bytes(whole[: len(whole) // 2])
+    assert any(each.level == "error" and "left.avi" in each.what for each in check_folder(tmp_path))
+
+
 def test_noise_is_no_comb_and_fields_are() -> None:
     fine = np.random.default_rng(0).integers(
         0, 255, (HEIGHT, WIDTH), np.uint8
@@ -185,8 +280,16 @@ def test_folders_that_are_not_played_yet_are_named(tmp_path: Path) -> None:
     assert "StereoMIS" in check_folder(tmp_path / "P2")[0].what
     (tmp_path / "stir/01/left01/seq00/segmentation").mkdir(parents=True)
     assert "STIR" in check_folder(tmp_path / "stir")[0].what
+    (tmp_path / "d4d/specimen_1/s/clips/Clip_1/left_images_rect").mkdir(parents=True)
+    for name in ("d4d", "d4d/specimen_1", "d4d/specimen_1/s", "d4d/specimen_1/s/clips/Clip_1"):
+        assert "D4D" in check_folder(tmp_path / name)[0].what
+    (tmp_path / "P3").mkdir()
+    (tmp_path / "P3/track_pts.pckl").touch()
+    assert "StereoMIS-Tracking" in check_folder(tmp_path / "P3")[0].what
     assert "nothing that is known" in check_folder(tmp_path)[0].what
-    assert "P2, stir" in check_folder(tmp_path)[-1].what
+    assert "P2, P3, d4d, stir" in check_folder(tmp_path)[-1].what
+    (tmp_path / "empty").mkdir()
+    assert "an empty folder" in check_folder(tmp_path / "empty")[0].what
 
 
 def test_the_command(tmp_path: Path) -> None:
