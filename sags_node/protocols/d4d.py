@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from sags_node.config import LaunchConfig, RecordedSource
+from sags_node.errors import SagsError
 from sags_node.evaluation import metrics
 from sags_node.kernels.threads import configure_threads
 from sags_node.launch_file import load_launch
@@ -33,9 +34,18 @@ def measure_d4d(folder: Path, overrides: Sequence[str], progress: Progress) -> d
     one after it; of stereo (`measured`), the drawn model, and the data set's own stereo depth; where the left
     eye sees tissue (`visible`), and where it sees an instrument and the scan tissue (`occluded`). PSNR of the
     drawn model over tissue, beside that of the frame before. All figures are means over clips.
+
+    Raises:
+        SagsError: no scan lies where stereo sees the surface, or a file is wrong. A single scan that does not
+            is `refused`, and says why.
     """
     clips = {clip.name: _measure_clip(clip, overrides, progress) for clip in d4d_clips(folder)}
-    return {"clips": len(clips), **_mean(list(clips.values())), "of_each": clips}
+    scans = [found for clip in clips.values() for when in ("start", "end") if (found := clip.get(when))]
+    refused = [found["refused"] for found in scans if "refused" in found]
+    if len(refused) == len(scans):
+        raise SagsError(refused[0] if refused else f"{folder}: no frame that belongs to a scan was played")
+    counts = {"clips": len(clips), "scans": len(scans) - len(refused), "refused": len(refused)}
+    return {**counts, **_mean(list(clips.values())), "of_each": clips}
 
 
 def _measure_clip(clip: D4dClip, overrides: Sequence[str], progress: Progress) -> Figures:
@@ -93,7 +103,10 @@ class _Run:
     def _compared(self, scan: Scan, number: int, result: FrameResult, tools: Bool | None) -> Figures:
         seen = result.observation
         points, is_tissue = read_surface(scan)
-        agreeing = check_scan(scan, points, seen.camera, seen.depth)
+        try:
+            agreeing = check_scan(scan, points, seen.camera, seen.depth)
+        except SagsError as error:
+            return {"refused": str(error)}
         tissue = points if is_tissue is None else points[is_tissue]
         truth = scan_depth(tissue, scan.T_cloud_cam, seen.camera)
         said = {"measured": seen.depth, "model": result.views["left"].depth}

@@ -117,6 +117,21 @@ def test_d4d_end_to_end(d4d: Path) -> None:
     assert found["psnr"]["drawn"] > 20 and found["psnr"]["frame_before"] > 20
 
 
+def test_one_scan_that_is_elsewhere_stops_no_other(d4d: Path, tmp_path: Path) -> None:
+    clip = copied(d4d, tmp_path / "wrong")
+    np.savetxt(clip / "curated_camera_pose_start.txt", invert(scanner_pose()))
+    command = ["eval", "--protocol", "d4d", str(clip), "--iterations", "1", "--json", "-"]
+    result = CliRunner().invoke(main, command)
+    assert result.exit_code == 0, result.output
+    found = json.loads(result.stdout)
+    assert (found["scans"], found["refused"]) == (1, 1) and found["start"] == {}
+    (of_clip,) = found["of_each"].values()
+    assert "the other way round" in of_clip["start"]["refused"]
+    assert found["end"]["visible"]["measured"] == of_clip["end"]["visible"]["measured"]
+    result = CliRunner().invoke(main, [*command, "source.frames:=1"])
+    assert result.exit_code == 1 and "the other way round" in result.stderr
+
+
 def test_clips_of_d4d(d4d: Path) -> None:
     rig = load_rig(SESSION / "calib")
     session = d4d / "specimen_1/2025_03_06-16_49_40"
