@@ -188,8 +188,8 @@ def _rig(folder: Path, session: Path) -> StereoRig:
             f"{BASELINES[1] * 1e3:g}; P is in metres times pixels"
         )
     eyes = []
-    for P, shift in ((P_left, 0.0), (P_right, baseline)):
-        placed = np.column_stack([P[:, :3], [-P[0, 0] * shift, 0, 0]])
+    for P, shift in ((P_left, 0.0), (P_right, baseline)):  # both come to the left one's principal point
+        placed = np.column_stack([P_left[:, :3], [-P_left[0, 0] * shift, 0, 0]])
         eyes.append(Eye(width, height, P[:, :3], np.zeros(5), np.eye(3), placed))
     return StereoRig(folder.name, *eyes)
 

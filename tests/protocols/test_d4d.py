@@ -21,7 +21,7 @@ from sags_node.launch_file import load_launch
 from sags_node.protocols.d4d_files import d4d_clips, instruments_are_white
 from sags_node.protocols.d4d_scan import check_scan, read_surface, scan_depth
 from sags_node.sources.source import open_source
-from sags_node.types import F32, F64, Camera, Eye
+from sags_node.types import F32, F64, Camera, Eye, StereoFrame
 from sags_node.vision.rectify import Rectifier
 
 FRAMES = 9  # the first and the last of them have depth
@@ -140,6 +140,26 @@ def test_clips_of_d4d(d4d: Path) -> None:
         assert clip.rig.baseline == pytest.approx(rig.baseline) and clip.rate == pytest.approx(15, rel=1e-3)
         assert [scan.when for scan in clip.scans] == ["start", "end"] and len(clip.masks) == FRAMES
         assert not clip.is_moved
+
+
+def test_principal_points_that_differ_are_brought_together(d4d: Path, tmp_path: Path) -> None:
+    """What lies 2 px farther to the right in the right picture, because its principal point does, lies at the
+    same depth."""
+    folder = copied(d4d, tmp_path / "apart")
+    rig = d4d_clips(folder)[0].rig
+    P = rig.right.P.copy()
+    P[0, 2] += 2
+    moved = Eye(rig.right.width, rig.right.height, P[:, :3], np.zeros(5), np.eye(3), P)
+    (folder / "camera_info/right_rect.yaml").write_text(eye_text(moved, "right"))
+    picture = np.zeros((rig.right.height, rig.right.width, 3), np.uint8)
+    picture[:, 100] = 255
+    shifted = np.roll(picture, 2, axis=1)
+    pairs = [
+        Rectifier(each, rig.left.width, rig.left.height)(StereoFrame(0, 0, 0, picture, right))
+        for each, right in ((rig, picture), (d4d_clips(folder)[0].rig, shifted))
+    ]
+    assert pairs[0].right is not None and pairs[1].right is not None
+    np.testing.assert_array_equal(pairs[1].right[:, 10:-10], pairs[0].right[:, 10:-10])
 
 
 def copied(d4d: Path, folder: Path) -> Path:
