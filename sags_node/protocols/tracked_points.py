@@ -7,10 +7,9 @@ camera poses, masks, and where points are in each frame.
 
 from __future__ import annotations
 
-import pickle
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -34,18 +33,15 @@ from sags_node.types import F64, Bool, StereoFrame, StereoRig
 from sags_node.warm_up import warm_up
 from sags_node.yaml_reader import read_yaml
 
-TRACKS = "track_pts.pckl"
-LARGEST_PICKLE = 256 << 20  # bytes
+TRACKS = "track_pts.json"
+PUBLISHED = "track_pts.pckl"  # a pickle runs what it holds, so it is not opened here
+CONVERT = (
+    "import json, pickle; json.dump(pickle.load(open('track_pts.pckl', 'rb')), "
+    "open('track_pts.json', 'w'), default=lambda array: array.tolist())"
+)
+LARGEST_JSON = 256 << 20  # bytes
 RATE = 30.0  # Hz; the files do not say it
 ERODED = 7  # px: their margin around instruments
-_CORES = ("numpy.core", "numpy._core")  # before and from NumPy 2 on
-_HARMLESS = {  # all that a pickle of arrays, lists, numbers and texts needs
-    ("_codecs", "encode"),
-    ("numpy", "ndarray"),
-    ("numpy", "dtype"),
-    *((f"{core}.multiarray", name) for core in _CORES for name in ("_reconstruct", "scalar")),
-    *((f"{core}.numeric", "_frombuffer") for core in _CORES),
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +58,7 @@ class TrackedSequence:
 
 
 def is_tracked(folder: Path) -> bool:
-    return (folder / TRACKS).is_file()
+    return any((folder / name).is_file() for name in (TRACKS, PUBLISHED))
 
 
 def tracked_sequence(folder: Path) -> TrackedSequence:
@@ -124,26 +120,24 @@ def _configuration(folder: Path) -> tuple[StereoRig, slice]:
     )
 
 
-class _Unpickler(pickle.Unpickler):
-    """A pickle may name any function of the machine; here only those that make arrays."""
-
-    def find_class(self, module: str, name: str) -> Any:
-        if (module, name) not in _HARMLESS:
-            raise pickle.UnpicklingError(f"it asks for {module}.{name}, which a list of points does not need")
-        return super().find_class(module, name)
-
-
 def _tracks(file: Path) -> tuple[F64, Bool]:
     """Pixels [P, T, 2] and whether they are visible [P, T], of the points that are so in the first frame."""
+    if not file.is_file():
+        raise UsageError(
+            f"{file.with_name(PUBLISHED)} is a pickle, which may run any code, so it is not opened here. If you "
+            f'trust it, write {TRACKS} beside it: cd {file.parent}; python3 -c "{CONVERT}"'
+        )
     try:
-        said = _Unpickler(BytesIO(read_file(file, LARGEST_PICKLE))).load()
+        said = json.loads(read_file(file, LARGEST_JSON))
         rows = [[(-1.0, -1.0) if at is None else at for at in track] for track in said["points"]]
         pixels = np.array(rows, np.float64)
-        visible: Bool = ~np.array([list(track) for track in said["not_visible"]], np.bool_)
+        visible: Bool = ~np.array(said["not_visible"], np.bool_)
         if pixels.ndim != 3 or pixels.shape != (*visible.shape, 2) or not pixels.size:
             raise ValueError(f"points {list(pixels.shape)}, not_visible {list(visible.shape)}")
-    except Exception as error:  # a damaged pickle raises anything
-        raise UsageError(f"{file} holds no tracked points ({str(error)[:200]}); download it again") from None
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
+        raise UsageError(
+            f"{file} holds no tracked points ({str(error)[:200]}); write it again from {PUBLISHED}"
+        ) from None
     visible &= pixels.sum(2) > 0
     return pixels[visible[:, 0]], visible[visible[:, 0]]
 

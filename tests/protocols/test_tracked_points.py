@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-import os
+import json
 import pickle
 import shutil
+import subprocess
+import sys
 from itertools import pairwise
 from pathlib import Path
 
@@ -21,7 +23,7 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.geometry import project
 from sags_node.launch_file import load_launch
 from sags_node.protocols.point_tracker import PointTracker, to_raw
-from sags_node.protocols.tracked_points import tracked_sequence
+from sags_node.protocols.tracked_points import CONVERT, tracked_sequence
 from sags_node.sources.source import open_source
 from sags_node.types import F64, Bool, StereoFrame, StereoRig
 from sags_node.vision.rectify import Rectifier
@@ -134,7 +136,9 @@ def tracked(frames: list[StereoFrame], rig: StereoRig, tmp_path_factory: pytest.
     ]
     points.append([None] * FRAMES)  # never seen
     hidden = [(~each).tolist() for each in seen] + [[True] * FRAMES]
-    (folder / "track_pts.pckl").write_bytes(pickle.dumps({"points": points, "not_visible": hidden}))
+    published = {"points": points, "not_visible": hidden}
+    (folder / "track_pts.pckl").write_bytes(pickle.dumps(published))
+    subprocess.run([sys.executable, "-c", CONVERT], cwd=folder, check=True, timeout=60)
     return folder
 
 
@@ -154,27 +158,27 @@ def test_stereomis_tracking_end_to_end(tracked: Path, frames: list[StereoFrame],
     assert found["tracked"]["mte_px"] < found["unmoved"]["mte_px"]
 
 
-class Harm:
-    def __reduce__(self) -> tuple[object, tuple[str]]:
-        return os.mkdir, ("harmed",)
-
-
-def test_a_list_of_points_runs_no_code(
-    tracked: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_pickle_is_not_opened(tracked: Path, tmp_path: Path) -> None:
     folder = tmp_path / "P3_1"
     shutil.copytree(tracked, folder)
-    monkeypatch.chdir(tmp_path)
-    for content in (
-        pickle.dumps({"points": Harm(), "not_visible": []}),
-        b"",
-        b"\x80\x05}",
-        pickle.dumps([1]),
-    ):
-        (folder / "track_pts.pckl").write_bytes(content)
-        with pytest.raises(UsageError, match="holds no tracked points"):
-            tracked_sequence(folder)
-    assert not (tmp_path / "harmed").exists()
+    (folder / "track_pts.json").unlink()
+    (folder / "track_pts.pckl").write_bytes(b"cos\n_exit\n(I7\ntR.")  # ends the process that opens it
+    with pytest.raises(UsageError, match=r"is a pickle.*import json, pickle"):
+        tracked_sequence(folder)
+
+
+@pytest.mark.parametrize(
+    "content",
+    ["", "{", "[1]", '{"points": 3, "not_visible": []}', '{"points": [], "not_visible": []}', "[" * 100_000,
+     json.dumps({"points": [[[1, 2], [1]]], "not_visible": [[False, False]]}),
+     json.dumps({"points": [[[1, 2], None]], "not_visible": [[False]]})],
+)  # fmt: skip
+def test_damaged_points_are_said(tracked: Path, tmp_path: Path, content: str) -> None:
+    folder = tmp_path / "P3_1"
+    shutil.copytree(tracked, folder)
+    (folder / "track_pts.json").write_text(content)
+    with pytest.raises(UsageError, match=r"track_pts\.json holds no tracked points"):
+        tracked_sequence(folder)
 
 
 def test_what_is_missing_is_said(tracked: Path, tmp_path: Path) -> None:
