@@ -1,8 +1,7 @@
-"""What the tissue looked like when it was seen first: places at rest are held to it, or they would creep.
+"""What the tissue looked like when it was seen first: that says where the camera is, however long ago.
 
-From frame to frame places follow the flow, whose errors add up. So some pictures are kept, with the places
-at rest of what has texture in them. Where that is found again says where the camera is, however long ago the
-picture was taken.
+Places at rest of the model follow the flow, whose errors add up. So some pictures are kept, with the places
+at rest of what has texture in them.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from sags_node.geometry import disparity_to_depth, project, unproject
+from sags_node.geometry import disparity_to_depth, invert, project, transform, unproject
 from sags_node.mapping.camera_pose import fit_pose
 from sags_node.mapping.keyframes import distance
 from sags_node.mapping.mapper import Mapper
@@ -27,6 +26,7 @@ WINDOW = (21, 21)  # px
 ASIDE = 0.02  # of the width, from where it is expected: a corner found farther is another one
 LEAST_CORNERS = 40
 LEAST_INLIERS = 0.5  # of those found
+LARGEST_SCALE = 6 / 640  # of the width: of the residuals; measured: up to 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,25 +47,32 @@ class FirstViews:
     def clear(self) -> None:
         self._kept.clear()
 
-    def look(self, observation: Observation, at_rest: F64) -> F64 | None:
-        """Where the camera is by the nearest picture, [4, 4]; None: that cannot be told. Where there is none
-        near, this one is kept.
+    def pose(self, observation: Observation, about: F64) -> F64 | None:
+        """Where the camera is by the nearest picture, [4, 4]; None: that cannot be told.
 
         Args:
-            observation: a frame whose pose is known, taken in.
+            observation: a frame that was taken in; its camera says where the tissue is now.
+            about: `T_world_cam` [4, 4] against the tissue at rest, about.
+        """
+        camera = replace(observation.camera, T_world_cam=about)
+        view = min(self._kept, key=lambda view: distance(view.camera, camera), default=None)
+        return None if view is None else self._fitted(view, observation, camera)
+
+    def offer(self, observation: Observation, at_rest: F64) -> None:
+        """Keep the picture of a frame that was taken in, where there is none near.
+
+        Args:
+            observation: its camera says where the tissue is now.
             at_rest: `T_world_cam` [4, 4] against the tissue at rest.
         """
         camera = replace(observation.camera, T_world_cam=at_rest)
-        distances = [distance(view.camera, camera) for view in self._kept]
-        nearest = int(np.argmin(distances)) if distances else -1
-        if distances and distances[nearest] < FAR:
-            return self._pose(self._kept[nearest], observation, camera)
+        if any(distance(view.camera, camera) < FAR for view in self._kept):
+            return
         view = self._seen(observation, camera)
         if len(view.pixels) >= LEAST_CORNERS:
             if len(self._kept) == MOST:
                 del self._kept[1]  # the first one shows how it all began
             self._kept.append(view)
-        return None
 
     def _seen(self, observation: Observation, camera: Camera) -> _View:
         where = (observation.tissue & (observation.depth > 0)).view(np.uint8)
@@ -73,9 +80,13 @@ class FirstViews:
         corners = cv2.goodFeaturesToTrack(observation.gray, CORNERS, CORNER_QUALITY, apart, mask=where)
         pixels = np.zeros((0, 2), np.float32) if corners is None else np.asarray(corners[:, 0], np.float32)
         points = np.asarray(unproject(observation.camera, pixels, _at(observation.depth, pixels)), np.float32)
-        return _View(camera, observation.gray, pixels, points - self._mapper.away_at(points))
+        rest = points - self._mapper.away_at(points)
+        # Where the model's tissue rests is not sure to a millimetre: the picture shall say what is known.
+        fit = fit_pose(rest, pixels, _disparities(observation, pixels), camera, observation.baseline)
+        right = camera.T_world_cam @ invert(fit.T_world_cam)
+        return _View(camera, observation.gray, pixels, transform(right, rest))
 
-    def _pose(self, view: _View, observation: Observation, camera: Camera) -> F64 | None:
+    def _fitted(self, view: _View, observation: Observation, camera: Camera) -> F64 | None:
         now = view.rest + self._mapper.away_at(view.rest)
         expected = np.asarray(project(observation.camera, now)[0], np.float32)
         height, width = observation.gray.shape
@@ -93,12 +104,16 @@ class FirstViews:
         if np.count_nonzero(found) < LEAST_CORNERS:
             return None
         pixels, rest = pixels[found], rest[found]
-        depths = _at(observation.depth, pixels)
-        disparities = disparity_to_depth(
-            depths, float(camera.K[0, 0]), observation.baseline
-        )  # its own inverse
-        fit = fit_pose(rest, pixels, disparities, camera, observation.baseline)
-        return fit.T_world_cam if fit.inliers >= LEAST_INLIERS * len(pixels) else None
+        fit = fit_pose(rest, pixels, _disparities(observation, pixels), camera, observation.baseline)
+        if fit.inliers < LEAST_INLIERS * len(pixels) or fit.scale > LARGEST_SCALE * width:
+            return None
+        return fit.T_world_cam
+
+
+def _disparities(observation: Observation, pixels: F32) -> F32:
+    """px [K], 0: not measured."""
+    depths = _at(observation.depth, pixels)  # the formula is its own inverse
+    return disparity_to_depth(depths, float(observation.camera.K[0, 0]), observation.baseline)
 
 
 def _at(picture: np.ndarray, pixels: F32) -> np.ndarray:

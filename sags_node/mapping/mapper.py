@@ -252,12 +252,10 @@ class Mapper:
         index, weight, _ = nearest_nodes(points, self._deformation.nodes)
         return self._deformation.away(index, weight)
 
-    def settle(self, share: float, T: F64) -> None:
-        """Let where the tissue rests follow where it is now, by a share of the way, and then move rigidly by
-        T [4, 4]."""
+    def settle(self, share: float) -> None:
+        """Let where the tissue rests follow where it is now, by a share of the way."""
         if self._deformation is not None:
             self._deformation.settle(share)
-            self._deformation.shift_rest(T)
 
     def doubt(self, error: float) -> None:
         """The depth of all Gaussians may be wrong by so much more, m, until it is measured again."""

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from sags_node.geometry import disparity_to_depth, invert, project
-from sags_node.mapping.camera_pose import fit_pose, towards
+from sags_node.mapping.camera_pose import fit_pose
 from sags_node.mapping.first_views import FirstViews
 from sags_node.mapping.mapper import Mapper
 from sags_node.types import F32, F64, I64, U8, Bool, Observation
@@ -21,7 +21,6 @@ LEAST_POINTS = 40
 REST_SECONDS = 60.0  # over which a place at rest follows the tissue: ten breaths and more
 CALM = 3.0  # of the usual way from its place at rest: tissue that is farther from it moves by itself
 LOOK_NS = 200_000_000  # between two looks at how the tissue was seen first
-LOOK_SECONDS = 1.0  # over which places at rest are brought back to that
 LEAST_INLIERS = 0.35  # of the points
 LEAST_AGREEMENT = 0.5  # correlation of the picture with the colours of the Gaussians found in it
 LARGEST_SCALE = 4 / 640  # of the width: of the residuals
@@ -45,6 +44,7 @@ class RestingTissue:
         self._seconds = 0.0  # that the model has been learnt for
         self._first_views = FirstViews(mapper)
         self._at_rest: F64 | None = None  # pose of the last frame against the tissue at rest
+        self._correction: F64 | None = None  # [4, 4] of a pose, from the left; None: first pictures tell none
         self._looked_ns = 0
 
     def fit(self, observation: Observation, start: F64) -> TissueFit | str:
@@ -80,6 +80,9 @@ class RestingTissue:
         near = fit_pose(points, pixels, disparities, start_camera, observation.baseline)
         if near.inliers < LEAST_INLIERS * len(rows) or near.scale > LARGEST_SCALE * camera.width:
             return "the tissue moved in no common way"
+        if self._correction is not None:
+            self._at_rest = self._correction @ near.T_world_cam
+            return TissueFit(near.T_world_cam, self._at_rest)
         near_camera = replace(camera, T_world_cam=near.T_world_cam)
         at_rest = fit_pose(points - away, pixels, disparities, near_camera, observation.baseline)
         is_there = at_rest.inliers >= LEAST_INLIERS * len(rows)
@@ -92,25 +95,27 @@ class RestingTissue:
             self._restarts = self._mapper.restarts
             self._seconds = 0.0
             self._first_views.clear()
-            self._at_rest = None
+            self._at_rest = self._correction = None
         before, self._stamp_ns = self._stamp_ns, observation.t_capture_ns
         passed = 0.0 if before is None else max(0.0, (self._stamp_ns - before) * 1e-9)
         # A model that is younger than a breath rests where it was on average until now.
         self._seconds = min(self._seconds + passed, REST_SECONDS)
         share = passed / max(self._seconds, passed, 1e-9)
-        self._mapper.settle(share, self._crept(observation))
+        self._mapper.settle(share)
+        self._look(observation)
 
-    def _crept(self, observation: Observation) -> F64:
-        """The motion [4, 4] of the world that brings places at rest back to where they were seen first."""
-        now = observation.t_capture_ns
-        at_rest = observation.camera.T_world_cam if self._at_rest is None else self._at_rest
-        if 0 <= now - self._looked_ns < LOOK_NS:
-            return np.eye(4)
-        self._looked_ns = now
-        found = self._first_views.look(observation, at_rest)
-        if found is None:
-            return np.eye(4)
-        return towards(at_rest, found, LOOK_NS * 1e-9 / LOOK_SECONDS) @ invert(at_rest)
+    def _look(self, observation: Observation) -> None:
+        """Let the first pictures say how far the pose of a frame is off."""
+        now, pose = observation.t_capture_ns, observation.camera.T_world_cam
+        at_rest = pose if self._at_rest is None else self._at_rest
+        told = self._correction is not None
+        if not 0 <= now - self._looked_ns < LOOK_NS:
+            self._looked_ns = now
+            found = self._first_views.pose(observation, at_rest)
+            told = found is not None
+            at_rest = at_rest if found is None else found
+            self._first_views.offer(observation, at_rest)
+        self._correction = at_rest @ invert(pose) if told else None
 
 
 def _is_inside(pixels: F32, picture: U8) -> Bool:

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numba import prange
 
-from sags_node.geometry import transform
 from sags_node.kernels.jit import PIECE, inlined, kernel, parallel_kernel
 from sags_node.model.gaussians import NEIGHBOURS, GaussianModel
 from sags_node.types import F32, F64, I32, I64
@@ -121,10 +120,6 @@ class NodeDeformation:
     def settle(self, share: float) -> None:
         """Let where the tissue rests follow where it is now, by a share of the way."""
         self._rest += np.float32(share) * (self.nodes - self._rest)
-
-    def shift_rest(self, T: F64) -> None:
-        """Let all tissue rest elsewhere, by a rigid motion [4, 4] of the world."""
-        self._rest = transform(T, self._rest).astype(np.float32)
 
     def away(self, index: I32, weight: F32) -> F32:
         """How far [N, 3] m from where it rests tissue is now, by its nodes [N, 4] and their weights."""
