@@ -43,13 +43,14 @@ class RestingTissue:
         self._stamp_ns: int | None = None  # of the last frame that was mapped
         self._seconds = 0.0  # that the model has been learnt for
         self._first_views = FirstViews(mapper)
-        self._at_rest: F64 | None = None  # pose of the last frame against the tissue at rest
+        self._at_rest: F64 | None = None  # pose of the last frame against the tissue at rest; None: not known
         self._correction: F64 | None = None  # [4, 4] of a pose, from the left; None: first pictures tell none
         self._looked_ns = 0
 
     def fit(self, observation: Observation, start: F64) -> TissueFit | str:
         """The pose of a frame, or why there is none; `start` [4, 4] is about where it was taken from."""
         model, camera, last = self._mapper.model, observation.camera, self._mapper.last
+        self._at_rest = None
         pixels = self._mapper.found_again(observation)
         rows = np.flatnonzero(_is_inside(pixels, observation.gray))
         rows = rows[:: max(1, len(rows) // CANDIDATES)]
@@ -107,7 +108,9 @@ class RestingTissue:
     def _look(self, observation: Observation) -> None:
         """Let the first pictures say how far the pose of a frame is off."""
         now, pose = observation.t_capture_ns, observation.camera.T_world_cam
-        at_rest = pose if self._at_rest is None else self._at_rest
+        at_rest = self._at_rest
+        if at_rest is None:
+            at_rest = pose if self._correction is None else self._correction @ pose
         told = self._correction is not None
         if not 0 <= now - self._looked_ns < LOOK_NS:
             self._looked_ns = now
