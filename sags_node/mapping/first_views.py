@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from sags_node.geometry import disparity_to_depth, invert, project, transform, unproject
+from sags_node.geometry import disparity_to_depth, project, unproject
 from sags_node.mapping.camera_pose import fit_pose
 from sags_node.mapping.keyframes import distance
 from sags_node.mapping.mapper import Mapper
@@ -80,11 +80,7 @@ class FirstViews:
         corners = cv2.goodFeaturesToTrack(observation.gray, CORNERS, CORNER_QUALITY, apart, mask=where)
         pixels = np.zeros((0, 2), np.float32) if corners is None else np.asarray(corners[:, 0], np.float32)
         points = np.asarray(unproject(observation.camera, pixels, _at(observation.depth, pixels)), np.float32)
-        rest = points - self._mapper.away_at(points)
-        # Where the model's tissue rests is not sure to a millimetre: the picture shall say what is known.
-        fit = fit_pose(rest, pixels, _disparities(observation, pixels), camera, observation.baseline)
-        right = camera.T_world_cam @ invert(fit.T_world_cam)
-        return _View(camera, observation.gray, pixels, transform(right, rest))
+        return _View(camera, observation.gray, pixels, points - self._mapper.away_at(points))
 
     def _fitted(self, view: _View, observation: Observation, camera: Camera) -> F64 | None:
         now = view.rest + self._mapper.away_at(view.rest)
@@ -104,16 +100,14 @@ class FirstViews:
         if np.count_nonzero(found) < LEAST_CORNERS:
             return None
         pixels, rest = pixels[found], rest[found]
-        fit = fit_pose(rest, pixels, _disparities(observation, pixels), camera, observation.baseline)
+        depths = _at(observation.depth, pixels)
+        disparities = disparity_to_depth(
+            depths, float(camera.K[0, 0]), observation.baseline
+        )  # its own inverse
+        fit = fit_pose(rest, pixels, disparities, camera, observation.baseline)
         if fit.inliers < LEAST_INLIERS * len(pixels) or fit.scale > LARGEST_SCALE * width:
             return None
         return fit.T_world_cam
-
-
-def _disparities(observation: Observation, pixels: F32) -> F32:
-    """px [K], 0: not measured."""
-    depths = _at(observation.depth, pixels)  # the formula is its own inverse
-    return disparity_to_depth(depths, float(observation.camera.K[0, 0]), observation.baseline)
 
 
 def _at(picture: np.ndarray, pixels: F32) -> np.ndarray:
