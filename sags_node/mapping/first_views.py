@@ -19,6 +19,7 @@ from sags_node.types import F32, F64, U8, Camera, Observation
 
 MOST = 16  # pictures
 FAR = 0.01  # m, as `keyframes.distance` counts: from there another picture is kept
+REACH = 0.025  # m, the same: from farther away too little of a picture is found again
 CORNERS = 300
 CORNER_QUALITY = 0.005
 CORNER_DISTANCE = 8 / 640  # of the width
@@ -48,15 +49,17 @@ class FirstViews:
         self._kept.clear()
 
     def pose(self, observation: Observation, about: F64) -> F64 | None:
-        """Where the camera is by the nearest picture, [4, 4]; None: that cannot be told.
+        """Where the camera is by the oldest picture that tells, [4, 4]; None: none does. Later ones hold what
+        the older ones left over.
 
         Args:
             observation: a frame that was taken in; its camera says where the tissue is now.
             about: `T_world_cam` [4, 4] against the tissue at rest, about.
         """
         camera = replace(observation.camera, T_world_cam=about)
-        view = min(self._kept, key=lambda view: distance(view.camera, camera), default=None)
-        return None if view is None else self._fitted(view, observation, camera)
+        near = (view for view in self._kept if distance(view.camera, camera) < REACH)
+        poses = (self._fitted(view, observation, camera) for view in near)
+        return next((pose for pose in poses if pose is not None), None)
 
     def offer(self, observation: Observation, at_rest: F64) -> None:
         """Keep the picture of a frame that was taken in, where there is none near.
