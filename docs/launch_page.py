@@ -167,7 +167,7 @@ def _type(annotation: Any) -> str:
     if origin in (Union, UnionType):
         return " or ".join(dict.fromkeys(_type(one) for one in inner if one is not type(None)))
     if origin is Literal:
-        *others, last = (f"`{one}`" for one in inner)
+        *others, last = (f"`{_yaml(one)}`" for one in inner)
         return f"{', '.join(others)} or {last}" if others else last
     if origin is tuple and annotation != Box:
         one = _type(inner[0])

@@ -658,7 +658,12 @@ class PublishConfig(Guarded):
         description="of the ipc socket and the connection file; default: `$XDG_RUNTIME_DIR/sags`, else "
         "`/tmp/sags-UID`",
     )
-    right: bool = Field(False, description="also publish the right eye's input and render")
+    right: Literal["auto", True, False] = Field(
+        "auto",
+        description="the right eye's input and render. auto: where there is a right eye; it is drawn while "
+        "somebody subscribes. true: it is drawn in every frame, which `sags eval` measures. false: nothing "
+        "of it is published",
+    )
 
 
 DeviceName = Literal["auto", "cpu", "cuda"]

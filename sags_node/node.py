@@ -119,6 +119,8 @@ class Node:
     # ---- life ----------------------------------------------------------------------------------------
 
     def start(self) -> None:
+        self._publisher.poll(timeout_ms=0)  # who is there already gets all of the first frame
+        self._note_who_looks()
         for thread in self._threads:
             thread.start()
         self._manager.ready()
@@ -284,6 +286,7 @@ class Node:
             self._manager.turned("publishing")
             if self._publisher.poll(timeout_ms=100, wake_fd=self._wake):
                 os.eventfd_read(self._wake)
+            self._note_who_looks()
             if self._state.parameters_changed.is_set():
                 self._state.parameters_changed.clear()
                 self._publisher.publish_parameters(self._state.config.model_dump(mode="json"))
@@ -324,8 +327,13 @@ class Node:
                 self._publisher.forget_view(name)
             else:
                 self._publisher.publish_view(name, drawn)
-        names = self._state.views.status
-        self._watched = frozenset(name for name in names if self._publisher.watches_view(name))
+
+    def _note_who_looks(self) -> None:
+        views = self._state.views
+        self._watched = frozenset(name for name in views.status if self._publisher.watches_view(name))
+        if self._state.config.publish.right == "auto":
+            pictures = ["right/render/image", *(f"view/{name}/right/image" for name in views.pairs)]
+            self._state.pipeline.draws_right = any(map(self._publisher.looked_at, pictures))
 
     def _send_thin(self) -> None:
         made = self._thin.get(timeout=0)

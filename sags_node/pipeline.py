@@ -54,6 +54,10 @@ class Pipeline:
     Args:
         masks: of another process, for `vision.tissue.method` topic.
         on_rectified: called with each pair and its epoch, before anything else is done with it.
+
+    Attributes:
+        draws_right: somebody looks at the right eye. It is drawn then, where there is one. Any thread may
+            change this.
     """
 
     def __init__(
@@ -78,6 +82,7 @@ class Pipeline:
             unhurried=config.mapping.budget_ms >= UNHURRIED_MS,
             field=config.mapping.field is True,
         )
+        self.draws_right = config.publish.right is True
         self._right = RightView()
         self._tracker: CameraTracker | PoseRefiner | None = None
         if vision.pose == "estimate":
@@ -165,7 +170,8 @@ class Pipeline:
             return self._held(frame, pair, watch, "pose", self._unposed.text, unseen(pair))
         if self._reset_due:
             self._forget()
-        if self._equals_the_last(pair):
+        draws_right = self.draws_right and pair.right is not None
+        if self._equals_the_last(pair, draws_right):
             return self._repeated(frame, pair, watch)
         with watch("watch"):
             scene = self._compared(pair, eyes)
@@ -194,10 +200,10 @@ class Pipeline:
                 return self._held(frame, pair, watch, "pose", self._tracker.lost, observation)
         learn = scene.learn and eyes.learn
         with watch("map"):
-            mapped = self._map(observation, budget, still, learn)
+            mapped = self._map(observation, budget, still, learn, draws_right)
         with watch("render"):
             views = {"left": mapped.view}
-            if self._config.publish.right:
+            if draws_right:
                 sure = seen_by_both if learn and not eyes.right else np.zeros_like(tissue)
                 views["right"] = self._right_eye(mapped, observation, seen, learn, sure)
         with watch("anchors"):
@@ -219,8 +225,10 @@ class Pipeline:
         pose = None if self._tracker is None else self._tracker.guess(frame.T_world_cam)
         return self.rectifier(replace(frame, T_world_cam=pose))
 
-    def _equals_the_last(self, pair: RectifiedPair) -> bool:
+    def _equals_the_last(self, pair: RectifiedPair, draws_right: bool) -> bool:
         if self._mapped is None or not self._config.mapping.skip_duplicates:
+            return False
+        if draws_right and "right" not in self._mapped.views:  # for somebody who has just come
             return False
         return rms_difference(pair, self._mapped.pair) < DUPLICATE_RMS
 
@@ -302,11 +310,16 @@ class Pipeline:
         needs_matching = self.depth.takes_time(frame) and self.mapper.model.count > 0  # the first needs depth
         return needs_matching and self._config.mapping.skip_depth and not budget.affords_depth()
 
-    def _map(self, observation: Observation, budget: Budget, still: int, learn: bool) -> Mapped:
+    def _map(
+        self, observation: Observation, budget: Budget, still: int, learn: bool, draws_right: bool
+    ) -> Mapped:
         if self._unwatched:
             self.mapper.doubt(self._unwatched)
             self._unwatched = 0.0
-        mapped = self.mapper.update(observation, budget, still, learn)
+        if draws_right and self._mapped is not None and "right" not in self._mapped.views:
+            self._right = RightView()  # what was learnt when somebody looked last is long out of date
+            self.mapper.model.right_colors[:] = 0
+        mapped = self.mapper.update(observation, budget, still, learn, draws_right)
         if self._tracker is not None:
             self._tracker.mapped(observation, mapped.view)
         return mapped
@@ -323,7 +336,7 @@ class Pipeline:
         if before is not None and "right" in before.views and before.views["left"].rgb is mapped.view.rgb:
             return replace(before.views["right"], frame_id=mapped.view.frame_id, t_capture_ns=stamp)
         drawn = self._right.draw(mapped, observation, seen.left, self._refiner.show, learn)
-        assert seen.right is not None  # publish.right is refused where there is no right eye
+        assert seen.right is not None  # else nothing is drawn for it
         self._right.learn(drawn, self.mapper.model, seen.right, sure, observation.baseline)
         return drawn.view
 

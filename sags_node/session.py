@@ -46,10 +46,12 @@ def open_session(
     """
     config = load_launch(launch, overrides)
     one_eyed = isinstance(config.source, EndoNerfSource) and config.source.baseline is None
-    if config.publish.right and (config.one_camera or one_eyed):
-        raise UsageError(
-            "publish.right: there is no right eye; set source.baseline, or leave publish.right out"
-        )
+    if config.one_camera or one_eyed:
+        if config.publish.right is True:
+            raise UsageError(
+                "publish.right: there is no right eye; set source.baseline, or leave publish.right out"
+            )
+        config = config.model_copy(update={"publish": config.publish.model_copy(update={"right": False})})
     if isinstance(config.source, PhantomSource):
         from sags_node.phantom import cached_session
 

@@ -254,7 +254,7 @@ def _silence(topic: str, endpoint: str | None, ns: str, seconds: float, keys: Cl
     full = topics.full_name(ns, topic.lstrip("/").removeprefix(f"{ns}/"))
     hint = "is the node running and not waiting?"
     if "/right/" in full:
-        hint += " The right eye needs publish.right:=true"
+        hint += f" ({topics.NO_RIGHT_EYE})"
     where = find_data(endpoint, ns, keys=keys).endpoint
     return SagsError(f"no messages on {full} from {where} in {seconds:g} s; {hint}")
 

@@ -232,6 +232,7 @@ class Snapshot:
     loss: float  # mean absolute colour residual over tissue, last step
     counts: Mapping[str, int] = field(default_factory=dict)  # inserted, removed, iterations, ...
     forecast: Forecast | None = None  # None: nobody asks for it, or too little is known yet
+    right_colors: F32 | None = None  # [N, 3] what the right eye sees more; None: nobody looks there
 
 
 @dataclass(frozen=True, slots=True)
@@ -306,7 +307,7 @@ class FrameResult:
     pair: RectifiedPair
     observation: Observation
     snapshot: Snapshot
-    views: Mapping[str, RenderedView]  # "left", and "right" when it is asked for
+    views: Mapping[str, RenderedView]  # "left", and "right" while somebody looks there
     epoch: int
     timings_ms: Mapping[str, float]  # stage -> ms
     skipped: Mapping[str, str] = field(default_factory=dict)  # what was left out, and why

@@ -2,7 +2,7 @@
 
 Mapping goes first. All views together get `SHARE` of one core, and `LEAST_SHARE` while the mapping misses
 frames; it is split so that each keeps the same part of the rate it asked for. A view that nobody subscribes
-to is not drawn. Used from one thread; only `status` may be read by others.
+to is not drawn. Used from one thread; only `status` and `pairs` may be read by others.
 """
 
 from __future__ import annotations
@@ -11,7 +11,9 @@ import os
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+
+import numpy as np
 
 from sags_node.engine.interface import Rasterizer
 from sags_node.engine.rasterizer.confidence import with_confidence
@@ -19,9 +21,10 @@ from sags_node.engine.rasterizer.rasterize import make_rasterizer, to_view
 from sags_node.errors import SagsError
 from sags_node.geometry import scale_intrinsics
 from sags_node.kernels.threads import configure_threads
+from sags_node.mapping.right_view import for_right_eye
 from sags_node.messaging.requests import ViewRequest
 from sags_node.model.forecast import gaussians_ahead, reached
-from sags_node.types import Camera, DrawnView, FrameResult, ViewStatus
+from sags_node.types import Camera, DrawnView, FrameResult, RenderedView, ViewStatus
 
 MAX_VIEWS = 8
 SHARE = 0.25  # of one core, for all views together
@@ -59,6 +62,7 @@ class Views:
 
     Attributes:
         status: how each is served; replaced as a whole whenever it changes.
+        pairs: those of both eyes that are drawn again and again; replaced as `status` is.
     """
 
     def __init__(
@@ -70,6 +74,7 @@ class Views:
     ) -> None:
         """`latency`: s from capture to published, as it was lately."""
         self.status: Mapping[str, ViewStatus] = {}
+        self.pairs: Collection[str] = ()
         self._backend = backend
         self._clock = clock
         self._processor_clock = processor_clock
@@ -152,13 +157,14 @@ class Views:
         wanted = self._latency() + view.cost if request.ahead_ms == "auto" else 1e-3 * request.ahead_ms
         ahead = reached(snapshot, wanted)
         gaussians = gaussians_ahead(snapshot, ahead) if ahead > 0 else snapshot.gaussians
-        planes = self._rasterizers[size].forward(gaussians, list(eyes.values()))
-        pictures = {
-            eye: with_confidence(
-                to_view(planes[i], eyes[eye], snapshot.frame_id, snapshot.t_capture_ns), gaussians
-            )
-            for i, eye in enumerate(eyes)
-        }
+        pictures = {}
+        for eye, camera in eyes.items():
+            shown = _published(scene, camera) if eye == "right" and ahead == 0 else None
+            if shown is None:
+                seen = for_right_eye(gaussians, snapshot) if eye == "right" else gaussians
+                planes = self._rasterizers[size].forward(seen, [camera])[0]
+                shown = to_view(planes, camera, snapshot.frame_id, snapshot.t_capture_ns)
+            pictures[eye] = with_confidence(shown, gaussians)
         spent = self._processor_clock() - started
         view.cost = spent if view.cost == 0 else view.cost + LEARNING * (spent - view.cost)
         view.failure = ""
@@ -183,6 +189,7 @@ class Views:
 
     def _note(self) -> None:
         self.status = {name: self._status(name, view) for name, view in self._views.items()}
+        self.pairs = [n for n, view in self._views.items() if view.request.stereo and not view.finished]
 
     def _status(self, name: str, view: _View) -> ViewStatus:
         now = self._clock()
@@ -205,6 +212,19 @@ class Views:
             (short, f"all views together get {SHARE:g} of a core"),
         )
         return next((why for applies, why in reasons if applies), "")
+
+
+def _published(scene: FrameResult, camera: Camera) -> RenderedView | None:
+    """The right eye as the node shows it, where that is this camera's; its depth may be written."""
+    shown = scene.views.get("right")
+    if shown is None or (shown.camera.width, shown.camera.height) != (camera.width, camera.height):
+        return None
+    if not (
+        np.array_equal(shown.camera.K, camera.K)
+        and np.array_equal(shown.camera.T_world_cam, camera.T_world_cam)
+    ):
+        return None
+    return replace(shown, depth=shown.depth.copy())
 
 
 def view_camera(request: ViewRequest, left: Camera) -> Camera:

@@ -143,6 +143,7 @@ class Measurer:
         self._rasterizer = make_rasterizer(backend, camera.width, camera.height)
         self._lpips = Lpips(options.lpips_weights) if options.lpips_weights else None
         self._usable_right: Bool | None = None
+        self._right_before: U8 | None = None  # of the frame processed before
         self._flicker = Flicker()
         self._tracks: PointTracks | None = None
         self._pose = pose
@@ -180,6 +181,7 @@ class Measurer:
             figures[group] = self._predict(before, shown, truth, seconds)
         if costly and pair.right is not None:
             figures |= self._right_eye(shown, pair.left, pair.right, frame)
+        self._right_before = pair.right
         flicker = self._flicker(pair.left, shown)
         if flicker is not None:
             figures["flicker"] = flicker
@@ -272,8 +274,8 @@ class Measurer:
         self, shown: SpooledFrame, left: U8, picture: U8, frame: StereoFrame
     ) -> dict[str, Figures]:
         """PSNR of the right eye's picture, each after a fit of gain and offset. `novel`: of the model alone;
-        the mapper never saw it, unless `mapping.right_eye` is set. `right`: of what was shown, and of the
-        left picture warped by the stereo stage's depth, where that is known."""
+        the mapper never saw it, unless `mapping.right_eye` is set. `right`: of what was shown, of the left
+        picture warped by the stereo stage's depth, where that is known, and of the right picture before."""
         if self._usable_right is None:
             self._usable_right = self._right_pixels(frame)
         camera, focal_px = shown.snapshot.camera, float(shown.snapshot.camera.K[0, 0])
@@ -300,6 +302,8 @@ class Measurer:
                 "model_psnr": quality(model, both),
                 "coverage": float(both.sum() / mask.sum()),
             }
+            if self._right_before is not None:
+                figures["right"]["copy_psnr"] = quality(metrics.as_float(self._right_before), both)
         return figures
 
     def _right_pixels(self, frame: StereoFrame) -> Bool:

@@ -68,6 +68,8 @@ def evaluate(
         raise UsageError("live cameras cannot be measured; record them first, then evaluate the recording")
     _check_segments(asked)
     forced = ["source.loop:=false", f"source.pace:={pace}"]
+    if asked.publish.right == "auto":
+        forced.append("publish.right:=false")  # a measured run does not depend on who looks at it
     if iterations is not None:
         forced.append(f"mapping.iterations:={iterations}")
     session = open_session(

@@ -25,7 +25,7 @@ GROUPS = {
     "heldout": ("psnr", "ssim", "lpips", "copy_psnr"),
     "between": ("psnr", "carried_psnr", "mean_psnr"),
     "novel": ("psnr",),
-    "right": ("psnr", "warp_psnr", "model_psnr", "coverage"),
+    "right": ("psnr", "warp_psnr", "model_psnr", "copy_psnr", "coverage"),
     "flicker": ("picture", "input", "right", "depth_mm", "measured_depth_mm", "share"),
     "depth": ("median_mm", "p90_mm", "rmse_mm", "coverage"),
     "measured_depth": ("median_mm", "p90_mm", "rmse_mm", "coverage"),
@@ -48,9 +48,10 @@ def summarise(
     `copy_psnr` is that picture, shown again: on tissue that hardly moves it is hard to beat.
     `between` is `heldout` once the next frame is known; `between.mean_psnr` the mean of the pictures around,
     `between.carried_psnr` the same with both carried along the model's motion, see `carried`.
-    `right` is the right view as it was shown, with `publish.right`; `right.warp_psnr` the left picture warped
-    by the frame's own stereo depth, `right.model_psnr` the model alone, all where the warp is known: the
-    share `right.coverage` of the pixels of `novel`.
+    `right` is the right view as it was shown, with `publish.right:=true`; `right.warp_psnr` the left picture
+    warped by the frame's own stereo depth, `right.model_psnr` the model alone, `right.copy_psnr` the right
+    picture of the frame before, shown again; all where the warp is known: the share `right.coverage` of the
+    pixels of `novel`.
     `flicker` is the standard deviation in time over thirty frames, where nothing moves, see `Flicker`.
     `pose` compares with the session's poses those of a run that was not given them; `pose.rigid_...` are
     those of the baseline, see `RigidOdometry`.

@@ -80,7 +80,6 @@ class Mapped:
 
     snapshot: Snapshot
     view: RenderedView  # the model drawn for the left eye
-    right_colors: F32  # [N, 3] what the right eye sees more than the snapshot's colours
 
 
 class Mapper:
@@ -129,12 +128,20 @@ class Mapper:
         self._frames_to_depth = 0  # since depth was known last
         self._metres_per_px = 0.0  # at the tissue's median depth
 
-    def update(self, observation: Observation, budget: Budget, still: int = 0, learn: bool = True) -> Mapped:
+    def update(
+        self,
+        observation: Observation,
+        budget: Budget,
+        still: int = 0,
+        learn: bool = True,
+        right: bool = False,
+    ) -> Mapped:
         """Take one frame in.
 
         Args:
             still: for how many frames, this one included, nothing has moved.
             learn: else the model only follows the motion: the picture's colours are not the tissue's.
+            right: somebody looks at the right eye: the snapshot says what that eye sees more.
         """
         self._frames += 1
         before, self._scale = self._scale, budget.rung.scale
@@ -161,10 +168,11 @@ class Mapper:
             loss=self._refiner.loss,
             counts=counts,
             forecast=forecast,
+            right_colors=self.model.right_colors.copy() if right else None,
         )
         assert self._view is not None
         drawn = Drawn(observation, self._view)
-        mapped = Mapped(snapshot, drawn.view, self.model.right_colors.copy())
+        mapped = Mapped(snapshot, drawn.view)
         if not still or self._last is None:  # a still frame is passed over: slow motion adds up until seen
             self.start_from(drawn)
             if not learn:

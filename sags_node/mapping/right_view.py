@@ -24,7 +24,7 @@ from sags_node.kernels.jit import PIECE, kernel, parallel_kernel
 from sags_node.mapping.mapper import Mapped
 from sags_node.mapping.right_eye import right_eye_mask
 from sags_node.model.gaussians import GaussianModel
-from sags_node.types import F32, F64, U8, Bool, Camera, Gaussians, Observation, RenderedView
+from sags_node.types import F32, F64, U8, Bool, Camera, Gaussians, Observation, RenderedView, Snapshot
 
 LEARNING = 0.5  # of what a Gaussian lacks in the right eye, taken in from every other frame
 FADING = 0.94  # in two frames, of what was not seen again: a highlight of a second ago lies elsewhere by now
@@ -75,8 +75,7 @@ class RightView:
         """
         snapshot, left = mapped.snapshot, mapped.view
         camera = snapshot.camera.moved_right(observation.baseline)
-        colors = snapshot.gaussians.colors + mapped.right_colors
-        planes = show(replace(snapshot.gaussians, colors=colors), camera)
+        planes = show(for_right_eye(snapshot.gaussians, snapshot), camera)
         view = to_view(planes, camera, left.frame_id, left.t_capture_ns)
         height, width = view.depth.shape
         brought = np.zeros((-(-height // EVERY), -(-width // EVERY), 3), f4)
@@ -112,6 +111,13 @@ class RightView:
             model.right_colors[:rows], self._turn,
         )  # fmt: skip
         self._turn = 1 - self._turn
+
+
+def for_right_eye(gaussians: Gaussians, snapshot: Snapshot) -> Gaussians:
+    """A snapshot's Gaussians, there or moved, in the colours that the right eye sees; in their own where that
+    is not known."""
+    more = snapshot.right_colors
+    return gaussians if more is None else replace(gaussians, colors=gaussians.colors + more)
 
 
 def _sure_tissue(tissue: Bool, depth: F32, focal_px: float, baseline: float) -> Bool:

@@ -159,7 +159,7 @@ def left_image(pair: RectifiedPair) -> Content:
 
 
 def _right_image(result: FrameResult) -> Content:
-    assert result.pair.right is not None  # publish.right is refused where there is no right eye
+    assert result.pair.right is not None  # else it is not told of
     return cdr.image(result.pair.right, "rgb8", result.pair.t_capture_ns, cdr.RIGHT_FRAME)
 
 
@@ -197,9 +197,13 @@ OF_THE_MODEL = (
 
 
 def tells_of(result: FrameResult, topic: str) -> bool:
-    """Whether a frame has something for a topic: there may have been no time to measure its depth, and
-    nothing of the model belongs to a frame that was not taken in."""
+    """Whether a frame has something for a topic: there may have been no time to measure its depth, nobody
+    may have looked at its right eye, and nothing of the model belongs to a frame that was not taken in."""
     if result.held and topic in OF_THE_MODEL:
+        return False
+    if topic == "right/render/image" and "right" not in result.views:
+        return False
+    if topic.startswith("right/") and result.pair.right is None:
         return False
     if topic == "left/render/depth_confidence" and result.views["left"].confidence is None:
         return False

@@ -87,7 +87,9 @@ class Publisher:
             check_endpoint(endpoint, config)
         self.ns = ns
         self.session = session
-        self._names = {topics.full_name(ns, t.name): t for t in offered if config.right or not t.right}
+        self._names = {
+            topics.full_name(ns, t.name): t for t in offered if config.right is not False or not t.right
+        }
         self._seq = dict.fromkeys((t.name for t in self._names.values()), 0)
         self._subscribed: set[str] = set()  # prefixes, only those of our topics and of views
         self.thin: Mapping[str, topics.ThinPicture] = {}
@@ -227,6 +229,10 @@ class Publisher:
         full = topics.full_name(self.ns, name)
         return any(full.startswith(prefix) for prefix in self._subscribed)
 
+    def looked_at(self, picture: str) -> bool:
+        """True while somebody subscribes to that topic, or to a thin form of it."""
+        return self.wanted(picture) or any(thin.topic == picture for thin in self.thin.values())
+
     def _publish_text(self, name: str, text: Content, stamp_ns: int) -> None:
         self._seq[name] += 1
         self._kept[name] = _Kept(text, stamp_ns)
@@ -348,7 +354,7 @@ class Publisher:
             if not self._thins:
                 raise UsageError("thin pictures are made by a running node only")
             if asked.topic not in self._seq:
-                raise UsageError(f"'{name}': {asked.topic} is not published; set publish.right:=true")
+                raise UsageError(f"'{name}': {asked.topic} is not published; {topics.NO_RIGHT_EYE}")
             if name not in self.thin and len(self.thin) >= MAX_THIN:
                 raise UsageError(f"'{name}': {MAX_THIN} thin pictures are made already, the most at once")
         except UsageError as error:

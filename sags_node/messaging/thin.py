@@ -72,7 +72,7 @@ def _colour(result: FrameResult, topic: str, part: tuple[slice, slice]) -> U8:
     if topic == "left/image_rect_color":
         return result.pair.left[part]
     if topic == "right/image_rect_color":
-        assert result.pair.right is not None  # publish.right is refused where there is no right eye
+        assert result.pair.right is not None  # else it is not told of
         return result.pair.right[part]
     view = _view(result, topic)
     rgb = cv2.convertScaleAbs(view.rgb[part], alpha=255.0)

@@ -28,7 +28,7 @@ class Topic:
     name: str  # under the namespace
     type: str  # stock ROS 2 type
     content: str
-    right: bool = False  # only when publish.right is set
+    right: bool = False  # not with publish.right:=false
     cached: bool = False  # the last value is sent again to whoever subscribes
     periodic: bool = True  # repeats with every frame or every second, so silence means stale
 
@@ -52,6 +52,7 @@ TOPICS = (
     Topic("status", STRING, "JSON: rates, latencies, drops, memory, what was skipped", cached=True),
     Topic("parameters", STRING, "JSON: the launch configuration in force", cached=True, periodic=False),
 )
+NO_RIGHT_EYE = "a node with one camera, or with publish.right:=false, has no right eye"
 BY_NAME = {topic.name: topic for topic in TOPICS}
 
 # What `sags bag play --clock` adds to the topics of the recording.

@@ -26,6 +26,7 @@ from sags_node.messaging.freezes import Freezes
 from sags_node.messaging.node_clock import NodeClock
 from sags_node.messaging.received import Received, ReceivedImage, ReceivedText, TopicName
 from sags_node.messaging.subscriber import Subscriber
+from sags_node.messaging.topics import NO_RIGHT_EYE
 from sags_node.overlay import draw as overlay_draw
 from sags_node.overlay.draw import Body, Placed
 from sags_node.overlay.durations import Durations
@@ -301,7 +302,7 @@ class _Overlay:
 
     def _right_info(self) -> Any:
         problem = self._node.problem(RIGHT_INFO)
-        self._right = "" if problem is None else f"no right/camera_info ({problem}): set publish.right:=true"
+        self._right = "" if problem is None else f"no right/camera_info ({problem}): {NO_RIGHT_EYE}"
         return self._node.latest(RIGHT_INFO) if problem is None else None
 
     # ---- what is not right ---------------------------------------------------------------------------------

@@ -21,7 +21,7 @@ class RunningNode:
             [
                 sys.executable, "-m", "sags_node", "run", str(session), "source.loop:=true",
                 "publish.data:=[tcp://127.0.0.1:*]", "publish.control:=tcp://127.0.0.1:*",
-                f"publish.run_dir:={self.run_dir}", "publish.right:=true", *overrides,
+                f"publish.run_dir:={self.run_dir}", *overrides,
             ],
             stderr=subprocess.PIPE,
             text=True,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from places import SESSION
 
-from sags_node.engine.rasterizer.rasterize import make_rasterizer
+from sags_node.engine.rasterizer.rasterize import make_rasterizer, rasterize
 from sags_node.evaluation import metrics
 from sags_node.evaluation.warp import warp_to_right
 from sags_node.mapping.budget import StepBudget
@@ -17,35 +17,44 @@ from sags_node.mapping.right_eye import right_eye_mask
 from sags_node.mapping.right_view import RightView
 from sags_node.pipeline import Pipeline
 from sags_node.session import open_session
-from sags_node.types import F32, Camera, FrameResult, Gaussians
+from sags_node.types import F32, Bool, Camera, FrameResult, Gaussians
 
 FRAMES = 10
+FEW = ["mapping.max_gaussians:=6000"]
 
 
 @pytest.fixture(scope="module")
 def played() -> tuple[Pipeline, list[FrameResult]]:
     overrides = ["source.pace:=step", f"source.frames:={FRAMES}", "publish.right:=true"]
-    session = open_session(SESSION, [*overrides, "mapping.max_gaussians:=6000"])
+    session = open_session(SESSION, [*overrides, *FEW])
     pipeline = Pipeline(session.config, session.rig)
     with session.source as source:
         return pipeline, [pipeline.process(frame, StepBudget(1)) for frame in source]
 
 
-def qualities(result: FrameResult) -> tuple[float, float]:
-    """PSNR of the right view and of the warped left picture, dB, where both are known."""
+def quality(result: FrameResult, picture: F32, known: Bool | None = None) -> float:
+    """PSNR of a picture for the right eye, dB, where that eye sees tissue, and where it is `known`."""
     camera, right = result.pair.camera, result.pair.right
     assert right is not None
-    known = result.views["left"].depth[result.observation.tissue]
-    mask = right_eye_mask(result.observation.tissue, known[known > 0], camera.K[0, 0], result.pair.baseline)
+    depths = result.views["left"].depth[result.observation.tissue]
+    mask = right_eye_mask(result.observation.tissue, depths[depths > 0], camera.K[0, 0], result.pair.baseline)
+    truth, where = metrics.as_float(right), mask if known is None else mask & known
+    return metrics.psnr(metrics.fit_gain_offset(picture, truth, where), truth, where)
+
+
+def qualities(result: FrameResult) -> tuple[float, float]:
+    """Of the right view and of the warped left picture, where both are known."""
+    focal_px = float(result.pair.camera.K[0, 0])
     warp, there = warp_to_right(
-        result.observation.image, result.observation.depth, float(camera.K[0, 0]), result.pair.baseline
+        result.observation.image, result.observation.depth, focal_px, result.pair.baseline
     )
-    truth, both = metrics.as_float(right), mask & there
-    shown, warped = (
-        metrics.psnr(metrics.fit_gain_offset(picture, truth, both), truth, both)
-        for picture in (result.views["right"].rgb, warp)
-    )
-    return shown, warped
+    return quality(result, result.views["right"].rgb, there), quality(result, warp, there)
+
+
+def model_alone(result: FrameResult) -> F32:
+    """Of the right eye."""
+    camera = result.pair.camera.moved_right(result.pair.baseline)
+    return rasterize(result.snapshot.gaussians, camera).rgb
 
 
 def test_the_right_view_is_better_than_the_left_picture_warped_by_the_same_depth(
@@ -53,6 +62,44 @@ def test_the_right_view_is_better_than_the_left_picture_warped_by_the_same_depth
 ) -> None:
     shown, warped = np.mean([qualities(result) for result in played[1][FRAMES // 2 :]], axis=0)
     assert shown > warped + 0.5, (shown, warped)
+
+
+def test_it_is_drawn_while_somebody_looks_and_changes_nothing_else() -> None:
+    """Nobody looks, then somebody does, goes, and comes again; beside it a run in which nobody ever does.
+    The first picture that is seen is better than the model alone, of which nothing was kept since."""
+    looks = [False] * 4 + [True] * 4 + [False] * 2 + [True] * 2
+    session = open_session(SESSION, ["source.pace:=step", f"source.frames:={len(looks)}", *FEW])
+    watched, alone = (Pipeline(session.config, session.rig) for _ in range(2))
+    came = 0
+    with session.source as source:
+        for frame, look in zip(source, looks, strict=True):
+            first = look and not watched.draws_right
+            watched.draws_right = look
+            result, other = (one.process(frame, StepBudget(1)) for one in (watched, alone))
+            assert np.array_equal(result.views["left"].rgb, other.views["left"].rgb)
+            assert ("right" in result.views) == look == (result.snapshot.right_colors is not None)
+            assert "right" not in other.views
+            if first:
+                came += 1
+                assert result.snapshot.right_colors is not None and not result.snapshot.right_colors.any()
+                assert quality(result, result.views["right"].rgb) > quality(result, model_alone(result))
+    assert came == 2
+
+
+def test_who_comes_while_the_input_is_frozen_sees_something() -> None:
+    """Frames that equal their predecessor are not mapped again, and have nothing to learn the eye from."""
+    session = open_session(SESSION, ["source.pace:=step", "source.frames:=3", *FEW])
+    pipeline = Pipeline(session.config, session.rig)
+    with session.source as source:
+        frames = list(source)
+    for frame in frames:
+        pipeline.process(frame, StepBudget(1))
+    assert "frame" in pipeline.process(replace(frames[-1], frame_id=7), StepBudget(1)).skipped
+    pipeline.draws_right = True
+    came, after = (pipeline.process(replace(frames[-1], frame_id=n), StepBudget(1)) for n in (8, 9))
+    assert "right" in came.views
+    assert "frame" in after.skipped and after.views["right"].frame_id == 9
+    assert np.array_equal(after.views["right"].rgb, came.views["right"].rgb)
 
 
 class Scene:
@@ -69,7 +116,7 @@ class Scene:
 
     def mapped(self, right_colors: float = 0.0) -> Mapped:
         colors = np.full((self.count, 3), right_colors, np.float32)
-        return Mapped(self.result.snapshot, self.result.views["left"], colors)
+        return Mapped(replace(self.result.snapshot, right_colors=colors), self.result.views["left"])
 
 
 @pytest.fixture(scope="module")

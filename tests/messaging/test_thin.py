@@ -186,7 +186,7 @@ def test_a_pause_loses_no_message_that_comes_after_it(tmp_path: Path) -> None:
         ("thin/half/left/depth/jpeg", "left/depth comes as png, not as jpeg"),
         ("thin/half/0,0,1,9/left/depth/png", "has no pixel"),
         ("thin/half", "no thin topic"),
-        ("thin/full/right/image_rect_color/jpeg", "set publish.right:=true"),
+        ("thin/full/right/image_rect_color/jpeg", "with publish.right:=false, has no right eye"),
         ("thin/full/90,0,10,10/left/depth/png", f"leaves the picture, which has {WIDTH}x{HEIGHT} px"),
     ],
 )

@@ -503,6 +503,7 @@ def test_a_recording_of_one_camera_is_played(
     launch = one_camera_launch(phantom_session, knowing, tmp_path, {"kind": kind, "left": str(left)})
     monkeypatch.chdir("/")
     session = open_session(launch, ["source.frames:=2"])
+    assert session.config.publish.right is False  # as `auto` is where there is none
     with session.source as source:
         results = play(Pipeline(session.config, session.rig), list(source))
     assert len(results) == 2
