@@ -216,7 +216,7 @@ def find_eyes(config: BagSource, contents: Contents) -> Eyes:
     there = ", ".join(sorted(contents.pictures)) or "none"
     raise UsageError(
         f"{config.path}: stereo pairs of topics that look usable: {listed}; set source.left and "
-        f"source.right. Picture topics: {there}. (A node publishes its right eye with publish.right:=true)"
+        f"source.right. Picture topics: {there}. (sags bag record takes both eyes, unless topics are named)"
     )
 
 

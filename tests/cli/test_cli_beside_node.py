@@ -108,7 +108,7 @@ def test_an_unknown_topic_names_the_nearest(tool: str, beside_node: dict[str, An
 def test_a_topic_that_says_too_little(beside_node: dict[str, Any]) -> None:
     listen = ("--seconds", "0.3")
     refused(1, "topic", "hz", "parameters", *listen, said=("sags/parameters", "too few", "--seconds"))
-    refused(1, "topic", "hz", "right/camera_info", *listen, said=("no messages", "publish.right:=true"))
+    refused(1, "topic", "hz", "right/camera_info", *listen, said=("no messages", "publish.right:=false"))
 
 
 def test_topic_tools_in_words_and_in_json(beside_node: dict[str, Any]) -> None:

@@ -67,7 +67,7 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def node(phantom_session: Path, run_dir: Path) -> Iterator[subprocess.Popen[str]]:
     """A node that plays the phantom in a loop. The last test kills it."""
-    settings = ["source.loop:=true", "publish.right:=true", f"publish.run_dir:={run_dir}"]
+    settings = ["source.loop:=true", f"publish.run_dir:={run_dir}"]
     settings += ["publish.data:=[tcp://127.0.0.1:*]", "publish.control:=tcp://127.0.0.1:*"]
     with process("run", phantom_session, *settings) as running:
         until(connection_path(run_dir, "sags").exists, running)

@@ -27,10 +27,10 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_every_frame_after_the_warm_up_is_recorded_and_plays_again(session: Path, tmp_path: Path) -> None:
     bag = tmp_path / "bag"
-    asked = ("publish.right:=true", f"source.warm_up:={WARM_UP}", "--json")
+    asked = (f"source.warm_up:={WARM_UP}", "--json")
     said = pure_json(sags("bag", "record", "-o", bag, "--session", session, *asked).stdout)
     assert (said["frames"], said["lost"], said["dropped"]) == (FRAMES, 0, 0)
-    for topic in ("left/image_rect_color", "left/render/depth", "splats"):
+    for topic in ("left/image_rect_color", "left/render/depth", "right/render/image", "splats"):
         assert said["topics"][f"sags/{topic}"]["messages"] == FRAMES
     with open_session(bag, ["source.pace:=step"]).source as source:
         assert len([frame for frame in source if frame.right is not None]) == FRAMES

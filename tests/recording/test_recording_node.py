@@ -38,7 +38,6 @@ def node(phantom_session: Path, tmp_path_factory: pytest.TempPathFactory) -> Ite
     home = tmp_path_factory.mktemp("node")
     command = [sys.executable, "-m", "sags_node", "run", str(phantom_session), "source.loop:=true"]
     command += [
-        "publish.right:=true",
         "publish.data:=[tcp://127.0.0.1:*]",
         "publish.control:=tcp://127.0.0.1:*",
     ]
