@@ -21,9 +21,9 @@ from sags_node.engine.rasterizer.rasterize import make_rasterizer, to_view
 from sags_node.errors import SagsError
 from sags_node.geometry import scale_intrinsics
 from sags_node.kernels.threads import configure_threads
-from sags_node.mapping.right_view import for_right_eye
 from sags_node.messaging.requests import ViewRequest
 from sags_node.model.forecast import gaussians_ahead, reached
+from sags_node.model.gaussians import for_right_eye
 from sags_node.types import Camera, DrawnView, FrameResult, RenderedView, ViewStatus
 
 MAX_VIEWS = 8

@@ -12,7 +12,7 @@ nor from the right one.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,8 +23,8 @@ from sags_node.engine.rasterizer.views import to_view
 from sags_node.kernels.jit import PIECE, kernel, parallel_kernel
 from sags_node.mapping.mapper import Mapped
 from sags_node.mapping.right_eye import right_eye_mask
-from sags_node.model.gaussians import GaussianModel
-from sags_node.types import F32, F64, U8, Bool, Camera, Gaussians, Observation, RenderedView, Snapshot
+from sags_node.model.gaussians import GaussianModel, for_right_eye
+from sags_node.types import F32, F64, U8, Bool, Camera, Gaussians, Observation, RenderedView
 
 LEARNING = 0.5  # of what a Gaussian lacks in the right eye, taken in from every other frame
 FADING = 0.94  # in two frames, of what was not seen again: a highlight of a second ago lies elsewhere by now
@@ -111,13 +111,6 @@ class RightView:
             model.right_colors[:rows], self._turn,
         )  # fmt: skip
         self._turn = 1 - self._turn
-
-
-def for_right_eye(gaussians: Gaussians, snapshot: Snapshot) -> Gaussians:
-    """A snapshot's Gaussians, there or moved, in the colours that the right eye sees; in their own where that
-    is not known."""
-    more = snapshot.right_colors
-    return gaussians if more is None else replace(gaussians, colors=gaussians.colors + more)
 
 
 def _sure_tissue(tissue: Bool, depth: F32, focal_px: float, baseline: float) -> Bool:

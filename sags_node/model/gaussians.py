@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sags_node.engine.rasterizer.smoothing import folded
-from sags_node.types import F32, I64, Gaussians
+from sags_node.types import F32, I64, Gaussians, Snapshot
 
 NEIGHBOURS = 4  # control nodes a Gaussian follows
 ADAM_PARAMETERS = 11  # mean 3, quat 4, log scale 3, opacity logit 1
@@ -166,3 +167,10 @@ class GaussianModel:
     def _new_ids(self, count: int) -> I64:
         self._next_id += count
         return np.arange(self._next_id - count, self._next_id)
+
+
+def for_right_eye(gaussians: Gaussians, snapshot: Snapshot) -> Gaussians:
+    """A snapshot's Gaussians, there or moved, in the colours that the right eye sees; in their own where that
+    is not known."""
+    more = snapshot.right_colors
+    return gaussians if more is None else replace(gaussians, colors=gaussians.colors + more)

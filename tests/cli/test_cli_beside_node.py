@@ -108,7 +108,7 @@ def test_an_unknown_topic_names_the_nearest(tool: str, beside_node: dict[str, An
 def test_a_topic_that_says_too_little(beside_node: dict[str, Any]) -> None:
     listen = ("--seconds", "0.3")
     refused(1, "topic", "hz", "parameters", *listen, said=("sags/parameters", "too few", "--seconds"))
-    refused(1, "topic", "hz", "right/camera_info", *listen, said=("no messages", "publish.right:=false"))
+    refused(1, "topic", "hz", "clock", *listen, said=("no messages", "is the node running"))
 
 
 def test_topic_tools_in_words_and_in_json(beside_node: dict[str, Any]) -> None:
@@ -116,7 +116,7 @@ def test_topic_tools_in_words_and_in_json(beside_node: dict[str, Any]) -> None:
     rows = {row["topic"]: row for row in pure_json(sags("topic", "list", "--seconds", "3", "--json").stdout)}
     assert 5 < rows["sags/left/render/depth"]["rate_hz"] < 20
     assert rows["sags/parameters"]["messages"] == 1 and rows["sags/parameters"]["rate_hz"] is None
-    assert rows["sags/right/camera_info"]["messages"] == 0
+    assert rows["sags/right/camera_info"]["messages"] > 0
     assert "sags/left/depth" in sags("topic", "list", *listen).stdout
     for tool, key, unit in (
         ("hz", "average_rate", " Hz"),

@@ -46,7 +46,7 @@ def received(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[client.
     """Five messages of every topic but `parameters`, as the independent client gets them over tcp."""
     names = [t.name for t in topics.TOPICS if t.name != "parameters"]
     run_dir = tmp_path_factory.mktemp("run", numbered=True) / "sags"
-    with publisher(run_dir, right=True) as running, stream(running):
+    with publisher(run_dir) as running, stream(running):
         endpoint = running.connection.data[-1]
         assert endpoint.startswith("tcp://")
         got = client.collect(endpoint, [f"sags/{name}" for name in names], count=5, timeout=30)
@@ -215,8 +215,8 @@ def test_only_what_is_subscribed_to_is_encoded(tmp_path: Path, monkeypatch: pyte
         assert encoded == [] and not running.wanted("left/depth")
 
 
-def test_right_eye_is_off_by_default(tmp_path: Path) -> None:
-    with publisher(tmp_path / "run") as running, stream(running):
+def test_the_right_eye_can_be_left_out(tmp_path: Path) -> None:
+    with publisher(tmp_path / "run", right=False) as running, stream(running):
         got = client.collect(running.connection.data[0], ["sags/right/camera_info"], count=1, timeout=0.5)
     assert got["sags/right/camera_info"] == []
 

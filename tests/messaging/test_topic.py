@@ -56,7 +56,7 @@ def test_list(endpoint: str) -> None:
     assert rows["sags/left/depth"]["rate_hz"] > 5
     assert rows["sags/left/depth"]["type"] == "sensor_msgs/msg/Image"
     assert rows["sags/parameters"]["messages"] == 1  # the last value, sent again
-    assert rows["sags/right/camera_info"]["messages"] == 0  # off by default
+    assert rows["sags/right/camera_info"]["messages"] > 0  # who listens to everything asks for it too
 
 
 @pytest.fixture(scope="module")
@@ -135,7 +135,7 @@ def test_what_a_node_sends_beside_its_fixed_topics_is_listed(tmp_path: Path) -> 
     assert rows["sags/clock"]["rate_hz"] > 3 and rows["sags/clock"]["type"] == topics.CLOCK
 
 
-@pytest.mark.parametrize("name", [t.name for t in topics.TOPICS if not t.right])
+@pytest.mark.parametrize("name", topics.BY_NAME)
 def test_echo(endpoint: str, name: str) -> None:
     (record,) = topic_echo(name, endpoint, count=1, seconds=10)
     assert json.loads(json.dumps(record))["topic"] == f"sags/{name}"
@@ -154,4 +154,10 @@ def test_silence_and_mistakes_are_named(endpoint: str) -> None:
     with pytest.raises(SagsError, match="no messages on other/"):
         topic_list(endpoint, ns="other", seconds=0.3)
     with pytest.raises(SagsError, match="no messages"):
-        list(topic_echo("right/camera_info", endpoint, seconds=0.2))
+        list(topic_echo("clock", endpoint, seconds=0.2))
+
+
+def test_why_there_is_no_right_eye_is_said(tmp_path: Path) -> None:
+    with publisher(tmp_path / "run", right=False) as running, stream(running):
+        with pytest.raises(SagsError, match=r"one camera, or with publish\.right:=false, has no right eye"):
+            topic_hz("right/render/image", running.connection.data[-1], seconds=0.2)
