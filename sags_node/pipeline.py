@@ -316,9 +316,10 @@ class Pipeline:
         if self._unwatched:
             self.mapper.doubt(self._unwatched)
             self._unwatched = 0.0
-        if draws_right and self._mapped is not None and "right" not in self._mapped.views:
-            self._right = RightView()  # what was learnt when somebody looked last is long out of date
-            self.mapper.model.right_colors[:] = 0
+        if draws_right:
+            self._right.wake(self.mapper.model)
+        else:
+            self._right.miss()
         mapped = self.mapper.update(observation, budget, still, learn, draws_right)
         if self._tracker is not None:
             self._tracker.mapped(observation, mapped.view)

@@ -57,6 +57,17 @@ class RightView:
         self.share = 1.0
         self._sums: F64 = np.zeros(2)  # of detail times what lacked, and of detail squared
         self._turn = 0  # which half of the Gaussians learns next
+        self._missed = 0  # frames in which nobody looked
+
+    def miss(self) -> None:
+        """Nobody looks at this frame."""
+        self._missed += 1
+
+    def wake(self, model: GaussianModel) -> None:
+        """Somebody looks at this frame: what was learnt is older by the frames that were missed."""
+        if self._missed:
+            model.right_colors[:] *= f4(FADING ** (self._missed / 2))
+            self._missed = 0
 
     def draw(
         self,

@@ -14,7 +14,7 @@ from sags_node.evaluation.warp import warp_to_right
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.mapper import Mapped
 from sags_node.mapping.right_eye import right_eye_mask
-from sags_node.mapping.right_view import RightView
+from sags_node.mapping.right_view import FADING, RightView
 from sags_node.pipeline import Pipeline
 from sags_node.session import open_session
 from sags_node.types import F32, Bool, Camera, FrameResult, Gaussians
@@ -66,7 +66,7 @@ def test_the_right_view_is_better_than_the_left_picture_warped_by_the_same_depth
 
 def test_it_is_drawn_while_somebody_looks_and_changes_nothing_else() -> None:
     """Nobody looks, then somebody does, goes, and comes again; beside it a run in which nobody ever does.
-    The first picture that is seen is better than the model alone, of which nothing was kept since."""
+    The first picture that is seen is better than the model alone."""
     looks = [False] * 4 + [True] * 4 + [False] * 2 + [True] * 2
     session = open_session(SESSION, ["source.pace:=step", f"source.frames:={len(looks)}", *FEW])
     watched, alone = (Pipeline(session.config, session.rig) for _ in range(2))
@@ -81,7 +81,6 @@ def test_it_is_drawn_while_somebody_looks_and_changes_nothing_else() -> None:
             assert "right" not in other.views
             if first:
                 came += 1
-                assert result.snapshot.right_colors is not None and not result.snapshot.right_colors.any()
                 assert quality(result, result.views["right"].rgb) > quality(result, model_alone(result))
     assert came == 2
 
@@ -173,6 +172,22 @@ def test_what_the_right_eye_sees_more_is_learnt_where_it_is_tissue_for_certain(
         + drawn.view.camera.viewmat[:3, 3:]
     )
     assert (pixels[1] / pixels[2]).min() > 100 - 4
+
+
+def test_what_was_learnt_grows_old_while_nobody_looks(played: tuple[Pipeline, list[FrameResult]]) -> None:
+    """As it does where the eye sees nothing: who looks now and then keeps most, who comes after ten seconds
+    begins anew."""
+    model, view = played[0].mapper.model, RightView()
+    model.right_colors[:] = 0.2
+    view.wake(model)
+    assert (model.right_colors == np.float32(0.2)).all()
+    left = []
+    for missed in (6, 300):
+        for _ in range(missed):
+            view.miss()
+        view.wake(model)
+        left.append(float(np.abs(model.right_colors).max()))
+    assert left[0] == pytest.approx(0.2 * FADING**3, rel=1e-5) and 0.15 < left[0] and left[1] < 1e-4
 
 
 def test_what_is_not_seen_again_is_gone_after_two_seconds(
