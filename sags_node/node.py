@@ -119,8 +119,6 @@ class Node:
     # ---- life ----------------------------------------------------------------------------------------
 
     def start(self) -> None:
-        self._publisher.poll(timeout_ms=0)  # who is there already gets all of the first frame
-        self._note_who_looks()
         for thread in self._threads:
             thread.start()
         self._manager.ready()
