@@ -124,8 +124,8 @@ def _tracks(file: Path) -> tuple[F64, Bool]:
     """Pixels [P, T, 2] and whether they are visible [P, T], of the points that are so in the first frame."""
     if not file.is_file():
         raise UsageError(
-            f"{file.with_name(PUBLISHED)} is a pickle, which may run any code, so it is not opened here. If you "
-            f'trust it, write {TRACKS} beside it: cd {file.parent}; python3 -c "{CONVERT}"'
+            f"{file.with_name(PUBLISHED)} is a pickle, which may run any code, so it is not opened here. "
+            f'If you trust it, write {TRACKS} beside it: cd {file.parent}; python3 -c "{CONVERT}"'
         )
     try:
         said = json.loads(read_file(file, LARGEST_JSON))
