@@ -109,13 +109,6 @@ def _averaged(picture: U8, every: int) -> U8:
     return smaller
 
 
-def _over_black(view: RenderedView, part: tuple[slice, slice]) -> U8:
-    rgb = cv2.convertScaleAbs(view.rgb[part], alpha=255.0)
-    alpha = cv2.convertScaleAbs(view.alpha[part], alpha=255.0)
-    black: U8 = cv2.multiply(rgb, cv2.merge([alpha] * 3), scale=1 / 255)
-    return black
-
-
 def _in_steps(depth: F32) -> NDArray[np.uint16]:
     """Depth [H, W] (m) in `DEPTH_STEP`; 0: unknown, or further than can be said."""
     steps = depth * np.float32(1 / DEPTH_STEP) + np.float32(0.5)

@@ -16,12 +16,14 @@ from synthetic import HEIGHT, WIDTH, health, publisher, stream
 from sags_node.cli.main import main
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import cdr, topics
+from sags_node.overlay.draw import color_key
 from sags_node.overlay.stream import OverlayStream
 from sags_node.topic import topic_bw, topic_delay, topic_echo, topic_hz, topic_list
 
 pytestmark = pytest.mark.live
 
 RATE = 40.0
+KEY = (0, 0, 255)
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +66,8 @@ def overlay(tmp_path_factory: pytest.TempPathFactory) -> Iterator[OverlayStream]
     """An overlay's own socket, served on a thread: a picture and `status` ten times a second."""
     run_dir = tmp_path_factory.mktemp("overlay") / "run"
     stop = threading.Event()
-    with OverlayStream("overlay", run_dir, (0, 0, 255)) as stream:
+    color_key(np.zeros((HEIGHT, WIDTH, 4), np.uint8), KEY)  # its kernel takes a second to load
+    with OverlayStream("overlay", run_dir, KEY) as stream:
 
         def serve() -> None:
             number = 0
