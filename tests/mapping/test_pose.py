@@ -311,6 +311,24 @@ def test_how_the_tissue_was_seen_first_says_where_the_camera_is_though_places_at
     assert mm < 0.3 and degrees < 0.2, (mm, degrees)
 
 
+def test_of_several_pictures_the_oldest_says_where_the_camera_is(still: Path) -> None:
+    session, frames = opened(still, "session")
+    pipeline, results = play(session, frames[:3])
+    seen, views = results[-1].observation, FirstViews(pipeline.mapper)
+    pose = seen.camera.T_world_cam
+    views.offer(seen, pose)
+    (first,) = views._kept
+    aside = pose.copy()
+    aside[0, 3] += 0.008
+    off = np.array([0, 0.003, 0], np.float32)  # m: what a later picture may have taken over from a drift
+    views._kept = [
+        replace(first, camera=replace(first.camera, T_world_cam=aside)),
+        replace(first, rest=first.rest + off),
+    ]
+    found = views.pose(seen, pose)
+    assert found is not None and error_mm_deg(found, pose)[0] < 0.3
+
+
 def test_a_picture_of_other_tissue_tells_no_pose(still: Path) -> None:
     session, frames = opened(still, "session")
     pipeline, results = play(session, frames[:3])
