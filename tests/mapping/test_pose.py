@@ -320,7 +320,7 @@ def test_of_several_pictures_the_oldest_says_where_the_camera_is(still: Path) ->
     (first,) = views._kept
     aside = pose.copy()
     aside[0, 3] += 0.008
-    off = np.array([0, 0.003, 0], np.float32)  # m: what a later picture may have taken over from a drift
+    off = np.array([0, 0.001, 0], np.float32)  # m: what a later picture may have taken over from a drift
     views._kept = [
         replace(first, camera=replace(first.camera, T_world_cam=aside)),
         replace(first, rest=first.rest + off),
