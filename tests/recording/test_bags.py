@@ -177,9 +177,7 @@ def test_a_ros1_bag_is_checked_once_until_it_changes(tmp_path: Path, monkeypatch
 def test_topics_can_be_named(tmp_path: Path) -> None:
     odd = "/endo/A", "/endo/B"
     path = files.write_rosbag2(tmp_path / "bag", files.stereo_rows(ROS2, 3, odd, infos=False))
-    with pytest.raises(
-        UsageError, match=r"set source\.left and source\.right.*/endo/A, /endo/B.*publish\.right"
-    ):
+    with pytest.raises(UsageError, match=r"set source\.left and source\.right.*/endo/A, /endo/B.*both eyes"):
         play(path)
     assert_frames(play(path, left="/endo/A", right="endo/B"), [0, 1, 2])
     with pytest.raises(UsageError, match=r"source\.right is missing"):
