@@ -63,6 +63,7 @@ REMEMBER_EVERY = 2.0  # s, while none is
 RECALL_RADIUS = 10  # px, around where the tissue around it says that it is
 SURE = 0.3  # s: what was found so lately is remembered
 LOST = 1.0  # s out of sight from which on an anchor is looked for everywhere
+TOLD = 0.2  # s for which one without tissue is said to be lost before it is looked for: frames are missed
 
 _NOBODY = -1  # in the place of a Gaussian's id
 _SIDE = 2 * PATCH_RADIUS + 1
@@ -249,7 +250,7 @@ class Anchors:
         have not been seen for long."""
         table, stamp = self._table, observation.t_capture_ns
         seen = (table.visibility == 1) & (table.unseen < SURE) & np.isfinite(table.depth_offsets)
-        lost = (table.unseen > LOST) | np.isnan(table.points).any(1)
+        lost = (table.unseen > LOST) | (np.isnan(table.points).any(1) & (table.unseen > TOLD))
         period = RECALL_EVERY if lost.any() else REMEMBER_EVERY
         if not (seen.any() or lost.any()) or 0 <= stamp - self._recalled_ns < period * 1e9:
             return
@@ -311,6 +312,7 @@ def _carry(table: _Table, gaussians: Gaussians) -> F64:
     table.weights[~alive] = 0
     share = table.weights.sum(1)
     lost = share == 0
+    table.unseen[lost & np.isfinite(table.points).all(1)] = 0  # from now on: for how long it is lost
     means = gaussians.means[rows].astype(np.float64) if len(gaussians) else table.means
     displacements = (table.weights[..., None] * (means - table.means)).sum(1)
     displacements /= np.where(lost, np.nan, share)[:, None]

@@ -98,6 +98,21 @@ def test_they_come_back_wherever_the_tissue_is(
     assert states.points[:, 2] == pytest.approx(DEPTH / scale, rel=1e-4)
 
 
+def test_a_new_model_is_told_before_they_come_back() -> None:
+    """However its first frame falls between two looks: who takes the newest frame only must see it."""
+    for more in range(6):  # tenths of a second: a look comes every five
+        anchors = Anchors()
+        for u, v in PINNED:
+            anchors.add_pixel(u, v, *scene(0))
+        follow(anchors, *(scene(0.1 * i) for i in range(1, 25 + more)))
+        start = 2.4 + 0.1 * more
+        for i in range(1, 6):
+            told = follow(anchors, scene(start + i / 30, kept=False))
+            assert np.isnan(told.points).all() and (told.confidence == 0).all(), (more, i)
+        states = follow(anchors, *(scene(start + 0.3 + 0.1 * i, kept=False) for i in range(7)))
+        assert np.isfinite(states.points).all() and (states.confidence > 0.7).all()
+
+
 @pytest.mark.parametrize(
     "how",
     [
