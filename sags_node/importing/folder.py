@@ -150,7 +150,7 @@ def _is_stereomis(folder: Path) -> bool:
 
 
 def _is_stereomis_tracking(folder: Path) -> bool:
-    return (folder / "track_pts.pckl").is_file()
+    return any(folder.glob("track_pts.*"))
 
 
 def _is_d4d(folder: Path) -> bool:

@@ -52,9 +52,7 @@ class D4dClip:
     rate: float  # Hz
     masks: dict[int, Path]  # by number of the frame
     scans: tuple[Scan, ...]
-    stereo: tuple[
-        Path, ...
-    ]  # depth [H, W] m of each frame by the data set's own stereo; empty: there is none
+    stereo: tuple[Path, ...]  # depth [H, W] m of each frame by the set's own stereo; empty: there is none
 
     @property
     def is_moved(self) -> bool:
@@ -150,7 +148,7 @@ def _rate(pictures: list[Path]) -> float:
     stamps = [file.stem.split("_") for file in pictures]
     if len(stamps) < 2 or not all(len(each) == 2 and "".join(each).isdecimal() for each in stamps):
         return DEFAULT_RATE
-    step = float(np.median(np.diff([int(seconds) + float(f"0.{rest}") for seconds, rest in stamps])))
+    step = float(np.median(np.diff([int(seconds) + 1e-9 * int(rest) for seconds, rest in stamps])))
     return 1 / step if step > 0 else DEFAULT_RATE
 
 
@@ -213,8 +211,8 @@ def matrix_in(said: dict[str, Any], short: str, long: str, shape: tuple[int, int
     Raises:
         KeyError, TypeError, ValueError: it is missing or wrong.
     """
-    value = said[long]["data"] if long in said else said[short]
-    matrix = np.array(value, np.float64).reshape(shape)
+    value = said[long] if long in said else said[short]
+    matrix = np.array(value["data"] if isinstance(value, dict) else value, np.float64).reshape(shape)
     if not np.isfinite(matrix).all() or matrix[0, 0] <= 0:
         raise ValueError(f"{long} is none")
     return matrix

@@ -25,7 +25,7 @@ from sags_node.mapping.keyframes import Keyframes
 from sags_node.phantom import write_session
 from sags_node.pipeline import Pipeline
 from sags_node.session import Session, open_session
-from sags_node.types import F32, F64, Camera, FrameResult, StereoFrame
+from sags_node.types import F32, F64, Camera, FrameResult, Observation, StereoFrame
 
 BASELINE = 0.0043
 MOTION = np.array([2e-3, -1e-3, 1.5e-3, 0.01, -0.02, 0.015])  # m and rad: 15 px in the picture
@@ -311,12 +311,18 @@ def test_how_the_tissue_was_seen_first_says_where_the_camera_is_though_places_at
     assert mm < 0.3 and degrees < 0.2, (mm, degrees)
 
 
-def test_of_several_pictures_the_oldest_says_where_the_camera_is(still: Path) -> None:
+def picture_kept(still: Path) -> tuple[Observation, FirstViews]:
+    """A frame whose picture was kept as the first."""
     session, frames = opened(still, "session")
     pipeline, results = play(session, frames[:3])
     seen, views = results[-1].observation, FirstViews(pipeline.mapper)
+    views.offer(seen, seen.camera.T_world_cam)
+    return seen, views
+
+
+def test_of_several_pictures_the_oldest_says_where_the_camera_is(still: Path) -> None:
+    seen, views = picture_kept(still)
     pose = seen.camera.T_world_cam
-    views.offer(seen, pose)
     (first,) = views._kept
     aside = pose.copy()
     aside[0, 3] += 0.008
@@ -330,13 +336,9 @@ def test_of_several_pictures_the_oldest_says_where_the_camera_is(still: Path) ->
 
 
 def test_a_picture_of_other_tissue_tells_no_pose(still: Path) -> None:
-    session, frames = opened(still, "session")
-    pipeline, results = play(session, frames[:3])
-    seen, views = results[-1].observation, FirstViews(pipeline.mapper)
-    pose = seen.camera.T_world_cam
-    views.offer(seen, pose)
+    seen, views = picture_kept(still)
     other = replace(seen, gray=np.ascontiguousarray(seen.gray[::-1]))
-    assert views.pose(other, pose) is None
+    assert views.pose(other, seen.camera.T_world_cam) is None
 
 
 def test_places_at_rest_that_lost_their_shape_do_not_move_the_camera(still: Path) -> None:
