@@ -25,7 +25,7 @@ The rules; breaking one costs up to 5 times without any error, so time a kernel 
 
 Machine code is kept on disk (`cache`) under a name that changes with the kernel's file, with every file that
 it imports from and with the compile target (`digest`). So helpers, constants and layouts stand once, in the
-file they belong to, and are imported.
+file they belong to, and are imported. In machine code each kernel has its own copy of a helper (`linkage`).
 """
 
 from __future__ import annotations
@@ -45,6 +45,9 @@ from numpy.typing import DTypeLike, NDArray
 
 from sags_node.kernels import threads  # noqa: F401  (fixes the threading layer before the first kernel)
 from sags_node.kernels.cache import cache_for
+from sags_node.kernels.linkage import keep_helpers_apart
+
+keep_helpers_apart()
 
 # Not "fast": that also promises the absence of NaN and infinity, and comparisons must reject those here.
 _FASTMATH = {"reassoc", "contract", "arcp", "nsz", "afn"}

@@ -95,7 +95,7 @@ def _band(
     left: F32, right: F32, stride: int, field: F32, good: Bool, clear: Bool, limits: F32,
     radius: int, low: int, high: int, depth: F32, trust: F32,
 ) -> None:  # fmt: skip
-    margin = max(2 * radius, agreement.RADIUS) + 1  # one for the rows between which depth is interpolated
+    margin = 2 * radius + agreement.RADIUS + 1  # one for the rows between which depth is interpolated
     begin, end = max(low - margin, 0), min(high + margin, clear.shape[0])
     height, width = end - begin, clear.shape[1]
     planes = np.empty((3, height, width), np.float32)

@@ -73,6 +73,22 @@ print(json.dumps([*map(float, intervals), *found]))
 """
 
 
+# A kernel whose helper rounds otherwise by itself than where it is linked in; what other kernels see of it.
+LOSS = """
+import hashlib, json, numpy as np
+from llvmlite.binding import Linkage
+from sags_node.engine.losses import tissue
+random = np.random.default_rng(0)
+planes, image, depth = (random.random(shape, np.float32) for shape in ((5, 64, 80), (64, 80, 3), (64, 80)))
+slopes, weight = np.empty_like(planes), np.empty_like(depth)
+tissue.tissue_loss(planes, image, depth > 0.1, depth, slopes, weight, 2e-3, 1e-3)
+(kernel,) = tissue._tissue_loss.overloads.values()
+shared = [f for f in kernel.library.get_defined_functions() if f.linkage == Linkage.linkonce_odr]
+intervals = [int(hashlib.sha256(slopes).hexdigest()[:12], 16), len(shared)]
+used = [tissue._tissue_loss]
+"""
+
+
 @pytest.fixture(scope="module")
 def whole_copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     copy = tmp_path_factory.mktemp("copy")
@@ -207,6 +223,13 @@ intervals = [scaled(getattr(np, kind)(4)) for kind in {}]
     alone = [json.loads(process.communicate(timeout=120)[0]) for process in processes]
     together = run(whole_copy, code.format(types))
     assert together == [*(found[0] for found in alone), 0, len(types)]
+
+
+def test_a_process_that_compiles_computes_the_bits_of_one_that_loads(whole_copy: Path) -> None:
+    """Each kernel runs its own copy of a helper, whatever else the process has compiled or loaded."""
+    compiles, loads = (run(whole_copy, LOSS) for _ in range(2))
+    assert [compiles[2:], loads[2:]] == [[1, 0], [0, 1]]
+    assert compiles[:2] == loads[:2] and compiles[1] == 0
 
 
 # ---- never in the way --------------------------------------------------------------------------------------

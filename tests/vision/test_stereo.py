@@ -17,6 +17,7 @@ from sags_node.config import StereoConfig, TissueConfig
 from sags_node.errors import UsageError
 from sags_node.sources.pictures import read_picture
 from sags_node.types import F32, U8, Bool, Camera, RectifiedPair
+from sags_node.vision import dense_depth, inverse_search
 from sags_node.vision.margin import EDGE_MARGIN
 from sags_node.vision.matchers import SemiGlobal
 from sags_node.vision.observe import observe
@@ -111,6 +112,24 @@ def test_rows_off_by_the_calibration_still_match() -> None:
     assert known.mean() > 0.95
     assert np.median(confidence[inside]) > 0.8
     assert np.median(np.abs(to_disparity(depth) - truth)[inside][known]) < 0.2
+
+
+@pytest.mark.parametrize("workers", [2, 3, 7])
+def test_bands_leave_no_seams(workers: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each worker takes a band of rows; how many there are changes nothing, in the last digit of confidence
+    either. With steps in depth and noise everything depends on what is around."""
+    pair, _ = plane_pair(28.0, 0.02, -0.01)
+    assert pair.right is not None
+    right = np.where(np.arange(HEIGHT)[:, None, None] // 40 % 2, pair.right, np.roll(pair.right, 6, axis=1))
+    noise = np.random.default_rng(1).normal(0, 4, right.shape)
+    pair = make_pair(pair.left, np.clip(right + noise, 0, 255).astype(np.uint8))
+    found = []
+    for count in (1, workers):
+        for module in (dense_depth, inverse_search):
+            monkeypatch.setattr(module, "thread_count", lambda count=count: count)
+        found.append(StereoDepth(StereoConfig(), CAMERA, BASELINE)(pair, ALL))
+    for alone, shared in zip(*found, strict=True):
+        assert (alone > 0).mean() > 0.3 and np.array_equal(alone, shared)
 
 
 def test_sgbm_says_where_it_found_nothing() -> None:
