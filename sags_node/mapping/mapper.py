@@ -18,7 +18,7 @@ from sags_node.mapping.motion_field import MotionField
 from sags_node.mapping.optimiser import Rates
 from sags_node.mapping.refiner import Refiner
 from sags_node.mapping.split import split_worst
-from sags_node.model.alias_free import smoothing_variances
+from sags_node.model.alias_free import narrow
 from sags_node.model.deformation import NodeDeformation, nearest_nodes
 from sags_node.model.gaussians import GaussianModel
 from sags_node.model.light import carried, is_near
@@ -312,7 +312,7 @@ class Mapper:
         removed = self.model.remove(densify.doomed(self.model, observation, limit))
         removed += densify.shed(self.model, limit)
         if self._smoothing:
-            self._sharpen(observation)
+            narrow(self.model.smoothing, self.model.means, observation.camera)
 
         drawn = resized(observation, self._scale)
         self._begin(drawn)
@@ -444,12 +444,6 @@ class Mapper:
     def _forget_motion(self) -> None:
         if self._field is not None:
             self._field.forget()
-
-    def _sharpen(self, observation: Observation) -> None:
-        """Narrow the 3D filter of what this camera sees finer than any before. What is out of view keeps its
-        filter. The right eye has the left's depths and so its sampling rates."""
-        variances = smoothing_variances(self.model.means, [observation.camera])
-        np.minimum(self.model.smoothing, variances, out=self.model.smoothing)
 
     def _limit(self, budget: Budget) -> int:
         """How many Gaussians this machine can afford."""

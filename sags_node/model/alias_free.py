@@ -31,22 +31,31 @@ def smoothing_variances(means: F32, cameras: Sequence[Camera]) -> F32:
         means: [N, 3] m, world, after deformation.
         cameras: those the Gaussians were fitted to. A camera that only looks at the result does not belong
             here: from nearer by it would ask for detail that nothing was ever measured of, and the picture
-            loses 2 dB at four times the size (`sags bench alias`).
+            loses 2 dB at four times the size (`sags bench alias`). The mapper's is that of the whole picture,
+            also while it fits to one of half the size (benchmarks/mapping.md).
 
     Gaussians that no camera sees take the largest variance of the seen ones.
     """
-    intervals = np.full(len(means), UNSEEN, np.float32)
+    variances = np.full(len(means), UNSEEN, np.float32)
     for camera in cameras:
-        _sampling_intervals(means, pack(camera), camera.width, camera.height, intervals)
-    seen = intervals < UNSEEN
-    intervals[~seen] = intervals[seen].max(initial=0.0)
-    return np.float32(FILTER_VARIANCE) * intervals * intervals
+        narrow(variances, means, camera)
+    seen = variances < UNSEEN
+    variances[~seen] = variances[seen].max(initial=0.0)
+    return variances
+
+
+def narrow(variances: F32, means: F32, camera: Camera) -> None:
+    """The variances [N] m^2 of Gaussians that are fitted to one camera more, in place: what it sees finer
+    than any before gets less, and what it does not see keeps its own."""
+    intervals = np.full(len(means), UNSEEN, np.float32)
+    _sampling_intervals(means, pack(camera), camera.width, camera.height, intervals)
+    np.minimum(variances, np.float32(FILTER_VARIANCE) * intervals * intervals, out=variances)
 
 
 @parallel_kernel
 def _sampling_intervals(means: F32, cam: F32, width: int, height: int, intervals: F32) -> None:
     for i in prange(len(means)):
-        intervals[i] = min(intervals[i], _sampling_interval(means[i], cam, width, height))
+        intervals[i] = _sampling_interval(means[i], cam, width, height)
 
 
 @kernel

@@ -19,6 +19,7 @@ from sags_node.cli.main import main
 from sags_node.engine.rasterizer.rasterize import make_rasterizer, rasterize
 from sags_node.engine.rasterizer.smoothing import folded
 from sags_node.evaluation.metrics import psnr
+from sags_node.geometry import project
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.mapper import Mapped, Mapper
 from sags_node.mapping.refiner import CpuRefiner
@@ -285,6 +286,26 @@ def test_the_filter_stays_as_narrow_as_the_nearest_look_was() -> None:
     mapper.update(near, StepBudget(0))
     assert (mapper.model.smoothing <= before).all()
     assert mapper.model.smoothing.min() == pytest.approx(before.min() / 4, rel=0.1)
+
+
+def test_what_the_camera_does_not_see_keeps_its_filter() -> None:
+    """From near by half of the tissue is out of view; from elsewhere all of it."""
+    observation = flat_scene(texture())
+    mapper = Mapper(CpuRefiner(partial(make_rasterizer, "numba")), 3000)
+    mapper.update(observation, StepBudget(0))
+    before, means = mapper.model.smoothing.copy(), mapper.model.means.copy()
+    away = dataclasses.replace(observation, tissue=np.zeros((SIDE, SIDE), bool))
+    near = moved(observation.camera, np.array([0, 0, 0.06]))
+    for seen_from in (moved(observation.camera, np.array([1.0, 0, 0])), near):
+        mapper.update(dataclasses.replace(away, camera=seen_from), StepBudget(0))
+        np.testing.assert_array_equal(mapper.model.means, means)
+        pixels, _ = project(seen_from, means)
+        outside = (np.abs(pixels - SIDE / 2) > 0.7 * SIDE).any(1)  # farther than the margin
+        assert outside.mean() > 0.3
+        np.testing.assert_array_equal(mapper.model.smoothing[outside], before[outside])
+        assert (mapper.model.smoothing > 0).all()
+    inside = (np.abs(pixels - SIDE / 2) < 0.5 * SIDE).all(1)
+    assert inside.any() and (mapper.model.smoothing[inside] < 0.5 * before[inside]).all()
 
 
 def test_a_ply_file_draws_the_same_without_knowing_the_filter(tmp_path: Path) -> None:
