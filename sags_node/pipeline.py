@@ -33,7 +33,7 @@ from sags_node.types import (
     StereoFrame,
     StereoRig,
 )
-from sags_node.vision.change import StillScene, rms_difference
+from sags_node.vision.change import StillScene, is_repeat
 from sags_node.vision.depth import DepthChoice, Measured
 from sags_node.vision.lens_watch import LensWatch, OnLenses
 from sags_node.vision.observe import observe
@@ -45,7 +45,6 @@ from sags_node.vision.tissue_topic import NearestMask
 
 UNHURRIED_MS = 60.0  # a budget that has room for several steps and a finer flow
 NOTICED_LATE = HALVING  # m: what was measured before matches are found to be wrong may be wrong by so much
-DUPLICATE_RMS = 0.6  # grey levels: below a video codec's own noise (PSNR > 52 dB)
 
 
 class Pipeline:
@@ -230,7 +229,7 @@ class Pipeline:
             return False
         if draws_right and "right" not in self._mapped.views:  # for somebody who has just come
             return False
-        return rms_difference(pair, self._mapped.pair) < DUPLICATE_RMS
+        return is_repeat(pair, self._mapped.pair)
 
     def _repeated(self, frame: StereoFrame, pair: RectifiedPair, watch: Stopwatch) -> FrameResult:
         assert self._mapped is not None

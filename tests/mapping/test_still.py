@@ -23,7 +23,7 @@ from sags_node.messaging.content import tells_of
 from sags_node.pipeline import Pipeline
 from sags_node.session import Session, open_session
 from sags_node.types import F32, Camera, FrameResult, RectifiedPair, RenderedView, StereoFrame
-from sags_node.vision.change import StillScene
+from sags_node.vision.change import REPEAT_RMS, StillScene, is_repeat
 from sags_node.vision.flow import OpticalFlow
 from sags_node.vision.scene_watch import NEW_SCENE_NS
 from sags_node.vision.stereo import StereoDepth
@@ -143,6 +143,35 @@ def test_what_is_forgotten_and_other_eyes_are_no_predecessor() -> None:
 
 
 # ---- the pipeline while nothing moves --------------------------------------------------------------------
+
+
+# ---- what is a repeat ------------------------------------------------------------------------------------
+
+
+def shown(left: np.ndarray) -> RectifiedPair:
+    height, width = left.shape[:2]
+    return RectifiedPair(0, 0, Camera(width, height, np.eye(3), np.eye(4)), 0.004, left, left)
+
+
+@pytest.mark.parametrize(("x", "y"), [(0, 0), (131, 100), (640 - 45, 512 - 45)])
+def test_a_small_piece_that_moved_is_no_repeat(x: int, y: int) -> None:
+    """A twentieth of the width, by a pixel, in a picture without noise: over all it is less than what a codec
+    does to a repeat."""
+    picture = texture(640, 512).round().astype(np.uint8)
+    moved = picture.copy()
+    moved[y : y + 32, x : x + 32] = np.roll(picture, 1, axis=1)[y : y + 32, x : x + 32]
+    before, after = (cv2.cvtColor(each, cv2.COLOR_RGB2GRAY).astype(np.float32) for each in (picture, moved))
+    assert 0.2 < np.sqrt(np.mean((after - before) ** 2)) < REPEAT_RMS
+    assert not is_repeat(shown(moved), shown(picture))
+
+
+@SIZES
+def test_a_picture_coded_again_is_a_repeat_and_one_taken_again_is_not(width: int, height: int) -> None:
+    picture, rng = texture(width, height), np.random.default_rng(0)
+    coded = [noisy(picture, rng, 0.25) for _ in range(2)]
+    assert is_repeat(shown(coded[0]), shown(coded[1])) and is_repeat(shown(coded[0]), shown(coded[0]))
+    taken = [noisy(picture, rng, 1.0) for _ in range(2)]
+    assert not is_repeat(shown(taken[0]), shown(taken[1]))
 
 
 @pytest.fixture(scope="module")
