@@ -99,6 +99,7 @@ class Pipeline:
         self._mapped: FrameResult | None = None  # the last frame that was really mapped
         self._unwatched = 0.0  # m: how far tissue may have moved in frames that were held since
 
+        self._depth: Measured | None = None  # of the last frame in which it was measured, or could not be
     def reset(self) -> None:
         """Forget the model; the next frame makes a new one, in a new epoch.
 
@@ -186,8 +187,7 @@ class Pipeline:
         with watch("depth"):
             seen_by_both = _without(tissue, hidden.right)
             measured = self._measured(frame, seen, seen_by_both, still, budget, eyes)
-            depth, confidence = measured.depth, measured.confidence
-            observation = observe(seen, tissue, depth, confidence, self._config.mapping.right_eye)
+            observation = observe(seen, tissue, measured, self._config.mapping.right_eye)
         if scene.guess is not None:
             self.mapper.found_again(observation, scene.guess)
         if self._tracker is not None:
@@ -288,12 +288,17 @@ class Pipeline:
     def _measured(
         self, frame: StereoFrame, pair: RectifiedPair, tissue: Bool, still: int, budget: Budget, eyes: Verdict
     ) -> Measured:
-        """The depth of a frame: of the last one where nothing moves, none where there is no time."""
-        known = self._mapped.observation if still and self._mapped is not None else None
-        if known is not None and known.depth.any():
+        """The depth of a frame: where nothing moves, that which was measured before."""
+        if still and self._depth is not None and self._depth.depth.any():
             self.depth.stereo.rows.stay()
-            skipped = dict.fromkeys(("depth", "motion"), "nothing moves")
-            return Measured(known.depth * tissue, known.depth_confidence * tissue, skipped)
+            return self._depth.handed_on(tissue)
+        self._depth = self._measured_now(frame, pair, tissue, budget, eyes)
+        return self._depth
+
+    def _measured_now(
+        self, frame: StereoFrame, pair: RectifiedPair, tissue: Bool, budget: Budget, eyes: Verdict
+    ) -> Measured:
+        """None where there is no time, or no right eye."""
         if self._lacks_time_for_depth(frame, budget):
             return Measured.nothing(tissue.shape, "no time", hurried=True)
         was_sound, self._is_sound = self._is_sound, True

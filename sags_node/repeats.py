@@ -10,6 +10,7 @@ import numpy as np
 from sags_node.confidence import confidence_of
 from sags_node.engine.rasterizer.confidence import doubted as doubted_view
 from sags_node.types import AnchorStates, FrameResult, Observation, RectifiedPair
+from sags_node.vision.depth import Measured
 from sags_node.vision.observe import observe
 
 
@@ -56,5 +57,4 @@ def doubted(held: FrameResult, error: float) -> FrameResult:
 def unseen(pair: RectifiedPair) -> Observation:
     """Of a picture of which nothing may be used."""
     shape = pair.left.shape[:2]
-    nothing = np.zeros(shape, np.float32)
-    return observe(pair, np.zeros(shape, np.bool_), nothing, nothing)
+    return observe(pair, np.zeros(shape, np.bool_), Measured.nothing(shape))

@@ -53,13 +53,14 @@ def candidates(planes: F32, observation: Observation, phase: int) -> tuple[I32, 
 def doomed(model: GaussianModel, observation: Observation, limit: int) -> Bool:
     """[N] what to remove: in free space for several frames in a row, transparent or not finite; when N nears
     its `limit` also what left the view, and what lies on the visible surface without showing. What an
-    instrument or other tissue hides is kept. Counts the frames in free space (`in_front`)."""
+    instrument or other tissue hides is kept. Counts the frames in free space (`in_front`), by each measured
+    depth once."""
     remove = np.zeros(model.count, np.bool_)
     _inspect(
         model.means, model.quats, model.scales, model.smoothing, model.node_weight,
         model.opacities, model.colors, model.contribution,
         pack(observation.camera), observation.tissue, observation.depth,
-        model.count > CROWDED * limit, model.in_front, remove,
+        observation.depth_is_new, model.count > CROWDED * limit, model.in_front, remove,
     )  # fmt: skip
     return remove
 
@@ -148,13 +149,13 @@ def _candidates(
 def _inspect(
     means: F32, quats: F32, scales: F32, smoothing: F32, node_weight: F32,
     opacities: F32, colors: F32, contribution: F32,
-    cam: F32, tissue: Bool, depth: F32, crowded: bool, in_front: I32, remove: Bool,
+    cam: F32, tissue: Bool, depth: F32, is_new: bool, crowded: bool, in_front: I32, remove: Bool,
 ) -> None:  # fmt: skip
     for piece in prange(-(-len(means) // PIECE)):
         first = np.int64(piece) * PIECE
         _inspect_rows(
             means, quats, scales, smoothing, node_weight, opacities, colors, contribution,
-            cam, tissue, depth, crowded, in_front, remove, first, min(first + PIECE, len(means)),
+            cam, tissue, depth, is_new, crowded, in_front, remove, first, min(first + PIECE, len(means)),
         )  # fmt: skip
 
 
@@ -162,7 +163,8 @@ def _inspect(
 def _inspect_rows(
     means: F32, quats: F32, scales: F32, smoothing: F32, node_weight: F32,
     opacities: F32, colors: F32, contribution: F32,
-    cam: F32, tissue: Bool, depth: F32, crowded: bool, in_front: I32, remove: Bool, first: Any, end: Any,
+    cam: F32, tissue: Bool, depth: F32, is_new: bool, crowded: bool, in_front: I32, remove: Bool,
+    first: Any, end: Any,
 ) -> None:  # fmt: skip
     height, width = tissue.shape
     for i in range(first, end):
@@ -182,7 +184,8 @@ def _inspect_rows(
         on_surface = False
         if tissue[py, px] and measured > 0:
             on_surface = abs(measured - z) < FRONT_TOLERANCE * measured
-            in_front[i] = in_front[i] + 1 if measured - z > FRONT_TOLERANCE * measured else 0
+            if is_new:
+                in_front[i] = in_front[i] + 1 if measured - z > FRONT_TOLERANCE * measured else 0
         idle = contribution[i] < IDLE
         remove[i] = in_front[i] >= FRONT_FRAMES or (crowded and idle and on_surface)
 

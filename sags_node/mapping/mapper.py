@@ -361,7 +361,8 @@ class Mapper:
         """Nothing moved: what was drawn last shows where steps pay, and only there the picture changes."""
         doomed = densify.doomed(self.model, observation, self._limit(budget))
         if np.count_nonzero(doomed) > TORN * self.model.count:
-            return self._follow(observation, budget)  # damage: there are holes to be filled
+            counted = replace(observation, depth_is_new=False)
+            return self._follow(counted, budget)  # damage: there are holes to be filled
         self.model.velocities[:] = 0
         removed = self.model.remove(doomed)
         rests = settled and self._frames % SETTLED_EVERY > 0
@@ -413,9 +414,9 @@ class Mapper:
             return
         before = self._last.observation
         self._frames_to_depth += 1
-        pull = depth_pull(self._frames_to_depth)
+        pull = depth_pull(self._frames_to_depth) if observation.depth_is_new else 0.0
         displacements, seen = scene_flow(self.model.means, self.found_again(observation), observation, pull)
-        if observation.depth.any():
+        if pull and observation.depth.any():
             self._frames_to_depth = 0
         start = self.model.means.copy()
         if self._field is None:

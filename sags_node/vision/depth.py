@@ -26,12 +26,18 @@ class Measured(NamedTuple):
     skipped: Mapping[str, str] = {}  # what was left out, and why
     is_sound: bool = True  # False: what was matched is no depth
     hurried: bool = False  # there was no time
+    is_new: bool = True  # False: it is an older frame's
 
     @classmethod
-    def nothing(cls, shape: tuple[int, ...], why: str, hurried: bool = False) -> Self:
+    def nothing(cls, shape: tuple[int, ...], why: str = "", hurried: bool = False) -> Self:
         """No depth at all."""
         depth, confidence = np.zeros((2, *shape), np.float32)
         return cls(depth, confidence, {"depth": why}, hurried=hurried)
+
+    def handed_on(self, tissue: Bool) -> Self:
+        """To a frame in which nothing has moved since, where that shows `tissue` [H, W]."""
+        skipped = dict.fromkeys(("depth", "motion"), "nothing moves")
+        return type(self)(self.depth * tissue, self.confidence * tissue, skipped, is_new=False)
 
 
 class DepthChoice:

@@ -9,20 +9,20 @@ import numpy as np
 
 from sags_node.geometry import scale_intrinsics
 from sags_node.types import F32, Bool, Camera, Observation, RectifiedPair
+from sags_node.vision.depth import Measured
 from sags_node.vision.depth_grid import depth_grid
 from sags_node.vision.pyramid import pyramids
 
 
-def observe(
-    pair: RectifiedPair, tissue: Bool, depth: F32, confidence: F32, right_eye: bool = False
-) -> Observation:
+def observe(pair: RectifiedPair, tissue: Bool, measured: Measured, right_eye: bool = False) -> Observation:
     """Gather one frame's observation.
 
     Args:
-        depth, confidence: [H, W] those of `StereoDepth`; specks of depth are taken out of both.
+        measured: depth and confidence; specks are taken out of both.
         right_eye: with the right eye's picture, where there is one.
     """
     pyramid, _ = pyramids(pair)
+    depth, confidence = measured.depth, measured.confidence
     grid = depth_grid(depth, confidence, tissue, float(pair.camera.K[0, 0]), pair.baseline)
     return Observation(
         frame_id=pair.frame_id,
@@ -33,6 +33,7 @@ def observe(
         tissue=tissue,
         depth=depth,
         depth_confidence=confidence,
+        depth_is_new=measured.is_new,
         right=pair.right * np.float32(1 / 255) if right_eye and pair.right is not None else None,
         baseline=pair.baseline,
         pyramid=pyramid,

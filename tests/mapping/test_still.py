@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from flat_scene import camera_in_front, flat_scene
 from places import SESSION
 
 from sags_node.calibration import rectified_rig
@@ -17,7 +19,8 @@ from sags_node.evaluation.metrics import psnr
 from sags_node.launch_file import load_launch
 from sags_node.mapping import mapper
 from sags_node.mapping.budget import StepBudget
-from sags_node.mapping.mapper import SETTLED, SETTLED_EVERY
+from sags_node.mapping.densify import FRONT_FRAMES
+from sags_node.mapping.mapper import SETTLED, SETTLED_EVERY, TORN, Mapper
 from sags_node.mapping.refiner import CpuRefiner
 from sags_node.messaging.content import tells_of
 from sags_node.pipeline import Pipeline
@@ -142,9 +145,6 @@ def test_what_is_forgotten_and_other_eyes_are_no_predecessor() -> None:
     assert [scene(both), scene(both), scene(replace(both, right=None))] == [0, 1, 0]
 
 
-# ---- the pipeline while nothing moves --------------------------------------------------------------------
-
-
 # ---- what is a repeat ------------------------------------------------------------------------------------
 
 
@@ -172,6 +172,9 @@ def test_a_picture_coded_again_is_a_repeat_and_one_taken_again_is_not(width: int
     assert is_repeat(shown(coded[0]), shown(coded[1])) and is_repeat(shown(coded[0]), shown(coded[0]))
     taken = [noisy(picture, rng, 1.0) for _ in range(2)]
     assert not is_repeat(shown(taken[0]), shown(taken[1]))
+
+
+# ---- the pipeline while nothing moves --------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -285,6 +288,54 @@ def test_a_rest_makes_up_for_the_depth_that_there_was_no_time_for(
     known = [result.observation.depth.any() for result in results]
     assert known == [True, True, False, True, True]
     assert calls["depth"] == 3
+
+
+def test_one_wrong_depth_counts_once_while_nothing_moves(frames: list[StereoFrame]) -> None:
+    """It is handed on from frame to frame, and three wrong ones in a row would take the tissue away. A tenth
+    of the picture: so large a hole would be filled at the wrong depth at once."""
+    play = Player(opened())
+    for frame in frames[:5]:
+        depth = play(frame).observation.depth
+    model = play.pipeline.mapper.model
+    assert not model.in_front.any()
+    wrong = depth.copy()
+    wrong[80:160, 100:200] *= 1.2
+    play(replace(frames[5], depth=wrong))
+    struck = model.ids[model.in_front == 1]
+    assert len(struck) > TORN * model.count
+    for _ in range(2 * FRONT_FRAMES):
+        play.again(replace(frames[5], depth=wrong))
+        assert model.in_front.max() == 1 and np.isin(struck, model.ids).all()
+    right = play(replace(frames[6], depth=depth))  # and one that is right takes the blame away
+    assert right.observation.depth_is_new
+    assert np.isin(struck, model.ids[model.in_front == 0]).mean() > 0.9
+
+
+def test_a_depth_measured_in_a_still_frame_counts_once_where_holes_are_filled_too() -> None:
+    """A model that is damaged while nothing moves is mended in that frame, and its depth looked at twice."""
+    camera, cells = camera_in_front(160, 128, 200.0), 16
+    observation, _, _ = flat_scene(camera, np.zeros((0, 3), np.float32), np.zeros((128, 160), np.uint8), 0.08)
+    model_of = Mapper(CpuRefiner(partial(make_rasterizer, "numba")), 2000)
+    model_of.update(observation, StepBudget(1))
+    wrong = observation.depth.copy()
+    wrong[:, : camera.width // 2] *= 1.2
+    model = model_of.model
+    model.means[: model.count // cells] = np.nan
+    model_of.update(replace(observation, frame_id=1, depth=wrong), StepBudget(1), still=1)
+    assert np.isfinite(model.means).all() and set(model.in_front.tolist()) == {0, 1}
+
+
+def test_a_mask_that_flickers_while_nothing_moves_takes_no_depth_away(frames: list[StereoFrame]) -> None:
+    play, rng = Player(opened()), np.random.default_rng(0)
+    first = play(frames[0]).observation.depth
+    tissue = frames[0].tissue
+    assert tissue is not None
+    for _ in range(10):
+        less = tissue & (rng.random(tissue.shape) > 0.01)
+        flickering = play.again(replace(frames[0], tissue=less)).observation
+        assert not flickering.depth_is_new and not flickering.depth[~flickering.tissue].any()
+    last = play.again(frames[0]).observation
+    assert (last.depth > 0).sum() >= 0.99 * (first > 0).sum() > 0  # a cell of specks may go
 
 
 def test_a_repeated_frame_does_not_claim_depth_that_was_never_matched(frames: list[StereoFrame]) -> None:

@@ -18,6 +18,7 @@ from sags_node.errors import UsageError
 from sags_node.sources.pictures import read_picture
 from sags_node.types import F32, U8, Bool, Camera, RectifiedPair
 from sags_node.vision import dense_depth, inverse_search
+from sags_node.vision.depth import Measured
 from sags_node.vision.margin import EDGE_MARGIN
 from sags_node.vision.matchers import SemiGlobal
 from sags_node.vision.observe import observe
@@ -205,7 +206,7 @@ def test_what_cannot_be_matched_is_refused(
 def test_observation_carries_the_frame() -> None:
     pair, truth = plane_pair(28.0, 0.0, 0.0)
     confidence = np.full_like(truth, 0.5)
-    observation = observe(pair, ALL, truth, confidence)
+    observation = observe(pair, ALL, Measured(truth, confidence))
     assert observation.camera is pair.camera
     assert observation.image.dtype == np.float32
     np.testing.assert_allclose(observation.image, pair.left / 255, atol=1e-6)
