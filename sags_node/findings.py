@@ -25,6 +25,7 @@ STAGES: Mapping[str, str] = {  # code -> which stage of the work it is about
     "eyes_knocked": "eyes",
     "rows_differ": "calibration",
     "tissue_too_near": "depth",
+    "picture_frozen": "picture",
     "picture_dark": "picture",
     "picture_bright": "picture",
     "picture_covered": "picture",

@@ -35,6 +35,7 @@ from sags_node.types import (
 )
 from sags_node.vision.change import StillScene, is_repeat
 from sags_node.vision.depth import DepthChoice, Measured
+from sags_node.vision.freeze_watch import FreezeWatch
 from sags_node.vision.lens_watch import LensWatch, OnLenses
 from sags_node.vision.observe import observe
 from sags_node.vision.pair_watch import PairWatch, Verdict
@@ -90,6 +91,7 @@ class Pipeline:
             self._tracker = PoseRefiner(self.mapper)
         self.anchors = Anchors()
         self._still = StillScene()
+        self._freeze = FreezeWatch()
         self._eyes = PairWatch()
         self._lenses = LensWatch()
         self._scene = SceneWatch(moving=vision.pose == "estimate")
@@ -97,9 +99,9 @@ class Pipeline:
         self._unposed: Finding | None = None  # why the newest frame's pose is not known
         self._reset_due = False
         self._mapped: FrameResult | None = None  # the last frame that was really mapped
+        self._depth: Measured | None = None  # of the last frame in which it was measured, or could not be
         self._unwatched = 0.0  # m: how far tissue may have moved in frames that were held since
 
-        self._depth: Measured | None = None  # of the last frame in which it was measured, or could not be
     def reset(self) -> None:
         """Forget the model; the next frame makes a new one, in a new epoch.
 
@@ -130,7 +132,7 @@ class Pipeline:
     @property
     def warnings(self) -> Findings:
         """What is wrong and how to mend it. May be read from any thread."""
-        watches = self._eyes, self._lenses, self.depth, self._scene
+        watches = self._freeze, self._eyes, self._lenses, self.depth, self._scene
         found = [finding for watch in watches for finding in watch.findings]
         lost = None if self._tracker is None else self._tracker.lost
         if lost is not None:
@@ -163,11 +165,14 @@ class Pipeline:
         with watch("rectify"):
             pair = self._placed(frame)
         with watch("watch"):
+            frozen = self._freeze(frame)
             eyes = self._eyes(frame, pair)
         self._on_rectified(pair, self._epoch(frame))
         self._unposed = frame.pose_problem if self._config.vision.pose in ("session", "refine") else None
         if self._unposed is not None and self._mapped is not None:
             return self._held(frame, pair, watch, "pose", self._unposed.text, unseen(pair))
+        if frozen and self._mapped is not None:
+            return self._held(frame, pair, watch, "picture", frozen, unseen(pair))
         if self._reset_due:
             self._forget()
         draws_right = self.draws_right and pair.right is not None
@@ -215,7 +220,7 @@ class Pipeline:
             pair, observation, mapped.snapshot, views, self._epoch(frame), watch.timings_ms,
             skipped, anchors, rung, hurried=measured.hurried,
         )  # fmt: skip
-        return self._mapped
+        return replace(self._mapped, held=frozen) if frozen else self._mapped
 
     def _placed(self, frame: StereoFrame) -> RectifiedPair:
         """The rectified pair; until its pose is found its camera is where it was last, or as it is given."""

@@ -69,7 +69,7 @@ def bench_disturbances(
     smoke         fills the space, drifts, is sucked off; thicker before what is far
     blood         covers half the picture and is sucked off
     fog_right, fog_left, drops      on one lens, on both
-    black_right, frozen_right, late_right (3 frames), knocked, swapped, equal
+    black_right, frozen_right, frozen (both), late_right (3 frames), knocked, swapped, equal
     dark, flicker, flash, blur      the lamp, the exposure, a spark, a shaken scope
     cut           another scene for ten frames
     lost_frames, jpeg               a fifth of the frames; a capture card that compresses too much

@@ -41,6 +41,7 @@ DISTURBANCES = {
         Disturbance("fog_left", lens.fog_left),
         Disturbance("black_right", signal.black_right),
         Disturbance("frozen_right", signal.frozen_right),
+        Disturbance("frozen", signal.frozen),
         Disturbance("late_right", signal.late_right),
         Disturbance("swapped", signal.swapped),
         Disturbance("equal", signal.equal),

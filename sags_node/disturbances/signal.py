@@ -32,6 +32,13 @@ def frozen_right(moment: Moment) -> StereoFrame:
     return replace(moment.frame, right=moment.earlier(moment.index + 1).right)
 
 
+def frozen(moment: Moment) -> StereoFrame:
+    """A live feed shows the last pictures from before it began, again and again, in both eyes."""
+    last = moment.earlier(moment.index + 1)
+    arrival_ns = moment.frame.t_capture_ns  # as a camera's pictures have one, and a recording's have not
+    return replace(moment.frame, left=last.left, right=last.right, t_arrival_ns=arrival_ns)
+
+
 def late_right(moment: Moment) -> StereoFrame:
     """The right eye is `LATE` frames behind, and its stamps do not say so."""
     return replace(moment.frame, right=moment.earlier(LATE).right)

@@ -26,8 +26,8 @@ from sags_node.types import F32, U8, StereoFrame
 
 SESSION = ROOT / "replay/phantom_pull"
 NAMES = (
-    "clean smoke blood fog_right fog_left black_right frozen_right late_right swapped equal drops dark "
-    "flicker flash cut blur lost_frames jpeg knocked"
+    "clean smoke blood fog_right fog_left black_right frozen_right frozen late_right swapped equal drops "
+    "dark flicker flash cut blur lost_frames jpeg knocked"
 )
 LEFT_STAYS = {"fog_right", "black_right", "frozen_right", "late_right", "equal", "knocked"}
 DURING = range(5, 9)
@@ -113,6 +113,15 @@ def test_faults_of_the_right_eye(session: Session, frames: list[StereoFrame]) ->
         assert np.array_equal(swapped[number].left, frame.right)
         assert np.array_equal(equal[number].right, frame.left)
         assert not black[number].right.any()
+
+
+def test_a_feed_that_freezes_is_live(session: Session, frames: list[StereoFrame]) -> None:
+    """Else the node takes it for a recording, which may repeat pictures."""
+    before, given = frames[DURING.start - 1], play("frozen", frames, scene_of(session, frames))
+    for number in DURING:
+        frozen = given[number]
+        assert frozen is not None and frozen.t_arrival_ns > 0
+        assert np.array_equal(frozen.left, before.left) and np.array_equal(frozen.right, before.right)
 
 
 def test_how_long_each_lasts() -> None:
@@ -294,6 +303,16 @@ def test_the_bench_measures_the_phantom(tmp_path: Path) -> None:
         assert drawn.shape == (3 * 288, 4 * 360, 3)
     row = drawn[288 : 2 * 288]
     assert not row[:, 360:720].any() and row[:, :360].mean() > 20  # amid, the right eye is black
+
+
+def test_a_feed_that_freezes_is_warned_of_within_half_a_second(tmp_path: Path) -> None:
+    file = tmp_path / "table.json"
+    result = bench(SESSION, "source.frames:=36", "--only", "frozen", "--from", 12, "--json", file)
+    assert result.exit_code == 0, result.output
+    (row,) = json.loads(file.read_text())["rows"]
+    assert row["warned_of"] == ["picture_frozen"]
+    assert row["warned_after_s"] <= 0.5 and row["cleared_after_s"] == 0.0
+    assert row["restarts"] == 0 and row["anchors_wrong"] == 0
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from places import SESSION
 from sags_node.confidence import SURE
 from sags_node.findings import by_code
 from sags_node.mapping.budget import StepBudget
+from sags_node.messaging.content import OF_THE_MODEL, tells_of
 from sags_node.pipeline import NOTICED_LATE, Pipeline
 from sags_node.session import Session, open_session
 from sags_node.types import U8, Finding, FrameResult, StereoFrame
@@ -169,6 +170,58 @@ def test_a_fault_is_said_and_leaves_no_trace(
     kept = np.isin(clean[FIRST - 1].snapshot.gaussians.ids, results[-1].snapshot.gaussians.ids)
     assert kept.mean() > 0.8
     assert psnr(results[-1], clean[-1]) > psnr(clean[-1], clean[-1]) - 1.0
+
+
+def frozen(frames: list[StereoFrame], during: range, live: bool = True) -> list[StereoFrame]:
+    """The frames as a camera gives them; in `during` the pictures of the one before, under new stamps."""
+    last = frames[during.start - 1]
+    given = [replace(f, t_arrival_ns=f.t_capture_ns + 1 if live else 0) for f in frames]
+    for i in during:
+        given[i] = replace(given[i], left=last.left.copy(), right=both(last, np.array).right)
+    return given
+
+
+@pytest.mark.fault(
+    "picture: both eyes of a live feed are frozen",
+    sees="for 0.3 s the same again, then the frames are held; nothing of the model is sent",
+    says="warning `picture_frozen` within 0.5 s",
+    back="with the next picture that differs",
+    left="the same model: over 80 % of the Gaussians are the same",
+)
+def test_a_live_feed_that_freezes_is_held_and_said(
+    session: Session, frames: list[StereoFrame], clean: list[FrameResult]
+) -> None:
+    during = range(FIRST, FIRST + COUNT)
+    results, codes, pipeline = play(session, frozen(frames, during))
+    said = [i for i, found in enumerate(codes) if "picture_frozen" in found]
+    held = [i for i, result in enumerate(results) if result.held]
+    assert said == held == list(range(FIRST + 2, during.stop))  # 10 Hz: unchanged for 0.3 s then
+    assert all(not tells_of(results[i], topic) for i in held for topic in OF_THE_MODEL)
+    doubts = [np.median(result.snapshot.gaussians.depth_errors) for result in results]
+    assert all(np.diff(doubts[held[0] - 1 : held[-1] + 1]) > 0)
+    assert pipeline.mapper.restarts == 0
+    kept = np.isin(clean[FIRST - 1].snapshot.gaussians.ids, results[-1].snapshot.gaussians.ids)
+    assert kept.mean() > 0.8
+    assert psnr(results[-1], clean[-1]) > psnr(clean[-1], clean[-1]) - 1.0
+
+
+def test_what_a_recording_repeats_is_no_frozen_feed(session: Session, frames: list[StereoFrame]) -> None:
+    during = range(FIRST, FIRST + COUNT)
+    results, codes, _ = play(session, frozen(frames[: during.stop], during, live=False))
+    assert not set().union(*codes) and not any(result.held for result in results)
+    assert all("frame" in results[i].skipped for i in during)
+
+
+def test_a_model_made_of_a_frozen_picture_is_not_shown(session: Session, frames: list[StereoFrame]) -> None:
+    """A reset while the feed is frozen: the picture is old, whatever the model."""
+    given = frozen(frames[: FIRST + COUNT + 1], range(FIRST, FIRST + COUNT))
+    pipeline, budget = Pipeline(session.config, session.rig), StepBudget(2)
+    for i, frame in enumerate(given):
+        if i == FIRST + 4:
+            pipeline.reset()
+        result = pipeline.process(frame, budget)
+        assert bool(result.held) == (FIRST + 2 <= i < FIRST + COUNT)
+    assert result.epoch == 1 and "frame" not in result.skipped
 
 
 @pytest.mark.fault(

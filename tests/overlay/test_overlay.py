@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,20 +17,26 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from command_line import FREE_PORTS
+from places import ROOT
+from ports import free_port
 from test_overlay_drawing import KEY, centre
 
+from sags_node.client import FrameSender
 from sags_node.geometry import project
 from sags_node.messaging.control import ControlClient
 from sags_node.messaging.received import ReceivedCloud, ReceivedImage, ReceivedText
 from sags_node.messaging.rundir import connection_path
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.overlay.draw import color_key
+from sags_node.sources.pictures import read_picture
 from sags_node.types import Camera
 
 pytestmark = pytest.mark.live
 
 MAX_AGE = 0.5  # s
 NOTICED = 0.1  # s more until it is noticed: what docs/wire.md promises
+FROZEN = 0.3  # s after the last new picture, from which on the node shows nothing
 BUSY = 1.0  # s that a busy machine may take on top
 START_SECONDS = 90  # the first start on a machine compiles kernels
 
@@ -267,8 +275,63 @@ def test_it_goes_blank_when_the_node_stops_is_reset_or_dies(
         assert running.poll() is None and watcher.status()["state"] == "blank"
 
 
-def blank_in_time(watcher: Watcher) -> str:
-    """Wait for an empty picture, check that it came in time, and give the reason that status gives."""
+class Scope(threading.Thread):
+    """Hands the phantom's pictures in, there and back, ten a second; frozen, the last pair over and over."""
+
+    def __init__(self, session: Path, endpoint: str) -> None:
+        super().__init__(daemon=True)
+        self.frozen = threading.Event()
+        self.ended = threading.Event()
+        self.newest_ns = 0  # stamp of the last pair that was a new one
+        self._endpoint = endpoint
+        self._pairs = [
+            [read_picture(session / eye / f"{i:04d}.jpg") for eye in ("left", "right")] for i in range(20)
+        ]
+
+    def run(self) -> None:
+        there_and_back = itertools.cycle([*self._pairs, *self._pairs[-2:0:-1]])
+        pair = next(there_and_back)
+        with FrameSender(self._endpoint) as sender:
+            while not self.ended.wait(0.1):
+                stamp_ns = time.time_ns()
+                if not self.frozen.is_set():
+                    pair, self.newest_ns = next(there_and_back), stamp_ns
+                sender.send(*pair, stamp_ns)
+
+
+@pytest.mark.fault(
+    "picture: both eyes of a live feed are frozen, under an overlay",
+    sees="a blank overlay, of no frame from 0.3 s after the last new picture on",
+    says="its status: `stale`, `picture_frozen`",
+    back="when pictures differ again",
+)
+def test_it_goes_blank_when_the_feed_freezes(phantom_session: Path, tmp_path: Path) -> None:
+    """All stamps are fresh, and the node goes on."""
+    run_dir, endpoint = tmp_path / "run", f"tcp://127.0.0.1:{free_port()}"
+    said = [f"source.endpoint:={endpoint}", "source.rate:=10", f"rig:={phantom_session / 'calib'}"]
+    said += ["vision.tissue.method:=none", f"publish.run_dir:={run_dir}", *FREE_PORTS]
+    scope = Scope(phantom_session, endpoint)
+    with process("run", ROOT / "launch/push.yaml", *said) as node:
+        until(connection_path(run_dir, "sags").exists, node)
+        scope.start()
+        try:
+            with overlay(run_dir) as (running, watcher):
+                watcher.pictures(3, drawn=True, seconds=START_SECONDS)
+                scope.frozen.set()
+                drawn, _ = until_blank(watcher)
+                assert drawn.stamp_ns < scope.newest_ns + (FROZEN + BUSY) * 1e9
+                assert str(until(lambda: watcher.status().get("reason"), seconds=5)).startswith("stale")
+                until(lambda: "picture_frozen" in watcher.status()["warning_codes"], running, seconds=5)
+                scope.frozen.clear()
+                watcher.pictures(3, drawn=True)
+                until(lambda: "picture_frozen" not in watcher.status()["warning_codes"], running, seconds=5)
+        finally:
+            scope.ended.set()
+            scope.join(10)
+
+
+def until_blank(watcher: Watcher) -> tuple[ReceivedImage, ReceivedImage]:
+    """The last picture that showed something, and the empty one after it, which came in time."""
     shown = watcher.pictures(1, drawn=True)[-1] if watcher.status()["state"] == "running" else None
     last_shown = (
         watcher._subscriber.latest("left/overlay/image") if shown is None else shown["left/overlay/image"]
@@ -282,6 +345,12 @@ def blank_in_time(watcher: Watcher) -> str:
     assert last_shown is not None and newest.meta.frame_id == -1
     age = (newest.meta.publish_ns - last_shown.stamp_ns) * 1e-9
     assert age < MAX_AGE + NOTICED + BUSY
+    return last_shown, newest
+
+
+def blank_in_time(watcher: Watcher) -> str:
+    """Wait for an empty picture, check that it came in time, and give the reason that status gives."""
+    until_blank(watcher)
     keyed = watcher._subscriber.wait("left/overlay/color_key", 1)
     assert isinstance(keyed, ReceivedImage)
     return str(until(lambda: watcher.status().get("reason"), seconds=5))
