@@ -130,8 +130,8 @@ class Receiver:
         """The newest message of a topic, if it may be shown as new.
 
         Raises:
-            StaleError: it is older than ten periods or `max_age` (s), fewer than 90 % of the messages
-                arrive, the sender says it is not running, or nothing has come.
+            StaleError: it is older than ten periods or `max_age` (s; default 0.5 for what shows a frame),
+                fewer than 90 % of the messages arrive, the sender says it is not running, or nothing came.
         """
         with self._arrived:
             problem = self._problem(name, max_age)

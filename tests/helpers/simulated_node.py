@@ -31,7 +31,7 @@ from sags_node.errors import SagsError
 from sags_node.mapping.budget import TimeBudget
 from sags_node.mapping.ladder import FULL, RUNGS, USED, Ladder, price
 from sags_node.messaging import publisher
-from sags_node.messaging.freshness import MAX_CLOCK_AHEAD, STALE_PERIODS, Freshness
+from sags_node.messaging.freshness import MAX_CLOCK_AHEAD, STALE_AFTER, STALE_PERIODS, Freshness
 from sags_node.messaging.wire import decode
 from sags_node.sources import live_pairs
 from sags_node.sources.sent import SentPictures
@@ -362,7 +362,8 @@ class Run:
                 self.shown[name] += 1
                 taken, wall_ahead = self.source.filmed[fresh.last.stamp_ns]
                 age, set_back = self.world.now - taken, wall_ahead - self.world.wall_ahead
-                limit = STALE_PERIODS * fresh.period + MOST_AHEAD + max(0.0, set_back) + 1e-6
+                limit = min(STALE_PERIODS * fresh.period, STALE_AFTER)
+                limit += MOST_AHEAD + max(0.0, set_back) + 1e-6
                 assert age <= limit, f"{name}: {age:.3f} s old is shown as new"
                 # By the clock that was set back its stamp is so far ahead, but for what the stamp lags.
                 ahead = set_back - age - BEHIND - JITTER
