@@ -6,6 +6,8 @@ import threading
 import time
 from collections import deque
 from collections.abc import Mapping
+from math import inf
+from statistics import median
 
 import numpy as np
 
@@ -13,7 +15,7 @@ from sags_node.findings import Findings, by_code, by_stage
 from sags_node.processes import resident_mb
 from sags_node.types import ClockStatus, Finding, FrameResult, MotionState, NodeHealth, RungState, ViewStatus
 
-WAITING_AFTER = 1.0  # s without a frame
+WAITING_AFTER = 1.0  # s without a frame, or without one that was taken in
 WINDOW = 150  # frames behind the published rates and latencies
 MOST_LEFT_OUT = 0.1  # of the frames; a strict reader refuses what comes less often (`messaging.freshness`)
 BACK_AT = 0.8  # of that: a warning ends
@@ -25,6 +27,7 @@ class Statistics:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._published: deque[float] = deque(maxlen=WINDOW)
+        self._taken_in = -inf  # when a frame was published that was
         self._latency: deque[float] = deque(maxlen=WINDOW)
         self._stages: dict[str, deque[float]] = {}
         self._skipped: dict[str, int] = {}
@@ -34,6 +37,9 @@ class Statistics:
         self._started = False
         self._left_out: deque[Mapping[str, int]] = deque(maxlen=WINDOW)  # slot -> frames, since the start
         self._too_many: set[str] = set()  # slots that leave out too much
+        # Median time from capture to published; 0 before the first frame. Read without the lock, which others
+        # may hold for long.
+        self.latency_s = 0.0
 
     def add(self, result: FrameResult, latency_ms: float, dropped: Mapping[str, int]) -> None:
         """Take a published frame; `dropped`: how many each slot has left out until now."""
@@ -41,7 +47,10 @@ class Statistics:
             self._left_out.append(dropped)
             self._started = True
             self._published.append(time.monotonic())
+            if not result.held:
+                self._taken_in = self._published[-1]
             self._latency.append(latency_ms)
+            self.latency_s = 1e-3 * median(self._latency)
             for stage, ms in result.timings_ms.items():
                 self._stages.setdefault(stage, deque(maxlen=WINDOW)).append(ms)
             for what in result.skipped:
@@ -79,6 +88,8 @@ class Statistics:
                 state = "paused"
             elif waiting:
                 state = "waiting" if self._started else "starting"
+            elif now - self._taken_in > WAITING_AFTER:
+                state = "held"
             else:
                 state = "running"
             latency = np.array(self._latency) if self._latency else np.zeros(1)
@@ -105,13 +116,7 @@ class Statistics:
                 clock=clock,
             )
 
-    @property
-    def latency_s(self) -> float:
-        """Median time from capture to published; 0 before the first frame."""
-        with self._lock:
-            return float(np.median(self._latency)) * 1e-3 if self._latency else 0.0
-
-    def _findings(self, state: str, now: float) -> list[Finding]:
+    def _findings(self, state: str, now: float, missed: str) -> list[Finding]:
         """What the flow of frames says; asked with the lock held."""
         found = []
         if state == "waiting":

@@ -270,7 +270,7 @@ def diagnostics(health: NodeHealth, stamp_ns: int) -> Content:
         },
     }
     statuses = [Status("node", level, health.last_error or health.state, values)]
-    running = health.state in ("running", "degraded")
+    running = health.state in ("running", "held", "degraded")
     for stage, ms in health.stage_ms.items():
         statuses.append(Status(stage, 0 if running else 3, f"{ms:.1f} ms", {"ms": f"{ms:.3f}"}))
     statuses += [

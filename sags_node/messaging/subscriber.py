@@ -33,7 +33,8 @@ from sags_node.messaging.stream import POLL_MS, check_topic, data_socket, receiv
 from sags_node.messaging.wire import WireError
 
 KEPT = 4  # newest messages of a topic, so that topics of one frame can be joined by stamp
-VALID_STATES = ("running", "degraded")  # of the node, in `status`
+# Of the node, in `status`. While frames are held their pictures are true, and nothing of the model is sent.
+VALID_STATES = ("running", "held", "degraded")
 _ALWAYS = frozenset({"status"})
 
 
