@@ -135,6 +135,15 @@ def test_control_socket_reads_changes_and_saves(node: RunningNode, tmp_path: Pat
             client.request("make_coffee")
 
 
+def test_no_thread_gives_way_to_others(node: RunningNode) -> None:
+    """They share the interpreter: one that is kept from the processor while it holds it keeps all waiting."""
+    threads = [int(thread) for thread in os.listdir(f"/proc/{node.process.pid}/task")]
+    assert len(threads) > 5
+    assert {os.sched_getscheduler(thread) for thread in threads} == {os.SCHED_OTHER}
+    own = os.getpriority(os.PRIO_PROCESS, node.process.pid)
+    assert {os.getpriority(os.PRIO_PROCESS, thread) for thread in threads} == {own}
+
+
 def test_reset_makes_a_new_model_and_a_new_epoch(node: RunningNode) -> None:
     topic = "sags/left/render/image"
     before = independent_client.collect(node.data, [topic], 1, 20)[topic][0].meta

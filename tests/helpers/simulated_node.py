@@ -272,7 +272,6 @@ class Run:
         patch.setattr(node, "os", self._wake)
         patch.setattr(node, "Pipeline", lambda *_: Pipeline(self))
         patch.setattr(node, "configure_threads", lambda _: None)
-        patch.setattr(node, "prepare_thread", lambda: None)
         patch.setattr(publisher, "zmq", self._network)
         patch.setattr(publisher, "Peers", _Peers)
         patch.setattr(
