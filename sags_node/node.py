@@ -148,6 +148,7 @@ class Node:
         for thread, ended in zip(self._threads, self._ended.values(), strict=True):
             if thread.ident is not None:  # it was started
                 ended.wait(STOP_SECONDS)
+        self._operations.finish(STOP_SECONDS)
         self._recorder.close()
         if self._masks is not None:
             self._masks.close()
