@@ -11,6 +11,7 @@ from statistics import median
 
 import numpy as np
 
+from sags_node.config import MappingConfig
 from sags_node.findings import Findings, by_code, by_stage
 from sags_node.processes import resident_mb
 from sags_node.types import ClockStatus, Finding, FrameResult, MotionState, NodeHealth, RungState, ViewStatus
@@ -19,6 +20,29 @@ WAITING_AFTER = 1.0  # s without a frame, or without one that was taken in
 WINDOW = 150  # frames behind the published rates and latencies
 MOST_LEFT_OUT = 0.1  # of the frames; a strict reader refuses what comes less often (`messaging.freshness`)
 BACK_AT = 0.8  # of that: a warning ends
+LONGER = 1.05  # times the time from frame to frame: a budget that is rounded is none that is too long
+
+
+TOO_SLOW = (
+    "this machine is too slow for them: end other programs, or lower mapping.max_gaussians, vision.width and "
+    "vision.height"
+)
+
+
+def why_missed(mapping: MappingConfig, rate: float | None) -> str:
+    """Why frames are left out, if they are, and the remedy.
+
+    Args:
+        rate: frames that come a second; None: they come when they are taken.
+    """
+    if mapping.iterations is not None:
+        return "mapping.iterations fixes the work on each: lower it, or leave it out"
+    if rate is not None and mapping.frame_ms(rate) > LONGER * 1e3 / rate:
+        of = f"of {mapping.budget_ms:g} is longer than the {1e3 / rate:.1f} ms from frame to frame"
+        return f"mapping.budget_ms {of}: leave it out"
+    if mapping.rung is not None:
+        return "mapping.rung fixes the quality: lower it, or leave it out"
+    return TOO_SLOW
 
 
 class Statistics:
@@ -75,7 +99,9 @@ class Statistics:
         connections: dict[str, dict[str, int]],
         views: Mapping[str, ViewStatus],
         clock: ClockStatus | None = None,
+        missed: str = TOO_SLOW,
     ) -> NodeHealth:
+        """`missed`: why frames are left out, if they are, and the remedy."""
         with self._lock:
             now = time.monotonic()
             waiting = not self._published or now - self._published[-1] > WAITING_AFTER
@@ -108,7 +134,7 @@ class Statistics:
                 rss_mb=resident_mb(),
                 skipped=dict(self._skipped),
                 last_error=str(error) if error else None,
-                warnings={**warnings, **by_stage(self._findings(state, now))},
+                warnings={**warnings, **by_stage(self._findings(state, now, missed))},
                 connections=connections,
                 views=views,
                 rung=self._rung,
@@ -127,9 +153,7 @@ class Statistics:
             mend = "is one camera away, source.pair_tolerance_ms too small, or the disk slow?"
             found.append(Finding("source_drops", f"the source leaves out over a tenth of its frames: {mend}"))
         if self._leaves_out_too_many("capture"):
-            mend = "end other programs, or lower mapping.max_gaussians, vision.width and vision.height"
-            said = "over a tenth of the frames is left out, as this machine is too slow for them"
-            found.append(Finding("frames_missed", f"{said}: {mend}"))
+            found.append(Finding("frames_missed", f"over a tenth of the frames is left out, as {missed}"))
         return found
 
     def _leaves_out_too_many(self, slot: str) -> bool:

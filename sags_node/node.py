@@ -25,7 +25,7 @@ from sags_node.allowance import Allowance, Pace
 from sags_node.config import LaunchConfig, LiveSource
 from sags_node.errors import SagsError
 from sags_node.findings import by_code
-from sags_node.health import Statistics, in_a_line
+from sags_node.health import Statistics, in_a_line, why_missed
 from sags_node.kernels.threads import configure_threads
 from sags_node.latest import Latest
 from sags_node.messaging import content
@@ -39,6 +39,7 @@ from sags_node.pipeline import Pipeline
 from sags_node.recording.child import RecorderProcess
 from sags_node.service_manager import ServiceManager
 from sags_node.sources.clock import CaptureClock
+from sags_node.sources.rate import FrameRate
 from sags_node.sources.source import Source
 from sags_node.types import DrawnView, FrameResult, NodeHealth, RectifiedPair, StereoFrame, StereoRig
 from sags_node.views import Views
@@ -75,18 +76,20 @@ class Node:
         self._source = source
         self._on_result = on_result
         self._masks: MaskSubscriber | None = None
+        self._live = config.in_real_time
+        rate = source.rate if self._live else None
+        self._rate = FrameRate(source.rate) if isinstance(config.source, LiveSource) else None
         if config.vision.tissue.endpoint is not None and config.vision.tissue.method == "topic":
             self._masks = MaskSubscriber(config.vision.tissue.endpoint, config.vision.tissue.ns)
-            pipeline = Pipeline(config, rig, self._masks.nearest, self._offer_picture)
+            pipeline = Pipeline(config, rig, self._masks.nearest, self._offer_picture, rate=rate)
         else:
-            pipeline = Pipeline(config, rig)
+            pipeline = Pipeline(config, rig, rate=rate)
         statistics = Statistics()
         self._allowance = Allowance()
         views = Views(config.engine.backend, self._allowance, latency=lambda: statistics.latency_s)
         self._state = NodeState(config, pipeline, pipeline.make_budget(), views, statistics=statistics)
         self._operations = Operations(self._state, self._hand_over_view)
         self._pictures: Latest[tuple[RectifiedPair, int]] = Latest(on_put=self._wake_publishing)  # and epoch
-        self._live = isinstance(config.source, LiveSource) or config.source.pace == "realtime"
         self._clock = CaptureClock()  # of live pictures
         self._manager = manager or ServiceManager({})
         self._wake = os.eventfd(0, os.EFD_NONBLOCK)
@@ -171,6 +174,7 @@ class Node:
             paused=self._state.paused.is_set(),
             error=self._error,
             warnings=self._state.pipeline.warnings,
+            missed=why_missed(self._state.config.mapping, self._state.pipeline.rate),
             connections=self._publisher.connections,
             views=self._state.views.status,
             clock=self._clock.status(),
@@ -227,6 +231,9 @@ class Node:
             came = self._frames.get(timeout=REQUEST_WAIT)
             if came is not None and not self._state.paused.is_set():
                 frame, at = came
+                if self._rate is not None and self._rate.add(frame):
+                    self._state.pipeline.rate = self._rate.hz
+                    self._operations.reconfigure()
                 waited = time.monotonic() - at if self._live else 0.0
                 self._state.pipeline.anchors.latency_s = self._state.statistics.latency_s
                 result = self._state.pipeline.process(frame, self._state.budget, waited)
