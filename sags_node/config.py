@@ -582,9 +582,18 @@ class VisionConfig(Section):
     """The pictures that are worked on, and where the camera is."""
 
     width: int | None = Field(
-        None, ge=16, le=4096, description="px; pictures are brought to this size; default: the calibration's"
+        None,
+        ge=16,
+        le=4096,
+        description="px; pictures are brought to this size; default: the calibration's, or what keeps its "
+        "proportions where vision.height is set",
     )
-    height: int | None = Field(None, ge=16, le=4096, description="px; default: the calibration's")
+    height: int | None = Field(
+        None,
+        ge=16,
+        le=4096,
+        description="px; default: the calibration's, or what keeps its proportions where vision.width is set",
+    )
     stereo: StereoConfig = StereoConfig()
     onnx: OnnxConfig = OnnxConfig()
     tissue: TissueConfig = TissueConfig()
@@ -596,8 +605,13 @@ class VisionConfig(Section):
     )
 
     def working_size(self, width: int, height: int) -> tuple[int, int]:
-        """Width and height of the pictures that are worked on, for a camera of `width` x `height` px."""
-        return self.width or width, self.height or height
+        """Width and height of the pictures that are worked on, for a camera of `width` x `height` px. Where
+        one is set, the other keeps the proportions."""
+        if self.width is not None:
+            return self.width, self.height or round(height * self.width / width)
+        if self.height is not None:
+            return round(width * self.height / height), self.height
+        return width, height
 
 
 class EngineConfig(Section):
@@ -613,10 +627,19 @@ class EngineConfig(Section):
     )
 
 
+USUAL_MS = 33.0  # of a frame, where nothing says when the next one comes
+LONGEST_MS = 100.0  # of a frame, where they come more seldom: what is shown of it must still be new
+
+
 class MappingConfig(Section):
     """How the model is built, and what it may cost."""
 
-    budget_ms: float = Field(33.0, gt=0, description="wall time of one frame, all stages")
+    budget_ms: float | None = Field(
+        None,
+        gt=0,
+        description="wall time of one frame, all stages; default: as long as it is until the next one comes, "
+        "100 at most; 33 where a recording is not played in real time",
+    )
     iterations: int | None = Field(None, ge=0, description="fixed steps per frame instead of the budget")
     rung: int | None = Field(
         None,
@@ -645,6 +668,18 @@ class MappingConfig(Section):
         "predicted to the moment of a display; default: once an anchor or a view asks for `ahead_ms`",
     )
     skip_still: bool = Field(True, description="while nothing moves: no matching, a step where it pays most")
+
+    def frame_ms(self, rate: float | None = None) -> float:
+        """What a frame may take, ms.
+
+        Args:
+            rate: frames that come a second; None: they come when they are taken.
+        """
+        if self.budget_ms is not None:
+            return self.budget_ms
+        if rate is None or self.iterations is not None:
+            return USUAL_MS
+        return min(1e3 / rate, LONGEST_MS)
 
 
 class PublishConfig(Guarded):
@@ -706,6 +741,11 @@ class LaunchConfig(Section):
         if self.robot is not None and self.vision.pose not in ("session", "refine"):
             raise ValueError(f"robot says where the scope is, vision.pose {self.vision.pose} too: choose one")
         return self
+
+    @property
+    def in_real_time(self) -> bool:
+        """Frames come whether or not they are taken."""
+        return isinstance(self.source, LiveSource) or self.source.pace == "realtime"
 
     @property
     def one_camera(self) -> bool:

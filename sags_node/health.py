@@ -6,17 +6,43 @@ import threading
 import time
 from collections import deque
 from collections.abc import Mapping
+from math import inf
+from statistics import median
 
 import numpy as np
 
+from sags_node.config import MappingConfig
 from sags_node.findings import Findings, by_code, by_stage
 from sags_node.processes import resident_mb
 from sags_node.types import ClockStatus, Finding, FrameResult, MotionState, NodeHealth, RungState, ViewStatus
 
-WAITING_AFTER = 1.0  # s without a frame
+WAITING_AFTER = 1.0  # s without a frame, or without one that was taken in
 WINDOW = 150  # frames behind the published rates and latencies
 MOST_LEFT_OUT = 0.1  # of the frames; a strict reader refuses what comes less often (`messaging.freshness`)
 BACK_AT = 0.8  # of that: a warning ends
+LONGER = 1.05  # times the time from frame to frame: a budget that is rounded is none that is too long
+
+
+TOO_SLOW = (
+    "this machine is too slow for them: end other programs, or lower mapping.max_gaussians, vision.width and "
+    "vision.height"
+)
+
+
+def why_missed(mapping: MappingConfig, rate: float | None) -> str:
+    """Why frames are left out, if they are, and the remedy.
+
+    Args:
+        rate: frames that come a second; None: they come when they are taken.
+    """
+    if mapping.iterations is not None:
+        return "mapping.iterations fixes the work on each: lower it, or leave it out"
+    if rate is not None and mapping.frame_ms(rate) > LONGER * 1e3 / rate:
+        of = f"of {mapping.budget_ms:g} is longer than the {1e3 / rate:.1f} ms from frame to frame"
+        return f"mapping.budget_ms {of}: leave it out"
+    if mapping.rung is not None:
+        return "mapping.rung fixes the quality: lower it, or leave it out"
+    return TOO_SLOW
 
 
 class Statistics:
@@ -25,6 +51,7 @@ class Statistics:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._published: deque[float] = deque(maxlen=WINDOW)
+        self._taken_in = -inf  # when a frame was published that was
         self._latency: deque[float] = deque(maxlen=WINDOW)
         self._stages: dict[str, deque[float]] = {}
         self._skipped: dict[str, int] = {}
@@ -34,6 +61,9 @@ class Statistics:
         self._started = False
         self._left_out: deque[Mapping[str, int]] = deque(maxlen=WINDOW)  # slot -> frames, since the start
         self._too_many: set[str] = set()  # slots that leave out too much
+        # Median time from capture to published; 0 before the first frame. Read without the lock, which others
+        # may hold for long.
+        self.latency_s = 0.0
 
     def add(self, result: FrameResult, latency_ms: float, dropped: Mapping[str, int]) -> None:
         """Take a published frame; `dropped`: how many each slot has left out until now."""
@@ -41,7 +71,10 @@ class Statistics:
             self._left_out.append(dropped)
             self._started = True
             self._published.append(time.monotonic())
+            if not result.held:
+                self._taken_in = self._published[-1]
             self._latency.append(latency_ms)
+            self.latency_s = 1e-3 * median(self._latency)
             for stage, ms in result.timings_ms.items():
                 self._stages.setdefault(stage, deque(maxlen=WINDOW)).append(ms)
             for what in result.skipped:
@@ -66,7 +99,9 @@ class Statistics:
         connections: dict[str, dict[str, int]],
         views: Mapping[str, ViewStatus],
         clock: ClockStatus | None = None,
+        missed: str = TOO_SLOW,
     ) -> NodeHealth:
+        """`missed`: why frames are left out, if they are, and the remedy."""
         with self._lock:
             now = time.monotonic()
             waiting = not self._published or now - self._published[-1] > WAITING_AFTER
@@ -79,6 +114,8 @@ class Statistics:
                 state = "paused"
             elif waiting:
                 state = "waiting" if self._started else "starting"
+            elif now - self._taken_in > WAITING_AFTER:
+                state = "held"
             else:
                 state = "running"
             latency = np.array(self._latency) if self._latency else np.zeros(1)
@@ -97,7 +134,7 @@ class Statistics:
                 rss_mb=resident_mb(),
                 skipped=dict(self._skipped),
                 last_error=str(error) if error else None,
-                warnings={**warnings, **by_stage(self._findings(state, now))},
+                warnings={**warnings, **by_stage(self._findings(state, now, missed))},
                 connections=connections,
                 views=views,
                 rung=self._rung,
@@ -105,13 +142,7 @@ class Statistics:
                 clock=clock,
             )
 
-    @property
-    def latency_s(self) -> float:
-        """Median time from capture to published; 0 before the first frame."""
-        with self._lock:
-            return float(np.median(self._latency)) * 1e-3 if self._latency else 0.0
-
-    def _findings(self, state: str, now: float) -> list[Finding]:
+    def _findings(self, state: str, now: float, missed: str) -> list[Finding]:
         """What the flow of frames says; asked with the lock held."""
         found = []
         if state == "waiting":
@@ -122,9 +153,7 @@ class Statistics:
             mend = "is one camera away, source.pair_tolerance_ms too small, or the disk slow?"
             found.append(Finding("source_drops", f"the source leaves out over a tenth of its frames: {mend}"))
         if self._leaves_out_too_many("capture"):
-            mend = "end other programs, or lower mapping.max_gaussians, vision.width and vision.height"
-            said = "over a tenth of the frames is left out, as this machine is too slow for them"
-            found.append(Finding("frames_missed", f"{said}: {mend}"))
+            found.append(Finding("frames_missed", f"over a tenth of the frames is left out, as {missed}"))
         return found
 
     def _leaves_out_too_many(self, slot: str) -> bool:

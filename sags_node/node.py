@@ -5,8 +5,8 @@ r"""The running node: five threads and the slots between them.
 
 Slots hold the newest value only (live), or hand every value over (recordings not played in real time).
 The sockets live on the publishing thread; what a client asks of the model runs on the mapping thread,
-between two frames. Consumers' own views are drawn, and thin pictures made, on threads that give way to all
-others.
+between two frames. Consumers' own views are drawn, and thin pictures made, on threads of their own, which
+take no more of a core than `allowance` says.
 """
 
 from __future__ import annotations
@@ -21,10 +21,11 @@ from concurrent.futures import Future
 from dataclasses import replace
 from typing import Any
 
+from sags_node.allowance import Allowance, Pace
 from sags_node.config import LaunchConfig, LiveSource
 from sags_node.errors import SagsError
 from sags_node.findings import by_code
-from sags_node.health import Statistics, in_a_line
+from sags_node.health import Statistics, in_a_line, why_missed
 from sags_node.kernels.threads import configure_threads
 from sags_node.latest import Latest
 from sags_node.messaging import content
@@ -38,9 +39,10 @@ from sags_node.pipeline import Pipeline
 from sags_node.recording.child import RecorderProcess
 from sags_node.service_manager import ServiceManager
 from sags_node.sources.clock import CaptureClock
+from sags_node.sources.rate import FrameRate
 from sags_node.sources.source import Source
 from sags_node.types import DrawnView, FrameResult, NodeHealth, RectifiedPair, StereoFrame, StereoRig
-from sags_node.views import Views, prepare_thread
+from sags_node.views import Views
 
 log = logging.getLogger(__name__)
 
@@ -74,23 +76,26 @@ class Node:
         self._source = source
         self._on_result = on_result
         self._masks: MaskSubscriber | None = None
+        self._live = config.in_real_time
+        rate = source.rate if self._live else None
+        self._rate = FrameRate(source.rate) if isinstance(config.source, LiveSource) else None
         if config.vision.tissue.endpoint is not None and config.vision.tissue.method == "topic":
             self._masks = MaskSubscriber(config.vision.tissue.endpoint, config.vision.tissue.ns)
-            pipeline = Pipeline(config, rig, self._masks.nearest, self._offer_picture)
+            pipeline = Pipeline(config, rig, self._masks.nearest, self._offer_picture, rate=rate)
         else:
-            pipeline = Pipeline(config, rig)
+            pipeline = Pipeline(config, rig, rate=rate)
         statistics = Statistics()
-        views = Views(config.engine.backend, latency=lambda: statistics.latency_s)
+        self._allowance = Allowance()
+        views = Views(config.engine.backend, self._allowance, latency=lambda: statistics.latency_s)
         self._state = NodeState(config, pipeline, pipeline.make_budget(), views, statistics=statistics)
         self._operations = Operations(self._state, self._hand_over_view)
         self._pictures: Latest[tuple[RectifiedPair, int]] = Latest(on_put=self._wake_publishing)  # and epoch
-        self._live = isinstance(config.source, LiveSource) or config.source.pace == "realtime"
         self._clock = CaptureClock()  # of live pictures
         self._manager = manager or ServiceManager({})
         self._wake = os.eventfd(0, os.EFD_NONBLOCK)
         self._frames: Latest[tuple[StereoFrame, float]] = Latest()  # and when it came
         self._results: Latest[FrameResult] = Latest(on_put=self._wake_publishing)
-        self._scenes: Latest[tuple[FrameResult, bool]] = Latest()  # and whether frames were missed
+        self._scenes: Latest[FrameResult] = Latest()
         self._whole: Latest[tuple[FrameResult, Mapping[str, ThinPicture]]] = Latest()  # and what is asked for
         self._thin: Latest[tuple[FrameResult, dict[str, Content]]] = Latest(on_put=self._wake_publishing)
         # By name, the newest only; None: closed. Single operations on a dict need no lock.
@@ -146,6 +151,7 @@ class Node:
         for thread, ended in zip(self._threads, self._ended.values(), strict=True):
             if thread.ident is not None:  # it was started
                 ended.wait(STOP_SECONDS)
+        self._operations.finish(STOP_SECONDS)
         self._recorder.close()
         if self._masks is not None:
             self._masks.close()
@@ -168,6 +174,7 @@ class Node:
             paused=self._state.paused.is_set(),
             error=self._error,
             warnings=self._state.pipeline.warnings,
+            missed=why_missed(self._state.config.mapping, self._state.pipeline.rate),
             connections=self._publisher.connections,
             views=self._state.views.status,
             clock=self._clock.status(),
@@ -224,6 +231,9 @@ class Node:
             came = self._frames.get(timeout=REQUEST_WAIT)
             if came is not None and not self._state.paused.is_set():
                 frame, at = came
+                if self._rate is not None and self._rate.add(frame):
+                    self._state.pipeline.rate = self._rate.hz
+                    self._operations.reconfigure()
                 waited = time.monotonic() - at if self._live else 0.0
                 self._state.pipeline.anchors.latency_s = self._state.statistics.latency_s
                 result = self._state.pipeline.process(frame, self._state.budget, waited)
@@ -231,30 +241,34 @@ class Node:
                     continue
                 give(result)
                 dropped, before = self._frames.dropped, dropped
+                self._allowance.frame(waited, missed=dropped > before)
                 if not result.held:
-                    self._scenes.put((result, dropped > before))
+                    self._scenes.put(result)
         self._operations.for_mapping.serve()
 
     def _draw_views(self) -> None:
-        prepare_thread()
-        newest: FrameResult | None = None
+        configure_threads(1)
         while not self._scenes.closed:
-            came = self._scenes.get(timeout=REQUEST_WAIT)
-            if came is not None:
-                newest, missed = came
-                for name, drawn in self._state.views.draw_due(newest, self._watched, missed):
+            scene = self._scenes.get(timeout=REQUEST_WAIT)
+            if scene is not None:
+                for name, drawn in self._state.views.draw_due(scene, self._watched):
                     self._hand_over_view(name, drawn)
-            self._state.scene = newest
+                self._state.scene = scene
             self._operations.for_drawing.serve()
         self._operations.for_drawing.serve()
 
     def _make_thin(self) -> None:
-        prepare_thread()
+        configure_threads(1)
+        pace = Pace(self._allowance)
+        logged: set[str] = set()
         while not self._whole.closed:
             came = self._whole.get(timeout=REQUEST_WAIT)
-            if came is not None:
-                result, asked = came
-                self._thin.put((result, thin_pictures(result, asked)))
+            if came is None or not pace.is_due(time.monotonic()):
+                continue
+            result, asked = came
+            started = time.thread_time()
+            self._thin.put((result, thin_pictures(result, asked, logged)))
+            pace.worked(time.monotonic(), time.thread_time() - started)
 
     def _hand_over_view(self, name: str, drawn: DrawnView | None) -> None:
         self._drawn[name] = drawn

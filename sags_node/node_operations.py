@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -50,7 +50,7 @@ class NodeState:
 
 class Operations:
     """Answers requests of clients. Those that touch the model wait for the mapping thread, those that touch
-    views for the drawing thread.
+    views for the drawing thread. A disk may hang: each file is written by a thread of its own.
 
     Args:
         show_view: called with a view's name and what is to be published of it; None: it is closed.
@@ -61,6 +61,7 @@ class Operations:
         self._show_view = show_view
         self.for_mapping = Requests()
         self.for_drawing = Requests()
+        self._saving: list[Future[Any]] = []  # models that are being written
 
     def handlers(self) -> dict[str, Callable[[dict[str, Any]], Any]]:
         """By the operation's name; a `Future` where another thread does the work."""
@@ -74,7 +75,7 @@ class Operations:
             "remove_anchor": lambda args: self.for_mapping.post(lambda: self._remove_anchor(args)),
             "open_view": lambda args: self.for_drawing.post(lambda: self._open_view(args)),
             "close_view": lambda args: self.for_drawing.post(lambda: self._close_view(args)),
-            "save_model": lambda args: self.for_mapping.post(lambda: self._save_model(args)),
+            "save_model": self._save_model,
         }
 
     def _set_parameters(self, args: dict[str, Any]) -> dict[str, Any]:
@@ -85,10 +86,14 @@ class Operations:
                 f"what can: {', '.join(LIVE_PARAMETERS)}"
             )
         self._state.config = with_parameters(self._state.config, args)
-        self._state.pipeline.reconfigure(self._state.config)
-        self._state.budget = self._state.pipeline.make_budget(self._state.budget.speed)
+        self.reconfigure()
         self._state.parameters_changed.set()
         return self._state.config.model_dump(mode="json")
+
+    def reconfigure(self) -> None:
+        """Let frames get what the configuration, or the rate of frames, says now; on the mapping thread."""
+        self._state.pipeline.reconfigure(self._state.config)
+        self._state.budget = self._state.pipeline.make_budget(self._state.budget.speed)
 
     def _reset_model(self) -> dict[str, Any]:
         self._state.pipeline.reset()
@@ -144,18 +149,29 @@ class Operations:
         self._show_view(name, None)
         return {}
 
-    def _save_model(self, args: dict[str, Any]) -> dict[str, Any]:
+    def _save_model(self, args: dict[str, Any]) -> Future[Any]:
         path = args.get("path")
         if not isinstance(path, str) or not path.endswith(".ply"):
             raise SagsError("save_model needs a path that ends in .ply")
         if "\0" in path:
             raise SagsError("a path cannot hold a zero character")
-        gaussians = self._state.pipeline.mapper.model.frozen()
-        if len(gaussians) == 0:
+        newest = self._state.pipeline.newest
+        if newest is None or len(newest.snapshot.gaussians) == 0:
             raise SagsError("there is no model yet; wait for the first frame")
-        file = Path(path).absolute()
-        write_ply(file, gaussians)
-        return {"path": str(file), "gaussians": len(gaussians)}
+        file, gaussians = Path(path).absolute(), newest.snapshot.gaussians  # never changed any more
+
+        def write() -> dict[str, Any]:
+            write_ply(file, gaussians)
+            return {"path": str(file), "gaussians": len(gaussians)}
+
+        saved: Future[Any] = Future()
+        self._saving = [one for one in self._saving if not one.done()] + [saved]
+        threading.Thread(target=_answer, args=(saved, write), name="save-model", daemon=True).start()
+        return saved
+
+    def finish(self, seconds: float) -> None:
+        """Wait so long at most for models that are being written."""
+        wait(self._saving, seconds)
 
 
 class Requests:
@@ -170,13 +186,18 @@ class Requests:
         return future
 
     def serve(self) -> None:
-        """Do all that waits; its failure is the answer, and does not end the thread."""
+        """Do all that waits."""
         while True:
             try:
                 work, future = self._waiting.get_nowait()
             except Empty:
                 return
-            try:
-                future.set_result(work())
-            except Exception as error:  # a client's request must not end the node; it is the answer
-                future.set_exception(error)
+            _answer(future, work)
+
+
+def _answer(future: Future[Any], work: Callable[[], Any]) -> None:
+    """Do it; its failure is the answer, and does not end the thread."""
+    try:
+        future.set_result(work())
+    except Exception as error:
+        future.set_exception(error)

@@ -54,8 +54,10 @@ class Pipeline:
     Args:
         masks: of another process, for `vision.tissue.method` topic.
         on_rectified: called with each pair and its epoch, before anything else is done with it.
+        rate: see below.
 
     Attributes:
+        rate: frames that come a second; None: they come when they are taken. `reconfigure` after a change.
         draws_right: somebody looks at the right eye. It is drawn then, where there is one. Any thread may
             change this.
     """
@@ -66,7 +68,9 @@ class Pipeline:
         rig: StereoRig,
         masks: NearestMask | None = None,
         on_rectified: Callable[[RectifiedPair, int], None] = lambda pair, epoch: None,
+        rate: float | None = None,
     ) -> None:
+        self.rate = rate
         vision = config.vision
         width, height = vision.working_size(rig.left.width, rig.left.height)
         self.rectifier = Rectifier(rig, width, height)
@@ -79,7 +83,7 @@ class Pipeline:
             self._refiner,
             affordable(config, width, height),
             config.mapping.smoothing,
-            unhurried=config.mapping.budget_ms >= UNHURRIED_MS,
+            unhurried=config.mapping.frame_ms(rate) >= UNHURRIED_MS,
             field=config.mapping.field is True,
         )
         self.draws_right = config.publish.right is True
@@ -149,13 +153,13 @@ class Pipeline:
     def reconfigure(self, config: LaunchConfig) -> None:
         """Take changed parameters over; the model stays."""
         self._config = config
-        self.mapper.pace(config.mapping.budget_ms >= UNHURRIED_MS)
+        self.mapper.pace(config.mapping.frame_ms(self.rate) >= UNHURRIED_MS)
 
     def make_budget(self, speed: float | None = None) -> Budget:
         """What frames get, by the configuration and how long this machine takes (`Ladder.speed`); None: it is
         measured now, which takes less than a tenth of a second."""
         camera = self.rectifier.camera
-        return make_budget(self._config, camera.width, camera.height, speed)
+        return make_budget(self._config, camera.width, camera.height, speed, self.rate)
 
     def process(self, frame: StereoFrame, budget: Budget, waited: float = 0.0) -> FrameResult:
         """Everything that happens to one frame, `waited` seconds after it came."""

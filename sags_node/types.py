@@ -354,7 +354,7 @@ class ClockStatus:
 class NodeHealth:
     """What the node says of itself once a second, also when no frames come."""
 
-    state: str  # starting | running | waiting | paused | degraded | stopping
+    state: str  # starting | running | held | waiting | paused | degraded | stopping
     rate_hz: float
     latency_ms: Mapping[str, float]  # p50, p90, p99, max over the last seconds
     stage_ms: Mapping[str, float]

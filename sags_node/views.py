@@ -1,13 +1,13 @@
 """Viewpoints that consumers asked for, drawn from the newest snapshot beside the mapping.
 
-Mapping goes first. All views together get `SHARE` of one core, and `LEAST_SHARE` while the mapping misses
-frames; it is split so that each keeps the same part of the rate it asked for. A view that nobody subscribes
-to is not drawn. Used from one thread; only `status` and `pairs` may be read by others.
+Mapping goes first. All views together get a share of one core, see `allowance`; it is split so that each
+keeps the same part of the rate it asked for. A view that nobody subscribes to is not drawn. Used from one
+thread; only `status` and `pairs` may be read by others.
 """
 
 from __future__ import annotations
 
-import os
+import logging
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping
@@ -15,25 +15,23 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from sags_node.allowance import SHARE, Allowance
 from sags_node.engine.interface import Rasterizer
 from sags_node.engine.rasterizer.confidence import with_confidence
 from sags_node.engine.rasterizer.rasterize import make_rasterizer, to_view
 from sags_node.errors import SagsError
 from sags_node.geometry import scale_intrinsics
-from sags_node.kernels.threads import configure_threads
 from sags_node.messaging.requests import ViewRequest
 from sags_node.model.forecast import gaussians_ahead, reached
 from sags_node.model.gaussians import for_right_eye
 from sags_node.types import Camera, DrawnView, FrameResult, RenderedView, ViewStatus
 
 MAX_VIEWS = 8
-SHARE = 0.25  # of one core, for all views together
-LEAST_SHARE = 0.05  # while the mapping is behind: less than its own rate varies by
-BEHIND = 0.05  # share of missed frames from which on it is
 HELD_OVER = 5.0  # s over which the held rate is counted
 EARLY = 0.25  # of a period: a view that is nearly due is drawn rather than left to the next frame
 LEARNING = 0.2  # share of a new measurement in a running mean of costs
-FORGETTING = 0.03  # the same for missed frames: about a second
+
+log = logging.getLogger(__name__)
 
 Clock = Callable[[], float]
 
@@ -44,17 +42,12 @@ class _View:
     due: float  # when it is to be drawn next
     cost: float = 0.0  # s of processor time for one drawing; 0: never drawn
     drawn_at: deque[float] = field(default_factory=deque)
-    failure: str = ""
+    failure: str = ""  # of the last drawing
+    logged: str = ""  # the last failure that was
 
     @property
     def finished(self) -> bool:
         return self.request.static and self.cost > 0
-
-
-def prepare_thread() -> None:
-    """Let the calling thread draw on one core, and give way to all others at once."""
-    configure_threads(1)
-    os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
 
 
 class Views:
@@ -68,27 +61,33 @@ class Views:
     def __init__(
         self,
         backend: str,
+        allowance: Allowance,
         clock: Clock = time.monotonic,
         processor_clock: Clock = time.thread_time,
         latency: Clock = lambda: 0.0,
     ) -> None:
-        """`latency`: s from capture to published, as it was lately."""
+        """
+        Args:
+            allowance: what drawing may take of one core.
+            latency: s from capture to published, as it was lately.
+        """
         self.status: Mapping[str, ViewStatus] = {}
         self.pairs: Collection[str] = ()
         self._backend = backend
+        self._allowance = allowance
         self._clock = clock
         self._processor_clock = processor_clock
         self._latency = latency
         self._views: dict[str, _View] = {}
         self._rasterizers: dict[tuple[int, int], Rasterizer] = {}
         self._watched: Collection[str] = ()
-        self._missed = 0.0  # running share of the frames
 
     def open(self, request: ViewRequest, scene: FrameResult | None) -> DrawnView | None:
         """Open a view, or change one of that name; returns its first picture where there is a scene.
 
         Raises:
-            SagsError: there are too many views, or it cannot be drawn.
+            SagsError: there are too many views.
+            Exception: it cannot be drawn; it is closed then.
         """
         known = self._views.get(request.name)
         if known is None and len(self._views) >= MAX_VIEWS:
@@ -97,12 +96,13 @@ class Views:
         view = _View(request, self._clock()) if known is None else known
         view.request = request
         self._views[request.name] = view
+        self._forget_sizes()
         self._watched = {*self._watched, request.name}  # until it is known better
         drawn = None
         if scene is not None and (known is None or request.static):
             try:
                 drawn = self._draw(view, scene)
-            except SagsError:
+            except Exception:
                 self.close(request.name)
                 raise
         self._note()
@@ -114,21 +114,21 @@ class Views:
         """
         if self._views.pop(name, None) is None:
             raise SagsError(f"no view '{name}' is open; open are: {', '.join(sorted(self._views)) or 'none'}")
-        sizes = {(view.request.width, view.request.height) for view in self._views.values()}
-        self._rasterizers = {size: kept for size, kept in self._rasterizers.items() if size in sizes}
+        self._forget_sizes()
         self._note()
 
-    def draw_due(
-        self, scene: FrameResult, watched: Collection[str], missed: bool
-    ) -> Iterator[tuple[str, DrawnView]]:
-        """Draw what is due of a new scene, longest overdue first.
+    def _forget_sizes(self) -> None:
+        """Let go of what draws a size that no view has any more: tens of MB each."""
+        sizes = {(view.request.width, view.request.height) for view in self._views.values()}
+        self._rasterizers = {size: kept for size, kept in self._rasterizers.items() if size in sizes}
+
+    def draw_due(self, scene: FrameResult, watched: Collection[str]) -> Iterator[tuple[str, DrawnView]]:
+        """Draw what is due of a new scene, longest overdue first. A drawing that fails costs its view alone.
 
         Args:
             watched: views that somebody subscribes to.
-            missed: the mapping left out a frame before this one.
         """
         self._watched = watched
-        self._missed += FORGETTING * (missed - self._missed)
         for name, view in sorted(self._views.items(), key=lambda item: item[1].due):
             if view.finished or (view.cost > 0 and name not in watched):
                 continue
@@ -138,9 +138,14 @@ class Views:
                 continue
             view.due = max(view.due + period, now)
             try:
-                yield name, self._draw(view, scene)
-            except SagsError as error:
-                view.failure = str(error)
+                drawn = self._draw(view, scene)
+            except Exception as error:
+                view.failure = f"it cannot be drawn: {str(error) or type(error).__name__}"
+                if view.failure != view.logged:
+                    view.logged = view.failure
+                    log.exception("view '%s' cannot be drawn", name)
+            else:
+                yield name, drawn
         self._note()
 
     def _draw(self, view: _View, scene: FrameResult) -> DrawnView:
@@ -177,15 +182,7 @@ class Views:
         """Hz: the part of the rate asked for that all views can keep."""
         served = {id(view): view, **{id(v): v for n, v in self._views.items() if n in self._watched}}
         demand = sum(one.cost * one.request.rate_hz for one in served.values() if not one.request.static)
-        return view.request.rate_hz * min(1.0, self._share / max(demand, 1e-9))
-
-    @property
-    def _behind(self) -> bool:
-        return self._missed > BEHIND
-
-    @property
-    def _share(self) -> float:
-        return LEAST_SHARE if self._behind else SHARE
+        return view.request.rate_hz * min(1.0, self._allowance.share / max(demand, 1e-9))
 
     def _note(self) -> None:
         self.status = {name: self._status(name, view) for name, view in self._views.items()}
@@ -208,7 +205,7 @@ class Views:
             (bool(view.failure), view.failure),
             (view.cost == 0, "no frame has come yet"),
             (live and name not in self._watched, "nobody subscribes"),
-            (short and self._behind, "the mapping misses frames and goes first"),
+            (short and self._allowance.is_behind, "the mapping is late and goes first"),
             (short, f"all views together get {SHARE:g} of a core"),
         )
         return next((why for applies, why in reasons if applies), "")

@@ -1,11 +1,12 @@
 """Launch files: every key is known, paths are found, mistakes are explained."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 from places import ROOT
 
-from sags_node.config import FoldersSource, LaunchConfig, PanesSource
+from sags_node.config import FoldersSource, LaunchConfig, MappingConfig, PanesSource, VisionConfig
 from sags_node.errors import UsageError
 from sags_node.launch_file import load_launch, with_parameters
 
@@ -88,6 +89,27 @@ def test_yaml_cannot_run_code(tmp_path: Path) -> None:
     file.write_text("ns: !!python/object/apply:os.system ['true']\n")
     with pytest.raises(UsageError, match="not valid YAML"):
         load_launch(file)
+
+
+def test_the_time_of_a_frame_is_that_until_the_next_unless_it_is_set() -> None:
+    def ms(rate: float | None, **mapping: Any) -> float:
+        return MappingConfig(**mapping).frame_ms(rate)
+
+    assert ms(60) == pytest.approx(1000 / 60) and ms(25) == 40 and ms(10) == 100
+    assert ms(2) == 100  # else what is shown would be half a second old
+    assert ms(60, budget_ms=25) == ms(None, budget_ms=25) == 25
+    assert ms(None) == ms(10, iterations=2) == 33  # what is not played in real time does not depend on rates
+
+
+@pytest.mark.parametrize(
+    ("asked", "size"),
+    [({}, (960, 768)), ({"width": 480}, (480, 384)), ({"height": 256}, (320, 256)),
+     ({"width": 640, "height": 400}, (640, 400))],
+)  # fmt: skip
+def test_one_side_of_the_working_size_keeps_the_proportions(
+    asked: dict[str, int], size: tuple[int, int]
+) -> None:
+    assert VisionConfig(**asked).working_size(960, 768) == size  # type: ignore[arg-type]
 
 
 def test_parameters_are_validated_like_a_file() -> None:

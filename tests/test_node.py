@@ -118,7 +118,7 @@ def test_control_socket_reads_changes_and_saves(node: RunningNode, tmp_path: Pat
         assert client.request("ping") is not None
         status = client.request("get_status")
         assert status["gaussians"] > 1000
-        assert client.request("get_parameters")["mapping"]["budget_ms"] == 33
+        assert client.request("get_parameters")["mapping"]["budget_ms"] is None
         assert client.request("set_parameters", {"mapping.budget_ms": 50})["mapping"]["budget_ms"] == 50
         with pytest.raises(SagsError, match="cannot be changed while running"):
             client.request("set_parameters", {"source.loop": False})
@@ -133,6 +133,15 @@ def test_control_socket_reads_changes_and_saves(node: RunningNode, tmp_path: Pat
             client.request("save_model", {"path": "a\0b.ply"})
         with pytest.raises(SagsError, match="unknown"):
             client.request("make_coffee")
+
+
+def test_no_thread_gives_way_to_others(node: RunningNode) -> None:
+    """They share the interpreter: one that is kept from the processor while it holds it keeps all waiting."""
+    threads = [int(thread) for thread in os.listdir(f"/proc/{node.process.pid}/task")]
+    assert len(threads) > 5
+    assert {os.sched_getscheduler(thread) for thread in threads} == {os.SCHED_OTHER}
+    own = os.getpriority(os.PRIO_PROCESS, node.process.pid)
+    assert {os.getpriority(os.PRIO_PROCESS, thread) for thread in threads} == {own}
 
 
 def test_reset_makes_a_new_model_and_a_new_epoch(node: RunningNode) -> None:

@@ -38,6 +38,7 @@ constexpr std::int64_t MAX_SIDE = 16384;    // px
 constexpr std::size_t KEPT = 4;             // messages of a topic, to join topics by their stamp
 constexpr std::size_t WINDOW = 20;          // messages behind the period and the rate
 constexpr double STALE_PERIODS = 10;
+constexpr double STALE_AFTER = 0.5;         // s, at most
 constexpr double MIN_RATE = 0.9;            // of the messages sent
 constexpr double UNKNOWN_PERIOD = 0.1;      // s, until two messages have come
 
@@ -129,7 +130,7 @@ public:
     std::optional<std::string> stale() const {
         if (kept_.empty()) return "nothing received";
         const double age = (now_ns() - kept_.back().stamp_ns) * 1e-9;
-        if (age > STALE_PERIODS * period()) return "too old: " + std::to_string(age) + " s";
+        if (age > std::min(STALE_AFTER, STALE_PERIODS * period())) return "too old: " + std::to_string(age) + " s";
         if (rate() < MIN_RATE) return "too few messages arrive";
         return std::nullopt;
     }

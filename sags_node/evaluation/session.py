@@ -112,7 +112,9 @@ def measure(
         measurer.rows,
         options,
         config.segments,
-        None if config.mapping.iterations is not None else config.mapping.budget_ms,
+        None
+        if config.mapping.iterations is not None
+        else config.mapping.frame_ms(session.source.rate if config.in_real_time else None),
     )
     summary["settings"] = {
         "overrides": list(overrides),

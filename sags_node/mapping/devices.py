@@ -31,7 +31,7 @@ def affordable(config: LaunchConfig, width: int, height: int) -> int:
     most = max(100, width * height // PIXELS_PER_GAUSSIAN)
     if config.mapping.iterations is None or config.mapping.rung is not None:
         return min(most, max(rung.gaussians for rung in rungs_of(config)))
-    return max(100, min(most, round(_speed(config) * GAUSSIANS_PER_MS * config.mapping.budget_ms)))
+    return max(100, min(most, round(_speed(config) * GAUSSIANS_PER_MS * config.mapping.frame_ms())))
 
 
 def rungs_of(config: LaunchConfig) -> tuple[Rung, ...]:
@@ -55,19 +55,22 @@ def rungs_of(config: LaunchConfig) -> tuple[Rung, ...]:
     )
 
 
-def make_budget(config: LaunchConfig, width: int, height: int, speed: float | None = None) -> Budget:
+def make_budget(
+    config: LaunchConfig, width: int, height: int, speed: float | None = None, rate: float | None = None
+) -> Budget:
     """Fixed steps where the configuration names them, else its time.
 
     Args:
         width, height: px of the working size.
         speed: see `Ladder`; None: it is measured.
+        rate: frames that come a second; None: they come when they are taken.
     """
     mapping = config.mapping
     if mapping.iterations is not None:
         return StepBudget(mapping.iterations, EVERYTHING if mapping.rung is None else rungs_of(config)[0])
     if speed is None:
         speed = measured_speed(make_rasterizer(config.engine.backend, *SAMPLE_SIZE))
-    return TimeBudget(Ladder(rungs_of(config), width * height, 1e-3 * mapping.budget_ms, speed))
+    return TimeBudget(Ladder(rungs_of(config), width * height, 1e-3 * mapping.frame_ms(rate), speed))
 
 
 def make_refiner(config: LaunchConfig, width: int, height: int) -> Refiner:

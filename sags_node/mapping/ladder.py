@@ -58,9 +58,13 @@ PER_THOUSAND = 0.31  # Gaussians
 FULL = 640 * 512  # px
 
 AVERAGED = 12  # frames behind the measured speed; the two slowest of them are left out
+LATE, LATE_OF = 4, 60  # so many frames of so many may take longer than a frame's time
+LATE_HIGHER = 1  # so many would have, on a higher rung, before it is tried
+SPARE = 0.2  # of the frame's time, at most, is left free for late frames: the five after one that is late by
+# a whole frame make up for it
 FIRST_AIM = 0.8  # of the frame's time: what the first rung may take, by a guess before the first frame
 AIM = 0.92  # of the frame's time: what a rung may take, since costs vary
-CLIMB = 0.85  # of the frame's time: what a higher rung may take before it is tried
+CLIMB = 0.9  # of the frame's time: what a higher rung may take, with the late frames, before it is tried
 SETTLING = 4  # frames after a change of the rung before the next
 PATIENCE = 10  # frames times higher rungs that would have fitted before one is tried; doubled when it did not
 LONGEST_PATIENCE = 960
@@ -87,8 +91,11 @@ class Ladder:
     """Finds the rung that fills a frame's time, by what frames take.
 
     In the first frames it jumps to where the measured speed says; then it goes down by one when frames take
-    too long, and up by one when higher rungs have seemed to fit for a while: the more of them, the sooner. A
-    climb that did not hold makes it more patient.
+    too long or too many of them are late, and up by one when higher rungs have seemed to fit for a while: the
+    more of them, the sooner. A climb that did not hold makes it more patient.
+
+    What makes single frames late (a neighbour, what is done twice a second) does not depend on the rung. So a
+    late frame on one rung tells how late it would have been on another.
 
     Attributes:
         rung: of the next frame.
@@ -108,6 +115,7 @@ class Ladder:
         self._pixels = pixels
         self.speed = speed
         self._took: deque[float] = deque(maxlen=AVERAGED)  # frames, in units of their prices
+        self._beyond: deque[float] = deque(maxlen=LATE_OF)  # ms, of what was expected of frames
         self._frames = 0
         self._since = 0  # frames since the rung changed
         self._fitted = 0  # higher rungs that would have fitted, over frames in a row
@@ -131,38 +139,51 @@ class Ladder:
 
     def learn(self, seconds: float, gaussians: int) -> None:
         """A frame took so long, further steps left out, with so many Gaussians."""
-        took = 1e3 * seconds / price(self.rung, gaussians, self._pixels)
+        usual_ms = price(self.rung, gaussians, self._pixels)
+        took = 1e3 * seconds / usual_ms
         self._frames += 1
         self._since += 1
         self._took.append(took)
         usual = sorted(self._took)[:-2] or [took]
         self.speed = sum(usual) / len(usual)
+        self._beyond.append(1e3 * seconds - self.speed * usual_ms)
         if self._frames <= FIRST_FRAMES:
             if self._frames in FIRST_LOOKS:
                 self._go(self._best(AIM), "by the time of the first frames")
             return
-        expected = self._expected(self.place)
         if self._since < SETTLING:
             return
-        if expected > 1e3 * self.seconds and self.place > 0:
+        ms, expected = 1e3 * self.seconds, self._expected(self.place)
+        said = f"frames took {expected:.0f} of {ms:.0f} ms"
+        too_many = expected > min(ms, self._most(self._tail(LATE, self._since)))
+        if too_many and self.place > 0:
             if self._climbed:
                 self._patience = min(2 * self._patience, LONGEST_PATIENCE)
-            self._go(self.place - 1, f"frames took {expected:.0f} of {1e3 * self.seconds:.0f} ms")
+            late = f"more than {LATE} of {min(self._since, LATE_OF)} frames took over {ms:.0f} ms"
+            self._go(self.place - 1, said if expected > ms else late)
             return
-        room = self._best(CLIMB) - self.place
+        room = self._best(CLIMB, self._tail(LATE_HIGHER, LATE_OF)) - self.place
         self._fitted = self._fitted + room if room > 0 else 0
         if self._fitted >= self._patience:
-            self._go(self.place + 1, f"frames took {expected:.0f} of {1e3 * self.seconds:.0f} ms")
+            self._go(self.place + 1, said)
 
     def _expected(self, place: int) -> float:
         """ms that a frame takes on that rung."""
         rung = self._rungs[place]
         return self.speed * price(rung, USED * rung.gaussians, self._pixels)
 
-    def _best(self, share: float) -> int:
-        """The highest rung that takes no more than this share of the time."""
-        fitting = [i for i in range(len(self._rungs)) if self._expected(i) <= share * 1e3 * self.seconds]
-        return max(fitting, default=0)
+    def _tail(self, late: int, frames: int) -> float:
+        """ms beyond what was expected: all but `late` of the last so many frames stayed below."""
+        return sorted([0.0] * (late + 1) + list(self._beyond)[-frames:])[-late - 1]
+
+    def _most(self, beyond: float) -> float:
+        """ms that are expected at most of a frame which may take so many more."""
+        return 1e3 * self.seconds - min(beyond, SPARE * 1e3 * self.seconds)
+
+    def _best(self, share: float, beyond: float = 0.0) -> int:
+        """The highest rung that takes no more than this share of the time that so many ms leave."""
+        most = share * self._most(beyond)
+        return max((i for i in range(len(self._rungs)) if self._expected(i) <= most), default=0)
 
     def _go(self, place: int, reason: str) -> None:
         if place == self.place:

@@ -35,7 +35,8 @@ IMAGE_ENCODINGS: dict[str, tuple[DType, int]] = {  # ROS name: dtype, channels
 COMPRESSED = topics.COMPRESSED_IMAGE
 POSE = "geometry_msgs/msg/PoseStamped"
 NODES = "rmw_dds_common/msg/ParticipantEntitiesInfo"
-PACKED_FIELDS = ("id", "rgb")  # 32-bit words that are no numbers on a scale
+UINT32_FIELDS = ("id", "id_high")
+PACKED_FIELDS = (*UINT32_FIELDS, "rgb")  # 32-bit words that are no numbers on a scale
 _POINT_FIELD_UINT32, _POINT_FIELD_FLOAT32 = 6, 7
 
 _store = get_typestore(Stores.ROS2_JAZZY)
@@ -203,7 +204,7 @@ def point_cloud(
     """
     count, width = columns.shape
     assert columns.dtype == np.float32 and width == len(fields), (columns.shape, columns.dtype)
-    kinds = [_POINT_FIELD_UINT32 if name == "id" else _POINT_FIELD_FLOAT32 for name in fields]
+    kinds = [_POINT_FIELD_UINT32 if name in UINT32_FIELDS else _POINT_FIELD_FLOAT32 for name in fields]
     point_field = _ros["sensor_msgs/msg/PointField"]
     described = [
         point_field(name, 4 * i, kind, 1) for i, (name, kind) in enumerate(zip(fields, kinds, strict=True))

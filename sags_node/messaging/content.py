@@ -33,7 +33,7 @@ SPLAT_FIELDS = (
     *("scale_0", "scale_1", "scale_2"),
     *("rot_w", "rot_x", "rot_y", "rot_z"),
     *("f_dc_0", "f_dc_1", "f_dc_2"),
-    *("opacity", "id", "confidence"),
+    *("opacity", "id", "confidence", "id_high"),
 )
 HEALTHY = ("running", "paused")  # states
 POINT_FIELDS = ("x", "y", "z", "rgb", "confidence")
@@ -54,8 +54,9 @@ def splats(result: FrameResult) -> Content:
     rows[:, 6:10] = gaussians.quats / np.linalg.norm(gaussians.quats, axis=1, keepdims=True)
     rows[:, 10:13] = (gaussians.colors - 0.5) / SH_DEGREE_0
     rows[:, 13] = gaussians.opacities
-    rows.view(np.uint32)[:, 14] = gaussians.ids.astype(np.uint32)
     rows[:, 15] = _confidence(gaussians)
+    bits = rows.view(np.uint32)
+    bits[:, 14], bits[:, 16] = gaussians.ids & 0xFFFFFFFF, gaussians.ids >> 32  # not 0 after a day or more
     return cdr.point_cloud(rows, SPLAT_FIELDS, result.pair.t_capture_ns)
 
 
@@ -269,7 +270,7 @@ def diagnostics(health: NodeHealth, stamp_ns: int) -> Content:
         },
     }
     statuses = [Status("node", level, health.last_error or health.state, values)]
-    running = health.state in ("running", "degraded")
+    running = health.state in ("running", "held", "degraded")
     for stage, ms in health.stage_ms.items():
         statuses.append(Status(stage, 0 if running else 3, f"{ms:.1f} ms", {"ms": f"{ms:.3f}"}))
     statuses += [

@@ -11,6 +11,7 @@ from sags_node.messaging.wire import Meta
 
 WINDOW = 20  # messages behind the period and the rate
 STALE_PERIODS = 10
+STALE_AFTER = 0.5  # s, at most, for content that shows a frame; a grasper pulls tissue 10 mm meanwhile
 MIN_RATE = 0.9  # of what the sender sends, or of the declared rate
 ENOUGH = 6  # messages that tell the period
 UNKNOWN_PERIOD = 0.1  # s, at most, until so many have come: who begins slowly must not be believed for long
@@ -88,19 +89,20 @@ class Freshness:
     def problem(self, now_ns: int, max_age: float | None = None) -> str | None:
         """Why the last message must not be shown as new; None when it may be.
 
-        `max_age` (s) tightens the limit of ten periods.
+        `max_age` (s) takes the place of `STALE_AFTER`; the limit of ten periods stays.
         """
         if self.last is None:
             return "nothing received yet"
         if self._mixed:
             return "two nodes send under this name; stop one of them, or give it another ns"
-        return self._untimely(now_ns, max_age) if self._periodic else None
+        return self._untimely(self.last, now_ns, max_age) if self._periodic else None
 
-    def _untimely(self, now_ns: int, max_age: float | None) -> str | None:
+    def _untimely(self, last: Meta, now_ns: int, max_age: float | None) -> str | None:
         sure = self._rate_hz is not None or len(self._window) >= ENOUGH
         limit = STALE_PERIODS * (self.period if sure else min(self.period, UNKNOWN_PERIOD))
-        if max_age is not None:
-            limit = min(limit, max_age)
+        if max_age is None:
+            max_age = STALE_AFTER if last.frame_id >= 0 else limit
+        limit = min(limit, max_age)
         age = self.age(now_ns)
         if age < -MAX_CLOCK_AHEAD:
             return f"stamped {-age:.2f} s ahead of this machine's clock; set both clocks"

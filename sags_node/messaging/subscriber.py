@@ -33,7 +33,8 @@ from sags_node.messaging.stream import POLL_MS, check_topic, data_socket, receiv
 from sags_node.messaging.wire import WireError
 
 KEPT = 4  # newest messages of a topic, so that topics of one frame can be joined by stamp
-VALID_STATES = ("running", "degraded")  # of the node, in `status`
+# Of the node, in `status`. While frames are held their pictures are true, and nothing of the model is sent.
+VALID_STATES = ("running", "held", "degraded")
 _ALWAYS = frozenset({"status"})
 
 
@@ -130,8 +131,8 @@ class Receiver:
         """The newest message of a topic, if it may be shown as new.
 
         Raises:
-            StaleError: it is older than ten periods or `max_age` (s), fewer than 90 % of the messages
-                arrive, the sender says it is not running, or nothing has come.
+            StaleError: it is older than ten periods or `max_age` (s; default 0.5 for what shows a frame),
+                fewer than 90 % of the messages arrive, the sender says it is not running, or nothing came.
         """
         with self._arrived:
             problem = self._problem(name, max_age)

@@ -6,6 +6,7 @@ depth is never averaged with its neighbour: at half size every second one comes,
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from typing import Any
 
@@ -28,18 +29,33 @@ CONFIDENCE_STEP = 1 / 255
 QUALITY = 80  # of JPEG; the default of ROS's image transport
 _JPEG = (cv2.IMWRITE_JPEG_QUALITY, QUALITY)
 
+log = logging.getLogger(__name__)
 
-def thin_pictures(result: FrameResult, asked: Mapping[str, ThinPicture]) -> dict[str, Content]:
-    """What a frame has for thin topics, by topic; a text where it cannot be made."""
+
+def thin_pictures(
+    result: FrameResult, asked: Mapping[str, ThinPicture], logged: set[str] | None = None
+) -> dict[str, Content]:
+    """What a frame has for thin topics, by topic; a text where it cannot be made.
+
+    Args:
+        logged: topics whose failure was logged; those that fail now are added.
+    """
     height, width = result.pair.left.shape[:2]
-    made = {}
+    logged = set() if logged is None else logged
+    made: dict[str, Content] = {}
     for name, thin in asked.items():
         x, y, wide, high = thin.region or (0, 0, width, height)
         if x + wide > width or y + high > height:
             made[name] = cdr.string(f"'{name}': the region leaves the picture, which has {width}x{height} px")
         elif tells_of(result, thin.topic):
             part = np.s_[y : y + high - high % thin.every, x : x + wide - wide % thin.every]
-            made[name] = _thin(result, thin, part, (x, y, thin.every))
+            try:
+                made[name] = _thin(result, thin, part, (x, y, thin.every))
+            except Exception as error:  # it costs this topic alone
+                if name not in logged:
+                    logged.add(name)
+                    log.exception("'%s' cannot be made", name)
+                made[name] = cdr.string(f"'{name}' cannot be made: {str(error) or type(error).__name__}")
     return made
 
 

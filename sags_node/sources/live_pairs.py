@@ -10,13 +10,15 @@ from sags_node.sources.pairing import Pairing
 from sags_node.types import Side, StereoFrame
 
 POLL_S = 0.1  # how soon a waiting taker notices `stop`, if nobody tells it
+SETTLING_NS = 300_000_000  # stamps that go back by less: their clock is better known now (`sources.clock`)
 
 
 class LivePairs:
     """Pictures in, frames out, until `stop`, or until all are out after `end`.
 
     `frame_id` counts the left eye's pictures, so a left picture that found no partner leaves a gap. `epoch`
-    grows when the clock is set back. A pair with the stamp of the one before was sent twice, and is left out.
+    grows when the clock is set back. Where stamps go back by less than `SETTLING_NS`, pairs are left out
+    until they have caught up; so is a pair with the stamp of the one before, which was sent twice.
 
     Args:
         tolerance_ms: how far the stamps of a pair may lie apart.
@@ -28,13 +30,13 @@ class LivePairs:
         self._latency_ns = round(latency_ms * 1e6)
         self._arrived = threading.Condition()
         self._ended = False
-        self._repeated = 0
+        self._outdated = 0
         self.stopped = threading.Event()
 
     @property
     def unpaired(self) -> int:
-        """Pictures of either eye that found no partner, and pairs that came twice."""
-        return self._pairing.unpaired + self._repeated
+        """Pictures of either eye that found no partner, and pairs no newer than the one before."""
+        return self._pairing.unpaired + self._outdated
 
     def put(self, eye: Side, picture: Picture) -> None:
         with self._arrived:
@@ -69,8 +71,8 @@ class LivePairs:
             if pair is None or self.stopped.is_set():
                 return
             frame_id, left, right = pair
-            if left.t_ns == last_ns:
-                self._repeated += 1
+            if last_ns - SETTLING_NS < left.t_ns <= last_ns:
+                self._outdated += 1
                 continue
             epoch += left.t_ns < last_ns
             last_ns = left.t_ns

@@ -31,7 +31,7 @@ from sags_node.errors import SagsError
 from sags_node.mapping.budget import TimeBudget
 from sags_node.mapping.ladder import FULL, RUNGS, USED, Ladder, price
 from sags_node.messaging import publisher
-from sags_node.messaging.freshness import MAX_CLOCK_AHEAD, STALE_PERIODS, Freshness
+from sags_node.messaging.freshness import MAX_CLOCK_AHEAD, STALE_AFTER, STALE_PERIODS, Freshness
 from sags_node.messaging.wire import decode
 from sags_node.sources import live_pairs
 from sags_node.sources.sent import SentPictures
@@ -131,8 +131,8 @@ class Network:
 class Pipeline:
     """Takes the time that a frame would, by the real budget; now and then it hangs, and it may fail."""
 
-    def __init__(self, run: Run) -> None:
-        self._run = run
+    def __init__(self, run: Run, rate: float) -> None:
+        self._run, self.rate = run, rate
         self._machine = run.world.random.choice((0.3, 0.8, 1.0, 2.0, 8.0))  # times the prices of the ladder
         self._resets = 0
         self.anchors = SimpleNamespace(latency_s=0.0, remove=self._no_anchor)
@@ -144,7 +144,7 @@ class Pipeline:
         raise SagsError("no such anchor")
 
     def make_budget(self, speed: float | None = None) -> TimeBudget:
-        return TimeBudget(Ladder(RUNGS, FULL, 0.033, speed or 1.0), self._run.world.monotonic)
+        return TimeBudget(Ladder(RUNGS, FULL, 1 / self.rate, speed or 1.0), self._run.world.monotonic)
 
     def reconfigure(self, config: LaunchConfig) -> None: ...
 
@@ -270,9 +270,8 @@ class Run:
         for module in (node, latest, live_pairs, node_operations):
             patch.setattr(module, "threading", self.world.threading)
         patch.setattr(node, "os", self._wake)
-        patch.setattr(node, "Pipeline", lambda *_: Pipeline(self))
+        patch.setattr(node, "Pipeline", lambda *_, rate: Pipeline(self, rate))
         patch.setattr(node, "configure_threads", lambda _: None)
-        patch.setattr(node, "prepare_thread", lambda: None)
         patch.setattr(publisher, "zmq", self._network)
         patch.setattr(publisher, "Peers", _Peers)
         patch.setattr(
@@ -362,7 +361,8 @@ class Run:
                 self.shown[name] += 1
                 taken, wall_ahead = self.source.filmed[fresh.last.stamp_ns]
                 age, set_back = self.world.now - taken, wall_ahead - self.world.wall_ahead
-                limit = STALE_PERIODS * fresh.period + MOST_AHEAD + max(0.0, set_back) + 1e-6
+                limit = min(STALE_PERIODS * fresh.period, STALE_AFTER)
+                limit += MOST_AHEAD + max(0.0, set_back) + 1e-6
                 assert age <= limit, f"{name}: {age:.3f} s old is shown as new"
                 # By the clock that was set back its stamp is so far ahead, but for what the stamp lags.
                 ahead = set_back - age - BEHIND - JITTER

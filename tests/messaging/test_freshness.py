@@ -7,14 +7,16 @@ from typing import Any
 import pytest
 from made_messages import MS, meta
 
-from sags_node.messaging.freshness import WINDOW, Freshness
+from sags_node.messaging.freshness import STALE_AFTER, WINDOW, Freshness
 
 
-def followed(sequence: list[int], period_ms: float = 33.0, **settings: Any) -> Freshness:
+def followed(
+    sequence: list[int], period_ms: float = 33.0, changes: dict[str, Any] | None = None, **settings: Any
+) -> Freshness:
     """What follows messages `sequence` of a sender with that period."""
     fresh = Freshness(**settings)
     for seq in sequence:
-        fresh.accept(meta(seq, seq * period_ms))
+        fresh.accept(meta(seq, seq * period_ms, **(changes or {})))
     return fresh
 
 
@@ -26,20 +28,42 @@ def test_stale_after_ten_periods() -> None:
     assert "too old" in str(fresh.problem((newest + 331) * MS))
     assert "too old" in str(fresh.problem((newest + 101) * MS, max_age=0.1))
     assert fresh.problem((newest + 99) * MS, max_age=0.1) is None
-    assert "too old" in str(fresh.problem((newest + 331) * MS, max_age=10.0))  # it only tightens
+    assert "too old" in str(fresh.problem((newest + 331) * MS, max_age=10.0))
+
+
+@pytest.mark.fault(
+    "CPU: the node makes one frame a second",
+    sees="stale from 0.5 s after each capture on",
+    says="reason: `too old`",
+)
+def test_what_a_slow_node_shows_is_stale_after_half_a_second() -> None:
+    """Ten of its periods would be ten seconds. Who wants older content says so."""
+    fresh = followed(list(range(1, 31)), period_ms=1000)
+    assert fresh.problem((30_000 + 499) * MS) is None
+    assert "too old" in str(fresh.problem((30_000 + 501) * MS))
+    assert fresh.problem((30_000 + 1_900) * MS, max_age=2.0) is None
+    assert "too old" in str(fresh.problem((30_000 + 2_001) * MS, max_age=2.0))
+
+
+def test_what_shows_no_frame_is_stale_after_ten_periods() -> None:
+    """`status` and `diagnostics` come once a second."""
+    said = followed(list(range(1, 31)), period_ms=1000, changes={"frame_id": -1})
+    assert said.problem((30_000 + 9_900) * MS) is None
+    assert "too old" in str(said.problem((30_000 + 10_100) * MS))
 
 
 def test_stale_before_the_period_is_known() -> None:
     assert Freshness().problem(0) == "nothing received yet"
-    fresh = followed([4])
-    assert fresh.problem((4 * 33 + 990) * MS) is None
-    assert "too old" in str(fresh.problem((4 * 33 + 1010) * MS))
+    for max_age, limit in ((None, 1000 * STALE_AFTER), (5.0, 1000)):  # ten of 0.1 s
+        fresh = followed([4])
+        assert fresh.problem((4 * 33 + limit - 10) * MS, max_age) is None
+        assert "too old" in str(fresh.problem((4 * 33 + limit + 10) * MS, max_age))
 
 
 def test_a_slow_beginning_is_not_believed_to_be_the_period() -> None:
     fresh = followed([1, 2, 3, 4, 5], period_ms=1500)  # the first frames of a node on a busy machine
-    assert "too old" in str(fresh.problem((5 * 1500 + 1010) * MS))
-    assert followed([1, 2, 3, 4, 5, 6], period_ms=1500).problem((6 * 1500 + 14_900) * MS) is None
+    assert "too old" in str(fresh.problem((5 * 1500 + 1010) * MS, max_age=20))
+    assert followed([1, 2, 3, 4, 5, 6], period_ms=1500).problem((6 * 1500 + 14_900) * MS, max_age=20) is None
 
 
 def test_losses_do_not_stretch_the_period_but_count() -> None:

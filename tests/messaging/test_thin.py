@@ -229,6 +229,34 @@ def test_no_name_begins_with_another() -> None:
     ] == []
 
 
+@pytest.mark.fault(
+    "memory: none is left for a thin picture",
+    sees="all other topics",
+    says="a text on that topic; the node's log, once",
+    back="with the next frame that has room",
+)
+def test_what_cannot_be_made_costs_its_topic_alone(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    names = "thin/half/left/depth/png", "thin/half/left/render/image/jpeg"
+    asked, logged = {name: topics.thin_picture(name) for name in names}, set[str]()
+    encode = cv2.imencode
+
+    def full(kind: str, *arguments: object) -> object:
+        if kind == ".png":
+            raise MemoryError
+        return encode(kind, *arguments)  # type: ignore[call-overload]
+
+    monkeypatch.setattr(cv2, "imencode", full)
+    for _ in range(3):
+        made = thin_pictures(plane_result(), asked, logged)
+        assert made[names[0]].type == topics.STRING and b"MemoryError" in b"".join(made[names[0]].parts)
+        assert made[names[1]].type == topics.COMPRESSED_IMAGE
+    assert [record.message for record in caplog.records] == [f"'{names[0]}' cannot be made"]
+    monkeypatch.undo()
+    assert thin_pictures(plane_result(), asked, logged)[names[0]].type == topics.COMPRESSED_IMAGE
+
+
 def test_a_damaged_file_is_said_and_nothing_is_shown() -> None:
     made = thin_pictures(plane_result(), {"t": topics.thin_picture("thin/half/left/depth/png")})["t"]
     file = bytes(made.parts[1])

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
+from waiting import until
 
 from sags_node.config import GeometryConfig, LaunchConfig, PushRobot, PushSource, Ros2Source
 from sags_node.errors import SagsError
@@ -12,7 +15,7 @@ from sags_node.health import Statistics
 from sags_node.messaging import cdr, content, topics
 from sags_node.sources.clock import KEPT, CaptureClock
 from sags_node.sources.sent import WINDOW, Arrivals, SentPictures
-from sags_node.types import U8, ClockStatus
+from sags_node.types import U8, ClockStatus, StereoFrame
 
 MS, S = 1_000_000, 1_000_000_000
 PERIOD = 33 * MS
@@ -94,6 +97,30 @@ def test_a_pair_that_comes_twice_is_one_frame() -> None:
     sent.pairs.end()
     assert [frame.t_capture_ns for frame in sent.pairs] == [S + number * PERIOD for number in range(3)]
     assert sent.dropped == 1
+
+
+@pytest.mark.fault(
+    "network: a sender's first picture is 150 ms late, stamps of its own clock",
+    sees="the same epoch, stamps that rise",
+    back="0.15 s",
+)
+def test_a_late_first_picture_makes_no_new_epoch() -> None:
+    """The offset of the clocks is known better with each picture that comes sooner."""
+    sent, frames = SentPictures(PushSource(stamps="own"), None), list[StereoFrame]()
+    with ThreadPoolExecutor(1) as taker:
+        taken = taker.submit(lambda: frames.extend(sent.pairs))
+        for number in range(30):
+            stamp = number * PERIOD
+            for eye in ("left", "right"):
+                sent.put(eye, stamp, 100 * S + stamp + (150 if number == 0 else 5) * MS, picture)
+            until(lambda number=number: len(frames) + sent.dropped > number)
+        sent.pairs.end()
+        taken.result(timeout=10)
+    assert {frame.epoch for frame in frames} == {0}
+    stamps = [frame.t_capture_ns for frame in frames]
+    # Its stamp was 145 ms too late: four of the next are older than it seemed to be.
+    assert stamps == [100 * S + 150 * MS] + [100 * S + n * PERIOD + 5 * MS for n in range(5, 30)]
+    assert sent.dropped == 4
 
 
 def test_the_latency_is_taken_off_and_all_stamps_are_kept() -> None:

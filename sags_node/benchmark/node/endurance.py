@@ -147,7 +147,7 @@ def measure_endurance(
         "order": order,
         "recorded_frames": len(kept),
         "per_window": per_window,
-        "budget_ms": session.config.mapping.budget_ms,
+        "budget_ms": session.config.mapping.frame_ms(),
         "interrupted": interrupted,
         "windows": [asdict(window) for window in windows],
         "per_1000_frames": {figure: slope(windows, figure) for figure in FIGURES},

@@ -59,7 +59,7 @@ def time_settings(config: LaunchConfig, size: tuple[int, int], parts: Sequence[s
 
     `size`: the default's working size, width and height, px.
     """
-    default = {BUDGET: config.mapping.budget_ms, WIDTH: size[0], HEIGHT: size[1]}
+    default = {BUDGET: config.mapping.frame_ms(), WIDTH: size[0], HEIGHT: size[1]}
     if config.mapping.max_gaussians is not None:
         default[COUNT] = config.mapping.max_gaussians
     asked: list[tuple[str, Mapping[str, float]]] = [("default", {})]
