@@ -234,7 +234,7 @@ class Pipeline:
 
     def _repeated(self, frame: StereoFrame, pair: RectifiedPair, watch: Stopwatch) -> FrameResult:
         assert self._mapped is not None
-        anchors = self.anchors.at(pair.t_capture_ns)
+        anchors = self.anchors.at(pair.t_capture_ns, equal=True)
         return repeated(self._mapped, pair, self._epoch(frame), watch.timings_ms, anchors)
 
     def _compared(self, pair: RectifiedPair, eyes: Verdict) -> Advice:
