@@ -247,7 +247,7 @@ class Pipeline:
         """What sits on the lenses, where both eyes can be compared."""
         if self._mapped is None:
             return OnLenses()
-        sound = eyes.learn and not (eyes.left or eyes.right or scene.held)
+        sound = eyes.learn and not (eyes.left or eyes.right or scene.held or self.depth.eyes_are_late)
         return self._lenses(pair, self._mapped, sound)
 
     def _held(
@@ -290,6 +290,7 @@ class Pipeline:
         self, frame: StereoFrame, pair: RectifiedPair, tissue: Bool, still: int, budget: Budget, eyes: Verdict
     ) -> Measured:
         """The depth of a frame: of the last one where nothing moves, none where there is no time."""
+        self.depth.see(pair)
         known = self._mapped.observation if still and self._mapped is not None else None
         if known is not None and known.depth.any():
             self.depth.stereo.rows.stay()
