@@ -15,6 +15,9 @@ from sags_node.types import F32, F64
 HALVING = 3e-3  # m of error
 LEAST = 1 / 64  # of confidence, with which a depth is still stated
 SURE = 0.5  # of confidence, with which a depth may decide something
+SURE_OF_ANCHOR = (
+    0.5  # of an anchor's confidence, with which it is taken to be on its tissue, see `overlay.frame`
+)
 FAINTEST = 1e-30  # of confidence: 0.3 m
 
 

@@ -242,7 +242,7 @@ class Pipeline:
 
     def _repeated(self, frame: StereoFrame, pair: RectifiedPair, watch: Stopwatch) -> FrameResult:
         assert self._mapped is not None
-        anchors = self.anchors.at(pair.t_capture_ns)
+        anchors = self.anchors.at(pair.t_capture_ns, equal=True)
         return repeated(self._mapped, pair, self._epoch(frame), watch.timings_ms, anchors)
 
     def _compared(self, pair: RectifiedPair, eyes: Verdict) -> Advice:
@@ -255,7 +255,7 @@ class Pipeline:
         """What sits on the lenses, where both eyes can be compared."""
         if self._mapped is None:
             return OnLenses()
-        sound = eyes.learn and not (eyes.left or eyes.right or scene.held)
+        sound = eyes.learn and not (eyes.left or eyes.right or scene.held or self.depth.eyes_are_late)
         return self._lenses(pair, self._mapped, sound)
 
     def _held(
@@ -298,6 +298,7 @@ class Pipeline:
         self, frame: StereoFrame, pair: RectifiedPair, tissue: Bool, still: int, budget: Budget, eyes: Verdict
     ) -> Measured:
         """The depth of a frame: where nothing moves, that which was measured before."""
+        self.depth.see(pair)
         if still and self._depth is not None and self._depth.depth.any():
             self.depth.stereo.rows.stay()
             return self._depth.handed_on(tissue)

@@ -61,12 +61,12 @@ def _picture(topic: str, ns: str) -> fl.ImagePanel:
 
 
 def _scene(ns: str) -> fl.ThreeDeePanel:
-    """The points as coloured, the anchors larger and by how well they are seen; from the camera's side."""
+    """The points as coloured, the anchors larger and by how sure they are; from the camera's side."""
     points = fl.BaseRendererPointCloudTopicSettings(
         visible=True, color_mode="rgb", color_field="rgb", point_size=3
     )
     anchors = fl.BaseRendererPointCloudTopicSettings(
-        visible=True, color_mode="colormap", color_map="turbo", color_field="visibility",
+        visible=True, color_mode="colormap", color_map="turbo", color_field="confidence",
         min_value=0, max_value=1, point_size=14,
     )  # fmt: skip
     view = fl.ThreeDeeCameraState(

@@ -29,6 +29,7 @@ from sags_node.bridge.pins import Pin, Pins, Release
 from sags_node.bridge.relay import MAX_AGE, Output, Relay, Source
 from sags_node.bridge.requests import Requests
 from sags_node.bridge.surface import surface_of
+from sags_node.confidence import SURE_OF_ANCHOR
 from sags_node.errors import UsageError
 from sags_node.messaging.received import (
     Frame,
@@ -53,7 +54,7 @@ OVERLAY = TopicName("left/overlay/image", ReceivedImage)
 
 RAS = np.diag([-1.0, -1.0, 1.0, 1.0])  # of an optical frame; its own inverse
 PLANE = 100.0  # mm before the camera: where a picture lies in 3D
-SEEN, HIDDEN = (60, 220, 60, 255), (230, 60, 60, 255)  # RGBA of anchors
+SEEN, UNSURE, HIDDEN = (60, 220, 60, 255), (240, 160, 40, 255), (230, 60, 60, 255)  # RGBA of anchors
 LEAST_SEEN = 0.5  # of an anchor's visibility
 STATE, ANSWER, PIN, REQUEST = "SagsState", "SagsAnswer", "SagsPin", "SagsRequest"
 
@@ -274,14 +275,17 @@ def _overlaid(frame: Frame) -> U8:
 
 
 def _anchors(cloud: ReceivedCloud, device: str, seconds: float) -> bytes | None:
-    """The anchors whose place is known, by number; red: hidden."""
+    """The anchors whose place is known, by number. Orange: not sure of; red: hidden."""
     rows = cloud.points
-    if not {"id", "visibility"} <= set(rows.dtype.names or ()):
+    if not {"id", "visibility", "confidence"} <= set(rows.dtype.names or ()):
         return None
     places = cloud.xyz().astype(np.float64)
     known = np.isfinite(places).all(axis=1)
     names = [f"anchor {number}" for number in rows["id"][known]]
-    colors = [SEEN if seen >= LEAST_SEEN else HIDDEN for seen in rows["visibility"][known]]
+    colors = [
+        HIDDEN if row["visibility"] < LEAST_SEEN else SEEN if row["confidence"] >= SURE_OF_ANCHOR else UNSURE
+        for row in rows[known]
+    ]
     return igtl.points(device, seconds, _ras(places[known]), names, colors)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from sags_node.types import F64, Bool
 
 THRESHOLDS_PX = (2, 4, 8, 16, 32)
-BINS = (0.0, 0.2, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)  # of confidence
+BINS = (0.0, 0.02, 0.1, 0.2, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)  # of confidence
 
 
 def shares_within(distances: F64, thresholds: Sequence[float] = THRESHOLDS_PX) -> dict[str, float]:

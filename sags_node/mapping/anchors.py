@@ -86,6 +86,7 @@ class _Table:
     agreement: F64  # [A] 0..1, of the patch when it was found last
     unseen: F64  # [A] s since it was found last; more, the farther it was carried
     searched: I64  # [A] number of the frame in which it was searched last
+    found: I64  # [A] the same of the last search that found it
     ages: F64  # [A] s since it was pinned
     depth_confidence: F64  # [A] 0..1, of the depth of its carriers
 
@@ -211,14 +212,19 @@ class Anchors:
             self._find(observation)
             self._find_lost(observation, snapshot, view)
 
-    def at(self, stamp_ns: int, held: bool = False) -> AnchorStates:
-        """All anchors as they are now, as part of the frame captured at `stamp_ns`; `held`: one that is not
-        taken in."""
+    def at(self, stamp_ns: int, held: bool = False, equal: bool = False) -> AnchorStates:
+        """All anchors as they are now, as part of the frame captured at `stamp_ns`.
+
+        Args:
+            held: the frame is not taken in.
+            equal: its picture is that of the frame before: what was found there would be found again.
+        """
         before, self._stamp_ns = self._stamp_ns, stamp_ns
         passed = 0.0 if before is None else max(0.0, (stamp_ns - before) * 1e-9)
         table = self._table
         table.ages[:] += passed
-        table.unseen[:] += UNWATCHED * passed if held else passed
+        found_again = equal & (table.visibility == 1) & (table.found == table.searched)
+        table.unseen[~found_again] += UNWATCHED * passed if held else passed
         return AnchorStates(
             ids=table.ids.copy(),
             points=table.points.astype(np.float32),
@@ -241,6 +247,7 @@ class Anchors:
             found = _match(window, tissue, table.patches[i], carried=followed)
             if found is not None and (followed or found[1] >= ALONE_AGREEMENT):
                 shift, table.agreement[i] = found
+                table.found[i] = self._frames
                 table.pixels[i] += shift - radius
                 table.points[i] = unproject(observation.camera, table.pixels[i], table.depths[i])
                 table.unseen[i] = 0.0
@@ -285,6 +292,7 @@ def _put_back(
     _hold(table, i, carriers)
     table.points[i], table.pixels[i], table.depths[i] = point, pixel, depth
     table.visibility[i], table.agreement[i], table.unseen[i] = 1, agreement, 0
+    table.found[i] = table.searched[i]
     table.patches[i] = patch
 
 
@@ -383,6 +391,7 @@ def _row(anchor_id: int, point: F64, carriers: tuple[I64, F64, F64]) -> _Table:
         agreement=np.ones(1),
         unseen=np.zeros(1),
         searched=np.zeros(1, np.int64),
+        found=np.zeros(1, np.int64),
         ages=np.zeros(1),
         depth_confidence=np.ones(1),
     )

@@ -1,8 +1,8 @@
 """Draws placed objects for one eye, tested against tissue and instruments.
 
 What is in front of the tissue or on it is drawn in full. What lies under it shows through: `UNDER` of its
-opacity, and so does all where the tissue's depth is not sure enough to tell. Over instruments, and where no
-depth is known, nothing is drawn.
+opacity. So does all where the tissue's depth is not sure enough to tell, and an object whose anchors are not
+sure; its label has a question mark. Over instruments, and where no depth is known, nothing is drawn.
 
 Depth and instruments are known for the left eye. For the right eye each point is looked up where the left
 eye sees it. How near an instrument is, is not known, so in the right eye its place is anywhere between the
@@ -79,6 +79,7 @@ class Body:
 class Placed:
     body: Body
     T_world_body: F64  # [4, 4]
+    is_sure: bool = True
 
 
 def draw(
@@ -96,8 +97,16 @@ def draw(
     camera = frame.camera.moved_right(baseline)
     z, rgba = np.full((height, width), np.inf, np.float32), np.zeros((height, width, 4), np.uint8)
     for placed in objects:
-        placed.body.draw(camera, placed.T_world_body, z, rgba)
+        if placed.is_sure:
+            placed.body.draw(camera, placed.T_world_body, z, rgba)
+    sure_z = z.copy()
+    for placed in objects:
+        if not placed.is_sure:
+            placed.body.draw(camera, placed.T_world_body, z, rgba)
+    rows, columns = np.nonzero(z < sure_z)
+    faint = np.rint(UNDER * rgba[rows, columns, 3]).astype(np.uint8)
     _hide(z, rgba, frame, slice(None), camera, baseline, UNDER)
+    rgba[rows, columns, 3] = np.minimum(rgba[rows, columns, 3], faint)
     for placed in objects:
         if placed.body.label is not None:
             _label(rgba, frame, camera, placed, baseline)
@@ -159,7 +168,8 @@ def _label(rgba: U8, frame: TissueFrame, camera: Camera, placed: Placed, baselin
     if point[2] > 0:
         u, v = (camera.K @ point)[:2] / point[2]
         if 0 <= u < camera.width and 0 <= v < camera.height:
-            _write(rgba, frame, placed.body.label, (int(u) + LABEL_ASIDE, int(v)), point[2], baseline)
+            text = placed.body.label if placed.is_sure else f"{placed.body.label} ?"
+            _write(rgba, frame, text, (int(u) + LABEL_ASIDE, int(v)), point[2], baseline)
 
 
 def _write(

@@ -17,7 +17,6 @@ from sags_node.overlay.pose import on_a_line, on_surface, rigid_fit, surface_nor
 from sags_node.overlay.scene import ObjectSpec
 from sags_node.types import F64
 
-LEAST_SURE = 0.1  # of an anchor that holds an object: about 6 s hidden
 LEAST_ANCHORS = 3  # for a rigid fit
 NORMAL_MEMORY = 0.8  # of the last normal; the depth of one frame is noisy
 GOODBYE = 0.5  # s for the node to take anchors back at the end
@@ -87,6 +86,7 @@ class HeldObject:
 
     Attributes:
         reason: why it has no place in the newest frame; None: it has.
+        is_sure: enough of the anchors that place it are.
         error: how badly its anchors fit its rigid shape (m, RMS); 0 with one anchor.
 
     Args:
@@ -99,6 +99,7 @@ class HeldObject:
     ) -> None:
         self.spec = spec
         self.reason: str | None = None
+        self.is_sure = False
         self.error = 0.0
         self.times_pinned = 0
         self._where = where  # what its anchors are called in messages
@@ -155,6 +156,7 @@ class HeldObject:
         return {
             "name": self.spec.name,
             "reason": self.reason,
+            "sure": self.reason is None and self.is_sure,
             "pinned": self.times_pinned,
             "error_mm": round(1e3 * self.error, 3),
             "anchors": [
@@ -232,39 +234,36 @@ class HeldObject:
 
     def _held(self, frame: TissueFrame, states: Sequence[Anchor | None]) -> tuple[F64 | None, str | None]:
         assert self._model is not None
-        sure = [
-            i
-            for i, state in enumerate(states)
-            if state is not None and np.isfinite(state.place).all() and state.sure >= LEAST_SURE
-        ]
-        guessed = [i for i in sure if (state := states[i]) is not None and state.depth_confidence < LEAST]
-        if guessed and len(sure) - len(guessed) < min(len(states), LEAST_ANCHORS):
+        holding = {i: state for i, state in enumerate(states) if state is not None and state.holds}
+        chosen = {i: state for i, state in holding.items() if state.depth_confidence >= LEAST}
+        if len(chosen) < min(len(holding), len(states), LEAST_ANCHORS):
             return None, "the depth at its anchors is not known well enough"
-        sure = [i for i in sure if i not in guessed]
-        chosen = [state for i in sure if (state := states[i]) is not None]
         if len(states) < LEAST_ANCHORS:
-            return self._on_surface(frame, chosen)
-        model = self._model[sure]
-        if len(sure) < LEAST_ANCHORS:
-            return None, f"{len(sure)} of its {len(states)} anchors are sure, {LEAST_ANCHORS} are needed"
+            return self._on_surface(frame, list(chosen.values()))
+        model = self._model[list(chosen)]
+        if len(chosen) < LEAST_ANCHORS:
+            return None, f"{len(chosen)} of its {len(states)} anchors hold it, {LEAST_ANCHORS} are needed"
         if on_a_line(model):
-            return None, "its sure anchors lie on a line"
-        weights = np.array([state.sure * state.depth_confidence for state in chosen])
-        T, self.error = rigid_fit(model, np.stack([state.place for state in chosen]), weights)
+            return None, "the anchors that hold it lie on a line"
+        sure = self._model[[i for i, state in chosen.items() if state.is_sure]]
+        self.is_sure = len(sure) >= LEAST_ANCHORS and not on_a_line(sure)
+        weights = np.array([state.confidence * state.depth_confidence for state in chosen.values()])
+        T, self.error = rigid_fit(model, np.stack([state.place for state in chosen.values()]), weights)
         return T, None
 
-    def _on_surface(self, frame: TissueFrame, sure: Sequence[Anchor]) -> tuple[F64 | None, str | None]:
+    def _on_surface(self, frame: TissueFrame, holding: Sequence[Anchor]) -> tuple[F64 | None, str | None]:
         assert self._model is not None
-        if not sure:
-            return None, "its anchor was not seen for too long"
-        normal = surface_normal(frame, sure[0].place)
+        if not holding:
+            return None, "its anchor was not recognised for too long"
+        self.is_sure = holding[0].is_sure
+        normal = surface_normal(frame, holding[0].place)
         if normal is not None and self._normal is not None:
             normal = NORMAL_MEMORY * self._normal + (1 - NORMAL_MEMORY) * normal
             normal /= np.linalg.norm(normal)
         self._normal = self._normal if normal is None else normal
         if self._normal is None:
             return None, "no surface at its anchor"
-        return on_surface(sure[0].place, self._model[0], self._normal, self._right), None
+        return on_surface(holding[0].place, self._model[0], self._normal, self._right), None
 
 
 def _middle(frame: TissueFrame) -> tuple[float, float] | None:

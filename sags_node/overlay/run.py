@@ -276,7 +276,11 @@ class _Overlay:
         if frame is None:  # the next one may be whole; if not, the clock takes the overlay away
             return None, "incomplete frame"
         poses = [held.place(frame) for held in self._objects]
-        placed = [Placed(body, T) for body, T in zip(self._bodies, poses, strict=True) if T is not None]
+        placed = [
+            Placed(body, T, held.is_sure)
+            for body, held, T in zip(self._bodies, self._objects, poses, strict=True)
+            if T is not None
+        ]
         if not placed:
             reason = self._objects[0].reason or "nothing to draw"
             self._stream.blank(reason)

@@ -14,6 +14,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from sags_node.confidence import SURE_OF_ANCHOR
 from sags_node.geometry import matrix_to_quat, transform
 from sags_node.types import U8, Camera
 from sags_node.viewer.feed import Moment
@@ -26,7 +27,7 @@ JPEG_QUALITY = 80
 STEP = 4096  # splats
 NEAR = 1.0  # mm; nothing closer is drawn
 ANCHOR_SIZE = 1.5  # mm
-SEEN, HIDDEN = (255, 220, 0), (150, 150, 150)  # colours of an anchor
+SEEN, UNSURE, HIDDEN = (255, 220, 0), (255, 90, 0), (150, 150, 150)  # colours of an anchor
 ASIDE = np.array([18.0, -16.0, -22.0])  # mm from the left camera, where the overview is drawn from
 USUAL_DEPTH = 80.0  # mm, to look at before any depth is known
 
@@ -119,7 +120,7 @@ class Scene:
         self._frustum.position = camera.T_world_cam[:3, 3] / UNIT
 
     def _show_anchors(self, anchors: NDArray[Any] | None) -> None:
-        """Anchors that have a place, as numbered points; grey while the left eye sees them not."""
+        """Anchors that have a place, as numbered points."""
         rows = () if anchors is None else anchors[np.isfinite(anchors["x"])]
         places = {int(row["id"]): np.array([row[axis] for axis in "xyz"]) / UNIT for row in rows}
         for gone in self._labels.keys() - places.keys():
@@ -132,15 +133,21 @@ class Scene:
             self._anchors.remove()
             self._anchors = None
         if places:
-            colors = np.array([SEEN if row["visibility"] > 0 else HIDDEN for row in rows], np.uint8)
             self._anchors = self._server.scene.add_point_cloud(
                 "/anchor_points",
                 np.array(list(places.values())),
-                colors,
+                np.array([anchor_color(row) for row in rows], np.uint8),
                 point_size=ANCHOR_SIZE,
                 point_shape="circle",
                 precision="float32",
             )
+
+
+def anchor_color(row: Any) -> tuple[int, int, int]:
+    """Grey while the left eye does not see it; orange where it is seen and not recognised."""
+    if row["visibility"] == 0:
+        return HIDDEN
+    return SEEN if row["confidence"] >= SURE_OF_ANCHOR else UNSURE
 
 
 def _fov(camera: Camera) -> float:

@@ -4,6 +4,7 @@ exchanged no longer fits its calibration, and stereo then fails bit by bit.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -51,8 +52,7 @@ class RowMonitor:
         self.alignment: Alignment | None = None
         self.newest: RowErrors | None = None
         self._width = width
-        self._medians: deque[float] = deque(maxlen=WINDOW)
-        self._spreads: deque[float] = deque(maxlen=WINDOW)
+        self._fields: deque[tuple[float, float]] = deque(maxlen=WINDOW)  # median, and spread or NaN
         self._warns = False
 
     def update(self, row_error: F32, known: Bool, width: int) -> None:
@@ -71,24 +71,31 @@ class RowMonitor:
         # Errors beyond what can be matched stand at the limit, unmatched: the median must see them.
         every = np.sort(errors, axis=None)
         self.newest = RowErrors(errors, matched, float(every[every.size // 2]))
-        self._medians.append(self.newest.median)
         some = np.sort(errors[matched])
-        if some.size >= FEWEST_KNOWN * every.size:
-            self._spreads.append(float(some[9 * some.size // 10] - some[some.size // 10]))
-        if len(self._medians) >= FEWEST_FIELDS:
+        enough = some.size >= FEWEST_KNOWN * every.size
+        spread = float(some[9 * some.size // 10] - some[some.size // 10]) if enough else math.nan
+        self._fields.append((self.newest.median, spread))
+        if len(self._fields) >= FEWEST_FIELDS:
             self.alignment = self._judge()
 
     def stay(self) -> None:
         """Take a frame in which nothing has moved: its rows are those of the last field."""
-        for values in (self._medians, self._spreads):
-            if values:
-                values.append(values[-1])
-        if len(self._medians) >= FEWEST_FIELDS:
+        if self._fields:
+            self._fields.append(self._fields[-1])
+        if len(self._fields) >= FEWEST_FIELDS:
+            self.alignment = self._judge()
+
+    def withdraw(self) -> None:
+        """Leave the last field out: an eye was late, which tells nothing of the calibration."""
+        self._fields.pop()
+        if self.alignment is not None:
             self.alignment = self._judge()
 
     def _judge(self) -> Alignment:
-        median = float(np.median(self._medians))
-        spread = float(np.median(self._spreads)) if self._spreads else 0.0
+        medians, spreads = np.array(self._fields).T
+        median = float(np.median(medians))
+        known = spreads[np.isfinite(spreads)]
+        spread = float(np.median(known)) if known.size else 0.0
         excess = max(abs(median) / LARGEST_MEDIAN, spread / LARGEST_SPREAD)
         self._warns = excess > (BACK_AT if self._warns else 1.0)
         warning = ""

@@ -67,12 +67,21 @@ class DepthChoice:
         failed = (Finding("network_failed", problem),) if problem else ()
         return (*self._matches.findings, *self.stereo.findings, *failed)
 
+    @property
+    def eyes_are_late(self) -> bool:
+        """One eye showed another moment than the other when they were matched last."""
+        return self._matches.is_late
+
     def takes_time(self, frame: StereoFrame) -> bool:
         """Whether a frame's depth has to be computed."""
         return frame.depth is None or self._network is not None
 
+    def see(self, pair: RectifiedPair) -> None:
+        """Take every pair, also one whose depth is not asked for."""
+        self._matches.see(pair.t_capture_ns, pyramids(pair)[0])
+
     def __call__(self, frame: StereoFrame, pair: RectifiedPair, tissue: Bool) -> Measured:
-        """The depth of a frame and its rectified pair where there is `tissue` [H, W]."""
+        """The depth of a frame and the rectified pair seen last, where there is `tissue` [H, W]."""
         self._unsound, skipped = "", {}
         found = None
         if self._network is not None:
@@ -100,5 +109,7 @@ class DepthChoice:
             return np.zeros(tissue.shape, np.float32), np.zeros(tissue.shape, np.float32)
         measured = self.stereo(pair, tissue)
         if self.stereo.rows.newest is not None:
-            self._unsound = self._matches(pair.t_capture_ns, pyramids(pair)[0], self.stereo.rows.newest)
+            self._unsound = self._matches(pair.t_capture_ns, self.stereo.rows.newest)
+            if self._matches.is_late:
+                self.stereo.rows.withdraw()
         return measured

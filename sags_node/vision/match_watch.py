@@ -7,6 +7,7 @@ scope. Both mean that disparities are off by as much.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from typing import NamedTuple
 
@@ -21,8 +22,10 @@ from sags_node.vision.standing import Standing
 
 STRIDE = 4  # px
 WINDOW_NS = 200_000_000  # of the motion that is compared with row errors
+FEWEST_FIELDS, LONGEST_WINDOW_NS = 3, 1_000_000_000  # behind it where frames that are matched are far apart
+FEWEST_LATE = 2  # fields that show it, each by itself: one alone was tissue that slips or a match gone wrong
 SHORTEST_STEP_NS = 50_000_000  # between two frames: in less time tissue moves less than flow errs
-LONGEST_STEP_NS = 150_000_000  # between two frames: longer motion is not followed in so small pictures
+LONGEST_STEP_NS = 200_000_000  # between two frames: longer motion is not followed in so small pictures
 LATE_ERROR = 0.2  # px of the working size, explained by motion: 1 % of the depth where disparities are 20 px
 LEAST_SLOPE = 0.1  # of the motion in a frame: less is chance
 KNOCKED = 1.0  # px of the working size beside the usual row error; clear pairs stay within 0.1
@@ -48,15 +51,27 @@ class _Sums(NamedTuple):
     matches: int
     motion: float  # of squares
     product: float  # of motion and row error
+    error: float  # px
+
+    @property
+    def explained(self) -> float:
+        """px of row error that motion explains, with its sign."""
+        return self.product / math.sqrt(self.motion * self.matches) if self.motion > 0 else 0.0
 
 
 class MatchWatch:
-    """Looks at every field of matches. Its frames may be far apart."""
+    """Looks at every field of matches. They may be farther apart than flow can follow: the motion is that
+    since a frame shortly before, which need not have been matched.
+
+    Attributes:
+        is_late: an eye was, in the last field.
+    """
 
     def __init__(self) -> None:
+        self.is_late = False
         self._standing = Standing()
         self._flow = OpticalFlow(STRIDE)
-        self._before: tuple[int, GrayPyramid] | None = None
+        self._seen: deque[tuple[int, GrayPyramid]] = deque()  # stamps and left pictures of the last frames
         self._sums: deque[_Sums] = deque()
         self._median: float | None = None  # px, usual
         self._matched: float | None = None  # usual share
@@ -67,8 +82,14 @@ class MatchWatch:
         """What is wrong with the eyes, and how to mend it. May be read from any thread."""
         return self._standing.findings
 
-    def __call__(self, stamp_ns: int, left: GrayPyramid, rows: RowErrors) -> str:
-        """Take the row errors of one frame, and its left picture; why its matches are no depth, or empty."""
+    def see(self, stamp_ns: int, left: GrayPyramid) -> None:
+        """Take the left picture of a frame, whether it is matched or not."""
+        while self._seen and not 0 <= stamp_ns - self._seen[0][0] <= LONGEST_STEP_NS:
+            self._seen.popleft()
+        self._seen.append((stamp_ns, narrowed(left)))
+
+    def __call__(self, stamp_ns: int, rows: RowErrors) -> str:
+        """Take the row errors of the frame seen last; why its matches are no depth, or empty."""
         passed = 0 if self._stamp_ns is None else max(0, stamp_ns - self._stamp_ns)
         self._stamp_ns = stamp_ns
         share = min(1.0, passed * 1e-9 / REMEMBERED_S)
@@ -76,10 +97,12 @@ class MatchWatch:
         if self._median is None or self._matched is None:
             self._median, self._matched = median, matched
         found = []
-        if abs(median - self._median) > KNOCKED:
-            found.append(_KNOCKED)
-        elif self._is_late(stamp_ns, left, rows):
+        apart = abs(median - self._median) > KNOCKED  # fast motion brings the rows of a late eye there, too
+        self.is_late = self._follows_motion(stamp_ns, rows, knocked=apart and _LATE not in self.findings)
+        if self.is_late:
             found.append(_LATE)
+        elif apart:
+            found.append(_KNOCKED)
         else:
             self._median += share * (median - self._median)
         self._standing.update(stamp_ns, found)
@@ -88,25 +111,32 @@ class MatchWatch:
             return found[0].text
         return "far fewer places match than usual" if matched < LEAST_MATCHED * usual else ""
 
-    def _is_late(self, stamp_ns: int, left: GrayPyramid, rows: RowErrors) -> bool:
-        """Row errors follow the vertical motion of the last frames."""
-        small, before, sums = narrowed(left), self._before, self._sums
-        if before is None or not 0 <= stamp_ns - before[0] < SHORTEST_STEP_NS:
-            self._before = stamp_ns, small
-        while sums and not 0 <= stamp_ns - sums[0].stamp_ns < WINDOW_NS:
+    def _follows_motion(self, stamp_ns: int, rows: RowErrors, knocked: bool) -> bool:
+        """Whether row errors follow the vertical motion of the last frames; where the scope may have been
+        `knocked`, whether that explains more of them than that they differ."""
+        small, sums = self._seen[-1][1], self._sums
+        before = [shown for then, shown in self._seen if stamp_ns - then >= SHORTEST_STEP_NS]
+        while sums:
+            window = WINDOW_NS if len(sums) >= FEWEST_FIELDS else LONGEST_WINDOW_NS
+            if 0 <= stamp_ns - sums[0].stamp_ns < window:
+                break
             sums.popleft()
-        if before is not None and SHORTEST_STEP_NS <= stamp_ns - before[0] <= LONGEST_STEP_NS:
+        if before:
             assert self._median is not None
             height, width = rows.errors.shape
-            down = self._flow(before[1], small)[..., 1]
-            scale = left.full.shape[1] / (2 * inner(small.halves[0]).shape[1])
+            down = self._flow(before[-1], small)[..., 1]
+            scale = small.full.shape[1] / (2 * inner(small.halves[0]).shape[1])
             motion = scale * cv2.resize(down, (width, height), interpolation=cv2.INTER_AREA)[rows.matched]
             errors = rows.errors[rows.matched] - np.float32(self._median)
-            sums.append(_Sums(stamp_ns, motion.size, float(motion @ motion), float(motion @ errors)))
-        count = sum(each.matches for each in sums)
-        squares = sum(each.motion for each in sums)
-        if not squares > 0:
+            products = float(motion @ motion), float(motion @ errors), float(errors.sum())
+            sums.append(_Sums(stamp_ns, motion.size, *products))
+        if len(sums) < FEWEST_LATE:
             return False
-        slope = sum(each.product for each in sums) / squares
-        explained = abs(slope) * np.sqrt(squares / count)
-        return bool(abs(slope) > LEAST_SLOPE and explained > LATE_ERROR)
+        every = _Sums(stamp_ns, *np.sum([each[1:] for each in sums], axis=0).tolist())
+        least = max(LATE_ERROR, abs(every.error) / max(every.matches, 1) if knocked else 0.0)
+        alike = [math.copysign(each.explained, each.explained * every.explained) for each in sums]
+        return (
+            abs(every.product) > LEAST_SLOPE * every.motion
+            and abs(every.explained) > least
+            and sum(each > LATE_ERROR for each in alike) >= FEWEST_LATE
+        )

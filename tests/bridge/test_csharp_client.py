@@ -109,7 +109,7 @@ def test_it_shows_depth_colour_and_anchors_and_nothing_old(program: Path, tmp_pa
     assert float(depth_mm) == pytest.approx(1000 * view.depth[middle], abs=1e-3)
     assert rgba.split(",") == [str(round(255 * value)) for value in (*view.rgb[middle], view.alpha[middle])]
     first = anchors.split(";")[0].split(":")
-    assert int(first[0]) == SEEN and float(first[1]) == pytest.approx(0.07) and len(anchors.split(";")) == 2
+    assert int(first[0]) == SEEN and float(first[1]) == pytest.approx(0.07) and len(anchors.split(";")) == 3
 
 
 def test_the_part_for_unity_compiles(program: Path, tmp_path: Path) -> None:

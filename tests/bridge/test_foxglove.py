@@ -185,7 +185,7 @@ def test_what_stops_is_empty_within_half_a_second_and_comes_back(tmp_path: Path)
             time.sleep(0.3)
             assert counts == {name: len(joined.came[name]) for name in counts}, "nothing more comes"
         with sockets(tmp_path) as running, stream(running, anchored_at):  # another node, on other ports
-            until(lambda: ros(joined, image).data.any() and ros(joined, anchors).width == 3)
+            until(lambda: ros(joined, image).data.any() and ros(joined, anchors).width == 4)
             until(lambda: joined.said[-1]["op"] == "removeStatus")
 
 

@@ -101,6 +101,15 @@ def test_slow_and_robust(phantom_session: Path) -> None:
     assert monitor.alignment.warning == ""
 
 
+def test_fields_of_a_late_eye_tell_nothing_of_the_rig(phantom_session: Path) -> None:
+    good, late = field(phantom_session, (0, 0, 0)), field(phantom_session, (0.3, 0, 0))
+    monitor = monitor_after(good)
+    for _ in range(WINDOW):
+        monitor.update(*late)
+        monitor.withdraw()
+    assert monitor.alignment is not None and monitor.alignment.warning == ""
+
+
 def flat(pixels: float) -> Field:
     """The same row error everywhere; px of the working size."""
     return np.full((256, 320), pixels / 2, np.float32), np.ones((256, 320), np.bool_), SIZE[0] // 2

@@ -26,7 +26,12 @@ def test_average_jaccard_counts_places_and_visibility() -> None:
 def test_reliability_tells_what_was_said_from_what_was_right() -> None:
     confidence = np.array([0.0, 0.1, 0.55, 0.95, 1.0, 0.9, 0.99])
     bins = reliability(confidence, np.array([0, 1, 1, 1, 1, 0, 1], bool))
-    assert [(each.least, each.most, each.count) for each in bins] == [(0, 0.2, 2), (0.5, 0.6, 1), (0.9, 1, 4)]
-    assert [each.right for each in bins] == [0.5, 1, 0.75]
-    assert bins[2].said == pytest.approx(0.96)
-    assert calibration_error(bins) == pytest.approx((2 * 0.45 + 0.45 + 4 * 0.21) / 7)
+    assert [(each.least, each.most, each.count) for each in bins] == [
+        (0, 0.02, 1),
+        (0.1, 0.2, 1),
+        (0.5, 0.6, 1),
+        (0.9, 1, 4),
+    ]
+    assert [each.right for each in bins] == [0, 1, 1, 0.75]
+    assert bins[3].said == pytest.approx(0.96)
+    assert calibration_error(bins) == pytest.approx((0.9 + 0.45 + 4 * 0.21) / 7)

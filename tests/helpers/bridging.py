@@ -17,7 +17,7 @@ from sags_node.config import PublishConfig
 from sags_node.messaging.publisher import Publisher
 from sags_node.types import AnchorStates, FrameResult
 
-SEEN, HIDDEN, LOST = 3, 5, 8  # numbers of the anchors in `anchored`
+SEEN, HIDDEN, LOST, UNSURE = 3, 5, 8, 9  # numbers of the anchors in `anchored`
 STARTING = 30.0  # s
 
 
@@ -34,16 +34,17 @@ def sockets(
 
 
 def anchored(result: FrameResult | None = None) -> FrameResult:
-    """The plane with three anchors on it: one seen, one hidden, one lost."""
+    """The plane with four anchors on it: one seen, one hidden, one lost, one seen and not recognised."""
     result = result or plane_result()
-    places = np.array([[0.01, 0.02, 0.07], [-0.01, 0.0, 0.08], [np.nan] * 3], np.float32)
-    ones = np.ones(3, np.float32)
+    places = np.array([[0.01, 0.02, 0.07], [-0.01, 0.0, 0.08], [np.nan] * 3, [0.0, 0.01, 0.08]], np.float32)
+    pixels = np.array([[20, 20], [50, 30], [np.nan] * 2, [75, 45]], np.float32)
+    ones = np.ones(4, np.float32)
     states = AnchorStates(
-        np.array([SEEN, HIDDEN, LOST]),
+        np.array([SEEN, HIDDEN, LOST, UNSURE]),
         places,
-        places[:, :2].copy(),
-        np.array([1, 0, 0], np.float32),
-        ones,
+        pixels,
+        np.array([1, 0, 0, 1], np.float32),
+        np.array([1, 1, 1, 0.2], np.float32),
         ones,
         ones,
     )

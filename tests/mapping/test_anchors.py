@@ -170,6 +170,22 @@ def test_visibility_tells_what_hides_it_and_confidence_falls_meanwhile() -> None
     assert only(anchors.at(seconds * 10 * PERIOD_NS))[2:] == (1.0, pytest.approx(1.0, abs=0.01))
 
 
+def test_while_the_picture_stays_the_same_what_was_found_in_it_stays_sure() -> None:
+    """Not what was not found in it, nor what is hidden."""
+    for shown, other in ((True, False), (True, True), (False, False)):
+        anchors = Anchors()
+        anchors.add_pixel(60, 45, *scene(0))
+        observation, snapshot, view = scene(1, texture()[:, ::-1].copy() if other else None)
+        observation.tissue[:] = shown
+        anchors.update(observation, snapshot, view)
+        first = anchors.at(0)
+        for i in range(1, 5):
+            states = anchors.at(i * 10 * PERIOD_NS, equal=True)
+        halvings = 0 if shown and not other else 4 / module.HALF_LIFE
+        assert states.confidence[0] == pytest.approx(first.confidence[0] * 0.5**halvings)
+        assert states.ages[0] == pytest.approx(4)
+
+
 def test_what_leaves_the_picture_is_followed_there() -> None:
     anchors = Anchors()
     anchors.add_pixel(4, 45, *flat(0))
@@ -281,6 +297,7 @@ def test_skipped_and_repeated_frames_keep_the_anchors(phantom_session: Path) -> 
     pipeline.anchors.add_pixel(160, 128, mapped.observation, mapped.snapshot, mapped.views["left"])
     again = pipeline.process(replace(first, frame_id=1, t_capture_ns=first.t_capture_ns + PERIOD_NS), budget)
     assert again.skipped.keys() == {"frame"} and len(again.anchors) == 1 and len(mapped.anchors) == 0
+    assert again.anchors.confidence[0] == 1  # the picture shows it still
     jumped = pipeline.process(later, budget)
     assert np.isfinite(jumped.anchors.points).all()
     pipeline.reset()

@@ -56,6 +56,24 @@ def test_where_the_depth_is_not_sure_all_is_as_faint_as_what_lies_under_the_tiss
     assert set(np.unique(left)) == {0, 255} and set(np.unique(right)) == {0, round(UNDER * 255)}
 
 
+@pytest.mark.parametrize("z", [0.04, 0.06], ids=["before the tissue", "under it"])
+def test_an_object_whose_place_is_not_sure_is_faint_everywhere(z: float) -> None:
+    unsure = replace(ball(z, opacity=0.8), is_sure=False)
+    alone = draw(wall(), [unsure])[..., 3]
+    assert set(np.unique(alone)) == {0, round(UNDER * 204)}
+    nearer = draw(wall(), [ball(z - 0.005, radius=0.0005), unsure])  # and what is sure beside it is not
+    assert nearer[60, 80, 3] == (255 if z < 0.05 else round(UNDER * 255))
+    assert set(np.unique(nearer[..., 3])) == {0, round(UNDER * 204), nearer[60, 80, 3]}
+    assert np.array_equal(nearer, draw(wall(), [unsure, ball(z - 0.005, radius=0.0005)]))
+
+
+def test_the_label_of_what_is_not_sure_has_a_question_mark() -> None:
+    label, T = Body(None, 1.0, "vessel"), ball(0.05).T_world_body
+    asked = draw(wall(), [Placed(Body(None, 1.0, "vessel ?"), T)])
+    assert np.array_equal(draw(wall(), [Placed(label, T, is_sure=False)]), asked)
+    assert not np.array_equal(draw(wall(), [Placed(label, T)]), asked)
+
+
 def test_triangles_are_drawn_as_rays_see_them() -> None:
     """Against Open3D's ray casting: the same pixels, the same depths, the same triangles."""
     import open3d

@@ -67,8 +67,8 @@ def measure_recall(session: Session, away: float, advance: Advance) -> dict[str,
     Returns:
         `rows`, by scenario: anchors, and shares of those whose points are in sight. `found` and `wrong`:
         sure, and right or not, 2.4 s after they are back, and `before` they went; `unmoved`: right where
-        they were. `reliability_mm`, `reliability_px`: of all anchors in all frames, in pixels of those whose
-        points are in the picture or hidden there.
+        they were. `reliability_mm`, `reliability_px`: of all anchors in all frames that were taken in, in
+        pixels of those whose points are in the picture or hidden there.
 
     Raises:
         UsageError: the session is not the phantom's.
@@ -93,23 +93,29 @@ class _Said:
     confidence: list[F64] = field(default_factory=list)  # [A] of each frame
     near_px: list[Bool] = field(default_factory=list)
     near_mm: list[Bool] = field(default_factory=list)
+    in_sight: list[Bool] = field(default_factory=list)
     inside: list[Bool] = field(default_factory=list)  # the point is in the picture, seen or hidden
 
     def add(self, result: FrameResult, pinned: dict[int, int], truth: F64, points: F64) -> None:
-        """`truth` [P, 2] px and `points` [P, 3] m of all the phantom's points."""
+        """`truth` [P, 2] px and `points` [P, 3] m of all the phantom's points. Of a frame that was not taken
+        in nobody is told where anchors are."""
+        if result.held:
+            return
         anchors, camera = result.anchors, result.pair.camera
         rows = [pinned[int(anchor)] for anchor in anchors.ids]
         pixels = truth[rows]
         self.confidence.append(anchors.confidence.astype(np.float64))
         self.near_px.append(np.linalg.norm(anchors.pixels - pixels, axis=1) < RIGHT * camera.width)
         self.near_mm.append(np.linalg.norm(anchors.points - points[rows], axis=1) < RIGHT_MM * 1e-3)
+        self.in_sight.append(anchors.visibility == 1)
         self.inside.append(_inside(pixels, camera))
 
     def reliability(self) -> dict[str, Any]:
-        confidence, inside = np.concatenate(self.confidence), np.concatenate(self.inside)
+        confidence, in_sight = np.concatenate(self.confidence), np.concatenate(self.in_sight)
+        near_px, inside = np.concatenate(self.near_px), np.concatenate(self.inside)
         return {
-            "reliability_px": reliability_rows(confidence[inside], np.concatenate(self.near_px)[inside]),
-            "reliability_mm": reliability_rows(confidence, np.concatenate(self.near_mm)),
+            "reliability_px": reliability_rows(confidence[inside], near_px[inside], in_sight[inside]),
+            "reliability_mm": reliability_rows(confidence, np.concatenate(self.near_mm), in_sight),
         }
 
 

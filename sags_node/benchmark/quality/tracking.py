@@ -186,6 +186,7 @@ class _Run:
     def figures(self) -> dict[str, Any]:
         """All methods over all frames that were measured, and whether the anchors' confidence is right."""
         confidence = np.concatenate([states.confidence for states in self._states]).astype(np.float64)
+        in_sight = np.concatenate([states.visibility for states in self._states]) == 1
         known = np.concatenate([truth.known for truth in self._truths])
         pixels = np.concatenate([states.pixels for states in self._states])
         off_px = np.linalg.norm(pixels - np.concatenate([truth.pixels for truth in self._truths]), axis=1)
@@ -195,12 +196,12 @@ class _Run:
             "frame_ms": float(np.median(self._frame_s)) * 1e3,
             "points_beside": len(self._shared),
             "methods": {name: self._judged(name, said) for name, said in self._said.items()},
-            "reliability_px": reliability_rows(confidence[known], right[known]),
+            "reliability_px": reliability_rows(confidence[known], right[known], in_sight[known]),
         }
         if self._exact:
             points = np.concatenate([states.points for states in self._states])
             off = np.linalg.norm(points - np.concatenate([truth.points for truth in self._truths]), axis=1)
-            found["reliability_mm"] = reliability_rows(confidence, off < RIGHT_MM * 1e-3)
+            found["reliability_mm"] = reliability_rows(confidence, off < RIGHT_MM * 1e-3, in_sight)
         return found
 
     def _judged(self, name: str, said: _Said) -> dict[str, Any]:
@@ -229,10 +230,13 @@ def _show(follower: Follower, said: _Said, result: FrameResult, measured: bool) 
         said.seen.append(seen)
 
 
-def reliability_rows(confidence: F64, right: Bool) -> dict[str, Any]:
-    """For JSON: `bins`, each as `Bin`, and the mean distance between confidence and truth (`error`)."""
-    bins = reliability(confidence, right)
-    return {"error": calibration_error(bins), "bins": [asdict(each) for each in bins]}
+def reliability_rows(confidence: F64, right: Bool, in_sight: Bool) -> dict[str, Any]:
+    """For JSON: `bins`, each as `Bin`, and the mean distance between confidence and truth (`error`); the bins
+    of anchors that are wholly `in_sight`, whose patches are looked for, and of those `out_of_sight`."""
+    parts = {"bins": np.ones_like(in_sight), "in_sight": in_sight, "out_of_sight": ~in_sight}
+    bins = {name: reliability(confidence[part], right[part]) for name, part in parts.items()}
+    rows = {name: [asdict(each) for each in found] for name, found in bins.items()}
+    return {"error": calibration_error(bins["bins"]), **rows}
 
 
 def true_points(frame: StereoFrame, result: FrameResult) -> F64 | None:

@@ -64,13 +64,17 @@ def reliability_tables(measured: dict[str, Any]) -> list[Table]:
 
 def _reliability(found: dict[str, Any], limit: str) -> Table:
     made = Table(
-        "confidence", "anchors", "said", "right",
+        "confidence", "anchors", "said", "right", "in sight", "right", "out of sight", "right",
         title=f"right is within {limit}; confidence is off by {found['error']:.3f} in the mean",
     )  # fmt: skip
+    parts = [
+        {row["least"]: (str(row["count"]), f"{row['right']:.2f}") for row in found[part]}
+        for part in ("in_sight", "out_of_sight")
+    ]
     for each in (Bin(**row) for row in found["bins"]):
-        made.add_row(
-            f"{each.least:g} to {each.most:g}", str(each.count), f"{each.said:.2f}", f"{each.right:.2f}"
-        )
+        split = [cell for part in parts for cell in part.get(each.least, ("0", "-"))]
+        said, right = f"{each.said:.2f}", f"{each.right:.2f}"
+        made.add_row(f"{each.least:g} to {each.most:g}", str(each.count), said, right, *split)
     return made
 
 

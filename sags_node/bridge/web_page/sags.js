@@ -35,7 +35,7 @@ export class Sags {
     }, blank);
   }
 
-  anchors(topic, draw) { // draw([{id, u, v, x, y, z, visibility, ...}, ...])
+  anchors(topic, draw) { // draw([{id, u, v, x, y, z, visibility, confidence, ...}, ...])
     this.follow(topic, async (head, data) => () => draw(rows(head, data)), () => draw([]));
   }
 

@@ -1,0 +1,135 @@
+"""An eye that is late, by what the matched rows tell of it: also where few frames are matched."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from sags_node.config import PhantomSource
+from sags_node.mapping.budget import StepBudget
+from sags_node.mapping.ladder import RUNGS
+from sags_node.phantom import write_session
+from sags_node.pipeline import Pipeline
+from sags_node.session import open_session
+from sags_node.sources.source import open_source
+from sags_node.types import F32, GrayPyramid
+from sags_node.vision.alignment import RowErrors
+from sags_node.vision.match_watch import MatchWatch
+from sags_node.vision.pyramid import gray_pyramid
+
+NOISE = cv2.GaussianBlur(np.random.default_rng(0).uniform(0, 255, (256, 320)).astype(np.float32), (0, 0), 3)
+TEXTURE = cv2.normalize(NOISE, None, 20, 230, cv2.NORM_MINMAX)
+SHARE = np.linspace(0, 1, 320, dtype=np.float32)  # of the motion that each column has
+BEGINS, ENDS = 1.0, 3.0  # s: the tissue goes down and up meanwhile, once a second
+SECOND = 1_000_000_000
+
+Row = Callable[[float], float]  # px, at a time in s
+
+
+def down(t: float) -> float:
+    """px that the tissue has gone down on the right; 19 px/s at most."""
+    return 3.0 * float(np.sin(2 * np.pi * t)) if BEGINS <= t < ENDS else 0.0
+
+
+def picture(t: float) -> GrayPyramid:
+    y, x = np.mgrid[:256, :320].astype(np.float32)
+    moved = cv2.remap(
+        TEXTURE, x, y - np.float32(down(t)) * SHARE, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
+    )
+    return gray_pyramid(moved.astype(np.uint8))
+
+
+def codes_at(
+    row: Row, rate: float, kept: str, every: int, share: F32 = SHARE[4::8]
+) -> dict[float, tuple[str, ...]]:
+    """What is found at the times (s) of the frames that come, of which every so many are matched.
+
+    Args:
+        kept: which frames come, again and again.
+        row: how far below its row in the left picture a point lies in the right one, on the right.
+    """
+    watch, found = MatchWatch(), {}
+    frames = [i / rate for i in range(round(4 * rate)) if kept[i % len(kept)] == "1"]
+    for number, t in enumerate(frames):
+        stamp = round(t * SECOND)
+        watch.see(stamp, picture(t))
+        if number % every == 0:
+            errors = row(t) * share + np.random.default_rng(number).normal(0, 0.3, (32, 40)).astype(
+                np.float32
+            )
+            watch(stamp, RowErrors(errors, np.ones((32, 40), np.bool_), float(np.median(errors))))
+        found[t] = tuple(finding.code for finding in watch.findings)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("rate", "kept", "every"),
+    [
+        (30, "1", 1),
+        (25, "1", 3),
+        (25, "1101", 3),
+        (25, "10", 3),
+        (25, "110", 2),
+        (12.5, "1", 2),
+        (12.5, "110", 2),
+    ],
+)
+@pytest.mark.parametrize("late", [0.12, -0.08])
+def test_a_late_eye_is_found_however_few_frames_are_matched(
+    late: float, rate: float, kept: str, every: int
+) -> None:
+    """Within three of the fields that show it, and half a period: at its turns the tissue hardly moves."""
+    found = codes_at(lambda t: down(t - late) - down(t), rate, kept, every)
+    assert {code for codes in found.values() for code in codes} == {"eyes_late"}
+    field = every * len(kept) / kept.count("1") / rate
+    first = min(t for t, codes in found.items() if codes)
+    assert BEGINS < first < BEGINS + 0.5 + 3 * field
+    in_time = codes_at(lambda t: 0.0, rate, kept, every)
+    assert set(in_time.values()) == {()}
+
+
+@pytest.mark.parametrize("at", [1.08, 1.32, 1.56])
+def test_one_field_that_looks_late_is_no_late_eye(at: float) -> None:
+    """Tissue that slips out of the grasper did so."""
+    found = codes_at(lambda t: 0.3 * (down(t) - down(t - 0.1)) if abs(t - at) < 0.06 else 0.0, 25, "1", 3)
+    assert set(found.values()) == {()}
+
+
+def test_a_knock_while_tissue_moves_is_no_late_eye() -> None:
+    found = codes_at(lambda t: 2.0 if t > 1.5 else 0.0, 25, "1", 3, share=np.ones(40, np.float32))
+    assert {code for codes in found.values() for code in codes} == {"eyes_knocked"}
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("late") / "session"
+    write_session(PhantomSource(seconds=3.0, width=320, height=256), folder)
+    return folder
+
+
+def warned(recording: Path, delay: int, rung: int, kept: str) -> set[str]:
+    """All codes of a run on one rung whose right pictures are so many frames old."""
+    session = open_session(recording, ["source.pace:=step"])
+    with open_source(session.config.source) as source:
+        frames = list(source)
+    pipeline, budget, codes = Pipeline(session.config, session.rig), StepBudget(1, RUNGS[rung]), set()
+    for number in range(delay, len(frames)):
+        if kept[number % len(kept)] == "1":
+            pipeline.process(replace(frames[number], right=frames[number - delay].right), budget)
+            codes |= {finding.code for found in pipeline.warnings.values() for finding in found}
+    return codes
+
+
+@pytest.mark.fault(
+    "picture: one eye is three frames late, and every sixth frame is matched",
+    says="`eyes_late`, and no other cause",
+)
+def test_what_a_slow_node_says_of_a_late_eye_is_that(recording: Path) -> None:
+    """Every third frame matched of every second: 200 ms apart. No other cause is blamed."""
+    assert warned(recording, 3, 0, "10") == {"eyes_late"}
+    assert warned(recording, 0, 0, "10") == set()
