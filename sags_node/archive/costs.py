@@ -15,8 +15,8 @@ from sags_node.archive.manifest import Recording
 from sags_node.archive.process import Limits
 from sags_node.archive.store import RECORDINGS
 from sags_node.archive.work import Outcome, Plan, work
-from sags_node.benchmark.provenance import revision
 from sags_node.errors import SagsError
+from sags_node.evaluation.provenance import revision
 
 SHORT = 4  # the shorter length is so many times shorter
 HOUR = 3600.0  # s

@@ -22,9 +22,8 @@ from sags_node.archive.launching import arguments, split
 from sags_node.archive.manifest import Recording
 from sags_node.archive.process import PROGRAM, Ended, Limits, run_limited
 from sags_node.archive.store import FAILED, Store
-from sags_node.benchmark.provenance import revision
 from sags_node.errors import SagsError, UsageError
-from sags_node.evaluation.machine import machine_name
+from sags_node.evaluation.provenance import machine_name, revision
 
 State = Literal["done", "failed", "refused", "no space"]
 NO_SPACE = os.strerror(errno.ENOSPC)

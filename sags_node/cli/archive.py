@@ -191,7 +191,7 @@ def run(
     from sags_node.archive.segments import check_frames
     from sags_node.archive.store import REPORT, RESULTS, Store
     from sags_node.archive.work import Plan, needs
-    from sags_node.benchmark.provenance import revision
+    from sags_node.evaluation.provenance import revision
 
     path, overrides = split(source)
     if path is None:

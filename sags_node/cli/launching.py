@@ -114,7 +114,7 @@ def write_json(file: Path | None, figures: Mapping[str, Any] | list[Any]) -> Non
         SagsError: it cannot be written.
     """
     if file is not None:
-        from sags_node.benchmark.provenance import provenance
+        from sags_node.evaluation.provenance import provenance
 
         rows = {"rows": figures} if isinstance(figures, list) else figures
         with writing(file):

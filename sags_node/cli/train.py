@@ -55,14 +55,14 @@ def train_depth(out: Path, steps: int, tissues: int, textures: Path | None, seed
 
     Pairs are crops of rendered phantoms, and surfaces painted with single pictures, one before the other; all
     with the faults of cameras. No depth of a recording is needed, nor used. The file is run by
-    vision.onnx.path, and compared with the matchers by sags bench depth --network.
+    vision.onnx.path, and compared with the matchers by python -m benchmarks depth --network.
 
     Ctrl-C ends it; the same command goes on. Once --steps are done, the file is written.
 
     \b
     sags train depth --out stereo.onnx --textures pictures/of/my/scope
     sags run launch/d4d_pull.yaml vision.onnx.path:=stereo.onnx
-    sags bench depth launch/d4d_pull.yaml --network stereo.onnx
+    python -m benchmarks depth launch/d4d_pull.yaml --network stereo.onnx
     """
     from sags_node.learning.material import gather
     from sags_node.learning.onnx_file import check_export, difference, export

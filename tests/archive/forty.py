@@ -39,9 +39,9 @@ from sags_node.archive.results import failed, read_results, write_results  # noq
 from sags_node.archive.run import Tally, about, run  # noqa: E402
 from sags_node.archive.store import RECORDINGS, Store  # noqa: E402
 from sags_node.archive.work import Plan, work  # noqa: E402
-from sags_node.benchmark.provenance import revision  # noqa: E402
 from sags_node.config import PhantomSource  # noqa: E402
 from sags_node.evaluation.golden import TIMING_KEYS  # noqa: E402
+from sags_node.evaluation.provenance import revision  # noqa: E402
 from sags_node.phantom import write_session  # noqa: E402
 
 SESSIONS = 12  # that are written

@@ -20,10 +20,10 @@ from sags_node.archive.results import read_results, write_results
 from sags_node.archive.segments import Cut, check_frames, segments
 from sags_node.archive.store import RECORDINGS, Store
 from sags_node.archive.work import Plan, work
-from sags_node.benchmark.provenance import revision
 from sags_node.config import DvrkSource, FoldersSource
 from sags_node.errors import UsageError
 from sags_node.evaluation.measure import Options
+from sags_node.evaluation.provenance import revision
 from sags_node.evaluation.session import evaluate
 from sags_node.fitting.clip import play
 from sags_node.kernels.threads import configure_threads
