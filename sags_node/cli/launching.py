@@ -35,14 +35,6 @@ def file_option(name: str, metavar: str, says: str) -> Callable[[Command], Comma
 
 table_option = file_option("--out", "FILE.json", "Write the table as JSON.")
 
-lerobot_option = click.option(
-    "--lerobot-version",
-    type=click.Choice(("v3.0", "v2.1")),
-    default="v3.0",
-    show_default=True,
-    help="Form of the LeRobot data set.",
-)
-
 
 def split(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
     """A launch file or session folder, if there is one, and the overrides."""

@@ -8,6 +8,7 @@ import shlex
 import signal
 import tempfile
 from collections.abc import Callable
+from importlib.metadata import distribution
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,6 @@ import click
 from rich.markup import escape
 
 from sags_node import __version__
-from sags_node.cli.archive import archive
 from sags_node.cli.bag import bag
 from sags_node.cli.bridge import bridge
 from sags_node.cli.calib import calib
@@ -317,5 +317,7 @@ def moved_bench(arguments: tuple[str, ...]) -> None:
     raise UsageError(f"sags bench is now, in a checkout of the sources: {asked}")
 
 
-for command in (evaluate, fit, export, archive, bag, bridge, calib, overlay, train, view, topic):
+for command in (evaluate, fit, export, bag, bridge, calib, overlay, train, view, topic):
     main.add_command(command)
+for more in distribution("sags-node").entry_points.select(group="sags.commands"):
+    more.load()(main)  # of packages that stand beside this one

@@ -15,7 +15,7 @@ from typing import Any
 
 ROOT = Path(__file__).parent.parent.parent
 # A change there may change a figure.
-WHAT_COUNTS = ("sags_node", ":(glob)benchmarks/**/*.py", "launch", "calib", "replay")
+WHAT_COUNTS = ("sags_node", "sags_lab", ":(glob)benchmarks/**/*.py", "launch", "calib", "replay")
 GIT_SECONDS = 10.0
 PROGRAMS = {"sags_node": "sags", "benchmarks": "python -m benchmarks"}  # by the folder of `__main__.py`
 
