@@ -1,5 +1,5 @@
 """The `sags` command: one file for each group of commands. Nothing imports it.
 
 Imports bridge, calibrate, calibration, engine, evaluation, export, fitting, importing, kernels,
-learning, mapping, messaging, model, overlay, phantom, recording, ros, terminal and viewer.
+mapping, messaging, model, overlay, phantom, recording, ros, terminal and viewer.
 """

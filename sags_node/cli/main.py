@@ -33,7 +33,6 @@ from sags_node.cli.node_options import keys_options, ns_option
 from sags_node.cli.offline import evaluate, fit
 from sags_node.cli.overlay import overlay
 from sags_node.cli.topic import topic
-from sags_node.cli.train import train
 from sags_node.cli.view import view
 from sags_node.errors import SagsError, UsageError
 from sags_node.plotting import check_plots
@@ -317,7 +316,7 @@ def moved_bench(arguments: tuple[str, ...]) -> None:
     raise UsageError(f"sags bench is now, in a checkout of the sources: {asked}")
 
 
-for command in (evaluate, fit, export, bag, bridge, calib, overlay, train, view, topic):
+for command in (evaluate, fit, export, bag, bridge, calib, overlay, view, topic):
     main.add_command(command)
 for more in distribution("sags-node").entry_points.select(group="sags.commands"):
     more.load()(main)  # of packages that stand beside this one
