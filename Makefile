@@ -60,7 +60,7 @@ simulate: setup
 
 # A live node with all its neighbours, ten minutes: does anything grow?
 soak: setup
-	$(BIN)/sags bench soak --check --out out/soak.json
+	$(BIN)/python -m benchmarks soak --check --out out/soak.json
 
 # Damaged bytes for every reader, for so long; inputs that fail are kept in out/fuzz. GUIDED=1: changed so that
 # they reach new lines, by atheris.

@@ -708,7 +708,7 @@ class LaunchConfig(Section):
     """One way to run the node."""
 
     ns: str = Field("sags", pattern=NAMESPACE, description="namespace of all topics")
-    seed: int = Field(0, description="of the random numbers of `sags bench endurance`")
+    seed: int = Field(0, description="of the random numbers of `python -m benchmarks endurance`")
     device: DeviceName = Field(
         "auto",
         description="auto: a GPU where one can be used, else the CPU; cuda: a GPU, or an error; docs/gpu.md",

@@ -12,8 +12,20 @@ from places import ROOT
 PACKAGE = ROOT / "sags_node"
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("benchmarks/*.md")])
 ARCHITECTURE = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
-SOURCES = {file.relative_to(ROOT).as_posix(): file.read_text("utf-8") for file in PACKAGE.rglob("*.py")}
-FOLDERS = {"sags_node", "tests", "docs", "benchmarks", "launch", "calib", "replay", "examples", ".ci"}
+FILES = [*PACKAGE.rglob("*.py"), *(ROOT / "sags_lab").rglob("*.py")]
+SOURCES = {file.relative_to(ROOT).as_posix(): file.read_text("utf-8") for file in FILES}
+FOLDERS = {
+    "sags_node",
+    "sags_lab",
+    "tests",
+    "docs",
+    "benchmarks",
+    "launch",
+    "calib",
+    "replay",
+    "examples",
+    ".ci",
+}
 STARTS = {
     "Thread", "Timer", "Process", "Popen", "ThreadPoolExecutor", "ProcessPoolExecutor", "Pool", "to_thread",
     "run_in_executor", "ThreadAuthenticator",

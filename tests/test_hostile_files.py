@@ -56,7 +56,7 @@ def jpeg(width: int = WIDTH, height: int = HEIGHT) -> bytes:
 BAD = {
     "huge.png": (png(60_000, 60_000), "says that it is 60000x60000 px; at most 64 Mpx are read"),
     "large.png": (png(30_000, 30_000), "says that it is 30000x30000 px"),
-    "flat.png": (png(0, 10), "says that it is 0x10 px"),
+    "flat.png": (png(0, 10), "or is damaged"),
     "huge.jpg": (jpeg(60_000, 60_000), "says that it is 60000x60000 px"),
     "short.png": (png(data=zlib.compress(ROWS[:500])), "libpng error: Not enough image data"),
     "garbage.png": (png(data=b"garbage" * 30), "libpng error: IDAT: incorrect header check"),

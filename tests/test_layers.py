@@ -80,6 +80,11 @@ def test_modules_import_each_other_in_no_circle() -> None:
         pytest.fail(" -> ".join(error.args[1]))
 
 
+def test_the_package_imports_nothing_that_stands_beside_it() -> None:
+    lines = re.compile(r"^\s*(?:from|import) (?:benchmarks|sags_lab|tests)\b", re.MULTILINE)
+    assert [name for name, file in FILES.items() if lines.search(file.read_text())] == []
+
+
 def said_in(folder: Path) -> str:
     return ast.get_docstring(ast.parse((folder / "__init__.py").read_text())) or ""
 

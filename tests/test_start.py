@@ -25,7 +25,7 @@ def test_a_client_loads_nothing_that_maps() -> None:
     assert not found & HEAVY
 
 
-@pytest.mark.parametrize("asked", [["--help"], ["topic", "--help"], ["bench", "--help"]], ids=" ".join)
+@pytest.mark.parametrize("asked", [["--help"], ["topic", "--help"], ["bag", "--help"]], ids=" ".join)
 def test_help_loads_no_numerics(asked: list[str]) -> None:
     found = loaded(f"from sags_node.cli.main import main\nmain({asked}, standalone_mode=False)")
     assert "click" in found

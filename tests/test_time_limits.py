@@ -14,8 +14,8 @@ import pytest
 from command_line import FREE_PORTS
 from places import SESSION
 
+from benchmarks.node import transport
 from sags_node import processes
-from sags_node.benchmark.node import transport
 from sags_node.config import V4l2Source
 from sags_node.errors import SagsError
 from sags_node.messaging.publisher import Publisher

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from sags_node.cli.launching import (
     as_json,
     file_option,
-    lerobot_option,
     open_launched,
     positive,
     split_recording,
@@ -20,9 +19,6 @@ from sags_node.cli.node_options import endpoint_option, keys_options, ns_option
 from sags_node.errors import UsageError
 from sags_node.terminal import text
 from sags_node.terminal.console import progress, show
-
-if TYPE_CHECKING:
-    from sags_node.export.lerobot_form import Version
 
 NO_CAMERAS = "live cameras are exported from the running node; leave out --session"
 
@@ -61,13 +57,6 @@ NO_CAMERAS = "live cameras are exported from the running node; leave out --sessi
     help="The model's depth of every frame of --session, 16-bit PNGs in units of 0.01 mm, 0 unknown.",
 )
 @click.option(
-    "--lerobot",
-    metavar="FOLDER",
-    type=click.Path(path_type=Path, file_okay=False),
-    help="All of that and the pictures, as a data set in the form of LeRobot.",
-)
-@lerobot_option
-@click.option(
     "--orbit-degrees",
     type=click.FloatRange(0, 60),
     default=12.0,
@@ -90,11 +79,6 @@ def export(
     mesh: Path | None,
     orbit: Path | None,
     sequence: Path | None,
-    tracks: Path | None,
-    render: Path | None,
-    depth: Path | None,
-    lerobot: Path | None,
-    lerobot_version: Version,
     orbit_degrees: float,
     orbit_seconds: float,
     force: bool,
@@ -102,6 +86,7 @@ def export(
     ns: str,
     keys: Any,
     json_out: bool,
+    **of_every_frame: Path | None,
 ) -> None:
     """Write the model at one moment for other programs, in metres.
 
@@ -113,14 +98,12 @@ def export(
     sags export --session launch/d4d_pull.yaml --fit out/d4d --at 3 --splats lift.ply
     sags export --session launch/d4d_pull.yaml --sequence out/frames
     sags export --session launch/d4d_pull.yaml --depth out/depth --tracks out/tracks.npz
-    sags export --session launch/d4d_pull.yaml --render out/model.mp4 --lerobot out/dataset
     """
     from sags_node.export import export as work
     from sags_node.export import scene as source
     from sags_node.export import sequence as many
 
-    every = {"depth": depth, "tracks": tracks, "render": render, "lerobot": lerobot}
-    played = {kind: path for kind, path in every.items() if path is not None}
+    played = {kind: path for kind, path in of_every_frame.items() if path is not None}
     asked = {"splats": splats, "points": points, "mesh": mesh, "orbit": orbit}
     targets = {kind: path for kind, path in asked.items() if path is not None}
     if played and (targets or sequence or at is not None or fit is not None or session is None):
@@ -129,7 +112,7 @@ def export(
             "moment, --sequence, --at or --fit beside it"
         )
     if played and session is not None:
-        _export_played((session, *overrides), played, lerobot_version, json_out)
+        _export_played((session, *overrides), played, json_out)
         return
     if sequence is None:
         work.check_targets(targets, force)
@@ -166,22 +149,15 @@ def export(
     show(rows if json_out else text.rows_table(rows))
 
 
-def _export_played(
-    launch: Sequence[str], played: Mapping[str, Path], version: Version, json_out: bool
-) -> None:
-    from sags_node.export.lerobot import LeRobot
-    from sags_node.export.played import DepthMaps, Product, Renders, Tracks, write_played
+def _export_played(launch: Sequence[str], played: Mapping[str, Path], json_out: bool) -> None:
+    from sags_node.export.played import PRODUCTS, write_played
 
     path, overrides = split_recording(launch, NO_CAMERAS)
     opened = open_launched(path, [*overrides, "source.loop:=false", "source.pace:=step"])
-    rate, size = opened.source.rate, opened.working_size
-    made: dict[str, Callable[[Path], Product]] = {
-        "depth": DepthMaps,
-        "tracks": Tracks,
-        "render": lambda file: Renders(file, rate, size),
-        "lerobot": lambda folder: LeRobot(folder, rate, version),
+    products = {
+        kind: PRODUCTS[kind](target, opened.source.rate, opened.working_size)
+        for kind, target in played.items()
     }
-    products = {kind: made[kind](target) for kind, target in played.items()}
     with progress("exporting") as advance:
         rows = write_played(opened, products, advance)
     show(rows if json_out else text.rows_table(rows))

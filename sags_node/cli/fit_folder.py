@@ -15,8 +15,8 @@ from sags_node.config import EndoNerfSource
 from sags_node.engine.rasterizer.smoothing import folded
 from sags_node.errors import UsageError
 from sags_node.evaluation.lpips import BACKBONE, Lpips
-from sags_node.evaluation.machine import machine_name
 from sags_node.evaluation.measure import Options
+from sags_node.evaluation.provenance import machine_name
 from sags_node.fitting import checkpoint
 from sags_node.fitting.clip import read_clip
 from sags_node.fitting.fit import Fit

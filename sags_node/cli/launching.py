@@ -35,14 +35,6 @@ def file_option(name: str, metavar: str, says: str) -> Callable[[Command], Comma
 
 table_option = file_option("--out", "FILE.json", "Write the table as JSON.")
 
-lerobot_option = click.option(
-    "--lerobot-version",
-    type=click.Choice(("v3.0", "v2.1")),
-    default="v3.0",
-    show_default=True,
-    help="Form of the LeRobot data set.",
-)
-
 
 def split(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
     """A launch file or session folder, if there is one, and the overrides."""
@@ -114,7 +106,7 @@ def write_json(file: Path | None, figures: Mapping[str, Any] | list[Any]) -> Non
         SagsError: it cannot be written.
     """
     if file is not None:
-        from sags_node.benchmark.provenance import provenance
+        from sags_node.evaluation.provenance import provenance
 
         rows = {"rows": figures} if isinstance(figures, list) else figures
         with writing(file):

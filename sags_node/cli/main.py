@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import logging
 import os
+import shlex
 import signal
 import tempfile
+from collections.abc import Callable
+from importlib.metadata import distribution
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +16,7 @@ import click
 from rich.markup import escape
 
 from sags_node import __version__
-from sags_node.cli.archive import archive
 from sags_node.cli.bag import bag
-from sags_node.cli.bench import bench
 from sags_node.cli.bridge import bridge
 from sags_node.cli.calib import calib
 from sags_node.cli.export import export
@@ -32,7 +33,6 @@ from sags_node.cli.node_options import keys_options, ns_option
 from sags_node.cli.offline import evaluate, fit
 from sags_node.cli.overlay import overlay
 from sags_node.cli.topic import topic
-from sags_node.cli.train import train
 from sags_node.cli.view import view
 from sags_node.errors import SagsError, UsageError
 from sags_node.plotting import check_plots
@@ -69,17 +69,32 @@ class Sags(click.Group):
             ctx.exit(error.exit_code)
 
 
-@click.group(cls=Sags, context_settings={"help_option_names": ["-h", "--help"]})
+def sags_group(function: Callable[..., None]) -> Sags:
+    """A group of commands, each error of which is one message; its options are those that `begin` takes."""
+    function = click.option(
+        "--log",
+        "form",
+        type=click.Choice(["text", "json"]),
+        default="text",
+        show_default=True,
+        help="What stderr gets: lines for people, or one JSON object for each event.",
+    )(function)
+    function = click.option("--verbose", "-v", is_flag=True, help="Show what happens inside.")(function)
+    return click.group(cls=Sags, context_settings={"help_option_names": ["-h", "--help"]})(function)
+
+
+def begin(verbose: bool, form: str) -> None:
+    """Set up messages and signals before a command runs."""
+    level = logging.INFO if verbose else logging.WARNING
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+        signal.signal(signal.SIGINT, interrupt)
+    signal.signal(signal.SIGTERM, interrupt)  # a service manager's stop is a Ctrl-C
+    console.quiet = form == "json"
+    logging.basicConfig(level=level, format="%(message)s", handlers=[log_handler()])
+
+
+@sags_group
 @click.version_option(__version__)
-@click.option("--verbose", "-v", is_flag=True, help="Show what happens inside.")
-@click.option(
-    "--log",
-    "form",
-    type=click.Choice(["text", "json"]),
-    default="text",
-    show_default=True,
-    help="What stderr gets: lines for people, or one JSON object for each event.",
-)
 def main(verbose: bool, form: str) -> None:
     """SAGS node: an online, deformable Gaussian model of tissue from stereo endoscope video.
 
@@ -88,12 +103,7 @@ def main(verbose: bool, form: str) -> None:
 
     Research software, not a medical device.
     """
-    level = logging.INFO if verbose else logging.WARNING
-    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
-        signal.signal(signal.SIGINT, interrupt)
-    signal.signal(signal.SIGTERM, interrupt)  # a service manager's stop is a Ctrl-C
-    console.quiet = form == "json"
-    logging.basicConfig(level=level, format="%(message)s", handlers=[log_handler()])
+    begin(verbose, form)
 
 
 # ---- run, demo -------------------------------------------------------------------------------------------
@@ -298,5 +308,15 @@ def import_folder(folder: Path, json_out: bool) -> None:
         raise SagsError(f"{folder} cannot be played as it is; see the mends above")
 
 
-for command in (evaluate, fit, export, archive, bag, bench, bridge, calib, overlay, train, view, topic):
+@main.command("bench", hidden=True, context_settings={"ignore_unknown_options": True})
+@click.argument("arguments", nargs=-1, type=click.UNPROCESSED)
+def moved_bench(arguments: tuple[str, ...]) -> None:
+    """Say where the benchmarks went: they are no part of the installed package."""
+    asked = shlex.join(["python", "-m", "benchmarks", *arguments])
+    raise UsageError(f"sags bench is now, in a checkout of the sources: {asked}")
+
+
+for command in (evaluate, fit, export, bag, bridge, calib, overlay, view, topic):
     main.add_command(command)
+for more in distribution("sags-node").entry_points.select(group="sags.commands"):
+    more.load()(main)  # of packages that stand beside this one

@@ -58,11 +58,6 @@ from sags_node.terminal.console import check_folder, console, progress, show, wr
 )
 @lpips_option
 @click.option("--paper-psnr", is_flag=True, help="Also PSNR with masked pixels counted as perfect.")
-@click.option(
-    "--protocol",
-    type=click.Choice(["d4d", "endonerf", "scared", "stereomis", "stir"]),
-    help="Measure a public data set, in its own layout, by its own rules (docs/protocols.md).",
-)
 @click.option("--report", type=click.Path(path_type=Path), help="Folder for an HTML report.")
 @click.option("--json", "json_out", metavar="FILE", help="Write the figures as JSON to FILE, - for stdout.")
 def evaluate(
@@ -74,7 +69,6 @@ def evaluate(
     every: int,
     lpips_weights: Path | None,
     paper_psnr: bool,
-    protocol: str | None,
     report: Path | None,
     json_out: str | None,
 ) -> None:
@@ -85,11 +79,7 @@ def evaluate(
     \b
     sags eval launch/d4d_pull.yaml --json out.json
     sags eval launch/d4d_pull.yaml --pace step --iterations 2 --report out/d4d
-    sags eval --protocol stir /data/STIR --json stir.json
     """
-    if protocol is not None:
-        _evaluate_protocol(protocol, launch, iterations, lpips_weights, json_out)
-        return
     from sags_node.evaluation.measure import Options
     from sags_node.evaluation.report import summary_table, write_report
     from sags_node.evaluation.session import Pace
@@ -122,44 +112,6 @@ def evaluate(
     elif json_out == "-":
         show(outcome.summary)
     write_json(file, outcome.summary)
-
-
-def _evaluate_protocol(
-    protocol: str,
-    launch: tuple[str, ...],
-    iterations: int | None,
-    lpips_weights: Path | None,
-    json_out: str | None,
-) -> None:
-    from sags_node.protocols import run
-    from sags_node.protocols.d4d import measure_d4d
-
-    path, overrides = split(launch)
-    if path is None:
-        raise UsageError(f"--protocol {protocol} needs the data set's folder")
-    if iterations is not None:
-        overrides = [*overrides, f"mapping.iterations:={iterations}"]
-    file = Path(json_out) if json_out is not None and json_out != "-" else None
-    check_files(file)
-    with progress("measuring") as advance:
-
-        def tell(done: int, what: str) -> None:
-            advance(done, None, what)
-
-        if protocol == "endonerf":
-            found = run.measure_endonerf(Path(path), overrides, lpips_weights, tell)
-        else:
-            measures = {
-                "d4d": measure_d4d,
-                "scared": run.measure_scared,
-                "stereomis": run.measure_stereomis,
-                "stir": run.measure_stir,
-            }
-            found = measures[protocol](Path(path), overrides, tell)
-    found = {"protocol": protocol, **found}
-    if file is None:
-        show(found)
-    write_json(file, found)
 
 
 @click.command()

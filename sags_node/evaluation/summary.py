@@ -11,9 +11,9 @@ import numpy as np
 
 from sags_node.evaluation import calibration
 from sags_node.evaluation.lpips import BACKBONE
-from sags_node.evaluation.machine import machine_name
 from sags_node.evaluation.measure import FrameRow, Options
 from sags_node.evaluation.metrics import percentiles
+from sags_node.evaluation.provenance import machine_name
 from sags_node.evaluation.spool import RunFacts
 from sags_node.evaluation.trajectory import trajectory_errors
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Protocol
@@ -207,3 +207,11 @@ def new_folder(folder: Path) -> None:
     check_folder(folder)
     if any(folder.iterdir()):
         raise UsageError(f"{folder} is not empty; choose another folder")
+
+
+# Kind -> what takes a target, a rate (1/s) and a size (px). `sags_lab` adds one.
+PRODUCTS: dict[str, Callable[[Path, float, tuple[int, int]], Product]] = {
+    "depth": lambda folder, rate, size: DepthMaps(folder),
+    "tracks": lambda file, rate, size: Tracks(file),
+    "render": Renders,
+}

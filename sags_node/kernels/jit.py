@@ -1,7 +1,7 @@
 """How the CPU kernels are compiled, and the rules that make LLVM vectorise them.
 
 The rules; breaking one costs up to 5 times without any error, so time a kernel after every edit
-(`sags bench kernels --check benchmarks/results/kernels.json`):
+(`python -m benchmarks kernels --check benchmarks/results/kernels.json`):
 
 1. Indices of inner loops are `np.uint64`, and so is every constant added to them. A signed index gets a
    wrap-around test that stops vectorisation; uint64 + int64 silently becomes float64.

@@ -31,7 +31,7 @@ def smoothing_variances(means: F32, cameras: Sequence[Camera]) -> F32:
         means: [N, 3] m, world, after deformation.
         cameras: those the Gaussians were fitted to. A camera that only looks at the result does not belong
             here: from nearer by it would ask for detail that nothing was ever measured of, and the picture
-            loses 2 dB at four times the size (`sags bench alias`). The mapper's is that of the whole picture,
+            loses 2 dB at four times the size (`benchmarks alias`). The mapper's is that of the whole picture,
             also while it fits to one of half the size (benchmarks/mapping.md).
 
     Gaussians that no camera sees take the largest variance of the seen ones.

@@ -12,9 +12,8 @@ import pytest
 from command_line import pure_json, refused, sags
 from tiny_archive import TINY_FRAMES, write_tiny_session
 
-from sags_node.calibration import read_rig
-from sags_node.export.lerobot import merge
-from sags_node.export.lerobot_form import (
+from sags_lab.lerobot.dataset import merge
+from sags_lab.lerobot.form import (
     COARSE,
     DEPTH,
     LEFT,
@@ -25,7 +24,8 @@ from sags_node.export.lerobot_form import (
     TISSUE,
     Version,
 )
-from sags_node.export.lerobot_stats import Sums, merged
+from sags_lab.lerobot.stats import Sums, merged
+from sags_node.calibration import read_rig
 from sags_node.export.played import DEPTH_UNIT, TRACKS
 from sags_node.session import open_session
 from sags_node.types import RectifiedPair

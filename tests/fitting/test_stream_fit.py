@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from sags_node.cli.main import main
+from benchmarks.__main__ import main
 from sags_node.engine.rasterizer.rasterize import to_view
 from sags_node.errors import SagsError
 from sags_node.evaluation.metrics import as_float, psnr
@@ -145,7 +145,7 @@ def test_the_cap_holds_where_everything_is_a_hole(frames: list[ClipFrame]) -> No
 
 
 def sags_bench(*arguments: str | Path) -> Any:
-    return CliRunner().invoke(main, ["bench", "stream", *map(str, arguments)])
+    return CliRunner().invoke(main, ["stream", *map(str, arguments)])
 
 
 def test_the_command_shows_that_a_stream_may_go_on(phantom_session: Path, tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import click
 import pytest
 from click.testing import CliRunner, Result
 
@@ -22,12 +23,12 @@ PROMPT_SECONDS = 5  # to end after Ctrl-C
 FREE_PORTS = ("publish.data:=[tcp://127.0.0.1:*]", "publish.control:=tcp://127.0.0.1:*")
 
 
-def sags(*arguments: object) -> Result:
-    """The command in this process, with any exception that it did not turn into a message; the process keeps
+def sags(*arguments: object, command: click.Command = main) -> Result:
+    """A command in this process, with any exception that it did not turn into a message; the process keeps
     its signal handlers."""
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)}
     try:
-        result = CliRunner().invoke(main, [str(argument) for argument in arguments])
+        result = CliRunner().invoke(command, [str(argument) for argument in arguments])
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
@@ -36,9 +37,9 @@ def sags(*arguments: object) -> Result:
     return result
 
 
-def refused(code: int, *arguments: object, said: tuple[str, ...]) -> None:
+def refused(code: int, *arguments: object, said: tuple[str, ...], command: click.Command = main) -> None:
     """One message on stderr, that says all of this, and nothing on stdout."""
-    result = sags(*arguments)
+    result = sags(*arguments, command=command)
     assert result.exit_code == code, result.output
     assert result.stdout == ""
     assert result.stderr.lower().count("error:") == 1, result.stderr

@@ -6,12 +6,12 @@ import json
 from pathlib import Path
 from typing import Any
 
-from sags_node.archive.manifest import Recording
-from sags_node.archive.process import Limits
-from sags_node.archive.store import RESULTS, Store
-from sags_node.archive.work import Outcome, Plan, work
-from sags_node.benchmark.provenance import revision
+from sags_lab.archive.manifest import Recording
+from sags_lab.archive.process import Limits
+from sags_lab.archive.store import RESULTS, Store
+from sags_lab.archive.work import Outcome, Plan, work
 from sags_node.config import PhantomSource
+from sags_node.evaluation.provenance import revision
 from sags_node.phantom import write_session
 
 TINY_FRAMES = 6

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sags_node.benchmark.quality.scope import WANDERED, WANDERS, Robot
+from benchmarks.quality.scope import WANDERED, WANDERS, Robot
 from sags_node.config import LaunchConfig, PhantomSource, VisionConfig
 from sags_node.geometry import invert
 from sags_node.mapping.budget import StepBudget

@@ -13,9 +13,9 @@ import pytest
 from click.testing import CliRunner
 from engine_scenes import DERIVATIVES, camera, draw_and_differentiate, random_gaussians, relative_error
 
-from sags_node.benchmark.quality.alias import VARIANTS, Settings, Trained, train
-from sags_node.benchmark.quality.alias_truth import moved, resized
-from sags_node.cli.main import main
+from benchmarks.__main__ import main
+from benchmarks.quality.alias import VARIANTS, Settings, Trained, train
+from benchmarks.quality.alias_truth import moved, resized
 from sags_node.engine.rasterizer.rasterize import make_rasterizer, rasterize
 from sags_node.engine.rasterizer.smoothing import folded
 from sags_node.evaluation.metrics import psnr
@@ -176,7 +176,7 @@ def test_a_thin_bright_line_grows_with_the_dilation() -> None:
 def test_bench_alias_measures_the_phantom(tmp_path: Path) -> None:
     """The command, and that its figures say what the test above says of a wall."""
     out, drawn = tmp_path / "alias.json", tmp_path / "alias.png"
-    arguments = ["bench", "alias", "--quick", "--json", "--out", str(out), "--picture", str(drawn)]
+    arguments = ["alias", "--quick", "--json", "--out", str(out), "--picture", str(drawn)]
     result = CliRunner().invoke(main, arguments)
     assert result.exit_code == 0, result.output
     table = json.loads(out.read_text())

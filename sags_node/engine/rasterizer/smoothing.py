@@ -7,7 +7,7 @@ A Gaussian with a filter of variance f is drawn as one with covariance R S S^T R
 The product runs over the two larger axes. Mip-Splatting takes all three, which makes surfaces transparent: a
 flat Gaussian is thinner than any sampling interval, but light that falls on it face on does not meet its
 thickness, and its alpha, as it is drawn, does not depend on it either. With three axes an online model of
-75,000 Gaussians lost 1.3 dB, with two 0.1 dB; the gain at other sizes is the same (`sags bench alias`).
+75,000 Gaussians lost 1.3 dB, with two 0.1 dB; the gain at other sizes is the same (`benchmarks alias`).
 
 It does not depend on the camera, so it is applied once per drawing, before the projection. f is a constant.
 """

@@ -1,0 +1,1 @@
+"""The commands of `python -m benchmarks`: one file for each group of them."""

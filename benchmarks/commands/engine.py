@@ -1,0 +1,305 @@
+"""Of the engine and the offline model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import click
+
+from sags_node.cli.launching import (
+    as_json,
+    check_files,
+    count_frames,
+    file_option,
+    launch_argument,
+    lpips_option,
+    open_launched,
+    positive,
+    split_recording,
+    table_option,
+    write_json,
+)
+from sags_node.errors import SagsError, UsageError
+from sags_node.plotting import check_plots
+from sags_node.terminal.console import progress, show, writing
+
+
+@click.command("kernels")
+@click.option(
+    "--device",
+    type=click.Choice(["cpu", "cuda"]),
+    default="cpu",
+    show_default=True,
+    help="cuda: the rasteriser on a GPU, beside gsplat where that is installed.",
+)
+@click.option("--quick", is_flag=True, help="A tiny scene and few runs: does it work, not how fast is it.")
+@click.option("--large", is_flag=True, help="Also a million Gaussians.")
+@click.option("--contention", is_flag=True, help="Also beside another process that burns one core.")
+@click.option("--no-twin", is_flag=True, help="Leave out the torch twins (most of the time, 10 GB).")
+@file_option("--out", "FILE.json", "Write the table as JSON, and a plot of the same name, .svg, beside it.")
+@file_option(
+    "--check", "FILE.json", "Compare with a table written by --out; fail if a kernel has become slower."
+)
+@click.option(
+    "--tolerance",
+    type=click.FloatRange(min=1.0),
+    default=1.3,
+    show_default=True,
+    help="How many times slower than in --check's table is too slow.",
+)
+@file_option(
+    "--yardstick", "FILE.cpp", "Only compare the rasteriser with this C++ program, call by call; needs g++."
+)
+@as_json
+def bench_kernels(
+    device: str,
+    quick: bool,
+    large: bool,
+    contention: bool,
+    no_twin: bool,
+    out: Path | None,
+    check: Path | None,
+    tolerance: float,
+    yardstick: Path | None,
+    json_out: bool,
+) -> None:
+    """Time every kernel of the engine beside the machine's peak.
+
+    Milliseconds per stage, pixel-Gaussian pairs per second, the share of the machine's peak (multiply-adds or
+    memory, whichever binds; both measured in the same run), the gain over the plain torch twin, how it scales
+    with threads, and what idle pauses cost. Takes two minutes, in which the machine should do nothing else.
+
+    --check is the guard against kernels that became slow without an error. It compares each kernel's time in
+    units of the machine's own peak, so a table from another machine serves too, less sharply. Exit code 1 and
+    the kernel's name if one is slower than the tolerance.
+
+    \b
+    python -m benchmarks kernels --out benchmarks/results/kernels.json
+    python -m benchmarks kernels --check benchmarks/results/kernels.json
+    python -m benchmarks kernels --device cuda --out gpu.json
+    python -m benchmarks kernels --yardstick splat.cpp
+    """
+    from benchmarks.kernels import check as guard
+    from benchmarks.kernels import device_report, report
+
+    on_gpu = device == "cuda"
+    if yardstick is not None:
+        if on_gpu or large or contention or no_twin or check is not None:
+            raise UsageError("with --yardstick give --quick, --out and --json only")
+        _compare_with(yardstick, quick, out, json_out)
+        return
+    if on_gpu and (large or contention or no_twin):
+        raise UsageError("--large, --contention and --no-twin are about the CPU's table; leave them out")
+    if check is not None and out is not None:
+        raise UsageError("give --out or --check: a check measures up to three times and keeps no table")
+    checks = check is not None
+    measure = (
+        _device_kernels(quick, checks) if on_gpu else _kernels(quick, large, contention, no_twin, checks)
+    )
+    if check is None:
+        check_files(out)
+        if out is not None:
+            check_plots()
+        with progress("measuring") as advance:
+            measured = measure(advance)
+        reporter = device_report if on_gpu else report
+        for table in [measured] if json_out else reporter.tables(measured):
+            show(table)
+        write_json(out, measured)
+        if out is not None:
+            with writing(out):
+                out.with_suffix(".svg").write_text(reporter.plot(measured), encoding="utf-8")
+        return
+    kept = guard.read_table(check)
+    with progress("measuring") as advance:
+        compared = guard.check(lambda: measure(advance), kept, tolerance)
+    show([asdict(each) for each in compared] if json_out else report.check_table(compared, tolerance))
+    slower = [f"{each.kernel} {each.ratio:.2f} times" for each in compared if each.ratio > tolerance]
+    if slower:
+        raise SagsError(f"slower than in {check}, three times in a row: {'; '.join(slower)}")
+
+
+Advance = Callable[[int, int, str], None]  # done, total, what comes next
+Measure = Callable[[Advance], dict[str, Any]]
+
+
+def _kernels(quick: bool, large: bool, contention: bool, no_twin: bool, checks: bool) -> Measure:
+    """What measures the CPU's table; of what is only to be checked, the kernels alone."""
+    from dataclasses import replace
+
+    from benchmarks.kernels import measure as kernels
+
+    settings = kernels.QUICK if quick else kernels.Settings()
+    if large:
+        settings = replace(settings, counts=(*settings.counts, kernels.MILLION))
+    if checks:
+        settings = replace(settings, twin=False, rhythm=False)
+    else:
+        settings = replace(settings, twin=not no_twin, contention=contention)
+    return lambda advance: kernels.measure_kernels(settings, advance)
+
+
+def _device_kernels(quick: bool, checks: bool) -> Measure:
+    """The same of a GPU.
+
+    Raises:
+        UsageError: torch and Triton are not here, as they must be for one.
+    """
+    from dataclasses import replace
+
+    from benchmarks.kernels import device as device_kernels
+
+    settings = device_kernels.QUICK if quick else device_kernels.DeviceSettings()
+    settings = replace(settings, gsplat=not checks)
+    return lambda advance: device_kernels.measure_device_kernels(settings, advance)
+
+
+def _compare_with(yardstick: Path, quick: bool, out: Path | None, json_out: bool) -> None:
+    from benchmarks.kernels import report
+    from benchmarks.kernels.yardstick import QUICK, YardstickSettings, measure_yardstick
+
+    if not yardstick.is_file():
+        raise UsageError(f"there is no file {yardstick}; --yardstick takes the C++ program to compare with")
+    check_files(out)
+    with progress("measuring") as advance:
+        measured = measure_yardstick(yardstick, QUICK if quick else YardstickSettings(), advance)
+    show(measured if json_out else report.yardstick_table(measured))
+    write_json(out, measured)
+
+
+@click.command("alias")
+@click.option("--quick", is_flag=True, help="A tiny scene and few steps: does it work, not how good is it.")
+@table_option
+@file_option("--picture", "FILE.png", "Draw the truth, both filters and none side by side.")
+@as_json
+def bench_alias(quick: bool, out: Path | None, picture: Path | None, json_out: bool) -> None:
+    """What both filters are worth at other sizes and distances.
+
+    Four models of one instant of the phantom, with each choice of filters, are drawn at 1/4 to 4 times the
+    size and from 1/2 to 4 times the distance, and compared with the ray-cast truth: PSNR, the brightness of
+    thin vessels, flicker in a slow motion. Takes about two minutes.
+
+    \b
+    python -m benchmarks alias --out benchmarks/results/alias.json --picture docs/alias.png
+    """
+    from benchmarks.quality import alias_report
+    from benchmarks.quality.alias import QUICK, Settings, measure_alias
+
+    check_files(out, picture)
+    with progress("measuring") as advance:
+        measured = measure_alias(QUICK if quick else Settings(), advance)
+    for table in [measured.table] if json_out else alias_report.tables(measured.table):
+        show(table)
+    write_json(out, measured.table)
+    if picture is not None:
+        with writing(picture):
+            picture.write_bytes(alias_report.picture(measured.truth, measured.models))
+
+
+@click.command("stream")
+@launch_argument
+@click.option(
+    "--seconds",
+    type=positive,
+    default=8.0,
+    show_default=True,
+    help="Length of the stream, on the recording's clock; a shorter recording begins again.",
+)
+@click.option("--window", type=positive, default=2.0, show_default=True, help="Seconds the model looks back.")
+@click.option("--quick", is_flag=True, help="A tiny model: does it work, not how good is it.")
+@table_option
+@as_json
+def bench_stream(
+    launch: tuple[str, ...], seconds: float, window: float, quick: bool, out: Path | None, json_out: bool
+) -> None:
+    """Whether the SAGS model lasts over a stream that never ends.
+
+    A session, by default the built-in phantom, is played frame by frame, however long each takes; --seconds
+    should be several times the --window that the deformation field remembers. What leaves the window is
+    folded into the Gaussians. Beside it: a model that forgets it instead, and one whose window covers all.
+    Second by second: PSNR on tissue of the newest frame before and after it was learnt from and of earlier
+    ones, the largest change of the picture as the window moves, sizes and times. Takes some five minutes.
+
+    \b
+    python -m benchmarks stream launch/phantom.yaml --seconds 6.5 --out benchmarks/results/stream.json
+    """
+    from dataclasses import replace
+
+    from benchmarks.node import stream
+    from sags_node.fitting.stream import QUICK, StreamSettings
+
+    no_cameras = "benchmarks stream plays recordings; live cameras do not come twice alike"
+    path, overrides = split_recording(launch, no_cameras)
+    if seconds < window:
+        raise UsageError(f"--seconds {seconds:g} is shorter than --window {window:g}: nothing would leave it")
+    check_files(out)
+    frames = count_frames(path, overrides, seconds)
+    forced = ["source.loop:=true", "source.pace:=step", f"source.frames:={frames}"]
+    session = open_launched(path, [*overrides, *forced])
+    settings = replace(QUICK if quick else StreamSettings(), window=window)
+    with progress("measuring") as advance:
+        measured = stream.measure_stream(session, settings, advance)
+    for table in [measured] if json_out else stream.tables(measured):
+        show(table)
+    write_json(out, measured)
+
+
+@click.command("ablation")
+@launch_argument
+@click.option(
+    "--warm-up", type=click.IntRange(0), default=300, show_default=True, help="Of the paper's schedule."
+)
+@click.option(
+    "--iterations", type=click.IntRange(1), default=1500, show_default=True, help="With deformation."
+)
+@click.option(
+    "--hold-out", type=click.IntRange(2), default=8, show_default=True, help="Test on every N-th frame."
+)
+@click.option("--seeds", type=click.IntRange(1), default=3, show_default=True, help="Fits of each variant.")
+@click.option("--variant", "only", multiple=True, metavar="NAME", help="Only this one; may be given again.")
+@click.option(
+    "--set", "changes", multiple=True, metavar="KEY=VALUE", help="A setting of every variant, as in sags fit."
+)
+@lpips_option
+@table_option
+@as_json
+def bench_ablation(
+    launch: tuple[str, ...],
+    warm_up: int,
+    iterations: int,
+    hold_out: int,
+    seeds: int,
+    only: tuple[str, ...],
+    changes: tuple[str, ...],
+    lpips_weights: Path | None,
+    out: Path | None,
+    json_out: bool,
+) -> None:
+    """What each part of the SAGS model brings, offline.
+
+    Fits a recording, by default the built-in phantom, with and without the self-adaptive decoder (an MLP of
+    its size in its place), the alias-free filters and the online start, and with each choice of tokens, each
+    from several seeds. Measures every eighth frame and the last three, from which nothing is learnt, training
+    frames, and smaller pictures. Takes some fifteen minutes for each seed.
+
+    \b
+    python -m benchmarks ablation launch/d4d_pull.yaml --out benchmarks/results/ablation_d4d.json
+    """
+    from benchmarks.quality import ablation
+    from sags_node.evaluation.measure import Options
+
+    no_cameras = "benchmarks ablation plays recordings; record the cameras first"
+    path, overrides = split_recording(launch, no_cameras)
+    options = Options(hold_out, lpips_weights=lpips_weights)
+    check_files(out)
+    session = open_launched(path, [*overrides, "source.loop:=false", "source.pace:=step"])
+    with progress("measuring") as advance:
+        measured = ablation.measure_ablation(
+            session, warm_up, iterations, options, advance, seeds, only, changes
+        )
+    for table in [measured] if json_out else ablation.tables(measured):
+        show(table)
+    write_json(out, measured)

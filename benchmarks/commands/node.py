@@ -1,0 +1,440 @@
+"""Of the running node: time against error, endurance, tracking, subscribers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from sags_node.cli.launching import (
+    as_json,
+    check_files,
+    file_option,
+    launch_argument,
+    open_launched,
+    positive,
+    split_recording,
+    table_option,
+    write_json,
+)
+from sags_node.errors import SagsError, UsageError
+from sags_node.plotting import check_plots
+from sags_node.terminal.console import progress, show, writing
+
+if TYPE_CHECKING:
+    from benchmarks.node.endurance import Order
+    from benchmarks.quality.scope import Motion
+
+
+@click.command("pareto")
+@click.argument("launch", nargs=-1, metavar="[LAUNCH.yaml | SESSION]... [key:=value ...]")
+@click.option(
+    "--only",
+    metavar="PARTS",
+    help="Some of budgets,resolutions,gaussians,skips (all by default), rungs, hosts.",
+)
+@click.option("--frames", type=click.IntRange(1), help="Of each recording; default: all.")
+@click.option(
+    "--repeat",
+    type=click.IntRange(1),
+    default=1,
+    show_default=True,
+    help="Play each setting so often; the run of middle speed counts.",
+)
+@click.option(
+    "--fit",
+    "fits",
+    multiple=True,
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE.json",
+    help="Figures of sags fit, for the session they name. Default: benchmarks/results/fit_*.json.",
+)
+@table_option
+@file_option("--plot", "FILE.png", "Draw the picture's quality over the time of a frame.")
+@as_json
+def bench_pareto(
+    launch: tuple[str, ...],
+    only: str | None,
+    frames: int | None,
+    repeat: int,
+    fits: tuple[Path, ...],
+    out: Path | None,
+    plot: Path | None,
+    json_out: bool,
+) -> None:
+    """Run time against error of the online mapper.
+
+    Plays recordings, by default the built-in phantom, with other time budgets, working sizes and numbers of
+    Gaussians than their launch files say, and with each rule that skips work on and off. Settings that no
+    other beats in both time and picture are marked. Beside them: the previous picture shown again, the left
+    picture warped into the right eye, stereo alone, and the offline fit.
+
+    A smaller working size is measured at that size, and once more at the launch file's, for which its
+    Gaussians are drawn there: the figure to compare. Takes three to five seconds per frame.
+
+    The part rungs is each rung of the ladder of quality, with one step a frame: its price, and what it gives.
+    The part hosts plays live, sockets included: with the machine for itself; on one of its cores; beside a
+    busy process, the overlay, a reader of everything and the viewer (with a browser, where there is one). How
+    many frames it shows after the first second, in which time and how well.
+
+    \b
+    python -m benchmarks pareto launch/d4d_pull.yaml launch/phantom.yaml source.start:=2 --frames 50 \\
+        --out benchmarks/results/pareto.json --plot docs/pareto.png
+    """
+    from benchmarks.pareto import plot as pareto_plot
+    from benchmarks.pareto import report as pareto_report
+    from benchmarks.pareto.baselines import read_fits
+    from benchmarks.pareto.measure import measure_pareto
+    from benchmarks.pareto.settings import PARTS, Sweep
+
+    overrides = [argument for argument in launch if ":=" in argument]
+    if frames is not None:
+        overrides.append(f"source.frames:={frames}")
+    alone = [[path, *overrides] for path in launch if ":=" not in path] or [overrides]
+    no_cameras = "benchmarks pareto plays recordings; live cameras do not come twice alike"
+    paths = [split_recording(arguments, no_cameras)[0] for arguments in alone]
+    sweep = Sweep(PARTS if only is None else tuple(only.split(",")), repeat)
+    known_fits = read_fits(fits or sorted(Path("benchmarks/results").glob("fit_*.json")))
+    check_files(out, plot)
+    if plot is not None:
+        check_plots()
+    with progress("measuring") as advance:
+        measured = measure_pareto(paths, overrides, sweep, known_fits, advance)
+    for table in [measured] if json_out else pareto_report.tables(measured):
+        show(table)
+    write_json(out, measured)
+    if plot is not None:
+        with writing(plot):
+            plot.write_bytes(pareto_plot.picture(measured))
+
+
+@click.command("endurance")
+@launch_argument
+@click.option("--frames", type=click.IntRange(1), default=10_000, show_default=True, help="To be played.")
+@click.option(
+    "--window", type=click.IntRange(2), default=500, show_default=True, help="Frames of a line of the table."
+)
+@click.option(
+    "--order",
+    type=click.Choice(["there-and-back", "wrap", "walk"]),
+    default="there-and-back",
+    show_default=True,
+    help="Without a jump; from the start again after the last frame; or a random walk that never repeats.",
+)
+@table_option
+@as_json
+def bench_endurance(
+    launch: tuple[str, ...], frames: int, window: int, order: Order, out: Path | None, json_out: bool
+) -> None:
+    """Whether the node lasts: thousands of frames in a row.
+
+    Plays a recording, by default the built-in phantom, over and over, with the launch file's time budget and
+    each frame in turn. Window by window: times, PSNR on tissue against each frame, Gaussians, nodes and
+    memory; at the end how they change per 1000 frames, and what a scene costs in which nothing moves. Takes
+    the budget for each frame, so six minutes for 10,000 at 33 ms; Ctrl-C ends it with the table so far.
+
+    \b
+    python -m benchmarks endurance launch/d4d_pull.yaml --order walk --out endurance.json
+    """
+    from benchmarks.node import endurance
+
+    no_cameras = "benchmarks endurance plays recordings; record the cameras first"
+    path, overrides = split_recording(launch, no_cameras)
+    check_files(out)
+    session = open_launched(path, [*overrides, "source.loop:=false", "source.pace:=step"])
+    with progress("playing") as advance:
+        measured = endurance.measure_endurance(session, frames, window, order, advance)
+    if json_out:
+        show(measured)
+    else:
+        show(endurance.table(measured))
+        show(endurance.statement(measured))
+    write_json(out, measured)
+
+
+@click.command("soak")
+@launch_argument
+@click.option(
+    "--frames",
+    type=click.IntRange(1),
+    default=18_000,
+    show_default=True,
+    help="Of the camera, published or left out; 10 minutes.",
+)
+@click.option(
+    "--window", type=click.IntRange(2), default=900, show_default=True, help="Frames of a line of the table."
+)
+@click.option(
+    "--check",
+    is_flag=True,
+    help="Fail if a figure gets worse beyond its scatter, by a tenth an hour.",
+)
+@table_option
+@as_json
+def bench_soak(
+    launch: tuple[str, ...], frames: int, window: int, check: bool, out: Path | None, json_out: bool
+) -> None:
+    """Whether a live node lasts beside all that uses it.
+
+    Runs a node, by default of the built-in phantom, in a process of its own and in real time, with the
+    overlay, the viewer and a browser, a recorder and three subscribers; the last two come and go. Window by
+    window: rate, latency, PSNR on tissue, memory, open files and threads; at the end how they change per 1000
+    frames, and p99.9 of the latency. 100,000 frames take an hour at 30 Hz; Ctrl-C ends it with the table so
+    far.
+
+    \b
+    python -m benchmarks soak --frames 100000 --window 5000 --out benchmarks/results/soak.json
+    """
+    from benchmarks.node import soak
+
+    check_files(out)
+    path, overrides = split_recording(launch, "benchmarks soak plays recordings; record the cameras first")
+    open_launched(path, overrides)  # what takes long is not part of the node's start
+    with progress("running") as advance:
+        measured = soak.measure_soak(launch, frames, window, advance)
+    if json_out:
+        show(measured)
+    else:
+        show(soak.table(measured))
+        show(soak.statement(measured))
+    write_json(out, measured)
+    if check and (worse := soak.worsening(measured)):
+        raise SagsError(f"worse with time: {', '.join(worse)}")
+
+
+@click.command("tracking")
+@launch_argument
+@click.option(
+    "--frames",
+    "numbers",
+    default="10,20,30,40,50,60,70,80,90",
+    show_default=True,
+    help="After how many frames to measure.",
+)
+@table_option
+@as_json
+def bench_tracking(launch: tuple[str, ...], numbers: str, out: Path | None, json_out: bool) -> None:
+    """How well anchors stay on the tissue.
+
+    Pins anchors all over the first frame of a recording, follows them with one step of the mapper a frame,
+    and compares with true points, where the recording has them (the phantom), else with direct optical flow
+    between the first and a later frame, where that is consistent. The model's Gaussians beside them, and
+    CSRT, pyramidal Lucas-Kanade and dense flow on the same points. Whether confident anchors are right.
+
+    \b
+    python -m benchmarks tracking launch/d4d_pull.yaml --out benchmarks/results/tracking_d4d.json
+    """
+    from benchmarks.quality import tracking, tracking_report
+
+    if not all(number.strip().isdigit() and int(number) > 0 for number in numbers.split(",")):
+        raise UsageError(f"--frames {numbers}: give numbers above 0 with commas between, e.g. 10,40")
+    path, overrides = split_recording(
+        launch, "benchmarks tracking plays recordings; record the cameras first"
+    )
+    check_files(out)
+    session = open_launched(path, [*overrides, "source.loop:=false", "source.pace:=step"])
+    with progress("following") as advance:
+        measured = tracking.measure_tracking(session, [int(n) for n in numbers.split(",")], advance)
+    for table in [measured] if json_out else tracking_report.tables(measured):
+        show(table)
+    write_json(out, measured)
+
+
+@click.command("recall")
+@launch_argument
+@click.option("--seconds", type=positive, default=10.0, show_default=True, help="Out of sight.")
+@table_option
+@as_json
+def bench_recall(launch: tuple[str, ...], seconds: float, out: Path | None, json_out: bool) -> None:
+    """Whether anchors come back after a long time out of sight.
+
+    Pins anchors to the phantom's tissue. Then a cloth covers it, or it is dark and the scope moves, or the
+    scope turns away; meanwhile the tissue moves on. Once it is back: how many anchors are on their points
+    again, how many are sure and wrong, and how many would be right if they had not moved at all. Also how
+    often anchors of some confidence are right, in all frames.
+
+    \b
+    python -m benchmarks recall source.seed:=1 --out benchmarks/results/recall.json
+    """
+    from benchmarks.quality import recall
+
+    path, overrides = split_recording(launch, "benchmarks recall needs the phantom")
+    check_files(out)
+    session = open_launched(path, [*overrides, "source.pace:=step"])
+    with progress("following") as advance:
+        measured = recall.measure_recall(session, seconds, advance)
+    for table in [measured] if json_out else recall.tables(measured):
+        show(table)
+    write_json(out, measured)
+
+
+@click.command("scope")
+@launch_argument
+@click.option(
+    "--motion",
+    "motions",
+    multiple=True,
+    type=click.Choice(["sway", "zoom", "orbit"]),
+    help="This one alone; may be given several times. Default: all.",
+)
+@click.option("--seconds", type=positive, default=120.0, show_default=True, help="Of each motion.")
+@table_option
+@as_json
+def bench_scope(
+    launch: tuple[str, ...],
+    motions: tuple[Motion, ...],
+    seconds: float,
+    out: Path | None,
+    json_out: bool,
+) -> None:
+    """How true the pose of a moving scope stays.
+
+    The phantom's scope sways, zooms and orbits over breathing, pulled tissue, at 10 Hz. Its pose is given,
+    estimated from the pictures, given by a robot that is off by some mm and a degree, and refined from that;
+    beside them a camera that takes the scene for rigid, and what fits the true surface points best. Errors of
+    the way, drift over whole breaths, pictures and depth. Takes some minutes for each motion.
+
+    \b
+    python -m benchmarks scope --motion orbit source.width:=320 source.height:=256
+    """
+    from benchmarks.quality import scope
+    from sags_node.launch_file import load_launch
+
+    path, overrides = split_recording(launch, "benchmarks scope needs the phantom")
+    check_files(out)
+    with progress("following") as advance:
+        measured = scope.measure_scope(
+            load_launch(path, overrides), motions or scope.MOTIONS, seconds, advance
+        )
+    show(measured if json_out else scope.table(measured))
+    write_json(out, measured)
+
+
+@click.command("crowd")
+@launch_argument
+@click.option(
+    "--seconds",
+    type=positive,
+    default=60.0,
+    show_default=True,
+    help="With the crowd; a quarter for each of the others.",
+)
+@click.option(
+    "--many", type=click.IntRange(0, 50), default=20, show_default=True, help="Further subscribers."
+)
+@table_option
+@as_json
+def bench_crowd(launch: tuple[str, ...], seconds: float, many: int, out: Path | None, json_out: bool) -> None:
+    """Whether subscribers disturb the node.
+
+    Runs a node, by default of the built-in phantom, in a process of its own: alone; with one reader of
+    everything; and with a fast subscriber, a slow one (200 ms a frame), a dead one (never reads) and many
+    more, each group in its own process. The node's rate, latency and memory, and how old the frames are that
+    the subscribers take.
+
+    \b
+    python -m benchmarks crowd --seconds 600 --out benchmarks/results/crowd.json
+    """
+    from benchmarks.node import crowd
+
+    check_files(out)
+    path, overrides = split_recording(launch, "benchmarks crowd plays recordings; record the cameras first")
+    open_launched(path, overrides)  # what takes long is not part of the node's start
+    with progress("listening") as advance:
+        measured = crowd.measure_crowd(launch, seconds / 4, seconds, many, advance)
+    show(measured if json_out else crowd.table(measured))
+    write_json(out, measured)
+
+
+@click.command("bridges")
+@launch_argument
+@click.option("--seconds", type=positive, default=30.0, show_default=True, help="Of each bridge.")
+@table_option
+@as_json
+def bench_bridges(launch: tuple[str, ...], seconds: float, out: Path | None, json_out: bool) -> None:
+    """What each bridge gives and costs.
+
+    Runs a node, by default of the built-in phantom, in a process of its own: alone, and beside each bridge of
+    sags bridge with one peer that reads all it gets. Per bridge: rate and bytes, the age of what the peer
+    gets, CPU time of the bridge for each frame of the node, and the node's own rate and latency.
+
+    \b
+    python -m benchmarks bridges launch/d4d_pull.yaml --out benchmarks/results/bridges.json
+    """
+    from benchmarks.node import bridges
+
+    check_files(out)
+    path, overrides = split_recording(launch, "benchmarks bridges plays recordings; record the cameras first")
+    open_launched(path, overrides)  # what takes long is not part of the node's start
+    with progress("listening") as advance:
+        rows = bridges.measure_bridges(launch, seconds, advance)
+    show(rows if json_out else bridges.table(rows))
+    write_json(out, rows)
+
+
+@click.command("transport")
+@click.option("--frames", type=click.IntRange(1), default=150, show_default=True, help="Of each transport.")
+@as_json
+def bench_transport(frames: int, json_out: bool) -> None:
+    """What sending a picture costs.
+
+    A 4 MB picture goes to another process over ipc, tcp, and tcp with encryption. Milliseconds from the send
+    call to the arrival, at 30 frames per second. Takes 20 seconds.
+    """
+    from benchmarks.node.transport import measure_transport
+    from sags_node.terminal.text import rows_table
+
+    rows = measure_transport(frames)
+    show(rows if json_out else rows_table(rows))
+
+
+@click.command("thin")
+@launch_argument
+@click.option("--frames", type=click.IntRange(1), default=60, show_default=True, help="To measure.")
+@table_option
+@as_json
+def bench_thin(launch: tuple[str, ...], frames: int, out: Path | None, json_out: bool) -> None:
+    """What thin pictures cost.
+
+    Plays a recording, by default the built-in phantom, and makes each kind of thin picture of every frame
+    (docs/wire.md). CPU time to make and to decode one, its size, and what it takes of a link at 30 Hz.
+
+    \b
+    python -m benchmarks thin launch/d4d_pull.yaml --out benchmarks/results/thin.json
+    """
+    from benchmarks.node.thin import measure_thin
+    from sags_node.terminal.text import rows_table
+
+    check_files(out)
+    path, overrides = split_recording(launch, "benchmarks thin plays recordings; record the cameras first")
+    session = open_launched(path, [*overrides, "source.loop:=false", "source.pace:=step"])
+    with progress("making") as advance:
+        rows = measure_thin(session, frames, advance)
+    show(rows if json_out else rows_table(rows))
+    write_json(out, rows)
+
+
+@click.command("inputs")
+@click.option("--seconds", type=positive, default=10.0, show_default=True, help="Of each way.")
+@click.option("--only", metavar="NAME", help="Ways that begin so, e.g. gst; default: all.")
+@table_option
+@as_json
+def bench_inputs(seconds: float, only: str | None, out: Path | None, json_out: bool) -> None:
+    """What a live pair costs until the mapper has it.
+
+    Two pictures of 1280x1024 px, 30 times a second, by each way into the node (docs/inputs.md). CPU time of a
+    pair in the node and in the process that sends, and the time from the stamp until the pair is there. The
+    sender also makes the pictures.
+
+    \b
+    python -m benchmarks inputs --out benchmarks/results/inputs.json
+    """
+    from benchmarks.node.inputs import measure_inputs
+    from sags_node.terminal.text import rows_table
+
+    check_files(out)
+    with progress("listening") as advance:
+        rows = measure_inputs(seconds, only, advance)
+    show(rows if json_out else rows_table(rows))
+    write_json(out, rows)

@@ -1,0 +1,58 @@
+"""All disturbances by name, and how long each lasts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from benchmarks.disturbances import lens, light, signal, tissue
+from benchmarks.disturbances.moment import Moment
+from sags_node.types import StereoFrame
+
+
+@dataclass(frozen=True, slots=True)
+class Disturbance:
+    """One thing that goes wrong."""
+
+    name: str
+    change: Callable[[Moment], StereoFrame | None]  # the frame as it comes; None: it does not
+    seconds: float | None = None  # that it lasts; None: all the time that is given
+    frames: int | None = None  # likewise, whatever the rate
+
+    @property
+    def says(self) -> str:
+        """What it is, in words."""
+        return (self.change.__doc__ or "").split(". ")[0].rstrip(".").replace("\n    ", " ")
+
+    def length(self, whole: int, rate: float) -> int:
+        """How many of the `whole` frames that are given it lasts, at `rate` frames per second."""
+        if self.frames is not None:
+            return min(self.frames, whole)
+        return whole if self.seconds is None else min(max(1, round(self.seconds * rate)), whole)
+
+
+DISTURBANCES = {
+    each.name: each
+    for each in (
+        Disturbance("clean", signal.clean),
+        Disturbance("smoke", tissue.smoke),
+        Disturbance("blood", tissue.blood),
+        Disturbance("fog_right", lens.fog_right),
+        Disturbance("fog_left", lens.fog_left),
+        Disturbance("black_right", signal.black_right),
+        Disturbance("frozen_right", signal.frozen_right),
+        Disturbance("frozen", signal.frozen),
+        Disturbance("late_right", signal.late_right),
+        Disturbance("swapped", signal.swapped),
+        Disturbance("equal", signal.equal),
+        Disturbance("drops", lens.drops),
+        Disturbance("dark", light.dark, seconds=0.5),
+        Disturbance("flicker", light.flicker),
+        Disturbance("flash", light.flash, frames=2),
+        Disturbance("cut", signal.cut, frames=10),
+        Disturbance("blur", lens.blur),
+        Disturbance("lost_frames", signal.lost_frames),
+        Disturbance("jpeg", signal.jpeg),
+        Disturbance("knocked", signal.knocked),
+    )
+}

@@ -1,0 +1,123 @@
+"""The table of `benchmarks kernels`: every kernel's time on this machine, beside the machine's own peak."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from typing import Any
+
+from benchmarks.kernels.adam import measure_adam
+from benchmarks.kernels.contention import measure_contention, measure_rhythm
+from benchmarks.kernels.decoding import CONTROL_NODES, measure_decoder
+from benchmarks.kernels.fields import measure_hexplane
+from benchmarks.kernels.pictures import measure_losses
+from benchmarks.kernels.rasterizing import RasterCase, measure_rasterizer
+from benchmarks.kernels.step import measure_step
+from sags_node.evaluation.provenance import machine_name
+from sags_node.kernels.peak import Peak, measure_peak, peak_row
+from sags_node.kernels.threads import configure_threads
+from sags_node.model.decoder import TOKEN_CHOICES
+
+Advance = Callable[[int, int, str], None]  # done, total, what comes next
+
+MILLION = 1_000_000
+GAUSSIAN_COLUMNS, CELL_COLUMNS = 14, 32
+ACTIVE_SHARES = (0.5, 0.25, 0.1, 0.05)
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What is measured."""
+
+    counts: tuple[int, ...] = (10_000, 30_000, 100_000)  # Gaussians
+    sizes: tuple[tuple[int, int], ...] = ((640, 512), (320, 256))  # px
+    runs: int = 31  # per median
+    twin: bool = True  # also time the torch twins
+    rhythm: bool = True  # also time at the pace of a camera
+    contention: bool = False  # also time beside another process that burns a core
+
+
+QUICK = Settings(counts=(500,), sizes=((64, 64),), runs=3)
+
+
+def measure_kernels(settings: Settings, advance: Advance) -> dict[str, Any]:
+    """Everything that `settings` ask for; keys as benchmarks/README.md lists them.
+
+    Uses all cores of the process, and leaves the calling thread set to them.
+    """
+    every = configure_threads(None)
+    peaks = {threads: measure_peak(threads) for threads in sorted({1, min(2, every), every})}
+    table: dict[str, Any] = {
+        "machine": machine_name(),
+        "threads": every,
+        "settings": asdict(settings),
+        "peaks": [peak_row(peak) for peak in peaks.values()],
+    }
+    jobs = list(_jobs(settings, peaks))
+    for done, job in enumerate(jobs):
+        advance(done, len(jobs), job.what)
+        configure_threads(job.threads)
+        table.setdefault(job.section, []).append(job.measure())
+    configure_threads(None)
+    return table
+
+
+@dataclass(frozen=True, slots=True)
+class _Job:
+    """One row of a section of the table."""
+
+    section: str
+    what: str
+    threads: int
+    measure: Callable[[], dict[str, Any]]
+
+
+def _jobs(settings: Settings, peaks: Mapping[int, Peak]) -> Iterator[_Job]:
+    every, runs = max(peaks), settings.runs
+    few, peak = settings.counts[0], peaks[every]
+    twin_runs = 1 if settings.twin else 0
+    for case in raster_cases(settings, sorted(peaks)):
+        plain = case == RasterCase(few, case.width, case.height, every)
+        # of more Gaussians the twin would take tens of GB
+        measure = partial(measure_rasterizer, case, runs, peaks[case.threads], twin_runs if plain else 0)
+        yield _Job("rasterize", f"rasteriser, {case.count} Gaussians", case.threads, measure)
+    for count in settings.counts[:2]:
+        measure = partial(measure_hexplane, count, every, runs, peak, twin_runs)
+        yield _Job("hexplane", f"HexPlane, {count} points", every, measure)
+    for tokens in TOKEN_CHOICES:
+        count = CONTROL_NODES if tokens == "nodes" else few
+        measure = partial(measure_decoder, count, tokens, every, runs, peak, twin_runs)
+        yield _Job("decoder", f"decoder, {tokens}", every, measure)
+    for width, height in settings.sizes:
+        measure = partial(measure_losses, few, width, height, every, runs, peak, twin_runs)
+        yield _Job("losses", f"losses, {width}x{height}", every, measure)
+    tables = [(count, count, GAUSSIAN_COLUMNS) for count in settings.counts[:2]]
+    for count, of, columns in [*tables, (4 * few, 12 * few, CELL_COLUMNS)]:
+        measure = partial(measure_adam, count, of, columns, every, runs, peak)
+        yield _Job("adam", f"Adam, {count} rows of {columns}", every, measure)
+    for (width, height), structural in zip(settings.sizes, (True, False), strict=False):
+        whole = RasterCase(few, width, height, every)
+        yield _Job("step", "a whole step", every, partial(measure_step, whole, structural, runs))
+    first = RasterCase(few, *settings.sizes[0], every)
+    if settings.rhythm:
+        yield _Job("rhythm", "in a camera's rhythm", every, partial(measure_rhythm, first, runs))
+    if settings.contention:
+        yield _Job("contention", "beside a busy process", every, partial(measure_contention, first, runs))
+
+
+def raster_cases(settings: Settings, thread_counts: list[int]) -> Iterator[RasterCase]:
+    """Every count at every size; then, of the second count at the first size, everything that can differ."""
+    every = thread_counts[-1]
+    for width, height in settings.sizes:
+        for count in settings.counts:
+            yield RasterCase(count, width, height, every)
+    second = RasterCase(settings.counts[:2][-1], *settings.sizes[0], every)
+    for threads in thread_counts[:-1]:
+        yield replace(second, threads=threads)
+    for scene in ("corner", "shuffled"):
+        yield replace(second, scene=scene)
+    yield replace(second, cameras=2)
+    yield replace(second, sh_degree=3)
+    for share in ACTIVE_SHARES:
+        yield replace(second, active_tiles=share)

@@ -1,0 +1,253 @@
+"""`benchmarks crowd`: whether slow, dead and many subscribers disturb a node."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from multiprocessing.connection import Connection
+from multiprocessing.synchronize import Event
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zmq
+from rich.table import Table
+
+from benchmarks.node.neighbours import everything, give_way
+from sags_node.errors import SagsError
+from sags_node.evaluation.metrics import percentiles
+from sags_node.messaging.address import connect, find_data
+from sags_node.messaging.received import ReceivedText, TopicName
+from sags_node.messaging.stream import MAX_MESSAGE_BYTES
+from sags_node.messaging.subscriber import Subscriber
+from sags_node.processes import end
+
+PICTURES = ("left/render/image", "left/render/depth")
+SMALL = ("tf", "anchors", "status")  # what each of the many listens to
+STATUS = TopicName("status", ReceivedText)
+WARM_UP = 10.0  # s
+STARTING = 60.0  # s for a node to bind its sockets
+STOPPING = 30.0  # s for it, and for each of the crowd, to end
+SLOW = 0.2  # s that the slow subscriber takes for each frame
+PHASE = "publish.data:=[tcp://127.0.0.1:*]", "publish.control:=tcp://127.0.0.1:*", "source.loop:=true"
+
+Advance = Callable[[int, int | None, str], None]  # done, of, what
+Task = Callable[[Path, float, Event, Connection], None]  # of a subscriber
+Work = tuple[Task, float]  # with its argument
+
+
+def measure_crowd(launch: Sequence[str], alone: float, crowded: float, many: int, advance: Advance) -> Any:
+    """One node in its own process: with one quiet observer, with a reader of everything, with a crowd, and
+    alone again. What the reader costs is that all is computed and sent; what the crowd costs beyond, itself.
+
+    The crowd: a fast subscriber that takes every picture and depth; a slow one that takes `SLOW` seconds for
+    each; a dead one that is connected to everything and never reads; and `many` more that listen to `SMALL`.
+    They stand for other machines, and so take only what the node leaves of the cores.
+
+    Args:
+        launch: launch file and overrides of the node.
+        alone, crowded: s for each phase.
+
+    Raises:
+        SagsError: the node does not run.
+    """
+    with tempfile.TemporaryDirectory() as folder, node_beside(launch, Path(folder)) as node:
+        with Subscriber([STATUS], run_dir=Path(folder)) as observer:
+            phases = []
+            for name, seconds, work in (
+                ("alone", alone, {}),
+                ("one reader", alone, {"reader": (_read, 0.0)}),
+                ("crowd", crowded, _crowd(many)),
+                ("alone again", alone, {}),
+            ):
+                with _peers(Path(folder), work) as stop:
+                    seen = []
+                    for status in watched(observer, seconds, node):
+                        seen.append(status)
+                        advance(len(seen), None, name)
+                    peers = stop()
+                phases.append({"phase": name, **_figures(seen), "peers": peers})
+    return {"launch": list(launch), "many": many, "phases": phases}
+
+
+@contextmanager
+def node_beside(launch: Sequence[str], folder: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """A node in its own process, with its files in `folder`."""
+    command = [sys.executable, "-m", "sags_node", "run", *launch, *PHASE, f"publish.run_dir:={folder}"]
+    with tempfile.TemporaryFile("w+", errors="replace") as errors:  # a pipe that is full would stop the node
+        node = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=errors)
+        try:
+            deadline = time.monotonic() + STARTING
+            while not any(folder.glob("*.json")):
+                if node.poll() is not None:
+                    errors.seek(0)
+                    raise SagsError(f"the node did not start: {errors.read().strip()}")
+                if time.monotonic() > deadline:
+                    raise SagsError(f"the node did not start within {STARTING:g} s")
+                time.sleep(0.1)
+            yield node
+        finally:
+            end(node, grace=STOPPING)
+
+
+def watched(observer: Subscriber, seconds: float, node: subprocess.Popen[bytes]) -> Iterator[dict[str, Any]]:
+    """The node's own status, once a second, without that of the first seconds."""
+    begun = time.monotonic()
+    newest: ReceivedText | None = None
+    while (passed := time.monotonic() - begun) < WARM_UP + seconds:
+        if node.poll() is not None:
+            raise SagsError("the node ended before its time")
+        newest = observer.wait(STATUS, timeout=5.0, after=newest) or newest
+        if newest is not None and passed > WARM_UP:
+            yield json.loads(newest.text)
+
+
+def _crowd(many: int) -> dict[str, Work]:
+    work: dict[str, Work] = {"fast": (_take, 0.0), "slow": (_take, SLOW), "dead": (_sleep, 0.0)}
+    if many:
+        work[f"{many} more"] = (_listen, float(many))
+    return work
+
+
+@contextmanager
+def _peers(folder: Path, work: Mapping[str, Work]) -> Iterator[Callable[[], dict[str, Any]]]:
+    """Subscribers in processes of their own; what is given ends them and returns what they saw."""
+    spawn = multiprocessing.get_context("spawn")
+    ending = spawn.Event()
+    members: list[tuple[str, Any, Connection]] = []
+    for name, (target, argument) in work.items():
+        here, there = spawn.Pipe()
+        process = spawn.Process(
+            target=_with_what_is_left, args=(target, folder, argument, ending, there), daemon=True
+        )
+        process.start()
+        members.append((name, process, here))
+
+    def stop() -> dict[str, Any]:
+        ending.set()
+        return {name: here.recv() for name, _, here in members if here.poll(10.0)}
+
+    try:
+        yield stop
+    finally:
+        for _, process, _ in members:
+            process.terminate()
+            process.join(STOPPING)
+            process.kill()
+
+
+def _with_what_is_left(work: Task, *arguments: Any) -> None:
+    """Work at the lowest priority: a subscriber stands for another machine."""
+    give_way()
+    work(*arguments)
+
+
+def _is_over(ending: Event) -> bool:
+    """Also when the benchmark was killed."""
+    parent = multiprocessing.parent_process()
+    return ending.is_set() or parent is None or not parent.is_alive()
+
+
+def _take(folder: Path, seconds: float, ending: Event, there: Connection) -> None:
+    """Take pictures and depth of the newest frame, and `seconds` for each."""
+    since_capture, since_sent = [], []
+    with Subscriber(PICTURES, run_dir=folder) as subscriber:
+        newest = subscriber.wait(PICTURES[0], timeout=STARTING)
+        begun = time.monotonic()
+        while not _is_over(ending):
+            newest = subscriber.wait(PICTURES[0], timeout=1.0, after=newest) or newest
+            if newest is None or subscriber.aligned(PICTURES, newest.stamp_ns, timeout=0.1) is None:
+                continue
+            now = time.time_ns()
+            since_capture.append((now - newest.stamp_ns) * 1e-6)
+            since_sent.append((now - newest.meta.publish_ns) * 1e-6)
+            time.sleep(seconds)
+    rate = len(since_sent) / (time.monotonic() - begun)
+    ages = {"since_capture_ms": percentiles(since_capture), "since_sent_ms": percentiles(since_sent)}
+    there.send({"rate_hz": rate, **ages})
+
+
+def _read(folder: Path, _: float, ending: Event, there: Connection) -> None:
+    """Take everything there is, as fast as it comes."""
+    taken = 0
+    with everything(folder) as socket:
+        while not _is_over(ending):
+            if socket.poll(100):
+                socket.recv_multipart(copy=False)
+                taken += 1
+    there.send({"messages": taken})
+
+
+def _sleep(folder: Path, _: float, ending: Event, there: Connection) -> None:
+    """Be connected to everything and never read."""
+    with everything(folder):
+        while not _is_over(ending):
+            ending.wait(1.0)
+    there.send({})
+
+
+def _listen(folder: Path, count: float, ending: Event, there: Connection) -> None:
+    """Many subscribers of small topics in one process."""
+    context, poller = zmq.Context(), zmq.Poller()
+    address = find_data(None, "sags", folder)
+    for _ in range(int(count)):
+        socket = context.socket(zmq.SUB)
+        for name in SMALL:
+            socket.subscribe(f"sags/{name}")
+        connect(socket, address, MAX_MESSAGE_BYTES)
+        poller.register(socket, zmq.POLLIN)
+    heard = 0
+    while not _is_over(ending):
+        for socket, _event in poller.poll(100):
+            socket.recv_multipart()
+            heard += 1
+    there.send({"messages": heard})
+    context.destroy(linger=0)
+
+
+def _figures(seen: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Medians over a phase, and how the memory grew in it."""
+    if len(seen) < 3:
+        raise SagsError("too little was heard of the node; make the phases longer")
+    rss = np.array([each["rss_mb"] for each in seen])
+    minutes = np.arange(len(rss)) / 60
+    return {
+        "seconds": len(seen),
+        "rate_hz": percentiles([each["rate_hz"] for each in seen]),
+        "latency_p50_ms": float(np.median([each["latency_ms"]["p50"] for each in seen])),
+        "latency_p99_ms": float(np.median([each["latency_ms"]["p99"] for each in seen])),
+        "rss_mb": {"start": float(rss[0]), "end": float(rss[-1]), "max": float(rss.max())},
+        "rss_mb_per_minute": float(np.polyfit(minutes, rss, 1)[0]),
+        "connections": seen[-1]["connections"],
+    }
+
+
+def table(measured: dict[str, Any]) -> Table:
+    """For people; `measured` as `measure_crowd` returns it."""
+    made = Table("phase", "rate, Hz", "latency p50, p99, ms", "RSS, MB", "MB per minute", "others saw")
+    for row in measured["phases"]:
+        made.add_row(
+            row["phase"],
+            f"{row['rate_hz']['p50']:.1f}",
+            f"{row['latency_p50_ms']:.0f}, {row['latency_p99_ms']:.0f}",
+            f"{row['rss_mb']['start']:.0f} - {row['rss_mb']['end']:.0f}",
+            f"{row['rss_mb_per_minute']:+.2f}",
+            "\n".join(_seen(name, peer) for name, peer in row["peers"].items()),
+        )
+    return made
+
+
+def _seen(name: str, peer: dict[str, Any]) -> str:
+    if "rate_hz" in peer:
+        captured, sent = peer["since_capture_ms"], peer["since_sent_ms"]
+        return (
+            f"{name}: {peer['rate_hz']:.1f} Hz, age p50 {captured['p50']:.0f} ms since capture, "
+            f"{sent['p50']:.0f} ms since it was sent"
+        )
+    return f"{name}: {peer['messages']} messages" if "messages" in peer else f"{name}: connected"

@@ -1,0 +1,297 @@
+"""Does the node last? Thousands of frames in a row: time, quality, sizes and memory, window by window.
+
+The frames of a recording are kept in memory and played there and back, so that nothing ever jumps, in a loop,
+or in an order that never repeats. At the end one frame is shown again and again: what stillness costs.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from rich.table import Table
+
+from sags_node.errors import SagsError
+from sags_node.evaluation.metrics import psnr
+from sags_node.evaluation.provenance import machine_name
+from sags_node.kernels.threads import configure_threads
+from sags_node.mapping.budget import Budget
+from sags_node.mapping.mapper import SETTLED
+from sags_node.pipeline import Pipeline
+from sags_node.processes import resident_mb
+from sags_node.session import Session
+from sags_node.types import U8, StereoFrame
+
+Order = Literal["there-and-back", "wrap", "walk"]
+Advance = Callable[[int, int, str], None]  # done, total, what comes next
+
+MOST_BYTES = 4_000_000_000  # of pictures kept in memory
+TURN = 0.05  # chance per frame that a walk goes the other way
+STILL_FRAMES = 100
+CAMERA_NOISE = 2.0  # grey levels, standard deviation
+SIGNIFICANT = 3.0  # standard errors: a smaller slope is no trend
+FIGURES = ("ms_p50", "ms_p99", "psnr", "gaussians", "nodes", "rss_mb")
+
+
+@dataclass(frozen=True, slots=True)
+class _Taken:
+    """What one frame cost, and how it looked."""
+
+    ms: float
+    cpu_ms: float
+    psnr: float  # dB over tissue, against the frame itself
+    still: bool
+    hurried: bool  # no time for depth
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """Some hundred frames in a row."""
+
+    frames: int  # played up to its end
+    ms_p50: float
+    ms_p99: float
+    psnr: float  # dB, median
+    gaussians: int  # at its end
+    nodes: int  # that Gaussians follow, likewise
+    rss_mb: float  # likewise
+    still: int  # frames in which nothing moved
+    hurried: int  # frames without time for depth
+    restarts: int  # of the model, since the first frame
+
+
+class _Run:
+    """A pipeline in step mode, with numbers and stamps that go on for ever."""
+
+    def __init__(self, session: Session) -> None:
+        configure_threads(session.config.engine.threads)
+        self.pipeline = Pipeline(session.config, session.rig)
+        self._budget: Budget = self.pipeline.make_budget()
+        self._rate = session.source.rate
+        self._number = 0
+
+    def take(self, frame: StereoFrame) -> _Taken:
+        stamp = round(self._number * 1e9 / self._rate)
+        frame = replace(frame, frame_id=self._number, t_capture_ns=stamp, t_capture_right_ns=stamp, epoch=0)
+        self._number += 1
+        began, cpu_began = time.perf_counter(), time.process_time()
+        result = self.pipeline.process(frame, self._budget)
+        ms, cpu_ms = (time.perf_counter() - began) * 1e3, (time.process_time() - cpu_began) * 1e3
+        quality = psnr(result.views["left"].rgb, result.observation.image, result.observation.tissue)
+        still = "motion" in result.skipped
+        return _Taken(ms, cpu_ms, quality, still, not still and "depth" in result.skipped)
+
+    def window(self, taken: Sequence[_Taken]) -> Window:
+        model = self.pipeline.mapper.model
+        p50, p99 = np.percentile([each.ms for each in taken], [50, 99])
+        return Window(
+            frames=self._number,
+            ms_p50=float(p50),
+            ms_p99=float(p99),
+            psnr=float(np.nanmedian([each.psnr for each in taken])),
+            gaussians=model.count,
+            nodes=int(model.node_index.max(initial=-1)) + 1,
+            rss_mb=resident_mb(),
+            still=sum(each.still for each in taken),
+            hurried=sum(each.hurried for each in taken),
+            restarts=self.pipeline.mapper.restarts,
+        )
+
+
+def measure_endurance(
+    session: Session, frames: int, per_window: int, order: Order, advance: Advance
+) -> dict[str, Any]:
+    """Play a recording's frames over and over. Ctrl-C ends the measurement with what is known by then.
+
+    Args:
+        session: a finite recording that fits into memory.
+        frames: to be played.
+        per_window: frames of one line of the table.
+        order: of the recording's frames: there and back; from the start again after the last one, which is a
+            cut where the recording does not end as it began; or a random walk through time.
+        advance: called with what is going on.
+
+    Returns:
+        The table, keys as benchmarks/README.md lists them.
+
+    Raises:
+        SagsError: the recording cannot be read, is empty, or is too long to be kept in memory.
+    """
+    kept = _kept(session)
+    run = _Run(session)
+    windows: list[Window] = []
+    moving: list[_Taken] = []  # of the newest window
+    still: list[_Taken] = []
+    interrupted = False
+    try:
+        for done, index in enumerate(itertools.islice(visits(len(kept), order, session.config.seed), frames)):
+            if len(moving) == per_window:
+                moving.clear()
+            moving.append(run.take(kept[index]))
+            if len(moving) == per_window:
+                windows.append(run.window(moving))
+            advance(done + 1, frames + STILL_FRAMES, "playing")
+        for done, frame in enumerate(_photographed(kept[index], STILL_FRAMES, session.config.seed)):
+            still.append(run.take(frame))
+            advance(frames + done + 1, frames + STILL_FRAMES, "standing still")
+    except KeyboardInterrupt:
+        interrupted = True
+    return {
+        "machine": machine_name(),
+        "session": session.name,
+        "order": order,
+        "recorded_frames": len(kept),
+        "per_window": per_window,
+        "budget_ms": session.config.mapping.frame_ms(),
+        "interrupted": interrupted,
+        "windows": [asdict(window) for window in windows],
+        "per_1000_frames": {figure: slope(windows, figure) for figure in FIGURES},
+        "still": _stillness(moving, still),
+    }
+
+
+def slope(windows: Sequence[Any], figure: str) -> dict[str, float] | None:
+    """How a figure changes in 1000 frames, by least squares over the windows after the first, in which the
+    model is still made; with its standard error. None of fewer than three: two always lie on a line."""
+    counted = [window for window in windows[1:] if math.isfinite(getattr(window, figure))]
+    if len(counted) < 3:
+        return None
+    x = np.array([window.frames for window in counted]) / 1000
+    y = np.array([getattr(window, figure) for window in counted], np.float64)
+    x -= x.mean()
+    y -= y.mean()  # what never changes has a slope of zero, not of the last bit
+    spread = float(np.sum(x * x))
+    per_1000 = float(np.sum(x * y)) / spread
+    residuals = y - per_1000 * x
+    error = math.sqrt(float(np.sum(residuals * residuals)) / (len(y) - 2) / spread)
+    return {"slope": per_1000, "standard_error": error}
+
+
+def _kept(session: Session) -> list[StereoFrame]:
+    """All frames of the session."""
+    kept: list[StereoFrame] = []
+    held = 0
+    with session.source as source:
+        for frame in source:
+            arrays = (frame.left, frame.right, frame.tissue, frame.depth)
+            held += sum(array.nbytes for array in arrays if array is not None)
+            if held > MOST_BYTES:
+                raise SagsError(
+                    f"more than {len(kept)} frames do not fit into {MOST_BYTES / 1e9:.0f} GB; play fewer, "
+                    f"e.g. source.frames:={len(kept)}"
+                )
+            kept.append(frame)
+    if not kept:
+        raise SagsError("the recording has no frames; check source.start and source.frames")
+    return kept
+
+
+def visits(count: int, order: Order, seed: int) -> Iterator[int]:
+    """Which frame comes next, for ever."""
+    if order == "wrap":
+        yield from itertools.cycle(range(count))
+    elif order == "there-and-back":
+        yield from itertools.cycle([*range(count), *range(count - 2, 0, -1)])
+    else:
+        yield from _walk(count, np.random.default_rng(seed))
+
+
+def _walk(count: int, rng: np.random.Generator) -> Iterator[int]:
+    """To the next or last frame; at the ends, and now and then between them, it turns round."""
+    at, step = 0, 1
+    while True:
+        yield at
+        if rng.random() < TURN:
+            step = -step
+        if not 0 <= at + step < count:
+            step = -step
+        at = min(max(at + step, 0), count - 1)
+
+
+def _photographed(frame: StereoFrame, times: int, seed: int) -> Iterator[StereoFrame]:
+    """The same scene again and again, each time with the camera's noise."""
+    rng = np.random.default_rng(seed)
+
+    def noisy(picture: U8) -> U8:
+        noise = np.float32(CAMERA_NOISE) * rng.standard_normal(picture.shape, np.float32)
+        return np.clip(np.rint(picture + noise), 0, 255).astype(np.uint8)
+
+    for _ in range(times):
+        right = None if frame.right is None else noisy(frame.right)
+        yield replace(frame, left=noisy(frame.left), right=right)
+
+
+def _stillness(moving: Iterable[_Taken], still: Sequence[_Taken]) -> dict[str, Any] | None:
+    """What frames cost in which nothing moves, once the model has settled, against those before."""
+    settled = [each for each in still[SETTLED + 1 :] if each.still]
+    before = [each for each in moving if not each.still]
+    if not settled or not before:
+        return None
+    cpu_ms = float(np.mean([each.cpu_ms for each in settled]))
+    moving_cpu_ms = float(np.mean([each.cpu_ms for each in before]))
+    return {
+        "frames": len(still),
+        "recognised": sum(each.still for each in still),
+        "settled": len(settled),
+        "cpu_ms": cpu_ms,
+        "moving_cpu_ms": moving_cpu_ms,
+        "cpu_ratio": cpu_ms / moving_cpu_ms,
+        "ms_p50": float(np.median([each.ms for each in settled])),
+        "psnr": float(np.median([each.psnr for each in settled])),
+    }
+
+
+HEADINGS = (
+    "frames", "ms p50", "ms p99", "PSNR*, dB", "Gaussians", "nodes", "RSS, MB", "still", "no depth",
+    "restarts",
+)  # fmt: skip
+
+
+def table(measured: Mapping[str, Any]) -> Table:
+    """For people; `measured` as `measure_endurance` returns it."""
+    made = Table(*HEADINGS, title=f"{measured['session']}, {measured['order'].replace('-', ' ')}")
+    for row in measured["windows"]:
+        made.add_row(
+            str(row["frames"]),
+            f"{row['ms_p50']:.1f}",
+            f"{row['ms_p99']:.1f}",
+            f"{row['psnr']:.2f}",
+            str(row["gaussians"]),
+            str(row["nodes"]),
+            f"{row['rss_mb']:.0f}",
+            str(row["still"]),
+            str(row["hurried"]),
+            str(row["restarts"]),
+        )
+    return made
+
+
+def statement(measured: Mapping[str, Any]) -> str:
+    """What the table says, in words, and no more than it can say."""
+    lines = ["stopped early"] if measured["interrupted"] else []
+    lines += trends(measured["per_1000_frames"], dict(zip(FIGURES, HEADINGS[1:], strict=False)))
+    still = measured["still"]
+    if still is not None:
+        lines.append(
+            f"one frame again and again: {still['recognised']} of {still['frames']} seen to be still; once "
+            f"settled {still['cpu_ms']:.1f} ms of CPU per frame, {still['cpu_ratio']:.2f} of the "
+            f"{still['moving_cpu_ms']:.1f} ms while it moved; PSNR* {still['psnr']:.2f} dB"
+        )
+    return "\n".join(lines)
+
+
+def trends(slopes: Mapping[str, Mapping[str, float] | None], names: Mapping[str, str]) -> list[str]:
+    """A line for each slope, and whether it is more than scatter."""
+    lines = []
+    for figure, found in slopes.items():
+        if found is None:
+            return ["too few windows to tell a trend: at least four are needed"]
+        change, error = found["slope"], found["standard_error"]
+        trend = "" if abs(change) > SIGNIFICANT * error else ", no trend beyond the scatter of the windows"
+        lines.append(f"{names[figure]}: {change:+.3g} ± {error:.2g} per 1000 frames{trend}")
+    return lines

@@ -1,0 +1,425 @@
+"""`benchmarks soak`: whether a live node lasts, with all beside it that a theatre puts there.
+
+The node, the overlay, the viewer with a browser, a recorder and three subscribers, each a process of its own.
+The recorder and the subscribers come and go. Every frame is timed by its own stamps; sizes are the system's.
+"""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import asdict, dataclass, field
+from multiprocessing.connection import Connection
+from multiprocessing.synchronize import Event
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+from benchmarks.node import neighbours
+from benchmarks.node.crowd import Advance, node_beside
+from benchmarks.node.endurance import SIGNIFICANT, slope, trends
+from sags_node.errors import SagsError
+from sags_node.evaluation.metrics import psnr
+from sags_node.evaluation.provenance import machine_name
+from sags_node.messaging.freezes import Freezes
+from sags_node.messaging.received import ReceivedImage, TopicName
+from sags_node.messaging.stream import listen
+from sags_node.messaging.subscriber import Subscriber
+from sags_node.messaging.wire import Message, Meta
+from sags_node.processes import descriptors, end, resident_mb, threads
+
+EACH_FRAME = "tf"  # the smallest topic that is sent with every frame
+HIGH_WATER = 1000  # frames may wait while a picture is compared
+SHOWN = TopicName("left/render/image", ReceivedImage)
+TRUTH = TopicName("left/image_rect_color", ReceivedImage)
+TISSUE = TopicName("left/tissue_mask", ReceivedImage)
+TAKEN = (SHOWN, "left/render/depth")  # by each subscriber
+RECORDED = ("left/image_rect_color", SHOWN, "anchors", EACH_FRAME, "status")
+WARM_UP = 10.0  # s before frames count
+COMPARED = 3  # pictures of each window
+SUBSCRIBERS = 3
+STAY, AWAY = (2.0, 20.0), (1.0, 5.0)  # s, of a subscriber, from and to
+RECORDING = 60.0  # s of one recording
+SILENCE = 30.0  # s without a frame: the node hangs
+NODE = ("frames_per_s", "latency_p50_ms", "latency_p99_ms", "psnr", "rss_mb", "descriptors", "threads")
+FIGURES = (*NODE, "overlay_mb", "viewer_mb")
+HEADINGS = (
+    "frames/s", "latency p50, ms", "p99, ms", "PSNR*, dB", "RSS, MB", "descriptors", "threads", "overlay, MB",
+    "viewer, MB",
+)  # fmt: skip
+
+
+WORSE_WHEN_LESS = ("frames_per_s", "psnr")  # of `FIGURES`; the others are worse when they grow
+AN_HOUR = 108_000  # frames of the camera
+TOLERATED = 0.1  # of a figure's mean, in an hour
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """Some thousand frames of the camera in a row."""
+
+    frames: int  # of the camera up to its end
+    frames_per_s: float  # published
+    latency_p50_ms: float
+    latency_p99_ms: float
+    psnr: float  # dB over tissue, median of the pictures that were compared; NaN: none
+    rss_mb: float  # of the node at its end
+    descriptors: int  # likewise
+    threads: int  # likewise
+    overlay_mb: float  # at its end
+    viewer_mb: float | None  # likewise; None: no browser here, so it does not run
+
+
+@dataclass
+class _Heard:
+    """What each frame said of itself."""
+
+    latency_ms: list[float] = field(default_factory=list)
+    published: list[float] = field(default_factory=list)  # s
+    missed: int = 0  # messages on their way here
+    dropped: int = 0  # frames that the node left out
+    freezes: Freezes = field(default_factory=Freezes)
+    _first: Meta | None = None
+    _last: Meta | None = None
+
+    @property
+    def taken(self) -> int:
+        """Frames of the camera: those that were published, and those that the node left out."""
+        return len(self.latency_ms) + self.dropped
+
+    def add(self, message: Message) -> None:
+        meta = message.meta
+        self._first = self._first or meta
+        if self._last is not None:
+            self.missed += meta.seq - self._last.seq - 1
+        self._last = meta
+        self.dropped = meta.dropped - self._first.dropped
+        self.latency_ms.append((meta.publish_ns - meta.stamp_ns) * 1e-6)
+        self.published.append(meta.publish_ns * 1e-9)
+        self.freezes.add(meta.publish_ns * 1e-9)
+
+
+def measure_soak(launch: Sequence[str], frames: int, per_window: int, advance: Advance) -> dict[str, Any]:
+    """Run a node live for so many frames of its camera. Ctrl-C ends it with what is known by then.
+
+    Args:
+        launch: launch file and overrides of the node.
+        frames: of the camera after the first seconds, published or left out.
+        per_window: of them, for one line of the table.
+        advance: called with what is going on.
+
+    Returns:
+        The table, keys as benchmarks/README.md lists them.
+
+    Raises:
+        SagsError: the node does not run, or publishes nothing any more.
+    """
+    heard, windows = _Heard(), list[Window]()
+    interrupted = False
+    with tempfile.TemporaryDirectory(prefix="sags-soak-") as folder, ExitStack() as stack:
+        run_dir = Path(folder) / "sags"  # where a process with this XDG_RUNTIME_DIR looks for it
+        run_dir.mkdir(mode=0o700)
+        node = stack.enter_context(node_beside(launch, run_dir))
+        overlay = stack.enter_context(neighbours.overlay(run_dir))
+        viewer = stack.enter_context(neighbours.viewer(run_dir)) if neighbours.find_browser() else None
+        visits = stack.enter_context(_visitors(run_dir))
+        recordings = stack.enter_context(_recordings(run_dir))
+        quality: list[float] = []
+        shown = 0  # up to the last window
+        try:
+            for _ in _frames(run_dir, node, heard):
+                taken = min(heard.taken, frames)
+                advance(taken, frames, "running")
+                in_window = taken - per_window * len(windows)
+                if in_window * COMPARED >= per_window * (len(quality) + 1):
+                    quality.append(_compared(run_dir))
+                if in_window >= per_window:
+                    windows.append(_window(heard, shown, quality, node.pid, overlay, viewer))
+                    shown = len(heard.latency_ms)
+                    quality.clear()
+                if taken == frames:
+                    break
+        except KeyboardInterrupt:
+            interrupted = True
+        came = {"visits": visits(), "recordings": recordings()}
+    return {
+        "machine": machine_name(),
+        "launch": list(launch),
+        "per_window": per_window,
+        "interrupted": interrupted,
+        **_overall(heard),
+        **came,
+        "windows": [asdict(window) for window in windows],
+        "per_1000_frames": {
+            figure: slope(windows, figure) for figure in FIGURES if viewer or figure != "viewer_mb"
+        },
+    }
+
+
+def _frames(run_dir: Path, node: subprocess.Popen[bytes], heard: _Heard) -> Iterator[None]:
+    """Each published frame after the first seconds is added to `heard`."""
+    begun = last = time.monotonic()
+    messages = listen((EACH_FRAME,), None, neighbours.NS, None, run_dir=run_dir, high_water=HIGH_WATER)
+    with closing(messages):
+        for arrived in messages:
+            now = time.monotonic()
+            if node.poll() is not None:
+                raise SagsError("the node ended before its time")
+            if now - last > SILENCE:
+                raise SagsError(f"the node published nothing for {SILENCE:g} s")
+            if arrived is None:
+                continue
+            last = now
+            if now - begun < WARM_UP:
+                continue
+            heard.add(arrived[0])
+            yield
+
+
+def _compared(run_dir: Path) -> float:
+    """PSNR (dB) over tissue of a picture that is being shown; NaN when none came whole."""
+    names = (SHOWN, TRUTH, TISSUE)
+    with Subscriber(names, run_dir=run_dir) as subscriber:
+        newest = subscriber.wait(SHOWN, timeout=1.0)
+        if newest is None or (frame := subscriber.aligned(names, newest.stamp_ns, timeout=1.0)) is None:
+            return float("nan")
+        shown, truth = (
+            frame[each].array[..., :3].astype(np.float32) / np.float32(255) for each in (SHOWN, TRUTH)
+        )
+        return psnr(shown, truth, frame[TISSUE].array > 0)
+
+
+def _window(
+    heard: _Heard, since: int, quality: Sequence[float], node: int, overlay: int, viewer: int | None
+) -> Window:
+    """Of the frames that were published after the first `since`."""
+    p50, p99 = np.percentile(heard.latency_ms[since:], [50, 99])
+    known = [each for each in quality if not np.isnan(each)]
+    moments = heard.published[max(0, since - 1) :]
+    return Window(
+        frames=heard.taken,
+        frames_per_s=(len(moments) - 1) / (moments[-1] - moments[0]),
+        latency_p50_ms=float(p50),
+        latency_p99_ms=float(p99),
+        psnr=float(np.median(known)) if known else float("nan"),
+        rss_mb=resident_mb(node),
+        descriptors=descriptors(node),
+        threads=threads(node),
+        overlay_mb=resident_mb(overlay),
+        viewer_mb=None if viewer is None else resident_mb(viewer),
+    )
+
+
+def _overall(heard: _Heard) -> dict[str, Any]:
+    if not heard.latency_ms:
+        raise SagsError("stopped before the first frame that counts")
+    p50, p99, p999 = np.percentile(heard.latency_ms, [50, 99, 99.9])
+    return {
+        "frames": heard.taken,
+        "published": len(heard.latency_ms),
+        "seconds": heard.published[-1] - heard.published[0],
+        "latency_ms": {
+            "p50": float(p50),
+            "p99": float(p99),
+            "p99.9": float(p999),
+            "max": max(heard.latency_ms),
+        },
+        "freezes": heard.freezes.status(),
+        "missed": heard.missed,
+        "dropped": heard.dropped,
+    }
+
+
+# ---- who comes and goes ----------------------------------------------------------------------------------
+
+
+@contextmanager
+def _visitors(run_dir: Path) -> Iterator[Callable[[], dict[str, int]]]:
+    """Subscribers that come, take pictures for a while, and leave; what is given ends them, and counts."""
+    spawn = multiprocessing.get_context("spawn")
+    ending = spawn.Event()
+    here, there = spawn.Pipe()
+    process = spawn.Process(target=_visit, args=(run_dir, ending, there), daemon=True)
+    process.start()
+
+    def stop() -> dict[str, int]:
+        ending.set()
+        return here.recv() if here.poll(neighbours.STARTING) else {"visits": 0, "pictures": 0}
+
+    try:
+        if not here.poll(neighbours.STARTING):
+            raise SagsError("the subscribers did not start")
+        here.recv()
+        yield stop
+    finally:
+        process.terminate()
+        process.join(neighbours.STOPPING)
+        process.kill()
+
+
+def _visit(run_dir: Path, ending: Event, there: Connection) -> None:
+    there.send(None)  # it runs
+    neighbours.give_way()
+    counted = [{"visits": 0, "pictures": 0} for _ in range(SUBSCRIBERS)]
+    working = [
+        threading.Thread(target=_come_and_go, args=(run_dir, ending, random.Random(seed), counts))
+        for seed, counts in enumerate(counted)
+    ]
+    for thread in working:
+        thread.start()
+    for thread in working:
+        thread.join()
+    there.send({key: sum(counts[key] for counts in counted) for key in counted[0]})
+
+
+def _come_and_go(run_dir: Path, ending: Event, chance: random.Random, counts: dict[str, int]) -> None:
+    parent = multiprocessing.parent_process()
+    while not ending.is_set() and parent is not None and parent.is_alive():
+        leaves = time.monotonic() + chance.uniform(*STAY)
+        with Subscriber(TAKEN, run_dir=run_dir) as subscriber:
+            counts["visits"] += 1
+            newest = None
+            while time.monotonic() < leaves and not ending.is_set():
+                came = subscriber.wait(SHOWN, timeout=0.5, after=newest)
+                counts["pictures"] += came is not None
+                newest = came or newest
+        ending.wait(chance.uniform(*AWAY))
+
+
+@contextmanager
+def _recordings(run_dir: Path) -> Iterator[Callable[[], dict[str, int]]]:
+    """One recording after the other, each removed when it is closed; what is given ends that and counts."""
+    counts = {"recordings": 0, "failed": 0, "messages": 0, "dropped": 0, "lost": 0}
+    ending = threading.Event()
+    thread = threading.Thread(target=_record, args=(run_dir, ending, counts), daemon=True)
+    thread.start()
+
+    def stop() -> dict[str, int]:
+        ending.set()
+        thread.join(neighbours.STARTING)
+        return counts
+
+    try:
+        yield stop
+    finally:
+        stop()
+
+
+def _record(run_dir: Path, ending: threading.Event, counts: dict[str, int]) -> None:
+    environment = os.environ | {"XDG_RUNTIME_DIR": str(run_dir.parent)}
+    folder = run_dir.parent / "recording"
+    topics = [word for name in RECORDED for word in ("--topics", name)]
+    command = [sys.executable, "-m", "sags_node", "bag", "record", "-o", str(folder), *topics]
+    while not ending.is_set():
+        recorder = subprocess.Popen(
+            [*command, "--compression", "jpeg", "--seconds", str(RECORDING), "--json"],
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+        )
+        try:
+            said = _said(recorder, ending)
+        finally:
+            end(recorder, grace=neighbours.STOPPING)
+        lines = said.splitlines()
+        if recorder.returncode == 0 and lines:
+            counts["recordings"] += 1
+            summary: Mapping[str, int] = json.loads(lines[-1])
+            for key in ("messages", "dropped", "lost"):
+                counts[key] += summary[key]
+        else:
+            counts["failed"] += 1
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _said(recorder: subprocess.Popen[str], ending: threading.Event) -> str:
+    """All it prints; it is asked to end, once, when `ending` is set."""
+    deadline = time.monotonic() + neighbours.STARTING + RECORDING
+    asked = False
+    while time.monotonic() < deadline:
+        if ending.is_set() and not asked:
+            recorder.terminate()
+            asked = True
+        try:
+            return recorder.communicate(timeout=0.5)[0]
+        except subprocess.TimeoutExpired:
+            continue
+    return ""
+
+
+def worsening(measured: Mapping[str, Any]) -> list[str]:
+    """The figures that get worse beyond their scatter, by more than `TOLERATED` an hour.
+
+    Args:
+        measured: as `measure_soak` returns it.
+
+    Returns:
+        Names of `FIGURES`.
+
+    Raises:
+        SagsError: there are too few windows to tell.
+    """
+    found = []
+    for figure, trend in measured["per_1000_frames"].items():
+        if trend is None:
+            raise SagsError("too few windows to tell a trend: at least four are needed")
+        worse = -trend["slope"] if figure in WORSE_WHEN_LESS else trend["slope"]
+        mean = np.nanmean([window[figure] for window in measured["windows"]])
+        if worse > SIGNIFICANT * trend["standard_error"] and worse * AN_HOUR / 1000 > TOLERATED * mean:
+            found.append(figure)
+    return found
+
+
+# ---- what is told ----------------------------------------------------------------------------------------
+
+
+def table(measured: Mapping[str, Any]) -> Table:
+    """For people; `measured` as `measure_soak` returns it."""
+    made = Table("frames", *HEADINGS, title=_title(measured))
+    for row in measured["windows"]:
+        made.add_row(str(row["frames"]), *(_figure(row[figure]) for figure in FIGURES))
+    return made
+
+
+def _title(measured: Mapping[str, Any]) -> str:
+    return (
+        f"{measured['frames']} frames of the camera in {measured['seconds']:.0f} s, "
+        f"{measured['published']} published"
+    )
+
+
+def _figure(value: float | None) -> str:
+    return f"{value:.1f}" if isinstance(value, float) else str(value)
+
+
+def statement(measured: Mapping[str, Any]) -> str:
+    """What the table says, in words, and no more than it can say."""
+    lines = ["stopped early"] if measured["interrupted"] else []
+    latency, freezes = measured["latency_ms"], measured["freezes"]
+    lines.append(
+        f"latency p50 {latency['p50']:.0f} ms, p99 {latency['p99']:.0f}, p99.9 {latency['p99.9']:.0f}, "
+        f"at most {latency['max']:.0f}; {freezes['count']} freezes, {freezes['seconds']:.1f} s together; "
+        f"{measured['dropped']} frames left out, {measured['missed']} messages missed"
+    )
+    visits, recordings = measured["visits"], measured["recordings"]
+    lines.append(
+        f"{visits['visits']} visits of subscribers took {visits['pictures']} pictures; "
+        f"{recordings['recordings']} recordings, {recordings['failed']} failed, of "
+        f"{recordings['messages']} messages {recordings['dropped']} dropped and {recordings['lost']} lost"
+    )
+    return "\n".join(
+        [*lines, *trends(measured["per_1000_frames"], dict(zip(FIGURES, HEADINGS, strict=True)))]
+    )

@@ -1,0 +1,258 @@
+"""Run time against error of the online mapper: every setting is played over the same recording.
+
+Time budgets, working sizes and numbers of Gaussians are compared in the mode the node runs in, with a budget
+of time. Rules that leave work out are compared with a fixed number of steps, so that only the rule changes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import cv2
+
+from benchmarks.node.hosts import measure_hosts
+from benchmarks.pareto.baselines import baselines_of_run, measured_baselines
+from benchmarks.pareto.settings import (
+    HOSTS,
+    RUNG_PART,
+    Setting,
+    Sweep,
+    rung_settings,
+    skip_settings,
+    time_settings,
+)
+from sags_node.engine.rasterizer.rasterize import make_rasterizer, to_view
+from sags_node.errors import SagsError
+from sags_node.evaluation import metrics
+from sags_node.evaluation.measure import FrameRow, Progress
+from sags_node.evaluation.provenance import machine_name
+from sags_node.evaluation.session import measure, run_step
+from sags_node.evaluation.spool import Spool
+from sags_node.evaluation.summary import summarise
+from sags_node.session import Session, open_session
+from sags_node.sources.source import open_source
+from sags_node.vision.rectify import Rectifier
+from sags_node.vision.tissue import TissueMask
+from sags_node.warm_up import warm_up
+
+SHORTEST = 3  # frames: the first one, in which the model is made, has times of its own
+KEPT = (
+    "frame_ms", "stage_ms", "rate_hz", "iterations_per_frame", "online", "predict", "heldout", "between",
+    "novel", "depth", "measured_depth", "track", "gaussians", "skipped",
+)  # fmt: skip
+
+Row = dict[str, Any]
+Advance = Callable[[int, int | None, str], None]  # frames done, of, what
+
+
+def measure_pareto(
+    launches: Sequence[str | None],
+    overrides: Sequence[str],
+    sweep: Sweep,
+    fits: Mapping[str, Row],
+    advance: Advance,
+) -> Row:
+    """Play every setting over every recording and measure it.
+
+    Args:
+        launches: launch files or session folders; None: the built-in phantom.
+        overrides: `key:=value`, for all of them.
+        fits: by session, rows of `pareto_baselines.read_fits`.
+        advance: called with what is going on.
+
+    Returns:
+        The table, keys as benchmarks/README.md lists them.
+
+    Raises:
+        UsageError: a wrong key, value or path.
+        SagsError: a recording cannot be used.
+    """
+    sessions = [_Comparison(launch, overrides, sweep, advance).measure(fits) for launch in launches]
+    return {
+        "machine": machine_name(),
+        "overrides": list(overrides),
+        "parts": list(sweep.parts),
+        "repeat": sweep.repeat,
+        "hold_out": sweep.options.hold_out,
+        "novel_every": sweep.options.every,
+        "psnr_convention": "tissue",
+        "sessions": sessions,
+    }
+
+
+def non_dominated(points: Sequence[tuple[float, float]]) -> list[bool]:
+    """Which (time, quality) no other point beats: none is as good in both and better in one."""
+    return [
+        not any(ms <= time and quality >= good and (ms, quality) != (time, good) for ms, quality in points)
+        for time, good in points
+    ]
+
+
+def why_default(rows: Sequence[Row], period_ms: float) -> str:
+    """What speaks for the default among rows of `time_settings`, or against it, in one sentence."""
+    default = rows[0]
+    ms, psnr = _place(default)
+    camera = f"the camera's {period_ms:.3g} ms"
+    if ms > period_ms:
+        return f"{default['name']} is the default, though it takes {ms:.1f} of {camera}"
+    best = max((row for row in rows if _place(row)[0] <= period_ms), key=lambda row: _place(row)[1])
+    if best is default:
+        return f"{default['name']} is the default: the best picture of all that stay within {camera}"
+    gain = _place(best)[1] - psnr
+    return (
+        f"{default['name']} is the default and stays within {camera}; so does {best['name']}, {gain:+.2f} dB"
+    )
+
+
+class _Comparison:
+    """All settings of one recording."""
+
+    def __init__(self, launch: str | None, overrides: Sequence[str], sweep: Sweep, advance: Advance) -> None:
+        self._launch = launch
+        self._overrides = (*overrides, "source.loop:=false", "source.pace:=step", "mapping.iterations:=null")
+        self._sweep = sweep
+        self._advance = advance
+        self._session = self._open(())
+        self._size = self._session.working_size
+        warm_up(self._session.config)
+
+    def measure(self, fits: Mapping[str, Row]) -> Row:
+        session, parts = self._session, self._sweep.parts
+        timed = time_settings(session.config, self._size, parts)
+        timed += rung_settings() if RUNG_PART in parts else []
+        skips = skip_settings(session.config.mapping) if "skips" in parts else {}
+        pairs = [setting for pair in skips.values() for setting in pair]
+        runs: dict[Setting, list[Row]] = {setting: [] for setting in (*timed, *pairs)}
+        turns = [setting for _ in range(self._sweep.repeat) for setting in runs]
+        baselines: list[Row] = []
+        for place, setting in enumerate(turns, 1):
+            progress = self._progress(f"{setting.name} ({place} of {len(turns)})")
+            with self._played(setting, progress) as (played, spool):
+                runs[setting].append(self._measured(setting, played, spool, progress))
+                if place == 1:  # the default
+                    baselines = baselines_of_run(runs[setting][0])
+                    baselines += measured_baselines(played, spool, self._size, self._sweep.options, progress)
+        if session.name in fits:
+            baselines.append(fits[session.name])
+        rows = [_middle(runs[setting]) for setting in timed]
+        for row, best in zip(rows, non_dominated([_place(row) for row in rows]), strict=True):
+            row["non_dominated"] = best
+        with session.source as source:
+            rate, frames = source.rate, source.frame_count
+        return {
+            "session": session.name,
+            "frames": frames,
+            "rate_hz": rate,
+            "segments": {name: list(span) for name, span in session.config.segments.items()},
+            "why_default": why_default(rows, 1e3 / rate),
+            "settings": rows,
+            "baselines": baselines,
+            "skips": [
+                self._skip(rule, _middle(runs[as_is]), _middle(runs[turned]))
+                for rule, (as_is, turned) in skips.items()
+            ],
+            "hosts": self._hosts(frames or 0, rate) if HOSTS in parts else [],
+        }
+
+    def _hosts(self, frames: int, rate: float) -> list[Row]:
+        return measure_hosts(
+            self._launch, self._overrides, frames / rate, lambda what: self._progress(what)("", 0)
+        )
+
+    def _skip(self, rule: str, as_is: Row, turned: Row) -> Row:
+        """What a rule changes."""
+        is_on = bool(getattr(self._session.config.mapping, rule))
+        on, off = (as_is, turned) if is_on else (turned, as_is)
+        return {"rule": rule, "default": is_on, **_effect(on, off), "on": on, "off": off}
+
+    @contextmanager
+    def _played(self, setting: Setting, progress: Progress) -> Iterator[tuple[Session, Spool]]:
+        session = self._open(setting.overrides)
+        with Spool() as spool:
+            run_step(session, self._sweep.options, spool, progress)
+            if len(spool) < SHORTEST:
+                raise SagsError(
+                    f"{session.name}: {len(spool)} frames were processed and {SHORTEST} are needed to tell "
+                    "a time; play more (--frames, source.frames, source.start)"
+                )
+            yield session, spool
+
+    def _measured(self, setting: Setting, session: Session, spool: Spool, progress: Progress) -> Row:
+        summary = measure(session, spool, self._sweep.options, setting.overrides, progress).summary
+        at_full_size = summary["online"]
+        if session.working_size != self._size:
+            at_full_size = self._at_full_size(session, spool, progress)
+        if at_full_size["psnr"] is None:
+            raise SagsError(
+                f"{session.name}: no frame shows tissue, so there is nothing to compare; see vision.tissue"
+            )
+        return {
+            "name": setting.name,
+            "part": setting.part,
+            "overrides": list(setting.overrides),
+            **{key: summary[key] for key in KEPT},
+            "online_at_full_size": at_full_size,
+        }
+
+    def _at_full_size(self, session: Session, spool: Spool, progress: Progress) -> Row:
+        """The figures `online` of a run at a smaller size, with its Gaussians drawn at the default's size and
+        compared with pictures of that size: only so do sizes compare."""
+        config = session.config
+        rectifier = Rectifier(session.rig, *self._size)
+        tissue_of = TissueMask(config.vision.tissue, rectifier)
+        rasterizer = make_rasterizer(config.engine.backend, *self._size)
+        places = {frame_id: place for place, frame_id in enumerate(spool.frame_ids)}
+        rows = []
+        with open_source(config.source.model_copy(update={"pace": "step"}), references=False) as frames:
+            for frame in frames:
+                place = places.get(frame.frame_id)
+                if place is None:
+                    continue
+                pair = rectifier(frame)
+                planes = rasterizer.forward(spool.read(place).snapshot.gaussians, [pair.camera])
+                view = to_view(planes[0], pair.camera, 0, 0)
+                shown = metrics.as_float(cv2.convertScaleAbs(view.rgb, alpha=255))
+                quality = metrics.psnr(shown, metrics.as_float(pair.left), tissue_of(frame, pair))
+                rows.append(FrameRow(frame.frame_id, 0.0, {"online": {"psnr": quality}}))
+                progress("measuring at full size", len(rows))
+        online: Row = summarise(session.name, rows, self._sweep.options, config.segments, None)["online"]
+        return online
+
+    def _open(self, overrides: Sequence[str]) -> Session:
+        def rendering(done: int, of: int) -> None:
+            self._advance(done, of, "rendering the phantom (once)")
+
+        return open_session(self._launch, (*self._overrides, *overrides), rendering)
+
+    def _progress(self, what: str) -> Progress:
+        name, count = self._session.name, self._session.source.frame_count
+        return lambda doing, done: self._advance(done, count, f"{name}, {what}: {doing}")
+
+
+def _place(row: Row) -> tuple[float, float]:
+    """Where a setting lies: ms of the median frame, and PSNR (dB) of what it shows, at the default's size."""
+    return row["frame_ms"]["p50"], row["online_at_full_size"]["psnr"]
+
+
+def _middle(runs: Sequence[Row]) -> Row:
+    """The run whose time is in the middle (the faster of two), with the spread of all."""
+    places = [_place(run) for run in runs]
+    middle = sorted(runs, key=lambda run: _place(run)[0])[(len(runs) - 1) // 2]
+    return middle | {"repeats": {"ms": [ms for ms, _ in places], "psnr": [psnr for _, psnr in places]}}
+
+
+def _effect(on: Row, off: Row) -> Row:
+    """What a rule changes: dB of the picture, mm of depth error, and the ms of a mean frame that it saves."""
+
+    def change(group: str, key: str) -> float | None:
+        before, after = ((run[group] or {}).get(key) for run in (off, on))
+        return None if before is None or after is None else round(after - before, 4)
+
+    return {
+        "online_db": change("online", "psnr"),
+        "depth_mm": change("depth", "median_mm"),
+        "saved_ms": round(1e3 / off["rate_hz"] - 1e3 / on["rate_hz"], 3),
+        "skipped": on["skipped"],
+    }

@@ -1,0 +1,276 @@
+"""What does each part of the SAGS model bring? The ablation of the paper, and of what goes beyond it.
+
+Every variant is fitted to the same training frames with as many iterations, from several seeds, and
+measured on the same frames that it never saw: every eighth, and the last ones of the recording, which ask it
+to look ahead. Training frames are measured too, which tells what is over-fitted from what is not learnt; and
+pictures of a half and a quarter of the size, which is what the filters are for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, replace
+from typing import Any
+
+import cv2
+import numpy as np
+from rich.table import Table
+
+from sags_node.engine.rasterizer.rasterize import make_rasterizer, to_view
+from sags_node.errors import SagsError, UsageError
+from sags_node.evaluation import metrics
+from sags_node.evaluation.lpips import Lpips
+from sags_node.evaluation.measure import Options
+from sags_node.evaluation.provenance import machine_name
+from sags_node.fitting.clip import Clip, ClipFrame, read_clip
+from sags_node.fitting.fit import Fit
+from sags_node.fitting.score import score, score_between, score_depth, score_tracks
+from sags_node.fitting.settings import ONLINE, PAPER, FitSettings, with_changes
+from sags_node.geometry import scale_intrinsics
+from sags_node.kernels.threads import configure_threads
+from sags_node.session import Session
+from sags_node.types import Bool
+
+AHEAD = 3  # last frames that nothing is learnt from
+SMALLER = {"half": 2, "quarter": 4}  # what a picture's sides are divided by
+
+_PAPER = replace(PAPER, max_gaussians=30_000)
+_ONLINE = replace(ONLINE, max_gaussians=30_000)
+VARIANTS: Mapping[str, FitSettings] = {
+    "base": replace(_PAPER, block="mlp", antialias=False),
+    "no_alias_free": replace(_PAPER, antialias=False),
+    "no_adaptive": replace(_PAPER, block="mlp"),
+    "full": _PAPER,
+    "no_block": replace(_PAPER, block="none"),
+    "planes": replace(_PAPER, tokens="planes"),
+    "nodes": replace(_PAPER, tokens="nodes"),
+    "online": _ONLINE,
+    "online_no_alias_free": replace(_ONLINE, antialias=False),
+    "online_no_adaptive": replace(_ONLINE, block="none"),
+    "online_self": replace(_ONLINE, tokens="self"),
+}
+
+# What a part brings: with it, without it, and dB by the paper's table (its rows, EndoNeRF "pulling").
+PARTS: Mapping[str, tuple[str, str, float | None]] = {
+    "self-adaptive block, beside an MLP of its size": ("full", "no_adaptive", 0.26),
+    "self-adaptive block, beside none": ("full", "no_block", None),
+    "both filters, without the block": ("no_adaptive", "base", 0.90),
+    "both filters, with the block": ("full", "no_alias_free", None),
+    "both filters, after the online start": ("online", "online_no_alias_free", None),
+    "self-adaptive block, after the online start": ("online", "online_no_adaptive", None),
+}
+
+Advance = Callable[[int, int | None, str], None]  # done, of, what
+Row = dict[str, Any]
+
+
+def measure_ablation(
+    session: Session,
+    warm_up: int,
+    iterations: int,
+    options: Options,
+    advance: Advance,
+    seeds: int = 3,
+    only: Sequence[str] = (),
+    changes: Sequence[str] = (),
+) -> dict[str, Any]:
+    """Fit and measure every variant.
+
+    Args:
+        session: a recording.
+        warm_up: iterations of each fit without deformation; only of the paper's schedule.
+        iterations: of each fit, with deformation.
+        options: hold-out and LPIPS weights.
+        advance: called with what is going on.
+        seeds: how many fits of each variant.
+        only: names of variants; none: all.
+        changes: of the settings of every variant, as `with_changes` takes them.
+
+    Returns:
+        The table, keys as benchmarks/README.md lists them.
+
+    Raises:
+        UsageError: there is no such variant, or no such setting.
+        SagsError: the recording cannot be read or is too short, or no frame has depth enough.
+    """
+    unknown = [name for name in only if name not in VARIANTS]
+    if unknown:
+        raise UsageError(f"there is no variant {', '.join(unknown)}; choose of {', '.join(VARIANTS)}")
+    lpips = None if options.lpips_weights is None else Lpips(options.lpips_weights)
+    configure_threads(session.config.engine.threads)
+    count = session.source.frame_count
+    clip = read_clip(session, options.holds_out, lambda done: advance(done, count, "reading"))
+    known, ahead = _split(clip)
+    chosen = {
+        name: replace(
+            with_changes(settings, changes),
+            warm_up=warm_up if settings.schedule == "paper" else 0,
+            iterations=iterations,
+        )
+        for name, settings in VARIANTS.items()
+        if not only or name in only
+    }
+    variants: dict[str, list[Row]] = {name: [] for name in chosen}
+    for seed in range(seeds):
+        for name, settings in chosen.items():
+            fit, started = _fitted(known, replace(settings, seed=seed), f"{name}, seed {seed}", advance)
+            row = _measured(fit, ahead, session.config.segments, lpips)
+            row["ms_per_iteration"] = round(1e3 * (fit.seconds - started) / fit.total, 1)
+            variants[name].append(row)
+    return {
+        "session": session.name,
+        "warm_up": warm_up,
+        "iterations": iterations,
+        "seeds": seeds,
+        "settings": {name: asdict(settings) for name, settings in chosen.items()},
+        "machine": machine_name(),
+        "variants": variants,
+        "parts": {
+            part: {"paper_db": claim, **_gain(variants[whole], variants[without])}
+            for part, (whole, without, claim) in PARTS.items()
+            if whole in variants and without in variants
+        },
+    }
+
+
+def _fitted(clip: Clip, settings: FitSettings, name: str, advance: Advance) -> tuple[Fit, float]:
+    """A finished fit, and the seconds that its start took."""
+    fit = Fit(clip, settings)
+    advance(0, None, f"{name}: starting")
+    fit.start(lambda what, done, of: advance(done, of, what))
+    started = fit.seconds
+    while not fit.done:
+        fit.iterate()
+        advance(fit.iteration, fit.total, f"{name}: fitting")
+    return fit, started
+
+
+def _measured(
+    fit: Fit, ahead: Sequence[ClipFrame], segments: Mapping[str, tuple[int, int]], lpips: Lpips | None
+) -> Row:
+    known, places = _by_time(fit.clip), dict(segments)
+    some = fit.clip.train[:: max(1, len(fit.clip.train) // max(1, len(fit.clip.test)))]
+    return {
+        "heldout": score(fit, fit.clip.test, places, lpips),
+        "train": score(fit, some, places),
+        "between": score_between(fit, fit.clip.test, places),
+        "smaller": {name: _smaller(fit, fit.clip.test, factor) for name, factor in SMALLER.items()},
+        "ahead": score(fit, ahead, {}, lpips),
+        "depth": score_depth(fit, known, places),
+        "track": score_tracks(fit, known),
+        "track_with_ahead": score_tracks(fit, [known[0], *ahead]),
+        "gaussians": len(fit.model),
+        "seconds": round(fit.seconds, 1),
+    }
+
+
+def _smaller(fit: Fit, frames: Iterable[ClipFrame], factor: int) -> float:
+    """Mean PSNR, dB, over tissue of pictures with sides divided by `factor`; the truth is the mean of the
+    pixels that one stands for."""
+    found = []
+    for frame in frames:
+        height, width = (side // factor for side in frame.tissue.shape)
+        rows, across = height * factor, width * factor
+        camera = replace(
+            frame.camera,
+            width=width,
+            height=height,
+            K=scale_intrinsics(frame.camera.K, (across, rows), (width, height)),
+        )
+        rasterizer = make_rasterizer("numba", width, height, fit.settings.antialias)
+        planes = rasterizer.forward(fit.gaussians(frame), [camera])[0]
+        shown = to_view(planes, camera, frame.frame_id, frame.t_capture_ns).rgb
+        picture = metrics.as_float(frame.image)[:rows, :across]
+        truth = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
+        blocks = frame.tissue[:rows, :across].reshape(height, factor, width, factor)
+        tissue: Bool = np.asarray(blocks.all(axis=(1, 3)))
+        found.append(metrics.psnr(shown, truth, tissue))
+    return round(float(np.nanmean(found)), 4)
+
+
+FIGURES: Mapping[str, Callable[[Row], float]] = {
+    "heldout": lambda row: float(row["heldout"]["psnr"]),
+    "train": lambda row: float(row["train"]["psnr"]),
+    "half": lambda row: float(row["smaller"]["half"]),
+    "quarter": lambda row: float(row["smaller"]["quarter"]),
+}
+
+
+def _gain(whole: Sequence[Row], without: Sequence[Row]) -> dict[str, dict[str, float]]:
+    """What the whole has beyond the other with the same seed, dB: mean, lowest and highest."""
+    found = {}
+    for name, figure in FIGURES.items():
+        gains = [figure(a) - figure(b) for a, b in zip(whole, without, strict=True)]
+        found[name] = {
+            "mean": round(float(np.mean(gains)), 3),
+            "lowest": round(min(gains), 3),
+            "highest": round(max(gains), 3),
+        }
+    return found
+
+
+def _by_time(clip: Clip) -> list[ClipFrame]:
+    return sorted((*clip.train, *clip.test), key=lambda frame: frame.frame_id)
+
+
+def _split(clip: Clip) -> tuple[Clip, list[ClipFrame]]:
+    """The clip without its last frames, and those."""
+    frames = _by_time(clip)
+    ahead = {frame.frame_id for frame in frames[-AHEAD:]}
+    known = Clip(
+        [frame for frame in clip.train if frame.frame_id not in ahead],
+        [frame for frame in clip.test if frame.frame_id not in ahead],
+    )
+    if not known.train or not known.test:
+        raise SagsError(
+            f"there are {len(frames)} frames; without the last {AHEAD}, which are for looking ahead, "
+            f"{len(known.train)} are left to learn from and {len(known.test)} to test on, and each needs "
+            "one: play more (source.frames, source.start) or change --hold-out"
+        )
+    return known, frames[-AHEAD:]
+
+
+def tables(measured: dict[str, Any]) -> list[Table]:
+    """A row for each variant, mean and half of the range over its seeds; and one for each part."""
+    headings = (
+        "",
+        "PSNR* held-out",
+        "train",
+        "half size",
+        "quarter",
+        "SSIM",
+        "ahead",
+        "track mm",
+        "N",
+        "ms/it",
+    )
+    made = _table(headings)
+    for name, rows in measured["variants"].items():
+        columns: list[list[float | None]] = [[figure(row) for row in rows] for figure in FIGURES.values()]
+        columns += [[row["heldout"]["ssim"] for row in rows], [row["ahead"]["psnr"] for row in rows]]
+        columns += [[(row["track"] or {}).get("median_mm") for row in rows]]
+        columns += [[row[key] for row in rows] for key in ("gaussians", "ms_per_iteration")]
+        made.add_row(name, *(_spread(column) for column in columns))
+    parts = _table(("dB", "held-out", "lowest to highest", "train", "half size", "quarter", "paper"))
+    for name, part in measured["parts"].items():
+        held, claim = part["heldout"], part["paper_db"]
+        parts.add_row(
+            name,
+            f"{held['mean']:+.2f}",
+            f"{held['lowest']:+.2f} to {held['highest']:+.2f}",
+            *(f"{part[key]['mean']:+.2f}" for key in ("train", "half", "quarter")),
+            "–" if claim is None else f"{claim:+.2f}",
+        )
+    return [made, parts]
+
+
+def _table(headings: tuple[str, ...]) -> Table:
+    return Table(*headings, box=None, padding=(0, 3, 0, 0), pad_edge=False)
+
+
+def _spread(values: Sequence[float | None]) -> str:
+    known = [value for value in values if value is not None]
+    if not known:
+        return "–"
+    half = (max(known) - min(known)) / 2
+    return f"{np.mean(known):.4g}" + (f" ± {half:.2g}" if half > 0 else "")

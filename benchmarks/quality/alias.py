@@ -1,0 +1,182 @@
+"""Does the picture stay right at another size, or from another distance, than it was trained at?
+
+That is what both filters of Mip-Splatting (Yu et al., CVPR 2024) are for; at the trained size they show
+nothing. Four models of one instant of the phantom are trained by the mapper, each with its own choice of
+filters, and drawn where nothing was trained, against the ray-cast truth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from benchmarks.quality.alias_truth import AliasTruth, Shot
+from sags_node.config import PhantomSource
+from sags_node.engine.rasterizer.rasterize import make_rasterizer, to_view
+from sags_node.evaluation.metrics import psnr
+from sags_node.evaluation.provenance import machine_name
+from sags_node.mapping.budget import StepBudget
+from sags_node.mapping.mapper import Mapper
+from sags_node.mapping.refiner import CpuRefiner
+from sags_node.model.alias_free import smoothing_variances
+from sags_node.types import F32, Camera, Gaussians, Observation
+
+SIZES = (0.25, 0.5, 1.0, 2.0, 4.0)
+DISTANCES = (0.5, 1.0, 2.0, 4.0)
+DRIFT_SIZE, DRIFT_STEP = 0.25, 0.1  # of the trained size; px per frame
+STEPS_PER_ROUND = 50  # between two looks for holes
+
+Advance = Callable[[int, int, str], None]  # done, total, what comes next
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What is measured."""
+
+    width: int = 640  # px that are trained at
+    height: int = 512
+    max_gaussians: int = 30_000
+    rounds: int = 6  # of STEPS_PER_ROUND
+    frames: int = 24  # of the slow motion
+
+
+QUICK = Settings(width=160, height=128, max_gaussians=3000, rounds=1, frames=4)
+
+
+@dataclass(frozen=True, slots=True)
+class Filters:
+    """Which of the two are on."""
+
+    screen: bool  # 2D; off: the fixed dilation of 3D Gaussian Splatting
+    world: bool  # 3D
+
+
+VARIANTS: Mapping[str, Filters] = {
+    "both": Filters(screen=True, world=True),
+    "only_2d": Filters(screen=True, world=False),
+    "only_3d": Filters(screen=False, world=True),
+    "none": Filters(screen=False, world=False),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Trained:
+    """A model and how it must be drawn."""
+
+    gaussians: Gaussians
+    antialias: bool
+
+    def draw(self, camera: Camera) -> F32:
+        """[H, W, 3]"""
+        rasterizer = make_rasterizer("numba", camera.width, camera.height, self.antialias)
+        return to_view(rasterizer.forward(self.gaussians, [camera])[0], camera, 0, 0).rgb
+
+
+def train(observation: Observation, filters: Filters, settings: Settings) -> Trained:
+    """A model of one still picture, by the node's own mapper."""
+    refiner = CpuRefiner(partial(make_rasterizer, "numba", antialias=filters.screen))
+    mapper = Mapper(refiner, settings.max_gaussians, filters.world, focus=1.0)
+    mapped = mapper.update(observation, StepBudget(STEPS_PER_ROUND))  # places the Gaussians
+    for _ in range(settings.rounds):
+        mapped = mapper.update(observation, StepBudget(STEPS_PER_ROUND))
+    return Trained(mapped.snapshot.gaussians, filters.screen)  # the mapper's own has new, untrained splits
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """The table, keys as benchmarks/README.md lists them, and what it was measured with."""
+
+    table: dict[str, Any]
+    truth: AliasTruth
+    models: Mapping[str, Trained]
+
+
+def measure_alias(settings: Settings, advance: Advance) -> Measured:
+    """Train, draw and compare."""
+    total = len(VARIANTS) + 2
+    advance(0, total, "the truth")
+    truth = AliasTruth(PhantomSource(width=settings.width, height=settings.height))
+    models = {}
+    for done, (name, filters) in enumerate(VARIANTS.items(), 1):
+        advance(done, total, f"training: {name.replace('_', ' ')}")
+        models[name] = train(truth.observation(), filters, settings)
+    advance(total - 1, total, "other sizes and distances, slow motion")
+    size = [{"factor": k, **_psnrs(models, truth.at_size(k))} for k in SIZES]
+    distance = [{"factor": k, **_psnrs(models, truth.at_distance(k))} for k in DISTANCES]
+    table = {
+        "machine": machine_name(),
+        "width": settings.width,
+        "height": settings.height,
+        "steps": settings.rounds * STEPS_PER_ROUND,
+        "gaussians": {name: len(model.gaussians) for name, model in models.items()},
+        "gain_db_quarter": _gain(size, 0.25),
+        "gain_db_size_4": _gain(size, 4.0),
+        "gain_db_distance_4": _gain(distance, 4.0),
+        "gain_db_distance_half": _gain(distance, 0.5),
+        "psnr_at_size": size,
+        "psnr_at_distance": distance,
+        "thin_vessel_brightness_change": [
+            {"factor": k, **_brightness_changes(models, truth, k)} for k in SIZES
+        ],
+        "flicker": _flicker(models, truth, settings.frames),
+        "requested_view_in_filter": _requested_view(models["both"], truth),
+    }
+    return Measured(table, truth, models)
+
+
+def _psnrs(models: Mapping[str, Trained], shot: Shot) -> dict[str, float]:
+    return {name: psnr(model.draw(shot.camera), shot.image, shot.counted) for name, model in models.items()}
+
+
+def _gain(rows: list[dict[str, float]], factor: float) -> float:
+    """Of both filters over none, dB."""
+    (row,) = (row for row in rows if row["factor"] == factor)
+    return row["both"] - row["none"]
+
+
+def _brightness_changes(models: Mapping[str, Trained], truth: AliasTruth, factor: float) -> dict[str, float]:
+    """Mean brightness of thin vessels against the truth's, as a share of it."""
+    shot, vessel = truth.at_size(factor), truth.thin_vessels(factor)
+    true = _brightness(shot.image, vessel)
+    return {name: _brightness(model.draw(shot.camera), vessel) / true - 1 for name, model in models.items()}
+
+
+def _brightness(image: F32, weight: F32) -> float:
+    return float(np.average(image.mean(-1, dtype=np.float64), weights=weight))
+
+
+def _flicker(models: Mapping[str, Trained], truth: AliasTruth, frames: int) -> dict[str, Any]:
+    """Energy of the pixels' second differences in time over a slow motion, as multiples of the truth's: of
+    the picture (1 is right, less is blurred, more flickers), and of its error (0 is right)."""
+    shots = list(truth.drift(DRIFT_SIZE, DRIFT_STEP, frames))
+    counted = np.logical_and.reduce([shot.counted for shot in shots])
+    true = np.stack([shot.image[counted] for shot in shots])
+    found: dict[str, Any] = {"size": DRIFT_SIZE, "px_per_frame": DRIFT_STEP, "frames": frames}
+    for name, model in models.items():
+        drawn = np.stack([model.draw(shot.camera)[counted] for shot in shots])
+        found[name] = {
+            "picture": _restlessness(drawn) / _restlessness(true),
+            "error": _restlessness(drawn - true) / _restlessness(true),
+        }
+    return found
+
+
+def _restlessness(pixels: F32) -> float:
+    """Mean square of the second differences along the first axis, time."""
+    return float(np.mean(np.diff(pixels, 2, axis=0) ** 2))
+
+
+def _requested_view(model: Trained, truth: AliasTruth) -> list[dict[str, Any]]:
+    """From nearer by: should the camera that only looks at the result take part in the 3D filter's sampling
+    rate? PSNR both ways."""
+    rows = []
+    for view, shot in (("size 4", truth.at_size(4.0)), ("distance 0.5", truth.at_distance(0.5))):
+        variances = smoothing_variances(model.gaussians.means, [truth.camera, shot.camera])
+        joined = replace(model, gaussians=replace(model.gaussians, smoothing=variances))
+        yes, no = (psnr(each.draw(shot.camera), shot.image, shot.counted) for each in (joined, model))
+        rows.append({"view": view, "yes": yes, "no": no})
+    return rows

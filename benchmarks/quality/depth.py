@@ -1,0 +1,342 @@
+"""Depth from stereo against what is known to be true: the node's stage in every setting, and plain SGBM."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from benchmarks.quality.depth_regions import regions_of
+from sags_node.config import OnnxConfig, PhantomSource, StereoConfig, VisionConfig
+from sags_node.errors import SagsError
+from sags_node.evaluation import metrics
+from sags_node.evaluation.provenance import machine_name
+from sags_node.geometry import disparity_to_depth
+from sags_node.kernels.threads import configure_threads
+from sags_node.mapping.budget import StepBudget
+from sags_node.phantom.scene import Phantom
+from sags_node.pipeline import Pipeline
+from sags_node.session import Session
+from sags_node.sources.source import open_source
+from sags_node.types import F32, F64, Bool, Camera, RectifiedPair, StereoFrame
+from sags_node.vision.onnx_depth import NetworkDepth
+from sags_node.vision.rectify import Rectifier
+from sags_node.vision.stereo import StereoDepth
+
+SCALES = (1, 2, 4)
+PLAIN_SCALES = (1, 2)
+MODEL = "the model, drawn"
+CONFIDENCES = (0.0, 0.25, 0.5, 0.75, 1.0)  # edges of the table's groups
+EVERY = 10  # frames of a recording
+WHITE = 230  # of 255, in every channel: a highlight
+FAULTS: dict[str, tuple[float, ...]] = {  # what `PhantomSource` calls it -> levels
+    "noise": (0.0, 0.01, 0.03, 0.06),
+    "blur": (0.0, 1.0, 2.0, 4.0),
+    "smoke": (0.0, 0.3, 0.6, 0.9),
+    "gloss": (0.0, 1.0, 8.0, 64.0),
+}
+
+Matcher = Callable[[RectifiedPair, Bool], tuple[F32, F32]]  # depth (m, 0 unknown) and confidence, [H, W]
+Advance = Callable[[int, int | None, str], None]  # done, of, what
+
+
+class PlainSGBM:
+    """OpenCV's StereoSGBM as its own sample `stereo_match.py` sets it up, and nothing around it."""
+
+    def __init__(self, config: StereoConfig, camera: Camera, baseline: float, scale: int) -> None:
+        self._size = round(camera.width / scale), round(camera.height / scale)
+        self._focal = float(camera.K[0, 0]) * self._size[0] / camera.width
+        self._baseline = baseline
+        self._smallest = int(self._focal * baseline / config.max_depth)
+        count = 16 * int(np.ceil((self._focal * baseline / config.nearest - self._smallest) / 16))
+        block = 5  # px
+        self._matcher = cv2.StereoSGBM.create(
+            minDisparity=self._smallest,
+            numDisparities=count,
+            blockSize=block,
+            P1=8 * block**2,
+            P2=32 * block**2,
+            disp12MaxDiff=1,
+            uniquenessRatio=10,
+            speckleWindowSize=100,
+            speckleRange=2,
+        )
+
+    def __call__(self, pair: RectifiedPair, tissue: Bool) -> tuple[F32, F32]:
+        assert pair.right is not None  # there is nothing to match without
+        left, right = (
+            cv2.resize(cv2.cvtColor(eye, cv2.COLOR_RGB2GRAY), self._size, interpolation=cv2.INTER_AREA)
+            for eye in (pair.left, pair.right)
+        )
+        sixteenths = self._matcher.compute(left, right)
+        known = sixteenths >= self._smallest * 16  # what is lower marks a pixel without a match
+        disparity = np.where(known, sixteenths.astype(np.float32) / np.float32(16), np.float32(0))
+        depth = disparity_to_depth(disparity, self._focal, self._baseline)
+        depth = metrics.resample_nearest(depth, tissue.shape[1], tissue.shape[0]) * tissue
+        return depth, (depth > 0).astype(np.float32)
+
+
+def network_matcher(file: Path, config: StereoConfig, camera: Camera, baseline: float) -> Matcher:
+    """The stage with a network, as `vision.onnx` sets it up. Nothing is matched where it fails.
+
+    Raises:
+        UsageError: the file is no depth network.
+    """
+    stereo = StereoDepth(config, camera, baseline)
+    onnx = OnnxConfig(path=file, fallback=False)
+    network = NetworkDepth(VisionConfig(stereo=config, onnx=onnx), stereo, camera, baseline)
+
+    def match(pair: RectifiedPair, tissue: Bool) -> tuple[F32, F32]:
+        found = network(pair, tissue, lambda: stereo(pair, tissue)[0])
+        assert found is not None  # without a fallback it raises
+        return found
+
+    return match
+
+
+def make_matchers(
+    config: StereoConfig, camera: Camera, baseline: float, network: Path | None = None
+) -> dict[str, Matcher]:
+    """By name; the first is the stage as `config` sets it up, which the others are compared with.
+
+    Args:
+        network: an ONNX file to compare as well.
+
+    Raises:
+        UsageError: the pictures are too small to match at `SCALES`, or the file is no depth network.
+    """
+    matchers: dict[str, Matcher] = {"as configured": StereoDepth(config, camera, baseline)}
+    for method, name in (("dis", "inverse search"), ("sgbm", "SGBM, judged")):
+        for scale in SCALES:
+            setting = config.model_copy(update={"method": method, "scale": scale})
+            matchers[f"{name}, scale {scale}"] = StereoDepth(setting, camera, baseline)
+    for scale in PLAIN_SCALES:
+        matchers[f"plain SGBM, scale {scale}"] = PlainSGBM(config, camera, baseline, scale)
+    if network is not None:
+        matchers[f"network {network.name}"] = network_matcher(network, config, camera, baseline)
+    return matchers
+
+
+@dataclass
+class Tally:
+    """What one matcher gave, over all frames so far."""
+
+    errors_mm: list[F64] = field(default_factory=list)  # measured minus true
+    confidences: list[F32] = field(default_factory=list)
+    shared: list[Bool] = field(default_factory=list)  # also known to the stage as configured
+    times_ms: list[float] = field(default_factory=list)
+    wanted: int = 0  # px that have a true depth
+
+    def add(self, depth: F32, confidence: F32, truth: F32, mask: Bool, shared: Bool) -> None:
+        """One frame: pictures [H, W], `mask` where it counts, `shared` where others know the depth too."""
+        comparable = mask & (truth > 0)
+        given = comparable & (depth > 0)
+        self.wanted += int(comparable.sum())
+        self.errors_mm.append((depth[given].astype(np.float64) - truth[given]) * 1e3)
+        self.confidences.append(confidence[given])
+        self.shared.append(shared[given])
+
+    def figures(self) -> dict[str, Any]:
+        errors, shared = np.concatenate(self.errors_mm), np.concatenate(self.shared)
+        return {
+            **error_figures(errors),
+            "coverage": rounded(len(errors) / self.wanted) if self.wanted else None,
+            "where_configured_knows": error_figures(errors[shared]),
+            "ms": rounded(statistics.median(self.times_ms)) if self.times_ms else None,
+        }
+
+    def by_confidence(self) -> list[dict[str, Any]]:
+        return by_confidence(np.concatenate(self.errors_mm), np.concatenate(self.confidences))
+
+
+def by_confidence(errors_mm: F64, confidences: F32) -> list[dict[str, Any]]:
+    """Whether the confidence orders the errors: one row for each group of it."""
+    rows = []
+    for low, high in pairwise(CONFIDENCES):
+        group = (confidences > low) & (confidences <= high)
+        share = rounded(group.mean()) if len(group) else None
+        rows.append({"above": low, "up_to": high, "share": share, **error_figures(errors_mm[group])})
+    return rows
+
+
+def error_figures(errors_mm: F64) -> dict[str, float | None]:
+    """Of signed errors; None of nothing. A negative bias means too near."""
+    if len(errors_mm) == 0:
+        return dict.fromkeys(("median_mm", "p90_mm", "bias_mm"))
+    size = np.abs(errors_mm)
+    figures = np.median(size), np.percentile(size, 90), np.median(errors_mm)
+    return dict(zip(("median_mm", "p90_mm", "bias_mm"), map(rounded, figures), strict=True))
+
+
+def rounded(value: float | np.floating[Any]) -> float:
+    return round(float(value), 4)
+
+
+class Comparison:
+    """Matchers on the same frames."""
+
+    def __init__(self, matchers: Mapping[str, Matcher]) -> None:
+        self._matchers = matchers
+        self.tallies = {name: Tally() for name in matchers}
+        self._warm = False
+
+    def add(self, pair: RectifiedPair, tissue: Bool, truth: F32, extra: Mapping[str, F32]) -> F32:
+        """Match one pair with each matcher and compare with `truth` [H, W] (m) on tissue.
+
+        Args:
+            extra: depths that are there already, by name.
+
+        Returns:
+            What the first matcher gave, [H, W] m.
+        """
+        configured: F32 | None = None
+        for name, matcher in self._matchers.items():
+            if not self._warm:
+                matcher(pair, tissue)  # buffers are made and code is loaded in the first call
+            started = time.perf_counter()
+            depth, confidence = matcher(pair, tissue)
+            self.tallies[name].times_ms.append((time.perf_counter() - started) * 1e3)
+            if configured is None:
+                configured = depth
+            self.tallies[name].add(depth, confidence, truth, tissue, configured > 0)
+        self._warm = True
+        assert configured is not None  # there is always a matcher
+        for name, depth in extra.items():
+            known = (depth > 0).astype(np.float32)
+            self.tallies.setdefault(name, Tally()).add(depth, known, truth, tissue, configured > 0)
+        return configured
+
+    def rows(self) -> list[dict[str, Any]]:
+        return [{"name": name, **tally.figures()} for name, tally in self.tallies.items()]
+
+
+class Regions:
+    """Errors by `regions_of` the picture, of the stage as configured and of the drawn model."""
+
+    def __init__(self) -> None:
+        self._tallies: dict[str, tuple[Tally, Tally]] = {}
+
+    def add(self, stage: F32, drawn: F32, truth: F32, masks: Mapping[str, Bool]) -> None:
+        for name, mask in masks.items():
+            tallies = self._tallies.setdefault(name, (Tally(), Tally()))
+            for tally, depth in zip(tallies, (stage, drawn), strict=True):
+                tally.add(depth, np.ones_like(depth), truth, mask, stage > 0)
+
+    def rows(self) -> list[dict[str, Any]]:
+        return [
+            {"region": name, "stage": _without_time(stage), "drawn": _without_time(drawn)}
+            for name, (stage, drawn) in self._tallies.items()
+        ]
+
+
+def _without_time(tally: Tally) -> dict[str, Any]:
+    return {key: value for key, value in tally.figures().items() if key != "ms"}
+
+
+def measure_recording(
+    session: Session, advance: Advance, every: int = EVERY, network: Path | None = None
+) -> dict[str, Any]:
+    """Frames of a recording that have a reference depth, at most one in `every`, against it, on tissue.
+
+    The whole recording is played with one step of the mapper a frame, so that the depth of the drawn model is
+    measured beside.
+
+    Raises:
+        SagsError: no frame has a reference depth, or the recording cannot be used.
+        UsageError: as `make_matchers`.
+    """
+    config = session.config
+    configure_threads(config.engine.threads)
+    pipeline, budget = Pipeline(config, session.rig), StepBudget(1)
+    camera, size = pipeline.rectifier.camera, session.working_size
+    matchers = make_matchers(config.vision.stereo, camera, pipeline.rectifier.baseline, network)
+    comparison, regions = Comparison(matchers), Regions()
+    measured, kind, next_number = 0, "", 0
+    focal_baseline = float(camera.K[0, 0]) * pipeline.rectifier.baseline
+    with open_source(config.source) as frames:
+        for number, frame in enumerate(frames):
+            result = pipeline.process(frame, budget)
+            advance(number + 1, None, "playing")
+            reference = frame.reference
+            if number < next_number or reference is None or reference.depth is None:
+                continue
+            next_number = number + every
+            truth, kind = metrics.resample_nearest(reference.depth, *size), reference.depth_kind
+            drawn, tissue = result.views["left"].depth, result.observation.tissue
+            stage = comparison.add(result.pair, tissue, truth, {MODEL: drawn})
+            regions.add(stage, drawn, truth, regions_of(truth, tissue, focal_baseline))
+            measured += 1
+    if measured == 0:
+        raise SagsError(f"{session.name} has no reference depth to compare with; set source.reference.depth")
+    return {
+        "truth": kind,
+        "session": session.name,
+        "size": size,
+        "frames": measured,
+        "machine": machine_name(),
+        "settings": comparison.rows(),
+        "confidence": comparison.tallies["as configured"].by_confidence(),
+        "regions": regions.rows(),
+    }
+
+
+def measure_faults(
+    size: tuple[int, int],
+    frames: int,
+    faults: Mapping[str, Sequence[float]],
+    advance: Advance,
+    network: Path | None = None,
+) -> dict[str, Any]:
+    """The phantom, whose depth is known exactly, with one fault of its pictures rising at a time.
+
+    Args:
+        size: width and height of the pictures, px.
+        frames: of each level, evenly over the whole motion.
+        faults: levels by the name of the fault in `PhantomSource`.
+        network: an ONNX file to compare as well.
+    """
+    levels = [(fault, level) for fault, values in faults.items() for level in values]
+    rows = []
+    for done, (fault, level) in enumerate(levels):
+        advance(done, len(levels), f"{fault} {level:g}")
+        phantom = Phantom(PhantomSource.model_validate({"width": size[0], "height": size[1], fault: level}))
+        rectifier = Rectifier(phantom.rig, *size)
+        matchers = make_matchers(StereoConfig(), rectifier.camera, rectifier.baseline, network)
+        comparison = Comparison(matchers)
+        white = []
+        for pair, tissue, truth in _phantom_pairs(phantom, rectifier, frames):
+            comparison.add(pair, tissue, truth, {})
+            white.append(float((pair.left.min(-1) >= WHITE)[tissue].mean()))
+        rows.append(
+            {
+                "fault": fault,
+                "level": level,
+                "white": rounded(statistics.mean(white)),
+                "settings": comparison.rows(),
+                "confidence": comparison.tallies["as configured"].by_confidence(),
+            }
+        )
+    return {
+        "truth": "exact",
+        "session": "phantom",
+        "size": size,
+        "frames": frames,
+        "machine": machine_name(),
+        "faults": rows,
+    }
+
+
+def _phantom_pairs(
+    phantom: Phantom, rectifier: Rectifier, count: int
+) -> Iterable[tuple[RectifiedPair, Bool, F32]]:
+    for index in range(count):
+        frame = phantom.frame(index, count)
+        pair = rectifier(StereoFrame(index, 0, 0, frame.left, frame.right))
+        yield pair, rectifier.mask(~frame.tool), frame.depth

@@ -1,0 +1,415 @@
+"""What the node makes of pictures that something is wrong with, for a second in the middle of a recording."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from benchmarks.disturbances import DISTURBANCES, Disturbance, Scene, Taken, disturbed
+from benchmarks.quality.tracking import true_points
+from sags_node.errors import SagsError, UsageError
+from sags_node.evaluation import metrics
+from sags_node.findings import by_code
+from sags_node.kernels.threads import configure_threads
+from sags_node.mapping.budget import StepBudget
+from sags_node.pipeline import Pipeline
+from sags_node.session import Session
+from sags_node.sources.source import open_source
+from sags_node.types import F32, F64, I64, U8, AnchorStates, Bool, FrameResult, RenderedView, StereoFrame
+from sags_node.vision.tissue import TissueMask
+
+LEAD = 10  # frames: how long before it begins the anchors are pinned
+RECOVERY = 10  # frames after its end, within which all should be as before
+AFTER_SECONDS = 2.0  # that are played after it
+BEGINS_AT = 0.4  # of the recording, where the launch file names no segment
+WITHIN_DB = 1.0  # of what it was: recovered
+STEADY = 3  # frames in a row that must be so good
+CONFIDENT = 0.5
+SUPPORTED_SECONDS = 0.5  # a depth that was measured in this time is not borrowed
+ANCHORS = 24
+ANCHOR_WRONG = 2e-3  # m: an instrument led to such a target misses it
+ANCHOR_WRONG_PX = 8 / 640  # of the width, where depth has no truth: 1.1 mm sideways at 80 mm
+
+Advance = Callable[[int, int | None, str], None]  # frames done, of, what
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """One frame of a run to look at: what came, and what the node made of it."""
+
+    left: U8  # [H, W, 3] rectified, as it came
+    right: U8  # [H, W, 3] likewise
+    view: RenderedView
+    tissue: Bool  # [H, W] in truth
+
+
+@dataclass(frozen=True, slots=True)
+class _Depth:
+    """Published depth of one frame against its reference, over the true tissue."""
+
+    all: metrics.DepthErrors
+    confident: metrics.DepthErrors
+
+
+@dataclass(frozen=True, slots=True)
+class _Shown:
+    """What one frame of a run showed."""
+
+    psnr: float  # dB over the true tissue, against the true picture
+    borrowed: float  # share of the published depth
+    confident_borrowed: float  # share of that which is published as confident
+    depth: _Depth | None  # None: there is no reference
+    warnings: frozenset[str]
+    restarts: int  # of the model, since the first frame
+
+
+def measure_disturbances(
+    session: Session,
+    names: Sequence[str],
+    start: int | None,
+    seconds: float,
+    advance: Advance,
+    look: Callable[[str, list[Shot]], None] = lambda name, shots: None,
+) -> dict[str, Any]:
+    """Play a recording once for each disturbance, frame by frame, one step of the mapper a frame.
+
+    Pictures are compared with the undisturbed picture of their time, over the tissue that the recording's own
+    masks say, where it has them. The undisturbed run is always played first: the others are judged by it.
+
+    Args:
+        names: of `DISTURBANCES`.
+        start: the frame in which each begins; None: that of the launch file's first segment, or `BEGINS_AT`.
+        seconds: that those last which have no length of their own.
+        look: called after each run with a frame before, in the middle, and after the disturbance.
+
+    Returns:
+        `rows`, one for each name; the keys are explained in benchmarks/disturbances.md.
+
+    Raises:
+        UsageError: one camera alone, or the recording is too short.
+        SagsError: the recording cannot be read, or nothing can be pinned.
+    """
+    configure_threads(session.config.engine.threads)
+    rate, during = _stretch(session, start, seconds)
+    scene = Scene(session.rig, _references(session, during))
+    last = during.stop + round(AFTER_SECONDS * rate)
+    order = ["clean", *(name for name in names if name != "clean")]
+    clean: _Run | None = None
+    rows: list[Row] = []
+    for number, name in enumerate(order):
+        disturbance = DISTURBANCES[name]
+        length = disturbance.length(len(during), rate)
+        run = _Run(session, disturbance, range(during.start, during.start + length), rate, clean)
+        with open_source(session.config.source) as source:
+            frames = source.frame_count or 1
+            for done, taken in enumerate(disturbed(disturbance, source, run.during, rate, scene)):
+                run.take(taken)
+                advance(number * frames + done + 1, len(order) * frames, name)
+                if taken.clean.frame_id >= last:
+                    break
+        clean = clean or run
+        if name in names:
+            rows.append(run.row())
+            look(name, run.shots)
+    return {
+        "session": session.name,
+        "settings": {
+            "from": during.start,
+            "seconds": seconds,
+            "rate": rate,
+            "masks": session.config.vision.tissue.method,
+            "width": session.working_size[0],
+            "height": session.working_size[1],
+        },
+        "rows": rows,
+    }
+
+
+def _stretch(session: Session, start: int | None, seconds: float) -> tuple[float, range]:
+    """Frames per second, and the frames to disturb."""
+    if session.config.one_camera:
+        raise UsageError("disturbances are made for two eyes; this recording has one")
+    with open_source(session.config.source, references=False) as source:
+        rate, count = source.rate, source.frame_count
+        first = next(iter(source)).frame_id
+    assert count is not None  # it does not loop
+    if start is None:
+        begins = [begin for begin, _ in session.config.segments.values() if begin >= first + LEAD]
+        start = begins[0] if begins else first + round(BEGINS_AT * count)
+    during = range(start, start + max(1, round(seconds * rate)))
+    if start < first + LEAD or during.stop + RECOVERY + STEADY > first + count:
+        raise UsageError(
+            f"{during.start} to {during.stop - 1} does not lie well inside frames {first} to "
+            f"{first + count - 1}: at least {LEAD} frames are needed before and {RECOVERY + STEADY} after; "
+            "choose another --from, or fewer --seconds"
+        )
+    return rate, during
+
+
+def _references(session: Session, during: range) -> dict[int, F32]:
+    """Depths from the last frame before the stretch that has one to the first after it."""
+    found: dict[int, F32] = {}
+    with open_source(session.config.source) as source:
+        for frame in source:
+            if frame.right is None:
+                raise UsageError("disturbances are made for two eyes; this recording has one")
+            if frame.reference is None or frame.reference.depth is None:
+                continue
+            if frame.frame_id <= during.start:
+                found.clear()
+            found[frame.frame_id] = frame.reference.depth
+            if frame.frame_id >= during.stop:
+                break
+    return found
+
+
+class _Run:
+    """One pass through the recording."""
+
+    def __init__(
+        self, session: Session, disturbance: Disturbance, during: range, rate: float, clean: _Run | None
+    ) -> None:
+        self.during = during
+        self.shots: list[Shot] = []
+        self._name = disturbance.name
+        self._rate = rate
+        self._clean = clean or self
+        self._pipeline = Pipeline(session.config, session.rig)
+        self._budget = StepBudget(1)
+        given = session.config.vision.tissue.model_copy(update={"method": "session"})
+        self._true_tissue = TissueMask(given, self._pipeline.rectifier)
+        self._shown: dict[int, _Shown] = {}  # by frame_id
+        self._measured_in: I64 | None = None  # [H, W] frame_id in which each pixel's depth was measured last
+        self._anchors = _PinnedAnchors(self._pipeline)
+        self._shoot_at = [during.start - 1, during.start + len(during) // 2, during.stop]
+
+    def take(self, taken: Taken) -> None:
+        """Play one frame and measure it. Where it is lost, nothing new is shown, and nothing measured."""
+        if taken.given is None:
+            return
+        result = self._pipeline.process(taken.given, self._budget)
+        frame, view = taken.clean, result.views["left"]
+        truth = self._pipeline.rectifier(frame)
+        tissue = self._true_tissue(frame, truth)
+        borrowed = self._borrowed(frame.frame_id, result)
+        published = view.depth > 0
+        confident = published & _is_confident(view)
+        self._shown[frame.frame_id] = _Shown(
+            psnr=metrics.psnr(view.rgb, metrics.as_float(truth.left), tissue),
+            borrowed=_share(borrowed, published),
+            confident_borrowed=_share(borrowed, confident),
+            depth=_depth_errors(frame, view, confident, tissue),
+            warnings=frozenset(by_code(self._pipeline.warnings)),
+            restarts=self._pipeline.mapper.restarts,
+        )
+        if not self._anchors.pinned and frame.frame_id >= self.during.start - LEAD:
+            self._anchors.pin(frame, result)
+        self._anchors.follow(frame, result)
+        if self._shoot_at and frame.frame_id >= self._shoot_at[0]:
+            del self._shoot_at[0]
+            assert result.pair.right is not None
+            self.shots.append(Shot(result.pair.left, result.pair.right, view, tissue))
+
+    def _borrowed(self, frame_id: int, result: FrameResult) -> Bool:
+        """Where stereo has not measured a depth for `SUPPORTED_SECONDS`, [H, W]: what is published there is
+        carried on, or taken from elsewhere. A wrong measurement counts as one."""
+        measured = result.observation.depth > 0
+        if self._measured_in is None:
+            self._measured_in = np.full(measured.shape, np.iinfo(np.int64).min // 2)
+        self._measured_in[measured] = frame_id
+        return np.asarray(frame_id - self._measured_in >= SUPPORTED_SECONDS * self._rate)
+
+    def row(self) -> Row:
+        """The figures of the run; None where one does not apply."""
+        first, stop = self.during.start, self.during.stop
+        before = [shown for frame, shown in self._shown.items() if first - self._rate <= frame < first]
+        within = [shown for frame, shown in self._shown.items() if frame in self.during]
+        after = [shown for frame, shown in self._shown.items() if frame >= stop + RECOVERY]
+        depths = [
+            shown.depth
+            for frame, shown in self._shown.items()
+            if first <= frame < stop + RECOVERY and shown.depth is not None
+        ]
+        psnr_before = _mean([shown.psnr for shown in before])
+        psnr = {frame: shown.psnr for frame, shown in self._shown.items()}
+        clean_psnr = {frame: shown.psnr for frame, shown in self._clean._shown.items()}
+        known = frozenset[str]().union(*(shown.warnings for shown in before))
+        fresh = {frame: shown.warnings - known for frame, shown in self._shown.items() if frame >= first}
+        warned, cleared = warning_times(fresh, self.during, self._rate)
+        anchors = self._anchors.judge(stop + RECOVERY - 1, self._clean._anchors)
+        last = max(self._shown)
+        return {
+            "name": self._name,
+            "frames": len(self.during),
+            "psnr_before": psnr_before,
+            "psnr_during": _mean([shown.psnr for shown in within]),
+            "psnr_after": _mean([shown.psnr for shown in after]),
+            "confident_depth_p90_mm": _worst([depth.confident.p90_mm for depth in depths]),
+            "depth_median_mm": _worst([depth.all.median_mm for depth in depths]),
+            "coverage": _least([depth.all.coverage for depth in depths]),
+            "confident_coverage": _least([depth.confident.coverage for depth in depths]),
+            "borrowed_share": _mean([shown.borrowed for shown in within]),
+            "confident_borrowed_share": _mean([shown.confident_borrowed for shown in within]),
+            "warned_after_s": _round(warned),
+            "cleared_after_s": _round(cleared),
+            "warned_of": sorted(frozenset[str]().union(*fresh.values())),
+            "frames_to_recover": frames_to_recover(psnr, clean_psnr, stop, psnr_before),
+            "restarts": self._shown[last].restarts - before[-1].restarts,
+            **anchors,
+        }
+
+
+def frames_to_recover(
+    psnr: Mapping[int, float], clean: Mapping[int, float], stop: int, before: float | None
+) -> int | None:
+    """Frames from the end of a disturbance until `STEADY` frames in a row are within `WITHIN_DB` of what it
+    was before, or of the undisturbed run's same frames, where those are worse; None: never.
+
+    Args:
+        psnr: frame_id -> dB, of the run; lost frames are not in it.
+        clean: the same of the undisturbed run.
+        stop: the first frame after the disturbance.
+        before: dB.
+    """
+    if before is None:
+        return None
+    frames = sorted(frame for frame in psnr if frame >= stop)
+    good = [psnr[frame] >= min(before, clean[frame]) - WITHIN_DB for frame in frames]
+    starts = range(len(good) - STEADY + 1)
+    return next((k for k in starts if all(good[k : k + STEADY])), None)
+
+
+def warning_times(
+    warnings: Mapping[int, frozenset[str]], during: range, rate: float
+) -> tuple[float | None, float | None]:
+    """Seconds from the begin of a disturbance to the first warning, and from its end until there is none;
+    None: never.
+
+    Args:
+        warnings: frame_id -> the codes of the warnings, without those that warned before.
+        during: frames of the disturbance.
+        rate: frames per second.
+    """
+    warned = [frame for frame, codes in warnings.items() if codes and frame >= during.start]
+    if not warned:
+        return None, None
+    after = (min(warned) - during.start) / rate
+    if max(warned) == max(warnings):
+        return after, None
+    return after, max(0, max(warned) + 1 - during.stop) / rate
+
+
+class _PinnedAnchors:
+    """Anchors of one run, and where they were in each frame after."""
+
+    def __init__(self, pipeline: Pipeline) -> None:
+        self.pinned = False
+        self._anchors, self._width = pipeline.anchors, pipeline.rectifier.camera.width
+        self._tracks: list[int] = []  # which of the recording's true points each is on, in the order of ids
+        self._states: dict[int, AnchorStates] = {}  # by frame_id
+        self._truth: dict[int, F64] = {}  # frame_id -> points [A, 3] (m, world), where the recording has any
+
+    def pin(self, frame: StereoFrame, result: FrameResult) -> None:
+        """On visible true surface points, where the recording has them, else on a grid.
+
+        Raises:
+            SagsError: nothing can be pinned.
+        """
+        self.pinned = True
+        shown = result.observation, result.snapshot, result.views["left"]
+        points = true_points(frame, result)
+        if points is not None:
+            assert frame.reference is not None and frame.reference.points_visible is not None
+            visible = np.flatnonzero(frame.reference.points_visible)
+            for track in visible[:: max(1, len(visible) // ANCHORS)][:ANCHORS]:
+                self._try(int(track), partial(self._anchors.add_point, points[track], *shown))
+        else:
+            height, width = result.observation.tissue.shape
+            columns = round((ANCHORS * width / height) ** 0.5)
+            rows = -(-ANCHORS // columns)
+            for place in range(ANCHORS):
+                u = (place % columns + 0.5) * width / columns
+                v = (place // columns + 0.5) * height / rows
+                self._try(place, partial(self._anchors.add_pixel, u, v, *shown))
+        if not self._tracks:
+            raise SagsError(f"nothing can be pinned in frame {frame.frame_id}; choose another --from")
+
+    def _try(self, track: int, add: Callable[[], int]) -> None:
+        with suppress(SagsError):  # an instrument, or no depth there
+            add()
+            self._tracks.append(track)
+
+    def follow(self, frame: StereoFrame, result: FrameResult) -> None:
+        """Note where they are said to be, and where they are."""
+        self._states[frame.frame_id] = result.anchors
+        points = true_points(frame, result)
+        if points is not None:
+            self._truth[frame.frame_id] = points[self._tracks]
+
+    def judge(self, frame_id: int, clean: _PinnedAnchors) -> Row:
+        """Shares 0..1 of the anchors in a frame, or the first after it that came: those confident and within
+        `ANCHOR_WRONG` of the truth, and those confident and farther away. The rest say that they are unsure,
+        or are lost. Without true points the truth is where the undisturbed run has them in the picture."""
+        frame_id = min(frame for frame in self._states if frame >= frame_id)
+        states = self._states[frame_id]
+        if frame_id in self._truth:
+            offsets, most = (states.points - self._truth[frame_id]).astype(np.float32), ANCHOR_WRONG
+        else:
+            offsets, most = states.pixels - clean._states[frame_id].pixels, ANCHOR_WRONG_PX * self._width
+        sure = (states.confidence >= CONFIDENT) & np.isfinite(offsets).all(1)
+        if frame_id in self._truth:
+            sure &= states.depth_confidence >= CONFIDENT  # it says that it may be 3 mm off along the ray
+        right = np.linalg.norm(offsets, axis=1) <= most  # NaN: not
+        return {
+            "anchors": len(states),
+            "anchors_back": _round(float(np.mean(sure & right))),
+            "anchors_wrong": _round(float(np.mean(sure & ~right))),
+        }
+
+
+def _is_confident(view: RenderedView) -> Bool:
+    """[H, W]; all of it, where the view does not say."""
+    if view.confidence is None:
+        return np.ones(view.depth.shape, np.bool_)
+    return np.asarray(view.confidence >= CONFIDENT)
+
+
+def _depth_errors(frame: StereoFrame, view: RenderedView, confident: Bool, tissue: Bool) -> _Depth | None:
+    if frame.reference is None or frame.reference.depth is None:
+        return None
+    height, width = view.depth.shape
+    truth = metrics.resample_nearest(frame.reference.depth, width, height)
+    sure = np.where(confident, view.depth, np.float32(0))
+    return _Depth(metrics.depth_errors(view.depth, truth, tissue), metrics.depth_errors(sure, truth, tissue))
+
+
+def _share(part: Bool, whole: Bool) -> float:
+    count = np.count_nonzero(whole)
+    return np.count_nonzero(part & whole) / count if count else float("nan")
+
+
+def _known(values: Sequence[float]) -> list[float]:
+    return [value for value in values if np.isfinite(value)]
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    known = _known(values)
+    return _round(float(np.mean(known))) if known else None
+
+
+def _worst(values: Sequence[float]) -> float | None:
+    return _round(max(_known(values), default=None))
+
+
+def _least(values: Sequence[float]) -> float | None:
+    return _round(min(_known(values), default=None))
+
+
+def _round(value: float | None) -> float | None:
+    return None if value is None else round(value, 3)

@@ -1,0 +1,231 @@
+"""How true the pose of a moving scope stays over minutes: on the phantom, whose tissue moves too.
+
+The same pictures are played once for each way to know the pose. Beside the node's own ways stand a camera
+that takes the scene for rigid, and the pose that fits the true surface points best: it says how much of an
+error is a matter of definition, since the motion that all tissue shares cannot be told from the scope's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, get_args
+
+import cv2
+import numpy as np
+from rich.table import Table
+
+from sags_node.config import LaunchConfig, PhantomSource, PoseWay
+from sags_node.errors import UsageError
+from sags_node.evaluation import metrics
+from sags_node.evaluation.trajectory import RigidOdometry, drift, trajectory_errors
+from sags_node.geometry import project
+from sags_node.kernels.threads import configure_threads
+from sags_node.mapping.budget import StepBudget
+from sags_node.mapping.camera_pose import fit_pose
+from sags_node.phantom.motion import BREATH
+from sags_node.phantom.scene import Phantom, PhantomFrame
+from sags_node.pipeline import Pipeline
+from sags_node.types import F32, F64, Bool, Camera, StereoFrame
+from sags_node.warm_up import warm_up
+
+Motion = Literal["sway", "zoom", "orbit"]
+MOTIONS: tuple[Motion, ...] = get_args(Motion)
+RATE = 10.0  # frames per second, where the launch file says nothing
+STEPS = 1  # of the mapper, each frame
+
+# What is wrong with the poses that a robot gives.
+WANDERS = 120.0  # s, in which it goes so far:
+WANDERED = np.array([0.002, -0.0015, 0.0017])  # m: 3 mm
+TURNED = np.radians([0.6, 0.5, -0.6])  # 1 degree
+HAND_EYE = np.radians([0.6, -0.6, 0.5])  # of the camera on the hand: 1 degree
+JITTER = 1e-4  # m, along each axis (standard deviation)
+JITTER_TURN = np.radians(0.03)  # about each
+
+Advance = Callable[[int, int | None, str], None]  # frames done, of, what
+
+
+class Robot:
+    """The poses that a robot gives whose base gives way slowly, whose hand-eye calibration is wrong, and
+    whose joints tremble."""
+
+    def __init__(self) -> None:
+        self._rng = np.random.default_rng(0)
+
+    def gives(self, T_world_cam: F64, seconds: float) -> F64:
+        """[4, 4] for the true pose after so many seconds."""
+        gone = seconds / WANDERS
+        trembles = self._rng.normal(size=(2, 3))
+        base = _rigid(gone * WANDERED, gone * TURNED)
+        hand = _rigid(JITTER * trembles[0], HAND_EYE + JITTER_TURN * trembles[1])
+        return np.asarray(base @ T_world_cam @ hand)
+
+
+def _rigid(place: F64, turn: F64) -> F64:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], place
+    return T
+
+
+@dataclass(slots=True)
+class _Played:
+    """What the node makes of the pictures with one way to know the pose."""
+
+    pipeline: Pipeline
+    budget: StepBudget = field(default_factory=lambda: StepBudget(STEPS))
+    poses: list[F64] = field(default_factory=list)
+    psnr: list[float] = field(default_factory=list)
+    depth: list[metrics.DepthErrors] = field(default_factory=list)
+    held: int = 0
+
+    def take(self, frame: StereoFrame, depth: F32) -> None:
+        result = self.pipeline.process(frame, self.budget)
+        view, tissue = result.views["left"], result.observation.tissue
+        self.poses.append(result.pair.camera.T_world_cam)
+        if result.held:
+            self.held += 1
+            return
+        self.psnr.append(metrics.psnr(view.rgb, metrics.as_float(result.pair.left), tissue))
+        truth = metrics.resample_nearest(depth, view.camera.width, view.camera.height)
+        self.depth.append(metrics.depth_errors(view.depth, truth, tissue))
+
+    def figures(self) -> dict[str, float]:
+        return {
+            "psnr": float(np.mean(self.psnr)),
+            "depth_median_mm": float(np.mean([each.median_mm for each in self.depth])),
+            "depth_p90_mm": float(np.mean([each.p90_mm for each in self.depth])),
+            "held": self.held,
+        }
+
+
+def measure_scope(
+    config: LaunchConfig, motions: Sequence[Motion], seconds: float, advance: Advance
+) -> dict[str, Any]:
+    """Each motion of the scope once.
+
+    Args:
+        config: of the phantom; its `source.rate` and what shapes its tissue are used.
+        seconds: of each.
+
+    Returns:
+        `rows`, by `motion` and `way`. `session`: the true poses are given; `estimate`: none; `robot`: those
+        of a `Robot`; `refine`: the same, put right; `rigid` and `points`: see the module. Errors are those of
+        `trajectory_errors` and `drift`, pictures and depth over frames that were not `held`.
+
+    Raises:
+        UsageError: the source is not the phantom, or the time is too short.
+    """
+    source = config.source
+    if not isinstance(source, PhantomSource):
+        raise UsageError("benchmarks scope needs the phantom, whose scope is known: launch/phantom.yaml")
+    if seconds < 2 * BREATH:
+        raise UsageError(f"--seconds {seconds:g} is too short: two breaths take {2 * BREATH:g}")
+    warm_up(config)
+    configure_threads(config.engine.threads)
+    rate = source.rate or RATE
+    rows: list[dict[str, Any]] = []
+    for motion in motions:
+        moving = source.model_copy(update={"seconds": seconds, "camera_motion": motion})
+        rows += _measured(config, Phantom(moving), motion, seconds, rate, advance)
+    return {
+        "seconds": seconds,
+        "rate": rate,
+        "seed": source.seed,
+        "width": source.width,
+        "height": source.height,
+        "still_tissue": source.still_tissue,
+        "rows": rows,
+    }
+
+
+def _measured(
+    config: LaunchConfig, phantom: Phantom, motion: Motion, seconds: float, rate: float, advance: Advance
+) -> list[dict[str, Any]]:
+    count, robot = round(seconds * rate), Robot()
+    ways: dict[str, PoseWay] = {way: way for way in ("session", "estimate", "refine")} | {"robot": "session"}
+    played = {name: _Played(Pipeline(_with_pose(config, way), phantom.rig)) for name, way in ways.items()}
+    rigid, rigid_poses, points = RigidOdometry(), list[F64](), _Points(phantom)
+    for number in range(count):
+        truth = phantom.frame(number, count)
+        given = robot.gives(truth.T_world_cam, number / rate)
+        frame = _stereo(number, rate, truth)
+        for name, each in played.items():
+            pose = given if name in ("robot", "refine") else truth.T_world_cam
+            each.take(replace(frame, T_world_cam=pose), truth.depth)
+        last = played["session"].pipeline.newest
+        assert last is not None
+        seen = last.observation
+        rigid_poses.append(rigid(last.pair.left, seen.depth, seen.tissue, seen.camera))
+        points.add(truth)
+        advance(number + 1, count, motion)
+    known, period = np.stack(points.poses), round(count / max(1, round(seconds / BREATH)))
+    poses = {name: each.poses for name, each in played.items()}
+    poses |= {"rigid": rigid_poses, "points": points.fitted(seen.camera)}
+    rows: list[dict[str, Any]] = []
+    for name, found in poses.items():
+        errors = trajectory_errors(np.stack(found), known) | drift(np.stack(found), known, period)
+        figures = played[name].figures() if name in played else {}
+        rows.append({"motion": motion, "way": name, **errors, **figures})
+    return rows
+
+
+def _with_pose(config: LaunchConfig, way: PoseWay) -> LaunchConfig:
+    vision = config.vision.model_copy(update={"pose": way})
+    return config.model_copy(update={"vision": vision})
+
+
+def _stereo(number: int, rate: float, truth: PhantomFrame) -> StereoFrame:
+    stamp = round((1 + number / rate) * 1e9)
+    return StereoFrame(number, stamp, stamp, truth.left, truth.right, tissue=~truth.tool)
+
+
+class _Points:
+    """The phantom's true surface points over time."""
+
+    def __init__(self, phantom: Phantom) -> None:
+        self.poses: list[F64] = []
+        self._baseline = phantom.rig.baseline
+        self._points: list[F64] = []
+        self._visible: list[Bool] = []
+
+    def add(self, truth: PhantomFrame) -> None:
+        self.poses.append(truth.T_world_cam)
+        self._points.append(truth.points)
+        self._visible.append(truth.visible)
+
+    def fitted(self, camera: Camera) -> list[F64]:
+        """The poses [4, 4] from which the points, where each is on average, are seen nearest to where they
+        are; `camera` says how it sees."""
+        rest = np.mean(self._points, axis=0).astype(np.float32)
+        fitted, focal_baseline = [], float(camera.K[0, 0]) * self._baseline
+        for pose, points, visible in zip(self.poses, self._points, self._visible, strict=True):
+            there = replace(camera, T_world_cam=pose)
+            pixels, depths = project(there, points[visible])
+            disparities = (focal_baseline / depths).astype(np.float32)
+            fit = fit_pose(rest[visible], pixels.astype(np.float32), disparities, there, self._baseline)
+            fitted.append(fit.T_world_cam)
+        return fitted
+
+
+def table(measured: dict[str, Any]) -> Table:
+    """For people; `measured` as `measure_scope` returns it."""
+    made = Table(
+        "motion", "pose", "ATE / max, mm", "RPE, mm / deg", "at the end, mm / deg", "drift, mm / deg",
+        "worst drift", "PSNR, dB", "depth, median / p90, mm", "held",
+        title=f"{measured['seconds']:g} s at {measured['rate']:g} Hz",
+    )  # fmt: skip
+    for row in measured["rows"]:
+        shown = "psnr" in row
+        made.add_row(
+            row["motion"],
+            row["way"],
+            f"{row['ate_mm']:.2f} / {row['max_mm']:.2f}",
+            f"{row['rpe_mm']:.3f} / {row['rpe_deg']:.3f}",
+            f"{row['end_mm']:.2f} / {row['end_deg']:.2f}",
+            f"{row['drift_mm']:.2f} / {row['drift_deg']:.2f}",
+            f"{row['worst_drift_mm']:.2f} / {row['worst_drift_deg']:.2f}",
+            f"{row['psnr']:.2f}" if shown else "",
+            f"{row['depth_median_mm']:.2f} / {row['depth_p90_mm']:.2f}" if shown else "",
+            str(row["held"]) if shown else "",
+        )
+    return made

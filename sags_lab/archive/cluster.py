@@ -1,0 +1,78 @@
+"""The Ray instance that an archive runs on: one that starts here by itself, or a cluster that is there."""
+
+from __future__ import annotations
+
+import logging
+import os
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from typing import Any
+
+from sags_node.errors import SagsError, UsageError
+
+NEEDED = ("ray", "pyarrow", "fsspec")  # the extra `archive`
+OBJECT_STORE = 80 << 20  # bytes: nothing large is passed; Ray wants 75 MiB at least
+QUIET = {
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_DEDUP_LOGS": "0",
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
+}
+LOCAL = {
+    "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",  # its sockets are of loopback only
+    "RAY_AUTH_MODE": "token",  # other users of this machine are kept out
+}
+
+
+def check_installed() -> None:
+    """To be asked before anything else is done.
+
+    Raises:
+        UsageError: a package that archives need is not installed.
+    """
+    missing = [name for name in NEEDED if find_spec(name) is None]
+    if missing:
+        raise UsageError(
+            f"archives need {', '.join(missing)}, which is not installed: pip install 'sags-node[lab]'"
+        )
+
+
+@contextmanager
+def connected(address: str | None) -> Iterator[Any]:
+    """Ray, started on this machine for as long as this lasts, or connected to a cluster.
+
+    Where this process is connected already, that connection is used, and stays.
+
+    Args:
+        address: HOST:PORT of the cluster's head; None: this machine alone, by loopback only.
+
+    Raises:
+        UsageError: Ray is not installed.
+        SagsError: it does not start, or there is no cluster.
+    """
+    check_installed()
+    os.environ.update(QUIET)
+    if address is None:
+        os.environ.update(LOCAL | {"RAY_AUTH_TOKEN": secrets.token_hex(32)})
+    import ray  # it reads the environment
+
+    if ray.is_initialized():
+        yield ray
+        return
+    where = {"address": address} if address else {"address": "local", "object_store_memory": OBJECT_STORE}
+    try:
+        ray.init(
+            **where,
+            **({} if address else {"include_dashboard": False}),
+            log_to_driver=False,
+            configure_logging=True,
+            logging_level=logging.ERROR,
+        )
+    except Exception as error:  # of any kind: sockets, versions, memory
+        what = f"Ray does not start on {address or 'this machine'}: {error}"
+        raise SagsError(f"{what}; ray status --address HOST:PORT tells whether a cluster answers") from None
+    try:
+        yield ray
+    finally:
+        ray.shutdown()

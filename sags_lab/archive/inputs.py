@@ -1,0 +1,149 @@
+"""The files of a recording: what tells whether they changed, and how they come to the machine that works."""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from fsspec.core import url_to_fs
+
+from sags_lab.archive.launching import arguments, belongs, split
+from sags_lab.archive.manifest import Recording, is_url
+from sags_node.config import LaunchConfig
+from sags_node.errors import SagsError, UsageError
+from sags_node.launch_file import load_launch
+
+Stat = tuple[str, int, str]  # name, bytes, and when it changed or what the server says of its content
+
+_SCRATCH = "sags-archive-"
+_CHANGED = ("ETag", "etag", "md5Hash", "LastModified", "mtime")  # of fsspec's info, the surest first
+
+
+def key_of(recording: Recording, about: Mapping[str, Any]) -> str:
+    """A hash of a recording's files, of all that is done with them, and by which version.
+
+    A file counts by its name, size and time of change (of a URL: the server's ETag, where it has one); what
+    is in it is not read. The files are those of the recording, of its calibration, and all that its launch
+    file names.
+
+    Args:
+        about: job, options, overrides and version.
+    """
+    stats = [_stats(place) for place in places(recording)]
+    said = {"files": stats, "own": recording.overrides, "rig": recording.rig_name, "about": about}
+    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def places(recording: Recording) -> list[str]:
+    """All paths and URLs that a recording needs; what cannot be known stays unknown."""
+    found = belongs(recording.place, recording.overrides)
+    if recording.rig is not None:
+        found.append(recording.rig)
+    if not any(is_url(place) for place in found):
+        rig = None if recording.rig is None else Path(recording.rig)
+        with suppress(SagsError, OSError):  # the job says what is wrong
+            said = arguments(Path(recording.place), rig, recording.overrides)
+            found += map(str, _named(load_launch(*split(said))))
+    return list(dict.fromkeys(found))
+
+
+def _named(config: LaunchConfig) -> Iterator[Path]:
+    trees: list[Any] = [config.model_dump(include={"source", "rig", "robot", "vision"})]
+    for tree in trees:  # grows
+        if isinstance(tree, Path):
+            yield tree
+        elif isinstance(tree, dict):
+            trees += tree.values()
+        elif isinstance(tree, tuple):
+            trees += tree
+
+
+def _stats(place: str) -> list[Stat]:
+    if is_url(place):
+        return _remote_stats(place)
+    path = Path(place)
+    files = sorted(path.rglob("*")) if path.is_dir() else [path]
+    found = []
+    for file in files:
+        with suppress(OSError):
+            stat = file.stat()
+            if not file.is_dir():
+                found.append((str(file.relative_to(path.parent)), stat.st_size, str(stat.st_mtime_ns)))
+    return found
+
+
+def _remote_stats(url: str) -> list[Stat]:
+    try:
+        fs, path = url_to_fs(url, use_listings_cache=False)
+        infos = {path: fs.info(path)} if fs.isfile(path) else fs.find(path, detail=True)
+    except (OSError, ValueError, ImportError):
+        return []  # the job says what is wrong
+    found = []
+    for name, info in sorted(infos.items()):
+        changed = next((info[key] for key in _CHANGED if key in info), "")
+        found.append((name.removeprefix(path), int(info.get("size") or 0), str(changed)))
+    return found
+
+
+@contextmanager
+def scratch() -> Iterator[Path]:
+    """An empty folder for temporary files. Those that killed workers of this machine left are removed."""
+    parent = Path(tempfile.gettempdir())
+    for old in parent.glob(f"{_SCRATCH}*"):
+        _remove_orphan(old)
+    folder = Path(tempfile.mkdtemp(prefix=_SCRATCH, dir=parent))
+    with (folder / ".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        try:
+            yield folder
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _remove_orphan(folder: Path) -> None:
+    with suppress(OSError), (folder / ".lock").open("r") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def fetched(recording: Recording, folder: Path, most_gb: float) -> tuple[Path, Path | None]:
+    """A recording and its calibration on this machine: URLs are copied to `folder`.
+
+    Returns:
+        Their paths.
+
+    Raises:
+        UsageError: it is larger than `most_gb` (10^9 bytes).
+        OSError: it cannot be fetched.
+    """
+    names = belongs(recording.place, recording.overrides)
+    places = [*names, *([] if recording.rig is None else [recording.rig])]
+    remote = [place for place in places if is_url(place)]
+    size = sum(stat[1] for place in remote for stat in _remote_stats(place)) * 1e-9
+    if size > most_gb:
+        raise UsageError(f"{recording.name} has {size:.2f} GB, {most_gb:g} may be fetched (--stage-limit)")
+    here = {place: _fetch(place, folder / str(number)) for number, place in enumerate(remote)}
+    if len(names) == 2 and names[0] in here:  # the eyes' videos, which find each other by name
+        (right := here[names[1]]).rename(here[names[0]].with_name(right.name))
+    found = [here.get(place) or Path(place) for place in places]
+    return found[0], None if recording.rig is None else found[-1]
+
+
+def _fetch(url: str, folder: Path) -> Path:
+    folder.mkdir()
+    try:
+        fs, path = url_to_fs(url, use_listings_cache=False)
+    except (ValueError, ImportError) as error:
+        raise UsageError(f"{url}: {error}") from None
+    target = folder / Path(path).name
+    fs.get(path, str(target), recursive=not fs.isfile(path))
+    if not target.exists():
+        raise FileNotFoundError(f"{url} does not exist")
+    return target

@@ -1,0 +1,62 @@
+"""`sags eval --protocol`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from sags_node.cli.launching import check_files, split, write_json
+from sags_node.errors import UsageError
+from sags_node.terminal.console import progress, show
+
+protocol_option = click.option(
+    "--protocol",
+    type=click.Choice(["d4d", "endonerf", "scared", "stereomis", "stir"]),
+    help="Measure a public data set, in its own layout, by its own rules (docs/protocols.md).",
+)
+
+
+def evaluate_protocol(
+    protocol: str,
+    launch: tuple[str, ...],
+    iterations: int | None,
+    lpips_weights: Path | None,
+    json_out: str | None,
+    **others: Any,
+) -> None:
+    """Measure a data set by its protocol.
+
+    Args:
+        others: options of `sags eval` that no protocol takes.
+    """
+    from sags_lab.protocols import run
+    from sags_lab.protocols.d4d import measure_d4d
+
+    path, overrides = split(launch)
+    if path is None:
+        raise UsageError(f"--protocol {protocol} needs the data set's folder")
+    if iterations is not None:
+        overrides = [*overrides, f"mapping.iterations:={iterations}"]
+    file = Path(json_out) if json_out is not None and json_out != "-" else None
+    check_files(file)
+    with progress("measuring") as advance:
+
+        def tell(done: int, what: str) -> None:
+            advance(done, None, what)
+
+        if protocol == "endonerf":
+            found = run.measure_endonerf(Path(path), overrides, lpips_weights, tell)
+        else:
+            measures = {
+                "d4d": measure_d4d,
+                "scared": run.measure_scared,
+                "stereomis": run.measure_stereomis,
+                "stir": run.measure_stir,
+            }
+            found = measures[protocol](Path(path), overrides, tell)
+    found = {"protocol": protocol, **found}
+    if file is None:
+        show(found)
+    write_json(file, found)

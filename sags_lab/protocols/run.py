@@ -1,0 +1,222 @@
+"""Public data sets played through the node's own pipeline, and measured by their own rules."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from sags_lab.protocols import arithmetic
+from sags_lab.protocols.layouts import StereoMisSequence, check_sizes, stereomis_sequence, stir_clips
+from sags_lab.protocols.playing import AS_GIVEN, STEP, Progress
+from sags_lab.protocols.point_tracker import Followed, PointTracker
+from sags_lab.protocols.tracked_points import is_tracked, measure_tracked
+from sags_node.config import LaunchConfig, RecordedSource
+from sags_node.errors import SagsError
+from sags_node.evaluation.measure import Options
+from sags_node.evaluation.metrics import resample_nearest
+from sags_node.evaluation.point_tracks import shares_within
+from sags_node.evaluation.session import evaluate
+from sags_node.kernels.threads import configure_threads
+from sags_node.launch_file import load_launch
+from sags_node.pipeline import Pipeline
+from sags_node.session import open_posed, rig_of
+from sags_node.sources.videos import Video
+from sags_node.types import F64, StereoRig
+from sags_node.warm_up import warm_up
+
+LEAST_POSES = 3  # to align
+HOLD_OUT = 8  # EndoNeRF's split, as EndoGaussian and those after it take it
+PICKED = ("paper_psnr", "paper_ssim", "lpips", "psnr", "ssim", "copy_psnr")
+
+
+def measure_endonerf(
+    folder: Path, overrides: Sequence[str], lpips: Path | None, progress: Progress
+) -> dict[str, Any]:
+    """Frames 1, 9, 17, ... are held out; masked pixels are black in both pictures and count. The masks are
+    taken as they are, without the margin that a node puts around instruments.
+
+    Each held-out frame is drawn from those before it. Published fits see those after it, too.
+    """
+    options = Options(HOLD_OUT, every=1, lpips_weights=lpips, paper_psnr=True)
+    found = evaluate(
+        folder, [AS_GIVEN, *overrides], options, "step", None, lambda what, done: progress(done, what)
+    )
+    heldout = found.summary["heldout"]
+    if heldout is None:
+        raise SagsError(f"{folder} has no frame to hold out; it needs more than {HOLD_OUT}")
+    figures = {key: heldout[key] for key in PICKED if heldout.get(key) is not None}
+    settings = found.summary["settings"]
+    return {"held_out": found.summary["held_out"], "causal": figures, "settings": settings}
+
+
+def measure_scared(folder: Path, overrides: Sequence[str], progress: Progress) -> dict[str, Any]:
+    """Mean absolute depth error of each frame, mm, and its mean over frames: of stereo and of the model."""
+    config = load_launch(folder, [*overrides, *STEP])
+    rig = rig_of(config)
+    warm_up(config)
+    configure_threads(config.engine.threads)
+    pipeline = Pipeline(config, rig)
+    budget, size = pipeline.make_budget(), config.vision.working_size(rig.left.width, rig.left.height)
+    errors: dict[str, list[tuple[float, float]]] = {"measured": [], "model": []}
+    with open_posed(config, rig) as frames:
+        for number, frame in enumerate(frames):
+            result = pipeline.process(frame, budget)
+            progress(number + 1, "playing")
+            if frame.reference is None or frame.reference.depth is None:
+                continue
+            truth = resample_nearest(frame.reference.depth, *size)
+            shown = {"measured": result.observation.depth, "model": result.views["left"].depth}
+            for name, depth in shown.items():
+                error = arithmetic.mean_depth_error(depth, truth)
+                if error is not None:
+                    errors[name].append(error)
+    if not errors["model"]:
+        raise SagsError(f"{folder} has no frame with enough true depth; scene_points are needed")
+    return {
+        name: {"frames": len(each), "mae_mm": mean(each, 0), "given": mean(each, 1)}
+        for name, each in errors.items()
+        if each
+    }
+
+
+def mean(rows: Sequence[tuple[float, ...]], column: int) -> float:
+    return float(np.mean([row[column] for row in rows]))
+
+
+def measure_stir(folder: Path, overrides: Sequence[str], progress: Progress) -> dict[str, Any]:
+    """Points pinned in each clip's first frame and followed to its last. In 2D a point that cannot be pinned
+    or is lost counts where it was last; in 3D one that cannot be pinned counts as missed."""
+    clips, distances, unmoved, times, lost = {}, [], [], [], 0
+    deep, deep_unmoved = [], []
+    for clip in stir_clips(folder):
+        given = ["source.kind:=videos", f"source.left:={clip.left}", f"source.right:={clip.right}"]
+        tracks = _follow([*given, *STEP, *overrides], clip.rig, clip.starts, clip.name, progress)
+        clips[clip.name] = arithmetic.nearest_distances(tracks.pixels, clip.ends)
+        distances.append(clips[clip.name])
+        unmoved.append(arithmetic.nearest_distances(clip.starts, clip.ends))
+        if len(clip.starts_mm) and len(clip.ends_mm):
+            deep.append(arithmetic.nearest_distances(tracks.points_mm, clip.ends_mm))
+            deep_unmoved.append(arithmetic.nearest_distances(clip.starts_mm, clip.ends_mm))
+        times += tracks.times_ms
+        lost += tracks.lost
+    if not distances:
+        raise SagsError(f"no sequence of {folder} has a marked point in its first and last frame")
+    return {
+        "points": int(sum(map(len, distances))),
+        "lost": lost,
+        "tracked": shares_within(np.concatenate(distances), arithmetic.STIR_PX),
+        "unmoved": shares_within(np.concatenate(unmoved), arithmetic.STIR_PX),  # the evaluator's control
+        "points_3d": int(sum(map(len, deep))),
+        "tracked_mm": _within_mm(deep),
+        "unmoved_mm": _within_mm(deep_unmoved),
+        "latency_ms": arithmetic.latency_score(times),
+        "clips": {name: float(np.mean(each)) for name, each in clips.items()},
+    }
+
+
+def _within_mm(distances: Sequence[F64]) -> dict[str, float] | None:
+    if not distances:
+        return None
+    return shares_within(np.concatenate(distances), arithmetic.STIR_MM)
+
+
+def measure_stereomis(folder: Path, overrides: Sequence[str], progress: Progress) -> dict[str, Any]:
+    """The camera's way as the node estimates it, against the robot's: the means over the ranges of the
+    sequence's table, each begun anew; without a table all of it. Of StereoMIS-Tracking the points instead."""
+    if is_tracked(folder):
+        return measure_tracked(folder, overrides, progress)
+    sequence = stereomis_sequence(folder)
+    check_sizes(Video(sequence.video), sequence.rig)
+    given = ["source.kind:=videos", f"source.left:={sequence.video}", "source.geometry.layout:=over_under"]
+    config = load_launch(None, [*given, "vision.pose:=estimate", *STEP, *overrides])
+    warm_up(config)
+    configure_threads(config.engine.threads)
+    ways = [_way(config, sequence, frames, progress) for frames in sequence.ranges]
+    ways = [(estimated, known) for estimated, known in ways if len(known) >= LEAST_POSES]
+    if not ways:
+        raise SagsError(f"{folder}: fewer than {LEAST_POSES} frames played have a pose in groundtruth.txt")
+    figures = [
+        arithmetic.trajectory_figures(np.stack(estimated), np.stack(known)) for estimated, known in ways
+    ]
+    return {
+        "frames": sum(len(known) for _, known in ways),
+        "ranges": len(ways),
+        "masks": sequence.masks is not None,
+        **{key: float(np.mean([each[key] for each in figures])) for key in figures[0]},
+    }
+
+
+def _way(
+    config: LaunchConfig, sequence: StereoMisSequence, frames: range, progress: Progress
+) -> tuple[list[F64], list[F64]]:
+    """Estimated and known poses [4, 4] of the frames of one range whose pose is known."""
+    stride = config.source.stride if isinstance(config.source, RecordedSource) else 1
+    pipeline = Pipeline(config, sequence.rig)
+    budget, T_rectified_raw = pipeline.make_budget(), np.eye(4)
+    T_rectified_raw[:3, :3] = sequence.rig.left.R
+    known_at = dict(zip(sequence.frames, sequence.poses, strict=True))
+    estimated, known = [], []
+    with open_posed(config, sequence.rig, references=False) as played:
+        for frame in played:
+            number = frame.frame_id * stride
+            if number >= frames.stop:
+                break
+            if number < frames.start:
+                continue
+            result = pipeline.process(replace(frame, tissue=sequence.tissue_in(number)), budget)
+            progress(number - frames.start + 1, "playing")
+            pose = known_at.get(number)
+            if pose is not None:
+                estimated.append(result.snapshot.camera.T_world_cam @ T_rectified_raw)
+                known.append(pose)
+    return estimated, known
+
+
+@dataclass(frozen=True, slots=True)
+class _Tracks:
+    """Points of the first raw left picture, where they were known last."""
+
+    pixels: F64  # [P, 2] raw, left
+    points_mm: F64  # [P, 3] in the raw left camera, as STIR counts; infinite: never pinned
+    lost: int
+    times_ms: list[float]  # of calls; the first takes two frames
+
+
+def _follow(launch: Sequence[str], rig: StereoRig, starts: F64, name: str, progress: Progress) -> _Tracks:
+    """As STIR's evaluator drives a method: each call is given what the one before it returned."""
+    config = load_launch(None, launch)
+    warm_up(config)
+    configure_threads(config.engine.threads)
+    tracker, followed = PointTracker(config, rig), Followed.unknown(starts)
+    points_mm = np.full((len(starts), 3), np.inf)
+    times: list[float] = []
+    with open_posed(config, rig, references=False) as frames:
+        for number, (now, following) in enumerate(pairwise(frames)):
+            started = time.perf_counter()
+            followed = tracker.follow(followed.pixels, now, following)
+            times.append((time.perf_counter() - started) * 1e3)
+            points_mm[followed.found] = as_stir_counts(rig, followed.points[followed.found])
+            progress(number + 2, name)
+    if not times:
+        raise SagsError(f"{name} has fewer than two frames; is its video whole?")
+    return _Tracks(followed.pixels, points_mm, int(np.count_nonzero(~followed.found)), times)
+
+
+def as_stir_counts(rig: StereoRig, points: F64) -> F64:
+    """Points [P, 3] (m, of the rectified left camera) where the arithmetic of STIR's truth puts them, mm:
+    each is said as a pixel of both raw pictures first."""
+    left = points @ rig.left.R  # the raw camera's
+    T = rig.T_right_left
+    pixels = [
+        cv2.projectPoints(seen[:, None], np.zeros(3), np.zeros(3), eye.K, eye.distortion)[0][:, 0]
+        for seen, eye in ((left, rig.left), (left @ T[:3, :3].T + T[:3, 3], rig.right))
+    ]
+    baseline_mm = 1e3 * abs(float(T[0, 3]))
+    return arithmetic.stereo_points_mm(pixels[0], pixels[1], rig.left.K, rig.right.K, baseline_mm)

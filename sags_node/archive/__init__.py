@@ -1,4 +1,0 @@
-"""Many recordings, on one machine or on many: a list of them, a task for each, one table of all.
-
-Imports benchmark, evaluation, sources and terminal.
-"""

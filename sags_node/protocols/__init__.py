@@ -1,4 +1,0 @@
-"""`sags eval --protocol`: public data sets in their own layouts, by their own rules (docs/protocols.md).
-
-Imports calibration, evaluation, kernels, mapping, overlay and sources.
-"""

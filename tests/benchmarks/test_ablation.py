@@ -1,0 +1,87 @@
+"""`benchmarks ablation`: every variant is fitted and measured alike, on frames it never saw."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+from unittest.mock import ANY
+
+import pytest
+from click.testing import CliRunner
+
+from benchmarks.__main__ import main
+from benchmarks.quality import ablation
+from sags_node.fitting import start
+from sags_node.fitting.fit import Fit
+from sags_node.fitting.settings import FieldShape
+
+
+def test_all_variants_are_measured_on_the_same_frames(
+    phantom_session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small = {
+        name: dataclasses.replace(settings, shape=FieldShape(cells=8, channels=16))
+        for name, settings in ablation.VARIANTS.items()
+    }
+    monkeypatch.setattr(ablation, "VARIANTS", small)
+    monkeypatch.setattr(start, "PATH_STEPS", 20)
+    learnt: list[list[int]] = []
+    begin = Fit.start
+
+    def noted(fit: Fit, progress: Any) -> None:
+        learnt.append([frame.frame_id for frame in fit.clip.train])
+        begin(fit, progress)
+
+    monkeypatch.setattr(Fit, "start", noted)
+    out = tmp_path / "ablation.json"
+    arguments = ["source.frames:=12", "--warm-up", "2", "--iterations", "3", "--seeds", "2"]
+    arguments += ["--set", "max_gaussians=800"]
+    arguments += [f"--variant={name}" for name in small if name != "nodes"] + ["--out", str(out), "--json"]
+    result = CliRunner().invoke(main, ["ablation", str(phantom_session), *arguments])
+    assert result.exit_code == 0, result.output
+    found = json.loads(result.stdout)
+    assert json.loads(out.read_text()) == {"provenance": ANY} | found
+    del small["nodes"]
+    assert list(found["variants"]) == list(small)
+    assert learnt == [[0, 2, 3, 4, 5, 6, 7, 8]] * len(small) * 2
+    for name, rows in found["variants"].items():
+        assert len(rows) == 2 and rows[0]["heldout"] != rows[1]["heldout"], name  # of other seeds
+        row = rows[0]
+        assert row["heldout"]["frames"] == 1 and row["ahead"]["frames"] == ablation.AHEAD, name
+        assert row["gaussians"] <= 800
+        used = found["settings"][name]
+        assert used["iterations"] == 3 and used["warm_up"] == (0 if used["schedule"] == "online" else 2)
+        assert row["track"]["median_mm"] > 0 and row["track_with_ahead"]["median_mm"] > 0
+        assert row["train"]["frames"] >= 1 and row["between"]["mean"]["frames"] == 1
+        assert row["smaller"].keys() == {"half", "quarter"}
+    base, online = (found["variants"][name][0]["heldout"]["psnr"] for name in ("base", "online"))
+    assert online > base
+    filters = found["parts"]["both filters, without the block"]
+    gains = [
+        a["heldout"]["psnr"] - b["heldout"]["psnr"]
+        for a, b in zip(found["variants"]["no_adaptive"], found["variants"]["base"], strict=True)
+    ]
+    assert filters["paper_db"] == 0.9
+    assert filters["heldout"]["lowest"] == pytest.approx(min(gains), abs=1e-3)
+    assert filters["heldout"]["mean"] == pytest.approx(sum(gains) / 2, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (["source.frames:=2"], 1, ("2 frames", "0 are left to learn from and 0 to test on", "source.frames")),
+        (["source.frames:=4"], 1, ("4 frames", "1 are left to learn from and 0 to test on", "source.frames")),
+        (["source.start:=0.2", "source.frames:=9"], 1, ("6 are left", "0 to test on", "--hold-out")),
+        (["--lpips-weights", "gone.npz"], 2, ("gone.npz", "check the path")),
+        (["--variant", "fuller"], 2, ("fuller", "full, no_block")),
+    ],
+)
+def test_an_ablation_that_cannot_be_says_why(
+    phantom_session: Path, arguments: list[str], code: int, said: tuple[str, ...]
+) -> None:
+    result = CliRunner().invoke(main, ["ablation", str(phantom_session), *arguments])
+    assert result.exit_code == code, result.output
+    for part in said:
+        assert part in result.stderr

@@ -1,0 +1,374 @@
+"""`benchmarks depth`: what it compares with, on scenes whose depth is known, and the CT surface itself."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from onnx_networks import save_matcher
+from places import SESSION
+
+from benchmarks.__main__ import main
+from benchmarks.quality import depth_plot, depth_report
+from benchmarks.quality.depth import (
+    MODEL,
+    Comparison,
+    PlainSGBM,
+    Tally,
+    by_confidence,
+    error_figures,
+    measure_faults,
+    measure_recording,
+)
+from benchmarks.quality.depth_ct import (
+    CTPair,
+    distances_to_surface,
+    errors_along_z,
+    measure_ct,
+    picture,
+    read_ct_pair,
+)
+from benchmarks.quality.depth_eyes import differences, measure_eyes, mirrored
+from benchmarks.quality.depth_regions import regions_of
+from sags_node.config import StereoConfig
+from sags_node.errors import SagsError, UsageError
+from sags_node.geometry import unproject
+from sags_node.session import open_session
+from sags_node.types import F32, U8, Bool, Camera, RectifiedPair
+from sags_node.vision.dense_depth import SMOOTHING_VARIANCE
+from sags_node.vision.smoothing import guided
+from sags_node.vision.stereo import StereoDepth
+
+WIDTH, HEIGHT, BASELINE, FOCAL = 320, 256, 0.0043, 285.0
+CAMERA = Camera(WIDTH, HEIGHT, np.array([[FOCAL, 0, 159.5], [0, FOCAL, 127.5], [0, 0, 1]]), np.eye(4))
+ALL = np.ones((HEIGHT, WIDTH), np.bool_)
+
+
+def silent(done: int, of: int | None, what: str) -> None: ...
+
+
+def shown_pair(disparity: F32, noise: float = 0.0) -> tuple[RectifiedPair, F32]:
+    """A textured surface of this disparity [H, W] (px, of the right picture), and its depth (m) as the left
+    eye sees it; 0 where it does not see it."""
+    rng = np.random.default_rng(3)
+    spots = sum(s * cv2.GaussianBlur(rng.normal(size=(HEIGHT, WIDTH)), (0, 0), s) for s in (1.2, 3, 8))
+    gray = np.clip(125 + 35 * spots / spots.std(), 30, 220).astype(np.float32)
+    columns, rows = np.meshgrid(np.arange(WIDTH, dtype=np.float32), np.arange(HEIGHT, dtype=np.float32))
+    right = cv2.remap(gray, columns + disparity, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    left_disparity = np.zeros_like(disparity)
+    for y in range(HEIGHT):  # the nearest surface wins, so far to near
+        order = np.argsort(disparity[y], kind="stable")
+        place = np.rint(order + disparity[y, order]).astype(int)
+        inside = place < WIDTH
+        left_disparity[y, place[inside]] = disparity[y, order[inside]]
+    truth = np.divide(FOCAL * BASELINE, left_disparity, where=left_disparity > 0, out=left_disparity * 0)
+
+    def eye(picture: F32) -> U8:
+        noisy = picture + noise * rng.standard_normal(picture.shape)
+        return np.repeat(np.clip(noisy, 0, 255).astype(np.uint8)[..., None], 3, -1)
+
+    return RectifiedPair(0, 0, CAMERA, BASELINE, eye(gray), eye(right)), truth.astype(np.float32)
+
+
+def slanted() -> F32:
+    columns, rows = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
+    return (16.0 + 0.010 * columns - 0.012 * rows).astype(np.float32)
+
+
+def stepped() -> F32:
+    return np.where(np.arange(WIDTH) < WIDTH // 2, np.float32(14), np.float32(22)) * np.ones(
+        (HEIGHT, 1), "f4"
+    )
+
+
+# ---- the smoothing of the stereo stage -------------------------------------------------------------------
+
+
+def smoothed(disparity: F32) -> F32:
+    result = np.empty_like(disparity)
+    guided(np.ascontiguousarray(disparity), 3, SMOOTHING_VARIANCE, result)
+    return result
+
+
+def test_smoothing_is_the_guided_filter() -> None:
+    disparity = (slanted() + np.random.default_rng(0).normal(size=(HEIGHT, WIDTH))).astype(np.float32)
+    windows = np.lib.stride_tricks.sliding_window_view
+    patches = windows(disparity.astype(np.float64), (7, 7))
+    mean, variance = patches.mean((-1, -2)), patches.var((-1, -2))
+    kept = variance / (variance + SMOOTHING_VARIANCE)
+    slope, offset = (windows(part, (7, 7)).mean((-1, -2)) for part in (kept, mean * (1 - kept)))
+    expected = slope * disparity[6:-6, 6:-6] + offset
+    np.testing.assert_allclose(smoothed(disparity)[6:-6, 6:-6], expected, atol=2e-3)
+
+
+def test_smoothing_keeps_planes_and_steps_and_takes_noise() -> None:
+    inner = np.s_[8:-8, 8:-8]
+    np.testing.assert_allclose(smoothed(slanted())[inner], slanted()[inner], atol=2e-3)
+    assert np.abs(smoothed(stepped()) - stepped()).max() < 0.2  # of 8 px
+    noise = np.random.default_rng(1).normal(scale=0.2, size=(HEIGHT, WIDTH)).astype(np.float32)
+    assert (smoothed(slanted() + noise) - slanted())[inner].std() < 0.4 * noise.std()
+
+
+@pytest.mark.parametrize(
+    ("disparity", "noise", "median_mm", "p90_mm"), [(slanted(), 6.0, 0.6, 1.8), (stepped(), 0.0, 0.05, 0.4)]
+)
+def test_the_stage_on_exact_scenes(disparity: F32, noise: float, median_mm: float, p90_mm: float) -> None:
+    pair, truth = shown_pair(disparity, noise)
+    depth, _ = StereoDepth(StereoConfig(), CAMERA, BASELINE)(pair, ALL)
+    known = (depth > 0) & (truth > 0)
+    error_mm = np.abs(depth - truth)[known] * 1e3
+    assert known[:, 40:].mean() > 0.85
+    assert np.median(error_mm) < median_mm
+    assert np.percentile(error_mm, 90) < p90_mm
+
+
+# ---- figures ---------------------------------------------------------------------------------------------
+
+
+def test_figures_of_known_errors() -> None:
+    errors = np.array([-4.0, -1, -1, 2, 3])
+    assert error_figures(errors) == {"median_mm": 2.0, "p90_mm": 3.6, "bias_mm": -1.0}
+    assert error_figures(np.empty(0))["median_mm"] is None
+    rows = by_confidence(errors, np.array([0.1, 0.2, 0.9, 1.0, 0.6], np.float32))
+    assert [row["share"] for row in rows] == [0.4, 0, 0.2, 0.4]
+    assert rows[0]["median_mm"] == 2.5 and rows[1]["p90_mm"] is None
+
+
+def test_coverage_counts_only_where_there_is_truth() -> None:
+    tally = Tally()
+    truth = np.array([[0.05, 0.05, 0.0, 0.05]], np.float32)
+    depth = np.array([[0.052, 0.0, 0.06, 0.01]], np.float32)
+    tissue = np.array([[True, True, True, False]])
+    tally.add(depth, (depth > 0).astype(np.float32), truth, tissue, shared=depth > 0.02)
+    figures = tally.figures()
+    assert figures["coverage"] == 0.5
+    assert figures["median_mm"] == pytest.approx(2.0, abs=1e-3)
+    assert figures["where_configured_knows"]["median_mm"] == figures["median_mm"]
+
+
+def test_plain_sgbm_is_metric_and_knows_what_it_does_not_know() -> None:
+    pair, truth = shown_pair(slanted())
+    for scale, limit_mm in ((1, 0.8), (2, 1.6)):  # a sixth of a pixel: it is drawn to whole ones
+        depth, _ = PlainSGBM(StereoConfig(), CAMERA, BASELINE, scale)(pair, ALL)
+        known = (depth > 0) & (truth > 0)
+        assert known[:, 60:].mean() > 0.9
+        assert np.median(np.abs(depth - truth)[known]) * 1e3 < limit_mm
+        assert depth.max() <= StereoConfig().max_depth * 1.2
+    blank = RectifiedPair(0, 0, CAMERA, BASELINE, np.zeros_like(pair.left), np.full_like(pair.left, 200))
+    assert not PlainSGBM(StereoConfig(), CAMERA, BASELINE, 1)(blank, ~ALL)[0].any()
+
+
+def test_matchers_are_compared_where_the_first_knows() -> None:
+    truth = np.full((HEIGHT, WIDTH), 0.05, np.float32)
+
+    def half(pair: RectifiedPair, tissue: Bool) -> tuple[F32, F32]:
+        depth = truth.copy()
+        depth[:, WIDTH // 2 :] = 0
+        return depth, (depth > 0).astype(np.float32)
+
+    def wrong_elsewhere(pair: RectifiedPair, tissue: Bool) -> tuple[F32, F32]:
+        depth = truth.copy()
+        depth[:, WIDTH // 2 :] += 0.01
+        return depth, np.ones_like(depth)
+
+    comparison = Comparison({"as configured": half, "other": wrong_elsewhere})
+    comparison.add(shown_pair(slanted())[0], ALL, truth, {"shown": truth})
+    first, other, shown = comparison.rows()
+    assert first["coverage"] == 0.5 and other["coverage"] == 1.0 and shown["coverage"] == 1.0
+    assert other["p90_mm"] == pytest.approx(10, abs=1e-3)
+    assert other["where_configured_knows"]["p90_mm"] == 0
+
+
+# ---- recordings ------------------------------------------------------------------------------------------
+
+
+def test_a_recording_with_exact_depth() -> None:
+    overrides = [
+        "source.pace:=step",
+        "source.loop:=false",
+        "source.frames:=21",
+        "vision.stereo.max_depth:=0.2",
+    ]
+    measured = measure_recording(open_session(SESSION, overrides), silent)
+    rows = {row["name"]: row for row in measured["settings"]}
+    assert measured["frames"] == 2 and measured["truth"] == "exact"
+    ours, plain = rows["as configured"], rows["plain SGBM, scale 1"]
+    assert ours["median_mm"] < 0.5 and ours["coverage"] > 0.75
+    assert ours["where_configured_knows"]["median_mm"] < plain["where_configured_knows"]["median_mm"]
+    assert rows[MODEL]["coverage"] > 0.95 and rows[MODEL]["median_mm"] < 1.0
+    medians = [row["median_mm"] for row in measured["confidence"]]
+    assert medians == sorted(medians, reverse=True)
+    assert [table.row_count for table in depth_report.tables(measured)] == [len(rows), 4, 6]
+    regions = {row["region"]: row for row in measured["regions"]}
+    assert (
+        regions["not seen by the right eye"]["stage"]["coverage"] < 0.2
+    )  # what cannot be measured is not given
+    assert regions["not seen by the right eye"]["drawn"]["coverage"] > 0.9
+    assert regions["at edges"]["stage"]["p90_mm"] > 1.5 * regions["elsewhere"]["stage"]["p90_mm"]
+    drawn = cv2.imdecode(np.frombuffer(depth_plot.picture(measured), np.uint8), cv2.IMREAD_COLOR)
+    assert drawn is not None and drawn.std() > 5
+
+
+def test_regions_of_a_step_beside_an_instrument() -> None:
+    """By hand: 20 px of disparity on the left half, 10 px on the right one, an instrument at the bottom."""
+    disparity = np.where(np.arange(WIDTH) < 160, np.float32(20), np.float32(10)) * np.ones((HEIGHT, 1), "f4")
+    truth, tissue = (FOCAL * BASELINE / disparity).astype(np.float32), ALL.copy()
+    tissue[200:] = False
+    truth[:, 300:] = 0
+    found = regions_of(truth, tissue, FOCAL * BASELINE)
+    columns = {name: np.flatnonzero(mask[50]) for name, mask in found.items()}
+    assert columns["near"].tolist() == list(range(160)) and not found["far"].any()
+    assert columns["at edges"].tolist() == list(range(150, 170))  # 10 px to either side
+    assert columns["not seen by the right eye"].tolist() == list(range(20))
+    assert columns["elsewhere"].tolist() == [*range(20, 150), *range(170, 300)]
+    assert np.flatnonzero(found["beside instruments"][:, 50]).tolist() == list(range(185, 200))
+    assert regions_of(np.zeros_like(truth), tissue, FOCAL * BASELINE) == {}
+
+
+def test_a_recording_without_truth_is_named() -> None:
+    overrides = ["source.pace:=step", "source.frames:=2", "source.reference.depth:=null"]
+    with pytest.raises(SagsError, match="has no reference depth"):
+        measure_recording(open_session(SESSION, overrides), silent)
+
+
+def test_faults_make_depth_worse(tmp_path: Path) -> None:
+    network = save_matcher(tmp_path / "blocks.onnx")
+    faults = {"noise": (0.0, 0.08), "gloss": (0.0, 64.0)}
+    measured = measure_faults((256, 192), 1, faults, silent, network)
+    clean, noisy, dull, shiny = measured["faults"]
+    assert noisy["settings"][0]["median_mm"] > 1.3 * clean["settings"][0]["median_mm"]
+    assert dull["white"] < 0.001 and shiny["white"] > 0.01
+    blocks = clean["settings"][-1]
+    assert blocks["name"] == "network blocks.onnx"
+    assert blocks["coverage"] > 0.5
+    assert 0 < blocks["median_mm"] < 3.3  # half a px of disparity at 80 mm, 230 px and 4.3 mm
+    assert [made.row_count for made in depth_report.tables(measured)] == [1 + len(clean["settings"])] * 2
+
+
+# ---- both eyes against each other ------------------------------------------------------------------------
+
+
+def test_eyes_that_see_one_surface_agree() -> None:
+    plane = np.full((HEIGHT, WIDTH), 12.0, np.float32)
+    assert np.nanmax(differences(plane, plane)) == 0
+    assert np.isnan(differences(plane, plane)[:, :12]).all()  # what the right eye does not see
+    np.testing.assert_allclose(differences(plane, plane + 1.5)[:, 12:], 1.5)
+    assert np.isnan(differences(plane, 0 * plane)).all()
+
+
+def test_a_pair_in_a_mirror_has_the_right_eyes_depth() -> None:
+    """The left disparity d of a point at x is that of the right picture at x - d."""
+    pair, _ = shown_pair(slanted())
+    everywhere = StereoDepth(StereoConfig(), CAMERA, BASELINE)
+    depth, _ = everywhere(mirrored(pair), ALL)
+    found = np.divide(FOCAL * BASELINE, depth, where=depth > 0, out=0 * depth)[:, ::-1]
+    known = (found > 0) & (np.arange(WIDTH) < WIDTH - 40)
+    assert known.mean() > 0.7
+    assert np.median(np.abs(found - slanted())[known]) < 0.1
+
+
+def test_a_recording_without_truth_is_measured_by_both_eyes() -> None:
+    overrides = ["source.pace:=step", "source.loop:=false", "source.frames:=1"]
+    measured = measure_eyes(open_session(SESSION, overrides), silent)
+    rows = {row["name"]: row for row in measured["settings"]}
+    assert measured["frames"] == 1
+    assert rows["as configured"]["median_px"] < 0.25  # of what was matched at half size
+    assert rows["as configured"]["agree"] > 0.7
+    assert [table.row_count for table in depth_report.tables(measured)] == [len(rows)]
+
+
+# ---- a CT surface ----------------------------------------------------------------------------------------
+
+
+def tilted_surface(offset: float) -> F32:
+    """Depth (m) of the plane z = 50 mm + offset + x."""
+    slopes = (np.arange(WIDTH) - CAMERA.K[0, 2]) / FOCAL
+    return np.tile((0.05 + offset) / (1 - slopes), (HEIGHT, 1)).astype(np.float32)
+
+
+def test_errors_along_z_and_to_the_surface() -> None:
+    region = np.zeros((HEIGHT, WIDTH), np.bool_)
+    region[64:192, 64:256] = True
+    v, u = np.mgrid[80:176:8, 100:220:8]
+    pixels = np.stack([u.ravel(), v.ravel()], -1).astype(np.float64)
+    depths = tilted_surface(0.0)[v.ravel(), u.ravel()].astype(np.float64)
+    points = np.asarray(unproject(CAMERA, pixels, depths), np.float64)
+    pair = RectifiedPair(0, 0, CAMERA, BASELINE, np.zeros((HEIGHT, WIDTH, 3), np.uint8), None)
+    ct = CTPair("plane", pair, region, points, pixels)
+    measured = tilted_surface(1e-3)
+    measured[:, 180:] = 0
+    errors, given = errors_along_z(ct, measured)
+    np.testing.assert_array_equal(given, pixels[:, 0] < 180)
+    np.testing.assert_allclose(errors, 1 / (1 - (pixels[given, 0] - CAMERA.K[0, 2]) / FOCAL), atol=1e-3)
+    inner = pixels[given, 0] < 170  # the nearest point of others lies where nothing was measured
+    np.testing.assert_allclose(distances_to_surface(ct, measured)[inner], np.sqrt(0.5), atol=0.03)
+    assert len(distances_to_surface(ct, np.zeros_like(measured))) == 0
+
+
+def write_ct_folder(folder: Path) -> None:
+    """A plane at 60 mm before another at 70 mm; the left half of the picture counts."""
+    black = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    for side in ("left", "right"):
+        cv2.imwrite(str(folder / f"{side}.png"), black)
+        np.savetxt(folder / f"calib.{side}.intrinsics.txt", CAMERA.K)
+        np.savetxt(folder / f"calib.{side}.distortion.txt", np.zeros((1, 5)))
+    l2r = np.eye(4)
+    l2r[0, 3] = -4.3
+    np.savetxt(folder / "calib.l2r.txt", l2r)
+    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    mask[20:-20, 20 : WIDTH // 2] = 0
+    cv2.imwrite(str(folder / "a_MASK_eval.png"), mask)
+    x, y = np.meshgrid(np.arange(-20, 20, 0.8), np.arange(-20, 20, 0.8))
+    planes = [np.stack([x.ravel(), y.ravel(), np.full(x.size, z)], -1) for z in (60.0, 70.0)]
+    np.savetxt(folder / "a_CT_cut.xyz", np.concatenate(planes))
+
+
+def test_hidden_points_and_those_outside_the_region_do_not_count(tmp_path: Path) -> None:
+    write_ct_folder(tmp_path)
+    ct = read_ct_pair(tmp_path)
+    np.testing.assert_allclose(ct.points[:, 2], 0.06)
+    assert len(ct.points) > 500
+    assert ct.pixels[:, 0].max() < WIDTH // 2 and ct.pixels[:, 0].min() > 19
+    assert ct.pair.baseline == pytest.approx(BASELINE)
+
+
+def test_a_wrong_ct_folder_is_named(tmp_path: Path) -> None:
+    write_ct_folder(tmp_path)
+    (tmp_path / "a_CT_cut.xyz").write_text("1 2\n3 4\n")
+    with pytest.raises(UsageError, match="three numbers in each line"):
+        read_ct_pair(tmp_path)
+    (tmp_path / "a_CT_cut.xyz").unlink()
+    with pytest.raises(UsageError, match=r"0 files \*_CT_cut.xyz"):
+        read_ct_pair(tmp_path)
+
+
+def test_real_tissue_against_its_ct_surface(data_folder: Path) -> None:
+    folder = data_folder / "tmi_ct_pair"
+    if not folder.is_dir():
+        pytest.skip(f"recording tmi_ct_pair is not under SAGS_DATA ({data_folder})")
+    ct = read_ct_pair(folder)
+    measured = measure_ct(ct, silent)
+    assert measured["points"] > 2000
+    assert measured["median_abs_mm"] < 0.75 and measured["p90_abs_mm"] < 1.65
+    assert measured["coverage"] > 0.91
+    rows = {row["name"]: row for row in measured["settings"]}
+    assert measured["median_abs_mm"] < 0.85 * rows["plain SGBM, scale 2"]["median_mm"]
+    assert rows["as configured"]["nearest_median_mm"] < 0.5
+    shown = cv2.imdecode(np.frombuffer(picture(ct), np.uint8), cv2.IMREAD_COLOR)
+    assert shown is not None and shown.shape[1] > 3 * shown.shape[0] // 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--picture", "a.jpg"], "add --ct FOLDER"),
+        (["launch/phantom.yaml", "--faults"], "give one of them"),
+        (["--faults", "--eyes"], "leave --ct and --faults out"),
+        (["--faults", "--plot", "a.png"], "leave --faults and --eyes out"),
+        (["launch/v4l2.yaml"], "live cameras have no reference depth"),
+    ],
+)
+def test_wrong_calls(arguments: list[str], says: str) -> None:
+    result = CliRunner().invoke(main, ["depth", *arguments])
+    assert result.exit_code == 2 and says in result.output

@@ -1,0 +1,172 @@
+"""`benchmarks endurance`: the orders of frames, the slopes, and a table that tells a leak from noise."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from unittest.mock import ANY
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+from places import SESSION
+
+from benchmarks.__main__ import main
+from benchmarks.node import endurance
+from benchmarks.node.endurance import (
+    FIGURES,
+    STILL_FRAMES,
+    Window,
+    measure_endurance,
+    slope,
+    statement,
+)
+from sags_node.session import Session, open_session
+
+QUIET = Window(0, 25.0, 30.0, 35.0, 30_000, 500, 400.0, 0, 0, 0)
+
+
+def bench(*arguments: object) -> Result:
+    return CliRunner().invoke(main, ["endurance", *(str(argument) for argument in arguments)])
+
+
+def opened(*overrides: str) -> Session:
+    return open_session(
+        SESSION, ["source.pace:=step", "mapping.max_gaussians:=2000", "mapping.iterations:=1", *overrides]
+    )
+
+
+def ignore(done: int, total: int, what: str) -> None:
+    pass
+
+
+# ---- the order of frames ---------------------------------------------------------------------------------
+
+
+def visits(count: int, order: Any, length: int, seed: int = 0) -> list[int]:
+    return list(itertools.islice(endurance.visits(count, order, seed), length))
+
+
+def test_there_and_back_never_jumps_and_shows_no_frame_twice_in_a_row() -> None:
+    assert visits(4, "there-and-back", 13) == [0, 1, 2, 3, 2, 1, 0, 1, 2, 3, 2, 1, 0]
+    assert visits(2, "there-and-back", 4) == [0, 1, 0, 1]
+
+
+def test_wrap_begins_again() -> None:
+    assert visits(3, "wrap", 7) == [0, 1, 2, 0, 1, 2, 0]
+
+
+def test_a_walk_goes_by_single_frames_to_all_of_them_and_never_the_same_way_again() -> None:
+    walk = visits(40, "walk", 4000)
+    assert set(np.abs(np.diff(walk))) == {1} and set(walk) == set(range(40))
+    assert walk == visits(40, "walk", 4000) != visits(40, "walk", 4000, seed=1)
+    stretches = {tuple(walk[i : i + 200]) for i in range(0, 4000, 200)}
+    assert len(stretches) == 20
+
+
+@pytest.mark.parametrize("order", ["there-and-back", "wrap", "walk"])
+def test_a_single_frame_is_enough(order: Any) -> None:
+    assert visits(1, order, 5) == [0] * 5
+
+
+# ---- slopes ----------------------------------------------------------------------------------------------
+
+
+def windows(rss: list[float]) -> list[Window]:
+    return [replace(QUIET, frames=500 * (i + 1), rss_mb=value) for i, value in enumerate(rss)]
+
+
+def test_a_slope_is_that_of_the_line_and_the_first_window_does_not_count() -> None:
+    found = slope(windows([0.0, 400, 401, 402, 403]), "rss_mb")
+    assert found is not None
+    assert found["slope"] == pytest.approx(2.0) and found["standard_error"] == pytest.approx(0, abs=1e-9)
+    assert slope(windows([0.0, 400, 401]), "rss_mb") is None
+
+
+def test_the_standard_error_covers_scatter() -> None:
+    """Of many series without a trend, the slope is beyond 2 standard errors as seldom as theory says."""
+    rng = np.random.default_rng(0)
+    beyond = 0
+    for _ in range(400):
+        found = slope(windows(list(rng.normal(400, 1, 21))), "rss_mb")
+        assert found is not None
+        beyond += abs(found["slope"]) > 2 * found["standard_error"]
+    assert 8 <= beyond <= 40  # 6 % of 400 for 18 degrees of freedom
+
+
+def measured(rss: list[float]) -> dict[str, Any]:
+    made = windows(rss)
+    slopes = {figure: slope(made, figure) for figure in FIGURES}
+    return {"interrupted": False, "per_1000_frames": slopes, "still": None}
+
+
+def test_the_statement_names_a_leak_and_leaves_noise_alone() -> None:
+    rng = np.random.default_rng(1)
+    noise = rng.normal(0, 1, 20)
+    leak = statement(measured(list(400 + noise + 5 * np.arange(20)))).splitlines()
+    calm = statement(measured(list(400 + noise))).splitlines()
+    named = [next(line for line in said if line.startswith("RSS")) for said in (leak, calm)]
+    assert "+10" in named[0].replace("+9.9", "+10") and "no trend" not in named[0]
+    assert "no trend" in named[1]
+    assert "too few windows" in statement(measured([400.0, 400, 400]))
+
+
+# ---- the run ---------------------------------------------------------------------------------------------
+
+
+def test_windows_cover_the_run_and_the_still_scene_is_recognised() -> None:
+    found = measure_endurance(opened(), 130, 30, "there-and-back", ignore)
+    assert [window["frames"] for window in found["windows"]] == [30, 60, 90, 120]
+    for window in found["windows"]:
+        assert 0 < window["ms_p50"] <= window["ms_p99"]
+        assert 25 < window["psnr"] < 60
+        assert 500 < window["gaussians"] <= 2000 and 0 < window["nodes"] <= 2048
+        assert window["restarts"] == 0 and window["rss_mb"] > 50
+    assert all(found["per_1000_frames"][figure] is not None for figure in FIGURES)
+    still = found["still"]
+    assert still["recognised"] >= STILL_FRAMES - 1 and still["settled"] < still["recognised"]
+    assert still["cpu_ratio"] == still["cpu_ms"] / still["moving_cpu_ms"]
+
+
+def test_ctrl_c_keeps_what_is_known_so_far() -> None:
+    def stop(done: int, total: int, what: str) -> None:
+        if done == 25:
+            raise KeyboardInterrupt
+
+    found = measure_endurance(opened(), 1000, 10, "walk", stop)
+    assert found["interrupted"] and [window["frames"] for window in found["windows"]] == [10, 20]
+    assert found["still"] is None and "stopped early" in statement(found)
+
+
+@pytest.mark.fault(
+    "memory: a recording does not fit",
+    says="error: `source.frames:=`, exit code 1",
+)
+def test_a_recording_that_does_not_fit_into_memory_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(endurance, "MOST_BYTES", 2_000_000)
+    result = bench(SESSION, "--frames", 5)
+    assert result.exit_code == 1 and "source.frames:=" in result.output and "Traceback" not in result.output
+
+
+def test_the_command_prints_and_writes_the_same_table(tmp_path: Path) -> None:
+    out = tmp_path / "new" / "endurance.json"
+    arguments = ("mapping.max_gaussians:=2000", "source.frames:=12", "--frames", 24, "--window", 6)
+    result = bench(SESSION, *arguments, "--order", "wrap", "--json", "--out", out)
+    assert result.exit_code == 0, result.output
+    found = json.loads(result.stdout)
+    assert json.loads(out.read_text()) == {"provenance": ANY} | found
+    assert found["recorded_frames"] == 12 and found["order"] == "wrap" and len(found["windows"]) == 4
+    shown = bench(SESSION, *arguments)
+    assert shown.exit_code == 0 and "Gaussians" in shown.stdout and "per 1000 frames" in shown.stdout
+
+
+def test_what_cannot_be_played_over_and_over_says_why(tmp_path: Path) -> None:
+    live = tmp_path / "live.yaml"
+    live.write_text("source: {kind: v4l2}\n")
+    result = bench(live)
+    assert result.exit_code == 2 and "record" in result.output
+    assert bench("nothing.yaml").exit_code == 2
+    assert bench(SESSION, "--order", "sideways").exit_code == 2
