@@ -93,7 +93,7 @@ class Pipeline:
             self._tracker = CameraTracker(self.mapper, self._draw_model)
         elif vision.pose == "refine":
             self._tracker = PoseRefiner(self.mapper)
-        self.anchors = Anchors()
+        self.anchors = Anchors(self.tissue.usable)
         self._still = StillScene()
         self._freeze = FreezeWatch()
         self._eyes = PairWatch()

@@ -229,7 +229,9 @@ def play(
 ) -> None:
     """Publish a recording again; Enter pauses and goes on.
 
-    Consumers cannot tell it from a node: stamps are moved to now, compressed pictures are sent raw.
+    Subscribers get it as from a node: stamps are moved to now, compressed pictures are sent raw. It takes no
+    requests: no anchors (sags overlay, clicks in sags view), views nor sags health. Those need a node, which
+    plays the pictures of a recording: sags run PATH.
 
     \b
     sags bag play out/case1 --rate 0.5 --loop

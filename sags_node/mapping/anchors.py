@@ -92,9 +92,14 @@ class _Table:
 
 
 class Anchors:
-    """All anchors of one node. Their ids are never used again."""
+    """All anchors of one node. Their ids are never used again.
 
-    def __init__(self) -> None:
+    Args:
+        usable: as of `TissueMask`, to say why a pixel cannot be pinned; None: all of the picture is.
+    """
+
+    def __init__(self, usable: Bool | None = None) -> None:
+        self._usable = usable
         self._table = _row(0, np.zeros(3), (np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3))))
         self._table = _selected(self._table, np.zeros(1, bool))
         self._next_id = 1
@@ -114,15 +119,18 @@ class Anchors:
         """Pin the tissue seen at a pixel (u, v) of the left picture; returns the anchor's id.
 
         Raises:
-            SagsError: the pixel is outside the picture, on an instrument or without depth, or there are too
-                many anchors.
+            SagsError: the pixel is outside the picture, excluded, on an instrument or without depth, or there
+                are too many anchors.
         """
         height, width = observation.tissue.shape
         if not (-0.5 <= u < width - 0.5 and -0.5 <= v < height - 0.5):
             raise SagsError(f"pixel ({u:g}, {v:g}) is outside the left picture of {width}x{height} px")
         row, column = round(v), round(u)
         if not observation.tissue[row, column]:
-            raise SagsError(f"pixel ({u:g}, {v:g}) shows an instrument, not tissue; choose another")
+            why = "shows an instrument, or what lies on a lens"
+            if self._usable is not None and not self._usable[row, column]:
+                why = "lies in a box of vision.tissue.exclude, or outside the camera's own picture"
+            raise SagsError(f"pixel ({u:g}, {v:g}) {why}, so no tissue is known there; choose another")
         depth = float(view.depth[row, column]) or float(observation.depth[row, column])
         if depth <= 0:
             raise SagsError(

@@ -74,11 +74,16 @@ def find_control(
     """The control socket given, or the one in the connection file of `ns`; see `find_data`.
 
     Raises:
-        SagsError: also when the node has none.
+        SagsError: also when the node has none, or a recording is played there.
     """
     if endpoint is not None:
         return _given(endpoint, keys)
     connection = read_connection(ns, run_dir)
+    if connection.recording is not None:
+        raise SagsError(
+            f"a recording is played as '{ns}': it takes no requests, so it holds no anchors and no views; "
+            f"a node does, with the recording's pictures: sags run {connection.recording}"
+        )
     if connection.control is None:
         raise SagsError(f"the node '{ns}' has no control socket; start it with publish.control set")
     return _known(connection.control, connection.public_key, keys)

@@ -8,6 +8,7 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
@@ -64,6 +65,7 @@ class Publisher:
         handlers: control op -> function of its args, see `control.ControlServer`; `ping` is always there.
         offered: what may be subscribed to, beside views.
         thins: whether somebody makes the thin pictures of `thin`.
+        recording: what is played here by `sags bag play`; None: this is a node.
 
     Attributes:
         thin: thin pictures that somebody subscribes to, by topic.
@@ -82,6 +84,7 @@ class Publisher:
         handlers: Mapping[str, control.Handler] | None = None,
         offered: Sequence[topics.Topic] = topics.TOPICS,
         thins: bool = False,
+        recording: Path | None = None,
     ) -> None:
         for endpoint in (*config.data, *([config.control] if config.control else [])):
             check_endpoint(endpoint, config)
@@ -94,6 +97,7 @@ class Publisher:
         self._subscribed: set[str] = set()  # prefixes, only those of our topics and of views
         self.thin: Mapping[str, topics.ThinPicture] = {}
         self._thins = thins
+        self._recording = recording
         self._thin_seq = 0  # where the numbers of the next one begin
         self._last: FrameResult | None = None
         self._dropped = 0
@@ -124,7 +128,8 @@ class Publisher:
             zmq.XPUB_VERBOSE, 1
         )  # each new peer's subscription is seen: the last values are due
         endpoints = [bind(self._data, self._run.ipc_endpoint, "publish.ipc", keys)] if config.ipc else []
-        endpoints += [bind(self._data, endpoint, "publish.data", keys) for endpoint in config.data]
+        option = "publish.data" if self._recording is None else "--endpoint"
+        endpoints += [bind(self._data, endpoint, option, keys) for endpoint in config.data]
         self._control: control.ControlServer | None = None
         control_endpoint = None
         if config.control:
@@ -141,6 +146,7 @@ class Publisher:
             data=endpoints,
             control=control_endpoint,
             public_key=None if keys is None else keys.public.decode(),
+            recording=None if self._recording is None else str(self._recording),
         )
         self._run.write_connection(self.connection)
 

@@ -1,7 +1,8 @@
 """The run directory: private to its owner, it holds the ipc socket, a lock and the connection file.
 
 The connection file tells a client on this machine where the node is:
-`{protocol, ns, session, pid, data: [endpoints], control: endpoint | null, public_key: Z85 | null}`.
+`{protocol, ns, session, pid, data: [endpoints], control: endpoint | null, public_key: Z85 | null,
+recording: path | null}`.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ class Connection(msgspec.Struct, frozen=True, kw_only=True):
     data: list[str]  # XPUB endpoints, the quickest first
     control: str | None
     public_key: str | None = None  # Z85; set when the tcp endpoints speak CURVE
+    recording: str | None = None  # what `sags bag play` plays there; no node
 
 
 def default_run_dir() -> Path:
@@ -85,7 +87,7 @@ class RunDirectory:
             os.close(lock)
             raise SagsError(
                 f"another node already runs as '{self._ns}' in {self.folder}; stop it, or choose another "
-                "ns:=NAME"
+                "ns:=NAME (sags bag play: --ns NAME)"
             ) from None
         return lock
 

@@ -30,13 +30,13 @@ def limit(
     socket.setsockopt(zmq.ZAP_DOMAIN, ZAP_DOMAIN)
 
 
-def bind(socket: zmq.Socket[bytes], endpoint: str, key: str, keys: KeyPair | None) -> str:
+def bind(socket: zmq.Socket[bytes], endpoint: str, option: str, keys: KeyPair | None) -> str:
     """Bind and return the endpoint as bound (a `*` port becomes its number).
 
     With `keys` a tcp endpoint speaks CURVE; an ipc endpoint never does: only the owner may open its file.
 
     Args:
-        key: of the launch file, for the message.
+        option: the key of the launch file that names the endpoint, or of the command line; for the message.
 
     Raises:
         SagsError: the endpoint is taken or cannot be bound.
@@ -49,8 +49,8 @@ def bind(socket: zmq.Socket[bytes], endpoint: str, key: str, keys: KeyPair | Non
     try:
         socket.bind(endpoint)
     except zmq.ZMQError as error:
-        example = "'[tcp://127.0.0.1:5560]'" if key == "publish.data" else "tcp://127.0.0.1:5561"
-        hint = f"choose another, e.g. {key}:={example}"
+        examples = {"publish.data": ":='[tcp://127.0.0.1:5560]'", "--endpoint": " tcp://127.0.0.1:5560"}
+        hint = f"choose another, e.g. {option}{examples.get(option, ':=tcp://127.0.0.1:5561')}"
         reason = "already in use" if error.errno == errno.EADDRINUSE else f"cannot be bound: {error.strerror}"
         raise SagsError(f"{endpoint} is {reason}; {hint}") from None
     bound = socket.getsockopt_string(zmq.LAST_ENDPOINT)

@@ -210,7 +210,7 @@ class HeldObject:
                     f"{self._where} {u:g} {v:g} lies outside the left picture of {width}x{height} px"
                 )
             if not frame.tissue[round(v), round(u)]:
-                return f"pixel {u:g} {v:g} shows an instrument"
+                return f"pixel {u:g} {v:g} shows no tissue: an instrument, or vision.tissue.exclude"
             if not np.isfinite(frame.depth[round(v), round(u)]):
                 return f"no depth at pixel {u:g} {v:g}"
             requests.append({"u": u, "v": v})

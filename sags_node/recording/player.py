@@ -78,7 +78,8 @@ class Player:
         began = time.monotonic()
         passes = 0
         offered = (*topics.TOPICS, *topics.PLAYER_TOPICS)
-        with Publisher(self._config, self._ns, uuid.uuid4().hex, offered=offered) as publisher:
+        session, recording = uuid.uuid4().hex, self._path.absolute()
+        with Publisher(self._config, self._ns, session, offered=offered, recording=recording) as publisher:
             self._delay(publisher)
             while not self._stopping.is_set():
                 self._play_once(publisher, epoch=passes)

@@ -72,7 +72,9 @@ class Scene:
                 client.camera.fov = _fov(self.camera)
 
     def _show_splats(self, splats: Splats | None) -> None:
-        """A browser builds its buffers anew when the number changes, so it is filled up to a round one."""
+        """A browser builds its buffers anew when the number changes, so it is filled up to a round one. Each
+        time viser 1.1.1 reports there `computeBoundingSphere(): Computed radius is NaN`. That is of its own
+        flat quad, not of what is sent: nothing is culled then."""
         self.splats = splats
         if splats is None or len(splats.means) == 0:
             if self._drawn_splats is not None:

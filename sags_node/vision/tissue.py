@@ -27,6 +27,7 @@ class TissueMask:
     """The tissue mask of every frame: the session's own, a network's, another process's, or found without.
 
     Attributes:
+        usable: [H, W], False where no frame shows tissue: in what is excluded, and outside the raw picture.
         problem: why the newest frame's mask is not the network's or the other process's; empty: it is, or
             there is none.
 
@@ -41,7 +42,7 @@ class TissueMask:
     def __init__(self, config: TissueConfig, rectifier: Rectifier, masks: NearestMask | None = None) -> None:
         self._config = config
         self._rectifier = rectifier
-        self._usable = rectifier.mask(_outside(config, rectifier.raw_size))
+        self.usable = rectifier.mask(_outside(config, rectifier.raw_size))
         self._segment: Callable[[RectifiedPair], Bool] | None = None
         self._topic: TopicMasks | None = None
         if config.method == "onnx":
@@ -67,7 +68,7 @@ class TissueMask:
             UsageError: the masks that were given say of the first frames that most of them is instrument.
         """
         if self._config.method == "none":
-            return self._usable
+            return self.usable
         tissue = self._given(frame, pair)
         if tissue is None:
             tissue = ~self._find_instruments(pair.left, expected, pair.t_capture_ns)
@@ -75,7 +76,7 @@ class TissueMask:
             self._check_polarity(tissue)
         # The picture's border counts as tissue here: only instruments grow.
         eroded: U8 = cv2.erode(tissue.view(np.uint8), self._neighbourhood)
-        return eroded.view(np.bool_) & self._usable
+        return eroded.view(np.bool_) & self.usable
 
     def _given(self, frame: StereoFrame, pair: RectifiedPair) -> Bool | None:
         if self._segment is not None:
@@ -96,7 +97,7 @@ class TissueMask:
         """A mask upside down would have the model learn the instruments alone."""
         if self._frames_checked == FIRST_FRAMES:
             return
-        share = float(np.mean(~tissue[self._usable]))
+        share = float(np.mean(~tissue[self.usable]))
         if share <= LARGEST_INSTRUMENTS:
             self._frames_checked = FIRST_FRAMES
             return

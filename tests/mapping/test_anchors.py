@@ -195,13 +195,16 @@ def test_what_leaves_the_picture_is_followed_there() -> None:
 
 
 def test_what_cannot_be_pinned_is_a_clear_error() -> None:
-    anchors = Anchors()
+    usable = np.ones((HEIGHT, WIDTH), bool)
+    usable[60:70] = False  # a caption
+    anchors = Anchors(usable)
     observation, snapshot, view = scene()
+    observation.tissue[:] = usable
     observation.tissue[:, :20] = False
     observation.depth[30:40] = view.depth[30:40] = 0
     for pixel, message in (
         ((-0.6, 5), "outside the left picture of 128x96"), ((50, 95.5), "outside"),
-        ((10, 50), "instrument"), ((50, 35), "no depth"),
+        ((10, 50), "instrument"), ((50, 65), "vision.tissue.exclude"), ((50, 35), "no depth"),
     ):  # fmt: skip
         with pytest.raises(SagsError, match=message):
             anchors.add_pixel(*pixel, observation, snapshot, view)

@@ -1,4 +1,4 @@
-"""A recording that is played again: for consumers it is a node."""
+"""A recording that is played again: for subscribers it is a node."""
 
 from __future__ import annotations
 
@@ -23,10 +23,14 @@ from waiting import until
 from sags_node.config import PublishConfig
 from sags_node.errors import SagsError
 from sags_node.messaging import cdr
+from sags_node.messaging.control import ControlClient
+from sags_node.messaging.publisher import Publisher
 from sags_node.messaging.received import ReceivedCloud, ReceivedImage
 from sags_node.messaging.rundir import read_connection
 from sags_node.messaging.stream import listen
 from sags_node.messaging.subscriber import Subscriber
+from sags_node.overlay.run import Options as OverlayOptions
+from sags_node.overlay.run import run_overlay
 from sags_node.recording.info import bag_info
 from sags_node.recording.player import Options as PlayOptions
 from sags_node.recording.player import Player
@@ -75,6 +79,28 @@ def test_a_consumer_sees_a_played_bag_as_a_node(plane_bag: Path, tmp_path: Path)
         assert stamp.sec * 10**9 + stamp.nanosec == picture.stamp_ns
         player.toggle_pause()
         until(lambda: not sub.ok(names[0]))
+
+
+def test_who_asks_a_played_bag_for_something_is_told_what_it_is(plane_bag: Path, tmp_path: Path) -> None:
+    """The overlay, and what the viewer asks for with a click."""
+    run_dir = tmp_path / "run"
+    told = f"a recording is played as 'sags': it takes no requests.*sags run {plane_bag}$"
+    with playing(plane_bag, run_dir, paused=False, loop=True):
+        with pytest.raises(SagsError, match=told):
+            run_overlay(OverlayOptions(own_ns="drawn", run_dir=run_dir, seconds=30))
+        with pytest.raises(SagsError, match=told), ControlClient(run_dir=run_dir) as client:
+            client.request("add_anchor", {"u": 10, "v": 10})
+
+
+def test_a_taken_port_is_named_with_the_option_that_takes_another(plane_bag: Path, tmp_path: Path) -> None:
+    config = PublishConfig(data=("tcp://127.0.0.1:*",), control=None, run_dir=tmp_path / "run")
+    with Publisher(config, "sags", "session") as running:
+        taken = running.connection.data[-1]
+        refused = sags("bag", "play", plane_bag, "--endpoint", taken, "--ns", "played")
+    assert refused.exit_code == 1
+    assert (
+        f"{taken} is already in use; choose another, e.g. --endpoint tcp://127.0.0.1:5560" in refused.output
+    )
 
 
 def cdr_of(received: Any) -> bytes:
