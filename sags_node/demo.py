@@ -83,7 +83,7 @@ def _start_overlay(config: LaunchConfig, seconds: float, video: Path) -> subproc
     """The consumer is a process of its own, as it would be in a theatre."""
     command = [sys.executable, "-m", "sags_node", "overlay", "--ns", config.ns, "--repin"]
     command += ["--run-dir", str(config.publish.run_dir or default_run_dir())]
-    command += ["--seconds", f"{seconds:.1f}", "--save", str(video), "--json"]
+    command += ["--seconds", f"{seconds:.1f}", "--save", str(video), "--force", "--json"]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 

@@ -107,9 +107,7 @@ def fit_session(
         ),
     }  # fmt: skip
     last = fit.gaussians(clip.train[-1])
-    ply = out / "model.ply"
-    ply.unlink(missing_ok=True)
-    write_ply(ply, folded(last))
+    write_ply(out / "model.ply", folded(last), force=True)
     write_json(out / "figures.json", found)
     return found
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import os
 import signal
@@ -35,11 +36,13 @@ from sags_node.cli.topic import topic
 from sags_node.cli.train import train
 from sags_node.cli.view import view
 from sags_node.errors import SagsError, UsageError
+from sags_node.files import check_folder
 from sags_node.plotting import check_plots
 from sags_node.terminal import text
-from sags_node.terminal.console import check_folder, console, interrupt, log_handler, progress, show
+from sags_node.terminal.console import console, interrupt, log_handler, progress, show
 
 log = logging.getLogger(__name__)
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT)  # of a disk; also of what stdout leads to
 
 
 class Sags(click.Group):
@@ -63,10 +66,15 @@ class Sags(click.Group):
         try:
             return super().invoke(ctx)
         except SagsError as error:
-            if console.quiet:
-                log.error("%s", error)
-            console.print(f"[red]error:[/] {escape(str(error))}", soft_wrap=True)
-            ctx.exit(error.exit_code)
+            said, code = str(error), error.exit_code
+        except OSError as error:
+            if error.errno not in NO_ROOM:
+                raise
+            said, code = f"cannot write {error.filename or 'what was asked for'}: {error.strerror}", 1
+        if console.quiet:
+            log.error("%s", said)
+        console.print(f"[red]error:[/] {escape(said)}", soft_wrap=True)
+        ctx.exit(code)
 
 
 @click.group(cls=Sags, context_settings={"help_option_names": ["-h", "--help"]})
@@ -137,7 +145,7 @@ def run(launch: tuple[str, ...], seconds: float | None, json_out: bool) -> None:
 @launch_argument
 @click.option("--seconds", type=positive, default=10.0, show_default=True, help="How long it plays.")
 @click.option(
-    "--out",
+    *("-o", "--out"),
     type=click.Path(path_type=Path),
     default=Path("out/demo"),
     show_default=True,
@@ -202,7 +210,12 @@ def phantom(folder: Path, overrides: tuple[str, ...]) -> None:
 @main.command()
 @click.argument("name")
 @click.option(
-    "--out", type=click.Path(path_type=Path), default=Path(), show_default=True, help="Folder for both files."
+    "-o",
+    "--out",
+    type=click.Path(path_type=Path),
+    default=Path(),
+    show_default=True,
+    help="Folder for both files.",
 )
 def keygen(name: str, out: Path) -> None:
     """Make a key pair for a node or for a client.

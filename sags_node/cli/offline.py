@@ -12,6 +12,7 @@ from rich.markup import escape
 from sags_node.cli.launching import (
     as_json,
     check_files,
+    figures_option,
     launch_argument,
     lpips_option,
     open_launched,
@@ -20,8 +21,9 @@ from sags_node.cli.launching import (
     write_json,
 )
 from sags_node.errors import UsageError
+from sags_node.files import check_folder
 from sags_node.plotting import check_plots
-from sags_node.terminal.console import check_folder, console, progress, show, writing
+from sags_node.terminal.console import console, progress, show
 
 
 @click.command("eval")
@@ -64,7 +66,8 @@ from sags_node.terminal.console import check_folder, console, progress, show, wr
     help="Measure a public data set, in its own layout, by its own rules (docs/protocols.md).",
 )
 @click.option("--report", type=click.Path(path_type=Path), help="Folder for an HTML report.")
-@click.option("--json", "json_out", metavar="FILE", help="Write the figures as JSON to FILE, - for stdout.")
+@figures_option
+@as_json
 def evaluate(
     launch: tuple[str, ...],
     pace: str,
@@ -76,19 +79,20 @@ def evaluate(
     paper_psnr: bool,
     protocol: str | None,
     report: Path | None,
-    json_out: str | None,
+    out: Path | None,
+    json_out: bool,
 ) -> None:
     """Measure a recorded session: run time against error.
 
     It is played through the node's own pipeline, then read once more and compared with what was shown.
 
     \b
-    sags eval launch/d4d_pull.yaml --json out.json
+    sags eval launch/d4d_pull.yaml --out out.json
     sags eval launch/d4d_pull.yaml --pace step --iterations 2 --report out/d4d
-    sags eval --protocol stir /data/STIR --json stir.json
+    sags eval --protocol stir /data/STIR --out stir.json
     """
     if protocol is not None:
-        _evaluate_protocol(protocol, launch, iterations, lpips_weights, json_out)
+        _evaluate_protocol(protocol, launch, iterations, lpips_weights, out)
         return
     from sags_node.evaluation.measure import Options
     from sags_node.evaluation.report import summary_table, write_report
@@ -99,11 +103,10 @@ def evaluate(
     if warm_up is not None:
         overrides.append(f"source.warm_up:={warm_up}")
     options = Options(hold_out, every, lpips_weights, paper_psnr)
-    file = Path(json_out) if json_out is not None and json_out != "-" else None
     if report is not None:
         check_plots()
         check_folder(report)
-    check_files(file)
+    check_files(out)
     with progress("measuring") as advance:
         outcome = measure(
             path,
@@ -114,14 +117,10 @@ def evaluate(
             lambda what, frames: advance(frames, None, what),
         )
     if report is not None:
-        with writing(report):
-            page = write_report(report, outcome.summary, outcome.rows, outcome.pictures)
+        page = write_report(report, outcome.summary, outcome.rows, outcome.pictures)
         console.print(f"report: [bold]{escape(str(page))}[/]", soft_wrap=True)
-    if json_out is None:
-        show(summary_table(outcome.summary))
-    elif json_out == "-":
-        show(outcome.summary)
-    write_json(file, outcome.summary)
+    show(outcome.summary if json_out else summary_table(outcome.summary))
+    write_json(out, outcome.summary)
 
 
 def _evaluate_protocol(
@@ -129,7 +128,7 @@ def _evaluate_protocol(
     launch: tuple[str, ...],
     iterations: int | None,
     lpips_weights: Path | None,
-    json_out: str | None,
+    out: Path | None,
 ) -> None:
     from sags_node.protocols import run
     from sags_node.protocols.d4d import measure_d4d
@@ -139,8 +138,7 @@ def _evaluate_protocol(
         raise UsageError(f"--protocol {protocol} needs the data set's folder")
     if iterations is not None:
         overrides = [*overrides, f"mapping.iterations:={iterations}"]
-    file = Path(json_out) if json_out is not None and json_out != "-" else None
-    check_files(file)
+    check_files(out)
     with progress("measuring") as advance:
 
         def tell(done: int, what: str) -> None:
@@ -157,15 +155,14 @@ def _evaluate_protocol(
             }
             found = measures[protocol](Path(path), overrides, tell)
     found = {"protocol": protocol, **found}
-    if file is None:
-        show(found)
-    write_json(file, found)
+    show(found)
+    write_json(out, found)
 
 
 @click.command()
 @click.argument("dataset", nargs=-1, metavar="[DATASET | LAUNCH.yaml] [key:=value ...]")
 @click.option(
-    "--out", type=click.Path(path_type=Path), default=Path("out/fit"), show_default=True, help="Folder."
+    "-o", "--out", type=click.Path(path_type=Path), default=Path("out/fit"), show_default=True, help="Folder."
 )
 @click.option("--resume", is_flag=True, help="Go on from the checkpoint in the folder; same settings.")
 @click.option(

@@ -8,7 +8,8 @@ import click
 from rich.markup import escape
 
 from sags_node.errors import SagsError
-from sags_node.terminal.console import check_file, console, progress, writing
+from sags_node.files import check_file, whole
+from sags_node.terminal.console import console, progress
 
 HELD_OUT_BATCHES = 16
 MOST_DIFFERENCE = 1e-3  # px: sums are taken in another order
@@ -21,7 +22,7 @@ def train() -> None:
 
 @train.command("depth")
 @click.option(
-    "--out",
+    *("-o", "--out"),
     type=click.Path(path_type=Path, dir_okay=False),
     required=True,
     metavar="FILE.onnx",
@@ -69,8 +70,8 @@ def train_depth(out: Path, steps: int, tissues: int, textures: Path | None, seed
     from sags_node.learning.training import Trainer, errors
 
     check_export()
-    check_file(out)
     state = out.with_suffix(".pt")
+    check_file(out, force=state.is_file())
     with progress("rendering") as advance:
         material = gather(tissues, textures, seed, advance)
     trainer = Trainer(material, steps, seed)
@@ -83,8 +84,8 @@ def train_depth(out: Path, steps: int, tissues: int, textures: Path | None, seed
     trained = (
         f"{trainer.step} steps on {len(material.rendered)} rendered pairs, {len(material.textures)} textures"
     )
-    with writing(out):
-        export(trainer.network, out, trained)
+    with whole(out) as partial:
+        export(trainer.network, partial, trained)
     off = difference(trainer.network, out)
     if off > MOST_DIFFERENCE:
         raise SagsError(f"{out} gives other numbers in ONNX Runtime than in torch, by {off:.2g} px")

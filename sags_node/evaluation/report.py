@@ -17,6 +17,7 @@ from sags_node.evaluation.page import encoded, page, picture_uri, svg_uri
 from sags_node.evaluation.plots import Series, line_plot
 from sags_node.evaluation.spool import RunFacts
 from sags_node.evaluation.tiles import ERROR_AT_TOP, depth_range, tiles
+from sags_node.files import check_folder, whole
 from sags_node.types import U8
 
 BLUE, ORANGE, GREEN = "#2166ac", "#d6604d", "#1b7837"
@@ -33,13 +34,17 @@ def write_report(
 
     Returns:
         The path of `report.html`.
+
+    Raises:
+        SagsError: the folder cannot be written to.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    check_folder(folder)
     near, far = depth_range(pictures)
     sheet = [tiles(picture, near, far) for picture in pictures]
     if sheet:
         grid = np.concatenate([np.concatenate(line, axis=1) for line in sheet])
-        (folder / "sheet.png").write_bytes(encoded(".png", grid))
+        with whole(folder / "sheet.png") as file:
+            file.write_bytes(encoded(".png", grid))
     title = f"SAGS: {summary['session']}"
     text = page(
         title,
@@ -56,9 +61,10 @@ def write_report(
             _figure_table(summary),
         ],
     )
-    file = folder / "report.html"
-    file.write_text(text, encoding="utf-8")
-    return file
+    report = folder / "report.html"
+    with whole(report) as file:
+        file.write_text(text, encoding="utf-8")
+    return report
 
 
 def summary_table(summary: Mapping[str, Any]) -> Table:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from io import BytesIO
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,7 +14,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from sags_node.errors import SagsError, UsageError
+from sags_node.errors import UsageError
+from sags_node.files import whole
 from sags_node.learning.example import Example
 from sags_node.learning.material import Material
 from sags_node.learning.network import StereoNetwork
@@ -142,12 +144,10 @@ class Trainer:
             "optimizer": self._optimizer.state_dict(),
             "step": self.step,
         }
-        partial = file.with_name(file.name + ".partial")
-        try:
-            torch.save(state, partial)
-            partial.replace(file)
-        except (OSError, RuntimeError) as error:
-            raise SagsError(f"cannot write {file}: {error}; check space and rights") from None
+        data = BytesIO()  # torch itself says of a full disk what nobody understands
+        torch.save(state, data)
+        with whole(file) as partial:
+            partial.write_bytes(data.getvalue())
 
     def resume(self, file: Path) -> None:
         """Go on from what was kept.

@@ -6,13 +6,11 @@ import json
 import logging
 import signal
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
-from pathlib import Path
 from types import FrameType
 from typing import Any
 
@@ -20,8 +18,6 @@ import click
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
-
-from sags_node.errors import SagsError
 
 WIDE = 200  # columns of a table that goes to a file or another program, and so is not cut to a screen
 
@@ -91,30 +87,6 @@ def _drawn(table: Table) -> str:
     with screen.capture() as captured:
         screen.print(table)
     return "\n".join(line.rstrip() for line in captured.get().splitlines())
-
-
-@contextmanager
-def writing(target: Path) -> Iterator[None]:
-    """A full disk or missing rights become one message."""
-    try:
-        yield
-    except OSError as error:
-        raise SagsError(f"cannot write {target}: {error.strerror}; name another place") from None
-
-
-def check_folder(folder: Path) -> None:
-    """Make the folder, and be sure that a file can be made in it."""
-    with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=folder).close()
-
-
-def check_file(file: Path) -> None:
-    """Be sure that this file can be written, without touching it."""
-    check_folder(file.parent)
-    with writing(file):
-        if file.exists():
-            file.open("r+b").close()
 
 
 class _Interrupt:

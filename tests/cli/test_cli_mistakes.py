@@ -170,7 +170,7 @@ def test_a_right_video_that_ends_too_early_cannot_be_measured_to_its_end(
     session = videos(user_files, right="short.mp4")
     file = tmp_path / "out.json"
     for pace in ("realtime", "step"):
-        command = ["eval", *session, "--hold-out", "0", "--pace", pace, "--json", file]
+        command = ["eval", *session, "--hold-out", "0", "--pace", pace, "--out", file]
         refused(1, *command, said=(f"short.mp4 ends at frame {SHORT}", "set source.frames"))
         assert not file.exists()
     result = sags("eval", *session, f"source.frames:={SHORT}", *command[-6:])

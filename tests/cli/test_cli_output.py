@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import socket
 import subprocess
 import sys
@@ -15,6 +16,7 @@ from command_line import pure_json, refused, sags
 from places import ROOT
 from user_files import videos
 
+from sags_node.cli.bench import bench
 from sags_node.cli.main import main
 
 pytestmark = [pytest.mark.live, pytest.mark.usefixtures("run_dir")]
@@ -23,7 +25,7 @@ pytestmark = [pytest.mark.live, pytest.mark.usefixtures("run_dir")]
 # ---- where results go ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("option", ["--json", "--report"])
+@pytest.mark.parametrize("option", ["--out", "--report"])
 def test_a_result_that_cannot_be_kept_is_noticed_before_the_run(user_files: Path, option: str) -> None:
     target = user_files / "file/inside"
     refused(1, "eval", "nowhere.yaml", option, target, said=(f"cannot write {user_files / 'file'}",))
@@ -31,14 +33,7 @@ def test_a_result_that_cannot_be_kept_is_noticed_before_the_run(user_files: Path
 
 
 def test_a_folder_is_no_json_file_and_a_file_no_folder(user_files: Path) -> None:
-    refused(
-        1,
-        "eval",
-        "nowhere.yaml",
-        "--json",
-        user_files / "empty",
-        said=(f"cannot write {user_files / 'empty'}",),
-    )
+    refused(2, "eval", "nowhere.yaml", "--out", user_files / "empty", said=("empty", "is a directory"))
     refused(1, "eval", "nowhere.yaml", "--report", user_files / "file", said=("cannot write",))
     refused(1, "demo", "--out", user_files / "file", said=("cannot write",))
     assert not any((user_files / "empty").iterdir()) and (user_files / "file").read_text() == "mine"
@@ -46,9 +41,80 @@ def test_a_folder_is_no_json_file_and_a_file_no_folder(user_files: Path) -> None
 
 def test_older_figures_stay_when_the_run_fails(tmp_path: Path) -> None:
     file = tmp_path / "out.json"
-    file.write_text("older figures")
-    refused(2, "eval", "nowhere.yaml", "--json", file, said=("nowhere.yaml",))
-    assert file.read_text() == "older figures"
+    file.write_text('{"provenance": "older figures"}')
+    refused(2, "eval", "nowhere.yaml", "--out", file, said=("nowhere.yaml",))
+    assert file.read_text() == '{"provenance": "older figures"}'
+
+
+WRITERS = [  # commands, and their options for one file
+    ("eval", "--out"),
+    ("eval --protocol stir DATA", "--out"),
+    *((f"bench {name}", "--out") for name in bench.commands if name != "transport"),
+    ("bench alias", "--picture"),
+    ("bench depth", "--plot"),
+    ("bench pareto", "--plot"),
+    ("archive scan FOLDER", "--out"),
+    ("archive costs SESSION --frames 4", "--out"),
+    ("export", "--splats"),
+    ("export", "--points"),
+    ("export", "--mesh"),
+    ("export", "--orbit"),
+    ("export --session SESSION", "--tracks"),
+    ("export --session SESSION", "--render"),
+    ("overlay", "--out"),
+    ("calib live SESSION", "--out"),
+    ("bridge foxglove", "--layout"),
+    ("train depth", "--out"),
+]
+ENDINGS = {"--splats": "ply", "--points": "ply", "--mesh": "ply", "--orbit": "mp4"}
+
+
+@pytest.mark.parametrize(("command", "option"), WRITERS)
+def test_no_command_overwrites_what_it_did_not_make(
+    tmp_path: Path, phantom_session: Path, command: str, option: str
+) -> None:
+    """Before any work."""
+    mine = tmp_path / f"mine.{ENDINGS.get(option, 'csv' if 'scan' in command else 'png')}"
+    mine.write_text("source: {kind: videos}")
+    said = [str(phantom_session) if word in ("SESSION", "FOLDER") else word for word in command.split()]
+    refused(2, *said, option, mine, said=(str(mine), "exists already", "choose another name"))
+    assert mine.read_text() == "source: {kind: videos}"
+
+
+def test_every_command_spells_its_options_alike() -> None:
+    """--json prints, whatever else; a file or folder to be written is -o or --out."""
+    for path in every_command(main):
+        command: Any = main
+        for name in path:
+            command = command.commands[name]
+        for option in command.params:
+            if "--json" in option.opts:
+                assert option.is_flag, path
+            if {"-o", "--out", "--output"} & set(option.opts):
+                assert option.opts[:2] == ["-o", "--out"], path
+
+
+def test_a_file_after_json_is_no_launch_file_and_stays(tmp_path: Path, user_files: Path) -> None:
+    mine = tmp_path / "mine.yaml"
+    mine.write_text("sorce: {kind: phantom}")
+    refused(2, "eval", "--json", mine, "source.frames:=2", said=("mine.yaml: unknown key 'sorce'",))
+    assert mine.read_text() == "sorce: {kind: phantom}"
+    for name in ("out.json", "-"):
+        refused(2, "eval", mine, "--json", name, said=(f"'{name}'", "--out FILE"))
+
+
+def test_figures_are_replaced_by_figures(user_files: Path, tmp_path: Path) -> None:
+    file = tmp_path / "out.json"
+    file.touch()
+    eval = ("eval", *videos(user_files), "source.frames:=2", "--pace", "step", "--out", file)
+    assert sags(*eval).exit_code == 0
+    first = json.loads(file.read_text())
+    assert sags(*eval, "mapping.iterations:=1").exit_code == 0
+    assert json.loads(file.read_text())["settings"] != first["settings"]
+    link = tmp_path / "link.json"
+    link.symlink_to(file)
+    assert sags(*eval[:-1], link).exit_code == 0
+    assert link.is_symlink() and json.loads(file.read_text())["settings"] == first["settings"]
 
 
 def test_phantom_overwrites_nothing(tmp_path: Path, user_files: Path) -> None:
@@ -126,7 +192,7 @@ def test_help_mentions_every_argument_and_option(path: tuple[str, ...]) -> None:
 
 @pytest.mark.parametrize("pace", ["realtime", "step"])
 def test_eval_prints_nothing_but_json(user_files: Path, pace: str) -> None:
-    session = [*videos(user_files), "source.frames:=4", "--pace", pace, "--json", "-"]
+    session = [*videos(user_files), "source.frames:=4", "--pace", pace, "--json"]
     assert pure_json(sags("eval", *session).stdout)["settings"]["pace"] == pace
 
 

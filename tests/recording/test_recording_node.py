@@ -121,7 +121,7 @@ def test_a_long_recording_in_several_files_is_a_session(node: Path, tmp_path: Pa
     assert len(files) > 3 and max(file.stat().st_size for file in files) < 12_400_000
     result = sags("bag", "info", tmp_path / "bag", "--json")
     assert result.exit_code == 0 and len(json.loads(result.stdout)["files"]) == len(files)
-    result = sags("eval", tmp_path / "bag", "source.frames:=10", "--pace", "step", "--json", "-")
+    result = sags("eval", tmp_path / "bag", "source.frames:=10", "--pace", "step", "--json")
     assert result.exit_code == 0, result.output
     assert json.loads(result.stdout)["frames"] == 10  # out of three files
 
