@@ -60,6 +60,11 @@ def check_calibration(
     if pairs and size is None:
         size = pairs[0][0].shape[1], pairs[0][0].shape[0]
     rig = read_rig(path, size, metres) if own is None else _rig_of(own, size, metres)
+    return judge(rig, pairs, depths)
+
+
+def judge(rig: StereoRig, pairs: Sequence[Pair], depths: Sequence[F32 | None] = ()) -> list[Finding]:
+    """Look over a calibration, and compare it with raw pictures where there are some."""
     findings = check_eyes(rig)
     if _broken(findings):
         return findings
