@@ -94,7 +94,8 @@ def rig_of(config: LaunchConfig) -> StereoRig:
         return recorded
     if config.rig is None:
         raise UsageError(
-            "no calibration: set rig to a folder with left.yaml and right.yaml, e.g. rig:=calib/d4d"
+            "no calibration: set rig to the folder with left.yaml and right.yaml of this scope; "
+            "docs/calibration.md says how to make one"
         )
     if config.one_camera and not config.rig.is_dir():
         return load_camera(config.rig)

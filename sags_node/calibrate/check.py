@@ -112,7 +112,7 @@ def _rig_of(config: LaunchConfig, size: tuple[int, int] | None, metres: float | 
         return read_rig(config.rig, size, metres)
     rig = recorded_rig(config.source)
     if rig is None:
-        raise UsageError("the session names no calibration: set rig, e.g. rig:=calib/d4d")
+        raise UsageError("the session names no calibration: set rig to its folder")
     return rig
 
 

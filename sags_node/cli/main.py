@@ -268,7 +268,10 @@ def health(control: str | None, ns: str, json_out: bool, keys: Any) -> None:
 @click.argument("launch", nargs=-1, metavar="[LAUNCH.yaml] [key:=value ...]")
 @as_json
 def doctor(launch: tuple[str, ...], json_out: bool) -> None:
-    """Check that everything the node needs is here."""
+    """Check that everything the node needs is here.
+
+    With a launch file also what it names: pictures, calibration, devices, networks. No camera is opened.
+    """
     from sags_node.doctor import as_rows, examine
     from sags_node.launch_file import load_launch
 

@@ -179,7 +179,21 @@ def installed() -> tuple[str, dict[str, str]]:
     Raises:
         SagsError: GStreamer is not installed, or does not answer.
     """
-    child = GstProcess({"elements": list(ELEMENTS)})
+    said = _asked({"elements": list(ELEMENTS)})
+    return said["version"], {name: ELEMENTS[name] for name in said["missing"]}
+
+
+def check_launch(launch: str) -> None:
+    """Whether GStreamer takes this launch string; nothing is played.
+
+    Raises:
+        SagsError: an element is missing, or the string is wrong.
+    """
+    _asked({"parse": launch})
+
+
+def _asked(request: dict[str, Any]) -> dict[str, Any]:
+    child = GstProcess(request)
     try:
         heard = None
         for _ in range(10):
@@ -188,4 +202,4 @@ def installed() -> tuple[str, dict[str, str]]:
         child.close()
     if heard is None:
         raise SagsError(f"GStreamer does not answer within {ASK_S:g} s")
-    return heard[0]["version"], {name: ELEMENTS[name] for name in heard[0]["missing"]}
+    return heard[0]

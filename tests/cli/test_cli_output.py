@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
+from ctypes.util import find_library
 from pathlib import Path
 from typing import Any
 
@@ -155,6 +156,87 @@ def test_doctor_finds_what_the_node_needs(user_files: Path, monkeypatch: pytest.
         checks["SAGS_DATA"]["level"] == "warning" and str(user_files / "gone") in checks["SAGS_DATA"]["found"]
     )
     assert sags("doctor", "publish.data:=[nonsense]").exit_code == 1
+
+
+CAMERAS = (str(ROOT / "launch/v4l2.yaml"), "source.left:=/dev/null", "source.right:=/dev/zero")
+PUSHED = ("source.kind:=push", "rig:=FILES/calib", "robot.kind:=push", "robot.hand_eye:=FILES/gone.yaml")
+NAMED_IN_A_LAUNCH = {  # what it names -> the launch, the row that says what is wrong, and how
+    "a video": (("VIDEOS", "source.left:=FILES/gone.mp4"), "source", "gone.mp4 does not exist"),
+    "a video cut short": (
+        ("VIDEOS", "source.right:=FILES/short.mp4"),
+        "source",
+        "short.mp4 ends after 6 frames",
+    ),
+    "a calibration": (("VIDEOS", "rig:=FILES/gone"), "calibration", "gone/left.yaml"),
+    "a calibration of another size": (("VIDEOS", "rig:=FILES/double"), "calibration", "640x512"),
+    "no calibration": (("VIDEOS", "rig:=null"), "calibration", "no calibration"),
+    "a camera": ((*CAMERAS, "source.left:=/dev/no-camera"), "/dev/no-camera", "no such camera"),
+    "a camera's size": (
+        (*CAMERAS, "rig:=FILES/calib"),
+        "calibration",
+        "320x256 px, an eye's pictures are 640x480",
+    ),
+    "a hand-eye calibration": (PUSHED, "hand-eye", "gone.yaml"),
+    "a depth network": (("VIDEOS", "vision.onnx.path:=FILES/gone.onnx"), "depth network", "gone.onnx"),
+    "a tissue network": (
+        (
+            "VIDEOS",
+            "vision.tissue.method:=onnx",
+            "vision.tissue.path:=FILES/file",
+            "vision.tissue.tissue_is:=white",
+        ),
+        "tissue network",
+        "is no ONNX model",
+    ),
+    "an interface": (
+        ("source.kind:=ros2", "source.interface:=nowhere0"),
+        "source",
+        "no network interface nowhere0",
+    ),
+}
+
+
+def doctor(user_files: Path, *launch: str) -> tuple[int, dict[str, dict[str, str]]]:
+    """Exit code, and the rows by name."""
+    said = [word.replace("FILES", str(user_files)) for word in launch]
+    if said[0] == "VIDEOS":
+        said[:1] = [word for word in videos(user_files) if word.partition(":=")[0] not in str(said[1:])]
+    result = sags("doctor", "--json", "device:=cpu", *said)
+    return result.exit_code, {check["name"]: check for check in pure_json(result.stdout)}
+
+
+@pytest.mark.parametrize("what", NAMED_IN_A_LAUNCH)
+def test_doctor_looks_at_all_that_a_launch_file_names(user_files: Path, what: str) -> None:
+    launch, row, said = NAMED_IN_A_LAUNCH[what]
+    code, checks = doctor(user_files, *launch)
+    assert code == 1 and checks[row]["level"] == "error"
+    assert said in checks[row]["found"]
+
+
+def test_doctor_asks_for_the_packages_that_a_launch_file_needs(
+    user_files: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sags_node.doctor.find_spec", lambda name: None)
+    code, checks = doctor(user_files, str(ROOT / "launch/ros2.yaml"))
+    assert code == 1 and "cyclonedds" in checks["source"]["found"] and "[ros2]" in checks["source"]["mend"]
+
+
+@pytest.mark.skipif(find_library("gstapp-1.0") is None, reason="GStreamer is not installed")
+def test_doctor_lets_gstreamer_read_the_launch_string(user_files: Path) -> None:
+    for launch, level, said in (
+        (("source.left:=nosuchsrc", "source.right:=videotestsrc"), "error", 'no element "nosuchsrc"'),
+        (("source.left:=videotestsrc pattern=nonsense", "source.right:=videotestsrc"), "error", "pattern"),
+        (("source.left:=videotestsrc", "source.right:=videotestsrc"), "ok", ""),
+    ):
+        code, checks = doctor(user_files, "source.kind:=gst", "rig:=FILES/calib", *launch)
+        assert (code, checks["source"]["level"]) == (int(level == "error"), level)
+        assert said in checks["source"]["found"]
+
+
+def test_doctor_is_content_with_a_launch_that_runs(user_files: Path) -> None:
+    code, checks = doctor(user_files, "VIDEOS")
+    assert code == 0 and checks["source"]["found"] == "12 frames of 320x256 px at 10 Hz"
+    assert checks["calibration"]["level"] == "ok"
 
 
 def test_a_table_for_another_program_is_not_cut(monkeypatch: pytest.MonkeyPatch) -> None:
