@@ -10,7 +10,7 @@ import json
 import os
 import stat
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
@@ -121,13 +121,32 @@ def check_file(file: Path, force: bool | None = None) -> None:
             return
         _refuse_others(file, file.stat().st_mode)
         file.open("r+b").close()
-        if force or _is_result(file):
+        if force or is_result(file):
             return
     remedy = "remove it" if force is None else "add --force"
     raise UsageError(f"{file} exists already and holds no earlier figures; choose another name, or {remedy}")
 
 
-def _is_result(file: Path) -> bool:
+def check_results(folder: Path, names: Sequence[str], ours: bool) -> None:
+    """`check_folder`, for results that have fixed names.
+
+    Args:
+        ours: what is there under these names is known to be of an earlier run, and may be replaced.
+
+    Raises:
+        UsageError: something else is there.
+        SagsError: the folder cannot be written to.
+    """
+    check_folder(folder)
+    there = [name for name in names if (folder / name).exists()]
+    if there and not ours:
+        raise UsageError(
+            f"{folder / there[0]} exists already and is no earlier result; choose another folder"
+        )
+
+
+def is_result(file: Path) -> bool:
+    """Whether this is an empty file, or figures that say where they come from."""
     size = file.stat().st_size
     try:
         return size == 0 or (size <= LARGEST_RESULT and "provenance" in json.loads(file.read_bytes()))

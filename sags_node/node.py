@@ -79,7 +79,7 @@ class Node:
             pipeline = Pipeline(config, rig, self._masks.nearest, self._offer_picture)
         else:
             pipeline = Pipeline(config, rig)
-        statistics = Statistics()
+        statistics = Statistics(config.source)
         views = Views(config.engine.backend, latency=lambda: statistics.latency_s)
         self._state = NodeState(config, pipeline, pipeline.make_budget(), views, statistics=statistics)
         self._operations = Operations(self._state, self._hand_over_view)

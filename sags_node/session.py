@@ -55,8 +55,7 @@ def open_session(
     if isinstance(config.source, PhantomSource):
         from sags_node.phantom import cached_session
 
-        folder = cached_session(config.source, progress)
-        rig = load_rig(config.rig or folder / "calib")
+        rig = load_rig(cached_session(config.source, progress) / "calib")
     else:
         rig = rig_of(config)
     source = open_posed(config, rig, references=False)

@@ -19,6 +19,7 @@ from tiny_archive import write_tiny_session
 from sags_node.calibration.hand_eye import HandEye, save_hand_eye
 from sags_node.cli.launching import write_json
 from sags_node.errors import SagsError
+from sags_node.export.lerobot import merge
 from sags_node.files import whole
 from sags_node.learning import onnx_file, training
 from sags_node.learning.material import Material
@@ -134,6 +135,14 @@ def a_video(disk: Path) -> None:
     output.close()
 
 
+def a_data_set(disk: Path) -> None:
+    pytest.importorskip("pyarrow", reason="the extra archive is not installed")
+    session, one = disk.parent / "session", disk.parent / "one"
+    write_tiny_session(session, seed=0)
+    assert sags("export", "--session", session, *SMALL, "--lerobot", one).exit_code == 0
+    merge([one], disk / "all", "v3.0")
+
+
 WRITERS: dict[str, Callable[[Path], Any]] = {
     "the node's model": lambda disk: write_ply(disk / "x.ply", random_gaussians(0, 1000, camera())),
     "a training's state": a_checkpoint,
@@ -141,16 +150,18 @@ WRITERS: dict[str, Callable[[Path], Any]] = {
     "the overlay's picture": a_still,
     "the overlay's video": a_video,
     "a hand-eye calibration": lambda disk: save_hand_eye(HandEye(np.eye(4)), disk / "rig", {}),
+    "a data set of many recordings": a_data_set,
     "a table": lambda disk: write_json(disk / "x.json", {}),
 }
 
 
+@pytest.mark.usefixtures("run_dir")
 @pytest.mark.parametrize("name", WRITERS)
 def test_a_writer_without_a_command_does_the_same(disk: Path, name: str) -> None:
     fill(disk, 0)
     with pytest.raises(SagsError, match=NO_SPACE):
         WRITERS[name](disk)
-    assert there(disk) <= {"rig"}
+    assert there(disk) <= {"rig", "all"}
 
 
 @pytest.mark.usefixtures("run_dir")

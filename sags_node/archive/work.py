@@ -21,7 +21,7 @@ from sags_node.archive.jobs import FIGURES, LOG, command, flat
 from sags_node.archive.launching import arguments, split
 from sags_node.archive.manifest import Recording
 from sags_node.archive.process import PROGRAM, Ended, Limits, run_limited
-from sags_node.archive.store import FAILED, Store
+from sags_node.archive.store import FAILED, RECORDINGS, Store
 from sags_node.benchmark.provenance import revision
 from sags_node.errors import SagsError, UsageError
 from sags_node.evaluation.machine import machine_name
@@ -144,6 +144,9 @@ def _work(recording: Recording, plan: Plan, key: str, program: Sequence[str]) ->
             raise _FailedError(
                 "refused" if ended.code == WRONG_REQUEST else "failed", _reason(ended, out / LOG)
             )
+        final = f"{plan.out.rstrip('/')}/{RECORDINGS}/{recording.id}"
+        for name in (FIGURES, LOG):  # they say where results are
+            (out / name).write_bytes((out / name).read_bytes().replace(os.fsencode(out), final.encode()))
         figures = flat(json.loads((out / FIGURES).read_bytes()))
         store.finish(recording.id, key, out, _row(recording, figures, plan, time.monotonic() - began))
     return int(figures.get("frames") or 0)

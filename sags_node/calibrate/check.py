@@ -106,7 +106,7 @@ def _launched(path: Path, overrides: Sequence[str]) -> LaunchConfig:
 
 def _rig_of(config: LaunchConfig, size: tuple[int, int] | None, metres: float | None) -> StereoRig:
     """The calibration that a session would use, not judged yet."""
-    if isinstance(config.source, PhantomSource) and config.rig is None:
+    if isinstance(config.source, PhantomSource):
         return read_rig(cached_session(config.source) / "calib")
     if config.rig is not None:
         return read_rig(config.rig, size, metres)

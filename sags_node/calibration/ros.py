@@ -110,6 +110,11 @@ class _Limited(gzip.GzipFile):
         return super().seek(offset, whence)
 
 
+def eye_files(folder: Path) -> tuple[Path, Path]:
+    """The files of a rig's folder."""
+    return folder / SIDES[0], folder / SIDES[1]
+
+
 def save_rig(rig: StereoRig, folder: Path) -> None:
     """Write `left.yaml` and `right.yaml`; the folder is made when it is missing.
 
@@ -117,7 +122,8 @@ def save_rig(rig: StereoRig, folder: Path) -> None:
         SagsError: they cannot be written. Both are as they were.
     """
     check_folder(folder)
-    with whole(folder / SIDES[0]) as left, whole(folder / SIDES[1]) as right:
+    left_file, right_file = eye_files(folder)
+    with whole(left_file) as left, whole(right_file) as right:
         left.write_text(eye_text(rig.left, "left"), encoding="utf-8")
         right.write_text(eye_text(rig.right, "right"), encoding="utf-8")
 

@@ -128,6 +128,11 @@ def record(
     """
     from datetime import datetime
 
+    if session is None and (stray := [said for said in overrides if ":=" not in said]):
+        named = " ".join(f"--topics {topic}" for topic in (*topics, *stray))
+        raise UsageError(
+            f"{' '.join(stray)}: topics are named so: {named}; without --topics all are recorded"
+        )
     if overrides and session is None:
         raise UsageError(f"{overrides[0]}: key:=value needs --session LAUNCH.yaml")
     if session is not None and (snapshot_mode is not None or from_stdin or seconds is not None or endpoint):

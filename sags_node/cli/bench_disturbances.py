@@ -11,6 +11,7 @@ from sags_node.cli.launching import (
     as_json,
     check_files,
     figures_option,
+    force_option,
     launch_argument,
     open_launched,
     positive,
@@ -18,7 +19,7 @@ from sags_node.cli.launching import (
     write_json,
 )
 from sags_node.errors import UsageError
-from sags_node.files import check_folder, whole
+from sags_node.files import whole
 from sags_node.terminal.console import progress, show
 
 
@@ -51,6 +52,7 @@ from sags_node.terminal.console import progress, show
     help="Write a PNG for each: both eyes as they came, the model and its depth, before, amid and after.",
 )
 @figures_option
+@force_option
 @as_json
 def bench_disturbances(
     launch: tuple[str, ...],
@@ -59,6 +61,7 @@ def bench_disturbances(
     seconds: float,
     pictures: Path | None,
     out: Path | None,
+    force: bool,
     json_out: bool,
 ) -> None:
     """What bad pictures do to the node.
@@ -95,9 +98,9 @@ def bench_disturbances(
     no_cameras = "sags bench disturbances plays recordings; record the cameras first"
     found = "vision.tissue.method:=classical"
     path, overrides = split_recording(launch, no_cameras)
-    check_files(out)
-    if pictures is not None:
-        check_folder(pictures)
+    names = only or tuple(DISTURBANCES)
+    drawn = [] if pictures is None else [pictures / f"{name}.png" for name in ("clean", *names)]
+    check_files(out, *drawn, force=force)
 
     def draw(name: str, shots: list[disturbances.Shot]) -> None:
         if pictures is not None:
@@ -106,8 +109,6 @@ def bench_disturbances(
 
     session = open_launched(path, [found, *overrides, "source.loop:=false", "source.pace:=step"])
     with progress("playing") as advance:
-        measured = disturbances.measure_disturbances(
-            session, only or tuple(DISTURBANCES), start, seconds, advance, draw
-        )
+        measured = disturbances.measure_disturbances(session, names, start, seconds, advance, draw)
     show(measured if json_out else disturbances_report.table(measured))
     write_json(out, measured)

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import click
 from rich.markup import escape
 
-from sags_node.cli.launching import as_json, force_option, launch_argument, positive, split
+from sags_node.cli.launching import as_json, check_files, force_option, launch_argument, positive, split
 from sags_node.errors import SagsError, UsageError
-from sags_node.files import check_file, check_folder, whole
+from sags_node.files import check_file, whole
 from sags_node.terminal import text
 from sags_node.terminal.console import console, progress, show
 
@@ -30,7 +30,7 @@ out_option = click.option(
     type=click.Path(path_type=Path),
     required=True,
     metavar="FOLDER",
-    help="Gets left.yaml and right.yaml; older ones are replaced.",
+    help="Gets left.yaml and right.yaml.",
 )
 
 
@@ -146,15 +146,21 @@ def check(
 @out_option
 @reading_options
 @click.option("--scale", type=positive, default=1.0, help="Of pictures that are resized after calibration.")
-def convert(path: Path, out: Path, size: tuple[int, int] | None, unit: str | None, scale: float) -> None:
+@force_option
+def convert(
+    path: Path, out: Path, size: tuple[int, int] | None, unit: str | None, scale: float, force: bool
+) -> None:
     """Write any known calibration as left.yaml and right.yaml.
 
     \b
     sags calib convert stereo_calib/ -o calib/mine --size 1280x720 --unit mm
     sags calib convert calibrationdata.tar.gz -o calib/mine
     """
-    from sags_node.calibration import check_rig, read_rig, refuse_errors, resized_rig, save_rig
+    from sags_node.calibration import check_rig, eye_files, read_rig, refuse_errors, resized_rig, save_rig
 
+    if path.resolve() in (file.resolve() for file in (out, *eye_files(out))):
+        raise UsageError(f"{out} is what is converted, and would be replaced; name another folder")
+    check_files(*eye_files(out), force=force)
     rig = resized_rig(read_rig(path, size, UNITS.get(unit or "")), scale)
     refuse_errors(check_rig(rig), path)
     save_rig(rig, out)
@@ -224,6 +230,7 @@ def look_at_eyes(launch: tuple[str, ...], seconds: float, out: Path, force: bool
 )
 @click.option("--views", type=click.IntRange(6), default=25, show_default=True, help="To take; --live only.")
 @out_option
+@force_option
 @as_json
 def stereo(
     folders: tuple[Path, ...],
@@ -232,6 +239,7 @@ def stereo(
     coefficients: str,
     views: int,
     out: Path,
+    force: bool,
     json_out: bool,
     **board_of: Any,
 ) -> None:
@@ -247,12 +255,12 @@ def stereo(
     sags calib stereo --live launch/v4l2.yaml --squares 10x7 --square-mm 4.5 -o calib/my_rig
     """
     from sags_node.calibrate.stereo import calibrate_folders, report_table, summarise
-    from sags_node.calibration import save_rig
+    from sags_node.calibration import eye_files, save_rig
 
     if (live is None) != (len(folders) == 2) or (live is not None and folders):
         raise UsageError("give two folders, LEFT_FOLDER RIGHT_FOLDER, or --live LAUNCH")
     board = _board(squares, **board_of)
-    check_folder(out)
+    check_files(*eye_files(out), force=force)
     left, right = folders if live is None else _grab(live, board, out / "views", views)
     with progress("looking for the board") as advance:
         calibrated = calibrate_folders(left, right, board, out.name, int(coefficients), advance)
@@ -273,14 +281,16 @@ def stereo(
     type=click.Path(path_type=Path),
     required=True,
     metavar="FOLDER",
-    help="The rig's folder; gets hand_eye.yaml, an older one is replaced.",
+    help="The rig's folder; gets hand_eye.yaml.",
 )
+@force_option
 @as_json
 def hand_eye(
     launch: tuple[str, ...],
     squares: tuple[int, int],
     views: int,
     out: Path,
+    force: bool,
     json_out: bool,
     **board_of: Any,
 ) -> None:
@@ -303,7 +313,7 @@ def hand_eye(
     path, overrides = split(launch)
     config = load_launch(path, overrides)
     board = _board(squares, **board_of)
-    check_folder(out)
+    check_files(out / FILE, force=force)
     with progress("looking for the board") as advance:
         solution = calibrate_hand_eye(config, rig_of(config), board, views, advance)
     summary = summarise_hand_eye(solution)

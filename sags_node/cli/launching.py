@@ -15,6 +15,7 @@ from sags_node.files import check_file, whole
 from sags_node.terminal.console import console, progress
 
 if TYPE_CHECKING:
+    from sags_node.config import Source
     from sags_node.engine.device import Device
     from sags_node.session import Session
 
@@ -74,17 +75,29 @@ def split_recording(arguments: Sequence[str], no_cameras: str) -> tuple[str | No
 
 
 def open_launched(path: str | None, overrides: Sequence[str]) -> Session:
-    """Open a session and make its kernels ready, saying what takes long and what it runs on."""
+    """Open a session and make its kernels ready; says what is played, what takes long and what it runs on."""
     from sags_node.mapping.devices import device_of
     from sags_node.session import open_session
     from sags_node.warm_up import warm_up
 
     with progress("rendering the phantom (once)") as advance:
         session = open_session(path, overrides, advance)
+    console.print(source_text(session.config.source), markup=False, soft_wrap=True)
     with console.status("loading kernels (compiled once per machine, about half a minute)"):
         warm_up(session.config)
     console.print(_runs_on(device_of(session.config)), soft_wrap=True)
     return session
+
+
+def source_text(source: Source) -> str:
+    """What is played, in a line."""
+    from sags_node.config import PhantomSource
+
+    if isinstance(source, PhantomSource):
+        return "source: the built-in phantom"
+    keys = ("left", "right", "launch", "video", "folder", "path", "endpoint")
+    said = [getattr(source, key, None) for key in keys]
+    return f"source: {source.kind} {', '.join(str(each) for each in said if isinstance(each, str | Path))}"
 
 
 def _runs_on(device: Device) -> str:

@@ -36,7 +36,6 @@ from sags_node.cli.topic import topic
 from sags_node.cli.train import train
 from sags_node.cli.view import view
 from sags_node.errors import SagsError, UsageError
-from sags_node.files import check_folder
 from sags_node.plotting import check_plots
 from sags_node.terminal import text
 from sags_node.terminal.console import console, interrupt, log_handler, progress, show
@@ -100,6 +99,8 @@ def main(verbose: bool, form: str) -> None:
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
         signal.signal(signal.SIGINT, interrupt)
     signal.signal(signal.SIGTERM, interrupt)  # a service manager's stop is a Ctrl-C
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # so is the end of the terminal, but for nohup
+        signal.signal(signal.SIGHUP, interrupt)
     console.quiet = form == "json"
     logging.basicConfig(level=level, format="%(message)s", handlers=[log_handler()])
 
@@ -158,13 +159,14 @@ def demo(launch: tuple[str, ...], seconds: float, out: Path, json_out: bool) -> 
     The node publishes over real sockets; `sags overlay` runs as its own process and consumes. The report
     shows input, render, depth and error side by side and figures over time. Default: the built-in phantom.
     """
-    from sags_node.demo import run_demo
+    from sags_node.demo import VIDEO, run_demo
+    from sags_node.evaluation.report import check_report
     from sags_node.session import open_session
 
     no_cameras = "sags demo plays recordings; for cameras use sags run and sags overlay"
     path, overrides = split_recording(launch, no_cameras)
     check_plots()
-    check_folder(out)
+    check_report(out, VIDEO)
     frames = count_frames(path, overrides, seconds)
     # Its own sockets and run directory, so that a demo does not meet a node that is already running.
     with tempfile.TemporaryDirectory(prefix="sags-demo-") as private:
@@ -175,8 +177,12 @@ def demo(launch: tuple[str, ...], seconds: float, out: Path, json_out: bool) -> 
             f"publish.run_dir:={private}",
         ]
         session = open_session(path, [*forced, *overrides])
-        with progress("playing") as advance:
-            outcome = run_demo(session, out, advance)
+        try:
+            with progress("playing") as advance:
+                outcome = run_demo(session, out, advance)
+        except BaseException:  # Ctrl-C, too: without its page nobody knows whose video it is
+            (out / VIDEO).unlink(missing_ok=True)
+            raise
     show(outcome.summary if json_out else outcome.table)
     console.print(f"report: [bold]{escape(str(outcome.report))}[/], overlay video beside it", soft_wrap=True)
 

@@ -16,12 +16,12 @@ from sags_node.cli.launching import (
     launch_argument,
     lpips_option,
     open_launched,
+    source_text,
     split,
     split_recording,
     write_json,
 )
 from sags_node.errors import UsageError
-from sags_node.files import check_folder
 from sags_node.plotting import check_plots
 from sags_node.terminal.console import console, progress, show
 
@@ -95,9 +95,10 @@ def evaluate(
         _evaluate_protocol(protocol, launch, iterations, lpips_weights, out)
         return
     from sags_node.evaluation.measure import Options
-    from sags_node.evaluation.report import summary_table, write_report
+    from sags_node.evaluation.report import check_report, summary_table, write_report
     from sags_node.evaluation.session import Pace
     from sags_node.evaluation.session import evaluate as measure
+    from sags_node.launch_file import load_launch
 
     path, overrides = split(launch)
     if warm_up is not None:
@@ -105,8 +106,9 @@ def evaluate(
     options = Options(hold_out, every, lpips_weights, paper_psnr)
     if report is not None:
         check_plots()
-        check_folder(report)
+        check_report(report)
     check_files(out)
+    console.print(source_text(load_launch(path, overrides).source), markup=False, soft_wrap=True)
     with progress("measuring") as advance:
         outcome = measure(
             path,
@@ -244,7 +246,7 @@ def fit(
     sags fit launch/d4d_pull.yaml --out out/d4d
     sags fit /data/endonerf/pulling_soft_tissues --schedule paper
     """
-    from sags_node.cli.fit_folder import figures_table, fit_session
+    from sags_node.cli.fit_folder import check_fit, figures_table, fit_session
     from sags_node.evaluation.measure import Options
     from sags_node.fitting.settings import MONOCULAR, PRESETS, with_changes
 
@@ -265,7 +267,7 @@ def fit(
     given: dict[str, Any] = {name: value for name, value in asked.items() if value is not None}
     settings = replace(settings, antialias=not no_alias_free, seed=seed, **given)
     settings = with_changes(settings, changes)
-    check_folder(out)
+    check_fit(out)
     session = open_launched(path, [*overrides, "source.loop:=false", "source.pace:=step"])
     with progress("fitting") as advance:
         found = fit_session(session, settings, options, out, resume, advance)

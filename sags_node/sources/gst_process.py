@@ -67,6 +67,7 @@ class GstProcess:
                 pass_fds=[there.fileno(), *keep],
                 stdin=subprocess.DEVNULL,
                 stderr=subprocess.PIPE,
+                process_group=0,  # a Ctrl-C in the terminal is the node's, which then ends it
                 env={"GST_DEBUG": "1", **os.environ, "GST_DEBUG_NO_COLOR": "1"},  # 1: errors
             )
         finally:

@@ -44,22 +44,36 @@ class _Json(logging.Formatter):
         return json.dumps(said)
 
 
+class _Lines(logging.Handler):
+    """The log for people, in the form of `tell`."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        try:
+            _print(f"{record.levelname.lower()}: {self.format(record)}")
+        except OSError:  # the terminal is gone: no reason to end a thread that logs
+            self.handleError(record)
+
+
 def log_handler() -> logging.Handler:
     """For people; where the console is quiet, for machines."""
-    if console.quiet:
-        handler = logging.StreamHandler()
-        handler.setFormatter(_Json())
-        return handler
-    from rich.logging import RichHandler  # --help needs none
-
-    return RichHandler(console=console, show_path=False)
+    if not console.quiet:
+        return _Lines()
+    handler = logging.StreamHandler()
+    handler.setFormatter(_Json())
+    return handler
 
 
 def tell(line: str) -> None:
     """Something that a person should know: a line, or an event in the log."""
     if console.quiet:
         log.warning("%s", line)
-    console.print(line, markup=False, soft_wrap=True)
+    _print(line)
+
+
+def _print(line: str) -> None:
+    """In a file with its time: nobody saw when it came."""
+    when = "" if console.is_terminal else datetime.now().astimezone().isoformat(" ", "seconds") + " "
+    console.print(when + line, markup=False, soft_wrap=True)
 
 
 @contextmanager
@@ -123,7 +137,7 @@ interrupt = _Interrupt()
 
 
 def on_stop_signals(stop: Callable[[], None]) -> None:
-    """Let Ctrl-C and a service manager's stop call this; a second one breaks off.
+    """Let Ctrl-C, a service manager's stop and the end of the terminal call this; a second one breaks off.
 
     For what runs until then: the exception that they raise otherwise is lost if it meets a finaliser.
     """
@@ -134,3 +148,5 @@ def on_stop_signals(stop: Callable[[], None]) -> None:
 
     signal.signal(signal.SIGINT, handle)
     signal.signal(signal.SIGTERM, handle)
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup
+        signal.signal(signal.SIGHUP, handle)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import logging
 import socket
 import subprocess
 import sys
 from collections.abc import Iterator
 from ctypes.util import find_library
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,8 @@ from user_files import videos
 
 from sags_node.cli.bench import bench
 from sags_node.cli.main import main
+from sags_node.evaluation.report import check_report
+from sags_node.terminal import console as terminal
 
 pytestmark = [pytest.mark.live, pytest.mark.usefixtures("run_dir")]
 
@@ -80,6 +84,32 @@ def test_no_command_overwrites_what_it_did_not_make(
     said = [str(phantom_session) if word in ("SESSION", "FOLDER") else word for word in command.split()]
     refused(2, *said, option, mine, said=(str(mine), "exists already", "choose another name"))
     assert mine.read_text() == "source: {kind: videos}"
+
+
+BOARD = ("--squares", "10x7", "--square-mm", "4.5")
+
+
+@pytest.mark.parametrize(
+    ("command", "option", "name"),
+    [
+        (("fit",), "--out", "model.ply"),
+        (("fit",), "--out", "figures.json"),
+        (("eval",), "--report", "report.html"),
+        (("eval",), "--report", "sheet.png"),
+        (("demo",), "--out", "overlay.mp4"),
+        (("calib", "convert", ROOT / "calib/d4d"), "--out", "left.yaml"),
+        (("calib", "stereo", "left", "right", *BOARD), "--out", "right.yaml"),
+        (("calib", "hand-eye", *BOARD), "--out", "hand_eye.yaml"),
+        (("bench", "disturbances"), "--pictures", "fog_left.png"),
+    ],
+)
+def test_no_command_overwrites_in_a_folder_what_it_did_not_make(
+    tmp_path: Path, command: tuple[Any, ...], option: str, name: str
+) -> None:
+    """Before any work."""
+    (tmp_path / name).write_text("mine")
+    refused(2, *command, option, tmp_path, said=(str(tmp_path / name), "exists already", "choose another"))
+    assert (tmp_path / name).read_text() == "mine"
 
 
 def test_every_command_spells_its_options_alike() -> None:
@@ -291,6 +321,7 @@ def test_demo_prints_nothing_but_json(user_files: Path, tmp_path: Path) -> None:
     summary = pure_json(result.stdout)
     assert summary["frames"] == 35 and summary["overlay"]["frames"] > 0
     assert {file.name for file in (tmp_path / "demo").iterdir()} >= {"report.html", "overlay.mp4"}
+    check_report(tmp_path / "demo", "overlay.mp4")  # the next one may replace it
 
 
 def test_torch_and_open3d_stay_out_of_the_start(user_files: Path) -> None:
@@ -305,3 +336,17 @@ def test_torch_and_open3d_stay_out_of_the_start(user_files: Path) -> None:
     )
     process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert process.stdout.splitlines()[-1] == "[]"
+
+
+def test_what_is_told_and_what_is_logged_are_one_line_each_in_one_form(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In a file each with its time, however long it is."""
+    monkeypatch.setenv("COLUMNS", "80")
+    handler, long = terminal.log_handler(), "no new picture of both for 2 s, [bold] " * 9
+    terminal.tell(f"warning: {long}")
+    handler.handle(logging.LogRecord("sags_node", logging.WARNING, "a.py", 1, "no new %s", (long,), None))
+    told, logged = capsys.readouterr().err.splitlines()
+    for line, said in ((told, f"warning: {long}"), (logged, f"warning: no new {long}")):
+        when, rest = line[:25], line[26:]
+        assert rest == said and datetime.fromisoformat(when).tzinfo is not None

@@ -150,6 +150,19 @@ def test_points_lie_on_the_surface_in_its_colours(
     assert np.abs(colors - picture.at(scene, points)).mean(axis=0).max() < 0.04
 
 
+@pytest.mark.parametrize("ending", [".ply", ".pcd", ".obj", ".stl"])
+def test_colours_beyond_white_are_white_and_nobody_says_so(
+    scene: Scene, tmp_path: Path, ending: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Live, the light of a moment ago leaves some."""
+    bright = replace(scene, gaussians=replace(scene.gaussians, colors=scene.gaussians.colors + np.float32(2)))
+    write = export_surface.write_points if ending == ".pcd" else export_surface.write_mesh
+    write(tmp_path / f"bright{ending}", bright)
+    assert capfd.readouterr() == ("", "")
+    if ending == ".pcd":
+        assert np.asarray(open3d.io.read_point_cloud(tmp_path / "bright.pcd").colors).min() == 1.0
+
+
 @pytest.mark.parametrize("ending", [".ply", ".obj", ".stl"])
 def test_the_mesh_is_the_true_surface(
     scene: Scene, truth: Truth, picture: Picture, tmp_path: Path, ending: str
