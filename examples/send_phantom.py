@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import itertools
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -77,7 +78,9 @@ def published(domain: int, name: str, infos: tuple[Eye, Eye], compressed: bool) 
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("way", choices=["push", "ros2"])
     parser.add_argument("--endpoint", default="tcp://127.0.0.1:5558")
     parser.add_argument("--pose-endpoint", help="also hand the scope's pose in there")
@@ -119,4 +122,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except KeyboardInterrupt:
+        sys.exit(130)  # as sags

@@ -47,12 +47,12 @@ def _by_protocol(own: Callable[..., None], protocol: str | None, **arguments: An
 
 
 def _with_lerobot(own: Callable[..., None], lerobot_version: Version, **arguments: Any) -> None:
-    from sags_node.export.played import PRODUCTS
+    from sags_node.export.played import KINDS, Kind
 
     def made(folder: Path, rate: float, size: tuple[int, int]) -> Any:
         from sags_lab.lerobot.dataset import LeRobot
 
         return LeRobot(folder, rate, lerobot_version)
 
-    PRODUCTS["lerobot"] = made
+    KINDS["lerobot"] = Kind(made, is_folder=True)
     own(**arguments)

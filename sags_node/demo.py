@@ -25,6 +25,7 @@ from sags_node.processes import end
 from sags_node.session import Session
 from sags_node.types import FrameResult
 
+VIDEO = "overlay.mp4"
 OVERLAY_START = 15.0  # s for the overlay to load its shapes and listen
 OVERLAY_GRACE = 15.0  # s for the overlay to write its video after the node has ended
 OVERLAY_STOP = 2.0  # s to do so when the demo is interrupted
@@ -61,7 +62,7 @@ def run_demo(session: Session, out: Path, progress: Callable[[int, int | None, s
             spool.add(result, frame_ms, time.monotonic_ns(), latency_ms, warnings)
 
         node = Node(session.config, session.rig, session.source, on_result=keep)
-        overlay = _start_overlay(session.config, seconds, out / "overlay.mp4")
+        overlay = _start_overlay(session.config, seconds, out / VIDEO)
         try:
             _await_overlay(session.config, overlay)
             node.start()
@@ -83,7 +84,7 @@ def _start_overlay(config: LaunchConfig, seconds: float, video: Path) -> subproc
     """The consumer is a process of its own, as it would be in a theatre."""
     command = [sys.executable, "-m", "sags_node", "overlay", "--ns", config.ns, "--repin"]
     command += ["--run-dir", str(config.publish.run_dir or default_run_dir())]
-    command += ["--seconds", f"{seconds:.1f}", "--save", str(video), "--json"]
+    command += ["--seconds", f"{seconds:.1f}", "--save", str(video), "--force", "--json"]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 

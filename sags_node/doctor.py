@@ -1,26 +1,55 @@
-"""`sags doctor`: is everything here that the node needs, and what would stand in its way."""
+"""`sags doctor`: is everything here that the node needs, and all that a launch file names."""
 
 from __future__ import annotations
 
 import ctypes
 import ctypes.util
+import getpass
 import glob
 import importlib.metadata
 import os
 import platform
 import socket
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass
+from importlib.util import find_spec
+from itertools import islice
 from pathlib import Path
 from typing import Literal
 
 from sags_node import host
-from sags_node.config import GstSource, LaunchConfig, PublishConfig
+from sags_node.calibration.hand_eye import read_hand_eye
+from sags_node.config import (
+    GstSource,
+    Guarded,
+    LaunchConfig,
+    OnnxConfig,
+    PhantomSource,
+    PublishConfig,
+    PushRobot,
+    PushSource,
+    RecordedSource,
+    Ros2Robot,
+    Ros2Source,
+    RosGraph,
+    V4l2Source,
+)
 from sags_node.engine.device import find_gpu, has_gpu
 from sags_node.errors import SagsError, UsageError
+from sags_node.importing.check import played
 from sags_node.kernels.cache import cache_root
 from sags_node.messaging.security import check_endpoint, read_allow_list, read_key_pair
-from sags_node.sources.gst_process import ELEMENTS, installed
+from sags_node.ros.graph import domain_of
+from sags_node.session import rig_of
+from sags_node.sources.gst import whole_launch
+from sags_node.sources.gst_process import ELEMENTS, check_launch, installed
+from sags_node.sources.layout import Layout
+from sags_node.sources.pictures import size_text
+from sags_node.sources.robot import hand_eye_file
+from sags_node.sources.source import open_source
+from sags_node.vision.onnx_session import OnnxSession
+from sags_node.vision.rectify import Rectifier
 
 Level = Literal["ok", "warning", "error"]
 REQUIRED = (
@@ -66,7 +95,88 @@ def examine(config: LaunchConfig) -> list[Check]:
         _cameras(),
         _gstreamer(config),
         _recordings(),
+        *_launched(config),
     ]
+
+
+def _launched(config: LaunchConfig) -> list[Check]:
+    """What the launch file names: pictures, calibration, the robot, networks."""
+    source, robot, vision = config.source, config.robot, config.vision
+    checks = []
+    if isinstance(source, RecordedSource) and not isinstance(source, PhantomSource):
+        checks += [Check("source", each.level, each.what, each.mend) for each in played(config)]
+    if isinstance(source, V4l2Source):
+        right = () if source.right is None or source.geometry.layout != "separate" else (source.right,)
+        checks += [_device(path) for path in (source.left, *right)]
+    if isinstance(source, GstSource):
+        checks.append(_tried("source", lambda: check_launch(whole_launch(source)[0]), "GStreamer takes it"))
+    for section, part in (("source", source), ("robot", robot)):
+        if isinstance(part, PushSource | PushRobot):
+            checks.append(_port(part.endpoint, part, section))
+        if isinstance(part, Ros2Source | Ros2Robot):
+            checks.append(_ros(section, part))
+    comes_with_pictures = isinstance(source, Ros2Source) and config.rig is None
+    if not (isinstance(source, PhantomSource) or comes_with_pictures):
+        readable = all(check.level != "error" for check in checks)
+        checks.append(_tried("calibration", lambda: _check_rig(config, readable), "can be used"))
+    if robot is not None:
+        checks.append(_tried("hand-eye", lambda: read_hand_eye(hand_eye_file(config)), "can be used"))
+    if vision.onnx.path is not None:
+        checks.append(_tried("depth network", lambda: OnnxSession(vision.onnx), "loads"))
+    if vision.tissue.method == "onnx":
+        tissue = OnnxConfig(path=vision.tissue.path)
+        checks.append(_tried("tissue network", lambda: OnnxSession(tissue, "vision.tissue"), "loads"))
+    return checks
+
+
+def _tried(name: str, look: Callable[[], object], found: str) -> Check:
+    try:
+        look()
+    except SagsError as error:
+        what, _, remedy = str(error).partition("; ")
+        return Check(name, "error", what, remedy)
+    return Check(name, "ok", found)
+
+
+def _check_rig(config: LaunchConfig, readable: bool) -> None:
+    """Read the calibration. Where the pictures' size is known without a camera, compare it.
+
+    Args:
+        readable: the pictures of a recording are.
+
+    Raises:
+        SagsError: it cannot be used.
+    """
+    rig, source = rig_of(config), config.source
+    if isinstance(source, RecordedSource) and readable:
+        with open_source(source.model_copy(update={"pace": "step"}), references=False) as opened:
+            for frame in islice(opened, 1):
+                Rectifier(rig, rig.left.width, rig.left.height)(frame)
+    if isinstance(source, V4l2Source):
+        size = Layout(source.geometry).size(source.width, source.height, source.left)
+        if size != (rig.left.width, rig.left.height):
+            raise UsageError(
+                f"{config.rig} is for {size_text(rig.left.width, rig.left.height)} px, an eye's pictures are "
+                f"{size_text(*size)}; set source.width, source.height or source.geometry, or calibrate anew"
+            )
+
+
+def _device(path: str) -> Check:
+    if not os.path.exists(path):
+        return Check(path, "error", "no such camera", "plug it in, or name another one: ls /dev/video*")
+    if not os.access(path, os.R_OK | os.W_OK):
+        return Check(path, "error", "this user may not use it", f"sudo usermod -aG video {getpass.getuser()}")
+    return Check(path, "ok", "is there")
+
+
+def _ros(section: str, config: RosGraph) -> Check:
+    if find_spec("cyclonedds") is None:
+        return Check(section, "error", "cyclonedds is not installed", "pip install 'sags-node[ros2]'")
+    there = sorted(each.name for each in Path("/sys/class/net").iterdir())
+    if config.interface not in there:
+        remedy = f"set {section}.interface to one of {', '.join(there)}"
+        return Check(section, "error", f"there is no network interface {config.interface}", remedy)
+    return Check(section, "ok", f"ROS 2 over {config.interface}, domain {domain_of(config)}")
 
 
 def as_rows(checks: list[Check]) -> list[dict[str, str]]:
@@ -171,9 +281,9 @@ def _ports(config: PublishConfig) -> list[Check]:
     return [_port(endpoint, config) for endpoint in endpoints]
 
 
-def _port(endpoint: str, config: PublishConfig) -> Check:
+def _port(endpoint: str, config: Guarded, section: str = "publish") -> Check:
     try:
-        check_endpoint(endpoint, config)
+        check_endpoint(endpoint, config, section)
     except UsageError as error:
         return Check(endpoint, "error", "cannot be used", str(error))
     address, _, port = endpoint.removeprefix("tcp://").rpartition(":")
@@ -185,7 +295,8 @@ def _port(endpoint: str, config: PublishConfig) -> Check:
             probe.bind((address.replace("*", ""), int(port)))
             return Check(endpoint, "ok", "free")
         except (OSError, ValueError, OverflowError) as error:  # taken, not a number, not a port
-            mend = "stop the other node, or set publish.data and publish.control to other ports"
+            keys = "publish.data and publish.control" if section == "publish" else f"{section}.endpoint"
+            mend = f"stop the other node, or set {keys} to another port"
             return Check(endpoint, "warning", str(error), mend)
 
 
@@ -237,7 +348,7 @@ def _running() -> set[str]:
 def _cameras() -> Check:
     devices = sorted(glob.glob("/dev/video*"))
     if not devices:
-        return Check("cameras", "ok", "none (replay needs none)")
+        return Check("cameras", "ok", "none")
     return Check("cameras", "ok", ", ".join(devices))
 
 

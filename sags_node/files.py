@@ -1,13 +1,23 @@
-"""Files that others made: only plain ones are opened. A pipe or a device would make the reader wait."""
+"""Files that others made: only plain ones are opened. A pipe or a device would make the reader wait.
+
+Files that we make: each appears when all of it is there, and takes the place of nothing but our own results.
+"""
 
 from __future__ import annotations
 
 import errno
+import json
 import os
 import stat
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
+from sags_node.errors import SagsError, UsageError
+
+LARGEST_RESULT = 64 << 20  # bytes of figures as JSON
 _KINDS = (
     (stat.S_ISDIR, "it is a folder"),
     (stat.S_ISFIFO, "it is a pipe, no file"),
@@ -50,3 +60,95 @@ def _refuse_others(path: Path, mode: int) -> None:
     if not stat.S_ISREG(mode):
         what = next((said for is_kind, said in _KINDS if is_kind(mode)), "it is no file")
         raise OSError(errno.EINVAL, what, str(path))
+
+
+# ---- writing ---------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def writing(target: Path) -> Iterator[None]:
+    """A full disk or missing rights become one message.
+
+    Raises:
+        SagsError: the block raised an `OSError`.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise SagsError(f"cannot write {target}: {error.strerror or error}; name another place") from None
+
+
+@contextmanager
+def whole(path: Path) -> Iterator[Path]:
+    """A place on the same disk to write a file or folder to. When nothing went wrong it becomes `path`; else
+    nothing of it is left, and what stood at `path` stays.
+
+    Raises:
+        SagsError: it cannot be written.
+    """
+    target = path.resolve()  # through a link, not over it
+    with writing(path), tempfile.TemporaryDirectory(prefix=".sags-", dir=target.parent) as passing:
+        partial = Path(passing) / path.name
+        yield partial
+        partial.replace(target)
+
+
+def check_folder(folder: Path) -> None:
+    """Make the folder, and be sure that a file can be made in it.
+
+    Raises:
+        SagsError: it cannot.
+    """
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+
+
+def check_file(file: Path, force: bool | None = None) -> None:
+    """Be sure that this file can be written, without touching it.
+
+    Args:
+        force: it may take the place of any file. Else only of an empty one, and of earlier figures: JSON that
+            says under `provenance` where it comes from. None: the command has no option --force.
+
+    Raises:
+        UsageError: another file is there.
+        SagsError: it cannot be written.
+    """
+    check_folder(file.parent)
+    with writing(file):
+        if not file.exists():
+            return
+        _refuse_others(file, file.stat().st_mode)
+        file.open("r+b").close()
+        if force or is_result(file):
+            return
+    remedy = "remove it" if force is None else "add --force"
+    raise UsageError(f"{file} exists already and holds no earlier figures; choose another name, or {remedy}")
+
+
+def check_results(folder: Path, names: Sequence[str], ours: bool) -> None:
+    """`check_folder`, for results that have fixed names.
+
+    Args:
+        ours: what is there under these names is known to be of an earlier run, and may be replaced.
+
+    Raises:
+        UsageError: something else is there.
+        SagsError: the folder cannot be written to.
+    """
+    check_folder(folder)
+    there = [name for name in names if (folder / name).exists()]
+    if there and not ours:
+        raise UsageError(
+            f"{folder / there[0]} exists already and is no earlier result; choose another folder"
+        )
+
+
+def is_result(file: Path) -> bool:
+    """Whether this is an empty file, or figures that say where they come from."""
+    size = file.stat().st_size
+    try:
+        return size == 0 or (size <= LARGEST_RESULT and "provenance" in json.loads(file.read_bytes()))
+    except (ValueError, TypeError):  # no JSON, or a single number
+        return False

@@ -11,7 +11,7 @@ from statistics import median
 
 import numpy as np
 
-from sags_node.config import MappingConfig
+from sags_node.config import MappingConfig, PushSource, RecordedSource, Ros2Source, Source
 from sags_node.findings import Findings, by_code, by_stage
 from sags_node.processes import resident_mb
 from sags_node.types import ClockStatus, Finding, FrameResult, MotionState, NodeHealth, RungState, ViewStatus
@@ -46,9 +46,14 @@ def why_missed(mapping: MappingConfig, rate: float | None) -> str:
 
 
 class Statistics:
-    """What the last frames tell of rate, latency and cost."""
+    """What the last frames tell of rate, latency and cost.
 
-    def __init__(self) -> None:
+    Args:
+        source: where they come from.
+    """
+
+    def __init__(self, source: Source | None = None) -> None:
+        self._nothing_comes, self._too_few_come = _remedies(source)
         self._lock = threading.Lock()
         self._published: deque[float] = deque(maxlen=WINDOW)
         self._taken_in = -inf  # when a frame was published that was
@@ -147,11 +152,10 @@ class Statistics:
         found = []
         if state == "waiting":
             said = f"no frame for {now - self._published[-1]:.0f} s" if self._published else "no frame comes"
-            mend = "see to the camera, its cable and the capture card"
-            found.append(Finding("no_frames", f"{said}: {mend}"))
+            found.append(Finding("no_frames", f"{said}: {self._nothing_comes}"))
         if self._leaves_out_too_many("source"):
-            mend = "is one camera away, source.pair_tolerance_ms too small, or the disk slow?"
-            found.append(Finding("source_drops", f"the source leaves out over a tenth of its frames: {mend}"))
+            said = "the source leaves out over a tenth of its frames"
+            found.append(Finding("source_drops", f"{said}: {self._too_few_come}"))
         if self._leaves_out_too_many("capture"):
             found.append(Finding("frames_missed", f"over a tenth of the frames is left out, as {missed}"))
         return found
@@ -162,6 +166,24 @@ class Statistics:
             limit = MOST_LEFT_OUT * (BACK_AT if slot in self._too_many else 1.0)
             (self._too_many.add if count > limit * (count + WINDOW - 1) else self._too_many.discard)(slot)
         return slot in self._too_many
+
+
+def _remedies(source: Source | None) -> tuple[str, str]:
+    """What helps where no frame comes, and where over a tenth is left out."""
+    match source:
+        case PushSource():
+            what = f"start the sender at {source.endpoint}"
+        case Ros2Source():
+            what = f"start what publishes {source.left} and {source.right}"
+        case RecordedSource():
+            return "is the disk slow?", "is the disk slow?"
+        case _:
+            what = "check the camera, its cable and the capture card"
+            return what, "is one camera away, or source.pair_tolerance_ms too small?"
+    return (
+        what,
+        "do the pictures of both eyes come, with stamps no further apart than source.pair_tolerance_ms?",
+    )
 
 
 def in_a_line(health: NodeHealth) -> str:

@@ -11,12 +11,13 @@ from typing import Any, get_args
 
 from pydantic import ValidationError
 
-from sags_node.config import LaunchConfig, LiveSource, Section, Source
+from sags_node.config import LaunchConfig, LiveSource, PhantomSource, Section, Source
 from sags_node.errors import UsageError, brief
 from sags_node.files import open_file
 from sags_node.yaml_reader import parse_yaml, read_yaml
 
 MOST_MISTAKES = 10  # named at once
+COMMAND_LINE = "command line"
 DEFAULT_DATA = "../shared/data"
 BAG_SUFFIXES = (".mcap", ".db3", ".bag")
 VIDEO_SUFFIXES = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".ts", ".wmv")
@@ -54,10 +55,11 @@ def load_launch(path: Path | str | None = None, overrides: Sequence[str] = ()) -
     `path=None` gives the defaults: the built-in phantom session.
 
     Raises:
-        UsageError: the file is missing, is not YAML, or holds an unknown key or a wrong value.
+        UsageError: the file is missing, is not YAML, or holds an unknown key or a wrong value; or there is a
+            calibration for the phantom, which is played where no source is named.
     """
     tree: dict[str, Any] = {"source": {"kind": "phantom"}}
-    name = "defaults"
+    name = COMMAND_LINE
     if path is not None:
         file = Path(path)
         recording = known_recording(file)
@@ -80,7 +82,13 @@ def load_launch(path: Path | str | None = None, overrides: Sequence[str] = ()) -
     try:
         config = LaunchConfig.model_validate(tree)
     except ValidationError as error:
-        raise UsageError(_explain(error, name)) from None
+        given = [override.partition(":=")[0] for override in overrides]
+        raise UsageError(_explain(error, name, given)) from None
+    if isinstance(config.source, PhantomSource) and config.rig is not None:
+        raise UsageError(
+            f"rig: the built-in phantom brings its own calibration; name the launch file or recording that "
+            f"{config.rig} is of, or leave rig out"
+        )
     if config.one_camera and config.vision.onnx.path is None:
         raise UsageError(
             f"{name}: source.right is missing: name the right eye's pictures. With one camera alone depth "
@@ -188,24 +196,31 @@ def _set(tree: dict[str, Any], key: str, value: Any, said: str) -> None:
     node[leaf] = value
 
 
-def _explain(error: ValidationError, name: str) -> str:
-    """One line per mistake: where, what, and the nearest known key for an unknown one."""
+def _explain(error: ValidationError, name: str, given: Sequence[str] = ()) -> str:
+    """One line per mistake: where, what, and the nearest known key for an unknown one.
+
+    Args:
+        name: of what was read.
+        given: keys that were said on the command line instead.
+    """
     lines = []
     mistakes = error.errors()
     for item in mistakes[:MOST_MISTAKES]:
         path = [str(part) for part in item["loc"]]
         where = ".".join(part for part in path if part not in _SOURCES)
+        said = COMMAND_LINE if any(f"{where}.".startswith(f"{key}.") for key in given) else name
         if item["type"] == "extra_forbidden":
-            lines.append(f"{name}: unknown key '{where}'; {_nearest(path)}")
+            lines.append(f"{said}: unknown key '{where}'; {_nearest(path)}")
         elif item["type"] == "missing":
-            lines.append(f"{name}: {where} is missing; set it")
+            lines.append(f"{said}: {where} is missing; set it")
         elif item["type"] in ("union_tag_invalid", "union_tag_not_found"):
             kinds = ", ".join(repr(kind) for kind in _SOURCES)
             got = brief(item["input"].get("kind"))
-            lines.append(f"{name}: source.kind: should be one of {kinds} (got {got})")
+            said = COMMAND_LINE if "source.kind" in given else name
+            lines.append(f"{said}: source.kind: should be one of {kinds} (got {got})")
         else:
             what = _PLAIN.get(item["type"], item["msg"])
-            lines.append(f"{name}: {where or 'launch file'}: {what} (got {brief(item.get('input'))})")
+            lines.append(f"{said}: {where or 'launch file'}: {what} (got {brief(item.get('input'))})")
     if len(mistakes) > MOST_MISTAKES:
         lines.append(f"{name}: and {len(mistakes) - MOST_MISTAKES} more")
     return "\n".join(lines)

@@ -84,7 +84,7 @@ class Node:
             pipeline = Pipeline(config, rig, self._masks.nearest, self._offer_picture, rate=rate)
         else:
             pipeline = Pipeline(config, rig, rate=rate)
-        statistics = Statistics()
+        statistics = Statistics(config.source)
         self._allowance = Allowance()
         views = Views(config.engine.backend, self._allowance, latency=lambda: statistics.latency_s)
         self._state = NodeState(config, pipeline, pipeline.make_budget(), views, statistics=statistics)

@@ -55,8 +55,7 @@ def open_session(
     if isinstance(config.source, PhantomSource):
         from sags_node.phantom import cached_session
 
-        folder = cached_session(config.source, progress)
-        rig = load_rig(config.rig or folder / "calib")
+        rig = load_rig(cached_session(config.source, progress) / "calib")
     else:
         rig = rig_of(config)
     source = open_posed(config, rig, references=False)
@@ -94,7 +93,8 @@ def rig_of(config: LaunchConfig) -> StereoRig:
         return recorded
     if config.rig is None:
         raise UsageError(
-            "no calibration: set rig to a folder with left.yaml and right.yaml, e.g. rig:=calib/d4d"
+            "no calibration: set rig to the folder with left.yaml and right.yaml of this scope; "
+            "docs/calibration.md says how to make one"
         )
     if config.one_camera and not config.rig.is_dir():
         return load_camera(config.rig)

@@ -248,7 +248,7 @@ def test_a_video_that_cannot_be_written_is_one_message(
 ) -> None:
     monkeypatch.delenv("OPENCV_FFMPEG_LOGLEVEL", raising=False)
     output = Output(tmp_path / "video.mp4")
-    with pytest.raises(SagsError, match=r"video\.mp4: the video cannot be written"):
+    with pytest.raises(SagsError, match=r"video\.mp4: 9000x8000 px cannot be encoded"):
         for _ in range(10):
             output.add(np.zeros((8000, 9000, 3), np.uint8), True, period=1 / 30)
     assert capfd.readouterr() == ("", "")

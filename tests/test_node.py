@@ -177,11 +177,11 @@ def test_a_killed_node_goes_stale_and_reads_fail(phantom_session: Path, tmp_path
 
 
 @pytest.mark.fault(
-    "process: Ctrl-C or SIGTERM to the node",
+    "process: Ctrl-C, SIGTERM or SIGHUP to the node",
     says="exit code 0",
     left="no connection file",
 )
-@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_stopping_is_clean(phantom_session: Path, tmp_path: Path, stop: signal.Signals) -> None:
     running = RunningNode(phantom_session, tmp_path)
     time.sleep(1.0)

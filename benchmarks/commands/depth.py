@@ -9,16 +9,18 @@ import click
 from sags_node.cli.launching import (
     as_json,
     check_files,
+    figures_option,
     file_option,
+    force_option,
     launch_argument,
     open_launched,
     split_recording,
-    table_option,
     write_json,
 )
 from sags_node.errors import UsageError
+from sags_node.files import whole
 from sags_node.plotting import check_plots
-from sags_node.terminal.console import progress, show, writing
+from sags_node.terminal.console import progress, show
 
 FAULT_SIZE = (640, 512)  # px
 FAULT_FRAMES = 4
@@ -44,9 +46,12 @@ FAULT_FRAMES = 4
     metavar="FILE.onnx",
     help="A depth network to compare as well.",
 )
-@table_option
-@file_option("--picture", "FILE.jpg", "With --ct: draw the left picture, the depth and its error.")
-@file_option("--plot", "FILE.png", "Draw the errors over run time; not with --faults or --eyes.")
+@figures_option
+@file_option(
+    "--picture", metavar="FILE.jpg", help="With --ct: draw the left picture, the depth and its error."
+)
+@file_option("--plot", metavar="FILE.png", help="Draw the errors over run time; not with --faults or --eyes.")
+@force_option
 @as_json
 def bench_depth(
     launch: tuple[str, ...],
@@ -57,6 +62,7 @@ def bench_depth(
     out: Path | None,
     picture: Path | None,
     plot: Path | None,
+    force: bool,
     json_out: bool,
 ) -> None:
     """How right the depth is, and how much there is of it.
@@ -90,14 +96,14 @@ def bench_depth(
         if faults or eyes:
             raise UsageError("--plot draws errors of one scene; leave --faults and --eyes out")
         check_plots()
-    check_files(out, picture, plot)
+    check_files(out, picture, plot, force=force)
     if ct is not None:
         pair = depth_ct.read_ct_pair(ct)
         with progress("measuring") as advance:
             measured = depth_ct.measure_ct(pair, advance, network)
         if picture is not None:
-            with writing(picture):
-                picture.write_bytes(depth_ct.picture(pair))
+            with whole(picture) as partial:
+                partial.write_bytes(depth_ct.picture(pair))
     elif faults:
         with progress("measuring") as advance:
             measured = depth.measure_faults(FAULT_SIZE, FAULT_FRAMES, depth.FAULTS, advance, network)
@@ -109,8 +115,8 @@ def bench_depth(
             measure = depth_eyes.measure_eyes if eyes else depth.measure_recording
             measured = measure(session, advance, network=network)
     if plot is not None:
-        with writing(plot):
-            plot.write_bytes(depth_plot.picture(measured))
+        with whole(plot) as partial:
+            partial.write_bytes(depth_plot.picture(measured))
     for table in [measured] if json_out else depth_report.tables(measured):
         show(table)
     write_json(out, measured)

@@ -8,7 +8,10 @@ from pathlib import Path
 import click
 
 from sags_node.cli.launching import (
+    as_json,
     check_files,
+    figures_option,
+    force_option,
     launch_argument,
     open_launched,
     positive,
@@ -16,7 +19,8 @@ from sags_node.cli.launching import (
     write_json,
 )
 from sags_node.errors import UsageError
-from sags_node.terminal.console import check_folder, progress, show, writing
+from sags_node.files import whole
+from sags_node.terminal.console import progress, show
 
 
 @click.command("disturbances")
@@ -47,14 +51,18 @@ from sags_node.terminal.console import check_folder, progress, show, writing
     metavar="DIR",
     help="Write a PNG for each: both eyes as they came, the model and its depth, before, amid and after.",
 )
-@click.option("--json", "json_out", metavar="FILE", help="Write the table as JSON to FILE, - for stdout.")
+@figures_option
+@force_option
+@as_json
 def bench_disturbances(
     launch: tuple[str, ...],
     only: tuple[str, ...],
     start: int | None,
     seconds: float,
     pictures: Path | None,
-    json_out: str | None,
+    out: Path | None,
+    force: bool,
+    json_out: bool,
 ) -> None:
     """What bad pictures do to the node.
 
@@ -77,7 +85,7 @@ def bench_disturbances(
     Takes ten to thirty seconds each. Keys: benchmarks/disturbances.md.
 
     \b
-    python -m benchmarks disturbances launch/d4d_pull.yaml --json new.json --pictures out/disturbances
+    python -m benchmarks disturbances launch/d4d_pull.yaml --out new.json --pictures out/disturbances
     python -m benchmarks disturbances --only fog_right --only late_right
     """
     from benchmarks.disturbances import DISTURBANCES
@@ -90,20 +98,17 @@ def bench_disturbances(
     no_cameras = "benchmarks disturbances plays recordings; record the cameras first"
     found = "vision.tissue.method:=classical"
     path, overrides = split_recording(launch, no_cameras)
-    file = Path(json_out) if json_out is not None and json_out != "-" else None
-    check_files(file)
-    if pictures is not None:
-        check_folder(pictures)
+    names = only or tuple(DISTURBANCES)
+    drawn = [] if pictures is None else [pictures / f"{name}.png" for name in ("clean", *names)]
+    check_files(out, *drawn, force=force)
 
     def draw(name: str, shots: list[disturbances.Shot]) -> None:
         if pictures is not None:
-            with writing(pictures):
-                (pictures / f"{name}.png").write_bytes(disturbances_report.strip(shots))
+            with whole(pictures / f"{name}.png") as file:
+                file.write_bytes(disturbances_report.strip(shots))
 
     session = open_launched(path, [found, *overrides, "source.loop:=false", "source.pace:=step"])
     with progress("playing") as advance:
-        measured = disturbances.measure_disturbances(
-            session, only or tuple(DISTURBANCES), start, seconds, advance, draw
-        )
-    show(measured if json_out == "-" else disturbances_report.table(measured))
-    write_json(file, measured)
+        measured = disturbances.measure_disturbances(session, names, start, seconds, advance, draw)
+    show(measured if json_out else disturbances_report.table(measured))
+    write_json(out, measured)

@@ -13,18 +13,20 @@ from sags_node.cli.launching import (
     as_json,
     check_files,
     count_frames,
+    figures_option,
     file_option,
+    force_option,
     launch_argument,
     lpips_option,
     open_launched,
     positive,
     split_recording,
-    table_option,
     write_json,
 )
 from sags_node.errors import SagsError, UsageError
+from sags_node.files import whole
 from sags_node.plotting import check_plots
-from sags_node.terminal.console import progress, show, writing
+from sags_node.terminal.console import progress, show
 
 
 @click.command("kernels")
@@ -39,9 +41,11 @@ from sags_node.terminal.console import progress, show, writing
 @click.option("--large", is_flag=True, help="Also a million Gaussians.")
 @click.option("--contention", is_flag=True, help="Also beside another process that burns one core.")
 @click.option("--no-twin", is_flag=True, help="Leave out the torch twins (most of the time, 10 GB).")
-@file_option("--out", "FILE.json", "Write the table as JSON, and a plot of the same name, .svg, beside it.")
+@figures_option
 @file_option(
-    "--check", "FILE.json", "Compare with a table written by --out; fail if a kernel has become slower."
+    "--check",
+    metavar="FILE.json",
+    help="Compare with a table written by --out; fail if a kernel has become slower.",
 )
 @click.option(
     "--tolerance",
@@ -51,7 +55,9 @@ from sags_node.terminal.console import progress, show, writing
     help="How many times slower than in --check's table is too slow.",
 )
 @file_option(
-    "--yardstick", "FILE.cpp", "Only compare the rasteriser with this C++ program, call by call; needs g++."
+    "--yardstick",
+    metavar="FILE.cpp",
+    help="Only compare the rasteriser with this C++ program, call by call; needs g++.",
 )
 @as_json
 def bench_kernels(
@@ -67,6 +73,8 @@ def bench_kernels(
     json_out: bool,
 ) -> None:
     """Time every kernel of the engine beside the machine's peak.
+
+    --out leaves a plot of the same name beside the figures, .svg.
 
     Milliseconds per stage, pixel-Gaussian pairs per second, the share of the machine's peak (multiply-adds or
     memory, whichever binds; both measured in the same run), the gain over the plain torch twin, how it scales
@@ -100,18 +108,21 @@ def bench_kernels(
         _device_kernels(quick, checks) if on_gpu else _kernels(quick, large, contention, no_twin, checks)
     )
     if check is None:
+        drawn = None if out is None else out.with_suffix(".svg")
         check_files(out)
         if out is not None:
             check_plots()
+            if not out.exists():  # else it is the earlier figures' plot
+                check_files(drawn)
         with progress("measuring") as advance:
             measured = measure(advance)
         reporter = device_report if on_gpu else report
         for table in [measured] if json_out else reporter.tables(measured):
             show(table)
         write_json(out, measured)
-        if out is not None:
-            with writing(out):
-                out.with_suffix(".svg").write_text(reporter.plot(measured), encoding="utf-8")
+        if drawn is not None:
+            with whole(drawn) as partial:
+                partial.write_text(reporter.plot(measured), encoding="utf-8")
         return
     kept = guard.read_table(check)
     with progress("measuring") as advance:
@@ -172,10 +183,11 @@ def _compare_with(yardstick: Path, quick: bool, out: Path | None, json_out: bool
 
 @click.command("alias")
 @click.option("--quick", is_flag=True, help="A tiny scene and few steps: does it work, not how good is it.")
-@table_option
-@file_option("--picture", "FILE.png", "Draw the truth, both filters and none side by side.")
+@figures_option
+@file_option("--picture", metavar="FILE.png", help="Draw the truth, both filters and none side by side.")
+@force_option
 @as_json
-def bench_alias(quick: bool, out: Path | None, picture: Path | None, json_out: bool) -> None:
+def bench_alias(quick: bool, out: Path | None, picture: Path | None, force: bool, json_out: bool) -> None:
     """What both filters are worth at other sizes and distances.
 
     Four models of one instant of the phantom, with each choice of filters, are drawn at 1/4 to 4 times the
@@ -188,15 +200,15 @@ def bench_alias(quick: bool, out: Path | None, picture: Path | None, json_out: b
     from benchmarks.quality import alias_report
     from benchmarks.quality.alias import QUICK, Settings, measure_alias
 
-    check_files(out, picture)
+    check_files(out, picture, force=force)
     with progress("measuring") as advance:
         measured = measure_alias(QUICK if quick else Settings(), advance)
     for table in [measured.table] if json_out else alias_report.tables(measured.table):
         show(table)
     write_json(out, measured.table)
     if picture is not None:
-        with writing(picture):
-            picture.write_bytes(alias_report.picture(measured.truth, measured.models))
+        with whole(picture) as partial:
+            partial.write_bytes(alias_report.picture(measured.truth, measured.models))
 
 
 @click.command("stream")
@@ -210,7 +222,7 @@ def bench_alias(quick: bool, out: Path | None, picture: Path | None, json_out: b
 )
 @click.option("--window", type=positive, default=2.0, show_default=True, help="Seconds the model looks back.")
 @click.option("--quick", is_flag=True, help="A tiny model: does it work, not how good is it.")
-@table_option
+@figures_option
 @as_json
 def bench_stream(
     launch: tuple[str, ...], seconds: float, window: float, quick: bool, out: Path | None, json_out: bool
@@ -264,7 +276,7 @@ def bench_stream(
     "--set", "changes", multiple=True, metavar="KEY=VALUE", help="A setting of every variant, as in sags fit."
 )
 @lpips_option
-@table_option
+@figures_option
 @as_json
 def bench_ablation(
     launch: tuple[str, ...],

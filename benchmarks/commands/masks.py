@@ -9,9 +9,9 @@ import click
 from sags_node.cli.launching import (
     as_json,
     check_files,
+    figures_option,
     open_launched,
     split_recording,
-    table_option,
     write_json,
 )
 from sags_node.terminal.console import progress, show
@@ -19,7 +19,7 @@ from sags_node.terminal.console import progress, show
 
 @click.command("masks")
 @click.argument("launch", nargs=-1, metavar="[LAUNCH.yaml | SESSION]... [key:=value ...]")
-@table_option
+@figures_option
 @as_json
 def bench_masks(launch: tuple[str, ...], out: Path | None, json_out: bool) -> None:
     """How right masks are that were found, and what they bring.

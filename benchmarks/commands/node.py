@@ -10,17 +10,19 @@ import click
 from sags_node.cli.launching import (
     as_json,
     check_files,
+    figures_option,
     file_option,
+    force_option,
     launch_argument,
     open_launched,
     positive,
     split_recording,
-    table_option,
     write_json,
 )
 from sags_node.errors import SagsError, UsageError
+from sags_node.files import whole
 from sags_node.plotting import check_plots
-from sags_node.terminal.console import progress, show, writing
+from sags_node.terminal.console import progress, show
 
 if TYPE_CHECKING:
     from benchmarks.node.endurance import Order
@@ -50,8 +52,9 @@ if TYPE_CHECKING:
     metavar="FILE.json",
     help="Figures of sags fit, for the session they name. Default: benchmarks/results/fit_*.json.",
 )
-@table_option
-@file_option("--plot", "FILE.png", "Draw the picture's quality over the time of a frame.")
+@figures_option
+@file_option("--plot", metavar="FILE.png", help="Draw the picture's quality over the time of a frame.")
+@force_option
 @as_json
 def bench_pareto(
     launch: tuple[str, ...],
@@ -61,6 +64,7 @@ def bench_pareto(
     fits: tuple[Path, ...],
     out: Path | None,
     plot: Path | None,
+    force: bool,
     json_out: bool,
 ) -> None:
     """Run time against error of the online mapper.
@@ -96,7 +100,7 @@ def bench_pareto(
     paths = [split_recording(arguments, no_cameras)[0] for arguments in alone]
     sweep = Sweep(PARTS if only is None else tuple(only.split(",")), repeat)
     known_fits = read_fits(fits or sorted(Path("benchmarks/results").glob("fit_*.json")))
-    check_files(out, plot)
+    check_files(out, plot, force=force)
     if plot is not None:
         check_plots()
     with progress("measuring") as advance:
@@ -105,8 +109,8 @@ def bench_pareto(
         show(table)
     write_json(out, measured)
     if plot is not None:
-        with writing(plot):
-            plot.write_bytes(pareto_plot.picture(measured))
+        with whole(plot) as partial:
+            partial.write_bytes(pareto_plot.picture(measured))
 
 
 @click.command("endurance")
@@ -122,7 +126,7 @@ def bench_pareto(
     show_default=True,
     help="Without a jump; from the start again after the last frame; or a random walk that never repeats.",
 )
-@table_option
+@figures_option
 @as_json
 def bench_endurance(
     launch: tuple[str, ...], frames: int, window: int, order: Order, out: Path | None, json_out: bool
@@ -170,7 +174,7 @@ def bench_endurance(
     is_flag=True,
     help="Fail if a figure gets worse beyond its scatter, by a tenth an hour.",
 )
-@table_option
+@figures_option
 @as_json
 def bench_soak(
     launch: tuple[str, ...], frames: int, window: int, check: bool, out: Path | None, json_out: bool
@@ -212,7 +216,7 @@ def bench_soak(
     show_default=True,
     help="After how many frames to measure.",
 )
-@table_option
+@figures_option
 @as_json
 def bench_tracking(launch: tuple[str, ...], numbers: str, out: Path | None, json_out: bool) -> None:
     """How well anchors stay on the tissue.
@@ -244,7 +248,7 @@ def bench_tracking(launch: tuple[str, ...], numbers: str, out: Path | None, json
 @click.command("recall")
 @launch_argument
 @click.option("--seconds", type=positive, default=10.0, show_default=True, help="Out of sight.")
-@table_option
+@figures_option
 @as_json
 def bench_recall(launch: tuple[str, ...], seconds: float, out: Path | None, json_out: bool) -> None:
     """Whether anchors come back after a long time out of sight.
@@ -279,7 +283,7 @@ def bench_recall(launch: tuple[str, ...], seconds: float, out: Path | None, json
     help="This one alone; may be given several times. Default: all.",
 )
 @click.option("--seconds", type=positive, default=120.0, show_default=True, help="Of each motion.")
-@table_option
+@figures_option
 @as_json
 def bench_scope(
     launch: tuple[str, ...],
@@ -323,7 +327,7 @@ def bench_scope(
 @click.option(
     "--many", type=click.IntRange(0, 50), default=20, show_default=True, help="Further subscribers."
 )
-@table_option
+@figures_option
 @as_json
 def bench_crowd(launch: tuple[str, ...], seconds: float, many: int, out: Path | None, json_out: bool) -> None:
     """Whether subscribers disturb the node.
@@ -350,7 +354,7 @@ def bench_crowd(launch: tuple[str, ...], seconds: float, many: int, out: Path | 
 @click.command("bridges")
 @launch_argument
 @click.option("--seconds", type=positive, default=30.0, show_default=True, help="Of each bridge.")
-@table_option
+@figures_option
 @as_json
 def bench_bridges(launch: tuple[str, ...], seconds: float, out: Path | None, json_out: bool) -> None:
     """What each bridge gives and costs.
@@ -392,7 +396,7 @@ def bench_transport(frames: int, json_out: bool) -> None:
 @click.command("thin")
 @launch_argument
 @click.option("--frames", type=click.IntRange(1), default=60, show_default=True, help="To measure.")
-@table_option
+@figures_option
 @as_json
 def bench_thin(launch: tuple[str, ...], frames: int, out: Path | None, json_out: bool) -> None:
     """What thin pictures cost.
@@ -418,7 +422,7 @@ def bench_thin(launch: tuple[str, ...], frames: int, out: Path | None, json_out:
 @click.command("inputs")
 @click.option("--seconds", type=positive, default=10.0, show_default=True, help="Of each way.")
 @click.option("--only", metavar="NAME", help="Ways that begin so, e.g. gst; default: all.")
-@table_option
+@figures_option
 @as_json
 def bench_inputs(seconds: float, only: str | None, out: Path | None, json_out: bool) -> None:
     """What a live pair costs until the mapper has it.

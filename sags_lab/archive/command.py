@@ -17,11 +17,12 @@ from sags_lab.lerobot.option import version_option
 from sags_node.cli.launching import (
     as_json,
     check_files,
+    figures_option,
+    force_option,
     launch_argument,
     positive,
     split,
     split_recording,
-    table_option,
     write_json,
 )
 from sags_node.errors import SagsError, UsageError
@@ -43,7 +44,7 @@ def archive() -> None:
 @archive.command()
 @click.argument("folder", type=click.Path(path_type=Path))
 @click.option(
-    "--out",
+    *("-o", "--out"),
     default="archive.csv",
     show_default=True,
     metavar="FILE",
@@ -68,9 +69,16 @@ def archive() -> None:
     metavar="SECONDS",
     help="What is played before a segment, so that the model is there when it begins.",
 )
+@force_option
 @as_json
 def scan(
-    folder: Path, out: str, rig: Path | None, segment: float | None, warm_up: float, json_out: bool
+    folder: Path,
+    out: str,
+    rig: Path | None,
+    segment: float | None,
+    warm_up: float,
+    force: bool,
+    json_out: bool,
 ) -> None:
     """List the recordings below a folder in a manifest.
 
@@ -82,10 +90,11 @@ def scan(
     sags archive scan /data/theatre3 --out theatre3.csv --segment 300
     """
     check_installed()
-    from sags_lab.archive.manifest import beside, write_manifest
+    from sags_lab.archive.manifest import beside, check_manifest, write_manifest
     from sags_lab.archive.scan import scan as look
     from sags_lab.archive.segments import Cut
 
+    check_manifest(out, force)
     with progress("looking") as advance:
         found = look(folder, rig, advance, None if segment is None else Cut(segment, warm_up))
     listed = [beside(each, out) for each in found.recordings]
@@ -120,7 +129,7 @@ def scan(
     "depth, tracks, render, lerobot: as sags export.",
 )
 @click.option(
-    "--out", required=True, metavar="FOLDER|URL", help="Where the results lie; the same one goes on."
+    "-o", "--out", required=True, metavar="FOLDER|URL", help="Where the results lie; the same one goes on."
 )
 @click.option("--ray", "address", metavar="HOST:PORT", help="A Ray cluster; default: --local.")
 @click.option("--local", is_flag=True, help="This machine alone; the default.")
@@ -358,7 +367,7 @@ def dataset(out: str, folder: Path, lerobot_version: Version) -> None:
     show_default=True,
     help="That are played; and a fourth of them, to tell what a start costs.",
 )
-@table_option
+@figures_option
 @as_json
 def costs(
     launch: tuple[str, ...], jobs: tuple[str, ...], frames: int, out: Path | None, json_out: bool

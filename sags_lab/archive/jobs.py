@@ -11,10 +11,7 @@ FIGURES, LOG = "figures.json", "log.txt"  # of a recording's folder: stdout and 
 Arguments = Callable[[list[str], Path], list[str]]
 
 JOBS: dict[str, Arguments] = {
-    "eval": lambda said, out: [
-        *("eval", *said),
-        *("--pace", "step", "--report", str(out / "report"), "--json", "-"),
-    ],
+    "eval": lambda said, out: ["eval", *said, "--pace", "step", "--report", str(out / "report"), "--json"],
     "depth": lambda said, out: ["export", "--session", *said, "--depth", str(out / "depth"), "--json"],
     "tracks": lambda said, out: ["export", "--session", *said, "--tracks", str(out / "tracks.npz"), "--json"],
     "render": lambda said, out: ["export", "--session", *said, "--render", str(out / "model.mp4"), "--json"],

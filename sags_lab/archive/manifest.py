@@ -21,6 +21,7 @@ from typing import Any
 from fsspec.core import url_to_fs
 
 from sags_node.errors import SagsError, UsageError, brief
+from sags_node.files import whole
 
 COLUMNS = ("recording", "rig", "overrides", "weight", "segment")
 PARQUET = ".parquet"
@@ -157,20 +158,38 @@ def beside(recording: Recording, url: str) -> Recording:
     return replace(recording, name=name(recording.place), folder=folder, rig_name=rig)
 
 
+def check_manifest(url: str, force: bool) -> None:
+    """Before any work: may a manifest be written there?
+
+    Raises:
+        UsageError: another suffix than .csv or .parquet, or it exists already and `force` is not given.
+    """
+    if not url.endswith(SUFFIXES):
+        raise UsageError(f"{url}: a manifest is a {' or '.join(SUFFIXES)} file")
+    try:
+        fs, path = url_to_fs(url)
+        there = fs.exists(path)
+    except (OSError, ValueError, ImportError) as error:
+        raise UsageError(f"{url} cannot be looked for: {error}; name another place") from None
+    if there and not force:
+        raise UsageError(f"{url} exists already; choose another name, or add --force")
+
+
 def write_manifest(url: str, recordings: Sequence[Recording]) -> None:
     """Write a .csv or .parquet file; an earlier one is replaced.
 
     Raises:
-        UsageError: another suffix.
         SagsError: it cannot be written.
     """
-    if not url.endswith(SUFFIXES):
-        raise UsageError(f"{url}: a manifest is a {' or '.join(SUFFIXES)} file")
     data = _as_parquet(recordings) if url.endswith(PARQUET) else as_csv(recordings)
     try:
         fs, path = url_to_fs(url)
         fs.makedirs(fs._parent(path), exist_ok=True)
-        fs.pipe_file(path, data)
+        if is_url(url):
+            fs.pipe_file(path, data)  # an object appears when all of it is there
+        else:
+            with whole(Path(path)) as partial:
+                partial.write_bytes(data)
     except (OSError, ValueError, ImportError) as error:
         raise SagsError(f"cannot write {url}: {error}; name another place") from None
 

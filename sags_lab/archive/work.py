@@ -21,7 +21,7 @@ from sags_lab.archive.jobs import FIGURES, LOG, command, flat
 from sags_lab.archive.launching import arguments, split
 from sags_lab.archive.manifest import Recording
 from sags_lab.archive.process import PROGRAM, Ended, Limits, run_limited
-from sags_lab.archive.store import FAILED, Store
+from sags_lab.archive.store import FAILED, RECORDINGS, Store
 from sags_node.errors import SagsError, UsageError
 from sags_node.evaluation.provenance import machine_name, revision
 
@@ -143,6 +143,9 @@ def _work(recording: Recording, plan: Plan, key: str, program: Sequence[str]) ->
             raise _FailedError(
                 "refused" if ended.code == WRONG_REQUEST else "failed", _reason(ended, out / LOG)
             )
+        final = f"{plan.out.rstrip('/')}/{RECORDINGS}/{recording.id}"
+        for name in (FIGURES, LOG):  # they say where results are
+            (out / name).write_bytes((out / name).read_bytes().replace(os.fsencode(out), final.encode()))
         figures = flat(json.loads((out / FIGURES).read_bytes()))
         store.finish(recording.id, key, out, _row(recording, figures, plan, time.monotonic() - began))
     return int(figures.get("frames") or 0)

@@ -31,9 +31,9 @@ from sags_lab.lerobot.form import (
     videos_of,
 )  # fmt: skip
 from sags_lab.lerobot.stats import Stats, Sums
-from sags_node.errors import SagsError, UsageError
+from sags_node.errors import UsageError
 from sags_node.export.played import depth_of, new_folder, points_of
-from sags_node.terminal.console import writing
+from sags_node.files import whole
 from sags_node.types import AnchorStates, FrameResult, RectifiedPair
 from sags_node.video_file import VideoFile
 
@@ -56,16 +56,16 @@ class LeRobot:
     64 points that are followed ([64, 3] m, world; NaN: lost) with their visibility 0..1.
 
     Args:
-        folder: new or empty.
+        folder: to be made.
         rate: frames per second; LeRobot takes whole ones.
 
     Raises:
-        UsageError: pyarrow is not installed, or the folder holds something.
+        UsageError: pyarrow is not installed.
     """
 
     def __init__(self, folder: Path, rate: float, version: Version) -> None:
         check_lerobot()
-        new_folder(folder)
+        folder.mkdir()
         self._folder, self._version = folder, version
         self._fps = max(1, round(rate))
         self._features: dict[str, Any] = {}
@@ -115,25 +115,14 @@ class LeRobot:
         if len(self._rows) == ROWS:
             self._write_rows()
 
-    def finish(self) -> dict[str, Any]:
-        if self._count == 0:
-            raise SagsError("no frame was played; check source.start, source.frames and source.warm_up")
-        with writing(self._folder):
-            self._write_rows()
-            self.close()
-            for eye in self._videos:
-                if (self._folder / video_path(self._version, eye, 0)).stat().st_size == 0:
-                    raise SagsError(f"cannot write {self._folder}: is the disk full?")
-            stats = {name: sums.stats(STATISTICS[name]) for name, sums in self._sums.items()}
-            describe(self._folder, self._version, self._features, self._fps, [self._count], [stats])
-        size = sum(file.stat().st_size for file in self._folder.rglob("*") if file.is_file())
-        return {"file": str(self._folder), "holds": self._count, "bytes": size}
-
-    def close(self) -> None:
+    def finish(self) -> int:
+        self._write_rows()
+        self._table.close()
         for video in self._videos.values():
-            video.close()
-        if self._table is not None:
-            self._table.close()
+            video.finish()
+        stats = {name: sums.stats(STATISTICS[name]) for name, sums in self._sums.items()}
+        describe(self._folder, self._version, self._features, self._fps, [self._count], [stats])
+        return self._count
 
     def _write_rows(self) -> None:
         import pyarrow as pa
@@ -165,33 +154,38 @@ def merge(folders: Sequence[Path], out: Path, version: Version) -> int:
         UsageError: they differ in rate, size or what is in them, or `out` holds something.
         SagsError: one cannot be read, or it cannot be written.
     """
+    new_folder(out)
+    with whole(out) as partial:
+        partial.mkdir()
+        return _merge(folders, partial, version)
+
+
+def _merge(folders: Sequence[Path], out: Path, version: Version) -> int:
     import pyarrow.parquet as pq
 
-    new_folder(out)
     lengths: list[int] = []
     stats: list[dict[str, Stats]] = []
     first: dict[str, Any] = {}
-    with writing(out):
-        for number, folder in enumerate(folders):
-            info = json.loads((folder / "meta/info.json").read_text(encoding="utf-8"))
-            first = first or info
-            if (info["features"], info["fps"]) != (first["features"], first["fps"]):
-                raise UsageError(
-                    f"{folder} has pictures of another size or rate than {folders[0]}: one data set "
-                    "holds one kind; give them vision.width, vision.height and source.rate that are the same"
-                )
-            old = info["codebase_version"]
-            source = pq.ParquetFile(folder / data_path(old, 0))
-            path = out / data_path(version, number)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with pq.ParquetWriter(path, source.schema_arrow) as writer:
-                for group in range(source.num_row_groups):
-                    writer.write_table(_renumbered(source.read_row_group(group), number, sum(lengths)))
-            for eye in videos_of(info["features"]):
-                _link(folder / video_path(old, eye, 0), out / video_path(version, eye, number))
-            lengths.append(info["total_frames"])
-            stats.append(json.loads((folder / "meta/stats.json").read_text(encoding="utf-8")))
-        describe(out, version, first["features"], first["fps"], lengths, stats)
+    for number, folder in enumerate(folders):
+        info = json.loads((folder / "meta/info.json").read_text(encoding="utf-8"))
+        first = first or info
+        if (info["features"], info["fps"]) != (first["features"], first["fps"]):
+            raise UsageError(
+                f"{folder} has pictures of another size or rate than {folders[0]}: one data set "
+                "holds one kind; give them vision.width, vision.height and source.rate that are the same"
+            )
+        old = info["codebase_version"]
+        source = pq.ParquetFile(folder / data_path(old, 0))
+        path = out / data_path(version, number)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with pq.ParquetWriter(path, source.schema_arrow) as writer:
+            for group in range(source.num_row_groups):
+                writer.write_table(_renumbered(source.read_row_group(group), number, sum(lengths)))
+        for eye in videos_of(info["features"]):
+            _link(folder / video_path(old, eye, 0), out / video_path(version, eye, number))
+        lengths.append(info["total_frames"])
+        stats.append(json.loads((folder / "meta/stats.json").read_text(encoding="utf-8")))
+    describe(out, version, first["features"], first["fps"], lengths, stats)
     return sum(lengths)
 
 

@@ -23,7 +23,7 @@ def evaluate_protocol(
     launch: tuple[str, ...],
     iterations: int | None,
     lpips_weights: Path | None,
-    json_out: str | None,
+    out: Path | None,
     **others: Any,
 ) -> None:
     """Measure a data set by its protocol.
@@ -39,8 +39,7 @@ def evaluate_protocol(
         raise UsageError(f"--protocol {protocol} needs the data set's folder")
     if iterations is not None:
         overrides = [*overrides, f"mapping.iterations:={iterations}"]
-    file = Path(json_out) if json_out is not None and json_out != "-" else None
-    check_files(file)
+    check_files(out)
     with progress("measuring") as advance:
 
         def tell(done: int, what: str) -> None:
@@ -57,6 +56,5 @@ def evaluate_protocol(
             }
             found = measures[protocol](Path(path), overrides, tell)
     found = {"protocol": protocol, **found}
-    if file is None:
-        show(found)
-    write_json(file, found)
+    show(found)
+    write_json(out, found)

@@ -60,6 +60,11 @@ def check_calibration(
     if pairs and size is None:
         size = pairs[0][0].shape[1], pairs[0][0].shape[0]
     rig = read_rig(path, size, metres) if own is None else _rig_of(own, size, metres)
+    return judge(rig, pairs, depths)
+
+
+def judge(rig: StereoRig, pairs: Sequence[Pair], depths: Sequence[F32 | None] = ()) -> list[Finding]:
+    """Look over a calibration, and compare it with raw pictures where there are some."""
     findings = check_eyes(rig)
     if _broken(findings):
         return findings
@@ -101,13 +106,13 @@ def _launched(path: Path, overrides: Sequence[str]) -> LaunchConfig:
 
 def _rig_of(config: LaunchConfig, size: tuple[int, int] | None, metres: float | None) -> StereoRig:
     """The calibration that a session would use, not judged yet."""
-    if isinstance(config.source, PhantomSource) and config.rig is None:
+    if isinstance(config.source, PhantomSource):
         return read_rig(cached_session(config.source) / "calib")
     if config.rig is not None:
         return read_rig(config.rig, size, metres)
     rig = recorded_rig(config.source)
     if rig is None:
-        raise UsageError("the session names no calibration: set rig, e.g. rig:=calib/d4d")
+        raise UsageError("the session names no calibration: set rig to its folder")
     return rig
 
 

@@ -11,8 +11,8 @@ import numpy as np
 from sags_node.calibration.boards import Board, StereoView, find_in_both
 from sags_node.config import LaunchConfig
 from sags_node.errors import SagsError, UsageError
+from sags_node.files import whole, writing
 from sags_node.sources.source import open_source
-from sags_node.terminal.console import writing
 from sags_node.types import F32, U8
 
 NEW_AT = 0.06  # of the diagonal: how far common corners must have moved from every view taken before
@@ -92,5 +92,5 @@ def _moved(view: StereoView, other: StereoView) -> float:
 
 def _write(sides: tuple[Path, Path], name: str, pair: tuple[U8, U8]) -> None:
     for side, picture in zip(sides, pair, strict=True):
-        with writing(side):
-            (side / name).write_bytes(cv2.imencode(".png", picture[..., ::-1])[1].tobytes())
+        with whole(side / name) as partial:
+            partial.write_bytes(cv2.imencode(".png", picture[..., ::-1])[1].tobytes())

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from sags_node.config import LaunchConfig, RecordedSource
 from sags_node.errors import SagsError, UsageError
+from sags_node.launch_file import VIDEO_SUFFIXES
 from sags_node.sources.pictures import check_counts, list_pictures, read_picture, size_text
 from sags_node.sources.source import open_source
 from sags_node.types import F32, U8
@@ -21,11 +22,14 @@ def pairs_of_files(named: Sequence[tuple[Path, Path]]) -> list[Pair]:
     """Pictures of pairs of files, or of pairs of folders.
 
     Raises:
-        UsageError: there are none, or left and right are not equally many.
+        UsageError: there are none, left and right are not equally many, or one is a video.
         SagsError: a picture is damaged, or of another size than the others.
     """
     files: list[tuple[Path, Path]] = []
     for left, right in named:
+        for file in (left, right):
+            if file.suffix.lower() in VIDEO_SUFFIXES:
+                raise UsageError(f"{file} is a video: name the launch file that plays it with --session")
         if left.is_dir() or right.is_dir():
             lefts, rights = list_pictures(left), list_pictures(right)
             check_counts(left, lefts, right, rights)

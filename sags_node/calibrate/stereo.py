@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 from rich.table import Table
 
-from sags_node.calibration import check_rig, save_rig
+from sags_node.calibration import check_rig
 from sags_node.calibration.boards import Board, StereoView, find_in_both
 from sags_node.calibration.coverage import coverage_hints
 from sags_node.calibration.rows import rectified_rows
@@ -19,7 +19,6 @@ from sags_node.calibration.solve import Solution, calibrate
 from sags_node.errors import SagsError
 from sags_node.sources.pictures import FolderPairs
 from sags_node.terminal import text
-from sags_node.terminal.console import writing
 
 LOOKED_AT = 5  # pictures to tell what is seen instead of the board
 
@@ -66,16 +65,6 @@ def calibrate_folders(
     solution = calibrate(name, views, board.points, pictures.size, coefficients)
     hints = coverage_hints(solution.views, solution.board_poses, pictures.size)
     return Calibrated(solution, pictures.size, pictures.count, unseen, hints)
-
-
-def save(calibrated: Calibrated, folder: Path) -> None:
-    """Write `left.yaml` and `right.yaml`.
-
-    Raises:
-        SagsError: the folder cannot be written.
-    """
-    with writing(folder):
-        save_rig(calibrated.solution.rig, folder)
 
 
 def summarise(calibrated: Calibrated) -> dict[str, Any]:

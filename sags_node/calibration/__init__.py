@@ -19,7 +19,7 @@ from sags_node.calibration.rig import (
     rectify_eyes,
     resized_rig,
 )
-from sags_node.calibration.ros import eye_text, save_rig
+from sags_node.calibration.ros import eye_files, eye_text, save_rig
 
 __all__ = [
     "Finding",
@@ -28,6 +28,7 @@ __all__ = [
     "check_intrinsics",
     "check_pair",
     "check_rig",
+    "eye_files",
     "eye_text",
     "find_form",
     "fit_distortion",

@@ -11,6 +11,7 @@ import numpy as np
 import yaml
 
 from sags_node.errors import UsageError
+from sags_node.files import check_folder, whole
 from sags_node.geometry import is_rotation
 from sags_node.types import F64
 from sags_node.yaml_reader import read_yaml
@@ -59,12 +60,17 @@ def read_hand_eye(file: Path) -> HandEye:
 
 
 def save_hand_eye(hand_eye: HandEye, folder: Path, figures: Mapping[str, Any]) -> None:
-    """Write `hand_eye.yaml` into a rig's folder; `figures` say how good it is, for people."""
+    """Write `hand_eye.yaml` into a rig's folder; `figures` say how good it is, for people.
+
+    Raises:
+        SagsError: it cannot be written.
+    """
     tree = {
         "T_hand_cam": [[float(number) for number in row] for row in hand_eye.T_hand_cam],
         "offset_ms": hand_eye.offset_ns * 1e-6,
         "figures": dict(figures),
     }
-    folder.mkdir(parents=True, exist_ok=True)
+    check_folder(folder)
     text = yaml.safe_dump(tree, sort_keys=False, default_flow_style=None)
-    (folder / FILE).write_text(f"# Metres. Made by sags calib hand-eye.\n{text}", encoding="utf-8")
+    with whole(folder / FILE) as partial:
+        partial.write_text(f"# Metres. Made by sags calib hand-eye.\n{text}", encoding="utf-8")

@@ -18,7 +18,7 @@ import yaml
 
 from sags_node.calibration.rig import LARGEST_SIDE, PLUMB_BOB, RATIONAL
 from sags_node.errors import UsageError, brief
-from sags_node.files import open_file, read_file
+from sags_node.files import check_folder, open_file, read_file, whole
 from sags_node.types import F64, Eye, StereoRig
 from sags_node.yaml_reader import parse_yaml
 
@@ -110,12 +110,22 @@ class _Limited(gzip.GzipFile):
         return super().seek(offset, whence)
 
 
+def eye_files(folder: Path) -> tuple[Path, Path]:
+    """The files of a rig's folder."""
+    return folder / SIDES[0], folder / SIDES[1]
+
+
 def save_rig(rig: StereoRig, folder: Path) -> None:
-    """Write `left.yaml` and `right.yaml`; the folder is made when it is missing."""
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    for side, eye in (("left", rig.left), ("right", rig.right)):
-        (folder / f"{side}.yaml").write_text(eye_text(eye, side), encoding="utf-8")
+    """Write `left.yaml` and `right.yaml`; the folder is made when it is missing.
+
+    Raises:
+        SagsError: they cannot be written. Both are as they were.
+    """
+    check_folder(folder)
+    left_file, right_file = eye_files(folder)
+    with whole(left_file) as left, whole(right_file) as right:
+        left.write_text(eye_text(rig.left, "left"), encoding="utf-8")
+        right.write_text(eye_text(rig.right, "right"), encoding="utf-8")
 
 
 def eye_text(eye: Eye, name: str) -> str:

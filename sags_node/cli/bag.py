@@ -42,7 +42,11 @@ def bag() -> None:
     "sags run.",
 )
 @click.option(
-    "-o", "--output", type=click.Path(path_type=Path), help="New folder; default: sags_<date>_<time>."
+    "-o",
+    "--out",
+    "--output",
+    type=click.Path(path_type=Path),
+    help="New folder; default: sags_<date>_<time>.",
 )
 @click.option("--topics", multiple=True, metavar="NAME", help="Record only this; may be repeated.")
 @click.option(
@@ -93,7 +97,7 @@ def bag() -> None:
 def record(
     overrides: tuple[str, ...],
     session: str | None,
-    output: Path | None,
+    out: Path | None,
     topics: tuple[str, ...],
     compression: str,
     max_cache: float,
@@ -124,6 +128,11 @@ def record(
     """
     from datetime import datetime
 
+    if session is None and (stray := [said for said in overrides if ":=" not in said]):
+        named = " ".join(f"--topics {topic}" for topic in (*topics, *stray))
+        raise UsageError(
+            f"{' '.join(stray)}: topics are named so: {named}; without --topics all are recorded"
+        )
     if overrides and session is None:
         raise UsageError(f"{overrides[0]}: key:=value needs --session LAUNCH.yaml")
     if session is not None and (snapshot_mode is not None or from_stdin or seconds is not None or endpoint):
@@ -148,7 +157,7 @@ def record(
     with _failure_told(tell if from_stdin else None):
         names = tuple(check_topic(say.plain(name, ns)).name for name in topics)
         options = Options(
-            folder=output or Path(f"sags_{datetime.now():%Y%m%d_%H%M%S}"),
+            folder=out or Path(f"sags_{datetime.now():%Y%m%d_%H%M%S}"),
             topics=names,
             compression=cast(Compression, compression),
             max_cache_mb=max_cache,
@@ -275,16 +284,16 @@ def info(path: Path, json_out: bool) -> None:
 
 @bag.command()
 @recording
-@click.option("-o", "--output", type=click.Path(path_type=Path), required=True, help="New folder.")
+@click.option("-o", "--out", "--output", type=click.Path(path_type=Path), required=True, help="New folder.")
 @as_json
-def recover(path: Path, output: Path, json_out: bool) -> None:
+def recover(path: Path, out: Path, json_out: bool) -> None:
     """Save what is whole of a damaged MCAP file or folder.
 
     Everything up to the damage, and every intact chunk after it. Exit code 3 when something was lost.
     """
     from sags_node.recording.recover import recover as save
 
-    done = save(path, output)
+    done = save(path, out)
     show(done if json_out else say.recovered_text(done))
     if done["lost"]:
         click.get_current_context().exit(DATA_LOST)

@@ -18,7 +18,8 @@ from rich.markup import escape
 from sags_node.cli.launching import as_json, positive
 from sags_node.cli.node_options import endpoint_option, keys_options, ns_option
 from sags_node.errors import UsageError
-from sags_node.terminal.console import check_file, console, on_stop_signals, show
+from sags_node.files import check_file, whole
+from sags_node.terminal.console import console, on_stop_signals, show
 
 NICENESS = 19  # the node goes first, where both want the same cores
 INSTALL = "install it with: pip install 'sags-node[bridges]'"
@@ -282,7 +283,8 @@ def foxglove(layout: Path | None, **options: Any) -> None:
         from sags_node.bridge.foxglove_layout import layout_of
 
         check_file(layout)
-        layout.write_text(layout_of(options["node"].ns, options["overlay"].ns), encoding="utf-8")
+        with whole(layout) as partial:
+            partial.write_text(layout_of(options["node"].ns, options["overlay"].ns), encoding="utf-8")
         return
     from sags_node.bridge.foxglove import Options, run_foxglove
 

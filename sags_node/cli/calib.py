@@ -11,24 +11,26 @@ from typing import TYPE_CHECKING, Any
 import click
 from rich.markup import escape
 
-from sags_node.cli.launching import as_json, launch_argument, positive, split
+from sags_node.cli.launching import as_json, check_files, force_option, launch_argument, positive, split
 from sags_node.errors import SagsError, UsageError
+from sags_node.files import check_file, whole
 from sags_node.terminal import text
-from sags_node.terminal.console import check_file, check_folder, console, progress, show, writing
+from sags_node.terminal.console import console, progress, show
 
 if TYPE_CHECKING:
     from sags_node.calibration.boards import Board
 
 UNITS = {"m": 1.0, "mm": 1e-3}
+OUT = ("-o", "--out", "--output")
+EYES = Path("eyes.png")
 
 path_argument = click.argument("path", type=click.Path(path_type=Path))
-output_option = click.option(
-    "-o",
-    "--output",
+out_option = click.option(
+    *OUT,
     type=click.Path(path_type=Path),
     required=True,
     metavar="FOLDER",
-    help="Gets left.yaml and right.yaml; older ones are replaced.",
+    help="Gets left.yaml and right.yaml.",
 )
 
 
@@ -141,24 +143,29 @@ def check(
 
 @calib.command()
 @path_argument
-@output_option
+@out_option
 @reading_options
 @click.option("--scale", type=positive, default=1.0, help="Of pictures that are resized after calibration.")
-def convert(path: Path, output: Path, size: tuple[int, int] | None, unit: str | None, scale: float) -> None:
+@force_option
+def convert(
+    path: Path, out: Path, size: tuple[int, int] | None, unit: str | None, scale: float, force: bool
+) -> None:
     """Write any known calibration as left.yaml and right.yaml.
 
     \b
     sags calib convert stereo_calib/ -o calib/mine --size 1280x720 --unit mm
     sags calib convert calibrationdata.tar.gz -o calib/mine
     """
-    from sags_node.calibration import check_rig, read_rig, refuse_errors, resized_rig, save_rig
+    from sags_node.calibration import check_rig, eye_files, read_rig, refuse_errors, resized_rig, save_rig
 
+    if path.resolve() in (file.resolve() for file in (out, *eye_files(out))):
+        raise UsageError(f"{out} is what is converted, and would be replaced; name another folder")
+    check_files(*eye_files(out), force=force)
     rig = resized_rig(read_rig(path, size, UNITS.get(unit or "")), scale)
     refuse_errors(check_rig(rig), path)
-    with writing(output):
-        save_rig(rig, output)
+    save_rig(rig, out)
     console.print(
-        f"calibration: [bold]{escape(str(output))}[/], {rig.left.width}x{rig.left.height} px, baseline "
+        f"calibration: [bold]{escape(str(out))}[/], {rig.left.width}x{rig.left.height} px, baseline "
         f"{rig.baseline * 1e3:.3g} mm",
         soft_wrap=True,
     )
@@ -168,16 +175,16 @@ def convert(path: Path, output: Path, size: tuple[int, int] | None, unit: str | 
 @launch_argument
 @click.option("--seconds", type=positive, default=2.0, show_default=True, help="To watch.")
 @click.option(
-    "-o",
-    "--output",
+    *OUT,
     type=click.Path(path_type=Path, dir_okay=False),
-    default=Path("eyes.png"),
+    default=EYES,
     show_default=True,
     metavar="FILE.png",
-    help="The picture; an older one is replaced.",
+    help="The picture; an older eyes.png is replaced.",
 )
+@force_option
 @as_json
-def look_at_eyes(launch: tuple[str, ...], seconds: float, output: Path, json_out: bool) -> None:
+def look_at_eyes(launch: tuple[str, ...], seconds: float, out: Path, force: bool, json_out: bool) -> None:
     """Show what the source gives for each eye.
 
     Watches cameras, or any other source, and writes a picture of both eyes side by side: is each eye whole,
@@ -195,12 +202,12 @@ def look_at_eyes(launch: tuple[str, ...], seconds: float, output: Path, json_out
     from sags_node.launch_file import load_launch
 
     config = load_launch(*split(launch))
-    check_file(output)
+    check_file(out, force or out == EYES)
     picture, found = look(config, seconds)
-    with writing(output):
-        output.write_bytes(cv2.imencode(".png", picture[..., ::-1])[1].tobytes())
+    with whole(out) as partial:
+        partial.write_bytes(cv2.imencode(".png", picture[..., ::-1])[1].tobytes())
     show(found if json_out else text.rows_table([found]))
-    console.print(f"both eyes: [bold]{escape(str(output))}[/]", soft_wrap=True)
+    console.print(f"both eyes: [bold]{escape(str(out))}[/]", soft_wrap=True)
     if config.rig is not None and not config.one_camera:
         eye = load_rig(config.rig).left
         if (eye.width, eye.height) != (found["width"], found["height"]):
@@ -222,7 +229,8 @@ def look_at_eyes(launch: tuple[str, ...], seconds: float, output: Path, json_out
     help="Of radial distortion: 2 and 3 plumb_bob, 6 rational_polynomial.",
 )
 @click.option("--views", type=click.IntRange(6), default=25, show_default=True, help="To take; --live only.")
-@output_option
+@out_option
+@force_option
 @as_json
 def stereo(
     folders: tuple[Path, ...],
@@ -230,7 +238,8 @@ def stereo(
     squares: tuple[int, int],
     coefficients: str,
     views: int,
-    output: Path,
+    out: Path,
+    force: bool,
     json_out: bool,
     **board_of: Any,
 ) -> None:
@@ -245,19 +254,20 @@ def stereo(
         --marker-mm 3.7 --dictionary 4X4_50 -o calib/my_rig
     sags calib stereo --live launch/v4l2.yaml --squares 10x7 --square-mm 4.5 -o calib/my_rig
     """
-    from sags_node.calibrate.stereo import calibrate_folders, report_table, save, summarise
+    from sags_node.calibrate.stereo import calibrate_folders, report_table, summarise
+    from sags_node.calibration import eye_files, save_rig
 
     if (live is None) != (len(folders) == 2) or (live is not None and folders):
         raise UsageError("give two folders, LEFT_FOLDER RIGHT_FOLDER, or --live LAUNCH")
     board = _board(squares, **board_of)
-    check_folder(output)
-    left, right = folders if live is None else _grab(live, board, output / "views", views)
+    check_files(*eye_files(out), force=force)
+    left, right = folders if live is None else _grab(live, board, out / "views", views)
     with progress("looking for the board") as advance:
-        calibrated = calibrate_folders(left, right, board, output.name, int(coefficients), advance)
-    save(calibrated, output)
+        calibrated = calibrate_folders(left, right, board, out.name, int(coefficients), advance)
+    save_rig(calibrated.solution.rig, out)
     summary = summarise(calibrated)
     show(summary if json_out else report_table(summary))
-    console.print(f"calibration: [bold]{escape(str(output))}[/]", soft_wrap=True)
+    console.print(f"calibration: [bold]{escape(str(out))}[/]", soft_wrap=True)
 
 
 @calib.command("hand-eye")
@@ -267,19 +277,20 @@ def stereo(
     "--views", type=click.IntRange(10, 1000), default=80, show_default=True, help="Spread over the recording."
 )
 @click.option(
-    "-o",
-    "--output",
+    *OUT,
     type=click.Path(path_type=Path),
     required=True,
     metavar="FOLDER",
-    help="The rig's folder; gets hand_eye.yaml, an older one is replaced.",
+    help="The rig's folder; gets hand_eye.yaml.",
 )
+@force_option
 @as_json
 def hand_eye(
     launch: tuple[str, ...],
     squares: tuple[int, int],
     views: int,
-    output: Path,
+    out: Path,
+    force: bool,
     json_out: bool,
     **board_of: Any,
 ) -> None:
@@ -302,14 +313,13 @@ def hand_eye(
     path, overrides = split(launch)
     config = load_launch(path, overrides)
     board = _board(squares, **board_of)
-    check_folder(output)
+    check_files(out / FILE, force=force)
     with progress("looking for the board") as advance:
         solution = calibrate_hand_eye(config, rig_of(config), board, views, advance)
     summary = summarise_hand_eye(solution)
-    with writing(output):
-        save_hand_eye(solution.hand_eye, output, summary)
+    save_hand_eye(solution.hand_eye, out, summary)
     show(summary if json_out else hand_eye_table(summary))
-    console.print(f"hand-eye calibration: [bold]{escape(str(output / FILE))}[/]", soft_wrap=True)
+    console.print(f"hand-eye calibration: [bold]{escape(str(out / FILE))}[/]", soft_wrap=True)
 
 
 def _board(

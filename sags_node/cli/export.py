@@ -10,7 +10,9 @@ import click
 
 from sags_node.cli.launching import (
     as_json,
+    check_files,
     file_option,
+    force_option,
     open_launched,
     positive,
     split_recording,
@@ -37,10 +39,16 @@ NO_CAMERAS = "live cameras are exported from the running node; leave out --sessi
     type=click.Path(path_type=Path, file_okay=False),
     help="What sags fit made of that session, in place of the online model.",
 )
-@file_option("--splats", "F.ply", "All Gaussians with the fields of 3D Gaussian Splatting.")
-@file_option("--points", "F.ply|.pcd", "The surface that the left camera sees, x y z (m) and rgb.")
-@file_option("--mesh", "F.ply|.obj|.stl", "The same surface as triangles; where nothing is known is a hole.")
-@file_option("--orbit", "F.mp4", "A video around the tissue.")
+@file_option("--splats", metavar="F.ply", help="All Gaussians with the fields of 3D Gaussian Splatting.")
+@file_option(
+    "--points", metavar="F.ply|.pcd", help="The surface that the left camera sees, x y z (m) and rgb."
+)
+@file_option(
+    "--mesh",
+    metavar="F.ply|.obj|.stl",
+    help="The same surface as triangles; where nothing is known is a hole.",
+)
+@file_option("--orbit", metavar="F.mp4", help="A video around the tissue.")
 @click.option(
     "--sequence",
     metavar="FOLDER",
@@ -48,8 +56,8 @@ NO_CAMERAS = "live cameras are exported from the running node; leave out --sessi
     help="All Gaussians of every frame of --session, a .ply each, and a video that plays in a loop. The same "
     "command again goes on where it was ended.",
 )
-@file_option("--tracks", "F.npz", "64 points that are followed through all of --session, in 3D.")
-@file_option("--render", "F.mp4", "The model as the left eye sees it, every frame of --session.")
+@file_option("--tracks", metavar="F.npz", help="64 points that are followed through all of --session, in 3D.")
+@file_option("--render", metavar="F.mp4", help="The model as the left eye sees it, every frame of --session.")
 @click.option(
     "--depth",
     metavar="FOLDER",
@@ -64,7 +72,7 @@ NO_CAMERAS = "live cameras are exported from the running node; leave out --sessi
     help="How far the camera of the video tilts from where it was.",
 )
 @click.option("--orbit-seconds", type=positive, default=6.0, show_default=True, help="Length of the video.")
-@click.option("--force", is_flag=True, help="Replace files that exist.")
+@force_option
 @endpoint_option
 @ns_option
 @keys_options
@@ -102,6 +110,7 @@ def export(
     from sags_node.export import export as work
     from sags_node.export import scene as source
     from sags_node.export import sequence as many
+    from sags_node.export.played import KINDS, new_folder
 
     played = {kind: path for kind, path in of_every_frame.items() if path is not None}
     asked = {"splats": splats, "points": points, "mesh": mesh, "orbit": orbit}
@@ -112,6 +121,11 @@ def export(
             "moment, --sequence, --at or --fit beside it"
         )
     if played and session is not None:
+        for kind, target in played.items():
+            if KINDS[kind].is_folder:
+                new_folder(target)
+            else:
+                check_files(target, force=force)
         _export_played((session, *overrides), played, json_out)
         return
     if sequence is None:
@@ -150,14 +164,10 @@ def export(
 
 
 def _export_played(launch: Sequence[str], played: Mapping[str, Path], json_out: bool) -> None:
-    from sags_node.export.played import PRODUCTS, write_played
+    from sags_node.export.played import write_played
 
     path, overrides = split_recording(launch, NO_CAMERAS)
     opened = open_launched(path, [*overrides, "source.loop:=false", "source.pace:=step"])
-    products = {
-        kind: PRODUCTS[kind](target, opened.source.rate, opened.working_size)
-        for kind, target in played.items()
-    }
     with progress("exporting") as advance:
-        rows = write_played(opened, products, advance)
+        rows = write_played(opened, played, advance)
     show(rows if json_out else text.rows_table(rows))

@@ -17,6 +17,7 @@ from sags_node.errors import UsageError
 from sags_node.evaluation.lpips import BACKBONE, Lpips
 from sags_node.evaluation.measure import Options
 from sags_node.evaluation.provenance import machine_name
+from sags_node.files import check_results, is_result
 from sags_node.fitting import checkpoint
 from sags_node.fitting.clip import read_clip
 from sags_node.fitting.fit import Fit
@@ -28,10 +29,23 @@ from sags_node.model.ply import write_ply
 from sags_node.session import Session
 from sags_node.terminal import text
 
+CHECKPOINT, FIGURES, MODEL, DRAWN = "checkpoint.npz", "figures.json", "model.ply", "test"
 CHECKPOINT_PERIOD = 60.0  # s; it holds hundreds of MB
 SHOWN_EVERY = 5  # iterations: what is shown waits for the GPU
 
 Advance = Callable[[int, int | None, str], None]  # done, of, what
+
+
+def check_fit(out: Path) -> None:
+    """Before any work: may a fit be written into this folder?
+
+    Raises:
+        UsageError: other files of its names are there.
+        SagsError: it cannot be written to.
+    """
+    figures = out / FIGURES
+    ours = (out / CHECKPOINT).is_file() or (figures.is_file() and is_result(figures))
+    check_results(out, (CHECKPOINT, FIGURES, MODEL, DRAWN), ours)
 
 
 def fit_session(
@@ -59,7 +73,7 @@ def fit_session(
         UsageError: nothing to resume, or made with other settings or frames.
         SagsError: the recording cannot be used, a file cannot be written, or the GPU failed.
     """
-    stored = out / "checkpoint.npz"
+    stored = out / CHECKPOINT
     if resume and not stored.is_file():
         raise UsageError(f"there is no {stored} to resume from; start without --resume")
     lpips = None if options.lpips_weights is None else Lpips(options.lpips_weights)
@@ -75,7 +89,7 @@ def fit_session(
         fit.start(lambda what, done, of: advance(done, of, what))
     _iterate(fit, stored, advance)
 
-    drawn = out / "test"
+    drawn = out / DRAWN
     drawn.mkdir(exist_ok=True)
     advance(0, len(clip.test), "measuring")
     segments = session.config.segments
@@ -107,10 +121,8 @@ def fit_session(
         ),
     }  # fmt: skip
     last = fit.gaussians(clip.train[-1])
-    ply = out / "model.ply"
-    ply.unlink(missing_ok=True)
-    write_ply(ply, folded(last))
-    write_json(out / "figures.json", found)
+    write_ply(out / MODEL, folded(last), force=True)
+    write_json(out / FIGURES, found)
     return found
 
 

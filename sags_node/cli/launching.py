@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from sags_node.errors import UsageError
-from sags_node.terminal.console import check_file, console, progress, writing
+from sags_node.files import check_file, whole
+from sags_node.terminal.console import console, progress
 
 if TYPE_CHECKING:
+    from sags_node.config import Source
     from sags_node.engine.device import Device
     from sags_node.session import Session
-
-Command = TypeVar("Command", bound=Callable[..., Any])
 
 positive = click.FloatRange(min=0, min_open=True)
 
@@ -27,13 +28,13 @@ lpips_option = click.option(
 )
 
 
-def file_option(name: str, metavar: str, says: str) -> Callable[[Command], Command]:
-    """An option for one file, no folder."""
-    kind = click.Path(path_type=Path, dir_okay=False)
-    return click.option(name, type=kind, metavar=metavar, help=says)
-
-
-table_option = file_option("--out", "FILE.json", "Write the table as JSON.")
+file_option = partial(click.option, type=click.Path(path_type=Path, dir_okay=False))
+figures_option = file_option(
+    *("-o", "--out"),
+    metavar="FILE.json",
+    help="Write the figures as JSON. Earlier ones are replaced, any other file that is there is not.",
+)
+force_option = click.option("--force", is_flag=True, help="Replace files that exist.")
 
 
 def split(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
@@ -43,6 +44,8 @@ def split(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
     for path in paths:
         if "=" in path and not Path(path).exists():
             raise UsageError(f"'{path}' is not an override; write {path.replace('=', ':=', 1)}")
+        if path == "-" or (path.endswith(".json") and len(paths) > 1):
+            raise UsageError(f"'{path}' is no launch file: --json prints on stdout, --out FILE writes a file")
     if len(paths) > 1:
         raise UsageError(f"one launch file or session at a time, not {', '.join(paths)}")
     return (paths[0] if paths else None), overrides
@@ -64,17 +67,29 @@ def split_recording(arguments: Sequence[str], no_cameras: str) -> tuple[str | No
 
 
 def open_launched(path: str | None, overrides: Sequence[str]) -> Session:
-    """Open a session and make its kernels ready, saying what takes long and what it runs on."""
+    """Open a session and make its kernels ready; says what is played, what takes long and what it runs on."""
     from sags_node.mapping.devices import device_of
     from sags_node.session import open_session
     from sags_node.warm_up import warm_up
 
     with progress("rendering the phantom (once)") as advance:
         session = open_session(path, overrides, advance)
+    console.print(source_text(session.config.source), markup=False, soft_wrap=True)
     with console.status("loading kernels (compiled once per machine, about half a minute)"):
         warm_up(session.config)
     console.print(_runs_on(device_of(session.config)), soft_wrap=True)
     return session
+
+
+def source_text(source: Source) -> str:
+    """What is played, in a line."""
+    from sags_node.config import PhantomSource
+
+    if isinstance(source, PhantomSource):
+        return "source: the built-in phantom"
+    keys = ("left", "right", "launch", "video", "folder", "path", "endpoint")
+    said = [getattr(source, key, None) for key in keys]
+    return f"source: {source.kind} {', '.join(str(each) for each in said if isinstance(each, str | Path))}"
 
 
 def _runs_on(device: Device) -> str:
@@ -87,15 +102,11 @@ def count_frames(path: str | None, overrides: Sequence[str], seconds: float) -> 
         return max(1, round(source.rate * seconds))
 
 
-def check_files(*files: Path | None) -> None:
-    """A long run must not end with nowhere to put its figures.
-
-    Raises:
-        SagsError: one of the files that were asked for cannot be written.
-    """
+def check_files(*files: Path | None, force: bool | None = None) -> None:
+    """A long run must not end with nowhere to put its figures: `check_file` of those that were asked for."""
     for file in files:
         if file is not None:
-            check_file(file)
+            check_file(file, force)
 
 
 def write_json(file: Path | None, figures: Mapping[str, Any] | list[Any]) -> None:
@@ -109,6 +120,6 @@ def write_json(file: Path | None, figures: Mapping[str, Any] | list[Any]) -> Non
         from sags_node.evaluation.provenance import provenance
 
         rows = {"rows": figures} if isinstance(figures, list) else figures
-        with writing(file):
-            text = json.dumps({"provenance": provenance()} | dict(rows), indent=1)
-            file.write_text(text + "\n", encoding="utf-8")
+        text = json.dumps({"provenance": provenance()} | dict(rows), indent=1)
+        with whole(file) as partial:
+            partial.write_text(text + "\n", encoding="utf-8")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import os
 import shlex
@@ -37,9 +38,10 @@ from sags_node.cli.view import view
 from sags_node.errors import SagsError, UsageError
 from sags_node.plotting import check_plots
 from sags_node.terminal import text
-from sags_node.terminal.console import check_folder, console, interrupt, log_handler, progress, show
+from sags_node.terminal.console import console, interrupt, log_handler, progress, show
 
 log = logging.getLogger(__name__)
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT)  # of a disk; also of what stdout leads to
 
 
 class Sags(click.Group):
@@ -63,10 +65,15 @@ class Sags(click.Group):
         try:
             return super().invoke(ctx)
         except SagsError as error:
-            if console.quiet:
-                log.error("%s", error)
-            console.print(f"[red]error:[/] {escape(str(error))}", soft_wrap=True)
-            ctx.exit(error.exit_code)
+            said, code = str(error), error.exit_code
+        except OSError as error:
+            if error.errno not in NO_ROOM:
+                raise
+            said, code = f"cannot write {error.filename or 'what was asked for'}: {error.strerror}", 1
+        if console.quiet:
+            log.error("%s", said)
+        console.print(f"[red]error:[/] {escape(said)}", soft_wrap=True)
+        ctx.exit(code)
 
 
 def sags_group(function: Callable[..., None]) -> Sags:
@@ -89,6 +96,8 @@ def begin(verbose: bool, form: str) -> None:
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
         signal.signal(signal.SIGINT, interrupt)
     signal.signal(signal.SIGTERM, interrupt)  # a service manager's stop is a Ctrl-C
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # so is the end of the terminal, but for nohup
+        signal.signal(signal.SIGHUP, interrupt)
     console.quiet = form == "json"
     logging.basicConfig(level=level, format="%(message)s", handlers=[log_handler()])
 
@@ -147,7 +156,7 @@ def run(launch: tuple[str, ...], seconds: float | None, json_out: bool) -> None:
 @launch_argument
 @click.option("--seconds", type=positive, default=10.0, show_default=True, help="How long it plays.")
 @click.option(
-    "--out",
+    *("-o", "--out"),
     type=click.Path(path_type=Path),
     default=Path("out/demo"),
     show_default=True,
@@ -160,13 +169,14 @@ def demo(launch: tuple[str, ...], seconds: float, out: Path, json_out: bool) -> 
     The node publishes over real sockets; `sags overlay` runs as its own process and consumes. The report
     shows input, render, depth and error side by side and figures over time. Default: the built-in phantom.
     """
-    from sags_node.demo import run_demo
+    from sags_node.demo import VIDEO, run_demo
+    from sags_node.evaluation.report import check_report
     from sags_node.session import open_session
 
     no_cameras = "sags demo plays recordings; for cameras use sags run and sags overlay"
     path, overrides = split_recording(launch, no_cameras)
     check_plots()
-    check_folder(out)
+    check_report(out, VIDEO)
     frames = count_frames(path, overrides, seconds)
     # Its own sockets and run directory, so that a demo does not meet a node that is already running.
     with tempfile.TemporaryDirectory(prefix="sags-demo-") as private:
@@ -177,8 +187,12 @@ def demo(launch: tuple[str, ...], seconds: float, out: Path, json_out: bool) -> 
             f"publish.run_dir:={private}",
         ]
         session = open_session(path, [*forced, *overrides])
-        with progress("playing") as advance:
-            outcome = run_demo(session, out, advance)
+        try:
+            with progress("playing") as advance:
+                outcome = run_demo(session, out, advance)
+        except BaseException:  # Ctrl-C, too: without its page nobody knows whose video it is
+            (out / VIDEO).unlink(missing_ok=True)
+            raise
     show(outcome.summary if json_out else outcome.table)
     console.print(f"report: [bold]{escape(str(outcome.report))}[/], overlay video beside it", soft_wrap=True)
 
@@ -212,7 +226,12 @@ def phantom(folder: Path, overrides: tuple[str, ...]) -> None:
 @main.command()
 @click.argument("name")
 @click.option(
-    "--out", type=click.Path(path_type=Path), default=Path(), show_default=True, help="Folder for both files."
+    "-o",
+    "--out",
+    type=click.Path(path_type=Path),
+    default=Path(),
+    show_default=True,
+    help="Folder for both files.",
 )
 def keygen(name: str, out: Path) -> None:
     """Make a key pair for a node or for a client.
@@ -265,7 +284,10 @@ def health(control: str | None, ns: str, json_out: bool, keys: Any) -> None:
 @click.argument("launch", nargs=-1, metavar="[LAUNCH.yaml] [key:=value ...]")
 @as_json
 def doctor(launch: tuple[str, ...], json_out: bool) -> None:
-    """Check that everything the node needs is here."""
+    """Check that everything the node needs is here.
+
+    With a launch file also what it names: pictures, calibration, devices, networks. No camera is opened.
+    """
     from sags_node.doctor import as_rows, examine
     from sags_node.launch_file import load_launch
 

@@ -12,16 +12,18 @@ from rich.markup import escape
 from sags_node.cli.launching import (
     as_json,
     check_files,
+    figures_option,
     launch_argument,
     lpips_option,
     open_launched,
+    source_text,
     split,
     split_recording,
     write_json,
 )
 from sags_node.errors import UsageError
 from sags_node.plotting import check_plots
-from sags_node.terminal.console import check_folder, console, progress, show, writing
+from sags_node.terminal.console import console, progress, show
 
 
 @click.command("eval")
@@ -59,7 +61,8 @@ from sags_node.terminal.console import check_folder, console, progress, show, wr
 @lpips_option
 @click.option("--paper-psnr", is_flag=True, help="Also PSNR with masked pixels counted as perfect.")
 @click.option("--report", type=click.Path(path_type=Path), help="Folder for an HTML report.")
-@click.option("--json", "json_out", metavar="FILE", help="Write the figures as JSON to FILE, - for stdout.")
+@figures_option
+@as_json
 def evaluate(
     launch: tuple[str, ...],
     pace: str,
@@ -70,30 +73,32 @@ def evaluate(
     lpips_weights: Path | None,
     paper_psnr: bool,
     report: Path | None,
-    json_out: str | None,
+    out: Path | None,
+    json_out: bool,
 ) -> None:
     """Measure a recorded session: run time against error.
 
     It is played through the node's own pipeline, then read once more and compared with what was shown.
 
     \b
-    sags eval launch/d4d_pull.yaml --json out.json
+    sags eval launch/d4d_pull.yaml --out out.json
     sags eval launch/d4d_pull.yaml --pace step --iterations 2 --report out/d4d
     """
     from sags_node.evaluation.measure import Options
-    from sags_node.evaluation.report import summary_table, write_report
+    from sags_node.evaluation.report import check_report, summary_table, write_report
     from sags_node.evaluation.session import Pace
     from sags_node.evaluation.session import evaluate as measure
+    from sags_node.launch_file import load_launch
 
     path, overrides = split(launch)
     if warm_up is not None:
         overrides.append(f"source.warm_up:={warm_up}")
     options = Options(hold_out, every, lpips_weights, paper_psnr)
-    file = Path(json_out) if json_out is not None and json_out != "-" else None
     if report is not None:
         check_plots()
-        check_folder(report)
-    check_files(file)
+        check_report(report)
+    check_files(out)
+    console.print(source_text(load_launch(path, overrides).source), markup=False, soft_wrap=True)
     with progress("measuring") as advance:
         outcome = measure(
             path,
@@ -104,20 +109,16 @@ def evaluate(
             lambda what, frames: advance(frames, None, what),
         )
     if report is not None:
-        with writing(report):
-            page = write_report(report, outcome.summary, outcome.rows, outcome.pictures)
+        page = write_report(report, outcome.summary, outcome.rows, outcome.pictures)
         console.print(f"report: [bold]{escape(str(page))}[/]", soft_wrap=True)
-    if json_out is None:
-        show(summary_table(outcome.summary))
-    elif json_out == "-":
-        show(outcome.summary)
-    write_json(file, outcome.summary)
+    show(outcome.summary if json_out else summary_table(outcome.summary))
+    write_json(out, outcome.summary)
 
 
 @click.command()
 @click.argument("dataset", nargs=-1, metavar="[DATASET | LAUNCH.yaml] [key:=value ...]")
 @click.option(
-    "--out", type=click.Path(path_type=Path), default=Path("out/fit"), show_default=True, help="Folder."
+    "-o", "--out", type=click.Path(path_type=Path), default=Path("out/fit"), show_default=True, help="Folder."
 )
 @click.option("--resume", is_flag=True, help="Go on from the checkpoint in the folder; same settings.")
 @click.option(
@@ -199,7 +200,7 @@ def fit(
     sags fit launch/d4d_pull.yaml --out out/d4d
     sags fit /data/endonerf/pulling_soft_tissues --schedule paper
     """
-    from sags_node.cli.fit_folder import figures_table, fit_session
+    from sags_node.cli.fit_folder import check_fit, figures_table, fit_session
     from sags_node.evaluation.measure import Options
     from sags_node.fitting.settings import MONOCULAR, PRESETS, with_changes
 
@@ -220,7 +221,7 @@ def fit(
     given: dict[str, Any] = {name: value for name, value in asked.items() if value is not None}
     settings = replace(settings, antialias=not no_alias_free, seed=seed, **given)
     settings = with_changes(settings, changes)
-    check_folder(out)
+    check_fit(out)
     session = open_launched(path, [*overrides, "source.loop:=false", "source.pace:=step"])
     with progress("fitting") as advance:
         found = fit_session(session, settings, options, out, resume, advance)

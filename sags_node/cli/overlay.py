@@ -8,7 +8,7 @@ from typing import Any
 import click
 from rich.markup import escape
 
-from sags_node.cli.launching import as_json, positive
+from sags_node.cli.launching import as_json, force_option, positive
 from sags_node.cli.node_options import endpoint_option, keys_options, ns_option
 from sags_node.terminal import text
 from sags_node.terminal.console import console, show
@@ -71,7 +71,12 @@ class Ahead(click.ParamType["float | str"]):
     help="Of the connection files, the node's and this overlay's; default: that of the node.",
 )
 @click.option("--seconds", type=positive, help="Stop after so long; default: Ctrl-C.")
-@click.option("--save", type=click.Path(path_type=Path), help="Write what is shown: .mp4, or .png.")
+@click.option(
+    *("-o", "--out", "--save", "save"),
+    type=click.Path(path_type=Path),
+    help="Write what is shown: .mp4, or .png.",
+)
+@force_option
 @as_json
 def overlay(json_out: bool, **options: Any) -> None:
     """Publish geometry held by the tissue, for both eyes.

@@ -17,10 +17,24 @@ from sags_node.evaluation.page import encoded, page, picture_uri, svg_uri
 from sags_node.evaluation.plots import Series, line_plot
 from sags_node.evaluation.spool import RunFacts
 from sags_node.evaluation.tiles import ERROR_AT_TOP, depth_range, tiles
+from sags_node.files import check_folder, check_results, whole
 from sags_node.types import U8
 
 BLUE, ORANGE, GREEN = "#2166ac", "#d6604d", "#1b7837"
+REPORT, SHEET, TITLE = "report.html", "sheet.png", "SAGS: "
 COLUMNS = ("input", "model", "depth", "error")
+
+
+def check_report(folder: Path, *more: str) -> None:
+    """Before any work: may a report be written into this folder, and `more` files beside it?
+
+    Raises:
+        UsageError: other files of those names are there.
+        SagsError: it cannot be written to.
+    """
+    page = folder / REPORT
+    ours = page.is_file() and TITLE.encode() in page.read_bytes()[:200]
+    check_results(folder, (REPORT, SHEET, *more), ours)
 
 
 def write_report(
@@ -33,14 +47,14 @@ def write_report(
 
     Returns:
         The path of `report.html`.
+
+    Raises:
+        SagsError: the folder cannot be written to.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    check_folder(folder)
     near, far = depth_range(pictures)
     sheet = [tiles(picture, near, far) for picture in pictures]
-    if sheet:
-        grid = np.concatenate([np.concatenate(line, axis=1) for line in sheet])
-        (folder / "sheet.png").write_bytes(encoded(".png", grid))
-    title = f"SAGS: {summary['session']}"
+    title = f"{TITLE}{summary['session']}"
     text = page(
         title,
         [
@@ -56,9 +70,14 @@ def write_report(
             _figure_table(summary),
         ],
     )
-    file = folder / "report.html"
-    file.write_text(text, encoding="utf-8")
-    return file
+    report = folder / REPORT
+    with whole(report) as file:
+        file.write_text(text, encoding="utf-8")
+    if sheet:
+        grid = np.concatenate([np.concatenate(line, axis=1) for line in sheet])
+        with whole(folder / SHEET) as file:
+            file.write_bytes(encoded(".png", grid))
+    return report
 
 
 def summary_table(summary: Mapping[str, Any]) -> Table:

@@ -5,9 +5,7 @@ A file appears, or replaces the one that stood there, only when it is complete.
 
 from __future__ import annotations
 
-import tempfile
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,8 +14,8 @@ from sags_node.errors import UsageError
 from sags_node.export.orbit import write_orbit
 from sags_node.export.scene import Advance, Scene
 from sags_node.export.surface import write_mesh, write_points
+from sags_node.files import check_file
 from sags_node.model.ply import write_ply
-from sags_node.terminal.console import check_file, writing
 
 KINDS = {
     "splats": (".ply",),
@@ -52,9 +50,7 @@ def check_targets(targets: Mapping[str, Path], force: bool) -> None:
             raise UsageError(f"--{kind} {path}: the name must end in {' or '.join(KINDS[kind])}")
         if not path.parent.is_dir():
             raise UsageError(f"--{kind} {path}: there is no folder {path.parent}")
-        if path.exists() and not force:
-            raise UsageError(f"--{kind} {path} exists already; choose another name, or add --force")
-        check_file(path)
+        check_file(path, force)
 
 
 def export(scene: Scene, targets: Mapping[str, Path], orbit: Orbit, advance: Advance) -> list[dict[str, Any]]:
@@ -69,25 +65,15 @@ def export(scene: Scene, targets: Mapping[str, Path], orbit: Orbit, advance: Adv
     rows = []
     for kind, path in targets.items():
         advance(0, None, f"writing {path.name}")
-        with writing(path), whole(path) as partial:
-            match kind:
-                case "splats":
-                    write_ply(partial, scene.gaussians)
-                    holds = len(scene.gaussians)
-                case "points":
-                    holds = write_points(partial, scene)
-                case "mesh":
-                    holds = write_mesh(partial, scene)
-                case _:
-                    holds = write_orbit(partial, scene, orbit.degrees, orbit.seconds, advance)
+        match kind:
+            case "splats":
+                write_ply(path, scene.gaussians, force=True)  # `check_targets` has asked
+                holds = len(scene.gaussians)
+            case "points":
+                holds = write_points(path, scene)
+            case "mesh":
+                holds = write_mesh(path, scene)
+            case _:
+                holds = write_orbit(path, scene, orbit.degrees, orbit.seconds, advance)
         rows.append({"file": str(path), "kind": kind, "holds": holds, "bytes": path.stat().st_size})
     return rows
-
-
-@contextmanager
-def whole(path: Path) -> Iterator[Path]:
-    """Another place on the same disk to write to; what is there becomes `path` when nothing went wrong."""
-    with tempfile.TemporaryDirectory(prefix=".sags-export-", dir=path.parent) as folder:
-        partial = Path(folder) / path.name
-        yield partial
-        partial.replace(path)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from sags_node.engine.interface import Rasterizer
 from sags_node.engine.rasterizer.rasterize import make_rasterizer, to_view
 from sags_node.errors import SagsError
 from sags_node.export.scene import Advance, Scene
+from sags_node.files import whole
 from sags_node.types import F32, U8, Camera, Gaussians
 from sags_node.video_file import VideoFile
 
@@ -56,8 +56,10 @@ def write_orbit(path: Path, scene: Scene, degrees: float, seconds: float, advanc
     depth = draw(camera)[1]
     if not (depth > 0).any():
         raise SagsError("the left camera sees nothing of the model; export another moment")
-    with closing(VideoFile(path, RATE, (camera.width, camera.height))) as video:
+    with whole(path) as partial:
+        video = VideoFile(partial, RATE, (camera.width, camera.height))
         for done, eye in enumerate(orbit(camera, float(np.median(depth[depth > 0])), degrees, count)):
             video.add(draw(eye)[0])
             advance(done + 1, count, "drawing")
+        video.finish()
     return count

@@ -5,18 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import cv2
 import numpy as np
 
 from sags_node.errors import SagsError, UsageError
-from sags_node.export.export import whole
 from sags_node.export.scene import Advance
+from sags_node.files import check_folder, whole, writing
 from sags_node.kernels.threads import configure_threads
 from sags_node.pipeline import Pipeline
 from sags_node.session import Session
-from sags_node.terminal.console import check_file, check_folder, writing
 from sags_node.types import F32, U8, AnchorStates, FrameResult
 from sags_node.video_file import VideoFile
 
@@ -27,18 +26,22 @@ SEEN = 0.5  # visibility from which on a point counts as seen
 
 
 class Product(Protocol):
-    """Takes one frame after the other."""
+    """Takes one frame after the other. Both methods may raise `OSError`."""
 
     def add(self, result: FrameResult, anchors: AnchorStates) -> None: ...
 
-    def finish(self) -> dict[str, Any]:
-        """Complete the files; `holds` counts what is in them, `bytes` their size."""
-
-    def close(self) -> None:
-        """Let go of what is open, also after a failure."""
+    def finish(self) -> int:
+        """Complete the file or folder; how much is in it."""
 
 
-def write_played(session: Session, products: Mapping[str, Product], advance: Advance) -> list[dict[str, Any]]:
+class Kind(NamedTuple):
+    """What makes a product at a path, from frames of a rate (1/s) and size (px)."""
+
+    make: Callable[[Path, float, tuple[int, int]], Product]
+    is_folder: bool = False
+
+
+def write_played(session: Session, wanted: Mapping[str, Path], advance: Advance) -> list[dict[str, Any]]:
     """Play a recording, every frame in turn, and give all of them what the node knows of it. Frames of the
     warm-up are played, not given.
 
@@ -46,7 +49,7 @@ def write_played(session: Session, products: Mapping[str, Product], advance: Adv
 
     Args:
         session: a recording with `source.pace` step.
-        products: by kind.
+        wanted: files, or new folders, by kind (`KINDS`).
         advance: called with what is going on.
 
     Returns:
@@ -55,15 +58,31 @@ def write_played(session: Session, products: Mapping[str, Product], advance: Adv
     Raises:
         SagsError: it cannot be read, or a file cannot be written.
     """
+    count, done, rows = session.source.frame_count, 0, []
     with ExitStack() as stack:
-        for product in products.values():
-            stack.callback(product.close)
-        count = session.source.frame_count
+        partial = {kind: stack.enter_context(whole(path)) for kind, path in wanted.items()}
+        products = {}
+        for kind, path in wanted.items():
+            with writing(path):
+                products[kind] = KINDS[kind].make(partial[kind], session.source.rate, session.working_size)
         for done, (result, anchors) in enumerate(_played(session), 1):
-            for product in products.values():
-                product.add(result, anchors)
+            for kind, product in products.items():
+                with writing(wanted[kind]):
+                    product.add(result, anchors)
             advance(done, count, "playing")
-        return [{"kind": kind, **product.finish()} for kind, product in products.items()]
+        if done == 0:
+            raise SagsError("no frame was played; check source.start, source.frames and source.warm_up")
+        for kind, product in products.items():
+            path = wanted[kind]
+            with writing(path):
+                row = {"kind": kind, "file": str(path), "holds": product.finish()}
+                rows.append(row | {"bytes": _size(partial[kind])})
+    return rows
+
+
+def _size(path: Path) -> int:
+    """Of a file, or of all in a folder, bytes."""
+    return sum(file.stat().st_size for file in (path, *path.rglob("*")) if file.is_file())
 
 
 def _played(session: Session) -> Iterator[tuple[FrameResult, AnchorStates]]:
@@ -117,32 +136,25 @@ class DepthMaps:
     """A 16-bit PNG for each frame, named by its number, as `source.reference.depth` reads them."""
 
     def __init__(self, folder: Path) -> None:
-        new_folder(folder)
+        folder.mkdir()
         self._folder = folder
-        self._holds = self._bytes = 0
+        self._holds = 0
 
     def add(self, result: FrameResult, anchors: AnchorStates) -> None:
         depth = depth_of(result)
         counts = np.where(depth < MOST_DEPTH, np.round(depth / DEPTH_UNIT), 0).astype(np.uint16)
         path = self._folder / f"{result.pair.frame_id:05d}.png"
-        data = cv2.imencode(".png", counts)[1].tobytes()
-        with writing(path), whole(path) as partial:
-            partial.write_bytes(data)
+        path.write_bytes(cv2.imencode(".png", counts)[1].tobytes())
         self._holds += 1
-        self._bytes += len(data)
 
-    def finish(self) -> dict[str, Any]:
-        return {"file": str(self._folder), "holds": self._holds, "bytes": self._bytes}
-
-    def close(self) -> None:
-        pass
+    def finish(self) -> int:
+        return self._holds
 
 
 class Tracks:
     """An npz with `points` [T, P, 3] (m), `visible` [T, P] and `frames` [T], as `source.reference.tracks`."""
 
     def __init__(self, file: Path) -> None:
-        check_file(file)
         self._file = file
         self._points: list[F32] = []
         self._visible: list[F32] = []
@@ -154,17 +166,11 @@ class Tracks:
         self._visible.append(visibility)
         self._frames.append(result.pair.frame_id)
 
-    def finish(self) -> dict[str, Any]:
-        if not self._points:
-            raise SagsError("no frame was played; check source.start, source.frames and source.warm_up")
+    def finish(self) -> int:
         points, seen = np.stack(self._points), np.stack(self._visible) >= SEEN
-        with writing(self._file), whole(self._file) as partial, partial.open("wb") as file:
+        with self._file.open("wb") as file:
             np.savez_compressed(file, points=points, visible=seen, frames=np.array(self._frames))
-        pinned = int(np.isfinite(points[..., 0]).any(0).sum())
-        return {"file": str(self._file), "holds": pinned, "bytes": self._file.stat().st_size}
-
-    def close(self) -> None:
-        pass
+        return int(np.isfinite(points[..., 0]).any(0).sum())  # that were pinned
 
 
 class Renders:
@@ -172,10 +178,7 @@ class Renders:
     taken in."""
 
     def __init__(self, file: Path, rate: float, size: tuple[int, int]) -> None:
-        check_file(file)
-        self._file = file
-        self._partial = file.with_name(f".partial-{file.name}")
-        self._video = VideoFile(self._partial, rate, size)
+        self._video = VideoFile(file, rate, size)
         self._holds = 0
 
     def add(self, result: FrameResult, anchors: AnchorStates) -> None:
@@ -185,17 +188,9 @@ class Renders:
         self._video.add(picture)
         self._holds += 1
 
-    def finish(self) -> dict[str, Any]:
-        self._video.close()
-        size = self._partial.stat().st_size
-        if size == 0:
-            raise SagsError(f"cannot write {self._file}: is the disk full?")
-        self._partial.replace(self._file)
-        return {"file": str(self._file), "holds": self._holds, "bytes": size}
-
-    def close(self) -> None:
-        self._video.close()
-        self._partial.unlink(missing_ok=True)
+    def finish(self) -> int:
+        self._video.finish()
+        return self._holds
 
 
 def new_folder(folder: Path) -> None:
@@ -209,9 +204,8 @@ def new_folder(folder: Path) -> None:
         raise UsageError(f"{folder} is not empty; choose another folder")
 
 
-# Kind -> what takes a target, a rate (1/s) and a size (px). `sags_lab` adds one.
-PRODUCTS: dict[str, Callable[[Path, float, tuple[int, int]], Product]] = {
-    "depth": lambda folder, rate, size: DepthMaps(folder),
-    "tracks": lambda file, rate, size: Tracks(file),
-    "render": Renders,
+KINDS = {  # by the option of `sags export`; `sags_lab` adds one
+    "depth": Kind(lambda folder, rate, size: DepthMaps(folder), is_folder=True),
+    "tracks": Kind(lambda file, rate, size: Tracks(file)),
+    "render": Kind(Renders),
 }

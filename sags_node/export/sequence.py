@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import tempfile
 from collections.abc import Iterable
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +16,10 @@ import cv2
 
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.errors import SagsError, UsageError
-from sags_node.export.export import whole
 from sags_node.export.orbit import picture_of
 from sags_node.export.scene import Advance, Scene
+from sags_node.files import check_folder, whole, writing
 from sags_node.model.ply import write_ply
-from sags_node.terminal.console import check_folder, writing
 from sags_node.video_file import VideoFile
 
 ABOUT = "sequence.json"
@@ -56,7 +54,7 @@ def check_sequence(folder: Path, about: dict[str, Any], force: bool) -> None:
                     file.unlink(missing_ok=True)
     elif any(folder.iterdir()) and not force:
         raise UsageError(f"{folder} is not empty; choose another folder, or add --force")
-    with writing(stored), whole(stored) as partial:
+    with whole(stored) as partial:
         partial.write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
 
 
@@ -76,7 +74,7 @@ def write_sequence(
         SagsError: nothing is shown, or a file cannot be written; what was written stays.
     """
     written = kept = size = pictures = 0
-    with writing(folder), tempfile.TemporaryDirectory(prefix=".sags-export-", dir=folder) as passing:
+    with writing(folder), tempfile.TemporaryDirectory(prefix=".sags-", dir=folder) as passing:
         rasterizer, camera = None, None
         for number, scene in enumerate(scenes):
             advance(number + 1, count, f"writing frames, {kept} were there")
@@ -87,8 +85,7 @@ def write_sequence(
                 kept += 1
             else:
                 try:
-                    with writing(path), whole(path) as partial:
-                        write_ply(partial, scene.gaussians)
+                    write_ply(path, scene.gaussians)
                 except SagsError as error:
                     said = f"{written + kept} frames are there; the same command goes on with the others"
                     raise SagsError(f"{error}: {said}") from None
@@ -108,15 +105,14 @@ def write_sequence(
         loop = folder / LOOP
         order = [*range(pictures), *range(pictures - 2, 0, -1)]
         with whole(loop) as partial:
-            with closing(VideoFile(partial, rate, (camera.width, camera.height))) as video:
-                for done, number in enumerate(order):
-                    read = cv2.imread(str(Path(passing) / f"{number}.jpg"))
-                    if read is None:
-                        raise SagsError(f"a picture in {passing} was removed; export again")
-                    video.add(cv2.cvtColor(read, cv2.COLOR_BGR2RGB))
-                    advance(done + 1, len(order), "writing the video")
-            if partial.stat().st_size == 0:
-                raise SagsError(f"cannot write {loop}: is the disk full? The same command goes on")
+            video = VideoFile(partial, rate, (camera.width, camera.height))
+            for done, number in enumerate(order):
+                read = cv2.imread(str(Path(passing) / f"{number}.jpg"))
+                if read is None:
+                    raise SagsError(f"a picture in {passing} was removed; export again")
+                video.add(cv2.cvtColor(read, cv2.COLOR_BGR2RGB))
+                advance(done + 1, len(order), "writing the video")
+            video.finish()
     return [
         {"file": str(folder / FRAME.format(0)), "kind": "sequence", "holds": written + kept, "bytes": size},
         {"file": str(loop), "kind": "loop", "holds": len(order), "bytes": loop.stat().st_size},

@@ -28,8 +28,10 @@ from sags_node.engine.rasterizer.rasterize import make_rasterizer, to_view
 from sags_node.errors import SagsError
 from sags_node.export.orbit import orbit
 from sags_node.export.scene import Scene
+from sags_node.export.surface_files import Surface, encoded
+from sags_node.files import whole
 from sags_node.geometry import unproject
-from sags_node.types import F32, Camera
+from sags_node.types import F32, U8, Camera
 
 EYES, TILT = 8, 10.0  # other cameras, and degrees they are tilted: enough to see the sides of folds
 VOXEL_PX = 4.0  # size of a voxel; half of it is noisy, twice as much loses detail
@@ -44,16 +46,12 @@ def write_points(path: Path, scene: Scene) -> int:
     Raises:
         SagsError: it shows nothing of the model, or the file cannot be written.
     """
-    import open3d
-
     camera = scene.camera
     colors, depth = next(_drawn(scene, [camera]))
     v, u = np.nonzero(depth)
     pixels = np.stack([u, v], axis=-1).astype(np.float64)
-    points = unproject(camera, pixels, depth[v, u].astype(np.float64))
-    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
-    cloud.colors = open3d.utility.Vector3dVector(colors[v, u])
-    _check(open3d.io.write_point_cloud(path, cloud))
+    points = unproject(camera, pixels, depth[v, u].astype(np.float64)).astype(np.float32)
+    _write(path, Surface(points, _bytes_of(colors[v, u])))
     return len(points)
 
 
@@ -64,8 +62,6 @@ def write_mesh(path: Path, scene: Scene) -> int:
     Raises:
         SagsError: the left camera sees no surface of the model, or the file cannot be written.
     """
-    import open3d
-
     camera = scene.camera
     _, depth = next(_drawn(scene, [camera]))
     distance = float(np.median(depth[depth > 0]))
@@ -77,13 +73,11 @@ def write_mesh(path: Path, scene: Scene) -> int:
     mesh.remove_unreferenced_vertices()
     if not mesh.triangles:
         raise SagsError("the left camera sees no surface of the model; export another moment")
-    if path.suffix.lower() == ".stl":  # which has no vertices of its own
-        mesh.compute_triangle_normals()
-    else:
-        mesh.compute_vertex_normals()
-        mesh.triangle_normals = open3d.utility.Vector3dVector()
-    _check(open3d.io.write_triangle_mesh(path, mesh))
-    return len(mesh.triangles)
+    mesh.compute_vertex_normals()
+    points, normals = (np.asarray(each, np.float32) for each in (mesh.vertices, mesh.vertex_normals))
+    triangles = np.asarray(mesh.triangles, np.int32)
+    _write(path, Surface(points, _bytes_of(np.asarray(mesh.vertex_colors, np.float32)), normals, triangles))
+    return len(triangles)
 
 
 def _drawn(scene: Scene, cameras: list[Camera]) -> Iterator[tuple[F32, F32]]:
@@ -127,6 +121,11 @@ def _fused(scene: Scene, cameras: list[Camera], voxel: float) -> Any:
     return grid.extract_triangle_mesh(weight_threshold=0.5)  # seen by one camera at least
 
 
-def _check(written: Any) -> None:
-    if not written:
-        raise SagsError("the file cannot be written; is the disk full?")
+def _bytes_of(colors: F32) -> U8:
+    """Colours 0 to 1; fusion goes a little beyond."""
+    return np.round(np.clip(colors, 0, 1) * 255).astype(np.uint8)
+
+
+def _write(path: Path, surface: Surface) -> None:
+    with whole(path) as partial:
+        partial.write_bytes(encoded(path.suffix, surface))

@@ -12,6 +12,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from sags_node.errors import SagsError, UsageError
+from sags_node.files import whole
 from sags_node.fitting.fit import Fit
 
 VERSION = 2
@@ -23,22 +24,17 @@ def save(fit: Fit, path: Path) -> None:
     Raises:
         SagsError: it cannot be written.
     """
-    part = path.with_suffix(".part")
     about = {
         "version": VERSION,
         "settings": asdict(fit.settings),
         "frames": [frame.frame_id for frame in fit.clip.train],
         "progress": fit.state(),
     }
-    try:
-        with part.open("wb") as file:
-            arrays: dict[str, Any] = fit.arrays()
-            np.savez(file, about=np.array(json.dumps(about)), **arrays)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
-    except OSError as error:
-        raise SagsError(f"cannot write the checkpoint {path}: {error.strerror}") from None
+    with whole(path) as partial, partial.open("wb") as file:
+        arrays: dict[str, Any] = fit.arrays()
+        np.savez(file, about=np.array(json.dumps(about)), **arrays)
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def load(fit: Fit, path: Path) -> None:

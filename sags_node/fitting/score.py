@@ -11,11 +11,11 @@ import cv2
 import numpy as np
 
 from sags_node.engine.rasterizer.rasterize import to_view
-from sags_node.errors import SagsError
 from sags_node.evaluation import metrics
 from sags_node.evaluation.carried import Seen, carried
 from sags_node.evaluation.lpips import Lpips
 from sags_node.evaluation.tracking import PointTracks
+from sags_node.files import whole
 from sags_node.fitting.clip import ClipFrame
 from sags_node.fitting.fit import Fit
 from sags_node.types import F32, F64
@@ -199,5 +199,5 @@ def _means(rows: list[dict[str, float]]) -> dict[str, Any]:
 
 def _write(path: Path, rgb: np.ndarray) -> None:
     picture = np.rint(np.clip(rgb, 0, 1) * 255).astype(np.uint8)
-    if not cv2.imwrite(str(path), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)):
-        raise SagsError(f"cannot write {path}; is the disk full?")
+    with whole(path) as partial:
+        partial.write_bytes(cv2.imencode(".png", picture[..., ::-1])[1].tobytes())

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from itertools import islice
 from pathlib import Path
 
-from sags_node.calibrate.check import check_calibration
-from sags_node.calibration import Finding
-from sags_node.config import EndoNerfSource, RecordedSource
+from sags_node.calibrate.check import check_calibration, judge
+from sags_node.calibrate.pictures import Pair, pairs_of_files
+from sags_node.calibration import Finding, read_rig
+from sags_node.config import EndoNerfSource, LaunchConfig, RecordedSource, VideosSource
 from sags_node.errors import SagsError
 from sags_node.importing import pictures, videos
 from sags_node.importing.folder import Contents, both_eyes, calibration_of, recognise
-from sags_node.sources.pictures import size_text
+from sags_node.importing.timing import LOOKED_AT, Timing, check_timing
+from sags_node.sources.pictures import FolderPairs, size_text
 from sags_node.sources.source import open_source
 
 
@@ -22,16 +25,20 @@ def check_folder(folder: Path) -> list[Finding]:
         UsageError: it is no folder.
     """
     contents = recognise(folder)
-    found = [Finding("ok", f"{folder.name or folder} is {contents.what}")]
+    mend = "" if contents.level == "ok" else contents.play
+    found = [Finding(contents.level, f"{folder.name or folder} is {contents.what}", mend)]
     if contents.left is not None:
         found += _pictures(contents, contents.left)
     play = contents.play
     if contents.videos:
-        looked, play = videos.look(contents.videos, calibration_of(folder))
-        found += looked
+        form = calibration_of(folder)
+        looked, play, pairs = videos.look(contents.videos, form)
+        found += looked + (_calibrated(form, lambda: pairs) if pairs else [])
     if contents.config is not None:
-        found += _played(contents)
+        found += played(contents.config)
     found = _once(found + _calibration(folder, contents))
+    if contents.level == "error":
+        return found
     wrong = any(finding.level == "error" for finding in found)
     how = "when that is mended: " if wrong else ""
     return [*found, Finding("ok", f"to play it: {how}{play}")]
@@ -59,6 +66,9 @@ def _pictures(contents: Contents, left_folder: Path) -> list[Finding]:
     if clip is not None and contents.depth is not None:
         there["depth"] = contents.depth
     found = _tried("pictures", lambda: pictures.check_counts(there))
+    right_folder = contents.right
+    if right_folder is not None and contents.config is None and found[0].level == "ok":
+        found += _tried("pictures", lambda: check_timing(FolderPairs(left_folder, right_folder)))
     try:
         left = pictures.sample(left_folder)
         right = [] if contents.right is None else pictures.sample(contents.right)
@@ -94,12 +104,22 @@ def _calibration(folder: Path, contents: Contents) -> list[Finding]:
         return _tried("calibration", lambda: _odd_or_last(check_calibration(folder)))
     if contents.right is None or contents.left is None:
         return []
-    form = calibration_of(folder)
+    eyes = [(contents.left, contents.right)]
+    return _calibrated(calibration_of(folder), lambda: pairs_of_files(eyes))
+
+
+def _calibrated(form: Path | None, read: Callable[[], Sequence[Pair]]) -> list[Finding]:
+    """The calibration beside pictures, against them."""
     if form is None:
         mend = "without one there is no depth in mm: sags calib stereo makes one (docs/calibration.md)"
         return [Finding("warning", "no calibration lies beside the pictures", mend)]
-    eyes = [(contents.left, contents.right)]
-    return _tried("calibration", lambda: _odd_or_last(check_calibration(form, images=eyes)))
+
+    def compare() -> list[Finding]:
+        pairs = read()
+        height, width = pairs[0][0].shape[:2]
+        return _odd_or_last(judge(read_rig(form, (width, height)), pairs))
+
+    return _tried("calibration", compare)
 
 
 def _odd_or_last(found: list[Finding]) -> list[Finding]:
@@ -108,25 +128,31 @@ def _odd_or_last(found: list[Finding]) -> list[Finding]:
     return odd or [Finding("ok", f"calibration: {found[-1].what}", "", found[-1].figures)]
 
 
-def _played(contents: Contents) -> list[Finding]:
-    """Whether the first frame comes, as `sags run` would read it."""
-    assert contents.config is not None  # the caller looked
-    source = contents.config.source
+def played(config: LaunchConfig) -> list[Finding]:
+    """Whether frames come as `sags run` would read them, all of both eyes, and both at one time."""
+    source = config.source
     if not isinstance(source, RecordedSource):
         return [
             Finding("ok", f"source.kind {source.kind} is live: sags doctor and sags calib live look at it")
         ]
     source = source.model_copy(update={"pace": "step", "loop": False})
 
-    def first() -> list[Finding]:
+    def look() -> list[Finding]:
+        timing, size, ends = Timing(), None, []
         with open_source(source, references=False) as opened:
-            frame = next(iter(opened), None)
-            if frame is None:
+            if isinstance(source, VideosSource) and source.right is not None:
+                frames = round(source.start * opened.rate) + (opened.frame_count or 0)
+                ends = videos.check_ends(source.left, source.right, frames * source.stride)
+            for frame in islice(opened, 1 if ends else LOOKED_AT):
+                size = size or frame.left.shape[1::-1]
+                if frame.right is not None:
+                    timing.add(frame.left, frame.right)
+            if size is None:
                 return [Finding("error", "not one frame can be read", "check the files")]
-            size = size_text(frame.left.shape[1], frame.left.shape[0])
-            return [Finding("ok", f"{opened.frame_count} frames of {size} px at {opened.rate:g} Hz")]
+            said = f"{opened.frame_count} frames of {size_text(*size)} px at {opened.rate:g} Hz"
+        return [Finding("ok", said), *ends, *timing.findings()]
 
-    return _tried("frames", first)
+    return _tried("frames", look)
 
 
 def _tried(what: str, look: Callable[[], list[Finding]]) -> list[Finding]:

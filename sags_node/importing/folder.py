@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from sags_node.calibration import find_form
 from sags_node.config import LaunchConfig
@@ -26,7 +27,8 @@ class Contents:
     """What was found; None: it is not there."""
 
     what: str
-    play: str  # how, or why not yet
+    play: str  # how, or what to do instead
+    level: Literal["ok", "error"] = "ok"  # error: nothing can be made of it as it is
     left: Path | None = None  # folders of pictures
     right: Path | None = None
     masks: Path | None = None
@@ -47,7 +49,7 @@ def recognise(folder: Path) -> Contents:
         config = load_launch(folder)
     except UsageError as error:
         if (folder / "launch.yaml").is_file():
-            return Contents("a session whose launch.yaml is wrong", str(error))
+            return Contents("a session whose launch.yaml is wrong", str(error), "error")
     else:
         return _playable(folder, config)
     for is_one, contents in _KNOWN:
@@ -70,7 +72,7 @@ def _playable(folder: Path, config: LaunchConfig) -> Contents:
         right, masks = _first(folder, ("images_right",)), _first(folder, ("masks",))
         left = _first(folder, ("images",))
     play = f"sags run {folder}"
-    return Contents(what, play, left, right, masks, _first(folder, DEPTHS), config)
+    return Contents(what, play, "ok", left, right, masks, _first(folder, DEPTHS), config)
 
 
 def _plain(folder: Path) -> Contents:
@@ -81,7 +83,7 @@ def _plain(folder: Path) -> Contents:
         play = f"sags run source.kind:=folders source.left:={left} source.right:={right}"
         tools = "" if masks is None else f" source.tools:={masks}"
         rig = f" rig:={calibration_of(folder) or 'CALIBRATION'}"
-        return Contents("two folders of pictures", f"{play}{tools}{rig}", left, right, masks, depth)
+        return Contents("two folders of pictures", f"{play}{tools}{rig}", "ok", left, right, masks, depth)
     videos = sorted(file for file in folder.iterdir() if file.suffix.lower() in VIDEO_SUFFIXES)
     if videos:
         what = "one video" if len(videos) == 1 else f"{len(videos)} videos"
@@ -90,15 +92,15 @@ def _plain(folder: Path) -> Contents:
         apart = both_eyes(folder)
         both = f" of both eyes, {len(apart)} pairs," if apart else ""
         play = "put the pictures of each eye in a folder of its own, left/ and right/, and check again"
-        return Contents(f"pictures{both} in one folder", play, left=folder)
+        return Contents(f"pictures{both} in one folder", play, "error", left=folder)
     below = sorted(each.name for each in folder.iterdir() if each.is_dir())
     if not below:
         what = (
             "a folder without pictures, videos or a recording" if any(folder.iterdir()) else "an empty folder"
         )
-        return Contents(what, "give the folder that holds the recording")
+        return Contents(what, "give the folder that holds the recording", "error")
     play = f"check one of the folders in it: {', '.join(below[:8])}"
-    return Contents("nothing that is known", play)
+    return Contents("nothing that is known", play, "error")
 
 
 def _eye_folders(folder: Path) -> tuple[Path, Path] | None:

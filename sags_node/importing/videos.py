@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
+from sags_node.calibrate.pictures import Pair
 from sags_node.calibration import Finding
 from sags_node.calibration.matches import match_eyes
+from sags_node.config import GeometryConfig
 from sags_node.errors import SagsError
 from sags_node.importing import pictures
+from sags_node.importing.timing import check_timing
+from sags_node.sources.layout import Layout
 from sags_node.sources.pictures import size_text
-from sags_node.sources.videos import Video
+from sags_node.sources.videos import Video, VideoPairs
 from sags_node.types import U8
 
 LOOKED_AT = 4  # pictures, spread over the video
@@ -58,8 +63,8 @@ _WAYS = (  # a part before the whole: what is found in the one is found in the o
 )
 
 
-def look(files: tuple[Path, ...], calibration: Path | None) -> tuple[list[Finding], str]:
-    """What is odd, and how to play them.
+def look(files: tuple[Path, ...], calibration: Path | None) -> tuple[list[Finding], str, list[Pair]]:
+    """What is odd, how to play them, and some pairs of two videos.
 
     Args:
         files: of the left and the right eye, or one.
@@ -67,17 +72,46 @@ def look(files: tuple[Path, ...], calibration: Path | None) -> tuple[list[Findin
     """
     rig = f"rig:={calibration or 'CALIBRATION'}"
     try:
+        found = [_length(file) for file in files]
         shown = [_some(file) for file in files]
     except SagsError as error:
-        return [
-            pictures.refused("video", error)
-        ], f"sags run source.kind:=videos source.left:={files[0]} {rig}"
+        play = f"sags run source.kind:=videos source.left:={files[0]} {rig}"
+        return [pictures.refused("video", error)], play, []
     if len(files) == 1:
-        return _one(files[0], shown[0], rig)
-    left, right = shown
-    found = pictures.check_eye("left", left) + pictures.check_eye("right", right)
-    play = f"sags run source.kind:=videos source.left:={files[0]} source.right:={files[1]} {rig}"
-    return [*found, *pictures.check_eyes(left, right)], play
+        odd, play = _one(files[0], shown[0], rig)
+        return found + odd, play, []
+    (left_file, right_file), (left, right) = files, shown
+    play = f"sags run source.kind:=videos source.left:={left_file} source.right:={right_file} {rig}"
+    found += pictures.check_eye("left", left) + pictures.check_eye("right", right)
+    try:
+        with closing(VideoPairs(left_file, right_file, Layout(GeometryConfig()))) as pairs:
+            ends = check_ends(left_file, right_file, pairs.count)
+            found += ends or check_timing(pairs)
+    except SagsError as error:
+        return [*found, pictures.refused("videos", error)], play, []
+    found += pictures.check_eyes(left, right)
+    return found, play, [(a, b) for (_, a), (_, b) in zip(left, right, strict=True)]
+
+
+def _length(file: Path) -> Finding:
+    with closing(Video(file)) as video:
+        rate = "" if video.rate is None else f" at {video.rate:g} Hz, {video.count / video.rate:.1f} s"
+        return Finding("ok", f"{file.name}: {video.count} frames of {size_text(*video.size)} px{rate}")
+
+
+def check_ends(left: Path, right: Path, needed: int) -> list[Finding]:
+    """Whether the right video reaches as far as the left one is played, so many frames."""
+    with closing(Video(right)) as video:
+        count = video.count
+    if count < needed:
+        what = f"{right.name} ends after {count} frames but {left.name} goes on: there playing fails"
+        return [Finding("error", what, f"set source.frames:={count} to stop there, or give both one length")]
+    with closing(Video(left)) as video:
+        if count == video.count:
+            return []
+        what = f"{right.name} has {count} frames, {left.name} {video.count}"
+    mend = "were both begun at the same moment? What the left one has is played"
+    return [Finding("warning", what, mend)]
 
 
 def _some(file: Path) -> list[tuple[Path, U8]]:

@@ -15,6 +15,7 @@ from pathlib import Path
 import msgspec
 
 from sags_node.errors import SagsError, UsageError
+from sags_node.files import whole
 
 MAX_CONNECTION_FILE_BYTES = 16384
 MAX_UNIX_SOCKET_PATH = 107  # bytes, sun_path of Linux without its final zero
@@ -125,13 +126,14 @@ class RunDirectory:
         return f"ipc://{self.ipc_path}"
 
     def write_connection(self, connection: Connection) -> None:
-        """Replace the connection file in one step, mode 0600."""
-        partial = self.connection_file.with_suffix(".partial")
-        partial.unlink(missing_ok=True)
-        descriptor = os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-        with os.fdopen(descriptor, "wb") as file:
-            file.write(msgspec.json.encode(connection))
-        partial.replace(self.connection_file)
+        """Replace the connection file in one step, mode 0600.
+
+        Raises:
+            SagsError: it cannot be written.
+        """
+        with whole(self.connection_file) as partial:
+            partial.touch(0o600)
+            partial.write_bytes(msgspec.json.encode(connection))
 
     def close(self) -> None:
         if self.is_held:  # else they are another node's

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import ipaddress
 import logging
-import os
 import re
 import struct
 import threading
@@ -25,6 +24,7 @@ from zmq.auth.thread import ThreadAuthenticator
 from zmq.utils import z85
 
 from sags_node.errors import SagsError, UsageError
+from sags_node.files import whole, writing
 from sags_node.messaging.roles import ROLES, Client, client_of, lesser
 
 if TYPE_CHECKING:
@@ -55,7 +55,8 @@ def write_key_pair(folder: Path, name: str) -> tuple[Path, Path]:
     """Make a new key pair: `name.key` (mode 0600) and `name.pub` in `folder`.
 
     Raises:
-        UsageError: a file of that name exists, the name is no file name, or the folder cannot be written.
+        UsageError: a file of that name exists, or the name is no file name.
+        SagsError: they cannot be written.
     """
     if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*", name):
         raise UsageError(f"'{name}' is no name for a key; use letters, digits, - _ and .")
@@ -64,28 +65,20 @@ def write_key_pair(folder: Path, name: str) -> tuple[Path, Path]:
     private = f"# Secret key of a SAGS node or client; keep it to yourself.\n{_curve(public)}"
     private += f'    secret-key = "{secret}"\n'
     shared = f"# Public key of a SAGS node or client; give it to the other side.\n{_curve(public)}"
-    try:
+    for file in (secret_file, public_file):
+        if file.exists():
+            raise UsageError(f"{file} exists already; choose another name or remove it")
+    with writing(folder):
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if public_file.exists():
-            raise FileExistsError(None, None, str(public_file))
-        _write_new(secret_file, private, 0o600)
-        _write_new(public_file, shared, 0o644)
-    except FileExistsError as error:
-        raise UsageError(f"{error.filename} exists already; choose another name or remove it") from None
-    except OSError as error:
-        raise UsageError(f"cannot write keys into {folder}: {error.strerror}; choose another --out") from None
+    with whole(secret_file) as secret_part, whole(public_file) as public_part:
+        secret_part.touch(0o600)  # never with a moment in which others can read it
+        secret_part.write_text(private, encoding="ascii")
+        public_part.write_text(shared, encoding="ascii")
     return secret_file, public_file
 
 
 def _curve(public: str) -> str:
     return f'curve\n    public-key = "{public}"\n'
-
-
-def _write_new(file: Path, text: str, mode: int) -> None:
-    """Never with a moment in which others can read it, never over another file."""
-    descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
-    with os.fdopen(descriptor, "w", encoding="ascii") as opened:
-        opened.write(text)
 
 
 def read_key_pair(file: Path) -> KeyPair:

@@ -9,6 +9,7 @@ import numpy as np
 from sags_node.confidence import confidence_of
 from sags_node.engine.rasterizer.smoothing import folded
 from sags_node.errors import SagsError
+from sags_node.files import whole
 from sags_node.types import SH_DEGREE_0, Gaussians
 
 _FIELDS = (
@@ -16,14 +17,14 @@ _FIELDS = (
 )
 
 
-def write_ply(path: Path, gaussians: Gaussians) -> None:
+def write_ply(path: Path, gaussians: Gaussians, force: bool = False) -> None:
     """Write a binary PLY in the layout of 3D Gaussian Splatting (Kerbl et al., 2023): log scales, opacity
     logits, quaternions wxyz, colours as degree-0 spherical harmonics; metres. The 3D filter is folded in:
     viewers do not know it. Where the errors of depth are known, `confidence` comes last, see
     `sags_node.confidence`; readers take properties by name.
 
     Raises:
-        SagsError: the file exists already (nothing is overwritten) or cannot be written.
+        SagsError: the file exists already and `force` is not given, or it cannot be written.
     """
     gaussians = folded(gaussians)
     opacities = np.clip(gaussians.opacities, 1e-6, 1 - 1e-6)
@@ -46,11 +47,8 @@ def write_ply(path: Path, gaussians: Gaussians) -> None:
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(gaussians)}"]
     header += [f"property float {name}" for name in fields]
     header += ["end_header", ""]
-    try:
-        with path.open("xb") as file:
-            file.write("\n".join(header).encode())
-            file.write(np.ascontiguousarray(columns, "<f4").tobytes())
-    except FileExistsError:
-        raise SagsError(f"{path} exists already; choose another name") from None
-    except OSError as error:
-        raise SagsError(f"cannot write {path}: {error.strerror}") from None
+    if path.exists() and not force:
+        raise SagsError(f"{path} exists already; choose another name")
+    with whole(path) as partial, partial.open("wb") as file:
+        file.write("\n".join(header).encode())
+        file.write(np.ascontiguousarray(columns, "<f4").tobytes())

@@ -64,6 +64,7 @@ class Options:
     shape: str = "target"
     seconds: float | None = None  # default: until Ctrl-C
     save: Path | None = None  # .mp4 for every picture, .png for the last one with the overlay
+    force: bool = False  # it may replace a file
     max_age: float = MAX_AGE
     repin: bool = False
     show_latency: bool = False
@@ -91,7 +92,7 @@ def run_overlay(options: Options, tell: Callable[[str], object] = log.warning) -
         raise UsageError("--pin is for the built-in target; a scene file says where its objects are pinned")
     if options.endpoint is not None and options.control is None:
         raise UsageError("--endpoint needs --control, the node's control socket: anchors are asked for there")
-    output = Output(options.save)
+    output = Output(options.save, options.force)
     scene = built_in(options.pin, options.shape) if options.scene is None else read_scene(options.scene)
     overlay_draw.warm_up()
     bodies = [Body(mesh_of(spec), spec.opacity, spec.label) for spec in scene.objects]

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from pathlib import Path
 
 import cv2
 
-from sags_node.errors import SagsError, UsageError
+from sags_node.errors import UsageError
+from sags_node.files import check_file, whole, writing
 from sags_node.types import U8
 from sags_node.video_file import VideoFile
 
@@ -16,18 +18,25 @@ PICTURES_BEFORE_VIDEO = 5  # the frame rate must be known before a video file is
 class Output:
     """Every picture as .mp4, or the last one with the overlay as .png; None: nothing is kept.
 
+    Args:
+        force: replace a file that exists.
+
     Raises:
-        UsageError: another kind of file, or its folder does not exist.
+        UsageError: another kind of file, its folder does not exist, or the file does.
+        SagsError: it cannot be written.
     """
 
-    def __init__(self, file: Path | None) -> None:
+    def __init__(self, file: Path | None, force: bool = False) -> None:
         if file is not None and file.suffix not in (".mp4", ".png"):
             raise UsageError(f"cannot save {file}: the name must end in .mp4 or .png")
         if file is not None and not file.parent.is_dir():
             raise UsageError(f"cannot save {file}: there is no folder {file.parent}")
+        if file is not None:
+            check_file(file, force)
         self._file = file
         self._still: U8 | None = None
         self._video: VideoFile | None = None
+        self._whole = ExitStack()  # of the video
         self._shown = 0
         self.saved: str | None = None  # what has been written
 
@@ -47,10 +56,9 @@ class Output:
         if self._shown < PICTURES_BEFORE_VIDEO:
             return
         if self._video is None:
-            try:
-                self._video = VideoFile(self._file, 1 / period, (picture.shape[1], picture.shape[0]))
-            except SagsError as error:
-                raise SagsError(f"{self._file}: {error}") from None
+            size = picture.shape[1], picture.shape[0]
+            with writing(self._file):
+                self._video = VideoFile(self._whole.enter_context(whole(self._file)), 1 / period, size)
         self._video.add(picture)
 
     def close(self) -> None:
@@ -60,9 +68,10 @@ class Output:
             SagsError: it cannot be written.
         """
         if self._video is not None:
-            self._video.close()
+            with self._whole:
+                self._video.finish()
             self.saved = str(self._file)
-        if self._still is not None:
-            if not cv2.imwrite(str(self._file), cv2.cvtColor(self._still, cv2.COLOR_RGB2BGR)):
-                raise SagsError(f"cannot write {self._file}; check the folder's rights and the disk")
+        if self._still is not None and self._file is not None:
+            with whole(self._file) as partial:
+                partial.write_bytes(cv2.imencode(".png", self._still[..., ::-1])[1].tobytes())
             self.saved = str(self._file)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import shutil
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -17,6 +16,7 @@ import yaml
 from sags_node.calibration import save_rig
 from sags_node.config import PhantomSource
 from sags_node.errors import SagsError, UsageError
+from sags_node.files import check_folder, whole
 from sags_node.phantom.scene import Phantom, PhantomFrame
 
 Progress = Callable[[int, int], None]  # frames done, frames in all
@@ -55,9 +55,8 @@ def write_session(
 ) -> None:
     """Render `round(config.seconds * rate)` frames and all that is true of them into a new folder.
 
-    The folder appears only when it is complete: until then everything is in a sibling whose name ends in
-    `.partial`, which is removed when rendering is interrupted. `launch_file.load_launch(folder)` reads the
-    result. Same config and rate, same files on one machine.
+    The folder appears only when it is complete. `launch_file.load_launch(folder)` reads the result. Same
+    config and rate, same files on one machine.
 
     Raises:
         UsageError: the folder exists and is not empty.
@@ -65,19 +64,12 @@ def write_session(
     """
     folder = Path(folder)
     count = max(1, round(config.seconds * rate))
-    partial = folder.with_name(f"{folder.name}.{os.getpid()}.partial")
-    try:
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise UsageError(f"{folder} exists and is not empty; remove it or name another folder")
-        partial.mkdir(parents=True)
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise UsageError(f"{folder} exists and is not empty; remove it or name another folder")
+    check_folder(folder.parent)
+    with whole(folder) as partial:
+        partial.mkdir()
         _write_frames(config, partial, count, rate, progress)
-        partial.rename(folder)
-    except OSError as error:
-        raise SagsError(
-            f"cannot write the phantom session {folder}: {error.strerror}; check space and rights"
-        ) from None
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
 
 
 def _write_frames(

@@ -17,7 +17,8 @@ from mcap.records import Schema
 from mcap.writer import CompressionType, Writer
 
 from sags_node import __version__
-from sags_node.errors import SagsError, UsageError
+from sags_node.errors import UsageError
+from sags_node.files import writing
 from sags_node.recording.bag import METADATA
 from sags_node.recording.bag_metadata import Part, Topic, describe, quality
 
@@ -62,11 +63,9 @@ class BagWriter:
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise UsageError(f"{folder} exists already; name a new folder")
         self._is_new = not folder.exists()
-        try:
+        with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
             self._begin_file()
-        except OSError as error:
-            raise SagsError(f"cannot write {folder}: {error.strerror}; name another place") from None
 
     def add_topic(
         self, name: str, kind: str, schema: Schema, type_hash: str = "", latched: bool = False
@@ -125,12 +124,21 @@ class BagWriter:
         return sum(part.counts.total() for part in self._parts)
 
     def close(self) -> None:
-        """Finish the file and describe the bag."""
+        """Finish the file and describe the bag.
+
+        Raises:
+            OSError: the disk is full.
+        """
         self._end_file()
         text = yaml.safe_dump(
             {"rosbag2_bagfile_information": describe(self._parts, self._topics)}, sort_keys=False
         )
-        (self.folder / METADATA).write_text(text, encoding="utf-8")
+        metadata = self.folder / METADATA
+        try:
+            metadata.write_text(text, encoding="utf-8")
+        except OSError:
+            metadata.unlink(missing_ok=True)  # half of it would hide a bag that is whole
+            raise
 
     def discard(self) -> None:
         """Remove what was written, and the folder if it was made for it."""

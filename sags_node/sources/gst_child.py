@@ -2,12 +2,13 @@
 
     python -m sags_node.sources.gst_child '{"launch": ..., "sinks": ["left", "right"]}' FD
     python -m sags_node.sources.gst_child '{"elements": ["rtspsrc", ...]}' FD
+    python -m sags_node.sources.gst_child '{"parse": ...}' FD
 
 FD is a SOCK_SEQPACKET socket. Each message to the parent is JSON: `{"sink", "width", ...}` with the memory's
 descriptor before the first picture of a sink, `{"sink", "slot", "t_ns", ...}` for a picture, `{"ended"}`,
-`{"error", "debug"}`. The parent gives slots back: two bytes, the sink's index and the slot. START plays a
-file, which is paused at first. The process ends when the parent does. It is one of its own because plugins
-and drivers may crash or hang.
+`{"error", "debug"}`; `{"parsed"}` of a launch string that is right. The parent gives slots back: two bytes,
+the sink's index and the slot. START plays a file, which is paused at first. The process ends when the parent
+does. It is one of its own because plugins and drivers may crash or hang.
 """
 
 from __future__ import annotations
@@ -234,6 +235,8 @@ def main() -> None:
             tell(
                 there, {"version": gst.version, "missing": [e for e in request["elements"] if not gst.has(e)]}
             )
+        elif "parse" in request:
+            tell(there, {"parsed": bool(Gst().parse(request["parse"]))})
         else:
             play(request, there)
     except GstError as error:

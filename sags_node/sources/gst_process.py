@@ -67,6 +67,7 @@ class GstProcess:
                 pass_fds=[there.fileno(), *keep],
                 stdin=subprocess.DEVNULL,
                 stderr=subprocess.PIPE,
+                process_group=0,  # a Ctrl-C in the terminal is the node's, which then ends it
                 env={"GST_DEBUG": "1", **os.environ, "GST_DEBUG_NO_COLOR": "1"},  # 1: errors
             )
         finally:
@@ -179,7 +180,21 @@ def installed() -> tuple[str, dict[str, str]]:
     Raises:
         SagsError: GStreamer is not installed, or does not answer.
     """
-    child = GstProcess({"elements": list(ELEMENTS)})
+    said = _asked({"elements": list(ELEMENTS)})
+    return said["version"], {name: ELEMENTS[name] for name in said["missing"]}
+
+
+def check_launch(launch: str) -> None:
+    """Whether GStreamer takes this launch string; nothing is played.
+
+    Raises:
+        SagsError: an element is missing, or the string is wrong.
+    """
+    _asked({"parse": launch})
+
+
+def _asked(request: dict[str, Any]) -> dict[str, Any]:
+    child = GstProcess(request)
     try:
         heard = None
         for _ in range(10):
@@ -188,4 +203,4 @@ def installed() -> tuple[str, dict[str, str]]:
         child.close()
     if heard is None:
         raise SagsError(f"GStreamer does not answer within {ASK_S:g} s")
-    return heard[0]["version"], {name: ELEMENTS[name] for name in heard[0]["missing"]}
+    return heard[0]

@@ -242,7 +242,8 @@ class DeviceReader:
                 self._device = self._open_device(self._input)
                 log.warning("%s is open again", self._input.name)
             except SagsError as error:
-                log.warning("%s; next attempt in %.1f s", error, pause)
+                if not self._stopped.is_set():
+                    log.warning("%s; next attempt in %.1f s", error, pause)
 
     def _read_until_lost(self, device: CaptureDevice) -> int:
         """Hand on pictures until the device fails or falls silent, or `stopped`; how many there were."""

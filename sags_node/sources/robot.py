@@ -171,7 +171,7 @@ class Posed:
 
     def __init__(self, source: Source, config: LaunchConfig, rig: StereoRig) -> None:
         assert config.robot is not None
-        hand_eye = read_hand_eye(_hand_eye_file(config))
+        hand_eye = read_hand_eye(hand_eye_file(config))
         self._T_hand_cam = rectified(hand_eye.T_hand_cam, rig)
         self._offset_ns = hand_eye.offset_ns
         if config.robot.offset_ms is not None:
@@ -237,7 +237,12 @@ def rectified(T_hand_cam: F64, rig: StereoRig) -> F64:
     return moved
 
 
-def _hand_eye_file(config: LaunchConfig) -> Path:
+def hand_eye_file(config: LaunchConfig) -> Path:
+    """Where the camera on the robot is said to be.
+
+    Raises:
+        UsageError: nowhere.
+    """
     assert config.robot is not None
     if config.robot.hand_eye is not None:
         return config.robot.hand_eye

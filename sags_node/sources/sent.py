@@ -17,6 +17,8 @@ from sags_node.sources.pictures import size_text
 from sags_node.types import U8, Side
 
 OLDEST_NS = 1_000_000_000  # what is older is of no use, or of another clock
+AWAY_NS = 1_000_000_000  # without a picture, and
+AWAY_STEPS = 10  # times the usual step: whoever sends was away, and nothing was lost
 AHEAD_NS = 100_000_000  # beyond what clocks that are set by each other differ
 LATE_NS = 200_000_000  # on the way: a hand that is shown so late misses
 SMOOTHED = 0.1  # share of the newest picture in what is said of the last ones
@@ -33,7 +35,7 @@ class Arrivals:
         self._lost_before = 0  # the last stretch of `WINDOW` pictures began
 
     def add(self, stamp_ns: int) -> None:
-        if self._stamps and stamp_ns <= self._stamps[-1]:
+        if self._stamps and (stamp_ns <= self._stamps[-1] or self._was_away(stamp_ns - self._stamps[-1])):
             self._stamps.clear()
             self._count = 0
         self._stamps.append(stamp_ns)
@@ -59,6 +61,11 @@ class Arrivals:
         if len(self._stamps) < WINDOW // 3:
             return float("inf")
         return (len(self._stamps) - 1) * 1e9 / (self._stamps[-1] - self._stamps[0])
+
+    def _was_away(self, gap_ns: int) -> bool:
+        if gap_ns < AWAY_NS or len(self._stamps) < 2:
+            return False
+        return gap_ns > AWAY_STEPS * float(np.median(np.diff(np.array(self._stamps))))
 
     def _lost_now(self) -> float:
         """In the last stretch: pictures that the usual step between two leaves room for, and did not come."""
@@ -99,7 +106,10 @@ class SentPictures:
         """What is wrong with how pictures come, for who sends them; None: nothing."""
         rate = min(arrivals.rate for arrivals in self.arrivals.values())
         if rate < ENOUGH * self._rate:
-            return f"{rate:.1f} of {self._rate:g} pictures a second come (source.rate): send faster"
+            return (
+                f"{rate:.1f} of {self._rate:g} pictures a second come: send faster, or set "
+                f"source.rate:={round(rate, 1):g}"
+            )
         if not self._own and self._age_ns > LATE_NS:
             return (
                 f"pictures are {self._age_ns * 1e-6:.0f} ms old when they come: send smaller ones, or JPEG; "

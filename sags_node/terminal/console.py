@@ -6,13 +6,11 @@ import json
 import logging
 import signal
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
-from pathlib import Path
 from types import FrameType
 from typing import Any
 
@@ -20,8 +18,6 @@ import click
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
-
-from sags_node.errors import SagsError
 
 WIDE = 200  # columns of a table that goes to a file or another program, and so is not cut to a screen
 
@@ -48,22 +44,36 @@ class _Json(logging.Formatter):
         return json.dumps(said)
 
 
+class _Lines(logging.Handler):
+    """The log for people, in the form of `tell`."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        try:
+            _print(f"{record.levelname.lower()}: {self.format(record)}")
+        except OSError:  # the terminal is gone: no reason to end a thread that logs
+            self.handleError(record)
+
+
 def log_handler() -> logging.Handler:
     """For people; where the console is quiet, for machines."""
-    if console.quiet:
-        handler = logging.StreamHandler()
-        handler.setFormatter(_Json())
-        return handler
-    from rich.logging import RichHandler  # --help needs none
-
-    return RichHandler(console=console, show_path=False)
+    if not console.quiet:
+        return _Lines()
+    handler = logging.StreamHandler()
+    handler.setFormatter(_Json())
+    return handler
 
 
 def tell(line: str) -> None:
     """Something that a person should know: a line, or an event in the log."""
     if console.quiet:
         log.warning("%s", line)
-    console.print(line, markup=False, soft_wrap=True)
+    _print(line)
+
+
+def _print(line: str) -> None:
+    """In a file with its time: nobody saw when it came."""
+    when = "" if console.is_terminal else datetime.now().astimezone().isoformat(" ", "seconds") + " "
+    console.print(when + line, markup=False, soft_wrap=True)
 
 
 @contextmanager
@@ -91,30 +101,6 @@ def _drawn(table: Table) -> str:
     with screen.capture() as captured:
         screen.print(table)
     return "\n".join(line.rstrip() for line in captured.get().splitlines())
-
-
-@contextmanager
-def writing(target: Path) -> Iterator[None]:
-    """A full disk or missing rights become one message."""
-    try:
-        yield
-    except OSError as error:
-        raise SagsError(f"cannot write {target}: {error.strerror}; name another place") from None
-
-
-def check_folder(folder: Path) -> None:
-    """Make the folder, and be sure that a file can be made in it."""
-    with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=folder).close()
-
-
-def check_file(file: Path) -> None:
-    """Be sure that this file can be written, without touching it."""
-    check_folder(file.parent)
-    with writing(file):
-        if file.exists():
-            file.open("r+b").close()
 
 
 class _Interrupt:
@@ -151,7 +137,7 @@ interrupt = _Interrupt()
 
 
 def on_stop_signals(stop: Callable[[], None]) -> None:
-    """Let Ctrl-C and a service manager's stop call this; a second one breaks off.
+    """Let Ctrl-C, a service manager's stop and the end of the terminal call this; a second one breaks off.
 
     For what runs until then: the exception that they raise otherwise is lost if it meets a finaliser.
     """
@@ -162,3 +148,5 @@ def on_stop_signals(stop: Callable[[], None]) -> None:
 
     signal.signal(signal.SIGINT, handle)
     signal.signal(signal.SIGTERM, handle)
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup
+        signal.signal(signal.SIGHUP, handle)

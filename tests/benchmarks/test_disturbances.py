@@ -284,7 +284,7 @@ KEYS = {
 def test_the_bench_measures_the_phantom(tmp_path: Path) -> None:
     file, pictures = tmp_path / "table.json", tmp_path / "pictures"
     asked = ["--only", "clean", "--only", "black_right", "--from", 12]
-    result = bench(SESSION, "source.frames:=36", *asked, "--json", file, "--pictures", pictures)
+    result = bench(SESSION, "source.frames:=36", *asked, "--out", file, "--pictures", pictures)
     assert result.exit_code == 0, result.output
     assert "black_right" in result.stdout
     table = json.loads(file.read_text())

@@ -173,7 +173,11 @@ def test_a_socket_for_other_machines(phantom_session: Path) -> None:
 def test_ctrl_c_ends_the_overlay_with_its_figures(beside_node: dict[str, Any], tmp_path: Path) -> None:
     video = tmp_path / "video.mp4"
     process = start(["overlay", "--save", video, "--json"])
-    wait_for(process, lambda: video.exists() and video.stat().st_size > 1000)  # more than its head
+
+    def begun() -> bool:
+        return any(file.stat().st_size > 1000 for file in tmp_path.glob(".sags-*/*"))  # more than its head
+
+    wait_for(process, begun)
     stdout, _ = stopped(process)
     assert process.returncode == 0 and pure_json(stdout)["frames"] > 0
     assert cv2.VideoCapture(str(video)).read()[0]

@@ -26,7 +26,7 @@ pytestmark = [pytest.mark.live, pytest.mark.usefixtures("run_dir")]
     says="`stopped`, exit code 130",
     left="no temporary file",
 )
-@pytest.mark.parametrize("command", [["eval", "--json", "-"], ["eval", "--pace", "step"], ["demo", "--json"]])
+@pytest.mark.parametrize("command", [["eval", "--json"], ["eval", "--pace", "step"], ["demo", "--json"]])
 def test_ctrl_c_ends_a_measured_run(
     command: list[str], phantom_session: Path, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
@@ -127,7 +127,7 @@ def test_an_import_that_hangs_is_broken_off_in_the_end(
 
 def test_ctrl_c_ends_the_rendering_of_a_phantom(tmp_path: Path) -> None:
     process = start(["phantom", tmp_path / "session", "seconds:=60", "width:=320", "height:=256"])
-    wait_for(process, lambda: any(tmp_path.glob("*.partial/left/*.jpg")))
+    wait_for(process, lambda: any(tmp_path.glob(".sags-*/*/left/*.jpg")))
     stopped(process)
     assert process.returncode == 130
     assert not any(tmp_path.iterdir())

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
-from command_line import START_SECONDS, refused, sags, start
+from command_line import FREE_PORTS, START_SECONDS, refused, sags, start
 from places import ROOT
 from user_files import SHORT, videos
 
@@ -44,6 +44,47 @@ def test_a_wrong_launch(command: str, arguments: list[str], said: tuple[str, ...
 
 def test_a_folder_that_is_no_session(user_files: Path) -> None:
     refused(2, "run", user_files / "empty", said=(str(user_files / "empty/launch.yaml"), "check the path"))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        (["mapping.bugdet_ms:=3"], "command line: unknown key 'mapping.bugdet_ms'"),
+        (["mapping.budget_ms:=soon"], "command line: mapping.budget_ms"),
+        (["mapping:={bugdet_ms: 3}"], "command line: unknown key 'mapping.bugdet_ms'"),
+        (["source.kind:=video"], "command line: source.kind: should be one of"),
+        ([], "mine.yaml: unknown key 'mapping.max_gausians'"),
+        (["mapping.budget_ms:=3"], "mine.yaml: unknown key 'mapping.max_gausians'"),
+    ],
+)
+def test_a_mistake_is_named_where_it_was_made(tmp_path: Path, overrides: list[str], said: str) -> None:
+    file = tmp_path / "mine.yaml"
+    file.write_text(
+        "mapping: {max_gaussians: 1000}" if "command line" in said else "mapping: {max_gausians: 1}"
+    )
+    refused(2, "run", file, *overrides, said=(said,))
+    if "command line" in said:
+        refused(2, "run", *overrides, said=(said,))
+
+
+def test_a_calibration_is_not_taken_for_that_of_the_phantom(user_files: Path, tmp_path: Path) -> None:
+    """The launch file was forgotten, or names no source."""
+    rig = f"rig:={user_files / 'calib'}"
+    said = (str(user_files / "calib"), "built-in phantom", "name the launch file")
+    for command in ("run", "eval", "doctor"):
+        refused(2, command, rig, said=said)
+    (tmp_path / "mine.yaml").write_text(f"rig: {user_files / 'calib'}")
+    refused(2, "run", tmp_path / "mine.yaml", said=said)
+
+
+def test_what_is_played_is_said(user_files: Path) -> None:
+    played = ("source.frames:=2", "source.pace:=fast")
+    said = f"source: videos {user_files / 'left.mp4'}, {user_files / 'right.mp4'}"
+    assert said in sags("run", *videos(user_files), *played).stderr.splitlines()
+    assert said in sags("eval", *videos(user_files), *played[:1], "--pace", "step").stderr.splitlines()
+    small = ("source.width:=160", "source.height:=128", "source.seconds:=0.2")
+    phantom = sags("run", *small, *FREE_PORTS, "source.loop:=false", *played)
+    assert "source: the built-in phantom" in phantom.stderr.splitlines()
 
 
 def test_every_mistake_of_a_launch_file_is_named(tmp_path: Path) -> None:
@@ -93,6 +134,34 @@ def test_a_wrong_recording_or_calibration(
 ) -> None:
     refused(code, "run", *videos(user_files, **overrides), said=said)
     refused(code, "eval", "--pace", "step", *videos(user_files, **overrides), said=said)
+
+
+def test_a_video_is_no_picture(user_files: Path) -> None:
+    pair = (user_files / "left.mp4", user_files / "right.mp4")
+    said = ("left.mp4 is a video", "--session")
+    refused(2, "calib", "check", user_files / "calib", "--images", *pair, said=said)
+
+
+def test_a_calibration_is_not_converted_onto_itself(user_files: Path, tmp_path: Path) -> None:
+    rig = tmp_path / "rig"
+    convert = ("calib", "convert", user_files / "calib", "-o", rig, "--scale", "2")
+    assert sags(*convert).exit_code == 0
+    before = [(rig / f"{eye}.yaml").read_text() for eye in ("left", "right")]
+    for same in (rig, rig / "../rig"):
+        refused(2, "calib", "convert", rig, "-o", same, "--scale", "2", said=("rig", "name another folder"))
+    assert [(rig / f"{eye}.yaml").read_text() for eye in ("left", "right")] == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["left/render/depth"], "--topics left/render/depth; without --topics all are recorded"),
+        (["--topics", "left/depth", "tf"], "--topics left/depth --topics tf"),
+        (["rig:=x"], "rig:=x: key:=value needs --session"),
+    ],
+)
+def test_topics_to_record_are_named_by_an_option(arguments: list[str], said: str) -> None:
+    refused(2, "bag", "record", *arguments, said=(said,))
 
 
 def test_no_library_adds_lines_of_its_own(user_files: Path) -> None:
@@ -170,7 +239,7 @@ def test_a_right_video_that_ends_too_early_cannot_be_measured_to_its_end(
     session = videos(user_files, right="short.mp4")
     file = tmp_path / "out.json"
     for pace in ("realtime", "step"):
-        command = ["eval", *session, "--hold-out", "0", "--pace", pace, "--json", file]
+        command = ["eval", *session, "--hold-out", "0", "--pace", pace, "--out", file]
         refused(1, *command, said=(f"short.mp4 ends at frame {SHORT}", "set source.frames"))
         assert not file.exists()
     result = sags("eval", *session, f"source.frames:={SHORT}", *command[-6:])

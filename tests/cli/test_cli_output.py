@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import json
+import logging
 import socket
 import subprocess
 import sys
 from collections.abc import Iterator
+from ctypes.util import find_library
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +17,12 @@ import click
 import pytest
 from command_line import pure_json, refused, sags
 from places import ROOT
+from sags_node.cli.bench import bench
 from user_files import videos
 
 from sags_node.cli.main import main
+from sags_node.evaluation.report import check_report
+from sags_node.terminal import console as terminal
 
 pytestmark = [pytest.mark.live, pytest.mark.usefixtures("run_dir")]
 
@@ -23,7 +30,7 @@ pytestmark = [pytest.mark.live, pytest.mark.usefixtures("run_dir")]
 # ---- where results go ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("option", ["--json", "--report"])
+@pytest.mark.parametrize("option", ["--out", "--report"])
 def test_a_result_that_cannot_be_kept_is_noticed_before_the_run(user_files: Path, option: str) -> None:
     target = user_files / "file/inside"
     refused(1, "eval", "nowhere.yaml", option, target, said=(f"cannot write {user_files / 'file'}",))
@@ -31,14 +38,7 @@ def test_a_result_that_cannot_be_kept_is_noticed_before_the_run(user_files: Path
 
 
 def test_a_folder_is_no_json_file_and_a_file_no_folder(user_files: Path) -> None:
-    refused(
-        1,
-        "eval",
-        "nowhere.yaml",
-        "--json",
-        user_files / "empty",
-        said=(f"cannot write {user_files / 'empty'}",),
-    )
+    refused(2, "eval", "nowhere.yaml", "--out", user_files / "empty", said=("empty", "is a directory"))
     refused(1, "eval", "nowhere.yaml", "--report", user_files / "file", said=("cannot write",))
     refused(1, "demo", "--out", user_files / "file", said=("cannot write",))
     assert not any((user_files / "empty").iterdir()) and (user_files / "file").read_text() == "mine"
@@ -46,9 +46,106 @@ def test_a_folder_is_no_json_file_and_a_file_no_folder(user_files: Path) -> None
 
 def test_older_figures_stay_when_the_run_fails(tmp_path: Path) -> None:
     file = tmp_path / "out.json"
-    file.write_text("older figures")
-    refused(2, "eval", "nowhere.yaml", "--json", file, said=("nowhere.yaml",))
-    assert file.read_text() == "older figures"
+    file.write_text('{"provenance": "older figures"}')
+    refused(2, "eval", "nowhere.yaml", "--out", file, said=("nowhere.yaml",))
+    assert file.read_text() == '{"provenance": "older figures"}'
+
+
+WRITERS = [  # commands, and their options for one file
+    ("eval", "--out"),
+    ("eval --protocol stir DATA", "--out"),
+    *((f"bench {name}", "--out") for name in bench.commands if name != "transport"),
+    ("bench alias", "--picture"),
+    ("bench depth", "--plot"),
+    ("bench pareto", "--plot"),
+    ("archive scan FOLDER", "--out"),
+    ("archive costs SESSION --frames 4", "--out"),
+    ("export", "--splats"),
+    ("export", "--points"),
+    ("export", "--mesh"),
+    ("export", "--orbit"),
+    ("export --session SESSION", "--tracks"),
+    ("export --session SESSION", "--render"),
+    ("overlay", "--out"),
+    ("calib live SESSION", "--out"),
+    ("bridge foxglove", "--layout"),
+    ("train depth", "--out"),
+]
+ENDINGS = {"--splats": "ply", "--points": "ply", "--mesh": "ply", "--orbit": "mp4"}
+
+
+@pytest.mark.parametrize(("command", "option"), WRITERS)
+def test_no_command_overwrites_what_it_did_not_make(
+    tmp_path: Path, phantom_session: Path, command: str, option: str
+) -> None:
+    """Before any work."""
+    mine = tmp_path / f"mine.{ENDINGS.get(option, 'csv' if 'scan' in command else 'png')}"
+    mine.write_text("source: {kind: videos}")
+    said = [str(phantom_session) if word in ("SESSION", "FOLDER") else word for word in command.split()]
+    refused(2, *said, option, mine, said=(str(mine), "exists already", "choose another name"))
+    assert mine.read_text() == "source: {kind: videos}"
+
+
+BOARD = ("--squares", "10x7", "--square-mm", "4.5")
+
+
+@pytest.mark.parametrize(
+    ("command", "option", "name"),
+    [
+        (("fit",), "--out", "model.ply"),
+        (("fit",), "--out", "figures.json"),
+        (("eval",), "--report", "report.html"),
+        (("eval",), "--report", "sheet.png"),
+        (("demo",), "--out", "overlay.mp4"),
+        (("calib", "convert", ROOT / "calib/d4d"), "--out", "left.yaml"),
+        (("calib", "stereo", "left", "right", *BOARD), "--out", "right.yaml"),
+        (("calib", "hand-eye", *BOARD), "--out", "hand_eye.yaml"),
+        (("bench", "disturbances"), "--pictures", "fog_left.png"),
+    ],
+)
+def test_no_command_overwrites_in_a_folder_what_it_did_not_make(
+    tmp_path: Path, command: tuple[Any, ...], option: str, name: str
+) -> None:
+    """Before any work."""
+    (tmp_path / name).write_text("mine")
+    refused(2, *command, option, tmp_path, said=(str(tmp_path / name), "exists already", "choose another"))
+    assert (tmp_path / name).read_text() == "mine"
+
+
+def test_every_command_spells_its_options_alike() -> None:
+    """--json prints, whatever else; a file or folder to be written is -o or --out."""
+    for path in every_command(main):
+        command: Any = main
+        for name in path:
+            command = command.commands[name]
+        for option in command.params:
+            if "--json" in option.opts:
+                assert option.is_flag, path
+            if {"-o", "--out", "--output"} & set(option.opts):
+                assert option.opts[:2] == ["-o", "--out"], path
+
+
+def test_a_file_after_json_is_no_launch_file_and_stays(tmp_path: Path, user_files: Path) -> None:
+    mine = tmp_path / "mine.yaml"
+    mine.write_text("sorce: {kind: phantom}")
+    refused(2, "eval", "--json", mine, "source.frames:=2", said=("mine.yaml: unknown key 'sorce'",))
+    assert mine.read_text() == "sorce: {kind: phantom}"
+    for name in ("out.json", "-"):
+        refused(2, "eval", mine, "--json", name, said=(f"'{name}'", "--out FILE"))
+
+
+def test_figures_are_replaced_by_figures(user_files: Path, tmp_path: Path) -> None:
+    file = tmp_path / "out.json"
+    file.touch()
+    eval = ("eval", *videos(user_files), "source.frames:=2", "--pace", "step", "--out", file)
+    assert sags(*eval).exit_code == 0
+    first = json.loads(file.read_text())
+    assert sags(*eval, "mapping.iterations:=1").exit_code == 0
+    assert json.loads(file.read_text())["settings"] != first["settings"]
+    link = tmp_path / "link.json"
+    link.symlink_to(file)
+    assert sags(*eval[:-1], link).exit_code == 0
+    assert link.is_symlink() and json.loads(file.read_text())["settings"] == first["settings"]
 
 
 def test_phantom_overwrites_nothing(tmp_path: Path, user_files: Path) -> None:
@@ -91,6 +188,87 @@ def test_doctor_finds_what_the_node_needs(user_files: Path, monkeypatch: pytest.
     assert sags("doctor", "publish.data:=[nonsense]").exit_code == 1
 
 
+CAMERAS = (str(ROOT / "launch/v4l2.yaml"), "source.left:=/dev/null", "source.right:=/dev/zero")
+PUSHED = ("source.kind:=push", "rig:=FILES/calib", "robot.kind:=push", "robot.hand_eye:=FILES/gone.yaml")
+NAMED_IN_A_LAUNCH = {  # what it names -> the launch, the row that says what is wrong, and how
+    "a video": (("VIDEOS", "source.left:=FILES/gone.mp4"), "source", "gone.mp4 does not exist"),
+    "a video cut short": (
+        ("VIDEOS", "source.right:=FILES/short.mp4"),
+        "source",
+        "short.mp4 ends after 6 frames",
+    ),
+    "a calibration": (("VIDEOS", "rig:=FILES/gone"), "calibration", "gone/left.yaml"),
+    "a calibration of another size": (("VIDEOS", "rig:=FILES/double"), "calibration", "640x512"),
+    "no calibration": (("VIDEOS", "rig:=null"), "calibration", "no calibration"),
+    "a camera": ((*CAMERAS, "source.left:=/dev/no-camera"), "/dev/no-camera", "no such camera"),
+    "a camera's size": (
+        (*CAMERAS, "rig:=FILES/calib"),
+        "calibration",
+        "320x256 px, an eye's pictures are 640x480",
+    ),
+    "a hand-eye calibration": (PUSHED, "hand-eye", "gone.yaml"),
+    "a depth network": (("VIDEOS", "vision.onnx.path:=FILES/gone.onnx"), "depth network", "gone.onnx"),
+    "a tissue network": (
+        (
+            "VIDEOS",
+            "vision.tissue.method:=onnx",
+            "vision.tissue.path:=FILES/file",
+            "vision.tissue.tissue_is:=white",
+        ),
+        "tissue network",
+        "is no ONNX model",
+    ),
+    "an interface": (
+        ("source.kind:=ros2", "source.interface:=nowhere0"),
+        "source",
+        "no network interface nowhere0",
+    ),
+}
+
+
+def doctor(user_files: Path, *launch: str) -> tuple[int, dict[str, dict[str, str]]]:
+    """Exit code, and the rows by name."""
+    said = [word.replace("FILES", str(user_files)) for word in launch]
+    if said[0] == "VIDEOS":
+        said[:1] = [word for word in videos(user_files) if word.partition(":=")[0] not in str(said[1:])]
+    result = sags("doctor", "--json", "device:=cpu", *said)
+    return result.exit_code, {check["name"]: check for check in pure_json(result.stdout)}
+
+
+@pytest.mark.parametrize("what", NAMED_IN_A_LAUNCH)
+def test_doctor_looks_at_all_that_a_launch_file_names(user_files: Path, what: str) -> None:
+    launch, row, said = NAMED_IN_A_LAUNCH[what]
+    code, checks = doctor(user_files, *launch)
+    assert code == 1 and checks[row]["level"] == "error"
+    assert said in checks[row]["found"]
+
+
+def test_doctor_asks_for_the_packages_that_a_launch_file_needs(
+    user_files: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sags_node.doctor.find_spec", lambda name: None)
+    code, checks = doctor(user_files, str(ROOT / "launch/ros2.yaml"))
+    assert code == 1 and "cyclonedds" in checks["source"]["found"] and "[ros2]" in checks["source"]["mend"]
+
+
+@pytest.mark.skipif(find_library("gstapp-1.0") is None, reason="GStreamer is not installed")
+def test_doctor_lets_gstreamer_read_the_launch_string(user_files: Path) -> None:
+    for launch, level, said in (
+        (("source.left:=nosuchsrc", "source.right:=videotestsrc"), "error", 'no element "nosuchsrc"'),
+        (("source.left:=videotestsrc pattern=nonsense", "source.right:=videotestsrc"), "error", "pattern"),
+        (("source.left:=videotestsrc", "source.right:=videotestsrc"), "ok", ""),
+    ):
+        code, checks = doctor(user_files, "source.kind:=gst", "rig:=FILES/calib", *launch)
+        assert (code, checks["source"]["level"]) == (int(level == "error"), level)
+        assert said in checks["source"]["found"]
+
+
+def test_doctor_is_content_with_a_launch_that_runs(user_files: Path) -> None:
+    code, checks = doctor(user_files, "VIDEOS")
+    assert code == 0 and checks["source"]["found"] == "12 frames of 320x256 px at 10 Hz"
+    assert checks["calibration"]["level"] == "ok"
+
+
 def test_a_table_for_another_program_is_not_cut(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "40")
     assert (
@@ -126,7 +304,7 @@ def test_help_mentions_every_argument_and_option(path: tuple[str, ...]) -> None:
 
 @pytest.mark.parametrize("pace", ["realtime", "step"])
 def test_eval_prints_nothing_but_json(user_files: Path, pace: str) -> None:
-    session = [*videos(user_files), "source.frames:=4", "--pace", pace, "--json", "-"]
+    session = [*videos(user_files), "source.frames:=4", "--pace", pace, "--json"]
     assert pure_json(sags("eval", *session).stdout)["settings"]["pace"] == pace
 
 
@@ -143,6 +321,7 @@ def test_demo_prints_nothing_but_json(user_files: Path, tmp_path: Path) -> None:
     summary = pure_json(result.stdout)
     assert summary["frames"] == 35 and summary["overlay"]["frames"] > 0
     assert {file.name for file in (tmp_path / "demo").iterdir()} >= {"report.html", "overlay.mp4"}
+    check_report(tmp_path / "demo", "overlay.mp4")  # the next one may replace it
 
 
 def test_torch_and_open3d_stay_out_of_the_start(user_files: Path) -> None:
@@ -157,3 +336,17 @@ def test_torch_and_open3d_stay_out_of_the_start(user_files: Path) -> None:
     )
     process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert process.stdout.splitlines()[-1] == "[]"
+
+
+def test_what_is_told_and_what_is_logged_are_one_line_each_in_one_form(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In a file each with its time, however long it is."""
+    monkeypatch.setenv("COLUMNS", "80")
+    handler, long = terminal.log_handler(), "no new picture of both for 2 s, [bold] " * 9
+    terminal.tell(f"warning: {long}")
+    handler.handle(logging.LogRecord("sags_node", logging.WARNING, "a.py", 1, "no new %s", (long,), None))
+    told, logged = capsys.readouterr().err.splitlines()
+    for line, said in ((told, f"warning: {long}"), (logged, f"warning: no new {long}")):
+        when, rest = line[:25], line[26:]
+        assert rest == said and datetime.fromisoformat(when).tzinfo is not None

@@ -22,6 +22,7 @@ from sags_node.export import scene as export_scene
 from sags_node.export import surface as export_surface
 from sags_node.export.orbit import orbit
 from sags_node.export.scene import Scene, from_node, from_session
+from sags_node.export.surface_files import Surface
 from sags_node.fitting import start
 from sags_node.geometry import project, unproject
 from sags_node.messaging.control import ControlClient
@@ -147,6 +148,19 @@ def test_points_lie_on_the_surface_in_its_colours(
     assert len(points) == count > 0.8 * scene.camera.width * scene.camera.height
     assert np.median(truth.distances(points)) < 0.5
     assert np.abs(colors - picture.at(scene, points)).mean(axis=0).max() < 0.04
+
+
+@pytest.mark.parametrize("ending", [".ply", ".pcd", ".obj", ".stl"])
+def test_colours_beyond_white_are_white_and_nobody_says_so(
+    scene: Scene, tmp_path: Path, ending: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Live, the light of a moment ago leaves some."""
+    bright = replace(scene, gaussians=replace(scene.gaussians, colors=scene.gaussians.colors + np.float32(2)))
+    write = export_surface.write_points if ending == ".pcd" else export_surface.write_mesh
+    write(tmp_path / f"bright{ending}", bright)
+    assert capfd.readouterr() == ("", "")
+    if ending == ".pcd":
+        assert np.asarray(open3d.io.read_point_cloud(tmp_path / "bright.pcd").colors).min() == 1.0
 
 
 @pytest.mark.parametrize("ending", [".ply", ".obj", ".stl"])
@@ -343,21 +357,18 @@ def test_what_exists_is_replaced_only_when_told_and_only_by_something_whole(
     refused(2, *command, said=("exists already", "--force"))
     assert file.read_text() == "mine"
 
-    write = open3d.io.write_triangle_mesh
+    encode = export_surface.encoded
 
-    def interrupted(path: Path, mesh: Any) -> bool:
-        assert write(path, mesh)
+    def interrupted(suffix: str, surface: Surface) -> bytes:
+        (part,) = folder.glob(".sags-*")
+        (part / "mesh.ply").write_bytes(encode(suffix, surface)[:100])
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(open3d.io, "write_triangle_mesh", interrupted)
+    monkeypatch.setattr(export_surface, "encoded", interrupted)
     done = sags(*command, "--force")
     assert done.exit_code == 130 and "stopped" in done.stderr
     assert file.read_text() == "mine" and list(folder.iterdir()) == [file]
 
-    monkeypatch.setattr(open3d.io, "write_triangle_mesh", lambda path, mesh: False)
-    refused(1, *command, "--force", said=("cannot be written",))
-    assert file.read_text() == "mine" and list(folder.iterdir()) == [file]
-
-    monkeypatch.setattr(open3d.io, "write_triangle_mesh", write)
+    monkeypatch.setattr(export_surface, "encoded", encode)
     assert sags(*command, "--force").exit_code == 0
     assert file.read_bytes().startswith(b"ply") and list(folder.iterdir()) == [file]

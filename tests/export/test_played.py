@@ -97,7 +97,7 @@ def test_points_stay_on_the_surface_and_sags_eval_reads_them(exported: Path) -> 
     said = pure_json(
         sags(
             *("eval", exported / "session0", f"source.reference.tracks:={exported}/0/tracks.npz"),
-            *("--pace", "step", "--iterations", "1", "--hold-out", "0", "--json", "-"),
+            *("--pace", "step", "--iterations", "1", "--hold-out", "0", "--json"),
         ).stdout
     )
     assert said["track"]["median_px"] < 2  # both follow the same tissue

@@ -26,7 +26,8 @@ FREE_PORTS = ("publish.data:=[tcp://127.0.0.1:*]", "publish.control:=tcp://127.0
 def sags(*arguments: object, command: click.Command = main) -> Result:
     """A command in this process, with any exception that it did not turn into a message; the process keeps
     its signal handlers."""
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)}
+    handled = signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1
+    before = {number: signal.getsignal(number) for number in handled}
     try:
         result = CliRunner().invoke(command, [str(argument) for argument in arguments])
     finally:

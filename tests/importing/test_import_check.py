@@ -173,10 +173,10 @@ def test_a_copy_that_broke_off_is_found_among_many(tmp_path: Path) -> None:
         folder.mkdir()
         for number in range(50):
             cv2.imwrite(str(folder / f"{number:03}.bmp"), texture(0))
-        assert check_folder(folder)[1].level == "ok"
+        assert check_folder(folder)[1].level == "ok", "but for being in one folder"
         file = folder / broken
         file.write_bytes(file.read_bytes()[:-100])
-        (finding,) = odd(folder)
+        _, finding = odd(folder)
         assert broken in finding.what and "cut off" in finding.what and "replace" in finding.mend
 
 
@@ -235,7 +235,8 @@ def test_a_video_says_how_it_shows_both_eyes(name: str, tmp_path: Path) -> None:
     write_video(tmp_path / "case.avi", pictures)
     found = check_folder(tmp_path)
     assert play in found[-1].what, found
-    assert ("one eye" in found[1].what) == (name == "one eye")
+    assert found[1].what.startswith("case.avi: 3 frames of ") and "px at 25 Hz, 0.1 s" in found[1].what
+    assert ("one eye" in found[2].what) == (name == "one eye")
     assert ("exchanged" in str(found)) == (name == "exchanged")
 
 
@@ -286,10 +287,9 @@ def test_folders_that_are_not_played_yet_are_named(tmp_path: Path) -> None:
     (tmp_path / "P3").mkdir()
     (tmp_path / "P3/track_pts.pckl").touch()
     assert "StereoMIS-Tracking" in check_folder(tmp_path / "P3")[0].what
-    assert "nothing that is known" in check_folder(tmp_path)[0].what
-    assert "P2, P3, d4d, stir" in check_folder(tmp_path)[-1].what
-    (tmp_path / "empty").mkdir()
-    assert "an empty folder" in check_folder(tmp_path / "empty")[0].what
+    (unknown,) = check_folder(tmp_path)
+    assert unknown.level == "error" and "nothing that is known" in unknown.what
+    assert "P2, P3, d4d, stir" in unknown.mend
 
 
 def test_the_command(tmp_path: Path) -> None:
@@ -301,3 +301,104 @@ def test_the_command(tmp_path: Path) -> None:
     assert result.exit_code == 1 and "cannot be played" in result.stderr and "polarity" in result.stdout
     missing = CliRunner().invoke(main, ["import", "--check", str(tmp_path / "none")])
     assert missing.exit_code == 2 and "is not a folder" in missing.stderr
+
+
+# ---- what sags run would refuse --------------------------------------------------------------------------
+
+
+def write_eyes(folder: Path, left: list[U8], right: list[U8], right_rate: float = 25.0) -> Path:
+    folder.mkdir()
+    write_video(folder / "left.avi", left)
+    write_video(folder / "right.avi", right, right_rate)
+    return folder
+
+
+def moving(count: int, shift: int = 0) -> list[U8]:
+    """Pictures of a texture that goes up and down; truth is the arithmetic of where it is."""
+    wide = np.vstack([texture(0, shift)] * 2)
+    t = np.arange(count)
+    places = np.round(20 + 12 * np.sin(0.7 * t) + 6 * np.sin(1.9 * t)).astype(int)
+    return [np.ascontiguousarray(wide[place : place + HEIGHT]) for place in places]
+
+
+@pytest.mark.parametrize("as_session", [False, True], ids=["videos", "a launch.yaml of them"])
+@pytest.mark.parametrize(
+    ("right", "rate", "said"),
+    [
+        (40, 30.0, ("25.0 frames/s", "30.0", "not one stereo pair")),
+        (25, 25.0, ("right.avi ends after 25 frames but left.avi goes on", "source.frames:=25")),
+    ],
+    ids=["another rate", "too short"],
+)
+def test_videos_that_cannot_be_played_are_refused(
+    tmp_path: Path, right: int, rate: float, said: tuple[str, ...], as_session: bool
+) -> None:
+    folder = write_eyes(tmp_path / "case", moving(40), moving(40, -DISPARITY)[:right], rate)
+    if as_session:
+        source = "{kind: videos, left: left.avi, right: right.avi}"
+        (folder / "launch.yaml").write_text(f"source: {source}\nrig: {SESSION / 'calib'}\n")
+    result = CliRunner().invoke(main, ["import", "--check", str(folder), "--json"])
+    assert result.exit_code == 1 and "cannot be played" in result.stderr
+    for part in said:
+        assert part in result.stdout
+
+
+def test_videos_say_rate_length_and_number(tmp_path: Path) -> None:
+    found = check_folder(write_eyes(tmp_path / "case", moving(50), moving(50, -DISPARITY)))
+    said = [each.what for each in found]
+    assert f"left.avi: 50 frames of {WIDTH}x{HEIGHT} px at 25 Hz, 2.0 s" in said
+    assert f"right.avi: 50 frames of {WIDTH}x{HEIGHT} px at 25 Hz, 2.0 s" in said
+    assert "error" not in {each.level for each in found} and "no calibration" in str(odd_of(found))
+
+
+def odd_of(found: list[Finding]) -> list[Finding]:
+    return [each for each in found if each.level != "ok"]
+
+
+@pytest.mark.parametrize("late", [3, 1, 0, -2])
+@pytest.mark.parametrize("how", ["videos", "pictures", "a session"])
+def test_an_eye_that_is_late_is_found(tmp_path: Path, late: int, how: str) -> None:
+    """The right eye shows at frame t what the left one shows at t - late."""
+    left, right = moving(60), moving(60, -DISPARITY)
+    left, right = left[max(0, late) : 50 + min(0, late)], right[max(0, -late) : 50 - max(0, late)]
+    if how == "videos":
+        folder = write_eyes(tmp_path / "case", left, right)
+    else:
+        folder = tmp_path / "case"
+        for side, pictures in (("left", left), ("right", right)):
+            (folder / side).mkdir(parents=True)
+            for number, picture in enumerate(pictures):
+                cv2.imwrite(str(folder / side / f"{number:03}.bmp"), picture)
+    if how == "a session":
+        (folder / "launch.yaml").write_text("source: {kind: folders, left: left, right: right}\nrig: gone\n")
+    said = [each.what for each in check_folder(folder) if "frames late" in each.what]
+    eye = "right" if late > 0 else "left"
+    assert [each.partition(":")[0] for each in said] == [f"the {eye} eye is {abs(late)} frames late"] * (
+        late != 0
+    )
+
+
+def test_where_nothing_moves_no_eye_is_late(tmp_path: Path) -> None:
+    noise = np.random.default_rng(0)
+    still = [cv2.add(texture(0), noise.integers(0, 9, (HEIGHT, WIDTH, 3), np.uint8)) for _ in range(80)]
+    found = check_folder(write_eyes(tmp_path / "case", still[:40], still[40:]))
+    assert "frames late" not in str(found)
+
+
+@pytest.mark.parametrize("what", ["empty", "pictures of one eye", "a wrong launch file", "text"])
+def test_what_cannot_be_played_has_exit_code_1(tmp_path: Path, what: str) -> None:
+    if what == "pictures of one eye":
+        cv2.imwrite(str(tmp_path / "a.png"), texture(0))
+    if what == "a wrong launch file":
+        (tmp_path / "launch.yaml").write_text("sorce: {}")
+    if what == "text":
+        (tmp_path / "notes.txt").write_text("mine")
+    result = CliRunner().invoke(main, ["import", "--check", str(tmp_path)])
+    assert result.exit_code == 1 and "cannot be played" in result.stderr and "error" in result.stdout
+
+
+def test_a_calibration_beside_videos_is_compared_with_them(tmp_path: Path) -> None:
+    folder = write_eyes(tmp_path / "case", moving(40), moving(40, -DISPARITY))
+    shutil.copytree(SESSION / "calib", folder / "calib")  # of 320x256 px
+    said = [each.what for each in check_folder(folder) if each.level == "error"]
+    assert any("the calibration is for 320x256 px, the pictures are 160x120" in each for each in said), said

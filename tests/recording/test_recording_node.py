@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import pty
 import signal
 import subprocess
 import sys
@@ -121,7 +122,7 @@ def test_a_long_recording_in_several_files_is_a_session(node: Path, tmp_path: Pa
     assert len(files) > 3 and max(file.stat().st_size for file in files) < 12_400_000
     result = sags("bag", "info", tmp_path / "bag", "--json")
     assert result.exit_code == 0 and len(json.loads(result.stdout)["files"]) == len(files)
-    result = sags("eval", tmp_path / "bag", "source.frames:=10", "--pace", "step", "--json", "-")
+    result = sags("eval", tmp_path / "bag", "source.frames:=10", "--pace", "step", "--json")
     assert result.exit_code == 0, result.output
     assert json.loads(result.stdout)["frames"] == 10  # out of three files
 
@@ -146,6 +147,52 @@ def test_ctrl_c_closes_the_file_and_a_signal_takes_a_snapshot(node: Path, tmp_pa
     assert {m.topic for m in read_messages(tmp_path / "bag")} == {"/sags/left/depth", "/sags/tf"}
     assert (tmp_path / "bag/metadata.yaml").exists()
     assert bag_info(tmp_path / "ring/snapshot_000")["messages"] > 5
+
+
+@pytest.mark.fault(
+    "process: the recorder's terminal goes",
+    sees="the messages until then",
+    left="a bag that is whole",
+)
+def test_the_end_of_the_terminal_closes_the_file(node: Path, tmp_path: Path) -> None:
+    """As `ssh` that is cut off leaves it: the kernel sends SIGHUP, and nothing can be printed any more."""
+    ours, theirs = pty.openpty()
+    process = subprocess.Popen(
+        [
+            *("setsid", "--ctty", "--wait", sys.executable, "-m", "sags_node"),
+            *("bag", "record", "-o", str(tmp_path / "bag"), "--topics", "tf"),
+        ],
+        env={**os.environ, "XDG_RUNTIME_DIR": str(node)},
+        stdin=theirs, stdout=theirs, stderr=theirs,
+    )  # fmt: skip
+    try:
+        os.close(theirs)
+        until(lambda: b"recording: " in os.read(ours, 1000), START_SECONDS)
+        time.sleep(1)
+        os.close(ours)
+        process.wait(30)
+    finally:
+        process.kill()
+    assert (tmp_path / "bag/metadata.yaml").exists()
+    assert bag_info(tmp_path / "bag")["messages"] > 5
+
+
+def test_a_recorder_that_nohup_started_outlives_its_terminal(node: Path, tmp_path: Path) -> None:
+    command = ["nohup", sys.executable, "-m", "sags_node", "bag", "record", "-o", str(tmp_path / "bag")]
+    process = subprocess.Popen(
+        [*command, "--topics", "tf"], env={**os.environ, "XDG_RUNTIME_DIR": str(node)}, stderr=subprocess.PIPE
+    )
+    try:
+        assert process.stderr is not None
+        while b"recording: " not in process.stderr.readline():
+            assert process.poll() is None
+        process.send_signal(signal.SIGHUP)
+        time.sleep(1)
+        assert process.poll() is None
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 0
+    finally:
+        process.kill()
 
 
 def test_recording_on_the_control_socket(node: Path, tmp_path: Path) -> None:

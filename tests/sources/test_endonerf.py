@@ -362,7 +362,7 @@ def test_the_pipeline_takes_the_given_depth_instead_of_stereo(clip: Path) -> Non
 
 
 def test_a_clip_is_measured_by_its_path_alone(clip: Path) -> None:
-    command = ["eval", str(clip), "--pace", "step", "--iterations", "2", "--paper-psnr", "--json", "-"]
+    command = ["eval", str(clip), "--pace", "step", "--iterations", "2", "--paper-psnr", "--json"]
     result = CliRunner().invoke(main, command)
     assert result.exit_code == 0, result.output
     figures = json.loads(result.stdout, parse_constant=lambda name: pytest.fail(f"{name} is no figure"))
@@ -383,7 +383,7 @@ def test_a_right_eye_that_is_not_there_cannot_be_published(clip: Path) -> None:
 def test_it_is_measured_by_its_own_protocol(clip: Path) -> None:
     """Held out are frames 1 and 9. Pixels masked black in both pictures count, which by arithmetic adds the
     share of the tissue to the PSNR."""
-    arguments = ["eval", "--protocol", "endonerf", str(clip), "--iterations", "2", "--json", "-"]
+    arguments = ["eval", "--protocol", "endonerf", str(clip), "--iterations", "2", "--json"]
     result = CliRunner().invoke(main, arguments)
     assert result.exit_code == 0, result.output
     found = json.loads(result.stdout)

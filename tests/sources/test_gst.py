@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import socket
 import sys
@@ -339,6 +340,15 @@ def test_a_source_that_gives_nothing_is_not_waited_for_long() -> None:
 def test_strings_that_cannot_be_two_eyes_are_refused(said: Any, words: str) -> None:
     with pytest.raises(ValidationError, match=words):
         GstSource(**said)
+
+
+def test_a_ctrl_c_in_the_terminal_is_not_the_pipelines() -> None:
+    """It goes to all of the terminal's foreground group, and the pipeline's death was told of as a fault."""
+    child = GstProcess({"elements": []})
+    try:
+        assert os.getpgid(child._process.pid) not in (os.getpgid(0), 0)
+    finally:
+        child.close()
 
 
 def test_a_child_that_crashes_is_told_of() -> None:

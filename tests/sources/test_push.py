@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, ExitStack
@@ -13,6 +15,7 @@ import numpy as np
 import pytest
 import zmq
 from live_taking import Taker
+from places import ROOT
 from sending import sending, stereo_sender
 from stereo_sender import paint_number
 from waiting import until
@@ -175,3 +178,19 @@ def test_a_sender_never_waits_for_a_node_that_is_away() -> None:
             sender.send(numbered(1), numbered(1))
         assert time.monotonic() - begun < 2
         assert sender.left_out >= 200 - 4
+
+
+def test_the_sender_of_the_phantom_ends_with_ctrl_c_and_explains_itself(tmp_path: Path) -> None:
+    command = [sys.executable, str(ROOT / "examples/send_phantom.py")]
+    said = subprocess.run([*command, "--help"], capture_output=True, text=True, check=True, timeout=60).stdout
+    assert "\n    python examples/send_phantom.py push\n" in said
+    command += ["push", "--size", "160", "128", "--endpoint", f"ipc://{tmp_path}/in"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        while process.stdout.readline() != "sending\n":
+            assert process.poll() is None
+        process.send_signal(signal.SIGINT)
+        assert process.communicate(timeout=30)[1] == "" and process.returncode == 130
+    finally:
+        process.kill()

@@ -331,7 +331,7 @@ def test_a_keyframe_is_measured_by_its_path_alone(keyframe: Path) -> None:
 
 
 def test_a_keyframe_is_measured_by_its_own_protocol(keyframe: Path) -> None:
-    arguments = ["eval", "--protocol", "scared", str(keyframe), "--iterations", "2", "--json", "-"]
+    arguments = ["eval", "--protocol", "scared", str(keyframe), "--iterations", "2", "--json"]
     result = CliRunner().invoke(main, arguments)
     assert result.exit_code == 0, result.output
     found = json.loads(result.stdout)

@@ -3,13 +3,24 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import numpy as np
 import pytest
 from waiting import until
 
-from sags_node.config import GeometryConfig, LaunchConfig, PushRobot, PushSource, Ros2Source
+from sags_node.config import (
+    FoldersSource,
+    GeometryConfig,
+    LaunchConfig,
+    PushRobot,
+    PushSource,
+    Ros2Source,
+    Source,
+    V4l2Source,
+)
 from sags_node.errors import SagsError
+from sags_node.findings import by_code
 from sags_node.foreground import inputs_text
 from sags_node.health import Statistics
 from sags_node.messaging import cdr, content, topics
@@ -40,6 +51,31 @@ def test_loss_is_counted_by_the_gaps(lost: int) -> None:
     assert arrivals.share_lost == pytest.approx(lost / 8, abs=0.04)  # 4 of 33 ms jitter on the median step
     assert arrivals.rate == pytest.approx((8 - lost) / 8 / 0.033, rel=0.03)
     assert arrivals.lost == pytest.approx(16 * WINDOW * lost / 8, abs=16 * WINDOW * 0.04)
+
+
+def test_a_sender_that_was_away_has_lost_nothing() -> None:
+    arrivals = Arrivals()
+    for begun in (0, 20 * S):
+        for number in range(2 * WINDOW):
+            arrivals.add(begun + number * PERIOD)
+    assert arrivals.lost == 0 and arrivals.share_lost == 0
+    assert arrivals.rate == pytest.approx(1 / 0.033, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("source", "said"),
+    [
+        (PushSource(endpoint="tcp://127.0.0.1:5999"), "start the sender at tcp://127.0.0.1:5999"),
+        (Ros2Source(left="/a/left", right="/a/right"), "start what publishes /a/left and /a/right"),
+        (FoldersSource(left=Path("left"), right=Path("right")), "is the disk slow?"),
+        (V4l2Source(), "check the camera, its cable and the capture card"),
+    ],
+)
+def test_what_helps_depends_on_where_pictures_come_from(source: Source, said: str) -> None:
+    statistics = Statistics(source)
+    statistics._started = True  # once there were frames
+    warnings = by_code(statistics.health({}, False, False, None, {}, {}, {}).warnings)
+    assert warnings["no_frames"] == f"no frame comes: {said}"
 
 
 @pytest.mark.fault(
@@ -137,7 +173,8 @@ def test_who_sends_too_slowly_is_told() -> None:
     for number in range(WINDOW):
         for eye in ("left", "right"):
             sent.put(eye, number * 2 * PERIOD, number * 2 * PERIOD, picture)
-    assert "15.2 of 30 pictures a second" in (sent.slowness() or "")
+    said = sent.slowness() or ""
+    assert "15.2 of 30 pictures a second" in said and said.endswith("send faster, or set source.rate:=15.2")
 
 
 @pytest.mark.fault(

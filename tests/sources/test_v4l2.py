@@ -217,6 +217,22 @@ def test_delivers_pairs_with_both_stamps(plugs: Plugs) -> None:
     assert all(camera.closed for cameras in plugs.opened.values() for camera in cameras)
 
 
+def test_what_fails_because_all_ends_is_not_told_of(plugs: Plugs, caplog: pytest.LogCaptureFixture) -> None:
+    opening = threading.Event()
+
+    def open_device(path: str, config: V4l2Source) -> FakeCamera:
+        if plugs.opened["/dev/right"]:  # it is opened again: until the end
+            opening.set()
+            assert source._pairs.stopped.wait(10)
+            raise SagsError("the end has broken it off")
+        return plugs(path, config)
+
+    with open_cameras(CONFIG, open_device=open_device) as source:
+        plugs.opened["/dev/right"][0].pictures.put(None)
+        assert opening.wait(10)
+    assert "camera is gone" in caplog.text and "broken it off" not in caplog.text
+
+
 @pytest.mark.fault(
     "camera: unplugged",
     sees="no frame; then only pictures of afterwards",

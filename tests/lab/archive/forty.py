@@ -29,6 +29,7 @@ from typing import Any
 ROOT = Path(__file__).parents[2]
 HELPERS = ROOT / "tests/helpers"
 sys.path.insert(0, str(HELPERS))
+from small_disk import small_disk  # noqa: E402
 from tiny_archive import quick_plan, quick_work, write_quick_recordings  # noqa: E402
 
 from sags_lab.archive.cluster import connected  # noqa: E402
@@ -237,18 +238,6 @@ def without_times(row: dict[str, Any]) -> dict[str, Any]:
 def markers(out: Path) -> dict[str, int]:
     """What is done, and when it was."""
     return {file.name: file.stat().st_mtime_ns for file in (out / "done").glob("[!.]*")}
-
-
-@contextmanager
-def small_disk(folder: Path, size: int) -> Iterator[Path]:
-    folder.mkdir()
-    subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)], check=True, timeout=10
-    )
-    try:
-        yield folder
-    finally:
-        subprocess.run(["umount", "-l", str(folder)], check=True, timeout=10)
 
 
 def below(process: int) -> list[int]:

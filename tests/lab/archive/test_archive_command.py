@@ -43,6 +43,8 @@ def test_figures_are_those_of_sags_eval(cluster: Any, tiny_session: Path, tmp_pa
     assert shown["state"] == "done" and shown["figures"]["settings.pace"] == "step"
     assert (tmp_path / "out/recordings" / done / "report/report.html").is_file()
 
+    assert shown["log"].splitlines()[-1] == f"report: {tmp_path}/out/recordings/{done}/report/report.html"
+
     why = sags("archive", "show", tmp_path / "out", poison).stdout
     assert "quarantined" in why and "nowhere" in why and "sags eval /" in why
     page = (tmp_path / "out/report.html").read_text()

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from small_disk import small_disk
 from tiny_archive import quick_plan, quick_work, table, write_quick_recordings
 
 from sags_lab.archive.cluster import connected
@@ -229,39 +230,22 @@ def test_a_killed_driver_and_ctrl_c(cluster: Any, tmp_path: Path, how: signal.Si
 
 
 @pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A file system of 12 MiB."""
-    folder = tmp_path / "disk"
-    folder.mkdir()
-    made = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=12m", "tmpfs", str(folder)],
-        check=False,
-        capture_output=True,
-        timeout=10,
-    )
-    if made.returncode != 0:
-        pytest.skip("a small file system needs the right to mount one")
-    try:
+def disk(tmp_path: Path) -> Iterator[Path]:
+    with small_disk(tmp_path / "disk", 12 << 20) as folder:
         yield folder
-    finally:
-        subprocess.run(["umount", "-l", str(folder)], check=True, timeout=10)
 
 
-def test_a_full_disk_stops_the_run_and_blames_no_recording(
-    cluster: Any, tmp_path: Path, small_disk: Path
-) -> None:
+def test_a_full_disk_stops_the_run_and_blames_no_recording(cluster: Any, tmp_path: Path, disk: Path) -> None:
     recordings = write_quick_recordings(tmp_path / "in", 6, writes=3)
     with pytest.raises(SagsError, match="no space left"):
-        gone_through(small_disk / "out", recordings, cluster)
-    store = Store(str(small_disk / "out"))
+        gone_through(disk / "out", recordings, cluster)
+    store = Store(str(disk / "out"))
     before = store.done()
     assert 1 <= len(before) <= 4 and failed(store) == []
-    assert all(
-        (small_disk / "out/recordings" / id / "report/large").stat().st_size == 3 << 20 for id in before
-    )
+    assert all((disk / "out/recordings" / id / "report/large").stat().st_size == 3 << 20 for id in before)
 
-    subprocess.run(["mount", "-o", "remount,size=64m", str(small_disk)], check=True, timeout=10)
-    tally = gone_through(small_disk / "out", recordings, cluster)[1]
+    subprocess.run(["mount", "-o", "remount,size=64m", str(disk)], check=True, timeout=10)
+    tally = gone_through(disk / "out", recordings, cluster)[1]
     assert (tally.kept, tally.done) == (len(before), 6 - len(before))
     assert [(row["state"], row["online.psnr"]) for row in table(store)] == [
         ("done", 30 + number / 8) for number in range(6)

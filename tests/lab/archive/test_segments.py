@@ -149,7 +149,7 @@ def test_the_warm_up_is_played_and_not_counted(tiny_session: Path, tmp_path: Pat
     assert {picture.frame_id for picture in part.pictures} <= {2, 3, 4, 5}
     shown = [[row.figures["online"]["psnr"] for row in run.rows[-4:]] for run in (whole, part)]
     assert shown[0] == shown[1]
-    asked = ("--pace", "step", "--warm-up", 2, "--hold-out", 0, "--json", "-")
+    asked = ("--pace", "step", "--warm-up", 2, "--hold-out", 0, "--json")
     assert pure_json(sags("eval", tiny_session, *STEPS, *asked).stdout)["online"] == part.summary["online"]
     cold = evaluate(tiny_session, [*STEPS, "source.start:=0.2"], Options(0, 2), "step")
     configure_threads(None)

@@ -97,9 +97,7 @@ def d4d(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_d4d_end_to_end(d4d: Path) -> None:
-    result = CliRunner().invoke(
-        main, ["eval", "--protocol", "d4d", str(d4d), "--iterations", "2", "--json", "-"]
-    )
+    result = CliRunner().invoke(main, ["eval", "--protocol", "d4d", str(d4d), "--iterations", "2", "--json"])
     assert result.exit_code == 0, result.output
     found = json.loads(result.stdout)
     assert found["clips"] == 1 and list(found["of_each"]) == ["specimen_1/2025_03_06-16_49_40/Clip_1"]
@@ -120,7 +118,7 @@ def test_d4d_end_to_end(d4d: Path) -> None:
 def test_one_scan_that_is_elsewhere_stops_no_other(d4d: Path, tmp_path: Path) -> None:
     clip = copied(d4d, tmp_path / "wrong")
     np.savetxt(clip / "curated_camera_pose_start.txt", invert(scanner_pose()))
-    command = ["eval", "--protocol", "d4d", str(clip), "--iterations", "1", "--json", "-"]
+    command = ["eval", "--protocol", "d4d", str(clip), "--iterations", "1", "--json"]
     result = CliRunner().invoke(main, command)
     assert result.exit_code == 0, result.output
     found = json.loads(result.stdout)

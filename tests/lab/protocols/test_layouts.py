@@ -49,7 +49,7 @@ def same_rig(made: StereoRig, truth: StereoRig) -> bool:
 
 
 def sags_eval(protocol: str, folder: Path, *more: str) -> dict[str, Any]:
-    result = CliRunner().invoke(main, ["eval", "--protocol", protocol, str(folder), *more, "--json", "-"])
+    result = CliRunner().invoke(main, ["eval", "--protocol", protocol, str(folder), *more, "--json"])
     assert result.exit_code == 0, result.output
     found: dict[str, Any] = json.loads(result.stdout)
     assert found["protocol"] == protocol

@@ -149,7 +149,7 @@ def test_stereomis_tracking_end_to_end(tracked: Path, frames: list[StereoFrame],
     np.testing.assert_array_equal(sequence.visible, seen)
     assert sequence.rig.baseline == pytest.approx(rig.baseline)
     np.testing.assert_array_equal(sequence.poses, np.tile(np.eye(4), (FRAMES, 1, 1)))
-    command = ["eval", "--protocol", "stereomis", str(tracked), "--iterations", "1", "--json", "-"]
+    command = ["eval", "--protocol", "stereomis", str(tracked), "--iterations", "1", "--json"]
     result = CliRunner().invoke(main, command)
     assert result.exit_code == 0, result.output
     found = yaml.safe_load(result.stdout)
