@@ -16,7 +16,7 @@ DEBIAN_TESTS := chromium g++ cmake pkg-config cppzmq-dev libmsgpack-cxx-dev fake
 missing = $(shell for p in $(1); do dpkg -s $$p >/dev/null 2>&1 || echo $$p; done)
 apt_install = apt-get update -qq && apt-get install -y -qq --no-install-recommends $(1) >/dev/null
 
-.PHONY: setup run test computed test-targets test-tools simulate soak fuzz wheel-test sbom audit licences lint golden docs clean
+.PHONY: setup run test computed test-targets test-tools simulate stops soak fuzz wheel-test sbom audit licences lint golden docs clean
 
 setup: $(STAMP)
 
@@ -57,6 +57,11 @@ test-targets: setup
 SEEDS ?= 5000
 simulate: setup
 	PYTHONPATH=tests/helpers $(BIN)/python tests/test_simulation.py $(SEEDS)
+
+# A node's start broken off at COUNT moments: a quarter of an hour.
+COUNT ?= 200
+stops: setup
+	PYTHONPATH=tests/helpers $(BIN)/python tests/test_stops.py $(COUNT)
 
 # A live node with all its neighbours, ten minutes: does anything grow?
 soak: setup

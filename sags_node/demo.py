@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,6 +24,7 @@ from sags_node.messaging.rundir import connection_path, default_run_dir
 from sags_node.node import Node
 from sags_node.processes import end
 from sags_node.session import Session
+from sags_node.terminal.console import stop_signals
 from sags_node.types import FrameResult
 
 VIDEO = "overlay.mp4"
@@ -61,18 +63,21 @@ def run_demo(session: Session, out: Path, progress: Callable[[int, int | None, s
             frame_ms, warnings = sum(result.timings_ms.values()), node.health().warnings
             spool.add(result, frame_ms, time.monotonic_ns(), latency_ms, warnings)
 
-        node = Node(session.config, session.rig, session.source, on_result=keep)
-        overlay = _start_overlay(session.config, seconds, out / VIDEO)
-        try:
-            _await_overlay(session.config, overlay)
-            node.start()
-            while not node.wait(0.25):
-                progress(len(spool), frames, "playing")
-        except BaseException:
-            _end(overlay)
-            raise
-        finally:
-            node.stop()
+        with stop_signals() as stop:
+            node = Node(session.config, session.rig, session.source, on_result=keep)
+            overlay = _start_overlay(session.config, seconds, out / VIDEO)
+            try:
+                _await_overlay(session.config, overlay, stop)
+                node.start()
+                while not (stop.is_set() or node.wait(0.25)):
+                    progress(len(spool), frames, "playing")
+                if stop.is_set():
+                    raise KeyboardInterrupt
+            except BaseException:
+                _end(overlay)
+                raise
+            finally:
+                node.stop()
         consumed = _finish_overlay(overlay)
         outcome = measure(session, spool, _OPTIONS, progress=lambda what, done: progress(done, frames, what))
     outcome.summary["overlay"] = consumed
@@ -88,12 +93,13 @@ def _start_overlay(config: LaunchConfig, seconds: float, video: Path) -> subproc
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
-def _await_overlay(config: LaunchConfig, overlay: subprocess.Popen[str]) -> None:
+def _await_overlay(config: LaunchConfig, overlay: subprocess.Popen[str], stop: threading.Event) -> None:
     """Wait until it listens: a short demo would be over before."""
     ready = connection_path(config.publish.run_dir or default_run_dir(), "overlay")
     deadline = time.monotonic() + OVERLAY_START
     while not ready.exists() and overlay.poll() is None and time.monotonic() < deadline:
-        time.sleep(0.02)
+        if stop.wait(0.02):
+            return
 
 
 def _end(overlay: subprocess.Popen[str]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
 
@@ -23,8 +24,8 @@ from sags_node.types import NodeHealth
 REFRESH = 4.0  # per second
 
 
-def run_node(node: Node, seconds: float | None, console: Console) -> NodeHealth:
-    """Run until the source ends, `seconds` have passed or Ctrl-C; returns the last health.
+def run_node(node: Node, seconds: float | None, console: Console, stop: threading.Event) -> NodeHealth:
+    """Run until the source ends, `seconds` have passed or `stop` is set; returns the last health.
 
     Tells of every warning that holds for `1 / REFRESH` s, when it begins and when it ends.
 
@@ -32,15 +33,15 @@ def run_node(node: Node, seconds: float | None, console: Console) -> NodeHealth:
         SagsError: what ended the node, if something did.
     """
     deadline = None if seconds is None else time.monotonic() + seconds
-    node.start()
     try:
+        node.start()
         if console.is_terminal:
             with Live(console=console, refresh_per_second=REFRESH, transient=True) as live:
-                _watch(node, deadline, lambda health: live.update(health_table(health)))
+                _watch(node, deadline, stop, lambda health: live.update(health_table(health)))
         else:
-            _watch(node, deadline, lambda health: None)
-    except KeyboardInterrupt:
-        console.print("stopping")
+            _watch(node, deadline, stop, lambda health: None)
+        if stop.is_set():
+            console.print("stopping")
     finally:
         health = node.health()
         node.stop()
@@ -60,9 +61,11 @@ def inputs_text(config: LaunchConfig) -> list[str]:
     return lines
 
 
-def _watch(node: Node, deadline: float | None, show: Callable[[NodeHealth], None]) -> None:
+def _watch(
+    node: Node, deadline: float | None, stop: threading.Event, show: Callable[[NodeHealth], None]
+) -> None:
     notices = Notices(tell)
-    while not node.wait(timeout=1 / REFRESH):
+    while not (stop.is_set() or node.wait(timeout=1 / REFRESH)):
         health = node.health()
         notices.update(by_code(health.warnings))
         show(health)

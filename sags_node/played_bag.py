@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import tempfile
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import count
@@ -15,6 +14,7 @@ from sags_node.errors import SagsError
 from sags_node.node import Node
 from sags_node.recording.recorder import Options, Recorder
 from sags_node.session import Session
+from sags_node.terminal.console import stop_signals
 from sags_node.types import FrameResult
 
 START_SECONDS = 30.0  # for the recorder to open its file
@@ -42,7 +42,7 @@ def record_session(session: Session, options: Options, advance: Advance) -> dict
     opened = threading.Event()
     summary: dict[str, Any] = {}
     failed: list[BaseException] = []
-    with tempfile.TemporaryDirectory(prefix="sags-record-") as private:
+    with tempfile.TemporaryDirectory(prefix="sags-record-") as private, stop_signals() as stop:
         own = {"data": (), "ipc": True, "control": None, "run_dir": Path(private)}
         config = session.config.model_copy(update={"publish": session.config.publish.model_copy(update=own)})
         sent = count(1)
@@ -66,18 +66,20 @@ def record_session(session: Session, options: Options, advance: Advance) -> dict
         try:
             if not opened.wait(START_SECONDS):
                 raise SagsError(f"the recorder did not begin in {START_SECONDS:g} s; does the disk answer?")
-            time.sleep(SUBSCRIBE_SECONDS)
+            stop.wait(SUBSCRIBE_SECONDS)
             if not failed:
                 node.start()
-            while not failed and not node.wait(LOOK_PERIOD):
+            while not (failed or stop.is_set() or node.wait(LOOK_PERIOD)):
                 pass
-            time.sleep(LAST_SECONDS)
+            stop.wait(LAST_SECONDS)
         finally:
             node.stop()
             recorder.stop()
             thread.join()
     if failed:
         raise failed[0]
+    if stop.is_set():
+        raise KeyboardInterrupt
     if summary["lost"] or summary["dropped"]:
         raise SagsError(
             f"{summary['lost'] + summary['dropped']} messages of {session.name} were lost on the way to "

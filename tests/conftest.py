@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,6 +18,8 @@ ROOT = Path(__file__).parent.parent
 
 def pytest_configure() -> None:
     import torch
+
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # else children ignore it beside `&` in a script
 
     if not torch.cuda.is_available():
         os.environ["TRITON_INTERPRET"] = "1"  # read when a kernel is imported: they then run on the CPU

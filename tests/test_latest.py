@@ -31,7 +31,7 @@ def test_close_wakes_a_waiter() -> None:
     waiter = threading.Thread(target=lambda: got.append(slot.get()))
     waiter.start()
     slot.close()
-    waiter.join(timeout=5)
+    waiter.join(timeout=60)
     assert got == [None]
 
 
@@ -40,10 +40,10 @@ def test_hand_over_drops_nothing() -> None:
     sender = threading.Thread(target=lambda: [slot.hand_over(i) for i in range(50)] and slot.close())
     sender.start()
     got = []
-    while (value := slot.get(timeout=5)) is not None:
+    while (value := slot.get(timeout=60)) is not None:
         time.sleep(0.001)
         got.append(value)
-    sender.join(timeout=5)
+    sender.join(timeout=60)
     assert got == list(range(50))
     assert slot.dropped == 0
 

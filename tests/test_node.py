@@ -14,9 +14,9 @@ from pathlib import Path
 import independent_client
 import numpy as np
 import pytest
-from command_line import FREE_PORTS, start
 from rosbags.typesys import Stores, get_typestore
 from running_node import START_SECONDS, RunningNode
+from waiting import until
 
 from sags_node.errors import SagsError
 from sags_node.messaging.control import ControlClient
@@ -164,14 +164,10 @@ def test_a_killed_node_goes_stale_and_reads_fail(phantom_session: Path, tmp_path
     name = "left/render/image"
     with Subscriber([name], endpoint=running.data) as subscriber:
         assert subscriber.wait(name, timeout=30) is not None
-        deadline = time.monotonic() + 30
-        while not subscriber.ok(name) and time.monotonic() < deadline:
-            time.sleep(0.05)
+        until(lambda: subscriber.ok(name))
         running.process.kill()
         running.process.wait(30)
-        deadline = time.monotonic() + 10
-        while subscriber.ok(name) and time.monotonic() < deadline:
-            time.sleep(0.05)
+        until(lambda: not subscriber.ok(name))
         with pytest.raises(SagsError):
             subscriber.read(name)
 
@@ -189,36 +185,6 @@ def test_stopping_is_clean(phantom_session: Path, tmp_path: Path, stop: signal.S
     assert running.process.wait(30) == 0
     assert not (running.run_dir / "sags.json").exists()
     assert "Traceback" not in running.said()
-
-
-@pytest.mark.fault(
-    "process: SIGTERM or SIGKILL at any moment of the start",
-    sees="no node, or one that stops",
-    back="the next node starts in the same place",
-    left="no process; after SIGTERM no connection file",
-)
-def test_a_start_may_be_broken_off_at_any_moment(phantom_session: Path, tmp_path: Path) -> None:
-    """From Python's first imports until frames are published, some seconds later."""
-    run_dir = tmp_path / "run"
-    command = ["run", phantom_session, "source.loop:=true", *FREE_PORTS, f"publish.run_dir:={run_dir}"]
-    for ending, moments in ((signal.SIGTERM, (0.2, 1.2, 3.0)), (signal.SIGKILL, (0.7, 3.0))):
-        for moment in moments:
-            process = start(command)
-            time.sleep(moment)
-            process.send_signal(ending)
-            _, stderr = process.communicate(timeout=30)
-            assert process.returncode in (
-                {0, 130, -signal.SIGTERM} if ending == signal.SIGTERM else {-ending}
-            )
-            assert "Traceback" not in stderr
-            with pytest.raises(ProcessLookupError):
-                os.killpg(process.pid, 0)  # of its group
-            assert ending == signal.SIGKILL or not (run_dir / "sags.json").exists()
-    (run_dir / "sags.json").unlink(
-        missing_ok=True
-    )  # what the killed one left; `RunningNode` waits for a new one
-    running = RunningNode(phantom_session, tmp_path)
-    assert running.stop() == 0
 
 
 def test_a_port_in_use_is_one_clear_message(phantom_session: Path, tmp_path: Path) -> None:

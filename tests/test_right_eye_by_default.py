@@ -61,7 +61,7 @@ class Watched:
             context.destroy(linger=0)
 
     def heard(self, *names: str, count: int = 3) -> dict[str, list[client.Received]]:
-        got = client.collect(self.data, [f"sags/{name}" for name in names], count, timeout=20)
+        got = client.collect(self.data, [f"sags/{name}" for name in names], count, timeout=60)
         return {name: got[f"sags/{name}"] for name in names}
 
 
@@ -121,7 +121,7 @@ def test_a_pair_of_eyes_from_elsewhere_is_a_look_at_the_right_one(running: Watch
             assert running.draws(False)
         with running.subscribed("sags/view/pair/right/image") as socket:
             until(lambda: running.draws(True))
-            assert socket.poll(10_000)
+            assert socket.poll(60_000)
         asker.request("close_view", {"name": "pair"})
     until(lambda: running.draws(False))
 
@@ -133,5 +133,5 @@ def test_one_may_have_it_always_or_never(
     with watched(phantom_session, tmp_path, f"publish.right:={right}") as one:
         assert one.draws(drawn)
         with one.subscribed("sags/right/") as socket:
-            assert bool(socket.poll(10_000 if drawn else 500)) == drawn
+            assert bool(socket.poll(60_000 if drawn else 500)) == drawn
         assert one.draws(drawn)

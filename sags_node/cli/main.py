@@ -38,7 +38,7 @@ from sags_node.cli.view import view
 from sags_node.errors import SagsError, UsageError
 from sags_node.plotting import check_plots
 from sags_node.terminal import text
-from sags_node.terminal.console import console, interrupt, log_handler, progress, show
+from sags_node.terminal.console import console, interrupt, log_handler, progress, show, stop_signals
 
 log = logging.getLogger(__name__)
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT)  # of a disk; also of what stdout leads to
@@ -143,12 +143,15 @@ def run(launch: tuple[str, ...], seconds: float | None, json_out: bool) -> None:
     if path is None and isinstance(load_launch(None, overrides).source, PhantomSource):
         overrides = ["source.loop:=true", *overrides]
     session = open_launched(path, overrides)
-    node = Node(session.config, session.rig, session.source, manager=manager)
-    where = escape(", ".join(node.endpoints))
-    console.print(f"publishing on {where} as [bold]{session.config.ns}/...[/]  (Ctrl-C ends)", soft_wrap=True)
-    for line in inputs_text(session.config):
-        console.print(line, markup=False, soft_wrap=True)
-    health = run_node(node, seconds, console)
+    with stop_signals() as stop:
+        node = Node(session.config, session.rig, session.source, manager=manager)
+        where = escape(", ".join(node.endpoints))
+        console.print(
+            f"publishing on {where} as [bold]{session.config.ns}/...[/]  (Ctrl-C ends)", soft_wrap=True
+        )
+        for line in inputs_text(session.config):
+            console.print(line, markup=False, soft_wrap=True)
+        health = run_node(node, seconds, console, stop)
     show(health_fields(health) if json_out else health_table(health))
 
 

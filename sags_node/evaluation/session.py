@@ -22,6 +22,7 @@ from sags_node.node import Node
 from sags_node.pipeline import Pipeline
 from sags_node.session import Session, open_posed, open_session
 from sags_node.sources.source import Source
+from sags_node.terminal.console import stop_signals
 from sags_node.types import FrameResult, StereoFrame
 from sags_node.vision.rectify import Rectifier
 from sags_node.vision.tissue import TissueMask
@@ -163,13 +164,16 @@ def run_realtime(
         spool.add(result, frame_ms, time.monotonic_ns(), latency_ms, warnings)
 
     config = session.config.model_copy(update={"publish": publish})
-    node = Node(config, session.rig, _WithoutHeldOut(session.source, options), on_result=keep)
-    node.start()
-    try:
-        while not node.wait(PROGRESS_PERIOD):
-            progress("playing", len(spool))
-    finally:
-        node.stop()
+    with stop_signals() as stop:
+        node = Node(config, session.rig, _WithoutHeldOut(session.source, options), on_result=keep)
+        try:
+            node.start()
+            while not (stop.is_set() or node.wait(PROGRESS_PERIOD)):
+                progress("playing", len(spool))
+        finally:
+            node.stop()
+    if stop.is_set():
+        raise KeyboardInterrupt
 
 
 class _WithoutHeldOut:

@@ -24,6 +24,8 @@ WIDE = 200  # columns of a table that goes to a file or another program, and so 
 LOOK_AGAIN = 0.02  # s until a Ctrl-C that could not come through is tried again
 LONGEST_WAIT = 10.0  # s, after which it is tried whatever becomes of it
 _IMPORT = "<frozen importlib._bootstrap>"  # where the frames of an import are
+# Finalisers, and what LLVM calls when it has compiled or loaded a kernel: the first Python code for long.
+_LOSING = {"__del__", "_raw_object_cache_notify", "_raw_object_cache_getbuffer"}
 
 console = Console(stderr=True, highlight=False)
 log = logging.getLogger(__name__)
@@ -106,7 +108,8 @@ def _drawn(table: Table) -> str:
 class _Interrupt:
     """Handler of Ctrl-C: `KeyboardInterrupt`, as soon as it can come through.
 
-    In the middle of an import it may come out of C code as an `ImportError`; a finaliser loses it.
+    In the middle of an import it may come out of C code as an `ImportError`; finalisers and callbacks of C
+    code lose it.
     """
 
     def __init__(self) -> None:
@@ -127,7 +130,7 @@ class _Interrupt:
 
 def _loses_exceptions(frame: FrameType | None) -> bool:
     while frame is not None:
-        if frame.f_code.co_filename == _IMPORT or frame.f_code.co_name == "__del__":
+        if frame.f_code.co_filename == _IMPORT or frame.f_code.co_name in _LOSING:
             return True
         frame = frame.f_back
     return False
@@ -146,7 +149,24 @@ def on_stop_signals(stop: Callable[[], None]) -> None:
         signal.signal(number, interrupt)
         stop()
 
-    signal.signal(signal.SIGINT, handle)
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # as after nohup
+        signal.signal(signal.SIGINT, handle)
     signal.signal(signal.SIGTERM, handle)
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup
         signal.signal(signal.SIGHUP, handle)
+
+
+@contextmanager
+def stop_signals() -> Iterator[threading.Event]:
+    """`on_stop_signals` for as long as something runs that has threads: they set the event.
+
+    Raised between two steps of its start or its end, an exception would leave threads and sockets behind.
+    """
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    stop = threading.Event()
+    on_stop_signals(stop.set)
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,4 +1,4 @@
-"""The overlay on GStreamer's side: every pixel of both eyes, at the display's rate, and nothing old."""
+"""The overlay on GStreamer's side: every pixel of both eyes, and nothing old."""
 
 from __future__ import annotations
 
@@ -23,8 +23,6 @@ from sags_node.overlay.stream import OverlayStream
 pytestmark = pytest.mark.live
 
 HEIGHT, WIDTH, KEY = 48, 70, (10, 200, 30)
-BLANK_WITHIN = 0.5  # s, that are promised
-RATE = 50.0
 
 
 def overlay_of(eye: int) -> np.ndarray:
@@ -68,7 +66,7 @@ def displays(run_dir: Path, **launches: str) -> Iterator[None]:
 
     def work() -> None:
         try:
-            run_gst(Options(Place("overlay", run_dir=run_dir), rate=RATE, **launches), lambda: None, stop)
+            run_gst(Options(Place("overlay", run_dir=run_dir), **launches), lambda: None, stop)
         except SagsError as error:
             failed.append(error)
 
@@ -78,7 +76,7 @@ def displays(run_dir: Path, **launches: str) -> Iterator[None]:
         yield
     finally:
         stop.set()
-        thread.join(20)
+        thread.join(60)
     assert not thread.is_alive() and not failed, failed
 
 
@@ -101,20 +99,14 @@ def test_both_eyes_come_to_the_pixel_and_what_is_old_becomes_the_key(tmp_path: P
             for eye, file in files.items():
                 picture = expected[eye == "right"]
                 until(lambda f=file, p=picture: len(shown(f)) and np.array_equal(shown(f)[-1], p))  # type: ignore[misc]
-            began, before = time.monotonic(), len(shown(files["left"]))
-            time.sleep(1.0)
-            rate = (len(shown(files["left"])) - before) / (time.monotonic() - began)
             paused.set()
-            stopped = time.monotonic()
             for file in files.values():
                 until(lambda f=file: np.array_equal(shown(f)[-1], nothing))  # type: ignore[misc]
-                assert time.monotonic() - stopped < BLANK_WITHIN
             paused.clear()
             until(lambda: np.array_equal(shown(files["left"])[-1], expected[0]))
         until(lambda: np.array_equal(shown(files["left"])[-1], nothing))  # the overlay is gone
         count = len(shown(files["left"]))
         until(lambda: len(shown(files["left"])) > count + 5)  # and the display gets pictures still
-    assert 0.8 * RATE < rate < 1.1 * RATE
     for n, file in enumerate(files.values()):
         for picture in shown(file):
             assert np.array_equal(picture, expected[n]) or np.array_equal(picture, nothing), (
@@ -126,7 +118,7 @@ def test_a_wrong_pipeline_is_said_in_words(tmp_path: Path) -> None:
     need_gstreamer()
     options = Options(Place("overlay", run_dir=tmp_path), left="nosuchsink")
     stop = threading.Event()
-    threading.Timer(20, stop.set).start()
+    threading.Timer(60, stop.set).start()
     with OverlayStream("overlay", tmp_path, KEY) as stream, drawing(stream, threading.Event()):
         with pytest.raises(SagsError, match='no element "nosuchsink"'):
             run_gst(options, lambda: None, stop)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -12,11 +14,16 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from command_line import start, stopped, wait_for
+from command_line import FREE_PORTS, START_SECONDS, sags, start, stopped, wait_for
+from llvmlite import binding as llvm
+from waiting import until
 
 from sags_node.cli.main import main
+from sags_node.messaging.publisher import Publisher
+from sags_node.node import Node
+from sags_node.service_manager import ServiceManager
 from sags_node.terminal import console as terminal
-from sags_node.terminal.console import interrupt, on_stop_signals
+from sags_node.terminal.console import interrupt, on_stop_signals, stop_signals
 
 pytestmark = [pytest.mark.live, pytest.mark.usefixtures("run_dir")]
 
@@ -109,6 +116,20 @@ def test_a_ctrl_c_in_a_finaliser_comes_through_after_it() -> None:
         signal.signal(signal.SIGINT, before)
 
 
+def test_a_ctrl_c_while_a_kernel_is_compiled_comes_through_after_it() -> None:
+    """LLVM calls back with what it has compiled, and there an exception is printed and forgotten."""
+    machine = llvm.Target.from_default_triple().create_target_machine()
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly("define void @kernel() { ret void }"), machine)
+    engine.set_object_cache(lambda module, code: signal.raise_signal(signal.SIGINT))
+    before = signal.signal(signal.SIGINT, interrupt)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            engine.finalize_object()
+            time.sleep(10)
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def test_an_import_that_hangs_is_broken_off_in_the_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -123,6 +144,74 @@ def test_an_import_that_hangs_is_broken_off_in_the_end(
             importlib.import_module("hanging")
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.fault(
+    "process: Ctrl-C or SIGTERM between two steps of a node's start or end",
+    says="exit code 0",
+    left="no thread, no connection file",
+)
+@pytest.mark.parametrize(
+    ("of", "step"),
+    [(Publisher, "__init__"), (Node, "__init__"), (ServiceManager, "ready"), (Node, "start"),
+     (ServiceManager, "stopping")],
+)  # fmt: skip
+def test_a_node_that_has_begun_ends_in_order(
+    of: type, step: str, phantom_session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It starts step by step: an exception between two of them would leave sockets and threads behind."""
+    original, signals = getattr(of, step), iter([signal.SIGTERM])
+
+    def interrupted(*arguments: object, **named: object) -> None:
+        original(*arguments, **named)
+        for number in signals:
+            signal.raise_signal(number)
+
+    monkeypatch.setattr(of, step, interrupted)
+    before = set(threading.enumerate())
+    private = f"publish.run_dir:={tmp_path}"
+    result = sags("run", phantom_session, "source.frames:=2", "source.pace:=fast", *FREE_PORTS, private)
+    assert result.exit_code == 0, result.stderr
+    assert [file.name for file in tmp_path.iterdir()] == ["sags.lock"]
+    until(lambda: not set(threading.enumerate()) - before)
+
+
+BROKEN_OFF = """
+import sys, threading, time
+import cv2, numpy as np
+import sags_node.cli.main
+from sags_node.__main__ import main
+
+class Kept:
+    def __del__(self):  # while Python finalises
+        time.sleep(1.0)
+
+def work(picture=np.zeros((1000, 1000), np.uint8)):
+    while True:
+        cv2.blur(picture, (9, 9))
+        began.set()
+
+def command():
+    threading.Thread(target=work, daemon=True).start()
+    began.wait()
+    print("said", end="")
+    sys.exit(7)
+
+began, sys.modules["kept"] = threading.Event(), Kept()
+sags_node.cli.main.main = command
+main()
+"""
+
+
+@pytest.mark.fault(
+    "process: it ends while a thread is busy in OpenCV, as after a second Ctrl-C",
+    says="its exit code, no SIGABRT",
+)
+def test_a_thread_that_is_given_up_does_not_abort_the_process() -> None:
+    ended = subprocess.run(
+        [sys.executable, "-c", BROKEN_OFF], capture_output=True, text=True, timeout=START_SECONDS, check=False
+    )
+    assert (ended.returncode, ended.stdout, ended.stderr) == (7, "said", "")
 
 
 def test_ctrl_c_ends_the_rendering_of_a_phantom(tmp_path: Path) -> None:
@@ -153,6 +242,20 @@ def test_a_ctrl_c_that_meets_a_finaliser_is_not_lost(stop: threading.Event) -> N
 
     Socket()
     assert stop.is_set()
+
+
+def test_a_ctrl_c_that_is_ignored_stays_so() -> None:
+    """As after nohup, and in scripts beside `&`."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with stop_signals() as stop:
+            signal.raise_signal(signal.SIGINT)
+            assert not stop.is_set()
+            signal.raise_signal(signal.SIGTERM)
+            assert stop.is_set()
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_a_second_ctrl_c_breaks_off(stop: threading.Event) -> None:

@@ -100,7 +100,6 @@ BOARD = ("--squares", "10x7", "--square-mm", "4.5")
         (("calib", "convert", ROOT / "calib/d4d"), "--out", "left.yaml"),
         (("calib", "stereo", "left", "right", *BOARD), "--out", "right.yaml"),
         (("calib", "hand-eye", *BOARD), "--out", "hand_eye.yaml"),
-        (("bench", "disturbances"), "--pictures", "fog_left.png"),
     ],
 )
 def test_no_command_overwrites_in_a_folder_what_it_did_not_make(

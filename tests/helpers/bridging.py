@@ -18,7 +18,7 @@ from sags_node.messaging.publisher import Publisher
 from sags_node.types import AnchorStates, FrameResult
 
 SEEN, HIDDEN, LOST, UNSURE = 3, 5, 8, 9  # numbers of the anchors in `anchored`
-STARTING = 30.0  # s
+STARTING = 60.0  # s
 
 
 @contextmanager
@@ -83,5 +83,5 @@ def bridged(
         yield ports[0]
     finally:
         stop.set()
-        thread.join(10)
+        thread.join(60)
         assert not thread.is_alive() and not failed, failed

@@ -19,7 +19,6 @@ from click.testing import CliRunner, Result
 from sags_node.cli.main import main
 
 START_SECONDS = 120  # the first start on a machine compiles kernels
-PROMPT_SECONDS = 5  # to end after Ctrl-C
 FREE_PORTS = ("publish.data:=[tcp://127.0.0.1:*]", "publish.control:=tcp://127.0.0.1:*")
 
 
@@ -80,7 +79,7 @@ def wait_for(process: subprocess.Popen[str], ready: Callable[[], bool]) -> None:
 def stopped(process: subprocess.Popen[str]) -> tuple[str, str]:
     """What it says after Ctrl-C; it and all its children have ended."""
     process.send_signal(signal.SIGINT)
-    stdout, stderr = process.communicate(timeout=PROMPT_SECONDS)
+    stdout, stderr = process.communicate(timeout=60)
     with pytest.raises(ProcessLookupError):
         os.killpg(process.pid, 0)
     assert "Traceback" not in stderr, stderr

@@ -5,7 +5,6 @@ from __future__ import annotations
 import shutil
 import subprocess
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -30,10 +29,10 @@ def built(source: Path, folder: Path) -> Path:
 
 
 class Peer:
-    """The program; what it prints is taken in as it comes: device -> (fields, when it came)."""
+    """The program; what it prints is taken in as it comes: the fields of each line."""
 
     def __init__(self, program: Path, port: int, *order: object) -> None:
-        self.came: list[tuple[list[str], float]] = []
+        self.came: list[list[str]] = []
         self._process = subprocess.Popen(
             [program, "127.0.0.1", str(port), *map(str, order)], stdout=subprocess.PIPE, text=True
         )
@@ -43,16 +42,16 @@ class Peer:
     def _read(self) -> None:
         assert self._process.stdout is not None
         for line in self._process.stdout:
-            self.came.append((line.split(), time.time()))
+            self.came.append(line.split())
 
     def newest(self, device: str) -> list[str] | None:
         """The fields after kind, device and stamp."""
-        return next((fields[3:] for fields, _ in reversed(self.came) if fields[1] == device), None)
+        return next((fields[3:] for fields in reversed(self.came) if fields[1] == device), None)
 
     def close(self) -> None:
         self._process.kill()
         self._process.wait(10)
-        self._thread.join(10)
+        self._thread.join(60)
 
 
 @contextmanager

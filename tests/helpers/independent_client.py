@@ -65,7 +65,7 @@ def collect(endpoint: str, topics: Sequence[str], count: int, timeout: float) ->
     return received
 
 
-def request(endpoint: str, op: str, args: Mapping[str, Any], timeout: float = 5.0) -> dict[str, Any]:
+def request(endpoint: str, op: str, args: Mapping[str, Any], timeout: float = 60.0) -> dict[str, Any]:
     """One request on the control socket."""
     context = zmq.Context()
     socket = context.socket(zmq.REQ)

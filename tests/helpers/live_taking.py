@@ -40,5 +40,5 @@ class Taker:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._source.stop()
-        self._thread.join(10)
+        self._thread.join(60)
         assert not self._thread.is_alive()

@@ -9,12 +9,15 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from synthetic import publisher, stream
+from synthetic import at_frame, plane_result, publisher, stream
 from waiting import until
 
 from sags_node.errors import SagsError
 from sags_node.recording.bag import BagMessage, read_messages
 from sags_node.recording.recorder import Options, Recorder
+from sags_node.types import FrameResult
+
+RATE = 30.0  # Hz
 
 
 @contextmanager
@@ -36,20 +39,27 @@ def recording(options: Options) -> Iterator[tuple[Recorder, list[dict[str, Any]]
         yield recorder, said
     finally:
         recorder.stop()
-        thread.join(30)
+        thread.join(60)
     if failed:
         raise failed[0]
 
 
 def record_plane(tmp_path: Path, seconds: float = 1.0, **options: Any) -> tuple[Path, dict[str, Any]]:
-    """A bag of the plane of `synthetic`, and the recorder's summary."""
-    run_dir = tmp_path / "run"
+    """A bag of the plane of `synthetic`, and the recorder's summary: as many frames as come in so long."""
+    run_dir, plane, count = tmp_path / "run", plane_result(), 0
+
+    def frame(number: int) -> FrameResult:
+        nonlocal count
+        count = number
+        return at_frame(plane, number, time.time_ns())
+
     with publisher(run_dir, right=True) as running:
         running.publish_parameters({"seed": 5})
-        with stream(running):
-            time.sleep(0.1)  # the last values are there
+        with stream(running, frame, RATE):
+            until(lambda: count > 2)  # the last values are there
             with recording(Options(tmp_path / "bag", run_dir=run_dir, **options)) as (_, said):
-                time.sleep(seconds)
+                last = count + seconds * RATE
+                until(lambda: count > last)
     return tmp_path / "bag", said[-1]
 
 

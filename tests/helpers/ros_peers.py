@@ -6,7 +6,6 @@ import json
 import os
 import subprocess
 import threading
-import time
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -50,7 +49,7 @@ class Listener:
 
     def __init__(self, *topics: Wanted) -> None:
         self.graph = Graph(RosGraph(domain=DOMAIN))
-        self.came: dict[str, list[tuple[bytes, float]]] = defaultdict(list)
+        self.came: dict[str, list[bytes]] = defaultdict(list)
         self._readers = {name: self.graph.reader(name, kind, *how) for name, kind, *how in topics}
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._listen)
@@ -60,15 +59,15 @@ class Listener:
         while not self._stop.is_set():
             self.graph.wait(0.05)
             for name, reader in self._readers.items():
-                self.came[name] += [(data, time.time()) for data in reader.take()]
+                self.came[name] += reader.take()
 
     def newest(self, name: str) -> bytes:
-        return self.came[name][-1][0]
+        return self.came[name][-1]
 
     def close(self) -> None:
         """Leave the graph."""
         self._stop.set()
-        self._thread.join(10)
+        self._thread.join(60)
         del self.graph, self._readers
 
 
@@ -86,7 +85,6 @@ class Came:
     """A message that reached rclpy; see tests/ros2/peer.py."""
 
     stamp: int
-    came: int
     size: int
     crc: int
     data: str = ""
@@ -138,7 +136,7 @@ class RosNode:
     def close(self) -> None:
         self.process.kill()
         self.process.wait(10)
-        self._thread.join(10)
+        self._thread.join(60)
 
 
 @contextmanager

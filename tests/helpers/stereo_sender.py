@@ -4,7 +4,8 @@
     python stereo_sender.py dds DOMAIN SESSION SECONDS [key=value ...]
 
 The number of each pair is painted into both pictures (`read_number`), so that a mismatch shows; with
-`clock=1` the milliseconds of its stamp (of a minute), so that a wrong stamp shows.
+`clock=1` the milliseconds of its stamp (of a minute), so that a wrong stamp shows. In the end it says how
+many pictures were left out because nobody took them in time.
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ def read_number(picture: U8) -> int:
     return sum(int(value > 127) << bit for bit, value in enumerate(middles))
 
 
-def push(endpoint: str, jpeg: bool) -> Callable[[U8, U8, int], None]:
+def push(endpoint: str, jpeg: bool) -> tuple[Callable[[U8, U8, int], None], Callable[[], int]]:
+    """What sends a pair, and how many pictures it has left out."""
     from sags_node.client import FrameSender
 
     sender = FrameSender(endpoint)
@@ -46,7 +48,7 @@ def push(endpoint: str, jpeg: bool) -> Callable[[U8, U8, int], None]:
         else:
             sender.send(left, right, stamp_ns)
 
-    return send
+    return send, lambda: sender.left_out
 
 
 def dds(domain: int, compressed: bool, scale: float, session: Path) -> Callable[[U8, U8, int], None]:
@@ -91,7 +93,10 @@ def main() -> None:
         for index in range(4)
     ]
     compressed = "jpeg" in said
-    send = push(where, compressed) if way == "push" else dds(int(where), compressed, width / 320, session)
+    if way == "push":
+        send, left_out = push(where, compressed)
+    else:
+        send, left_out = dds(int(where), compressed, width / 320, session), lambda: 0
     print("sending", flush=True)
     begun = time.monotonic()
     for number in range(round(float(seconds) * rate)):
@@ -103,6 +108,7 @@ def main() -> None:
             paint_number(picture, painted % 2**BITS)
         send(left, right, stamp_ns)
     time.sleep(0.5)
+    print(left_out(), flush=True)
 
 
 if __name__ == "__main__":

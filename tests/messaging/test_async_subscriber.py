@@ -40,7 +40,7 @@ def test_messages_are_new_ones_in_order_and_end_when_they_go_stale(running: Publ
             publishing = stream(running)
             publishing.__enter__()
             with pytest.raises(StaleError, match="left/image_rect_color is stale"):
-                async for image in subscriber.messages(PICTURE, timeout=0.6):
+                async for image in subscriber.messages(PICTURE, timeout=5.0):
                     seen.append(image)
                     if len(seen) == 10:
                         await asyncio.to_thread(publishing.__exit__, None, None, None)

@@ -29,6 +29,8 @@ from sags_node.messaging.rundir import Connection
 
 pytestmark = pytest.mark.live
 
+GUARD_MS = 60_000  # against waiting for ever
+
 
 def refuse(args: dict[str, Any]) -> Any:
     raise SagsError("mapping.nothing cannot be changed")
@@ -122,7 +124,7 @@ def test_what_is_owed_is_bounded(tmp_path: Path) -> None:
         asker.connect(endpoint)
         for i in range(MAX_PENDING + 5):
             asker.send(msgpack.packb({"v": "1.0", "id": i, "op": "never"}))
-        refused = [msgpack.unpackb(asker.recv()) for _ in range(5) if asker.poll(5000)]
+        refused = [msgpack.unpackb(asker.recv()) for _ in range(5) if asker.poll(GUARD_MS)]
         assert [reply["ok"] for reply in refused] == [False] * 5
         assert "waiting" in refused[0]["error"]
         context.destroy(linger=0)
@@ -141,7 +143,7 @@ def test_thousands_of_random_requests_do_no_harm(tmp_path: Path) -> None:
     with node(tmp_path / "run", {"echo": lambda args: args}) as endpoint:
         context = zmq.Context()
         asker = context.socket(zmq.DEALER)
-        asker.setsockopt(zmq.SNDTIMEO, 5000)
+        asker.setsockopt(zmq.SNDTIMEO, GUARD_MS)
         asker.connect(endpoint)
         answered = 0
         for i in range(3000):
@@ -151,8 +153,7 @@ def test_thousands_of_random_requests_do_no_harm(tmp_path: Path) -> None:
             asker.send_multipart(parts)
             while asker.poll(0):
                 answered += is_reply(asker.recv_multipart()[-1])
-        deadline = time.monotonic() + 30
-        while answered < 2900 and time.monotonic() < deadline and asker.poll(500):
+        while answered < 2900 and asker.poll(GUARD_MS):
             answered += is_reply(asker.recv_multipart()[-1])
         context.destroy(linger=0)
         assert answered >= 2900  # all but those in too many parts

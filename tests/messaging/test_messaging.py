@@ -28,6 +28,7 @@ from synthetic import (
     publisher,
     stream,
 )
+from waiting import until
 
 from sags_node.geometry import project
 from sags_node.messaging import topics
@@ -49,7 +50,7 @@ def received(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[client.
     with publisher(run_dir) as running, stream(running):
         endpoint = running.connection.data[-1]
         assert endpoint.startswith("tcp://")
-        got = client.collect(endpoint, [f"sags/{name}" for name in names], count=5, timeout=30)
+        got = client.collect(endpoint, [f"sags/{name}" for name in names], count=5, timeout=60)
     return {name: got[f"sags/{name}"] for name in names}
 
 
@@ -180,7 +181,7 @@ def test_a_late_subscriber_gets_the_last_values(tmp_path: Path) -> None:
         running.publish_health(health())
         running.publish_parameters({"mapping": {"budget_ms": 33.0}})
         names = ["left/camera_info", "splats", "parameters", "status", "left/depth", "points"]
-        got = _collect_while_polling(running, [f"sags/{name}" for name in names], seconds=1.0)
+        got = _collect_while_polling(running, [f"sags/{name}" for name in names], seconds=3.0)
     counts = {name: len(got[f"sags/{name}"]) for name in names}
     assert counts == {
         "left/camera_info": 1,
@@ -206,13 +207,12 @@ def test_only_what_is_subscribed_to_is_encoded(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(content, "FRAME_CONTENT", counted)
     with publisher(tmp_path / "run") as running:
         with stream(running, rate=100):
-            client.collect(running.connection.data[-1], ["sags/left/depth"], count=3, timeout=30)
+            client.collect(running.connection.data[-1], ["sags/left/depth"], count=3, timeout=60)
             assert set(encoded) == {"left/depth"}
-        for _ in range(20):  # the peer is gone: its subscription ends
-            running.poll(20)
+        _poll_until(running, lambda: not running.wanted("left/depth"))  # the peer is gone
         encoded.clear()
         running.publish_result(plane_result(), dropped=0)
-        assert encoded == [] and not running.wanted("left/depth")
+        assert encoded == []
 
 
 def test_the_right_eye_can_be_left_out(tmp_path: Path) -> None:
@@ -227,7 +227,7 @@ def test_a_prefix_subscribes_to_all_below_it(tmp_path: Path) -> None:
         _poll_until(running, lambda: running.wanted("left/render/depth"))
         assert running.wanted("left/render/image") and not running.wanted("left/depth")
         running.publish_result(plane_result(), dropped=0)
-        names = {peer.recv_multipart()[0] for _ in range(2) if peer.poll(5000)}
+        names = {peer.recv_multipart()[0] for _ in range(2) if peer.poll(60_000)}
         assert names == {b"sags/left/render/image", b"sags/left/render/depth"}
         context.destroy(linger=0)
 
@@ -241,7 +241,7 @@ def test_a_frame_without_time_for_depth_sends_none_and_leaves_no_gap(tmp_path: P
 
     wanted = ["sags/left/depth", "sags/tf"]
     with publisher(tmp_path / "run") as running, stream(running, every_other):
-        got = client.collect(running.connection.data[-1], wanted, count=4, timeout=30)
+        got = client.collect(running.connection.data[-1], wanted, count=4, timeout=60)
     assert all(message.meta["frame_id"] % 2 == 0 for message in got["sags/left/depth"])
     assert np.diff([message.meta["seq"] for message in got["sags/left/depth"]]).tolist() == [1, 1, 1]
     assert np.diff([message.meta["frame_id"] for message in got["sags/tf"]]).tolist() == [1, 1, 1]
@@ -268,7 +268,7 @@ def test_while_the_camera_is_lost_no_model_goes_out_under_a_new_stamp(tmp_path: 
 def test_restart_and_loop_are_visible(tmp_path: Path) -> None:
     result = plane_result(epoch=4, step=11)
     with publisher(tmp_path / "run") as running, stream(running, lambda i: at_frame(result, i, i + 1, 4 + i)):
-        got = client.collect(running.connection.data[-1], ["sags/tf"], count=3, timeout=30)["sags/tf"]
+        got = client.collect(running.connection.data[-1], ["sags/tf"], count=3, timeout=60)["sags/tf"]
     assert [m.meta["epoch"] - m.meta["frame_id"] for m in got] == [4, 4, 4]
     assert {m.meta["step"] for m in got} == {11}
     assert [m.meta["dropped"] for m in got] == [m.meta["frame_id"] // 2 for m in got]
@@ -319,7 +319,7 @@ def test_garbage_bytes_do_no_harm(tmp_path: Path, which: str) -> None:
                     raw.sendall(start + rng.bytes(size))
                     running.poll(1)
         with stream(running):
-            got = client.collect(connection.data[-1], ["sags/left/depth"], count=2, timeout=30)
+            got = client.collect(connection.data[-1], ["sags/left/depth"], count=2, timeout=60)
             assert client.request(str(connection.control), "ping", {})["result"] == "pong"
     assert len(got["sags/left/depth"]) == 2
 
@@ -341,7 +341,7 @@ def test_subscription_spam_is_bounded(tmp_path: Path) -> None:
         spammer.send(b"\x01\xff\xfe")
         spammer.send(b"\x05sags/tf")
         with stream(running):
-            got = client.collect(running.connection.data[-1], ["sags/tf"], count=2, timeout=30)
+            got = client.collect(running.connection.data[-1], ["sags/tf"], count=2, timeout=60)
         context.destroy(linger=0)
         assert running._subscribed <= {"sags/tf"}
     assert len(got["sags/tf"]) == 2
@@ -371,10 +371,7 @@ def _subscriber(endpoint: str, prefix: str, high_water: int = 1000) -> tuple[zmq
 
 
 def _poll_until(running: Publisher, condition: Any) -> None:
-    deadline = time.monotonic() + 30
-    while not condition():
-        assert time.monotonic() < deadline
-        running.poll(10)
+    until(lambda: running.poll(10) or condition())
 
 
 def _collect_while_polling(running: Publisher, names: list[str], seconds: float) -> Any:

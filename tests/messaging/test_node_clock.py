@@ -161,13 +161,14 @@ def test_a_drifting_clock_is_known_to_a_millisecond(tmp_path: Path) -> None:
         for _ in range(20):
             found = clock.offset
             assert found is not None and abs(found.seconds - true_offset()) <= found.bound + 1e-4
-            assert clock.latest_ns() >= ahead_and_drifting() - 100_000  # stamps are not taken at one moment
+            before = ahead_and_drifting()
+            assert clock.latest_ns() >= before
             time.sleep(0.05)
         delay = topic_delay(
             "left/depth", running.connection.data[0], seconds=1, control=clock_endpoint(running)
         )
     assert delay["clock_offset_s"] == pytest.approx(true_offset(), abs=delay["clock_bound_s"] + 1e-4)
-    assert -delay["clock_bound_s"] <= delay["min_s"] < AHEAD, "not stamped in the future any more"
+    assert -delay["clock_bound_s"] <= delay["min_s"] < 2 * AHEAD, "not stamped in the future any more"
 
 
 @pytest.mark.live
@@ -185,7 +186,7 @@ def test_a_clock_that_is_set_while_it_is_followed(tmp_path: Path) -> None:
     with answering(tmp_path, lambda: time.time_ns() + shift[0]), NodeClock(run_dir=tmp_path) as clock:
         until(lambda: clock.offset is not None and clock.offset.bound < 1e-2)
         shift[0] = 3_000_000_000
-        until(lambda: clock.jumps == 1, seconds=10)
+        until(lambda: clock.jumps == 1)
         found = clock.offset
         assert found is not None and abs(found.seconds - 3) <= found.bound
 
@@ -207,7 +208,7 @@ def test_ages_are_by_the_nodes_clock_and_nothing_is_fresh_without_it(tmp_path: P
         with NodeClock(run_dir=tmp_path) as clock, Subscriber([name], run_dir=tmp_path, clock=clock) as sure:
             until(lambda: sure.ok(name))
             shown = sure.read(name)
-            assert 0 < shown.age(sure.now_ns()) < 1
+            assert 0 < shown.age(sure.now_ns()) < 5, "as much as the clock is ahead"
         silent = "tcp://127.0.0.1:1"
         with NodeClock(silent) as unknown, Subscriber([name], run_dir=tmp_path, clock=unknown) as unsure:
             assert unsure.wait(name, 30)

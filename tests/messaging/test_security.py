@@ -10,7 +10,6 @@ import stat
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -34,7 +33,6 @@ from sags_node.messaging.peers import MAX_PEERS
 from sags_node.messaging.publisher import Publisher
 from sags_node.messaging.roles import Client
 from sags_node.messaging.security import (
-    LOOK_AGAIN,
     read_allow_list,
     read_key_pair,
     read_public_key,
@@ -207,7 +205,7 @@ def test_a_listed_key_gets_data_and_answers(tmp_path: Path, keys: Path) -> None:
             control = running.connection.control if node_key else None
             mine = ClientKeys(viewer.own, node_key)
             with Subscriber([TOPIC], endpoint=endpoint, run_dir=run_dir, keys=mine) as subscriber:
-                assert subscriber.wait(TOPIC, 10) is not None and subscriber.refusal is None
+                assert subscriber.wait(TOPIC, 60) is not None and subscriber.refusal is None
             with ControlClient(control, run_dir=run_dir, keys=mine) as asker:
                 assert asker.request("ping") == "pong"
         said = json.loads((run_dir / "sags.json").read_text())
@@ -232,12 +230,11 @@ def test_others_are_refused_counted_and_told_why(
     with secured(tmp_path / "run", keys) as running, stream(running):
         if which == "data":
             with Subscriber([TOPIC], endpoint=running.connection.data[-1], keys=mine) as subscriber:
-                assert subscriber.wait(TOPIC, 1.5) is None
-                assert why in str(subscriber.problem(TOPIC))
+                until(lambda: why in str(subscriber.problem(TOPIC)))
+                assert subscriber.latest(TOPIC) is None
         else:
             with ControlClient(running.connection.control, keys=mine) as asker:
-                with pytest.raises(SagsError, match=why):
-                    asker.request("ping", timeout=1.5)
+                until(lambda: why in error_of(asker))
         until(lambda: running.connections[which]["refused"] >= 1)
         assert running.connections[which]["unlisted_key"] == (client == "stranger")
         other = {"data": "control", "control": "data"}[which]
@@ -245,11 +242,20 @@ def test_others_are_refused_counted_and_told_why(
         assert not running.wanted(TOPIC)
 
 
+def error_of(asker: ControlClient) -> str:
+    """Why it is not answered; empty: it is."""
+    try:
+        asker.request("ping")
+    except SagsError as error:
+        return str(error)
+    return ""
+
+
 @pytest.mark.fault(
     "keys: revoked, added and broken while it runs",
     sees="the revoked one gets nothing more, the others go on",
     says="`refusal` of the client",
-    back="an added key gets in within a second",
+    back="an added key gets in when the folder is looked at again",
 )
 def test_keys_are_revoked_and_added_while_the_node_runs(tmp_path: Path) -> None:
     keys, clients = tmp_path / "keys", tmp_path / "keys/clients"
@@ -261,22 +267,25 @@ def test_keys_are_revoked_and_added_while_the_node_runs(tmp_path: Path) -> None:
 
     with secured(tmp_path / "run", keys) as running, stream(running):
         with subscriber("clients/stays") as stays, subscriber("clients/goes") as goes:
-            assert stays.wait(TOPIC, 10) is not None and goes.wait(TOPIC, 10) is not None
+            assert stays.wait(TOPIC, 60) is not None and goes.wait(TOPIC, 60) is not None
             (clients / "broken.pub").write_text("no key")  # lets nobody in, and keeps nobody out
             (clients / "goes.pub").unlink()
-            until(lambda: goes.refusal, seconds=10)
+            until(lambda: goes.refusal)
             before = goes.latest(TOPIC)
-            assert stays.wait(TOPIC, 10) is not None
-            until(lambda: stays.problem(TOPIC) is None, seconds=10)
+            assert stays.wait(TOPIC, 60) is not None
+            until(lambda: stays.problem(TOPIC) is None)
             assert goes.latest(TOPIC) is before
             with subscriber("comes") as early:
-                until(lambda: early.refusal, seconds=10)
+                until(lambda: early.refusal)
             (keys / "comes.pub").rename(clients / "comes.pub")
-            time.sleep(LOOK_AGAIN)
             mine = ClientKeys(read_key_pair(keys / "comes.key"), read_public_key(keys / "node.pub"))
-            with ControlClient(running.connection.control, keys=mine) as asker:
-                assert asker.request("ping") == "pong"
-            assert stays.problem(TOPIC) is None
+
+            def gets_in() -> bool:
+                with ControlClient(running.connection.control, keys=mine) as asker:
+                    return not error_of(asker)
+
+            until(gets_in)
+            until(lambda: stays.problem(TOPIC) is None)
 
 
 def test_ipc_needs_no_key_and_belongs_to_its_user(tmp_path: Path, keys: Path) -> None:
@@ -377,7 +386,7 @@ def test_random_bytes_on_both_ports_while_a_client_receives(
 @pytest.mark.fault(
     "socket: half open, silent or HTTP",
     says="`connections`: refused",
-    back="within 10 s",
+    back="by itself",
     left="no descriptor",
 )
 @pytest.mark.parametrize(
@@ -396,7 +405,7 @@ def test_raw_connections_leave_no_descriptor(tmp_path: Path, said: bytes) -> Non
                     stranger.sendall(said)
         until(lambda: running.connections["data"]["refused"] == 100)
         until(lambda: running.connections["control"]["refused"] == 100)
-        until(lambda: descriptors() == before, seconds=10)
+        until(lambda: descriptors() == before)
 
 
 def test_a_peer_of_the_old_protocol_is_no_subscriber(tmp_path: Path) -> None:
@@ -455,8 +464,9 @@ def test_a_flood_is_cut_off(tmp_path: Path, which: str, kind: bytes, block: byte
             sent: list[int] = []
             attack = threading.Thread(target=lambda: sent.append(hostile.flood(endpoint, kind, block, 2.0)))
             attack.start()
+            until(lambda: running.connections[which]["flooding"])
             attack.join()
-            assert running.connections[which]["flooding"] >= 1 and sent[0] > len(block)
+            assert sent[0] > len(block)
             assert _resident_mb() - before < 100
             assert subscriber.wait(TOPIC, 30, after=subscriber.latest(TOPIC)) is not None
             assert subscriber.lost(TOPIC) == 0

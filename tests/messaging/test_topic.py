@@ -11,18 +11,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from made_messages import MS, meta
 from synthetic import HEIGHT, WIDTH, health, publisher, stream
 
 from sags_node.cli.main import main
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import cdr, topics
+from sags_node.messaging.wire import Message
 from sags_node.overlay.draw import color_key
 from sags_node.overlay.stream import OverlayStream
 from sags_node.topic import topic_bw, topic_delay, topic_echo, topic_hz, topic_list
 
 pytestmark = pytest.mark.live
 
-RATE = 40.0
 KEY = (0, 0, 255)
 
 
@@ -30,32 +31,54 @@ KEY = (0, 0, 255)
 def endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     with publisher(tmp_path_factory.mktemp("topic") / "run") as running:
         running.publish_parameters({"seed": 1})
-        with stream(running, rate=RATE):
+        with stream(running, rate=40.0):
             yield running.connection.data[-1]
+
+
+def test_figures_are_those_of_the_arrivals(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Four messages that come 10, 20 and 70 ms one after the other, and 5 ms after their capture."""
+    came = np.cumsum([1000, 10, 20, 70])  # ms
+    sizes = [500, 100, 200, 300]
+    heard = [
+        (Message("sags/left/depth", meta(seq, at - 5.0), (bytes(size),)), int(at * MS))
+        for seq, (at, size) in enumerate(zip(came, sizes, strict=True))
+    ]
+    monkeypatch.setattr("sags_node.topic.listen", lambda *_, **__: iter([*heard, None]))
+    hz = topic_hz("left/depth", "tcp://127.0.0.1:9")
+    assert (hz["window"], hz["freezes"]) == (4, 0)
+    steps = [0.01, 0.02, 0.07]
+    expected = {"average_rate": 30.0, "min_s": 0.01, "max_s": 0.07, "std_dev_s": np.std(steps)}
+    assert {key: hz[key] for key in expected} == pytest.approx(expected)
+    bw = topic_bw("left/depth", "tcp://127.0.0.1:9")  # the first one only starts the clock
+    assert (bw["bytes_per_s"], bw["mean_bytes"]) == (pytest.approx(600 / 0.1), 275)
+    delay = topic_delay("left/depth", "tcp://127.0.0.1:9")
+    for key in ("min_s", "average_delay_s", "max_s"):
+        assert delay[key] == pytest.approx(5e-3)
+    (row,) = (row for row in topic_list("tcp://127.0.0.1:9") if row["messages"])
+    assert (row["topic"], row["rate_hz"], row["mean_bytes"]) == ("sags/left/depth", 30.0, 275)
 
 
 def test_hz(endpoint: str) -> None:
     figures = topic_hz("left/depth", endpoint, seconds=1.0)
-    assert RATE / 3 < figures["average_rate"] < RATE * 1.2
     assert figures["min_s"] <= 1 / figures["average_rate"] <= figures["max_s"]
-    assert figures["window"] >= figures["average_rate"] * 0.5
+    assert figures["window"] >= 2
 
 
 def test_bw(endpoint: str) -> None:
     figures = topic_bw("sags/left/depth", endpoint, seconds=1.0)  # the full name is understood too
     assert figures["mean_bytes"] == pytest.approx(4 * WIDTH * HEIGHT, rel=0.01)
-    assert figures["bytes_per_s"] > 10 * figures["mean_bytes"]
+    assert figures["bytes_per_s"] > 0
 
 
 def test_delay(endpoint: str) -> None:
     figures = topic_delay("tf", endpoint, seconds=1.0)
-    assert 0 < figures["min_s"] <= figures["average_delay_s"] <= figures["max_s"] < 1
+    assert 0 < figures["min_s"] <= figures["average_delay_s"] <= figures["max_s"]
 
 
 def test_list(endpoint: str) -> None:
     rows = {row["topic"]: row for row in topic_list(endpoint, seconds=1.0)}
     assert set(rows) == {f"sags/{name}" for name in topics.BY_NAME}
-    assert rows["sags/left/depth"]["rate_hz"] > 5
+    assert rows["sags/left/depth"]["rate_hz"] > 0
     assert rows["sags/left/depth"]["type"] == "sensor_msgs/msg/Image"
     assert rows["sags/parameters"]["messages"] == 1  # the last value, sent again
     assert rows["sags/right/camera_info"]["messages"] > 0  # who listens to everything asks for it too
@@ -89,18 +112,16 @@ def overlay(tmp_path_factory: pytest.TempPathFactory) -> Iterator[OverlayStream]
 
 def test_an_overlay_is_listed_and_measured(overlay: OverlayStream) -> None:
     endpoint = overlay.endpoints[-1]
-    rows = {row["topic"]: row for row in topic_list(endpoint, ns="overlay", seconds=1.2)}
+    rows = {row["topic"]: row for row in topic_list(endpoint, ns="overlay", seconds=2.0)}
     assert set(rows) == {f"overlay/{topic.name}" for topic in topics.OVERLAY_TOPICS}
-    assert 5 < rows["overlay/left/overlay/image"]["rate_hz"] < 15
+    assert rows["overlay/left/overlay/image"]["rate_hz"] > 0
     assert rows["overlay/left/overlay/image"]["mean_bytes"] > 4 * WIDTH * HEIGHT
     assert rows["overlay/status"]["messages"] >= 1
     assert rows["overlay/right/overlay/color_key"]["type"] == topics.IMAGE
-    figures = topic_hz("left/overlay/color_key", endpoint, ns="overlay", seconds=1.0)
-    assert 5 < figures["average_rate"] < 15
-    assert (
-        topic_bw("left/overlay/image", endpoint, ns="overlay", seconds=1.0)["mean_bytes"] > 4 * WIDTH * HEIGHT
-    )
-    (said,) = topic_echo("status", endpoint, ns="overlay", count=1, seconds=5)
+    assert topic_hz("left/overlay/color_key", endpoint, ns="overlay", seconds=2.0)["window"] >= 2
+    bw = topic_bw("left/overlay/image", endpoint, ns="overlay", seconds=2.0)
+    assert bw["mean_bytes"] > 4 * WIDTH * HEIGHT
+    (said,) = topic_echo("status", endpoint, ns="overlay", count=1, seconds=60)
     assert said["content"]["state"] == "running"
 
 
@@ -110,7 +131,7 @@ def test_an_overlay_is_found_by_its_namespace_alone(
     """As people type it: `sags topic list --ns overlay`."""
     run_dir = Path(overlay.endpoints[0].removeprefix("ipc://")).parent
     monkeypatch.setattr("sags_node.messaging.rundir.default_run_dir", lambda: run_dir)
-    result = CliRunner().invoke(main, ["topic", "list", "--ns", "overlay", "--seconds", "1", "--json"])
+    result = CliRunner().invoke(main, ["topic", "list", "--ns", "overlay", "--seconds", "2", "--json"])
     assert result.exit_code == 0, result.output
     heard = {row["topic"] for row in json.loads(result.stdout) if row["messages"]}
     assert heard >= {"overlay/left/overlay/image", "overlay/right/overlay/image", "overlay/status"}
@@ -130,17 +151,17 @@ def test_what_a_node_sends_beside_its_fixed_topics_is_listed(tmp_path: Path) -> 
         thread = threading.Thread(target=serve)
         thread.start()
         try:
-            rows = {row["topic"]: row for row in topic_list(endpoint, seconds=0.8)}
+            rows = {row["topic"]: row for row in topic_list(endpoint, seconds=1.5)}
         finally:
             stop.set()
             thread.join()
     assert set(rows) == {f"sags/{name}" for name in (*topics.BY_NAME, "clock")}
-    assert rows["sags/clock"]["rate_hz"] > 3 and rows["sags/clock"]["type"] == topics.CLOCK
+    assert rows["sags/clock"]["rate_hz"] > 0 and rows["sags/clock"]["type"] == topics.CLOCK
 
 
 @pytest.mark.parametrize("name", topics.BY_NAME)
 def test_echo(endpoint: str, name: str) -> None:
-    (record,) = topic_echo(name, endpoint, count=1, seconds=10)
+    (record,) = topic_echo(name, endpoint, count=1, seconds=60)
     assert json.loads(json.dumps(record))["topic"] == f"sags/{name}"
     assert record["type"] == topics.BY_NAME[name].type and record["content"]
     if name == "left/depth":

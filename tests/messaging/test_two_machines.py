@@ -32,11 +32,11 @@ import json, time
 from sags_node.client import NodeClock, Subscriber
 data, control, name = "tcp://{ADDRESS}:5556", "tcp://{ADDRESS}:5557", "left/render/depth"
 with NodeClock(control) as clock, Subscriber([name], data, clock=clock) as subscriber:
-    end = time.monotonic() + 30
+    end = time.monotonic() + 60
     while not (clock.offset and clock.offset.bound < 1e-3 and subscriber.ok(name)) and time.monotonic() < end:
         time.sleep(0.01)
     newest = subscriber.latest(name)
-    ages = newest.age(subscriber.now_ns()), newest.age()
+    ages = newest.age(), newest.age(subscriber.now_ns()), newest.age()
     print(json.dumps({{**clock.status(), "problem": subscriber.problem(name), "ages": ages}}))
 """
 
@@ -82,14 +82,15 @@ def test_ages_are_right_between_machines_whose_clocks_differ(machines: None, tmp
     try:
         assert node.stdout is not None and node.stdout.readline() == b"ready\n"
         began = time.monotonic()
-        asked = subprocess.run(on_client, env=environment, timeout=60, capture_output=True, check=True)
+        asked = subprocess.run(on_client, env=environment, timeout=120, capture_output=True, check=True)
         took = time.monotonic() - began
     finally:
-        node.communicate(timeout=10)
+        node.communicate(timeout=60)
     said = json.loads(asked.stdout)
     bound = said["bound_ms"]
     assert said["problem"] is None and bound < 1
     assert abs(said["offset_ms"] - 1e3 * AHEAD) <= bound
-    by_node, by_own = said["ages"]
+    own_before, by_node, own_after = said["ages"]  # asked for one after the other
     assert 0 <= by_node < took
-    assert by_node - by_own == pytest.approx(AHEAD, abs=2e-3 * bound + 1e-3)  # asked for one after the other
+    off = 2e-3 * bound
+    assert own_before + AHEAD - off <= by_node <= own_after + AHEAD + off

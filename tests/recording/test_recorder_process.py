@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import os
 import signal
-import time
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
 import pytest
 from synthetic import publisher, stream
+from waiting import until
 
 from sags_node.errors import SagsError
+from sags_node.messaging.subscriber import Subscriber
 from sags_node.processes import children
 from sags_node.recording import child
 from sags_node.recording.child import RecorderProcess
@@ -46,7 +47,9 @@ def test_a_snapshot_of_an_ordinary_recording_is_refused_and_the_recording_goes_o
     recorder.start({"path": str(tmp_path / "bag")}).result(ANSWER)
     with pytest.raises(SagsError, match="start_recording with snapshot_seconds"):
         recorder.snapshot().result(ANSWER)
-    time.sleep(0.5)
+    with Subscriber(["tf"], run_dir=tmp_path / "run") as beside:
+        first = beside.wait("tf", ANSWER)
+        until(lambda: (newest := beside.latest("tf")) and first and newest.meta.seq > first.meta.seq + 15)
     summary = recorder.stop().result(ANSWER)
     assert summary["messages"] == bag_info(tmp_path / "bag")["messages"] > 0
 

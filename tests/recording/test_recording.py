@@ -39,7 +39,7 @@ def test_every_topic_is_recorded_as_it_was_published(tmp_path: Path) -> None:
     for messages in found.values():
         sequence = [message.sequence for message in messages]
         assert sequence == list(range(sequence[0], sequence[0] + len(messages)))
-        assert all(0 <= message.log_ns - message.publish_ns < 5e9 for message in messages)
+        assert all(0 <= message.log_ns - message.publish_ns < 60e9 for message in messages)
     stamp = cdr.decode(picture.data, picture.type).header.stamp
     assert stamp.sec * 10**9 + stamp.nanosec == picture.publish_ns  # the time of capture
     assert json.loads(cdr.decode(found["parameters"][0].data, "std_msgs/msg/String").data) == {"seed": 5}

@@ -35,13 +35,13 @@ def say(**fields):
 
 
 def heard(topic, kind, data):
-    came, stamp = time.time_ns(), 0
+    stamp = 0
     body = bytearray(data)
     if kind != HEADERLESS:
         stamp = int.from_bytes(body[4:8], "little") * 10**9 + int.from_bytes(body[8:12], "little")
         body[4:12] = bytes(8)
     few = {"data": data.hex()} if len(data) <= FEW else {}
-    say(topic=topic, stamp=stamp, came=came, size=len(data), crc=zlib.crc32(body), **few)
+    say(topic=topic, stamp=stamp, size=len(data), crc=zlib.crc32(body), **few)
 
 
 rclpy.init()

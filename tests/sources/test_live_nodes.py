@@ -9,6 +9,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from statistics import median
 from typing import Any, NamedTuple
 
 import cv2
@@ -34,12 +35,13 @@ pytestmark = pytest.mark.live
 
 DOMAIN = 60 + os.getpid() % 40  # away from nodes of this machine, and from tests of another checkout
 SMALL = ["vision.width:=320", "vision.height:=256", "mapping.max_gaussians:=2000"]
-SLOW_S, STALL_S = 0.2, 1.5
-PAUSES = [SLOW_S] * 8 + [STALL_S]  # of the first frames
+SLOW, STALL = 3, 40
+PAUSES = [SLOW] * 8 + [STALL]  # of the first frames: each lasts until so many others were left out
 CAMERA = f"{BALL} ! video/x-raw,format=RGB,width=1280,height=1024,framerate=30/1"
 
 
 class Shown(NamedTuple):
+    number: int
     stamp_ns: int
     sent_ns: int
     moment: float  # of the sender's second, as the picture itself shows it
@@ -84,7 +86,8 @@ def running(
     pauses, process = iter(PAUSES), Pipeline.process
 
     def slowly(pipeline: Pipeline, *arguments: Any) -> FrameResult:
-        time.sleep(next(pauses, 0.0))
+        due = node._frames.dropped + next(pauses, 0)
+        until(lambda: node._frames.dropped >= due)
         return process(pipeline, *arguments)
 
     monkeypatch.setattr(Pipeline, "process", slowly)
@@ -93,7 +96,8 @@ def running(
     def note(result: FrameResult, latency_ms: float) -> None:
         pair = result.pair
         assert pair.right is not None
-        shown.append(Shown(pair.t_capture_ns, time.time_ns(), moment(pair.left), moment(pair.right)))
+        moments = moment(pair.left), moment(pair.right)
+        shown.append(Shown(pair.frame_id, pair.t_capture_ns, time.time_ns(), *moments))
 
     def sender() -> AbstractContextManager[object]:
         if way == "gst":
@@ -111,9 +115,9 @@ def running(
 
 @pytest.mark.fault(
     "process: what sends pictures is killed, the mapping is slow and stalls",
-    sees="each frame's own stamp, rising; nothing older than 1 s after the stall",
+    sees="each frame's own stamp, rising; nothing of what came during the stall",
     says="counts of dropped frames",
-    back="5 s",
+    back="by itself",
 )
 @pytest.mark.parametrize("way", ["gst", "push", "ros2"])
 def test_a_stalled_mapper_shows_nothing_old_and_a_killed_source_comes_again(
@@ -132,19 +136,15 @@ def test_a_stalled_mapper_shows_nothing_old_and_a_killed_source_comes_again(
                 kill_pipelines()
         killed = time.time_ns()
         with sender():
-            until(lambda: shown[-1].stamp_ns > killed, seconds=5)
+            until(lambda: shown[-1].stamp_ns > killed)
         dropped = sum(node.health().dropped.values())
-    slow, stalled, after = (
-        until_killed[2 : len(PAUSES) - 1],  # without the first frames, which load kernels
-        until_killed[len(PAUSES) - 1],
-        until_killed[len(PAUSES) :],
-    )
-    # Of a mapper that is too slow the lag does not grow: it would by 0.17 s with each frame, and by 1.5 s at
-    # once. A frame may wait for the one before it (0.2 s); the rest is for a busy machine.
-    assert max(one.age_s for one in slow) < 2 * SLOW_S + 0.6
-    assert stalled.age_s > STALL_S  # an old picture keeps its old stamp
-    assert max(one.age_s for one in after) < 1.0
-    assert all(lie_s(one, until_killed[0]) < 0.25 for one in until_killed)
+    # What came meanwhile is left out; an old picture keeps its old stamp.
+    for pause, (one, other) in zip(PAUSES, pairwise(until_killed), strict=False):
+        assert other.number - one.number > pause
+    stalled = until_killed[len(PAUSES) - 1]
+    assert stalled.age_s > STALL / 30 / 2
+    # A stamp is when a picture came: of single ones a busy machine makes anything.
+    assert median(lie_s(one, until_killed[0]) for one in until_killed) < 0.25
     assert all(one.moment == one.right_moment for one in shown)
     assert all(one.stamp_ns < other.stamp_ns for one, other in pairwise(shown))
-    assert dropped > 30 * STALL_S  # they were left out, and that is said
+    assert dropped >= sum(PAUSES)  # and that is said

@@ -44,9 +44,9 @@ def config(suffix: str = "") -> Ros2Source:
 def test_no_pair_is_mismatched_and_nothing_is_lost_unseen(phantom_session: Path, suffix: str) -> None:
     settings = ("jpeg=1", "rate=15") if suffix else ()
     source = RosCameras(config(suffix), SIZE)
-    with Taker(source) as taker, sending(dds(phantom_session, 8, *settings)):
+    with Taker(source) as taker, sending(dds(phantom_session, 60, *settings)):
         due = 60
-        until(lambda: len(taker.numbers) >= due, seconds=30)
+        until(lambda: len(taker.numbers) >= due)
     assert taker.mismatched == 0
     numbers = [left for left, _ in taker.numbers]
     assert numbers == sorted(set(numbers))
@@ -57,7 +57,7 @@ def test_the_cameras_calibration_is_taken(phantom_session: Path) -> None:
     from sags_node.calibration import load_rig, resized_rig
 
     with sending(dds(phantom_session, 30, "size=640x512")):
-        rig = read_rig(config(), seconds=20)
+        rig = read_rig(config(), seconds=60)
     want = resized_rig(load_rig(phantom_session / "calib"), 2)
     assert rig is not None and (rig.left.width, rig.left.height) == (640, 512)
     assert rig.baseline == pytest.approx(want.baseline)
@@ -97,7 +97,7 @@ def test_wrong_encodings_stamps_and_types_are_said(
         caplog.clear()
         said = config().model_copy(update={"left": wanted[0], "right": wanted[1]})
         with Taker(RosCameras(said, SIZE)) as taker:
-            until(lambda: send() or len(caplog.messages) >= 2, seconds=10)
+            until(lambda: send() or len(caplog.messages) >= 2)
         assert taker.numbers == []
         return caplog.messages
 
@@ -112,8 +112,8 @@ def test_wrong_encodings_stamps_and_types_are_said(
         assert any(
             "/wrong/encoding: left out: a picture encoded as '32FC1' is not read" in one for one in both
         )
-        # A day, and what the way took: less than the 10 s that are waited.
-        old = re.compile(r"/wrong/stamp: left out: a picture's stamp is 8640\d\.\d s old")
+        # A day, and what the way took: less than the minute that is waited.
+        old = re.compile(r"/wrong/stamp: left out: a picture's stamp is 864[0-5]\d\.\d s old")
         assert any(old.search(one) for one in both)
         silent = lines("/wrong/kind", "/wrong/kind")
         assert "/wrong/kind is tf2_msgs/msg/TFMessage, not a picture topic; set source.left" in silent
@@ -135,7 +135,7 @@ def test_one_topic_may_show_both_eyes() -> None:
 
     said = Ros2Source(domain=DOMAIN, left=name, geometry=geometry)
     with Taker(RosCameras(said, (160, 120))) as taker:
-        until(sent_and_come, seconds=10)
+        until(sent_and_come)
     assert set(taker.numbers) == {(7, 7)}
 
 
@@ -156,10 +156,10 @@ def rclpy_camera() -> list[object]:
 def test_a_real_ros_node_is_heard(rclpy_camera: list[object]) -> None:
     """Two 1280x1024 pictures at 30 Hz from rclpy and Fast DDS."""
     with sending([*rclpy_camera, 30, 30, *SIZE], ROS_DOMAIN_ID=str(DOMAIN)):
-        rig = read_rig(config(), seconds=20)
+        rig = read_rig(config(), seconds=60)
         source = RosCameras(config(), SIZE)
         with Taker(source) as taker:
-            until(lambda: len(taker.numbers) >= 60, seconds=20)
+            until(lambda: len(taker.numbers) >= 60)
     assert rig is not None and rig.baseline == pytest.approx(0.004)
     assert taker.mismatched == 0
 
@@ -170,10 +170,10 @@ def test_the_pose_of_a_real_ros_node_is_heard(rclpy_camera: list[object]) -> Non
     source = RosCameras(config(), SIZE)
     try:
         with sending([*rclpy_camera, 30, 30, *SIZE], ROS_DOMAIN_ID=str(DOMAIN)), Taker(source) as taker:
-            until(lambda: len(taker.numbers) >= 30, seconds=20)
+            until(lambda: len(taker.numbers) >= 30)
             assert taker.newest is not None
             number, stamp = taker.numbers[-1][0], taker.newest.t_device_ns
-            place = robot.track.at(stamp, timeout=1.0)[0, 3]
+            place = robot.track.at(stamp, timeout=60.0)[0, 3]
     finally:
         robot.close()
     assert place == pytest.approx(0.001 * number, abs=0.0011)  # a frame may come between the two lines
@@ -183,7 +183,7 @@ def test_tf_of_a_graph_is_followed(phantom_session: Path) -> None:
     robot = open_robot(LaunchConfig(robot=Ros2Robot(domain=DOMAIN, base="world", hand="left_optical_frame")))
     try:
         with sending(dds(phantom_session, 60, "size=64x48")):
-            until(lambda: robot.track.newest_ns > 0, seconds=20)
+            until(lambda: robot.track.newest_ns > 0)
             stamp = robot.track.newest_ns
             assert robot.track.at(stamp)[:3, 3] == pytest.approx([0.1, 0.2, 0.3])
     finally:
