@@ -21,8 +21,8 @@ def measure_gsplat(case: RasterCase, runs: int, clock: Clock, device: torch.devi
 
     Returns:
         `forward_ms` and `forward_backward_ms` of gsplat's own call, with its own layout and without what only
-        we ask for; `same_outputs_...` of the backend, which gives all that ours gives: planes, gradients of
-        the poses, contribution. `planes_apart`, `gradients_apart`: from ours, relative, the largest.
+        we ask for; `same_outputs_...` of the backend, which gives all that ours gives: planes, gradients,
+        contribution. `planes_apart`, `gradients_apart`: from ours, relative, the largest.
     """
     rasterizer = GsplatRasterizer(case.width, case.height, True, device)
     same = DeviceDrawing(case, rasterizer)

@@ -2,8 +2,8 @@
 
 A ratio of two times on one machine in one run says how good machine code is; the times themselves say more
 about the machine. The program is one file, not part of this project. It is compiled for this processor, and
-exports what `_Program` calls: project, sort, bin, blend, and the same backwards. It gives neither
-contributions nor gradients of the pose, which ours does, and its screen filter is 0.3 px^2.
+exports what `_Program` calls: project, sort, bin, blend, and the same backwards. It gives no
+contributions, which ours does, and its screen filter is 0.3 px^2.
 """
 
 from __future__ import annotations

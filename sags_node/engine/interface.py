@@ -55,8 +55,6 @@ class Gradients:
     opacities: F32  # [N] before the filters
     colors: F32  # [N, 3]
     sh_rest: F32  # [N, K - 1, 3]; [N, 0, 3] without spherical harmonics
-    poses: F64  # [C, 6] per m and per rad: of a small motion (translation, rotation vector) of each camera's
-    # view, viewmat' = exp(twist) viewmat
     contribution: F32  # [N] sum over pixels of (blending weight of this Gaussian) * (weight of the pixel)
 
 

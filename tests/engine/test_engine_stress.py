@@ -11,13 +11,11 @@ from engine_scenes import (
     DERIVATIVES,
     EXPONENTIAL,
     INPUTS,
-    PER_GAUSSIAN,
     camera,
     cotangents,
     draw_and_differentiate,
     one_gaussian,
     random_gaussians,
-    relative_error,
     rows,
     truth,
     with_filter,
@@ -69,7 +67,7 @@ def test_a_larger_world_further_away_looks_the_same(factor: float) -> None:
     rasterizer = make_rasterizer("numba", VIEW.width, VIEW.height)
     rasterizer.forward(gaussians, [VIEW])
     gradients = rasterizer.backward(v_planes, weight)
-    lengths = {"means": factor, "scales": factor, "poses": np.array([[factor] * 3 + [1.0] * 3])}
+    lengths = {"means": factor, "scales": factor}
     for name in DERIVATIVES:
         true.check_gradient(name, getattr(gradients, name).astype(np.float64) * lengths.get(name, 1.0))
 
@@ -129,7 +127,7 @@ def test_quaternions_without_a_direction_are_not_drawn(length: float) -> None:
     planes, found = draw_and_differentiate(changed(FULL, "quats", 13, length), [VIEW])
     expected, _ = draw_and_differentiate(rows(FULL, np.arange(30) != 13), [VIEW])
     np.testing.assert_array_equal(planes, expected)
-    assert not any(found[name][13].any() for name in PER_GAUSSIAN)
+    assert not any(found[name][13].any() for name in DERIVATIVES)
 
 
 @pytest.mark.parametrize("height", [1.0 + 1e-6, 1.01, 2.0])  # in near planes
@@ -197,7 +195,6 @@ def test_nothing_to_draw(backend: str) -> None:
         planes, found = draw_and_differentiate(gaussians, [VIEW, VIEW.moved_right(0.004)], backend)
         assert planes.shape == (2, 5, 40, 48)
         assert not planes.any()
-        assert found["poses"].shape == (2, 6)
         assert found["sh_rest"].shape == (len(gaussians), 8, 3)
         assert not any(found[name].any() for name in DERIVATIVES)
 
@@ -227,21 +224,19 @@ def test_a_spoilt_value_costs_one_gaussian_and_no_other(name: str, value: float)
         others[:] = True
     elif name == "opacities" and value < 0:
         expected, true = draw_and_differentiate(changed(FULL, name, 13, 0.0), [VIEW])
-        true = {key: value[others] if key in PER_GAUSSIAN else value for key, value in true.items()}
+        true = {key: value[others] for key, value in true.items()}
     else:
         expected, true = draw_and_differentiate(rows(FULL, others), [VIEW])
     np.testing.assert_array_equal(planes, expected)
-    for key in PER_GAUSSIAN:
+    for key in DERIVATIVES:
         np.testing.assert_array_equal(found[key][others], true[key], err_msg=key)
         assert not found[key][~others].any(), key
-    # the sum of 30 Gaussians in blocks, one of which is now made up of others
-    assert relative_error(found["poses"], true["poses"]) < after(30)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 @pytest.mark.parametrize("what", ["v_planes", "weight"])
 def test_a_spoilt_cotangent_stays_in_its_tile(what: str, value: float) -> None:
-    """Gaussians that do not reach the pixel's tile keep their gradients bit by bit; the pose stays finite."""
+    """Gaussians that do not reach the pixel's tile keep their gradients bit by bit."""
     view = camera(width=160, height=128, focal=200.0)
     gaussians = with_filter(with_view_dependence(random_gaussians(8, 200, view), 1))
     rasterizer = make_rasterizer("numba", view.width, view.height)
@@ -255,10 +250,9 @@ def test_a_spoilt_cotangent_stays_in_its_tile(what: str, value: float) -> None:
     reach = 4 * gaussians.scales.max(1) / gaussians.means[:, 2] * 206 + 2
     away = np.abs(pixels - [40, 70]).max(1) > reach + 32
     assert 20 < away.sum() < 190
-    for name in PER_GAUSSIAN:
+    for name in DERIVATIVES:
         np.testing.assert_array_equal(getattr(found, name)[away], clean[name][away], err_msg=name)
     assert not np.isfinite(found.contribution if what == "weight" else found.means).all()
-    assert np.isfinite(found.poses).all()
 
 
 def test_opacity_is_held_below_one() -> None:

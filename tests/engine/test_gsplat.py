@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 import torch
 from engine_scenes import (
+    DERIVATIVES,
     EXPONENTIAL,
-    PER_GAUSSIAN,
     camera,
     cotangents,
     draw_and_differentiate,
@@ -125,7 +125,7 @@ def test_what_cannot_be_drawn_is_left_out_and_harms_nobody() -> None:
     planes, found = draw_and_differentiate(gaussians, [view], "gsplat")
     expected, true = draw_and_differentiate(sound, [view], "gsplat")
     np.testing.assert_array_equal(planes, expected)
-    for name in PER_GAUSSIAN:
+    for name in DERIVATIVES:
         assert not found[name][:10].any(), name
         assert relative_error(found[name][10:], true[name]) < after(SUMMED), name
     assert_agrees(sound, [view])
@@ -133,8 +133,8 @@ def test_what_cannot_be_drawn_is_left_out_and_harms_nobody() -> None:
 
 def test_no_gaussians() -> None:
     planes, found = draw_and_differentiate(rows(random_gaussians(0, 3, VIEW), slice(0)), EYES, "gsplat")
-    assert not planes.any() and not found["poses"].any()
-    assert [len(found[name]) for name in PER_GAUSSIAN] == [0] * len(PER_GAUSSIAN)
+    assert not planes.any()
+    assert not any(len(found[name]) for name in DERIVATIVES)
 
 
 # ---- where they differ: what docs/gpu.md says of it --------------------------------------------------------
@@ -167,7 +167,7 @@ def test_where_hardly_anything_shines_through_any_more() -> None:
     assert true_planes[0, 4].min() > 0.9999
     apart = (true_planes - planes)[0, 4]
     assert -EXPONENTIAL < apart.min() and 1e-3 < apart.max() < 1e-4 / (1 - opacity)
-    for name in PER_GAUSSIAN[:5]:
+    for name in DERIVATIVES[:5]:
         assert 1e-4 < relative_error(found[name], true[name]) < 2e-2, name
 
 
@@ -189,7 +189,7 @@ def test_tiles_that_are_not_asked_for_stay_and_count_for_nothing() -> None:
     planes = part.forward(gaussians, EYES, tiles)
     np.testing.assert_array_equal(planes, np.where(drawn[:, None], everything, old))
     found = part.backward(v_planes, weight)
-    for name in ("means", "quats", "scales", "opacities", "colors", "poses", "contribution"):
+    for name in ("means", "quats", "scales", "opacities", "colors", "contribution"):
         assert relative_error(getattr(found, name), getattr(expected, name)) < after(SUMMED), name
     assert 2 < int((found.contribution == 0).sum()) < 23
 
@@ -201,7 +201,7 @@ def test_geometry_can_be_left_out_and_asked_for_later() -> None:
     part, whole = drawing.backward(v_planes, weight, geometry=False), drawing.backward(v_planes, weight)
     assert relative_error(part.colors, whole.colors) < after(SUMMED)
     assert relative_error(part.contribution, whole.contribution) < after(SUMMED)
-    for name in ("means", "quats", "scales", "opacities", "sh_rest", "poses"):
+    for name in ("means", "quats", "scales", "opacities", "sh_rest"):
         assert len(getattr(part, name)) == 0 and getattr(whole, name).any(), name
 
 

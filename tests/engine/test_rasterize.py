@@ -34,7 +34,7 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.types import F32, Camera, Gaussians
 from sags_node.warm_up import warm_up
 
-GRADIENTS = (*INPUTS, "poses", "contribution")
+GRADIENTS = (*INPUTS, "contribution")
 
 
 def draw(
@@ -229,7 +229,7 @@ def test_geometry_can_be_left_out() -> None:
     part = rasterizer.backward(*cotangents([view], 0), geometry=False)
     np.testing.assert_array_equal(part.colors, whole["colors"])
     np.testing.assert_array_equal(part.contribution, whole["contribution"])
-    for name in ("means", "quats", "scales", "opacities", "sh_rest", "poses"):
+    for name in ("means", "quats", "scales", "opacities", "sh_rest"):
         assert len(getattr(part, name)) == 0, name
 
 

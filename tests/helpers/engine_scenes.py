@@ -17,7 +17,6 @@ from sags_node.types import F32, F64, Camera, Gaussians
 
 INPUTS = ("means", "quats", "scales", "opacities", "colors")
 DERIVATIVES = tuple(field.name for field in dataclasses.fields(Gradients))
-PER_GAUSSIAN = tuple(name for name in DERIVATIVES if name != "poses")
 
 
 def camera(width: int = 48, height: int = 40, focal: float = 60.0, moved: bool = False) -> Camera:

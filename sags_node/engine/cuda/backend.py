@@ -81,7 +81,6 @@ class DeviceBackend:
             opacities=found.opacities.cpu().numpy(),
             colors=found.colors.cpu().numpy(),
             sh_rest=found.sh_rest.cpu().numpy(),
-            poses=found.poses.cpu().numpy(),
             contribution=found.contribution.cpu().numpy(),
         )
 

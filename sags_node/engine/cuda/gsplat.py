@@ -92,8 +92,7 @@ class GsplatRasterizer:
             self._sh_rest = _leaf(sh_rest, usable)
             # a feature of value 0 whose cotangent is the pixels' weight: its gradient is the contribution
             self._statistic = torch.zeros_like(self._opacities)[:, None].requires_grad_()
-            views, Ks = camera_matrices(pinholes, self.device)
-            self._views = views.requires_grad_()
+            self._views, Ks = camera_matrices(pinholes, self.device)
             scales, opacities = self._scales, self._opacities
             if gaussians.smoothing is not None:
                 smoothing = torch.where(usable, gaussians.smoothing, 0.0)
@@ -151,9 +150,7 @@ class GsplatRasterizer:
         n = len(self._means)
         leaves = [self._colors, self._statistic]
         if geometry:
-            leaves += [
-                self._means, self._quats, self._scales, self._opacities, self._sh_rest, self._views
-            ]  # fmt: skip
+            leaves += [self._means, self._quats, self._scales, self._opacities, self._sh_rest]
         v_planes = torch.where(self._shown, v_planes, 0.0)
         weight = torch.where(self._shown[:, 0], weight, 0.0)
         v_rendered = torch.cat([v_planes[:, :3], weight[:, None], v_planes[:, 3:4]], 1).permute(0, 2, 3, 1)
@@ -167,11 +164,10 @@ class GsplatRasterizer:
             )
         colors, statistic = found[:2]
         if not geometry:
-            none, no_poses = colors[:0], colors.new_empty((0, 6), dtype=torch.float64)
-            return DeviceGradients(none, none, none, none, colors, none, no_poses, statistic[:, 0])
-        means, quats, scales, opacities, sh_rest, views = found[2:]
-        poses = _twists(views.double(), self._views.detach().double())
-        return DeviceGradients(means, quats, scales, opacities, colors, sh_rest, poses, statistic[:, 0])
+            none = colors[:0]
+            return DeviceGradients(none, none, none, none, colors, none, statistic[:, 0])
+        means, quats, scales, opacities, sh_rest = found[2:]
+        return DeviceGradients(means, quats, scales, opacities, colors, sh_rest, statistic[:, 0])
 
     def median_depth(self) -> tuple[Tensor, Tensor]:
         """UsageError: gsplat has none."""
@@ -255,11 +251,3 @@ def _smoothed(scales: Tensor, opacities: Tensor, smoothing: Tensor) -> tuple[Ten
     filtered = torch.where(variance == 0, scales, filtered)
     kept = (scales / filtered).topk(2).values.prod(1)
     return filtered, opacities * kept
-
-
-def _twists(v_views: Tensor, views: Tensor) -> Tensor:
-    """Gradient [C, 6] of a small motion, views' = exp(twist) views, from that of the views [C, 4, 4]."""
-    v_motion = v_views @ views.transpose(1, 2)
-    turned = v_motion - v_motion.transpose(1, 2)
-    v_rotation = torch.stack([turned[:, 2, 1], turned[:, 0, 2], turned[:, 1, 0]], 1)
-    return torch.cat([v_motion[:, :3, 3], v_rotation], 1)

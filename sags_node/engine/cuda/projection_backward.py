@@ -1,12 +1,8 @@
-"""The derivative of the projection, of every parameter and of the cameras' poses:
-`engine.rasterizer.projection_backward` in vectors.
+"""The derivative of the projection by every parameter: `engine.rasterizer.projection_backward` in vectors.
 
 Quaternion: turning a Gaussian by a small vector d in its own axes moves a row a of J R_cam, seen there as
 U = R_q^T a, by U x d, so dL/dd = sum v_U x U. The unit quaternion q then moves by q (0, d) / 2, across q and
 half as far as d. So v_q = 2 q (0, dL/dd), divided by the length of the given quaternion.
-
-Pose: a twist (xi_t, xi_r) moves a point p of the camera by xi_t + xi_r x p and turns the camera's axes under
-the rows j of J, so dL/dxi_t = sum v_p and dL/dxi_r = sum p x v_p + sum v_j x j.
 """
 
 from __future__ import annotations
@@ -28,7 +24,6 @@ from sags_node.engine.cuda.layout import (
 )
 from sags_node.engine.cuda.projection import (
     MAX_OPACITY,
-    MAX_VALUE,
     MIP_VARIANCE,
     jacobian,
     kept_by_smoothing,
@@ -143,7 +138,6 @@ def project_backward(
     v_quats: tl.tensor,  # [N, 4]
     v_scales: tl.tensor,  # [N, 3]
     v_opacities: tl.tensor,  # [N]
-    v_twists: tl.tensor,  # [C, programs, 6] written: still to be summed over the programs
     count: tl.tensor,  # N
     camera_count: tl.tensor,  # C
     TERMS: tl.constexpr,
@@ -151,8 +145,7 @@ def project_backward(
     ANTIALIASED: tl.constexpr,
     BLOCK: tl.constexpr,
 ) -> None:
-    program = tl.program_id(0)
-    rows = program.to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    rows = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     inside = rows < count
     mean = load3(means + 3 * rows, inside)
     w, q, n, _ = load_turn(quats, rows, inside)
@@ -202,23 +195,10 @@ def project_backward(
         along_z = v_slope_x * slope[0] + v_slope_y * slope[1] + v_inverse_z * inverse_z
         v_point = (v_slope_x * inverse_z, v_slope_y * inverse_z, v_depth - along_z * inverse_z)
         v_mean = add(v_mean, select(drawn, times_transposed(rotation, v_point)))
-        shift = v_point
         if TERMS > 0:
             terms = sh_rest + rows * TERMS * 3
             by_direction = direction_backward(mean, v_color, terms, camera, inside, TERMS)
             v_mean = add(v_mean, select(drawn, by_direction))
-            shift = add(shift, times_matrix(rotation, by_direction))
-
-        turned = add(cross(point, v_point), add(cross(v_j_x, j_x), cross(v_j_y, j_y)))
-        sound = drawn & (size(shift) + size(turned) < MAX_VALUE)  # overflow must not spoil the pose
-        shift, turned = select(sound, shift), select(sound, turned)
-        at = v_twists + (index * tl.num_programs(0) + program) * 6
-        tl.store(at, tl.sum(shift[0], 0))
-        tl.store(at + 1, tl.sum(shift[1], 0))
-        tl.store(at + 2, tl.sum(shift[2], 0))
-        tl.store(at + 3, tl.sum(turned[0], 0))
-        tl.store(at + 4, tl.sum(turned[1], 0))
-        tl.store(at + 5, tl.sum(turned[2], 0))
 
     if SMOOTHED:
         variance = tl.load(smoothing + rows, mask=inside, other=0.0)
@@ -240,8 +220,7 @@ SIGNATURES = tuple(
             "means": "*fp32", "quats": "*fp32", "scales": "*fp32", "opacities": "*fp32",
             **({"sh_rest": "*fp32"} if terms else {}), **({"smoothing": "*fp32"} if smoothed else {}),
             "cameras": "*fp32", "v_splats": "*fp32", "v_means": "*fp32", "v_quats": "*fp32",
-            "v_scales": "*fp32", "v_opacities": "*fp32", "v_twists": "*fp32", "count": "i32",
-            "camera_count": "i32",
+            "v_scales": "*fp32", "v_opacities": "*fp32", "count": "i32", "camera_count": "i32",
         },
         {
             **({} if terms else {"sh_rest": None}), **({} if smoothed else {"smoothing": None}),

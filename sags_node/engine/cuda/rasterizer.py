@@ -136,8 +136,8 @@ class CudaRasterizer:
                 STEPS=colour_step is not None, BLOCK=pair_sums.BLOCK, num_warps=pair_sums.WARPS,
             )  # fmt: skip
             if not geometry:
-                none, no_poses = v_colors[:0], v_colors.new_empty((0, 6), dtype=torch.float64)
-                return DeviceGradients(none, none, none, none, v_colors, none, no_poses, contribution)
+                none = v_colors[:0]
+                return DeviceGradients(none, none, none, none, v_colors, none, contribution)
             return self._pull_back_geometry(v_splats, v_colors, contribution)
 
     def _pull_back_geometry(
@@ -148,10 +148,9 @@ class CudaRasterizer:
         programs = triton.cdiv(n, projection_backward.BLOCK)
         v_means, v_scales = torch.empty_like(gaussians.means), torch.empty_like(gaussians.scales)
         v_quats, v_opacities = torch.empty_like(gaussians.quats), torch.empty_like(gaussians.opacities)
-        v_twists = v_splats.new_empty((cameras, programs, 6))
         projection_backward.project_backward[(programs,)](
             gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh_rest,
-            gaussians.smoothing, self._cameras, v_splats, v_means, v_quats, v_scales, v_opacities, v_twists,
+            gaussians.smoothing, self._cameras, v_splats, v_means, v_quats, v_scales, v_opacities,
             n, cameras, TERMS=terms, SMOOTHED=gaussians.smoothing is not None, ANTIALIASED=self._antialias,
             BLOCK=projection_backward.BLOCK, num_warps=projection_backward.WARPS,
         )  # fmt: skip
@@ -161,10 +160,7 @@ class CudaRasterizer:
                 gaussians.means, self._cameras, v_splats, v_sh_rest, n, cameras,
                 TERMS=terms, BLOCK=harmonics.BLOCK,
             )  # fmt: skip
-        v_poses = v_twists.double().sum(1)
-        return DeviceGradients(
-            v_means, v_quats, v_scales, v_opacities, v_colors, v_sh_rest, v_poses, contribution
-        )
+        return DeviceGradients(v_means, v_quats, v_scales, v_opacities, v_colors, v_sh_rest, contribution)
 
     def median_depth(self) -> tuple[Tensor, Tensor]:
         """Depth [C, H, W] m and row of the Gaussian [C, H, W] int32 as `interface.Rasterizer.median` has

@@ -73,7 +73,6 @@ class DeviceGradients:
     opacities: Tensor  # [N]
     colors: Tensor  # [N, 3]
     sh_rest: Tensor  # [N, K - 1, 3]
-    poses: Tensor  # [C, 6] float64
     contribution: Tensor  # [N]
 
 

@@ -168,9 +168,9 @@ class NumbaRasterizer:
             weight.reshape(-1),
             self._v_pairs,
         )
-        v_colors, contribution, poses = self._v_colors[:n], self._contribution[:n], np.empty((cameras, 6))
+        v_colors, contribution = self._v_colors[:n], self._contribution[:n]
         for camera in range(cameras):
-            poses[camera] = self._projector.backward(
+            self._projector.backward(
                 camera,
                 self._slots[camera * n : (camera + 1) * n],
                 self._v_pairs,
@@ -189,11 +189,10 @@ class NumbaRasterizer:
                 opacities=nothing,
                 colors=v_colors,
                 sh_rest=nothing,
-                poses=np.zeros((0, 6)),
                 contribution=contribution,
             )
         means, quats, scales, opacities, sh_rest = self._projector.gradients()
-        return Gradients(means, quats, scales, opacities, v_colors, sh_rest, poses, contribution)
+        return Gradients(means, quats, scales, opacities, v_colors, sh_rest, contribution)
 
     def median(self) -> tuple[F32, I32]:
         cameras = self._cameras

@@ -14,7 +14,7 @@ from sags_node.engine.interface import DILATION_VARIANCE, MIP_VARIANCE, Pinhole
 from sags_node.engine.rasterizer import projection, projection_backward, smoothing, spherical_harmonics
 from sags_node.kernels.jit import aligned, read_only
 from sags_node.kernels.threads import thread_count
-from sags_node.types import F32, F64, Gaussians
+from sags_node.types import F32, Gaussians
 
 SPARE = 1.25  # what is asked for beyond the need when memory grows
 
@@ -39,8 +39,6 @@ class Projector:
         self._opacities, self._v_opacities = aligned((room,)), aligned((room,))
         self._v_quats = aligned((room, 4))
         self._v_sh_rest = aligned((room, self._terms, 3))
-        self._v_twists = aligned((-(-room // projection.BLOCK), 6), np.float64)
-        self._v_centres = aligned((-(-room // spherical_harmonics.BLOCK), 3), np.float64)
 
     def load(self, gaussians: Gaussians, pinholes: Sequence[Pinhole]) -> None:
         """Keeps the Gaussians, checked and contiguous, and the cameras until the next call; applies the 3D
@@ -92,9 +90,8 @@ class Projector:
         v_view_colors: F32,
         v_colors: F32,
         contribution: F32,
-    ) -> F64:
-        """Gradient of this camera's pose [6]. Those of the Gaussians are added to the cameras' before where
-        `accumulate` is set.
+    ) -> None:
+        """Gradients of this camera's picture, added to those of the cameras before where `accumulate` is set.
 
         Args:
             slots: [N] SLOTS of this camera.
@@ -105,7 +102,6 @@ class Projector:
             contribution: [N] written or added to.
         """
         n, gaussians = self._count, self._smoothed
-        v_twists = self._v_twists[: -(-n // projection.BLOCK)]
         projection_backward.project_backward(
             gaussians.means,
             gaussians.quats,
@@ -126,13 +122,8 @@ class Projector:
             self._v_quats[:n],
             self._v_scales[:n],
             self._v_opacities[:n],
-            v_twists,
         )
-        if not geometry:
-            return np.zeros(6)
-        v_pose: F64 = v_twists.sum(0)
-        if gaussians.sh_rest is not None:
-            v_centres = self._v_centres[: -(-n // spherical_harmonics.BLOCK)]
+        if geometry and gaussians.sh_rest is not None:
             spherical_harmonics.color_backward(
                 gaussians.means,
                 gaussians.sh_rest,
@@ -141,12 +132,7 @@ class Projector:
                 accumulate,
                 self._v_sh_rest[:n],
                 self._v_means[:n],
-                v_centres,
             )
-            v_pose[:3] -= self._pinholes[camera].R @ v_centres.sum(
-                0
-            )  # the twist moves the centre by -R^T translation
-        return v_pose
 
     def gradients(self) -> tuple[F32, F32, F32, F32, F32]:
         """Of means, quats, scales, opacities and sh_rest, after the last camera's `backward`; call once."""

@@ -15,9 +15,8 @@ from typing import Any
 import numba
 import numpy as np
 
-from sags_node.engine.rasterizer.projection import MAX_VALUE
 from sags_node.kernels.jit import inlined, kernel, parallel_kernel, square_root
-from sags_node.types import F32, F64
+from sags_node.types import F32
 
 f4 = np.float32
 BLOCK = 64  # Gaussians per piece of work
@@ -131,7 +130,6 @@ def _block_backward(
     accumulate: bool,
     v_sh_rest: F32,
     v_means: F32,
-    v_centre: F64,
 ) -> None:
     terms = sh_rest.shape[1]
     basis, v_basis = np.empty(MOST, f4), np.empty(MOST, f4)
@@ -157,16 +155,9 @@ def _block_backward(
                 v_sh_rest[i, k, 2] = blue * basis[k]
         v_x, v_y, v_z = _slope(v_basis, terms, x, y, z)
         radial = v_x * x + v_y * y + v_z * z  # only the part across the direction turns it
-        v_x = (v_x - radial * x) * inverse
-        v_y = (v_y - radial * y) * inverse
-        v_z = (v_z - radial * z) * inverse
-        v_means[i, 0] += v_x
-        v_means[i, 1] += v_y
-        v_means[i, 2] += v_z
-        if abs(v_x) + abs(v_y) + abs(v_z) < MAX_VALUE:  # one that overflowed must not spoil the pose
-            v_centre[0] -= v_x
-            v_centre[1] -= v_y
-            v_centre[2] -= v_z
+        v_means[i, 0] += (v_x - radial * x) * inverse
+        v_means[i, 1] += (v_y - radial * y) * inverse
+        v_means[i, 2] += (v_z - radial * z) * inverse
 
 
 @parallel_kernel
@@ -178,12 +169,10 @@ def color_backward(
     accumulate: bool,  # add to v_sh_rest instead of writing it: every camera after the first
     v_sh_rest: F32,  # [N, 3 or 8 or 15, 3]
     v_means: F32,  # [N, 3] added to
-    v_centres: F64,  # [ceil(N / BLOCK), 3] written: the camera's place, still to be summed over the blocks
 ) -> None:
     count = means.shape[0]
     for block in numba.prange((count + BLOCK - 1) // BLOCK):
         first = block * BLOCK
-        v_centres[block] = 0.0
         _block_backward(
             means,
             sh_rest,
@@ -194,5 +183,4 @@ def color_backward(
             accumulate,
             v_sh_rest,
             v_means,
-            v_centres[block],
         )

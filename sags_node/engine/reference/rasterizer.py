@@ -27,7 +27,6 @@ from sags_node.engine.rasterizer.compositing import TILE_HEIGHT, TILE_WIDTH
 from sags_node.types import F32, I32, Bool, Gaussians
 
 if TYPE_CHECKING:  # torch takes seconds to import; only who draws with this backend pays
-    import torch
     from torch import Tensor
 
 T = TypeVar("T", bound=np.generic)
@@ -52,11 +51,7 @@ class ReferenceRasterizer:
         if gaussians.smoothing is not None:
             smoothing = torch.tensor(gaussians.smoothing, dtype=torch.float64)
         self._inputs = [torch.tensor(array, dtype=torch.float64, requires_grad=True) for array in arrays]
-        self._twists = torch.zeros((len(pinholes), 6), dtype=torch.float64, requires_grad=True)
-        splats = [
-            project(pinhole, self._inputs, smoothing, twist, self._antialias)
-            for pinhole, twist in zip(pinholes, self._twists, strict=True)
-        ]
+        splats = [project(pinhole, self._inputs, smoothing, self._antialias) for pinhole in pinholes]
         width, height = pinholes[0].width, pinholes[0].height
         self._planes = torch.stack([blend(seen, width, height) for seen in splats])
         depths, rows = zip(*(median(seen, width, height) for seen in splats), strict=True)
@@ -77,10 +72,10 @@ class ReferenceRasterizer:
             self._planes[:, 0], self._inputs[4], red, retain_graph=True, materialize_grads=True
         )
         found = torch.autograd.grad(
-            self._planes, [*self._inputs, self._twists], cotangent, retain_graph=True, materialize_grads=True
+            self._planes, self._inputs, cotangent, retain_graph=True, materialize_grads=True
         )
         by_means, by_quats, by_scales, by_opacities, by_colors, by_sh_rest = (
-            gradient.numpy().astype(np.float32) for gradient in found[:6]
+            gradient.numpy().astype(np.float32) for gradient in found
         )
         kept = None if geometry else 0
         return Gradients(
@@ -90,7 +85,6 @@ class ReferenceRasterizer:
             by_opacities[:kept],
             by_colors,
             by_sh_rest[:kept],
-            poses=found[6].numpy()[:kept],
             contribution=by_red[:, 0].numpy().astype(np.float32),
         )
 
@@ -127,7 +121,6 @@ def project(
     pinhole: Pinhole,
     inputs: Sequence[Tensor],
     smoothing: Tensor | None = None,
-    twist: Tensor | None = None,
     antialias: bool = True,
 ) -> Splats:
     """EWA projection (Zwicker et al. 2001) with both filters of Mip-Splatting (Yu et al. 2024).
@@ -137,13 +130,12 @@ def project(
         inputs: means, quats, scales, opacities, colors and, where there are any, sh_rest; shapes as in
             `types.Gaussians`.
         smoothing: [N] as in `types.Gaussians`.
-        twist: [6] translation (m) and rotation vector that move the view, viewmat' = exp(twist) viewmat.
         antialias: False puts the dilation of 3D Gaussian Splatting in the place of the 2D filter.
     """
     import torch
 
     means, quats, scales, opacities, colors, *harmonics = inputs
-    R, t = _view(pinhole, means.dtype, twist)
+    R, t = torch.tensor(pinhole.R, dtype=means.dtype), torch.tensor(pinhole.t, dtype=means.dtype)
     if smoothing is not None:
         variance = torch.clamp(smoothing, min=0)[:, None]
         ratio = torch.where(variance == 0, 1, scales / torch.sqrt(scales.square() + variance))
@@ -178,20 +170,6 @@ def project(
     order = torch.argsort(z.detach(), stable=True)
     order = order[(opacity > MIN_ALPHA)[order]]
     return Splats(mean2d[order], covariance[order], opacity[order], features[order], rows[order])
-
-
-def _view(pinhole: Pinhole, dtype: torch.dtype, twist: Tensor | None) -> tuple[Tensor, Tensor]:
-    """World to camera: R [3, 3] and t [3]."""
-    import torch
-
-    R, t = torch.tensor(pinhole.R, dtype=dtype), torch.tensor(pinhole.t, dtype=dtype)
-    if twist is None:
-        return R, t
-    a, b, c, x, y, z = twist.unbind()
-    zero = torch.zeros_like(a)
-    generator = torch.stack([zero, -z, y, a, z, zero, -x, b, -y, x, zero, c, zero, zero, zero, zero])
-    motion = torch.linalg.matrix_exp(generator.reshape(4, 4))
-    return motion[:3, :3] @ R, motion[:3, :3] @ t + motion[:3, 3]
 
 
 def _view_dependent(offsets: Tensor, sh_rest: Tensor) -> Tensor:
