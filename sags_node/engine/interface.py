@@ -63,7 +63,7 @@ class Backend(Protocol):
 
     def forward(self, gaussians: Gaussians, pinholes: Sequence[Pinhole], tiles: Bool | None) -> F32: ...
 
-    def backward(self, v_planes: F32, weight: F32, geometry: bool) -> Gradients: ...
+    def backward(self, v_planes: F32, weight: F32) -> Gradients: ...
 
     def median(self) -> tuple[F32, I32]: ...
 
@@ -92,13 +92,12 @@ class Rasterizer(Protocol):
         """
         ...
 
-    def backward(self, v_planes: F32, weight: F32, geometry: bool = True) -> Gradients:
+    def backward(self, v_planes: F32, weight: F32) -> Gradients:
         """Gradients of sum(v_planes * planes) for the last `forward`, whose arrays must be unchanged.
 
         Args:
             v_planes: [C, 5, H, W] cotangent of the planes.
             weight: [C, H, W] pixel weights for `Gradients.contribution`.
-            geometry: False leaves out everything but colours and contribution: it comes back empty, [0, ...].
 
         Returns:
             Views into own memory, overwritten by the next `backward`.

@@ -29,7 +29,6 @@ from sags_node import geometry
 from sags_node.engine.interface import MAX_OPACITY, NEAR_PLANE, Pinhole
 from sags_node.engine.rasterizer.rasterize import TILE_HEIGHT, TILE_WIDTH, Rasterizer, make_rasterizer
 from sags_node.errors import SagsError, UsageError
-from sags_node.mapping.optimiser import COLOR_RANGE, COLOUR_DAMPING, COLOUR_RELAXATION, MIN_CONTRIBUTION
 from sags_node.types import Bool, Camera, Gaussians
 
 pytest.importorskip("triton", reason="Triton comes with torch's CUDA builds, or by `pip install triton`")
@@ -42,7 +41,7 @@ pytestmark = [
 from sags_node.engine import cuda  # noqa: E402  (needs triton)
 from sags_node.engine.cuda import layout, rasterizer  # noqa: E402  (needs triton)
 from sags_node.engine.cuda.backend import default_device  # noqa: E402
-from sags_node.engine.cuda.scene import ColourStep, DeviceGaussians  # noqa: E402
+from sags_node.engine.cuda.scene import DeviceGaussians  # noqa: E402
 
 VIEW = camera(width=35, height=21, focal=42.0)  # no whole number of tiles
 EYES = [camera(width=35, height=21, focal=42.0, moved=True)]
@@ -425,38 +424,6 @@ def drawn_on_device(gaussians: Gaussians) -> tuple[Any, DeviceGaussians, Any, An
     inside = inner(checked)
     v_planes, weight = (torch.tensor(array, device=inside.device) for array in cotangents([VIEW], 0))
     return inside, inside._gaussians, v_planes, weight
-
-
-def test_geometry_can_be_left_out() -> None:
-    inside, _, v_planes, weight = drawn_on_device(with_view_dependence(random_gaussians(2, 8, VIEW), 1))
-    whole, part = inside.pull_back(v_planes, weight), inside.pull_back(v_planes, weight, geometry=False)
-    assert torch.equal(part.colors, whole.colors) and torch.equal(part.contribution, whole.contribution)
-    for name in ("means", "quats", "scales", "opacities", "sh_rest"):
-        assert len(getattr(part, name)) == 0, name
-
-
-def test_colour_step_moves_colours_as_the_optimiser_does() -> None:
-    """In place and held in its range; rows that were hardly seen, or whose gradient is NaN, stay."""
-    gaussians = random_gaussians(2, 12, VIEW, spread=0.3)
-    gaussians.means[3] *= -1
-    inside, drawn, v_planes, weight = drawn_on_device(gaussians)
-    v_planes *= 3
-    weight[0, 5, 20] = np.nan
-    step = ColourStep(COLOUR_RELAXATION, COLOUR_DAMPING, MIN_CONTRIBUTION, *COLOR_RANGE)
-    before = drawn.colors.clone()
-    found = inside.pull_back(v_planes, weight, geometry=False, colour_step=step)
-    contribution = found.contribution.cpu().numpy()
-    moves = contribution > MIN_CONTRIBUTION
-    assert 4 < moves.sum() < 11 and np.isnan(contribution).any()
-    free = before.cpu().numpy() - (COLOUR_RELAXATION / (contribution + COLOUR_DAMPING))[:, None] * (
-        found.colors.cpu().numpy()
-    )
-    low, high = COLOR_RANGE
-    assert (free[moves] < low).any() and (free[moves] > high).any()
-    expected = np.where(moves[:, None], np.clip(free, low, high), before.cpu().numpy())
-    # a step is a quotient and a sum of four roundings
-    step = np.abs(free - before.cpu().numpy())[moves].max()
-    np.testing.assert_allclose(drawn.colors.cpu().numpy(), expected, rtol=0, atol=after(4) * (high + step))
 
 
 def test_wrong_tensors_are_explained() -> None:

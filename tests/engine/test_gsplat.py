@@ -194,17 +194,6 @@ def test_tiles_that_are_not_asked_for_stay_and_count_for_nothing() -> None:
     assert 2 < int((found.contribution == 0).sum()) < 23
 
 
-def test_geometry_can_be_left_out_and_asked_for_later() -> None:
-    drawing = make_rasterizer("gsplat", 50, 44)
-    drawing.forward(with_view_dependence(random_gaussians(2, 8, VIEW), 1), EYES)
-    v_planes, weight = cotangents(EYES, 0)
-    part, whole = drawing.backward(v_planes, weight, geometry=False), drawing.backward(v_planes, weight)
-    assert relative_error(part.colors, whole.colors) < after(SUMMED)
-    assert relative_error(part.contribution, whole.contribution) < after(SUMMED)
-    for name in ("means", "quats", "scales", "opacities", "sh_rest"):
-        assert len(getattr(part, name)) == 0 and getattr(whole, name).any(), name
-
-
 def test_limits_are_said(monkeypatch: pytest.MonkeyPatch) -> None:
     drawing = make_rasterizer("gsplat", 50, 44)
     gaussians = random_gaussians(2, 8, VIEW)

@@ -158,6 +158,6 @@ def test_contribution_makes_the_closed_form_colour_step_converge() -> None:
     for _ in range(30):
         (planes,) = rasterizer.forward(gaussians, [view])
         losses.append(tissue_loss(planes, image, tissue, unknown, v_planes, weight, 0.0, DEPTH_SCALE))
-        gradients = rasterizer.backward(v_planes[None], weight[None], geometry=False)
+        gradients = rasterizer.backward(v_planes[None], weight[None])
         gaussians.colors[:] -= gradients.colors / np.maximum(gradients.contribution, 1e-3)[:, None]
     assert losses[-1] < 0.15 * losses[0]

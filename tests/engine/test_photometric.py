@@ -303,7 +303,7 @@ def test_descending_it_paints_the_picture(normalised: bool) -> None:
     for _ in range(60):
         (planes,) = rasterizer.forward(gaussians, [view])
         history.append(loss.evaluate(planes, **inputs, v_planes=v_planes, weight=weight))
-        gradients = rasterizer.backward(v_planes[None], weight[None], geometry=False)
+        gradients = rasterizer.backward(v_planes[None], weight[None])
         adam_step(gaussians.colors, gradients.colors, state, rates)
     assert history[-1].color < 0.15 * history[0].color
     assert history[-1].similarity < 0.15 * history[0].similarity

@@ -157,16 +157,6 @@ def test_a_rasterizer_used_again_gives_what_a_fresh_one_gives() -> None:
         same_bits((planes, found), draw_and_differentiate(gaussians, EYES))
 
 
-def test_geometry_can_be_left_out() -> None:
-    gaussians = with_filter(with_view_dependence(random_gaussians(2, 40, VIEW), 1))
-    rasterizer = make_rasterizer("numba", VIEW.width, VIEW.height)
-    rasterizer.forward(gaussians, EYES)
-    whole = rasterizer.backward(*cotangents(EYES, 0)).colors.copy()
-    part = rasterizer.backward(*cotangents(EYES, 0), geometry=False)
-    np.testing.assert_array_equal(part.colors, whole)
-    assert len(part.sh_rest) == 0
-
-
 def test_kernels_compile_once() -> None:
     """Also for frozen arrays and other float types, which are other types to Numba."""
     plain = with_filter(with_view_dependence(random_gaussians(1, 30, VIEW), 1))

@@ -220,19 +220,6 @@ def test_view_is_normalised_by_coverage() -> None:
     assert drawn.rgb[0, 0, 0] == pytest.approx(0.5, rel=after(4))  # fresh arrays
 
 
-def test_geometry_can_be_left_out() -> None:
-    view = camera()
-    gaussians = random_gaussians(2, 40, view)
-    rasterizer = make_rasterizer("numba", view.width, view.height)
-    rasterizer.forward(gaussians, [view])
-    whole = copies(rasterizer.backward(*cotangents([view], 0)))
-    part = rasterizer.backward(*cotangents([view], 0), geometry=False)
-    np.testing.assert_array_equal(part.colors, whole["colors"])
-    np.testing.assert_array_equal(part.contribution, whole["contribution"])
-    for name in ("means", "quats", "scales", "opacities", "sh_rest"):
-        assert len(getattr(part, name)) == 0, name
-
-
 # ---- repeatable --------------------------------------------------------------------------------------------
 
 

@@ -25,7 +25,7 @@ class DeviceRasterizer(Protocol):
         self, gaussians: DeviceGaussians, pinholes: Sequence[Pinhole], tiles: Tensor | None = None
     ) -> Tensor: ...
 
-    def pull_back(self, v_planes: Tensor, weight: Tensor, geometry: bool = True) -> DeviceGradients: ...
+    def pull_back(self, v_planes: Tensor, weight: Tensor) -> DeviceGradients: ...
 
     def median_depth(self) -> tuple[Tensor, Tensor]: ...
 
@@ -69,10 +69,10 @@ class DeviceBackend:
         )
         return planes
 
-    def backward(self, v_planes: F32, weight: F32, geometry: bool) -> Gradients:
+    def backward(self, v_planes: F32, weight: F32) -> Gradients:
         device = self._rasterizer.device
         found = self._rasterizer.pull_back(
-            torch.tensor(v_planes, device=device), torch.tensor(weight, device=device), geometry
+            torch.tensor(v_planes, device=device), torch.tensor(weight, device=device)
         )
         return Gradients(
             means=found.means.cpu().numpy(),

@@ -144,29 +144,22 @@ class GsplatRasterizer:
         )  # fmt: skip
         return rendered, alphas
 
-    def pull_back(self, v_planes: Tensor, weight: Tensor, geometry: bool = True) -> DeviceGradients:
+    def pull_back(self, v_planes: Tensor, weight: Tensor) -> DeviceGradients:
         """As `CudaRasterizer.pull_back`."""
         self._check_drawn()
         n = len(self._means)
-        leaves = [self._colors, self._statistic]
-        if geometry:
-            leaves += [self._means, self._quats, self._scales, self._opacities, self._sh_rest]
+        leaves = [self._means, self._quats, self._scales, self._opacities, self._colors, self._sh_rest]
         v_planes = torch.where(self._shown, v_planes, 0.0)
         weight = torch.where(self._shown[:, 0], weight, 0.0)
         v_rendered = torch.cat([v_planes[:, :3], weight[:, None], v_planes[:, 3:4]], 1).permute(0, 2, 3, 1)
         with self._memory_reported(n):
-            found = torch.autograd.grad(
+            means, quats, scales, opacities, colors, sh_rest, statistic = torch.autograd.grad(
                 (self._rendered, self._alphas),
-                leaves,
+                [*leaves, self._statistic],
                 (v_rendered, v_planes[:, 4, ..., None]),
                 retain_graph=True,
                 materialize_grads=True,
             )
-        colors, statistic = found[:2]
-        if not geometry:
-            none = colors[:0]
-            return DeviceGradients(none, none, none, none, colors, none, statistic[:, 0])
-        means, quats, scales, opacities, sh_rest = found[2:]
         return DeviceGradients(means, quats, scales, opacities, colors, sh_rest, statistic[:, 0])
 
     def median_depth(self) -> tuple[Tensor, Tensor]:

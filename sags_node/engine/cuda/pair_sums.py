@@ -1,4 +1,4 @@
-"""From gradients per pair to gradients per splat and per Gaussian, and from those to new colours."""
+"""From gradients per pair to gradients per splat and per Gaussian."""
 
 from __future__ import annotations
 
@@ -19,9 +19,8 @@ from sags_node.engine.cuda.layout import (
     V_VV,
     V_WEIGHT,
 )
-from sags_node.engine.cuda.projection import MAX_VALUE
 from sags_node.engine.cuda.signatures import Compiled
-from sags_node.engine.cuda.vectors import load3, size, store3
+from sags_node.engine.cuda.vectors import store3
 
 BLOCK = 32  # Gaussians per program: one warp, which waits for the one with the most pairs
 WARPS = 1
@@ -35,19 +34,11 @@ def sum_pairs(
     v_splats: tl.tensor,  # [C N, V_SPLAT_FLOATS] written
     v_colors: tl.tensor,  # [N, 3] written: the sum over the cameras
     contribution: tl.tensor,  # [N] likewise
-    colors: tl.tensor,  # [N, 3] moved by the colour step; None where not STEPS
     count: tl.tensor,  # N
     camera_count: tl.tensor,  # C
-    relaxation: tl.tensor,  # of the colour step, as the next four
-    damping: tl.tensor,
-    min_contribution: tl.tensor,
-    lowest: tl.tensor,
-    highest: tl.tensor,
-    STEPS: tl.constexpr,
     BLOCK: tl.constexpr,
 ) -> None:
-    """Pairs are added in the order of their slots, cameras in theirs. With STEPS a colour then moves by
-    -relaxation / (contribution + damping) v_colors, unless that is not finite."""
+    """Pairs are added in the order of their slots, cameras in theirs."""
     rows = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     inside = rows < count
     zero = tl.zeros([BLOCK], tl.float32)
@@ -87,25 +78,18 @@ def sum_pairs(
         all_green += green
         all_blue += blue
         all_weight += weight
-    v_color = (all_red, all_green, all_blue)
-    store3(v_colors + 3 * rows, v_color, inside)
+    store3(v_colors + 3 * rows, (all_red, all_green, all_blue), inside)
     tl.store(contribution + rows, all_weight, mask=inside)
-    if STEPS:
-        moves = inside & (all_weight > min_contribution) & (size(v_color) + all_weight < MAX_VALUE)
-        gain = relaxation / (all_weight + damping)
-        red, green, blue = load3(colors + 3 * rows, moves)
-        red = tl.minimum(tl.maximum(red - gain * all_red, lowest), highest)
-        green = tl.minimum(tl.maximum(green - gain * all_green, lowest), highest)
-        blue = tl.minimum(tl.maximum(blue - gain * all_blue, lowest), highest)
-        store3(colors + 3 * rows, (red, green, blue), moves)
 
 
-_SIGNATURE = {
-    "first_slots": "*i32", "counts": "*i32", "v_pairs": "*fp32", "v_splats": "*fp32", "v_colors": "*fp32",
-    "contribution": "*fp32", "count": "i32", "camera_count": "i32", "relaxation": "fp32", "damping": "fp32",
-    "min_contribution": "fp32", "lowest": "fp32", "highest": "fp32",
-}  # fmt: skip
 SIGNATURES = (
-    Compiled(sum_pairs, _SIGNATURE, {"colors": None, "STEPS": False, "BLOCK": BLOCK}, WARPS),
-    Compiled(sum_pairs, {**_SIGNATURE, "colors": "*fp32"}, {"STEPS": True, "BLOCK": BLOCK}, WARPS),
-)
+    Compiled(
+        sum_pairs,
+        {
+            "first_slots": "*i32", "counts": "*i32", "v_pairs": "*fp32", "v_splats": "*fp32",
+            "v_colors": "*fp32", "contribution": "*fp32", "count": "i32", "camera_count": "i32",
+        },
+        {"BLOCK": BLOCK},
+        WARPS,
+    ),
+)  # fmt: skip

@@ -13,13 +13,7 @@ from sags_node.engine import interface
 from sags_node.engine.cuda import compositing, layout, pair_sums, projection, projection_backward
 from sags_node.engine.cuda import spherical_harmonics as harmonics
 from sags_node.engine.cuda.binning import bin_splats
-from sags_node.engine.cuda.scene import (
-    ColourStep,
-    DeviceGaussians,
-    DeviceGradients,
-    camera_table,
-    check_tensor,
-)
+from sags_node.engine.cuda.scene import DeviceGaussians, DeviceGradients, camera_table, check_tensor
 from sags_node.engine.failures import DeviceMemoryError
 from sags_node.engine.rasterizer.compositing import TILE_HEIGHT as GIVEN_TILE_HEIGHT
 from sags_node.errors import UsageError
@@ -27,7 +21,6 @@ from sags_node.errors import UsageError
 MAX_PAIRS = 1 << 26  # 3 GiB of gradients
 TILE_WIDTH, TILE_HEIGHT = layout.TILE_WIDTH.value, layout.TILE_HEIGHT.value
 ROWS_OF_TILES = GIVEN_TILE_HEIGHT // TILE_HEIGHT  # in one of the tiles that callers name; as wide as those
-NO_STEP = ColourStep(0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class CudaRasterizer:
@@ -94,21 +87,12 @@ class CudaRasterizer:
         self._drawn = cameras
         return self._planes[:cameras]
 
-    def pull_back(
-        self,
-        v_planes: Tensor,
-        weight: Tensor,
-        geometry: bool = True,
-        colour_step: ColourStep | None = None,
-    ) -> DeviceGradients:
+    def pull_back(self, v_planes: Tensor, weight: Tensor) -> DeviceGradients:
         """Gradients of sum(v_planes * planes) for the last `draw`, in fresh tensors.
 
         Args:
             v_planes: [C, 5, H, W] cotangent of the planes.
             weight: [C, H, W] pixel weights for the contribution.
-            geometry: False leaves out everything but colours and contribution.
-            colour_step: moves the colours of the drawn Gaussians in place. A row whose gradient or
-                contribution is not finite keeps its colour.
 
         Raises:
             UsageError: nothing was drawn, or a tensor has another shape, type or device.
@@ -118,7 +102,7 @@ class CudaRasterizer:
         gaussians, bins, cameras = self._gaussians, self._bins, self._drawn
         check_tensor(v_planes, (cameras, 5, self._height, self._width), self.device, "v_planes")
         check_tensor(weight, (cameras, self._height, self._width), self.device, "weight")
-        n, step = len(gaussians), colour_step or NO_STEP
+        n, terms = len(gaussians), gaussians.terms
         with self._memory_reported():
             # zeros for what the ellipse misses or a finished tile hides
             v_pairs = v_planes.new_zeros((len(bins.slots), layout.V_SPLAT_FLOATS.value))
@@ -130,36 +114,24 @@ class CudaRasterizer:
             v_splats = v_planes.new_empty((cameras * n, layout.V_SPLAT_FLOATS.value))
             v_colors, contribution = v_planes.new_empty((n, 3)), v_planes.new_empty(n)
             pair_sums.sum_pairs[(triton.cdiv(n, pair_sums.BLOCK),)](
-                bins.first_slots, bins.counts, v_pairs, v_splats, v_colors, contribution,
-                gaussians.colors if colour_step else None, n, cameras,
-                step.relaxation, step.damping, step.min_contribution, step.lowest, step.highest,
-                STEPS=colour_step is not None, BLOCK=pair_sums.BLOCK, num_warps=pair_sums.WARPS,
+                bins.first_slots, bins.counts, v_pairs, v_splats, v_colors, contribution, n, cameras,
+                BLOCK=pair_sums.BLOCK, num_warps=pair_sums.WARPS,
             )  # fmt: skip
-            if not geometry:
-                none = v_colors[:0]
-                return DeviceGradients(none, none, none, none, v_colors, none, contribution)
-            return self._pull_back_geometry(v_splats, v_colors, contribution)
-
-    def _pull_back_geometry(
-        self, v_splats: Tensor, v_colors: Tensor, contribution: Tensor
-    ) -> DeviceGradients:
-        gaussians, cameras = self._gaussians, self._drawn
-        n, terms = len(gaussians), gaussians.terms
-        programs = triton.cdiv(n, projection_backward.BLOCK)
-        v_means, v_scales = torch.empty_like(gaussians.means), torch.empty_like(gaussians.scales)
-        v_quats, v_opacities = torch.empty_like(gaussians.quats), torch.empty_like(gaussians.opacities)
-        projection_backward.project_backward[(programs,)](
-            gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh_rest,
-            gaussians.smoothing, self._cameras, v_splats, v_means, v_quats, v_scales, v_opacities,
-            n, cameras, TERMS=terms, SMOOTHED=gaussians.smoothing is not None, ANTIALIASED=self._antialias,
-            BLOCK=projection_backward.BLOCK, num_warps=projection_backward.WARPS,
-        )  # fmt: skip
-        v_sh_rest = v_splats.new_empty((n, terms, 3))
-        if terms:
-            harmonics.coefficients_backward[(triton.cdiv(n, harmonics.BLOCK),)](
-                gaussians.means, self._cameras, v_splats, v_sh_rest, n, cameras,
-                TERMS=terms, BLOCK=harmonics.BLOCK,
+            v_means, v_scales = torch.empty_like(gaussians.means), torch.empty_like(gaussians.scales)
+            v_quats, v_opacities = torch.empty_like(gaussians.quats), torch.empty_like(gaussians.opacities)
+            projection_backward.project_backward[(triton.cdiv(n, projection_backward.BLOCK),)](
+                gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh_rest,
+                gaussians.smoothing, self._cameras, v_splats, v_means, v_quats, v_scales, v_opacities,
+                n, cameras, TERMS=terms, SMOOTHED=gaussians.smoothing is not None,
+                ANTIALIASED=self._antialias, BLOCK=projection_backward.BLOCK,
+                num_warps=projection_backward.WARPS,
             )  # fmt: skip
+            v_sh_rest = v_splats.new_empty((n, terms, 3))
+            if terms:
+                harmonics.coefficients_backward[(triton.cdiv(n, harmonics.BLOCK),)](
+                    gaussians.means, self._cameras, v_splats, v_sh_rest, n, cameras,
+                    TERMS=terms, BLOCK=harmonics.BLOCK,
+                )  # fmt: skip
         return DeviceGradients(v_means, v_quats, v_scales, v_opacities, v_colors, v_sh_rest, contribution)
 
     def median_depth(self) -> tuple[Tensor, Tensor]:

@@ -65,7 +65,7 @@ class DeviceGaussians:
 
 @dataclass(frozen=True, slots=True)
 class DeviceGradients:
-    """`interface.Gradients` on a device; empty, [0, ...], where only the colours were asked for."""
+    """`interface.Gradients` on a device."""
 
     means: Tensor  # [N, 3]
     quats: Tensor  # [N, 4]
@@ -74,17 +74,6 @@ class DeviceGradients:
     colors: Tensor  # [N, 3]
     sh_rest: Tensor  # [N, K - 1, 3]
     contribution: Tensor  # [N]
-
-
-@dataclass(frozen=True, slots=True)
-class ColourStep:
-    """One simultaneous reconstruction step: color -= relaxation / (contribution + damping) v_color."""
-
-    relaxation: float
-    damping: float  # px of coverage
-    min_contribution: float  # px; what was seen less keeps its colour
-    lowest: float
-    highest: float
 
 
 def check_tensor(tensor: Tensor, shape: tuple[int, ...], device: torch.device, name: str) -> None:

@@ -149,7 +149,7 @@ class NumbaRasterizer:
             self._next,
         )
 
-    def backward(self, v_planes: F32, weight: F32, geometry: bool) -> Gradients:
+    def backward(self, v_planes: F32, weight: F32) -> Gradients:
         n, cameras = self._count, self._cameras
         if len(self._v_pairs) < RECORD * len(self._emitted):
             self._v_pairs = aligned((RECORD * len(self._emitted),))
@@ -174,21 +174,9 @@ class NumbaRasterizer:
                 camera,
                 self._slots[camera * n : (camera + 1) * n],
                 self._v_pairs,
-                geometry,
                 accumulate=camera > 0,
                 v_view_colors=self._v_view_colors[:n] if cameras > 1 else v_colors,
                 v_colors=v_colors,
-                contribution=contribution,
-            )
-        if not geometry:
-            nothing = np.zeros((0, 0), np.float32)
-            return Gradients(
-                means=nothing,
-                quats=nothing,
-                scales=nothing,
-                opacities=nothing,
-                colors=v_colors,
-                sh_rest=nothing,
                 contribution=contribution,
             )
         means, quats, scales, opacities, sh_rest = self._projector.gradients()

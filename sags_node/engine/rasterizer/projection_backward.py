@@ -108,8 +108,8 @@ def _clear(v_means: F32, v_quats: F32, v_scales: F32, v_opacities: F32, first: i
 @kernel
 def _blocks_backward(
     means: F32, quats: F32, scales: F32, opacities: F32, view: F32, screen_filter: Row, S: F32,
-    next_block: I64, slots: Any, v_pairs: F32, geometry: bool, accumulate: bool, v_view_colors: F32,
-    v_colors: F32, contribution: F32, v_means: F32, v_quats: F32, v_scales: F32, v_opacities: F32,
+    next_block: I64, slots: Any, v_pairs: F32, accumulate: bool, v_view_colors: F32, v_colors: F32,
+    contribution: F32, v_means: F32, v_quats: F32, v_scales: F32, v_opacities: F32,
 ) -> None:  # fmt: skip
     count, blocks = means.shape[0], (means.shape[0] + BLOCK - 1) // BLOCK
     R, t, (fx, fy, _, _), limits = unpack(view)
@@ -133,8 +133,6 @@ def _blocks_backward(
                 v_colors[i, k] = before + S[record + V_RED + k]
             before = contribution[i] if accumulate else ZERO
             contribution[i] = before + S[record + CONTRIBUTION]
-        if not geometry:
-            continue
         if not any_drawn:
             if not accumulate:
                 _clear(v_means, v_quats, v_scales, v_opacities, first, filled)
@@ -256,7 +254,6 @@ def project_backward(
     next_block: I64,  # [1] for the workers
     slots: Any,  # [N] SLOTS of this camera
     v_pairs: F32,  # [16 slots] of `composite_backward`
-    geometry: bool,  # False: only the next three are written
     accumulate: bool,  # add to what follows, but for the first, instead of writing it: every camera but one
     v_view_colors: F32,  # [N 3] this camera's alone
     v_colors: F32,  # [N 3]
@@ -271,6 +268,5 @@ def project_backward(
     for worker in numba.prange(scratch.shape[0]):
         _blocks_backward(
             means, quats, scales, opacities, view, screen_filter, scratch[worker], next_block, slots, v_pairs,
-            geometry, accumulate, v_view_colors, v_colors, contribution, v_means, v_quats, v_scales,
-            v_opacities,
+            accumulate, v_view_colors, v_colors, contribution, v_means, v_quats, v_scales, v_opacities,
         )  # fmt: skip

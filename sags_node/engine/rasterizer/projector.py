@@ -85,7 +85,6 @@ class Projector:
         camera: int,
         slots: Records,
         v_pairs: F32,
-        geometry: bool,
         accumulate: bool,
         v_view_colors: F32,
         v_colors: F32,
@@ -96,7 +95,6 @@ class Projector:
         Args:
             slots: [N] SLOTS of this camera.
             v_pairs: [16 slots] a SPLAT_GRADIENT per slot.
-            geometry: False: only the next three are written.
             v_view_colors: [N, 3] written: of this camera's picture, 0 where not drawn.
             v_colors: [N, 3] written or added to; with one camera it may be the same.
             contribution: [N] written or added to.
@@ -113,7 +111,6 @@ class Projector:
             self._next_block,
             slots,
             v_pairs,
-            geometry,
             accumulate,
             v_view_colors,
             v_colors,
@@ -123,7 +120,7 @@ class Projector:
             self._v_scales[:n],
             self._v_opacities[:n],
         )
-        if geometry and gaussians.sh_rest is not None:
+        if gaussians.sh_rest is not None:
             spherical_harmonics.color_backward(
                 gaussians.means,
                 gaussians.sh_rest,

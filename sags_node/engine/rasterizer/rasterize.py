@@ -105,12 +105,12 @@ class _CheckedRasterizer:
         self._drawn = len(cameras)
         return planes
 
-    def backward(self, v_planes: F32, weight: F32, geometry: bool = True) -> Gradients:
+    def backward(self, v_planes: F32, weight: F32) -> Gradients:
         if not self._drawn:
             raise UsageError("nothing was drawn yet; call forward before backward")
         v_planes = _as_f32(v_planes, (self._drawn, 5, self._height, self._width), "v_planes")
         weight = _as_f32(weight, (self._drawn, self._height, self._width), "weight")
-        return self._backend.backward(v_planes, weight, geometry)
+        return self._backend.backward(v_planes, weight)
 
     def median(self) -> tuple[F32, I32]:
         if not self._drawn:

@@ -61,7 +61,7 @@ class ReferenceRasterizer:
         self._rows = _over(self._rows, torch.stack(rows), self._drawn)
         return self._shown
 
-    def backward(self, v_planes: F32, weight: F32, geometry: bool) -> Gradients:
+    def backward(self, v_planes: F32, weight: F32) -> Gradients:
         import torch
 
         cotangent = torch.tensor(np.where(self._drawn[:, None], v_planes, 0), dtype=torch.float64)
@@ -74,19 +74,7 @@ class ReferenceRasterizer:
         found = torch.autograd.grad(
             self._planes, self._inputs, cotangent, retain_graph=True, materialize_grads=True
         )
-        by_means, by_quats, by_scales, by_opacities, by_colors, by_sh_rest = (
-            gradient.numpy().astype(np.float32) for gradient in found
-        )
-        kept = None if geometry else 0
-        return Gradients(
-            by_means[:kept],
-            by_quats[:kept],
-            by_scales[:kept],
-            by_opacities[:kept],
-            by_colors,
-            by_sh_rest[:kept],
-            contribution=by_red[:, 0].numpy().astype(np.float32),
-        )
+        return Gradients(*(gradient.numpy().astype(np.float32) for gradient in (*found, by_red[:, 0])))
 
     def median(self) -> tuple[F32, I32]:
         return self._depths, self._rows
