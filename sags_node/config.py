@@ -630,11 +630,6 @@ class MappingConfig(Section):
         le=2_000_000,
         description="the model has no more; default: as many as the machine refines within the budget",
     )
-    right_eye: bool = Field(
-        False,
-        description="learn from the right picture too, for stereo displays: that eye is drawn 1 to 2 dB "
-        "better, the left one 0.3 to 0.8 dB worse, in a third more time",
-    )
     smoothing: bool = Field(True, description="the 3D filter of Mip-Splatting: nothing finer than was seen")
     skip_duplicates: bool = Field(True, description="a frame equal to its predecessor is not mapped again")
     skip_depth: bool = Field(True, description="when time is short, match depth in some of the frames only")
@@ -713,3 +708,9 @@ class LaunchConfig(Section):
         if isinstance(self.source, VideosSource) and self.source.geometry.layout != "separate":
             return False
         return isinstance(self.source, FoldersSource | VideosSource) and self.source.right is None
+
+
+# Keys of earlier versions, and what stands in their place: an error says it.
+REMOVED = {
+    "mapping.right_eye": "publish.right draws the right eye, and learns from what it sees",
+}

@@ -188,7 +188,7 @@ class Pipeline:
             seen_by_both = _without(tissue, hidden.right)
             measured = self._measured(frame, seen, seen_by_both, still, budget, eyes)
             depth, confidence = measured.depth, measured.confidence
-            observation = observe(seen, tissue, depth, confidence, self._config.mapping.right_eye)
+            observation = observe(seen, tissue, depth, confidence)
         if scene.guess is not None:
             self.mapper.found_again(observation, scene.guess)
         if self._tracker is not None:

@@ -174,7 +174,6 @@ class Observation:
     tissue: Bool  # [H, W] True = tissue
     depth: F32  # [H, W] m, 0 unknown
     depth_confidence: F32  # [H, W] 0..1
-    right: F32 | None = None  # [H, W, 3] RGB 0..1, the right eye, if the mapper is to learn from it
     baseline: float = 0.0  # m, to the right eye
     pyramid: GrayPyramid | None = None  # of `gray`, where it is made already
     grid: DepthGrid | None = None  # of `depth`, where it is made already

@@ -1,11 +1,12 @@
 """Launch files: every key is known, paths are found, mistakes are explained."""
 
+import re
 from pathlib import Path
 
 import pytest
 from places import ROOT
 
-from sags_node.config import FoldersSource, LaunchConfig, PanesSource
+from sags_node.config import REMOVED, FoldersSource, LaunchConfig, PanesSource
 from sags_node.errors import UsageError
 from sags_node.launch_file import load_launch, with_parameters
 
@@ -88,6 +89,15 @@ def test_yaml_cannot_run_code(tmp_path: Path) -> None:
     file.write_text("ns: !!python/object/apply:os.system ['true']\n")
     with pytest.raises(UsageError, match="not valid YAML"):
         load_launch(file)
+
+
+@pytest.mark.parametrize("key", REMOVED)
+def test_a_key_that_is_gone_says_what_stands_in_its_place(key: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        load_launch(None, [f"{key}:=1"])
+    assert str(caught.value) == f"defaults: there is no {key} any more: {REMOVED[key]}"
+    with pytest.raises(UsageError, match=re.escape(f"there is no {key} any more")):
+        with_parameters(LaunchConfig(), {key: 1})
 
 
 def test_parameters_are_validated_like_a_file() -> None:
