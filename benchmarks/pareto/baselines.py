@@ -171,8 +171,8 @@ def _right_views(
     mask = right_eye_mask(shown.tissue, depths, focal_px, shown.baseline) & usable
     warp, known = warp_to_right(metrics.as_float(left), shown.measured_depth, focal_px, shown.baseline)
     right_camera = camera.moved_right(shown.baseline)
-    planes = rasterizer.forward(shown.snapshot.gaussians, [right_camera])
-    model = to_view(planes[0], right_camera, 0, 0).rgb
+    planes = rasterizer.forward(shown.snapshot.gaussians, right_camera)
+    model = to_view(planes, right_camera, 0, 0).rgb
     truth, both = metrics.as_float(right), mask & known
     warp_psnr, model_psnr = (
         metrics.psnr(metrics.fit_gain_offset(picture, truth, both), truth, both) for picture in (warp, model)

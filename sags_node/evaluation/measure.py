@@ -268,7 +268,7 @@ class Measurer:
         return figures
 
     def _draw(self, gaussians: Gaussians, camera: Camera) -> F32:
-        return to_view(self._rasterizer.forward(gaussians, [camera])[0], camera, 0, 0).rgb
+        return to_view(self._rasterizer.forward(gaussians, camera), camera, 0, 0).rgb
 
     def _right_eye(
         self, shown: SpooledFrame, left: U8, picture: U8, frame: StereoFrame

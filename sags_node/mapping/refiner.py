@@ -64,7 +64,7 @@ class Refiner(Protocol):
         Args:
             share: of the picture, where it was worst before the steps. What else the steps changed, they
                 changed little: it keeps what was drawn before them. 1: all of it.
-            tiles: [1, rows, columns] that are drawn in any case, as those are that `refine_worst` drew.
+            tiles: [rows, columns] that are drawn in any case, as those are that `refine_worst` drew.
         """
 
     def planes(self) -> F32:
@@ -89,7 +89,7 @@ class Refiner(Protocol):
         """
 
     def touched(self) -> Bool:
-        """The tiles [1, rows, columns] that `refine_worst` drew since `begin`."""
+        """The tiles [rows, columns] that `refine_worst` drew since `begin`."""
 
     def show(self, gaussians: Gaussians, camera: Camera) -> F32:
         """Planes [5, H, W] of any Gaussians for any camera, in memory of their own; overwritten by the next
@@ -112,9 +112,9 @@ class CpuRefiner:
         self._rasterizers: dict[tuple[int, int], Rasterizer] = {}  # by the size of their pictures
         self._viewers: dict[tuple[int, int], Rasterizer] = {}  # those of `show`
         self._optimiser = Optimiser()
-        # [1, 5, H, W] and [1, H, W]; the planes are the rasteriser's memory: what it drew last
-        self._planes: F32 = np.zeros((1, 5, 1, 1), np.float32)
-        self._v_planes, self._weight = np.zeros_like(self._planes), np.zeros_like(self._planes[:, 0])
+        # [5, H, W] and [H, W]; the planes are the rasteriser's memory: what it drew last
+        self._planes: F32 = np.zeros((5, 1, 1), np.float32)
+        self._v_planes, self._weight = np.zeros_like(self._planes), np.zeros_like(self._planes[0])
 
     def begin(
         self, model: GaussianModel, deformation: NodeDeformation, observation: Observation, node_step: float
@@ -131,27 +131,26 @@ class CpuRefiner:
         pass
 
     def draw(self) -> None:
-        self._planes = self._rasterizer.forward(self._model.gaussians(), [self._observation.camera])
+        self._planes = self._rasterizer.forward(self._model.gaussians(), self._observation.camera)
 
     def planes(self) -> F32:
-        planes: F32 = self._planes[0]
-        return planes
+        return self._planes
 
     def exposure_gain(self) -> F32:
-        return exposure_gain(self._planes[0], self._observation.image, self._observation.tissue)
+        return exposure_gain(self._planes, self._observation.image, self._observation.tissue)
 
     def refine(self, rates: Rates, share: float = 1.0) -> None:
         observation, tissue = self._observation, self._observation.tissue
         if share >= 1.0:
             self._model.contribution[:] = self._step(observation, rates).contribution
             return
-        tiles = worst_tiles(self._planes[0], observation.image, tissue, share)
+        tiles = worst_tiles(self._planes, observation.image, tissue, share)
         self._step(replace(observation, tissue=tissue & pixels_of(tiles, tissue.shape)), rates)
 
     def refine_worst(self, share: float, rates: Rates, nodes: bool = True) -> None:
         observation = self._observation
-        tiles = worst_tiles(self._planes[0], observation.image, observation.tissue, share)
-        self._planes = self._rasterizer.forward(self._model.gaussians(), [observation.camera], tiles)
+        tiles = worst_tiles(self._planes, observation.image, observation.tissue, share)
+        self._planes = self._rasterizer.forward(self._model.gaussians(), observation.camera, tiles)
         self._step(observation, rates, nodes)
         self._touched |= tiles
 
@@ -163,12 +162,11 @@ class CpuRefiner:
         if share < 1.0:
             some = tiles | self._touched
             if share > 0:
-                some |= worst_tiles(self._planes[0], observation.image, observation.tissue, share)
-        self._planes = self._rasterizer.forward(self._model.gaussians(), [observation.camera], some)
+                some |= worst_tiles(self._planes, observation.image, observation.tissue, share)
+        self._planes = self._rasterizer.forward(self._model.gaussians(), observation.camera, some)
 
     def show(self, gaussians: Gaussians, camera: Camera) -> F32:
-        planes: F32 = self._rasterizer_for(camera, self._viewers).forward(gaussians, [camera])[0]
-        return planes
+        return self._rasterizer_for(camera, self._viewers).forward(gaussians, camera)
 
     def _rasterizer_for(self, camera: Camera, made: dict[tuple[int, int], Rasterizer]) -> Rasterizer:
         size = camera.width, camera.height
@@ -179,11 +177,11 @@ class CpuRefiner:
     def _step(self, observation: Observation, rates: Rates, nodes: bool = True) -> Gradients:
         planes = self._planes
         if self._v_planes.shape != planes.shape:
-            self._v_planes, self._weight = np.zeros_like(planes), np.zeros_like(planes[:, 0])
+            self._v_planes, self._weight = np.zeros_like(planes), np.zeros_like(planes[0])
         v_planes, weight = self._v_planes, self._weight
         self.loss = tissue_loss(
-            planes[0], observation.image, observation.tissue, observation.depth,
-            v_planes[0], weight[0], DEPTH_WEIGHT, DEPTH_SCALE,
+            planes, observation.image, observation.tissue, observation.depth, v_planes, weight,
+            DEPTH_WEIGHT, DEPTH_SCALE,
         )  # fmt: skip
         gradients = self._rasterizer.backward(v_planes, weight)
         if nodes:  # they move all that follows them, also far from the tiles that were drawn

@@ -406,7 +406,7 @@ def test_after_the_pause_the_gpu_begins_with_a_drawing_of_its_own(monkeypatch: p
     played.take(frame(6))
     played.mapper._begin(frame(6))
     rasterizer = make_rasterizer("numba", WIDTH, HEIGHT)
-    expected = rasterizer.forward(played.mapper.model.gaussians(), [frame(6).camera])[0]
+    expected = rasterizer.forward(played.mapper.model.gaussians(), frame(6).camera)
     assert isinstance(played.refiner, FallbackRefiner) and played.refiner._working is played.refiner._gpu
     np.testing.assert_allclose(played.refiner.planes(), expected, atol=1e-4)
 

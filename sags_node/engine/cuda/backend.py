@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Protocol
 
 import torch
@@ -21,9 +20,7 @@ class DeviceRasterizer(Protocol):
 
     device: torch.device
 
-    def draw(
-        self, gaussians: DeviceGaussians, pinholes: Sequence[Pinhole], tiles: Tensor | None = None
-    ) -> Tensor: ...
+    def draw(self, gaussians: DeviceGaussians, pinhole: Pinhole, tiles: Tensor | None = None) -> Tensor: ...
 
     def pull_back(self, v_planes: Tensor, weight: Tensor) -> DeviceGradients: ...
 
@@ -57,11 +54,11 @@ class DeviceBackend:
     def __init__(self, rasterizer: DeviceRasterizer) -> None:
         self._rasterizer = rasterizer
 
-    def forward(self, gaussians: Gaussians, pinholes: Sequence[Pinhole], tiles: Bool | None) -> F32:
+    def forward(self, gaussians: Gaussians, pinhole: Pinhole, tiles: Bool | None) -> F32:
         planes: F32 = (
             self._rasterizer.draw(
                 DeviceGaussians.from_host(gaussians, self._rasterizer.device),
-                pinholes,
+                pinhole,
                 None if tiles is None else torch.tensor(tiles),
             )
             .cpu()

@@ -90,12 +90,6 @@ def _sum_pairs(S: F32, slots: Any, v_pairs: F32, first: int, filled: int) -> Any
 
 
 @inlined
-def _put(gradients: F32, i: int, k: int, value: Any, drawn: bool, accumulate: bool) -> None:
-    before = gradients[i, k] if accumulate else ZERO
-    gradients[i, k] = before + (value if drawn else ZERO)
-
-
-@inlined
 def _clear(v_means: F32, v_quats: F32, v_scales: F32, v_opacities: F32, first: int, filled: int) -> None:
     for i in range(first, first + filled):
         for k in range(3):
@@ -108,8 +102,8 @@ def _clear(v_means: F32, v_quats: F32, v_scales: F32, v_opacities: F32, first: i
 @kernel
 def _blocks_backward(
     means: F32, quats: F32, scales: F32, opacities: F32, view: F32, screen_filter: Row, S: F32,
-    next_block: I64, slots: Any, v_pairs: F32, accumulate: bool, v_view_colors: F32, v_colors: F32,
-    contribution: F32, v_means: F32, v_quats: F32, v_scales: F32, v_opacities: F32,
+    next_block: I64, slots: Any, v_pairs: F32, v_colors: F32, contribution: F32, v_means: F32, v_quats: F32,
+    v_scales: F32, v_opacities: F32,
 ) -> None:  # fmt: skip
     count, blocks = means.shape[0], (means.shape[0] + BLOCK - 1) // BLOCK
     R, t, (fx, fy, _, _), limits = unpack(view)
@@ -128,14 +122,10 @@ def _blocks_backward(
         for lane in range(filled):
             i, record = first + lane, RECORDS + lane * RECORD
             for k in range(3):
-                before = v_colors[i, k] if accumulate else ZERO
-                v_view_colors[i, k] = S[record + V_RED + k]
-                v_colors[i, k] = before + S[record + V_RED + k]
-            before = contribution[i] if accumulate else ZERO
-            contribution[i] = before + S[record + CONTRIBUTION]
+                v_colors[i, k] = S[record + V_RED + k]
+            contribution[i] = S[record + CONTRIBUTION]
         if not any_drawn:
-            if not accumulate:
-                _clear(v_means, v_quats, v_scales, v_opacities, first, filled)
+            _clear(v_means, v_quats, v_scales, v_opacities, first, filled)
             continue
         load_block(S, means, quats, scales, opacities, first, filled)
         for lane in range(filled, BLOCK):
@@ -234,12 +224,11 @@ def _blocks_backward(
         for lane in range(filled):
             i, drawn = first + lane, S[DRAWN + lane] > ZERO
             for k in range(3):
-                _put(v_means, i, k, S[V_MEAN_X + k * BLOCK + lane], drawn, accumulate)
-                _put(v_scales, i, k, S[V_SCALE_X + k * BLOCK + lane], drawn, accumulate)
+                v_means[i, k] = S[V_MEAN_X + k * BLOCK + lane] if drawn else ZERO
+                v_scales[i, k] = S[V_SCALE_X + k * BLOCK + lane] if drawn else ZERO
             for k in range(4):
-                _put(v_quats, i, k, S[V_QUAT_W + k * BLOCK + lane], drawn, accumulate)
-            opacity_before = v_opacities[i] if accumulate else ZERO
-            v_opacities[i] = opacity_before + (S[V_OPACITY + lane] if drawn else ZERO)
+                v_quats[i, k] = S[V_QUAT_W + k * BLOCK + lane] if drawn else ZERO
+            v_opacities[i] = S[V_OPACITY + lane] if drawn else ZERO
 
 
 @parallel_kernel
@@ -252,11 +241,9 @@ def project_backward(
     screen_filter: Row,
     scratch: F32,  # [workers, SCRATCH]
     next_block: I64,  # [1] for the workers
-    slots: Any,  # [N] SLOTS of this camera
+    slots: Any,  # [N] SLOTS
     v_pairs: F32,  # [16 slots] of `composite_backward`
-    accumulate: bool,  # add to what follows, but for the first, instead of writing it: every camera but one
-    v_view_colors: F32,  # [N 3] this camera's alone
-    v_colors: F32,  # [N 3]
+    v_colors: F32,  # [N 3] written, as what follows: 0 where not drawn
     contribution: F32,  # [N]
     v_means: F32,
     v_quats: F32,
@@ -268,5 +255,5 @@ def project_backward(
     for worker in numba.prange(scratch.shape[0]):
         _blocks_backward(
             means, quats, scales, opacities, view, screen_filter, scratch[worker], next_block, slots, v_pairs,
-            accumulate, v_view_colors, v_colors, contribution, v_means, v_quats, v_scales, v_opacities,
+            v_colors, contribution, v_means, v_quats, v_scales, v_opacities,
         )  # fmt: skip

@@ -126,33 +126,24 @@ def _block_backward(
     centre: Row,
     first: int,
     last: int,
-    v_view_colors: F32,
-    accumulate: bool,
+    v_colors: F32,
     v_sh_rest: F32,
     v_means: F32,
 ) -> None:
     terms = sh_rest.shape[1]
     basis, v_basis = np.empty(MOST, f4), np.empty(MOST, f4)
     for i in range(first, last):
-        red, green, blue = v_view_colors[i, 0], v_view_colors[i, 1], v_view_colors[i, 2]
+        red, green, blue = v_colors[i, 0], v_colors[i, 1], v_colors[i, 2]
         if red == ZERO and green == ZERO and blue == ZERO:  # not drawn: its values may be anything, NaN too
-            if not accumulate:
-                v_sh_rest[i] = ZERO
+            v_sh_rest[i] = ZERO
             continue
         x, y, z, inverse = _direction(means, i, centre)
         _write_basis(basis, terms, x, y, z)
         for k in range(terms):
             v_basis[k] = red * sh_rest[i, k, 0] + green * sh_rest[i, k, 1] + blue * sh_rest[i, k, 2]
-        if accumulate:
-            for k in range(terms):
-                v_sh_rest[i, k, 0] += red * basis[k]
-                v_sh_rest[i, k, 1] += green * basis[k]
-                v_sh_rest[i, k, 2] += blue * basis[k]
-        else:
-            for k in range(terms):
-                v_sh_rest[i, k, 0] = red * basis[k]
-                v_sh_rest[i, k, 1] = green * basis[k]
-                v_sh_rest[i, k, 2] = blue * basis[k]
+            v_sh_rest[i, k, 0] = red * basis[k]
+            v_sh_rest[i, k, 1] = green * basis[k]
+            v_sh_rest[i, k, 2] = blue * basis[k]
         v_x, v_y, v_z = _slope(v_basis, terms, x, y, z)
         radial = v_x * x + v_y * y + v_z * z  # only the part across the direction turns it
         v_means[i, 0] += (v_x - radial * x) * inverse
@@ -165,9 +156,8 @@ def color_backward(
     means: F32,
     sh_rest: F32,
     centre: Row,
-    v_view_colors: F32,  # [N, 3] of this camera's picture; 0 for what was not drawn
-    accumulate: bool,  # add to v_sh_rest instead of writing it: every camera after the first
-    v_sh_rest: F32,  # [N, 3 or 8 or 15, 3]
+    v_colors: F32,  # [N, 3] 0 for what was not drawn
+    v_sh_rest: F32,  # [N, 3 or 8 or 15, 3] written
     v_means: F32,  # [N, 3] added to
 ) -> None:
     count = means.shape[0]
@@ -179,8 +169,7 @@ def color_backward(
             centre,
             first,
             min(first + BLOCK, count),
-            v_view_colors,
-            accumulate,
+            v_colors,
             v_sh_rest,
             v_means,
         )

@@ -38,10 +38,10 @@ class ReferenceRasterizer:
 
     def __init__(self, antialias: bool) -> None:
         self._antialias = antialias
-        self._shown = np.zeros((0, 5, 0, 0), np.float32)
-        self._depths, self._rows = np.zeros((0, 0, 0), np.float32), np.zeros((0, 0, 0), np.int32)
+        self._shown = np.zeros((5, 0, 0), np.float32)
+        self._depths, self._rows = np.zeros((0, 0), np.float32), np.zeros((0, 0), np.int32)
 
-    def forward(self, gaussians: Gaussians, pinholes: Sequence[Pinhole], tiles: Bool | None) -> F32:
+    def forward(self, gaussians: Gaussians, pinhole: Pinhole, tiles: Bool | None) -> F32:
         import torch
 
         none = np.zeros((len(gaussians), 0, 3), np.float32)
@@ -51,25 +51,25 @@ class ReferenceRasterizer:
         if gaussians.smoothing is not None:
             smoothing = torch.tensor(gaussians.smoothing, dtype=torch.float64)
         self._inputs = [torch.tensor(array, dtype=torch.float64, requires_grad=True) for array in arrays]
-        splats = [project(pinhole, self._inputs, smoothing, self._antialias) for pinhole in pinholes]
-        width, height = pinholes[0].width, pinholes[0].height
-        self._planes = torch.stack([blend(seen, width, height) for seen in splats])
-        depths, rows = zip(*(median(seen, width, height) for seen in splats), strict=True)
-        self._drawn = _drawn_pixels(tiles, len(pinholes), width, height)
-        self._shown = _over(self._shown, self._planes, self._drawn[:, None])
-        self._depths = _over(self._depths, torch.stack(depths), self._drawn)
-        self._rows = _over(self._rows, torch.stack(rows), self._drawn)
+        splats = project(pinhole, self._inputs, smoothing, self._antialias)
+        width, height = pinhole.width, pinhole.height
+        self._planes = blend(splats, width, height)
+        depths, rows = median(splats, width, height)
+        self._drawn = _drawn_pixels(tiles, width, height)
+        self._shown = _over(self._shown, self._planes, self._drawn)
+        self._depths = _over(self._depths, depths, self._drawn)
+        self._rows = _over(self._rows, rows, self._drawn)
         return self._shown
 
     def backward(self, v_planes: F32, weight: F32) -> Gradients:
         import torch
 
-        cotangent = torch.tensor(np.where(self._drawn[:, None], v_planes, 0), dtype=torch.float64)
+        cotangent = torch.tensor(np.where(self._drawn, v_planes, 0), dtype=torch.float64)
         # the red plane is the sum of w * red: its gradient with the pixel weights as cotangent is the sum of
         # w * weight
         red = torch.tensor(np.where(self._drawn, weight, 0), dtype=torch.float64)
         (by_red,) = torch.autograd.grad(
-            self._planes[:, 0], self._inputs[4], red, retain_graph=True, materialize_grads=True
+            self._planes[0], self._inputs[4], red, retain_graph=True, materialize_grads=True
         )
         found = torch.autograd.grad(
             self._planes, self._inputs, cotangent, retain_graph=True, materialize_grads=True
@@ -80,11 +80,11 @@ class ReferenceRasterizer:
         return self._depths, self._rows
 
 
-def _drawn_pixels(tiles: Bool | None, cameras: int, width: int, height: int) -> Bool:
-    """[C, H, W]"""
+def _drawn_pixels(tiles: Bool | None, width: int, height: int) -> Bool:
+    """[H, W]"""
     if tiles is None:
-        return np.ones((cameras, height, width), bool)
-    return tiles.repeat(TILE_HEIGHT, 1).repeat(TILE_WIDTH, 2)[:, :height, :width]
+        return np.ones((height, width), bool)
+    return tiles.repeat(TILE_HEIGHT, 0).repeat(TILE_WIDTH, 1)[:height, :width]
 
 
 def _over(before: NDArray[T], now: Tensor, drawn: Bool) -> NDArray[T]:

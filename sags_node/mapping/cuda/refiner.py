@@ -71,8 +71,8 @@ class CudaRefiner:
         self._rasterizers: dict[tuple[int, int], CudaRasterizer] = {}  # by the size of their pictures
         self._viewers: dict[tuple[int, int], CudaRasterizer] = {}  # those of `show`
         self._optimiser = Optimiser(STEP)
-        self._planes = torch.zeros((1, 5, 1, 1), device=self._device)
-        self._v_planes, self._weight = torch.zeros_like(self._planes), torch.zeros_like(self._planes[:, 0])
+        self._planes = torch.zeros((5, 1, 1), device=self._device)
+        self._v_planes, self._weight = torch.zeros_like(self._planes), torch.zeros_like(self._planes[0])
         self._last_loss = torch.zeros((), device=self._device)
         self._host: GaussianModel | None = None
         self._tables: dict[str, Tensor] = {}
@@ -135,14 +135,14 @@ class CudaRefiner:
         self._changed = False
 
     def draw(self) -> None:
-        self._planes = self._rasterizer.draw(self._gaussians, [self._pinhole])
+        self._planes = self._rasterizer.draw(self._gaussians, self._pinhole)
 
     def planes(self) -> F32:
-        planes: F32 = self._planes[0].cpu().numpy()
+        planes: F32 = self._planes.cpu().numpy()
         return planes
 
     def exposure_gain(self) -> F32:
-        gain = device_exposure.exposure_gain(self._planes[0], self._image, self._tissue, EXPOSURE)
+        gain = device_exposure.exposure_gain(self._planes, self._image, self._tissue, EXPOSURE)
         found: F32 = gain.cpu().numpy()
         return found
 
@@ -151,12 +151,12 @@ class CudaRefiner:
             self._contribution.copy_(self._step(self._tissue, rates).contribution)
             return
         height, width = self._tissue.shape
-        rows = self._worst_tiles(share)[0].repeat_interleave(TILE_HEIGHT, 0)[:height]
+        rows = self._worst_tiles(share).repeat_interleave(TILE_HEIGHT, 0)[:height]
         self._step(self._tissue & rows.repeat_interleave(TILE_WIDTH, 1)[:, :width], rates)
 
     def refine_worst(self, share: float, rates: Rates, nodes: bool = True) -> None:
         tiles = self._worst_tiles(share)
-        self._planes = self._rasterizer.draw(self._gaussians, [self._pinhole], tiles)
+        self._planes = self._rasterizer.draw(self._gaussians, self._pinhole, tiles)
         self._step(self._tissue, rates, nodes)
         self._touched |= tiles
 
@@ -170,12 +170,12 @@ class CudaRefiner:
             some = self._sent(tiles) | self._touched
             if share > 0:
                 some |= self._worst_tiles(share)
-        self._planes = self._rasterizer.draw(self._gaussians, [self._pinhole], some)
+        self._planes = self._rasterizer.draw(self._gaussians, self._pinhole, some)
 
     def show(self, gaussians: Gaussians, camera: Camera) -> F32:
         drawn = DeviceGaussians.from_host(gaussians, self._device)
-        planes = self._rasterizer_for(camera, self._viewers).draw(drawn, [as_pinhole(camera)])
-        found: F32 = planes[0].cpu().numpy()
+        planes = self._rasterizer_for(camera, self._viewers).draw(drawn, as_pinhole(camera))
+        found: F32 = planes.cpu().numpy()
         return found
 
     def _rasterizer_for(self, camera: Camera, made: dict[tuple[int, int], CudaRasterizer]) -> CudaRasterizer:
@@ -187,10 +187,10 @@ class CudaRefiner:
     def _step(self, tissue: Tensor, rates: Rates, nodes: bool = True) -> DeviceGradients:
         planes = self._planes
         if self._v_planes.shape != planes.shape:
-            self._v_planes, self._weight = torch.zeros_like(planes), torch.zeros_like(planes[:, 0])
+            self._v_planes, self._weight = torch.zeros_like(planes), torch.zeros_like(planes[0])
         v_planes, weight = self._v_planes, self._weight
         self._last_loss = tissue_loss(
-            planes[0], self._image, tissue, self._depth, v_planes[0], weight[0], DEPTH_WEIGHT, DEPTH_SCALE
+            planes, self._image, tissue, self._depth, v_planes, weight, DEPTH_WEIGHT, DEPTH_SCALE
         )
         gradients = self._rasterizer.pull_back(v_planes, weight)
         if nodes:  # they move all that follows them, also far from the tiles that were drawn
@@ -209,7 +209,7 @@ class CudaRefiner:
 
     def _worst_tiles(self, share: float) -> Tensor:
         return device_focus.worst_tiles(
-            self._planes[0], self._image, self._tissue, share,
+            self._planes, self._image, self._tissue, share,
             every=focus.EVERY, least_coverage=float(COVERED),
         )  # fmt: skip
 
