@@ -449,7 +449,6 @@ USUAL_NEAREST = 0.03  # m: scopes work at 50 to 100 mm, an organ that swells tow
 class StereoConfig(Section):
     """Depth from the rectified pair."""
 
-    method: Literal["dis", "sgbm"] = Field("dis", description="dense inverse search, or StereoSGBM 3WAY")
     scale: Literal[1, 2, 4] | None = Field(
         None, description="divide the working size by this for matching; default: 2 from 480 px width, else 1"
     )
@@ -713,4 +712,5 @@ class LaunchConfig(Section):
 # Keys of earlier versions, and what stands in their place: an error says it.
 REMOVED = {
     "mapping.right_eye": "publish.right draws the right eye, and learns from what it sees",
+    "vision.stereo.method": "inverse search matches; SGBM is a baseline of `python -m benchmarks depth`",
 }

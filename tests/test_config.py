@@ -49,10 +49,10 @@ def test_overrides_win_over_the_file() -> None:
     [
         ("mapping.budgt_ms:=3", "did you mean 'budget_ms'"),
         ("source.secnds:=3", "did you mean 'seconds'"),
-        ("vision.stereo.methd:=sgbm", "did you mean 'method'"),
+        ("vision.stereo.scal:=2", "did you mean 'scale'"),
         ("zzz:=3", "known keys: "),
         ("mapping.budget_ms:=-1", "greater than 0"),
-        ("vision.stereo.method:=magic", "'dis' or 'sgbm'"),
+        ("vision.pose:=magic", "'session', 'fixed', 'estimate' or 'refine'"),
         ("vision.stereo:={min_depth: 0.2, max_depth: 0.1}", "must be below max_depth"),
         ("source.kind:=carrier_pigeon", "'folders'"),
         ("mapping.budget_ms", "key:=value"),
