@@ -50,7 +50,8 @@ mapping:
   [recording](recordings.md) that is known by its files. Without one the built-in phantom is played.
 - `key:=value` on the command line wins over the file. Keys are written with dots, as in the tables below.
   Values are YAML: `source.right:=null`, `'publish.data:=[tcp://*:5556]'`.
-- An unknown key is an error that names the nearest known one. So is a wrong value. The exit code is 2.
+- An unknown key is an error that names the nearest known one, or what stands in its place. So is a wrong
+  value. The exit code is 2.
 - A key that is left out has its default.
 - Paths in a file are relative to the file. Paths on the command line are relative to the folder that you are
   in.

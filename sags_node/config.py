@@ -449,7 +449,6 @@ USUAL_NEAREST = 0.03  # m: scopes work at 50 to 100 mm, an organ that swells tow
 class StereoConfig(Section):
     """Depth from the rectified pair."""
 
-    method: Literal["dis", "sgbm"] = Field("dis", description="dense inverse search, or StereoSGBM 3WAY")
     scale: Literal[1, 2, 4] | None = Field(
         None, description="divide the working size by this for matching; default: 2 from 480 px width, else 1"
     )
@@ -653,11 +652,6 @@ class MappingConfig(Section):
         le=2_000_000,
         description="the model has no more; default: as many as the machine refines within the budget",
     )
-    right_eye: bool = Field(
-        False,
-        description="learn from the right picture too, for stereo displays: that eye is drawn 1 to 2 dB "
-        "better, the left one 0.3 to 0.8 dB worse, in a third more time",
-    )
     smoothing: bool = Field(True, description="the 3D filter of Mip-Splatting: nothing finer than was seen")
     skip_duplicates: bool = Field(True, description="a frame equal to its predecessor is not mapped again")
     skip_depth: bool = Field(True, description="when time is short, match depth in some of the frames only")
@@ -753,3 +747,10 @@ class LaunchConfig(Section):
         if isinstance(self.source, VideosSource) and self.source.geometry.layout != "separate":
             return False
         return isinstance(self.source, FoldersSource | VideosSource) and self.source.right is None
+
+
+# Keys of earlier versions, and what stands in their place: an error says it.
+REMOVED = {
+    "mapping.right_eye": "publish.right draws the right eye, and learns from what it sees",
+    "vision.stereo.method": "inverse search matches; SGBM is a baseline of `python -m benchmarks depth`",
+}

@@ -1,4 +1,4 @@
-"""Reads launch files. An unknown key is an error that names the nearest known one."""
+"""Reads launch files. An unknown key is an error that names the nearest known one, or what replaced it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any, get_args
 
 from pydantic import ValidationError
 
-from sags_node.config import LaunchConfig, LiveSource, PhantomSource, Section, Source
+from sags_node.config import REMOVED, LaunchConfig, LiveSource, PhantomSource, Section, Source
 from sags_node.errors import UsageError, brief
 from sags_node.files import open_file
 from sags_node.yaml_reader import parse_yaml, read_yaml
@@ -197,7 +197,7 @@ def _set(tree: dict[str, Any], key: str, value: Any, said: str) -> None:
 
 
 def _explain(error: ValidationError, name: str, given: Sequence[str] = ()) -> str:
-    """One line per mistake: where, what, and the nearest known key for an unknown one.
+    """One line per mistake: where, what, and for an unknown key what replaced it or the nearest known one.
 
     Args:
         name: of what was read.
@@ -209,7 +209,9 @@ def _explain(error: ValidationError, name: str, given: Sequence[str] = ()) -> st
         path = [str(part) for part in item["loc"]]
         where = ".".join(part for part in path if part not in _SOURCES)
         said = COMMAND_LINE if any(f"{where}.".startswith(f"{key}.") for key in given) else name
-        if item["type"] == "extra_forbidden":
+        if item["type"] == "extra_forbidden" and where in REMOVED:
+            lines.append(f"{said}: there is no {where} any more: {REMOVED[where]}")
+        elif item["type"] == "extra_forbidden":
             lines.append(f"{said}: unknown key '{where}'; {_nearest(path)}")
         elif item["type"] == "missing":
             lines.append(f"{said}: {where} is missing; set it")

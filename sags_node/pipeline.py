@@ -196,7 +196,7 @@ class Pipeline:
         with watch("depth"):
             seen_by_both = _without(tissue, hidden.right)
             measured = self._measured(frame, seen, seen_by_both, still, budget, eyes)
-            observation = observe(seen, tissue, measured, self._config.mapping.right_eye)
+            observation = observe(seen, tissue, measured)
         if scene.guess is not None:
             self.mapper.found_again(observation, scene.guess)
         if self._tracker is not None:

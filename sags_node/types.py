@@ -175,7 +175,6 @@ class Observation:
     depth: F32  # [H, W] m, 0 unknown
     depth_confidence: F32  # [H, W] 0..1
     depth_is_new: bool = True  # measured in this frame; else in an earlier one, since which nothing has moved
-    right: F32 | None = None  # [H, W, 3] RGB 0..1, the right eye, if the mapper is to learn from it
     baseline: float = 0.0  # m, to the right eye
     pyramid: GrayPyramid | None = None  # of `gray`, where it is made already
     grid: DepthGrid | None = None  # of `depth`, where it is made already

@@ -167,7 +167,7 @@ class Views:
             shown = _published(scene, camera) if eye == "right" and ahead == 0 else None
             if shown is None:
                 seen = for_right_eye(gaussians, snapshot) if eye == "right" else gaussians
-                planes = self._rasterizers[size].forward(seen, [camera])[0]
+                planes = self._rasterizers[size].forward(seen, camera)
                 shown = to_view(planes, camera, snapshot.frame_id, snapshot.t_capture_ns)
             pictures[eye] = with_confidence(shown, gaussians)
         spent = self._processor_clock() - started

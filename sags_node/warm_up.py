@@ -42,7 +42,7 @@ def warm_up(config: LaunchConfig) -> None:
     small = config.model_copy(
         update={
             "vision": VisionConfig(stereo=config.vision.stereo, pose=config.vision.pose),
-            "mapping": MappingConfig(max_gaussians=1000, right_eye=config.mapping.right_eye),
+            "mapping": MappingConfig(max_gaussians=1000),
         }
     )
     pipeline = Pipeline(small, _rig())

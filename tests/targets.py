@@ -20,7 +20,7 @@ import llvmlite.binding as llvm
 
 ROOT = Path(__file__).parent.parent
 TESTS = (
-    "rasterize", "cameras_and_tiles", "projection", "losses", "photometric", "ssim", "adam", "hexplane",
+    "rasterize", "tiles", "projection", "losses", "photometric", "ssim", "adam", "hexplane",
     "decoder", "residuals", "skinning", "kernels", "matching_kernels", "engine_stress", "replay",
 )  # fmt: skip
 THREADS = (1, 2)

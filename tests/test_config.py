@@ -1,12 +1,13 @@
 """Launch files: every key is known, paths are found, mistakes are explained."""
 
+import re
 from pathlib import Path
 from typing import Any
 
 import pytest
 from places import ROOT
 
-from sags_node.config import FoldersSource, LaunchConfig, MappingConfig, PanesSource, VisionConfig
+from sags_node.config import REMOVED, FoldersSource, LaunchConfig, MappingConfig, PanesSource, VisionConfig
 from sags_node.errors import UsageError
 from sags_node.launch_file import load_launch, with_parameters
 
@@ -49,10 +50,10 @@ def test_overrides_win_over_the_file() -> None:
     [
         ("mapping.budgt_ms:=3", "did you mean 'budget_ms'"),
         ("source.secnds:=3", "did you mean 'seconds'"),
-        ("vision.stereo.methd:=sgbm", "did you mean 'method'"),
+        ("vision.stereo.scal:=2", "did you mean 'scale'"),
         ("zzz:=3", "known keys: "),
         ("mapping.budget_ms:=-1", "greater than 0"),
-        ("vision.stereo.method:=magic", "'dis' or 'sgbm'"),
+        ("vision.pose:=magic", "'session', 'fixed', 'estimate' or 'refine'"),
         ("vision.stereo:={min_depth: 0.2, max_depth: 0.1}", "must be below max_depth"),
         ("source.kind:=carrier_pigeon", "'folders'"),
         ("mapping.budget_ms", "key:=value"),
@@ -110,6 +111,15 @@ def test_one_side_of_the_working_size_keeps_the_proportions(
     asked: dict[str, int], size: tuple[int, int]
 ) -> None:
     assert VisionConfig(**asked).working_size(960, 768) == size  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("key", REMOVED)
+def test_a_key_that_is_gone_says_what_stands_in_its_place(key: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        load_launch(None, [f"{key}:=1"])
+    assert str(caught.value) == f"command line: there is no {key} any more: {REMOVED[key]}"
+    with pytest.raises(UsageError, match=re.escape(f"there is no {key} any more")):
+        with_parameters(LaunchConfig(), {key: 1})
 
 
 def test_parameters_are_validated_like_a_file() -> None:

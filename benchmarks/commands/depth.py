@@ -67,8 +67,8 @@ def bench_depth(
 ) -> None:
     """How right the depth is, and how much there is of it.
 
-    The stereo stage with both methods at every scale, beside OpenCV's SGBM as its own sample sets it up, and
-    a network where one is given.
+    The stereo stage at every scale, beside OpenCV's SGBM in its place and as its own sample sets it up, and a
+    network where one is given.
     Median, 90th percentile and median signed error (below 0: too near), the share of the tissue that has a
     depth, the time of one pair, and whether the confidence orders the errors.
 

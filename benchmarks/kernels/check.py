@@ -22,7 +22,6 @@ SETTINGS = (
     "width",
     "height",
     "scene",
-    "cameras",
     "active_tiles",
     "sh_degree",
     "threads",

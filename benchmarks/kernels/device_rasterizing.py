@@ -46,16 +46,16 @@ class DeviceDrawing:
     """One case on a device, drawn by any rasteriser there."""
 
     def __init__(self, case: RasterCase, rasterizer: DeviceRasterizer) -> None:
-        gaussians, cameras = make_scene(case)
+        gaussians, camera = make_scene(case)
         v_planes, weight = make_cotangents(case)
         self.rasterizer = rasterizer
         self.gaussians = DeviceGaussians.from_host(gaussians, rasterizer.device)
-        self.pinholes = [as_pinhole(camera) for camera in cameras]
+        self.pinhole = as_pinhole(camera)
         self.v_planes = torch.tensor(v_planes, device=rasterizer.device)
         self._weight = torch.tensor(weight, device=rasterizer.device)
 
     def forward(self) -> Tensor:
-        return self.rasterizer.draw(self.gaussians, self.pinholes)
+        return self.rasterizer.draw(self.gaussians, self.pinhole)
 
     def forward_backward(self) -> DeviceGradients:
         self.forward()

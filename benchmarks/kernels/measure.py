@@ -117,7 +117,6 @@ def raster_cases(settings: Settings, thread_counts: list[int]) -> Iterator[Raste
         yield replace(second, threads=threads)
     for scene in ("corner", "shuffled"):
         yield replace(second, scene=scene)
-    yield replace(second, cameras=2)
     yield replace(second, sh_degree=3)
     for share in ACTIVE_SHARES:
         yield replace(second, active_tiles=share)

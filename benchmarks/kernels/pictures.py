@@ -43,7 +43,7 @@ def measure_losses(
     """One row of the table: of a drawn surface against a darker picture of itself. The calling thread must be
     set to `threads`, and `peak` be that of them."""
     gaussians, camera = surface(count, width, height)
-    (planes,) = make_rasterizer("numba", width, height).forward(gaussians, [camera])
+    planes = make_rasterizer("numba", width, height).forward(gaussians, camera)
     view = views.to_view(planes, camera, 0, 0)
     image, tissue = 0.9 * view.rgb, np.ones((height, width), np.bool_)
     v_planes, weight = np.empty_like(planes), np.empty_like(view.depth)

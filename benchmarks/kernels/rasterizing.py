@@ -39,7 +39,6 @@ STAGES: Stages = {
 # multiply-add, a rounding, a shift, a division count as one each. The AVX-512 machine code of the innermost
 # loops holds as many vector instructions beside its loads and stores.
 OPERATIONS_PER_PAIR = {"composite": 18, "composite backward": 36}
-BASELINE = 4e-3  # m, between the two eyes of a stereo endoscope
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +50,6 @@ class RasterCase:
     height: int
     threads: int
     scene: str = "surface"
-    cameras: int = 1
     active_tiles: float = 1.0  # share of the tiles
     sh_degree: int = 0
 
@@ -104,7 +102,6 @@ def time_drawing(
         "width": case.width,
         "height": case.height,
         "scene": case.scene,
-        "cameras": case.cameras,
         "active_tiles": case.active_tiles,
         "sh_degree": case.sh_degree,
         "threads": case.threads,
@@ -129,31 +126,31 @@ class Drawing:
     """One case on the host's arrays."""
 
     def __init__(self, case: RasterCase, backend: str = "numba") -> None:
-        self.gaussians, self._cameras = make_scene(case)
+        self.gaussians, self._camera = make_scene(case)
         self._tiles = _active_tiles(case)
         self._v_planes, self._weight = make_cotangents(case)
         self._rasterizer = make_rasterizer(backend, case.width, case.height)
 
     def forward(self) -> F32:
-        return self._rasterizer.forward(self.gaussians, self._cameras, self._tiles)
+        return self._rasterizer.forward(self.gaussians, self._camera, self._tiles)
 
     def forward_backward(self) -> None:
         self.forward()
         self._rasterizer.backward(self._v_planes, self._weight)
 
 
-def make_scene(case: RasterCase) -> tuple[Gaussians, list[Camera]]:
+def make_scene(case: RasterCase) -> tuple[Gaussians, Camera]:
     """What is drawn, and for whom."""
-    gaussians, left = SCENES[case.scene](case.count, case.width, case.height)
+    gaussians, camera = SCENES[case.scene](case.count, case.width, case.height)
     if case.sh_degree > 0:
         gaussians = with_harmonics(gaussians, case.sh_degree)
-    return gaussians, [left.moved_right(eye * BASELINE) for eye in range(case.cameras)]
+    return gaussians, camera
 
 
 def make_cotangents(case: RasterCase) -> tuple[F32, F32]:
-    """Random ones of the planes [C, 5, H, W], and the pixels' weights [C, H, W]."""
-    size = (case.cameras, case.height, case.width)
-    v_planes = np.random.default_rng(0).normal(size=(size[0], 5, *size[1:]))
+    """Random ones of the planes [5, H, W], and the pixels' weights [H, W]."""
+    size = (case.height, case.width)
+    v_planes = np.random.default_rng(0).normal(size=(5, *size))
     return v_planes.astype(np.float32), np.ones(size, np.float32)
 
 
@@ -161,7 +158,7 @@ def _active_tiles(case: RasterCase) -> Bool | None:
     """The tiles that are drawn, spread at random; None: all."""
     if case.active_tiles == 1.0:
         return None
-    shape = (case.cameras, -(-case.height // TILE_HEIGHT), -(-case.width // TILE_WIDTH))
+    shape = (-(-case.height // TILE_HEIGHT), -(-case.width // TILE_WIDTH))
     order = np.random.default_rng(0).permutation(int(np.prod(shape)))
     return (order < case.active_tiles * order.size).reshape(shape)
 

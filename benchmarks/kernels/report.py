@@ -177,7 +177,7 @@ def add_stages(made: Table, row: Row, of: str) -> None:
 
 
 def _is_plain(row: Row, threads: int) -> bool:
-    special = row["cameras"] > 1 or row["sh_degree"] > 0 or row["active_tiles"] < 1
+    special = row["sh_degree"] > 0 or row["active_tiles"] < 1
     return not special and row["scene"] == "surface" and row["threads"] == threads
 
 
@@ -185,8 +185,6 @@ def drawing_name(row: Row) -> str:
     parts = [f"{_count(row['n'])} at {row['width']}x{row['height']}"]
     if row["scene"] != "surface":
         parts.append(row["scene"])
-    if row["cameras"] > 1:
-        parts.append(f"{row['cameras']} cameras")
     if row["sh_degree"] > 0:
         parts.append(f"harmonics of degree {row['sh_degree']}")
     if row["active_tiles"] < 1:

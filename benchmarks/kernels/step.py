@@ -68,11 +68,11 @@ class _Step:
         self._weights = _Trained(self._decoder.values[None])
         self._rasterizer = make_rasterizer("numba", case.width, case.height)
         self._loss = PhotometricLoss(case.width, case.height, WITH_SSIM if structural else WITHOUT_SSIM)
-        planes = self._rasterizer.forward(gaussians, [self._camera])
-        view = to_view(planes[0], self._camera, 0, 0)
+        planes = self._rasterizer.forward(gaussians, self._camera)
+        view = to_view(planes, self._camera, 0, 0)
         self._image, self._depth = 0.9 * view.rgb, view.depth
         self._tissue = np.ones(view.depth.shape, np.bool_)
-        self._v_planes, self._weight = np.empty_like(planes), np.empty((1, *view.depth.shape), np.float32)
+        self._v_planes, self._weight = np.empty_like(planes), np.empty_like(view.depth)
         functions: dict[str, Callable[..., Any]] = {
             "HexPlane": self._field.forward,
             "decoder": self._decoder.forward,
@@ -92,8 +92,8 @@ class _Step:
         features = stages["HexPlane"](self._cells.values, rows[:, columns.MEAN], MOMENT)
         deltas = stages["decoder"](features)
         gaussians = stages["activate"](rows + DELTA_SCALE * deltas, self._ids, None)
-        (planes,) = stages["draw"](gaussians, [self._camera])
-        stages["loss"](planes, self._image, self._tissue, self._depth, self._v_planes[0], self._weight[0])
+        planes = stages["draw"](gaussians, self._camera)
+        stages["loss"](planes, self._image, self._tissue, self._depth, self._v_planes, self._weight)
         gradients = stages["draw backward"](self._v_planes, self._weight)
         v_rows = stages["activate backward"](gaussians, gradients)
         v_features = stages["decoder backward"](DELTA_SCALE * v_rows)

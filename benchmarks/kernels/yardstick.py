@@ -2,8 +2,8 @@
 
 A ratio of two times on one machine in one run says how good machine code is; the times themselves say more
 about the machine. The program is one file, not part of this project. It is compiled for this processor, and
-exports what `_Program` calls: project, sort, bin, blend, and the same backwards. It gives neither
-contributions nor gradients of the pose, which ours does, and its screen filter is 0.3 px^2.
+exports what `_Program` calls: project, sort, bin, blend, and the same backwards. It gives no
+contributions, which ours does, and its screen filter is 0.3 px^2.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def _compare(library: ctypes.CDLL, case: RasterCase, runs: int) -> dict[str, Any
         "forward_backward_ms": both_ms,
         "yardstick_forward_backward_ms": program_both_ms,
         "forward_backward_ratio": both_ms / program_both_ms,
-        "pictures_apart": float(np.abs(program.picture - ours.forward()[0, :3]).mean()),
+        "pictures_apart": float(np.abs(program.picture - ours.forward()[:3]).mean()),
     }
 
 
@@ -148,7 +148,7 @@ class _Program:
 
     def __init__(self, library: ctypes.CDLL, case: RasterCase) -> None:
         self._library = library
-        gaussians, (camera,) = make_scene(case)
+        gaussians, camera = make_scene(case)
         n = self._count = len(gaussians)
         given = (
             gaussians.means * MILLIMETRE, gaussians.quats, gaussians.scales * MILLIMETRE,
@@ -175,7 +175,7 @@ class _Program:
         self._ends = _Buffer((columns * rows,), np.uint32)
         self._statistics = _Buffer((2,), np.int64)
         self._planes, self._v_planes = _Buffer(planes), _Buffer(planes)
-        self._v_planes.array[:, : case.height, : case.width] = make_cotangents(case)[0][0]
+        self._v_planes.array[:, : case.height, : case.width] = make_cotangents(case)[0]
         self._v_planes.array[3] /= MILLIMETRE  # of the depth
         self._outputs = [_Buffer(array.shape) for array in given]
 

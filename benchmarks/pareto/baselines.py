@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.quality.sgbm import JudgedSGBM
 from sags_node.config import Box
 from sags_node.engine.rasterizer.rasterize import Rasterizer, make_rasterizer, to_view
 from sags_node.errors import UsageError
@@ -24,7 +25,6 @@ from sags_node.session import Session
 from sags_node.sources.source import open_source
 from sags_node.types import U8, Bool, StereoRig
 from sags_node.vision.rectify import Rectifier
-from sags_node.vision.stereo import StereoDepth
 
 SGBM_SCALES = (1, 2)
 
@@ -53,12 +53,7 @@ def measured_baselines(
     usable = right_pixels(session.rig, size, config.vision.tissue.exclude)
     rasterizer = make_rasterizer(config.engine.backend, *size)
     matchers = [
-        StereoDepth(
-            config.vision.stereo.model_copy(update={"method": "sgbm", "scale": scale}),
-            rectifier.camera,
-            rectifier.baseline,
-        )
-        for scale in SGBM_SCALES
+        JudgedSGBM(config.vision.stereo, rectifier.camera, rectifier.baseline, scale) for scale in SGBM_SCALES
     ]
     places = {frame_id: place for place, frame_id in enumerate(spool.frame_ids)}
     warped: list[FrameRow] = []
@@ -171,8 +166,8 @@ def _right_views(
     mask = right_eye_mask(shown.tissue, depths, focal_px, shown.baseline) & usable
     warp, known = warp_to_right(metrics.as_float(left), shown.measured_depth, focal_px, shown.baseline)
     right_camera = camera.moved_right(shown.baseline)
-    planes = rasterizer.forward(shown.snapshot.gaussians, [right_camera])
-    model = to_view(planes[0], right_camera, 0, 0).rgb
+    planes = rasterizer.forward(shown.snapshot.gaussians, right_camera)
+    model = to_view(planes, right_camera, 0, 0).rgb
     truth, both = metrics.as_float(right), mask & known
     warp_psnr, model_psnr = (
         metrics.psnr(metrics.fit_gain_offset(picture, truth, both), truth, both) for picture in (warp, model)

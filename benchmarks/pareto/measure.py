@@ -211,8 +211,8 @@ class _Comparison:
                 if place is None:
                     continue
                 pair = rectifier(frame)
-                planes = rasterizer.forward(spool.read(place).snapshot.gaussians, [pair.camera])
-                view = to_view(planes[0], pair.camera, 0, 0)
+                planes = rasterizer.forward(spool.read(place).snapshot.gaussians, pair.camera)
+                view = to_view(planes, pair.camera, 0, 0)
                 shown = metrics.as_float(cv2.convertScaleAbs(view.rgb, alpha=255))
                 quality = metrics.psnr(shown, metrics.as_float(pair.left), tissue_of(frame, pair))
                 rows.append(FrameRow(frame.frame_id, 0.0, {"online": {"psnr": quality}}))

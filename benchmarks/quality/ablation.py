@@ -178,7 +178,7 @@ def _smaller(fit: Fit, frames: Iterable[ClipFrame], factor: int) -> float:
             K=scale_intrinsics(frame.camera.K, (across, rows), (width, height)),
         )
         rasterizer = make_rasterizer("numba", width, height, fit.settings.antialias)
-        planes = rasterizer.forward(fit.gaussians(frame), [camera])[0]
+        planes = rasterizer.forward(fit.gaussians(frame), camera)
         shown = to_view(planes, camera, frame.frame_id, frame.t_capture_ns).rgb
         picture = metrics.as_float(frame.image)[:rows, :across]
         truth = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)

@@ -73,7 +73,7 @@ class Trained:
     def draw(self, camera: Camera) -> F32:
         """[H, W, 3]"""
         rasterizer = make_rasterizer("numba", camera.width, camera.height, self.antialias)
-        return to_view(rasterizer.forward(self.gaussians, [camera])[0], camera, 0, 0).rgb
+        return to_view(rasterizer.forward(self.gaussians, camera), camera, 0, 0).rgb
 
 
 def train(observation: Observation, filters: Filters, settings: Settings) -> Trained:

@@ -1,4 +1,4 @@
-"""Depth from stereo against what is known to be true: the node's stage in every setting, and plain SGBM."""
+"""Depth from stereo against what is known to be true: the node's stage at every scale, and SGBM."""
 
 from __future__ import annotations
 
@@ -10,15 +10,14 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from benchmarks.quality.depth_regions import regions_of
+from benchmarks.quality.sgbm import JudgedSGBM, PlainSGBM
 from sags_node.config import OnnxConfig, PhantomSource, StereoConfig, VisionConfig
 from sags_node.errors import SagsError
 from sags_node.evaluation import metrics
 from sags_node.evaluation.provenance import machine_name
-from sags_node.geometry import disparity_to_depth
 from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import StepBudget
 from sags_node.phantom.scene import Phantom
@@ -45,42 +44,6 @@ FAULTS: dict[str, tuple[float, ...]] = {  # what `PhantomSource` calls it -> lev
 
 Matcher = Callable[[RectifiedPair, Bool], tuple[F32, F32]]  # depth (m, 0 unknown) and confidence, [H, W]
 Advance = Callable[[int, int | None, str], None]  # done, of, what
-
-
-class PlainSGBM:
-    """OpenCV's StereoSGBM as its own sample `stereo_match.py` sets it up, and nothing around it."""
-
-    def __init__(self, config: StereoConfig, camera: Camera, baseline: float, scale: int) -> None:
-        self._size = round(camera.width / scale), round(camera.height / scale)
-        self._focal = float(camera.K[0, 0]) * self._size[0] / camera.width
-        self._baseline = baseline
-        self._smallest = int(self._focal * baseline / config.max_depth)
-        count = 16 * int(np.ceil((self._focal * baseline / config.nearest - self._smallest) / 16))
-        block = 5  # px
-        self._matcher = cv2.StereoSGBM.create(
-            minDisparity=self._smallest,
-            numDisparities=count,
-            blockSize=block,
-            P1=8 * block**2,
-            P2=32 * block**2,
-            disp12MaxDiff=1,
-            uniquenessRatio=10,
-            speckleWindowSize=100,
-            speckleRange=2,
-        )
-
-    def __call__(self, pair: RectifiedPair, tissue: Bool) -> tuple[F32, F32]:
-        assert pair.right is not None  # there is nothing to match without
-        left, right = (
-            cv2.resize(cv2.cvtColor(eye, cv2.COLOR_RGB2GRAY), self._size, interpolation=cv2.INTER_AREA)
-            for eye in (pair.left, pair.right)
-        )
-        sixteenths = self._matcher.compute(left, right)
-        known = sixteenths >= self._smallest * 16  # what is lower marks a pixel without a match
-        disparity = np.where(known, sixteenths.astype(np.float32) / np.float32(16), np.float32(0))
-        depth = disparity_to_depth(disparity, self._focal, self._baseline)
-        depth = metrics.resample_nearest(depth, tissue.shape[1], tissue.shape[0]) * tissue
-        return depth, (depth > 0).astype(np.float32)
 
 
 def network_matcher(file: Path, config: StereoConfig, camera: Camera, baseline: float) -> Matcher:
@@ -113,10 +76,11 @@ def make_matchers(
         UsageError: the pictures are too small to match at `SCALES`, or the file is no depth network.
     """
     matchers: dict[str, Matcher] = {"as configured": StereoDepth(config, camera, baseline)}
-    for method, name in (("dis", "inverse search"), ("sgbm", "SGBM, judged")):
-        for scale in SCALES:
-            setting = config.model_copy(update={"method": method, "scale": scale})
-            matchers[f"{name}, scale {scale}"] = StereoDepth(setting, camera, baseline)
+    for scale in SCALES:
+        setting = config.model_copy(update={"scale": scale})
+        matchers[f"inverse search, scale {scale}"] = StereoDepth(setting, camera, baseline)
+    for scale in SCALES:
+        matchers[f"SGBM, judged, scale {scale}"] = JudgedSGBM(config, camera, baseline, scale)
     for scale in PLAIN_SCALES:
         matchers[f"plain SGBM, scale {scale}"] = PlainSGBM(config, camera, baseline, scale)
     if network is not None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -46,8 +45,7 @@ class Pinhole:
 
 @dataclass(frozen=True, slots=True)
 class Gradients:
-    """Derivatives with respect to what was drawn, summed over the cameras; rows of Gaussians that were not
-    drawn are zero."""
+    """Derivatives with respect to what was drawn; rows of Gaussians that were not drawn are zero."""
 
     means: F32  # [N, 3] per m
     quats: F32  # [N, 4] of the given, not normalised, quaternion
@@ -55,17 +53,15 @@ class Gradients:
     opacities: F32  # [N] before the filters
     colors: F32  # [N, 3]
     sh_rest: F32  # [N, K - 1, 3]; [N, 0, 3] without spherical harmonics
-    poses: F64  # [C, 6] per m and per rad: of a small motion (translation, rotation vector) of each camera's
-    # view, viewmat' = exp(twist) viewmat
     contribution: F32  # [N] sum over pixels of (blending weight of this Gaussian) * (weight of the pixel)
 
 
 class Backend(Protocol):
     """One implementation of the arithmetic; `make_rasterizer` wraps it with the checks."""
 
-    def forward(self, gaussians: Gaussians, pinholes: Sequence[Pinhole], tiles: Bool | None) -> F32: ...
+    def forward(self, gaussians: Gaussians, pinhole: Pinhole, tiles: Bool | None) -> F32: ...
 
-    def backward(self, v_planes: F32, weight: F32, geometry: bool) -> Gradients: ...
+    def backward(self, v_planes: F32, weight: F32) -> Gradients: ...
 
     def median(self) -> tuple[F32, I32]: ...
 
@@ -73,18 +69,18 @@ class Backend(Protocol):
 class Rasterizer(Protocol):
     """Draws Gaussians and differentiates the drawing. Not for use by two threads at once."""
 
-    def forward(self, gaussians: Gaussians, cameras: Sequence[Camera], tiles: Bool | None = None) -> F32:
-        """Draw for one or several cameras of the same picture size, both eyes for example.
+    def forward(self, gaussians: Gaussians, camera: Camera, tiles: Bool | None = None) -> F32:
+        """Draw for a camera.
 
         Args:
             gaussians: what is drawn.
-            cameras: C of them.
-            tiles: [C, ceil(H / TILE_HEIGHT), ceil(W / TILE_WIDTH)] True: this tile is drawn. The pixels of
-                the others keep what the call before left there, and their part of `v_planes` is ignored.
-                None: all are drawn.
+            camera: of the rasteriser's picture size.
+            tiles: [ceil(H / TILE_HEIGHT), ceil(W / TILE_WIDTH)] True: this tile is drawn. The pixels of the
+                others keep what the call before left there, and their part of `v_planes` is ignored. None:
+                all are drawn.
 
         Returns:
-            Planes [C, 5, H, W]: sums over the Gaussians of w r, w g, w b, w z (m) and w, where
+            Planes [5, H, W]: sums over the Gaussians of w r, w g, w b, w z (m) and w, where
             w = alpha * transmittance; not normalised. A view into own memory, overwritten by the next
             `forward`.
 
@@ -94,13 +90,12 @@ class Rasterizer(Protocol):
         """
         ...
 
-    def backward(self, v_planes: F32, weight: F32, geometry: bool = True) -> Gradients:
+    def backward(self, v_planes: F32, weight: F32) -> Gradients:
         """Gradients of sum(v_planes * planes) for the last `forward`, whose arrays must be unchanged.
 
         Args:
-            v_planes: [C, 5, H, W] cotangent of the planes.
-            weight: [C, H, W] pixel weights for `Gradients.contribution`.
-            geometry: False leaves out everything but colours and contribution: it comes back empty, [0, ...].
+            v_planes: [5, H, W] cotangent of the planes.
+            weight: [H, W] pixel weights for `Gradients.contribution`.
 
         Returns:
             Views into own memory, overwritten by the next `backward`.
@@ -108,6 +103,6 @@ class Rasterizer(Protocol):
         ...
 
     def median(self) -> tuple[F32, I32]:
-        """Where the transmittance of the last `forward` falls to one half: depth [C, H, W] m and row of that
-        Gaussian [C, H, W]. Where it stays above: 0 and -1. Tiles that were not drawn keep what was there."""
+        """Where the transmittance of the last `forward` falls to one half: depth [H, W] m and row of that
+        Gaussian [H, W]. Where it stays above: 0 and -1. Tiles that were not drawn keep what was there."""
         ...

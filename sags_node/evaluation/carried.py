@@ -55,7 +55,7 @@ def carried(rasterizer: Rasterizer, middle: Gaussians, camera: Camera, around: S
             seen.picture, places, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
         )
         weights += weight
-    drawn = to_view(rasterizer.forward(middle, [camera])[0], camera, 0, 0).rgb
+    drawn = to_view(rasterizer.forward(middle, camera), camera, 0, 0).rgb
     found: F32 = np.where(weights > 0, total / np.maximum(weights, np.float32(1e-6)), drawn)
     return np.clip(found, 0, 1)
 
@@ -70,7 +70,7 @@ def _displaced(rasterizer: Rasterizer, middle: Gaussians, camera: Camera, seen: 
     there, _ = project(seen.camera, seen.gaussians.means[rows])
     known = (seen.gaussians.ids[rows] == middle.ids)[:, None] & np.isfinite(there) & np.isfinite(pixels)
     displacement[:, :2] = np.where(known, there - pixels, 0)
-    planes = rasterizer.forward(replace(middle, colors=displacement, sh_rest=None), [camera])[0]
+    planes = rasterizer.forward(replace(middle, colors=displacement, sh_rest=None), camera)
     covered = planes[4] > COVERED
     moved = np.where(covered, planes[:2] / np.where(covered, planes[4], np.float32(1)), np.float32(0))
     places: F32 = np.moveaxis(np.indices(covered.shape, np.float32)[::-1] + moved, 0, -1)

@@ -268,14 +268,14 @@ class Measurer:
         return figures
 
     def _draw(self, gaussians: Gaussians, camera: Camera) -> F32:
-        return to_view(self._rasterizer.forward(gaussians, [camera])[0], camera, 0, 0).rgb
+        return to_view(self._rasterizer.forward(gaussians, camera), camera, 0, 0).rgb
 
     def _right_eye(
         self, shown: SpooledFrame, left: U8, picture: U8, frame: StereoFrame
     ) -> dict[str, Figures]:
         """PSNR of the right eye's picture, each after a fit of gain and offset. `novel`: of the model alone;
-        the mapper never saw it, unless `mapping.right_eye` is set. `right`: of what was shown, of the left
-        picture warped by the stereo stage's depth, where that is known, and of the right picture before."""
+        the mapper never saw it. `right`: of what was shown, of the left picture warped by the stereo stage's
+        depth, where that is known, and of the right picture before."""
         if self._usable_right is None:
             self._usable_right = self._right_pixels(frame)
         camera, focal_px = shown.snapshot.camera, float(shown.snapshot.camera.K[0, 0])

@@ -121,7 +121,6 @@ def measure(
         "overrides": list(overrides),
         "pace": None if isinstance(config.source, LiveSource) else config.source.pace,
         "iterations": config.mapping.iterations,
-        "right_eye": config.mapping.right_eye,
         "max_gaussians": affordable(config, *session.working_size),
         "backend": config.engine.backend,
         "device": device_of(config).kind,

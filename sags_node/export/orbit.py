@@ -35,7 +35,7 @@ def orbit(camera: Camera, distance: float, degrees: float, count: int) -> Iterat
 
 def picture_of(rasterizer: Rasterizer, gaussians: Gaussians, eye: Camera) -> tuple[U8, F32]:
     """Gaussians as a camera sees them, RGB [H, W, 3], and their depth [H, W] m."""
-    view = to_view(rasterizer.forward(gaussians, [eye])[0], eye, 0, 0)
+    view = to_view(rasterizer.forward(gaussians, eye), eye, 0, 0)
     alpha = view.alpha[..., None]
     rgb = view.rgb * alpha + np.float32(BACKGROUND) * (1 - alpha)
     return cv2.convertScaleAbs(rgb, alpha=255.0), view.depth

@@ -89,9 +89,9 @@ def _drawn(scene: Scene, cameras: list[Camera]) -> Iterator[tuple[F32, F32]]:
     first = cameras[0]
     rasterizer = make_rasterizer("numba", first.width, first.height)
     for camera in cameras:
-        view = to_view(rasterizer.forward(scene.gaussians, [camera])[0], camera, 0, scene.t_capture_ns)
+        view = to_view(rasterizer.forward(scene.gaussians, camera), camera, 0, scene.t_capture_ns)
         view = with_confidence(view, scene.gaussians)
-        apart = np.abs(view.depth - rasterizer.median()[0][0])
+        apart = np.abs(view.depth - rasterizer.median()[0])
         agree = apart < AGREEMENT_PX * view.depth / np.float32(camera.K[0, 0])
         if camera is first and not agree.any():
             raise SagsError("the left camera sees nothing of the model; export another moment")

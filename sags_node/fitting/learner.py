@@ -88,8 +88,8 @@ class CpuLearner:
         self._rasterizer = rasterizer
         self._loss = PhotometricLoss(width, height, settings.weights)
         self._unseen = unseen
-        self._v_planes = np.zeros((1, 5, height, width), np.float32)
-        self._weight = np.zeros((1, height, width), np.float32)
+        self._v_planes = np.zeros((5, height, width), np.float32)
+        self._weight = np.zeros((height, width), np.float32)
 
     def begin(self, model: DeformableModel, density: Density) -> None:
         self._model, self._density = model, density
@@ -99,9 +99,9 @@ class CpuLearner:
     ) -> None:
         observation = frame.observation()
         gaussians = self._model.at(frame.t_capture_ns, [frame.camera], deformed)
-        planes = self._rasterizer.forward(gaussians, [frame.camera])
+        planes = self._rasterizer.forward(gaussians, frame.camera)
         self.residual = self._loss.evaluate(
-            planes[0], observation.image, frame.tissue, frame.depth, self._v_planes[0], self._weight[0],
+            planes, observation.image, frame.tissue, frame.depth, self._v_planes, self._weight,
             self._unseen,
         ).color  # fmt: skip
         gradients = self._rasterizer.backward(self._v_planes, self._weight)
@@ -111,9 +111,9 @@ class CpuLearner:
     def refine(self, frame: ClipFrame, rates: F32, relaxation: float, field_rates: FieldRates) -> None:
         observation = frame.observation()
         gaussians = self._model.at(frame.t_capture_ns, [frame.camera])
-        planes = self._rasterizer.forward(gaussians, [frame.camera])
+        planes = self._rasterizer.forward(gaussians, frame.camera)
         self.residual = tissue_loss(
-            planes[0], observation.image, frame.tissue, frame.depth, self._v_planes[0], self._weight[0],
+            planes, observation.image, frame.tissue, frame.depth, self._v_planes, self._weight,
             DEPTH_WEIGHT, DEPTH_SCALE,
         )  # fmt: skip
         gradients = self._rasterizer.backward(self._v_planes, self._weight)

@@ -70,7 +70,7 @@ def score(
     """
     rows = []
     for done, frame in enumerate(frames):
-        planes = fit.rasterizer.forward(fit.gaussians(frame), [frame.camera])[0]
+        planes = fit.rasterizer.forward(fit.gaussians(frame), frame.camera)
         view = to_view(planes, frame.camera, frame.frame_id, frame.t_capture_ns)
         rows.append(_figures(view.rgb, frame, lpips))
         if pictures is not None:
@@ -123,7 +123,7 @@ def score_depth(fit: Fit, frames: Iterable[ClipFrame], segments: Segments) -> di
     for frame in frames:
         if frame.reference is None or frame.reference.depth is None:
             continue
-        planes = fit.rasterizer.forward(fit.gaussians(frame), [frame.camera])[0]
+        planes = fit.rasterizer.forward(fit.gaussians(frame), frame.camera)
         depth = to_view(planes, frame.camera, frame.frame_id, frame.t_capture_ns).depth
         height, width = frame.tissue.shape
         reference = metrics.resample_nearest(frame.reference.depth, width, height)

@@ -66,8 +66,8 @@ class StreamFit:
         self._model: WindowModel | None = None
         self._frames = 0
         self._loss = PhotometricLoss(width, height, LossWeights(coverage=0.1))
-        self._v_planes = np.zeros((1, 5, height, width), np.float32)
-        self._weight = np.zeros((1, height, width), np.float32)
+        self._v_planes = np.zeros((5, height, width), np.float32)
+        self._weight = np.zeros((height, width), np.float32)
         self._unseen = np.ones((height, width), np.bool_)
         self._drawn_ns: I64 = np.zeros(0, np.int64)  # [N] newest frame that each Gaussian had a part in
         self._rng = np.random.default_rng(settings.seed)
@@ -115,8 +115,7 @@ class StreamFit:
 
     def draw(self, t_ns: int, camera: Camera) -> F32:
         """Planes [5, H, W] of the model at a time within the window, in the rasteriser's memory."""
-        planes: F32 = self.rasterizer.forward(self.gaussians(t_ns, camera), [camera])[0]
-        return planes
+        return self.rasterizer.forward(self.gaussians(t_ns, camera), camera)
 
     def _keep(self, frame: ClipFrame) -> None:
         window_ns = round(self.settings.window * 1e9)
@@ -162,9 +161,9 @@ class StreamFit:
     def _step(self, frame: ClipFrame, speed: float = 1.0, deformed: bool = True) -> None:
         model, observation = self.model, frame.observation()
         gaussians = model.at(frame.t_capture_ns, [frame.camera], deformed)
-        planes = self.rasterizer.forward(gaussians, [frame.camera])
+        planes = self.rasterizer.forward(gaussians, frame.camera)
         self._loss.evaluate(
-            planes[0], observation.image, frame.tissue, frame.depth, self._v_planes[0], self._weight[0],
+            planes, observation.image, frame.tissue, frame.depth, self._v_planes, self._weight,
             self._unseen,
         )  # fmt: skip
         gradients = self.rasterizer.backward(self._v_planes, self._weight)

@@ -18,7 +18,7 @@ REACH = 32  # px: few Gaussians are larger, and those are faint out there
 
 
 def worst_tiles(planes: F32, image: F32, tissue: Bool, share: float) -> Bool:
-    """The tiles [1, rows, columns] of a picture with the largest squared colour residuals.
+    """The tiles [rows, columns] of a picture with the largest squared colour residuals.
 
     PSNR counts squares, and most of them stand in few tiles: a step on a sixth of the picture gains half of
     what a step on all of it does.
@@ -30,7 +30,7 @@ def worst_tiles(planes: F32, image: F32, tissue: Bool, share: float) -> Bool:
         share: of all tiles, 0..1; at least one is chosen.
     """
     chosen = tile_grid(tissue)
-    sums = np.zeros(chosen.shape[1:], np.float32)
+    sums = np.zeros(chosen.shape, np.float32)
     _sum_residuals(planes, image, tissue, sums)
     count = max(1, round(share * sums.size))
     chosen.ravel()[np.argpartition(sums.ravel(), -count)[-count:]] = True
@@ -38,30 +38,30 @@ def worst_tiles(planes: F32, image: F32, tissue: Bool, share: float) -> Bool:
 
 
 def tile_grid(mask: Bool) -> Bool:
-    """The rasteriser's tiles [1, rows, columns] of a picture as large as `mask` [H, W]; none is chosen."""
+    """The rasteriser's tiles [rows, columns] of a picture as large as `mask` [H, W]; none is chosen."""
     height, width = mask.shape
-    return np.zeros((1, -(-height // TILE_HEIGHT), -(-width // TILE_WIDTH)), np.bool_)
+    return np.zeros((-(-height // TILE_HEIGHT), -(-width // TILE_WIDTH)), np.bool_)
 
 
 def tiles_of(pixels: I32, mask: Bool) -> Bool:
-    """The tiles [1, rows, columns] of a picture as large as `mask` in which the pixels [M, 2] (x, y) lie."""
+    """The tiles [rows, columns] of a picture as large as `mask` in which the pixels [M, 2] (x, y) lie."""
     tiles = tile_grid(mask)
-    tiles[0, pixels[:, 1] // TILE_HEIGHT, pixels[:, 0] // TILE_WIDTH] = True
+    tiles[pixels[:, 1] // TILE_HEIGHT, pixels[:, 0] // TILE_WIDTH] = True
     return tiles
 
 
 def pixels_of(tiles: Bool, shape: tuple[int, ...]) -> Bool:
-    """The pixels [H, W] of the tiles [1, rows, columns] of a picture of that shape."""
-    rows = np.repeat(tiles[0], TILE_HEIGHT, axis=0)[: shape[0]]
+    """The pixels [H, W] of the tiles [rows, columns] of a picture of that shape."""
+    rows = np.repeat(tiles, TILE_HEIGHT, axis=0)[: shape[0]]
     return np.repeat(rows, TILE_WIDTH, axis=1)[:, : shape[1]]
 
 
 def with_neighbours(tiles: Bool) -> Bool:
-    """The tiles [1, rows, columns] and those less than `REACH` px away: a Gaussian may reach into them."""
+    """The tiles [rows, columns] and those less than `REACH` px away: a Gaussian may reach into them."""
     rows, columns = -(-REACH // TILE_HEIGHT), -(-REACH // TILE_WIDTH)
     window = np.ones((2 * rows + 1, 2 * columns + 1), np.uint8)
-    grown: U8 = cv2.dilate(tiles[0].view(np.uint8), window)
-    return grown.view(np.bool_)[None]
+    grown: U8 = cv2.dilate(tiles.view(np.uint8), window)
+    return grown.view(np.bool_)
 
 
 @parallel_kernel

@@ -13,7 +13,6 @@ from sags_node.engine.rasterizer.rasterize import Gradients, Rasterizer
 from sags_node.mapping.exposure import exposure_gain
 from sags_node.mapping.focus import pixels_of, tile_grid, worst_tiles
 from sags_node.mapping.optimiser import Optimiser, Rates
-from sags_node.mapping.right_eye import right_eye_loss
 from sags_node.model.deformation import NodeDeformation
 from sags_node.model.gaussians import GaussianModel
 from sags_node.types import F32, Bool, Camera, Finding, Gaussians, Observation
@@ -57,19 +56,19 @@ class Refiner(Protocol):
         """Write what was refined into the model and the nodes."""
 
     def draw(self) -> None:
-        """Draw the model for the frame's camera; the right eye too where it is learnt from."""
+        """Draw the model for the frame's camera."""
 
     def redraw(self, share: float, tiles: Bool) -> None:
-        """Draw the left eye as it is after the steps, to be shown.
+        """Draw the model as it is after the steps, to be shown.
 
         Args:
             share: of the picture, where it was worst before the steps. What else the steps changed, they
                 changed little: it keeps what was drawn before them. 1: all of it.
-            tiles: [1, rows, columns] that are drawn in any case, as those are that `refine_worst` drew.
+            tiles: [rows, columns] that are drawn in any case, as those are that `refine_worst` drew.
         """
 
     def planes(self) -> F32:
-        """[5, H, W] of the left eye, as they were drawn last; overwritten by the next drawing."""
+        """[5, H, W] as they were drawn last; overwritten by the next drawing."""
 
     def exposure_gain(self) -> F32:
         """[3] see `exposure.exposure_gain`, of what was drawn last."""
@@ -90,7 +89,7 @@ class Refiner(Protocol):
         """
 
     def touched(self) -> Bool:
-        """The tiles [1, rows, columns] that `refine_worst` drew since `begin`."""
+        """The tiles [rows, columns] that `refine_worst` drew since `begin`."""
 
     def show(self, gaussians: Gaussians, camera: Camera) -> F32:
         """Planes [5, H, W] of any Gaussians for any camera, in memory of their own; overwritten by the next
@@ -113,9 +112,9 @@ class CpuRefiner:
         self._rasterizers: dict[tuple[int, int], Rasterizer] = {}  # by the size of their pictures
         self._viewers: dict[tuple[int, int], Rasterizer] = {}  # those of `show`
         self._optimiser = Optimiser()
-        # [eyes, 5, H, W] and [eyes, H, W]; the planes are the rasteriser's memory: what it drew last
-        self._planes: F32 = np.zeros((1, 5, 1, 1), np.float32)
-        self._v_planes, self._weight = np.zeros_like(self._planes), np.zeros((1, 1, 1), np.float32)
+        # [5, H, W] and [H, W]; the planes are the rasteriser's memory: what it drew last
+        self._planes: F32 = np.zeros((5, 1, 1), np.float32)
+        self._v_planes, self._weight = np.zeros_like(self._planes), np.zeros_like(self._planes[0])
 
     def begin(
         self, model: GaussianModel, deformation: NodeDeformation, observation: Observation, node_step: float
@@ -132,31 +131,26 @@ class CpuRefiner:
         pass
 
     def draw(self) -> None:
-        observation = self._observation
-        cameras = [observation.camera]
-        if observation.right is not None:
-            cameras.append(observation.camera.moved_right(observation.baseline))
-        self._planes = self._rasterizer.forward(self._model.gaussians(), cameras)
+        self._planes = self._rasterizer.forward(self._model.gaussians(), self._observation.camera)
 
     def planes(self) -> F32:
-        left: F32 = self._planes[0]
-        return left
+        return self._planes
 
     def exposure_gain(self) -> F32:
-        return exposure_gain(self._planes[0], self._observation.image, self._observation.tissue)
+        return exposure_gain(self._planes, self._observation.image, self._observation.tissue)
 
     def refine(self, rates: Rates, share: float = 1.0) -> None:
         observation, tissue = self._observation, self._observation.tissue
         if share >= 1.0:
             self._model.contribution[:] = self._step(observation, rates).contribution
             return
-        tiles = worst_tiles(self._planes[0], observation.image, tissue, share)
+        tiles = worst_tiles(self._planes, observation.image, tissue, share)
         self._step(replace(observation, tissue=tissue & pixels_of(tiles, tissue.shape)), rates)
 
     def refine_worst(self, share: float, rates: Rates, nodes: bool = True) -> None:
         observation = self._observation
-        tiles = worst_tiles(self._planes[0], observation.image, observation.tissue, share)
-        self._planes = self._rasterizer.forward(self._model.gaussians(), [observation.camera], tiles)
+        tiles = worst_tiles(self._planes, observation.image, observation.tissue, share)
+        self._planes = self._rasterizer.forward(self._model.gaussians(), observation.camera, tiles)
         self._step(observation, rates, nodes)
         self._touched |= tiles
 
@@ -168,12 +162,11 @@ class CpuRefiner:
         if share < 1.0:
             some = tiles | self._touched
             if share > 0:
-                some |= worst_tiles(self._planes[0], observation.image, observation.tissue, share)
-        self._planes = self._rasterizer.forward(self._model.gaussians(), [observation.camera], some)
+                some |= worst_tiles(self._planes, observation.image, observation.tissue, share)
+        self._planes = self._rasterizer.forward(self._model.gaussians(), observation.camera, some)
 
     def show(self, gaussians: Gaussians, camera: Camera) -> F32:
-        planes: F32 = self._rasterizer_for(camera, self._viewers).forward(gaussians, [camera])[0]
-        return planes
+        return self._rasterizer_for(camera, self._viewers).forward(gaussians, camera)
 
     def _rasterizer_for(self, camera: Camera, made: dict[tuple[int, int], Rasterizer]) -> Rasterizer:
         size = camera.width, camera.height
@@ -183,17 +176,13 @@ class CpuRefiner:
 
     def _step(self, observation: Observation, rates: Rates, nodes: bool = True) -> Gradients:
         planes = self._planes
-        eyes = len(planes)
-        if len(self._weight) < eyes or self._weight.shape[1:] != planes.shape[2:]:
-            self._v_planes = np.zeros_like(planes)
-            self._weight = np.zeros((eyes, *planes.shape[2:]), np.float32)
-        v_planes, weight = self._v_planes[:eyes], self._weight[:eyes]
+        if self._v_planes.shape != planes.shape:
+            self._v_planes, self._weight = np.zeros_like(planes), np.zeros_like(planes[0])
+        v_planes, weight = self._v_planes, self._weight
         self.loss = tissue_loss(
-            planes[0], observation.image, observation.tissue, observation.depth,
-            v_planes[0], weight[0], DEPTH_WEIGHT, DEPTH_SCALE,
+            planes, observation.image, observation.tissue, observation.depth, v_planes, weight,
+            DEPTH_WEIGHT, DEPTH_SCALE,
         )  # fmt: skip
-        if eyes > 1:
-            right_eye_loss(planes, observation, v_planes[1], weight[1])
         gradients = self._rasterizer.backward(v_planes, weight)
         if nodes:  # they move all that follows them, also far from the tiles that were drawn
             self._deformation.descend(self._model, gradients.means, gradients.contribution, self._node_step)

@@ -1,44 +1,13 @@
-"""What the right eye's picture says of the model."""
+"""Which pixels of the right eye show tissue."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from sags_node.engine.losses.tissue import tissue_loss
-from sags_node.mapping.exposure import exposure_gain
-from sags_node.types import F32, Bool, Observation
+from sags_node.types import F32, Bool
 
 FAR_MARGIN = 0.1  # of the disparity, below the furthest tissue drawn
 NEAR_MARGIN = 0.5  # of the disparity, above the nearest: instruments come in between tissue and camera
-WEIGHT = 0.3  # of a right pixel against a left one; see benchmarks/mapping.md
-EVERY = 4  # px: enough to know the range of depths
-
-
-def right_eye_loss(planes: F32, observation: Observation, v_planes: F32, weight: F32) -> None:
-    """Loss of the right eye's picture, and its gradient.
-
-    Both eyes see one model: their gradients are added in one step. Each eye has its own gain in each channel,
-    and the right one counts less, since what shines looks different from there. Its depth is not measured.
-
-    Args:
-        planes: [2, 5, H, W] of the rasteriser, left and right.
-        observation: with the right eye's picture.
-        v_planes: [5, H, W] written.
-        weight: [H, W] written, as the losses of the engine do.
-    """
-    image, (left, right) = observation.right, planes
-    assert image is not None
-    coverage = left[4, ::EVERY, ::EVERY]
-    depth = np.zeros_like(coverage)
-    np.divide(left[3, ::EVERY, ::EVERY], coverage, out=depth, where=coverage > 0.5)
-    known = depth[observation.tissue[::EVERY, ::EVERY] & (depth > 0)]
-    focal_px = float(observation.camera.K[0, 0])
-    mask = right_eye_mask(observation.tissue, known, focal_px, observation.baseline)
-    gain = exposure_gain(right, image, mask)
-    nothing = np.zeros(mask.shape, np.float32)
-    tissue_loss(right, image / gain, mask, nothing, v_planes, weight, 0.0, 1.0)
-    v_planes *= np.float32(WEIGHT)
-    weight *= np.float32(WEIGHT)
 
 
 def right_eye_mask(tissue: Bool, depths: F32, focal_px: float, baseline: float) -> Bool:

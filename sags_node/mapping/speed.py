@@ -37,11 +37,11 @@ def measured_speed(rasterizer: Rasterizer) -> float:
         colors=rng.uniform(0, 1, (SAMPLE_GAUSSIANS, 3)).astype(np.float32),
         ids=np.arange(SAMPLE_GAUSSIANS),
     )
-    v_planes, weight = np.ones((1, 5, height, width), np.float32), np.ones((1, height, width), np.float32)
+    v_planes, weight = np.ones((5, height, width), np.float32), np.ones((height, width), np.float32)
     times = []
     for _ in range(TRIES):
         started = time.perf_counter()
-        rasterizer.forward(gaussians, [camera])
+        rasterizer.forward(gaussians, camera)
         rasterizer.backward(v_planes, weight)
         times.append(time.perf_counter() - started)
     return 1e3 * float(np.median(times)) / SAMPLE_MS

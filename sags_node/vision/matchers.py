@@ -1,4 +1,4 @@
-"""Two stereo matchers. Both take rectified gray pictures, see `pyramid`, and work in one of their halves."""
+"""Stereo matching of rectified gray pictures, see `pyramid`, in one of their halves."""
 
 from __future__ import annotations
 
@@ -7,12 +7,11 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from sags_node.types import F32, U8, Bool, GrayPyramid
+from sags_node.types import F32, Bool, GrayPyramid
 from sags_node.vision.coarse_stereo import coarse_disparity
 from sags_node.vision.inverse_search import CENTRE, search, start
 from sags_node.vision.pyramid import level
 
-SGBM_BLOCK = 5  # px
 PATCH_STRIDE = 4  # px, of patches of 8
 COARSE_STRIDE = 4  # px, in smaller pictures than the last
 SEARCH_STEPS = 3
@@ -24,36 +23,6 @@ LARGEST_ROW_STEP = 0.35  # px beside the mean row error around
 LARGEST_STEP = 1.5  # px beside the median disparity around: a wrong match stands alone
 MOST_ALONE = 0.35  # of the patches around: where more stand alone, none is right
 TETHER = 0.7  # of the texture along rows: how firmly a patch is held to that mean
-
-
-class SemiGlobal:
-    """StereoSGBM (Hirschmueller, PAMI 2008) over a range of disparities (px)."""
-
-    def __init__(self, smallest: float, largest: float) -> None:
-        self._smallest = int(smallest)
-        count = 16 * int(np.ceil((largest + 1 - self._smallest) / 16))
-        self._pad = self._smallest + count
-        self._matcher = cv2.StereoSGBM.create(
-            minDisparity=self._smallest,
-            numDisparities=count,
-            blockSize=SGBM_BLOCK,
-            P1=8 * SGBM_BLOCK**2,
-            P2=32 * SGBM_BLOCK**2,
-            disp12MaxDiff=1,
-            uniquenessRatio=5,
-            speckleWindowSize=50,
-            speckleRange=1,
-            mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
-        )
-
-    def __call__(self, left: U8, right: U8) -> tuple[F32, Bool]:
-        """Disparity (px) of gray pictures [h, w], and where a match was found."""
-        # OpenCV leaves out the columns that the largest disparity would push out of the picture: pad them.
-        padded = [cv2.copyMakeBorder(eye, 0, 0, self._pad, 0, cv2.BORDER_REPLICATE) for eye in (left, right)]
-        sixteenths = self._matcher.compute(padded[0], padded[1])[:, self._pad :]
-        disparity = sixteenths.astype(np.float32) / np.float32(16)
-        # A pixel without a match is marked by (minDisparity - 1) * 16.
-        return disparity, sixteenths >= self._smallest * 16
 
 
 class Patches(NamedTuple):
@@ -69,9 +38,9 @@ class Patches(NamedTuple):
 class InverseSearch:
     """Inverse search from a guess in a small picture up to the one wanted.
 
-    On the smooth surface of organs it is more accurate than `SemiGlobal` in less time, but it only
-    refines a guess that is right to a few pixels. That is made afresh for every frame: it costs little
-    and keeps no memory that could lock in an error.
+    On the smooth surface of organs it is more accurate than semi-global matching in less time, but it only
+    refines a guess that is right to a few pixels. That is made afresh for every frame: it costs little and
+    keeps no memory that could lock in an error.
     """
 
     def __init__(self, smallest: float, largest: float, halvings: int, stride: int = PATCH_STRIDE) -> None:

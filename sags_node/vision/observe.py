@@ -14,12 +14,11 @@ from sags_node.vision.depth_grid import depth_grid
 from sags_node.vision.pyramid import pyramids
 
 
-def observe(pair: RectifiedPair, tissue: Bool, measured: Measured, right_eye: bool = False) -> Observation:
+def observe(pair: RectifiedPair, tissue: Bool, measured: Measured) -> Observation:
     """Gather one frame's observation.
 
     Args:
         measured: depth and confidence; specks are taken out of both.
-        right_eye: with the right eye's picture, where there is one.
     """
     pyramid, _ = pyramids(pair)
     depth, confidence = measured.depth, measured.confidence
@@ -34,7 +33,6 @@ def observe(pair: RectifiedPair, tissue: Bool, measured: Measured, right_eye: bo
         depth=depth,
         depth_confidence=confidence,
         depth_is_new=measured.is_new,
-        right=pair.right * np.float32(1 / 255) if right_eye and pair.right is not None else None,
         baseline=pair.baseline,
         pyramid=pyramid,
         grid=grid,
@@ -53,7 +51,7 @@ def resized(observation: Observation, scale: float) -> Observation:
     def nearest(array: F32) -> F32:
         return np.asarray(cv2.resize(array, size, interpolation=cv2.INTER_NEAREST_EXACT))
 
-    right, grid = observation.right, observation.grid
+    grid = observation.grid
     return replace(
         observation,
         camera=Camera(*size, scale_intrinsics(camera.K, full, size), camera.T_world_cam),
@@ -62,6 +60,5 @@ def resized(observation: Observation, scale: float) -> Observation:
         tissue=nearest(observation.tissue.view(np.uint8)).view(np.bool_),
         depth=nearest(observation.depth),
         depth_confidence=nearest(observation.depth_confidence),
-        right=None if right is None else cv2.resize(right, size),
         grid=None if grid is None else replace(grid, side=grid.side * size[0] / full[0]),
     )

@@ -7,11 +7,11 @@ import numpy as np
 
 from sags_node.config import StereoConfig
 from sags_node.errors import UsageError
-from sags_node.types import F32, U8, Bool, Camera, Finding, GrayPyramid, RectifiedPair
+from sags_node.types import F32, Bool, Camera, Finding, GrayPyramid, RectifiedPair
 from sags_node.vision.alignment import RowMonitor
 from sags_node.vision.dense_depth import depth_of_patches, depth_of_pixels
 from sags_node.vision.margin import clear_of_instruments
-from sags_node.vision.matchers import InverseSearch, SemiGlobal
+from sags_node.vision.matchers import InverseSearch
 from sags_node.vision.near_limit import NearLimit
 from sags_node.vision.pyramid import inner, level, pyramids
 
@@ -45,7 +45,6 @@ class StereoDepth:
         self._focal_baseline = float(camera.K[0, 0]) / scale * baseline
         self._smallest = self._focal_baseline / config.max_depth
         self._near = NearLimit(config, float(camera.K[0, 0]) * baseline)
-        self._method = config.method
         self._end_at(self._near.limit)
         if self._smallest >= self._largest:
             raise UsageError(
@@ -62,10 +61,6 @@ class StereoDepth:
         left, right = pyramids(pair)
         assert right is not None  # a frame without a right eye brings its depth
         self._look_how_near(pair, left, right, tissue)
-        if isinstance(self._match, SemiGlobal):
-            pictures = (level(eye, self._halvings) for eye in (left, right))
-            disparity, known = self._match(*(_bytes(picture) for picture in pictures))
-            return self._judge(left, right, disparity, known, tissue)
         patches = self._match(left, right)
         self.rows.update(patches.field[..., 1], patches.good, self._size[0])
         clear = clear_of_instruments(tissue, self._halvings)
@@ -97,32 +92,10 @@ class StereoDepth:
         left, right = pyramids(pair)
         assert right is not None  # there is no disparity without
         self._look_how_near(pair, left, right, tissue)
-        small = disparity
         if self._size != disparity.shape[1::-1]:
-            small = cv2.resize(disparity, self._size, interpolation=cv2.INTER_AREA)
-            small *= np.float32(self._size[0] / disparity.shape[1])
-        return self._judge(left, right, small, small > 0, tissue)
-
-    def _look_how_near(
-        self, pair: RectifiedPair, left: GrayPyramid, right: GrayPyramid, tissue: Bool
-    ) -> None:
-        before = self._near.limit
-        self._near.look(pair.t_capture_ns, left, right, tissue)
-        if self._near.limit != before:
-            self._end_at(self._near.limit)
-
-    def _end_at(self, nearest: float) -> None:
-        """Match down to a depth, m."""
-        self._largest = min(self._focal_baseline / nearest, self._size[0] - 1.0)
-        self._match = (
-            SemiGlobal(self._smallest, self._largest)
-            if self._method == "sgbm"
-            else InverseSearch(self._smallest, self._largest, self._halvings)
-        )
-
-    def _judge(
-        self, left: GrayPyramid, right: GrayPyramid, disparity: F32, known: Bool, tissue: Bool
-    ) -> tuple[F32, F32]:
+            ratio = np.float32(self._size[0] / disparity.shape[1])
+            disparity = ratio * cv2.resize(disparity, self._size, interpolation=cv2.INTER_AREA)
+        known = disparity > 0
         disparity = np.where(known, disparity, np.float32(0))
         columns, rows = np.meshgrid(*(np.arange(side, dtype=np.float32) for side in self._size))
         pictures = level(left, self._halvings), level(right, self._halvings)
@@ -142,10 +115,18 @@ class StereoDepth:
             self._focal_baseline,
         )
 
+    def _look_how_near(
+        self, pair: RectifiedPair, left: GrayPyramid, right: GrayPyramid, tissue: Bool
+    ) -> None:
+        before = self._near.limit
+        self._near.look(pair.t_capture_ns, left, right, tissue)
+        if self._near.limit != before:
+            self._end_at(self._near.limit)
 
-def _bytes(picture: F32) -> U8:
-    rounded: U8 = cv2.convertScaleAbs(inner(picture))
-    return rounded
+    def _end_at(self, nearest: float) -> None:
+        """Match down to a depth, m."""
+        self._largest = min(self._focal_baseline / nearest, self._size[0] - 1.0)
+        self._match = InverseSearch(self._smallest, self._largest, self._halvings)
 
 
 def _leave_out_unseen(clear: Bool, disparities: F32) -> None:

@@ -85,9 +85,9 @@ def frozen(quick: tuple[Table, Path], monkeypatch: pytest.MonkeyPatch) -> Table:
 def test_work_of_one_gaussian(monkeypatch: pytest.MonkeyPatch) -> None:
     """It covers the picture of two tiles, one below the other, so it is evaluated at each of their pixels."""
     case = RasterCase(count=1, width=layout.TILE_WIDTH.value, height=2 * layout.TILE_HEIGHT.value, threads=1)
-    _, cameras = device_rasterizing.make_scene(case)
+    _, view = device_rasterizing.make_scene(case)
     scene = one_gaussian(np.array([0, 0, 0.06]), scale=0.05)
-    monkeypatch.setattr(device_rasterizing, "make_scene", lambda case: (scene, cameras))
+    monkeypatch.setattr(device_rasterizing, "make_scene", lambda case: (scene, view))
     peak = Peak(threads=1, operations=1e5, bandwidths={MIB: 1e6})
     row = measure_device_rasterizer(case, 1, peak, WALL, CPU)
     pixels = case.width * case.height
@@ -220,7 +220,7 @@ def test_gsplat_draws_the_same_scene_and_a_wrong_one_is_seen(with_gsplat: None) 
     plain = gsplat_rasterizing.PlainCall(drawing, rasterizer)
     planes, same = drawing.forward(), drawing.forward_backward()
     color_and_depth, alpha = plain.forward()
-    assert torch.allclose(torch.cat([color_and_depth, alpha], 3).permute(0, 3, 1, 2), planes, atol=1e-6)
+    assert torch.allclose(torch.cat([color_and_depth, alpha], 2).permute(2, 0, 1), planes, atol=1e-6)
     for own, name in zip(
         plain.forward_backward(), ("means", "quats", "scales", "opacities", "colors"), strict=True
     ):

@@ -14,7 +14,6 @@ from benchmarks.quality import depth_plot, depth_report
 from benchmarks.quality.depth import (
     MODEL,
     Comparison,
-    PlainSGBM,
     Tally,
     by_confidence,
     error_figures,
@@ -31,6 +30,7 @@ from benchmarks.quality.depth_ct import (
 )
 from benchmarks.quality.depth_eyes import differences, measure_eyes, mirrored
 from benchmarks.quality.depth_regions import regions_of
+from benchmarks.quality.sgbm import JudgedSGBM, PlainSGBM
 from sags_node.config import StereoConfig
 from sags_node.errors import SagsError, UsageError
 from sags_node.geometry import unproject
@@ -147,16 +147,21 @@ def test_coverage_counts_only_where_there_is_truth() -> None:
     assert figures["where_configured_knows"]["median_mm"] == figures["median_mm"]
 
 
-def test_plain_sgbm_is_metric_and_knows_what_it_does_not_know() -> None:
+@pytest.mark.parametrize("baseline", [PlainSGBM, JudgedSGBM])
+def test_sgbm_is_metric(baseline: type[PlainSGBM | JudgedSGBM]) -> None:
     pair, truth = shown_pair(slanted())
     for scale, limit_mm in ((1, 0.8), (2, 1.6)):  # a sixth of a pixel: it is drawn to whole ones
-        depth, _ = PlainSGBM(StereoConfig(), CAMERA, BASELINE, scale)(pair, ALL)
+        depth, _ = baseline(StereoConfig(), CAMERA, BASELINE, scale)(pair, ALL)
         known = (depth > 0) & (truth > 0)
         assert known[:, 60:].mean() > 0.9
         assert np.median(np.abs(depth - truth)[known]) * 1e3 < limit_mm
         assert depth.max() <= StereoConfig().max_depth * 1.2
-    blank = RectifiedPair(0, 0, CAMERA, BASELINE, np.zeros_like(pair.left), np.full_like(pair.left, 200))
-    assert not PlainSGBM(StereoConfig(), CAMERA, BASELINE, 1)(blank, ~ALL)[0].any()
+
+
+def test_sgbm_in_the_stage_finds_nothing_where_there_is_nothing() -> None:
+    left = shown_pair(slanted())[0].left
+    blank = RectifiedPair(0, 0, CAMERA, BASELINE, np.zeros_like(left), np.full_like(left, 200))
+    assert not JudgedSGBM(StereoConfig(), CAMERA, BASELINE, 1)(blank, ALL)[0].any()
 
 
 def test_matchers_are_compared_where_the_first_knows() -> None:

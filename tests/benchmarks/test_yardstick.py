@@ -53,7 +53,7 @@ def test_both_draw_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     """With its screen filter in the place of ours."""
     monkeypatch.setattr(projector, "MIP_VARIANCE", 0.3)
     case = RasterCase(500, 64, 64, 1)
-    ours = Drawing(case).forward()[0, :3]
+    ours = Drawing(case).forward()[:3]
     with yardstick.compiled(PROGRAM, 1) as library:
         program = yardstick._Program(library, case)
         program.forward_backward()

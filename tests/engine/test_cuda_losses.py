@@ -10,7 +10,6 @@ import pytest
 import test_losses
 import test_photometric
 import torch
-from engine_scenes import relative_error
 from rounding import after, exact
 from test_photometric import ALL, OFF, TERMS
 
@@ -80,16 +79,6 @@ def test_tissue_loss_is_the_cpu_engines() -> None:
         true.check(v_planes[plane], plane)
         true.check(v_expected[plane], plane)
     np.testing.assert_allclose(weight, expected_weight, rtol=after(2))
-
-
-def test_tissue_loss_of_the_right_eye_counts_less() -> None:
-    """What `mapping.right_eye` makes of it: no depth, and a share of the gradient."""
-    inputs = test_losses.frame() | {"depth": np.zeros((test_losses.HEIGHT, test_losses.WIDTH), np.float32)}
-    mean, v_planes, weight = tissue_loss(inputs)
-    shared_mean, v_shared, shared_weight = tissue_loss(inputs, share=0.3)
-    assert shared_mean == mean
-    assert relative_error(v_shared, 0.3 * v_planes) < after(8)  # the factor comes first or last
-    np.testing.assert_allclose(shared_weight, 0.3 * weight, rtol=after(4))
 
 
 @pytest.mark.parametrize("where", ["image", "depth", 0, 3, 4])

@@ -11,13 +11,11 @@ from engine_scenes import (
     DERIVATIVES,
     EXPONENTIAL,
     INPUTS,
-    PER_GAUSSIAN,
     camera,
     cotangents,
     draw_and_differentiate,
     one_gaussian,
     random_gaussians,
-    relative_error,
     rows,
     truth,
     with_filter,
@@ -42,7 +40,7 @@ def changed(gaussians: Gaussians, name: str, row: int, value: float) -> Gaussian
 
 def assert_finite(planes: np.ndarray, found: dict[str, np.ndarray]) -> None:
     assert np.isfinite(planes).all()
-    assert (planes[:, 4] >= 0).all() and planes[:, 4].max() <= 1 + after(1000)
+    assert (planes[4] >= 0).all() and planes[4].max() <= 1 + after(1000)
     for name in DERIVATIVES:
         assert np.isfinite(found[name]).all(), name
 
@@ -59,17 +57,17 @@ def test_a_larger_world_further_away_looks_the_same(factor: float) -> None:
         scales=FULL.scales * np.float32(factor),
         smoothing=FULL.smoothing * np.float32(factor) ** 2,
     )
-    planes, _ = draw_and_differentiate(gaussians, [VIEW])
-    expected, _ = draw_and_differentiate(FULL, [VIEW])
-    v_planes, weight = cotangents([VIEW], 0)
-    v_planes[:, 3] = 0
-    true = truth(FULL, [VIEW], given=(v_planes, weight))
+    planes, _ = draw_and_differentiate(gaussians, VIEW)
+    expected, _ = draw_and_differentiate(FULL, VIEW)
+    v_planes, weight = cotangents(VIEW, 0)
+    v_planes[3] = 0
+    true = truth(FULL, VIEW, given=(v_planes, weight))
     unit = np.array([1, 1, 1, factor, 1])[:, None, None]
-    np.testing.assert_allclose(planes[0] / unit, expected[0], rtol=0, atol=2 * true.off.max())
+    np.testing.assert_allclose(planes / unit, expected, rtol=0, atol=2 * true.off.max())
     rasterizer = make_rasterizer("numba", VIEW.width, VIEW.height)
-    rasterizer.forward(gaussians, [VIEW])
+    rasterizer.forward(gaussians, VIEW)
     gradients = rasterizer.backward(v_planes, weight)
-    lengths = {"means": factor, "scales": factor, "poses": np.array([[factor] * 3 + [1.0] * 3])}
+    lengths = {"means": factor, "scales": factor}
     for name in DERIVATIVES:
         true.check_gradient(name, getattr(gradients, name).astype(np.float64) * lengths.get(name, 1.0))
 
@@ -84,10 +82,10 @@ def test_scales_from_a_vanishing_dot_to_a_wall(scale: float, filtered: bool) -> 
     gaussians = dataclasses.replace(gaussians, scales=axes)
     if filtered:
         gaussians = dataclasses.replace(gaussians, smoothing=np.full(6, 0.01 * scale**2, np.float32))
-    planes, found = draw_and_differentiate(gaussians, [view])
-    true = truth(gaussians, [view])
+    planes, found = draw_and_differentiate(gaussians, view)
+    true = truth(gaussians, view)
     assert_finite(planes, found)
-    assert true.planes[0, 4].max() > 0.05
+    assert true.planes[4].max() > 0.05
     true.check(planes, found)
 
 
@@ -100,9 +98,9 @@ def test_flat_as_paper_and_thin_as_a_thread(filtered: bool) -> None:
     gaussians = dataclasses.replace(gaussians, scales=scales, opacities=np.full(12, 0.97, np.float32))
     if filtered:
         gaussians = dataclasses.replace(gaussians, smoothing=np.full(12, 1e-12, np.float32))
-    planes, found = draw_and_differentiate(gaussians, [VIEW])
-    true = truth(gaussians, [VIEW])
-    assert true.planes[0, 4].max() > 0.05
+    planes, found = draw_and_differentiate(gaussians, VIEW)
+    true = truth(gaussians, VIEW)
+    assert true.planes[4].max() > 0.05
     true.check(planes, found)
 
 
@@ -110,26 +108,26 @@ def test_flat_as_paper_and_thin_as_a_thread(filtered: bool) -> None:
 def test_opacities_from_nothing_to_everything(opacity: float) -> None:
     gaussians = random_gaussians(5, 8, VIEW, spread=3.0)
     gaussians = dataclasses.replace(gaussians, opacities=np.full(8, opacity, np.float32))
-    planes, found = draw_and_differentiate(gaussians, [VIEW])
-    assert planes[0, 4].any() == (opacity > 1 / 255)
-    truth(gaussians, [VIEW]).check(planes, found)
+    planes, found = draw_and_differentiate(gaussians, VIEW)
+    assert planes[4].any() == (opacity > 1 / 255)
+    truth(gaussians, VIEW).check(planes, found)
 
 
 @pytest.mark.parametrize("length", [1e-11, 1e-6, 1e6, 1e15])
 def test_quaternions_of_any_length_are_the_same_turn(length: float) -> None:
     unit = FULL.quats / np.linalg.norm(FULL.quats, axis=1)[:, None]
-    true = truth(dataclasses.replace(FULL, quats=unit), [VIEW])
+    true = truth(dataclasses.replace(FULL, quats=unit), VIEW)
     scaled = dataclasses.replace(FULL, quats=unit * np.float32(length))
-    planes, found = draw_and_differentiate(scaled, [VIEW])
+    planes, found = draw_and_differentiate(scaled, VIEW)
     true.check(planes, found | {"quats": found["quats"].astype(np.float64) * length})
 
 
 @pytest.mark.parametrize("length", [1e-13, 1e-30, 1e19])
 def test_quaternions_without_a_direction_are_not_drawn(length: float) -> None:
-    planes, found = draw_and_differentiate(changed(FULL, "quats", 13, length), [VIEW])
-    expected, _ = draw_and_differentiate(rows(FULL, np.arange(30) != 13), [VIEW])
+    planes, found = draw_and_differentiate(changed(FULL, "quats", 13, length), VIEW)
+    expected, _ = draw_and_differentiate(rows(FULL, np.arange(30) != 13), VIEW)
     np.testing.assert_array_equal(planes, expected)
-    assert not any(found[name][13].any() for name in PER_GAUSSIAN)
+    assert not any(found[name][13].any() for name in DERIVATIVES)
 
 
 @pytest.mark.parametrize("height", [1.0 + 1e-6, 1.01, 2.0])  # in near planes
@@ -143,15 +141,15 @@ def test_just_in_front_of_the_near_plane(height: float, scale: float) -> None:
         means=np.array([[0, 0, z], [0.45 * z, 0.1 * z, z], [30 * z, -20 * z, z]], np.float32),
         scales=np.full((3, 3), scale, np.float32) * np.array([1, 0.5, 0.7], np.float32),
     )
-    planes, found = draw_and_differentiate(gaussians, [VIEW])
+    planes, found = draw_and_differentiate(gaussians, VIEW)
     assert_finite(planes, found)
-    truth(gaussians, [VIEW]).check(planes, found)
+    truth(gaussians, VIEW).check(planes, found)
 
 
 @pytest.mark.parametrize("z", [NEAR_PLANE, 1e-6, 0.0, -1e-6, -0.05, -1e9])
 def test_at_or_behind_the_near_plane_nothing_is_drawn(z: float) -> None:
     gaussians = one_gaussian(np.array([0.001, 0.0, z]), 0.01)
-    planes, found = draw_and_differentiate(with_view_dependence(gaussians, 3), [VIEW])
+    planes, found = draw_and_differentiate(with_view_dependence(gaussians, 3), VIEW)
     assert not planes.any()
     assert not any(found[name].any() for name in DERIVATIVES)
 
@@ -160,9 +158,9 @@ def test_a_principal_point_far_outside_and_a_telephoto_lens() -> None:
     K = np.array([[20000.0, 0, -900.0], [0, 21000, 700], [0, 0, 1]])
     view = Camera(31, 29, K, np.eye(4))
     gaussians = random_gaussians(2, 40, view)
-    planes, found = draw_and_differentiate(gaussians, [view])
-    true = truth(gaussians, [view])
-    assert true.planes[0, 4].mean() > 0.2
+    planes, found = draw_and_differentiate(gaussians, view)
+    true = truth(gaussians, view)
+    assert true.planes[4].mean() > 0.2
     true.check(planes, found)
 
 
@@ -176,39 +174,38 @@ def test_a_crowd_on_one_pixel_follows_the_law_of_absorption(count: int, opacity:
     view = camera(width=3, height=2, focal=30.0)
     one = one_gaussian(geometry.unproject(view, np.array([1.0, 1.0]), np.array(0.07)), 0.3, opacity)
     crowd = rows(one, np.zeros(count, int))
-    planes, found = draw_and_differentiate(crowd, [view])
-    single, _ = draw_and_differentiate(one, [view])
+    planes, found = draw_and_differentiate(crowd, view)
+    single, _ = draw_and_differentiate(one, view)
     assert_finite(planes, found)
-    left = np.maximum((1 - single[0, 4].astype(np.float64)) ** count, 1e-4)
+    left = np.maximum((1 - single[4].astype(np.float64)) ** count, 1e-4)
     drawn = int(np.count_nonzero(found["contribution"]))  # until the tile stops
-    np.testing.assert_allclose(1 - planes[0, 4], left, atol=1e-4 + drawn * EXPONENTIAL * opacity * left.max())
-    np.testing.assert_allclose(planes[0, 0], 0.8 * planes[0, 4], rtol=after(2 * drawn))
-    weight = cotangents([view], 0)[1]
+    np.testing.assert_allclose(1 - planes[4], left, atol=1e-4 + drawn * EXPONENTIAL * opacity * left.max())
+    np.testing.assert_allclose(planes[0], 0.8 * planes[4], rtol=after(2 * drawn))
+    weight = cotangents(view, 0)[1]
     total = found["contribution"].astype(np.float64).sum()
-    assert total == pytest.approx((weight * planes[:, 4]).sum(), rel=after(2 * drawn))
+    assert total == pytest.approx((weight * planes[4]).sum(), rel=after(2 * drawn))
     assert (np.diff(found["contribution"]) <= 0).all()  # the nearest are the first of equals
 
 
 @pytest.mark.parametrize("backend", ["numba", "reference"])
 def test_nothing_to_draw(backend: str) -> None:
-    """No Gaussians at all, or none that any camera sees."""
+    """No Gaussians at all, or none that the camera sees."""
     away = dataclasses.replace(FULL, means=FULL.means + np.array([0, 50, 0], np.float32))
     for gaussians in (rows(FULL, np.zeros(30, bool)), away):
-        planes, found = draw_and_differentiate(gaussians, [VIEW, VIEW.moved_right(0.004)], backend)
-        assert planes.shape == (2, 5, 40, 48)
+        planes, found = draw_and_differentiate(gaussians, VIEW, backend)
+        assert planes.shape == (5, 40, 48)
         assert not planes.any()
-        assert found["poses"].shape == (2, 6)
         assert found["sh_rest"].shape == (len(gaussians), 8, 3)
         assert not any(found[name].any() for name in DERIVATIVES)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 70), (33, 1), (17, 65)])
-def test_pictures_of_odd_sizes_from_two_cameras(size: tuple[int, int]) -> None:
-    views = [camera(*size, focal=30.0), camera(*size, focal=30.0, moved=True)]
-    gaussians = with_filter(with_view_dependence(random_gaussians(3, 25, views[0], spread=2.0), 1))
-    planes, found = draw_and_differentiate(gaussians, views)
-    true = truth(gaussians, views)
-    assert (true.planes[:, 4].max((1, 2)) > 0.05).all()
+def test_pictures_of_odd_sizes(size: tuple[int, int]) -> None:
+    view = camera(*size, focal=30.0, moved=True)
+    gaussians = with_filter(with_view_dependence(random_gaussians(3, 25, view, spread=2.0), 1))
+    planes, found = draw_and_differentiate(gaussians, view)
+    true = truth(gaussians, view)
+    assert true.planes[4].max() > 0.05
     true.check(planes, found)
 
 
@@ -221,48 +218,44 @@ def test_a_spoilt_value_costs_one_gaussian_and_no_other(name: str, value: float)
     """With view dependence and filter on. A negative filter is none at all."""
     spoilt = changed(FULL, name, 13, value)
     others = np.arange(30) != 13
-    planes, found = draw_and_differentiate(spoilt, [VIEW])
+    planes, found = draw_and_differentiate(spoilt, VIEW)
     if name == "smoothing" and value < 0:
-        expected, true = draw_and_differentiate(changed(FULL, name, 13, 0.0), [VIEW])
+        expected, true = draw_and_differentiate(changed(FULL, name, 13, 0.0), VIEW)
         others[:] = True
     elif name == "opacities" and value < 0:
-        expected, true = draw_and_differentiate(changed(FULL, name, 13, 0.0), [VIEW])
-        true = {key: value[others] if key in PER_GAUSSIAN else value for key, value in true.items()}
+        expected, true = draw_and_differentiate(changed(FULL, name, 13, 0.0), VIEW)
+        true = {key: value[others] for key, value in true.items()}
     else:
-        expected, true = draw_and_differentiate(rows(FULL, others), [VIEW])
+        expected, true = draw_and_differentiate(rows(FULL, others), VIEW)
     np.testing.assert_array_equal(planes, expected)
-    for key in PER_GAUSSIAN:
+    for key in DERIVATIVES:
         np.testing.assert_array_equal(found[key][others], true[key], err_msg=key)
         assert not found[key][~others].any(), key
-    # the sum of 30 Gaussians in blocks, one of which is now made up of others
-    assert relative_error(found["poses"], true["poses"]) < after(30)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 @pytest.mark.parametrize("what", ["v_planes", "weight"])
 def test_a_spoilt_cotangent_stays_in_its_tile(what: str, value: float) -> None:
-    """Gaussians that do not reach the pixel's tile keep their gradients bit by bit; the pose stays finite."""
+    """Gaussians that do not reach the pixel's tile keep their gradients bit by bit."""
     view = camera(width=160, height=128, focal=200.0)
     gaussians = with_filter(with_view_dependence(random_gaussians(8, 200, view), 1))
     rasterizer = make_rasterizer("numba", view.width, view.height)
-    rasterizer.forward(gaussians, [view])
-    v_planes, weight = cotangents([view], 0)
+    rasterizer.forward(gaussians, view)
+    v_planes, weight = cotangents(view, 0)
     clean = {name: getattr(rasterizer.backward(v_planes, weight), name).copy() for name in DERIVATIVES}
-    spoilt = (v_planes if what == "v_planes" else weight)[0]
-    spoilt[..., 70, 40] = value
+    (v_planes if what == "v_planes" else weight)[..., 70, 40] = value
     found = rasterizer.backward(v_planes, weight)
     pixels, _ = geometry.project(view, gaussians.means.astype(np.float64))
     reach = 4 * gaussians.scales.max(1) / gaussians.means[:, 2] * 206 + 2
     away = np.abs(pixels - [40, 70]).max(1) > reach + 32
     assert 20 < away.sum() < 190
-    for name in PER_GAUSSIAN:
+    for name in DERIVATIVES:
         np.testing.assert_array_equal(getattr(found, name)[away], clean[name][away], err_msg=name)
     assert not np.isfinite(found.contribution if what == "weight" else found.means).all()
-    assert np.isfinite(found.poses).all()
 
 
 def test_opacity_is_held_below_one() -> None:
     """What keeps 1 - alpha away from zero: even a wall lets a thousandth through."""
     view = camera(width=3, height=3, focal=30.0)
-    planes, _ = draw_and_differentiate(one_gaussian(np.array([0, 0, 0.07]), 1.0, 1.0), [view])
-    assert planes[0, 4].max() == pytest.approx(MAX_OPACITY, rel=EXPONENTIAL)
+    planes, _ = draw_and_differentiate(one_gaussian(np.array([0, 0, 0.07]), 1.0, 1.0), view)
+    assert planes[4].max() == pytest.approx(MAX_OPACITY, rel=EXPONENTIAL)

@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 import torch
 from engine_scenes import (
+    DERIVATIVES,
     EXPONENTIAL,
-    PER_GAUSSIAN,
     camera,
     cotangents,
     draw_and_differentiate,
@@ -51,7 +51,6 @@ from gsplat_on_cpu import use_gsplat_on_cpu
 from sags_node.engine.cuda import gsplat as gsplat_backend
 
 VIEW = camera(width=50, height=44, focal=60.0, moved=True)
-EYES = [VIEW, VIEW.moved_right(0.004)]
 SUMMED = 50 * 44  # pixels, whose gradients may be added in any order
 
 
@@ -65,17 +64,13 @@ def on_cpu(request: pytest.FixtureRequest) -> Iterator[None]:
         yield
 
 
-def assert_agrees(
-    gaussians: Gaussians,
-    views: list[Camera],
-    antialias: bool = True,
-) -> None:
+def assert_agrees(gaussians: Gaussians, view: Camera, antialias: bool = True) -> None:
     """Planes, and gradients of a random cotangent, of both gsplat and the CPU engine, against the float64
     twin."""
-    true = truth(gaussians, views, antialias=antialias)
-    assert true.planes[:, 4].max() > 0.05  # there is something to see
+    true = truth(gaussians, view, antialias=antialias)
+    assert true.planes[4].max() > 0.05  # there is something to see
     for backend in ("gsplat", "numba"):
-        true.check(*draw_and_differentiate(gaussians, views, backend, antialias=antialias))
+        true.check(*draw_and_differentiate(gaussians, view, backend, antialias=antialias))
 
 
 # ---- where gsplat's semantics are ours ---------------------------------------------------------------------
@@ -86,13 +81,13 @@ def assert_agrees(
     [(0, False, True), (1, True, False), (2, False, True), (3, True, True)],
 )
 def test_planes_and_gradients_are_ours(degree: int, filtered: bool, antialias: bool) -> None:
-    """Two turned cameras, every derivative, harmonics of all degrees, both filters on and off."""
+    """A turned camera, every derivative, harmonics of all degrees, both filters on and off."""
     gaussians = random_gaussians(degree, 40, VIEW)
     if degree:
         gaussians = with_view_dependence(gaussians, degree)
     if filtered:
         gaussians = with_filter(gaussians)
-    assert_agrees(gaussians, EYES, antialias=antialias)
+    assert_agrees(gaussians, VIEW, antialias=antialias)
 
 
 def test_a_jacobian_held_within_the_frustum() -> None:
@@ -104,7 +99,7 @@ def test_a_jacobian_held_within_the_frustum() -> None:
         means=geometry.unproject(VIEW, pixels, rng.uniform(0.05, 0.09, 6)).astype(np.float32),
         scales=rng.uniform(0.02, 0.05, (6, 3)).astype(np.float32),
     )
-    assert_agrees(gaussians, [VIEW])
+    assert_agrees(gaussians, VIEW)
 
 
 def test_what_cannot_be_drawn_is_left_out_and_harms_nobody() -> None:
@@ -122,19 +117,19 @@ def test_what_cannot_be_drawn_is_left_out_and_harms_nobody() -> None:
     gaussians.colors[7, 2] = np.nan
     gaussians.sh_rest[8, 1, 1] = np.inf
     gaussians.smoothing[9] = np.nan
-    planes, found = draw_and_differentiate(gaussians, [view], "gsplat")
-    expected, true = draw_and_differentiate(sound, [view], "gsplat")
+    planes, found = draw_and_differentiate(gaussians, view, "gsplat")
+    expected, true = draw_and_differentiate(sound, view, "gsplat")
     np.testing.assert_array_equal(planes, expected)
-    for name in PER_GAUSSIAN:
+    for name in DERIVATIVES:
         assert not found[name][:10].any(), name
         assert relative_error(found[name][10:], true[name]) < after(SUMMED), name
-    assert_agrees(sound, [view])
+    assert_agrees(sound, view)
 
 
 def test_no_gaussians() -> None:
-    planes, found = draw_and_differentiate(rows(random_gaussians(0, 3, VIEW), slice(0)), EYES, "gsplat")
-    assert not planes.any() and not found["poses"].any()
-    assert [len(found[name]) for name in PER_GAUSSIAN] == [0] * len(PER_GAUSSIAN)
+    planes, found = draw_and_differentiate(rows(random_gaussians(0, 3, VIEW), slice(0)), VIEW, "gsplat")
+    assert not planes.any()
+    assert not any(len(found[name]) for name in DERIVATIVES)
 
 
 # ---- where they differ: what docs/gpu.md says of it --------------------------------------------------------
@@ -144,15 +139,15 @@ def test_opacities_above_the_largest_of_ours() -> None:
     """Ours holds the opacity at 0.999, gsplat alpha at every pixel: apart by 0.001, and at the rim of each
     Gaussian, where only one of them is cut off, by the smallest alpha."""
     gaussians = dataclasses.replace(random_gaussians(4, 40, VIEW), opacities=np.ones(40, np.float32))
-    planes, _ = draw_and_differentiate(gaussians, [VIEW], "gsplat")
-    true_planes, _ = draw_and_differentiate(gaussians, [VIEW], "numba")
-    apart = np.abs(planes - true_planes)[0, 4]
+    planes, _ = draw_and_differentiate(gaussians, VIEW, "gsplat")
+    true_planes, _ = draw_and_differentiate(gaussians, VIEW, "numba")
+    apart = np.abs(planes - true_planes)[4]
     assert 2e-4 < apart.max() < 3 * MIN_ALPHA
     assert np.median(apart) < 2e-4
     wall = one_gaussian(np.array([0, 0, 0.07]), 0.5, 1.0)
     for backend in ("gsplat", "numba"):
-        drawn, _ = draw_and_differentiate(wall, [camera()], backend)
-        assert drawn[0, 4].max() == pytest.approx(MAX_OPACITY, rel=EXPONENTIAL)
+        drawn, _ = draw_and_differentiate(wall, camera(), backend)
+        assert drawn[4].max() == pytest.approx(MAX_OPACITY, rel=EXPONENTIAL)
 
 
 def test_where_hardly_anything_shines_through_any_more() -> None:
@@ -162,12 +157,12 @@ def test_where_hardly_anything_shines_through_any_more() -> None:
     gaussians = dataclasses.replace(
         random_gaussians(6, 400, VIEW, spread=4.0), opacities=np.full(400, opacity, np.float32)
     )
-    planes, found = draw_and_differentiate(gaussians, [VIEW], "gsplat")
-    true_planes, true = draw_and_differentiate(gaussians, [VIEW], "numba")
-    assert true_planes[0, 4].min() > 0.9999
-    apart = (true_planes - planes)[0, 4]
+    planes, found = draw_and_differentiate(gaussians, VIEW, "gsplat")
+    true_planes, true = draw_and_differentiate(gaussians, VIEW, "numba")
+    assert true_planes[4].min() > 0.9999
+    apart = (true_planes - planes)[4]
     assert -EXPONENTIAL < apart.min() and 1e-3 < apart.max() < 1e-4 / (1 - opacity)
-    for name in PER_GAUSSIAN[:5]:
+    for name in DERIVATIVES[:5]:
         assert 1e-4 < relative_error(found[name], true[name]) < 2e-2, name
 
 
@@ -176,39 +171,26 @@ def test_where_hardly_anything_shines_through_any_more() -> None:
 
 def test_tiles_that_are_not_asked_for_stay_and_count_for_nothing() -> None:
     gaussians, before = random_gaussians(5, 25, VIEW, spread=0.5), random_gaussians(9, 6, VIEW)
-    tiles = np.zeros((2, -(-44 // TILE_HEIGHT), -(-50 // TILE_WIDTH)), bool)
-    tiles[[0, 0, 1], [0, 1, 1], [1, 3, 0]] = True
-    drawn = np.kron(tiles, np.ones((TILE_HEIGHT, TILE_WIDTH), bool))[:, :44, :50]
-    v_planes, weight = cotangents(EYES, 1)
+    tiles = np.zeros((-(-44 // TILE_HEIGHT), -(-50 // TILE_WIDTH)), bool)
+    tiles[[0, 1], [1, 3]] = True
+    drawn = np.kron(tiles, np.ones((TILE_HEIGHT, TILE_WIDTH), bool))[:44, :50]
+    v_planes, weight = cotangents(VIEW, 1)
     whole, part = (make_rasterizer("gsplat", 50, 44) for _ in range(2))
-    everything = whole.forward(gaussians, EYES).copy()
-    expected = whole.backward(np.where(drawn[:, None], v_planes, 0), np.where(drawn, weight, 0))
-    part.forward(before, EYES[:1])
-    old = np.zeros_like(everything)
-    old[:1] = part.forward(before, EYES[:1])
-    planes = part.forward(gaussians, EYES, tiles)
-    np.testing.assert_array_equal(planes, np.where(drawn[:, None], everything, old))
+    everything = whole.forward(gaussians, VIEW).copy()
+    expected = whole.backward(np.where(drawn, v_planes, 0), np.where(drawn, weight, 0))
+    old = part.forward(before, VIEW).copy()
+    planes = part.forward(gaussians, VIEW, tiles)
+    np.testing.assert_array_equal(planes, np.where(drawn, everything, old))
     found = part.backward(v_planes, weight)
-    for name in ("means", "quats", "scales", "opacities", "colors", "poses", "contribution"):
+    for name in ("means", "quats", "scales", "opacities", "colors", "contribution"):
         assert relative_error(getattr(found, name), getattr(expected, name)) < after(SUMMED), name
     assert 2 < int((found.contribution == 0).sum()) < 23
-
-
-def test_geometry_can_be_left_out_and_asked_for_later() -> None:
-    drawing = make_rasterizer("gsplat", 50, 44)
-    drawing.forward(with_view_dependence(random_gaussians(2, 8, VIEW), 1), EYES)
-    v_planes, weight = cotangents(EYES, 0)
-    part, whole = drawing.backward(v_planes, weight, geometry=False), drawing.backward(v_planes, weight)
-    assert relative_error(part.colors, whole.colors) < after(SUMMED)
-    assert relative_error(part.contribution, whole.contribution) < after(SUMMED)
-    for name in ("means", "quats", "scales", "opacities", "sh_rest", "poses"):
-        assert len(getattr(part, name)) == 0 and getattr(whole, name).any(), name
 
 
 def test_limits_are_said(monkeypatch: pytest.MonkeyPatch) -> None:
     drawing = make_rasterizer("gsplat", 50, 44)
     gaussians = random_gaussians(2, 8, VIEW)
-    drawing.forward(gaussians, [VIEW])
+    drawing.forward(gaussians, VIEW)
     with pytest.raises(UsageError, match=r"gsplat gives no median depth; choose the numba"):
         drawing.median()
 
@@ -217,9 +199,9 @@ def test_limits_are_said(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr("gsplat.rasterization", full)
     with pytest.raises(SagsError, match="not enough free memory for gsplat to draw 8 Gaussians at 50x44 px"):
-        drawing.forward(gaussians, [VIEW])
+        drawing.forward(gaussians, VIEW)
     with pytest.raises(UsageError, match="last drawing failed"):
-        drawing.backward(*cotangents([VIEW], 0))
+        drawing.backward(*cotangents(VIEW, 0))
 
 
 def test_a_mapper_learns_the_same_with_it(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -312,8 +294,8 @@ def test_its_kernels_draw_what_the_cpu_engine_draws(machine: pytest.MonkeyPatch)
     except UsageError as error:
         pytest.skip(str(error))
     gaussians = with_filter(with_view_dependence(random_gaussians(3, 200, VIEW), 3))
-    planes, found = draw_and_differentiate(gaussians, EYES, "gsplat")
-    true_planes, true = draw_and_differentiate(gaussians, EYES, "numba")
+    planes, found = draw_and_differentiate(gaussians, VIEW, "gsplat")
+    true_planes, true = draw_and_differentiate(gaussians, VIEW, "numba")
     np.testing.assert_allclose(planes, true_planes, atol=2e-4)
     for name in true:
         assert relative_error(found[name], true[name]) < 2e-3, name

@@ -147,7 +147,7 @@ def test_contribution_makes_the_closed_form_colour_step_converge() -> None:
     view = camera(WIDTH, HEIGHT, focal=40.0)
     gaussians = random_gaussians(3, 80, view)
     rasterizer = make_rasterizer("numba", WIDTH, HEIGHT)
-    (planes,) = rasterizer.forward(gaussians, [view])
+    planes = rasterizer.forward(gaussians, view)
     coverage = planes[4].copy()
     image = np.ascontiguousarray((planes[:3] / np.maximum(coverage, 1e-6)).transpose(1, 2, 0))
     tissue = coverage > 0.3
@@ -156,8 +156,8 @@ def test_contribution_makes_the_closed_form_colour_step_converge() -> None:
     gaussians.colors[:] = 0.5
     losses = []
     for _ in range(30):
-        (planes,) = rasterizer.forward(gaussians, [view])
+        planes = rasterizer.forward(gaussians, view)
         losses.append(tissue_loss(planes, image, tissue, unknown, v_planes, weight, 0.0, DEPTH_SCALE))
-        gradients = rasterizer.backward(v_planes[None], weight[None], geometry=False)
+        gradients = rasterizer.backward(v_planes, weight)
         gaussians.colors[:] -= gradients.colors / np.maximum(gradients.contribution, 1e-3)[:, None]
     assert losses[-1] < 0.15 * losses[0]

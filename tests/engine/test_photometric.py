@@ -288,7 +288,7 @@ def test_descending_it_paints_the_picture(normalised: bool) -> None:
     view = camera(WIDTH, HEIGHT, focal=50.0)
     gaussians = random_gaussians(3, 150, view)
     rasterizer = make_rasterizer("numba", WIDTH, HEIGHT)
-    (planes,) = rasterizer.forward(gaussians, [view])
+    planes = rasterizer.forward(gaussians, view)
     divisor = np.maximum(planes[4], 1e-6) if normalised else np.float32(1)
     inputs = {
         "image": np.ascontiguousarray((planes[:3] / divisor).transpose(1, 2, 0)),
@@ -301,9 +301,9 @@ def test_descending_it_paints_the_picture(normalised: bool) -> None:
     state, rates = AdamState.new(150, 3), np.full(3, 0.02, np.float32)
     history = []
     for _ in range(60):
-        (planes,) = rasterizer.forward(gaussians, [view])
+        planes = rasterizer.forward(gaussians, view)
         history.append(loss.evaluate(planes, **inputs, v_planes=v_planes, weight=weight))
-        gradients = rasterizer.backward(v_planes[None], weight[None], geometry=False)
+        gradients = rasterizer.backward(v_planes, weight)
         adam_step(gaussians.colors, gradients.colors, state, rates)
     assert history[-1].color < 0.15 * history[0].color
     assert history[-1].similarity < 0.15 * history[0].similarity

@@ -34,15 +34,7 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.types import F32, Camera, Gaussians
 from sags_node.warm_up import warm_up
 
-GRADIENTS = (*INPUTS, "poses", "contribution")
-
-
-def draw(
-    gaussians: Gaussians, view: Camera, backend: str = "numba", seed: int = 0
-) -> tuple[F32, dict[str, NDArray[np.floating]]]:
-    """Planes [5, H, W] of one camera, and gradients for a random cotangent."""
-    planes, gradients = draw_and_differentiate(gaussians, [view], backend, seed)
-    return planes[0], gradients
+GRADIENTS = (*INPUTS, "contribution")
 
 
 def copies(gradients: Gradients) -> dict[str, NDArray[np.floating]]:
@@ -68,9 +60,9 @@ def subset(gaussians: Gaussians, keep: np.ndarray) -> Gaussians:
 def test_kernels_agree_with_the_float64_twin(seed: int, moved: bool) -> None:
     view = camera(moved=moved)
     gaussians = random_gaussians(seed, 60, view)
-    true = truth(gaussians, [view], seed)
-    assert true.planes[0, 4].mean() > 0.3  # the scene does cover the picture
-    true.check(*draw_and_differentiate(gaussians, [view], "numba", seed))
+    true = truth(gaussians, view, seed)
+    assert true.planes[4].mean() > 0.3  # the scene does cover the picture
+    true.check(*draw_and_differentiate(gaussians, view, "numba", seed))
 
 
 def test_held_jacobian_agrees_with_the_twin() -> None:
@@ -82,9 +74,9 @@ def test_held_jacobian_agrees_with_the_twin() -> None:
     means = geometry.unproject(view, pixels, rng.uniform(0.05, 0.09, 12)).astype(np.float32)
     scales = rng.uniform(0.02, 0.05, (12, 3)).astype(np.float32)
     gaussians = dataclasses.replace(inside, means=means, scales=scales)
-    true = truth(gaussians, [view])
-    assert true.planes[0, 4].mean() > 0.05
-    true.check(*draw_and_differentiate(gaussians, [view]))
+    true = truth(gaussians, view)
+    assert true.planes[4].mean() > 0.05
+    true.check(*draw_and_differentiate(gaussians, view))
 
 
 def test_needles_of_one_to_ten_thousand_stay_exact() -> None:
@@ -92,17 +84,17 @@ def test_needles_of_one_to_ten_thousand_stay_exact() -> None:
     gaussians = random_gaussians(7, 12, view)
     scales = np.tile(np.array([[0.1, 1e-5, 1e-3]], np.float32), (12, 1))
     gaussians = dataclasses.replace(gaussians, scales=scales)
-    true = truth(gaussians, [view])
-    assert true.planes[0, 4].max() > 0.01
-    true.check(*draw_and_differentiate(gaussians, [view]))
+    true = truth(gaussians, view)
+    assert true.planes[4].max() > 0.01
+    true.check(*draw_and_differentiate(gaussians, view))
 
 
 def test_larger_picture_by_percentiles() -> None:
     """Single pixels may differ by a splat cut at 1/255 or by two splats of equal depth in another order."""
     view = camera(width=110, height=80, focal=110.0)
     gaussians = random_gaussians(4, 800, view)
-    true = truth(gaussians, [view], moves=1)
-    planes, found = draw_and_differentiate(gaussians, [view])
+    true = truth(gaussians, view, moves=1)
+    planes, found = draw_and_differentiate(gaussians, view)
     assert np.percentile(np.abs(planes - true.planes), 99.9) < np.percentile(true.off, 99.9)
     for name in GRADIENTS:
         true.check_gradient(name, found[name])
@@ -131,13 +123,13 @@ def test_rounding_changes_no_more_than_whether_a_splat_is_cut(
     opacities = gaussians.opacities.copy()
     opacities[rows[splat]] *= MIN_ALPHA / alpha[pixel, splat]
     gaussians = dataclasses.replace(gaussians, opacities=opacities)
-    found, found_gradients = draw_and_differentiate(gaussians, [view], seed=seed)
+    found, found_gradients = draw_and_differentiate(gaussians, view, seed=seed)
 
     wrong = []
     for moved_cut in (1 - 1e-4, 1 + 1e-4):  # far more than rounding
         monkeypatch.setattr(reference, "MIN_ALPHA", moved_cut * MIN_ALPHA)
         shown = np.count_nonzero(alphas(gaussians, view)[0])
-        true = truth(gaussians, [view], seed)
+        true = truth(gaussians, view, seed)
         off = [np.abs(found - true.planes).max() / true.off.max()]
         for name in GRADIENTS:
             error = np.linalg.norm(found_gradients[name] - true.gradients[name])
@@ -154,14 +146,14 @@ def test_opaque_layers_stop_early_without_being_seen() -> None:
     gaussians = random_gaussians(9, 300, view, spread=6.0)
     gaussians = dataclasses.replace(gaussians, opacities=np.full(300, 0.99, np.float32))
     rasterizer = make_rasterizer("numba", 40, 40)
-    (planes,) = rasterizer.forward(gaussians, [view])
+    planes = rasterizer.forward(gaussians, view)
     backend = rasterizer._backend  # type: ignore[attr-defined]  # the only way to see that tiles did stop
     assert (backend._tile_ends < backend._tile_starts[1:]).all()  # also those that overhang the picture
-    true = truth(gaussians, [view])
+    true = truth(gaussians, view)
     left_out = 1e-4 * max(1, gaussians.colors.max())  # of what is seen, and of every pixel of a gradient
-    np.testing.assert_allclose(planes, true.planes[0], rtol=0, atol=left_out + true.off.max())
-    found = copies(rasterizer.backward(*cotangents([view], 0)))
-    v_colors = np.abs(cotangents([view], 0)[0][0, :3]).sum(axis=(1, 2))
+    np.testing.assert_allclose(planes, true.planes, rtol=0, atol=left_out + true.off.max())
+    found = copies(rasterizer.backward(*cotangents(view, 0)))
+    v_colors = np.abs(cotangents(view, 0)[0][:3]).sum(axis=(1, 2))
     error = np.linalg.norm(found["colors"] - true.gradients["colors"])
     assert error < left_out * np.linalg.norm(v_colors) + true.gradients_within["colors"]
 
@@ -220,19 +212,6 @@ def test_view_is_normalised_by_coverage() -> None:
     assert drawn.rgb[0, 0, 0] == pytest.approx(0.5, rel=after(4))  # fresh arrays
 
 
-def test_geometry_can_be_left_out() -> None:
-    view = camera()
-    gaussians = random_gaussians(2, 40, view)
-    rasterizer = make_rasterizer("numba", view.width, view.height)
-    rasterizer.forward(gaussians, [view])
-    whole = copies(rasterizer.backward(*cotangents([view], 0)))
-    part = rasterizer.backward(*cotangents([view], 0), geometry=False)
-    np.testing.assert_array_equal(part.colors, whole["colors"])
-    np.testing.assert_array_equal(part.contribution, whole["contribution"])
-    for name in ("means", "quats", "scales", "opacities", "sh_rest", "poses"):
-        assert len(getattr(part, name)) == 0, name
-
-
 # ---- repeatable --------------------------------------------------------------------------------------------
 
 
@@ -240,15 +219,15 @@ def test_what_is_not_asked_of_a_tile_leaves_nothing_of_an_earlier_answer() -> No
     """Tiles without a cotangent are passed over; their pairs still hold the gradients of the call before."""
     view = camera()
     gaussians = random_gaussians(4, 60, view)
-    v_planes, weight = cotangents([view], 4)
+    v_planes, weight = cotangents(view, 4)
     used, fresh = (make_rasterizer("numba", view.width, view.height) for _ in range(2))
-    used.forward(gaussians, [view])
+    used.forward(gaussians, view)
     used.backward(v_planes, weight)
     asked = np.zeros((view.height, view.width), np.bool_)
     asked[: view.height // 2, : view.width // 3] = True
-    fresh.forward(gaussians, [view])
+    fresh.forward(gaussians, view)
     found, again = (copies(r.backward(v_planes * asked, weight * asked)) for r in (used, fresh))
-    true = truth(gaussians, [view], given=(v_planes * asked, weight * asked))
+    true = truth(gaussians, view, given=(v_planes * asked, weight * asked))
     for name in GRADIENTS:
         np.testing.assert_array_equal(found[name], again[name], err_msg=name)
         true.check_gradient(name, found[name])
@@ -261,35 +240,35 @@ def test_same_bits_for_any_number_of_threads(monkeypatch: pytest.MonkeyPatch) ->
     cores = numba.get_num_threads()
     numba.set_num_threads(1)
     try:
-        alone = draw(gaussians, view)
+        alone = draw_and_differentiate(gaussians, view)
     finally:
         numba.set_num_threads(cores)
-    assert_same_bits(alone, draw(gaussians, view))
+    assert_same_bits(alone, draw_and_differentiate(gaussians, view))
     for pieces in (2, 3, 7, 64):  # the work cut for more threads than this machine may have
         monkeypatch.setattr(numba_rasterizer, "thread_count", lambda pieces=pieces: pieces)
-        assert_same_bits(alone, draw(gaussians, view))
+        assert_same_bits(alone, draw_and_differentiate(gaussians, view))
 
 
 def test_repeated_runs_of_one_rasterizer_give_the_same_bits() -> None:
     view = camera()
     many, few = random_gaussians(6, 300, view, spread=3.0), random_gaussians(7, 20, view)
-    fresh_many, fresh_few = draw(many, view), draw(few, view)
+    fresh_many, fresh_few = draw_and_differentiate(many, view), draw_and_differentiate(few, view)
     rasterizer = make_rasterizer("numba", view.width, view.height)
     for gaussians, fresh in [(few, fresh_few), (many, fresh_many), (few, fresh_few), (many, fresh_many)]:
-        planes = rasterizer.forward(gaussians, [view])[0].copy()
-        assert_same_bits((planes, copies(rasterizer.backward(*cotangents([view], 0)))), fresh)
+        planes = rasterizer.forward(gaussians, view).copy()
+        assert_same_bits((planes, copies(rasterizer.backward(*cotangents(view, 0)))), fresh)
 
 
 def test_two_python_threads_draw_at_once() -> None:
     view = camera(width=100, height=77, focal=100.0)
     scenes = [random_gaussians(seed, 500, view) for seed in (1, 2)]
-    alone = [draw(scene, view) for scene in scenes]
+    alone = [draw_and_differentiate(scene, view) for scene in scenes]
     failures: list[BaseException] = []
 
     def work(index: int) -> None:
         try:
             for _ in range(20):
-                assert_same_bits(draw(scenes[index], view), alone[index])
+                assert_same_bits(draw_and_differentiate(scenes[index], view), alone[index])
         except BaseException as error:  # carried to the test's own thread
             failures.append(error)
 
@@ -319,7 +298,7 @@ def test_warm_up_leaves_nothing_to_compile() -> None:
     gaussians = random_gaussians(1, 50, view)
     for name in INPUTS:
         getattr(gaussians, name).flags.writeable = False
-    draw(gaussians, view)
+    draw_and_differentiate(gaussians, view)
     rasterize(gaussians, view)
     assert [len(kernel.signatures) for kernel in kernels] == compiled == [1] * len(kernels)
 
@@ -360,8 +339,8 @@ def test_a_spoilt_gaussian_is_left_out_and_harms_no_other(name: str) -> None:
     spoilt = random_gaussians(8, 30, view)
     SPOILERS[name](spoilt, 13)
     others = np.arange(30) != 13
-    planes, found = draw(spoilt, view)
-    true_planes, true = draw(subset(clean, others), view)
+    planes, found = draw_and_differentiate(spoilt, view)
+    true_planes, true = draw_and_differentiate(subset(clean, others), view)
     np.testing.assert_array_equal(planes, true_planes)
     for key in (*INPUTS, "contribution"):
         np.testing.assert_array_equal(found[key][others], true[key], err_msg=key)
@@ -375,7 +354,7 @@ def test_extreme_values_give_finite_pictures_and_gradients(
     scale: float, distance: float, opacity: float
 ) -> None:
     view = camera(width=33, height=35)
-    planes, found = draw(one_gaussian(np.array([0.0, 0.0, distance]), scale, opacity), view)
+    planes, found = draw_and_differentiate(one_gaussian(np.array([0.0, 0.0, distance]), scale, opacity), view)
     assert np.isfinite(planes).all()
     assert (planes[4] >= 0).all()
     assert planes[4].max() <= 1
@@ -386,7 +365,9 @@ def test_extreme_values_give_finite_pictures_and_gradients(
 @pytest.mark.parametrize("backend", ["numba", "reference"])
 def test_no_gaussians(backend: str) -> None:
     view = camera()
-    planes, found = draw(subset(random_gaussians(0, 1, view), np.zeros(1, bool)), view, backend)
+    planes, found = draw_and_differentiate(
+        subset(random_gaussians(0, 1, view), np.zeros(1, bool)), view, backend
+    )
     assert planes.shape == (5, 40, 48)
     assert not planes.any()
     assert found["means"].shape == (0, 3)
@@ -397,7 +378,7 @@ def test_no_gaussians(backend: str) -> None:
 def test_sizes_that_no_tile_divides(size: tuple[int, int]) -> None:
     view = camera(*size, focal=30.0)
     gaussians = random_gaussians(3, 25, view, spread=2.0)
-    truth(gaussians, [view]).check(*draw_and_differentiate(gaussians, [view]))
+    truth(gaussians, view).check(*draw_and_differentiate(gaussians, view))
 
 
 def test_buffers_grow_when_a_picture_needs_more_pairs() -> None:
@@ -407,16 +388,16 @@ def test_buffers_grow_when_a_picture_needs_more_pairs() -> None:
     gaussians = dataclasses.replace(
         gaussians, scales=np.full((100, 3), 0.2, np.float32), opacities=np.full(100, 0.02, np.float32)
     )
-    planes, found = draw_and_differentiate(gaussians, [view])
+    planes, found = draw_and_differentiate(gaussians, view)
     assert (found["contribution"] > 0).all()
-    truth(gaussians, [view], moves=1).check(planes, found, ["colors", "contribution"])
+    truth(gaussians, view, moves=1).check(planes, found, ["colors", "contribution"])
 
 
 def test_too_many_pairs_are_refused_with_a_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(numba_rasterizer, "MAX_PAIRS", 50)
     view = camera()
     with pytest.raises(SagsError, match="pairs, the limit is 50"):
-        draw(random_gaussians(1, 60, view), view)
+        draw_and_differentiate(random_gaussians(1, 60, view), view)
 
 
 def test_hundred_thousand_on_one_pixel() -> None:
@@ -424,7 +405,7 @@ def test_hundred_thousand_on_one_pixel() -> None:
     count = 100_000
     one = one_gaussian(geometry.unproject(view, np.array([20.0, 20.0]), np.array(0.07)), 1e-4)
     index = np.zeros(count, int)
-    planes, found = draw(subset(one, index), view)
+    planes, found = draw_and_differentiate(subset(one, index), view)
     assert planes[4, 20, 20] > 0.9999
     assert np.isfinite(found["means"]).all()
 
@@ -434,18 +415,18 @@ def test_wrong_input_is_explained() -> None:
     gaussians = random_gaussians(0, 5, view)
     rasterizer = make_rasterizer("numba", view.width, view.height)
     with pytest.raises(UsageError, match="call forward before backward"):
-        rasterizer.backward(*cotangents([view], 0))
+        rasterizer.backward(*cotangents(view, 0))
     with pytest.raises(UsageError, match=r"quats has shape \[5, 3\], expected \[5, 4\]"):
-        rasterizer.forward(dataclasses.replace(gaussians, quats=gaussians.means), [view])
+        rasterizer.forward(dataclasses.replace(gaussians, quats=gaussians.means), view)
     with pytest.raises(UsageError, match="draws 48x40 px, the camera has 50x40"):
-        rasterizer.forward(gaussians, [camera(width=50)])
-    rasterizer.forward(gaussians, [view])
+        rasterizer.forward(gaussians, camera(width=50))
+    rasterizer.forward(gaussians, view)
     with pytest.raises(UsageError, match="v_planes has shape"):
-        rasterizer.backward(np.zeros((1, 5, 3, 3), np.float32), cotangents([view], 0)[1])
+        rasterizer.backward(np.zeros((5, 3, 3), np.float32), cotangents(view, 0)[1])
     with pytest.raises(UsageError, match="unknown engine backend 'cudnn'; choose"):
         make_rasterizer("cudnn", 8, 8)
     with pytest.raises(UsageError, match="0x8"):
         make_rasterizer("numba", 0, 8)
     spoilt = Camera(view.width, view.height, view.K, np.full((4, 4), np.nan))
     with pytest.raises(UsageError, match="NaN or infinity"):
-        rasterizer.forward(gaussians, [spoilt])
+        rasterizer.forward(gaussians, spoilt)

@@ -117,7 +117,7 @@ def resumed(clip: Clip, path: Path, settings: FitSettings, device: DeviceKind) -
 def picture(made: Fit) -> Any:
     """What the model looks like in a frame that it never saw."""
     frame = made.clip.test[0]
-    return made.rasterizer.forward(made.gaussians(frame), [frame.camera])[0].copy()
+    return made.rasterizer.forward(made.gaussians(frame), frame.camera).copy()
 
 
 # ---- the same as on the CPU --------------------------------------------------------------------------------

@@ -91,7 +91,7 @@ def test_each_part_of_the_method_has_its_share_in_the_result(clip: Clip) -> None
 
     def drawn(**changed: Any) -> F32:
         fit = fitted(clip, dataclasses.replace(PAPER, warm_up=10, iterations=30, **changed))
-        return fit.rasterizer.forward(fit.gaussians(frame), [frame.camera])[0, :3, frame.tissue]
+        return fit.rasterizer.forward(fit.gaussians(frame), frame.camera)[:3, frame.tissue]
 
     whole, alone = drawn(), drawn(tokens="self")
     assert np.array_equal(drawn(), whole)

@@ -17,7 +17,6 @@ from sags_node.types import F32, F64, Camera, Gaussians
 
 INPUTS = ("means", "quats", "scales", "opacities", "colors")
 DERIVATIVES = tuple(field.name for field in dataclasses.fields(Gradients))
-PER_GAUSSIAN = tuple(name for name in DERIVATIVES if name != "poses")
 
 
 def camera(width: int = 48, height: int = 40, focal: float = 60.0, moved: bool = False) -> Camera:
@@ -89,25 +88,25 @@ def rows(gaussians: Gaussians, keep: NDArray[np.bool_] | NDArray[np.integer] | s
     return Gaussians(**{name: None if value is None else value[keep] for name, value in values.items()})
 
 
-def cotangents(views: Sequence[Camera], seed: int) -> tuple[F32, F32]:
-    """Random v_planes [C, 5, H, W] and weight [C, H, W]."""
+def cotangents(view: Camera, seed: int) -> tuple[F32, F32]:
+    """Random v_planes [5, H, W] and weight [H, W]."""
     rng = np.random.default_rng(seed)
-    size = views[0].height, views[0].width
-    v_planes = rng.normal(size=(len(views), 5, *size)).astype(np.float32)
-    return v_planes, rng.uniform(0, 2, (len(views), *size)).astype(np.float32)
+    size = view.height, view.width
+    v_planes = rng.normal(size=(5, *size)).astype(np.float32)
+    return v_planes, rng.uniform(0, 2, size).astype(np.float32)
 
 
 def draw_and_differentiate(
     gaussians: Gaussians,
-    views: Sequence[Camera],
+    view: Camera,
     backend: str = "numba",
     seed: int = 0,
     antialias: bool = True,
 ) -> tuple[F32, dict[str, NDArray[np.floating]]]:
     """Planes, and gradients for a random cotangent, as copies."""
-    rasterizer = make_rasterizer(backend, views[0].width, views[0].height, antialias)
-    planes = rasterizer.forward(gaussians, views).copy()
-    gradients = rasterizer.backward(*cotangents(views, seed))
+    rasterizer = make_rasterizer(backend, view.width, view.height, antialias)
+    planes = rasterizer.forward(gaussians, view).copy()
+    gradients = rasterizer.backward(*cotangents(view, seed))
     return planes, {name: getattr(gradients, name).copy() for name in DERIVATIVES}
 
 
@@ -115,9 +114,9 @@ def draw_and_differentiate(
 class Truth:
     """What the float64 twin draws, and how near to it float32 must come."""
 
-    planes: F32  # [C, 5, H, W]
+    planes: F32  # [5, H, W]
     gradients: dict[str, NDArray[np.floating]]
-    off: F64  # [C, 5, H, W] how far values moved that were computed from inputs a little off
+    off: F64  # [5, H, W] how far values moved that were computed from inputs a little off
     gradients_within: dict[str, float]  # of the norm of all values
 
     def check(
@@ -139,7 +138,7 @@ SUMMED = 60  # additions one after the other: the pixels of a tile's column, its
 
 def truth(
     gaussians: Gaussians,
-    views: Sequence[Camera],
+    view: Camera,
     seed: int = 0,
     antialias: bool = True,
     moves: int = 3,
@@ -150,17 +149,17 @@ def truth(
     As `rounding.exact`: the twin draws `moves` times more from inputs that are a little off, with an
     exponential that is off by `EXPONENTIAL`, anew for each pixel of each Gaussian or always the same way.
     """
-    rasterizer = make_rasterizer("reference", views[0].width, views[0].height, antialias)
+    rasterizer = make_rasterizer("reference", view.width, view.height, antialias)
 
     def draw(
-        gaussians: Gaussians, views: Sequence[Camera], v_planes: F32, weight: F32
+        gaussians: Gaussians, view: Camera, v_planes: F32, weight: F32
     ) -> tuple[F32, dict[str, NDArray[np.floating]]]:
-        planes = rasterizer.forward(gaussians, views).copy()
+        planes = rasterizer.forward(gaussians, view).copy()
         gradients = rasterizer.backward(v_planes, weight)
         return planes, {name: getattr(gradients, name).copy() for name in DERIVATIVES}
 
-    given = given or cotangents(views, seed)
-    planes, gradients = draw(gaussians, views, *given)
+    given = given or cotangents(view, seed)
+    planes, gradients = draw(gaussians, view, *given)
     off = np.zeros(planes.shape)
     within = dict.fromkeys(gradients, 0.0)
     for move in range(moves):
@@ -169,7 +168,7 @@ def truth(
             patch.setattr(torch, "exp", roughly(torch.exp, rng, EXPONENTIAL))
             near, near_gradients = draw(
                 _moved_gaussians(gaussians, rng),
-                [Camera(v.width, v.height, moved(v.K, rng), moved(v.T_world_cam, rng)) for v in views],
+                Camera(view.width, view.height, moved(view.K, rng), moved(view.T_world_cam, rng)),
                 *(moved(array, rng) for array in given),
             )
         off = np.maximum(off, np.abs(near - planes))
@@ -179,7 +178,7 @@ def truth(
         within[name] += (EXPONENTIAL + after(SUMMED)) * float(np.linalg.norm(values))
     if len(gaussians):
         # what is behind a splat comes by subtraction from all that a pixel shows, and is divided by 1 - alpha
-        shown = np.linalg.norm((given[0] * planes).sum(1))
+        shown = np.linalg.norm((given[0] * planes).sum(0))
         within["opacities"] += U * float(shown) / (1 - min(gaussians.opacities.max(), MAX_OPACITY))
     return Truth(planes, gradients, off + EXPONENTIAL * np.abs(planes).max(initial=0), within)
 

@@ -60,10 +60,10 @@ def test_the_kernel_its_source_and_numpy_agree(scene: tuple[F32, F32, Bool]) -> 
 @pytest.mark.parametrize("share", [0.0, 0.15, 0.5, 1.0])
 def test_the_worst_are_chosen_and_no_more_than_asked_for(scene: tuple[F32, F32, Bool], share: float) -> None:
     tiles = worst_tiles(*scene, share)
-    assert tiles.shape == (1, *SHAPE) and tiles.dtype == np.bool_
+    assert tiles.shape == SHAPE and tiles.dtype == np.bool_
     assert tiles.sum() == max(1, round(share * tiles.size))
     sums = numpy_sums(*scene)
-    assert sums[tiles[0]].min() >= sums[~tiles[0]].max(initial=0.0)
+    assert sums[tiles].min() >= sums[~tiles].max(initial=0.0)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e30])
@@ -82,7 +82,7 @@ def test_what_is_not_finite_chooses_no_tile(scene: tuple[F32, F32, Bool], where:
     if where == "everywhere":
         planes[4][damaged] = value
     tiles = worst_tiles(planes, image, tissue, 2 / (SHAPE[0] * SHAPE[1]))
-    assert np.argwhere(tiles[0]).tolist() == [[1, 0], [1, 1]]
+    assert np.argwhere(tiles).tolist() == [[1, 0], [1, 1]]
 
 
 def test_a_picture_without_tissue_still_names_tiles(scene: tuple[F32, F32, Bool]) -> None:
@@ -94,14 +94,14 @@ def test_a_picture_without_tissue_still_names_tiles(scene: tuple[F32, F32, Bool]
 
 @pytest.mark.parametrize("place", [(3, 4), (0, 0), (6, 8), (0, 8)])
 def test_neighbours_are_all_around_and_stay_inside(place: tuple[int, int]) -> None:
-    tiles = np.zeros((1, 7, 9), bool)
-    tiles[0][place] = True
+    tiles = np.zeros((7, 9), bool)
+    tiles[place] = True
     grown = with_neighbours(tiles)
     y, x = np.indices((7, 9))
     touching = np.maximum(abs(y - place[0]), abs(x - place[1])) <= 1
     assert tiles.sum() == 1 and grown.shape == tiles.shape and grown.dtype == np.bool_
-    assert grown[0][touching].all()
-    reach = np.argwhere(grown[0])
+    assert grown[touching].all()
+    reach = np.argwhere(grown)
     assert (reach.max(0) - reach.min(0) <= [2, 4]).all()  # tiles are twice as high as wide
 
 

@@ -110,7 +110,7 @@ class Scene:
         self._rasterizer = make_rasterizer("numba", camera.width, camera.height)
 
     def show(self, gaussians: Gaussians, camera: Camera) -> F32:
-        planes: F32 = self._rasterizer.forward(gaussians, [camera])[0]
+        planes: F32 = self._rasterizer.forward(gaussians, camera)
         return planes
 
     def mapped(self, right_colors: float = 0.0) -> Mapped:

@@ -382,7 +382,7 @@ def test_what_is_drawn_in_parts_is_the_whole_model(
     for _ in range(25):
         result = play.again(frames[3])
         for eye, shown in result.views.items():
-            planes = whole.forward(result.snapshot.gaussians, [shown.camera])[0]
+            planes = whole.forward(result.snapshot.gaussians, shown.camera)
             drawn = to_view(planes, shown.camera, shown.frame_id, shown.t_capture_ns)
             for part in ("rgb", "alpha", "depth") if eye == "left" else ("alpha", "depth"):
                 difference = np.abs(getattr(shown, part) - getattr(drawn, part)).max()

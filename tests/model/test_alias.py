@@ -37,9 +37,9 @@ VIEW = camera(moved=True)
 @pytest.mark.parametrize("seed", [1, 2])
 def test_gradients_of_the_dilation_agree_with_the_float64_twin(seed: int) -> None:
     gaussians = random_gaussians(seed, 60, VIEW, spread=0.4)
-    planes, found = draw_and_differentiate(gaussians, [VIEW], "numba", seed, antialias=False)
-    true_planes, true = draw_and_differentiate(gaussians, [VIEW], "reference", seed, antialias=False)
-    filtered, _ = draw_and_differentiate(gaussians, [VIEW], "numba", seed)
+    planes, found = draw_and_differentiate(gaussians, VIEW, "numba", seed, antialias=False)
+    true_planes, true = draw_and_differentiate(gaussians, VIEW, "reference", seed, antialias=False)
+    filtered, _ = draw_and_differentiate(gaussians, VIEW, "numba", seed)
     assert np.abs(planes - filtered).max() > 0.05  # it is another picture
     np.testing.assert_allclose(planes, true_planes, atol=1e-5)
     for name in set(DERIVATIVES) - {"sh_rest"}:
@@ -58,7 +58,7 @@ def test_dilation_is_that_of_3d_gaussian_splatting() -> None:
         colors=np.ones((1, 3), np.float32),
         ids=np.zeros(1, np.int64),
     )
-    alpha = make_rasterizer("numba", 41, 41, antialias=False).forward(gaussian, [view])[0, 4]
+    alpha = make_rasterizer("numba", 41, 41, antialias=False).forward(gaussian, view)[4]
     offsets = np.arange(-2, 3)
     np.testing.assert_allclose(alpha[20, 18:23], 0.8 * np.exp(-0.5 * offsets**2 / 1.3), rtol=1e-4)
 
@@ -160,8 +160,8 @@ def light_of_a_line(factor: float, antialias: bool) -> float:
         smoothing=smoothing_variances(means, [camera]),
     )
     view = resized(camera, factor)
-    planes = make_rasterizer("numba", view.width, view.height, antialias).forward(line, [view])
-    return float(planes[0, 0].sum(dtype=np.float64)) / factor**2
+    planes = make_rasterizer("numba", view.width, view.height, antialias).forward(line, view)
+    return float(planes[0].sum(dtype=np.float64)) / factor**2
 
 
 @pytest.mark.parametrize("factor", [0.25, 0.5, 2, 4])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Protocol
 
 import torch
@@ -21,11 +20,9 @@ class DeviceRasterizer(Protocol):
 
     device: torch.device
 
-    def draw(
-        self, gaussians: DeviceGaussians, pinholes: Sequence[Pinhole], tiles: Tensor | None = None
-    ) -> Tensor: ...
+    def draw(self, gaussians: DeviceGaussians, pinhole: Pinhole, tiles: Tensor | None = None) -> Tensor: ...
 
-    def pull_back(self, v_planes: Tensor, weight: Tensor, geometry: bool = True) -> DeviceGradients: ...
+    def pull_back(self, v_planes: Tensor, weight: Tensor) -> DeviceGradients: ...
 
     def median_depth(self) -> tuple[Tensor, Tensor]: ...
 
@@ -57,11 +54,11 @@ class DeviceBackend:
     def __init__(self, rasterizer: DeviceRasterizer) -> None:
         self._rasterizer = rasterizer
 
-    def forward(self, gaussians: Gaussians, pinholes: Sequence[Pinhole], tiles: Bool | None) -> F32:
+    def forward(self, gaussians: Gaussians, pinhole: Pinhole, tiles: Bool | None) -> F32:
         planes: F32 = (
             self._rasterizer.draw(
                 DeviceGaussians.from_host(gaussians, self._rasterizer.device),
-                pinholes,
+                pinhole,
                 None if tiles is None else torch.tensor(tiles),
             )
             .cpu()
@@ -69,10 +66,10 @@ class DeviceBackend:
         )
         return planes
 
-    def backward(self, v_planes: F32, weight: F32, geometry: bool) -> Gradients:
+    def backward(self, v_planes: F32, weight: F32) -> Gradients:
         device = self._rasterizer.device
         found = self._rasterizer.pull_back(
-            torch.tensor(v_planes, device=device), torch.tensor(weight, device=device), geometry
+            torch.tensor(v_planes, device=device), torch.tensor(weight, device=device)
         )
         return Gradients(
             means=found.means.cpu().numpy(),
@@ -81,7 +78,6 @@ class DeviceBackend:
             opacities=found.opacities.cpu().numpy(),
             colors=found.colors.cpu().numpy(),
             sh_rest=found.sh_rest.cpu().numpy(),
-            poses=found.poses.cpu().numpy(),
             contribution=found.contribution.cpu().numpy(),
         )
 

@@ -42,19 +42,17 @@ BLOCK = 256  # pairs per program
 ROW_SLACK = tl.constexpr(0.001)  # px: rounding must not lose a row
 
 
-@triton.jit(do_not_specialize=["pairs", "count", "tiles_x", "tiles", "cameras"])
+@triton.jit(do_not_specialize=["pairs", "tiles_x", "tiles"])
 def find_tiles(
-    splats: tl.tensor,  # [C N, SPLAT_FLOATS]
-    boxes: tl.tensor,  # [C N, BOX_INTS]
-    first_slots: tl.tensor,  # [C N] slot of a splat's first pair
+    splats: tl.tensor,  # [N, SPLAT_FLOATS]
+    boxes: tl.tensor,  # [N, BOX_INTS]
+    first_slots: tl.tensor,  # [N] slot of a splat's first pair
     owners: tl.tensor,  # [pairs] the splat of each slot
-    active: tl.tensor,  # [C, tiles] 1: this tile is drawn
-    found: tl.tensor,  # [pairs] written: camera * tiles + tile; cameras * tiles where the ellipse misses it
+    active: tl.tensor,  # [tiles] 1: this tile is drawn
+    found: tl.tensor,  # [pairs] written: the tile; `tiles` where the ellipse misses it
     pairs: tl.tensor,
-    count: tl.tensor,  # N
     tiles_x: tl.tensor,  # columns of tiles
-    tiles: tl.tensor,  # of one picture
-    cameras: tl.tensor,  # C
+    tiles: tl.tensor,  # of the picture
     BLOCK: tl.constexpr,
 ) -> None:
     """The ellipse on which alpha is 1/255 against the tiles of its box."""
@@ -88,21 +86,20 @@ def find_tiles(
     from_top = (row << TILE_HEIGHT_BITS).to(tl.float32) + 0.5 - mean_y
     touched = (above - ROW_SLACK <= from_top + (TILE_HEIGHT - 1)) & (below + ROW_SLACK >= from_top)
 
-    camera = (owner // count).to(tl.int32)
-    tile = camera * tiles + row * tiles_x + column
+    tile = row * tiles_x + column
     touched &= tl.load(active + tile, mask=inside, other=0) != 0
-    tl.store(found + slots, tl.where(touched, tile, cameras * tiles), mask=inside)
+    tl.store(found + slots, tl.where(touched, tile, tiles), mask=inside)
 
 
 @dataclass(frozen=True, slots=True)
 class Bins:
     """Pairs of splats and tiles, P of them."""
 
-    first_slots: Tensor  # [C N] int32, slot of a splat's first pair
-    counts: Tensor  # [C N] int32, its number of slots
+    first_slots: Tensor  # [N] int32, slot of a splat's first pair
+    counts: Tensor  # [N] int32, its number of slots
     splats: Tensor  # [P] int32, tile after tile, near to far in each
     slots: Tensor  # [P] int64, of these pairs
-    tile_starts: Tensor  # [C tiles + 1] int32
+    tile_starts: Tensor  # [tiles + 1] int32
 
 
 def bin_splats(
@@ -112,7 +109,7 @@ def bin_splats(
     active: Tensor,
     check: Callable[[int], None],
 ) -> Bins:
-    """Sort splats [C N, SPLAT_FLOATS] of `project` into the active tiles [C, rows, columns].
+    """Sort splats [N, SPLAT_FLOATS] of `project` into the active tiles [rows, columns].
 
     The number of pairs is read back: the one time in a drawing that the host waits for the device. A buffer
     of fixed size would spare that wait, but would be sorted in full in every drawing, and what does not fit
@@ -121,8 +118,7 @@ def bin_splats(
     Args:
         check: is told that number before memory is taken; raises where it is too large.
     """
-    cameras, tiles_y, tiles_x = active.shape
-    tiles = tiles_y * tiles_x
+    tiles = active.numel()
     order = torch.argsort(splats[:, DEPTH.value], stable=True)
     sorted_counts = counts[order]
     ends = torch.cumsum(sorted_counts, 0)  # int64
@@ -133,11 +129,10 @@ def bin_splats(
     owners = torch.repeat_interleave(order.to(torch.int32), sorted_counts, output_size=pairs)
     found = torch.empty(pairs, dtype=torch.int32, device=splats.device)
     find_tiles[(triton.cdiv(pairs, BLOCK),)](
-        splats, boxes, first_slots, owners, active, found,
-        pairs, max(len(splats) // cameras, 1), tiles_x, tiles, cameras, BLOCK=BLOCK,
+        splats, boxes, first_slots, owners, active, found, pairs, active.shape[1], tiles, BLOCK=BLOCK
     )  # fmt: skip
     found, slots = torch.sort(found, stable=True)
-    borders = torch.arange(cameras * tiles + 1, dtype=torch.int32, device=splats.device)
+    borders = torch.arange(tiles + 1, dtype=torch.int32, device=splats.device)
     tile_starts = torch.searchsorted(found, borders, out_int32=True)
     return Bins(first_slots, counts, owners[slots], slots, tile_starts)
 
@@ -147,8 +142,7 @@ SIGNATURES = (
         find_tiles,
         {
             "splats": "*fp32", "boxes": "*i32", "first_slots": "*i32", "owners": "*i32", "active": "*i32",
-            "found": "*i32", "pairs": "i32", "count": "i32", "tiles_x": "i32", "tiles": "i32",
-            "cameras": "i32",
+            "found": "*i32", "pairs": "i32", "tiles_x": "i32", "tiles": "i32",
         },
         {"BLOCK": BLOCK},
     ),

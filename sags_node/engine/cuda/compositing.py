@@ -20,7 +20,6 @@ from sags_node.engine.cuda.layout import (
     MEAN_Y,
     RED,
     SPLAT_FLOATS,
-    TILE_HEIGHT,
     TILE_HEIGHT_BITS,
     TILE_PIXELS,
     TILE_WARPS,
@@ -51,17 +50,14 @@ TEST_EVERY = tl.constexpr(8)  # pairs between two looks at the transmittance
 
 @triton.jit
 def tile_pixels(tile: tl.tensor, active: tl.tensor, width: tl.tensor, height: tl.tensor) -> tl.tuple:
-    """Of a tile's pixels: the centres, px; their places in a picture [H W]; whether they are drawn. And the
-    camera."""
+    """Of a tile's pixels: the centres, px; their places in a picture [H W]; whether they are drawn."""
     tiles_x = (width + TILE_WIDTH - 1) >> TILE_WIDTH_BITS
-    tiles_y = (height + TILE_HEIGHT - 1) >> TILE_HEIGHT_BITS
-    camera = tile // (tiles_x * tiles_y)
     nth = tl.arange(0, TILE_PIXELS)
     x = (tile % tiles_x << TILE_WIDTH_BITS) + nth % TILE_WIDTH
-    y = (tile // tiles_x % tiles_y << TILE_HEIGHT_BITS) + (nth >> TILE_WIDTH_BITS)
+    y = (tile // tiles_x << TILE_HEIGHT_BITS) + (nth >> TILE_WIDTH_BITS)
     inside = (x < width * tl.load(active + tile)) & (y < height)  # a tile that is not active has no width
     centres = x.to(tl.float32) + 0.5, y.to(tl.float32) + 0.5
-    return centres, y.to(tl.int64) * width + x, inside, camera.to(tl.int64)
+    return centres, y.to(tl.int64) * width + x, inside
 
 
 @triton.jit
@@ -76,17 +72,17 @@ def alpha_at(splat: tl.tensor, x: tl.tensor, y: tl.tensor) -> tl.tuple:
 
 @triton.jit(do_not_specialize=["width", "height"])
 def composite(
-    splats: tl.tensor,  # [C N, SPLAT_FLOATS]
+    splats: tl.tensor,  # [N, SPLAT_FLOATS]
     pairs: tl.tensor,  # [P] the splats of the tiles, near to far in each
-    tile_starts: tl.tensor,  # [C tiles + 1]
-    active: tl.tensor,  # [C, tiles] 1: this tile is drawn
-    planes: tl.tensor,  # [C, 5, H, W] written where drawn
-    tile_ends: tl.tensor,  # [C tiles] first pair of a tile that was not blended, written
+    tile_starts: tl.tensor,  # [tiles + 1]
+    active: tl.tensor,  # [tiles] 1: this tile is drawn
+    planes: tl.tensor,  # [5, H, W] written where drawn
+    tile_ends: tl.tensor,  # [tiles] first pair of a tile that was not blended, written
     width: tl.tensor,
     height: tl.tensor,
 ) -> None:
     tile = tl.program_id(0)
-    (x, y), at, inside, camera = tile_pixels(tile, active, width, height)
+    (x, y), at, inside = tile_pixels(tile, active, width, height)
     transmittance = tl.where(inside, 1.0, 0.0)  # pixels outside neither draw nor keep a tile open
     red, green, blue, depth = (tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x))
     p, end = tl.load(tile_starts + tile), tl.load(tile_starts + tile + 1)
@@ -104,7 +100,7 @@ def composite(
         p = stop
     tl.store(tile_ends + tile, p)
     plane = height.to(tl.int64) * width
-    at += planes + camera * 5 * plane
+    at += planes
     tl.store(at, red, mask=inside)
     tl.store(at + plane, green, mask=inside)
     tl.store(at + 2 * plane, blue, mask=inside)
@@ -120,9 +116,9 @@ def composite_backward(
     tile_starts: tl.tensor,
     tile_ends: tl.tensor,
     active: tl.tensor,
-    planes: tl.tensor,  # [C, 5, H, W] of `composite`
-    v_planes: tl.tensor,  # [C, 5, H, W]
-    weight: tl.tensor,  # [C, H, W]
+    planes: tl.tensor,  # [5, H, W] of `composite`
+    v_planes: tl.tensor,  # [5, H, W]
+    weight: tl.tensor,  # [H, W]
     v_pairs: tl.tensor,  # [P, V_SPLAT_FLOATS] written for what was blended where anything is asked
     width: tl.tensor,
     height: tl.tensor,
@@ -130,10 +126,9 @@ def composite_backward(
     """With s = (color, depth, 1) . v_planes, `remaining` is the sum of w s over the pairs behind, starting
     from planes . v_planes: nothing is recovered by dividing."""
     tile = tl.program_id(0)
-    (x, y), at, inside, camera = tile_pixels(tile, active, width, height)
+    (x, y), at, inside = tile_pixels(tile, active, width, height)
     plane = height.to(tl.int64) * width
-    of_weight = weight + camera * plane + at
-    to_v, to_planes = v_planes + camera * 5 * plane + at, planes + camera * 5 * plane + at
+    to_v, to_planes = v_planes + at, planes + at
     v_red = tl.load(to_v, mask=inside, other=0.0)
     v_green = tl.load(to_v + plane, mask=inside, other=0.0)
     v_blue = tl.load(to_v + 2 * plane, mask=inside, other=0.0)
@@ -144,7 +139,7 @@ def composite_backward(
     remaining += v_blue * tl.load(to_planes + 2 * plane, mask=inside, other=0.0)
     remaining += v_depth * tl.load(to_planes + 3 * plane, mask=inside, other=0.0)
     remaining += v_coverage * tl.load(to_planes + 4 * plane, mask=inside, other=0.0)
-    pixel_weight = tl.load(of_weight, mask=inside, other=0.0)
+    pixel_weight = tl.load(weight + at, mask=inside, other=0.0)
     asked = tl.abs(v_red) + tl.abs(v_green) + tl.abs(v_blue) + tl.abs(v_depth) + tl.abs(v_coverage)
     start, end = tl.load(tile_starts + tile), tl.load(tile_ends + tile)
     end = tl.where(tl.sum(asked + tl.abs(pixel_weight), 0) != 0.0, end, start)  # NaN is not 0
@@ -172,21 +167,20 @@ def composite_backward(
         tl.store(v_pair + V_WEIGHT, tl.sum(w * pixel_weight, 0))
 
 
-@triton.jit(do_not_specialize=["count", "width", "height"])
+@triton.jit(do_not_specialize=["width", "height"])
 def median(
     splats: tl.tensor,  # as in `composite`
     pairs: tl.tensor,
     tile_starts: tl.tensor,
     tile_ends: tl.tensor,
     active: tl.tensor,
-    depths: tl.tensor,  # [C, H, W] m, written where drawn: where the transmittance falls to 1/2, or 0
-    gaussians: tl.tensor,  # [C, H, W] likewise: row of its Gaussian, or -1
-    count: tl.tensor,  # N
+    depths: tl.tensor,  # [H, W] m, written where drawn: where the transmittance falls to 1/2, or 0
+    gaussians: tl.tensor,  # [H, W] likewise: row of its Gaussian, or -1
     width: tl.tensor,
     height: tl.tensor,
 ) -> None:
     tile = tl.program_id(0)
-    (x, y), at, inside, camera = tile_pixels(tile, active, width, height)
+    (x, y), at, inside = tile_pixels(tile, active, width, height)
     transmittance = tl.where(inside, 1.0, 0.0)
     depth, gaussian = tl.zeros_like(x), tl.full([TILE_PIXELS], -1, tl.int32)
     p, end = tl.load(tile_starts + tile), tl.load(tile_ends + tile)
@@ -199,10 +193,9 @@ def median(
             after = transmittance - alpha * transmittance
             crossed = (transmittance > 0.5) & (after <= 0.5)
             depth = tl.where(crossed, tl.load(splat + DEPTH), depth)
-            gaussian = tl.where(crossed, index % count, gaussian)
+            gaussian = tl.where(crossed, index, gaussian)
             transmittance = after
         p = stop
-    at += camera * height.to(tl.int64) * width
     tl.store(depths + at, depth, mask=inside)
     tl.store(gaussians + at, gaussian, mask=inside)
 
@@ -221,7 +214,7 @@ SIGNATURES = (
     ),
     Compiled(
         median,
-        {**_LISTS, "depths": "*fp32", "gaussians": "*i32", "count": "i32", **_SIZE},
+        {**_LISTS, "depths": "*fp32", "gaussians": "*i32", **_SIZE},
         num_warps=TILE_WARPS,
     ),
 )  # fmt: skip

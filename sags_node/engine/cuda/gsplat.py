@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import importlib.util
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
 from math import sqrt
 
@@ -71,16 +71,14 @@ class GsplatRasterizer:
 
     def __init__(self, width: int, height: int, antialias: bool, device: torch.device) -> None:
         self._width, self._height, self._antialias = width, height, antialias
-        self._planes = torch.zeros((0, 5, height, width), device=device)
+        self._planes = torch.zeros((5, height, width), device=device)
         self.device = self._planes.device
-        self._drawn = 0  # cameras of the last drawing
+        self._drawn = False
 
-    def draw(
-        self, gaussians: DeviceGaussians, pinholes: Sequence[Pinhole], tiles: Tensor | None = None
-    ) -> Tensor:
+    def draw(self, gaussians: DeviceGaussians, pinhole: Pinhole, tiles: Tensor | None = None) -> Tensor:
         """As `CudaRasterizer.draw`. All tiles are drawn; `tiles` says which of them are shown."""
-        self._drawn = 0
-        n, cameras = len(gaussians), len(pinholes)
+        self._drawn = False
+        n = len(gaussians)
         with self._memory_reported(n):
             usable = _usable(gaussians)
             self._means = _leaf(gaussians.means, usable)
@@ -92,25 +90,21 @@ class GsplatRasterizer:
             self._sh_rest = _leaf(sh_rest, usable)
             # a feature of value 0 whose cotangent is the pixels' weight: its gradient is the contribution
             self._statistic = torch.zeros_like(self._opacities)[:, None].requires_grad_()
-            views, Ks = camera_matrices(pinholes, self.device)
-            self._views = views.requires_grad_()
+            view, K = camera_matrices(pinhole, self.device)
             scales, opacities = self._scales, self._opacities
             if gaussians.smoothing is not None:
                 smoothing = torch.where(usable, gaussians.smoothing, 0.0)
                 scales, opacities = _smoothed(scales, opacities, smoothing)
-            features = torch.cat([self._seen_colors(), self._statistic.expand(cameras, n, 1)], 2)
+            features = torch.cat([self._seen_colors(view), self._statistic], 1)
             self._rendered, self._alphas = self.rasterize(
-                self._means, self._quats, scales, opacities, features, self._views, Ks
+                self._means, self._quats, scales, opacities, features, view, K
             )
             red_green_blue, depth = self._rendered[..., :3], self._rendered[..., 4:]
-            now = torch.cat([red_green_blue, depth, self._alphas], 3).detach().permute(0, 3, 1, 2)
-            self._shown = self._shown_pixels(tiles, cameras)
-            if cameras > len(self._planes):
-                more = self._planes.new_zeros((cameras - len(self._planes), *self._planes.shape[1:]))
-                self._planes = torch.cat([self._planes, more])
-            self._planes[:cameras] = torch.where(self._shown, now, self._planes[:cameras])
-        self._drawn = cameras
-        return self._planes[:cameras]
+            now = torch.cat([red_green_blue, depth, self._alphas], 2).detach().permute(2, 0, 1)
+            self._shown = self._shown_pixels(tiles)
+            self._planes.copy_(torch.where(self._shown, now, self._planes))
+        self._drawn = True
+        return self._planes
 
     def rasterize(
         self,
@@ -119,85 +113,72 @@ class GsplatRasterizer:
         scales: Tensor,
         opacities: Tensor,
         features: Tensor,
-        views: Tensor,
-        Ks: Tensor,
+        view: Tensor,
+        K: Tensor,
     ) -> tuple[Tensor, Tensor]:
         """gsplat's own call with our camera model, differentiable: sums over the Gaussians of w features and
-        w z, [C, H, W, F + 1], and of w, [C, H, W, 1].
+        w z, [H, W, F + 1], and of w, [H, W, 1].
 
         Args:
             means, quats, scales, opacities: as in `types.Gaussians`.
-            features: [N, F] or [C, N, F].
-            views, Ks: as `camera_matrices` gives them.
+            features: [N, F].
+            view, K: as `camera_matrices` gives them.
         """
         import gsplat
 
         if len(means) == 0:  # which gsplat does not promise to draw; sums of nothing keep the graph
-            nothing = features.sum() + means.new_zeros((len(views), self._height, self._width, 1))
-            return nothing.expand(-1, -1, -1, features.shape[-1] + 1), nothing
+            nothing = features.sum() + means.new_zeros((self._height, self._width, 1))
+            return nothing.expand(-1, -1, features.shape[-1] + 1), nothing
         rendered, alphas, _ = gsplat.rasterization(
-            means, quats, scales, opacities, features, views, Ks, self._width, self._height,
+            means, quats, scales, opacities, features, view[None], K[None], self._width, self._height,
             near_plane=NEAR_PLANE,
             eps2d=MIP_VARIANCE if self._antialias else DILATION_VARIANCE,
             rasterize_mode="antialiased" if self._antialias else "classic",
             render_mode="RGB+D",
             packed=False,  # the faster one where most Gaussians are in the picture
         )  # fmt: skip
-        return rendered, alphas
+        return rendered[0], alphas[0]
 
-    def pull_back(self, v_planes: Tensor, weight: Tensor, geometry: bool = True) -> DeviceGradients:
+    def pull_back(self, v_planes: Tensor, weight: Tensor) -> DeviceGradients:
         """As `CudaRasterizer.pull_back`."""
         self._check_drawn()
         n = len(self._means)
-        leaves = [self._colors, self._statistic]
-        if geometry:
-            leaves += [
-                self._means, self._quats, self._scales, self._opacities, self._sh_rest, self._views
-            ]  # fmt: skip
+        leaves = [self._means, self._quats, self._scales, self._opacities, self._colors, self._sh_rest]
         v_planes = torch.where(self._shown, v_planes, 0.0)
-        weight = torch.where(self._shown[:, 0], weight, 0.0)
-        v_rendered = torch.cat([v_planes[:, :3], weight[:, None], v_planes[:, 3:4]], 1).permute(0, 2, 3, 1)
+        weight = torch.where(self._shown, weight, 0.0)
+        v_rendered = torch.cat([v_planes[:3], weight[None], v_planes[3:4]]).permute(1, 2, 0)
         with self._memory_reported(n):
-            found = torch.autograd.grad(
+            means, quats, scales, opacities, colors, sh_rest, statistic = torch.autograd.grad(
                 (self._rendered, self._alphas),
-                leaves,
-                (v_rendered, v_planes[:, 4, ..., None]),
+                [*leaves, self._statistic],
+                (v_rendered, v_planes[4, ..., None]),
                 retain_graph=True,
                 materialize_grads=True,
             )
-        colors, statistic = found[:2]
-        if not geometry:
-            none, no_poses = colors[:0], colors.new_empty((0, 6), dtype=torch.float64)
-            return DeviceGradients(none, none, none, none, colors, none, no_poses, statistic[:, 0])
-        means, quats, scales, opacities, sh_rest, views = found[2:]
-        poses = _twists(views.double(), self._views.detach().double())
-        return DeviceGradients(means, quats, scales, opacities, colors, sh_rest, poses, statistic[:, 0])
+        return DeviceGradients(means, quats, scales, opacities, colors, sh_rest, statistic[:, 0])
 
     def median_depth(self) -> tuple[Tensor, Tensor]:
         """UsageError: gsplat has none."""
         raise UsageError("gsplat gives no median depth; choose the numba, cuda or reference backend for it")
 
-    def _seen_colors(self) -> Tensor:
-        """[C, N, 3] as each camera sees them."""
-        cameras, (n, terms, _) = len(self._views), self._sh_rest.shape
+    def _seen_colors(self, view: Tensor) -> Tensor:
+        """[N, 3] as the camera sees them."""
+        terms = self._sh_rest.shape[1]
         if terms == 0:
-            return self._colors.expand(cameras, n, 3)
+            return self._colors
         import gsplat
 
-        directions = self._means - torch.linalg.inv(self._views)[:, None, :3, 3]
+        directions = self._means - torch.linalg.inv(view)[:3, 3]
         coefficients = torch.cat([self._colors[:, None] / SH_DEGREE_0, self._sh_rest], 1)
-        degree = round(sqrt(terms + 1)) - 1
-        seen: Tensor = gsplat.spherical_harmonics(
-            degree, directions, coefficients.expand(cameras, n, terms + 1, 3)
-        )
+        seen: Tensor = gsplat.spherical_harmonics(round(sqrt(terms + 1)) - 1, directions, coefficients)
         return seen
 
-    def _shown_pixels(self, tiles: Tensor | None, cameras: int) -> Tensor:
-        """[C, 1, H, W]"""
+    def _shown_pixels(self, tiles: Tensor | None) -> Tensor:
+        """[H, W]"""
         if tiles is None:
-            return torch.ones((cameras, 1, 1, 1), dtype=torch.bool, device=self.device)
-        pixels = tiles.to(self.device).repeat_interleave(TILE_HEIGHT, 1).repeat_interleave(TILE_WIDTH, 2)
-        return pixels[:, None, : self._height, : self._width]
+            return torch.ones((1, 1), dtype=torch.bool, device=self.device)
+        pixels = tiles.to(self.device).repeat_interleave(TILE_HEIGHT, 0).repeat_interleave(TILE_WIDTH, 1)
+        return pixels[: self._height, : self._width]
 
     def _check_drawn(self) -> None:
         if not self._drawn:
@@ -214,14 +195,12 @@ class GsplatRasterizer:
             ) from error
 
 
-def camera_matrices(pinholes: Sequence[Pinhole], device: torch.device) -> tuple[Tensor, Tensor]:
-    """World to camera [C, 4, 4] and K [C, 3, 3]. gsplat's first pixel has its centre at 0.5, like ours."""
-    views = np.tile(np.eye(4, dtype=np.float32), (len(pinholes), 1, 1))
-    Ks = np.tile(np.eye(3, dtype=np.float32), (len(pinholes), 1, 1))
-    for view, K, pinhole in zip(views, Ks, pinholes, strict=True):
-        view[:3, :3], view[:3, 3] = pinhole.R, pinhole.t
-        K[0, 0], K[1, 1], K[:2, 2] = pinhole.fx, pinhole.fy, (pinhole.cx, pinhole.cy)
-    return torch.from_numpy(views).to(device), torch.from_numpy(Ks).to(device)
+def camera_matrices(pinhole: Pinhole, device: torch.device) -> tuple[Tensor, Tensor]:
+    """World to camera [4, 4] and K [3, 3]. gsplat's first pixel has its centre at 0.5, like ours."""
+    view, K = np.eye(4, dtype=np.float32), np.eye(3, dtype=np.float32)
+    view[:3, :3], view[:3, 3] = pinhole.R, pinhole.t
+    K[0, 0], K[1, 1], K[:2, 2] = pinhole.fx, pinhole.fy, (pinhole.cx, pinhole.cy)
+    return torch.from_numpy(view).to(device), torch.from_numpy(K).to(device)
 
 
 def _usable(gaussians: DeviceGaussians) -> Tensor:
@@ -255,11 +234,3 @@ def _smoothed(scales: Tensor, opacities: Tensor, smoothing: Tensor) -> tuple[Ten
     filtered = torch.where(variance == 0, scales, filtered)
     kept = (scales / filtered).topk(2).values.prod(1)
     return filtered, opacities * kept
-
-
-def _twists(v_views: Tensor, views: Tensor) -> Tensor:
-    """Gradient [C, 6] of a small motion, views' = exp(twist) views, from that of the views [C, 4, 4]."""
-    v_motion = v_views @ views.transpose(1, 2)
-    turned = v_motion - v_motion.transpose(1, 2)
-    v_rotation = torch.stack([turned[:, 2, 1], turned[:, 0, 2], turned[:, 1, 0]], 1)
-    return torch.cat([v_motion[:, :3, 3], v_rotation], 1)

@@ -39,7 +39,6 @@ def _tissue_loss(
     depth_weight: tl.tensor,
     inverse_scale: tl.tensor,
     coverage_weight: tl.tensor,
-    share: tl.tensor,
     BLOCK: tl.constexpr,
 ) -> None:
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -60,20 +59,19 @@ def _tissue_loss(
     depth_residual = (d - true_depth) * inverse_scale
     measured = used & (coverage > DEPTH_COVERED) & (true_depth > 0.0) & (tl.abs(depth_residual) < INFINITY)
     slope = tl.minimum(tl.maximum(depth_residual, -1.0), 1.0)
-    by_pixel = share * inverse
-    v_red = tl.where(used, by_pixel * r0, 0.0)
-    v_green = tl.where(used, by_pixel * r1, 0.0)
-    v_blue = tl.where(used, by_pixel * r2, 0.0)
-    v_depth = tl.where(measured, by_pixel * depth_weight * inverse_scale * slope, 0.0)
+    v_red = tl.where(used, inverse * r0, 0.0)
+    v_green = tl.where(used, inverse * r1, 0.0)
+    v_blue = tl.where(used, inverse * r2, 0.0)
+    v_depth = tl.where(measured, inverse * depth_weight * inverse_scale * slope, 0.0)
     by_inverse = tl.where(used, v_red * c0 + v_green * c1 + v_blue * c2, 0.0)  # selects keep NaN out
     by_inverse += tl.where(measured, v_depth * d, 0.0)
-    push = tl.where(is_tissue & (tl.abs(coverage) < FULL), share * coverage_weight, 0.0)
+    push = tl.where(is_tissue & (tl.abs(coverage) < FULL), coverage_weight, 0.0)
     tl.store(v_planes + pixel, v_red, inside)
     tl.store(v_planes + pixels + pixel, v_green, inside)
     tl.store(v_planes + 2 * pixels + pixel, v_blue, inside)
     tl.store(v_planes + 3 * pixels + pixel, v_depth, inside)
     tl.store(v_planes + 4 * pixels + pixel, -by_inverse - push, inside)
-    tl.store(weight + pixel, tl.where(used, by_pixel, 0.0), inside)
+    tl.store(weight + pixel, tl.where(used, inverse, 0.0), inside)
     tl.store(sums + 2 * tl.program_id(0), tl.sum(tl.where(used, residual, 0.0)))
     tl.store(sums + 2 * tl.program_id(0) + 1, tl.sum(tl.where(used, 1.0, 0.0)))
 
@@ -88,7 +86,6 @@ def tissue_loss(
     depth_weight: float,
     depth_scale: float,
     coverage_weight: float = 2e-3,
-    share: float = 1.0,
 ) -> Tensor:
     """Compare planes with a frame and write the gradient of the loss, `engine.losses.tissue.tissue_loss`.
 
@@ -100,23 +97,21 @@ def tissue_loss(
         tissue: [H, W] bool, True where the pixel is to be explained.
         depth: [H, W] m, 0 unknown.
         v_planes: [5, H, W] written: the gradient with respect to `planes`.
-        weight: [H, W] written: `share` / coverage where the colour counts, else 0.
+        weight: [H, W] written: 1 / coverage where the colour counts, else 0.
         depth_weight: weight of the depth term against the colour term, 1.
         depth_scale: m; depth residuals beyond it count linearly.
         coverage_weight: weight of the push towards full coverage.
-        share: factor of the gradient and of `weight`: how much this picture counts against others, the right
-            eye's against the left's.
 
     Returns:
-        [] float64 on the device: mean absolute colour residual over the tissue pixels that count, whatever
-        the share; 0 if there are none. Reading it waits for the device.
+        [] float64 on the device: mean absolute colour residual over the tissue pixels that count; 0 if there
+        are none. Reading it waits for the device.
     """
     pixels = tissue.numel()
     programs = triton.cdiv(pixels, BLOCK)
     sums = torch.empty((programs, 2), dtype=torch.float32, device=planes.device)
     _tissue_loss[(programs,)](
         planes, image, tissue, depth, v_planes, weight, sums,
-        pixels, depth_weight, 1.0 / depth_scale, coverage_weight, share, BLOCK=BLOCK,
+        pixels, depth_weight, 1.0 / depth_scale, coverage_weight, BLOCK=BLOCK,
     )  # fmt: skip
     residuals, used = sums.sum(dim=0, dtype=torch.float64)
     mean: Tensor = residuals / (3.0 * used).clamp(min=1.0)
@@ -131,7 +126,7 @@ SIGNATURES = (
             "tissue": "*i1",
             **dict.fromkeys(("depth", "v_planes", "weight", "sums"), "*fp32"),
             "pixels": "i32",
-            **dict.fromkeys(("depth_weight", "inverse_scale", "coverage_weight", "share"), "fp32"),
+            **dict.fromkeys(("depth_weight", "inverse_scale", "coverage_weight"), "fp32"),
         },
         {"BLOCK": BLOCK},
     ),

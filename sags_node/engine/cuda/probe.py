@@ -61,7 +61,7 @@ def largest_difference() -> float:
     )
     K = np.array([[60.0, 0.0, (WIDTH - 1) / 2], [0.0, 60.0, (HEIGHT - 1) / 2], [0.0, 0.0, 1.0]])
     camera = Camera(WIDTH, HEIGHT, K, np.eye(4))
-    v_planes = rng.normal(size=(1, 5, HEIGHT, WIDTH)).astype(np.float32)
+    v_planes = rng.normal(size=(5, HEIGHT, WIDTH)).astype(np.float32)
     (planes, found), (true_planes, true) = (
         _draw(backend, scene, camera, v_planes) for backend in ("cuda", "numba")
     )
@@ -72,5 +72,5 @@ def largest_difference() -> float:
 
 def _draw(backend: str, scene: Gaussians, camera: Camera, v_planes: F32) -> tuple[F32, Gradients]:
     rasterizer = make_rasterizer(backend, camera.width, camera.height)
-    planes = rasterizer.forward(scene, [camera])
-    return planes, rasterizer.backward(v_planes, np.ones_like(v_planes[:, 0]))
+    planes = rasterizer.forward(scene, camera)
+    return planes, rasterizer.backward(v_planes, np.ones_like(v_planes[0]))

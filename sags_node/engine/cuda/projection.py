@@ -21,7 +21,6 @@ from sags_node.engine.cuda.layout import (
     BOX_INTS,
     BOX_LEFT,
     BOX_TOP,
-    CAMERA_FLOATS,
     DEPTH,
     GREEN,
     INTRINSICS,
@@ -186,11 +185,11 @@ def project(
     colors: tl.tensor,  # [N, 3]
     sh_rest: tl.tensor,  # [N, TERMS, 3]; None where TERMS is 0
     smoothing: tl.tensor,  # [N]; None where not SMOOTHED
-    cameras: tl.tensor,  # [C, CAMERA_FLOATS]
-    active_sums: tl.tensor,  # [C, tile rows + 1, tile columns + 1]: active tiles above and to the left
-    splats: tl.tensor,  # [C N, SPLAT_FLOATS] written
-    boxes: tl.tensor,  # [C N, BOX_INTS] written
-    counts: tl.tensor,  # [C N] written: tiles in the box; 0: not drawn
+    camera: tl.tensor,  # [CAMERA_FLOATS]
+    active_sums: tl.tensor,  # [tile rows + 1, tile columns + 1]: active tiles above and to the left
+    splats: tl.tensor,  # [N, SPLAT_FLOATS] written
+    boxes: tl.tensor,  # [N, BOX_INTS] written
+    counts: tl.tensor,  # [N] written: tiles in the box; 0: not drawn
     count: tl.tensor,  # N
     width: tl.tensor,  # px
     height: tl.tensor,  # px
@@ -200,8 +199,6 @@ def project(
     BLOCK: tl.constexpr,
 ) -> None:
     rows = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    index = tl.program_id(1)
-    camera = cameras + index * CAMERA_FLOATS
     inside = rows < count
 
     mean = load3(means + 3 * rows, inside)
@@ -234,14 +231,12 @@ def project(
     left, right = x_first >> TILE_WIDTH_BITS, (x_last >> TILE_WIDTH_BITS) + 1
     top, bottom = y_first >> TILE_HEIGHT_BITS, (y_last >> TILE_HEIGHT_BITS) + 1
     line = ((width - 1) >> TILE_WIDTH_BITS) + 2
-    lines = ((height - 1) >> TILE_HEIGHT_BITS) + 2
-    upper = active_sums + index.to(tl.int64) * line * lines + top * line
+    upper = active_sums + top * line
     lower = upper + (bottom - top) * line
     active = tl.load(lower + right, mask=drawn, other=0) - tl.load(lower + left, mask=drawn, other=0)
     above = tl.load(upper + right, mask=drawn, other=0) - tl.load(upper + left, mask=drawn, other=0)
     drawn &= active > above
 
-    rows += index.to(tl.int64) * count
     splat = splats + rows * SPLAT_FLOATS
     tl.store(splat + MEAN_X, mean_x, mask=inside)
     tl.store(splat + MEAN_Y, mean_y, mask=inside)
@@ -266,7 +261,7 @@ SIGNATURES = tuple(
         {
             "means": "*fp32", "quats": "*fp32", "scales": "*fp32", "opacities": "*fp32", "colors": "*fp32",
             **({"sh_rest": "*fp32"} if terms else {}), **({"smoothing": "*fp32"} if smoothed else {}),
-            "cameras": "*fp32", "active_sums": "*i32", "splats": "*fp32", "boxes": "*i32", "counts": "*i32",
+            "camera": "*fp32", "active_sums": "*i32", "splats": "*fp32", "boxes": "*i32", "counts": "*i32",
             "count": "i32", "width": "i32", "height": "i32",
         },
         {

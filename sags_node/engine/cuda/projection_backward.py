@@ -1,12 +1,8 @@
-"""The derivative of the projection, of every parameter and of the cameras' poses:
-`engine.rasterizer.projection_backward` in vectors.
+"""The derivative of the projection by every parameter: `engine.rasterizer.projection_backward` in vectors.
 
 Quaternion: turning a Gaussian by a small vector d in its own axes moves a row a of J R_cam, seen there as
 U = R_q^T a, by U x d, so dL/dd = sum v_U x U. The unit quaternion q then moves by q (0, d) / 2, across q and
 half as far as d. So v_q = 2 q (0, dL/dd), divided by the length of the given quaternion.
-
-Pose: a twist (xi_t, xi_r) moves a point p of the camera by xi_t + xi_r x p and turns the camera's axes under
-the rows j of J, so dL/dxi_t = sum v_p and dL/dxi_r = sum p x v_p + sum v_j x j.
 """
 
 from __future__ import annotations
@@ -17,7 +13,6 @@ import triton
 import triton.language as tl
 
 from sags_node.engine.cuda.layout import (
-    CAMERA_FLOATS,
     V_DEPTH,
     V_RED,
     V_SPLAT_FLOATS,
@@ -28,7 +23,6 @@ from sags_node.engine.cuda.layout import (
 )
 from sags_node.engine.cuda.projection import (
     MAX_OPACITY,
-    MAX_VALUE,
     MIP_VARIANCE,
     jacobian,
     kept_by_smoothing,
@@ -129,7 +123,7 @@ def smoothing_backward(
     return v_scales, tl.where(on, v_opacity * kept_by_smoothing(shares), v_opacity)
 
 
-@triton.jit(do_not_specialize=["count", "camera_count"])
+@triton.jit(do_not_specialize=["count"])
 def project_backward(
     means: tl.tensor,  # as in `project`
     quats: tl.tensor,
@@ -137,22 +131,19 @@ def project_backward(
     opacities: tl.tensor,
     sh_rest: tl.tensor,
     smoothing: tl.tensor,
-    cameras: tl.tensor,
-    v_splats: tl.tensor,  # [C N, V_SPLAT_FLOATS] of `sum_pairs`
-    v_means: tl.tensor,  # [N, 3] written, as the next three: sums over the cameras
+    camera: tl.tensor,
+    v_splats: tl.tensor,  # [N, V_SPLAT_FLOATS] of `sum_pairs`
+    v_means: tl.tensor,  # [N, 3] written, as the next three
     v_quats: tl.tensor,  # [N, 4]
     v_scales: tl.tensor,  # [N, 3]
     v_opacities: tl.tensor,  # [N]
-    v_twists: tl.tensor,  # [C, programs, 6] written: still to be summed over the programs
     count: tl.tensor,  # N
-    camera_count: tl.tensor,  # C
     TERMS: tl.constexpr,
     SMOOTHED: tl.constexpr,
     ANTIALIASED: tl.constexpr,
     BLOCK: tl.constexpr,
 ) -> None:
-    program = tl.program_id(0)
-    rows = program.to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    rows = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     inside = rows < count
     mean = load3(means + 3 * rows, inside)
     w, q, n, _ = load_turn(quats, rows, inside)
@@ -160,65 +151,48 @@ def project_backward(
     given = tl.load(opacities + rows, mask=inside, other=0.0)
     filtered = given * kept_by_smoothing(shares)
 
-    zero = tl.zeros([BLOCK], tl.float32)
-    v_mean, v_axes, v_turn, v_opacity = (zero, zero, zero), (zero, zero, zero), (zero, zero, zero), zero
-    for index in range(camera_count):
-        camera = cameras + index * CAMERA_FLOATS
-        v_splat = v_splats + (index * count + rows) * V_SPLAT_FLOATS
-        g = tl.load(v_splat + V_SUM, mask=inside, other=0.0)
-        g_u = tl.load(v_splat + V_U, mask=inside, other=0.0)
-        g_v = tl.load(v_splat + V_V, mask=inside, other=0.0)
-        moments = load3(v_splat + V_UU, inside)
-        v_depth = tl.load(v_splat + V_DEPTH, mask=inside, other=0.0)
-        v_color = load3(v_splat + V_RED, inside)
-        total = size((g, g_u, g_v)) + size(moments) + size(v_color) + tl.abs(v_depth)
-        drawn = total != 0.0  # also where it is NaN; what was not drawn may hold NaN itself
+    v_splat = v_splats + rows * V_SPLAT_FLOATS
+    g = tl.load(v_splat + V_SUM, mask=inside, other=0.0)
+    g_u = tl.load(v_splat + V_U, mask=inside, other=0.0)
+    g_v = tl.load(v_splat + V_V, mask=inside, other=0.0)
+    moments = load3(v_splat + V_UU, inside)
+    v_depth = tl.load(v_splat + V_DEPTH, mask=inside, other=0.0)
+    v_color = load3(v_splat + V_RED, inside)
+    total = size((g, g_u, g_v)) + size(moments) + size(v_color) + tl.abs(v_depth)
+    drawn = total != 0.0  # also where it is NaN; what was not drawn may hold NaN itself
 
-        # the forward pass again
-        rotation, translation, intrinsics = load_view(camera)
-        point = add(times_matrix(rotation, mean), translation)
-        inverse_z, slope, held, j_x, j_y = jacobian(point, intrinsics, camera)
-        a_x, a_y = times_transposed(rotation, j_x), times_transposed(rotation, j_y)
-        u_x, u_y = rotate(-w, q, a_x), rotate(-w, q, a_y)
-        v_x, v_y = multiply(u_x, axes), multiply(u_y, axes)
-        factor, kept, minors = whitening(v_x, v_y, ANTIALIASED)
+    # the forward pass again
+    rotation, translation, intrinsics = load_view(camera)
+    point = add(times_matrix(rotation, mean), translation)
+    inverse_z, slope, held, j_x, j_y = jacobian(point, intrinsics, camera)
+    a_x, a_y = times_transposed(rotation, j_x), times_transposed(rotation, j_y)
+    u_x, u_y = rotate(-w, q, a_x), rotate(-w, q, a_y)
+    v_x, v_y = multiply(u_x, axes), multiply(u_y, axes)
+    factor, kept, minors = whitening(v_x, v_y, ANTIALIASED)
 
-        v_log_opacity = tl.where(filtered * kept < MAX_OPACITY, g, 0.0)
-        by_x, by_y = covariance_backward(v_x, v_y, minors, factor, moments, v_log_opacity, ANTIALIASED)
-        v_axes = add(v_axes, select(drawn, add(multiply(by_x, u_x), multiply(by_y, u_y))))
-        by_x, by_y = multiply(by_x, axes), multiply(by_y, axes)
-        v_turn = add(v_turn, select(drawn, add(cross(by_x, u_x), cross(by_y, u_y))))
-        v_opacity += tl.where(drawn, v_log_opacity / tl.maximum(filtered, TINY), 0.0)
+    v_log_opacity = tl.where(filtered * kept < MAX_OPACITY, g, 0.0)
+    by_x, by_y = covariance_backward(v_x, v_y, minors, factor, moments, v_log_opacity, ANTIALIASED)
+    v_axes = select(drawn, add(multiply(by_x, u_x), multiply(by_y, u_y)))
+    by_x, by_y = multiply(by_x, axes), multiply(by_y, axes)
+    v_turn = select(drawn, add(cross(by_x, u_x), cross(by_y, u_y)))
+    v_opacity = tl.where(drawn, v_log_opacity / tl.maximum(filtered, TINY), 0.0)
 
-        # J = (fx / z, 0, -fx / z held_x), (0, fy / z, -fy / z held_y); a held slope is constant
-        v_j_x = times_matrix(rotation, rotate(w, q, by_x))
-        v_j_y = times_matrix(rotation, rotate(w, q, by_y))
-        fx, fy = intrinsics[0], intrinsics[1]
-        v_inverse_z = fx * (v_j_x[0] - held[0] * v_j_x[2]) + fy * (v_j_y[1] - held[1] * v_j_y[2])
-        v_slope_x = fx * TWO_LN2 * factor[0] * g_u
-        v_slope_y = fy * TWO_LN2 * (factor[1] * g_u + factor[2] * g_v)
-        v_slope_x -= tl.where(held[0] == slope[0], j_x[0] * v_j_x[2], 0.0)
-        v_slope_y -= tl.where(held[1] == slope[1], j_y[1] * v_j_y[2], 0.0)
-        along_z = v_slope_x * slope[0] + v_slope_y * slope[1] + v_inverse_z * inverse_z
-        v_point = (v_slope_x * inverse_z, v_slope_y * inverse_z, v_depth - along_z * inverse_z)
-        v_mean = add(v_mean, select(drawn, times_transposed(rotation, v_point)))
-        shift = v_point
-        if TERMS > 0:
-            terms = sh_rest + rows * TERMS * 3
-            by_direction = direction_backward(mean, v_color, terms, camera, inside, TERMS)
-            v_mean = add(v_mean, select(drawn, by_direction))
-            shift = add(shift, times_matrix(rotation, by_direction))
-
-        turned = add(cross(point, v_point), add(cross(v_j_x, j_x), cross(v_j_y, j_y)))
-        sound = drawn & (size(shift) + size(turned) < MAX_VALUE)  # overflow must not spoil the pose
-        shift, turned = select(sound, shift), select(sound, turned)
-        at = v_twists + (index * tl.num_programs(0) + program) * 6
-        tl.store(at, tl.sum(shift[0], 0))
-        tl.store(at + 1, tl.sum(shift[1], 0))
-        tl.store(at + 2, tl.sum(shift[2], 0))
-        tl.store(at + 3, tl.sum(turned[0], 0))
-        tl.store(at + 4, tl.sum(turned[1], 0))
-        tl.store(at + 5, tl.sum(turned[2], 0))
+    # J = (fx / z, 0, -fx / z held_x), (0, fy / z, -fy / z held_y); a held slope is constant
+    v_j_x = times_matrix(rotation, rotate(w, q, by_x))
+    v_j_y = times_matrix(rotation, rotate(w, q, by_y))
+    fx, fy = intrinsics[0], intrinsics[1]
+    v_inverse_z = fx * (v_j_x[0] - held[0] * v_j_x[2]) + fy * (v_j_y[1] - held[1] * v_j_y[2])
+    v_slope_x = fx * TWO_LN2 * factor[0] * g_u
+    v_slope_y = fy * TWO_LN2 * (factor[1] * g_u + factor[2] * g_v)
+    v_slope_x -= tl.where(held[0] == slope[0], j_x[0] * v_j_x[2], 0.0)
+    v_slope_y -= tl.where(held[1] == slope[1], j_y[1] * v_j_y[2], 0.0)
+    along_z = v_slope_x * slope[0] + v_slope_y * slope[1] + v_inverse_z * inverse_z
+    v_point = (v_slope_x * inverse_z, v_slope_y * inverse_z, v_depth - along_z * inverse_z)
+    v_mean = select(drawn, times_transposed(rotation, v_point))
+    if TERMS > 0:
+        terms = sh_rest + rows * TERMS * 3
+        by_direction = direction_backward(mean, v_color, terms, camera, inside, TERMS)
+        v_mean = add(v_mean, select(drawn, by_direction))
 
     if SMOOTHED:
         variance = tl.load(smoothing + rows, mask=inside, other=0.0)
@@ -239,9 +213,8 @@ SIGNATURES = tuple(
         {
             "means": "*fp32", "quats": "*fp32", "scales": "*fp32", "opacities": "*fp32",
             **({"sh_rest": "*fp32"} if terms else {}), **({"smoothing": "*fp32"} if smoothed else {}),
-            "cameras": "*fp32", "v_splats": "*fp32", "v_means": "*fp32", "v_quats": "*fp32",
-            "v_scales": "*fp32", "v_opacities": "*fp32", "v_twists": "*fp32", "count": "i32",
-            "camera_count": "i32",
+            "camera": "*fp32", "v_splats": "*fp32", "v_means": "*fp32", "v_quats": "*fp32",
+            "v_scales": "*fp32", "v_opacities": "*fp32", "count": "i32",
         },
         {
             **({} if terms else {"sh_rest": None}), **({} if smoothed else {"smoothing": None}),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 import torch
@@ -13,13 +13,7 @@ from sags_node.engine import interface
 from sags_node.engine.cuda import compositing, layout, pair_sums, projection, projection_backward
 from sags_node.engine.cuda import spherical_harmonics as harmonics
 from sags_node.engine.cuda.binning import bin_splats
-from sags_node.engine.cuda.scene import (
-    ColourStep,
-    DeviceGaussians,
-    DeviceGradients,
-    camera_table,
-    check_tensor,
-)
+from sags_node.engine.cuda.scene import DeviceGaussians, DeviceGradients, camera_record, check_tensor
 from sags_node.engine.failures import DeviceMemoryError
 from sags_node.engine.rasterizer.compositing import TILE_HEIGHT as GIVEN_TILE_HEIGHT
 from sags_node.errors import UsageError
@@ -27,60 +21,56 @@ from sags_node.errors import UsageError
 MAX_PAIRS = 1 << 26  # 3 GiB of gradients
 TILE_WIDTH, TILE_HEIGHT = layout.TILE_WIDTH.value, layout.TILE_HEIGHT.value
 ROWS_OF_TILES = GIVEN_TILE_HEIGHT // TILE_HEIGHT  # in one of the tiles that callers name; as wide as those
-NO_STEP = ColourStep(0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class CudaRasterizer:
     """Everything stays on the device. Not for use by two threads at once.
 
-    Memory beside the pictures: about 200 bytes for each Gaussian and camera, and up to 50 for each pair of a
-    splat and a tile that its box touches, twice that while differentiating.
+    Memory beside the pictures: about 200 bytes for each Gaussian, and up to 50 for each pair of a splat and a
+    tile that its box touches, twice that while differentiating.
     """
 
     def __init__(self, width: int, height: int, antialias: bool, device: torch.device) -> None:
         self._width, self._height, self._antialias = width, height, antialias
         self._tiles_x, self._tiles_y = -(-width // TILE_WIDTH), -(-height // TILE_HEIGHT)
-        self._planes = torch.zeros((0, 5, height, width), device=device)
-        self._median_depths = torch.zeros((0, height, width), device=device)
-        self._median_rows = torch.zeros((0, height, width), dtype=torch.int32, device=device)
+        self._planes = torch.zeros((5, height, width), device=device)
+        self._median_depths = torch.zeros((height, width), device=device)
+        self._median_rows = torch.full((height, width), -1, dtype=torch.int32, device=device)
+        self._all_active = torch.ones((self._tiles_y, self._tiles_x), dtype=torch.int32, device=device)
+        self._all_sums = _integral(self._all_active)
         self.device = self._planes.device  # with its number
-        self._drawn = 0  # cameras of the last drawing; 0: there is none to differentiate
+        self._drawn = False  # there is a drawing to differentiate
 
     def draw(
-        self,
-        gaussians: DeviceGaussians,
-        pinholes: Sequence[interface.Pinhole],
-        tiles: Tensor | None = None,
+        self, gaussians: DeviceGaussians, pinhole: interface.Pinhole, tiles: Tensor | None = None
     ) -> Tensor:
-        """Draw for one or several cameras of the rasteriser's picture size.
+        """Draw for a camera of the rasteriser's picture size.
 
         Args:
             gaussians: kept until the next call, and must be unchanged for `pull_back`.
-            pinholes: C of them.
-            tiles: [C, ceil(H / 32), ceil(W / 16)] bool, as in `interface.Rasterizer.forward`. None: all.
+            pinhole: the camera.
+            tiles: [ceil(H / 32), ceil(W / 16)] bool, as in `interface.Rasterizer.forward`. None: all.
 
         Returns:
-            Planes [C, 5, H, W] as `interface.Rasterizer.forward` has them, overwritten by the next call.
+            Planes [5, H, W] as `interface.Rasterizer.forward` has them, overwritten by the next call.
 
         Raises:
             UsageError: the Gaussians are on another device, or `tiles` has another shape.
             DeviceMemoryError: too many pairs of splats and tiles, or the device has not enough memory.
         """
-        n, cameras = len(gaussians), len(pinholes)
+        n = len(gaussians)
         check_tensor(gaussians.means, (n, 3), self.device, "means")
-        self._gaussians, self._drawn = gaussians, 0
-        self._cameras = camera_table(pinholes, self.device)
+        self._gaussians, self._drawn = gaussians, False
+        self._camera = camera_record(pinhole, self.device)
         with self._memory_reported():
-            if cameras > len(self._planes):
-                self._allocate_pictures(cameras)
-            self._active = self._all_active[:cameras] if tiles is None else self._small_tiles(tiles, cameras)
-            sums = self._all_sums[:cameras] if tiles is None else _integral(self._active)
-            self._splats = torch.empty((cameras * n, layout.SPLAT_FLOATS.value), device=self.device)
-            boxes = self._splats.new_empty((cameras * n, layout.BOX_INTS.value), dtype=torch.int32)
-            counts = boxes.new_empty(cameras * n)
-            projection.project[(triton.cdiv(n, projection.BLOCK), cameras)](
+            self._active = self._all_active if tiles is None else self._small_tiles(tiles)
+            sums = self._all_sums if tiles is None else _integral(self._active)
+            self._splats = torch.empty((n, layout.SPLAT_FLOATS.value), device=self.device)
+            boxes = self._splats.new_empty((n, layout.BOX_INTS.value), dtype=torch.int32)
+            counts = boxes.new_empty(n)
+            projection.project[(triton.cdiv(n, projection.BLOCK),)](
                 gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.colors,
-                gaussians.sh_rest, gaussians.smoothing, self._cameras, sums, self._splats, boxes, counts,
+                gaussians.sh_rest, gaussians.smoothing, self._camera, sums, self._splats, boxes, counts,
                 n, self._width, self._height,
                 TERMS=gaussians.terms, SMOOTHED=gaussians.smoothing is not None,
                 ANTIALIASED=self._antialias, BLOCK=projection.BLOCK,
@@ -91,34 +81,25 @@ class CudaRasterizer:
                 self._splats, self._bins.splats, self._bins.tile_starts, self._active, self._planes,
                 self._tile_ends, self._width, self._height, num_warps=layout.TILE_WARPS,
             )  # fmt: skip
-        self._drawn = cameras
-        return self._planes[:cameras]
+        self._drawn = True
+        return self._planes
 
-    def pull_back(
-        self,
-        v_planes: Tensor,
-        weight: Tensor,
-        geometry: bool = True,
-        colour_step: ColourStep | None = None,
-    ) -> DeviceGradients:
+    def pull_back(self, v_planes: Tensor, weight: Tensor) -> DeviceGradients:
         """Gradients of sum(v_planes * planes) for the last `draw`, in fresh tensors.
 
         Args:
-            v_planes: [C, 5, H, W] cotangent of the planes.
-            weight: [C, H, W] pixel weights for the contribution.
-            geometry: False leaves out everything but colours and contribution.
-            colour_step: moves the colours of the drawn Gaussians in place. A row whose gradient or
-                contribution is not finite keeps its colour.
+            v_planes: [5, H, W] cotangent of the planes.
+            weight: [H, W] pixel weights for the contribution.
 
         Raises:
             UsageError: nothing was drawn, or a tensor has another shape, type or device.
             DeviceMemoryError: the device has not enough memory.
         """
         self._check_drawn()
-        gaussians, bins, cameras = self._gaussians, self._bins, self._drawn
-        check_tensor(v_planes, (cameras, 5, self._height, self._width), self.device, "v_planes")
-        check_tensor(weight, (cameras, self._height, self._width), self.device, "weight")
-        n, step = len(gaussians), colour_step or NO_STEP
+        gaussians, bins = self._gaussians, self._bins
+        check_tensor(v_planes, (5, self._height, self._width), self.device, "v_planes")
+        check_tensor(weight, (self._height, self._width), self.device, "weight")
+        n, terms = len(gaussians), gaussians.terms
         with self._memory_reported():
             # zeros for what the ellipse misses or a finished tile hides
             v_pairs = v_planes.new_zeros((len(bins.slots), layout.V_SPLAT_FLOATS.value))
@@ -127,75 +108,44 @@ class CudaRasterizer:
                 self._planes, v_planes, weight, v_pairs, self._width, self._height,
                 num_warps=layout.TILE_WARPS,
             )  # fmt: skip
-            v_splats = v_planes.new_empty((cameras * n, layout.V_SPLAT_FLOATS.value))
+            v_splats = v_planes.new_empty((n, layout.V_SPLAT_FLOATS.value))
             v_colors, contribution = v_planes.new_empty((n, 3)), v_planes.new_empty(n)
             pair_sums.sum_pairs[(triton.cdiv(n, pair_sums.BLOCK),)](
-                bins.first_slots, bins.counts, v_pairs, v_splats, v_colors, contribution,
-                gaussians.colors if colour_step else None, n, cameras,
-                step.relaxation, step.damping, step.min_contribution, step.lowest, step.highest,
-                STEPS=colour_step is not None, BLOCK=pair_sums.BLOCK, num_warps=pair_sums.WARPS,
+                bins.first_slots, bins.counts, v_pairs, v_splats, v_colors, contribution, n,
+                BLOCK=pair_sums.BLOCK, num_warps=pair_sums.WARPS,
             )  # fmt: skip
-            if not geometry:
-                none, no_poses = v_colors[:0], v_colors.new_empty((0, 6), dtype=torch.float64)
-                return DeviceGradients(none, none, none, none, v_colors, none, no_poses, contribution)
-            return self._pull_back_geometry(v_splats, v_colors, contribution)
-
-    def _pull_back_geometry(
-        self, v_splats: Tensor, v_colors: Tensor, contribution: Tensor
-    ) -> DeviceGradients:
-        gaussians, cameras = self._gaussians, self._drawn
-        n, terms = len(gaussians), gaussians.terms
-        programs = triton.cdiv(n, projection_backward.BLOCK)
-        v_means, v_scales = torch.empty_like(gaussians.means), torch.empty_like(gaussians.scales)
-        v_quats, v_opacities = torch.empty_like(gaussians.quats), torch.empty_like(gaussians.opacities)
-        v_twists = v_splats.new_empty((cameras, programs, 6))
-        projection_backward.project_backward[(programs,)](
-            gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh_rest,
-            gaussians.smoothing, self._cameras, v_splats, v_means, v_quats, v_scales, v_opacities, v_twists,
-            n, cameras, TERMS=terms, SMOOTHED=gaussians.smoothing is not None, ANTIALIASED=self._antialias,
-            BLOCK=projection_backward.BLOCK, num_warps=projection_backward.WARPS,
-        )  # fmt: skip
-        v_sh_rest = v_splats.new_empty((n, terms, 3))
-        if terms:
-            harmonics.coefficients_backward[(triton.cdiv(n, harmonics.BLOCK),)](
-                gaussians.means, self._cameras, v_splats, v_sh_rest, n, cameras,
-                TERMS=terms, BLOCK=harmonics.BLOCK,
+            v_means, v_scales = torch.empty_like(gaussians.means), torch.empty_like(gaussians.scales)
+            v_quats, v_opacities = torch.empty_like(gaussians.quats), torch.empty_like(gaussians.opacities)
+            projection_backward.project_backward[(triton.cdiv(n, projection_backward.BLOCK),)](
+                gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh_rest,
+                gaussians.smoothing, self._camera, v_splats, v_means, v_quats, v_scales, v_opacities, n,
+                TERMS=terms, SMOOTHED=gaussians.smoothing is not None, ANTIALIASED=self._antialias,
+                BLOCK=projection_backward.BLOCK, num_warps=projection_backward.WARPS,
             )  # fmt: skip
-        v_poses = v_twists.double().sum(1)
-        return DeviceGradients(
-            v_means, v_quats, v_scales, v_opacities, v_colors, v_sh_rest, v_poses, contribution
-        )
+            v_sh_rest = v_splats.new_empty((n, terms, 3))
+            if terms:
+                harmonics.coefficients_backward[(triton.cdiv(n, harmonics.BLOCK),)](
+                    gaussians.means, self._camera, v_splats, v_sh_rest, n, TERMS=terms, BLOCK=harmonics.BLOCK
+                )  # fmt: skip
+        return DeviceGradients(v_means, v_quats, v_scales, v_opacities, v_colors, v_sh_rest, contribution)
 
     def median_depth(self) -> tuple[Tensor, Tensor]:
-        """Depth [C, H, W] m and row of the Gaussian [C, H, W] int32 as `interface.Rasterizer.median` has
+        """Depth [H, W] m and row of the Gaussian [H, W] int32 as `interface.Rasterizer.median` has
         them, overwritten by the next call. UsageError where nothing was drawn."""
         self._check_drawn()
         compositing.median[(self._active.numel(),)](
             self._splats, self._bins.splats, self._bins.tile_starts, self._tile_ends, self._active,
-            self._median_depths, self._median_rows, max(len(self._gaussians), 1), self._width, self._height,
-            num_warps=layout.TILE_WARPS,
+            self._median_depths, self._median_rows, self._width, self._height, num_warps=layout.TILE_WARPS,
         )  # fmt: skip
-        return self._median_depths[: self._drawn], self._median_rows[: self._drawn]
+        return self._median_depths, self._median_rows
 
-    def _allocate_pictures(self, cameras: int) -> None:
-        """Room for more cameras; the pictures of the others stay."""
-        more = cameras - len(self._planes)
-        size = (more, self._height, self._width)
-        self._planes = torch.cat([self._planes, self._planes.new_zeros((more, 5, *size[1:]))])
-        self._median_depths = torch.cat([self._median_depths, self._median_depths.new_zeros(size)])
-        self._median_rows = torch.cat([self._median_rows, self._median_rows.new_full(size, -1)])
-        self._all_active = torch.ones(
-            (cameras, self._tiles_y, self._tiles_x), dtype=torch.int32, device=self.device
-        )
-        self._all_sums = _integral(self._all_active)
-
-    def _small_tiles(self, tiles: Tensor, cameras: int) -> Tensor:
-        """[C, tile rows, tile columns] int32: 1 where a tile of the kernels is to be drawn."""
-        shape = (cameras, -(-self._height // GIVEN_TILE_HEIGHT), self._tiles_x)
+    def _small_tiles(self, tiles: Tensor) -> Tensor:
+        """[tile rows, tile columns] int32: 1 where a tile of the kernels is to be drawn."""
+        shape = (-(-self._height // GIVEN_TILE_HEIGHT), self._tiles_x)
         if tuple(tiles.shape) != shape or tiles.dtype != torch.bool:
             raise UsageError(f"tiles is {tiles.dtype} {list(tiles.shape)}, expected bool {list(shape)}")
-        rows = tiles.to(self.device).repeat_interleave(ROWS_OF_TILES, 1)
-        return rows[:, : self._tiles_y].to(torch.int32).contiguous()
+        rows = tiles.to(self.device).repeat_interleave(ROWS_OF_TILES, 0)
+        return rows[: self._tiles_y].to(torch.int32).contiguous()
 
     def _check_drawn(self) -> None:
         if not self._drawn:
@@ -220,6 +170,6 @@ class CudaRasterizer:
 
 
 def _integral(active: Tensor) -> Tensor:
-    """[C, rows + 1, columns + 1] int32: entry y, x counts the active tiles above y and left of x."""
-    sums = active.cumsum(1, dtype=torch.int32).cumsum(2, dtype=torch.int32)
+    """[rows + 1, columns + 1] int32: entry y, x counts the active tiles above y and left of x."""
+    sums = active.cumsum(0, dtype=torch.int32).cumsum(1, dtype=torch.int32)
     return torch.nn.functional.pad(sums, (1, 0, 1, 0))

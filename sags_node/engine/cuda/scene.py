@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,7 +64,7 @@ class DeviceGaussians:
 
 @dataclass(frozen=True, slots=True)
 class DeviceGradients:
-    """`interface.Gradients` on a device; empty, [0, ...], where only the colours were asked for."""
+    """`interface.Gradients` on a device."""
 
     means: Tensor  # [N, 3]
     quats: Tensor  # [N, 4]
@@ -73,19 +72,7 @@ class DeviceGradients:
     opacities: Tensor  # [N]
     colors: Tensor  # [N, 3]
     sh_rest: Tensor  # [N, K - 1, 3]
-    poses: Tensor  # [C, 6] float64
     contribution: Tensor  # [N]
-
-
-@dataclass(frozen=True, slots=True)
-class ColourStep:
-    """One simultaneous reconstruction step: color -= relaxation / (contribution + damping) v_color."""
-
-    relaxation: float
-    damping: float  # px of coverage
-    min_contribution: float  # px; what was seen less keeps its colour
-    lowest: float
-    highest: float
 
 
 def check_tensor(tensor: Tensor, shape: tuple[int, ...], device: torch.device, name: str) -> None:
@@ -101,11 +88,10 @@ def check_tensor(tensor: Tensor, shape: tuple[int, ...], device: torch.device, n
         )
 
 
-def camera_table(pinholes: Sequence[Pinhole], device: torch.device) -> Tensor:
-    """Records [C, CAMERA_FLOATS] of cameras; see `layout`."""
-    table = np.zeros((len(pinholes), CAMERA_FLOATS.value), np.float32)
-    for row, pinhole in zip(table, pinholes, strict=True):
-        centre = -pinhole.R.T @ pinhole.t
-        intrinsics = (pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy)
-        row[:23] = [*pinhole.R.ravel(), *pinhole.t, *intrinsics, *pinhole.limits, *centre]
-    return torch.from_numpy(table).to(device)
+def camera_record(pinhole: Pinhole, device: torch.device) -> Tensor:
+    """[CAMERA_FLOATS]; see `layout`."""
+    record = np.zeros(CAMERA_FLOATS.value, np.float32)
+    centre = -pinhole.R.T @ pinhole.t
+    intrinsics = (pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy)
+    record[:23] = [*pinhole.R.ravel(), *pinhole.t, *intrinsics, *pinhole.limits, *centre]
+    return torch.from_numpy(record).to(device)

@@ -7,9 +7,9 @@ import math
 import triton
 import triton.language as tl
 
-from sags_node.engine.cuda.layout import CAMERA_FLOATS, CENTRE, V_RED, V_SPLAT_FLOATS
+from sags_node.engine.cuda.layout import CENTRE, V_RED, V_SPLAT_FLOATS
 from sags_node.engine.cuda.signatures import Compiled
-from sags_node.engine.cuda.vectors import dot, load3, load_vector, size
+from sags_node.engine.cuda.vectors import dot, load3, load_vector, multiply, size, store3
 
 BLOCK = 128  # Gaussians per program
 C1 = tl.constexpr(math.sqrt(3 / (4 * math.pi)))
@@ -120,44 +120,33 @@ def direction_backward(
     return (v_x - radial * x) * inverse, (v_y - radial * y) * inverse, (v_z - radial * z) * inverse
 
 
-@triton.jit(do_not_specialize=["count", "camera_count"])
+@triton.jit(do_not_specialize=["count"])
 def coefficients_backward(
     means: tl.tensor,  # [N, 3]
-    cameras: tl.tensor,  # [C, CAMERA_FLOATS]
-    v_splats: tl.tensor,  # [C N, V_SPLAT_FLOATS]
+    camera: tl.tensor,  # [CAMERA_FLOATS]
+    v_splats: tl.tensor,  # [N, V_SPLAT_FLOATS]
     v_sh_rest: tl.tensor,  # [N, TERMS, 3] written
     count: tl.tensor,  # N
-    camera_count: tl.tensor,  # C
     TERMS: tl.constexpr,
     BLOCK: tl.constexpr,
 ) -> None:
-    """Sum over the cameras; the direction is worked out anew for each term, which costs less than 45 sums in
-    registers."""
     rows = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     mask = rows < count
     mean = load3(means + 3 * rows, mask)
+    (x, y, z), _ = direction(mean, camera)
+    v_color = load3(v_splats + rows * V_SPLAT_FLOATS + V_RED, mask)
+    drawn = size(v_color) != 0.0  # else its mean may be NaN
     for k in tl.static_range(TERMS):
-        red, green, blue = (tl.zeros_like(mean[0]), tl.zeros_like(mean[0]), tl.zeros_like(mean[0]))
-        for camera in range(camera_count):
-            (x, y, z), _ = direction(mean, cameras + camera * CAMERA_FLOATS)
-            value, _ = harmonic(k, x, y, z)
-            seen = load3(v_splats + (camera * count + rows) * V_SPLAT_FLOATS + V_RED, mask)
-            value = tl.where(size(seen) != 0.0, value, 0.0)  # not drawn: its mean may be NaN
-            red += value * seen[0]
-            green += value * seen[1]
-            blue += value * seen[2]
-        at = v_sh_rest + (rows * TERMS + k) * 3
-        tl.store(at, red, mask=mask)
-        tl.store(at + 1, green, mask=mask)
-        tl.store(at + 2, blue, mask=mask)
+        value, _ = harmonic(k, x, y, z)
+        value = tl.where(drawn, value, 0.0)
+        store3(v_sh_rest + (rows * TERMS + k) * 3, multiply((value, value, value), v_color), mask)
 
 
 SIGNATURES = tuple(
     Compiled(
         coefficients_backward,
         {
-            "means": "*fp32", "cameras": "*fp32", "v_splats": "*fp32", "v_sh_rest": "*fp32",
-            "count": "i32", "camera_count": "i32",
+            "means": "*fp32", "camera": "*fp32", "v_splats": "*fp32", "v_sh_rest": "*fp32", "count": "i32",
         },
         {"TERMS": terms, "BLOCK": BLOCK},
     )

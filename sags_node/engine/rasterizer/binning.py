@@ -1,8 +1,4 @@
-"""From splats to depth-sorted lists of splats per tile.
-
-With C cameras there are C N splats, camera after camera, and C times the tiles of a picture; a splat only
-meets the tiles of its own camera. All are sorted together: what is in order is also in order within a camera.
-"""
+"""From splats to depth-sorted lists of splats per tile."""
 
 from __future__ import annotations
 
@@ -79,8 +75,8 @@ def _box(splat: Any, width: int, height: int, tile_width_bits: int) -> Any:
 
 @kernel
 def _drop_block(
-    splats: Any, depths: F32, first: int, last: int, sums: I32, first_sum: int, width: int, height: int,
-    tile_width_bits: int, tile_height_bits: int,
+    splats: Any, depths: F32, first: int, last: int, sums: I32, width: int, height: int, tile_width_bits: int,
+    tile_height_bits: int,
 ) -> None:  # fmt: skip
     row = ((width + (1 << tile_width_bits) - 1) >> tile_width_bits) + 1  # of the integral picture
     for i in range(first, last):
@@ -88,7 +84,7 @@ def _drop_block(
         if splat.extent > ZERO:
             left, right, y_first, y_last = _box(splat, width, height, tile_width_bits)
             top, bottom = y_first >> tile_height_bits, (y_last >> tile_height_bits) + 1
-            upper, lower = first_sum + top * row, first_sum + bottom * row
+            upper, lower = top * row, bottom * row
             if sums[lower + right] - sums[lower + left] == sums[upper + right] - sums[upper + left]:
                 splat.extent = ZERO
                 depths[i] = ZERO
@@ -96,30 +92,27 @@ def _drop_block(
 
 @parallel_kernel
 def drop_untouched(
-    splats: Any,  # [C N] SPLAT; extent made 0 where no active tile is touched
-    depths: F32,  # [C N] likewise
-    cameras: int,  # C
-    active_sums: I32,  # [C (tile rows + 1) (tile columns + 1)] integral pictures of the active tiles
+    splats: Any,  # [N] SPLAT; extent made 0 where no active tile is touched
+    depths: F32,  # [N] likewise
+    active_sums: I32,  # [(tile rows + 1) (tile columns + 1)] integral picture of the active tiles
     width: int,
     height: int,
     tile_width_bits: int,  # tiles are 2**bits px
     tile_height_bits: int,
 ) -> None:
     """Take out what meets no active tile, before it costs more than this look at its box."""
-    count, area = splats.size // cameras, active_sums.size // cameras
-    blocks = (count + BLOCK - 1) // BLOCK  # of one camera
-    for n in numba.prange(cameras * blocks):
-        first = n // blocks * count
+    count = splats.size
+    for n in numba.prange((count + BLOCK - 1) // BLOCK):
         _drop_block(
-            splats, depths, first + n % blocks * BLOCK, min(first + (n % blocks + 1) * BLOCK, first + count),
-            active_sums, n // blocks * area, width, height, tile_width_bits, tile_height_bits,
+            splats, depths, n * BLOCK, min((n + 1) * BLOCK, count), active_sums, width, height,
+            tile_width_bits, tile_height_bits,
         )  # fmt: skip
 
 
 @kernel
 def sort_by_depth(depths: F32, slots: Any, order: I32, spare_order: I32, keys: I32, spare_keys: I32) -> int:
-    """Stable radix sort: `order` begins with the indices of the `depths` [C N] above 0, from near to far.
-    Returns how many those are. Positive floats sort like their bits. The others' `slots` [C N] SLOTS are
+    """Stable radix sort: `order` begins with the indices of the `depths` [N] above 0, from near to far.
+    Returns how many those are. Positive floats sort like their bits. The others' `slots` [N] SLOTS are
     made empty."""
     bits = depths.view(np.int32)
     kept = 0
@@ -193,12 +186,11 @@ def _row_in_tile(row: int, first: int, tile_height: int) -> int:
 
 @kernel
 def _emit_parts(
-    splats: Any, order: I32, cameras: int, active: Bool, width: int, height: int, tile_width_bits: int,
+    splats: Any, order: I32, active: Bool, width: int, height: int, tile_width_bits: int,
     tile_height_bits: int, emitted: Any, slots: Any, runs: Any, reserved: I64, histogram: I32, next_part: I64,
 ) -> None:  # fmt: skip
     """First all of a block's rows, then its pairs: with both in one loop the processor would wait for every
     square root before it knows where to go on."""
-    count, tiles = splats.size // cameras, active.size // cameras
     tile_height = 1 << tile_height_bits
     tiles_x = (width + (1 << tile_width_bits) - 1) >> tile_width_bits
     boxes = np.empty((BLOCK, 2), np.int32)
@@ -240,7 +232,6 @@ def _emit_parts(
                 i = order[position]
                 left, right = boxes[position - begin, 0], boxes[position - begin, 1]
                 first = slot
-                first_tile = i // count * tiles
                 for column in range(left, right):
                     k = (column - left) * COLUMNS
                     at = n + k // AT_ONCE * LANES + k % AT_ONCE
@@ -248,7 +239,7 @@ def _emit_parts(
                     begin0, begin1 = -rows[at + AT_ONCE], -rows[at + AT_ONCE + 1]
                     row_first, row_end = min(begin0, begin1), max(end0, end1)
                     for row in range(row_first >> tile_height_bits, (row_end - 1 >> tile_height_bits) + 1):
-                        tile = first_tile + row * tiles_x + column
+                        tile = row * tiles_x + column
                         if active[tile]:
                             pair = emitted[slot]
                             top = row * tile_height
@@ -277,20 +268,19 @@ def blocks_of(part: int, parts: int, size: int) -> Any:
 
 @parallel_kernel
 def emit_pairs(
-    splats: Any,  # [C N] SPLAT; extent made 0 where no pair is found
+    splats: Any,  # [N] SPLAT; extent made 0 where no pair is found
     order: I32,  # what is drawn, near to far
-    cameras: int,  # C
-    active: Bool,  # [C tiles] True: this tile is drawn
+    active: Bool,  # [tiles] True: this tile is drawn
     width: int,
     height: int,
     tile_width_bits: int,
     tile_height_bits: int,
     workers: int,
     emitted: Any,  # EMITTED, written, with gaps
-    slots: Any,  # [C N] SLOTS, written for what is drawn: where a splat's pairs stand
-    runs: Any,  # [ceil(C N / BLOCK)] SLOTS, written: where the pairs of a block of the order stand
+    slots: Any,  # [N] SLOTS, written for what is drawn: where a splat's pairs stand
+    runs: Any,  # [ceil(N / BLOCK)] SLOTS, written: where the pairs of a block of the order stand
     reserved: I64,  # [1] written: how many of `emitted` are needed; if that is more than it has, call again
-    histogram: I32,  # [parts, C tiles] pairs per tile of each part of the order, written
+    histogram: I32,  # [parts, tiles] pairs per tile of each part of the order, written
     next_part: I64,  # [1] for the workers
 ) -> None:
     """Find the tiles and rows that each splat touches."""
@@ -298,8 +288,8 @@ def emit_pairs(
     next_part[0] = 0
     for _ in numba.prange(workers):
         _emit_parts(
-            splats, order, cameras, active, width, height, tile_width_bits, tile_height_bits, emitted, slots,
-            runs, reserved, histogram, next_part,
+            splats, order, active, width, height, tile_width_bits, tile_height_bits, emitted, slots, runs,
+            reserved, histogram, next_part,
         )  # fmt: skip
 
 
@@ -332,7 +322,7 @@ def sort_into_tiles(
     runs: Any,
     histogram: I32,  # used up
     pairs: Any,  # PAIR, written: tile after tile, near to far within each
-    tile_starts: I32,  # [C tiles + 1] written
+    tile_starts: I32,  # [tiles + 1] written
     next_part: I64,  # [1] for the workers
 ) -> None:
     """Stable counting sort: the result does not depend on the number of parts."""

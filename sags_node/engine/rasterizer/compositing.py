@@ -95,10 +95,10 @@ def whitened(a: Any, b: Any, c: Any, dx: Any, dy: Any) -> Any:
 
 @inlined
 def place_of(t: int, width: int, height: int) -> Any:
-    """Camera, first pixel and size of a tile."""
-    tiles_x, tiles_y = (width + TILE_WIDTH - 1) // TILE_WIDTH, (height + TILE_HEIGHT - 1) // TILE_HEIGHT
-    x0, y0 = t % tiles_x * TILE_WIDTH, t // tiles_x % tiles_y * TILE_HEIGHT
-    return t // (tiles_x * tiles_y), x0, y0, min(TILE_WIDTH, width - x0), min(TILE_HEIGHT, height - y0)
+    """First pixel and size of a tile."""
+    tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
+    x0, y0 = t % tiles_x * TILE_WIDTH, t // tiles_x * TILE_HEIGHT
+    return x0, y0, min(TILE_WIDTH, width - x0), min(TILE_HEIGHT, height - y0)
 
 
 @inlined
@@ -161,8 +161,8 @@ def _composite_tiles(
         if turn >= drawn.size:
             break
         t = drawn[turn]
-        camera, x0, y0, columns, rows = place_of(t, width, height)
-        start = (camera * 5 * height + y0) * width + x0
+        x0, y0, columns, rows = place_of(t, width, height)
+        start = y0 * width + x0
         open_tile(tile, DRAWN, columns, rows)
         for block in range(COLUMNS * BLOCKS):
             for plane in range(RED, DRAWN, LANES):
@@ -217,16 +217,16 @@ def _composite_tiles(
 
 @parallel_kernel
 def composite(
-    splats: Any,  # [C N] SPLAT
+    splats: Any,  # [N] SPLAT
     pairs: Any,  # PAIR
-    tile_starts: I32,  # [C tiles + 1]
+    tile_starts: I32,  # [tiles + 1]
     drawn: I32,  # the tiles to draw
     next_tile: I64,  # [1] for the workers
     scratch: F32,  # [workers, SCRATCH]
     width: int,
     height: int,
-    planes: F32,  # [C 5 H W] written where drawn
-    tile_ends: I32,  # [C tiles] first pair of a tile that was not blended, written where drawn
+    planes: F32,  # [5 H W] written where drawn
+    tile_ends: I32,  # [tiles] first pair of a tile that was not blended, written where drawn
 ) -> None:
     next_tile[0] = 0
     for worker in numba.prange(scratch.shape[0]):
@@ -237,8 +237,8 @@ def composite(
 
 @inlined
 def _read_tile(
-    tile: F32, planes: F32, v_planes: F32, weight: F32, start: int, first_weight: int, width: int, area: int,
-    columns: int, rows: int,
+    tile: F32, planes: F32, v_planes: F32, weight: F32, start: int, width: int, area: int, columns: int,
+    rows: int,
 ) -> Any:  # fmt: skip
     """Fill the scratch: cotangents, what remains to be seen of them, weights. Whether any of it is not 0; NaN
     is not."""
@@ -254,7 +254,7 @@ def _read_tile(
                 asked |= cotangent != ZERO
                 store(tile, at + RED + k * LANES, cotangent)
             store(tile, at + REMAINING, remaining)
-            weights = load_block(weight, first_weight + y * width + x, width)
+            weights = load_block(weight, start + y * width + x, width)
             asked |= weights != ZERO
             store(tile, at + WEIGHT, weights)
         return any_of(asked)
@@ -268,7 +268,7 @@ def _read_tile(
                 tile[at + RED + k * LANES] = value
                 tile[at + REMAINING] += value * planes[pixel + k * area]
                 asked_at_edge |= value != ZERO
-            tile[at + WEIGHT] = weight[first_weight + y * width + x]
+            tile[at + WEIGHT] = weight[pixel]
             asked_at_edge |= tile[at + WEIGHT] != ZERO
     return asked_at_edge
 
@@ -278,12 +278,12 @@ def _prefetch_row(
     planes: F32, v_planes: F32, weight: F32, place: Any, y: int, width: int, height: int
 ) -> None:
     """One row of what `_read_tile` reads of a tile."""
-    camera, x0, y0, _, rows = place
+    x0, y0, _, rows = place
     if y < rows:
         pixel = (y0 + y) * width + x0
-        prefetch_far(weight, camera * height * width + pixel)
+        prefetch_far(weight, pixel)
         for k in range(5):
-            plane = (camera * 5 + k) * height * width
+            plane = k * height * width
             prefetch_far(v_planes, plane + pixel)
             prefetch_far(planes, plane + pixel)
 
@@ -297,10 +297,9 @@ def _composite_tiles_backward(
     turn = take(next_tile, 1)
     while turn < drawn.size:
         t, turn = drawn[turn], take(next_tile, 1)
-        camera, x0, y0, columns, rows = place_of(t, width, height)
-        start, first_weight = (camera * 5 * height + y0) * width + x0, (camera * height + y0) * width + x0
+        x0, y0, columns, rows = place_of(t, width, height)
         end = tile_ends[t]
-        if not _read_tile(tile, planes, v_planes, weight, start, first_weight, width, area, columns, rows):
+        if not _read_tile(tile, planes, v_planes, weight, y0 * width + x0, width, area, columns, rows):
             end = tile_starts[t]
         open_tile(tile, DERIVED, columns, rows)
         following = place_of(drawn[min(turn, drawn.size - 1)], width, height)
@@ -388,9 +387,9 @@ def composite_backward(
     scratch: F32,
     width: int,
     height: int,
-    planes: F32,  # [C 5 H W] of `composite`
-    v_planes: F32,  # [C 5 H W]
-    weight: F32,  # [C H W]
+    planes: F32,  # [5 H W] of `composite`
+    v_planes: F32,  # [5 H W]
+    weight: F32,  # [H W]
     v_pairs: F32,  # [16 slots] written: a SPLAT_GRADIENT per slot
 ) -> None:
     next_tile[0] = 0

@@ -52,13 +52,12 @@ def _median_tiles(
     splats: Any, pairs: Any, tile_starts: I32, tile_ends: I32, drawn: I32, next_tile: I64, tile: F32,
     width: int, height: int, depths: F32, rows_of: I32,
 ) -> None:  # fmt: skip
-    count = splats.size // (depths.size // (width * height))  # Gaussians
     while True:
         turn = take(next_tile, 1)
         if turn >= drawn.size:
             break
         t = drawn[turn]
-        camera, x0, y0, columns, rows = place_of(t, width, height)
+        x0, y0, columns, rows = place_of(t, width, height)
         open_tile(tile, DRAWN, columns, rows)
         for block in range(COLUMNS * BLOCKS):
             store(tile, block * DRAWN + DEPTH, spread(ZERO))
@@ -70,7 +69,7 @@ def _median_tiles(
             pair = pairs[p]
             splat = splats[pair.splat]
             a, b, c, log2_opacity = splat.whiten_xx, splat.whiten_xy, splat.whiten_yy, splat.log2_opacity
-            depth, gaussian = splat.depth, spread_bits(np.int32(pair.splat - camera * count))
+            depth, gaussian = splat.depth, spread_bits(np.int32(pair.splat))
             for column in range(COLUMNS):
                 first, beyond = pair.begin[column] // BLOCK_HEIGHT, pair.end[column]
                 blocks = (beyond + BLOCK_HEIGHT - 1) // BLOCK_HEIGHT - first
@@ -93,7 +92,7 @@ def _median_tiles(
                 until_test = TEST_EVERY
                 if not any_above(tile, DRAWN, HALF):
                     break
-        start = (camera * height + y0) * width + x0
+        start = y0 * width + x0
         write_plane(tile, DEPTH, DRAWN, depths, start, width, columns, rows)
         write_plane(tile.view(np.int32), FOUND, DRAWN, rows_of, start, width, columns, rows)
 
@@ -109,8 +108,8 @@ def median(
     scratch: F32,
     width: int,
     height: int,
-    depths: F32,  # [C H W] m, written where drawn: of the splat that brings the transmittance to 1/2, or 0
-    gaussians: I32,  # [C H W] likewise: row of its Gaussian, or -1
+    depths: F32,  # [H W] m, written where drawn: of the splat that brings the transmittance to 1/2, or 0
+    gaussians: I32,  # [H W] likewise: row of its Gaussian, or -1
 ) -> None:
     next_tile[0] = 0
     for worker in numba.prange(scratch.shape[0]):

@@ -1,13 +1,5 @@
-"""The derivative of the projection (`projection`), of every parameter and of the camera's pose, from the
-gradients of pairs, which are summed first.
-
-The pose moves by a small twist xi = (translation, rotation vector) on the camera's side, viewmat' =
-exp(xi) viewmat, so that p' = p + xi_t + xi_r x p for a point p of the camera and R' = (I + [xi_r]_x) R:
-
-    dL/dxi_t = sum dL/dp        dL/dxi_r = sum (p x dL/dp) + axial(J^T dL/dJ)
-
-The last term is the covariance's: V = J R_cam R_q S, and axial(M) = (M21 - M12, M02 - M20, M10 - M01).
-"""
+"""The derivative of the projection (`projection`) by every parameter, from the gradients of pairs, which are
+summed first."""
 
 from __future__ import annotations
 
@@ -22,7 +14,6 @@ from sags_node.engine.rasterizer.projection import (
     GRAIN,
     HALF,
     MAX_OPACITY,
-    MAX_VALUE,
     MEAN_X,
     MEAN_Y,
     MEAN_Z,
@@ -59,13 +50,11 @@ from sags_node.kernels.vectors import (
     larger,
     load,
     load_records,
-    magnitudes,
     select,
     spread,
     store,
-    store_sums,
 )
-from sags_node.types import F32, F64, I64
+from sags_node.types import F32, I64
 
 f4 = np.float32
 TINY = f4(1e-30)  # keeps quotients of vanishing Gaussians finite
@@ -75,8 +64,7 @@ AHEAD = 8  # Gaussians between prefetch and use
 V_MEAN_X, V_MEAN_Y, V_MEAN_Z, V_SCALE_X, V_SCALE_Y, V_SCALE_Z = (k * BLOCK for k in range(11, 17))
 V_QUAT_W, V_QUAT_X, V_QUAT_Y, V_QUAT_Z, V_OPACITY, DRAWN = (k * BLOCK for k in range(17, 23))
 RECORDS = 23 * BLOCK  # the block's SPLAT_GRADIENT, one after the other
-TWIST = RECORDS + RECORD * BLOCK
-SCRATCH = TWIST + RECORD  # floats per worker
+SCRATCH = RECORDS + RECORD * BLOCK  # floats per worker
 # Places in a record
 V_RED, CONTRIBUTION = (list(SPLAT_GRADIENT.names or ()).index(name) for name in ("red", "contribution"))
 
@@ -102,12 +90,6 @@ def _sum_pairs(S: F32, slots: Any, v_pairs: F32, first: int, filled: int) -> Any
 
 
 @inlined
-def _put(gradients: F32, i: int, k: int, value: Any, drawn: bool, accumulate: bool) -> None:
-    before = gradients[i, k] if accumulate else ZERO
-    gradients[i, k] = before + (value if drawn else ZERO)
-
-
-@inlined
 def _clear(v_means: F32, v_quats: F32, v_scales: F32, v_opacities: F32, first: int, filled: int) -> None:
     for i in range(first, first + filled):
         for k in range(3):
@@ -120,11 +102,10 @@ def _clear(v_means: F32, v_quats: F32, v_scales: F32, v_opacities: F32, first: i
 @kernel
 def _blocks_backward(
     means: F32, quats: F32, scales: F32, opacities: F32, view: F32, screen_filter: Row, S: F32,
-    next_block: I64, slots: Any, v_pairs: F32, geometry: bool, accumulate: bool, v_view_colors: F32,
-    v_colors: F32, contribution: F32, v_means: F32, v_quats: F32, v_scales: F32, v_opacities: F32,
-    v_twists: F64,
+    next_block: I64, slots: Any, v_pairs: F32, v_colors: F32, contribution: F32, v_means: F32, v_quats: F32,
+    v_scales: F32, v_opacities: F32,
 ) -> None:  # fmt: skip
-    count = means.shape[0]
+    count, blocks = means.shape[0], (means.shape[0] + BLOCK - 1) // BLOCK
     R, t, (fx, fy, _, _), limits = unpack(view)
     given_up = screen_filter[0] * screen_filter[1]
     block, end = 0, 0
@@ -133,7 +114,7 @@ def _blocks_backward(
         if block >= end:
             block = take(next_block, GRAIN)
             end = block + GRAIN
-        if block >= v_twists.shape[0]:
+        if block >= blocks:
             break
         first = block * BLOCK
         filled = min(BLOCK, count - first)
@@ -141,22 +122,14 @@ def _blocks_backward(
         for lane in range(filled):
             i, record = first + lane, RECORDS + lane * RECORD
             for k in range(3):
-                before = v_colors[i, k] if accumulate else ZERO
-                v_view_colors[i, k] = S[record + V_RED + k]
-                v_colors[i, k] = before + S[record + V_RED + k]
-            before = contribution[i] if accumulate else ZERO
-            contribution[i] = before + S[record + CONTRIBUTION]
-        if not geometry:
-            continue
+                v_colors[i, k] = S[record + V_RED + k]
+            contribution[i] = S[record + CONTRIBUTION]
         if not any_drawn:
-            v_twists[block] = 0.0
-            if not accumulate:
-                _clear(v_means, v_quats, v_scales, v_opacities, first, filled)
+            _clear(v_means, v_quats, v_scales, v_opacities, first, filled)
             continue
         load_block(S, means, quats, scales, opacities, first, filled)
         for lane in range(filled, BLOCK):
             S[DRAWN + lane] = ZERO
-        moved_x = moved_y = moved_z = turned_x = turned_y = turned_z = spread(ZERO)
         for j in range(0, filled, LANES):
             g, g_u, g_v, g_uu, g_uv, g_vv, _, _, _, g_depth, _, _, _, _, _, _ = load_records(
                 S, RECORDS + j * RECORD
@@ -233,9 +206,7 @@ def _blocks_backward(
             a4 = v3 * Q[3] + v4 * Q[4] + v5 * Q[5]
             a5 = v3 * Q[6] + v4 * Q[7] + v5 * Q[8]
             v_j00 = a0 * R[0] + a1 * R[1] + a2 * R[2]
-            v_j01 = a0 * R[3] + a1 * R[4] + a2 * R[5]
             v_j02 = a0 * R[6] + a1 * R[7] + a2 * R[8]
-            v_j10 = a3 * R[0] + a4 * R[1] + a5 * R[2]
             v_j11 = a3 * R[3] + a4 * R[4] + a5 * R[5]
             v_j12 = a3 * R[6] + a4 * R[7] + a5 * R[8]
             # j00 = fx / z, j02 = -fx / z held_x; a held slope is constant
@@ -250,31 +221,14 @@ def _blocks_backward(
             store(S, V_MEAN_Y + j, R[1] * v_x + R[4] * v_y + R[7] * v_z)
             store(S, V_MEAN_Z + j, R[2] * v_x + R[5] * v_y + R[8] * v_z)
             store(S, V_OPACITY + j, v_log_opacity / larger(load(S, OPACITY + j), TINY))
-            turn_x = y * v_z - z * v_y + j02 * v_j01 + j12 * v_j11 - j11 * v_j12
-            turn_y = z * v_x - x * v_z + j00 * v_j02 - j02 * v_j00 - j12 * v_j10
-            turn_z = x * v_y - y * v_x + j11 * v_j10 - j00 * v_j01
-            # One whose own derivative overflowed must not spoil the pose.
-            size = magnitudes(v_x) + magnitudes(v_y) + magnitudes(v_z)
-            size += magnitudes(turn_x) + magnitudes(turn_y) + magnitudes(turn_z)
-            counts = (load(S, DRAWN + j) > ZERO) & (size < MAX_VALUE)
-            moved_x += select(counts, v_x, ZERO)
-            moved_y += select(counts, v_y, ZERO)
-            moved_z += select(counts, v_z, ZERO)
-            turned_x += select(counts, turn_x, ZERO)
-            turned_y += select(counts, turn_y, ZERO)
-            turned_z += select(counts, turn_z, ZERO)
-        store_sums(S, TWIST, (moved_x, moved_y, moved_z, turned_x, turned_y, turned_z))
-        for k in range(6):
-            v_twists[block, k] = S[TWIST + k]
         for lane in range(filled):
             i, drawn = first + lane, S[DRAWN + lane] > ZERO
             for k in range(3):
-                _put(v_means, i, k, S[V_MEAN_X + k * BLOCK + lane], drawn, accumulate)
-                _put(v_scales, i, k, S[V_SCALE_X + k * BLOCK + lane], drawn, accumulate)
+                v_means[i, k] = S[V_MEAN_X + k * BLOCK + lane] if drawn else ZERO
+                v_scales[i, k] = S[V_SCALE_X + k * BLOCK + lane] if drawn else ZERO
             for k in range(4):
-                _put(v_quats, i, k, S[V_QUAT_W + k * BLOCK + lane], drawn, accumulate)
-            opacity_before = v_opacities[i] if accumulate else ZERO
-            v_opacities[i] = opacity_before + (S[V_OPACITY + lane] if drawn else ZERO)
+                v_quats[i, k] = S[V_QUAT_W + k * BLOCK + lane] if drawn else ZERO
+            v_opacities[i] = S[V_OPACITY + lane] if drawn else ZERO
 
 
 @parallel_kernel
@@ -287,24 +241,19 @@ def project_backward(
     screen_filter: Row,
     scratch: F32,  # [workers, SCRATCH]
     next_block: I64,  # [1] for the workers
-    slots: Any,  # [N] SLOTS of this camera
+    slots: Any,  # [N] SLOTS
     v_pairs: F32,  # [16 slots] of `composite_backward`
-    geometry: bool,  # False: only the next three are written
-    accumulate: bool,  # add to what follows, but for the first, instead of writing it: every camera but one
-    v_view_colors: F32,  # [N 3] this camera's alone
-    v_colors: F32,  # [N 3]
+    v_colors: F32,  # [N 3] written, as what follows: 0 where not drawn
     contribution: F32,  # [N]
     v_means: F32,
     v_quats: F32,
     v_scales: F32,
     v_opacities: F32,
-    v_twists: F64,  # [ceil(N / BLOCK), 6] written: the camera's pose, still to be summed over the blocks
 ) -> None:
     """From gradients of pairs to those of Gaussians."""
     next_block[0] = 0
     for worker in numba.prange(scratch.shape[0]):
         _blocks_backward(
             means, quats, scales, opacities, view, screen_filter, scratch[worker], next_block, slots, v_pairs,
-            geometry, accumulate, v_view_colors, v_colors, contribution, v_means, v_quats, v_scales,
-            v_opacities, v_twists,
+            v_colors, contribution, v_means, v_quats, v_scales, v_opacities,
         )  # fmt: skip

@@ -3,7 +3,6 @@ the camera's place, the projection. Its memory grows with the Gaussians and is n
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -14,7 +13,7 @@ from sags_node.engine.interface import DILATION_VARIANCE, MIP_VARIANCE, Pinhole
 from sags_node.engine.rasterizer import projection, projection_backward, smoothing, spherical_harmonics
 from sags_node.kernels.jit import aligned, read_only
 from sags_node.kernels.threads import thread_count
-from sags_node.types import F32, F64, Gaussians
+from sags_node.types import F32, Gaussians
 
 SPARE = 1.25  # what is asked for beyond the need when memory grows
 
@@ -23,7 +22,7 @@ Records = NDArray[Any]  # of a structured type of `layout`
 
 
 class Projector:
-    """`load` once per drawing, `project` once per camera; then `backward` once per camera and `gradients`."""
+    """`project` once per drawing; then `backward`, once."""
 
     def __init__(self, antialias: bool) -> None:
         variance = MIP_VARIANCE if antialias else DILATION_VARIANCE
@@ -39,12 +38,10 @@ class Projector:
         self._opacities, self._v_opacities = aligned((room,)), aligned((room,))
         self._v_quats = aligned((room, 4))
         self._v_sh_rest = aligned((room, self._terms, 3))
-        self._v_twists = aligned((-(-room // projection.BLOCK), 6), np.float64)
-        self._v_centres = aligned((-(-room // spherical_harmonics.BLOCK), 3), np.float64)
 
-    def load(self, gaussians: Gaussians, pinholes: Sequence[Pinhole]) -> None:
-        """Keeps the Gaussians, checked and contiguous, and the cameras until the next call; applies the 3D
-        filter."""
+    def project(self, gaussians: Gaussians, pinhole: Pinhole, splats: Records, depths: F32) -> None:
+        """Writes `splats` [N] SPLAT and `depths` [N] m (0 where not drawn). Keeps the Gaussians, checked and
+        contiguous, until the next call."""
         n = self._count = len(gaussians)
         terms = 0 if gaussians.sh_rest is None else gaussians.sh_rest.shape[1]
         if n > self._room or terms != self._terms:
@@ -52,21 +49,16 @@ class Projector:
             self._allocate(max(self._room, int(n * SPARE)))
         if len(self._scratch) != thread_count():
             self._scratch = aligned((thread_count(), projection_backward.SCRATCH))
-        self._pinholes, self._views = pinholes, [_view_of(pinhole) for pinhole in pinholes]
+        self._view, self._centre = _view_of(pinhole), _centre(pinhole)
         self._given = self._smoothed = gaussians
         if gaussians.smoothing is not None:
             scales, opacities = self._scales[:n], self._opacities[:n]
             smoothing.smooth(gaussians.scales, gaussians.opacities, gaussians.smoothing, scales, opacities)
             self._smoothed = replace(gaussians, scales=read_only(scales), opacities=read_only(opacities))
-
-    def project(self, camera: int, splats: Records, depths: F32) -> None:
-        """Writes `splats` [N] SPLAT and `depths` [N] m (0 where not drawn)."""
         gaussians, colors = self._smoothed, self._smoothed.colors
         if gaussians.sh_rest is not None:
-            seen = self._colors[: self._count]
-            spherical_harmonics.color(
-                gaussians.means, colors, gaussians.sh_rest, _centre(self._pinholes[camera]), seen
-            )
+            seen = self._colors[:n]
+            spherical_harmonics.color(gaussians.means, colors, gaussians.sh_rest, self._centre, seen)
             colors = read_only(seen)
         projection.project(
             gaussians.means,
@@ -74,7 +66,7 @@ class Projector:
             gaussians.scales,
             gaussians.opacities,
             colors,
-            self._views[camera],
+            self._view,
             self._screen_filter,
             self._scratch,
             self._next_block,
@@ -83,75 +75,45 @@ class Projector:
         )
 
     def backward(
-        self,
-        camera: int,
-        slots: Records,
-        v_pairs: F32,
-        geometry: bool,
-        accumulate: bool,
-        v_view_colors: F32,
-        v_colors: F32,
-        contribution: F32,
-    ) -> F64:
-        """Gradient of this camera's pose [6]. Those of the Gaussians are added to the cameras' before where
-        `accumulate` is set.
+        self, slots: Records, v_pairs: F32, v_colors: F32, contribution: F32
+    ) -> tuple[F32, F32, F32, F32, F32]:
+        """Gradients of means, quats, scales, opacities and sh_rest.
 
         Args:
-            slots: [N] SLOTS of this camera.
+            slots: [N] SLOTS.
             v_pairs: [16 slots] a SPLAT_GRADIENT per slot.
-            geometry: False: only the next three are written.
-            v_view_colors: [N, 3] written: of this camera's picture, 0 where not drawn.
-            v_colors: [N, 3] written or added to; with one camera it may be the same.
-            contribution: [N] written or added to.
+            v_colors: [N, 3] written: 0 where not drawn.
+            contribution: [N] written.
         """
-        n, gaussians = self._count, self._smoothed
-        v_twists = self._v_twists[: -(-n // projection.BLOCK)]
+        n, gaussians, given = self._count, self._smoothed, self._given
+        v_scales, v_opacities = self._v_scales[:n], self._v_opacities[:n]
         projection_backward.project_backward(
             gaussians.means,
             gaussians.quats,
             gaussians.scales,
             gaussians.opacities,
-            self._views[camera],
+            self._view,
             self._screen_filter,
             self._scratch,
             self._next_block,
             slots,
             v_pairs,
-            geometry,
-            accumulate,
-            v_view_colors,
             v_colors,
             contribution,
             self._v_means[:n],
             self._v_quats[:n],
-            self._v_scales[:n],
-            self._v_opacities[:n],
-            v_twists,
+            v_scales,
+            v_opacities,
         )
-        if not geometry:
-            return np.zeros(6)
-        v_pose: F64 = v_twists.sum(0)
         if gaussians.sh_rest is not None:
-            v_centres = self._v_centres[: -(-n // spherical_harmonics.BLOCK)]
             spherical_harmonics.color_backward(
                 gaussians.means,
                 gaussians.sh_rest,
-                _centre(self._pinholes[camera]),
-                v_view_colors,
-                accumulate,
+                self._centre,
+                v_colors,
                 self._v_sh_rest[:n],
                 self._v_means[:n],
-                v_centres,
             )
-            v_pose[:3] -= self._pinholes[camera].R @ v_centres.sum(
-                0
-            )  # the twist moves the centre by -R^T translation
-        return v_pose
-
-    def gradients(self) -> tuple[F32, F32, F32, F32, F32]:
-        """Of means, quats, scales, opacities and sh_rest, after the last camera's `backward`; call once."""
-        n, given = self._count, self._given
-        v_scales, v_opacities = self._v_scales[:n], self._v_opacities[:n]
         if given.smoothing is not None:
             smoothing.smooth_backward(given.scales, given.opacities, given.smoothing, v_scales, v_opacities)
         return self._v_means[:n], self._v_quats[:n], v_scales, v_opacities, self._v_sh_rest[:n]

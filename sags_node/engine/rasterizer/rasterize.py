@@ -7,7 +7,6 @@ those of the rasterisers (first pixel at (0.5, 0.5)).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,7 +74,7 @@ def rasterize(
         UsageError: an array or the camera has the wrong shape or size.
     """
     rasterizer = make_rasterizer(backend, camera.width, camera.height)
-    return to_view(rasterizer.forward(gaussians, [camera])[0], camera, frame_id, t_capture_ns)
+    return to_view(rasterizer.forward(gaussians, camera), camera, frame_id, t_capture_ns)
 
 
 class _CheckedRasterizer:
@@ -84,33 +83,30 @@ class _CheckedRasterizer:
     def __init__(self, backend: Backend, width: int, height: int) -> None:
         self._backend = backend
         self._width, self._height = width, height
-        self._drawn = 0  # cameras of the last forward
+        self._drawn = False
 
-    def forward(self, gaussians: Gaussians, cameras: Sequence[Camera], tiles: Bool | None = None) -> F32:
-        if not cameras:
-            raise UsageError("no camera was given; forward takes one or several")
-        for camera in cameras:
-            if (camera.width, camera.height) != (self._width, self._height):
-                raise UsageError(
-                    f"this rasteriser draws {self._width}x{self._height} px, "
-                    f"the camera has {camera.width}x{camera.height}; make one for its size"
-                )
-        shape = (len(cameras), -(-self._height // TILE_HEIGHT), -(-self._width // TILE_WIDTH))
+    def forward(self, gaussians: Gaussians, camera: Camera, tiles: Bool | None = None) -> F32:
+        if (camera.width, camera.height) != (self._width, self._height):
+            raise UsageError(
+                f"this rasteriser draws {self._width}x{self._height} px, "
+                f"the camera has {camera.width}x{camera.height}; make one for its size"
+            )
+        shape = (-(-self._height // TILE_HEIGHT), -(-self._width // TILE_WIDTH))
         if tiles is not None and (tiles.shape != shape or tiles.dtype != np.bool_):
             raise UsageError(
                 f"tiles is {tiles.dtype} {list(tiles.shape)}, expected bool {list(shape)}: one for each "
-                f"{TILE_WIDTH}x{TILE_HEIGHT} px of each camera"
+                f"{TILE_WIDTH}x{TILE_HEIGHT} px"
             )
-        planes = self._backend.forward(_checked(gaussians), [as_pinhole(camera) for camera in cameras], tiles)
-        self._drawn = len(cameras)
+        planes = self._backend.forward(_checked(gaussians), as_pinhole(camera), tiles)
+        self._drawn = True
         return planes
 
-    def backward(self, v_planes: F32, weight: F32, geometry: bool = True) -> Gradients:
+    def backward(self, v_planes: F32, weight: F32) -> Gradients:
         if not self._drawn:
             raise UsageError("nothing was drawn yet; call forward before backward")
-        v_planes = _as_f32(v_planes, (self._drawn, 5, self._height, self._width), "v_planes")
-        weight = _as_f32(weight, (self._drawn, self._height, self._width), "weight")
-        return self._backend.backward(v_planes, weight, geometry)
+        v_planes = _as_f32(v_planes, (5, self._height, self._width), "v_planes")
+        weight = _as_f32(weight, (self._height, self._width), "weight")
+        return self._backend.backward(v_planes, weight)
 
     def median(self) -> tuple[F32, I32]:
         if not self._drawn:

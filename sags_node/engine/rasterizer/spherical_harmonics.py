@@ -15,9 +15,8 @@ from typing import Any
 import numba
 import numpy as np
 
-from sags_node.engine.rasterizer.projection import MAX_VALUE
 from sags_node.kernels.jit import inlined, kernel, parallel_kernel, square_root
-from sags_node.types import F32, F64
+from sags_node.types import F32
 
 f4 = np.float32
 BLOCK = 64  # Gaussians per piece of work
@@ -127,46 +126,29 @@ def _block_backward(
     centre: Row,
     first: int,
     last: int,
-    v_view_colors: F32,
-    accumulate: bool,
+    v_colors: F32,
     v_sh_rest: F32,
     v_means: F32,
-    v_centre: F64,
 ) -> None:
     terms = sh_rest.shape[1]
     basis, v_basis = np.empty(MOST, f4), np.empty(MOST, f4)
     for i in range(first, last):
-        red, green, blue = v_view_colors[i, 0], v_view_colors[i, 1], v_view_colors[i, 2]
+        red, green, blue = v_colors[i, 0], v_colors[i, 1], v_colors[i, 2]
         if red == ZERO and green == ZERO and blue == ZERO:  # not drawn: its values may be anything, NaN too
-            if not accumulate:
-                v_sh_rest[i] = ZERO
+            v_sh_rest[i] = ZERO
             continue
         x, y, z, inverse = _direction(means, i, centre)
         _write_basis(basis, terms, x, y, z)
         for k in range(terms):
             v_basis[k] = red * sh_rest[i, k, 0] + green * sh_rest[i, k, 1] + blue * sh_rest[i, k, 2]
-        if accumulate:
-            for k in range(terms):
-                v_sh_rest[i, k, 0] += red * basis[k]
-                v_sh_rest[i, k, 1] += green * basis[k]
-                v_sh_rest[i, k, 2] += blue * basis[k]
-        else:
-            for k in range(terms):
-                v_sh_rest[i, k, 0] = red * basis[k]
-                v_sh_rest[i, k, 1] = green * basis[k]
-                v_sh_rest[i, k, 2] = blue * basis[k]
+            v_sh_rest[i, k, 0] = red * basis[k]
+            v_sh_rest[i, k, 1] = green * basis[k]
+            v_sh_rest[i, k, 2] = blue * basis[k]
         v_x, v_y, v_z = _slope(v_basis, terms, x, y, z)
         radial = v_x * x + v_y * y + v_z * z  # only the part across the direction turns it
-        v_x = (v_x - radial * x) * inverse
-        v_y = (v_y - radial * y) * inverse
-        v_z = (v_z - radial * z) * inverse
-        v_means[i, 0] += v_x
-        v_means[i, 1] += v_y
-        v_means[i, 2] += v_z
-        if abs(v_x) + abs(v_y) + abs(v_z) < MAX_VALUE:  # one that overflowed must not spoil the pose
-            v_centre[0] -= v_x
-            v_centre[1] -= v_y
-            v_centre[2] -= v_z
+        v_means[i, 0] += (v_x - radial * x) * inverse
+        v_means[i, 1] += (v_y - radial * y) * inverse
+        v_means[i, 2] += (v_z - radial * z) * inverse
 
 
 @parallel_kernel
@@ -174,25 +156,20 @@ def color_backward(
     means: F32,
     sh_rest: F32,
     centre: Row,
-    v_view_colors: F32,  # [N, 3] of this camera's picture; 0 for what was not drawn
-    accumulate: bool,  # add to v_sh_rest instead of writing it: every camera after the first
-    v_sh_rest: F32,  # [N, 3 or 8 or 15, 3]
+    v_colors: F32,  # [N, 3] 0 for what was not drawn
+    v_sh_rest: F32,  # [N, 3 or 8 or 15, 3] written
     v_means: F32,  # [N, 3] added to
-    v_centres: F64,  # [ceil(N / BLOCK), 3] written: the camera's place, still to be summed over the blocks
 ) -> None:
     count = means.shape[0]
     for block in numba.prange((count + BLOCK - 1) // BLOCK):
         first = block * BLOCK
-        v_centres[block] = 0.0
         _block_backward(
             means,
             sh_rest,
             centre,
             first,
             min(first + BLOCK, count),
-            v_view_colors,
-            accumulate,
+            v_colors,
             v_sh_rest,
             v_means,
-            v_centres[block],
         )

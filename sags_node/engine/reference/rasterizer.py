@@ -27,7 +27,6 @@ from sags_node.engine.rasterizer.compositing import TILE_HEIGHT, TILE_WIDTH
 from sags_node.types import F32, I32, Bool, Gaussians
 
 if TYPE_CHECKING:  # torch takes seconds to import; only who draws with this backend pays
-    import torch
     from torch import Tensor
 
 T = TypeVar("T", bound=np.generic)
@@ -39,10 +38,10 @@ class ReferenceRasterizer:
 
     def __init__(self, antialias: bool) -> None:
         self._antialias = antialias
-        self._shown = np.zeros((0, 5, 0, 0), np.float32)
-        self._depths, self._rows = np.zeros((0, 0, 0), np.float32), np.zeros((0, 0, 0), np.int32)
+        self._shown = np.zeros((5, 0, 0), np.float32)
+        self._depths, self._rows = np.zeros((0, 0), np.float32), np.zeros((0, 0), np.int32)
 
-    def forward(self, gaussians: Gaussians, pinholes: Sequence[Pinhole], tiles: Bool | None) -> F32:
+    def forward(self, gaussians: Gaussians, pinhole: Pinhole, tiles: Bool | None) -> F32:
         import torch
 
         none = np.zeros((len(gaussians), 0, 3), np.float32)
@@ -52,57 +51,40 @@ class ReferenceRasterizer:
         if gaussians.smoothing is not None:
             smoothing = torch.tensor(gaussians.smoothing, dtype=torch.float64)
         self._inputs = [torch.tensor(array, dtype=torch.float64, requires_grad=True) for array in arrays]
-        self._twists = torch.zeros((len(pinholes), 6), dtype=torch.float64, requires_grad=True)
-        splats = [
-            project(pinhole, self._inputs, smoothing, twist, self._antialias)
-            for pinhole, twist in zip(pinholes, self._twists, strict=True)
-        ]
-        width, height = pinholes[0].width, pinholes[0].height
-        self._planes = torch.stack([blend(seen, width, height) for seen in splats])
-        depths, rows = zip(*(median(seen, width, height) for seen in splats), strict=True)
-        self._drawn = _drawn_pixels(tiles, len(pinholes), width, height)
-        self._shown = _over(self._shown, self._planes, self._drawn[:, None])
-        self._depths = _over(self._depths, torch.stack(depths), self._drawn)
-        self._rows = _over(self._rows, torch.stack(rows), self._drawn)
+        splats = project(pinhole, self._inputs, smoothing, self._antialias)
+        width, height = pinhole.width, pinhole.height
+        self._planes = blend(splats, width, height)
+        depths, rows = median(splats, width, height)
+        self._drawn = _drawn_pixels(tiles, width, height)
+        self._shown = _over(self._shown, self._planes, self._drawn)
+        self._depths = _over(self._depths, depths, self._drawn)
+        self._rows = _over(self._rows, rows, self._drawn)
         return self._shown
 
-    def backward(self, v_planes: F32, weight: F32, geometry: bool) -> Gradients:
+    def backward(self, v_planes: F32, weight: F32) -> Gradients:
         import torch
 
-        cotangent = torch.tensor(np.where(self._drawn[:, None], v_planes, 0), dtype=torch.float64)
+        cotangent = torch.tensor(np.where(self._drawn, v_planes, 0), dtype=torch.float64)
         # the red plane is the sum of w * red: its gradient with the pixel weights as cotangent is the sum of
         # w * weight
         red = torch.tensor(np.where(self._drawn, weight, 0), dtype=torch.float64)
         (by_red,) = torch.autograd.grad(
-            self._planes[:, 0], self._inputs[4], red, retain_graph=True, materialize_grads=True
+            self._planes[0], self._inputs[4], red, retain_graph=True, materialize_grads=True
         )
         found = torch.autograd.grad(
-            self._planes, [*self._inputs, self._twists], cotangent, retain_graph=True, materialize_grads=True
+            self._planes, self._inputs, cotangent, retain_graph=True, materialize_grads=True
         )
-        by_means, by_quats, by_scales, by_opacities, by_colors, by_sh_rest = (
-            gradient.numpy().astype(np.float32) for gradient in found[:6]
-        )
-        kept = None if geometry else 0
-        return Gradients(
-            by_means[:kept],
-            by_quats[:kept],
-            by_scales[:kept],
-            by_opacities[:kept],
-            by_colors,
-            by_sh_rest[:kept],
-            poses=found[6].numpy()[:kept],
-            contribution=by_red[:, 0].numpy().astype(np.float32),
-        )
+        return Gradients(*(gradient.numpy().astype(np.float32) for gradient in (*found, by_red[:, 0])))
 
     def median(self) -> tuple[F32, I32]:
         return self._depths, self._rows
 
 
-def _drawn_pixels(tiles: Bool | None, cameras: int, width: int, height: int) -> Bool:
-    """[C, H, W]"""
+def _drawn_pixels(tiles: Bool | None, width: int, height: int) -> Bool:
+    """[H, W]"""
     if tiles is None:
-        return np.ones((cameras, height, width), bool)
-    return tiles.repeat(TILE_HEIGHT, 1).repeat(TILE_WIDTH, 2)[:, :height, :width]
+        return np.ones((height, width), bool)
+    return tiles.repeat(TILE_HEIGHT, 0).repeat(TILE_WIDTH, 1)[:height, :width]
 
 
 def _over(before: NDArray[T], now: Tensor, drawn: Bool) -> NDArray[T]:
@@ -127,7 +109,6 @@ def project(
     pinhole: Pinhole,
     inputs: Sequence[Tensor],
     smoothing: Tensor | None = None,
-    twist: Tensor | None = None,
     antialias: bool = True,
 ) -> Splats:
     """EWA projection (Zwicker et al. 2001) with both filters of Mip-Splatting (Yu et al. 2024).
@@ -137,13 +118,12 @@ def project(
         inputs: means, quats, scales, opacities, colors and, where there are any, sh_rest; shapes as in
             `types.Gaussians`.
         smoothing: [N] as in `types.Gaussians`.
-        twist: [6] translation (m) and rotation vector that move the view, viewmat' = exp(twist) viewmat.
         antialias: False puts the dilation of 3D Gaussian Splatting in the place of the 2D filter.
     """
     import torch
 
     means, quats, scales, opacities, colors, *harmonics = inputs
-    R, t = _view(pinhole, means.dtype, twist)
+    R, t = torch.tensor(pinhole.R, dtype=means.dtype), torch.tensor(pinhole.t, dtype=means.dtype)
     if smoothing is not None:
         variance = torch.clamp(smoothing, min=0)[:, None]
         ratio = torch.where(variance == 0, 1, scales / torch.sqrt(scales.square() + variance))
@@ -178,20 +158,6 @@ def project(
     order = torch.argsort(z.detach(), stable=True)
     order = order[(opacity > MIN_ALPHA)[order]]
     return Splats(mean2d[order], covariance[order], opacity[order], features[order], rows[order])
-
-
-def _view(pinhole: Pinhole, dtype: torch.dtype, twist: Tensor | None) -> tuple[Tensor, Tensor]:
-    """World to camera: R [3, 3] and t [3]."""
-    import torch
-
-    R, t = torch.tensor(pinhole.R, dtype=dtype), torch.tensor(pinhole.t, dtype=dtype)
-    if twist is None:
-        return R, t
-    a, b, c, x, y, z = twist.unbind()
-    zero = torch.zeros_like(a)
-    generator = torch.stack([zero, -z, y, a, z, zero, -x, b, -y, x, zero, c, zero, zero, zero, zero])
-    motion = torch.linalg.matrix_exp(generator.reshape(4, 4))
-    return motion[:3, :3] @ R, motion[:3, :3] @ t + motion[:3, 3]
 
 
 def _view_dependent(offsets: Tensor, sh_rest: Tensor) -> Tensor:

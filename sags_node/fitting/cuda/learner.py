@@ -50,8 +50,8 @@ class CudaLearner:
         self._rasterizer = CudaRasterizer(width, height, settings.antialias, device)
         self._loss = PhotometricLoss(width, height, settings.weights, device)
         self._unseen = torch.tensor(unseen, device=device)
-        self._v_planes = torch.zeros((1, 5, height, width), device=device)
-        self._weight = torch.zeros((1, height, width), device=device)
+        self._v_planes = torch.zeros((5, height, width), device=device)
+        self._weight = torch.zeros((height, width), device=device)
         self._residual = torch.zeros((), device=device)
         self._frames = _Frames(device)
         self._loan: Loan | None = None  # there is one while the model, or the field, is on the device
@@ -71,7 +71,7 @@ class CudaLearner:
         there = self._frames.of(frame)
         planes = self._draw(frame, deformed)
         self._loss.evaluate(
-            planes, there.colors(), there.tissue, there.depth, self._v_planes[0], self._weight[0],
+            planes, there.colors(), there.tissue, there.depth, self._v_planes, self._weight,
             self._unseen,
         )  # fmt: skip
         self._residual = self._loss.color
@@ -85,7 +85,7 @@ class CudaLearner:
         there = self._frames.of(frame)
         planes = self._draw(frame, True)
         self._residual = tissue_loss(
-            planes, there.colors(), there.tissue, there.depth, self._v_planes[0], self._weight[0],
+            planes, there.colors(), there.tissue, there.depth, self._v_planes, self._weight,
             DEPTH_WEIGHT, DEPTH_SCALE,
         )  # fmt: skip
         self._model.refine(self._pull_back(), rates, relaxation, field_rates)
@@ -130,7 +130,7 @@ class CudaLearner:
     def _draw(self, frame: ClipFrame, deformed: bool) -> Tensor:
         """Planes [5, H, W] of the model at the frame's time."""
         gaussians = self._model.at(frame.t_capture_ns, frame.camera, deformed)
-        return self._rasterizer.draw(gaussians, [as_pinhole(frame.camera)])[0]
+        return self._rasterizer.draw(gaussians, as_pinhole(frame.camera))
 
     def _pull_back(self) -> DeviceGradients:
         return self._rasterizer.pull_back(self._v_planes, self._weight)

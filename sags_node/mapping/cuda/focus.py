@@ -47,7 +47,7 @@ def _sum_residuals(
 def worst_tiles(
     planes: Tensor, image: Tensor, tissue: Tensor, share: float, *, every: int, least_coverage: float
 ) -> Tensor:
-    """The rasteriser's tiles [1, rows, columns] of a picture with the largest squared colour residuals, bool.
+    """The rasteriser's tiles [rows, columns] of a picture with the largest squared colour residuals, bool.
 
     Nothing is read back to the host. Tiles that tie at the edge of the choice are chosen in no fixed order.
 
@@ -69,7 +69,7 @@ def worst_tiles(
     worst = torch.topk(sums.flatten(), max(1, round(share * sums.numel())), sorted=False).indices
     chosen = torch.zeros(sums.numel(), dtype=torch.bool, device=planes.device)
     chosen.index_fill_(0, worst, True)
-    return chosen.reshape(1, rows, columns)
+    return chosen.reshape(rows, columns)
 
 
 SIGNATURES = (

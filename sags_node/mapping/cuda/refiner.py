@@ -6,8 +6,7 @@ Motion, removal and insertion stay on the CPU: they happen once per frame, on ro
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -18,10 +17,9 @@ from sags_node.engine.cuda.rasterizer import CudaRasterizer
 from sags_node.engine.cuda.scene import DeviceGaussians, DeviceGradients
 from sags_node.engine.losses.tissue import COVERED
 from sags_node.engine.rasterizer.rasterize import TILE_HEIGHT, TILE_WIDTH, as_pinhole
-from sags_node.mapping import exposure, focus, optimiser, right_eye
+from sags_node.mapping import exposure, focus, optimiser
 from sags_node.mapping.cuda import exposure as device_exposure
 from sags_node.mapping.cuda import focus as device_focus
-from sags_node.mapping.cuda import right_eye as device_right_eye
 from sags_node.mapping.cuda.optimiser import Constants, Model, Optimiser, Slopes
 from sags_node.mapping.optimiser import Rates
 from sags_node.mapping.refiner import DEPTH_SCALE, DEPTH_WEIGHT
@@ -42,9 +40,6 @@ GIVEN = ("smoothing", "node_index", "node_weight")
 LEAST_SEEN = 1e-3  # px: a Gaussian that contributes less moves no node, see `NodeDeformation.descend`
 EXPOSURE = device_exposure.ExposureRule(
     exposure.EVERY, exposure.COVERED, exposure.DARK, exposure.BRIGHT, exposure.LEAST_PIXELS, exposure.LARGEST
-)
-RIGHT_EYE = device_right_eye.RightEyeRule(
-    right_eye.FAR_MARGIN, right_eye.NEAR_MARGIN, right_eye.WEIGHT, right_eye.EVERY, EXPOSURE
 )
 STEP = Constants(
     relaxation=optimiser.COLOUR_RELAXATION,
@@ -76,8 +71,8 @@ class CudaRefiner:
         self._rasterizers: dict[tuple[int, int], CudaRasterizer] = {}  # by the size of their pictures
         self._viewers: dict[tuple[int, int], CudaRasterizer] = {}  # those of `show`
         self._optimiser = Optimiser(STEP)
-        self._planes = torch.zeros((1, 5, 1, 1), device=self._device)
-        self._v_planes, self._weight = torch.zeros_like(self._planes), torch.zeros_like(self._planes[:, 0])
+        self._planes = torch.zeros((5, 1, 1), device=self._device)
+        self._v_planes, self._weight = torch.zeros_like(self._planes), torch.zeros_like(self._planes[0])
         self._last_loss = torch.zeros((), device=self._device)
         self._host: GaussianModel | None = None
         self._tables: dict[str, Tensor] = {}
@@ -140,14 +135,14 @@ class CudaRefiner:
         self._changed = False
 
     def draw(self) -> None:
-        self._planes = self._rasterizer.draw(self._gaussians, self._pinholes)
+        self._planes = self._rasterizer.draw(self._gaussians, self._pinhole)
 
     def planes(self) -> F32:
-        left: F32 = self._planes[0].cpu().numpy()
-        return left
+        planes: F32 = self._planes.cpu().numpy()
+        return planes
 
     def exposure_gain(self) -> F32:
-        gain = device_exposure.exposure_gain(self._planes[0], self._image, self._tissue, EXPOSURE)
+        gain = device_exposure.exposure_gain(self._planes, self._image, self._tissue, EXPOSURE)
         found: F32 = gain.cpu().numpy()
         return found
 
@@ -156,12 +151,12 @@ class CudaRefiner:
             self._contribution.copy_(self._step(self._tissue, rates).contribution)
             return
         height, width = self._tissue.shape
-        rows = self._worst_tiles(share)[0].repeat_interleave(TILE_HEIGHT, 0)[:height]
+        rows = self._worst_tiles(share).repeat_interleave(TILE_HEIGHT, 0)[:height]
         self._step(self._tissue & rows.repeat_interleave(TILE_WIDTH, 1)[:, :width], rates)
 
     def refine_worst(self, share: float, rates: Rates, nodes: bool = True) -> None:
         tiles = self._worst_tiles(share)
-        self._planes = self._rasterizer.draw(self._gaussians, self._pinholes[:1], tiles)
+        self._planes = self._rasterizer.draw(self._gaussians, self._pinhole, tiles)
         self._step(self._tissue, rates, nodes)
         self._touched |= tiles
 
@@ -175,12 +170,12 @@ class CudaRefiner:
             some = self._sent(tiles) | self._touched
             if share > 0:
                 some |= self._worst_tiles(share)
-        self._planes = self._rasterizer.draw(self._gaussians, self._pinholes[:1], some)
+        self._planes = self._rasterizer.draw(self._gaussians, self._pinhole, some)
 
     def show(self, gaussians: Gaussians, camera: Camera) -> F32:
         drawn = DeviceGaussians.from_host(gaussians, self._device)
-        planes = self._rasterizer_for(camera, self._viewers).draw(drawn, [as_pinhole(camera)])
-        found: F32 = planes[0].cpu().numpy()
+        planes = self._rasterizer_for(camera, self._viewers).draw(drawn, as_pinhole(camera))
+        found: F32 = planes.cpu().numpy()
         return found
 
     def _rasterizer_for(self, camera: Camera, made: dict[tuple[int, int], CudaRasterizer]) -> CudaRasterizer:
@@ -190,18 +185,13 @@ class CudaRefiner:
         return made[size]
 
     def _step(self, tissue: Tensor, rates: Rates, nodes: bool = True) -> DeviceGradients:
-        planes, eyes = self._planes, len(self._planes)
-        if len(self._weight) < eyes or self._weight.shape[1:] != planes.shape[2:]:
-            self._v_planes, self._weight = torch.zeros_like(planes), torch.zeros_like(planes[:, 0])
-        v_planes, weight = self._v_planes[:eyes], self._weight[:eyes]
+        planes = self._planes
+        if self._v_planes.shape != planes.shape:
+            self._v_planes, self._weight = torch.zeros_like(planes), torch.zeros_like(planes[0])
+        v_planes, weight = self._v_planes, self._weight
         self._last_loss = tissue_loss(
-            planes[0], self._image, tissue, self._depth, v_planes[0], weight[0], DEPTH_WEIGHT, DEPTH_SCALE
+            planes, self._image, tissue, self._depth, v_planes, weight, DEPTH_WEIGHT, DEPTH_SCALE
         )
-        if eyes > 1:
-            assert self._right is not None
-            device_right_eye.right_eye_loss(
-                planes, self._right, tissue, self._focal_px, self._baseline, RIGHT_EYE, v_planes[1], weight[1]
-            )
         gradients = self._rasterizer.pull_back(v_planes, weight)
         if nodes:  # they move all that follows them, also far from the tiles that were drawn
             descend(
@@ -219,20 +209,16 @@ class CudaRefiner:
 
     def _worst_tiles(self, share: float) -> Tensor:
         return device_focus.worst_tiles(
-            self._planes[0], self._image, self._tissue, share,
+            self._planes, self._image, self._tissue, share,
             every=focus.EVERY, least_coverage=float(COVERED),
         )  # fmt: skip
 
     def _look_at(self, observation: Observation) -> None:
-        """The frame's pictures, on the device, and its cameras."""
+        """The frame's pictures, on the device, and its camera."""
         camera = observation.camera
         self._image, self._tissue = self._sent(observation.image), self._sent(observation.tissue)
-        self._depth, self._right = self._sent(observation.depth), None
-        self._pinholes: Sequence[Any] = [as_pinhole(camera)]
-        if observation.right is not None:
-            self._right = self._sent(observation.right)
-            self._pinholes = [*self._pinholes, as_pinhole(camera.moved_right(observation.baseline))]
-        self._focal_px, self._baseline = float(camera.K[0, 0]), observation.baseline
+        self._depth = self._sent(observation.depth)
+        self._pinhole, self._focal_px = as_pinhole(camera), float(camera.K[0, 0])
         x, y, z, shift = camera.viewmat[2].tolist()
         self._view_z = x, y, z, shift
         self._observation = observation  # now all of it is here

@@ -1,4 +1,4 @@
-"""Several cameras in one drawing, tiles that are left out, the median depth, and how the work is shared."""
+"""Tiles that are left out, the median depth, and how the work is shared."""
 
 from __future__ import annotations
 
@@ -38,8 +38,7 @@ from sags_node.types import F32, I64, Bool, Camera, Gaussians
 WIDTH, HEIGHT = 100, 77  # no whole number of tiles
 LEFT = camera(WIDTH, HEIGHT, focal=110.0, moved=True)
 TURNED = camera(WIDTH, HEIGHT, focal=95.0)
-CAMERAS = [LEFT, LEFT.moved_right(0.004), TURNED]
-SHAPE = (len(CAMERAS), -(-HEIGHT // TILE_HEIGHT), -(-WIDTH // TILE_WIDTH))
+SHAPE = (-(-HEIGHT // TILE_HEIGHT), -(-WIDTH // TILE_WIDTH))
 
 
 def scene(count: int = 400) -> Gaussians:
@@ -55,50 +54,9 @@ def copies(gradients: Gradients) -> dict[str, Any]:
 
 
 def some_tiles(seed: int) -> tuple[Bool, Bool]:
-    """A fifth of the tiles [C, rows, columns], and their pixels [C, H, W]."""
-    tiles = np.random.default_rng(seed).random(SHAPE) < 0.2
-    return tiles, np.kron(tiles, np.ones((TILE_HEIGHT, TILE_WIDTH), bool))[:, :HEIGHT, :WIDTH]
-
-
-# ---- cameras -----------------------------------------------------------------------------------------------
-
-
-def test_cameras_together_draw_what_each_draws_alone() -> None:
-    """Pictures to the bit. Gradients are added up in float32: to rounding."""
-    gaussians = scene()
-    v_planes, weight = cotangents(CAMERAS, 1)
-    together = new_rasterizer()
-    planes = together.forward(gaussians, CAMERAS)
-    both = together.backward(v_planes, weight)
-    sums: dict[str, Any] = dict.fromkeys(DERIVATIVES, 0.0)
-    sizes = dict.fromkeys(DERIVATIVES, 0.0)
-    for c, view in enumerate(CAMERAS):
-        alone = new_rasterizer()
-        np.testing.assert_array_equal(alone.forward(gaussians, [view])[0], planes[c])
-        assert planes[c, 4].mean() > 0.3
-        found = alone.backward(v_planes[c : c + 1], weight[c : c + 1])
-        for name in set(DERIVATIVES) - {"poses"}:
-            sums[name] = sums[name] + getattr(found, name).astype(np.float64)
-            sizes[name] += float(np.linalg.norm(getattr(found, name)))
-        np.testing.assert_array_equal(found.poses[0], both.poses[c])
-    for name in set(DERIVATIVES) - {"poses"}:
-        error = np.linalg.norm(getattr(both, name) - sums[name])
-        assert error <= after(2 * len(CAMERAS)) * sizes[name], name
-
-
-def test_cameras_of_one_rasterizer_may_become_more_and_fewer() -> None:
-    """And what is not drawn stays as it was: nothing is drawn in the later calls."""
-    gaussians = scene()
-    rasterizer = new_rasterizer()
-    pictures = new_rasterizer().forward(gaussians, CAMERAS).copy()
-    rasterizer.forward(gaussians, CAMERAS[:1])
-    nothing = np.zeros(SHAPE, bool)
-    grown = rasterizer.forward(gaussians, CAMERAS, nothing)
-    np.testing.assert_array_equal(grown[0], pictures[0])
-    assert not grown[1:].any()
-    rasterizer.forward(gaussians, CAMERAS)
-    shrunk = rasterizer.forward(gaussians, CAMERAS[:2], nothing[:2])
-    np.testing.assert_array_equal(shrunk, pictures[:2])
+    """A fifth of the tiles [rows, columns], and their pixels [H, W]."""
+    tiles = np.random.default_rng(seed).permutation(SHAPE[0] * SHAPE[1]).reshape(SHAPE) < 4
+    return tiles, np.kron(tiles, np.ones((TILE_HEIGHT, TILE_WIDTH), bool))[:HEIGHT, :WIDTH]
 
 
 # ---- tiles -------------------------------------------------------------------------------------------------
@@ -108,16 +66,14 @@ def test_cameras_of_one_rasterizer_may_become_more_and_fewer() -> None:
 def test_active_tiles_are_those_of_the_whole_drawing(seed: int) -> None:
     gaussians, before = scene(), random_gaussians(9, 100, LEFT)
     tiles, drawn = some_tiles(seed)
-    v_planes, weight = cotangents(CAMERAS, seed)
+    v_planes, weight = cotangents(LEFT, seed)
     whole = new_rasterizer()
-    everything = whole.forward(gaussians, CAMERAS)
-    inside = drawn[:, None]
-    masked = np.where(inside, v_planes, 0), np.where(drawn, weight, 0)
-    expected = whole.backward(*masked)
+    everything = whole.forward(gaussians, LEFT)
+    expected = whole.backward(np.where(drawn, v_planes, 0), np.where(drawn, weight, 0))
     part = new_rasterizer()
-    old = part.forward(before, CAMERAS).copy()
-    planes = part.forward(gaussians, CAMERAS, tiles)
-    np.testing.assert_array_equal(planes, np.where(inside, everything, old))
+    old = part.forward(before, LEFT).copy()
+    planes = part.forward(gaussians, LEFT, tiles)
+    np.testing.assert_array_equal(planes, np.where(drawn, everything, old))
     found = part.backward(v_planes, weight)
     for name in DERIVATIVES:
         np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)
@@ -128,50 +84,50 @@ def test_active_tiles_are_those_of_the_whole_drawing(seed: int) -> None:
 def test_tiles_agree_with_the_twin() -> None:
     gaussians = scene(80)
     tiles, drawn = some_tiles(3)
-    v_planes, weight = cotangents(CAMERAS, 0)
+    v_planes, weight = cotangents(LEFT, 0)
     rasterizer = new_rasterizer()
-    rasterizer.forward(random_gaussians(9, 30, LEFT), CAMERAS)
-    planes = rasterizer.forward(gaussians, CAMERAS, tiles).copy()
-    asked = np.where(drawn[:, None], v_planes, 0), np.where(drawn, weight, 0)
-    true = truth(gaussians, CAMERAS, given=asked)
-    planes = np.where(drawn[:, None], planes, true.planes)  # elsewhere is what was there before
+    rasterizer.forward(random_gaussians(9, 30, LEFT), LEFT)
+    planes = rasterizer.forward(gaussians, LEFT, tiles).copy()
+    asked = np.where(drawn, v_planes, 0), np.where(drawn, weight, 0)
+    true = truth(gaussians, LEFT, given=asked)
+    planes = np.where(drawn, planes, true.planes)  # elsewhere is what was there before
     true.check(planes, copies(rasterizer.backward(v_planes, weight)))
 
 
 def test_without_active_tiles_nothing_happens() -> None:
     rasterizer = new_rasterizer()
-    before = rasterizer.forward(scene(), CAMERAS).copy()
-    after = rasterizer.forward(random_gaussians(9, 100, LEFT), CAMERAS, np.zeros(SHAPE, bool))
+    before = rasterizer.forward(scene(), LEFT).copy()
+    after = rasterizer.forward(random_gaussians(9, 100, LEFT), LEFT, np.zeros(SHAPE, bool))
     np.testing.assert_array_equal(after, before)
-    for name, found in copies(rasterizer.backward(*cotangents(CAMERAS, 0))).items():
+    for name, found in copies(rasterizer.backward(*cotangents(LEFT, 0))).items():
         assert not found.any(), name
 
 
 def test_pairs_are_made_for_active_tiles_only() -> None:
     rasterizer = new_rasterizer()
     backend: Any = rasterizer._backend  # type: ignore[attr-defined]  # only inside is seen what was not done
-    rasterizer.forward(scene(), CAMERAS)
+    rasterizer.forward(scene(), LEFT)
     everywhere = np.diff(backend._tile_starts)
     tiles = np.zeros(SHAPE, bool)
-    tiles[1, 0, 2] = True
-    rasterizer.forward(scene(), CAMERAS, tiles)
+    tiles[0, 2] = True
+    rasterizer.forward(scene(), LEFT, tiles)
     np.testing.assert_array_equal(np.diff(backend._tile_starts), everywhere * tiles.ravel())
-    drawn = backend._splats["extent"][: len(CAMERAS) * len(scene())] > 0
+    drawn = backend._splats["extent"][: len(scene())] > 0
     assert drawn.sum() == everywhere[tiles.ravel()]  # one pair each
 
 
 @pytest.mark.parametrize("backend", ["numba", "reference"])
-def test_nothing_to_draw_for_several_cameras(backend: str) -> None:
+def test_nothing_to_draw_in_some_tiles(backend: str) -> None:
     rasterizer = new_rasterizer(backend)
     nobody = random_gaussians(0, 0, LEFT)
     tiles, drawn = some_tiles(1)
-    rasterizer.forward(scene(30), CAMERAS)
-    planes = rasterizer.forward(nobody, CAMERAS, tiles)
-    assert not planes[np.broadcast_to(drawn[:, None], planes.shape)].any()
+    rasterizer.forward(scene(30), LEFT)
+    planes = rasterizer.forward(nobody, LEFT, tiles)
+    assert not planes[:, drawn].any()
     depths, rows = rasterizer.median()
     assert not depths[drawn].any()
     assert (rows[drawn] == -1).all()
-    assert rasterizer.backward(*cotangents(CAMERAS, 0)).means.shape == (0, 3)
+    assert rasterizer.backward(*cotangents(LEFT, 0)).means.shape == (0, 3)
 
 
 # ---- median ------------------------------------------------------------------------------------------------
@@ -184,7 +140,7 @@ def test_median_agrees_with_the_twin() -> None:
     results = []
     for backend in ("numba", "reference"):
         rasterizer = new_rasterizer(backend)
-        rasterizer.forward(gaussians, CAMERAS)
+        rasterizer.forward(gaussians, LEFT)
         results.append(rasterizer.median())
     (depths, rows), (true_depths, true_rows) = results
     assert 0.2 < (true_rows >= 0).mean() < 0.99
@@ -203,22 +159,22 @@ def test_median_is_the_surface_that_is_seen() -> None:
     for veil, row in ((0.45, 1), (0.55, 0)):
         two.opacities[:] = [veil, 0.9]
         rasterizer = new_rasterizer()
-        rasterizer.forward(two, [TURNED])
+        rasterizer.forward(two, TURNED)
         depths, rows = rasterizer.median()
-        assert rows[0, 38, 50] == row
-        assert depths[0, 38, 50] == pytest.approx([0.05, 0.08][row], rel=after(8))
+        assert rows[38, 50] == row
+        assert depths[38, 50] == pytest.approx([0.05, 0.08][row], rel=after(8))
 
 
 def test_median_leaves_the_other_tiles_alone() -> None:
     rasterizer = new_rasterizer()
-    rasterizer.forward(scene(), CAMERAS)
+    rasterizer.forward(scene(), LEFT)
     old_depths, old_rows = (array.copy() for array in rasterizer.median())
     tiles, drawn = some_tiles(4)
     others = random_gaussians(9, 300, LEFT)
-    rasterizer.forward(others, CAMERAS, tiles)
+    rasterizer.forward(others, LEFT, tiles)
     depths, rows = rasterizer.median()
     whole = new_rasterizer()
-    whole.forward(others, CAMERAS)
+    whole.forward(others, LEFT)
     all_depths, all_rows = whole.median()
     np.testing.assert_array_equal(depths, np.where(drawn, all_depths, old_depths))
     np.testing.assert_array_equal(rows, np.where(drawn, all_rows, old_rows))
@@ -229,8 +185,8 @@ def test_median_leaves_the_other_tiles_alone() -> None:
 
 def everything(tiles: Bool | None) -> list[Any]:
     rasterizer = new_rasterizer()
-    planes = rasterizer.forward(scene(), CAMERAS, tiles).copy()
-    return [planes, *rasterizer.median(), *copies(rasterizer.backward(*cotangents(CAMERAS, 0))).values()]
+    planes = rasterizer.forward(scene(), LEFT, tiles).copy()
+    return [planes, *rasterizer.median(), *copies(rasterizer.backward(*cotangents(LEFT, 0))).values()]
 
 
 @pytest.mark.parametrize("tiles", [None, some_tiles(2)[0]], ids=["all", "some"])
@@ -281,9 +237,9 @@ def crowd(corner: Sequence[float]) -> Gaussians:
 def test_a_crowd_in_one_corner(corner: tuple[float, float]) -> None:
     """All pairs in one or four tiles; the storage order does not matter either."""
     gaussians = crowd(corner)
-    planes = new_rasterizer().forward(gaussians, [LEFT]).copy()
-    assert planes[0, 4].max() > 0.99
-    true = new_rasterizer("reference").forward(gaussians, [LEFT])
+    planes = new_rasterizer().forward(gaussians, LEFT).copy()
+    assert planes[4].max() > 0.99
+    true = new_rasterizer("reference").forward(gaussians, LEFT)
     # a tile stops at a transmittance of 1e-4
     np.testing.assert_allclose(planes, true, rtol=0, atol=1e-4 + 2 * EXPONENTIAL)
     order = np.random.default_rng(5).permutation(2000)
@@ -293,23 +249,23 @@ def test_a_crowd_in_one_corner(corner: tuple[float, float]) -> None:
             for name in ("means", "quats", "scales", "opacities", "colors", "ids")
         )
     )
-    np.testing.assert_array_equal(new_rasterizer().forward(shuffled, [LEFT]), planes)
+    np.testing.assert_array_equal(new_rasterizer().forward(shuffled, LEFT), planes)
 
 
 def test_threads_with_rasterizers_of_their_own() -> None:
     """Four Python threads, other scenes, cameras, tiles and numbers of cores, at once."""
-    cases: list[tuple[Gaussians, list[Camera], Bool | None]] = [
-        (scene(300), CAMERAS, None),
-        (random_gaussians(2, 500, LEFT), CAMERAS[:1], None),
-        (scene(200), CAMERAS, some_tiles(1)[0]),
-        (random_gaussians(4, 400, LEFT), CAMERAS[1:], None),
+    cases: list[tuple[Gaussians, Camera, Bool | None]] = [
+        (scene(300), LEFT, None),
+        (random_gaussians(2, 500, LEFT), TURNED, None),
+        (scene(200), LEFT, some_tiles(1)[0]),
+        (random_gaussians(4, 400, LEFT), LEFT, None),
     ]
 
-    def work(case: tuple[Gaussians, list[Camera], Bool | None]) -> tuple[F32, dict[str, Any]]:
-        gaussians, views, tiles = case
+    def work(case: tuple[Gaussians, Camera, Bool | None]) -> tuple[F32, dict[str, Any]]:
+        gaussians, view, tiles = case
         rasterizer = new_rasterizer()
-        planes = rasterizer.forward(gaussians, views, tiles).copy()
-        return planes, copies(rasterizer.backward(*cotangents(views, 0)))
+        planes = rasterizer.forward(gaussians, view, tiles).copy()
+        return planes, copies(rasterizer.backward(*cotangents(view, 0)))
 
     expected = [work(case) for case in cases]
     failures: list[BaseException] = []
@@ -342,12 +298,10 @@ def test_wrong_use_is_explained() -> None:
     gaussians = scene(10)
     with pytest.raises(UsageError, match="call forward before median"):
         rasterizer.median()
-    with pytest.raises(UsageError, match="takes one or several"):
-        rasterizer.forward(gaussians, [])
-    with pytest.raises(UsageError, match=r"tiles is bool \[1, 3, 7\], expected bool \[3, 3, 7\]"):
-        rasterizer.forward(gaussians, CAMERAS, np.ones((1, *SHAPE[1:]), bool))
+    with pytest.raises(UsageError, match=r"tiles is bool \[7, 3\], expected bool \[3, 7\]"):
+        rasterizer.forward(gaussians, LEFT, np.ones(SHAPE[::-1], bool))
     with pytest.raises(UsageError, match="tiles is float64"):
-        rasterizer.forward(gaussians, CAMERAS, np.ones(SHAPE))  # type: ignore[arg-type]  # that is the mistake
-    rasterizer.forward(gaussians, CAMERAS)
-    with pytest.raises(UsageError, match=r"weight has shape \[1, 77, 100\], expected \[3, 77, 100\]"):
-        rasterizer.backward(cotangents(CAMERAS, 0)[0], cotangents(CAMERAS[:1], 0)[1])
+        rasterizer.forward(gaussians, LEFT, np.ones(SHAPE))  # type: ignore[arg-type]  # that is the mistake
+    rasterizer.forward(gaussians, LEFT)
+    with pytest.raises(UsageError, match=r"weight has shape \[100, 77\], expected \[77, 100\]"):
+        rasterizer.backward(cotangents(LEFT, 0)[0], cotangents(LEFT, 0)[1].T)
