@@ -702,7 +702,6 @@ class LaunchConfig(Section):
     """One way to run the node."""
 
     ns: str = Field("sags", pattern=NAMESPACE, description="namespace of all topics")
-    seed: int = Field(0, description="of the random numbers of `python -m benchmarks endurance`")
     device: DeviceName = Field(
         "auto",
         description="auto: a GPU where one can be used, else the CPU; cuda: a GPU, or an error; docs/gpu.md",
@@ -751,6 +750,7 @@ class LaunchConfig(Section):
 
 # Keys of earlier versions, and what stands in their place: an error says it.
 REMOVED = {
+    "seed": "`python -m benchmarks endurance` has --seed; source.seed is the phantom's",
     "mapping.right_eye": "publish.right draws the right eye, and learns from what it sees",
     "vision.stereo.method": "inverse search matches; SGBM is a baseline of `python -m benchmarks depth`",
 }

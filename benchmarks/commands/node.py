@@ -126,10 +126,17 @@ def bench_pareto(
     show_default=True,
     help="Without a jump; from the start again after the last frame; or a random walk that never repeats.",
 )
+@click.option("--seed", type=int, default=0, show_default=True, help="Of the walk and the camera's noise.")
 @figures_option
 @as_json
 def bench_endurance(
-    launch: tuple[str, ...], frames: int, window: int, order: Order, out: Path | None, json_out: bool
+    launch: tuple[str, ...],
+    frames: int,
+    window: int,
+    order: Order,
+    seed: int,
+    out: Path | None,
+    json_out: bool,
 ) -> None:
     """Whether the node lasts: thousands of frames in a row.
 
@@ -148,7 +155,7 @@ def bench_endurance(
     check_files(out)
     session = open_launched(path, [*overrides, "source.loop:=false", "source.pace:=step"])
     with progress("playing") as advance:
-        measured = endurance.measure_endurance(session, frames, window, order, advance)
+        measured = endurance.measure_endurance(session, frames, window, order, advance, seed)
     if json_out:
         show(measured)
     else:

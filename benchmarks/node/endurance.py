@@ -104,7 +104,7 @@ class _Run:
 
 
 def measure_endurance(
-    session: Session, frames: int, per_window: int, order: Order, advance: Advance
+    session: Session, frames: int, per_window: int, order: Order, advance: Advance, seed: int = 0
 ) -> dict[str, Any]:
     """Play a recording's frames over and over. Ctrl-C ends the measurement with what is known by then.
 
@@ -115,6 +115,7 @@ def measure_endurance(
         order: of the recording's frames: there and back; from the start again after the last one, which is a
             cut where the recording does not end as it began; or a random walk through time.
         advance: called with what is going on.
+        seed: of the walk, and of the camera's noise over what stands still.
 
     Returns:
         The table, keys as benchmarks/README.md lists them.
@@ -129,14 +130,14 @@ def measure_endurance(
     still: list[_Taken] = []
     interrupted = False
     try:
-        for done, index in enumerate(itertools.islice(visits(len(kept), order, session.config.seed), frames)):
+        for done, index in enumerate(itertools.islice(visits(len(kept), order, seed), frames)):
             if len(moving) == per_window:
                 moving.clear()
             moving.append(run.take(kept[index]))
             if len(moving) == per_window:
                 windows.append(run.window(moving))
             advance(done + 1, frames + STILL_FRAMES, "playing")
-        for done, frame in enumerate(_photographed(kept[index], STILL_FRAMES, session.config.seed)):
+        for done, frame in enumerate(_photographed(kept[index], STILL_FRAMES, seed)):
             still.append(run.take(frame))
             advance(frames + done + 1, frames + STILL_FRAMES, "standing still")
     except KeyboardInterrupt:

@@ -124,7 +124,6 @@ def measure(
         "max_gaussians": affordable(config, *session.working_size),
         "backend": config.engine.backend,
         "device": device_of(config).kind,
-        "seed": config.seed,
         "width": session.working_size[0],
         "height": session.working_size[1],
         "pose": config.vision.pose,
