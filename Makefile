@@ -56,12 +56,12 @@ test-targets: setup
 # A node on a virtual clock with seeded faults: SEEDS="count first".
 SEEDS ?= 5000
 simulate: setup
-	PYTHONPATH=tests/helpers $(BIN)/python tests/test_simulation.py $(SEEDS)
+	PYTHONPATH=tests/helpers $(BIN)/python tests/node/test_simulation.py $(SEEDS)
 
 # A node's start broken off at COUNT moments: a quarter of an hour.
 COUNT ?= 200
 stops: setup
-	PYTHONPATH=tests/helpers $(BIN)/python tests/test_stops.py $(COUNT)
+	PYTHONPATH=tests/helpers $(BIN)/python tests/node/test_stops.py $(COUNT)
 
 # A live node with all its neighbours, ten minutes: does anything grow?
 soak: setup

@@ -1,4 +1,4 @@
-"""Writes docs/launch.md from the descriptions of `sags_node.config`: `make docs`."""
+"""Writes docs/launch.md from the descriptions of `sags_node.config.schema`: `make docs`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, TypeGuard, Union, get_args, get_orig
 from annotated_types import Ge, Gt, Le
 from pydantic.fields import FieldInfo
 
-from sags_node.config import (
+from sags_node.config.schema import (
     BagRobot,
     Box,
     GeometryConfig,
@@ -30,7 +30,7 @@ from sags_node.config import (
 PAGE = Path(__file__).with_name("launch.md")
 HEAD = """# Launch files
 
-<!-- Written by `make docs` from sags_node/config.py. Change it there. -->
+<!-- Written by `make docs` from sags_node/config/schema.py. Change it there. -->
 
 A launch file says what the node plays, with which calibration, and how. It is YAML:
 

@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from sags_node.calibration import save_rig
 from sags_node.geometry import invert
 from sags_node.messaging import cdr
 from sags_node.messaging.topics import IMAGE
 from sags_node.phantom.board import chessboard, draw, fine_rays
 from sags_node.phantom.rig import phantom_rig
+from sags_node.rig import save_rig
 
 Pose = NDArray[np.float64]  # [4, 4] m
 

@@ -19,12 +19,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sags_node.calibration import load_rig, save_rig
-from sags_node.calibration.hand_eye import HandEye, save_hand_eye
 from sags_node.client import FrameSender, PoseSender
-from sags_node.config import PhantomSource
+from sags_node.config.schema import PhantomSource
 from sags_node.messaging import cdr
 from sags_node.phantom import cached_session
+from sags_node.rig import load_rig, save_rig
+from sags_node.rig.hand_eye import HandEye, save_hand_eye
 from sags_node.types import Eye
 
 Picture = NDArray[np.uint8]
@@ -53,7 +53,7 @@ def pushed(endpoint: str, jpeg: int | None, pose_endpoint: str | None) -> Send:
 
 def published(domain: int, name: str, infos: tuple[Eye, Eye], compressed: bool) -> Send:
     """As ROS 2 topics `name/left/image_raw` and so on, with camera_info and tf."""
-    from sags_node.config import RosGraph
+    from sags_node.config.schema import RosGraph
     from sags_node.messaging.topics import CAMERA_INFO, IMAGE, TF
     from sags_node.ros.graph import Graph
 

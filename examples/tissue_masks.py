@@ -11,7 +11,7 @@ import uuid
 import numpy as np
 
 from sags_node.client import ReceivedImage, Subscriber, TopicName
-from sags_node.config import PublishConfig
+from sags_node.config.schema import PublishConfig
 from sags_node.messaging import cdr
 from sags_node.messaging.publisher import Publisher
 from sags_node.types import U8

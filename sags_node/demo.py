@@ -14,16 +14,16 @@ from typing import Any
 
 from rich.table import Table
 
-from sags_node.config import LaunchConfig
+from sags_node.config.schema import LaunchConfig
 from sags_node.errors import SagsError
 from sags_node.evaluation.measure import Options
 from sags_node.evaluation.report import summary_table, write_report
 from sags_node.evaluation.session import measure
 from sags_node.evaluation.spool import Spool
 from sags_node.messaging.rundir import connection_path, default_run_dir
-from sags_node.node import Node
+from sags_node.node.node import Node
+from sags_node.pipeline.session import Session
 from sags_node.processes import end
-from sags_node.session import Session
 from sags_node.terminal.console import stop_signals
 from sags_node.types import FrameResult
 

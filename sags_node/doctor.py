@@ -19,8 +19,7 @@ from pathlib import Path
 from typing import Literal
 
 from sags_node import host
-from sags_node.calibration.hand_eye import read_hand_eye
-from sags_node.config import (
+from sags_node.config.schema import (
     GstSource,
     Guarded,
     LaunchConfig,
@@ -40,8 +39,9 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.importing.check import played
 from sags_node.kernels.cache import cache_root
 from sags_node.messaging.security import check_endpoint, read_allow_list, read_key_pair
+from sags_node.pipeline.session import rig_of
+from sags_node.rig.hand_eye import read_hand_eye
 from sags_node.ros.graph import domain_of
-from sags_node.session import rig_of
 from sags_node.sources.gst import whole_launch
 from sags_node.sources.gst_process import ELEMENTS, check_launch, installed
 from sags_node.sources.layout import Layout

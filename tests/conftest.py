@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import sags_node.kernels.threads  # noqa: F401 - before torch: it says how idle workers wait, here as in a node
-from sags_node.config import FoldersSource, PhantomSource
+from sags_node.config.schema import FoldersSource, PhantomSource
 from sags_node.phantom import write_session
 
 ROOT = Path(__file__).parent.parent

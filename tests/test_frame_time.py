@@ -13,14 +13,14 @@ from command_line import FREE_PORTS
 from places import SESSION
 from synthetic import at_frame, plane_result
 
-from sags_node.calibration import load_rig
-from sags_node.config import MappingConfig
-from sags_node.health import TOO_SLOW, why_missed
-from sags_node.launch_file import load_launch
+from sags_node.config.launch_file import load_launch
+from sags_node.config.schema import MappingConfig
 from sags_node.mapping.budget import TimeBudget
-from sags_node.node import Node
-from sags_node.pipeline import Pipeline
-from sags_node.session import open_session
+from sags_node.node.health import TOO_SLOW, why_missed
+from sags_node.node.node import Node
+from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.session import open_session
+from sags_node.rig import load_rig
 from sags_node.sources.rate import MEASURED, FrameRate
 from sags_node.types import FrameResult, StereoFrame
 

@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 from numbered_pictures import HEIGHT, WIDTH, picture, recordings
 
-from sags_node import config as cfg
+from sags_node.config import schema as cfg
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import open_file
-from sags_node.native_output import native_output
+from sags_node.media.native_output import native_output
+from sags_node.media.picture_header import claimed_size, is_whole
 from sags_node.overlay.mesh import mesh_of
 from sags_node.overlay.save import Output
 from sags_node.overlay.scene import ObjectSpec
-from sags_node.picture_header import claimed_size, is_whole
 from sags_node.recording.pictures import decode_file
 from sags_node.sources.numbered import open_numbered
 from sags_node.sources.pictures import read_picture

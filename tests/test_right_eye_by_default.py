@@ -16,8 +16,8 @@ from command_line import FREE_PORTS
 from waiting import until
 
 from sags_node.messaging.control import ControlClient
-from sags_node.node import Node
-from sags_node.session import open_session
+from sags_node.node.node import Node
+from sags_node.pipeline.session import open_session
 from sags_node.types import FrameResult
 
 pytestmark = pytest.mark.live

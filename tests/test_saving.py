@@ -10,11 +10,11 @@ from types import SimpleNamespace
 import pytest
 from synthetic import plane_result
 
-from sags_node import node_operations
-from sags_node.config import LaunchConfig
+from sags_node.config.schema import LaunchConfig
 from sags_node.errors import SagsError
 from sags_node.model.ply import write_ply
-from sags_node.node_operations import NodeState, Operations
+from sags_node.node import operations as node_operations
+from sags_node.node.operations import NodeState, Operations
 from sags_node.types import FrameResult, Gaussians
 
 

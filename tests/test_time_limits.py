@@ -16,15 +16,15 @@ from places import SESSION
 
 from benchmarks.node import transport
 from sags_node import processes
-from sags_node.config import V4l2Source
+from sags_node.config.schema import V4l2Source
 from sags_node.errors import SagsError
 from sags_node.messaging.publisher import Publisher
-from sags_node.node import Node
-from sags_node.session import open_session
+from sags_node.node.node import Node
+from sags_node.pipeline.session import open_session
+from sags_node.pipeline.warm_up import warm_up
 from sags_node.sources import live
 from sags_node.sources.device import Shot
 from sags_node.sources.v4l2 import open_cameras
-from sags_node.warm_up import warm_up
 
 pytestmark = pytest.mark.live
 

@@ -20,8 +20,8 @@ from sags_node.cli.launching import (
     write_json,
 )
 from sags_node.errors import SagsError, UsageError
+from sags_node.evaluation.plotting import check_plots
 from sags_node.files import whole
-from sags_node.plotting import check_plots
 from sags_node.terminal.console import progress, show
 
 if TYPE_CHECKING:
@@ -310,7 +310,7 @@ def bench_scope(
     python -m benchmarks scope --motion orbit source.width:=320 source.height:=256
     """
     from benchmarks.quality import scope
-    from sags_node.launch_file import load_launch
+    from sags_node.config.launch_file import load_launch
 
     path, overrides = split_recording(launch, "benchmarks scope needs the phantom")
     check_files(out)

@@ -25,7 +25,7 @@ from websockets.sync.client import connect
 from websockets.sync.connection import Connection
 
 from benchmarks.node.crowd import STARTING, STATUS, STOPPING, Advance, node_beside, watched
-from sags_node.config import RosGraph
+from sags_node.config.schema import RosGraph
 from sags_node.errors import SagsError
 from sags_node.evaluation.metrics import percentiles
 from sags_node.messaging.cdr import COMPRESSED

@@ -22,8 +22,8 @@ from sags_node.errors import SagsError
 from sags_node.evaluation.measure import Options
 from sags_node.evaluation.session import measure, run_realtime
 from sags_node.evaluation.spool import Spool
-from sags_node.session import open_session
-from sags_node.warm_up import warm_up
+from sags_node.pipeline.session import open_session
+from sags_node.pipeline.warm_up import warm_up
 
 MEASURING = 600.0  # s to measure a run beyond its length
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from sags_node.client import FrameSender
-from sags_node.config import GeometryConfig, GstSource, PushSource, Ros2Source, RosGraph
+from sags_node.config.schema import GeometryConfig, GstSource, PushSource, Ros2Source, RosGraph
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import cdr
 from sags_node.messaging.topics import IMAGE

@@ -21,8 +21,8 @@ from sags_node.evaluation.provenance import machine_name
 from sags_node.fitting.clip import ClipFrame, play
 from sags_node.fitting.stream import StreamFit, StreamSettings
 from sags_node.kernels.threads import configure_threads
+from sags_node.pipeline.session import Session
 from sags_node.processes import resident_mb
-from sags_node.session import Session
 from sags_node.types import F32
 
 AGES = (0.25, 0.5, 0.75, 1.0)  # of the window: what is still remembered of then

@@ -13,8 +13,8 @@ from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import StepBudget
 from sags_node.messaging.thin import decode, thin_pictures
 from sags_node.messaging.topics import thin_picture
-from sags_node.pipeline import Pipeline
-from sags_node.session import Session
+from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.session import Session
 
 WARM_UP = 30  # frames: the model has grown to what the picture asks for
 RATE = 30.0  # Hz, of the rate on a link

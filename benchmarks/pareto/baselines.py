@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.quality.sgbm import JudgedSGBM
-from sags_node.config import Box
+from sags_node.config.schema import Box
 from sags_node.engine.rasterizer.rasterize import Rasterizer, make_rasterizer, to_view
 from sags_node.errors import UsageError
 from sags_node.evaluation import metrics
@@ -21,7 +21,7 @@ from sags_node.evaluation.spool import Spool, SpooledFrame
 from sags_node.evaluation.summary import summarise
 from sags_node.evaluation.warp import warp_to_right
 from sags_node.mapping.right_eye import right_eye_mask
-from sags_node.session import Session
+from sags_node.pipeline.session import Session
 from sags_node.sources.source import open_source
 from sags_node.types import U8, Bool, StereoRig
 from sags_node.vision.rectify import Rectifier

@@ -31,11 +31,11 @@ from sags_node.evaluation.provenance import machine_name
 from sags_node.evaluation.session import measure, run_step
 from sags_node.evaluation.spool import Spool
 from sags_node.evaluation.summary import summarise
-from sags_node.session import Session, open_session
+from sags_node.pipeline.session import Session, open_session
+from sags_node.pipeline.warm_up import warm_up
 from sags_node.sources.source import open_source
 from sags_node.vision.rectify import Rectifier
 from sags_node.vision.tissue import TissueMask
-from sags_node.warm_up import warm_up
 
 SHORTEST = 3  # frames: the first one, in which the model is made, has times of its own
 KEPT = (

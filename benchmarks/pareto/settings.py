@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from sags_node.config import LaunchConfig, MappingConfig
+from sags_node.config.schema import LaunchConfig, MappingConfig
 from sags_node.errors import UsageError
 from sags_node.evaluation.measure import Options
 from sags_node.mapping.ladder import RUNGS

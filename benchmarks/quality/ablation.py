@@ -28,7 +28,7 @@ from sags_node.fitting.score import score, score_between, score_depth, score_tra
 from sags_node.fitting.settings import ONLINE, PAPER, FitSettings, with_changes
 from sags_node.geometry import scale_intrinsics
 from sags_node.kernels.threads import configure_threads
-from sags_node.session import Session
+from sags_node.pipeline.session import Session
 from sags_node.types import Bool
 
 AHEAD = 3  # last frames that nothing is learnt from

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.quality.alias_truth import AliasTruth, Shot
-from sags_node.config import PhantomSource
+from sags_node.config.schema import PhantomSource
 from sags_node.engine.rasterizer.rasterize import make_rasterizer, to_view
 from sags_node.evaluation.metrics import psnr
 from sags_node.evaluation.provenance import machine_name

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from sags_node.config import PhantomSource
+from sags_node.config.schema import PhantomSource
 from sags_node.geometry import project, scale_intrinsics, unproject
 from sags_node.phantom.scene import Phantom
 from sags_node.types import F32, F64, Bool, Camera, Observation

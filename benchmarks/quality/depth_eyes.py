@@ -20,7 +20,7 @@ from sags_node.errors import SagsError
 from sags_node.evaluation.provenance import machine_name
 from sags_node.geometry import disparity_to_depth
 from sags_node.kernels.threads import configure_threads
-from sags_node.session import Session
+from sags_node.pipeline.session import Session
 from sags_node.sources.source import open_source
 from sags_node.types import F32, F64, Bool, Camera, RectifiedPair
 from sags_node.vision.rectify import Rectifier

@@ -17,8 +17,8 @@ from sags_node.evaluation import metrics
 from sags_node.findings import by_code
 from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import StepBudget
-from sags_node.pipeline import Pipeline
-from sags_node.session import Session
+from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.session import Session
 from sags_node.sources.source import open_source
 from sags_node.types import F32, F64, I64, U8, AnchorStates, Bool, FrameResult, RenderedView, StereoFrame
 from sags_node.vision.tissue import TissueMask

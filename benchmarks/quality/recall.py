@@ -16,16 +16,16 @@ from rich.table import Table
 
 from benchmarks.quality.tracking import RIGHT, RIGHT_MM, SURE, reliability_rows
 from benchmarks.quality.tracking_report import reliability_tables
-from sags_node.config import PhantomSource
+from sags_node.config.schema import PhantomSource
 from sags_node.errors import SagsError, UsageError
 from sags_node.geometry import project
 from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import StepBudget
 from sags_node.phantom.scene import Phantom, PhantomFrame
-from sags_node.pipeline import Pipeline
-from sags_node.session import Session
+from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.session import Session
+from sags_node.pipeline.warm_up import warm_up
 from sags_node.types import F64, AnchorStates, Bool, Camera, FrameResult, StereoFrame
-from sags_node.warm_up import warm_up
 
 Scenario = Literal["covered", "dark", "turned away"]
 SCENARIOS: tuple[Scenario, ...] = get_args(Scenario)

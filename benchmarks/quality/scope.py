@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from rich.table import Table
 
-from sags_node.config import LaunchConfig, PhantomSource, PoseWay
+from sags_node.config.schema import LaunchConfig, PhantomSource, PoseWay
 from sags_node.errors import UsageError
 from sags_node.evaluation import metrics
 from sags_node.evaluation.trajectory import RigidOdometry, drift, trajectory_errors
@@ -25,9 +25,9 @@ from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.camera_pose import fit_pose
 from sags_node.phantom.motion import BREATH
 from sags_node.phantom.scene import Phantom, PhantomFrame
-from sags_node.pipeline import Pipeline
+from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.warm_up import warm_up
 from sags_node.types import F32, F64, Bool, Camera, StereoFrame
-from sags_node.warm_up import warm_up
 
 Motion = Literal["sway", "zoom", "orbit"]
 MOTIONS: tuple[Motion, ...] = get_args(Motion)

@@ -29,10 +29,10 @@ from sags_node.geometry import project, transform
 from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.motion import BEHIND_TOLERANCE
-from sags_node.pipeline import Pipeline
-from sags_node.session import Session, open_posed
+from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.session import Session, open_posed
+from sags_node.pipeline.warm_up import warm_up
 from sags_node.types import F32, F64, I64, AnchorStates, Bool, FrameResult, StereoFrame
-from sags_node.warm_up import warm_up
 
 SPACING = 34  # px between anchors
 BESIDE = 40  # points, at most, that all methods are compared on: CSRT is slow

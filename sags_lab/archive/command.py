@@ -26,7 +26,7 @@ from sags_node.cli.launching import (
     write_json,
 )
 from sags_node.errors import SagsError, UsageError
-from sags_node.plotting import check_plots, has_plots
+from sags_node.evaluation.plotting import check_plots, has_plots
 from sags_node.terminal import text
 from sags_node.terminal.console import console, progress, show
 
@@ -382,7 +382,7 @@ def costs(
     """
     check_installed()
     from sags_lab.archive.costs import job_costs
-    from sags_node.session import open_session
+    from sags_node.pipeline.session import open_session
 
     path, overrides = split_recording(launch, "live cameras have no length; name a recording")
     with open_session(path, [*overrides, "source.loop:=false"]).source as source:

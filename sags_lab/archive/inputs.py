@@ -16,9 +16,9 @@ from fsspec.core import url_to_fs
 
 from sags_lab.archive.launching import arguments, belongs, split
 from sags_lab.archive.manifest import Recording, is_url
-from sags_node.config import LaunchConfig
+from sags_node.config.launch_file import load_launch
+from sags_node.config.schema import LaunchConfig
 from sags_node.errors import SagsError, UsageError
-from sags_node.launch_file import load_launch
 
 Stat = tuple[str, int, str]  # name, bytes, and when it changed or what the server says of its content
 

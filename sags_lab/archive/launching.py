@@ -6,8 +6,8 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
+from sags_node.config.launch_file import VIDEO_SUFFIXES, known_recording
 from sags_node.errors import UsageError
-from sags_node.launch_file import VIDEO_SUFFIXES, known_recording
 
 
 def counterpart(left: str) -> str | None:

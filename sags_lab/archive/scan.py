@@ -9,15 +9,15 @@ from pathlib import Path
 from sags_lab.archive.launching import arguments, counterpart, is_video, split
 from sags_lab.archive.manifest import Recording
 from sags_lab.archive.segments import Cut, segments
-from sags_node.config import LiveSource, PhantomSource, Source
+from sags_node.config.launch_file import BAG_SUFFIXES, is_sidecar, known_recording, load_launch
+from sags_node.config.schema import LiveSource, PhantomSource, Source
+from sags_node.config.yaml_reader import read_yaml
 from sags_node.errors import SagsError, UsageError
-from sags_node.launch_file import BAG_SUFFIXES, is_sidecar, known_recording, load_launch
-from sags_node.session import open_session
+from sags_node.pipeline.session import open_session
 from sags_node.sources.dvrk import read_sidecar
 from sags_node.sources.replay import Replay
 from sags_node.sources.source import open_source, recorded_rig
 from sags_node.sources.videos import Video
-from sags_node.yaml_reader import read_yaml
 
 WIDE = 2.2  # times as wide as high: two pictures beside each other; one alone is at most 1.9 (16:9, 17:9)
 PHANTOM_RATE = 30.0  # frames per second, unless it says another

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 from sags_lab.archive.manifest import Recording
-from sags_node.config import RecordedSource
+from sags_node.config.schema import RecordedSource
 from sags_node.errors import UsageError
 from sags_node.sources.replay import Replay
 

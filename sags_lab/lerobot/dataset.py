@@ -34,8 +34,8 @@ from sags_lab.lerobot.stats import Stats, Sums
 from sags_node.errors import UsageError
 from sags_node.export.played import depth_of, new_folder, points_of
 from sags_node.files import whole
+from sags_node.media.video_file import VideoFile
 from sags_node.types import AnchorStates, FrameResult, RectifiedPair
-from sags_node.video_file import VideoFile
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -14,17 +14,17 @@ from sags_lab.protocols.arithmetic import depth_figures
 from sags_lab.protocols.d4d_files import D4dClip, Scan, d4d_clips, instruments_are_white, read_tools
 from sags_lab.protocols.d4d_scan import check_scan, read_surface, scan_depth
 from sags_lab.protocols.playing import AS_GIVEN, STEP, Progress
-from sags_node.config import LaunchConfig, RecordedSource
+from sags_node.config.launch_file import load_launch
+from sags_node.config.schema import LaunchConfig, RecordedSource
 from sags_node.errors import SagsError
 from sags_node.evaluation import metrics
 from sags_node.kernels.threads import configure_threads
-from sags_node.launch_file import load_launch
-from sags_node.pipeline import Pipeline
-from sags_node.session import open_posed
+from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.session import open_posed
+from sags_node.pipeline.warm_up import warm_up
 from sags_node.sources.pictures import list_pictures
 from sags_node.sources.truth import load_npy
 from sags_node.types import F32, Bool, FrameResult
-from sags_node.warm_up import warm_up
 
 Figures = dict[str, Any]  # numbers, in groups
 

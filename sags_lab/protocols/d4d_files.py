@@ -17,11 +17,11 @@ import cv2
 import numpy as np
 
 from sags_node import geometry
+from sags_node.config.yaml_reader import read_yaml
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import read_file
 from sags_node.sources.pictures import list_pictures, read_picture
 from sags_node.types import F64, Bool, Eye, StereoRig
-from sags_node.yaml_reader import read_yaml
 
 LARGEST_JSON = 64 << 20  # bytes
 BASELINES = (1e-3, 50e-3)  # m: outside, the calibration is not in metres

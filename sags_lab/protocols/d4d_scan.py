@@ -10,11 +10,11 @@ import numpy as np
 
 from sags_lab.protocols.d4d_files import Scan, instruments_are_white, matrix_in, read_tools
 from sags_node import geometry
+from sags_node.config.yaml_reader import read_yaml
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import read_file
 from sags_node.overlay.mesh_files import parse_mesh
 from sags_node.types import F32, F64, Bool, Camera
-from sags_node.yaml_reader import read_yaml
 
 LARGEST_CLOUD = 1 << 30  # bytes
 BEHIND = 3e-3  # m: a point so far behind one within `AROUND` px is seen through the gaps between points

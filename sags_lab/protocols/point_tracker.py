@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from sags_node.config import LaunchConfig
+from sags_node.config.schema import LaunchConfig
 from sags_node.errors import SagsError
 from sags_node.geometry import transform
 from sags_node.mapping.anchors import MAX_ANCHORS
-from sags_node.pipeline import Pipeline
+from sags_node.pipeline.pipeline import Pipeline
 from sags_node.types import F64, I64, Bool, Camera, Eye, FrameResult, StereoFrame, StereoRig
 
 SAME = 0.01  # px: a point so near to where it was said to be is the same, whatever type of number kept it

@@ -17,19 +17,19 @@ from sags_lab.protocols.layouts import StereoMisSequence, check_sizes, stereomis
 from sags_lab.protocols.playing import AS_GIVEN, STEP, Progress
 from sags_lab.protocols.point_tracker import Followed, PointTracker
 from sags_lab.protocols.tracked_points import is_tracked, measure_tracked
-from sags_node.config import LaunchConfig, RecordedSource
+from sags_node.config.launch_file import load_launch
+from sags_node.config.schema import LaunchConfig, RecordedSource
 from sags_node.errors import SagsError
 from sags_node.evaluation.measure import Options
 from sags_node.evaluation.metrics import resample_nearest
 from sags_node.evaluation.point_tracks import shares_within
 from sags_node.evaluation.session import evaluate
 from sags_node.kernels.threads import configure_threads
-from sags_node.launch_file import load_launch
-from sags_node.pipeline import Pipeline
-from sags_node.session import open_posed, rig_of
+from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.session import open_posed, rig_of
+from sags_node.pipeline.warm_up import warm_up
 from sags_node.sources.videos import Video
 from sags_node.types import F64, StereoRig
-from sags_node.warm_up import warm_up
 
 LEAST_POSES = 3  # to align
 HOLD_OUT = 8  # EndoNeRF's split, as EndoGaussian and those after it take it

@@ -22,16 +22,16 @@ from sags_lab.protocols.layouts import read_tum
 from sags_lab.protocols.playing import STEP, Progress
 from sags_lab.protocols.point_tracker import Followed, PointTracker
 from sags_node import geometry
-from sags_node.calibration import rectified_rig
-from sags_node.config import LaunchConfig, RecordedSource
+from sags_node.config.launch_file import load_launch
+from sags_node.config.schema import LaunchConfig, RecordedSource
+from sags_node.config.yaml_reader import read_yaml
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import read_file
 from sags_node.kernels.threads import configure_threads
-from sags_node.launch_file import load_launch
+from sags_node.pipeline.warm_up import warm_up
+from sags_node.rig import rectified_rig
 from sags_node.sources.pictures import read_picture
 from sags_node.types import F64, Bool, StereoFrame, StereoRig
-from sags_node.warm_up import warm_up
-from sags_node.yaml_reader import read_yaml
 
 TRACKS = "track_pts.json"
 PUBLISHED = "track_pts.pckl"  # a pickle runs what it holds, so it is not opened here

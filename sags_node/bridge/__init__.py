@@ -3,5 +3,5 @@
 `relay` is the loop that bridges share; `openigtlink`, `foxglove`, `ros2`, `web` and `gst` are what it speaks
 to.
 
-Imports messaging, overlay, recording, ros and sources.
+Imports config, media, messaging, overlay, recording, ros and sources.
 """

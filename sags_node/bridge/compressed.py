@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sags_node.media.picture_file import PNG
 from sags_node.messaging import cdr, topics
 from sags_node.messaging.received import Received, ReceivedImage
-from sags_node.picture_file import PNG
 from sags_node.recording.pictures import encode_file
 from sags_node.types import F32, U8
 

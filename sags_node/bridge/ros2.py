@@ -21,7 +21,7 @@ from sags_node.bridge.feed import Place
 from sags_node.bridge.relay import MAX_AGE, Output, Relay, Source, silent
 from sags_node.bridge.requests import Requests
 from sags_node.bridge.ros2_requests import ANSWER, Inbox
-from sags_node.config import RosGraph
+from sags_node.config.schema import RosGraph
 from sags_node.errors import UsageError
 from sags_node.messaging import cdr, content, topics
 from sags_node.messaging.received import Frame, Received, ReceivedCloud, ReceivedRos

@@ -1,45 +1,4 @@
-"""Stereo calibrations: files of any usual form read into a checked `StereoRig`, and rigs made from boards.
+"""`sags calib`: pictures of a board to a rig and to the camera on the robot, and a calibration checked.
 
-Imports no other folder.
+Imports config, phantom, rig, sources, terminal and vision.
 """
-
-from sags_node.calibration.check import (
-    Finding,
-    check_eyes,
-    check_intrinsics,
-    check_pair,
-    check_rig,
-    refuse_errors,
-)
-from sags_node.calibration.read import Form, find_form, load_camera, load_rig, read_rig, unknown_form
-from sags_node.calibration.rig import (
-    fit_distortion,
-    rectified_camera,
-    rectified_rig,
-    rectify_eyes,
-    resized_rig,
-)
-from sags_node.calibration.ros import eye_files, eye_text, save_rig
-
-__all__ = [
-    "Finding",
-    "Form",
-    "check_eyes",
-    "check_intrinsics",
-    "check_pair",
-    "check_rig",
-    "eye_files",
-    "eye_text",
-    "find_form",
-    "fit_distortion",
-    "load_camera",
-    "load_rig",
-    "read_rig",
-    "rectified_camera",
-    "rectified_rig",
-    "rectify_eyes",
-    "refuse_errors",
-    "resized_rig",
-    "save_rig",
-    "unknown_form",
-]

@@ -1,211 +1,165 @@
-"""What is right, odd or wrong with the numbers of a calibration. `rows` asks pictures."""
+"""`sags calib check`: a calibration, alone or against the pictures it is for."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
-from sags_node import geometry
+from sags_node.calibration.matches import match_eyes
+from sags_node.calibration.pictures import Pair, pairs_of_files, pairs_of_session
+from sags_node.calibration.principal_points import judge_known_depths
+from sags_node.calibration.rows import Rows, judge_matches, judge_scale, rectified_rows
+from sags_node.config.launch_file import load_launch
+from sags_node.config.schema import LaunchConfig, PhantomSource
 from sags_node.errors import UsageError
-from sags_node.types import F64, Eye, StereoRig
+from sags_node.phantom import cached_session
+from sags_node.rig import Finding, check_eyes, check_pair, find_form, read_rig, unknown_form
+from sags_node.sources.pictures import size_text
+from sags_node.sources.source import recorded_rig
+from sags_node.types import F32, StereoFrame, StereoRig
+from sags_node.vision.rectify import Rectifier
+from sags_node.vision.row_error import measure_rows
 
-ENDOSCOPE_BASELINE = (0.003, 0.010)  # m
-LARGEST_BASELINE = 0.5  # m; more can only be another unit
-OTHER_SIZES = (0.25, 1 / 3, 0.5, 2.0, 3.0, 4.0)  # of the picture that a calibration may have been made for
-SAME_CENTRE = 0.12  # of the ratio of principal point to middle: how well both axes and eyes must agree
-LARGEST_RADIUS, RADII = 4.0, 4001  # at distance 1: 76 degrees from the axis
-RECALIBRATE = "run the stereo calibration again and save both files from one run"
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """One thing a calibration check looked at."""
-
-    level: Literal["ok", "warning", "error"]
-    what: str
-    mend: str = ""
-    figures: Mapping[str, float] = field(default_factory=dict)  # what was measured, for programs
+Progress = Callable[[int, int], None]
+GOOD_ROWS = (0.7, 2.0)  # px of the full picture, median and 90 %
+DISPARITY_MARGIN = 4.0  # px beyond those of matched points
 
 
-def refuse_errors(findings: list[Finding], where: Path | str) -> None:
-    """End with the errors among the findings on a file, folder or anything else.
+def check_calibration(
+    path: Path,
+    session: Path | None = None,
+    images: Sequence[tuple[Path, Path]] = (),
+    overrides: Sequence[str] = (),
+    size: tuple[int, int] | None = None,
+    metres: float | None = None,
+    progress: Progress | None = None,
+) -> list[Finding]:
+    """Look over a calibration, or the one a session uses, and compare it with pictures where there are some.
+
+    Args:
+        path: a calibration of any known form, or a session, which is then compared with its own pictures.
+        session: launch file or session folder whose pictures are used.
+        images: pairs of files or of folders.
+        overrides: `key:=value` of the session.
+        size, metres: as in `read_rig`.
 
     Raises:
-        UsageError: there are some.
+        UsageError: a path is wrong, or nothing known is there.
+        SagsError: pictures cannot be read.
     """
-    errors = [finding for finding in findings if finding.level == "error"]
-    if errors:
-        raise UsageError("\n".join(f"{where}: {error.what}; {error.mend}" for error in errors))
+    own = None if find_form(path) is not None else _launched(path, overrides)
+    config = own if session is None else load_launch(session, overrides)
+    pairs: list[Pair] = []
+    depths: Sequence[F32 | None] = ()
+    if images:
+        pairs = pairs_of_files(images)
+    elif config is not None:
+        pairs, depths = pairs_of_session(config, progress)
+    if pairs and size is None:
+        size = pairs[0][0].shape[1], pairs[0][0].shape[0]
+    rig = read_rig(path, size, metres) if own is None else _rig_of(own, size, metres)
+    return judge(rig, pairs, depths)
 
 
-def check_rig(rig: StereoRig) -> list[Finding]:
-    """What is right, odd or wrong with a calibration, each with a way to mend it."""
+def judge(rig: StereoRig, pairs: Sequence[Pair], depths: Sequence[F32 | None] = ()) -> list[Finding]:
+    """Look over a calibration, and compare it with raw pictures where there are some."""
     findings = check_eyes(rig)
-    if any(finding.level == "error" for finding in findings):
+    if _broken(findings):
         return findings
-    return findings + check_pair(rig)
+    findings += check_pair(rig)
+    return findings + (check_pictures(rig, pairs, depths) if pairs else [])
 
 
-def check_eyes(rig: StereoRig) -> list[Finding]:
-    """`check_rig`'s look at each eye and at what both must share: an error here leaves nothing to go on.
+def check_pictures(rig: StereoRig, pairs: Sequence[Pair], depths: Sequence[F32 | None] = ()) -> list[Finding]:
+    """What raw pictures say of a rig whose numbers are sound.
 
-    The first broken group ends the checks: what follows would only repeat it.
+    Args:
+        depths: what is known of each pair's depth, [H, W] m of the left rectified picture, 0 unknown.
     """
-    return _until_error(rig, (_check_numbers, _check_eyes, _check_rows))
-
-
-def check_pair(rig: StereoRig) -> list[Finding]:
-    """`check_rig`'s look at which eye is which, and how far apart they are."""
-    return _until_error(rig, (_check_order, _check_baseline))
-
-
-def _until_error(rig: StereoRig, checks: Sequence[Callable[[StereoRig], list[Finding]]]) -> list[Finding]:
-    findings: list[Finding] = []
-    for check in checks:
-        findings += check(rig)
-        if any(finding.level == "error" for finding in findings):
-            break
+    size = pairs[0][0].shape[1], pairs[0][0].shape[0]
+    if size != (rig.left.width, rig.left.height):
+        return [_wrong_size(rig, size)]
+    found = [match_eyes(*pair) for pair in pairs]
+    matches = np.concatenate(found)
+    findings = judge_matches(rig, matches)
+    if findings[0].level == "ok":
+        rows = rectified_rows(rig, matches)
+        findings.append(_check_rows(rig, pairs, rows))
+        findings += judge_scale(rig, rows)
+        if depths:
+            findings += judge_known_depths(rig, found, depths)
     return findings
 
 
-def _eyes(rig: StereoRig) -> Iterator[tuple[str, Eye]]:
-    yield "left.yaml", rig.left
-    yield "right.yaml", rig.right
+def _launched(path: Path, overrides: Sequence[str]) -> LaunchConfig:
+    if not path.exists():
+        raise UsageError(unknown_form(path))
+    try:
+        return load_launch(path, overrides)
+    except UsageError as error:
+        if (path / "launch.yaml").exists():
+            raise
+        raise UsageError(f"{unknown_form(path)}. Nor is it a session: {error}") from None
 
 
-def _check_numbers(rig: StereoRig) -> list[Finding]:
-    found = []
-    for file, eye in _eyes(rig):
-        fields = {
-            "camera_matrix": eye.K,
-            "distortion_coefficients": eye.distortion,
-            "rectification_matrix": eye.R,
-            "projection_matrix": eye.P,
-        }
-        for key, values in fields.items():
-            if not np.isfinite(values).all():
-                found.append(Finding("error", f"{file}: {key} holds NaN or infinity", RECALIBRATE))
-    return found or [Finding("ok", "all numbers are finite")]
+def _rig_of(config: LaunchConfig, size: tuple[int, int] | None, metres: float | None) -> StereoRig:
+    """The calibration that a session would use, not judged yet."""
+    if isinstance(config.source, PhantomSource):
+        return read_rig(cached_session(config.source) / "calib")
+    if config.rig is not None:
+        return read_rig(config.rig, size, metres)
+    rig = recorded_rig(config.source)
+    if rig is None:
+        raise UsageError("the session names no calibration: set rig to its folder")
+    return rig
 
 
-def _check_eyes(rig: StereoRig) -> list[Finding]:
-    found = _check_size(rig)
-    for file, eye in _eyes(rig):
-        if not geometry.is_rotation(eye.R):
-            found.append(Finding("error", f"{file}: rectification_matrix is not a rotation", RECALIBRATE))
-        for key, K in (("camera_matrix", eye.K), ("projection_matrix", eye.P[:, :3])):
-            found += check_intrinsics(f"{file}: {key}", K, eye.width, eye.height)
-        found += _check_distortion(file, eye)
-    return found or [Finding("ok", "rotations, focal lengths and principal points are plausible")]
+def _broken(findings: Sequence[Finding]) -> bool:
+    return any(finding.level == "error" for finding in findings)
 
 
-def check_intrinsics(where: str, K: F64, width: int, height: int) -> list[Finding]:
-    """What is odd or wrong with `K` [3, 3] px of a picture; `where` names it."""
-    found = []
-    for axis, focal in (("fx", K[0, 0]), ("fy", K[1, 1])):
-        if not 0.2 * width < focal < 20 * width:
-            what = f"{where}: {axis} = {focal:g} px is not plausible for a picture {width} px wide"
-            found.append(Finding("error", what, "give it in pixels of the full picture"))
-    for axis, centre, side in (("cx", K[0, 2], width), ("cy", K[1, 2], height)):
-        if not -side < centre < 2 * side:
-            what = f"{where}: {axis} = {centre:g} px is far outside a picture of {side} px"
-            found.append(Finding("error", what, "check image_width, image_height and the calibration"))
-        elif not 0.2 * side < centre < 0.8 * side:
-            what = f"{where}: {axis} = {centre:g} px is far from the middle of {side} px"
-            found.append(Finding("warning", what, "check that the calibration is of this picture size"))
-    return found
-
-
-def _check_distortion(file: str, eye: Eye) -> list[Finding]:
-    """Whether the radial distortion reaches the picture's corners before it turns back."""
-    k1, k2, _, _, k3, k4, k5, k6 = np.pad(eye.distortion, (0, 8 - len(eye.distortion)))
-    farthest = np.maximum(eye.K[:2, 2], [eye.width, eye.height] - eye.K[:2, 2]) / eye.K[[0, 1], [0, 1]]
-    radius = np.linspace(0, LARGEST_RADIUS, RADII)
-    square = radius**2
-    distorted = radius * (1 + square * (k1 + square * (k2 + square * k3)))
-    distorted /= 1 + square * (k4 + square * (k5 + square * k6))
-    turns = np.flatnonzero(np.diff(distorted) <= 0)
-    if not len(turns) or distorted[turns[0]] >= np.hypot(*farthest):
-        return []
-    reach = distorted[turns[0]] * eye.K[0, 0]
-    what = f"{file}: the distortion turns back {reach:.0f} px from the principal point, inside the picture"
-    return [Finding("warning", what, "what lies farther out is wrong: calibrate with the board there too")]
-
-
-def size_made_for(rig: StereoRig) -> float | None:
-    """The size that `K` was probably made for, as a part of the size that the rig states: 0.5 for K of half
-    the pictures. None where the principal points lie near the middle, or do not agree on another size."""
-    ratios = [
-        ratio
-        for _, eye in _eyes(rig)
-        for ratio in (2 * eye.K[0, 2] / (eye.width - 1), 2 * eye.K[1, 2] / (eye.height - 1))
-    ]
-    for size in OTHER_SIZES:
-        if all(abs(ratio / size - 1) < SAME_CENTRE for ratio in ratios):
-            return size
-    return None
-
-
-def _check_size(rig: StereoRig) -> list[Finding]:
-    size, eye = size_made_for(rig), rig.left
-    if size is None:
-        return []
-    made_for = f"{eye.width * size:.0f}x{eye.height * size:.0f}"
-    what = (
-        f"both principal points lie at {size:.3g} of the middle: camera_matrix is of {made_for} pictures, "
-        f"the files say {eye.width}x{eye.height}"
+def _wrong_size(rig: StereoRig, size: tuple[int, int]) -> Finding:
+    calibrated = rig.left.width, rig.left.height
+    ratio = size[0] / calibrated[0]
+    what = f"the calibration is for {size_text(*calibrated)} px, the pictures are {size_text(*size)}"
+    if ratio != size[1] / calibrated[1]:
+        mend = "the pictures have another shape (cropped?): calibrate with pictures as they come now"
+        return Finding("error", what, mend)
+    mend = (
+        f"calibrate at {size_text(*size)}, or if the pictures are only resized, not cropped: "
+        f"sags calib convert PATH -o FOLDER --scale {ratio:g}"
     )
-    mend = f"if the pictures are {eye.width}x{eye.height}, multiply camera_matrix and projection_matrix by "
-    return [Finding("warning", what, f"{mend}{1 / size:.3g}, or calibrate at that size")]
+    return Finding("error", f"{what}, {ratio:.3g} times as large", mend, {"scale": ratio})
 
 
-def _check_rows(rig: StereoRig) -> list[Finding]:
-    left, right = rig.left, rig.right
-    if (left.width, left.height) != (right.width, right.height):
-        what = f"left.yaml is {left.width}x{left.height}, right.yaml {right.width}x{right.height}"
-        return [Finding("error", what, "both eyes need the same picture size")]
-    found = []
-    for name, row, column, tolerance in (
-        ("fx", 0, 0, 1e-3 * left.P[0, 0]),
-        ("fy", 1, 1, 1e-3 * left.P[1, 1]),
-        ("cy", 1, 2, 0.5),
-    ):
-        a, b = left.P[row, column], right.P[row, column]
-        if abs(a - b) > tolerance:
-            what = f"rectified {name} differs: {a:g} px in left.yaml, {b:g} px in right.yaml"
-            mend = "the files are not from one stereo calibration; " + RECALIBRATE
-            found.append(Finding("error", what, mend))
-    return found or [Finding("ok", "rectified rows of both eyes agree")]
-
-
-def _check_order(rig: StereoRig) -> list[Finding]:
-    left, right = float(rig.left.P[0, 3]), float(rig.right.P[0, 3])
-    what = f"projection_matrix[3] is {left:g} in left.yaml and {right:g} in right.yaml"
-    if left < 0 and right == 0:
-        return [Finding("error", f"{what}: the eyes are swapped", "exchange left.yaml and right.yaml")]
-    if left != 0:
-        return [Finding("error", what, "the left one must be 0: the left eye is the reference")]
-    if right == 0:
-        return [Finding("error", f"{what}: there is no baseline", RECALIBRATE)]
-    if right > 0:
-        mend = "the right one must be -fx * baseline, negative: exchange the eyes or mend the sign"
-        return [Finding("error", what, mend)]
-    return [Finding("ok", "the left eye is the reference")]
-
-
-def _check_baseline(rig: StereoRig) -> list[Finding]:
-    baseline = rig.baseline
-    if baseline > LARGEST_BASELINE:
-        what = f"the baseline of {baseline:g} m looks like millimetres"
-        mend = (
-            "lengths are metres: divide projection_matrix[3] in right.yaml by 1000, or read it with --unit mm"
-        )
-        return [Finding("error", what, mend)]
-    if not ENDOSCOPE_BASELINE[0] <= baseline <= ENDOSCOPE_BASELINE[1]:
-        what = f"a baseline of {baseline * 1e3:.3g} mm is unusual for a stereo endoscope (3 to 10 mm)"
-        return [Finding("warning", what, "check the unit of projection_matrix[3] in right.yaml: fx * metres")]
-    return [Finding("ok", f"baseline {baseline * 1e3:.3g} mm")]
+def _check_rows(rig: StereoRig, pairs: Sequence[Pair], rows: Rows) -> Finding:
+    """Dense rows of the rectified pictures: finer than those of matched points, where these fit roughly."""
+    rectifier = Rectifier(rig, rig.left.width, rig.left.height)
+    smallest, largest = np.percentile(rows.disparities, [2, 98])
+    measured = []
+    for left, right in pairs:
+        pair = rectifier(StereoFrame(0, 0, 0, left, right))
+        assert pair.right is not None  # this frame has one
+        error = measure_rows(pair.left, pair.right, smallest - DISPARITY_MARGIN, largest + DISPARITY_MARGIN)
+        if error is not None:
+            measured.append(error)
+    if not measured:
+        return Finding("warning", "too little matches densely to measure rows", "give sharper pictures")
+    median, p90, matched = (float(figure) for figure in np.median(measured, axis=0))
+    figures = {"row_median_px": round(median, 3), "row_p90_px": round(p90, 3), "matched": round(matched, 3)}
+    what = f"rows agree to {median:.2f} px (median), {p90:.2f} px (90 %), over {matched:.0%} of the picture"
+    if median <= GOOD_ROWS[0] and p90 <= GOOD_ROWS[1]:
+        return Finding("ok", what, "", figures)
+    mend = "depth suffers: calibrate again, with the scope as it is used"
+    if rows.scale_differs:  # that is said next, and what is left is no turn
+        return Finding("warning", what, mend, figures)
+    pitch, roll = rows.turn
+    lower = float(np.median(rows.errors))
+    turned = (
+        f"; as if one eye were turned by {pitch:.2f} degrees up or down, {roll:.2f} about its axis, or the "
+        f"right one's principal point lay {abs(lower):.1f} px {'lower' if lower > 0 else 'higher'}"
+    )
+    turn = {"pitch_deg": pitch, "roll_deg": roll, "row_offset_px": round(lower, 3)}
+    return Finding("warning", what + turned, mend, figures | turn)

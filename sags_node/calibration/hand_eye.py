@@ -1,76 +1,107 @@
-"""How the camera sits on what the robot moves: `hand_eye.yaml` beside a rig's `left.yaml`."""
+"""`sags calib hand-eye`: from a recording of a board and the robot's poses to `hand_eye.yaml`."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import yaml
+from rich.table import Table
 
-from sags_node.errors import UsageError
-from sags_node.files import check_folder, whole
-from sags_node.geometry import is_rotation
-from sags_node.types import F64
-from sags_node.yaml_reader import read_yaml
+from sags_node.calibration.boards import Board, Chessboard, StereoView, find_in_both, turned
+from sags_node.calibration.hand_eye_solve import HandEyeSolution, solve_hand_eye
+from sags_node.config.schema import BagRobot, LaunchConfig, RecordedSource
+from sags_node.errors import SagsError, UsageError
+from sags_node.sources.pose_track import NoPoseError
+from sags_node.sources.robot import open_robot
+from sags_node.sources.source import open_source
+from sags_node.terminal import text
+from sags_node.types import F64, StereoRig
 
-FILE = "hand_eye.yaml"
-LARGEST_DISTANCE = 2.0  # m, from the hand to the camera: a scope has half a metre
-
-
-@dataclass(frozen=True, slots=True)
-class HandEye:
-    """A hand-eye calibration."""
-
-    T_hand_cam: F64  # [4, 4] m, the left raw camera in what the robot tells the pose of
-    offset_ns: int = 0  # robot's stamp - picture's stamp, of one moment
+Progress = Callable[[int, int], None]
 
 
-def read_hand_eye(file: Path) -> HandEye:
-    """Read a `hand_eye.yaml`.
-
-    Raises:
-        UsageError: it is missing, or holds no rigid transform in metres.
-    """
-    if not file.is_file():
-        raise UsageError(
-            f"{file} does not exist: calibrate with sags calib hand-eye, or set robot.hand_eye to the file"
-        )
-    tree = read_yaml(file, "hand-eye calibration")
-    said: Any = tree if isinstance(tree, dict) else {}
-    try:
-        T = np.array(said["T_hand_cam"], np.float64)
-        offset_ns = round(float(said.get("offset_ms", 0.0)) * 1e6)
-    except (KeyError, TypeError, ValueError, OverflowError):
-        raise UsageError(f"{file}: T_hand_cam must be 4 rows of 4 numbers, offset_ms a number") from None
-    if (
-        T.shape != (4, 4)
-        or not np.isfinite(T).all()
-        or not is_rotation(T[:3, :3])
-        or np.any(T[3] != (0, 0, 0, 1))
-    ):
-        raise UsageError(f"{file}: T_hand_cam is no rotation and translation above a last row 0 0 0 1")
-    if np.linalg.norm(T[:3, 3]) > LARGEST_DISTANCE:
-        raise UsageError(
-            f"{file}: the camera is {np.linalg.norm(T[:3, 3]):.3g} m from the hand; T_hand_cam is in metres"
-        )
-    return HandEye(T, offset_ns)
-
-
-def save_hand_eye(hand_eye: HandEye, folder: Path, figures: Mapping[str, Any]) -> None:
-    """Write `hand_eye.yaml` into a rig's folder; `figures` say how good it is, for people.
+def calibrate_hand_eye(
+    config: LaunchConfig,
+    rig: StereoRig,
+    board: Board,
+    count: int,
+    progress: Progress = lambda done, total: None,
+) -> HandEyeSolution:
+    """Calibrate from `count` views, spread over a recording in which the board lies still.
 
     Raises:
-        SagsError: it cannot be written.
+        UsageError: the source is live, or the poses are not in the recording.
+        SagsError: the board is seen too rarely, or the motion does not tell where the camera sits.
     """
-    tree = {
-        "T_hand_cam": [[float(number) for number in row] for row in hand_eye.T_hand_cam],
-        "offset_ms": hand_eye.offset_ns * 1e-6,
-        "figures": dict(figures),
+    source = config.source
+    if not isinstance(source, RecordedSource) or not isinstance(config.robot, BagRobot):
+        raise UsageError(
+            "a hand-eye calibration needs a recording with pictures and poses: record both topics (ros2 bag "
+            "record), then set source.kind:=bag and robot.kind:=bag"
+        )
+    with open_source(source, references=False) as recording:
+        stride = max(1, (recording.frame_count or count) // count)
+    playing = source.model_copy(update={"stride": source.stride * stride, "pace": "step", "loop": False})
+    track = open_robot(config).track
+
+    def pose_at(t_ns: int) -> F64 | None:
+        try:
+            return track.at(t_ns)
+        except NoPoseError:
+            return None
+
+    views: list[StereoView] = []
+    stamps: list[int] = []
+    with open_source(playing, references=False) as opened:
+        for number, frame in enumerate(opened):
+            if frame.right is None:
+                raise UsageError("the session has no right eye; hand-eye calibration uses both")
+            view = find_in_both(board, str(frame.frame_id), frame.left, frame.right)
+            if view is not None:
+                upside_down = isinstance(board, Chessboard) and views and not _alike(view, views[0])
+                views.append(turned(view) if upside_down else view)
+                stamps.append(frame.t_device_ns)
+            progress(number + 1, opened.frame_count or number + 1)
+    if not views:
+        raise SagsError("the board is seen in no frame; check --board, --squares, light and focus")
+    return solve_hand_eye(views, stamps, board.points, rig, pose_at)
+
+
+def _alike(view: StereoView, other: StereoView) -> bool:
+    """Whether the corners of a chessboard run the same way: the scope is not turned by half a turn."""
+    diagonals = view.left[-1] - view.left[0], other.left[-1] - other.left[0]
+    return float(diagonals[0] @ diagonals[1]) > 0
+
+
+def summarise_hand_eye(solution: HandEyeSolution) -> dict[str, Any]:
+    """Everything that there is to say, for programs."""
+    T = solution.hand_eye.T_hand_cam
+    worst = np.argsort(-solution.errors)[:3]
+    return {
+        "views": len(solution.errors),
+        "error_px": round(float(np.sqrt(np.mean(solution.errors**2))), 4),
+        "worst_views": {solution.names[i]: round(float(solution.errors[i]), 3) for i in worst},
+        "place_mm": [round(float(part) * 1e3, 4) for part in T[:3, 3]],
+        "place_sure_to_mm": round(solution.position_error * 1e3, 4),
+        "turn_sure_to_degrees": round(float(np.degrees(solution.rotation_error)), 5),
+        "offset_ms": round(solution.hand_eye.offset_ns * 1e-6, 3),
+        "offset_sure_to_ms": round(solution.offset_error_ns * 1e-6, 3),
     }
-    check_folder(folder)
-    text = yaml.safe_dump(tree, sort_keys=False, default_flow_style=None)
-    with whole(folder / FILE) as partial:
-        partial.write_text(f"# Metres. Made by sags calib hand-eye.\n{text}", encoding="utf-8")
+
+
+def hand_eye_table(summary: dict[str, Any]) -> Table:
+    """The summary for people."""
+    made = text.table()
+    made.add_row("views", f"{summary['views']} of the board with a pose of the robot")
+    made.add_row("error", f"{summary['error_px']:.3f} px (root mean square, both eyes)")
+    worst = (f"frame {name} {error:.2f} px" for name, error in summary["worst_views"].items())
+    made.add_row("worst views", ", ".join(worst))
+    place = " ".join(f"{part:.2f}" for part in summary["place_mm"])
+    sure = f"sure to {summary['place_sure_to_mm']:.2f} mm, {summary['turn_sure_to_degrees']:.3f} degrees"
+    made.add_row("camera on the hand", f"{place} mm; {sure}")
+    made.add_row(
+        "clocks",
+        f"robot - pictures {summary['offset_ms']:.1f} ms, sure to {summary['offset_sure_to_ms']:.1f} ms",
+    )
+    return made

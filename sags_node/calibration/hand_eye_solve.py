@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 
 from sags_node.calibration.boards import StereoView
-from sags_node.calibration.hand_eye import HandEye
 from sags_node.errors import SagsError
 from sags_node.geometry import invert
+from sags_node.rig.hand_eye import HandEye
 from sags_node.types import F32, F64, I64, StereoRig
 
 PoseAt = Callable[[int], F64 | None]  # the robot's pose [4, 4] at its own time, ns; None: not known

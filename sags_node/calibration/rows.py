@@ -14,7 +14,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from sags_node.calibration.check import RECALIBRATE, Finding, size_made_for
+from sags_node.rig.check import RECALIBRATE, Finding, size_made_for
 from sags_node.types import F64, Eye, StereoRig
 
 FEWEST_MATCHES = 30

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 
 from sags_node.calibration.boards import StereoView
-from sags_node.calibration.rig import fit_distortion, rectify_eyes
 from sags_node.errors import SagsError
+from sags_node.rig.rig import fit_distortion, rectify_eyes
 from sags_node.types import F32, F64, StereoRig
 
 FEWEST_VIEWS = 6

@@ -185,7 +185,7 @@ def record(
 
 
 def _recorded(launch: Sequence[str], options: Options) -> dict[str, Any]:
-    from sags_node.played_bag import record_session
+    from sags_node.cli.played_bag import record_session
 
     path, overrides = split_recording(
         launch, "live cameras are recorded from the running node; leave out --session"
@@ -246,7 +246,7 @@ def play(
     sags bag play out/case1 --rate 0.5 --loop
     sags bag play out/case1 --clock 100
     """
-    from sags_node.config import PublishConfig
+    from sags_node.config.schema import PublishConfig
     from sags_node.recording.player import Options, Player
 
     options = Options(

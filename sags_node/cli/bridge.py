@@ -344,7 +344,7 @@ def ros2(
     from pydantic import ValidationError
 
     from sags_node.bridge.ros2 import Options, run_ros2
-    from sags_node.config import RosGraph
+    from sags_node.config.schema import RosGraph
     from sags_node.ros.graph import where
 
     try:

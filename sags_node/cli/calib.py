@@ -123,7 +123,7 @@ def check(
     sags calib check /data/pair --images /data/pair/left.png /data/pair/right.png
     sags calib check launch/v4l2.yaml source.left:=/dev/video-left
     """
-    from sags_node.calibrate.check import check_calibration
+    from sags_node.calibration.check import check_calibration
 
     if session is not None and images:
         raise UsageError("--session and --images: one of them is enough")
@@ -156,7 +156,7 @@ def convert(
     sags calib convert stereo_calib/ -o calib/mine --size 1280x720 --unit mm
     sags calib convert calibrationdata.tar.gz -o calib/mine
     """
-    from sags_node.calibration import check_rig, eye_files, read_rig, refuse_errors, resized_rig, save_rig
+    from sags_node.rig import check_rig, eye_files, read_rig, refuse_errors, resized_rig, save_rig
 
     if path.resolve() in (file.resolve() for file in (out, *eye_files(out))):
         raise UsageError(f"{out} is what is converted, and would be replaced; name another folder")
@@ -197,9 +197,9 @@ def look_at_eyes(launch: tuple[str, ...], seconds: float, out: Path, force: bool
     """
     import cv2
 
-    from sags_node.calibrate.eyes import look
-    from sags_node.calibration import load_rig
-    from sags_node.launch_file import load_launch
+    from sags_node.calibration.eyes import look
+    from sags_node.config.launch_file import load_launch
+    from sags_node.rig import load_rig
 
     config = load_launch(*split(launch))
     check_file(out, force or out == EYES)
@@ -254,8 +254,8 @@ def stereo(
         --marker-mm 3.7 --dictionary 4X4_50 -o calib/my_rig
     sags calib stereo --live launch/v4l2.yaml --squares 10x7 --square-mm 4.5 -o calib/my_rig
     """
-    from sags_node.calibrate.stereo import calibrate_folders, report_table, summarise
-    from sags_node.calibration import eye_files, save_rig
+    from sags_node.calibration.stereo import calibrate_folders, report_table, summarise
+    from sags_node.rig import eye_files, save_rig
 
     if (live is None) != (len(folders) == 2) or (live is not None and folders):
         raise UsageError("give two folders, LEFT_FOLDER RIGHT_FOLDER, or --live LAUNCH")
@@ -305,10 +305,10 @@ def hand_eye(
     sags calib hand-eye case.mcap rig:=calib/my_rig robot.kind:=bag robot.topic:=/ECM/measured_cp \\
         --squares 10x7 --square-mm 4.5 -o calib/my_rig
     """  # fmt: skip
-    from sags_node.calibrate.hand_eye import calibrate_hand_eye, hand_eye_table, summarise_hand_eye
-    from sags_node.calibration.hand_eye import FILE, save_hand_eye
-    from sags_node.launch_file import load_launch
-    from sags_node.session import rig_of
+    from sags_node.calibration.hand_eye import calibrate_hand_eye, hand_eye_table, summarise_hand_eye
+    from sags_node.config.launch_file import load_launch
+    from sags_node.pipeline.session import rig_of
+    from sags_node.rig.hand_eye import FILE, save_hand_eye
 
     path, overrides = split(launch)
     config = load_launch(path, overrides)
@@ -346,8 +346,8 @@ def _board(
 
 
 def _grab(live: Path, board: Board, folder: Path, count: int) -> tuple[Path, Path]:
-    from sags_node.calibrate.live import grab_views
-    from sags_node.launch_file import load_launch
+    from sags_node.calibration.live import grab_views
+    from sags_node.config.launch_file import load_launch
 
     with console.status("starting the source (Ctrl-C: enough views)") as status:
 

@@ -11,7 +11,7 @@ from typing import Any
 from rich.table import Table
 
 from sags_node.cli.launching import write_json
-from sags_node.config import EndoNerfSource
+from sags_node.config.schema import EndoNerfSource
 from sags_node.engine.rasterizer.smoothing import folded
 from sags_node.errors import UsageError
 from sags_node.evaluation.lpips import BACKBONE, Lpips
@@ -26,7 +26,7 @@ from sags_node.fitting.settings import FitSettings
 from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.devices import device_of
 from sags_node.model.ply import write_ply
-from sags_node.session import Session
+from sags_node.pipeline.session import Session
 from sags_node.terminal import text
 
 CHECKPOINT, FIGURES, MODEL, DRAWN = "checkpoint.npz", "figures.json", "model.ply", "test"

@@ -15,9 +15,9 @@ from sags_node.files import check_file, whole
 from sags_node.terminal.console import console, progress
 
 if TYPE_CHECKING:
-    from sags_node.config import Source
+    from sags_node.config.schema import Source
     from sags_node.engine.device import Device
-    from sags_node.session import Session
+    from sags_node.pipeline.session import Session
 
 positive = click.FloatRange(min=0, min_open=True)
 
@@ -57,8 +57,8 @@ def split_recording(arguments: Sequence[str], no_cameras: str) -> tuple[str | No
     Raises:
         UsageError: the source is live cameras, or the launch is wrong.
     """
-    from sags_node.config import LiveSource
-    from sags_node.launch_file import load_launch
+    from sags_node.config.launch_file import load_launch
+    from sags_node.config.schema import LiveSource
 
     path, overrides = split(arguments)
     if isinstance(load_launch(path, overrides).source, LiveSource):
@@ -69,8 +69,8 @@ def split_recording(arguments: Sequence[str], no_cameras: str) -> tuple[str | No
 def open_launched(path: str | None, overrides: Sequence[str]) -> Session:
     """Open a session and make its kernels ready; says what is played, what takes long and what it runs on."""
     from sags_node.mapping.devices import device_of
-    from sags_node.session import open_session
-    from sags_node.warm_up import warm_up
+    from sags_node.pipeline.session import open_session
+    from sags_node.pipeline.warm_up import warm_up
 
     with progress("rendering the phantom (once)") as advance:
         session = open_session(path, overrides, advance)
@@ -83,7 +83,7 @@ def open_launched(path: str | None, overrides: Sequence[str]) -> Session:
 
 def source_text(source: Source) -> str:
     """What is played, in a line."""
-    from sags_node.config import PhantomSource
+    from sags_node.config.schema import PhantomSource
 
     if isinstance(source, PhantomSource):
         return "source: the built-in phantom"

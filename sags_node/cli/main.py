@@ -36,7 +36,7 @@ from sags_node.cli.overlay import overlay
 from sags_node.cli.topic import topic
 from sags_node.cli.view import view
 from sags_node.errors import SagsError, UsageError
-from sags_node.plotting import check_plots
+from sags_node.evaluation.plotting import check_plots
 from sags_node.terminal import text
 from sags_node.terminal.console import console, interrupt, log_handler, progress, show, stop_signals
 
@@ -131,12 +131,12 @@ def run(launch: tuple[str, ...], seconds: float | None, json_out: bool) -> None:
     sags run launch/d4d_pull.yaml
     sags run launch/v4l2.yaml source.left:=/dev/video-left mapping.budget_ms:=25
     """
-    from sags_node.config import PhantomSource
-    from sags_node.foreground import health_table, inputs_text, run_node
-    from sags_node.launch_file import load_launch
+    from sags_node.cli.foreground import health_table, inputs_text, run_node
+    from sags_node.config.launch_file import load_launch
+    from sags_node.config.schema import PhantomSource
     from sags_node.messaging.content import health_fields
-    from sags_node.node import Node
-    from sags_node.service_manager import ServiceManager
+    from sags_node.node.node import Node
+    from sags_node.node.service_manager import ServiceManager
 
     manager = ServiceManager(os.environ)
     path, overrides = split(launch)
@@ -174,7 +174,7 @@ def demo(launch: tuple[str, ...], seconds: float, out: Path, json_out: bool) -> 
     """
     from sags_node.demo import VIDEO, run_demo
     from sags_node.evaluation.report import check_report
-    from sags_node.session import open_session
+    from sags_node.pipeline.session import open_session
 
     no_cameras = "sags demo plays recordings; for cameras use sags run and sags overlay"
     path, overrides = split_recording(launch, no_cameras)
@@ -214,8 +214,8 @@ def phantom(folder: Path, overrides: tuple[str, ...]) -> None:
     \b
     sags phantom out/session seconds:=8 seed:=3 camera_motion:=orbit smoke:=0.3
     """
-    from sags_node.config import PhantomSource
-    from sags_node.launch_file import load_launch
+    from sags_node.config.launch_file import load_launch
+    from sags_node.config.schema import PhantomSource
     from sags_node.phantom import write_session
 
     config = load_launch(None, [f"source.{override}" for override in overrides]).source
@@ -291,8 +291,8 @@ def doctor(launch: tuple[str, ...], json_out: bool) -> None:
 
     With a launch file also what it names: pictures, calibration, devices, networks. No camera is opened.
     """
+    from sags_node.config.launch_file import load_launch
     from sags_node.doctor import as_rows, examine
-    from sags_node.launch_file import load_launch
 
     checks = examine(load_launch(*split(launch)))
     rows = as_rows(checks)

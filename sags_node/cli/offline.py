@@ -22,7 +22,7 @@ from sags_node.cli.launching import (
     write_json,
 )
 from sags_node.errors import UsageError
-from sags_node.plotting import check_plots
+from sags_node.evaluation.plotting import check_plots
 from sags_node.terminal.console import console, progress, show
 
 
@@ -84,11 +84,11 @@ def evaluate(
     sags eval launch/d4d_pull.yaml --out out.json
     sags eval launch/d4d_pull.yaml --pace step --iterations 2 --report out/d4d
     """
+    from sags_node.config.launch_file import load_launch
     from sags_node.evaluation.measure import Options
     from sags_node.evaluation.report import check_report, summary_table, write_report
     from sags_node.evaluation.session import Pace
     from sags_node.evaluation.session import evaluate as measure
-    from sags_node.launch_file import load_launch
 
     path, overrides = split(launch)
     if warm_up is not None:

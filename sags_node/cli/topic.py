@@ -34,7 +34,7 @@ def topic_list(endpoint: str | None, ns: str, seconds: float, json_out: bool, ke
     sags topic list
     sags topic list --ns overlay
     """
-    from sags_node import topic as tool
+    from sags_node.messaging import introspection as tool
 
     rows = tool.topic_list(endpoint=endpoint, ns=ns, seconds=seconds, keys=keys)
     show(rows if json_out else text.topics_table(rows))
@@ -54,7 +54,7 @@ def topic_echo(
 
     Warnings of its sender go to stderr.
     """
-    from sags_node import topic as tool
+    from sags_node.messaging import introspection as tool
     from sags_node.terminal.notices import Notices
 
     notices = Notices(tell)
@@ -75,7 +75,7 @@ def _measuring(name: str, doc: str, *more: Callable[..., Any]) -> None:
     @click.option("--seconds", type=positive, default=5.0, show_default=True, help="How long to listen.")
     @as_json
     def command(topic_name: str, json_out: bool, **asked: Any) -> None:
-        from sags_node import topic as tool
+        from sags_node.messaging import introspection as tool
 
         figures = getattr(tool, f"topic_{name}")(topic_name, **asked)
         show(figures if json_out else getattr(text, f"{name}_text")(figures))

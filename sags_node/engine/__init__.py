@@ -1,4 +1,4 @@
 """The rasteriser, the space-time field and the losses, forward and backward, on CPU and GPU.
 
-Imports kernels.
+Imports config and kernels.
 """

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from sags_node.config import DeviceName
+from sags_node.config.schema import DeviceName
 from sags_node.engine.failures import UnusableError
 from sags_node.errors import UsageError
 

@@ -1,4 +1,4 @@
 """How right a run was: metrics, truth, summaries, reports.
 
-Imports engine, kernels, mapping, model, sources, terminal and vision.
+Imports config, engine, kernels, mapping, model, node, pipeline, sources, terminal and vision.
 """

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sags_node.config import Box, PoseWay
+from sags_node.config.schema import Box, PoseWay
 from sags_node.engine.rasterizer.rasterize import make_rasterizer, to_view
 from sags_node.errors import UsageError
 from sags_node.evaluation import calibration, metrics

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from sags_node.plotting import as_svg, new_figure
+from sags_node.evaluation.plotting import as_svg, new_figure
 
 WIDTH, HEIGHT = 720, 200  # px
 

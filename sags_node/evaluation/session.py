@@ -9,24 +9,24 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
 
-from sags_node.config import LaunchConfig, LiveSource, PublishConfig
+from sags_node.config.launch_file import load_launch
+from sags_node.config.schema import LaunchConfig, LiveSource, PublishConfig
 from sags_node.errors import SagsError, UsageError
 from sags_node.evaluation.gallery import Picture
 from sags_node.evaluation.measure import FrameRow, Measurer, Options, Progress
 from sags_node.evaluation.spool import Spool
 from sags_node.evaluation.summary import GROUPS, summarise
 from sags_node.kernels.threads import configure_threads
-from sags_node.launch_file import load_launch
 from sags_node.mapping.devices import affordable, device_of
-from sags_node.node import Node
-from sags_node.pipeline import Pipeline
-from sags_node.session import Session, open_posed, open_session
+from sags_node.node.node import Node
+from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.session import Session, open_posed, open_session
+from sags_node.pipeline.warm_up import warm_up
 from sags_node.sources.source import Source
 from sags_node.terminal.console import stop_signals
 from sags_node.types import FrameResult, StereoFrame
 from sags_node.vision.rectify import Rectifier
 from sags_node.vision.tissue import TissueMask
-from sags_node.warm_up import warm_up
 
 Pace = Literal["realtime", "step"]
 PROGRESS_PERIOD = 0.2  # s

@@ -14,8 +14,8 @@ from sags_node.engine.rasterizer.rasterize import make_rasterizer, to_view
 from sags_node.errors import SagsError
 from sags_node.export.scene import Advance, Scene
 from sags_node.files import whole
+from sags_node.media.video_file import VideoFile
 from sags_node.types import F32, U8, Camera, Gaussians
-from sags_node.video_file import VideoFile
 
 RATE = 30.0  # pictures per second
 BACKGROUND = 0.12  # grey, where the model says nothing

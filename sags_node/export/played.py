@@ -14,10 +14,10 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.export.scene import Advance
 from sags_node.files import check_folder, whole, writing
 from sags_node.kernels.threads import configure_threads
-from sags_node.pipeline import Pipeline
-from sags_node.session import Session
+from sags_node.media.video_file import VideoFile
+from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.session import Session
 from sags_node.types import F32, U8, AnchorStates, FrameResult
-from sags_node.video_file import VideoFile
 
 DEPTH_UNIT = 1e-5  # m for a count, as `source.reference.depth_unit`
 MOST_DEPTH = 65535 * DEPTH_UNIT  # m; 16 bits reach no farther

@@ -23,8 +23,8 @@ from sags_node.messaging.address import ClientKeys
 from sags_node.messaging.content import SPLAT_FIELDS
 from sags_node.messaging.received import ReceivedCameraInfo, ReceivedCloud, ReceivedRos, TopicName
 from sags_node.messaging.subscriber import Subscriber
-from sags_node.pipeline import Pipeline
-from sags_node.session import Session
+from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.session import Session
 from sags_node.types import F32, SH_DEGREE_0, Camera, Gaussians
 
 SPLATS = TopicName("splats", ReceivedCloud)

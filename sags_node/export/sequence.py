@@ -19,8 +19,8 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.export.orbit import picture_of
 from sags_node.export.scene import Advance, Scene
 from sags_node.files import check_folder, whole, writing
+from sags_node.media.video_file import VideoFile
 from sags_node.model.ply import write_ply
-from sags_node.video_file import VideoFile
 
 ABOUT = "sequence.json"
 LOOP = "loop.mp4"

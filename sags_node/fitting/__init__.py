@@ -1,4 +1,4 @@
 """Offline fit of the deformable model to a whole clip.
 
-Imports engine, evaluation, mapping and model.
+Imports config, engine, evaluation, mapping, model and pipeline.
 """

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 
 from sags_node.errors import SagsError
-from sags_node.pipeline import Pipeline
-from sags_node.session import Session, open_posed
+from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.session import Session, open_posed
 from sags_node.types import F32, U8, Bool, Camera, Observation, Reference
 
 log = logging.getLogger(__name__)

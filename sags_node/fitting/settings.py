@@ -9,10 +9,10 @@ from typing import Any, Literal
 
 from pydantic import TypeAdapter, ValidationError
 
+from sags_node.config.yaml_reader import parse_yaml
 from sags_node.engine.losses.photometric import LossWeights
 from sags_node.errors import UsageError
 from sags_node.model.field import Block, FieldRates
-from sags_node.yaml_reader import parse_yaml
 
 Tokens = Literal["self", "planes", "nodes"]
 Schedule = Literal["paper", "online"]

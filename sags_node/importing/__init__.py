@@ -1,4 +1,4 @@
 """`sags import --check`: what a folder of recordings is, what is missing or odd in it, and how to mend it.
 
-Imports calibrate, calibration and sources.
+Imports calibration, config, media, rig and sources.
 """

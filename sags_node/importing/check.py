@@ -6,14 +6,14 @@ from collections.abc import Callable, Sequence
 from itertools import islice
 from pathlib import Path
 
-from sags_node.calibrate.check import check_calibration, judge
-from sags_node.calibrate.pictures import Pair, pairs_of_files
-from sags_node.calibration import Finding, read_rig
-from sags_node.config import EndoNerfSource, LaunchConfig, RecordedSource, VideosSource
+from sags_node.calibration.check import check_calibration, judge
+from sags_node.calibration.pictures import Pair, pairs_of_files
+from sags_node.config.schema import EndoNerfSource, LaunchConfig, RecordedSource, VideosSource
 from sags_node.errors import SagsError
 from sags_node.importing import pictures, videos
 from sags_node.importing.folder import Contents, both_eyes, calibration_of, recognise
 from sags_node.importing.timing import LOOKED_AT, Timing, check_timing
+from sags_node.rig import Finding, read_rig
 from sags_node.sources.pictures import FolderPairs, size_text
 from sags_node.sources.source import open_source
 

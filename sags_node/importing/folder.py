@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from sags_node.calibration import find_form
-from sags_node.config import LaunchConfig
+from sags_node.config.launch_file import VIDEO_SUFFIXES, load_launch
+from sags_node.config.schema import LaunchConfig
 from sags_node.errors import UsageError
-from sags_node.launch_file import VIDEO_SUFFIXES, load_launch
-from sags_node.picture_header import SUFFIXES
+from sags_node.media.picture_header import SUFFIXES
+from sags_node.rig import find_form
 
 EYES = (("left", "right"), ("l", "r"), ("image_left", "image_right"), ("left_rectified", "right_rectified"))
 HAMLYN_EYES = (("image01", "image02"), ("image_0", "image_1"), ("images", "images_right"))

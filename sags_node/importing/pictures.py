@@ -9,9 +9,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from sags_node.calibration import Finding
 from sags_node.calibration.matches import match_eyes
 from sags_node.errors import SagsError
+from sags_node.rig import Finding
 from sags_node.sources.pictures import list_pictures, read_picture, size_text
 from sags_node.types import U8, Bool
 

@@ -10,13 +10,13 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from sags_node.calibrate.pictures import Pair
-from sags_node.calibration import Finding
 from sags_node.calibration.matches import match_eyes
-from sags_node.config import GeometryConfig
+from sags_node.calibration.pictures import Pair
+from sags_node.config.schema import GeometryConfig
 from sags_node.errors import SagsError
 from sags_node.importing import pictures
 from sags_node.importing.timing import check_timing
+from sags_node.rig import Finding
 from sags_node.sources.layout import Layout
 from sags_node.sources.pictures import size_text
 from sags_node.sources.videos import Video, VideoPairs

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 
-from sags_node.config import LaunchConfig
+from sags_node.config.schema import LaunchConfig
 from sags_node.engine.device import Device, choose_device
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.errors import UsageError

@@ -1,4 +1,4 @@
 """The wire: topics, messages, sockets, keys, publisher and subscribers.
 
-Imports no other folder.
+Imports config and media.
 """

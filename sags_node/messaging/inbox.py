@@ -25,7 +25,7 @@ from sags_node.messaging.security import Seldom, authenticated, check_endpoint
 from sags_node.messaging.sockets import bind, limit, receive_frames
 
 if TYPE_CHECKING:
-    from sags_node.config import Guarded
+    from sags_node.config.schema import Guarded
 
 log = logging.getLogger(__name__)
 

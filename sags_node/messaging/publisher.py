@@ -15,7 +15,7 @@ from typing import Any, Self
 import msgspec
 import zmq
 
-from sags_node.config import PublishConfig
+from sags_node.config.schema import PublishConfig
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import cdr, content, control, topics
 from sags_node.messaging.cdr import Content, type_hash

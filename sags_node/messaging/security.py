@@ -28,7 +28,7 @@ from sags_node.files import whole, writing
 from sags_node.messaging.roles import ROLES, Client, client_of, lesser
 
 if TYPE_CHECKING:
-    from sags_node.config import Guarded  # whose validation a client need not load
+    from sags_node.config.schema import Guarded  # whose validation a client need not load
 
 KEY_CHARACTERS = 40  # a CURVE key in Z85
 MAX_KEY_FILE_BYTES = 4096

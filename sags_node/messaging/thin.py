@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sags_node.errors import SagsError
+from sags_node.media.picture_file import PNG
+from sags_node.media.picture_file import decode as decode_file
 from sags_node.messaging import cdr
 from sags_node.messaging.cdr import Content
 from sags_node.messaging.content import tells_of
 from sags_node.messaging.topics import ThinPicture
 from sags_node.messaging.wire import Buffer, WireError
-from sags_node.picture_file import PNG
-from sags_node.picture_file import decode as decode_file
 from sags_node.types import F32, U8, FrameResult, RenderedView
 
 DEPTH_STEP = 5e-5  # m: 25 um at most beside the depth, far below what any depth here is sure to; up to 3.2 m

@@ -1,4 +1,4 @@
 """`sags overlay`: meshes held by the tissue, drawn over the live picture, for both eyes.
 
-Imports kernels and messaging.
+Imports config, kernels, media and messaging.
 """

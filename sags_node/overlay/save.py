@@ -9,8 +9,8 @@ import cv2
 
 from sags_node.errors import UsageError
 from sags_node.files import check_file, whole, writing
+from sags_node.media.video_file import VideoFile
 from sags_node.types import U8
-from sags_node.video_file import VideoFile
 
 PICTURES_BEFORE_VIDEO = 5  # the frame rate must be known before a video file is opened
 

@@ -9,9 +9,9 @@ from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import Field, ValidationError, model_validator
 
-from sags_node.config import Section
+from sags_node.config.schema import Section
+from sags_node.config.yaml_reader import read_yaml
 from sags_node.errors import UsageError
-from sags_node.yaml_reader import read_yaml
 
 KEY_DISTANCE = 64  # of 255: an object's colour nearer than this to the key colour could be taken for it
 

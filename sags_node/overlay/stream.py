@@ -14,7 +14,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from sags_node.config import PublishConfig
+from sags_node.config.schema import PublishConfig
 from sags_node.messaging import cdr, content
 from sags_node.messaging.publisher import Publisher
 from sags_node.messaging.topics import OVERLAY_TOPICS

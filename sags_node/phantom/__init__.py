@@ -1,6 +1,6 @@
 """A synthetic stereo endoscope session: deforming tissue, instruments, and the exact truth of both.
 
-Imports calibration.
+Imports config and rig.
 """
 
 from sags_node.phantom.session import cached_session, write_session

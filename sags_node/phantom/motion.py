@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from sags_node.config import CameraMotion
+from sags_node.config.schema import CameraMotion
 from sags_node.types import F64
 
 _ACTION = 4.0  # s, about one grasp

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sags_node.config import PhantomSource
+from sags_node.config.schema import PhantomSource
 from sags_node.geometry import invert, transform
 from sags_node.phantom.camera import add_smoke, expose, look, world_rays
 from sags_node.phantom.casting import Bodies

@@ -13,11 +13,11 @@ import cv2
 import numpy as np
 import yaml
 
-from sags_node.calibration import save_rig
-from sags_node.config import PhantomSource
+from sags_node.config.schema import PhantomSource
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import check_folder, whole
 from sags_node.phantom.scene import Phantom, PhantomFrame
+from sags_node.rig import save_rig
 
 Progress = Callable[[int, int], None]  # frames done, frames in all
 

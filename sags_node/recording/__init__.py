@@ -1,4 +1,4 @@
 """Recordings in MCAP: written, read, played, recovered.
 
-Imports calibration and messaging.
+Imports config, media, messaging and rig.
 """

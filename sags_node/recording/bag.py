@@ -16,13 +16,13 @@ import zstandard
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
+from sags_node.config.launch_file import BAG_SUFFIXES as SUFFIXES
+from sags_node.config.yaml_reader import read_yaml
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import open_file
-from sags_node.launch_file import BAG_SUFFIXES as SUFFIXES
 from sags_node.messaging import cdr
 from sags_node.recording import mcap_file, rosbag1_check
 from sags_node.recording.mcap_file import MAGIC, MAX_RECORD_BYTES, DamagedError, Entry, Head, Inner
-from sags_node.yaml_reader import read_yaml
 
 MAX_METADATA_BYTES = 4 << 20
 METADATA = "metadata.yaml"

@@ -9,15 +9,15 @@ import cv2
 from mcap.records import Schema
 
 from sags_node import __version__
-from sags_node.calibration import eye_text
 from sags_node.errors import SagsError
+from sags_node.media.picture_file import PNG
 from sags_node.messaging import cdr, topics
 from sags_node.messaging.topics import CAMERA_INFO, IMAGE
 from sags_node.messaging.wire import PROTOCOL, Message, WireError
-from sags_node.picture_file import PNG
 from sags_node.recording.backlog import Arrived
 from sags_node.recording.bag_writer import NO_LIMITS, BagWriter, Limits
 from sags_node.recording.pictures import encode_file, read_eye
+from sags_node.rig import eye_text
 
 Compression = Literal["none", "jpeg", "png"]
 JPEG_QUALITY = 92

@@ -10,11 +10,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sags_node.calibration import fit_distortion
 from sags_node.errors import SagsError, UsageError
+from sags_node.media.picture_file import decode
 from sags_node.messaging import cdr
 from sags_node.messaging.topics import CAMERA_INFO, IMAGE
-from sags_node.picture_file import decode
+from sags_node.rig import fit_distortion
 from sags_node.types import U8, Eye
 
 IMAGE_TYPES = (IMAGE, cdr.COMPRESSED)

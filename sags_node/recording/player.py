@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from sags_node.config import PublishConfig
+from sags_node.config.schema import PublishConfig
 from sags_node.errors import SagsError
 from sags_node.messaging import cdr, topics
 from sags_node.messaging.publisher import Publisher

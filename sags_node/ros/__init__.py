@@ -1,4 +1,4 @@
 """A ROS 2 graph without ROS (extra `ros2`): joined as a process of its own, read and written.
 
-Imports messaging.
+Imports config and messaging.
 """

@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 from typing import Any, Literal
 
-from sags_node.config import RosGraph
+from sags_node.config.schema import RosGraph
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import cdr
 from sags_node.ros.endpoints import BEST_EFFORT, Delivery, Reader, Writer, ros_type

@@ -1,4 +1,4 @@
 """Where frames come from: recordings, cameras, data sets, network streams.
 
-Imports calibration, kernels, messaging, phantom, recording and ros.
+Imports config, kernels, media, messaging, phantom, recording, rig and ros.
 """

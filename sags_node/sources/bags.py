@@ -16,12 +16,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sags_node.calibration import check_rig, refuse_errors
-from sags_node.config import BagSource
+from sags_node.config.schema import BagSource
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging.topics import CAMERA_INFO
 from sags_node.recording.bag import BagMessage, read_messages
 from sags_node.recording.pictures import IMAGE_TYPES, decode_picture, header_stamp, read_eye
+from sags_node.rig import check_rig, refuse_errors
 from sags_node.sources.pictures import RawPair, size_text
 from sags_node.sources.stamps import nearest, pair
 from sags_node.types import I64, U8, StereoRig

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from sags_node.config import V4l2Source
+from sags_node.config.schema import V4l2Source
 from sags_node.errors import SagsError
 from sags_node.types import U8, Samples, Side
 

@@ -13,10 +13,10 @@ from typing import Annotated, Literal
 import msgspec
 import numpy as np
 
-from sags_node.config import DvrkSource
+from sags_node.config.launch_file import SIDECAR_TYPE
+from sags_node.config.schema import DvrkSource
 from sags_node.errors import UsageError
 from sags_node.files import read_file
-from sags_node.launch_file import SIDECAR_TYPE
 from sags_node.sources.layout import side_by_side
 from sags_node.sources.pictures import RawPair
 from sags_node.sources.stamps import nearest

@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 
 from sags_node import geometry
-from sags_node.calibration import check_intrinsics, rectified_rig, refuse_errors
-from sags_node.config import EndoNerfSource
+from sags_node.config.schema import EndoNerfSource
 from sags_node.errors import SagsError, UsageError
+from sags_node.rig import check_intrinsics, rectified_rig, refuse_errors
 from sags_node.sources.pictures import (
     FolderPairs,
     RawPair,

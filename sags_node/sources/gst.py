@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from sags_node.config import GstSource
+from sags_node.config.schema import GstSource
 from sags_node.errors import SagsError
 from sags_node.sources.device import Shot
 from sags_node.sources.gst_process import GstProcess

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 import cv2
 import numpy as np
 
-from sags_node.config import Box, GeometryConfig
+from sags_node.config.schema import Box, GeometryConfig
 from sags_node.errors import UsageError
 from sags_node.types import U8, Samples, Side
 

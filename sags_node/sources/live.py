@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from types import TracebackType
 from typing import NamedTuple, Protocol, Self
 
-from sags_node.config import GeometryConfig
+from sags_node.config.schema import GeometryConfig
 from sags_node.errors import SagsError, UsageError
 from sags_node.sources.device import Picture, Shot
 from sags_node.sources.layout import Layout

@@ -11,8 +11,8 @@ import cv2
 
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import read_file
-from sags_node.picture_file import decode
-from sags_node.picture_header import KINDS, SUFFIXES, is_whole
+from sags_node.media.picture_file import decode
+from sags_node.media.picture_header import KINDS, SUFFIXES, is_whole
 from sags_node.types import F32, F64, U8, Bool, Reference
 
 log = logging.getLogger(__name__)

@@ -9,7 +9,7 @@ from typing import Self
 
 import cv2
 
-from sags_node.config import PushSource
+from sags_node.config.schema import PushSource
 from sags_node.errors import SagsError
 from sags_node.messaging.cdr import COMPRESSED
 from sags_node.messaging.inbox import Inbox

@@ -10,7 +10,7 @@ from typing import Protocol, Self
 
 import numpy as np
 
-from sags_node import config as cfg
+from sags_node.config import schema as cfg
 from sags_node.errors import UsageError
 from sags_node.sources.bags import BagPairs
 from sags_node.sources.dvrk import DvrkPairs

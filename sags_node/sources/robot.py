@@ -12,13 +12,13 @@ from typing import Protocol, Self
 
 import numpy as np
 
-from sags_node.calibration.hand_eye import FILE, read_hand_eye
-from sags_node.config import BagRobot, BagSource, LaunchConfig, LiveSource, PushRobot, Ros2Robot
+from sags_node.config.schema import BagRobot, BagSource, LaunchConfig, LiveSource, PushRobot, Ros2Robot
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging.inbox import Inbox
 from sags_node.messaging.security import Seldom
 from sags_node.messaging.wire import Message
 from sags_node.recording.bag import read_messages
+from sags_node.rig.hand_eye import FILE, read_hand_eye
 from sags_node.ros.endpoints import Delivery, Reader
 from sags_node.ros.graph import Graph
 from sags_node.sources.pose_track import POSE_TYPES, NoPoseError, PoseTrack

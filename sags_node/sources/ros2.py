@@ -10,12 +10,12 @@ from functools import partial
 from types import TracebackType
 from typing import Self
 
-from sags_node.calibration import check_rig, refuse_errors
-from sags_node.config import Ros2Source
+from sags_node.config.schema import Ros2Source
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging.security import Seldom
 from sags_node.messaging.topics import CAMERA_INFO
 from sags_node.recording.pictures import IMAGE_TYPES, decode_picture, header_stamp, read_eye
+from sags_node.rig import check_rig, refuse_errors
 from sags_node.ros.endpoints import Reader
 from sags_node.ros.graph import Graph, receive_buffer
 from sags_node.sources.sent import SentPictures

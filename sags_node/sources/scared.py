@@ -16,10 +16,10 @@ import cv2
 import numpy as np
 
 from sags_node import geometry
-from sags_node.calibration import check_intrinsics, rectified_rig, refuse_errors
-from sags_node.calibration.opencv import numbers_in, open_storage
 from sags_node.errors import SagsError, UsageError
-from sags_node.picture_file import decode
+from sags_node.media.picture_file import decode
+from sags_node.rig import check_intrinsics, rectified_rig, refuse_errors
+from sags_node.rig.opencv import numbers_in, open_storage
 from sags_node.sources.numbered import NumberedFiles, open_numbered
 from sags_node.sources.pictures import FolderPairs, RawPair
 from sags_node.sources.videos import PanePairs, Video

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from sags_node.config import SentSource
+from sags_node.config.schema import SentSource
 from sags_node.errors import SagsError
 from sags_node.sources.clock import CaptureClock
 from sags_node.sources.device import Picture

@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator
 from types import TracebackType
 from typing import Protocol, Self
 
-from sags_node import config as cfg
-from sags_node.launch_file import load_launch
+from sags_node.config import schema as cfg
+from sags_node.config.launch_file import load_launch
 from sags_node.types import StereoFrame, StereoRig
 
 

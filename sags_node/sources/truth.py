@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sags_node.config import ReferenceConfig
+from sags_node.config.schema import ReferenceConfig
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import open_file
 from sags_node.sources.pictures import list_pictures, read_picture

@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable
 from functools import partial
 
-from sags_node.config import V4l2Source
+from sags_node.config.schema import V4l2Source
 from sags_node.errors import UsageError
 from sags_node.sources.device import Device
 from sags_node.sources.live import CaptureDevice, Input, LiveStereo

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import cv2
 
-from sags_node.config import Box
+from sags_node.config.schema import Box
 from sags_node.errors import SagsError, UsageError
 from sags_node.sources.layout import Layout
 from sags_node.sources.pictures import RawPair, size_text

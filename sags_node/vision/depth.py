@@ -7,7 +7,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from sags_node.config import VisionConfig
+from sags_node.config.schema import VisionConfig
 from sags_node.types import F32, Bool, Finding, RectifiedPair, StereoFrame
 from sags_node.vision.match_watch import MatchWatch
 from sags_node.vision.onnx_depth import NetworkDepth

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sags_node.config import StereoConfig
+from sags_node.config.schema import StereoConfig
 from sags_node.errors import UsageError
 from sags_node.types import F32, Bool
 from sags_node.vision.mono_scale import ScaleShift, fit_scale_shift

@@ -12,7 +12,7 @@ from collections import deque
 import cv2
 import numpy as np
 
-from sags_node.config import StereoConfig
+from sags_node.config.schema import StereoConfig
 from sags_node.types import F32, Bool, GrayPyramid
 from sags_node.vision.coarse_stereo import coarse_disparity
 from sags_node.vision.matchers import GUESS_WIDTH

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 
-from sags_node.config import VisionConfig
+from sags_node.config.schema import VisionConfig
 from sags_node.errors import UsageError
 from sags_node.types import F32, Bool, Camera, RectifiedPair
 from sags_node.vision.mono_depth import Measure, MonoDepth

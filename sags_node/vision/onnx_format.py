@@ -8,9 +8,9 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from sags_node.config import NetworkFormat, OnnxConfig
+from sags_node.config.schema import NetworkFormat, OnnxConfig
+from sags_node.config.yaml_reader import parse_yaml, read_yaml
 from sags_node.errors import UsageError
-from sags_node.yaml_reader import parse_yaml, read_yaml
 
 LARGEST_SIDECAR = 2**16  # bytes
 KEYS = tuple(NetworkFormat.model_fields)

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sags_node.config import NetworkFormat, Normalization
+from sags_node.config.schema import NetworkFormat, Normalization
 from sags_node.errors import UsageError
 from sags_node.types import F32, U8
 from sags_node.vision.onnx_session import Tensor

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from sags_node.config import NORMALIZATIONS, Normalization, OnnxConfig
+from sags_node.config.schema import NORMALIZATIONS, Normalization, OnnxConfig
 from sags_node.errors import UsageError
 from sags_node.types import F32, U8
 from sags_node.vision.onnx_format import read_format

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sags_node.config import OnnxConfig
+from sags_node.config.schema import OnnxConfig
 from sags_node.errors import SagsError, UsageError
 
 LARGEST_FILE = 2**31  # bytes: an ONNX file cannot be larger

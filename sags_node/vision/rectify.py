@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 
 from sags_node import geometry
-from sags_node.calibration import rectified_camera
 from sags_node.errors import SagsError, UsageError
+from sags_node.rig import rectified_camera
 from sags_node.types import F32, F64, U8, Bool, Camera, Eye, RectifiedPair, StereoFrame, StereoRig
 from sags_node.vision.pyramid import gray_pyramid
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from sags_node.config import StereoConfig
+from sags_node.config.schema import StereoConfig
 from sags_node.errors import UsageError
 from sags_node.types import F32, Bool, Camera, Finding, GrayPyramid, RectifiedPair
 from sags_node.vision.alignment import RowMonitor

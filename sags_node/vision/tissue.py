@@ -8,7 +8,7 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from sags_node.config import TissueConfig
+from sags_node.config.schema import TissueConfig
 from sags_node.errors import UsageError
 from sags_node.types import U8, Bool, RectifiedPair, RenderedView, StereoFrame
 from sags_node.vision.onnx_session import DepthNetworkError

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sags_node.config import NORMALIZATIONS, OnnxConfig, TissueConfig
+from sags_node.config.schema import NORMALIZATIONS, OnnxConfig, TissueConfig
 from sags_node.errors import UsageError
 from sags_node.types import U8, Bool
 from sags_node.vision.onnx_format import read_format

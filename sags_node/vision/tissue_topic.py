@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sags_node.config import TissueConfig
+from sags_node.config.schema import TissueConfig
 from sags_node.errors import SagsError, UsageError
 from sags_node.types import Bool, RectifiedPair
 

@@ -31,10 +31,10 @@ from benchmarks.quality.depth_ct import (
 from benchmarks.quality.depth_eyes import differences, measure_eyes, mirrored
 from benchmarks.quality.depth_regions import regions_of
 from benchmarks.quality.sgbm import JudgedSGBM, PlainSGBM
-from sags_node.config import StereoConfig
+from sags_node.config.schema import StereoConfig
 from sags_node.errors import SagsError, UsageError
 from sags_node.geometry import unproject
-from sags_node.session import open_session
+from sags_node.pipeline.session import open_session
 from sags_node.types import F32, U8, Bool, Camera, RectifiedPair
 from sags_node.vision.dense_depth import SMOOTHING_VARIANCE
 from sags_node.vision.smoothing import guided

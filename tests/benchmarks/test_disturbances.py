@@ -18,9 +18,9 @@ from benchmarks.disturbances import DISTURBANCES, Scene, disturbed
 from benchmarks.disturbances.light import GRAIN, to_linear
 from benchmarks.disturbances.tissue import SMOKE_VEIL
 from benchmarks.quality.disturbances import frames_to_recover, warning_times
-from sags_node.calibration import rectified_rig
 from sags_node.phantom.camera import SMOKE_COLOR
-from sags_node.session import Session, open_session
+from sags_node.pipeline.session import Session, open_session
+from sags_node.rig import rectified_rig
 from sags_node.sources.source import open_source
 from sags_node.types import F32, U8, StereoFrame
 

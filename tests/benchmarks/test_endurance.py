@@ -24,7 +24,7 @@ from benchmarks.node.endurance import (
     slope,
     statement,
 )
-from sags_node.session import Session, open_session
+from sags_node.pipeline.session import Session, open_session
 
 QUIET = Window(0, 25.0, 30.0, 35.0, 30_000, 500, 400.0, 0, 0, 0)
 

@@ -20,12 +20,12 @@ from benchmarks.pareto import settings as pareto_settings
 from benchmarks.pareto.baselines import right_pixels
 from benchmarks.pareto.measure import non_dominated, why_default
 from benchmarks.pareto.settings import HURRIED_RULES, skip_rules, skip_settings, time_settings
-from sags_node.calibration import load_rig
-from sags_node.config import MappingConfig
+from sags_node.config.launch_file import load_launch
+from sags_node.config.schema import MappingConfig
 from sags_node.evaluation import metrics
 from sags_node.evaluation.warp import warp_to_right
-from sags_node.launch_file import load_launch
 from sags_node.mapping.ladder import RUNGS
+from sags_node.rig import load_rig
 from sags_node.sources.source import open_source
 from sags_node.vision.rectify import Rectifier
 

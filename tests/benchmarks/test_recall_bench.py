@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 
 from benchmarks.quality import recall
-from sags_node.config import FoldersSource
+from sags_node.config.schema import FoldersSource
 from sags_node.errors import UsageError
-from sags_node.session import open_session
+from sags_node.pipeline.session import open_session
 
 SMALL = [
     *("source.seconds:=1", "source.width:=320", "source.height:=256", "source.pace:=step"),

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from benchmarks.quality import scope
-from sags_node.config import FoldersSource
+from sags_node.config.launch_file import load_launch
+from sags_node.config.schema import FoldersSource
 from sags_node.errors import UsageError
-from sags_node.launch_file import load_launch
 
 SMALL = [
     *("source.width:=160", "source.height:=128", "source.rate:=2.5", "source.still_tissue:=true"),

@@ -7,7 +7,7 @@ from places import SESSION
 
 from benchmarks.node import thin
 from sags_node.errors import SagsError
-from sags_node.session import open_session
+from sags_node.pipeline.session import open_session
 
 
 def test_each_kind_has_its_cost_and_smaller_ones_are_smaller(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,7 +12,7 @@ from benchmarks.quality.tracking import measure_tracking
 from benchmarks.quality.tracking_report import tables
 from sags_node.errors import SagsError
 from sags_node.mapping.anchors import Anchors
-from sags_node.session import Session, open_session
+from sags_node.pipeline.session import Session, open_session
 
 
 def opened(*overrides: str) -> Session:

@@ -22,7 +22,7 @@ from sags_node.bridge.compressed import LARGEST, Compressor
 from sags_node.bridge.feed import Place
 from sags_node.bridge.ros2 import PACE, Options, Pace, offers, run_ros2
 from sags_node.bridge.ros2_requests import asks
-from sags_node.config import RosGraph
+from sags_node.config.schema import RosGraph
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import cdr, topics
 from sags_node.messaging.received import ReceivedImage, interpret

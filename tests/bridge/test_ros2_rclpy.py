@@ -25,7 +25,7 @@ from waiting import until
 
 from sags_node.bridge.feed import Place
 from sags_node.bridge.ros2 import Options, run_ros2
-from sags_node.config import RosGraph
+from sags_node.config.schema import RosGraph
 from sags_node.messaging import cdr, topics
 from sags_node.messaging.received import Received, ReceivedCloud, TopicName
 from sags_node.messaging.subscriber import Subscriber

@@ -8,8 +8,8 @@ import pytest
 import yaml
 from places import ROOT
 
-from sags_node.calibration import check_rig, load_rig, read_rig, rectified_camera, save_rig
 from sags_node.errors import UsageError
+from sags_node.rig import check_rig, load_rig, read_rig, rectified_camera, save_rig
 from sags_node.types import Eye, StereoRig
 
 CALIB = ROOT / "calib"

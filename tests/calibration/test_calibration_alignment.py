@@ -11,12 +11,12 @@ import pytest
 from places import SESSION
 from synthetic import health
 
-from sags_node.calibration import load_rig
 from sags_node.mapping.budget import StepBudget
 from sags_node.messaging.cdr import decode
 from sags_node.messaging.content import diagnostics
-from sags_node.pipeline import Pipeline
-from sags_node.session import open_session
+from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.session import open_session
+from sags_node.rig import load_rig
 from sags_node.sources.pictures import read_picture
 from sags_node.types import F32, U8, Bool, StereoFrame, StereoRig
 from sags_node.vision.alignment import FEWEST_FIELDS, WINDOW, RowMonitor

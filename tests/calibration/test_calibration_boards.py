@@ -22,12 +22,12 @@ from drawn_boards import (
     poses,
 )
 
-from sags_node.calibration import load_rig
 from sags_node.calibration.boards import Charuco, Chessboard, StereoView, find_in_both
 from sags_node.calibration.coverage import coverage_hints
 from sags_node.calibration.solve import Solution, calibrate
 from sags_node.cli.main import main
 from sags_node.errors import SagsError, UsageError
+from sags_node.rig import load_rig
 from sags_node.types import F32, U8, StereoRig
 
 

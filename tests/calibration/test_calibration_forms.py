@@ -15,10 +15,10 @@ import yaml
 from click.testing import CliRunner
 from test_calibration import make_rig
 
-from sags_node.calibration import check_rig, load_rig, read_rig, rectify_eyes, resized_rig, save_rig
 from sags_node.cli.main import main
 from sags_node.errors import UsageError
 from sags_node.geometry import scale_intrinsics
+from sags_node.rig import check_rig, load_rig, read_rig, rectify_eyes, resized_rig, save_rig
 from sags_node.types import F64, StereoRig
 
 SIZE = 640, 480

@@ -13,9 +13,15 @@ import pytest
 from click.testing import CliRunner
 from places import ROOT
 
-from sags_node.calibrate.check import check_pictures
-from sags_node.calibrate.pictures import pairs_of_files, pairs_of_session
-from sags_node.calibration import (
+from sags_node.calibration.check import check_pictures
+from sags_node.calibration.matches import match_eyes
+from sags_node.calibration.pictures import pairs_of_files, pairs_of_session
+from sags_node.calibration.principal_points import judge_known_depths
+from sags_node.calibration.rows import judge_scale, rectified_rows
+from sags_node.cli.main import main
+from sags_node.config.launch_file import load_launch
+from sags_node.errors import SagsError
+from sags_node.rig import (
     Finding,
     check_rig,
     load_rig,
@@ -24,13 +30,7 @@ from sags_node.calibration import (
     rectify_eyes,
     save_rig,
 )
-from sags_node.calibration.check import size_made_for
-from sags_node.calibration.matches import match_eyes
-from sags_node.calibration.principal_points import judge_known_depths
-from sags_node.calibration.rows import judge_scale, rectified_rows
-from sags_node.cli.main import main
-from sags_node.errors import SagsError
-from sags_node.launch_file import load_launch
+from sags_node.rig.check import size_made_for
 from sags_node.sources.pictures import read_picture
 from sags_node.types import U8, Eye, StereoFrame, StereoRig
 from sags_node.vision.rectify import Rectifier

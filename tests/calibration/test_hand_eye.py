@@ -15,22 +15,22 @@ from click.testing import CliRunner
 from drawn_boards import charuco_print, known_rig
 from places import ROOT
 
-from sags_node.calibration import save_rig
 from sags_node.calibration.boards import StereoView
-from sags_node.calibration.hand_eye import HandEye, read_hand_eye, save_hand_eye
 from sags_node.calibration.hand_eye_solve import solve_hand_eye
 from sags_node.cli.main import main
+from sags_node.config.launch_file import load_launch
 from sags_node.errors import SagsError, UsageError
 from sags_node.evaluation.measure import Measurer, Options
 from sags_node.evaluation.session import evaluate
 from sags_node.fitting.clip import read_clip
 from sags_node.geometry import invert, matrix_to_quat
-from sags_node.launch_file import load_launch
 from sags_node.messaging import cdr, topics
 from sags_node.phantom.board import draw, fine_rays
 from sags_node.phantom.motion import scope_pose
 from sags_node.phantom.rig import phantom_rig
-from sags_node.session import open_session
+from sags_node.pipeline.session import open_session
+from sags_node.rig import save_rig
+from sags_node.rig.hand_eye import HandEye, read_hand_eye, save_hand_eye
 from sags_node.sources.pose_track import NoPoseError, PoseTrack
 from sags_node.sources.robot import open_robot, rectified
 from sags_node.types import F32, F64, Camera, RectifiedPair, StereoFrame, StereoRig

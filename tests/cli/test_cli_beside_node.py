@@ -12,7 +12,7 @@ import cv2
 import pytest
 from command_line import FREE_PORTS, pure_json, refused, sags, start, stopped, wait_for
 
-from sags_node import topic
+from sags_node.messaging import introspection as topic
 from sags_node.messaging.received import ReceivedText
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.overlay import run as overlay

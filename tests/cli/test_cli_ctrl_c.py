@@ -20,8 +20,8 @@ from waiting import until
 
 from sags_node.cli.main import main
 from sags_node.messaging.publisher import Publisher
-from sags_node.node import Node
-from sags_node.service_manager import ServiceManager
+from sags_node.node.node import Node
+from sags_node.node.service_manager import ServiceManager
 from sags_node.terminal import console as terminal
 from sags_node.terminal.console import interrupt, on_stop_signals, stop_signals
 

@@ -330,7 +330,7 @@ def test_torch_and_open3d_stay_out_of_the_start(user_files: Path) -> None:
     code = (
         f"import sys; from sags_node.cli.main import main\n"
         f"for command in {commands}: main(command, standalone_mode=False)\n"
-        f"import sags_node.overlay.run, sags_node.topic, sags_node.demo\n"
+        f"import sags_node.overlay.run, sags_node.messaging.introspection, sags_node.demo\n"
         f"print(sorted({{'torch', 'open3d', 'onnxruntime'}} & set(sys.modules)))"
     )
     process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -18,13 +18,13 @@ pytest.importorskip("triton", reason="Triton comes with torch's CUDA builds, or 
 
 from sags_node import doctor
 from sags_node.cli.main import main
-from sags_node.config import LaunchConfig, MappingConfig
+from sags_node.config.launch_file import load_launch
+from sags_node.config.schema import LaunchConfig, MappingConfig
 from sags_node.engine import device as devices
 from sags_node.engine.cuda import probe
 from sags_node.engine.cuda.rasterizer import CudaRasterizer
 from sags_node.engine.device import choose_device, find_gpu
 from sags_node.errors import UsageError
-from sags_node.launch_file import load_launch
 from sags_node.mapping import devices as mapping_devices
 
 # kernels divide by a coverage of zero and select afterwards; a GPU says nothing of it
@@ -165,8 +165,8 @@ def test_machines_without_a_gpu_never_wait_for_torch() -> None:
 import sys
 from sags_node.engine import device
 device.has_gpu = lambda: False
-from sags_node.config import LaunchConfig
-from sags_node.warm_up import warm_up
+from sags_node.config.schema import LaunchConfig
+from sags_node.pipeline.warm_up import warm_up
 warm_up(LaunchConfig())
 assert "sags_node.mapping.mapper" in sys.modules
 print([name for name in ("torch", "triton") if name in sys.modules])

@@ -33,11 +33,11 @@ from engine_scenes import (
 from rounding import after
 
 from sags_node import geometry
+from sags_node.config.launch_file import load_launch
 from sags_node.doctor import examine
 from sags_node.engine.interface import MAX_OPACITY, MIN_ALPHA, NEAR_PLANE
 from sags_node.engine.rasterizer.rasterize import TILE_HEIGHT, TILE_WIDTH, make_rasterizer
 from sags_node.errors import SagsError, UsageError
-from sags_node.launch_file import load_launch
 from sags_node.mapping import mapper
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.refiner import CpuRefiner

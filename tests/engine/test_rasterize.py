@@ -24,15 +24,15 @@ from numpy.typing import NDArray
 from rounding import after
 
 from sags_node import geometry
-from sags_node.config import LaunchConfig
+from sags_node.config.schema import LaunchConfig
 from sags_node.engine.interface import MIN_ALPHA
 from sags_node.engine.rasterizer import binning, compositing, projection, projection_backward, views
 from sags_node.engine.rasterizer import cpu as numba_rasterizer
 from sags_node.engine.rasterizer.rasterize import Gradients, as_pinhole, make_rasterizer, rasterize, to_view
 from sags_node.engine.reference import rasterizer as reference
 from sags_node.errors import SagsError, UsageError
+from sags_node.pipeline.warm_up import warm_up
 from sags_node.types import F32, Camera, Gaussians
-from sags_node.warm_up import warm_up
 
 GRADIENTS = (*INPUTS, "contribution")
 

@@ -15,11 +15,10 @@ import pytest
 from click.testing import CliRunner
 from places import ROOT
 
-from sags_node import plotting
-from sags_node.calibration import save_rig
 from sags_node.cli.main import main
 from sags_node.engine.rasterizer.rasterize import rasterize
 from sags_node.errors import SagsError, UsageError
+from sags_node.evaluation import plotting
 from sags_node.evaluation.golden import Golden, Tolerance, compare, read_golden, write_golden
 from sags_node.evaluation.measure import Measurer, Options
 from sags_node.evaluation.plots import Series, line_plot
@@ -27,6 +26,7 @@ from sags_node.evaluation.report import write_report
 from sags_node.evaluation.session import evaluate
 from sags_node.evaluation.spool import Spool
 from sags_node.evaluation.summary import GROUPS, STAGES, summarise
+from sags_node.rig import save_rig
 from sags_node.types import (
     Camera,
     Eye,

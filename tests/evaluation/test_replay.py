@@ -15,8 +15,8 @@ from sags_node.evaluation.measure import Options
 from sags_node.evaluation.session import evaluate
 from sags_node.kernels.threads import configure_threads, thread_count
 from sags_node.mapping.budget import StepBudget
-from sags_node.pipeline import Pipeline
-from sags_node.session import open_session
+from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.session import open_session
 from sags_node.types import FrameResult
 
 # Another CPU rounds otherwise, and rounding decides now and then whether a Gaussian is inserted.

@@ -14,7 +14,7 @@ import pytest
 from command_line import refused, sags
 from running_node import RunningNode
 
-from sags_node.config import PhantomSource
+from sags_node.config.schema import PhantomSource
 from sags_node.engine.rasterizer.rasterize import rasterize
 from sags_node.errors import SagsError
 from sags_node.export import export
@@ -29,8 +29,8 @@ from sags_node.messaging.control import ControlClient
 from sags_node.messaging.received import ReceivedImage, TopicName
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.phantom.scene import Phantom
-from sags_node.pipeline import Pipeline
-from sags_node.session import open_session
+from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.session import open_session
 from sags_node.types import SH_DEGREE_0
 
 pytestmark = pytest.mark.usefixtures("run_dir")

@@ -25,9 +25,9 @@ from sags_lab.lerobot.form import (
     Version,
 )
 from sags_lab.lerobot.stats import Sums, merged
-from sags_node.calibration import read_rig
 from sags_node.export.played import DEPTH_UNIT, TRACKS
-from sags_node.session import open_session
+from sags_node.pipeline.session import open_session
+from sags_node.rig import read_rig
 from sags_node.types import RectifiedPair
 from sags_node.vision.rectify import Rectifier
 

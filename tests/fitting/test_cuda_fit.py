@@ -310,7 +310,7 @@ def sags_fit(*arguments: str | Path) -> Any:
 
 
 def test_the_command_fits_on_the_device_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sags_node.warm_up.warm_up", lambda config: None)  # refines at full size
+    monkeypatch.setattr("sags_node.pipeline.warm_up.warm_up", lambda config: None)  # refines at full size
     options = "--schedule paper --warm-up 1 --iterations 0 --json --out".split()
     folder = write_clip(tmp_path / "sheet")
     for device, resume in (("cuda", ()), ("cpu", ("--resume",))):

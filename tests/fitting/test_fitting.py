@@ -26,7 +26,7 @@ from sags_node.kernels.threads import configure_threads
 from sags_node.model import columns
 from sags_node.model.decoder import Decoder
 from sags_node.model.deformable import FADE_NS, LOOK_BACK_NS
-from sags_node.session import open_session
+from sags_node.pipeline.session import open_session
 from sags_node.types import F32
 
 SMALL = FitSettings(

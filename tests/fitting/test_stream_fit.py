@@ -19,7 +19,7 @@ from sags_node.evaluation.metrics import as_float, psnr
 from sags_node.fitting.clip import ClipFrame, play
 from sags_node.fitting.stream import MOST_KEPT, QUICK, StreamFit, StreamSettings
 from sags_node.kernels.threads import configure_threads
-from sags_node.session import open_session
+from sags_node.pipeline.session import open_session
 from sags_node.types import F32
 
 SMALL = dataclasses.replace(QUICK, window=0.8)

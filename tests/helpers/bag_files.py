@@ -11,7 +11,7 @@ import numpy as np
 from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_typestore
 
-from sags_node.config import BagSource
+from sags_node.config.schema import BagSource
 from sags_node.sources.replay import Replay
 from sags_node.types import StereoFrame
 

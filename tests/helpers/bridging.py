@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from synthetic import at_frame, plane_result
 
-from sags_node.config import PublishConfig
+from sags_node.config.schema import PublishConfig
 from sags_node.messaging.publisher import Publisher
 from sags_node.types import AnchorStates, FrameResult
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from sags_node.calibration import rectify_eyes
 from sags_node.phantom.board import TEXELS, PrintedBoard, chessboard, draw, fine_rays, printed
+from sags_node.rig import rectify_eyes
 from sags_node.types import F64, U8, StereoRig
 
 SIZE = 480, 384

@@ -32,11 +32,10 @@ from places import ROOT
 from simulated_node import Socket
 from synthetic import plane_result
 
-from sags_node import config as cfg
-from sags_node.calibration.check import check_rig
-from sags_node.calibration.read import read_rig
+from sags_node.config import schema as cfg
+from sags_node.config.launch_file import load_launch
 from sags_node.errors import SagsError
-from sags_node.launch_file import load_launch
+from sags_node.media.picture_file import claimed_size
 from sags_node.messaging import cdr, content, thin, topics
 from sags_node.messaging.control import ControlServer
 from sags_node.messaging.received import ReceivedImage, interpret
@@ -44,10 +43,11 @@ from sags_node.messaging.requests import AnchorName, AnchorRequest, ViewName, Vi
 from sags_node.messaging.wire import Message, Meta, decode, encode
 from sags_node.overlay.mesh import mesh_of
 from sags_node.overlay.scene import ObjectSpec
-from sags_node.picture_file import claimed_size
 from sags_node.recording.info import bag_info
 from sags_node.recording.pictures import decode_file
 from sags_node.recording.recover import recover
+from sags_node.rig.check import check_rig
+from sags_node.rig.read import read_rig
 from sags_node.sources.pose_track import PoseTrack
 from sags_node.sources.source import open_source
 from sags_node.vision.onnx_network import DepthNetwork

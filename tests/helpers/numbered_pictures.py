@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from sags_node import config as cfg
+from sags_node.config import schema as cfg
 from sags_node.sources.replay import Recording
 from sags_node.types import U8, StereoFrame
 

@@ -17,7 +17,7 @@ import pytest
 from places import ROOT
 from waiting import until
 
-from sags_node.config import RosGraph
+from sags_node.config.schema import RosGraph
 from sags_node.ros.endpoints import Delivery
 from sags_node.ros.graph import Graph
 

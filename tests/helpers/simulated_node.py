@@ -25,14 +25,15 @@ import zmq
 from simulation import EventFd, World
 from synthetic import at_frame, plane_result
 
-from sags_node import health, latest, node, node_operations, views
-from sags_node.config import LaunchConfig, PublishConfig, PushSource
+from sags_node.config.schema import LaunchConfig, PublishConfig, PushSource
 from sags_node.errors import SagsError
 from sags_node.mapping.budget import TimeBudget
 from sags_node.mapping.ladder import FULL, RUNGS, USED, Ladder, price
 from sags_node.messaging import publisher
 from sags_node.messaging.freshness import MAX_CLOCK_AHEAD, STALE_AFTER, STALE_PERIODS, Freshness
 from sags_node.messaging.wire import decode
+from sags_node.node import health, latest, node, views
+from sags_node.node import operations as node_operations
 from sags_node.sources import live_pairs
 from sags_node.sources.sent import SentPictures
 from sags_node.types import FrameResult, StereoFrame

@@ -18,7 +18,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from sags_node.calibration import load_rig, resized_rig
+from sags_node.rig import load_rig, resized_rig
 from sags_node.types import U8
 
 BITS, BLOCK = 16, 8  # of the painted number, and px of one
@@ -52,7 +52,7 @@ def push(endpoint: str, jpeg: bool) -> tuple[Callable[[U8, U8, int], None], Call
 
 
 def dds(domain: int, compressed: bool, scale: float, session: Path) -> Callable[[U8, U8, int], None]:
-    from sags_node.config import RosGraph
+    from sags_node.config.schema import RosGraph
     from sags_node.messaging import cdr
     from sags_node.messaging.topics import CAMERA_INFO, IMAGE, TF
     from sags_node.ros.graph import Graph

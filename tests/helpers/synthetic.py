@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from sags_node.config import PublishConfig
+from sags_node.config.schema import PublishConfig
 from sags_node.geometry import quat_to_matrix, unproject
 from sags_node.messaging.control import Handler
 from sags_node.messaging.publisher import Publisher

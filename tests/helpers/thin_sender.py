@@ -10,7 +10,7 @@ from pathlib import Path
 
 from synthetic import at_frame, health
 
-from sags_node.config import PublishConfig
+from sags_node.config.schema import PublishConfig
 from sags_node.messaging.publisher import Publisher
 from sags_node.messaging.thin import thin_pictures
 from sags_node.types import FrameResult

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from command_line import FREE_PORTS
 
-from sags_node.calibration import read_rig, save_rig
+from sags_node.rig import read_rig, save_rig
 
 SHORT = 6  # frames of the right video that ends too early
 

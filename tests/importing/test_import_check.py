@@ -13,10 +13,10 @@ from click.testing import CliRunner
 from numbered_pictures import write_video
 from places import SESSION
 
-from sags_node.calibration import Finding
 from sags_node.cli.main import main
 from sags_node.importing.check import check_folder
 from sags_node.importing.pictures import combing, lit_box
+from sags_node.rig import Finding
 from sags_node.types import U8
 
 WIDTH, HEIGHT, FRAMES, DISPARITY = 160, 120, 4, 9

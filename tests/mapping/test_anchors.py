@@ -15,8 +15,8 @@ from sags_node.geometry import project
 from sags_node.mapping import anchors as module
 from sags_node.mapping.anchors import Anchors
 from sags_node.mapping.budget import StepBudget
-from sags_node.pipeline import Pipeline
-from sags_node.session import open_session
+from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.session import open_session
 from sags_node.sources.source import open_source
 from sags_node.types import (
     AnchorStates,

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from places import SESSION
 
-from sags_node.config import LaunchConfig, MappingConfig
-from sags_node.launch_file import with_parameters
+from sags_node.config.launch_file import with_parameters
+from sags_node.config.schema import LaunchConfig, MappingConfig
 from sags_node.mapping.budget import (
     FIRST_SECONDS,
     LEAST_FIRST_STEPS,
@@ -19,8 +19,8 @@ from sags_node.mapping.budget import (
 )
 from sags_node.mapping.devices import make_budget
 from sags_node.mapping.ladder import FULL, Ladder, Rung
-from sags_node.pipeline import Pipeline
-from sags_node.session import open_session
+from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.session import open_session
 
 BUDGET, PERIOD = 0.033, 1 / 30  # s
 USUAL = Rung(10_000)

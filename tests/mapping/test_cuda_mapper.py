@@ -15,8 +15,7 @@ import torch
 
 pytest.importorskip("triton", reason="Triton comes with torch's CUDA builds, or by `pip install triton`")
 
-from sags_node.calibration import rectified_rig
-from sags_node.config import LaunchConfig, MappingConfig
+from sags_node.config.schema import LaunchConfig, MappingConfig
 from sags_node.engine.cuda.rasterizer import CudaRasterizer
 from sags_node.engine.failures import DeviceMemoryError
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
@@ -30,7 +29,8 @@ from sags_node.mapping.fallback_refiner import LOWERED, FallbackRefiner
 from sags_node.mapping.mapper import Mapper
 from sags_node.mapping.optimiser import Rates
 from sags_node.mapping.refiner import CpuRefiner, Refiner
-from sags_node.pipeline import Pipeline
+from sags_node.pipeline.pipeline import Pipeline
+from sags_node.rig import rectified_rig
 from sags_node.types import F32, Camera, Observation, RenderedView, Snapshot, StereoFrame
 
 # kernels divide by a coverage of zero and select afterwards; a GPU says nothing of it

@@ -8,8 +8,8 @@ from places import SESSION
 
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.exposure import LARGEST, exposure_gain
-from sags_node.pipeline import Pipeline
-from sags_node.session import open_session
+from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.session import open_session
 from sags_node.types import FrameResult, StereoFrame
 
 SIZE = 96

@@ -13,8 +13,8 @@ from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.focus import EVERY, with_neighbours, worst_tiles
 from sags_node.mapping.ladder import Rung
 from sags_node.mapping.split import SPLIT
-from sags_node.pipeline import Pipeline
-from sags_node.session import open_session
+from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.session import open_session
 from sags_node.types import F32, Bool
 
 HEIGHT, WIDTH = 3 * TILE_HEIGHT + 7, 5 * TILE_WIDTH + 3  # no tile divides it

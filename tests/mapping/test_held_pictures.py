@@ -13,8 +13,8 @@ from sags_node.confidence import SURE
 from sags_node.findings import by_code
 from sags_node.mapping.budget import StepBudget
 from sags_node.messaging.content import OF_THE_MODEL, tells_of
-from sags_node.pipeline import NOTICED_LATE, Pipeline
-from sags_node.session import Session, open_session
+from sags_node.pipeline.pipeline import NOTICED_LATE, Pipeline
+from sags_node.pipeline.session import Session, open_session
 from sags_node.types import U8, Finding, FrameResult, StereoFrame
 from sags_node.vision.match_watch import MatchWatch
 

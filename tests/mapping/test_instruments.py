@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from tissue_pictures import FRAME_NS, GOLD, HEIGHT, JAW, SHAFT, WIDTH, iou, textured_tissue
 
-from sags_node.config import LaunchConfig, PhantomSource
+from sags_node.config.schema import LaunchConfig, PhantomSource
 from sags_node.mapping.budget import StepBudget
 from sags_node.phantom.scene import Phantom
-from sags_node.pipeline import Pipeline
+from sags_node.pipeline.pipeline import Pipeline
 from sags_node.types import U8, Camera, RenderedView, StereoFrame
 from sags_node.vision.tissue_classical import LONGEST_DOUBT, InstrumentFinder
 

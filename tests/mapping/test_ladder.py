@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from sags_node.config import LaunchConfig, MappingConfig
+from sags_node.config.schema import LaunchConfig, MappingConfig
 from sags_node.errors import UsageError
 from sags_node.mapping.devices import affordable, make_budget, rungs_of
 from sags_node.mapping.ladder import (

@@ -12,8 +12,8 @@ from places import SESSION
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.motion_field import HORIZONS, STEADY, MotionField
 from sags_node.model.forecast import gaussians_ahead, points_ahead, reached
-from sags_node.pipeline import Pipeline
-from sags_node.session import open_session
+from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.session import open_session
 from sags_node.types import F32, Camera, Forecast, Gaussians, MotionState, Snapshot
 
 FRAME_S = 1 / 30

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from places import SESSION
 
-from sags_node.config import PhantomSource
+from sags_node.config.schema import PhantomSource
 from sags_node.engine.rasterizer.rasterize import rasterize
 from sags_node.evaluation.measure import Options
 from sags_node.evaluation.session import evaluate
@@ -23,8 +23,8 @@ from sags_node.mapping.camera_tracker import GIVE_UP_NS, TRIAL
 from sags_node.mapping.first_views import FirstViews
 from sags_node.mapping.keyframes import Keyframes
 from sags_node.phantom import write_session
-from sags_node.pipeline import Pipeline
-from sags_node.session import Session, open_session
+from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.session import Session, open_session
 from sags_node.types import F32, F64, Camera, FrameResult, Observation, StereoFrame
 
 BASELINE = 0.0043

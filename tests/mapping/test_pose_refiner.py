@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from benchmarks.quality.scope import WANDERED, WANDERS, Robot
-from sags_node.config import LaunchConfig, PhantomSource, VisionConfig
+from sags_node.config.schema import LaunchConfig, PhantomSource, VisionConfig
 from sags_node.geometry import invert
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.camera_pose import exponential, towards
 from sags_node.mapping.pose_refiner import SECONDS, PoseRefiner
 from sags_node.mapping.resting_tissue import TissueFit
 from sags_node.phantom.scene import Phantom
-from sags_node.pipeline import Pipeline
+from sags_node.pipeline.pipeline import Pipeline
 from sags_node.types import F64, Camera, StereoFrame
 
 RATE = 10.0

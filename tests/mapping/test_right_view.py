@@ -15,8 +15,8 @@ from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.mapper import Mapped
 from sags_node.mapping.right_eye import right_eye_mask
 from sags_node.mapping.right_view import FADING, RightView
-from sags_node.pipeline import Pipeline
-from sags_node.session import open_session
+from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.session import open_session
 from sags_node.types import F32, Bool, Camera, FrameResult, Gaussians
 
 FRAMES = 10

@@ -14,8 +14,8 @@ from sags_node.mapping import densify, initialise, mapper, split
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.split import split_worst
 from sags_node.model.gaussians import GaussianModel
-from sags_node.pipeline import Pipeline
-from sags_node.session import open_session
+from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.session import open_session
 from sags_node.types import F32, F64, Bool, Camera, FrameResult, Observation, RenderedView
 
 HEIGHT, WIDTH, DEPTH = 60, 80, 0.08

@@ -13,18 +13,18 @@ import pytest
 from flat_scene import camera_in_front, flat_scene
 from places import SESSION
 
-from sags_node.calibration import rectified_rig
+from sags_node.config.launch_file import load_launch
 from sags_node.engine.rasterizer.rasterize import make_rasterizer, to_view
 from sags_node.evaluation.metrics import psnr
-from sags_node.launch_file import load_launch
 from sags_node.mapping import mapper
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.densify import FRONT_FRAMES
 from sags_node.mapping.mapper import SETTLED, SETTLED_EVERY, TORN, Mapper
 from sags_node.mapping.refiner import CpuRefiner
 from sags_node.messaging.content import tells_of
-from sags_node.pipeline import Pipeline
-from sags_node.session import Session, open_session
+from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.session import Session, open_session
+from sags_node.rig import rectified_rig
 from sags_node.types import F32, Camera, FrameResult, RectifiedPair, RenderedView, StereoFrame
 from sags_node.vision.change import REPEAT_RMS, StillScene, is_repeat
 from sags_node.vision.flow import OpticalFlow

@@ -13,9 +13,9 @@ from places import SESSION
 
 from sags_node.errors import UsageError
 from sags_node.mapping.budget import StepBudget
-from sags_node.pipeline import Pipeline
+from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.session import Session, open_session
 from sags_node.processes import resident_mb
-from sags_node.session import Session, open_session
 from sags_node.types import U8, FrameResult, StereoFrame
 
 CAP = 8000

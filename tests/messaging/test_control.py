@@ -21,7 +21,7 @@ import zmq
 from hostile import is_reply, random_request
 from waiting import until
 
-from sags_node.config import PublishConfig
+from sags_node.config.schema import PublishConfig
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging.control import MAX_PENDING, ControlClient, Handler
 from sags_node.messaging.publisher import Publisher
@@ -169,7 +169,8 @@ def node_process(run_dir: Path, session: str, control: str = "tcp://127.0.0.1:*"
     """A node in its own process, which ends with SIGKILL and so leaves its connection file behind."""
     program = (
         "import sys; from pathlib import Path\n"
-        "from sags_node.config import PublishConfig; from sags_node.messaging.publisher import Publisher\n"
+        "from sags_node.config.schema import PublishConfig\n"
+        "from sags_node.messaging.publisher import Publisher\n"
         f"config = PublishConfig(data=(), control={control!r}, run_dir=Path({str(run_dir)!r}))\n"
         f"handlers = {{'who': lambda args: {session!r}}}\n"
         f"with Publisher(config, 'sags', {session!r}, handlers) as running:\n"

@@ -21,7 +21,7 @@ from places import ROOT
 from running_node import RunningNode
 from synthetic import plane_result
 
-from sags_node.config import PushSource
+from sags_node.config.schema import PushSource
 from sags_node.messaging import cdr, content
 from sags_node.messaging.control import ControlClient
 from sags_node.messaging.received import ReceivedImage, TopicName

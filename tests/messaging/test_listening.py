@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from synthetic import health, publisher
 
-from sags_node.config import PublishConfig
+from sags_node.config.schema import PublishConfig
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging.publisher import Publisher
 from sags_node.messaging.rundir import read_connection

@@ -14,12 +14,12 @@ import pytest
 from synthetic import at_frame, plane_result, publisher, stream
 from waiting import until
 
-from sags_node.config import PublishConfig
+from sags_node.config.schema import PublishConfig
 from sags_node.errors import SagsError
+from sags_node.messaging.introspection import topic_delay
 from sags_node.messaging.node_clock import DRIFT, Exchange, NodeClock, OffsetEstimate
 from sags_node.messaging.publisher import Publisher
 from sags_node.messaging.subscriber import Subscriber
-from sags_node.topic import topic_delay
 
 AHEAD = 0.08  # s
 JITTER = 0.02  # s, at most, each way

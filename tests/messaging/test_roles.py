@@ -26,9 +26,9 @@ from sags_node.messaging.requests import MAX_VIEW_HZ
 from sags_node.messaging.roles import ROLES, Client, needed
 from sags_node.messaging.security import read_allow_list, read_key_pair, read_public_key, write_key_pair
 from sags_node.messaging.subscriber import Subscriber
-from sags_node.node import Node
-from sags_node.node_operations import Operations
-from sags_node.views import MAX_VIEWS
+from sags_node.node.node import Node
+from sags_node.node.operations import Operations
+from sags_node.node.views import MAX_VIEWS
 
 TOPIC = "left/depth"
 

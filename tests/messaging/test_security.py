@@ -25,8 +25,8 @@ from waiting import until
 from zmq.auth import load_certificate
 
 from sags_node.cli.main import main
+from sags_node.config.launch_file import load_launch
 from sags_node.errors import SagsError, UsageError
-from sags_node.launch_file import load_launch
 from sags_node.messaging.address import ClientKeys, client_keys
 from sags_node.messaging.control import ControlClient
 from sags_node.messaging.peers import MAX_PEERS

@@ -18,13 +18,13 @@ from waiting import until
 
 from sags_node.errors import UsageError
 from sags_node.messaging import content, thin, topics
+from sags_node.messaging.introspection import topic_echo, topic_hz
 from sags_node.messaging.publisher import MAX_THIN, Publisher
 from sags_node.messaging.received import ReceivedCompressed, ReceivedImage, TopicName
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.messaging.thin import DEPTH_STEP, thin_pictures
 from sags_node.messaging.wire import WireError
 from sags_node.recording.recorder import Options, Recorder
-from sags_node.topic import topic_echo, topic_hz
 
 pytestmark = pytest.mark.live
 

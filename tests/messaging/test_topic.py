@@ -17,10 +17,10 @@ from synthetic import HEIGHT, WIDTH, health, publisher, stream
 from sags_node.cli.main import main
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import cdr, topics
+from sags_node.messaging.introspection import topic_bw, topic_delay, topic_echo, topic_hz, topic_list
 from sags_node.messaging.wire import Message
 from sags_node.overlay.draw import color_key
 from sags_node.overlay.stream import OverlayStream
-from sags_node.topic import topic_bw, topic_delay, topic_echo, topic_hz, topic_list
 
 pytestmark = pytest.mark.live
 
@@ -43,7 +43,7 @@ def test_figures_are_those_of_the_arrivals(monkeypatch: pytest.MonkeyPatch) -> N
         (Message("sags/left/depth", meta(seq, at - 5.0), (bytes(size),)), int(at * MS))
         for seq, (at, size) in enumerate(zip(came, sizes, strict=True))
     ]
-    monkeypatch.setattr("sags_node.topic.listen", lambda *_, **__: iter([*heard, None]))
+    monkeypatch.setattr("sags_node.messaging.introspection.listen", lambda *_, **__: iter([*heard, None]))
     hz = topic_hz("left/depth", "tcp://127.0.0.1:9")
     assert (hz["window"], hz["freezes"]) == (4, 0)
     steps = [0.01, 0.02, 0.07]

@@ -185,7 +185,7 @@ def test_it_waits_for_a_node_that_is_started_later(phantom_session: Path, tmp_pa
 
 def phantom_truth(session: Path) -> tuple[Callable[[int], Camera], np.ndarray, np.ndarray]:
     """The left camera of each frame, and its surface points [T, P, 3] with whether they are seen [T, P]."""
-    from sags_node.session import open_session
+    from sags_node.pipeline.session import open_session
 
     tracks = np.load(session / "tracks.npz")
     poses = np.load(session / "poses.npz")["T_world_cam"]
@@ -206,7 +206,7 @@ def steady_pixel(pixels: np.ndarray, seen: np.ndarray) -> np.ndarray:
 
 
 def phantom_baseline(session: Path) -> float:
-    from sags_node.calibration import read_rig
+    from sags_node.rig import read_rig
 
     P = read_rig(session / "calib").right.P
     return float(-P[0, 3] / P[0, 0])

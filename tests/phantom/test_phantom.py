@@ -6,17 +6,17 @@ import cv2
 import numpy as np
 import pytest
 
-from sags_node.calibration import load_rig
-from sags_node.config import FoldersSource, PhantomSource
+from sags_node.config.launch_file import load_launch
+from sags_node.config.schema import FoldersSource, PhantomSource
 from sags_node.errors import SagsError, UsageError
 from sags_node.geometry import invert, transform
-from sags_node.launch_file import load_launch
 from sags_node.phantom import cached_session, write_session
 from sags_node.phantom.motion import CENTRE, Clock, scope_pose
 from sags_node.phantom.relief import make_relief
 from sags_node.phantom.rig import phantom_rig, raw_rays
 from sags_node.phantom.scene import Phantom, PhantomFrame
 from sags_node.phantom.tissue import LIFT, Tissue
+from sags_node.rig import load_rig
 from sags_node.types import F64, Eye, StereoRig
 
 TINY = PhantomSource(seconds=0.1, width=96, height=80)

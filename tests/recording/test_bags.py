@@ -14,16 +14,16 @@ from bag_files import KINDS, MS, ROS1, ROS2, START, picture, play
 from mcap.records import Schema
 from mcap.writer import Writer as McapWriter
 
-from sags_node.calibration import save_rig
-from sags_node.config import BagSource
+from sags_node.config.launch_file import load_launch
+from sags_node.config.schema import BagSource
 from sags_node.errors import SagsError, UsageError
-from sags_node.launch_file import load_launch
 from sags_node.messaging import cdr
+from sags_node.pipeline.session import open_session
 from sags_node.recording import rosbag1_check
 from sags_node.recording.bag import read_messages
 from sags_node.recording.bag_writer import BagWriter, Limits
 from sags_node.recording.info import bag_info
-from sags_node.session import open_session
+from sags_node.rig import save_rig
 from sags_node.sources.bags import read_rig
 from sags_node.sources.replay import Replay
 from sags_node.sources.stamps import pair
@@ -143,7 +143,7 @@ def test_opening_a_large_bag_takes_little_memory(tmp_path: Path) -> None:
             for channel in channels:
                 writer.write(channel, stamp, stamp, number, data)
     program = (
-        "import resource, sys; from pathlib import Path; from sags_node.config import BagSource\n"
+        "import resource, sys; from pathlib import Path; from sags_node.config.schema import BagSource\n"
         "from sags_node.sources.bags import BagPairs, read_rig\n"
         "def most(): return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
         "before, config = most(), BagSource(path=Path(sys.argv[1]))\n"

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from bag_files import KINDS, play
 
-from sags_node.config import BagSource
+from sags_node.config.launch_file import load_launch
+from sags_node.config.schema import BagSource
 from sags_node.errors import SagsError, UsageError
-from sags_node.launch_file import load_launch
 from sags_node.recording.info import bag_info
 from sags_node.sources.bags import read_rig
 

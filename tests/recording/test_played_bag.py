@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 from command_line import pure_json, refused, sags
 
-from sags_node.config import PhantomSource
+from sags_node.config.schema import PhantomSource
 from sags_node.phantom import write_session
-from sags_node.session import open_session
+from sags_node.pipeline.session import open_session
 
 pytestmark = pytest.mark.live
 FRAMES = 6

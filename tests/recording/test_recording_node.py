@@ -26,9 +26,9 @@ from sags_node.messaging.control import ControlClient
 from sags_node.messaging.received import ReceivedImage
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.messaging.topics import TOPICS
+from sags_node.pipeline.session import open_session
 from sags_node.recording.bag import read_messages
 from sags_node.recording.info import bag_info
-from sags_node.session import open_session
 
 pytestmark = pytest.mark.live
 

@@ -15,7 +15,7 @@ from mcap_ros2.decoder import DecoderFactory
 from recorded_plane import by_topic, content, record_plane
 from rosbags.highlevel import AnyReader
 
-from sags_node.config import PublishConfig
+from sags_node.config.schema import PublishConfig
 from sags_node.recording.bag import read_messages
 from sags_node.recording.bag_writer import Limits
 from sags_node.recording.info import bag_info

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sags_node import config as cfg
+from sags_node.config import schema as cfg
 from sags_node.sources.source import open_source
 
 

@@ -12,9 +12,9 @@ from bag_files import MS, START, picture
 from dvrk_files import frame_record, write_session
 
 from sags_node.cli.launching import split
-from sags_node.config import DvrkSource, LaunchConfig
+from sags_node.config.launch_file import load_launch
+from sags_node.config.schema import DvrkSource, LaunchConfig
 from sags_node.errors import UsageError
-from sags_node.launch_file import load_launch
 from sags_node.sources.replay import Replay
 
 

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from sags_node import config as cfg
 from sags_node.cli.main import main
+from sags_node.config import schema as cfg
+from sags_node.config.launch_file import load_launch
 from sags_node.errors import SagsError, UsageError
-from sags_node.launch_file import load_launch
 from sags_node.mapping.budget import StepBudget
-from sags_node.pipeline import Pipeline
-from sags_node.session import open_session
+from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.session import open_session
 from sags_node.sources.source import open_source
 from sags_node.types import U8, StereoFrame
 

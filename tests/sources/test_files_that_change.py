@@ -12,9 +12,9 @@ from bag_files import ROS1, ROS2, stereo_rows, write_rosbag1, write_rosbag2
 from numbered_pictures import numbers, picture, recordings, write_png, write_video
 from places import SESSION
 
-from sags_node import config as cfg
+from sags_node.config import schema as cfg
 from sags_node.errors import SagsError
-from sags_node.session import open_session
+from sags_node.pipeline.session import open_session
 from sags_node.sources.replay import Recording
 from sags_node.sources.source import open_source
 from sags_node.types import StereoFrame

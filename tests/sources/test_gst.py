@@ -24,11 +24,11 @@ from pydantic import ValidationError
 from sending import sending
 from waiting import until
 
-from sags_node.calibrate.eyes import look
-from sags_node.config import GeometryConfig, GstSource, LaunchConfig
+from sags_node.calibration.eyes import look
+from sags_node.config.launch_file import load_launch
+from sags_node.config.schema import GeometryConfig, GstSource, LaunchConfig
 from sags_node.doctor import examine
 from sags_node.errors import SagsError, UsageError
-from sags_node.launch_file import load_launch
 from sags_node.sources import gst_child, gst_library
 from sags_node.sources.gst import Sink, open_pipeline
 from sags_node.sources.gst_process import GstProcess, in_words

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from sags_node.config import GeometryConfig, VideosSource
+from sags_node.config.schema import GeometryConfig, VideosSource
 from sags_node.errors import UsageError
 from sags_node.sources.device import Shot
 from sags_node.sources.layout import Layout

@@ -23,13 +23,13 @@ from sending import sending, stereo_sender
 from stereo_sender import read_number
 from waiting import until
 
-from sags_node.calibration import load_rig, resized_rig, save_rig
-from sags_node.node import Node
-from sags_node.pipeline import Pipeline
-from sags_node.session import open_session
+from sags_node.node.node import Node
+from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.session import open_session
+from sags_node.pipeline.warm_up import warm_up
+from sags_node.rig import load_rig, resized_rig, save_rig
 from sags_node.sources.push import PushedPictures
 from sags_node.types import U8, FrameResult
-from sags_node.warm_up import warm_up
 
 pytestmark = pytest.mark.live
 

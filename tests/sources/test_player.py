@@ -20,10 +20,11 @@ from recorded_plane import by_topic, record_plane
 from synthetic import HEIGHT, WIDTH, plane_result
 from waiting import until
 
-from sags_node.config import PublishConfig
+from sags_node.config.schema import PublishConfig
 from sags_node.errors import SagsError
 from sags_node.messaging import cdr
 from sags_node.messaging.control import ControlClient
+from sags_node.messaging.introspection import topic_hz
 from sags_node.messaging.publisher import Publisher
 from sags_node.messaging.received import ReceivedCloud, ReceivedImage
 from sags_node.messaging.rundir import read_connection
@@ -34,7 +35,6 @@ from sags_node.overlay.run import run_overlay
 from sags_node.recording.info import bag_info
 from sags_node.recording.player import Options as PlayOptions
 from sags_node.recording.player import Player
-from sags_node.topic import topic_hz
 
 pytestmark = pytest.mark.live
 PHASE = 24  # times that a clock is told before the player is paused, and goes on

@@ -14,17 +14,17 @@ import pytest
 from places import SESSION
 from waiting import until
 
-from sags_node.calibration.hand_eye import HandEye, save_hand_eye
 from sags_node.client import PoseSender
-from sags_node.config import LaunchConfig, PushRobot, PushSource, VisionConfig
+from sags_node.config.schema import LaunchConfig, PushRobot, PushSource, VisionConfig
 from sags_node.errors import SagsError
 from sags_node.findings import by_code
 from sags_node.mapping.budget import StepBudget
 from sags_node.messaging import cdr, topics
 from sags_node.phantom.motion import scope_pose
 from sags_node.phantom.rig import phantom_rig
-from sags_node.pipeline import Pipeline
-from sags_node.session import open_session
+from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.session import open_session
+from sags_node.rig.hand_eye import HandEye, save_hand_eye
 from sags_node.sources.pose_track import JUMP_HELD_NS, NoPoseError, PoseTrack
 from sags_node.sources.robot import Posed, open_robot, rectified
 from sags_node.types import F64, StereoFrame

@@ -21,7 +21,7 @@ from stereo_sender import paint_number
 from waiting import until
 
 from sags_node.client import ClientKeys, FrameSender
-from sags_node.config import PushSource
+from sags_node.config.schema import PushSource
 from sags_node.errors import UsageError
 from sags_node.messaging import cdr
 from sags_node.messaging.security import read_key_pair, write_key_pair

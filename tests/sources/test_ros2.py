@@ -16,7 +16,7 @@ from sending import sending, stereo_sender
 from stereo_sender import paint_number
 from waiting import until
 
-from sags_node.config import GeometryConfig, LaunchConfig, Ros2Robot, Ros2Source, RosGraph
+from sags_node.config.schema import GeometryConfig, LaunchConfig, Ros2Robot, Ros2Source, RosGraph
 from sags_node.errors import UsageError
 from sags_node.messaging import cdr
 from sags_node.messaging.topics import IMAGE, TF
@@ -54,7 +54,7 @@ def test_no_pair_is_mismatched_and_nothing_is_lost_unseen(phantom_session: Path,
 
 
 def test_the_cameras_calibration_is_taken(phantom_session: Path) -> None:
-    from sags_node.calibration import load_rig, resized_rig
+    from sags_node.rig import load_rig, resized_rig
 
     with sending(dds(phantom_session, 30, "size=640x512")):
         rig = read_rig(config(), seconds=60)

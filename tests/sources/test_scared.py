@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from sags_node import config as cfg
 from sags_node.cli.main import main
+from sags_node.config import schema as cfg
+from sags_node.config.launch_file import load_launch
 from sags_node.errors import SagsError, UsageError
 from sags_node.evaluation.measure import Options
 from sags_node.evaluation.session import evaluate
 from sags_node.geometry import invert, project, unproject
-from sags_node.launch_file import load_launch
-from sags_node.session import open_session
+from sags_node.pipeline.session import open_session
 from sags_node.sources.source import open_source
 from sags_node.types import F32, F64, U8, StereoFrame
 from sags_node.vision.rectify import Rectifier

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from waiting import until
 
-from sags_node.config import (
+from sags_node.cli.foreground import inputs_text
+from sags_node.config.schema import (
     FoldersSource,
     GeometryConfig,
     LaunchConfig,
@@ -21,9 +22,8 @@ from sags_node.config import (
 )
 from sags_node.errors import SagsError
 from sags_node.findings import by_code
-from sags_node.foreground import inputs_text
-from sags_node.health import Statistics
 from sags_node.messaging import cdr, content, topics
+from sags_node.node.health import Statistics
 from sags_node.sources.clock import KEPT, CaptureClock
 from sags_node.sources.sent import WINDOW, Arrivals, SentPictures
 from sags_node.types import U8, ClockStatus, StereoFrame

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numbered_pictures import HEIGHT, WIDTH, numbers, picture, recordings, write_png, write_video
 
-from sags_node import config as cfg
+from sags_node.config import schema as cfg
 from sags_node.errors import SagsError, UsageError
 from sags_node.sources.replay import Recording
 from sags_node.sources.source import open_source

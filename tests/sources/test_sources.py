@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numbered_pictures import HEIGHT, WIDTH, numbers, recordings
 
-from sags_node import config as cfg
+from sags_node.config import schema as cfg
 from sags_node.sources.replay import Recording, Replay
 from sags_node.sources.source import open_source
 from sags_node.types import StereoFrame

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from waiting import until
 
-from sags_node.config import GeometryConfig, V4l2Source
+from sags_node.config.schema import GeometryConfig, V4l2Source
 from sags_node.errors import SagsError, UsageError
 from sags_node.sources import live
 from sags_node.sources.device import Device, Picture, Shot, wall_stamp

@@ -21,7 +21,7 @@ import pytest
 from click.testing import CliRunner
 
 from sags_node.cli.main import main
-from sags_node.config import PhantomSource
+from sags_node.config.schema import PhantomSource
 from sags_node.evaluation.gallery import Picture
 from sags_node.messaging.content import SPLAT_FIELDS
 from sags_node.messaging.received import ReceivedCloud

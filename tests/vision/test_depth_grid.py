@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sags_node.confidence import HALVING, SURE, confidence_of, error_of
-from sags_node.config import PhantomSource, StereoConfig
+from sags_node.config.schema import PhantomSource, StereoConfig
 from sags_node.engine.rasterizer.confidence import with_confidence
 from sags_node.evaluation import calibration
 from sags_node.geometry import unproject

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sags_node.config import PhantomSource
+from sags_node.config.schema import PhantomSource
 from sags_node.sources.source import open_source
 from sags_node.types import F32, U8, GrayPyramid
 from sags_node.vision.landmarks import find_again, motion

@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 import pytest
 
-from sags_node.config import PhantomSource
+from sags_node.config.schema import PhantomSource
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.ladder import RUNGS
 from sags_node.phantom import write_session
-from sags_node.pipeline import Pipeline
-from sags_node.session import open_session
+from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.session import open_session
 from sags_node.sources.source import open_source
 from sags_node.types import F32, GrayPyramid
 from sags_node.vision.alignment import RowErrors

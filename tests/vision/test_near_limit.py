@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from places import ROOT
 
-from sags_node.config import USUAL_NEAREST, StereoConfig
-from sags_node.session import open_session
+from sags_node.config.schema import USUAL_NEAREST, StereoConfig
+from sags_node.pipeline.session import open_session
 from sags_node.sources.source import open_source
 from sags_node.types import F32, RectifiedPair, StereoRig
 from sags_node.vision import near_limit

@@ -14,14 +14,14 @@ import pytest
 import yaml
 from onnx_networks import save_matcher, save_odd, save_table
 
-from sags_node.config import NORMALIZATIONS, OnnxConfig, StereoConfig
+from sags_node.config.launch_file import load_launch
+from sags_node.config.schema import NORMALIZATIONS, OnnxConfig, StereoConfig
 from sags_node.errors import UsageError
-from sags_node.health import Statistics
-from sags_node.launch_file import load_launch
 from sags_node.mapping.budget import StepBudget
 from sags_node.messaging.content import status
-from sags_node.pipeline import Pipeline
-from sags_node.session import open_session
+from sags_node.node.health import Statistics
+from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.session import open_session
 from sags_node.sources.source import open_source
 from sags_node.types import F32, U8, Bool, FrameResult, RectifiedPair, StereoFrame
 from sags_node.vision.mono_depth import MonoDepth

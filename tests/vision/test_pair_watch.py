@@ -16,8 +16,8 @@ from synthetic import health
 from sags_node.mapping.budget import StepBudget
 from sags_node.messaging.cdr import decode
 from sags_node.messaging.content import diagnostics
-from sags_node.pipeline import Pipeline
-from sags_node.session import Session, open_session
+from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.session import Session, open_session
 from sags_node.types import U8, StereoFrame
 from sags_node.vision.blocks import is_blocky
 from sags_node.vision.pair_watch import PairWatch, Verdict

@@ -11,8 +11,8 @@ from frames import make_frame
 from places import ROOT
 
 from sags_node import geometry
-from sags_node.calibration import check_rig, load_rig, read_rig
 from sags_node.errors import SagsError
+from sags_node.rig import check_rig, load_rig, read_rig
 from sags_node.sources.pictures import read_picture
 from sags_node.types import U8, Eye, StereoFrame, StereoRig
 from sags_node.vision.rectify import Rectifier

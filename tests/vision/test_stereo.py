@@ -12,9 +12,9 @@ from frames import make_frame
 from places import ROOT
 
 from sags_node import geometry
-from sags_node.calibration import load_rig, read_rig
-from sags_node.config import StereoConfig, TissueConfig
+from sags_node.config.schema import StereoConfig, TissueConfig
 from sags_node.errors import UsageError
+from sags_node.rig import load_rig, read_rig
 from sags_node.sources.pictures import read_picture
 from sags_node.types import F32, U8, Bool, Camera, RectifiedPair
 from sags_node.vision import dense_depth, inverse_search

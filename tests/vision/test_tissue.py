@@ -11,11 +11,11 @@ from onnx_networks import FLOAT, Graph, floats
 from places import ROOT
 from tissue_pictures import FRAME_NS, HEIGHT, SHAFT, WIDTH, iou, make_frame, textured_tissue
 
-from sags_node.calibration import load_rig, rectified_rig
-from sags_node.config import TissueConfig
+from sags_node.config.launch_file import load_launch
+from sags_node.config.schema import TissueConfig
 from sags_node.errors import UsageError
-from sags_node.launch_file import load_launch
 from sags_node.messaging.masks import MaskSubscriber
+from sags_node.rig import load_rig, rectified_rig
 from sags_node.types import U8, Bool, RectifiedPair, StereoFrame
 from sags_node.vision.rectify import Rectifier
 from sags_node.vision.tissue import FIRST_FRAMES, TissueMask

@@ -17,25 +17,25 @@ from places import ROOT
 from rich.console import Console
 from synthetic import health, plane_result, publisher, stream
 
+from sags_node.cli.foreground import run_node
 from sags_node.evaluation.measure import FrameRow, Options
 from sags_node.evaluation.report import warning_table
 from sags_node.evaluation.spool import RunFacts
 from sags_node.evaluation.summary import summarise
 from sags_node.findings import STAGES, by_code, by_stage, in_words
-from sags_node.foreground import run_node
-from sags_node.health import MOST_LEFT_OUT, WINDOW, Statistics
 from sags_node.messaging.cdr import decode
 from sags_node.messaging.content import diagnostics, status
+from sags_node.messaging.introspection import topic_echo
 from sags_node.messaging.received import ReceivedText
 from sags_node.messaging.subscriber import Subscriber
-from sags_node.node import HEALTH_PERIOD, Node
+from sags_node.node.health import MOST_LEFT_OUT, WINDOW, Statistics
+from sags_node.node.node import HEALTH_PERIOD, Node
 from sags_node.overlay.draw import color_key, draw
 from sags_node.overlay.frame import TissueFrame
 from sags_node.overlay.mark import draw_mark, headlines
-from sags_node.pipeline import Pipeline
-from sags_node.session import open_session
+from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.session import open_session
 from sags_node.terminal.notices import Notices
-from sags_node.topic import topic_echo
 from sags_node.types import Camera, Finding, NodeHealth
 from sags_node.viewer.feed import Moment, Status
 

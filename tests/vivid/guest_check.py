@@ -14,7 +14,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from sags_node.config import GeometryConfig, V4l2Source
+from sags_node.config.schema import GeometryConfig, V4l2Source
 from sags_node.errors import SagsError
 from sags_node.sources.source import open_source
 from sags_node.types import StereoFrame

@@ -40,7 +40,7 @@ from sags_lab.archive.results import failed, read_results, write_results  # noqa
 from sags_lab.archive.run import Tally, about, run  # noqa: E402
 from sags_lab.archive.store import RECORDINGS, Store  # noqa: E402
 from sags_lab.archive.work import Plan, work  # noqa: E402
-from sags_node.config import PhantomSource  # noqa: E402
+from sags_node.config.schema import PhantomSource  # noqa: E402
 from sags_node.evaluation.golden import TIMING_KEYS  # noqa: E402
 from sags_node.evaluation.provenance import revision  # noqa: E402
 from sags_node.phantom import write_session  # noqa: E402

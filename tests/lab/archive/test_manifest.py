@@ -16,7 +16,7 @@ from sags_lab.archive.launching import arguments, counterpart
 from sags_lab.archive.manifest import Recording, beside, read_manifest, write_manifest
 from sags_lab.archive.scan import scan
 from sags_node.errors import UsageError
-from sags_node.session import open_session
+from sags_node.pipeline.session import open_session
 
 FRAMES = 3
 

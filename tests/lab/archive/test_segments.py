@@ -20,14 +20,14 @@ from sags_lab.archive.results import read_results, write_results
 from sags_lab.archive.segments import Cut, check_frames, segments
 from sags_lab.archive.store import RECORDINGS, Store
 from sags_lab.archive.work import Plan, work
-from sags_node.config import DvrkSource, FoldersSource
+from sags_node.config.schema import DvrkSource, FoldersSource
 from sags_node.errors import UsageError
 from sags_node.evaluation.measure import Options
 from sags_node.evaluation.provenance import revision
 from sags_node.evaluation.session import evaluate
 from sags_node.fitting.clip import play
 from sags_node.kernels.threads import configure_threads
-from sags_node.session import open_session
+from sags_node.pipeline.session import open_session
 from sags_node.sources import replay
 from sags_node.sources.bags import BagPairs
 from sags_node.sources.replay import Replay

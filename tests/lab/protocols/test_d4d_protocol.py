@@ -15,11 +15,11 @@ from places import SESSION
 
 from sags_lab.protocols.d4d_files import d4d_clips, instruments_are_white
 from sags_lab.protocols.d4d_scan import check_scan, read_surface, scan_depth
-from sags_node.calibration import eye_text, load_rig
 from sags_node.cli.main import main
+from sags_node.config.launch_file import load_launch
 from sags_node.errors import SagsError, UsageError
 from sags_node.geometry import invert, transform, unproject
-from sags_node.launch_file import load_launch
+from sags_node.rig import eye_text, load_rig
 from sags_node.sources.source import open_source
 from sags_node.types import F32, F64, Camera, Eye, StereoFrame
 from sags_node.vision.rectify import Rectifier

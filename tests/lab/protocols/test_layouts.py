@@ -17,11 +17,11 @@ from places import SESSION
 from sags_lab.protocols.layouts import marked_in_both, read_tum, stereomis_sequence, stir_clips
 from sags_lab.protocols.point_tracker import to_raw, to_working
 from sags_lab.protocols.run import as_stir_counts
-from sags_node.calibration import load_rig, rectify_eyes
 from sags_node.cli.main import main
+from sags_node.config.launch_file import load_launch
 from sags_node.errors import SagsError, UsageError
 from sags_node.geometry import project
-from sags_node.launch_file import load_launch
+from sags_node.rig import load_rig, rectify_eyes
 from sags_node.sources.source import open_source
 from sags_node.types import F64, StereoFrame, StereoRig
 from sags_node.vision.rectify import Rectifier

@@ -19,11 +19,11 @@ from places import SESSION
 
 from sags_lab.protocols.point_tracker import PointTracker, to_raw
 from sags_lab.protocols.tracked_points import CONVERT, tracked_sequence
-from sags_node.calibration import load_rig
 from sags_node.cli.main import main
+from sags_node.config.launch_file import load_launch
 from sags_node.errors import SagsError, UsageError
 from sags_node.geometry import project
-from sags_node.launch_file import load_launch
+from sags_node.rig import load_rig
 from sags_node.sources.source import open_source
 from sags_node.types import F64, Bool, StereoFrame, StereoRig
 from sags_node.vision.rectify import Rectifier

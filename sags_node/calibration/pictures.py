@@ -1,0 +1,83 @@
+"""Stereo pictures to check a calibration with: files, folders, or some frames of a session."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+from sags_node.config.launch_file import VIDEO_SUFFIXES
+from sags_node.config.schema import LaunchConfig, RecordedSource
+from sags_node.errors import SagsError, UsageError
+from sags_node.sources.pictures import check_counts, list_pictures, read_picture, size_text
+from sags_node.sources.source import open_source
+from sags_node.types import F32, U8
+
+Pair = tuple[U8, U8]  # left, right: [H, W, 3] RGB, raw
+PAIRS = 8  # spread over what there is
+REFERENCE_EVERY = 10  # frames: recordings often know the depth of every tenth one only
+LIVE_STRIDE = 15  # frames of cameras, which go on and on
+
+
+def pairs_of_files(named: Sequence[tuple[Path, Path]]) -> list[Pair]:
+    """Pictures of pairs of files, or of pairs of folders.
+
+    Raises:
+        UsageError: there are none, left and right are not equally many, or one is a video.
+        SagsError: a picture is damaged, or of another size than the others.
+    """
+    files: list[tuple[Path, Path]] = []
+    for left, right in named:
+        for file in (left, right):
+            if file.suffix.lower() in VIDEO_SUFFIXES:
+                raise UsageError(f"{file} is a video: name the launch file that plays it with --session")
+        if left.is_dir() or right.is_dir():
+            lefts, rights = list_pictures(left), list_pictures(right)
+            check_counts(left, lefts, right, rights)
+            files += zip(lefts, rights, strict=True)
+        else:
+            files.append((left, right))
+    pairs = [(read_picture(left), read_picture(right)) for left, right in _spread(files)]
+    sizes = {picture.shape[1::-1] for pair in pairs for picture in pair}
+    if len(sizes) > 1:
+        raise SagsError(f"pictures of {_sizes(sizes)} px: give those of one rig, all of one size")
+    return pairs
+
+
+def pairs_of_session(
+    config: LaunchConfig, progress: Callable[[int, int], None] | None = None
+) -> tuple[list[Pair], list[F32 | None]]:
+    """Some frames, spread over a recording, and the depth [H, W] m that it knows of each, if any; of cameras,
+    one every half second.
+
+    Raises:
+        UsageError: the session has no right eye, or a wrong path.
+        SagsError: it cannot be read.
+    """
+    source, stride = config.source, LIVE_STRIDE
+    if isinstance(source, RecordedSource):
+        with open_source(source, references=False, progress=progress) as recording:
+            stride = max(1, (recording.frame_count or PAIRS) // PAIRS)
+        if stride > REFERENCE_EVERY:
+            stride -= stride % REFERENCE_EVERY
+        playing = {"stride": source.stride * stride, "pace": "step", "loop": False}
+        source, stride = source.model_copy(update=playing), 1
+    pairs: list[Pair] = []
+    depths: list[F32 | None] = []
+    with open_source(source) as opened:
+        for index, frame in enumerate(opened):
+            if frame.right is None:
+                raise UsageError("the session has no right eye: there are no rows to compare")
+            if index % stride == 0:
+                pairs.append((frame.left, frame.right))
+                depths.append(None if frame.reference is None else frame.reference.depth)
+            if len(pairs) == PAIRS:
+                break
+    return pairs, depths
+
+
+def _spread(files: list[tuple[Path, Path]]) -> Iterator[tuple[Path, Path]]:
+    return iter(files[:: max(1, -(-len(files) // PAIRS))])
+
+
+def _sizes(sizes: set[tuple[int, int]]) -> str:
+    return " and ".join(size_text(*size) for size in sorted(sizes))

@@ -1,0 +1,259 @@
+"""Reads launch files. An unknown key is an error that names the nearest known one, or what replaced it."""
+
+from __future__ import annotations
+
+import difflib
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from string import Template
+from typing import Any, get_args
+
+from pydantic import ValidationError
+
+from sags_node.config.schema import REMOVED, LaunchConfig, LiveSource, PhantomSource, Section, Source
+from sags_node.config.yaml_reader import parse_yaml, read_yaml
+from sags_node.errors import UsageError, brief
+from sags_node.files import open_file
+
+MOST_MISTAKES = 10  # named at once
+COMMAND_LINE = "command line"
+DEFAULT_DATA = "../shared/data"
+BAG_SUFFIXES = (".mcap", ".db3", ".bag")
+VIDEO_SUFFIXES = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".ts", ".wmv")
+SIDECAR_TYPE = "dvrk_data:video_sidecar@"
+SIDECAR_LOOK = 65536  # bytes at either end; jsoncpp sorts the keys, so the type comes after the frames
+
+
+def _path_keys(section: type[Section]) -> Iterator[str]:
+    """The keys whose values are paths, of a section and of all that are in it."""
+    for name, field in section.model_fields.items():
+        kinds = [field.annotation]
+        for kind in kinds:  # grows
+            kinds += get_args(kind)
+        if Path in kinds:
+            yield name
+        for kind in kinds:
+            if isinstance(kind, type) and issubclass(kind, Section):
+                yield from _path_keys(kind)
+
+
+_PATH_KEYS = frozenset(_path_keys(LaunchConfig))
+_SOURCES: dict[str, type[Section]] = {
+    source.model_fields["kind"].default: source for source in get_args(get_args(Source)[0])
+}
+_LIVE_PATHS = {  # of sources whose other keys are devices, topics and launch strings
+    kind: frozenset(_path_keys(source)) for kind, source in _SOURCES.items() if issubclass(source, LiveSource)
+}
+
+
+def load_launch(path: Path | str | None = None, overrides: Sequence[str] = ()) -> LaunchConfig:
+    """Read a launch file, or a folder that holds `launch.yaml` or a known recording, and apply `key:=value`
+    overrides.
+
+    `$SAGS_DATA` and other variables are expanded; relative paths in the file are relative to the file.
+    `path=None` gives the defaults: the built-in phantom session.
+
+    Raises:
+        UsageError: the file is missing, is not YAML, or holds an unknown key or a wrong value; or there is a
+            calibration for the phantom, which is played where no source is named.
+    """
+    tree: dict[str, Any] = {"source": {"kind": "phantom"}}
+    name = COMMAND_LINE
+    if path is not None:
+        file = Path(path)
+        recording = known_recording(file)
+        if file.is_dir() and recording is None:
+            file = file / "launch.yaml"
+        elif file.suffix.lower() in VIDEO_SUFFIXES:
+            raise UsageError(
+                f"{file} is a video, not a launch file; write source.kind:=side_by_side source.video:={file} "
+                f"(both eyes in it), or source.kind:=videos source.left:={file} source.right:=OTHER, and "
+                "rig:=CALIBRATION"
+            )
+        name = str(file)
+        if recording is not None:
+            tree = recording
+        else:
+            tree = _read_yaml(file)
+            _resolve_paths(tree, file.parent)
+    for override in overrides:
+        _apply_override(tree, override)
+    try:
+        config = LaunchConfig.model_validate(tree)
+    except ValidationError as error:
+        given = [override.partition(":=")[0] for override in overrides]
+        raise UsageError(_explain(error, name, given)) from None
+    if isinstance(config.source, PhantomSource) and config.rig is not None:
+        raise UsageError(
+            f"rig: the built-in phantom brings its own calibration; name the launch file or recording that "
+            f"{config.rig} is of, or leave rig out"
+        )
+    if config.one_camera and config.vision.onnx.path is None:
+        raise UsageError(
+            f"{name}: source.right is missing: name the right eye's pictures. With one camera alone depth "
+            "comes from a monocular network: set vision.onnx.path, and vision.onnx.declared_depth to the "
+            "distance to the middle of the first picture, m; docs/depth.md has an example under 'One eye'"
+        )
+    return config
+
+
+def known_recording(folder: Path) -> dict[str, Any] | None:
+    """How to play what is no session of ours but a ROS bag, or laid out as dVRK or a research data set."""
+    if (folder / "launch.yaml").exists():
+        return None
+    is_folder = folder.is_dir()
+    if folder.suffix in BAG_SUFFIXES or (folder / "metadata.yaml").is_file() or any(folder.glob("*.mcap")):
+        return {"source": {"kind": "bag", "path": str(folder)}}
+    if any(is_sidecar(file) for file in (folder.glob("*.json") if is_folder else [folder])):
+        return {"source": {"kind": "dvrk", "path": str(folder)}}
+    if (folder / "poses_bounds.npy").is_file() or all(
+        (folder / name).is_dir() for name in ("images", "masks")
+    ):
+        return {"source": {"kind": "endonerf", "folder": str(folder)}}
+    if (folder / "endoscope_calibration.yaml").is_file() or (folder / "data/rgb.mp4").is_file():
+        # No instrument is in view; the search for them by colour would only take tissue away.
+        return {
+            "source": {"kind": "scared", "folder": str(folder)},
+            "vision": {"tissue": {"method": "none"}},
+        }
+    return None
+
+
+def is_sidecar(file: Path) -> bool:
+    """Whether this describes a video of dVRK's `record`; its type stands at the beginning or the end."""
+    if file.suffix != ".json" or not file.is_file():
+        return False
+    with open_file(file) as opened:
+        start = opened.read(SIDECAR_LOOK)
+        opened.seek(max(0, file.stat().st_size - SIDECAR_LOOK))
+        return SIDECAR_TYPE.encode() in start + opened.read(SIDECAR_LOOK)
+
+
+def with_parameters(config: LaunchConfig, parameters: Mapping[str, Any]) -> LaunchConfig:
+    """The same configuration with some `section.key` values replaced, validated again.
+
+    Raises:
+        UsageError: an unknown key or a wrong value.
+    """
+    tree = config.model_dump()
+    for key, value in parameters.items():
+        _set(tree, key, value, key)
+    try:
+        return LaunchConfig.model_validate(tree)
+    except ValidationError as error:
+        raise UsageError(_explain(error, "parameters")) from None
+
+
+def _read_yaml(file: Path) -> dict[str, Any]:
+    tree = read_yaml(file, "launch file")
+    if tree is None:
+        return {}
+    if not isinstance(tree, dict):
+        raise UsageError(f"{file}: a launch file is a map of sections, this is a {type(tree).__name__}")
+    return tree
+
+
+def _resolve_paths(tree: dict[str, Any], folder: Path, path_keys: frozenset[str] = _PATH_KEYS) -> None:
+    """Expand variables in every string and make `path_keys` relative to the launch file."""
+    variables = {"SAGS_DATA": str((folder / ".." / DEFAULT_DATA).resolve()), **os.environ}
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            is_live = key == "source" and value.get("kind") in _LIVE_PATHS
+            _resolve_paths(value, folder, _LIVE_PATHS[value["kind"]] if is_live else path_keys)
+        elif isinstance(value, str):
+            tree[key] = _resolve(key, value, folder, variables, path_keys)
+        elif isinstance(value, list):
+            tree[key] = [
+                _resolve(key, item, folder, variables, path_keys) if isinstance(item, str) else item
+                for item in value
+            ]
+
+
+def _resolve(
+    key: str, value: str, folder: Path, variables: Mapping[str, str], path_keys: frozenset[str]
+) -> str:
+    expanded = Template(value).safe_substitute(variables)
+    if "$" in expanded and key in path_keys:
+        raise UsageError(f"{key}: {value} uses a variable that is not set; export it first")
+    return str(folder / expanded) if key in path_keys else expanded
+
+
+def _apply_override(tree: dict[str, Any], override: str) -> None:
+    key, separator, text = override.partition(":=")
+    if not separator or not key:
+        raise UsageError(f"'{override}' is not an override; write key:=value, e.g. mapping.budget_ms:=33")
+    _set(tree, key, parse_yaml(text, f"the value of {key}:="), override)
+
+
+def _set(tree: dict[str, Any], key: str, value: Any, said: str) -> None:
+    node = tree
+    *parents, leaf = key.split(".")
+    for parent in parents:
+        node = node.setdefault(parent, {})
+        if not isinstance(node, dict):
+            raise UsageError(f"'{said}': {parent} is a value, not a section")
+    node[leaf] = value
+
+
+def _explain(error: ValidationError, name: str, given: Sequence[str] = ()) -> str:
+    """One line per mistake: where, what, and for an unknown key what replaced it or the nearest known one.
+
+    Args:
+        name: of what was read.
+        given: keys that were said on the command line instead.
+    """
+    lines = []
+    mistakes = error.errors()
+    for item in mistakes[:MOST_MISTAKES]:
+        path = [str(part) for part in item["loc"]]
+        where = ".".join(part for part in path if part not in _SOURCES)
+        said = COMMAND_LINE if any(f"{where}.".startswith(f"{key}.") for key in given) else name
+        if item["type"] == "extra_forbidden" and where in REMOVED:
+            lines.append(f"{said}: there is no {where} any more: {REMOVED[where]}")
+        elif item["type"] == "extra_forbidden":
+            lines.append(f"{said}: unknown key '{where}'; {_nearest(path)}")
+        elif item["type"] == "missing":
+            lines.append(f"{said}: {where} is missing; set it")
+        elif item["type"] in ("union_tag_invalid", "union_tag_not_found"):
+            kinds = ", ".join(repr(kind) for kind in _SOURCES)
+            got = brief(item["input"].get("kind"))
+            said = COMMAND_LINE if "source.kind" in given else name
+            lines.append(f"{said}: source.kind: should be one of {kinds} (got {got})")
+        else:
+            what = _PLAIN.get(item["type"], item["msg"])
+            lines.append(f"{said}: {where or 'launch file'}: {what} (got {brief(item.get('input'))})")
+    if len(mistakes) > MOST_MISTAKES:
+        lines.append(f"{name}: and {len(mistakes) - MOST_MISTAKES} more")
+    return "\n".join(lines)
+
+
+_PLAIN = {  # where pydantic speaks of Python
+    "path_type": "Input should be a path",
+    "tuple_type": "Input should be a list, e.g. [a, b]",
+    "model_type": "Input should be a section of keys",
+    "model_attributes_type": "Input should be a section of keys",
+}
+
+
+def _nearest(path: Sequence[str]) -> str:
+    """The known key that was probably meant: of this section, or one of that name in another."""
+    known = _known_keys(path[:-1])
+    near = difflib.get_close_matches(path[-1], known, n=1, cutoff=0.5)
+    if not near:
+        near = [f"{section}.{path[-1]}" for section in _SECTIONS if path[-1] in _known_keys([section])]
+    return f"did you mean '{near[0]}'?" if near else f"known keys: {', '.join(sorted(known))}"
+
+
+def _known_keys(path: Sequence[str]) -> list[str]:
+    model: Any = LaunchConfig
+    for part in path:
+        field = model.model_fields.get(part)
+        if part in _SOURCES:
+            model = _SOURCES[part]
+        elif field is not None and part != "source":
+            model = field.annotation
+    return list(model.model_fields)
+
+
+_SECTIONS = ("vision", "engine", "mapping", "publish")

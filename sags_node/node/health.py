@@ -1,0 +1,194 @@
+"""What the node says of itself: rates, latencies and costs of its last frames."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Mapping
+from math import inf
+from statistics import median
+
+import numpy as np
+
+from sags_node.config.schema import MappingConfig, PushSource, RecordedSource, Ros2Source, Source
+from sags_node.findings import Findings, by_code, by_stage
+from sags_node.processes import resident_mb
+from sags_node.types import ClockStatus, Finding, FrameResult, MotionState, NodeHealth, RungState, ViewStatus
+
+WAITING_AFTER = 1.0  # s without a frame, or without one that was taken in
+WINDOW = 150  # frames behind the published rates and latencies
+MOST_LEFT_OUT = 0.1  # of the frames; a strict reader refuses what comes less often (`messaging.freshness`)
+BACK_AT = 0.8  # of that: a warning ends
+LONGER = 1.05  # times the time from frame to frame: a budget that is rounded is none that is too long
+
+
+TOO_SLOW = (
+    "this machine is too slow for them: end other programs, or lower mapping.max_gaussians, vision.width and "
+    "vision.height"
+)
+
+
+def why_missed(mapping: MappingConfig, rate: float | None) -> str:
+    """Why frames are left out, if they are, and the remedy.
+
+    Args:
+        rate: frames that come a second; None: they come when they are taken.
+    """
+    if mapping.iterations is not None:
+        return "mapping.iterations fixes the work on each: lower it, or leave it out"
+    if rate is not None and mapping.frame_ms(rate) > LONGER * 1e3 / rate:
+        of = f"of {mapping.budget_ms:g} is longer than the {1e3 / rate:.1f} ms from frame to frame"
+        return f"mapping.budget_ms {of}: leave it out"
+    if mapping.rung is not None:
+        return "mapping.rung fixes the quality: lower it, or leave it out"
+    return TOO_SLOW
+
+
+class Statistics:
+    """What the last frames tell of rate, latency and cost.
+
+    Args:
+        source: where they come from.
+    """
+
+    def __init__(self, source: Source | None = None) -> None:
+        self._nothing_comes, self._too_few_come = _remedies(source)
+        self._lock = threading.Lock()
+        self._published: deque[float] = deque(maxlen=WINDOW)
+        self._taken_in = -inf  # when a frame was published that was
+        self._latency: deque[float] = deque(maxlen=WINDOW)
+        self._stages: dict[str, deque[float]] = {}
+        self._skipped: dict[str, int] = {}
+        self._gaussians = 0
+        self._rung: RungState | None = None
+        self._motion: MotionState | None = None
+        self._started = False
+        self._left_out: deque[Mapping[str, int]] = deque(maxlen=WINDOW)  # slot -> frames, since the start
+        self._too_many: set[str] = set()  # slots that leave out too much
+        # Median time from capture to published; 0 before the first frame. Read without the lock, which others
+        # may hold for long.
+        self.latency_s = 0.0
+
+    def add(self, result: FrameResult, latency_ms: float, dropped: Mapping[str, int]) -> None:
+        """Take a published frame; `dropped`: how many each slot has left out until now."""
+        with self._lock:
+            self._left_out.append(dropped)
+            self._started = True
+            self._published.append(time.monotonic())
+            if not result.held:
+                self._taken_in = self._published[-1]
+            self._latency.append(latency_ms)
+            self.latency_s = 1e-3 * median(self._latency)
+            for stage, ms in result.timings_ms.items():
+                self._stages.setdefault(stage, deque(maxlen=WINDOW)).append(ms)
+            for what in result.skipped:
+                self._skipped[what] = self._skipped.get(what, 0) + 1
+            self._gaussians = len(result.snapshot.gaussians)
+            self._rung = result.rung
+            forecast = result.snapshot.forecast
+            self._motion = None if forecast is None else forecast.state
+
+    def forget_rate(self) -> None:
+        """After a pause the time without frames says nothing."""
+        with self._lock:
+            self._published.clear()
+
+    def health(
+        self,
+        dropped: dict[str, int],
+        stopping: bool,
+        paused: bool,
+        error: BaseException | None,
+        warnings: Findings,
+        connections: dict[str, dict[str, int]],
+        views: Mapping[str, ViewStatus],
+        clock: ClockStatus | None = None,
+        missed: str = TOO_SLOW,
+    ) -> NodeHealth:
+        """`missed`: why frames are left out, if they are, and the remedy."""
+        with self._lock:
+            now = time.monotonic()
+            waiting = not self._published or now - self._published[-1] > WAITING_AFTER
+            span = self._published[-1] - self._published[0] if len(self._published) > 1 else 0.0
+            if stopping:
+                state = "stopping"
+            elif error is not None:
+                state = "degraded"
+            elif paused:
+                state = "paused"
+            elif waiting:
+                state = "waiting" if self._started else "starting"
+            elif now - self._taken_in > WAITING_AFTER:
+                state = "held"
+            else:
+                state = "running"
+            latency = np.array(self._latency) if self._latency else np.zeros(1)
+            return NodeHealth(
+                state=state,
+                rate_hz=(len(self._published) - 1) / span if span > 0 and not (waiting or paused) else 0.0,
+                latency_ms={
+                    "p50": float(np.percentile(latency, 50)),
+                    "p90": float(np.percentile(latency, 90)),
+                    "p99": float(np.percentile(latency, 99)),
+                    "max": float(latency.max()),
+                },
+                stage_ms={stage: float(np.median(ms)) for stage, ms in self._stages.items()},
+                dropped=dropped,
+                gaussians=self._gaussians,
+                rss_mb=resident_mb(),
+                skipped=dict(self._skipped),
+                last_error=str(error) if error else None,
+                warnings={**warnings, **by_stage(self._findings(state, now, missed))},
+                connections=connections,
+                views=views,
+                rung=self._rung,
+                motion=self._motion,
+                clock=clock,
+            )
+
+    def _findings(self, state: str, now: float, missed: str) -> list[Finding]:
+        """What the flow of frames says; asked with the lock held."""
+        found = []
+        if state == "waiting":
+            said = f"no frame for {now - self._published[-1]:.0f} s" if self._published else "no frame comes"
+            found.append(Finding("no_frames", f"{said}: {self._nothing_comes}"))
+        if self._leaves_out_too_many("source"):
+            said = "the source leaves out over a tenth of its frames"
+            found.append(Finding("source_drops", f"{said}: {self._too_few_come}"))
+        if self._leaves_out_too_many("capture"):
+            found.append(Finding("frames_missed", f"over a tenth of the frames is left out, as {missed}"))
+        return found
+
+    def _leaves_out_too_many(self, slot: str) -> bool:
+        if len(self._left_out) == WINDOW:
+            count = self._left_out[-1].get(slot, 0) - self._left_out[0].get(slot, 0)
+            limit = MOST_LEFT_OUT * (BACK_AT if slot in self._too_many else 1.0)
+            (self._too_many.add if count > limit * (count + WINDOW - 1) else self._too_many.discard)(slot)
+        return slot in self._too_many
+
+
+def _remedies(source: Source | None) -> tuple[str, str]:
+    """What helps where no frame comes, and where over a tenth is left out."""
+    match source:
+        case PushSource():
+            what = f"start the sender at {source.endpoint}"
+        case Ros2Source():
+            what = f"start what publishes {source.left} and {source.right}"
+        case RecordedSource():
+            return "is the disk slow?", "is the disk slow?"
+        case _:
+            what = "check the camera, its cable and the capture card"
+            return what, "is one camera away, or source.pair_tolerance_ms too small?"
+    return (
+        what,
+        "do the pictures of both eyes come, with stamps no further apart than source.pair_tolerance_ms?",
+    )
+
+
+def in_a_line(health: NodeHealth) -> str:
+    """State, rate and latency, then the codes of all warnings."""
+    latency = health.latency_ms["p50"]
+    words = f"{health.state}, {health.rate_hz:.1f} Hz, latency {latency:.0f} ms, {health.gaussians} Gaussians"
+    codes = ", ".join(by_code(health.warnings))
+    return f"{words}; warnings: {codes}" if codes else words

@@ -1,0 +1,203 @@
+"""What clients may ask of a running node: by which name, and on which of its threads it is done."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future, wait
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import Any
+
+import numpy as np
+
+from sags_node.config.launch_file import with_parameters
+from sags_node.config.schema import LaunchConfig
+from sags_node.errors import SagsError
+from sags_node.mapping.budget import Budget
+from sags_node.messaging import content
+from sags_node.messaging.requests import AnchorName, AnchorRequest, ViewName, ViewRequest, parse
+from sags_node.model.ply import write_ply
+from sags_node.node.health import Statistics
+from sags_node.node.views import Views
+from sags_node.pipeline.pipeline import Pipeline
+from sags_node.types import DrawnView, FrameResult
+
+LIVE_PARAMETERS = (
+    "mapping.budget_ms",
+    "mapping.skip_duplicates",
+    "mapping.skip_depth",
+    "mapping.skip_fitted",
+    "mapping.skip_still",
+)
+
+
+@dataclass
+class NodeState:
+    """What the threads of a node and its operations share."""
+
+    config: LaunchConfig
+    pipeline: Pipeline  # of the mapping thread
+    budget: Budget  # of the mapping thread
+    views: Views  # of the drawing thread
+    scene: FrameResult | None = None  # drawn last; of the drawing thread
+    statistics: Statistics = field(default_factory=Statistics)
+    paused: threading.Event = field(default_factory=threading.Event)
+    parameters_changed: threading.Event = field(default_factory=threading.Event)
+    status_due: threading.Event = field(default_factory=threading.Event)  # at once
+
+
+class Operations:
+    """Answers requests of clients. Those that touch the model wait for the mapping thread, those that touch
+    views for the drawing thread. A disk may hang: each file is written by a thread of its own.
+
+    Args:
+        show_view: called with a view's name and what is to be published of it; None: it is closed.
+    """
+
+    def __init__(self, state: NodeState, show_view: Callable[[str, DrawnView | None], None]) -> None:
+        self._state = state
+        self._show_view = show_view
+        self.for_mapping = Requests()
+        self.for_drawing = Requests()
+        self._saving: list[Future[Any]] = []  # models that are being written
+
+    def handlers(self) -> dict[str, Callable[[dict[str, Any]], Any]]:
+        """By the operation's name; a `Future` where another thread does the work."""
+        return {
+            "get_parameters": lambda args: self._state.config.model_dump(mode="json"),
+            "set_parameters": lambda args: self.for_mapping.post(lambda: self._set_parameters(args)),
+            "reset_model": lambda args: self.for_mapping.post(self._reset_model),
+            "pause": lambda args: self.for_mapping.post(self._pause),
+            "resume": lambda args: self.for_mapping.post(self._resume),
+            "add_anchor": lambda args: self.for_mapping.post(lambda: self._add_anchor(args)),
+            "remove_anchor": lambda args: self.for_mapping.post(lambda: self._remove_anchor(args)),
+            "open_view": lambda args: self.for_drawing.post(lambda: self._open_view(args)),
+            "close_view": lambda args: self.for_drawing.post(lambda: self._close_view(args)),
+            "save_model": self._save_model,
+        }
+
+    def _set_parameters(self, args: dict[str, Any]) -> dict[str, Any]:
+        refused = [key for key in args if key not in LIVE_PARAMETERS]
+        if refused:
+            raise SagsError(
+                f"{', '.join(refused)} cannot be changed while running; "
+                f"what can: {', '.join(LIVE_PARAMETERS)}"
+            )
+        self._state.config = with_parameters(self._state.config, args)
+        self.reconfigure()
+        self._state.parameters_changed.set()
+        return self._state.config.model_dump(mode="json")
+
+    def reconfigure(self) -> None:
+        """Let frames get what the configuration, or the rate of frames, says now; on the mapping thread."""
+        self._state.pipeline.reconfigure(self._state.config)
+        self._state.budget = self._state.pipeline.make_budget(self._state.budget.speed)
+
+    def _reset_model(self) -> dict[str, Any]:
+        self._state.pipeline.reset()
+        return {}
+
+    def _pause(self) -> dict[str, Any]:
+        self._state.paused.set()
+        self._state.status_due.set()
+        return {"paused": True}
+
+    def _resume(self) -> dict[str, Any]:
+        if self._state.paused.is_set():
+            self._state.statistics.forget_rate()
+            self._state.paused.clear()
+            self._state.status_due.set()
+        return {"paused": False}
+
+    def _add_anchor(self, args: dict[str, Any]) -> dict[str, Any]:
+        request = parse(AnchorRequest, args)
+        newest = self._state.pipeline.newest
+        if newest is None:
+            raise SagsError("there is no model yet; wait for the first frame")
+        frame = newest.observation, newest.snapshot, newest.views["left"]
+        if request.u is not None and request.v is not None:
+            anchor = self._state.pipeline.anchors.add_pixel(request.u, request.v, *frame)
+        else:
+            point = np.array([request.x, request.y, request.z], np.float64)
+            anchor = self._state.pipeline.anchors.add_point(point, *frame)
+        if request.ahead_ms:
+            seconds = None if request.ahead_ms == "auto" else request.ahead_ms * 1e-3
+            self._state.pipeline.anchors.look_ahead(anchor, seconds)
+            self._state.pipeline.foresee()
+        sure = self._state.pipeline.anchors.depth_confidence(anchor)
+        return {"id": anchor, "frame_id": newest.pair.frame_id, "depth_confidence": round(sure, 3)}
+
+    def _remove_anchor(self, args: dict[str, Any]) -> dict[str, Any]:
+        self._state.pipeline.anchors.remove(parse(AnchorName, args).id)
+        return {}
+
+    def _open_view(self, args: dict[str, Any]) -> dict[str, Any]:
+        request = parse(ViewRequest, args)
+        if request.ahead_ms:
+            self._state.pipeline.foresee()
+        drawn = self._state.views.open(request, self._state.scene)
+        if drawn is not None:
+            self._show_view(request.name, drawn)
+        status = self._state.views.status[request.name]
+        return {"topics": content.view_topics(request.name, request.stereo, request.depth), **asdict(status)}
+
+    def _close_view(self, args: dict[str, Any]) -> dict[str, Any]:
+        name = parse(ViewName, args).name
+        self._state.views.close(name)
+        self._show_view(name, None)
+        return {}
+
+    def _save_model(self, args: dict[str, Any]) -> Future[Any]:
+        path = args.get("path")
+        if not isinstance(path, str) or not path.endswith(".ply"):
+            raise SagsError("save_model needs a path that ends in .ply")
+        if "\0" in path:
+            raise SagsError("a path cannot hold a zero character")
+        newest = self._state.pipeline.newest
+        if newest is None or len(newest.snapshot.gaussians) == 0:
+            raise SagsError("there is no model yet; wait for the first frame")
+        file, gaussians = Path(path).absolute(), newest.snapshot.gaussians  # never changed any more
+
+        def write() -> dict[str, Any]:
+            write_ply(file, gaussians)
+            return {"path": str(file), "gaussians": len(gaussians)}
+
+        saved: Future[Any] = Future()
+        self._saving = [one for one in self._saving if not one.done()] + [saved]
+        threading.Thread(target=_answer, args=(saved, write), name="save-model", daemon=True).start()
+        return saved
+
+    def finish(self, seconds: float) -> None:
+        """Wait so long at most for models that are being written."""
+        wait(self._saving, seconds)
+
+
+class Requests:
+    """Work that other threads leave for one thread to do."""
+
+    def __init__(self) -> None:
+        self._waiting: SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = SimpleQueue()
+
+    def post(self, work: Callable[[], Any]) -> Future[Any]:
+        future: Future[Any] = Future()
+        self._waiting.put((work, future))
+        return future
+
+    def serve(self) -> None:
+        """Do all that waits."""
+        while True:
+            try:
+                work, future = self._waiting.get_nowait()
+            except Empty:
+                return
+            _answer(future, work)
+
+
+def _answer(future: Future[Any], work: Callable[[], Any]) -> None:
+    """Do it; its failure is the answer, and does not end the thread."""
+    try:
+        future.set_result(work())
+    except Exception as error:
+        future.set_exception(error)

@@ -1,0 +1,234 @@
+"""Viewpoints that consumers asked for, drawn from the newest snapshot beside the mapping.
+
+Mapping goes first. All views together get a share of one core, see `allowance`; it is split so that each
+keeps the same part of the rate it asked for. A view that nobody subscribes to is not drawn. Used from one
+thread; only `status` and `pairs` may be read by others.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections import deque
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from sags_node.engine.interface import Rasterizer
+from sags_node.engine.rasterizer.confidence import with_confidence
+from sags_node.engine.rasterizer.rasterize import make_rasterizer, to_view
+from sags_node.errors import SagsError
+from sags_node.geometry import scale_intrinsics
+from sags_node.messaging.requests import ViewRequest
+from sags_node.model.forecast import gaussians_ahead, reached
+from sags_node.model.gaussians import for_right_eye
+from sags_node.node.allowance import SHARE, Allowance
+from sags_node.types import Camera, DrawnView, FrameResult, RenderedView, ViewStatus
+
+MAX_VIEWS = 8
+HELD_OVER = 5.0  # s over which the held rate is counted
+EARLY = 0.25  # of a period: a view that is nearly due is drawn rather than left to the next frame
+LEARNING = 0.2  # share of a new measurement in a running mean of costs
+
+log = logging.getLogger(__name__)
+
+Clock = Callable[[], float]
+
+
+@dataclass(slots=True)
+class _View:
+    request: ViewRequest
+    due: float  # when it is to be drawn next
+    cost: float = 0.0  # s of processor time for one drawing; 0: never drawn
+    drawn_at: deque[float] = field(default_factory=deque)
+    failure: str = ""  # of the last drawing
+    logged: str = ""  # the last failure that was
+
+    @property
+    def finished(self) -> bool:
+        return self.request.static and self.cost > 0
+
+
+class Views:
+    """The open views.
+
+    Attributes:
+        status: how each is served; replaced as a whole whenever it changes.
+        pairs: those of both eyes that are drawn again and again; replaced as `status` is.
+    """
+
+    def __init__(
+        self,
+        backend: str,
+        allowance: Allowance,
+        clock: Clock = time.monotonic,
+        processor_clock: Clock = time.thread_time,
+        latency: Clock = lambda: 0.0,
+    ) -> None:
+        """
+        Args:
+            allowance: what drawing may take of one core.
+            latency: s from capture to published, as it was lately.
+        """
+        self.status: Mapping[str, ViewStatus] = {}
+        self.pairs: Collection[str] = ()
+        self._backend = backend
+        self._allowance = allowance
+        self._clock = clock
+        self._processor_clock = processor_clock
+        self._latency = latency
+        self._views: dict[str, _View] = {}
+        self._rasterizers: dict[tuple[int, int], Rasterizer] = {}
+        self._watched: Collection[str] = ()
+
+    def open(self, request: ViewRequest, scene: FrameResult | None) -> DrawnView | None:
+        """Open a view, or change one of that name; returns its first picture where there is a scene.
+
+        Raises:
+            SagsError: there are too many views.
+            Exception: it cannot be drawn; it is closed then.
+        """
+        known = self._views.get(request.name)
+        if known is None and len(self._views) >= MAX_VIEWS:
+            names = ", ".join(sorted(self._views))
+            raise SagsError(f"{MAX_VIEWS} views are open, the most there can be ({names}); close one first")
+        view = _View(request, self._clock()) if known is None else known
+        view.request = request
+        self._views[request.name] = view
+        self._forget_sizes()
+        self._watched = {*self._watched, request.name}  # until it is known better
+        drawn = None
+        if scene is not None and (known is None or request.static):
+            try:
+                drawn = self._draw(view, scene)
+            except Exception:
+                self.close(request.name)
+                raise
+        self._note()
+        return drawn
+
+    def close(self, name: str) -> None:
+        """Raises:
+        SagsError: no view of that name is open.
+        """
+        if self._views.pop(name, None) is None:
+            raise SagsError(f"no view '{name}' is open; open are: {', '.join(sorted(self._views)) or 'none'}")
+        self._forget_sizes()
+        self._note()
+
+    def _forget_sizes(self) -> None:
+        """Let go of what draws a size that no view has any more: tens of MB each."""
+        sizes = {(view.request.width, view.request.height) for view in self._views.values()}
+        self._rasterizers = {size: kept for size, kept in self._rasterizers.items() if size in sizes}
+
+    def draw_due(self, scene: FrameResult, watched: Collection[str]) -> Iterator[tuple[str, DrawnView]]:
+        """Draw what is due of a new scene, longest overdue first. A drawing that fails costs its view alone.
+
+        Args:
+            watched: views that somebody subscribes to.
+        """
+        self._watched = watched
+        for name, view in sorted(self._views.items(), key=lambda item: item[1].due):
+            if view.finished or (view.cost > 0 and name not in watched):
+                continue
+            now = self._clock()
+            period = 1 / self._granted(view)
+            if now < view.due - EARLY * period:
+                continue
+            view.due = max(view.due + period, now)
+            try:
+                drawn = self._draw(view, scene)
+            except Exception as error:
+                view.failure = f"it cannot be drawn: {str(error) or type(error).__name__}"
+                if view.failure != view.logged:
+                    view.logged = view.failure
+                    log.exception("view '%s' cannot be drawn", name)
+            else:
+                yield name, drawn
+        self._note()
+
+    def _draw(self, view: _View, scene: FrameResult) -> DrawnView:
+        request = view.request
+        started = self._processor_clock()
+        size = request.width, request.height
+        if size not in self._rasterizers:
+            self._rasterizers[size] = make_rasterizer(self._backend, *size)
+        snapshot = scene.snapshot
+        camera = view_camera(request, snapshot.camera)
+        eyes = {"": camera}
+        if request.stereo:
+            eyes = {"left": camera, "right": camera.moved_right(scene.pair.baseline)}
+        wanted = self._latency() + view.cost if request.ahead_ms == "auto" else 1e-3 * request.ahead_ms
+        ahead = reached(snapshot, wanted)
+        gaussians = gaussians_ahead(snapshot, ahead) if ahead > 0 else snapshot.gaussians
+        pictures = {}
+        for eye, camera in eyes.items():
+            shown = _published(scene, camera) if eye == "right" and ahead == 0 else None
+            if shown is None:
+                seen = for_right_eye(gaussians, snapshot) if eye == "right" else gaussians
+                planes = self._rasterizers[size].forward(seen, camera)
+                shown = to_view(planes, camera, snapshot.frame_id, snapshot.t_capture_ns)
+            pictures[eye] = with_confidence(shown, gaussians)
+        spent = self._processor_clock() - started
+        view.cost = spent if view.cost == 0 else view.cost + LEARNING * (spent - view.cost)
+        view.failure = ""
+        view.drawn_at.append(self._clock())
+        return DrawnView(pictures, scene.pair.baseline, request.depth, request.static, scene.epoch, ahead)
+
+    # ---- rates -----------------------------------------------------------------------------------------
+
+    def _granted(self, view: _View) -> float:
+        """Hz: the part of the rate asked for that all views can keep."""
+        served = {id(view): view, **{id(v): v for n, v in self._views.items() if n in self._watched}}
+        demand = sum(one.cost * one.request.rate_hz for one in served.values() if not one.request.static)
+        return view.request.rate_hz * min(1.0, self._allowance.share / max(demand, 1e-9))
+
+    def _note(self) -> None:
+        self.status = {name: self._status(name, view) for name, view in self._views.items()}
+        self.pairs = [n for n, view in self._views.items() if view.request.stereo and not view.finished]
+
+    def _status(self, name: str, view: _View) -> ViewStatus:
+        now = self._clock()
+        while view.drawn_at and view.drawn_at[0] < now - HELD_OVER:
+            view.drawn_at.popleft()
+        span = now - view.drawn_at[0] if view.drawn_at else 0.0
+        held = (len(view.drawn_at) - 1) / span if span > 0 else 0.0
+        asked = 0.0 if view.request.static else view.request.rate_hz
+        granted = 0.0 if view.request.static else self._granted(view)
+        return ViewStatus(asked, granted, held, view.cost * 1e3, self._limit(name, view, granted))
+
+    def _limit(self, name: str, view: _View, granted: float) -> str:
+        live = not view.request.static
+        short = live and granted < 0.95 * view.request.rate_hz
+        reasons = (
+            (bool(view.failure), view.failure),
+            (view.cost == 0, "no frame has come yet"),
+            (live and name not in self._watched, "nobody subscribes"),
+            (short and self._allowance.is_behind, "the mapping is late and goes first"),
+            (short, f"all views together get {SHARE:g} of a core"),
+        )
+        return next((why for applies, why in reasons if applies), "")
+
+
+def _published(scene: FrameResult, camera: Camera) -> RenderedView | None:
+    """The right eye as the node shows it, where that is this camera's; its depth may be written."""
+    shown = scene.views.get("right")
+    if shown is None or (shown.camera.width, shown.camera.height) != (camera.width, camera.height):
+        return None
+    if not (
+        np.array_equal(shown.camera.K, camera.K)
+        and np.array_equal(shown.camera.T_world_cam, camera.T_world_cam)
+    ):
+        return None
+    return replace(shown, depth=shown.depth.copy())
+
+
+def view_camera(request: ViewRequest, left: Camera) -> Camera:
+    """The camera of a view when the left camera is `left`."""
+    size = request.width, request.height
+    K = request.intrinsics()
+    if K is None:
+        K = scale_intrinsics(left.K, (left.width, left.height), size)
+    pose = request.pose()
+    return Camera(*size, K, pose if request.T_world_cam is not None else left.T_world_cam @ pose)

@@ -1,0 +1,101 @@
+"""From a launch file to the three things the node runs on: configuration, rig and source."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from sags_node.config.launch_file import load_launch
+from sags_node.config.schema import BagSource, EndoNerfSource, LaunchConfig, PhantomSource, Ros2Source
+from sags_node.errors import UsageError
+from sags_node.rig import load_camera, load_rig
+from sags_node.sources.robot import Posed
+from sags_node.sources.source import Source, open_source, recorded_rig
+from sags_node.types import StereoRig
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """What a node needs. The source brings no truth with its frames; measuring opens its own."""
+
+    name: str  # of the launch file or folder
+    config: LaunchConfig
+    rig: StereoRig
+    source: Source
+
+    @property
+    def working_size(self) -> tuple[int, int]:
+        """Width and height of the pictures that the mapper works on, px."""
+        return self.config.vision.working_size(self.rig.left.width, self.rig.left.height)
+
+
+def open_session(
+    launch: Path | str | None,
+    overrides: Sequence[str] = (),
+    progress: Callable[[int, int], None] | None = None,
+) -> Session:
+    """Read a launch file or session folder (None: the built-in phantom) and open what it names.
+
+    Args:
+        progress: called with (frames done, frames in all) while the phantom is rendered for the first time.
+
+    Raises:
+        UsageError: a wrong key, value or path.
+        SagsError: the recording or the calibration cannot be used.
+    """
+    config = load_launch(launch, overrides)
+    one_eyed = isinstance(config.source, EndoNerfSource) and config.source.baseline is None
+    if config.one_camera or one_eyed:
+        if config.publish.right is True:
+            raise UsageError(
+                "publish.right: there is no right eye; set source.baseline, or leave publish.right out"
+            )
+        config = config.model_copy(update={"publish": config.publish.model_copy(update={"right": False})})
+    if isinstance(config.source, PhantomSource):
+        from sags_node.phantom import cached_session
+
+        rig = load_rig(cached_session(config.source, progress) / "calib")
+    else:
+        rig = rig_of(config)
+    source = open_posed(config, rig, references=False)
+    return Session(_name(launch), config, rig, source)
+
+
+def open_posed(config: LaunchConfig, rig: StereoRig, references: bool = True) -> Source:
+    """The frames of a launch file, with the robot's poses where it names one.
+
+    Args:
+        references: read the recording's truth with each frame. Only measuring needs it.
+
+    Raises:
+        UsageError, SagsError: see `open_source` and `Posed`.
+    """
+    source = open_source(config.source, references, size=(rig.left.width, rig.left.height))
+    return source if config.robot is None else Posed(source, config, rig)
+
+
+def _name(launch: Path | str | None) -> str:
+    if launch is None:
+        return "phantom"
+    path = Path(launch)
+    return path.name if path.is_dir() else path.stem
+
+
+def rig_of(config: LaunchConfig) -> StereoRig:
+    """The calibration that comes with the pictures, or the one that the launch file names."""
+    if config.rig is not None and isinstance(config.source, BagSource | Ros2Source):
+        return load_rig(config.rig)  # what drivers say is often uncalibrated, or of another day
+    recorded = recorded_rig(config.source)
+    if recorded is not None and config.rig is not None:
+        raise UsageError(f"rig: {config.rig} is one calibration too many: the recording brings its own")
+    if recorded is not None:
+        return recorded
+    if config.rig is None:
+        raise UsageError(
+            "no calibration: set rig to the folder with left.yaml and right.yaml of this scope; "
+            "docs/calibration.md says how to make one"
+        )
+    if config.one_camera and not config.rig.is_dir():
+        return load_camera(config.rig)
+    return load_rig(config.rig)

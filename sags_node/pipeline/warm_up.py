@@ -1,0 +1,108 @@
+"""Compile (once per machine) and load every kernel of the frame path, before the first frame needs it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import cv2
+import numpy as np
+
+from sags_node.config.schema import LaunchConfig, MappingConfig, VisionConfig
+from sags_node.kernels.cache import is_cold
+from sags_node.mapping.budget import StepBudget
+from sags_node.pipeline.pipeline import Pipeline
+from sags_node.processes import end
+from sags_node.rig import rectified_rig
+from sags_node.types import U8, StereoFrame, StereoRig
+from sags_node.vision.flow import OpticalFlow
+from sags_node.vision.inverse_search import spread_patches
+from sags_node.vision.pyramid import pyramids
+from sags_node.vision.rectify import Rectifier
+from sags_node.vision.stereo import StereoDepth
+from sags_node.vision.tissue_classical import InstrumentFinder
+
+COMPILING = 600.0  # s that the vision's kernels may take on a slow machine
+# Large enough for work that is shared between threads: smaller pictures take other kernels.
+_WIDTH, _HEIGHT, _FOCAL, _BASELINE, _DISPARITY = 240, 192, 225.0, 0.0043, 12
+
+
+def warm_up(config: LaunchConfig) -> None:
+    """Run a few small made-up frames through a pipeline of the same kind.
+
+    Kernels do not depend on sizes, so this takes well under a second once they are in Numba's disk cache, and
+    about a minute the first time, in which a second process compiles those of the vision. A GPU is tried out,
+    and its kernels are compiled, by the same frames.
+
+    Raises:
+        UsageError: a GPU is wanted and none can be used.
+    """
+    small = config.model_copy(
+        update={
+            "vision": VisionConfig(stereo=config.vision.stereo, pose=config.vision.pose),
+            "mapping": MappingConfig(max_gaussians=1000),
+        }
+    )
+    pipeline = Pipeline(small, _rig())
+    pipeline.draws_right = config.publish.right is not False  # somebody may look
+    budget = StepBudget(2)  # the first on the whole picture, the second where it is worst
+    frames = _frames()
+    with _vision_beside():
+        for frame in frames[:3]:  # with a depth of their own: stereo is left to the other process
+            pipeline.process(frame, budget)
+    for frame in frames[3:]:
+        result = pipeline.process(frame, budget)
+    InstrumentFinder()(frames[-1].left, result.views["left"])  # for sessions without masks
+
+
+def compile_vision() -> None:
+    """Compile and keep the kernels of flow and stereo, the one that is needed first before the other."""
+    rectifier = Rectifier(_rig(), _WIDTH, _HEIGHT)
+    before, after = (rectifier(frame) for frame in _frames()[-2:])
+    OpticalFlow(stride=4)(pyramids(before)[0], pyramids(after)[0])
+    StereoDepth(VisionConfig().stereo, rectifier.camera, _BASELINE)(
+        after, np.ones((_HEIGHT, _WIDTH), np.bool_)
+    )
+
+
+@contextmanager
+def _vision_beside() -> Iterator[None]:
+    """Where nothing is compiled yet, another process does `compile_vision` meanwhile. It only saves time:
+    what it leaves undone is compiled here."""
+    if not is_cold(spread_patches):
+        yield
+        return
+    other = subprocess.Popen(
+        [sys.executable, "-c", "from sags_node.pipeline.warm_up import compile_vision; compile_vision()"],
+        stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    try:
+        yield
+        other.wait(COMPILING)
+    except subprocess.TimeoutExpired:
+        pass
+    finally:
+        end(other, grace=0.0)
+
+
+def _frames() -> list[StereoFrame]:
+    """Six of a picture that moves by a pixel a frame; the first three bring their depth."""
+    coarse: U8 = np.random.default_rng(0).integers(40, 220, (_HEIGHT // 4, _WIDTH // 4 + 16, 3), np.uint8)
+    texture = cv2.resize(coarse, (_WIDTH + 64, _HEIGHT))
+    tissue = np.ones((_HEIGHT, _WIDTH), np.bool_)
+    depth = np.full((_HEIGHT, _WIDTH), np.float32(_FOCAL * _BASELINE / _DISPARITY))
+    frames = []
+    for i in range(6):
+        left = np.ascontiguousarray(texture[:, i : i + _WIDTH])
+        right = np.ascontiguousarray(texture[:, i + _DISPARITY : i + _DISPARITY + _WIDTH])
+        stamp = i * 33_000_000
+        own = depth if i < 3 else None
+        frames.append(StereoFrame(i, stamp, stamp, left, right, depth=own, tissue=tissue))
+    return frames
+
+
+def _rig() -> StereoRig:
+    K = np.array([[_FOCAL, 0, _WIDTH / 2], [0, _FOCAL, _HEIGHT / 2], [0, 0, 1]])
+    return rectified_rig("warm-up", _WIDTH, _HEIGHT, K, _BASELINE)

@@ -1,0 +1,45 @@
+"""Stereo rigs: calibrations of any usual form read into a checked `StereoRig`.
+
+Imports config.
+"""
+
+from sags_node.rig.check import (
+    Finding,
+    check_eyes,
+    check_intrinsics,
+    check_pair,
+    check_rig,
+    refuse_errors,
+)
+from sags_node.rig.read import Form, find_form, load_camera, load_rig, read_rig, unknown_form
+from sags_node.rig.rig import (
+    fit_distortion,
+    rectified_camera,
+    rectified_rig,
+    rectify_eyes,
+    resized_rig,
+)
+from sags_node.rig.ros import eye_files, eye_text, save_rig
+
+__all__ = [
+    "Finding",
+    "Form",
+    "check_eyes",
+    "check_intrinsics",
+    "check_pair",
+    "check_rig",
+    "eye_files",
+    "eye_text",
+    "find_form",
+    "fit_distortion",
+    "load_camera",
+    "load_rig",
+    "read_rig",
+    "rectified_camera",
+    "rectified_rig",
+    "rectify_eyes",
+    "refuse_errors",
+    "resized_rig",
+    "save_rig",
+    "unknown_form",
+]

@@ -1,0 +1,171 @@
+"""Stereo calibrations in OpenCV's own files (`cv2.FileStorage`, YAML or XML).
+
+Either `intrinsics.yml` and `extrinsics.yml` as OpenCV's sample stereo_calib writes them, or one file with all
+matrices under the names that are in use. The files do not say the unit of T.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from sags_node.config.yaml_reader import check_dialect
+from sags_node.errors import UsageError
+from sags_node.files import open_file, read_file
+from sags_node.rig.rig import fit_distortion, rectify_eyes
+from sags_node.types import F64, Eye, StereoRig
+
+LARGEST_FILE = 2**20  # bytes
+LARGEST_MATRIX = 64  # numbers
+STARTS = (b"%YAML:", b"%YAML 1", b"<?xml", b"<opencv_storage")
+SUFFIXES = (".yml", ".yaml", ".xml")
+NAMES = {
+    "M1": ("M1", "K1", "KL", "cameraMatrix1", "cameraMatrixL", "camera_matrix_1", "left_camera_matrix"),
+    "M2": ("M2", "K2", "KR", "cameraMatrix2", "cameraMatrixR", "camera_matrix_2", "right_camera_matrix"),
+    "D1": ("D1", "DL", "distCoeffs1", "distCoeffsL", "dist_coeffs_1", "left_distortion_coefficients"),
+    "D2": ("D2", "DR", "distCoeffs2", "distCoeffsR", "dist_coeffs_2", "right_distortion_coefficients"),
+    "R": ("R",),
+    "T": ("T", "t"),
+}
+SIZES = (("image_width", "image_height"), ("imageWidth", "imageHeight"), ("width", "height"))
+SIZE_LISTS = ("imageSize", "image_size")
+
+
+def is_opencv(file: Path) -> bool:
+    """Whether a file looks like one of `cv2.FileStorage`."""
+    if file.suffix.lower() not in SUFFIXES or not file.is_file():
+        return False
+    with open_file(file) as opened:
+        return opened.read(64).lstrip().startswith(STARTS)
+
+
+def pair_in(folder: Path) -> list[Path]:
+    """The sample's `intrinsics` and `extrinsics` files of a folder, those that are there."""
+    names = [folder / f"{stem}{suffix}" for stem in ("intrinsics", "extrinsics") for suffix in SUFFIXES]
+    return [file for file in names if file.is_file()]
+
+
+def read_files(
+    files: Sequence[Path], name: str, size: tuple[int, int] | None, metres: float | None
+) -> StereoRig:
+    """The rig in files that together hold M1 D1 M2 D2 R T, or these under other usual names.
+
+    R1 R2 P1 P2, if they are there, are kept: what was rectified with them elsewhere looks the same here.
+
+    Args:
+        size: width and height of the pictures, px, where the files do not say it.
+        metres: per unit of T; default 1.
+
+    Raises:
+        UsageError: a file cannot be read, a matrix is missing or malformed, or the size is not known.
+    """
+    storages = [(file, open_storage(file)) for file in files]
+    where = " and ".join(map(str, files))
+    K = _matrix(storages, "M1", (9,)).reshape(3, 3), _matrix(storages, "M2", (9,)).reshape(3, 3)
+    left, right = (
+        fit_distortion(_matrix(storages, key, (4, 5, 8, 12, 14)), f"{where}: {key}") for key in ("D1", "D2")
+    )
+    size = _size(storages) or size
+    if size is None:
+        raise UsageError(
+            f"{where} does not say the size of the pictures: give --size WxH; for a launch file "
+            "convert it first (sags calib convert)"
+        )
+    T = _matrix(storages, "T", (3,)) * (metres or 1.0)
+    rig = rectify_eyes(name, size, K, (left, right), _matrix(storages, "R", (9,)).reshape(3, 3), T)
+    if not all(_find(storages, key) for key in ("R1", "R2", "P1", "P2")):
+        return rig
+    eyes = []
+    for eye, R_key, P_key in ((rig.left, "R1", "P1"), (rig.right, "R2", "P2")):
+        R, P = _matrix(storages, R_key, (9,)).reshape(3, 3), _matrix(storages, P_key, (12,)).reshape(3, 4)
+        P[:, 3] *= metres or 1.0
+        eyes.append(Eye(*size, eye.K, eye.distortion, R, P))
+    return StereoRig(name, *eyes)
+
+
+Storages = Sequence[tuple[Path, cv2.FileStorage]]
+
+
+def open_storage(file: Path) -> cv2.FileStorage:
+    """A file of matrices.
+
+    Raises:
+        UsageError: it is missing, too large, or not written by OpenCV.
+    """
+    try:
+        text = read_file(file, LARGEST_FILE).decode("utf-8")
+        directive, _, document = text.partition("\n")
+        if directive.startswith("%YAML"):  # of two keys OpenCV takes the first
+            check_dialect(document, str(file))
+        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        has_names = storage.root().isMap()
+    except OSError as error:
+        raise UsageError(f"cannot read calibration {file}: {error.strerror}; check the path") from None
+    except (UnicodeDecodeError, cv2.error, SystemError):
+        raise UsageError(f"{file} is not a YAML or XML file as OpenCV writes it; save it again") from None
+    if not has_names:
+        raise UsageError(f"{file} holds no matrices with names; save it again")
+    return storage
+
+
+def _find(storages: Storages, key: str) -> tuple[Path, cv2.FileNode] | None:
+    for name in NAMES.get(key, (key,)):
+        for file, storage in storages:
+            node = storage.getNode(name)
+            if not node.empty():
+                return file, node
+    return None
+
+
+def _matrix(storages: Storages, key: str, lengths: tuple[int, ...]) -> F64:
+    """The numbers of one matrix, as one row."""
+    found = _find(storages, key)
+    if found is None:
+        names = ", ".join(NAMES.get(key, (key,)))
+        where = " and ".join(str(file) for file, _ in storages)
+        raise UsageError(f"{where}: looked for a matrix named {names}; a stereo calibration needs it")
+    file, node = found
+    numbers = numbers_in(node)
+    if numbers is None or numbers.size not in lengths:
+        needed = " or ".join(map(str, lengths))
+        raise UsageError(f"{file}: {node.name()} is not a matrix of {needed} numbers; save the file again")
+    return numbers
+
+
+def numbers_in(node: cv2.FileNode) -> F64 | None:
+    """The numbers of a matrix or list, as one row; None: it is neither, or too large for a calibration."""
+    if node.isSeq():
+        return np.array([node.at(index).real() for index in range(min(node.size(), LARGEST_MATRIX))])
+    if not node.isMap():
+        return None
+    sizes = node.getNode("sizes")  # of one dimension, since OpenCV 5
+    of_one = sizes.at(0).real() if sizes.isSeq() and sizes.size() == 1 else 0.0
+    claimed = of_one or node.getNode("rows").real() * node.getNode("cols").real()
+    if not 0 < claimed <= LARGEST_MATRIX:  # what is claimed is what OpenCV makes room for
+        return None
+    try:
+        matrix = node.mat()
+    except cv2.error:  # fewer numbers than it has rows and columns
+        return None
+    return None if matrix is None else np.asarray(matrix, np.float64).ravel()
+
+
+def _size(storages: Storages) -> tuple[int, int] | None:
+    for key in SIZE_LISTS:
+        found = _find(storages, key)
+        numbers = None if found is None else numbers_in(found[1])
+        if numbers is not None and len(numbers) == 2:
+            return _pixels(numbers[0]), _pixels(numbers[1])
+    for names in SIZES:
+        width, height = (_find(storages, name) for name in names)
+        if width is not None and height is not None:
+            return _pixels(width[1].real()), _pixels(height[1].real())
+    return None
+
+
+def _pixels(number: float) -> int:
+    """0 for what is no number; it is refused with the size."""
+    return int(number) if np.isfinite(number) else 0

@@ -1,0 +1,136 @@
+"""Launch files: every key is known, paths are found, mistakes are explained."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+from places import ROOT
+
+from sags_node.config.launch_file import load_launch, with_parameters
+from sags_node.config.schema import (
+    REMOVED,
+    FoldersSource,
+    LaunchConfig,
+    MappingConfig,
+    PanesSource,
+    VisionConfig,
+)
+from sags_node.errors import UsageError
+
+
+@pytest.mark.parametrize("file", sorted((ROOT / "launch").glob("*.yaml")), ids=lambda f: f.stem)
+def test_every_launch_file_loads(file: Path) -> None:
+    config = load_launch(file)
+    if config.rig is not None:
+        assert (config.rig / "left.yaml").is_file()
+
+
+def test_no_launch_file_means_the_phantom() -> None:
+    assert load_launch().source.kind == "phantom"
+
+
+def test_paths_are_relative_to_the_file_and_variables_are_expanded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("EYES", "/somewhere")
+    file = tmp_path / "launch.yaml"
+    file.write_text("source: {kind: folders, left: left, right: $EYES/right}\nrig: calib\n")
+    config = load_launch(tmp_path)
+    assert isinstance(config.source, FoldersSource)
+    assert config.source.left == tmp_path / "left"
+    assert config.source.right == Path("/somewhere/right")
+    assert config.rig == tmp_path / "calib"
+
+
+def test_overrides_win_over_the_file() -> None:
+    config = load_launch(
+        ROOT / "launch/d4d_pull.yaml", ["mapping.budget_ms:=50", "source.left:=[1, 2, 300, 200]"]
+    )
+    assert config.mapping.budget_ms == 50
+    assert isinstance(config.source, PanesSource)
+    assert config.source.left == (1, 2, 300, 200)
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("mapping.budgt_ms:=3", "did you mean 'budget_ms'"),
+        ("source.secnds:=3", "did you mean 'seconds'"),
+        ("vision.stereo.scal:=2", "did you mean 'scale'"),
+        ("zzz:=3", "known keys: "),
+        ("mapping.budget_ms:=-1", "greater than 0"),
+        ("vision.pose:=magic", "'session', 'fixed', 'estimate' or 'refine'"),
+        ("vision.stereo:={min_depth: 0.2, max_depth: 0.1}", "must be below max_depth"),
+        ("source.kind:=carrier_pigeon", "'folders'"),
+        ("mapping.budget_ms", "key:=value"),
+        ("mapping.budget_ms.x:=3", "mapping.budget_ms"),
+    ],
+)
+def test_a_mistake_is_named_with_its_mend(override: str, said: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        load_launch(None, [override])
+    assert said in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [("- a\n- b\n", "map of sections"), ("a: [", "not valid YAML"), ("a: \xff", "unknown key")],
+)
+def test_files_that_are_no_launch_files(tmp_path: Path, content: str, said: str) -> None:
+    file = tmp_path / "launch.yaml"
+    file.write_text(content, encoding="utf-8")
+    with pytest.raises(UsageError, match=said):
+        load_launch(file)
+
+
+def test_a_missing_or_binary_file_is_one_clear_error(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"nowhere\.yaml.*check the path"):
+        load_launch(tmp_path / "nowhere.yaml")
+    (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(UsageError, match="not UTF-8"):
+        load_launch(tmp_path / "binary.yaml")
+
+
+def test_yaml_cannot_run_code(tmp_path: Path) -> None:
+    file = tmp_path / "launch.yaml"
+    file.write_text("ns: !!python/object/apply:os.system ['true']\n")
+    with pytest.raises(UsageError, match="not valid YAML"):
+        load_launch(file)
+
+
+def test_the_time_of_a_frame_is_that_until_the_next_unless_it_is_set() -> None:
+    def ms(rate: float | None, **mapping: Any) -> float:
+        return MappingConfig(**mapping).frame_ms(rate)
+
+    assert ms(60) == pytest.approx(1000 / 60) and ms(25) == 40 and ms(10) == 100
+    assert ms(2) == 100  # else what is shown would be half a second old
+    assert ms(60, budget_ms=25) == ms(None, budget_ms=25) == 25
+    assert ms(None) == ms(10, iterations=2) == 33  # what is not played in real time does not depend on rates
+
+
+@pytest.mark.parametrize(
+    ("asked", "size"),
+    [({}, (960, 768)), ({"width": 480}, (480, 384)), ({"height": 256}, (320, 256)),
+     ({"width": 640, "height": 400}, (640, 400))],
+)  # fmt: skip
+def test_one_side_of_the_working_size_keeps_the_proportions(
+    asked: dict[str, int], size: tuple[int, int]
+) -> None:
+    assert VisionConfig(**asked).working_size(960, 768) == size  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("key", REMOVED)
+def test_a_key_that_is_gone_says_what_stands_in_its_place(key: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        load_launch(None, [f"{key}:=1"])
+    assert str(caught.value) == f"command line: there is no {key} any more: {REMOVED[key]}"
+    with pytest.raises(UsageError, match=re.escape(f"there is no {key} any more")):
+        with_parameters(LaunchConfig(), {key: 1})
+
+
+def test_parameters_are_validated_like_a_file() -> None:
+    config = LaunchConfig()
+    assert with_parameters(config, {"mapping.budget_ms": 20}).mapping.budget_ms == 20
+    with pytest.raises(UsageError, match="budget_ms"):
+        with_parameters(config, {"mapping.budget_ms": "soon"})

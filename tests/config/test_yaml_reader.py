@@ -1,0 +1,207 @@
+"""YAML as users, programs and pranksters write it: values, or one short line: what is wrong, and where."""
+
+from __future__ import annotations
+
+import os
+import random
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from places import ROOT
+
+from sags_node.config.launch_file import load_launch
+from sags_node.config.yaml_reader import MOST_VALUES, parse_yaml, read_yaml
+from sags_node.errors import UsageError
+from sags_node.recording.bag import storage_files
+from sags_node.rig import load_rig, read_rig
+
+LONGEST = 300  # characters of a message, without the name of the file
+
+BOMB = "a: &a [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"{name}: &{name} [{', '.join([f'*{before}'] * 10)}]\n"
+    for before, name in zip("abcdefgh", "bcdefghi", strict=True)
+)
+
+
+def refusal(read: Callable[[], object]) -> str:
+    with pytest.raises(UsageError) as caught:
+        read()
+    said = str(caught.value)
+    assert "\n" not in said and len(said) < LONGEST, said
+    return said
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("source: &a\n  kind: *a\n", "line 1: it contains itself, through an alias"),
+        ("&a [*a]", "line 1: it contains itself, through an alias"),
+        (BOMB, f"more than {MOST_VALUES} values"),
+        ("a: 1\nb: 2\na: 3\n", "line 3: the key 'a' is given twice, first in line 1"),
+        ("s: {kind: x, kind: y}", "the key 'kind' is given twice"),
+        ("1: a\n0x1: b\n", "the key 1 is given twice"),
+        ('a: "b\\0c"', "line 1: a text holds a zero character"),
+        ('"a\\0b": c', "a text holds a zero character"),
+        ("a: b: c", "line 1: mapping values are not allowed here"),
+        ("a: [", "line 1: "),
+        ("a: *b", "found undefined alias"),
+        ("[" * 3000, "nested too deeply"),
+        ("a: " + "9" * 5000, "a value is not what it looks like"),
+        ("a: 2001-99-99", "a value is not what it looks like"),
+        ("a: !!int x", "a value is not what it looks like"),
+        ("a: !!bool x", "a value is not what it looks like"),
+        ("a: !!python/object/apply:os.system ['true']", "could not determine a constructor"),
+        ("? [a, b]\n: c", "line 1: found unhashable key"),
+        ("a: 1\n---\nb: 2\n", "line 2: but found another document"),
+        ("a: \x07", "character"),
+        (b"\xff\xfe\x00", "not UTF-8"),
+        ("*" + "x" * 5000, "found undefined alias"),
+    ],
+    ids=lambda value: str(value)[:20],
+)
+def test_what_is_refused(text: str | bytes, said: str) -> None:
+    message = refusal(lambda: parse_yaml(text, "file"))
+    assert message.startswith("file is not valid YAML: ") and said in message
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "a: 1\nb: [1, 2.5, x]\n",
+        "base: &b {x: 1, y: 2}\nmine: {<<: *b, y: 3}\n",  # y is given once on each side of the merge
+        "deep: {inner: &m {<<: {x: 1}, x: 2}}\ntop: {<<: *m, z: 1}\n",
+        "a: &a 5\nb: *a\n",
+        "- {k: 1}\n- {k: 2}\n",
+    ],
+)
+def test_everything_else_is_what_pyyaml_reads(text: str) -> None:
+    assert parse_yaml(text, "file") == yaml.safe_load(text)
+
+
+def test_parts_are_not_shared() -> None:
+    tree = parse_yaml("a: &a {x: [1]}\nb: *a\n", "file")
+    tree["a"]["x"].append(2)
+    assert tree["b"] == {"x": [1]}
+
+
+@pytest.mark.fault(
+    "file: a launch or calibration file is damaged",
+    says="one line of error",
+)
+def test_damaged_files_end_in_one_line_each() -> None:
+    """A thousand mutations of real files: values, or a message."""
+    rng = random.Random(0)
+    texts = [
+        file.read_text() for folder in ("launch", "calib/d4d") for file in (ROOT / folder).glob("*.yaml")
+    ]
+    refused = 0
+    for _ in range(1000):
+        text = list(rng.choice(texts)[:400])
+        for _ in range(rng.randint(1, 4)):
+            text[rng.randrange(len(text))] = rng.choice("&*[]{}:-!|>'\"#%@`\n\t ,?<a0\\")
+        try:
+            parse_yaml("".join(text), "file")
+        except UsageError as error:
+            assert "\n" not in str(error) and len(str(error)) < LONGEST
+            refused += 1
+    assert 100 < refused < 1000
+
+
+# ---- files -----------------------------------------------------------------------------------------------
+
+
+def as_launch(text: str, folder: Path) -> object:
+    (folder / "launch.yaml").write_text(text)
+    return load_launch(folder)
+
+
+def as_override(text: str, folder: Path) -> object:
+    return load_launch(None, [f"source:={text}"])
+
+
+def as_calibration(text: str, folder: Path) -> object:
+    for side in ("left", "right"):
+        (folder / f"{side}.yaml").write_text((ROOT / f"calib/d4d/{side}.yaml").read_text() + text)
+    return load_rig(folder)
+
+
+def as_opencv(text: str, folder: Path) -> object:
+    (folder / "rig.yml").write_text(f"%YAML:1.0\n---\n{text}")
+    return read_rig(folder / "rig.yml")
+
+
+def as_scene(text: str, folder: Path) -> object:
+    from sags_node.overlay.scene import read_scene
+
+    (folder / "scene.yaml").write_text(text)
+    return read_scene(folder / "scene.yaml")
+
+
+def as_bag(text: str, folder: Path) -> object:
+    (folder / "metadata.yaml").write_text(text)
+    return storage_files(folder)
+
+
+def as_network(text: str, folder: Path) -> object:
+    from sags_node.config.schema import OnnxConfig
+    from sags_node.vision.onnx_format import read_format
+
+    (folder / "net.yaml").write_text(text)
+    return read_format(OnnxConfig(path=folder / "net.onnx"), {})
+
+
+Reader = Callable[[str, Path], object]
+READERS: list[Reader] = [as_launch, as_override, as_calibration, as_opencv, as_scene, as_bag, as_network]
+
+
+@pytest.mark.parametrize("read", READERS)
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("a: 1\na: 2\n", "given twice"),
+        ("a: &a\n  kind: *a\n", "it contains itself, through an alias"),
+        (BOMB, "values, with its aliases unfolded"),
+    ],
+    ids=["twice", "itself", "bomb"],
+)
+def test_every_reader_is_this_one(read: Reader, text: str, said: str, tmp_path: Path) -> None:
+    message = refusal(lambda: read(text, tmp_path))
+    assert said in message.replace(str(tmp_path), "")
+
+
+def test_a_section_of_a_launch_file_may_stand_in_two_places(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its paths become relative to the file once."""
+    monkeypatch.chdir(tmp_path)
+    folder = Path("sub")
+    folder.mkdir()
+    config: Any = as_launch("vision: {onnx: &n {path: net.onnx}, tissue: *n}\n", folder)
+    assert config.vision.onnx.path == config.vision.tissue.path == folder / "net.onnx"
+
+
+def test_a_value_of_any_size_is_shown_in_short(tmp_path: Path) -> None:
+    many = ", ".join(["[x, y]"] * 2000)
+    message = refusal(lambda: as_launch(f"mapping: {{budget_ms: [{many}]}}", tmp_path))
+    assert "mapping.budget_ms" in message
+
+
+def test_a_thousand_mistakes_are_not_all_told(tmp_path: Path) -> None:
+    with pytest.raises(UsageError) as caught:
+        as_launch("".join(f"key{number}: 1\n" for number in range(1000)), tmp_path)
+    lines = str(caught.value).splitlines()
+    assert len(lines) == 11 and lines[-1].endswith("and 990 more")
+
+
+def test_what_is_no_plain_file_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.yaml")
+    (tmp_path / "folder.yaml").mkdir()
+    for name, said in (("pipe.yaml", "a pipe"), ("folder.yaml", "a folder"), ("gone.yaml", "No such file")):
+        assert said in refusal(lambda name=name: read_yaml(tmp_path / name, "launch file"))  # type: ignore[misc]
+    assert "a device" in refusal(lambda: read_yaml(Path("/dev/zero"), "launch file"))
+    (tmp_path / "large.yaml").write_bytes(b"#" * (1 << 20) + b"\n")
+    assert "bytes" in refusal(lambda: read_yaml(tmp_path / "large.yaml", "launch file"))
