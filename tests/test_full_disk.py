@@ -13,16 +13,12 @@ import pytest
 from command_line import refused, sags
 from engine_scenes import camera, random_gaussians
 from places import ROOT
-from sags_node.learning import onnx_file, training
-from sags_node.learning.material import Material
-from sags_node.learning.network import StereoNetwork
 from small_disk import fill, small_disk
 from tiny_archive import write_tiny_session
 
 from sags_lab.lerobot.dataset import merge
 from sags_node.cli.launching import write_json
 from sags_node.errors import SagsError
-from sags_node.files import whole
 from sags_node.model.ply import write_ply
 from sags_node.overlay.save import Output
 from sags_node.rig.hand_eye import HandEye, save_hand_eye
@@ -111,16 +107,6 @@ def test_what_stood_there_stays(disk: Path, tiny: Path) -> None:
     assert there(disk) == {"x.ply", "x.json"}
 
 
-def a_checkpoint(disk: Path) -> None:
-    trainer = training.Trainer(Material([], []), 1)
-    trainer.save(disk / "state.pt")
-
-
-def a_network(disk: Path) -> None:
-    with whole(disk / "x.onnx") as partial:
-        onnx_file.export(StereoNetwork(), partial, "nothing")
-
-
 def a_still(disk: Path) -> None:
     output = Output(disk / "x.png")
     output.add(np.random.default_rng(0).integers(0, 255, (256, 320, 3), np.uint8), True, 1 / 30)
@@ -145,8 +131,6 @@ def a_data_set(disk: Path) -> None:
 
 WRITERS: dict[str, Callable[[Path], Any]] = {
     "the node's model": lambda disk: write_ply(disk / "x.ply", random_gaussians(0, 1000, camera())),
-    "a training's state": a_checkpoint,
-    "a network": a_network,
     "the overlay's picture": a_still,
     "the overlay's video": a_video,
     "a hand-eye calibration": lambda disk: save_hand_eye(HandEye(np.eye(4)), disk / "rig", {}),

@@ -18,6 +18,7 @@ from numbered_pictures import HEIGHT, WIDTH, picture, recordings
 from sags_node.config import schema as cfg
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import open_file
+from sags_node.media import picture_file
 from sags_node.media.native_output import native_output
 from sags_node.media.picture_header import claimed_size, is_whole
 from sags_node.overlay.mesh import mesh_of
@@ -89,8 +90,12 @@ def test_a_bad_picture_is_one_message_that_names_it(
 
 
 def test_what_a_decoder_says_of_a_picture_that_it_can_read_is_logged_once(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+    tmp_path: Path,
+    capfd: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr(picture_file, "_complaints", picture_file._Complaints())
     for name, content in (
         ("1.png", png(extra=chunk(b"iCCP", b"x\0\0garbage"))),
         ("2.png", png(extra=chunk(b"iCCP", b"y\0\0garbage"))),

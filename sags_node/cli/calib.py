@@ -160,9 +160,9 @@ def convert(
 
     if path.resolve() in (file.resolve() for file in (out, *eye_files(out))):
         raise UsageError(f"{out} is what is converted, and would be replaced; name another folder")
-    check_files(*eye_files(out), force=force)
     rig = resized_rig(read_rig(path, size, UNITS.get(unit or "")), scale)
     refuse_errors(check_rig(rig), path)
+    check_files(*eye_files(out), force=force)
     save_rig(rig, out)
     console.print(
         f"calibration: [bold]{escape(str(out))}[/], {rig.left.width}x{rig.left.height} px, baseline "

@@ -307,7 +307,7 @@ def test_the_bench_measures_the_phantom(tmp_path: Path) -> None:
 
 def test_a_feed_that_freezes_is_warned_of_within_half_a_second(tmp_path: Path) -> None:
     file = tmp_path / "table.json"
-    result = bench(SESSION, "source.frames:=36", "--only", "frozen", "--from", 12, "--json", file)
+    result = bench(SESSION, "source.frames:=36", "--only", "frozen", "--from", 12, "--out", file)
     assert result.exit_code == 0, result.output
     (row,) = json.loads(file.read_text())["rows"]
     assert row["warned_of"] == ["picture_frozen"]

@@ -157,7 +157,7 @@ def test_live_takes_new_views_that_are_held_still(chess_pairs: list[tuple[U8, U8
     assert len(list((out / "views/left").iterdir())) == len(list((out / "views/right").iterdir())) == 8
     assert load_rig(out).baseline == pytest.approx(known_rig().baseline, rel=0.02)
     code, _, err = sags("--live", launch, *BOARD, "-o", out)
-    assert code == 2 and "is not empty" in err
+    assert code == 2 and "exists already" in err
 
 
 # ---- clear messages --------------------------------------------------------------------------------------

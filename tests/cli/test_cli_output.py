@@ -17,7 +17,6 @@ import click
 import pytest
 from command_line import pure_json, refused, sags
 from places import ROOT
-from sags_node.cli.bench import bench
 from user_files import videos
 
 from sags_node.cli.main import main
@@ -54,10 +53,6 @@ def test_older_figures_stay_when_the_run_fails(tmp_path: Path) -> None:
 WRITERS = [  # commands, and their options for one file
     ("eval", "--out"),
     ("eval --protocol stir DATA", "--out"),
-    *((f"bench {name}", "--out") for name in bench.commands if name != "transport"),
-    ("bench alias", "--picture"),
-    ("bench depth", "--plot"),
-    ("bench pareto", "--plot"),
     ("archive scan FOLDER", "--out"),
     ("archive costs SESSION --frames 4", "--out"),
     ("export", "--splats"),
@@ -69,7 +64,6 @@ WRITERS = [  # commands, and their options for one file
     ("overlay", "--out"),
     ("calib live SESSION", "--out"),
     ("bridge foxglove", "--layout"),
-    ("train depth", "--out"),
 ]
 ENDINGS = {"--splats": "ply", "--points": "ply", "--mesh": "ply", "--orbit": "mp4"}
 

@@ -247,4 +247,4 @@ def test_what_is_not_finite_chooses_no_tile(value: float) -> None:
     scene[0][:3, :TILE_HEIGHT, :TILE_WIDTH] = value
     tiles = chosen(scene, 0.9)
     np.testing.assert_array_equal(tiles, worst_tiles(*scene, 0.9))
-    assert not tiles[0, 0, 0]
+    assert not tiles[0, 0]

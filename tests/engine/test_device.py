@@ -122,7 +122,8 @@ def test_a_missing_gpu_ends_the_command_with_one_message(
     for command in (["run"], ["eval", "--pace", "step"], ["fit"]):
         result = CliRunner().invoke(main, [*command, str(phantom_session), "device:=cuda"])
         assert result.exit_code == 2 and result.stdout == ""
-        assert result.stderr.startswith("error: device: cuda cannot be used: this machine has no NVIDIA GPU")
+        said = result.stderr.splitlines()[-1]
+        assert said.startswith("error: device: cuda cannot be used: this machine has no NVIDIA GPU")
 
 
 def test_a_usable_gpu_is_chosen_and_gets_more_gaussians(machine: pytest.MonkeyPatch) -> None:

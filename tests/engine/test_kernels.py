@@ -108,7 +108,7 @@ def test_inspect(scene: dict[str, np.ndarray], crowded: bool) -> None:
     quats, scales, contribution = (np.ascontiguousarray(r[:, k]) for k in (slice(4), slice(4, 7), 7))
     smoothing, weight = np.full(N, 1e-9, np.float32), np.full((N, 4), 0.25, np.float32)
     arguments = (s["means"], quats, scales, smoothing, weight, s["opacities"], s["colors"], contribution,
-                 s["cam0"], s["tissue"], s["depth"], crowded)  # fmt: skip
+                 s["cam0"], s["tissue"], s["depth"], True, crowded)  # fmt: skip
     front, remove = np.full((2, N), 2, np.int32), np.zeros((2, N), bool)
     densify._inspect(*arguments, front[0], remove[0])
     densify._inspect.py_func(*arguments, front[1], remove[1])

@@ -325,4 +325,5 @@ def test_the_command_without_a_gpu(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(devices, "find_gpu", lambda: missing)
     result = sags_fit(write_clip(tmp_path / "sheet"), "--out", tmp_path / "fit", "device:=cuda")
     assert result.exit_code == 2 and result.stdout == ""
-    assert result.stderr.startswith("error: device: cuda cannot be used: this machine has no NVIDIA GPU")
+    said = result.stderr.splitlines()[-1]
+    assert said.startswith("error: device: cuda cannot be used: this machine has no NVIDIA GPU")

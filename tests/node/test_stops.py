@@ -20,8 +20,8 @@ from typing import NamedTuple
 
 import pytest
 from command_line import FREE_PORTS, start, wait_for
-from sags_node.benchmark.kernels.contention import burning_core
 
+from benchmarks.kernels.contention import burning_core
 from sags_node.config.schema import PhantomSource
 from sags_node.phantom import write_session
 
