@@ -16,7 +16,7 @@ DEBIAN_TESTS := chromium g++ cmake pkg-config cppzmq-dev libmsgpack-cxx-dev fake
 missing = $(shell for p in $(1); do dpkg -s $$p >/dev/null 2>&1 || echo $$p; done)
 apt_install = apt-get update -qq && apt-get install -y -qq --no-install-recommends $(1) >/dev/null
 
-.PHONY: setup run test computed test-targets test-tools simulate stops soak fuzz wheel-test sbom audit licences lint golden docs clean
+.PHONY: setup run test test-all test-targets test-tools simulate stops soak fuzz wheel-test sbom audit licences lint golden docs clean
 
 setup: $(STAMP)
 
@@ -39,15 +39,15 @@ $(STAMP): pyproject.toml constraints.txt
 run: setup
 	$(BIN)/sags demo
 
-# What only computes runs beside anything; what has sockets and clocks waits a lot, so two such files run at a time;
-# what measures time has the machine for itself.
-test: setup test-tools
-	$(MAKE) --no-print-directory -j2 lint computed
-	$(BIN)/python -m pytest -m 'live and not alone' -n 2 --dist loadfile
-	$(BIN)/python -m pytest -m alone
+# What must pass before a change goes in. What has sockets and clocks waits a lot, so three such files run at a time.
+test: setup test-tools lint
+	$(BIN)/python -m pytest -m 'not live and not beside' -n 2 --dist worksteal
+	$(BIN)/python -m pytest -m 'live and not beside and not alone' -n 3 --dist loadfile
 
-computed: setup
-	$(BIN)/python -m pytest -m 'not live' -n 2 --dist loadfile
+# What `make test` leaves out: benchmarks, sags_lab, GPU kernels in an interpreter, and what needs the machine for itself.
+test-all: setup test-tools
+	$(BIN)/python -m pytest -m 'beside and not alone' -n 2 --dist loadfile
+	$(BIN)/python -m pytest -m alone
 
 # The kernels' tests for other processors than this one, on one and on two threads: a quarter of an hour.
 test-targets: setup

@@ -10,19 +10,31 @@ from pathlib import Path
 import pytest
 
 import sags_node.kernels.threads  # noqa: F401 - before torch: it says how idle workers wait, here as in a node
-from sags_node.config.schema import FoldersSource, PhantomSource
+from sags_node.config.schema import FoldersSource, LaunchConfig, PhantomSource
 from sags_node.phantom import write_session
 
 ROOT = Path(__file__).parent.parent
 
 
-def pytest_configure() -> None:
+def pytest_configure(config: pytest.Config) -> None:
     import torch
 
     signal.signal(signal.SIGINT, signal.default_int_handler)  # else children ignore it beside `&` in a script
 
     if not torch.cuda.is_available():
         os.environ["TRITON_INTERPRET"] = "1"  # read when a kernel is imported: they then run on the CPU
+    if config.getoption("numprocesses", None):  # this starts the workers: each would compile what is not kept
+        from sags_node.pipeline.warm_up import warm_up
+
+        warm_up(LaunchConfig())
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what is `beside` the node by its place."""
+    for item in items:
+        folder, name = item.path.relative_to(ROOT / "tests").parts[0], item.path.name
+        if folder in ("benchmarks", "lab") or name.startswith("test_cuda_"):
+            item.add_marker("beside")
 
 
 @pytest.fixture(scope="module")
