@@ -18,11 +18,12 @@ from typing import Any
 
 from benchmarks.kernels.contention import burning_core
 from benchmarks.node.neighbours import NS, STARTING, STOPPING, find_browser, overlay, reader, viewer
+from benchmarks.pareto.full_size import online_at
 from sags_node.errors import SagsError
 from sags_node.evaluation.measure import Options
 from sags_node.evaluation.session import measure, run_realtime
 from sags_node.evaluation.spool import Spool
-from sags_node.pipeline.session import open_session
+from sags_node.pipeline.session import at_best_scale, open_session
 from sags_node.pipeline.warm_up import warm_up
 
 MEASURING = 600.0  # s to measure a run beyond its length
@@ -117,14 +118,25 @@ def _live(launch: str | None, overrides: list[str], run_dir: str) -> Row:
     live = ["source.loop:=false", "source.pace:=realtime", "mapping.iterations:=null", f"ns:={NS}"]
     session = open_session(launch, [*overrides, *sockets, *live])
     warm_up(session.config)
+    full = session.config.vision.model_copy(update={"scale": 1.0})
+    session = at_best_scale(session)
     options = Options(hold_out=0)
     with Spool() as spool:
         run_realtime(session, session.config.publish, options, spool, lambda what, frames: None)
         outcome = measure(session, spool, options)
+        online = online_at(
+            full.working_size(session.rig.left.width, session.rig.left.height),
+            session,
+            spool,
+            options,
+            lambda what, frames: None,
+        )
     after = outcome.rows[round(session.source.rate) :]
     summary = outcome.summary
     kept = ("first_render_ms", "frame_ms", "latency_ms", "online", "gaussians", "rungs")
     return {
         "share_after_first_second": sum(row.facts is not None for row in after) / max(1, len(after)),
         **{key: summary[key] for key in kept},
+        "size": list(session.working_size),
+        "online_at_full_size": online,
     }

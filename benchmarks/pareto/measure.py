@@ -10,10 +10,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-import cv2
-
 from benchmarks.node.hosts import measure_hosts
 from benchmarks.pareto.baselines import baselines_of_run, measured_baselines
+from benchmarks.pareto.full_size import online_at
 from benchmarks.pareto.settings import (
     HOSTS,
     RUNG_PART,
@@ -23,19 +22,13 @@ from benchmarks.pareto.settings import (
     skip_settings,
     time_settings,
 )
-from sags_node.engine.rasterizer.rasterize import make_rasterizer, to_view
 from sags_node.errors import SagsError
-from sags_node.evaluation import metrics
-from sags_node.evaluation.measure import FrameRow, Progress
+from sags_node.evaluation.measure import Progress
 from sags_node.evaluation.provenance import machine_name
 from sags_node.evaluation.session import measure, run_step
 from sags_node.evaluation.spool import Spool
-from sags_node.evaluation.summary import summarise
 from sags_node.pipeline.session import Session, open_session
 from sags_node.pipeline.warm_up import warm_up
-from sags_node.sources.source import open_source
-from sags_node.vision.rectify import Rectifier
-from sags_node.vision.tissue import TissueMask
 
 SHORTEST = 3  # frames: the first one, in which the model is made, has times of its own
 KEPT = (
@@ -183,7 +176,7 @@ class _Comparison:
         summary = measure(session, spool, self._sweep.options, setting.overrides, progress).summary
         at_full_size = summary["online"]
         if session.working_size != self._size:
-            at_full_size = self._at_full_size(session, spool, progress)
+            at_full_size = online_at(self._size, session, spool, self._sweep.options, progress)
         if at_full_size["psnr"] is None:
             raise SagsError(
                 f"{session.name}: no frame shows tissue, so there is nothing to compare; see vision.tissue"
@@ -195,30 +188,6 @@ class _Comparison:
             **{key: summary[key] for key in KEPT},
             "online_at_full_size": at_full_size,
         }
-
-    def _at_full_size(self, session: Session, spool: Spool, progress: Progress) -> Row:
-        """The figures `online` of a run at a smaller size, with its Gaussians drawn at the default's size and
-        compared with pictures of that size: only so do sizes compare."""
-        config = session.config
-        rectifier = Rectifier(session.rig, *self._size)
-        tissue_of = TissueMask(config.vision.tissue, rectifier)
-        rasterizer = make_rasterizer(config.engine.backend, *self._size)
-        places = {frame_id: place for place, frame_id in enumerate(spool.frame_ids)}
-        rows = []
-        with open_source(config.source.model_copy(update={"pace": "step"}), references=False) as frames:
-            for frame in frames:
-                place = places.get(frame.frame_id)
-                if place is None:
-                    continue
-                pair = rectifier(frame)
-                planes = rasterizer.forward(spool.read(place).snapshot.gaussians, pair.camera)
-                view = to_view(planes, pair.camera, 0, 0)
-                shown = metrics.as_float(cv2.convertScaleAbs(view.rgb, alpha=255))
-                quality = metrics.psnr(shown, metrics.as_float(pair.left), tissue_of(frame, pair))
-                rows.append(FrameRow(frame.frame_id, 0.0, {"online": {"psnr": quality}}))
-                progress("measuring at full size", len(rows))
-        online: Row = summarise(session.name, rows, self._sweep.options, config.segments, None)["online"]
-        return online
 
     def _open(self, overrides: Sequence[str]) -> Session:
         def rendering(done: int, of: int) -> None:

@@ -38,7 +38,7 @@ def picture(measured: Row) -> bytes:
 
 def _panel(axes: Axes, session: Row) -> list[Row]:
     """Draws the points of a recording; returns their rows."""
-    live = [row | {"online_at_full_size": row["online"], "non_dominated": False} for row in session["hosts"]]
+    live = [row | {"non_dominated": False} for row in session["hosts"]]
     rows = [*session["settings"], *live]
     rate = session["rate_hz"]
     axes.set_title(

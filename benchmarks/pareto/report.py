@@ -73,7 +73,7 @@ def _skips(session: Row) -> Table:
 def _hosts(session: Row) -> Table:
     made = _table(
         session, "host", "frames after the first second", "first render, ms", "frame, ms: p50", "p99",
-        "latency, ms: p50", "p99", "online, dB", "N",
+        "latency, ms: p50", "p99", "size, px", "online at full size, dB", "N",
     )  # fmt: skip
     for row in session["hosts"]:
         made.add_row(
@@ -85,7 +85,8 @@ def _hosts(session: Row) -> Table:
                 for key in ("frame_ms", "latency_ms")
                 for place in ("p50", "p99")
             ),
-            _decibels(row["online"], list(session["segments"])),
+            "x".join(map(str, row["size"])),
+            _decibels(row["online_at_full_size"], list(session["segments"])),
             _number(row["gaussians"]["mean"], ",.0f"),
         )
     return made

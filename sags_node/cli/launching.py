@@ -69,7 +69,7 @@ def split_recording(arguments: Sequence[str], no_cameras: str) -> tuple[str | No
 def open_launched(path: str | None, overrides: Sequence[str]) -> Session:
     """Open a session and make its kernels ready; says what is played, what takes long and what it runs on."""
     from sags_node.mapping.devices import device_of
-    from sags_node.pipeline.session import open_session
+    from sags_node.pipeline.session import at_best_scale, open_session
     from sags_node.pipeline.warm_up import warm_up
 
     with progress("rendering the phantom (once)") as advance:
@@ -77,7 +77,9 @@ def open_launched(path: str | None, overrides: Sequence[str]) -> Session:
     console.print(source_text(session.config.source), markup=False, soft_wrap=True)
     with console.status("loading kernels (compiled once per machine, about half a minute)"):
         warm_up(session.config)
-    console.print(_runs_on(device_of(session.config)), soft_wrap=True)
+    session = at_best_scale(session)
+    width, height = session.working_size
+    console.print(f"{_runs_on(device_of(session.config))}, pictures of {width}x{height} px", soft_wrap=True)
     return session
 
 

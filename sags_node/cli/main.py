@@ -174,7 +174,7 @@ def demo(launch: tuple[str, ...], seconds: float, out: Path, json_out: bool) -> 
     """
     from sags_node.demo import VIDEO, run_demo
     from sags_node.evaluation.report import check_report
-    from sags_node.pipeline.session import open_session
+    from sags_node.pipeline.session import at_best_scale, open_session
 
     no_cameras = "sags demo plays recordings; for cameras use sags run and sags overlay"
     path, overrides = split_recording(launch, no_cameras)
@@ -189,7 +189,7 @@ def demo(launch: tuple[str, ...], seconds: float, out: Path, json_out: bool) -> 
             "publish.control:=tcp://127.0.0.1:*",
             f"publish.run_dir:={private}",
         ]
-        session = open_session(path, [*forced, *overrides])
+        session = at_best_scale(open_session(path, [*forced, *overrides]))
         try:
             with progress("playing") as advance:
                 outcome = run_demo(session, out, advance)

@@ -593,6 +593,11 @@ class VisionConfig(Section):
         le=4096,
         description="px; default: the calibration's, or what keeps its proportions where vision.width is set",
     )
+    scale: Literal["auto"] | Annotated[float, Field(ge=0.25, le=1)] = Field(
+        "auto",
+        description="share of that size that is worked at and published. auto: where frames come in "
+        "real time what shows most on this machine, from 1 down to 0.25; else 1",
+    )
     stereo: StereoConfig = StereoConfig()
     onnx: OnnxConfig = OnnxConfig()
     tissue: TissueConfig = TissueConfig()
@@ -605,12 +610,13 @@ class VisionConfig(Section):
 
     def working_size(self, width: int, height: int) -> tuple[int, int]:
         """Width and height of the pictures that are worked on, for a camera of `width` x `height` px. Where
-        one is set, the other keeps the proportions."""
+        one is set, the other keeps the proportions. A scale that is still to be chosen counts as 1."""
         if self.width is not None:
-            return self.width, self.height or round(height * self.width / width)
-        if self.height is not None:
-            return round(width * self.height / height), self.height
-        return width, height
+            width, height = self.width, self.height or round(height * self.width / width)
+        elif self.height is not None:
+            width, height = round(width * self.height / height), self.height
+        scale = 1.0 if self.scale == "auto" else self.scale
+        return round(scale * width), round(scale * height)
 
 
 class EngineConfig(Section):

@@ -20,7 +20,7 @@ from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.devices import affordable, device_of
 from sags_node.node.node import Node
 from sags_node.pipeline.pipeline import Pipeline
-from sags_node.pipeline.session import Session, open_posed, open_session
+from sags_node.pipeline.session import Session, at_best_scale, open_posed, open_session
 from sags_node.pipeline.warm_up import warm_up
 from sags_node.sources.source import Source
 from sags_node.terminal.console import stop_signals
@@ -76,14 +76,14 @@ def evaluate(
     session = open_session(
         launch, [*overrides, *forced], lambda done, total: progress("rendering the phantom (once)", done)
     )
-    config = session.config
     progress("loading kernels", 0)
-    warm_up(config)
+    warm_up(session.config)
+    session = at_best_scale(session)
     with Spool() as spool:
         if pace == "realtime":
             # Its own sockets, away from those of a node that may be running on this machine.
             private = {"data": (), "ipc": True, "control": None, "run_dir": spool.folder / "run"}
-            publish = config.publish.model_copy(update=private)
+            publish = session.config.publish.model_copy(update=private)
             run_realtime(session, publish, options, spool, progress)
         else:
             run_step(session, options, spool, progress)

@@ -10,13 +10,12 @@ from sags_node.engine.device import Device, choose_device
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.errors import UsageError
 from sags_node.mapping.budget import Budget, StepBudget, TimeBudget
-from sags_node.mapping.ladder import EVERYTHING, RUNGS, Ladder, Rung
+from sags_node.mapping.ladder import EVERYTHING, PIXELS_PER_GAUSSIAN, RUNGS, Ladder, Rung, best_scale
 from sags_node.mapping.refiner import CpuRefiner, Refiner
 from sags_node.mapping.speed import SAMPLE_SIZE, measured_speed
 
 GPU_SPEED = 10.0  # times two CPU cores, in Gaussians of a rung: an ESTIMATE, never run on a GPU
 GAUSSIANS_PER_MS = 1100  # of the budget, where the number of steps is fixed; see benchmarks/mapping.md
-PIXELS_PER_GAUSSIAN = 2  # fewer pixels have no more to tell
 
 
 def device_of(config: LaunchConfig) -> Device:
@@ -71,6 +70,25 @@ def make_budget(
     if speed is None:
         speed = measured_speed(make_rasterizer(config.engine.backend, *SAMPLE_SIZE))
     return TimeBudget(Ladder(rungs_of(config), width * height, 1e-3 * mapping.frame_ms(rate), speed))
+
+
+def with_scale(config: LaunchConfig, width: int, height: int, rate: float | None) -> LaunchConfig:
+    """The launch with its `vision.scale` chosen, where that is still to be done.
+
+    In real time on a CPU by the speed of this machine, which is measured; else 1, so that results repeat.
+
+    Args:
+        width, height: px of the working size at scale 1.
+        rate: frames that come a second.
+    """
+    if config.vision.scale != "auto":
+        return config
+    scale = 1.0
+    if config.in_real_time and config.mapping.iterations is None and device_of(config).kind == "cpu":
+        speed = measured_speed(make_rasterizer(config.engine.backend, *SAMPLE_SIZE))
+        seconds = 1e-3 * config.mapping.frame_ms(rate)
+        scale = best_scale(rungs_of(config), width * height, seconds, speed)
+    return config.model_copy(update={"vision": config.vision.model_copy(update={"scale": scale})})
 
 
 def make_refiner(config: LaunchConfig, width: int, height: int) -> Refiner:

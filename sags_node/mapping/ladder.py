@@ -72,6 +72,10 @@ FIRST_LOOKS = (4, 8, 16, 30)  # frames after which the rung may jump; later it g
 FIRST_FRAMES = FIRST_LOOKS[-1]
 
 
+SCALES = (1.0, 0.75, 0.5, 0.375, 0.25)  # of the working size, that a machine may choose from
+PIXELS_PER_GAUSSIAN = 2  # fewer pixels have no more to tell
+
+
 def price(rung: Rung, gaussians: float, pixels: int) -> float:
     """What a frame costs, ms on the machine of the constants.
 
@@ -85,6 +89,23 @@ def price(rung: Rung, gaussians: float, pixels: int) -> float:
     return (
         vision + drawn * (DRAWN * (1 + rung.redraw) + STEPPED * rung.step) + PER_THOUSAND * 1e-3 * gaussians
     )
+
+
+def best_scale(rungs: Sequence[Rung], pixels: int, seconds: float, speed: float) -> float:
+    """Which of `SCALES` shows most. A smaller picture costs less, so it affords more Gaussians; but many
+    Gaussians in few pixels show no more than the pixels do. `benchmarks/ladder.md` has the measurements.
+
+    Args:
+        pixels: of the picture at scale 1.
+        seconds, speed: see `Ladder`.
+    """
+    shown = {SCALES[-1]: 0.0}
+    for scale in SCALES:
+        worked = scale**2 * pixels
+        ladder = Ladder(rungs, round(worked), seconds, speed)
+        if ladder.fits:
+            shown[scale] = 1 / (1 / (USED * ladder.rung.gaussians) + PIXELS_PER_GAUSSIAN / worked)
+    return max(shown, key=shown.__getitem__)
 
 
 class Ladder:
@@ -128,6 +149,11 @@ class Ladder:
     @property
     def rung(self) -> Rung:
         return self._rungs[self.place]
+
+    @property
+    def fits(self) -> bool:
+        """Whether a frame's time is expected to do for the rung."""
+        return self._expected(self.place) <= 1e3 * self.seconds
 
     @property
     def state(self) -> RungState:

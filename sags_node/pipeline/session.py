@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from sags_node.config.launch_file import load_launch
 from sags_node.config.schema import BagSource, EndoNerfSource, LaunchConfig, PhantomSource, Ros2Source
 from sags_node.errors import UsageError
+from sags_node.mapping.devices import with_scale
 from sags_node.rig import load_camera, load_rig
 from sags_node.sources.robot import Posed
 from sags_node.sources.source import Source, open_source, recorded_rig
@@ -60,6 +61,12 @@ def open_session(
         rig = rig_of(config)
     source = open_posed(config, rig, references=False)
     return Session(_name(launch), config, rig, source)
+
+
+def at_best_scale(session: Session) -> Session:
+    """The session with its `vision.scale` chosen, see `with_scale`. Kernels must be ready: they are timed."""
+    config = with_scale(session.config, *session.working_size, session.source.rate)
+    return replace(session, config=config)
 
 
 def open_posed(config: LaunchConfig, rig: StereoRig, references: bool = True) -> Source:

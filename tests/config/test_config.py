@@ -112,7 +112,8 @@ def test_the_time_of_a_frame_is_that_until_the_next_unless_it_is_set() -> None:
 @pytest.mark.parametrize(
     ("asked", "size"),
     [({}, (960, 768)), ({"width": 480}, (480, 384)), ({"height": 256}, (320, 256)),
-     ({"width": 640, "height": 400}, (640, 400))],
+     ({"width": 640, "height": 400}, (640, 400)), ({"scale": 0.75}, (720, 576)),
+     ({"width": 480, "scale": 0.5}, (240, 192))],
 )  # fmt: skip
 def test_one_side_of_the_working_size_keeps_the_proportions(
     asked: dict[str, int], size: tuple[int, int]

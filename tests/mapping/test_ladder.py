@@ -11,16 +11,19 @@ import pytest
 
 from sags_node.config.schema import LaunchConfig, MappingConfig
 from sags_node.errors import UsageError
-from sags_node.mapping.devices import affordable, make_budget, rungs_of
+from sags_node.mapping import devices
+from sags_node.mapping.devices import affordable, make_budget, rungs_of, with_scale
 from sags_node.mapping.ladder import (
     FIRST_FRAMES,
     FULL,
     RUNGS,
+    SCALES,
     SETTLING,
     SPARE,
     USED,
     Ladder,
     Rung,
+    best_scale,
     price,
 )
 
@@ -190,3 +193,30 @@ def test_a_new_budget_goes_on_at_the_speed_of_the_one_before() -> None:
     config = LaunchConfig(device="cpu")
     fast, slow = (make_budget(config, 640, 512, speed).state for speed in (0.5, 2.0))
     assert fast is not None and slow is not None and fast.number > slow.number
+
+
+def test_the_slower_a_machine_the_smaller_its_pictures() -> None:
+    """By steps of two: rungs lie so far apart that less may change nothing, or too much."""
+    scales = [best_scale(RUNGS, FULL, SECONDS, speed) for speed in 0.1 * 2.0 ** np.arange(10)]
+    assert scales[0] == SCALES[0] and scales[-1] == SCALES[-1]  # at the last nothing fits
+    assert scales == sorted(scales, reverse=True)
+
+
+def test_many_gaussians_in_few_pixels_are_worth_no_less_of_the_picture() -> None:
+    """Where the top rung fits at every size, the largest shows most."""
+    assert best_scale(RUNGS[-1:], FULL, 10.0, 1.0) == 1.0
+
+
+def test_the_scale_is_chosen_in_real_time_only_and_never_over_a_person(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(devices, "measured_speed", lambda rasterizer: 1.6)
+
+    def chosen(**asked: object) -> object:
+        config = LaunchConfig.model_validate({"device": "cpu", **asked})
+        return with_scale(config, 640, 512, 30.0).vision.scale
+
+    assert chosen() == best_scale(RUNGS, FULL, PERIOD, 1.6) < 1
+    assert chosen(source={"kind": "phantom", "pace": "step"}) == 1.0  # results repeat
+    assert chosen(mapping={"iterations": 2}) == 1.0
+    assert chosen(vision={"scale": 0.5}) == 0.5 and chosen(vision={"scale": 1}) == 1
