@@ -27,7 +27,7 @@ from sags_node.config.schema import (
     SentSource,
 )
 
-PAGE = Path(__file__).with_name("launch.md")
+PAGE = Path(__file__).parents[1] / "launch.md"
 HEAD = """# Launch files
 
 <!-- Written by `make docs` from sags_node/config/schema.py. Change it there. -->
