@@ -18,14 +18,14 @@ HEAD = """# Faults
 
 <!-- Written by `make docs` from the marks of the tests. Change it there. -->
 
-What is broken in the tests, and what then happens. Each row is what its test asserts, and no more: an
-empty field says that the test does not look at it. [warnings.md](../warnings.md) says what to do about each
+What the tests break, and what then happens. Each row is what its test asserts, and no more: an
+empty field means that the test does not check it. [warnings.md](../warnings.md) says what to do about each
 warning, [security.md](../security.md#exit-codes) what the exit codes mean.
 
-- **sees**: what a consumer of the node, or whoever runs the command, gets meanwhile.
-- **says**: which warning, error or count tells of it.
+- **sees**: what a consumer of the node, or the user of the command, gets meanwhile.
+- **says**: which warning, error or count reports it.
 - **works again**: how long that takes, or what it takes.
-- **left**: what is the same afterwards, or is not left behind.
+- **left**: what is unchanged afterwards, or is not left behind.
 """
 
 

@@ -21,9 +21,9 @@ HEAD = """# Licences
 
 <!-- Written by `make licences` from what is installed. Change nothing here. -->
 
-Python packages that the product needs, and those that they need, with the licence that each states of itself.
-The product is under Apache-2.0 ([LICENSE](../../LICENSE)). "extra" names what brings a package where the product
-does without it: `pip install 'sags-node[EXTRA]'`. `make sbom` writes what an installation holds as CycloneDX.
+Python packages that the product needs, directly or indirectly, with the licence that each states.
+The product is under Apache-2.0 ([LICENSE](../../LICENSE)). "extra" names the extra that brings an
+optional package: `pip install 'sags-node[EXTRA]'`. `make sbom` writes what an installation holds as CycloneDX.
 
 | package | version | licence | extra |
 |---|---|---|---|
