@@ -22,8 +22,9 @@ HEAD = """# Licences
 <!-- Written by `make licences` from what is installed. Change nothing here. -->
 
 Python packages that the product needs, directly or indirectly, with the licence that each states.
-The product is under Apache-2.0 ([LICENSE](../../LICENSE)). "extra" names the extra that brings an
-optional package: `pip install 'sags-node[EXTRA]'`. `make sbom` writes what an installation holds as CycloneDX.
+The product is under Apache-2.0 ([LICENSE](../../LICENSE)). "extra" names the extra of an
+optional package: `pip install 'sags-node[EXTRA]'`. `make sbom` writes the contents of an installation
+as CycloneDX.
 
 | package | version | licence | extra |
 |---|---|---|---|
