@@ -88,10 +88,10 @@ lint: setup
 golden: setup
 	$(BIN)/python -m pytest tests/evaluation/test_replay.py --update-golden -s
 
-# Rewrite the pages that are made: docs/launch.md from the configuration, docs/faults.md from the tests' marks.
+# Rewrite the pages that are made: docs/launch.md from the configuration, docs/dev/faults.md from the tests' marks.
 docs: setup
-	$(BIN)/python docs/launch_page.py
-	$(BIN)/python docs/faults_page.py
+	$(BIN)/python docs/dev/launch_page.py
+	$(BIN)/python docs/dev/faults_page.py
 
 # The wheel in an empty environment, and its demo: some minutes, 2 GB in out/wheel.
 wheel-test: setup
@@ -108,9 +108,9 @@ audit: wheel-test
 	out/wheel/venv/bin/pip freeze --exclude sags-node | sed 's/+.*//' > out/installed.txt
 	out/tools/bin/pip-audit -s osv --strict --no-deps --disable-pip -r out/installed.txt
 
-# Rewrite docs/licences.md from the packages that are installed here.
+# Rewrite docs/dev/licences.md from the packages that are installed here.
 licences: setup
-	$(BIN)/python docs/licences_page.py
+	$(BIN)/python docs/dev/licences_page.py
 
 clean:
 	rm -rf $(VENV) out build *.egg-info .pytest_cache .mypy_cache .ruff_cache

@@ -1,4 +1,4 @@
-"""Documents name files, threads and layers as they are."""
+"""Documents name files, threads, rooms and each other as they are."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ import pytest
 from places import ROOT
 
 PACKAGE = ROOT / "sags_node"
-PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("benchmarks/*.md")])
+PAGES = sorted(
+    page for place in ("*.md", "docs/**/*.md", "benchmarks/*.md", "calib/*.md") for page in ROOT.glob(place)
+)
 ARCHITECTURE = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
 FILES = [*PACKAGE.rglob("*.py"), *(ROOT / "sags_lab").rglob("*.py")]
 SOURCES = {file.relative_to(ROOT).as_posix(): file.read_text("utf-8") for file in FILES}
@@ -43,6 +45,13 @@ def paths(text: str) -> set[str]:
     return set(re.findall(r"`([\w./-]+(?:\.py|/))`", text))
 
 
+def anchors(page: Path) -> set[str]:
+    """What may stand behind `#` in a link to a page: its titles as GitHub writes them."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    titles = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
 def starts_one(source: str) -> bool:
     """Whether a module starts a thread or a process."""
     for node in ast.walk(ast.parse(source)):
@@ -58,8 +67,35 @@ def test_every_file_that_is_named_exists(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     named = {path for path in paths(text) if path.partition("/")[0] in FOLDERS}
     assert sorted(path for path in named if not (ROOT / path).exists()) == []
-    links = re.findall(r"\]\((?!https?:|#)([^)#\s]+)", text)
-    assert sorted(link for link in links if not (page.parent / link).exists()) == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_link_leads_to_a_file_and_to_a_title_in_it(page: Path) -> None:
+    links = re.findall(r"\]\((?!https?:)([^)#\s]*)(?:#([^)\s]*))?\)", page.read_text(encoding="utf-8"))
+    for link, anchor in links:
+        target = page.parent / link if link else page
+        assert target.exists(), link
+        if anchor:
+            assert anchor in anchors(target), f"{link}#{anchor}"
+
+
+def test_every_page_is_in_the_index_and_every_page_that_a_program_names_exists() -> None:
+    index = (ROOT / "docs/README.md").read_text(encoding="utf-8")
+    pages = {page.relative_to(ROOT / "docs").as_posix() for page in ROOT.glob("docs/**/*.md")} - {"README.md"}
+    assert pages == {link for link in re.findall(r"\]\(([^)#]+\.md)", index) if not link.startswith("..")}
+    places = ("sags_node", "sags_lab", "benchmarks", "examples", "launch", "tests")
+    endings = {".py", ".js", ".yaml", ".cpp", ".cs", ".md"}
+    files = [file for place in places for file in (ROOT / place).rglob("*") if file.suffix in endings]
+    named = {name for file in files for name in re.findall(r"docs/([\w/-]+\.md)", file.read_text("utf-8"))}
+    assert len(named) > 8  # they were found
+    assert named - pages - {"README.md"} == set()
+
+
+def test_the_house_has_the_rooms_that_are_drawn() -> None:
+    drawn = section("The house").split("sags_lab/")[0].split("sags_node/\n")[1]
+    there = {file.name for file in PACKAGE.glob("*.py")} - {"__init__.py"}
+    there |= {f"{init.parent.name}/" for init in PACKAGE.glob("*/__init__.py")}
+    assert set(re.findall(r"(?:^ {4}| )(\w+/|\w+\.py)(?=[ \n])", drawn, re.MULTILINE)) == there
 
 
 def test_every_name_stands_in_the_file_that_is_named_before_it() -> None:

@@ -13,12 +13,12 @@ from places import ROOT
 @pytest.fixture(scope="module")
 def made() -> dict[str, Any]:
     """What `make docs` writes the page with."""
-    return runpy.run_path(str(ROOT / "docs/faults_page.py"))
+    return runpy.run_path(str(ROOT / "docs/dev/faults_page.py"))
 
 
 def test_the_page_is_of_these_tests(made: dict[str, Any]) -> None:
-    written = (ROOT / "docs/faults.md").read_text(encoding="utf-8")
-    assert written == made["page"](), "docs/faults.md is stale; write it anew with: make docs"
+    written = (ROOT / "docs/dev/faults.md").read_text(encoding="utf-8")
+    assert written == made["page"](), "docs/dev/faults.md is stale; write it anew with: make docs"
 
 
 def test_each_fault_is_shown_once_and_says_something(made: dict[str, Any]) -> None:

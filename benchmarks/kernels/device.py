@@ -39,7 +39,7 @@ QUICK = DeviceSettings(counts=(8,), sizes=((32, 16),), runs=1)
 
 
 def measure_device_kernels(settings: DeviceSettings, advance: Advance) -> dict[str, Any]:
-    """Everything that `settings` ask for; keys as docs/gpu.md lists them.
+    """Everything that `settings` ask for; keys as benchmarks/gpu.md lists them.
 
     Raises:
         UsageError: there is no GPU that can be used, or only Triton's interpreter for a scene of real size.

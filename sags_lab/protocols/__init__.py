@@ -1,1 +1,1 @@
-"""`sags eval --protocol`: public data sets in their own layouts, by their own rules (docs/protocols.md)."""
+"""`sags eval --protocol`: public data sets in their own layouts, by their own rules (docs/evaluation.md)."""

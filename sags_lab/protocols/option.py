@@ -14,7 +14,7 @@ from sags_node.terminal.console import progress, show
 protocol_option = click.option(
     "--protocol",
     type=click.Choice(["d4d", "endonerf", "scared", "stereomis", "stir"]),
-    help="Measure a public data set, in its own layout, by its own rules (docs/protocols.md).",
+    help="Measure a public data set, in its own layout, by its own rules (docs/evaluation.md).",
 )
 
 

@@ -82,8 +82,8 @@ def overlay(json_out: bool, **options: Any) -> None:
     """Publish geometry held by the tissue, for both eyes.
 
     It is tested against the depth of the tissue, hidden behind instruments, and blank as soon as anything it
-    needs is stale. The node may be started later and restarted. docs/wire.md says what is published and how a
-    scene file looks.
+    needs is stale. The node may be started later and restarted. docs/overlay.md describes the scene file,
+    docs/wire.md what is published.
     """
     from sags_node.overlay.run import Options, run_overlay
 

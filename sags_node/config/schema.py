@@ -524,7 +524,7 @@ class NetworkFormat(Section):
 
 
 class OnnxConfig(NetworkFormat):
-    """Depth from a network of the user's; docs/depth.md says what is recognised."""
+    """Depth from a network of the user's; docs/networks.md says what is recognised."""
 
     path: Path | None = Field(
         None, description="the .onnx file; null: depth is matched, as vision.stereo says"

@@ -171,7 +171,7 @@ _KNOWN: tuple[tuple[Callable[[Path], bool], Contents], ...] = (
         _is_stereomis_tracking,
         Contents(
             "a sequence of StereoMIS-Tracking",
-            "sags eval --protocol stereomis FOLDER follows its points (docs/protocols.md)",
+            "sags eval --protocol stereomis FOLDER follows its points (docs/evaluation.md)",
         ),
     ),
     (
@@ -179,7 +179,7 @@ _KNOWN: tuple[tuple[Callable[[Path], bool], Contents], ...] = (
         Contents(
             "clips of D4D",
             "sags eval --protocol d4d FOLDER measures them; to play one, give its left_images_rect and "
-            "right_images_rect as source.kind folders (docs/protocols.md)",
+            "right_images_rect as source.kind folders (docs/evaluation.md)",
         ),
     ),
     (
@@ -187,7 +187,7 @@ _KNOWN: tuple[tuple[Callable[[Path], bool], Contents], ...] = (
         Contents(
             "a sequence of StereoMIS",
             "sags eval --protocol stereomis FOLDER measures it; to play it, write a launch file with "
-            "source.geometry.layout over_under (docs/protocols.md)",
+            "source.geometry.layout over_under (docs/evaluation.md)",
         ),
     ),
     (
@@ -195,7 +195,7 @@ _KNOWN: tuple[tuple[Callable[[Path], bool], Contents], ...] = (
         Contents(
             "sequences of STIR",
             "sags eval --protocol stir FOLDER measures them; each leftNN/seqNN/frames/*.mp4 and its rightNN "
-            "are source.kind videos (docs/protocols.md)",
+            "are source.kind videos (docs/evaluation.md)",
         ),
     ),
 )

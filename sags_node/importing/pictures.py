@@ -170,7 +170,7 @@ def check_masks(folder: Path, size: tuple[int, int], instruments: str = "white")
         )
         return [Finding("error", f"masks: {share:.0%} would be instrument: polarity the other way?", mend)]
     if share == 0:
-        mend = "leave masks out, and tissue is found by colour (docs/masks.md)"
+        mend = "leave masks out, and tissue is found by colour (docs/networks.md)"
         return [Finding("warning", "masks: none marks an instrument", mend)]
     return [Finding("ok", f"masks: {share:.0%} of the picture is instrument")]
 

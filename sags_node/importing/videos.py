@@ -153,7 +153,7 @@ def _one(file: Path, shown: list[tuple[Path, U8]], rig: str) -> tuple[list[Findi
         first = " source.geometry.first:=right" if swapped and not panes else ""
         return found, f"sags run {way.launch.format(file=file, w=width // 2, h=height // 2)}{first} {rig}"
     what = f"{size_text(width, height)} px show one eye, or both in a way that was not recognised"
-    mend = "two videos or one of both eyes are needed; one camera alone needs a network (docs/depth.md)"
+    mend = "two videos or one of both eyes are needed; one camera alone needs a network (docs/networks.md)"
     try_it = f"sags calib live source.kind:=videos source.left:={file} source.geometry.layout:=side_by_side"
     found = [Finding("warning", what, mend), *pictures.check_eye("video", shown)]
     return found, f"{try_it} shows what is in it"

@@ -88,7 +88,7 @@ class MonoDepth:
         if self._declared is None:
             raise UsageError(
                 "one camera alone does not tell how far things are; set vision.onnx.declared_depth to the "
-                "distance to the middle of the first picture, m (docs/depth.md, 'One eye')"
+                "distance to the middle of the first picture, m (docs/networks.md, 'One eye')"
             )
         values = relative[tissue & np.isfinite(relative)]
         middle = float(np.median(values)) if values.size else 0.0

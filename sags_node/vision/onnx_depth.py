@@ -52,7 +52,7 @@ class NetworkDepth:
         if self._network.is_stereo and pair.right is None:
             raise UsageError(
                 f"{self._network.name} is a stereo network but the source has no right eye; name a "
-                "monocular one, and vision.onnx.declared_depth (docs/depth.md, 'One eye')"
+                "monocular one, and vision.onnx.declared_depth (docs/networks.md, 'One eye')"
             )
         if self._failures == MOST_FAILURES:
             return None

@@ -26,7 +26,7 @@ WRONG = 10.0  # px: no error counts for more
 EQUAL_COSTS = 0.01  # px: within them what is tried first wins
 ERROR_PER_OCTAVE = 0.25  # px
 FEWEST_FINITE = 0.5  # of the numbers
-MENDS = "docs/depth.md says what to write into a .yaml file beside it"
+MENDS = "docs/networks.md says what to write into a .yaml file beside it"
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,7 +31,7 @@ pytestmark = [pytest.mark.live, pytest.mark.usefixtures("run_dir")]
         (["publish.data:=tcp://127.0.0.1:5"], ("publish.data", "a list", "'tcp://127.0.0.1:5'")),
         (
             ["source.kind:=videos", "source.left:=a.mp4"],
-            ("source.right is missing", "vision.onnx.declared_depth", "docs/depth.md"),
+            ("source.right is missing", "vision.onnx.declared_depth", "docs/networks.md"),
         ),
         (["clip.MP4"], ("clip.MP4 is a video", "source.video:=clip.MP4", "source.left:=clip.MP4", "rig:=")),
         (["mapping.budget_ms=25"], ("'mapping.budget_ms=25'", "write mapping.budget_ms:=25")),

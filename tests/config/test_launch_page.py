@@ -13,7 +13,7 @@ DOCS = ROOT / "docs"
 @pytest.fixture(scope="module")
 def made() -> str:
     """The page as `make docs` would write it now."""
-    return str(runpy.run_path(str(DOCS / "launch_page.py"))["page"]())
+    return str(runpy.run_path(str(DOCS / "dev/launch_page.py"))["page"]())
 
 
 def test_the_page_is_of_this_configuration(made: str) -> None:

@@ -132,7 +132,7 @@ def test_no_gaussians() -> None:
     assert not any(len(found[name]) for name in DERIVATIVES)
 
 
-# ---- where they differ: what docs/gpu.md says of it --------------------------------------------------------
+# ---- where they differ: what benchmarks/gpu.md says of it --------------------------------------------------
 
 
 def test_opacities_above_the_largest_of_ours() -> None:

@@ -496,6 +496,6 @@ def test_live_cameras_and_ambiguous_segments_are_refused(tmp_path: Path) -> None
 
 
 def test_the_page_of_figures_explains_every_group() -> None:
-    page = (ROOT / "docs/results.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs/evaluation.md").read_text(encoding="utf-8")
     groups = [*GROUPS, "depth_confidence", "track", "pose"]
     assert [group for group in groups if f"`{group}`" not in page] == []

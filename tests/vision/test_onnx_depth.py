@@ -207,7 +207,7 @@ def test_a_wrong_sidecar_is_named_with_its_mend(text: str, words: str, scene: Sc
         ({"a": [1, 5, 64, 64], "b": [1, 5, 64, 64]}, "same", "a has 5 channels|is 1x5x64x64"),
         ({"a": PICTURE, "b": PICTURE}, "nan", "not finite"),
         ({"a": PICTURE, "b": PICTURE}, "small", "no output is a map of the 320x256 px"),
-        ({"a": PICTURE, "b": PICTURE}, "noise", r"best is off by [\d.]+ px .*; docs/depth.md"),
+        ({"a": PICTURE, "b": PICTURE}, "noise", r"best is off by [\d.]+ px .*; docs/networks.md"),
         ({"a": [1, 3, 5000, 5000]}, "same", "more than 4096 px"),
         ({"a": PICTURE}, "nan", "not finite"),
     ],

@@ -1,7 +1,7 @@
 """gsplat as a second backend on a GPU: the planes and gradients of `interface.Backend` from its kernels.
 
 gsplat (V. Ye et al., JMLR 2025) is a package of its own, `pip install 'sags-node[gsplat]'`, and builds its
-kernels with CUDA's compiler at its first use. What differs from our engines stands in docs/gpu.md.
+kernels with CUDA's compiler at its first use. What differs from our engines stands in benchmarks/gpu.md.
 """
 
 from __future__ import annotations

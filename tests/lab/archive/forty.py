@@ -6,7 +6,8 @@
     python tests/lab/archive/forty.py tiny FOLDER         # 2000 recordings that do next to nothing
     python tests/lab/archive/forty.py large FOLDER        # 100,000 that are done
 
-Each takes some minutes of two cores; FOLDER must be new, but for `faults`. docs/archive.md has what came out.
+Each takes some minutes of two cores; FOLDER must be new, but for `faults`. benchmarks/archive.md has
+what came out.
 """
 
 from __future__ import annotations

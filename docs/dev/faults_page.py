@@ -1,4 +1,4 @@
-"""Writes docs/faults.md from the marks of the tests: `make docs`.
+"""Writes docs/dev/faults.md from the marks of the tests: `make docs`.
 
 A test that shows what a fault does carries `@pytest.mark.fault(name, sees=, says=, back=, left=)`. The marks
 are read from the source, so nothing needs to run, and nothing that a test needs must be there.
@@ -13,19 +13,19 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 PAGE = Path(__file__).with_name("faults.md")
-ROOT = PAGE.parent.parent
+ROOT = PAGE.parents[2]
 HEAD = """# Faults
 
 <!-- Written by `make docs` from the marks of the tests. Change it there. -->
 
-What is broken in the tests, and what then happens. Each row is what its test asserts, and no more: an
-empty field says that the test does not look at it. [warnings.md](warnings.md) says what to do about each
-warning, [service.md](service.md) what the exit codes mean.
+What the tests break, and what then happens. Each row is what its test asserts, and no more: an
+empty field means that the test does not check it. [warnings.md](../warnings.md) says what to do about each
+warning, [security.md](../security.md#exit-codes) what the exit codes mean.
 
-- **sees**: what a consumer of the node, or whoever runs the command, gets meanwhile.
-- **says**: which warning, error or count tells of it.
+- **sees**: what a consumer of the node, or the user of the command, gets meanwhile.
+- **says**: which warning, error or count reports it.
 - **works again**: how long that takes, or what it takes.
-- **left**: what is the same afterwards, or is not left behind.
+- **left**: what is unchanged afterwards, or is not left behind.
 """
 
 
@@ -91,7 +91,7 @@ def page() -> str:
         lines += ["| fault | sees | says | works again | left | test |", "|---|---|---|---|---|---|"]
         for fault in ones:
             what = fault.name.partition(": ")[2]
-            test = f"[{fault.test.removeprefix('test_')}](../{fault.file})"
+            test = f"[{fault.test.removeprefix('test_')}](../../{fault.file})"
             lines.append(f"| {' | '.join([what, *fault[1:5], test])} |")
         lines.append("")
     return "\n".join(lines)

@@ -1,4 +1,4 @@
-"""Writes docs/licences.md: what the product needs, and under which licences it comes: `make licences`.
+"""Writes docs/dev/licences.md: what the product needs, and under which licences it comes: `make licences`.
 
 What is installed says it of itself (`importlib.metadata`); so the page has the versions of the machine where
 it was written.
@@ -14,16 +14,17 @@ from pathlib import Path
 
 from packaging.requirements import Requirement
 
-ROOT = Path(__file__).parent.parent
-PAGE = ROOT / "docs/licences.md"
+PAGE = Path(__file__).with_name("licences.md")
+ROOT = PAGE.parents[2]
 NOT_SHIPPED = {"dev"}  # extras for those who change the product
 HEAD = """# Licences
 
 <!-- Written by `make licences` from what is installed. Change nothing here. -->
 
-Python packages that the product needs, and those that they need, with the licence that each states of itself.
-The product is under Apache-2.0 ([LICENSE](../LICENSE)). "extra" names what brings a package where the product
-does without it: `pip install 'sags-node[EXTRA]'`. `make sbom` writes what an installation holds as CycloneDX.
+Python packages that the product needs, directly or indirectly, with the licence that each states.
+The product is under Apache-2.0 ([LICENSE](../../LICENSE)). "extra" names the extra of an
+optional package: `pip install 'sags-node[EXTRA]'`. `make sbom` writes the contents of an installation
+as CycloneDX.
 
 | package | version | licence | extra |
 |---|---|---|---|

@@ -27,7 +27,7 @@ from sags_node.config.schema import (
     SentSource,
 )
 
-PAGE = Path(__file__).with_name("launch.md")
+PAGE = Path(__file__).parents[1] / "launch.md"
 HEAD = """# Launch files
 
 <!-- Written by `make docs` from sags_node/config/schema.py. Change it there. -->
@@ -46,18 +46,18 @@ mapping:
 
     sags run my_launch.yaml mapping.budget_ms:=25
 
-- The first argument is a path: of a launch file, of a folder with a `launch.yaml` in it, or of a
-  [recording](recordings.md) that is known by its files. Without one the built-in phantom is played.
+- The first argument is the path of a launch file, of a folder with a `launch.yaml` in it, or of a
+  [recording](recordings.md) that is recognised by its files. Without one the built-in phantom is played.
 - `key:=value` on the command line wins over the file. Keys are written with dots, as in the tables below.
   Values are YAML: `source.right:=null`, `'publish.data:=[tcp://*:5556]'`.
-- An unknown key is an error that names the nearest known one, or what stands in its place. So is a wrong
+- An unknown key is an error that names the nearest known one, or the key that replaced it. So is a wrong
   value. The exit code is 2.
-- A key that is left out has its default.
+- A missing key has its default.
 - Paths in a file are relative to the file. Paths on the command line are relative to the folder that you are
   in.
-- `$NAME` in a file stands for a variable of the environment. `$SAGS_DATA` need not be set. It is then
+- `$NAME` in a file is an environment variable. `$SAGS_DATA` need not be set. It is then
   `../shared/data`, seen from the folder above the launch file's.
-- The topic `parameters` says what a running node goes by.
+- The topic `parameters` shows the configuration of a running node.
 """
 WORDS: dict[Any, str] = {
     bool: "`true` or `false`",
