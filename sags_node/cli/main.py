@@ -209,20 +209,18 @@ def demo(launch: tuple[str, ...], seconds: float, out: Path, json_out: bool) -> 
 def phantom(folder: Path, overrides: tuple[str, ...]) -> None:
     """Write a synthetic stereo session with exact truth.
 
-    FOLDER must be new or empty. Keys: seconds, rate, width, height, seed, camera_motion, smoke, noise, blur.
+    FOLDER must be new or empty. Keys: seconds, rate, width, height, seed, camera_motion, smoke, noise, blur,
+    gloss, still_tissue, blackout.
 
     \b
     sags phantom out/session seconds:=8 seed:=3 camera_motion:=orbit smoke:=0.3
     """
-    from sags_node.config.launch_file import load_launch
-    from sags_node.config.schema import PhantomSource
-    from sags_node.phantom import write_session
+    from sags_node.config.launch_file import section_of
+    from sags_node.phantom import PhantomScene, write_session
 
-    config = load_launch(None, [f"source.{override}" for override in overrides]).source
-    if not isinstance(config, PhantomSource):
-        raise UsageError(f"sags phantom writes phantom sessions; kind:={config.kind} is something else")
+    scene = section_of(PhantomScene, overrides)
     with progress("rendering") as advance:
-        write_session(config, folder, rate=config.rate or 30.0, progress=advance)
+        write_session(scene, folder, rate=scene.rate or 30.0, progress=advance)
     console.print(f"session: [bold]{escape(str(folder))}[/]; play it with: sags run {escape(str(folder))}")
 
 

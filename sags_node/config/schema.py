@@ -217,14 +217,6 @@ class PhantomSource(RecordedSource):
         description="of the scope, again and again. sway (or true): it looks about; zoom: in and out, 15 mm; "
         "orbit: round a point of the tissue, 11 degrees to each side",
     )
-    smoke: float = Field(0.0, ge=0, le=1, description="density")
-    noise: float = Field(0.01, ge=0, le=0.2, description="of a pixel: standard deviation, in units of white")
-    blur: float = Field(0.0, ge=0, le=5, description="of the lens: standard deviation, px")
-    gloss: float = Field(1.0, ge=0, le=100, description="strength of the wet highlights")
-    still_tissue: bool = Field(False, description="only the instruments move, and the scope if it is to")
-    blackout: tuple[float, float] | None = Field(
-        None, description="s: without light from, until; null: never"
-    )
 
 
 class LiveSource(Section):
@@ -749,8 +741,15 @@ class LaunchConfig(Section):
 
 
 # Keys of earlier versions, and what stands in their place: an error says it.
+SCENE = "tests and `sags phantom FOLDER key:=value` set it: play that folder"
 REMOVED = {
     "seed": "`python -m benchmarks endurance` has --seed; source.seed is the phantom's",
     "mapping.right_eye": "publish.right draws the right eye, and learns from what it sees",
     "vision.stereo.method": "inverse search matches; SGBM is a baseline of `python -m benchmarks depth`",
+    "source.smoke": SCENE,
+    "source.noise": SCENE,
+    "source.blur": SCENE,
+    "source.gloss": SCENE,
+    "source.still_tissue": SCENE,
+    "source.blackout": SCENE,
 }
