@@ -608,11 +608,6 @@ class VisionConfig(Section):
 class EngineConfig(Section):
     """What draws the Gaussians."""
 
-    backend: Literal["numba", "gsplat", "reference"] = Field(
-        "numba",
-        description="numba: the CPU, or a GPU by `device`; gsplat: that package on a GPU, docs/gpu.md; "
-        "reference: the slow readable twin, for tests",
-    )
     threads: int | None = Field(
         None, ge=1, le=64, description="of the kernels; default: all cores of this process"
     )
@@ -644,16 +639,11 @@ class MappingConfig(Section):
         le=2_000_000,
         description="the model has no more; default: as many as the machine refines within the budget",
     )
-    smoothing: bool = Field(True, description="the 3D filter of Mip-Splatting: nothing finer than was seen")
-    skip_duplicates: bool = Field(True, description="a frame equal to its predecessor is not mapped again")
-    skip_depth: bool = Field(True, description="when time is short, match depth in some of the frames only")
-    skip_fitted: bool = Field(True, description="when time is short, refine where it fits worst only")
     field: bool | None = Field(
         None,
         description="remember how tissue moves: hidden tissue goes on as it did before, and motion is "
         "predicted to the moment of a display; default: once an anchor or a view asks for `ahead_ms`",
     )
-    skip_still: bool = Field(True, description="while nothing moves: no matching, a step where it pays most")
 
     def frame_ms(self, rate: float | None = None) -> float:
         """What a frame may take, ms.
@@ -687,7 +677,7 @@ class PublishConfig(Guarded):
     )
 
 
-DeviceName = Literal["auto", "cpu", "cuda"]
+DeviceName = Literal["auto", "cpu", "cuda", "gsplat"]
 
 
 class LaunchConfig(Section):
@@ -696,7 +686,8 @@ class LaunchConfig(Section):
     ns: str = Field("sags", pattern=NAMESPACE, description="namespace of all topics")
     device: DeviceName = Field(
         "auto",
-        description="auto: a GPU where one can be used, else the CPU; cuda: a GPU, or an error; docs/gpu.md",
+        description="auto: a GPU where one can be used, else the CPU; cuda: a GPU, or an error; gsplat: the "
+        "CPU, and that package draws on a GPU; docs/gpu.md",
     )
     rig: Path | None = Field(
         None,
@@ -716,16 +707,15 @@ class LaunchConfig(Section):
     )
 
     @model_validator(mode="after")
-    def _one_engine(self) -> LaunchConfig:
-        if self.device == "cuda" and self.engine.backend != "numba":
-            raise ValueError(f"device cuda and engine.backend {self.engine.backend}: choose one of them")
-        return self
-
-    @model_validator(mode="after")
     def _one_pose(self) -> Self:
         if self.robot is not None and self.vision.pose not in ("session", "refine"):
             raise ValueError(f"robot says where the scope is, vision.pose {self.vision.pose} too: choose one")
         return self
+
+    @property
+    def backend(self) -> Literal["numba", "gsplat"]:
+        """What draws where the CPU refines; see `make_rasterizer`."""
+        return "gsplat" if self.device == "gsplat" else "numba"
 
     @property
     def in_real_time(self) -> bool:
@@ -741,11 +731,18 @@ class LaunchConfig(Section):
 
 
 # Keys of earlier versions, and what stands in their place: an error says it.
+ALWAYS_ON = "it is always on; `python -m benchmarks pareto --only skips` says what it brings"
 SCENE = "tests and `sags phantom FOLDER key:=value` set it: play that folder"
 REMOVED = {
     "seed": "`python -m benchmarks endurance` has --seed; source.seed is the phantom's",
     "mapping.right_eye": "publish.right draws the right eye, and learns from what it sees",
     "vision.stereo.method": "inverse search matches; SGBM is a baseline of `python -m benchmarks depth`",
+    "engine.backend": "device:=gsplat draws with that package, any other device with our kernels",
+    "mapping.smoothing": "it is always on; `python -m benchmarks alias` says what it brings",
+    "mapping.skip_duplicates": ALWAYS_ON,
+    "mapping.skip_depth": ALWAYS_ON,
+    "mapping.skip_fitted": ALWAYS_ON,
+    "mapping.skip_still": ALWAYS_ON,
     "source.smoke": SCENE,
     "source.noise": SCENE,
     "source.blur": SCENE,
