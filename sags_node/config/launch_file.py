@@ -11,7 +11,15 @@ from typing import Any, TypeVar, get_args
 
 from pydantic import ValidationError
 
-from sags_node.config.schema import REMOVED, LaunchConfig, LiveSource, PhantomSource, Section, Source
+from sags_node.config.schema import (
+    REMOVED,
+    REMOVED_KINDS,
+    LaunchConfig,
+    LiveSource,
+    PhantomSource,
+    Section,
+    Source,
+)
 from sags_node.config.yaml_reader import parse_yaml, read_yaml
 from sags_node.errors import UsageError, brief
 from sags_node.files import open_file
@@ -69,8 +77,8 @@ def load_launch(path: Path | str | None = None, overrides: Sequence[str] = ()) -
             file = file / "launch.yaml"
         elif file.suffix.lower() in VIDEO_SUFFIXES:
             raise UsageError(
-                f"{file} is a video, not a launch file; write source.kind:=side_by_side source.video:={file} "
-                f"(both eyes in it), or source.kind:=videos source.left:={file} source.right:=OTHER, and "
+                f"{file} is a video, not a launch file; write source.kind:=videos source.left:={file} "
+                "source.right:=OTHER, or where it shows both eyes source.geometry.layout:=side_by_side, and "
                 "rig:=CALIBRATION"
             )
         name = str(file)
@@ -237,9 +245,12 @@ def _explain(
             lines.append(f"{said}: {where} is missing; set it")
         elif item["type"] in ("union_tag_invalid", "union_tag_not_found"):
             kinds = ", ".join(repr(kind) for kind in _SOURCES)
-            got = brief(item["input"].get("kind"))
+            got = item["input"].get("kind")
             said = COMMAND_LINE if "source.kind" in given else name
-            lines.append(f"{said}: source.kind: should be one of {kinds} (got {got})")
+            if got in REMOVED_KINDS:
+                lines.append(f"{said}: there is no source.kind {got} any more: {REMOVED_KINDS[got]}")
+            else:
+                lines.append(f"{said}: source.kind: should be one of {kinds} (got {brief(got)})")
         else:
             what = _PLAIN.get(item["type"], item["msg"])
             lines.append(f"{said}: {where or 'launch file'}: {what} (got {brief(item.get('input'))})")

@@ -71,11 +71,14 @@ class FoldersSource(RecordedSource):
 class GeometryConfig(Section):
     """How pictures become those of the two eyes: taken apart; each eye deinterlaced, cropped, turned."""
 
-    layout: Literal["separate", "side_by_side", "over_under", "row_interleaved", "frame_sequential"] = Field(
+    layout: Literal[
+        "separate", "side_by_side", "over_under", "panes", "row_interleaved", "frame_sequential"
+    ] = Field(
         "separate",
         description="separate: a picture shows one eye; side_by_side: both, in its left and right half; "
-        "over_under: in the upper and lower half; row_interleaved: in every other row, as the two fields of "
-        "field-sequential stereo are; frame_sequential: each eye in every other picture",
+        "over_under: in the upper and lower half; panes: in the boxes crop and crop_right; row_interleaved: "
+        "in every other row, as the two fields of field-sequential stereo are; frame_sequential: each eye in "
+        "every other picture",
     )
     first: Literal["left", "right"] = Field(
         "left", description="whose is the left or upper half, the first row, the first picture"
@@ -100,6 +103,8 @@ class GeometryConfig(Section):
     def _possible(self) -> GeometryConfig:
         if self.layout == "row_interleaved" and self.deinterlace != "none":
             raise ValueError("row_interleaved takes the fields apart itself: leave deinterlace out")
+        if self.layout == "panes" and (self.crop is None or self.crop_right is None):
+            raise ValueError("panes needs crop and crop_right: the boxes [x, y, width, height] of the eyes")
         for box in (self.crop, self.crop_right):
             if box is not None and (min(box) < 0 or min(box[2:]) < 1):
                 raise ValueError(
@@ -119,32 +124,19 @@ class VideosSource(RecordedSource):
         None, description="video of the right eye; null: one camera, with a monocular vision.onnx"
     )
     geometry: GeometryConfig = GeometryConfig()
+    tools: Box | None = Field(
+        None, description="of source.geometry.layout panes: the left eye with the instruments painted green"
+    )
 
     @model_validator(mode="after")
     def _one_file_of_both(self) -> VideosSource:
+        if self.tools is not None and self.geometry.layout != "panes":
+            raise ValueError("tools is a pane beside those of the eyes: set geometry.layout to panes")
         if self.geometry.layout != "separate" and self.right is not None:
             raise ValueError(
                 f"geometry.layout {self.geometry.layout}: source.left shows both, leave right out"
             )
         return self
-
-
-class SideBySideSource(RecordedSource):
-    """One video with both eyes side by side."""
-
-    kind: Literal["side_by_side"] = "side_by_side"
-    video: Path = Field(description="the file")
-    order: Literal["LR", "RL"] = Field("LR", description="LR: the left eye is in the left half")
-
-
-class PanesSource(RecordedSource):
-    """One video of several panes; each eye is a crop of it."""
-
-    kind: Literal["panes"] = "panes"
-    video: Path = Field(description="the file")
-    left: Box = Field(description="pane of the left eye")
-    right: Box = Field(description="pane of the right eye")
-    tools: Box | None = Field(None, description="pane of the left eye with the instruments painted green")
 
 
 class EndoNerfSource(RecordedSource):
@@ -375,8 +367,6 @@ class PushSource(SentSource, Guarded):
 Source = Annotated[
     FoldersSource
     | VideosSource
-    | SideBySideSource
-    | PanesSource
     | EndoNerfSource
     | ScaredSource
     | BagSource
@@ -737,6 +727,8 @@ REMOVED = {
     "seed": "`python -m benchmarks endurance` has --seed; source.seed is the phantom's",
     "mapping.right_eye": "publish.right draws the right eye, and learns from what it sees",
     "vision.stereo.method": "inverse search matches; SGBM is a baseline of `python -m benchmarks depth`",
+    "source.order": "source.geometry.first says whose the left half is",
+    "source.video": "source.left names the video",
     "engine.backend": "device:=gsplat draws with that package, any other device with our kernels",
     "mapping.smoothing": "it is always on; `python -m benchmarks alias` says what it brings",
     "mapping.skip_duplicates": ALWAYS_ON,
@@ -749,4 +741,9 @@ REMOVED = {
     "source.gloss": SCENE,
     "source.still_tissue": SCENE,
     "source.blackout": SCENE,
+}
+REMOVED_KINDS = {
+    "side_by_side": "source.kind:=videos source.left:=VIDEO source.geometry.layout:=side_by_side",
+    "panes": "source.kind:=videos source.left:=VIDEO source.geometry.layout:=panes, with the boxes of the "
+    "eyes in source.geometry.crop and crop_right",
 }

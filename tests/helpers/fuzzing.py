@@ -460,7 +460,8 @@ def films(folder: Path) -> list[bytes]:
 def read_film(data: bytes, folder: Path) -> None:
     file = folder / ("a.avi" if data[:4] == b"RIFF" else "a.mp4")
     file.write_bytes(data)
-    with open_source(cfg.SideBySideSource(video=file, pace="step", frames=8)) as source:
+    halves = cfg.GeometryConfig(layout="side_by_side")
+    with open_source(cfg.VideosSource(left=file, geometry=halves, pace="step", frames=8)) as source:
         for frame in source:
             assert frame.right is not None and frame.left.shape == frame.right.shape
 
