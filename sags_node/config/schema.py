@@ -478,35 +478,42 @@ def _by_name(said: object) -> object:
 
 
 class NetworkFormat(Section):
-    """How a depth network takes pictures and what it gives. What is not said is found out."""
+    """How a depth network takes pictures and what it gives: what its file does not say must be set."""
 
-    inputs: tuple[str, ...] | None = Field(None, description="names: left eye, right eye; default: found out")
+    inputs: tuple[str, ...] | None = Field(
+        None, description="names: left eye, right eye; default: the only one"
+    )
     layout: Literal["nchw", "nhwc"] | None = Field(
-        None, description="order of the inputs' axes; default: found out"
+        None, description="order of the inputs' axes; default: by their shape"
     )
     color: Literal["rgb", "bgr"] | None = Field(None, description="order of the channels; default: rgb")
     normalization: Annotated[Normalization | None, BeforeValidator(_by_name)] = Field(
         None,
         description="`unit` (0..1), `bytes` (0..255), `imagenet`, `symmetric` (-1..1), or "
-        "`{mean: [], std: []}`; default: found out",
+        "`{mean: [], std: []}`; to be set, but for inputs of bytes",
     )
     size: tuple[Side, Side] | None = Field(
-        None, description="width and height for a network that takes any; default: the working size"
+        None, description="width and height for a network that takes any; default: the working size, padded"
     )
     multiple: int | None = Field(
         None,
         ge=1,
         le=512,
-        description="px; width and height are padded to multiples of it; default: found out",
+        description="px; width and height are padded to multiples of it, for a network that takes any",
     )
-    output: str | None = Field(None, description="name of the output to use; default: found out")
-    meaning: Literal["disparity", "negative_disparity", "depth", "inverse_depth"] | None = Field(
-        None, description="of the output's numbers; default: found out"
+    output: str | None = Field(None, description="name of the output to use; default: the only one")
+    meaning: Literal["disparity", "depth", "inverse_depth"] | None = Field(
+        None, description="of the output's numbers; to be set"
+    )
+    scale: float | None = Field(
+        None,
+        description="the output's numbers times this are px of the picture that the network gets, or m; -1: "
+        "disparities are negative; default: 1",
     )
 
 
 class OnnxConfig(NetworkFormat):
-    """Depth from a network of the user's; docs/depth.md says what is recognised."""
+    """Depth from a network of the user's; docs/depth.md has examples."""
 
     path: Path | None = Field(
         None, description="the .onnx file; null: depth is matched, as vision.stereo says"

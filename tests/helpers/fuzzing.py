@@ -432,11 +432,10 @@ def mesh_files(sound: Callable[[Path], Sequence[bytes]], suffix: str) -> Target:
 
 
 def networks(folder: Path) -> list[bytes]:
-    silent = save_matcher(folder / "a.onnx", size=(64, 48))
-    said = save_matcher(
-        folder / "b.onnx", size=(64, 48), metadata={"normalization": "bytes", "multiple": "16"}
-    )
-    return [silent.read_bytes(), said.read_bytes()]
+    said = {"inputs": "[first, second]", "normalization": "bytes", "meaning": "disparity"}
+    fixed = save_matcher(folder / "a.onnx", size=(64, 48), metadata=said)
+    padded = save_matcher(folder / "b.onnx", metadata={**said, "multiple": "16"})
+    return [fixed.read_bytes(), padded.read_bytes()]
 
 
 def open_network(data: bytes, folder: Path) -> None:
