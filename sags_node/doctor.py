@@ -242,8 +242,8 @@ def _memory(root: Path = host.ROOT) -> Check:
 
 def check_gpu(config: LaunchConfig) -> Check:
     """What the GPU's test drawing says. A machine without one is no worse for it, unless one is wanted."""
-    if config.device == "cpu":
-        return Check("GPU", "ok", "not used: device is cpu")
+    if config.device in ("cpu", "gsplat"):
+        return Check("GPU", "ok", f"not used: device is {config.device}")
     found = find_gpu()
     if found.kind == "cuda":
         return Check("GPU", "ok", f"{found.name}: draws what the CPU draws")
@@ -253,7 +253,7 @@ def check_gpu(config: LaunchConfig) -> Check:
 
 def _gsplat(config: LaunchConfig) -> list[Check]:
     """Only where it was chosen: looking for it may build its kernels."""
-    if config.engine.backend != "gsplat":
+    if config.backend != "gsplat":
         return []
     from sags_node.engine.cuda import gsplat as gsplat_backend
 

@@ -22,7 +22,7 @@ from rich.table import Table
 from benchmarks.node.neighbours import everything, give_way
 from sags_node.errors import SagsError
 from sags_node.evaluation.metrics import percentiles
-from sags_node.messaging.address import connect, find_data
+from sags_node.messaging.address import NodeAddress, connect
 from sags_node.messaging.received import ReceivedText, TopicName
 from sags_node.messaging.stream import MAX_MESSAGE_BYTES
 from sags_node.messaging.subscriber import Subscriber
@@ -195,7 +195,7 @@ def _sleep(folder: Path, _: float, ending: Event, there: Connection) -> None:
 def _listen(folder: Path, count: float, ending: Event, there: Connection) -> None:
     """Many subscribers of small topics in one process."""
     context, poller = zmq.Context(), zmq.Poller()
-    address = find_data(None, "sags", folder)
+    address = NodeAddress(run_dir=folder).data()
     for _ in range(int(count)):
         socket = context.socket(zmq.SUB)
         for name in SMALL:

@@ -21,7 +21,7 @@ from typing import Any
 import zmq
 
 from sags_node.errors import SagsError
-from sags_node.messaging.address import connect, find_data
+from sags_node.messaging.address import NodeAddress, connect
 from sags_node.messaging.rundir import connection_path
 from sags_node.messaging.stream import MAX_MESSAGE_BYTES
 from sags_node.processes import end
@@ -38,7 +38,7 @@ def everything(folder: Path) -> Iterator[zmq.Socket[bytes]]:
     context = zmq.Context()
     socket = context.socket(zmq.SUB)
     socket.subscribe("")
-    connect(socket, find_data(None, NS, folder), MAX_MESSAGE_BYTES)
+    connect(socket, NodeAddress(NS, run_dir=folder).data(), MAX_MESSAGE_BYTES)
     try:
         yield socket
     finally:

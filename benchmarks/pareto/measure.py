@@ -115,7 +115,7 @@ class _Comparison:
         session, parts = self._session, self._sweep.parts
         timed = time_settings(session.config, self._size, parts)
         timed += rung_settings() if RUNG_PART in parts else []
-        skips = skip_settings(session.config.mapping) if "skips" in parts else {}
+        skips = skip_settings() if "skips" in parts else {}
         pairs = [setting for pair in skips.values() for setting in pair]
         runs: dict[Setting, list[Row]] = {setting: [] for setting in (*timed, *pairs)}
         turns = [setting for _ in range(self._sweep.repeat) for setting in runs]
@@ -143,8 +143,8 @@ class _Comparison:
             "settings": rows,
             "baselines": baselines,
             "skips": [
-                self._skip(rule, _middle(runs[as_is]), _middle(runs[turned]))
-                for rule, (as_is, turned) in skips.items()
+                {"rule": rule, **_effect(_middle(runs[on]), _middle(runs[off]))}
+                for rule, (on, off) in skips.items()
             ],
             "hosts": self._hosts(frames or 0, rate) if HOSTS in parts else [],
         }
@@ -154,17 +154,11 @@ class _Comparison:
             self._launch, self._overrides, frames / rate, lambda what: self._progress(what)("", 0)
         )
 
-    def _skip(self, rule: str, as_is: Row, turned: Row) -> Row:
-        """What a rule changes."""
-        is_on = bool(getattr(self._session.config.mapping, rule))
-        on, off = (as_is, turned) if is_on else (turned, as_is)
-        return {"rule": rule, "default": is_on, **_effect(on, off), "on": on, "off": off}
-
     @contextmanager
     def _played(self, setting: Setting, progress: Progress) -> Iterator[tuple[Session, Spool]]:
         session = self._open(setting.overrides)
         with Spool() as spool:
-            run_step(session, self._sweep.options, spool, progress)
+            run_step(session, self._sweep.options, spool, progress, setting.skips)
             if len(spool) < SHORTEST:
                 raise SagsError(
                     f"{session.name}: {len(spool)} frames were processed and {SHORTEST} are needed to tell "
@@ -224,4 +218,6 @@ def _effect(on: Row, off: Row) -> Row:
         "depth_mm": change("depth", "median_mm"),
         "saved_ms": round(1e3 / off["rate_hz"] - 1e3 / on["rate_hz"], 3),
         "skipped": on["skipped"],
+        "on": on,
+        "off": off,
     }

@@ -53,13 +53,12 @@ def _settings(session: Row) -> Table:
 
 def _skips(session: Row) -> Table:
     made = _table(
-        session, "rule", "", "online, dB: on", "off", "change", "depth, mm: on", "off", "change", "saved, ms"
+        session, "rule", "online, dB: on", "off", "change", "depth, mm: on", "off", "change", "saved, ms"
     )
     for row in session["skips"]:
         on, off = row["on"], row["off"]
         made.add_row(
             row["rule"],
-            "on by default" if row["default"] else "off by default",
             _number(on["online"]["psnr"], ".2f"),
             _number(off["online"]["psnr"], ".2f"),
             _number(row["online_db"], "+.2f"),

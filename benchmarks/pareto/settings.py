@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
-from sags_node.config.schema import LaunchConfig, MappingConfig
+from sags_node.config.schema import LaunchConfig
 from sags_node.errors import UsageError
 from sags_node.evaluation.measure import Options
+from sags_node.mapping.devices import ALL_SKIPS, Skips
 from sags_node.mapping.ladder import RUNGS
 
 PARTS = ("budgets", "resolutions", "gaussians", "skips")
@@ -18,7 +19,7 @@ SIZES = (0.75, 0.5)  # of the launch file's working size
 COUNTS = (10_000, 20_000, 30_000, 50_000, 70_000)
 COUNT_BUDGETS_MS = (33.0, 100.0)
 SKIP_STEPS = 2  # per frame, where rules that leave work out are compared
-HURRIED_RULES = ("skip_depth", "skip_fitted")  # that act on rungs of the ladder where time is short
+HURRIED_RULES = ("depth", "fitted")  # that act on rungs of the ladder where time is short
 
 BUDGET, COUNT = "mapping.budget_ms", "mapping.max_gaussians"
 WIDTH, HEIGHT = "vision.width", "vision.height"
@@ -33,6 +34,7 @@ class Setting:
     part: str  # of PARTS, or "default"
     name: str
     overrides: tuple[str, ...]  # key:=value, on top of the launch file; none: the default
+    skips: Skips = ALL_SKIPS
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,27 +85,21 @@ def rung_settings() -> list[Setting]:
     return [Setting(RUNG_PART, f"rung {i}", (step, f"mapping.rung:={i}")) for i in range(len(RUNGS))]
 
 
-def skip_settings(mapping: MappingConfig) -> dict[str, tuple[Setting, Setting]]:
-    """For each rule of `skip_rules`: all rules as they are, and this one turned round.
+def skip_settings() -> dict[str, tuple[Setting, Setting]]:
+    """For each rule of `Skips`: all rules, and all but this one.
 
     Both at a fixed number of steps. A rule for when time is short is compared on the highest rung of the
     ladder on which it acts.
     """
-    steps = Setting("skips", "all rules as they are", (f"mapping.iterations:={SKIP_STEPS}",))
+    steps = Setting("skips", "all rules", (f"mapping.iterations:={SKIP_STEPS}",))
     rung = max(i for i, each in enumerate(RUNGS) if each.step < 1 and each.depth_every > 1)
     hurry = Setting("skips", "in a hurry", ("mapping.iterations:=1", f"mapping.rung:={rung}"))
     pairs = {}
-    for rule in skip_rules():
+    for rule in (field.name for field in fields(Skips)):
         base = hurry if rule in HURRIED_RULES else steps
-        turned = f"mapping.{rule}:={str(not getattr(mapping, rule)).lower()}"
-        pairs[rule] = base, Setting("skips", f"{base.name}, {turned}", (*base.overrides, turned))
+        off = replace(ALL_SKIPS, **{rule: False})
+        pairs[f"skip_{rule}"] = base, replace(base, name=f"{base.name} but skip_{rule}", skips=off)
     return pairs
-
-
-def skip_rules() -> list[str]:
-    """The mapper's rules that leave work out: all switches of its configuration named skip_*."""
-    fields = MappingConfig.model_fields.items()
-    return [name for name, field in fields if name.startswith("skip_") and field.annotation is bool]
 
 
 def _name(values: Mapping[str, float]) -> str:

@@ -14,13 +14,13 @@ import numpy as np
 
 from benchmarks.quality.depth_regions import regions_of
 from benchmarks.quality.sgbm import JudgedSGBM, PlainSGBM
-from sags_node.config.schema import OnnxConfig, PhantomSource, StereoConfig, VisionConfig
+from sags_node.config.schema import OnnxConfig, StereoConfig, VisionConfig
 from sags_node.errors import SagsError
 from sags_node.evaluation import metrics
 from sags_node.evaluation.provenance import machine_name
 from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import StepBudget
-from sags_node.phantom.scene import Phantom
+from sags_node.phantom.scene import Phantom, PhantomScene
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import Session
 from sags_node.sources.source import open_source
@@ -35,7 +35,7 @@ MODEL = "the model, drawn"
 CONFIDENCES = (0.0, 0.25, 0.5, 0.75, 1.0)  # edges of the table's groups
 EVERY = 10  # frames of a recording
 WHITE = 230  # of 255, in every channel: a highlight
-FAULTS: dict[str, tuple[float, ...]] = {  # what `PhantomSource` calls it -> levels
+FAULTS: dict[str, tuple[float, ...]] = {  # what `PhantomScene` calls it -> levels
     "noise": (0.0, 0.01, 0.03, 0.06),
     "blur": (0.0, 1.0, 2.0, 4.0),
     "smoke": (0.0, 0.3, 0.6, 0.9),
@@ -263,14 +263,14 @@ def measure_faults(
     Args:
         size: width and height of the pictures, px.
         frames: of each level, evenly over the whole motion.
-        faults: levels by the name of the fault in `PhantomSource`.
+        faults: levels by the name of the fault in `PhantomScene`.
         network: an ONNX file to compare as well.
     """
     levels = [(fault, level) for fault, values in faults.items() for level in values]
     rows = []
     for done, (fault, level) in enumerate(levels):
         advance(done, len(levels), f"{fault} {level:g}")
-        phantom = Phantom(PhantomSource.model_validate({"width": size[0], "height": size[1], fault: level}))
+        phantom = Phantom(PhantomScene.model_validate({"width": size[0], "height": size[1], fault: level}))
         rectifier = Rectifier(phantom.rig, *size)
         matchers = make_matchers(StereoConfig(), rectifier.camera, rectifier.baseline, network)
         comparison = Comparison(matchers)

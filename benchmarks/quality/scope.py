@@ -24,7 +24,7 @@ from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.camera_pose import fit_pose
 from sags_node.phantom.motion import BREATH
-from sags_node.phantom.scene import Phantom, PhantomFrame
+from sags_node.phantom.scene import Phantom, PhantomFrame, PhantomScene
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.warm_up import warm_up
 from sags_node.types import F32, F64, Bool, Camera, StereoFrame
@@ -133,7 +133,7 @@ def measure_scope(
         "seed": source.seed,
         "width": source.width,
         "height": source.height,
-        "still_tissue": source.still_tissue,
+        "still_tissue": PhantomScene.of(source).still_tissue,
         "rows": rows,
     }
 

@@ -57,13 +57,10 @@ def arguments(place: Path, rig: Path | None, overrides: Sequence[str]) -> list[s
 
 
 def _video(place: Path, overrides: Sequence[str]) -> list[str]:
-    kind = _kind(overrides)
-    if kind in ("side_by_side", "panes"):
-        return [f"source.video:={place}"]
-    if kind != "videos":
+    if _kind(overrides) != "videos":
         raise UsageError(
-            f"{place} is a video: its overrides must say how it shows the eyes, source.kind:=side_by_side or "
-            "source.kind:=videos (docs/archive.md)"
+            f"{place} is a video: its overrides must say source.kind:=videos and how it shows the eyes, e.g. "
+            "source.geometry.layout:=side_by_side (docs/archive.md)"
         )
     right = counterpart(place.name)
     if _shows_both(overrides) or right is None:

@@ -175,7 +175,7 @@ def _says_how(video: Path) -> list[str]:
     opened.close()
     width, height = opened.size
     if width >= WIDE * height:
-        return ["source.kind:=side_by_side"]
+        return ["source.kind:=videos", "source.geometry.layout:=side_by_side"]
     raise UsageError(
         f"one video of {width}x{height} px, and no other one is named as its right eye. If it shows both "
         "eyes, write its row by hand with source.kind:=videos source.geometry.layout:=..., or a launch file "

@@ -6,10 +6,9 @@ import time
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass
-from pathlib import Path
 
 from sags_node.errors import SagsError, UsageError
-from sags_node.messaging.address import ClientKeys
+from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.node_clock import NodeClock
 from sags_node.messaging.received import Frame, Received
 from sags_node.messaging.subscriber import Subscriber
@@ -21,17 +20,13 @@ LOOK = 0.2  # s between looks for a sender that is not there
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
-    """Where a sender is; without an `endpoint`, in the connection file of `ns`.
+class Place(NodeAddress):
+    """Where a sender is.
 
     Attributes:
         clock: that stamped what it sends, where that is another machine's.
     """
 
-    ns: str = "sags"
-    endpoint: str | None = None
-    run_dir: Path | None = None
-    keys: ClientKeys | None = None
     clock: NodeClock | None = None
 
     def now_ns(self) -> int:
@@ -92,16 +87,8 @@ class Feed:
     def _connect(self) -> None:
         place = self._place
         try:
-            subscriber = Subscriber(
-                self._topics,
-                place.endpoint,
-                place.ns,
-                place.run_dir,
-                rates=dict.fromkeys(self._topics, LEAST_HZ),
-                keys=place.keys,
-                clock=place.clock,
-                paused=True,
-            )
+            rates = dict.fromkeys(self._topics, LEAST_HZ)
+            subscriber = Subscriber.at(place, self._topics, rates=rates, clock=place.clock, paused=True)
         except UsageError:
             raise
         except SagsError as error:

@@ -41,7 +41,6 @@ class Options:
 
     node: Place
     overlay: Place
-    control: str | None = None
     host: str = "127.0.0.1"
     port: int = 8765  # Foxglove's default
     rate: float | None = None  # Hz of each topic; default: all that come
@@ -104,8 +103,7 @@ class Foxglove:
     """
 
     def __init__(self, options: Options, offered: Sequence[Output]) -> None:
-        place = options.node
-        self._requests = Requests(options.control, place.ns, place.run_dir, place.keys)
+        self._requests = Requests(options.node)
         self._missing: dict[str, str] = {}
         self._server: WebSocketServer | None = None
         self._shown: dict[str, Received] = {}  # by output

@@ -67,7 +67,6 @@ class Options:
 
     node: Place
     overlay: Place
-    control: str | None = None
     host: str = "127.0.0.1"
     port: int = 18944  # Slicer's default
     send: tuple[str, ...] = ()  # names of outputs; default: all
@@ -148,7 +147,7 @@ class OpenIgtLink:
         self._pins = Pins()
         self._answers: deque[Callable[[], list[Release]]] = deque()  # for the peers' thread
         self._now_ns = place.now_ns
-        self._requests = Requests(options.control, place.ns, place.run_dir, place.keys)
+        self._requests = Requests(options.node)
         self._peers = Peers(options.host, options.port, self._hear, self._idle)
         self._peers.start()
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import Any
 
 from sags_node.errors import SagsError
-from sags_node.messaging.address import ClientKeys
+from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.control import ControlClient
 
 MOST_WAITING = 32
@@ -19,20 +18,10 @@ Answer = Callable[[dict[str, Any] | None, str], None]  # the node's answer, or N
 
 
 class Requests:
-    """Asks the node; it may be restarted meanwhile.
+    """Asks the node; it may be restarted meanwhile."""
 
-    Args:
-        control: its control socket; default: its connection file.
-    """
-
-    def __init__(
-        self,
-        control: str | None = None,
-        ns: str = "sags",
-        run_dir: Path | None = None,
-        keys: ClientKeys | None = None,
-    ) -> None:
-        self._where = (control, ns, run_dir, keys)
+    def __init__(self, node: NodeAddress) -> None:
+        self._node = node
         self._worker = ThreadPoolExecutor(1, "sags-bridge-requests")
         self._places = threading.Semaphore(MOST_WAITING)
 
@@ -63,7 +52,7 @@ class Requests:
     ) -> tuple[dict[str, Any] | None, str]:
         """Ask, and wait for the answer for up to `seconds`; from any thread."""
         try:
-            with ControlClient(*self._where) as client:
+            with ControlClient.at(self._node) as client:
                 result = client.request(op, args, seconds)
         except SagsError as error:
             return None, str(error)

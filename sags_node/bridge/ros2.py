@@ -49,7 +49,6 @@ class Options:
 
     node: Place
     overlay: Place
-    control: str | None = None
     graph: RosGraph = field(default_factory=RosGraph)
     views: tuple[str, ...] = ("ros",)  # that consumers may open
     points: int = 8000  # of a cloud, at most; 20 bytes each
@@ -183,7 +182,7 @@ class Ros2:
         self._namesake = False
         self._refused: dict[str, int] = {}
         answers = self.graph.writer(f"/{place.ns}/{ANSWER}", topics.STRING, Delivery(reliable=True, depth=10))
-        self._requests = Requests(options.control, place.ns, place.run_dir, place.keys)
+        self._requests = Requests(options.node)
         self._inbox = Inbox(self.graph, place.ns, options.views, self._requests, answers)
         self.graph.call_it(f"/{place.ns}")
         self._stopping = threading.Event()

@@ -48,7 +48,6 @@ class Options:
 
     node: Place
     overlay: Place
-    control: str | None = None
     host: str = "127.0.0.1"
     port: int = 8766
     pin: bool = False  # let peers pin anchors
@@ -83,7 +82,7 @@ def run_web(options: Options, ready: Callable[[str, int], None], stop: threading
     """
     for place in (options.overlay, options.node):  # what is wrong is said now, not to the first peer
         Feed((), place, options.max_age, lambda: None).close()
-    requests = Requests(options.control, place.ns, place.run_dir, place.keys)
+    requests = Requests(options.node)
     try:
         server, port = _served(options, requests, stop)
         serving = threading.Thread(target=server.serve_forever, name="sags-web")

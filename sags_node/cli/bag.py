@@ -16,11 +16,12 @@ from rich.markup import escape
 
 from sags_node.cli import bag_text as say
 from sags_node.cli.launching import as_json, open_launched, positive, split_recording
-from sags_node.cli.node_options import endpoint_option, keys_options, ns_option
+from sags_node.cli.node_options import endpoint_option, node_options, ns_option
 from sags_node.errors import SagsError, UsageError
 from sags_node.terminal.console import console, on_stop_signals, progress, show
 
 if TYPE_CHECKING:
+    from sags_node.messaging.address import NodeAddress
     from sags_node.recording.recorder import Options
 
 DATA_LOST = 3  # exit code
@@ -91,7 +92,7 @@ def bag() -> None:
 @click.option("--stdin", "from_stdin", is_flag=True, help="A line on stdin saves the ring; its end ends it.")
 @endpoint_option
 @ns_option
-@keys_options
+@node_options
 @click.option("--seconds", type=positive, help="Stop after so long; default: Ctrl-C.")
 @as_json
 def record(
@@ -105,11 +106,9 @@ def record(
     max_bag_duration: float,
     snapshot_mode: float | None,
     from_stdin: bool,
-    endpoint: str | None,
-    ns: str,
     seconds: float | None,
     json_out: bool,
-    keys: Any,
+    node: NodeAddress,
 ) -> None:
     """Record what a running node publishes until Ctrl-C.
 
@@ -135,7 +134,9 @@ def record(
         )
     if overrides and session is None:
         raise UsageError(f"{overrides[0]}: key:=value needs --session LAUNCH.yaml")
-    if session is not None and (snapshot_mode is not None or from_stdin or seconds is not None or endpoint):
+    if session is not None and (
+        snapshot_mode is not None or from_stdin or seconds is not None or node.endpoint
+    ):
         raise UsageError(
             "--session records a whole recording: no --snapshot-mode, --stdin, --seconds, --endpoint"
         )
@@ -155,7 +156,7 @@ def record(
             )
 
     with _failure_told(tell if from_stdin else None):
-        names = tuple(check_topic(say.plain(name, ns)).name for name in topics)
+        names = tuple(check_topic(say.plain(name, node.ns)).name for name in topics)
         options = Options(
             folder=out or Path(f"sags_{datetime.now():%Y%m%d_%H%M%S}"),
             topics=names,
@@ -163,9 +164,7 @@ def record(
             max_cache_mb=max_cache,
             snapshot_seconds=snapshot_mode,
             limits=Limits(max_bag_size, max_bag_duration),
-            ns=ns,
-            endpoint=endpoint,
-            keys=keys,
+            node=node,
         )
         if session is not None:
             summary = _recorded((session, *overrides), options)

@@ -10,16 +10,19 @@ from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from functools import partial, wraps
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 from rich.markup import escape
 
 from sags_node.cli.launching import as_json, positive
-from sags_node.cli.node_options import endpoint_option, keys_options, ns_option
+from sags_node.cli.node_options import endpoint_option, node_options, ns_option
 from sags_node.errors import UsageError
 from sags_node.files import check_file, whole
 from sags_node.terminal.console import console, on_stop_signals, show
+
+if TYPE_CHECKING:
+    from sags_node.messaging.address import NodeAddress
 
 NICENESS = 19  # the node goes first, where both want the same cores
 INSTALL = "install it with: pip install 'sags-node[bridges]'"
@@ -51,13 +54,13 @@ def bridge() -> None:
 
 
 def _common(command: Callable[..., None]) -> Callable[..., None]:
-    """Options of every bridge; the command gets them as `node`, `overlay`, `control`, `max_age`, `stop`, and
+    """Options of every bridge; the command gets them as `node`, `overlay`, `max_age`, `stop`, and
     `say`, which tells where it is once peers can come."""
 
     @endpoint_option
     @click.option("--control", metavar="ENDPOINT", help="Control socket of the node; with --endpoint.")
     @ns_option
-    @keys_options
+    @node_options
     @click.option("--overlay-ns", default="overlay", show_default=True, help="Namespace of a sags overlay.")
     @click.option("--run-dir", type=click.Path(path_type=Path), help="Of the connection files.")
     @click.option(
@@ -70,16 +73,15 @@ def _common(command: Callable[..., None]) -> Callable[..., None]:
     @as_json
     @wraps(command)
     def with_common(
-        endpoint: str | None, ns: str, overlay_ns: str, run_dir: Path | None, keys: Any, json_out: bool,
-        **rest: Any,
+        node: NodeAddress, overlay_ns: str, json_out: bool, **rest: Any,
     ) -> None:  # fmt: skip
         from sags_node.bridge.feed import Place
         from sags_node.messaging.node_clock import NodeClock
 
-        remote = endpoint is not None and rest["control"] is not None
-        clock = NodeClock(rest["control"], keys=keys) if remote else None
-        node = Place(ns, endpoint, run_dir, keys, clock)
-        overlay = Place(overlay_ns, None, run_dir, clock=clock)  # its stamps are the node's
+        remote = node.endpoint is not None and node.control is not None
+        clock = NodeClock.at(node) if remote else None
+        place = Place(node.ns, node.endpoint, node.control, node.run_dir, node.keys, clock)
+        overlay = Place(overlay_ns, run_dir=node.run_dir, clock=clock)  # its stamps are the node's
         stop = threading.Event()
 
         def say(words: str, fields: Mapping[str, Any]) -> None:
@@ -90,7 +92,7 @@ def _common(command: Callable[..., None]) -> Callable[..., None]:
 
         on_stop_signals(stop.set)
         with clock or nullcontext():
-            command(node=node, overlay=overlay, say=say, stop=stop, **rest)
+            command(node=place, overlay=overlay, say=say, stop=stop, **rest)
 
     return with_common
 
@@ -247,7 +249,7 @@ def gst(overlay_ns: str, run_dir: Path | None, **options: Any) -> None:
     stop = threading.Event()
     on_stop_signals(stop.set)
     ready = partial(console.print, "writing as soon as an overlay is there  (Ctrl-C ends)")
-    run_gst(Options(Place(overlay_ns, None, run_dir), **options), ready, stop)
+    run_gst(Options(Place(overlay_ns, run_dir=run_dir), **options), ready, stop)
 
 
 @bridge.command()

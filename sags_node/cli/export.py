@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -17,10 +17,13 @@ from sags_node.cli.launching import (
     positive,
     split_recording,
 )
-from sags_node.cli.node_options import endpoint_option, keys_options, ns_option
+from sags_node.cli.node_options import endpoint_option, node_options, ns_option
 from sags_node.errors import UsageError
 from sags_node.terminal import text
 from sags_node.terminal.console import progress, show
+
+if TYPE_CHECKING:
+    from sags_node.messaging.address import NodeAddress
 
 NO_CAMERAS = "live cameras are exported from the running node; leave out --session"
 
@@ -75,7 +78,7 @@ NO_CAMERAS = "live cameras are exported from the running node; leave out --sessi
 @force_option
 @endpoint_option
 @ns_option
-@keys_options
+@node_options
 @as_json
 def export(
     overrides: tuple[str, ...],
@@ -90,9 +93,7 @@ def export(
     orbit_degrees: float,
     orbit_seconds: float,
     force: bool,
-    endpoint: str | None,
-    ns: str,
-    keys: Any,
+    node: NodeAddress,
     json_out: bool,
     **of_every_frame: Path | None,
 ) -> None:
@@ -154,7 +155,7 @@ def export(
         return
     with progress("exporting") as advance:
         if session is None:
-            scene = source.from_node(endpoint, ns, keys=keys)
+            scene = source.from_node(node)
         elif fit is None:
             scene = source.from_session(opened, at, advance)
         else:

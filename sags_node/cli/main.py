@@ -11,7 +11,7 @@ import tempfile
 from collections.abc import Callable
 from importlib.metadata import distribution
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 from rich.markup import escape
@@ -30,7 +30,7 @@ from sags_node.cli.launching import (
     split,
     split_recording,
 )
-from sags_node.cli.node_options import keys_options, ns_option
+from sags_node.cli.node_options import node_options, ns_option
 from sags_node.cli.offline import evaluate, fit
 from sags_node.cli.overlay import overlay
 from sags_node.cli.topic import topic
@@ -39,6 +39,9 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.evaluation.plotting import check_plots
 from sags_node.terminal import text
 from sags_node.terminal.console import console, interrupt, log_handler, progress, show, stop_signals
+
+if TYPE_CHECKING:
+    from sags_node.messaging.address import NodeAddress
 
 log = logging.getLogger(__name__)
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT)  # of a disk; also of what stdout leads to
@@ -209,20 +212,18 @@ def demo(launch: tuple[str, ...], seconds: float, out: Path, json_out: bool) -> 
 def phantom(folder: Path, overrides: tuple[str, ...]) -> None:
     """Write a synthetic stereo session with exact truth.
 
-    FOLDER must be new or empty. Keys: seconds, rate, width, height, seed, camera_motion, smoke, noise, blur.
+    FOLDER must be new or empty. Keys: seconds, rate, width, height, seed, camera_motion, smoke, noise, blur,
+    gloss, still_tissue, blackout.
 
     \b
     sags phantom out/session seconds:=8 seed:=3 camera_motion:=orbit smoke:=0.3
     """
-    from sags_node.config.launch_file import load_launch
-    from sags_node.config.schema import PhantomSource
-    from sags_node.phantom import write_session
+    from sags_node.config.launch_file import section_of
+    from sags_node.phantom import PhantomScene, write_session
 
-    config = load_launch(None, [f"source.{override}" for override in overrides]).source
-    if not isinstance(config, PhantomSource):
-        raise UsageError(f"sags phantom writes phantom sessions; kind:={config.kind} is something else")
+    scene = section_of(PhantomScene, overrides)
     with progress("rendering") as advance:
-        write_session(config, folder, rate=config.rate or 30.0, progress=advance)
+        write_session(scene, folder, rate=scene.rate or 30.0, progress=advance)
     console.print(f"session: [bold]{escape(str(folder))}[/]; play it with: sags run {escape(str(folder))}")
 
 
@@ -262,9 +263,9 @@ def keygen(name: str, out: Path) -> None:
 @main.command()
 @click.option("--control", metavar="ENDPOINT", help="Control socket; default: the node's connection file.")
 @ns_option
-@keys_options
+@node_options
 @as_json
-def health(control: str | None, ns: str, json_out: bool, keys: Any) -> None:
+def health(json_out: bool, node: NodeAddress) -> None:
     """Ask a running node whether it does its work.
 
     Exit code 0: frames come and are shown, or the node was told to pause. 1: it waits for frames, starts,
@@ -275,12 +276,12 @@ def health(control: str | None, ns: str, json_out: bool, keys: Any) -> None:
     """
     from sags_node.messaging.control import ControlClient
 
-    with ControlClient(control, ns, keys=keys) as client:
+    with ControlClient.at(node) as client:
         answer = client.request("get_health")
     warnings = ", ".join(answer["warnings"])
     show(answer if json_out else answer["state"] + (f"; warnings: {warnings}" if warnings else ""))
     if not answer["healthy"]:
-        raise SagsError(f"the node is {answer['state']}: see sags topic echo diagnostics --ns {ns}")
+        raise SagsError(f"the node is {answer['state']}: see sags topic echo diagnostics --ns {node.ns}")
 
 
 @main.command()

@@ -15,8 +15,9 @@ endpoint_option = click.option(
 ns_option = click.option("--ns", default="sags", show_default=True, help="Namespace of the topics.")
 
 
-def keys_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Options for a node that wants keys; the command gets them as `keys`."""
+def node_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Options for a node that wants keys; the command gets them, and what other options say of where the node
+    is, as `node`."""
 
     @click.option(
         "--key",
@@ -30,9 +31,10 @@ def keys_options(command: Callable[..., None]) -> Callable[..., None]:
         help="The node's .pub file or the key itself; default: the connection file.",
     )
     @wraps(command)
-    def with_keys(*args: Any, key: Path | None, server_key: str | None, **rest: Any) -> None:
-        from sags_node.messaging.address import client_keys
+    def with_node(*args: Any, key: Path | None, server_key: str | None, **rest: Any) -> None:
+        from sags_node.messaging.address import NodeAddress, client_keys
 
-        command(*args, keys=client_keys(key, server_key), **rest)
+        said = {name: rest.pop(name) for name in ("ns", "endpoint", "control", "run_dir") if name in rest}
+        command(*args, node=NodeAddress(**said, keys=client_keys(key, server_key)), **rest)
 
-    return with_keys
+    return with_node

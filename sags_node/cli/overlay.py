@@ -9,7 +9,7 @@ import click
 from rich.markup import escape
 
 from sags_node.cli.launching import as_json, force_option, positive
-from sags_node.cli.node_options import endpoint_option, keys_options, ns_option
+from sags_node.cli.node_options import endpoint_option, node_options, ns_option
 from sags_node.terminal import text
 from sags_node.terminal.console import console, show
 
@@ -37,7 +37,7 @@ class Ahead(click.ParamType["float | str"]):
 @endpoint_option
 @click.option("--control", metavar="ENDPOINT", help="Control socket of the node; needed with --endpoint.")
 @ns_option
-@keys_options
+@node_options
 @click.option(
     "--scene",
     metavar="FILE.yaml",

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from sags_node.errors import SagsError
+from sags_node.messaging.address import NodeAddress
 from sags_node.node.node import Node
 from sags_node.pipeline.session import Session
 from sags_node.recording.recorder import Options, Recorder
@@ -30,7 +31,7 @@ def record_session(session: Session, options: Options, advance: Advance) -> dict
 
     Args:
         session: a recording with `source.pace` step: the node waits for nobody, and no frame is left out.
-        options: where and how; `ns`, `endpoint` and `run_dir` are this node's.
+        options: where and how; `node` is this one.
         advance: called with what is going on.
 
     Returns:
@@ -52,7 +53,7 @@ def record_session(session: Session, options: Options, advance: Advance) -> dict
             advance(next(sent), frames, "recording")
 
         node = Node(config, session.rig, session.source, on_result=tell)
-        recorder = Recorder(replace(options, ns=config.ns, endpoint=None, run_dir=Path(private), keys=None))
+        recorder = Recorder(replace(options, node=NodeAddress(config.ns, run_dir=Path(private))))
 
         def record() -> None:
             try:

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from sags_node.cli.launching import as_json, positive
-from sags_node.cli.node_options import endpoint_option, keys_options, ns_option
+from sags_node.cli.node_options import endpoint_option, node_options, ns_option
 from sags_node.terminal import text
 from sags_node.terminal.console import show, tell
+
+if TYPE_CHECKING:
+    from sags_node.messaging.address import NodeAddress
 
 
 @click.group()
@@ -24,10 +27,10 @@ def topic() -> None:
 @topic.command("list")
 @endpoint_option
 @ns_option
-@keys_options
+@node_options
 @click.option("--seconds", type=positive, default=3.0, show_default=True, help="How long to listen.")
 @as_json
-def topic_list(endpoint: str | None, ns: str, seconds: float, json_out: bool, keys: Any) -> None:
+def topic_list(seconds: float, json_out: bool, node: NodeAddress) -> None:
     """Every topic with its type, and the rate and size of what was heard.
 
     \b
@@ -36,7 +39,7 @@ def topic_list(endpoint: str | None, ns: str, seconds: float, json_out: bool, ke
     """
     from sags_node.messaging import introspection as tool
 
-    rows = tool.topic_list(endpoint=endpoint, ns=ns, seconds=seconds, keys=keys)
+    rows = tool.topic_list(node, seconds)
     show(rows if json_out else text.topics_table(rows))
 
 
@@ -44,12 +47,10 @@ def topic_list(endpoint: str | None, ns: str, seconds: float, json_out: bool, ke
 @click.argument("name")
 @endpoint_option
 @ns_option
-@keys_options
+@node_options
 @click.option("--count", type=click.IntRange(1), help="Stop after so many messages; default: Ctrl-C.")
 @as_json
-def topic_echo(
-    name: str, endpoint: str | None, ns: str, count: int | None, json_out: bool, keys: Any
-) -> None:
+def topic_echo(name: str, count: int | None, json_out: bool, node: NodeAddress) -> None:
     """Print the messages of topic NAME, bulk data as shape and range.
 
     Warnings of its sender go to stderr.
@@ -58,9 +59,7 @@ def topic_echo(
     from sags_node.terminal.notices import Notices
 
     notices = Notices(tell)
-    for message in tool.topic_echo(
-        name, endpoint=endpoint, ns=ns, count=count, keys=keys, warned=notices.update
-    ):
+    for message in tool.topic_echo(name, node, count=count, warned=notices.update):
         show(message if json_out else text.echo_text(message))
 
 
@@ -71,7 +70,7 @@ def _measuring(name: str, doc: str, *more: Callable[..., Any]) -> None:
     @click.argument("topic_name", metavar="NAME")
     @endpoint_option
     @ns_option
-    @keys_options
+    @node_options
     @click.option("--seconds", type=positive, default=5.0, show_default=True, help="How long to listen.")
     @as_json
     def command(topic_name: str, json_out: bool, **asked: Any) -> None:

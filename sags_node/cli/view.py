@@ -5,15 +5,18 @@ from __future__ import annotations
 import importlib.util
 import os
 import threading
-from typing import Any
+from typing import TYPE_CHECKING
 
 import click
 from rich.markup import escape
 
 from sags_node.cli.launching import as_json
-from sags_node.cli.node_options import endpoint_option, keys_options, ns_option
+from sags_node.cli.node_options import endpoint_option, node_options, ns_option
 from sags_node.errors import UsageError
 from sags_node.terminal.console import console, on_stop_signals, show
+
+if TYPE_CHECKING:
+    from sags_node.messaging.address import NodeAddress
 
 NICENESS = 19  # the node goes first, where both want the same cores
 
@@ -22,7 +25,7 @@ NICENESS = 19  # the node goes first, where both want the same cores
 @endpoint_option
 @click.option("--control", help="Control socket of the node; default: its connection file.")
 @ns_option
-@keys_options
+@node_options
 @click.option(
     "--port", type=click.IntRange(0, 65535), default=8080, show_default=True, help="0: any free one."
 )
@@ -30,14 +33,11 @@ NICENESS = 19  # the node goes first, where both want the same cores
 @click.option("--insecure", is_flag=True, help="Serve also to other machines: there are no keys.")
 @as_json
 def view(
-    endpoint: str | None,
-    control: str | None,
-    ns: str,
     port: int,
     host: str,
     insecure: bool,
     json_out: bool,
-    keys: Any,
+    node: NodeAddress,
 ) -> None:
     """Show a running node in a web browser on this machine.
 
@@ -71,4 +71,4 @@ def view(
 
     stop = threading.Event()
     on_stop_signals(stop.set)
-    run_viewer(host, port, insecure, endpoint, control, ns, keys, ready, stop=stop)
+    run_viewer(host, port, insecure, node, ready, stop=stop)

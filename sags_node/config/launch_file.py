@@ -7,14 +7,24 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from string import Template
-from typing import Any, get_args
+from typing import Any, TypeVar, get_args
 
 from pydantic import ValidationError
 
-from sags_node.config.schema import REMOVED, LaunchConfig, LiveSource, PhantomSource, Section, Source
+from sags_node.config.schema import (
+    REMOVED,
+    REMOVED_KINDS,
+    LaunchConfig,
+    LiveSource,
+    PhantomSource,
+    Section,
+    Source,
+)
 from sags_node.config.yaml_reader import parse_yaml, read_yaml
 from sags_node.errors import UsageError, brief
 from sags_node.files import open_file
+
+S = TypeVar("S", bound=Section)
 
 MOST_MISTAKES = 10  # named at once
 COMMAND_LINE = "command line"
@@ -67,8 +77,8 @@ def load_launch(path: Path | str | None = None, overrides: Sequence[str] = ()) -
             file = file / "launch.yaml"
         elif file.suffix.lower() in VIDEO_SUFFIXES:
             raise UsageError(
-                f"{file} is a video, not a launch file; write source.kind:=side_by_side source.video:={file} "
-                f"(both eyes in it), or source.kind:=videos source.left:={file} source.right:=OTHER, and "
+                f"{file} is a video, not a launch file; write source.kind:=videos source.left:={file} "
+                "source.right:=OTHER, or where it shows both eyes source.geometry.layout:=side_by_side, and "
                 "rig:=CALIBRATION"
             )
         name = str(file)
@@ -96,6 +106,21 @@ def load_launch(path: Path | str | None = None, overrides: Sequence[str] = ()) -
             "distance to the middle of the first picture, m; docs/networks.md has an example under 'One eye'"
         )
     return config
+
+
+def section_of(kind: type[S], overrides: Sequence[str]) -> S:
+    """A section by itself, as `key:=value` say.
+
+    Raises:
+        UsageError: an unknown key or a wrong value.
+    """
+    tree: dict[str, Any] = {}
+    for override in overrides:
+        _apply_override(tree, override)
+    try:
+        return kind.model_validate(tree)
+    except ValidationError as error:
+        raise UsageError(_explain(error, COMMAND_LINE, root=kind)) from None
 
 
 def known_recording(folder: Path) -> dict[str, Any] | None:
@@ -196,12 +221,15 @@ def _set(tree: dict[str, Any], key: str, value: Any, said: str) -> None:
     node[leaf] = value
 
 
-def _explain(error: ValidationError, name: str, given: Sequence[str] = ()) -> str:
+def _explain(
+    error: ValidationError, name: str, given: Sequence[str] = (), root: type[Section] = LaunchConfig
+) -> str:
     """One line per mistake: where, what, and for an unknown key what replaced it or the nearest known one.
 
     Args:
         name: of what was read.
         given: keys that were said on the command line instead.
+        root: what it should be.
     """
     lines = []
     mistakes = error.errors()
@@ -212,14 +240,17 @@ def _explain(error: ValidationError, name: str, given: Sequence[str] = ()) -> st
         if item["type"] == "extra_forbidden" and where in REMOVED:
             lines.append(f"{said}: there is no {where} any more: {REMOVED[where]}")
         elif item["type"] == "extra_forbidden":
-            lines.append(f"{said}: unknown key '{where}'; {_nearest(path)}")
+            lines.append(f"{said}: unknown key '{where}'; {_nearest(path, root)}")
         elif item["type"] == "missing":
             lines.append(f"{said}: {where} is missing; set it")
         elif item["type"] in ("union_tag_invalid", "union_tag_not_found"):
             kinds = ", ".join(repr(kind) for kind in _SOURCES)
-            got = brief(item["input"].get("kind"))
+            got = item["input"].get("kind")
             said = COMMAND_LINE if "source.kind" in given else name
-            lines.append(f"{said}: source.kind: should be one of {kinds} (got {got})")
+            if got in REMOVED_KINDS:
+                lines.append(f"{said}: there is no source.kind {got} any more: {REMOVED_KINDS[got]}")
+            else:
+                lines.append(f"{said}: source.kind: should be one of {kinds} (got {brief(got)})")
         else:
             what = _PLAIN.get(item["type"], item["msg"])
             lines.append(f"{said}: {where or 'launch file'}: {what} (got {brief(item.get('input'))})")
@@ -236,17 +267,17 @@ _PLAIN = {  # where pydantic speaks of Python
 }
 
 
-def _nearest(path: Sequence[str]) -> str:
+def _nearest(path: Sequence[str], root: type[Section]) -> str:
     """The known key that was probably meant: of this section, or one of that name in another."""
-    known = _known_keys(path[:-1])
+    known = _known_keys(path[:-1], root)
     near = difflib.get_close_matches(path[-1], known, n=1, cutoff=0.5)
     if not near:
-        near = [f"{section}.{path[-1]}" for section in _SECTIONS if path[-1] in _known_keys([section])]
+        near = [f"{part}.{path[-1]}" for part in _SECTIONS if path[-1] in _known_keys([part], LaunchConfig)]
     return f"did you mean '{near[0]}'?" if near else f"known keys: {', '.join(sorted(known))}"
 
 
-def _known_keys(path: Sequence[str]) -> list[str]:
-    model: Any = LaunchConfig
+def _known_keys(path: Sequence[str], root: type[Section]) -> list[str]:
+    model: Any = root
     for part in path:
         field = model.model_fields.get(part)
         if part in _SOURCES:

@@ -71,11 +71,14 @@ class FoldersSource(RecordedSource):
 class GeometryConfig(Section):
     """How pictures become those of the two eyes: taken apart; each eye deinterlaced, cropped, turned."""
 
-    layout: Literal["separate", "side_by_side", "over_under", "row_interleaved", "frame_sequential"] = Field(
+    layout: Literal[
+        "separate", "side_by_side", "over_under", "panes", "row_interleaved", "frame_sequential"
+    ] = Field(
         "separate",
         description="separate: a picture shows one eye; side_by_side: both, in its left and right half; "
-        "over_under: in the upper and lower half; row_interleaved: in every other row, as the two fields of "
-        "field-sequential stereo are; frame_sequential: each eye in every other picture",
+        "over_under: in the upper and lower half; panes: in the boxes crop and crop_right; row_interleaved: "
+        "in every other row, as the two fields of field-sequential stereo are; frame_sequential: each eye in "
+        "every other picture",
     )
     first: Literal["left", "right"] = Field(
         "left", description="whose is the left or upper half, the first row, the first picture"
@@ -100,6 +103,8 @@ class GeometryConfig(Section):
     def _possible(self) -> GeometryConfig:
         if self.layout == "row_interleaved" and self.deinterlace != "none":
             raise ValueError("row_interleaved takes the fields apart itself: leave deinterlace out")
+        if self.layout == "panes" and (self.crop is None or self.crop_right is None):
+            raise ValueError("panes needs crop and crop_right: the boxes [x, y, width, height] of the eyes")
         for box in (self.crop, self.crop_right):
             if box is not None and (min(box) < 0 or min(box[2:]) < 1):
                 raise ValueError(
@@ -119,32 +124,19 @@ class VideosSource(RecordedSource):
         None, description="video of the right eye; null: one camera, with a monocular vision.onnx"
     )
     geometry: GeometryConfig = GeometryConfig()
+    tools: Box | None = Field(
+        None, description="of source.geometry.layout panes: the left eye with the instruments painted green"
+    )
 
     @model_validator(mode="after")
     def _one_file_of_both(self) -> VideosSource:
+        if self.tools is not None and self.geometry.layout != "panes":
+            raise ValueError("tools is a pane beside those of the eyes: set geometry.layout to panes")
         if self.geometry.layout != "separate" and self.right is not None:
             raise ValueError(
                 f"geometry.layout {self.geometry.layout}: source.left shows both, leave right out"
             )
         return self
-
-
-class SideBySideSource(RecordedSource):
-    """One video with both eyes side by side."""
-
-    kind: Literal["side_by_side"] = "side_by_side"
-    video: Path = Field(description="the file")
-    order: Literal["LR", "RL"] = Field("LR", description="LR: the left eye is in the left half")
-
-
-class PanesSource(RecordedSource):
-    """One video of several panes; each eye is a crop of it."""
-
-    kind: Literal["panes"] = "panes"
-    video: Path = Field(description="the file")
-    left: Box = Field(description="pane of the left eye")
-    right: Box = Field(description="pane of the right eye")
-    tools: Box | None = Field(None, description="pane of the left eye with the instruments painted green")
 
 
 class EndoNerfSource(RecordedSource):
@@ -216,14 +208,6 @@ class PhantomSource(RecordedSource):
         "none",
         description="of the scope, again and again. sway (or true): it looks about; zoom: in and out, 15 mm; "
         "orbit: round a point of the tissue, 11 degrees to each side",
-    )
-    smoke: float = Field(0.0, ge=0, le=1, description="density")
-    noise: float = Field(0.01, ge=0, le=0.2, description="of a pixel: standard deviation, in units of white")
-    blur: float = Field(0.0, ge=0, le=5, description="of the lens: standard deviation, px")
-    gloss: float = Field(1.0, ge=0, le=100, description="strength of the wet highlights")
-    still_tissue: bool = Field(False, description="only the instruments move, and the scope if it is to")
-    blackout: tuple[float, float] | None = Field(
-        None, description="s: without light from, until; null: never"
     )
 
 
@@ -383,8 +367,6 @@ class PushSource(SentSource, Guarded):
 Source = Annotated[
     FoldersSource
     | VideosSource
-    | SideBySideSource
-    | PanesSource
     | EndoNerfSource
     | ScaredSource
     | BagSource
@@ -496,35 +478,42 @@ def _by_name(said: object) -> object:
 
 
 class NetworkFormat(Section):
-    """How a depth network takes pictures and what it gives. What is not said is found out."""
+    """How a depth network takes pictures and what it gives: what its file does not say must be set."""
 
-    inputs: tuple[str, ...] | None = Field(None, description="names: left eye, right eye; default: found out")
+    inputs: tuple[str, ...] | None = Field(
+        None, description="names: left eye, right eye; default: the only one"
+    )
     layout: Literal["nchw", "nhwc"] | None = Field(
-        None, description="order of the inputs' axes; default: found out"
+        None, description="order of the inputs' axes; default: by their shape"
     )
     color: Literal["rgb", "bgr"] | None = Field(None, description="order of the channels; default: rgb")
     normalization: Annotated[Normalization | None, BeforeValidator(_by_name)] = Field(
         None,
         description="`unit` (0..1), `bytes` (0..255), `imagenet`, `symmetric` (-1..1), or "
-        "`{mean: [], std: []}`; default: found out",
+        "`{mean: [], std: []}`; to be set, but for inputs of bytes",
     )
     size: tuple[Side, Side] | None = Field(
-        None, description="width and height for a network that takes any; default: the working size"
+        None, description="width and height for a network that takes any; default: the working size, padded"
     )
     multiple: int | None = Field(
         None,
         ge=1,
         le=512,
-        description="px; width and height are padded to multiples of it; default: found out",
+        description="px; width and height are padded to multiples of it, for a network that takes any",
     )
-    output: str | None = Field(None, description="name of the output to use; default: found out")
-    meaning: Literal["disparity", "negative_disparity", "depth", "inverse_depth"] | None = Field(
-        None, description="of the output's numbers; default: found out"
+    output: str | None = Field(None, description="name of the output to use; default: the only one")
+    meaning: Literal["disparity", "depth", "inverse_depth"] | None = Field(
+        None, description="of the output's numbers; to be set"
+    )
+    scale: float | None = Field(
+        None,
+        description="the output's numbers times this are px of the picture that the network gets, or m; -1: "
+        "disparities are negative; default: 1",
     )
 
 
 class OnnxConfig(NetworkFormat):
-    """Depth from a network of the user's; docs/networks.md says what is recognised."""
+    """Depth from a network of the user's; docs/networks.md has examples."""
 
     path: Path | None = Field(
         None, description="the .onnx file; null: depth is matched, as vision.stereo says"
@@ -622,11 +611,6 @@ class VisionConfig(Section):
 class EngineConfig(Section):
     """What draws the Gaussians."""
 
-    backend: Literal["numba", "gsplat", "reference"] = Field(
-        "numba",
-        description="numba: the CPU, or a GPU by `device`; gsplat: that package on a GPU, docs/gpu.md; "
-        "reference: the slow readable twin, for tests",
-    )
     threads: int | None = Field(
         None, ge=1, le=64, description="of the kernels; default: all cores of this process"
     )
@@ -658,16 +642,11 @@ class MappingConfig(Section):
         le=2_000_000,
         description="the model has no more; default: as many as the machine refines within the budget",
     )
-    smoothing: bool = Field(True, description="the 3D filter of Mip-Splatting: nothing finer than was seen")
-    skip_duplicates: bool = Field(True, description="a frame equal to its predecessor is not mapped again")
-    skip_depth: bool = Field(True, description="when time is short, match depth in some of the frames only")
-    skip_fitted: bool = Field(True, description="when time is short, refine where it fits worst only")
     field: bool | None = Field(
         None,
         description="remember how tissue moves: hidden tissue goes on as it did before, and motion is "
         "predicted to the moment of a display; default: once an anchor or a view asks for `ahead_ms`",
     )
-    skip_still: bool = Field(True, description="while nothing moves: no matching, a step where it pays most")
 
     def frame_ms(self, rate: float | None = None) -> float:
         """What a frame may take, ms.
@@ -701,7 +680,7 @@ class PublishConfig(Guarded):
     )
 
 
-DeviceName = Literal["auto", "cpu", "cuda"]
+DeviceName = Literal["auto", "cpu", "cuda", "gsplat"]
 
 
 class LaunchConfig(Section):
@@ -710,7 +689,8 @@ class LaunchConfig(Section):
     ns: str = Field("sags", pattern=NAMESPACE, description="namespace of all topics")
     device: DeviceName = Field(
         "auto",
-        description="auto: a GPU where one can be used, else the CPU; cuda: a GPU, or an error; docs/gpu.md",
+        description="auto: a GPU where one can be used, else the CPU; cuda: a GPU, or an error; gsplat: the "
+        "CPU, and that package draws on a GPU; docs/gpu.md",
     )
     rig: Path | None = Field(
         None,
@@ -730,16 +710,15 @@ class LaunchConfig(Section):
     )
 
     @model_validator(mode="after")
-    def _one_engine(self) -> LaunchConfig:
-        if self.device == "cuda" and self.engine.backend != "numba":
-            raise ValueError(f"device cuda and engine.backend {self.engine.backend}: choose one of them")
-        return self
-
-    @model_validator(mode="after")
     def _one_pose(self) -> Self:
         if self.robot is not None and self.vision.pose not in ("session", "refine"):
             raise ValueError(f"robot says where the scope is, vision.pose {self.vision.pose} too: choose one")
         return self
+
+    @property
+    def backend(self) -> Literal["numba", "gsplat"]:
+        """What draws where the CPU refines; see `make_rasterizer`."""
+        return "gsplat" if self.device == "gsplat" else "numba"
 
     @property
     def in_real_time(self) -> bool:
@@ -755,8 +734,29 @@ class LaunchConfig(Section):
 
 
 # Keys of earlier versions, and what stands in their place: an error says it.
+ALWAYS_ON = "it is always on; `python -m benchmarks pareto --only skips` says what it brings"
+SCENE = "tests and `sags phantom FOLDER key:=value` set it: play that folder"
 REMOVED = {
     "seed": "`python -m benchmarks endurance` has --seed; source.seed is the phantom's",
     "mapping.right_eye": "publish.right draws the right eye, and learns from what it sees",
     "vision.stereo.method": "inverse search matches; SGBM is a baseline of `python -m benchmarks depth`",
+    "source.order": "source.geometry.first says whose the left half is",
+    "source.video": "source.left names the video",
+    "engine.backend": "device:=gsplat draws with that package, any other device with our kernels",
+    "mapping.smoothing": "it is always on; `python -m benchmarks alias` says what it brings",
+    "mapping.skip_duplicates": ALWAYS_ON,
+    "mapping.skip_depth": ALWAYS_ON,
+    "mapping.skip_fitted": ALWAYS_ON,
+    "mapping.skip_still": ALWAYS_ON,
+    "source.smoke": SCENE,
+    "source.noise": SCENE,
+    "source.blur": SCENE,
+    "source.gloss": SCENE,
+    "source.still_tissue": SCENE,
+    "source.blackout": SCENE,
+}
+REMOVED_KINDS = {
+    "side_by_side": "source.kind:=videos source.left:=VIDEO source.geometry.layout:=side_by_side",
+    "panes": "source.kind:=videos source.left:=VIDEO source.geometry.layout:=panes, with the boxes of the "
+    "eyes in source.geometry.crop and crop_right",
 }

@@ -35,7 +35,7 @@ def choose_device(wanted: DeviceName) -> Device:
     Raises:
         UsageError: a GPU is wanted and none can be used.
     """
-    if wanted == "cpu":
+    if wanted in ("cpu", "gsplat"):
         return Device("cpu", "the CPU")
     if wanted == "auto" and _interpreted():
         return Device("cpu", "the CPU", "TRITON_INTERPRET is set, for tests of kernels", "unset it")

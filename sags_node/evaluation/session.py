@@ -17,7 +17,7 @@ from sags_node.evaluation.measure import FrameRow, Measurer, Options, Progress
 from sags_node.evaluation.spool import Spool
 from sags_node.evaluation.summary import GROUPS, summarise
 from sags_node.kernels.threads import configure_threads
-from sags_node.mapping.devices import affordable, device_of
+from sags_node.mapping.devices import ALL_SKIPS, Skips, affordable, device_of
 from sags_node.node.node import Node
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import Session, at_best_scale, open_posed, open_session
@@ -122,7 +122,7 @@ def measure(
         "pace": None if isinstance(config.source, LiveSource) else config.source.pace,
         "iterations": config.mapping.iterations,
         "max_gaussians": affordable(config, *session.working_size),
-        "backend": config.engine.backend,
+        "backend": config.backend,
         "device": device_of(config).kind,
         "width": session.working_size[0],
         "height": session.working_size[1],
@@ -134,10 +134,12 @@ def measure(
     return Evaluation(summary, measurer.rows, measurer.gallery.pictures)
 
 
-def run_step(session: Session, options: Options, spool: Spool, progress: Progress) -> None:
+def run_step(
+    session: Session, options: Options, spool: Spool, progress: Progress, skips: Skips = ALL_SKIPS
+) -> None:
     """Every frame in turn, none lost; only the pipeline's own work is timed."""
     configure_threads(session.config.engine.threads)
-    pipeline = Pipeline(session.config, session.rig)
+    pipeline = Pipeline(session.config, session.rig, skips=skips)
     budget = pipeline.make_budget()
     with session.source as source:
         for frame in source:
@@ -215,7 +217,7 @@ def _measured(session: Session, spool: Spool, options: Options, progress: Progre
     rectifier = Rectifier(session.rig, *session.working_size)
     tissue = TissueMask(config.vision.tissue, rectifier)
     exclude = config.vision.tissue.exclude
-    measurer = Measurer(spool, rectifier, tissue, options, exclude, config.engine.backend, config.vision.pose)
+    measurer = Measurer(spool, rectifier, tissue, options, exclude, config.backend, config.vision.pose)
     played = config.source.model_copy(update={"pace": "step"})
     with open_posed(config.model_copy(update={"source": played}), session.rig) as frames:
         measurer.run(frames, progress)

@@ -19,7 +19,7 @@ from sags_node.fitting.clip import ClipFrame, read_clip
 from sags_node.fitting.fit import Fit
 from sags_node.fitting.settings import FitSettings
 from sags_node.kernels.threads import configure_threads
-from sags_node.messaging.address import ClientKeys
+from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.content import SPLAT_FIELDS
 from sags_node.messaging.received import ReceivedCameraInfo, ReceivedCloud, ReceivedRos, TopicName
 from sags_node.messaging.subscriber import Subscriber
@@ -48,9 +48,7 @@ class Scene:
 # ---- a running node --------------------------------------------------------------------------------------
 
 
-def from_node(
-    endpoint: str | None = None, ns: str = "sags", run_dir: Path | None = None, keys: ClientKeys | None = None
-) -> Scene:
+def from_node(node: NodeAddress) -> Scene:
     """The newest fresh frame of a running node.
 
     Raises:
@@ -58,7 +56,7 @@ def from_node(
         UsageError: it wants keys.
     """
     names = (SPLATS, INFO, POSE)
-    with Subscriber(names, endpoint, ns, run_dir, keys=keys) as subscriber:
+    with Subscriber.at(node, names) as subscriber:
         deadline = time.monotonic() + PATIENCE
         newest = None
         while (left := deadline - time.monotonic()) > 0:

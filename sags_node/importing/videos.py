@@ -29,7 +29,7 @@ APART = 1.0  # px: eyes see the tissue in different columns; fields of one pictu
 
 
 VIDEO = "source.kind:=videos source.left:={file} source.geometry.layout:="
-PANES = "source.kind:=panes source.video:={file} source.left:=[0,0,{w},{h}] source.right:=[{w},0,{w},{h}]"
+PANES = VIDEO + "panes source.geometry.crop:=[0,0,{w},{h}] source.geometry.crop_right:=[{w},0,{w},{h}]"
 
 
 class _Way(NamedTuple):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 from sags_node.config.schema import LaunchConfig
@@ -18,9 +18,22 @@ GPU_SPEED = 10.0  # times two CPU cores, in Gaussians of a rung: an ESTIMATE, ne
 GAUSSIANS_PER_MS = 1100  # of the budget, where the number of steps is fixed; see benchmarks/mapping.md
 
 
+@dataclass(frozen=True, slots=True)
+class Skips:
+    """What a frame may leave out. All of it, but in an ablation."""
+
+    duplicates: bool = True  # a frame equal to its predecessor is not mapped again
+    depth: bool = True  # when time is short, depth is matched in some of the frames only
+    fitted: bool = True  # when time is short, it is refined where it fits worst only
+    still: bool = True  # while nothing moves: no matching, a step where it pays most
+
+
+ALL_SKIPS = Skips()
+
+
 def device_of(config: LaunchConfig) -> Device:
     """The device that refines. UsageError: a GPU is wanted and none can be used."""
-    return choose_device(config.device if config.engine.backend == "numba" else "cpu")
+    return choose_device(config.device)
 
 
 def affordable(config: LaunchConfig, width: int, height: int) -> int:
@@ -33,7 +46,7 @@ def affordable(config: LaunchConfig, width: int, height: int) -> int:
     return max(100, min(most, round(_speed(config) * GAUSSIANS_PER_MS * config.mapping.frame_ms())))
 
 
-def rungs_of(config: LaunchConfig) -> tuple[Rung, ...]:
+def rungs_of(config: LaunchConfig, skips: Skips = ALL_SKIPS) -> tuple[Rung, ...]:
     """Those that the mapper may be on, from the cheapest to the best.
 
     Raises:
@@ -47,16 +60,17 @@ def rungs_of(config: LaunchConfig) -> tuple[Rung, ...]:
         replace(
             rung,
             gaussians=round(_speed(config) * rung.gaussians),
-            depth_every=rung.depth_every if mapping.skip_depth else 1,
-            step=rung.step if mapping.skip_fitted else 1.0,
+            depth_every=rung.depth_every if skips.depth else 1,
+            step=rung.step if skips.fitted else 1.0,
         )
         for rung in rungs
     )
 
 
 def make_budget(
-    config: LaunchConfig, width: int, height: int, speed: float | None = None, rate: float | None = None
-) -> Budget:
+    config: LaunchConfig, width: int, height: int, speed: float | None = None, rate: float | None = None,
+    skips: Skips = ALL_SKIPS,
+) -> Budget:  # fmt: skip
     """Fixed steps where the configuration names them, else its time.
 
     Args:
@@ -66,10 +80,11 @@ def make_budget(
     """
     mapping = config.mapping
     if mapping.iterations is not None:
-        return StepBudget(mapping.iterations, EVERYTHING if mapping.rung is None else rungs_of(config)[0])
+        rung = EVERYTHING if mapping.rung is None else rungs_of(config, skips)[0]
+        return StepBudget(mapping.iterations, rung)
     if speed is None:
-        speed = measured_speed(make_rasterizer(config.engine.backend, *SAMPLE_SIZE))
-    return TimeBudget(Ladder(rungs_of(config), width * height, 1e-3 * mapping.frame_ms(rate), speed))
+        speed = measured_speed(make_rasterizer(config.backend, *SAMPLE_SIZE))
+    return TimeBudget(Ladder(rungs_of(config, skips), width * height, 1e-3 * mapping.frame_ms(rate), speed))
 
 
 def with_scale(config: LaunchConfig, width: int, height: int, rate: float | None) -> LaunchConfig:
@@ -85,7 +100,7 @@ def with_scale(config: LaunchConfig, width: int, height: int, rate: float | None
         return config
     scale = 1.0
     if config.in_real_time and config.mapping.iterations is None and device_of(config).kind == "cpu":
-        speed = measured_speed(make_rasterizer(config.engine.backend, *SAMPLE_SIZE))
+        speed = measured_speed(make_rasterizer(config.backend, *SAMPLE_SIZE))
         seconds = 1e-3 * config.mapping.frame_ms(rate)
         scale = best_scale(rungs_of(config), width * height, seconds, speed)
     return config.model_copy(update={"vision": config.vision.model_copy(update={"scale": scale})})
@@ -97,7 +112,7 @@ def make_refiner(config: LaunchConfig, width: int, height: int) -> Refiner:
     Raises:
         UsageError: a GPU is wanted and none can be used.
     """
-    cpu = CpuRefiner(partial(make_rasterizer, config.engine.backend))
+    cpu = CpuRefiner(partial(make_rasterizer, config.backend))
     if device_of(config).kind == "cpu":
         return cpu
     from sags_node.mapping.cuda.refiner import CudaRefiner

@@ -53,40 +53,55 @@ class Address:
     keys: ClientKeys | None = None
 
 
-def find_data(
-    endpoint: str | None, ns: str, run_dir: Path | None = None, keys: ClientKeys | None = None
-) -> Address:
-    """The data socket given, or the quickest one in the connection file of `ns`.
+@dataclass(frozen=True, slots=True)
+class NodeAddress:
+    """Where a sender is: a node, an overlay, a player. A socket that is not given is in the connection file.
 
-    Raises:
-        SagsError: no node with that name runs here.
-        UsageError: it wants keys that are not given, or keys are given that it does not want.
+    Attributes:
+        ns: namespace of its topics, and name of its connection file.
+        endpoint: its data socket.
+        control: its control socket.
+        run_dir: of its connection file; default: the user's own.
     """
-    if endpoint is not None:
-        return _given(endpoint, keys)
-    connection = read_connection(ns, run_dir)
-    return _known(connection.data[0], connection.public_key, keys)
+
+    ns: str = "sags"
+    endpoint: str | None = None
+    control: str | None = None
+    run_dir: Path | None = None
+    keys: ClientKeys | None = None
+
+    def data(self) -> Address:
+        """The data socket given, or the quickest one in the connection file.
+
+        Raises:
+            SagsError: no node with that name runs here.
+            UsageError: it wants keys that are not given, or keys are given that it does not want.
+        """
+        if self.endpoint is not None:
+            return _given(self.endpoint, self.keys)
+        connection = read_connection(self.ns, self.run_dir)
+        return _known(connection.data[0], connection.public_key, self.keys)
+
+    def control_socket(self) -> Address:
+        """The control socket given, or the one in the connection file; see `data`.
+
+        Raises:
+            SagsError: also when the node has none, or a recording is played there.
+        """
+        if self.control is not None:
+            return _given(self.control, self.keys)
+        connection = read_connection(self.ns, self.run_dir)
+        if connection.recording is not None:
+            raise SagsError(
+                f"a recording is played as '{self.ns}': it takes no requests, so it holds no anchors and no "
+                f"views; a node does, with the recording's pictures: sags run {connection.recording}"
+            )
+        if connection.control is None:
+            raise SagsError(f"the node '{self.ns}' has no control socket; start it with publish.control set")
+        return _known(connection.control, connection.public_key, self.keys)
 
 
-def find_control(
-    endpoint: str | None, ns: str, run_dir: Path | None = None, keys: ClientKeys | None = None
-) -> Address:
-    """The control socket given, or the one in the connection file of `ns`; see `find_data`.
-
-    Raises:
-        SagsError: also when the node has none, or a recording is played there.
-    """
-    if endpoint is not None:
-        return _given(endpoint, keys)
-    connection = read_connection(ns, run_dir)
-    if connection.recording is not None:
-        raise SagsError(
-            f"a recording is played as '{ns}': it takes no requests, so it holds no anchors and no views; "
-            f"a node does, with the recording's pictures: sags run {connection.recording}"
-        )
-    if connection.control is None:
-        raise SagsError(f"the node '{ns}' has no control socket; start it with publish.control set")
-    return _known(connection.control, connection.public_key, keys)
+THE_NODE = NodeAddress()  # of this machine, where nothing else is said
 
 
 def _given(endpoint: str, keys: ClientKeys | None) -> Address:

@@ -17,7 +17,7 @@ import msgspec
 import zmq
 
 from sags_node.errors import SagsError, UsageError
-from sags_node.messaging.address import Address, ClientKeys, connect, find_control
+from sags_node.messaging.address import Address, ClientKeys, NodeAddress, connect
 from sags_node.messaging.request_rate import RATE, RequestRate
 from sags_node.messaging.roles import Client, needed
 from sags_node.messaging.security import Gate, Seldom
@@ -229,9 +229,14 @@ class ControlClient:
         run_dir: Path | None = None,
         keys: ClientKeys | None = None,
     ) -> None:
-        self._find = partial(find_control, endpoint, ns, run_dir, keys)
+        self._find = NodeAddress(ns, None, endpoint, run_dir, keys).control_socket
         self._last_id = 0
         self._connect(self._find())
+
+    @classmethod
+    def at(cls, node: NodeAddress) -> Self:
+        """Asks this node; see the class."""
+        return cls(node.control, node.ns, node.run_dir, node.keys)
 
     @property
     def endpoint(self) -> str:

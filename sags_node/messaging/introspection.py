@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from sags_node.errors import SagsError
 from sags_node.messaging import topics, wire
-from sags_node.messaging.address import ClientKeys, find_data
+from sags_node.messaging.address import THE_NODE, NodeAddress
 from sags_node.messaging.freezes import freezes_of
 from sags_node.messaging.node_clock import NodeClock
 from sags_node.messaging.received import (
@@ -30,7 +30,7 @@ from sags_node.messaging.received import (
     ReceivedText,
     interpret,
 )
-from sags_node.messaging.stream import listen
+from sags_node.messaging.stream import listen_to
 
 Record = dict[str, Any]
 
@@ -44,9 +44,7 @@ class _Sample:
     size: int  # bytes
 
 
-def topic_list(
-    endpoint: str | None = None, ns: str = "sags", seconds: float = 3.0, keys: ClientKeys | None = None
-) -> list[Record]:
+def topic_list(node: NodeAddress = THE_NODE, seconds: float = 3.0) -> list[Record]:
     """Every topic of the contract, a node's or an overlay's, and others that were heard in `seconds`.
 
     `messages` and `mean_bytes` are 0 where nothing came; `rate_hz` is None where too little came to tell.
@@ -54,12 +52,12 @@ def topic_list(
     Raises:
         SagsError: no node is known, or nothing at all came.
     """
-    heard = _heard([], endpoint, ns, seconds, keys)
+    heard = _heard([], node, seconds)
     if not heard:
-        raise _silence("*", endpoint, ns, seconds, keys)
+        raise _silence("*", node, seconds)
     rows = []
-    for topic in _listed({full.removeprefix(f"{ns}/") for full in heard}):
-        full = topics.full_name(ns, topic.name)
+    for topic in _listed({full.removeprefix(f"{node.ns}/") for full in heard}):
+        full = topics.full_name(node.ns, topic.name)
         samples = heard.get(full, [])
         mean_size = sum(sample.size for sample in samples) / len(samples) if samples else 0.0
         steps = np.diff([sample.arrival_ns for sample in _without_resent(topic.name, samples)]) * 1e-9
@@ -81,11 +79,9 @@ def _listed(heard: set[str]) -> list[topics.Topic]:
 
 def topic_echo(
     topic: str,
-    endpoint: str | None = None,
-    ns: str = "sags",
+    node: NodeAddress = THE_NODE,
     seconds: float | None = None,
     count: int | None = None,
-    keys: ClientKeys | None = None,
     warned: Callable[[Mapping[str, str]], object] = lambda warnings: None,
 ) -> Iterator[Record]:
     """Each message of a topic: who, when, and its content (arrays as their range).
@@ -99,32 +95,30 @@ def topic_echo(
     """
     shown = 0
     began = time.monotonic()
-    status = topics.full_name(ns, "status")
-    for arrived in listen([topic, "status"], endpoint, ns, seconds, keys=keys):
+    status = topics.full_name(node.ns, "status")
+    for arrived in listen_to(node, [topic, "status"], seconds):
         received = None if arrived is None else interpret(*arrived)
         if received is not None and received.topic == status:
             assert isinstance(received, ReceivedText)  # so says its topic
             warned(received.warnings())
-            if topic.lstrip("/").removeprefix(f"{ns}/") != "status":
+            if topic.lstrip("/").removeprefix(f"{node.ns}/") != "status":
                 received = None
         if received is None:
             if not shown and time.monotonic() - began > PATIENCE:
-                raise _silence(topic, endpoint, ns, PATIENCE, keys)
+                raise _silence(topic, node, PATIENCE)
             continue
         yield _echo(received)
         shown += 1
         if shown == count:
             return
     if not shown and seconds is not None:
-        raise _silence(topic, endpoint, ns, seconds, keys)
+        raise _silence(topic, node, seconds)
 
 
 def topic_hz(
     topic: str,
-    endpoint: str | None = None,
-    ns: str = "sags",
+    node: NodeAddress = THE_NODE,
     seconds: float = 5.0,
-    keys: ClientKeys | None = None,
 ) -> Record:
     """Rate over `seconds`; the shortest, longest and standard deviation of the intervals; freezes.
 
@@ -132,7 +126,7 @@ def topic_hz(
         UsageError: there is no such topic.
         SagsError: no node is known, or fewer than two messages came.
     """
-    samples = _listen_to(topic, endpoint, ns, seconds, keys)
+    samples = _listen_to(topic, node, seconds)
     arrivals = [sample.arrival_ns * 1e-9 for sample in samples]
     steps, freezes = np.diff(arrivals), freezes_of(arrivals)
     return {
@@ -148,10 +142,8 @@ def topic_hz(
 
 def topic_bw(
     topic: str,
-    endpoint: str | None = None,
-    ns: str = "sags",
+    node: NodeAddress = THE_NODE,
     seconds: float = 5.0,
-    keys: ClientKeys | None = None,
 ) -> Record:
     """Bytes per second over `seconds`, and the mean, smallest and largest message.
 
@@ -159,7 +151,7 @@ def topic_bw(
         UsageError: there is no such topic.
         SagsError: no node is known, or fewer than two messages came.
     """
-    samples = _listen_to(topic, endpoint, ns, seconds, keys)
+    samples = _listen_to(topic, node, seconds)
     sizes = np.array([sample.size for sample in samples])
     span = (samples[-1].arrival_ns - samples[0].arrival_ns) * 1e-9
     return {
@@ -173,30 +165,27 @@ def topic_bw(
 
 def topic_delay(
     topic: str,
-    endpoint: str | None = None,
-    ns: str = "sags",
+    node: NodeAddress = THE_NODE,
     seconds: float = 5.0,
-    keys: ClientKeys | None = None,
-    control: str | None = None,
 ) -> Record:
     """How long after their frame's capture the messages of `seconds` arrived, by the node's clock.
 
     Args:
-        control: where to ask for that clock; default: it is taken to be this machine's.
+        node: without `control`, its clock is taken to be this machine's.
 
     Raises:
         UsageError: there is no such topic.
         SagsError: no node is known, fewer than two messages came, or the node's clock was not told.
     """
     offset = None
-    if control is None:
-        samples = _listen_to(topic, endpoint, ns, seconds, keys)
+    if node.control is None:
+        samples = _listen_to(topic, node, seconds)
     else:
-        with NodeClock(control, ns, keys=keys) as clock:
-            samples = _listen_to(topic, endpoint, ns, seconds, keys)
+        with NodeClock.at(node) as clock:
+            samples = _listen_to(topic, node, seconds)
             offset, problem = clock.offset, clock.problem
         if offset is None:
-            raise SagsError(f"{control}: {problem}")
+            raise SagsError(f"{node.control}: {problem}")
     ahead = 0.0 if offset is None else offset.seconds
     delays = np.array([sample.arrival_ns - sample.stamp_ns for sample in samples]) * 1e-9 + ahead
     return {
@@ -210,15 +199,13 @@ def topic_delay(
     }
 
 
-def _listen_to(
-    topic: str, endpoint: str | None, ns: str, seconds: float, keys: ClientKeys | None
-) -> list[_Sample]:
+def _listen_to(topic: str, node: NodeAddress, seconds: float) -> list[_Sample]:
     """At least two messages of one topic."""
-    heard = _heard([topic], endpoint, ns, seconds, keys)
+    heard = _heard([topic], node, seconds)
     if not heard:
-        raise _silence(topic, endpoint, ns, seconds, keys)
+        raise _silence(topic, node, seconds)
     ((full, samples),) = heard.items()
-    fresh = _without_resent(full.removeprefix(f"{ns}/"), samples)
+    fresh = _without_resent(full.removeprefix(f"{node.ns}/"), samples)
     if len(fresh) < 2:
         raise SagsError(
             f"too few messages came on {full} in {seconds:g} s to measure; set --seconds to listen longer"
@@ -226,12 +213,10 @@ def _listen_to(
     return fresh
 
 
-def _heard(
-    names: Sequence[str], endpoint: str | None, ns: str, seconds: float, keys: ClientKeys | None
-) -> dict[str, list[_Sample]]:
+def _heard(names: Sequence[str], node: NodeAddress, seconds: float) -> dict[str, list[_Sample]]:
     """What came on some topics, each message once: a last value may be sent again for another peer."""
     heard: dict[str, dict[tuple[str, int], _Sample]] = defaultdict(dict)
-    for arrived in listen(names, endpoint, ns, seconds, keys=keys):
+    for arrived in listen_to(node, names, seconds):
         if arrived is not None:
             message, arrival_ns = arrived
             key = (message.meta.session, message.meta.seq)
@@ -250,12 +235,12 @@ def _size(message: wire.Message) -> int:
     return sum(memoryview(part).nbytes for part in message.parts)
 
 
-def _silence(topic: str, endpoint: str | None, ns: str, seconds: float, keys: ClientKeys | None) -> SagsError:
-    full = topics.full_name(ns, topic.lstrip("/").removeprefix(f"{ns}/"))
+def _silence(topic: str, node: NodeAddress, seconds: float) -> SagsError:
+    full = topics.full_name(node.ns, topic.lstrip("/").removeprefix(f"{node.ns}/"))
     hint = "is the node running and not waiting?"
     if "/right/" in full:
         hint += f" ({topics.NO_RIGHT_EYE})"
-    where = find_data(endpoint, ns, keys=keys).endpoint
+    where = node.data().endpoint
     return SagsError(f"no messages on {full} from {where} in {seconds:g} s; {hint}")
 
 

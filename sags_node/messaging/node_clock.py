@@ -16,7 +16,7 @@ from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 from sags_node.errors import SagsError
-from sags_node.messaging.address import ClientKeys
+from sags_node.messaging.address import ClientKeys, NodeAddress
 from sags_node.messaging.control import ControlClient
 
 DRIFT = 500e-6  # s/s between two clocks, at most: NTP slews by no more (RFC 5905), quartz drifts by a tenth
@@ -115,6 +115,11 @@ class NodeClock:
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._follow, name="sags-node-clock", daemon=True)
         self._thread.start()
+
+    @classmethod
+    def at(cls, node: NodeAddress) -> Self:
+        """Follows the clock of this node; see the class."""
+        return cls(node.control, node.ns, node.run_dir, node.keys)
 
     @property
     def offset(self) -> Offset | None:

@@ -12,7 +12,7 @@ import zmq
 
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import topics, wire
-from sags_node.messaging.address import Address, ClientKeys, HandshakeWatch, connect, find_data
+from sags_node.messaging.address import Address, ClientKeys, HandshakeWatch, NodeAddress, connect
 from sags_node.messaging.sockets import HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS, receive_frames
 
 MAX_MESSAGE_BYTES = 128 << 20  # of one part: a 4096 x 4096 picture of 8 bytes a pixel
@@ -89,12 +89,19 @@ def listen(
         UsageError: an unknown topic.
         SagsError: no endpoint is known, or the node refuses this client.
     """
+    return listen_to(NodeAddress(ns, endpoint, None, run_dir, keys), names, seconds, high_water)
+
+
+def listen_to(
+    node: NodeAddress, names: Sequence[str], seconds: float | None, high_water: int = RECEIVE_HIGH_WATER
+) -> Generator[tuple[wire.Message, int] | None, None, None]:
+    """`listen`, to this node."""
+    ns = node.ns
     known = [check_topic(name.lstrip("/").removeprefix(f"{ns}/")) for name in names]
     wanted = {topics.full_name(ns, topic.name) for topic in known}
     prefixes = sorted(wanted) or [f"{ns}/"]
     deadline = None if seconds is None else time.monotonic() + seconds
-    address = find_data(endpoint, ns, run_dir, keys)
-    with data_socket(address, prefixes, high_water) as (socket, watch):
+    with data_socket(node.data(), prefixes, high_water) as (socket, watch):
         while deadline is None or time.monotonic() < deadline:
             if not socket.poll(POLL_MS):
                 if (refusal := watch.refusal()) is not None:

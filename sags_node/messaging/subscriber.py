@@ -15,17 +15,16 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Self, overload
+from typing import Any, Self, overload
 
 import msgspec
 import zmq
 
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import topics
-from sags_node.messaging.address import Address, ClientKeys, find_data
+from sags_node.messaging.address import Address, ClientKeys, NodeAddress
 from sags_node.messaging.freshness import Freshness, StaleError
 from sags_node.messaging.node_clock import NodeClock
 from sags_node.messaging.received import Frame, R, Received, ReceivedText, TopicName, interpret
@@ -91,12 +90,17 @@ class Receiver:
         self._stopping = threading.Event()
         self._names = {topics.full_name(ns, name): name for name in self._kept}
         self._asked = _ALWAYS if paused else frozenset(self._kept)
-        self._find = partial(find_data, endpoint, ns, run_dir, keys)
+        self._find = NodeAddress(ns, endpoint, None, run_dir, keys).data
         self._resources = ExitStack()  # holds the socket; only the receiver thread uses it once it runs
         self._connect(self._find())
         self._thread = threading.Thread(target=self._receive_all, name="sags-subscriber", daemon=True)
         self._thread.start()
         atexit.register(self.close)  # the thread must not outlive the interpreter
+
+    @classmethod
+    def at(cls, node: NodeAddress, names: Iterable[str], **options: Any) -> Self:
+        """Subscribes to this node; see the class."""
+        return cls(names, node.endpoint, node.ns, node.run_dir, keys=node.keys, **options)
 
     @property
     def endpoint(self) -> str:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from sags_node.config.launch_file import with_parameters
-from sags_node.config.schema import LaunchConfig
+from sags_node.config.schema import REMOVED, LaunchConfig
 from sags_node.errors import SagsError
 from sags_node.mapping.budget import Budget
 from sags_node.messaging import content
@@ -24,13 +24,7 @@ from sags_node.node.views import Views
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.types import DrawnView, FrameResult
 
-LIVE_PARAMETERS = (
-    "mapping.budget_ms",
-    "mapping.skip_duplicates",
-    "mapping.skip_depth",
-    "mapping.skip_fitted",
-    "mapping.skip_still",
-)
+LIVE_PARAMETERS = ("mapping.budget_ms",)
 
 
 @dataclass
@@ -79,6 +73,8 @@ class Operations:
         }
 
     def _set_parameters(self, args: dict[str, Any]) -> dict[str, Any]:
+        if gone := [f"there is no {key} any more: {REMOVED[key]}" for key in args if key in REMOVED]:
+            raise SagsError("\n".join(gone))
         refused = [key for key in args if key not in LIVE_PARAMETERS]
         if refused:
             raise SagsError(

@@ -20,7 +20,7 @@ import numpy as np
 
 from sags_node.errors import SagsError, UsageError
 from sags_node.findings import OF_THE_FLOW, STAGES
-from sags_node.messaging.address import ClientKeys, find_control
+from sags_node.messaging.address import THE_NODE, NodeAddress
 from sags_node.messaging.control import ControlClient
 from sags_node.messaging.freezes import Freezes
 from sags_node.messaging.node_clock import NodeClock
@@ -53,12 +53,8 @@ RECENT = 300  # durations are behind the figures in `status`
 class Options:
     """How `sags overlay` runs; the defaults are those of the command."""
 
-    endpoint: str | None = None  # of the node's data; default: its connection file
-    control: str | None = None  # of the node's requests; to be given with `endpoint`
-    ns: str = "sags"
+    node: NodeAddress = THE_NODE  # with its endpoint, its control is to be given; `run_dir` is ours, too
     own_ns: str = "overlay"
-    run_dir: Path | None = None  # of the connection files, the node's and the overlay's
-    keys: ClientKeys | None = None
     scene: Path | None = None
     pin: tuple[float, float] | None = None  # u v, of the built-in shape; default: middle of the tissue
     shape: str = "target"
@@ -90,13 +86,13 @@ def run_overlay(options: Options, tell: Callable[[str], object] = log.warning) -
     """
     if options.scene is not None and options.pin is not None:
         raise UsageError("--pin is for the built-in target; a scene file says where its objects are pinned")
-    if options.endpoint is not None and options.control is None:
+    if options.node.endpoint is not None and options.node.control is None:
         raise UsageError("--endpoint needs --control, the node's control socket: anchors are asked for there")
     output = Output(options.save, options.force)
     scene = built_in(options.pin, options.shape) if options.scene is None else read_scene(options.scene)
     overlay_draw.warm_up()
     bodies = [Body(mesh_of(spec), spec.opacity, spec.label) for spec in scene.objects]
-    with OverlayStream(options.own_ns, options.run_dir, scene.color_key) as stream:
+    with OverlayStream(options.own_ns, options.node.run_dir, scene.color_key) as stream:
         overlay = _Overlay(options, scene, bodies, stream, output, tell)
         try:
             overlay.run()
@@ -117,7 +113,7 @@ class _Overlay:
         output: Output,
         tell: Callable[[str], object],
     ) -> None:
-        connect = partial(ControlClient, options.control, options.ns, options.run_dir, options.keys)
+        connect = partial(ControlClient.at, options.node)
         self._options = options
         self._bodies = bodies
         self._subscriber: Subscriber | None = None  # before there is a node
@@ -165,9 +161,7 @@ class _Overlay:
             received = self._node.wait(leading, WAIT_FOR_FRAME, after=last)
             if received is not None:
                 if last is None:  # a node without a control socket: better said now than never
-                    find_control(
-                        self._options.control, self._options.ns, self._options.run_dir, self._options.keys
-                    )
+                    self._options.node.control_socket()
                 last = received
                 self._take(received)
             elif last is None and time.monotonic() > patient_until:
@@ -190,12 +184,11 @@ class _Overlay:
         wanted: list[str] = [*NEEDED, CONFIDENCE, RIGHT_INFO, *([] if options.save is None else [PICTURE])]
         while True:
             try:
-                if options.endpoint is not None and self._clock is None:
-                    self._clock = NodeClock(options.control, keys=options.keys)
-                where = options.endpoint, options.ns, options.run_dir
-                return Subscriber(wanted, *where, keys=options.keys, clock=self._clock)
+                if options.node.endpoint is not None and self._clock is None:
+                    self._clock = NodeClock.at(options.node)
+                return Subscriber.at(options.node, wanted, clock=self._clock)
             except SagsError as error:
-                is_absent = not isinstance(error, UsageError) and options.endpoint is None
+                is_absent = not isinstance(error, UsageError) and options.node.endpoint is None
                 if not is_absent or time.monotonic() > end:
                     raise
                 self._say_waiting(str(error))

@@ -3,6 +3,7 @@
 Imports config and rig.
 """
 
+from sags_node.phantom.scene import PhantomScene
 from sags_node.phantom.session import cached_session, write_session
 
-__all__ = ["cached_session", "write_session"]
+__all__ = ["PhantomScene", "cached_session", "write_session"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from pydantic import Field
 
 from sags_node.config.schema import PhantomSource
 from sags_node.geometry import invert, transform
@@ -26,6 +27,22 @@ HOOK_DEPTH = 0.055  # m
 HIDDEN = 5e-5  # m: a surface this much nearer hides a tracked point
 
 
+class PhantomScene(PhantomSource):
+    """The session of a launch file, and what tests, benchmarks and `sags phantom` change of it besides."""
+
+    smoke: float = Field(0.0, ge=0, le=1)  # density
+    noise: float = Field(0.01, ge=0, le=0.2)  # of a pixel: standard deviation, in units of white
+    blur: float = Field(0.0, ge=0, le=5)  # of the lens: standard deviation, px
+    gloss: float = Field(1.0, ge=0, le=100)  # strength of the wet highlights
+    still_tissue: bool = False  # only the instruments move, and the scope if it is to
+    blackout: tuple[float, float] | None = None  # s: without light from, until
+
+    @classmethod
+    def of(cls, config: PhantomSource) -> PhantomScene:
+        """The scene of `config`; of a launch file's, with nothing changed."""
+        return config if isinstance(config, cls) else cls(**dict(config))
+
+
 @dataclass(frozen=True, slots=True)
 class PhantomFrame:
     """One frame and its truth."""
@@ -43,7 +60,7 @@ class Phantom:
     """A seeded scene; a frame is a pure function of its place in the session."""
 
     def __init__(self, config: PhantomSource) -> None:
-        self._config = config
+        self._scene = scene = PhantomScene.of(config)
         self.rig = phantom_rig(config.width, config.height)
         self._left_rays = raw_rays(self.rig.left).astype(np.float32)
         self._right_rays = raw_rays(self.rig.right).astype(np.float32)
@@ -59,7 +76,7 @@ class Phantom:
         self._relief = make_relief(shape, self._half_view)
         self._tissue = Tissue(self._relief, self._clock)
         self._skin = paint_skin(self._relief, paint, footprint=0.8 * BED_DEPTH / float(self.rig.left.K[0, 0]))
-        self._skin.surface[..., 2] *= np.sqrt(config.gloss)  # highlights go with the square of the wetness
+        self._skin.surface[..., 2] *= np.sqrt(scene.gloss)  # highlights go with the square of the wetness
         self._instruments = Instruments()
         self._tracks = self._tissue.track_indices(tracks, self._half_view, TRACKS)
         self._cloud = fractal_noise(smoke, (512, 512), 70, 4)
@@ -70,7 +87,7 @@ class Phantom:
         phase = index / count
         if T_world_cam is None:
             T_world_cam = self._scope(phase)
-        vertices = self._tissue.vertices(0.0 if self._config.still_tissue else phase)
+        vertices = self._tissue.vertices(0.0 if self._scene.still_tissue else phase)
         hook_view = HOOK_DEPTH * np.array(self._half_view)
         tools = self._instruments.mesh(self._clock.action(phase), self._tissue.grip(vertices), hook_view)
         bodies = Bodies(self._tissue, vertices, tools)
@@ -81,11 +98,11 @@ class Phantom:
             linear, mask = look(rays, offset, T_world_cam, bodies, self._relief, self._skin, lamp)
             if self._is_dark(phase):
                 linear = np.zeros_like(linear)
-            elif self._config.smoke > 0:
+            elif self._scene.smoke > 0:
                 drift = 60 * np.array([np.cos(2 * np.pi * phase), np.sin(2 * np.pi * phase)])
-                linear = add_smoke(linear, rays, offset, self._cloud, drift, self._config.smoke)
+                linear = add_smoke(linear, rays, offset, self._cloud, drift, self._scene.smoke)
             rng = np.random.default_rng([*self._noise_key, index, eye])
-            pictures.append(expose(linear, self._config.blur, self._config.noise, rng))
+            pictures.append(expose(linear, self._scene.blur, self._scene.noise, rng))
             masks.append(mask)
 
         hits = bodies.cast(world_rays(self._rectified_rays, 0.0, T_world_cam))
@@ -101,18 +118,18 @@ class Phantom:
         )
 
     def _scope(self, phase: float) -> F64:
-        return scope_pose(self._clock.scope(phase), self._config.camera_motion)
+        return scope_pose(self._clock.scope(phase), self._scene.camera_motion)
 
     def _is_dark(self, phase: float) -> bool:
-        if self._config.blackout is None:
+        if self._scene.blackout is None:
             return False
-        first, last = self._config.blackout
-        return first <= phase * self._config.seconds < last
+        first, last = self._scene.blackout
+        return first <= phase * self._scene.seconds < last
 
     def still(self, phase: float) -> Still:
         """The tissue alone at a phase 0..1 of the session, as the left rectified camera there sees it."""
         T_world_cam = self._scope(phase)
-        vertices = self._tissue.vertices(0.0 if self._config.still_tissue else phase)
+        vertices = self._tissue.vertices(0.0 if self._scene.still_tissue else phase)
         bodies = Bodies(self._tissue, vertices, NOTHING)
         lamp = Lamp.at_tip(T_world_cam, self.rig.baseline)
         return Still(bodies, self._relief, self._skin, lamp, eye=T_world_cam[:3, 3])

@@ -16,7 +16,7 @@ import yaml
 from sags_node.config.schema import PhantomSource
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import check_folder, whole
-from sags_node.phantom.scene import Phantom, PhantomFrame
+from sags_node.phantom.scene import Phantom, PhantomFrame, PhantomScene
 from sags_node.rig import save_rig
 
 Progress = Callable[[int, int], None]  # frames done, frames in all
@@ -37,7 +37,8 @@ def cached_session(config: PhantomSource, progress: Progress | None = None) -> P
 
     Rendered at 30 frames per second when it is not there yet; see `write_session`.
     """
-    shaping = {"version": VERSION, "rate": RATE} | {name: getattr(config, name) for name in _SHAPING}
+    scene = PhantomScene.of(config)
+    shaping = {"version": VERSION, "rate": RATE} | {name: getattr(scene, name) for name in _SHAPING}
     digest = hashlib.sha256(json.dumps(shaping, sort_keys=True).encode()).hexdigest()[:16]
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sags"
     folder = cache / f"phantom-{digest}"

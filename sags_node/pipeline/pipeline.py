@@ -17,7 +17,7 @@ from sags_node.mapping.anchors import Anchors
 from sags_node.mapping.budget import Budget
 from sags_node.mapping.camera_tracker import CameraTracker
 from sags_node.mapping.depth_memory import UNWATCHED
-from sags_node.mapping.devices import affordable, make_budget, make_refiner
+from sags_node.mapping.devices import ALL_SKIPS, Skips, affordable, make_budget, make_refiner
 from sags_node.mapping.mapper import Mapped, Mapper
 from sags_node.mapping.pose_refiner import PoseRefiner
 from sags_node.mapping.right_view import RightView
@@ -69,8 +69,10 @@ class Pipeline:
         masks: NearestMask | None = None,
         on_rectified: Callable[[RectifiedPair, int], None] = lambda pair, epoch: None,
         rate: float | None = None,
+        skips: Skips = ALL_SKIPS,
     ) -> None:
         self.rate = rate
+        self._skips = skips
         vision = config.vision
         width, height = vision.working_size(rig.left.width, rig.left.height)
         self.rectifier = Rectifier(rig, width, height)
@@ -82,7 +84,6 @@ class Pipeline:
         self.mapper = Mapper(
             self._refiner,
             affordable(config, width, height),
-            config.mapping.smoothing,
             unhurried=config.mapping.frame_ms(rate) >= UNHURRIED_MS,
             field=config.mapping.field is True,
         )
@@ -159,7 +160,7 @@ class Pipeline:
         """What frames get, by the configuration and how long this machine takes (`Ladder.speed`); None: it is
         measured now, which takes less than a tenth of a second."""
         camera = self.rectifier.camera
-        return make_budget(self._config, camera.width, camera.height, speed, self.rate)
+        return make_budget(self._config, camera.width, camera.height, speed, self.rate, self._skips)
 
     def process(self, frame: StereoFrame, budget: Budget, waited: float = 0.0) -> FrameResult:
         """Everything that happens to one frame, `waited` seconds after it came."""
@@ -234,7 +235,7 @@ class Pipeline:
         return self.rectifier(replace(frame, T_world_cam=pose))
 
     def _equals_the_last(self, pair: RectifiedPair, draws_right: bool) -> bool:
-        if self._mapped is None or not self._config.mapping.skip_duplicates:
+        if self._mapped is None or not self._skips.duplicates:
             return False
         if draws_right and "right" not in self._mapped.views:  # for somebody who has just come
             return False
@@ -274,7 +275,7 @@ class Pipeline:
         return replace(held, observation=observation, skipped={what: why}, held=why, hurried=False)
 
     def _still_frames(self, pair: RectifiedPair) -> int:
-        if not self._config.mapping.skip_still:
+        if not self._skips.still:
             return 0
         if self._tracker is not None:  # an estimated pose tells nothing that the pictures do not
             pair = replace(pair, camera=self.rectifier.camera)
@@ -322,7 +323,7 @@ class Pipeline:
 
     def _lacks_time_for_depth(self, frame: StereoFrame, budget: Budget) -> bool:
         needs_matching = self.depth.takes_time(frame) and self.mapper.model.count > 0  # the first needs depth
-        return needs_matching and self._config.mapping.skip_depth and not budget.affords_depth()
+        return needs_matching and self._skips.depth and not budget.affords_depth()
 
     def _map(
         self, observation: Observation, budget: Budget, still: int, learn: bool, draws_right: bool

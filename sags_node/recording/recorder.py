@@ -17,9 +17,9 @@ from typing import Any
 
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import cdr, topics
-from sags_node.messaging.address import ClientKeys
+from sags_node.messaging.address import THE_NODE, NodeAddress
 from sags_node.messaging.freshness import Freshness
-from sags_node.messaging.stream import listen
+from sags_node.messaging.stream import listen_to
 from sags_node.messaging.wire import WireError
 from sags_node.recording.backlog import Arrived, Backlog
 from sags_node.recording.bag_writer import NO_LIMITS, Limits
@@ -48,10 +48,7 @@ class Options:
     max_cache_mb: float = DEFAULT_CACHE_MB
     snapshot_seconds: float | None = None
     limits: Limits = NO_LIMITS
-    ns: str = "sags"
-    endpoint: str | None = None
-    run_dir: Path | None = None
-    keys: ClientKeys | None = None
+    node: NodeAddress = THE_NODE
 
 
 @dataclass(slots=True)
@@ -121,17 +118,8 @@ class Recorder:
     def _messages(self) -> Generator[Arrived | None, None, None]:
         """Every new message once, None now and then while nothing comes; ends after `stop`."""
         options = self._options
-        thin = topics.full_name(options.ns, topics.THIN)
-        heard = listen(
-            options.topics,
-            options.endpoint,
-            options.ns,
-            None,
-            run_dir=options.run_dir,
-            keys=options.keys,
-            high_water=HIGH_WATER,
-        )
-        with closing(heard):
+        thin = topics.full_name(options.node.ns, topics.THIN)
+        with closing(listen_to(options.node, options.topics, None, HIGH_WATER)) as heard:
             for arrived in heard:
                 if self._stopping.is_set() or self._error is not None:
                     return
@@ -150,7 +138,7 @@ class Recorder:
 
     def _writer(self, folder: Path) -> MessageWriter:
         options = self._options
-        return MessageWriter(folder, options.ns, options.compression, options.limits)
+        return MessageWriter(folder, options.node.ns, options.compression, options.limits)
 
     # ---- everything ----------------------------------------------------------------------------------
 
@@ -220,7 +208,7 @@ class Recorder:
             thread.join()
 
     def _is_latched(self, arrived: Arrived) -> bool:
-        known = topics.BY_NAME.get(arrived.message.topic.removeprefix(f"{self._options.ns}/"))
+        known = topics.BY_NAME.get(arrived.message.topic.removeprefix(f"{self._options.node.ns}/"))
         return known is not None and known.cached
 
     def _save(self, folder: Path, messages: list[Arrived], tell: Callable[[dict[str, Any]], None]) -> None:

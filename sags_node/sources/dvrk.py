@@ -23,6 +23,7 @@ from sags_node.sources.stamps import nearest
 from sags_node.sources.videos import OneVideoPairs, Video
 from sags_node.types import I64
 
+ALONE = "alone with source.kind:=videos source.geometry.layout:=side_by_side"
 MAX_SIDECAR_BYTES = 512 << 20  # hours at 60 Hz
 
 Stamp = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
@@ -163,8 +164,7 @@ def _stamps(file: Path, sidecar: Sidecar, video: Video) -> I64:
     if (np.diff(stamps[:, 0]) < 0).any():
         turn = int(np.argmax(np.diff(stamps[:, 0]) < 0)) + 1
         raise UsageError(
-            f"{file}: the stamp of frame {turn} lies before that of the frame before; play the MP4 "
-            "alone with source.kind:=side_by_side"
+            f"{file}: the stamp of frame {turn} lies before that of the frame before; play the MP4 {ALONE}"
         )
     return stamps
 
@@ -176,7 +176,7 @@ def _nearest_frames(file: Path, sidecar: Sidecar, video: Video) -> I64:
     if (known < 0).any() or video.rate is None or (np.diff(known) < 0).any():
         raise UsageError(
             f"{file} lists {len(known)} frames but {video.path} holds {video.count}, and there are no rising "
-            "presentation times to join them by; play the MP4 alone with source.kind:=side_by_side"
+            f"presentation times to join them by; play the MP4 {ALONE}"
         )
     at = np.round(np.arange(video.count) * 1e9 / video.rate).astype(np.int64)
     return nearest(at, known - known[0])

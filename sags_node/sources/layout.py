@@ -24,11 +24,13 @@ class Layout:
 
     Args:
         config: `source.geometry`.
+        tools: box of a third pane, as large as those of the eyes.
     """
 
-    def __init__(self, config: GeometryConfig) -> None:
+    def __init__(self, config: GeometryConfig, tools: Box | None = None) -> None:
         self._config = config
         self._crops = {"left": config.crop, "right": config.crop_right or config.crop}
+        self._tools = tools
         self._tones: Tones | None = None  # for the depth of the last picture
         self.is_sequential = config.layout == "frame_sequential"
         self.shows_both = config.layout not in ("separate", "frame_sequential")
@@ -55,16 +57,26 @@ class Layout:
                 f"source.geometry.crop is {sizes[0][0]}x{sizes[0][1]} px but crop_right "
                 f"{sizes[1][0]}x{sizes[1][1]}; both eyes need one size"
             )
+        if self._tools is not None and _cropped(width, height, self._tools, name) != sizes[0]:
+            raise UsageError(
+                f"source.tools is {self._tools[2]}x{self._tools[3]} px but source.geometry.crop "
+                f"{sizes[0][0]}x{sizes[0][1]}; all panes need one size"
+            )
         return sizes[0]
 
     def eye(self, picture: Samples, side: Side) -> U8:
         """The picture [H, W, 3] of one eye; the argument itself where there is nothing to do."""
-        return self._finish(picture, 0, side)
+        return self._finish(picture, 0, self._crops[side])
+
+    def tools(self, picture: Samples) -> U8 | None:
+        """The pane [H, W, 3] beside those of the eyes, None where there is none."""
+        return None if self._tools is None else self._finish(picture, 0, self._tools)
 
     def eyes(self, picture: Samples) -> tuple[U8, U8]:
         """Left and right of a picture [H, W, 3] that shows both; views of it where that does."""
         of = dict(zip(self.order, self._apart(picture), strict=True))
-        return self._finish(*of["left"], "left"), self._finish(*of["right"], "right")
+        left, right = (self._finish(*of[side], self._crops[side]) for side in ("left", "right"))
+        return left, right
 
     def _apart(self, picture: Samples) -> tuple[tuple[Samples, int], tuple[Samples, int]]:
         """First and second eye, as views, and in which row of the picture each begins."""
@@ -74,11 +86,13 @@ class Layout:
                 return (picture[:, : width // 2], 0), (picture[:, width // 2 :], 0)
             case "over_under":
                 return (picture[: height // 2], 0), (picture[height // 2 :], height // 2)
+            case "panes":
+                return (picture, 0), (picture, 0)
             case _:
                 return (picture[0::2], 0), (picture[1::2], 1)
 
-    def _finish(self, picture: Samples, row: int, side: Side) -> U8:
-        crop, flip, keep = self._crops[side], self._config.flip, self._config.deinterlace
+    def _finish(self, picture: Samples, row: int, crop: Box | None) -> U8:
+        flip, keep = self._config.flip, self._config.deinterlace
         if keep != "none":
             picture = _one_field(picture, (FIELD_ROWS[keep] - row) % 2)
         if crop is not None:

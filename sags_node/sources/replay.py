@@ -15,19 +15,17 @@ from sags_node.errors import UsageError
 from sags_node.sources.bags import BagPairs
 from sags_node.sources.dvrk import DvrkPairs
 from sags_node.sources.endonerf import EndoNerfPairs
-from sags_node.sources.layout import Layout, side_by_side
+from sags_node.sources.layout import Layout
 from sags_node.sources.one_eye import refuse_one_eye_twice
 from sags_node.sources.pictures import FolderPairs, RawPair
 from sags_node.sources.scared import ScaredPairs
 from sags_node.sources.truth import Poses, References
-from sags_node.sources.videos import OneVideoPairs, PanePairs, Video, VideoPairs
+from sags_node.sources.videos import OneVideoPairs, Video, VideoPairs
 from sags_node.types import I64, StereoFrame
 
 Recording = (
     cfg.FoldersSource
     | cfg.VideosSource
-    | cfg.SideBySideSource
-    | cfg.PanesSource
     | cfg.EndoNerfSource
     | cfg.ScaredSource
     | cfg.BagSource
@@ -258,14 +256,10 @@ def _open_pairs(config: Recording, references: bool) -> Pairs:  # noqa: PLR0911,
         case cfg.FoldersSource():
             return FolderPairs(config.left, config.right, config.tools)
         case cfg.VideosSource():
-            layout = Layout(config.geometry)
+            layout = Layout(config.geometry, config.tools)
             if layout.shows_both or layout.is_sequential:
                 return OneVideoPairs(Video(config.left), layout)
             return VideoPairs(config.left, config.right, layout)
-        case cfg.SideBySideSource():
-            return OneVideoPairs(Video(config.video), side_by_side(config.order))
-        case cfg.PanesSource():
-            return PanePairs(Video(config.video), config.left, config.right, config.tools)
         case cfg.EndoNerfSource():
             return EndoNerfPairs(config)
         case cfg.ScaredSource():

@@ -16,13 +16,15 @@ import cv2
 import numpy as np
 
 from sags_node import geometry
+from sags_node.config.schema import GeometryConfig
 from sags_node.errors import SagsError, UsageError
 from sags_node.media.picture_file import decode
 from sags_node.rig import check_intrinsics, rectified_rig, refuse_errors
 from sags_node.rig.opencv import numbers_in, open_storage
+from sags_node.sources.layout import Layout
 from sags_node.sources.numbered import NumberedFiles, open_numbered
 from sags_node.sources.pictures import FolderPairs, RawPair
-from sags_node.sources.videos import PanePairs, Video
+from sags_node.sources.videos import OneVideoPairs, Video
 from sags_node.types import F32, F64, Eye, Reference, StereoRig
 
 log = logging.getLogger(__name__)
@@ -192,12 +194,11 @@ def _matrix(storage: cv2.FileStorage, file: Path, key: str, lengths: tuple[int, 
     return values
 
 
-def _open_pictures(folder: Path) -> tuple[PanePairs | FolderPairs, bool]:
+def _open_pictures(folder: Path) -> tuple[OneVideoPairs | FolderPairs, bool]:
     """The reader of the pictures that are there, and whether they are rectified."""
     if (folder / "data/rgb.mp4").is_file():
         video = Video(folder / "data/rgb.mp4")
-        width, height = video.size[0], video.size[1] // 2
-        return PanePairs(video, (0, 0, width, height), (0, height, width, height)), False
+        return OneVideoPairs(video, Layout(GeometryConfig(layout="over_under"))), False
     for left, right in RECTIFIED_FOLDERS:
         if (folder / left).is_dir():
             pictures = FolderPairs(folder / left, folder / right)

@@ -8,11 +8,10 @@ from pathlib import Path
 
 import cv2
 
-from sags_node.config.schema import Box
 from sags_node.errors import SagsError, UsageError
 from sags_node.sources.layout import Layout
 from sags_node.sources.pictures import RawPair, size_text
-from sags_node.types import U8
+from sags_node.types import U8, Bool
 
 log = logging.getLogger(__name__)
 
@@ -164,7 +163,10 @@ class VideoPairs:
 
 
 class OneVideoPairs:
-    """One video of both eyes: in halves of a picture, in rows, or one after the other.
+    """One video of both eyes: in halves or boxes of a picture, in rows, or one after the other.
+
+    Attributes:
+        size: width and height of an eye's picture, px.
 
     Raises:
         UsageError: its pictures cannot be split as asked.
@@ -177,7 +179,7 @@ class OneVideoPairs:
         self.rate = None if video.rate is None else video.rate / self._pictures
         self.count = video.count // self._pictures
         try:
-            layout.size(*video.size, str(video.path))
+            self.size = layout.size(*video.size, str(video.path))
         except UsageError:
             self.close()
             raise
@@ -199,65 +201,8 @@ class OneVideoPairs:
             left, right = self._layout.eye(of["left"], "left"), self._layout.eye(of["right"], "right")
         else:
             left, right = self._layout.eyes(first)
-        return RawPair(_rgb(left), _rgb(right), None)
-
-    def close(self) -> None:
-        self._video.close()
-
-
-class PanePairs:
-    """One video whose frames show both eyes, each in its own box.
-
-    Attributes:
-        size: width and height of one box, px.
-
-    Raises:
-        UsageError: a box leaves the picture or differs in size from the others.
-    """
-
-    def __init__(self, video: Video, left: Box, right: Box, tools: Box | None = None) -> None:
-        self._video = video
-        self._boxes = {"left": left, "right": right}
-        if tools is not None:
-            from sags_node.sources.painted import unpainted  # a kernel: other sources need no place for one
-
-            self._boxes["tools"], self._unpainted = tools, unpainted
-        self.rate, self.count = video.rate, video.count
-        self.size = left[2], left[3]
-        try:
-            self._check_boxes()
-        except UsageError:
-            self.close()
-            raise
-
-    def _check_boxes(self) -> None:
-        width, height = self._video.size
-        for name, (x, y, w, h) in self._boxes.items():
-            if min(x, y) < 0 or min(w, h) < 1 or x + w > width or y + h > height:
-                raise UsageError(
-                    f"pane '{name}' {x, y, w, h} (x, y, width, height) leaves the picture: "
-                    f"{self._video.path} is {size_text(width, height)} px"
-                )
-            if (w, h) != self.size:
-                raise UsageError(
-                    f"pane '{name}' is {size_text(w, h)} px but the left pane is {size_text(*self.size)}; "
-                    "all panes must have one size"
-                )
-
-    def seek(self, index: int) -> None:
-        self._video.seek(index)
-
-    def skip(self) -> bool:
-        return self._video.skip()
-
-    def read(self) -> RawPair | None:
-        """The next pair, None at the end."""
-        picture = self._video.read()
-        if picture is None:
-            return None
-        panes = {name: picture[y : y + h, x : x + w] for name, (x, y, w, h) in self._boxes.items()}
-        tissue = self._unpainted(panes["tools"], panes["left"]) if "tools" in panes else None
-        return RawPair(_rgb(panes["left"]), _rgb(panes["right"]), tissue)
+        painted = self._layout.tools(first)
+        return RawPair(_rgb(left), _rgb(right), None if painted is None else _unpainted(painted, left))
 
     def close(self) -> None:
         self._video.close()
@@ -267,6 +212,12 @@ def _rgb(bgr: U8) -> U8:
     """A new RGB picture, so that nothing the decoder owns leaves this file."""
     rgb: U8 = cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
     return rgb
+
+
+def _unpainted(painted: U8, left: U8) -> Bool:
+    from sags_node.sources.painted import unpainted  # a kernel: other videos need no place for one
+
+    return unpainted(painted, left)
 
 
 def _is_same_rate(one: float | None, other: float | None) -> bool:

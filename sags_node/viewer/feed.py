@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 
 from sags_node.errors import SagsError, UsageError
 from sags_node.evaluation.gallery import Picture
-from sags_node.messaging.address import ClientKeys, find_data
+from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.node_clock import NodeClock
 from sags_node.messaging.received import (
     Received,
@@ -87,23 +86,16 @@ class Moment:
 
 
 class Feed:
-    """Follows the node named `ns`, or the one at `endpoint`; used from one thread.
+    """Follows a node; used from one thread.
 
     Raises:
         UsageError: the node wants keys that are not given, or the other way round.
-        SagsError: `endpoint` is malformed. That no node runs yet is no error.
+        SagsError: its endpoint is malformed. That no node runs yet is no error.
     """
 
-    def __init__(
-        self,
-        endpoint: str | None,
-        ns: str,
-        keys: ClientKeys | None = None,
-        run_dir: Path | None = None,
-        clock: NodeClock | None = None,
-    ) -> None:
+    def __init__(self, node: NodeAddress, clock: NodeClock | None = None) -> None:
         self._clock = clock
-        self._where = (endpoint, ns, run_dir, keys)
+        self._address = node
         self._subscriber: Subscriber | None = None
         self._frame: dict[str, Received] | None = None  # the newest that came as a whole
         self._absent: str | None = None  # why there is no subscriber
@@ -112,7 +104,7 @@ class Feed:
         except UsageError:
             raise
         except SagsError as error:
-            if endpoint is not None:
+            if node.endpoint is not None:
                 raise
             self._absent = str(error)
 
@@ -165,17 +157,15 @@ class Feed:
             self._clock.close()
 
     def _connect(self) -> None:
-        endpoint, ns, run_dir, keys = self._where
-        self._subscriber = Subscriber(
-            TOPICS, endpoint, ns, run_dir, rates=dict.fromkeys(TOPICS, LEAST_HZ), keys=keys, clock=self._clock
-        )
+        rates = dict.fromkeys(TOPICS, LEAST_HZ)
+        self._subscriber = Subscriber.at(self._address, TOPICS, rates=rates, clock=self._clock)
         self._absent = None
 
     def _follow(self) -> None:
         """Connect, and again where the node is now, when it has moved or has ended."""
         try:
             if self._subscriber is not None and _silence(self._subscriber) > SILENT_AFTER:
-                if find_data(*self._where).endpoint != self._subscriber.endpoint:
+                if self._address.data().endpoint != self._subscriber.endpoint:
                     self.rest()
             if self._subscriber is None:
                 self._connect()

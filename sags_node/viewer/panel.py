@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from viser import uplot
 
 from sags_node.errors import SagsError
-from sags_node.messaging.address import ClientKeys
+from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.control import ControlClient
 from sags_node.viewer.feed import Moment, Status
 from sags_node.viewer.history import LENGTH, PERIOD, History
@@ -32,13 +32,13 @@ BRIGHT, BLUE, ORANGE = "#c9d1d9", "#4dabf7", "#ffa94d"
 class Asker:
     """Asks the node on behalf of a browser and tells it the answer."""
 
-    def __init__(self, control: str | None, ns: str, keys: ClientKeys | None) -> None:
-        self._where = (control, ns, None, keys)
+    def __init__(self, node: NodeAddress) -> None:
+        self._node = node
 
     def ask(self, client: viser.ClientHandle | None, title: str, op: str, args: Mapping[str, Any]) -> None:
         """One request of its own: callbacks come from several threads."""
         try:
-            with ControlClient(*self._where) as control:
+            with ControlClient.at(self._node) as control:
                 answer = control.request(op, args, ANSWER_TIME)
         except SagsError as error:
             tell(client, f"{title}: refused", str(error), "red")

@@ -10,7 +10,7 @@ from contextlib import redirect_stdout
 
 import viser
 
-from sags_node.messaging.address import ClientKeys
+from sags_node.messaging.address import THE_NODE, NodeAddress
 from sags_node.messaging.node_clock import NodeClock
 from sags_node.viewer.feed import Feed, Moment
 from sags_node.viewer.panel import Asker, Panel
@@ -26,10 +26,7 @@ def run_viewer(
     host: str = "127.0.0.1",
     port: int = 8080,
     insecure: bool = False,
-    endpoint: str | None = None,
-    control: str | None = None,
-    ns: str = "sags",
-    keys: ClientKeys | None = None,
+    node: NodeAddress = THE_NODE,
     ready: Callable[[str, int], None] = lambda url, port: None,
     *,
     stop: threading.Event,
@@ -37,21 +34,19 @@ def run_viewer(
     """Serve the viewer until `stop` is set.
 
     Args:
-        endpoint: data socket of the node; default: its connection file. No node need run yet.
-        control: its control socket; default: its connection file. With `endpoint` the node's clock is
-            asked for there, too.
+        node: it need not run yet. With both `endpoint` and `control` its clock is asked for, too.
         ready: told the address and the port once browsers can connect.
 
     Raises:
         UsageError: `host` is no loopback address and `insecure` is not given, or the node's keys do not fit.
-        SagsError: the port cannot be bound, or `endpoint` is malformed.
+        SagsError: the port cannot be bound, or the node's endpoint is malformed.
     """
-    remote = endpoint is not None and control is not None
-    feed = Feed(endpoint, ns, keys, clock=NodeClock(control, keys=keys) if remote else None)
+    remote = node.endpoint is not None and node.control is not None
+    feed = Feed(node, NodeClock.at(node) if remote else None)
     try:
         with serving(host, port, insecure) as (server, url):
             scene = Scene(server)
-            panel = Panel(server, scene, Asker(control, ns, keys), ns, RATE)
+            panel = Panel(server, scene, Asker(node), node.ns, RATE)
             server.on_client_connect(scene.look)
             ready(url, server.get_port())
             with redirect_stdout(sys.stderr):  # what viser has to say; stdout is for machines

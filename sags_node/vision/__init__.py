@@ -1,4 +1,4 @@
 """What is seen in a picture: rectification, masks, depth, flow, and what is wrong with it.
 
-Imports config, kernels, phantom and rig.
+Imports config, kernels and rig.
 """

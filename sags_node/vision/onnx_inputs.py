@@ -19,6 +19,7 @@ Eye = Literal["left", "right"]
 Size = tuple[int, int]  # width, height, px
 PICTURE_CHANNELS = (1, 3)
 PAIR_CHANNELS = (2, 6)  # both eyes in one tensor, left first
+CHANNELS = (*PICTURE_CHANNELS, *PAIR_CHANNELS)
 GRAY_WEIGHTS = (0.299, 0.587, 0.114)
 
 
@@ -94,8 +95,9 @@ def recognise(tensors: Sequence[Tensor], said: NetworkFormat, name: str) -> tupl
             f"{name} takes {len(tensors)} inputs ({', '.join(t.name for t in tensors)}); a depth network "
             "takes one picture, a pair, or a pair at two sizes: export it with those alone"
         )
+    tensors = _ordered(tensors, said, name)
     shapes = [_layout(tensor, said, name) for tensor in tensors]
-    eyes: list[tuple[Eye, ...]] = [(eye,) for eye in _eyes(tensors, said, name)]
+    eyes: list[tuple[Eye, ...]] = [("left",), ("right",)] * (len(tensors) // 2)
     if len(tensors) == 1:
         eyes = [("left", "right") if shapes[0][0] in PAIR_CHANNELS else ("left",)]
     found = []
@@ -120,20 +122,20 @@ def _layout(tensor: Tensor, said: NetworkFormat, name: str) -> tuple[int, bool]:
         raise UsageError(
             f"{name}: input {tensor.name} is {text}; a picture is 1x3xHxW or 1xHxWx3 with batch size 1"
         )
-    known = (*PICTURE_CHANNELS, *PAIR_CHANNELS)
-    first = said.layout == "nchw" if said.layout else shape[1] in known or shape[3] not in known
+    first = said.layout == "nchw" if said.layout else shape[1] in CHANNELS or shape[3] not in CHANNELS
     return (shape[1] if first else shape[3]) or 3, first
 
 
-def _eyes(tensors: Sequence[Tensor], said: NetworkFormat, name: str) -> list[Eye]:
-    """By the names given, else by the tensors' names, else left and right in turn."""
-    names = [tensor.name for tensor in tensors]
-    if said.inputs is not None:
-        if sorted(said.inputs) != sorted(names):
-            raise UsageError(f"{name}: inputs: its inputs are {', '.join(names)}; name all, left eye first")
-        return ["right" if said.inputs.index(one) % 2 else "left" for one in names]
-    rights = ["right" in one.lower() for one in names]
-    lefts = ["left" in one.lower() for one in names]
-    if sum(rights) == sum(lefts) == len(names) // 2 and not any(map(all, zip(lefts, rights, strict=True))):
-        return ["right" if right else "left" for right in rights]
-    return ["right" if place % 2 else "left" for place in range(len(names))]
+def has_clear_layout(tensor: Tensor) -> bool:
+    """Whether its shape says which side is the channels'."""
+    return tensor.shape[1] in CHANNELS or tensor.shape[3] in CHANNELS
+
+
+def _ordered(tensors: Sequence[Tensor], said: NetworkFormat, name: str) -> Sequence[Tensor]:
+    """As they are named, left and right eye in turn; else in the file's order."""
+    if said.inputs is None:
+        return tensors
+    by_name = {tensor.name: tensor for tensor in tensors}
+    if sorted(said.inputs) != sorted(by_name):
+        raise UsageError(f"{name}: inputs: its inputs are {', '.join(by_name)}; name all, left eye first")
+    return [by_name[one] for one in said.inputs]

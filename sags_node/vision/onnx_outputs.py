@@ -1,9 +1,8 @@
-"""A network's outputs: which numbers of them are a map of the picture, and what they mean."""
+"""A network's output as a map of the picture."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,51 +15,25 @@ COARSENESS = (1, 2, 4, 8)  # picture px per px of an output
 MOST_CHANNELS = 4  # of an output that is maps; more are features
 
 
-class MapName(NamedTuple):
-    """One map among a network's outputs."""
+def find_map(values: NDArray[Any], fit: Fit) -> F32 | None:
+    """The first channel [h, w] of maps of the padded picture, whole or coarser; None: they are none.
 
-    output: str
-    channel: int
-    coarseness: int  # px of the picture per px of the map
-
-
-class Reading(NamedTuple):
-    """What a map's numbers mean: disparity (px of the picture) is factor * number, or factor / number."""
-
-    factor: float
-    inverted: bool = False
-
-    def disparity(self, numbers: F32) -> F32:
-        if not self.inverted:
-            return numbers * np.float32(self.factor)
-        return np.divide(np.float32(self.factor), numbers, out=np.zeros_like(numbers), where=numbers > 0)
-
-
-def find_maps(outputs: Mapping[str, NDArray[Any]], fit: Fit) -> dict[MapName, F32]:
-    """Every map [h, w] of the padded picture, whole or coarser, in the order of the outputs."""
-    maps: dict[MapName, F32] = {}
-    for name, values in outputs.items():
-        for coarseness in COARSENESS:
-            planes = _planes(values, (-(-fit.outer[1] // coarseness), -(-fit.outer[0] // coarseness)))
-            maps |= {MapName(name, channel, coarseness): plane for channel, plane in enumerate(planes)}
-            if planes:
-                break
-    return maps
-
-
-def _planes(values: NDArray[Any], shape: tuple[int, int]) -> list[F32]:
-    """The channels of [1, C, h, w], [1, h, w, C], [C, h, w], [h, w, C] or [h, w]; none where h, w differ."""
+    Args:
+        values: [1, C, h, w], [1, h, w, C], [C, h, w], [h, w, C] or [h, w].
+    """
     if values.dtype.kind not in "fiu":
-        return []
-    if values.ndim == 4 and values.shape[0] == 1:
-        values = values[0]
-    if values.shape == shape:
-        values = values[None]
-    if values.ndim == 3 and values.shape[:2] == shape:
-        values = values.transpose(2, 0, 1)
-    if values.ndim != 3 or values.shape[1:] != shape or len(values) > MOST_CHANNELS:
-        return []
-    return [plane.astype(np.float32) for plane in values]
+        return None
+    maps: F32 = (values[0] if values.ndim == 4 and len(values) == 1 else values).astype(np.float32)
+    for coarseness in COARSENESS:
+        shape = -(-fit.outer[1] // coarseness), -(-fit.outer[0] // coarseness)
+        if maps.shape == shape:
+            return maps
+        if maps.ndim == 3 and maps.shape[:2] == shape and maps.shape[2] <= MOST_CHANNELS:
+            maps = maps.transpose(2, 0, 1)
+        if maps.ndim == 3 and maps.shape[1:] == shape and len(maps) <= MOST_CHANNELS:
+            first: F32 = maps[0]
+            return first
+    return None
 
 
 def unfit(plane: F32, fit: Fit) -> F32:

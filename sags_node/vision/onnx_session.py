@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -46,6 +46,8 @@ class OnnxSession:
 
     Attributes:
         inputs: in the file's order.
+        outputs: their names.
+        description: what the file says of both, for messages.
         metadata: what the file says of itself.
         processor: "cuda" or "cpu", where it runs.
 
@@ -80,7 +82,9 @@ class OnnxSession:
                 enable_fallback=0,  # it would print to stdout
             )
             declared, metadata = self._session.get_inputs(), self._session.get_modelmeta()
-            self._output_names: list[str] = [output.name for output in self._session.get_outputs()]
+            given = self._session.get_outputs()
+            self.outputs: tuple[str, ...] = tuple(output.name for output in given)
+            self.description = f"inputs: {_in_words(declared)}; outputs: {_in_words(given)}"
             self.metadata: Mapping[str, str] = metadata.custom_metadata_map
             self.inputs = tuple(self._tensor(tensor) for tensor in declared)
         except UsageError:
@@ -98,12 +102,12 @@ class OnnxSession:
             DepthNetworkError: the runtime failed.
         """
         try:
-            values = self._session.run(self._output_names, dict(feeds))
+            values = self._session.run(self.outputs, dict(feeds))
         except Exception as error:  # as above
             raise DepthNetworkError(f"{self.name} failed: {first_line(error)}") from None
         return {
             name: value
-            for name, value in zip(self._output_names, values, strict=True)
+            for name, value in zip(self.outputs, values, strict=True)
             if isinstance(value, np.ndarray)
         }
 
@@ -120,6 +124,15 @@ class OnnxSession:
                 "export the network for smaller pictures"
             )
         return Tensor(declared.name, shape, TYPES[declared.type])
+
+
+def _in_words(tensors: Sequence[Any]) -> str:
+    """Name, shape and type of each, as the runtime gives them."""
+    return ", ".join(f"{each.name} {_sides(each.shape)}{each.type}" for each in tensors)
+
+
+def _sides(shape: Sequence[Any] | None) -> str:
+    return "x".join("?" if side is None else str(side) for side in shape) + " " if shape else ""
 
 
 def _check_file(path: Path, setting: str) -> None:

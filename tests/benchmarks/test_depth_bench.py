@@ -238,7 +238,8 @@ def test_a_recording_without_truth_is_named() -> None:
 
 
 def test_faults_make_depth_worse(tmp_path: Path) -> None:
-    network = save_matcher(tmp_path / "blocks.onnx")
+    said = {"inputs": "[first, second]", "normalization": "bytes", "meaning": "disparity", "multiple": "32"}
+    network = save_matcher(tmp_path / "blocks.onnx", metadata=said)
     faults = {"noise": (0.0, 0.08), "gloss": (0.0, 64.0)}
     measured = measure_faults((256, 192), 1, faults, silent, network)
     clean, noisy, dull, shiny = measured["faults"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 from unittest.mock import ANY
@@ -19,15 +20,17 @@ from benchmarks.pareto import measure as pareto
 from benchmarks.pareto import settings as pareto_settings
 from benchmarks.pareto.baselines import right_pixels
 from benchmarks.pareto.measure import non_dominated, why_default
-from benchmarks.pareto.settings import HURRIED_RULES, skip_rules, skip_settings, time_settings
+from benchmarks.pareto.settings import HURRIED_RULES, skip_settings, time_settings
 from sags_node.config.launch_file import load_launch
-from sags_node.config.schema import MappingConfig
 from sags_node.evaluation import metrics
 from sags_node.evaluation.warp import warp_to_right
+from sags_node.mapping.devices import Skips
 from sags_node.mapping.ladder import RUNGS
 from sags_node.rig import load_rig
 from sags_node.sources.source import open_source
 from sags_node.vision.rectify import Rectifier
+
+RULES = {"skip_duplicates", "skip_depth", "skip_fitted", "skip_still"}
 
 
 def bench(*arguments: Any) -> Result:
@@ -76,18 +79,14 @@ def test_each_setting_is_played_once_and_the_default_first() -> None:
         assert setting.name == (f"{said}, {count / 1e3:g}k" if count else said)
 
 
-def test_every_skip_rule_of_the_mapper_is_turned_round() -> None:
-    switches = [name for name in MappingConfig.model_fields if name.startswith("skip_")]
-    assert "skip_duplicates" in switches and skip_rules() == switches
-    pairs = skip_settings(MappingConfig())
-    assert list(pairs) == switches
-    for rule, (as_is, turned) in pairs.items():
-        *base, change = turned.overrides
-        assert as_is.overrides == tuple(base)
-        assert (load_launch(None, base).mapping.rung is not None) == (rule in HURRIED_RULES)
-        changed = load_launch(None, [change]).mapping
-        assert [name for name in MappingConfig.model_fields
-                if getattr(changed, name) != getattr(MappingConfig(), name)] == [rule]  # fmt: skip
+def test_each_skip_rule_alone_is_turned_off() -> None:
+    pairs = skip_settings()
+    assert set(pairs) == RULES
+    for rule, (on, off) in pairs.items():
+        assert on.overrides == off.overrides and on.skips == Skips()
+        assert [name for name, used in asdict(off.skips).items() if not used] == [rule.removeprefix("skip_")]
+        hurried = load_launch(None, on.overrides).mapping.rung is not None
+        assert hurried == (rule.removeprefix("skip_") in HURRIED_RULES)
 
 
 # ---- baselines -------------------------------------------------------------------------------------------
@@ -182,11 +181,11 @@ def test_everything_is_measured_on_a_tiny_session(phantom_session: Path, tmp_pat
     assert full["depth"]["median_mm"] < halved["depth"]["median_mm"] < 3 and full["frame_ms"]["p50"] > 0
     assert offline["heldout"]["psnr"] == 41.0
 
-    assert {each["rule"] for each in session["skips"]} == set(skip_rules())
+    assert {each["rule"] for each in session["skips"]} == RULES
     depth = next(each for each in session["skips"] if each["rule"] == "skip_depth")
     assert depth["on"]["skipped"]["depth"] > 0 and "depth" not in depth["off"]["skipped"]
     skip = next(each for each in session["skips"] if each["rule"] == "skip_duplicates")
-    assert skip["default"] and skip["online_db"] == 0  # no frame repeats: the rule changes nothing
+    assert skip["online_db"] == 0  # no frame repeats: the rule changes nothing
     picture = cv2.imdecode(np.frombuffer(plot.read_bytes(), np.uint8), cv2.IMREAD_COLOR)
     assert picture is not None and (picture != 255).any(-1).mean() > 0.005
 
@@ -201,7 +200,6 @@ def test_a_duplicate_that_is_skipped_saves_its_time(phantom_session: Path, tmp_p
     result = bench(
         folder,
         "mapping.max_gaussians:=2000",
-        "mapping.skip_still:=false",
         "--frames",
         6,
         "--only",
@@ -211,7 +209,7 @@ def test_a_duplicate_that_is_skipped_saves_its_time(phantom_session: Path, tmp_p
     assert result.exit_code == 0, result.output
     (session,) = json.loads(result.stdout)["sessions"]
     skip = next(each for each in session["skips"] if each["rule"] == "skip_duplicates")
-    assert skip["on"]["skipped"] == {"frame": 4} and skip["off"]["skipped"] == {}  # frame 1 is held out
+    assert skip["on"]["skipped"] == {"frame": 4} and "frame" not in skip["off"]["skipped"]  # 1 is held out
     assert skip["online_db"] == pytest.approx(skip["on"]["online"]["psnr"] - skip["off"]["online"]["psnr"])
     assert skip["online_db"] < 0  # more steps on the same picture would have brought it nearer
 

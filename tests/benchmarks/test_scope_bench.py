@@ -9,17 +9,21 @@ import pytest
 
 from benchmarks.quality import scope
 from sags_node.config.launch_file import load_launch
-from sags_node.config.schema import FoldersSource
+from sags_node.config.schema import FoldersSource, PhantomSource
 from sags_node.errors import UsageError
+from sags_node.phantom import PhantomScene
 
 SMALL = [
-    *("source.width:=160", "source.height:=128", "source.rate:=2.5", "source.still_tissue:=true"),
-    *("mapping.max_gaussians:=1500",),
+    *("source.width:=160", "source.height:=128", "source.rate:=2.5", "mapping.max_gaussians:=1500"),
 ]
 
 
 def test_what_is_told_is_exact_and_what_a_robot_is_off_by_is_what_was_planted() -> None:
-    measured = scope.measure_scope(load_launch(None, SMALL), ["zoom"], 8.0, lambda done, of, what: None)
+    config = load_launch(None, SMALL)
+    assert isinstance(config.source, PhantomSource)
+    still = PhantomScene.of(config.source).model_copy(update={"still_tissue": True})
+    config = config.model_copy(update={"source": still})
+    measured = scope.measure_scope(config, ["zoom"], 8.0, lambda done, of, what: None)
     rows = {row["way"]: row for row in measured["rows"]}
     assert set(rows) == {"session", "estimate", "refine", "robot", "rigid", "points"}
     assert rows["session"]["ate_mm"] == pytest.approx(0, abs=1e-9) and rows["session"]["psnr"] > 25

@@ -33,7 +33,7 @@ pytestmark = [pytest.mark.live, pytest.mark.usefixtures("run_dir")]
             ["source.kind:=videos", "source.left:=a.mp4"],
             ("source.right is missing", "vision.onnx.declared_depth", "docs/networks.md"),
         ),
-        (["clip.MP4"], ("clip.MP4 is a video", "source.video:=clip.MP4", "source.left:=clip.MP4", "rig:=")),
+        (["clip.MP4"], ("clip.MP4 is a video", "layout:=side_by_side", "source.left:=clip.MP4", "rig:=")),
         (["mapping.budget_ms=25"], ("'mapping.budget_ms=25'", "write mapping.budget_ms:=25")),
         ([":=25"], ("':=25'", "write key:=value")),
     ],
@@ -194,13 +194,12 @@ def test_wrong_picture_folders(
 
 
 def test_a_crop_outside_the_picture(user_files: Path) -> None:
-    boxes = ["source.left:=[0, 0, 200, 256]", "source.right:=[200, 0, 200, 256]"]
+    boxes = ["source.geometry.crop:=[0, 0, 200, 256]", "source.geometry.crop_right:=[200, 0, 200, 256]"]
     source = [
-        "source.kind:=panes",
-        f"source.video:={user_files / 'left.mp4'}",
+        *("source.kind:=videos", "source.geometry.layout:=panes", f"source.left:={user_files / 'left.mp4'}"),
         f"rig:={user_files / 'calib'}",
     ]
-    refused(2, "run", *source, *boxes, said=("pane 'right'", "leaves the picture", "320x256"))
+    refused(2, "run", *source, *boxes, said=("[200, 0, 200, 256]", "leaves the picture", "320x256"))
 
 
 def test_a_camera_that_is_not_there() -> None:

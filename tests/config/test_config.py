@@ -10,10 +10,11 @@ from places import ROOT
 from sags_node.config.launch_file import load_launch, with_parameters
 from sags_node.config.schema import (
     REMOVED,
+    REMOVED_KINDS,
     FoldersSource,
     LaunchConfig,
     MappingConfig,
-    PanesSource,
+    VideosSource,
     VisionConfig,
 )
 from sags_node.errors import UsageError
@@ -45,11 +46,11 @@ def test_paths_are_relative_to_the_file_and_variables_are_expanded(
 
 def test_overrides_win_over_the_file() -> None:
     config = load_launch(
-        ROOT / "launch/d4d_pull.yaml", ["mapping.budget_ms:=50", "source.left:=[1, 2, 300, 200]"]
+        ROOT / "launch/d4d_pull.yaml", ["mapping.budget_ms:=50", "source.tools:=[1, 2, 300, 200]"]
     )
     assert config.mapping.budget_ms == 50
-    assert isinstance(config.source, PanesSource)
-    assert config.source.left == (1, 2, 300, 200)
+    assert isinstance(config.source, VideosSource)
+    assert config.source.tools == (1, 2, 300, 200)
 
 
 @pytest.mark.parametrize(
@@ -128,6 +129,15 @@ def test_a_key_that_is_gone_says_what_stands_in_its_place(key: str) -> None:
     assert str(caught.value) == f"command line: there is no {key} any more: {REMOVED[key]}"
     with pytest.raises(UsageError, match=re.escape(f"there is no {key} any more")):
         with_parameters(LaunchConfig(), {key: 1})
+
+
+@pytest.mark.parametrize("kind", REMOVED_KINDS)
+def test_a_kind_that_is_gone_says_what_stands_in_its_place(kind: str, tmp_path: Path) -> None:
+    (tmp_path / "launch.yaml").write_text(f"source: {{kind: {kind}, video: a.mp4}}")
+    with pytest.raises(UsageError) as caught:
+        load_launch(tmp_path)
+    said = f"there is no source.kind {kind} any more: {REMOVED_KINDS[kind]}"
+    assert str(caught.value) == f"{tmp_path / 'launch.yaml'}: {said}"
 
 
 def test_parameters_are_validated_like_a_file() -> None:

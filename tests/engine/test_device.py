@@ -179,10 +179,7 @@ print([name for name in ("torch", "triton") if name in sys.modules])
     assert done.stdout == "[]\n"
 
 
-@pytest.mark.parametrize(
-    ("override", "said"), [("device:=gpu", "device"), ("engine.backend:=reference", "choose one of them")]
-)
-def test_device_is_a_launch_key(override: str, said: str) -> None:
+def test_device_is_a_launch_key() -> None:
     assert load_launch().device == "auto"
-    with pytest.raises(UsageError, match=said):
-        load_launch(None, ["device:=cuda", override])
+    with pytest.raises(UsageError, match="device"):
+        load_launch(None, ["device:=gpu"])

@@ -35,6 +35,7 @@ from rounding import after
 from sags_node import geometry
 from sags_node.config.launch_file import load_launch
 from sags_node.doctor import examine
+from sags_node.engine.device import choose_device
 from sags_node.engine.interface import MAX_OPACITY, MIN_ALPHA, NEAR_PLANE
 from sags_node.engine.rasterizer.rasterize import TILE_HEIGHT, TILE_WIDTH, make_rasterizer
 from sags_node.errors import SagsError, UsageError
@@ -270,9 +271,8 @@ def test_where_its_kernels_are_missing_or_cannot_be_built(machine: pytest.Monkey
 
 
 def test_it_is_a_launch_key_and_the_doctor_looks_at_it(machine: pytest.MonkeyPatch) -> None:
-    config = load_launch(None, ["engine.backend:=gsplat"])
-    with pytest.raises(UsageError, match="choose one of them"):
-        load_launch(None, ["engine.backend:=gsplat", "device:=cuda"])
+    config = load_launch(None, ["device:=gsplat"])
+    assert config.backend == "gsplat" and choose_device(config.device).kind == "cpu"
     machine.setattr(torch.cuda, "is_available", lambda: False)
     (found,) = (check for check in examine(config) if check.name == "gsplat")
     assert found.level == "error" and "found no GPU" in found.mend

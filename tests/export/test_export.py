@@ -25,6 +25,7 @@ from sags_node.export.scene import Scene, from_node, from_session
 from sags_node.export.surface_files import Surface
 from sags_node.fitting import start
 from sags_node.geometry import project, unproject
+from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.control import ControlClient
 from sags_node.messaging.received import ReceivedImage, TopicName
 from sags_node.messaging.subscriber import Subscriber
@@ -262,12 +263,12 @@ def test_a_running_node_is_exported_as_it_is_now(
         with Subscriber([depth], run_dir=node.run_dir) as subscriber:
             assert subscriber.wait(depth, 60) is not None
             drawn = {}
-            taken = from_node(run_dir=node.run_dir)
+            taken = from_node(NodeAddress(run_dir=node.run_dir))
             while taken.t_capture_ns not in drawn:  # the same frame, as the node drew it
                 newest = subscriber.latest(depth)
                 drawn[newest.stamp_ns if newest else 0] = newest
                 if newest is not None and newest.stamp_ns > taken.t_capture_ns:
-                    taken = from_node(run_dir=node.run_dir)
+                    taken = from_node(NodeAddress(run_dir=node.run_dir))
         theirs = drawn[taken.t_capture_ns].array
         mine = rasterize(taken.gaussians, taken.camera).depth
         both = np.isfinite(theirs) & (mine > 0)
@@ -281,7 +282,7 @@ def test_a_running_node_is_exported_as_it_is_now(
         with ControlClient(run_dir=node.run_dir) as control:
             control.request("pause")
         with pytest.raises(SagsError, match="nothing fresh came"):
-            from_node(run_dir=node.run_dir)
+            from_node(NodeAddress(run_dir=node.run_dir))
     finally:
         node.stop()
     refused(1, "export", "--mesh", tmp_path / "none.ply", said=("no node runs as 'sags'",))

@@ -432,11 +432,10 @@ def mesh_files(sound: Callable[[Path], Sequence[bytes]], suffix: str) -> Target:
 
 
 def networks(folder: Path) -> list[bytes]:
-    silent = save_matcher(folder / "a.onnx", size=(64, 48))
-    said = save_matcher(
-        folder / "b.onnx", size=(64, 48), metadata={"normalization": "bytes", "multiple": "16"}
-    )
-    return [silent.read_bytes(), said.read_bytes()]
+    said = {"inputs": "[first, second]", "normalization": "bytes", "meaning": "disparity"}
+    fixed = save_matcher(folder / "a.onnx", size=(64, 48), metadata=said)
+    padded = save_matcher(folder / "b.onnx", metadata={**said, "multiple": "16"})
+    return [fixed.read_bytes(), padded.read_bytes()]
 
 
 def open_network(data: bytes, folder: Path) -> None:
@@ -460,7 +459,8 @@ def films(folder: Path) -> list[bytes]:
 def read_film(data: bytes, folder: Path) -> None:
     file = folder / ("a.avi" if data[:4] == b"RIFF" else "a.mp4")
     file.write_bytes(data)
-    with open_source(cfg.SideBySideSource(video=file, pace="step", frames=8)) as source:
+    halves = cfg.GeometryConfig(layout="side_by_side")
+    with open_source(cfg.VideosSource(left=file, geometry=halves, pace="step", frames=8)) as source:
         for frame in source:
             assert frame.right is not None and frame.left.shape == frame.right.shape
 

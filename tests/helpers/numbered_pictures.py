@@ -65,12 +65,15 @@ def recordings(tmp_path: Path) -> dict[str, Recording]:
     panes = write_video(
         tmp_path / "panes.avi", [np.vstack([np.hstack(p), np.hstack([green] * 2)]) for p in pairs]
     )
+    halves = cfg.GeometryConfig(layout="side_by_side")
+    turned = cfg.GeometryConfig(layout="side_by_side", first="right")
+    boxes = cfg.GeometryConfig(
+        layout="panes", crop=(0, 0, WIDTH, HEIGHT), crop_right=(WIDTH, 0, WIDTH, HEIGHT)
+    )
     return {
         "folders": cfg.FoldersSource(left=tmp_path / "l", right=tmp_path / "r", pace="step", rate=25),
         "videos": cfg.VideosSource(left=left_file, right=right_file, pace="step"),
-        "LR": cfg.SideBySideSource(video=lr, pace="step"),
-        "RL": cfg.SideBySideSource(video=rl, order="RL", pace="step"),
-        "panes": cfg.PanesSource(
-            video=panes, left=(0, 0, WIDTH, HEIGHT), right=(WIDTH, 0, WIDTH, HEIGHT), pace="step"
-        ),
+        "LR": cfg.VideosSource(left=lr, geometry=halves, pace="step"),
+        "RL": cfg.VideosSource(left=rl, geometry=turned, pace="step"),
+        "panes": cfg.VideosSource(left=panes, geometry=boxes, pace="step"),
     }

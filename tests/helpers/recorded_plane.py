@@ -13,6 +13,7 @@ from synthetic import at_frame, plane_result, publisher, stream
 from waiting import until
 
 from sags_node.errors import SagsError
+from sags_node.messaging.address import NodeAddress
 from sags_node.recording.bag import BagMessage, read_messages
 from sags_node.recording.recorder import Options, Recorder
 from sags_node.types import FrameResult
@@ -57,7 +58,8 @@ def record_plane(tmp_path: Path, seconds: float = 1.0, **options: Any) -> tuple[
         running.publish_parameters({"seed": 5})
         with stream(running, frame, RATE):
             until(lambda: count > 2)  # the last values are there
-            with recording(Options(tmp_path / "bag", run_dir=run_dir, **options)) as (_, said):
+            node = NodeAddress(run_dir=run_dir)
+            with recording(Options(tmp_path / "bag", node=node, **options)) as (_, said):
                 last = count + seconds * RATE
                 until(lambda: count > last)
     return tmp_path / "bag", said[-1]

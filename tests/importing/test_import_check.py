@@ -218,7 +218,8 @@ def shown(left: U8, right: U8) -> dict[str, tuple[U8, str]]:
         "rows": (rows, "layout:=row_interleaved rig"),
         "panes": (
             np.vstack([np.hstack([left, right]), np.hstack([dark, left])]),
-            f"left:=[0,0,{2 * WIDTH},{2 * HEIGHT}] source.right:=[{2 * WIDTH},0,{2 * WIDTH},{2 * HEIGHT}]",
+            f"layout:=panes source.geometry.crop:=[0,0,{2 * WIDTH},{2 * HEIGHT}] "
+            f"source.geometry.crop_right:=[{2 * WIDTH},0,{2 * WIDTH},{2 * HEIGHT}] rig",
         ),
         "one eye": (left, "layout:=side_by_side shows what is in it"),
     }

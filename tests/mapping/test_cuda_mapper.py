@@ -25,6 +25,7 @@ from sags_node.mapping.anchors import Anchors
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.cuda import refiner as cuda_refiner
 from sags_node.mapping.cuda.refiner import REFINED, CudaRefiner
+from sags_node.mapping.devices import Skips
 from sags_node.mapping.fallback_refiner import LOWERED, FallbackRefiner
 from sags_node.mapping.mapper import Mapper
 from sags_node.mapping.optimiser import Rates
@@ -422,8 +423,8 @@ def pipeline_on(device: str, steps: int) -> tuple[Pipeline, Callable[[int], Any]
     """A pipeline, and how to let it take a frame in."""
     K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
     rig = rectified_rig("sheet", WIDTH, HEIGHT, K, BASELINE)
-    mapping = MappingConfig(max_gaussians=100, skip_still=False)
-    pipeline = Pipeline(LaunchConfig(device=device, mapping=mapping), rig)
+    mapping = MappingConfig(max_gaussians=100)
+    pipeline = Pipeline(LaunchConfig(device=device, mapping=mapping), rig, skips=Skips(still=False))
 
     def take(i: int) -> Any:
         observation = frame(i)

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from tissue_pictures import FRAME_NS, GOLD, HEIGHT, JAW, SHAFT, WIDTH, iou, textured_tissue
 
-from sags_node.config.schema import LaunchConfig, PhantomSource
+from sags_node.config.schema import LaunchConfig
 from sags_node.mapping.budget import StepBudget
-from sags_node.phantom.scene import Phantom
+from sags_node.phantom.scene import Phantom, PhantomScene
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.types import U8, Camera, RenderedView, StereoFrame
 from sags_node.vision.tissue_classical import LONGEST_DOUBT, InstrumentFinder
@@ -155,7 +155,7 @@ def test_noise_makes_a_remembered_mask_flicker_less() -> None:
 
 def test_instruments_of_the_phantom_while_it_is_mapped() -> None:
     """The masks shape the model, and the model the masks."""
-    source = PhantomSource(width=WIDTH, height=HEIGHT, seconds=4.0, noise=0.02)
+    source = PhantomScene(width=WIDTH, height=HEIGHT, seconds=4.0, noise=0.02)
     phantom = Phantom(source)
     config = LaunchConfig.model_validate(
         {

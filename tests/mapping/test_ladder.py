@@ -12,7 +12,7 @@ import pytest
 from sags_node.config.schema import LaunchConfig, MappingConfig
 from sags_node.errors import UsageError
 from sags_node.mapping import devices
-from sags_node.mapping.devices import affordable, make_budget, rungs_of, with_scale
+from sags_node.mapping.devices import ALL_SKIPS, Skips, affordable, make_budget, rungs_of, with_scale
 from sags_node.mapping.ladder import (
     FIRST_FRAMES,
     FULL,
@@ -165,13 +165,13 @@ def test_a_few_late_frames_change_nothing() -> None:
 
 
 def test_what_a_launch_pins_and_switches_off() -> None:
-    def rungs(**mapping: object) -> tuple[Rung, ...]:
-        return rungs_of(LaunchConfig(device="cpu", mapping=MappingConfig.model_validate(mapping)))
+    def rungs(rung: int | None = None, skips: Skips = ALL_SKIPS) -> tuple[Rung, ...]:
+        return rungs_of(LaunchConfig(device="cpu", mapping=MappingConfig(rung=rung)), skips)
 
     assert rungs() == RUNGS
     assert rungs(rung=3) == (RUNGS[3],)
-    assert {rung.depth_every for rung in rungs(skip_depth=False)} == {1}
-    assert {rung.step for rung in rungs(skip_fitted=False)} == {1.0}
+    assert {rung.depth_every for rung in rungs(skips=Skips(depth=False))} == {1}
+    assert {rung.step for rung in rungs(skips=Skips(fitted=False))} == {1.0}
     with pytest.raises(UsageError, match=r"mapping\.rung 99: the ladder's rungs are 0 to \d+"):
         rungs(rung=99)
 

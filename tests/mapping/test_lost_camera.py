@@ -9,20 +9,19 @@ import cv2
 import numpy as np
 import pytest
 
-from sags_node.config.schema import PhantomSource
 from sags_node.engine.rasterizer.views import to_view
 from sags_node.geometry import invert, transform
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.camera_pose import exponential
 from sags_node.mapping.camera_tracker import DISAGREEING, LOOK_NS, TRIAL
 from sags_node.model.light import carried
-from sags_node.phantom import write_session
+from sags_node.phantom import PhantomScene, write_session
 from sags_node.phantom.scene import Phantom
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import Session, open_session
 from sags_node.types import F64, FrameResult, StereoFrame
 
-SHAPE = PhantomSource(seconds=8, width=320, height=256, still_tissue=True)
+SHAPE = PhantomScene(seconds=8, width=320, height=256, still_tissue=True)
 PERIOD_NS = 33_000_000
 TISSUE = 0.075  # m, to the middle of what the scope sees first
 

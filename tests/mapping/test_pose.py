@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from places import SESSION
 
-from sags_node.config.schema import PhantomSource
 from sags_node.engine.rasterizer.rasterize import rasterize
 from sags_node.evaluation.measure import Options
 from sags_node.evaluation.session import evaluate
@@ -22,7 +21,7 @@ from sags_node.mapping.camera_pose import exponential, fit_pose
 from sags_node.mapping.camera_tracker import GIVE_UP_NS, TRIAL
 from sags_node.mapping.first_views import FirstViews
 from sags_node.mapping.keyframes import Keyframes
-from sags_node.phantom import write_session
+from sags_node.phantom import PhantomScene, write_session
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import Session, open_session
 from sags_node.types import F32, F64, Camera, FrameResult, Observation, StereoFrame
@@ -132,7 +131,7 @@ def deforming(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def rendered(factory: pytest.TempPathFactory, still_tissue: bool) -> Path:
     folder = factory.mktemp("moving") / "session"
-    shape = PhantomSource(seconds=2, width=320, height=256, camera_motion="sway", still_tissue=still_tissue)
+    shape = PhantomScene(seconds=2, width=320, height=256, camera_motion="sway", still_tissue=still_tissue)
     write_session(shape, folder, RATE)
     return folder
 

@@ -19,6 +19,7 @@ from sags_node.evaluation.metrics import psnr
 from sags_node.mapping import mapper
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.densify import FRONT_FRAMES
+from sags_node.mapping.devices import ALL_SKIPS, Skips
 from sags_node.mapping.mapper import SETTLED, SETTLED_EVERY, TORN, Mapper
 from sags_node.mapping.refiner import CpuRefiner
 from sags_node.messaging.content import tells_of
@@ -190,8 +191,8 @@ def opened(*overrides: str) -> Session:
 class Player:
     """A pipeline that is given frames with fresh numbers and stamps."""
 
-    def __init__(self, session: Session, steps: int = 2) -> None:
-        self.pipeline = Pipeline(session.config, session.rig)
+    def __init__(self, session: Session, skips: Skips = ALL_SKIPS, steps: int = 2) -> None:
+        self.pipeline = Pipeline(session.config, session.rig, skips=skips)
         self._steps = steps
         self._number = 0
         self._rng = np.random.default_rng(3)
@@ -254,7 +255,7 @@ def test_neither_depth_nor_flow_is_asked_for_until_something_moves(
 def test_each_frame_is_mapped_where_still_scenes_are_not_wanted(
     frames: list[StereoFrame], calls: dict[str, int]
 ) -> None:
-    play = Player(opened("mapping.skip_still:=false"))
+    play = Player(opened(), Skips(still=False))
     play(frames[0])
     assert not any(play.again(frames[0]).skipped for _ in range(3))
     assert calls == {"depth": 4, "flow": 3}

@@ -18,6 +18,7 @@ from waiting import until
 
 from sags_node.errors import UsageError
 from sags_node.messaging import content, thin, topics
+from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.introspection import topic_echo, topic_hz
 from sags_node.messaging.publisher import MAX_THIN, Publisher
 from sags_node.messaging.received import ReceivedCompressed, ReceivedImage, TopicName
@@ -143,9 +144,9 @@ def test_nothing_is_made_that_nobody_asks_for_by_its_name(tmp_path: Path) -> Non
 def test_sags_topic_reads_them_like_the_whole(tmp_path: Path) -> None:
     depth = plane_result().observation.depth[::2, ::2]
     with node_sockets(tmp_path) as running, making(running, plane_result()):
-        endpoint = running.connection.data[-1]
-        (said,) = topic_echo("thin/half/left/depth/png", endpoint, count=1, seconds=60)
-        assert topic_hz("thin/half/left/depth/png", endpoint, seconds=1.0)["window"] >= 2
+        node = NodeAddress(endpoint=running.connection.data[-1])
+        (said,) = topic_echo("thin/half/left/depth/png", node, count=1, seconds=60)
+        assert topic_hz("thin/half/left/depth/png", node, seconds=1.0)["window"] >= 2
     assert said["content"]["shape"] == list(depth.shape)
     assert said["content"]["max"] == pytest.approx(depth.max(), abs=DEPTH_STEP)
     assert said["content"]["unknown"] == pytest.approx(np.mean(depth == 0))
@@ -155,7 +156,7 @@ def test_a_recording_of_everything_leaves_out_what_others_asked_for(tmp_path: Pa
     """It has the whole pictures."""
     name = thin_name("thin/quarter/left/depth/png")
     with node_sockets(tmp_path) as running, making(running, plane_result()):
-        recorder = Recorder(Options(tmp_path / "bag", endpoint=running.connection.data[-1]))
+        recorder = Recorder(Options(tmp_path / "bag", node=NodeAddress(endpoint=running.connection.data[-1])))
         with Subscriber([name], running.connection.data[-1]) as one, ThreadPoolExecutor(1) as worker:
             recording = worker.submit(recorder.run)
             until(lambda: list((tmp_path / "bag").glob("*.mcap")))

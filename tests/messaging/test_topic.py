@@ -17,6 +17,7 @@ from synthetic import HEIGHT, WIDTH, health, publisher, stream
 from sags_node.cli.main import main
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import cdr, topics
+from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.introspection import topic_bw, topic_delay, topic_echo, topic_hz, topic_list
 from sags_node.messaging.wire import Message
 from sags_node.overlay.draw import color_key
@@ -24,15 +25,16 @@ from sags_node.overlay.stream import OverlayStream
 
 pytestmark = pytest.mark.live
 
+NOWHERE = NodeAddress(endpoint="tcp://127.0.0.1:9")
 KEY = (0, 0, 255)
 
 
 @pytest.fixture(scope="module")
-def endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+def node(tmp_path_factory: pytest.TempPathFactory) -> Iterator[NodeAddress]:
     with publisher(tmp_path_factory.mktemp("topic") / "run") as running:
         running.publish_parameters({"seed": 1})
         with stream(running, rate=40.0):
-            yield running.connection.data[-1]
+            yield NodeAddress(endpoint=running.connection.data[-1])
 
 
 def test_figures_are_those_of_the_arrivals(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -43,40 +45,40 @@ def test_figures_are_those_of_the_arrivals(monkeypatch: pytest.MonkeyPatch) -> N
         (Message("sags/left/depth", meta(seq, at - 5.0), (bytes(size),)), int(at * MS))
         for seq, (at, size) in enumerate(zip(came, sizes, strict=True))
     ]
-    monkeypatch.setattr("sags_node.messaging.introspection.listen", lambda *_, **__: iter([*heard, None]))
-    hz = topic_hz("left/depth", "tcp://127.0.0.1:9")
+    monkeypatch.setattr("sags_node.messaging.introspection.listen_to", lambda *_, **__: iter([*heard, None]))
+    hz = topic_hz("left/depth", NOWHERE)
     assert (hz["window"], hz["freezes"]) == (4, 0)
     steps = [0.01, 0.02, 0.07]
     expected = {"average_rate": 30.0, "min_s": 0.01, "max_s": 0.07, "std_dev_s": np.std(steps)}
     assert {key: hz[key] for key in expected} == pytest.approx(expected)
-    bw = topic_bw("left/depth", "tcp://127.0.0.1:9")  # the first one only starts the clock
+    bw = topic_bw("left/depth", NOWHERE)  # the first one only starts the clock
     assert (bw["bytes_per_s"], bw["mean_bytes"]) == (pytest.approx(600 / 0.1), 275)
-    delay = topic_delay("left/depth", "tcp://127.0.0.1:9")
+    delay = topic_delay("left/depth", NOWHERE)
     for key in ("min_s", "average_delay_s", "max_s"):
         assert delay[key] == pytest.approx(5e-3)
-    (row,) = (row for row in topic_list("tcp://127.0.0.1:9") if row["messages"])
+    (row,) = (row for row in topic_list(NOWHERE) if row["messages"])
     assert (row["topic"], row["rate_hz"], row["mean_bytes"]) == ("sags/left/depth", 30.0, 275)
 
 
-def test_hz(endpoint: str) -> None:
-    figures = topic_hz("left/depth", endpoint, seconds=1.0)
+def test_hz(node: NodeAddress) -> None:
+    figures = topic_hz("left/depth", node, seconds=1.0)
     assert figures["min_s"] <= 1 / figures["average_rate"] <= figures["max_s"]
     assert figures["window"] >= 2
 
 
-def test_bw(endpoint: str) -> None:
-    figures = topic_bw("sags/left/depth", endpoint, seconds=1.0)  # the full name is understood too
+def test_bw(node: NodeAddress) -> None:
+    figures = topic_bw("sags/left/depth", node, seconds=1.0)  # the full name is understood too
     assert figures["mean_bytes"] == pytest.approx(4 * WIDTH * HEIGHT, rel=0.01)
     assert figures["bytes_per_s"] > 0
 
 
-def test_delay(endpoint: str) -> None:
-    figures = topic_delay("tf", endpoint, seconds=1.0)
+def test_delay(node: NodeAddress) -> None:
+    figures = topic_delay("tf", node, seconds=1.0)
     assert 0 < figures["min_s"] <= figures["average_delay_s"] <= figures["max_s"]
 
 
-def test_list(endpoint: str) -> None:
-    rows = {row["topic"]: row for row in topic_list(endpoint, seconds=1.0)}
+def test_list(node: NodeAddress) -> None:
+    rows = {row["topic"]: row for row in topic_list(node, seconds=1.0)}
     assert set(rows) == {f"sags/{name}" for name in topics.BY_NAME}
     assert rows["sags/left/depth"]["rate_hz"] > 0
     assert rows["sags/left/depth"]["type"] == "sensor_msgs/msg/Image"
@@ -112,16 +114,16 @@ def overlay(tmp_path_factory: pytest.TempPathFactory) -> Iterator[OverlayStream]
 
 def test_an_overlay_is_listed_and_measured(overlay: OverlayStream) -> None:
     endpoint = overlay.endpoints[-1]
-    rows = {row["topic"]: row for row in topic_list(endpoint, ns="overlay", seconds=2.0)}
+    rows = {row["topic"]: row for row in topic_list(NodeAddress("overlay", endpoint), seconds=2.0)}
     assert set(rows) == {f"overlay/{topic.name}" for topic in topics.OVERLAY_TOPICS}
     assert rows["overlay/left/overlay/image"]["rate_hz"] > 0
     assert rows["overlay/left/overlay/image"]["mean_bytes"] > 4 * WIDTH * HEIGHT
     assert rows["overlay/status"]["messages"] >= 1
     assert rows["overlay/right/overlay/color_key"]["type"] == topics.IMAGE
-    assert topic_hz("left/overlay/color_key", endpoint, ns="overlay", seconds=2.0)["window"] >= 2
-    bw = topic_bw("left/overlay/image", endpoint, ns="overlay", seconds=2.0)
+    assert topic_hz("left/overlay/color_key", NodeAddress("overlay", endpoint), seconds=2.0)["window"] >= 2
+    bw = topic_bw("left/overlay/image", NodeAddress("overlay", endpoint), seconds=2.0)
     assert bw["mean_bytes"] > 4 * WIDTH * HEIGHT
-    (said,) = topic_echo("status", endpoint, ns="overlay", count=1, seconds=60)
+    (said,) = topic_echo("status", NodeAddress("overlay", endpoint), count=1, seconds=60)
     assert said["content"]["state"] == "running"
 
 
@@ -151,7 +153,7 @@ def test_what_a_node_sends_beside_its_fixed_topics_is_listed(tmp_path: Path) -> 
         thread = threading.Thread(target=serve)
         thread.start()
         try:
-            rows = {row["topic"]: row for row in topic_list(endpoint, seconds=1.5)}
+            rows = {row["topic"]: row for row in topic_list(NodeAddress(endpoint=endpoint), seconds=1.5)}
         finally:
             stop.set()
             thread.join()
@@ -160,8 +162,8 @@ def test_what_a_node_sends_beside_its_fixed_topics_is_listed(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("name", topics.BY_NAME)
-def test_echo(endpoint: str, name: str) -> None:
-    (record,) = topic_echo(name, endpoint, count=1, seconds=60)
+def test_echo(node: NodeAddress, name: str) -> None:
+    (record,) = topic_echo(name, node, count=1, seconds=60)
     assert json.loads(json.dumps(record))["topic"] == f"sags/{name}"
     assert record["type"] == topics.BY_NAME[name].type and record["content"]
     if name == "left/depth":
@@ -170,18 +172,18 @@ def test_echo(endpoint: str, name: str) -> None:
         assert 0.03 < record["content"]["min"] < record["content"]["max"] < 0.2
 
 
-def test_silence_and_mistakes_are_named(endpoint: str) -> None:
+def test_silence_and_mistakes_are_named(node: NodeAddress) -> None:
     with pytest.raises(UsageError, match="did you mean 'left/depth'"):
-        topic_hz("left/dept", endpoint)
+        topic_hz("left/dept", node)
     with pytest.raises(SagsError, match=r"no messages on sags/tf from tcp://127\.0\.0\.1:9 in 0\.2 s"):
-        topic_hz("tf", "tcp://127.0.0.1:9", seconds=0.2)
+        topic_hz("tf", NOWHERE, seconds=0.2)
     with pytest.raises(SagsError, match="no messages on other/"):
-        topic_list(endpoint, ns="other", seconds=0.3)
+        topic_list(NodeAddress("other", node.endpoint), seconds=0.3)
     with pytest.raises(SagsError, match="no messages"):
-        list(topic_echo("clock", endpoint, seconds=0.2))
+        list(topic_echo("clock", node, seconds=0.2))
 
 
 def test_why_there_is_no_right_eye_is_said(tmp_path: Path) -> None:
     with publisher(tmp_path / "run", right=False) as running, stream(running):
         with pytest.raises(SagsError, match=r"one camera, or with publish\.right:=false, has no right eye"):
-            topic_hz("right/render/image", running.connection.data[-1], seconds=0.2)
+            topic_hz("right/render/image", NodeAddress(endpoint=running.connection.data[-1]), seconds=0.2)

@@ -14,12 +14,12 @@ from sags_node.phantom import cached_session, write_session
 from sags_node.phantom.motion import CENTRE, Clock, scope_pose
 from sags_node.phantom.relief import make_relief
 from sags_node.phantom.rig import phantom_rig, raw_rays
-from sags_node.phantom.scene import Phantom, PhantomFrame
+from sags_node.phantom.scene import Phantom, PhantomFrame, PhantomScene
 from sags_node.phantom.tissue import LIFT, Tissue
 from sags_node.rig import load_rig
 from sags_node.types import F64, Eye, StereoRig
 
-TINY = PhantomSource(seconds=0.1, width=96, height=80)
+TINY = PhantomScene(seconds=0.1, width=96, height=80)
 COUNT = 8
 LIFTED = 4  # the frame of COUNT in which the fold is held up
 
@@ -27,7 +27,7 @@ LIFTED = 4  # the frame of COUNT in which the fold is held up
 @pytest.fixture(scope="module")
 def swaying() -> Phantom:
     """A clean scene with a moving scope."""
-    return Phantom(PhantomSource(width=320, height=256, noise=0, camera_motion="sway"))
+    return Phantom(PhantomScene(width=320, height=256, noise=0, camera_motion="sway"))
 
 
 @pytest.fixture(scope="module")
@@ -290,6 +290,7 @@ def test_cache_renders_once_and_keys_on_what_shapes_the_pictures(
     assert cached_session(looped, progress=lambda done, _count: rendered.append(done)) == first
     assert rendered == [1, 2, 3]
     assert cached_session(TINY.model_copy(update={"smoke": 0.5})) != first
+    assert cached_session(PhantomSource(seconds=TINY.seconds, width=TINY.width, height=TINY.height)) == first
 
 
 def test_the_scope_zooms_along_its_axis_and_orbits_round_what_it_looks_at() -> None:

@@ -20,11 +20,10 @@ def folder(data_folder: Path) -> Path:
     return folder
 
 
-def d4d(folder: Path, **playing: object) -> cfg.PanesSource:
-    return cfg.PanesSource(
-        video=folder / "2025_03_06-16_49_40_combined_2x2.mp4",
-        left=(0, 0, 675, 540),
-        right=(675, 0, 675, 540),
+def d4d(folder: Path, **playing: object) -> cfg.VideosSource:
+    return cfg.VideosSource(
+        left=folder / "2025_03_06-16_49_40_combined_2x2.mp4",
+        geometry=cfg.GeometryConfig(layout="panes", crop=(0, 0, 675, 540), crop_right=(675, 0, 675, 540)),
         tools=(675, 540, 675, 540),
         pace="step",
         reference=cfg.ReferenceConfig(depth=folder / "depth_mm_x100", depth_kind="stereo_network"),

@@ -23,11 +23,11 @@ from waiting import until
 from sags_node.config.schema import PublishConfig
 from sags_node.errors import SagsError
 from sags_node.messaging import cdr
+from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.control import ControlClient
 from sags_node.messaging.introspection import topic_hz
 from sags_node.messaging.publisher import Publisher
 from sags_node.messaging.received import ReceivedCloud, ReceivedImage
-from sags_node.messaging.rundir import read_connection
 from sags_node.messaging.stream import listen
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.overlay.run import Options as OverlayOptions
@@ -88,7 +88,7 @@ def test_who_asks_a_played_bag_for_something_is_told_what_it_is(plane_bag: Path,
     told = f"a recording is played as 'sags': it takes no requests.*sags run {plane_bag}$"
     with playing(plane_bag, run_dir, paused=False, loop=True):
         with pytest.raises(SagsError, match=told):
-            run_overlay(OverlayOptions(own_ns="drawn", run_dir=run_dir, seconds=30))
+            run_overlay(OverlayOptions(NodeAddress(run_dir=run_dir), "drawn", seconds=30))
         with pytest.raises(SagsError, match=told), ControlClient(run_dir=run_dir) as client:
             client.request("add_anchor", {"u": 10, "v": 10})
 
@@ -209,7 +209,7 @@ def test_the_clock_on_the_command_line(plane_bag: Path, tmp_path: Path) -> None:
     ) as process:
         try:
             until((tmp_path / "sags/sags.json").exists, START_SECONDS)
-            figures = topic_hz("clock", read_connection("sags", tmp_path / "sags").data[0], seconds=1.5)
+            figures = topic_hz("clock", NodeAddress(run_dir=tmp_path / "sags"), 1.5)
         finally:
             process.send_signal(signal.SIGINT)
             assert process.wait(30) == 0

@@ -18,6 +18,8 @@ from sags_node.sources.replay import Recording
 from sags_node.sources.source import open_source
 from sags_node.types import StereoFrame
 
+HALVES = cfg.GeometryConfig(layout="side_by_side")
+
 # ---- at opening ------------------------------------------------------------------------------------------
 
 
@@ -59,12 +61,12 @@ def start_behind_end(folder: Path) -> Recording:
 
 
 def no_video(folder: Path) -> Recording:
-    return cfg.SideBySideSource(video=folder / "none.mp4")
+    return cfg.VideosSource(left=folder / "none.mp4", geometry=HALVES)
 
 
 def text_as_video(folder: Path) -> Recording:
     (folder / "text.mp4").write_text("hello")
-    return cfg.SideBySideSource(video=folder / "text.mp4")
+    return cfg.VideosSource(left=folder / "text.mp4", geometry=HALVES)
 
 
 def odd_width(folder: Path) -> Recording:
@@ -74,15 +76,24 @@ def odd_width(folder: Path) -> Recording:
     assert writer.isOpened()
     writer.write(np.zeros((24, 33, 3), np.uint8))
     writer.release()
-    return cfg.SideBySideSource(video=folder / "odd.avi")
+    return cfg.VideosSource(left=folder / "odd.avi", geometry=HALVES)
+
+
+def panes(folder: Path, left: cfg.Box, right: cfg.Box, tools: cfg.Box | None = None) -> Recording:
+    boxes = cfg.GeometryConfig(layout="panes", crop=left, crop_right=right)
+    return cfg.VideosSource(left=folder / "lr.avi", geometry=boxes, tools=tools)
 
 
 def crop_outside(folder: Path) -> Recording:
-    return cfg.PanesSource(video=folder / "lr.avi", left=(0, 0, 32, 24), right=(40, 0, 32, 24))
+    return panes(folder, (0, 0, 32, 24), (40, 0, 32, 24))
 
 
 def crops_of_two_sizes(folder: Path) -> Recording:
-    return cfg.PanesSource(video=folder / "lr.avi", left=(0, 0, 32, 24), right=(32, 0, 16, 24))
+    return panes(folder, (0, 0, 32, 24), (32, 0, 16, 24))
+
+
+def tools_of_another_size(folder: Path) -> Recording:
+    return panes(folder, (0, 0, 32, 24), (32, 0, 32, 24), (0, 0, 16, 24))
 
 
 def videos_of_two_sizes(folder: Path) -> Recording:
@@ -143,8 +154,9 @@ def depth_without_numbers(folder: Path) -> Recording:
         (no_video, "none.mp4 does not exist; check the path"),
         (text_as_video, "text.mp4 cannot be read as a video"),
         (odd_width, "odd.avi is 33 px wide, which is odd"),
-        (crop_outside, r"pane 'right' \(40, 0, 32, 24\) .* leaves the picture: .*lr.avi is 64x24 px"),
-        (crops_of_two_sizes, "pane 'right' is 16x24 px but the left pane is 32x24"),
+        (crop_outside, r"the box \[40, 0, 32, 24\] .* leaves the picture: an eye of .*lr.avi is 64x24 px"),
+        (crops_of_two_sizes, "source.geometry.crop is 32x24 px but crop_right 16x24; both eyes need one"),
+        (tools_of_another_size, "source.tools is 16x24 px but source.geometry.crop 32x24; all panes need"),
         (videos_of_two_sizes, "l.avi has 32x24 px but .*lr.avi has 64x24; they are not one stereo pair"),
         (videos_of_two_rates, r"l.avi has 25.0 frames/s but .*slow.avi has 10.0;"),
         (no_poses, "poses.npz does not exist; check the path"),

@@ -9,6 +9,7 @@ import pytest
 from synthetic import health, publisher, stream
 from waiting import until
 
+from sags_node.messaging.address import NodeAddress
 from sags_node.viewer.feed import TOPICS, Feed
 
 pytestmark = pytest.mark.live
@@ -18,7 +19,7 @@ def test_the_node_makes_one_frame_for_each_update_and_nothing_between(tmp_path: 
     run_dir = tmp_path / "run"
     running_well = replace(health(), latency_ms={"p50": 40.0})
     with publisher(run_dir) as running, stream(running, said=lambda: running_well):
-        feed = Feed(None, "sags", run_dir=run_dir)
+        feed = Feed(NodeAddress(run_dir=run_dir))
         until(lambda: feed.now().model is not None)
         shown = []
         for _ in range(3):
@@ -35,7 +36,7 @@ def test_a_node_of_two_frames_a_second_is_shown_too(tmp_path: Path) -> None:
     run_dir = tmp_path / "run"
     running_well = replace(health(), latency_ms={"p50": 40.0})
     with publisher(run_dir) as running, stream(running, rate=2.0, said=lambda: running_well):
-        feed = Feed(None, "sags", run_dir=run_dir)
+        feed = Feed(NodeAddress(run_dir=run_dir))
         until(lambda: feed.now().model is not None)
         for _ in range(3):
             moment = feed.now()

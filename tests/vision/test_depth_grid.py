@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from sags_node.confidence import HALVING, SURE, confidence_of, error_of
-from sags_node.config.schema import PhantomSource, StereoConfig
+from sags_node.config.schema import StereoConfig
 from sags_node.engine.rasterizer.confidence import with_confidence
 from sags_node.evaluation import calibration
 from sags_node.geometry import unproject
 from sags_node.mapping import densify
 from sags_node.mapping.depth_memory import DRIFT, UNSEEN, remember
 from sags_node.model.gaussians import GaussianModel
-from sags_node.phantom.scene import Phantom
+from sags_node.phantom.scene import Phantom, PhantomScene
 from sags_node.types import Camera, DepthGrid, Observation, RectifiedPair, RenderedView, StereoFrame
 from sags_node.vision.depth_grid import JUMP, SLOPE, depth_grid
 from sags_node.vision.rectify import Rectifier
@@ -54,7 +54,7 @@ def fogged(pair: RectifiedPair) -> RectifiedPair:
 @pytest.mark.parametrize("fault", ["none", "fog", "noise"])
 def test_predicted_errors_cover_the_real_ones(fault: str) -> None:
     """What is said to be within 3 mm is so in nine of ten pixels; and clear pictures are sure."""
-    source = PhantomSource(width=WIDTH, height=HEIGHT, noise=0.04 if fault == "noise" else 0.01)
+    source = PhantomScene(width=WIDTH, height=HEIGHT, noise=0.04 if fault == "noise" else 0.01)
     phantom = Phantom(source)
     rectifier = Rectifier(phantom.rig, WIDTH, HEIGHT)
     stereo = StereoDepth(StereoConfig(), rectifier.camera, rectifier.baseline)

@@ -23,6 +23,7 @@ from sags_node.evaluation.report import warning_table
 from sags_node.evaluation.spool import RunFacts
 from sags_node.evaluation.summary import summarise
 from sags_node.findings import STAGES, by_code, by_stage, in_words
+from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.cdr import decode
 from sags_node.messaging.content import diagnostics, status
 from sags_node.messaging.introspection import topic_echo
@@ -270,9 +271,9 @@ def test_topic_echo_tells_of_warnings_whatever_the_topic(tmp_path: Path) -> None
     told: list[dict[str, str]] = []
     with publisher(tmp_path / "run") as running:
         with stream(running, said=lambda: warned):
-            where = running.connection.data[-1]
+            node = NodeAddress(endpoint=running.connection.data[-1])
             records = []
-            for record in topic_echo("tf", where, seconds=20, warned=lambda found: told.append(dict(found))):
+            for record in topic_echo("tf", node, seconds=20, warned=lambda found: told.append(dict(found))):
                 records.append(record["topic"])
                 if told:
                     break

@@ -41,10 +41,9 @@ from sags_lab.archive.results import failed, read_results, write_results  # noqa
 from sags_lab.archive.run import Tally, about, run  # noqa: E402
 from sags_lab.archive.store import RECORDINGS, Store  # noqa: E402
 from sags_lab.archive.work import Plan, work  # noqa: E402
-from sags_node.config.schema import PhantomSource  # noqa: E402
 from sags_node.evaluation.golden import TIMING_KEYS  # noqa: E402
 from sags_node.evaluation.provenance import revision  # noqa: E402
-from sags_node.phantom import write_session  # noqa: E402
+from sags_node.phantom import PhantomScene, write_session  # noqa: E402
 
 SESSIONS = 12  # that are written
 KINDS: tuple[dict[str, Any], ...] = (
@@ -62,7 +61,7 @@ PATIENCE = 240.0  # s
 def phantoms(folder: Path, count: int) -> list[Recording]:
     """Of several seeds and kinds, each in several lengths."""
     for number in range(min(count, SESSIONS)):
-        source = PhantomSource(seconds=0.8, width=160, height=128, seed=number, **KINDS[number % len(KINDS)])
+        source = PhantomScene(seconds=0.8, width=160, height=128, seed=number, **KINDS[number % len(KINDS)])
         write_session(source, folder / f"phantom{number:02d}", rate=10.0)
     said = [(number % SESSIONS, 8 - number // SESSIONS) for number in range(count)]
     return [

@@ -53,7 +53,7 @@ def test_all_that_can_be_played_is_found_and_the_rest_explained(archive: Path) -
     found = scan(archive)
     assert {each.name: each.overrides for each in found.recordings} == {
         "case1/scope_left.mp4": ("source.kind:=videos",),
-        "case2/both.mp4": ("source.kind:=side_by_side",),
+        "case2/both.mp4": ("source.kind:=videos", "source.geometry.layout:=side_by_side"),
         "case3": (),
         "case4": (),
     }
@@ -144,10 +144,10 @@ def test_the_right_eyes_name(left: str, right: str | None) -> None:
 
 
 def test_a_video_that_does_not_say_how_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"source\.kind:=side_by_side"):
+    with pytest.raises(UsageError, match=r"source\.geometry\.layout:=side_by_side"):
         arguments(tmp_path / "a.mp4", None, ())
-    said = arguments(tmp_path / "a.mp4", None, ("source.kind:=panes", "source.left:=[0, 0, 4, 4]"))
-    assert f"source.video:={tmp_path}/a.mp4" in said
+    said = arguments(tmp_path / "a.mp4", None, ("source.kind:=videos", "source.geometry.layout:=panes"))
+    assert f"source.left:={tmp_path}/a.mp4" in said
 
 
 def test_the_command_leaves_a_manifest(archive: Path, tmp_path: Path) -> None:
