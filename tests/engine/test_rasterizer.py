@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from rounding import after
 
 from sags_node import geometry
-from sags_node.engine.interface import MAX_OPACITY, NEAR_PLANE
+from sags_node.engine.interface import MAX_OPACITY, MIN_ALPHA, NEAR_PLANE
 from sags_node.engine.rasterizer.rasterize import (
     TILE_HEIGHT,
     TILE_WIDTH,
@@ -297,12 +297,13 @@ CROWDS = {  # how many of which opacity, and the error of an exponential as a sh
 
 @ours
 def test_a_crowd_on_one_pixel_follows_the_law_of_absorption(backend: Backend) -> None:
-    """n equal Gaussians behind each other, each larger than the picture: what is left is (1 - alpha)^n, down
-    to 1e-4, where a tile stops. Those it hides have no gradient."""
+    """n equal Gaussians behind each other, larger than the picture and smaller than a tile, whose rest beyond
+    its border never fills: what is left is (1 - alpha)^n, down to 1e-4, where a tile stops. Those that it
+    hides have no gradient."""
     view = camera(width=3, height=2, focal=30.0)
     crowds, exponential = CROWDS[backend.name]
     for count, opacity in crowds:
-        one = one_gaussian(geometry.unproject(view, np.array([1.0, 1.0]), np.array(0.07)), 0.3, opacity)
+        one = one_gaussian(geometry.unproject(view, np.array([1.0, 1.0]), np.array(0.07)), 0.01, opacity)
         planes, found = backend.draw(rows(one, np.zeros(count, int)), view)
         alpha = backend.draw(one, view)[0][4].astype(np.float64)
         through = (1 - alpha) ** count
@@ -332,18 +333,26 @@ def test_unprojected_pixel_peaks_at_that_pixel(backend: Backend) -> None:
 
 # ---- what is not a number, nowhere, or of an odd size ------------------------------------------------------
 
-SPOILED: list[tuple[str, float]] = [
+SPOILED: list[tuple[str, Any]] = [
     (name, number) for name in (*INPUTS, "sh_rest") for number in (np.nan, np.inf, -np.inf)
 ]
 SPOILED += [("quats", 0.0), ("quats", 1e-13), ("quats", 1e-30), ("quats", 1e19)]
-SPOILED += [("means", 0.0), ("means", -0.07), ("opacities", 0.0), ("opacities", -1.0), ("scales", 1e30)]
+SPOILED += [
+    ("means", 0.0),
+    ("means", -0.07),
+    ("means", (0, 0, 0.9 * NEAR_PLANE)),
+    ("opacities", 0.99 * MIN_ALPHA),
+    ("opacities", 0.0),
+    ("opacities", -1.0),
+    ("scales", 1e30),
+]
 WITHOUT_FILTER = [*SPOILED, ("scales", 0.0), ("scales", 1e-30)]  # a filter gives these a size
 WITH_FILTER = [*SPOILED, ("smoothing", np.nan), ("smoothing", np.inf)]
 
 
 @pytest.mark.parametrize("kinds", [WITH_FILTER, WITHOUT_FILTER], ids=["filter", "no filter"])
 def test_a_spoilt_gaussian_is_left_out_and_harms_no_other(
-    backend: Backend, kinds: list[tuple[str, float]]
+    backend: Backend, kinds: list[tuple[str, Any]]
 ) -> None:
     """One of each kind among sound ones, and the same scene without them: the same bits."""
     view = backend.camera()
