@@ -37,7 +37,7 @@ def test_what_must_hold_holds_for_every_seed() -> None:
     # They are worth something only if much happened in them.
     assert sum(run.published for run in runs) > 10 * len(runs)
     assert sum(run.shown.total() for run in runs) > 20 * len(runs)
-    assert sum(run.node._frames.dropped for run in runs) > len(runs)
+    assert sum(run.node.dropped["capture"] for run in runs) > len(runs)
     assert sum(run.source.refused for run in runs) > len(runs)
     assert any(run.error is not None for run in runs) and any(run.error is None for run in runs)
 
