@@ -69,11 +69,7 @@ BAD = {
 }
 
 
-@pytest.mark.fault(
-    "file: a picture is damaged or claims to be huge",
-    says="one line of error that names it",
-    left="no other output",
-)
+@pytest.mark.fault("file: a picture is damaged or claims to be huge")
 @pytest.mark.parametrize("name", BAD)
 def test_a_bad_picture_is_one_message_that_names_it(
     name: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
@@ -171,10 +167,7 @@ Maker = Callable[[Path], None]
 NO_FILES: list[Maker] = [pipe, bound_socket, device, Path.mkdir]
 
 
-@pytest.mark.fault(
-    "file: a pipe, socket, device or folder in its place",
-    says="error: `is no file`",
-)
+@pytest.mark.fault("file: a pipe, socket, device or folder in its place")
 @pytest.mark.parametrize("make", NO_FILES, ids=["pipe", "socket", "device", "folder"])
 def test_what_is_no_file_is_not_waited_for(make: Maker, tmp_path: Path) -> None:
     recordings(tmp_path)
@@ -218,7 +211,7 @@ def test_a_damaged_mesh_is_refused_in_one_message(tmp_path: Path, capfd: pytest.
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.fault("file: a mesh whose faces name corners that there are not", says="error: `is damaged`")
+@pytest.mark.fault("file: a mesh whose faces name corners that there are not")
 @pytest.mark.parametrize("corner", [4, 2**31 - 1, -1])
 @pytest.mark.parametrize("sides", [3, 5])
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])

@@ -23,12 +23,7 @@ def operations(newest: FrameResult | None) -> Operations:
     return Operations(NodeState(LaunchConfig(), pipeline, None, None), lambda *_: None)  # type: ignore[arg-type]
 
 
-@pytest.mark.fault(
-    "disk: hangs while a model is saved",
-    sees="all frames",
-    says="the answer, once the disk goes on",
-    back="at once",
-)
+@pytest.mark.fault("disk: hangs while a model is saved")
 def test_a_disk_that_hangs_keeps_no_frame_waiting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     goes_on = threading.Event()
 

@@ -49,11 +49,7 @@ def test_a_process_that_listens_is_not(tmp_path: Path) -> None:
         assert process.returncode == -signal.SIGTERM
 
 
-@pytest.mark.fault(
-    "process: the publishing thread fails",
-    says="the error itself",
-    back="the node ends within a minute",
-)
+@pytest.mark.fault("process: the publishing thread fails")
 def test_a_node_whose_publishing_fails_ends_with_that_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -94,12 +90,7 @@ class HungCamera:
         assert self.released.is_set(), "closed under its reader"
 
 
-@pytest.mark.fault(
-    "camera: its driver hangs while the node stops",
-    sees="the source ends",
-    says="log: `driver does not answer`",
-    back="the node ends all the same",
-)
+@pytest.mark.fault("camera: its driver hangs while the node stops")
 def test_a_driver_that_does_not_come_back_does_not_keep_the_node(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

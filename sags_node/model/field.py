@@ -13,6 +13,7 @@ from typing import Literal, Protocol
 import numpy as np
 
 from sags_node.engine.adam import AdamState, adam_step
+from sags_node.engine.field.hexplane import FieldGradients
 from sags_node.model import columns
 from sags_node.model.decoder import Decoder
 from sags_node.model.deformation import nearest_nodes
@@ -103,11 +104,15 @@ class Deltas:
         rows = self._found.rows.copy()
         self._aside = rows, self._found.v_cells[rows], self.decoder.gradients.copy()
 
-    def step(self, rates: FieldRates) -> None:
+    def found(self) -> FieldGradients:
+        """By the cells, of the last `backward` and what was set aside; `decoder.gradients` are the others."""
         if self._aside is not None:
             self._add(*self._aside)
             self._aside = None
-        decoder, hexplane, found = self.decoder, self.hexplane, self._found
+        return self._found
+
+    def step(self, rates: FieldRates) -> None:
+        decoder, hexplane, found = self.decoder, self.hexplane, self.found()
         for name in self.still:
             decoder.parameter_gradients[name][:] = 0
         adam_step(

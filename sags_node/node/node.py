@@ -169,7 +169,7 @@ class Node:
     def health(self) -> NodeHealth:
         """What is true now; may be called from any thread."""
         return self._state.statistics.health(
-            dropped=self._dropped(),
+            dropped=self.dropped,
             stopping=self._stopping.is_set(),
             paused=self._state.paused.is_set(),
             error=self._error,
@@ -180,7 +180,13 @@ class Node:
             clock=self._clock.status(),
         )
 
-    def _dropped(self) -> dict[str, int]:
+    @property
+    def failed(self) -> bool:
+        """Whether an error ends it: `wait` raises it."""
+        return self._error is not None
+
+    @property
+    def dropped(self) -> dict[str, int]:
         """Slot -> frames left out since the start."""
         return {
             "source": self._source.dropped,
@@ -327,7 +333,7 @@ class Node:
         result = replace(result, timings_ms={**result.timings_ms, "publish": publish_ms})
         if self._publisher.thin:
             self._whole.put((result, self._publisher.thin))
-        self._state.statistics.add(result, latency_ms, self._dropped())
+        self._state.statistics.add(result, latency_ms, self.dropped)
         self._last_sent = result
         if self._on_result is not None:
             self._on_result(result, latency_ms)

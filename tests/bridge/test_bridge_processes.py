@@ -44,12 +44,7 @@ def state(joined: Peer) -> str:
     return (joined.newest("SagsState") or ["0"])[0]
 
 
-@pytest.mark.fault(
-    "process: a bridge is killed; the node is killed under a bridge",
-    sees="no anchors",
-    says="the bridge's state",
-    back="when it is started anew",
-)
+@pytest.mark.fault("process: a bridge is killed; the node is killed under a bridge")
 def test_a_pinned_anchor_comes_back_and_a_killed_node_leaves_nothing_standing(
     tmp_path: Path,
 ) -> None:

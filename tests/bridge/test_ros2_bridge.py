@@ -84,11 +84,7 @@ def test_every_topic_comes_byte_for_byte(tmp_path: Path) -> None:
     assert {"sags: node", "sags: map", "sags: bridge"} <= stages
 
 
-@pytest.mark.fault(
-    "network: two nodes publish under one name in a ROS 2 graph",
-    says="`/diagnostics` of the bridge: `two nodes`; one line in the log",
-    back="a second after one of them has gone",
-)
+@pytest.mark.fault("network: two nodes publish under one name in a ROS 2 graph")
 def test_a_namesake_in_the_graph_is_said_until_it_goes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -143,10 +143,7 @@ def test_dense_rows_of_nothing() -> None:
     assert measure_rows(left, right, 2, 60) is None
 
 
-@pytest.mark.fault(
-    "calibration: the eyes have moved against each other",
-    says="`diagnostics`: `rows of the eyes differ`",
-)
+@pytest.mark.fault("calibration: the eyes have moved against each other")
 @pytest.mark.parametrize("degrees", [0.0, 0.3])
 def test_the_node_warns_while_it_runs(degrees: float) -> None:
     session = open_session(SESSION, ["source.pace:=step", "mapping.max_gaussians:=2000"])

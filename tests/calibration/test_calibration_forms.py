@@ -146,10 +146,7 @@ def test_archives_that_are_refused(tmp_path: Path, ros_files: dict[str, bytes]) 
     assert "is not a readable tar.gz" in refusal(tmp_path / "gone.tar.gz")
 
 
-@pytest.mark.fault(
-    "memory: an archive claims to be huge",
-    says="error: `not a readable tar.gz`",
-)
+@pytest.mark.fault("memory: an archive claims to be huge")
 @pytest.mark.parametrize("kind", [tarfile.XHDTYPE, tarfile.GNUTYPE_LONGNAME, tarfile.REGTYPE])
 def test_an_archive_that_claims_to_be_huge_takes_no_memory(tmp_path: Path, kind: bytes) -> None:
     info = tarfile.TarInfo("left-0000.png")

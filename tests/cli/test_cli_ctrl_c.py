@@ -28,11 +28,7 @@ from sags_node.terminal.console import interrupt, on_stop_signals, stop_signals
 pytestmark = [pytest.mark.live, pytest.mark.usefixtures("run_dir")]
 
 
-@pytest.mark.fault(
-    "process: Ctrl-C during a measurement",
-    says="`stopped`, exit code 130",
-    left="no temporary file",
-)
+@pytest.mark.fault("process: Ctrl-C during a measurement")
 @pytest.mark.parametrize("command", [["eval", "--json"], ["eval", "--pace", "step"], ["demo", "--json"]])
 def test_ctrl_c_ends_a_measured_run(
     command: list[str], phantom_session: Path, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
@@ -84,10 +80,7 @@ def __getattr__(name):
 """
 
 
-@pytest.mark.fault(
-    "process: Ctrl-C while it starts",
-    says="`stopped`, exit code 130",
-)
+@pytest.mark.fault("process: Ctrl-C while it starts")
 @pytest.mark.parametrize(("module", "command"), [("click", ["doctor"]), ("open3d", ["overlay"])])
 def test_a_ctrl_c_while_modules_are_loaded_is_one_word(
     module: str, command: list[str], run_dir: Path, tmp_path: Path
@@ -146,11 +139,7 @@ def test_an_import_that_hangs_is_broken_off_in_the_end(
         signal.signal(signal.SIGINT, before)
 
 
-@pytest.mark.fault(
-    "process: Ctrl-C or SIGTERM between two steps of a node's start or end",
-    says="exit code 0",
-    left="no thread, no connection file",
-)
+@pytest.mark.fault("process: Ctrl-C or SIGTERM between two steps of a node's start or end")
 @pytest.mark.parametrize(
     ("of", "step"),
     [(Publisher, "__init__"), (Node, "__init__"), (ServiceManager, "ready"), (Node, "start"),
@@ -203,10 +192,7 @@ main()
 """
 
 
-@pytest.mark.fault(
-    "process: it ends while a thread is busy in OpenCV, as after a second Ctrl-C",
-    says="its exit code, no SIGABRT",
-)
+@pytest.mark.fault("process: it ends while a thread is busy in OpenCV, as after a second Ctrl-C")
 def test_a_thread_that_is_given_up_does_not_abort_the_process() -> None:
     ended = subprocess.run(
         [sys.executable, "-c", BROKEN_OFF], capture_output=True, text=True, timeout=START_SECONDS, check=False

@@ -111,11 +111,7 @@ def test_numbers_out_of_range(arguments: list[str]) -> None:
 # ---- recordings and calibrations -------------------------------------------------------------------------
 
 
-@pytest.mark.fault(
-    "calibration: missing, one eye only, in mm, of another size",
-    sees="the node does not start",
-    says="one line of error with the mend; exit code 1 or 2",
-)
+@pytest.mark.fault("calibration: missing, one eye only, in mm, of another size")
 @pytest.mark.parametrize(
     ("code", "overrides", "said"),
     [
@@ -209,12 +205,7 @@ def test_a_camera_that_is_not_there() -> None:
     refused(2, "eval", ROOT / "launch/v4l2.yaml", said=("live cameras", "record them first"))
 
 
-@pytest.mark.fault(
-    "file: the right eye's video is shorter",
-    sees="the frames before its end",
-    says="error: `ends at frame`, set source.frames; exit code 1",
-    back="with `source.frames` as the message says",
-)
+@pytest.mark.fault("file: the right eye's video is shorter")
 def test_a_right_video_that_ends_too_early_ends_the_node_at_that_frame(
     user_files: Path, run_dir: Path
 ) -> None:

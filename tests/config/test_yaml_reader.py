@@ -88,10 +88,7 @@ def test_parts_are_not_shared() -> None:
     assert tree["b"] == {"x": [1]}
 
 
-@pytest.mark.fault(
-    "file: a launch or calibration file is damaged",
-    says="one line of error",
-)
+@pytest.mark.fault("file: a launch or calibration file is damaged")
 def test_damaged_files_end_in_one_line_each() -> None:
     """A thousand mutations of real files: values, or a message."""
     rng = random.Random(0)

@@ -25,24 +25,20 @@ from engine_scenes import (
     one_gaussian,
     random_gaussians,
     relative_error,
-    rows,
-    truth,
     with_filter,
     with_view_dependence,
 )
-from rounding import after
 
-from sags_node import geometry
 from sags_node.config.launch_file import load_launch
 from sags_node.doctor import examine
 from sags_node.engine.device import choose_device
-from sags_node.engine.interface import MAX_OPACITY, MIN_ALPHA, NEAR_PLANE
-from sags_node.engine.rasterizer.rasterize import TILE_HEIGHT, TILE_WIDTH, make_rasterizer
+from sags_node.engine.interface import MAX_OPACITY, MIN_ALPHA
+from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.errors import SagsError, UsageError
 from sags_node.mapping import mapper
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.refiner import CpuRefiner
-from sags_node.types import Camera, Gaussians, Observation
+from sags_node.types import Observation
 
 pytest.importorskip("gsplat", reason="the optional backend is not installed: pip install 'sags-node[gsplat]'")
 pytest.importorskip("triton", reason="Triton comes with torch's CUDA builds, or by `pip install triton`")
@@ -52,7 +48,7 @@ from gsplat_on_cpu import use_gsplat_on_cpu
 from sags_node.engine.cuda import gsplat as gsplat_backend
 
 VIEW = camera(width=50, height=44, focal=60.0, moved=True)
-SUMMED = 50 * 44  # pixels, whose gradients may be added in any order
+pytestmark = pytest.mark.beside
 
 
 @pytest.fixture(autouse=True)
@@ -65,75 +61,7 @@ def on_cpu(request: pytest.FixtureRequest) -> Iterator[None]:
         yield
 
 
-def assert_agrees(gaussians: Gaussians, view: Camera, antialias: bool = True) -> None:
-    """Planes, and gradients of a random cotangent, of both gsplat and the CPU engine, against the float64
-    twin."""
-    true = truth(gaussians, view, antialias=antialias)
-    assert true.planes[4].max() > 0.05  # there is something to see
-    for backend in ("gsplat", "numba"):
-        true.check(*draw_and_differentiate(gaussians, view, backend, antialias=antialias))
-
-
-# ---- where gsplat's semantics are ours ---------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("degree", "filtered", "antialias"),
-    [(0, False, True), (1, True, False), (2, False, True), (3, True, True)],
-)
-def test_planes_and_gradients_are_ours(degree: int, filtered: bool, antialias: bool) -> None:
-    """A turned camera, every derivative, harmonics of all degrees, both filters on and off."""
-    gaussians = random_gaussians(degree, 40, VIEW)
-    if degree:
-        gaussians = with_view_dependence(gaussians, degree)
-    if filtered:
-        gaussians = with_filter(gaussians)
-    assert_agrees(gaussians, VIEW, antialias=antialias)
-
-
-def test_a_jacobian_held_within_the_frustum() -> None:
-    """Large Gaussians whose centres lie outside the widened frustum reach into the picture."""
-    rng = np.random.default_rng(11)
-    pixels = rng.uniform([-60, -30], [-30, 60], (6, 2))
-    gaussians = dataclasses.replace(
-        random_gaussians(11, 6, VIEW),
-        means=geometry.unproject(VIEW, pixels, rng.uniform(0.05, 0.09, 6)).astype(np.float32),
-        scales=rng.uniform(0.02, 0.05, (6, 3)).astype(np.float32),
-    )
-    assert_agrees(gaussians, VIEW)
-
-
-def test_what_cannot_be_drawn_is_left_out_and_harms_nobody() -> None:
-    """Behind the near plane, on the camera and behind it; NaN, infinity, no direction; nearly transparent."""
-    view = camera(width=50, height=44, focal=60.0)
-    gaussians = with_filter(with_view_dependence(random_gaussians(2, 20, view), 1))
-    sound = rows(gaussians, slice(10, 20))
-    gaussians.means[0] = [0, 0, 0.9 * NEAR_PLANE]
-    gaussians.means[1] = 0
-    gaussians.means[2] *= -1
-    gaussians.means[3, 0] = np.nan
-    gaussians.scales[4, 1] = np.inf
-    gaussians.quats[5] = 0
-    gaussians.opacities[6] = 0.99 * MIN_ALPHA
-    gaussians.colors[7, 2] = np.nan
-    gaussians.sh_rest[8, 1, 1] = np.inf
-    gaussians.smoothing[9] = np.nan
-    planes, found = draw_and_differentiate(gaussians, view, "gsplat")
-    expected, true = draw_and_differentiate(sound, view, "gsplat")
-    np.testing.assert_array_equal(planes, expected)
-    for name in DERIVATIVES:
-        assert not found[name][:10].any(), name
-        assert relative_error(found[name][10:], true[name]) < after(SUMMED), name
-    assert_agrees(sound, view)
-
-
-def test_no_gaussians() -> None:
-    planes, found = draw_and_differentiate(rows(random_gaussians(0, 3, VIEW), slice(0)), VIEW, "gsplat")
-    assert not planes.any()
-    assert not any(len(found[name]) for name in DERIVATIVES)
-
-
-# ---- where they differ: what benchmarks/gpu.md says of it --------------------------------------------------
+# ---- where they differ: what docs/gpu.md says of it --------------------------------------------------------
 
 
 def test_opacities_above_the_largest_of_ours() -> None:
@@ -168,24 +96,6 @@ def test_where_hardly_anything_shines_through_any_more() -> None:
 
 
 # ---- tiles, parts, limits ----------------------------------------------------------------------------------
-
-
-def test_tiles_that_are_not_asked_for_stay_and_count_for_nothing() -> None:
-    gaussians, before = random_gaussians(5, 25, VIEW, spread=0.5), random_gaussians(9, 6, VIEW)
-    tiles = np.zeros((-(-44 // TILE_HEIGHT), -(-50 // TILE_WIDTH)), bool)
-    tiles[[0, 1], [1, 3]] = True
-    drawn = np.kron(tiles, np.ones((TILE_HEIGHT, TILE_WIDTH), bool))[:44, :50]
-    v_planes, weight = cotangents(VIEW, 1)
-    whole, part = (make_rasterizer("gsplat", 50, 44) for _ in range(2))
-    everything = whole.forward(gaussians, VIEW).copy()
-    expected = whole.backward(np.where(drawn, v_planes, 0), np.where(drawn, weight, 0))
-    old = part.forward(before, VIEW).copy()
-    planes = part.forward(gaussians, VIEW, tiles)
-    np.testing.assert_array_equal(planes, np.where(drawn, everything, old))
-    found = part.backward(v_planes, weight)
-    for name in ("means", "quats", "scales", "opacities", "colors", "contribution"):
-        assert relative_error(getattr(found, name), getattr(expected, name)) < after(SUMMED), name
-    assert 2 < int((found.contribution == 0).sum()) < 23
 
 
 def test_limits_are_said(monkeypatch: pytest.MonkeyPatch) -> None:

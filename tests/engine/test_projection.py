@@ -1,4 +1,4 @@
-"""From Gaussians to splats: view-dependent colour, the 3D filter, and every derivative."""
+"""From Gaussians to splats: view-dependent colour, the 3D filter, and the derivatives of the float64 twin."""
 
 from __future__ import annotations
 
@@ -8,12 +8,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import pytest
 from engine_scenes import (
     DERIVATIVES,
     INPUTS,
     camera,
-    cotangents,
     draw_and_differentiate,
     one_gaussian,
     random_gaussians,
@@ -26,11 +24,9 @@ from numpy.typing import NDArray
 from rounding import after
 
 from sags_node import geometry
-from sags_node.engine.rasterizer import cpu as numba_rasterizer
-from sags_node.engine.rasterizer import projection, projection_backward, projector, smoothing
+from sags_node.engine.rasterizer import smoothing
 from sags_node.engine.rasterizer import spherical_harmonics as harmonics
 from sags_node.engine.rasterizer.rasterize import make_rasterizer, rasterize
-from sags_node.errors import UsageError
 from sags_node.types import F64, Camera
 
 VIEW = camera(moved=True)
@@ -43,18 +39,6 @@ def same_bits(a: tuple[Any, dict[str, Any]], b: tuple[Any, dict[str, Any]]) -> N
 
 
 # ---- derivatives -------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("seed", [1, 2, 3])
-@pytest.mark.parametrize(("degree", "filtered"), [(0, False), (1, True), (2, False), (3, True)])
-def test_every_gradient_agrees_with_the_float64_twin(seed: int, degree: int, filtered: bool) -> None:
-    gaussians = with_view_dependence(random_gaussians(seed, 60, VIEW), degree, seed)
-    if filtered:
-        gaussians = with_filter(gaussians, seed)
-    planes, found = draw_and_differentiate(gaussians, VIEW, "numba", seed)
-    true = truth(gaussians, VIEW, seed)
-    assert true.planes[4].mean() > 0.25  # the scene does cover the picture
-    true.check(planes, found)
 
 
 def smooth_scene() -> tuple[Camera, list[F64], F64]:
@@ -109,49 +93,6 @@ def test_twin_agrees_with_finite_differences() -> None:
         assert np.abs(differences[-1]).max() > 0, name  # the one with the held Jacobian takes part
         # steps of 1e-6 leave ten digits of a float64 loss, and the square of 1e-6 of its third derivative
         assert relative_error(found[index].numpy(), differences) < 1e-6, name
-
-
-@pytest.mark.parametrize("pieces", [1, 3, 64])
-def test_same_bits_for_any_number_of_threads(pieces: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    gaussians = with_filter(with_view_dependence(random_gaussians(6, 700, VIEW), 3))
-    expected = draw_and_differentiate(gaussians, VIEW)
-    for module in (numba_rasterizer, projector):
-        monkeypatch.setattr(module, "thread_count", lambda: pieces)
-    same_bits(draw_and_differentiate(gaussians, VIEW), expected)
-
-
-def test_a_rasterizer_used_again_gives_what_a_fresh_one_gives() -> None:
-    """Other numbers of Gaussians and degrees, half of them out of sight."""
-    many = with_filter(with_view_dependence(random_gaussians(6, 300, VIEW), 1))
-    away = np.where(np.arange(300)[:, None] % 2, many.means, many.means + np.float32(9))
-    few = with_view_dependence(random_gaussians(7, 20, VIEW), 3)
-    scenes = [many, dataclasses.replace(many, means=away), few, random_gaussians(8, 40, VIEW), many]
-    rasterizer = make_rasterizer("numba", VIEW.width, VIEW.height)
-    for gaussians in scenes:
-        planes = rasterizer.forward(gaussians, VIEW).copy()
-        gradients = rasterizer.backward(*cotangents(VIEW, 0))
-        found = {name: getattr(gradients, name) for name in DERIVATIVES}
-        same_bits((planes, found), draw_and_differentiate(gaussians, VIEW))
-
-
-def test_kernels_compile_once() -> None:
-    """Also for frozen arrays and other float types, which are other types to Numba."""
-    plain = with_filter(with_view_dependence(random_gaussians(1, 30, VIEW), 1))
-    for name in (*INPUTS, "sh_rest", "smoothing"):
-        getattr(plain, name).flags.writeable = False
-    wide = {name: getattr(plain, name).astype(np.float64) for name in (*INPUTS, "sh_rest", "smoothing")}
-    for gaussians in (plain, dataclasses.replace(plain, **wide)):
-        draw_and_differentiate(gaussians, VIEW)
-        smoothing.smoothed(gaussians.scales, gaussians.opacities, gaussians.smoothing)
-    kernels: list[Any] = [
-        projection.project,
-        projection_backward.project_backward,
-        smoothing.smooth,
-        smoothing.smooth_backward,
-        harmonics.color,
-        harmonics.color_backward,
-    ]
-    assert [len(kernel.signatures) for kernel in kernels] == [1] * len(kernels)
 
 
 # ---- spherical harmonics -----------------------------------------------------------------------------------
@@ -300,16 +241,3 @@ def test_filter_of_vanishing_scales() -> None:
     np.testing.assert_allclose(found_scales, true_scales, rtol=after(3))
     np.testing.assert_allclose(found_opacities, true_opacities, rtol=after(8))
     np.testing.assert_array_equal(found_scales[2], scales[2])
-
-
-# ---- wrong input -------------------------------------------------------------------------------------------
-
-
-def test_wrong_shapes_are_explained() -> None:
-    gaussians = random_gaussians(0, 5, VIEW)
-    rasterizer = make_rasterizer("numba", VIEW.width, VIEW.height)
-    for shape in [(5, 4, 3), (4, 3, 3), (5, 3), (5, 3, 4)]:
-        with pytest.raises(UsageError, match="sh_rest has shape"):
-            rasterizer.forward(dataclasses.replace(gaussians, sh_rest=np.zeros(shape, np.float32)), VIEW)
-    with pytest.raises(UsageError, match=r"smoothing has shape \[6\], expected \[5\]"):
-        rasterizer.forward(dataclasses.replace(gaussians, smoothing=np.zeros(6, np.float32)), VIEW)

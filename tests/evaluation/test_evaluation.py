@@ -208,10 +208,7 @@ def test_spool_is_gone_after_ctrl_c(frames: list[StereoFrame]) -> None:
     assert not folder.exists()
 
 
-@pytest.mark.fault(
-    "disk: what a measurement keeps cannot be written",
-    says="error: `set TMPDIR`",
-)
+@pytest.mark.fault("disk: what a measurement keeps cannot be written")
 def test_spool_says_what_to_do_when_it_cannot_write(frames: list[StereoFrame]) -> None:
     with Spool() as spool:
         spool.folder.rmdir()

@@ -290,7 +290,7 @@ class Run:
         if self.world.random.random() < 0.3:  # it may be stopped by an error before
             self.world.sleep(self.world.random.uniform(0, SECONDS))
             self.world.wall_ahead = self.world.random.choice((-3600.0, -2.0, -0.5, 0.5, 3600.0))
-        self.world.wait(lambda: self.node._error is not None, SECONDS - self.world.now)
+        self.world.wait(lambda: self.node.failed, SECONDS - self.world.now)
         self.stopped_at = self.world.now
         self.node.stop()
         self.took_to_stop = self.world.now - self.stopped_at
@@ -374,7 +374,7 @@ class Run:
     def _check_end(self) -> None:
         assert self.took_to_stop < node.STOP_SECONDS, "a thread was given up"
         assert (self.error is None) or self.failing, self.error
-        left_out = self.node._dropped()
+        left_out = self.node.dropped
         in_slots = self.given - self.taken - left_out["capture"]
         assert in_slots >= 0 and (self._pausing or in_slots <= 1)
         assert self.processed - self.published - left_out["publish"] in (0, 1)

@@ -35,14 +35,18 @@ class Scope:
         self._frames = 0
 
     def look(self, T: F64) -> StereoFrame:
-        shown = self._phantom.frame(0, 240, T)
-        return StereoFrame(0, 0, 0, shown.left, shown.right, T_world_cam=T, tissue=~shown.tool)
+        return seen(self._phantom, T)
 
     def take(self, frame: StereoFrame) -> FrameResult:
         self._frames += 1
         stamp = self._frames * PERIOD_NS
         now = replace(frame, frame_id=self._frames, t_capture_ns=stamp, t_capture_right_ns=stamp)
         return self.pipeline.process(now, self._budget)
+
+
+def seen(phantom: Phantom, T: F64) -> StereoFrame:
+    shown = phantom.frame(0, 240, T)
+    return StereoFrame(0, 0, 0, shown.left, shown.right, T_world_cam=T, tissue=~shown.tool)
 
 
 @pytest.fixture(scope="module")
@@ -56,6 +60,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def phantom() -> Phantom:
     return Phantom(SHAPE)
+
+
+@pytest.fixture(scope="module")
+def swaying(phantom: Phantom) -> list[StereoFrame]:
+    return [seen(phantom, sway(k, 12)) for k in range(12)]
 
 
 def scope(folder: Path, phantom: Phantom, pose: str, steps: int = 1) -> Scope:
@@ -88,11 +97,11 @@ def error(T: F64, true: F64) -> tuple[float, float]:
     return float(np.linalg.norm(wrong[:3, 3])), float(turn)
 
 
-def test_no_jump_ends_verified_and_wrong(folder: Path, phantom: Phantom) -> None:
+def test_no_jump_ends_verified_and_wrong(folder: Path, phantom: Phantom, swaying: list[StereoFrame]) -> None:
     """Near jumps, far ones, and some to where the scope has never been."""
     ours = scope(folder, phantom, "estimate")
-    for k in range(12):
-        ours.take(ours.look(sway(k, 12)))
+    for frame in swaying:
+        ours.take(frame)
     rng = np.random.default_rng(0)
     found = []
     for size in np.linspace(0.1, 1.0, 12):
@@ -111,9 +120,11 @@ def test_no_jump_ends_verified_and_wrong(folder: Path, phantom: Phantom) -> None
     assert all(found[:3]) and sum(found) >= 4, found  # or it would be right by finding nothing
 
 
-def test_while_it_is_verified_nothing_is_learnt(folder: Path, phantom: Phantom) -> None:
+def test_while_it_is_verified_nothing_is_learnt(
+    folder: Path, phantom: Phantom, swaying: list[StereoFrame]
+) -> None:
     ours = scope(folder, phantom, "estimate")
-    before = [ours.take(ours.look(sway(k, 12))) for k in range(12)][-1]
+    before = [ours.take(frame) for frame in swaying][-1]
     frame = ours.look(aside(0.008))
     results = [ours.take(frame) for _ in range(TRIAL)]
     assert all(each.held for each in results[:-1])
@@ -124,10 +135,12 @@ def test_while_it_is_verified_nothing_is_learnt(folder: Path, phantom: Phantom) 
     assert again and np.isin(again[0].snapshot.gaussians.ids, before.snapshot.gaussians.ids).mean() > 0.8
 
 
-def test_a_wrong_place_is_found_out_and_what_was_learnt_there_undone(folder: Path, phantom: Phantom) -> None:
+def test_a_wrong_place_is_found_out_and_what_was_learnt_there_undone(
+    folder: Path, phantom: Phantom, swaying: list[StereoFrame]
+) -> None:
     """The model and the camera are put elsewhere together: the model fits, but not what was seen before."""
     ours = scope(folder, phantom, "estimate")
-    frames = [ours.look(sway(k, 12)) for k in range(12)]
+    frames = swaying
     last = [ours.take(frame) for frame in frames][-1]
     tracker, mapper = ours.pipeline._tracker, ours.pipeline.mapper
     assert tracker is not None

@@ -87,8 +87,6 @@ SPOILED: dict[str, Spoil] = {
     "white": _flat(255),
     "grey": _flat(128),
     "noise": _noise,
-    "one eye twice": lambda frame, rng: replace(frame, right=frame.left),
-    "eyes swapped": lambda frame, rng: replace(frame, left=frame.right, right=frame.left),
     "all instrument": lambda frame, rng: replace(frame, tissue=np.zeros(frame.left.shape[:2], bool)),
 }
 
@@ -105,10 +103,7 @@ def test_unusable_pictures_are_survived_and_left_behind(
     assert max(after[2:]) > before - 3.0, (before, after)
 
 
-@pytest.mark.fault(
-    "picture: the first one is black, noise or all instrument",
-    back="the next five frames make a model of over 28 dB",
-)
+@pytest.mark.fault("picture: the first one is black, noise or all instrument")
 @pytest.mark.parametrize("name", ["black", "noise", "all instrument"])
 def test_an_unusable_first_picture_only_delays_the_start(
     session: Session, frames: list[StereoFrame], name: str
@@ -118,13 +113,7 @@ def test_an_unusable_first_picture_only_delays_the_start(
     assert psnr(play(pipeline, frames[1:6])[-1]) > 28
 
 
-@pytest.mark.fault(
-    "picture: another scene for three seconds",
-    sees="frames are held for three seconds, then a new epoch",
-    says="`epoch` of each message",
-    back="two frames after that it is over 30 dB",
-    left="no identity of the old model",
-)
+@pytest.mark.fault("picture: another scene for three seconds")
 def test_a_cut_begins_a_new_model_in_a_new_epoch(session: Session, frames: list[StereoFrame]) -> None:
     """Another scene in front of the same cameras: here, the negative of the first."""
     negative = [replace(f, left=255 - f.left, right=255 - f.right) for f in frames]
@@ -154,7 +143,7 @@ NOT_NUMBERS = np.array([np.nan, np.inf, -np.inf, 1e30], np.float32)
 def lasting(frames: list[StereoFrame], still: bool) -> list[StereoFrame]:
     """Three frames and what follows: motion, or the third again and again with fresh noise."""
     if not still:
-        return frames[:6]
+        return frames[:9]
     rng = np.random.default_rng(0)
 
     def again(picture: U8 | None) -> U8:
@@ -162,41 +151,38 @@ def lasting(frames: list[StereoFrame], still: bool) -> list[StereoFrame]:
         return np.clip(picture + rng.normal(0, 1.5, picture.shape), 0, 255).round().astype(np.uint8)
 
     third = frames[2]
-    repeats = [replace(third, left=again(third.left), right=again(third.right)) for _ in range(4)]
+    repeats = [replace(third, left=again(third.left), right=again(third.right)) for _ in range(7)]
     return [*frames[1:3], *repeats]
 
 
 @pytest.fixture(scope="module", params=["moving", "still"])
 def scene(
     request: pytest.FixtureRequest, session: Session, frames: list[StereoFrame]
-) -> tuple[list[StereoFrame], float]:
-    """Frames, and what the last one looks like when nothing goes wrong, dB."""
+) -> tuple[list[StereoFrame], list[float]]:
+    """Frames, and what each looks like when nothing goes wrong, dB."""
     shown = lasting(frames, request.param == "still")
     results = play(Pipeline(session.config, session.rig), shown)
     assert bool(results[-1].skipped) == (request.param == "still")
-    return shown, psnr(results[-1])
+    return shown, [psnr(result) for result in results]
 
 
-@pytest.mark.fault(
-    "memory: values of the model are overwritten with NaN or infinities",
-    sees="finite pictures",
-    back="three frames: within 1 dB",
-)
+@pytest.mark.fault("memory: values of the model are overwritten with NaN or infinities")
 @damaging
-@pytest.mark.parametrize("every", [100, 1])
 @pytest.mark.parametrize("array", ARRAYS + NODE_ARRAYS)
 def test_damage_in_the_model_heals_within_three_frames(
-    session: Session, scene: tuple[list[StereoFrame], float], array: str, every: int
+    session: Session, scene: tuple[list[StereoFrame], list[float]], array: str
 ) -> None:
-    """Rows of one array are overwritten between two frames, in turn by NaN, infinities and a huge number."""
+    """Rows of one array are overwritten between two frames, in turn by NaN, infinities and a huge number: one
+    in a hundred, and when that has healed, all."""
     shown, undamaged = scene
     pipeline = Pipeline(session.config, session.rig)
     play(pipeline, shown[:3])
-    owner = pipeline.mapper._deformation if array in NODE_ARRAYS else pipeline.mapper.model
-    rows = getattr(owner, array)[::every]
-    rows[:] = np.resize(NOT_NUMBERS, len(rows)).reshape(-1, *[1] * (rows.ndim - 1))
-    healed = play(pipeline, shown[3:])[-1]
-    assert psnr(healed) > undamaged - 1.0
+    for every, after in ((100, 3), (1, 6)):
+        owner = pipeline.mapper._deformation if array in NODE_ARRAYS else pipeline.mapper.model
+        rows = getattr(owner, array)[::every]
+        rows[:] = np.resize(NOT_NUMBERS, len(rows)).reshape(-1, *[1] * (rows.ndim - 1))
+        healed = play(pipeline, shown[after : after + 3])[-1]
+        assert psnr(healed) > undamaged[after + 2] - 1.0
 
 
 @pytest.fixture(scope="module")
@@ -208,18 +194,18 @@ def measured_frames(session: Session, frames: list[StereoFrame]) -> list[StereoF
     ]
 
 
-@pytest.mark.fault(
-    "depth: NaN, infinite, negative or huge in a recording",
-    sees="a picture within 3 dB",
-    back="three frames later within 1 dB",
-    left="no new model",
-)
+@pytest.fixture(scope="module")
+def undamaged(session: Session, measured_frames: list[StereoFrame]) -> float:
+    """What the last of them looks like, dB."""
+    return psnr(play(Pipeline(session.config, session.rig), measured_frames)[-1])
+
+
+@pytest.mark.fault("depth: NaN, infinite, negative or huge in a recording")
 @pytest.mark.parametrize("every", [10, 1])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, -0.1, 1e30])
 def test_damage_in_a_session_s_own_depth_is_survived_and_left_behind(
-    session: Session, measured_frames: list[StereoFrame], value: float, every: int
+    session: Session, measured_frames: list[StereoFrame], undamaged: float, value: float, every: int
 ) -> None:
-    undamaged = psnr(play(Pipeline(session.config, session.rig), measured_frames)[-1])
 
     def spoil(frame: StereoFrame) -> StereoFrame:
         assert frame.depth is not None
@@ -261,12 +247,7 @@ def test_a_mask_that_misses_the_instruments_for_a_while_does_no_lasting_harm(
     assert psnr(play(pipeline, frames[6:9])[-1]) > undamaged - 1.0
 
 
-@pytest.mark.fault(
-    "robot: a frame's pose is not finite",
-    sees="no result of this frame",
-    says="error: `pose`",
-    back="three frames later within 1 dB",
-)
+@pytest.mark.fault("robot: a frame's pose is not finite")
 @damaging
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_a_pose_that_is_no_pose_is_refused_and_does_no_harm(
@@ -304,12 +285,7 @@ def test_sizes_that_no_tile_divides(frames: list[StereoFrame], width: int, heigh
     assert psnr(play(pipeline, frames[:4])[-1]) > 28
 
 
-@pytest.mark.fault(
-    "picture: the same one again",
-    sees="its own stamp",
-    says="`skipped` of the frame",
-    back="with the next picture that differs",
-)
+@pytest.mark.fault("picture: the same one again")
 def test_a_repeated_picture_is_not_mapped_again_but_keeps_its_own_stamp(
     session: Session, frames: list[StereoFrame]
 ) -> None:

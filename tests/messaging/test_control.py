@@ -112,11 +112,7 @@ def test_a_future_is_answered_when_it_is_done_and_others_meanwhile(tmp_path: Pat
             assert slow.request("ping") == "pong"  # the late answer is not taken for this one
 
 
-@pytest.mark.fault(
-    "socket: more requests than may wait",
-    sees="64 wait, each further one is refused",
-    says="the answer: `waiting`",
-)
+@pytest.mark.fault("socket: more requests than may wait")
 def test_what_is_owed_is_bounded(tmp_path: Path) -> None:
     with node(tmp_path / "run", {"never": lambda args: Future()}) as endpoint:
         context = zmq.Context()
@@ -220,12 +216,7 @@ def test_a_node_that_stopped_in_order_is_waited_for(tmp_path: Path) -> None:
             assert asker.endpoint == endpoint
 
 
-@pytest.mark.fault(
-    "process: the node dies with a request unanswered",
-    sees="an error; nothing is done twice",
-    says="`started anew before it answered; ask again`",
-    back="with the next request",
-)
+@pytest.mark.fault("process: the node dies with a request unanswered")
 def test_what_may_have_been_done_is_not_asked_for_again(tmp_path: Path) -> None:
     """The node dies with a request unanswered, and another one comes while the client waits."""
     asked: list[str] = []
@@ -272,12 +263,7 @@ def test_an_endpoint_that_was_given_is_kept(tmp_path: Path) -> None:
         asker.request("ping", timeout=0.4)
 
 
-@pytest.mark.fault(
-    "socket: a request is too large",
-    sees="`no answer` for this client",
-    says="the client's error",
-    back="with the next client",
-)
+@pytest.mark.fault("socket: a request is too large")
 def test_an_oversized_request_is_cut_off(tmp_path: Path) -> None:
     with node(tmp_path / "run", {"echo": lambda args: len(args["a"])}) as endpoint:
         with ControlClient(endpoint) as asker, pytest.raises(SagsError, match="no answer"):

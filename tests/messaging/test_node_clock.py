@@ -53,12 +53,7 @@ def test_the_offset_lies_within_its_bound_whatever_the_delays(drift: float) -> N
     assert late is not None and late.bound == pytest.approx(found.bound + 10 * DRIFT)
 
 
-@pytest.mark.fault(
-    "clock: the node's machine sets it by 50 ms",
-    sees="ages by the new clock, within a bound that is told",
-    says="a count of jumps",
-    back="with the next exchange",
-)
+@pytest.mark.fault("clock: the node's machine sets it by 50 ms")
 @pytest.mark.parametrize("by", [0.05, -0.05])
 def test_a_clock_that_is_set_is_noticed_at_once(by: float) -> None:
     estimate = OffsetEstimate()
@@ -191,12 +186,7 @@ def test_a_clock_that_is_set_while_it_is_followed(tmp_path: Path) -> None:
         assert found is not None and abs(found.seconds - 3) <= found.bound
 
 
-@pytest.mark.fault(
-    "clock: the node's is 5 s ahead and cannot be asked",
-    sees="stale",
-    says="reason: `ahead of this machine's clock`",
-    back="with a clock that asks the node (`NodeClock`)",
-)
+@pytest.mark.fault("clock: the node's is 5 s ahead and cannot be asked")
 @pytest.mark.live
 def test_ages_are_by_the_nodes_clock_and_nothing_is_fresh_without_it(tmp_path: Path) -> None:
     name = "left/render/depth"

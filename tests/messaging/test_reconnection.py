@@ -65,12 +65,7 @@ def _node(run_dir: Path, session: str, port: int, ipc: bool = False) -> Iterator
         process.wait()
 
 
-@pytest.mark.fault(
-    "process: the node is killed, another begins in its place",
-    sees="stale; then the new session only",
-    says="another `session`",
-    back="by itself",
-)
+@pytest.mark.fault("process: the node is killed, another begins in its place")
 @pytest.mark.parametrize(
     ("by_file", "ipc", "moves"),
     [(False, False, False), (True, True, False), (True, False, True)],
@@ -94,11 +89,7 @@ def test_a_killed_node_is_followed(tmp_path: Path, by_file: bool, ipc: bool, mov
         assert subscriber.lost("tf") == 0
 
 
-@pytest.mark.fault(
-    "socket: the cable is cut",
-    sees="stale",
-    back="by itself, with a second connection",
-)
+@pytest.mark.fault("socket: the cable is cut")
 def test_a_connection_that_died_without_a_word_is_made_anew(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

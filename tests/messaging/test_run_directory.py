@@ -38,13 +38,7 @@ def the_socket(run_dir: Path) -> None:
     (run_dir / "sags.ipc").unlink()
 
 
-@pytest.mark.fault(
-    "run directory: it, its file or its socket is removed",
-    sees="old consumers lose nothing, new ones find the node",
-    says="log, once: `is there again`",
-    back="with the next look",
-    left="nothing at the end",
-)
+@pytest.mark.fault("run directory: it, its file or its socket is removed")
 @pytest.mark.parametrize("remove", [the_directory, the_connection_file, the_socket])
 def test_what_is_removed_comes_back(remove: Remove, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     run_dir = tmp_path / "run"
@@ -63,11 +57,7 @@ def test_what_is_removed_comes_back(remove: Remove, tmp_path: Path, caplog: pyte
     assert not (run_dir / "sags.json").exists() and not (run_dir / "sags.ipc").exists()
 
 
-@pytest.mark.fault(
-    "run directory: another node has taken the place",
-    sees="the new node is found",
-    says="log, once: `another node already runs`",
-)
+@pytest.mark.fault("run directory: another node has taken the place")
 def test_the_place_that_another_node_has_taken_is_left_to_it(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -82,12 +72,7 @@ def test_the_place_that_another_node_has_taken_is_left_to_it(
         assert read_connection("sags", run_dir) == second.connection
 
 
-@pytest.mark.fault(
-    "run directory: open to others",
-    sees="nothing is written there",
-    says="log, once: `is open to other users`",
-    back="when its rights are mended",
-)
+@pytest.mark.fault("run directory: open to others")
 def test_a_directory_that_is_open_to_others_is_not_used(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -103,12 +103,7 @@ def test_a_key_name_is_a_file_name(tmp_path: Path, name: str) -> None:
     assert not (tmp_path / "keys").exists()
 
 
-@pytest.mark.fault(
-    "keys: readable by others",
-    sees="the node does not start",
-    says="error: `chmod 600`",
-    back="after the chmod",
-)
+@pytest.mark.fault("keys: readable by others")
 @pytest.mark.parametrize("mode", [0o640, 0o604, 0o620, 0o644])
 def test_a_key_that_others_can_read_is_refused_with_the_mend(tmp_path: Path, keys: Path, mode: int) -> None:
     file, _ = write_key_pair(tmp_path, "node")
@@ -251,12 +246,7 @@ def error_of(asker: ControlClient) -> str:
     return ""
 
 
-@pytest.mark.fault(
-    "keys: revoked, added and broken while it runs",
-    sees="the revoked one gets nothing more, the others go on",
-    says="`refusal` of the client",
-    back="an added key gets in when the folder is looked at again",
-)
+@pytest.mark.fault("keys: revoked, added and broken while it runs")
 def test_keys_are_revoked_and_added_while_the_node_runs(tmp_path: Path) -> None:
     keys, clients = tmp_path / "keys", tmp_path / "keys/clients"
     for folder, name in ((keys, "node"), (clients, "stays"), (clients, "goes"), (keys, "comes")):
@@ -345,12 +335,7 @@ def test_refusals_reach_the_log_but_do_not_fill_it(
 # ---- strangers -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.fault(
-    "socket: random bytes",
-    sees="another consumer loses nothing",
-    says="`connections`: refused",
-    left="under 30 MB",
-)
+@pytest.mark.fault("socket: random bytes")
 @pytest.mark.parametrize("with_keys", [False, True])
 def test_random_bytes_on_both_ports_while_a_client_receives(
     tmp_path: Path, keys: Path, with_keys: bool
@@ -383,12 +368,7 @@ def test_random_bytes_on_both_ports_while_a_client_receives(
             assert asker.request("ping") == "pong"
 
 
-@pytest.mark.fault(
-    "socket: half open, silent or HTTP",
-    says="`connections`: refused",
-    back="by itself",
-    left="no descriptor",
-)
+@pytest.mark.fault("socket: half open, silent or HTTP")
 @pytest.mark.parametrize(
     "said", [b"", b"GET / HTTP/1.1\r\n\r\n", b"\xff" + bytes(8) + b"\x7f"], ids=["nothing", "http", "half"]
 )
@@ -419,12 +399,7 @@ def test_a_peer_of_the_old_protocol_is_no_subscriber(tmp_path: Path) -> None:
         until(lambda: running.connections["data"] == {**running.connections["data"], "open": 0, "refused": 1})
 
 
-@pytest.mark.fault(
-    "socket: too many connections",
-    sees="those inside lose nothing",
-    says="`connections`: too_many",
-    back="when they have gone",
-)
+@pytest.mark.fault("socket: too many connections")
 def test_peers_are_capped_and_those_who_are_in_stay_in(tmp_path: Path) -> None:
     with publisher(tmp_path / "run") as running, stream(running):
         endpoint = running.connection.data[-1]
@@ -445,12 +420,7 @@ SUBSCRIPTIONS = b"".join(b"\x00\xc9\x01" + np.random.default_rng(i).bytes(200) f
 ENDLESS = b"".join(b"\x01\xc9" + bytes(201) for _ in range(2000))  # each part says: more to come
 
 
-@pytest.mark.fault(
-    "socket: flooded",
-    sees="another consumer loses nothing",
-    says="`connections`: flooding",
-    left="under 100 MB",
-)
+@pytest.mark.fault("socket: flooded")
 @pytest.mark.parametrize(
     ("which", "kind", "block"), [("data", b"SUB", SUBSCRIPTIONS), ("control", b"DEALER", ENDLESS)]
 )

@@ -230,12 +230,7 @@ def test_no_name_begins_with_another() -> None:
     ] == []
 
 
-@pytest.mark.fault(
-    "memory: none is left for a thin picture",
-    sees="all other topics",
-    says="a text on that topic; the node's log, once",
-    back="with the next frame that has room",
-)
+@pytest.mark.fault("memory: none is left for a thin picture")
 def test_what_cannot_be_made_costs_its_topic_alone(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -155,11 +155,7 @@ def test_reset_makes_a_new_model_and_a_new_epoch(node: RunningNode) -> None:
     assert after["epoch"] > before["epoch"]
 
 
-@pytest.mark.fault(
-    "process: the node is killed",
-    sees="stale; reading raises an error",
-    says="the error",
-)
+@pytest.mark.fault("process: the node is killed")
 def test_a_killed_node_goes_stale_and_reads_fail(phantom_session: Path, tmp_path: Path) -> None:
     """What was received from a dead node must not be taken for the present."""
     running = RunningNode(phantom_session, tmp_path)
@@ -174,11 +170,7 @@ def test_a_killed_node_goes_stale_and_reads_fail(phantom_session: Path, tmp_path
             subscriber.read(name)
 
 
-@pytest.mark.fault(
-    "process: Ctrl-C, SIGTERM or SIGHUP to the node",
-    says="exit code 0",
-    left="no connection file",
-)
+@pytest.mark.fault("process: Ctrl-C, SIGTERM or SIGHUP to the node")
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_stopping_is_clean(phantom_session: Path, tmp_path: Path, stop: signal.Signals) -> None:
     running = RunningNode(phantom_session, tmp_path)

@@ -64,12 +64,7 @@ def break_off(stop: Stop, session: Path, run_dir: Path) -> None:
     assert killed or not connection.exists(), f"{stop}: it can still be found"
 
 
-@pytest.mark.fault(
-    "process: SIGTERM or SIGKILL at any moment of the start",
-    sees="no node, or one that stops",
-    back="the next node starts in the same place",
-    left="no process; after SIGTERM no connection file",
-)
+@pytest.mark.fault("process: SIGTERM or SIGKILL at any moment of the start")
 def test_a_start_may_be_broken_off_at_any_moment(phantom_session: Path, tmp_path: Path) -> None:
     term, kill = signal.SIGTERM, signal.SIGKILL
     for stop in (

@@ -373,12 +373,7 @@ def test_what_drew_a_size_goes_with_the_size(monkeypatch: pytest.MonkeyPatch) ->
     assert len(made) == 2
 
 
-@pytest.mark.fault(
-    "memory: none is left for a view that a consumer asked for",
-    sees="all but that view",
-    says="`limited_by` of the view; the node's log, once",
-    back="with the first drawing that has room",
-)
+@pytest.mark.fault("memory: none is left for a view that a consumer asked for")
 def test_what_cannot_be_drawn_costs_its_view_alone(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -1,7 +1,8 @@
-"""The overlay as a process beside a node: on the tissue in both eyes, and blank when in any doubt."""
+"""The overlay beside a node: on the tissue in both eyes, and blank when in any doubt."""
 
 from __future__ import annotations
 
+import ctypes
 import itertools
 import json
 import signal
@@ -21,6 +22,7 @@ from command_line import FREE_PORTS
 from places import ROOT
 from ports import free_port
 from test_overlay_drawing import KEY, centre
+from waiting import until
 
 from sags_node.client import FrameSender
 from sags_node.geometry import project
@@ -29,6 +31,7 @@ from sags_node.messaging.received import ReceivedCloud, ReceivedImage, ReceivedT
 from sags_node.messaging.rundir import connection_path
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.overlay.draw import color_key
+from sags_node.overlay.run import Options, run_overlay
 from sags_node.sources.pictures import read_picture
 from sags_node.types import Camera
 
@@ -57,14 +60,27 @@ def process(*arguments: str | Path) -> Iterator[subprocess.Popen[str]]:
             running.communicate()
 
 
-def until(ready: Callable[[], Any], *alive: subprocess.Popen[str], seconds: float = START_SECONDS) -> Any:
-    deadline = time.monotonic() + seconds
-    while not (found := ready()):
-        for running in alive:
-            assert running.poll() is None, running.communicate()
-        assert time.monotonic() < deadline, "it did not come"
-        time.sleep(0.01)
-    return found
+class Overlay(threading.Thread):
+    """`sags overlay` in a thread."""
+
+    def __init__(self, run_dir: Path, **options: Any) -> None:
+        super().__init__(daemon=True)
+        self.said: list[str] = []
+        self._options = Options(run_dir=run_dir, max_age=MAX_AGE, **options)
+        self._summary: dict[str, Any] = {}
+
+    def run(self) -> None:
+        self._summary = run_overlay(self._options, self.said.append)
+
+    def end(self) -> dict[str, Any]:
+        """As Ctrl-C does; what it says in the end."""
+        if self.is_alive():
+            ctypes.pythonapi.PyThreadState_SetAsyncExc(
+                ctypes.c_ulong(self.ident or 0), ctypes.py_object(KeyboardInterrupt)
+            )
+        self.join(30)
+        assert not self.is_alive() and self._summary
+        return self._summary
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +94,7 @@ def node(phantom_session: Path, run_dir: Path) -> Iterator[subprocess.Popen[str]
     settings = ["source.loop:=true", f"publish.run_dir:={run_dir}"]
     settings += ["publish.data:=[tcp://127.0.0.1:*]", "publish.control:=tcp://127.0.0.1:*"]
     with process("run", phantom_session, *settings) as running:
-        until(connection_path(run_dir, "sags").exists, running)
+        until(connection_path(run_dir, "sags").exists, START_SECONDS)
         yield running
 
 
@@ -89,8 +105,7 @@ class Watcher:
         self.topics = [
             f"{eye}/overlay/{kind}" for eye in ("left", "right") for kind in ("image", "color_key")
         ]
-        self._subscriber = Subscriber(self.topics, ns="overlay", run_dir=run_dir)
-        self._seen: dict[str, ReceivedImage] = {}
+        self.subscriber = Subscriber(self.topics, ns="overlay", run_dir=run_dir)
 
     def pictures(self, count: int, drawn: bool, seconds: float = 60) -> list[dict[str, ReceivedImage]]:
         """The next so many frames with (or without) an overlay in the left eye: all four topics of each."""
@@ -98,30 +113,44 @@ class Watcher:
         deadline, last = time.monotonic() + seconds, None
         while len(found) < count:
             assert time.monotonic() < deadline, self.status()
-            last = self._subscriber.wait(self.topics[0], 0.1, after=last)
+            last = self.subscriber.wait(self.topics[0], 0.1, after=last)
             if not isinstance(last, ReceivedImage) or bool(last.array.any()) != drawn:
                 continue
-            whole = self._subscriber.aligned(self.topics, last.stamp_ns, 0.2 if drawn else 0)
+            whole = self.subscriber.aligned(self.topics, last.stamp_ns, 0.2 if drawn else 0)
             found.append(dict(whole) if whole else {self.topics[0]: last})  # type: ignore[arg-type]  # images
         return found
 
     def status(self) -> dict[str, Any]:
-        said = self._subscriber.latest("status")
+        said = self.subscriber.latest("status")
         return json.loads(said.text) if isinstance(said, ReceivedText) else {}
 
     def close(self) -> None:
-        self._subscriber.close()
+        self.subscriber.close()
 
 
 @contextmanager
-def overlay(run_dir: Path, *options: str | Path) -> Iterator[tuple[subprocess.Popen[str], Watcher]]:
-    with process("overlay", "--run-dir", run_dir, "--max-age", str(MAX_AGE), "--json", *options) as running:
-        until(connection_path(run_dir, "overlay").exists, running)
+def overlay(run_dir: Path, **options: Any) -> Iterator[tuple[Overlay, Watcher]]:
+    running = Overlay(run_dir, **options)
+    running.start()
+    try:
+        until(connection_path(run_dir, "overlay").exists)
         watcher = Watcher(run_dir)
         try:
             yield running, watcher
         finally:
             watcher.close()
+    finally:
+        running.end()
+
+
+def test_it_waits_for_a_node_that_is_started_later(run_dir: Path, request: pytest.FixtureRequest) -> None:
+    """The first of these tests, before there is a node."""
+    assert not connection_path(run_dir, "sags").exists()
+    with overlay(run_dir) as (running, watcher):
+        until(lambda: watcher.status().get("reason") == "waiting for the node")
+        assert len(running.said) == 1 and "waiting (Ctrl-C ends)" in running.said[0]
+        request.getfixturevalue("node")
+        assert watcher.pictures(3, drawn=True, seconds=START_SECONDS)
 
 
 @pytest.mark.usefixtures("node")
@@ -136,10 +165,9 @@ def test_on_the_phantom_both_eyes_follow_the_tissue(
     scene.write_text(
         f"objects: [{{shape: sphere, color: [255, 40, 40], anchors: [{{pixel: {start.round().tolist()}}}]}}]"
     )
-    with overlay(run_dir, "--scene", scene) as (running, watcher):
+    with overlay(run_dir, scene=scene) as (running, watcher):
         frames = watcher.pictures(45, drawn=True)  # once through the recording
-        running.send_signal(signal.SIGINT)
-        summary = json.loads(running.communicate(timeout=30)[0])
+        summary = running.end()
     frames = [frame for frame in frames if len(frame) == 4]
     assert len(frames) > 20
     full = np.median([(frame["left/overlay/image"].array[..., 3] > 0).sum() for frame in frames])
@@ -170,17 +198,6 @@ def test_on_the_phantom_both_eyes_follow_the_tissue(
     latency = summary["latency_ms"]
     assert 0 < latency["p50"] <= latency["p99"] < 1000
     assert summary["overlay"] >= 20 and len(summary["objects"][0]["anchors"]) == 1
-
-
-def test_it_waits_for_a_node_that_is_started_later(phantom_session: Path, tmp_path: Path) -> None:
-    run_dir = tmp_path / "run"
-    with overlay(run_dir) as (running, watcher):
-        until(lambda: watcher.status().get("reason") == "waiting for the node", running)
-        assert running.stderr is not None and "waiting (Ctrl-C ends)" in running.stderr.readline()
-        settings = ["source.loop:=true", f"publish.run_dir:={run_dir}"]
-        settings += ["publish.data:=[tcp://127.0.0.1:*]", "publish.control:=tcp://127.0.0.1:*"]
-        with process("run", phantom_session, *settings):
-            assert watcher.pictures(3, drawn=True, seconds=START_SECONDS)
 
 
 def phantom_truth(session: Path) -> tuple[Callable[[int], Camera], np.ndarray, np.ndarray]:
@@ -215,8 +232,7 @@ def phantom_baseline(session: Path) -> float:
 @pytest.mark.usefixtures("node")
 def test_the_saved_video_is_whole_also_where_there_is_no_overlay(run_dir: Path, tmp_path: Path) -> None:
     video = tmp_path / "overlay.mp4"
-    with process("overlay", "--run-dir", run_dir, "--save", video, "--seconds", "2", "--json") as running:
-        summary = json.loads(running.communicate(timeout=60)[0])
+    summary = run_overlay(Options(run_dir=run_dir, save=video, seconds=2.0))
     assert summary["frames"] == summary["overlay"] + sum(summary["blanked"].values()) > 5
     assert summary["blanked"]["being pinned"] > 0
     capture = cv2.VideoCapture(str(video))
@@ -234,18 +250,12 @@ def test_it_leaves_no_anchors_behind(run_dir: Path) -> None:
 
         with overlay(run_dir) as (running, watcher):
             watcher.pictures(1, drawn=True)
-            until(lambda: anchors() == 1, running)
-            running.send_signal(signal.SIGINT)
-            running.communicate(timeout=30)
+            until(lambda: anchors() == 1)
+            running.end()
             until(lambda: anchors() == 0)
 
 
-@pytest.mark.fault(
-    "process: the node is stopped (SIGSTOP), reset or killed under an overlay",
-    sees="a blank overlay",
-    says="its status: `stale` or `lost`",
-    back="when the node goes on",
-)
+@pytest.mark.fault("process: the node is stopped (SIGSTOP), reset or killed under an overlay")
 def test_it_goes_blank_when_the_node_stops_is_reset_or_dies(
     node: subprocess.Popen[str], run_dir: Path
 ) -> None:
@@ -261,18 +271,17 @@ def test_it_goes_blank_when_the_node_stops_is_reset_or_dies(
             client.request("reset_model", timeout=30)
         lost = "lost: the model was started anew"
         assert blank_in_time(watcher).startswith(("lost", "stale"))
-        until(lambda: watcher.status()["reason"] == lost, running)
-        running.send_signal(signal.SIGINT)
-        assert json.loads(running.communicate(timeout=30)[0])["blanked"][lost] > 0
-    with overlay(run_dir, "--repin") as (running, watcher):
+        until(lambda: watcher.status()["reason"] == lost)
+        assert running.end()["blanked"][lost] > 0
+    with overlay(run_dir, repin=True) as (running, watcher):
         watcher.pictures(3, drawn=True)
         with ControlClient(run_dir=run_dir) as client:
             client.request("reset_model", timeout=30)
-        until(lambda: watcher.status()["objects"][0]["pinned"] > 1, running)
+        until(lambda: watcher.status()["objects"][0]["pinned"] > 1)
         watcher.pictures(3, drawn=True)
         node.kill()
         assert blank_in_time(watcher).startswith("stale")
-        assert running.poll() is None and watcher.status()["state"] == "blank"
+        assert running.is_alive() and watcher.status()["state"] == "blank"
 
 
 class Scope(threading.Thread):
@@ -299,32 +308,27 @@ class Scope(threading.Thread):
                 sender.send(*pair, stamp_ns)
 
 
-@pytest.mark.fault(
-    "picture: both eyes of a live feed are frozen, under an overlay",
-    sees="a blank overlay, of no frame from 0.3 s after the last new picture on",
-    says="its status: `stale`, `picture_frozen`",
-    back="when pictures differ again",
-)
+@pytest.mark.fault("picture: both eyes of a live feed are frozen, under an overlay")
 def test_it_goes_blank_when_the_feed_freezes(phantom_session: Path, tmp_path: Path) -> None:
     """All stamps are fresh, and the node goes on."""
     run_dir, endpoint = tmp_path / "run", f"tcp://127.0.0.1:{free_port()}"
     said = [f"source.endpoint:={endpoint}", "source.rate:=10", f"rig:={phantom_session / 'calib'}"]
     said += ["vision.tissue.method:=none", f"publish.run_dir:={run_dir}", *FREE_PORTS]
     scope = Scope(phantom_session, endpoint)
-    with process("run", ROOT / "launch/push.yaml", *said) as node:
-        until(connection_path(run_dir, "sags").exists, node)
+    with process("run", ROOT / "launch/push.yaml", *said):
+        until(connection_path(run_dir, "sags").exists, START_SECONDS)
         scope.start()
         try:
-            with overlay(run_dir) as (running, watcher):
+            with overlay(run_dir) as (_, watcher):
                 watcher.pictures(3, drawn=True, seconds=START_SECONDS)
                 scope.frozen.set()
                 drawn, _ = until_blank(watcher)
                 assert drawn.stamp_ns < scope.newest_ns + (FROZEN + BUSY) * 1e9
-                assert str(until(lambda: watcher.status().get("reason"), seconds=5)).startswith("stale")
-                until(lambda: "picture_frozen" in watcher.status()["warning_codes"], running, seconds=5)
+                until(lambda: str(watcher.status().get("reason")).startswith("stale"))
+                until(lambda: "picture_frozen" in watcher.status()["warning_codes"])
                 scope.frozen.clear()
                 watcher.pictures(3, drawn=True)
-                until(lambda: "picture_frozen" not in watcher.status()["warning_codes"], running, seconds=5)
+                until(lambda: "picture_frozen" not in watcher.status()["warning_codes"])
         finally:
             scope.ended.set()
             scope.join(10)
@@ -334,10 +338,10 @@ def until_blank(watcher: Watcher) -> tuple[ReceivedImage, ReceivedImage]:
     """The last picture that showed something, and the empty one after it, which came in time."""
     shown = watcher.pictures(1, drawn=True)[-1] if watcher.status()["state"] == "running" else None
     last_shown = (
-        watcher._subscriber.latest("left/overlay/image") if shown is None else shown["left/overlay/image"]
+        watcher.subscriber.latest("left/overlay/image") if shown is None else shown["left/overlay/image"]
     )
     while True:
-        newest = watcher._subscriber.wait("left/overlay/image", 30, after=last_shown)
+        newest = watcher.subscriber.wait("left/overlay/image", 30, after=last_shown)
         assert isinstance(newest, ReceivedImage), "the last overlay was left standing"
         if not newest.array.any():
             break
@@ -351,6 +355,7 @@ def until_blank(watcher: Watcher) -> tuple[ReceivedImage, ReceivedImage]:
 def blank_in_time(watcher: Watcher) -> str:
     """Wait for an empty picture, check that it came in time, and give the reason that status gives."""
     until_blank(watcher)
-    keyed = watcher._subscriber.wait("left/overlay/color_key", 60)
+    keyed = watcher.subscriber.wait("left/overlay/color_key", 60)
     assert isinstance(keyed, ReceivedImage)
-    return str(until(lambda: watcher.status().get("reason")))
+    until(lambda: watcher.status().get("reason"))
+    return str(watcher.status()["reason"])

@@ -45,11 +45,7 @@ def bounded_memory() -> Any:
 HOSTILE = ("mcap file", "mcap zstd", "db3 file", "ros1", "ros1 lz4", "ros1 bz2")
 
 
-@pytest.mark.fault(
-    "file: a ROS bag is cut off",
-    says="one line of error",
-    left="memory stays under 1 GB more",
-)
+@pytest.mark.fault("file: a ROS bag is cut off")
 @pytest.mark.parametrize("kind", HOSTILE)
 def test_cut_off_anywhere(kind: str, tmp_path: Path, bounded_memory: None) -> None:
     file = single_file(KINDS[kind](tmp_path))
@@ -63,11 +59,7 @@ def test_cut_off_anywhere(kind: str, tmp_path: Path, bounded_memory: None) -> No
     assert went_well == 0 or kind == "db3 file"  # sqlite can do without unused pages at its end
 
 
-@pytest.mark.fault(
-    "file: bits of a ROS bag are flipped",
-    says="values, or one line of error",
-    left="memory stays under 1 GB more",
-)
+@pytest.mark.fault("file: bits of a ROS bag are flipped")
 @pytest.mark.parametrize("kind", HOSTILE)
 def test_flipped_bits(kind: str, tmp_path: Path, bounded_memory: None) -> None:
     file = single_file(KINDS[kind](tmp_path))
@@ -83,11 +75,7 @@ def test_flipped_bits(kind: str, tmp_path: Path, bounded_memory: None) -> None:
         consume(flipped)
 
 
-@pytest.mark.fault(
-    "file: an MCAP claims to be huge",
-    says="error: `damaged at byte`",
-    left="memory stays under 1 GB more",
-)
+@pytest.mark.fault("file: an MCAP claims to be huge")
 @pytest.mark.parametrize("length", [2**60, 2**63, 2**64 - 1, 1 << 33, 300 << 20])
 def test_forged_lengths_of_mcap_records(length: int, tmp_path: Path, bounded_memory: None) -> None:
     file = KINDS["mcap zstd"](tmp_path) / "bag.mcap"

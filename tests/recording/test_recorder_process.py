@@ -69,13 +69,7 @@ def test_a_zero_character_is_refused(recorder: RecorderProcess, args: dict[str, 
         recorder.start(args).result(ANSWER)
 
 
-@pytest.mark.fault(
-    "process: the recorder hangs",
-    sees="each request is answered",
-    says="error: `did not finish`",
-    back="the next recording begins",
-    left="no recorder process",
-)
+@pytest.mark.fault("process: the recorder hangs")
 def test_a_recorder_that_does_not_answer_is_ended(
     recorder: RecorderProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -94,10 +88,7 @@ def test_a_recorder_that_does_not_answer_is_ended(
     recorder.start({"path": str(tmp_path / "bag")}).result(ANSWER)
 
 
-@pytest.mark.fault(
-    "process: the recorder hangs while the node stops",
-    left="no recorder process",
-)
+@pytest.mark.fault("process: the recorder hangs while the node stops")
 def test_a_node_ends_beside_a_recorder_that_does_not(
     recorder: RecorderProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -109,11 +100,7 @@ def test_a_node_ends_beside_a_recorder_that_does_not(
     assert recorders() == []
 
 
-@pytest.mark.fault(
-    "process: the recorder does not begin",
-    says="error: `did not begin`",
-    left="no recorder process",
-)
+@pytest.mark.fault("process: the recorder does not begin")
 def test_a_recorder_that_does_not_begin_is_ended(
     recorder: RecorderProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

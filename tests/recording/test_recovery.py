@@ -32,12 +32,7 @@ def recovered(file: bytes, tmp_path: Path, name: str) -> tuple[dict[str, Any] | 
     return done, list(read_messages(out))
 
 
-@pytest.mark.fault(
-    "file: a recording is cut off",
-    sees="nearly all messages before the cut, and no wrong one",
-    says="`lost`",
-    back="`sags bag recover`",
-)
+@pytest.mark.fault("file: a recording is cut off")
 def test_recovery_after_a_cut_keeps_all_before_it(plane_bag: Path, tmp_path: Path) -> None:
     (file,) = plane_bag.glob("*.mcap")
     whole, original = file.read_bytes(), content(list(read_messages(plane_bag)))
@@ -115,11 +110,7 @@ def test_recovery_of_nothing_leaves_nothing(content: bytes, there: bool, tmp_pat
     assert damaged.read_bytes() == content
 
 
-@pytest.mark.fault(
-    "disk: full while a recording is recovered",
-    says="error: `No space left on device`, exit code 1",
-    left="nothing half written",
-)
+@pytest.mark.fault("disk: full while a recording is recovered")
 def test_recovery_that_is_broken_off_leaves_nothing(
     plane_bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -38,11 +38,7 @@ def played(config: Recording, change: Callable[[], object]) -> tuple[list[Stereo
     return frames, ""
 
 
-@pytest.mark.fault(
-    "file: a picture is deleted while it is played",
-    sees="the frames before it",
-    says="error with the picture's name",
-)
+@pytest.mark.fault("file: a picture is deleted while it is played")
 def test_a_picture_that_is_deleted_is_named(tmp_path: Path) -> None:
     config = recordings(tmp_path)["folders"]
     frames, error = played(config, (tmp_path / "r/006.png").unlink)
@@ -50,10 +46,7 @@ def test_a_picture_that_is_deleted_is_named(tmp_path: Path) -> None:
     assert "r/006.png" in error
 
 
-@pytest.mark.fault(
-    "file: a folder of pictures grows while it is played",
-    sees="the frames that were there when it was opened",
-)
+@pytest.mark.fault("file: a folder of pictures grows while it is played")
 def test_pictures_that_come_later_are_not_played(tmp_path: Path) -> None:
     config = recordings(tmp_path)["folders"]
 
@@ -65,18 +58,14 @@ def test_pictures_that_come_later_are_not_played(tmp_path: Path) -> None:
     assert numbers(frames) == list(range(8)) and error == ""
 
 
-@pytest.mark.fault("file: a video is deleted while it is played", sees="all of its frames")
+@pytest.mark.fault("file: a video is deleted while it is played")
 def test_a_video_that_is_deleted_is_played_to_its_end(tmp_path: Path) -> None:
     config = recordings(tmp_path)["videos"]
     frames, error = played(config, (tmp_path / "r.avi").unlink)
     assert numbers(frames) == list(range(8)) and error == ""
 
 
-@pytest.mark.fault(
-    "file: a video is cut off while it is played",
-    sees="whole frames; of the last one the decoder may have made up a part",
-    says="error: at which frame it ends",
-)
+@pytest.mark.fault("file: a video is cut off while it is played")
 def test_a_video_that_is_cut_off_is_named(tmp_path: Path) -> None:
     """Two megabytes of noise: more than a reader reads ahead."""
     rng = np.random.default_rng(0)
@@ -92,11 +81,7 @@ def test_a_video_that_is_cut_off_is_named(tmp_path: Path) -> None:
         assert np.array_equal(frame.right, true.right)
 
 
-@pytest.mark.fault(
-    "file: a ROS bag is cut off while it is played",
-    sees="whole frames only",
-    says="error with the bag's name",
-)
+@pytest.mark.fault("file: a ROS bag is cut off while it is played")
 @pytest.mark.parametrize("kind", ["mcap", "ros1"])
 def test_a_bag_that_is_cut_off_is_named(kind: str, tmp_path: Path) -> None:
     """Four megabytes: more than a chunk, which is read at once."""
@@ -118,16 +103,8 @@ def cut(file: Path) -> None:
         opened.truncate(0)
 
 
-@pytest.mark.fault(
-    "calibration: deleted or overwritten while it is used",
-    sees="the frames and the rig of when it was opened",
-    back="a restart reads it anew, and says what is wrong",
-)
-@pytest.mark.fault(
-    "launch file: broken while it is used",
-    sees="the frames and the keys of when it was opened",
-    back="a restart reads it anew, and says what is wrong",
-)
+@pytest.mark.fault("calibration: deleted or overwritten while it is used")
+@pytest.mark.fault("launch file: broken while it is used")
 def test_what_was_read_at_the_start_may_change(tmp_path: Path) -> None:
     folder = tmp_path / "session"
     shutil.copytree(SESSION, folder)

@@ -189,10 +189,7 @@ def test_impossible_array_size_is_refused_before_memory_is_taken(tmp_path: Path)
         open_source(no_poses(tmp_path))
 
 
-@pytest.mark.fault(
-    "file: pictures of both eyes were deleted before it is played",
-    says="log: which are paired with which",
-)
+@pytest.mark.fault("file: pictures of both eyes were deleted before it is played")
 def test_missing_pictures_on_both_sides_are_noticed(
     folders: cfg.FoldersSource, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -214,11 +211,7 @@ def frames_until_error(config: Recording) -> tuple[list[StereoFrame], str]:
     return frames, str(caught.value)
 
 
-@pytest.mark.fault(
-    "file: a picture is cut off",
-    sees="the frames before it",
-    says="error: `is damaged or cut off`",
-)
+@pytest.mark.fault("file: a picture is cut off")
 @pytest.mark.parametrize("suffix", ["jpg", "png"])
 def test_damaged_picture_in_the_middle_is_named(tmp_path: Path, suffix: str) -> None:
     left, right = np.random.default_rng(1).integers(0, 255, (2, HEIGHT, WIDTH, 3), np.uint8)
@@ -234,11 +227,7 @@ def test_damaged_picture_in_the_middle_is_named(tmp_path: Path, suffix: str) -> 
     assert f"picture {broken} is damaged or cut off" in message
 
 
-@pytest.mark.fault(
-    "file: a picture has another size",
-    sees="the frames before it",
-    says="error with both sizes",
-)
+@pytest.mark.fault("file: a picture has another size")
 def test_picture_of_another_size_in_the_middle_is_named(folders: cfg.FoldersSource) -> None:
     write_png(folders.left / "L7.png", np.zeros((HEIGHT + 2, WIDTH, 3), np.uint8))
     frames, message = frames_until_error(folders)

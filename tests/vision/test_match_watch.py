@@ -125,10 +125,7 @@ def warned(recording: Path, delay: int, rung: int, kept: str) -> set[str]:
     return codes
 
 
-@pytest.mark.fault(
-    "picture: one eye is three frames late, and every sixth frame is matched",
-    says="`eyes_late`, and no other cause",
-)
+@pytest.mark.fault("picture: one eye is three frames late, and every sixth frame is matched")
 def test_what_a_slow_node_says_of_a_late_eye_is_that(recording: Path) -> None:
     """Every third frame matched of every second: 200 ms apart. No other cause is blamed."""
     assert warned(recording, 3, 0, "10") == {"eyes_late"}

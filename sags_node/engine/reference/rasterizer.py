@@ -200,7 +200,7 @@ def blend(splats: Splats, width: int, height: int) -> Tensor:
     """Planes [5, H, W]."""
 
     def tile(left: int, top: int, right: int, bottom: int) -> Tensor:
-        alpha, before, touching = _alphas(splats, left, top, right, bottom)
+        alpha, before, touching = alphas(splats, left, top, right, bottom)
         return ((alpha * before) @ splats.features[touching]).T.reshape(5, bottom - top, right - left)
 
     return _tile_by_tile(tile, width, height)
@@ -212,7 +212,7 @@ def median(splats: Splats, width: int, height: int) -> tuple[Tensor, Tensor]:
     import torch
 
     def tile(left: int, top: int, right: int, bottom: int) -> Tensor:
-        alpha, before, touching = _alphas(splats, left, top, right, bottom)
+        alpha, before, touching = alphas(splats, left, top, right, bottom)
         dim = before * (1 - alpha) <= 0.5
         nobody = dim.new_ones(len(dim), 1)
         first = torch.cat([dim, nobody], 1).int().argmax(1)
@@ -237,7 +237,7 @@ def _tile_by_tile(tile: Callable[[int, int, int, int], Tensor], width: int, heig
     return torch.cat(bands, 1)
 
 
-def _alphas(splats: Splats, left: int, top: int, right: int, bottom: int) -> tuple[Tensor, Tensor, Tensor]:
+def alphas(splats: Splats, left: int, top: int, right: int, bottom: int) -> tuple[Tensor, Tensor, Tensor]:
     """Of one tile with P pixels: alpha [P, S'] and the transmittance before each splat [P, S'], and which
     splats these are [S']."""
     import torch

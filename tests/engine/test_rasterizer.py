@@ -1,0 +1,566 @@
+"""What every rasteriser must do: the CPU's kernels, ours for a GPU (in Triton's interpreter where there is
+none) and gsplat (on the torch versions of its stages, `gsplat_on_cpu`), against the float64 twin, a closed
+form, or the same scene without what was spoilt."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from engine_scenes import (
+    DERIVATIVES,
+    EXPONENTIAL,
+    INPUTS,
+    camera,
+    cotangents,
+    draw_and_differentiate,
+    one_gaussian,
+    random_gaussians,
+    relative_error,
+    rows,
+    truth,
+    with_filter,
+    with_view_dependence,
+)
+from numpy.typing import NDArray
+from rounding import after
+
+from sags_node import geometry
+from sags_node.engine.interface import MAX_OPACITY, MIN_ALPHA, NEAR_PLANE
+from sags_node.engine.rasterizer.rasterize import (
+    TILE_HEIGHT,
+    TILE_WIDTH,
+    Gradients,
+    Rasterizer,
+    make_rasterizer,
+    rasterize,
+)
+from sags_node.errors import SagsError
+from sags_node.types import F32, Bool, Camera, Gaussians
+
+# what Triton's interpreter says of lanes without a Gaussian
+pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning:triton.runtime.interpreter")
+
+
+@dataclasses.dataclass(frozen=True)
+class Backend:
+    """One of them, and a scene's size that suits it: in the interpreter a pair of a splat and a tile takes
+    milliseconds."""
+
+    name: str
+    width: int
+    height: int
+    count: int  # Gaussians
+    rounding: float  # of the sums of gradients in another order; 0: the order is always the same
+    module: str = ""  # where its MAX_PAIRS stands
+
+    def camera(self, **options: Any) -> Camera:
+        return camera(self.width, self.height, **options)
+
+    def scene(self, seed: int, view: Camera, spread: float = 1.0) -> Gaussians:
+        return random_gaussians(seed, self.count, view, spread)
+
+    def rasterizer(self, view: Camera) -> Rasterizer:
+        return make_rasterizer(self.name, view.width, view.height)
+
+    def draw(self, gaussians: Gaussians, view: Camera, **options: Any) -> tuple[F32, dict[str, Any]]:
+        return draw_and_differentiate(gaussians, view, self.name, **options)
+
+    def agrees(self, gaussians: Gaussians, view: Camera, shown: float = 0.05, **options: Any) -> None:
+        """Planes, and gradients of a random cotangent, with the float64 twin; `shown`: the least coverage of
+        some pixel."""
+        true = truth(gaussians, view, **options)
+        assert true.planes[4].max() > shown
+        true.check(*self.draw(gaussians, view, **options))
+
+    def same(self, found: dict[str, Any], true: dict[str, Any], keep: Any = ...) -> None:
+        """The gradients of `keep` are those, bit by bit where the order of sums is fixed."""
+        for name in DERIVATIVES:
+            if self.rounding and true[name].any():
+                assert relative_error(found[name][keep], true[name]) < self.rounding, name
+            else:
+                np.testing.assert_array_equal(found[name][keep], true[name], err_msg=name)
+
+
+NUMBA = pytest.param(Backend("numba", 48, 40, 60, 0.0, "sags_node.engine.rasterizer.cpu"), id="numba")
+CUDA = pytest.param(
+    Backend("cuda", 35, 21, 10, 0.0, "sags_node.engine.cuda.rasterizer"), id="cuda", marks=pytest.mark.beside
+)
+GSPLAT = pytest.param(Backend("gsplat", 50, 44, 40, after(50 * 44)), id="gsplat", marks=pytest.mark.beside)
+
+
+@pytest.fixture(params=[NUMBA, CUDA, GSPLAT])
+def backend(request: pytest.FixtureRequest) -> Iterator[Backend]:
+    chosen: Backend = request.param
+    if chosen.name != "numba":
+        pytest.importorskip("triton", reason="Triton comes with torch's CUDA builds: pip install triton")
+    if chosen.name == "cuda":
+        request.getfixturevalue("quick_interpreter")
+    with pytest.MonkeyPatch.context() as patch:
+        if chosen.name == "gsplat":
+            pytest.importorskip("gsplat", reason="it is optional: pip install 'sags-node[gsplat]'")
+            from gsplat_on_cpu import use_gsplat_on_cpu
+
+            use_gsplat_on_cpu(patch)
+        yield chosen
+
+
+ours = pytest.mark.parametrize("backend", [NUMBA, CUDA], indirect=True)  # gsplat's differ: test_gsplat.py
+
+
+def copies(gradients: Gradients) -> dict[str, NDArray[np.floating]]:
+    return {name: getattr(gradients, name).copy() for name in DERIVATIVES}
+
+
+def scene_of(gaussians: Gaussians, degree: int, filtered: bool, seed: int = 0) -> Gaussians:
+    gaussians = with_view_dependence(gaussians, degree, seed) if degree else gaussians
+    return with_filter(gaussians, seed) if filtered else gaussians
+
+
+# ---- the arithmetic ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize(
+    ("degree", "filtered", "antialias", "moved"),
+    [(0, False, True, False), (0, False, True, True), (1, True, False, True), (2, False, True, True),
+     (3, True, True, True)],
+)  # fmt: skip
+def test_agrees_with_the_float64_twin(
+    backend: Backend, seed: int, degree: int, filtered: bool, antialias: bool, moved: bool
+) -> None:
+    """Every derivative, all degrees, both filters on and off."""
+    view = backend.camera(moved=moved)
+    gaussians = scene_of(backend.scene(seed, view), degree, filtered, seed)
+    backend.agrees(gaussians, view, seed=seed, antialias=antialias, shown=0.25)
+
+
+def test_agrees_on_a_larger_scene(backend: Backend) -> None:
+    view = camera(width=64, height=48, focal=80.0)
+    backend.agrees(with_filter(random_gaussians(4, 110, view, spread=0.7)), view)
+
+
+def test_a_jacobian_held_within_the_frustum(backend: Backend) -> None:
+    """Large Gaussians whose centres lie outside the widened frustum reach into the picture."""
+    view = backend.camera(moved=True)
+    rng = np.random.default_rng(11)
+    pixels = rng.uniform([-60, -30], [-30, 60], (6, 2))
+    gaussians = dataclasses.replace(
+        random_gaussians(11, 6, view),
+        means=geometry.unproject(view, pixels, rng.uniform(0.05, 0.09, 6)).astype(np.float32),
+        scales=rng.uniform(0.02, 0.05, (6, 3)).astype(np.float32),
+    )
+    backend.agrees(gaussians, view)
+
+
+@ours
+@pytest.mark.parametrize("scale", [1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0])
+@pytest.mark.parametrize("filtered", [False, True])
+def test_scales_from_a_vanishing_dot_to_a_wall(backend: Backend, scale: float, filtered: bool) -> None:
+    """Six turned Gaussians whose axes differ by 10, through a lens that can show 10 micrometres."""
+    view = backend.camera(focal=2000.0)
+    axes = np.tile(np.array([scale, scale / 10, scale / 3], np.float32), (6, 1))
+    smoothing = np.full(6, 0.01 * scale**2, np.float32) if filtered else None
+    gaussians = dataclasses.replace(random_gaussians(3, 6, view), scales=axes, smoothing=smoothing)
+    backend.agrees(gaussians, view)
+
+
+@ours
+@pytest.mark.parametrize(
+    "axes", [(1e-3, 1e-7, 2e-3), (1e-3, 1.1e-3, 1e-7), (3e-3, 3e-4, 3e-7), (0.1, 1e-5, 1e-3)]
+)
+@pytest.mark.parametrize("filtered", [False, True])
+def test_flat_as_paper_and_thin_as_a_thread(
+    backend: Backend, axes: tuple[float, float, float], filtered: bool
+) -> None:
+    """Axes of 1 : 10,000; with and without a filter of a micrometre."""
+    view = backend.camera()
+    gaussians = dataclasses.replace(
+        random_gaussians(7, 8, view),
+        scales=np.tile(np.array(axes, np.float32), (8, 1)),
+        opacities=np.full(8, 0.97, np.float32),
+        smoothing=np.full(8, 1e-12, np.float32) if filtered else None,
+    )
+    backend.agrees(gaussians, view, shown=0.01)
+
+
+@ours
+@pytest.mark.parametrize("opacity", [1e-6, 1 / 255, 0.0045, 0.5, 0.9985, 0.9995, 1 - 1e-6, 1.0])
+def test_opacities_from_nothing_to_everything(backend: Backend, opacity: float) -> None:
+    view = backend.camera()
+    gaussians = random_gaussians(5, 8, view, spread=3.0)
+    gaussians = dataclasses.replace(gaussians, opacities=np.full(8, opacity, np.float32))
+    planes, found = backend.draw(gaussians, view)
+    assert planes[4].any() == (opacity > 1 / 255)
+    truth(gaussians, view).check(planes, found)
+
+
+def test_even_a_wall_lets_a_thousandth_through(backend: Backend) -> None:
+    """What keeps 1 - alpha away from zero."""
+    planes, _ = backend.draw(one_gaussian(np.array([0, 0, 0.07]), 1.0, 1.0), backend.camera())
+    assert planes[4].max() == pytest.approx(MAX_OPACITY, rel=EXPONENTIAL)
+
+
+@ours
+def test_quaternions_of_any_length_are_the_same_turn(backend: Backend) -> None:
+    view = backend.camera()
+    gaussians = scene_of(random_gaussians(8, 8, view), 2, True)
+    unit = gaussians.quats / np.linalg.norm(gaussians.quats, axis=1)[:, None]
+    lengths = np.array([1e-11, 1e-6, 1e-3, 1, 1e3, 1e6, 1e15, 7], np.float32)[:, None]
+    true = truth(dataclasses.replace(gaussians, quats=unit), view)
+    planes, found = backend.draw(dataclasses.replace(gaussians, quats=unit * lengths), view)
+    true.check(planes, found | {"quats": found["quats"].astype(np.float64) * lengths})
+
+
+@ours
+@pytest.mark.parametrize("height", [1.0 + 1e-6, 1.01, 2.0])  # in near planes
+@pytest.mark.parametrize("scale", [1e-6, 1e-4, 1e-2])
+def test_just_in_front_of_the_near_plane_and_not_behind_it(
+    backend: Backend, height: float, scale: float
+) -> None:
+    """On the axis, beside the picture, far outside; then at the plane, on the camera and behind it."""
+    view = backend.camera()
+    z = NEAR_PLANE * np.array([height, height, height, 0.999, 1e-3, -1e-3, -1.0, -1e12])
+    means = np.stack([z * [0, 0.45, 30, 0, 0, 0, 0, 0], z * [0, 0.1, -20, 0, 0, 0, 0, 0], z], 1)
+    gaussians = dataclasses.replace(
+        with_view_dependence(random_gaussians(1, 8, view), 3),
+        means=means.astype(np.float32),
+        scales=np.full((8, 3), scale, np.float32) * np.array([1, 0.5, 0.7], np.float32),
+    )
+    planes, found = backend.draw(gaussians, view)
+    truth(gaussians, view).check(planes, found)
+    assert not any(found[name][3:].any() for name in DERIVATIVES)
+
+
+@ours
+@pytest.mark.parametrize("z", [NEAR_PLANE, 1e-6, 0.0, -1e-6, -0.05, -1e9])
+def test_at_or_behind_the_near_plane_nothing_is_drawn(backend: Backend, z: float) -> None:
+    gaussians = with_view_dependence(one_gaussian(np.array([0.001, 0.0, z]), 0.01), 3)
+    planes, found = backend.draw(gaussians, backend.camera())
+    assert not planes.any()
+    assert not any(found[name].any() for name in DERIVATIVES)
+
+
+@ours
+@pytest.mark.parametrize("factor", [0.03, 1e3, 1e6, 1e9])
+def test_a_larger_world_further_away_looks_the_same(backend: Backend, factor: float) -> None:
+    """Pictures do not know the unit of length: depths and derivatives scale, the rest stays."""
+    view = backend.camera()
+    gaussians = scene_of(random_gaussians(8, min(backend.count, 30), view), 2, True)
+    larger = dataclasses.replace(
+        gaussians,
+        means=gaussians.means * np.float32(factor),
+        scales=gaussians.scales * np.float32(factor),
+        smoothing=gaussians.smoothing * np.float32(factor) ** 2,
+    )
+    v_planes, weight = cotangents(view, 0)
+    v_planes[3] = 0
+    true = truth(gaussians, view, given=(v_planes, weight))
+    rasterizer = backend.rasterizer(view)
+    planes = rasterizer.forward(larger, view).copy()
+    unit = np.array([1, 1, 1, factor, 1])[:, None, None]
+    np.testing.assert_allclose(planes / unit, true.planes, rtol=0, atol=true.off.max())
+    lengths = {"means": factor, "scales": factor}
+    for name, gradient in copies(rasterizer.backward(v_planes, weight)).items():
+        true.check_gradient(name, gradient.astype(np.float64) * lengths.get(name, 1.0))
+
+
+@ours
+def test_a_principal_point_far_outside_and_a_telephoto_lens(backend: Backend) -> None:
+    K = np.array([[20000.0, 0, -900.0], [0, 21000, 700], [0, 0, 1]])
+    view = Camera(31, 29, K, np.eye(4))
+    backend.agrees(random_gaussians(2, min(backend.count, 40), view), view, shown=0.2)
+
+
+@ours
+@pytest.mark.parametrize("scale", [1e-7, 1e-5, 1e-3, 1e-1, 1.0])
+@pytest.mark.parametrize("distance", [1.001e-3, 0.07, 1e3])
+def test_extreme_values_give_finite_pictures_and_gradients(
+    backend: Backend, scale: float, distance: float
+) -> None:
+    view = backend.camera()
+    for opacity in (1e-6, 1 - 1e-6):
+        planes, found = backend.draw(one_gaussian(np.array([0, 0, distance]), scale, opacity), view)
+        assert np.isfinite(planes).all() and (planes[4] >= 0).all() and planes[4].max() <= 1
+        assert all(np.isfinite(found[name]).all() for name in DERIVATIVES)
+
+
+CROWDS = {  # how many of which opacity, and the error of an exponential as a share of it
+    "numba": ([(100_000, 0.9), (100_000, 0.01), (300, 0.01)], EXPONENTIAL),
+    "cuda": ([(40, 0.6)], after(8)),
+}
+
+
+@ours
+def test_a_crowd_on_one_pixel_follows_the_law_of_absorption(backend: Backend) -> None:
+    """n equal Gaussians behind each other, larger than the picture and smaller than a tile, whose rest beyond
+    its border never fills: what is left is (1 - alpha)^n, down to 1e-4, where a tile stops. Those that it
+    hides have no gradient."""
+    view = camera(width=3, height=2, focal=30.0)
+    crowds, exponential = CROWDS[backend.name]
+    for count, opacity in crowds:
+        one = one_gaussian(geometry.unproject(view, np.array([1.0, 1.0]), np.array(0.07)), 0.01, opacity)
+        planes, found = backend.draw(rows(one, np.zeros(count, int)), view)
+        alpha = backend.draw(one, view)[0][4].astype(np.float64)
+        through = (1 - alpha) ** count
+        left = np.maximum(through, 1e-4)
+        drawn = int(np.count_nonzero(found["contribution"]))  # until the tile stops
+        assert (drawn < count) == (through.max() < 1e-4)
+        assert found["means"][0].all() and not found["means"][drawn:].any()
+        rough = drawn * exponential * (opacity if backend.name == "numba" else 1) * left.max()
+        np.testing.assert_allclose(1 - planes[4], left, rtol=0, atol=1e-4 + rough)
+        np.testing.assert_allclose(planes[0], 0.8 * planes[4], rtol=after(2 * drawn))
+        total = found["contribution"].astype(np.float64).sum()
+        assert total == pytest.approx((cotangents(view, 0)[1] * planes[4]).sum(), rel=after(2 * drawn))
+        assert (np.diff(found["contribution"]) <= 0).all()  # the nearest are the first of equals
+
+
+def test_unprojected_pixel_peaks_at_that_pixel(backend: Backend) -> None:
+    """The first pixel's middle is at (0, 0), as in OpenCV: also in corners and beside borders of tiles."""
+    view = camera(48, 40, moved=True)
+    for pixel in [(0, 0), (17, 5), (47, 39), (15, 31), (16, 32)]:
+        mean = geometry.unproject(view, np.array(pixel, float), np.array(0.07))
+        drawn = rasterize(one_gaussian(mean, 0.001), view, backend=backend.name)
+        row, column = np.unravel_index(np.argmax(drawn.alpha), drawn.alpha.shape)
+        assert (int(column), int(row)) == pixel
+        assert drawn.depth[row, column] == pytest.approx(0.07, rel=after(20))  # one weight, divided out again
+        np.testing.assert_allclose(drawn.rgb[row, column], [0.8, 0.5, 0.2], rtol=after(8))
+
+
+# ---- what is not a number, nowhere, or of an odd size ------------------------------------------------------
+
+SPOILED: list[tuple[str, Any]] = [
+    (name, number) for name in (*INPUTS, "sh_rest") for number in (np.nan, np.inf, -np.inf)
+]
+SPOILED += [("quats", 0.0), ("quats", 1e-13), ("quats", 1e-30), ("quats", 1e19)]
+SPOILED += [
+    ("means", 0.0),
+    ("means", -0.07),
+    ("means", (0, 0, 0.9 * NEAR_PLANE)),
+    ("opacities", 0.99 * MIN_ALPHA),
+    ("opacities", 0.0),
+    ("opacities", -1.0),
+    ("scales", 1e30),
+]
+WITHOUT_FILTER = [*SPOILED, ("scales", 0.0), ("scales", 1e-30)]  # a filter gives these a size
+WITH_FILTER = [*SPOILED, ("smoothing", np.nan), ("smoothing", np.inf)]
+
+
+@pytest.mark.parametrize("kinds", [WITH_FILTER, WITHOUT_FILTER], ids=["filter", "no filter"])
+def test_a_spoilt_gaussian_is_left_out_and_harms_no_other(
+    backend: Backend, kinds: list[tuple[str, Any]]
+) -> None:
+    """One of each kind among sound ones, and the same scene without them: the same bits."""
+    view = backend.camera()
+    filtered = kinds is WITH_FILTER
+    if backend.name == "gsplat":
+        kinds = [kind for kind in kinds if kind != ("quats", 1e19)]  # it draws that, turned anyhow
+    spoilt = scene_of(random_gaussians(8, 2 * len(kinds), view, spread=0.9), 1, filtered)
+    for index, (name, number) in enumerate(kinds):
+        getattr(spoilt, name)[2 * index] = number
+    sound = np.arange(2 * len(kinds)) % 2 == 1
+    planes, found = backend.draw(spoilt, view)
+    expected, true = backend.draw(rows(spoilt, sound), view)
+    assert expected[4].mean() > 0.3
+    np.testing.assert_array_equal(planes, expected)
+    backend.same(found, true, sound)
+    for name in DERIVATIVES:
+        harmed = np.nonzero(found[name][~sound].reshape(len(kinds), -1).any(1))[0]
+        assert not len(harmed), (name, [kinds[index] for index in harmed])
+
+
+@ours
+def test_a_negative_filter_is_none(backend: Backend) -> None:
+    view = backend.camera()
+    negative, none = (scene_of(random_gaussians(8, 8, view), 1, True) for _ in range(2))
+    assert negative.smoothing is not None and none.smoothing is not None
+    negative.smoothing[3], none.smoothing[3] = -np.inf, 0
+    planes, found = backend.draw(negative, view)
+    expected, true = backend.draw(none, view)
+    np.testing.assert_array_equal(planes, expected)
+    backend.same(found, true)
+
+
+@ours
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("what", ["v_planes", "weight"])
+def test_a_spoilt_cotangent_stays_in_its_tile(backend: Backend, what: str, value: float) -> None:
+    """Gaussians that do not reach the pixel's tile keep their gradients bit by bit."""
+    view = camera(width=110, height=80, focal=140.0)
+    count = 200 if backend.name == "numba" else 24
+    gaussians = scene_of(random_gaussians(8, count, view, spread=np.sqrt(count / 200)), 1, True)
+    rasterizer = backend.rasterizer(view)
+    rasterizer.forward(gaussians, view)
+    v_planes, weight = cotangents(view, 0)
+    clean = copies(rasterizer.backward(v_planes, weight))
+    (v_planes if what == "v_planes" else weight)[..., 70, 10] = value
+    found = rasterizer.backward(v_planes, weight)
+    pixels, _ = geometry.project(view, gaussians.means.astype(np.float64))
+    reach = 4 * gaussians.scales.max(1) / gaussians.means[:, 2] * 144.2 + 2
+    away = np.abs(pixels - [10, 70]).max(1) > reach + 32
+    assert 0.1 * count < away.sum() < 0.95 * count
+    for name in DERIVATIVES:
+        np.testing.assert_array_equal(getattr(found, name)[away], clean[name][away], err_msg=name)
+    assert not np.isfinite(found.contribution if what == "weight" else found.means).all()
+
+
+def test_nothing_to_draw(backend: Backend) -> None:
+    """No Gaussians at all, or none that the camera sees, also where there was something before."""
+    view = backend.camera()
+    some = scene_of(random_gaussians(2, 6, view), 2, True)
+    away = dataclasses.replace(some, means=some.means + np.array([0, 50, 0], np.float32))
+    nothing = [rows(some, np.zeros(6, bool)), away]
+    for gaussians in nothing[
+        : 1 if backend.name == "gsplat" else 2
+    ]:  # its torch stages give no gradient then
+        rasterizer = backend.rasterizer(view)
+        assert rasterizer.forward(some, view).any()
+        planes = rasterizer.forward(gaussians, view)
+        assert planes.shape == (5, view.height, view.width) and not planes.any()
+        if backend.name != "gsplat":  # it has no median
+            depths, rows_of = rasterizer.median()
+            assert not depths.any() and (rows_of == -1).all()
+        found = rasterizer.backward(*cotangents(view, 0))
+        assert found.sh_rest.shape == (len(gaussians), 8, 3)
+        assert not any(getattr(found, name).any() for name in DERIVATIVES)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 70), (33, 1), (15, 31), (16, 32), (17, 33), (17, 65), (100, 7)])
+def test_pictures_of_odd_sizes(backend: Backend, size: tuple[int, int]) -> None:
+    view = camera(*size, focal=30.0, moved=True)
+    gaussians = random_gaussians(3, min(backend.count, 25), view, spread=2.0)
+    backend.agrees(scene_of(gaussians, 1, True), view)
+
+
+# ---- repeatable; tiles; median -----------------------------------------------------------------------------
+
+WIDE = camera(width=100, height=77, focal=110.0, moved=True)  # no whole number of tiles
+SHAPE = (-(-77 // TILE_HEIGHT), -(-100 // TILE_WIDTH))
+
+
+def wide_scene(backend: Backend, seed: int = 5) -> Gaussians:
+    count = {"numba": 400, "cuda": 40, "gsplat": 60}[backend.name]
+    return with_view_dependence(random_gaussians(seed, count, WIDE, spread=0.5), 1)
+
+
+def some_tiles(seed: int) -> tuple[Bool, Bool]:
+    """A fifth of the tiles [rows, columns], and their pixels [H, W]."""
+    tiles = np.random.default_rng(seed).permutation(SHAPE[0] * SHAPE[1]).reshape(SHAPE) < 4
+    return tiles, np.kron(tiles, np.ones((TILE_HEIGHT, TILE_WIDTH), bool))[:77, :100]
+
+
+def test_a_rasterizer_used_again_gives_what_a_fresh_one_gives(backend: Backend) -> None:
+    """Other numbers of Gaussians and degrees, half of them out of sight."""
+    view = backend.camera(moved=True)
+    many = scene_of(random_gaussians(6, 5 * backend.count, view, spread=0.7), 1, True)
+    away = np.where(np.arange(len(many))[:, None] % 2, many.means, many.means + np.float32(9))
+    few = with_view_dependence(random_gaussians(7, 3, view), 3)
+    rasterizer = backend.rasterizer(view)
+    for gaussians in (few, many, dataclasses.replace(many, means=away), backend.scene(8, view), many):
+        planes = rasterizer.forward(gaussians, view).copy()
+        expected, true = backend.draw(gaussians, view)
+        np.testing.assert_array_equal(planes, expected)
+        backend.same(copies(rasterizer.backward(*cotangents(view, 0))), true)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_active_tiles_are_those_of_the_whole_drawing(backend: Backend, seed: int) -> None:
+    """What is not asked for stays, counts for nothing, and has left nothing behind from before."""
+    gaussians, before = wide_scene(backend), random_gaussians(9, backend.count, WIDE, spread=0.5)
+    tiles, drawn = some_tiles(seed)
+    v_planes, weight = cotangents(WIDE, seed)
+    whole, part = backend.rasterizer(WIDE), backend.rasterizer(WIDE)
+    everything = whole.forward(gaussians, WIDE).copy()
+    if backend.name == "numba":
+        whole.backward(v_planes, weight)  # its pairs hold gradients of tiles that are then passed over
+    expected = copies(whole.backward(np.where(drawn, v_planes, 0), np.where(drawn, weight, 0)))
+    old = part.forward(before, WIDE).copy()
+    medians = []
+    if backend.name != "gsplat":
+        medians = [[array.copy() for array in rasterizer.median()] for rasterizer in (whole, part)]
+    planes = part.forward(gaussians, WIDE, tiles).copy()
+    np.testing.assert_array_equal(planes, np.where(drawn, everything, old))
+    found = copies(part.backward(v_planes, weight))
+    backend.same(found, expected)
+    untouched = int((found["contribution"] == 0).sum())
+    assert 2 < untouched < len(gaussians) - 2
+    if medians:
+        for now, all_of_it, then in zip(part.median(), *medians, strict=True):
+            np.testing.assert_array_equal(now, np.where(drawn, all_of_it, then))
+
+
+def test_tiles_agree_with_the_twin(backend: Backend) -> None:
+    gaussians = rows(wide_scene(backend), slice(80))
+    tiles, drawn = some_tiles(3)
+    v_planes, weight = cotangents(WIDE, 0)
+    rasterizer = backend.rasterizer(WIDE)
+    rasterizer.forward(random_gaussians(9, 10, WIDE, spread=0.5), WIDE)
+    planes = rasterizer.forward(gaussians, WIDE, tiles).copy()
+    true = truth(gaussians, WIDE, given=(np.where(drawn, v_planes, 0), np.where(drawn, weight, 0)))
+    planes = np.where(drawn, planes, true.planes)  # elsewhere is what was there before
+    true.check(planes, copies(rasterizer.backward(v_planes, weight)))
+
+
+@ours
+def test_without_active_tiles_nothing_happens(backend: Backend) -> None:
+    rasterizer = backend.rasterizer(WIDE)
+    before = rasterizer.forward(wide_scene(backend), WIDE).copy()
+    others, nothing = random_gaussians(9, 12, WIDE), np.zeros(SHAPE, bool)
+    np.testing.assert_array_equal(rasterizer.forward(others, WIDE, nothing), before)
+    for name, found in copies(rasterizer.backward(*cotangents(WIDE, 0))).items():
+        assert not found.any(), name
+
+
+@ours
+def test_pairs_are_made_for_active_tiles_only_and_too_many_are_refused(
+    backend: Backend, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Room for half of the Gaussians is enough for one of 28 tiles; the CPU reserves it in blocks."""
+    count = 5000 if backend.name == "numba" else 40
+    gaussians, tiles = random_gaussians(5, count, WIDE, spread=0.1), np.zeros(SHAPE, bool)
+    tiles[0, 2] = True
+    rasterizer = backend.rasterizer(WIDE)
+    rasterizer.forward(gaussians, WIDE)
+    module = importlib.import_module(backend.module)
+    monkeypatch.setattr(module, "MAX_PAIRS", count // 2)
+    rasterizer.forward(gaussians, WIDE, tiles)
+    with pytest.raises(SagsError, match=rf"pairs, the limit is {module.MAX_PAIRS}: .* draw fewer"):
+        rasterizer.forward(gaussians, WIDE)
+
+
+@ours
+def test_median_agrees_with_the_twin(backend: Backend) -> None:
+    """A pixel whose transmittance passes 1/2 by less than rounding may name the next Gaussian: transmittances
+    are off by 1e-5 of themselves, so this is one pixel in 100,000."""
+    gaussians = random_gaussians(5, len(wide_scene(backend)), WIDE)
+    results = []
+    for name in (backend.name, "reference"):
+        rasterizer = make_rasterizer(name, WIDE.width, WIDE.height)
+        rasterizer.forward(gaussians, WIDE)
+        results.append(rasterizer.median())
+    (depths, found), (true_depths, true) = results
+    assert 0.2 < (true >= 0).mean() < 0.99
+    assert np.count_nonzero(found != true) <= 2
+    same = found == true
+    np.testing.assert_allclose(depths[same], true_depths[same], rtol=after(8))
+    assert not depths[found < 0].any()
+
+
+@ours
+def test_median_is_the_surface_that_is_seen(backend: Backend) -> None:
+    """Behind a thin veil the wall, in front of it the veil if that is dense enough."""
+    view = camera(48, 40)
+    two = random_gaussians(0, 2, view)
+    two.means[:] = geometry.unproject(view, np.full((2, 2), [20.0, 18.0]), np.array([0.05, 0.08]))
+    two.scales[:] = 0.01
+    for veil, row in ((0.45, 1), (0.55, 0)):
+        two.opacities[:] = [veil, 0.9]
+        rasterizer = backend.rasterizer(view)
+        rasterizer.forward(two, view)
+        depths, rows_of = rasterizer.median()
+        assert rows_of[18, 20] == row
+        assert depths[18, 20] == pytest.approx([0.05, 0.08][row], rel=after(8))
