@@ -74,7 +74,7 @@ class Check:
     name: str
     level: Level
     found: str
-    mend: str = ""
+    fix: str = ""
 
 
 def examine(config: LaunchConfig) -> list[Check]:
@@ -104,7 +104,7 @@ def _launched(config: LaunchConfig) -> list[Check]:
     source, robot, vision = config.source, config.robot, config.vision
     checks = []
     if isinstance(source, RecordedSource) and not isinstance(source, PhantomSource):
-        checks += [Check("source", each.level, each.what, each.mend) for each in played(config)]
+        checks += [Check("source", each.level, each.what, each.fix) for each in played(config)]
     if isinstance(source, V4l2Source):
         right = () if source.right is None or source.geometry.layout != "separate" else (source.right,)
         checks += [_device(path) for path in (source.left, *right)]
@@ -208,12 +208,12 @@ def _cores(root: Path = host.ROOT) -> Check:
     if quota is not None:
         found += f"; the time of {quota:.3g} granted"
     if cores < CORES:
-        mend = "camera rate needs two cores" + "; give this process more (taskset, cpuset)" * (cores < there)
-        return Check("CPU", "warning", found, mend)
+        fix = "camera rate needs two cores" + "; give this process more (taskset, cpuset)" * (cores < there)
+        return Check("CPU", "warning", found, fix)
     if quota is not None and quota < min(cores, CORES):
         # Threads use the quota up at once, and then all of them stand still until the next period.
-        mend = "give the container or unit two cores or more (CPUQuota=, --cpus), or none to share"
-        return Check("CPU", "warning", found, mend)
+        fix = "give the container or unit two cores or more (CPUQuota=, --cpus), or none to share"
+        return Check("CPU", "warning", found, fix)
     return Check("CPU", "ok", found)
 
 
@@ -235,8 +235,8 @@ def _memory(root: Path = host.ROOT) -> Check:
     swapped = f"{used / 1e9:.1f} of {swap / 1e9:.1f} GB swap used" if swap else "no swap"
     found = f"{free / 1e9:.1f} GB free, {swapped}"
     if free < ENOUGH_MEMORY or used > free:  # it would not all fit, were it needed again
-        mend = "close other programs" + ": what is swapped out misses frames" * bool(swap)
-        return Check("memory", "warning", found, mend)
+        fix = "close other programs" + ": what is swapped out misses frames" * bool(swap)
+        return Check("memory", "warning", found, fix)
     return Check("memory", "ok", found)
 
 
@@ -248,7 +248,7 @@ def check_gpu(config: LaunchConfig) -> Check:
     if found.kind == "cuda":
         return Check("GPU", "ok", f"{found.name}: draws what the CPU draws")
     level: Level = "error" if config.device == "cuda" else "warning" if has_gpu() else "ok"
-    return Check("GPU", level, f"not used: {found.reason}", found.mend if level != "ok" else "")
+    return Check("GPU", level, f"not used: {found.reason}", found.fix if level != "ok" else "")
 
 
 def _gsplat(config: LaunchConfig) -> list[Check]:
@@ -296,8 +296,8 @@ def _port(endpoint: str, config: Guarded, section: str = "publish") -> Check:
             return Check(endpoint, "ok", "free")
         except (OSError, ValueError, OverflowError) as error:  # taken, not a number, not a port
             keys = "publish.data and publish.control" if section == "publish" else f"{section}.endpoint"
-            mend = f"stop the other node, or set {keys} to another port"
-            return Check(endpoint, "warning", str(error), mend)
+            fix = f"stop the other node, or set {keys} to another port"
+            return Check(endpoint, "warning", str(error), fix)
 
 
 def _keys(config: PublishConfig) -> list[Check]:
@@ -331,8 +331,8 @@ def _clock() -> Check:
     by = ", ".join(sorted(_running() & TIME_KEEPERS)) or "no program here"
     timex = _Timex()
     if ctypes.CDLL(None).adjtimex(ctypes.byref(timex)) in (-1, TIME_ERROR):
-        mend = "to compare stamps with other machines': sudo apt-get install chrony"
-        return Check("clock", "ok", f"kept by {by}; not synchronised", mend)
+        fix = "to compare stamps with other machines': sudo apt-get install chrony"
+        return Check("clock", "ok", f"kept by {by}; not synchronised", fix)
     return Check("clock", "ok", f"kept by {by}; synchronised to within {timex.maxerror * 1e-3:.0f} ms")
 
 
@@ -357,8 +357,8 @@ def _gstreamer(config: LaunchConfig) -> Check:
     wanted: Level = "error" if isinstance(config.source, GstSource) else "ok"
     if ctypes.util.find_library("gstapp-1.0") is None:
         packages = " ".join(sorted(name for name in set(ELEMENTS.values()) if " " not in name))
-        mend = f"for source.kind gst: sudo apt-get install gstreamer1.0-tools {packages}"
-        return Check("GStreamer", wanted, "not installed", mend)
+        fix = f"for source.kind gst: sudo apt-get install gstreamer1.0-tools {packages}"
+        return Check("GStreamer", wanted, "not installed", fix)
     try:
         version, missing = installed()
     except SagsError as error:
@@ -366,8 +366,8 @@ def _gstreamer(config: LaunchConfig) -> Check:
     if not missing:
         return Check("GStreamer", "ok", version)
     without = ", ".join(missing)
-    mend = "; ".join(f"{name}: {package}" for name, package in missing.items())
-    return Check("GStreamer", "ok", f"{version}, without {without}", mend)
+    fix = "; ".join(f"{name}: {package}" for name, package in missing.items())
+    return Check("GStreamer", "ok", f"{version}, without {without}", fix)
 
 
 def _recordings() -> Check:
@@ -376,5 +376,5 @@ def _recordings() -> Check:
         return Check("SAGS_DATA", "ok", "not set: launch files look in ../shared/data beside the checkout")
     if Path(folder).is_dir():
         return Check("SAGS_DATA", "ok", folder)
-    mend = "set it to the folder of your recordings; without any, sags run plays the phantom"
-    return Check("SAGS_DATA", "warning", f"{folder} is no folder", mend)
+    fix = "set it to the folder of your recordings; without any, sags run plays the phantom"
+    return Check("SAGS_DATA", "warning", f"{folder} is no folder", fix)

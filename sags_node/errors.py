@@ -6,7 +6,7 @@ from reprlib import Repr
 
 
 class SagsError(Exception):
-    """Something failed: says what is wrong, where, and how to mend it. Exit code 1."""
+    """Something failed: says what is wrong, where, and how to fix it. Exit code 1."""
 
     exit_code = 1
 

@@ -285,7 +285,7 @@ class Finding(NamedTuple):
     """Something a person should know of: a warning."""
 
     code: str  # stable, e.g. right_eye_dark; explained in docs/warnings.md
-    text: str  # what is wrong and how to mend it
+    text: str  # what is wrong and how to fix it
 
 
 @dataclass(frozen=True, slots=True)

@@ -62,11 +62,11 @@ def test_a_quota_below_two_cores_is_said(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(os, "cpu_count", lambda: 8)
     files = {"proc__self__cgroup": "0::/\n", "sys__fs__cgroup__cpu.max": "150000 100000\n"}
     found = doctor._cores(made(tmp_path, **files))
-    assert found.level == "warning" and "CPUQuota" in found.mend
+    assert found.level == "warning" and "CPUQuota" in found.fix
     assert "the machine has 8" in found.found and "time of 1.5" in found.found
     assert doctor._cores(made(tmp_path, **{"sys__fs__cgroup__cpu.max": "200000 100000\n"})).level == "ok"
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0})
-    assert "cpuset" in doctor._cores(tmp_path / "nothing").mend
+    assert "cpuset" in doctor._cores(tmp_path / "nothing").fix
 
 
 @pytest.mark.parametrize(
@@ -84,7 +84,7 @@ def test_governors(governor: str, driver: str, level: str, said: str, tmp_path: 
     files = {f"{folder}scaling_governor": f"{governor}\n", f"{folder}scaling_driver": f"{driver}\n"}
     found = doctor._governor(made(tmp_path, **files))
     assert (found.level, found.found) == (level, said)
-    assert bool(found.mend) == (governor != "performance")
+    assert bool(found.fix) == (governor != "performance")
 
 
 @pytest.mark.parametrize(
@@ -101,4 +101,4 @@ def test_memory(free: int, swap: int, unused: int, level: str, said: str, tmp_pa
     lines = "".join(f"{name}:  {amount * 10**9 // 1024} kB\n" for name, amount in amounts.items())
     found = doctor._memory(made(tmp_path, proc__meminfo=f"{lines}HugePages_Total:  0\n"))
     assert found.level == level and said in found.found
-    assert bool(found.mend) == (level == "warning")
+    assert bool(found.fix) == (level == "warning")

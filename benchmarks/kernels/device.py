@@ -46,7 +46,7 @@ def measure_device_kernels(settings: DeviceSettings, advance: Advance) -> dict[s
     """
     found = find_gpu()
     if found.kind == "cpu":
-        raise UsageError(f"--device cuda cannot be used: {found.reason}; {found.mend}, or leave it out")
+        raise UsageError(f"--device cuda cannot be used: {found.reason}; {found.fix}, or leave it out")
     device = default_device()
     interpreted = device.type == "cpu"
     if interpreted and settings.counts != QUICK.counts:

@@ -59,7 +59,7 @@ class DeviceDrawing:
 
     def forward_backward(self) -> DeviceGradients:
         self.forward()
-        return self.rasterizer.pull_back(self.v_planes, self._weight)
+        return self.rasterizer.backward_pass(self.v_planes, self._weight)
 
 
 def measure_device_rasterizer(

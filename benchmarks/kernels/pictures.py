@@ -25,7 +25,7 @@ STAGES: Stages = {
     (Dissimilarity, "forward"): "SSIM",
     (Dissimilarity, "backward"): "SSIM backward",
     (photometric, "add_total_variation"): "total variation",
-    (photometric_kernels, "pull_back"): "pull back",
+    (photometric_kernels, "backward_pass"): "pull back",
 }
 WITH_SSIM = LossWeights(color=0.8, similarity=0.2)
 WITHOUT_SSIM = LossWeights()
@@ -65,7 +65,7 @@ def measure_losses(
         "SSIM": Work(4 * SSIM_FLOATS * pixels, SSIM_OPERATIONS * pixels),
         "SSIM backward": Work(4 * SSIM_BACKWARD_FLOATS * pixels, SSIM_BACKWARD_OPERATIONS * pixels),
         "total variation": Work(TOTAL_VARIATIONS * touched_bytes(arguments["add_total_variation"])),
-        "pull back": Work(touched_bytes(arguments["pull_back"])),
+        "pull back": Work(touched_bytes(arguments["backward_pass"])),
     }
     photometric_ms = median_ms(lambda: photometric_loss(structural), runs)
     share = share_of_peak(photometric_ms, work, peak)

@@ -27,7 +27,7 @@ from sags_node.evaluation.provenance import machine_name, revision
 
 State = Literal["done", "failed", "refused", "no space"]
 NO_SPACE = os.strerror(errno.ENOSPC)
-WRONG_REQUEST = UsageError.exit_code  # of a recording that no further attempt can mend
+WRONG_REQUEST = UsageError.exit_code  # of a recording that no further attempt can fix
 LEAST_FREE = 1 << 20  # bytes; a file system with less is full
 TAIL = 20_000  # bytes of a log that are looked at
 LONGEST_REASON = 500  # characters

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 
 from sags_node.bridge import igtl
 from sags_node.errors import SagsError
-from sags_node.messaging.security import Seldom
+from sags_node.messaging.security import RateLimitedLog
 
 MOST_PEERS = 8
 SEND_BUFFER = 1 << 18  # bytes in the kernel: less than a picture, so that nothing old waits there
@@ -53,7 +53,7 @@ class Peers:
         self._lock = threading.Lock()
         self._peers: dict[socket.socket, _Peer] = {}
         self._greeting: tuple[str, bytes] | None = None
-        self._seldom = Seldom()
+        self._seldom = RateLimitedLog()
         try:
             family = socket.AF_INET6 if ":" in host else socket.AF_INET
             self._listener = socket.create_server((host, port), family=family, backlog=MOST_PEERS)

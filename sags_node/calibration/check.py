@@ -125,13 +125,13 @@ def _wrong_size(rig: StereoRig, size: tuple[int, int]) -> Finding:
     ratio = size[0] / calibrated[0]
     what = f"the calibration is for {size_text(*calibrated)} px, the pictures are {size_text(*size)}"
     if ratio != size[1] / calibrated[1]:
-        mend = "the pictures have another shape (cropped?): calibrate with pictures as they come now"
-        return Finding("error", what, mend)
-    mend = (
+        fix = "the pictures have another shape (cropped?): calibrate with pictures as they come now"
+        return Finding("error", what, fix)
+    fix = (
         f"calibrate at {size_text(*size)}, or if the pictures are only resized, not cropped: "
         f"sags calib convert PATH -o FOLDER --scale {ratio:g}"
     )
-    return Finding("error", f"{what}, {ratio:.3g} times as large", mend, {"scale": ratio})
+    return Finding("error", f"{what}, {ratio:.3g} times as large", fix, {"scale": ratio})
 
 
 def _check_rows(rig: StereoRig, pairs: Sequence[Pair], rows: Rows) -> Finding:
@@ -152,9 +152,9 @@ def _check_rows(rig: StereoRig, pairs: Sequence[Pair], rows: Rows) -> Finding:
     what = f"rows agree to {median:.2f} px (median), {p90:.2f} px (90 %), over {matched:.0%} of the picture"
     if median <= GOOD_ROWS[0] and p90 <= GOOD_ROWS[1]:
         return Finding("ok", what, "", figures)
-    mend = "depth suffers: calibrate again, with the scope as it is used"
+    fix = "depth suffers: calibrate again, with the scope as it is used"
     if rows.scale_differs:  # that is said next, and what is left is no turn
-        return Finding("warning", what, mend, figures)
+        return Finding("warning", what, fix, figures)
     pitch, roll = rows.turn
     lower = float(np.median(rows.errors))
     turned = (
@@ -162,4 +162,4 @@ def _check_rows(rig: StereoRig, pairs: Sequence[Pair], rows: Rows) -> Finding:
         f"right one's principal point lay {abs(lower):.1f} px {'lower' if lower > 0 else 'higher'}"
     )
     turn = {"pitch_deg": pitch, "roll_deg": roll, "row_offset_px": round(lower, 3)}
-    return Finding("warning", what + turned, mend, figures | turn)
+    return Finding("warning", what + turned, fix, figures | turn)

@@ -65,12 +65,12 @@ def judge_known_depths(rig: StereoRig, matches: Sequence[F64], depths: Sequence[
     )
     if abs(free - offset) > NOTICED:
         what += f"; a baseline longer by {scale - 1:.1%} and {free:+.2f} px fit as well"
-    mended = rig.right.K[0, 2] - offset
-    mend = (
+    fixed = rig.right.K[0, 2] - offset
+    fix = (
         "calibrate again with a board near and far; or, if the known depths are not from these pictures "
-        f"(say, structured light or CT), set cx in camera_matrix of right.yaml to {mended:.2f}"
+        f"(say, structured light or CT), set cx in camera_matrix of right.yaml to {fixed:.2f}"
     )
-    return [Finding("warning", what, mend, figures)]
+    return [Finding("warning", what, fix, figures)]
 
 
 def _disparities(rig: StereoRig, matches: F64, depth: F32) -> F64:

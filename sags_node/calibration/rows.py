@@ -25,7 +25,7 @@ CLEARLY_PX = 0.3  # px: a reading that is worse by more does not fit
 WRONG_MATCH = 4.0  # times the median distance from the median row error
 LEAST_SCALE = 0.004  # between the eyes: beyond it depth leans by more than matching errs
 SURE_SCALE = 4.0  # times its standard error
-EXPLAINED = 0.7  # px: where turn and scale leave more, the lenses are off too, and no scale mends depth
+EXPLAINED = 0.7  # px: where turn and scale leave more, the lenses are off too, and no scale fixes depth
 ROUNDS = 10
 PICTURES_SWAPPED = "the pictures are swapped: the left ones come from the right camera"
 PLAUSIBLE_DEPTH = (0.005, 1.0)  # m, the median: in an endoscope's view
@@ -56,7 +56,7 @@ class Reading:
 
     rows: Rows
     what: str
-    mend: str
+    fix: str
 
 
 def rectified_rows(rig: StereoRig, matches: F64) -> Rows:
@@ -90,13 +90,13 @@ def judge_matches(rig: StereoRig, matches: F64) -> list[Finding]:
         if named.what == PICTURES_SWAPPED and as_is.rows.median <= enough:
             return [_swapped_or_shifted(as_is.rows)]
         if named is not as_is or _signed_baseline(rig) < 0:
-            return [Finding("error", named.what, named.mend, _figures(named.rows))]
+            return [Finding("error", named.what, named.fix, _figures(named.rows))]
     if as_is.rows.median > limit:
         return [_rows_differ(as_is.rows)]
     if as_is.rows.in_front < IN_FRONT:
         what = f"only {as_is.rows.in_front:.0%} of the points lie in front of both eyes"
-        mend = "the calibration is not of these pictures, or they show no stereo pair"
-        return [Finding("error", what, mend, _figures(as_is.rows))]
+        fix = "the calibration is not of these pictures, or they show no stereo pair"
+        return [Finding("error", what, fix, _figures(as_is.rows))]
     return _depth(rig, as_is.rows)
 
 
@@ -145,11 +145,11 @@ def _swapped_or_shifted(rows: Rows) -> Finding:
         f"{PICTURES_SWAPPED}; or their principal points differ by at least {shift:.0f} px more than the "
         "calibration says"
     )
-    mend = (
+    fix = (
         "cover the left eye's lens: if the right picture goes dark, exchange left and right of the source; "
         "if not, calibrate again with pictures as they come now"
     )
-    return Finding("error", what, mend, _figures(rows))
+    return Finding("error", what, fix, _figures(rows))
 
 
 def _other_size(rig: StereoRig, factor: float) -> StereoRig:
@@ -189,10 +189,10 @@ def judge_scale(rig: StereoRig, rows: Rows) -> list[Finding]:
         f"{_scale_said(rows)}. If its columns are like its rows, depth leans by {abs(leans):.1f} mm in "
         f"100 px at {depth * 1e3:.0f} mm, too {'near' if leans > 0 else 'far'} on the right"
     )
-    mend = "calibrate again with zoom, focus and picture size as they are used, and the board up to the edges"
+    fix = "calibrate again with zoom, focus and picture size as they are used, and the board up to the edges"
     if rows.left_over <= EXPLAINED:
         fx, fy = (rig.right.K[k, k] * (1 + rows.scale) for k in (0, 1))
-        mend += f"; until then set fx to {fx:.2f} and fy to {fy:.2f} in camera_matrix of right.yaml"
+        fix += f"; until then set fx to {fx:.2f} and fy to {fy:.2f} in camera_matrix of right.yaml"
     else:
         what += f". Rows are still off by {rows.left_over:.1f} px then: the distortion is wrong, too"
     figures = {
@@ -201,7 +201,7 @@ def judge_scale(rig: StereoRig, rows: Rows) -> list[Finding]:
         "rows_left_over_px": round(rows.left_over, 3),
         "leans_mm_per_100_px": round(float(leans), 3),
     }
-    return [Finding("warning", what, mend, figures)]
+    return [Finding("warning", what, fix, figures)]
 
 
 def _scale_said(rows: Rows) -> str:
@@ -223,8 +223,8 @@ def _rows_differ(rows: Rows) -> Finding:
     if rows.scale_differs:
         what += f"; {_scale_said(rows)}"
         figures["scale"] = round(rows.scale, 4)
-    mend = "the calibration is not of these pictures (another scope, zoom or focus): calibrate again"
-    return Finding("error", what, mend, figures)
+    fix = "the calibration is not of these pictures (another scope, zoom or focus): calibrate again"
+    return Finding("error", what, fix, figures)
 
 
 def _turn(errors: F64, left: F64) -> tuple[tuple[float, float], float, float, float]:
@@ -250,10 +250,8 @@ def _depth(rig: StereoRig, rows: Rows) -> list[Finding]:
     if not PLAUSIBLE_DEPTH[0] <= depth <= PLAUSIBLE_DEPTH[1]:
         what = f"points would lie at {depth:.3g} m (median); an endoscope sees 0.005 to 1 m"
         thousandth = PLAUSIBLE_DEPTH[0] <= depth / 1000 <= PLAUSIBLE_DEPTH[1]
-        mend = (
-            "the calibration is in millimetres: divide by 1000, or --unit mm" if thousandth else RECALIBRATE
-        )
-        return [Finding("error", what, mend, figures)]
+        fix = "the calibration is in millimetres: divide by 1000, or --unit mm" if thousandth else RECALIBRATE
+        return [Finding("error", what, fix, figures)]
     per_pixel = depth**2 / (rig.left.P[0, 0] * _signed_baseline(rig))
     what = (
         f"the pictures' points lie in front of both eyes, at {depth * 1e3:.0f} mm; matches cannot show "

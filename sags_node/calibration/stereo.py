@@ -115,9 +115,7 @@ def report_table(summary: dict[str, Any]) -> Table:
     for hint in summary["hints"]:
         made.add_row("to improve", hint)
     for finding in summary["findings"]:
-        made.add_row(
-            f"check: {finding['level']}", "; ".join(filter(None, (finding["what"], finding["mend"])))
-        )
+        made.add_row(f"check: {finding['level']}", "; ".join(filter(None, (finding["what"], finding["fix"]))))
     return made
 
 

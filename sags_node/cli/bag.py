@@ -1,4 +1,4 @@
-"""`sags bag`: record what a node publishes, look at recordings, mend them and play them again."""
+"""`sags bag`: record what a node publishes, look at recordings, fix them and play them again."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def record(
 
     Leaves a rosbag2 folder: MCAP files that Foxglove, PlotJuggler and `ros2 bag` open, and metadata.yaml.
     Calibration and parameters are attached. Messages that the disk was too slow for are counted as dropped,
-    those that never arrived as lost. A killed recorder's file is mended by `sags bag recover`.
+    those that never arrived as lost. A killed recorder's file is fixed by `sags bag recover`.
 
     \b
     sags bag record -o out/case1 --compression jpeg

@@ -135,10 +135,10 @@ def check(
             path, session, images, overrides_only, size, UNITS.get(unit or ""), advance
         )
     rows = [asdict(finding) for finding in findings]
-    people = [{key: row[key] for key in ("level", "what", "mend")} for row in rows]
+    people = [{key: row[key] for key in ("level", "what", "fix")} for row in rows]
     show(rows if json_out else text.rows_table(people))
     if any(finding.level == "error" for finding in findings):
-        raise SagsError(f"{path} cannot be used as it is; see the mends above")
+        raise SagsError(f"{path} cannot be used as it is; see the fixes above")
 
 
 @calib.command()

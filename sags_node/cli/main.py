@@ -299,7 +299,7 @@ def doctor(launch: tuple[str, ...], json_out: bool) -> None:
     rows = as_rows(checks)
     show(rows if json_out else text.rows_table(rows))
     if any(check.level == "error" for check in checks):
-        raise SagsError("something the node needs is missing; see the mends above")
+        raise SagsError("something the node needs is missing; see the fixes above")
 
 
 @main.command("import")
@@ -315,7 +315,7 @@ def doctor(launch: tuple[str, ...], json_out: bool) -> None:
 def import_folder(folder: Path, json_out: bool) -> None:
     """Say what a folder is, and what is odd in it.
 
-    Each thing that is odd or missing comes with its mend. Looked at are layout, counts and gaps, sizes, black
+    Each thing that is odd or missing comes with its fix. Looked at are layout, counts and gaps, sizes, black
     borders, interlacing, order of the eyes and rows, mask polarity, unit of depth, and the calibration
     against the pictures. Exit code 1: it cannot be played as it is.
 
@@ -328,10 +328,10 @@ def import_folder(folder: Path, json_out: bool) -> None:
 
     findings = look_over(folder)
     rows = [asdict(finding) for finding in findings]
-    people = [{key: row[key] for key in ("level", "what", "mend")} for row in rows]
+    people = [{key: row[key] for key in ("level", "what", "fix")} for row in rows]
     show(rows if json_out else text.rows_table(people))
     if any(finding.level == "error" for finding in findings):
-        raise SagsError(f"{folder} cannot be played as it is; see the mends above")
+        raise SagsError(f"{folder} cannot be played as it is; see the fixes above")
 
 
 @main.command("bench", hidden=True, context_settings={"ignore_unknown_options": True})

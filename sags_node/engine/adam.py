@@ -61,11 +61,11 @@ def _step_row(
 def _step(
     values: F32, gradients: F32, moments: F32, shares: F32, rates: F32, rows: Any,
     move_m: Any, move_v: Any, eps: Any,
-    mended: Bool,  # [K] written
+    fixed: Bool,  # [K] written
 ) -> None:  # fmt: skip
     for k in numba.prange(rows.size):
         row = rows[k]
-        mended[k] = _step_row(
+        fixed[k] = _step_row(
             values[row], gradients[row], moments[row], shares[row], rates, move_m, move_v, eps
         )
 
@@ -122,7 +122,7 @@ def adam_step(
         raise ValueError(f"rates {rates.shape} and eps {eps}: expected ({columns},) and a positive number")
     if rows is None:
         rows = np.arange(count)
-    mended = np.empty(len(rows), np.bool_)
+    fixed = np.empty(len(rows), np.bool_)
     _step(
         values,
         read_only(gradients),
@@ -133,6 +133,6 @@ def adam_step(
         f4(1 - betas[0]),
         f4(1 - betas[1]),
         f4(eps),
-        mended,
+        fixed,
     )
-    return int(np.count_nonzero(mended))
+    return int(np.count_nonzero(fixed))

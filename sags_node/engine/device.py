@@ -21,12 +21,12 @@ from sags_node.errors import UsageError
 
 @dataclass(frozen=True, slots=True)
 class Device:
-    """What was chosen; of the CPU, why it is not a GPU and how to mend that."""
+    """What was chosen; of the CPU, why it is not a GPU and how to fix that."""
 
     kind: Literal["cpu", "cuda"]
     name: str
     reason: str = ""
-    mend: str = ""
+    fix: str = ""
 
 
 def choose_device(wanted: DeviceName) -> Device:
@@ -41,7 +41,7 @@ def choose_device(wanted: DeviceName) -> Device:
         return Device("cpu", "the CPU", "TRITON_INTERPRET is set, for tests of kernels", "unset it")
     found = find_gpu()
     if wanted == "cuda" and found.kind == "cpu":
-        raise UsageError(f"device: cuda cannot be used: {found.reason}; {found.mend}, or set device:=cpu")
+        raise UsageError(f"device: cuda cannot be used: {found.reason}; {found.fix}, or set device:=cpu")
     return found
 
 
@@ -58,7 +58,7 @@ def find_gpu() -> Device:
 
         return Device("cuda", probe())
     except UnusableError as error:
-        return Device("cpu", "the CPU", error.reason, error.mend)
+        return Device("cpu", "the CPU", error.reason, error.fix)
 
 
 def has_gpu() -> bool:

@@ -8,8 +8,8 @@ class DeviceMemoryError(SagsError):
 
 
 class UnusableError(Exception):
-    """Why no GPU can be used, and how to mend it."""
+    """Why no GPU can be used, and how to fix it."""
 
-    def __init__(self, reason: str, mend: str) -> None:
+    def __init__(self, reason: str, fix: str) -> None:
         super().__init__(reason)
-        self.reason, self.mend = reason, mend
+        self.reason, self.fix = reason, fix

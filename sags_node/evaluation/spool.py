@@ -50,7 +50,7 @@ class RunFacts:
     gaussians: int
     counts: dict[str, int]  # inserted, removed, iterations, ...
     rung: int | None = None  # of the ladder of quality; None: fixed steps
-    warnings: dict[str, str] = field(default_factory=dict)  # code -> what is wrong and how to mend it
+    warnings: dict[str, str] = field(default_factory=dict)  # code -> what is wrong and how to fix it
 
 
 @dataclass(frozen=True, slots=True)

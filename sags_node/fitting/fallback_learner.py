@@ -57,8 +57,8 @@ class FallbackLearner:
     def learn_paths(self, slot: int, picked: I64, rates: FieldRates) -> None:
         self._do(lambda learner: learner.learn_paths(slot, picked, rates))
 
-    def give_back(self) -> None:
-        self._do(lambda learner: learner.give_back())
+    def download(self) -> None:
+        self._do(lambda learner: learner.download())
 
     def _do(self, work: Callable[[Learner], Result]) -> Result:
         if self._working is not self._cpu:
@@ -82,7 +82,7 @@ class FallbackLearner:
             )
             log.warning("%s", self.problem)
             log.info("the GPU's memory", exc_info=error)
-        self._working.give_back()
+        self._working.download()
         self._working = self._cpu
         release_memory()
         return work(self._cpu)

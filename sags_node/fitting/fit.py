@@ -23,7 +23,7 @@ from sags_node.fitting.field import make_box, make_deltas, make_field, marked, r
 from sags_node.fitting.learner import DeviceKind
 from sags_node.fitting.settings import FitSettings
 from sags_node.fitting.start import Progress, follow_online, learn_paths, pooled_rows, remainder
-from sags_node.mapping.optimiser import COLOUR_RELAXATION, Rates
+from sags_node.mapping.optimiser import COLOUR_RELAXATION, LearningRates
 from sags_node.model import columns
 from sags_node.model.deformable import DeformableModel
 from sags_node.model.exposure import Exposure
@@ -32,7 +32,7 @@ from sags_node.model.hexplane import HexPlaneField
 from sags_node.model.residuals import Residuals
 from sags_node.types import F32, Gaussians
 
-REFINE_RATES = Rates()  # the mapper's, gentle: the start is good
+REFINE_RATES = LearningRates()  # the mapper's, gentle: the start is good
 REFINE_FIELD_SHARE = 0.003  # of the field's rates, which are for learning from nothing
 REFINE_DECAY = 0.1
 
@@ -110,7 +110,7 @@ class Fit:
         Raises:
             SagsError: the GPU that it was on has failed.
         """
-        self._learner.give_back()
+        self._learner.download()
         return self._model
 
     @property
@@ -125,7 +125,7 @@ class Fit:
 
     @property
     def problem(self) -> str | None:
-        """What is wrong with the device, and how to mend it; None: nothing."""
+        """What is wrong with the device, and how to fix it; None: nothing."""
         return self._learner.problem
 
     @property
@@ -162,7 +162,7 @@ class Fit:
         self.iteration += 1
         growth = self.settings.growth
         if self.iteration % growth.every == 0 and self._progress() < growth.until:
-            self._learner.give_back()
+            self._learner.download()
             pruned, split = self._density.adapt(self._rng)
             self.pruned, self.split = self.pruned + pruned, self.split + split
 

@@ -26,7 +26,7 @@ class Learner(Protocol):
     """Improves a model, frame by frame, or a field, path by path.
 
     What it was given with `begin` or `begin_paths` is its own from the next step on: the host's arrays show
-    what was learnt only after `give_back`. After that, and before the next step, they may be changed.
+    what was learnt only after `download`. After that, and before the next step, they may be changed.
     """
 
     @property
@@ -35,7 +35,7 @@ class Learner(Protocol):
 
     @property
     def problem(self) -> str | None:
-        """What is wrong with it and how to mend it; None: nothing."""
+        """What is wrong with it and how to fix it; None: nothing."""
 
     @property
     def residual(self) -> float:
@@ -68,7 +68,7 @@ class Learner(Protocol):
         """A step of the field against the mean absolute errors of the positions of some Gaussians, `picked`
         [P], at one of the paths' times."""
 
-    def give_back(self) -> None:
+    def download(self) -> None:
         """Write what was learnt into what was given.
 
         Raises:
@@ -133,5 +133,5 @@ class CpuLearner:
         field.backward(v_deformed)
         field.step(rates)
 
-    def give_back(self) -> None:
+    def download(self) -> None:
         pass

@@ -189,7 +189,7 @@ def learn_paths(
         picked = rng.choice(known, min(PATH_POINTS, len(known)), replace=False)
         learner.learn_paths(t, picked, settings.field_rates.scaled(settings.decay ** (step / PATH_STEPS)))
         progress("learning the paths", step + 1, PATH_STEPS)
-    learner.give_back()
+    learner.download()
     field.follow(rows[:, columns.MEAN])
 
 

@@ -19,14 +19,14 @@ from sags_node.sources.source import open_source
 
 
 def check_folder(folder: Path) -> list[Finding]:
-    """What a folder is, what is missing or odd, each with a way to mend it; the last says how to play it.
+    """What a folder is, what is missing or odd, each with a way to fix it; the last says how to play it.
 
     Raises:
         UsageError: it is no folder.
     """
     contents = recognise(folder)
-    mend = "" if contents.level == "ok" else contents.play
-    found = [Finding(contents.level, f"{folder.name or folder} is {contents.what}", mend)]
+    fix = "" if contents.level == "ok" else contents.play
+    found = [Finding(contents.level, f"{folder.name or folder} is {contents.what}", fix)]
     if contents.left is not None:
         found += _pictures(contents, contents.left)
     play = contents.play
@@ -40,7 +40,7 @@ def check_folder(folder: Path) -> list[Finding]:
     if contents.level == "error":
         return found
     wrong = any(finding.level == "error" for finding in found)
-    how = "when that is mended: " if wrong else ""
+    how = "when that is fixed: " if wrong else ""
     return [*found, Finding("ok", f"to play it: {how}{play}")]
 
 
@@ -111,8 +111,8 @@ def _calibration(folder: Path, contents: Contents) -> list[Finding]:
 def _calibrated(form: Path | None, read: Callable[[], Sequence[Pair]]) -> list[Finding]:
     """The calibration beside pictures, against them."""
     if form is None:
-        mend = "without one there is no depth in mm: sags calib stereo makes one (docs/calibration.md)"
-        return [Finding("warning", "no calibration lies beside the pictures", mend)]
+        fix = "without one there is no depth in mm: sags calib stereo makes one (docs/calibration.md)"
+        return [Finding("warning", "no calibration lies beside the pictures", fix)]
 
     def compare() -> list[Finding]:
         pairs = read()

@@ -34,20 +34,20 @@ def check_counts(named: dict[str, Path]) -> list[Finding]:
     counts = {what: len(each) for what, each in files.items()}
     if len(set(counts.values())) > 1:
         said = ", ".join(f"{what} {count}" for what, count in counts.items())
-        found.append(Finding("error", f"not equally many pictures: {said}", _counts_mend(files)))
+        found.append(Finding("error", f"not equally many pictures: {said}", _counts_fix(files)))
     for what, each in files.items():
         numbers = [int(part[-1]) for file in each if (part := re.findall(r"\d+", file.stem))]
         steps = np.diff(numbers)
         if len(steps) and (odd := np.flatnonzero(steps != np.median(steps))).size:
             where = f"{each[odd[0]].name} and {each[odd[0] + 1].name}"
-            mend = "frames are paired by order, and played evenly: fill the gap or split the recording there"
+            fix = "frames are paired by order, and played evenly: fill the gap or split the recording there"
             found.append(
-                Finding("warning", f"{what}: {odd.size} gaps in the numbers, first between {where}", mend)
+                Finding("warning", f"{what}: {odd.size} gaps in the numbers, first between {where}", fix)
             )
     return found or [Finding("ok", f"{min(counts.values())} pictures each, numbered without gaps")]
 
 
-def _counts_mend(files: dict[str, list[Path]]) -> str:
+def _counts_fix(files: dict[str, list[Path]]) -> str:
     fewest = min(files, key=lambda what: len(files[what]))
     stems = {file.stem for file in files[fewest]}
     missing = [file.name for each in files.values() for file in each if file.stem not in stems]
@@ -87,18 +87,14 @@ def check_eye(what: str, pictures: Sequence[tuple[Path, U8]]) -> list[Finding]:
     found = []
     x, y, width, height = lit_box(np.max(gray, axis=0))
     if (width, height) != gray[0].shape[::-1]:
-        mend = (
-            f"set source.geometry.crop:=[{x},{y},{width},{height}] (videos, cameras) or cut both eyes alike"
-        )
+        fix = f"set source.geometry.crop:=[{x},{y},{width},{height}] (videos, cameras) or cut both eyes alike"
         what_is = f"{what}: black borders; the picture is {size_text(width, height)} px at {x},{y}"
-        found.append(Finding("warning", f"{what_is}, of {size_text(*gray[0].shape[::-1])}", mend))
+        found.append(Finding("warning", f"{what_is}, of {size_text(*gray[0].shape[::-1])}", fix))
     combs = [(combing(each), combing(np.ascontiguousarray(each.T))) for each in gray]
     rows, columns = np.max([comb[0] for comb in combs]), np.median([comb[1] for comb in combs])
     if rows > COMB_SHARE and rows > COMB_RATIO * columns:
-        mend = (
-            "videos: source.geometry.deinterlace:=top or bottom; folders: deinterlace before (ffmpeg bwdif)"
-        )
-        found.append(Finding("warning", f"{what}: interlaced, {rows:.0%} of the pixels show combs", mend))
+        fix = "videos: source.geometry.deinterlace:=top or bottom; folders: deinterlace before (ffmpeg bwdif)"
+        found.append(Finding("warning", f"{what}: interlaced, {rows:.0%} of the pixels show combs", fix))
     return found or [
         Finding("ok", f"{what}: {size_text(*gray[0].shape[::-1])} px, not interlaced, no borders")
     ]
@@ -131,24 +127,24 @@ def check_eyes(left: Sequence[tuple[Path, U8]], right: Sequence[tuple[Path, U8]]
         return [Finding("error", "both eyes show the same picture", "give each eye its own pictures")]
     matches = np.concatenate([match_eyes(a, b) for a, b in pairs])
     if len(matches) < FEWEST_MATCHES:
-        mend = "are they of one moment and of one scope? Sharper pictures with more texture tell more"
-        return [Finding("warning", f"only {len(matches)} points are found in both eyes", mend)]
+        fix = "are they of one moment and of one scope? Sharper pictures with more texture tell more"
+        return [Finding("warning", f"only {len(matches)} points are found in both eyes", fix)]
     across, down = (float(np.median(matches[:, k] - matches[:, k + 2])) for k in (0, 1))
     rows = float(np.median(np.abs(matches[:, 1] - matches[:, 3])))
     figures = {"disparity_px": round(across, 2), "rows_px": round(rows, 2)}
     if np.mean(matches[:, 0] < matches[:, 2]) > 0.8:
-        mend = (
+        fix = (
             "exchange left and right, unless each picture was cut out elsewhere (then calibrate as they are)"
         )
         return [
             Finding(
-                "warning", "points lie farther to the right in the right eye: eyes exchanged?", mend, figures
+                "warning", "points lie farther to the right in the right eye: eyes exchanged?", fix, figures
             )
         ]
     aligned = rows < 1 / 180 * pairs[0][0].shape[1]
     what = f"disparity {across:.1f} px, rows {'agree' if aligned else 'differ'} ({down:+.1f} px)"
-    mend = "" if aligned else "not rectified: a calibration with distortion and rectification is needed"
-    return [Finding("ok" if aligned else "warning", what, mend, figures)]
+    fix = "" if aligned else "not rectified: a calibration with distortion and rectification is needed"
+    return [Finding("ok" if aligned else "warning", what, fix, figures)]
 
 
 def check_masks(folder: Path, size: tuple[int, int], instruments: str = "white") -> list[Finding]:
@@ -164,14 +160,14 @@ def check_masks(folder: Path, size: tuple[int, int], instruments: str = "white")
         shares.append(np.mean((mask >= 128) == (instruments == "white")))
     share = float(np.median(shares))
     if share > POLARITY:
-        mend = (
+        fix = (
             f"255 must be the instrument: invert the masks, or for EndoNeRF's layout set "
             f"source.instruments:={'black' if instruments == 'white' else 'white'}"
         )
-        return [Finding("error", f"masks: {share:.0%} would be instrument: polarity the other way?", mend)]
+        return [Finding("error", f"masks: {share:.0%} would be instrument: polarity the other way?", fix)]
     if share == 0:
-        mend = "leave masks out, and tissue is found by colour (docs/networks.md)"
-        return [Finding("warning", "masks: none marks an instrument", mend)]
+        fix = "leave masks out, and tissue is found by colour (docs/networks.md)"
+        return [Finding("warning", "masks: none marks an instrument", fix)]
     return [Finding("ok", f"masks: {share:.0%} of the picture is instrument")]
 
 
@@ -204,8 +200,8 @@ def check_depth(folder: Path, size: tuple[int, int], unit: float | None = None) 
         )
     ]
     if coarse:
-        mend = "steps of a whole count: export 16 bit"
-        found.append(Finding("warning", "depth: only 8 bit", mend))
+        fix = "steps of a whole count: export 16 bit"
+        found.append(Finding("warning", "depth: only 8 bit", fix))
     return found
 
 
@@ -224,6 +220,6 @@ def _no_depth(file: Path, depth: U8, size: tuple[int, int]) -> Finding | None:
 
 
 def refused(what: str, error: SagsError) -> Finding:
-    """Errors say what is wrong, and after a semicolon how to mend it."""
-    why, _, mend = str(error).partition("; ")
-    return Finding("error", f"{what}: {why}", mend or "mend or remove that file")
+    """Errors say what is wrong, and after a semicolon how to fix it."""
+    why, _, fix = str(error).partition("; ")
+    return Finding("error", f"{what}: {why}", fix or "fix or remove that file")

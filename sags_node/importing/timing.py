@@ -46,8 +46,8 @@ class Timing:
             return []
         eye = "right" if late > 0 else "left"
         what = f"the {eye} eye is {abs(late)} frames late: it shows what the other one showed before"
-        mend = f"cut the first {abs(late)} frames off the {eye} eye's recording, or record both by one clock"
-        return [Finding("warning", what, mend, {"right_late_frames": late})]
+        fix = f"cut the first {abs(late)} frames off the {eye} eye's recording, or record both by one clock"
+        return [Finding("warning", what, fix, {"right_late_frames": late})]
 
 
 def check_timing(recording: Pairs) -> list[Finding]:

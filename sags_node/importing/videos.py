@@ -110,8 +110,8 @@ def check_ends(left: Path, right: Path, needed: int) -> list[Finding]:
         if count == video.count:
             return []
         what = f"{right.name} has {count} frames, {left.name} {video.count}"
-    mend = "were both begun at the same moment? What the left one has is played"
-    return [Finding("warning", what, mend)]
+    fix = "were both begun at the same moment? What the left one has is played"
+    return [Finding("warning", what, fix)]
 
 
 def _some(file: Path) -> list[tuple[Path, U8]]:
@@ -153,9 +153,9 @@ def _one(file: Path, shown: list[tuple[Path, U8]], rig: str) -> tuple[list[Findi
         first = " source.geometry.first:=right" if swapped and not panes else ""
         return found, f"sags run {way.launch.format(file=file, w=width // 2, h=height // 2)}{first} {rig}"
     what = f"{size_text(width, height)} px show one eye, or both in a way that was not recognised"
-    mend = "two videos or one of both eyes are needed; one camera alone needs a network (docs/networks.md)"
+    fix = "two videos or one of both eyes are needed; one camera alone needs a network (docs/networks.md)"
     try_it = f"sags calib live source.kind:=videos source.left:={file} source.geometry.layout:=side_by_side"
-    found = [Finding("warning", what, mend), *pictures.check_eye("video", shown)]
+    found = [Finding("warning", what, fix), *pictures.check_eye("video", shown)]
     return found, f"{try_it} shows what is in it"
 
 

@@ -11,7 +11,7 @@ worker keeps it from the one everybody waits for, and a frame takes up to 2.5 ti
 when its library is loaded: import this module before torch.
 
 Place: left to the system. Some schedulers pack threads that were asleep onto one core, and a drawing right
-after a pause then takes twice as long. Pinning a thread and its workers to cores of their own mends that for
+after a pause then takes twice as long. Pinning a thread and its workers to cores of their own fixes that for
 a kernel alone, but cost the whole node 5 to 25 % of its rate: its other threads want the same cores.
 
 Count: Numba keeps it per Python thread, and a new thread starts with all cores of the process.

@@ -50,7 +50,7 @@ def candidates(planes: F32, observation: Observation, phase: int) -> tuple[I32, 
     return pixels[:count], depths[:count], errors[:count]
 
 
-def doomed(model: GaussianModel, observation: Observation, limit: int) -> Bool:
+def prune_mask(model: GaussianModel, observation: Observation, limit: int) -> Bool:
     """[N] what to remove: in free space for several frames in a row, transparent or not finite; when N nears
     its `limit` also what left the view, and what lies on the visible surface without showing. What an
     instrument or other tissue hides is kept. Counts the frames in free space (`in_front`), by each measured
@@ -65,7 +65,7 @@ def doomed(model: GaussianModel, observation: Observation, limit: int) -> Bool:
     return remove
 
 
-def shed(model: GaussianModel, limit: int) -> int:
+def prune_to_budget(model: GaussianModel, limit: int) -> int:
     """While there are more than `limit`, give up some of those that show least; returns how many.
 
     The others grow by the area that is given up, so that the tissue stays covered.

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import TypeVar
 
 from sags_node.engine.cuda.failures import FAILURES, SHORTAGES, release_memory
-from sags_node.mapping.optimiser import Rates
+from sags_node.mapping.optimiser import LearningRates
 from sags_node.mapping.refiner import Refiner
 from sags_node.model.deformation import NodeDeformation
 from sags_node.model.gaussians import GaussianModel
@@ -58,8 +58,8 @@ class FallbackRefiner:
     def take(self, rows: slice) -> None:
         self._do(lambda refiner: refiner.take(rows))
 
-    def give_back(self) -> None:
-        self._do(lambda refiner: refiner.give_back())
+    def download(self) -> None:
+        self._do(lambda refiner: refiner.download())
 
     def draw(self) -> None:
         self._do(lambda refiner: refiner.draw())
@@ -70,10 +70,10 @@ class FallbackRefiner:
     def exposure_gain(self) -> F32:
         return self._do(lambda refiner: refiner.exposure_gain())
 
-    def refine(self, rates: Rates, share: float = 1.0) -> None:
+    def refine(self, rates: LearningRates, share: float = 1.0) -> None:
         self._do(lambda refiner: refiner.refine(rates, share))
 
-    def refine_worst(self, share: float, rates: Rates, nodes: bool = True) -> None:
+    def refine_worst(self, share: float, rates: LearningRates, nodes: bool = True) -> None:
         self._do(lambda refiner: refiner.refine_worst(share, rates, nodes))
 
     def touched(self) -> Bool:

@@ -83,10 +83,10 @@ class FirstViews:
         corners = cv2.goodFeaturesToTrack(observation.gray, CORNERS, CORNER_QUALITY, apart, mask=where)
         pixels = np.zeros((0, 2), np.float32) if corners is None else np.asarray(corners[:, 0], np.float32)
         points = np.asarray(unproject(observation.camera, pixels, _at(observation.depth, pixels)), np.float32)
-        return _View(camera, observation.gray, pixels, points - self._mapper.away_at(points))
+        return _View(camera, observation.gray, pixels, points - self._mapper.displacement_at(points))
 
     def _fitted(self, view: _View, observation: Observation, camera: Camera) -> F64 | None:
-        now = view.rest + self._mapper.away_at(view.rest)
+        now = view.rest + self._mapper.displacement_at(view.rest)
         expected = np.asarray(project(observation.camera, now)[0], np.float32)
         height, width = observation.gray.shape
         inside = ((expected > 0) & (expected < [width - 1, height - 1])).all(1)

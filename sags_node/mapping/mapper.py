@@ -13,9 +13,9 @@ from sags_node.mapping import densify, initialise
 from sags_node.mapping.budget import Budget
 from sags_node.mapping.depth_memory import remember
 from sags_node.mapping.focus import tile_grid, tiles_of, with_neighbours
-from sags_node.mapping.motion import depth_pull, found_again, scene_flow
+from sags_node.mapping.motion import depth_pull, scene_flow, track
 from sags_node.mapping.motion_field import MotionField
-from sags_node.mapping.optimiser import Rates
+from sags_node.mapping.optimiser import LearningRates
 from sags_node.mapping.refiner import Refiner
 from sags_node.mapping.split import split_worst
 from sags_node.model.alias_free import narrow
@@ -51,7 +51,7 @@ SETTLED_EVERY = 5  # frames: then it is refined so rarely
 FOCUS = 0.15  # of the picture; measured: half the gain of a whole step in a quarter of its time
 MIN_FIRST_DEPTHS = 200  # px
 LOST_COVERAGE = 0.3  # of the tissue
-FIRST_RATES = Rates().scaled(4.0)
+FIRST_RATES = LearningRates().scaled(4.0)
 UNHURRIED_RATES = 0.6  # measured with six steps: +0.3 dB; with one step a frame it loses as much
 NODE_STEP_PX = 0.08
 FINE_FLOW, COARSE_FLOW = 4, 6  # px between patches
@@ -162,7 +162,7 @@ class Mapper:
             frame_id=observation.frame_id,
             t_capture_ns=observation.t_capture_ns,
             step=self.step,
-            gaussians=self.model.frozen(),
+            gaussians=self.model.snapshot(),
             velocities=self.model.velocities.copy(),
             camera=observation.camera,
             loss=self._refiner.loss,
@@ -186,7 +186,7 @@ class Mapper:
     def pace(self, unhurried: bool) -> None:
         """Whether there is time for several steps a frame. They are shorter then, and the flow is finer."""
         self._flow = OpticalFlow(FINE_FLOW if unhurried else COARSE_FLOW)
-        self._rates = Rates().scaled(UNHURRIED_RATES) if unhurried else Rates()
+        self._rates = LearningRates().scaled(UNHURRIED_RATES) if unhurried else LearningRates()
 
     def remember_motion(self) -> None:
         """From now on, see `mapping.motion_field`. Any thread may call this."""
@@ -212,7 +212,7 @@ class Mapper:
         self._forget_motion()
         self.start_from(None)
 
-    def lit_from(self, camera: Camera) -> Gaussians:
+    def relight(self, camera: Camera) -> Gaussians:
         """The model as the scope's light shows it when its left eye is there; views, for drawing now."""
         gaussians, lamp = self.model.gaussians(), self._lamp
         if lamp is None or self._deformation is None or np.array_equal(lamp, camera.T_world_cam):
@@ -226,12 +226,12 @@ class Mapper:
     def _move_light(self, camera: Camera) -> None:
         """Let the colours be those that the scope's light shows from where it is now."""
         if self._lamp is None or not is_near(self._lamp, camera.T_world_cam):
-            self.model.colors[:] = self.lit_from(camera).colors
+            self.model.colors[:] = self.relight(camera).colors
             self._lamp = camera.T_world_cam
 
-    def found_again(self, observation: Observation, guess: F32 | None = None) -> F32:
+    def track(self, observation: Observation, guess: F32 | None = None) -> F32:
         """Pixels [N, 2] where the Gaussians are found in a frame that is not taken in yet, see
-        `motion.found_again`; all NaN where there is no frame before.
+        `motion.track`; all NaN where there is no frame before.
 
         Args:
             guess: [rows, columns, 2] px, of square cells over the picture, from where to search.
@@ -241,9 +241,7 @@ class Mapper:
             if self._last is not None:
                 before = self._last.observation
                 flow = self._flow(pyramid_of(before), pyramid_of(observation), guess)
-                pixels = found_again(
-                    self.model.means, self._last.view, before.tissue, flow, observation.tissue
-                )
+                pixels = track(self.model.means, self._last.view, before.tissue, flow, observation.tissue)
             self._found = observation.gray, pixels
         return self._found[1]
 
@@ -253,7 +251,7 @@ class Mapper:
             return np.zeros((len(rows), 3), np.float32)
         return self._deformation.away(self.model.node_index[rows], self.model.node_weight[rows])
 
-    def away_at(self, points: F32) -> F32:
+    def displacement_at(self, points: F32) -> F32:
         """How far [K, 3] m from where it rests the tissue at places [K, 3] is now."""
         if self._deformation is None:
             return np.zeros_like(points)
@@ -299,21 +297,24 @@ class Mapper:
             self._refiner.draw()
             self._refiner.refine(FIRST_RATES)
             self._first_steps += 1
-        self._refiner.give_back()
+        self._refiner.download()
         self._show(observation, 1.0, tile_grid(drawn.tissue))
         self.step += self._first_steps
         return {"inserted": len(pixels), "iterations": self._first_steps}
 
     def _follow(self, observation: Observation, budget: Budget) -> dict[str, int]:
         assert self._deformation is not None
+        # 1. Deform: every Gaussian goes to where flow and depth saw its tissue go.
         self._predict(observation)
         self._move_light(observation.camera)
+        # 2. Prune: what floats in front of the tissue, and what the machine does not afford.
         limit = self._limit(budget)
-        removed = self.model.remove(densify.doomed(self.model, observation, limit))
-        removed += densify.shed(self.model, limit)
+        removed = self.model.remove(densify.prune_mask(self.model, observation, limit))
+        removed += densify.prune_to_budget(self.model, limit)
         if self._smoothing:
             narrow(self.model.smoothing, self.model.means, observation.camera)
 
+        # 3. Draw, and let the colours follow a jump of the exposure.
         drawn = resized(observation, self._scale)
         self._begin(drawn)
         self._refiner.draw()
@@ -326,25 +327,28 @@ class Mapper:
         if _is_lost(planes, drawn) and self._can_start(observation):
             self.restart()
             return self._initialise(observation, budget) | {"restarted": 1}
+        # 4. Refine once on that drawing, before inserting: it serves both, since it shows the holes, too.
         pixels, depths, errors = densify.candidates(planes, drawn, phase=7 * self._frames)
         iterations = 0
-        if budget.more():  # before inserting, so that the drawing above serves both
+        if budget.more():
             self._refiner.refine(self._next_rates(), budget.first_share())
             iterations = 1
+        # 5. Densify: new Gaussians in the holes. A full model gives up what shows least for them.
         room = max(ADDED, limit - self.model.count)
         pixels, depths, errors = pixels[:room], depths[:room], errors[:room]
         lacking = min(len(pixels), HOLES) - max(0, limit - self.model.count)
-        if 0 < lacking < self.model.count:  # the view has grown: what is in it gives way
-            self._refiner.give_back()
+        if 0 < lacking < self.model.count:
+            self._refiner.download()
             removed += self.model.remove(densify.least_shown(self.model, lacking))
             self._refiner.take(self._all_rows)
         rows = initialise.insert(self.model, drawn, pixels, depths, errors, densify.GRID, self._smoothing)
         self._deformation.attach(self.model, rows)
         self._refiner.take(rows)
+        # 6. Refine where it is worst, while the frame's time lasts; then draw what is shown.
         while budget.more():
             self._refiner.refine_worst(self._focus, self._next_rates())
             iterations += 1
-        self._refiner.give_back()
+        self._refiner.download()
         self._show(observation, budget.rung.redraw, tiles_of(pixels, drawn.tissue))
         self.step += iterations
         return {"inserted": rows.stop - rows.start, "removed": removed, "iterations": iterations}
@@ -354,24 +358,24 @@ class Mapper:
         drawn = resized(observation, self._scale)
         self._begin(drawn)
         self._show(observation, 1.0, tile_grid(drawn.tissue))
-        self._refiner.give_back()
+        self._refiner.download()
         return {"inserted": 0, "removed": 0, "iterations": 0}
 
     def _touch_up(self, observation: Observation, budget: Budget, settled: bool) -> dict[str, int]:
         """Nothing moved: what was drawn last shows where steps pay, and only there the picture changes."""
-        doomed = densify.doomed(self.model, observation, self._limit(budget))
-        if np.count_nonzero(doomed) > TORN * self.model.count:
+        prune_mask = densify.prune_mask(self.model, observation, self._limit(budget))
+        if np.count_nonzero(prune_mask) > TORN * self.model.count:
             counted = replace(observation, depth_is_new=False)
             return self._follow(counted, budget)  # damage: there are holes to be filled
         self.model.velocities[:] = 0
-        removed = self.model.remove(doomed)
+        removed = self.model.remove(prune_mask)
         rests = settled and self._frames % SETTLED_EVERY > 0
         iterations = 0
         self._begin(resized(observation, self._scale))
         while not (rests or (settled and iterations)) and budget.more():
             self._refiner.refine_worst(self._focus, self._next_rates(), nodes=False)
             iterations += 1
-        self._refiner.give_back()
+        self._refiner.download()
         stale = with_neighbours(self._refiner.touched())
         if removed or self._split:
             self._show(observation, 1.0, stale)
@@ -388,7 +392,7 @@ class Mapper:
         step = NODE_STEP_PX * self._metres_per_px
         self._refiner.begin(self.model, self._deformation, observation, step)
 
-    def _next_rates(self) -> Rates:
+    def _next_rates(self) -> LearningRates:
         """Of the next step."""
         self._first_steps += 1
         return FIRST_RATES if self._first_steps <= FIRST_STEPS else self._rates
@@ -415,7 +419,7 @@ class Mapper:
         before = self._last.observation
         self._frames_to_depth += 1
         pull = depth_pull(self._frames_to_depth) if observation.depth_is_new else 0.0
-        displacements, seen = scene_flow(self.model.means, self.found_again(observation), observation, pull)
+        displacements, seen = scene_flow(self.model.means, self.track(observation), observation, pull)
         if pull and observation.depth.any():
             self._frames_to_depth = 0
         start = self.model.means.copy()

@@ -26,7 +26,7 @@ def depth_pull(frames: int) -> float:
     return float(1 - (1 - DEPTH_PULL) ** min(frames, MOST_FRAMES))
 
 
-def found_again(means: F32, before: RenderedView, tissue_before: Bool, flow: F32, tissue_after: Bool) -> F32:
+def track(means: F32, before: RenderedView, tissue_before: Bool, flow: F32, tissue_after: Bool) -> F32:
     """Where in the later picture each Gaussian of the earlier one is found.
 
     Args:
@@ -53,7 +53,7 @@ def scene_flow(means: F32, pixels: F32, after: Observation, pull: float) -> tupl
 
     Args:
         means: [N, 3] m, world, at the earlier frame.
-        pixels: [N, 2] in the later one, of `found_again`.
+        pixels: [N, 2] in the later one, of `track`.
         after: the later frame; its depth pulls the Gaussian along the ray.
         pull: by which share of the difference; see `depth_pull`.
 

@@ -16,7 +16,7 @@ from sags_node.types import F32, Camera
 
 
 @dataclass(frozen=True, slots=True)
-class Rates:
+class LearningRates:
     """Lengths of one optimiser step. Positions are in px at the Gaussian's depth, so they are scale-free."""
 
     mean_px: float = 0.08
@@ -24,8 +24,8 @@ class Rates:
     log_scale: float = 0.005
     opacity_logit: float = 0.0075
 
-    def scaled(self, factor: float) -> Rates:
-        return Rates(
+    def scaled(self, factor: float) -> LearningRates:
+        return LearningRates(
             factor * self.mean_px, factor * self.quat, factor * self.log_scale, factor * self.opacity_logit
         )
 
@@ -53,7 +53,7 @@ class Optimiser:
     def __init__(self) -> None:
         self._steps = 0
 
-    def step(self, model: GaussianModel, gradients: Gradients, camera: Camera, rates: Rates) -> None:
+    def step(self, model: GaussianModel, gradients: Gradients, camera: Camera, rates: LearningRates) -> None:
         """Update every row of the model that contributed to the picture. A row whose gradient or optimiser
         state is not finite sits the step out, with its state made anew."""
         self._steps += 1
@@ -112,7 +112,7 @@ def _step_rows(
             size += abs(v_colors[i, k])
         raw = abs(opacity_logits[i]) + abs(log_scales[i, 0]) + abs(log_scales[i, 1]) + abs(log_scales[i, 2])
         if not (size < np.float32(LARGEST) and raw < np.float32(LARGEST_RAW)):
-            _mend(log_scales[i], opacity_logits, scales[i], opacities, adam_m[i], adam_v[i], g, i)
+            _fix(log_scales[i], opacity_logits, scales[i], opacities, adam_m[i], adam_v[i], g, i)
             continue
         gain = np.float32(COLOUR_RELAXATION) / (contribution[i] + np.float32(COLOUR_DAMPING))
         for k in range(3):
@@ -140,7 +140,7 @@ def _step_rows(
 
 
 @kernel
-def _mend(
+def _fix(
     log_scale: F32, opacity_logits: F32, scale: F32, opacities: F32, adam_m: F32, adam_v: F32, g: F32, i: int
 ) -> None:
     """Make a row's hidden state anew from what is drawn of it, which is known to be sound."""

@@ -12,7 +12,7 @@ from sags_node.engine.losses.tissue import tissue_loss
 from sags_node.engine.rasterizer.rasterize import Gradients, Rasterizer
 from sags_node.mapping.exposure import exposure_gain
 from sags_node.mapping.focus import pixels_of, tile_grid, worst_tiles
-from sags_node.mapping.optimiser import Optimiser, Rates
+from sags_node.mapping.optimiser import LearningRates, Optimiser
 from sags_node.model.deformation import NodeDeformation
 from sags_node.model.gaussians import GaussianModel
 from sags_node.types import F32, Bool, Camera, Finding, Gaussians, Observation
@@ -24,8 +24,8 @@ DEPTH_SCALE = 1e-3  # m: beyond this a depth residual counts linearly
 class Refiner(Protocol):
     """Draws the model and moves it towards a frame.
 
-    Between `begin` and `give_back` the refiner owns the rows that it was given: what it did to them, and to
-    the nodes, is seen in the model only after `give_back`. Rows may be appended meanwhile (`take`).
+    Between `begin` and `download` the refiner owns the rows that it was given: what it did to them, and to
+    the nodes, is seen in the model only after `download`. Rows may be appended meanwhile (`take`).
     """
 
     @property
@@ -38,7 +38,7 @@ class Refiner(Protocol):
 
     @property
     def problem(self) -> Finding | None:
-        """What is wrong with it and how to mend it; None: nothing. May be read from any thread."""
+        """What is wrong with it and how to fix it; None: nothing. May be read from any thread."""
 
     def begin(
         self, model: GaussianModel, deformation: NodeDeformation, observation: Observation, node_step: float
@@ -52,7 +52,7 @@ class Refiner(Protocol):
     def take(self, rows: slice) -> None:
         """Take these rows of the model, which the host has written; nodes that were added as well."""
 
-    def give_back(self) -> None:
+    def download(self) -> None:
         """Write what was refined into the model and the nodes."""
 
     def draw(self) -> None:
@@ -73,7 +73,7 @@ class Refiner(Protocol):
     def exposure_gain(self) -> F32:
         """[3] see `exposure.exposure_gain`, of what was drawn last."""
 
-    def refine(self, rates: Rates, share: float = 1.0) -> None:
+    def refine(self, rates: LearningRates, share: float = 1.0) -> None:
         """One step on what was drawn last: loss and its gradient, back-propagation, nodes, Gaussians.
 
         Args:
@@ -81,7 +81,7 @@ class Refiner(Protocol):
                 what each Gaussian contributes to the picture: the part does not tell what they show beyond.
         """
 
-    def refine_worst(self, share: float, rates: Rates, nodes: bool = True) -> None:
+    def refine_worst(self, share: float, rates: LearningRates, nodes: bool = True) -> None:
         """Draw that share of the picture anew, where it is worst, and take one step on it.
 
         Args:
@@ -127,7 +127,7 @@ class CpuRefiner:
     def take(self, rows: slice) -> None:
         pass
 
-    def give_back(self) -> None:
+    def download(self) -> None:
         pass
 
     def draw(self) -> None:
@@ -139,7 +139,7 @@ class CpuRefiner:
     def exposure_gain(self) -> F32:
         return exposure_gain(self._planes, self._observation.image, self._observation.tissue)
 
-    def refine(self, rates: Rates, share: float = 1.0) -> None:
+    def refine(self, rates: LearningRates, share: float = 1.0) -> None:
         observation, tissue = self._observation, self._observation.tissue
         if share >= 1.0:
             self._model.contribution[:] = self._step(observation, rates).contribution
@@ -147,7 +147,7 @@ class CpuRefiner:
         tiles = worst_tiles(self._planes, observation.image, tissue, share)
         self._step(replace(observation, tissue=tissue & pixels_of(tiles, tissue.shape)), rates)
 
-    def refine_worst(self, share: float, rates: Rates, nodes: bool = True) -> None:
+    def refine_worst(self, share: float, rates: LearningRates, nodes: bool = True) -> None:
         observation = self._observation
         tiles = worst_tiles(self._planes, observation.image, observation.tissue, share)
         self._planes = self._rasterizer.forward(self._model.gaussians(), observation.camera, tiles)
@@ -174,7 +174,7 @@ class CpuRefiner:
             made[size] = self._make_rasterizer(*size)
         return made[size]
 
-    def _step(self, observation: Observation, rates: Rates, nodes: bool = True) -> Gradients:
+    def _step(self, observation: Observation, rates: LearningRates, nodes: bool = True) -> Gradients:
         planes = self._planes
         if self._v_planes.shape != planes.shape:
             self._v_planes, self._weight = np.zeros_like(planes), np.zeros_like(planes[0])

@@ -51,7 +51,7 @@ class RestingTissue:
         """The pose of a frame, or why there is none; `start` [4, 4] is about where it was taken from."""
         model, camera, last = self._mapper.model, observation.camera, self._mapper.last
         self._at_rest = None
-        pixels = self._mapper.found_again(observation)
+        pixels = self._mapper.track(observation)
         rows = np.flatnonzero(_is_inside(pixels, observation.gray))
         rows = rows[:: max(1, len(rows) // CANDIDATES)]
         if last is None or len(rows) < LEAST_POINTS:

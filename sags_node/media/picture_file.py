@@ -32,7 +32,7 @@ PNG = (
 )
 
 
-def decode(data: bytes | NDArray[np.uint8], flags: int, where: str, mend: str) -> NDArray[Any]:
+def decode(data: bytes | NDArray[np.uint8], flags: int, where: str, fix: str) -> NDArray[Any]:
     """A picture as OpenCV decodes it.
 
     What the decoder says of a picture that it could read goes to the log, with `where`.
@@ -40,7 +40,7 @@ def decode(data: bytes | NDArray[np.uint8], flags: int, where: str, mend: str) -
     Args:
         flags: of `cv2.imdecode`.
         where: what to call it in messages.
-        mend: what to do where it is damaged.
+        fix: what to do where it is damaged.
 
     Raises:
         SagsError: it is of another kind, damaged, or says that it is larger than `MAX_PIXELS`.
@@ -48,11 +48,11 @@ def decode(data: bytes | NDArray[np.uint8], flags: int, where: str, mend: str) -
     array = np.frombuffer(data, np.uint8)
     size = claimed_size(array.data)
     if size is None:
-        raise SagsError(f"{where} is no {KINDS}, or is damaged ({array.size} bytes); {mend}")
+        raise SagsError(f"{where} is no {KINDS}, or is damaged ({array.size} bytes); {fix}")
     width, height = size
     if not 0 < width * height <= MAX_PIXELS:
         raise SagsError(
-            f"{where} says that it is {width}x{height} px; at most {MAX_PIXELS >> 20} Mpx are read; {mend}"
+            f"{where} says that it is {width}x{height} px; at most {MAX_PIXELS >> 20} Mpx are read; {fix}"
         )
     with native_output() as said:
         try:
@@ -61,7 +61,7 @@ def decode(data: bytes | NDArray[np.uint8], flags: int, where: str, mend: str) -
             picture = None
     if picture is None:
         reason = f": {said[-1]}" if said else ""
-        raise SagsError(f"{where} is damaged or cut off ({array.size} bytes){reason}; {mend}")
+        raise SagsError(f"{where} is damaged or cut off ({array.size} bytes){reason}; {fix}")
     _complaints.tell(where, said)
     return picture
 

@@ -160,7 +160,7 @@ class HandshakeWatch:
         self._last = (0, 0)  # event and value of the last one
 
     def refusal(self) -> str | None:
-        """What the node has against this client, and how to mend it; None while nothing speaks against it."""
+        """What the node has against this client, and how to fix it; None while nothing speaks against it."""
         while self._monitor.poll(0):
             said = recv_monitor_message(self._monitor)
             if said["event"] == zmq.EVENT_HANDSHAKE_SUCCEEDED:

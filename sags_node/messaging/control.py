@@ -20,7 +20,7 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.messaging.address import Address, ClientKeys, NodeAddress, connect
 from sags_node.messaging.request_rate import RATE, RequestRate
 from sags_node.messaging.roles import Client, needed
-from sags_node.messaging.security import Gate, Seldom
+from sags_node.messaging.security import Gate, RateLimitedLog
 from sags_node.messaging.sockets import receive_frames
 from sags_node.messaging.wire import PROTOCOL
 
@@ -107,7 +107,7 @@ class ControlServer:
         self._gate = gate
         self._rate = RequestRate()
         self.refused = Counter[str](requests_not_allowed=0, requests_too_often=0)
-        self._seldom = Seldom()
+        self._seldom = RateLimitedLog()
         self._pending: list[tuple[_Sender, Identifier, Future[Any]]] = []
         self._request = msgspec.msgpack.Decoder(Request)
 

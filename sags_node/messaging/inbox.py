@@ -21,7 +21,7 @@ from sags_node.errors import SagsError
 from sags_node.messaging import wire
 from sags_node.messaging.peers import Peers
 from sags_node.messaging.receipt import Receipt
-from sags_node.messaging.security import Seldom, authenticated, check_endpoint
+from sags_node.messaging.security import RateLimitedLog, authenticated, check_endpoint
 from sags_node.messaging.sockets import bind, limit, receive_frames
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ class Inbox:
         self._section = section
         self._take, self._advice, self._newest = take, advice, newest
         self._senders: dict[bytes, _Sender] = {}
-        self._seldom = Seldom()
+        self._seldom = RateLimitedLog()
         self._stopping = threading.Event()
         self._resources = ExitStack()
         context = zmq.Context()

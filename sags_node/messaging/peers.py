@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
-from sags_node.messaging.security import Seldom
+from sags_node.messaging.security import RateLimitedLog
 
 MAX_PEERS = 64  # of one socket; ZeroMQ has no such limit of its own
 SMALL_TALK = 1024  # bytes per second that a peer may send besides its messages: heartbeats
@@ -75,7 +75,7 @@ class Peers:
         self._open: dict[int, _Peer] = {}  # by the file descriptor that libzmq has
         self._count: Counter[str] = Counter()
         self._closed_until = 0.0
-        self._seldom = Seldom()
+        self._seldom = RateLimitedLog()
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._follow, name=f"sags-{name}-peers", daemon=True)
         self._thread.start()

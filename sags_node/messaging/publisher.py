@@ -22,7 +22,7 @@ from sags_node.messaging.cdr import Content, type_hash
 from sags_node.messaging.node_clock import stamps
 from sags_node.messaging.peers import Peers
 from sags_node.messaging.rundir import Connection, RunDirectory
-from sags_node.messaging.security import Gate, Seldom, authenticated, check_endpoint
+from sags_node.messaging.security import Gate, RateLimitedLog, authenticated, check_endpoint
 from sags_node.messaging.sockets import bind, limit, receive_frames
 from sags_node.messaging.wire import PROTOCOL, Message, Meta, encode
 from sags_node.types import DrawnView, FrameResult, NodeHealth, RectifiedPair
@@ -108,7 +108,7 @@ class Publisher:
         self._run = RunDirectory(config.run_dir, ns)
         self._has_ipc = config.ipc
         self._next_look = 0.0  # at the run directory
-        self._seldom = Seldom()
+        self._seldom = RateLimitedLog()
         self._context = zmq.Context()
         try:
             gate = self._resources.enter_context(authenticated(self._context, config))

@@ -12,4 +12,4 @@ class Receipt(msgspec.Struct, frozen=True, kw_only=True):
     taken: int  # messages since it connected
     refused: int
     overtaken: int  # that newer ones came before they were looked at
-    problem: str | None = None  # what is wrong and how to mend it
+    problem: str | None = None  # what is wrong and how to fix it

@@ -91,7 +91,7 @@ class ReceivedText(Received):
     text: str
 
     def warnings(self) -> dict[str, str]:
-        """Of a `status`: code -> what is wrong and how to mend it."""
+        """Of a `status`: code -> what is wrong and how to fix it."""
         try:
             return msgspec.json.decode(self.text, type=_Warnings).warning_codes
         except (msgspec.MsgspecError, RecursionError):

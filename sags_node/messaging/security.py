@@ -211,7 +211,7 @@ def is_loopback(host: str) -> bool:
         return False
 
 
-class Seldom:
+class RateLimitedLog:
     """Keeps a stranger from filling the log."""
 
     def __init__(self, period: float = LOG_PERIOD) -> None:
@@ -244,7 +244,7 @@ class AllowList:
         self._seen = _versions(places, section)
         self._next_look = 0.0
         self._revocations = 0
-        self._seldom = Seldom()
+        self._seldom = RateLimitedLog()
 
     def callback(self, domain: str, key: bytes) -> bool:
         """Answers the authenticator whether a key may come in."""

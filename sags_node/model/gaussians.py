@@ -8,7 +8,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from sags_node.engine.rasterizer.smoothing import folded
+from sags_node.engine.rasterizer.smoothing import bake_filter
 from sags_node.types import F32, I64, Gaussians, Snapshot
 
 NEIGHBOURS = 4  # control nodes a Gaussian follows
@@ -118,14 +118,14 @@ class GaussianModel:
         """Forget all rows; ids go on."""
         self.count = 0
 
-    def remove(self, doomed: np.ndarray) -> int:
-        """Remove the rows where `doomed` [count] is True: the last rows move into the holes."""
-        removed = int(np.count_nonzero(doomed))
+    def remove(self, prune_mask: np.ndarray) -> int:
+        """Remove the rows where `prune_mask` [count] is True: the last rows move into the holes."""
+        removed = int(np.count_nonzero(prune_mask))
         if removed == 0:
             return 0
         kept = self.count - removed
-        holes = np.flatnonzero(doomed[:kept])
-        movers = kept + np.flatnonzero(~doomed[kept:])
+        holes = np.flatnonzero(prune_mask[:kept])
+        movers = kept + np.flatnonzero(~prune_mask[kept:])
         for values in self.rows.values():
             values[holes] = values[movers]
         self.count = kept
@@ -150,10 +150,10 @@ class GaussianModel:
             self.depth_errors,
         )
 
-    def frozen(self) -> Gaussians:
+    def snapshot(self) -> Gaussians:
         """Copies of the live rows, for publishing, with the 3D filter folded in: any renderer draws the same
         picture."""
-        drawn = folded(self.gaussians())
+        drawn = bake_filter(self.gaussians())
         return Gaussians(
             self.means.copy(),
             self.quats.copy(),

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from sags_node.confidence import confidence_of
-from sags_node.engine.rasterizer.smoothing import folded
+from sags_node.engine.rasterizer.smoothing import bake_filter
 from sags_node.errors import SagsError
 from sags_node.files import whole
 from sags_node.types import SH_DEGREE_0, Gaussians
@@ -26,7 +26,7 @@ def write_ply(path: Path, gaussians: Gaussians, force: bool = False) -> None:
     Raises:
         SagsError: the file exists already and `force` is not given, or it cannot be written.
     """
-    gaussians = folded(gaussians)
+    gaussians = bake_filter(gaussians)
     opacities = np.clip(gaussians.opacities, 1e-6, 1 - 1e-6)
     quats = gaussians.quats / np.linalg.norm(gaussians.quats, axis=1, keepdims=True)
     columns = np.concatenate(

@@ -121,7 +121,7 @@ class Operations:
         if request.ahead_ms:
             seconds = None if request.ahead_ms == "auto" else request.ahead_ms * 1e-3
             self._state.pipeline.anchors.look_ahead(anchor, seconds)
-            self._state.pipeline.foresee()
+            self._state.pipeline.predict_motion()
         sure = self._state.pipeline.anchors.depth_confidence(anchor)
         return {"id": anchor, "frame_id": newest.pair.frame_id, "depth_confidence": round(sure, 3)}
 
@@ -132,7 +132,7 @@ class Operations:
     def _open_view(self, args: dict[str, Any]) -> dict[str, Any]:
         request = parse(ViewRequest, args)
         if request.ahead_ms:
-            self._state.pipeline.foresee()
+            self._state.pipeline.predict_motion()
         drawn = self._state.views.open(request, self._state.scene)
         if drawn is not None:
             self._show_view(request.name, drawn)

@@ -21,10 +21,10 @@ ENDS = "..."
 
 
 def headlines(warnings: Mapping[str, str]) -> list[str]:
-    """What is wrong in a few words each; how to mend it stands in `status`.
+    """What is wrong in a few words each; how to fix it stands in `status`.
 
     Args:
-        warnings: code -> what is wrong, up to the first colon or semicolon, and how to mend it.
+        warnings: code -> what is wrong, up to the first colon or semicolon, and how to fix it.
     """
     said = [re.split(r"[:;] ", text, maxsplit=1)[0] for text in warnings.values()]
     rest = len(said) - MOST_LINES

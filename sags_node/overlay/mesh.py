@@ -108,7 +108,7 @@ def _check_vertices(file: Path, vertices: F64) -> None:
     if not np.isfinite(vertices).all():
         bad = int((~np.isfinite(vertices).all(1)).sum())
         raise UsageError(
-            f"{file}: {bad} of its {len(vertices)} vertices are not finite or far too large; mend the file"
+            f"{file}: {bad} of its {len(vertices)} vertices are not finite or far too large; fix the file"
         )
     across = float(np.ptp(vertices, axis=0).max())
     if across > LARGEST:

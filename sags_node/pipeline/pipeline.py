@@ -124,7 +124,7 @@ class Pipeline:
         self._mapped = None
         self._unwatched = 0.0
 
-    def foresee(self) -> None:
+    def predict_motion(self) -> None:
         """Somebody wants motion predicted. Any thread may call this."""
         if self._config.mapping.field is not False:
             self.mapper.remember_motion()
@@ -136,7 +136,7 @@ class Pipeline:
 
     @property
     def warnings(self) -> Findings:
-        """What is wrong and how to mend it. May be read from any thread."""
+        """What is wrong and how to fix it. May be read from any thread."""
         watches = self._freeze, self._eyes, self._lenses, self.depth, self._scene
         found = [finding for watch in watches for finding in watch.findings]
         lost = None if self._tracker is None else self._tracker.lost
@@ -167,6 +167,7 @@ class Pipeline:
         budget.start(waited)
         rung = budget.state
         watch = Stopwatch()
+        # 1. May this frame be trusted? One without a pose, or of a feed that stands still, is held.
         with watch("rectify"):
             pair = self._placed(frame)
         with watch("watch"):
@@ -180,6 +181,7 @@ class Pipeline:
             return self._held(frame, pair, watch, "picture", frozen, unseen(pair))
         if self._reset_due:
             self._forget()
+        # 2. Is it new? An equal one is the last again, another scene begins a new model, a bad one is held.
         draws_right = self.draws_right and pair.right is not None
         if self._equals_the_last(pair, draws_right):
             return self._repeated(frame, pair, watch)
@@ -190,6 +192,7 @@ class Pipeline:
             self._forget()
         elif scene.held:
             return self._held(frame, pair, watch, "picture", scene.held, unseen(pair))
+        # 3. Where is tissue, and how deep is it?
         seen = pair if scene.gain is None else exposed(pair, scene.gain)
         still = self._still_frames(pair)
         with watch("mask"):
@@ -198,8 +201,9 @@ class Pipeline:
             seen_by_both = _without(tissue, hidden.right)
             measured = self._measured(frame, seen, seen_by_both, still, budget, eyes)
             observation = observe(seen, tissue, measured)
+        # 4. Where is the camera? The tissue's motion is searched from where the watch saw it go.
         if scene.guess is not None:
-            self.mapper.found_again(observation, scene.guess)
+            self.mapper.track(observation, scene.guess)
         if self._tracker is not None:
             with watch("pose"):
                 tracked = still > 0 or self._tracker.track(observation)
@@ -207,9 +211,11 @@ class Pipeline:
                 pair, observation = replace(pair, camera=camera), replace(observation, camera=camera)
             if not tracked and self._tracker.lost is not None and self._mapped is not None:
                 return self._held(frame, pair, watch, "pose", self._tracker.lost, observation)
+        # 5. Deform, refine, add and prune Gaussians.
         learn = scene.learn and eyes.learn
         with watch("map"):
             mapped = self._map(observation, budget, still, learn, draws_right)
+        # 6. Draw the right eye for who looks, and follow the anchors.
         with watch("render"):
             views = {"left": mapped.view}
             if draws_right:
@@ -358,7 +364,7 @@ class Pipeline:
 
     def _draw_model(self, camera: Camera) -> RenderedView:
         """The model as it is now, in the light of a scope that is there."""
-        return to_view(self._refiner.show(self.mapper.lit_from(camera), camera), camera, 0, 0)
+        return to_view(self._refiner.show(self.mapper.relight(camera), camera), camera, 0, 0)
 
 
 def _without(tissue: Bool, cover: Bool | None) -> Bool:

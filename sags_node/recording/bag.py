@@ -49,7 +49,7 @@ def read_messages(
 
     Raises:
         UsageError: there is no bag at `path`, or it is of a form that is not read.
-        SagsError: it is damaged; says where and how to mend it.
+        SagsError: it is damaged; says where and how to fix it.
     """
     files, unpack = storage_files(path)
     for file in files:
@@ -113,16 +113,16 @@ def _metadata(file: Path) -> dict[str, Any]:
 
 @contextmanager
 def _explained(file: Path) -> Iterator[None]:
-    """Say which file, and how to mend it."""
+    """Say which file, and how to fix it."""
     try:
         yield
     except OSError as error:
         raise SagsError(f"cannot read {file}: {error.strerror}") from None
     except DamagedError as error:
-        mend = f"save what is whole with: sags bag recover {file} -o OUT"
+        fix = f"save what is whole with: sags bag recover {file} -o OUT"
         if file.suffix != ".mcap":
-            mend = "copy it again, or mend it with its own tools (rosbag reindex, sqlite3 .recover)"
-        raise SagsError(f"{file} is {error}; {mend}") from None
+            fix = "copy it again, or fix it with its own tools (rosbag reindex, sqlite3 .recover)"
+        raise SagsError(f"{file} is {error}; {fix}") from None
 
 
 # ---- MCAP ------------------------------------------------------------------------------------------------

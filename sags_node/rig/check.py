@@ -27,7 +27,7 @@ class Finding:
 
     level: Literal["ok", "warning", "error"]
     what: str
-    mend: str = ""
+    fix: str = ""
     figures: Mapping[str, float] = field(default_factory=dict)  # what was measured, for programs
 
 
@@ -39,11 +39,11 @@ def refuse_errors(findings: list[Finding], where: Path | str) -> None:
     """
     errors = [finding for finding in findings if finding.level == "error"]
     if errors:
-        raise UsageError("\n".join(f"{where}: {error.what}; {error.mend}" for error in errors))
+        raise UsageError("\n".join(f"{where}: {error.what}; {error.fix}" for error in errors))
 
 
 def check_rig(rig: StereoRig) -> list[Finding]:
-    """What is right, odd or wrong with a calibration, each with a way to mend it."""
+    """What is right, odd or wrong with a calibration, each with a way to fix it."""
     findings = check_eyes(rig)
     if any(finding.level == "error" for finding in findings):
         return findings
@@ -159,8 +159,8 @@ def _check_size(rig: StereoRig) -> list[Finding]:
         f"both principal points lie at {size:.3g} of the middle: camera_matrix is of {made_for} pictures, "
         f"the files say {eye.width}x{eye.height}"
     )
-    mend = f"if the pictures are {eye.width}x{eye.height}, multiply camera_matrix and projection_matrix by "
-    return [Finding("warning", what, f"{mend}{1 / size:.3g}, or calibrate at that size")]
+    fix = f"if the pictures are {eye.width}x{eye.height}, multiply camera_matrix and projection_matrix by "
+    return [Finding("warning", what, f"{fix}{1 / size:.3g}, or calibrate at that size")]
 
 
 def _check_rows(rig: StereoRig) -> list[Finding]:
@@ -177,8 +177,8 @@ def _check_rows(rig: StereoRig) -> list[Finding]:
         a, b = left.P[row, column], right.P[row, column]
         if abs(a - b) > tolerance:
             what = f"rectified {name} differs: {a:g} px in left.yaml, {b:g} px in right.yaml"
-            mend = "the files are not from one stereo calibration; " + RECALIBRATE
-            found.append(Finding("error", what, mend))
+            fix = "the files are not from one stereo calibration; " + RECALIBRATE
+            found.append(Finding("error", what, fix))
     return found or [Finding("ok", "rectified rows of both eyes agree")]
 
 
@@ -192,8 +192,8 @@ def _check_order(rig: StereoRig) -> list[Finding]:
     if right == 0:
         return [Finding("error", f"{what}: there is no baseline", RECALIBRATE)]
     if right > 0:
-        mend = "the right one must be -fx * baseline, negative: exchange the eyes or mend the sign"
-        return [Finding("error", what, mend)]
+        fix = "the right one must be -fx * baseline, negative: exchange the eyes or fix the sign"
+        return [Finding("error", what, fix)]
     return [Finding("ok", "the left eye is the reference")]
 
 
@@ -201,10 +201,10 @@ def _check_baseline(rig: StereoRig) -> list[Finding]:
     baseline = rig.baseline
     if baseline > LARGEST_BASELINE:
         what = f"the baseline of {baseline:g} m looks like millimetres"
-        mend = (
+        fix = (
             "lengths are metres: divide projection_matrix[3] in right.yaml by 1000, or read it with --unit mm"
         )
-        return [Finding("error", what, mend)]
+        return [Finding("error", what, fix)]
     if not ENDOSCOPE_BASELINE[0] <= baseline <= ENDOSCOPE_BASELINE[1]:
         what = f"a baseline of {baseline * 1e3:.3g} mm is unusual for a stereo endoscope (3 to 10 mm)"
         return [Finding("warning", what, "check the unit of projection_matrix[3] in right.yaml: fx * metres")]

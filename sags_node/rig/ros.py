@@ -41,8 +41,8 @@ def read_folder(folder: Path) -> StereoRig:
         try:
             eyes.append(_read_eye(read_file(file, LARGEST_FILE), str(file)))
         except OSError as error:
-            mend = "a rig is a folder with left.yaml and right.yaml"
-            raise UsageError(f"cannot read calibration {file}: {error.strerror}; {mend}") from None
+            fix = "a rig is a folder with left.yaml and right.yaml"
+            raise UsageError(f"cannot read calibration {file}: {error.strerror}; {fix}") from None
     return StereoRig(folder.resolve().name, *eyes)
 
 
@@ -190,8 +190,8 @@ def _side(tree: dict[str, Any], key: str, file: str) -> int:
 def _distortion(tree: dict[str, Any], file: str) -> F64:
     model = tree.get("distortion_model", "plumb_bob")
     if model not in MODELS:
-        mend = f"calibrate with {' or '.join(map(repr, MODELS))}"
-        raise UsageError(f"{file}: distortion_model: {brief(model)} is not supported; {mend}")
+        fix = f"calibrate with {' or '.join(map(repr, MODELS))}"
+        raise UsageError(f"{file}: distortion_model: {brief(model)} is not supported; {fix}")
     coefficients = _numbers(tree, "distortion_coefficients", file)
     lengths = MODELS[model]
     if len(coefficients) not in lengths:

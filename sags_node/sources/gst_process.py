@@ -38,7 +38,7 @@ ELEMENTS = {  # what the launch files use, and the Debian package that brings it
 }
 SEE_PLACE = "see to the path, address or device in the launch string"
 SEE_STRING = "try the string with gst-launch-1.0; gst-inspect-1.0 ELEMENT lists what an element takes"
-MENDS = (  # what GStreamer says, and what helps
+FIXES = (  # what GStreamer says, and what helps
     (r"no element \"(\w+)\"", "install {package}"),
     (r"not-negotiated|could not link|can't handle caps", "neighbours do not agree on format, size or rate"),
     (r"busy|in use", "another program uses it"),
@@ -110,7 +110,7 @@ class GstProcess:
         """Play a file from its first picture on; live pipelines play anyway."""
         self._tell(START)
 
-    def give_back(self, sink: int, slot: int) -> None:
+    def download(self, sink: int, slot: int) -> None:
         """A picture has been copied."""
         self._tell(bytes((sink, slot)))
 
@@ -165,11 +165,11 @@ def in_words(message: str, debug: str) -> str:
     said = message.strip().rstrip(".")
     where = f"{path[1]}: " if path else ""
     more = "" if is_place or not detail or detail in said else f" ({detail.rstrip('.')})"
-    for pattern, mend in MENDS:
+    for pattern, fix in FIXES:
         found = re.search(pattern, f"{said} {detail}", re.IGNORECASE)
         if found is not None:
-            named = found[1] if "{" in mend else ""
-            help = mend.format(package=ELEMENTS.get(named, "the plugin that has it"))
+            named = found[1] if "{" in fix else ""
+            help = fix.format(package=ELEMENTS.get(named, "the plugin that has it"))
             return f"GStreamer: {where}{said}{more}; {help}"
     return f"GStreamer: {where}{said}{more}"
 

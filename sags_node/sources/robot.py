@@ -15,7 +15,7 @@ import numpy as np
 from sags_node.config.schema import BagRobot, BagSource, LaunchConfig, LiveSource, PushRobot, Ros2Robot
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging.inbox import Inbox
-from sags_node.messaging.security import Seldom
+from sags_node.messaging.security import RateLimitedLog
 from sags_node.messaging.wire import Message
 from sags_node.recording.bag import read_messages
 from sags_node.rig.hand_eye import FILE, read_hand_eye
@@ -99,7 +99,7 @@ class _RosPoses:
         self._topic = absolute(config.topic)
         self._graph = Graph(config)
         self._readers: dict[str, Reader] = {}
-        self._seldom = Seldom()
+        self._seldom = RateLimitedLog()
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._read, name="ros2-poses", daemon=True)
         self._thread.start()
@@ -184,7 +184,7 @@ class Posed:
         self._recorded = isinstance(config.robot, BagRobot)
         self._source = source
         self._without = 0  # frames before the first pose
-        self._seldom = Seldom()
+        self._seldom = RateLimitedLog()
 
     @property
     def rate(self) -> float:

@@ -12,7 +12,7 @@ from typing import Self
 
 from sags_node.config.schema import Ros2Source
 from sags_node.errors import SagsError, UsageError
-from sags_node.messaging.security import Seldom
+from sags_node.messaging.security import RateLimitedLog
 from sags_node.messaging.topics import CAMERA_INFO
 from sags_node.recording.pictures import IMAGE_TYPES, decode_picture, header_stamp, read_eye
 from sags_node.rig import check_rig, refuse_errors
@@ -51,8 +51,8 @@ class RosCameras:
         self._graph = Graph(config)
         self._names = picture_topics(config)
         self._readers: dict[Side, Reader] = {}
-        self._left_out: Mapping[Side, Seldom] = {"left": Seldom(), "right": Seldom()}
-        self._silent: Mapping[Side, Seldom] = {"left": Seldom(), "right": Seldom()}
+        self._left_out: Mapping[Side, RateLimitedLog] = {"left": RateLimitedLog(), "right": RateLimitedLog()}
+        self._silent: Mapping[Side, RateLimitedLog] = {"left": RateLimitedLog(), "right": RateLimitedLog()}
         self._thread = threading.Thread(target=self._read, name="ros2", daemon=True)
 
     @property

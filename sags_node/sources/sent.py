@@ -121,7 +121,7 @@ class SentPictures:
         """Take one eye's picture in.
 
         Raises:
-            SagsError: it is refused; why, and how to mend it.
+            SagsError: it is refused; why, and how to fix it.
         """
         t_ns = self._on_wall(stamp_ns, arrival_ns)
         self.arrivals[eye].add(stamp_ns)

@@ -221,5 +221,5 @@ def _unpainted(painted: U8, left: U8) -> Bool:
 
 
 def _is_same_rate(one: float | None, other: float | None) -> bool:
-    """Rates measured from a file's stamps differ a little."""
+    """LearningRates measured from a file's stamps differ a little."""
     return one is None or other is None or abs(one - other) <= 0.01 * one

@@ -14,7 +14,7 @@ class Notices:
         self._since: dict[str, float] = {}  # code -> when it began
 
     def update(self, warnings: Mapping[str, str]) -> None:
-        """`warnings`: all that hold now, code -> what is wrong and how to mend it."""
+        """`warnings`: all that hold now, code -> what is wrong and how to fix it."""
         now = time.monotonic()
         for code in [code for code in self._since if code not in warnings]:
             self._tell(f"over after {now - self._since.pop(code):.1f} s: {code}")

@@ -66,7 +66,7 @@ class Status(msgspec.Struct, frozen=True):
     gaussians: int = 0
     rung: Rung | None = None
     last_error: str | None = None
-    warning_codes: dict[str, str] = {}  # code -> what is wrong and how to mend it
+    warning_codes: dict[str, str] = {}  # code -> what is wrong and how to fix it
 
 
 SILENT = Status()

@@ -24,7 +24,7 @@ class FreezeWatch:
     """Compares every live frame with the one before, as they came.
 
     Attributes:
-        findings: what is wrong, and how to mend it. May be read from any thread.
+        findings: what is wrong, and how to fix it. May be read from any thread.
     """
 
     def __init__(self) -> None:

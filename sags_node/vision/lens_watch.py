@@ -16,7 +16,7 @@ from sags_node.kernels.jit import kernel
 from sags_node.types import F32, I8, Bool, Finding, FrameResult, RectifiedPair
 from sags_node.vision.clarity import LOST_CONTRAST, REMEMBERED_S, USUAL_DIFFERENCE
 from sags_node.vision.pyramid import BORDER, inner, pyramids
-from sags_node.vision.standing import Standing
+from sags_node.vision.standing import Debounced
 
 CELLS = 40  # across the picture
 SMALLEST = 8  # px of the first half, the side of a cell: of fewer, the detail is chance
@@ -44,14 +44,14 @@ class LensWatch:
     """Compares the eyes of every pair."""
 
     def __init__(self) -> None:
-        self._standing = Standing()
+        self._standing = Debounced()
         self._stamp_ns: int | None = None
         self._usual: F32 | None = None  # octaves of the left eye over the right one, of each cell
         self._hidden: I8 = np.zeros((1, 1), np.int8)  # -1: from the left eye, 1: from the right one
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What is wrong with the lenses, and how to mend it. May be read from any thread."""
+        """What is wrong with the lenses, and how to fix it. May be read from any thread."""
         return self._standing.findings
 
     def __call__(self, pair: RectifiedPair, last: FrameResult, sound: bool = True) -> OnLenses:

@@ -18,7 +18,7 @@ from sags_node.types import Finding, GrayPyramid
 from sags_node.vision.alignment import RowErrors
 from sags_node.vision.flow import OpticalFlow
 from sags_node.vision.pyramid import inner, narrowed
-from sags_node.vision.standing import Standing
+from sags_node.vision.standing import Debounced
 
 STRIDE = 4  # px
 WINDOW_NS = 200_000_000  # of the motion that is compared with row errors
@@ -69,7 +69,7 @@ class MatchWatch:
 
     def __init__(self) -> None:
         self.is_late = False
-        self._standing = Standing()
+        self._standing = Debounced()
         self._flow = OpticalFlow(STRIDE)
         self._seen: deque[tuple[int, GrayPyramid]] = deque()  # stamps and left pictures of the last frames
         self._sums: deque[_Sums] = deque()
@@ -79,7 +79,7 @@ class MatchWatch:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What is wrong with the eyes, and how to mend it. May be read from any thread."""
+        """What is wrong with the eyes, and how to fix it. May be read from any thread."""
         return self._standing.findings
 
     def see(self, stamp_ns: int, left: GrayPyramid) -> None:

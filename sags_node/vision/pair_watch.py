@@ -17,7 +17,7 @@ from sags_node.types import F32, I64, U8, Finding, RectifiedPair, StereoFrame
 from sags_node.vision.blocks import is_blocky
 from sags_node.vision.clarity import LENS, SMOKE, Clarity, mean_difference, structure
 from sags_node.vision.pyramid import pyramids
-from sags_node.vision.standing import Standing
+from sags_node.vision.standing import Debounced
 
 WIDTH = 80  # px of the small pictures
 BLACK = 20.0  # grey levels; video that keeps its black at 16 too
@@ -74,13 +74,13 @@ class PairWatch:
     """Looks at every pair of a source."""
 
     def __init__(self) -> None:
-        self._standing = Standing()
+        self._standing = Debounced()
         self._clarity = Clarity()
         self._history: deque[tuple[F32, F32]] = deque(maxlen=HISTORY)
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What is wrong with the eyes, and how to mend it. May be read from any thread."""
+        """What is wrong with the eyes, and how to fix it. May be read from any thread."""
         return self._standing.findings
 
     def __call__(self, frame: StereoFrame, pair: RectifiedPair) -> Verdict:

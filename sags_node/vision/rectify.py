@@ -139,5 +139,5 @@ class Rectifier:
         if picture.shape[:2] != (height, width):
             raise SagsError(
                 f"calibration is for {width}x{height} but the {name} picture is "
-                f"{picture.shape[1]}x{picture.shape[0]}; calibrate at this size or mend the source"
+                f"{picture.shape[1]}x{picture.shape[0]}; calibrate at this size or fix the source"
             )

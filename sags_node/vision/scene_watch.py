@@ -28,7 +28,7 @@ from sags_node.vision.picture_fit import (
     Fit,
 )
 from sags_node.vision.pyramid import gray_pyramid, inner, narrowed, pyramid_of, pyramids
-from sags_node.vision.standing import Standing
+from sags_node.vision.standing import Debounced
 
 WIDTH = 80  # px of the small pictures
 SEEN_ALPHA = 0.5
@@ -93,7 +93,7 @@ class SceneWatch:
             moving: the camera's pose is estimated: what shows another scene is left to that.
         """
         self._moving = moving
-        self._standing = Standing()
+        self._standing = Debounced()
         self._since: dict[str, int] = {}  # stamps: how long something has lasted
         self._gain: F32 = np.ones(3, np.float32)  # of the frame before
         self._taken_out: F32 = np.ones(3, np.float32)

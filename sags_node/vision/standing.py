@@ -12,7 +12,7 @@ BEGINS, ENDS = 0.6, 0.3  # of the frames in that time: a finding stands, and it 
 FEWEST = 2  # frames
 
 
-class Standing:
+class Debounced:
     """The findings of the last frames, and those of them that last.
 
     Attributes:

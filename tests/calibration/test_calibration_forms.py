@@ -100,7 +100,7 @@ def test_ros_files_in_millimetres(tmp_path: Path) -> None:
     in_mm = replace(rig.right, P=rig.right.P * [1, 1, 1, 1000])
     save_rig(StereoRig("rig", rig.left, in_mm), tmp_path)
     (error,) = [finding for finding in check_rig(read_rig(tmp_path)) if finding.level == "error"]
-    assert "--unit mm" in error.mend
+    assert "--unit mm" in error.fix
     assert_same(read_rig(tmp_path, metres=1e-3), rig)
 
 
@@ -171,7 +171,7 @@ def test_millimetres_must_be_said(tmp_path: Path) -> None:
     folder = write_pair(tmp_path / "rig", ".yml", PLUMB_BOB, T * 1000)
     findings = check_rig(read_rig(folder, SIZE))
     assert findings[-1].level == "error"
-    assert "looks like millimetres" in findings[-1].what and "--unit mm" in findings[-1].mend
+    assert "looks like millimetres" in findings[-1].what and "--unit mm" in findings[-1].fix
 
 
 def test_the_size_must_be_said(tmp_path: Path) -> None:

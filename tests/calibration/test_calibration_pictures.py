@@ -143,7 +143,7 @@ def test_swapped_pictures(subject: tuple[StereoRig, Pairs]) -> None:
     rig, pairs = subject
     finding = worst(check_pictures(rig, swapped(pairs)))
     assert finding.level == "error"
-    assert "the pictures are swapped" in finding.what and "calibration is in order" in finding.mend
+    assert "the pictures are swapped" in finding.what and "calibration is in order" in finding.fix
 
 
 @every_subject
@@ -151,7 +151,7 @@ def test_swapped_files(subject: tuple[StereoRig, Pairs]) -> None:
     rig, pairs = subject
     finding = worst(check_pictures(swapped_files(rig), pairs))
     assert finding.level == "error"
-    assert "swapped in the calibration" in finding.what and "pictures are in order" in finding.mend
+    assert "swapped in the calibration" in finding.what and "pictures are in order" in finding.fix
 
 
 @every_subject
@@ -161,7 +161,7 @@ def test_wrong_sign(subject: tuple[StereoRig, Pairs]) -> None:
     assert any(finding.level == "error" for finding in check_rig(wrong))
     finding = worst(check_pictures(wrong, pairs))
     assert finding.level == "error"
-    assert "has the wrong sign" in finding.what and "pictures are in order" in finding.mend
+    assert "has the wrong sign" in finding.what and "pictures are in order" in finding.fix
 
 
 @every_subject
@@ -176,7 +176,7 @@ def test_millimetres(subject: tuple[StereoRig, Pairs]) -> None:
     rig, pairs = subject
     assert "looks like millimetres" in worst(check_rig(in_millimetres(rig))).what
     finding = worst(check_pictures(in_millimetres(rig), pairs))
-    assert finding.level == "error" and "millimetres" in finding.mend
+    assert finding.level == "error" and "millimetres" in finding.fix
 
 
 @every_subject
@@ -184,7 +184,7 @@ def test_half_size_matrices(subject: tuple[StereoRig, Pairs]) -> None:
     rig, pairs = subject
     wrong = half_size(rig)
     warned = worst(check_rig(wrong))
-    assert "camera_matrix is of" in warned.what and "by 2" in warned.mend
+    assert "camera_matrix is of" in warned.what and "by 2" in warned.fix
     finding = worst(check_pictures(wrong, pairs))
     assert finding.level == "error" and "0.5 times the size" in finding.what
 
@@ -196,9 +196,9 @@ def test_another_picture_size(subject: tuple[StereoRig, Pairs]) -> None:
         (cv2.resize(left, None, fx=2, fy=2), cv2.resize(right, None, fx=2, fy=2)) for left, right in pairs
     ]
     (finding,) = check_pictures(rig, double)
-    assert finding.level == "error" and "2 times as large" in finding.what and "--scale 2" in finding.mend
+    assert finding.level == "error" and "2 times as large" in finding.what and "--scale 2" in finding.fix
     (finding,) = check_pictures(rig, [(left[:-20], right[:-20]) for left, right in pairs])
-    assert "cropped" in finding.mend
+    assert "cropped" in finding.fix
 
 
 @pytest.mark.parametrize(
@@ -228,10 +228,8 @@ def with_principal_point_moved(rig: StereoRig, x: float, y: float) -> StereoRig:
 
 
 @pytest.mark.parametrize("scale", [0.01, -0.01])
-def test_an_eye_of_another_scale_is_said_with_its_mend(
-    phantom: tuple[StereoRig, Pairs], scale: float
-) -> None:
-    """The right picture is so much larger than the calibration says. What is said to set mends it, and depth
+def test_an_eye_of_another_scale_is_said_with_its_fix(phantom: tuple[StereoRig, Pairs], scale: float) -> None:
+    """The right picture is so much larger than the calibration says. What is said to set fixes it, and depth
     leans by what follows from disparity = f B / Z."""
     rig, pairs = phantom
     assert not [finding for finding in check_pictures(rig, pairs) if "scale" in finding.figures]
@@ -242,7 +240,7 @@ def test_an_eye_of_another_scale_is_said_with_its_mend(
     depth = check_pictures(rig, pairs)[0].figures["depth_median_m"]
     per_pixel = depth**2 / (rig.left.P[0, 0] * rig.baseline) * 1e3  # mm
     assert abs(finding.figures["leans_mm_per_100_px"]) == pytest.approx(per_pixel, rel=2 * BENT)
-    fx, fy = (float(number) for number in re.findall(r"to ([\d.]+)", finding.mend))
+    fx, fy = (float(number) for number in re.findall(r"to ([\d.]+)", finding.fix))
     assert (fx, fy) == pytest.approx((rig.right.K[0, 0], rig.right.K[1, 1]), rel=0.0005)
 
 
@@ -252,7 +250,7 @@ def with_right_focal(rig: StereoRig, factor: float) -> StereoRig:
 
 
 @pytest.mark.parametrize("bent", [0.0, 3.0])
-def test_a_scale_is_named_only_where_it_mends_the_rows(bent: float) -> None:
+def test_a_scale_is_named_only_where_it_fixes_the_rows(bent: float) -> None:
     """By arithmetic: rows 1 % too large, and bent by so many px to either side."""
     rig = rectified_rig("plane", 640, 512, np.array([[600.0, 0, 319.5], [0, 600, 255.5], [0, 0, 1]]), 0.004)
     rng = np.random.default_rng(0)
@@ -262,7 +260,7 @@ def test_a_scale_is_named_only_where_it_mends_the_rows(bent: float) -> None:
     (finding,) = judge_scale(rig, rows)
     assert finding.figures["scale"] == pytest.approx(0.01, abs=4 * rows.scale_error)
     assert rows.left_over == pytest.approx(np.hypot(0.2, bent / np.sqrt(2)), rel=0.15)
-    assert ("set fx to" in finding.mend) == (bent == 0)
+    assert ("set fx to" in finding.fix) == (bent == 0)
     assert ("distortion is wrong" in finding.what) == (bent > 0)
 
 
@@ -288,8 +286,8 @@ def test_known_depths_show_what_matches_cannot(
     assert wrong.level == "warning" and "too near" in wrong.what
     shift = wrong.figures["offset_px"] - right.figures["offset_px"]
     assert shift == pytest.approx(0.5, abs=0.02)  # exact but for the lens distortion
-    mended = float(re.findall(r"right.yaml to ([\d.]+)", wrong.mend)[0])
-    assert mended == pytest.approx(moved.right.K[0, 2] - wrong.figures["offset_px"], abs=0.01)
+    fixed = float(re.findall(r"right.yaml to ([\d.]+)", wrong.fix)[0])
+    assert fixed == pytest.approx(moved.right.K[0, 2] - wrong.figures["offset_px"], abs=0.01)
 
 
 @pytest.mark.parametrize(("nearest", "farthest"), [(0.05, 0.12), (0.1, 0.101)])
@@ -313,7 +311,7 @@ def test_an_offset_is_told_from_a_longer_baseline_where_depths_differ(
 def test_the_calibration_of_another_scope(phantom: tuple[StereoRig, Pairs]) -> None:
     rig, pairs = phantom
     finding = worst(check_pictures(with_right_turned(rig, (3.0, 0.0, 1.0)), pairs))
-    assert finding.level == "error" and "not of these pictures" in finding.mend
+    assert finding.level == "error" and "not of these pictures" in finding.fix
 
 
 def test_rectified_pictures_swapped(data_folder: Path) -> None:
@@ -339,7 +337,7 @@ def test_principal_points_far_apart_are_not_taken_for_a_swap(phantom: tuple[Ster
     said = worst(check_pictures(plain_rig(rectifier, 0.0), [(left, moved)]))
     assert said.level == "error" and "or their principal points differ by at least" in said.what
     least = int(re.findall(r"at least (\d+) px", said.what)[0])
-    assert 0 < least < shift and "cover the left eye's lens" in said.mend
+    assert 0 < least < shift and "cover the left eye's lens" in said.fix
     # A calibration that says so is in order.
     assert worst(check_pictures(plain_rig(rectifier, shift), [(left, moved)])).level == "ok"
 

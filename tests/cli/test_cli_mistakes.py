@@ -209,7 +209,7 @@ def test_a_camera_that_is_not_there() -> None:
 def test_a_right_video_that_ends_too_early_ends_the_node_at_that_frame(
     user_files: Path, run_dir: Path
 ) -> None:
-    """What comes before is processed and published; following the message's advice mends it."""
+    """What comes before is processed and published; following the message's advice fixes it."""
     session = videos(user_files, right="short.mp4")
     depth = "left/render/depth"
     with Subscriber([depth], endpoint=f"ipc://{run_dir}/sags.ipc") as subscriber:

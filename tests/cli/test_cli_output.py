@@ -241,7 +241,7 @@ def test_doctor_asks_for_the_packages_that_a_launch_file_needs(
 ) -> None:
     monkeypatch.setattr("sags_node.doctor.find_spec", lambda name: None)
     code, checks = doctor(user_files, str(ROOT / "launch/ros2.yaml"))
-    assert code == 1 and "cyclonedds" in checks["source"]["found"] and "[ros2]" in checks["source"]["mend"]
+    assert code == 1 and "cyclonedds" in checks["source"]["found"] and "[ros2]" in checks["source"]["fix"]
 
 
 @pytest.mark.skipif(find_library("gstapp-1.0") is None, reason="GStreamer is not installed")

@@ -68,7 +68,7 @@ def test_overrides_win_over_the_file() -> None:
         ("mapping.budget_ms.x:=3", "mapping.budget_ms"),
     ],
 )
-def test_a_mistake_is_named_with_its_mend(override: str, said: str) -> None:
+def test_a_mistake_is_named_with_its_fix(override: str, said: str) -> None:
     with pytest.raises(UsageError) as caught:
         load_launch(None, [override])
     assert said in str(caught.value)

@@ -20,7 +20,7 @@ from sags_node.engine.interface import Gradients
 from sags_node.mapping import optimiser as mapping_optimiser
 from sags_node.mapping.cuda import optimiser
 from sags_node.mapping.cuda.refiner import STEP
-from sags_node.mapping.optimiser import Rates
+from sags_node.mapping.optimiser import LearningRates
 from sags_node.model.cuda import nodes
 from sags_node.model.deformation import NodeDeformation
 from sags_node.model.gaussians import GaussianModel
@@ -174,7 +174,7 @@ def model_on_device(model: GaussianModel) -> optimiser.Model:
 
 
 def device_step(
-    engine: optimiser.Optimiser, model: optimiser.Model, gradients: Gradients, rates: Rates
+    engine: optimiser.Optimiser, model: optimiser.Model, gradients: Gradients, rates: LearningRates
 ) -> None:
     names = ("means", "quats", "scales", "opacities", "colors", "contribution")
     slopes = optimiser.Slopes(**{name: on_device(getattr(gradients, name)) for name in names})
@@ -193,7 +193,7 @@ def check_model(found: optimiser.Model, model: GaussianModel) -> None:
 def test_the_mappers_step_is_the_mappers() -> None:
     model = make_model()
     found, before = model_on_device(model), model_on_device(model)
-    host, device, rates = mapping_optimiser.Optimiser(), optimiser.Optimiser(STEP), Rates().scaled(20)
+    host, device, rates = mapping_optimiser.Optimiser(), optimiser.Optimiser(STEP), LearningRates().scaled(20)
     for step in range(4):
         gradients = make_gradients(step)
         host.step(model, gradients, camera(moved=True), rates)
@@ -217,7 +217,7 @@ def test_the_mappers_step_is_the_mappers() -> None:
     "where",
     ["means", "quats", "scales", "opacities", "colors", "adam_m", "adam_v", "log_scales", "opacity_logits"],
 )
-def test_the_mappers_step_mends_broken_rows(where: str, value: float) -> None:
+def test_the_mappers_step_fixes_broken_rows(where: str, value: float) -> None:
     """Gradients (the first five) and hidden state; a sound row beside it moves on."""
     model, gradients = make_model(), make_gradients(0)
     broken = 2  # is seen
@@ -226,8 +226,8 @@ def test_the_mappers_step_mends_broken_rows(where: str, value: float) -> None:
     table.reshape(COUNT, -1)[broken, -1] = value
     model.opacities[broken] = 1.0  # has no logit
     found = model_on_device(model)
-    mapping_optimiser.Optimiser().step(model, gradients, camera(moved=True), Rates())
-    device_step(optimiser.Optimiser(STEP), found, gradients, Rates())
+    mapping_optimiser.Optimiser().step(model, gradients, camera(moved=True), LearningRates())
+    device_step(optimiser.Optimiser(STEP), found, gradients, LearningRates())
     check_model(found, model)
     assert torch.isfinite(found.log_scales).all() and torch.isfinite(found.opacity_logits).all()
 

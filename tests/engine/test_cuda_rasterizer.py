@@ -68,7 +68,7 @@ def test_wrong_tensors_are_explained() -> None:
     with pytest.raises(UsageError, match="sh_rest has 4 terms, expected 0, 3, 8 or 15"):
         dataclasses.replace(drawn, sh_rest=drawn.means.new_zeros((5, 4, 3)))
     with pytest.raises(UsageError, match="v_planes is"):
-        inside.pull_back(v_planes[:4], weight)
+        inside.backward_pass(v_planes[:4], weight)
     with pytest.raises(UsageError, match=r"tiles is torch.bool \[2, 3\], expected bool \[1, 3\]"):
         inside.draw(drawn, as_pinhole(VIEW), torch.ones((2, 3), dtype=torch.bool))
 

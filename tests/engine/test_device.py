@@ -99,20 +99,20 @@ UNUSABLE = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("lacks", "reason", "mend"), UNUSABLE)
+@pytest.mark.parametrize(("lacks", "reason", "fix"), UNUSABLE)
 def test_a_gpu_that_cannot_be_used_is_explained(
-    lacks: Callable[[pytest.MonkeyPatch], None], reason: str, mend: str, machine: pytest.MonkeyPatch
+    lacks: Callable[[pytest.MonkeyPatch], None], reason: str, fix: str, machine: pytest.MonkeyPatch
 ) -> None:
-    """auto: the CPU, and why; cuda: an error that says how to mend it; doctor: the same."""
+    """auto: the CPU, and why; cuda: an error that says how to fix it; doctor: the same."""
     lacks(machine)
     found = choose_device("auto")
     assert found.kind == "cpu" and reason in found.reason
     with pytest.raises(UsageError) as raised:
         choose_device("cuda")
     said = str(raised.value)
-    assert reason in said and mend in said and "\n" not in said and "device:=cpu" in said
+    assert reason in said and fix in said and "\n" not in said and "device:=cpu" in said
     check = doctor.check_gpu(LaunchConfig(device="cuda"))
-    assert check.level == "error" and reason in check.found and mend in check.mend
+    assert check.level == "error" and reason in check.found and fix in check.fix
 
 
 def test_a_missing_gpu_ends_the_command_with_one_message(
@@ -150,13 +150,13 @@ def test_the_gpu_is_tried_out_once(machine: pytest.MonkeyPatch) -> None:
 
 def test_the_probe_compares_a_drawing_and_its_gradients(monkeypatch: pytest.MonkeyPatch) -> None:
     assert probe.largest_difference() < 0.1 * probe.TOLERANCE
-    real = CudaRasterizer.pull_back
+    real = CudaRasterizer.backward_pass
 
     def wrong(*args: Any, **names: Any) -> Any:
         found = real(*args, **names)
         return replace(found, means=found.means * 1.01)
 
-    monkeypatch.setattr(CudaRasterizer, "pull_back", wrong)
+    monkeypatch.setattr(CudaRasterizer, "backward_pass", wrong)
     assert probe.largest_difference() > probe.TOLERANCE
 
 

@@ -185,7 +185,7 @@ def test_it_is_a_launch_key_and_the_doctor_looks_at_it(machine: pytest.MonkeyPat
     assert config.backend == "gsplat" and choose_device(config.device).kind == "cpu"
     machine.setattr(torch.cuda, "is_available", lambda: False)
     (found,) = (check for check in examine(config) if check.name == "gsplat")
-    assert found.level == "error" and "found no GPU" in found.mend
+    assert found.level == "error" and "found no GPU" in found.fix
     machine.setattr(gsplat_backend, "usable_device", lambda: torch.device("cuda"))
     (found,) = (check for check in examine(config) if check.name == "gsplat")
     assert found.level == "ok"

@@ -273,7 +273,7 @@ def test_a_gpu_that_fails_ends_the_fit_and_leaves_the_last_checkpoint(
     before = path.read_bytes()
     made.iterate()
     failing(monkeypatch, CudaRasterizer, "draw", 1, CUDA_ERROR)
-    failing(monkeypatch, Loan, "give_back", 1, CUDA_ERROR)
+    failing(monkeypatch, Loan, "download", 1, CUDA_ERROR)
     for work in (made.iterate, lambda: checkpoint.save(made, path), lambda: made.model):
         with pytest.raises(SagsError) as raised:
             work()

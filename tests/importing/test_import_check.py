@@ -155,12 +155,12 @@ PLANTED = {
 
 
 @pytest.mark.parametrize("name", PLANTED)
-def test_a_planted_oddity_is_named_with_its_mend(name: str, tmp_path: Path) -> None:
+def test_a_planted_oddity_is_named_with_its_fix(name: str, tmp_path: Path) -> None:
     folder = made(tmp_path / "case")
-    plant, what, mend = PLANTED[name]
+    plant, what, fix = PLANTED[name]
     plant(folder)
     found = odd(folder)
-    assert any(what in each.what and mend in each.what + each.mend for each in found), found
+    assert any(what in each.what and fix in each.what + each.fix for each in found), found
     other = [each.what for each in found if what not in each.what]
     # One cause may show twice: both eyes have borders, fields in one eye hide its matches.
     assert name in ("interlaced", "borders", "right_one_missing", "gap") or not other, other
@@ -177,7 +177,7 @@ def test_a_copy_that_broke_off_is_found_among_many(tmp_path: Path) -> None:
         file = folder / broken
         file.write_bytes(file.read_bytes()[:-100])
         _, finding = odd(folder)
-        assert broken in finding.what and "cut off" in finding.what and "replace" in finding.mend
+        assert broken in finding.what and "cut off" in finding.what and "replace" in finding.fix
 
 
 def test_one_broken_file_is_said_once(tmp_path: Path) -> None:
@@ -290,7 +290,7 @@ def test_folders_that_are_not_played_yet_are_named(tmp_path: Path) -> None:
     assert "StereoMIS-Tracking" in check_folder(tmp_path / "P3")[0].what
     (unknown,) = check_folder(tmp_path)
     assert unknown.level == "error" and "nothing that is known" in unknown.what
-    assert "P2, P3, d4d, stir" in unknown.mend
+    assert "P2, P3, d4d, stir" in unknown.fix
 
 
 def test_the_command(tmp_path: Path) -> None:

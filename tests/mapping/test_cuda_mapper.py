@@ -28,7 +28,7 @@ from sags_node.mapping.cuda.refiner import REFINED, CudaRefiner
 from sags_node.mapping.devices import Skips
 from sags_node.mapping.fallback_refiner import LOWERED, FallbackRefiner
 from sags_node.mapping.mapper import Mapper
-from sags_node.mapping.optimiser import Rates
+from sags_node.mapping.optimiser import LearningRates
 from sags_node.mapping.refiner import CpuRefiner, Refiner
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.rig import rectified_rig
@@ -152,8 +152,8 @@ def test_a_hurried_step_is_the_cpus(monkeypatch: pytest.MonkeyPatch) -> None:
         played.mapper.model.contribution[:] = 7.0
         colors = played.row("colors").copy()
         played.refiner.take(slice(0, played.mapper.model.count))
-        played.refiner.refine(Rates(), 0.6)
-        played.refiner.give_back()
+        played.refiner.refine(LearningRates(), 0.6)
+        played.refiner.download()
     assert_same_rows(*both)
     assert (both[1].row("contribution") == 7.0).all()
     kept = (both[1].row("colors") == colors).all(axis=1)
@@ -204,10 +204,10 @@ def test_nothing_is_copied_between_steps(monkeypatch: pytest.MonkeyPatch) -> Non
     with monkeypatch.context() as forbidden:
         forbidden.setattr(torch.Tensor, "cpu", lambda self: pytest.fail("fetched from the device"))
         forbidden.setattr(CudaRefiner, "_sent", lambda self, array: pytest.fail("sent to the device"))
-        played.refiner.refine(Rates())
-        played.refiner.refine_worst(0.3, Rates())
+        played.refiner.refine(LearningRates())
+        played.refiner.refine_worst(0.3, LearningRates())
     assert all(np.array_equal(before[name], played.row(name)) for name in REFINED)
-    played.refiner.give_back()
+    played.refiner.download()
     assert all(not np.array_equal(before[name], played.row(name)) for name in REFINED)
 
 
@@ -326,8 +326,8 @@ class Fault:
 
 
 FAULTS = [
-    (CudaRasterizer, "draw", 1), (CudaRasterizer, "draw", 2), (CudaRasterizer, "pull_back", 2),
-    (CudaRefiner, "begin", 1), (CudaRefiner, "take", 2), (CudaRefiner, "give_back", 1),
+    (CudaRasterizer, "draw", 1), (CudaRasterizer, "draw", 2), (CudaRasterizer, "backward_pass", 2),
+    (CudaRefiner, "begin", 1), (CudaRefiner, "take", 2), (CudaRefiner, "download", 1),
     (CudaRefiner, "redraw", 1),
 ]  # fmt: skip
 
@@ -432,7 +432,7 @@ def test_the_pipeline_runs_on_the_device_and_says_when_it_fails(monkeypatch: pyt
     assert psnr(take(0).views["left"], frame(0)) > 19
     take(1)
     assert "device" not in pipeline.warnings
-    Fault(CUDA_ERROR, 1).break_(monkeypatch, CudaRasterizer, "pull_back")
+    Fault(CUDA_ERROR, 1).break_(monkeypatch, CudaRasterizer, "backward_pass")
     result = take(2)
     assert psnr(result.views["left"], frame(2)) > 20 and len(result.snapshot.gaussians) > 60
     assert "the CPU goes on" in pipeline.warnings["device"][0].text

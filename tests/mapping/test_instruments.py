@@ -105,7 +105,7 @@ def test_a_pale_patch_inside_and_a_dark_picture() -> None:
 
 
 def test_tissue_that_the_model_does_not_know_is_let_go_in_time() -> None:
-    """Pale tissue moves in from the edge over a redder model that would never be mended."""
+    """Pale tissue moves in from the edge over a redder model that would never be fixed."""
     tissue = textured_tissue()
     picture = tissue.copy()
     picture[SHAFT] = (150, 150, 152)

@@ -186,7 +186,7 @@ def test_the_light_moves_with_the_scope(folder: Path) -> None:
         pair = pipeline.rectifier(there)
         tissue = cv2.erode(pipeline.tissue(there, pair, None).view(np.uint8), np.ones((9, 9))) > 0
         psnr = []
-        for gaussians in (pipeline.mapper.model.gaussians(), pipeline.mapper.lit_from(pair.camera)):
+        for gaussians in (pipeline.mapper.model.gaussians(), pipeline.mapper.relight(pair.camera)):
             view = to_view(pipeline._refiner.show(gaussians, pair.camera), pair.camera, 0, 0)
             wrong = (view.rgb - pair.left / np.float32(255))[tissue & (view.alpha > 0.9)]
             psnr.append(-10 * np.log10(np.mean(np.square(wrong))))

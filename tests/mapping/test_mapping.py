@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sags_node.mapping import densify, initialise
-from sags_node.mapping.motion import found_again, scene_flow
+from sags_node.mapping.motion import scene_flow, track
 from sags_node.model.gaussians import GaussianModel
 from sags_node.types import Camera, Observation, RenderedView
 
@@ -44,7 +44,7 @@ def grid_points(depth: float = DEPTH) -> np.ndarray:
 def flow_of(
     means: np.ndarray, before: RenderedView, tissue: np.ndarray, flow: np.ndarray, after: Observation
 ) -> tuple[np.ndarray, np.ndarray]:
-    return scene_flow(means, found_again(means, before, tissue, flow, after.tissue), after, 0.4)
+    return scene_flow(means, track(means, before, tissue, flow, after.tissue), after, 0.4)
 
 
 def test_scene_flow_of_a_sideways_shift() -> None:
@@ -142,8 +142,8 @@ def test_free_space_is_cleared_only_after_several_frames() -> None:
     )
     frame = observation()
     for _ in range(densify.FRONT_FRAMES - 1):
-        assert not densify.doomed(model, frame, model.capacity).any()
-    assert densify.doomed(model, frame, model.capacity).all()
+        assert not densify.prune_mask(model, frame, model.capacity).any()
+    assert densify.prune_mask(model, frame, model.capacity).all()
 
 
 def test_what_is_not_finite_or_transparent_goes_at_once_and_what_left_the_view_when_it_is_crowded() -> None:
@@ -155,9 +155,9 @@ def test_what_is_not_finite_or_transparent_goes_at_once_and_what_left_the_view_w
     model.colors[1, 2] = np.inf
     model.opacities[2] = 0.01
     model.means[3, 0] = 1.0
-    assert np.flatnonzero(densify.doomed(model, observation(), model.capacity)).tolist() == [0, 1, 2]
+    assert np.flatnonzero(densify.prune_mask(model, observation(), model.capacity)).tolist() == [0, 1, 2]
     model.append(points[50:], size[50:], grey[50:], 0.9)
-    assert np.flatnonzero(densify.doomed(model, observation(), model.capacity)).tolist() == [0, 1, 2, 3]
+    assert np.flatnonzero(densify.prune_mask(model, observation(), model.capacity)).tolist() == [0, 1, 2, 3]
 
 
 def test_where_the_machine_affords_fewer_those_that_show_least_go_but_none_that_has_just_come() -> None:
@@ -171,8 +171,8 @@ def test_where_the_machine_affords_fewer_those_that_show_least_go_but_none_that_
     model.contribution[:] = np.random.default_rng(0).uniform(2, 20, old)
     model.append(points, size, grey, 0.9)
     ids, shown, area = model.ids.copy(), model.contribution.copy(), shown_area(model)
-    assert densify.shed(model, len(ids)) == 0
-    removed = densify.shed(model, old // 2)
+    assert densify.prune_to_budget(model, len(ids)) == 0
+    removed = densify.prune_to_budget(model, old // 2)
     assert removed == len(ids) - model.count == int(densify.SHED * len(ids))
     gone = ~np.isin(ids, model.ids)
     assert not gone[old:].any()
@@ -180,7 +180,7 @@ def test_where_the_machine_affords_fewer_those_that_show_least_go_but_none_that_
     # What is left covers as much as all did, in the share that each one shows of its area.
     assert shown_area(model) == pytest.approx(area, rel=1e-3)
     np.testing.assert_allclose(model.log_scales, np.log(model.scales), atol=1e-5)
-    assert densify.shed(model, model.count - 1) == 1
+    assert densify.prune_to_budget(model, model.count - 1) == 1
 
 
 def shown_area(model: GaussianModel) -> float:
@@ -195,8 +195,8 @@ def test_a_full_model_gives_up_what_shows_least_and_nothing_that_shows_much() ->
     model = GaussianModel(len(points))
     model.append(points, size, grey, 0.9)
     model.contribution[:] = np.linspace(10, 1, len(points))
-    doomed = densify.least_shown(model, 10)
-    assert np.flatnonzero(doomed).tolist() == list(range(len(points) - 10, len(points)))
+    prune_mask = densify.least_shown(model, 10)
+    assert np.flatnonzero(prune_mask).tolist() == list(range(len(points) - 10, len(points)))
     model.contribution[:] = np.linspace(10, 5, len(points))
     assert not densify.least_shown(model, 10).any()
 

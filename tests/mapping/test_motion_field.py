@@ -161,6 +161,6 @@ def test_motion_is_remembered_once_somebody_wants_it_predicted() -> None:
         with session.source as source:
             for number, frame in enumerate(islice(source, 20)):
                 if number == 10:
-                    pipeline.foresee()
+                    pipeline.predict_motion()
                 forecasts.append(pipeline.process(frame, StepBudget(1)).snapshot.forecast is not None)
         assert [any(forecasts[:10]), any(forecasts[10:])] == found, said

@@ -313,7 +313,7 @@ def test_one_wrong_depth_counts_once_while_nothing_moves(frames: list[StereoFram
 
 
 def test_a_depth_measured_in_a_still_frame_counts_once_where_holes_are_filled_too() -> None:
-    """A model that is damaged while nothing moves is mended in that frame, and its depth looked at twice."""
+    """A model that is damaged while nothing moves is fixed in that frame, and its depth looked at twice."""
     camera, cells = camera_in_front(160, 128, 200.0), 16
     observation, _, _ = flat_scene(camera, np.zeros((0, 3), np.float32), np.zeros((128, 160), np.uint8), 0.08)
     model_of = Mapper(CpuRefiner(partial(make_rasterizer, "numba")), 2000)

@@ -105,7 +105,7 @@ def test_a_key_name_is_a_file_name(tmp_path: Path, name: str) -> None:
 
 @pytest.mark.fault("keys: readable by others")
 @pytest.mark.parametrize("mode", [0o640, 0o604, 0o620, 0o644])
-def test_a_key_that_others_can_read_is_refused_with_the_mend(tmp_path: Path, keys: Path, mode: int) -> None:
+def test_a_key_that_others_can_read_is_refused_with_the_fix(tmp_path: Path, keys: Path, mode: int) -> None:
     file, _ = write_key_pair(tmp_path, "node")
     file.chmod(mode)
     with pytest.raises(UsageError, match=rf"run: chmod 600 {file}") as raised:

@@ -17,7 +17,7 @@ from benchmarks.__main__ import main
 from benchmarks.quality.alias import VARIANTS, Settings, Trained, train
 from benchmarks.quality.alias_truth import moved, resized
 from sags_node.engine.rasterizer.rasterize import make_rasterizer, rasterize
-from sags_node.engine.rasterizer.smoothing import folded
+from sags_node.engine.rasterizer.smoothing import bake_filter
 from sags_node.evaluation.metrics import psnr
 from sags_node.geometry import project
 from sags_node.mapping.budget import StepBudget
@@ -336,5 +336,5 @@ def test_a_ply_file_draws_the_same_without_knowing_the_filter(tmp_path: Path) ->
 
 def test_folding_twice_changes_nothing() -> None:
     model, _, _ = mapped(smoothing=True)
-    once = folded(model.gaussians())
-    assert folded(once) is once
+    once = bake_filter(model.gaussians())
+    assert bake_filter(once) is once

@@ -130,7 +130,7 @@ def test_a_step_of_the_field_is_the_cpus(tokens: Any, broken: bool) -> None:
     before = {name: array.copy() for name, array in parameters(other).items()}
     host.step(FieldRates())
     device.step(FieldRates())
-    loan.give_back()
+    loan.download()
     for name, array in parameters(host).items():
         changed = parameters(other)[name]
         sound = np.isfinite(array)
@@ -158,7 +158,7 @@ def test_broken_nodes_spoil_no_others() -> None:
     np.testing.assert_allclose(found.cpu().numpy(), expected, rtol=1e-5, atol=1e-5)
     device.backward(on_device(v))
     device.step(FieldRates())
-    loan.give_back()
+    loan.download()
     assert np.isfinite(host.deltas.decoder.values).all()
     assert not np.array_equal(host.deltas.decoder.values, before)
     assert (~np.isfinite(host.deltas.hexplane.cells).all(axis=1)).sum() == 1

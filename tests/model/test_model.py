@@ -53,7 +53,7 @@ def test_capacity_is_never_exceeded_and_ids_are_never_reused() -> None:
 
 def test_frozen_copies_do_not_change_with_the_model() -> None:
     model = filled_model(patch(20))
-    frozen = model.frozen()
+    frozen = model.snapshot()
     model.means[:] += 1
     assert not np.any(frozen.means == model.means)
 
@@ -125,7 +125,7 @@ def test_new_tissue_far_away_gets_nodes_of_its_own() -> None:
 def test_ply_holds_what_viewers_expect_and_nothing_is_overwritten(tmp_path: Path) -> None:
     model = filled_model(patch(7))
     file = tmp_path / "model.ply"
-    write_ply(file, model.frozen())
+    write_ply(file, model.snapshot())
     header, _, body = file.read_bytes().partition(b"end_header\n")
     names = [line.split()[-1] for line in header.decode().splitlines() if line.startswith("property")]
     table = np.frombuffer(body, [(name, "<f4") for name in names])
@@ -134,4 +134,4 @@ def test_ply_holds_what_viewers_expect_and_nothing_is_overwritten(tmp_path: Path
     assert np.allclose(1 / (1 + np.exp(-table["opacity"])), 0.9)
     assert np.allclose(0.5 + 0.28209479 * table["f_dc_1"], 0.5)
     with pytest.raises(SagsError, match="exists already"):
-        write_ply(file, model.frozen())
+        write_ply(file, model.snapshot())

@@ -323,9 +323,7 @@ def sheared_pose(clip: Path) -> None:
     ],
     ids=lambda value: value.__name__ if callable(value) else "",
 )
-def test_mistakes_are_named_with_their_mend(
-    clip: Path, mistake: Callable[[Path], None], message: str
-) -> None:
+def test_mistakes_are_named_with_their_fix(clip: Path, mistake: Callable[[Path], None], message: str) -> None:
     mistake(clip)
     with pytest.raises(SagsError, match=message) as caught:
         open_source(load_launch(clip).source)

@@ -417,7 +417,7 @@ SHEARED = np.eye(4) + np.eye(4, k=1)
     ],
     ids=lambda value: getattr(value, "__name__", ""),
 )
-def test_mistakes_are_named_with_their_mend(
+def test_mistakes_are_named_with_their_fix(
     keyframe: Path, mistake: Callable[[Path], None], message: str
 ) -> None:
     mistake(keyframe)

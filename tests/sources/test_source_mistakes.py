@@ -1,4 +1,4 @@
-"""Recordings that cannot be played: what users get wrong, and damage that shows late, named with its mend."""
+"""Recordings that cannot be played: what users get wrong, and damage that shows late, named with its fix."""
 
 from __future__ import annotations
 

@@ -202,7 +202,7 @@ def test_an_open_shape_does_not_say_where_the_channels_are(scene: Scene, tmp_pat
         ("output: depth", "output: its outputs are disparity"),
     ],
 )
-def test_a_wrong_sidecar_is_named_with_its_mend(text: str, words: str, scene: Scene, tmp_path: Path) -> None:
+def test_a_wrong_sidecar_is_named_with_its_fix(text: str, words: str, scene: Scene, tmp_path: Path) -> None:
     path = save_matcher(tmp_path / "network.onnx")
     path.with_suffix(".yaml").write_text(text)
     with pytest.raises(UsageError, match=words) as caught:

@@ -136,7 +136,7 @@ WRONG: dict[str, tuple[Spoil, str]] = {
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_what_is_wrong_is_said_and_how_to_mend_it(
+def test_what_is_wrong_is_said_and_how_to_fix_it(
     name: str, session: Session, frames: list[StereoFrame]
 ) -> None:
     spoil, said = WRONG[name]

@@ -192,7 +192,7 @@ def test_a_line_when_it_begins_and_one_when_it_is_over() -> None:
 
 def test_the_mark_says_what_is_wrong_and_stays_on_the_rim() -> None:
     assert headlines(by_code({"eyes": (BLACK,)})) == ["the right picture is black"]
-    many = {str(number): f"number {number}: mend it" for number in range(5)}
+    many = {str(number): f"number {number}: fix it" for number in range(5)}
     assert headlines(many) == ["number 0", "number 1 (and 3 more)"]
     rgba = np.zeros((512, 640, 4), np.uint8)
     draw_mark(rgba, in_words({"eyes": (BLACK,)}))

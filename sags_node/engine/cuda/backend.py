@@ -22,7 +22,7 @@ class DeviceRasterizer(Protocol):
 
     def draw(self, gaussians: DeviceGaussians, pinhole: Pinhole, tiles: Tensor | None = None) -> Tensor: ...
 
-    def pull_back(self, v_planes: Tensor, weight: Tensor) -> DeviceGradients: ...
+    def backward_pass(self, v_planes: Tensor, weight: Tensor) -> DeviceGradients: ...
 
     def median_depth(self) -> tuple[Tensor, Tensor]: ...
 
@@ -38,7 +38,7 @@ def default_device() -> torch.device:
     if not torch.cuda.is_available():
         raise UsageError(
             "the cuda backend found no GPU: this torch has no CUDA build or sees no driver (try nvidia-smi); "
-            "mend that, or choose the numba backend"
+            "fix that, or choose the numba backend"
         )
     return torch.device("cuda", torch.cuda.current_device())
 
@@ -68,7 +68,7 @@ class DeviceBackend:
 
     def backward(self, v_planes: F32, weight: F32) -> Gradients:
         device = self._rasterizer.device
-        found = self._rasterizer.pull_back(
+        found = self._rasterizer.backward_pass(
             torch.tensor(v_planes, device=device), torch.tensor(weight, device=device)
         )
         return Gradients(

@@ -50,7 +50,7 @@ def usable_device() -> torch.device:
     if not torch.cuda.is_available():
         raise UsageError(
             "the gsplat backend found no GPU: this torch has no CUDA build or sees no driver (try "
-            "nvidia-smi); mend that, or choose the numba backend"
+            "nvidia-smi); fix that, or choose the numba backend"
         )
     try:
         with redirect_stdout(sys.stderr):  # it reports its progress; our results are alone on stdout
@@ -139,8 +139,8 @@ class GsplatRasterizer:
         )  # fmt: skip
         return rendered[0], alphas[0]
 
-    def pull_back(self, v_planes: Tensor, weight: Tensor) -> DeviceGradients:
-        """As `CudaRasterizer.pull_back`."""
+    def backward_pass(self, v_planes: Tensor, weight: Tensor) -> DeviceGradients:
+        """As `CudaRasterizer.backward_pass`."""
         self._check_drawn()
         n = len(self._means)
         leaves = [self._means, self._quats, self._scales, self._opacities, self._colors, self._sh_rest]

@@ -95,7 +95,7 @@ class PhotometricLoss:
         if similar:
             self._dissimilar = self._dissimilarity.forward(self._drawn[:3], self._truth, weight)
             self._dissimilarity.backward(self._factors[kernels.BY_SIMILARITY.value], self._v_similar)
-        kernels.pull_back[(self._programs,)](
+        kernels.backward_pass[(self._programs,)](
             planes, tissue, tissue if unseen is None else unseen, self._drawn, self._truth, weight,
             self._depth_residual, self._v_similar, self._factors, v_planes, self._variations, *self._size,
             weights.smoothness / (3 * self._pixels), weights.depth_smoothness / self._pixels,

@@ -23,9 +23,9 @@ RESIDUALS, PIXELS, DEPTH_RESIDUALS, DEPTHS, LACKS, TISSUES = (tl.constexpr(k) fo
 DRAWN_MEAN, GIVEN_MEAN, DRAWN_SQUARES, GIVEN_SQUARES, PRODUCTS = (tl.constexpr(k) for k in range(6, 11))
 SUMS = tl.constexpr(11)
 
-# what `combine` writes for `pull_back`: derivatives of the loss by one pixel's colour residual, inverse depth
-# residual and lack of coverage; a, b, c, d of the correlation, whose derivative by a drawn inverse depth x
-# with the given one y is -a (y - b) + c (x - d); and the derivative by one pixel's 1 - SSIM
+# what `combine` writes for `backward_pass`: derivatives of the loss by one pixel's colour residual, inverse
+# depth residual and lack of coverage; a, b, c, d of the correlation, whose derivative by a drawn inverse depth
+# x with the given one y is -a (y - b) + c (x - d); and the derivative by one pixel's 1 - SSIM
 BY_COLOR, BY_DEPTH, BY_COVERAGE, BY_GIVEN, DRAWN_BY_GIVEN = (tl.constexpr(k) for k in range(5))
 BY_DRAWN, DRAWN_BY_DRAWN, BY_SIMILARITY = (tl.constexpr(k) for k in range(5, 8))
 FACTORS = 8
@@ -172,7 +172,7 @@ def _step(here: tl.tensor, plane: tl.tensor, to: tl.tensor, counted: tl.tensor) 
 
 
 @triton.jit(do_not_specialize=("height", "width"))
-def pull_back(
+def backward_pass(
     planes: tl.tensor,  # [5, P]
     tissue: tl.tensor,  # [P]
     region: tl.tensor,  # [P] where the total variation applies; not read if EVERYWHERE
@@ -279,7 +279,7 @@ SIGNATURES = (
     ),
     *(
         Compiled(
-            pull_back,
+            backward_pass,
             _PULL_BACK,
             {"NORMALISED": on, "SIMILAR": on, "EVERYWHERE": not on, "BLOCK": BLOCK},
         )

@@ -38,7 +38,7 @@ def probe() -> str:
     except Exception as error:  # the driver, Triton and the C compiler that it calls fail in many ways
         first = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise UnusableError(
-            f"the GPU's test drawing failed: {first}", "mend that (Triton needs a C compiler: gcc)"
+            f"the GPU's test drawing failed: {first}", "fix that (Triton needs a C compiler: gcc)"
         ) from error
     if not apart < TOLERANCE:
         raise UnusableError(

@@ -47,7 +47,7 @@ class CudaRasterizer:
         """Draw for a camera of the rasteriser's picture size.
 
         Args:
-            gaussians: kept until the next call, and must be unchanged for `pull_back`.
+            gaussians: kept until the next call, and must be unchanged for `backward_pass`.
             pinhole: the camera.
             tiles: [ceil(H / 32), ceil(W / 16)] bool, as in `interface.Rasterizer.forward`. None: all.
 
@@ -84,7 +84,7 @@ class CudaRasterizer:
         self._drawn = True
         return self._planes
 
-    def pull_back(self, v_planes: Tensor, weight: Tensor) -> DeviceGradients:
+    def backward_pass(self, v_planes: Tensor, weight: Tensor) -> DeviceGradients:
         """Gradients of sum(v_planes * planes) for the last `draw`, in fresh tensors.
 
         Args:

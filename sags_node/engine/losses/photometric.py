@@ -141,7 +141,7 @@ class PhotometricLoss:
             weights.correlation * correlation.by_drawn,
             correlation.drawn_mean,
         ]
-        kernels.pull_back(
+        kernels.backward_pass(
             read_only(planes), read_only(tissue), read_only(drawn), read_only(truth), read_only(weight),
             read_only(self._depth_residual), read_only(self._v_drawn.reshape(4, pixels)),
             self._normalised, np.array(factors, np.float32), scratch, v_planes,

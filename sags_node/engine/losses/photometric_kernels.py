@@ -190,7 +190,7 @@ def _pull_back_piece(
     depth_residual: F32,
     v_drawn: F32,  # [4, P] of the other terms
     normalised: bool,
-    factors: F32,  # [7], see `pull_back`
+    factors: F32,  # [7], see `backward_pass`
     start: Any,
     count: int,
     v_planes: F32,  # [5, P] written
@@ -248,7 +248,7 @@ def _pull_back_piece(
 
 
 @parallel_kernel
-def pull_back(
+def backward_pass(
     planes: F32, tissue: Bool, drawn: F32, truth: F32, weight: F32, depth_residual: F32, v_drawn: F32,
     normalised: bool, factors: F32, scratch: F32, v_planes: F32,
 ) -> None:  # fmt: skip

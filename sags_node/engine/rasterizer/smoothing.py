@@ -28,7 +28,7 @@ u8 = np.uint64
 ZERO, ONE = f4(0.0), f4(1.0)
 
 
-def folded(gaussians: Gaussians) -> Gaussians:
+def bake_filter(gaussians: Gaussians) -> Gaussians:
     """The same picture without a filter still to be applied, for whoever does not know it: viewers, files,
     messages. Scales and opacities are fresh arrays where there was one."""
     if gaussians.smoothing is None:

@@ -46,7 +46,7 @@ class Loan:
         """A copy on the device, to be read."""
         return torch.tensor(array, device=self.device)
 
-    def give_back(self) -> None:
+    def download(self) -> None:
         """Write what was taken into the host's arrays. Waits for the device."""
         for array, tensor in self._lent:
             torch.from_numpy(array).copy_(tensor)

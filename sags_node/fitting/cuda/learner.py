@@ -61,7 +61,7 @@ class CudaLearner:
         return float(self._residual)
 
     def begin(self, model: DeformableModel, density: Density) -> None:
-        self.give_back()
+        self.download()
         self._host, self._density = model, density
 
     def descend(
@@ -91,7 +91,7 @@ class CudaLearner:
         self._model.refine(self._pull_back(), rates, relaxation, field_rates)
 
     def begin_paths(self, field: Field, rows: F32, paths: Paths) -> None:
-        self.give_back()
+        self.download()
         field.follow(rows[:, columns.MEAN])
         self._field_host, self._paths_host = field, (rows, paths)
 
@@ -107,9 +107,9 @@ class CudaLearner:
         self._field.backward(v_deformed)
         self._field.step(rates)
 
-    def give_back(self) -> None:
+    def download(self) -> None:
         if self._loan is not None:
-            self._loan.give_back()
+            self._loan.download()
             self._loan = None
 
     def _borrow_model(self) -> None:
@@ -133,7 +133,7 @@ class CudaLearner:
         return self._rasterizer.draw(gaussians, as_pinhole(frame.camera))
 
     def _pull_back(self) -> DeviceGradients:
-        return self._rasterizer.pull_back(self._v_planes, self._weight)
+        return self._rasterizer.backward_pass(self._v_planes, self._weight)
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,7 +21,7 @@ from sags_node.mapping import exposure, focus, optimiser
 from sags_node.mapping.cuda import exposure as device_exposure
 from sags_node.mapping.cuda import focus as device_focus
 from sags_node.mapping.cuda.optimiser import Constants, Model, Optimiser, Slopes
-from sags_node.mapping.optimiser import Rates
+from sags_node.mapping.optimiser import LearningRates
 from sags_node.mapping.refiner import DEPTH_SCALE, DEPTH_WEIGHT
 from sags_node.model.cuda.nodes import Followers, Nodes, descend
 from sags_node.model.deformation import NodeDeformation
@@ -120,7 +120,7 @@ class CudaRefiner:
         self._gaussians = DeviceGaussians(**{name: alive[name] for name in drawn})
         self._followers = Followers.of(alive["node_index"], alive["node_weight"], len(self._nodes.places))
 
-    def give_back(self) -> None:
+    def download(self) -> None:
         if not self._changed:
             return
         assert self._host is not None and self._deformation is not None
@@ -146,7 +146,7 @@ class CudaRefiner:
         found: F32 = gain.cpu().numpy()
         return found
 
-    def refine(self, rates: Rates, share: float = 1.0) -> None:
+    def refine(self, rates: LearningRates, share: float = 1.0) -> None:
         if share >= 1.0:
             self._contribution.copy_(self._step(self._tissue, rates).contribution)
             return
@@ -154,7 +154,7 @@ class CudaRefiner:
         rows = self._worst_tiles(share).repeat_interleave(TILE_HEIGHT, 0)[:height]
         self._step(self._tissue & rows.repeat_interleave(TILE_WIDTH, 1)[:, :width], rates)
 
-    def refine_worst(self, share: float, rates: Rates, nodes: bool = True) -> None:
+    def refine_worst(self, share: float, rates: LearningRates, nodes: bool = True) -> None:
         tiles = self._worst_tiles(share)
         self._planes = self._rasterizer.draw(self._gaussians, self._pinhole, tiles)
         self._step(self._tissue, rates, nodes)
@@ -184,7 +184,7 @@ class CudaRefiner:
             made[size] = CudaRasterizer(*size, True, self._device)
         return made[size]
 
-    def _step(self, tissue: Tensor, rates: Rates, nodes: bool = True) -> DeviceGradients:
+    def _step(self, tissue: Tensor, rates: LearningRates, nodes: bool = True) -> DeviceGradients:
         planes = self._planes
         if self._v_planes.shape != planes.shape:
             self._v_planes, self._weight = torch.zeros_like(planes), torch.zeros_like(planes[0])
@@ -192,7 +192,7 @@ class CudaRefiner:
         self._last_loss = tissue_loss(
             planes, self._image, tissue, self._depth, v_planes, weight, DEPTH_WEIGHT, DEPTH_SCALE
         )
-        gradients = self._rasterizer.pull_back(v_planes, weight)
+        gradients = self._rasterizer.backward_pass(v_planes, weight)
         if nodes:  # they move all that follows them, also far from the tiles that were drawn
             descend(
                 self._nodes, self._followers, gradients.means, gradients.contribution, self._model.means,

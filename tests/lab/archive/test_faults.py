@@ -85,7 +85,7 @@ def is_alive(process: int) -> bool:
         return False
 
 
-def test_broken_recordings_are_quarantined_and_mended_ones_done(cluster: Any, tmp_path: Path) -> None:
+def test_broken_recordings_are_quarantined_and_fixed_ones_done(cluster: Any, tmp_path: Path) -> None:
     recordings = write_quick_recordings(tmp_path / "in", 8)
     _, whole = gone_through(tmp_path / "whole", recordings, cluster)
     assert (whole.done, whole.quarantined) == (8, 0)
@@ -113,8 +113,8 @@ def test_broken_recordings_are_quarantined_and_mended_ones_done(cluster: Any, tm
     assert (again.kept, again.done, again.quarantined) == (4, 0, 4)  # nothing is tried for a third time
     for number, (said, _, _) in broken.items():
         change(recordings[number], **dict.fromkeys(said))
-    mended = gone_through(tmp_path / "out", recordings, cluster, plan=plan)[1]
-    assert (mended.kept, mended.done, mended.quarantined) == (4, 4, 0)
+    fixed = gone_through(tmp_path / "out", recordings, cluster, plan=plan)[1]
+    assert (fixed.kept, fixed.done, fixed.quarantined) == (4, 4, 0)
     assert table(store) == table(Store(str(tmp_path / "whole")))
     assert status(store)["failed"] == []
 
