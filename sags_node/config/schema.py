@@ -735,7 +735,7 @@ class LaunchConfig(Section):
 
 # Keys of earlier versions, and what stands in their place: an error says it.
 ALWAYS_ON = "it is always on; `python -m benchmarks pareto --only skips` says what it brings"
-SCENE = "tests and `sags phantom FOLDER key:=value` set it: play that folder"
+SCENE = "`sags phantom FOLDER key:=value` writes a session with it; play that folder"
 REMOVED = {
     "seed": "`python -m benchmarks endurance` has --seed; source.seed is the phantom's",
     "mapping.right_eye": "publish.right draws the right eye, and learns from what it sees",

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sags_node.config.launch_file import load_launch
+from sags_node.config.launch_file import load_launch, section_of
 from sags_node.config.schema import FoldersSource, PhantomSource
 from sags_node.errors import SagsError, UsageError
 from sags_node.geometry import invert, transform
@@ -291,6 +291,14 @@ def test_cache_renders_once_and_keys_on_what_shapes_the_pictures(
     assert rendered == [1, 2, 3]
     assert cached_session(TINY.model_copy(update={"smoke": 0.5})) != first
     assert cached_session(PhantomSource(seconds=TINY.seconds, width=TINY.width, height=TINY.height)) == first
+
+
+def test_a_scene_has_keys_that_a_launch_file_lacks() -> None:
+    assert section_of(PhantomScene, ["seconds:=2", "smoke:=0.5"]) == PhantomScene(seconds=2, smoke=0.5)
+    with pytest.raises(UsageError, match="unknown key 'smok'; did you mean 'smoke'"):
+        section_of(PhantomScene, ["smok:=0.5"])
+    with pytest.raises(UsageError, match=r"there is no source\.smoke any more: `sags phantom FOLDER"):
+        load_launch(None, ["source.smoke:=0.5"])
 
 
 def test_the_scope_zooms_along_its_axis_and_orbits_round_what_it_looks_at() -> None:
