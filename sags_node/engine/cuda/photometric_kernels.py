@@ -24,8 +24,8 @@ DRAWN_MEAN, GIVEN_MEAN, DRAWN_SQUARES, GIVEN_SQUARES, PRODUCTS = (tl.constexpr(k
 SUMS = tl.constexpr(11)
 
 # what `combine` writes for `backward_pass`: derivatives of the loss by one pixel's colour residual, inverse
-# depth residual and lack of coverage; a, b, c, d of the correlation, whose derivative by a drawn inverse depth
-# x with the given one y is -a (y - b) + c (x - d); and the derivative by one pixel's 1 - SSIM
+# depth residual and lack of coverage; a, b, c, d of the correlation, whose derivative by a drawn inverse
+# depth x with the given one y is -a (y - b) + c (x - d); and the derivative by one pixel's 1 - SSIM
 BY_COLOR, BY_DEPTH, BY_COVERAGE, BY_GIVEN, DRAWN_BY_GIVEN = (tl.constexpr(k) for k in range(5))
 BY_DRAWN, DRAWN_BY_DRAWN, BY_SIMILARITY = (tl.constexpr(k) for k in range(5, 8))
 FACTORS = 8
