@@ -51,7 +51,9 @@ def marks() -> list[Mark]:
 
 def _marks(file: Path) -> Iterator[Mark]:
     for node in ast.parse(file.read_text(encoding="utf-8")).body:
-        for call in node.decorator_list if isinstance(node, ast.FunctionDef) else ():
+        if not isinstance(node, ast.FunctionDef):
+            continue
+        for call in node.decorator_list:
             if isinstance(call, ast.Call) and ast.unparse(call.func) == "pytest.mark.fault":
                 (name,) = map(ast.literal_eval, call.args)
                 yield Mark(name, node.name, file.relative_to(ROOT).as_posix())
