@@ -50,10 +50,9 @@ def marks() -> list[Mark]:
 
 
 def _marks(file: Path) -> Iterator[Mark]:
-    functions = (
-        node for node in ast.parse(file.read_text("utf-8")).body if isinstance(node, ast.FunctionDef)
-    )
-    for node in functions:
+    for node in ast.parse(file.read_text(encoding="utf-8")).body:
+        if not isinstance(node, ast.FunctionDef):
+            continue
         for call in node.decorator_list:
             if isinstance(call, ast.Call) and ast.unparse(call.func) == "pytest.mark.fault":
                 (name,) = map(ast.literal_eval, call.args)

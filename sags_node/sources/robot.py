@@ -180,7 +180,7 @@ class Posed:
             config.source, LiveSource
         ):  # the offset is to the stamp, which had no latency taken off
             self._offset_ns += round(config.source.latency_ms * 1e6)
-        self._robot = open_robot(config)
+        self.robot = open_robot(config)
         self._recorded = isinstance(config.robot, BagRobot)
         self._source = source
         self._without = 0  # frames before the first pose
@@ -207,7 +207,7 @@ class Posed:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._source.__exit__(kind, error, trace)
-        self._robot.close()
+        self.robot.close()
 
     def stop(self) -> None:
         self._source.stop()
@@ -218,7 +218,7 @@ class Posed:
             t_ns = frame.t_device_ns if self._recorded else frame.t_capture_ns
             problem = None
             try:
-                last = self._robot.track.at(t_ns + self._offset_ns, WAIT_S) @ self._T_hand_cam
+                last = self.robot.track.at(t_ns + self._offset_ns, WAIT_S) @ self._T_hand_cam
             except NoPoseError as error:
                 problem = error.finding
             if last is None:

@@ -6,6 +6,7 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -138,55 +139,36 @@ def test_rows_of_the_phantom_are_exact(phantom: tuple[StereoRig, Pairs]) -> None
 # ---- planted errors --------------------------------------------------------------------------------------
 
 
-@every_subject
-def test_swapped_pictures(subject: tuple[StereoRig, Pairs]) -> None:
-    rig, pairs = subject
-    finding = worst(check_pictures(rig, swapped(pairs)))
-    assert finding.level == "error"
-    assert "the pictures are swapped" in finding.what and "calibration is in order" in finding.fix
+def unchanged(given: Any) -> Any:
+    return given
+
+
+NOTHING = "", ""
+# What is done to the rig and to the pictures; what pictures tell of it and its fix; what numbers alone tell.
+PLANTED: dict[str, tuple[Any, Any, tuple[str, str], tuple[str, str]]] = {
+    "swapped pictures": (
+        unchanged, swapped, ("the pictures are swapped", "calibration is in order"), NOTHING
+    ),
+    "swapped files": (
+        swapped_files, unchanged, ("swapped in the calibration", "pictures are in order"), NOTHING
+    ),
+    "wrong sign": (
+        with_T_negated, unchanged, ("has the wrong sign", "pictures are in order"), ("", "must be -fx")
+    ),
+    "both ends swapped": (swapped_files, swapped, ("pictures and calibration agree", ""), NOTHING),
+    "millimetres": (in_millimetres, unchanged, ("", "millimetres"), ("looks like millimetres", "")),
+    "half size": (half_size, unchanged, ("0.5 times the size", ""), ("camera_matrix is of", "by 2")),
+}  # fmt: skip
 
 
 @every_subject
-def test_swapped_files(subject: tuple[StereoRig, Pairs]) -> None:
-    rig, pairs = subject
-    finding = worst(check_pictures(swapped_files(rig), pairs))
-    assert finding.level == "error"
-    assert "swapped in the calibration" in finding.what and "pictures are in order" in finding.fix
-
-
-@every_subject
-def test_wrong_sign(subject: tuple[StereoRig, Pairs]) -> None:
-    rig, pairs = subject
-    wrong = with_T_negated(rig)
-    assert any(finding.level == "error" for finding in check_rig(wrong))
-    finding = worst(check_pictures(wrong, pairs))
-    assert finding.level == "error"
-    assert "has the wrong sign" in finding.what and "pictures are in order" in finding.fix
-
-
-@every_subject
-def test_both_ends_swapped(subject: tuple[StereoRig, Pairs]) -> None:
-    rig, pairs = subject
-    finding = worst(check_pictures(swapped_files(rig), swapped(pairs)))
-    assert finding.level == "error" and "pictures and calibration agree" in finding.what
-
-
-@every_subject
-def test_millimetres(subject: tuple[StereoRig, Pairs]) -> None:
-    rig, pairs = subject
-    assert "looks like millimetres" in worst(check_rig(in_millimetres(rig))).what
-    finding = worst(check_pictures(in_millimetres(rig), pairs))
-    assert finding.level == "error" and "millimetres" in finding.fix
-
-
-@every_subject
-def test_half_size_matrices(subject: tuple[StereoRig, Pairs]) -> None:
-    rig, pairs = subject
-    wrong = half_size(rig)
-    warned = worst(check_rig(wrong))
-    assert "camera_matrix is of" in warned.what and "by 2" in warned.fix
-    finding = worst(check_pictures(wrong, pairs))
-    assert finding.level == "error" and "0.5 times the size" in finding.what
+@pytest.mark.parametrize("name", PLANTED)
+def test_a_planted_error_is_found_and_named(subject: tuple[StereoRig, Pairs], name: str) -> None:
+    of_rig, of_pairs, said, said_of_numbers = PLANTED[name]
+    rig = of_rig(subject[0])
+    finding, numbers = worst(check_pictures(rig, of_pairs(subject[1]))), worst(check_rig(rig))
+    assert finding.level == "error" and said[0] in finding.what and said[1] in finding.fix
+    assert said_of_numbers[0] in numbers.what and said_of_numbers[1] in numbers.fix
 
 
 @every_subject

@@ -112,8 +112,8 @@ def test_a_topic_that_says_too_little(beside_node: dict[str, Any]) -> None:
 
 
 def test_topic_tools_in_words_and_in_json(beside_node: dict[str, Any]) -> None:
-    listen = ("--seconds", "2")
-    rows = {row["topic"]: row for row in pure_json(sags("topic", "list", "--seconds", "3", "--json").stdout)}
+    listen = ("--seconds", "1")
+    rows = {row["topic"]: row for row in pure_json(sags("topic", "list", "--seconds", "2", "--json").stdout)}
     assert rows["sags/left/render/depth"]["rate_hz"] > 0
     assert rows["sags/parameters"]["messages"] == 1 and rows["sags/parameters"]["rate_hz"] is None
     assert rows["sags/right/camera_info"]["messages"] > 0
@@ -137,7 +137,7 @@ def test_echo_in_words_and_in_json(beside_node: dict[str, Any]) -> None:
 
 def test_overlay_in_words_and_in_json(beside_node: dict[str, Any], tmp_path: Path) -> None:
     still, video = tmp_path / "still.png", tmp_path / "video.mp4"
-    summary = pure_json(sags("overlay", "--seconds", "3", "--save", still, "--json").stdout)
+    summary = pure_json(sags("overlay", "--seconds", "2", "--save", still, "--json").stdout)
     assert summary["frames"] > 0 and summary["saved"] == str(still)
     assert cv2.imread(str(still)).shape == (256, 320, 3)
     assert "with the overlay" in sags("overlay", "--seconds", "1.5", "--save", video).stdout

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 import pytest
-from engine_scenes import relative_error
+from engine_scenes import on_one_thread, relative_error
 
 from sags_node.engine.adam import AdamState, adam_step
 from sags_node.types import F32, F64, I64
@@ -122,12 +121,7 @@ def test_same_bits_for_one_and_all_threads() -> None:
         return values
 
     together = run()
-    cores = numba.get_num_threads()
-    numba.set_num_threads(1)
-    try:
-        alone = run()
-    finally:
-        numba.set_num_threads(cores)
+    alone = on_one_thread(run)
     np.testing.assert_array_equal(alone, together)
 
 

@@ -19,6 +19,7 @@ from engine_scenes import (
     camera,
     cotangents,
     draw_and_differentiate,
+    on_one_thread,
     random_gaussians,
     truth,
     with_filter,
@@ -206,12 +207,7 @@ def test_a_crowd_in_one_corner(corner: tuple[float, float]) -> None:
 @pytest.mark.parametrize("tiles", [None, SOME], ids=["all", "some"])
 def test_same_bits_however_many_share_the_work(tiles: Bool | None, monkeypatch: pytest.MonkeyPatch) -> None:
     expected = everything(scene(), WIDE, tiles)
-    cores = numba.get_num_threads()
-    numba.set_num_threads(1)
-    try:
-        assert_same_bits(everything(scene(), WIDE, tiles), expected)
-    finally:
-        numba.set_num_threads(cores)
+    assert_same_bits(on_one_thread(lambda: everything(scene(), WIDE, tiles)), expected)
     for pieces in (2, 3, 7, 64):  # more workers than this machine may have cores
         for module in (numba_rasterizer, projector):
             monkeypatch.setattr(module, "thread_count", lambda pieces=pieces: pieces)

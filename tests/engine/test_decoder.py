@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 import pytest
-from engine_scenes import relative_error
+from engine_scenes import on_one_thread, relative_error
 
 from sags_node.engine.reference import decoder as decoder_reference
 from sags_node.errors import UsageError
@@ -206,12 +205,7 @@ def test_same_bits_for_one_and_all_threads(config: DecoderConfig) -> None:
     decoder = trained(config)
     arrays = inputs(config, 900)
     together = run(decoder, *arrays)
-    cores = numba.get_num_threads()
-    numba.set_num_threads(1)
-    try:
-        alone = run(trained(config), *arrays)
-    finally:
-        numba.set_num_threads(cores)
+    alone = on_one_thread(lambda: run(trained(config), *arrays))
     for a, b in zip(together, alone, strict=True):
         np.testing.assert_array_equal(a, b)
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import cv2
-import numba
 import numpy as np
 import pytest
 import torch
+from engine_scenes import on_one_thread
 from rounding import after, exact
 
 from sags_node.engine.losses.ssim import TILE_HEIGHT, TILE_WIDTH, Dissimilarity
@@ -116,11 +116,6 @@ def test_scale_multiplies_the_gradient() -> None:
 def test_same_bits_for_one_and_all_threads() -> None:
     inputs = pictures(100, 300)
     together = run(*inputs)
-    cores = numba.get_num_threads()
-    numba.set_num_threads(1)
-    try:
-        alone = run(*inputs)
-    finally:
-        numba.set_num_threads(cores)
+    alone = on_one_thread(lambda: run(*inputs))
     assert alone[0] == together[0]
     np.testing.assert_array_equal(alone[1], together[1])

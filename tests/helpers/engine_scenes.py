@@ -2,9 +2,10 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
 
+import numba
 import numpy as np
 import pytest
 import torch
@@ -15,6 +16,7 @@ from sags_node.engine.interface import MAX_OPACITY
 from sags_node.engine.rasterizer.rasterize import Gradients, make_rasterizer
 from sags_node.types import F32, F64, Camera, Gaussians
 
+T = TypeVar("T")
 INPUTS = ("means", "quats", "scales", "opacities", "colors")
 DERIVATIVES = tuple(field.name for field in dataclasses.fields(Gradients))
 
@@ -190,3 +192,12 @@ def _moved_gaussians(gaussians: Gaussians, rng: np.random.Generator) -> Gaussian
 
 def relative_error(found: NDArray[np.floating], true: NDArray[np.floating]) -> float:
     return float(np.linalg.norm(found - true) / np.linalg.norm(true))
+
+
+def on_one_thread(run: Callable[[], T]) -> T:
+    cores = numba.get_num_threads()
+    numba.set_num_threads(1)
+    try:
+        return run()
+    finally:
+        numba.set_num_threads(cores)

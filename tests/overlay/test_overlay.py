@@ -357,5 +357,4 @@ def blank_in_time(watcher: Watcher) -> str:
     until_blank(watcher)
     keyed = watcher.subscriber.wait("left/overlay/color_key", 60)
     assert isinstance(keyed, ReceivedImage)
-    until(lambda: watcher.status().get("reason"))
-    return str(watcher.status()["reason"])
+    return str(until(lambda: watcher.status().get("reason")))

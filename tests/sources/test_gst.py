@@ -41,7 +41,6 @@ CAMERA = (
     "! video/x-raw,format=RGB,width={width},height={height},framerate=30/1"
 )
 SMALL = CAMERA.format(width=320, height=240)
-STALL = 120  # pictures of either eye
 # The right eye sees the mirrored picture: a pair that is none would not fit.
 TWO_EYES = "{camera} ! tee name=t  t. ! left.  t. ! queue ! {more} videoflip video-direction=horiz ! right."
 
@@ -95,45 +94,6 @@ def test_no_pair_is_mismatched_also_where_pictures_are_lost() -> None:
     assert frames[-1].frame_id - frames[0].frame_id >= 44  # gaps where a left picture found no partner
     ages = np.array(came) - [frame.t_capture_ns for frame in frames]
     assert (ages > -1e6).all()  # a stamp is exact to a millisecond
-
-
-@pytest.mark.fault("mapping: stalls for some seconds")
-def test_a_stalled_mapper_meets_no_old_pictures() -> None:
-    """It stalls until so many were left out. What waits in all places together is a fraction of a second."""
-    frames = []
-    with open_pipeline(two_eyes()) as source:
-        for frame in source:
-            frames.append(frame)
-            if len(frames) == 9:
-                break
-            if len(frames) == 8:
-                before = source.dropped
-                until(lambda before=before: source.dropped >= before + STALL)
-    # They were counted in pairs or single pictures.
-    assert frames[8].frame_id - frames[7].frame_id > STALL / 2
-
-
-@pytest.mark.fault("process: the camera's pipeline is killed")
-def test_a_killed_pipeline_is_back_by_itself(caplog: pytest.LogCaptureFixture) -> None:
-    frames: list[StereoFrame] = []
-    with open_pipeline(two_eyes()) as source:
-
-        def keep() -> None:
-            frames.extend(source)
-
-        taking = threading.Thread(target=keep)
-        taking.start()
-        until(lambda: len(frames) > 5)
-        kill_pipelines()
-        before = time.time_ns()
-        until(lambda: frames[-1].t_capture_ns > before + 500_000_000)
-        source.stop()
-        taking.join(60)
-        assert not taking.is_alive()
-    assert "its process was ended by signal 9" in caplog.text and "GStreamer is open again" in caplog.text
-    stamps = [frame.t_capture_ns for frame in frames]
-    assert all(b > a for a, b in pairwise(stamps))
-    assert [frame.epoch for frame in frames] == [0] * len(frames)
 
 
 @pytest.mark.fault("camera: one eye falls silent")

@@ -46,6 +46,7 @@ class Shown(NamedTuple):
     sent_ns: int
     moment: float  # of the sender's second, as the picture itself shows it
     right_moment: float
+    epoch: int
 
     @property
     def age_s(self) -> float:
@@ -86,8 +87,8 @@ def running(
     pauses, process = iter(PAUSES), Pipeline.process
 
     def slowly(pipeline: Pipeline, *arguments: Any) -> FrameResult:
-        due = node._frames.dropped + next(pauses, 0)
-        until(lambda: node._frames.dropped >= due)
+        due = node.dropped["capture"] + next(pauses, 0)
+        until(lambda: node.dropped["capture"] >= due)
         return process(pipeline, *arguments)
 
     monkeypatch.setattr(Pipeline, "process", slowly)
@@ -97,7 +98,7 @@ def running(
         pair = result.pair
         assert pair.right is not None
         moments = moment(pair.left), moment(pair.right)
-        shown.append(Shown(pair.frame_id, pair.t_capture_ns, time.time_ns(), *moments))
+        shown.append(Shown(pair.frame_id, pair.t_capture_ns, time.time_ns(), *moments, result.epoch))
 
     def sender() -> AbstractContextManager[object]:
         if way == "gst":
@@ -114,6 +115,8 @@ def running(
 
 
 @pytest.mark.fault("process: what sends pictures is killed, the mapping is slow and stalls")
+@pytest.mark.fault("mapping: stalls for some seconds")
+@pytest.mark.fault("process: the camera's pipeline is killed")
 @pytest.mark.parametrize("way", ["gst", "push", "ros2"])
 def test_a_stalled_mapper_shows_nothing_old_and_a_killed_source_comes_again(
     way: str, phantom_session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -142,4 +145,5 @@ def test_a_stalled_mapper_shows_nothing_old_and_a_killed_source_comes_again(
     assert median(lie_s(one, until_killed[0]) for one in until_killed) < 0.25
     assert all(one.moment == one.right_moment for one in shown)
     assert all(one.stamp_ns < other.stamp_ns for one, other in pairwise(shown))
+    assert {one.epoch for one in shown} == {0}
     assert dropped >= sum(PAUSES)  # and that is said

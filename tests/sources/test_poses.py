@@ -169,7 +169,7 @@ def test_a_frame_without_a_pose_is_held_and_said(tmp_path: Path, monkeypatch: py
     posed = Posed(Frames(frames), session.config.model_copy(update={"robot": robot}), session.rig)
     known = [*range(18, 57), *range(78, 130)]  # in 1/100 s
     for number in known:
-        told(posed._robot.track, shifted(0.3), number * 10 * MS)
+        told(posed.robot.track, shifted(0.3), number * 10 * MS)
     monkeypatch.setattr("sags_node.sources.robot.WAIT_S", 0.0)
     with posed:
         came = list(posed)
@@ -198,7 +198,7 @@ def test_the_offset_is_to_the_stamp_before_its_latency_is_taken_off(tmp_path: Pa
     frame = StereoFrame(0, S - 40 * MS, S - 40 * MS, picture, picture, t_device_ns=S)
     with Posed(Frames([frame]), config, rig) as posed:
         for number in range(90, 111):
-            told(posed._robot.track, shifted(0.001 * number), number * 10 * MS)
+            told(posed.robot.track, shifted(0.001 * number), number * 10 * MS)
         (came,) = list(posed)
     assert came.T_world_cam is not None and came.T_world_cam[0, 3] == pytest.approx(0.103)
 

@@ -7,8 +7,7 @@ import os
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ import cv2
 import numpy as np
 import pytest
 from places import ROOT
+from waiting import until
 
 from sags_node.messaging.control import ControlClient
 from sags_node.messaging.received import ReceivedImage, TopicName
@@ -56,14 +56,6 @@ def process(home: Path, *command: str) -> Iterator[subprocess.Popen[str]]:
         finally:
             running.send_signal(signal.SIGINT)
             running.wait(30)
-
-
-def until(ready: Callable[[], Any], seconds: float = 60.0) -> Any:
-    deadline = time.monotonic() + seconds
-    while not (found := ready()):
-        assert time.monotonic() < deadline, "it did not come"
-        time.sleep(0.02)
-    return found
 
 
 def node_command(session: Path, home: Path, **changes: str) -> list[str]:
