@@ -9,7 +9,7 @@ from typing import Any, Self
 
 import numpy as np
 import pytest
-from command_line import FREE_PORTS
+from command_line import RUN_HERE
 from places import SESSION
 from synthetic import at_frame, plane_result
 
@@ -77,7 +77,7 @@ def test_a_node_gives_a_frame_the_time_until_the_next(
     overrides: list[str], ms: float, given: list[float], tmp_path: Path
 ) -> None:
     """The recording has ten frames a second."""
-    launch = ["source.frames:=3", *overrides, *FREE_PORTS, f"publish.run_dir:={tmp_path}"]
+    launch = ["source.frames:=3", *overrides, *RUN_HERE, f"publish.run_dir:={tmp_path}"]
     opened = open_session(SESSION, launch)
     node = Node(opened.config, opened.rig, opened.source)
     node.start()
@@ -88,7 +88,7 @@ def test_a_node_gives_a_frame_the_time_until_the_next(
 
 @pytest.mark.live
 def test_a_node_follows_what_a_live_source_really_sends(given: list[float], tmp_path: Path) -> None:
-    launch = ["source.kind:=push", f"rig:={SESSION / 'calib'}", *FREE_PORTS, f"publish.run_dir:={tmp_path}"]
+    launch = ["source.kind:=push", f"rig:={SESSION / 'calib'}", *RUN_HERE, f"publish.run_dir:={tmp_path}"]
     node = Node(load_launch(None, launch), load_rig(SESSION / "calib"), Camera(60.0, 1000))
     node.start()
     deadline = time.monotonic() + 30

@@ -12,7 +12,7 @@ import independent_client as client
 import numpy as np
 import pytest
 import zmq
-from command_line import FREE_PORTS
+from command_line import RUN_HERE
 from waiting import until
 
 from sags_node.messaging.control import ControlClient
@@ -32,7 +32,7 @@ class Watched:
     def __init__(self, session: Path, run_dir: Path, *overrides: str) -> None:
         opened = open_session(
             session,
-            [*FREE_PORTS, f"publish.run_dir:={run_dir}", "source.loop:=true", "source.pace:=fast",
+            [*RUN_HERE, f"publish.run_dir:={run_dir}", "source.loop:=true", "source.pace:=fast",
              "mapping.iterations:=1", "mapping.max_gaussians:=2000", *overrides],
         )  # fmt: skip
         self._newest: deque[bool] = deque(maxlen=ENOUGH)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from command_line import FREE_PORTS
+from command_line import RUN_HERE
 from places import SESSION
 
 from benchmarks.node import transport
@@ -63,7 +63,7 @@ def test_a_node_whose_publishing_fails_ends_with_that_error(
         taken.set()
 
     monkeypatch.setattr(Publisher, "publish_result", fail)
-    overrides = ["source.pace:=step", f"publish.run_dir:={tmp_path / 'run'}", *FREE_PORTS]
+    overrides = ["source.pace:=step", f"publish.run_dir:={tmp_path / 'run'}", *RUN_HERE]
     session = open_session(SESSION, [*overrides, "mapping.max_gaussians:=2000"])
     warm_up(session.config)  # compiles, once on a machine
     node = Node(session.config, session.rig, session.source)

@@ -10,7 +10,7 @@ from typing import Any
 
 import cv2
 import pytest
-from command_line import FREE_PORTS, pure_json, refused, sags, start, stopped, wait_for
+from command_line import RUN_HERE, pure_json, refused, sags, start, stopped, wait_for
 
 from sags_node.messaging import introspection as topic
 from sags_node.messaging.received import ReceivedText
@@ -84,7 +84,7 @@ def test_a_place_for_the_overlay_that_cannot_be(tmp_path: Path) -> None:
 def node(phantom_session: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Where a running node's run directory lies: the folder `XDG_RUNTIME_DIR` should name."""
     runtime = tmp_path_factory.mktemp("runtime")
-    process = start(["run", phantom_session, "source.loop:=true", *FREE_PORTS], XDG_RUNTIME_DIR=runtime)
+    process = start(["run", phantom_session, "source.loop:=true", *RUN_HERE], XDG_RUNTIME_DIR=runtime)
     wait_for(process, (runtime / "sags/sags.json").exists)
     yield runtime
     process.send_signal(signal.SIGINT)
@@ -147,7 +147,7 @@ def test_overlay_in_words_and_in_json(beside_node: dict[str, Any], tmp_path: Pat
 
 def test_a_second_node_of_the_same_name(beside_node: dict[str, Any], phantom_session: Path) -> None:
     said = ("another node already runs as 'sags'", "ns:=NAME")
-    refused(1, "run", phantom_session, *FREE_PORTS, said=said)
+    refused(1, "run", phantom_session, *RUN_HERE, said=said)
 
 
 def test_a_port_that_another_node_has(beside_node: dict[str, Any], phantom_session: Path) -> None:
@@ -159,7 +159,7 @@ def test_a_port_that_another_node_has(beside_node: dict[str, Any], phantom_sessi
 def test_a_run_directory_that_others_can_enter(phantom_session: Path, tmp_path: Path) -> None:
     tmp_path.chmod(0o755)
     override = f"publish.run_dir:={tmp_path}"
-    refused(2, "run", phantom_session, *FREE_PORTS, override, said=("open to other users", "chmod 700"))
+    refused(2, "run", phantom_session, *RUN_HERE, override, said=("open to other users", "chmod 700"))
 
 
 def test_a_socket_for_other_machines(phantom_session: Path) -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from command_line import FREE_PORTS, START_SECONDS, sags, start, stopped, wait_for
+from command_line import RUN_HERE, START_SECONDS, sags, start, stopped, wait_for
 from llvmlite import binding as llvm
 from waiting import until
 
@@ -159,7 +159,7 @@ def test_a_node_that_has_begun_ends_in_order(
     monkeypatch.setattr(of, step, interrupted)
     before = set(threading.enumerate())
     private = f"publish.run_dir:={tmp_path}"
-    result = sags("run", phantom_session, "source.frames:=2", "source.pace:=fast", *FREE_PORTS, private)
+    result = sags("run", phantom_session, "source.frames:=2", "source.pace:=fast", *RUN_HERE, private)
     assert result.exit_code == 0, result.stderr
     assert [file.name for file in tmp_path.iterdir()] == ["sags.lock"]
     until(lambda: not set(threading.enumerate()) - before)

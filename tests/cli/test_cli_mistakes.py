@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
-from command_line import FREE_PORTS, START_SECONDS, refused, sags, start
+from command_line import RUN_HERE, START_SECONDS, refused, sags, start
 from places import ROOT
 from user_files import SHORT, videos
 
@@ -83,7 +83,7 @@ def test_what_is_played_is_said(user_files: Path) -> None:
     assert said in sags("run", *videos(user_files), *played).stderr.splitlines()
     assert said in sags("eval", *videos(user_files), *played[:1], "--pace", "step").stderr.splitlines()
     small = ("source.width:=160", "source.height:=128", "source.seconds:=0.2")
-    phantom = sags("run", *small, *FREE_PORTS, "source.loop:=false", *played)
+    phantom = sags("run", *small, *RUN_HERE, "source.loop:=false", *played)
     assert "source: the built-in phantom" in phantom.stderr.splitlines()
 
 

@@ -19,7 +19,8 @@ from click.testing import CliRunner, Result
 from sags_node.cli.main import main
 
 START_SECONDS = 120  # the first start on a machine compiles kernels
-FREE_PORTS = ("publish.data:=[tcp://127.0.0.1:*]", "publish.control:=tcp://127.0.0.1:*")
+# For a node that a test starts: ports that are free, and pictures of one size, however busy the machine is.
+RUN_HERE = ("publish.data:=[tcp://127.0.0.1:*]", "publish.control:=tcp://127.0.0.1:*", "vision.scale:=1")
 
 
 def sags(*arguments: object, command: click.Command = main) -> Result:

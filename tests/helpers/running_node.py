@@ -9,6 +9,8 @@ import sys
 import time
 from pathlib import Path
 
+from command_line import RUN_HERE
+
 START_SECONDS = 90  # the first start on a machine compiles kernels
 
 
@@ -20,8 +22,7 @@ class RunningNode:
         self.process = subprocess.Popen(
             [
                 sys.executable, "-m", "sags_node", "run", str(session), "source.loop:=true",
-                "publish.data:=[tcp://127.0.0.1:*]", "publish.control:=tcp://127.0.0.1:*",
-                f"publish.run_dir:={self.run_dir}", *overrides,
+                *RUN_HERE, f"publish.run_dir:={self.run_dir}", *overrides,
             ],
             stderr=subprocess.PIPE,
             text=True,

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from command_line import FREE_PORTS
+from command_line import RUN_HERE
 
 from sags_node.rig import read_rig, save_rig
 
@@ -61,5 +61,5 @@ def write_video(file: Path, pictures: list[np.ndarray]) -> None:
 def videos(folder: Path, left: str = "left.mp4", right: str = "right.mp4", rig: str = "calib") -> list[str]:
     return [
         "source.kind:=videos", f"source.left:={folder / left}", f"source.right:={folder / right}",
-        f"rig:={folder / rig}", *FREE_PORTS,
+        f"rig:={folder / rig}", *RUN_HERE,
     ]  # fmt: skip

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from command_line import FREE_PORTS, START_SECONDS, sags, start
+from command_line import RUN_HERE, START_SECONDS, sags, start
 from places import SESSION
 
 from sags_node.node import service_manager
@@ -108,7 +108,7 @@ def test_pings_end_when_the_mapping_hangs(
 ) -> None:
     overrides = [
         f"publish.run_dir:={tmp_path / 'run'}",
-        *FREE_PORTS,
+        *RUN_HERE,
         "source.pace:=step",
         "source.loop:=true",
     ]
@@ -142,7 +142,7 @@ def test_pings_end_when_the_mapping_hangs(
 @pytest.mark.live
 def test_a_service_is_told_and_tells(manager: Manager, phantom_session: Path, run_dir: Path) -> None:
     process = start(
-        ["--log", "json", "run", phantom_session, "source.loop:=true", *FREE_PORTS], **manager.environment()
+        ["--log", "json", "run", phantom_session, "source.loop:=true", *RUN_HERE], **manager.environment()
     )
     try:
         manager.listen(START_SECONDS, until="READY=1")

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
-from command_line import FREE_PORTS, start, wait_for
+from command_line import RUN_HERE, start, wait_for
 
 from benchmarks.kernels.contention import burning_core
 from sags_node.config.schema import PhantomSource
@@ -42,7 +42,7 @@ def break_off(stop: Stop, session: Path, run_dir: Path) -> None:
     """
     connection = run_dir / "sags.json"
     connection.unlink(missing_ok=True)  # of one that was killed
-    command = ["run", session, "source.loop:=true", *FREE_PORTS, f"publish.run_dir:={run_dir}"]
+    command = ["run", session, "source.loop:=true", *RUN_HERE, f"publish.run_dir:={run_dir}"]
     process = start(command, PYTHONFAULTHANDLER="1")
     try:
         if stop.found:

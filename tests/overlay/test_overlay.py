@@ -18,7 +18,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from command_line import FREE_PORTS
+from command_line import RUN_HERE
 from places import ROOT
 from ports import free_port
 from test_overlay_drawing import KEY, centre
@@ -91,8 +91,7 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def node(phantom_session: Path, run_dir: Path) -> Iterator[subprocess.Popen[str]]:
     """A node that plays the phantom in a loop. The last test kills it."""
-    settings = ["source.loop:=true", f"publish.run_dir:={run_dir}"]
-    settings += ["publish.data:=[tcp://127.0.0.1:*]", "publish.control:=tcp://127.0.0.1:*"]
+    settings = ["source.loop:=true", f"publish.run_dir:={run_dir}", *RUN_HERE]
     with process("run", phantom_session, *settings) as running:
         until(connection_path(run_dir, "sags").exists, START_SECONDS)
         yield running
@@ -313,7 +312,7 @@ def test_it_goes_blank_when_the_feed_freezes(phantom_session: Path, tmp_path: Pa
     """All stamps are fresh, and the node goes on."""
     run_dir, endpoint = tmp_path / "run", f"tcp://127.0.0.1:{free_port()}"
     said = [f"source.endpoint:={endpoint}", "source.rate:=10", f"rig:={phantom_session / 'calib'}"]
-    said += ["vision.tissue.method:=none", f"publish.run_dir:={run_dir}", *FREE_PORTS]
+    said += ["vision.tissue.method:=none", f"publish.run_dir:={run_dir}", *RUN_HERE]
     scope = Scope(phantom_session, endpoint)
     with process("run", ROOT / "launch/push.yaml", *said):
         until(connection_path(run_dir, "sags").exists, START_SECONDS)

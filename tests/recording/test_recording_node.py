@@ -15,7 +15,7 @@ from typing import cast
 
 import numpy as np
 import pytest
-from command_line import START_SECONDS, sags
+from command_line import RUN_HERE, START_SECONDS, sags
 from mcap.reader import make_reader
 from recorded_plane import by_topic
 from rosbags.highlevel import AnyReader
@@ -37,12 +37,16 @@ pytestmark = pytest.mark.live
 def node(phantom_session: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """`sags run` in its own process; its run directory."""
     home = tmp_path_factory.mktemp("node")
-    command = [sys.executable, "-m", "sags_node", "run", str(phantom_session), "source.loop:=true"]
-    command += [
-        "publish.data:=[tcp://127.0.0.1:*]",
-        "publish.control:=tcp://127.0.0.1:*",
+    command = [
+        sys.executable,
+        "-m",
+        "sags_node",
+        "run",
+        str(phantom_session),
+        "vision.scale:=1",
+        "source.loop:=true",
     ]
-    command += ["mapping.budget_ms:=20"]
+    command += ["mapping.budget_ms:=20", *RUN_HERE]
     environment = {**os.environ, "XDG_RUNTIME_DIR": str(home)}
     with subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL) as process:
         try:

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import pytest
-from command_line import FREE_PORTS
+from command_line import RUN_HERE
 from gstreamer import BALL, apart, ball_moment, kill_pipelines, need_gstreamer
 from places import ROOT
 from running_node import START_SECONDS
@@ -81,7 +81,7 @@ def running(
         "push": ("push", ["source.endpoint:=tcp://127.0.0.1:*"], painted_moment),
         "ros2": ("ros2", [f"source.domain:={DOMAIN}"], painted_moment),
     }[way]
-    said = [*said, f"rig:={folder / 'rig'}", f"publish.run_dir:={folder / 'run'}", *FREE_PORTS, *SMALL]
+    said = [*said, f"rig:={folder / 'rig'}", f"publish.run_dir:={folder / 'run'}", *RUN_HERE, *SMALL]
     opened = open_session(ROOT / f"launch/{launch}.yaml", said)
     warm_up(opened.config)
     pauses, process = iter(PAUSES), Pipeline.process

@@ -296,7 +296,7 @@ def node(view: RunningView, tmp_path: Path) -> Iterator[subprocess.Popen[bytes]]
     session = tmp_path / "session"
     write_session(PhantomSource(seconds=2.0, width=160, height=128, seed=1), session, rate=10.0)
     command = [sys.executable, "-m", "sags_node", "run", session, "source.loop:=true"]
-    command += ["source.rate:=5", "publish.data:=[]", "publish.control:=tcp://127.0.0.1:*"]
+    command += ["source.rate:=5", "vision.scale:=1", "publish.data:=[]", "publish.control:=tcp://127.0.0.1:*"]
     running = subprocess.Popen(
         list(map(str, command)),
         env=os.environ | {"XDG_RUNTIME_DIR": str(view.runtime)},

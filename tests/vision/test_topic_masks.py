@@ -15,6 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from command_line import RUN_HERE
 from places import ROOT
 from waiting import until
 
@@ -69,7 +70,7 @@ def node_command(session: Path, home: Path, **changes: str) -> list[str]:
     }
     return [
         *("-m", "sags_node", "run", str(session), "source.loop:=true", "mapping.budget_ms:=20"),
-        *("publish.data:=[tcp://127.0.0.1:*]", "publish.control:=tcp://127.0.0.1:*"),
+        *RUN_HERE,
         *(f"vision.tissue.{key}:={value}" for key, value in settings.items()),
     ]
 
