@@ -16,7 +16,7 @@ DEBIAN_TESTS := chromium g++ cmake pkg-config cppzmq-dev libmsgpack-cxx-dev fake
 missing = $(shell for p in $(1); do dpkg -s $$p >/dev/null 2>&1 || echo $$p; done)
 apt_install = apt-get update -qq && apt-get install -y -qq --no-install-recommends $(1) >/dev/null
 
-.PHONY: setup run test test-all test-targets test-tools simulate stops soak fuzz wheel-test sbom audit licences lint golden docs clean
+.PHONY: setup run test test-all bench test-targets test-tools simulate stops soak fuzz wheel-test sbom audit licences lint golden docs clean
 
 setup: $(STAMP)
 
@@ -48,6 +48,10 @@ test: setup test-tools lint
 test-all: setup test-tools
 	$(BIN)/python -m pytest -m 'beside and not alone' -n 2 --dist loadfile
 	$(BIN)/python -m pytest -m alone
+
+# Run time against error on this machine, and its plot: out/pareto.json and out/pareto.png. LAUNCH: other recordings.
+bench: setup
+	$(BIN)/python -m benchmarks pareto $(LAUNCH) --frames 40 --out out/pareto.json --plot out/pareto.png --force
 
 # The kernels' tests for other processors than this one, on one and on two threads: a quarter of an hour.
 test-targets: setup

@@ -50,9 +50,12 @@ def insert(
     scales = np.sqrt(np.maximum(scales**2 - variances[:, None], (LEAST_SHARE * scales) ** 2))
     rows = model.append(means, scales, observation.image[y, x], OPACITY)
     model.smoothing[rows] = variances[: rows.stop - rows.start]
-    known = model.depth_errors[: rows.start]
-    usual = np.median(known) if len(known) else LARGEST_ERROR
-    model.depth_errors[rows] = np.where(np.isfinite(errors), errors, usual)[: rows.stop - rows.start]
+    added = errors[: rows.stop - rows.start]
+    unknown = ~np.isfinite(added)
+    if unknown.any():
+        known = model.depth_errors[: rows.start]
+        added = np.where(unknown, np.median(known) if len(known) else LARGEST_ERROR, added)
+    model.depth_errors[rows] = added
     return rows
 
 
