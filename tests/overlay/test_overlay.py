@@ -26,6 +26,7 @@ from waiting import until
 
 from sags_node.client import FrameSender
 from sags_node.geometry import project
+from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.control import ControlClient
 from sags_node.messaging.received import ReceivedCloud, ReceivedImage, ReceivedText
 from sags_node.messaging.rundir import connection_path
@@ -66,7 +67,7 @@ class Overlay(threading.Thread):
     def __init__(self, run_dir: Path, **options: Any) -> None:
         super().__init__(daemon=True)
         self.said: list[str] = []
-        self._options = Options(run_dir=run_dir, max_age=MAX_AGE, **options)
+        self._options = Options(NodeAddress(run_dir=run_dir), max_age=MAX_AGE, **options)
         self._summary: dict[str, Any] = {}
 
     def run(self) -> None:
@@ -231,7 +232,7 @@ def phantom_baseline(session: Path) -> float:
 @pytest.mark.usefixtures("node")
 def test_the_saved_video_is_whole_also_where_there_is_no_overlay(run_dir: Path, tmp_path: Path) -> None:
     video = tmp_path / "overlay.mp4"
-    summary = run_overlay(Options(run_dir=run_dir, save=video, seconds=2.0))
+    summary = run_overlay(Options(NodeAddress(run_dir=run_dir), save=video, seconds=2.0))
     assert summary["frames"] == summary["overlay"] + sum(summary["blanked"].values()) > 5
     assert summary["blanked"]["being pinned"] > 0
     capture = cv2.VideoCapture(str(video))
