@@ -74,6 +74,7 @@ FIRST_FRAMES = FIRST_LOOKS[-1]
 
 SCALES = (1.0, 0.75, 0.5, 0.375, 0.25)  # of the working size, that a machine may choose from
 PIXELS_PER_GAUSSIAN = 2  # fewer pixels have no more to tell
+WITH_OTHERS = 1.1  # times as long as prices say: the least that live frames take (`benchmarks/ladder.md`)
 
 
 def price(rung: Rung, gaussians: float, pixels: int) -> float:
@@ -99,12 +100,18 @@ def best_scale(rungs: Sequence[Rung], pixels: int, seconds: float, speed: float)
         pixels: of the picture at scale 1.
         seconds, speed: see `Ladder`.
     """
+    affords = FIRST_AIM * 1e3 * seconds / (WITH_OTHERS * speed)  # ms, in units of the prices
     shown = {SCALES[-1]: 0.0}
     for scale in SCALES:
         worked = scale**2 * pixels
-        ladder = Ladder(rungs, round(worked), seconds, speed)
-        if ladder.fits:
-            shown[scale] = 1 / (1 / (USED * ladder.rung.gaussians) + PIXELS_PER_GAUSSIAN / worked)
+        spare = [affords - price(rung, USED * rung.gaussians, round(worked)) for rung in rungs]
+        fitting = [
+            USED * r.gaussians + 1e3 * ms / PER_THOUSAND
+            for r, ms in zip(rungs, spare, strict=True)
+            if ms >= 0
+        ]
+        if fitting:  # a frame has room for some more than the last rung that fits allows
+            shown[scale] = 1 / (1 / fitting[-1] + PIXELS_PER_GAUSSIAN / worked)
     return max(shown, key=shown.__getitem__)
 
 
@@ -149,11 +156,6 @@ class Ladder:
     @property
     def rung(self) -> Rung:
         return self._rungs[self.place]
-
-    @property
-    def fits(self) -> bool:
-        """Whether a frame's time is expected to do for the rung."""
-        return self._expected(self.place) <= 1e3 * self.seconds
 
     @property
     def state(self) -> RungState:
