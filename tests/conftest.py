@@ -20,6 +20,7 @@ def pytest_configure(config: pytest.Config) -> None:
     import torch
 
     signal.signal(signal.SIGINT, signal.default_int_handler)  # else children ignore it beside `&` in a script
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # and this one under nohup
 
     if not torch.cuda.is_available():
         os.environ["TRITON_INTERPRET"] = "1"  # read when a kernel is imported: they then run on the CPU
