@@ -46,7 +46,7 @@ def main() -> None:
     with zipfile.ZipFile(wheel) as packed:
         names = packed.namelist()
     missing = [name for name in NEEDED if name not in names]
-    strangers = [name for name in names if not name.startswith(("sags_node/", "sags_node-"))]
+    strangers = [name for name in names if not name.startswith(("sags_node/", "sags_lab/", "sags_node-"))]
     assert not missing and not strangers, (missing, strangers)
     print(f"{wheel.name}: {wheel.stat().st_size / 1e6:.1f} MB, {len(names)} files", flush=True)
 
