@@ -12,7 +12,6 @@ import click
 from sags_node.cli.launching import (
     as_json,
     check_files,
-    count_frames,
     figures_option,
     file_option,
     force_option,
@@ -242,15 +241,17 @@ def bench_stream(
 
     from benchmarks.node import stream
     from sags_node.fitting.stream import QUICK, StreamSettings
+    from sags_node.pipeline.session import open_session
 
     no_cameras = "benchmarks stream plays recordings; live cameras do not come twice alike"
     path, overrides = split_recording(launch, no_cameras)
     if seconds < window:
         raise UsageError(f"--seconds {seconds:g} is shorter than --window {window:g}: nothing would leave it")
     check_files(out)
-    frames = count_frames(path, overrides, seconds)
-    forced = ["source.loop:=true", "source.pace:=step", f"source.frames:={frames}"]
-    session = open_launched(path, [*overrides, *forced])
+    forced = ["source.loop:=true", "source.pace:=step"]
+    with open_launched(path, [*overrides, *forced]).source as source:
+        frames = max(1, round(source.rate * seconds))
+    session = open_session(path, [*overrides, *forced, f"source.frames:={frames}"])
     settings = replace(QUICK if quick else StreamSettings(), window=window)
     with progress("measuring") as advance:
         measured = stream.measure_stream(session, settings, advance)

@@ -98,12 +98,6 @@ def _runs_on(device: Device) -> str:
     return f"refining on {device.name}" + (f" ({device.reason})" if device.reason else "")
 
 
-def count_frames(path: str | None, overrides: Sequence[str], seconds: float) -> int:
-    """How many frames a recording plays in so long."""
-    with open_launched(path, overrides).source as source:
-        return max(1, round(source.rate * seconds))
-
-
 def check_files(*files: Path | None, force: bool | None = None) -> None:
     """A long run must not end with nowhere to put its figures: `check_file` of those that were asked for."""
     for file in files:

@@ -23,7 +23,6 @@ from sags_node.cli.calib import calib
 from sags_node.cli.export import export
 from sags_node.cli.launching import (
     as_json,
-    count_frames,
     launch_argument,
     open_launched,
     positive,
@@ -177,22 +176,25 @@ def demo(launch: tuple[str, ...], seconds: float, out: Path, json_out: bool) -> 
     """
     from sags_node.demo import VIDEO, run_demo
     from sags_node.evaluation.report import check_report
-    from sags_node.pipeline.session import at_best_scale, open_session
+    from sags_node.pipeline.session import open_session
 
     no_cameras = "sags demo plays recordings; for cameras use sags run and sags overlay"
     path, overrides = split_recording(launch, no_cameras)
     check_plots()
     check_report(out, VIDEO)
-    frames = count_frames(path, overrides, seconds)
+    live = ["source.loop:=true", "source.pace:=realtime"]
+    opened = open_launched(path, [*live, *overrides])  # says what it plays, and at what size
+    with opened.source as source:
+        frames = max(1, round(source.rate * seconds))
     # Its own sockets and run directory, so that a demo does not meet a node that is already running.
     with tempfile.TemporaryDirectory(prefix="sags-demo-") as private:
-        forced = ["source.loop:=true", "source.pace:=realtime", f"source.frames:={frames}"]
+        forced = [*live, f"source.frames:={frames}", f"vision.scale:={opened.config.vision.scale}"]
         forced += [
             "publish.data:=[tcp://127.0.0.1:*]",
             "publish.control:=tcp://127.0.0.1:*",
             f"publish.run_dir:={private}",
         ]
-        session = at_best_scale(open_session(path, [*forced, *overrides]))
+        session = open_session(path, [*forced, *overrides])
         try:
             with progress("playing") as advance:
                 outcome = run_demo(session, out, advance)

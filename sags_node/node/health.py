@@ -24,8 +24,7 @@ LONGER = 1.05  # times the time from frame to frame: a budget that is rounded is
 
 
 TOO_SLOW = (
-    "this machine is too slow for them: end other programs, or lower mapping.max_gaussians, vision.width and "
-    "vision.height"
+    "this machine is too slow for them: end other programs, or lower mapping.max_gaussians or vision.scale"
 )
 
 

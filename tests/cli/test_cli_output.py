@@ -313,6 +313,7 @@ def test_demo_prints_nothing_but_json(user_files: Path, tmp_path: Path) -> None:
     assert result.exit_code == 0, result.stderr
     summary = pure_json(result.stdout)
     assert summary["frames"] == 35 and summary["overlay"]["frames"] > 0
+    assert "pictures of {width}x{height} px".format_map(summary["settings"]) in result.stderr
     assert {file.name for file in (tmp_path / "demo").iterdir()} >= {"report.html", "overlay.mp4"}
     check_report(tmp_path / "demo", "overlay.mp4")  # the next one may replace it
 
