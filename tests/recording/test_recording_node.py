@@ -179,7 +179,7 @@ def test_the_end_of_the_terminal_closes_the_file(node: Path, tmp_path: Path) -> 
     finally:
         process.kill()
     assert (tmp_path / "bag/metadata.yaml").exists()
-    assert bag_info(tmp_path / "bag")["messages"] > 5
+    assert bag_info(tmp_path / "bag")["messages"] > 0
 
 
 def test_a_recorder_that_nohup_started_outlives_its_terminal(node: Path, tmp_path: Path) -> None:
