@@ -18,7 +18,7 @@ from sags_node.config.schema import MappingConfig
 from sags_node.mapping.budget import TimeBudget
 from sags_node.node.health import TOO_SLOW, why_missed
 from sags_node.node.node import Node
-from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.pipeline import FrameRequest, Pipeline
 from sags_node.pipeline.session import open_session
 from sags_node.rig import load_rig
 from sags_node.sources.rate import MEASURED, FrameRate
@@ -59,7 +59,7 @@ def given(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """The time, ms, that each frame got; nothing is made of it."""
     times, plane = [], plane_result()
 
-    def process(self: Pipeline, one: StereoFrame, budget: TimeBudget, waited: float) -> FrameResult:
+    def process(self: Pipeline, one: StereoFrame, budget: TimeBudget, request: FrameRequest) -> FrameResult:
         times.append(1e3 * budget.ladder.seconds)
         return at_frame(plane, one.frame_id, one.t_capture_ns)
 

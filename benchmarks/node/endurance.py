@@ -87,7 +87,7 @@ class _Run:
         return _Taken(ms, cpu_ms, quality, still, not still and "depth" in result.skipped)
 
     def window(self, taken: Sequence[_Taken]) -> Window:
-        model = self.pipeline.mapper.model
+        model = self.pipeline.map.model
         p50, p99 = np.percentile([each.ms for each in taken], [50, 99])
         return Window(
             frames=self._number,
@@ -99,7 +99,7 @@ class _Run:
             rss_mb=resident_mb(),
             still=sum(each.still for each in taken),
             hurried=sum(each.hurried for each in taken),
-            restarts=self.pipeline.mapper.restarts,
+            restarts=self.pipeline.map.restarts,
         )
 
 

@@ -21,7 +21,9 @@ from sags_node.evaluation.metrics import psnr
 from sags_node.evaluation.provenance import machine_name
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.mapper import Mapper
+from sags_node.mapping.motion import Drawn, SurfaceTracker
 from sags_node.mapping.refiner import CpuRefiner
+from sags_node.mapping.tissue_map import TissueMap
 from sags_node.model.alias_free import smoothing_variances
 from sags_node.types import F32, Camera, Gaussians, Observation
 
@@ -79,10 +81,12 @@ class Trained:
 def train(observation: Observation, filters: Filters, settings: Settings) -> Trained:
     """A model of one still picture, by the node's own mapper."""
     refiner = CpuRefiner(partial(make_rasterizer, "numba", antialias=filters.screen))
-    mapper = Mapper(refiner, settings.max_gaussians, filters.world, focus=1.0)
-    mapped = mapper.update(observation, StepBudget(STEPS_PER_ROUND))  # places the Gaussians
+    mapper = Mapper(refiner, TissueMap(settings.max_gaussians), filters.world, focus=1.0)
+    mapped = mapper.update(observation, None, StepBudget(STEPS_PER_ROUND))  # places the Gaussians
     for _ in range(settings.rounds):
-        mapped = mapper.update(observation, StepBudget(STEPS_PER_ROUND))
+        last = Drawn(observation, mapped.view)
+        tracks = SurfaceTracker().track(mapper.model.means, last, observation)
+        mapped = mapper.update(observation, tracks, StepBudget(STEPS_PER_ROUND))
     return Trained(mapped.snapshot.gaussians, filters.screen)  # the mapper's own has new, untrained splits
 
 

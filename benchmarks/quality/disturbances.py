@@ -206,7 +206,7 @@ class _Run:
             confident_borrowed=_share(borrowed, confident),
             depth=_depth_errors(frame, view, confident, tissue),
             warnings=frozenset(by_code(self._pipeline.warnings)),
-            restarts=self._pipeline.mapper.restarts,
+            restarts=self._pipeline.map.restarts,
         )
         if not self._anchors.pinned and frame.frame_id >= self.during.start - LEAD:
             self._anchors.pin(frame, result)

@@ -144,7 +144,7 @@ def _played(
         **_scored(result.anchors, pinned, truth, visible, width),
         "before": at_last,
         "unmoved": unmoved["found"],
-        "restarts": pipeline.mapper.restarts,
+        "restarts": pipeline.map.restarts,
     }
 
 

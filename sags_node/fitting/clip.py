@@ -86,7 +86,6 @@ def play(session: Session, references: bool) -> Iterator[ClipFrame]:
                 continue
             pair = pipeline.rectifier(frame)
             tissue = pipeline.tissue(frame, pair)
-            pipeline.depth.see(pair)
             depth = pipeline.depth(frame, pair, tissue).depth
             yield ClipFrame(
                 pair.frame_id, pair.t_capture_ns, pair.camera, pair.left, tissue, depth, frame.reference

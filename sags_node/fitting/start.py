@@ -21,7 +21,9 @@ from sags_node.fitting.settings import FitSettings
 from sags_node.geometry import unproject
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.mapper import Mapper
+from sags_node.mapping.motion import Drawn, SurfaceTracker
 from sags_node.mapping.refiner import CpuRefiner
+from sags_node.mapping.tissue_map import TissueMap
 from sags_node.model import columns
 from sags_node.model.activation import deactivate
 from sags_node.model.exposure import Exposure
@@ -115,15 +117,18 @@ def follow_online(
     slots = {*range(0, len(clip.train), PATH_EVERY), len(clip.train) - 1}
     check_size(len(slots), settings.max_gaussians)
     refiner = CpuRefiner(lambda width, height: rasterizer)  # all frames have its size
-    mapper, budget = Mapper(refiner, settings.max_gaussians), StepBudget(ONLINE_STEPS)
+    mapper, budget = Mapper(refiner, TissueMap(settings.max_gaussians)), StepBudget(ONLINE_STEPS)
+    surface, last = SurfaceTracker(), None
     seen: list[tuple[I64, F32]] = []
     first = _Places()
     for done, frame in enumerate(clip.train):
         observation = frame.observation()
         if done and _is_cut(clip.train[done - 1], frame):
-            mapper.restart()
+            mapper.map.restart()
+            last = None
         budget.start()
-        mapper.update(observation, budget)
+        tracks = None if last is None else surface.track(mapper.model.means, last, observation)
+        last = Drawn(observation, mapper.update(observation, tracks, budget).view)
         gaussians = mapper.model.gaussians()  # before the 3D filter: the fit applies its own
         first.add(gaussians.ids, gaussians.means)
         if done in slots:

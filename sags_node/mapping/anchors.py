@@ -107,8 +107,7 @@ class Anchors:
         self._stamp_ns: int | None = None  # of the last frame
         self._recall = Recall()
         self._recalled_ns = 0  # stamp of the frame in which it was used last
-        self._wanted: dict[int, float | None] = {}  # s ahead, by id; None: as `latency_s`
-        self.latency_s = 0.0  # from capture to what shows it, as it was lately
+        self._wanted: dict[int, float | None] = {}  # s ahead, by id; None: by the latency
 
     def __len__(self) -> int:
         return len(self._table.ids)
@@ -163,17 +162,19 @@ class Anchors:
         return anchor_id
 
     def look_ahead(self, anchor_id: int, seconds: float | None) -> None:
-        """Say of an anchor also where it is expected so much later; None: later by `latency_s`."""
+        """Say of an anchor also where it is expected so much later; None: later by the latency."""
         self._wanted[anchor_id] = seconds
 
-    def ahead(self, states: AnchorStates, snapshot: Snapshot) -> AnchorStates:
-        """The states with where those who want it are expected, as far ahead as motion is predicted."""
+    def ahead(self, states: AnchorStates, snapshot: Snapshot, latency_s: float) -> AnchorStates:
+        """The states with where those who want it are expected, as far ahead as motion is predicted.
+
+        Args:
+            latency_s: from capture to what shows it, as it was lately.
+        """
         if not self._wanted or snapshot.forecast is None or len(states) == 0:
             return states
         wanted = [self._wanted.get(int(anchor), 0.0) for anchor in states.ids]
-        seconds = np.array(
-            [reached(snapshot, self.latency_s if s is None else s) for s in wanted], np.float32
-        )
+        seconds = np.array([reached(snapshot, latency_s if s is None else s) for s in wanted], np.float32)
         points, pixels = states.points.copy(), states.pixels.copy()
         for s in np.unique(seconds[seconds > 0]):
             rows = seconds == s

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Protocol
 
 from sags_node.mapping.ladder import EVERYTHING, Ladder, Rung
@@ -17,30 +18,31 @@ FIRST_SECONDS = 0.1  # of its first frame, after which the rest is left to those
 WHOLE_EVERY = 8  # frames: a first step on the whole picture tells what each Gaussian shows
 
 
-class Budget(Protocol):
-    """What a frame gets; asked by the mapper."""
+@dataclass(frozen=True, slots=True)
+class FramePlan:
+    """What one frame gets, decided when it begins."""
 
-    @property
-    def rung(self) -> Rung:
-        """What this frame gets at most. Changes between frames only."""
+    rung: Rung  # at most
+    state: RungState | None  # which rung that is and why; None: it is none of a ladder
+    depth: bool  # may be matched
+    # Of the picture, where it is worst: what the first step is on. Often enough 1: only a step on all of it
+    # says which Gaussians show.
+    first_share: float
+
+
+class Budget(Protocol):
+    """What frames get."""
 
     @property
     def speed(self) -> float:
         """How long this machine takes, see `Ladder`."""
 
     @property
-    def state(self) -> RungState | None:
-        """Which rung that is and why; None: it is none of a ladder."""
+    def plan(self) -> FramePlan:
+        """Of the frame that began last."""
 
-    def start(self, waited: float = 0.0) -> None:
+    def start(self, waited: float = 0.0) -> FramePlan:
         """A new frame begins, `waited` seconds after it came."""
-
-    def affords_depth(self) -> bool:
-        """True when depth may be matched in this frame."""
-
-    def first_share(self) -> float:
-        """Share of the picture, where it is worst, that the first step is on. Often enough 1: only a step on
-        all of it tells the model which Gaussians show."""
 
     def more_at_first(self, steps: int) -> bool:
         """True when a new model that has had so many steps may have one more in its first frame."""
@@ -48,31 +50,29 @@ class Budget(Protocol):
     def more(self) -> bool:
         """True when one more step may be taken. Asked once before every step."""
 
-    def finish(self, gaussians: int) -> None:
-        """The frame is done; the model has so many."""
+    def finish(self, gaussians: int, matched: bool = False) -> None:
+        """The frame is done; the model has so many, and depth was matched."""
 
 
 class StepBudget:
     """A fixed number of steps per frame: deterministic."""
 
     speed = 1.0
-    state: RungState | None = None
 
     def __init__(self, steps: int, rung: Rung = EVERYTHING) -> None:
-        self.rung = rung
+        self._rung = rung
         self._steps = steps
         self._left = steps
         self._frames = 0
+        self.plan = FramePlan(rung, None, depth=True, first_share=1.0)
 
-    def start(self, waited: float = 0.0) -> None:
+    def start(self, waited: float = 0.0) -> FramePlan:
         self._left = self._steps
         self._frames += 1
-
-    def affords_depth(self) -> bool:
-        return self._frames % self.rung.depth_every == 0
-
-    def first_share(self) -> float:
-        return 1.0 if self._frames % WHOLE_EVERY == 0 else self.rung.step
+        rung, whole = self._rung, self._frames % WHOLE_EVERY == 0
+        matched = self._frames % rung.depth_every == 0
+        self.plan = FramePlan(rung, None, matched, 1.0 if whole else rung.step)
+        return self.plan
 
     def more(self) -> bool:
         self._left -= 1
@@ -81,7 +81,7 @@ class StepBudget:
     def more_at_first(self, steps: int) -> bool:
         return True
 
-    def finish(self, gaussians: int) -> None:
+    def finish(self, gaussians: int, matched: bool = False) -> None:
         pass
 
 
@@ -96,46 +96,33 @@ class TimeBudget:
 
     def __init__(self, ladder: Ladder, clock: Callable[[], float] = time.perf_counter) -> None:
         self.ladder = ladder
-        self.rung = ladder.rung
         self._clock = clock
         self._step_cost = _RunningMean()
         self._after_cost = _RunningMean()
         self._cost_with_depth = _RunningMean()
         self._since_depth = 0  # frames, this one included
         self._since_whole = 0
-        self.start()
+        self.plan = self.start()
 
     @property
     def speed(self) -> float:
         return self.ladder.speed
 
-    @property
-    def state(self) -> RungState:
-        return self.ladder.state
-
-    def start(self, waited: float = 0.0) -> None:
-        self.rung = self.ladder.rung
+    def start(self, waited: float = 0.0) -> FramePlan:
+        rung = self.ladder.rung
         self._started = self._asked = self._clock()
         self._deadline = self._started + max(0.0, self.ladder.seconds - waited)
         self._asks = 0
-        self._depth = False  # whether it is matched
         self._since_depth += 1
         self._since_whole += 1
         self._optional = 0.0  # s, spent on all steps but the first
-
-    def affords_depth(self) -> bool:
-        every = self.rung.depth_every
         late = self._started + self._cost_with_depth.value > self._deadline
-        self._depth = self._since_depth >= (every + 1 if late else every)
-        if self._depth:
-            self._since_depth = 0
-        return self._depth
-
-    def first_share(self) -> float:
-        if self._since_whole >= WHOLE_EVERY or self.rung.step == 1:
+        depth = self._since_depth >= rung.depth_every + late
+        whole = self._since_whole >= WHOLE_EVERY or rung.step == 1
+        if whole:
             self._since_whole = 0
-            return 1.0
-        return self.rung.step
+        self.plan = FramePlan(rung, self.ladder.state, depth, 1.0 if whole else rung.step)
+        return self.plan
 
     def more_at_first(self, steps: int) -> bool:
         return steps < LEAST_FIRST_STEPS or self._clock() - self._started <= FIRST_SECONDS
@@ -153,14 +140,15 @@ class TimeBudget:
             self._step_cost.value *= FORGET
         return False
 
-    def finish(self, gaussians: int) -> None:
+    def finish(self, gaussians: int, matched: bool = False) -> None:
         """Learn from this frame. One that never asked, since it made a new model, tells nothing."""
         if self._asks == 0:
             return
         now = self._clock()
         self._after_cost.add(now - self._asked)
         essential = now - self._started - self._optional
-        if self._depth:
+        if matched:
+            self._since_depth = 0
             self._cost_with_depth.add(essential)
         self.ladder.learn(essential, gaussians)
 

@@ -11,9 +11,10 @@ import numpy as np
 from sags_node.geometry import invert
 from sags_node.mapping.camera_pose import towards
 from sags_node.mapping.keyframes import Keyframes, distance
-from sags_node.mapping.mapper import Drawn, Learnt, Mapper
+from sags_node.mapping.motion import Drawn, SurfaceTracker, Tracks
 from sags_node.mapping.pose_agreement import Agreement, agreement, small_frame, small_view
 from sags_node.mapping.resting_tissue import RestingTissue, correlation
+from sags_node.mapping.tissue_map import Learnt, TissueMap
 from sags_node.types import F64, Camera, Observation, RenderedView
 
 HOLD = 0.2  # share of the way to the pose against the tissue at rest, per frame: keeps it from drifting
@@ -47,16 +48,23 @@ class CameraTracker:
         lost: why the camera is lost; None: it is not.
     """
 
-    def __init__(self, mapper: Mapper, draw: Callable[[Camera], RenderedView]) -> None:
-        """`draw`: shows the mapper's model as it is now."""
+    def __init__(
+        self, tissue_map: TissueMap, surface: SurfaceTracker, draw: Callable[[Camera], RenderedView]
+    ) -> None:
+        """
+        Args:
+            surface: finds the map's Gaussians in a frame.
+            draw: shows the map as it is now.
+        """
         self.lost: str | None = None
-        self._mapper = mapper
+        self._map = tissue_map
+        self._surface = surface
         self._draw = draw
-        self._tissue = RestingTissue(mapper)
+        self._tissue = RestingTissue(tissue_map)
         self._pose: F64 = np.eye(4)
         self._motion: F64 = np.eye(4)  # of the camera in its own axes, from the frame before to the last one
         self._keyframes = Keyframes()
-        self._restarts = mapper.restarts
+        self._restarts = tissue_map.restarts
         self._trial: _Candidate | None = None
         self._passed = 0  # frames that the trial's pose has agreed with
         self._unknown: list[Observation] = []  # first and last of those that show something else
@@ -74,25 +82,37 @@ class CameraTracker:
         """The pose of a frame before it is looked at, whatever its session says."""
         return self._pose
 
-    def track(self, observation: Observation) -> bool:
-        """Find the pose of a frame, whatever its camera says; False: the camera is lost."""
-        if self._mapper.model.count == 0:
+    def locate(self, observation: Observation, last: Drawn | None, tracks: Tracks | None) -> Tracks | None:
+        """Find the pose of a frame, whatever its camera says, or be `lost`.
+
+        Args:
+            last: the frame before, and `tracks` from it to this one; None: there is no model yet.
+
+        Returns:
+            Where the Gaussians are found in it: `tracks`, or those from where the camera was found again.
+        """
+        if self._map.model.count == 0:
             self.lost, self._motion = None, np.eye(4)
-            return True  # the model begins where the camera was last
+            return None  # the model begins where the camera was last
         if self.lost is not None:
-            return self._find_again(observation) or self._begin_anew(observation)
-        fit = self._follow(observation)
+            found = self._find_again(observation)
+            if found is None:
+                self._begin_anew(observation)
+            return found
+        fit = self._follow(observation, last, tracks)
         if isinstance(fit, str):
             self.lost, self._motion = fit, np.eye(4)
             self._trial, self._passed, self._unknown = None, 0, []
-            return False
+            return None
         self._pose, self._motion = fit, invert(self._pose) @ fit
-        return True
+        return tracks
 
-    def _follow(self, observation: Observation) -> F64 | str:
+    def _follow(self, observation: Observation, last: Drawn | None, tracks: Tracks | None) -> F64 | str:
         """The pose of a frame that follows one that was tracked, or why the camera is lost."""
+        if last is None or tracks is None:
+            return "hardly any tissue in view"
         start = self._pose @ self._motion
-        fit = self._tissue.fit(observation, start)
+        fit = self._tissue.fit(observation, last, tracks, start)
         if isinstance(fit, str):
             return fit
         pose, camera = towards(fit.near, fit.at_rest, HOLD), observation.camera
@@ -116,50 +136,47 @@ class CameraTracker:
             return False
         self._disagreed = 0
         if self._before is not None:
-            self._mapper.go_back(self._before)
+            self._map.go_back(self._before)
         self._found_ns = self._before = None
         return True
 
-    def _find_again(self, observation: Observation) -> bool:
-        """Whether the camera has been verified to be where it was found."""
+    def _find_again(self, observation: Observation) -> Tracks | None:
+        """Where the Gaussians are, once the camera is verified to be where it was found."""
         tried = None if self._trial is None else self._tried(observation, self._trial.drawn)
         if tried is None or tried.agreement.problem:
             self._passed = 0
             tried = self._best_candidate(observation)
         self._trial = tried
         if tried is None:
-            return False
+            return None
         self._passed += tried.agreement.near is not None  # without depth nothing is verified
         self.lost = f"verifying where it is, {self._passed} of {TRIAL} frames"
-        self._mapper.start_from(tried.drawn)
         if self._passed < TRIAL:
-            return False
+            return None
         self._pose, self._motion = tried.T_world_rest, np.eye(4)
         self.lost = None
-        self._found_ns, self._before = observation.t_capture_ns, self._mapper.learnt()
+        self._found_ns, self._before = observation.t_capture_ns, self._map.learnt()
         self._looked_ns, self._disagreed = observation.t_capture_ns, 0
-        return True
+        return self._surface.track(self._map.model.means, tried.drawn, observation)
 
-    def _begin_anew(self, observation: Observation) -> bool:
-        """Whether a new model is begun: something else has been shown, lit and steadily, for long."""
+    def _begin_anew(self, observation: Observation) -> None:
+        """Begin a new map where something else has been shown, lit and steadily, for long."""
         if self._trial is not None:
-            return False
+            return
         if self._unknown and not _is_same_scene(self._unknown[-1], observation):
             self._unknown = []
         if not _is_lit(observation):
             self._unknown = []
-            return False
+            return
         self._unknown = [*self._unknown[:1], observation]
-        if observation.t_capture_ns - self._unknown[0].t_capture_ns < GIVE_UP_NS:
-            return False
-        self._mapper.restart()
-        self.lost = None
-        return True
+        if observation.t_capture_ns - self._unknown[0].t_capture_ns >= GIVE_UP_NS:
+            self._map.restart()
+            self.lost = None
 
-    def mapped(self, observation: Observation, view: RenderedView) -> None:
+    def learn(self, observation: Observation, view: RenderedView) -> None:
         """Learn from a frame that was tracked and taken in; `view` is the model drawn for it."""
-        if self._mapper.restarts != self._restarts:
-            self._restarts = self._mapper.restarts
+        if self._map.restarts != self._restarts:
+            self._restarts = self._map.restarts
             self._keyframes.clear()
             self._found_ns = self._before = None
         self._tissue.learn(observation)
@@ -181,8 +198,8 @@ class CameraTracker:
 
     def _tried(self, observation: Observation, before: Drawn) -> _Candidate | None:
         """Where the camera is if it was there before from where the model is drawn; None: not near it."""
-        self._mapper.start_from(before)
-        fit = self._tissue.fit(observation, before.view.camera.T_world_cam)
+        tracks = self._surface.track(self._map.model.means, before, observation)
+        fit = self._tissue.fit(observation, before, tracks, before.view.camera.T_world_cam)
         if isinstance(fit, str):
             self.lost = fit
             return None

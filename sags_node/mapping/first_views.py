@@ -14,7 +14,7 @@ import numpy as np
 from sags_node.geometry import disparity_to_depth, project, unproject
 from sags_node.mapping.camera_pose import fit_pose
 from sags_node.mapping.keyframes import distance
-from sags_node.mapping.mapper import Mapper
+from sags_node.mapping.tissue_map import TissueMap
 from sags_node.types import F32, F64, U8, Camera, Observation
 
 MOST = 16  # pictures
@@ -41,8 +41,8 @@ class _View:
 class FirstViews:
     """At most `MOST` pictures, the first one of each place."""
 
-    def __init__(self, mapper: Mapper) -> None:
-        self._mapper = mapper
+    def __init__(self, tissue_map: TissueMap) -> None:
+        self._map = tissue_map
         self._kept: list[_View] = []  # oldest first
 
     def clear(self) -> None:
@@ -83,10 +83,10 @@ class FirstViews:
         corners = cv2.goodFeaturesToTrack(observation.gray, CORNERS, CORNER_QUALITY, apart, mask=where)
         pixels = np.zeros((0, 2), np.float32) if corners is None else np.asarray(corners[:, 0], np.float32)
         points = np.asarray(unproject(observation.camera, pixels, _at(observation.depth, pixels)), np.float32)
-        return _View(camera, observation.gray, pixels, points - self._mapper.displacement_at(points))
+        return _View(camera, observation.gray, pixels, points - self._map.displacement_at(points))
 
     def _fitted(self, view: _View, observation: Observation, camera: Camera) -> F64 | None:
-        now = view.rest + self._mapper.displacement_at(view.rest)
+        now = view.rest + self._map.displacement_at(view.rest)
         expected = np.asarray(project(observation.camera, now)[0], np.float32)
         height, width = observation.gray.shape
         inside = ((expected > 0) & (expected < [width - 1, height - 1])).all(1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from copy import deepcopy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,31 +12,16 @@ from sags_node.mapping import densify, initialise
 from sags_node.mapping.budget import Budget
 from sags_node.mapping.depth_memory import remember
 from sags_node.mapping.focus import tile_grid, tiles_of, with_neighbours
-from sags_node.mapping.motion import depth_pull, scene_flow, track
-from sags_node.mapping.motion_field import MotionField
+from sags_node.mapping.motion import Tracks, depth_pull, scene_flow
 from sags_node.mapping.optimiser import LearningRates
 from sags_node.mapping.refiner import Refiner
 from sags_node.mapping.split import split_worst
+from sags_node.mapping.tissue_map import TissueMap
 from sags_node.model.alias_free import narrow
-from sags_node.model.deformation import NodeDeformation, nearest_nodes
+from sags_node.model.deformation import NodeDeformation
 from sags_node.model.gaussians import GaussianModel
-from sags_node.model.light import carried, is_near
-from sags_node.types import (
-    F32,
-    F64,
-    I64,
-    U8,
-    Bool,
-    Camera,
-    Forecast,
-    Gaussians,
-    Observation,
-    RenderedView,
-    Snapshot,
-)
-from sags_node.vision.flow import OpticalFlow
+from sags_node.types import F32, Bool, Forecast, Observation, RenderedView, Snapshot
 from sags_node.vision.observe import resized
-from sags_node.vision.pyramid import pyramid_of
 
 CONTROL_NODES = 512
 FIRST_STEPS = 30  # of a new model: long ones, in its first frame or, where time is short, in the next ones
@@ -54,24 +38,6 @@ LOST_COVERAGE = 0.3  # of the tissue
 FIRST_RATES = LearningRates().scaled(4.0)
 UNHURRIED_RATES = 0.6  # measured with six steps: +0.3 dB; with one step a frame it loses as much
 NODE_STEP_PX = 0.08
-FINE_FLOW, COARSE_FLOW = 4, 6  # px between patches
-
-
-@dataclass(frozen=True, slots=True)
-class Drawn:
-    """A frame and the model drawn for it: what the next frame's motion starts from."""
-
-    observation: Observation
-    view: RenderedView
-
-
-@dataclass(frozen=True, slots=True)
-class Learnt:
-    """A copy of the model and of how it moves, to go back to."""
-
-    model: GaussianModel
-    deformation: NodeDeformation | None
-    lamp: F64 | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,22 +49,25 @@ class Mapped:
 
 
 class Mapper:
-    """Builds and refines the model while the video runs.
+    """Builds and refines the map while the video runs.
 
     Each frame: predict where the tissue went (optical flow and depth, averaged on control nodes), remove what
     floats in free space, insert where the model has a hole or something new appears, refine while the budget
     lasts: once the whole picture, then where it is worst. The order and the constants follow a measured
     design; see `benchmarks/`.
+
+    Attributes:
+        map: what it refines.
+        step: how many steps were taken.
     """
 
     def __init__(
         self,
         refiner: Refiner,
-        max_gaussians: int,
+        tissue_map: TissueMap,
         smoothing: bool = True,
         unhurried: bool = False,
         focus: float = FOCUS,
-        field: bool = False,
     ) -> None:
         """
         Args:
@@ -106,20 +75,13 @@ class Mapper:
             smoothing: draw the Gaussians with the 3D filter (`model.alias_free`).
             unhurried: see `pace`.
             focus: share of the picture, where it is worst, for the steps after the first of a frame.
-            field: remember motion (`mapping.motion_field`), for hidden tissue and to predict.
         """
-        self.model = GaussianModel(max_gaussians)
+        self.map = tissue_map
         self.step = 0
-        self.restarts = 0  # how often a new model was begun because the old one did not fit any more
         self._refiner = refiner
         self._smoothing = smoothing
         self._focus = focus
         self.pace(unhurried)
-        self._deformation: NodeDeformation | None = None
-        self._field = MotionField() if field else None
-        self._lamp: F64 | None = None  # T_world_cam of the scope whose light the colours show
-        self._last: Drawn | None = None
-        self._found: tuple[U8, F32] | None = None  # a picture, and the pixels where the Gaussians are in it
         self._view: RenderedView | None = None  # the model as it was drawn last
         self._scale = 1.0  # of the pictures' size: at which the model was drawn last
         self._first_steps = 0  # that a new model has had
@@ -131,6 +93,7 @@ class Mapper:
     def update(
         self,
         observation: Observation,
+        tracks: Tracks | None,
         budget: Budget,
         still: int = 0,
         learn: bool = True,
@@ -139,145 +102,36 @@ class Mapper:
         """Take one frame in.
 
         Args:
+            tracks: where the Gaussians are found in it; None: where they are.
             still: for how many frames, this one included, nothing has moved.
             learn: else the model only follows the motion: the picture's colours are not the tissue's.
             right: somebody looks at the right eye: the snapshot says what that eye sees more.
         """
         self._frames += 1
-        before, self._scale = self._scale, budget.rung.scale
-        known = observation.depth[::8, ::8]
-        known = known[known > 0]
-        if known.size:
-            self._metres_per_px = float(np.median(known)) / observation.camera.K[0, 0]
-        if self._deformation is None:
+        before, self._scale = self._scale, budget.plan.rung.scale
+        self._note_depth(observation)
+        if self.map.deformation is None:
             counts = self._initialise(observation, budget)
         elif not learn:
-            counts = self._follow_only(observation)
+            counts = self._follow_only(observation, tracks)
         elif still and self._scale == before:
             counts = self._touch_up(observation, budget, settled=still > SETTLED)
         else:
-            counts = self._follow(observation, budget)
-        forecast = self._remember(observation.t_capture_ns, still > 0)
-        snapshot = Snapshot(
-            frame_id=observation.frame_id,
-            t_capture_ns=observation.t_capture_ns,
-            step=self.step,
-            gaussians=self.model.snapshot(),
-            velocities=self.model.velocities.copy(),
-            camera=observation.camera,
-            loss=self._refiner.loss,
-            counts=counts,
-            forecast=forecast,
-            right_colors=self.model.right_colors.copy() if right else None,
-        )
+            counts = self._follow(observation, tracks, budget)
         assert self._view is not None
-        drawn = Drawn(observation, self._view)
-        mapped = Mapped(snapshot, drawn.view)
-        if not still or self._last is None:  # a still frame is passed over: slow motion adds up until seen
-            self.start_from(drawn)
-            if not learn:
-                return mapped
-            room = self._limit(budget) - self.model.count
-            if room > HOLES:  # else what hardly shows is needed to fill holes
-                grown = round(GROWN * self._limit(budget)) - self.model.count
-                self._split = split_worst(self.model, observation, drawn.view, max(0, grown)) > 0
+        mapped = Mapped(self._snapshot(observation, counts, still > 0, right), self._view)
+        if learn and not still:
+            self._split_worst(observation, budget)
         return mapped
 
     def pace(self, unhurried: bool) -> None:
-        """Whether there is time for several steps a frame. They are shorter then, and the flow is finer."""
-        self._flow = OpticalFlow(FINE_FLOW if unhurried else COARSE_FLOW)
+        """Whether there is time for several steps a frame. They are shorter then."""
         self._rates = LearningRates().scaled(UNHURRIED_RATES) if unhurried else LearningRates()
 
-    def remember_motion(self) -> None:
-        """From now on, see `mapping.motion_field`. Any thread may call this."""
-        if self._field is None:
-            self._field = MotionField()
-
-    def restart(self) -> None:
-        """Forget the model; the next frame, or this one if it is being taken in, makes a new one."""
-        self.model.clear()
-        self._deformation = None
-        self._forget_motion()
-        self._last = None
-        self.restarts += 1
-
-    def learnt(self) -> Learnt:
-        """What is known now."""
-        return Learnt(*deepcopy((self.model, self._deformation)), self._lamp)
-
-    def go_back(self, learnt: Learnt) -> None:
-        """Forget what was learnt since. The next frame's motion has nothing to start from (`start_from`)."""
-        learnt.model.never_reuse(self.model)
-        self.model, self._deformation, self._lamp = learnt.model, learnt.deformation, learnt.lamp
-        self._forget_motion()
-        self.start_from(None)
-
-    def relight(self, camera: Camera) -> Gaussians:
-        """The model as the scope's light shows it when its left eye is there; views, for drawing now."""
-        gaussians, lamp = self.model.gaussians(), self._lamp
-        if lamp is None or self._deformation is None or np.array_equal(lamp, camera.T_world_cam):
-            return gaussians
-        model, normals = self.model, self._deformation.normals(lamp[:3, 3])
-        colors = carried(
-            model.colors, model.means, normals, model.node_index, model.node_weight, lamp, camera.T_world_cam
-        )
-        return replace(gaussians, colors=colors)
-
-    def _move_light(self, camera: Camera) -> None:
-        """Let the colours be those that the scope's light shows from where it is now."""
-        if self._lamp is None or not is_near(self._lamp, camera.T_world_cam):
-            self.model.colors[:] = self.relight(camera).colors
-            self._lamp = camera.T_world_cam
-
-    def track(self, observation: Observation, guess: F32 | None = None) -> F32:
-        """Pixels [N, 2] where the Gaussians are found in a frame that is not taken in yet, see
-        `motion.track`; all NaN where there is no frame before.
-
-        Args:
-            guess: [rows, columns, 2] px, of square cells over the picture, from where to search.
-        """
-        if self._found is None or self._found[0] is not observation.gray:
-            pixels = np.full((self.model.count, 2), np.float32(np.nan))
-            if self._last is not None:
-                before = self._last.observation
-                flow = self._flow(pyramid_of(before), pyramid_of(observation), guess)
-                pixels = track(self.model.means, self._last.view, before.tissue, flow, observation.tissue)
-            self._found = observation.gray, pixels
-        return self._found[1]
-
-    def away(self, rows: I64) -> F32:
-        """How far [K, 3] m from where they rest the Gaussians in `rows` are now."""
-        if self._deformation is None:
-            return np.zeros((len(rows), 3), np.float32)
-        return self._deformation.away(self.model.node_index[rows], self.model.node_weight[rows])
-
-    def displacement_at(self, points: F32) -> F32:
-        """How far [K, 3] m from where it rests the tissue at places [K, 3] is now."""
-        if self._deformation is None:
-            return np.zeros_like(points)
-        index, weight, _ = nearest_nodes(points, self._deformation.nodes)
-        return self._deformation.away(index, weight)
-
-    def settle(self, share: float) -> None:
-        """Let where the tissue rests follow where it is now, by a share of the way."""
-        if self._deformation is not None:
-            self._deformation.settle(share)
-
-    def doubt(self, error: float) -> None:
-        """The depth of all Gaussians may be wrong by so much more, m, until it is measured again."""
-        self.model.depth_errors[:] = np.minimum(
-            self.model.depth_errors + np.float32(error), initialise.LARGEST_ERROR
-        )
-
     @property
-    def last(self) -> Drawn | None:
-        """What the next frame's motion starts from; None: nothing yet."""
-        return self._last
-
-    def start_from(self, last: Drawn | None) -> Drawn | None:
-        """Let the next frame's motion start from this one; returns from which it would have started."""
-        before, self._last, self._found = self._last, last, None
-        return before
+    def model(self) -> GaussianModel:
+        """The Gaussians of the map."""
+        return self.map.model
 
     def _initialise(self, observation: Observation, budget: Budget) -> dict[str, int]:
         if not self._can_start(observation):  # a black or covered picture: try again with the next frame
@@ -288,9 +142,9 @@ class Mapper:
         limit = int(initialise.INITIAL_SHARE * self._limit(budget))
         pixels, depths, errors, spacing = initialise.first_pixels(drawn, limit)
         rows = initialise.insert(self.model, drawn, pixels, depths, errors, spacing, self._smoothing)
-        self._deformation = NodeDeformation(self.model.means, CONTROL_NODES)
-        self._deformation.attach(self.model, rows)
-        self._lamp = observation.camera.T_world_cam
+        self.map.deformation = NodeDeformation(self.model.means, CONTROL_NODES)
+        self.map.deformation.attach(self.model, rows)
+        self.map.lamp = observation.camera.T_world_cam
         self._begin(drawn)
         self._first_steps = 0
         while self._first_steps < FIRST_STEPS and budget.more_at_first(self._first_steps):
@@ -302,11 +156,10 @@ class Mapper:
         self.step += self._first_steps
         return {"inserted": len(pixels), "iterations": self._first_steps}
 
-    def _follow(self, observation: Observation, budget: Budget) -> dict[str, int]:
-        assert self._deformation is not None
+    def _follow(self, observation: Observation, tracks: Tracks | None, budget: Budget) -> dict[str, int]:
         # 1. Deform: every Gaussian goes to where flow and depth saw its tissue go.
-        self._predict(observation)
-        self._move_light(observation.camera)
+        self._predict(observation, tracks)
+        self.map.move_light(observation.camera)
         # 2. Prune: what floats in front of the tissue, and what the machine does not afford.
         limit = self._limit(budget)
         removed = self.model.remove(densify.prune_mask(self.model, observation, limit))
@@ -325,13 +178,13 @@ class Mapper:
             self._refiner.draw()
         planes = self._refiner.planes()
         if _is_lost(planes, drawn) and self._can_start(observation):
-            self.restart()
+            self.map.restart()
             return self._initialise(observation, budget) | {"restarted": 1}
         # 4. Refine once on that drawing, before inserting: it serves both, since it shows the holes, too.
         pixels, depths, errors = densify.candidates(planes, drawn, phase=7 * self._frames)
         iterations = 0
         if budget.more():
-            self._refiner.refine(self._next_rates(), budget.first_share())
+            self._refiner.refine(self._next_rates(), budget.plan.first_share)
             iterations = 1
         # 5. Densify: new Gaussians in the holes. A full model gives up what shows least for them.
         room = max(ADDED, limit - self.model.count)
@@ -349,12 +202,12 @@ class Mapper:
             self._refiner.refine_worst(self._focus, self._next_rates())
             iterations += 1
         self._refiner.download()
-        self._show(observation, budget.rung.redraw, tiles_of(pixels, drawn.tissue))
+        self._show(observation, budget.plan.rung.redraw, tiles_of(pixels, drawn.tissue))
         self.step += iterations
         return {"inserted": rows.stop - rows.start, "removed": removed, "iterations": iterations}
 
-    def _follow_only(self, observation: Observation) -> dict[str, int]:
-        self._predict(observation)
+    def _follow_only(self, observation: Observation, tracks: Tracks | None) -> dict[str, int]:
+        self._predict(observation, tracks)
         drawn = resized(observation, self._scale)
         self._begin(drawn)
         self._show(observation, 1.0, tile_grid(drawn.tissue))
@@ -366,7 +219,7 @@ class Mapper:
         prune_mask = densify.prune_mask(self.model, observation, self._limit(budget))
         if np.count_nonzero(prune_mask) > TORN * self.model.count:
             counted = replace(observation, depth_is_new=False)
-            return self._follow(counted, budget)  # damage: there are holes to be filled
+            return self._follow(counted, None, budget)  # damage: there are holes to be filled
         self.model.velocities[:] = 0
         removed = self.model.remove(prune_mask)
         rests = settled and self._frames % SETTLED_EVERY > 0
@@ -388,7 +241,6 @@ class Mapper:
         return {"inserted": 0, "removed": removed, "iterations": iterations}
 
     def _begin(self, observation: Observation) -> None:
-        assert self._deformation is not None
         step = NODE_STEP_PX * self._metres_per_px
         self._refiner.begin(self.model, self._deformation, observation, step)
 
@@ -411,34 +263,69 @@ class Mapper:
     def _all_rows(self) -> slice:
         return slice(0, self.model.count)
 
-    def _predict(self, observation: Observation) -> None:
+    @property
+    def _deformation(self) -> NodeDeformation:
+        """Of a map that has tissue."""
+        assert self.map.deformation is not None
+        return self.map.deformation
+
+    def _predict(self, observation: Observation, tracks: Tracks | None) -> None:
         """Move all Gaussians to where flow and depth saw the tissue go."""
-        assert self._deformation is not None
-        if self._last is None:
+        if tracks is None:
+            self.model.velocities[:] = 0
             return
-        before = self._last.observation
         self._frames_to_depth += 1
         pull = depth_pull(self._frames_to_depth) if observation.depth_is_new else 0.0
-        displacements, seen = scene_flow(self.model.means, self.track(observation), observation, pull)
+        displacements, seen = scene_flow(self.model.means, tracks.pixels, observation, pull)
         if pull and observation.depth.any():
             self._frames_to_depth = 0
         start = self.model.means.copy()
-        if self._field is None:
+        motion = self.map.motion
+        if motion is None:
             self._deformation.follow(self.model, displacements, seen)
         else:
-            self._deformation.follow(self.model, displacements, seen, self._field.recalled)
-        seconds = (observation.t_capture_ns - before.t_capture_ns) * 1e-9
-        if seconds > 0:
-            self.model.velocities[:] = (self.model.means - start) / np.float32(seconds)
-        remember(self.model, observation, pull, max(seconds, 0.0))
+            self._deformation.follow(self.model, displacements, seen, motion.recalled)
+        if tracks.seconds > 0:
+            self.model.velocities[:] = (self.model.means - start) / np.float32(tracks.seconds)
+        remember(self.model, observation, pull, tracks.seconds)
 
-    def _remember(self, t_ns: int, still: bool) -> Forecast | None:
-        """Take the nodes' places at the end of a frame into the field; what it expects next."""
-        deformation, model = self._deformation, self.model
-        if self._field is None or deformation is None:
+    def _note_depth(self, observation: Observation) -> None:
+        known = observation.depth[::8, ::8]
+        known = known[known > 0]
+        if known.size:
+            self._metres_per_px = float(np.median(known)) / observation.camera.K[0, 0]
+
+    def _split_worst(self, observation: Observation, budget: Budget) -> None:
+        """Split Gaussians that show too little detail, for the frames to come."""
+        assert self._view is not None
+        limit = self._limit(budget)
+        if limit - self.model.count > HOLES:  # else what hardly shows is needed to fill holes
+            grown = round(GROWN * limit) - self.model.count
+            self._split = split_worst(self.model, observation, self._view, max(0, grown)) > 0
+
+    def _snapshot(
+        self, observation: Observation, counts: dict[str, int], still: bool, right: bool
+    ) -> Snapshot:
+        return Snapshot(
+            frame_id=observation.frame_id,
+            t_capture_ns=observation.t_capture_ns,
+            step=self.step,
+            gaussians=self.model.snapshot(),
+            velocities=self.model.velocities.copy(),
+            camera=observation.camera,
+            loss=self._refiner.loss,
+            counts=counts,
+            forecast=self._forecast(observation.t_capture_ns, still),
+            right_colors=self.model.right_colors.copy() if right else None,
+        )
+
+    def _forecast(self, t_ns: int, still: bool) -> Forecast | None:
+        """What the remembered motion, with the nodes' places at the end of this frame, expects next."""
+        motion, deformation, model = self.map.motion, self.map.deformation, self.model
+        if motion is None or deformation is None:
             return None
-        self._field.take(deformation.nodes, deformation.seen, t_ns)
-        expected = self._field.forecast()
+        motion.take(deformation.nodes, deformation.seen, t_ns)
+        expected = motion.forecast()
         if expected is None or still:
             return None
         moves, frame_s, state = expected
@@ -446,13 +333,9 @@ class Mapper:
             state, frame_s, deformation.nodes.copy(), moves, model.node_index.copy(), model.node_weight.copy()
         )
 
-    def _forget_motion(self) -> None:
-        if self._field is not None:
-            self._field.forget()
-
     def _limit(self, budget: Budget) -> int:
         """How many Gaussians this machine can afford."""
-        return min(budget.rung.gaussians, round(self._refiner.share * self.model.capacity))
+        return min(budget.plan.rung.gaussians, round(self._refiner.share * self.model.capacity))
 
     def _can_start(self, observation: Observation) -> bool:
         """Whether this frame has depth enough for a first model."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import prange
@@ -10,13 +11,16 @@ from numba import prange
 from sags_node.engine.pinhole import pack, to_camera, to_pixel
 from sags_node.kernels.jit import PIECE, inlined, kernel, parallel_kernel
 from sags_node.types import F32, Bool, Observation, RenderedView
+from sags_node.vision.flow import OpticalFlow
 from sags_node.vision.margin import clear_of_instruments
+from sags_node.vision.pyramid import pyramid_of
 
 DEPTH_GATE = 0.13  # of the depth: a larger innovation is another surface, not this one
 BEHIND_TOLERANCE = 0.035  # of the depth: what is this far behind the drawn surface is hidden by it
 SEEN_ALPHA = 0.3
 HALVINGS = 1  # of the masks: finer than the flow that they guard
 DEPTH_PULL = 0.4  # share of the depth innovation taken per frame; measured best 0.3-0.5
+FINE_FLOW, COARSE_FLOW = 4, 6  # px between patches
 MOST_FRAMES = 4  # without depth, after which the pull is not stronger any more
 
 
@@ -26,17 +30,52 @@ def depth_pull(frames: int) -> float:
     return float(1 - (1 - DEPTH_PULL) ** min(frames, MOST_FRAMES))
 
 
-def track(means: F32, before: RenderedView, tissue_before: Bool, flow: F32, tissue_after: Bool) -> F32:
-    """Where in the later picture each Gaussian of the earlier one is found.
+@dataclass(frozen=True, slots=True)
+class Drawn:
+    """A frame and the model drawn for it: what the next frame's motion starts from."""
+
+    observation: Observation
+    view: RenderedView
+
+
+class Tracks(NamedTuple):
+    """Where Gaussians are found in a frame."""
+
+    pixels: F32  # [N, 2], also beyond the picture's edges; NaN: not seen, or covered by an instrument now
+    seconds: float  # since they were where they are in the model
+
+
+class SurfaceTracker:
+    """Finds the Gaussians of one frame in the next, by optical flow."""
+
+    def __init__(self, unhurried: bool = False) -> None:
+        self.pace(unhurried)
+
+    def pace(self, unhurried: bool) -> None:
+        """Whether there is time for a finer flow."""
+        self._flow = OpticalFlow(FINE_FLOW if unhurried else COARSE_FLOW)
+
+    def track(self, means: F32, last: Drawn, observation: Observation, guess: F32 | None = None) -> Tracks:
+        """
+        Args:
+            means: [N, 3] m, world, at the earlier frame.
+            last: that frame, and the model drawn for it, to know what was hidden.
+            guess: [rows, columns, 2] px, of square cells over the picture, from where to search.
+        """
+        before = last.observation
+        flow = self._flow(pyramid_of(before), pyramid_of(observation), guess)
+        seconds = max(0.0, (observation.t_capture_ns - before.t_capture_ns) * 1e-9)
+        return Tracks(found(means, last.view, before.tissue, flow, observation.tissue), seconds)
+
+
+def found(means: F32, before: RenderedView, tissue_before: Bool, flow: F32, tissue_after: Bool) -> F32:
+    """Where in the later picture each Gaussian of the earlier one is, as `Tracks.pixels`.
 
     Args:
         means: [N, 3] m, world, at the earlier frame.
         before: the model drawn at the earlier frame, to know what was hidden.
         tissue_before, tissue_after: [H, W].
         flow: [h, w, 2] px of the whole pictures, from the earlier to the later one, at any size.
-
-    Returns:
-        Pixels [N, 2], also beyond the picture's edges; NaN: not seen, or covered by an instrument now.
     """
     clear_before, clear_after = (
         clear_of_instruments(mask, HALVINGS) for mask in (tissue_before, tissue_after)
@@ -53,7 +92,7 @@ def scene_flow(means: F32, pixels: F32, after: Observation, pull: float) -> tupl
 
     Args:
         means: [N, 3] m, world, at the earlier frame.
-        pixels: [N, 2] in the later one, of `track`.
+        pixels: [N, 2] in the later one, as `Tracks.pixels`.
         after: the later frame; its depth pulls the Gaussian along the ray.
         pull: by which share of the difference; see `depth_pull`.
 

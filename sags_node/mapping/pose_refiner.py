@@ -6,8 +6,9 @@ import numpy as np
 
 from sags_node.geometry import invert
 from sags_node.mapping.camera_pose import towards
-from sags_node.mapping.mapper import Mapper
+from sags_node.mapping.motion import Drawn, Tracks
 from sags_node.mapping.resting_tissue import RestingTissue
+from sags_node.mapping.tissue_map import TissueMap
 from sags_node.types import F64, Observation, RenderedView
 
 SECONDS = 10.0  # over which the correction follows the picture: longer than a breath
@@ -28,10 +29,9 @@ class PoseRefiner:
 
     lost: str | None = None
 
-    def __init__(self, mapper: Mapper) -> None:
+    def __init__(self, tissue_map: TissueMap) -> None:
         self.unsure = ""
-        self._mapper = mapper
-        self._tissue = RestingTissue(mapper)
+        self._tissue = RestingTissue(tissue_map)
         self._correction: F64 = np.eye(4)  # of given poses, from the left
         self._given: F64 = np.eye(4)  # pose of the last frame
         self._pose: F64 = np.eye(4)
@@ -49,22 +49,26 @@ class PoseRefiner:
         self._given = given
         return self._correction @ given
 
-    def track(self, observation: Observation) -> bool:
-        """Find the pose of a frame whose camera is as guessed; it is never lost."""
+    def locate(self, observation: Observation, last: Drawn | None, tracks: Tracks | None) -> Tracks | None:
+        """Find the pose of a frame whose camera is as guessed; it is never lost.
+
+        Args:
+            last: the frame before, and `tracks` from it to this one; None: there is no model yet.
+        """
         guess = observation.camera.T_world_cam
         before, self._stamp_ns = self._stamp_ns, observation.t_capture_ns
         self._pose, self.unsure = guess, ""
-        if before is None or self._mapper.model.count == 0:
-            return True
-        fit = self._tissue.fit(observation, guess)
+        if before is None or last is None or tracks is None:
+            return tracks
+        fit = self._tissue.fit(observation, last, tracks, guess)
         if isinstance(fit, str):
             self.unsure = fit
-            return True
+            return tracks
         seconds = min(max(0.0, (self._stamp_ns - before) * 1e-9), 1.0)
         self._pose = towards(guess, fit.at_rest, seconds / SECONDS)
         self._correction = self._pose @ invert(self._given)
-        return True
+        return tracks
 
-    def mapped(self, observation: Observation, view: RenderedView) -> None:
+    def learn(self, observation: Observation, view: RenderedView) -> None:
         """Learn from a frame that was taken in."""
         self._tissue.learn(observation)

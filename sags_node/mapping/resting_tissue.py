@@ -10,7 +10,8 @@ import numpy as np
 from sags_node.geometry import disparity_to_depth, invert, project
 from sags_node.mapping.camera_pose import fit_pose
 from sags_node.mapping.first_views import FirstViews
-from sags_node.mapping.mapper import Mapper
+from sags_node.mapping.motion import Drawn, Tracks
+from sags_node.mapping.tissue_map import TissueMap
 from sags_node.types import F32, F64, I64, U8, Bool, Observation
 
 CANDIDATES = 2000  # Gaussians, of those found
@@ -37,26 +38,30 @@ class TissueFit:
 class RestingTissue:
     """The tissue has a place at rest, which follows it slowly."""
 
-    def __init__(self, mapper: Mapper) -> None:
-        self._mapper = mapper
-        self._restarts = mapper.restarts
+    def __init__(self, tissue_map: TissueMap) -> None:
+        self._map = tissue_map
+        self._restarts = tissue_map.restarts
         self._stamp_ns: int | None = None  # of the last frame that was mapped
         self._seconds = 0.0  # that the model has been learnt for
-        self._first_views = FirstViews(mapper)
+        self._first_views = FirstViews(tissue_map)
         self._at_rest: F64 | None = None  # pose of the last frame against the tissue at rest; None: not known
         self._correction: F64 | None = None  # [4, 4] of a pose, from the left; None: first pictures tell none
         self._looked_ns = 0
 
-    def fit(self, observation: Observation, start: F64) -> TissueFit | str:
-        """The pose of a frame, or why there is none; `start` [4, 4] is about where it was taken from."""
-        model, camera, last = self._mapper.model, observation.camera, self._mapper.last
+    def fit(self, observation: Observation, last: Drawn, tracks: Tracks, start: F64) -> TissueFit | str:
+        """The pose of a frame, or why there is none.
+
+        Args:
+            last: the frame before, and `tracks` from it to this one.
+            start: [4, 4] about where it was taken from.
+        """
+        model, camera, pixels = self._map.model, observation.camera, tracks.pixels
         self._at_rest = None
-        pixels = self._mapper.track(observation)
         rows = np.flatnonzero(_is_inside(pixels, observation.gray))
         rows = rows[:: max(1, len(rows) // CANDIDATES)]
-        if last is None or len(rows) < LEAST_POINTS:
+        if len(rows) < LEAST_POINTS:
             return "hardly any tissue in view"
-        away = self._mapper.away(rows)
+        away = self._map.away(rows)
         ways = np.linalg.norm(away, axis=1)
         calm = ways <= CALM * np.median(ways)
         rows, away = rows[calm], away[calm]
@@ -92,8 +97,8 @@ class RestingTissue:
 
     def learn(self, observation: Observation) -> None:
         """Let the places at rest follow a frame that was taken in."""
-        if self._mapper.restarts != self._restarts:
-            self._restarts = self._mapper.restarts
+        if self._map.restarts != self._restarts:
+            self._restarts = self._map.restarts
             self._seconds = 0.0
             self._first_views.clear()
             self._at_rest = self._correction = None
@@ -102,7 +107,7 @@ class RestingTissue:
         # A model that is younger than a breath rests where it was on average until now.
         self._seconds = min(self._seconds + passed, REST_SECONDS)
         share = passed / max(self._seconds, passed, 1e-9)
-        self._mapper.settle(share)
+        self._map.settle(share)
         self._look(observation)
 
     def _look(self, observation: Observation) -> None:

@@ -37,7 +37,7 @@ from sags_node.node.latest import Latest
 from sags_node.node.operations import NodeState, Operations
 from sags_node.node.service_manager import ServiceManager
 from sags_node.node.views import Views
-from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.pipeline import FrameRequest, Pipeline
 from sags_node.recording.child import RecorderProcess
 from sags_node.sources.clock import CaptureClock
 from sags_node.sources.rate import FrameRate
@@ -101,6 +101,7 @@ class Node:
         # By name, the newest only; None: closed. Single operations on a dict need no lock.
         self._drawn: dict[str, DrawnView | None] = {}
         self._watched: frozenset[str] = frozenset()  # views that somebody subscribes to
+        self._right_is_watched = False  # somebody looks at the right eye
         self._error: BaseException | None = None
         self._stopping = threading.Event()
         self._last_sent: FrameResult | None = None
@@ -241,8 +242,8 @@ class Node:
                     self._state.pipeline.rate = self._rate.hz
                     self._operations.reconfigure()
                 waited = time.monotonic() - at if self._live else 0.0
-                self._state.pipeline.anchors.latency_s = self._state.statistics.latency_s
-                result = self._state.pipeline.process(frame, self._state.budget, waited)
+                request = FrameRequest(waited, self._right_is_watched, self._state.statistics.latency_s)
+                result = self._state.pipeline.process(frame, self._state.budget, request)
                 if frame.warm_up:
                     continue
                 give(result)
@@ -351,7 +352,7 @@ class Node:
         self._watched = frozenset(name for name in views.status if self._publisher.watches_view(name))
         if self._state.config.publish.right == "auto":
             pictures = ["right/render/image", *(f"view/{name}/right/image" for name in views.pairs)]
-            self._state.pipeline.draws_right = any(map(self._publisher.looked_at, pictures))
+            self._right_is_watched = any(map(self._publisher.looked_at, pictures))
 
     def _send_thin(self) -> None:
         made = self._thin.get(timeout=0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,13 +14,15 @@ from sags_node.config.schema import LaunchConfig
 from sags_node.engine.rasterizer.rasterize import to_view
 from sags_node.findings import Findings, by_stage
 from sags_node.mapping.anchors import Anchors
-from sags_node.mapping.budget import Budget
+from sags_node.mapping.budget import Budget, FramePlan
 from sags_node.mapping.camera_tracker import CameraTracker
 from sags_node.mapping.depth_memory import UNWATCHED
 from sags_node.mapping.devices import ALL_SKIPS, Skips, affordable, make_budget, make_refiner
 from sags_node.mapping.mapper import Mapped, Mapper
+from sags_node.mapping.motion import Drawn, SurfaceTracker, Tracks
 from sags_node.mapping.pose_refiner import PoseRefiner
 from sags_node.mapping.right_view import RightView
+from sags_node.mapping.tissue_map import TissueMap
 from sags_node.pipeline.repeats import doubted, repeated, unseen
 from sags_node.types import (
     Bool,
@@ -36,11 +38,13 @@ from sags_node.types import (
 from sags_node.vision.change import StillScene, is_repeat
 from sags_node.vision.depth import DepthChoice, Measured
 from sags_node.vision.freeze_watch import FreezeWatch
-from sags_node.vision.lens_watch import LensWatch, OnLenses
+from sags_node.vision.judgement import Evidence, Judgement, Watcher
+from sags_node.vision.lens_watch import LensWatch
 from sags_node.vision.observe import observe
-from sags_node.vision.pair_watch import PairWatch, Verdict
+from sags_node.vision.pair_watch import PairWatch
+from sags_node.vision.pose_watch import PoseWatch
 from sags_node.vision.rectify import Rectifier
-from sags_node.vision.scene_watch import Advice, SceneWatch, enlarged, exposed
+from sags_node.vision.scene_watch import SceneWatch, enlarged, exposed
 from sags_node.vision.tissue import TissueMask
 from sags_node.vision.tissue_topic import NearestMask
 
@@ -48,8 +52,20 @@ UNHURRIED_MS = 60.0  # a budget that has room for several steps and a finer flow
 NOTICED_LATE = HALVING  # m: what was measured before matches are found to be wrong may be wrong by so much
 
 
+@dataclass(frozen=True, slots=True)
+class FrameRequest:
+    """What consumers want of one frame."""
+
+    waited: float = 0.0  # s since it came
+    right: bool = False  # somebody looks at the right eye: it is drawn, where there is one
+    latency: float = 0.0  # s from capture to what shows it, as it was lately
+
+
+NOTHING_ASKED = FrameRequest()
+
+
 class Pipeline:
-    """rectify -> tissue mask -> depth -> map -> render.
+    """watch -> segment -> depth -> track -> locate -> map, then draw.
 
     Args:
         masks: of another process, for `vision.tissue.method` topic.
@@ -58,8 +74,7 @@ class Pipeline:
 
     Attributes:
         rate: frames that come a second; None: they come when they are taken. `reconfigure` after a change.
-        draws_right: somebody looks at the right eye. It is drawn then, where there is one. Any thread may
-            change this.
+        newest: the frame mapped last; None before the first, and after a reset.
     """
 
     def __init__(
@@ -81,30 +96,26 @@ class Pipeline:
         self.depth = DepthChoice(vision, self.rectifier)
         self._refiner = make_refiner(config, width, height)
         self._config = config
-        self.mapper = Mapper(
-            self._refiner,
-            affordable(config, width, height),
-            unhurried=config.mapping.frame_ms(rate) >= UNHURRIED_MS,
-            field=config.mapping.field is True,
-        )
-        self.draws_right = config.publish.right is True
+        self.map = TissueMap(affordable(config, width, height), field=config.mapping.field is True)
+        unhurried = config.mapping.frame_ms(rate) >= UNHURRIED_MS
+        self.mapper = Mapper(self._refiner, self.map, unhurried=unhurried)
+        self._surface = SurfaceTracker(unhurried)
         self._right = RightView()
-        self._tracker: CameraTracker | PoseRefiner | None = None
+        self._camera: CameraTracker | PoseRefiner | None = None  # None: its pose is given, or fixed
         if vision.pose == "estimate":
-            self._tracker = CameraTracker(self.mapper, self._draw_model)
+            self._camera = CameraTracker(self.map, self._surface, self._draw_model)
         elif vision.pose == "refine":
-            self._tracker = PoseRefiner(self.mapper)
+            self._camera = PoseRefiner(self.map)
         self.anchors = Anchors(self.tissue.usable)
-        self._still = StillScene()
-        self._freeze = FreezeWatch()
-        self._eyes = PairWatch()
-        self._lenses = LensWatch()
+        self._pose = PoseWatch(needed=vision.pose in ("session", "refine"))
         self._scene = SceneWatch(moving=vision.pose == "estimate")
-        self._is_sound = True  # what was matched last is depth
-        self._unposed: Finding | None = None  # why the newest frame's pose is not known
+        self._watchers: tuple[Watcher, ...] = (
+            self._pose, FreezeWatch(), PairWatch(), self._scene, LensWatch()
+        )  # fmt: skip
+        self._still = StillScene()
         self._reset_due = False
-        self._mapped: FrameResult | None = None  # the last frame that was really mapped
-        self._depth: Measured | None = None  # of the last frame in which it was measured, or could not be
+        self.newest: FrameResult | None = None
+        self._last: Drawn | None = None  # what motion starts from: the last frame in which something moved
         self._unwatched = 0.0  # m: how far tissue may have moved in frames that were held since
 
     def reset(self) -> None:
@@ -113,38 +124,32 @@ class Pipeline:
         While the scope's pose is not known no frame can: it is forgotten when one comes whose pose is.
         """
         self._reset_due = True
-        if self._unposed is None:
+        if not self._pose.findings:
             self._forget()
 
     def _forget(self) -> None:
         self._reset_due = False
-        self.mapper.restart()
+        self.map.restart()
         self._scene.forget()
         self._still.forget()
-        self._mapped = None
+        self.newest = self._last = None
         self._unwatched = 0.0
 
     def predict_motion(self) -> None:
         """Somebody wants motion predicted. Any thread may call this."""
         if self._config.mapping.field is not False:
-            self.mapper.remember_motion()
-
-    @property
-    def newest(self) -> FrameResult | None:
-        """The frame mapped last; None before the first, and after a reset."""
-        return self._mapped
+            self.map.remember_motion()
 
     @property
     def warnings(self) -> Findings:
         """What is wrong and how to fix it. May be read from any thread."""
-        watches = self._freeze, self._eyes, self._lenses, self.depth, self._scene
-        found = [finding for watch in watches for finding in watch.findings]
-        lost = None if self._tracker is None else self._tracker.lost
+        found = [*self.depth.findings]
+        for watcher in self._watchers:
+            found += watcher.findings
+        lost = None if self._camera is None else self._camera.lost
         if lost is not None:
             back = "bring the scope back to tissue that it saw before"
             found.append(Finding("camera_lost", f"the camera is lost: {lost}; {back}"))
-        if self._unposed is not None:
-            found.append(self._unposed)
         if self.tissue.problem:
             found.append(Finding("mask_missing", self.tissue.problem))
         if self._refiner.problem is not None:
@@ -154,7 +159,9 @@ class Pipeline:
     def reconfigure(self, config: LaunchConfig) -> None:
         """Take changed parameters over; the model stays."""
         self._config = config
-        self.mapper.pace(config.mapping.frame_ms(self.rate) >= UNHURRIED_MS)
+        unhurried = config.mapping.frame_ms(self.rate) >= UNHURRIED_MS
+        self.mapper.pace(unhurried)
+        self._surface.pace(unhurried)
 
     def make_budget(self, speed: float | None = None) -> Budget:
         """What frames get, by the configuration and how long this machine takes (`Ladder.speed`); None: it is
@@ -162,209 +169,190 @@ class Pipeline:
         camera = self.rectifier.camera
         return make_budget(self._config, camera.width, camera.height, speed, self.rate, self._skips)
 
-    def process(self, frame: StereoFrame, budget: Budget, waited: float = 0.0) -> FrameResult:
-        """Everything that happens to one frame, `waited` seconds after it came."""
-        budget.start(waited)
-        rung = budget.state
-        watch = Stopwatch()
-        # 1. May this frame be trusted? One without a pose, or of a feed that stands still, is held.
-        with watch("rectify"):
-            pair = self._placed(frame)
-        with watch("watch"):
-            frozen = self._freeze(frame)
-            eyes = self._eyes(frame, pair)
+    def process(
+        self, frame: StereoFrame, budget: Budget, request: FrameRequest = NOTHING_ASKED
+    ) -> FrameResult:
+        """Everything that happens to one frame."""
+        plan, clock = budget.start(request.waited), Stopwatch()
+        with clock("rectify"):
+            pair = self._rectified(frame)
         self._on_rectified(pair, self._epoch(frame))
-        self._unposed = frame.pose_problem if self._config.vision.pose in ("session", "refine") else None
-        if self._unposed is not None and self._mapped is not None:
-            return self._held(frame, pair, watch, "pose", self._unposed.text, unseen(pair))
-        if frozen and self._mapped is not None:
-            return self._held(frame, pair, watch, "picture", frozen, unseen(pair))
-        if self._reset_due:
+        # 1. Watch: may this frame be trusted? One that may not is held, an equal one is the last again.
+        right = pair.right is not None and (request.right or self._config.publish.right is True)
+        with clock("watch"):
+            judged, repeats = self._watch(frame, pair, right)
+        if judged.hold and self.newest is not None:
+            return self._held(frame, pair, clock, judged.stage, judged.hold, unseen(pair))
+        if repeats:
+            return self._repeated(frame, pair, clock)
+        if judged.is_new_scene:
             self._forget()
-        # 2. Is it new? An equal one is the last again, another scene begins a new model, a bad one is held.
-        draws_right = self.draws_right and pair.right is not None
-        if self._equals_the_last(pair, draws_right):
-            return self._repeated(frame, pair, watch)
-        with watch("watch"):
-            scene = self._compared(pair, eyes)
-            hidden = self._hidden(pair, eyes, scene)
-        if scene.is_new:
-            self._forget()
-        elif scene.held:
-            return self._held(frame, pair, watch, "picture", scene.held, unseen(pair))
-        # 3. Where is tissue, and how deep is it?
-        seen = pair if scene.gain is None else exposed(pair, scene.gain)
-        still = self._still_frames(pair)
-        with watch("mask"):
-            tissue = self._tissue_in(frame, seen, scene.covered, hidden.left)
-        with watch("depth"):
-            seen_by_both = _without(tissue, hidden.right)
-            measured = self._measured(frame, seen, seen_by_both, still, budget, eyes)
+        # 2. Segment: where is tissue? Cover, and drops on the lens, are none.
+        seen, still = self._in_usual_light(pair, judged), self._still_frames(pair)
+        with clock("mask"):
+            tissue = self._segmented(frame, seen, judged)
+        # 3. Depth, where both eyes see tissue and the plan has time for it.
+        with clock("depth"):
+            by_both = _without(tissue, judged.covered_right)
+            measured = self._measured(frame, seen, by_both, still > 0, plan, judged)
             observation = observe(seen, tissue, measured)
-        # 4. Where is the camera? The tissue's motion is searched from where the watch saw it go.
-        if scene.guess is not None:
-            self.mapper.track(observation, scene.guess)
-        if self._tracker is not None:
-            with watch("pose"):
-                tracked = still > 0 or self._tracker.track(observation)
-                camera = replace(pair.camera, T_world_cam=self._tracker.pose)
-                pair, observation = replace(pair, camera=camera), replace(observation, camera=camera)
-            if not tracked and self._tracker.lost is not None and self._mapped is not None:
-                return self._held(frame, pair, watch, "pose", self._tracker.lost, observation)
-        # 5. Deform, refine, add and prune Gaussians.
-        learn = scene.learn and eyes.learn
-        with watch("map"):
-            mapped = self._map(observation, budget, still, learn, draws_right)
-        # 6. Draw the right eye for who looks, and follow the anchors.
-        with watch("render"):
-            views = {"left": mapped.view}
-            if draws_right:
-                sure = seen_by_both if learn and not eyes.right else np.zeros_like(tissue)
-                views["right"] = self._right_eye(mapped, observation, seen, learn, sure)
-        with watch("anchors"):
-            self.anchors.update(observation, mapped.snapshot, mapped.view, learn)
-            anchors = self.anchors.ahead(self.anchors.at(pair.t_capture_ns), mapped.snapshot)
+        # 4. Track: where did the known surface go? By optical flow since the last frame.
+        with clock("track"):
+            tracks = self._tracks(observation, still, judged)
+        # 5. Locate the camera, where its pose is not given.
+        with clock("pose"):
+            pair, observation, tracks = self._located(pair, observation, still, tracks)
+        if self._camera is not None and self._camera.lost and self.newest is not None:
+            return self._held(frame, pair, clock, "pose", self._camera.lost, observation)
+        # 6. Map: deform, refine, add and prune Gaussians.
+        with clock("map"):
+            mapped = self._mapped(observation, tracks, budget, still, judged.learn, right)
         if not still:  # which tells nothing of what a moving frame costs
-            budget.finish(self.mapper.model.count)
-        skipped = {**self._without_mask(), **self._without_refinement(), **measured.skipped}
-        self._mapped = FrameResult(
-            pair, observation, mapped.snapshot, views, self._epoch(frame), watch.timings_ms,
-            skipped, anchors, rung, hurried=measured.hurried,
+            budget.finish(self.map.model.count, matched=plan.depth and measured.is_new)
+        # Then draw what consumers watch: the right eye, and their anchors.
+        with clock("render"):
+            views = {"left": mapped.view}
+            if right:
+                views["right"] = self._right_eye(mapped, observation, seen, judged, by_both)
+        with clock("anchors"):
+            self.anchors.update(observation, mapped.snapshot, mapped.view, judged.learn)
+            states = self.anchors.at(pair.t_capture_ns)
+            anchors = self.anchors.ahead(states, mapped.snapshot, request.latency)
+        self.newest = FrameResult(
+            pair, observation, mapped.snapshot, views, self._epoch(frame), clock.timings_ms,
+            self._skipped(measured), anchors, plan.state, hurried=measured.hurried,
         )  # fmt: skip
-        return replace(self._mapped, held=frozen) if frozen else self._mapped
+        return replace(self.newest, held=judged.hold) if judged.hold else self.newest
 
-    def _placed(self, frame: StereoFrame) -> RectifiedPair:
-        """The rectified pair; until its pose is found its camera is where it was last, or as it is given."""
+    def _rectified(self, frame: StereoFrame) -> RectifiedPair:
+        """Until its pose is found, its camera is where it was last, or as it is given."""
         if self._config.vision.pose == "session":
             return self.rectifier(frame)
-        pose = None if self._tracker is None else self._tracker.guess(frame.T_world_cam)
+        pose = None if self._camera is None else self._camera.guess(frame.T_world_cam)
         return self.rectifier(replace(frame, T_world_cam=pose))
 
-    def _equals_the_last(self, pair: RectifiedPair, draws_right: bool) -> bool:
-        if self._mapped is None or not self._skips.duplicates:
-            return False
-        if draws_right and "right" not in self._mapped.views:  # for somebody who has just come
-            return False
-        return is_repeat(pair, self._mapped.pair)
+    def _watch(self, frame: StereoFrame, pair: RectifiedPair, right: bool) -> tuple[Judgement, bool]:
+        """What all watchers together say of a frame, and whether it equals the last one."""
+        if self._reset_due and frame.pose_problem is None:
+            self._forget()
+        last = self.newest
+        lacks_right = right and last is not None and "right" not in last.views  # somebody has just come
+        equal = last is not None and self._skips.duplicates and not lacks_right and is_repeat(pair, last.pair)
+        evidence = Evidence(frame, pair, last, equal, self.depth.eyes_are_late)
+        judged = Judgement()
+        for watcher in self._watchers:
+            judged = watcher.judge(evidence, judged)
+        return judged, equal
 
-    def _repeated(self, frame: StereoFrame, pair: RectifiedPair, watch: Stopwatch) -> FrameResult:
-        assert self._mapped is not None
+    def _repeated(self, frame: StereoFrame, pair: RectifiedPair, clock: Stopwatch) -> FrameResult:
+        assert self.newest is not None
         anchors = self.anchors.at(pair.t_capture_ns, equal=True)
-        return repeated(self._mapped, pair, self._epoch(frame), watch.timings_ms, anchors)
-
-    def _compared(self, pair: RectifiedPair, eyes: Verdict) -> Advice:
-        """What to do with a frame, by how it fits the last one."""
-        if self._mapped is None:
-            return Advice()
-        return Advice(eyes.left) if eyes.left else self._scene(pair, self._mapped, not eyes.learn)
-
-    def _hidden(self, pair: RectifiedPair, eyes: Verdict, scene: Advice) -> OnLenses:
-        """What sits on the lenses, where both eyes can be compared."""
-        if self._mapped is None:
-            return OnLenses()
-        sound = eyes.learn and not (eyes.left or eyes.right or scene.held or self.depth.eyes_are_late)
-        return self._lenses(pair, self._mapped, sound)
+        return repeated(self.newest, pair, self._epoch(frame), clock.timings_ms, anchors)
 
     def _held(
-        self, frame: StereoFrame, pair: RectifiedPair, watch: Stopwatch, what: str, why: str,
+        self, frame: StereoFrame, pair: RectifiedPair, clock: Stopwatch, what: str, why: str,
         observation: Observation,
     ) -> FrameResult:  # fmt: skip
         """For a frame that something (`what`) forbids to take in: the last model, and nothing is learnt from
         the picture. The tissue moves meanwhile, and the depth is less and less sure."""
-        assert self._mapped is not None
+        assert self.newest is not None
         self._still.forget()
-        seconds = max(0, pair.t_capture_ns - self._mapped.pair.t_capture_ns) * 1e-9
+        seconds = max(0, pair.t_capture_ns - self.newest.pair.t_capture_ns) * 1e-9
         self._unwatched = UNWATCHED * seconds
         anchors = self.anchors.at(pair.t_capture_ns, held=True)
-        last = repeated(self._mapped, pair, self._epoch(frame), watch.timings_ms, anchors)
+        last = repeated(self.newest, pair, self._epoch(frame), clock.timings_ms, anchors)
         held = doubted(last, self._unwatched)
         return replace(held, observation=observation, skipped={what: why}, held=why, hurried=False)
 
+    def _in_usual_light(self, pair: RectifiedPair, judged: Judgement) -> RectifiedPair:
+        """The pair in the exposure that the model has."""
+        return pair if judged.gain is None else exposed(pair, judged.gain)
+
     def _still_frames(self, pair: RectifiedPair) -> int:
+        """For how many frames nothing has moved."""
         if not self._skips.still:
             return 0
-        if self._tracker is not None:  # an estimated pose tells nothing that the pictures do not
+        if self._camera is not None:  # an estimated pose tells nothing that the pictures do not
             pair = replace(pair, camera=self.rectifier.camera)
         return self._still(pair)
 
-    def _tissue_in(self, frame: StereoFrame, pair: RectifiedPair, *covers: Bool | None) -> Bool:
-        drawn = None if self._mapped is None else self._mapped.views["left"]
+    def _segmented(self, frame: StereoFrame, pair: RectifiedPair, judged: Judgement) -> Bool:
+        drawn = None if self.newest is None else self.newest.views["left"]
         tissue = self.tissue(frame, pair, drawn)
-        for cover in covers:
-            tissue = _without(tissue, cover)
-        return tissue
-
-    def _without_mask(self) -> dict[str, str]:
-        return {"mask": self.tissue.problem} if self.tissue.problem else {}
-
-    def _without_refinement(self) -> dict[str, str]:
-        unsure = self._tracker.unsure if isinstance(self._tracker, PoseRefiner) else ""
-        return {"refine": unsure} if unsure else {}
+        return _without(_without(tissue, judged.covered), judged.covered_left)
 
     def _measured(
-        self, frame: StereoFrame, pair: RectifiedPair, tissue: Bool, still: int, budget: Budget, eyes: Verdict
-    ) -> Measured:
-        """The depth of a frame: where nothing moves, that which was measured before."""
-        self.depth.see(pair)
-        if still and self._depth is not None and self._depth.depth.any():
-            self.depth.stereo.rows.stay()
-            return self._depth.handed_on(tissue)
-        self._depth = self._measured_now(frame, pair, tissue, budget, eyes)
-        return self._depth
-
-    def _measured_now(
-        self, frame: StereoFrame, pair: RectifiedPair, tissue: Bool, budget: Budget, eyes: Verdict
-    ) -> Measured:
-        """None where there is no time, or no right eye."""
-        if self._lacks_time_for_depth(frame, budget):
-            return Measured.nothing(tissue.shape, "no time", hurried=True)
-        was_sound, self._is_sound = self._is_sound, True
-        if eyes.right and frame.depth is None and pair.right is not None:
-            return Measured.nothing(tissue.shape, eyes.right)
-        measured = self.depth(frame, pair, tissue)
-        self._is_sound = measured.is_sound
-        if was_sound and not measured.is_sound:
-            self.mapper.doubt(NOTICED_LATE)
+        self, frame: StereoFrame, pair: RectifiedPair, tissue: Bool, still: bool, plan: FramePlan,
+        judged: Judgement,
+    ) -> Measured:  # fmt: skip
+        # A first model cannot do without depth.
+        has_time = plan.depth or not self._skips.depth or self.map.model.count == 0
+        measured = self.depth(frame, pair, tissue, still, has_time, judged.no_stereo)
+        if measured.found_out:
+            self.map.doubt(NOTICED_LATE)
         return measured
 
-    def _lacks_time_for_depth(self, frame: StereoFrame, budget: Budget) -> bool:
-        needs_matching = self.depth.takes_time(frame) and self.mapper.model.count > 0  # the first needs depth
-        return needs_matching and self._skips.depth and not budget.affords_depth()
+    def _tracks(self, observation: Observation, still: int, judged: Judgement) -> Tracks | None:
+        if still or self._last is None or self.map.deformation is None:
+            return None
+        return self._surface.track(self.map.model.means, self._last, observation, judged.guess)
 
-    def _map(
-        self, observation: Observation, budget: Budget, still: int, learn: bool, draws_right: bool
-    ) -> Mapped:
+    def _located(
+        self, pair: RectifiedPair, observation: Observation, still: int, tracks: Tracks | None
+    ) -> tuple[RectifiedPair, Observation, Tracks | None]:
+        if self._camera is None:
+            return pair, observation, tracks
+        if not still:
+            tracks = self._camera.locate(observation, self._last, tracks)
+        camera = replace(pair.camera, T_world_cam=self._camera.pose)
+        return replace(pair, camera=camera), replace(observation, camera=camera), tracks
+
+    def _mapped(
+        self, observation: Observation, tracks: Tracks | None, budget: Budget, still: int, learn: bool,
+        right: bool,
+    ) -> Mapped:  # fmt: skip
         if self._unwatched:
-            self.mapper.doubt(self._unwatched)
+            self.map.doubt(self._unwatched)
             self._unwatched = 0.0
-        if draws_right:
-            self._right.wake(self.mapper.model)
+        if right:
+            self._right.wake(self.map.model)
         else:
             self._right.miss()
-        mapped = self.mapper.update(observation, budget, still, learn, draws_right)
-        if self._tracker is not None:
-            self._tracker.mapped(observation, mapped.view)
+        begins = self.map.deformation is None
+        mapped = self.mapper.update(observation, tracks, budget, still, learn, right)
+        if not still or begins:  # a still frame is passed over: slow motion adds up until seen
+            self._last = Drawn(observation, mapped.view)
+        if self._camera is not None:
+            self._camera.learn(observation, mapped.view)
         return mapped
 
-    def _epoch(self, frame: StereoFrame) -> int:
-        """Grows with the source's epochs and with every new model: ids then mean other Gaussians."""
-        return frame.epoch + self.mapper.restarts
-
     def _right_eye(
-        self, mapped: Mapped, observation: Observation, seen: RectifiedPair, learn: bool, sure: Bool
+        self, mapped: Mapped, observation: Observation, seen: RectifiedPair, judged: Judgement, by_both: Bool
     ) -> RenderedView:
-        """The model drawn for the right eye, which is learnt from where tissue is `sure`."""
-        before, stamp = self._mapped, mapped.view.t_capture_ns
-        if before is not None and "right" in before.views and before.views["left"].rgb is mapped.view.rgb:
-            return replace(before.views["right"], frame_id=mapped.view.frame_id, t_capture_ns=stamp)
-        drawn = self._right.draw(mapped, observation, seen.left, self._refiner.show, learn)
+        """The model drawn for the right eye, which is learnt from where both see tissue."""
+        last, stamp = self.newest, mapped.view.t_capture_ns
+        if last is not None and "right" in last.views and last.views["left"].rgb is mapped.view.rgb:
+            return replace(last.views["right"], frame_id=mapped.view.frame_id, t_capture_ns=stamp)
+        drawn = self._right.draw(mapped, observation, seen.left, self._refiner.show, judged.learn)
         assert seen.right is not None  # else nothing is drawn for it
-        self._right.learn(drawn, self.mapper.model, seen.right, sure, observation.baseline)
+        sure = by_both if judged.learn and not judged.no_stereo else np.zeros_like(by_both)
+        self._right.learn(drawn, self.map.model, seen.right, sure, observation.baseline)
         return drawn.view
+
+    def _skipped(self, measured: Measured) -> dict[str, str]:
+        """What was left out of a frame that was mapped, and why."""
+        skipped = {"mask": self.tissue.problem} if self.tissue.problem else {}
+        if isinstance(self._camera, PoseRefiner) and self._camera.unsure:
+            skipped["refine"] = self._camera.unsure
+        return {**skipped, **measured.skipped}
 
     def _draw_model(self, camera: Camera) -> RenderedView:
         """The model as it is now, in the light of a scope that is there."""
-        return to_view(self._refiner.show(self.mapper.relight(camera), camera), camera, 0, 0)
+        return to_view(self._refiner.show(self.map.relight(camera), camera), camera, 0, 0)
+
+    def _epoch(self, frame: StereoFrame) -> int:
+        """Grows with the source's epochs and with every new model: ids then mean other Gaussians."""
+        return frame.epoch + self.map.restarts
 
 
 def _without(tissue: Bool, cover: Bool | None) -> Bool:

@@ -13,7 +13,7 @@ import numpy as np
 from sags_node.config.schema import LaunchConfig, MappingConfig, VisionConfig
 from sags_node.kernels.cache import is_cold
 from sags_node.mapping.budget import StepBudget
-from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.pipeline import FrameRequest, Pipeline
 from sags_node.processes import end
 from sags_node.rig import rectified_rig
 from sags_node.types import U8, StereoFrame, StereoRig
@@ -46,14 +46,14 @@ def warm_up(config: LaunchConfig) -> None:
         }
     )
     pipeline = Pipeline(small, _rig())
-    pipeline.draws_right = config.publish.right is not False  # somebody may look
+    request = FrameRequest(right=config.publish.right is not False)  # somebody may look
     budget = StepBudget(2)  # the first on the whole picture, the second where it is worst
     frames = _frames()
     with _vision_beside():
         for frame in frames[:3]:  # with a depth of their own: stereo is left to the other process
-            pipeline.process(frame, budget)
+            pipeline.process(frame, budget, request)
     for frame in frames[3:]:
-        result = pipeline.process(frame, budget)
+        result = pipeline.process(frame, budget, request)
     InstrumentFinder()(frames[-1].left, result.views["left"])  # for sessions without masks
 
 

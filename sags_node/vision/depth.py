@@ -24,9 +24,9 @@ class Measured(NamedTuple):
     depth: F32  # [H, W] m, 0 unknown
     confidence: F32  # [H, W] 0..1
     skipped: Mapping[str, str] = {}  # what was left out, and why
-    is_sound: bool = True  # False: what was matched is no depth
     hurried: bool = False  # there was no time
     is_new: bool = True  # False: it is an older frame's
+    found_out: bool = False  # what was matched before turns out to be no depth
 
     @classmethod
     def nothing(cls, shape: tuple[int, ...], why: str = "", hurried: bool = False) -> Self:
@@ -59,6 +59,8 @@ class DepthChoice:
             self._network = NetworkDepth(config, self.stereo, camera, baseline)
         self._matches = MatchWatch()
         self._unsound = ""  # why what was matched in this frame is no depth; empty: it is
+        self._was_sound = True  # what was matched last is depth
+        self._last: Measured | None = None  # of the last frame in which it was measured, or could not be
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -72,16 +74,43 @@ class DepthChoice:
         """One eye showed another moment than the other when they were matched last."""
         return self._matches.is_late
 
-    def takes_time(self, frame: StereoFrame) -> bool:
-        """Whether a frame's depth has to be computed."""
-        return frame.depth is None or self._network is not None
+    def __call__(
+        self,
+        frame: StereoFrame,
+        pair: RectifiedPair,
+        tissue: Bool,
+        still: bool = False,
+        has_time: bool = True,
+        no_stereo: str = "",
+    ) -> Measured:
+        """The depth of a frame where there is `tissue` [H, W].
 
-    def see(self, pair: RectifiedPair) -> None:
-        """Take every pair, also one whose depth is not asked for."""
+        Args:
+            still: nothing has moved: what was measured before holds.
+            has_time: to compute it; what the session gives takes none.
+            no_stereo: why the eyes are not to be matched; empty: they are.
+        """
         self._matches.see(pair.t_capture_ns, pyramids(pair)[0])
+        if still and self._last is not None and self._last.depth.any():
+            self.stereo.rows.stay()
+            return self._last.handed_on(tissue)
+        self._last = self._measured_now(frame, pair, tissue, has_time, no_stereo)
+        return self._last
 
-    def __call__(self, frame: StereoFrame, pair: RectifiedPair, tissue: Bool) -> Measured:
-        """The depth of a frame and the rectified pair seen last, where there is `tissue` [H, W]."""
+    def _measured_now(
+        self, frame: StereoFrame, pair: RectifiedPair, tissue: Bool, has_time: bool, no_stereo: str
+    ) -> Measured:
+        takes_time = frame.depth is None or self._network is not None
+        if takes_time and not has_time:
+            return Measured.nothing(tissue.shape, "no time", hurried=True)
+        was_sound, self._was_sound = self._was_sound, True
+        if no_stereo and frame.depth is None and pair.right is not None:
+            return Measured.nothing(tissue.shape, no_stereo)
+        measured = self._best(frame, pair, tissue)
+        self._was_sound = not self._unsound
+        return measured._replace(found_out=was_sound and not self._was_sound)
+
+    def _best(self, frame: StereoFrame, pair: RectifiedPair, tissue: Bool) -> Measured:
         self._unsound, skipped = "", {}
         found = None
         if self._network is not None:
@@ -97,7 +126,7 @@ class DepthChoice:
         if self._unsound:
             depth, confidence = np.zeros((2, *tissue.shape), np.float32)
             skipped["depth"] = self._unsound
-        return Measured(depth, confidence, skipped, is_sound=not self._unsound)
+        return Measured(depth, confidence, skipped)
 
     def _measured(self, frame: StereoFrame, pair: RectifiedPair, tissue: Bool) -> tuple[F32, F32]:
         """The session's own depth, fully trusted, or else stereo; all unknown for one camera alone."""

@@ -7,9 +7,12 @@ lost its input repeats the last one. Where both eyes take that way, neither tell
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from sags_node.types import U8, Finding, StereoFrame
+from sags_node.vision.judgement import Evidence, Judgement
 
 LONGEST_NS = 300_000_000  # what converts frame rates repeats a picture for 0.1 s at most (10 Hz given as 30)
 
@@ -32,8 +35,9 @@ class FreezeWatch:
         self._last: StereoFrame | None = None
         self._unchanged_ns = 0  # for so long, by the stamps
 
-    def __call__(self, frame: StereoFrame) -> str:
-        """Why a frame may not be taken in; empty: it may."""
+    def judge(self, evidence: Evidence, judged: Judgement) -> Judgement:
+        """A picture that came for too long is held."""
+        frame = evidence.frame
         last, self._last = self._last, frame
         is_live = frame.t_arrival_ns > 0
         if last is not None and is_live and _equal(frame.left, last.left) and _equal(frame.right, last.right):
@@ -41,7 +45,7 @@ class FreezeWatch:
         else:
             self._unchanged_ns = 0
         self.findings = (_FROZEN,) if self._unchanged_ns >= LONGEST_NS else ()
-        return self.findings[0].text if self.findings else ""
+        return replace(judged, hold=judged.hold or _FROZEN.text) if self.findings else judged
 
 
 def _equal(picture: U8 | None, other: U8 | None) -> bool:

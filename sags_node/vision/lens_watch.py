@@ -8,13 +8,15 @@ both eyes.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from sags_node.kernels.jit import kernel
-from sags_node.types import F32, I8, Bool, Finding, FrameResult, RectifiedPair
+from sags_node.types import F32, I8, Bool, Finding
 from sags_node.vision.clarity import LOST_CONTRAST, REMEMBERED_S, USUAL_DIFFERENCE
+from sags_node.vision.judgement import Evidence, Judgement
 from sags_node.vision.pyramid import BORDER, inner, pyramids
 from sags_node.vision.standing import Debounced
 
@@ -33,13 +35,6 @@ _TEXT = "drops or dirt on the {eye} lens hide some of the tissue, which is not l
 _LEFT, _RIGHT = (Finding(f"{eye}_eye_drops", _TEXT.format(eye=eye)) for eye in ("left", "right"))
 
 
-class OnLenses(NamedTuple):
-    """Square cells [rows, columns] of the left picture that an eye does not see; None: it sees all."""
-
-    left: Bool | None = None
-    right: Bool | None = None
-
-
 class LensWatch:
     """Compares the eyes of every pair."""
 
@@ -54,17 +49,16 @@ class LensWatch:
         """What is wrong with the lenses, and how to fix it. May be read from any thread."""
         return self._standing.findings
 
-    def __call__(self, pair: RectifiedPair, last: FrameResult, sound: bool = True) -> OnLenses:
-        """Take one frame.
-
-        Args:
-            last: the frame mapped last; its depth says where tissue is in the right picture.
-            sound: both eyes may be compared.
-        """
+    def judge(self, evidence: Evidence, judged: Judgement) -> Judgement:
+        """The depth of the frame mapped last says where tissue is in the right picture."""
+        pair, last = evidence.pair, evidence.last
+        if last is None or evidence.is_repeat:
+            return judged
         left, right = pyramids(pair)
-        if right is None or not sound:
+        sound = judged.learn and not (judged.hold or judged.no_stereo or evidence.eyes_are_late)
+        if right is None or not sound or judged.is_new_scene:
             self._standing.update(pair.t_capture_ns, [])
-            return OnLenses()
+            return judged
         height, width = inner(left.halves[0]).shape
         side = max(SMALLEST, round(width / CELLS))  # px of the first half
         rows, columns = height // side, width // side
@@ -85,14 +79,15 @@ class LensWatch:
         if abs(np.median(off[apart != 0])) > VEIL:
             self._usual = (self._usual + share * off).clip(-USUAL_DIFFERENCE, USUAL_DIFFERENCE)
             self._standing.update(pair.t_capture_ns, [])
-            return OnLenses()
+            return judged
         covered = np.zeros((2, rows, columns), np.bool_)
         counts = _judge(apart, last.observation.tissue, 2 * side, share, self._usual, self._hidden, covered)
         many = [count >= FEWEST for count in counts]
         self._standing.update(
             pair.t_capture_ns, [found for found, is_so in zip((_LEFT, _RIGHT), many, strict=True) if is_so]
         )
-        return OnLenses(*(mask if is_so else None for mask, is_so in zip(covered, many, strict=True)))
+        hidden = (mask if is_so else None for mask, is_so in zip(covered, many, strict=True))
+        return replace(judged, covered_left=next(hidden), covered_right=next(hidden))
 
 
 @kernel

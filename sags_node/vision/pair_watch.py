@@ -7,6 +7,7 @@ other one and with what it showed a moment ago: a scene that gets smooth or stan
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 from typing import NamedTuple
 
 import cv2
@@ -16,6 +17,7 @@ from sags_node.kernels.jit import kernel
 from sags_node.types import F32, I64, U8, Finding, RectifiedPair, StereoFrame
 from sags_node.vision.blocks import is_blocky
 from sags_node.vision.clarity import LENS, SMOKE, Clarity, mean_difference, structure
+from sags_node.vision.judgement import Evidence, Judgement
 from sags_node.vision.pyramid import pyramids
 from sags_node.vision.standing import Debounced
 
@@ -55,14 +57,6 @@ _COMPRESSED = Finding(
 )
 
 
-class Verdict(NamedTuple):
-    """What of one frame may be used."""
-
-    left: str = ""  # why its left picture may not; empty: it may
-    right: str = ""  # why there may be no stereo
-    learn: bool = True  # else what it shows may be followed, and not learnt
-
-
 class Small(NamedTuple):
     """One picture, shrunk."""
 
@@ -83,20 +77,21 @@ class PairWatch:
         """What is wrong with the eyes, and how to fix it. May be read from any thread."""
         return self._standing.findings
 
-    def __call__(self, frame: StereoFrame, pair: RectifiedPair) -> Verdict:
-        """Take one frame, raw and rectified."""
-        found = self._look(frame, pair)
+    def judge(self, evidence: Evidence, judged: Judgement) -> Judgement:
+        """Without its left picture a frame is held; without its right one nothing is matched."""
+        frame = evidence.frame
+        found = self._look(frame, evidence.pair)
         learn = not any(code.startswith("picture") for code, _ in found)
         if is_blocky(frame.left):  # learnt all the same: on D4D leaving it out cost more than it spared
             found = [*found, _COMPRESSED]
         self._standing.update(frame.t_capture_ns, found)
-        left = right = ""
+        hold, no_stereo = judged.hold, judged.no_stereo
         for code, text in found:
             if code.startswith("left") or code == _EXCHANGED.code:
-                left = left or text
+                hold = hold or text
             if not code.startswith("picture"):
-                right = right or text
-        return Verdict(left, right, learn)
+                no_stereo = no_stereo or text
+        return replace(judged, hold=hold, no_stereo=no_stereo, learn=judged.learn and learn)
 
     def _look(self, frame: StereoFrame, pair: RectifiedPair) -> list[Finding]:
         """What is wrong in one frame."""

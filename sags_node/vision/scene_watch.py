@@ -18,6 +18,7 @@ from sags_node.kernels.jit import kernel
 from sags_node.types import F32, U8, Bool, Finding, FrameResult, GrayPyramid, RectifiedPair
 from sags_node.vision.clarity import SMOKE
 from sags_node.vision.flow import OpticalFlow
+from sags_node.vision.judgement import Evidence, Judgement
 from sags_node.vision.landmarks import Landmarks, find_again, motion
 from sags_node.vision.palette import Palette
 from sags_node.vision.picture_fit import (
@@ -73,17 +74,6 @@ class Look(NamedTuple):
     clear: bool = True  # it is good in itself
 
 
-class Advice(NamedTuple):
-    """What to do with a frame."""
-
-    held: str = ""  # why it is not taken in; empty: it is
-    is_new: bool = False  # it shows another scene for good: begin a new model
-    learn: bool = True  # else it is only followed
-    covered: Bool | None = None  # [h, w] a small picture of what is not tissue now
-    gain: F32 | None = None  # [3] to be taken out of the pictures
-    guess: F32 | None = None  # [rows, columns, 2] px of square cells, where the motion search is to begin
-
-
 class SceneWatch:
     """Compares every picture with the frame mapped last."""
 
@@ -113,12 +103,11 @@ class SceneWatch:
         self._tissue = None
         self._gain = self._taken_out = np.ones(3, np.float32)
 
-    def __call__(self, pair: RectifiedPair, last: FrameResult, veiled: bool = False) -> Advice:
-        """Take one frame.
-
-        Args:
-            veiled: it is known to be blurred or veiled: colours tell nothing.
-        """
+    def judge(self, evidence: Evidence, judged: Judgement) -> Judgement:
+        """Where it is known that a frame is not to be learnt, its colours tell nothing."""
+        pair, last = evidence.pair, evidence.last
+        if last is None or judged.hold or evidence.is_repeat:
+            return judged
         now = pair.t_capture_ns
         step = max(1, pair.camera.width // WIDTH)
         if self._tissue is None or self._is_clear:
@@ -129,23 +118,26 @@ class SceneWatch:
         if seen.wrong is _UNKNOWN and self._moving:
             self._is_clear = False
             self._standing.update(now, [])
-            return Advice()
+            return judged
         if seen.wrong is not None:
             self._is_clear = False
             self._standing.update(now, [seen.wrong])
             lasts = self._lasts("scene", seen.wrong is _UNKNOWN and seen.clear, now)
-            return Advice(seen.wrong.text, is_new=lasts >= NEW_SCENE_NS)
+            is_new = lasts >= NEW_SCENE_NS
+            return replace(judged, hold="" if is_new else seen.wrong.text, is_new_scene=is_new)
         self._lasts("scene", False, now)
+        veiled = not judged.learn
         if veiled or (seen.veiled and self._lasts("veil", True, now) < LONGEST_NS["veil"]):
             self._is_clear = False
             self._standing.update(now, [] if veiled else [SMOKE])
-            return Advice(learn=False, guess=seen.guess)
+            return replace(judged, learn=False, guess=seen.guess)
         self._lasts("veil", False, now)
         cover = self._cover(seen, picture, now)
         self._is_clear = cover is None
         self._standing.update(now, [] if cover is None else [_COVERED])
         gain = self._exposure(seen.gain, now)
-        return Advice(learn=gain is None or seen.whole, covered=cover, gain=gain, guess=seen.guess)
+        learn = gain is None or seen.whole
+        return replace(judged, learn=learn, covered=cover, gain=gain, guess=seen.guess)
 
     def _cover(self, seen: Look, picture: U8, now: int) -> Bool | None:
         """[h, w] what lies over the tissue: what the model does not explain, and colours that are new. What

@@ -28,6 +28,7 @@ from engine_scenes import (
     with_filter,
     with_view_dependence,
 )
+from following import Following
 
 from sags_node.config.launch_file import load_launch
 from sags_node.doctor import examine
@@ -38,6 +39,7 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.mapping import mapper
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.refiner import CpuRefiner
+from sags_node.mapping.tissue_map import TissueMap
 from sags_node.types import Observation
 
 pytest.importorskip("gsplat", reason="the optional backend is not installed: pip install 'sags-node[gsplat]'")
@@ -124,16 +126,14 @@ def test_a_mapper_learns_the_same_with_it(monkeypatch: pytest.MonkeyPatch) -> No
     y, x = np.mgrid[:24, :48].astype(np.float32)
     learnt = []
     for backend in ("gsplat", "numba"):
-        learning = mapper.Mapper(CpuRefiner(partial(make_rasterizer, backend)), 60)
+        learning = Following(mapper.Mapper(CpuRefiner(partial(make_rasterizer, backend)), TissueMap(60)))
         for i in range(3):
             image = np.ascontiguousarray(pictures[:, i : i + 48])
             observation = Observation(
                 i, i * 33_000_000, camera(48, 24), image, (255 * image.mean(2)).astype(np.uint8),
                 np.ones((24, 48), np.bool_), 0.056 + 1e-4 * x + 1.3e-4 * y, np.ones((24, 48), np.float32),
             )  # fmt: skip
-            budget = StepBudget(1)
-            budget.start()
-            mapped = learning.update(observation, budget)
+            mapped = learning.take(observation, StepBudget(1))
         view = mapped.view
         learnt.append((mapped.snapshot.gaussians, view, float(np.square(view.rgb - image).mean())))
     (found, view, error), (expected, true_view, true_error) = learnt

@@ -148,8 +148,8 @@ def test_compiled_kernels_do_what_their_source_says(monkeypatch: pytest.MonkeyPa
         for frame in source:
             compare.compared.clear()
             pipeline.process(frame, budget)
-            pipeline.mapper.model.adam_m[3::40] = np.inf  # they are set right
-    model = pipeline.mapper.model
+            pipeline.map.model.adam_m[3::40] = np.inf  # they are set right
+    model = pipeline.map.model
     assert len(model.means) > 2 * PIECE  # several threads share them
     normals, lamps = np.full_like(model.means, 0.6), np.stack([np.eye(4)] * 2)
     lamps[1, :3, 3] = 0.01

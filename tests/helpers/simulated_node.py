@@ -34,6 +34,7 @@ from sags_node.messaging.freshness import MAX_CLOCK_AHEAD, STALE_AFTER, STALE_PE
 from sags_node.messaging.wire import decode
 from sags_node.node import health, latest, node, views
 from sags_node.node import operations as node_operations
+from sags_node.pipeline.pipeline import FrameRequest
 from sags_node.sources import live_pairs
 from sags_node.sources.sent import SentPictures
 from sags_node.types import FrameResult, StereoFrame
@@ -136,7 +137,7 @@ class Pipeline:
         self._run, self.rate = run, rate
         self._machine = run.world.random.choice((0.3, 0.8, 1.0, 2.0, 8.0))  # times the prices of the ladder
         self._resets = 0
-        self.anchors = SimpleNamespace(latency_s=0.0, remove=self._no_anchor)
+        self.anchors = SimpleNamespace(remove=self._no_anchor)
         self.warnings: dict[str, Any] = {}
         self.newest: FrameResult | None = None
 
@@ -152,12 +153,12 @@ class Pipeline:
     def reset(self) -> None:
         self._resets += 1
 
-    def process(self, frame: StereoFrame, budget: TimeBudget, waited: float = 0.0) -> FrameResult:
+    def process(self, frame: StereoFrame, budget: TimeBudget, request: FrameRequest) -> FrameResult:
         world, chance = self._run.world, self._run.world.random
         self._run.taken += 1
-        budget.start(waited)
-        gaussians = USED * budget.rung.gaussians
-        world.sleep(1e-3 * self._machine * price(budget.rung, gaussians, FULL) * chance.uniform(0.8, 1.2))
+        rung = budget.start(request.waited).rung
+        gaussians = USED * rung.gaussians
+        world.sleep(1e-3 * self._machine * price(rung, gaussians, FULL) * chance.uniform(0.8, 1.2))
         while budget.more():
             world.sleep(1e-3 * self._machine * 2.0)
         if chance.random() < 0.01:

@@ -231,9 +231,8 @@ def test_who_wants_it_learns_also_where_an_anchor_is_expected() -> None:
     asked, silent, soon = (anchors.add_pixel(u, 48, observation, snapshot, view) for u in (40, 60, 80))
     anchors.look_ahead(asked, 0.5)  # far beyond 0.1 s
     anchors.look_ahead(soon, None)
-    anchors.latency_s = 0.025
     anchors.update(observation, snapshot, view)
-    states = anchors.ahead(anchors.at(0), snapshot)
+    states = anchors.ahead(anchors.at(0), snapshot, 0.025)
     assert states.ahead is not None and list(states.ids) == [asked, silent, soon]
     np.testing.assert_allclose(states.ahead.seconds, [0.1, 0, 0.025], atol=1e-6)
     np.testing.assert_allclose((states.ahead.points - states.points)[:, 0], [2e-3, 0, 5e-4], atol=1e-6)
@@ -241,7 +240,7 @@ def test_who_wants_it_learns_also_where_an_anchor_is_expected() -> None:
     np.testing.assert_allclose(
         (states.ahead.pixels - states.pixels)[:, 0], [2e-3 * px, 0, 5e-4 * px], atol=1e-2
     )
-    assert anchors.ahead(anchors.at(0), replace(snapshot, forecast=None)).ahead is None
+    assert anchors.ahead(anchors.at(0), replace(snapshot, forecast=None), 0.025).ahead is None
 
 
 def test_ids_are_never_used_again_and_their_number_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -48,18 +48,18 @@ class Machine:
     def frame(self, waited: float = 0.0, spike: str = "") -> tuple[int, float]:
         """One frame, in the named part of which another process takes 80 ms: its steps and its time, s."""
         started, steps = self.now, 0
-        self.budget.start(waited)
+        plan = self.budget.start(waited)
         self.now += self.before + 0.080 * (spike == "before")
         if self.depth:
-            self.matched.append(self.budget.affords_depth())
+            self.matched.append(plan.depth)
             self.now += self.depth * self.matched[-1]
         while self.budget.more():
             steps += 1
             if steps == 1:
-                self.shares.append(self.budget.first_share())
+                self.shares.append(plan.first_share)
             self.now += self.step + 0.080 * (spike == "step" and steps == 2)
         self.now += self.after + 0.080 * (spike == "after")
-        self.budget.finish(8000)
+        self.budget.finish(8000, matched=bool(self.depth) and plan.depth)
         return steps, self.now - started
 
     def play(self, frames: int, spike_at: int = -1, spike: str = "") -> list[tuple[int, int, float]]:
@@ -156,8 +156,7 @@ def test_a_rung_with_steps_on_part_of_the_picture_has_one_on_all_of_it_now_and_t
     steps = StepBudget(1, Rung(10_000, step=0.6))
     shares = []
     for _ in range(3 * WHOLE_EVERY):
-        steps.start()
-        shares.append(steps.first_share())
+        shares.append(steps.start().first_share)
     assert shares.count(1.0) == 3
 
 

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from following import Following
 
 pytest.importorskip("triton", reason="Triton comes with torch's CUDA builds, or by `pip install triton`")
 
@@ -30,6 +31,7 @@ from sags_node.mapping.fallback_refiner import LOWERED, FallbackRefiner
 from sags_node.mapping.mapper import Mapper
 from sags_node.mapping.optimiser import LearningRates
 from sags_node.mapping.refiner import CpuRefiner, Refiner
+from sags_node.mapping.tissue_map import TissueMap
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.rig import rectified_rig
 from sags_node.types import F32, Camera, Observation, RenderedView, Snapshot, StereoFrame
@@ -83,22 +85,19 @@ class Played:
 
     refiner: Refiner
     mapper: Mapper
+    frames: Following
 
     @classmethod
     def on(cls, refiner: Refiner, capacity: int = CAPACITY) -> Played:
-        return cls(refiner, Mapper(refiner, capacity))
+        mapper = Mapper(refiner, TissueMap(capacity))
+        return cls(refiner, mapper, Following(mapper))
 
     def take(self, observation: Observation, steps: int = 1, still: int = 0) -> tuple[Snapshot, RenderedView]:
-        mapped = self.mapper.update(observation, started(StepBudget(steps)), still)
+        mapped = self.frames.take(observation, StepBudget(steps), still)
         return mapped.snapshot, mapped.view
 
     def row(self, name: str) -> np.ndarray:
         return np.array(getattr(self.mapper.model, name))
-
-
-def started(budget: Any) -> Any:
-    budget.start()
-    return budget
 
 
 def on_cpu(capacity: int = CAPACITY) -> Played:
@@ -131,7 +130,7 @@ def assert_same_rows(a: Played, b: Played) -> None:
             expected, found = expected[matters], found[matters]
         within = 1e-3 if "adam" in name else 1e-5
         np.testing.assert_allclose(found, expected, rtol=2e-4, atol=within, err_msg=name)
-    nodes_a, nodes_b = (p.mapper._deformation.nodes for p in (a, b) if p.mapper._deformation)
+    nodes_a, nodes_b = (p.mapper.map.deformation.nodes for p in (a, b) if p.mapper.map.deformation)
     np.testing.assert_allclose(nodes_b, nodes_a, atol=1e-7)
 
 
@@ -147,7 +146,7 @@ def test_a_hurried_step_is_the_cpus(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mapper, "FIRST_STEPS", 0)
     both = on_cpu(), on_device()
     for played in both:
-        played.mapper.update(frame(0), StepBudget(0))
+        played.take(frame(0), 0)
         played.refiner.draw()
         played.mapper.model.contribution[:] = 7.0
         colors = played.row("colors").copy()
@@ -234,9 +233,9 @@ def test_a_new_model_is_begun_on_the_device() -> None:
     played = on_device()
     first, _ = played.take(frame(0))
     negative = replace(frame(1), image=1 - frame(1, seed=5).image)
-    played.mapper.restart()
+    played.mapper.map.restart()
     snapshot, view = played.take(negative)
-    assert played.mapper.restarts == 1
+    assert played.mapper.map.restarts == 1
     assert snapshot.gaussians.ids.min() > first.gaussians.ids.max()
     assert psnr(view, negative) > 18
     snapshot, view = played.take(replace(negative, frame_id=2, t_capture_ns=66_000_000))
@@ -248,7 +247,7 @@ def test_damage_is_healed(where: str) -> None:
     """On its way through the device too; nodes are damaged for good on neither, but they move nothing."""
     played = on_device()
     played.take(frame(0))
-    deformation = played.mapper._deformation
+    deformation = played.mapper.map.deformation
     assert deformation is not None
     count = played.mapper.model.count
     if where == "nodes":
@@ -286,13 +285,13 @@ def test_tissue_that_comes_into_view_gets_nodes_on_the_device_too() -> None:
             observation.tissue[hidden] = False
             observation.depth[hidden] = 0
             played.take(observation, steps=2)
-            assert played.mapper._deformation is not None
-            counts.append(len(played.mapper._deformation.nodes))
+            assert played.mapper.map.deformation is not None
+            counts.append(len(played.mapper.map.deformation.nodes))
     assert counts[1] > counts[0] and counts[2:] == counts[:2]
     assert played.mapper.model.node_index.max() >= counts[0]
     assert isinstance(played.refiner, CudaRefiner)
     on_gpu = played.refiner._nodes.places.cpu().numpy()
-    np.testing.assert_array_equal(on_gpu, played.mapper._deformation.nodes)
+    np.testing.assert_array_equal(on_gpu, played.mapper.map.deformation.nodes)
 
 
 # ---- when the device fails ---------------------------------------------------------------------------------

@@ -113,7 +113,7 @@ def test_in_a_hurry_the_first_step_leaves_alone_what_fits_best() -> None:
     with session.source as source:
         first, second, third = (frame for frame, _ in zip(source, range(3), strict=False))
     pipeline.process(first, budget)
-    model = pipeline.mapper.model
+    model = pipeline.map.model
 
     def rows() -> dict[int, tuple[F32, float]]:
         found = zip(model.ids, model.colors.copy(), model.contribution, strict=True)

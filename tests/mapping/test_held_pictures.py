@@ -82,7 +82,7 @@ def psnr(result: FrameResult, clean: FrameResult) -> float:
 @pytest.fixture(scope="module")
 def clean(session: Session, frames: list[StereoFrame]) -> list[FrameResult]:
     results, codes, pipeline = play(session, frames)
-    assert set().union(*codes) == set() and pipeline.mapper.restarts == 0
+    assert set().union(*codes) == set() and pipeline.map.restarts == 0
     assert not any(result.held or result.skipped for result in results)
     return results
 
@@ -103,7 +103,7 @@ def test_a_fault_is_said_and_leaves_no_trace(
     during = range(FIRST, FIRST + COUNT)
     given = [spoil(frame, i) if i in during else frame for i, frame in enumerate(frames)]
     results, codes, pipeline = play(session, given)
-    assert pipeline.mapper.restarts == 0
+    assert pipeline.map.restarts == 0
     if code:
         assert any(code in codes[i] for i in range(FIRST, FIRST + WITHIN))
     assert not set().union(*codes[:FIRST], *codes[during.stop + WITHIN :])
@@ -138,7 +138,7 @@ def test_a_live_feed_that_freezes_is_held_and_said(
     assert all(not tells_of(results[i], topic) for i in held for topic in OF_THE_MODEL)
     doubts = [np.median(result.snapshot.gaussians.depth_errors) for result in results]
     assert all(np.diff(doubts[held[0] - 1 : held[-1] + 1]) > 0)
-    assert pipeline.mapper.restarts == 0
+    assert pipeline.map.restarts == 0
     kept = np.isin(clean[FIRST - 1].snapshot.gaussians.ids, results[-1].snapshot.gaussians.ids)
     assert kept.mean() > 0.8
     assert psnr(results[-1], clean[-1]) > psnr(clean[-1], clean[-1]) - 1.0
@@ -169,7 +169,7 @@ def test_lost_frames_are_no_fault_of_the_others(
 ) -> None:
     lost = np.random.default_rng(0).permutation(range(1, len(frames) - 1))[: len(frames) // 5]
     results, codes, pipeline = play(session, [f for i, f in enumerate(frames) if i not in lost])
-    assert set().union(*codes) == set() and pipeline.mapper.restarts == 0
+    assert set().union(*codes) == set() and pipeline.map.restarts == 0
     stamps = [frame.t_capture_ns for i, frame in enumerate(frames) if i not in lost]
     assert [result.views["left"].t_capture_ns for result in results] == stamps
     assert not any(result.held for result in results)
@@ -224,7 +224,7 @@ def test_blood_is_seen_where_the_scene_has_its_colour_already(
     _, codes, pipeline = play(session, given)
     assert not set().union(*codes[:FIRST])
     assert any("picture_covered" in code for code in codes[FIRST : FIRST + WITHIN])
-    assert pipeline.mapper.restarts == 0
+    assert pipeline.map.restarts == 0
 
 
 @pytest.mark.fault("picture: one eye is late (simulated)")

@@ -13,7 +13,7 @@ from sags_node.engine.rasterizer.views import to_view
 from sags_node.geometry import invert, transform
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.camera_pose import exponential
-from sags_node.mapping.camera_tracker import DISAGREEING, LOOK_NS, TRIAL
+from sags_node.mapping.camera_tracker import DISAGREEING, LOOK_NS, TRIAL, CameraTracker
 from sags_node.model.light import carried
 from sags_node.phantom import PhantomScene, write_session
 from sags_node.phantom.scene import Phantom
@@ -142,18 +142,18 @@ def test_a_wrong_place_is_found_out_and_what_was_learnt_there_undone(
     ours = scope(folder, phantom, "estimate")
     frames = swaying
     last = [ours.take(frame) for frame in frames][-1]
-    tracker, mapper = ours.pipeline._tracker, ours.pipeline.mapper
-    assert tracker is not None
-    right, ids = mapper.learnt(), mapper.model.ids.copy()
+    tracker, tissue = ours.pipeline._camera, ours.pipeline.map
+    assert isinstance(tracker, CameraTracker) and tissue.deformation is not None
+    right, ids = tissue.learnt(), tissue.model.ids.copy()
     tracker._found_ns, tracker._before = last.pair.t_capture_ns, right
     wrong = exponential(np.array([0.012, -0.01, 0.004, 0.1, 0.0, 0.1]))  # 16 mm, 8 degrees
-    assert mapper._deformation is not None
-    for places in (mapper.model.means, mapper._deformation.nodes, mapper._deformation._rest):
+    for places in (tissue.model.means, tissue.deformation.nodes, tissue.deformation._rest):
         places[:] = transform(wrong, places)
     tracker._pose = wrong @ tracker._pose
-    assert mapper.last is not None
-    camera = replace(mapper.last.view.camera, T_world_cam=tracker._pose)
-    mapper.start_from(replace(mapper.last, view=replace(mapper.last.view, camera=camera)))
+    before = ours.pipeline._last
+    assert before is not None
+    camera = replace(before.view.camera, T_world_cam=tracker._pose)
+    ours.pipeline._last = replace(before, view=replace(before.view, camera=camera))
 
     looks = DISAGREEING * (LOOK_NS // PERIOD_NS + 1) + 1
     for k in range(looks):
@@ -162,7 +162,7 @@ def test_a_wrong_place_is_found_out_and_what_was_learnt_there_undone(
             break
         assert error(result.pair.camera.T_world_cam, frames[k % 12].T_world_cam)[0] > 5e-3
     assert result.held and "elsewhere" in result.skipped["pose"]
-    assert mapper.model is right.model and np.array_equal(mapper.model.ids, ids)
+    assert tissue.model is right.model and np.array_equal(tissue.model.ids, ids)
     results = [ours.take(frames[(k + i) % 12]) for i in range(TRIAL + 3)]
     assert not results[-1].held
     metres, degrees = error(results[-1].pair.camera.T_world_cam, frames[(k + TRIAL + 2) % 12].T_world_cam)
@@ -186,7 +186,7 @@ def test_the_light_moves_with_the_scope(folder: Path) -> None:
         pair = pipeline.rectifier(there)
         tissue = cv2.erode(pipeline.tissue(there, pair, None).view(np.uint8), np.ones((9, 9))) > 0
         psnr = []
-        for gaussians in (pipeline.mapper.model.gaussians(), pipeline.mapper.relight(pair.camera)):
+        for gaussians in (pipeline.map.model.gaussians(), pipeline.map.relight(pair.camera)):
             view = to_view(pipeline._refiner.show(gaussians, pair.camera), pair.camera, 0, 0)
             wrong = (view.rgb - pair.left / np.float32(255))[tissue & (view.alpha > 0.9)]
             psnr.append(-10 * np.log10(np.mean(np.square(wrong))))

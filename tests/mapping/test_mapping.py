@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sags_node.mapping import densify, initialise
-from sags_node.mapping.motion import scene_flow, track
+from sags_node.mapping.motion import found, scene_flow
 from sags_node.model.gaussians import GaussianModel
 from sags_node.types import Camera, Observation, RenderedView
 
@@ -44,7 +44,7 @@ def grid_points(depth: float = DEPTH) -> np.ndarray:
 def flow_of(
     means: np.ndarray, before: RenderedView, tissue: np.ndarray, flow: np.ndarray, after: Observation
 ) -> tuple[np.ndarray, np.ndarray]:
-    return scene_flow(means, track(means, before, tissue, flow, after.tissue), after, 0.4)
+    return scene_flow(means, found(means, before, tissue, flow, after.tissue), after, 0.4)
 
 
 def test_scene_flow_of_a_sideways_shift() -> None:

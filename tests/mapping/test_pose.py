@@ -304,7 +304,7 @@ def test_how_the_tissue_was_seen_first_says_where_the_camera_is_though_places_at
     session, frames = opened(still, "session")
     pipeline, results = play(session, frames[:7])
     first, last = results[0].observation, results[-1].observation
-    views = FirstViews(pipeline.mapper)
+    views = FirstViews(pipeline.map)
     assert views.pose(first, first.camera.T_world_cam) is None
     views.offer(first, first.camera.T_world_cam)
     true = last.camera.T_world_cam
@@ -319,7 +319,7 @@ def picture_kept(still: Path) -> tuple[Observation, FirstViews]:
     """A frame whose picture was kept as the first."""
     session, frames = opened(still, "session")
     pipeline, results = play(session, frames[:3])
-    seen, views = results[-1].observation, FirstViews(pipeline.mapper)
+    seen, views = results[-1].observation, FirstViews(pipeline.map)
     views.offer(seen, seen.camera.T_world_cam)
     return seen, views
 
@@ -348,7 +348,7 @@ def test_a_picture_of_other_tissue_tells_no_pose(still: Path) -> None:
 def test_places_at_rest_that_lost_their_shape_do_not_move_the_camera(still: Path) -> None:
     session, frames = opened(still)
     pipeline, results = play(session, frames[:7])
-    deformation = pipeline.mapper._deformation
+    deformation = pipeline.map.deformation
     assert deformation is not None
     rest = deformation._rest
     rest += np.float32(0.02) * (rest - rest.mean(0))  # as a camera sees it that is 1.5 mm nearer

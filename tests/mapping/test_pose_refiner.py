@@ -14,8 +14,10 @@ from sags_node.config.schema import LaunchConfig, PhantomSource, VisionConfig
 from sags_node.geometry import invert
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.camera_pose import exponential, towards
+from sags_node.mapping.motion import Tracks
 from sags_node.mapping.pose_refiner import SECONDS, PoseRefiner
 from sags_node.mapping.resting_tissue import TissueFit
+from sags_node.mapping.tissue_map import TissueMap
 from sags_node.phantom.scene import Phantom
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.types import F64, Camera, StereoFrame
@@ -31,16 +33,18 @@ def camera(T: F64) -> Camera:
 
 def refined(monkeypatch: pytest.MonkeyPatch, given: list[F64], seen: list[F64 | None]) -> list[F64]:
     """What a refiner makes of given poses, where the picture says others, or nothing."""
-    mapper: Any = SimpleNamespace(model=SimpleNamespace(count=1), restarts=0)
-    refiner = PoseRefiner(mapper)
+    refiner = PoseRefiner(TissueMap(1))
+    last: Any = SimpleNamespace()
+    tracks = Tracks(np.zeros((1, 2), np.float32), 1 / RATE)
     poses = []
     for number, (T, says) in enumerate(zip(given, seen, strict=True)):
         fit = "hardly any tissue in view" if says is None else TissueFit(says, says)
-        monkeypatch.setattr(refiner._tissue, "fit", lambda observation, start, fit=fit: fit)
+        monkeypatch.setattr(refiner._tissue, "fit", lambda observation, last, tracks, start, fit=fit: fit)
         guess = refiner.guess(T)
         assert guess is not None
         observation: Any = SimpleNamespace(t_capture_ns=round(number / RATE * 1e9), camera=camera(guess))
-        assert refiner.track(observation) and bool(refiner.unsure) == (says is None and number > 0)
+        assert refiner.locate(observation, last, tracks) is tracks
+        assert bool(refiner.unsure) == (says is None and number > 0)
         poses.append(refiner.pose)
     return poses
 

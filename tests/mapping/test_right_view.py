@@ -15,7 +15,7 @@ from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.mapper import Mapped
 from sags_node.mapping.right_eye import right_eye_mask
 from sags_node.mapping.right_view import FADING, RightView
-from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.pipeline import FrameRequest, Pipeline
 from sags_node.pipeline.session import open_session
 from sags_node.types import F32, Bool, Camera, FrameResult, Gaussians
 
@@ -70,12 +70,12 @@ def test_it_is_drawn_while_somebody_looks_and_changes_nothing_else() -> None:
     looks = [False] * 4 + [True] * 4 + [False] * 2 + [True] * 2
     session = open_session(SESSION, ["source.pace:=step", f"source.frames:={len(looks)}", *FEW])
     watched, alone = (Pipeline(session.config, session.rig) for _ in range(2))
-    came = 0
+    came, looked = 0, False
     with session.source as source:
         for frame, look in zip(source, looks, strict=True):
-            first = look and not watched.draws_right
-            watched.draws_right = look
-            result, other = (one.process(frame, StepBudget(1)) for one in (watched, alone))
+            first, looked = look and not looked, look
+            result = watched.process(frame, StepBudget(1), FrameRequest(right=look))
+            other = alone.process(frame, StepBudget(1))
             assert np.array_equal(result.views["left"].rgb, other.views["left"].rgb)
             assert ("right" in result.views) == look == (result.snapshot.right_colors is not None)
             assert "right" not in other.views
@@ -94,8 +94,10 @@ def test_who_comes_while_the_input_is_frozen_sees_something() -> None:
     for frame in frames:
         pipeline.process(frame, StepBudget(1))
     assert "frame" in pipeline.process(replace(frames[-1], frame_id=7), StepBudget(1)).skipped
-    pipeline.draws_right = True
-    came, after = (pipeline.process(replace(frames[-1], frame_id=n), StepBudget(1)) for n in (8, 9))
+    came, after = (
+        pipeline.process(replace(frames[-1], frame_id=n), StepBudget(1), FrameRequest(right=True))
+        for n in (8, 9)
+    )
     assert "right" in came.views
     assert "frame" in after.skipped and after.views["right"].frame_id == 9
     assert np.array_equal(after.views["right"].rgb, came.views["right"].rgb)
@@ -151,7 +153,7 @@ def test_what_the_right_eye_sees_more_is_learnt_where_it_is_tissue_for_certain(
 ) -> None:
     """A right picture that is brighter by 0.2 everywhere: Gaussians take over half of what lacks, each from
     every other frame. What is hidden from the right eye learns nothing."""
-    model, baseline = played[0].mapper.model, scene.result.pair.baseline
+    model, baseline = played[0].map.model, scene.result.pair.baseline
     tissue = scene.result.observation.tissue.copy()
     tissue[:100] = False
     view = RightView()
@@ -177,7 +179,7 @@ def test_what_the_right_eye_sees_more_is_learnt_where_it_is_tissue_for_certain(
 def test_what_was_learnt_grows_old_while_nobody_looks(played: tuple[Pipeline, list[FrameResult]]) -> None:
     """As it does where the eye sees nothing: who looks now and then keeps most, who comes after ten seconds
     begins anew."""
-    model, view = played[0].mapper.model, RightView()
+    model, view = played[0].map.model, RightView()
     model.right_colors[:] = 0.2
     view.wake(model)
     assert (model.right_colors == np.float32(0.2)).all()
@@ -194,7 +196,7 @@ def test_what_is_not_seen_again_is_gone_after_two_seconds(
     played: tuple[Pipeline, list[FrameResult]], scene: Scene
 ) -> None:
     """While the right eye is bad nothing is learnt from it, and what it saw before is less and less shown."""
-    model, view = played[0].mapper.model, RightView()
+    model, view = played[0].map.model, RightView()
     drawn = view.draw(scene.mapped(), scene.result.observation, scene.result.pair.left, scene.show, False)
     right = scene.result.pair.right
     assert right is not None

@@ -16,12 +16,13 @@ from places import SESSION
 from sags_node.config.launch_file import load_launch
 from sags_node.engine.rasterizer.rasterize import make_rasterizer, to_view
 from sags_node.evaluation.metrics import psnr
-from sags_node.mapping import mapper
-from sags_node.mapping.budget import StepBudget
+from sags_node.mapping import motion
+from sags_node.mapping.budget import FramePlan, StepBudget
 from sags_node.mapping.densify import FRONT_FRAMES
 from sags_node.mapping.devices import ALL_SKIPS, Skips
 from sags_node.mapping.mapper import SETTLED, SETTLED_EVERY, TORN, Mapper
 from sags_node.mapping.refiner import CpuRefiner
+from sags_node.mapping.tissue_map import TissueMap
 from sags_node.messaging.content import tells_of
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import Session, open_session
@@ -226,7 +227,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
     class Flow(OpticalFlow):
         """That of the mapper; the watches have their own, of smaller pictures."""
 
-    monkeypatch.setattr(mapper, "OpticalFlow", Flow)
+    monkeypatch.setattr(motion, "OpticalFlow", Flow)
     count(StereoDepth, "depth")
     count(Flow, "flow")
     return counts
@@ -266,8 +267,9 @@ class Hurried(StepBudget):
 
     hurry = False
 
-    def affords_depth(self) -> bool:
-        return not self.hurry
+    def start(self, waited: float = 0.0) -> FramePlan:
+        self.plan = replace(super().start(waited), depth=not self.hurry)
+        return self.plan
 
 
 def test_a_rest_makes_up_for_the_depth_that_there_was_no_time_for(
@@ -297,7 +299,7 @@ def test_one_wrong_depth_counts_once_while_nothing_moves(frames: list[StereoFram
     play = Player(opened())
     for frame in frames[:5]:
         depth = play(frame).observation.depth
-    model = play.pipeline.mapper.model
+    model = play.pipeline.map.model
     assert not model.in_front.any()
     wrong = depth.copy()
     wrong[80:160, 100:200] *= 1.2
@@ -316,13 +318,13 @@ def test_a_depth_measured_in_a_still_frame_counts_once_where_holes_are_filled_to
     """A model that is damaged while nothing moves is fixed in that frame, and its depth looked at twice."""
     camera, cells = camera_in_front(160, 128, 200.0), 16
     observation, _, _ = flat_scene(camera, np.zeros((0, 3), np.float32), np.zeros((128, 160), np.uint8), 0.08)
-    model_of = Mapper(CpuRefiner(partial(make_rasterizer, "numba")), 2000)
-    model_of.update(observation, StepBudget(1))
+    model_of = Mapper(CpuRefiner(partial(make_rasterizer, "numba")), TissueMap(2000))
+    model_of.update(observation, None, StepBudget(1))
     wrong = observation.depth.copy()
     wrong[:, : camera.width // 2] *= 1.2
     model = model_of.model
     model.means[: model.count // cells] = np.nan
-    model_of.update(replace(observation, frame_id=1, depth=wrong), StepBudget(1), still=1)
+    model_of.update(replace(observation, frame_id=1, depth=wrong), None, StepBudget(1), still=1)
     assert np.isfinite(model.means).all() and set(model.in_front.tolist()) == {0, 1}
 
 
@@ -357,7 +359,7 @@ def test_motion_is_followed_at_once_after_a_model_was_begun_while_nothing_moved(
 ) -> None:
     play = Player(opened())
     play(frames[0])
-    play.pipeline.mapper.restart()
+    play.pipeline.map.restart()
     play.again(frames[0])
     play(frames[3])
     assert calls["flow"] == 1

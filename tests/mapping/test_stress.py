@@ -178,7 +178,7 @@ def test_damage_in_the_model_heals_within_three_frames(
     pipeline = Pipeline(session.config, session.rig)
     play(pipeline, shown[:3])
     for every, after in ((100, 3), (1, 6)):
-        owner = pipeline.mapper._deformation if array in NODE_ARRAYS else pipeline.mapper.model
+        owner = pipeline.map.deformation if array in NODE_ARRAYS else pipeline.map.model
         rows = getattr(owner, array)[::every]
         rows[:] = np.resize(NOT_NUMBERS, len(rows)).reshape(-1, *[1] * (rows.ndim - 1))
         healed = play(pipeline, shown[after : after + 3])[-1]
@@ -219,7 +219,7 @@ def test_damage_in_a_session_s_own_depth_is_survived_and_left_behind(
     after = play(pipeline, measured_frames[5:])[-1]
     assert min(psnr(result) for result in during) > undamaged - 3.0
     assert psnr(after) > undamaged - 1.0
-    assert pipeline.mapper.restarts == 0
+    assert pipeline.map.restarts == 0
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e30])
@@ -272,7 +272,7 @@ def test_hours_in_small(session: Session, frames: list[StereoFrame]) -> None:
         memory.append(resident_mb())
     assert qualities[-1] > qualities[1] - 0.5, qualities
     assert memory[-1] - memory[3] < 20, memory
-    assert pipeline.mapper.restarts == 0
+    assert pipeline.map.restarts == 0
 
 
 @pytest.mark.parametrize(("width", "height"), [(97, 71), (33, 41), (319, 255)])

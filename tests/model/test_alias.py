@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from engine_scenes import DERIVATIVES, camera, draw_and_differentiate, random_gaussians, relative_error
+from following import Following
 
 from benchmarks.__main__ import main
 from benchmarks.quality.alias import VARIANTS, Settings, Trained, train
@@ -23,6 +24,7 @@ from sags_node.geometry import project
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.mapper import Mapped, Mapper
 from sags_node.mapping.refiner import CpuRefiner
+from sags_node.mapping.tissue_map import TissueMap
 from sags_node.model.alias_free import FILTER_VARIANCE, smoothing_variances
 from sags_node.model.gaussians import GaussianModel
 from sags_node.model.ply import write_ply
@@ -245,9 +247,10 @@ def test_nothing_seen_is_nothing_filtered() -> None:
 def mapped(smoothing: bool) -> tuple[GaussianModel, Mapped, Observation]:
     """A small model after two frames, and what was published of it."""
     observation = flat_scene(texture())
-    mapper = Mapper(CpuRefiner(partial(make_rasterizer, "numba")), 3000, smoothing)
-    mapper.update(observation, StepBudget(1))
-    return mapper.model, mapper.update(observation, StepBudget(1)), observation
+    mapper = Mapper(CpuRefiner(partial(make_rasterizer, "numba")), TissueMap(3000), smoothing)
+    frames = Following(mapper)
+    frames.take(observation, StepBudget(1))
+    return mapper.model, frames.take(observation, StepBudget(1)), observation
 
 
 def test_mapper_filters_and_publishes_what_it_draws() -> None:
@@ -271,8 +274,8 @@ def test_first_scales_are_as_drawn_without_a_filter() -> None:
 def test_the_filter_stays_as_narrow_as_the_nearest_look_was() -> None:
     """From farther away nothing is forgotten of what was seen from near by."""
     observation = flat_scene(texture())
-    mapper = Mapper(CpuRefiner(partial(make_rasterizer, "numba")), 3000)
-    mapper.update(observation, StepBudget(0))
+    mapper = Mapper(CpuRefiner(partial(make_rasterizer, "numba")), TissueMap(3000))
+    mapper.update(observation, None, StepBudget(0))
     before = mapper.model.smoothing.copy()
     far = dataclasses.replace(
         observation,
@@ -280,10 +283,10 @@ def test_the_filter_stays_as_narrow_as_the_nearest_look_was() -> None:
         depth=observation.depth * 2,
         tissue=np.zeros((SIDE, SIDE), bool),
     )
-    mapper.update(far, StepBudget(0))
+    mapper.update(far, None, StepBudget(0))
     np.testing.assert_array_equal(mapper.model.smoothing, before)
     near = dataclasses.replace(far, camera=moved(observation.camera, np.array([0, 0, 0.04])))
-    mapper.update(near, StepBudget(0))
+    mapper.update(near, None, StepBudget(0))
     assert (mapper.model.smoothing <= before).all()
     assert mapper.model.smoothing.min() == pytest.approx(before.min() / 4, rel=0.1)
 
@@ -291,13 +294,13 @@ def test_the_filter_stays_as_narrow_as_the_nearest_look_was() -> None:
 def test_what_the_camera_does_not_see_keeps_its_filter() -> None:
     """From near by half of the tissue is out of view; from elsewhere all of it."""
     observation = flat_scene(texture())
-    mapper = Mapper(CpuRefiner(partial(make_rasterizer, "numba")), 3000)
-    mapper.update(observation, StepBudget(0))
+    mapper = Mapper(CpuRefiner(partial(make_rasterizer, "numba")), TissueMap(3000))
+    mapper.update(observation, None, StepBudget(0))
     before, means = mapper.model.smoothing.copy(), mapper.model.means.copy()
     away = dataclasses.replace(observation, tissue=np.zeros((SIDE, SIDE), bool))
     near = moved(observation.camera, np.array([0, 0, 0.06]))
     for seen_from in (moved(observation.camera, np.array([1.0, 0, 0])), near):
-        mapper.update(dataclasses.replace(away, camera=seen_from), StepBudget(0))
+        mapper.update(dataclasses.replace(away, camera=seen_from), None, StepBudget(0))
         np.testing.assert_array_equal(mapper.model.means, means)
         pixels, _ = project(seen_from, means)
         outside = (np.abs(pixels - SIDE / 2) > 0.7 * SIDE).any(1)  # farther than the margin

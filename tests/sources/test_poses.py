@@ -185,7 +185,7 @@ def test_a_frame_without_a_pose_is_held_and_said(tmp_path: Path, monkeypatch: py
         held.append(bool(pipeline.process(frame, StepBudget(1)).held))
         warned.append("pose_missing" in by_code(pipeline.warnings))
     assert held == warned == [code is not None for code in codes]
-    assert pipeline.mapper.restarts == 0
+    assert pipeline.map.restarts == 0
 
 
 def test_the_offset_is_to_the_stamp_before_its_latency_is_taken_off(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from watching import judged
 
 from sags_node.types import U8, StereoFrame
 from sags_node.vision.freeze_watch import FreezeWatch
@@ -34,7 +35,7 @@ def feed(rate: float = 30.0, eyes: int = 2, start: int = 0) -> Iterator[StereoFr
 
 def told(watch: FreezeWatch, frame: StereoFrame) -> bool:
     """Whether it is held, which goes with the warning."""
-    why = watch(frame)
+    why = judged(watch, frame).hold
     assert [finding.text for finding in watch.findings] == [why] * bool(why)
     assert all(finding.code == "picture_frozen" for finding in watch.findings)
     return bool(why)

@@ -55,7 +55,7 @@ def _play(
         given = spoil(frame) if FIRST <= number < FIRST + COUNT else frame
         results.append(pipeline.process(given, StepBudget(1)))
         codes.append(set(by_code(pipeline.warnings)))
-    assert pipeline.mapper.restarts == 0
+    assert pipeline.map.restarts == 0
     return results, codes
 
 

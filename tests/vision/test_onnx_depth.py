@@ -30,7 +30,7 @@ from sags_node.vision.onnx_network import DepthNetwork
 from sags_node.vision.onnx_session import DepthNetworkError
 from sags_node.vision.pair_watch import PairWatch, Verdict
 from sags_node.vision.rectify import Rectifier
-from sags_node.vision.scene_watch import Advice, SceneWatch
+from sags_node.vision.scene_watch import SceneWatch
 from sags_node.vision.stereo import StereoDepth
 
 WIDTH, HEIGHT = 320, 256
@@ -319,7 +319,7 @@ def test_a_network_replaces_the_matcher(
 def unwatched(monkeypatch: pytest.MonkeyPatch) -> None:
     """Dark pictures are taken in: else no network would ever see one."""
     monkeypatch.setattr(PairWatch, "__call__", lambda self, frame, pair: Verdict())
-    monkeypatch.setattr(SceneWatch, "__call__", lambda self, pair, last, veiled: Advice())
+    monkeypatch.setattr(SceneWatch, "judge", lambda self, evidence, judged: judged)
 
 
 @pytest.mark.fault("network: a depth network fails or gives NaN")

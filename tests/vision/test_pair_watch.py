@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from places import ROOT
 from synthetic import health
+from watching import judged
 
 from sags_node.mapping.budget import StepBudget
 from sags_node.messaging.cdr import decode
@@ -20,7 +21,8 @@ from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import Session, open_session
 from sags_node.types import U8, StereoFrame
 from sags_node.vision.blocks import is_blocky
-from sags_node.vision.pair_watch import PairWatch, Verdict
+from sags_node.vision.judgement import Judgement
+from sags_node.vision.pair_watch import PairWatch
 from sags_node.vision.rectify import Rectifier
 
 STEP_NS = 100_000_000
@@ -51,7 +53,7 @@ def watched(session: Session, frames: list[StereoFrame], step_ns: int = STEP_NS)
     rectify = Rectifier(session.rig, *session.working_size)
     for number, frame in enumerate(frames):
         stamped = replace(frame, t_capture_ns=10**18 + number * step_ns)
-        watch(stamped, rectify(stamped))
+        judged(watch, stamped, rectify(stamped))
         yield "; ".join(finding.text for finding in watch.findings)
 
 
@@ -166,7 +168,7 @@ def test_a_clock_may_jump_back(session: Session, frames: list[StereoFrame]) -> N
     rectify = Rectifier(session.rig, *session.working_size)
     for number, frame in enumerate([*black, *black]):
         stamped = replace(frame, t_capture_ns=number % len(black) * STEP_NS)
-        watch(stamped, rectify(stamped))
+        judged(watch, stamped, rectify(stamped))
     assert [finding.code for finding in watch.findings] == ["left_eye_black"]
 
 
@@ -174,29 +176,30 @@ def _fogged(picture: U8) -> U8:
     return (cv2.GaussianBlur(picture, (0, 0), 4) * 0.4 + 100).astype(np.uint8)
 
 
-LASTING: dict[str, tuple[Callable[[StereoFrame, StereoFrame], StereoFrame], str, Verdict]] = {
+NO_LEFT, NO_RIGHT = Judgement(hold="x", no_stereo="x"), Judgement(no_stereo="x")
+LASTING: dict[str, tuple[Callable[[StereoFrame, StereoFrame], StereoFrame], str, Judgement]] = {
     "right fogged": (
         lambda f, before: replace(f, right=_fogged(_right(f))),
         "right_eye_fogged",
-        Verdict("", "x"),
+        NO_RIGHT,
     ),
-    "left fogged": (lambda f, before: replace(f, left=_fogged(f.left)), "left_eye_fogged", Verdict("x", "x")),
-    "right frozen": (lambda f, before: replace(f, right=before.right), "right_eye_frozen", Verdict("", "x")),
-    "left frozen": (lambda f, before: replace(f, left=before.left), "left_eye_frozen", Verdict("x", "x")),
+    "left fogged": (lambda f, before: replace(f, left=_fogged(f.left)), "left_eye_fogged", NO_LEFT),
+    "right frozen": (lambda f, before: replace(f, right=before.right), "right_eye_frozen", NO_RIGHT),
+    "left frozen": (lambda f, before: replace(f, left=before.left), "left_eye_frozen", NO_LEFT),
     "both blurred": (
         lambda f, before: both(lambda picture: cv2.GaussianBlur(picture, (0, 0), 4))(f),
         "picture_blurred",
-        Verdict("", "", False),
+        Judgement(learn=False),
     ),
     "both veiled": (
         lambda f, before: both(lambda picture: (picture * 0.3 + 120).astype(np.uint8))(f),
         "picture_smoke",
-        Verdict("", "", False),
+        Judgement(learn=False),
     ),
     "both compressed": (
         lambda f, before: both(lambda picture: _jpeg(picture, 6))(f),
         "picture_compressed",
-        Verdict(),
+        Judgement(),
     ),
 }  # fmt: skip
 
@@ -212,13 +215,14 @@ def test_an_eye_is_compared_with_the_other_and_with_a_moment_ago(
     watch, rectify = PairWatch(), Rectifier(session.rig, *session.working_size)
     for number, frame in enumerate(moving):
         given = spoil(frame, moving[9]) if 10 <= number < 20 else frame
-        verdict = watch(given, rectify(given))
+        verdict = judged(watch, given, rectify(given))
         codes = [finding.code for finding in watch.findings]
         if 11 <= number < 20:  # the first may be taken for the other eye's fault
-            assert bool(verdict.left) == bool(expected.left) and bool(verdict.right) == bool(expected.right)
+            assert bool(verdict.hold) == bool(expected.hold)
+            assert bool(verdict.no_stereo) == bool(expected.no_stereo)
             assert verdict.learn == expected.learn
         elif number not in (10, 20):
-            assert verdict == Verdict()
+            assert verdict == Judgement()
         assert codes == ([code] if 14 <= number < 20 else codes)
         if number < 10 or number >= 24:
             assert codes == []
@@ -230,7 +234,7 @@ def test_what_is_compressed_hard_from_the_first_picture_on_is_said_too(
     watch, rectify = PairWatch(), Rectifier(session.rig, *session.working_size)
     for frame in moving[:10]:
         given = both(lambda picture: _jpeg(picture, 6))(frame)
-        assert watch(given, rectify(given)) == Verdict()
+        assert judged(watch, given, rectify(given)) == Judgement()
     assert [finding.code for finding in watch.findings] == ["picture_compressed"]
 
 

@@ -1,0 +1,112 @@
+"""The map: the tissue's Gaussians, how they deform, and the light that their colours show."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sags_node.mapping.initialise import LARGEST_ERROR
+from sags_node.mapping.motion_field import MotionField
+from sags_node.model.deformation import NodeDeformation, nearest_nodes
+from sags_node.model.gaussians import GaussianModel
+from sags_node.model.light import carried, is_near
+from sags_node.types import F32, F64, I64, Camera, Gaussians
+
+
+@dataclass(frozen=True, slots=True)
+class Learnt:
+    """A copy of the map, to go back to."""
+
+    model: GaussianModel
+    deformation: NodeDeformation | None
+    lamp: F64 | None
+
+
+class TissueMap:
+    """What the mapper refines, and what a pose is found against.
+
+    Attributes:
+        model: the Gaussians, where they are now.
+        deformation: the nodes that move them; None: there is no tissue yet.
+        motion: what is remembered of how they moved (`mapping.motion_field`); None: nothing is.
+        lamp: `T_world_cam` [4, 4] of the scope whose light the colours show.
+        restarts: how often a new map was begun because the old one did not fit any more.
+    """
+
+    def __init__(self, max_gaussians: int, field: bool = False) -> None:
+        """
+        Args:
+            field: remember motion, for hidden tissue and to predict.
+        """
+        self.model = GaussianModel(max_gaussians)
+        self.deformation: NodeDeformation | None = None
+        self.motion = MotionField() if field else None
+        self.lamp: F64 | None = None
+        self.restarts = 0
+
+    def restart(self) -> None:
+        """Forget the tissue; the next frame, or this one if it is being taken in, makes a new map."""
+        self.model.clear()
+        self.deformation = None
+        self._forget_motion()
+        self.restarts += 1
+
+    def remember_motion(self) -> None:
+        """From now on. Any thread may call this."""
+        if self.motion is None:
+            self.motion = MotionField()
+
+    def learnt(self) -> Learnt:
+        """What is known now."""
+        return Learnt(*deepcopy((self.model, self.deformation)), self.lamp)
+
+    def go_back(self, learnt: Learnt) -> None:
+        """Forget what was learnt since."""
+        learnt.model.never_reuse(self.model)
+        self.model, self.deformation, self.lamp = learnt.model, learnt.deformation, learnt.lamp
+        self._forget_motion()
+
+    def relight(self, camera: Camera) -> Gaussians:
+        """The Gaussians as the scope's light shows them from there; views, for drawing now."""
+        gaussians, lamp = self.model.gaussians(), self.lamp
+        if lamp is None or self.deformation is None or np.array_equal(lamp, camera.T_world_cam):
+            return gaussians
+        model, normals = self.model, self.deformation.normals(lamp[:3, 3])
+        colors = carried(
+            model.colors, model.means, normals, model.node_index, model.node_weight, lamp, camera.T_world_cam
+        )
+        return replace(gaussians, colors=colors)
+
+    def move_light(self, camera: Camera) -> None:
+        """Let the colours be those that the scope's light shows from where it is now."""
+        if self.lamp is None or not is_near(self.lamp, camera.T_world_cam):
+            self.model.colors[:] = self.relight(camera).colors
+            self.lamp = camera.T_world_cam
+
+    def away(self, rows: I64) -> F32:
+        """How far [K, 3] m from where they rest the Gaussians in `rows` are now."""
+        if self.deformation is None:
+            return np.zeros((len(rows), 3), np.float32)
+        return self.deformation.away(self.model.node_index[rows], self.model.node_weight[rows])
+
+    def displacement_at(self, points: F32) -> F32:
+        """How far [K, 3] m from where it rests the tissue at places [K, 3] is now."""
+        if self.deformation is None:
+            return np.zeros_like(points)
+        index, weight, _ = nearest_nodes(points, self.deformation.nodes)
+        return self.deformation.away(index, weight)
+
+    def settle(self, share: float) -> None:
+        """Let where the tissue rests follow where it is now, by a share of the way."""
+        if self.deformation is not None:
+            self.deformation.settle(share)
+
+    def doubt(self, error: float) -> None:
+        """The depth of all Gaussians may be wrong by so much more, m, until it is measured again."""
+        self.model.depth_errors[:] = np.minimum(self.model.depth_errors + np.float32(error), LARGEST_ERROR)
+
+    def _forget_motion(self) -> None:
+        if self.motion is not None:
+            self.motion.forget()

@@ -1,0 +1,45 @@
+"""What watchers say of a frame: the one question of all of them is what of it may be trusted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+from sags_node.types import F32, Bool, Finding, FrameResult, RectifiedPair, StereoFrame
+
+
+class Evidence(NamedTuple):
+    """What a frame is judged by."""
+
+    frame: StereoFrame
+    pair: RectifiedPair
+    last: FrameResult | None  # the frame mapped last, and what was made of it
+    is_repeat: bool = False  # it shows the same as that one
+    eyes_are_late: bool = False  # one eye showed another moment than the other when they were matched last
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """What of a frame may be used."""
+
+    hold: str = ""  # why nothing of it is taken in; empty: it is
+    stage: str = "picture"  # what that is about
+    no_stereo: str = ""  # why its eyes are not matched; empty: they are
+    learn: bool = True  # else it is followed, and not learnt
+    is_new_scene: bool = False  # it shows another scene for good: begin a new model
+    covered: Bool | None = None  # [h, w] a small picture of what is not tissue now
+    covered_left: Bool | None = None  # [rows, columns] cells that the left eye does not see
+    covered_right: Bool | None = None  # and the right one
+    gain: F32 | None = None  # [3] exposure to be taken out of the pictures
+    guess: F32 | None = None  # [rows, columns, 2] px of square cells, where the motion search is to begin
+
+
+class Watcher(Protocol):
+    """Looks at every frame."""
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What is wrong, and how to fix it. May be read from any thread."""
+
+    def judge(self, evidence: Evidence, judged: Judgement) -> Judgement:
+        """What may be used of a frame: `judged`, which those that were asked before say, or less."""

@@ -1,0 +1,11 @@
+"""Watchers, asked about a frame as the pipeline asks them."""
+
+from __future__ import annotations
+
+from sags_node.types import RectifiedPair, StereoFrame
+from sags_node.vision.judgement import Evidence, Judgement, Watcher
+
+
+def judged(watcher: Watcher, frame: StereoFrame, pair: RectifiedPair | None = None) -> Judgement:
+    """Of one that needs no `pair` where there is none."""
+    return watcher.judge(Evidence(frame, pair, None), Judgement())  # type: ignore[arg-type]
