@@ -6,7 +6,7 @@ import pytest
 from sags_node.mapping import densify, initialise
 from sags_node.mapping.motion import scene_flow, track
 from sags_node.model.gaussians import GaussianModel
-from sags_node.types import Camera, Observation, RenderedView
+from sags_node.types import Camera, Colours, Observation, RenderedView
 
 WIDTH, HEIGHT, FOCAL, DEPTH = 64, 48, 60.0, 0.08
 
@@ -29,7 +29,7 @@ def observation(depth: float = DEPTH, T: np.ndarray | None = None, seed: int = 0
 def view(depth: float = DEPTH) -> RenderedView:
     shape = (HEIGHT, WIDTH)
     return RenderedView(
-        0, 0, camera(), np.zeros((*shape, 3), np.float32), np.full(shape, depth, np.float32),
+        0, 0, camera(), Colours(np.zeros((*shape, 3), np.uint8)), np.full(shape, depth, np.float32),
         np.ones(shape, np.float32),
     )  # fmt: skip
 

@@ -17,13 +17,14 @@ from sags_node.mapping import densify
 from sags_node.mapping.depth_memory import DRIFT, UNSEEN, remember
 from sags_node.model.gaussians import GaussianModel
 from sags_node.phantom.scene import Phantom, PhantomScene
-from sags_node.types import Camera, DepthGrid, Observation, RectifiedPair, RenderedView, StereoFrame
+from sags_node.types import Camera, Colours, DepthGrid, Observation, RectifiedPair, RenderedView, StereoFrame
 from sags_node.vision.depth_grid import JUMP, SLOPE, depth_grid
 from sags_node.vision.rectify import Rectifier
 from sags_node.vision.stereo import StereoDepth
 
 WIDTH, HEIGHT, FOCAL, BASELINE, DEPTH = 320, 256, 300.0, 4e-3, 0.08
 SHAPE = (HEIGHT, WIDTH)
+BLACK = Colours(np.zeros((*SHAPE, 3), np.uint8))
 CAMERA = Camera(WIDTH, HEIGHT, np.array([[FOCAL, 0, 160.0], [0, FOCAL, 128.0], [0, 0, 1]]), np.eye(4))
 
 
@@ -186,7 +187,7 @@ def test_the_drawn_depth_says_how_sure_it_is_and_keeps_silent_where_it_is_a_gues
     right = model.means[:, 0] > 0
     model.depth_errors[right] = 0.02
     drawn = np.full(SHAPE, DEPTH, np.float32)
-    view = RenderedView(0, 0, CAMERA, np.zeros((*SHAPE, 3), np.float32), drawn, np.ones(SHAPE, np.float32))
+    view = RenderedView(0, 0, CAMERA, BLACK, drawn, np.ones(SHAPE, np.float32))
     shown = with_confidence(view, model.gaussians())
     assert shown.confidence is not None
     assert np.allclose(shown.confidence[:, :140], confidence_of(np.float32(1e-3)), atol=1e-3)
@@ -202,7 +203,7 @@ def test_a_drawn_depth_is_no_surer_than_it_agrees_with_what_is_measured() -> Non
     seen[:, : WIDTH // 2] -= apart
     grid = grid_of(seen.copy())
     drawn = np.full(SHAPE, DEPTH, np.float32)
-    view = RenderedView(0, 0, CAMERA, np.zeros((*SHAPE, 3), np.float32), drawn, np.ones(SHAPE, np.float32))
+    view = RenderedView(0, 0, CAMERA, BLACK, drawn, np.ones(SHAPE, np.float32))
     shown = with_confidence(view, wall(1e-3).gaussians(), grid)
     assert shown.confidence is not None
     its_error = float((grid.error * np.square(DEPTH - apart))[:, :30].max())
@@ -217,7 +218,7 @@ def test_a_model_that_does_not_know_its_errors_has_no_confidence() -> None:
         0,
         0,
         CAMERA,
-        np.zeros((*SHAPE, 3), np.float32),
+        BLACK,
         np.ones(SHAPE, np.float32),
         np.ones(SHAPE, np.float32),
     )
