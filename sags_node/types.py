@@ -53,14 +53,19 @@ class Camera:
     height: int  # px
     K: F64  # [3, 3] px
     T_world_cam: F64  # [4, 4] m
+    _viewmat: F64 | None = field(default=None, init=False, repr=False, compare=False)
 
     @property
     def viewmat(self) -> F64:
-        """World to camera, [4, 4]."""
+        """World to camera, [4, 4]; made once, since a frame asks a dozen times. Not to be written."""
+        if self._viewmat is not None:
+            return self._viewmat
         R, t = self.T_world_cam[:3, :3], self.T_world_cam[:3, 3]
         view = np.eye(4)
         view[:3, :3] = R.T
         view[:3, 3] = -R.T @ t
+        view.flags.writeable = False
+        object.__setattr__(self, "_viewmat", view)
         return view
 
     def moved_right(self, distance: float) -> Camera:

@@ -18,6 +18,7 @@ from sags_node.mapping.motion_field import MotionField
 from sags_node.mapping.optimiser import LearningRates
 from sags_node.mapping.refiner import Refiner
 from sags_node.mapping.split import split_worst
+from sags_node.mapping.surface import surface_at
 from sags_node.model.alias_free import narrow
 from sags_node.model.deformation import NodeDeformation, nearest_nodes
 from sags_node.model.gaussians import GaussianModel
@@ -305,11 +306,12 @@ class Mapper:
     def _follow(self, observation: Observation, budget: Budget) -> dict[str, int]:
         assert self._deformation is not None
         # 1. Deform: every Gaussian goes to where flow and depth saw its tissue go.
-        self._predict(observation)
+        surface = self._predict(observation)
         self._move_light(observation.camera)
         # 2. Prune: what floats in front of the tissue, and what the machine does not afford.
         limit = self._limit(budget)
-        removed = self.model.remove(densify.prune_mask(self.model, observation, limit))
+        is_new = observation.depth_is_new
+        removed = self.model.remove(densify.prune_mask(self.model, surface, is_new, limit))
         removed += densify.prune_to_budget(self.model, limit)
         if self._smoothing:
             narrow(self.model.smoothing, self.model.means, observation.camera)
@@ -363,7 +365,8 @@ class Mapper:
 
     def _touch_up(self, observation: Observation, budget: Budget, settled: bool) -> dict[str, int]:
         """Nothing moved: what was drawn last shows where steps pay, and only there the picture changes."""
-        prune_mask = densify.prune_mask(self.model, observation, self._limit(budget))
+        surface, is_new = surface_at(self.model.means, observation), observation.depth_is_new
+        prune_mask = densify.prune_mask(self.model, surface, is_new, self._limit(budget))
         if np.count_nonzero(prune_mask) > TORN * self.model.count:
             counted = replace(observation, depth_is_new=False)
             return self._follow(counted, budget)  # damage: there are holes to be filled
@@ -411,11 +414,11 @@ class Mapper:
     def _all_rows(self) -> slice:
         return slice(0, self.model.count)
 
-    def _predict(self, observation: Observation) -> None:
-        """Move all Gaussians to where flow and depth saw the tissue go."""
+    def _predict(self, observation: Observation) -> F32:
+        """Move all Gaussians to where flow and depth saw the tissue go; `surface_at` there."""
         assert self._deformation is not None
         if self._last is None:
-            return
+            return surface_at(self.model.means, observation)
         before = self._last.observation
         self._frames_to_depth += 1
         pull = depth_pull(self._frames_to_depth) if observation.depth_is_new else 0.0
@@ -430,7 +433,9 @@ class Mapper:
         seconds = (observation.t_capture_ns - before.t_capture_ns) * 1e-9
         if seconds > 0:
             self.model.velocities[:] = (self.model.means - start) / np.float32(seconds)
-        remember(self.model, observation, pull, max(seconds, 0.0))
+        surface = surface_at(self.model.means, observation)
+        remember(self.model, surface, pull, max(seconds, 0.0))
+        return surface
 
     def _remember(self, t_ns: int, still: bool) -> Forecast | None:
         """Take the nodes' places at the end of a frame into the field; what it expects next."""

@@ -15,6 +15,7 @@ from sags_node.evaluation import calibration
 from sags_node.geometry import unproject
 from sags_node.mapping import densify
 from sags_node.mapping.depth_memory import DRIFT, UNSEEN, remember
+from sags_node.mapping.surface import surface_at
 from sags_node.model.gaussians import GaussianModel
 from sags_node.phantom.scene import Phantom, PhantomScene
 from sags_node.types import Camera, Colours, DepthGrid, Observation, RectifiedPair, RenderedView, StereoFrame
@@ -148,20 +149,21 @@ def test_what_moves_unseen_is_known_worse_and_comes_back_when_it_is_measured() -
     model.velocities[:, 0] = 0.02
     hidden = model.means[:, 0] > 1e-3
     for _ in range(30):
-        remember(model, observation(depth * tissue, tissue), 0.4, 1 / 30)
+        remember(model, surface_at(model.means, observation(depth * tissue, tissue)), 0.4, 1 / 30)
     grown = 1e-3 + DRIFT * 0.02 + UNSEEN
     assert np.allclose(model.depth_errors[hidden], grown, rtol=1e-3)
     assert confidence_of(model.depth_errors[hidden]).max() < SURE
     assert confidence_of(model.depth_errors[~hidden]).mean() > SURE
     seen[:] = True
     for _ in range(10):
-        remember(model, observation(depth, seen), 0.4, 1 / 30)
+        remember(model, surface_at(model.means, observation(depth, seen)), 0.4, 1 / 30)
     assert confidence_of(model.depth_errors).min() > SURE
 
 
 def test_a_measurement_that_contradicts_makes_unsure() -> None:
     model = wall(5e-4)
-    remember(model, observation(np.full(SHAPE, DEPTH - 0.006, np.float32), np.ones(SHAPE, bool)), 0.4, 0.03)
+    nearer = observation(np.full(SHAPE, DEPTH - 0.006, np.float32), np.ones(SHAPE, bool))
+    remember(model, surface_at(model.means, nearer), 0.4, 0.03)
     assert model.depth_errors.min() >= 0.0059
 
 
