@@ -42,6 +42,7 @@ Side = Literal["left", "right"]
 # What is drawn small is learnt from means over small pixels. A mean differs from what is in the middle by
 # 1/24 of the second difference along each axis (Taylor). Measured: 0.15 to 0.3 dB for taking it out.
 MIDDLES = np.array([-1 / 24, 26 / 24, -1 / 24], np.float32)
+_ENLARGING = threading.Lock()  # one for all: it is held for less than 0.5 ms, and pictures stay copyable
 SH_DEGREE_0 = 0.5 / math.sqrt(math.pi)  # Y_00, the constant spherical harmonic: rgb = 0.5 + Y_00 f_dc
 
 
@@ -253,20 +254,19 @@ class Colours:
         small: [h, w, 3] RGB.
     """
 
-    __slots__ = ("_lock", "_size", "_whole", "small")
+    __slots__ = ("_size", "_whole", "small")
 
     def __init__(self, small: U8, width: int | None = None, height: int | None = None) -> None:
         """`width`, `height`: in which they are shown, px; None: as they are."""
         self.small = small
         self._size = width or small.shape[1], height or small.shape[0]
         self._whole: U8 | None = small if self._is_whole else None
-        self._lock = threading.Lock()
 
     @property
     def whole(self) -> U8:
         """[H, W, 3] by cubic polynomials, which keep twice the sharpness of straight lines. Any thread may
         ask."""
-        with self._lock:
+        with _ENLARGING:
             if self._whole is None:
                 middles = cv2.sepFilter2D(self.small, -1, MIDDLES, MIDDLES, borderType=cv2.BORDER_REPLICATE)
                 self._whole = np.asarray(cv2.resize(middles, self._size, interpolation=cv2.INTER_CUBIC))
