@@ -1,3 +1,5 @@
+import dataclasses
+
 import cv2
 import numpy as np
 import pytest
@@ -112,3 +114,16 @@ def test_no_disparity_is_unknown_depth() -> None:
     depth = geometry.disparity_to_depth(disparity, 500.0, 0.004)
     np.testing.assert_allclose(depth, [0, 0, 0, 0.1], rtol=1e-6)
     assert depth.dtype == np.float32
+
+
+def test_a_camera_that_was_moved_has_a_view_of_its_own() -> None:
+    """The view matrix is kept by the camera, and no copy with another pose takes it over."""
+    rng = np.random.default_rng(5)
+    first, second = random_pose(rng), random_pose(rng)
+    there = Camera(320, 240, K, first)
+    np.testing.assert_allclose(there.viewmat @ first, np.eye(4), atol=1e-12)
+    moved = dataclasses.replace(there, T_world_cam=second)
+    np.testing.assert_allclose(moved.viewmat @ second, np.eye(4), atol=1e-12)
+    assert there.viewmat is there.viewmat
+    with pytest.raises(ValueError, match="read-only"):
+        there.viewmat[0, 0] = 1

@@ -45,7 +45,7 @@ def measure_losses(
     gaussians, camera = surface(count, width, height)
     planes = make_rasterizer("numba", width, height).forward(gaussians, camera)
     view = views.to_view(planes, camera, 0, 0)
-    image, tissue = 0.9 * view.rgb, np.ones((height, width), np.bool_)
+    image, tissue = 0.9 * views.colours_of(planes), np.ones((height, width), np.bool_)
     v_planes, weight = np.empty_like(planes), np.empty_like(view.depth)
     structural = PhotometricLoss(width, height, WITH_SSIM)
     plain = PhotometricLoss(width, height, WITHOUT_SSIM)

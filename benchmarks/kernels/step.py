@@ -17,7 +17,7 @@ from sags_node.engine.adam import AdamState, adam_step
 from sags_node.engine.field.hexplane import HexPlane
 from sags_node.engine.losses.photometric import PhotometricLoss
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
-from sags_node.engine.rasterizer.views import to_view
+from sags_node.engine.rasterizer.views import colours_of, to_view
 from sags_node.model import columns
 from sags_node.model.activation import activate, activate_backward, deactivate
 from sags_node.types import F32, I64
@@ -70,7 +70,7 @@ class _Step:
         self._loss = PhotometricLoss(case.width, case.height, WITH_SSIM if structural else WITHOUT_SSIM)
         planes = self._rasterizer.forward(gaussians, self._camera)
         view = to_view(planes, self._camera, 0, 0)
-        self._image, self._depth = 0.9 * view.rgb, view.depth
+        self._image, self._depth = 0.9 * colours_of(planes), view.depth
         self._tissue = np.ones(view.depth.shape, np.bool_)
         self._v_planes, self._weight = np.empty_like(planes), np.empty_like(view.depth)
         functions: dict[str, Callable[..., Any]] = {

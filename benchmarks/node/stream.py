@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from sags_node.engine.rasterizer.rasterize import to_view
+from sags_node.engine.rasterizer.views import colours_of
 from sags_node.evaluation.metrics import as_float, psnr
 from sags_node.evaluation.provenance import machine_name
 from sags_node.fitting.clip import ClipFrame, play
@@ -169,7 +169,7 @@ def _summary(arrivals: list[_Arrival], second: int) -> dict[str, Any]:
 def _picture(fit: StreamFit, frame: ClipFrame) -> F32:
     """[H, W, 3] the model at the time of a frame."""
     planes = fit.draw(frame.t_capture_ns, frame.camera)
-    return to_view(planes, frame.camera, frame.frame_id, frame.t_capture_ns).rgb
+    return colours_of(planes)
 
 
 def _psnr(fit: StreamFit, frame: ClipFrame) -> float:

@@ -13,7 +13,8 @@ import numpy as np
 
 from benchmarks.quality.sgbm import JudgedSGBM
 from sags_node.config.schema import Box
-from sags_node.engine.rasterizer.rasterize import Rasterizer, make_rasterizer, to_view
+from sags_node.engine.rasterizer.rasterize import Rasterizer, make_rasterizer
+from sags_node.engine.rasterizer.views import colours_of
 from sags_node.errors import UsageError
 from sags_node.evaluation import metrics
 from sags_node.evaluation.measure import FrameRow, Options, Progress
@@ -167,7 +168,7 @@ def _right_views(
     warp, known = warp_to_right(metrics.as_float(left), shown.measured_depth, focal_px, shown.baseline)
     right_camera = camera.moved_right(shown.baseline)
     planes = rasterizer.forward(shown.snapshot.gaussians, right_camera)
-    model = to_view(planes, right_camera, 0, 0).rgb
+    model = colours_of(planes)
     truth, both = metrics.as_float(right), mask & known
     warp_psnr, model_psnr = (
         metrics.psnr(metrics.fit_gain_offset(picture, truth, both), truth, both) for picture in (warp, model)

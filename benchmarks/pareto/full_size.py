@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import cv2
-
 from sags_node.engine.rasterizer.rasterize import make_rasterizer, to_view
 from sags_node.evaluation import metrics
 from sags_node.evaluation.measure import FrameRow, Options, Progress
@@ -40,7 +38,7 @@ def online_at(
             pair = rectifier(frame)
             planes = rasterizer.forward(spool.read(place).snapshot.gaussians, pair.camera)
             view = to_view(planes, pair.camera, 0, 0)
-            shown = metrics.as_float(cv2.convertScaleAbs(view.rgb, alpha=255))
+            shown = metrics.as_float(view.rgb)
             quality = metrics.psnr(shown, metrics.as_float(pair.left), tissue_of(frame, pair))
             rows.append(FrameRow(frame.frame_id, 0.0, {"online": {"psnr": quality}}))
             progress("measuring at full size", len(rows))

@@ -16,7 +16,8 @@ import cv2
 import numpy as np
 from rich.table import Table
 
-from sags_node.engine.rasterizer.rasterize import make_rasterizer, to_view
+from sags_node.engine.rasterizer.rasterize import make_rasterizer
+from sags_node.engine.rasterizer.views import colours_of
 from sags_node.errors import SagsError, UsageError
 from sags_node.evaluation import metrics
 from sags_node.evaluation.lpips import Lpips
@@ -179,7 +180,7 @@ def _smaller(fit: Fit, frames: Iterable[ClipFrame], factor: int) -> float:
         )
         rasterizer = make_rasterizer("numba", width, height, fit.settings.antialias)
         planes = rasterizer.forward(fit.gaussians(frame), camera)
-        shown = to_view(planes, camera, frame.frame_id, frame.t_capture_ns).rgb
+        shown = colours_of(planes)
         picture = metrics.as_float(frame.image)[:rows, :across]
         truth = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
         blocks = frame.tissue[:rows, :across].reshape(height, factor, width, factor)

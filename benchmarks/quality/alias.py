@@ -16,7 +16,8 @@ import numpy as np
 
 from benchmarks.quality.alias_truth import AliasTruth, Shot
 from sags_node.config.schema import PhantomSource
-from sags_node.engine.rasterizer.rasterize import make_rasterizer, to_view
+from sags_node.engine.rasterizer.rasterize import make_rasterizer
+from sags_node.engine.rasterizer.views import colours_of
 from sags_node.evaluation.metrics import psnr
 from sags_node.evaluation.provenance import machine_name
 from sags_node.mapping.budget import StepBudget
@@ -75,7 +76,7 @@ class Trained:
     def draw(self, camera: Camera) -> F32:
         """[H, W, 3]"""
         rasterizer = make_rasterizer("numba", camera.width, camera.height, self.antialias)
-        return to_view(rasterizer.forward(self.gaussians, camera), camera, 0, 0).rgb
+        return colours_of(rasterizer.forward(self.gaussians, camera))
 
 
 def train(observation: Observation, filters: Filters, settings: Settings) -> Trained:

@@ -201,7 +201,7 @@ class _Run:
         published = view.depth > 0
         confident = published & _is_confident(view)
         self._shown[frame.frame_id] = _Shown(
-            psnr=metrics.psnr(view.rgb, metrics.as_float(truth.left), tissue),
+            psnr=metrics.psnr(metrics.as_float(view.rgb), metrics.as_float(truth.left), tissue),
             borrowed=_share(borrowed, published),
             confident_borrowed=_share(borrowed, confident),
             depth=_depth_errors(frame, view, confident, tissue),

@@ -91,7 +91,9 @@ class _Run:
 
     def _measure(self, result: FrameResult, tissue: Bool, reference: Reference | None) -> None:
         view = result.views["left"]
-        self._psnr.append(metrics.psnr(view.rgb, metrics.as_float(result.pair.left), tissue))
+        self._psnr.append(
+            metrics.psnr(metrics.as_float(view.rgb), metrics.as_float(result.pair.left), tissue)
+        )
         if reference is not None and reference.depth is not None:
             truth = metrics.resample_nearest(reference.depth, view.camera.width, view.camera.height)
             self._depth.append(metrics.depth_errors(view.depth, truth, tissue))

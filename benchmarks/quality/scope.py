@@ -85,7 +85,7 @@ class _Played:
         if result.held:
             self.held += 1
             return
-        self.psnr.append(metrics.psnr(view.rgb, metrics.as_float(result.pair.left), tissue))
+        self.psnr.append(metrics.psnr(metrics.as_float(view.rgb), metrics.as_float(result.pair.left), tissue))
         truth = metrics.resample_nearest(depth, view.camera.width, view.camera.height)
         self.depth.append(metrics.depth_errors(view.depth, truth, tissue))
 

@@ -91,7 +91,7 @@ class _Run:
     def look(self, number: int, result: FrameResult, tools: Bool | None) -> None:
         """Compare what is shown of a frame with its picture, and with the scan that belongs to it."""
         seen = result.observation
-        self._drawn.append(metrics.psnr(result.views["left"].rgb, seen.image, seen.tissue))
+        self._drawn.append(metrics.psnr(metrics.as_float(result.views["left"].rgb), seen.image, seen.tissue))
         if self._before is not None:
             self._copied.append(metrics.psnr(self._before, seen.image, seen.tissue))
         self._before = seen.image

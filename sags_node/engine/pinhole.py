@@ -12,9 +12,11 @@ from sags_node.types import F32, Camera
 
 def pack(camera: Camera) -> F32:
     """[16]: the rows of the view matrix (12), then fx, fy, cx, cy."""
-    K = camera.K
-    intrinsics = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
-    return np.concatenate([camera.viewmat[:3].ravel(), intrinsics]).astype(np.float32)
+    packed = np.empty(16, np.float32)
+    packed[:12] = camera.viewmat.ravel()[:12]
+    (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
+    packed[12:] = fx, fy, cx, cy
+    return packed
 
 
 @kernel

@@ -12,7 +12,8 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from sags_node.engine.rasterizer.rasterize import Rasterizer, to_view
+from sags_node.engine.rasterizer.rasterize import Rasterizer
+from sags_node.engine.rasterizer.views import colours_of
 from sags_node.geometry import project
 from sags_node.types import F32, Bool, Camera, Gaussians
 
@@ -55,7 +56,7 @@ def carried(rasterizer: Rasterizer, middle: Gaussians, camera: Camera, around: S
             seen.picture, places, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
         )
         weights += weight
-    drawn = to_view(rasterizer.forward(middle, camera), camera, 0, 0).rgb
+    drawn = colours_of(rasterizer.forward(middle, camera))
     found: F32 = np.where(weights > 0, total / np.maximum(weights, np.float32(1e-6)), drawn)
     return np.clip(found, 0, 1)
 

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from sags_node.config.schema import Box, PoseWay
-from sags_node.engine.rasterizer.rasterize import make_rasterizer, to_view
+from sags_node.engine.rasterizer.rasterize import make_rasterizer
+from sags_node.engine.rasterizer.views import colours_of
 from sags_node.errors import UsageError
 from sags_node.evaluation import calibration, metrics
 from sags_node.evaluation.carried import Seen, carried
@@ -268,7 +269,7 @@ class Measurer:
         return figures
 
     def _draw(self, gaussians: Gaussians, camera: Camera) -> F32:
-        return to_view(self._rasterizer.forward(gaussians, camera), camera, 0, 0).rgb
+        return colours_of(self._rasterizer.forward(gaussians, camera))
 
     def _right_eye(
         self, shown: SpooledFrame, left: U8, picture: U8, frame: StereoFrame

@@ -13,7 +13,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-import cv2
 import numpy as np
 
 from sags_node.errors import SagsError
@@ -138,10 +137,10 @@ class Spool:
             gaussians.colors,
             gaussians.ids,
             snapshot.velocities,
-            _as_bytes(view.rgb),
+            view.rgb,
             view.depth,
             np.full_like(view.depth, np.nan) if view.confidence is None else view.confidence,
-            _as_bytes(result.views["right"].rgb) if "right" in result.views else np.empty(0, np.uint8),
+            result.views["right"].rgb if "right" in result.views else np.empty(0, np.uint8),
             *(_NO_FORECAST if forecast is None else _forecast_arrays(forecast)),
         )
         try:
@@ -195,11 +194,6 @@ class Spool:
 
     def _file(self, place: int) -> Path:
         return self.folder / f"{place:06d}.frame"
-
-
-def _as_bytes(rgb: F32) -> U8:
-    """Rounded and clipped at 255, as on the wire."""
-    return np.asarray(cv2.convertScaleAbs(rgb, alpha=255))
 
 
 def _forecast_arrays(forecast: Forecast) -> tuple[F32, F32, I32, F32]:

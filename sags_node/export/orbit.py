@@ -37,8 +37,8 @@ def picture_of(rasterizer: Rasterizer, gaussians: Gaussians, eye: Camera) -> tup
     """Gaussians as a camera sees them, RGB [H, W, 3], and their depth [H, W] m."""
     view = to_view(rasterizer.forward(gaussians, eye), eye, 0, 0)
     alpha = view.alpha[..., None]
-    rgb = view.rgb * alpha + np.float32(BACKGROUND) * (1 - alpha)
-    return cv2.convertScaleAbs(rgb, alpha=255.0), view.depth
+    rgb = view.rgb * alpha + np.float32(255 * BACKGROUND) * (1 - alpha)
+    return cv2.convertScaleAbs(rgb), view.depth
 
 
 def write_orbit(path: Path, scene: Scene, degrees: float, seconds: float, advance: Advance) -> int:

@@ -17,7 +17,7 @@ from sags_node.kernels.threads import configure_threads
 from sags_node.media.video_file import VideoFile
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import Session
-from sags_node.types import F32, U8, AnchorStates, FrameResult
+from sags_node.types import F32, AnchorStates, FrameResult
 
 DEPTH_UNIT = 1e-5  # m for a count, as `source.reference.depth_unit`
 MOST_DEPTH = 65535 * DEPTH_UNIT  # m; 16 bits reach no farther
@@ -183,9 +183,7 @@ class Renders:
 
     def add(self, result: FrameResult, anchors: AnchorStates) -> None:
         view = result.views["left"]
-        shown = view.rgb * (view.alpha[..., None] > 0) * (not result.held)
-        picture: U8 = np.round(np.clip(shown, 0, 1) * 255).astype(np.uint8)
-        self._video.add(picture)
+        self._video.add(view.rgb * (view.alpha[..., None] > 0) * np.uint8(not result.held))
         self._holds += 1
 
     def finish(self) -> int:

@@ -24,7 +24,8 @@ from typing import Any
 import numpy as np
 
 from sags_node.engine.rasterizer.confidence import with_confidence
-from sags_node.engine.rasterizer.rasterize import make_rasterizer, to_view
+from sags_node.engine.rasterizer.rasterize import make_rasterizer
+from sags_node.engine.rasterizer.views import colours_of, to_view
 from sags_node.errors import SagsError
 from sags_node.export.orbit import orbit
 from sags_node.export.scene import Scene
@@ -89,13 +90,14 @@ def _drawn(scene: Scene, cameras: list[Camera]) -> Iterator[tuple[F32, F32]]:
     first = cameras[0]
     rasterizer = make_rasterizer("numba", first.width, first.height)
     for camera in cameras:
-        view = to_view(rasterizer.forward(scene.gaussians, camera), camera, 0, scene.t_capture_ns)
+        planes = rasterizer.forward(scene.gaussians, camera)
+        view = to_view(planes, camera, 0, scene.t_capture_ns)
         view = with_confidence(view, scene.gaussians)
         apart = np.abs(view.depth - rasterizer.median()[0])
         agree = apart < AGREEMENT_PX * view.depth / np.float32(camera.K[0, 0])
         if camera is first and not agree.any():
             raise SagsError("the left camera sees nothing of the model; export another moment")
-        yield view.rgb, np.where(agree, view.depth, np.float32(0))
+        yield colours_of(planes), np.where(agree, view.depth, np.float32(0))
 
 
 def _fused(scene: Scene, cameras: list[Camera], voxel: float) -> Any:

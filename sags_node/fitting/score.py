@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from sags_node.engine.rasterizer.rasterize import to_view
+from sags_node.engine.rasterizer.views import colours_of, to_view
 from sags_node.evaluation import metrics
 from sags_node.evaluation.carried import Seen, carried
 from sags_node.evaluation.lpips import Lpips
@@ -71,10 +71,10 @@ def score(
     rows = []
     for done, frame in enumerate(frames):
         planes = fit.rasterizer.forward(fit.gaussians(frame), frame.camera)
-        view = to_view(planes, frame.camera, frame.frame_id, frame.t_capture_ns)
-        rows.append(_figures(view.rgb, frame, lpips))
+        picture = colours_of(planes)
+        rows.append(_figures(picture, frame, lpips))
         if pictures is not None:
-            _write(pictures / f"{frame.frame_id:06d}.png", view.rgb)
+            _write(pictures / f"{frame.frame_id:06d}.png", picture)
         progress(done + 1)
     return _summary(rows, segments)
 

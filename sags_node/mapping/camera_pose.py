@@ -50,7 +50,7 @@ def fit_pose(points: F32, pixels: F32, disparities: F32, camera: Camera, baselin
         camera: the pose to start from.
         baseline: m.
     """
-    view = camera.viewmat
+    view = camera.viewmat.copy()
     focal = float(camera.K[0, 0])
     intrinsics = np.array([focal, camera.K[1, 1], camera.K[0, 2], camera.K[1, 2], focal * baseline])
     weights, squares = np.zeros(len(points), np.float32), np.zeros(len(points), np.float32)

@@ -211,7 +211,7 @@ class CameraTracker:
     def _seen_from(self, observation: Observation, pose: F64) -> Drawn:
         """The model as a frame that was taken from there would have shown it."""
         view = self._draw(replace(observation.camera, T_world_cam=pose))
-        gray = cv2.cvtColor(cv2.convertScaleAbs(view.rgb, alpha=255.0), cv2.COLOR_RGB2GRAY)
+        gray = cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY)
         shown = replace(observation, camera=view.camera, gray=gray, tissue=view.alpha > 0.5)
         return Drawn(shown, view)
 

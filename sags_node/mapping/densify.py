@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from numba import prange
 
-from sags_node.engine.pinhole import pack, to_camera, to_pixel
 from sags_node.kernels.jit import PIECE, inlined, kernel, parallel_kernel
 from sags_node.model.gaussians import GaussianModel
 from sags_node.types import F32, I32, Bool, Observation
@@ -50,17 +49,21 @@ def candidates(planes: F32, observation: Observation, phase: int) -> tuple[I32, 
     return pixels[:count], depths[:count], errors[:count]
 
 
-def prune_mask(model: GaussianModel, observation: Observation, limit: int) -> Bool:
+def prune_mask(model: GaussianModel, surface: F32, depth_is_new: bool, limit: int) -> Bool:
     """[N] what to remove: in free space for several frames in a row, transparent or not finite; when N nears
     its `limit` also what left the view, and what lies on the visible surface without showing. What an
     instrument or other tissue hides is kept. Counts the frames in free space (`in_front`), by each measured
-    depth once."""
+    depth once.
+
+    Args:
+        surface: [N, 3] of `surface_at`.
+        depth_is_new: it was not counted yet.
+    """
     remove = np.zeros(model.count, np.bool_)
     _inspect(
         model.means, model.quats, model.scales, model.smoothing, model.node_weight,
         model.opacities, model.colors, model.contribution,
-        pack(observation.camera), observation.tissue, observation.depth,
-        observation.depth_is_new, model.count > CROWDED * limit, model.in_front, remove,
+        surface, depth_is_new, model.count > CROWDED * limit, model.in_front, remove,
     )  # fmt: skip
     return remove
 
@@ -149,13 +152,13 @@ def _candidates(
 def _inspect(
     means: F32, quats: F32, scales: F32, smoothing: F32, node_weight: F32,
     opacities: F32, colors: F32, contribution: F32,
-    cam: F32, tissue: Bool, depth: F32, is_new: bool, crowded: bool, in_front: I32, remove: Bool,
+    surface: F32, is_new: bool, crowded: bool, in_front: I32, remove: Bool,
 ) -> None:  # fmt: skip
     for piece in prange(-(-len(means) // PIECE)):
         first = np.int64(piece) * PIECE
         _inspect_rows(
             means, quats, scales, smoothing, node_weight, opacities, colors, contribution,
-            cam, tissue, depth, is_new, crowded, in_front, remove, first, min(first + PIECE, len(means)),
+            surface, is_new, crowded, in_front, remove, first, min(first + PIECE, len(means)),
         )  # fmt: skip
 
 
@@ -163,26 +166,19 @@ def _inspect(
 def _inspect_rows(
     means: F32, quats: F32, scales: F32, smoothing: F32, node_weight: F32,
     opacities: F32, colors: F32, contribution: F32,
-    cam: F32, tissue: Bool, depth: F32, is_new: bool, crowded: bool, in_front: I32, remove: Bool,
+    surface: F32, is_new: bool, crowded: bool, in_front: I32, remove: Bool,
     first: Any, end: Any,
 ) -> None:  # fmt: skip
-    height, width = tissue.shape
     for i in range(first, end):
         if not _is_sound(means, quats, scales, smoothing, node_weight, opacities, colors, i):
             remove[i] = True
             continue
-        x, y, z = to_camera(cam, means[i, 0], means[i, 1], means[i, 2])
-        if not z > 0:
+        z, measured = surface[i, 0], surface[i, 1]
+        if z == 0:  # out of view
             remove[i] = crowded
             continue
-        u, v = to_pixel(cam, x, y, z)
-        if not (u > -0.5 and v > -0.5 and u < width - 0.5 and v < height - 0.5):
-            remove[i] = crowded
-            continue
-        px, py = int(u + 0.5), int(v + 0.5)
-        measured = depth[py, px]
         on_surface = False
-        if tissue[py, px] and measured > 0:
+        if measured > 0:
             on_surface = abs(measured - z) < FRONT_TOLERANCE * measured
             if is_new:
                 in_front[i] = in_front[i] + 1 if measured - z > FRONT_TOLERANCE * measured else 0

@@ -14,66 +14,42 @@ from typing import Any
 import numpy as np
 from numba import prange
 
-from sags_node.engine.pinhole import pack, to_camera, to_pixel
 from sags_node.kernels.jit import PIECE, kernel, parallel_kernel
 from sags_node.mapping.initialise import LARGEST_ERROR
 from sags_node.mapping.motion import BEHIND_TOLERANCE, DEPTH_GATE
 from sags_node.model.gaussians import GaussianModel
-from sags_node.types import F32, Bool, Observation
-from sags_node.vision.depth_grid import grid_of
+from sags_node.types import F32
 
 DRIFT = 0.5  # of the way that tissue is taken: so much of it may lie along the ray, where nothing shows it
 UNSEEN = 1e-3  # m/s: what tissue moves by itself
 UNWATCHED = 2e-2  # m/s: what tissue moves at when it is pulled, and nobody looks
 
 
-def remember(model: GaussianModel, observation: Observation, pull: float, seconds: float) -> None:
+def remember(model: GaussianModel, surface: F32, pull: float, seconds: float) -> None:
     """Carry the predicted errors on to a frame to which the Gaussians were moved already.
 
     Args:
-        observation: its depth; 0 everywhere: not measured.
+        surface: [N, 3] of `surface_at` for that frame.
         pull: share of the difference in depth by which the Gaussians were moved.
         seconds: since the frame before.
     """
-    grid = grid_of(observation)
-    _remember(
-        model.means, model.velocities, tuple(pack(observation.camera)), observation.tissue, observation.depth,
-        grid.error, np.float32(1 / grid.side), np.float32(pull), np.float32(seconds),
-        model.depth_errors,
-    )  # fmt: skip
+    _remember(surface, model.velocities, np.float32(pull), np.float32(seconds), model.depth_errors)
 
 
 @parallel_kernel
-def _remember(
-    means: F32, velocities: F32, cam: Any, tissue: Bool, depth: F32, grid_error: F32, per_px: Any,
-    pull: Any, seconds: Any, errors: F32,
-) -> None:  # fmt: skip
-    for piece in prange(-(-len(means) // PIECE)):
+def _remember(surface: F32, velocities: F32, pull: Any, seconds: Any, errors: F32) -> None:
+    for piece in prange(-(-len(surface) // PIECE)):
         first = np.int64(piece) * PIECE
-        _remember_rows(
-            means, velocities, cam, tissue, depth, grid_error, per_px, pull, seconds, errors,
-            first, min(first + PIECE, len(means)),
-        )  # fmt: skip
+        _remember_rows(surface, velocities, pull, seconds, errors, first, min(first + PIECE, len(surface)))
 
 
 @kernel
 def _remember_rows(
-    means: F32, velocities: F32, cam: Any, tissue: Bool, depth: F32, grid_error: F32, per_px: Any,
-    pull: Any, seconds: Any, errors: F32, first: Any, end: Any,
-) -> None:  # fmt: skip
-    height, width = depth.shape
+    surface: F32, velocities: F32, pull: Any, seconds: Any, errors: F32, first: Any, end: Any
+) -> None:
     left = (np.float32(1) - pull) ** 2  # of the old squared error
     for i in range(first, end):
-        error = errors[i]
-        x, y, z = to_camera(cam, means[i, 0], means[i, 1], means[i, 2])
-        measured = np.float32(0)
-        if z > 0:
-            u, v = to_pixel(cam, x, y, z)
-            if u > -0.5 and v > -0.5 and u < width - 0.5 and v < height - 0.5:
-                px, py = int(u + 0.5), int(v + 0.5)
-                if tissue[py, px] and depth[py, px] > 0:
-                    measured = depth[py, px]
-                    its_error = grid_error[int(py * per_px), int(px * per_px)] * measured * measured
+        error, z, measured, its_error = errors[i], surface[i, 0], surface[i, 1], surface[i, 2]
         apart = measured - z
         if measured > 0 and abs(apart) < np.float32(BEHIND_TOLERANCE) * z:
             expected = error * error + its_error * its_error

@@ -29,11 +29,16 @@ def worst_tiles(planes: F32, image: F32, tissue: Bool, share: float) -> Bool:
         tissue: [H, W] the pixels that count.
         share: of all tiles, 0..1; at least one is chosen.
     """
-    chosen = tile_grid(tissue)
-    sums = np.zeros(chosen.shape, np.float32)
-    _sum_residuals(planes, image, tissue, sums)
-    count = max(1, round(share * sums.size))
-    chosen.ravel()[np.argpartition(sums.ravel(), -count)[-count:]] = True
+    residuals = np.zeros(tile_grid(tissue).shape, np.float32)
+    sum_residuals(planes, image, tissue, ~tile_grid(tissue), residuals)
+    return largest(residuals, share)
+
+
+def largest(residuals: F32, share: float) -> Bool:
+    """The tiles [rows, columns] of which that is the largest, by share; at least one."""
+    chosen = np.zeros(residuals.shape, np.bool_)
+    count = max(1, round(share * residuals.size))
+    chosen.ravel()[np.argpartition(residuals.ravel(), -count)[-count:]] = True
     return chosen
 
 
@@ -65,16 +70,27 @@ def with_neighbours(tiles: Bool) -> Bool:
 
 
 @parallel_kernel
-def _sum_residuals(planes: F32, image: F32, tissue: Bool, sums: F32) -> None:
+def sum_residuals(
+    planes: F32,  # [5, H, W]
+    image: F32,  # [H, W, 3]
+    tissue: Bool,  # [H, W]
+    tiles: Bool,  # [rows, columns] of which
+    sums: F32,  # [rows, columns] squared colour residuals, written for those
+) -> None:
     for row in prange(sums.shape[0]):
-        _sum_row(planes, image, tissue, sums, np.int64(row))
+        _sum_row(planes, image, tissue, tiles, sums, np.int64(row))
 
 
 @kernel
-def _sum_row(planes: F32, image: F32, tissue: Bool, sums: F32, row: Any) -> None:
+def _sum_row(planes: F32, image: F32, tissue: Bool, tiles: Bool, sums: F32, row: Any) -> None:
     height, width = tissue.shape
+    for column in range(sums.shape[1]):
+        if tiles[row, column]:
+            sums[row, column] = np.float32(0)
     for y in range(row * TILE_HEIGHT, min((row + 1) * TILE_HEIGHT, height), EVERY):
         for x in range(0, width, EVERY):
+            if not tiles[row, x // TILE_WIDTH]:
+                continue
             coverage = planes[4, y, x]
             if tissue[y, x] and coverage > COVERED:
                 for k in range(3):

@@ -16,6 +16,7 @@ from sags_node.mapping.motion import Tracks, depth_pull, scene_flow
 from sags_node.mapping.optimiser import LearningRates
 from sags_node.mapping.refiner import Refiner
 from sags_node.mapping.split import split_worst
+from sags_node.mapping.surface import surface_at
 from sags_node.mapping.tissue_map import TissueMap
 from sags_node.model.alias_free import narrow
 from sags_node.model.deformation import NodeDeformation
@@ -158,11 +159,12 @@ class Mapper:
 
     def _follow(self, observation: Observation, tracks: Tracks | None, budget: Budget) -> dict[str, int]:
         # 1. Deform: every Gaussian goes to where flow and depth saw its tissue go.
-        self._predict(observation, tracks)
+        surface = self._predict(observation, tracks)
         self.map.move_light(observation.camera)
         # 2. Prune: what floats in front of the tissue, and what the machine does not afford.
         limit = self._limit(budget)
-        removed = self.model.remove(densify.prune_mask(self.model, observation, limit))
+        is_new = observation.depth_is_new
+        removed = self.model.remove(densify.prune_mask(self.model, surface, is_new, limit))
         removed += densify.prune_to_budget(self.model, limit)
         if self._smoothing:
             narrow(self.model.smoothing, self.model.means, observation.camera)
@@ -216,7 +218,8 @@ class Mapper:
 
     def _touch_up(self, observation: Observation, budget: Budget, settled: bool) -> dict[str, int]:
         """Nothing moved: what was drawn last shows where steps pay, and only there the picture changes."""
-        prune_mask = densify.prune_mask(self.model, observation, self._limit(budget))
+        surface, is_new = surface_at(self.model.means, observation), observation.depth_is_new
+        prune_mask = densify.prune_mask(self.model, surface, is_new, self._limit(budget))
         if np.count_nonzero(prune_mask) > TORN * self.model.count:
             counted = replace(observation, depth_is_new=False)
             return self._follow(counted, None, budget)  # damage: there are holes to be filled
@@ -269,11 +272,11 @@ class Mapper:
         assert self.map.deformation is not None
         return self.map.deformation
 
-    def _predict(self, observation: Observation, tracks: Tracks | None) -> None:
-        """Move all Gaussians to where flow and depth saw the tissue go."""
+    def _predict(self, observation: Observation, tracks: Tracks | None) -> F32:
+        """Move all Gaussians to where flow and depth saw the tissue go; `surface_at` there."""
         if tracks is None:
             self.model.velocities[:] = 0
-            return
+            return surface_at(self.model.means, observation)
         self._frames_to_depth += 1
         pull = depth_pull(self._frames_to_depth) if observation.depth_is_new else 0.0
         displacements, seen = scene_flow(self.model.means, tracks.pixels, observation, pull)
@@ -287,7 +290,9 @@ class Mapper:
             self._deformation.follow(self.model, displacements, seen, motion.recalled)
         if tracks.seconds > 0:
             self.model.velocities[:] = (self.model.means - start) / np.float32(tracks.seconds)
-        remember(self.model, observation, pull, tracks.seconds)
+        surface = surface_at(self.model.means, observation)
+        remember(self.model, surface, pull, tracks.seconds)
+        return surface
 
     def _note_depth(self, observation: Observation) -> None:
         known = observation.depth[::8, ::8]

@@ -82,7 +82,7 @@ def small_frame(observation: Observation) -> Small:
 
 def small_view(view: RenderedView) -> Small:
     """What the model shows."""
-    gray = cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY) * np.float32(255)
+    gray = cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY)
     return shrunk(gray, view.depth, (view.alpha > 0.5) & (view.depth > 0))
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from sags_node.engine.losses.tissue import tissue_loss
 from sags_node.engine.rasterizer.rasterize import Gradients, Rasterizer
 from sags_node.mapping.exposure import exposure_gain
-from sags_node.mapping.focus import pixels_of, tile_grid, worst_tiles
+from sags_node.mapping.focus import largest, pixels_of, sum_residuals, tile_grid
 from sags_node.mapping.optimiser import LearningRates, Optimiser
 from sags_node.model.deformation import NodeDeformation
 from sags_node.model.gaussians import GaussianModel
@@ -112,6 +112,9 @@ class CpuRefiner:
         self._rasterizers: dict[tuple[int, int], Rasterizer] = {}  # by the size of their pictures
         self._viewers: dict[tuple[int, int], Rasterizer] = {}  # those of `show`
         self._optimiser = Optimiser()
+        # [rows, columns] what `focus.sum_residuals` says of each tile, and where it is of an older drawing
+        self._sums: F32 = np.zeros((1, 1), np.float32)
+        self._old: Bool = np.ones((1, 1), np.bool_)
         # [5, H, W] and [H, W]; the planes are the rasteriser's memory: what it drew last
         self._planes: F32 = np.zeros((5, 1, 1), np.float32)
         self._v_planes, self._weight = np.zeros_like(self._planes), np.zeros_like(self._planes[0])
@@ -123,6 +126,8 @@ class CpuRefiner:
         self._node_step = node_step
         self._rasterizer = self._rasterizer_for(observation.camera, self._rasterizers)
         self._touched = tile_grid(observation.tissue)
+        self._sums = np.zeros(self._touched.shape, np.float32)
+        self._old = ~self._touched
 
     def take(self, rows: slice) -> None:
         pass
@@ -131,7 +136,7 @@ class CpuRefiner:
         pass
 
     def draw(self) -> None:
-        self._planes = self._rasterizer.forward(self._model.gaussians(), self._observation.camera)
+        self._forward(None)
 
     def planes(self) -> F32:
         return self._planes
@@ -144,29 +149,40 @@ class CpuRefiner:
         if share >= 1.0:
             self._model.contribution[:] = self._step(observation, rates).contribution
             return
-        tiles = worst_tiles(self._planes, observation.image, tissue, share)
+        tiles = self._worst_tiles(share)
         self._step(replace(observation, tissue=tissue & pixels_of(tiles, tissue.shape)), rates)
 
     def refine_worst(self, share: float, rates: LearningRates, nodes: bool = True) -> None:
-        observation = self._observation
-        tiles = worst_tiles(self._planes, observation.image, observation.tissue, share)
-        self._planes = self._rasterizer.forward(self._model.gaussians(), observation.camera, tiles)
-        self._step(observation, rates, nodes)
+        tiles = self._worst_tiles(share)
+        self._forward(tiles)
+        self._step(self._observation, rates, nodes)
         self._touched |= tiles
 
     def touched(self) -> Bool:
         return self._touched
 
     def redraw(self, share: float, tiles: Bool) -> None:
-        observation, some = self._observation, None
+        some = None
         if share < 1.0:
             some = tiles | self._touched
             if share > 0:
-                some |= worst_tiles(self._planes, observation.image, observation.tissue, share)
-        self._planes = self._rasterizer.forward(self._model.gaussians(), observation.camera, some)
+                some |= self._worst_tiles(share)
+        self._forward(some)
 
     def show(self, gaussians: Gaussians, camera: Camera) -> F32:
         return self._rasterizer_for(camera, self._viewers).forward(gaussians, camera)
+
+    def _forward(self, tiles: Bool | None) -> None:
+        self._planes = self._rasterizer.forward(self._model.gaussians(), self._observation.camera, tiles)
+        self._old |= True if tiles is None else tiles
+
+    def _worst_tiles(self, share: float) -> Bool:
+        """See `focus.worst_tiles`. Only tiles that were drawn since are looked at again."""
+        if self._old.any():
+            seen = self._observation
+            sum_residuals(self._planes, seen.image, seen.tissue, self._old, self._sums)
+            self._old[:] = False
+        return largest(self._sums, share)
 
     def _rasterizer_for(self, camera: Camera, made: dict[tuple[int, int], Rasterizer]) -> Rasterizer:
         size = camera.width, camera.height

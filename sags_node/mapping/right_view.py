@@ -133,8 +133,8 @@ def _sure_tissue(tissue: Bool, depth: F32, focal_px: float, baseline: float) -> 
 
 @parallel_kernel
 def _carry(
-    picture: U8, rgb: F32, drawn: F32, tissue: Bool, disparity: Any, share: Any,
-    right: F32, right_depth: F32, brought: F32,
+    picture: U8, rgb: U8, drawn: F32, tissue: Bool, disparity: Any, share: Any,
+    right: U8, right_depth: F32, brought: F32,
 ) -> None:  # fmt: skip
     """Adds `share` of what the left picture has beyond the left view to the right view; writes all of it to
     `brought`. disparity: px m."""
@@ -148,13 +148,13 @@ def _carry(
 
 @kernel
 def _carry_row(
-    picture: U8, rgb: F32, drawn: F32, tissue: Bool, disparity: Any, share: Any,
-    right: F32, right_depth: F32, brought: F32, sampled: Any,
+    picture: U8, rgb: U8, drawn: F32, tissue: Bool, disparity: Any, share: Any,
+    right: U8, right_depth: F32, brought: F32, sampled: Any,
 ) -> None:  # fmt: skip
     width = len(drawn)
     beyond = np.empty(3 * width, f4)
     for i in range(u8(3 * width)):
-        beyond[i] = f4(picture[i]) * f4(1 / 255) - rgb[i]
+        beyond[i] = (f4(picture[i]) - f4(rgb[i])) * f4(1 / 255)
     # What a right pixel shows lies between `columns` and the next one in the left picture.
     columns, fractions, weights = np.empty(width, np.int32), np.empty(width, f4), np.empty(width, f4)
     last = f4(width - 2)
@@ -171,11 +171,12 @@ def _carry_row(
         if not (tissue[left] and tissue[left + u8(1)] and abs(surface - z) < f4(SAME) * z):
             weights[x] = f4(0)
     for x in range(u8(width)):
-        left, part, weight = u8(3) * u8(columns[x]), fractions[x], share * weights[x]
+        left, part, weight = u8(3) * u8(columns[x]), fractions[x], f4(255) * share * weights[x]
         for c in range(u8(3)):
             first, at = beyond[left + c], u8(3) * x + c
             detail = first + part * (beyond[left + u8(3) + c] - first)
-            right[at] = min(max(right[at] + weight * detail, f4(0)), f4(1))
+            level = min(max(f4(right[at]) + weight * detail, f4(0)), f4(255))
+            right[at] = np.uint8(np.int32(level + f4(0.5)))
     if not sampled:
         return
     for j in range(len(brought)):
@@ -187,7 +188,7 @@ def _carry_row(
 
 
 @kernel
-def _compare(picture: U8, right: F32, brought: F32, sure: Bool, share: Any, sums: F64) -> None:
+def _compare(picture: U8, right: U8, brought: F32, sure: Bool, share: Any, sums: F64) -> None:
     """Adds to `sums`: what the view would lack without detail from the left times that detail, and the
     detail squared."""
     height, width = sure.shape
@@ -197,14 +198,14 @@ def _compare(picture: U8, right: F32, brought: F32, sure: Bool, share: Any, sums
                 continue
             for c in range(3):
                 detail = brought[i, j, c]
-                seen = f4(picture[EVERY * i, EVERY * j, c]) * f4(1 / 255)
-                sums[0] += (seen - right[EVERY * i, EVERY * j, c] + share * detail) * detail
+                lacks = f4(picture[EVERY * i, EVERY * j, c]) - f4(right[EVERY * i, EVERY * j, c])
+                sums[0] += (lacks * f4(1 / 255) + share * detail) * detail
                 sums[1] += detail * detail
 
 
 @parallel_kernel
 def _learn(
-    means: F32, same: Bool, cam: F32, picture: U8, right: F32, right_depth: F32, sure: Bool, colors: F32,
+    means: F32, same: Bool, cam: F32, picture: U8, right: U8, right_depth: F32, sure: Bool, colors: F32,
     turn: Any,
 ) -> None:  # fmt: skip
     for pair in prange(-(-len(means) // (2 * PIECE))):
@@ -217,7 +218,7 @@ def _learn(
 
 @kernel
 def _learn_rows(
-    means: F32, same: Bool, cam: F32, picture: U8, right: F32, right_depth: F32, sure: Bool, colors: F32,
+    means: F32, same: Bool, cam: F32, picture: U8, right: U8, right_depth: F32, sure: Bool, colors: F32,
     first: Any, end: Any,
 ) -> None:  # fmt: skip
     """Moves the colours [N, 3] of Gaussians that show in the right view by what they lack there, the mean of
@@ -243,5 +244,5 @@ def _learn_rows(
             lacks = f4(0)
             for row in range(py - u8(1), py + u8(2)):
                 for column in range(px - u8(1), px + u8(2)):
-                    lacks += f4(picture[row, column, c]) * f4(1 / 255) - right[row, column, c]
-            colors[i, c] += f4(LEARNING / 9) * lacks
+                    lacks += f4(picture[row, column, c]) - f4(right[row, column, c])
+            colors[i, c] += f4(LEARNING / (9 * 255)) * lacks

@@ -17,7 +17,7 @@ from sags_node.geometry import quat_to_matrix
 from sags_node.kernels.jit import PIECE, kernel, parallel_kernel
 from sags_node.mapping.densify import FRONT_TOLERANCE, mean_contribution
 from sags_node.model.gaussians import GaussianModel
-from sags_node.types import F32, I64, Bool, Observation, RenderedView
+from sags_node.types import F32, I64, U8, Bool, Observation, RenderedView
 
 SPLIT = 0.005  # of all, per frame: at most so many are split, where the parts take others' rows
 GROWTH = 0.03  # of all, per frame: the same where there is room
@@ -44,7 +44,7 @@ def split_worst(model: GaussianModel, observation: Observation, view: RenderedVi
     score = np.zeros(model.count, np.float32)
     spare = np.zeros(model.count, np.bool_)
     _look(
-        model.means, contribution, pack(view.camera), view.rgb, view.depth, observation.image,
+        model.means, contribution, pack(view.camera), view.colours.small, view.depth, observation.image,
         observation.tissue, np.float32(HARDLY * mean), np.float32(ENOUGH * mean), score, spare,
     )  # fmt: skip
     spare_rows, wholes = np.flatnonzero(spare), np.flatnonzero(score)
@@ -79,7 +79,7 @@ def _split(model: GaussianModel, wholes: I64, spare: I64) -> None:
 
 @parallel_kernel
 def _look(
-    means: F32, contribution: F32, cam: F32, rgb: F32, drawn: F32, image: F32, tissue: Bool,
+    means: F32, contribution: F32, cam: F32, rgb: U8, drawn: F32, image: F32, tissue: Bool,
     hardly: Any, enough: Any, score: F32, spare: Bool,
 ) -> None:  # fmt: skip
     for piece in prange(-(-len(means) // PIECE)):
@@ -92,12 +92,13 @@ def _look(
 
 @kernel
 def _look_at_rows(
-    means: F32, contribution: F32, cam: F32, rgb: F32, drawn: F32, image: F32, tissue: Bool,
+    means: F32, contribution: F32, cam: F32, rgb: U8, drawn: F32, image: F32, tissue: Bool,
     hardly: Any, enough: Any, score: F32, spare: Bool, first: Any, end: Any,
 ) -> None:  # fmt: skip
     """Of the Gaussians on the visible tissue, marks those that are to spare, and writes how much those that
     may be split have to do with residuals of the colour."""
     height, width = tissue.shape
+    across, down = np.float32(rgb.shape[1] / width), np.float32(rgb.shape[0] / height)
     for i in range(first, end):
         much = contribution[i] > enough and contribution[i] < np.float32(np.inf)
         if not (much or contribution[i] < hardly):
@@ -114,9 +115,10 @@ def _look_at_rows(
         if not much:
             spare[i] = True
             continue
+        row, column = int(py * down), int(px * across)
         square = np.float32(0)
         for k in range(3):
-            difference = rgb[py, px, k] - image[py, px, k]
+            difference = np.float32(rgb[row, column, k]) * np.float32(1 / 255) - image[py, px, k]
             square += difference * difference
         if square < np.float32(3):  # else one of them is damaged
             score[i] = square * contribution[i]

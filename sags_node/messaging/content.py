@@ -130,10 +130,9 @@ def _visible(result: FrameResult) -> Bool:
 
 def _rgba(picture: RenderedView) -> U8:
     """Straight-alpha picture [H, W, 4] of a rendered view."""
-    rgba = np.empty((*picture.alpha.shape, 4), np.uint8)
-    rgba[..., :3] = cv2.convertScaleAbs(picture.rgb, alpha=255.0)  # scales, rounds and saturates in one pass
-    rgba[..., 3] = cv2.convertScaleAbs(picture.alpha, alpha=255.0)
-    return rgba
+    rgba = cv2.cvtColor(picture.rgb, cv2.COLOR_RGB2RGBA)
+    alpha = cv2.convertScaleAbs(picture.alpha, alpha=255.0)  # scales, rounds and saturates in one pass
+    return np.asarray(cv2.insertChannel(alpha, rgba, 3), np.uint8)
 
 
 def _confidence(gaussians: Gaussians) -> F32:

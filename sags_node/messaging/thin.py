@@ -91,8 +91,7 @@ def _colour(result: FrameResult, topic: str, part: tuple[slice, slice]) -> U8:
         assert result.pair.right is not None  # else it is not told of
         return result.pair.right[part]
     view = _view(result, topic)
-    rgb = cv2.convertScaleAbs(view.rgb[part], alpha=255.0)
-    over_black: U8 = cv2.multiply(rgb, cv2.merge([_alpha(view, part)] * 3), scale=1 / 255)
+    over_black: U8 = cv2.multiply(view.rgb[part], cv2.merge([_alpha(view, part)] * 3), scale=1 / 255)
     return over_black
 
 

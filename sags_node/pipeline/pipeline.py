@@ -331,7 +331,7 @@ class Pipeline:
     ) -> RenderedView:
         """The model drawn for the right eye, which is learnt from where both see tissue."""
         last, stamp = self.newest, mapped.view.t_capture_ns
-        if last is not None and "right" in last.views and last.views["left"].rgb is mapped.view.rgb:
+        if last is not None and "right" in last.views and last.views["left"].colours is mapped.view.colours:
             return replace(last.views["right"], frame_id=mapped.view.frame_id, t_capture_ns=stamp)
         drawn = self._right.draw(mapped, observation, seen.left, self._refiner.show, judged.learn)
         assert seen.right is not None  # else nothing is drawn for it

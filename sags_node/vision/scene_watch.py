@@ -217,8 +217,7 @@ def look(pair: RectifiedPair, last: FrameResult, picture: U8, tissue: Bool) -> L
     step = max(1, pair.camera.width // WIDTH)
     view = last.views["left"]
     seen = picture * np.float32(1 / 255)
-    drawn = np.empty(picture.shape, np.float32)
-    _every(step, view.rgb, drawn)
+    drawn = view.colours.every(step) * np.float32(1 / 255)
     known = (view.alpha[::step, ::step] > SEEN_ALPHA) & tissue
     if np.count_nonzero(known) < FEWEST:
         return Look()

@@ -74,8 +74,9 @@ class InstrumentFinder:
         else:
             memory = self._memory or _Memory(evidence.shape, stamp_ns)
             # Not averaged: the model's picture has no noise, and reading all of it takes long.
-            sampled = cv2.resize(expected.rgb, size, interpolation=cv2.INTER_NEAREST)
-            drawn_red, drawn_green, drawn_blue = cv2.split(_mean(sampled, WINDOW))
+            sampled = cv2.resize(expected.colours.small, size, interpolation=cv2.INTER_NEAREST)
+            drawn = _mean(sampled * np.float32(1 / 255), WINDOW)
+            drawn_red, drawn_green, drawn_blue = cv2.split(drawn)
             doubtful = _doubtful(
                 red, green, blue, drawn_red, drawn_green, drawn_blue, _shrunk(expected.alpha, size),
                 is_open, memory.found, memory.trusted,

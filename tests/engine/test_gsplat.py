@@ -36,6 +36,7 @@ from sags_node.engine.device import choose_device
 from sags_node.engine.interface import MAX_OPACITY, MIN_ALPHA
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.errors import SagsError, UsageError
+from sags_node.evaluation.metrics import as_float
 from sags_node.mapping import mapper
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.refiner import CpuRefiner
@@ -135,13 +136,13 @@ def test_a_mapper_learns_the_same_with_it(monkeypatch: pytest.MonkeyPatch) -> No
             )  # fmt: skip
             mapped = learning.take(observation, StepBudget(1))
         view = mapped.view
-        learnt.append((mapped.snapshot.gaussians, view, float(np.square(view.rgb - image).mean())))
+        learnt.append((mapped.snapshot.gaussians, view, float(np.square(as_float(view.rgb) - image).mean())))
     (found, view, error), (expected, true_view, true_error) = learnt
     np.testing.assert_array_equal(found.ids, expected.ids)
     assert len(found) > 40 and true_error < 0.01
     assert error == pytest.approx(true_error, rel=0.01)
     assert relative_error(found.means, expected.means) < 1e-4  # Adam divides what is nearly 0 by its own size
-    assert np.abs(view.rgb - true_view.rgb).max() < 0.02
+    assert np.abs(view.rgb.astype(int) - true_view.rgb).max() < 0.02 * 255
 
 
 # ---- whether it can be used --------------------------------------------------------------------------------

@@ -236,7 +236,7 @@ def test_the_video_goes_around_and_comes_back(scene: Scene, tmp_path: Path) -> N
     still = tmp_path / "still.mp4"
     export.export(scene, {"orbit": still}, export.Orbit(degrees=0, seconds=0.1), lambda *said: None)
     view = rasterize(scene.gaussians, scene.camera)
-    apart = np.abs(frames_of(still)[0] / 255 - view.rgb)[view.alpha > 0.99]
+    apart = np.abs((frames_of(still)[0].astype(int) - view.rgb) / 255)[view.alpha > 0.99]
     assert apart.mean(axis=0).max() < 0.02
 
 

@@ -13,7 +13,7 @@ import pytest
 from click.testing import CliRunner
 
 from benchmarks.__main__ import main
-from sags_node.engine.rasterizer.rasterize import to_view
+from sags_node.engine.rasterizer.views import colours_of
 from sags_node.errors import SagsError
 from sags_node.evaluation.metrics import as_float, psnr
 from sags_node.fitting.clip import ClipFrame, play
@@ -40,7 +40,7 @@ def started(frames: list[ClipFrame], settings: StreamSettings) -> StreamFit:
 
 
 def picture(fit: StreamFit, frame: ClipFrame) -> F32:
-    return to_view(fit.draw(frame.t_capture_ns, frame.camera), frame.camera, 0, 0).rgb
+    return colours_of(fit.draw(frame.t_capture_ns, frame.camera))
 
 
 def quality(fit: StreamFit, frame: ClipFrame) -> float:
@@ -104,7 +104,7 @@ def test_what_was_learnt_is_remembered_and_helps_the_next_frame(frames: list[Cli
     assert quality(fit, frames[11]) > predicted
     # the field knows where the tissue was at the start of the window; the newest state alone does not
     oldest = fit.kept[0]
-    newest_state = to_view(fit.draw(frames[11].t_capture_ns, oldest.camera), oldest.camera, 0, 0).rgb
+    newest_state = colours_of(fit.draw(frames[11].t_capture_ns, oldest.camera))
     assert quality(fit, oldest) > psnr(newest_state, as_float(oldest.image), oldest.tissue) + 1
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sags_node.types import Camera, Gaussians, Observation, RenderedView, Snapshot
+from sags_node.types import Camera, Colours, Gaussians, Observation, RenderedView, Snapshot
 
 Scene = tuple[Observation, Snapshot, RenderedView]
 
@@ -44,6 +44,7 @@ def flat_scene(
     depth = np.full(shape, drawn, np.float32)
     image = np.zeros((*shape, 3), np.float32)
     tissue = np.ones(shape, bool)
+    dark = Colours(np.zeros((*shape, 3), np.uint8))
     observation = Observation(frame, stamp_ns, camera, image, gray, tissue, depth, depth)
     snapshot = Snapshot(frame, stamp_ns, 0, gaussians, np.zeros_like(means), camera, 0.0)
-    return observation, snapshot, RenderedView(frame, stamp_ns, camera, image, depth, np.ones_like(depth))
+    return observation, snapshot, RenderedView(frame, stamp_ns, camera, dark, depth, np.ones_like(depth))

@@ -18,6 +18,7 @@ from sags_node.messaging.control import Handler
 from sags_node.messaging.publisher import Publisher
 from sags_node.types import (
     Camera,
+    Colours,
     FrameResult,
     Gaussians,
     NodeHealth,
@@ -54,6 +55,7 @@ def plane_result(
     camera = plane_camera()
     v, u = np.mgrid[:HEIGHT, :WIDTH]
     picture = np.stack([2 * u, 3 * v, u + v], -1).astype(np.uint8)
+    shown = Colours(picture)
     colors = picture.astype(np.float32) / 255
     depth = plane_depth(camera)
     known = depth.copy()
@@ -83,8 +85,8 @@ def plane_result(
             frame_id, stamp, step, gaussians, np.zeros_like(gaussians.means), camera, 0.01, {"inserted": 3}
         ),
         views={
-            "left": RenderedView(frame_id, stamp, camera, colors, known, alpha, sure),
-            "right": RenderedView(frame_id, stamp, camera.moved_right(BASELINE), colors, known, alpha, sure),
+            "left": RenderedView(frame_id, stamp, camera, shown, known, alpha, sure),
+            "right": RenderedView(frame_id, stamp, camera.moved_right(BASELINE), shown, known, alpha, sure),
         },
         epoch=epoch,
         timings_ms={"map": 12.0},

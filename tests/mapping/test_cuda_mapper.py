@@ -21,6 +21,7 @@ from sags_node.engine.cuda.rasterizer import CudaRasterizer
 from sags_node.engine.failures import DeviceMemoryError
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.errors import UsageError
+from sags_node.evaluation.metrics import as_float
 from sags_node.mapping import densify, exposure, fallback_refiner, mapper
 from sags_node.mapping.anchors import Anchors
 from sags_node.mapping.budget import StepBudget
@@ -76,7 +77,9 @@ def frame(i: int, seed: int = 1, brightness: float = 1.0, instrument: bool = Tru
 
 
 def psnr(view: RenderedView, observation: Observation) -> float:
-    return float(-10 * np.log10(np.mean(np.square(view.rgb - observation.image)[observation.tissue])))
+    return float(
+        -10 * np.log10(np.mean(np.square(as_float(view.rgb) - observation.image)[observation.tissue]))
+    )
 
 
 @dataclass

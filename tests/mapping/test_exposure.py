@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from places import SESSION
 
+from sags_node.evaluation.metrics import as_float
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.exposure import LARGEST, exposure_gain
 from sags_node.pipeline.pipeline import Pipeline
@@ -70,5 +71,5 @@ def brighter(frame: StereoFrame, gain: float) -> StereoFrame:
 
 
 def psnr(result: FrameResult) -> float:
-    error = (result.views["left"].rgb - result.observation.image)[result.observation.tissue]
+    error = (as_float(result.views["left"].rgb) - result.observation.image)[result.observation.tissue]
     return float(-10 * np.log10(np.mean(np.square(error))))

@@ -12,6 +12,7 @@ from sags_node.mapping import focus
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.focus import EVERY, with_neighbours, worst_tiles
 from sags_node.mapping.ladder import Rung
+from sags_node.mapping.refiner import CpuRefiner
 from sags_node.mapping.split import SPLIT
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import open_session
@@ -50,8 +51,8 @@ def numpy_sums(planes: F32, image: F32, tissue: Bool) -> F32:
 
 def test_the_kernel_its_source_and_numpy_agree(scene: tuple[F32, F32, Bool]) -> None:
     compiled, source = np.zeros((2, *SHAPE), np.float32)
-    focus._sum_residuals(*scene, compiled)
-    focus._sum_residuals.py_func(*scene, source)
+    focus.sum_residuals(*scene, np.ones(SHAPE, np.bool_), compiled)
+    focus.sum_residuals.py_func(*scene, np.ones(SHAPE, np.bool_), source)
     assert compiled.min() >= 0 and compiled.max() > 10
     assert np.allclose(compiled, source, rtol=1e-5)
     assert np.allclose(compiled, numpy_sums(*scene), rtol=1e-4)
@@ -128,3 +129,24 @@ def test_in_a_hurry_the_first_step_leaves_alone_what_fits_best() -> None:
     pipeline.process(third, budget)
     whole = rows()
     assert np.mean([hurried[i][1] == whole[i][1] for i in hurried.keys() & whole.keys()]) < 0.01
+
+
+def test_the_worst_tiles_are_those_of_what_was_drawn_last(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tiles that were not drawn again are not looked at again: nothing in them has changed."""
+    asked = 0
+    of_the_refiner = CpuRefiner._worst_tiles
+
+    def compared(refiner: CpuRefiner, share: float) -> Bool:
+        nonlocal asked
+        asked += 1
+        found, seen = of_the_refiner(refiner, share), refiner._observation
+        np.testing.assert_array_equal(found, worst_tiles(refiner.planes(), seen.image, seen.tissue, share))
+        return found
+
+    monkeypatch.setattr(CpuRefiner, "_worst_tiles", compared)
+    session = open_session(SESSION, ["source.pace:=step", "mapping.max_gaussians:=4000"])
+    pipeline = Pipeline(session.config, session.rig)
+    with session.source as source:
+        for frame, _ in zip(source, range(4), strict=False):
+            pipeline.process(frame, StepBudget(3, Rung(4000, step=0.4, redraw=0.4)))
+    assert asked == 3 * 4  # a step on a part, two on what is worst, and what is shown; not in the first frame

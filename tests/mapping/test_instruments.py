@@ -14,7 +14,7 @@ from sags_node.config.schema import LaunchConfig
 from sags_node.mapping.budget import StepBudget
 from sags_node.phantom.scene import Phantom, PhantomScene
 from sags_node.pipeline.pipeline import Pipeline
-from sags_node.types import U8, Camera, RenderedView, StereoFrame
+from sags_node.types import U8, Camera, Colours, RenderedView, StereoFrame
 from sags_node.vision.tissue_classical import LONGEST_DOUBT, InstrumentFinder
 
 
@@ -27,7 +27,7 @@ def drawn(picture: U8) -> RenderedView:
     """A model that looks like this picture."""
     camera = Camera(WIDTH, HEIGHT, np.eye(3), np.eye(4))
     plane = np.ones((HEIGHT, WIDTH), np.float32)
-    return RenderedView(0, 0, camera, picture.astype(np.float32) / 255, plane, plane)
+    return RenderedView(0, 0, camera, Colours(picture), plane, plane)
 
 
 def test_grey_and_gold_that_come_in_from_the_edge_are_instruments() -> None:

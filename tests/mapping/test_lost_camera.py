@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from sags_node.engine.rasterizer.views import to_view
+from sags_node.evaluation.metrics import as_float
 from sags_node.geometry import invert, transform
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.camera_pose import exponential
@@ -188,7 +189,7 @@ def test_the_light_moves_with_the_scope(folder: Path) -> None:
         psnr = []
         for gaussians in (pipeline.map.model.gaussians(), pipeline.map.relight(pair.camera)):
             view = to_view(pipeline._refiner.show(gaussians, pair.camera), pair.camera, 0, 0)
-            wrong = (view.rgb - pair.left / np.float32(255))[tissue & (view.alpha > 0.9)]
+            wrong = (as_float(view.rgb) - pair.left / np.float32(255))[tissue & (view.alpha > 0.9)]
             psnr.append(-10 * np.log10(np.mean(np.square(wrong))))
         gains[name] = psnr[1] - psnr[0]
     # Seen from elsewhere tissue has its broad gleam elsewhere too, which is left out: turned, there is less

@@ -5,8 +5,9 @@ import pytest
 
 from sags_node.mapping import densify, initialise
 from sags_node.mapping.motion import found, scene_flow
+from sags_node.mapping.surface import surface_at
 from sags_node.model.gaussians import GaussianModel
-from sags_node.types import Camera, Observation, RenderedView
+from sags_node.types import Bool, Camera, Colours, Observation, RenderedView
 
 WIDTH, HEIGHT, FOCAL, DEPTH = 64, 48, 60.0, 0.08
 
@@ -29,9 +30,14 @@ def observation(depth: float = DEPTH, T: np.ndarray | None = None, seed: int = 0
 def view(depth: float = DEPTH) -> RenderedView:
     shape = (HEIGHT, WIDTH)
     return RenderedView(
-        0, 0, camera(), np.zeros((*shape, 3), np.float32), np.full(shape, depth, np.float32),
+        0, 0, camera(), Colours(np.zeros((*shape, 3), np.uint8)), np.full(shape, depth, np.float32),
         np.ones(shape, np.float32),
     )  # fmt: skip
+
+
+def pruned(model: GaussianModel, frame: Observation) -> Bool:
+    surface = surface_at(model.means, frame)
+    return densify.prune_mask(model, surface, frame.depth_is_new, model.capacity)
 
 
 def grid_points(depth: float = DEPTH) -> np.ndarray:
@@ -142,8 +148,8 @@ def test_free_space_is_cleared_only_after_several_frames() -> None:
     )
     frame = observation()
     for _ in range(densify.FRONT_FRAMES - 1):
-        assert not densify.prune_mask(model, frame, model.capacity).any()
-    assert densify.prune_mask(model, frame, model.capacity).all()
+        assert not pruned(model, frame).any()
+    assert pruned(model, frame).all()
 
 
 def test_what_is_not_finite_or_transparent_goes_at_once_and_what_left_the_view_when_it_is_crowded() -> None:
@@ -155,9 +161,9 @@ def test_what_is_not_finite_or_transparent_goes_at_once_and_what_left_the_view_w
     model.colors[1, 2] = np.inf
     model.opacities[2] = 0.01
     model.means[3, 0] = 1.0
-    assert np.flatnonzero(densify.prune_mask(model, observation(), model.capacity)).tolist() == [0, 1, 2]
+    assert np.flatnonzero(pruned(model, observation())).tolist() == [0, 1, 2]
     model.append(points[50:], size[50:], grey[50:], 0.9)
-    assert np.flatnonzero(densify.prune_mask(model, observation(), model.capacity)).tolist() == [0, 1, 2, 3]
+    assert np.flatnonzero(pruned(model, observation())).tolist() == [0, 1, 2, 3]
 
 
 def test_where_the_machine_affords_fewer_those_that_show_least_go_but_none_that_has_just_come() -> None:

@@ -12,6 +12,7 @@ from places import SESSION
 
 from sags_node.engine.rasterizer.rasterize import rasterize
 from sags_node.evaluation.measure import Options
+from sags_node.evaluation.metrics import as_float
 from sags_node.evaluation.session import evaluate
 from sags_node.evaluation.trajectory import RigidOdometry, trajectory_errors
 from sags_node.findings import by_code
@@ -165,7 +166,7 @@ def known_poses(frames: list[StereoFrame]) -> F64:
 
 def psnr(result: FrameResult) -> float:
     tissue = result.observation.tissue
-    error = (result.views["left"].rgb - result.observation.image)[tissue]
+    error = (as_float(result.views["left"].rgb) - result.observation.image)[tissue]
     return float(-10 * np.log10(np.mean(np.square(error))))
 
 
@@ -290,7 +291,7 @@ def test_a_keyframe_finds_the_camera_again_where_flow_cannot(
     here = result.pair.camera
     far = here.T_world_cam @ exponential(np.array([8e-3, -4e-3, 2e-3, 0.05, 0.05, 0.3]))  # 17 degrees
     there = rasterize(result.snapshot.gaussians, replace(here, T_world_cam=far))
-    picture = cv2.cvtColor(cv2.convertScaleAbs(there.rgb, alpha=255), cv2.COLOR_RGB2GRAY)
+    picture = cv2.cvtColor(there.rgb, cv2.COLOR_RGB2GRAY)
     seen = replace(result.observation, gray=picture, tissue=there.alpha > 0.5)
     found = keyframes.find(seen)
     mm, degrees = error_mm_deg(found[0], far)

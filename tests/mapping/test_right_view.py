@@ -17,7 +17,7 @@ from sags_node.mapping.right_eye import right_eye_mask
 from sags_node.mapping.right_view import FADING, RightView
 from sags_node.pipeline.pipeline import FrameRequest, Pipeline
 from sags_node.pipeline.session import open_session
-from sags_node.types import F32, Bool, Camera, FrameResult, Gaussians
+from sags_node.types import F32, U8, Bool, Camera, Colours, FrameResult, Gaussians
 
 FRAMES = 10
 FEW = ["mapping.max_gaussians:=6000"]
@@ -32,14 +32,14 @@ def played() -> tuple[Pipeline, list[FrameResult]]:
         return pipeline, [pipeline.process(frame, StepBudget(1)) for frame in source]
 
 
-def quality(result: FrameResult, picture: F32, known: Bool | None = None) -> float:
+def quality(result: FrameResult, picture: F32 | U8, known: Bool | None = None) -> float:
     """PSNR of a picture for the right eye, dB, where that eye sees tissue, and where it is `known`."""
     camera, right = result.pair.camera, result.pair.right
     assert right is not None
     depths = result.views["left"].depth[result.observation.tissue]
     mask = right_eye_mask(result.observation.tissue, depths[depths > 0], camera.K[0, 0], result.pair.baseline)
     truth, where = metrics.as_float(right), mask if known is None else mask & known
-    return metrics.psnr(metrics.fit_gain_offset(picture, truth, where), truth, where)
+    return metrics.psnr(metrics.fit_gain_offset(picture.astype(np.float32), truth, where), truth, where)
 
 
 def qualities(result: FrameResult) -> tuple[float, float]:
@@ -51,7 +51,7 @@ def qualities(result: FrameResult) -> tuple[float, float]:
     return quality(result, result.views["right"].rgb, there), quality(result, warp, there)
 
 
-def model_alone(result: FrameResult) -> F32:
+def model_alone(result: FrameResult) -> U8:
     """Of the right eye."""
     camera = result.pair.camera.moved_right(result.pair.baseline)
     return rasterize(result.snapshot.gaussians, camera).rgb
@@ -145,7 +145,7 @@ def test_nothing_of_the_left_picture_comes_over_but_tissue(scene: Scene) -> None
     shows = np.indices(drawn.depth.shape)[1] + disparity  # the left picture's column
     changed = (drawn.rgb != plain).any(-1)
     assert not changed[shows >= 160].any()
-    assert changed.mean() > 0.2 and np.median(drawn.rgb[changed]) > 0.99  # all of it, with the share of 1
+    assert changed.mean() > 0.2 and np.median(drawn.rgb[changed]) > 252  # all of it, with the share of 1
 
 
 def test_what_the_right_eye_sees_more_is_learnt_where_it_is_tissue_for_certain(
@@ -158,7 +158,7 @@ def test_what_the_right_eye_sees_more_is_learnt_where_it_is_tissue_for_certain(
     tissue[:100] = False
     view = RightView()
     drawn = view.draw(scene.mapped(), scene.result.observation, scene.result.pair.left, scene.show, False)
-    dim = replace(drawn, view=replace(drawn.view, rgb=np.full_like(drawn.view.rgb, 0.4)))
+    dim = replace(drawn, view=replace(drawn.view, colours=Colours(np.full_like(drawn.view.rgb, 102))))
     bright = np.full(drawn.view.rgb.shape, 153, np.uint8)  # 0.6
     model.right_colors[:] = 0
     view.learn(dim, model, bright, tissue, baseline)

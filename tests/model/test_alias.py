@@ -332,9 +332,9 @@ def test_a_ply_file_draws_the_same_without_knowing_the_filter(tmp_path: Path) ->
     )
     found, drawn = rasterize(read, observation.camera), rasterize(model.gaussians(), observation.camera)
     step = 1 / 255  # a logit's last bit may carry a pixel over the cut-off
-    np.testing.assert_allclose(found.rgb, drawn.rgb, atol=step)
+    apart = np.abs(found.rgb.astype(int) - drawn.rgb)
+    assert apart.max() <= 1 and apart.mean() < 1e-3
     np.testing.assert_allclose(found.alpha, drawn.alpha, atol=step)
-    assert np.abs(found.rgb - drawn.rgb).mean() < 1e-6
 
 
 def test_folding_twice_changes_nothing() -> None:

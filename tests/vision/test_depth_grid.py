@@ -15,15 +15,17 @@ from sags_node.evaluation import calibration
 from sags_node.geometry import unproject
 from sags_node.mapping import densify
 from sags_node.mapping.depth_memory import DRIFT, UNSEEN, remember
+from sags_node.mapping.surface import surface_at
 from sags_node.model.gaussians import GaussianModel
 from sags_node.phantom.scene import Phantom, PhantomScene
-from sags_node.types import Camera, DepthGrid, Observation, RectifiedPair, RenderedView, StereoFrame
+from sags_node.types import Camera, Colours, DepthGrid, Observation, RectifiedPair, RenderedView, StereoFrame
 from sags_node.vision.depth_grid import JUMP, SLOPE, depth_grid
 from sags_node.vision.rectify import Rectifier
 from sags_node.vision.stereo import StereoDepth
 
 WIDTH, HEIGHT, FOCAL, BASELINE, DEPTH = 320, 256, 300.0, 4e-3, 0.08
 SHAPE = (HEIGHT, WIDTH)
+BLACK = Colours(np.zeros((*SHAPE, 3), np.uint8))
 CAMERA = Camera(WIDTH, HEIGHT, np.array([[FOCAL, 0, 160.0], [0, FOCAL, 128.0], [0, 0, 1]]), np.eye(4))
 
 
@@ -147,20 +149,21 @@ def test_what_moves_unseen_is_known_worse_and_comes_back_when_it_is_measured() -
     model.velocities[:, 0] = 0.02
     hidden = model.means[:, 0] > 1e-3
     for _ in range(30):
-        remember(model, observation(depth * tissue, tissue), 0.4, 1 / 30)
+        remember(model, surface_at(model.means, observation(depth * tissue, tissue)), 0.4, 1 / 30)
     grown = 1e-3 + DRIFT * 0.02 + UNSEEN
     assert np.allclose(model.depth_errors[hidden], grown, rtol=1e-3)
     assert confidence_of(model.depth_errors[hidden]).max() < SURE
     assert confidence_of(model.depth_errors[~hidden]).mean() > SURE
     seen[:] = True
     for _ in range(10):
-        remember(model, observation(depth, seen), 0.4, 1 / 30)
+        remember(model, surface_at(model.means, observation(depth, seen)), 0.4, 1 / 30)
     assert confidence_of(model.depth_errors).min() > SURE
 
 
 def test_a_measurement_that_contradicts_makes_unsure() -> None:
     model = wall(5e-4)
-    remember(model, observation(np.full(SHAPE, DEPTH - 0.006, np.float32), np.ones(SHAPE, bool)), 0.4, 0.03)
+    nearer = observation(np.full(SHAPE, DEPTH - 0.006, np.float32), np.ones(SHAPE, bool))
+    remember(model, surface_at(model.means, nearer), 0.4, 0.03)
     assert model.depth_errors.min() >= 0.0059
 
 
@@ -186,7 +189,7 @@ def test_the_drawn_depth_says_how_sure_it_is_and_keeps_silent_where_it_is_a_gues
     right = model.means[:, 0] > 0
     model.depth_errors[right] = 0.02
     drawn = np.full(SHAPE, DEPTH, np.float32)
-    view = RenderedView(0, 0, CAMERA, np.zeros((*SHAPE, 3), np.float32), drawn, np.ones(SHAPE, np.float32))
+    view = RenderedView(0, 0, CAMERA, BLACK, drawn, np.ones(SHAPE, np.float32))
     shown = with_confidence(view, model.gaussians())
     assert shown.confidence is not None
     assert np.allclose(shown.confidence[:, :140], confidence_of(np.float32(1e-3)), atol=1e-3)
@@ -202,7 +205,7 @@ def test_a_drawn_depth_is_no_surer_than_it_agrees_with_what_is_measured() -> Non
     seen[:, : WIDTH // 2] -= apart
     grid = grid_of(seen.copy())
     drawn = np.full(SHAPE, DEPTH, np.float32)
-    view = RenderedView(0, 0, CAMERA, np.zeros((*SHAPE, 3), np.float32), drawn, np.ones(SHAPE, np.float32))
+    view = RenderedView(0, 0, CAMERA, BLACK, drawn, np.ones(SHAPE, np.float32))
     shown = with_confidence(view, wall(1e-3).gaussians(), grid)
     assert shown.confidence is not None
     its_error = float((grid.error * np.square(DEPTH - apart))[:, :30].max())
@@ -217,7 +220,7 @@ def test_a_model_that_does_not_know_its_errors_has_no_confidence() -> None:
         0,
         0,
         CAMERA,
-        np.zeros((*SHAPE, 3), np.float32),
+        BLACK,
         np.ones(SHAPE, np.float32),
         np.ones(SHAPE, np.float32),
     )

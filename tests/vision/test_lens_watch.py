@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from places import SESSION
 
+from sags_node.evaluation.metrics import as_float
 from sags_node.findings import by_code
 from sags_node.mapping.budget import StepBudget
 from sags_node.pipeline.pipeline import Pipeline
@@ -79,7 +80,7 @@ def test_a_drop_on_the_left_lens_is_no_tissue(
         assert tissue[_disc(tissue.shape, RADIUS)].mean() < 0.1
         assert tissue[far].mean() > 0.95 * true[far].mean()
     truth = frames[FIRST + COUNT - 1].left.astype(np.float32) / 255
-    drawn = results[FIRST + COUNT - 1].views["left"].rgb
+    drawn = as_float(results[FIRST + COUNT - 1].views["left"].rgb)
     inner = _disc(truth.shape, 0.7 * RADIUS)
     wet = _wet(frames[FIRST + COUNT - 1].left).astype(np.float32) / 255
     assert np.square(drawn - truth)[inner].mean() < 0.5 * np.square(drawn - wet)[inner].mean()

@@ -2,51 +2,84 @@
 
 from __future__ import annotations
 
-import cv2
-import numba
-import numpy as np
+from typing import Any
 
-from sags_node.kernels.jit import parallel_kernel, read_only
-from sags_node.types import F32, Camera, RenderedView
+import cv2
+import numpy as np
+from numba import prange
+
+from sags_node.kernels.jit import inlined, kernel, parallel_kernel, read_only
+from sags_node.types import F32, U8, Camera, Colours, RenderedView
 
 f4 = np.float32
+u8 = np.uint64
 ZERO, ONE = f4(0.0), f4(1.0)
 FAINT = f4(1e-3)  # below this coverage a colour means nothing
 SOLID = f4(0.5)  # coverage from which on a depth is stated
-
-
-@parallel_kernel
-def _normalise(planes: F32, solid: F32, rgb: F32, depth: F32, alpha: F32) -> None:
-    """planes [5, H, W], the last for the coverage of the colours; solid [H, W] is that of the depth."""
-    _, height, width = planes.shape
-    for y in numba.prange(height):
-        for x in range(width):
-            coverage = planes[4, y, x]
-            inverse = ONE / coverage if coverage > FAINT else ZERO
-            for k in range(3):
-                rgb[y, x, k] = min(max(planes[k, y, x] * inverse, ZERO), ONE)
-            coverage = solid[y, x]
-            depth[y, x] = planes[3, y, x] / coverage if coverage >= SOLID else ZERO
-            alpha[y, x] = min(max(coverage, ZERO), ONE)
 
 
 def to_view(planes: F32, camera: Camera, frame_id: int, t_capture_ns: int) -> RenderedView:
     """The picture that `planes` [5, h, w] of `Rasterizer.forward` show, in fresh arrays of the camera's size.
 
     rgb = C / alpha held in 0..1, 0 where alpha < 0.001; depth = D / alpha (m) where alpha >= 0.5, else 0.
-    Planes of another size than the camera's are interpolated before they are divided: colours by cubic
-    polynomials, which keep twice the sharpness, depths by straight lines, which invent no depth beyond those
-    around.
+    Planes of another size than the camera's are interpolated: depths, before they are divided, by straight
+    lines, which invent no depth beyond those around; colours as bytes, when somebody asks for them.
     """
     height, width = camera.height, camera.width
-    solid = planes[4]
-    if planes.shape[1:] != (height, width):
-        size, small = (width, height), planes
-        planes = np.empty((5, height, width), f4)
-        for k in (0, 1, 2, 4):
-            cv2.resize(small[k], size, planes[k], interpolation=cv2.INTER_CUBIC)
-        cv2.resize(small[3], size, planes[3], interpolation=cv2.INTER_LINEAR)
-        solid = cv2.resize(solid, size, interpolation=cv2.INTER_LINEAR)
-    rgb, (depth, alpha) = np.empty((height, width, 3), f4), np.empty((2, height, width), f4)
-    _normalise(read_only(planes), read_only(solid), rgb, depth, alpha)
-    return RenderedView(frame_id, t_capture_ns, camera, rgb, depth, alpha)
+    colours = np.empty((*planes.shape[1:], 3), np.uint8)
+    _write_colours(read_only(planes), colours)
+    sums, coverage = planes[3], planes[4]
+    if coverage.shape != (height, width):
+        sums, coverage = (
+            cv2.resize(plane, (width, height), interpolation=cv2.INTER_LINEAR) for plane in (sums, coverage)
+        )
+    depth, alpha = np.empty((2, height, width), f4)
+    _write_depths(read_only(sums), read_only(coverage), depth, alpha)
+    return RenderedView(frame_id, t_capture_ns, camera, Colours(colours, width, height), depth, alpha)
+
+
+def colours_of(planes: F32) -> F32:
+    """RGB [H, W, 3] 0..1 that `planes` [5, H, W] show, where bytes are too coarse; as `to_view`."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found = np.where(planes[4] > FAINT, planes[:3] / planes[4], ZERO)
+    return np.ascontiguousarray(np.clip(found, ZERO, ONE).transpose(1, 2, 0))
+
+
+@inlined
+def _byte(value: Any) -> Any:
+    return np.uint8(np.int32(min(max(value, ZERO), ONE) * f4(255) + f4(0.5)))
+
+
+@parallel_kernel
+def _write_colours(planes: F32, colours: U8) -> None:
+    for row in prange(planes.shape[1]):
+        y = np.int64(row)
+        _write_colours_row(planes[0, y], planes[1, y], planes[2, y], planes[4, y], colours[y].reshape(-1))
+
+
+@kernel
+def _write_colours_row(red: F32, green: F32, blue: F32, coverage: F32, colours: U8) -> None:
+    for i in range(coverage.size):
+        x = u8(i)
+        inverse = ONE / coverage[x] if coverage[x] > FAINT else ZERO
+        at = u8(3) * x
+        colours[at] = _byte(red[x] * inverse)
+        colours[at + u8(1)] = _byte(green[x] * inverse)
+        colours[at + u8(2)] = _byte(blue[x] * inverse)
+
+
+@parallel_kernel
+def _write_depths(sums: F32, coverage: F32, depth: F32, alpha: F32) -> None:
+    for row in prange(len(sums)):
+        y = np.int64(row)
+        _write_depths_row(sums[y], coverage[y], depth[y], alpha[y])
+
+
+@kernel
+def _write_depths_row(sums: F32, coverage: F32, depth: F32, alpha: F32) -> None:
+    for i in range(sums.size):
+        x = u8(i)
+        solid = coverage[x] >= SOLID
+        quotient = sums[x] / coverage[x]
+        depth[x] = quotient if solid else ZERO
+        alpha[x] = min(max(coverage[x], ZERO), ONE)
