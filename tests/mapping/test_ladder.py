@@ -183,7 +183,7 @@ def test_how_many_gaussians_a_model_may_have() -> None:
 
 def test_a_new_budget_goes_on_at_the_speed_of_the_one_before() -> None:
     config = LaunchConfig(device="cpu")
-    fast, slow = (make_budget(config, 640, 512, speed).state for speed in (0.5, 2.0))
+    fast, slow = (make_budget(config, 640, 512, speed).plan.state for speed in (0.5, 2.0))
     assert fast is not None and slow is not None and fast.number > slow.number
 
 

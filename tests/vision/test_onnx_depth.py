@@ -28,7 +28,7 @@ from sags_node.vision.mono_depth import MonoDepth
 from sags_node.vision.mono_scale import fit_scale_shift
 from sags_node.vision.onnx_network import DepthNetwork
 from sags_node.vision.onnx_session import DepthNetworkError
-from sags_node.vision.pair_watch import PairWatch, Verdict
+from sags_node.vision.pair_watch import PairWatch
 from sags_node.vision.rectify import Rectifier
 from sags_node.vision.scene_watch import SceneWatch
 from sags_node.vision.stereo import StereoDepth
@@ -318,7 +318,7 @@ def test_a_network_replaces_the_matcher(
 @pytest.fixture
 def unwatched(monkeypatch: pytest.MonkeyPatch) -> None:
     """Dark pictures are taken in: else no network would ever see one."""
-    monkeypatch.setattr(PairWatch, "__call__", lambda self, frame, pair: Verdict())
+    monkeypatch.setattr(PairWatch, "judge", lambda self, evidence, judged: judged)
     monkeypatch.setattr(SceneWatch, "judge", lambda self, evidence, judged: judged)
 
 
