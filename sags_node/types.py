@@ -169,7 +169,7 @@ class Observation:
     frame_id: int
     t_capture_ns: int
     camera: Camera
-    image: F32  # [H, W, 3] RGB 0..1
+    image: U8  # [H, W, 3] RGB
     gray: U8  # [H, W], for optical flow
     tissue: Bool  # [H, W] True = tissue
     depth: F32  # [H, W] m, 0 unknown

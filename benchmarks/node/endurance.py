@@ -17,7 +17,7 @@ import numpy as np
 from rich.table import Table
 
 from sags_node.errors import SagsError
-from sags_node.evaluation.metrics import psnr
+from sags_node.evaluation.metrics import as_float, psnr
 from sags_node.evaluation.provenance import machine_name
 from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import Budget
@@ -82,7 +82,8 @@ class _Run:
         began, cpu_began = time.perf_counter(), time.process_time()
         result = self.pipeline.process(frame, self._budget)
         ms, cpu_ms = (time.perf_counter() - began) * 1e3, (time.process_time() - cpu_began) * 1e3
-        quality = psnr(result.views["left"].rgb, result.observation.image, result.observation.tissue)
+        seen = result.observation
+        quality = psnr(result.views["left"].rgb, as_float(seen.image), seen.tissue)
         still = "motion" in result.skipped
         return _Taken(ms, cpu_ms, quality, still, not still and "depth" in result.skipped)
 

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numba import prange
 
+from sags_node.engine.losses.pieces import LEVEL
 from sags_node.engine.losses.tissue import COVERED
 from sags_node.engine.rasterizer.compositing import TILE_HEIGHT, TILE_WIDTH
 from sags_node.kernels.jit import kernel, parallel_kernel
@@ -17,7 +18,7 @@ EVERY = 2  # px: a quarter of the pixels tells enough
 REACH = 32  # px: few Gaussians are larger, and those are faint out there
 
 
-def worst_tiles(planes: F32, image: F32, tissue: Bool, share: float) -> Bool:
+def worst_tiles(planes: F32, image: U8, tissue: Bool, share: float) -> Bool:
     """The tiles [rows, columns] of a picture with the largest squared colour residuals.
 
     PSNR counts squares, and most of them stand in few tiles: a step on a sixth of the picture gains half of
@@ -25,7 +26,7 @@ def worst_tiles(planes: F32, image: F32, tissue: Bool, share: float) -> Bool:
 
     Args:
         planes: [5, H, W] of the rasteriser.
-        image: [H, W, 3] RGB 0..1, what they should show.
+        image: [H, W, 3] RGB, what they should show.
         tissue: [H, W] the pixels that count.
         share: of all tiles, 0..1; at least one is chosen.
     """
@@ -65,19 +66,19 @@ def with_neighbours(tiles: Bool) -> Bool:
 
 
 @parallel_kernel
-def _sum_residuals(planes: F32, image: F32, tissue: Bool, sums: F32) -> None:
+def _sum_residuals(planes: F32, image: U8, tissue: Bool, sums: F32) -> None:
     for row in prange(sums.shape[0]):
         _sum_row(planes, image, tissue, sums, np.int64(row))
 
 
 @kernel
-def _sum_row(planes: F32, image: F32, tissue: Bool, sums: F32, row: Any) -> None:
+def _sum_row(planes: F32, image: U8, tissue: Bool, sums: F32, row: Any) -> None:
     height, width = tissue.shape
     for y in range(row * TILE_HEIGHT, min((row + 1) * TILE_HEIGHT, height), EVERY):
         for x in range(0, width, EVERY):
             coverage = planes[4, y, x]
             if tissue[y, x] and coverage > COVERED:
                 for k in range(3):
-                    residual = planes[k, y, x] / coverage - image[y, x, k]
+                    residual = planes[k, y, x] / coverage - np.float32(image[y, x, k]) * LEVEL
                     if abs(residual) < np.float32(1):
                         sums[row, x // TILE_WIDTH] += residual * residual

@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 from numba import prange
 
+from sags_node.engine.losses.pieces import LEVEL
 from sags_node.engine.pinhole import pack, to_camera, to_pixel
 from sags_node.geometry import quat_to_matrix
 from sags_node.kernels.jit import PIECE, kernel, parallel_kernel
 from sags_node.mapping.densify import FRONT_TOLERANCE, mean_contribution
 from sags_node.model.gaussians import GaussianModel
-from sags_node.types import F32, I64, Bool, Observation, RenderedView
+from sags_node.types import F32, I64, U8, Bool, Observation, RenderedView
 
 SPLIT = 0.005  # of all, per frame: at most so many are split, where the parts take others' rows
 GROWTH = 0.03  # of all, per frame: the same where there is room
@@ -79,7 +80,7 @@ def _split(model: GaussianModel, wholes: I64, spare: I64) -> None:
 
 @parallel_kernel
 def _look(
-    means: F32, contribution: F32, cam: F32, rgb: F32, drawn: F32, image: F32, tissue: Bool,
+    means: F32, contribution: F32, cam: F32, rgb: F32, drawn: F32, image: U8, tissue: Bool,
     hardly: Any, enough: Any, score: F32, spare: Bool,
 ) -> None:  # fmt: skip
     for piece in prange(-(-len(means) // PIECE)):
@@ -92,7 +93,7 @@ def _look(
 
 @kernel
 def _look_at_rows(
-    means: F32, contribution: F32, cam: F32, rgb: F32, drawn: F32, image: F32, tissue: Bool,
+    means: F32, contribution: F32, cam: F32, rgb: F32, drawn: F32, image: U8, tissue: Bool,
     hardly: Any, enough: Any, score: F32, spare: Bool, first: Any, end: Any,
 ) -> None:  # fmt: skip
     """Of the Gaussians on the visible tissue, marks those that are to spare, and writes how much those that
@@ -116,7 +117,7 @@ def _look_at_rows(
             continue
         square = np.float32(0)
         for k in range(3):
-            difference = rgb[py, px, k] - image[py, px, k]
+            difference = rgb[py, px, k] - np.float32(image[py, px, k]) * LEVEL
             square += difference * difference
         if square < np.float32(3):  # else one of them is damaged
             score[i] = square * contribution[i]

@@ -44,6 +44,6 @@ def flat_scene(
     depth = np.full(shape, drawn, np.float32)
     image = np.zeros((*shape, 3), np.float32)
     tissue = np.ones(shape, bool)
-    observation = Observation(frame, stamp_ns, camera, image, gray, tissue, depth, depth)
+    observation = Observation(frame, stamp_ns, camera, image.astype(np.uint8), gray, tissue, depth, depth)
     snapshot = Snapshot(frame, stamp_ns, 0, gaussians, np.zeros_like(means), camera, 0.0)
     return observation, snapshot, RenderedView(frame, stamp_ns, camera, image, depth, np.ones_like(depth))

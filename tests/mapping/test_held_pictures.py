@@ -10,6 +10,7 @@ import pytest
 from places import SESSION
 
 from sags_node.confidence import SURE
+from sags_node.evaluation.metrics import as_float
 from sags_node.findings import by_code
 from sags_node.mapping.budget import StepBudget
 from sags_node.messaging.content import OF_THE_MODEL, tells_of
@@ -75,7 +76,7 @@ def play(session: Session, frames: list[StereoFrame]) -> tuple[list[FrameResult]
 
 
 def psnr(result: FrameResult, clean: FrameResult) -> float:
-    error = (result.views["left"].rgb - clean.observation.image)[clean.observation.tissue]
+    error = (result.views["left"].rgb - as_float(clean.observation.image))[clean.observation.tissue]
     return float(-10 * np.log10(np.mean(np.square(error))))
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from sags_node.evaluation.metrics import as_float
 from sags_node.mapping import densify, initialise
 from sags_node.mapping.motion import scene_flow, track
 from sags_node.model.gaussians import GaussianModel
@@ -18,7 +19,7 @@ def camera(T: np.ndarray | None = None) -> Camera:
 
 def observation(depth: float = DEPTH, T: np.ndarray | None = None, seed: int = 0) -> Observation:
     rng = np.random.default_rng(seed)
-    image = rng.uniform(0.2, 0.8, (HEIGHT, WIDTH, 3)).astype(np.float32)
+    image = rng.integers(51, 205, (HEIGHT, WIDTH, 3), np.uint8)
     shape = (HEIGHT, WIDTH)
     return Observation(
         1, 33_000_000, camera(T), image, np.zeros(shape, np.uint8), np.ones(shape, bool),
@@ -103,7 +104,7 @@ def test_the_motion_of_an_instrument_is_not_taken_for_that_of_the_tissue_beside_
 def test_candidates_fill_holes_first() -> None:
     frame = observation()
     planes = np.zeros((5, HEIGHT, WIDTH), np.float32)
-    planes[:3] = np.moveaxis(frame.image, -1, 0)
+    planes[:3] = np.moveaxis(as_float(frame.image), -1, 0)
     planes[3], planes[4] = DEPTH, 1.0
     assert len(densify.candidates(planes, frame, 0)[0]) == 0
     planes[:, 10:30, 20:40] = 0
@@ -126,7 +127,7 @@ def test_a_hole_without_depth_takes_that_of_its_neighbours() -> None:
 def test_candidates_need_residual_and_depth_to_agree_before_a_new_surface_is_believed() -> None:
     frame = observation()
     planes = np.zeros((5, HEIGHT, WIDTH), np.float32)
-    planes[:3] = np.moveaxis(frame.image, -1, 0)
+    planes[:3] = np.moveaxis(as_float(frame.image), -1, 0)
     planes[3], planes[4] = 1.2 * DEPTH, 1.0  # the model is far behind, but the picture agrees
     assert len(densify.candidates(planes, frame, 0)[0]) == 0
     planes[:3] = 1 - planes[:3]

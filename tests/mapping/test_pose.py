@@ -12,6 +12,7 @@ from places import SESSION
 
 from sags_node.engine.rasterizer.rasterize import rasterize
 from sags_node.evaluation.measure import Options
+from sags_node.evaluation.metrics import as_float
 from sags_node.evaluation.session import evaluate
 from sags_node.evaluation.trajectory import RigidOdometry, trajectory_errors
 from sags_node.findings import by_code
@@ -165,7 +166,7 @@ def known_poses(frames: list[StereoFrame]) -> F64:
 
 def psnr(result: FrameResult) -> float:
     tissue = result.observation.tissue
-    error = (result.views["left"].rgb - result.observation.image)[tissue]
+    error = (result.views["left"].rgb - as_float(result.observation.image))[tissue]
     return float(-10 * np.log10(np.mean(np.square(error))))
 
 

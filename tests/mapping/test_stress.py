@@ -12,6 +12,7 @@ import pytest
 from places import SESSION
 
 from sags_node.errors import UsageError
+from sags_node.evaluation.metrics import as_float
 from sags_node.mapping.budget import StepBudget
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import Session, open_session
@@ -64,7 +65,7 @@ def check(result: FrameResult) -> None:
 
 def psnr(result: FrameResult) -> float:
     tissue = result.observation.tissue
-    error = (result.views["left"].rgb - result.observation.image)[tissue]
+    error = (result.views["left"].rgb - as_float(result.observation.image))[tissue]
     return float(-10 * np.log10(np.mean(np.square(error)) + 1e-12))
 
 
