@@ -13,7 +13,7 @@ from sags_node.mapping import densify, initialise
 from sags_node.mapping.budget import Budget
 from sags_node.mapping.depth_memory import remember
 from sags_node.mapping.focus import tile_grid, tiles_of, with_neighbours
-from sags_node.mapping.motion import depth_pull, scene_flow, track
+from sags_node.mapping.motion import HALVINGS, depth_pull, scene_flow, track
 from sags_node.mapping.motion_field import MotionField
 from sags_node.mapping.optimiser import LearningRates
 from sags_node.mapping.refiner import Refiner
@@ -36,6 +36,7 @@ from sags_node.types import (
     Snapshot,
 )
 from sags_node.vision.flow import OpticalFlow
+from sags_node.vision.margin import ClearOfInstruments
 from sags_node.vision.observe import resized
 from sags_node.vision.pyramid import pyramid_of
 
@@ -120,6 +121,7 @@ class Mapper:
         self._lamp: F64 | None = None  # T_world_cam of the scope whose light the colours show
         self._last: Drawn | None = None
         self._found: tuple[U8, F32] | None = None  # a picture, and the pixels where the Gaussians are in it
+        self._clear = ClearOfInstruments(HALVINGS)
         self._view: RenderedView | None = None  # the model as it was drawn last
         self._scale = 1.0  # of the pictures' size: at which the model was drawn last
         self._first_steps = 0  # that a new model has had
@@ -241,7 +243,8 @@ class Mapper:
             if self._last is not None:
                 before = self._last.observation
                 flow = self._flow(pyramid_of(before), pyramid_of(observation), guess)
-                pixels = track(self.model.means, self._last.view, before.tissue, flow, observation.tissue)
+                clear = self._clear(before.tissue), self._clear(observation.tissue)
+                pixels = track(self.model.means, self._last.view, clear[0], flow, clear[1])
             self._found = observation.gray, pixels
         return self._found[1]
 

@@ -10,7 +10,6 @@ from numba import prange
 from sags_node.engine.pinhole import pack, to_camera, to_pixel
 from sags_node.kernels.jit import PIECE, inlined, kernel, parallel_kernel
 from sags_node.types import F32, Bool, Observation, RenderedView
-from sags_node.vision.margin import clear_of_instruments
 
 DEPTH_GATE = 0.13  # of the depth: a larger innovation is another surface, not this one
 BEHIND_TOLERANCE = 0.035  # of the depth: what is this far behind the drawn surface is hidden by it
@@ -26,25 +25,20 @@ def depth_pull(frames: int) -> float:
     return float(1 - (1 - DEPTH_PULL) ** min(frames, MOST_FRAMES))
 
 
-def track(means: F32, before: RenderedView, tissue_before: Bool, flow: F32, tissue_after: Bool) -> F32:
+def track(means: F32, before: RenderedView, clear_before: Bool, flow: F32, clear_after: Bool) -> F32:
     """Where in the later picture each Gaussian of the earlier one is found.
 
     Args:
         means: [N, 3] m, world, at the earlier frame.
         before: the model drawn at the earlier frame, to know what was hidden.
-        tissue_before, tissue_after: [H, W].
+        clear_before, clear_after: [h, w] tissue far enough from instruments, after so many `HALVINGS`.
         flow: [h, w, 2] px of the whole pictures, from the earlier to the later one, at any size.
 
     Returns:
         Pixels [N, 2], also beyond the picture's edges; NaN: not seen, or covered by an instrument now.
     """
-    clear_before, clear_after = (
-        clear_of_instruments(mask, HALVINGS) for mask in (tissue_before, tissue_after)
-    )
     pixels = np.full((len(means), 2), np.float32(np.nan))
-    _find(
-        means, pack(before.camera), before.depth, before.alpha, clear_before, flow, clear_after, pixels
-    )  # fmt: skip
+    _find(means, pack(before.camera), before.depth, before.alpha, clear_before, flow, clear_after, pixels)
     return pixels
 
 

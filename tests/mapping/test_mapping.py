@@ -5,9 +5,10 @@ import pytest
 
 from sags_node.evaluation.metrics import as_float
 from sags_node.mapping import densify, initialise
-from sags_node.mapping.motion import scene_flow, track
+from sags_node.mapping.motion import HALVINGS, scene_flow, track
 from sags_node.model.gaussians import GaussianModel
 from sags_node.types import Camera, Observation, RenderedView
+from sags_node.vision.margin import ClearOfInstruments, clear_of_instruments
 
 WIDTH, HEIGHT, FOCAL, DEPTH = 64, 48, 60.0, 0.08
 
@@ -45,7 +46,8 @@ def grid_points(depth: float = DEPTH) -> np.ndarray:
 def flow_of(
     means: np.ndarray, before: RenderedView, tissue: np.ndarray, flow: np.ndarray, after: Observation
 ) -> tuple[np.ndarray, np.ndarray]:
-    return scene_flow(means, track(means, before, tissue, flow, after.tissue), after, 0.4)
+    clear = (clear_of_instruments(mask, HALVINGS) for mask in (tissue, after.tissue))
+    return scene_flow(means, track(means, before, next(clear), flow, next(clear)), after, 0.4)
 
 
 def test_scene_flow_of_a_sideways_shift() -> None:
@@ -99,6 +101,16 @@ def test_the_motion_of_an_instrument_is_not_taken_for_that_of_the_tissue_beside_
     moved, seen = flow_of(means, view(), tissue, flow, observation())
     assert 0 < seen.sum() < len(means) / 2
     assert np.allclose(moved[seen > 0], 0, atol=1e-7)
+
+
+def test_what_is_clear_of_instruments_is_worked_out_once_for_a_mask_and_anew_for_another() -> None:
+    clear = ClearOfInstruments(HALVINGS)
+    masks = [np.ones((HEIGHT, WIDTH), bool) for _ in range(2)]
+    masks[1][:, :20] = False
+    for mask in (*masks, masks[0]):
+        found = clear(mask)
+        np.testing.assert_array_equal(found, clear_of_instruments(mask, HALVINGS))
+        assert clear(mask) is found
 
 
 def test_candidates_fill_holes_first() -> None:
