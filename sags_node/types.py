@@ -25,7 +25,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -180,7 +179,7 @@ class Observation:
     frame_id: int
     t_capture_ns: int
     camera: Camera
-    image: F32  # [H, W, 3] RGB 0..1
+    image: U8  # [H, W, 3] RGB
     gray: U8  # [H, W], for optical flow
     tissue: Bool  # [H, W] True = tissue
     depth: F32  # [H, W] m, 0 unknown
@@ -266,6 +265,8 @@ class Colours:
     def whole(self) -> U8:
         """[H, W, 3] by cubic polynomials, which keep twice the sharpness of straight lines. Any thread may
         ask."""
+        import cv2  # a client that only reads these types need not load it
+
         with _ENLARGING:
             if self._whole is None:
                 middles = cv2.sepFilter2D(self.small, -1, MIDDLES, MIDDLES, borderType=cv2.BORDER_REPLICATE)
@@ -277,6 +278,8 @@ class Colours:
         is the same whether somebody asked for the whole or not."""
         if self._is_whole:
             return self.small[::step, ::step]
+        import cv2
+
         (width, height), (small_height, small_width) = self._size, self.small.shape[:2]
         across, down = small_width / width, small_height / height
         places = np.array([[step * across, 0, 0.5 * across - 0.5], [0, step * down, 0.5 * down - 0.5]])

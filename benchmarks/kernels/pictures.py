@@ -18,7 +18,7 @@ from sags_node.engine.rasterizer import views
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.kernels.peak import Peak
 from sags_node.kernels.threads import thread_count
-from sags_node.types import F32, Bool
+from sags_node.types import F32, U8, Bool
 
 STAGES: Stages = {
     (photometric_kernels, "compare"): "compare",
@@ -45,7 +45,8 @@ def measure_losses(
     gaussians, camera = surface(count, width, height)
     planes = make_rasterizer("numba", width, height).forward(gaussians, camera)
     view = views.to_view(planes, camera, 0, 0)
-    image, tissue = 0.9 * views.colours_of(planes), np.ones((height, width), np.bool_)
+    image = (0.9 * 255 * views.colours_of(planes)).astype(np.uint8)
+    tissue = np.ones((height, width), np.bool_)
     v_planes, weight = np.empty_like(planes), np.empty_like(view.depth)
     structural = PhotometricLoss(width, height, WITH_SSIM)
     plain = PhotometricLoss(width, height, WITHOUT_SSIM)
@@ -95,7 +96,7 @@ def measure_losses(
     return row
 
 
-def _twin(planes: F32, image: F32, tissue: Bool, depth: F32) -> None:
+def _twin(planes: F32, image: U8, tissue: Bool, depth: F32) -> None:
     """The loss with SSIM, and its gradient."""
     import torch
 
@@ -103,7 +104,7 @@ def _twin(planes: F32, image: F32, tissue: Bool, depth: F32) -> None:
 
     torch.set_num_threads(thread_count())
     drawn, everywhere = torch.tensor(planes, requires_grad=True), torch.tensor(tissue)
-    frame = torch.tensor(image), everywhere, torch.tensor(depth), everywhere
+    frame = torch.tensor(image) / 255, everywhere, torch.tensor(depth), everywhere
     terms = losses_reference.photometric(drawn, *frame, normalised=True)
     total = sum(weight * terms[name] for name, weight in asdict(WITH_SSIM).items())
     torch.autograd.grad(total, drawn)

@@ -70,7 +70,8 @@ class _Step:
         self._loss = PhotometricLoss(case.width, case.height, WITH_SSIM if structural else WITHOUT_SSIM)
         planes = self._rasterizer.forward(gaussians, self._camera)
         view = to_view(planes, self._camera, 0, 0)
-        self._image, self._depth = 0.9 * colours_of(planes), view.depth
+        self._image = (0.9 * 255 * colours_of(planes)).astype(np.uint8)
+        self._depth = view.depth
         self._tissue = np.ones(view.depth.shape, np.bool_)
         self._v_planes, self._weight = np.empty_like(planes), np.empty_like(view.depth)
         functions: dict[str, Callable[..., Any]] = {

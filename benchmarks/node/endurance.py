@@ -83,7 +83,7 @@ class _Run:
         result = self.pipeline.process(frame, self._budget)
         ms, cpu_ms = (time.perf_counter() - began) * 1e3, (time.process_time() - cpu_began) * 1e3
         shown, seen = as_float(result.views["left"].rgb), result.observation
-        quality = psnr(shown, seen.image, seen.tissue)
+        quality = psnr(shown, as_float(seen.image), seen.tissue)
         still = "motion" in result.skipped
         return _Taken(ms, cpu_ms, quality, still, not still and "depth" in result.skipped)
 

@@ -47,13 +47,13 @@ class AliasTruth:
     def observation(self) -> Observation:
         """What there is to train with: the picture and its exact depth."""
         shape = self._depth.shape
-        gray = cv2.cvtColor(np.asarray(self._image * 255, np.uint8), cv2.COLOR_RGB2GRAY)
+        picture = np.rint(self._image * 255).astype(np.uint8)
         return Observation(
             frame_id=0,
             t_capture_ns=0,
             camera=self.camera,
-            image=self._image,
-            gray=gray,
+            image=picture,
+            gray=cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY),
             tissue=np.ones(shape, np.bool_),
             depth=self._depth,
             depth_confidence=np.ones(shape, np.float32),

@@ -90,11 +90,11 @@ class _Run:
 
     def look(self, number: int, result: FrameResult, tools: Bool | None) -> None:
         """Compare what is shown of a frame with its picture, and with the scan that belongs to it."""
-        seen = result.observation
-        self._drawn.append(metrics.psnr(metrics.as_float(result.views["left"].rgb), seen.image, seen.tissue))
+        tissue, image = result.observation.tissue, metrics.as_float(result.observation.image)
+        self._drawn.append(metrics.psnr(metrics.as_float(result.views["left"].rgb), image, tissue))
         if self._before is not None:
-            self._copied.append(metrics.psnr(self._before, seen.image, seen.tissue))
-        self._before = seen.image
+            self._copied.append(metrics.psnr(self._before, image, tissue))
+        self._before = image
         if number == 0 and "start" in self._scans:
             self._found["start"] = self._compared(self._scans["start"], number, result, tools)
         if number > self._last - self._stride and "end" in self._scans:

@@ -39,7 +39,7 @@ class ClipFrame:
             frame_id=self.frame_id,
             t_capture_ns=self.t_capture_ns,
             camera=self.camera,
-            image=self.image * np.float32(1 / 255),
+            image=self.image,
             gray=cv2.cvtColor(self.image, cv2.COLOR_RGB2GRAY),
             tissue=self.tissue,
             depth=self.depth,

@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 from numba import prange
 
+from sags_node.engine.losses.pieces import LEVEL
 from sags_node.kernels.jit import PIECE, inlined, kernel, parallel_kernel
 from sags_node.model.gaussians import GaussianModel
-from sags_node.types import F32, I32, Bool, Observation
+from sags_node.types import F32, I32, U8, Bool, Observation
 from sags_node.vision.depth_grid import depth_at, grid_of
 
 HOLE_ALPHA = 0.4  # below this a tissue pixel is a hole; 0.8 would count the gaps between small Gaussians
@@ -107,7 +108,7 @@ def mean_contribution(model: GaussianModel) -> float:
 
 @kernel
 def _candidates(
-    planes: F32, image: F32, tissue: Bool, depth: F32, inverse: F32, grid_error: F32, side: Any,
+    planes: F32, image: U8, tissue: Bool, depth: F32, inverse: F32, grid_error: F32, side: Any,
     phase: int, pixels: I32, depths: F32, errors: F32,
 ) -> int:  # fmt: skip
     height, width = tissue.shape
@@ -128,7 +129,7 @@ def _candidates(
                 else:
                     residual = np.float32(0)
                     for c in range(3):
-                        residual += abs(planes[c, y, x] / alpha - image[y, x, c])
+                        residual += abs(planes[c, y, x] / alpha - np.float32(image[y, x, c]) * LEVEL)
                     drawn_z = planes[3, y, x] / alpha
                     if z <= 0:
                         z = drawn_z

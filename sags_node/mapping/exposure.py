@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
+from sags_node.engine.losses.pieces import LEVEL
 from sags_node.kernels.jit import kernel
-from sags_node.types import F32, Bool
+from sags_node.types import F32, U8, Bool
 
 EVERY = 8  # px
 COVERED = 0.5
@@ -14,7 +17,7 @@ LEAST_PIXELS = 50
 LARGEST = 1.5  # a larger change within one frame is another scene, not another exposure
 
 
-def exposure_gain(planes: F32, image: F32, tissue: Bool) -> F32:
+def exposure_gain(planes: F32, image: U8, tissue: Bool) -> F32:
     """Factor [3] by which a picture is brighter than the model, for each channel.
 
     An endoscope's exposure follows what comes near, and all colours change at once; taking that as one gain
@@ -22,7 +25,7 @@ def exposure_gain(planes: F32, image: F32, tissue: Bool) -> F32:
 
     Args:
         planes: [5, H, W] of the rasteriser, drawn for that picture.
-        image: [H, W, 3] RGB 0..1.
+        image: [H, W, 3] RGB.
         tissue: [H, W] where to compare.
     """
     most = -(-tissue.shape[0] // EVERY) * -(-tissue.shape[1] // EVERY)
@@ -35,7 +38,7 @@ def exposure_gain(planes: F32, image: F32, tissue: Bool) -> F32:
 
 
 @kernel
-def _ratios(planes: F32, image: F32, tissue: Bool, ratios: F32) -> int:
+def _ratios(planes: F32, image: U8, tissue: Bool, ratios: F32) -> Any:
     """Picture over model of every so many fair pixels, ratios [3, M] written; returns how many."""
     height, width = tissue.shape
     dark, bright = np.float32(DARK), np.float32(BRIGHT)
@@ -45,9 +48,9 @@ def _ratios(planes: F32, image: F32, tissue: Bool, ratios: F32) -> int:
             coverage = planes[4, y, x]
             if not (tissue[y, x] and coverage > np.float32(COVERED)):
                 continue
-            fair = True
+            fair: Any = True
             for c in range(3):
-                seen, drawn = image[y, x, c], planes[c, y, x] / coverage
+                seen, drawn = np.float32(image[y, x, c]) * LEVEL, planes[c, y, x] / coverage
                 fair = fair and seen > dark and seen < bright and drawn > dark and drawn < bright
                 ratios[c, n] = seen / drawn
             if fair:

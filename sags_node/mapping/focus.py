@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numba import prange
 
+from sags_node.engine.losses.pieces import LEVEL
 from sags_node.engine.losses.tissue import COVERED
 from sags_node.engine.rasterizer.compositing import TILE_HEIGHT, TILE_WIDTH
 from sags_node.kernels.jit import kernel, parallel_kernel
@@ -17,7 +18,7 @@ EVERY = 2  # px: a quarter of the pixels tells enough
 REACH = 32  # px: few Gaussians are larger, and those are faint out there
 
 
-def worst_tiles(planes: F32, image: F32, tissue: Bool, share: float) -> Bool:
+def worst_tiles(planes: F32, image: U8, tissue: Bool, share: float) -> Bool:
     """The tiles [rows, columns] of a picture with the largest squared colour residuals.
 
     PSNR counts squares, and most of them stand in few tiles: a step on a sixth of the picture gains half of
@@ -25,7 +26,7 @@ def worst_tiles(planes: F32, image: F32, tissue: Bool, share: float) -> Bool:
 
     Args:
         planes: [5, H, W] of the rasteriser.
-        image: [H, W, 3] RGB 0..1, what they should show.
+        image: [H, W, 3] RGB, what they should show.
         tissue: [H, W] the pixels that count.
         share: of all tiles, 0..1; at least one is chosen.
     """
@@ -72,7 +73,7 @@ def with_neighbours(tiles: Bool) -> Bool:
 @parallel_kernel
 def sum_residuals(
     planes: F32,  # [5, H, W]
-    image: F32,  # [H, W, 3]
+    image: U8,  # [H, W, 3]
     tissue: Bool,  # [H, W]
     tiles: Bool,  # [rows, columns] of which
     sums: F32,  # [rows, columns] squared colour residuals, written for those
@@ -82,7 +83,7 @@ def sum_residuals(
 
 
 @kernel
-def _sum_row(planes: F32, image: F32, tissue: Bool, tiles: Bool, sums: F32, row: Any) -> None:
+def _sum_row(planes: F32, image: U8, tissue: Bool, tiles: Bool, sums: F32, row: Any) -> None:
     height, width = tissue.shape
     for column in range(sums.shape[1]):
         if tiles[row, column]:
@@ -94,6 +95,6 @@ def _sum_row(planes: F32, image: F32, tissue: Bool, tiles: Bool, sums: F32, row:
             coverage = planes[4, y, x]
             if tissue[y, x] and coverage > COVERED:
                 for k in range(3):
-                    residual = planes[k, y, x] / coverage - image[y, x, k]
+                    residual = planes[k, y, x] / coverage - np.float32(image[y, x, k]) * LEVEL
                     if abs(residual) < np.float32(1):
                         sums[row, x // TILE_WIDTH] += residual * residual

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from sags_node.engine.losses.pieces import LEVEL
 from sags_node.geometry import unproject
 from sags_node.kernels.jit import kernel
 from sags_node.model.alias_free import smoothing_variances
@@ -48,7 +49,7 @@ def insert(
     means = unproject(camera, pixels.astype(np.float32), z).astype(np.float32)
     variances = smoothing_variances(means, [camera]) if smoothing else np.zeros(len(means), np.float32)
     scales = np.sqrt(np.maximum(scales**2 - variances[:, None], (LEAST_SHARE * scales) ** 2))
-    rows = model.append(means, scales, observation.image[y, x], OPACITY)
+    rows = model.append(means, scales, observation.image[y, x] * LEVEL, OPACITY)
     model.smoothing[rows] = variances[: rows.stop - rows.start]
     added = errors[: rows.stop - rows.start]
     unknown = ~np.isfinite(added)

@@ -12,7 +12,7 @@ from sags_node.engine.pinhole import pack, to_camera, to_pixel
 from sags_node.kernels.jit import PIECE, inlined, kernel, parallel_kernel
 from sags_node.types import F32, Bool, Observation, RenderedView
 from sags_node.vision.flow import OpticalFlow
-from sags_node.vision.margin import clear_of_instruments
+from sags_node.vision.margin import ClearOfInstruments
 from sags_node.vision.pyramid import pyramid_of
 
 DEPTH_GATE = 0.13  # of the depth: a larger innovation is another surface, not this one
@@ -49,6 +49,7 @@ class SurfaceTracker:
     """Finds the Gaussians of one frame in the next, by optical flow."""
 
     def __init__(self, unhurried: bool = False) -> None:
+        self._clear = ClearOfInstruments(HALVINGS)
         self.pace(unhurried)
 
     def pace(self, unhurried: bool) -> None:
@@ -64,26 +65,22 @@ class SurfaceTracker:
         """
         before = last.observation
         flow = self._flow(pyramid_of(before), pyramid_of(observation), guess)
+        clear = self._clear(before.tissue), self._clear(observation.tissue)
         seconds = max(0.0, (observation.t_capture_ns - before.t_capture_ns) * 1e-9)
-        return Tracks(found(means, last.view, before.tissue, flow, observation.tissue), seconds)
+        return Tracks(found(means, last.view, clear[0], flow, clear[1]), seconds)
 
 
-def found(means: F32, before: RenderedView, tissue_before: Bool, flow: F32, tissue_after: Bool) -> F32:
+def found(means: F32, before: RenderedView, clear_before: Bool, flow: F32, clear_after: Bool) -> F32:
     """Where in the later picture each Gaussian of the earlier one is, as `Tracks.pixels`.
 
     Args:
         means: [N, 3] m, world, at the earlier frame.
         before: the model drawn at the earlier frame, to know what was hidden.
-        tissue_before, tissue_after: [H, W].
+        clear_before, clear_after: [h, w] tissue far enough from instruments, after so many `HALVINGS`.
         flow: [h, w, 2] px of the whole pictures, from the earlier to the later one, at any size.
     """
-    clear_before, clear_after = (
-        clear_of_instruments(mask, HALVINGS) for mask in (tissue_before, tissue_after)
-    )
     pixels = np.full((len(means), 2), np.float32(np.nan))
-    _find(
-        means, pack(before.camera), before.depth, before.alpha, clear_before, flow, clear_after, pixels
-    )  # fmt: skip
+    _find(means, pack(before.camera), before.depth, before.alpha, clear_before, flow, clear_after, pixels)
     return pixels
 
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numba import prange
 
+from sags_node.engine.losses.pieces import LEVEL
 from sags_node.engine.pinhole import pack, to_camera, to_pixel
 from sags_node.geometry import quat_to_matrix
 from sags_node.kernels.jit import PIECE, kernel, parallel_kernel
@@ -79,7 +80,7 @@ def _split(model: GaussianModel, wholes: I64, spare: I64) -> None:
 
 @parallel_kernel
 def _look(
-    means: F32, contribution: F32, cam: F32, rgb: U8, drawn: F32, image: F32, tissue: Bool,
+    means: F32, contribution: F32, cam: F32, rgb: U8, drawn: F32, image: U8, tissue: Bool,
     hardly: Any, enough: Any, score: F32, spare: Bool,
 ) -> None:  # fmt: skip
     for piece in prange(-(-len(means) // PIECE)):
@@ -92,7 +93,7 @@ def _look(
 
 @kernel
 def _look_at_rows(
-    means: F32, contribution: F32, cam: F32, rgb: U8, drawn: F32, image: F32, tissue: Bool,
+    means: F32, contribution: F32, cam: F32, rgb: U8, drawn: F32, image: U8, tissue: Bool,
     hardly: Any, enough: Any, score: F32, spare: Bool, first: Any, end: Any,
 ) -> None:  # fmt: skip
     """Of the Gaussians on the visible tissue, marks those that are to spare, and writes how much those that
@@ -118,7 +119,7 @@ def _look_at_rows(
         row, column = int(py * down), int(px * across)
         square = np.float32(0)
         for k in range(3):
-            difference = np.float32(rgb[row, column, k]) * np.float32(1 / 255) - image[py, px, k]
+            difference = (np.float32(rgb[row, column, k]) - np.float32(image[py, px, k])) * LEVEL
             square += difference * difference
         if square < np.float32(3):  # else one of them is damaged
             score[i] = square * contribution[i]

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import cv2
 import numpy as np
 
 from sags_node.kernels.jit import kernel
 from sags_node.types import F32, F64, U8, RectifiedPair
-from sags_node.vision.pyramid import inner, level, pyramids
+from sags_node.vision.pyramid import BORDER, level, pyramids
 
 HALVINGS = 3  # 8x8 px are averaged: camera noise up to 4 grey levels stays below the limit
 SIDE = 32  # px of a block: the length over which something moves or does not
@@ -48,11 +47,22 @@ class StillScene:
 
 
 def _alike(a: F32, b: F32) -> bool:
-    difference = cv2.absdiff(inner(a), inner(b))
-    height, width = difference.shape
-    blocks = max(1, width // BLOCK), max(1, height // BLOCK)
-    mean = cv2.resize(difference, blocks, interpolation=cv2.INTER_AREA)
-    return bool(np.mean(mean > LARGEST_DIFFERENCE) <= LARGEST_SHARE)
+    return bool(_share_that_differs(a, b) <= LARGEST_SHARE)
+
+
+@kernel
+def _share_that_differs(a: F32, b: F32) -> Any:
+    """Of the blocks of two pictures with borders."""
+    height, width = a.shape[0] - 2 * BORDER, a.shape[1] - 2 * BORDER
+    rows, columns = max(1, height // BLOCK), max(1, width // BLOCK)  # the last ones take the rest
+    sums, counts = np.zeros((rows, columns), np.float32), np.zeros((rows, columns), np.float32)
+    for y in range(height):
+        row = min(y // BLOCK, rows - 1)
+        for x in range(width):
+            column = min(x // BLOCK, columns - 1)
+            sums[row, column] += abs(a[BORDER + y, BORDER + x] - b[BORDER + y, BORDER + x])
+            counts[row, column] += 1
+    return np.mean(sums > np.float32(LARGEST_DIFFERENCE) * counts)
 
 
 def is_repeat(a: RectifiedPair, b: RectifiedPair) -> bool:

@@ -17,6 +17,7 @@ from sags_node.kernels.jit import kernel
 from sags_node.types import F32, I8, Bool, Finding
 from sags_node.vision.clarity import LOST_CONTRAST, REMEMBERED_S, USUAL_DIFFERENCE
 from sags_node.vision.judgement import Evidence, Judgement
+from sags_node.vision.picture_fit import middle_of
 from sags_node.vision.pyramid import BORDER, inner, pyramids
 from sags_node.vision.standing import Debounced
 
@@ -76,7 +77,7 @@ class LensWatch:
         self._stamp_ns = pair.t_capture_ns
         share = np.float32(min(1.0, passed / REMEMBERED_S))
         off = apart - self._usual
-        if abs(np.median(off[apart != 0])) > VEIL:
+        if abs(middle_of(off[apart != 0])) > VEIL:
             self._usual = (self._usual + share * off).clip(-USUAL_DIFFERENCE, USUAL_DIFFERENCE)
             self._standing.update(pair.t_capture_ns, [])
             return judged

@@ -18,3 +18,16 @@ def clear_of_instruments(tissue: Bool, halvings: int) -> Bool:
     side = 2 * round(EDGE_MARGIN * width) + 1
     clear: U8 = cv2.erode(small.view(np.uint8), np.ones((side, side), np.uint8))
     return clear.view(np.bool_)
+
+
+class ClearOfInstruments:
+    """The same for masks that are asked for twice: with their own frame, and as that of the frame before."""
+
+    def __init__(self, halvings: int) -> None:
+        self._halvings = halvings
+        self._newest: tuple[Bool, Bool] | None = None  # a mask and what is clear of it
+
+    def __call__(self, tissue: Bool) -> Bool:
+        if self._newest is None or self._newest[0] is not tissue:
+            self._newest = tissue, clear_of_instruments(tissue, self._halvings)
+        return self._newest[1]

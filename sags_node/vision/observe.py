@@ -27,7 +27,7 @@ def observe(pair: RectifiedPair, tissue: Bool, measured: Measured) -> Observatio
         frame_id=pair.frame_id,
         t_capture_ns=pair.t_capture_ns,
         camera=pair.camera,
-        image=pair.left * np.float32(1 / 255),
+        image=pair.left,
         gray=pyramid.full,
         tissue=tissue,
         depth=depth,

@@ -87,21 +87,18 @@ def _compare(seen: F32, drawn: F32, known: Bool, fair: Bool, ratios: F32, counts
     return channels
 
 
-@kernel
 def _gain(ratios: F32, counts: I64) -> F32:
     """[3] of the exposure: the median of each channel's ratios; of too few, the mean of the others."""
-    gain, total, clear = np.ones(3, np.float32), np.float32(0), 0
-    enough = np.zeros(3, np.bool_)
-    for k in range(3):
-        some = (counts[k] + SOME - 1) // SOME
-        if some >= FEWEST:
-            enough[k], gain[k] = True, np.median(ratios[k, :some])
-            total += gain[k]
-            clear += 1
-    for k in range(3):
-        if clear > 0 and not enough[k]:
-            gain[k] = total / np.float32(clear)
-    return gain
+    some = [-(-count // SOME) for count in counts.tolist()]
+    known = {k: middle_of(ratios[k, : some[k]]) for k in range(3) if some[k] >= FEWEST}
+    mean = sum(known.values()) / len(known) if known else 1.0
+    return np.array([known.get(k, mean) for k in range(3)], np.float32)
+
+
+def middle_of(values: F32) -> float:
+    """The upper of the middle ones; 0 of none. `np.median` takes eight times as long."""
+    half = values.size // 2
+    return float(np.partition(values, half)[half]) if values.size else 0.0
 
 
 @kernel

@@ -14,7 +14,7 @@ from test_photometric import ALL, TERMS
 
 pytest.importorskip("triton", reason="Triton comes with torch's CUDA builds, or by `pip install triton`")
 
-from device_losses import DEVICE, photometric, tensors, unwritten
+from device_losses import DEVICE, as_colors, photometric, tensors, unwritten
 
 from sags_node.engine.cuda import photometric as photometric_loss
 from sags_node.engine.cuda.photometric import PhotometricLoss
@@ -23,7 +23,7 @@ from sags_node.engine.losses.tissue import COVERED
 from sags_node.engine.rasterizer.rasterize import TILE_HEIGHT, TILE_WIDTH
 from sags_node.mapping.cuda import focus
 from sags_node.mapping.focus import EVERY, worst_tiles
-from sags_node.types import F32, Bool
+from sags_node.types import F32, U8, Bool
 
 # the kernels divide by a coverage of zero and select afterwards; a GPU says nothing of it
 pytestmark = [
@@ -74,14 +74,14 @@ def test_equal_pictures_are_similar_without_a_gradient() -> None:
     assert not v_picture.any()
 
 
-def tile_scene() -> tuple[F32, F32, Bool]:
+def tile_scene() -> tuple[F32, U8, Bool]:
     """Tiles that are well drawn and badly, with holes and instruments; no tile divides the picture."""
     inputs = test_photometric.frame(3 * TILE_HEIGHT + 7, 5 * TILE_WIDTH + 3)
     return inputs["planes"], inputs["image"], inputs["tissue"]
 
 
-def chosen(scene: tuple[F32, F32, Bool], share: float) -> Bool:
-    given = [torch.tensor(array, device=DEVICE) for array in scene]
+def chosen(scene: tuple[F32, U8, Bool], share: float) -> Bool:
+    given = [torch.tensor(as_colors(array), device=DEVICE) for array in scene]
     tiles = focus.worst_tiles(*given, share, every=EVERY, least_coverage=float(COVERED))
     found: Bool = tiles.cpu().numpy()
     return found

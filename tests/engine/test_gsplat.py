@@ -19,6 +19,7 @@ import torch
 from engine_scenes import (
     DERIVATIVES,
     EXPONENTIAL,
+    as_bytes,
     camera,
     cotangents,
     draw_and_differentiate,
@@ -34,6 +35,7 @@ from sags_node.config.launch_file import load_launch
 from sags_node.doctor import examine
 from sags_node.engine.device import choose_device
 from sags_node.engine.interface import MAX_OPACITY, MIN_ALPHA
+from sags_node.engine.losses.pieces import LEVEL
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.errors import SagsError, UsageError
 from sags_node.evaluation.metrics import as_float
@@ -129,14 +131,15 @@ def test_a_mapper_learns_the_same_with_it(monkeypatch: pytest.MonkeyPatch) -> No
     for backend in ("gsplat", "numba"):
         learning = Following(mapper.Mapper(CpuRefiner(partial(make_rasterizer, backend)), TissueMap(60)))
         for i in range(3):
-            image = np.ascontiguousarray(pictures[:, i : i + 48])
+            image = as_bytes(pictures[:, i : i + 48])
             observation = Observation(
-                i, i * 33_000_000, camera(48, 24), image, (255 * image.mean(2)).astype(np.uint8),
+                i, i * 33_000_000, camera(48, 24), image, image.mean(2).astype(np.uint8),
                 np.ones((24, 48), np.bool_), 0.056 + 1e-4 * x + 1.3e-4 * y, np.ones((24, 48), np.float32),
             )  # fmt: skip
             mapped = learning.take(observation, StepBudget(1))
         view = mapped.view
-        learnt.append((mapped.snapshot.gaussians, view, float(np.square(as_float(view.rgb) - image).mean())))
+        error = float(np.square(as_float(view.rgb) - image * LEVEL).mean())
+        learnt.append((mapped.snapshot.gaussians, view, error))
     (found, view, error), (expected, true_view, true_error) = learnt
     np.testing.assert_array_equal(found.ids, expected.ids)
     assert len(found) > 40 and true_error < 0.01

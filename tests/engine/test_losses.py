@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from engine_scenes import camera, on_one_thread, random_gaussians
+from engine_scenes import as_bytes, camera, on_one_thread, random_gaussians
 from rounding import after, exact
 
 from sags_node.engine.losses.pieces import PIECE
@@ -35,7 +35,7 @@ def frame(seed: int = 0) -> dict[str, Any]:
     depth[rng.uniform(size=depth.shape) < 0.3] = 0
     return {
         "planes": (planes * coverage).astype(np.float32),
-        "image": rng.uniform(0, 1, (HEIGHT, WIDTH, 3)).astype(np.float32),
+        "image": rng.integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8),
         "tissue": rng.uniform(size=(HEIGHT, WIDTH)) < 0.8,
         "depth": depth.astype(np.float32),
     }
@@ -73,7 +73,7 @@ def twin(planes: Any, image: Any, tissue: Any, depth: Any) -> list[Any]:
     from sags_node.engine.reference import rasterizer as reference
 
     drawn = torch.tensor(planes, dtype=torch.float64, requires_grad=True)
-    seen = (torch.tensor(array) for array in (image, tissue, depth))
+    seen = (torch.tensor(array) for array in (image / 255, tissue, depth))
     loss = reference.tissue_loss(drawn, *seen, DEPTH_WEIGHT, DEPTH_SCALE)
     (gradient,) = torch.autograd.grad(loss, drawn)
     return list(gradient.numpy())
@@ -93,7 +93,7 @@ def test_mean_residual_and_weight(run: Run) -> None:
     coverage = inputs["planes"][4]
     counts = inputs["tissue"] & (coverage > 0.05)
     color = inputs["planes"][:3].transpose(1, 2, 0)[counts].astype(np.float64) / coverage[counts][:, None]
-    expected = np.abs(color - inputs["image"][counts]).mean()
+    expected = np.abs(color - inputs["image"][counts] / 255).mean()
     assert mean == pytest.approx(expected, rel=after(3 * PIECE))  # pieces are added up in float64
     np.testing.assert_allclose(weight[counts], 1 / coverage[counts], rtol=after(2))
     assert not weight[~counts].any()
@@ -107,7 +107,7 @@ def test_no_tissue_no_gradient(run: Run) -> None:
     assert not weight.any()
 
 
-@pytest.mark.parametrize("where", ["image", "depth", *range(5)])
+@pytest.mark.parametrize("where", ["depth", *range(5)])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_broken_pixels_are_left_out(run: Run, where: str | int, value: float) -> None:
     clean, broken = frame(), frame()
@@ -137,7 +137,7 @@ def test_every_size(run: Run, height: int, width: int) -> None:
         if name != "image"
     }
     inputs["tissue"][0, 0], inputs["planes"][4, 0, 0] = True, 0.5
-    inputs["image"] = np.random.default_rng(1).uniform(0, 1, (height, width, 3)).astype(np.float32)
+    inputs["image"] = np.random.default_rng(1).integers(0, 256, (height, width, 3), np.uint8)
     _, v_planes, _ = run(inputs)
     for plane, true in enumerate(exact(twin, inputs)):
         true.check(v_planes[plane], plane)
@@ -158,7 +158,7 @@ def test_contribution_makes_the_closed_form_colour_step_converge() -> None:
     rasterizer = make_rasterizer("numba", WIDTH, HEIGHT)
     planes = rasterizer.forward(gaussians, view)
     coverage = planes[4].copy()
-    image = np.ascontiguousarray((planes[:3] / np.maximum(coverage, 1e-6)).transpose(1, 2, 0))
+    image = as_bytes((planes[:3] / np.maximum(coverage, 1e-6)).transpose(1, 2, 0))
     tissue = coverage > 0.3
     unknown = np.zeros((HEIGHT, WIDTH), np.float32)
     v_planes, weight = np.empty((5, HEIGHT, WIDTH), np.float32), np.empty((HEIGHT, WIDTH), np.float32)

@@ -109,13 +109,12 @@ def frame_result(frame: StereoFrame, velocity: np.ndarray, late: float = 0.0) ->
     velocities = np.tile(velocity.astype(np.float32), (len(gaussians), 1))
     ids = frame.frame_id, frame.t_capture_ns
     assert frame.tissue is not None
-    image = frame.left.astype(np.float32) / 255
     measured = np.where(frame.tissue, np.float32(DEPTH + 0.002), np.float32(0))
     view = rasterize(gaussians, CAMERA)
     return FrameResult(
         pair=RectifiedPair(*ids, CAMERA, BASELINE, frame.left, frame.right),
         observation=Observation(
-            *ids, CAMERA, image, frame.left[..., 0], frame.tissue, measured, np.ones_like(measured)
+            *ids, CAMERA, frame.left, frame.left[..., 0], frame.tissue, measured, np.ones_like(measured)
         ),
         snapshot=Snapshot(*ids, 3 * frame.frame_id, gaussians, velocities, CAMERA, 0.01, {"iterations": 2}),
         views={"left": RenderedView(*ids, CAMERA, view.colours, view.depth, view.alpha)},

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 
 from sags_node.engine.cuda import losses
 from sags_node.engine.cuda.backend import default_device
 from sags_node.engine.cuda.photometric import PhotometricLoss
 from sags_node.engine.losses.photometric import LossTerms, LossWeights
+from sags_node.engine.losses.pieces import LEVEL
 from sags_node.types import F32
 
 DEVICE = default_device()
@@ -17,8 +19,14 @@ DEVICE = default_device()
 
 def tensors(inputs: dict[str, Any]) -> dict[str, Any]:
     return {
-        name: None if array is None else torch.tensor(array, device=DEVICE) for name, array in inputs.items()
+        name: None if array is None else torch.tensor(as_colors(array), device=DEVICE)
+        for name, array in inputs.items()
     }
+
+
+def as_colors(array: Any) -> Any:
+    """A picture's bytes as the device takes them, 0..1; other arrays stay."""
+    return array * LEVEL if array.dtype == np.uint8 else array
 
 
 def unwritten(inputs: dict[str, Any]) -> dict[str, Any]:

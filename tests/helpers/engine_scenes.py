@@ -14,11 +14,16 @@ from rounding import U, after, moved, roughly
 
 from sags_node.engine.interface import MAX_OPACITY
 from sags_node.engine.rasterizer.rasterize import Gradients, make_rasterizer
-from sags_node.types import F32, F64, Camera, Gaussians
+from sags_node.types import F32, F64, U8, Camera, Gaussians
 
 T = TypeVar("T")
 INPUTS = ("means", "quats", "scales", "opacities", "colors")
 DERIVATIVES = tuple(field.name for field in dataclasses.fields(Gradients))
+
+
+def as_bytes(picture: Any) -> U8:
+    """A picture 0..1, as a camera gives it."""
+    return np.ascontiguousarray(np.rint(255 * np.clip(picture, 0, 1)), np.uint8)
 
 
 def camera(width: int = 48, height: int = 40, focal: float = 60.0, moved: bool = False) -> Camera:

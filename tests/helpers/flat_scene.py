@@ -42,9 +42,8 @@ def flat_scene(
         np.arange(count) + first_id,
     )
     depth = np.full(shape, drawn, np.float32)
-    image = np.zeros((*shape, 3), np.float32)
     tissue = np.ones(shape, bool)
     dark = Colours(np.zeros((*shape, 3), np.uint8))
-    observation = Observation(frame, stamp_ns, camera, image, gray, tissue, depth, depth)
+    observation = Observation(frame, stamp_ns, camera, dark.small, gray, tissue, depth, depth)
     snapshot = Snapshot(frame, stamp_ns, 0, gaussians, np.zeros_like(means), camera, 0.0)
     return observation, snapshot, RenderedView(frame, stamp_ns, camera, dark, depth, np.ones_like(depth))

@@ -79,7 +79,7 @@ def plane_result(
     return FrameResult(
         pair=RectifiedPair(frame_id, stamp, camera, BASELINE, picture, picture[:, ::-1].copy()),
         observation=Observation(
-            frame_id, stamp, camera, colors, picture[..., 1].copy(), tissue, known, np.ones_like(known)
+            frame_id, stamp, camera, picture, picture[..., 1].copy(), tissue, known, np.ones_like(known)
         ),
         snapshot=Snapshot(
             frame_id, stamp, step, gaussians, np.zeros_like(gaussians.means), camera, 0.01, {"inserted": 3}

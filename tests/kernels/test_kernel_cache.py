@@ -80,7 +80,8 @@ import hashlib, json, numpy as np
 from llvmlite.binding import Linkage
 from sags_node.engine.losses import tissue
 random = np.random.default_rng(0)
-planes, image, depth = (random.random(shape, np.float32) for shape in ((5, 64, 80), (64, 80, 3), (64, 80)))
+planes, depth = (random.random(shape, np.float32) for shape in ((5, 64, 80), (64, 80)))
+image = random.integers(0, 256, (64, 80, 3), np.uint8)
 slopes, weight = np.empty_like(planes), np.empty_like(depth)
 tissue.tissue_loss(planes, image, depth > 0.1, depth, slopes, weight, 2e-3, 1e-3)
 (kernel,) = tissue._tissue_loss.overloads.values()

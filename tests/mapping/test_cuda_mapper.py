@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from engine_scenes import as_bytes
 from following import Following
 
 pytest.importorskip("triton", reason="Triton comes with torch's CUDA builds, or by `pip install triton`")
@@ -64,7 +65,7 @@ def texture(seed: int) -> F32:
 
 def frame(i: int, seed: int = 1, brightness: float = 1.0, instrument: bool = True) -> Observation:
     """A tilted sheet that moves by a pixel per frame to the left, partly hidden."""
-    image = np.ascontiguousarray(texture(seed)[:, i : i + WIDTH]) * np.float32(brightness)
+    image = as_bytes(texture(seed)[:, i : i + WIDTH] * brightness)
     K = np.array([[FOCAL, 0, (WIDTH - 1) / 2], [0, FOCAL, (HEIGHT - 1) / 2], [0, 0, 1]])
     tissue = np.ones((HEIGHT, WIDTH), np.bool_)
     tissue[6:14, 30:38] = not instrument
@@ -72,13 +73,14 @@ def frame(i: int, seed: int = 1, brightness: float = 1.0, instrument: bool = Tru
     depth = (DEPTH + 1e-4 * x + 1.3e-4 * y).astype(np.float32) * tissue  # no two Gaussians lie equally far
     return Observation(
         i, i * 33_000_000, Camera(WIDTH, HEIGHT, K, np.eye(4)), image,
-        (image.mean(2) * 255).astype(np.uint8), tissue, depth, np.ones_like(depth),
+        image.mean(2).astype(np.uint8), tissue, depth, np.ones_like(depth),
     )  # fmt: skip
 
 
 def psnr(view: RenderedView, observation: Observation) -> float:
     return float(
-        -10 * np.log10(np.mean(np.square(as_float(view.rgb) - observation.image)[observation.tissue]))
+        -10
+        * np.log10(np.mean(np.square(as_float(view.rgb) - as_float(observation.image))[observation.tissue]))
     )
 
 
@@ -235,7 +237,7 @@ def test_a_still_frame_that_rests_changes_nothing() -> None:
 def test_a_new_model_is_begun_on_the_device() -> None:
     played = on_device()
     first, _ = played.take(frame(0))
-    negative = replace(frame(1), image=1 - frame(1, seed=5).image)
+    negative = replace(frame(1), image=255 - frame(1, seed=5).image)
     played.mapper.map.restart()
     snapshot, view = played.take(negative)
     assert played.mapper.map.restarts == 1
@@ -419,7 +421,7 @@ def pipeline_on(device: str, steps: int) -> tuple[Pipeline, Callable[[int], Any]
 
     def take(i: int) -> Any:
         observation = frame(i)
-        left = np.rint(observation.image * 255).astype(np.uint8)
+        left = observation.image
         stamp = i * 33_000_000
         given = StereoFrame(i, stamp, stamp, left, left, tissue=observation.tissue, depth=observation.depth)
         return pipeline.process(given, StepBudget(steps))

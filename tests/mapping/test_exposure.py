@@ -18,20 +18,21 @@ ALL = np.ones((SIZE, SIZE), bool)
 
 
 def planes_of(image: np.ndarray, coverage: float) -> np.ndarray:
-    picture = np.concatenate([image.transpose(2, 0, 1), np.ones((2, SIZE, SIZE))]) * coverage
+    picture = np.concatenate([image.transpose(2, 0, 1) / 255, np.ones((2, SIZE, SIZE))]) * coverage
     return picture.astype(np.float32)
 
 
 @pytest.fixture()
 def picture() -> np.ndarray:
-    return np.random.default_rng(0).uniform(0.2, 0.6, (SIZE, SIZE, 3)).astype(np.float32)
+    """Bytes that stay whole numbers times any of the gains."""
+    return 20 * np.random.default_rng(0).integers(3, 8, (SIZE, SIZE, 3), np.uint8)
 
 
 def test_the_gain_of_each_channel_is_found_whatever_is_new_or_bright(picture: np.ndarray) -> None:
     gain = np.array([1.2, 0.9, 1.05], np.float32)
-    seen = picture * gain
-    seen[:30] = 0.1  # something dark came in
-    seen[40:50] = 1.0  # highlights
+    seen = np.rint(picture * gain).astype(np.uint8)
+    seen[:30] = 26  # something dark came in
+    seen[40:50] = 255  # highlights
     assert np.allclose(exposure_gain(planes_of(picture, 0.8), seen, ALL), gain, atol=1e-3)
 
 
@@ -42,7 +43,7 @@ def test_where_nothing_can_be_compared_the_gain_is_one(picture: np.ndarray) -> N
         (picture, np.full((5, SIZE, SIZE), np.nan, np.float32)),
     ):
         assert np.array_equal(exposure_gain(planes, seen, ALL), np.ones(3, np.float32))
-    bright = np.minimum(3 * picture, 0.94)
+    bright = np.minimum(3.0 * picture, 240).astype(np.uint8)
     assert exposure_gain(planes_of(picture, 1.0), bright, ALL).max() <= LARGEST
 
 
@@ -71,5 +72,6 @@ def brighter(frame: StereoFrame, gain: float) -> StereoFrame:
 
 
 def psnr(result: FrameResult) -> float:
-    error = (as_float(result.views["left"].rgb) - result.observation.image)[result.observation.tissue]
+    seen = result.observation
+    error = (as_float(result.views["left"].rgb) - as_float(seen.image))[seen.tissue]
     return float(-10 * np.log10(np.mean(np.square(error))))

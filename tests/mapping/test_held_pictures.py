@@ -76,7 +76,8 @@ def play(session: Session, frames: list[StereoFrame]) -> tuple[list[FrameResult]
 
 
 def psnr(result: FrameResult, clean: FrameResult) -> float:
-    error = (as_float(result.views["left"].rgb) - clean.observation.image)[clean.observation.tissue]
+    truth = clean.observation
+    error = (as_float(result.views["left"].rgb) - as_float(truth.image))[truth.tissue]
     return float(-10 * np.log10(np.mean(np.square(error))))
 
 

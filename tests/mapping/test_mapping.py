@@ -3,11 +3,13 @@
 import numpy as np
 import pytest
 
+from sags_node.evaluation.metrics import as_float
 from sags_node.mapping import densify, initialise
-from sags_node.mapping.motion import found, scene_flow
+from sags_node.mapping.motion import HALVINGS, found, scene_flow
 from sags_node.mapping.surface import surface_at
 from sags_node.model.gaussians import GaussianModel
 from sags_node.types import Bool, Camera, Colours, Observation, RenderedView
+from sags_node.vision.margin import ClearOfInstruments, clear_of_instruments
 
 WIDTH, HEIGHT, FOCAL, DEPTH = 64, 48, 60.0, 0.08
 
@@ -19,7 +21,7 @@ def camera(T: np.ndarray | None = None) -> Camera:
 
 def observation(depth: float = DEPTH, T: np.ndarray | None = None, seed: int = 0) -> Observation:
     rng = np.random.default_rng(seed)
-    image = rng.uniform(0.2, 0.8, (HEIGHT, WIDTH, 3)).astype(np.float32)
+    image = rng.integers(51, 205, (HEIGHT, WIDTH, 3), np.uint8)
     shape = (HEIGHT, WIDTH)
     return Observation(
         1, 33_000_000, camera(T), image, np.zeros(shape, np.uint8), np.ones(shape, bool),
@@ -50,7 +52,8 @@ def grid_points(depth: float = DEPTH) -> np.ndarray:
 def flow_of(
     means: np.ndarray, before: RenderedView, tissue: np.ndarray, flow: np.ndarray, after: Observation
 ) -> tuple[np.ndarray, np.ndarray]:
-    return scene_flow(means, found(means, before, tissue, flow, after.tissue), after, 0.4)
+    clear = (clear_of_instruments(mask, HALVINGS) for mask in (tissue, after.tissue))
+    return scene_flow(means, found(means, before, next(clear), flow, next(clear)), after, 0.4)
 
 
 def test_scene_flow_of_a_sideways_shift() -> None:
@@ -106,10 +109,20 @@ def test_the_motion_of_an_instrument_is_not_taken_for_that_of_the_tissue_beside_
     assert np.allclose(moved[seen > 0], 0, atol=1e-7)
 
 
+def test_what_is_clear_of_instruments_is_worked_out_once_for_a_mask_and_anew_for_another() -> None:
+    clear = ClearOfInstruments(HALVINGS)
+    masks = [np.ones((HEIGHT, WIDTH), bool) for _ in range(2)]
+    masks[1][:, :20] = False
+    for mask in (*masks, masks[0]):
+        found = clear(mask)
+        np.testing.assert_array_equal(found, clear_of_instruments(mask, HALVINGS))
+        assert clear(mask) is found
+
+
 def test_candidates_fill_holes_first() -> None:
     frame = observation()
     planes = np.zeros((5, HEIGHT, WIDTH), np.float32)
-    planes[:3] = np.moveaxis(frame.image, -1, 0)
+    planes[:3] = np.moveaxis(as_float(frame.image), -1, 0)
     planes[3], planes[4] = DEPTH, 1.0
     assert len(densify.candidates(planes, frame, 0)[0]) == 0
     planes[:, 10:30, 20:40] = 0
@@ -132,7 +145,7 @@ def test_a_hole_without_depth_takes_that_of_its_neighbours() -> None:
 def test_candidates_need_residual_and_depth_to_agree_before_a_new_surface_is_believed() -> None:
     frame = observation()
     planes = np.zeros((5, HEIGHT, WIDTH), np.float32)
-    planes[:3] = np.moveaxis(frame.image, -1, 0)
+    planes[:3] = np.moveaxis(as_float(frame.image), -1, 0)
     planes[3], planes[4] = 1.2 * DEPTH, 1.0  # the model is far behind, but the picture agrees
     assert len(densify.candidates(planes, frame, 0)[0]) == 0
     planes[:3] = 1 - planes[:3]

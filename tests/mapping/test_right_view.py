@@ -46,7 +46,7 @@ def qualities(result: FrameResult) -> tuple[float, float]:
     """Of the right view and of the warped left picture, where both are known."""
     focal_px = float(result.pair.camera.K[0, 0])
     warp, there = warp_to_right(
-        result.observation.image, result.observation.depth, focal_px, result.pair.baseline
+        metrics.as_float(result.observation.image), result.observation.depth, focal_px, result.pair.baseline
     )
     return quality(result, result.views["right"].rgb, there), quality(result, warp, there)
 

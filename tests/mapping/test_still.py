@@ -27,7 +27,7 @@ from sags_node.messaging.content import tells_of
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import Session, open_session
 from sags_node.rig import rectified_rig
-from sags_node.types import F32, Camera, FrameResult, RectifiedPair, RenderedView, StereoFrame
+from sags_node.types import F32, U8, Camera, FrameResult, RectifiedPair, RenderedView, StereoFrame
 from sags_node.vision.change import REPEAT_RMS, StillScene, is_repeat
 from sags_node.vision.flow import OpticalFlow
 from sags_node.vision.scene_watch import NEW_SCENE_NS
@@ -394,8 +394,8 @@ def test_what_is_drawn_in_parts_is_the_whole_model(
     assert len(result.views) == 1 + len(overrides)
 
 
-def against_clean(result: FrameResult, clean: F32) -> float:
-    return psnr(as_float(result.views["left"].rgb), clean, result.observation.tissue)
+def against_clean(result: FrameResult, clean: U8) -> float:
+    return psnr(as_float(result.views["left"].rgb), as_float(clean), result.observation.tissue)
 
 
 def test_more_of_the_same_is_never_worse(frames: list[StereoFrame]) -> None:

@@ -65,7 +65,7 @@ def check(result: FrameResult) -> None:
 
 def psnr(result: FrameResult) -> float:
     tissue = result.observation.tissue
-    error = (as_float(result.views["left"].rgb) - result.observation.image)[tissue]
+    error = (as_float(result.views["left"].rgb) - as_float(result.observation.image))[tissue]
     return float(-10 * np.log10(np.mean(np.square(error)) + 1e-12))
 
 

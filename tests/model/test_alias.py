@@ -11,7 +11,14 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from engine_scenes import DERIVATIVES, camera, draw_and_differentiate, random_gaussians, relative_error
+from engine_scenes import (
+    DERIVATIVES,
+    as_bytes,
+    camera,
+    draw_and_differentiate,
+    random_gaussians,
+    relative_error,
+)
 from following import Following
 
 from benchmarks.__main__ import main
@@ -19,7 +26,7 @@ from benchmarks.quality.alias import VARIANTS, Settings, Trained, train
 from benchmarks.quality.alias_truth import moved, resized
 from sags_node.engine.rasterizer.rasterize import make_rasterizer, rasterize
 from sags_node.engine.rasterizer.smoothing import bake_filter
-from sags_node.evaluation.metrics import psnr
+from sags_node.evaluation.metrics import as_float, psnr
 from sags_node.geometry import project
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.mapper import Mapped, Mapper
@@ -94,7 +101,7 @@ def flat_scene(fine: F32) -> Observation:
         frame_id=0,
         t_capture_ns=0,
         camera=Camera(SIDE, SIDE, K, np.eye(4)),
-        image=shrunk(fine, 1),
+        image=as_bytes(shrunk(fine, 1)),
         gray=np.zeros(shape, np.uint8),
         tissue=np.ones(shape, bool),
         depth=np.full(shape, 0.08, np.float32),
@@ -142,7 +149,9 @@ def test_both_filters_beat_none_from_four_times_the_distance(
 
 def test_filters_cost_nothing_at_the_trained_size(wall: tuple[Observation, dict[str, Trained]]) -> None:
     observation, models = wall
-    both, none = (error_db(models[name], observation.camera, observation.image) for name in ("both", "none"))
+    both, none = (
+        error_db(models[name], observation.camera, as_float(observation.image)) for name in ("both", "none")
+    )
     assert both > 30
     assert both > none - 0.5
 

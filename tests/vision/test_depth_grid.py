@@ -123,7 +123,7 @@ def test_without_any_depth_nothing_is_known() -> None:
 
 
 def observation(depth: np.ndarray, tissue: np.ndarray) -> Observation:
-    picture = np.full((*SHAPE, 3), 0.5, np.float32)
+    picture = np.full((*SHAPE, 3), 128, np.uint8)
     return Observation(
         0, 0, CAMERA, picture, np.zeros(SHAPE, np.uint8), tissue, depth, (depth > 0).astype(np.float32),
         baseline=BASELINE,

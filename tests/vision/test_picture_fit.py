@@ -5,9 +5,12 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from rounding import after
 
+from sags_node.vision.clarity import LOCAL, small_level, structure
 from sags_node.vision.pair_watch import row_correlation
-from sags_node.vision.picture_fit import Fit
+from sags_node.vision.picture_fit import Fit, middle_of
+from sags_node.vision.pyramid import gray_pyramid, inner
 
 GAIN = np.array([1.2, 1.0, 0.8], np.float32)
 
@@ -49,3 +52,17 @@ def test_rows_correlate_where_they_lie(shift: int) -> None:
     match = row_correlation(left, right)
     assert len(match) == 81 and np.argmax(match) == 40 + shift
     assert match.max() == pytest.approx(1, abs=1e-5)
+
+
+def test_structure_is_what_a_small_picture_has_beside_the_mean_around() -> None:
+    noise = np.random.default_rng(5).integers(0, 256, (512, 640), np.uint8)
+    pyramid = gray_pyramid(cv2.GaussianBlur(noise, (0, 0), 5))
+    small = inner(small_level(pyramid))
+    around = cv2.blur(small, (LOCAL, LOCAL), borderType=cv2.BORDER_REPLICATE)
+    np.testing.assert_allclose(structure(pyramid), small - around, atol=255 * after(LOCAL**2))
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 7, 100])
+def test_middle_of_is_the_upper_median(count: int) -> None:
+    values = np.random.default_rng(count).normal(size=count).astype(np.float32)
+    assert middle_of(values) == (np.sort(values)[count // 2] if count else 0)

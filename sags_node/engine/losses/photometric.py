@@ -29,7 +29,7 @@ from sags_node.engine.losses.ssim import Dissimilarity
 from sags_node.engine.losses.tissue import COVERED, DEPTH_COVERED
 from sags_node.kernels.jit import aligned, read_only
 from sags_node.kernels.threads import thread_count
-from sags_node.types import F32, F64, Bool
+from sags_node.types import F32, F64, U8, Bool
 
 NO_LEAST = -1.0  # plain planes mean something everywhere
 FLAT = 1e-6  # inverse depths whose relative spread is below this have no correlation
@@ -92,7 +92,7 @@ class PhotometricLoss:
     def evaluate(
         self,
         planes: F32,
-        image: F32,
+        image: U8,
         tissue: Bool,
         depth: F32,
         v_planes: F32,
@@ -104,7 +104,7 @@ class PhotometricLoss:
 
         Args:
             planes: [5, H, W] of `Rasterizer.forward`, one camera.
-            image: [H, W, 3] RGB 0..1.
+            image: [H, W, 3] RGB; above, its bytes over 255.
             tissue: [H, W] True where the pixel is to be explained.
             depth: [H, W] m, 0 unknown. For a monocular network, whose inverse depth has an unknown scale and
                 offset: 1 / that, and the term `correlation`.

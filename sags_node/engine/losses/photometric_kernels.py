@@ -30,7 +30,7 @@ from sags_node.engine.losses.pieces import (
 )
 from sags_node.engine.losses.tissue import FULL, MAX_RESIDUAL
 from sags_node.kernels.jit import inlined, kernel, parallel_kernel
-from sags_node.types import F32, Bool
+from sags_node.types import F32, U8, Bool
 
 f4 = np.float32
 u8 = np.uint64
@@ -92,7 +92,7 @@ def _add_up(scratch: F32, sums: F32) -> None:
 def _compare_piece(
     scratch: F32,  # [SCRATCH]
     planes: F32,  # [5, P]
-    image: F32,  # [3 P]
+    image: U8,  # [3 P]
     tissue: Bool,  # [P]
     depth: F32,
     normalised: bool,
@@ -152,7 +152,7 @@ def _compare_piece(
 
 @parallel_kernel
 def compare(
-    planes: F32, image: F32, tissue: Bool, depth: F32, normalised: bool, least: Any, least_depth: Any,
+    planes: F32, image: U8, tissue: Bool, depth: F32, normalised: bool, least: Any, least_depth: Any,
     scratch: F32, drawn: F32, truth: F32, weight: F32, depth_residual: F32, sums: F32,
 ) -> None:  # fmt: skip
     """Read all pixels; `_compare_piece` says what is written."""

@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 
 from sags_node.kernels.jit import inlined
-from sags_node.types import F32, Bool
+from sags_node.types import F32, U8, Bool
 
 u8 = np.uint64
 ZERO, ONE = np.float32(0.0), np.float32(1.0)
+LEVEL = np.float32(1 / 255)  # of a picture's bytes
 
 PIECE = 256  # pixels that a kernel takes at a time
 PLANE = PIECE + 16  # floats; 64 bytes of padding
@@ -40,16 +41,16 @@ def load_mask(scratch: F32, plane: Any, mask: Bool, start: Any, count: int) -> N
 
 @inlined
 def load_frame(
-    scratch: F32, planes: F32, image: F32, tissue: Bool, depth: F32, start: Any, count: int
+    scratch: F32, planes: F32, image: U8, tissue: Bool, depth: F32, start: Any, count: int
 ) -> None:
     """What was drawn, `planes` [5, P], and what was seen: `image` [3 P] interleaved, `depth`, `tissue`."""
     for plane in range(5):
         load(scratch, u8(plane * PLANE), planes[plane], start, count)
     for k in range(count):
         i = u8(3) * (start + u8(k))
-        scratch[TRUE_RED + u8(k)] = image[i]
-        scratch[TRUE_GREEN + u8(k)] = image[i + u8(1)]
-        scratch[TRUE_BLUE + u8(k)] = image[i + u8(2)]
+        scratch[TRUE_RED + u8(k)] = np.float32(image[i]) * LEVEL
+        scratch[TRUE_GREEN + u8(k)] = np.float32(image[i + u8(1)]) * LEVEL
+        scratch[TRUE_BLUE + u8(k)] = np.float32(image[i + u8(2)]) * LEVEL
     load(scratch, TRUE_DEPTH, depth, start, count)
     load_mask(scratch, TISSUE, tissue, start, count)
 

@@ -27,7 +27,7 @@ from sags_node.engine.losses.pieces import (
 )
 from sags_node.kernels.jit import aligned, kernel, parallel_kernel, read_only
 from sags_node.kernels.threads import thread_count
-from sags_node.types import F32, Bool
+from sags_node.types import F32, U8, Bool
 
 f4 = np.float32
 u8 = np.uint64
@@ -46,7 +46,7 @@ SCRATCH = (FREE + 1) * PLANE  # floats per worker
 def _piece_loss(
     scratch: F32,  # [SCRATCH]
     planes: F32,  # [5, P]
-    image: F32,  # [3 P]
+    image: U8,  # [3 P]
     tissue: Bool,  # [P]
     depth: F32,
     v_planes: F32,
@@ -111,7 +111,7 @@ def _piece_loss(
 @parallel_kernel
 def _tissue_loss(
     planes: F32,
-    image: F32,
+    image: U8,
     tissue: Bool,
     depth: F32,
     v_planes: F32,
@@ -139,7 +139,7 @@ def _tissue_loss(
 
 def tissue_loss(
     planes: F32,
-    image: F32,
+    image: U8,
     tissue: Bool,
     depth: F32,
     v_planes: F32,
@@ -159,7 +159,7 @@ def tissue_loss(
 
     Args:
         planes: [5, H, W] of `Rasterizer.forward`.
-        image: [H, W, 3] RGB 0..1.
+        image: [H, W, 3] RGB; above, its bytes over 255.
         tissue: [H, W] True where the pixel is to be explained.
         depth: [H, W] m, 0 unknown.
         v_planes: [5, H, W] written: the gradient with respect to `planes`.

@@ -8,7 +8,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
 
 from sags_node.engine.cuda.backend import default_device
@@ -16,6 +15,7 @@ from sags_node.engine.cuda.losses import tissue_loss
 from sags_node.engine.cuda.photometric import PhotometricLoss
 from sags_node.engine.cuda.rasterizer import CudaRasterizer
 from sags_node.engine.cuda.scene import DeviceGradients
+from sags_node.engine.losses.pieces import LEVEL
 from sags_node.engine.rasterizer.rasterize import as_pinhole
 from sags_node.fitting.clip import ClipFrame
 from sags_node.fitting.cuda.field import DeviceField, Loan
@@ -145,8 +145,8 @@ class _DeviceFrame:
     depth: Tensor  # [H, W] m
 
     def colors(self) -> Tensor:
-        """RGB 0..1, as `ClipFrame.observation` has it."""
-        return self.image.float() * float(np.float32(1 / 255))
+        """RGB 0..1."""
+        return self.image.float() * float(LEVEL)
 
 
 class _Frames:

@@ -15,6 +15,7 @@ from sags_node.engine.cuda.backend import default_device
 from sags_node.engine.cuda.losses import tissue_loss
 from sags_node.engine.cuda.rasterizer import CudaRasterizer
 from sags_node.engine.cuda.scene import DeviceGaussians, DeviceGradients
+from sags_node.engine.losses.pieces import LEVEL
 from sags_node.engine.losses.tissue import COVERED
 from sags_node.engine.rasterizer.rasterize import TILE_HEIGHT, TILE_WIDTH, as_pinhole
 from sags_node.mapping import exposure, focus, optimiser
@@ -26,7 +27,7 @@ from sags_node.mapping.refiner import DEPTH_SCALE, DEPTH_WEIGHT
 from sags_node.model.cuda.nodes import Followers, Nodes, descend
 from sags_node.model.deformation import NodeDeformation
 from sags_node.model.gaussians import GaussianModel
-from sags_node.types import F32, Bool, Camera, Finding, Gaussians, Observation
+from sags_node.types import F32, U8, Bool, Camera, Finding, Gaussians, Observation
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -216,8 +217,8 @@ class CudaRefiner:
     def _look_at(self, observation: Observation) -> None:
         """The frame's pictures, on the device, and its camera."""
         camera = observation.camera
-        self._image, self._tissue = self._sent(observation.image), self._sent(observation.tissue)
-        self._depth = self._sent(observation.depth)
+        self._image = self._sent(observation.image).float() * float(LEVEL)
+        self._tissue, self._depth = self._sent(observation.tissue), self._sent(observation.depth)
         self._pinhole, self._focal_px = as_pinhole(camera), float(camera.K[0, 0])
         x, y, z, shift = camera.viewmat[2].tolist()
         self._view_z = x, y, z, shift
@@ -232,6 +233,6 @@ class CudaRefiner:
             room[name] = torch.zeros((model.capacity, *rows.shape[1:]), dtype=kind, device=self._device)
         return room
 
-    def _sent(self, array: F32 | Bool) -> Tensor:
+    def _sent(self, array: F32 | U8 | Bool) -> Tensor:
         """A copy on the device."""
         return torch.tensor(array, device=self._device)
