@@ -60,23 +60,6 @@ def test_figures_are_those_of_the_arrivals(monkeypatch: pytest.MonkeyPatch) -> N
     assert (row["topic"], row["rate_hz"], row["mean_bytes"]) == ("sags/left/depth", 30.0, 275)
 
 
-def test_hz(node: NodeAddress) -> None:
-    figures = topic_hz("left/depth", node, seconds=1.0)
-    assert figures["min_s"] <= 1 / figures["average_rate"] <= figures["max_s"]
-    assert figures["window"] >= 2
-
-
-def test_bw(node: NodeAddress) -> None:
-    figures = topic_bw("sags/left/depth", node, seconds=1.0)  # the full name is understood too
-    assert figures["mean_bytes"] == pytest.approx(4 * WIDTH * HEIGHT, rel=0.01)
-    assert figures["bytes_per_s"] > 0
-
-
-def test_delay(node: NodeAddress) -> None:
-    figures = topic_delay("tf", node, seconds=1.0)
-    assert 0 < figures["min_s"] <= figures["average_delay_s"] <= figures["max_s"]
-
-
 def test_list(node: NodeAddress) -> None:
     rows = {row["topic"]: row for row in topic_list(node, seconds=1.0)}
     assert set(rows) == {f"sags/{name}" for name in topics.BY_NAME}

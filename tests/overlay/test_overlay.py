@@ -198,7 +198,7 @@ def test_on_the_phantom_both_eyes_follow_the_tissue(
     assert np.median(errors) < 1 and np.percentile(errors, 90) < 2
     assert np.abs(np.median(disparities)) < 0.5
     latency = summary["latency_ms"]
-    assert 0 < latency["p50"] <= latency["p99"] < 1000 * seconds  # in milliseconds, of pictures of this session
+    assert 0 < latency["p50"] <= latency["p99"] < 1000 * seconds  # ms, of this session
     assert summary["overlay"] >= 20 and len(summary["objects"][0]["anchors"]) == 1
 
 

@@ -104,11 +104,6 @@ def test_a_wrong_size_is_told(source: PushedPictures) -> None:
         assert sender.receipt is not None and sender.receipt.refused > 0 and sender.receipt.taken == 0
 
 
-def test_a_wrong_stamp_is_told(source: PushedPictures) -> None:
-    with FrameSender(source.endpoint) as sender:
-        assert "source.stamps:=own" in sent_until_told(sender, numbered(1), numbered(1), stamp_ns=1)
-
-
 def test_each_sender_is_told_what_is_no_picture_of_an_eye(source: PushedPictures) -> None:
     wrong = {
         "pictures come on NAME/left/image_raw": ("middle/image_raw", numbered(1), "rgb8"),

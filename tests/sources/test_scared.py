@@ -355,16 +355,11 @@ def replaced(name: str, data: bytes) -> Callable[[Path], None]:
     return replace
 
 
-def no_calibration(keyframe: Path) -> None:
-    (keyframe / "endoscope_calibration.yaml").unlink()
-
-
-def calibration_that_is_none(keyframe: Path) -> None:
-    (keyframe / "endoscope_calibration.yaml").write_text("hello")
-
-
-def no_video(keyframe: Path) -> None:
-    (keyframe / "data/rgb.mp4").unlink()
+def written(name: str, content: bytes | None) -> Callable[[Path], None]:
+    """That file; None: there is none."""
+    return lambda keyframe: (
+        (keyframe / name).unlink() if content is None else (keyframe / name).write_bytes(content) and None
+    )
 
 
 def torn_archive(keyframe: Path) -> None:
@@ -372,14 +367,7 @@ def torn_archive(keyframe: Path) -> None:
     file.write_bytes(file.read_bytes()[:-300])
 
 
-def no_archive(keyframe: Path) -> None:
-    (keyframe / "data/frame_data.tar.gz").write_bytes(b"hello")
-
-
-def empty_archive(keyframe: Path) -> None:
-    pack(keyframe / "data/frame_data.tar.gz", {})
-
-
+CALIBRATION, VIDEO, ARCHIVE = "endoscope_calibration.yaml", "data/rgb.mp4", "data/frame_data.tar.gz"
 POSE = "data/frame_data/frame_data000001.json"
 SHEARED = np.eye(4) + np.eye(4, k=1)
 
@@ -387,8 +375,8 @@ SHEARED = np.eye(4) + np.eye(4, k=1)
 @pytest.mark.parametrize(
     ("mistake", "message"),
     [
-        (no_calibration, r"cannot read calibration .*endoscope_calibration\.yaml: No such file"),
-        (calibration_that_is_none, r"calibration\.yaml is not a YAML or XML file as OpenCV writes it"),
+        (written(CALIBRATION, None), r"cannot read calibration .*endoscope_calibration\.yaml: No such file"),
+        (written(CALIBRATION, b"hello"), r"calibration\.yaml is not a YAML or XML file as OpenCV writes it"),
         (calibration(M2=None), r"endoscope_calibration\.yaml: M2 is not a matrix of 9 numbers"),
         (calibration(D1=np.zeros(8)), "D1 is not a matrix of 4 or 5 numbers"),
         (calibration(R=np.full((3, 3), np.nan)), "R is not a matrix of 9 numbers"),
@@ -399,10 +387,16 @@ SHEARED = np.eye(4) + np.eye(4, k=1)
         ),
         (calibration(T=-T), "the eyes are exchanged"),
         (calibration(M1=np.diag([9e4, 151, 1.0])), "M1: fx = 90000 px is not plausible"),
-        (no_video, "holds neither data/rgb.mp4 nor left_rectified/ and right_rectified/"),
+        (written(VIDEO, None), "holds neither data/rgb.mp4 nor left_rectified/ and right_rectified/"),
         (torn_archive, r"frame_data\.tar\.gz is cut off or damaged .*download it again"),
-        (no_archive, r"frame_data\.tar\.gz is not a readable tar\.gz: .*; unpack or download it again"),
-        (empty_archive, "data/frame_data holds no frame_data000000.json; unpack it again"),
+        (
+            written(ARCHIVE, b"hello"),
+            r"frame_data\.tar\.gz is not a readable tar\.gz: .*; unpack or download it again",
+        ),
+        (
+            lambda keyframe: pack(keyframe / ARCHIVE, {}),
+            "data/frame_data holds no frame_data000000.json; unpack it again",
+        ),
         (replaced(POSE, b"{"), "data/frame_data 1: no JSON with a camera-pose of numbers"),
         (replaced(POSE, b'{"camera-pose": "here"}'), "data/frame_data 1: no JSON with a camera-pose"),
         (replaced(POSE, b'{"camera-pose": [[1, 0], [0, 1]]}'), "data/frame_data 1: camera-pose is not a rot"),

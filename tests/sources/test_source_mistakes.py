@@ -6,6 +6,7 @@ import io
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -23,50 +24,31 @@ HALVES = cfg.GeometryConfig(layout="side_by_side")
 # ---- at opening ------------------------------------------------------------------------------------------
 
 
-def no_left(folder: Path) -> Recording:
-    return cfg.FoldersSource(left=folder / "nowhere", right=folder / "r")
+def folders_of(folder: Path, left: str = "l", right: str = "r", **said: Any) -> Recording:
+    return cfg.FoldersSource(left=folder / left, right=folder / right, **said)
 
 
-def left_is_a_file(folder: Path) -> Recording:
-    return cfg.FoldersSource(left=folder / "l/000.png", right=folder / "r")
+def video(folder: Path, left: str, right: str | None = None) -> Recording:
+    if right is None:
+        return cfg.VideosSource(left=folder / left, geometry=HALVES)
+    return cfg.VideosSource(left=folder / left, right=folder / right)
 
 
-def empty_folder(folder: Path) -> Recording:
-    (folder / "empty").mkdir()
-    return cfg.FoldersSource(left=folder / "l", right=folder / "empty")
+def panes(folder: Path, left: cfg.Box, right: cfg.Box, tools: cfg.Box | None = None) -> Recording:
+    boxes = cfg.GeometryConfig(layout="panes", crop=left, crop_right=right)
+    return cfg.VideosSource(left=folder / "lr.avi", geometry=boxes, tools=tools)
 
 
-def fewer_right(folder: Path) -> Recording:
-    (folder / "r/003.png").unlink()
-    return cfg.FoldersSource(left=folder / "l", right=folder / "r")
+def posed(folder: Path, **arrays: np.ndarray) -> Recording:
+    np.savez(folder / "poses.npz", **arrays)
+    return folders_of(folder, poses=folder / "poses.npz")
 
 
-def fewer_tools(folder: Path) -> Recording:
-    write_png(folder / "tools/000.png", picture(0))
-    return cfg.FoldersSource(left=folder / "l", right=folder / "r", tools=folder / "tools")
-
-
-def eyes_of_two_sizes(folder: Path) -> Recording:
-    write_png(folder / "r/000.png", np.zeros((HEIGHT, WIDTH + 1, 3), np.uint8))
-    return cfg.FoldersSource(left=folder / "l", right=folder / "r")
-
-
-def damaged_first(folder: Path) -> Recording:
-    (folder / "l/000.png").write_bytes(b"not a picture")
-    return cfg.FoldersSource(left=folder / "l", right=folder / "r")
-
-
-def start_behind_end(folder: Path) -> Recording:
-    return cfg.FoldersSource(left=folder / "l", right=folder / "r", start=60)
-
-
-def no_video(folder: Path) -> Recording:
-    return cfg.VideosSource(left=folder / "none.mp4", geometry=HALVES)
-
-
-def text_as_video(folder: Path) -> Recording:
-    (folder / "text.mp4").write_text("hello")
-    return cfg.VideosSource(left=folder / "text.mp4", geometry=HALVES)
+def torn_poses(folder: Path) -> Recording:
+    config = posed(folder, T_world_cam=np.tile(np.eye(4), (8, 1, 1)))
+    data = (folder / "poses.npz").read_bytes()
+    (folder / "poses.npz").write_bytes(data[: len(data) // 2])
+    return config
 
 
 def odd_width(folder: Path) -> Recording:
@@ -76,105 +58,59 @@ def odd_width(folder: Path) -> Recording:
     assert writer.isOpened()
     writer.write(np.zeros((24, 33, 3), np.uint8))
     writer.release()
-    return cfg.VideosSource(left=folder / "odd.avi", geometry=HALVES)
+    return video(folder, "odd.avi")
 
 
-def panes(folder: Path, left: cfg.Box, right: cfg.Box, tools: cfg.Box | None = None) -> Recording:
-    boxes = cfg.GeometryConfig(layout="panes", crop=left, crop_right=right)
-    return cfg.VideosSource(left=folder / "lr.avi", geometry=boxes, tools=tools)
+# What is wrong, made in a folder of `recordings`; what is said.
+MISTAKES: list[tuple[Callable[[Path], Recording], str]] = [
+    (lambda at: folders_of(at, "nowhere"), "nowhere does not exist; check the path"),
+    (lambda at: folders_of(at, "l/000.png"), "000.png is not a folder; check the path"),
+    (lambda at: (at / "empty").mkdir() or folders_of(at, right="empty"), "empty holds no picture"),
+    (lambda at: (at / "r/003.png").unlink() or folders_of(at),
+     "l holds 8 pictures but .*r holds 7; pairing goes by sorted name"),
+    (lambda at: write_png(at / "tools/000.png", picture(0)) or folders_of(at, tools=at / "tools"),
+     "l holds 8 pictures but .*tools holds 1; pairing"),
+    (lambda at: folders_of(at, start=60), "source.start 60.0 s lies behind the recording's end at 0.27 s"),
+    (lambda at: video(at, "none.mp4"), "none.mp4 does not exist; check the path"),
+    (lambda at: (at / "text.mp4").write_text("hello") and video(at, "text.mp4"),
+     "text.mp4 cannot be read as a video"),
+    (odd_width, "odd.avi is 33 px wide, which is odd"),
+    (lambda at: panes(at, (0, 0, 32, 24), (40, 0, 32, 24)),
+     r"the box \[40, 0, 32, 24\] .* leaves the picture: an eye of .*lr.avi is 64x24 px"),
+    (lambda at: panes(at, (0, 0, 32, 24), (32, 0, 16, 24)),
+     "source.geometry.crop is 32x24 px but crop_right 16x24; both eyes need one"),
+    (lambda at: panes(at, (0, 0, 32, 24), (32, 0, 32, 24), (0, 0, 16, 24)),
+     "source.tools is 16x24 px but source.geometry.crop 32x24; all panes need"),
+    (lambda at: video(at, "l.avi", "lr.avi"),
+     "l.avi has 32x24 px but .*lr.avi has 64x24; they are not one stereo pair"),
+    (lambda at: write_video(at / "slow.avi", [picture(0)], rate=10) and video(at, "l.avi", "slow.avi"),
+     r"l.avi has 25.0 frames/s but .*slow.avi has 10.0;"),
+    (lambda at: folders_of(at, poses=at / "poses.npz"), "poses.npz does not exist; check the path"),
+    (lambda at: posed(at, T_world_cam=np.eye(4)),
+     r"'T_world_cam' is float64 \[4, 4\], wanted numbers \[any, 4, 4\]"),
+    (lambda at: posed(at, poses=np.eye(4)[None]), "poses.npz holds no array 'T_world_cam'"),
+    (lambda at: posed(at, T_world_cam=np.full((8, 4, 4), {}, dtype=object)), "'T_world_cam' is object"),
+    (torn_poses, "poses.npz is not a readable npz file"),
+    (lambda at: write_png(at / "depth/first.png", picture(0))
+     or folders_of(at, reference=cfg.ReferenceConfig(depth=at / "depth")),
+     "first.png: reference depth files are named by frame number"),
+]  # fmt: skip
+DAMAGED: list[tuple[Callable[[Path], Recording], str]] = [
+    (lambda at: write_png(at / "r/000.png", np.zeros((HEIGHT, WIDTH + 1, 3), np.uint8)) or folders_of(at),
+     "r/000.png is 33x24 px but .*l/000.png is 32x24; all pictures must have one size"),
+    (lambda at: (at / "l/000.png").write_bytes(b"not a picture") and folders_of(at),
+     "l/000.png is damaged or cut off"),
+]  # fmt: skip
 
 
-def crop_outside(folder: Path) -> Recording:
-    return panes(folder, (0, 0, 32, 24), (40, 0, 32, 24))
-
-
-def crops_of_two_sizes(folder: Path) -> Recording:
-    return panes(folder, (0, 0, 32, 24), (32, 0, 16, 24))
-
-
-def tools_of_another_size(folder: Path) -> Recording:
-    return panes(folder, (0, 0, 32, 24), (32, 0, 32, 24), (0, 0, 16, 24))
-
-
-def videos_of_two_sizes(folder: Path) -> Recording:
-    return cfg.VideosSource(left=folder / "l.avi", right=folder / "lr.avi")
-
-
-def videos_of_two_rates(folder: Path) -> Recording:
-    write_video(folder / "slow.avi", [picture(0)], rate=10)
-    return cfg.VideosSource(left=folder / "l.avi", right=folder / "slow.avi")
-
-
-def no_poses(folder: Path) -> Recording:
-    return cfg.FoldersSource(left=folder / "l", right=folder / "r", poses=folder / "poses.npz")
-
-
-def poses_of_wrong_shape(folder: Path) -> Recording:
-    np.savez(folder / "poses.npz", T_world_cam=np.eye(4))
-    return no_poses(folder)
-
-
-def poses_of_other_name(folder: Path) -> Recording:
-    np.savez(folder / "poses.npz", poses=np.eye(4)[None])
-    return no_poses(folder)
-
-
-def pickled_poses(folder: Path) -> Recording:
-    np.savez(folder / "poses.npz", T_world_cam=np.full((8, 4, 4), {}, dtype=object))
-    return no_poses(folder)
-
-
-def torn_poses(folder: Path) -> Recording:
-    np.savez(folder / "poses.npz", T_world_cam=np.tile(np.eye(4), (8, 1, 1)))
-    data = (folder / "poses.npz").read_bytes()
-    (folder / "poses.npz").write_bytes(data[: len(data) // 2])
-    return no_poses(folder)
-
-
-def depth_without_numbers(folder: Path) -> Recording:
-    write_png(folder / "depth/first.png", picture(0))
-    truth = cfg.ReferenceConfig(depth=folder / "depth")
-    return cfg.FoldersSource(left=folder / "l", right=folder / "r", reference=truth)
-
-
-@pytest.mark.parametrize(
-    ("mistake", "message"),
-    [
-        (no_left, "nowhere does not exist; check the path"),
-        (left_is_a_file, "000.png is not a folder; check the path"),
-        (empty_folder, "empty holds no picture"),
-        (fewer_right, "l holds 8 pictures but .*r holds 7; pairing goes by sorted name"),
-        (fewer_tools, "l holds 8 pictures but .*tools holds 1; pairing"),
-        (
-            eyes_of_two_sizes,
-            "r/000.png is 33x24 px but .*l/000.png is 32x24; all pictures must have one size",
-        ),
-        (damaged_first, "l/000.png is damaged or cut off"),
-        (start_behind_end, "source.start 60.0 s lies behind the recording's end at 0.27 s"),
-        (no_video, "none.mp4 does not exist; check the path"),
-        (text_as_video, "text.mp4 cannot be read as a video"),
-        (odd_width, "odd.avi is 33 px wide, which is odd"),
-        (crop_outside, r"the box \[40, 0, 32, 24\] .* leaves the picture: an eye of .*lr.avi is 64x24 px"),
-        (crops_of_two_sizes, "source.geometry.crop is 32x24 px but crop_right 16x24; both eyes need one"),
-        (tools_of_another_size, "source.tools is 16x24 px but source.geometry.crop 32x24; all panes need"),
-        (videos_of_two_sizes, "l.avi has 32x24 px but .*lr.avi has 64x24; they are not one stereo pair"),
-        (videos_of_two_rates, r"l.avi has 25.0 frames/s but .*slow.avi has 10.0;"),
-        (no_poses, "poses.npz does not exist; check the path"),
-        (poses_of_wrong_shape, r"'T_world_cam' is float64 \[4, 4\], wanted numbers \[any, 4, 4\]"),
-        (poses_of_other_name, "poses.npz holds no array 'T_world_cam'"),
-        (pickled_poses, "'T_world_cam' is object"),
-        (torn_poses, "poses.npz is not a readable npz file"),
-        (depth_without_numbers, "first.png: reference depth files are named by frame number"),
-    ],
-    ids=lambda value: value.__name__ if callable(value) else "",
-)
+@pytest.mark.parametrize(("mistake", "message"), MISTAKES + DAMAGED)
 def test_mistakes_at_opening(tmp_path: Path, mistake: Callable[[Path], Recording], message: str) -> None:
+    """All but damaged picture data are mistakes of the request."""
     recordings(tmp_path)
     with pytest.raises(SagsError, match=message) as caught:
         open_source(mistake(tmp_path))
     assert "\n" not in str(caught.value)
-    # Everything but damaged picture data is a mistake of the request.
-    assert isinstance(caught.value, UsageError) or mistake in (damaged_first, eyes_of_two_sizes)
+    assert isinstance(caught.value, UsageError) or (mistake, message) in DAMAGED
 
 
 def test_impossible_array_size_is_refused_before_memory_is_taken(tmp_path: Path) -> None:
@@ -186,7 +122,7 @@ def test_impossible_array_size_is_refused_before_memory_is_taken(tmp_path: Path)
     with zipfile.ZipFile(tmp_path / "poses.npz", "w") as archive:
         archive.writestr("T_world_cam.npy", header.getvalue() + bytes(128))
     with pytest.raises(UsageError, match="claims an impossible size"):
-        open_source(no_poses(tmp_path))
+        open_source(folders_of(tmp_path, poses=tmp_path / "poses.npz"))
 
 
 @pytest.mark.fault("file: pictures of both eyes were deleted before it is played")
