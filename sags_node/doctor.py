@@ -220,7 +220,7 @@ def _cores(root: Path = host.ROOT) -> Check:
 def _governor(root: Path = host.ROOT) -> Check:
     found = host.governors(root)
     if not found:
-        return Check("CPU governor", "ok", "not told by this machine")
+        return Check("CPU governor", "ok", "not known")
     said = ", ".join(sorted(found))
     if found == {"performance"}:
         return Check("CPU governor", "ok", said)
@@ -229,9 +229,9 @@ def _governor(root: Path = host.ROOT) -> Check:
 
 
 def _memory(root: Path = host.ROOT) -> Check:
-    told = host.memory(root)
-    free = told.get("MemAvailable", 0)
-    swap, used = told.get("SwapTotal", 0), told.get("SwapTotal", 0) - told.get("SwapFree", 0)
+    amounts = host.memory(root)
+    free = amounts.get("MemAvailable", 0)
+    swap, used = amounts.get("SwapTotal", 0), amounts.get("SwapTotal", 0) - amounts.get("SwapFree", 0)
     swapped = f"{used / 1e9:.1f} of {swap / 1e9:.1f} GB swap used" if swap else "no swap"
     found = f"{free / 1e9:.1f} GB free, {swapped}"
     if free < ENOUGH_MEMORY or used > free:  # it would not all fit, were it needed again

@@ -79,7 +79,7 @@ def test_a_quota_below_two_cores_is_said(tmp_path: Path, monkeypatch: pytest.Mon
     ],
 )
 def test_governors(governor: str, driver: str, level: str, said: str, tmp_path: Path) -> None:
-    assert doctor._governor(tmp_path).found == "not told by this machine"
+    assert doctor._governor(tmp_path).found == "not known"
     folder = "sys__devices__system__cpu__cpu3__cpufreq__"
     files = {f"{folder}scaling_governor": f"{governor}\n", f"{folder}scaling_driver": f"{driver}\n"}
     found = doctor._governor(made(tmp_path, **files))

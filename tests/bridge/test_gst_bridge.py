@@ -15,7 +15,7 @@ from gstreamer import need_gstreamer
 from waiting import until
 
 from sags_node.bridge.feed import Place
-from sags_node.bridge.gst import Options, run_gst
+from sags_node.bridge.gst import GstOptions, run_gst
 from sags_node.errors import SagsError
 from sags_node.overlay.draw import color_key
 from sags_node.overlay.stream import OverlayStream
@@ -66,7 +66,7 @@ def displays(run_dir: Path, **launches: str) -> Iterator[None]:
 
     def work() -> None:
         try:
-            run_gst(Options(Place("overlay", run_dir=run_dir), **launches), lambda: None, stop)
+            run_gst(GstOptions(Place("overlay", run_dir=run_dir), **launches), lambda: None, stop)
         except SagsError as error:
             failed.append(error)
 
@@ -116,7 +116,7 @@ def test_both_eyes_come_to_the_pixel_and_what_is_old_becomes_the_key(tmp_path: P
 
 def test_a_wrong_pipeline_is_said_in_words(tmp_path: Path) -> None:
     need_gstreamer()
-    options = Options(Place("overlay", run_dir=tmp_path), left="nosuchsink")
+    options = GstOptions(Place("overlay", run_dir=tmp_path), left="nosuchsink")
     stop = threading.Event()
     threading.Timer(60, stop.set).start()
     with OverlayStream("overlay", tmp_path, KEY) as stream, drawing(stream, threading.Event()):

@@ -25,7 +25,7 @@ from sags_node.bridge import igtl
 from sags_node.bridge.feed import Place
 from sags_node.bridge.igtl import MAX_BODY_BYTES
 from sags_node.bridge.igtl_peers import Peers
-from sags_node.bridge.openigtlink import Options, request_of, run_openigtlink
+from sags_node.bridge.openigtlink import IgtlOptions, request_of, run_openigtlink
 from sags_node.geometry import invert, transform, unproject
 from sags_node.overlay.stream import OverlayStream
 
@@ -45,9 +45,9 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return built(PEER, tmp_path_factory.mktemp("peer"))
 
 
-def options(run_dir: Path, **changes: Any) -> Options:
+def options(run_dir: Path, **changes: Any) -> IgtlOptions:
     settings = {"node": Place(run_dir=run_dir), "overlay": Place("overlay", run_dir=run_dir), "port": 0}
-    return Options(**{**settings, **changes})
+    return IgtlOptions(**{**settings, **changes})
 
 
 def weighted(picture: np.ndarray) -> int:

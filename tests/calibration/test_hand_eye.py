@@ -20,7 +20,7 @@ from sags_node.calibration.hand_eye_solve import solve_hand_eye
 from sags_node.cli.main import main
 from sags_node.config.launch_file import load_launch
 from sags_node.errors import SagsError, UsageError
-from sags_node.evaluation.measure import Measurer, Options
+from sags_node.evaluation.measure import MeasureOptions, Measurer
 from sags_node.evaluation.session import evaluate
 from sags_node.fitting.clip import read_clip
 from sags_node.geometry import invert, matrix_to_quat
@@ -293,7 +293,7 @@ def test_fits_and_figures_know_where_the_robot_says_the_scope_is(
     monkeypatch.setattr(Measurer, "_held_out", noted)
     session = open_session(recording, [*played, "source.frames:=4"])
     clip = read_clip(session, lambda number: number == 1)
-    evaluate(recording, [*played, "source.frames:=4"], Options(hold_out=4), iterations=0)
+    evaluate(recording, [*played, "source.frames:=4"], MeasureOptions(hold_out=4), iterations=0)
     assert list(seen) == [frame.frame_id for frame in clip.test] == [1] and len(clip.train) == 3
     for number, camera in (*seen.items(), *((f.frame_id, f.camera) for f in (*clip.train, *clip.test))):
         exact = camera_at(number / RATE, 5.0) @ rectified(np.eye(4), session.rig)

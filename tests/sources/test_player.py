@@ -30,11 +30,9 @@ from sags_node.messaging.publisher import Publisher
 from sags_node.messaging.received import ReceivedCloud, ReceivedImage
 from sags_node.messaging.stream import listen
 from sags_node.messaging.subscriber import Subscriber
-from sags_node.overlay.run import Options as OverlayOptions
-from sags_node.overlay.run import run_overlay
+from sags_node.overlay.run import OverlayOptions, run_overlay
 from sags_node.recording.info import bag_info
-from sags_node.recording.player import Options as PlayOptions
-from sags_node.recording.player import Player
+from sags_node.recording.player import Player, PlayOptions
 
 pytestmark = pytest.mark.live
 PHASE = 24  # times that a clock is told before the player is paused, and goes on

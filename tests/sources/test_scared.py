@@ -19,7 +19,7 @@ from sags_node.cli.main import main
 from sags_node.config import schema as cfg
 from sags_node.config.launch_file import load_launch
 from sags_node.errors import SagsError, UsageError
-from sags_node.evaluation.measure import Options
+from sags_node.evaluation.measure import MeasureOptions
 from sags_node.evaluation.session import evaluate
 from sags_node.geometry import invert, project, unproject
 from sags_node.pipeline.session import open_session
@@ -323,7 +323,7 @@ def test_a_folder_is_known_by_its_files(keyframe: Path) -> None:
 
 
 def test_a_keyframe_is_measured_by_its_path_alone(keyframe: Path) -> None:
-    figures = evaluate(keyframe, options=Options(hold_out=4, every=1), iterations=2).summary
+    figures = evaluate(keyframe, options=MeasureOptions(hold_out=4, every=1), iterations=2).summary
     assert [figures[key] for key in ("session", "processed", "held_out")] == ["keyframe_2", 4, 2]
     assert figures["settings"]["depth_reference"] == "structured_light"
     assert figures["depth"]["median_mm"] < 2 and figures["measured_depth"]["median_mm"] < 2  # one pixel: 6 mm

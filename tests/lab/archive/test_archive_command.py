@@ -11,7 +11,7 @@ from command_line import pure_json, refused, sags
 
 from sags_lab.archive import cluster as cluster_module
 from sags_lab.archive.manifest import Recording, write_manifest
-from sags_node.evaluation.measure import Options
+from sags_node.evaluation.measure import MeasureOptions
 from sags_node.evaluation.session import evaluate
 from sags_node.kernels.threads import configure_threads
 
@@ -34,7 +34,9 @@ def test_figures_are_those_of_sags_eval(cluster: Any, tiny_session: Path, tmp_pa
     done, poison = (each.id for each in recordings)
     shown = pure_json(sags("archive", "show", tmp_path / "out", done[:10], "--json").stdout)
     try:
-        expected = evaluate(tiny_session, ["engine.threads:=1", *SETTINGS], Options(2, 2), "step", 1).summary
+        expected = evaluate(
+            tiny_session, ["engine.threads:=1", *SETTINGS], MeasureOptions(2, 2), "step", 1
+        ).summary
     finally:
         configure_threads(None)
     for group in ("online", "heldout", "depth", "track", "novel"):
