@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import independent_client as client
@@ -48,17 +48,8 @@ class Watched:
         until(lambda: len(self._newest) == ENOUGH)
         return list(self._newest) == ENOUGH * [right]
 
-    @contextmanager
-    def subscribed(self, *prefixes: str) -> Iterator[zmq.Socket[bytes]]:
-        context = zmq.Context()
-        socket = context.socket(zmq.SUB)
-        for prefix in prefixes:
-            socket.setsockopt_string(zmq.SUBSCRIBE, prefix)
-        socket.connect(self.data)
-        try:
-            yield socket
-        finally:
-            context.destroy(linger=0)
+    def subscribed(self, *prefixes: str) -> AbstractContextManager[zmq.Socket[bytes]]:
+        return client.subscribed(self.data, *prefixes)
 
     def heard(self, *names: str, count: int = 3) -> dict[str, list[client.Received]]:
         got = client.collect(self.data, [f"sags/{name}" for name in names], count, timeout=60)

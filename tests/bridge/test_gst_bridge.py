@@ -5,14 +5,14 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 from command_line import refused
 from gstreamer import need_gstreamer
-from waiting import until
+from waiting import repeating, until
 
 from sags_node.bridge.feed import Place
 from sags_node.bridge.gst import GstOptions, run_gst
@@ -36,28 +36,18 @@ def bgrx(rgb: np.ndarray) -> np.ndarray:
     return np.concatenate([rgb[..., ::-1], np.full((*rgb.shape[:2], 1), 255, np.uint8)], axis=2)
 
 
-@contextmanager
-def drawing(stream: OverlayStream, paused: threading.Event) -> Iterator[None]:
+def drawing(stream: OverlayStream, paused: threading.Event) -> AbstractContextManager[None]:
     """An overlay's thread; while `paused` it says nothing, as one that hangs."""
-    stop = threading.Event()
 
-    def draw() -> None:
-        number = 0
-        while not stop.wait(1 / 30):
-            if not paused.is_set():
-                stream.serve()
-                pictures = {eye: overlay_of(n) for n, eye in enumerate(("left", "right"))}
-                stream.show(pictures, number, time.time_ns(), 0)
-                stream.tell({})
-                number += 1
+    def draw(number: int) -> None:
+        time.sleep(1 / 30)
+        if not paused.is_set():
+            stream.serve()
+            pictures = {eye: overlay_of(n) for n, eye in enumerate(("left", "right"))}
+            stream.show(pictures, number, time.time_ns(), 0)
+            stream.tell({})
 
-    thread = threading.Thread(target=draw)
-    thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        thread.join()
+    return repeating(draw)
 
 
 @contextmanager

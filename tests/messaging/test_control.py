@@ -17,7 +17,7 @@ import msgpack
 import msgspec
 import pytest
 import zmq
-from waiting import until
+from waiting import repeating, until
 
 from sags_node.config.schema import PublishConfig
 from sags_node.errors import SagsError, UsageError
@@ -38,15 +38,9 @@ def refuse(args: dict[str, Any]) -> Any:
 def node(run_dir: Path, handlers: dict[str, Handler]) -> Iterator[str]:
     """A publisher that answers from its own thread; gives the control endpoint."""
     config = PublishConfig(data=(), control="tcp://127.0.0.1:*", run_dir=run_dir)
-    stop = threading.Event()
     with Publisher(config, "sags", "session-1", handlers) as running:
-        thread = threading.Thread(target=lambda: [running.poll(20) for _ in iter(stop.is_set, True)])
-        thread.start()
-        try:
+        with repeating(lambda _: running.poll(20)):
             yield str(running.connection.control)
-        finally:
-            stop.set()
-            thread.join()
 
 
 def test_results_and_errors_come_back(tmp_path: Path) -> None:
@@ -112,16 +106,13 @@ def test_a_future_is_answered_when_it_is_done_and_others_meanwhile(tmp_path: Pat
 
 @pytest.mark.fault("socket: more requests than may wait")
 def test_what_is_owed_is_bounded(tmp_path: Path) -> None:
-    with node(tmp_path / "run", {"never": lambda args: Future()}) as endpoint:
-        context = zmq.Context()
-        asker = context.socket(zmq.DEALER)
-        asker.connect(endpoint)
+    never = {"never": lambda args: Future()}
+    with node(tmp_path / "run", never) as endpoint, client.zmq_socket(zmq.DEALER, endpoint) as asker:
         for i in range(MAX_PENDING + 5):
             asker.send(msgpack.packb({"v": "1.0", "id": i, "op": "never"}))
         refused = [msgpack.unpackb(asker.recv()) for _ in range(5) if asker.poll(GUARD_MS)]
         assert [reply["ok"] for reply in refused] == [False] * 5
         assert "waiting" in refused[0]["error"]
-        context.destroy(linger=0)
 
 
 def test_silence_is_an_error() -> None:

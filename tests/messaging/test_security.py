@@ -21,6 +21,7 @@ import pytest
 import zmq
 from click.testing import CliRunner, Result
 from command_line import sags
+from independent_client import zmq_socket
 from synthetic import publisher, stream
 from waiting import until
 from zmq.auth import load_certificate
@@ -444,23 +445,17 @@ def test_a_flood_is_cut_off(tmp_path: Path, which: str, kind: bytes, block: byte
 
 
 def test_a_reply_too_large_for_the_client_is_not_taken() -> None:
-    context = zmq.Context()
-    router = context.socket(zmq.ROUTER)
-    router.bind("tcp://127.0.0.1:*")
-
     def answer() -> None:
         identity, _ = router.recv_multipart()
         router.send_multipart([identity, bytes(8 << 20)])
 
-    thread = threading.Thread(target=answer)
-    thread.start()
-    with (
-        ControlClient(router.getsockopt_string(zmq.LAST_ENDPOINT)) as asker,
-        pytest.raises(SagsError, match="no answer"),
-    ):
-        asker.request("ping", timeout=0.5)
-    thread.join()
-    context.destroy(linger=0)
+    with zmq_socket(zmq.ROUTER, "tcp://127.0.0.1:*", bind=True) as router:
+        thread = threading.Thread(target=answer)
+        thread.start()
+        with ControlClient(router.getsockopt_string(zmq.LAST_ENDPOINT)) as asker:
+            with pytest.raises(SagsError, match="no answer"):
+                asker.request("ping", timeout=0.5)
+        thread.join()
 
 
 # ---- the whole, with a process ---------------------------------------------------------------------------

@@ -9,6 +9,7 @@ from pathlib import Path
 import msgspec
 import pytest
 import zmq
+from independent_client import zmq_socket
 from made_messages import meta
 from recorded_plane import by_topic, recording
 from synthetic import HEIGHT, WIDTH, at_frame, plane_result, publisher, stream
@@ -32,15 +33,10 @@ def text_message(seq: int, text: str = "x") -> Message:
 
 
 def test_gaps_repeats_and_strangers_are_counted(tmp_path: Path) -> None:
-    context = zmq.Context()
-    socket = context.socket(zmq.XPUB)
     endpoint = f"ipc://{tmp_path / 'data'}"
-    socket.bind(endpoint)
-    try:
-        with recording(RecordOptions(tmp_path / "bag", node=NodeAddress(endpoint=endpoint))) as (
-            recorder,
-            said,
-        ):
+    options = RecordOptions(tmp_path / "bag", node=NodeAddress(endpoint=endpoint))
+    with zmq_socket(zmq.XPUB, endpoint, bind=True) as socket:
+        with recording(options) as (recorder, said):
             socket.recv()  # the subscription
             for seq in (3, 4, 4, 7, 8, 3, 12):
                 socket.send_multipart(encode(text_message(seq)))
@@ -49,8 +45,6 @@ def test_gaps_repeats_and_strangers_are_counted(tmp_path: Path) -> None:
             of_own = msgspec.structs.replace(unknown.meta, type="my_msgs/msg/Own")
             socket.send_multipart(encode(Message("sags/own", of_own, (b"1234",))))
             until(lambda: recorder._rejected)
-    finally:
-        context.destroy(linger=0)
     row = said[-1]["topics"]["sags/status"]
     assert row == {"messages": 5, "dropped": 0, "lost": 2 + 3} and said[-1]["rejected"] == 1
     (listed,) = bag_info(tmp_path / "bag")["topics"]

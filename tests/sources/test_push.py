@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import pytest
 import zmq
+from independent_client import zmq_socket
 from live_taking import Taker
 from places import ROOT
 from sending import sending, stereo_sender
@@ -126,17 +127,12 @@ def test_each_sender_is_told_what_is_no_picture_of_an_eye(source: PushedPictures
 
 
 def test_damaged_files_and_messages_are_told_and_do_no_harm(source: PushedPictures) -> None:
-    context = zmq.Context()
-    stranger = context.socket(zmq.DEALER)
-    stranger.connect(source.endpoint)
-    try:
+    with zmq_socket(zmq.DEALER, source.endpoint) as stranger:
         for parts in ([b""], [b"x"] * 9, [b"a/left/image_raw", b"\xc1", b"data"], [b"t"] * 100):
             stranger.send_multipart(parts)
         with FrameSender(source.endpoint) as sender:
             assert "damaged" in sent_until_told(sender, b"\xff\xd8 no JPEG", b"\xff\xd8 no JPEG")
         assert stranger.poll(60_000)
-    finally:
-        context.destroy(linger=0)
 
 
 def test_only_listed_keys_get_in(tmp_path: Path) -> None:
