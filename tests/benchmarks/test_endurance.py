@@ -12,6 +12,7 @@ from unittest.mock import ANY
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
+from command_line import figures_of
 from places import SESSION
 
 from benchmarks.__main__ import main
@@ -151,9 +152,8 @@ def test_a_recording_that_does_not_fit_into_memory_is_refused(monkeypatch: pytes
 def test_the_command_prints_and_writes_the_same_table(tmp_path: Path) -> None:
     out = tmp_path / "new" / "endurance.json"
     arguments = ("mapping.max_gaussians:=2000", "source.frames:=12", "--frames", 24, "--window", 6)
-    result = bench(SESSION, *arguments, "--order", "wrap", "--json", "--out", out)
-    assert result.exit_code == 0, result.output
-    found = json.loads(result.stdout)
+    asked = (*arguments, "--order", "wrap", "--json", "--out", out)
+    found = figures_of("endurance", SESSION, *asked, command=main)
     assert json.loads(out.read_text()) == {"provenance": ANY} | found
     assert found["recorded_frames"] == 12 and found["order"] == "wrap" and len(found["windows"]) == 4
     shown = bench(SESSION, *arguments)

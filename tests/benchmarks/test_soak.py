@@ -9,7 +9,7 @@ from pathlib import Path
 from unittest.mock import ANY
 
 import pytest
-from click.testing import CliRunner
+from command_line import figures_of
 
 from benchmarks.__main__ import main
 from benchmarks.node import neighbours, soak
@@ -25,9 +25,7 @@ def test_a_node_and_all_its_neighbours_run_and_are_measured(
     monkeypatch.setattr(soak, "WARM_UP", 1.0)
     out = tmp_path / "soak.json"
     arguments = ["soak", *SMALL, "--frames", "50", "--window", "10", "--json", "--out", str(out)]
-    result = CliRunner().invoke(main, arguments)
-    assert result.exit_code == 0, result.output
-    measured = json.loads(result.stdout)
+    measured = figures_of(*arguments, command=main)
     assert json.loads(out.read_text()) == {"provenance": ANY} | measured
     ends = [window["frames"] for window in measured["windows"]]  # with those that the node left out
     assert len(ends) == 5 and all(end >= due for end, due in zip(ends, range(10, 51, 10), strict=True))

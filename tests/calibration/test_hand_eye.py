@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import runpy
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ import numpy as np
 import pytest
 from bag_files import ROS2, Row, image, write_rosbag2
 from click.testing import CliRunner
+from command_line import figures_of
 from drawn_boards import charuco_print, known_rig
 from places import ROOT
 
@@ -234,9 +234,7 @@ def test_from_a_bag_to_poses_of_the_camera(recording: Path) -> None:
         "calib", "hand-eye", str(recording), f"rig:={rig}", "robot.kind:=bag",
         "robot.topic:=/ECM/measured_cp", *BOARD, "--dictionary", "4X4_50", "-o", str(rig), "--json",
     ]  # fmt: skip
-    result = CliRunner().invoke(main, command)
-    assert result.exit_code == 0, result.output
-    summary = json.loads(result.stdout)
+    summary = figures_of(*command)
     assert summary["views"] >= VIEWS - 2 and summary["error_px"] < 0.3
     hand_eye = read_hand_eye(rig / "hand_eye.yaml")
     place, turn = errors(hand_eye.T_hand_cam)

@@ -7,8 +7,6 @@ import logging
 import os
 import socket
 import stat
-import subprocess
-import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -22,6 +20,7 @@ import zmq
 from click.testing import CliRunner, Result
 from command_line import sags
 from independent_client import zmq_socket
+from running_node import RunningNode
 from synthetic import publisher, stream
 from waiting import until
 from zmq.auth import load_certificate
@@ -464,23 +463,10 @@ def test_a_reply_too_large_for_the_client_is_not_taken() -> None:
 def test_a_secured_node_as_a_process_and_its_clients(
     phantom_session: Path, keys: Path, tmp_path: Path
 ) -> None:
-    run_dir = tmp_path / "run"
-    node = subprocess.Popen(
-        [
-            *(sys.executable, "-m", "sags_node", "run", str(phantom_session), "source.loop:=true"),
-            *(
-                "publish.data:=[tcp://*:*]",
-                "publish.control:=tcp://127.0.0.1:*",
-                f"publish.run_dir:={run_dir}",
-            ),
-            *(f"publish.key:={keys}/node.key", f"publish.allow:={keys}/clients"),
-        ],
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    secured = (f"publish.key:={keys}/node.key", f"publish.allow:={keys}/clients", "publish.data:=[tcp://*:*]")
+    node = RunningNode(phantom_session, tmp_path, *secured)
     try:
-        until((run_dir / "sags.json").exists, 90)
-        port = json.loads((run_dir / "sags.json").read_text())["data"][-1].rpartition(":")[2]
+        port = node.data.rpartition(":")[2]
         where = ["--endpoint", f"tcp://127.0.0.1:{port}"]
         good = tf_rate(*where, "--key", f"{keys}/clients/viewer.key", "--server-key", f"{keys}/node.pub")
         assert good.exit_code == 0 and json.loads(good.stdout)["average_rate"] > 0
@@ -489,12 +475,12 @@ def test_a_secured_node_as_a_process_and_its_clients(
         plain = tf_rate(*where)
         assert plain.exit_code == 1 and "wants a key" in plain.stderr
         viewer = ClientKeys(read_key_pair(keys / "clients/viewer.key"))
-        with ControlClient(run_dir=run_dir, keys=viewer) as asker:
+        with ControlClient(run_dir=node.run_dir, keys=viewer) as asker:
             connections = asker.request("get_status")["connections"]
         assert connections["data"]["unlisted_key"] == 1 and connections["data"]["refused"] >= 2
     finally:
-        node.terminate()
-        _, said = node.communicate(timeout=30)
+        node.stop()
+    said = node.said()
     assert "Traceback" not in said
     assert read_key_pair(keys / "stranger.key").public.decode() in said.replace("\n", "").replace(" ", "")
 

@@ -15,7 +15,7 @@ from typing import cast
 
 import numpy as np
 import pytest
-from command_line import RUN_HERE, START_SECONDS, sags
+from command_line import RUN_HERE, START_SECONDS, sags, start, stopped, wait_for
 from mcap.reader import make_reader
 from recorded_plane import by_topic
 from rosbags.highlevel import AnyReader
@@ -37,26 +37,15 @@ pytestmark = pytest.mark.live
 def node(phantom_session: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """`sags run` in its own process; its run directory."""
     home = tmp_path_factory.mktemp("node")
-    command = [
-        sys.executable,
-        "-m",
-        "sags_node",
-        "run",
-        str(phantom_session),
-        "vision.scale:=1",
-        "source.loop:=true",
-    ]
-    command += ["mapping.budget_ms:=20", *RUN_HERE]
-    environment = {**os.environ, "XDG_RUNTIME_DIR": str(home)}
-    with subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL) as process:
-        try:
-            until((home / "sags/sags.json").exists, START_SECONDS)
-            with Subscriber(["tf"], run_dir=home / "sags") as subscriber:
-                assert subscriber.wait("tf", START_SECONDS) is not None
-            yield home
-        finally:
-            process.send_signal(signal.SIGINT)
-            process.wait(30)
+    command = ["run", phantom_session, "source.loop:=true", "mapping.budget_ms:=20", *RUN_HERE]
+    process = start(command, XDG_RUNTIME_DIR=home)
+    try:
+        wait_for(process, (home / "sags/sags.json").exists)
+        with Subscriber(["tf"], run_dir=home / "sags") as subscriber:
+            assert subscriber.wait("tf", START_SECONDS) is not None
+        yield home
+    finally:
+        stopped(process)
 
 
 def frames_pass(home: Path, count: int) -> None:
@@ -69,11 +58,7 @@ def frames_pass(home: Path, count: int) -> None:
 
 
 def start_recorder(home: Path, *arguments: object) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "sags_node", "bag", "record", *map(str, arguments)]
-    environment = {**os.environ, "XDG_RUNTIME_DIR": str(home)}
-    return subprocess.Popen(
-        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
+    return start(["bag", "record", *arguments], XDG_RUNTIME_DIR=home)
 
 
 @pytest.mark.fault("process: the recorder is killed")
@@ -118,22 +103,6 @@ def test_a_killed_recording_is_recovered_and_replayed(node: Path, tmp_path: Path
                 compared += 1
     assert compared >= 5
     assert session.rig.baseline > 0 and session.rig.left.width == frame.left.shape[1]
-
-
-def test_a_long_recording_in_several_files_is_a_session(node: Path, tmp_path: Path) -> None:
-    """What `ros2 bag record -b` is for: a real node, a real recorder, and every command takes the folder."""
-    process = start_recorder(node, "-o", tmp_path / "bag", "-b", 12_000_000)
-    until(lambda: len(list((tmp_path / "bag").glob("*.mcap"))) > 3)
-    process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=60)
-    assert process.returncode == 0, errors
-    files = list((tmp_path / "bag").glob("*.mcap"))
-    assert max(file.stat().st_size for file in files) < 12_400_000
-    result = sags("bag", "info", tmp_path / "bag", "--json")
-    assert result.exit_code == 0 and len(json.loads(result.stdout)["files"]) == len(files)
-    result = sags("eval", tmp_path / "bag", "source.frames:=10", "--pace", "step", "--json")
-    assert result.exit_code == 0, result.output
-    assert json.loads(result.stdout)["frames"] == 10  # out of three files
 
 
 def test_ctrl_c_closes_the_file_and_a_signal_takes_a_snapshot(node: Path, tmp_path: Path) -> None:

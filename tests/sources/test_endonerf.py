@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import pickle
 import shutil
 from collections.abc import Callable
@@ -13,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from command_line import figures_of
 
 from sags_node.cli.main import main
 from sags_node.config import schema as cfg
@@ -314,9 +314,7 @@ def test_the_pipeline_takes_the_given_depth_instead_of_stereo(clip: Path) -> Non
 
 def test_a_clip_is_measured_by_its_path_alone(clip: Path) -> None:
     command = ["eval", str(clip), "--pace", "step", "--iterations", "2", "--paper-psnr", "--json"]
-    result = CliRunner().invoke(main, command)
-    assert result.exit_code == 0, result.output
-    figures = json.loads(result.stdout, parse_constant=lambda name: pytest.fail(f"{name} is no figure"))
+    figures = figures_of(*command)
     assert figures["session"] == "pulling_soft_tissues"
     # The literature's test split: frames 1 and 9.
     assert [figures[key] for key in ("frames", "processed", "held_out", "dropped")] == [12, 10, 2, 0]
@@ -335,9 +333,7 @@ def test_it_is_measured_by_its_own_protocol(clip: Path) -> None:
     """Held out are frames 1 and 9. Pixels masked black in both pictures count, which by arithmetic adds the
     share of the tissue to the PSNR."""
     arguments = ["eval", "--protocol", "endonerf", str(clip), "--iterations", "2", "--json"]
-    result = CliRunner().invoke(main, arguments)
-    assert result.exit_code == 0, result.output
-    found = json.loads(result.stdout)
+    found = figures_of(*arguments)
     assert found["held_out"] == 2
     shares = [np.mean(instrument(number) < 128) for number in (1, 9)]
     gained = found["causal"]["paper_psnr"] - found["causal"]["psnr"]

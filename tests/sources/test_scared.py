@@ -13,9 +13,8 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from command_line import figures_of
 
-from sags_node.cli.main import main
 from sags_node.config import schema as cfg
 from sags_node.config.launch_file import load_launch
 from sags_node.errors import SagsError, UsageError
@@ -332,9 +331,7 @@ def test_a_keyframe_is_measured_by_its_path_alone(keyframe: Path) -> None:
 
 def test_a_keyframe_is_measured_by_its_own_protocol(keyframe: Path) -> None:
     arguments = ["eval", "--protocol", "scared", str(keyframe), "--iterations", "2", "--json"]
-    result = CliRunner().invoke(main, arguments)
-    assert result.exit_code == 0, result.output
-    found = json.loads(result.stdout)
+    found = figures_of(*arguments)
     assert found["measured"]["frames"] == found["model"]["frames"] == 6
     assert found["measured"]["mae_mm"] < 2 and found["model"]["mae_mm"] < 3  # one pixel: 6 mm
     assert 0.5 < found["measured"]["given"] <= 1
