@@ -30,6 +30,7 @@ class Watched:
     """A running node, and what its newest frames held."""
 
     def __init__(self, session: Path, run_dir: Path, *overrides: str) -> None:
+        self.run_dir = run_dir
         opened = open_session(
             session,
             [*RUN_HERE, f"publish.run_dir:={run_dir}", "source.loop:=true", "source.pace:=fast",
@@ -103,8 +104,7 @@ def test_a_pair_of_eyes_from_elsewhere_is_a_look_at_the_right_one(running: Watch
     """Of a view nobody subscribes to, and of its left eye alone, it is not."""
     aside = np.eye(4)
     aside[0, 3] = 0.002
-    control = running.node._publisher.connection.control
-    with ControlClient(control) as asker:
+    with ControlClient(run_dir=running.run_dir) as asker:
         request = {"name": "pair", "stereo": True, "width": 64, "height": 48, "T_left_cam": aside.tolist()}
         asker.request("open_view", request)
         with running.subscribed("sags/view/pair/left/image"):

@@ -7,7 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import ExitStack
 from pathlib import Path
 
 import cv2
@@ -17,7 +17,6 @@ import zmq
 from independent_client import zmq_socket
 from live_taking import Taker
 from places import ROOT
-from sending import sending, stereo_sender
 from stereo_sender import paint_number
 from waiting import until
 
@@ -32,27 +31,6 @@ from sags_node.types import U8
 pytestmark = pytest.mark.live
 
 ANYWHERE = "tcp://127.0.0.1:*"
-SIZE = 1280, 1024
-
-
-def simulator(
-    source: PushedPictures, session: Path, seconds: float, *settings: str
-) -> AbstractContextManager[subprocess.Popen[bytes]]:
-    """Another process that sends."""
-    return sending(stereo_sender("push", source.endpoint, session, seconds, *settings))
-
-
-@pytest.mark.parametrize("settings", [(), ("jpeg=1", "rate=15")], ids=["raw", "jpeg"])
-def test_no_pair_is_mismatched_at_camera_rate(phantom_session: Path, settings: tuple[str, ...]) -> None:
-    source = PushedPictures(PushSource(endpoint=ANYWHERE), SIZE)
-    with Taker(source) as taker, simulator(source, phantom_session, 2.0, *settings) as process:
-        assert process.stdout is not None
-        left_out = int(process.stdout.readline())  # by a busy machine
-        assert process.wait(60) == 0
-        due = (30 if settings else 60) - 4  # that may be on the way when the process ends
-        until(lambda: len(taker.numbers) + source.dropped + left_out >= due)
-    assert taker.mismatched == 0 and taker.numbers
-    assert taker.newest is not None and taker.newest.left.shape == (1024, 1280, 3)
 
 
 @pytest.fixture
