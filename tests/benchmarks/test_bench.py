@@ -202,14 +202,7 @@ def test_the_rasteriser_is_measured_in_every_situation(quick: tuple[Table, Path]
     )
     for row in rows:
         stages = {stage["stage"] for stage in row["stages"]}
-        assert {
-            "project",
-            "sort",
-            "bin",
-            "composite",
-            "composite backward",
-            "project backward",
-        } <= stages
+        assert {"project", "sort", "bin", "composite", "composite backward", "project backward"} <= stages
         assert ("color" in stages) == (row["sh_degree"] > 0)
 
 

@@ -17,14 +17,7 @@ from places import SESSION
 
 from benchmarks.__main__ import main
 from benchmarks.node import endurance
-from benchmarks.node.endurance import (
-    FIGURES,
-    STILL_FRAMES,
-    Window,
-    measure_endurance,
-    slope,
-    statement,
-)
+from benchmarks.node.endurance import FIGURES, STILL_FRAMES, Window, measure_endurance, slope, statement
 from benchmarks.node.soak import worsening
 from sags_node.errors import SagsError
 from sags_node.pipeline.session import Session, open_session

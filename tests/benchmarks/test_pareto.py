@@ -196,15 +196,7 @@ def test_a_duplicate_that_is_skipped_saves_its_time(phantom_session: Path, tmp_p
         first, *others = sorted((folder / name).iterdir())
         for other in others:
             shutil.copy(first, other)
-    result = bench(
-        folder,
-        "mapping.max_gaussians:=2000",
-        "--frames",
-        6,
-        "--only",
-        "skips",
-        "--json",
-    )
+    result = bench(folder, "mapping.max_gaussians:=2000", "--frames", 6, "--only", "skips", "--json")
     assert result.exit_code == 0, result.output
     (session,) = json.loads(result.stdout)["sessions"]
     skip = next(each for each in session["skips"] if each["rule"] == "skip_duplicates")

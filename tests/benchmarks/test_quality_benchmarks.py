@@ -60,9 +60,7 @@ def test_only_the_phantom_knows_its_points() -> None:
 # ---- `benchmarks scope`: two breaths of a small phantom ------------------------------------------------
 
 
-BREATHS = [
-    *("source.width:=160", "source.height:=128", "source.rate:=2.5", "mapping.max_gaussians:=1500"),
-]
+BREATHS = [*("source.width:=160", "source.height:=128", "source.rate:=2.5", "mapping.max_gaussians:=1500")]
 
 
 def test_what_is_told_is_exact_and_what_a_robot_is_off_by_is_what_was_planted() -> None:

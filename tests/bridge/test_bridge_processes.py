@@ -40,9 +40,7 @@ def state(joined: Peer) -> str:
 
 
 @pytest.mark.fault("process: a bridge is killed; the node is killed under a bridge")
-def test_a_pinned_anchor_comes_back_and_a_killed_node_leaves_nothing_standing(
-    tmp_path: Path,
-) -> None:
+def test_a_pinned_anchor_comes_back_and_a_killed_node_leaves_nothing_standing(tmp_path: Path) -> None:
     pytest.importorskip("pyigtl", reason="no OpenIGTLink without: pip install 'sags-node[bridges]'")
     program = built(PEER, tmp_path)
     run_dir = tmp_path / "run"

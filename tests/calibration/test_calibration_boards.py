@@ -12,16 +12,7 @@ import numpy as np
 import pytest
 import yaml
 from command_line import ran
-from drawn_boards import (
-    SIZE,
-    SQUARE,
-    SQUARES,
-    charuco_print,
-    chessboard_print,
-    draw_pairs,
-    known_rig,
-    poses,
-)
+from drawn_boards import SIZE, SQUARE, SQUARES, charuco_print, chessboard_print, draw_pairs, known_rig, poses
 
 from sags_node.calibration.boards import Charuco, Chessboard, StereoView, find_in_both
 from sags_node.calibration.coverage import coverage_hints

@@ -22,15 +22,7 @@ from sags_node.calibration.principal_points import judge_known_depths
 from sags_node.calibration.rows import judge_scale, rectified_rows
 from sags_node.config.launch_file import load_launch
 from sags_node.errors import SagsError
-from sags_node.rig import (
-    Finding,
-    check_rig,
-    load_rig,
-    read_rig,
-    rectified_rig,
-    rectify_eyes,
-    save_rig,
-)
+from sags_node.rig import Finding, check_rig, load_rig, read_rig, rectified_rig, rectify_eyes, save_rig
 from sags_node.rig.check import size_made_for
 from sags_node.sources.pictures import read_picture
 from sags_node.types import U8, Eye, StereoFrame, StereoRig

@@ -93,9 +93,7 @@ def stereo_frame(frame_id: int) -> StereoFrame:
     right[40:60, 88:] = (200, 255, 200)
     points = tissue_at(0).means[7350:7400].astype(np.float64) + SPEED * stamp * 1e-9
     reference = Reference(
-        depth=np.full((HEIGHT, WIDTH), DEPTH, np.float32),
-        points=points,
-        points_visible=np.ones(50, bool),
+        depth=np.full((HEIGHT, WIDTH), DEPTH, np.float32), points=points, points_visible=np.ones(50, bool)
     )
     return StereoFrame(frame_id, stamp, stamp, left, right, tissue=tissue, reference=reference)
 

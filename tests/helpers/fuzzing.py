@@ -271,10 +271,7 @@ def read_thin(data: bytes, _: Path) -> None:
 
 
 def poses(_: Path) -> list[bytes]:
-    return [
-        bytes(cdr.pose(np.eye(4), 5).parts[0]),
-        bytes(cdr.transform(np.eye(4), 5).parts[0]),
-    ]
+    return [bytes(cdr.pose(np.eye(4), 5).parts[0]), bytes(cdr.transform(np.eye(4), 5).parts[0])]
 
 
 def read_pose(data: bytes, _: Path) -> None:

@@ -16,17 +16,7 @@ import numpy as np
 import pytest
 import zmq
 from rosbags.typesys import Stores, get_typestore
-from synthetic import (
-    BASELINE,
-    HEIGHT,
-    WIDTH,
-    at_frame,
-    health,
-    plane_depth,
-    plane_result,
-    publisher,
-    stream,
-)
+from synthetic import BASELINE, HEIGHT, WIDTH, at_frame, health, plane_depth, plane_result, publisher, stream
 from waiting import repeating, until
 
 from sags_node.geometry import project

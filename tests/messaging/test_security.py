@@ -33,12 +33,7 @@ from sags_node.messaging.control import ControlClient
 from sags_node.messaging.peers import MAX_PEERS
 from sags_node.messaging.publisher import Publisher
 from sags_node.messaging.roles import Client
-from sags_node.messaging.security import (
-    read_allow_list,
-    read_key_pair,
-    read_public_key,
-    write_key_pair,
-)
+from sags_node.messaging.security import read_allow_list, read_key_pair, read_public_key, write_key_pair
 from sags_node.messaging.subscriber import Subscriber
 
 pytestmark = pytest.mark.live

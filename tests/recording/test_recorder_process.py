@@ -39,9 +39,7 @@ def recorders() -> list[int]:
 
 
 @pytest.mark.parametrize(
-    "args",
-    [{"path": "a\0b"}, {"path": "a", "topics": ["left/depth\0"]}],
-    ids=["path", "topic"],
+    "args", [{"path": "a\0b"}, {"path": "a", "topics": ["left/depth\0"]}], ids=["path", "topic"]
 )
 def test_a_zero_character_is_refused(recorder: RecorderProcess, args: dict[str, object]) -> None:
     with pytest.raises(SagsError, match="zero character"):

@@ -273,7 +273,7 @@ def test_a_ctrl_c_in_the_terminal_is_not_the_pipelines() -> None:
     """It goes to all of the terminal's foreground group, and the pipeline's death was told of as a fault."""
     child = GstProcess({"elements": []})
     try:
-        (process,) = pipelines()
+        (process,) = until(pipelines)
         assert os.getpgid(process) not in (os.getpgid(0), 0)
     finally:
         child.close()

@@ -401,10 +401,7 @@ SHEARED = np.eye(4) + np.eye(4, k=1)
             replaced(POSE, json.dumps({"camera-pose": SHEARED.tolist()}).encode()),
             "data/frame_data 1: camera-pose is not a rotation and a translation",
         ),
-        (
-            replaced(POSE, bytes(2**20 + 1)),
-            r"frame_data000001\.json: it has 1048577 bytes, 1048576 at most",
-        ),
+        (replaced(POSE, bytes(2**20 + 1)), r"frame_data000001\.json: it has 1048577 bytes, 1048576 at most"),
     ],
     ids=lambda value: getattr(value, "__name__", ""),
 )

@@ -21,10 +21,7 @@ SETTINGS = ("mapping.max_gaussians:=2000", "source.frames:=4")
 
 
 def test_figures_are_those_of_sags_eval(cluster: Any, tiny_session: Path, tmp_path: Path) -> None:
-    recordings = [
-        Recording(str(tiny_session), str(tmp_path)),
-        Recording("nowhere", str(tmp_path)),
-    ]
+    recordings = [Recording(str(tiny_session), str(tmp_path)), Recording("nowhere", str(tmp_path))]
     write_manifest(str(tmp_path / "m.csv"), recordings)
     command = ["archive", "run", tmp_path / "m.csv", "--job", "eval", "--out", tmp_path / "out"]
     command += ["--ray", cluster.address, "--options", "--iterations 1 --hold-out 2 --every 2", *SETTINGS]
