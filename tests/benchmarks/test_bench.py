@@ -244,11 +244,6 @@ def test_tables_for_people(frozen: Table) -> None:
 # ---- the check -------------------------------------------------------------------------------------------
 
 
-def test_a_table_passes_against_itself(quick: tuple[Table, Path]) -> None:
-    table = long_enough(quick[0])
-    assert [each.ratio for each in compare(table, table)] == pytest.approx([1.0] * len(compare(table, table)))
-
-
 def test_a_kernel_twice_as_slow_is_named(quick: tuple[Table, Path]) -> None:
     now = long_enough(quick[0])
     kept = copy.deepcopy(now)

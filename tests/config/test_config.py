@@ -88,21 +88,6 @@ def test_files_that_are_no_launch_files(tmp_path: Path, content: str, said: str)
         load_launch(file)
 
 
-def test_a_missing_or_binary_file_is_one_clear_error(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"nowhere\.yaml.*check the path"):
-        load_launch(tmp_path / "nowhere.yaml")
-    (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(UsageError, match="not UTF-8"):
-        load_launch(tmp_path / "binary.yaml")
-
-
-def test_yaml_cannot_run_code(tmp_path: Path) -> None:
-    file = tmp_path / "launch.yaml"
-    file.write_text("ns: !!python/object/apply:os.system ['true']\n")
-    with pytest.raises(UsageError, match="not valid YAML"):
-        load_launch(file)
-
-
 def test_the_time_of_a_frame_is_that_until_the_next_unless_it_is_set() -> None:
     def ms(rate: float | None, **mapping: Any) -> float:
         return MappingConfig(**mapping).frame_ms(rate)

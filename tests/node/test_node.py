@@ -122,15 +122,6 @@ def test_no_thread_gives_way_to_others(node: RunningNode) -> None:
     assert {os.getpriority(os.PRIO_PROCESS, thread) for thread in threads} == {own}
 
 
-def test_reset_makes_a_new_model_and_a_new_epoch(node: RunningNode) -> None:
-    topic = "sags/left/render/image"
-    before = independent_client.collect(node.data, [topic], 1, 20)[topic][0].meta
-    reply = independent_client.request(node.connection["control"], "reset_model", {})
-    assert reply["ok"]
-    after = independent_client.collect(node.data, [topic], 1, 20)[topic][0].meta
-    assert after["epoch"] > before["epoch"]
-
-
 @pytest.mark.fault("process: Ctrl-C, SIGTERM or SIGHUP to the node")
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_stopping_is_clean(phantom_session: Path, tmp_path: Path, stop: signal.Signals) -> None:

@@ -99,14 +99,6 @@ def test_compressed_pictures(compression: str, tmp_path: Path) -> None:
     assert stamp.sec * 10**9 + stamp.nanosec == picture.publish_ns
 
 
-def test_only_the_topics_asked_for(tmp_path: Path) -> None:
-    path, summary = record_plane(tmp_path, seconds=0.4, topics=("left/depth", "sags/tf"))
-    assert set(by_topic(path)) == {"left/depth", "tf"} and set(summary["topics"]) == {
-        "sags/left/depth",
-        "sags/tf",
-    }
-
-
 def test_snapshots_hold_the_last_seconds(tmp_path: Path) -> None:
     run_dir = tmp_path / "run"
     with publisher(run_dir) as running:

@@ -88,14 +88,6 @@ def test_endless_loop_has_no_frame_count(folders: cfg.FoldersSource) -> None:
     assert len({frame.frame_id for frame in seen}) == 30
 
 
-def test_step_pace_is_reproducible(folders: cfg.FoldersSource) -> None:
-    def play() -> list[tuple[int, int, bytes]]:
-        with open_source(folders) as source:
-            return [(f.frame_id, f.t_capture_ns, f.left.tobytes()) for f in source]
-
-    assert play() == play()
-
-
 def test_realtime_waits_and_stamps_the_due_moment(folders: cfg.FoldersSource) -> None:
     clock = Clock()
     released = []
