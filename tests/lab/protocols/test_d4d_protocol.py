@@ -237,7 +237,7 @@ def test_which_colour_is_instrument(tmp_path: Path) -> None:
         mask.flat[: round(100 * share)] = 255
         cv2.imwrite(str(tmp_path / "mask.png"), mask)
         if white is None:
-            with pytest.raises(SagsError, match="cannot be told"):
+            with pytest.raises(SagsError, match="not clear which colour"):
                 instruments_are_white([tmp_path / "mask.png"])
         else:
             assert instruments_are_white([tmp_path / "mask.png"]) is white
