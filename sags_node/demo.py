@@ -16,7 +16,7 @@ from rich.table import Table
 
 from sags_node.config.schema import LaunchConfig
 from sags_node.errors import SagsError
-from sags_node.evaluation.measure import Options
+from sags_node.evaluation.measure import MeasureOptions
 from sags_node.evaluation.report import summary_table, write_report
 from sags_node.evaluation.session import measure
 from sags_node.evaluation.spool import Spool
@@ -31,7 +31,7 @@ VIDEO = "overlay.mp4"
 OVERLAY_START = 15.0  # s for the overlay to load its shapes and listen
 OVERLAY_GRACE = 15.0  # s for the overlay to write its video after the node has ended
 OVERLAY_STOP = 2.0  # s to do so when the demo is interrupted
-_OPTIONS = Options(hold_out=0)
+_OPTIONS = MeasureOptions(hold_out=0)
 
 
 @dataclass(frozen=True, slots=True)

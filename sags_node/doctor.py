@@ -83,9 +83,9 @@ def examine(config: LaunchConfig) -> list[Check]:
         _python(),
         *(_package(name) for name in REQUIRED),
         *(_library(name, package) for name, package in OPEN3D_LIBRARIES.items()),
-        _cores(),
-        _governor(),
-        _memory(),
+        check_cores(),
+        check_governor(),
+        check_memory(),
         check_gpu(config),
         *_gsplat(config),
         _kernel_cache(),
@@ -200,7 +200,7 @@ def _library(name: str, package: str) -> Check:
     return Check(package, "warning", "missing", f"Open3D needs it: sudo apt-get install {package}")
 
 
-def _cores(root: Path = host.ROOT) -> Check:
+def check_cores(root: Path = host.ROOT) -> Check:
     cores, there, quota = len(os.sched_getaffinity(0)), os.cpu_count() or 1, host.core_quota(root)
     found = f"{cores} core{'s' * (cores != 1)}, {platform.machine()}"
     if cores < there:
@@ -217,10 +217,10 @@ def _cores(root: Path = host.ROOT) -> Check:
     return Check("CPU", "ok", found)
 
 
-def _governor(root: Path = host.ROOT) -> Check:
+def check_governor(root: Path = host.ROOT) -> Check:
     found = host.governors(root)
     if not found:
-        return Check("CPU governor", "ok", "not told by this machine")
+        return Check("CPU governor", "ok", "not known")
     said = ", ".join(sorted(found))
     if found == {"performance"}:
         return Check("CPU governor", "ok", said)
@@ -228,10 +228,10 @@ def _governor(root: Path = host.ROOT) -> Check:
     return Check("CPU governor", level, said, "for even times: sudo cpupower frequency-set -g performance")
 
 
-def _memory(root: Path = host.ROOT) -> Check:
-    told = host.memory(root)
-    free = told.get("MemAvailable", 0)
-    swap, used = told.get("SwapTotal", 0), told.get("SwapTotal", 0) - told.get("SwapFree", 0)
+def check_memory(root: Path = host.ROOT) -> Check:
+    amounts = host.memory(root)
+    free = amounts.get("MemAvailable", 0)
+    swap, used = amounts.get("SwapTotal", 0), amounts.get("SwapTotal", 0) - amounts.get("SwapFree", 0)
     swapped = f"{used / 1e9:.1f} of {swap / 1e9:.1f} GB swap used" if swap else "no swap"
     found = f"{free / 1e9:.1f} GB free, {swapped}"
     if free < ENOUGH_MEMORY or used > free:  # it would not all fit, were it needed again

@@ -12,7 +12,7 @@ ROOT = Path("/")
 
 
 def core_quota(root: Path = ROOT) -> float | None:
-    """The cores whose time control groups grant, of this one and those above it; None: no limit is told.
+    """The cores whose time control groups grant, of this one and those above it; None: no limit is known.
 
     Versions 2 and 1 (https://docs.kernel.org/admin-guide/cgroup-v2.html).
     """

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import independent_client as client
@@ -30,6 +30,7 @@ class Watched:
     """A running node, and what its newest frames held."""
 
     def __init__(self, session: Path, run_dir: Path, *overrides: str) -> None:
+        self.run_dir = run_dir
         opened = open_session(
             session,
             [*RUN_HERE, f"publish.run_dir:={run_dir}", "source.loop:=true", "source.pace:=fast",
@@ -48,17 +49,8 @@ class Watched:
         until(lambda: len(self._newest) == ENOUGH)
         return list(self._newest) == ENOUGH * [right]
 
-    @contextmanager
-    def subscribed(self, *prefixes: str) -> Iterator[zmq.Socket[bytes]]:
-        context = zmq.Context()
-        socket = context.socket(zmq.SUB)
-        for prefix in prefixes:
-            socket.setsockopt_string(zmq.SUBSCRIBE, prefix)
-        socket.connect(self.data)
-        try:
-            yield socket
-        finally:
-            context.destroy(linger=0)
+    def subscribed(self, *prefixes: str) -> AbstractContextManager[zmq.Socket[bytes]]:
+        return client.subscribed(self.data, *prefixes)
 
     def heard(self, *names: str, count: int = 3) -> dict[str, list[client.Received]]:
         got = client.collect(self.data, [f"sags/{name}" for name in names], count, timeout=60)
@@ -112,8 +104,7 @@ def test_a_pair_of_eyes_from_elsewhere_is_a_look_at_the_right_one(running: Watch
     """Of a view nobody subscribes to, and of its left eye alone, it is not."""
     aside = np.eye(4)
     aside[0, 3] = 0.002
-    control = running.node._publisher.connection.control
-    with ControlClient(control) as asker:
+    with ControlClient(run_dir=running.run_dir) as asker:
         request = {"name": "pair", "stereo": True, "width": 64, "height": 48, "T_left_cam": aside.tolist()}
         asker.request("open_view", request)
         with running.subscribed("sags/view/pair/left/image"):

@@ -302,11 +302,11 @@ def bench_ablation(
     python -m benchmarks ablation launch/d4d_pull.yaml --out benchmarks/results/ablation_d4d.json
     """
     from benchmarks.quality import ablation
-    from sags_node.evaluation.measure import Options
+    from sags_node.evaluation.measure import MeasureOptions
 
     no_cameras = "benchmarks ablation plays recordings; record the cameras first"
     path, overrides = split_recording(launch, no_cameras)
-    options = Options(hold_out, lpips_weights=lpips_weights)
+    options = MeasureOptions(hold_out, lpips_weights=lpips_weights)
     check_files(out)
     session = open_launched(path, [*overrides, "source.loop:=false", "source.pace:=step"])
     with progress("measuring") as advance:

@@ -20,7 +20,7 @@ from benchmarks.kernels.contention import burning_core
 from benchmarks.node.neighbours import NS, STARTING, STOPPING, find_browser, overlay, reader, viewer
 from benchmarks.pareto.full_size import online_at
 from sags_node.errors import SagsError
-from sags_node.evaluation.measure import Options
+from sags_node.evaluation.measure import MeasureOptions
 from sags_node.evaluation.session import measure, run_realtime
 from sags_node.evaluation.spool import Spool
 from sags_node.pipeline.session import at_best_scale, open_session
@@ -120,7 +120,7 @@ def _live(launch: str | None, overrides: list[str], run_dir: str) -> Row:
     warm_up(session.config)
     full = session.config.vision.model_copy(update={"scale": 1.0})
     session = at_best_scale(session)
-    options = Options(hold_out=0)
+    options = MeasureOptions(hold_out=0)
     with Spool() as spool:
         run_realtime(session, session.config.publish, options, spool, lambda what, frames: None)
         outcome = measure(session, spool, options)

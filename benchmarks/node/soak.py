@@ -383,7 +383,7 @@ def worsening(measured: Mapping[str, Any]) -> list[str]:
     return found
 
 
-# ---- what is told ----------------------------------------------------------------------------------------
+# ---- what is said ----------------------------------------------------------------------------------------
 
 
 def table(measured: Mapping[str, Any]) -> Table:

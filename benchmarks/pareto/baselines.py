@@ -17,7 +17,7 @@ from sags_node.engine.rasterizer.rasterize import Rasterizer, make_rasterizer
 from sags_node.engine.rasterizer.views import colours_of
 from sags_node.errors import UsageError
 from sags_node.evaluation import metrics
-from sags_node.evaluation.measure import FrameRow, Options, Progress
+from sags_node.evaluation.measure import FrameRow, MeasureOptions, Progress
 from sags_node.evaluation.spool import Spool, SpooledFrame
 from sags_node.evaluation.summary import summarise
 from sags_node.evaluation.warp import warp_to_right
@@ -33,7 +33,7 @@ Row = dict[str, Any]  # with the keys of `sags eval` that apply
 
 
 def measured_baselines(
-    session: Session, spool: Spool, size: tuple[int, int], options: Options, progress: Progress
+    session: Session, spool: Spool, size: tuple[int, int], options: MeasureOptions, progress: Progress
 ) -> list[Row]:
     """Baselines that need the recording, over the frames of a run and with its masks.
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from sags_node.engine.rasterizer.rasterize import make_rasterizer, to_view
 from sags_node.evaluation import metrics
-from sags_node.evaluation.measure import FrameRow, Options, Progress
+from sags_node.evaluation.measure import FrameRow, MeasureOptions, Progress
 from sags_node.evaluation.spool import Spool
 from sags_node.evaluation.summary import summarise
 from sags_node.pipeline.session import Session
@@ -16,7 +16,7 @@ from sags_node.vision.tissue import TissueMask
 
 
 def online_at(
-    size: tuple[int, int], session: Session, spool: Spool, options: Options, progress: Progress
+    size: tuple[int, int], session: Session, spool: Spool, options: MeasureOptions, progress: Progress
 ) -> dict[str, Any]:
     """The figures `online` of a finished run, with its Gaussians drawn at `size` (width, height, px) and
     compared with pictures of that size.

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields, replace
 
 from sags_node.config.schema import LaunchConfig
 from sags_node.errors import UsageError
-from sags_node.evaluation.measure import Options
+from sags_node.evaluation.measure import MeasureOptions
 from sags_node.mapping.devices import ALL_SKIPS, Skips
 from sags_node.mapping.ladder import RUNGS
 
@@ -24,7 +24,7 @@ HURRIED_RULES = ("depth", "fitted")  # that act on rungs of the ladder where tim
 BUDGET, COUNT = "mapping.budget_ms", "mapping.max_gaussians"
 WIDTH, HEIGHT = "vision.width", "vision.height"
 
-DEFAULT_OPTIONS = Options()
+DEFAULT_OPTIONS = MeasureOptions()
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +47,7 @@ class Sweep:
 
     parts: tuple[str, ...] = PARTS
     repeat: int = 1
-    options: Options = DEFAULT_OPTIONS
+    options: MeasureOptions = DEFAULT_OPTIONS
 
     def __post_init__(self) -> None:
         known = (*PARTS, RUNG_PART, HOSTS)

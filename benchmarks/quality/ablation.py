@@ -21,7 +21,7 @@ from sags_node.engine.rasterizer.views import colours_of
 from sags_node.errors import SagsError, UsageError
 from sags_node.evaluation import metrics
 from sags_node.evaluation.lpips import Lpips
-from sags_node.evaluation.measure import Options
+from sags_node.evaluation.measure import MeasureOptions
 from sags_node.evaluation.provenance import machine_name
 from sags_node.fitting.clip import Clip, ClipFrame, read_clip
 from sags_node.fitting.fit import Fit
@@ -69,7 +69,7 @@ def measure_ablation(
     session: Session,
     warm_up: int,
     iterations: int,
-    options: Options,
+    options: MeasureOptions,
     advance: Advance,
     seeds: int = 3,
     only: Sequence[str] = (),

@@ -1,6 +1,6 @@
 """Points followed in the pictures of one eye by common methods that know no model: what anchors stand beside.
 
-Each is told the points' pixels in the first picture, and then shown the pictures in turn.
+Each gets the points' pixels in the first picture, and then shown the pictures in turn.
 """
 
 from __future__ import annotations

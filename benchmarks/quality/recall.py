@@ -1,7 +1,7 @@
 """Whether anchors come back after a long time out of sight: on the phantom, whose points are known exactly.
 
 Anchors are pinned, then the tissue is out of sight, then it is back. Meanwhile it breathes and is pulled, and
-the scope moves. Its pose is told, as by a robot, unless the node is to estimate it (`vision.pose`).
+the scope moves. Its pose is given, as by a robot, unless the node is to estimate it (`vision.pose`).
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ class _Said:
 
     def add(self, result: FrameResult, pinned: dict[int, int], truth: F64, points: F64) -> None:
         """`truth` [P, 2] px and `points` [P, 3] m of all the phantom's points. Of a frame that was not taken
-        in nobody is told where anchors are."""
+        in nobody knows where anchors are."""
         if result.held:
             return
         anchors, camera = result.anchors, result.pair.camera

@@ -132,7 +132,7 @@ def _table(section: type[Section], prefix: str, title: str, names: list[str]) ->
 
 
 def _said(field: FieldInfo) -> tuple[str, str]:
-    """What a key does, and its default: a default that depends is told by the description."""
+    """What a key does, and its default: a default that depends stands in the description."""
     said, _, depends = (field.description or "").partition("default: ")
     if depends:
         return _linked(said.removesuffix("; ")), _linked(depends)

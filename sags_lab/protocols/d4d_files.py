@@ -233,8 +233,8 @@ def instruments_are_white(masks: list[Path]) -> bool | None:
     share = float(np.median([np.mean(read_picture(file, cv2.IMREAD_GRAYSCALE) > 0) for file in chosen]))
     if UNSURE[0] < share < UNSURE[1]:
         raise SagsError(
-            f"{masks[0].parent}: {share:.0%} of the masks is white: which colour is the instrument cannot be "
-            "told; take the folder of masks away, and instruments are found by colour"
+            f"{masks[0].parent}: {share:.0%} of the masks is white: it is not clear which colour "
+            "is the instrument; take the folder of masks away, and instruments are found by colour"
         )
     return share <= UNSURE[0]
 

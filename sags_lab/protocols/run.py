@@ -20,7 +20,7 @@ from sags_lab.protocols.tracked_points import is_tracked, measure_tracked
 from sags_node.config.launch_file import load_launch
 from sags_node.config.schema import LaunchConfig, RecordedSource
 from sags_node.errors import SagsError
-from sags_node.evaluation.measure import Options
+from sags_node.evaluation.measure import MeasureOptions
 from sags_node.evaluation.metrics import resample_nearest
 from sags_node.evaluation.point_tracks import shares_within
 from sags_node.evaluation.session import evaluate
@@ -44,7 +44,7 @@ def measure_endonerf(
 
     Each held-out frame is drawn from those before it. Published fits see those after it, too.
     """
-    options = Options(HOLD_OUT, every=1, lpips_weights=lpips, paper_psnr=True)
+    options = MeasureOptions(HOLD_OUT, every=1, lpips_weights=lpips, paper_psnr=True)
     found = evaluate(
         folder, [AS_GIVEN, *overrides], options, "step", None, lambda what, done: progress(done, what)
     )

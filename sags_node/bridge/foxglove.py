@@ -36,7 +36,7 @@ SECOND_NS = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class Options:
+class FoxgloveOptions:
     """How `sags bridge foxglove` runs; the defaults are those of the command."""
 
     node: Place
@@ -48,7 +48,7 @@ class Options:
     max_age: float = MAX_AGE
 
 
-def outputs(options: Options) -> list[Output]:
+def outputs(options: FoxgloveOptions) -> list[Output]:
     """One channel for each topic of the node and of an overlay, and one more for each picture as H.264."""
     period = 0.0 if options.rate is None else 1 / options.rate
     offered = [(options.node.ns, topic) for topic in topics.TOPICS]
@@ -72,11 +72,11 @@ def _is_picture(topic: topics.Topic) -> bool:
     return topic.type == topics.IMAGE and topic.content.startswith("rgb")
 
 
-def run_foxglove(options: Options, ready: Callable[[str, int], None], stop: threading.Event) -> None:
+def run_foxglove(options: FoxgloveOptions, ready: Callable[[str, int], None], stop: threading.Event) -> None:
     """Serve Foxglove until `stop` is set. The node may come later and be restarted.
 
     Args:
-        ready: told the host and the port once peers can connect.
+        ready: called with the host and the port once peers can connect.
 
     Raises:
         UsageError: wrong keys.
@@ -102,7 +102,7 @@ class Foxglove:
         SagsError: the port cannot be bound.
     """
 
-    def __init__(self, options: Options, offered: Sequence[Output]) -> None:
+    def __init__(self, options: FoxgloveOptions, offered: Sequence[Output]) -> None:
         self._requests = Requests(options.node)
         self._missing: dict[str, str] = {}
         self._server: WebSocketServer | None = None
@@ -134,7 +134,7 @@ class Foxglove:
         """Foxglove goes on showing what came last, so something empty must come."""
         self._ways[output.name].blank(self._shown.pop(output.name), reason)
 
-    def tell(self, missing: Mapping[str, str], shows: bool) -> None:
+    def report(self, missing: Mapping[str, str], shows: bool) -> None:
         gone = self._missing.keys() - missing.keys()
         self._missing = dict(missing)
         if self._server is not None and gone:
@@ -170,7 +170,7 @@ class _Audience(ServerListener):
 
     Args:
         welcome: called when a client has begun to look at something.
-        pin: told what clients publish on `CLICKED`; None: they may not.
+        pin: called with what clients publish on `CLICKED`; None: they may not.
     """
 
     def __init__(self, welcome: Callable[[], None], pin: Callable[[bytes], None] | None) -> None:
@@ -290,7 +290,7 @@ def _way(output: Output, context: foxglove.Context) -> _Way:
 
 
 def _served(
-    options: Options, context: foxglove.Context, audience: _Audience, backlog: int
+    options: FoxgloveOptions, context: foxglove.Context, audience: _Audience, backlog: int
 ) -> WebSocketServer:
     """The server; a client that is slow gets at most `backlog` old messages, about those of a frame."""
     try:

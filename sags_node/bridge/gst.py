@@ -29,7 +29,7 @@ STOPPING = 5.0  # s for a writer to end
 
 
 @dataclass(frozen=True, slots=True)
-class Options:
+class GstOptions:
     """How `sags bridge gst` runs; the defaults are those of the command."""
 
     overlay: Place
@@ -39,11 +39,11 @@ class Options:
     max_age: float = MAX_AGE
 
 
-def run_gst(options: Options, ready: Callable[[], None], stop: threading.Event) -> None:
+def run_gst(options: GstOptions, ready: Callable[[], None], stop: threading.Event) -> None:
     """Write until `stop` is set. The overlay may come later and be restarted.
 
     Args:
-        ready: told once it waits for an overlay.
+        ready: called once it waits for an overlay.
 
     Raises:
         UsageError: no eye is to be written.
@@ -77,7 +77,7 @@ def run_gst(options: Options, ready: Callable[[], None], stop: threading.Event) 
 class _Displays:
     """The outlet: one pipeline for each eye, from its first picture on."""
 
-    def __init__(self, launches: Mapping[str, str], options: Options) -> None:
+    def __init__(self, launches: Mapping[str, str], options: GstOptions) -> None:
         self._launches, self._options = launches, options
         self._key: tuple[int, int, int] | None = None  # RGB
         self._displays: dict[str, _Display] = {}
@@ -109,7 +109,7 @@ class _Displays:
         if output.name in self._displays:
             self._displays[output.name].blank()
 
-    def tell(self, missing: Mapping[str, str], shows: bool) -> None:
+    def report(self, missing: Mapping[str, str], shows: bool) -> None:
         """A display shows pictures only; the overlay's `status` has the words."""
 
     def look(self) -> None:

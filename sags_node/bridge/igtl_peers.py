@@ -41,7 +41,7 @@ class Peers:
 
     Args:
         port: 0 for any free one.
-        hear: told what peers send, from that thread.
+        hear: called with what peers send, from that thread.
         idle: called there every `LOOK` s.
 
     Raises:

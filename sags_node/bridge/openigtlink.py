@@ -62,7 +62,7 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class Options:
+class IgtlOptions:
     """How `sags bridge openigtlink` runs; the defaults are those of the command."""
 
     node: Place
@@ -76,7 +76,7 @@ class Options:
     max_age: float = MAX_AGE
 
 
-def outputs(options: Options) -> list[Output]:
+def outputs(options: IgtlOptions) -> list[Output]:
     """What peers get, one device each: "Sags" and the name.
 
     Raises:
@@ -104,11 +104,11 @@ def outputs(options: Options) -> list[Output]:
     return [offered[name] for name in options.send or offered]
 
 
-def run_openigtlink(options: Options, ready: Callable[[str, int], None], stop: threading.Event) -> None:
+def run_openigtlink(options: IgtlOptions, ready: Callable[[str, int], None], stop: threading.Event) -> None:
     """Serve OpenIGTLink peers until `stop` is set. The node may come later and be restarted.
 
     Args:
-        ready: told the host and the port once peers can connect.
+        ready: called with the host and the port once peers can connect.
 
     Raises:
         UsageError: wrong keys, or something that cannot be sent.
@@ -138,7 +138,7 @@ class OpenIgtLink:
         SagsError: the port cannot be bound.
     """
 
-    def __init__(self, options: Options) -> None:
+    def __init__(self, options: IgtlOptions) -> None:
         place = options.node
         self._step, self._max_age = options.surface_step, options.max_age
         self._shapes: dict[
@@ -188,7 +188,7 @@ class OpenIgtLink:
         elif output.name == "Anchors":
             self._peers.send(device, igtl.points(device, seconds, np.empty((0, 3)), [], []))
 
-    def tell(self, missing: Mapping[str, str], shows: bool) -> None:
+    def report(self, missing: Mapping[str, str], shows: bool) -> None:
         words = "; ".join(f"{name}: {reason}" for name, reason in missing.items())
         if missing or not shows:
             code, words = igtl.NOT_READY, words or "waiting for the node's first message"
@@ -327,8 +327,15 @@ def _before_camera(K: F64) -> F64:
 def _written(dark: U8, reason: str) -> U8:
     """A picture without light that says why."""
     scale = max(dark.shape[0] / 1000, 0.4)
-    told = dark.copy()
+    written = dark.copy()
     cv2.putText(
-        told, reason, (8, dark.shape[0] // 2), cv2.FONT_HERSHEY_SIMPLEX, scale, (255, 170, 0), 1, cv2.LINE_AA
+        written,
+        reason,
+        (8, dark.shape[0] // 2),
+        cv2.FONT_HERSHEY_SIMPLEX,
+        scale,
+        (255, 170, 0),
+        1,
+        cv2.LINE_AA,
     )
-    return told
+    return written

@@ -66,7 +66,7 @@ class Outlet(Protocol):
         """Take back what was sent: it is not new any more."""
         ...
 
-    def tell(self, missing: Mapping[str, str], shows: bool) -> None:
+    def report(self, missing: Mapping[str, str], shows: bool) -> None:
         """What is asked for and does not come, output -> reason, and whether anything does; called when that
         changes."""
         ...
@@ -105,7 +105,7 @@ class Relay:
         self._outputs, self._outlet, self._max_age = outputs, outlet, max_age
         self._arrived = threading.Event()
         self._courses: dict[str, _Course] = {}
-        self._told: tuple[dict[str, str], bool] | None = None
+        self._reported: tuple[dict[str, str], bool] | None = None
         self._places = {place.ns: place for place in senders}
         self._feeds: dict[str, Feed] = {}
         try:
@@ -141,9 +141,9 @@ class Relay:
             self._pass_on(output, self._courses[output.name], now)
         missing = {name: course.reason for name, course in self._courses.items() if course.reason is not None}
         shows = any(course.shown_ns is not None for course in self._courses.values())
-        if self._told != (missing, shows):
-            self._told = missing, shows
-            self._outlet.tell(missing, shows)
+        if self._reported != (missing, shows):
+            self._reported = missing, shows
+            self._outlet.report(missing, shows)
 
     def close(self) -> None:
         for feed in self._feeds.values():

@@ -44,7 +44,7 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class Options:
+class Ros2Options:
     """How `sags bridge ros2` runs; the defaults are those of the command."""
 
     node: Place
@@ -69,7 +69,7 @@ class Offer:
     make: Make
 
 
-def offers(options: Options) -> list[Offer]:
+def offers(options: Ros2Options) -> list[Offer]:
     """Every topic of the node, of an overlay and of `options.views` as it is, and the small ones beside.
 
     Raises:
@@ -90,7 +90,7 @@ def offers(options: Options) -> list[Offer]:
     return found
 
 
-def _of_topic(ns: str, topic: topics.Topic, options: Options, optional: bool = False) -> list[Offer]:
+def _of_topic(ns: str, topic: topics.Topic, options: Ros2Options, optional: bool = False) -> list[Offer]:
     name = GLOBAL.get(topic.name, f"/{topics.full_name(ns, topic.name)}")
     delivery = _delivery(topic, options.max_age)
 
@@ -122,11 +122,11 @@ def _delivery(topic: topics.Topic, max_age: float) -> Delivery:
     return Delivery(reliable=topic.name == "anchors", depth=5, lifespan=max_age)
 
 
-def run_ros2(options: Options, ready: Callable[[int, str], None], stop: threading.Event) -> None:
+def run_ros2(options: Ros2Options, ready: Callable[[int, str], None], stop: threading.Event) -> None:
     """Publish into a ROS 2 graph until `stop` is set. The node may come later and be restarted.
 
     Args:
-        ready: told the domain and the interface once peers can see the topics.
+        ready: called with the domain and the interface once peers can see the topics.
 
     Raises:
         UsageError: wrong keys, `cyclonedds` is not installed, or there is no such network interface.
@@ -166,7 +166,7 @@ class Ros2:
         UsageError, SagsError: see `Graph`.
     """
 
-    def __init__(self, options: Options, offered: Sequence[Offer]) -> None:
+    def __init__(self, options: Ros2Options, offered: Sequence[Offer]) -> None:
         place = options.node
         self.graph = Graph(options.graph)
         self._ns = place.ns
@@ -177,7 +177,7 @@ class Ros2:
         self._pace = Pace()
         self._read: frozenset[str] = frozenset()  # by somebody
         self._missing: dict[str, str] = {}
-        self._stages: list[str] = []  # that the node's diagnostics told of last
+        self._stages: list[str] = []  # of the node's last diagnostics
         self._silent = False
         self._namesake = False
         self._refused: dict[str, int] = {}
@@ -221,7 +221,7 @@ class Ros2:
         if self._offers[output.name].kind == topics.STRING:
             self._writers[output.name].write(cdr.string(silent(reason)).cdr(), time.time_ns())
 
-    def tell(self, missing: Mapping[str, str], shows: bool) -> None:
+    def report(self, missing: Mapping[str, str], shows: bool) -> None:
         self._missing = dict(missing)
 
     # ---- on a thread of its own ----------------------------------------------------------------------------
@@ -240,17 +240,17 @@ class Ros2:
     def _beat(self) -> None:
         """Say how the bridge does, and that the node is silent while it is."""
         words = "; ".join(dict.fromkeys([*self._missing.values(), *self._namesakes()]))
-        told = [
+        statuses = [
             cdr.Status(
                 "bridge", 1 if words else 0, words or "all is new", {"topics_read": str(len(self._read))}
             )
         ]
         reason = self._missing.get(GLOBAL["diagnostics"])
         if reason is not None and (self._stages or self._silent):  # the first one takes up to a second
-            told += [cdr.Status(stage, STALE, reason, {}) for stage in self._stages or ["node"]]
+            statuses += [cdr.Status(stage, STALE, reason, {}) for stage in self._stages or ["node"]]
         self._silent = reason is not None
         now_ns = time.time_ns()
-        self._diagnostics.write(_array(told, self._ns, now_ns), now_ns)
+        self._diagnostics.write(_array(statuses, self._ns, now_ns), now_ns)
 
     def _namesakes(self) -> list[str]:
         """Who else publishes what only this node should: readers would get both, one after the other."""
@@ -303,14 +303,14 @@ def _thinned(received: Received, most: int) -> bytes:
 def _named(received: Received, ns: str) -> bytes:
     """The node's diagnostics for a topic that all share."""
     assert isinstance(received, ReceivedRos)
-    told = [
+    statuses = [
         cdr.Status(said.name, said.level, said.message, {each.key: each.value for each in said.values})
         for said in received.message.status
     ]
-    return _array(told, ns, received.stamp_ns)
+    return _array(statuses, ns, received.stamp_ns)
 
 
-def _array(told: Sequence[cdr.Status], ns: str, stamp_ns: int) -> bytes:
+def _array(statuses: Sequence[cdr.Status], ns: str, stamp_ns: int) -> bytes:
     """All of ROS shares one topic, so each name begins with the node's."""
-    named = [replace(status, name=f"{ns}: {status.name}") for status in told]
+    named = [replace(status, name=f"{ns}: {status.name}") for status in statuses]
     return cdr.diagnostics(named, stamp_ns).cdr()

@@ -43,7 +43,7 @@ PINNING = ("add_anchor", "remove_anchor")  # what peers may ask of the node, wit
 
 
 @dataclass(frozen=True, slots=True)
-class Options:
+class WebOptions:
     """How `sags bridge web` runs; the defaults are those of the command."""
 
     node: Place
@@ -70,11 +70,11 @@ _unheard.disabled = True
 _decoder = msgspec.json.Decoder(_Said)
 
 
-def run_web(options: Options, ready: Callable[[str, int], None], stop: threading.Event) -> None:
+def run_web(options: WebOptions, ready: Callable[[str, int], None], stop: threading.Event) -> None:
     """Serve WebSocket peers until `stop` is set. The node may come later and be restarted.
 
     Args:
-        ready: told the host and the port once peers can connect.
+        ready: called with the host and the port once peers can connect.
 
     Raises:
         UsageError: wrong keys.
@@ -98,7 +98,7 @@ def run_web(options: Options, ready: Callable[[str, int], None], stop: threading
         requests.close()
 
 
-def _served(options: Options, requests: Requests, stop: threading.Event) -> tuple[Server, int]:
+def _served(options: WebOptions, requests: Requests, stop: threading.Event) -> tuple[Server, int]:
     """A server that is bound and does not serve yet, and its port."""
     family = socket.AF_INET6 if ":" in options.host else socket.AF_INET
     try:
@@ -166,7 +166,7 @@ def _page(connection: ServerConnection, request: Request) -> Response | None:
 class Peer:
     """The outlet to one peer, on its thread."""
 
-    def __init__(self, connection: ServerConnection, options: Options, requests: Requests) -> None:
+    def __init__(self, connection: ServerConnection, options: WebOptions, requests: Requests) -> None:
         self._connection, self._options, self._requests = connection, options, requests
         self._missing: frozenset[str] = frozenset()
         self._relay: Relay | None = None
@@ -264,9 +264,9 @@ class Peer:
         return True
 
     def blank(self, output: Output, reason: str) -> None:
-        """`tell` says it."""
+        """`report` says it."""
 
-    def tell(self, missing: Mapping[str, str], shows: bool) -> None:
+    def report(self, missing: Mapping[str, str], shows: bool) -> None:
         for name in missing.keys() - self._missing:
             self._say({"topic": name, "stale": missing[name]})
         self._missing = frozenset(missing)

@@ -22,7 +22,7 @@ from sags_node.terminal.console import console, on_stop_signals, progress, show
 
 if TYPE_CHECKING:
     from sags_node.messaging.address import NodeAddress
-    from sags_node.recording.recorder import Options
+    from sags_node.recording.recorder import RecordOptions
 
 DATA_LOST = 3  # exit code
 
@@ -144,7 +144,7 @@ def record(
     from sags_node.messaging.stream import check_topic
     from sags_node.recording.bag_writer import Limits
     from sags_node.recording.message_writer import Compression
-    from sags_node.recording.recorder import Options, Recorder
+    from sags_node.recording.recorder import Recorder, RecordOptions
 
     def tell(said: dict[str, Any]) -> None:
         if from_stdin:
@@ -155,9 +155,9 @@ def record(
                 escape(" ".join(f"{what}: {value}" for what, value in said.items())), soft_wrap=True
             )
 
-    with _failure_told(tell if from_stdin else None):
+    with _failure_reported(tell if from_stdin else None):
         names = tuple(check_topic(say.plain(name, node.ns)).name for name in topics)
-        options = Options(
+        options = RecordOptions(
             folder=out or Path(f"sags_{datetime.now():%Y%m%d_%H%M%S}"),
             topics=names,
             compression=cast(Compression, compression),
@@ -183,7 +183,7 @@ def record(
     show(summary if json_out else say.recorded_table(summary))
 
 
-def _recorded(launch: Sequence[str], options: Options) -> dict[str, Any]:
+def _recorded(launch: Sequence[str], options: RecordOptions) -> dict[str, Any]:
     from sags_node.cli.played_bag import record_session
 
     path, overrides = split_recording(
@@ -246,9 +246,9 @@ def play(
     sags bag play out/case1 --clock 100
     """
     from sags_node.config.schema import PublishConfig
-    from sags_node.recording.player import Options, Player
+    from sags_node.recording.player import Player, PlayOptions
 
-    options = Options(
+    options = PlayOptions(
         rate=rate,
         loop=loop,
         delay=delay,
@@ -299,8 +299,8 @@ def recover(path: Path, out: Path, json_out: bool) -> None:
 
 
 @contextmanager
-def _failure_told(tell: Callable[[dict[str, Any]], None] | None) -> Iterator[None]:
-    """Also say a failure where a program reads it: `{"error": text}`; None: nobody reads."""
+def _failure_reported(tell: Callable[[dict[str, Any]], None] | None) -> Iterator[None]:
+    """Also report a failure where a program reads it: `{"error": text}`; None: nobody reads."""
     try:
         yield
     except SagsError as error:

@@ -172,12 +172,12 @@ def openigtlink(send: str, **options: Any) -> None:
     Needs: pip install 'sags-node[bridges]'
     """
     _check_installed("pyigtl", "pyigtl", "openigtlink")
-    from sags_node.bridge.openigtlink import Options, run_openigtlink
+    from sags_node.bridge.openigtlink import IgtlOptions, run_openigtlink
 
     ready, stop = options.pop("ready"), options.pop("stop")
     chosen = tuple(name for name in send.split(",") if name)
     os.nice(NICENESS)
-    run_openigtlink(Options(send=chosen, **options), ready, stop)
+    run_openigtlink(IgtlOptions(send=chosen, **options), ready, stop)
 
 
 @bridge.command()
@@ -208,10 +208,10 @@ def web(**options: Any) -> None:
     Needs: pip install 'sags-node[bridges]'
     """
     _check_installed("websockets", "websockets", "web")
-    from sags_node.bridge.web import Options, run_web
+    from sags_node.bridge.web import WebOptions, run_web
 
     ready, stop = options.pop("ready"), options.pop("stop")
-    run_web(Options(**options), ready, stop)
+    run_web(WebOptions(**options), ready, stop)
 
 
 @bridge.command()
@@ -244,12 +244,12 @@ def gst(overlay_ns: str, run_dir: Path | None, **options: Any) -> None:
     unixfdsink, for dVRK's sockets, needs GStreamer 1.24.
     """
     from sags_node.bridge.feed import Place
-    from sags_node.bridge.gst import Options, run_gst
+    from sags_node.bridge.gst import GstOptions, run_gst
 
     stop = threading.Event()
     on_stop_signals(stop.set)
     ready = partial(console.print, "writing as soon as an overlay is there  (Ctrl-C ends)")
-    run_gst(Options(Place(overlay_ns, run_dir=run_dir), **options), ready, stop)
+    run_gst(GstOptions(Place(overlay_ns, run_dir=run_dir), **options), ready, stop)
 
 
 @bridge.command()
@@ -288,10 +288,10 @@ def foxglove(layout: Path | None, **options: Any) -> None:
         with whole(layout) as partial:
             partial.write_text(layout_of(options["node"].ns, options["overlay"].ns), encoding="utf-8")
         return
-    from sags_node.bridge.foxglove import Options, run_foxglove
+    from sags_node.bridge.foxglove import FoxgloveOptions, run_foxglove
 
     os.nice(NICENESS)
-    run_foxglove(Options(**options), ready, stop)
+    run_foxglove(FoxgloveOptions(**options), ready, stop)
 
 
 @bridge.command()
@@ -345,7 +345,7 @@ def ros2(
         _check_open(f"--interface {interface}", insecure)
     from pydantic import ValidationError
 
-    from sags_node.bridge.ros2 import Options, run_ros2
+    from sags_node.bridge.ros2 import Ros2Options, run_ros2
     from sags_node.config.schema import RosGraph
     from sags_node.ros.graph import where
 
@@ -358,4 +358,4 @@ def ros2(
         say(f"in [bold]{escape(where(domain, interface))}[/]", {"domain": domain, "interface": interface})
 
     os.nice(NICENESS)
-    run_ros2(Options(graph=graph, **options), ready, stop)
+    run_ros2(Ros2Options(graph=graph, **options), ready, stop)

@@ -15,7 +15,7 @@ from sags_node.config.schema import EndoNerfSource
 from sags_node.engine.rasterizer.smoothing import bake_filter
 from sags_node.errors import UsageError
 from sags_node.evaluation.lpips import BACKBONE, Lpips
-from sags_node.evaluation.measure import Options
+from sags_node.evaluation.measure import MeasureOptions
 from sags_node.evaluation.provenance import machine_name
 from sags_node.files import check_results, is_result
 from sags_node.fitting import checkpoint
@@ -51,7 +51,7 @@ def check_fit(out: Path) -> None:
 def fit_session(
     session: Session,
     settings: FitSettings,
-    options: Options,
+    options: MeasureOptions,
     out: Path,
     resume: bool,
     advance: Advance,

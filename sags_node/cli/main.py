@@ -270,7 +270,7 @@ def keygen(name: str, out: Path) -> None:
 def health(json_out: bool, node: NodeAddress) -> None:
     """Ask a running node whether it does its work.
 
-    Exit code 0: frames come and are shown, or the node was told to pause. 1: it waits for frames, starts,
+    Exit code 0: frames come and are shown, or the node was paused. 1: it waits for frames, starts,
     stops, or does not answer within two seconds. For service managers and containers.
 
     \b

@@ -85,7 +85,7 @@ def evaluate(
     sags eval launch/d4d_pull.yaml --pace step --iterations 2 --report out/d4d
     """
     from sags_node.config.launch_file import load_launch
-    from sags_node.evaluation.measure import Options
+    from sags_node.evaluation.measure import MeasureOptions
     from sags_node.evaluation.report import check_report, summary_table, write_report
     from sags_node.evaluation.session import Pace
     from sags_node.evaluation.session import evaluate as measure
@@ -93,7 +93,7 @@ def evaluate(
     path, overrides = split(launch)
     if warm_up is not None:
         overrides.append(f"source.warm_up:={warm_up}")
-    options = Options(hold_out, every, lpips_weights, paper_psnr)
+    options = MeasureOptions(hold_out, every, lpips_weights, paper_psnr)
     if report is not None:
         check_plots()
         check_report(report)
@@ -201,7 +201,7 @@ def fit(
     sags fit /data/endonerf/pulling_soft_tissues --schedule paper
     """
     from sags_node.cli.fit_folder import check_fit, figures_table, fit_session
-    from sags_node.evaluation.measure import Options
+    from sags_node.evaluation.measure import MeasureOptions
     from sags_node.fitting.settings import MONOCULAR, PRESETS, with_changes
 
     no_cameras = "live cameras cannot be fitted; record them first, then fit the recording"
@@ -209,7 +209,7 @@ def fit(
     settings = PRESETS[schedule]
     if monocular and settings.schedule == "online":
         raise UsageError("--monocular needs --schedule paper: the online start measures distances")
-    options = Options(hold_out, 1, lpips_weights)
+    options = MeasureOptions(hold_out, 1, lpips_weights)
     asked = {
         "warm_up": warm_up,
         "iterations": iterations,

@@ -14,7 +14,7 @@ from sags_node.errors import SagsError
 from sags_node.messaging.address import NodeAddress
 from sags_node.node.node import Node
 from sags_node.pipeline.session import Session
-from sags_node.recording.recorder import Options, Recorder
+from sags_node.recording.recorder import Recorder, RecordOptions
 from sags_node.terminal.console import stop_signals
 from sags_node.types import FrameResult
 
@@ -26,7 +26,7 @@ LOOK_PERIOD = 0.25  # s
 Advance = Callable[[int, int | None, str], None]  # done, of, what
 
 
-def record_session(session: Session, options: Options, advance: Advance) -> dict[str, Any]:
+def record_session(session: Session, options: RecordOptions, advance: Advance) -> dict[str, Any]:
     """Play a recording and record what the node publishes; neither uses the sockets of another node.
 
     Args:

@@ -36,7 +36,7 @@ TissueOf = Callable[[StereoFrame, RectifiedPair], Bool]
 
 
 @dataclass(frozen=True, slots=True)
-class Options:
+class MeasureOptions:
     """What to measure, and what the run must leave out for it.
 
     Raises:
@@ -120,7 +120,7 @@ class Measurer:
         spool: Spool,
         rectifier: Rectifier,
         tissue_of: TissueOf,
-        options: Options,
+        options: MeasureOptions,
         exclude: tuple[Box, ...] = (),
         backend: str = "numba",
         pose: PoseWay = "session",

@@ -13,7 +13,7 @@ from sags_node.config.launch_file import load_launch
 from sags_node.config.schema import LaunchConfig, LiveSource, PublishConfig
 from sags_node.errors import SagsError, UsageError
 from sags_node.evaluation.gallery import Picture
-from sags_node.evaluation.measure import FrameRow, Measurer, Options, Progress
+from sags_node.evaluation.measure import FrameRow, MeasureOptions, Measurer, Progress
 from sags_node.evaluation.spool import Spool
 from sags_node.evaluation.summary import GROUPS, summarise
 from sags_node.kernels.threads import configure_threads
@@ -30,7 +30,7 @@ from sags_node.vision.tissue import TissueMask
 
 Pace = Literal["realtime", "step"]
 PROGRESS_PERIOD = 0.2  # s
-DEFAULT_OPTIONS = Options()
+DEFAULT_OPTIONS = MeasureOptions()
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +45,7 @@ class Evaluation:
 def evaluate(
     launch: Path | str | None,
     overrides: Sequence[str] = (),
-    options: Options = DEFAULT_OPTIONS,
+    options: MeasureOptions = DEFAULT_OPTIONS,
     pace: Pace = "step",
     iterations: int | None = None,
     progress: Progress = lambda what, frames: None,
@@ -93,7 +93,7 @@ def evaluate(
 def measure(
     session: Session,
     spool: Spool,
-    options: Options,
+    options: MeasureOptions,
     overrides: Sequence[str] = (),
     progress: Progress = lambda what, frames: None,
 ) -> Evaluation:
@@ -135,7 +135,7 @@ def measure(
 
 
 def run_step(
-    session: Session, options: Options, spool: Spool, progress: Progress, skips: Skips = ALL_SKIPS
+    session: Session, options: MeasureOptions, spool: Spool, progress: Progress, skips: Skips = ALL_SKIPS
 ) -> None:
     """Every frame in turn, none lost; only the pipeline's own work is timed."""
     configure_threads(session.config.engine.threads)
@@ -155,7 +155,7 @@ def run_step(
 
 
 def run_realtime(
-    session: Session, publish: PublishConfig, options: Options, spool: Spool, progress: Progress
+    session: Session, publish: PublishConfig, options: MeasureOptions, spool: Spool, progress: Progress
 ) -> None:
     """The node itself, threads and sockets included, on the recording's clock."""
 
@@ -179,7 +179,7 @@ def run_realtime(
 class _WithoutHeldOut:
     """A source whose held-out frames never reach the node."""
 
-    def __init__(self, source: Source, options: Options) -> None:
+    def __init__(self, source: Source, options: MeasureOptions) -> None:
         self._source = source
         self._options = options
 
@@ -211,7 +211,7 @@ class _WithoutHeldOut:
         self._source.stop()
 
 
-def _measured(session: Session, spool: Spool, options: Options, progress: Progress) -> Measurer:
+def _measured(session: Session, spool: Spool, options: MeasureOptions, progress: Progress) -> Measurer:
     """Read the recording again, with its truth, and measure every frame."""
     config = session.config
     rectifier = Rectifier(session.rig, *session.working_size)

@@ -11,7 +11,7 @@ import numpy as np
 
 from sags_node.evaluation import calibration
 from sags_node.evaluation.lpips import BACKBONE
-from sags_node.evaluation.measure import FrameRow, Options
+from sags_node.evaluation.measure import FrameRow, MeasureOptions
 from sags_node.evaluation.metrics import percentiles
 from sags_node.evaluation.provenance import machine_name
 from sags_node.evaluation.spool import RunFacts
@@ -36,7 +36,7 @@ STAGES = ("rectify", "mask", "depth", "map", "render", "publish")
 def summarise(
     session: str,
     rows: Sequence[FrameRow],
-    options: Options,
+    options: MeasureOptions,
     segments: Mapping[str, tuple[int, int]],
     budget_ms: float | None,
 ) -> dict[str, Any]:
@@ -122,7 +122,7 @@ def _memory(facts: Sequence[RunFacts]) -> dict[str, float] | None:
     }
 
 
-def _quality(rows: Sequence[FrameRow], options: Options) -> dict[str, dict[str, Any] | None]:
+def _quality(rows: Sequence[FrameRow], options: MeasureOptions) -> dict[str, dict[str, Any] | None]:
     groups: dict[str, dict[str, Any] | None] = {}
     for group, keys in GROUPS.items():
         figures = [row.figures[group] for row in rows if group in row.figures]

@@ -42,7 +42,7 @@ class Learner(Protocol):
         """Mean absolute colour residual before the last step on a frame. Reading it waits for that step."""
 
     def begin(self, model: DeformableModel, density: Density) -> None:
-        """What is to be learnt from now on, and who is told how hard pictures pull at the Gaussians."""
+        """What is to be learnt from now on, and what collects the gradients of the Gaussians."""
 
     def descend(
         self, frame: ClipFrame, rates: F32, field_rates: FieldRates, exposure_rate: float, deformed: bool

@@ -44,7 +44,7 @@ class FieldShape:
     levels: int = 2
     cells: int = 64  # along each axis, coarsest level
     channels: int = 32  # of each level
-    # How many of the clip's frames from one slot of time to the next. The paths are told at every third
+    # How many of the clip's frames from one slot of time to the next. The paths are given at every third
     # training frame: each slot has two of their times, as one without any is left to chance.
     frames_per_slot: float = 7.0
     first_values: tuple[float, float] = (0.7, 1.3)  # of the planes in space, at random between these

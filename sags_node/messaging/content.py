@@ -144,7 +144,7 @@ def _confidence(gaussians: Gaussians) -> F32:
 
 def _depth_confidence(result: FrameResult) -> Content:
     confidence = result.views["left"].confidence
-    assert confidence is not None  # else it is not told of
+    assert confidence is not None  # else it is not published
     return cdr.image(confidence, "32FC1", result.pair.t_capture_ns)
 
 
@@ -159,7 +159,7 @@ def left_image(pair: RectifiedPair) -> Content:
 
 
 def _right_image(result: FrameResult) -> Content:
-    assert result.pair.right is not None  # else it is not told of
+    assert result.pair.right is not None  # else it is not published
     return cdr.image(result.pair.right, "rgb8", result.pair.t_capture_ns, cdr.RIGHT_FRAME)
 
 
@@ -233,7 +233,7 @@ def status(health: NodeHealth, last: FrameResult | None) -> dict[str, Any]:
 
 
 def health_answer(health: NodeHealth) -> dict[str, Any]:
-    """Whether the node does its work: frames come and are shown, or it was told to pause."""
+    """Whether the node does its work: frames come and are shown, or it was paused."""
     codes = list(by_code(health.warnings))
     return {"healthy": health.state in HEALTHY, "state": health.state, "warnings": codes}
 

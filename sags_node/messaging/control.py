@@ -87,7 +87,7 @@ class ControlServer:
     A `SagsError` it raises is the answer; anything else is answered as an internal error and logged.
 
     Args:
-        took: told the file descriptor of a peer and the bytes of each request read from it.
+        took: called with the file descriptor of a peer and the bytes of each request read from it.
         gate: who came through it with which key.
 
     Attributes:

@@ -59,8 +59,8 @@ class Inbox:
         config: who may send.
         section: of the launch file that both stand in.
         take: called with each message and its arrival (wall clock, ns); what it refuses it raises as
-            `SagsError`, which the sender is told.
-        advice: what else its sender should be told; None: nothing.
+            `SagsError`, which the sender gets.
+        advice: what else its sender gets; None: nothing.
         newest: of each topic so many messages are taken from what waits; 0: all.
 
     Raises:

@@ -87,7 +87,7 @@ def topic_echo(
     """Each message of a topic: who, when, and its content (arrays as their range).
 
     Args:
-        warned: told all that the sender's `status` warns of, code -> text, whenever one comes.
+        warned: called with all that the sender's `status` warns of, code -> text, whenever one comes.
 
     Raises:
         UsageError: there is no such topic.
@@ -175,7 +175,7 @@ def topic_delay(
 
     Raises:
         UsageError: there is no such topic.
-        SagsError: no node is known, fewer than two messages came, or the node's clock was not told.
+        SagsError: no node is known, fewer than two messages came, or the node's clock is not known.
     """
     offset = None
     if node.control is None:

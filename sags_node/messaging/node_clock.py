@@ -142,7 +142,7 @@ class NodeClock:
             return self._estimate.jumps
 
     def latest_ns(self) -> int:
-        """What the node's clock shows now at the latest, so that no age is told too young. Where the offset
+        """What the node's clock shows now at the latest, so that no age is given too young. Where the offset
         is not known, what the clock here shows."""
         offset = self.offset
         return time.time_ns() + (0 if offset is None else round(1e9 * (offset.seconds + offset.bound)))

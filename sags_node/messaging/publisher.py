@@ -349,7 +349,7 @@ class Publisher:
             self._subscribed.discard(prefix)
 
     def _thin_subscription(self, name: str, begins: bool) -> None:
-        """Who asks for what cannot be made is told so on that very topic."""
+        """Who asks for what cannot be made gets the reason on that very topic."""
         if not begins:
             if name in self.thin:  # any number of names may come and go, and a number must not come again
                 self.thin = {asked: thin for asked, thin in self.thin.items() if asked != name}

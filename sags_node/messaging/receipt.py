@@ -1,4 +1,4 @@
-"""What a program that hands pictures or poses in is told, once a second, as msgpack."""
+"""What a program that hands pictures or poses in gets back, once a second, as msgpack."""
 
 from __future__ import annotations
 

@@ -212,7 +212,7 @@ def is_loopback(host: str) -> bool:
 
 
 class RateLimitedLog:
-    """Keeps a stranger from filling the log."""
+    """Logs at most once in a period, so that no stranger fills the log."""
 
     def __init__(self, period: float = LOG_PERIOD) -> None:
         self._period = period

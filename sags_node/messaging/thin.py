@@ -88,7 +88,7 @@ def _colour(result: FrameResult, topic: str, part: tuple[slice, slice]) -> U8:
     if topic == "left/image_rect_color":
         return result.pair.left[part]
     if topic == "right/image_rect_color":
-        assert result.pair.right is not None  # else it is not told of
+        assert result.pair.right is not None  # else it is not published
         return result.pair.right[part]
     view = _view(result, topic)
     over_black: U8 = cv2.multiply(view.rgb[part], cv2.merge([_alpha(view, part)] * 3), scale=1 / 255)
@@ -108,7 +108,7 @@ def _numbers(
         return 0.0, "mono8", result.observation.tissue[part][few].view(np.uint8) * np.uint8(255)
     view = result.views["left"]
     if topic == "left/render/depth_confidence":
-        assert view.confidence is not None  # else it is not told of
+        assert view.confidence is not None  # else it is not published
         steps = cv2.convertScaleAbs(view.confidence[part][few], alpha=1 / CONFIDENCE_STEP)
         return CONFIDENCE_STEP, "mono8", steps
     depth = view.depth if topic == "left/render/depth" else result.observation.depth

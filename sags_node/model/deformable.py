@@ -71,7 +71,7 @@ class DeformableModel:
 
     def between(self, t_ns: int, before_ns: int, after_ns: int, cameras: Sequence[Camera]) -> Gaussians:
         """The Gaussians at a time between two that were learnt, on straight lines from the one to the other:
-        in between nothing told the field what to say.
+        in between the field was given nothing to learn.
 
         Args:
             t_ns: the time.

@@ -68,7 +68,7 @@ class Node:
 
         Args:
             on_result: called on the publishing thread after each result has been sent.
-            manager: told how the node fares.
+            manager: notified of the state of the node.
 
         Raises:
             SagsError: an endpoint cannot be bound, or the configuration does not fit the rig.

@@ -1,4 +1,4 @@
-"""What a service manager is told: systemd's protocol (sd_notify(3)), datagrams to `$NOTIFY_SOCKET`."""
+"""What a service manager is notified of: systemd's protocol (sd_notify(3)), datagrams to `$NOTIFY_SOCKET`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ LONGEST_STATUS = 400  # characters
 
 
 class ServiceManager:
-    """Whoever started the process and asked to be told; where nobody did, nothing is sent.
+    """Whoever started the process and asked for notifications; where nobody did, nothing is sent.
 
     Args:
         environment: `NOTIFY_SOCKET` says where, `WATCHDOG_USEC` how long silence may last, and `WATCHDOG_PID`

@@ -34,7 +34,7 @@ def rigid_fit(model: F64, places: F64, weights: F64) -> tuple[F64, float]:
 
 
 def on_a_line(points: F64) -> bool:
-    """True when points [k, 3] lie so nearly on a line that no rotation can be told from them."""
+    """True when points [k, 3] lie so nearly on a line that no rotation follows from them."""
     spread = np.linalg.svd(points - points.mean(0), compute_uv=False)
     return bool(spread[1] < LEAST_SPREAD * spread[0] or spread[0] == 0)
 

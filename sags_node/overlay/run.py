@@ -50,7 +50,7 @@ RECENT = 300  # durations are behind the figures in `status`
 
 
 @dataclass(frozen=True, slots=True)
-class Options:
+class OverlayOptions:
     """How `sags overlay` runs; the defaults are those of the command."""
 
     node: NodeAddress = THE_NODE  # with its endpoint, its control is to be given; `run_dir` is ours, too
@@ -67,7 +67,7 @@ class Options:
     ahead: float | str = 0.0  # ms, or auto
 
 
-def run_overlay(options: Options, tell: Callable[[str], object] = log.warning) -> dict[str, Any]:
+def run_overlay(options: OverlayOptions, tell: Callable[[str], object] = log.warning) -> dict[str, Any]:
     """Publish an overlay of a node until its time is over or Ctrl-C. The node may be started later.
 
     Args:
@@ -106,7 +106,7 @@ def run_overlay(options: Options, tell: Callable[[str], object] = log.warning) -
 class _Overlay:
     def __init__(
         self,
-        options: Options,
+        options: OverlayOptions,
         scene: SceneSpec,
         bodies: Sequence[Body],
         stream: OverlayStream,
@@ -262,9 +262,9 @@ class _Overlay:
             self._stream.blank(stale)
             return None, stale
         confidence = self._node.aligned([CONFIDENCE], stamp_ns)
-        told = self._node.latest(CONFIDENCE) is not None  # else this node or recording never tells
+        given = self._node.latest(CONFIDENCE) is not None  # else this node or recording has none
         frame = None
-        if messages is not None and (confidence is not None or not told):
+        if messages is not None and (confidence is not None or not given):
             sure = None if confidence is None else confidence[CONFIDENCE]
             frame = tissue_frame(messages, self._right_info(), sure)
         if frame is None:  # the next one may be whole; if not, the clock takes the overlay away

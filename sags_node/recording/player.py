@@ -25,7 +25,7 @@ FRAME_TYPES = (topics.IMAGE, topics.POINT_CLOUD, topics.CAMERA_INFO, topics.TF)
 
 
 @dataclass(frozen=True, slots=True)
-class Options:
+class PlayOptions:
     """The flags of `ros2 bag play`. Seconds are those of the recording, but for `delay`.
 
     Attributes:
@@ -49,7 +49,7 @@ class Player:
     """Call `play` once. `stop` and `toggle_pause` may be called from any thread or signal handler."""
 
     def __init__(
-        self, path: Path, options: Options, config: PublishConfig, ns: str = "sags", paused: bool = False
+        self, path: Path, options: PlayOptions, config: PublishConfig, ns: str = "sags", paused: bool = False
     ) -> None:
         self._path = path
         self._options = options

@@ -33,7 +33,7 @@ DEFAULT_CACHE_MB = 256.0
 
 
 @dataclass(frozen=True, slots=True)
-class Options:
+class RecordOptions:
     """What to record, and how.
 
     Attributes:
@@ -61,7 +61,7 @@ class _Topic:
 class Recorder:
     """Call `run` once. `stop` and `snapshot` may be called from any thread or signal handler."""
 
-    def __init__(self, options: Options) -> None:
+    def __init__(self, options: RecordOptions) -> None:
         self._options = options
         self._most_bytes = int(options.max_cache_mb * 1e6)
         self._stopping = threading.Event()

@@ -80,14 +80,14 @@ class Graph:
         return found
 
     def reader(self, topic: str, kind: str, delivery: Delivery = BEST_EFFORT) -> Reader:
-        """A reader of a topic, told as ROS tells it, e.g. `/a/image_raw`. Best effort fits every writer."""
+        """A reader of a topic, named as in ROS, e.g. `/a/image_raw`. Best effort fits every writer."""
         reader = Reader(self.participant, topic, kind, delivery)
         self._waiting.attach(reader.condition)
         self._read.append(reader.guid)
         return reader
 
     def writer(self, topic: str, kind: str, delivery: Delivery = BEST_EFFORT) -> Writer:
-        """A writer of a topic, told as ROS tells it."""
+        """A writer of a topic, named as in ROS."""
         writer = Writer(self.participant, topic, kind, delivery)
         self._written.append(writer.guid)
         return writer
@@ -139,7 +139,7 @@ def receive_buffer() -> int:
 
 def kernel_buffer(which: Literal["default", "max"]) -> int | None:
     """The receive buffer, in bytes, of a process of this machine that asks for none, or the largest that it
-    may ask for; None: the kernel does not tell."""
+    may ask for; None: the kernel does not say."""
     said = Path(f"/proc/sys/net/core/rmem_{which}")
     return int(said.read_text()) if said.exists() else None
 

@@ -35,7 +35,7 @@ def run_viewer(
 
     Args:
         node: it need not run yet. With both `endpoint` and `control` its clock is asked for, too.
-        ready: told the address and the port once browsers can connect.
+        ready: called with the address and the port once browsers can connect.
 
     Raises:
         UsageError: `host` is no loopback address and `insecure` is not given, or the node's keys do not fit.

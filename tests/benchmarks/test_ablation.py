@@ -10,6 +10,7 @@ from unittest.mock import ANY
 
 import pytest
 from click.testing import CliRunner
+from command_line import figures_of
 
 from benchmarks.__main__ import main
 from benchmarks.quality import ablation
@@ -39,9 +40,7 @@ def test_all_variants_are_measured_on_the_same_frames(
     arguments = ["source.frames:=12", "--warm-up", "2", "--iterations", "3", "--seeds", "2"]
     arguments += ["--set", "max_gaussians=800"]
     arguments += [f"--variant={name}" for name in small if name != "nodes"] + ["--out", str(out), "--json"]
-    result = CliRunner().invoke(main, ["ablation", str(phantom_session), *arguments])
-    assert result.exit_code == 0, result.output
-    found = json.loads(result.stdout)
+    found = figures_of("ablation", str(phantom_session), *arguments, command=main)
     assert json.loads(out.read_text()) == {"provenance": ANY} | found
     del small["nodes"]
     assert list(found["variants"]) == list(small)

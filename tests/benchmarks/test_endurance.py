@@ -12,18 +12,14 @@ from unittest.mock import ANY
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
+from command_line import figures_of
 from places import SESSION
 
 from benchmarks.__main__ import main
 from benchmarks.node import endurance
-from benchmarks.node.endurance import (
-    FIGURES,
-    STILL_FRAMES,
-    Window,
-    measure_endurance,
-    slope,
-    statement,
-)
+from benchmarks.node.endurance import FIGURES, STILL_FRAMES, Window, measure_endurance, slope, statement
+from benchmarks.node.soak import worsening
+from sags_node.errors import SagsError
 from sags_node.pipeline.session import Session, open_session
 
 QUIET = Window(0, 25.0, 30.0, 35.0, 30_000, 500, 400.0, 0, 0, 0)
@@ -151,9 +147,8 @@ def test_a_recording_that_does_not_fit_into_memory_is_refused(monkeypatch: pytes
 def test_the_command_prints_and_writes_the_same_table(tmp_path: Path) -> None:
     out = tmp_path / "new" / "endurance.json"
     arguments = ("mapping.max_gaussians:=2000", "source.frames:=12", "--frames", 24, "--window", 6)
-    result = bench(SESSION, *arguments, "--order", "wrap", "--json", "--out", out)
-    assert result.exit_code == 0, result.output
-    found = json.loads(result.stdout)
+    asked = (*arguments, "--order", "wrap", "--json", "--out", out)
+    found = figures_of("endurance", SESSION, *asked, command=main)
     assert json.loads(out.read_text()) == {"provenance": ANY} | found
     assert found["recorded_frames"] == 12 and found["order"] == "wrap" and len(found["windows"]) == 4
     shown = bench(SESSION, *arguments)
@@ -167,3 +162,37 @@ def test_what_cannot_be_played_over_and_over_says_why(tmp_path: Path) -> None:
     assert result.exit_code == 2 and "record" in result.output
     assert bench("nothing.yaml").exit_code == 2
     assert bench(SESSION, "--order", "sideways").exit_code == 2
+
+
+# ---- when `python -m benchmarks soak --check` fails ----------------------------------------------------
+
+
+HOURLY = 108.0  # thousands of frames
+
+
+def soak(figure: str, mean: float, hourly: float, error: float) -> dict[str, Any]:
+    trend = {"slope": hourly / HOURLY, "standard_error": error / HOURLY}
+    return {"windows": [{figure: mean}] * 5, "per_1000_frames": {figure: trend}}
+
+
+@pytest.mark.parametrize(
+    ("figure", "mean", "hourly", "error", "fails"),
+    [
+        ("rss_mb", 400.0, 50.0, 10.0, True),
+        ("rss_mb", 400.0, 50.0, 20.0, False),  # within its scatter
+        ("rss_mb", 400.0, 30.0, 1.0, False),  # less than a tenth
+        ("rss_mb", 400.0, -50.0, 1.0, False),
+        ("psnr", 32.0, -4.0, 1.0, True),
+        ("psnr", 32.0, 4.0, 1.0, False),
+        ("descriptors", 40.0, 5.0, 0.0, True),
+    ],
+)
+def test_what_gets_worse_beyond_its_scatter_fails(
+    figure: str, mean: float, hourly: float, error: float, fails: bool
+) -> None:
+    assert worsening(soak(figure, mean, hourly, error)) == ([figure] if fails else [])
+
+
+def test_too_few_windows_are_no_pass() -> None:
+    with pytest.raises(SagsError, match="too few windows"):
+        worsening({"windows": [], "per_1000_frames": {"rss_mb": None}})

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
+from command_line import figures_of
 from places import ROOT
 
 from benchmarks.__main__ import main
@@ -155,9 +156,7 @@ def test_everything_is_measured_on_a_tiny_session(phantom_session: Path, tmp_pat
     out, plot = tmp_path / "pareto.json", tmp_path / "pareto.png"
     files = ["--fit", tmp_path / "fit.json", "--out", out, "--plot", plot]
     asked = ["mapping.max_gaussians:=3000", "mapping.rung:=8", "--frames", 10]  # whatever the machine affords
-    result = bench(phantom_session, *asked, *files, "--json")
-    assert result.exit_code == 0, result.output
-    found = json.loads(result.stdout)
+    found = figures_of("pareto", phantom_session, *asked, *files, "--json", command=main)
     assert json.loads(out.read_text()) == {"provenance": ANY} | found
     (session,) = found["sessions"]
     rows = {tuple(each["overrides"]): each for each in session["settings"]}
@@ -197,15 +196,7 @@ def test_a_duplicate_that_is_skipped_saves_its_time(phantom_session: Path, tmp_p
         first, *others = sorted((folder / name).iterdir())
         for other in others:
             shutil.copy(first, other)
-    result = bench(
-        folder,
-        "mapping.max_gaussians:=2000",
-        "--frames",
-        6,
-        "--only",
-        "skips",
-        "--json",
-    )
+    result = bench(folder, "mapping.max_gaussians:=2000", "--frames", 6, "--only", "skips", "--json")
     assert result.exit_code == 0, result.output
     (session,) = json.loads(result.stdout)["sessions"]
     skip = next(each for each in session["skips"] if each["rule"] == "skip_duplicates")

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from command_line import refused, sags
+from command_line import refused, sags, start
 from igtl_peer import PEER, Peer, built, peer
 from places import SESSION
 from running_node import RunningNode
@@ -24,12 +24,7 @@ pytestmark = pytest.mark.live
 @contextmanager
 def bridge(run_dir: Path, *command: str) -> Iterator[tuple[subprocess.Popen[str], int]]:
     """`sags bridge` and its port."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", "sags_node", "bridge", *command, "--json", "--run-dir", str(run_dir)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    process = start(["bridge", *command, "--json", "--run-dir", run_dir])
     try:
         assert process.stdout is not None and process.stderr is not None
         line = process.stdout.readline()  # ends with the process
@@ -45,9 +40,7 @@ def state(joined: Peer) -> str:
 
 
 @pytest.mark.fault("process: a bridge is killed; the node is killed under a bridge")
-def test_a_pinned_anchor_comes_back_and_a_killed_node_leaves_nothing_standing(
-    tmp_path: Path,
-) -> None:
+def test_a_pinned_anchor_comes_back_and_a_killed_node_leaves_nothing_standing(tmp_path: Path) -> None:
     pytest.importorskip("pyigtl", reason="no OpenIGTLink without: pip install 'sags-node[bridges]'")
     program = built(PEER, tmp_path)
     run_dir = tmp_path / "run"

@@ -28,7 +28,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from sags_node.bridge.feed import Place
-from sags_node.bridge.foxglove import CLICKED, Options, clicked, outputs, run_foxglove
+from sags_node.bridge.foxglove import CLICKED, FoxgloveOptions, clicked, outputs, run_foxglove
 from sags_node.bridge.foxglove_layout import layout_of
 from sags_node.messaging import cdr, topics
 from sags_node.messaging.subscriber import Subscriber
@@ -107,9 +107,9 @@ def client(port: int) -> Iterator[Client]:
         joined.close()
 
 
-def options(run_dir: Path, **changes: Any) -> Options:
+def options(run_dir: Path, **changes: Any) -> FoxgloveOptions:
     settings = {"node": Place(run_dir=run_dir), "overlay": Place("overlay", run_dir=run_dir), "port": 0}
-    return Options(**{**settings, **changes})
+    return FoxgloveOptions(**{**settings, **changes})
 
 
 def ros(joined: Client, name: str, number: int = -1) -> Any:

@@ -5,17 +5,17 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 from command_line import refused
 from gstreamer import need_gstreamer
-from waiting import until
+from waiting import repeating, until
 
 from sags_node.bridge.feed import Place
-from sags_node.bridge.gst import Options, run_gst
+from sags_node.bridge.gst import GstOptions, run_gst
 from sags_node.errors import SagsError
 from sags_node.overlay.draw import color_key
 from sags_node.overlay.stream import OverlayStream
@@ -36,28 +36,18 @@ def bgrx(rgb: np.ndarray) -> np.ndarray:
     return np.concatenate([rgb[..., ::-1], np.full((*rgb.shape[:2], 1), 255, np.uint8)], axis=2)
 
 
-@contextmanager
-def drawing(stream: OverlayStream, paused: threading.Event) -> Iterator[None]:
+def drawing(stream: OverlayStream, paused: threading.Event) -> AbstractContextManager[None]:
     """An overlay's thread; while `paused` it says nothing, as one that hangs."""
-    stop = threading.Event()
 
-    def draw() -> None:
-        number = 0
-        while not stop.wait(1 / 30):
-            if not paused.is_set():
-                stream.serve()
-                pictures = {eye: overlay_of(n) for n, eye in enumerate(("left", "right"))}
-                stream.show(pictures, number, time.time_ns(), 0)
-                stream.tell({})
-                number += 1
+    def draw(number: int) -> None:
+        time.sleep(1 / 30)
+        if not paused.is_set():
+            stream.serve()
+            pictures = {eye: overlay_of(n) for n, eye in enumerate(("left", "right"))}
+            stream.show(pictures, number, time.time_ns(), 0)
+            stream.tell({})
 
-    thread = threading.Thread(target=draw)
-    thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        thread.join()
+    return repeating(draw)
 
 
 @contextmanager
@@ -66,7 +56,7 @@ def displays(run_dir: Path, **launches: str) -> Iterator[None]:
 
     def work() -> None:
         try:
-            run_gst(Options(Place("overlay", run_dir=run_dir), **launches), lambda: None, stop)
+            run_gst(GstOptions(Place("overlay", run_dir=run_dir), **launches), lambda: None, stop)
         except SagsError as error:
             failed.append(error)
 
@@ -116,7 +106,7 @@ def test_both_eyes_come_to_the_pixel_and_what_is_old_becomes_the_key(tmp_path: P
 
 def test_a_wrong_pipeline_is_said_in_words(tmp_path: Path) -> None:
     need_gstreamer()
-    options = Options(Place("overlay", run_dir=tmp_path), left="nosuchsink")
+    options = GstOptions(Place("overlay", run_dir=tmp_path), left="nosuchsink")
     stop = threading.Event()
     threading.Timer(60, stop.set).start()
     with OverlayStream("overlay", tmp_path, KEY) as stream, drawing(stream, threading.Event()):

@@ -25,7 +25,7 @@ from sags_node.bridge import igtl
 from sags_node.bridge.feed import Place
 from sags_node.bridge.igtl import MAX_BODY_BYTES
 from sags_node.bridge.igtl_peers import Peers
-from sags_node.bridge.openigtlink import Options, request_of, run_openigtlink
+from sags_node.bridge.openigtlink import IgtlOptions, request_of, run_openigtlink
 from sags_node.geometry import invert, transform, unproject
 from sags_node.overlay.stream import OverlayStream
 
@@ -45,9 +45,9 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return built(PEER, tmp_path_factory.mktemp("peer"))
 
 
-def options(run_dir: Path, **changes: Any) -> Options:
+def options(run_dir: Path, **changes: Any) -> IgtlOptions:
     settings = {"node": Place(run_dir=run_dir), "overlay": Place("overlay", run_dir=run_dir), "port": 0}
-    return Options(**{**settings, **changes})
+    return IgtlOptions(**{**settings, **changes})
 
 
 def weighted(picture: np.ndarray) -> int:
@@ -157,7 +157,6 @@ def test_the_overlay_comes_over_its_picture(tmp_path: Path, program: Path) -> No
     rgba[10:20, 30:50] = (0, 255, 0, 255)
     expected = plane_result().pair.left.copy()
     expected[10:20, 30:50] = (0, 255, 0)
-    overlay = OverlayStream("overlay", tmp_path, (0, 0, 255))
     newest: list[tuple[int, int]] = []
 
     def frame(number: int) -> Any:
@@ -165,22 +164,20 @@ def test_the_overlay_comes_over_its_picture(tmp_path: Path, program: Path) -> No
         newest.append((number, result.pair.t_capture_ns))
         return result
 
-    try:
-        with sockets(tmp_path) as running, stream(running, frame):
-            with (
-                bridged(run_openigtlink, options(tmp_path, send=("overlay",))) as port,
-                peer(program, port) as joined,
-            ):
+    def drawn() -> bool:
+        overlay.serve()
+        overlay.show({"left": rgba}, *newest[-1], 0)
+        return joined.newest("SagsOverlay") is not None
 
-                def drawn() -> bool:
-                    overlay.serve()
-                    overlay.show({"left": rgba}, *newest[-1], 0)
-                    return joined.newest("SagsOverlay") is not None
-
-                until(drawn)
-                assert int((joined.newest("SagsOverlay") or [])[4]) == weighted(expected)
-    finally:
-        overlay._publisher.close()
+    with (
+        OverlayStream("overlay", tmp_path, (0, 0, 255)) as overlay,
+        sockets(tmp_path) as running,
+        stream(running, frame),
+        bridged(run_openigtlink, options(tmp_path, send=("overlay",))) as port,
+        peer(program, port) as joined,
+    ):
+        until(drawn)
+        assert int((joined.newest("SagsOverlay") or [])[4]) == weighted(expected)
 
 
 # ---- nothing old is shown as new -------------------------------------------------------------------------

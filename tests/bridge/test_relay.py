@@ -84,7 +84,7 @@ class Peer:
     def blank(self, output: Output, reason: str) -> None:
         self.shown.append((self._world.now, None))
 
-    def tell(self, missing: Mapping[str, str], shows: bool) -> None: ...
+    def report(self, missing: Mapping[str, str], shows: bool) -> None: ...
 
 
 def bridged(

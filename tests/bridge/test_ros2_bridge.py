@@ -20,7 +20,7 @@ from waiting import until
 from sags_node.bridge import ros2
 from sags_node.bridge.compressed import LARGEST, Compressor
 from sags_node.bridge.feed import Place
-from sags_node.bridge.ros2 import PACE, Options, Pace, offers, run_ros2
+from sags_node.bridge.ros2 import PACE, Pace, Ros2Options, offers, run_ros2
 from sags_node.bridge.ros2_requests import asks
 from sags_node.config.schema import RosGraph
 from sags_node.errors import SagsError, UsageError
@@ -38,12 +38,12 @@ FRAME_TOPICS = [topic.name for topic in topics.TOPICS if topic.name != "paramete
 TEXT, TF, ARRAY = topics.STRING, topics.TF, topics.DIAGNOSTICS
 
 
-def options(run_dir: Path, **changes: Any) -> Options:
+def options(run_dir: Path, **changes: Any) -> Ros2Options:
     settings = {
         "node": Place(run_dir=run_dir), "overlay": Place("overlay", run_dir=run_dir),
         "graph": RosGraph(domain=DOMAIN),
     }  # fmt: skip
-    return Options(**{**settings, **changes})
+    return Ros2Options(**{**settings, **changes})
 
 
 def named(topic: str) -> str:

@@ -24,7 +24,7 @@ from synthetic import at_frame, stream
 from waiting import until
 
 from sags_node.bridge.feed import Place
-from sags_node.bridge.ros2 import Options, run_ros2
+from sags_node.bridge.ros2 import Ros2Options, run_ros2
 from sags_node.config.schema import RosGraph
 from sags_node.messaging import cdr, topics
 from sags_node.messaging.received import Received, ReceivedCloud, TopicName
@@ -44,9 +44,9 @@ def _rclpy() -> None:
     rclpy_python()
 
 
-def options(run_dir: Path) -> Options:
+def options(run_dir: Path) -> Ros2Options:
     places = {"node": Place(run_dir=run_dir), "overlay": Place("overlay", run_dir=run_dir)}
-    return Options(**places, graph=RosGraph(domain=DOMAIN))
+    return Ros2Options(**places, graph=RosGraph(domain=DOMAIN))
 
 
 def checksum(message: Received) -> int:

@@ -29,7 +29,7 @@ from websockets.sync.client import ClientConnection, connect
 from sags_node.bridge import web as gateway
 from sags_node.bridge.feed import Place
 from sags_node.bridge.relay import MAX_AGE
-from sags_node.bridge.web import LONGEST_MESSAGE, MOST_PEERS, Options, run_web
+from sags_node.bridge.web import LONGEST_MESSAGE, MOST_PEERS, WebOptions, run_web
 from sags_node.messaging import content
 
 pytestmark = pytest.mark.live
@@ -38,9 +38,9 @@ CHROMIUM = shutil.which("chromium")
 DEPTH, IMAGE = "sags/left/render/depth", "sags/left/render/image"
 
 
-def options(run_dir: Path, **changes: Any) -> Options:
+def options(run_dir: Path, **changes: Any) -> WebOptions:
     settings = {"node": Place(run_dir=run_dir), "overlay": Place("overlay", run_dir=run_dir), "port": 0}
-    return Options(**{**settings, **changes})
+    return WebOptions(**{**settings, **changes})
 
 
 @contextmanager

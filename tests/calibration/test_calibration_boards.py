@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,22 +11,12 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from click.testing import CliRunner
-from drawn_boards import (
-    SIZE,
-    SQUARE,
-    SQUARES,
-    charuco_print,
-    chessboard_print,
-    draw_pairs,
-    known_rig,
-    poses,
-)
+from command_line import ran
+from drawn_boards import SIZE, SQUARE, SQUARES, charuco_print, chessboard_print, draw_pairs, known_rig, poses
 
 from sags_node.calibration.boards import Charuco, Chessboard, StereoView, find_in_both
 from sags_node.calibration.coverage import coverage_hints
 from sags_node.calibration.solve import Solution, calibrate
-from sags_node.cli.main import main
 from sags_node.errors import SagsError, UsageError
 from sags_node.rig import load_rig
 from sags_node.types import F32, U8, StereoRig
@@ -67,10 +58,7 @@ def exact_views(count: int = 18) -> list[StereoView]:
     return views
 
 
-def sags(*arguments: object) -> tuple[int, str, str]:
-    result = CliRunner().invoke(main, ["calib", "stereo", *map(str, arguments)])
-    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
-    return result.exit_code, result.stdout, result.stderr
+sags = partial(ran, "calib", "stereo")
 
 
 BOARD = ["--squares", "10x7", "--square-mm", "4.5"]

@@ -12,10 +12,9 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from click.testing import CliRunner
+from command_line import ran
 from test_calibration import make_rig
 
-from sags_node.cli.main import main
 from sags_node.errors import UsageError
 from sags_node.geometry import scale_intrinsics
 from sags_node.rig import check_rig, load_rig, read_rig, rectify_eyes, resized_rig, save_rig
@@ -320,20 +319,15 @@ def test_resized() -> None:
     np.testing.assert_allclose(half.T_right_left, rig.T_right_left)
 
 
-def sags(*arguments: object) -> tuple[int, str]:
-    result = CliRunner().invoke(main, [str(argument) for argument in arguments])
-    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
-    return result.exit_code, result.output
-
-
 def test_convert(tmp_path: Path) -> None:
     folder = write_pair(tmp_path / "scope", ".yml", PLUMB_BOB, T * 1000)
-    code, said = sags("calib", "convert", folder, "-o", tmp_path / "out", "--size", "640x480", "--unit", "mm")
+    size = ("--size", "640x480")
+    code, _, said = ran("calib", "convert", folder, "-o", tmp_path / "out", *size, "--unit", "mm")
     assert code == 0 and "baseline 5.2 mm" in said
     assert_same(load_rig(tmp_path / "out"), expected())
-    code, said = sags("calib", "convert", folder, "-o", tmp_path / "no", "--size", "640x480")
+    code, _, said = ran("calib", "convert", folder, "-o", tmp_path / "no", *size)
     assert code == 2 and "looks like millimetres" in said and not (tmp_path / "no").exists()
-    code, said = sags("calib", "convert", folder, "-o", tmp_path / "no", "--size", "640")
+    code, _, said = ran("calib", "convert", folder, "-o", tmp_path / "no", "--size", "640")
     assert code == 2 and "'640' is not like 720x576" in said
-    code, _ = sags("calib", "convert", tmp_path / "out", "-o", tmp_path / "double", "--scale", "2")
+    code, _, _ = ran("calib", "convert", tmp_path / "out", "-o", tmp_path / "double", "--scale", "2")
     assert code == 0 and load_rig(tmp_path / "double").left.width == 1280

@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from command_line import ran
 from places import ROOT
 
 from sags_node.calibration.check import check_pictures
@@ -19,18 +20,9 @@ from sags_node.calibration.matches import match_eyes
 from sags_node.calibration.pictures import pairs_of_files, pairs_of_session
 from sags_node.calibration.principal_points import judge_known_depths
 from sags_node.calibration.rows import judge_scale, rectified_rows
-from sags_node.cli.main import main
 from sags_node.config.launch_file import load_launch
 from sags_node.errors import SagsError
-from sags_node.rig import (
-    Finding,
-    check_rig,
-    load_rig,
-    read_rig,
-    rectified_rig,
-    rectify_eyes,
-    save_rig,
-)
+from sags_node.rig import Finding, check_rig, load_rig, read_rig, rectified_rig, rectify_eyes, save_rig
 from sags_node.rig.check import size_made_for
 from sags_node.sources.pictures import read_picture
 from sags_node.types import U8, Eye, StereoFrame, StereoRig
@@ -394,10 +386,7 @@ def test_distortion_that_turns_back(phantom: tuple[StereoRig, Pairs]) -> None:
 # ---- the command -----------------------------------------------------------------------------------------
 
 
-def sags(*arguments: object) -> tuple[int, str, str]:
-    result = CliRunner().invoke(main, ["calib", "check", *map(str, arguments)])
-    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
-    return result.exit_code, result.stdout, result.stderr
+sags = partial(ran, "calib", "check")
 
 
 def test_check_of_a_session_against_itself(phantom_session: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import runpy
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ import numpy as np
 import pytest
 from bag_files import ROS2, Row, image, write_rosbag2
 from click.testing import CliRunner
+from command_line import figures_of
 from drawn_boards import charuco_print, known_rig
 from places import ROOT
 
@@ -20,7 +20,7 @@ from sags_node.calibration.hand_eye_solve import solve_hand_eye
 from sags_node.cli.main import main
 from sags_node.config.launch_file import load_launch
 from sags_node.errors import SagsError, UsageError
-from sags_node.evaluation.measure import Measurer, Options
+from sags_node.evaluation.measure import MeasureOptions, Measurer
 from sags_node.evaluation.session import evaluate
 from sags_node.fitting.clip import read_clip
 from sags_node.geometry import invert, matrix_to_quat
@@ -234,9 +234,7 @@ def test_from_a_bag_to_poses_of_the_camera(recording: Path) -> None:
         "calib", "hand-eye", str(recording), f"rig:={rig}", "robot.kind:=bag",
         "robot.topic:=/ECM/measured_cp", *BOARD, "--dictionary", "4X4_50", "-o", str(rig), "--json",
     ]  # fmt: skip
-    result = CliRunner().invoke(main, command)
-    assert result.exit_code == 0, result.output
-    summary = json.loads(result.stdout)
+    summary = figures_of(*command)
     assert summary["views"] >= VIEWS - 2 and summary["error_px"] < 0.3
     hand_eye = read_hand_eye(rig / "hand_eye.yaml")
     place, turn = errors(hand_eye.T_hand_cam)
@@ -293,7 +291,7 @@ def test_fits_and_figures_know_where_the_robot_says_the_scope_is(
     monkeypatch.setattr(Measurer, "_held_out", noted)
     session = open_session(recording, [*played, "source.frames:=4"])
     clip = read_clip(session, lambda number: number == 1)
-    evaluate(recording, [*played, "source.frames:=4"], Options(hold_out=4), iterations=0)
+    evaluate(recording, [*played, "source.frames:=4"], MeasureOptions(hold_out=4), iterations=0)
     assert list(seen) == [frame.frame_id for frame in clip.test] == [1] and len(clip.train) == 3
     for number, camera in (*seen.items(), *((f.frame_id, f.camera) for f in (*clip.train, *clip.test))):
         exact = camera_at(number / RATE, 5.0) @ rectified(np.eye(4), session.rig)

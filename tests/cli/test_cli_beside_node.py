@@ -99,12 +99,6 @@ def beside_node(node: Path, run_dir: Path, monkeypatch: pytest.MonkeyPatch) -> d
     return connection
 
 
-@pytest.mark.parametrize("tool", ["echo", "hz", "bw", "delay"])
-def test_an_unknown_topic_names_the_nearest(tool: str, beside_node: dict[str, Any]) -> None:
-    said = ("unknown topic 'left/rendr/depth'", "did you mean 'left/render/depth'")
-    refused(2, "topic", tool, "left/rendr/depth", said=said)
-
-
 def test_a_topic_that_says_too_little(beside_node: dict[str, Any]) -> None:
     listen = ("--seconds", "0.3")
     refused(1, "topic", "hz", "parameters", *listen, said=("sags/parameters", "too few", "--seconds"))
@@ -143,28 +137,6 @@ def test_overlay_in_words_and_in_json(beside_node: dict[str, Any], tmp_path: Pat
     assert "with the overlay" in sags("overlay", "--seconds", "1.5", "--save", video).stdout
     assert cv2.VideoCapture(str(video)).read()[0]
     refused(2, "overlay", "--pin", "5000", "3", said=("pin 5000 3", "320x256"))
-
-
-def test_a_second_node_of_the_same_name(beside_node: dict[str, Any], phantom_session: Path) -> None:
-    said = ("another node already runs as 'sags'", "ns:=NAME")
-    refused(1, "run", phantom_session, *RUN_HERE, said=said)
-
-
-def test_a_port_that_another_node_has(beside_node: dict[str, Any], phantom_session: Path) -> None:
-    taken = next(endpoint for endpoint in beside_node["data"] if endpoint.startswith("tcp"))
-    overrides = ("ns:=second", f"publish.data:=[{taken}]", "publish.control:=null")
-    refused(1, "run", phantom_session, *overrides, said=(taken, "in use", "publish.data:="))
-
-
-def test_a_run_directory_that_others_can_enter(phantom_session: Path, tmp_path: Path) -> None:
-    tmp_path.chmod(0o755)
-    override = f"publish.run_dir:={tmp_path}"
-    refused(2, "run", phantom_session, *RUN_HERE, override, said=("open to other users", "chmod 700"))
-
-
-def test_a_socket_for_other_machines(phantom_session: Path) -> None:
-    override = "publish.data:=[tcp://0.0.0.0:5556]"
-    refused(2, "run", phantom_session, override, said=("0.0.0.0", "other machines", "publish.insecure"))
 
 
 # ---- Ctrl-C ----------------------------------------------------------------------------------------------

@@ -167,37 +167,6 @@ def test_no_library_adds_lines_of_its_own(user_files: Path) -> None:
     assert stderr == f"error: {user_files / 'garbage.mp4'} cannot be read as a video; is it complete?\n"
 
 
-@pytest.mark.parametrize(
-    ("code", "overrides", "said"),
-    [
-        (2, ["source.left:=gone"], ("picture folder gone", "does not exist")),
-        (2, ["source.left:=empty"], ("picture folder empty", "holds no picture")),
-        (1, ["source.right:=small"], ("320x256", "160x128", "small/0000.jpg")),
-        (2, ["rig:=null"], ("no calibration", "set rig")),
-        (2, ["source.start:=1000"], ("source.start", "behind the recording's end", "4.00 s")),
-    ],
-)
-def test_wrong_picture_folders(
-    user_files: Path,
-    phantom_session: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    code: int,
-    overrides: list[str],
-    said: tuple[str, ...],
-) -> None:
-    monkeypatch.chdir(user_files)
-    refused(code, "run", phantom_session, "source.tools:=null", *overrides, said=said)
-
-
-def test_a_crop_outside_the_picture(user_files: Path) -> None:
-    boxes = ["source.geometry.crop:=[0, 0, 200, 256]", "source.geometry.crop_right:=[200, 0, 200, 256]"]
-    source = [
-        *("source.kind:=videos", "source.geometry.layout:=panes", f"source.left:={user_files / 'left.mp4'}"),
-        f"rig:={user_files / 'calib'}",
-    ]
-    refused(2, "run", *source, *boxes, said=("[200, 0, 200, 256]", "leaves the picture", "320x256"))
-
-
 def test_a_camera_that_is_not_there() -> None:
     camera = "source.left:=/dev/no-camera"
     refused(1, "run", ROOT / "launch/v4l2.yaml", camera, said=("/dev/no-camera", "does not exist"))

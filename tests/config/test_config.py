@@ -1,6 +1,9 @@
 """Launch files: every key is known, paths are found, mistakes are explained."""
 
+from __future__ import annotations
+
 import re
+import runpy
 from pathlib import Path
 from typing import Any
 
@@ -85,21 +88,6 @@ def test_files_that_are_no_launch_files(tmp_path: Path, content: str, said: str)
         load_launch(file)
 
 
-def test_a_missing_or_binary_file_is_one_clear_error(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"nowhere\.yaml.*check the path"):
-        load_launch(tmp_path / "nowhere.yaml")
-    (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(UsageError, match="not UTF-8"):
-        load_launch(tmp_path / "binary.yaml")
-
-
-def test_yaml_cannot_run_code(tmp_path: Path) -> None:
-    file = tmp_path / "launch.yaml"
-    file.write_text("ns: !!python/object/apply:os.system ['true']\n")
-    with pytest.raises(UsageError, match="not valid YAML"):
-        load_launch(file)
-
-
 def test_the_time_of_a_frame_is_that_until_the_next_unless_it_is_set() -> None:
     def ms(rate: float | None, **mapping: Any) -> float:
         return MappingConfig(**mapping).frame_ms(rate)
@@ -145,3 +133,26 @@ def test_parameters_are_validated_like_a_file() -> None:
     assert with_parameters(config, {"mapping.budget_ms": 20}).mapping.budget_ms == 20
     with pytest.raises(UsageError, match="budget_ms"):
         with_parameters(config, {"mapping.budget_ms": "soon"})
+
+
+# ---- the page of launch keys says what the configuration says ------------------------------------------
+
+
+DOCS = ROOT / "docs"
+
+
+@pytest.fixture(scope="module")
+def made() -> str:
+    """The page as `make docs` would write it now."""
+    return str(runpy.run_path(str(DOCS / "dev/launch_page.py"))["page"]())
+
+
+def test_the_page_is_of_this_configuration(made: str) -> None:
+    written = (DOCS / "launch.md").read_text(encoding="utf-8")
+    assert written == made, "docs/launch.md is stale; write it anew with: make docs"
+
+
+def test_every_key_says_what_it_does(made: str) -> None:
+    rows = [row.split(" | ") for row in made.splitlines() if row.startswith("| `")]
+    assert len(rows) > 80  # tables were found
+    assert [row[0] for row in rows if not row[-1].strip(" |")] == []

@@ -21,7 +21,7 @@ from sags_node.engine.rasterizer.views import colours_of
 from sags_node.errors import SagsError, UsageError
 from sags_node.evaluation import plotting
 from sags_node.evaluation.golden import Golden, Tolerance, compare, read_golden, write_golden
-from sags_node.evaluation.measure import Measurer, Options
+from sags_node.evaluation.measure import MeasureOptions, Measurer
 from sags_node.evaluation.plots import Series, line_plot
 from sags_node.evaluation.report import write_report
 from sags_node.evaluation.session import evaluate
@@ -49,7 +49,7 @@ CAMERA = Camera(WIDTH, HEIGHT, K, np.eye(4))
 PERIOD_NS = 33_333_333
 SPEED = np.array([0.015, 0.006, 0.0], np.float32)  # m/s: 1.25 and 0.5 px a frame
 FRAMES = 20
-DEFAULTS = Options()
+DEFAULTS = MeasureOptions()
 
 
 def rig() -> StereoRig:
@@ -96,9 +96,7 @@ def stereo_frame(frame_id: int) -> StereoFrame:
     right[40:60, 88:] = (200, 255, 200)
     points = tissue_at(0).means[7350:7400].astype(np.float64) + SPEED * stamp * 1e-9
     reference = Reference(
-        depth=np.full((HEIGHT, WIDTH), DEPTH, np.float32),
-        points=points,
-        points_visible=np.ones(50, bool),
+        depth=np.full((HEIGHT, WIDTH), DEPTH, np.float32), points=points, points_visible=np.ones(50, bool)
     )
     return StereoFrame(frame_id, stamp, stamp, left, right, tissue=tissue, reference=reference)
 
@@ -134,7 +132,7 @@ def with_right_eye(result: FrameResult) -> FrameResult:
 def measured_run(
     frames: list[StereoFrame],
     velocity: np.ndarray,
-    options: Options = DEFAULTS,
+    options: MeasureOptions = DEFAULTS,
     late: float = 0.0,
     dropped: int | None = None,
     right: bool = False,
@@ -152,7 +150,7 @@ def measured_run(
 
 
 def summary_of(
-    measurer: Measurer, options: Options = DEFAULTS, **segments: tuple[int, int]
+    measurer: Measurer, options: MeasureOptions = DEFAULTS, **segments: tuple[int, int]
 ) -> dict[str, Any]:
     return summarise("synthetic", measurer.rows, options, segments, 33.0)
 
@@ -298,7 +296,7 @@ def test_counts_and_segments(frames: list[StereoFrame]) -> None:
 
 def test_what_was_not_known_is_null(frames: list[StereoFrame]) -> None:
     blind = [replace(frame, reference=None) for frame in frames[:4]]
-    options = Options(hold_out=0, paper_psnr=True)
+    options = MeasureOptions(hold_out=0, paper_psnr=True)
     summary = summary_of(measured_run(blind, SPEED, options, late=0.1), options)
     assert summary["depth"] is None and summary["track"] is None and summary["heldout"] is None
     assert summary["online"]["paper_psnr"] > summary["online"]["psnr"]
@@ -392,7 +390,7 @@ def test_report_opens_and_shows_the_worst_frame(frames: list[StereoFrame], tmp_p
 
 
 def test_report_of_a_run_without_anything_optional(frames: list[StereoFrame], tmp_path: Path) -> None:
-    measurer = measured_run([replace(frames[0], reference=None)], SPEED, Options(hold_out=0))
+    measurer = measured_run([replace(frames[0], reference=None)], SPEED, MeasureOptions(hold_out=0))
     file = write_report(tmp_path, summary_of(measurer), measurer.rows, measurer.gallery.pictures)
     assert sum("jpeg" in uri for uri in Page(file.read_text()).images) == 4
 
@@ -480,9 +478,9 @@ def test_a_session_in_real_time_goes_through_the_node(
 
 def test_options_out_of_range_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="every 0"):
-        Options(every=0)
+        MeasureOptions(every=0)
     with pytest.raises(UsageError, match=r"no file of LPIPS weights at .*none\.npz"):
-        Options(lpips_weights=tmp_path / "none.npz")
+        MeasureOptions(lpips_weights=tmp_path / "none.npz")
 
 
 def test_live_cameras_and_ambiguous_segments_are_refused(tmp_path: Path) -> None:

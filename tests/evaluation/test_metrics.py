@@ -1,5 +1,8 @@
 """Figures of merit against closed forms and cases made by hand."""
 
+from __future__ import annotations
+
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -8,9 +11,14 @@ import pytest
 
 from sags_node.errors import UsageError
 from sags_node.evaluation import metrics
+from sags_node.evaluation.flicker import FRAMES, Flicker
 from sags_node.evaluation.lpips import Lpips
+from sags_node.evaluation.point_tracks import average_jaccard, calibration_error, reliability
+from sags_node.evaluation.spool import RunFacts, SpooledFrame
 from sags_node.evaluation.tracking import PointTracks
+from sags_node.evaluation.trajectory import drift
 from sags_node.evaluation.views import VELOCITY_SHARE, extrapolated
+from sags_node.mapping.camera_pose import exponential
 from sags_node.mapping.right_eye import right_eye_mask
 from sags_node.types import Camera, Gaussians, Snapshot
 
@@ -331,3 +339,117 @@ def test_a_point_is_bound_when_it_is_first_seen_near_the_model() -> None:
     assert later.lost == 1  # still the far one; the newly seen one is bound, not lost
     assert len(later.errors_mm) == 38
     assert len(tracks.update(start, points, visible, CAMERA).errors_mm) == 39
+
+
+# ---- how the drift of a trajectory is told from what its scene does again and again --------------------
+
+
+PERIOD, ROUNDS = 40, 5
+
+
+def test_a_drift_is_told_from_a_swing() -> None:
+    """1 mm and 0.2 degrees in all; the means of first and last period are four fifths of that apart."""
+    count = PERIOD * ROUNDS
+    known = np.tile(np.eye(4), (count + 1, 1, 1))
+    estimated = []
+    for k in range(count + 1):
+        gone, swing = k / count, np.sin(2 * np.pi * k / PERIOD)
+        twist = [1e-3 * gone, 1.2e-3 * swing, 0, 0, 0, np.radians(0.2) * gone]
+        estimated.append(exponential(np.array(twist)))
+    found = drift(np.stack(estimated), known, PERIOD)
+    assert found["drift_mm"] == pytest.approx(0.8, abs=1e-6) == found["worst_drift_mm"]
+    assert found["drift_deg"] == pytest.approx(0.16, abs=1e-6)
+    assert found["end_mm"] == pytest.approx(1.0, abs=1e-6)
+    assert found["end_deg"] == pytest.approx(0.2, abs=1e-6)
+
+
+# ---- figures of followed points, by hand ---------------------------------------------------------------
+
+
+def test_average_jaccard_counts_places_and_visibility() -> None:
+    """Four points: near; 5 px off; seen but not said to be; hidden but said to be seen. Three are seen.
+
+    Within 2 and 4 px one is right, and two of those said are not: 1 / (3 + 2). Within 8, 16 and 32 px two are
+    right, and one is not: 2 / (3 + 1).
+    """
+    distances = np.array([1.0, 5.0, 40.0, 1.0])
+    visible, said = np.array([1, 1, 1, 0], bool), np.array([1, 1, 0, 1], bool)
+    assert average_jaccard(distances, visible, said) == pytest.approx((2 / 5 + 3 * 2 / 4) / 5)
+    assert average_jaccard(np.zeros(4), visible, visible) == 1
+    assert average_jaccard(np.zeros(4), visible, ~visible) == 0
+    assert average_jaccard(np.array([2.0]), np.array([True]), np.array([True]), [2]) == 0  # TAP-Vid: below it
+    assert average_jaccard(np.full(4, np.inf), visible, said) == 0
+
+
+def test_reliability_tells_what_was_said_from_what_was_right() -> None:
+    confidence = np.array([0.0, 0.1, 0.55, 0.95, 1.0, 0.9, 0.99])
+    bins = reliability(confidence, np.array([0, 1, 1, 1, 1, 0, 1], bool))
+    assert [(each.least, each.most, each.count) for each in bins] == [
+        (0, 0.02, 1),
+        (0.1, 0.2, 1),
+        (0.5, 0.6, 1),
+        (0.9, 1, 4),
+    ]
+    assert [each.right for each in bins] == [0, 1, 1, 0.75]
+    assert bins[3].said == pytest.approx(0.96)
+    assert calibration_error(bins) == pytest.approx((0.9 + 0.45 + 4 * 0.21) / 7)
+
+
+# ---- flicker, by hand ----------------------------------------------------------------------------------
+
+
+HEIGHT, WIDTH = 64, 96
+
+
+def frame() -> SpooledFrame:
+    """All tissue, gray, 100 mm away."""
+    nothing = np.zeros((0, 3), np.float32)
+    gaussians = Gaussians(
+        nothing, np.zeros((0, 4), np.float32), nothing, nothing[:, 0], nothing, np.zeros(0, np.int64)
+    )
+    camera = Camera(WIDTH, HEIGHT, np.diag([100.0, 100, 1]), np.eye(4))  # 5 px of disparity
+    depth = np.full((HEIGHT, WIDTH), 0.1, np.float32)
+    return SpooledFrame(
+        facts=RunFacts(0, 0, None, 0, {}, {}, 0, {}),
+        snapshot=Snapshot(0, 0, 0, gaussians, nothing, camera, 0.0, {}),
+        baseline=0.005,
+        rgb=np.full((HEIGHT, WIDTH, 3), 100, np.uint8),
+        depth=depth,
+        tissue=np.ones((HEIGHT, WIDTH), np.bool_),
+        measured_depth=depth,
+        confidence=depth,
+        right_rgb=None,
+    )
+
+
+def test_flicker_is_the_deviation_where_nothing_moves_and_all_is_tissue() -> None:
+    """The view alternates between 100 and 104 (deviation 2), the depth by 1 mm either way, the stereo depth
+    by 3; the input has a checkerboard of noise, +-5, whose block means stay. In the left third something
+    passes by, and in the right third an instrument lies in one frame: what happens there does not count.
+    The right view shows the same 5 px farther left."""
+    flicker, seen = Flicker(), []
+    checks = np.indices((HEIGHT, WIDTH)).sum(0) % 2 * 10 - 5
+    for number in range(FRAMES):
+        sign = 1 if number % 2 else -1
+        shown = frame()
+        shown.rgb[:] = 102 + 2 * sign
+        shown.rgb[:, :32] = 8 * number
+        right = np.roll(shown.rgb, -5, axis=1)
+        depth, measured = shown.depth + np.float32(1e-3 * sign), shown.depth + np.float32(3e-3 * sign)
+        measured[:, 40:48] = 0 if number == 7 else 0.2  # not known in all of them
+        tissue = shown.tissue
+        tissue[:, 64:] = number != 5
+        picture = np.repeat((120 + sign * checks)[..., None], 3, 2).astype(np.uint8)
+        picture[:, :32] = 5 * number
+        seen.append(flicker(picture, replace(shown, depth=depth, measured_depth=measured, right_rgb=right)))
+    assert seen[:-1] == [None] * (FRAMES - 1)
+    expected = {"input": 5, "picture": 2, "right": 2, "depth_mm": 1, "measured_depth_mm": 3, "share": 0.5}
+    assert seen[-1] == pytest.approx(expected, rel=1e-3)
+    assert flicker(picture, shown) is None  # the next thirty begin
+
+
+def test_nothing_is_said_of_a_scene_that_moves() -> None:
+    flicker, rng = Flicker(), np.random.default_rng(0)
+    for _ in range(FRAMES):
+        said = flicker(np.full((HEIGHT, WIDTH, 3), rng.integers(50, 200), np.uint8), frame())
+    assert said is None

@@ -11,7 +11,7 @@ from places import ROOT, SESSION
 
 from sags_node.evaluation.calibration import STEP_MM
 from sags_node.evaluation.golden import Golden, Tolerance, compare, read_golden, write_golden
-from sags_node.evaluation.measure import Options
+from sags_node.evaluation.measure import MeasureOptions
 from sags_node.evaluation.session import evaluate
 from sags_node.kernels.threads import configure_threads, thread_count
 from sags_node.mapping.budget import StepBudget
@@ -40,7 +40,7 @@ NEW_GOLDEN = Golden(
 
 
 def test_the_phantom_session_gives_its_golden_figures(request: pytest.FixtureRequest) -> None:
-    outcome = evaluate(SESSION, options=Options(every=10), pace="step", iterations=2)
+    outcome = evaluate(SESSION, options=MeasureOptions(every=10), pace="step", iterations=2)
     _check(request, outcome.summary, SESSION.with_suffix(".golden.json"))
 
 
@@ -51,7 +51,7 @@ def test_the_lift_of_a_real_recording_gives_its_golden_figures(
     monkeypatch.setenv("SAGS_DATA", str(data_folder))
     lift = ["source.start:=2", "source.frames:=50", "vision.width:=320", "vision.height:=256"]
     launch = ROOT / "launch/d4d_pull.yaml"
-    outcome = evaluate(launch, lift, options=Options(every=10), pace="step", iterations=2)
+    outcome = evaluate(launch, lift, options=MeasureOptions(every=10), pace="step", iterations=2)
     _check(request, outcome.summary, ROOT / "replay/d4d_lift.golden.json")
 
 

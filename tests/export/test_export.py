@@ -13,6 +13,7 @@ import open3d
 import pytest
 from command_line import refused, sags
 from running_node import RunningNode
+from splat_files import splats_of
 
 from sags_node.config.schema import PhantomSource
 from sags_node.engine.rasterizer.rasterize import rasterize
@@ -38,7 +39,6 @@ pytestmark = pytest.mark.usefixtures("run_dir")
 
 STEP = ("source.pace:=step", "mapping.iterations:=2")
 FRAME, FRAMES = 20, 40  # the lift, at 2 s
-FIELDS = "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3".split()
 MM = 1e3
 
 
@@ -101,18 +101,6 @@ def tensor(values: np.ndarray) -> Any:
 @pytest.fixture(scope="module")
 def truth(phantom: Phantom) -> Truth:
     return Truth(phantom, FRAME)
-
-
-def splats_of(path: Path) -> dict[str, np.ndarray]:
-    """A splat PLY, read by its own header."""
-    head, _, body = path.read_bytes().partition(b"end_header\n")
-    lines = head.decode().splitlines()
-    assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
-    named = [line.removeprefix("property float ") for line in lines[3:]]
-    assert named[: len(FIELDS)] == list(FIELDS), "what came later stands after what was there"
-    count = int(lines[2].removeprefix("element vertex "))
-    rows = np.frombuffer(body, "<f4").reshape(count, len(named))
-    return dict(zip(named, rows.T, strict=True))
 
 
 # ---- what is written -------------------------------------------------------------------------------------

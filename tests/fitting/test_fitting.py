@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from command_line import figures_of
 
 from sags_node.cli.main import main
 from sags_node.errors import SagsError, UsageError
@@ -264,9 +265,7 @@ def sags_fit(*arguments: str | Path) -> Any:
 def test_the_command_leaves_model_pictures_and_figures(phantom_session: Path, tmp_path: Path) -> None:
     out = tmp_path / "fit"
     options = ["--out", out, "--iterations", "20", "--max-gaussians", "1500", "--json"]
-    result = sags_fit(phantom_session, "source.frames:=10", *options)
-    assert result.exit_code == 0, result.output
-    found = json.loads(result.stdout)
+    found = figures_of("fit", phantom_session, "source.frames:=10", *options)
     assert json.loads((out / "figures.json").read_text()) == {"provenance": ANY} | found
     assert found["heldout"]["frames"] == 2 and found["heldout"]["psnr"] > 15
     assert found["depth"]["median_mm"] < 10
@@ -352,9 +351,7 @@ def test_a_clip_of_a_public_data_set_is_fitted_from_its_path(tmp_path: Path, sch
     matrix = np.column_stack([np.eye(3), np.zeros(3), [128, 160, 150.0]])
     np.save(folder / "poses_bounds.npy", np.tile(np.concatenate([matrix.ravel(), [60, 80]]), (10, 1)))
     options = ["--schedule", schedule, "--warm-up", "40", "--iterations", "80", "--max-gaussians", "2000"]
-    result = sags_fit(folder, *options, "--out", tmp_path / "fit", "--json")
-    assert result.exit_code == 0, result.output
-    found = json.loads(result.stdout)
+    found = figures_of("fit", folder, *options, "--out", tmp_path / "fit", "--json")
     assert found["session"] == "pulling" and found["depth"] is None and found["track"] is None
     assert found["heldout"]["frames"] == 2
     assert found["heldout"]["psnr"] > (25 if schedule == "online" else 18)

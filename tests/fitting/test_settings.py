@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from sags_node.errors import UsageError
 from sags_node.fitting.field import marked, row_rates
+from sags_node.fitting.score import published
 from sags_node.fitting.settings import ONLINE, PRESETS, RELEASED, FieldShape, RowRates, Units, with_changes
 from sags_node.fitting.start import PATH_EVERY
 from sags_node.model import columns
@@ -88,3 +91,14 @@ def test_parts_of_a_row_have_their_own_rates() -> None:
     assert (rates[columns.MEAN] == 0.125).all() and (rates[columns.COLOR] == 7).all()
     found = marked(("quats", "logits"))
     assert found[columns.QUAT].all() and found[columns.LOGIT] == 1 and found.sum() == 5
+
+
+# ---- published figures stand beside the clip that they belong to, and beside no other ------------------
+
+
+def test_only_the_clip_itself_has_published_figures() -> None:
+    assert published(Path("pulling_soft_tissues"), 63)["SAGS"] == 38.3
+    assert published(Path("cutting_tissues_twice"), 156)["SAGS"] == 39.5
+    assert published(Path("pulling_soft_tissues"), 40) == {}  # a part of it
+    assert published(Path("my_pulling"), 100) == {}
+    assert published(Path("other"), 63) == published(None, 63) == {}

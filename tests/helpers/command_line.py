@@ -38,6 +38,19 @@ def sags(*arguments: object, command: click.Command = main) -> Result:
     return result
 
 
+def ran(*arguments: object, command: click.Command = main) -> tuple[int, str, str]:
+    """Its exit code, and what it said on stdout and stderr."""
+    result = sags(*arguments, command=command)
+    return result.exit_code, result.stdout, result.stderr
+
+
+def figures_of(*arguments: object, command: click.Command = main) -> Any:
+    """What a command that does well says as strict JSON."""
+    code, stdout, stderr = ran(*arguments, command=command)
+    assert code == 0, stdout + stderr
+    return pure_json(stdout)
+
+
 def refused(code: int, *arguments: object, said: tuple[str, ...], command: click.Command = main) -> None:
     """One message on stderr, that says all of this, and nothing on stdout."""
     result = sags(*arguments, command=command)

@@ -104,11 +104,7 @@ def cotangents(view: Camera, seed: int) -> tuple[F32, F32]:
 
 
 def draw_and_differentiate(
-    gaussians: Gaussians,
-    view: Camera,
-    backend: str = "numba",
-    seed: int = 0,
-    antialias: bool = True,
+    gaussians: Gaussians, view: Camera, backend: str = "numba", seed: int = 0, antialias: bool = True
 ) -> tuple[F32, dict[str, NDArray[np.floating]]]:
     """Planes, and gradients for a random cotangent, as copies."""
     rasterizer = make_rasterizer(backend, view.width, view.height, antialias)

@@ -24,7 +24,7 @@ import hostile
 import msgpack
 import msgspec
 import numpy as np
-from bag_files import ROS1, ROS2, play, stereo_rows, write_rosbag1, write_rosbag2
+from bag_files import KINDS, play
 from hypothesis import strategies as st
 from numbered_pictures import write_video
 from onnx_networks import save_matcher
@@ -48,6 +48,7 @@ from sags_node.recording.pictures import decode_file
 from sags_node.recording.recover import recover
 from sags_node.rig.check import check_rig
 from sags_node.rig.read import read_rig
+from sags_node.sources.bags import read_rig as read_bag_rig
 from sags_node.sources.pose_track import PoseTrack
 from sags_node.sources.source import open_source
 from sags_node.vision.onnx_network import DepthNetwork
@@ -164,10 +165,10 @@ def ended_in_time() -> Iterator[None]:
 
 
 @contextmanager
-def bounded_memory() -> Iterator[None]:
+def bounded_memory(most: int = MOST_MEMORY) -> Iterator[None]:
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     before = resource.getrlimit(resource.RLIMIT_AS)
-    resource.setrlimit(resource.RLIMIT_AS, (used + MOST_MEMORY, before[1]))
+    resource.setrlimit(resource.RLIMIT_AS, (used + most, before[1]))
     try:
         yield
     finally:
@@ -270,10 +271,7 @@ def read_thin(data: bytes, _: Path) -> None:
 
 
 def poses(_: Path) -> list[bytes]:
-    return [
-        bytes(cdr.pose(np.eye(4), 5).parts[0]),
-        bytes(cdr.transform(np.eye(4), 5).parts[0]),
-    ]
+    return [bytes(cdr.pose(np.eye(4), 5).parts[0]), bytes(cdr.transform(np.eye(4), 5).parts[0])]
 
 
 def read_pose(data: bytes, _: Path) -> None:
@@ -303,26 +301,27 @@ def read_picture(data: bytes, _: Path) -> None:
     decode_file(np.frombuffer(data, np.uint8), "picture")
 
 
+BAGS = ("mcap file", "mcap zstd", "db3 file", "ros1", "ros1 lz4", "ros1 bz2")
+
+
 def bag(kind: str) -> Target:
-    suffix = ".mcap" if kind == "mcap" else ".db3" if kind == "db3" else ".bag"
+    suffix = {"mcap": ".mcap", "db3": ".db3", "ros1": ".bag"}[kind.split(maxsplit=1)[0]]
 
     def sound(folder: Path) -> list[bytes]:
-        if kind == "ros1":
-            write_rosbag1(folder / "a.bag", stereo_rows(ROS1, 3), "LZ4")
-        else:
-            plugin, packed = ("MCAP", "STORAGE") if kind == "mcap" else ("SQLITE3", None)
-            write_rosbag2(folder / "bag", stereo_rows(ROS2, 3), plugin, packed)
+        KINDS[kind](folder)
         return [next(folder.rglob(f"*{suffix}")).read_bytes()]
 
     def use(data: bytes, folder: Path) -> None:
         file = folder / f"x{suffix}"
         file.write_bytes(data)
-        if kind == "mcap":
+        if suffix == ".mcap":
             try:
                 recover(file, folder / "saved")
             except SagsError as error:
                 assert "\n" not in str(error) and not (folder / "saved").exists()
+        load_launch(file)
         bag_info(file)
+        read_bag_rig(cfg.BagSource(path=file))
         play(file)
 
     return Target(sound, use)
@@ -472,9 +471,7 @@ TARGETS: dict[str, Target] = {
     "thin pictures": Target(thin_files, read_thin),
     "poses": Target(poses, read_pose),
     "pictures": Target(pictures, read_picture),
-    "mcap": bag("mcap"),
-    "db3": bag("db3"),
-    "ros1": bag("ros1"),
+    **{kind: bag(kind) for kind in BAGS},
     "launch files": Target(launch_files, read_launch),
     "ros calibration": Target(ros_rigs, read_ros_rig),
     "calibration archive": Target(archives, read_archive),

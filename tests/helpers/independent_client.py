@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import struct
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -41,17 +42,31 @@ class Received:
         return b"".join(self.parts)
 
 
+@contextmanager
+def zmq_socket(kind: int, endpoint: str, *options: tuple[int, Any], bind: bool = False) -> Iterator[Any]:
+    """A plain socket, connected or bound."""
+    context = zmq.Context()
+    socket = context.socket(kind)
+    for option, value in options:
+        socket.setsockopt(option, value)
+    (socket.bind if bind else socket.connect)(endpoint)
+    try:
+        yield socket
+    finally:
+        context.destroy(linger=0)
+
+
+def subscribed(endpoint: str, *prefixes: str, high_water: int = 1000) -> AbstractContextManager[Any]:
+    """A socket that gets what begins so."""
+    wanted = ((zmq.SUBSCRIBE, prefix.encode()) for prefix in prefixes)
+    return zmq_socket(zmq.SUB, endpoint, (zmq.RCVHWM, high_water), *wanted)
+
+
 def collect(endpoint: str, topics: Sequence[str], count: int, timeout: float) -> dict[str, list[Received]]:
     """The first `count` messages of every topic, or what has come after `timeout` seconds."""
-    context = zmq.Context()
-    socket = context.socket(zmq.SUB)
-    socket.setsockopt(zmq.RCVHWM, 1000)
-    for topic in topics:
-        socket.setsockopt_string(zmq.SUBSCRIBE, topic)
-    socket.connect(endpoint)
     received: dict[str, list[Received]] = {topic: [] for topic in topics}
     deadline = time.monotonic() + timeout
-    try:
+    with subscribed(endpoint, *topics) as socket:
         while time.monotonic() < deadline and min(len(got) for got in received.values()) < count:
             if not socket.poll(50):
                 continue
@@ -60,22 +75,15 @@ def collect(endpoint: str, topics: Sequence[str], count: int, timeout: float) ->
             # A subscription is a prefix: that to a depth brings its confidence too.
             if message.topic in received and len(received[message.topic]) < count:
                 received[message.topic].append(message)
-    finally:
-        context.destroy(linger=0)
     return received
 
 
 def request(endpoint: str, op: str, args: Mapping[str, Any], timeout: float = 60.0) -> dict[str, Any]:
     """One request on the control socket."""
-    context = zmq.Context()
-    socket = context.socket(zmq.REQ)
-    socket.connect(endpoint)
-    try:
+    with zmq_socket(zmq.REQ, endpoint) as socket:
         socket.send(msgpack.packb({"v": "1.0", "id": 7, "op": op, "args": dict(args)}))
         assert socket.poll(int(timeout * 1000)), f"no answer to {op}"
         reply = msgpack.unpackb(socket.recv())
-    finally:
-        context.destroy(linger=0)
     assert reply["v"] == "1.0" and reply["id"] == 7, reply
     return reply
 

@@ -15,14 +15,14 @@ from waiting import until
 from sags_node.errors import SagsError
 from sags_node.messaging.address import NodeAddress
 from sags_node.recording.bag import BagMessage, read_messages
-from sags_node.recording.recorder import Options, Recorder
+from sags_node.recording.recorder import Recorder, RecordOptions
 from sags_node.types import FrameResult
 
 RATE = 30.0  # Hz
 
 
 @contextmanager
-def recording(options: Options) -> Iterator[tuple[Recorder, list[dict[str, Any]]]]:
+def recording(options: RecordOptions) -> Iterator[tuple[Recorder, list[dict[str, Any]]]]:
     """A recorder on a thread, ready; the summary is the last thing that it says."""
     recorder, said = Recorder(options), []
     failed: list[BaseException] = []
@@ -59,7 +59,7 @@ def record_plane(tmp_path: Path, seconds: float = 1.0, **options: Any) -> tuple[
         with stream(running, frame, RATE):
             until(lambda: count > 2)  # the last values are there
             node = NodeAddress(run_dir=run_dir)
-            with recording(Options(tmp_path / "bag", node=node, **options)) as (_, said):
+            with recording(RecordOptions(tmp_path / "bag", node=node, **options)) as (_, said):
                 last = count + seconds * RATE
                 until(lambda: count > last)
     return tmp_path / "bag", said[-1]

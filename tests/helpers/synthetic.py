@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from waiting import repeating
 
 from sags_node.config.schema import PublishConfig
 from sags_node.geometry import quat_to_matrix, unproject
@@ -129,31 +129,20 @@ def publisher(
         yield running
 
 
-@contextmanager
 def stream(
     running: Publisher,
     frame: Callable[[int], FrameResult] | None = None,
     rate: float = 30.0,
     said: Callable[[], NodeHealth] = health,
-) -> Iterator[None]:
+) -> AbstractContextManager[None]:
     """Publish `frame(i)` (default: the plane, now) and every third time health, from one thread."""
     plane = plane_result()
     make = frame or (lambda i: at_frame(plane, i, time.time_ns()))
-    stop = threading.Event()
 
-    def publish() -> None:
-        i = 0
-        while not stop.is_set():
-            running.publish_result(make(i), dropped=i // 2)
-            if i % 3 == 0:
-                running.publish_health(said())
-            running.poll(int(1000 / rate))
-            i += 1
+    def publish(i: int) -> None:
+        running.publish_result(make(i), dropped=i // 2)
+        if i % 3 == 0:
+            running.publish_health(said())
+        running.poll(int(1000 / rate))
 
-    thread = threading.Thread(target=publish)
-    thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        thread.join()
+    return repeating(publish)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from synthetic import at_frame, health
+from waiting import repeating
 
 from sags_node.config.schema import PublishConfig
 from sags_node.messaging.publisher import Publisher
@@ -28,25 +28,17 @@ def node_sockets(run_dir: Path, right: bool = False) -> Iterator[Publisher]:
 @contextmanager
 def making(running: Publisher, result: FrameResult, rate: float = 50.0) -> Iterator[list[frozenset[str]]]:
     """A node's publishing and thinning on one thread; gives what was made of each frame."""
-    stop, made = threading.Event(), []
+    made: list[frozenset[str]] = []
+    began = time.monotonic()
 
-    def publish() -> None:
-        number, due = 0, time.monotonic()
-        while not stop.is_set():
-            due += 1 / rate
-            frame = at_frame(result, number, time.time_ns())
-            running.publish_result(frame, 0)
-            pictures = thin_pictures(frame, running.thin)
-            made.append(frozenset(pictures))
-            running.publish_thin(frame, pictures)
-            running.publish_health(health())
-            running.poll(max(0, round(1000 * (due - time.monotonic()))))
-            number += 1
+    def publish(number: int) -> None:
+        frame = at_frame(result, number, time.time_ns())
+        running.publish_result(frame, 0)
+        pictures = thin_pictures(frame, running.thin)
+        made.append(frozenset(pictures))
+        running.publish_thin(frame, pictures)
+        running.publish_health(health())
+        running.poll(max(0, round(1000 * (began + (number + 1) / rate - time.monotonic()))))
 
-    thread = threading.Thread(target=publish)
-    thread.start()
-    try:
+    with repeating(publish):
         yield made
-    finally:
-        stop.set()
-        thread.join()

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import TypeVar
 
 T = TypeVar("T")
@@ -17,3 +20,17 @@ def until(done: Callable[[], T], seconds: float = 60.0) -> T:
         assert time.monotonic() < deadline, "waited in vain"
         time.sleep(0.01)
     return found
+
+
+@contextmanager
+def repeating(step: Callable[[int], object]) -> Iterator[None]:
+    """Calls `step` with 0, 1, 2 and so on, from a thread of its own."""
+    stop = threading.Event()
+    calls = itertools.takewhile(lambda _: not stop.is_set(), itertools.count())
+    thread = threading.Thread(target=lambda: [step(number) for number in calls])
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()

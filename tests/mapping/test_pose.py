@@ -11,7 +11,7 @@ import pytest
 from places import SESSION
 
 from sags_node.engine.rasterizer.rasterize import rasterize
-from sags_node.evaluation.measure import Options
+from sags_node.evaluation.measure import MeasureOptions
 from sags_node.evaluation.metrics import as_float
 from sags_node.evaluation.session import evaluate
 from sags_node.evaluation.trajectory import RigidOdometry, trajectory_errors
@@ -203,7 +203,7 @@ def test_the_baseline_without_a_model_follows_still_tissue_too(
 
 
 def test_eval_gives_the_errors_of_the_path_and_measures_all_else_in_the_estimated_world(still: Path) -> None:
-    options = Options(hold_out=4, every=100)
+    options = MeasureOptions(hold_out=4, every=100)
     runs = {
         pose: evaluate(still, [f"vision.pose:={pose}", "source.frames:=14"], options, iterations=1).summary
         for pose in ("session", "estimate", "fixed")

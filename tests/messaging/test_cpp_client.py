@@ -17,6 +17,7 @@ import msgpack
 import numpy as np
 import pytest
 import zmq
+from independent_client import zmq_socket
 from places import ROOT
 from running_node import RunningNode
 from synthetic import plane_result
@@ -111,10 +112,7 @@ def test_it_shows_what_the_python_subscriber_shows(read_depth: Path, node: Runni
 
 
 def test_it_says_stale_and_shows_nothing_while_no_frames_come(read_depth: Path, node: RunningNode) -> None:
-    with (
-        ControlClient(run_dir=node.run_dir) as control,
-        running(read_depth, node.data) as process,
-    ):
+    with ControlClient(run_dir=node.run_dir) as control, running(read_depth, node.data) as process:
         assert process.stdout is not None
         while not LINE.match(process.stdout.readline()):
             assert process.poll() is None
@@ -136,11 +134,8 @@ def test_hostile_messages_are_left_out(read_depth: Path) -> None:
     depth = result.views["left"].depth.copy()
     depth[32, 48] = 0  # the centre is unknown
     result = replace(result, views={"left": replace(result.views["left"], depth=depth)})
-    context = zmq.Context()
-    socket = context.socket(zmq.XPUB)
-    port = socket.bind_to_random_port("tcp://127.0.0.1")
-    try:
-        with running(read_depth, f"tcp://127.0.0.1:{port}", "1") as process:
+    with zmq_socket(zmq.XPUB, "tcp://127.0.0.1:*", bind=True) as socket:
+        with running(read_depth, socket.getsockopt_string(zmq.LAST_ENDPOINT), "1") as process:
             for _ in range(2):
                 assert socket.poll(60_000) and socket.recv()[:1] == b"\x01"
             good = {name: message(name, result) for name in (IMAGE, DEPTH)}
@@ -163,8 +158,6 @@ def test_hostile_messages_are_left_out(read_depth: Path) -> None:
         assert process.returncode == 0
         assert complaints.count("left out: ") == len(bad) - 1
         assert [row[4] for row in LINE.findall(said)] == ["unknown"]
-    finally:
-        context.destroy(linger=0)
 
 
 def test_pictures_are_handed_in_and_a_wrong_size_is_told(examples: Path) -> None:

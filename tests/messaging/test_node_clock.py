@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 from synthetic import at_frame, plane_result, publisher, stream
-from waiting import until
+from waiting import repeating, until
 
 from sags_node.config.schema import PublishConfig
 from sags_node.errors import SagsError
@@ -83,23 +83,14 @@ def answering(run_dir: Path, clock_ns: Callable[[], int]) -> Iterator[Publisher]
 
     config = PublishConfig(data=("tcp://127.0.0.1:*",), control="tcp://127.0.0.1:*", run_dir=run_dir)
     with Publisher(config, "sags", "session-1", {"get_clock": stamps}) as running:
-        stop = threading.Event()
         plane = plane_result()
 
-        def serve() -> None:
-            frame = 0
-            while not stop.is_set():
-                running.publish_result(at_frame(plane, frame, clock_ns()), dropped=0)
-                running.poll(20)
-                frame += 1
+        def serve(frame: int) -> None:
+            running.publish_result(at_frame(plane, frame, clock_ns()), dropped=0)
+            running.poll(20)
 
-        thread = threading.Thread(target=serve)
-        thread.start()
-        try:
+        with repeating(serve):
             yield running
-        finally:
-            stop.set()
-            thread.join()
 
 
 @contextmanager

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import Future
@@ -13,8 +12,9 @@ from typing import Any
 import msgpack
 import pytest
 import zmq
+from independent_client import zmq_socket
 from synthetic import publisher, stream
-from waiting import until
+from waiting import repeating, until
 
 from sags_node.errors import SagsError
 from sags_node.mapping.anchors import MAX_ANCHORS
@@ -211,37 +211,24 @@ def test_a_client_that_was_refused_asks_again_by_itself(
 @pytest.mark.fault("socket: flooded with requests")
 def test_a_flood_of_requests_does_not_slow_others(tmp_path: Path) -> None:
     with answering(tmp_path / "run") as running:
-        context, stop = zmq.Context(), threading.Event()
-        flooder = context.socket(zmq.DEALER)
-        flooder.setsockopt(zmq.LINGER, 0)
-        flooder.connect(running.connection.control)
         answers: list[Any] = []
 
-        def flood() -> None:
+        def flood(number: int) -> None:
             # What is owed to one client leaves room for the others, too.
-            for _ in range(2 * MAX_PENDING_OF_ONE):
-                flooder.send(msgpack.packb({"v": "1.0", "id": 0, "op": "wait"}))
-            ping = msgpack.packb({"v": "1.0", "id": 1, "op": "ping"})
-            while not stop.is_set():
-                if flooder.poll(1, zmq.POLLOUT):
-                    flooder.send(ping)
-                while flooder.poll(0):
-                    answers.append(msgpack.unpackb(flooder.recv()))
+            op = "wait" if number < 2 * MAX_PENDING_OF_ONE else "ping"
+            if flooder.poll(1, zmq.POLLOUT):
+                flooder.send(msgpack.packb({"v": "1.0", "id": 0, "op": op}))
+            while flooder.poll(0):
+                answers.append(msgpack.unpackb(flooder.recv()))
 
         began = time.monotonic()
-        thread = threading.Thread(target=flood)
-        thread.start()
-        try:
+        with zmq_socket(zmq.DEALER, running.connection.control) as flooder, repeating(flood):
             until(lambda: running.connections["control"]["requests_too_often"])
             with ControlClient(running.connection.control) as asker:
                 for _ in range(100):
                     assert asker.request("pause", timeout=60) == "done"
                 with pytest.raises(SagsError, match="no answer"):  # it waits, and is not refused
                     asker.request("wait", timeout=0.2)
-        finally:
-            stop.set()
-            thread.join()
-            context.destroy(linger=0)
         served = sum(one["ok"] for one in answers)
         assert served <= BURST + RATE * (time.monotonic() - began)
         refused = [one for one in answers if one.get("code") == "too_often"]

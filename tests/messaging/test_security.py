@@ -7,8 +7,6 @@ import logging
 import os
 import socket
 import stat
-import subprocess
-import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,6 +19,8 @@ import pytest
 import zmq
 from click.testing import CliRunner, Result
 from command_line import sags
+from independent_client import zmq_socket
+from running_node import RunningNode
 from synthetic import publisher, stream
 from waiting import until
 from zmq.auth import load_certificate
@@ -33,12 +33,7 @@ from sags_node.messaging.control import ControlClient
 from sags_node.messaging.peers import MAX_PEERS
 from sags_node.messaging.publisher import Publisher
 from sags_node.messaging.roles import Client
-from sags_node.messaging.security import (
-    read_allow_list,
-    read_key_pair,
-    read_public_key,
-    write_key_pair,
-)
+from sags_node.messaging.security import read_allow_list, read_key_pair, read_public_key, write_key_pair
 from sags_node.messaging.subscriber import Subscriber
 
 pytestmark = pytest.mark.live
@@ -444,23 +439,17 @@ def test_a_flood_is_cut_off(tmp_path: Path, which: str, kind: bytes, block: byte
 
 
 def test_a_reply_too_large_for_the_client_is_not_taken() -> None:
-    context = zmq.Context()
-    router = context.socket(zmq.ROUTER)
-    router.bind("tcp://127.0.0.1:*")
-
     def answer() -> None:
         identity, _ = router.recv_multipart()
         router.send_multipart([identity, bytes(8 << 20)])
 
-    thread = threading.Thread(target=answer)
-    thread.start()
-    with (
-        ControlClient(router.getsockopt_string(zmq.LAST_ENDPOINT)) as asker,
-        pytest.raises(SagsError, match="no answer"),
-    ):
-        asker.request("ping", timeout=0.5)
-    thread.join()
-    context.destroy(linger=0)
+    with zmq_socket(zmq.ROUTER, "tcp://127.0.0.1:*", bind=True) as router:
+        thread = threading.Thread(target=answer)
+        thread.start()
+        with ControlClient(router.getsockopt_string(zmq.LAST_ENDPOINT)) as asker:
+            with pytest.raises(SagsError, match="no answer"):
+                asker.request("ping", timeout=0.5)
+        thread.join()
 
 
 # ---- the whole, with a process ---------------------------------------------------------------------------
@@ -469,23 +458,10 @@ def test_a_reply_too_large_for_the_client_is_not_taken() -> None:
 def test_a_secured_node_as_a_process_and_its_clients(
     phantom_session: Path, keys: Path, tmp_path: Path
 ) -> None:
-    run_dir = tmp_path / "run"
-    node = subprocess.Popen(
-        [
-            *(sys.executable, "-m", "sags_node", "run", str(phantom_session), "source.loop:=true"),
-            *(
-                "publish.data:=[tcp://*:*]",
-                "publish.control:=tcp://127.0.0.1:*",
-                f"publish.run_dir:={run_dir}",
-            ),
-            *(f"publish.key:={keys}/node.key", f"publish.allow:={keys}/clients"),
-        ],
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    secured = (f"publish.key:={keys}/node.key", f"publish.allow:={keys}/clients", "publish.data:=[tcp://*:*]")
+    node = RunningNode(phantom_session, tmp_path, *secured)
     try:
-        until((run_dir / "sags.json").exists, 90)
-        port = json.loads((run_dir / "sags.json").read_text())["data"][-1].rpartition(":")[2]
+        port = node.data.rpartition(":")[2]
         where = ["--endpoint", f"tcp://127.0.0.1:{port}"]
         good = tf_rate(*where, "--key", f"{keys}/clients/viewer.key", "--server-key", f"{keys}/node.pub")
         assert good.exit_code == 0 and json.loads(good.stdout)["average_rate"] > 0
@@ -494,12 +470,12 @@ def test_a_secured_node_as_a_process_and_its_clients(
         plain = tf_rate(*where)
         assert plain.exit_code == 1 and "wants a key" in plain.stderr
         viewer = ClientKeys(read_key_pair(keys / "clients/viewer.key"))
-        with ControlClient(run_dir=run_dir, keys=viewer) as asker:
+        with ControlClient(run_dir=node.run_dir, keys=viewer) as asker:
             connections = asker.request("get_status")["connections"]
         assert connections["data"]["unlisted_key"] == 1 and connections["data"]["refused"] >= 2
     finally:
-        node.terminate()
-        _, said = node.communicate(timeout=30)
+        node.stop()
+    said = node.said()
     assert "Traceback" not in said
     assert read_key_pair(keys / "stranger.key").public.decode() in said.replace("\n", "").replace(" ", "")
 

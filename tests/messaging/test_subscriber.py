@@ -14,6 +14,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 import zmq
+from independent_client import zmq_socket
 from made_messages import MS, meta
 from places import ROOT
 from synthetic import HEIGHT, WIDTH, at_frame, health, plane_result, publisher, stream
@@ -278,11 +279,8 @@ def _publish_until(running: Any, subscriber: Subscriber, result: Any) -> None:
 @contextmanager
 def _sender() -> Iterator[tuple[zmq.Socket[bytes], str]]:
     """An XPUB socket that sends whatever a test likes."""
-    context = zmq.Context()
-    socket = context.socket(zmq.XPUB)
-    socket.bind("tcp://127.0.0.1:*")
-    yield socket, socket.getsockopt_string(zmq.LAST_ENDPOINT)
-    context.destroy(linger=0)
+    with zmq_socket(zmq.XPUB, "tcp://127.0.0.1:*", bind=True) as socket:
+        yield socket, socket.getsockopt_string(zmq.LAST_ENDPOINT)
 
 
 def _image_meta(said: cdr.Content, seq: int, **changes: Any) -> Meta:

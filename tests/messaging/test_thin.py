@@ -25,7 +25,7 @@ from sags_node.messaging.received import ReceivedCompressed, ReceivedImage, Topi
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.messaging.thin import DEPTH_STEP, thin_pictures
 from sags_node.messaging.wire import WireError
-from sags_node.recording.recorder import Options, Recorder
+from sags_node.recording.recorder import Recorder, RecordOptions
 
 pytestmark = pytest.mark.live
 
@@ -156,7 +156,9 @@ def test_a_recording_of_everything_leaves_out_what_others_asked_for(tmp_path: Pa
     """It has the whole pictures."""
     name = thin_name("thin/quarter/left/depth/png")
     with node_sockets(tmp_path) as running, making(running, plane_result()):
-        recorder = Recorder(Options(tmp_path / "bag", node=NodeAddress(endpoint=running.connection.data[-1])))
+        recorder = Recorder(
+            RecordOptions(tmp_path / "bag", node=NodeAddress(endpoint=running.connection.data[-1]))
+        )
         with Subscriber([name], running.connection.data[-1]) as one, ThreadPoolExecutor(1) as worker:
             recording = worker.submit(recorder.run)
             until(lambda: list((tmp_path / "bag").glob("*.mcap")))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,6 +12,7 @@ import pytest
 from click.testing import CliRunner
 from made_messages import MS, meta
 from synthetic import HEIGHT, WIDTH, health, publisher, stream
+from waiting import repeating
 
 from sags_node.cli.main import main
 from sags_node.errors import SagsError, UsageError
@@ -60,56 +60,22 @@ def test_figures_are_those_of_the_arrivals(monkeypatch: pytest.MonkeyPatch) -> N
     assert (row["topic"], row["rate_hz"], row["mean_bytes"]) == ("sags/left/depth", 30.0, 275)
 
 
-def test_hz(node: NodeAddress) -> None:
-    figures = topic_hz("left/depth", node, seconds=1.0)
-    assert figures["min_s"] <= 1 / figures["average_rate"] <= figures["max_s"]
-    assert figures["window"] >= 2
-
-
-def test_bw(node: NodeAddress) -> None:
-    figures = topic_bw("sags/left/depth", node, seconds=1.0)  # the full name is understood too
-    assert figures["mean_bytes"] == pytest.approx(4 * WIDTH * HEIGHT, rel=0.01)
-    assert figures["bytes_per_s"] > 0
-
-
-def test_delay(node: NodeAddress) -> None:
-    figures = topic_delay("tf", node, seconds=1.0)
-    assert 0 < figures["min_s"] <= figures["average_delay_s"] <= figures["max_s"]
-
-
-def test_list(node: NodeAddress) -> None:
-    rows = {row["topic"]: row for row in topic_list(node, seconds=1.0)}
-    assert set(rows) == {f"sags/{name}" for name in topics.BY_NAME}
-    assert rows["sags/left/depth"]["rate_hz"] > 0
-    assert rows["sags/left/depth"]["type"] == "sensor_msgs/msg/Image"
-    assert rows["sags/parameters"]["messages"] == 1  # the last value, sent again
-    assert rows["sags/right/camera_info"]["messages"] > 0  # who listens to everything asks for it too
-
-
 @pytest.fixture(scope="module")
 def overlay(tmp_path_factory: pytest.TempPathFactory) -> Iterator[OverlayStream]:
     """An overlay's own socket, served on a thread: a picture and `status` ten times a second."""
     run_dir = tmp_path_factory.mktemp("overlay") / "run"
-    stop = threading.Event()
     color_key(np.zeros((HEIGHT, WIDTH, 4), np.uint8), KEY)  # its kernel takes a second to load
     with OverlayStream("overlay", run_dir, KEY) as stream:
 
-        def serve() -> None:
-            number = 0
-            while not stop.wait(0.1):
-                stream.serve()
-                picture = np.full((HEIGHT, WIDTH, 4), number % 256, np.uint8)
-                stream.show({"left": picture}, number, time.time_ns(), 0)
-                stream.tell({"frames": number})
-                number += 1
+        def serve(number: int) -> None:
+            time.sleep(0.1)
+            stream.serve()
+            picture = np.full((HEIGHT, WIDTH, 4), number % 256, np.uint8)
+            stream.show({"left": picture}, number, time.time_ns(), 0)
+            stream.tell({"frames": number})
 
-        thread = threading.Thread(target=serve)
-        thread.start()
-        try:
+        with repeating(serve):
             yield stream
-        finally:
-            stop.set()
-            thread.join()
 
 
 def test_an_overlay_is_listed_and_measured(overlay: OverlayStream) -> None:
@@ -142,21 +108,14 @@ def test_an_overlay_is_found_by_its_namespace_alone(
 def test_what_a_node_sends_beside_its_fixed_topics_is_listed(tmp_path: Path) -> None:
     with publisher(tmp_path / "run") as running:
         endpoint = running.connection.data[-1]
-        stop = threading.Event()
 
-        def serve() -> None:
-            while not stop.is_set():
-                running.publish_health(health())
-                running.publish_content("clock", cdr.clock(5), -1, time.time_ns(), 0)
-                running.poll(100)
+        def serve(_: int) -> None:
+            running.publish_health(health())
+            running.publish_content("clock", cdr.clock(5), -1, time.time_ns(), 0)
+            running.poll(100)
 
-        thread = threading.Thread(target=serve)
-        thread.start()
-        try:
+        with repeating(serve):
             rows = {row["topic"]: row for row in topic_list(NodeAddress(endpoint=endpoint), seconds=1.5)}
-        finally:
-            stop.set()
-            thread.join()
     assert set(rows) == {f"sags/{name}" for name in (*topics.BY_NAME, "clock")}
     assert rows["sags/clock"]["rate_hz"] > 0 and rows["sags/clock"]["type"] == topics.CLOCK
 

@@ -20,6 +20,7 @@ from engine_scenes import (
     relative_error,
 )
 from following import Following
+from splat_files import splats_of
 
 from benchmarks.__main__ import main
 from benchmarks.quality.alias import VARIANTS, Settings, Trained, train
@@ -324,9 +325,7 @@ def test_a_ply_file_draws_the_same_without_knowing_the_filter(tmp_path: Path) ->
     model, _, observation = mapped(smoothing=True)
     file = tmp_path / "model.ply"
     write_ply(file, model.gaussians())
-    header, _, body = file.read_bytes().partition(b"end_header\n")
-    names = [line.split()[-1] for line in header.decode().splitlines() if line.startswith("property")]
-    rows = np.frombuffer(body, [(name, "<f4") for name in names])
+    rows = splats_of(file)
 
     def columns(*wanted: str) -> F32:
         return np.stack([rows[name] for name in wanted], 1)
@@ -337,7 +336,7 @@ def test_a_ply_file_draws_the_same_without_knowing_the_filter(tmp_path: Path) ->
         scales=np.exp(columns("scale_0", "scale_1", "scale_2")),
         opacities=1 / (1 + np.exp(-rows["opacity"])),
         colors=columns("f_dc_0", "f_dc_1", "f_dc_2") * np.float32(SH_DEGREE_0) + np.float32(0.5),
-        ids=np.arange(len(rows)),
+        ids=np.arange(len(rows["x"])),
     )
     found, drawn = rasterize(read, observation.camera), rasterize(model.gaussians(), observation.camera)
     step = 1 / 255  # a logit's last bit may carry a pixel over the cut-off

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from splat_files import splats_of
 
 from sags_node.errors import SagsError
 from sags_node.model import deformation as deformation_module
@@ -126,10 +127,8 @@ def test_ply_holds_what_viewers_expect_and_nothing_is_overwritten(tmp_path: Path
     model = filled_model(patch(7))
     file = tmp_path / "model.ply"
     write_ply(file, model.snapshot())
-    header, _, body = file.read_bytes().partition(b"end_header\n")
-    names = [line.split()[-1] for line in header.decode().splitlines() if line.startswith("property")]
-    table = np.frombuffer(body, [(name, "<f4") for name in names])
-    assert len(table) == 7
+    table = splats_of(file)
+    assert len(table["x"]) == 7
     assert np.allclose(np.exp(table["scale_0"]), 2e-4)
     assert np.allclose(1 / (1 + np.exp(-table["opacity"])), 0.9)
     assert np.allclose(0.5 + 0.28209479 * table["f_dc_1"], 0.5)

@@ -106,12 +106,7 @@ def test_a_manager_that_has_gone_ends_nothing(manager: Manager) -> None:
 def test_pings_end_when_the_mapping_hangs(
     manager: Manager, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    overrides = [
-        f"publish.run_dir:={tmp_path / 'run'}",
-        *RUN_HERE,
-        "source.pace:=step",
-        "source.loop:=true",
-    ]
+    overrides = [f"publish.run_dir:={tmp_path / 'run'}", *RUN_HERE, "source.pace:=step", "source.loop:=true"]
     session = open_session(SESSION, [*overrides, "mapping.max_gaussians:=2000"])
     warm_up(session.config)
     node = Node(session.config, session.rig, session.source, manager=ServiceManager(manager.environment()))

@@ -13,7 +13,6 @@ import independent_client as client
 import msgpack
 import numpy as np
 import pytest
-import zmq
 from running_node import START_SECONDS, RunningNode
 from synthetic import at_frame, plane_result
 from waiting import until
@@ -220,11 +219,7 @@ def test_what_is_wrong_with_a_request_is_said(node: RunningNode, control: Contro
 def test_paused_it_says_so_sends_nothing_and_goes_on_with_what_is_new(
     node: RunningNode, control: ControlClient
 ) -> None:
-    context = zmq.Context()
-    socket = context.socket(zmq.SUB)
-    socket.setsockopt_string(zmq.SUBSCRIBE, "sags/left/render/depth")
-    socket.connect(node.data)
-    try:
+    with client.subscribed(node.data, "sags/left/render/depth") as socket:
         assert socket.poll(60_000)
         assert control.request("pause") == {"paused": True}
         assert control.request("get_status")["state"] == "paused"
@@ -239,8 +234,6 @@ def test_paused_it_says_so_sends_nothing_and_goes_on_with_what_is_new(
             newest["seq"] + 1,
             newest["frame_id"] + 1,
         )
-    finally:
-        context.destroy(linger=0)
     until(lambda: control.request("get_status")["state"] == "running")
 
 

@@ -32,7 +32,7 @@ from sags_node.messaging.received import ReceivedCloud, ReceivedImage, ReceivedT
 from sags_node.messaging.rundir import connection_path
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.overlay.draw import color_key
-from sags_node.overlay.run import Options, run_overlay
+from sags_node.overlay.run import OverlayOptions, run_overlay
 from sags_node.sources.pictures import read_picture
 from sags_node.types import Camera
 
@@ -67,7 +67,7 @@ class Overlay(threading.Thread):
     def __init__(self, run_dir: Path, **options: Any) -> None:
         super().__init__(daemon=True)
         self.said: list[str] = []
-        self._options = Options(NodeAddress(run_dir=run_dir), max_age=MAX_AGE, **options)
+        self._options = OverlayOptions(NodeAddress(run_dir=run_dir), max_age=MAX_AGE, **options)
         self._summary: dict[str, Any] = {}
 
     def run(self) -> None:
@@ -198,7 +198,7 @@ def test_on_the_phantom_both_eyes_follow_the_tissue(
     assert np.median(errors) < 1 and np.percentile(errors, 90) < 2
     assert np.abs(np.median(disparities)) < 0.5
     latency = summary["latency_ms"]
-    assert 0 < latency["p50"] <= latency["p99"] < 1000 * seconds  # ms, of pictures of this session
+    assert 0 < latency["p50"] <= latency["p99"] < 1000 * seconds  # ms, of this session
     assert summary["overlay"] >= 20 and len(summary["objects"][0]["anchors"]) == 1
 
 
@@ -234,7 +234,7 @@ def phantom_baseline(session: Path) -> float:
 @pytest.mark.usefixtures("node")
 def test_the_saved_video_is_whole_also_where_there_is_no_overlay(run_dir: Path, tmp_path: Path) -> None:
     video = tmp_path / "overlay.mp4"
-    summary = run_overlay(Options(NodeAddress(run_dir=run_dir), save=video, seconds=2.0))
+    summary = run_overlay(OverlayOptions(NodeAddress(run_dir=run_dir), save=video, seconds=2.0))
     assert summary["frames"] == summary["overlay"] + sum(summary["blanked"].values()) > 5
     assert summary["blanked"]["being pinned"] > 0
     capture = cv2.VideoCapture(str(video))

@@ -9,6 +9,7 @@ import pytest
 
 from sags_node.geometry import quat_to_matrix
 from sags_node.overlay.draw import NEAREST, UNDER, Body, Placed, color_key, draw, over
+from sags_node.overlay.durations import REMEMBERED, Durations
 from sags_node.overlay.frame import TissueFrame
 from sags_node.overlay.mesh import Mesh
 from sags_node.overlay.raster import fill
@@ -208,3 +209,17 @@ def test_the_colour_key_is_exact(key: tuple[int, int, int]) -> None:
     assert np.array_equal(is_key, ~drawn)
     difference = np.abs(keyed.astype(int) - rgba[..., :3])[drawn]
     assert difference.sum(1).max() == 1 and (difference > 0).sum() >= 2  # only where it would be the key
+
+
+# ---- what the overlay remembers of its own speed -------------------------------------------------------
+
+
+def test_the_newest_are_kept_in_their_order() -> None:
+    durations = Durations()
+    assert durations.percentiles() == {"p50": None, "p90": None, "p99": None}
+    for ms in range(REMEMBERED + 10):
+        durations.add(float(ms))
+    assert durations.last(3).tolist() == [REMEMBERED + 7, REMEMBERED + 8, REMEMBERED + 9]
+    assert durations.last()[0] == 10 and len(durations.last()) == REMEMBERED
+    last = REMEMBERED + 9
+    assert durations.percentiles(101) == {"p50": last - 50, "p90": last - 10, "p99": last - 1}

@@ -117,9 +117,14 @@ class FakePinner(Pinner):
 PIXELS = [[20, 20], [70, 30], [30, 55], [85, 50]]
 
 
-def held(anchors: list[Request] | list[dict[str, Any]], repin: bool = False, **more: Any) -> HeldObject:
+def held(
+    anchors: list[Request] | list[dict[str, Any]],
+    repin: bool = False,
+    pinner: FakePinner | None = None,
+    **more: Any,
+) -> HeldObject:
     spec = ObjectSpec.model_validate({"shape": "sphere", "anchors": anchors, **more})
-    return HeldObject(spec, "pin", FakePinner(), repin)
+    return HeldObject(spec, "pin", pinner or FakePinner(), repin)
 
 
 def with_anchors(frame: TissueFrame, places: Any, confidence: Any = 1.0) -> TissueFrame:
@@ -144,9 +149,9 @@ def placed_at(thing: HeldObject, frame: TissueFrame) -> np.ndarray:
 
 def test_one_anchor_carries_the_object_and_keeps_its_direction_while_hidden() -> None:
     frame = plane_frame()
-    thing = held([{"pixel": [30, 40]}])
+    thing = held([{"pixel": [30, 40]}], pinner=(pinner := FakePinner()))
     T = placed_at(thing, with_anchors(frame, [on_plane(frame, 30, 40)]))
-    assert thing._pinner.asked == [[{"u": 30, "v": 40}]]  # type: ignore[attr-defined]  # the fake one
+    assert pinner.asked == [[{"u": 30, "v": 40}]]
     assert np.allclose(T[:3, 3], on_plane(frame, 30, 40))
     hidden = replace(frame, tissue=~np.ones_like(frame.tissue))
     again = thing.place(with_anchors(hidden, [on_plane(frame, 33, 41)], 0.3))
@@ -255,16 +260,16 @@ def test_it_waits_for_tissue_with_depth_and_for_the_node() -> None:
     assert held([]).place(unknown) is None
     with pytest.raises(UsageError, match=r"pin 96 30 lies outside the left picture of 96x64"):
         held([{"pixel": [96, 30]}]).place(frame)
-    thing = held([{"pixel": [30, 30]}])
-    thing._pinner.refusal = SagsError("there are 256 anchors already")  # type: ignore[attr-defined]  # fake
+    thing = held([{"pixel": [30, 30]}], pinner=(pinner := FakePinner()))
+    pinner.refusal = SagsError("there are 256 anchors already")
     assert [thing.place(frame) for _ in range(2)] == [None, None]
     assert thing.reason == "there are 256 anchors already"
 
 
 def test_the_default_place_is_the_middle_of_the_tissue() -> None:
-    thing = held([])
+    thing = held([], pinner=(pinner := FakePinner()))
     thing.place(plane_frame())
-    ((asked,),) = thing._pinner.asked  # type: ignore[attr-defined]  # the fake one
+    ((asked,),) = pinner.asked
     assert abs(asked["u"] - 43) < 8 and abs(asked["v"] - 32) < 3
 
 
@@ -273,7 +278,7 @@ def test_the_default_place_is_the_middle_of_the_tissue() -> None:
 def test_after_a_new_start_it_is_lost_or_pinned_anew(how: str, repin: bool) -> None:
     frame = plane_frame()
     place = on_plane(frame, 30, 40)
-    thing = held([{"pixel": [30, 40]}], repin)
+    thing = held([{"pixel": [30, 40]}], repin, pinner := FakePinner())
     placed_at(thing, with_anchors(frame, [place]))
     after = {
         "model": with_anchors(frame, [np.full(3, np.nan)]),
@@ -281,7 +286,6 @@ def test_after_a_new_start_it_is_lost_or_pinned_anew(how: str, repin: bool) -> N
         "removed": with_anchors(frame, [None]),
     }[how]
     assert thing.place(after) is None and str(thing.reason).startswith("lost: ")
-    pinner: Any = thing._pinner
     assert (pinner.removed, pinner.forgotten) == (([], [1]) if how == "node" else ([1], []))
     if not repin:
         assert thing.place(with_anchors(frame, [place])) is None and str(thing.reason).startswith("lost: ")

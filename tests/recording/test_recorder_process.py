@@ -10,14 +10,11 @@ from pathlib import Path
 
 import pytest
 from synthetic import publisher, stream
-from waiting import until
 
 from sags_node.errors import SagsError
-from sags_node.messaging.subscriber import Subscriber
 from sags_node.processes import children
 from sags_node.recording import child
 from sags_node.recording.child import RecorderProcess
-from sags_node.recording.info import bag_info
 
 pytestmark = pytest.mark.live
 
@@ -41,28 +38,8 @@ def recorders() -> list[int]:
     return children("record")
 
 
-def test_a_snapshot_of_an_ordinary_recording_is_refused_and_the_recording_goes_on(
-    recorder: RecorderProcess, tmp_path: Path
-) -> None:
-    recorder.start({"path": str(tmp_path / "bag")}).result(ANSWER)
-    with pytest.raises(SagsError, match="start_recording with snapshot_seconds"):
-        recorder.snapshot().result(ANSWER)
-    with Subscriber(["tf"], run_dir=tmp_path / "run") as beside:
-        first = beside.wait("tf", ANSWER)
-        until(lambda: (newest := beside.latest("tf")) and first and newest.meta.seq > first.meta.seq + 15)
-    summary = recorder.stop().result(ANSWER)
-    assert summary["messages"] == bag_info(tmp_path / "bag")["messages"] > 0
-
-
-def test_a_snapshot_of_nothing_is_refused(recorder: RecorderProcess) -> None:
-    with pytest.raises(SagsError, match="nothing is being recorded"):
-        recorder.snapshot().result(ANSWER)
-
-
 @pytest.mark.parametrize(
-    "args",
-    [{"path": "a\0b"}, {"path": "a", "topics": ["left/depth\0"]}],
-    ids=["path", "topic"],
+    "args", [{"path": "a\0b"}, {"path": "a", "topics": ["left/depth\0"]}], ids=["path", "topic"]
 )
 def test_a_zero_character_is_refused(recorder: RecorderProcess, args: dict[str, object]) -> None:
     with pytest.raises(SagsError, match="zero character"):

@@ -21,7 +21,7 @@ from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.topics import TOPICS
 from sags_node.recording.bag import read_messages
 from sags_node.recording.pictures import decode_picture
-from sags_node.recording.recorder import Options
+from sags_node.recording.recorder import RecordOptions
 
 pytestmark = pytest.mark.live
 
@@ -99,19 +99,11 @@ def test_compressed_pictures(compression: str, tmp_path: Path) -> None:
     assert stamp.sec * 10**9 + stamp.nanosec == picture.publish_ns
 
 
-def test_only_the_topics_asked_for(tmp_path: Path) -> None:
-    path, summary = record_plane(tmp_path, seconds=0.4, topics=("left/depth", "sags/tf"))
-    assert set(by_topic(path)) == {"left/depth", "tf"} and set(summary["topics"]) == {
-        "sags/left/depth",
-        "sags/tf",
-    }
-
-
 def test_snapshots_hold_the_last_seconds(tmp_path: Path) -> None:
     run_dir = tmp_path / "run"
     with publisher(run_dir) as running:
         running.publish_parameters({"seed": 6})
-        options = Options(tmp_path / "ring", snapshot_seconds=0.6, node=NodeAddress(run_dir=run_dir))
+        options = RecordOptions(tmp_path / "ring", snapshot_seconds=0.6, node=NodeAddress(run_dir=run_dir))
         with stream(running), recording(options) as (recorder, said):
             for number in range(2):
                 time.sleep(1.2)

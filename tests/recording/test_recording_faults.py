@@ -9,6 +9,7 @@ from pathlib import Path
 import msgspec
 import pytest
 import zmq
+from independent_client import zmq_socket
 from made_messages import meta
 from recorded_plane import by_topic, recording
 from synthetic import HEIGHT, WIDTH, at_frame, plane_result, publisher, stream
@@ -20,7 +21,7 @@ from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.wire import Message, encode
 from sags_node.recording.backlog import Arrived, Backlog
 from sags_node.recording.info import bag_info
-from sags_node.recording.recorder import Options
+from sags_node.recording.recorder import RecordOptions
 
 pytestmark = pytest.mark.live
 
@@ -32,12 +33,10 @@ def text_message(seq: int, text: str = "x") -> Message:
 
 
 def test_gaps_repeats_and_strangers_are_counted(tmp_path: Path) -> None:
-    context = zmq.Context()
-    socket = context.socket(zmq.XPUB)
     endpoint = f"ipc://{tmp_path / 'data'}"
-    socket.bind(endpoint)
-    try:
-        with recording(Options(tmp_path / "bag", node=NodeAddress(endpoint=endpoint))) as (recorder, said):
+    options = RecordOptions(tmp_path / "bag", node=NodeAddress(endpoint=endpoint))
+    with zmq_socket(zmq.XPUB, endpoint, bind=True) as socket:
+        with recording(options) as (recorder, said):
             socket.recv()  # the subscription
             for seq in (3, 4, 4, 7, 8, 3, 12):
                 socket.send_multipart(encode(text_message(seq)))
@@ -46,8 +45,6 @@ def test_gaps_repeats_and_strangers_are_counted(tmp_path: Path) -> None:
             of_own = msgspec.structs.replace(unknown.meta, type="my_msgs/msg/Own")
             socket.send_multipart(encode(Message("sags/own", of_own, (b"1234",))))
             until(lambda: recorder._rejected)
-    finally:
-        context.destroy(linger=0)
     row = said[-1]["topics"]["sags/status"]
     assert row == {"messages": 5, "dropped": 0, "lost": 2 + 3} and said[-1]["rejected"] == 1
     (listed,) = bag_info(tmp_path / "bag")["topics"]
@@ -69,7 +66,7 @@ def test_a_disk_that_is_too_slow_costs_messages_that_are_counted(tmp_path: Path)
     """Room for two depth pictures and no more: a burst cannot be kept."""
     run_dir = tmp_path / "run"
     most = 2.5 * 4 * WIDTH * HEIGHT / 1e6
-    options = Options(
+    options = RecordOptions(
         tmp_path / "bag", ("left/depth",), "png", max_cache_mb=most, node=NodeAddress(run_dir=run_dir)
     )
     plane = plane_result()
@@ -104,17 +101,17 @@ def test_mistakes_are_named(tmp_path: Path) -> None:
     with publisher(tmp_path / "run"):
         with (
             pytest.raises(UsageError, match="taken exists already"),
-            recording(Options(taken, node=NodeAddress(run_dir=tmp_path / "run"))),
+            recording(RecordOptions(taken, node=NodeAddress(run_dir=tmp_path / "run"))),
         ):
             pass
         with (
             pytest.raises(SagsError, match="cannot write"),
-            recording(Options(Path("/proc/nowhere/bag"), node=NodeAddress(run_dir=tmp_path / "run"))),
+            recording(RecordOptions(Path("/proc/nowhere/bag"), node=NodeAddress(run_dir=tmp_path / "run"))),
         ):
             pass
     with (
         pytest.raises(SagsError, match="no node runs as 'sags'"),
-        recording(Options(tmp_path / "none", node=NodeAddress(run_dir=tmp_path / "run"))),
+        recording(RecordOptions(tmp_path / "none", node=NodeAddress(run_dir=tmp_path / "run"))),
     ):
         pass
     assert not (tmp_path / "none").exists()
@@ -127,7 +124,10 @@ def test_a_full_disk_ends_with_one_message(tmp_path: Path) -> None:
         recorder_folder = tmp_path / "bag"
         recorder_folder.mkdir()
         with pytest.raises(SagsError, match=r"cannot write .*: No space left on device; save what is there"):
-            with recording(Options(recorder_folder, node=NodeAddress(run_dir=tmp_path / "run"))) as (_, _):
+            with recording(RecordOptions(recorder_folder, node=NodeAddress(run_dir=tmp_path / "run"))) as (
+                _,
+                _,
+            ):
                 # The file that is being written becomes a full disk.
                 (written,) = recorder_folder.glob("*.mcap")
                 descriptors = Path("/proc/self/fd")

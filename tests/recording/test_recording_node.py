@@ -15,17 +15,19 @@ from typing import cast
 
 import numpy as np
 import pytest
-from command_line import RUN_HERE, START_SECONDS, sags
+from command_line import RUN_HERE, START_SECONDS, pure_json, refused, sags, start, stopped, wait_for
 from mcap.reader import make_reader
 from recorded_plane import by_topic
 from rosbags.highlevel import AnyReader
 from waiting import until
 
+from sags_node.config.schema import PhantomSource
 from sags_node.errors import SagsError
 from sags_node.messaging.control import ControlClient
 from sags_node.messaging.received import ReceivedImage
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.messaging.topics import TOPICS
+from sags_node.phantom import write_session
 from sags_node.pipeline.session import open_session
 from sags_node.recording.bag import read_messages
 from sags_node.recording.info import bag_info
@@ -37,26 +39,15 @@ pytestmark = pytest.mark.live
 def node(phantom_session: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """`sags run` in its own process; its run directory."""
     home = tmp_path_factory.mktemp("node")
-    command = [
-        sys.executable,
-        "-m",
-        "sags_node",
-        "run",
-        str(phantom_session),
-        "vision.scale:=1",
-        "source.loop:=true",
-    ]
-    command += ["mapping.budget_ms:=20", *RUN_HERE]
-    environment = {**os.environ, "XDG_RUNTIME_DIR": str(home)}
-    with subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL) as process:
-        try:
-            until((home / "sags/sags.json").exists, START_SECONDS)
-            with Subscriber(["tf"], run_dir=home / "sags") as subscriber:
-                assert subscriber.wait("tf", START_SECONDS) is not None
-            yield home
-        finally:
-            process.send_signal(signal.SIGINT)
-            process.wait(30)
+    command = ["run", phantom_session, "source.loop:=true", "mapping.budget_ms:=20", *RUN_HERE]
+    process = start(command, XDG_RUNTIME_DIR=home)
+    try:
+        wait_for(process, (home / "sags/sags.json").exists)
+        with Subscriber(["tf"], run_dir=home / "sags") as subscriber:
+            assert subscriber.wait("tf", START_SECONDS) is not None
+        yield home
+    finally:
+        stopped(process)
 
 
 def frames_pass(home: Path, count: int) -> None:
@@ -69,11 +60,7 @@ def frames_pass(home: Path, count: int) -> None:
 
 
 def start_recorder(home: Path, *arguments: object) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "sags_node", "bag", "record", *map(str, arguments)]
-    environment = {**os.environ, "XDG_RUNTIME_DIR": str(home)}
-    return subprocess.Popen(
-        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
+    return start(["bag", "record", *arguments], XDG_RUNTIME_DIR=home)
 
 
 @pytest.mark.fault("process: the recorder is killed")
@@ -118,22 +105,6 @@ def test_a_killed_recording_is_recovered_and_replayed(node: Path, tmp_path: Path
                 compared += 1
     assert compared >= 5
     assert session.rig.baseline > 0 and session.rig.left.width == frame.left.shape[1]
-
-
-def test_a_long_recording_in_several_files_is_a_session(node: Path, tmp_path: Path) -> None:
-    """What `ros2 bag record -b` is for: a real node, a real recorder, and every command takes the folder."""
-    process = start_recorder(node, "-o", tmp_path / "bag", "-b", 12_000_000)
-    until(lambda: len(list((tmp_path / "bag").glob("*.mcap"))) > 3)
-    process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=60)
-    assert process.returncode == 0, errors
-    files = list((tmp_path / "bag").glob("*.mcap"))
-    assert max(file.stat().st_size for file in files) < 12_400_000
-    result = sags("bag", "info", tmp_path / "bag", "--json")
-    assert result.exit_code == 0 and len(json.loads(result.stdout)["files"]) == len(files)
-    result = sags("eval", tmp_path / "bag", "source.frames:=10", "--pace", "step", "--json")
-    assert result.exit_code == 0, result.output
-    assert json.loads(result.stdout)["frames"] == 10  # out of three files
 
 
 def test_ctrl_c_closes_the_file_and_a_signal_takes_a_snapshot(node: Path, tmp_path: Path) -> None:
@@ -225,3 +196,38 @@ def test_recording_on_the_control_socket(node: Path, tmp_path: Path) -> None:
         saved = bag_info(Path(taken["snapshot"]))
         assert saved["messages"] == taken["messages"] > 5 and len(saved["files"]) > 1
         assert control.request("stop_recording", timeout=30)["messages"] == taken["messages"]
+
+
+# ---- `sags bag record --session`: a recording goes through a node into a bag, and nothing is left ------
+
+
+FRAMES = 6
+WARM_UP = 2  # more, before them
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("session") / "played"
+    write_session(
+        PhantomSource(seconds=(WARM_UP + FRAMES) / 10, width=160, height=128, seed=3), folder, rate=10.0
+    )
+    return folder
+
+
+def test_every_frame_after_the_warm_up_is_recorded_and_plays_again(session: Path, tmp_path: Path) -> None:
+    bag = tmp_path / "bag"
+    asked = (f"source.warm_up:={WARM_UP}", "--json")
+    said = pure_json(sags("bag", "record", "-o", bag, "--session", session, *asked).stdout)
+    assert (said["frames"], said["lost"], said["dropped"]) == (FRAMES, 0, 0)
+    for topic in ("left/image_rect_color", "left/render/depth", "right/render/image", "splats"):
+        assert said["topics"][f"sags/{topic}"]["messages"] == FRAMES
+    with open_session(bag, ["source.pace:=step"]).source as source:
+        assert len([frame for frame in source if frame.right is not None]) == FRAMES
+
+
+def test_what_does_not_go_together_is_refused(session: Path, tmp_path: Path) -> None:
+    record = ("bag", "record", "-o", tmp_path)
+    refused(2, *record, "mapping.rung:=1", said=("mapping.rung:=1", "--session"))
+    refused(2, *record, "--session", session, "--seconds", "2", said=("no --snapshot-mode",))
+    refused(2, *record, "--session", session, said=("exists already",))
+    refused(2, *record, "--session", "source.kind:=v4l2", said=("leave out --session",))

@@ -19,8 +19,7 @@ from sags_node.config.schema import PublishConfig
 from sags_node.recording.bag import read_messages
 from sags_node.recording.bag_writer import Limits
 from sags_node.recording.info import bag_info
-from sags_node.recording.player import Options as PlayOptions
-from sags_node.recording.player import Player
+from sags_node.recording.player import Player, PlayOptions
 
 
 @pytest.fixture(scope="module")

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import pickle
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from command_line import figures_of
 
 from sags_node.cli.main import main
 from sags_node.config import schema as cfg
@@ -141,9 +142,7 @@ def test_right_pictures_are_used_when_the_baseline_is_known(clip: Path) -> None:
 def test_stereo_replaces_missing_depth(clip: Path) -> None:
     for number in range(FRAMES):
         write(clip / f"images_right/{number:06d}.png", left_picture(number + 3))
-    for file in (clip / "depth").iterdir():
-        file.unlink()
-    (clip / "depth").rmdir()
+    shutil.rmtree(clip / "depth")
     with pytest.raises(UsageError, match=r"holds no depth/; set source\.baseline"):
         play(clip)
     frame = play(clip, baseline=0.0042)[0]
@@ -209,18 +208,19 @@ def test_one_frame_full_of_instruments_is_possible(clip: Path) -> None:
 # ---- mistakes --------------------------------------------------------------------------------------------
 
 
-def no_masks(clip: Path) -> None:
-    for file in (clip / "masks").iterdir():
-        file.unlink()
-    (clip / "masks").rmdir()
+def depth(clip: Path, picture: np.ndarray, number: int = 0) -> None:
+    write(clip / f"depth/frame-{number}.png", picture)
 
 
-def one_mask_less(clip: Path) -> None:
-    (clip / "masks/000005.png").unlink()
+def posed(clip: Path, table: np.ndarray) -> None:
+    np.save(clip / "poses_bounds.npy", table)
 
 
-def one_depth_less(clip: Path) -> None:
-    (clip / "depth/frame-5.png").unlink()
+def changed(rows: Any, columns: Any, value: float, factor: float = 0.0) -> np.ndarray:
+    """The poses with some numbers set to `value`, or multiplied."""
+    table = poses_bounds()
+    table[rows, columns] = value + factor * table[rows, columns]
+    return table
 
 
 def label_masks(clip: Path) -> None:
@@ -228,37 +228,9 @@ def label_masks(clip: Path) -> None:
         write(clip / f"masks/{number:06d}.png", instrument(number) // 255)
 
 
-def small_mask(clip: Path) -> None:
-    write(clip / "masks/000000.png", instrument(0)[:-2])
-
-
-def small_depth(clip: Path) -> None:
-    write(clip / "depth/frame-0.png", depth_counts(0)[:, :-4])
-
-
-def coloured_depth(clip: Path) -> None:
-    write(clip / "depth/frame-0.png", left_picture(0))
-
-
 def depth_in_micrometres(clip: Path) -> None:
     for number in range(FRAMES):
-        write(clip / f"depth/frame-{number}.png", depth_counts(number).astype(np.uint16) * 500)
-
-
-def no_poses(clip: Path) -> None:
-    (clip / "poses_bounds.npy").unlink()
-
-
-def poses_of_wrong_shape(clip: Path) -> None:
-    np.save(clip / "poses_bounds.npy", poses_bounds()[:, :12])
-
-
-def pickled_poses(clip: Path) -> None:
-    np.save(clip / "poses_bounds.npy", poses_bounds().astype(object), allow_pickle=True)
-
-
-def pickle_as_npy(clip: Path) -> None:
-    (clip / "poses_bounds.npy").write_bytes(pickle.dumps(poses_bounds()))
+        depth(clip, depth_counts(number).astype(np.uint16) * 500, number)
 
 
 def torn_poses(clip: Path) -> None:
@@ -266,64 +238,45 @@ def torn_poses(clip: Path) -> None:
     file.write_bytes(file.read_bytes()[:-64])
 
 
-def fewer_poses(clip: Path) -> None:
-    np.save(clip / "poses_bounds.npy", poses_bounds(FRAMES - 2))
+EVERY = np.s_[:]
+MISTAKES: list[tuple[Callable[[Path], object], str]] = [
+    (lambda clip: shutil.rmtree(clip / "masks"), "masks does not exist; check the path"),
+    (lambda clip: (clip / "masks/000005.png").unlink(), "images holds 12 pictures but .*masks holds 11"),
+    (lambda clip: (clip / "depth/frame-5.png").unlink(), "images holds 12 pictures but .*depth holds 11"),
+    (label_masks, "masks/000000.png: no value is above 1; a mask holds 0 and 255, scale it"),
+    (lambda clip: write(clip / "masks/000000.png", instrument(0)[:-2]),
+     "masks/000000.png is 160x126 px but .*images/000000.png is 160x128"),
+    (lambda clip: depth(clip, depth_counts(0)[:, :-4]),
+     "depth/frame-0.png is 156x128 px but the pictures are 160x128"),
+    (lambda clip: depth(clip, left_picture(0)),
+     "depth/frame-0.png has 3 channels; a depth picture is a grey PNG of 8 or 16 bit"),
+    (depth_in_micrometres, r"frame-0.png: the median depth would be \d+ m, .*set source.depth_unit"),
+    (lambda clip: (clip / "poses_bounds.npy").unlink(), "poses_bounds.npy does not exist; check the path"),
+    (lambda clip: posed(clip, poses_bounds()[:, :12]),
+     r"poses_bounds.npy is float64 \[12, 12\], wanted numbers \[any, 17\]"),
+    (lambda clip: posed(clip, poses_bounds().astype(object)), "poses_bounds.npy is object"),
+    (lambda clip: (clip / "poses_bounds.npy").write_bytes(pickle.dumps(poses_bounds())),
+     "poses_bounds.npy is not a readable npy file"),
+    (torn_poses, "poses_bounds.npy claims an impossible size"),
+    (lambda clip: posed(clip, poses_bounds(FRAMES - 2)),
+     "poses_bounds.npy holds 10 poses but .*images 12 pictures; there must be one pose"),
+    (lambda clip: posed(clip, poses_bounds() * np.nan),
+     "poses_bounds.npy holds no poses, or values that are not finite"),
+    (lambda clip: posed(clip, changed(EVERY, [4, 9], 0, 2)),
+     "poses_bounds.npy is for 320x256 px but the pictures are 160x128; scale"),
+    (lambda clip: posed(clip, changed(EVERY, 14, 0.004)),
+     "poses_bounds.npy: camera: fx = 0.004 px is not plausible"),
+    (lambda clip: posed(clip, changed(np.s_[3:], 14, 0, 2)),
+     "poses_bounds.npy: size and focal length must be the same for all frames"),
+    (lambda clip: posed(clip, changed(6, 1, 0.5)),
+     "poses_bounds.npy: the pose of frame 6 is not a rotation and a translation"),
+]  # fmt: skip
 
 
-def nan_poses(clip: Path) -> None:
-    np.save(clip / "poses_bounds.npy", poses_bounds() * np.nan)
-
-
-def poses_for_another_size(clip: Path) -> None:
-    table = poses_bounds()
-    table[:, 4], table[:, 9] = 2 * HEIGHT, 2 * WIDTH
-    np.save(clip / "poses_bounds.npy", table)
-
-
-def focal_length_in_metres(clip: Path) -> None:
-    table = poses_bounds()
-    table[:, 14] = 0.004
-    np.save(clip / "poses_bounds.npy", table)
-
-
-def zoom(clip: Path) -> None:
-    table = poses_bounds()
-    table[3:, 14] *= 2
-    np.save(clip / "poses_bounds.npy", table)
-
-
-def sheared_pose(clip: Path) -> None:
-    table = poses_bounds()
-    table[6, 1] = 0.5
-    np.save(clip / "poses_bounds.npy", table)
-
-
-@pytest.mark.parametrize(
-    ("mistake", "message"),
-    [
-        (no_masks, "masks does not exist; check the path"),
-        (one_mask_less, "images holds 12 pictures but .*masks holds 11"),
-        (one_depth_less, "images holds 12 pictures but .*depth holds 11"),
-        (label_masks, "masks/000000.png: no value is above 1; a mask holds 0 and 255, scale it"),
-        (small_mask, "masks/000000.png is 160x126 px but .*images/000000.png is 160x128"),
-        (small_depth, "depth/frame-0.png is 156x128 px but the pictures are 160x128"),
-        (coloured_depth, "depth/frame-0.png has 3 channels; a depth picture is a grey PNG of 8 or 16 bit"),
-        (depth_in_micrometres, r"frame-0.png: the median depth would be \d+ m, .*set source.depth_unit"),
-        (no_poses, "poses_bounds.npy does not exist; check the path"),
-        (poses_of_wrong_shape, r"poses_bounds.npy is float64 \[12, 12\], wanted numbers \[any, 17\]"),
-        (pickled_poses, "poses_bounds.npy is object"),
-        (pickle_as_npy, "poses_bounds.npy is not a readable npy file"),
-        (torn_poses, "poses_bounds.npy claims an impossible size"),
-        (fewer_poses, "poses_bounds.npy holds 10 poses but .*images 12 pictures; there must be one pose"),
-        (nan_poses, "poses_bounds.npy holds no poses, or values that are not finite"),
-        (poses_for_another_size, "poses_bounds.npy is for 320x256 px but the pictures are 160x128; scale"),
-        (focal_length_in_metres, "poses_bounds.npy: camera: fx = 0.004 px is not plausible"),
-        (zoom, "poses_bounds.npy: size and focal length must be the same for all frames"),
-        (sheared_pose, "poses_bounds.npy: the pose of frame 6 is not a rotation and a translation"),
-    ],
-    ids=lambda value: value.__name__ if callable(value) else "",
-)
-def test_mistakes_are_named_with_their_fix(clip: Path, mistake: Callable[[Path], None], message: str) -> None:
+@pytest.mark.parametrize(("mistake", "message"), MISTAKES)
+def test_mistakes_are_named_with_their_fix(
+    clip: Path, mistake: Callable[[Path], object], message: str
+) -> None:
     mistake(clip)
     with pytest.raises(SagsError, match=message) as caught:
         open_source(load_launch(clip).source)
@@ -361,9 +314,7 @@ def test_the_pipeline_takes_the_given_depth_instead_of_stereo(clip: Path) -> Non
 
 def test_a_clip_is_measured_by_its_path_alone(clip: Path) -> None:
     command = ["eval", str(clip), "--pace", "step", "--iterations", "2", "--paper-psnr", "--json"]
-    result = CliRunner().invoke(main, command)
-    assert result.exit_code == 0, result.output
-    figures = json.loads(result.stdout, parse_constant=lambda name: pytest.fail(f"{name} is no figure"))
+    figures = figures_of(*command)
     assert figures["session"] == "pulling_soft_tissues"
     # The literature's test split: frames 1 and 9.
     assert [figures[key] for key in ("frames", "processed", "held_out", "dropped")] == [12, 10, 2, 0]
@@ -382,9 +333,7 @@ def test_it_is_measured_by_its_own_protocol(clip: Path) -> None:
     """Held out are frames 1 and 9. Pixels masked black in both pictures count, which by arithmetic adds the
     share of the tissue to the PSNR."""
     arguments = ["eval", "--protocol", "endonerf", str(clip), "--iterations", "2", "--json"]
-    result = CliRunner().invoke(main, arguments)
-    assert result.exit_code == 0, result.output
-    found = json.loads(result.stdout)
+    found = figures_of(*arguments)
     assert found["held_out"] == 2
     shares = [np.mean(instrument(number) < 128) for number in (1, 9)]
     gained = found["causal"]["paper_psnr"] - found["causal"]["psnr"]

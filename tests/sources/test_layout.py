@@ -238,16 +238,3 @@ def test_two_videos_are_cropped_alike(tmp_path: Path) -> None:
     frames, _ = played(config)
     for found, expected in zip(frames[1], eyes[1], strict=True):
         assert np.abs(found.astype(int) - expected[4:28, 8:40][::-1, ::-1]).max() <= NEAR
-
-
-def test_a_video_that_cannot_be_split_is_refused(tmp_path: Path) -> None:
-    write_video(tmp_path / "left.avi", movie(2)[:, 0])
-    geometry = GeometryConfig(layout="side_by_side", crop=(0, 0, 64, 48))
-    with pytest.raises(UsageError, match="leaves the picture"):
-        Replay(VideosSource(left=tmp_path / "left.avi", geometry=geometry))
-    with pytest.raises(ValidationError, match="leave right out"):
-        VideosSource(
-            left=tmp_path / "left.avi",
-            right=tmp_path / "left.avi",
-            geometry=GeometryConfig(layout="over_under"),
-        )

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -15,7 +11,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from command_line import START_SECONDS, sags
+from command_line import sags, start, stopped, wait_for
 from recorded_plane import by_topic, record_plane
 from synthetic import HEIGHT, WIDTH, plane_result
 from waiting import until
@@ -30,11 +26,9 @@ from sags_node.messaging.publisher import Publisher
 from sags_node.messaging.received import ReceivedCloud, ReceivedImage
 from sags_node.messaging.stream import listen
 from sags_node.messaging.subscriber import Subscriber
-from sags_node.overlay.run import Options as OverlayOptions
-from sags_node.overlay.run import run_overlay
+from sags_node.overlay.run import OverlayOptions, run_overlay
 from sags_node.recording.info import bag_info
-from sags_node.recording.player import Options as PlayOptions
-from sags_node.recording.player import Player
+from sags_node.recording.player import Player, PlayOptions
 
 pytestmark = pytest.mark.live
 PHASE = 24  # times that a clock is told before the player is paused, and goes on
@@ -201,17 +195,10 @@ def test_without_being_asked_there_is_no_clock(plane_bag: Path, tmp_path: Path) 
 
 
 def test_the_clock_on_the_command_line(plane_bag: Path, tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "sags_node", "bag", "play", str(plane_bag), "--loop", "--clock"]
-    command += ["--endpoint", "tcp://127.0.0.1:*"]
-    environment = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)}
-    with subprocess.Popen(
-        command, env=environment, stdin=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    ) as process:
-        try:
-            until((tmp_path / "sags/sags.json").exists, START_SECONDS)
-            figures = topic_hz("clock", NodeAddress(run_dir=tmp_path / "sags"), 1.5)
-        finally:
-            process.send_signal(signal.SIGINT)
-            assert process.wait(30) == 0
-    assert figures["window"] >= 2
+    command = ["bag", "play", plane_bag, "--loop", "--clock", "--endpoint", "tcp://127.0.0.1:*"]
+    process = start(command, XDG_RUNTIME_DIR=tmp_path)
+    wait_for(process, (tmp_path / "sags/sags.json").exists)
+    figures = topic_hz("clock", NodeAddress(run_dir=tmp_path / "sags"), 1.5)
+    stopped(process)
+    assert process.returncode == 0 and figures["window"] >= 2
     assert sags("bag", "play", plane_bag, "--clock", "0").exit_code == 2

@@ -34,23 +34,8 @@ def dds(session: Path, seconds: float, *settings: str) -> list[object]:
     return stereo_sender("dds", DOMAIN, session, seconds, *settings)
 
 
-def config(suffix: str = "") -> Ros2Source:
-    return Ros2Source(
-        domain=DOMAIN, left=f"stereo/left/image_raw{suffix}", right=f"/stereo/right/image_raw{suffix}"
-    )
-
-
-@pytest.mark.parametrize("suffix", ["", "/compressed"])
-def test_no_pair_is_mismatched_and_nothing_is_lost_unseen(phantom_session: Path, suffix: str) -> None:
-    settings = ("jpeg=1", "rate=15") if suffix else ()
-    source = RosCameras(config(suffix), SIZE)
-    with Taker(source) as taker, sending(dds(phantom_session, 60, *settings)):
-        due = 60
-        until(lambda: len(taker.numbers) >= due)
-    assert taker.mismatched == 0
-    numbers = [left for left, _ in taker.numbers]
-    assert numbers == sorted(set(numbers))
-    assert taker.newest is not None and taker.newest.left.shape == (1024, 1280, 3)
+def config() -> Ros2Source:
+    return Ros2Source(domain=DOMAIN, left="stereo/left/image_raw", right="/stereo/right/image_raw")
 
 
 def test_the_cameras_calibration_is_taken(phantom_session: Path) -> None:

@@ -13,13 +13,12 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from command_line import figures_of
 
-from sags_node.cli.main import main
 from sags_node.config import schema as cfg
 from sags_node.config.launch_file import load_launch
 from sags_node.errors import SagsError, UsageError
-from sags_node.evaluation.measure import Options
+from sags_node.evaluation.measure import MeasureOptions
 from sags_node.evaluation.session import evaluate
 from sags_node.geometry import invert, project, unproject
 from sags_node.pipeline.session import open_session
@@ -323,7 +322,7 @@ def test_a_folder_is_known_by_its_files(keyframe: Path) -> None:
 
 
 def test_a_keyframe_is_measured_by_its_path_alone(keyframe: Path) -> None:
-    figures = evaluate(keyframe, options=Options(hold_out=4, every=1), iterations=2).summary
+    figures = evaluate(keyframe, options=MeasureOptions(hold_out=4, every=1), iterations=2).summary
     assert [figures[key] for key in ("session", "processed", "held_out")] == ["keyframe_2", 4, 2]
     assert figures["settings"]["depth_reference"] == "structured_light"
     assert figures["depth"]["median_mm"] < 2 and figures["measured_depth"]["median_mm"] < 2  # one pixel: 6 mm
@@ -332,9 +331,7 @@ def test_a_keyframe_is_measured_by_its_path_alone(keyframe: Path) -> None:
 
 def test_a_keyframe_is_measured_by_its_own_protocol(keyframe: Path) -> None:
     arguments = ["eval", "--protocol", "scared", str(keyframe), "--iterations", "2", "--json"]
-    result = CliRunner().invoke(main, arguments)
-    assert result.exit_code == 0, result.output
-    found = json.loads(result.stdout)
+    found = figures_of(*arguments)
     assert found["measured"]["frames"] == found["model"]["frames"] == 6
     assert found["measured"]["mae_mm"] < 2 and found["model"]["mae_mm"] < 3  # one pixel: 6 mm
     assert 0.5 < found["measured"]["given"] <= 1
@@ -355,16 +352,11 @@ def replaced(name: str, data: bytes) -> Callable[[Path], None]:
     return replace
 
 
-def no_calibration(keyframe: Path) -> None:
-    (keyframe / "endoscope_calibration.yaml").unlink()
-
-
-def calibration_that_is_none(keyframe: Path) -> None:
-    (keyframe / "endoscope_calibration.yaml").write_text("hello")
-
-
-def no_video(keyframe: Path) -> None:
-    (keyframe / "data/rgb.mp4").unlink()
+def written(name: str, content: bytes | None) -> Callable[[Path], None]:
+    """That file; None: there is none."""
+    return lambda keyframe: (
+        (keyframe / name).unlink() if content is None else (keyframe / name).write_bytes(content) and None
+    )
 
 
 def torn_archive(keyframe: Path) -> None:
@@ -372,14 +364,7 @@ def torn_archive(keyframe: Path) -> None:
     file.write_bytes(file.read_bytes()[:-300])
 
 
-def no_archive(keyframe: Path) -> None:
-    (keyframe / "data/frame_data.tar.gz").write_bytes(b"hello")
-
-
-def empty_archive(keyframe: Path) -> None:
-    pack(keyframe / "data/frame_data.tar.gz", {})
-
-
+CALIBRATION, VIDEO, ARCHIVE = "endoscope_calibration.yaml", "data/rgb.mp4", "data/frame_data.tar.gz"
 POSE = "data/frame_data/frame_data000001.json"
 SHEARED = np.eye(4) + np.eye(4, k=1)
 
@@ -387,8 +372,8 @@ SHEARED = np.eye(4) + np.eye(4, k=1)
 @pytest.mark.parametrize(
     ("mistake", "message"),
     [
-        (no_calibration, r"cannot read calibration .*endoscope_calibration\.yaml: No such file"),
-        (calibration_that_is_none, r"calibration\.yaml is not a YAML or XML file as OpenCV writes it"),
+        (written(CALIBRATION, None), r"cannot read calibration .*endoscope_calibration\.yaml: No such file"),
+        (written(CALIBRATION, b"hello"), r"calibration\.yaml is not a YAML or XML file as OpenCV writes it"),
         (calibration(M2=None), r"endoscope_calibration\.yaml: M2 is not a matrix of 9 numbers"),
         (calibration(D1=np.zeros(8)), "D1 is not a matrix of 4 or 5 numbers"),
         (calibration(R=np.full((3, 3), np.nan)), "R is not a matrix of 9 numbers"),
@@ -399,10 +384,16 @@ SHEARED = np.eye(4) + np.eye(4, k=1)
         ),
         (calibration(T=-T), "the eyes are exchanged"),
         (calibration(M1=np.diag([9e4, 151, 1.0])), "M1: fx = 90000 px is not plausible"),
-        (no_video, "holds neither data/rgb.mp4 nor left_rectified/ and right_rectified/"),
+        (written(VIDEO, None), "holds neither data/rgb.mp4 nor left_rectified/ and right_rectified/"),
         (torn_archive, r"frame_data\.tar\.gz is cut off or damaged .*download it again"),
-        (no_archive, r"frame_data\.tar\.gz is not a readable tar\.gz: .*; unpack or download it again"),
-        (empty_archive, "data/frame_data holds no frame_data000000.json; unpack it again"),
+        (
+            written(ARCHIVE, b"hello"),
+            r"frame_data\.tar\.gz is not a readable tar\.gz: .*; unpack or download it again",
+        ),
+        (
+            lambda keyframe: pack(keyframe / ARCHIVE, {}),
+            "data/frame_data holds no frame_data000000.json; unpack it again",
+        ),
         (replaced(POSE, b"{"), "data/frame_data 1: no JSON with a camera-pose of numbers"),
         (replaced(POSE, b'{"camera-pose": "here"}'), "data/frame_data 1: no JSON with a camera-pose"),
         (replaced(POSE, b'{"camera-pose": [[1, 0], [0, 1]]}'), "data/frame_data 1: camera-pose is not a rot"),
@@ -410,10 +401,7 @@ SHEARED = np.eye(4) + np.eye(4, k=1)
             replaced(POSE, json.dumps({"camera-pose": SHEARED.tolist()}).encode()),
             "data/frame_data 1: camera-pose is not a rotation and a translation",
         ),
-        (
-            replaced(POSE, bytes(2**20 + 1)),
-            r"frame_data000001\.json: it has 1048577 bytes, 1048576 at most",
-        ),
+        (replaced(POSE, bytes(2**20 + 1)), r"frame_data000001\.json: it has 1048577 bytes, 1048576 at most"),
     ],
     ids=lambda value: getattr(value, "__name__", ""),
 )

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import io
+import shutil
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from bag_files import ROS1, ROS2, stereo_rows, write_rosbag1, write_rosbag2
 from numbered_pictures import HEIGHT, WIDTH, numbers, picture, recordings, write_png, write_video
+from places import SESSION
 
 from sags_node.config import schema as cfg
 from sags_node.errors import SagsError, UsageError
+from sags_node.pipeline.session import open_session
 from sags_node.sources.replay import Recording
 from sags_node.sources.source import open_source
 from sags_node.types import StereoFrame
@@ -23,50 +28,31 @@ HALVES = cfg.GeometryConfig(layout="side_by_side")
 # ---- at opening ------------------------------------------------------------------------------------------
 
 
-def no_left(folder: Path) -> Recording:
-    return cfg.FoldersSource(left=folder / "nowhere", right=folder / "r")
+def folders_of(folder: Path, left: str = "l", right: str = "r", **said: Any) -> Recording:
+    return cfg.FoldersSource(left=folder / left, right=folder / right, **said)
 
 
-def left_is_a_file(folder: Path) -> Recording:
-    return cfg.FoldersSource(left=folder / "l/000.png", right=folder / "r")
+def video(folder: Path, left: str, right: str | None = None) -> Recording:
+    if right is None:
+        return cfg.VideosSource(left=folder / left, geometry=HALVES)
+    return cfg.VideosSource(left=folder / left, right=folder / right)
 
 
-def empty_folder(folder: Path) -> Recording:
-    (folder / "empty").mkdir()
-    return cfg.FoldersSource(left=folder / "l", right=folder / "empty")
+def panes(folder: Path, left: cfg.Box, right: cfg.Box, tools: cfg.Box | None = None) -> Recording:
+    boxes = cfg.GeometryConfig(layout="panes", crop=left, crop_right=right)
+    return cfg.VideosSource(left=folder / "lr.avi", geometry=boxes, tools=tools)
 
 
-def fewer_right(folder: Path) -> Recording:
-    (folder / "r/003.png").unlink()
-    return cfg.FoldersSource(left=folder / "l", right=folder / "r")
+def posed(folder: Path, **arrays: np.ndarray) -> Recording:
+    np.savez(folder / "poses.npz", **arrays)
+    return folders_of(folder, poses=folder / "poses.npz")
 
 
-def fewer_tools(folder: Path) -> Recording:
-    write_png(folder / "tools/000.png", picture(0))
-    return cfg.FoldersSource(left=folder / "l", right=folder / "r", tools=folder / "tools")
-
-
-def eyes_of_two_sizes(folder: Path) -> Recording:
-    write_png(folder / "r/000.png", np.zeros((HEIGHT, WIDTH + 1, 3), np.uint8))
-    return cfg.FoldersSource(left=folder / "l", right=folder / "r")
-
-
-def damaged_first(folder: Path) -> Recording:
-    (folder / "l/000.png").write_bytes(b"not a picture")
-    return cfg.FoldersSource(left=folder / "l", right=folder / "r")
-
-
-def start_behind_end(folder: Path) -> Recording:
-    return cfg.FoldersSource(left=folder / "l", right=folder / "r", start=60)
-
-
-def no_video(folder: Path) -> Recording:
-    return cfg.VideosSource(left=folder / "none.mp4", geometry=HALVES)
-
-
-def text_as_video(folder: Path) -> Recording:
-    (folder / "text.mp4").write_text("hello")
-    return cfg.VideosSource(left=folder / "text.mp4", geometry=HALVES)
+def torn_poses(folder: Path) -> Recording:
+    config = posed(folder, T_world_cam=np.tile(np.eye(4), (8, 1, 1)))
+    data = (folder / "poses.npz").read_bytes()
+    (folder / "poses.npz").write_bytes(data[: len(data) // 2])
+    return config
 
 
 def odd_width(folder: Path) -> Recording:
@@ -76,105 +62,59 @@ def odd_width(folder: Path) -> Recording:
     assert writer.isOpened()
     writer.write(np.zeros((24, 33, 3), np.uint8))
     writer.release()
-    return cfg.VideosSource(left=folder / "odd.avi", geometry=HALVES)
+    return video(folder, "odd.avi")
 
 
-def panes(folder: Path, left: cfg.Box, right: cfg.Box, tools: cfg.Box | None = None) -> Recording:
-    boxes = cfg.GeometryConfig(layout="panes", crop=left, crop_right=right)
-    return cfg.VideosSource(left=folder / "lr.avi", geometry=boxes, tools=tools)
+# What is wrong, made in a folder of `recordings`; what is said.
+MISTAKES: list[tuple[Callable[[Path], Recording], str]] = [
+    (lambda at: folders_of(at, "nowhere"), "nowhere does not exist; check the path"),
+    (lambda at: folders_of(at, "l/000.png"), "000.png is not a folder; check the path"),
+    (lambda at: (at / "empty").mkdir() or folders_of(at, right="empty"), "empty holds no picture"),
+    (lambda at: (at / "r/003.png").unlink() or folders_of(at),
+     "l holds 8 pictures but .*r holds 7; pairing goes by sorted name"),
+    (lambda at: write_png(at / "tools/000.png", picture(0)) or folders_of(at, tools=at / "tools"),
+     "l holds 8 pictures but .*tools holds 1; pairing"),
+    (lambda at: folders_of(at, start=60), "source.start 60.0 s lies behind the recording's end at 0.27 s"),
+    (lambda at: video(at, "none.mp4"), "none.mp4 does not exist; check the path"),
+    (lambda at: (at / "text.mp4").write_text("hello") and video(at, "text.mp4"),
+     "text.mp4 cannot be read as a video"),
+    (odd_width, "odd.avi is 33 px wide, which is odd"),
+    (lambda at: panes(at, (0, 0, 32, 24), (40, 0, 32, 24)),
+     r"the box \[40, 0, 32, 24\] .* leaves the picture: an eye of .*lr.avi is 64x24 px"),
+    (lambda at: panes(at, (0, 0, 32, 24), (32, 0, 16, 24)),
+     "source.geometry.crop is 32x24 px but crop_right 16x24; both eyes need one"),
+    (lambda at: panes(at, (0, 0, 32, 24), (32, 0, 32, 24), (0, 0, 16, 24)),
+     "source.tools is 16x24 px but source.geometry.crop 32x24; all panes need"),
+    (lambda at: video(at, "l.avi", "lr.avi"),
+     "l.avi has 32x24 px but .*lr.avi has 64x24; they are not one stereo pair"),
+    (lambda at: write_video(at / "slow.avi", [picture(0)], rate=10) and video(at, "l.avi", "slow.avi"),
+     r"l.avi has 25.0 frames/s but .*slow.avi has 10.0;"),
+    (lambda at: folders_of(at, poses=at / "poses.npz"), "poses.npz does not exist; check the path"),
+    (lambda at: posed(at, T_world_cam=np.eye(4)),
+     r"'T_world_cam' is float64 \[4, 4\], wanted numbers \[any, 4, 4\]"),
+    (lambda at: posed(at, poses=np.eye(4)[None]), "poses.npz holds no array 'T_world_cam'"),
+    (lambda at: posed(at, T_world_cam=np.full((8, 4, 4), {}, dtype=object)), "'T_world_cam' is object"),
+    (torn_poses, "poses.npz is not a readable npz file"),
+    (lambda at: write_png(at / "depth/first.png", picture(0))
+     or folders_of(at, reference=cfg.ReferenceConfig(depth=at / "depth")),
+     "first.png: reference depth files are named by frame number"),
+]  # fmt: skip
+DAMAGED: list[tuple[Callable[[Path], Recording], str]] = [
+    (lambda at: write_png(at / "r/000.png", np.zeros((HEIGHT, WIDTH + 1, 3), np.uint8)) or folders_of(at),
+     "r/000.png is 33x24 px but .*l/000.png is 32x24; all pictures must have one size"),
+    (lambda at: (at / "l/000.png").write_bytes(b"not a picture") and folders_of(at),
+     "l/000.png is damaged or cut off"),
+]  # fmt: skip
 
 
-def crop_outside(folder: Path) -> Recording:
-    return panes(folder, (0, 0, 32, 24), (40, 0, 32, 24))
-
-
-def crops_of_two_sizes(folder: Path) -> Recording:
-    return panes(folder, (0, 0, 32, 24), (32, 0, 16, 24))
-
-
-def tools_of_another_size(folder: Path) -> Recording:
-    return panes(folder, (0, 0, 32, 24), (32, 0, 32, 24), (0, 0, 16, 24))
-
-
-def videos_of_two_sizes(folder: Path) -> Recording:
-    return cfg.VideosSource(left=folder / "l.avi", right=folder / "lr.avi")
-
-
-def videos_of_two_rates(folder: Path) -> Recording:
-    write_video(folder / "slow.avi", [picture(0)], rate=10)
-    return cfg.VideosSource(left=folder / "l.avi", right=folder / "slow.avi")
-
-
-def no_poses(folder: Path) -> Recording:
-    return cfg.FoldersSource(left=folder / "l", right=folder / "r", poses=folder / "poses.npz")
-
-
-def poses_of_wrong_shape(folder: Path) -> Recording:
-    np.savez(folder / "poses.npz", T_world_cam=np.eye(4))
-    return no_poses(folder)
-
-
-def poses_of_other_name(folder: Path) -> Recording:
-    np.savez(folder / "poses.npz", poses=np.eye(4)[None])
-    return no_poses(folder)
-
-
-def pickled_poses(folder: Path) -> Recording:
-    np.savez(folder / "poses.npz", T_world_cam=np.full((8, 4, 4), {}, dtype=object))
-    return no_poses(folder)
-
-
-def torn_poses(folder: Path) -> Recording:
-    np.savez(folder / "poses.npz", T_world_cam=np.tile(np.eye(4), (8, 1, 1)))
-    data = (folder / "poses.npz").read_bytes()
-    (folder / "poses.npz").write_bytes(data[: len(data) // 2])
-    return no_poses(folder)
-
-
-def depth_without_numbers(folder: Path) -> Recording:
-    write_png(folder / "depth/first.png", picture(0))
-    truth = cfg.ReferenceConfig(depth=folder / "depth")
-    return cfg.FoldersSource(left=folder / "l", right=folder / "r", reference=truth)
-
-
-@pytest.mark.parametrize(
-    ("mistake", "message"),
-    [
-        (no_left, "nowhere does not exist; check the path"),
-        (left_is_a_file, "000.png is not a folder; check the path"),
-        (empty_folder, "empty holds no picture"),
-        (fewer_right, "l holds 8 pictures but .*r holds 7; pairing goes by sorted name"),
-        (fewer_tools, "l holds 8 pictures but .*tools holds 1; pairing"),
-        (
-            eyes_of_two_sizes,
-            "r/000.png is 33x24 px but .*l/000.png is 32x24; all pictures must have one size",
-        ),
-        (damaged_first, "l/000.png is damaged or cut off"),
-        (start_behind_end, "source.start 60.0 s lies behind the recording's end at 0.27 s"),
-        (no_video, "none.mp4 does not exist; check the path"),
-        (text_as_video, "text.mp4 cannot be read as a video"),
-        (odd_width, "odd.avi is 33 px wide, which is odd"),
-        (crop_outside, r"the box \[40, 0, 32, 24\] .* leaves the picture: an eye of .*lr.avi is 64x24 px"),
-        (crops_of_two_sizes, "source.geometry.crop is 32x24 px but crop_right 16x24; both eyes need one"),
-        (tools_of_another_size, "source.tools is 16x24 px but source.geometry.crop 32x24; all panes need"),
-        (videos_of_two_sizes, "l.avi has 32x24 px but .*lr.avi has 64x24; they are not one stereo pair"),
-        (videos_of_two_rates, r"l.avi has 25.0 frames/s but .*slow.avi has 10.0;"),
-        (no_poses, "poses.npz does not exist; check the path"),
-        (poses_of_wrong_shape, r"'T_world_cam' is float64 \[4, 4\], wanted numbers \[any, 4, 4\]"),
-        (poses_of_other_name, "poses.npz holds no array 'T_world_cam'"),
-        (pickled_poses, "'T_world_cam' is object"),
-        (torn_poses, "poses.npz is not a readable npz file"),
-        (depth_without_numbers, "first.png: reference depth files are named by frame number"),
-    ],
-    ids=lambda value: value.__name__ if callable(value) else "",
-)
+@pytest.mark.parametrize(("mistake", "message"), MISTAKES + DAMAGED)
 def test_mistakes_at_opening(tmp_path: Path, mistake: Callable[[Path], Recording], message: str) -> None:
+    """All but damaged picture data are mistakes of the request."""
     recordings(tmp_path)
     with pytest.raises(SagsError, match=message) as caught:
         open_source(mistake(tmp_path))
     assert "\n" not in str(caught.value)
-    # Everything but damaged picture data is a mistake of the request.
-    assert isinstance(caught.value, UsageError) or mistake in (damaged_first, eyes_of_two_sizes)
+    assert isinstance(caught.value, UsageError) or (mistake, message) in DAMAGED
 
 
 def test_impossible_array_size_is_refused_before_memory_is_taken(tmp_path: Path) -> None:
@@ -186,7 +126,7 @@ def test_impossible_array_size_is_refused_before_memory_is_taken(tmp_path: Path)
     with zipfile.ZipFile(tmp_path / "poses.npz", "w") as archive:
         archive.writestr("T_world_cam.npy", header.getvalue() + bytes(128))
     with pytest.raises(UsageError, match="claims an impossible size"):
-        open_source(no_poses(tmp_path))
+        open_source(folders_of(tmp_path, poses=tmp_path / "poses.npz"))
 
 
 @pytest.mark.fault("file: pictures of both eyes were deleted before it is played")
@@ -251,3 +191,118 @@ def test_too_few_poses_say_for_which_frame(folders: cfg.FoldersSource, tmp_path:
     frames, message = frames_until_error(folders.model_copy(update={"poses": tmp_path / "poses.npz"}))
     assert len(frames) == 4
     assert "poses.npz holds 4 poses, none for frame 4" in message
+
+
+# ---- files that are deleted, cut off, replaced or still being written while they are played ------------
+
+
+AT = 3  # frames are taken before the file changes
+COUNT = 150  # frames of a recording that is too long to be in a buffer
+
+
+def played(config: Recording, change: Callable[[], object]) -> tuple[list[StereoFrame], str]:
+    """The frames of a recording that changes while it is played, and the error that ends it, if one does."""
+    frames = []
+    with open_source(config) as source:
+        try:
+            for frame in source:
+                frames.append(frame)
+                if len(frames) == AT:
+                    change()
+        except SagsError as error:
+            assert "\n" not in str(error)
+            return frames, str(error)
+    return frames, ""
+
+
+@pytest.mark.fault("file: a picture is deleted while it is played")
+def test_a_picture_that_is_deleted_is_named(tmp_path: Path) -> None:
+    config = recordings(tmp_path)["folders"]
+    frames, error = played(config, (tmp_path / "r/006.png").unlink)
+    assert numbers(frames) == list(range(len(frames))) and AT <= len(frames) <= 6
+    assert "r/006.png" in error
+
+
+@pytest.mark.fault("file: a folder of pictures grows while it is played")
+def test_pictures_that_come_later_are_not_played(tmp_path: Path) -> None:
+    config = recordings(tmp_path)["folders"]
+
+    def grow() -> None:
+        for eye, name in enumerate(("l", "r")):
+            write_png(tmp_path / f"{name}/008.png", picture(8, eye))
+
+    frames, error = played(config, grow)
+    assert numbers(frames) == list(range(8)) and error == ""
+
+
+@pytest.mark.fault("file: a video is deleted while it is played")
+def test_a_video_that_is_deleted_is_played_to_its_end(tmp_path: Path) -> None:
+    config = recordings(tmp_path)["videos"]
+    frames, error = played(config, (tmp_path / "r.avi").unlink)
+    assert numbers(frames) == list(range(8)) and error == ""
+
+
+@pytest.mark.fault("file: a video is cut off while it is played")
+def test_a_video_that_is_cut_off_is_named(tmp_path: Path) -> None:
+    """Two megabytes of noise: more than a reader reads ahead."""
+    rng = np.random.default_rng(0)
+    eyes = [[rng.integers(0, 255, (128, 160, 3), np.uint8) for _ in range(COUNT)] for _ in range(2)]
+    left, right = (
+        write_video(tmp_path / f"{name}.avi", shown) for name, shown in zip("lr", eyes, strict=True)
+    )
+    config = cfg.VideosSource(left=left, right=right, pace="step")
+    whole, _ = played(config, lambda: None)
+    frames, error = played(config, lambda: cut(right))
+    assert AT <= len(frames) < len(whole) == COUNT and f"r.avi ends at frame {len(frames)}" in error
+    for frame, true in zip(frames[:-1], whole, strict=False):
+        assert np.array_equal(frame.right, true.right)
+
+
+@pytest.mark.fault("file: a ROS bag is cut off while it is played")
+@pytest.mark.parametrize("kind", ["mcap", "ros1"])
+def test_a_bag_that_is_cut_off_is_named(kind: str, tmp_path: Path) -> None:
+    """Four megabytes: more than a chunk, which is read at once."""
+    if kind == "mcap":
+        path = write_rosbag2(tmp_path / "bag", stereo_rows(ROS2, COUNT)) / "bag.mcap"
+    else:
+        path = write_rosbag1(tmp_path / "a.bag", stereo_rows(ROS1, COUNT))
+    config = cfg.BagSource(path=path, pace="step")
+    whole, _ = played(config, lambda: None)
+    frames, error = played(config, lambda: cut(path))
+    assert AT <= len(frames) < len(whole) == COUNT and f"{path.name} is damaged" in error
+    for frame, true in zip(frames, whole, strict=False):
+        assert np.array_equal(frame.left, true.left) and np.array_equal(frame.right, true.right)
+
+
+def cut(file: Path) -> None:
+    """To nothing: what a reader has in its buffer is at most what it has read ahead."""
+    with file.open("r+b") as opened:
+        opened.truncate(0)
+
+
+@pytest.mark.fault("calibration: deleted or overwritten while it is used")
+@pytest.mark.fault("launch file: broken while it is used")
+def test_what_was_read_at_the_start_may_change(tmp_path: Path) -> None:
+    folder = tmp_path / "session"
+    shutil.copytree(SESSION, folder)
+    overrides = ["source.pace:=step", "source.frames:=6"]
+    with open_session(SESSION, overrides).source as source:
+        true = list(source)
+    session = open_session(folder, overrides)
+    rig, config = session.rig, session.config.model_copy(deep=True)
+    frames = []
+    with session.source as source:
+        for frame in source:
+            frames.append(frame)
+            if len(frames) == AT:
+                (folder / "launch.yaml").write_text("source: [")
+                (folder / "calib/left.yaml").write_bytes(b"\xff")
+                (folder / "calib/right.yaml").unlink()
+    assert len(frames) == 6 and (session.rig, session.config) == (rig, config)
+    for frame, one in zip(frames, true, strict=True):
+        assert np.array_equal(frame.left, one.left) and np.array_equal(frame.right, one.right)
+    with pytest.raises(SagsError, match=r"launch\.yaml"):
+        open_session(folder)
+    shutil.copy(SESSION / "launch.yaml", folder)
+    with pytest.raises(SagsError, match=r"left\.yaml"):
+        open_session(folder)

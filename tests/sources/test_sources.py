@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import json
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from bag_files import MS, START, picture
+from dvrk_files import frame_record, write_session
 from numbered_pictures import HEIGHT, WIDTH, numbers, recordings
 
+from sags_node.cli.launching import split
 from sags_node.config import schema as cfg
+from sags_node.config.launch_file import load_launch
+from sags_node.config.schema import DvrkSource, LaunchConfig
+from sags_node.errors import UsageError
 from sags_node.sources.replay import Recording, Replay
 from sags_node.sources.source import open_source
 from sags_node.types import StereoFrame
@@ -78,14 +86,6 @@ def test_endless_loop_has_no_frame_count(folders: cfg.FoldersSource) -> None:
                 source.stop()
     assert numbers(seen) == [n % 12 for n in range(30)]
     assert len({frame.frame_id for frame in seen}) == 30
-
-
-def test_step_pace_is_reproducible(folders: cfg.FoldersSource) -> None:
-    def play() -> list[tuple[int, int, bytes]]:
-        with open_source(folders) as source:
-            return [(f.frame_id, f.t_capture_ns, f.left.tobytes()) for f in source]
-
-    assert play() == play()
 
 
 def test_realtime_waits_and_stamps_the_due_moment(folders: cfg.FoldersSource) -> None:
@@ -213,3 +213,117 @@ def test_phantom_session_is_played_as_this_launch_file_asks(
         assert frame.tissue is not None and frame.T_world_cam is not None
         assert frame.reference is not None and frame.reference.depth_kind == "exact"
         assert frame.reference.depth is not None and frame.reference.points is not None
+
+
+# ---- the real recording d4d_pull: colours, depth, instrument masks, and exact seeking ------------------
+
+
+@pytest.fixture(scope="module")
+def folder(data_folder: Path) -> Path:
+    folder = data_folder / "d4d_pull"
+    if not folder.is_dir():
+        pytest.skip(f"recording d4d_pull is not under SAGS_DATA ({data_folder})")
+    return folder
+
+
+def d4d(folder: Path, **playing: object) -> cfg.VideosSource:
+    return cfg.VideosSource(
+        left=folder / "2025_03_06-16_49_40_combined_2x2.mp4",
+        geometry=cfg.GeometryConfig(layout="panes", crop=(0, 0, 675, 540), crop_right=(675, 0, 675, 540)),
+        tools=(675, 540, 675, 540),
+        pace="step",
+        reference=cfg.ReferenceConfig(depth=folder / "depth_mm_x100", depth_kind="stereo_network"),
+    ).model_copy(update=playing)
+
+
+def test_d4d_clip(folder: Path) -> None:
+    overlaps = []
+    with open_source(d4d(folder)) as source:
+        assert source.rate == 30 and source.frame_count == 179
+        for index, frame in enumerate(source):
+            assert frame.frame_id == index
+            assert frame.left.shape == frame.right.shape == (540, 675, 3)
+            assert frame.left[..., 0].mean() > frame.left[..., 1].mean()  # tissue is red: RGB, not BGR
+            assert frame.tissue is not None
+            assert (frame.reference is not None) == (index % 10 == 0)
+            if frame.reference is None:
+                continue
+            assert frame.reference.depth is not None and frame.reference.depth_kind == "stereo_network"
+            known = frame.reference.depth[frame.reference.depth > 0]
+            assert 0.03 < float(np.median(known)) < 0.15  # metres
+            mask = cv2.imread(str(folder / f"toolmask/{index:04d}.png"), cv2.IMREAD_GRAYSCALE)
+            assert mask is not None
+            tools, found = mask > 127, ~frame.tissue
+            overlaps.append((tools & found).sum() / (tools | found).sum())
+    assert index == 178
+    assert len(overlaps) == 18
+    assert np.median(overlaps) >= 0.95 and min(overlaps) >= 0.9
+
+
+def test_d4d_seeks_to_the_exact_frame(folder: Path) -> None:
+    with open_source(d4d(folder, frames=92), references=False) as source:
+        last = list(source)[-1]
+    with open_source(d4d(folder, start=91 / 30, frames=1), references=False) as source:
+        sought = next(iter(source))
+    assert last.frame_id == sought.frame_id == 91
+    assert (last.left == sought.left).all()
+
+
+# ---- dVRK sessions as sources: stamps of the sidecar for the pictures of its video ---------------------
+
+
+@pytest.mark.parametrize("order", ["LR", "RL"])
+def test_a_dvrk_session(order: str, tmp_path: Path) -> None:
+    frames = [frame_record(number) for number in range(8)]
+    frames[3] = frame_record(3, left_source_ns=None)
+    frames[5] = frame_record(5, left_source_ns=None, right_source_ns=None)
+    folder = write_session(tmp_path / "session", frames, order=order)
+    for given in (folder, folder / "stereo.json"):
+        assert isinstance(load_launch(given).source, DvrkSource)
+    with Replay(DvrkSource(path=folder, pace="step")) as source:
+        played = list(source)
+        assert source.rate == pytest.approx(25, rel=0.1)
+    stamps = [((f.t_capture_ns - START) // MS, (f.t_capture_right_ns - START) // MS) for f in played]
+    assert stamps == [(0, 3), (40, 43), (80, 83), (123, 123), (160, 163), (209, 209), (240, 243), (280, 283)]
+    for frame in played:
+        assert frame.right is not None and abs(float(frame.right.mean()) - 200) < 8
+    assert np.abs(played[6].left.astype(int) - picture(6, 0)).mean() < 15
+
+
+def test_a_dvrk_video_with_other_frames_than_its_sidecar(tmp_path: Path) -> None:
+    """The encoder made 25 Hz of frames of which two never came."""
+    frames = [frame_record(number) for number in (0, 1, 2, 5, 6, 7)]
+    folder = write_session(tmp_path / "session", frames)
+    with Replay(DvrkSource(path=folder, pace="step")) as source:
+        stamps = [(frame.t_capture_ns - START) // MS for frame in source]
+    assert stamps == [0, 40, 80, 80, 200, 200, 240, 280]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"type": "dvrk_data:sidecar@1.0.0"}, "is of type 'dvrk_data:sidecar@1.0.0'"),
+        ({"frames": []}, "lists no frames"),
+        ({"frames": [{"cpu": 3}]}, r"not a dvrk_data:video_sidecar@1\.0\.0 file: .*cpu"),
+        ({"frames": [frame_record(0), frame_record(0, left_source_ns=-5)]}, "not a dvrk_data"),
+        ({"frames": [frame_record(n) for n in (0, 1, 2, 4, 3, 5, 6, 7)]}, "frame 4 lies before"),
+        ({"side_by_side": "undefined"}, "set source.side_by_side to LR or RL"),
+        ({"video_file": "../../other.mp4"}, "other.mp4 does not exist"),
+    ],
+)
+def test_a_wrong_sidecar(change: dict[str, Any], said: str, tmp_path: Path) -> None:
+    folder = write_session(tmp_path / "session", [frame_record(number) for number in range(8)])
+    file = folder / "stereo.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), **change}))
+    with pytest.raises(UsageError, match=said):
+        Replay(DvrkSource(path=file))
+
+
+def test_a_session_as_users_give_it(tmp_path: Path) -> None:
+    folder = write_session(tmp_path / "session", [frame_record(number) for number in range(8)])
+    path, overrides = split([str(folder), "source.side_by_side:=RL"])
+    config = load_launch(path, overrides)
+    assert isinstance(config, LaunchConfig) and isinstance(config.source, DvrkSource)
+    assert config.source.side_by_side == "RL"
+    with pytest.raises(UsageError, match="one sidecar of a stereo video is needed, there are: none"):
+        Replay(DvrkSource(path=tmp_path))

@@ -15,7 +15,7 @@ from typing import ClassVar
 import cv2
 import numpy as np
 import pytest
-from waiting import until
+from waiting import repeating, until
 
 from sags_node.config.schema import GeometryConfig, V4l2Source
 from sags_node.errors import SagsError, UsageError
@@ -251,19 +251,13 @@ def test_silent_camera_is_opened_again(plugs: Plugs, caplog: pytest.LogCaptureFi
         plugs.put(0, value=1)
         until(lambda: all(len(cameras) >= 2 for cameras in plugs.opened.values()))
         assert plugs.opened["/dev/left"][0].closed
-        stop = threading.Event()
 
-        def film() -> None:
-            t = 1000.0
-            while not stop.wait(0.02):
-                plugs.put(t, value=2)
-                t += 20
+        def film(number: int) -> None:
+            time.sleep(0.02)
+            plugs.put(1000.0 + 20 * number, value=2)
 
-        filming = threading.Thread(target=film)
-        filming.start()
-        until(lambda: 2 in collector.values())
-        stop.set()
-        filming.join()
+        with repeating(film):
+            until(lambda: 2 in collector.values())
     assert "no new picture for" in caplog.text
 
 

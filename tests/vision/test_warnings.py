@@ -18,7 +18,7 @@ from rich.console import Console
 from synthetic import health, plane_result, publisher, stream
 
 from sags_node.cli.foreground import run_node
-from sags_node.evaluation.measure import FrameRow, Options
+from sags_node.evaluation.measure import FrameRow, MeasureOptions
 from sags_node.evaluation.report import warning_table
 from sags_node.evaluation.spool import RunFacts
 from sags_node.evaluation.summary import summarise
@@ -258,7 +258,7 @@ def test_the_report_says_when_and_what_to_do() -> None:
     table = warning_table(rows)
     assert "5 frames, 3 to 7" in table and "&lt;" + BLACK.text in table and BLACK.code in table
     assert warning_table(rows[:3]) == ""
-    assert summarise("s", rows, Options(hold_out=0), {}, None)["warnings"] == {BLACK.code: 5}
+    assert summarise("s", rows, MeasureOptions(hold_out=0), {}, None)["warnings"] == {BLACK.code: 5}
 
 
 @pytest.mark.live

@@ -71,12 +71,7 @@ def unplug_and_replug() -> dict[str, Any]:
         wait_for(lambda: len(frames) >= before + 3)
         source.stop()
         taking.join(10)
-    return {
-        "vanished": vanished,
-        "before": before,
-        "after": len(frames),
-        "ended": not taking.is_alive(),
-    }
+    return {"vanished": vanished, "before": before, "after": len(frames), "ended": not taking.is_alive()}
 
 
 def wait_for(condition: Callable[[], bool]) -> None:

@@ -27,7 +27,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 HELPERS = ROOT / "tests/helpers"
 sys.path.insert(0, str(HELPERS))
 from small_disk import small_disk  # noqa: E402

@@ -8,10 +8,12 @@ from typing import Any
 
 import pytest
 from command_line import pure_json, refused, sags
+from tiny_archive import TINY_FRAMES
 
 from sags_lab.archive import cluster as cluster_module
+from sags_lab.archive.costs import Cost, of_an_hour
 from sags_lab.archive.manifest import Recording, write_manifest
-from sags_node.evaluation.measure import Options
+from sags_node.evaluation.measure import MeasureOptions
 from sags_node.evaluation.session import evaluate
 from sags_node.kernels.threads import configure_threads
 
@@ -19,10 +21,7 @@ SETTINGS = ("mapping.max_gaussians:=2000", "source.frames:=4")
 
 
 def test_figures_are_those_of_sags_eval(cluster: Any, tiny_session: Path, tmp_path: Path) -> None:
-    recordings = [
-        Recording(str(tiny_session), str(tmp_path)),
-        Recording("nowhere", str(tmp_path)),
-    ]
+    recordings = [Recording(str(tiny_session), str(tmp_path)), Recording("nowhere", str(tmp_path))]
     write_manifest(str(tmp_path / "m.csv"), recordings)
     command = ["archive", "run", tmp_path / "m.csv", "--job", "eval", "--out", tmp_path / "out"]
     command += ["--ray", cluster.address, "--options", "--iterations 1 --hold-out 2 --every 2", *SETTINGS]
@@ -34,7 +33,9 @@ def test_figures_are_those_of_sags_eval(cluster: Any, tiny_session: Path, tmp_pa
     done, poison = (each.id for each in recordings)
     shown = pure_json(sags("archive", "show", tmp_path / "out", done[:10], "--json").stdout)
     try:
-        expected = evaluate(tiny_session, ["engine.threads:=1", *SETTINGS], Options(2, 2), "step", 1).summary
+        expected = evaluate(
+            tiny_session, ["engine.threads:=1", *SETTINGS], MeasureOptions(2, 2), "step", 1
+        ).summary
     finally:
         configure_threads(None)
     for group in ("online", "heldout", "depth", "track", "novel"):
@@ -88,3 +89,27 @@ def test_without_the_extra_the_command_says_how_to_get_it(
     refused(2, "archive", "run", tmp_path / "m.csv", "--job", "eval", "--out", out, said=said)
     refused(2, "archive", "status", out, said=said)
     assert not out.exists()
+
+
+# ---- what an hour of video costs, from two lengths of a recording --------------------------------------
+
+
+def test_a_start_counts_once_and_each_frame_the_same() -> None:
+    """3 s to start and 0.1 s for a frame; an hour at 30 Hz has 108,000 frames."""
+    short, long = (Cost(3 + 0.1 * n, 4 + 0.2 * n, 300.0, 50 + 1000 * n) for n in (30, 120))
+    assert of_an_hour("depth", short, long, 120, 30.0) == {
+        "cpu_s": 10_803,
+        "wall_s": 21_604,
+        "bytes": 108_000_050,
+    }
+    assert of_an_hour("fit", long, long, 120, 30.0)["cpu_s"] == 900 * 15  # so many clips
+
+
+def test_the_command_measures_a_recording(tiny_session: Path) -> None:
+    asked = ("--job", "depth", "--frames", TINY_FRAMES, "--json")
+    rows = pure_json(sags("archive", "costs", tiny_session, "mapping.iterations:=1", *asked).stdout)
+    assert [(row["job"], row["frames"], row["seconds_of_video"]) for row in rows] == [("depth", 6, 0.6)]
+    assert rows[0]["cpu_s"] > 0.1 and rows[0]["peak_mb"] > 50
+    pictures = 2 * 160 * 128 * TINY_FRAMES  # bytes, before they are compressed
+    assert 0 < rows[0]["bytes"] < pictures + 10_000
+    refused(2, "archive", "costs", tiny_session, "--frames", 7, said=("7 frames", "has 6", "--frames"))

@@ -198,7 +198,7 @@ def test_a_killed_driver_and_ctrl_c(cluster: Any, tmp_path: Path, how: signal.Si
     change(recordings[3], waits_for=str(marker))
     recordings = [replace(each, weight=10.0 - number) for number, each in enumerate(recordings)]
     code = DRIVER.format(
-        helpers=str(Path(__file__).parents[1] / "helpers"),
+        helpers=str(Path(__file__).parents[2] / "helpers"),
         out=str(tmp_path / "out"),
         folder=str(tmp_path / "in"),
         address=cluster.address,

@@ -22,7 +22,7 @@ from sags_lab.archive.store import RECORDINGS, Store
 from sags_lab.archive.work import Plan, work
 from sags_node.config.schema import DvrkSource, FoldersSource
 from sags_node.errors import UsageError
-from sags_node.evaluation.measure import Options
+from sags_node.evaluation.measure import MeasureOptions
 from sags_node.evaluation.provenance import revision
 from sags_node.evaluation.session import evaluate
 from sags_node.fitting.clip import play
@@ -139,7 +139,7 @@ def test_the_warm_up_is_played_and_not_counted(tiny_session: Path, tmp_path: Pat
     """What comes after it is what a run of the whole shows of these frames."""
     try:
         whole, part = (
-            evaluate(tiny_session, [*STEPS, f"source.warm_up:={frames}"], Options(0, 2), "step")
+            evaluate(tiny_session, [*STEPS, f"source.warm_up:={frames}"], MeasureOptions(0, 2), "step")
             for frames in (0, 2)
         )
     finally:
@@ -151,7 +151,7 @@ def test_the_warm_up_is_played_and_not_counted(tiny_session: Path, tmp_path: Pat
     assert shown[0] == shown[1]
     asked = ("--pace", "step", "--warm-up", 2, "--hold-out", 0, "--json")
     assert pure_json(sags("eval", tiny_session, *STEPS, *asked).stdout)["online"] == part.summary["online"]
-    cold = evaluate(tiny_session, [*STEPS, "source.start:=0.2"], Options(0, 2), "step")
+    cold = evaluate(tiny_session, [*STEPS, "source.start:=0.2"], MeasureOptions(0, 2), "step")
     configure_threads(None)
     assert cold.rows[0].frame_id == 2
     assert cold.rows[0].figures["online"]["psnr"] != shown[1][0]  # a model that begins there

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from command_line import figures_of
 from places import SESSION
 
 from sags_lab.protocols.d4d_files import d4d_clips, instruments_are_white
@@ -97,9 +98,7 @@ def d4d(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_d4d_end_to_end(d4d: Path) -> None:
-    result = CliRunner().invoke(main, ["eval", "--protocol", "d4d", str(d4d), "--iterations", "2", "--json"])
-    assert result.exit_code == 0, result.output
-    found = json.loads(result.stdout)
+    found = figures_of("eval", "--protocol", "d4d", str(d4d), "--iterations", "2", "--json")
     assert found["clips"] == 1 and list(found["of_each"]) == ["specimen_1/2025_03_06-16_49_40/Clip_1"]
     clip = found["of_each"]["specimen_1/2025_03_06-16_49_40/Clip_1"]
     assert clip["masks"] == "white is instrument" and clip["moved"] is False and clip["frames"] == FRAMES
@@ -238,7 +237,7 @@ def test_which_colour_is_instrument(tmp_path: Path) -> None:
         mask.flat[: round(100 * share)] = 255
         cv2.imwrite(str(tmp_path / "mask.png"), mask)
         if white is None:
-            with pytest.raises(SagsError, match="cannot be told"):
+            with pytest.raises(SagsError, match="not clear which colour"):
                 instruments_are_white([tmp_path / "mask.png"])
         else:
             assert instruments_are_white([tmp_path / "mask.png"]) is white

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from command_line import figures_of
 from numbered_pictures import write_video
 from places import SESSION
 
@@ -49,9 +50,7 @@ def same_rig(made: StereoRig, truth: StereoRig) -> bool:
 
 
 def sags_eval(protocol: str, folder: Path, *more: str) -> dict[str, Any]:
-    result = CliRunner().invoke(main, ["eval", "--protocol", protocol, str(folder), *more, "--json"])
-    assert result.exit_code == 0, result.output
-    found: dict[str, Any] = json.loads(result.stdout)
+    found: dict[str, Any] = figures_of("eval", "--protocol", protocol, str(folder), *more, "--json")
     assert found["protocol"] == protocol
     return found
 

@@ -1,4 +1,7 @@
-"""Whole nodes on live inputs, 2 x 1280x1024 at 30 Hz: the mapper stalls, and whoever sends is killed."""
+"""What every live input does, 2 x 1280x1024 at 30 Hz: pairs as sent, nothing old, and it comes again.
+
+For cameras of the kernel see `test_v4l2.py` and `test_v4l2_vivid.py`.
+"""
 
 from __future__ import annotations
 
@@ -17,12 +20,14 @@ import numpy as np
 import pytest
 from command_line import RUN_HERE
 from gstreamer import BALL, apart, ball_moment, kill_pipelines, need_gstreamer
+from live_taking import Taker
 from places import ROOT
 from running_node import START_SECONDS
 from sending import sending, stereo_sender
 from stereo_sender import read_number
 from waiting import until
 
+from sags_node.config.schema import PushSource, Ros2Source
 from sags_node.node.node import Node
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import open_session
@@ -112,6 +117,32 @@ def running(
         yield node, shown, sender
     finally:
         node.stop()
+
+
+JPEG = ("jpeg=1", "rate=15")
+
+
+@pytest.mark.parametrize("settings", [(), JPEG], ids=["raw", "jpeg"])
+@pytest.mark.parametrize("way", ["push", "dds"])
+def test_no_pair_is_mismatched_or_comes_twice(
+    way: str, settings: tuple[str, ...], phantom_session: Path
+) -> None:
+    size, where = (1280, 1024), DOMAIN
+    if way == "push":
+        source: Any = PushedPictures(PushSource(endpoint="tcp://127.0.0.1:*"), size)
+        where = source.endpoint
+    else:
+        pytest.importorskip("cyclonedds", reason="ROS 2 needs: pip install 'sags-node[ros2]'")
+        from sags_node.sources.ros2 import RosCameras
+
+        kind = "compressed" if settings else ""
+        left, right = (f"stereo/{eye}/image_raw/{kind}".rstrip("/") for eye in ("left", "right"))
+        source = RosCameras(Ros2Source(domain=DOMAIN, left=left, right=right), size)
+    with Taker(source) as taker, sending(stereo_sender(way, where, phantom_session, 60, *settings)):
+        until(lambda: len(taker.numbers) >= 60)
+    numbers = [left for left, _ in taker.numbers]
+    assert taker.mismatched == 0 and numbers == sorted(set(numbers))
+    assert taker.newest is not None and taker.newest.left.shape == (1024, 1280, 3)
 
 
 @pytest.mark.fault("process: what sends pictures is killed, the mapping is slow and stalls")

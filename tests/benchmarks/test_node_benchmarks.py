@@ -1,0 +1,110 @@
+"""`python -m benchmarks crowd`, `hosts` and `soak` on small nodes: real processes and sockets."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from pathlib import Path
+from unittest.mock import ANY
+
+import pytest
+from command_line import figures_of
+
+from benchmarks.__main__ import main
+from benchmarks.node import crowd, hosts, neighbours, soak
+from sags_node.errors import SagsError
+
+pytestmark = [pytest.mark.live, pytest.mark.alone]
+
+SMALL = ("replay/phantom_pull", "source.pace:=realtime", "mapping.max_gaussians:=2000")
+
+
+def test_everybody_hears_the_node_and_it_does_not_wait_for_any(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(crowd, "WARM_UP", 2.0)
+    measured = crowd.measure_crowd(SMALL, 5.0, 7.0, 3, lambda done, of, what: None)
+    alone, read, crowded, _ = measured["phases"]
+    assert [each["phase"] for each in measured["phases"]] == ["alone", "one reader", "crowd", "alone again"]
+    assert read["peers"]["reader"]["messages"] > 3 * 6
+    assert set(crowded["peers"]) == {"fast", "slow", "dead", "3 more"} and not alone["peers"]
+    fast, slow = crowded["peers"]["fast"], crowded["peers"]["slow"]
+    assert slow["rate_hz"] < 1 / crowd.SLOW < fast["rate_hz"]
+    # The slow one takes what is new, not what has queued up behind it.
+    assert slow["since_sent_ms"]["p50"] < 1e3 * crowd.SLOW
+    assert crowded["peers"]["3 more"]["messages"] > 3 * 6
+    assert crowded["rate_hz"]["p50"] > 0.5 * alone["rate_hz"]["p50"]
+    assert crowd.table(measured).row_count == 4
+
+
+def test_a_node_that_does_not_start_says_why() -> None:
+    with pytest.raises(SagsError, match=r"did not start.*no_such_key"):
+        crowd.measure_crowd(("no_such_key:=1",), 1.0, 1.0, 0, lambda done, of, what: None)
+
+
+# ---- a node that is played live on hosts with less to give: real processes, and figures of each --------
+
+
+SHORT = ["source.frames:=20"]  # at 10 Hz
+
+
+def test_hosts_are_played_and_leave_the_machine_as_it_was(
+    phantom_session: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    chosen = {"one core": None, "with a reader of everything": hosts.reader}
+    monkeypatch.setattr(hosts, "neighbours", lambda: chosen)
+    mine, said = os.sched_getaffinity(0), []
+    rows = hosts.measure_hosts(str(phantom_session), SHORT, 2.0, said.append)
+    assert [row["name"] for row in rows] == list(chosen) and len(said) == 2
+    for row in rows:
+        assert 0 < row["share_after_first_second"] <= 1 and row["latency_ms"]["p50"] > 0
+        assert row["online"]["psnr"] > 15 and sum(row["rungs"].values()) > 0
+    assert os.sched_getaffinity(0) == mine
+
+
+def test_a_run_that_fails_says_why(phantom_session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(hosts, "neighbours", lambda: {"alone": None})
+    with pytest.raises(SagsError, match=r"mapping\.rung 99"):
+        hosts.measure_hosts(str(phantom_session), [*SHORT, "mapping.rung:=99"], 2.0, lambda what: None)
+
+
+# ---- `benchmarks soak` on a small node with all its neighbours: real processes and sockets -------------
+
+
+def test_a_node_and_all_its_neighbours_run_and_are_measured(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(soak, "WARM_UP", 1.0)
+    out = tmp_path / "soak.json"
+    arguments = ["soak", *SMALL, "--frames", "50", "--window", "10", "--json", "--out", str(out)]
+    measured = figures_of(*arguments, command=main)
+    assert json.loads(out.read_text()) == {"provenance": ANY} | measured
+    ends = [window["frames"] for window in measured["windows"]]  # with those that the node left out
+    assert len(ends) == 5 and all(end >= due for end, due in zip(ends, range(10, 51, 10), strict=True))
+    assert measured["published"] + measured["dropped"] == measured["frames"] >= 50
+    for window in measured["windows"]:
+        assert 0 < window["latency_p50_ms"] <= window["latency_p99_ms"]
+        assert 20 < window["psnr"] < 60
+        assert window["threads"] > 5 and window["descriptors"] > 10 and window["rss_mb"] > 50
+        assert window["overlay_mb"] > 50
+        assert (window["viewer_mb"] is None) == (neighbours.find_browser() is None)
+    latency = measured["latency_ms"]
+    assert latency["p50"] <= latency["p99"] <= latency["p99.9"] <= latency["max"]
+    assert measured["visits"]["visits"] > 0 and measured["recordings"]["recordings"] == 1
+    assert measured["recordings"]["failed"] == 0 and not measured["interrupted"]
+    assert all(math.isfinite(found["slope"]) for found in measured["per_1000_frames"].values())
+    assert "visits of subscribers" in soak.statement(measured) and soak.table(measured).row_count == 5
+
+
+@pytest.mark.parametrize("name", ["overlay", "viewer"])
+def test_a_neighbour_that_ends_is_not_measured(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It would cost nothing, and the figures would say so."""
+    if name == "viewer" and neighbours.find_browser() is None:
+        pytest.skip("needs Chromium")
+    beside = neighbours.overlay if name == "overlay" else neighbours.viewer
+    run_dir = tmp_path / "sags"
+    run_dir.mkdir(mode=0o700)
+    with pytest.raises(SagsError, match=f"the {name} ended before its time"), beside(run_dir) as process:
+        os.kill(process, 9)
+        os.waitid(os.P_PID, process, os.WEXITED | os.WNOWAIT)

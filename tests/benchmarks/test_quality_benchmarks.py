@@ -1,0 +1,177 @@
+"""`python -m benchmarks recall`, `scope` and `tracking` on small phantoms, and followers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from places import SESSION
+
+from benchmarks.quality import recall, scope
+from benchmarks.quality.followers import Csrt, Follower, dense_flow, lucas_kanade, sample
+from benchmarks.quality.tracking import measure_tracking
+from benchmarks.quality.tracking_report import tables
+from sags_node.config.launch_file import load_launch
+from sags_node.config.schema import FoldersSource, PhantomSource
+from sags_node.errors import SagsError, UsageError
+from sags_node.mapping.anchors import Anchors
+from sags_node.phantom import PhantomScene
+from sags_node.pipeline.session import Session, open_session
+
+SMALL = [
+    *("source.seconds:=1", "source.width:=320", "source.height:=256", "source.pace:=step"),
+    *("vision.width:=320", "vision.height:=256", "mapping.max_gaussians:=8000"),
+]
+
+
+def measured(monkeypatch: pytest.MonkeyPatch, scenario: recall.Scenario) -> dict[str, Any]:
+    monkeypatch.setattr(recall, "SCENARIOS", [scenario])
+    monkeypatch.setattr(recall, "BEFORE", 1.2)
+    monkeypatch.setattr(recall, "AFTER", 1.2)
+    session = open_session("launch/phantom.yaml", SMALL)
+    found = recall.measure_recall(session, 2.0, lambda done, of, what: None)
+    assert next(table.row_count for table in recall.tables(found)) == 1
+    for key in ("reliability_px", "reliability_mm"):
+        bins = found[key]["bins"]
+        assert sum(row["count"] for row in bins) > 500
+        assert bins[-1]["right"] > max(0.9, bins[0]["right"])  # who says to be sure is
+    return dict(found["rows"][0])
+
+
+def test_most_anchors_come_back_after_the_scope_looked_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    row = measured(monkeypatch, "turned away")
+    assert row["anchors"] > 30 and row["found"] > max(0.5, row["unmoved"]) and row["wrong"] < 0.1
+
+
+def test_only_the_phantom_knows_its_points() -> None:
+    session = open_session("launch/phantom.yaml", SMALL)
+    other = session.config.model_copy(
+        update={"source": FoldersSource(left=Path("left"), right=Path("right"))}
+    )
+    with pytest.raises(UsageError, match="phantom"):
+        recall.measure_recall(replace(session, config=other), 2.0, lambda done, of, what: None)
+
+
+# ---- `benchmarks scope`: two breaths of a small phantom ------------------------------------------------
+
+
+BREATHS = [*("source.width:=160", "source.height:=128", "source.rate:=2.5", "mapping.max_gaussians:=1500")]
+
+
+def test_what_is_told_is_exact_and_what_a_robot_is_off_by_is_what_was_planted() -> None:
+    config = load_launch(None, BREATHS)
+    assert isinstance(config.source, PhantomSource)
+    still = PhantomScene.of(config.source).model_copy(update={"still_tissue": True})
+    config = config.model_copy(update={"source": still})
+    measured = scope.measure_scope(config, ["zoom"], 8.0, lambda done, of, what: None)
+    rows = {row["way"]: row for row in measured["rows"]}
+    assert set(rows) == {"session", "estimate", "refine", "robot", "rigid", "points"}
+    assert rows["session"]["ate_mm"] == pytest.approx(0, abs=1e-9) and rows["session"]["psnr"] > 25
+    # Still points, seen exactly, leave no doubt; a hand turned by a degree turns 15 mm of way by that.
+    assert rows["points"]["max_mm"] < 1e-2
+    assert rows["robot"]["max_mm"] > 15 * np.sin(np.linalg.norm(scope.HAND_EYE))
+    assert scope.table(measured).row_count == len(rows)
+
+
+def test_only_the_phantom_knows_its_scope() -> None:
+    config = load_launch(None, BREATHS)
+    other = config.model_copy(update={"source": FoldersSource(left=Path("left"), right=Path("right"))})
+    with pytest.raises(UsageError, match="phantom"):
+        scope.measure_scope(other, ["zoom"], 8.0, lambda done, of, what: None)
+    with pytest.raises(UsageError, match="breaths"):
+        scope.measure_scope(config, ["zoom"], 5.0, lambda done, of, what: None)
+
+
+# ---- `benchmarks tracking`: its truths, and what it says of the node on the phantom --------------------
+
+
+def opened(*overrides: str) -> Session:
+    return open_session(SESSION, ["source.pace:=step", "source.loop:=false", *overrides])
+
+
+def tracked(*overrides: str, frames: Sequence[int] = (4, 12), beside: Sequence[str] = ()) -> dict[str, Any]:
+    return measure_tracking(opened(*overrides), frames, lambda done, of, what: None, beside)
+
+
+def test_anchors_stay_where_the_flow_goes() -> None:
+    found = tracked("source.reference.tracks:=null")
+    for row in found["frames"]:
+        assert row["anchors"] > 10 and row["gaussians"] > 1000
+        assert row["anchors_px"]["p50"] < 0.3 and row["gaussians_px"]["p50"] < 0.8
+    assert found["frames"][1]["motion_px"]["p90"] > 1.5  # they had to move
+    assert found["truth"] == "direct flow" and found["methods"]["anchors"]["average_jaccard"] is None
+    assert [table.row_count for table in tables(found)][:2] == [2, 1]
+
+
+def test_all_who_follow_stand_beside_on_the_true_points() -> None:
+    found = tracked(frames=range(1, 13), beside=["lucas_kanade", "dense_flow", "unmoved"])
+    methods = found["methods"]
+    assert found["truth"] == "exact" and found["anchors"] > 50
+    assert methods.keys() == {"anchors", "lucas_kanade", "dense_flow", "unmoved", "direct_flow"}
+    for name in ("anchors", "lucas_kanade", "dense_flow", "direct_flow"):
+        assert methods[name]["off_by_px"]["p50"] < 0.4 and methods[name]["sure"] > 0.7
+        assert methods[name]["average_jaccard"] > methods["unmoved"]["average_jaccard"]
+    assert methods["unmoved"]["off_by_px"]["p50"] > 0.4 and methods["unmoved"]["sure"] == 1
+    counts = [
+        sum(row["count"] for row in found["reliability_mm"][part])
+        for part in ("bins", "in_sight", "out_of_sight")
+    ]
+    assert counts[0] == 12 * found["anchors"] == counts[1] + counts[2] and min(counts) > 0
+    assert len(tables(found)) == 4
+
+
+def test_a_model_of_any_size_is_followed() -> None:
+    """OpenCV samples at most 32,766 places at once."""
+    flow = np.zeros((30, 40, 2), np.float32)
+    flow[..., 0], flow[..., 1] = np.arange(40), np.arange(30)[:, None]
+    places = np.random.default_rng(0).uniform(0, [39, 29], (70_000, 2))
+    assert sample(flow, places) == pytest.approx(places, abs=1 / 32)  # px: what OpenCV rounds places to
+
+
+def test_anchors_that_stand_still_are_seen_to_be_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Anchors, "update", lambda self, *arguments: None)
+    row = tracked(frames=[12])["frames"][0]
+    assert row["anchors_px"]["p90"] == pytest.approx(row["motion_px"]["p90"], rel=0.1)
+    assert np.isfinite(row["gaussians_px"]["p90"])
+
+
+def test_a_recording_that_is_too_short_is_named() -> None:
+    with pytest.raises(SagsError, match="ends before frame 5000"):
+        tracked(frames=[2, 5000])
+
+
+# ---- methods that anchors stand beside: on a picture that moves as a whole, all know where its poi------
+
+
+POINTS = np.array([[60.0, 50], [100, 60], [80, 80]])
+STEPS = np.array([[1.5, 0.5], [2.0, -1.0], [0.5, 2.5]])  # px
+
+
+def picture(moved: np.ndarray) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    sheet = sum(cv2.GaussianBlur(rng.normal(size=(160, 200)), (0, 0), s) * s for s in (1.5, 3.0, 6.0))
+    shifted = cv2.warpAffine(sheet, np.float32([[1, 0, moved[0] - 20], [0, 1, moved[1] - 20]]), (160, 120))
+    return np.repeat((120 + 60 * shifted).clip(0, 255).astype(np.uint8)[..., None], 3, axis=2)
+
+
+@pytest.mark.parametrize(("follower", "most"), [(lucas_kanade, 0.2), (dense_flow, 0.3), (Csrt, 1.5)])
+def test_they_follow(follower: Callable[[np.ndarray, np.ndarray], Follower], most: float) -> None:
+    moved, following = np.zeros(2), follower(picture(np.zeros(2)), POINTS)
+    for step in STEPS:
+        moved = moved + step
+        pixels, kept = following.follow(picture(moved))
+    assert kept.all()
+    assert np.linalg.norm(pixels - POINTS - moved, axis=1).max() < most
+
+
+@pytest.mark.parametrize("follower", [lucas_kanade, dense_flow])
+def test_what_was_lost_stays_lost(follower: Callable[[np.ndarray, np.ndarray], Follower]) -> None:
+    """The last point leaves the picture and comes back."""
+    following = follower(picture(np.zeros(2)), np.array([*POINTS, [2.0, 50]]))
+    assert following.follow(picture(np.array([-5.0, 0])))[1].tolist() == [True, True, True, False]
+    assert following.follow(picture(np.zeros(2)))[1].tolist() == [True, True, True, False]

@@ -1,0 +1,161 @@
+"""Parts of a node, each alone."""
+
+from __future__ import annotations
+
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from synthetic import plane_result
+
+from sags_node.config.schema import LaunchConfig
+from sags_node.errors import SagsError
+from sags_node.messaging import cdr, content, topics
+from sags_node.model.ply import write_ply
+from sags_node.node import health as health_module
+from sags_node.node import operations as node_operations
+from sags_node.node.health import WAITING_AFTER, Statistics
+from sags_node.node.latest import Latest
+from sags_node.node.operations import NodeState, Operations
+from sags_node.types import FrameResult, Gaussians, NodeHealth
+
+
+def test_newest_wins_and_the_replaced_are_counted() -> None:
+    slot: Latest[int] = Latest()
+    for value in (1, 2, 3):
+        slot.put(value)
+    assert slot.get() == 3
+    assert slot.dropped == 2
+    assert slot.get(timeout=0.01) is None
+
+
+def test_close_delivers_what_is_left_then_ends() -> None:
+    slot: Latest[int] = Latest()
+    slot.put(7)
+    slot.close()
+    assert not slot.closed
+    assert slot.get() == 7
+    assert slot.closed
+    assert slot.get() is None
+
+
+def test_close_wakes_a_waiter() -> None:
+    slot: Latest[int] = Latest()
+    got: list[int | None] = []
+    waiter = threading.Thread(target=lambda: got.append(slot.get()))
+    waiter.start()
+    slot.close()
+    waiter.join(timeout=60)
+    assert got == [None]
+
+
+def test_hand_over_drops_nothing() -> None:
+    slot: Latest[int] = Latest()
+    sender = threading.Thread(target=lambda: [slot.hand_over(i) for i in range(50)] and slot.close())
+    sender.start()
+    got = []
+    while (value := slot.get(timeout=60)) is not None:
+        time.sleep(0.001)
+        got.append(value)
+    sender.join(timeout=60)
+    assert got == list(range(50))
+    assert slot.dropped == 0
+
+
+def test_on_put_is_called_for_values_and_for_the_end() -> None:
+    calls = []
+    slot: Latest[int] = Latest(on_put=lambda: calls.append(1))
+    slot.put(1)
+    slot.close()
+    assert len(calls) == 2
+
+
+# ---- what the node says of itself, on a clock that only the tests move ---------------------------------
+
+
+PERIOD = 1 / 30
+TAKEN_IN = plane_result()
+HELD = replace(TAKEN_IN, held="the left picture is black")
+
+
+class Node:
+    """Publishes at 30 Hz."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now, self._statistics = 0.0, Statistics()
+        monkeypatch.setattr(health_module.time, "monotonic", lambda: self.now)
+
+    def publish(self, seconds: float, held: bool = False) -> NodeHealth:
+        for _ in range(round(seconds / PERIOD)):
+            self.now += PERIOD
+            self._statistics.add(HELD if held else TAKEN_IN, 40.0, {})
+        return self._statistics.health({}, False, False, None, {}, {}, {})
+
+
+@pytest.mark.fault("camera: its cap is on, for longer than a second")
+def test_a_node_that_takes_no_frame_in_is_not_well(monkeypatch: pytest.MonkeyPatch) -> None:
+    node = Node(monkeypatch)
+    said = node.publish(3.0)
+    assert content.health_answer(said)["healthy"] and said.state == "running"
+    assert node.publish(WAITING_AFTER - 3 * PERIOD, held=True).state == "running"
+    said = node.publish(6 * PERIOD, held=True)
+    assert content.health_answer(said) == {"healthy": False, "state": "held", "warnings": []}
+    assert said.rate_hz == pytest.approx(30)  # pictures go on
+    (part,) = content.diagnostics(said, 0).parts
+    statuses = cdr.decode(bytes(part), topics.DIAGNOSTICS).status
+    assert [int(status.level) for status in statuses[:2]] == [1, 0]  # of the node; of a stage, which works
+    assert node.publish(PERIOD).state == "running"
+    said = node.publish(0.5, held=True)
+    assert said.state == "running" and content.health_answer(said)["healthy"]
+
+
+def test_the_latency_is_told_while_the_health_is_being_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The mapping thread reads it in every frame."""
+    statistics = Statistics()
+    assert statistics.latency_s == 0
+    for latency_ms in (10.0, 20.0, 90.0):
+        statistics.add(TAKEN_IN, latency_ms, {})
+    with ThreadPoolExecutor(1) as other, statistics._lock:
+        assert other.submit(lambda: statistics.latency_s).result(timeout=10) == pytest.approx(0.020)
+
+
+# ---- `save_model`: the disk is written by a thread that nobody waits for -------------------------------
+
+
+def operations(newest: FrameResult | None) -> Operations:
+    pipeline = SimpleNamespace(newest=newest, mapper=None)
+    return Operations(NodeState(LaunchConfig(), pipeline, None, None), lambda *_: None)  # type: ignore[arg-type]
+
+
+@pytest.mark.fault("disk: hangs while a model is saved")
+def test_a_disk_that_hangs_keeps_no_frame_waiting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    goes_on = threading.Event()
+
+    def write(file: Path, gaussians: Gaussians) -> None:
+        assert goes_on.wait(30)
+        write_ply(file, gaussians)
+
+    monkeypatch.setattr(node_operations, "write_ply", write)
+    asked = operations(plane_result())
+    file = tmp_path / "model.ply"
+    try:
+        with ThreadPoolExecutor(1) as mapping:
+            answer = asked.handlers()["save_model"]({"path": str(file)})
+            mapping.submit(asked.for_mapping.serve).result(timeout=10)  # between two frames
+            assert not answer.done()
+    finally:
+        goes_on.set()
+    asked.finish(30)
+    assert answer.result(0) == {"path": str(file), "gaussians": len(plane_result().snapshot.gaussians)}
+    assert file.stat().st_size > 0
+    with pytest.raises(SagsError, match="exists already"):
+        asked.handlers()["save_model"]({"path": str(file)}).result(30)
+
+
+def test_before_the_first_frame_there_is_nothing_to_save(tmp_path: Path) -> None:
+    with pytest.raises(SagsError, match="no model yet"):
+        operations(None).handlers()["save_model"]({"path": str(tmp_path / "model.ply")})
