@@ -178,7 +178,7 @@ def test_ros_pins_an_anchor_and_outlives_a_killed_bridge_and_a_killed_node(tmp_p
                 assert stamps == sorted(set(stamps)), "sent again"
                 until(lambda: stale(joined.newest("/diagnostics")))
                 second.send_signal(signal.SIGINT)
-                assert second.wait(10) == 0
+                assert second.wait(30) == 0
     finally:
         running.process.kill()
         running.process.wait(10)

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from engine_scenes import camera
 
-from sags_node import types
 from sags_node.engine.rasterizer.views import colours_of, to_view
 from sags_node.types import F32, U8, Colours
 
@@ -52,7 +51,7 @@ def test_they_are_enlarged_once_and_by_who_asks(monkeypatch: pytest.MonkeyPatch)
 
     planes = np.ones((5, HEIGHT // 2, WIDTH // 2), np.float32)
     view = to_view(planes, camera(WIDTH, HEIGHT), 0, 0)
-    monkeypatch.setattr(types.cv2, "resize", slow)
+    monkeypatch.setattr(cv2, "resize", slow)
     found: list[U8] = []
     askers = [threading.Thread(target=lambda: found.append(view.rgb)) for _ in range(4)]
     for asker in askers:
