@@ -328,7 +328,7 @@ def test_unprojected_pixel_peaks_at_that_pixel(backend: Backend) -> None:
         row, column = np.unravel_index(np.argmax(drawn.alpha), drawn.alpha.shape)
         assert (int(column), int(row)) == pixel
         assert drawn.depth[row, column] == pytest.approx(0.07, rel=after(20))  # one weight, divided out again
-    XX
+        assert drawn.rgb[row, column] == pytest.approx([204, 127.5, 51], abs=0.5)  # 0.8, 0.5 and 0.2 of 255
 
 
 # ---- what is not a number, nowhere, or of an odd size ------------------------------------------------------
