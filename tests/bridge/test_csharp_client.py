@@ -103,7 +103,7 @@ def test_it_shows_depth_colour_and_anchors_and_nothing_old(program: Path, tmp_pa
     _, height, width, depth_mm, rgba, anchors = found.groups()
     assert (int(height), int(width)) == (HEIGHT, WIDTH)
     assert float(depth_mm) == pytest.approx(1000 * view.depth[middle], abs=1e-3)
-    assert rgba.split(",") == [str(round(255 * value)) for value in (*view.rgb[middle], view.alpha[middle])]
+    assert rgba.split(",") == [*map(str, view.rgb[middle]), str(round(255 * view.alpha[middle]))]
     first = anchors.split(";")[0].split(":")
     assert int(first[0]) == SEEN and float(first[1]) == pytest.approx(0.07) and len(anchors.split(";")) == 3
 

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from bridging import anchored_at, bridged, sockets
 from places import ROOT
-from ports import free_port
+from ports import free_port, is_free
 from synthetic import HEIGHT, WIDTH, plane_result, stream
 from waiting import until
 
@@ -207,6 +207,7 @@ def test_a_bridge_that_is_started_anew_goes_on_on_the_same_port(tmp_path: Path) 
             with bridged(run_foxglove, options(tmp_path, port=port)), client(port) as joined:
                 joined.subscribe("/sags/tf")
                 until(lambda: joined.came["/sags/tf"])
+            until(lambda: is_free(port))  # a server of the SDK ends a moment after it was stopped
 
 
 def test_a_client_that_does_not_read_holds_nobody_up_and_goes_on_with_what_is_new(tmp_path: Path) -> None:

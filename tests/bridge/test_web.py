@@ -273,7 +273,7 @@ def test_a_browser_draws_what_comes_and_goes_blank(page: Any, tmp_path: Path) ->
     view = result.views["left"]
     opaque = raw["render"][..., 3]
     assert np.all(opaque == round(0.75 * 255)), "the video shows through"
-    expected = view.rgb
+    expected = view.rgb.astype(int)
     assert np.abs(raw["render"][..., :3] - expected).max() <= 255 / 191 + 1, (
         "a canvas stores colour times alpha"
     )
