@@ -30,6 +30,9 @@ PARTS = (  # of the package, that a frame goes through
     "model.alias_free",
 )  # fmt: skip
 ELSEWHERE = {"mapping.focus.sum_residuals", "mapping.focus._sum_row"}  # tests/mapping/test_focus.py
+# Read pictures in the pixel in which a Gaussian is seen. Four roundings of 6e-8 at 128 px are 3e-5 px: as near
+# to a border, above or below, along two axes, lie 1.2e-4 of the places, and are read in either pixel.
+LOOKED_UP, NEAR_A_BORDER = {"mapping.surface._find_surface"}, 1e-3
 SMALL = [
     "source.pace:=step",
     "source.frames:=6",
@@ -79,6 +82,10 @@ def assert_same(compiled: Any, source: Any, where: str) -> None:
         assert compiled == source, where
     elif np.asarray(compiled).dtype.kind == "f":
         size = np.nanmax(np.abs(source), initial=0, where=np.isfinite(source))
+        if where in LOOKED_UP:
+            same = np.isclose(compiled, source, rtol=1e-4, atol=1e-5 * size)
+            assert np.mean(~same) < NEAR_A_BORDER, where
+            return
         np.testing.assert_allclose(compiled, source, rtol=1e-4, atol=1e-5 * size, err_msg=where)
     else:
         np.testing.assert_array_equal(compiled, source, err_msg=where)
