@@ -30,8 +30,8 @@ PARTS = (  # of the package, that a frame goes through
     "model.alias_free",
 )  # fmt: skip
 ELSEWHERE = {"mapping.focus.sum_residuals", "mapping.focus._sum_row"}  # tests/mapping/test_focus.py
-# Read pictures in the pixel in which a Gaussian is seen. Four roundings of 6e-8 at 128 px are 3e-5 px: so near
-# to a border, above or below, along two axes, lie 1.2e-4 of the places, and are read in either pixel.
+# They read pictures in the pixel in which a Gaussian is seen. Four roundings of 6e-8 at 128 px are 3e-5 px.
+# So near to a border, on either side and along two axes, lie 1.2e-4 of the places: either pixel is right.
 LOOKED_UP, NEAR_A_BORDER = {"mapping.surface._find_surface"}, 1e-3
 SMALL = [
     "source.pace:=step",
