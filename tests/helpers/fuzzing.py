@@ -319,10 +319,11 @@ def bag(kind: str) -> Target:
                 recover(file, folder / "saved")
             except SagsError as error:
                 assert "\n" not in str(error) and not (folder / "saved").exists()
-        load_launch(file)
-        bag_info(file)
-        read_bag_rig(cfg.BagSource(path=file))
-        play(file)
+        with bounded_memory(1 << 30):
+            load_launch(file)
+            bag_info(file)
+            read_bag_rig(cfg.BagSource(path=file))
+            play(file)
 
     return Target(sound, use)
 

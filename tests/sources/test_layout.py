@@ -238,3 +238,9 @@ def test_two_videos_are_cropped_alike(tmp_path: Path) -> None:
     frames, _ = played(config)
     for found, expected in zip(frames[1], eyes[1], strict=True):
         assert np.abs(found.astype(int) - expected[4:28, 8:40][::-1, ::-1]).max() <= NEAR
+
+
+def test_one_video_of_both_eyes_needs_no_other() -> None:
+    both = Path("both.avi")
+    with pytest.raises(ValidationError, match="leave right out"):
+        VideosSource(left=both, right=both, geometry=GeometryConfig(layout="over_under"))
