@@ -203,6 +203,10 @@ class Gaussians:
     sh_rest: F32 | None = None  # [N, K - 1, 3] real spherical harmonics of degree 1 to 3 without the constant
     smoothing: F32 | None = None  # [N] m^2, variance of the 3D filter (Mip-Splatting), still to be applied
     depth_errors: F32 | None = None  # [N] m, predicted: nine of ten real ones are smaller; None: unknown
+    slopes: F32 | None = None  # [N, 3] change of all three colours for each standard deviation along the
+    # Gaussian's own axes: at a point x they are colors + slopes . diag(1 / scales) R^T (x - mean), and at a
+    # pixel the expectation of that over the Gaussian along the pixel's ray, `engine.rasterizer.projection`;
+    # None: 0, a Gaussian of one colour
 
     def __len__(self) -> int:
         return len(self.means)

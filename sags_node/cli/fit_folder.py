@@ -12,7 +12,6 @@ from rich.table import Table
 
 from sags_node.cli.launching import write_json
 from sags_node.config.schema import EndoNerfSource
-from sags_node.engine.rasterizer.smoothing import bake_filter
 from sags_node.errors import UsageError
 from sags_node.evaluation.lpips import BACKBONE, Lpips
 from sags_node.evaluation.measure import MeasureOptions
@@ -121,7 +120,7 @@ def fit_session(
         ),
     }  # fmt: skip
     last = fit.gaussians(clip.train[-1])
-    write_ply(out / MODEL, bake_filter(last), force=True)
+    write_ply(out / MODEL, last, force=True)
     write_json(out / FIGURES, found)
     return found
 

@@ -71,7 +71,7 @@ def _displaced(rasterizer: Rasterizer, middle: Gaussians, camera: Camera, seen: 
     there, _ = project(seen.camera, seen.gaussians.means[rows])
     known = (seen.gaussians.ids[rows] == middle.ids)[:, None] & np.isfinite(there) & np.isfinite(pixels)
     displacement[:, :2] = np.where(known, there - pixels, 0)
-    planes = rasterizer.forward(replace(middle, colors=displacement, sh_rest=None), camera)
+    planes = rasterizer.forward(replace(middle, colors=displacement, sh_rest=None, slopes=None), camera)
     covered = planes[4] > COVERED
     moved = np.where(covered, planes[:2] / np.where(covered, planes[4], np.float32(1)), np.float32(0))
     places: F32 = np.moveaxis(np.indices(covered.shape, np.float32)[::-1] + moved, 0, -1)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import tempfile
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -31,7 +31,7 @@ from sags_node.types import (
     Snapshot,
 )
 
-_ARRAYS = 19  # in a frame's file
+_ARRAYS = 20  # in a frame's file
 _NO_FORECAST = (np.empty(0, np.float32),) * 4
 _SHOWN = 5 + len(_NO_FORECAST)  # of them the last: velocities, what was shown, and the forecast
 
@@ -136,6 +136,7 @@ class Spool:
             gaussians.opacities,
             gaussians.colors,
             gaussians.ids,
+            np.zeros_like(gaussians.means) if gaussians.slopes is None else gaussians.slopes,
             snapshot.velocities,
             view.rgb,
             view.depth,
@@ -164,16 +165,26 @@ class Spool:
         if header["forecast"] is not None:
             frame_s, *state = header["forecast"]
             forecast = Forecast(MotionState(*state), frame_s, *arrays[-len(_NO_FORECAST) :])
-        K, T_world_cam, tissue, measured_depth, *splats, velocities, rgb, depth, confidence, right_rgb = (
-            arrays[: -len(_NO_FORECAST)]
-        )
+        (
+            K,
+            T_world_cam,
+            tissue,
+            measured_depth,
+            *splats,
+            slopes,
+            velocities,
+            rgb,
+            depth,
+            confidence,
+            right_rgb,
+        ) = arrays[: -len(_NO_FORECAST)]
         facts = RunFacts(**header["facts"])
         height, width = measured_depth.shape
         snapshot = Snapshot(
             frame_id=header["frame_id"],
             t_capture_ns=header["t_capture_ns"],
             step=header["step"],
-            gaussians=Gaussians(*splats),
+            gaussians=replace(Gaussians(*splats), slopes=slopes),
             velocities=velocities,
             camera=Camera(width, height, K, T_world_cam),
             loss=header["loss"],

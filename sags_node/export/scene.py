@@ -20,7 +20,7 @@ from sags_node.fitting.fit import Fit
 from sags_node.fitting.settings import FitSettings
 from sags_node.kernels.threads import configure_threads
 from sags_node.messaging.address import NodeAddress
-from sags_node.messaging.content import SPLAT_FIELDS
+from sags_node.messaging.content import SLOPE_FIELDS, SPLAT_FIELDS
 from sags_node.messaging.received import ReceivedCameraInfo, ReceivedCloud, ReceivedRos, TopicName
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.pipeline.pipeline import Pipeline
@@ -72,7 +72,7 @@ def from_node(node: NodeAddress) -> Scene:
 
 def _gaussians(cloud: ReceivedCloud) -> Gaussians:
     fields = cloud.points.dtype.names or ()
-    if not set(SPLAT_FIELDS) - {"confidence"} <= set(fields):
+    if not set(SPLAT_FIELDS) - {"confidence", *SLOPE_FIELDS} <= set(fields):
         raise SagsError(f"{cloud.topic} is not what this version reads: {cloud.meta.encoding}")
 
     def columns(*names: str) -> F32:
@@ -86,6 +86,7 @@ def _gaussians(cloud: ReceivedCloud) -> Gaussians:
         colors=0.5 + np.float32(SH_DEGREE_0) * columns("f_dc_0", "f_dc_1", "f_dc_2"),
         ids=cloud.points["id"].astype(np.int64),
         depth_errors=error_of(cloud.points["confidence"]) if "confidence" in fields else None,
+        slopes=columns(*SLOPE_FIELDS) if set(SLOPE_FIELDS) <= set(fields) else None,
     )
 
 

@@ -63,7 +63,7 @@ def prune_mask(model: GaussianModel, surface: F32, depth_is_new: bool, limit: in
     remove = np.zeros(model.count, np.bool_)
     _inspect(
         model.means, model.quats, model.scales, model.smoothing, model.node_weight,
-        model.opacities, model.colors, model.contribution,
+        model.opacities, model.colors, model.slopes, model.contribution,
         surface, depth_is_new, model.count > CROWDED * limit, model.in_front, remove,
     )  # fmt: skip
     return remove
@@ -152,13 +152,13 @@ def _candidates(
 @parallel_kernel
 def _inspect(
     means: F32, quats: F32, scales: F32, smoothing: F32, node_weight: F32,
-    opacities: F32, colors: F32, contribution: F32,
+    opacities: F32, colors: F32, slopes: F32, contribution: F32,
     surface: F32, is_new: bool, crowded: bool, in_front: I32, remove: Bool,
 ) -> None:  # fmt: skip
     for piece in prange(-(-len(means) // PIECE)):
         first = np.int64(piece) * PIECE
         _inspect_rows(
-            means, quats, scales, smoothing, node_weight, opacities, colors, contribution,
+            means, quats, scales, smoothing, node_weight, opacities, colors, slopes, contribution,
             surface, is_new, crowded, in_front, remove, first, min(first + PIECE, len(means)),
         )  # fmt: skip
 
@@ -166,12 +166,12 @@ def _inspect(
 @kernel
 def _inspect_rows(
     means: F32, quats: F32, scales: F32, smoothing: F32, node_weight: F32,
-    opacities: F32, colors: F32, contribution: F32,
+    opacities: F32, colors: F32, slopes: F32, contribution: F32,
     surface: F32, is_new: bool, crowded: bool, in_front: I32, remove: Bool,
     first: Any, end: Any,
 ) -> None:  # fmt: skip
     for i in range(first, end):
-        if not _is_sound(means, quats, scales, smoothing, node_weight, opacities, colors, i):
+        if not _is_sound(means, quats, scales, smoothing, node_weight, opacities, colors, slopes, i):
             remove[i] = True
             continue
         z, measured = surface[i, 0], surface[i, 1]
@@ -189,12 +189,20 @@ def _inspect_rows(
 
 @inlined
 def _is_sound(
-    means: F32, quats: F32, scales: F32, smoothing: F32, node_weight: F32, opacities: F32, colors: F32, i: int
+    means: F32,
+    quats: F32,
+    scales: F32,
+    smoothing: F32,
+    node_weight: F32,
+    opacities: F32,
+    colors: F32,
+    slopes: F32,
+    i: int,
 ) -> bool:
     """Finite, and something to draw."""
     held = abs(node_weight[i, 0]) + abs(node_weight[i, 1]) + abs(node_weight[i, 2]) + abs(node_weight[i, 3])
     size = abs(smoothing[i]) + abs(quats[i, 0]) + abs(quats[i, 1]) + abs(quats[i, 2]) + abs(quats[i, 3])
     for k in range(3):
-        size += abs(means[i, k]) + abs(colors[i, k]) + abs(scales[i, k])
+        size += abs(means[i, k]) + abs(colors[i, k]) + abs(slopes[i, k]) + abs(scales[i, k])
     least = min(scales[i, 0], scales[i, 1], scales[i, 2])
     return bool(size < LARGEST and held < 2 and least > 0 and MIN_OPACITY <= opacities[i] <= 1)

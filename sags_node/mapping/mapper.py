@@ -176,6 +176,7 @@ class Mapper:
         gain = self._refiner.exposure_gain()
         if np.abs(gain - 1).max() > EXPOSURE_JUMP:
             self.model.colors[:] *= gain
+            self.model.slopes[:] *= gain.mean()
             self._refiner.take(self._all_rows)
             self._refiner.draw()
         planes = self._refiner.planes()

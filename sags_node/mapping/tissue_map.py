@@ -11,7 +11,7 @@ from sags_node.mapping.initialise import LARGEST_ERROR
 from sags_node.mapping.motion_field import MotionField
 from sags_node.model.deformation import NodeDeformation, nearest_nodes
 from sags_node.model.gaussians import GaussianModel
-from sags_node.model.light import carried, is_near
+from sags_node.model.light import is_near, light_gain
 from sags_node.types import F32, F64, I64, Camera, Gaussians
 
 
@@ -74,15 +74,17 @@ class TissueMap:
         if lamp is None or self.deformation is None or np.array_equal(lamp, camera.T_world_cam):
             return gaussians
         model, normals = self.model, self.deformation.normals(lamp[:3, 3])
-        colors = carried(
-            model.colors, model.means, normals, model.node_index, model.node_weight, lamp, camera.T_world_cam
-        )
-        return replace(gaussians, colors=colors)
+        gain = light_gain(
+            model.means, normals, model.node_index, model.node_weight, lamp, camera.T_world_cam
+        )[:, None]
+        return replace(gaussians, colors=model.colors * gain, slopes=model.slopes * gain)
 
     def move_light(self, camera: Camera) -> None:
         """Let the colours be those that the scope's light shows from where it is now."""
         if self.lamp is None or not is_near(self.lamp, camera.T_world_cam):
-            self.model.colors[:] = self.relight(camera).colors
+            lit = self.relight(camera)
+            assert lit.slopes is not None
+            self.model.colors[:], self.model.slopes[:] = lit.colors, lit.slopes
             self.lamp = camera.T_world_cam
 
     def away(self, rows: I64) -> F32:

@@ -28,12 +28,14 @@ from sags_node.types import (
     RenderedView,
 )
 
+SLOPE_FIELDS = ("slope_0", "slope_1", "slope_2")
 SPLAT_FIELDS = (
     *("x", "y", "z"),
     *("scale_0", "scale_1", "scale_2"),
     *("rot_w", "rot_x", "rot_y", "rot_z"),
     *("f_dc_0", "f_dc_1", "f_dc_2"),
     *("opacity", "id", "confidence", "id_high"),
+    *SLOPE_FIELDS,
 )
 HEALTHY = ("running", "paused")  # states
 POINT_FIELDS = ("x", "y", "z", "rgb", "confidence")
@@ -55,6 +57,7 @@ def splats(result: FrameResult) -> Content:
     rows[:, 10:13] = (gaussians.colors - 0.5) / SH_DEGREE_0
     rows[:, 13] = gaussians.opacities
     rows[:, 15] = _confidence(gaussians)
+    rows[:, 17:20] = 0 if gaussians.slopes is None else gaussians.slopes
     bits = rows.view(np.uint32)
     bits[:, 14], bits[:, 16] = gaussians.ids & 0xFFFFFFFF, gaussians.ids >> 32  # not 0 after a day or more
     return cdr.point_cloud(rows, SPLAT_FIELDS, result.pair.t_capture_ns)

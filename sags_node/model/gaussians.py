@@ -47,6 +47,7 @@ class GaussianModel:
     opacity_logits = _Column(np.float32)
     opacities = _Column(np.float32)  # before the 3D filter
     colors = _Column(np.float32, 3)
+    slopes = _Column(np.float32, 3)  # of the luminance, see `types.Gaussians`
     right_colors = _Column(np.float32, 3)  # what the right eye sees more, see `mapping.right_view`
     velocities = _Column(np.float32, 3)  # m/s, world
     depth_errors = _Column(np.float32)  # m, predicted, see `mapping.depth_memory`
@@ -132,7 +133,8 @@ class GaussianModel:
         return removed
 
     def grow(self, factor: float) -> None:
-        """Make all as much larger."""
+        """Make all as much larger; what they show gets no steeper by it, per metre."""
+        self.slopes[:] *= np.float32(factor)
         self.scales[:] *= np.float32(factor)
         self.log_scales[:] += np.float32(np.log(factor))
 
@@ -148,6 +150,7 @@ class GaussianModel:
             None,
             self.smoothing,
             self.depth_errors,
+            self.slopes,
         )
 
     def snapshot(self) -> Gaussians:
@@ -162,6 +165,7 @@ class GaussianModel:
             self.colors.copy(),
             self.ids.copy(),
             depth_errors=self.depth_errors.copy(),
+            slopes=drawn.slopes,
         )
 
     def _new_ids(self, count: int) -> I64:

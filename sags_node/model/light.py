@@ -17,23 +17,22 @@ STEP_M, STEP_RAD = 0.5e-3, 0.01  # motion that changes no colour by as much as a
 LARGEST = 3.0  # of a colour: beyond it the normal is not to be believed
 
 
-def carried(colors: F32, means: F32, normals: F32, index: I32, weight: F32, before: F64, after: F64) -> F32:
-    """Colours [N, 3] as a lamp shows them after it has moved.
+def light_gain(means: F32, normals: F32, index: I32, weight: F32, before: F64, after: F64) -> F32:
+    """By what factor [N] colours and slopes change, as a lamp shows them after it has moved.
 
     The light that a matt surface sends back falls with the square of the lamp's distance, with the cosine of
     the angle at which it arrives (Lambert) and towards the rim of the beam. Gleams and shadows are left out.
 
     Args:
-        colors: [N, 3] as they look now, display values.
         means: [N, 3] m, world.
         normals: [M, 3] of the control nodes, towards the cameras.
         index, weight: [N, K] the nodes that a Gaussian follows.
         before, after: `T_world_cam` [4, 4] of the lamp, which shines along z.
     """
-    lit = np.empty_like(colors)
+    gain = np.empty(len(means), np.float32)
     lamps = np.stack([np.concatenate([T[:3, 3], T[:3, 2]]) for T in (before, after)]).astype(np.float32)
-    _carry(colors, means, normals, index, weight, lamps, lit)
-    return lit
+    _gains(means, normals, index, weight, lamps, gain)
+    return gain
 
 
 def is_near(before: F64, after: F64) -> bool:
@@ -43,17 +42,16 @@ def is_near(before: F64, after: F64) -> bool:
 
 
 @parallel_kernel
-def _carry(colors: F32, means: F32, normals: F32, index: I32, weight: F32, lamps: F32, lit: F32) -> None:
+def _gains(means: F32, normals: F32, index: I32, weight: F32, lamps: F32, gain: F32) -> None:
     for piece in prange(-(-len(means) // PIECE)):
         first = np.int64(piece) * PIECE
-        _carry_rows(colors, means, normals, index, weight, lamps, lit, first, min(first + PIECE, len(means)))
+        _gains_of_rows(means, normals, index, weight, lamps, gain, first, min(first + PIECE, len(means)))
 
 
 @kernel
-def _carry_rows(
-    colors: F32, means: F32, normals: F32, index: I32, weight: F32, lamps: F32, lit: F32,
-    first: Any, end: Any,
-) -> None:  # fmt: skip
+def _gains_of_rows(
+    means: F32, normals: F32, index: I32, weight: F32, lamps: F32, gain: F32, first: Any, end: Any
+) -> None:
     exponent, most = np.float32(1 / GAMMA), np.float32(LARGEST)
     one = np.float32(1)
     for i in range(first, end):
@@ -66,11 +64,9 @@ def _carry_rows(
         x, y, z = means[i, 0], means[i, 1], means[i, 2]
         before = _brightness(lamps[0], x, y, z, nx, ny, nz)
         after = _brightness(lamps[1], x, y, z, nx, ny, nz)
-        gain = one
+        gain[i] = one
         if before > 0 and after > 0:
-            gain = min(max((after / before) ** exponent, one / most), most)
-        for c in range(3):
-            lit[i, c] = colors[i, c] * gain
+            gain[i] = min(max((after / before) ** exponent, one / most), most)
 
 
 @inlined

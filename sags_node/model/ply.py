@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from sags_node.confidence import confidence_of
-from sags_node.engine.rasterizer.smoothing import bake_filter
 from sags_node.errors import SagsError
 from sags_node.files import whole
+from sags_node.model.constant_colours import with_constant_colours
 from sags_node.types import SH_DEGREE_0, Gaussians
 
 _FIELDS = (
@@ -19,14 +19,14 @@ _FIELDS = (
 
 def write_ply(path: Path, gaussians: Gaussians, force: bool = False) -> None:
     """Write a binary PLY in the layout of 3D Gaussian Splatting (Kerbl et al., 2023): log scales, opacity
-    logits, quaternions wxyz, colours as degree-0 spherical harmonics; metres. The 3D filter is folded in:
-    viewers do not know it. Where the errors of depth are known, `confidence` comes last, see
-    `sags_node.confidence`; readers take properties by name.
+    logits, quaternions wxyz, colours as degree-0 spherical harmonics; metres. The 3D filter and slopes are
+    folded in (`model.constant_colours`): viewers know neither. Where the errors of depth are known,
+    `confidence` comes last, see `sags_node.confidence`; readers take properties by name.
 
     Raises:
         SagsError: the file exists already and `force` is not given, or it cannot be written.
     """
-    gaussians = bake_filter(gaussians)
+    gaussians = with_constant_colours(gaussians)
     opacities = np.clip(gaussians.opacities, 1e-6, 1 - 1e-6)
     quats = gaussians.quats / np.linalg.norm(gaussians.quats, axis=1, keepdims=True)
     columns = np.concatenate(

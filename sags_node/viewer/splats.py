@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sags_node.geometry import quat_to_matrix
-from sags_node.types import F32, F64, SH_DEGREE_0
+from sags_node.messaging.content import SLOPE_FIELDS
+from sags_node.model.constant_colours import with_constant_colours
+from sags_node.types import F32, F64, SH_DEGREE_0, Gaussians
 
 MAX_SPLATS = 60_000  # that a browser draws smoothly; of more, those that cover most
 REACH = 3.0  # standard deviations within which a Gaussian is met
@@ -56,18 +58,30 @@ class Splats:
 
 
 def splats_of(points: NDArray[Any]) -> Splats:
-    """The rows of the topic `splats`, at most `MAX_SPLATS`."""
-    if len(points) > MAX_SPLATS:
-        scales = np.sort(_columns(points, "scale_0", "scale_1", "scale_2"), axis=1)
-        cover = points["opacity"] * scales[:, 1] * scales[:, 2]
-        points = points[np.argpartition(cover, -MAX_SPLATS)[-MAX_SPLATS:]]
+    """The rows of the topic `splats`, in colours that a browser knows; at most `MAX_SPLATS`."""
     f_dc = _columns(points, "f_dc_0", "f_dc_1", "f_dc_2")
+    gaussians = with_constant_colours(
+        Gaussians(
+            means=_columns(points, "x", "y", "z"),
+            quats=_columns(points, "rot_w", "rot_x", "rot_y", "rot_z"),
+            scales=_columns(points, "scale_0", "scale_1", "scale_2"),
+            opacities=np.ascontiguousarray(points["opacity"]),
+            colors=0.5 + np.float32(SH_DEGREE_0) * f_dc,
+            ids=np.zeros(len(points), np.int64),
+            slopes=_columns(points, *SLOPE_FIELDS) if SLOPE_FIELDS[0] in (points.dtype.names or ()) else None,
+        )
+    )
+    rows = np.arange(len(gaussians))
+    if len(rows) > MAX_SPLATS:
+        scales = np.sort(gaussians.scales, axis=1)
+        cover = gaussians.opacities * scales[:, 1] * scales[:, 2]
+        rows = np.argpartition(cover, -MAX_SPLATS)[-MAX_SPLATS:]
     return Splats(
-        means=_columns(points, "x", "y", "z"),
-        rotations=quat_to_matrix(_columns(points, "rot_w", "rot_x", "rot_y", "rot_z")),
-        scales=_columns(points, "scale_0", "scale_1", "scale_2"),
-        colors=np.clip(0.5 + np.float32(SH_DEGREE_0) * f_dc, 0, 1),
-        opacities=np.ascontiguousarray(points["opacity"]),
+        means=gaussians.means[rows],
+        rotations=quat_to_matrix(gaussians.quats[rows]),
+        scales=gaussians.scales[rows],
+        colors=np.clip(gaussians.colors[rows], 0, 1),
+        opacities=gaussians.opacities[rows],
     )
 
 

@@ -21,7 +21,7 @@ from places import SESSION
 
 from sags_node.kernels.jit import PIECE
 from sags_node.mapping.budget import StepBudget
-from sags_node.model.light import carried
+from sags_node.model.light import light_gain
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import open_session
 
@@ -160,5 +160,5 @@ def test_compiled_kernels_do_what_their_source_says(monkeypatch: pytest.MonkeyPa
     assert len(model.means) > 2 * PIECE  # several threads share them
     normals, lamps = np.full_like(model.means, 0.6), np.stack([np.eye(4)] * 2)
     lamps[1, :3, 3] = 0.01
-    carried(model.colors, model.means, normals, model.node_index, model.node_weight, *lamps)
+    light_gain(model.means, normals, model.node_index, model.node_weight, *lamps)
     assert len(compare.reached) > 60 and required() - compare.reached <= ELSEWHERE

@@ -164,14 +164,18 @@ def _find_rows(splat: Any, box: Any, height: int, tile_width_bits: int, rows: I3
     sign; their sum is the number of rows, or not above 0.
     """
     left, right, y_first, y_last = box
+    # The ellipse u^2 + v^2 = extent lies over any dx between dy = -shear dx +- chord sqrt(reach_x^2 - dx^2)
+    a, b, c = splat.whiten_xx, splat.whiten_xy, splat.whiten_yy
+    per_bb_cc = ONE / (b * b + c * c)
+    chord, shear = a * c * per_bb_cc, a * b * per_bb_cc
     side = half_signs()
     low = half_lanes() * f4(BLOCK_WIDTH) + (f4(left << tile_width_bits) + HALF - splat.mean_x)
     most = select(side > ZERO, f4(y_last + 1), f4(-y_first))
     for _ in range(0, (right - left) * COLUMNS, AT_ONCE):
         begin, end = larger(low, -splat.reach_x), smaller(low + f4(BLOCK_WIDTH - 1), splat.reach_x)
         dx = smaller(larger(side * splat.lowest_x, begin), end)
-        half_chord = square_roots(larger((splat.reach_x - dx) * (splat.reach_x + dx), ZERO)) * splat.chord
-        dy = half_chord - side * dx * splat.shear
+        half_chord = square_roots(larger((splat.reach_x - dx) * (splat.reach_x + dx), ZERO)) * chord
+        dy = half_chord - side * dx * shear
         last = round_downs(side * splat.mean_y + dy + (HALF + ROW_SLACK))
         store_integers(rows, n, smaller(select(begin <= end, larger(last, f4(-height)), f4(-height)), most))
         low += f4(BLOCK_WIDTH * AT_ONCE)

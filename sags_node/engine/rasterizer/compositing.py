@@ -61,9 +61,9 @@ BLOCK_HEIGHT = LANES // BLOCK_WIDTH
 BLOCKS = TILE_HEIGHT // BLOCK_HEIGHT  # in a column
 
 # Planes of a block in the scratch
-TRANSMITTANCE, RED, GREEN, BLUE, DEPTH, COVERAGE, REMAINING, WEIGHT = (k * LANES for k in range(8))
+TRANSMITTANCE, RED, GREEN, BLUE, DEPTH, COVERAGE, REMAINING, WEIGHT, LUMINANCE = (k * LANES for k in range(9))
 DRAWN = 5 * LANES  # floats from one block to the next when drawing, which needs the first five,
-DERIVED = 9 * LANES  # and for the derivative; one is spare: blocks 512 bytes apart would share few cache sets
+DERIVED = 9 * LANES  # and for the derivative
 SCRATCH = COLUMNS * BLOCKS * DERIVED  # floats per worker
 
 ZERO, HALF, ONE = f4(0.0), f4(0.5), f4(1.0)
@@ -180,6 +180,7 @@ def _composite_tiles(
             splat = splats[pair.splat]
             a, b, c, log2_opacity = splat.whiten_xx, splat.whiten_xy, splat.whiten_yy, splat.log2_opacity
             red, green, blue, depth = splat.red, splat.green, splat.blue, splat.depth
+            slope_u, slope_v = splat.slope_u, splat.slope_v
             for column in range(COLUMNS):
                 first, beyond = pair.begin[column] // BLOCK_HEIGHT, pair.end[column]
                 blocks = (beyond + BLOCK_HEIGHT - 1) // BLOCK_HEIGHT - first
@@ -192,9 +193,10 @@ def _composite_tiles(
                 for _ in range(blocks):
                     transmittance = load(tile, at + TRANSMITTANCE)
                     w = alpha_of(log2_opacity - v * v - u * u) * transmittance
-                    store(tile, at + RED, load(tile, at + RED) + w * red)
-                    store(tile, at + GREEN, load(tile, at + GREEN) + w * green)
-                    store(tile, at + BLUE, load(tile, at + BLUE) + w * blue)
+                    brighter = u * slope_u + v * slope_v
+                    store(tile, at + RED, load(tile, at + RED) + w * (brighter + red))
+                    store(tile, at + GREEN, load(tile, at + GREEN) + w * (brighter + green))
+                    store(tile, at + BLUE, load(tile, at + BLUE) + w * (brighter + blue))
                     store(tile, at + DEPTH, load(tile, at + DEPTH) + w * depth)
                     store(tile, at + TRANSMITTANCE, transmittance - w)
                     u += b * f4(BLOCK_HEIGHT)
@@ -246,14 +248,17 @@ def _read_tile(
         asked = spread(ZERO) != ZERO
         for block in range(COLUMNS * BLOCKS):
             at, y, x = block * DERIVED, block % BLOCKS * BLOCK_HEIGHT, block // BLOCKS * BLOCK_WIDTH
-            remaining = spread(ZERO)
+            remaining = luminance = spread(ZERO)
             for k in range(5):
                 pixel = start + k * area + y * width + x
                 cotangent = load_block(v_planes, pixel, width)
                 remaining += cotangent * load_block(planes, pixel, width)
                 asked |= cotangent != ZERO
                 store(tile, at + RED + k * LANES, cotangent)
+                if k < 3:
+                    luminance += cotangent
             store(tile, at + REMAINING, remaining)
+            store(tile, at + LUMINANCE, luminance)
             weights = load_block(weight, start + y * width + x, width)
             asked |= weights != ZERO
             store(tile, at + WEIGHT, weights)
@@ -267,6 +272,8 @@ def _read_tile(
                 value = v_planes[pixel + k * area]
                 tile[at + RED + k * LANES] = value
                 tile[at + REMAINING] += value * planes[pixel + k * area]
+                if k < 3:
+                    tile[at + LUMINANCE] += value
                 asked_at_edge |= value != ZERO
             tile[at + WEIGHT] = weight[pixel]
             asked_at_edge |= tile[at + WEIGHT] != ZERO
@@ -315,8 +322,9 @@ def _composite_tiles_backward(
             splat = splats[pair.splat]
             a, b, c, log2_opacity = splat.whiten_xx, splat.whiten_xy, splat.whiten_yy, splat.log2_opacity
             red, green, blue, depth = splat.red, splat.green, splat.blue, splat.depth
+            slope_u, slope_v = splat.slope_u, splat.slope_v
             g_sum = g_u = g_v = g_uu = g_uv = g_vv = spread(ZERO)
-            w_red = w_green = w_blue = w_depth = w_weight = spread(ZERO)
+            w_red = w_green = w_blue = w_depth = w_weight = w_u = w_v = spread(ZERO)
             for column in range(COLUMNS):
                 first, beyond = pair.begin[column] // BLOCK_HEIGHT, pair.end[column]
                 blocks = (beyond + BLOCK_HEIGHT - 1) // BLOCK_HEIGHT - first
@@ -326,7 +334,7 @@ def _composite_tiles_backward(
                 dy = block_y() + (f4(y0 + first * BLOCK_HEIGHT) + HALF - splat.mean_y)
                 along, u, v = whitened(a, b, c, dx, dy)
                 at = (column * BLOCKS + first) * DERIVED
-                g_here = gv_here = gvv_here = spread(ZERO)
+                g_here = gv_here = gvv_here = w_here = wv_here = spread(ZERO)
                 for _ in range(blocks):
                     alpha = alpha_of(log2_opacity - v * v - u * u)
                     transmittance = load(tile, at + TRANSMITTANCE)
@@ -337,11 +345,10 @@ def _composite_tiles_backward(
                         load(tile, at + GREEN),
                         load(tile, at + BLUE),
                     )
-                    v_depth = load(tile, at + DEPTH)
-                    ws = w * (
-                        v_red * red
-                        + (v_green * green + (v_blue * blue + (v_depth * depth + load(tile, at + COVERAGE))))
-                    )
+                    v_depth, v_luminance = load(tile, at + DEPTH), load(tile, at + LUMINANCE)
+                    brighter = u * slope_u + v * slope_v
+                    by_color = v_red * red + (v_green * green + (v_blue * blue + v_luminance * brighter))
+                    ws = w * (by_color + (v_depth * depth + load(tile, at + COVERAGE)))
                     remaining = load(tile, at + REMAINING) - ws
                     store(tile, at + REMAINING, remaining)
                     g = ws - alpha / (ONE - alpha) * remaining
@@ -354,6 +361,9 @@ def _composite_tiles_backward(
                     w_blue += w * v_blue
                     w_depth += w * v_depth
                     w_weight += w * load(tile, at + WEIGHT)
+                    lit = w * v_luminance
+                    w_here += lit
+                    wv_here += lit * v
                     u += b * f4(BLOCK_HEIGHT)
                     v += c * f4(BLOCK_HEIGHT)
                     at += DERIVED
@@ -366,11 +376,16 @@ def _composite_tiles_backward(
                 g_uu += gu_here * along + guv_here * slope
                 g_uv += guv_here
                 g_vv += gvv_here
+                w_u += w_here * along + wv_here * slope
+                w_v += wv_here
             store_sums(
                 v_pairs,
                 pair.slot * RECORD,
-                (g_sum, g_u, g_v, g_uu, g_uv, g_vv, w_red, w_green, w_blue, w_depth, w_weight),
-            )
+                (
+                    g_sum, g_u, g_v, g_uu, g_uv, g_vv, w_red, w_green, w_blue, w_depth, w_weight,
+                    w_u, w_v,
+                ),
+            )  # fmt: skip
         for p in range(end, tile_starts[t + 1]):  # hidden behind a finished tile, or nothing is asked of it
             for part in range(0, RECORD, LANES):
                 store(v_pairs, pairs[p].slot * RECORD + part, spread(ZERO))

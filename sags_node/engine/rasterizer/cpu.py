@@ -148,10 +148,10 @@ class NumbaRasterizer:
             self._v_pairs,
         )
         v_colors, contribution = self._v_colors[:n], self._contribution[:n]
-        means, quats, scales, opacities, sh_rest = self._projector.backward(
+        means, quats, scales, opacities, sh_rest, slopes = self._projector.backward(
             self._slots[:n], self._v_pairs, v_colors, contribution
         )
-        return Gradients(means, quats, scales, opacities, v_colors, sh_rest, contribution)
+        return Gradients(means, quats, scales, opacities, v_colors, sh_rest, slopes, contribution)
 
     def median(self) -> tuple[F32, I32]:
         median.median(

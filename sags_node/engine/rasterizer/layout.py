@@ -24,9 +24,9 @@ SPLAT = np.dtype(
             # The ellipse on which u^2 + v^2 = extent reaches so far from the mean, px,
             "reach_x",
             "reach_y",
-            "lowest_x",  # reaches the largest dy at this dx,
-            "chord",  # and over any dx lies between dy = -shear dx +- chord sqrt(reach_x^2 - dx^2)
-            "shear",
+            "lowest_x",  # and reaches the largest dy at this dx
+            "slope_u",  # luminance at a pixel: that of the colour + slope_u u + slope_v v
+            "slope_v",
         ],
         "formats": ["f4"] * 16,
     }
@@ -76,8 +76,10 @@ SPLAT_GRADIENT = np.dtype(
             "blue",
             "depth",
             "contribution",
+            "slope_u",
+            "slope_v",
         ],
-        "formats": ["f4"] * 11,
+        "formats": ["f4"] * 13,
         "itemsize": 64,
     }
 )

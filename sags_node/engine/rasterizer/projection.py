@@ -48,9 +48,11 @@ GRAIN = 16  # blocks that a worker takes at a time: neighbours in memory
 # Planes of a block's scratch
 MEAN_X, MEAN_Y, MEAN_Z, SCALE_X, SCALE_Y, SCALE_Z = (k * BLOCK for k in range(6))
 QUAT_W, QUAT_X, QUAT_Y, QUAT_Z, OPACITY = (k * BLOCK for k in range(6, 11))
-RED, GREEN, BLUE, DEPTH = (k * BLOCK for k in range(11, 15))
-RECORDS = 15 * BLOCK  # finished splats, one after the other
-SCRATCH = (15 + RECORD) * BLOCK  # floats per worker
+SLOPE_X, SLOPE_Y, SLOPE_Z = (k * BLOCK for k in range(11, 14))
+INPUTS = 14  # planes up to here
+RED, GREEN, BLUE, DEPTH = (k * BLOCK for k in range(INPUTS, INPUTS + 4))
+RECORDS = (INPUTS + 4) * BLOCK  # finished splats, one after the other
+SCRATCH = RECORDS + RECORD * BLOCK  # floats per worker
 
 NEAR_PLANE, MAX_OPACITY = f4(interface.NEAR_PLANE), f4(interface.MAX_OPACITY)
 LOG2_MIN_ALPHA = f4(math.log2(interface.MIN_ALPHA))
@@ -173,16 +175,31 @@ def log2_of(x: Any) -> Any:
 
 @inlined
 def ellipse(a: Any, b: Any, c: Any, extent: Any) -> Row:
-    """How far a splat reaches: the last five fields of its record."""
-    bb_cc = b * b + c * c
-    inverse, inverse_a = ONE / bb_cc, ONE / a
+    """How far a splat reaches: three fields of its record."""
+    inverse_a = ONE / a
     reach_y = square_roots(extent) / c
-    reach_x = square_roots(extent * bb_cc) * inverse_a / c
-    return reach_x, reach_y, -b * inverse_a * reach_y, a * c * inverse, a * b * inverse
+    reach_x = square_roots(extent * (b * b + c * c)) * inverse_a / c
+    return reach_x, reach_y, -b * inverse_a * reach_y
 
 
 @inlined
-def load_block(S: F32, means: F32, quats: F32, scales: F32, opacities: F32, first: int, filled: int) -> None:
+def times_axes(V: Row, ax: Any, ay: Any, az: Any) -> Row:
+    """V [2, 3] a [3]."""
+    return V[0] * ax + V[1] * ay + V[2] * az, V[3] * ax + V[4] * ay + V[5] * az
+
+
+@inlined
+def screen_slopes(W: Row, px: Any, py: Any) -> Row:
+    """Slopes of the luminance along u and v, of V a = (px, py): see `types.Gaussians.slopes`. With
+    C = 2 ln 2 W^T W the conic, a V^T C d = (2 ln 2 W V a) . (W d)."""
+    along, across, down = W
+    return TWO_LN2 * (along * px + across * py), TWO_LN2 * down * py
+
+
+@inlined
+def load_block(
+    S: F32, means: F32, quats: F32, scales: F32, opacities: F32, slopes: F32, first: int, filled: int
+) -> None:
     for lane in range(filled):
         i = first + lane
         S[MEAN_X + lane] = means[i, 0]
@@ -196,11 +213,15 @@ def load_block(S: F32, means: F32, quats: F32, scales: F32, opacities: F32, firs
         S[QUAT_Y + lane] = quats[i, 2]
         S[QUAT_Z + lane] = quats[i, 3]
         S[OPACITY + lane] = opacities[i]
+        S[SLOPE_X + lane] = slopes[i, 0]
+        S[SLOPE_Y + lane] = slopes[i, 1]
+        S[SLOPE_Z + lane] = slopes[i, 2]
 
 
 @kernel
 def _project_blocks(
-    means: F32, quats: F32, scales: F32, opacities: F32, colors: F32, view: F32, screen_filter: Row, S: F32,
+    means: F32, quats: F32, scales: F32, opacities: F32, colors: F32, slopes: F32, view: F32,
+    screen_filter: Row, S: F32,
     next_block: I64, splats: F32, depths: F32,
 ) -> None:  # fmt: skip
     count, blocks = means.shape[0], (means.shape[0] + BLOCK - 1) // BLOCK
@@ -215,7 +236,7 @@ def _project_blocks(
             break
         first = block * BLOCK
         filled = min(BLOCK, count - first)
-        load_block(S, means, quats, scales, opacities, first, filled)
+        load_block(S, means, quats, scales, opacities, slopes, first, filled)
         for lane in range(filled):
             S[RED + lane] = colors[first + lane, 0]
             S[GREEN + lane] = colors[first + lane, 1]
@@ -246,19 +267,23 @@ def _project_blocks(
             )
             drawn = in_front & has_direction & (xx + yy < MAX_VALUE) & (given < MAX_VALUE)
             drawn &= magnitudes(mean_x) + magnitudes(mean_y) < MAX_COORDINATE
+            a = load(S, SLOPE_X + j), load(S, SLOPE_Y + j), load(S, SLOPE_Z + j)
+            px, py = times_axes(V, *a)
+            slope_u, slope_v = screen_slopes((along, across, down), px, py)
+            drawn &= magnitudes(slope_u) + magnitudes(slope_v) < MAX_VALUE
             drawn &= magnitudes(red) + magnitudes(green) + magnitudes(blue) < MAX_VALUE
             opacity = smaller(given * kept, MAX_OPACITY)
             drawn &= opacity > ZERO
             log2_opacity = log2_of(select(drawn, opacity, ONE))
             extent = select(drawn, larger(log2_opacity - LOG2_MIN_ALPHA, ZERO), ZERO)
-            reach_x, reach_y, lowest_x, chord, shear = ellipse(along, across, down, extent)
+            reach_x, reach_y, lowest_x = ellipse(along, across, down, extent)
             store(S, DEPTH + j, select(extent > ZERO, z, ZERO))
             store_records(
                 S,
                 RECORDS + j * RECORD,
                 (
                     mean_x, mean_y, along, across, down, log2_opacity, extent, red, green, blue, z,
-                    reach_x, reach_y, lowest_x, chord, shear,
+                    reach_x, reach_y, lowest_x, slope_u, slope_v,
                 ),
             )  # fmt: skip
         copy(splats, first * RECORD, S, RECORDS, filled * RECORD)
@@ -272,6 +297,7 @@ def project(
     scales: F32,
     opacities: F32,
     colors: F32,
+    slopes: F32,
     view: F32,  # [VIEW]
     screen_filter: Row,
     scratch: F32,  # [workers, SCRATCH]
@@ -282,6 +308,6 @@ def project(
     next_block[0] = 0
     for worker in numba.prange(scratch.shape[0]):
         _project_blocks(
-            means, quats, scales, opacities, colors, view, screen_filter, scratch[worker], next_block, splats,
-            depths,
+            means, quats, scales, opacities, colors, slopes, view, screen_filter, scratch[worker],
+            next_block, splats, depths,
         )  # fmt: skip

@@ -13,6 +13,7 @@ from sags_node.engine.rasterizer.projection import (
     BLOCK,
     GRAIN,
     HALF,
+    INPUTS,
     MAX_OPACITY,
     MEAN_X,
     MEAN_Y,
@@ -27,6 +28,9 @@ from sags_node.engine.rasterizer.projection import (
     SCALE_X,
     SCALE_Y,
     SCALE_Z,
+    SLOPE_X,
+    SLOPE_Y,
+    SLOPE_Z,
     TWO,
     TWO_LN2,
     ZERO,
@@ -37,6 +41,8 @@ from sags_node.engine.rasterizer.projection import (
     rotation,
     scale_axes,
     screen_axes,
+    screen_slopes,
+    times_axes,
     times_rotation,
     to_camera,
     unit_quaternion,
@@ -61,9 +67,10 @@ TINY = f4(1e-30)  # keeps quotients of vanishing Gaussians finite
 AHEAD = 8  # Gaussians between prefetch and use
 
 # Planes of a block's scratch after the inputs, which `projection` lays out.
-V_MEAN_X, V_MEAN_Y, V_MEAN_Z, V_SCALE_X, V_SCALE_Y, V_SCALE_Z = (k * BLOCK for k in range(11, 17))
-V_QUAT_W, V_QUAT_X, V_QUAT_Y, V_QUAT_Z, V_OPACITY, DRAWN = (k * BLOCK for k in range(17, 23))
-RECORDS = 23 * BLOCK  # the block's SPLAT_GRADIENT, one after the other
+V_MEAN_X, V_MEAN_Y, V_MEAN_Z, V_SCALE_X, V_SCALE_Y, V_SCALE_Z = ((INPUTS + k) * BLOCK for k in range(6))
+V_QUAT_W, V_QUAT_X, V_QUAT_Y, V_QUAT_Z, V_OPACITY, DRAWN = ((INPUTS + k) * BLOCK for k in range(6, 12))
+V_SLOPE_X, V_SLOPE_Y, V_SLOPE_Z = ((INPUTS + k) * BLOCK for k in range(12, 15))
+RECORDS = (INPUTS + 15) * BLOCK  # the block's SPLAT_GRADIENT, one after the other
 SCRATCH = RECORDS + RECORD * BLOCK  # floats per worker
 # Places in a record
 V_RED, CONTRIBUTION = (list(SPLAT_GRADIENT.names or ()).index(name) for name in ("red", "contribution"))
@@ -90,10 +97,12 @@ def _sum_pairs(S: F32, slots: Any, v_pairs: F32, first: int, filled: int) -> Any
 
 
 @inlined
-def _clear(v_means: F32, v_quats: F32, v_scales: F32, v_opacities: F32, first: int, filled: int) -> None:
+def _clear(
+    v_means: F32, v_quats: F32, v_scales: F32, v_opacities: F32, v_slopes: F32, first: int, filled: int
+) -> None:
     for i in range(first, first + filled):
         for k in range(3):
-            v_means[i, k] = v_scales[i, k] = ZERO
+            v_means[i, k] = v_scales[i, k] = v_slopes[i, k] = ZERO
         for k in range(4):
             v_quats[i, k] = ZERO
         v_opacities[i] = ZERO
@@ -101,9 +110,9 @@ def _clear(v_means: F32, v_quats: F32, v_scales: F32, v_opacities: F32, first: i
 
 @kernel
 def _blocks_backward(
-    means: F32, quats: F32, scales: F32, opacities: F32, view: F32, screen_filter: Row, S: F32,
-    next_block: I64, slots: Any, v_pairs: F32, v_colors: F32, contribution: F32, v_means: F32, v_quats: F32,
-    v_scales: F32, v_opacities: F32,
+    means: F32, quats: F32, scales: F32, opacities: F32, slopes: F32, view: F32, screen_filter: Row, S: F32,
+    next_block: I64, slots: Any, v_pairs: F32, v_colors: F32, contribution: F32, v_means: F32,
+    v_quats: F32, v_scales: F32, v_opacities: F32, v_slopes: F32,
 ) -> None:  # fmt: skip
     count, blocks = means.shape[0], (means.shape[0] + BLOCK - 1) // BLOCK
     R, t, (fx, fy, _, _), limits = unpack(view)
@@ -125,14 +134,14 @@ def _blocks_backward(
                 v_colors[i, k] = S[record + V_RED + k]
             contribution[i] = S[record + CONTRIBUTION]
         if not any_drawn:
-            _clear(v_means, v_quats, v_scales, v_opacities, first, filled)
+            _clear(v_means, v_quats, v_scales, v_opacities, v_slopes, first, filled)
             continue
-        load_block(S, means, quats, scales, opacities, first, filled)
+        load_block(S, means, quats, scales, opacities, slopes, first, filled)
         for lane in range(filled, BLOCK):
             S[DRAWN + lane] = ZERO
         for j in range(0, filled, LANES):
-            g, g_u, g_v, g_uu, g_uv, g_vv, _, _, _, g_depth, _, _, _, _, _, _ = load_records(
-                S, RECORDS + j * RECORD
+            g, g_u, g_v, g_uu, g_uv, g_vv, g_red, g_green, g_blue, g_depth, _, b_u, b_v, _, _, _ = (
+                load_records(S, RECORDS + j * RECORD)
             )
             # the forward pass again
             x, y, z = to_camera(R, t, load(S, MEAN_X + j), load(S, MEAN_Y + j), load(S, MEAN_Z + j))
@@ -163,6 +172,22 @@ def _blocks_backward(
             c_xx = half_k * along * along * g_uu
             c_xy = half_k * along * (across * g_uu + down * g_uv)
             c_yy = half_k * (across * (across * g_uu + TWO * down * g_uv) + down * down * g_vv)
+            # Slopes add p^T C d to the luminance, with p = V a, C = cov^-1. With b = sum w g (u, v) over the
+            # pixels, g the luminance's cotangent, x = C sum w g d = 2 ln 2 W^T b and y = C p = W^T s:
+            #   dL/dp = x,   dL/dmean2d = -y sum w g,   dL/dcov = -1/2 (y x^T + x y^T)
+            a_x, a_y, a_z = load(S, SLOPE_X + j), load(S, SLOPE_Y + j), load(S, SLOPE_Z + j)
+            slope_u, slope_v = screen_slopes((along, across, down), *times_axes(V, a_x, a_y, a_z))
+            x_x, x_y = TWO_LN2 * along * b_u, TWO_LN2 * (across * b_u + down * b_v)
+            y_x, y_y = along * slope_u, across * slope_u + down * slope_v
+            g_luminance = g_red + g_green + g_blue
+            v_mean_x -= y_x * g_luminance
+            v_mean_y -= y_y * g_luminance
+            c_xx -= x_x * y_x
+            c_xy -= HALF * (x_x * y_y + x_y * y_x)
+            c_yy -= x_y * y_y
+            store(S, V_SLOPE_X + j, V[0] * x_x + V[3] * x_y)
+            store(S, V_SLOPE_Y + j, V[1] * x_x + V[4] * x_y)
+            store(S, V_SLOPE_Z + j, V[2] * x_x + V[5] * x_y)
             # opacity' = opacity sqrt(det cov0 / det cov): dlog opacity'/dV = variance cov^-1 cov0^-1 V.
             # As a difference it would cancel for large Gaussians. cov0^-1 V comes from the minors
             share = TWO_LN2 * given_up * v_log_opacity / larger(det0, TINY)
@@ -171,12 +196,12 @@ def _blocks_backward(
             w0, w3 = m01 * V[4] + m02 * V[5], -m01 * V[1] - m02 * V[2]
             w1, w4 = m12 * V[5] - m01 * V[3], m01 * V[0] - m12 * V[2]
             w2, w5 = -m02 * V[3] - m12 * V[4], m02 * V[0] + m12 * V[1]
-            v0 = TWO * (c_xx * V[0] + c_xy * V[3]) + s_xx * w0 + s_xy * w3
-            v1 = TWO * (c_xx * V[1] + c_xy * V[4]) + s_xx * w1 + s_xy * w4
-            v2 = TWO * (c_xx * V[2] + c_xy * V[5]) + s_xx * w2 + s_xy * w5
-            v3 = TWO * (c_xy * V[0] + c_yy * V[3]) + s_xy * w0 + s_yy * w3
-            v4 = TWO * (c_xy * V[1] + c_yy * V[4]) + s_xy * w1 + s_yy * w4
-            v5 = TWO * (c_xy * V[2] + c_yy * V[5]) + s_xy * w2 + s_yy * w5
+            v0 = TWO * (c_xx * V[0] + c_xy * V[3]) + s_xx * w0 + s_xy * w3 + x_x * a_x
+            v1 = TWO * (c_xx * V[1] + c_xy * V[4]) + s_xx * w1 + s_xy * w4 + x_x * a_y
+            v2 = TWO * (c_xx * V[2] + c_xy * V[5]) + s_xx * w2 + s_xy * w5 + x_x * a_z
+            v3 = TWO * (c_xy * V[0] + c_yy * V[3]) + s_xy * w0 + s_yy * w3 + x_y * a_x
+            v4 = TWO * (c_xy * V[1] + c_yy * V[4]) + s_xy * w1 + s_yy * w4 + x_y * a_y
+            v5 = TWO * (c_xy * V[2] + c_yy * V[5]) + s_xy * w2 + s_yy * w5 + x_y * a_z
 
             # V = U S
             store(S, V_SCALE_X + j, v0 * U[0] + v3 * U[3])
@@ -226,6 +251,7 @@ def _blocks_backward(
             for k in range(3):
                 v_means[i, k] = S[V_MEAN_X + k * BLOCK + lane] if drawn else ZERO
                 v_scales[i, k] = S[V_SCALE_X + k * BLOCK + lane] if drawn else ZERO
+                v_slopes[i, k] = S[V_SLOPE_X + k * BLOCK + lane] if drawn else ZERO
             for k in range(4):
                 v_quats[i, k] = S[V_QUAT_W + k * BLOCK + lane] if drawn else ZERO
             v_opacities[i] = S[V_OPACITY + lane] if drawn else ZERO
@@ -237,6 +263,7 @@ def project_backward(
     quats: F32,
     scales: F32,
     opacities: F32,
+    slopes: F32,
     view: F32,  # [VIEW]
     screen_filter: Row,
     scratch: F32,  # [workers, SCRATCH]
@@ -249,11 +276,12 @@ def project_backward(
     v_quats: F32,
     v_scales: F32,
     v_opacities: F32,
+    v_slopes: F32,
 ) -> None:
     """From gradients of pairs to those of Gaussians."""
     next_block[0] = 0
     for worker in numba.prange(scratch.shape[0]):
         _blocks_backward(
-            means, quats, scales, opacities, view, screen_filter, scratch[worker], next_block, slots, v_pairs,
-            v_colors, contribution, v_means, v_quats, v_scales, v_opacities,
+            means, quats, scales, opacities, slopes, view, screen_filter, scratch[worker], next_block, slots,
+            v_pairs, v_colors, contribution, v_means, v_quats, v_scales, v_opacities, v_slopes,
         )  # fmt: skip

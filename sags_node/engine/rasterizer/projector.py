@@ -34,7 +34,9 @@ class Projector:
 
     def _allocate(self, room: int) -> None:
         self._room = room
-        self._scales, self._colors, self._v_means, self._v_scales = (aligned((room, 3)) for _ in range(4))
+        self._scales, self._colors, self._slopes, self._no_slopes = (aligned((room, 3)) for _ in range(4))
+        self._no_slopes[:] = 0
+        self._v_means, self._v_scales, self._v_slopes = (aligned((room, 3)) for _ in range(3))
         self._opacities, self._v_opacities = aligned((room,)), aligned((room,))
         self._v_quats = aligned((room, 4))
         self._v_sh_rest = aligned((room, self._terms, 3))
@@ -51,10 +53,16 @@ class Projector:
             self._scratch = aligned((thread_count(), projection_backward.SCRATCH))
         self._view, self._centre = _view_of(pinhole), _centre(pinhole)
         self._given = self._smoothed = gaussians
+        given_slopes = read_only(self._no_slopes[:n]) if gaussians.slopes is None else gaussians.slopes
+        self._given_slopes = self._smoothed_slopes = given_slopes
         if gaussians.smoothing is not None:
-            scales, opacities = self._scales[:n], self._opacities[:n]
-            smoothing.smooth(gaussians.scales, gaussians.opacities, gaussians.smoothing, scales, opacities)
+            scales, opacities, slopes = self._scales[:n], self._opacities[:n], self._slopes[:n]
+            smoothing.smooth(
+                gaussians.scales, gaussians.opacities, gaussians.smoothing, given_slopes,
+                scales, opacities, slopes,
+            )  # fmt: skip
             self._smoothed = replace(gaussians, scales=read_only(scales), opacities=read_only(opacities))
+            self._smoothed_slopes = read_only(slopes)
         gaussians, colors = self._smoothed, self._smoothed.colors
         if gaussians.sh_rest is not None:
             seen = self._colors[:n]
@@ -66,6 +74,7 @@ class Projector:
             gaussians.scales,
             gaussians.opacities,
             colors,
+            self._smoothed_slopes,
             self._view,
             self._screen_filter,
             self._scratch,
@@ -76,8 +85,8 @@ class Projector:
 
     def backward(
         self, slots: Records, v_pairs: F32, v_colors: F32, contribution: F32
-    ) -> tuple[F32, F32, F32, F32, F32]:
-        """Gradients of means, quats, scales, opacities and sh_rest.
+    ) -> tuple[F32, F32, F32, F32, F32, F32]:
+        """Gradients of means, quats, scales, opacities, sh_rest and slopes.
 
         Args:
             slots: [N] SLOTS.
@@ -86,12 +95,13 @@ class Projector:
             contribution: [N] written.
         """
         n, gaussians, given = self._count, self._smoothed, self._given
-        v_scales, v_opacities = self._v_scales[:n], self._v_opacities[:n]
+        v_scales, v_opacities, v_slopes = self._v_scales[:n], self._v_opacities[:n], self._v_slopes[:n]
         projection_backward.project_backward(
             gaussians.means,
             gaussians.quats,
             gaussians.scales,
             gaussians.opacities,
+            self._smoothed_slopes,
             self._view,
             self._screen_filter,
             self._scratch,
@@ -104,6 +114,7 @@ class Projector:
             self._v_quats[:n],
             v_scales,
             v_opacities,
+            v_slopes,
         )
         if gaussians.sh_rest is not None:
             spherical_harmonics.color_backward(
@@ -115,8 +126,16 @@ class Projector:
                 self._v_means[:n],
             )
         if given.smoothing is not None:
-            smoothing.smooth_backward(given.scales, given.opacities, given.smoothing, v_scales, v_opacities)
-        return self._v_means[:n], self._v_quats[:n], v_scales, v_opacities, self._v_sh_rest[:n]
+            smoothing.smooth_backward(
+                given.scales,
+                given.opacities,
+                given.smoothing,
+                self._given_slopes,
+                v_scales,
+                v_opacities,
+                v_slopes,
+            )
+        return self._v_means[:n], self._v_quats[:n], v_scales, v_opacities, self._v_sh_rest[:n], v_slopes
 
 
 def _centre(pinhole: Pinhole) -> Row:

@@ -142,6 +142,7 @@ def _checked(gaussians: Gaussians) -> Gaussians:
         ids=gaussians.ids,
         sh_rest=_checked_harmonics(gaussians.sh_rest, n),
         smoothing=None if gaussians.smoothing is None else _as_f32(gaussians.smoothing, (n,), "smoothing"),
+        slopes=None if gaussians.slopes is None else _as_f32(gaussians.slopes, (n, 3), "slopes"),
     )
 
 

@@ -47,11 +47,12 @@ class ReferenceRasterizer:
         none = np.zeros((len(gaussians), 0, 3), np.float32)
         arrays = [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.colors]
         arrays.append(none if gaussians.sh_rest is None else gaussians.sh_rest)
+        arrays.append(np.zeros_like(gaussians.means) if gaussians.slopes is None else gaussians.slopes)
         smoothing = None
         if gaussians.smoothing is not None:
             smoothing = torch.tensor(gaussians.smoothing, dtype=torch.float64)
         self._inputs = [torch.tensor(array, dtype=torch.float64, requires_grad=True) for array in arrays]
-        splats = project(pinhole, self._inputs, smoothing, self._antialias)
+        splats = self._splats = project(pinhole, self._inputs, smoothing, self._antialias)
         width, height = pinhole.width, pinhole.height
         self._planes = blend(splats, width, height)
         depths, rows = median(splats, width, height)
@@ -65,16 +66,12 @@ class ReferenceRasterizer:
         import torch
 
         cotangent = torch.tensor(np.where(self._drawn, v_planes, 0), dtype=torch.float64)
-        # the red plane is the sum of w * red: its gradient with the pixel weights as cotangent is the sum of
-        # w * weight
-        red = torch.tensor(np.where(self._drawn, weight, 0), dtype=torch.float64)
-        (by_red,) = torch.autograd.grad(
-            self._planes[0], self._inputs[4], red, retain_graph=True, materialize_grads=True
-        )
         found = torch.autograd.grad(
             self._planes, self._inputs, cotangent, retain_graph=True, materialize_grads=True
         )
-        return Gradients(*(gradient.numpy().astype(np.float32) for gradient in (*found, by_red[:, 0])))
+        counted = torch.tensor(np.where(self._drawn, weight, 0), dtype=torch.float64)
+        contribution = contributions(self._splats, counted, len(self._inputs[0]))
+        return Gradients(*(gradient.numpy().astype(np.float32) for gradient in (*found, contribution)))
 
     def median(self) -> tuple[F32, I32]:
         return self._depths, self._rows
@@ -102,6 +99,7 @@ class Splats:
     covariance: Tensor  # [S, 2, 2] px^2, after the 2D Mip filter
     opacity: Tensor  # [S] after the filters, above 1/255
     features: Tensor  # [S, 5] r, g, b, z (m), 1
+    gradient: Tensor  # [S, 2] of the luminance in the picture, 1/px
     rows: Tensor  # [S] which Gaussian this is
 
 
@@ -115,22 +113,24 @@ def project(
 
     Args:
         pinhole: the camera.
-        inputs: means, quats, scales, opacities, colors and, where there are any, sh_rest; shapes as in
-            `types.Gaussians`.
+        inputs: means, quats, scales, opacities, colors and, where there are any, sh_rest and slopes; shapes
+            as in `types.Gaussians`.
         smoothing: [N] as in `types.Gaussians`.
         antialias: False puts the dilation of 3D Gaussian Splatting in the place of the 2D filter.
     """
     import torch
 
-    means, quats, scales, opacities, colors, *harmonics = inputs
+    means, quats, scales, opacities, colors, *more = inputs
+    slopes = more[1] if len(more) > 1 else torch.zeros_like(means)
     R, t = torch.tensor(pinhole.R, dtype=means.dtype), torch.tensor(pinhole.t, dtype=means.dtype)
     if smoothing is not None:
         variance = torch.clamp(smoothing, min=0)[:, None]
         ratio = torch.where(variance == 0, 1, scales / torch.sqrt(scales.square() + variance))
         scales, opacities = torch.sqrt(scales.square() + variance), opacities * ratio.topk(2).values.prod(1)
-    for sh_rest in harmonics:
+        slopes = slopes * ratio
+    for sh_rest in more[:1]:
         colors = colors + _view_dependent(means + R.T @ t, sh_rest)
-    everything = torch.cat([means, quats, scales, opacities[:, None], colors], 1)
+    everything = torch.cat([means, quats, scales, opacities[:, None], colors, slopes], 1)
     usable = torch.isfinite(everything).all(1) & (torch.addmm(t, means, R.T)[:, 2] > NEAR_PLANE)
     usable &= torch.linalg.vector_norm(quats, dim=1) > MIN_QUAT_NORM
     rows = torch.nonzero(usable)[:, 0]
@@ -155,9 +155,14 @@ def project(
     opacity = torch.clamp(opacities[rows] * kept, max=MAX_OPACITY)
     features = torch.cat([colors[rows], z[:, None], torch.ones_like(z)[:, None]], 1)
 
+    # a V^T Sigma2D^-1: the expectation of the luminance along a pixel's ray is linear in the pixel
+    gradient = torch.linalg.solve(covariance, (V @ slopes[rows, :, None]))[:, :, 0]
+
     order = torch.argsort(z.detach(), stable=True)
     order = order[(opacity > MIN_ALPHA)[order]]
-    return Splats(mean2d[order], covariance[order], opacity[order], features[order], rows[order])
+    return Splats(
+        mean2d[order], covariance[order], opacity[order], features[order], gradient[order], rows[order]
+    )
 
 
 def _view_dependent(offsets: Tensor, sh_rest: Tensor) -> Tensor:
@@ -198,10 +203,16 @@ def _rotations(quats: Tensor) -> Tensor:
 
 def blend(splats: Splats, width: int, height: int) -> Tensor:
     """Planes [5, H, W]."""
+    import torch
 
     def tile(left: int, top: int, right: int, bottom: int) -> Tensor:
-        alpha, before, touching = alphas(splats, left, top, right, bottom)
-        return ((alpha * before) @ splats.features[touching]).T.reshape(5, bottom - top, right - left)
+        alpha, before, touching, offset = alphas(splats, left, top, right, bottom)
+        brighter = torch.einsum("psk,sk->ps", offset, splats.gradient[touching])
+        features = splats.features[touching] + torch.stack(
+            [brighter] * 3 + [torch.zeros_like(brighter)] * 2, 2
+        )
+        weight = alpha * before
+        return torch.einsum("ps,psk->kp", weight, features).reshape(5, bottom - top, right - left)
 
     return _tile_by_tile(tile, width, height)
 
@@ -212,7 +223,7 @@ def median(splats: Splats, width: int, height: int) -> tuple[Tensor, Tensor]:
     import torch
 
     def tile(left: int, top: int, right: int, bottom: int) -> Tensor:
-        alpha, before, touching = alphas(splats, left, top, right, bottom)
+        alpha, before, touching, _ = alphas(splats, left, top, right, bottom)
         dim = before * (1 - alpha) <= 0.5
         nobody = dim.new_ones(len(dim), 1)
         first = torch.cat([dim, nobody], 1).int().argmax(1)
@@ -237,9 +248,11 @@ def _tile_by_tile(tile: Callable[[int, int, int, int], Tensor], width: int, heig
     return torch.cat(bands, 1)
 
 
-def alphas(splats: Splats, left: int, top: int, right: int, bottom: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Of one tile with P pixels: alpha [P, S'] and the transmittance before each splat [P, S'], and which
-    splats these are [S']."""
+def alphas(
+    splats: Splats, left: int, top: int, right: int, bottom: int
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Of one tile with P pixels: alpha [P, S'] and the transmittance before each splat [P, S'], which splats
+    these are [S'], and how far the pixels are from them [P, S', 2] px."""
     import torch
 
     # the box around the ellipse on which alpha is 1/255
@@ -258,7 +271,25 @@ def alphas(splats: Splats, left: int, top: int, right: int, bottom: int) -> tupl
     alpha = torch.where(alpha >= MIN_ALPHA, alpha, 0.0)
     transmittance = torch.cumprod(1 - alpha, 1)
     before = torch.cat([torch.ones_like(alpha[:, :1]), transmittance[:, :-1]], 1)
-    return alpha, before, touching
+    return alpha, before, touching, offset
+
+
+def contributions(splats: Splats, weight: Tensor, count: int) -> Tensor:
+    """Sums over pixels of (blending weight of a Gaussian) * (weight of the pixel [H, W]), [count]."""
+    import torch
+
+    height, width = weight.shape
+    sums = weight.new_zeros(count)
+
+    def tile(left: int, top: int, right: int, bottom: int) -> Tensor:
+        alpha, before, touching, _ = alphas(splats, left, top, right, bottom)
+        seen = weight[top:bottom, left:right]
+        sums.index_add_(0, splats.rows[touching], (alpha * before).T @ seen.reshape(-1))
+        return seen[None]
+
+    with torch.no_grad():
+        _tile_by_tile(tile, width, height)
+    return sums
 
 
 def render(pinhole: Pinhole, *arrays: Tensor) -> Tensor:
