@@ -33,8 +33,8 @@ def warm_up(config: LaunchConfig) -> None:
     """Run a few small made-up frames through a pipeline of the same kind.
 
     Kernels do not depend on sizes, so this takes well under a second once they are in Numba's disk cache, and
-    about a minute the first time, in which a second process compiles those of the vision. A GPU is tried out,
-    and its kernels are compiled, by the same frames.
+    about a minute the first time, in which a second process compiles those of the vision. gsplat
+    builds its kernels for a GPU at its first start: minutes.
 
     Raises:
         UsageError: a GPU is wanted and none can be used.
