@@ -98,6 +98,6 @@ def _missing_software() -> tuple[str, str] | None:
     if _backend._C is None:
         return (
             "gsplat has no kernels and found no CUDA compiler to build them",
-            f"install the CUDA toolkit {torch.version.cuda} (nvcc), or a wheel of gsplat for it",
+            f"install the CUDA toolkit {torch.version.cuda} (nvcc)",
         )
     return None

@@ -44,8 +44,7 @@ from sags_node.types import F32, Bool, Camera, Gaussians
 
 @dataclasses.dataclass(frozen=True)
 class Backend:
-    """One of them, and a scene's size that suits it: in the interpreter a pair of a splat and a tile takes
-    milliseconds."""
+    """One of them, and a scene's size that suits it: gsplat's stages in torch are slow."""
 
     name: str
     width: int
