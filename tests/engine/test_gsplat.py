@@ -12,6 +12,7 @@ from engine_scenes import (
     DERIVATIVES,
     EXPONENTIAL,
     camera,
+    cotangents,
     draw_and_differentiate,
     one_gaussian,
     random_gaussians,
@@ -19,6 +20,7 @@ from engine_scenes import (
     with_filter,
     with_view_dependence,
 )
+from rounding import after
 
 from sags_node.engine.device import find_gpu
 from sags_node.engine.interface import MAX_OPACITY, MIN_ALPHA
@@ -67,6 +69,13 @@ def test_where_hardly_anything_shines_through_any_more(on_cpu: None) -> None:
     assert -EXPONENTIAL < apart.min() and 1e-3 < apart.max() < 1e-4 / (1 - opacity)
     for name in DERIVATIVES[:5]:
         assert 1e-4 < relative_error(found[name], true[name]) < 2e-2, name
+
+
+def test_a_drawing_may_be_differentiated_twice(on_cpu: None) -> None:
+    rasterizer = make_rasterizer("gsplat", 50, 44)
+    rasterizer.forward(random_gaussians(2, 8, VIEW), VIEW)
+    first, again = (rasterizer.backward(*cotangents(VIEW, 0)) for _ in range(2))
+    assert relative_error(again.means, first.means) < after(50 * 44)  # sums in another order
 
 
 def test_it_gives_no_median_depth(on_cpu: None) -> None:

@@ -152,6 +152,17 @@ def test_nodes_descend_as_on_the_cpu(pair: Pair) -> None:
     assert np.nanmean(np.abs(pair.row("means") - before)) > 1e-5
 
 
+def test_the_nodes_of_a_new_model_remember_nothing(pair: Pair) -> None:
+    """Also where they are fewer."""
+    pair.descend(make_gradients(0))
+    pair.model, pair.deformation = make_model(), NodeDeformation(pair.model.means, 6)
+    pair.deformation.attach(pair.model, slice(0, COUNT))
+    pair.begin()
+    assert pair.refiner.problem is None
+    pair.descend(make_gradients(1))
+    pair.check_nodes()
+
+
 def test_a_node_that_little_was_seen_of_stays(pair: Pair) -> None:
     """The weights of one Gaussian on its four nodes add up to 1: at most one of them learns from it."""
     before = pair.deformation.nodes.copy()
