@@ -160,7 +160,7 @@ def _work(stage: str, times: StageTimes) -> Work:
     tile_pairs, tiles = int(drawing["tile_starts"][-1]), drawing["tile_ends"].size
     drawn_share = drawing["drawn"].size / tiles
     touched = 0.0
-    for name, value in arrays_of(stage, STAGES, times):
+    for name, value in _arrays_of(stage, times):
         if name not in _IN_CACHE:
             items = tile_pairs * _PER_PAIR[name] if name in _PER_PAIR else value.size
             used = items * value.itemsize
@@ -171,9 +171,9 @@ def _work(stage: str, times: StageTimes) -> Work:
     return Work(touched)
 
 
-def arrays_of(stage: str, stages: Stages, times: StageTimes) -> Iterator[tuple[str, Any]]:
-    """Arrays or tensors, by their names, that the functions of a stage were given in their last calls."""
-    for function in (name for (_, name), each in stages.items() if each == stage):
+def _arrays_of(stage: str, times: StageTimes) -> Iterator[tuple[str, Any]]:
+    """Arrays, by their names, that the functions of a stage were given in their last calls."""
+    for function in (name for (_, name), each in STAGES.items() if each == stage):
         for name, value in times.arguments[function].items():
             if hasattr(value, "nbytes"):
                 yield name, value

@@ -79,7 +79,7 @@ class Drawing:
         )
         self._leaves = leaves
         self._all = torch.cat([rendered, alphas], 2).permute(2, 0, 1)  # r g b, statistic, z, w
-        self.planes = self._all[[0, 1, 2, 4, 5]].detach()
+        self.planes = torch.cat([self._all[:3], self._all[4:]]).detach()
 
     def backward(self, v_planes: Tensor, weight: Tensor) -> dict[str, Tensor]:
         """Gradients of sum(v_planes * planes), by name as in `interface.Gradients`.

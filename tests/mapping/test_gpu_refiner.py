@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -33,9 +34,10 @@ from sags_node.mapping.mapper import Mapper
 from sags_node.mapping.optimiser import LearningRates
 from sags_node.mapping.refiner import CpuRefiner, Refiner
 from sags_node.mapping.tissue_map import TissueMap
+from sags_node.pipeline import warm_up
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.rig import rectified_rig
-from sags_node.types import F32, Camera, Observation, RenderedView, Snapshot, StereoFrame
+from sags_node.types import F32, Camera, Observation, RenderedView, Snapshot, StereoFrame, StereoRig
 
 WIDTH, HEIGHT, FOCAL, BASELINE, DEPTH = 48, 24, 60.0, 0.004, 0.056
 CAPACITY = 72
@@ -382,6 +384,23 @@ def test_a_failure_before_the_first_frame(monkeypatch: pytest.MonkeyPatch) -> No
     assert played.refiner.problem is not None
     snapshot, _ = played.take(frame(0))
     assert 20 < len(snapshot.gaussians) <= CPU_SHARE * CAPACITY
+
+
+def test_the_cpu_is_ready_to_go_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else its kernels would be compiled while the video runs."""
+    made = []
+
+    class Noted:
+        def __init__(self, config: LaunchConfig, rig: StereoRig) -> None:
+            made.append(config.device)
+
+        def process(self, given: StereoFrame, *_: Any) -> Any:
+            return SimpleNamespace(views={"left": given.left})
+
+    monkeypatch.setattr(warm_up, "Pipeline", Noted)
+    monkeypatch.setattr(warm_up, "InstrumentFinder", lambda: lambda left, view: None)
+    warm_up.warm_up(LaunchConfig(device="cuda"))
+    assert made == ["cpu", "cuda"]
 
 
 def test_a_request_that_is_wrong_is_no_fault_of_the_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
