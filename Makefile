@@ -44,7 +44,7 @@ test: setup test-tools lint
 	$(BIN)/python -m pytest -m 'not live and not beside' -n 2 --dist worksteal
 	$(BIN)/python -m pytest -m 'live and not beside and not alone' -n 3 --dist loadfile
 
-# What `make test` leaves out: benchmarks, sags_lab, GPU kernels in an interpreter, and what needs the machine for itself.
+# What `make test` leaves out: benchmarks, sags_lab, gsplat on the CPU, and what needs the machine for itself.
 test-all: setup test-tools
 	$(BIN)/python -m pytest -m 'beside and not alone' -n 2 --dist loadfile
 	$(BIN)/python -m pytest -m alone

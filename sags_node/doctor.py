@@ -87,7 +87,6 @@ def examine(config: LaunchConfig) -> list[Check]:
         check_governor(),
         check_memory(),
         check_gpu(config),
-        *_gsplat(config),
         _kernel_cache(),
         *_ports(config.publish),
         *_keys(config.publish),
@@ -241,27 +240,14 @@ def check_memory(root: Path = host.ROOT) -> Check:
 
 
 def check_gpu(config: LaunchConfig) -> Check:
-    """What the GPU's test drawing says. A machine without one is no worse for it, unless one is wanted."""
-    if config.device in ("cpu", "gsplat"):
+    """Whether gsplat can draw there. A machine without one is no worse for it, unless one is wanted."""
+    if config.device == "cpu":
         return Check("GPU", "ok", f"not used: device is {config.device}")
     found = find_gpu()
     if found.kind == "cuda":
-        return Check("GPU", "ok", f"{found.name}: draws what the CPU draws")
+        return Check("GPU", "ok", f"{found.name}, gsplat {importlib.metadata.version('gsplat')}")
     level: Level = "error" if config.device == "cuda" else "warning" if has_gpu() else "ok"
     return Check("GPU", level, f"not used: {found.reason}", found.fix if level != "ok" else "")
-
-
-def _gsplat(config: LaunchConfig) -> list[Check]:
-    """Only where it was chosen: looking for it may build its kernels."""
-    if config.backend != "gsplat":
-        return []
-    from sags_node.engine.cuda import gsplat as gsplat_backend
-
-    try:
-        gsplat_backend.usable_device()
-    except UsageError as error:
-        return [Check("gsplat", "error", "cannot be used", str(error))]
-    return [Check("gsplat", "ok", importlib.metadata.version("gsplat"))]
 
 
 def _kernel_cache() -> Check:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -17,13 +16,9 @@ ROOT = Path(__file__).parent.parent
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    import torch
-
     signal.signal(signal.SIGINT, signal.default_int_handler)  # else children ignore it beside `&` in a script
     signal.signal(signal.SIGHUP, signal.SIG_DFL)  # and this one under nohup
 
-    if not torch.cuda.is_available():
-        os.environ["TRITON_INTERPRET"] = "1"  # read when a kernel is imported: they then run on the CPU
     if config.getoption("numprocesses", None):  # this starts the workers: each would compile what is not kept
         from sags_node.pipeline.warm_up import warm_up
 
@@ -33,27 +28,9 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark what is `beside` the node by its place."""
     for item in items:
-        folder, name = item.path.relative_to(ROOT / "tests").parts[0], item.path.name
-        if folder in ("benchmarks", "lab") or name.startswith("test_cuda_"):
+        folder = item.path.relative_to(ROOT / "tests").parts[0]
+        if folder in ("benchmarks", "lab"):
             item.add_marker("beside")
-
-
-@pytest.fixture(scope="module")
-def quick_interpreter() -> Iterator[None]:
-    """Triton's interpreter prepares its language anew for every call of a function, which takes longer than
-    all the rest: prepare it once."""
-    if "TRITON_INTERPRET" not in os.environ:
-        yield
-        return
-    import triton.language as tl
-    from triton.runtime import interpreter
-
-    prepared = interpreter._patch_lang(tl.zeros.fn)
-    with pytest.MonkeyPatch.context() as patch:
-        function = interpreter.InterpretedFunction
-        patch.setattr(function, "__call__", lambda self, *args, **names: self.rewrite()(*args, **names))
-        yield
-    prepared.restore()
 
 
 @pytest.fixture(scope="session")

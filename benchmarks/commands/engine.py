@@ -34,7 +34,7 @@ from sags_node.terminal.console import progress, show
     type=click.Choice(["cpu", "cuda"]),
     default="cpu",
     show_default=True,
-    help="cuda: the rasteriser on a GPU, beside gsplat where that is installed.",
+    help="cuda: only compare the mapper's refinement on a GPU with that on the CPU.",
 )
 @click.option("--quick", is_flag=True, help="A tiny scene and few runs: does it work, not how fast is it.")
 @click.option("--large", is_flag=True, help="Also a million Gaussians.")
@@ -90,22 +90,21 @@ def bench_kernels(
     python -m benchmarks kernels --yardstick splat.cpp
     """
     from benchmarks.kernels import check as guard
-    from benchmarks.kernels import device_report, report
+    from benchmarks.kernels import report
 
-    on_gpu = device == "cuda"
-    if yardstick is not None:
-        if on_gpu or large or contention or no_twin or check is not None:
-            raise UsageError("with --yardstick give --quick, --out and --json only")
-        _compare_with(yardstick, quick, out, json_out)
+    if yardstick is not None or device == "cuda":
+        both = yardstick is not None and device == "cuda"
+        if both or large or contention or no_twin or check is not None:
+            raise UsageError("with --yardstick or --device cuda give --quick, --out and --json only")
+        if yardstick is None:
+            _compare_gpu(quick, out, json_out)
+        else:
+            _compare_with(yardstick, quick, out, json_out)
         return
-    if on_gpu and (large or contention or no_twin):
-        raise UsageError("--large, --contention and --no-twin are about the CPU's table; leave them out")
     if check is not None and out is not None:
         raise UsageError("give --out or --check: a check measures up to three times and keeps no table")
     checks = check is not None
-    measure = (
-        _device_kernels(quick, checks) if on_gpu else _kernels(quick, large, contention, no_twin, checks)
-    )
+    measure = _kernels(quick, large, contention, no_twin, checks)
     if check is None:
         drawn = None if out is None else out.with_suffix(".svg")
         check_files(out)
@@ -115,13 +114,12 @@ def bench_kernels(
                 check_files(drawn)
         with progress("measuring") as advance:
             measured = measure(advance)
-        reporter = device_report if on_gpu else report
-        for table in [measured] if json_out else reporter.tables(measured):
+        for table in [measured] if json_out else report.tables(measured):
             show(table)
         write_json(out, measured)
         if drawn is not None:
             with whole(drawn) as partial:
-                partial.write_text(reporter.plot(measured), encoding="utf-8")
+                partial.write_text(report.plot(measured), encoding="utf-8")
         return
     kept = guard.read_table(check)
     with progress("measuring") as advance:
@@ -152,19 +150,14 @@ def _kernels(quick: bool, large: bool, contention: bool, no_twin: bool, checks: 
     return lambda advance: kernels.measure_kernels(settings, advance)
 
 
-def _device_kernels(quick: bool, checks: bool) -> Measure:
-    """The same of a GPU.
+def _compare_gpu(quick: bool, out: Path | None, json_out: bool) -> None:
+    from benchmarks.kernels.gpu import QUICK, GpuSettings, gpu_table, measure_gpu
 
-    Raises:
-        UsageError: torch and Triton are not here, as they must be for one.
-    """
-    from dataclasses import replace
-
-    from benchmarks.kernels import device as device_kernels
-
-    settings = device_kernels.QUICK if quick else device_kernels.DeviceSettings()
-    settings = replace(settings, gsplat=not checks)
-    return lambda advance: device_kernels.measure_device_kernels(settings, advance)
+    check_files(out)
+    with progress("measuring") as advance:
+        measured = measure_gpu(QUICK if quick else GpuSettings(), advance)
+    show(measured if json_out else gpu_table(measured))
+    write_json(out, measured)
 
 
 def _compare_with(yardstick: Path, quick: bool, out: Path | None, json_out: bool) -> None:

@@ -80,11 +80,8 @@ def compare(now: Table, kept: Table) -> list[Compared]:
     """Every kernel that both tables hold, the slowest first.
 
     Raises:
-        UsageError: they have none in common, or are of different devices.
+        UsageError: they have none in common.
     """
-    devices = [str(table.get("device", "the CPU")) for table in (now, kept)]
-    if devices[0] != devices[1]:
-        raise UsageError(f"the kept table is of {devices[1]}, this run of {devices[0]}; see --device")
     before = dict(_kernels(kept))
     found = []
     for kernel, stage in _kernels(now):

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sized
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from benchmarks.kernels.scenes import SCENES, with_harmonics
-from benchmarks.kernels.timing import WALL, Clock, Stages, StageTimes, median_ms, stage_clock
+from benchmarks.kernels.timing import Stages, StageTimes, median_ms, stage_clock
 from benchmarks.kernels.work import Work, share_of_peak, stage_rows
 from sags_node.engine.rasterizer import (
     binning,
@@ -60,44 +60,13 @@ def measure_rasterizer(case: RasterCase, runs: int, peak: Peak, twin_runs: int =
     Args:
         twin_runs: how often to draw with the slow torch twin, too; 0: not at all.
     """
-    row = time_drawing(Drawing(case), case, runs, peak, STAGES, _work)
-    if twin_runs > 0:
-        row["twin_forward_backward_ms"] = _time_twin(case, twin_runs)
-        row["speedup_over_twin"] = row["twin_forward_backward_ms"] / row["forward_backward_ms"]
-    return row
-
-
-class Drawn(Protocol):
-    """One case that a rasteriser draws again and again."""
-
-    @property
-    def gaussians(self) -> Sized: ...
-
-    def forward(self) -> object: ...
-
-    def forward_backward(self) -> object: ...
-
-
-def time_drawing(
-    drawing: Drawn,
-    case: RasterCase,
-    runs: int,
-    peak: Peak,
-    stages: Stages,
-    work_of: Callable[[str, StageTimes], Work],
-    clock: Clock = WALL,
-) -> dict[str, Any]:
-    """What a row of the table says of any rasteriser.
-
-    Args:
-        work_of: a stage's, from the arguments of its last calls.
-    """
-    forward_ms = median_ms(drawing.forward, runs, clock=clock)
-    both_ms = median_ms(drawing.forward_backward, runs, clock=clock)
-    with stage_clock(stages, clock) as times:
+    drawing = Drawing(case)
+    forward_ms = median_ms(drawing.forward, runs)
+    both_ms = median_ms(drawing.forward_backward, runs)
+    with stage_clock(STAGES) as times:
         stages_ms = times.medians_ms(drawing.forward_backward, runs)
-    work = {stage: work_of(stage, times) for stage in stages_ms}
-    return {
+    work = {stage: _work(stage, times) for stage in stages_ms}
+    row: dict[str, Any] = {
         "n": len(drawing.gaussians),
         "width": case.width,
         "height": case.height,
@@ -112,6 +81,10 @@ def time_drawing(
         "stages": stage_rows(stages_ms, work, peak),
         "between_stages_ms": max(0.0, both_ms - sum(stages_ms.values())),
     }
+    if twin_runs > 0:
+        row["twin_forward_backward_ms"] = _time_twin(case, twin_runs)
+        row["speedup_over_twin"] = row["twin_forward_backward_ms"] / row["forward_backward_ms"]
+    return row
 
 
 def _time_twin(case: RasterCase, runs: int) -> float:
@@ -187,7 +160,7 @@ def _work(stage: str, times: StageTimes) -> Work:
     tile_pairs, tiles = int(drawing["tile_starts"][-1]), drawing["tile_ends"].size
     drawn_share = drawing["drawn"].size / tiles
     touched = 0.0
-    for name, value in arrays_of(stage, STAGES, times):
+    for name, value in _arrays_of(stage, times):
         if name not in _IN_CACHE:
             items = tile_pairs * _PER_PAIR[name] if name in _PER_PAIR else value.size
             used = items * value.itemsize
@@ -198,9 +171,9 @@ def _work(stage: str, times: StageTimes) -> Work:
     return Work(touched)
 
 
-def arrays_of(stage: str, stages: Stages, times: StageTimes) -> Iterator[tuple[str, Any]]:
-    """Arrays or tensors, by their names, that the functions of a stage were given in their last calls."""
-    for function in (name for (_, name), each in stages.items() if each == stage):
+def _arrays_of(stage: str, times: StageTimes) -> Iterator[tuple[str, Any]]:
+    """Arrays, by their names, that the functions of a stage were given in their last calls."""
+    for function in (name for (_, name), each in STAGES.items() if each == stage):
         for name, value in times.arguments[function].items():
             if hasattr(value, "nbytes"):
                 yield name, value

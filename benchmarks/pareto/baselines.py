@@ -52,7 +52,7 @@ def measured_baselines(
     config = session.config
     rectifier = Rectifier(session.rig, *size)
     usable = right_pixels(session.rig, size, config.vision.tissue.exclude)
-    rasterizer = make_rasterizer(config.backend, *size)
+    rasterizer = make_rasterizer("numba", *size)
     matchers = [
         JudgedSGBM(config.vision.stereo, rectifier.camera, rectifier.baseline, scale) for scale in SGBM_SCALES
     ]

@@ -27,7 +27,7 @@ def online_at(
     config = session.config
     rectifier = Rectifier(session.rig, *size)
     tissue_of = TissueMask(config.vision.tissue, rectifier)
-    rasterizer = make_rasterizer(config.backend, *size)
+    rasterizer = make_rasterizer("numba", *size)
     places = {frame_id: place for place, frame_id in enumerate(spool.frame_ids)}
     rows = []
     with open_source(config.source.model_copy(update={"pace": "step"}), references=False) as frames:

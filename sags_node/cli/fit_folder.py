@@ -23,14 +23,13 @@ from sags_node.fitting.fit import Fit
 from sags_node.fitting.score import published, score, score_between, score_depth, score_tracks
 from sags_node.fitting.settings import FitSettings
 from sags_node.kernels.threads import configure_threads
-from sags_node.mapping.devices import device_of
 from sags_node.model.ply import write_ply
 from sags_node.pipeline.session import Session
 from sags_node.terminal import text
 
 CHECKPOINT, FIGURES, MODEL, DRAWN = "checkpoint.npz", "figures.json", "model.ply", "test"
 CHECKPOINT_PERIOD = 60.0  # s; it holds hundreds of MB
-SHOWN_EVERY = 5  # iterations: what is shown waits for the GPU
+SHOWN_EVERY = 5  # iterations
 
 Advance = Callable[[int, int | None, str], None]  # done, of, what
 
@@ -58,7 +57,7 @@ def fit_session(
     """Fit a recording and leave `checkpoint.npz`, `model.ply`, `test/` and `figures.json` in `out`.
 
     Args:
-        session: a recording; its launch's device is what iterates.
+        session: a recording.
         settings: of the fit.
         options: hold-out and LPIPS weights.
         out: an existing folder. An earlier result there is replaced.
@@ -70,7 +69,7 @@ def fit_session(
 
     Raises:
         UsageError: nothing to resume, or made with other settings or frames.
-        SagsError: the recording cannot be used, a file cannot be written, or the GPU failed.
+        SagsError: the recording cannot be used, or a file cannot be written.
     """
     stored = out / CHECKPOINT
     if resume and not stored.is_file():
@@ -79,7 +78,7 @@ def fit_session(
     configure_threads(session.config.engine.threads)
     count = session.source.frame_count
     clip = read_clip(session, options.holds_out, lambda done: advance(done, count, "reading"))
-    fit = Fit(clip, settings, device_of(session.config).kind)
+    fit = Fit(clip, settings)
     if resume:
         advance(0, None, "reading the checkpoint")
         checkpoint.load(fit, stored)
@@ -97,8 +96,6 @@ def fit_session(
         "session": session.name,
         "settings": asdict(settings),
         "machine": machine_name(),
-        "device": fit.device,
-        "device_problem": fit.problem,
         "seconds": round(fit.seconds, 1),
         "gaussians": len(fit.model),
         "cap": settings.max_gaussians,
@@ -132,7 +129,7 @@ def _iterate(fit: Fit, stored: Path, advance: Advance) -> None:
         while not fit.done:
             fit.iterate()
             if fit.iteration % SHOWN_EVERY == 0 or fit.done:
-                what = f"fitting, L1 {fit.residual:.4f}, {fit.count} Gaussians"
+                what = f"fitting, L1 {fit.residual:.4f}, {len(fit.model)} Gaussians"
                 advance(fit.iteration, fit.total, what)
             if time.monotonic() - saved > CHECKPOINT_PERIOD:
                 checkpoint.save(fit, stored)

@@ -194,18 +194,21 @@ def fit(
 
     DATASET is a folder in EndoNeRF or SCARED layout, or any session the node can play. Leaves a checkpoint,
     the model as PLY (standard 3DGS fields, filters folded in), the drawn test frames and figures.json. It
-    iterates on the device that the launch names (device:=cpu, cuda or auto); --resume may name another.
+    runs on the CPU; with device:=cuda it is refused.
 
     \b
     sags fit launch/d4d_pull.yaml --out out/d4d
     sags fit /data/endonerf/pulling_soft_tissues --schedule paper
     """
     from sags_node.cli.fit_folder import check_fit, figures_table, fit_session
+    from sags_node.config.launch_file import load_launch
     from sags_node.evaluation.measure import MeasureOptions
     from sags_node.fitting.settings import MONOCULAR, PRESETS, with_changes
 
     no_cameras = "live cameras cannot be fitted; record them first, then fit the recording"
     path, overrides = split_recording(dataset, no_cameras)
+    if load_launch(path, overrides).device == "cuda":
+        raise UsageError("device: cuda: sags fit runs on the CPU; leave that out, or set device:=cpu")
     settings = PRESETS[schedule]
     if monocular and settings.schedule == "online":
         raise UsageError("--monocular needs --schedule paper: the online start measures distances")
@@ -222,7 +225,7 @@ def fit(
     settings = replace(settings, antialias=not no_alias_free, seed=seed, **given)
     settings = with_changes(settings, changes)
     check_fit(out)
-    session = open_launched(path, [*overrides, "source.loop:=false", "source.pace:=step"])
+    session = open_launched(path, [*overrides, "device:=cpu", "source.loop:=false", "source.pace:=step"])
     with progress("fitting") as advance:
         found = fit_session(session, settings, options, out, resume, advance)
     show(found if json_out else figures_table(found))

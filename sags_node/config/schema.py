@@ -680,7 +680,7 @@ class PublishConfig(Guarded):
     )
 
 
-DeviceName = Literal["auto", "cpu", "cuda", "gsplat"]
+DeviceName = Literal["auto", "cpu", "cuda"]
 
 
 class LaunchConfig(Section):
@@ -689,8 +689,7 @@ class LaunchConfig(Section):
     ns: str = Field("sags", pattern=NAMESPACE, description="namespace of all topics")
     device: DeviceName = Field(
         "auto",
-        description="auto: a GPU where one can be used, else the CPU; cuda: a GPU, or an error; gsplat: the "
-        "CPU, and that package draws on a GPU; docs/gpu.md",
+        description="auto: a GPU where one can be used, else the CPU; cuda: a GPU, or an error; docs/gpu.md",
     )
     rig: Path | None = Field(
         None,
@@ -716,11 +715,6 @@ class LaunchConfig(Section):
         return self
 
     @property
-    def backend(self) -> Literal["numba", "gsplat"]:
-        """What draws where the CPU refines; see `make_rasterizer`."""
-        return "gsplat" if self.device == "gsplat" else "numba"
-
-    @property
     def in_real_time(self) -> bool:
         """Frames come whether or not they are taken."""
         return isinstance(self.source, LiveSource) or self.source.pace == "realtime"
@@ -742,7 +736,7 @@ REMOVED = {
     "vision.stereo.method": "inverse search matches; SGBM is a baseline of `python -m benchmarks depth`",
     "source.order": "source.geometry.first says whose the left half is",
     "source.video": "source.left names the video",
-    "engine.backend": "device:=gsplat draws with that package, any other device with our kernels",
+    "engine.backend": "device:=cuda draws and refines on a GPU, any other device on the CPU",
     "mapping.smoothing": "it is always on; `python -m benchmarks alias` says what it brings",
     "mapping.skip_duplicates": ALWAYS_ON,
     "mapping.skip_depth": ALWAYS_ON,

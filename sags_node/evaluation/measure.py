@@ -122,7 +122,6 @@ class Measurer:
         tissue_of: TissueOf,
         options: MeasureOptions,
         exclude: tuple[Box, ...] = (),
-        backend: str = "numba",
         pose: PoseWay = "session",
     ) -> None:
         """
@@ -141,7 +140,7 @@ class Measurer:
         self._options = options
         self._exclude = exclude
         camera = rectifier.camera
-        self._rasterizer = make_rasterizer(backend, camera.width, camera.height)
+        self._rasterizer = make_rasterizer("numba", camera.width, camera.height)
         self._lpips = Lpips(options.lpips_weights) if options.lpips_weights else None
         self._usable_right: Bool | None = None
         self._right_before: U8 | None = None  # of the frame processed before

@@ -122,7 +122,7 @@ def measure(
         "pace": None if isinstance(config.source, LiveSource) else config.source.pace,
         "iterations": config.mapping.iterations,
         "max_gaussians": affordable(config, *session.working_size),
-        "backend": config.backend,
+        "backend": "numba",  # what draws for the measuring
         "device": device_of(config).kind,
         "width": session.working_size[0],
         "height": session.working_size[1],
@@ -217,7 +217,7 @@ def _measured(session: Session, spool: Spool, options: MeasureOptions, progress:
     rectifier = Rectifier(session.rig, *session.working_size)
     tissue = TissueMask(config.vision.tissue, rectifier)
     exclude = config.vision.tissue.exclude
-    measurer = Measurer(spool, rectifier, tissue, options, exclude, config.backend, config.vision.pose)
+    measurer = Measurer(spool, rectifier, tissue, options, exclude, config.vision.pose)
     played = config.source.model_copy(update={"pace": "step"})
     with open_posed(config.model_copy(update={"source": played}), session.rig) as frames:
         measurer.run(frames, progress)

@@ -18,9 +18,8 @@ from sags_node.engine.adam import AdamState
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.fitting.clip import Clip, ClipFrame
 from sags_node.fitting.density import Density
-from sags_node.fitting.devices import make_learner
 from sags_node.fitting.field import make_box, make_deltas, make_field, marked, row_rates
-from sags_node.fitting.learner import DeviceKind
+from sags_node.fitting.learner import Learner
 from sags_node.fitting.settings import FitSettings
 from sags_node.fitting.start import Progress, follow_online, learn_paths, pooled_rows, remainder
 from sags_node.mapping.optimiser import COLOUR_RELAXATION, LearningRates
@@ -40,12 +39,11 @@ REFINE_DECAY = 0.1
 class Fit:
     """A model being fitted: `start`, then `iterate` until `done`."""
 
-    def __init__(self, clip: Clip, settings: FitSettings, device: DeviceKind = "cpu") -> None:
+    def __init__(self, clip: Clip, settings: FitSettings) -> None:
         """
         Args:
             clip: what it learns from.
-            settings: of the fit; a fit goes on on another device with the same.
-            device: what iterates; "cuda" where `engine.device` says that a GPU can be used.
+            settings: of the fit.
         """
         self.clip = clip
         self.settings = settings
@@ -56,7 +54,7 @@ class Fit:
         height, width = first.tissue.shape
         self.rasterizer = make_rasterizer("numba", width, height, antialias=settings.antialias)
         unseen = ~np.any([frame.tissue for frame in clip.train], axis=0) | settings.smooth_everywhere
-        self._learner = make_learner(device, self.rasterizer, settings, unseen)
+        self._learner = Learner(self.rasterizer, settings, unseen)
         self._rng = np.random.default_rng(settings.seed)
         self._order: list[int] = []
         known = first.depth[first.depth > 0]
@@ -72,7 +70,7 @@ class Fit:
         """Make the model.
 
         Raises:
-            SagsError: no frame has depth enough, or the GPU failed.
+            SagsError: no frame has depth enough.
         """
         started = time.perf_counter()
         settings, exposure, residuals = self.settings, self._make_exposure(), None
@@ -104,41 +102,12 @@ class Fit:
         return self.warm_up + self.settings.iterations
 
     @property
-    def model(self) -> DeformableModel:
-        """As far as it was learnt; the next iteration begins with what it is then.
-
-        Raises:
-            SagsError: the GPU that it was on has failed.
-        """
-        self._learner.download()
-        return self._model
-
-    @property
-    def count(self) -> int:
-        """Gaussians; unlike the model, it may be asked for at every iteration."""
-        return len(self._model)
-
-    @property
-    def device(self) -> DeviceKind:
-        """What iterates: a GPU too small is left for the CPU."""
-        return self._learner.device
-
-    @property
-    def problem(self) -> str | None:
-        """What is wrong with the device, and how to fix it; None: nothing."""
-        return self._learner.problem
-
-    @property
     def residual(self) -> float:
-        """Mean absolute colour residual of the last iteration. Reading it waits for a GPU."""
+        """Mean absolute colour residual of the last iteration."""
         return self._learner.residual
 
     def iterate(self) -> None:
-        """One step on one training frame.
-
-        Raises:
-            SagsError: the GPU failed.
-        """
+        """One step on one training frame."""
         started = time.perf_counter()
         if self.settings.schedule == "paper":
             self._descend()
@@ -162,7 +131,6 @@ class Fit:
         self.iteration += 1
         growth = self.settings.growth
         if self.iteration % growth.every == 0 and self._progress() < growth.until:
-            self._learner.download()
             pruned, split = self._density.adapt(self._rng)
             self.pruned, self.split = self.pruned + pruned, self.split + split
 
@@ -221,7 +189,7 @@ class Fit:
             "seconds": self.seconds,
             "pruned": self.pruned,
             "split": self.split,
-            "next_id": self._model.next_id,
+            "next_id": self.model.next_id,
             "order": self._order,
             "rng": self._rng.bit_generator.state,
         }
@@ -259,7 +227,7 @@ class Fit:
         self._rng.bit_generator.state = state["rng"]
 
     def _begin(self, model: DeformableModel, density: Density) -> None:
-        self._model, self._density = model, density
+        self.model, self._density = model, density
         self._learner.begin(model, density)
 
     def _progress(self) -> float:

@@ -1,8 +1,6 @@
-"""What one iteration does to a model, behind one small interface; here on the CPU."""
+"""What one iteration does to a model."""
 
 from __future__ import annotations
-
-from typing import Literal, Protocol
 
 import numpy as np
 
@@ -19,30 +17,31 @@ from sags_node.model.deformable import DeformableModel
 from sags_node.model.field import Field, FieldRates
 from sags_node.types import F32, I64, Bool
 
-DeviceKind = Literal["cpu", "cuda"]
 
-
-class Learner(Protocol):
+class Learner:
     """Improves a model, frame by frame, or a field, path by path.
 
-    What it was given with `begin` or `begin_paths` is its own from the next step on: the host's arrays show
-    what was learnt only after `download`. After that, and before the next step, they may be changed.
+    Attributes:
+        residual: mean absolute colour residual before the last step on a frame.
     """
 
-    @property
-    def device(self) -> DeviceKind:
-        """Where it works now."""
-
-    @property
-    def problem(self) -> str | None:
-        """What is wrong with it and how to fix it; None: nothing."""
-
-    @property
-    def residual(self) -> float:
-        """Mean absolute colour residual before the last step on a frame. Reading it waits for that step."""
+    def __init__(self, rasterizer: Rasterizer, settings: FitSettings, unseen: Bool) -> None:
+        """
+        Args:
+            rasterizer: for pictures of the size of `unseen`.
+            unseen: [H, W] pixels that no frame shows: where smoothness applies.
+        """
+        height, width = unseen.shape
+        self.residual = 0.0
+        self._rasterizer = rasterizer
+        self._loss = PhotometricLoss(width, height, settings.weights)
+        self._unseen = unseen
+        self._v_planes = np.zeros((5, height, width), np.float32)
+        self._weight = np.zeros((height, width), np.float32)
 
     def begin(self, model: DeformableModel, density: Density) -> None:
         """What is to be learnt from now on, and what collects the gradients of the Gaussians."""
+        self._model, self._density = model, density
 
     def descend(
         self, frame: ClipFrame, rates: F32, field_rates: FieldRates, exposure_rate: float, deformed: bool
@@ -56,47 +55,6 @@ class Learner(Protocol):
             exposure_rate: of the gains.
             deformed: False leaves the field out.
         """
-
-    def refine(self, frame: ClipFrame, rates: F32, relaxation: float, field_rates: FieldRates) -> None:
-        """A step of the joint refinement after the online pass: residuals and field, against squared colour
-        residuals. See `DeformableModel.refine`."""
-
-    def begin_paths(self, field: Field, rows: F32, paths: Paths) -> None:
-        """The field, before there is a model, is to lead canonical rows [N, 14] along these paths."""
-
-    def learn_paths(self, slot: int, picked: I64, rates: FieldRates) -> None:
-        """A step of the field against the mean absolute errors of the positions of some Gaussians, `picked`
-        [P], at one of the paths' times."""
-
-    def download(self) -> None:
-        """Write what was learnt into what was given.
-
-        Raises:
-            SagsError: it is lost.
-        """
-
-
-class CpuLearner:
-    """The learner that works on the arrays it was given."""
-
-    device: DeviceKind = "cpu"
-    problem: str | None = None
-
-    def __init__(self, rasterizer: Rasterizer, settings: FitSettings, unseen: Bool) -> None:
-        height, width = unseen.shape
-        self.residual = 0.0
-        self._rasterizer = rasterizer
-        self._loss = PhotometricLoss(width, height, settings.weights)
-        self._unseen = unseen
-        self._v_planes = np.zeros((5, height, width), np.float32)
-        self._weight = np.zeros((height, width), np.float32)
-
-    def begin(self, model: DeformableModel, density: Density) -> None:
-        self._model, self._density = model, density
-
-    def descend(
-        self, frame: ClipFrame, rates: F32, field_rates: FieldRates, exposure_rate: float, deformed: bool
-    ) -> None:
         observation = frame.observation()
         gaussians = self._model.at(frame.t_capture_ns, [frame.camera], deformed)
         planes = self._rasterizer.forward(gaussians, frame.camera)
@@ -109,6 +67,8 @@ class CpuLearner:
         self._density.observe(gradients)
 
     def refine(self, frame: ClipFrame, rates: F32, relaxation: float, field_rates: FieldRates) -> None:
+        """A step of the joint refinement after the online pass: residuals and field, against squared colour
+        residuals. See `DeformableModel.refine`."""
         observation = frame.observation()
         gaussians = self._model.at(frame.t_capture_ns, [frame.camera])
         planes = self._rasterizer.forward(gaussians, frame.camera)
@@ -120,9 +80,12 @@ class CpuLearner:
         self._model.refine(gradients, rates, relaxation, field_rates)
 
     def begin_paths(self, field: Field, rows: F32, paths: Paths) -> None:
+        """The field, before there is a model, is to lead canonical rows [N, 14] along these paths."""
         self._field, self._rows, self._paths = field, rows, paths
 
     def learn_paths(self, slot: int, picked: I64, rates: FieldRates) -> None:
+        """A step of the field against the mean absolute errors of the positions of some Gaussians, `picked`
+        [P], at one of the paths' times."""
         field, paths = self._field, self._paths
         canonical = self._rows[picked]
         field.follow(canonical[:, columns.MEAN])
@@ -132,6 +95,3 @@ class CpuLearner:
         v_deformed[:, columns.MEAN] = np.sign(off[:, columns.MEAN]) / np.float32(len(picked))
         field.backward(v_deformed)
         field.step(rates)
-
-    def download(self) -> None:
-        pass

@@ -181,11 +181,7 @@ class _Places:
 def learn_paths(
     learner: Learner, field: Field, rows: F32, paths: Paths, settings: FitSettings, progress: Progress
 ) -> None:
-    """Let the field learn the paths: mean absolute errors of positions, at random times.
-
-    Raises:
-        SagsError: the learner's GPU failed.
-    """
+    """Let the field learn the paths: mean absolute errors of positions, at random times."""
     rng = np.random.default_rng(settings.seed)
     learner.begin_paths(field, rows, paths)
     for step in range(PATH_STEPS):
@@ -194,7 +190,6 @@ def learn_paths(
         picked = rng.choice(known, min(PATH_POINTS, len(known)), replace=False)
         learner.learn_paths(t, picked, settings.field_rates.scaled(settings.decay ** (step / PATH_STEPS)))
         progress("learning the paths", step + 1, PATH_STEPS)
-    learner.download()
     field.follow(rows[:, columns.MEAN])
 
 

@@ -83,7 +83,7 @@ def make_budget(
         rung = EVERYTHING if mapping.rung is None else rungs_of(config, skips)[0]
         return StepBudget(mapping.iterations, rung)
     if speed is None:
-        speed = measured_speed(make_rasterizer(config.backend, *SAMPLE_SIZE))
+        speed = measured_speed(make_rasterizer("numba", *SAMPLE_SIZE))
     return TimeBudget(Ladder(rungs_of(config, skips), width * height, 1e-3 * mapping.frame_ms(rate), speed))
 
 
@@ -100,7 +100,7 @@ def with_scale(config: LaunchConfig, width: int, height: int, rate: float | None
         return config
     scale = 1.0
     if config.in_real_time and config.mapping.iterations is None and device_of(config).kind == "cpu":
-        speed = measured_speed(make_rasterizer(config.backend, *SAMPLE_SIZE))
+        speed = measured_speed(make_rasterizer("numba", *SAMPLE_SIZE))
         seconds = 1e-3 * config.mapping.frame_ms(rate)
         scale = best_scale(rungs_of(config), width * height, seconds, speed)
     return config.model_copy(update={"vision": config.vision.model_copy(update={"scale": scale})})
@@ -112,14 +112,13 @@ def make_refiner(config: LaunchConfig, width: int, height: int) -> Refiner:
     Raises:
         UsageError: a GPU is wanted and none can be used.
     """
-    cpu = CpuRefiner(partial(make_rasterizer, config.backend))
+    cpu = CpuRefiner(partial(make_rasterizer, "numba"))
     if device_of(config).kind == "cpu":
         return cpu
-    from sags_node.mapping.cuda.refiner import CudaRefiner
-    from sags_node.mapping.fallback_refiner import FallbackRefiner
+    from sags_node.mapping.gpu_refiner import GpuRefiner
 
     on_cpu = affordable(config.model_copy(update={"device": "cpu"}), width, height)
-    return FallbackRefiner(CudaRefiner(), cpu, on_cpu / affordable(config, width, height))
+    return GpuRefiner(cpu, on_cpu / affordable(config, width, height))
 
 
 def _speed(config: LaunchConfig) -> float:

@@ -14,11 +14,14 @@ from sags_node.model.gaussians import NEIGHBOURS, GaussianModel
 from sags_node.types import F32, F64, I32, I64
 
 _SMOOTHING_ROUNDS = 3  # how far, in nodes, motion spreads into hidden tissue per frame
-_LEAST_SEEN = 0.5  # weight of what was seen around a node: below it nothing is known of it
+LEAST_SEEN = 0.5  # weight of what was seen around a node: below it nothing is known of it
 _LEAST_STIFFNESS = 0.2  # in squared node spacings: what little is known of a gradient is not believed
 # No gradients give more momentum than 1.57 times the root of the variance (Cauchy-Schwarz over both running
 # means), where that is far above the smallest float.
-_STEEPEST = 2.0
+STEEPEST = 2.0
+INERTIA, CALM = 0.2, 0.05  # how fast momentum and variance follow the gradient
+NODE_EPS = 1e-12  # keeps a node that nothing pulls where it is
+MIN_CONTRIBUTION = 1e-3  # px: a Gaussian that contributes less moves no node
 _NEW_NODE_DISTANCE = 1.5  # in node spacings: farther new tissue gets nodes of its own
 
 Recall = Callable[[F32, F32], F32 | None]  # motion [M, 3] m and the weight [M] behind it -> all nodes' motion
@@ -75,7 +78,7 @@ class NodeDeformation:
         """
         motion, weight = _average(displacements, seen, model.node_index, model.node_weight, len(self.nodes))
         self.seen = weight
-        hidden = weight <= _LEAST_SEEN
+        hidden = weight <= LEAST_SEEN
         expected = recall(motion, weight) if hidden.any() else None
         if expected is None:
             _spread(motion, weight, self._neighbours, _SMOOTHING_ROUNDS)
@@ -86,7 +89,7 @@ class NodeDeformation:
             motion += expected
         # The motion is that of the middle of what was seen around a node, not of the node itself.
         places, _ = _average(model.means, seen, model.node_index, model.node_weight, len(self.nodes))
-        places = np.where(weight[:, None] > _LEAST_SEEN, places, self.nodes)
+        places = np.where(weight[:, None] > LEAST_SEEN, places, self.nodes)
         least = np.float32(_LEAST_STIFFNESS * self.spacing**2)
         gradients = _motion_gradients(places, motion, self._neighbours, least)
         _carry(places, motion, gradients, model.node_index, model.node_weight, model.means, model.quats)
@@ -103,17 +106,17 @@ class NodeDeformation:
         """
         gradient, _ = _average(
             gradients,
-            (contribution > 1e-3).astype(np.float32),
+            (contribution > MIN_CONTRIBUTION).astype(np.float32),
             model.node_index,
             model.node_weight,
             len(self.nodes),
         )
-        self._momentum += 0.2 * (gradient - self._momentum)
-        self._variance += 0.05 * (gradient * gradient - self._variance)
+        self._momentum += INERTIA * (gradient - self._momentum)
+        self._variance += CALM * (gradient * gradient - self._variance)
         size = np.sqrt(self._variance)
-        damaged = ~((np.abs(self._momentum) <= _STEEPEST * size) & np.isfinite(size))
+        damaged = ~((np.abs(self._momentum) <= STEEPEST * size) & np.isfinite(size))
         self._momentum[damaged] = self._variance[damaged] = size[damaged] = 0
-        motion = (-step * self._momentum / (size + 1e-12)).astype(np.float32)
+        motion = (-step * self._momentum / (size + NODE_EPS)).astype(np.float32)
         self.nodes += motion
         _skin(motion, model.node_index, model.node_weight, model.means)
 
@@ -256,14 +259,14 @@ def _average(values: F32, seen: F32, index: I32, weight: F32, nodes: int) -> tup
                     total[j, a] += w * values[i, a]
     for j in range(nodes):
         for a in range(3):
-            total[j, a] = total[j, a] / mass[j] if mass[j] > np.float32(_LEAST_SEEN) else np.float32(0)
+            total[j, a] = total[j, a] / mass[j] if mass[j] > np.float32(LEAST_SEEN) else np.float32(0)
     return total, mass
 
 
 @kernel
 def _spread(motion: F32, mass: F32, neighbours: I32, rounds: int) -> None:
     """Nodes that nothing was seen of take the mean motion of the neighbours that have one."""
-    known = mass > np.float32(_LEAST_SEEN)
+    known = mass > np.float32(LEAST_SEEN)
     for _ in range(rounds):
         reached = known.copy()
         for j in range(len(motion)):

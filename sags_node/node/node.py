@@ -86,7 +86,7 @@ class Node:
             pipeline = Pipeline(config, rig, rate=rate)
         statistics = Statistics(config.source)
         self._allowance = Allowance()
-        views = Views(config.backend, self._allowance, latency=lambda: statistics.latency_s)
+        views = Views(self._allowance, latency=lambda: statistics.latency_s)
         self._state = NodeState(config, pipeline, pipeline.make_budget(), views, statistics=statistics)
         self._operations = Operations(self._state, self._hand_over_view)
         self._pictures: Latest[tuple[RectifiedPair, int]] = Latest(on_put=self._wake_publishing)  # and epoch

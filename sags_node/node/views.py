@@ -60,7 +60,6 @@ class Views:
 
     def __init__(
         self,
-        backend: str,
         allowance: Allowance,
         clock: Clock = time.monotonic,
         processor_clock: Clock = time.thread_time,
@@ -73,7 +72,6 @@ class Views:
         """
         self.status: Mapping[str, ViewStatus] = {}
         self.pairs: Collection[str] = ()
-        self._backend = backend
         self._allowance = allowance
         self._clock = clock
         self._processor_clock = processor_clock
@@ -153,7 +151,7 @@ class Views:
         started = self._processor_clock()
         size = request.width, request.height
         if size not in self._rasterizers:
-            self._rasterizers[size] = make_rasterizer(self._backend, *size)
+            self._rasterizers[size] = make_rasterizer("numba", *size)
         snapshot = scene.snapshot
         camera = view_camera(request, snapshot.camera)
         eyes = {"": camera}

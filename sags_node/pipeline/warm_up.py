@@ -13,6 +13,7 @@ import numpy as np
 from sags_node.config.schema import LaunchConfig, MappingConfig, VisionConfig
 from sags_node.kernels.cache import is_cold
 from sags_node.mapping.budget import StepBudget
+from sags_node.mapping.devices import device_of
 from sags_node.pipeline.pipeline import FrameRequest, Pipeline
 from sags_node.processes import end
 from sags_node.rig import rectified_rig
@@ -33,12 +34,14 @@ def warm_up(config: LaunchConfig) -> None:
     """Run a few small made-up frames through a pipeline of the same kind.
 
     Kernels do not depend on sizes, so this takes well under a second once they are in Numba's disk cache, and
-    about a minute the first time, in which a second process compiles those of the vision. A GPU is tried out,
-    and its kernels are compiled, by the same frames.
+    about a minute the first time, in which a second process compiles those of the vision. With a GPU those of
+    the CPU are made ready too: it goes on where the GPU fails.
 
     Raises:
         UsageError: a GPU is wanted and none can be used.
     """
+    if device_of(config).kind == "cuda":
+        warm_up(config.model_copy(update={"device": "cpu"}))
     small = config.model_copy(
         update={
             "vision": VisionConfig(stereo=config.vision.stereo, pose=config.vision.pose),

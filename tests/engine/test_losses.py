@@ -1,9 +1,8 @@
-"""The tissue loss of both engines against autograd of what it states; the device's is interpreted."""
+"""The tissue loss, the kernel's and that in torch for a GPU, against autograd of what it states."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,13 +10,10 @@ import pytest
 from engine_scenes import as_bytes, camera, on_one_thread, random_gaussians
 from rounding import after, exact
 
-from sags_node.engine.losses.pieces import PIECE
+from sags_node.engine.losses.pieces import LEVEL, PIECE
 from sags_node.engine.losses.tissue import tissue_loss
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.types import F32
-
-# the device's kernels divide by a coverage of zero and select afterwards; a GPU says nothing of it
-pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning:triton.runtime.interpreter")
 
 HEIGHT, WIDTH = 23, 31
 DEPTH_WEIGHT, DEPTH_SCALE = 0.02, 1e-3
@@ -55,15 +51,22 @@ def on_cpu(inputs: dict[str, Any]) -> tuple[float, F32, F32]:
     return mean, v_planes, weight
 
 
-@pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.beside)])
-def run(request: pytest.FixtureRequest) -> Run:
-    if request.param == "cpu":
-        return on_cpu
-    pytest.importorskip("triton", reason="Triton comes with torch's CUDA builds: pip install triton")
-    request.getfixturevalue("quick_interpreter")
-    from device_losses import tissue_loss
+def in_torch(inputs: dict[str, Any]) -> tuple[float, F32, F32]:
+    import torch
 
-    return partial(tissue_loss, depth_weight=DEPTH_WEIGHT, depth_scale=DEPTH_SCALE)
+    from sags_node.mapping import gpu_refiner
+
+    given = {name: torch.tensor(array) for name, array in inputs.items()}
+    given["image"] = given["image"].permute(2, 0, 1) * float(LEVEL)
+    mean, *rest = gpu_refiner.tissue_loss(**given, depth_weight=DEPTH_WEIGHT, depth_scale=DEPTH_SCALE)
+    v_planes, weight = (each.numpy() for each in rest)
+    return mean.item(), v_planes, weight
+
+
+@pytest.fixture(params=[on_cpu, in_torch])
+def run(request: pytest.FixtureRequest) -> Run:
+    found: Run = request.param
+    return found
 
 
 def twin(planes: Any, image: Any, tissue: Any, depth: Any) -> list[Any]:

@@ -1,8 +1,7 @@
-"""The training loss of both engines against autograd of its twin, term by term; the device's interpreted."""
+"""The training loss against autograd of its twin, term by term."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import astuple, fields, replace
 from typing import Any
 
@@ -17,9 +16,6 @@ from sags_node.engine.losses.photometric import LossTerms, LossWeights, Photomet
 from sags_node.engine.losses.pieces import PIECE
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.types import F32
-
-# the device's kernels divide by a coverage of zero and select afterwards; a GPU says nothing of it
-pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning:triton.runtime.interpreter")
 
 HEIGHT, WIDTH = 37, 53
 TERMS = [field.name for field in fields(LossTerms)]
@@ -47,9 +43,7 @@ def frame(height: int = HEIGHT, width: int = WIDTH, seed: int = 0) -> dict[str, 
     }
 
 
-def on_cpu(
-    inputs: dict[str, Any], weights: LossWeights, normalised: bool = True
-) -> tuple[LossTerms, F32, F32]:
+def run(inputs: dict[str, Any], weights: LossWeights, normalised: bool = True) -> tuple[LossTerms, F32, F32]:
     _, height, width = inputs["planes"].shape
     v_planes = np.full((5, height, width), np.nan, np.float32)  # every value must be written
     weight = np.full((height, width), np.nan, np.float32)
@@ -57,20 +51,6 @@ def on_cpu(
         **inputs, v_planes=v_planes, weight=weight
     )
     return terms, v_planes, weight
-
-
-Run = Callable[..., tuple[LossTerms, F32, F32]]
-
-
-@pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.beside)])
-def run(request: pytest.FixtureRequest) -> Run:
-    if request.param == "cpu":
-        return on_cpu
-    pytest.importorskip("triton", reason="Triton comes with torch's CUDA builds: pip install triton")
-    request.getfixturevalue("quick_interpreter")
-    from device_losses import photometric
-
-    return photometric
 
 
 def twin(inputs: dict[str, Any], normalised: bool) -> tuple[Any, dict[str, Any]]:
@@ -140,7 +120,7 @@ def cancelled(inputs: dict[str, Any], normalised: bool) -> float:
 
 @pytest.mark.parametrize("normalised", [True, False])
 @pytest.mark.parametrize("name", TERMS)
-def test_value_and_gradient_of_each_term(run: Run, name: str, normalised: bool) -> None:
+def test_value_and_gradient_of_each_term(name: str, normalised: bool) -> None:
     inputs = frame()
     weights = replace(OFF, **{name: 1.0})
     terms, v_planes, _ = run(inputs, weights, normalised)
@@ -148,7 +128,7 @@ def test_value_and_gradient_of_each_term(run: Run, name: str, normalised: bool) 
 
 
 @pytest.mark.parametrize("normalised", [True, False])
-def test_gradient_of_the_weighted_sum(run: Run, normalised: bool) -> None:
+def test_gradient_of_the_weighted_sum(normalised: bool) -> None:
     inputs = frame()
     terms, v_planes, _ = run(inputs, ALL, normalised)
     check(inputs, ALL, normalised, TERMS, terms.total(ALL), v_planes)
@@ -171,7 +151,7 @@ def test_twin_by_finite_differences(normalised: bool) -> None:
     assert torch.autograd.gradcheck(terms, inputs["planes"], eps=1e-7, rtol=1e-3)
 
 
-def test_weight_is_the_derivative_of_the_colour(run: Run) -> None:
+def test_weight_is_the_derivative_of_the_colour() -> None:
     inputs = frame()
     coverage = inputs["planes"][4]
     _, _, weight = run(inputs, LossWeights())
@@ -182,7 +162,7 @@ def test_weight_is_the_derivative_of_the_colour(run: Run) -> None:
     np.testing.assert_array_equal(weight, inputs["tissue"])
 
 
-def test_correlation_knows_no_scale_and_offset(run: Run) -> None:
+def test_correlation_knows_no_scale_and_offset() -> None:
     inputs = frame()
     inputs["depth"] = np.full((HEIGHT, WIDTH), 0.055, np.float32)
     inputs["depth"] += np.linspace(0, 0.005, WIDTH, dtype=np.float32)
@@ -196,7 +176,7 @@ def test_correlation_knows_no_scale_and_offset(run: Run) -> None:
     assert relative_error(v_other, v_metric) < within
 
 
-def test_flat_depth_has_no_correlation(run: Run) -> None:
+def test_flat_depth_has_no_correlation() -> None:
     inputs = frame()
     inputs["depth"][:] = 0.05
     terms, v_planes, _ = run(inputs, replace(OFF, correlation=1.0))
@@ -204,7 +184,7 @@ def test_flat_depth_has_no_correlation(run: Run) -> None:
     assert not v_planes.any()
 
 
-def test_smoothness_everywhere_unless_a_region_is_given(run: Run) -> None:
+def test_smoothness_everywhere_unless_a_region_is_given() -> None:
     inputs = frame()
     everywhere = {**inputs, "unseen": np.ones((HEIGHT, WIDTH), np.bool_)}
     nowhere = {**inputs, "unseen": np.zeros((HEIGHT, WIDTH), np.bool_)}
@@ -218,7 +198,7 @@ def test_smoothness_everywhere_unless_a_region_is_given(run: Run) -> None:
     assert not v_planes.any()
 
 
-def test_no_tissue_no_gradient(run: Run) -> None:
+def test_no_tissue_no_gradient() -> None:
     inputs = frame() | {
         "tissue": np.zeros((HEIGHT, WIDTH), np.bool_),
         "unseen": np.zeros((HEIGHT, WIDTH), np.bool_),
@@ -232,7 +212,7 @@ def test_no_tissue_no_gradient(run: Run) -> None:
 @pytest.mark.parametrize("normalised", [True, False])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("where", ["depth", *range(5)])
-def test_broken_pixels_are_left_out(run: Run, where: str | int, value: float, normalised: bool) -> None:
+def test_broken_pixels_are_left_out(where: str | int, value: float, normalised: bool) -> None:
     clean, broken = frame(9, 13), frame(9, 13)
     for inputs in (clean, broken):
         inputs["tissue"][4, 5] = True
@@ -263,7 +243,7 @@ def test_broken_pixels_are_left_out(run: Run, where: str | int, value: float, no
 @pytest.mark.parametrize(
     ("height", "width"), [(1, 1), (1, 2), (2, 1), (1, 300), (257, 1), (16, 16), (3, 70), (17, 4)]
 )
-def test_every_size(run: Run, height: int, width: int) -> None:
+def test_every_size(height: int, width: int) -> None:
     inputs = frame(height, width)
     inputs["tissue"][:] = True
     inputs["planes"][4] += np.float32(0.5)
@@ -285,14 +265,14 @@ def test_memory_of_an_earlier_frame_does_not_show() -> None:
     v_planes, weight = np.empty((5, HEIGHT, WIDTH), np.float32), np.empty((HEIGHT, WIDTH), np.float32)
     loss.evaluate(**frame(seed=1), v_planes=v_planes, weight=weight)
     terms = loss.evaluate(**frame(seed=2), v_planes=v_planes, weight=weight)
-    expected, v_expected, _ = on_cpu(frame(seed=2), ALL)
+    expected, v_expected, _ = run(frame(seed=2), ALL)
     assert terms == expected
     np.testing.assert_array_equal(v_planes, v_expected)
 
 
 def test_same_bits_for_one_and_all_threads() -> None:
-    together = on_cpu(frame(), ALL)
-    alone = on_one_thread(lambda: on_cpu(frame(), ALL))
+    together = run(frame(), ALL)
+    alone = on_one_thread(lambda: run(frame(), ALL))
     assert alone[0] == together[0]
     np.testing.assert_array_equal(alone[1], together[1])
 

@@ -16,13 +16,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from sags_node.engine.cuda import gsplat as gsplat_backend
+from sags_node.engine import device, gsplat_backend
 
 ALPHA_THRESHOLD, MAX_ALPHA, OPAQUE = 1 / 255, 0.999, 1e-4  # of gsplat's kernels
 
 
 def use_gsplat_on_cpu(patch: pytest.MonkeyPatch) -> None:
-    """Replace the stages, and what chooses gsplat's device, until `patch` is undone."""
+    """Replace the stages, and what looks for a GPU, until `patch` is undone."""
     import gsplat
     from gsplat import rendering
     from gsplat.cuda import _torch_impl, _wrapper
@@ -44,7 +44,8 @@ def use_gsplat_on_cpu(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(rendering, "rasterize_to_pixels", rasterize_to_pixels)
     patch.setattr(_wrapper, "rasterize_to_indices_in_range", indices_in_range)
     patch.setattr(gsplat, "spherical_harmonics", _torch_impl._spherical_harmonics)
-    patch.setattr(gsplat_backend, "usable_device", lambda: torch.device("cpu"))
+    patch.setattr(device, "find_gpu", lambda: device.Device("cuda", "gsplat's stages in torch"))
+    patch.setattr(gsplat_backend, "gpu", lambda: torch.device("cpu"))
 
 
 def projection(

@@ -295,7 +295,7 @@ def run(views: Views, clocks: Clocks, seconds: float, watched: set[str], waited:
 
 def opened(cost: float, **rates: float) -> tuple[Views, Clocks]:
     clocks = Clocks(cost)
-    views = Views("numba", clocks.allowance, clocks.wall, clocks.processor)
+    views = Views(clocks.allowance, clocks.wall, clocks.processor)
     for name, rate in rates.items():
         request = parse(ViewRequest, {"name": name, "width": 32, "height": 32, "rate_hz": rate})
         assert views.open(request, plane_result()) is not None
@@ -407,7 +407,7 @@ def test_work_that_is_not_shared_out_keeps_to_its_allowance(missed: bool, share:
 
 def test_a_view_opened_before_the_first_frame_is_drawn_with_it() -> None:
     clocks = Clocks(0.005)
-    views = Views("numba", clocks.allowance, clocks.wall, clocks.processor)
+    views = Views(clocks.allowance, clocks.wall, clocks.processor)
     assert views.open(parse(ViewRequest, {"name": "a", "width": 32, "height": 32}), None) is None
     assert views.status["a"].limited_by == "no frame has come yet"
     assert run(views, clocks, 0.1, set()) == ["a"]
@@ -424,7 +424,7 @@ def test_a_view_ahead_is_drawn_where_the_tissue_is_expected_and_says_so() -> Non
     )  # fmt: skip
     scene = replace(plane, snapshot=replace(plane.snapshot, forecast=forecast))
     there = replace(gaussians, means=gaussians.means + 2 * step)
-    views = Views("numba", Allowance(), lambda: 0.0, lambda: 0.0, latency=lambda: 0.05)
+    views = Views(Allowance(), lambda: 0.0, lambda: 0.0, latency=lambda: 0.05)
     asked = {"width": 64, "height": 48}
     for name, ahead_ms, seconds in (("now", 0, 0.0), ("far", 500, 0.1), ("own", "auto", 0.05)):
         drawn = views.open(parse(ViewRequest, {"name": name, "ahead_ms": ahead_ms, **asked}), scene)

@@ -35,6 +35,7 @@ ZERO, ONE, INFINITY = f4(0.0), f4(1.0), f4(np.inf)
 COVERED = f4(0.05)  # below this coverage the normalised colour means nothing
 DEPTH_COVERED = f4(0.3)  # the same for depth
 FULL = f4(0.9)  # coverage that tissue should reach
+COVERAGE_WEIGHT = 2e-3  # of the push towards it, against the colour term
 MAX_RESIDUAL = f4(1e3)  # also rejects NaN in the picture
 
 WEIGHT = u8(FREE * PLANE)  # planes beyond those of `pieces`
@@ -146,7 +147,7 @@ def tissue_loss(
     weight: F32,
     depth_weight: float,
     depth_scale: float,
-    coverage_weight: float = 2e-3,
+    coverage_weight: float = COVERAGE_WEIGHT,
 ) -> float:
     """Compare planes with a frame and write the loss's gradient. With coverage A, colour c = C / A and depth
     d = D / A, summed over tissue pixels:

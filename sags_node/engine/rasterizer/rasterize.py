@@ -30,8 +30,8 @@ def make_rasterizer(backend: str, width: int, height: int, antialias: bool = Tru
     """A rasteriser for pictures of one size (px).
 
     Args:
-        backend: "numba" (CPU), "cuda" (Triton kernels on a GPU), "gsplat" (that package's kernels on a GPU,
-            without median depth) or "reference" (torch, slow).
+        backend: "numba" (CPU), "gsplat" (that package's kernels on a GPU, without median depth) or
+            "reference" (torch, slow).
         width, height: px.
         antialias: the 2D filter of Mip-Splatting. False: the fixed dilation of 3D Gaussian Splatting in its
             place, which grows brighter and thicker when the picture gets smaller. For comparison only.
@@ -45,19 +45,15 @@ def make_rasterizer(backend: str, width: int, height: int, antialias: bool = Tru
         from sags_node.engine.rasterizer.cpu import NumbaRasterizer
 
         return _CheckedRasterizer(NumbaRasterizer(width, height, antialias), width, height)
-    if backend == "cuda":
-        from sags_node.engine.cuda.backend import cuda_backend
-
-        return _CheckedRasterizer(cuda_backend(width, height, antialias), width, height)
     if backend == "gsplat":
-        from sags_node.engine.cuda.gsplat import gsplat_backend
+        from sags_node.engine.gsplat_backend import GsplatBackend
 
-        return _CheckedRasterizer(gsplat_backend(width, height, antialias), width, height)
+        return _CheckedRasterizer(GsplatBackend(width, height, antialias), width, height)
     if backend == "reference":
         from sags_node.engine.reference.rasterizer import ReferenceRasterizer
 
         return _CheckedRasterizer(ReferenceRasterizer(antialias), width, height)
-    raise UsageError(f"unknown engine backend '{backend}'; choose numba, cuda, gsplat or reference")
+    raise UsageError(f"unknown engine backend '{backend}'; choose numba, gsplat or reference")
 
 
 def rasterize(

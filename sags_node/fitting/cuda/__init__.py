@@ -1,1 +1,0 @@
-"""The offline fit on a GPU."""

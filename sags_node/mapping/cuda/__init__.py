@@ -1,1 +1,0 @@
-"""The mapper's refinement on a GPU."""

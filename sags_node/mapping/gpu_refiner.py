@@ -1,0 +1,354 @@
+"""The refiner on a GPU: gsplat draws, torch does the rest, and the CPU goes on where the GPU fails.
+
+The model is sent once per frame and fetched once. Motion, removal and insertion stay on the CPU.
+"""
+
+from __future__ import annotations
+
+import functools
+import logging
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Concatenate, ParamSpec, TypeVar
+
+import torch
+
+from sags_node.engine import gsplat_backend
+from sags_node.engine.gsplat_backend import Drawing, pixels_of, sent
+from sags_node.engine.interface import MAX_OPACITY
+from sags_node.engine.losses.pieces import LEVEL
+from sags_node.engine.losses.tissue import COVERAGE_WEIGHT, COVERED, DEPTH_COVERED, FULL, MAX_RESIDUAL
+from sags_node.engine.rasterizer.rasterize import TILE_HEIGHT, TILE_WIDTH, as_pinhole
+from sags_node.mapping import optimiser
+from sags_node.mapping.exposure import exposure_gain
+from sags_node.mapping.focus import EVERY, tile_grid
+from sags_node.mapping.optimiser import BETA1, BETA2, LearningRates
+from sags_node.mapping.refiner import DEPTH_SCALE, DEPTH_WEIGHT, CpuRefiner
+from sags_node.model.deformation import (
+    CALM,
+    INERTIA,
+    LEAST_SEEN,
+    MIN_CONTRIBUTION,
+    NODE_EPS,
+    STEEPEST,
+    NodeDeformation,
+)
+from sags_node.model.gaussians import GaussianModel
+from sags_node.types import F32, U8, Bool, Camera, Finding, Gaussians, Observation
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+log = logging.getLogger(__name__)
+
+# Rows of the model, 200 bytes a Gaussian. The first come back, 164 bytes.
+REFINED = (
+    "means", "quats", "log_scales", "opacity_logits", "scales", "opacities", "colors", "adam_m", "adam_v",
+    "contribution",
+)  # fmt: skip
+GIVEN = ("smoothing", "node_index", "node_weight")
+DRAWN = ("means", "quats", "scales", "opacities", "colors", "smoothing")
+
+Given = ParamSpec("Given")
+Result = TypeVar("Result")
+
+
+def _or_on_the_cpu(
+    method: Callable[Concatenate[GpuRefiner, Given], Result],
+) -> Callable[Concatenate[GpuRefiner, Given], Result]:
+    """Where the GPU fails, and ever after, the CPU's method of that name does it."""
+
+    @functools.wraps(method)
+    def guarded(self: GpuRefiner, /, *args: Given.args, **names: Given.kwargs) -> Result:
+        if self.problem is None:
+            try:
+                return method(self, *args, **names)
+            except RuntimeError as error:  # torch raises the driver's errors so, and those of memory
+                self._give_up(error)
+        result: Result = getattr(self._cpu, method.__name__)(*args, **names)
+        return result
+
+    return guarded
+
+
+class GpuRefiner:
+    """`refiner.Refiner` on the current GPU.
+
+    A frame in which the GPU fails is finished on the CPU, which goes on for good: a CUDA error cannot be
+    recovered from in the same process. The model still stands there as it was before the frame's steps, so
+    nothing but these is lost.
+    """
+
+    def __init__(self, cpu: CpuRefiner, cpu_share: float) -> None:
+        """
+        Args:
+            cpu: goes on where the GPU fails.
+            cpu_share: how much of the model's capacity it can refine, 0..1.
+
+        Raises:
+            UsageError: no GPU can be used.
+        """
+        self.share = 1.0
+        self.problem: Finding | None = None
+        self._cpu, self._cpu_share = cpu, cpu_share
+        self._device = gsplat_backend.gpu()
+        self._loss = 0.0
+        self._steps = 0
+        self._frame: tuple[GaussianModel, NodeDeformation, Observation, float] | None = None
+        self._rows: dict[str, Tensor] = {}
+        self._nodes = self._momentum = self._variance = torch.zeros((0, 3), device=self._device)
+
+    @property
+    def loss(self) -> float:
+        return self._loss if self.problem is None else self._cpu.loss
+
+    @_or_on_the_cpu
+    def begin(
+        self, model: GaussianModel, deformation: NodeDeformation, observation: Observation, node_step: float
+    ) -> None:
+        if self._frame is None or self._frame[1] is not deformation:
+            self._momentum = self._variance = self._nodes[:0]
+        self._frame = model, deformation, observation, node_step
+        self._image = self._sent(observation.image).permute(2, 0, 1) * float(LEVEL)
+        self._tissue, self._depth = self._sent(observation.tissue), self._sent(observation.depth)
+        self._pinhole = as_pinhole(observation.camera)
+        self._touched = self._sent(tile_grid(observation.tissue))
+        self._changed = False
+        self._nodes = self._nodes[:0]
+        self._take(slice(0, model.count))
+
+    @_or_on_the_cpu
+    def take(self, rows: slice) -> None:
+        self._take(rows)
+
+    @_or_on_the_cpu
+    def download(self) -> None:
+        if not self._changed:
+            return
+        assert self._frame is not None
+        model, deformation, *_ = self._frame
+        loss = float(self._last_loss)
+        rows = {name: self._rows[name].cpu().numpy() for name in REFINED}
+        nodes = self._nodes.cpu().numpy()
+        for name, values in rows.items():  # nothing is written before all of it is here
+            getattr(model, name)[: len(values)] = values
+        deformation.nodes[: len(nodes)] = nodes
+        self._loss, self._changed = loss, False
+
+    @_or_on_the_cpu
+    def draw(self) -> None:
+        self._draw()
+
+    @_or_on_the_cpu
+    def redraw(self, share: float, tiles: Bool) -> None:
+        with torch.no_grad():
+            self._draw()  # all of it: gsplat cannot draw a part
+
+    @_or_on_the_cpu
+    def planes(self) -> F32:
+        return self._fetched_planes()
+
+    @_or_on_the_cpu
+    def exposure_gain(self) -> F32:
+        assert self._frame is not None
+        observation = self._frame[2]
+        return exposure_gain(self._fetched_planes(), observation.image, observation.tissue)
+
+    @_or_on_the_cpu
+    def refine(self, rates: LearningRates, share: float = 1.0) -> None:
+        if share < 1.0:
+            self._step(rates, self._worst_tiles(share))
+            return
+        self._rows["contribution"] = self._step(rates, None)
+
+    @_or_on_the_cpu
+    def refine_worst(self, share: float, rates: LearningRates, nodes: bool = True) -> None:
+        tiles = self._worst_tiles(share)
+        self._draw()
+        self._step(rates, tiles, nodes)
+        self._touched |= tiles
+
+    @_or_on_the_cpu
+    def touched(self) -> Bool:
+        touched: Bool = self._touched.cpu().numpy()
+        return touched
+
+    @_or_on_the_cpu
+    def show(self, gaussians: Gaussians, camera: Camera) -> F32:
+        with torch.no_grad():
+            drawing = Drawing(sent(gaussians, self._device), as_pinhole(camera))
+        planes: F32 = drawing.planes.cpu().numpy()
+        return planes
+
+    def _give_up(self, error: RuntimeError) -> None:
+        said = (str(error).strip() or type(error).__name__).splitlines()[0]
+        full = isinstance(error, torch.OutOfMemoryError)
+        remedy = "end what else uses the GPU, or lower mapping.max_gaussians, and " if full else ""
+        self.problem = Finding(
+            "gpu_memory" if full else "gpu_failed",
+            f"the GPU failed and the CPU goes on: {said}; {remedy}restart the node to use the GPU again",
+        )
+        log.info("%s", self.problem.text, exc_info=error)
+        self.share = self._cpu_share
+        if self._frame is not None:
+            self._cpu.begin(*self._frame)
+            self._cpu.draw()
+
+    def _take(self, rows: slice) -> None:
+        assert self._frame is not None
+        model, deformation, *_ = self._frame
+        for name in (*REFINED, *GIVEN):
+            given = self._sent(getattr(model, name)[rows])
+            here = self._rows.get(name, given[:0])
+            joined = torch.cat([here[: rows.start], given, here[rows.stop :]])
+            self._rows[name] = joined[: model.count]
+        self._nodes = torch.cat([self._nodes, self._sent(deformation.nodes[len(self._nodes) :])])
+        still = torch.zeros_like(self._nodes[len(self._momentum) :])
+        self._momentum = torch.cat([self._momentum, still])
+        self._variance = torch.cat([self._variance, still])
+
+    def _draw(self) -> None:
+        self._drawing = Drawing({name: self._rows[name] for name in DRAWN}, self._pinhole)
+        self._fetched: F32 | None = None
+
+    def _fetched_planes(self) -> F32:
+        if self._fetched is None:
+            self._fetched = self._drawing.planes.cpu().numpy()
+        return self._fetched
+
+    def _step(self, rates: LearningRates, tiles: Tensor | None, nodes: bool = True) -> Tensor:
+        """A step on what was drawn last, or on some tiles [rows, columns] of it: `CpuRefiner._step`.
+
+        Returns:
+            [N] px, what each Gaussian contributes.
+        """
+        assert self._frame is not None
+        self._last_loss, v_planes, weight = tissue_loss(
+            self._drawing.planes, self._image, self._tissue, self._depth, DEPTH_WEIGHT, DEPTH_SCALE
+        )
+        if tiles is not None:
+            pixels = pixels_of(tiles, self._tissue.shape)
+            v_planes, weight = torch.where(pixels, v_planes, 0.0), torch.where(pixels, weight, 0.0)
+        gradients = self._drawing.backward(v_planes, weight)
+        contribution = gradients["contribution"]
+        if nodes:  # they move all that follows them, also far from the tiles that count
+            self._descend(gradients["means"], contribution, self._frame[3])
+        self._optimise(gradients, rates, self._frame[2].camera)
+        self._changed = True
+        return contribution
+
+    def _worst_tiles(self, share: float) -> Tensor:
+        """The tiles [rows, columns] with the largest squared colour residuals, by share, at least one: as
+        `focus.worst_tiles`. Nothing is fetched."""
+        some = (..., slice(None, None, EVERY), slice(None, None, EVERY))
+        planes, tissue = self._drawing.planes[some], self._tissue[some]
+        residuals = planes[:3] / planes[4] - self._image[some]
+        counted = tissue & (planes[4] > float(COVERED)) & (residuals.abs() < 1)
+        squares = torch.where(counted, residuals.square(), 0.0).sum(0)
+        sums = torch.nn.functional.avg_pool2d(
+            squares[None], (TILE_HEIGHT // EVERY, TILE_WIDTH // EVERY), ceil_mode=True, divisor_override=1
+        )[0]
+        worst = torch.topk(sums.flatten(), max(1, round(share * sums.numel())), sorted=False).indices
+        chosen = torch.zeros_like(sums, dtype=torch.bool)
+        chosen.view(-1)[worst] = True
+        return chosen
+
+    def _descend(self, v_means: Tensor, contribution: Tensor, step: float) -> None:
+        """`NodeDeformation.descend`. On a GPU a sum's order, and so its last bits, change from run to run."""
+        index, weight = self._rows["node_index"].long(), self._rows["node_weight"]
+        counted = (contribution > MIN_CONTRIBUTION)[:, None] & (weight >= 0) & (weight <= 1)
+        pulls = torch.where(counted[..., None], weight[..., None] * v_means[:, None], 0.0)  # [N, 4, 3]
+        total, mass = torch.zeros_like(self._nodes), torch.zeros_like(self._nodes[:, :1])
+        total.index_add_(0, index.flatten(), pulls.flatten(0, 1))
+        mass.index_add_(0, index.flatten(), torch.where(counted, weight, 0.0).flatten()[:, None])
+        gradient = torch.where(mass > LEAST_SEEN, total / mass, 0.0)
+        momentum = self._momentum + INERTIA * (gradient - self._momentum)
+        variance = self._variance + CALM * (gradient.square() - self._variance)
+        size = variance.sqrt()
+        sound = (momentum.abs() <= STEEPEST * size) & torch.isfinite(size)
+        self._momentum, self._variance = (torch.where(sound, kept, 0.0) for kept in (momentum, variance))
+        motion = -step * self._momentum / (torch.where(sound, size, 0.0) + NODE_EPS)
+        self._nodes = self._nodes + motion
+        self._rows["means"] = self._rows["means"] + (weight[..., None] * motion[index]).sum(1)
+
+    def _optimise(self, gradients: dict[str, Tensor], rates: LearningRates, camera: Camera) -> None:
+        """`optimiser.Optimiser.step`: a SIRT step on colours, Adam on the rest."""
+        self._steps += 1
+        rows, seen = self._rows, gradients["contribution"]
+        m, v, scales, opacities = rows["adam_m"], rows["adam_v"], rows["scales"], rows["opacities"]
+        by_logit = gradients["opacities"] * opacities * (1 - opacities)
+        slopes = torch.cat(
+            [gradients["means"], gradients["quats"], gradients["scales"] * scales, by_logit[:, None]], 1
+        )
+        size = seen + (slopes.abs() + m.abs() + v.abs()).sum(1) + gradients["colors"].abs().sum(1)
+        raw = rows["opacity_logits"].abs() + rows["log_scales"].abs().sum(1)
+        taken = seen > optimiser.MIN_CONTRIBUTION
+        moves = taken & (size < optimiser.LARGEST) & (raw < optimiser.LARGEST_RAW)
+        broken = taken & ~moves  # its hidden state is made anew from what is drawn of it
+
+        gain = optimiser.COLOUR_RELAXATION / (seen + optimiser.COLOUR_DAMPING)
+        colors = rows["colors"] - gain[:, None] * gradients["colors"]
+        self._put(moves, "colors", colors.clamp(*optimiser.COLOR_RANGE))
+        self._put(broken, "adam_m", torch.zeros_like(m))
+        self._put(broken, "adam_v", torch.where(torch.isfinite(slopes), slopes.square(), 0.0))
+        m, v = m + (1 - BETA1) * (slopes - m), v + (1 - BETA2) * (slopes.square() - v)
+        self._put(moves, "adam_m", m)
+        self._put(moves, "adam_v", v)
+        lengths = [rates.mean_px] * 3 + [rates.quat] * 4 + [rates.log_scale] * 3 + [rates.opacity_logit]
+        step = slopes.new_tensor(lengths) * m / (1 - BETA1**self._steps)
+        step /= (v / (1 - BETA2**self._steps)).sqrt() + optimiser.EPS
+
+        view_z = slopes.new_tensor(camera.viewmat[2])
+        pixel = (rows["means"] @ view_z[:3] + view_z[3]).abs() / float(camera.K[0, 0])  # m at its depth
+        self._put(moves, "means", rows["means"] - pixel[:, None] * step[:, :3])
+        self._put(moves, "quats", rows["quats"] - step[:, 3:7])
+        log_scales = (rows["log_scales"] - step[:, 7:10]).clamp(*optimiser.LOG_SCALE_RANGE)
+        logits = (rows["opacity_logits"] - step[:, 10]).clamp(*optimiser.LOGIT_RANGE)
+        self._put(broken, "log_scales", scales.log())
+        self._put(broken, "opacity_logits", torch.logit(opacities.clamp(max=MAX_OPACITY)))
+        self._put(moves, "log_scales", log_scales)
+        self._put(moves, "scales", log_scales.exp())
+        self._put(moves, "opacity_logits", logits)
+        self._put(moves, "opacities", logits.sigmoid())
+
+    def _put(self, where: Tensor, name: str, values: Tensor) -> None:
+        """Into the rows where [N] is True."""
+        rows = where.reshape(-1, *[1] * (values.ndim - 1))
+        self._rows[name] = torch.where(rows, values, self._rows[name])
+
+    def _sent(self, array: F32 | U8 | Bool) -> Tensor:
+        """A copy on the device."""
+        return torch.tensor(array, device=self._device)
+
+
+def tissue_loss(
+    planes: Tensor, image: Tensor, tissue: Tensor, depth: Tensor, depth_weight: float, depth_scale: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """`engine.losses.tissue.tissue_loss`; nothing is fetched.
+
+    Args:
+        planes: [5, H, W] as drawn.
+        image: [3, H, W] RGB 0..1.
+        tissue: [H, W] bool.
+        depth: [H, W] m, 0 unknown.
+        depth_weight, depth_scale: as there.
+
+    Returns:
+        The mean absolute colour residual, the gradient [5, H, W] by the planes, and 1 / coverage [H, W] where
+        the colour counts, else 0.
+    """
+    coverage = planes[4]
+    inverse = 1 / coverage  # selects below keep infinity and NaN out
+    color, drawn_depth = planes[:3] * inverse, planes[3] * inverse
+    residual, off = color - image, (drawn_depth - depth) / depth_scale
+    size = residual.abs().sum(0)
+    covered = (coverage > float(COVERED)) & (coverage < torch.inf)
+    used = tissue & covered & (size < float(MAX_RESIDUAL))
+    measured = used & (coverage > float(DEPTH_COVERED)) & (depth > 0) & (off.abs() < torch.inf)
+    v_color = torch.where(used, inverse * residual, 0.0)
+    v_depth = torch.where(measured, inverse * off.clamp(-1, 1) * (depth_weight / depth_scale), 0.0)
+    by_color = torch.where(used, (v_color * color).sum(0), 0.0)
+    by_depth = torch.where(measured, v_depth * drawn_depth, 0.0)
+    push = torch.where(tissue & (coverage.abs() < float(FULL)), COVERAGE_WEIGHT, 0.0)
+    mean = torch.where(used, size, 0.0).sum() / (3 * used.sum()).clamp(min=1)
+    v_planes = torch.cat([v_color, v_depth[None], (-by_color - by_depth - push)[None]])
+    return mean, v_planes, torch.where(used, inverse, 0.0)

@@ -1,1 +1,0 @@
-"""Skinning and control nodes on a GPU."""

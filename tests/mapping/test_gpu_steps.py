@@ -1,0 +1,203 @@
+"""What `GpuRefiner` does in torch against the CPU: the mapper's optimiser, control nodes, worst tiles."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from engine_scenes import camera, relative_error
+
+from sags_node.engine import gsplat_backend
+from sags_node.engine.interface import Gradients
+from sags_node.engine.rasterizer.rasterize import make_rasterizer
+from sags_node.mapping import focus, optimiser
+from sags_node.mapping.gpu_refiner import GpuRefiner
+from sags_node.mapping.optimiser import LearningRates, Optimiser
+from sags_node.mapping.refiner import CpuRefiner
+from sags_node.model.deformation import NodeDeformation
+from sags_node.model.gaussians import GaussianModel
+from sags_node.types import F32, Observation
+
+COUNT = 141
+VIEW = camera(moved=True)
+TABLES = (
+    "means", "quats", "log_scales", "opacity_logits", "scales", "opacities", "colors", "adam_m", "adam_v"
+)  # fmt: skip
+
+
+def make_model() -> GaussianModel:
+    rng = np.random.default_rng(0)
+    model = GaussianModel(COUNT)
+    means = rng.normal([0, 0, 0.06], 0.01, (COUNT, 3)).astype(np.float32)
+    scales = rng.uniform(1e-5, 4e-3, (COUNT, 3)).astype(np.float32)
+    model.append(means, scales, rng.uniform(0, 1, (COUNT, 3)).astype(np.float32), 0.7)
+    model.quats[:] = rng.normal(size=(COUNT, 4))
+    model.opacity_logits[:] = rng.uniform(-5.9, 5.9, COUNT)
+    model.opacities[:] = 1 / (1 + np.exp(-model.opacity_logits))
+    return model
+
+
+def make_gradients(seed: int) -> Gradients:
+    """Some rows were hardly seen, or not at all."""
+    rng = np.random.default_rng(seed)
+
+    def rows(*shape: int) -> F32:
+        sizes = 10 ** rng.uniform(-4, 1, (COUNT, *shape))
+        return (rng.normal(size=(COUNT, *shape)) * sizes).astype(np.float32)
+
+    contribution = rng.uniform(0, 2, COUNT).astype(np.float32)
+    contribution[::5] = 0
+    contribution[1::5] = 9e-4
+    return Gradients(
+        rows(3), rows(4), rows(3), rows(), rows(3), np.zeros((COUNT, 0, 3), np.float32), contribution
+    )
+
+
+def in_torch(gradients: Gradients) -> dict[str, torch.Tensor]:
+    return {
+        field.name: torch.tensor(getattr(gradients, field.name)) for field in dataclasses.fields(gradients)
+    }
+
+
+@pytest.fixture
+def pair(monkeypatch: pytest.MonkeyPatch) -> Pair:
+    monkeypatch.setattr(gsplat_backend, "gpu", lambda: torch.device("cpu"))
+    return Pair()
+
+
+class Pair:
+    """A model with control nodes on the host, and the same with a refiner."""
+
+    def __init__(self, nodes: int = 20) -> None:
+        self.model = make_model()
+        self.deformation = NodeDeformation(self.model.means, nodes)
+        self.deformation.attach(self.model, slice(0, COUNT))
+        self.refiner = GpuRefiner(CpuRefiner(partial(make_rasterizer, "numba")), 1.0)
+        self.optimiser = Optimiser()
+        self.begin()
+
+    def begin(self) -> None:
+        size = VIEW.height, VIEW.width
+        ones, image = np.ones(size, np.float32), np.zeros((*size, 3), np.uint8)
+        observation = Observation(0, 0, VIEW, image, image[..., 0], ones > 0, ones, ones)
+        self.refiner.begin(self.model, self.deformation, observation, 1e-4)
+
+    def optimise(self, gradients: Gradients, rates: LearningRates) -> None:
+        self.optimiser.step(self.model, gradients, VIEW, rates)
+        self.refiner._optimise(in_torch(gradients), rates, VIEW)
+
+    def descend(self, gradients: Gradients, step: float = 1e-4) -> None:
+        self.deformation.descend(self.model, gradients.means, gradients.contribution, step)
+        given = in_torch(gradients)
+        self.refiner._descend(given["means"], given["contribution"], step)
+
+    def row(self, name: str) -> Any:
+        return self.refiner._rows[name].numpy()
+
+    def check_rows(self) -> None:
+        for name in TABLES:
+            expected = getattr(self.model, name)
+            np.testing.assert_allclose(self.row(name), expected, rtol=1e-4, atol=1e-6, err_msg=name)
+
+    def check_nodes(self) -> None:
+        np.testing.assert_allclose(self.refiner._nodes.numpy(), self.deformation.nodes, atol=1e-7)
+        np.testing.assert_allclose(self.row("means"), self.model.means, atol=1e-7)
+
+
+def test_the_optimisers_step_is_the_cpus(pair: Pair) -> None:
+    """Each moves the same way; rows that are not seen stay, and all ranges are met."""
+    before, rates = make_model(), LearningRates().scaled(20)
+    for step in range(4):
+        pair.optimise(make_gradients(step), rates)
+    pair.check_rows()
+    for name in TABLES[:-2]:
+        moved, expected = (
+            values - getattr(before, name) for values in (pair.row(name), getattr(pair.model, name))
+        )
+        assert relative_error(moved, expected) < 1e-4, name
+    np.testing.assert_array_equal(pair.row("means")[::5], before.means[::5])
+    assert (abs(pair.row("opacity_logits")) == 6).any() and (pair.row("colors") == 1.5).any()
+    assert (pair.row("log_scales") == np.float32(optimiser.LOG_SCALE_RANGE[1])).any()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e25])
+@pytest.mark.parametrize(
+    "where",
+    ["means", "quats", "scales", "opacities", "colors", "adam_m", "adam_v", "log_scales", "opacity_logits"],
+)
+def test_the_optimisers_step_fixes_broken_rows(pair: Pair, where: str, value: float) -> None:
+    """Gradients (the first five) and hidden state; a sound row beside it moves on."""
+    gradients, broken = make_gradients(0), 2  # is seen
+    hidden = where in {"adam_m", "adam_v", "log_scales", "opacity_logits"}
+    table = getattr(pair.model if hidden else gradients, where)
+    table.reshape(COUNT, -1)[broken, -1] = value
+    pair.model.opacities[broken] = 1.0  # has no logit
+    pair.begin()
+    pair.optimise(gradients, LearningRates())
+    pair.check_rows()
+    assert np.isfinite(pair.row("log_scales")).all() and np.isfinite(pair.row("opacity_logits")).all()
+
+
+def test_nodes_descend_as_on_the_cpu(pair: Pair) -> None:
+    pair.model.node_weight[7] = np.nan  # damaged, and seen
+    pair.begin()
+    before = pair.row("means").copy()
+    for step in range(3):
+        pair.descend(make_gradients(step))
+    pair.check_nodes()
+    assert np.nanmean(np.abs(pair.row("means") - before)) > 1e-5
+
+
+def test_the_nodes_of_a_new_model_remember_nothing(pair: Pair) -> None:
+    """Also where they are fewer."""
+    pair.descend(make_gradients(0))
+    pair.model, pair.deformation = make_model(), NodeDeformation(pair.model.means, 6)
+    pair.deformation.attach(pair.model, slice(0, COUNT))
+    pair.begin()
+    assert pair.refiner.problem is None
+    pair.descend(make_gradients(1))
+    pair.check_nodes()
+
+
+def test_a_node_that_little_was_seen_of_stays(pair: Pair) -> None:
+    """The weights of one Gaussian on its four nodes add up to 1: at most one of them learns from it."""
+    before = pair.deformation.nodes.copy()
+    gradients = make_gradients(0)
+    gradients.contribution[:] = 1e-4
+    pair.descend(gradients)
+    np.testing.assert_array_equal(pair.refiner._nodes.numpy(), before)
+    gradients.contribution[8] = 1.0
+    pair.descend(gradients)
+    pair.check_nodes()
+    assert (pair.refiner._nodes.numpy() != before).any(axis=1).sum() <= 1
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_broken_gradient_stops_its_nodes_only(pair: Pair, value: float) -> None:
+    gradients = make_gradients(0)
+    gradients.means[8, 1] = value
+    gradients.contribution[8] = 1.0
+    pair.descend(gradients)
+    pair.descend(make_gradients(1))
+    pair.check_nodes()
+    assert np.isfinite(pair.refiner._nodes.numpy()).all()
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2, 0.5])
+def test_the_worst_tiles_are_the_cpus(pair: Pair, share: float) -> None:
+    """Of a picture that is no whole number of tiles, with pixels that do not count."""
+    rng = np.random.default_rng(0)
+    height, width = VIEW.height - 3, VIEW.width - 5
+    planes = rng.uniform(0, 1, (5, height, width)).astype(np.float32)
+    image = rng.integers(0, 256, (height, width, 3), np.uint8)
+    tissue = rng.uniform(size=(height, width)) < 0.8
+    refiner = pair.refiner
+    refiner._drawing = type("Drawn", (), {"planes": torch.tensor(planes)})()  # type: ignore[assignment]
+    refiner._image = torch.tensor(image).permute(2, 0, 1) / 255
+    refiner._tissue = torch.tensor(tissue)
+    expected = focus.worst_tiles(planes, image, tissue, share)
+    np.testing.assert_array_equal(refiner._worst_tiles(share).numpy(), expected)
