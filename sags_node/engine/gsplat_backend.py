@@ -23,13 +23,23 @@ from sags_node.engine.interface import (
     Pinhole,
 )
 from sags_node.engine.rasterizer.compositing import TILE_HEIGHT, TILE_WIDTH
+from sags_node.engine.reference.rasterizer import rotations
 from sags_node.errors import UsageError
 from sags_node.types import F32, I32, SH_DEGREE_0, Bool, Gaussians
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-DIFFERENTIATED = ("means", "quats", "scales", "opacities", "colors", "sh_rest")  # of `types.Gaussians`
+DIFFERENTIATED = (
+    "means",
+    "quats",
+    "scales",
+    "opacities",
+    "colors",
+    "sh_rest",
+    "slopes",
+)  # of `types.Gaussians`
+LARGEST = 1e12  # m: the square of as many px is finite
 HARMLESS = {"quats": 1.0, "scales": 1.0}  # in rows that are not drawn; in the other tables 0
 
 
@@ -70,15 +80,26 @@ class Drawing:
         # A feature of value 0 whose cotangent is the pixels' weight: its gradient is the contribution.
         leaves["statistic"] = torch.zeros_like(leaves["opacities"])[:, None].requires_grad_()
         view, K = _camera_matrices(pinhole, usable.device)
-        scales, opacities = leaves["scales"], leaves["opacities"]
+        scales, opacities, kept = leaves["scales"], leaves["opacities"], torch.ones_like(leaves["scales"])
         if "smoothing" in tables:
-            scales, opacities = _smoothed(scales, opacities, torch.where(usable, tables["smoothing"], 0.0))
-        features = torch.cat([_seen_colors(leaves, view), leaves["statistic"]], 1)
+            scales, kept = _smoothed(scales, torch.where(usable, tables["smoothing"], 0.0))
+            opacities = opacities * kept.topk(2).values.prod(1)
+        colors, gradient = _seen_colors(leaves, view), torch.zeros_like(leaves["means"][:, :2])
+        if "slopes" in leaves:
+            slopes = leaves["slopes"] * kept
+            places, gradient = _luminance_gradients(leaves, scales, slopes, view, pinhole, antialias)
+            colors = colors - (gradient * places).sum(1, keepdim=True)
+        features = torch.cat([colors, gradient, leaves["statistic"]], 1)
         rendered, alphas = _rasterize(
             (leaves["means"], leaves["quats"], scales, opacities, features), view, K, pinhole, antialias
         )
         self._leaves = leaves
-        self._all = torch.cat([rendered, alphas], 2).permute(2, 0, 1)  # r g b, statistic, z, w
+        summed = torch.cat([rendered, alphas], 2).permute(2, 0, 1)  # r g b, gradient 2, statistic, z, w
+        # sum of w (c + g . (p - m)) = sum of w (c - g . m) + (sum of w g) . p at a pixel p
+        y, x = _pixel_places(pinhole, usable.device)
+        self._all = torch.cat(
+            [summed[:3] + summed[3] * x + summed[4] * y, summed[5:]]
+        )  # r g b, statistic, z, w
         self.planes = torch.cat([self._all[:3], self._all[4:]]).detach()
 
     def backward(self, v_planes: Tensor, weight: Tensor) -> dict[str, Tensor]:
@@ -120,7 +141,9 @@ class GsplatBackend:
         given = (torch.tensor(array, device=self._device) for array in (v_planes, weight))
         found = self._drawing.backward(*(torch.where(self._shown, values, 0.0) for values in given))
         arrays = {name: values.cpu().numpy() for name, values in found.items()}
-        return Gradients(**{"sh_rest": np.zeros((len(found["means"]), 0, 3), np.float32)} | arrays)
+        count = len(found["means"])
+        absent = {"sh_rest": np.zeros((count, 0, 3), np.float32), "slopes": np.zeros((count, 3), np.float32)}
+        return Gradients(**absent | arrays)
 
     def median(self) -> tuple[F32, I32]:
         raise UsageError("gsplat gives no median depth; choose the numba or reference backend for it")
@@ -167,6 +190,44 @@ def _seen_colors(leaves: Mapping[str, Tensor], view: Tensor) -> Tensor:
     return seen
 
 
+def _luminance_gradients(
+    leaves: Mapping[str, Tensor],
+    scales: Tensor,
+    slopes: Tensor,
+    view: Tensor,
+    pinhole: Pinhole,
+    antialias: bool,
+) -> tuple[Tensor, Tensor]:
+    """Where the Gaussians are in the picture, from its middle, [N, 2] px, and how their luminance changes
+    there [N, 2] 1/px: a V^T cov^-1, as `reference.project` has it."""
+    R, t = view[:3, :3], view[:3, 3]
+    x, y, z = (leaves["means"] @ R.T + t).unbind(1)
+    z = torch.where(z > NEAR_PLANE, z, 1.0)  # what is not drawn must be finite
+    scales = torch.where(scales < LARGEST, scales, 1.0)
+    low_x, high_x, low_y, high_y = pinhole.limits
+    fx, fy, zero = pinhole.fx / z, pinhole.fy / z, torch.zeros_like(z)
+    J = torch.stack(
+        [
+            torch.stack([fx, zero, -fx * (x / z).clamp(low_x, high_x)], 1),
+            torch.stack([zero, fy, -fy * (y / z).clamp(low_y, high_y)], 1),
+        ],
+        1,
+    )
+    V = J @ R @ rotations(leaves["quats"]) * scales[:, None, :]
+    variance = MIP_VARIANCE if antialias else DILATION_VARIANCE
+    covariance = V @ V.transpose(1, 2) + variance * torch.eye(2, device=V.device)
+    gradient = torch.linalg.solve(covariance, V @ slopes[:, :, None])[:, :, 0]
+    middle_x, middle_y = pinhole.cx - 0.5 * pinhole.width, pinhole.cy - 0.5 * pinhole.height
+    return torch.stack([fx * x + middle_x, fy * y + middle_y], 1), gradient
+
+
+def _pixel_places(pinhole: Pinhole, device: torch.device) -> tuple[Tensor, Tensor]:
+    """y [H, 1] and x [W] px of pixel centres from the picture's middle."""
+    y = torch.arange(pinhole.height, device=device) + 0.5 - 0.5 * pinhole.height
+    x = torch.arange(pinhole.width, device=device) + 0.5 - 0.5 * pinhole.width
+    return y[:, None], x
+
+
 def _camera_matrices(pinhole: Pinhole, device: torch.device) -> tuple[Tensor, Tensor]:
     """World to camera [4, 4] and K [3, 3]. gsplat's first pixel has its centre at 0.5, like ours."""
     view, K = np.eye(4, dtype=np.float32), np.eye(3, dtype=np.float32)
@@ -189,10 +250,10 @@ def _leaf(values: Tensor, usable: Tensor, otherwise: float) -> Tensor:
     return torch.where(rows, values, otherwise).requires_grad_()
 
 
-def _smoothed(scales: Tensor, opacities: Tensor, smoothing: Tensor) -> tuple[Tensor, Tensor]:
-    """After the 3D filter of Mip-Splatting, which gsplat lacks; as `reference.project` has it."""
+def _smoothed(scales: Tensor, smoothing: Tensor) -> tuple[Tensor, Tensor]:
+    """Scales after the 3D filter of Mip-Splatting, which gsplat lacks, and those before as a share of them,
+    [N, 3] each; as `reference.project` has it."""
     variance = torch.clamp(smoothing, min=0)[:, None]
     filtered = torch.sqrt(scales.square() + variance)
     filtered = torch.where(variance == 0, scales, filtered)
-    kept = (scales / filtered).topk(2).values.prod(1)
-    return filtered, opacities * kept
+    return filtered, scales / filtered

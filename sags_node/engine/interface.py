@@ -52,8 +52,8 @@ class Gradients:
     scales: F32  # [N, 3] per m, before the 3D filter
     opacities: F32  # [N] before the filters
     colors: F32  # [N, 3]
-    sh_rest: F32  # [N, K - 1, 3]; [N, 0, 3] without spherical harmonics
     slopes: F32  # [N, 3] before the 3D filter
+    sh_rest: F32  # [N, K - 1, 3]; [N, 0, 3] without spherical harmonics
     contribution: F32  # [N] sum over pixels of (blending weight of this Gaussian) * (weight of the pixel)
 
 

@@ -86,7 +86,7 @@ def alphas(gaussians: Gaussians, view: Camera) -> tuple[NDArray[np.float64], NDA
     """Of the twin: [pixels, splats], 0 where cut; and which Gaussians the splats are."""
     inputs = [torch.tensor(getattr(gaussians, name), dtype=torch.float64) for name in INPUTS]
     splats = reference.project(as_pinhole(view), inputs)
-    alpha, _, touching = reference.alphas(splats, 0, 0, view.width, view.height)
+    alpha, _, touching, _ = reference.alphas(splats, 0, 0, view.width, view.height)
     return alpha.numpy(), splats.rows[touching].numpy()
 
 
@@ -196,7 +196,8 @@ def test_a_crowd_in_one_corner(corner: tuple[float, float]) -> None:
         *(
             getattr(gaussians, name)[order]
             for name in ("means", "quats", "scales", "opacities", "colors", "ids")
-        )
+        ),
+        slopes=gaussians.slopes[order],
     )
     np.testing.assert_array_equal(make_rasterizer("numba", 100, 77).forward(shuffled, WIDE), planes)
 
@@ -287,7 +288,7 @@ def test_kernels_compile_once_and_warm_up_has_done_it() -> None:
     wide = {name: getattr(full, name).astype(np.float64) for name in (*INPUTS, "sh_rest", "smoothing")}
     for gaussians in (full, dataclasses.replace(full, **wide)):
         draw_and_differentiate(gaussians, WIDE)
-        smoothing.smoothed(gaussians.scales, gaussians.opacities, gaussians.smoothing)
+        smoothing.bake_filter(gaussians)
     assert [len(kernel.signatures) for kernel in kernels] == [1] * len(kernels)
 
 

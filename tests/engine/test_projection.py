@@ -53,6 +53,7 @@ def smooth_scene() -> tuple[Camera, list[F64], F64]:
         np.append(rng.uniform(0.02, 0.05, (5, 3)), [[0.06, 0.05, 0.07]], 0),
         rng.uniform(0.6, 0.9, 6),
         rng.uniform(0, 1, (6, 3)),
+        rng.normal(0, 0.4, (6, 3)),
         rng.normal(0, 0.4, (6, 15, 3)),
     ]
     return view, inputs, rng.uniform(1e-5, 1e-4, 6)
@@ -197,7 +198,8 @@ def test_no_view_dependence_and_no_filter_change_nothing() -> None:
 
 
 def test_filter_enlarges_the_covariance_and_keeps_the_mass_on_the_surface() -> None:
-    """R S S^T R^T + f I, taken apart again by its eigenvectors, drawn without a filter."""
+    """R S S^T R^T + f I, taken apart again by its eigenvectors, drawn without a filter. The gradient of the
+    luminance at the middle, R S'^-2 S a, is what remains of R S^-1 a."""
     gaussians = with_filter(random_gaussians(5, 60, VIEW))
     R = geometry.quat_to_matrix(gaussians.quats.astype(np.float64))
     scales = gaussians.scales.astype(np.float64)
@@ -208,11 +210,14 @@ def test_filter_enlarges_the_covariance_and_keeps_the_mass_on_the_surface() -> N
     ratios = np.sort(scales) / np.sqrt(variances)  # eigenvalues come sorted
     kept = ratios[:, 1:].prod(1)  # thickness does not count
     assert kept.min() < 0.6
+    gentler = gaussians.slopes * scales / (scales**2 + gaussians.smoothing[:, None])
+    gradient = np.einsum("nij,nj->ni", R, gentler)
     enlarged = dataclasses.replace(
         gaussians,
         scales=np.sqrt(variances).astype(np.float32),
         quats=np.stack([geometry.matrix_to_quat(matrix) for matrix in axes]).astype(np.float32),
         opacities=(gaussians.opacities * kept).astype(np.float32),
+        slopes=(np.sqrt(variances) * np.einsum("nji,nj->ni", axes, gradient)).astype(np.float32),
         smoothing=None,
     )
     rasterizer = make_rasterizer("numba", VIEW.width, VIEW.height)
@@ -224,8 +229,8 @@ def test_filter_enlarges_the_covariance_and_keeps_the_mass_on_the_surface() -> N
 
 def test_what_is_exported_draws_the_same() -> None:
     gaussians = with_filter(random_gaussians(5, 60, VIEW))
-    scales, opacities = smoothing.smoothed(gaussians.scales, gaussians.opacities, gaussians.smoothing)
-    exported = dataclasses.replace(gaussians, scales=scales, opacities=opacities, smoothing=None)
+    exported = smoothing.bake_filter(gaussians)
+    assert exported.smoothing is None
     rasterizer = make_rasterizer("numba", VIEW.width, VIEW.height)
     expected = rasterizer.forward(gaussians, VIEW).copy()
     np.testing.assert_array_equal(rasterizer.forward(exported, VIEW), expected)
@@ -233,11 +238,17 @@ def test_what_is_exported_draws_the_same() -> None:
 
 def test_filter_of_vanishing_scales() -> None:
     scales = np.array([[1e-7, 1e-7, 1e-7], [1e-7, 1e-3, 1.0], [1e-7, 1e-7, 1e-7]], np.float32)
+    slopes = np.full((3, 3), 0.1, np.float32)
     opacities = np.array([1 - 1e-6, 0.5, 1e-6], np.float32)
     variance = np.array([1e-9, 1e-9, 0], np.float32)
-    found_scales, found_opacities = smoothing.smoothed(scales, opacities, variance)
+    found_scales, found_opacities, found_slopes = (
+        np.empty_like(array) for array in (scales, opacities, slopes)
+    )
+    smoothing.smooth(scales, opacities, variance, slopes, found_scales, found_opacities, found_slopes)
     true_scales = np.sqrt(scales.astype(np.float64) ** 2 + variance[:, None])
     true_opacities = opacities * np.sort(scales / true_scales)[:, 1:].prod(1)
     np.testing.assert_allclose(found_scales, true_scales, rtol=after(3))
     np.testing.assert_allclose(found_opacities, true_opacities, rtol=after(8))
+    np.testing.assert_allclose(found_slopes, slopes * (scales / true_scales), rtol=after(4))
     np.testing.assert_array_equal(found_scales[2], scales[2])
+    np.testing.assert_array_equal(found_slopes[2], slopes[2])

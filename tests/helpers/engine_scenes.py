@@ -17,7 +17,7 @@ from sags_node.engine.rasterizer.rasterize import Gradients, make_rasterizer
 from sags_node.types import F32, F64, U8, Camera, Gaussians
 
 T = TypeVar("T")
-INPUTS = ("means", "quats", "scales", "opacities", "colors")
+INPUTS = ("means", "quats", "scales", "opacities", "colors", "slopes")
 DERIVATIVES = tuple(field.name for field in dataclasses.fields(Gradients))
 
 
@@ -61,6 +61,7 @@ def random_gaussians(seed: int, count: int, view: Camera, spread: float = 1.0) -
         opacities=rng.uniform(0.3, 0.97, count).astype(np.float32),
         colors=rng.uniform(0, 1, (count, 3)).astype(np.float32),
         ids=np.arange(count),
+        slopes=rng.normal(0, 0.2, (count, 3)).astype(np.float32),
     )
 
 
@@ -72,6 +73,7 @@ def one_gaussian(mean: NDArray[np.floating], scale: float, opacity: float = 0.9)
         opacities=np.full(1, opacity, np.float32),
         colors=np.array([[0.8, 0.5, 0.2]], np.float32),
         ids=np.zeros(1, np.int64),
+        slopes=np.zeros((1, 3), np.float32),
     )
 
 

@@ -53,7 +53,7 @@ def make_gradients(seed: int) -> Gradients:
     contribution[::5] = 0
     contribution[1::5] = 9e-4
     return Gradients(
-        rows(3), rows(4), rows(3), rows(), rows(3), np.zeros((COUNT, 0, 3), np.float32), contribution
+        rows(3), rows(4), rows(3), rows(), rows(3), rows(3), np.zeros((COUNT, 0, 3), np.float32), contribution
     )
 
 

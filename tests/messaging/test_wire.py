@@ -94,11 +94,11 @@ def test_point_cloud_fields_describe_the_rows() -> None:
     said = contents()["splats"]
     ros = STORE.deserialize_cdr(message_of(said).cdr(), said.type)
     assert [field.name for field in ros.fields] == list(content.SPLAT_FIELDS)
-    assert [field.offset for field in ros.fields] == list(range(0, 68, 4))
+    assert [field.offset for field in ros.fields] == list(range(0, 80, 4))
     kinds = {field.name: field.datatype for field in ros.fields}
     assert kinds["id"] == kinds["id_high"] == 6  # UINT32
-    assert (ros.height, ros.width, ros.point_step, ros.row_step) == (1, said.shape[0], 68, 68 * said.shape[0])
-    rows = ros.data.view(np.float32).reshape(-1, 17)
+    assert (ros.height, ros.width, ros.point_step, ros.row_step) == (1, said.shape[0], 80, 80 * said.shape[0])
+    rows = ros.data.view(np.float32).reshape(-1, 20)
     assert np.allclose(rows[:, :3], plane_result().snapshot.gaussians.means)
 
 

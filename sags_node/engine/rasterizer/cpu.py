@@ -151,7 +151,7 @@ class NumbaRasterizer:
         means, quats, scales, opacities, sh_rest, slopes = self._projector.backward(
             self._slots[:n], self._v_pairs, v_colors, contribution
         )
-        return Gradients(means, quats, scales, opacities, v_colors, sh_rest, slopes, contribution)
+        return Gradients(means, quats, scales, opacities, v_colors, slopes, sh_rest, contribution)
 
     def median(self) -> tuple[F32, I32]:
         median.median(

@@ -46,8 +46,8 @@ class ReferenceRasterizer:
 
         none = np.zeros((len(gaussians), 0, 3), np.float32)
         arrays = [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.colors]
-        arrays.append(none if gaussians.sh_rest is None else gaussians.sh_rest)
         arrays.append(np.zeros_like(gaussians.means) if gaussians.slopes is None else gaussians.slopes)
+        arrays.append(none if gaussians.sh_rest is None else gaussians.sh_rest)
         smoothing = None
         if gaussians.smoothing is not None:
             smoothing = torch.tensor(gaussians.smoothing, dtype=torch.float64)
@@ -113,22 +113,21 @@ def project(
 
     Args:
         pinhole: the camera.
-        inputs: means, quats, scales, opacities, colors and, where there are any, sh_rest and slopes; shapes
-            as in `types.Gaussians`.
+        inputs: means, quats, scales, opacities, colors, slopes and, where there are any, sh_rest; shapes as
+            in `types.Gaussians`.
         smoothing: [N] as in `types.Gaussians`.
         antialias: False puts the dilation of 3D Gaussian Splatting in the place of the 2D filter.
     """
     import torch
 
-    means, quats, scales, opacities, colors, *more = inputs
-    slopes = more[1] if len(more) > 1 else torch.zeros_like(means)
+    means, quats, scales, opacities, colors, slopes, *harmonics = inputs
     R, t = torch.tensor(pinhole.R, dtype=means.dtype), torch.tensor(pinhole.t, dtype=means.dtype)
     if smoothing is not None:
         variance = torch.clamp(smoothing, min=0)[:, None]
         ratio = torch.where(variance == 0, 1, scales / torch.sqrt(scales.square() + variance))
         scales, opacities = torch.sqrt(scales.square() + variance), opacities * ratio.topk(2).values.prod(1)
         slopes = slopes * ratio
-    for sh_rest in more[:1]:
+    for sh_rest in harmonics:
         colors = colors + _view_dependent(means + R.T @ t, sh_rest)
     everything = torch.cat([means, quats, scales, opacities[:, None], colors, slopes], 1)
     usable = torch.isfinite(everything).all(1) & (torch.addmm(t, means, R.T)[:, 2] > NEAR_PLANE)
@@ -147,7 +146,7 @@ def project(
         ],
         1,
     )
-    V = J @ R @ _rotations(quats[rows]) * scales[rows, None, :]
+    V = J @ R @ rotations(quats[rows]) * scales[rows, None, :]
     screen_variance = MIP_VARIANCE if antialias else DILATION_VARIANCE
     covariance = V @ V.transpose(1, 2) + screen_variance * torch.eye(2, dtype=z.dtype)
     det0 = torch.linalg.cross(V[:, 0], V[:, 1]).square().sum(1)  # Cauchy-Binet
@@ -188,7 +187,7 @@ def _view_dependent(offsets: Tensor, sh_rest: Tensor) -> Tensor:
     return torch.einsum("nk,nkc->nc", torch.stack(basis, 1)[:, : sh_rest.shape[1]], sh_rest)
 
 
-def _rotations(quats: Tensor) -> Tensor:
+def rotations(quats: Tensor) -> Tensor:
     """Rotation matrices [N, 3, 3]."""
     import torch
 
