@@ -12,12 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rich.table import Table
-
 from sags_node.config.schema import LaunchConfig
 from sags_node.errors import SagsError
 from sags_node.evaluation.measure import MeasureOptions
-from sags_node.evaluation.report import summary_table, write_report
+from sags_node.evaluation.report import write_report
 from sags_node.evaluation.session import measure
 from sags_node.evaluation.spool import Spool
 from sags_node.messaging.rundir import connection_path, default_run_dir
@@ -39,7 +37,6 @@ class Demo:
     """What a demo leaves behind."""
 
     summary: dict[str, Any]  # as `sags eval`, and what the overlay subscriber counted under "overlay"
-    table: Table
     report: Path
 
 
@@ -82,7 +79,7 @@ def run_demo(session: Session, out: Path, progress: Callable[[int, int | None, s
         outcome = measure(session, spool, _OPTIONS, progress=lambda what, done: progress(done, frames, what))
     outcome.summary["overlay"] = consumed
     page = write_report(out, outcome.summary, outcome.rows, outcome.pictures)
-    return Demo(outcome.summary, summary_table(outcome.summary), page)
+    return Demo(outcome.summary, page)
 
 
 def _start_overlay(config: LaunchConfig, seconds: float, video: Path) -> subprocess.Popen[str]:

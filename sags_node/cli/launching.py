@@ -12,7 +12,8 @@ import click
 
 from sags_node.errors import UsageError
 from sags_node.files import check_file, whole
-from sags_node.terminal.console import console, progress
+from sags_node.terminal import text
+from sags_node.terminal.console import console, progress, show
 
 if TYPE_CHECKING:
     from sags_node.config.schema import Source
@@ -23,6 +24,7 @@ positive = click.FloatRange(min=0, min_open=True)
 
 launch_argument = click.argument("launch", nargs=-1, metavar="[LAUNCH.yaml | SESSION] [key:=value ...]")
 as_json = click.option("--json", "json_out", is_flag=True, help="Print JSON on stdout, for machines.")
+all_figures = click.option("-v", "--verbose", is_flag=True, help="Print all figures, not the verdict alone.")
 lpips_option = click.option(
     "--lpips-weights", type=click.Path(path_type=Path), help="npz of LPIPS SqueezeNet weights."
 )
@@ -105,6 +107,32 @@ def check_files(*files: Path | None, force: bool | None = None) -> None:
             check_file(file, force)
 
 
+def show_outcome(summary: Mapping[str, Any], report: Path | None, verbose: bool, json_out: bool) -> None:
+    """Print what a measured run was worth, where its report is, and if asked for all of its figures."""
+    from sags_node.evaluation.figure_table import groups, headings
+    from sags_node.evaluation.verdict import flat, verdict
+
+    if json_out:
+        show(dict(summary))
+        if report is not None:
+            console.print(f"report: {report}", markup=False, soft_wrap=True)
+        return
+    show_verdict([*verdict(flat(summary)), *([] if report is None else [("report", str(report))])])
+    for group, rows in groups(summary).items() if verbose else ():
+        table = text.table(f"\n{group}", *(f"\n{name}" for name in headings(summary)), "\ncompared with")
+        for what, values, compared in rows:
+            table.add_row(what, *values, compared)
+        show(table)
+
+
+def show_verdict(lines: Sequence[tuple[str, str]]) -> None:
+    """Print what and how good, a line each."""
+    table = text.table()
+    for what, said in lines:
+        table.add_row(what, said)
+    show(table)
+
+
 def write_json(file: Path | None, figures: Mapping[str, Any] | list[Any]) -> None:
     """Keep figures, if a file was asked for, and under `provenance` where they come from. A list of them is
     kept under `rows`.
@@ -116,6 +144,6 @@ def write_json(file: Path | None, figures: Mapping[str, Any] | list[Any]) -> Non
         from sags_node.evaluation.provenance import provenance
 
         rows = {"rows": figures} if isinstance(figures, list) else figures
-        text = json.dumps({"provenance": provenance()} | dict(rows), indent=1)
+        lines = json.dumps({"provenance": provenance()} | dict(rows), indent=1)
         with whole(file) as partial:
-            partial.write_text(text + "\n", encoding="utf-8")
+            partial.write_text(lines + "\n", encoding="utf-8")

@@ -22,10 +22,12 @@ from sags_node.cli.bridge import bridge
 from sags_node.cli.calib import calib
 from sags_node.cli.export import export
 from sags_node.cli.launching import (
+    all_figures,
     as_json,
     launch_argument,
     open_launched,
     positive,
+    show_outcome,
     split,
     split_recording,
 )
@@ -167,8 +169,9 @@ def run(launch: tuple[str, ...], seconds: float | None, json_out: bool) -> None:
     show_default=True,
     help="Folder for report.html, sheet.png and overlay.mp4; older ones are replaced.",
 )
+@all_figures
 @as_json
-def demo(launch: tuple[str, ...], seconds: float, out: Path, json_out: bool) -> None:
+def demo(launch: tuple[str, ...], seconds: float, out: Path, verbose: bool, json_out: bool) -> None:
     """Play a session live beside an overlay subscriber; leave a report.
 
     The node publishes over real sockets; `sags overlay` runs as its own process and consumes. The report
@@ -201,8 +204,7 @@ def demo(launch: tuple[str, ...], seconds: float, out: Path, json_out: bool) -> 
         except BaseException:  # Ctrl-C, too: without its page nobody knows whose video it is
             (out / VIDEO).unlink(missing_ok=True)
             raise
-    show(outcome.summary if json_out else outcome.table)
-    console.print(f"report: [bold]{escape(str(outcome.report))}[/], overlay video beside it", soft_wrap=True)
+    show_outcome(outcome.summary, outcome.report, verbose, json_out)
 
 
 # ---- tools -----------------------------------------------------------------------------------------------

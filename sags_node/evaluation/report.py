@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.table import Table
 
 from sags_node.evaluation import calibration
 from sags_node.evaluation.gallery import Picture
@@ -78,14 +77,6 @@ def write_report(
         with whole(folder / SHEET) as file:
             file.write_bytes(encoded(".png", grid))
     return report
-
-
-def summary_table(summary: Mapping[str, Any]) -> Table:
-    """The figures for a terminal."""
-    table = Table(show_header=False, box=None, padding=(0, 2))
-    for key, value in summary.items():
-        table.add_row(key, _text(value))
-    return table
 
 
 def _circumstances(summary: Mapping[str, Any]) -> str:

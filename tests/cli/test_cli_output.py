@@ -318,6 +318,20 @@ def test_demo_prints_nothing_but_json(user_files: Path, tmp_path: Path) -> None:
     check_report(tmp_path / "demo", "overlay.mp4")  # the next one may replace it
 
 
+def test_eval_says_what_it_found_in_a_dozen_lines(user_files: Path, tmp_path: Path) -> None:
+    """Figures in groups only when asked for, and never as Python prints a dictionary."""
+    session = [*videos(user_files), "source.frames:=4", "--pace", "step"]
+    result = sags("eval", *session, "--report", tmp_path / "report")
+    assert result.exit_code == 0, result.stderr
+    lines = result.stdout.splitlines()
+    assert 5 <= len(lines) <= 12 and lines[-1].split() == ["report", f"{tmp_path}/report/report.html"]
+    said = dict(line.split(None, 1) for line in lines)
+    assert "dB PSNR (the picture before, shown again:" in said["picture"] and "ms (p99)" in said["latency"]
+    all_figures = sags("eval", *session, "--verbose").stdout
+    assert "of that, median: rectify" in all_figures and len(all_figures.splitlines()) > 30
+    assert "{" not in all_figures + result.stdout and "None" not in all_figures
+
+
 def test_torch_and_open3d_stay_out_of_the_start(user_files: Path) -> None:
     """Together they cost seconds, and nothing but LPIPS, the reference engine and meshes needs them."""
     session = videos(user_files)
