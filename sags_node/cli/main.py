@@ -179,11 +179,13 @@ def demo(launch: tuple[str, ...], seconds: float, out: Path, verbose: bool, json
     """
     from sags_node.demo import VIDEO, run_demo
     from sags_node.evaluation.report import check_report
+    from sags_node.media.h264_file import check_h264
     from sags_node.pipeline.session import open_session
 
     no_cameras = "sags demo plays recordings; for cameras use sags run and sags overlay"
     path, overrides = split_recording(launch, no_cameras)
     check_plots()
+    check_h264()
     check_report(out, VIDEO)
     live = ["source.loop:=true", "source.pace:=realtime"]
     opened = open_launched(path, [*live, *overrides])  # says what it plays, and at what size
@@ -198,12 +200,8 @@ def demo(launch: tuple[str, ...], seconds: float, out: Path, verbose: bool, json
             f"publish.run_dir:={private}",
         ]
         session = open_session(path, [*forced, *overrides])
-        try:
-            with progress("playing") as advance:
-                outcome = run_demo(session, out, advance)
-        except BaseException:  # Ctrl-C, too: without its page nobody knows whose video it is
-            (out / VIDEO).unlink(missing_ok=True)
-            raise
+        with progress("playing") as advance:
+            outcome = run_demo(session, out, advance)
     show_outcome(outcome.summary, outcome.report, verbose, json_out)
 
 

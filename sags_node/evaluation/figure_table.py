@@ -44,7 +44,7 @@ GROUPS: dict[str, list[Figure]] = {
         Figure("first frame", "first_render_ms", "ms", 1),
         *_times("camera's stamp to sending", "latency_ms"),
         *_times("work on a frame", "frame_ms", "the time it may take", "budget_ms"),
-        Figure("of that, median", "stage_ms.*", "ms", 2),
+        Figure("of that, median of", "stage_ms.*", "ms", 2),
         Figure("steps of refinement for a frame", "iterations_per_frame", "", 1),
         Figure("Gaussians, mean", "gaussians.mean"),
         Figure("Gaussians, at most", "gaussians.max"),
@@ -52,7 +52,7 @@ GROUPS: dict[str, list[Figure]] = {
         Figure("memory at the end", "rss_mb.end", "MB"),
         Figure("memory, at most", "rss_mb.max", "MB"),
         Figure("frames on rung", "rungs.*"),
-        Figure("frames without", "skipped.*"),
+        Figure("frames that left out", "skipped.*"),
         Figure("frames with the warning", "warnings.*"),
     ],
     "Picture": [

@@ -62,6 +62,7 @@ WRITERS = [  # commands, and their options for one file
     ("export --session SESSION", "--tracks"),
     ("export --session SESSION", "--render"),
     ("overlay", "--out"),
+    ("overlay", "--layers"),
     ("calib live SESSION", "--out"),
     ("bridge foxglove", "--layout"),
 ]
@@ -313,6 +314,7 @@ def test_demo_prints_nothing_but_json(user_files: Path, tmp_path: Path) -> None:
     assert result.exit_code == 0, result.stderr
     summary = pure_json(result.stdout)
     assert summary["frames"] == 35 and summary["overlay"]["frames"] > 0
+    assert summary["overlay"]["saved"] == str(tmp_path / "demo/overlay.mp4")
     assert "pictures of {width}x{height} px".format_map(summary["settings"]) in result.stderr
     assert {file.name for file in (tmp_path / "demo").iterdir()} >= {"report.html", "overlay.mp4"}
     check_report(tmp_path / "demo", "overlay.mp4")  # the next one may replace it
@@ -328,7 +330,7 @@ def test_eval_says_what_it_found_in_a_dozen_lines(user_files: Path, tmp_path: Pa
     said = dict(line.split(None, 1) for line in lines)
     assert "dB PSNR (the picture before, shown again:" in said["picture"] and "ms (p99)" in said["latency"]
     all_figures = sags("eval", *session, "--verbose").stdout
-    assert "of that, median: rectify" in all_figures and len(all_figures.splitlines()) > 30
+    assert "of that, median of: rectify" in all_figures and len(all_figures.splitlines()) > 30
     assert "{" not in all_figures + result.stdout and "None" not in all_figures
 
 
