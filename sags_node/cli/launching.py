@@ -77,6 +77,7 @@ def open_launched(path: str | None, overrides: Sequence[str]) -> Session:
     with progress("rendering the phantom (once)") as advance:
         session = open_session(path, overrides, advance)
     console.print(source_text(session.config.source), markup=False, soft_wrap=True)
+    console.print(f"  {_pictures_text(session)}", markup=False, soft_wrap=True)
     with console.status("loading kernels (compiled once per machine, about half a minute)"):
         warm_up(session.config)
     session = at_best_scale(session)
@@ -94,6 +95,15 @@ def source_text(source: Source) -> str:
     keys = ("left", "right", "launch", "video", "folder", "path", "endpoint")
     said = [getattr(source, key, None) for key in keys]
     return f"source: {source.kind} {', '.join(str(each) for each in said if isinstance(each, str | Path))}"
+
+
+def _pictures_text(session: Session) -> str:
+    """Size, rate and calibration of what is played."""
+    eye, source, config = session.rig.left, session.source, session.config
+    count = source.frame_count
+    length = "" if count is None else f", {count} frames, {count / source.rate:.1f} s"
+    rig = f"calibration {config.rig}" if config.rig is not None else "calibration of the recording"
+    return f"{eye.width}x{eye.height} px at {source.rate:g} frames/s{length}; {rig}"
 
 
 def _runs_on(device: Device) -> str:

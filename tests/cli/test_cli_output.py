@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 import socket
 import subprocess
 import sys
@@ -305,6 +306,7 @@ def test_eval_prints_nothing_but_json(user_files: Path, pace: str) -> None:
 def test_run_prints_nothing_but_json(user_files: Path) -> None:
     result = sags("run", *videos(user_files), "source.frames:=3", "--json")
     assert result.exit_code == 0 and pure_json(result.stdout)["gaussians"] > 100
+    assert re.search(r"source: videos .*\n.* \d+x\d+ px at 10 frames/s, .* calibration \S+\n", result.stderr)
     assert "state" in sags("run", *videos(user_files), "--seconds", "0.3").stdout
 
 
