@@ -7,30 +7,32 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rich.table import Table
-
 from sags_node.config.schema import LaunchConfig
 from sags_node.errors import SagsError
 from sags_node.evaluation.measure import MeasureOptions
-from sags_node.evaluation.report import summary_table, write_report
+from sags_node.evaluation.report import write_report
 from sags_node.evaluation.session import measure
 from sags_node.evaluation.spool import Spool
+from sags_node.files import whole
+from sags_node.media.h264_file import H264File
 from sags_node.messaging.rundir import connection_path, default_run_dir
 from sags_node.node.node import Node
+from sags_node.overlay.draw import over
+from sags_node.overlay.save import Layer, read_layers
 from sags_node.pipeline.session import Session
 from sags_node.processes import end
 from sags_node.terminal.console import stop_signals
-from sags_node.types import FrameResult
+from sags_node.types import U8, FrameResult
 
-VIDEO = "overlay.mp4"
+VIDEO, LAYERS = "overlay.mp4", "overlay.layers"
 OVERLAY_START = 15.0  # s for the overlay to load its shapes and listen
-OVERLAY_GRACE = 15.0  # s for the overlay to write its video after the node has ended
-OVERLAY_STOP = 2.0  # s to do so when the demo is interrupted
+OVERLAY_GRACE = 15.0  # s for the overlay to end after the node
+OVERLAY_STOP = 2.0  # s for it when the demo is interrupted
 _OPTIONS = MeasureOptions(hold_out=0)
 
 
@@ -39,7 +41,6 @@ class Demo:
     """What a demo leaves behind."""
 
     summary: dict[str, Any]  # as `sags eval`, and what the overlay subscriber counted under "overlay"
-    table: Table
     report: Path
 
 
@@ -65,7 +66,7 @@ def run_demo(session: Session, out: Path, progress: Callable[[int, int | None, s
 
         with stop_signals() as stop:
             node = Node(session.config, session.rig, session.source, on_result=keep)
-            overlay = _start_overlay(session.config, seconds, out / VIDEO)
+            overlay = _start_overlay(session.config, seconds, spool.folder / LAYERS)
             try:
                 _await_overlay(session.config, overlay, stop)
                 node.start()
@@ -79,17 +80,42 @@ def run_demo(session: Session, out: Path, progress: Callable[[int, int | None, s
             finally:
                 node.stop()
         consumed = _finish_overlay(overlay)
-        outcome = measure(session, spool, _OPTIONS, progress=lambda what, done: progress(done, frames, what))
-    outcome.summary["overlay"] = consumed
-    page = write_report(out, outcome.summary, outcome.rows, outcome.pictures)
-    return Demo(outcome.summary, summary_table(outcome.summary), page)
+        with whole(out / VIDEO) as partial:
+            video = H264File(partial, session.source.rate, session.working_size)
+            shown = _Shown(video, read_layers(spool.folder / LAYERS))
+            outcome = measure(
+                session, spool, _OPTIONS, (), lambda what, done: progress(done, frames, what), shown.add
+            )
+            video.finish()
+    outcome.summary["overlay"] = consumed | {"saved": str(out / VIDEO)}
+    page = write_report(out, outcome.summary, outcome.rows, outcome.pictures, VIDEO)
+    return Demo(outcome.summary, page)
 
 
-def _start_overlay(config: LaunchConfig, seconds: float, video: Path) -> subprocess.Popen[str]:
+class _Shown:
+    """What a display showed: the camera's picture, and what the overlay drew over it. For a missed frame,
+    what was there before."""
+
+    def __init__(self, file: H264File, layers: Mapping[int, Layer]) -> None:
+        self._file = file
+        self._layers = layers
+        self._shown: U8 | None = None
+
+    def add(self, frame_id: int, left: U8) -> None:
+        layer = self._layers.get(frame_id)
+        if layer is not None:
+            self._shown = left.copy()
+            bottom, right = layer.top + layer.rgba.shape[0], layer.left + layer.rgba.shape[1]
+            part = self._shown[layer.top : bottom, layer.left : right]
+            part[:] = over(part, layer.rgba)
+        self._file.add(left if self._shown is None else self._shown)
+
+
+def _start_overlay(config: LaunchConfig, seconds: float, layers: Path) -> subprocess.Popen[str]:
     """The consumer is a process of its own, as it would be in a theatre."""
     command = [sys.executable, "-m", "sags_node", "overlay", "--ns", config.ns, "--repin"]
     command += ["--run-dir", str(config.publish.run_dir or default_run_dir())]
-    command += ["--seconds", f"{seconds:.1f}", "--save", str(video), "--force", "--json"]
+    command += ["--seconds", f"{seconds:.1f}", "--layers", str(layers), "--json"]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 

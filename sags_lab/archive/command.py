@@ -15,6 +15,7 @@ from sags_lab.archive.cluster import check_installed
 from sags_lab.archive.jobs import JOBS
 from sags_lab.lerobot.option import version_option
 from sags_node.cli.launching import (
+    all_figures,
     as_json,
     check_files,
     figures_option,
@@ -295,17 +296,20 @@ def status(out: str, json_out: bool) -> None:
 @archive.command("show")
 @click.argument("out", metavar="OUT")
 @click.argument("id", metavar="ID")
+@all_figures
 @as_json
-def show_one(out: str, id: str, json_out: bool) -> None:
+def show_one(out: str, id: str, verbose: bool, json_out: bool) -> None:
     """Show all about one recording.
 
-    Its figures, or its failed attempts, their log and the command that repeats them.
+    Its figures (--verbose: all of them, and the log), or its failed attempts, their log and the command that
+    repeats them.
 
     ID may be the beginning of one.
     """
     check_installed()
     from sags_lab.archive.results import of_one
     from sags_lab.archive.store import Store
+    from sags_node.evaluation.verdict import verdict
 
     found = of_one(Store(out), id)
     if json_out:
@@ -317,10 +321,20 @@ def show_one(out: str, id: str, json_out: bool) -> None:
         made.add_row("", f"{attempt['reason']} ({attempt['seconds']:.1f} s, {attempt['host']})")
     if found["failed"] is not None:
         made.add_row("repeat", found["failed"]["command"])
-    for key, value in (found["figures"] or {}).items():
-        made.add_row(key, "–" if value is None else str(value))
+    figures = {key: value for key, value in (found["figures"] or {}).items() if value is not None}
+    if figures.get("job") == "eval":
+        for what, said in [
+            *verdict(figures),
+            ("report", f"{out}/recordings/{found['id']}/report/report.html"),
+        ]:
+            made.add_row(what, said)
+    if verbose or figures.get("job") != "eval":
+        for key, value in figures.items():
+            if verbose or not key.startswith("settings."):
+                made.add_row(key, str(value))
     show(made)
-    console.print(found["log"], markup=False, soft_wrap=True)
+    if verbose or found["failed"] is not None:
+        console.print(found["log"], markup=False, soft_wrap=True)
 
 
 @archive.command()

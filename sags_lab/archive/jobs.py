@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
+
+from sags_node.evaluation.verdict import flat
 
 FIGURES, LOG = "figures.json", "log.txt"  # of a recording's folder: stdout and stderr of the command
 
@@ -36,14 +38,8 @@ def command(job: str, said: Sequence[str], options: Sequence[str], out: Path) ->
     return [*JOBS[job](list(said), out), *options]
 
 
-def flat(figures: Any, prefix: str = "") -> dict[str, Any]:
-    """All numbers and words of nested figures in one row, named by their way: `online.psnr`."""
-    row: dict[str, Any] = {}
+def row_of(figures: Any) -> dict[str, Any]:
+    """The figures of a job in one row, named by their way: `online.psnr`."""
     if isinstance(figures, list):  # of `sags export`: a row for each kind of file
         figures = {each["kind"]: {"holds": each["holds"], "bytes": each["bytes"]} for each in figures}
-    for key, value in figures.items():
-        if isinstance(value, Mapping):
-            row |= flat(value, f"{prefix}{key}.")
-        elif not isinstance(value, list):
-            row[f"{prefix}{key}"] = value
-    return row
+    return flat(figures)

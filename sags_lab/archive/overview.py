@@ -73,7 +73,12 @@ def _spreads(rows: Sequence[Mapping[str, Any]]) -> list[str]:
         shares = np.linspace(0, 100, len(values)) if len(values) > 1 else [50.0]
         points = list(zip(map(float, shares), values, strict=True)) if values else []
         plots.append(
-            line_plot(f"{title}; over % of the recordings", [Series("", BLUE, points, len(points) < 2)], {})
+            line_plot(
+                title,
+                [Series("", BLUE, points, len(points) < 2)],
+                {},
+                "so many % of the recordings are below",
+            )
         )
     return plots
 
@@ -83,7 +88,7 @@ def _scatters(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     for (across, up), title in AGAINST.items():
         pairs = [(_number(row, across), _number(row, up)) for row in rows]
         points = sorted((x, y) for x, y in pairs if x is not None and y is not None)
-        plots.append(line_plot(title, [Series("", BLUE, points, dots=True)], {}))
+        plots.append(line_plot(title, [Series("", BLUE, points, dots=True)], {}, across=""))
     return plots
 
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from sags_lab.archive.inputs import fetched, scratch
-from sags_lab.archive.jobs import FIGURES, LOG, command, flat
+from sags_lab.archive.jobs import FIGURES, LOG, command, row_of
 from sags_lab.archive.launching import arguments, split
 from sags_lab.archive.manifest import Recording
 from sags_lab.archive.process import PROGRAM, Ended, Limits, run_limited
@@ -146,7 +146,7 @@ def _work(recording: Recording, plan: Plan, key: str, program: Sequence[str]) ->
         final = f"{plan.out.rstrip('/')}/{RECORDINGS}/{recording.id}"
         for name in (FIGURES, LOG):  # they say where results are
             (out / name).write_bytes((out / name).read_bytes().replace(os.fsencode(out), final.encode()))
-        figures = flat(json.loads((out / FIGURES).read_bytes()))
+        figures = row_of(json.loads((out / FIGURES).read_bytes()))
         store.finish(recording.id, key, out, _row(recording, figures, plan, time.monotonic() - began))
     return int(figures.get("frames") or 0)
 

@@ -9,6 +9,8 @@ import click
 
 from sags_node.cli.launching import check_files, split, write_json
 from sags_node.errors import UsageError
+from sags_node.evaluation.verdict import flat
+from sags_node.terminal import text
 from sags_node.terminal.console import progress, show
 
 protocol_option = click.option(
@@ -24,6 +26,7 @@ def evaluate_protocol(
     iterations: int | None,
     lpips_weights: Path | None,
     out: Path | None,
+    json_out: bool,
     **others: Any,
 ) -> None:
     """Measure a data set by its protocol.
@@ -56,5 +59,13 @@ def evaluate_protocol(
             }
             found = measures[protocol](Path(path), overrides, tell)
     found = {"protocol": protocol, **found}
-    show(found)
+    if json_out:
+        show(found)
+    else:
+        table = text.table()
+        for key, value in flat(found).items():
+            table.add_row(
+                key, "–" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
+            )
+        show(table)
     write_json(out, found)

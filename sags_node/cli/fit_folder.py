@@ -138,9 +138,35 @@ def _iterate(fit: Fit, stored: Path, advance: Advance) -> None:
         checkpoint.save(fit, stored)
 
 
+def fit_verdict(found: dict[str, Any]) -> list[tuple[str, str]]:
+    """What a fit was worth, a line each; beside it what was published for the same clip."""
+    tested, learnt, depth, track = found["heldout"], found["train"], found["depth"], found["track"]
+    mean = (found["between"] or {}).get("mean")
+    lines = {}
+    if tested is not None:
+        lines["picture"] = f"{_number(tested['psnr'], 'dB')} PSNR on {tested['frames']} frames kept back" + (
+            "" if mean is None else f" (the mean of the pictures around: {_number(mean['psnr'], 'dB')})"
+        )
+        if found["published"]:
+            others = ", ".join(f"{name} {psnr:.1f} dB" for name, psnr in found["published"].items())
+            own = _number(tested.get("paper_psnr"), "dB")
+            lines["published"] = f"{others}; here, counted as they do: {own}"
+    if learnt is not None:
+        lines["learnt"] = f"{_number(learnt['psnr'], 'dB')} PSNR on frames that it was fitted to"
+    if depth is not None:
+        lines["depth"] = f"{depth['median_mm']:.2f} mm off (median), on {depth['frames']} frames"
+    if track is not None:
+        lines["points"] = f"{track['median_mm']:.2f} mm off (median); {track['lost']:.0%} lost"
+    device = "CPU" if found["device"] == "cpu" else "GPU"
+    size = f"{found['gaussians']:,} Gaussians (at most {found['cap']:,})"
+    lines["model"] = f"{size}, fitted in {found['seconds']:.0f} s on the {device}"
+    lines["machine"] = found["machine"]
+    return list(lines.items())
+
+
 def figures_table(found: dict[str, Any]) -> Table:
-    """Figures of the fit; beside them those published for the same clip."""
-    table = text.table("", "frames", "PSNR* (tissue)", "PSNR (masked)", "SSIM", "LPIPS")
+    """All figures of the pictures; beside them those published for the same clip."""
+    table = text.table("", "frames", "PSNR over tissue", "PSNR, masked pixels equal", "SSIM", "LPIPS")
     between = found["between"] or {}
     rows = {
         "heldout": found["heldout"],

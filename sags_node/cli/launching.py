@@ -12,7 +12,8 @@ import click
 
 from sags_node.errors import UsageError
 from sags_node.files import check_file, whole
-from sags_node.terminal.console import console, progress
+from sags_node.terminal import text
+from sags_node.terminal.console import console, progress, show
 
 if TYPE_CHECKING:
     from sags_node.config.schema import Source
@@ -23,6 +24,7 @@ positive = click.FloatRange(min=0, min_open=True)
 
 launch_argument = click.argument("launch", nargs=-1, metavar="[LAUNCH.yaml | SESSION] [key:=value ...]")
 as_json = click.option("--json", "json_out", is_flag=True, help="Print JSON on stdout, for machines.")
+all_figures = click.option("-v", "--verbose", is_flag=True, help="Print all figures, not the verdict alone.")
 lpips_option = click.option(
     "--lpips-weights", type=click.Path(path_type=Path), help="npz of LPIPS SqueezeNet weights."
 )
@@ -75,6 +77,7 @@ def open_launched(path: str | None, overrides: Sequence[str]) -> Session:
     with progress("rendering the phantom (once)") as advance:
         session = open_session(path, overrides, advance)
     console.print(source_text(session.config.source), markup=False, soft_wrap=True)
+    console.print(f"  {_pictures_text(session)}", markup=False, soft_wrap=True)
     with console.status("loading kernels (compiled once per machine, about half a minute)"):
         warm_up(session.config)
     session = at_best_scale(session)
@@ -94,6 +97,15 @@ def source_text(source: Source) -> str:
     return f"source: {source.kind} {', '.join(str(each) for each in said if isinstance(each, str | Path))}"
 
 
+def _pictures_text(session: Session) -> str:
+    """Size, rate and calibration of what is played."""
+    eye, source, config = session.rig.left, session.source, session.config
+    count = source.frame_count
+    length = "" if count is None else f", {count} frames, {count / source.rate:.1f} s"
+    rig = f"calibration {config.rig}" if config.rig is not None else "calibration of the recording"
+    return f"{eye.width}x{eye.height} px at {source.rate:g} frames/s{length}; {rig}"
+
+
 def _runs_on(device: Device) -> str:
     return f"refining on {device.name}" + (f" ({device.reason})" if device.reason else "")
 
@@ -103,6 +115,32 @@ def check_files(*files: Path | None, force: bool | None = None) -> None:
     for file in files:
         if file is not None:
             check_file(file, force)
+
+
+def show_outcome(summary: Mapping[str, Any], report: Path | None, verbose: bool, json_out: bool) -> None:
+    """Print what a measured run was worth, where its report is, and if asked for all of its figures."""
+    from sags_node.evaluation.figure_table import groups, headings
+    from sags_node.evaluation.verdict import flat, verdict
+
+    if json_out:
+        show(dict(summary))
+        if report is not None:
+            console.print(f"report: {report}", markup=False, soft_wrap=True)
+        return
+    show_verdict([*verdict(flat(summary)), *([] if report is None else [("report", str(report))])])
+    for group, rows in groups(summary).items() if verbose else ():
+        table = text.table(f"\n{group}", *(f"\n{name}" for name in headings(summary)), "\ncompared with")
+        for what, values, compared in rows:
+            table.add_row(what, *values, compared)
+        show(table)
+
+
+def show_verdict(lines: Sequence[tuple[str, str]]) -> None:
+    """Print what and how good, a line each."""
+    table = text.table()
+    for what, said in lines:
+        table.add_row(what, said)
+    show(table)
 
 
 def write_json(file: Path | None, figures: Mapping[str, Any] | list[Any]) -> None:
@@ -116,6 +154,6 @@ def write_json(file: Path | None, figures: Mapping[str, Any] | list[Any]) -> Non
         from sags_node.evaluation.provenance import provenance
 
         rows = {"rows": figures} if isinstance(figures, list) else figures
-        text = json.dumps({"provenance": provenance()} | dict(rows), indent=1)
+        lines = json.dumps({"provenance": provenance()} | dict(rows), indent=1)
         with whole(file) as partial:
-            partial.write_text(text + "\n", encoding="utf-8")
+            partial.write_text(lines + "\n", encoding="utf-8")

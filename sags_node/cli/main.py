@@ -22,10 +22,12 @@ from sags_node.cli.bridge import bridge
 from sags_node.cli.calib import calib
 from sags_node.cli.export import export
 from sags_node.cli.launching import (
+    all_figures,
     as_json,
     launch_argument,
     open_launched,
     positive,
+    show_outcome,
     split,
     split_recording,
 )
@@ -167,8 +169,9 @@ def run(launch: tuple[str, ...], seconds: float | None, json_out: bool) -> None:
     show_default=True,
     help="Folder for report.html, sheet.png and overlay.mp4; older ones are replaced.",
 )
+@all_figures
 @as_json
-def demo(launch: tuple[str, ...], seconds: float, out: Path, json_out: bool) -> None:
+def demo(launch: tuple[str, ...], seconds: float, out: Path, verbose: bool, json_out: bool) -> None:
     """Play a session live beside an overlay subscriber; leave a report.
 
     The node publishes over real sockets; `sags overlay` runs as its own process and consumes. The report
@@ -176,11 +179,13 @@ def demo(launch: tuple[str, ...], seconds: float, out: Path, json_out: bool) -> 
     """
     from sags_node.demo import VIDEO, run_demo
     from sags_node.evaluation.report import check_report
+    from sags_node.media.h264_file import check_h264
     from sags_node.pipeline.session import open_session
 
     no_cameras = "sags demo plays recordings; for cameras use sags run and sags overlay"
     path, overrides = split_recording(launch, no_cameras)
     check_plots()
+    check_h264()
     check_report(out, VIDEO)
     live = ["source.loop:=true", "source.pace:=realtime"]
     opened = open_launched(path, [*live, *overrides])  # says what it plays, and at what size
@@ -195,14 +200,9 @@ def demo(launch: tuple[str, ...], seconds: float, out: Path, json_out: bool) -> 
             f"publish.run_dir:={private}",
         ]
         session = open_session(path, [*forced, *overrides])
-        try:
-            with progress("playing") as advance:
-                outcome = run_demo(session, out, advance)
-        except BaseException:  # Ctrl-C, too: without its page nobody knows whose video it is
-            (out / VIDEO).unlink(missing_ok=True)
-            raise
-    show(outcome.summary if json_out else outcome.table)
-    console.print(f"report: [bold]{escape(str(outcome.report))}[/], overlay video beside it", soft_wrap=True)
+        with progress("playing") as advance:
+            outcome = run_demo(session, out, advance)
+    show_outcome(outcome.summary, outcome.report, verbose, json_out)
 
 
 # ---- tools -----------------------------------------------------------------------------------------------

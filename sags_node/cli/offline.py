@@ -7,15 +7,17 @@ from pathlib import Path
 from typing import Any, cast
 
 import click
-from rich.markup import escape
 
 from sags_node.cli.launching import (
+    all_figures,
     as_json,
     check_files,
     figures_option,
     launch_argument,
     lpips_option,
     open_launched,
+    show_outcome,
+    show_verdict,
     source_text,
     split,
     split_recording,
@@ -62,6 +64,7 @@ from sags_node.terminal.console import console, progress, show
 @click.option("--paper-psnr", is_flag=True, help="Also PSNR with masked pixels counted as perfect.")
 @click.option("--report", type=click.Path(path_type=Path), help="Folder for an HTML report.")
 @figures_option
+@all_figures
 @as_json
 def evaluate(
     launch: tuple[str, ...],
@@ -74,6 +77,7 @@ def evaluate(
     paper_psnr: bool,
     report: Path | None,
     out: Path | None,
+    verbose: bool,
     json_out: bool,
 ) -> None:
     """Measure a recorded session: run time against error.
@@ -86,7 +90,7 @@ def evaluate(
     """
     from sags_node.config.launch_file import load_launch
     from sags_node.evaluation.measure import MeasureOptions
-    from sags_node.evaluation.report import check_report, summary_table, write_report
+    from sags_node.evaluation.report import check_report, write_report
     from sags_node.evaluation.session import Pace
     from sags_node.evaluation.session import evaluate as measure
 
@@ -108,10 +112,10 @@ def evaluate(
             iterations,
             lambda what, frames: advance(frames, None, what),
         )
+    page = None
     if report is not None:
         page = write_report(report, outcome.summary, outcome.rows, outcome.pictures)
-        console.print(f"report: [bold]{escape(str(page))}[/]", soft_wrap=True)
-    show(outcome.summary if json_out else summary_table(outcome.summary))
+    show_outcome(outcome.summary, page, verbose, json_out)
     write_json(out, outcome.summary)
 
 
@@ -167,6 +171,7 @@ def evaluate(
     help="Test on every N-th frame; 0: none.",
 )
 @lpips_option
+@all_figures
 @as_json
 def fit(
     dataset: tuple[str, ...],
@@ -184,6 +189,7 @@ def fit(
     seed: int,
     hold_out: int,
     lpips_weights: Path | None,
+    verbose: bool,
     json_out: bool,
 ) -> None:
     """Fit the SAGS model offline to a whole recording.
@@ -200,7 +206,7 @@ def fit(
     sags fit launch/d4d_pull.yaml --out out/d4d
     sags fit /data/endonerf/pulling_soft_tissues --schedule paper
     """
-    from sags_node.cli.fit_folder import check_fit, figures_table, fit_session
+    from sags_node.cli.fit_folder import check_fit, figures_table, fit_session, fit_verdict
     from sags_node.config.launch_file import load_launch
     from sags_node.evaluation.measure import MeasureOptions
     from sags_node.fitting.settings import MONOCULAR, PRESETS, with_changes
@@ -228,4 +234,9 @@ def fit(
     session = open_launched(path, [*overrides, "device:=cpu", "source.loop:=false", "source.pace:=step"])
     with progress("fitting") as advance:
         found = fit_session(session, settings, options, out, resume, advance)
-    show(found if json_out else figures_table(found))
+    if json_out:
+        show(found)
+        return
+    show_verdict([*fit_verdict(found), ("where", f"{out}: model.ply, test/, figures.json")])
+    if verbose:
+        show(figures_table(found))

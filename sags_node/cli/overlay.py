@@ -76,6 +76,12 @@ class Ahead(click.ParamType["float | str"]):
     type=click.Path(path_type=Path),
     help="Write what is shown: .mp4, or .png.",
 )
+@click.option(
+    "--layers",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help="Keep what is drawn, without the video: costs the node nothing. sags demo makes its video of it.",
+)
 @force_option
 @as_json
 def overlay(json_out: bool, **options: Any) -> None:

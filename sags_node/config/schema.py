@@ -617,6 +617,9 @@ class EngineConfig(Section):
 
 
 USUAL_MS = 33.0  # of a frame, where nothing says when the next one comes
+# Of the time until the next frame comes. A node that uses all of it never makes up for a late one: the frames
+# after it wait, too. benchmarks/ladder.md has what the rest is worth.
+SHARE = 0.9
 LONGEST_MS = 100.0  # of a frame, where they come more seldom: what is shown of it must still be new
 
 
@@ -626,8 +629,8 @@ class MappingConfig(Section):
     budget_ms: float | None = Field(
         None,
         gt=0,
-        description="wall time of one frame, all stages; default: as long as it is until the next one comes, "
-        "100 at most; 33 where a recording is not played in real time",
+        description="wall time of one frame, all stages; default: nine tenths of the time until the next "
+        "one comes, 100 at most; 33 where a recording is not played in real time",
     )
     iterations: int | None = Field(None, ge=0, description="fixed steps per frame instead of the budget")
     rung: int | None = Field(
@@ -658,7 +661,7 @@ class MappingConfig(Section):
             return self.budget_ms
         if rate is None or self.iterations is not None:
             return USUAL_MS
-        return min(1e3 / rate, LONGEST_MS)
+        return min(SHARE * 1e3 / rate, LONGEST_MS)
 
 
 class PublishConfig(Guarded):

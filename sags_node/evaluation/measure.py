@@ -32,6 +32,7 @@ PREDICTED = 3  # frames ahead, at most
 
 Figures = dict[str, float]
 Progress = Callable[[str, int], None]  # what is going on, frames done
+OnPicture = Callable[[int, U8], None]  # a frame's number and its rectified left picture
 TissueOf = Callable[[StereoFrame, RectifiedPair], Bool]
 
 
@@ -123,12 +124,14 @@ class Measurer:
         options: MeasureOptions,
         exclude: tuple[Box, ...] = (),
         pose: PoseWay = "session",
+        on_picture: OnPicture = lambda frame_id, left: None,
     ) -> None:
         """
         Args:
             tissue_of: the run's own tissue mask, for frames that it held out.
             exclude: boxes of the raw pictures that are never measured (captions, burnt into both eyes).
             pose: where the run had its poses from.
+            on_picture: called with each frame of the recording.
         """
         self.rows: list[FrameRow] = []
         self.gallery = Gallery(len(spool))
@@ -147,6 +150,7 @@ class Measurer:
         self._flicker = Flicker()
         self._tracks: PointTracks | None = None
         self._pose = pose
+        self._on_picture = on_picture
         self._rigid = RigidOdometry()
         self._earlier: deque[_Before] = deque(maxlen=PREDICTED)  # the latest first
         self._held: _HeldOut | None = None
@@ -157,6 +161,7 @@ class Measurer:
             if frame.warm_up:
                 continue
             pair = self._rectifier(frame)
+            self._on_picture(frame.frame_id, pair.left)
             seconds = frame.t_capture_ns * 1e-9
             place = self._places.get(frame.frame_id)
             if place is not None:

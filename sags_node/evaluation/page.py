@@ -15,14 +15,21 @@ _JPEG_QUALITY = 85
 _STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; color: #222 }
 body { max-width: 1480px; margin: 24px auto; padding: 0 16px }
-h1 { font-size: 22px; margin: 0 } h2 { font-size: 17px; margin: 28px 0 8px } p { margin: 4px 0 }
+h1 { font-size: 22px; margin: 0 } h2 { font-size: 18px; margin: 28px 0 8px }
+h3 { font-size: 15px; margin: 12px 0 4px } h2.warning { color: #b35c00 }
+p { margin: 4px 0; overflow-wrap: anywhere } .quiet { color: #666 }
 table { border-collapse: collapse } td, th { padding: 3px 12px 3px 0; text-align: left; vertical-align: top }
-table.figures td { border-top: 1px solid #ddd } .number { font-variant-numeric: tabular-nums }
-table.pictures img { width: 100%; display: block } table.pictures td { padding: 2px; width: 25% }
-.plots { display: grid; grid-template-columns: repeat(auto-fit, minmax(520px, 1fr)); gap: 8px }
-.quiet { color: #666 }
-h3 { font-size: 15px; margin: 12px 0 4px; color: #b35c00 }
-.plots img { width: 100% }
+td { overflow-wrap: anywhere }
+.first { display: flex; align-items: flex-start; flex-wrap: wrap; gap: 12px 24px; margin-top: 16px }
+.first video { flex: 1 1 420px; min-width: 0; max-width: 720px; background: #000 }
+.first .verdict { flex: 1 1 320px }
+.figures td, .figures th { border-top: 1px solid #ddd } .figures th { padding-top: 18px; color: #222 }
+.figures tr.quiet td { vertical-align: bottom }
+.number { font-variant-numeric: tabular-nums; white-space: nowrap }
+.pictures { display: grid; grid-template-columns: repeat(4, 1fr); gap: 4px }
+.plots { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 560px), 1fr)); gap: 8px }
+figure { margin: 0 } figcaption { color: #666; font-size: 13px } img { width: 100%; display: block }
+@media (max-width: 700px) { .pictures { grid-template-columns: repeat(2, 1fr) } }
 """
 
 
@@ -31,6 +38,7 @@ def page(title: str, parts: Sequence[str]) -> str:
     return "\n".join(
         [
             f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>',
+            '<meta name="viewport" content="width=device-width, initial-scale=1">',
             f"<style>{_STYLE}</style></head><body>",
             f"<h1>{escape(title)}</h1>",
             *parts,

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from sags_node.evaluation.plotting import as_svg, new_figure
 
-WIDTH, HEIGHT = 720, 200  # px
+WIDTH, HEIGHT = 640, 280  # px
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,28 +21,40 @@ class Series:
     dots: bool = False  # single points, not joined
 
 
-def line_plot(title: str, series: Sequence[Series], spans: Mapping[str, tuple[int, int]]) -> str:
-    """An SVG file of several series; `spans` (first and last frame) are shaded and named.
+def line_plot(
+    title: str,
+    series: Sequence[Series],
+    spans: Mapping[str, tuple[int, int]],
+    across: str = "frame",
+    gaps: Sequence[int] = (),
+) -> str:
+    """An SVG file of several series; empty text when there is nothing to draw.
 
-    Empty text when there is nothing to draw.
+    Args:
+        spans: first and last frame of what is shaded and named.
+        across: what lies across; empty: the title says it.
+        gaps: frames that are shaded grey.
     """
     series = [each for each in series if any(math.isfinite(value) for _, value in each.points)]
     if not series:
         return ""
     with new_figure(WIDTH, HEIGHT) as figure:
         axes = figure.subplots()
-        axes.set_title(title, loc="left", fontweight="bold", fontsize=9)
+        axes.set_title(title, loc="left", fontweight="bold", fontsize=10)
         for each in series:
-            across, values = zip(*each.points, strict=True)
+            places, values = zip(*each.points, strict=True)
             style = {"linestyle": "", "marker": "o", "markersize": 3} if each.dots else {"linewidth": 1.2}
-            axes.plot(across, values, color=each.colour, label=each.label, **style)
+            axes.plot(places, values, color=each.colour, label=each.label, **style)
         first, last = axes.get_xlim()
         for name, (begin, end) in spans.items():
             if begin <= last and first <= end:
                 axes.axvspan(max(begin, first), min(end, last), color="#f2e3c6", zorder=0)
                 corner = max(begin, first), 1
                 axes.annotate(name, corner, (3, -9), ("data", "axes fraction"), "offset points")
+        for frame in gaps:
+            axes.axvspan(frame - 0.5, frame + 0.5, color="#dddddd", linewidth=0, zorder=0)
         axes.set_xlim(first, last)
+        axes.set_xlabel(across)
         if len(series) > 1:
-            axes.legend(loc="upper left", bbox_to_anchor=(1, 1))
+            figure.legend(loc="outside lower left", ncols=len(series))
         return as_svg(figure)

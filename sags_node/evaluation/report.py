@@ -1,4 +1,4 @@
-"""A run on one page that opens anywhere: pictures, plots over time, and the figures."""
+"""A run on one page: its video, what it was worth, pictures, plots over time, and every figure."""
 
 from __future__ import annotations
 
@@ -8,21 +8,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.table import Table
 
 from sags_node.evaluation import calibration
+from sags_node.evaluation.figure_table import groups, headings
 from sags_node.evaluation.gallery import Picture
 from sags_node.evaluation.measure import FrameRow
 from sags_node.evaluation.page import encoded, page, picture_uri, svg_uri
 from sags_node.evaluation.plots import Series, line_plot
+from sags_node.evaluation.provenance import provenance
 from sags_node.evaluation.spool import RunFacts
 from sags_node.evaluation.tiles import ERROR_AT_TOP, depth_range, tiles
+from sags_node.evaluation.verdict import flat, verdict
 from sags_node.files import check_folder, check_results, whole
 from sags_node.types import U8
 
-BLUE, ORANGE, GREEN = "#2166ac", "#d6604d", "#1b7837"
+BLUE, ORANGE, GREEN, GREY = "#2166ac", "#d6604d", "#1b7837", "#777777"
 REPORT, SHEET, TITLE = "report.html", "sheet.png", "SAGS: "
-COLUMNS = ("input", "model", "depth", "error")
+COLUMNS = ("camera", "model", "depth", "error")
 
 
 def check_report(folder: Path, *more: str) -> None:
@@ -38,12 +40,18 @@ def check_report(folder: Path, *more: str) -> None:
 
 
 def write_report(
-    folder: Path, summary: Mapping[str, Any], rows: Sequence[FrameRow], pictures: Sequence[Picture]
+    folder: Path,
+    summary: Mapping[str, Any],
+    rows: Sequence[FrameRow],
+    pictures: Sequence[Picture],
+    video: str | None = None,
 ) -> Path:
-    """Write `report.html` (self-contained, below 2 MB) and `sheet.png` (its pictures) into `folder`.
+    """Write `report.html` (below 2 MB, and whole but for its video) and `sheet.png` (its pictures) into
+    `folder`.
 
     Args:
         summary: as `summarise` makes it.
+        video: name of a file in `folder` that browsers play.
 
     Returns:
         The path of `report.html`.
@@ -54,16 +62,16 @@ def write_report(
     check_folder(folder)
     near, far = depth_range(pictures)
     sheet = [tiles(picture, near, far) for picture in pictures]
-    title = f"{TITLE}{summary['session']}"
     text = page(
-        title,
+        f"{TITLE}{summary['session']}",
         [
-            f'<p class="quiet">{escape(_circumstances(summary))}</p>',
-            "<h2>What it showed</h2>",
+            f'<p class="quiet">{escape(_origin())}</p>',
+            f'<div class="first">{_video(video)}{_verdict(summary)}</div>',
             warning_table(rows),
-            _picture_table(pictures, sheet),
+            "<h2>Pictures</h2>",
+            _pictures(pictures, sheet),
             f'<p class="quiet">Grey: not tissue, or nothing known. Depth from {near * 1e3:.0f} to '
-            f"{far * 1e3:.0f} mm; the error is brightest at {ERROR_AT_TOP:.0%} of full scale.</p>",
+            f"{far * 1e3:.0f} mm. The error is brightest at {ERROR_AT_TOP:.0%} of full scale.</p>",
             "<h2>Over time</h2>",
             _plots(rows, summary.get("segments") or {}),
             "<h2>Figures</h2>",
@@ -80,33 +88,34 @@ def write_report(
     return report
 
 
-def summary_table(summary: Mapping[str, Any]) -> Table:
-    """The figures for a terminal."""
-    table = Table(show_header=False, box=None, padding=(0, 2))
-    for key, value in summary.items():
-        table.add_row(key, _text(value))
-    return table
+def _origin() -> str:
+    known = provenance()
+    return f"{known['command']}; {known['date']}; revision {known['revision']}"
 
 
-def _circumstances(summary: Mapping[str, Any]) -> str:
-    settings = summary.get("settings") or {}
-    said = [f"{key} {_text(value)}" for key, value in settings.items() if value not in (None, [])]
-    return "; ".join([str(summary.get("machine", "")), *said])
+def _video(name: str | None) -> str:
+    if name is None:
+        return ""
+    return f'<video src="{escape(name)}" controls autoplay muted loop playsinline></video>'
 
 
-def _picture_table(pictures: Sequence[Picture], sheet: Sequence[Sequence[U8]]) -> str:
-    head = "".join(f"<th>{name}</th>" for name in COLUMNS)
-    lines = [f'<table class="pictures"><tr>{head}</tr>']
+def _verdict(summary: Mapping[str, Any]) -> str:
+    lines = [f"<tr><th>{what}</th><td>{escape(said)}</td></tr>" for what, said in verdict(flat(summary))]
+    return f'<table class="verdict">{"".join(lines)}</table>'
+
+
+def _pictures(pictures: Sequence[Picture], sheet: Sequence[Sequence[U8]]) -> str:
+    lines = []
     worst = min((picture.psnr for picture in pictures), default=None)
     for picture, line in zip(pictures, sheet, strict=True):
         note = " (the worst)" if picture.psnr == worst and len(pictures) > 1 else ""
-        caption = f"frame {picture.frame_id}, {picture.psnr:.1f} dB{note}"
         cells = "".join(
-            f'<td><img alt="{name}" src="{picture_uri(tile)}"></td>'
+            f'<figure><img alt="{name}" src="{picture_uri(tile)}"><figcaption>{name}</figcaption></figure>'
             for name, tile in zip(COLUMNS, line, strict=True)
         )
-        lines.append(f'<tr>{cells}</tr><tr><td colspan="4" class="quiet">{caption}</td></tr>')
-    return "\n".join([*lines, "</table>"])
+        lines.append(f"<h3>frame {picture.frame_id}, {picture.psnr:.1f} dB{note}</h3>")
+        lines.append(f'<div class="pictures">{cells}</div>')
+    return "\n".join(lines)
 
 
 def warning_table(rows: Sequence[FrameRow]) -> str:
@@ -122,79 +131,75 @@ def warning_table(rows: Sequence[FrameRow]) -> str:
         f'<td class="quiet">{escape(code)}, see docs/warnings.md</td></tr>'
         for code, shown in frames.items()
     ]
-    return f'<h3>Warnings</h3><table class="warnings">{"".join(lines)}</table>' if lines else ""
+    return f'<h2 class="warning">Warnings</h2><table>{"".join(lines)}</table>' if lines else ""
 
 
 def _plots(rows: Sequence[FrameRow], spans: Mapping[str, tuple[int, int]]) -> str:
-    def quality(label: str, colour: str, group: str, dots: bool = False) -> Series:
-        points = [(row.frame_id, row.figures[group]["psnr"]) for row in rows if group in row.figures]
+    def figure(label: str, colour: str, key: str, dots: bool = False) -> Series:
+        group, _, name = key.partition(".")
+        points = [(row.frame_id, row.figures[group][name]) for row in rows if group in row.figures]
         return Series(label, colour, points, dots)
 
     def run(label: str, colour: str, value: Callable[[RunFacts], float | None]) -> Series:
+        """Without the first frame, which takes long."""
         found = [(row.frame_id, value(row.facts)) for row in rows if row.facts is not None]
         return Series(label, colour, [(frame, each) for frame, each in found[1:] if each is not None])
 
-    plots = [
-        line_plot(
-            "PSNR over tissue, dB",
-            [
-                quality("online", BLUE, "online"),
-                quality("predicted", ORANGE, "predict"),
-                quality("held out", GREEN, "heldout", dots=True),
-                quality("right eye", "#7b3294", "novel", dots=True),
-            ],
-            spans,
-        ),
-        line_plot(
-            "one frame (without the first), ms",
-            [run("processing", BLUE, lambda facts: facts.frame_ms)],
-            spans,
-        ),
-        line_plot(
-            "capture to publish (without the first frame), ms",
-            [run("latency", BLUE, lambda facts: facts.latency_ms)],
-            spans,
-        ),
-        line_plot("Gaussians", [run("Gaussians", BLUE, lambda facts: facts.gaussians)], spans),
-    ]
-    rungs = run("rung", BLUE, lambda facts: facts.rung)
-    if rungs.points:
-        plots.append(line_plot("rung of the ladder of quality", [rungs], spans))
     tallies = [row.calibration for row in rows if row.calibration is not None]
     sure = calibration.points(tallies, 0.9)
-    plots.append(
+    plots = [
         line_plot(
-            "nine of ten real errors of depth are below (mm), over the predicted error (mm)",
+            "How near the picture is to the camera's: PSNR, dB; higher is better",
             [
-                Series("real", BLUE, sure),
-                Series("half of them", GREEN, calibration.points(tallies, 0.5)),
-                Series("as predicted", ORANGE, [(middle, middle) for middle, _ in sure]),
+                figure("shown", BLUE, "online.psnr"),
+                figure("predicted a frame ahead", ORANGE, "predict.psnr"),
+                figure("the picture before, again", GREY, "predict.copy_psnr"),
+                figure("kept back, never seen", GREEN, "heldout.psnr", dots=True),
+            ],
+            spans,
+        ),
+        line_plot(
+            "How long a frame took: ms (grey: missed)",
+            [
+                run("stamp to sending", BLUE, lambda facts: facts.latency_ms),
+                run("work", ORANGE, lambda facts: facts.frame_ms),
+            ],
+            spans,
+            gaps=[row.frame_id for row in rows if row.facts is None],
+        ),
+        line_plot(
+            "How far the depth is off: mm, lower is better",
+            [
+                figure("nine of ten below", ORANGE, "depth.p90_mm"),
+                figure("half below", BLUE, "depth.median_mm"),
+                figure("half below, stereo alone", GREY, "measured_depth.median_mm"),
+            ],
+            spans,
+        ),
+        line_plot(
+            "Whether depth knows its error: real over predicted, mm",
+            [
+                Series("nine of ten below", ORANGE, sure),
+                Series("half below", BLUE, calibration.points(tallies, 0.5)),
+                Series("as predicted", GREY, [(middle, middle) for middle, _ in sure]),
             ],
             {},
-        )
-    )
+            across="predicted error, mm",
+        ),
+    ]
+    if not tallies:  # no true depth
+        gaussians = run("Gaussians", BLUE, lambda facts: facts.gaussians)
+        plots.append(line_plot("How many Gaussians the model has", [gaussians], spans))
     shown = [f'<img alt="plot" src="{svg_uri(plot)}">' for plot in plots if plot]
     return f'<div class="plots">{"".join(shown)}</div>'
 
 
 def _figure_table(summary: Mapping[str, Any]) -> str:
+    head = "".join(f"<td>{escape(name)}</td>" for name in headings(summary))
     lines = ['<table class="figures">']
-    for key, value in summary.items():
-        if key not in {"settings", "machine", "session"}:
-            lines.append(f'<tr><td>{escape(key)}</td><td class="number">{escape(_text(value))}</td></tr>')
+    for group, rows in groups(summary).items():
+        lines.append(f'<tr class="quiet"><th>{group}</th>{head}<td>compared with</td></tr>')
+        for what, values, compared in rows:
+            cells = "".join(f'<td class="number">{escape(value)}</td>' for value in values)
+            lines.append(f'<tr><td>{escape(what)}</td>{cells}<td class="quiet">{escape(compared)}</td></tr>')
     return "\n".join([*lines, "</table>"])
-
-
-def _text(value: Any) -> str:
-    """A figure for people: maps on one line, None as a dash."""
-    if value is None:
-        return "–"
-    if isinstance(value, Mapping):
-        return ", ".join(f"{key} {_inner(part)}" for key, part in value.items()) or "–"
-    if isinstance(value, list):
-        return " ".join(_text(part) for part in value)
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
-def _inner(value: Any) -> str:
-    return f"({_text(value)})" if isinstance(value, Mapping) else _text(value)

@@ -13,7 +13,7 @@ from sags_node.config.launch_file import load_launch
 from sags_node.config.schema import LaunchConfig, LiveSource, PublishConfig
 from sags_node.errors import SagsError, UsageError
 from sags_node.evaluation.gallery import Picture
-from sags_node.evaluation.measure import FrameRow, MeasureOptions, Measurer, Progress
+from sags_node.evaluation.measure import FrameRow, MeasureOptions, Measurer, OnPicture, Progress
 from sags_node.evaluation.spool import Spool
 from sags_node.evaluation.summary import GROUPS, summarise
 from sags_node.kernels.threads import configure_threads
@@ -96,8 +96,12 @@ def measure(
     options: MeasureOptions,
     overrides: Sequence[str] = (),
     progress: Progress = lambda what, frames: None,
+    on_picture: OnPicture = lambda frame_id, left: None,
 ) -> Evaluation:
     """Measure a finished run against the recording it was played from, which is read once more.
+
+    Args:
+        on_picture: called with each frame's number and its rectified left picture.
 
     Raises:
         SagsError: nothing was processed, or the recording cannot be read again.
@@ -107,7 +111,7 @@ def measure(
             "no frame was processed; check source.start, source.frames, source.warm_up and the hold-out"
         )
     config = session.config
-    measurer = _measured(session, spool, options, progress)
+    measurer = _measured(session, spool, options, progress, on_picture)
     summary = summarise(
         session.name,
         measurer.rows,
@@ -211,13 +215,15 @@ class _WithoutHeldOut:
         self._source.stop()
 
 
-def _measured(session: Session, spool: Spool, options: MeasureOptions, progress: Progress) -> Measurer:
+def _measured(
+    session: Session, spool: Spool, options: MeasureOptions, progress: Progress, on_picture: OnPicture
+) -> Measurer:
     """Read the recording again, with its truth, and measure every frame."""
     config = session.config
     rectifier = Rectifier(session.rig, *session.working_size)
     tissue = TissueMask(config.vision.tissue, rectifier)
     exclude = config.vision.tissue.exclude
-    measurer = Measurer(spool, rectifier, tissue, options, exclude, config.vision.pose)
+    measurer = Measurer(spool, rectifier, tissue, options, exclude, config.vision.pose, on_picture)
     played = config.source.model_copy(update={"pace": "step"})
     with open_posed(config.model_copy(update={"source": played}), session.rig) as frames:
         measurer.run(frames, progress)

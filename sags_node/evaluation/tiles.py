@@ -65,17 +65,17 @@ def shrunk(picture: U8) -> U8:
 
 def _with_bar(tile: U8, colormap: int, low: str, high: str) -> U8:
     """The colour scale along the lower edge, its ends labelled."""
-    length, thickness, margin = TILE_WIDTH // 3, 8, 6
+    length, thickness, margin, size = TILE_WIDTH // 3, 10, 6, 0.55
     bar = _coloured(
         np.linspace(0, 1, length, dtype=np.float32)[None].repeat(thickness, 0), colormap, np.array(True)
     )
     bottom = tile.shape[0] - margin
     if bottom < thickness:
         return tile
+    tile[bottom - thickness - margin :] = 0  # under it: the scale is readable on anything
     left = (TILE_WIDTH - length) // 2
     tile[bottom - thickness : bottom, left : left + length] = bar
-    width = cv2.getTextSize(low, _FONT, 0.4, 1)[0][0]
+    width = cv2.getTextSize(low, _FONT, size, 1)[0][0]
     for text, x in ((low, left - width - margin), (high, left + length + margin)):
-        cv2.putText(tile, text, (x, bottom), _FONT, 0.4, (0, 0, 0), 3, cv2.LINE_AA)
-        cv2.putText(tile, text, (x, bottom), _FONT, 0.4, (255, 255, 255), 1, cv2.LINE_AA)
+        cv2.putText(tile, text, (x, bottom), _FONT, size, (255, 255, 255), 1, cv2.LINE_AA)
     return tile

@@ -69,9 +69,14 @@ class Statistics:
         # may hold for long.
         self.latency_s = 0.0
 
-    def add(self, result: FrameResult, latency_ms: float, dropped: Mapping[str, int]) -> None:
-        """Take a published frame; `dropped`: how many each slot has left out until now."""
+    def add(self, result: FrameResult, latency_ms: float, dropped: Mapping[str, int]) -> bool:
+        """Take a published frame; `dropped`: how many each slot has left out until now.
+
+        Returns:
+            Whether none was expected any more, or none had come yet.
+        """
         with self._lock:
+            waited = self._is_waiting(time.monotonic())
             self._left_out.append(dropped)
             self._started = True
             self._published.append(time.monotonic())
@@ -87,6 +92,10 @@ class Statistics:
             self._rung = result.rung
             forecast = result.snapshot.forecast
             self._motion = None if forecast is None else forecast.state
+        return waited
+
+    def _is_waiting(self, now: float) -> bool:
+        return not self._published or now - self._published[-1] > WAITING_AFTER
 
     def forget_rate(self) -> None:
         """After a pause the time without frames says nothing."""
@@ -108,7 +117,7 @@ class Statistics:
         """`missed`: why frames are left out, if they are, and the remedy."""
         with self._lock:
             now = time.monotonic()
-            waiting = not self._published or now - self._published[-1] > WAITING_AFTER
+            waiting = self._is_waiting(now)
             span = self._published[-1] - self._published[0] if len(self._published) > 1 else 0.0
             if stopping:
                 state = "stopping"

@@ -334,7 +334,8 @@ class Node:
         result = replace(result, timings_ms={**result.timings_ms, "publish": publish_ms})
         if self._publisher.thin:
             self._whole.put((result, self._publisher.thin))
-        self._state.statistics.add(result, latency_ms, self.dropped)
+        if self._state.statistics.add(result, latency_ms, self.dropped):
+            self._state.status_due.set()  # until it is told, consumers refuse what comes
         self._last_sent = result
         if self._on_result is not None:
             self._on_result(result, latency_ms)

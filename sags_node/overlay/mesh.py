@@ -6,9 +6,9 @@ Everything ends as one triangle mesh in metres; a point becomes a small octahedr
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -130,34 +130,42 @@ def _octahedra(points: F64, radius: float) -> tuple[F64, I32]:
 
 def _target(color: tuple[int, int, int]) -> Mesh:
     """A ring on the surface and an arrow that points at its middle."""
-    import open3d
-
-    create = open3d.geometry.TriangleMesh
-    ring = create.create_torus(0.0035, 0.0005, 48, 10)
-    arrow = create.create_arrow(
-        cylinder_radius=0.0004, cone_radius=0.0012, cylinder_height=0.0065, cone_height=0.0035
+    around = np.linspace(0, 2 * np.pi, 11)
+    ring = _turned(0.0035 + 0.0005 * np.cos(around), 0.0005 * np.sin(around), 48)
+    head, back, tip = -0.0035, -0.010, 0.0  # along z: where the cone begins, the shaft's end, the tip
+    points, triangles = _turned(
+        np.array([0, 0.0004, 0.0004, 0.0012, 0]), np.array([back, back, head, head, tip]), 20
     )
-    turned = create.get_rotation_matrix_from_xyz((np.pi - LEAN, 0.0, 0.0))
-    arrow.translate((0.0, 0.0, -0.010)).rotate(turned, center=(0.0, 0.0, 0.0)).translate((0.0, 0.0, 0.001))
-    return _joined([(ring, GREEN), (arrow, color)])
+    cos, sin = np.cos(np.pi - LEAN), np.sin(np.pi - LEAN)
+    leaning = points @ np.array([[1, 0, 0], [0, cos, -sin], [0, sin, cos]]).T + (0.0, 0.0, 0.001)
+    return _joined([(ring, GREEN), ((leaning, triangles), color)])
 
 
 def _marker(color: tuple[int, int, int]) -> Mesh:
     """A ball of 2 mm in the surface."""
-    import open3d
+    angles = np.linspace(-np.pi / 2, np.pi / 2, 17)
+    return _joined([(_turned(0.002 * np.cos(angles), 0.002 * np.sin(angles), 32), color)])
 
-    return _joined([(open3d.geometry.TriangleMesh.create_sphere(0.002, 16), color)])
+
+def _turned(radii: F64, heights: F64, segments: int) -> tuple[F64, I32]:
+    """Vertices [V, 3] and outward triangles [T, 3] of a profile (m) that runs upwards, turned about z."""
+    angles = 2 * np.pi * np.arange(segments) / segments
+    rings = [radii[:, None] * np.cos(angles), radii[:, None] * np.sin(angles)]
+    vertices = np.stack([*rings, np.repeat(heights[:, None], segments, 1)], -1).reshape(-1, 3)
+    ring, place = np.divmod(np.arange((len(radii) - 1) * segments), segments)
+    start, beside = ring * segments + place, ring * segments + (place + 1) % segments
+    lower = np.stack([start, beside, beside + segments], -1)[radii[ring] > 1e-9]
+    upper = np.stack([start, beside + segments, start + segments], -1)[radii[ring + 1] > 1e-9]
+    return vertices, np.concatenate([lower, upper]).astype(np.int32)
 
 
-def _joined(parts: list[tuple[Any, tuple[int, int, int]]]) -> Mesh:
-    starts = np.cumsum([0, *(len(mesh.vertices) for mesh, _ in parts)])
+def _joined(parts: Sequence[tuple[tuple[F64, I32], tuple[int, int, int]]]) -> Mesh:
+    starts = np.cumsum([0, *(len(vertices) for (vertices, _), _ in parts)])
     numbered = zip(parts, starts, strict=False)
     return Mesh(
-        np.concatenate([np.asarray(mesh.vertices, np.float32) for mesh, _ in parts]),
-        np.concatenate(
-            [np.asarray(mesh.triangles, np.int32) + np.int32(start) for (mesh, _), start in numbered]
-        ),
-        np.concatenate([_painted(len(mesh.triangles), color) for mesh, color in parts]),
+        np.concatenate([vertices for (vertices, _), _ in parts]).astype(np.float32),
+        np.concatenate([triangles + np.int32(start) for ((_, triangles), _), start in numbered]),
+        np.concatenate([_painted(len(triangles), color) for (_, triangles), color in parts]),
     )
 
 

@@ -33,7 +33,7 @@ from sags_node.overlay.durations import Durations
 from sags_node.overlay.frame import CONFIDENCE, NEEDED, RIGHT_INFO, TISSUE, TissueFrame, tissue_frame
 from sags_node.overlay.held import HeldObject, Pinner
 from sags_node.overlay.mesh import mesh_of
-from sags_node.overlay.save import Output
+from sags_node.overlay.save import Layers, Output
 from sags_node.overlay.scene import SceneSpec, built_in, read_scene
 from sags_node.overlay.stream import OverlayStream
 from sags_node.types import U8
@@ -60,6 +60,7 @@ class OverlayOptions:
     shape: str = "target"
     seconds: float | None = None  # default: until Ctrl-C
     save: Path | None = None  # .mp4 for every picture, .png for the last one with the overlay
+    layers: Path | None = None  # for `Layers`
     force: bool = False  # it may replace a file
     max_age: float = MAX_AGE
     repin: bool = False
@@ -89,11 +90,12 @@ def run_overlay(options: OverlayOptions, tell: Callable[[str], object] = log.war
     if options.node.endpoint is not None and options.node.control is None:
         raise UsageError("--endpoint needs --control, the node's control socket: anchors are asked for there")
     output = Output(options.save, options.force)
+    layers = None if options.layers is None else Layers(options.layers, options.force)
     scene = built_in(options.pin, options.shape) if options.scene is None else read_scene(options.scene)
     overlay_draw.warm_up()
     bodies = [Body(mesh_of(spec), spec.opacity, spec.label) for spec in scene.objects]
     with OverlayStream(options.own_ns, options.node.run_dir, scene.color_key) as stream:
-        overlay = _Overlay(options, scene, bodies, stream, output, tell)
+        overlay = _Overlay(options, scene, bodies, stream, output, layers, tell)
         try:
             overlay.run()
         except KeyboardInterrupt:
@@ -111,6 +113,7 @@ class _Overlay:
         bodies: Sequence[Body],
         stream: OverlayStream,
         output: Output,
+        layers: Layers | None,
         tell: Callable[[str], object],
     ) -> None:
         connect = partial(ControlClient.at, options.node)
@@ -122,6 +125,7 @@ class _Overlay:
         self._waiting_because = ""
         self._stream = stream
         self._output = output
+        self._layers = layers
         self._pinner = Pinner(connect)
         self._objects = [
             HeldObject(
@@ -220,6 +224,8 @@ class _Overlay:
         self._stream.blank("the overlay was stopped")
         self._stream.tell(self._facts())
         self._pinner.close()
+        if self._layers is not None:
+            self._layers.close()
         self._output.close()
 
     def summary(self) -> dict[str, Any]:
@@ -247,6 +253,8 @@ class _Overlay:
         rgba, reason = self._overlay(leading.stamp_ns)
         if reason is not None:
             self._blanked[reason] += 1
+        if self._layers is not None:
+            self._layers.add(leading.meta.frame_id, rgba)
         if self._options.save is None:
             return
         came = self._node.aligned([PICTURE], leading.stamp_ns, WAIT_FOR_REST)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import struct
 from contextlib import ExitStack
 from pathlib import Path
+from typing import BinaryIO, NamedTuple
 
 import cv2
+import numpy as np
 
 from sags_node.errors import UsageError
 from sags_node.files import check_file, whole, writing
@@ -13,6 +16,56 @@ from sags_node.media.video_file import VideoFile
 from sags_node.types import U8
 
 PICTURES_BEFORE_VIDEO = 5  # the frame rate must be known before a video file is opened
+
+_LAYER = struct.Struct("<5i")  # frame, first row and column, height and width of what follows: RGBA
+
+
+class Layers:
+    """What was drawn over each frame, and nothing else. A video can be made of it when the node has ended.
+
+    Args:
+        force: replace a file that exists.
+
+    Raises:
+        UsageError: the file exists.
+        SagsError: it cannot be written.
+    """
+
+    def __init__(self, file: Path, force: bool = False) -> None:
+        check_file(file, force)
+        self._file: BinaryIO = file.open("wb")
+
+    def add(self, frame_id: int, rgba: U8 | None) -> None:
+        """Of one frame [H, W, 4]; None: it was blank."""
+        top = left = height = width = 0
+        if rgba is not None and rgba[..., 3].any():
+            left, top, width, height = cv2.boundingRect(rgba[..., 3])
+        self._file.write(_LAYER.pack(frame_id, top, left, height, width))
+        if rgba is not None:
+            self._file.write(np.ascontiguousarray(rgba[top : top + height, left : left + width]).data)
+
+    def close(self) -> None:
+        self._file.close()
+
+
+class Layer(NamedTuple):
+    """Where something was drawn over a frame."""
+
+    top: int
+    left: int
+    rgba: U8  # [h, w, 4]
+
+
+def read_layers(file: Path) -> dict[int, Layer]:
+    """Of every frame that came, by its number."""
+    data, at, found = file.read_bytes(), 0, {}
+    while at < len(data):
+        frame_id, top, left, height, width = _LAYER.unpack_from(data, at)
+        at += _LAYER.size
+        part = np.frombuffer(data, np.uint8, 4 * height * width, at).reshape(height, width, 4)
+        at += part.size
+        found[frame_id] = Layer(top, left, part)
+    return found
 
 
 class Output:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 import socket
 import subprocess
 import sys
@@ -62,6 +63,7 @@ WRITERS = [  # commands, and their options for one file
     ("export --session SESSION", "--tracks"),
     ("export --session SESSION", "--render"),
     ("overlay", "--out"),
+    ("overlay", "--layers"),
     ("calib live SESSION", "--out"),
     ("bridge foxglove", "--layout"),
 ]
@@ -304,6 +306,7 @@ def test_eval_prints_nothing_but_json(user_files: Path, pace: str) -> None:
 def test_run_prints_nothing_but_json(user_files: Path) -> None:
     result = sags("run", *videos(user_files), "source.frames:=3", "--json")
     assert result.exit_code == 0 and pure_json(result.stdout)["gaussians"] > 100
+    assert re.search(r"source: videos .*\n.* \d+x\d+ px at 10 frames/s, .* calibration \S+\n", result.stderr)
     assert "state" in sags("run", *videos(user_files), "--seconds", "0.3").stdout
 
 
@@ -313,9 +316,24 @@ def test_demo_prints_nothing_but_json(user_files: Path, tmp_path: Path) -> None:
     assert result.exit_code == 0, result.stderr
     summary = pure_json(result.stdout)
     assert summary["frames"] == 35 and summary["overlay"]["frames"] > 0
+    assert summary["overlay"]["saved"] == str(tmp_path / "demo/overlay.mp4")
     assert "pictures of {width}x{height} px".format_map(summary["settings"]) in result.stderr
     assert {file.name for file in (tmp_path / "demo").iterdir()} >= {"report.html", "overlay.mp4"}
     check_report(tmp_path / "demo", "overlay.mp4")  # the next one may replace it
+
+
+def test_eval_says_what_it_found_in_a_dozen_lines(user_files: Path, tmp_path: Path) -> None:
+    """Figures in groups only when asked for, and never as Python prints a dictionary."""
+    session = [*videos(user_files), "source.frames:=4", "--pace", "step"]
+    result = sags("eval", *session, "--report", tmp_path / "report")
+    assert result.exit_code == 0, result.stderr
+    lines = result.stdout.splitlines()
+    assert 5 <= len(lines) <= 12 and lines[-1].split() == ["report", f"{tmp_path}/report/report.html"]
+    said = dict(line.split(None, 1) for line in lines)
+    assert "dB PSNR (the picture before, shown again:" in said["picture"] and "ms (p99)" in said["latency"]
+    all_figures = sags("eval", *session, "--verbose").stdout
+    assert "of that, median of: rectify" in all_figures and len(all_figures.splitlines()) > 30
+    assert "{" not in all_figures + result.stdout and "None" not in all_figures
 
 
 def test_torch_and_open3d_stay_out_of_the_start(user_files: Path) -> None:

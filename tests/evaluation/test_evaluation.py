@@ -376,15 +376,20 @@ def test_report_opens_and_shows_the_worst_frame(frames: list[StereoFrame], tmp_p
     summary = {**summary_of(measurer, motion=(2, 5)), "session": "<b>name</b>"}
     pictures = measurer.gallery.pictures
     assert [picture.frame_id for picture in pictures] == [0, 7, 10, 19]
-    file = write_report(tmp_path / "out", summary, measurer.rows, pictures)
+    file = write_report(tmp_path / "out", summary, measurer.rows, pictures, "overlay.mp4")
     text = file.read_text(encoding="utf-8")
     page = Page(text)
     assert page.open == []
     kinds = Counter(uri.partition(";base64,")[0] for uri in page.images)
-    assert kinds["data:image/jpeg"] == 16 and kinds["data:image/svg+xml"] >= 3 and len(kinds) == 2
+    assert kinds["data:image/jpeg"] == 16 and kinds["data:image/svg+xml"] == 4 and len(kinds) == 2
     assert len(text) < 2_000_000
     assert "frame 7," in text and "the worst" in text
     assert "<b>name" not in text and "http" not in text
+    order = [text.index(each) for each in ("overlay.mp4", "<h2>Pictures", "<h2>Over time", "<h2>Figures")]
+    assert order == sorted(order)
+    groups = text[order[-1] :]
+    assert "the picture before, shown again:" in groups and "stereo alone:" in groups
+    assert "<td></td></tr><tr>" not in groups.replace("\n", "") and "None" not in groups and "{" not in groups
     sheet = cv2.imread(str(file.parent / "sheet.png"))
     assert sheet.shape == (4 * 288, 4 * 360, 3)
 

@@ -8,6 +8,7 @@ and listens. Views, thin pictures and the recorder are there and nobody asks for
 
 from __future__ import annotations
 
+import json
 import sys
 import tempfile
 from collections import Counter, deque
@@ -29,7 +30,7 @@ from sags_node.config.schema import LaunchConfig, PublishConfig, PushSource
 from sags_node.errors import SagsError
 from sags_node.mapping.budget import TimeBudget
 from sags_node.mapping.ladder import FULL, RUNGS, USED, Ladder, price
-from sags_node.messaging import publisher
+from sags_node.messaging import cdr, publisher, topics
 from sags_node.messaging.freshness import MAX_CLOCK_AHEAD, STALE_AFTER, STALE_PERIODS, Freshness
 from sags_node.messaging.wire import decode
 from sags_node.node import health, latest, node, views
@@ -247,6 +248,10 @@ class Run:
         self.fresh = {f"sags/{name}": Freshness() for name in ("tf", "anchors")}
         self.shown = Counter[str]()
         self._seen: dict[str, tuple[int, int, int, int]] = {}
+        self._state, self._refused = (
+            "starting",
+            0,
+        )  # as consumers know it, and the frames that they refuse for it
         self._ended = False
 
     def play(self) -> None:
@@ -336,11 +341,21 @@ class Run:
                 self.asked[int(envelope)].answers += 1
             while self._data.sent:
                 parts = self._data.sent.popleft()
+                self._hear(parts)
                 if chance.random() >= self._losing:
                     self._take(parts)
                     if chance.random() < 0.02:
                         self._take(parts)  # as to another subscriber, who has just come
             self._look()
+
+    def _hear(self, parts: list[bytes]) -> None:
+        """After the first frame the state is said at once: until then consumers refuse all frames."""
+        message = decode(parts)
+        if message.topic == "sags/status":
+            self._state = json.loads(cdr.decode(message.parts[0], topics.STRING).data)["state"]
+        elif message.topic == "sags/tf" and self._state == "starting":
+            self._refused += 1
+            assert self._refused == 1, "frames are published, and the node says that it is starting"
 
     def _take(self, parts: list[bytes]) -> None:
         message = decode(parts)

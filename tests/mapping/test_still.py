@@ -466,9 +466,9 @@ WIDTH, HEIGHT, FOCAL, DISPARITY = 320, 256, 300.0, 16
 
 
 def test_tissue_that_creeps_is_followed() -> None:
-    """A tenth of a pixel per frame: most frames look still, and yet the model keeps up. Noise in the picture that
-    is compared makes least squares see less motion than there was (errors in variables); here a twentieth to a
-    tenth less."""
+    """A tenth of a pixel per frame: most frames look still, and yet the model keeps up. Noise in the picture
+    that is compared makes least squares see less motion than there was (errors in variables), here a
+    twentieth to a tenth less."""
     K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
     config = load_launch(
         None, ["mapping.max_gaussians:=8000", f"vision.width:={WIDTH}", f"vision.height:={HEIGHT}"]

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,6 +14,7 @@ from pathlib import Path
 import independent_client
 import numpy as np
 import pytest
+from places import ROOT
 from running_node import RunningNode
 from waiting import until
 
@@ -146,3 +150,28 @@ def test_a_killed_node_goes_stale_and_reads_fail(node: RunningNode) -> None:
         until(lambda: not subscriber.ok(name))
         with pytest.raises(SagsError):
             subscriber.read(name)
+
+
+def test_the_consumer_of_the_readme_runs_as_it_stands(
+    phantom_session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Depth and an anchor, in metres; where the anchor is, the depth is its own."""
+    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+    assert len([line for line in code.splitlines() if line]) <= 15
+    running = RunningNode(phantom_session, tmp_path)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(running.run_dir.parent))
+    consumer = subprocess.Popen(
+        [sys.executable, "-u", "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    try:
+        assert consumer.stdout is not None
+        lines = [consumer.stdout.readline() for _ in range(5)]
+    finally:
+        running.stop()
+        said = consumer.communicate(timeout=60)[1]  # nothing comes any more, so it ends
+    assert consumer.returncode == 0 and all(lines), said
+    for line in lines:
+        found = re.fullmatch(r"depth (\S+) m, anchor (\S+) (\S+) (\S+) m\n", line)
+        assert found is not None, line
+        metres, x, y, z = map(float, found.groups())
+        assert 0.05 < metres < 0.1 and abs(z - metres) < 0.02 and abs(x) < 0.04 and abs(y) < 0.04

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from command_line import refused
 
-from sags_node.overlay.mesh import mesh_of
+from sags_node.overlay.mesh import LEAN, mesh_of
 from sags_node.overlay.polygons import triangulate
 from sags_node.overlay.scene import SHAPES, ObjectSpec, built_in
 
@@ -149,3 +149,37 @@ def test_other_mistakes_are_named(tmp_path: Path) -> None:
 
 def scene_refused(scene: Path, *said: str, extra: tuple[str, ...] = ()) -> None:
     refused(2, "overlay", "--scene", scene, *extra, said=said)
+
+
+def test_built_in_shapes_are_those_of_open3d() -> None:
+    """Closed, turned outwards, and of the same size."""
+    import open3d
+
+    create = open3d.geometry.TriangleMesh
+    arrow = create.create_arrow(
+        cylinder_radius=0.0004, cone_radius=0.0012, cylinder_height=0.0065, cone_height=0.0035
+    )
+    arrow.translate((0.0, 0.0, -0.010))
+    arrow.rotate(create.get_rotation_matrix_from_xyz((np.pi - LEAN, 0.0, 0.0)), center=(0.0, 0.0, 0.0))
+    arrow.translate((0.0, 0.0, 0.001))
+    expected = {
+        "target": [create.create_torus(0.0035, 0.0005, 48, 10), arrow],
+        "sphere": [create.create_sphere(0.002, 16)],
+    }
+    for shape, parts in expected.items():
+        mesh = mesh_of(built_in((1, 2), shape).objects[0])
+        assert mesh is not None
+        corners = mesh.vertices.astype(np.float64)[mesh.triangles]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        assert (np.linalg.norm(normals, axis=1) > 0).all()
+        volume = np.einsum("tc,tc->", corners[:, 0], normals) / 6  # of a closed surface; outward: above 0
+        whole = open3d.geometry.TriangleMesh()
+        for part in parts:
+            whole += part
+        theirs = np.asarray(whole.vertices)[np.asarray(whole.triangles)]
+        crossed = np.cross(theirs[:, 1] - theirs[:, 0], theirs[:, 2] - theirs[:, 0])
+        assert volume == pytest.approx(np.einsum("tc,tc->", theirs[:, 0], crossed) / 6, rel=0.01)
+        for side in (np.min, np.max):
+            np.testing.assert_allclose(
+                side(corners.reshape(-1, 3), axis=0), side(theirs.reshape(-1, 3), axis=0), atol=3e-5
+            )

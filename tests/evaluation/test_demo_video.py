@@ -1,0 +1,69 @@
+"""The demo's video: what the overlay kept of each frame, and the picture that a display showed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import av
+import numpy as np
+
+from sags_node.demo import _Shown
+from sags_node.media.h264_file import H264File
+from sags_node.overlay.draw import over
+from sags_node.overlay.save import Layers, read_layers
+from sags_node.types import U8
+
+RATE, HEIGHT, WIDTH = 30.0, 64, 81
+
+
+class Kept:
+    """Where a video is written to."""
+
+    def __init__(self) -> None:
+        self.pictures: list[U8] = []
+
+    def add(self, picture: U8) -> None:
+        self.pictures.append(picture.copy())
+
+
+def drawn(rng: np.random.Generator) -> U8:
+    rgba = np.zeros((HEIGHT, WIDTH, 4), np.uint8)
+    rgba[10:30, 20:51] = rng.integers(0, 256, (20, 31, 4))
+    rgba[15, 21, 3] = 0  # a hole
+    return rgba
+
+
+def test_a_display_shows_what_was_drawn_and_for_a_missed_frame_what_was_there_before(tmp_path: Path) -> None:
+    """Layers leave out what is empty; over the picture nothing is different for it."""
+    rng = np.random.default_rng(0)
+    pictures = rng.integers(0, 256, (4, HEIGHT, WIDTH, 3), np.uint8)
+    rgba = drawn(rng)
+    layers = Layers(tmp_path / "layers")
+    layers.add(1, rgba)
+    layers.add(3, None)
+    layers.close()
+    assert (tmp_path / "layers").stat().st_size < rgba.nbytes / 4
+    kept = Kept()
+    shown = _Shown(kept, read_layers(tmp_path / "layers"))  # type: ignore[arg-type]
+    for frame_id, picture in enumerate(pictures):
+        shown.add(frame_id, picture)
+    with_it = over(pictures[1], rgba)
+    assert (with_it != pictures[1]).any()
+    for got, expected in zip(kept.pictures, (pictures[0], with_it, with_it, pictures[3]), strict=True):
+        np.testing.assert_array_equal(got, expected)
+
+
+def test_its_file_is_what_browsers_play(tmp_path: Path) -> None:
+    """H.264 in yuv420p, whose sides are even; its index stands first."""
+    file = H264File(tmp_path / "video.mp4", RATE, (WIDTH, HEIGHT))
+    for level in range(0, 200, 10):
+        file.add(np.full((HEIGHT, WIDTH, 3), level, np.uint8))
+    file.finish()
+    with av.open(str(tmp_path / "video.mp4")) as video:
+        stream = video.streams.video[0]
+        assert (stream.codec_context.name, stream.pix_fmt) == ("h264", "yuv420p")
+        assert (stream.width, stream.height, stream.average_rate) == (WIDTH - 1, HEIGHT, RATE)
+        levels = [frame.to_ndarray(format="rgb24").mean() for frame in video.decode(video=0)]
+    np.testing.assert_allclose(levels, range(0, 200, 10), atol=4)
+    data = (tmp_path / "video.mp4").read_bytes()
+    assert data.index(b"moov") < data.index(b"mdat")

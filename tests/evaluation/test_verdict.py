@@ -1,0 +1,89 @@
+"""What a run was worth, in words: with units and baselines, and no figure left out."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sags_node.evaluation.figure_table import GROUPS, groups, headings
+from sags_node.evaluation.measure import MeasureOptions
+from sags_node.evaluation.summary import GROUPS as QUALITY
+from sags_node.evaluation.summary import STAGES, summarise
+from sags_node.evaluation.verdict import flat, verdict
+
+TIMES = {"p50": 38.6, "p90": 60.0, "p99": 96.9, "max": 313.8}
+
+
+def live() -> dict[str, Any]:
+    """Of a demo, in the form of `summarise`."""
+    return {
+        **{"session": "phantom", "frames": 300, "processed": 268, "held_out": 0, "dropped": 32},
+        **{"rate_hz": 27.57, "first_render_ms": 313.8, "latency_ms": TIMES, "frame_ms": TIMES},
+        "budget_ms": 33.33,
+        "online": {"psnr": 34.61, "ssim": 0.9356, "lpips": None, "motion": {"psnr": 31.0, "ssim": 0.9}},
+        "predict": {"psnr": 33.65, "copy_psnr": 35.84, "motion": {"psnr": 29.9, "copy_psnr": 30.1}},
+        "heldout": None,
+        "depth": {"median_mm": 0.2443, "p90_mm": 0.9778, "rmse_mm": 0.81, "coverage": 0.9906},
+        "measured_depth": {"median_mm": 0.1721, "p90_mm": 0.64, "rmse_mm": 0.53, "coverage": 0.87},
+        "track": {"median_mm": 0.3769, "p90_mm": 0.8802, "median_px": 1.9, "lost": 0.3297},
+        "gaussians": {"mean": 21510.0, "max": 92395},
+        "rungs": {1: 14, 3: 137, 14: 5},
+        "warnings": {"frames_missed": 16},
+        "segments": {"motion": [5, 9]},
+        "settings": {"depth_reference": "exact", "width": 640, "height": 512, "device": "cpu"},
+        "machine": "AMD EPYC, 2 cores",
+        "overlay": {"frames": 268, "overlay": 249, "blanked": {"being pinned": 19}, "latency_ms": TIMES},
+    }
+
+
+def test_a_verdict_is_a_dozen_lines_with_units_and_baselines() -> None:
+    said = dict(verdict(flat(live())))
+    assert len(said) < 12  # where the report is comes after them
+    depth = "0.24 mm off (median), nine of ten within 0.98 mm, on 99% of the tissue, against exact truth"
+    assert said.pop("depth") == depth
+    assert said == {
+        "speed": "268 of 300 frames shown at 27.6 frames/s, 32 missed",
+        "latency": "39 ms (p50), 97 ms (p99) from the camera's stamp to sending; 314 ms for the first frame",
+        "picture": "34.6 dB PSNR (the picture before, shown again: 35.8 dB)",
+        "points": "0.38 mm off (median), nine of ten within 0.88 mm; 33% lost",
+        "overlay": "on 249 of 268 frames; 19 without: being pinned",
+        "quality": "rung 3 of 0 to 15 for most frames (1 to 14), 21,510 Gaussians on average, 640x512 px",
+        "warnings": "frames_missed (16 frames)",
+        "machine": "AMD EPYC, 2 cores; the model on the CPU",
+    }
+
+
+def test_a_run_frame_by_frame_is_not_called_live() -> None:
+    step = live() | {"latency_ms": None, "held_out": 22, "heldout": {"psnr": 35.7, "copy_psnr": 39.5}}
+    said = dict(verdict(flat(step)))
+    assert said["speed"].startswith("27.6 frames/s would be possible; frame by frame, 268 of 278 frames")
+    assert said["latency"] == "39 ms (p50), 97 ms (p99) of work on a frame"
+    assert said["unseen"] == "35.7 dB PSNR on frames kept back (the picture before, shown again: 39.5 dB)"
+
+
+def test_what_is_not_known_is_not_said() -> None:
+    empty = summarise("nothing", [], MeasureOptions(hold_out=0), {}, None)
+    assert [name for name, _ in verdict(flat(empty))] == ["speed", "machine"]
+    assert verdict({}) == []
+
+
+def test_figures_stand_in_groups_beside_their_baselines() -> None:
+    found = groups(live())
+    assert list(found) == list(GROUPS) and headings(live()) == ["all frames", "motion"]
+    shown = {(group, row[0]): row for group, rows in found.items() for row in rows}
+    what = ("Picture", "shown, PSNR over tissue")
+    assert shown[what] == (what[1], ["34.6 dB", "31.0 dB"], "the picture before, shown again: 35.8 dB")
+    assert shown["Depth", "error, median"] == ("error, median", ["0.24 mm", ""], "stereo alone: 0.17 mm")
+    assert shown["Points", "lost"][1] == ["33 %", ""]
+    assert shown["Overlay", "not shown: being pinned"][1] == ["19"]
+    for rows in found.values():
+        for what, values, _ in rows:
+            assert any(values) and not any("{" in value or "None" in value for value in values), what
+
+
+def test_no_figure_of_a_summary_is_left_out() -> None:
+    given = {f"{group}.{key}" for group, keys in QUALITY.items() for key in keys}
+    given |= {f"stage_ms.{stage}" for stage in STAGES}
+    given |= {key for key, value in flat(live()).items() if value is not None and ".motion." not in key}
+    shown = {key for rows in GROUPS.values() for figure in rows for key in (figure.key, figure.baseline_key)}
+    prefixes = (*(key[:-1] for key in shown if key.endswith(".*")), "settings.")
+    assert {key for key in given - shown if not key.startswith(prefixes)} == {"session", "machine"}
