@@ -81,7 +81,7 @@ def __getattr__(name):
 
 
 @pytest.mark.fault("process: Ctrl-C while it starts")
-@pytest.mark.parametrize(("module", "command"), [("click", ["doctor"]), ("open3d", ["overlay"])])
+@pytest.mark.parametrize(("module", "command"), [("click", ["doctor"]), ("numba", ["overlay"])])
 def test_a_ctrl_c_while_modules_are_loaded_is_one_word(
     module: str, command: list[str], run_dir: Path, tmp_path: Path
 ) -> None:
