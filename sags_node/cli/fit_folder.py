@@ -157,9 +157,8 @@ def fit_verdict(found: dict[str, Any]) -> list[tuple[str, str]]:
         lines["depth"] = f"{depth['median_mm']:.2f} mm off (median), on {depth['frames']} frames"
     if track is not None:
         lines["points"] = f"{track['median_mm']:.2f} mm off (median); {track['lost']:.0%} lost"
-    device = "CPU" if found["device"] == "cpu" else "GPU"
     size = f"{found['gaussians']:,} Gaussians (at most {found['cap']:,})"
-    lines["model"] = f"{size}, fitted in {found['seconds']:.0f} s on the {device}"
+    lines["model"] = f"{size}, fitted in {found['seconds']:.0f} s"
     lines["machine"] = found["machine"]
     return list(lines.items())
 

@@ -77,30 +77,30 @@ class Drawing:
             for name in DIFFERENTIATED
             if name in tables
         }
-        # A feature of value 0 whose cotangent is the pixels' weight: its gradient is the contribution.
-        leaves["statistic"] = torch.zeros_like(leaves["opacities"])[:, None].requires_grad_()
+        # Features of value 0 whose cotangents are the pixels' weight times 1, x, y, x^2, x y, y^2: their
+        # gradients are the contribution and the moments that `spread` is made of.
+        leaves["statistics"] = leaves["opacities"].new_zeros((len(usable), 6)).requires_grad_()
         view, K = _camera_matrices(pinhole, usable.device)
         scales, opacities, kept = leaves["scales"], leaves["opacities"], torch.ones_like(leaves["scales"])
         if "smoothing" in tables:
             scales, kept = _smoothed(scales, torch.where(usable, tables["smoothing"], 0.0))
             opacities = opacities * kept.topk(2).values.prod(1)
-        colors, gradient = _seen_colors(leaves, view), torch.zeros_like(leaves["means"][:, :2])
-        if "slopes" in leaves:
-            slopes = leaves["slopes"] * kept
-            places, gradient = _luminance_gradients(leaves, scales, slopes, view, pinhole, antialias)
-            colors = colors - (gradient * places).sum(1, keepdim=True)
-        features = torch.cat([colors, gradient, leaves["statistic"]], 1)
+        slopes = leaves["slopes"] * kept if "slopes" in leaves else torch.zeros_like(leaves["means"])
+        places, covariance, gradient = _in_picture(leaves, scales, slopes, view, pinhole, antialias)
+        self._places, self._covariance = places.detach(), covariance.detach()
+        colors = _seen_colors(leaves, view) - (gradient * places).sum(1, keepdim=True)
+        features = torch.cat([colors, gradient, leaves["statistics"]], 1)
         rendered, alphas = _rasterize(
             (leaves["means"], leaves["quats"], scales, opacities, features), view, K, pinhole, antialias
         )
         self._leaves = leaves
-        summed = torch.cat([rendered, alphas], 2).permute(2, 0, 1)  # r g b, gradient 2, statistic, z, w
+        summed = torch.cat([rendered, alphas], 2).permute(2, 0, 1)  # r g b, gradient 2, statistics 6, z, w
         # sum of w (c + g . (p - m)) = sum of w (c - g . m) + (sum of w g) . p at a pixel p
-        y, x = _pixel_places(pinhole, usable.device)
+        y, x = self._pixels = _pixel_places(pinhole, usable.device)
         self._all = torch.cat(
             [summed[:3] + summed[3] * x + summed[4] * y, summed[5:]]
-        )  # r g b, statistic, z, w
-        self.planes = torch.cat([self._all[:3], self._all[4:]]).detach()
+        )  # r g b, statistics 6, z, w
+        self.planes = torch.cat([self._all[:3], self._all[9:]]).detach()
 
     def backward(self, v_planes: Tensor, weight: Tensor) -> dict[str, Tensor]:
         """Gradients of sum(v_planes * planes), by name as in `interface.Gradients`.
@@ -109,12 +109,26 @@ class Drawing:
             v_planes: [5, H, W] cotangent of the planes.
             weight: [H, W] pixel weights for the contribution.
         """
-        cotangent = torch.cat([v_planes[:3], weight[None], v_planes[3:]])
+        y, x = self._pixels
+        moments = torch.stack([weight * power for power in (1, x, y, x * x, x * y, y * y)])
+        cotangent = torch.cat([v_planes[:3], moments, v_planes[3:]])
         found = torch.autograd.grad(
             self._all, list(self._leaves.values()), cotangent, retain_graph=True, materialize_grads=True
         )
         gradients = dict(zip(self._leaves, found, strict=True))
-        return gradients | {"contribution": gradients.pop("statistic")[:, 0]}
+        one, by_x, by_y, xx, xy, yy = gradients.pop("statistics").unbind(1)
+        mean_x, mean_y = self._places.unbind(1)
+        about_mean = torch.stack(
+            [
+                xx - mean_x * (2 * by_x - mean_x * one),
+                xy - mean_x * by_y - mean_y * by_x + mean_x * mean_y * one,
+                yy - mean_y * (2 * by_y - mean_y * one),
+            ],
+            1,
+        )
+        conic = torch.linalg.inv(self._covariance)
+        conic = torch.stack([conic[:, 0, 0], 2 * conic[:, 0, 1], conic[:, 1, 1]], 1)
+        return gradients | {"contribution": one, "spread": (conic * about_mean).sum(1).clamp(min=0)}
 
 
 class GsplatBackend:
@@ -190,16 +204,16 @@ def _seen_colors(leaves: Mapping[str, Tensor], view: Tensor) -> Tensor:
     return seen
 
 
-def _luminance_gradients(
+def _in_picture(
     leaves: Mapping[str, Tensor],
     scales: Tensor,
     slopes: Tensor,
     view: Tensor,
     pinhole: Pinhole,
     antialias: bool,
-) -> tuple[Tensor, Tensor]:
-    """Where the Gaussians are in the picture, from its middle, [N, 2] px, and how their luminance changes
-    there [N, 2] 1/px: a V^T cov^-1, as `reference.project` has it."""
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Where the Gaussians are in the picture, from its middle, [N, 2] px, their covariance there [N, 2, 2]
+    px^2, and how their luminance changes [N, 2] 1/px: a V^T cov^-1, as `reference.project` has it."""
     R, t = view[:3, :3], view[:3, 3]
     x, y, z = (leaves["means"] @ R.T + t).unbind(1)
     z = torch.where(z > NEAR_PLANE, z, 1.0)  # what is not drawn must be finite
@@ -218,7 +232,7 @@ def _luminance_gradients(
     covariance = V @ V.transpose(1, 2) + variance * torch.eye(2, device=V.device)
     gradient = torch.linalg.solve(covariance, V @ slopes[:, :, None])[:, :, 0]
     middle_x, middle_y = pinhole.cx - 0.5 * pinhole.width, pinhole.cy - 0.5 * pinhole.height
-    return torch.stack([fx * x + middle_x, fy * y + middle_y], 1), gradient
+    return torch.stack([fx * x + middle_x, fy * y + middle_y], 1), covariance, gradient
 
 
 def _pixel_places(pinhole: Pinhole, device: torch.device) -> tuple[Tensor, Tensor]:

@@ -55,6 +55,7 @@ class Gradients:
     slopes: F32  # [N, 3] before the 3D filter
     sh_rest: F32  # [N, K - 1, 3]; [N, 0, 3] without spherical harmonics
     contribution: F32  # [N] sum over pixels of (blending weight of this Gaussian) * (weight of the pixel)
+    spread: F32  # [N] the same, each pixel times its squared distance in the Gaussian's standard deviations
 
 
 class Backend(Protocol):

@@ -22,7 +22,7 @@ from sags_node.fitting.field import make_box, make_deltas, make_field, marked, r
 from sags_node.fitting.learner import Learner
 from sags_node.fitting.settings import FitSettings
 from sags_node.fitting.start import Progress, follow_online, learn_paths, pooled_rows, remainder
-from sags_node.mapping.optimiser import COLOUR_RELAXATION, LearningRates
+from sags_node.mapping.optimiser import LearningRates
 from sags_node.model import columns
 from sags_node.model.deformable import DeformableModel
 from sags_node.model.exposure import Exposure
@@ -33,6 +33,7 @@ from sags_node.types import F32, Gaussians
 
 REFINE_RATES = LearningRates()  # the mapper's, gentle: the start is good
 REFINE_FIELD_SHARE = 0.003  # of the field's rates, which are for learning from nothing
+REFINE_RELAXATION = 1.6  # of the colour step: a frame is seen again after many others
 REFINE_DECAY = 0.1
 
 
@@ -73,17 +74,17 @@ class Fit:
             SagsError: no frame has depth enough.
         """
         started = time.perf_counter()
-        settings, exposure, residuals = self.settings, self._make_exposure(), None
+        settings, exposure, residuals, slopes = self.settings, self._make_exposure(), None, None
         if settings.schedule == "paper":
             rows = pooled_rows(self.clip, exposure, settings)
             field = self._make_field(rows[:, columns.MEAN])
         else:
-            rows, paths = follow_online(self.clip, self.rasterizer, exposure, settings, progress)
+            rows, slopes, paths = follow_online(self.clip, self.rasterizer, exposure, settings, progress)
             field = self._make_field(rows[:, columns.MEAN])
             learn_paths(self._learner, field, rows, paths, settings, progress)
             residuals = remainder(field, rows, paths)
         self._start_means = np.ascontiguousarray(rows[:, columns.MEAN])
-        model = DeformableModel(rows, field, exposure, settings.antialias, residuals)
+        model = DeformableModel(rows, field, exposure, settings.antialias, residuals, slopes)
         self._begin(model, self._make_density(model))
         self.seconds += time.perf_counter() - started
 
@@ -140,7 +141,7 @@ class Fit:
         self._learner.refine(
             self._next_frame(),
             self._refine_rates * np.float32(share),
-            COLOUR_RELAXATION * math.sqrt(share),  # less and less, so that frames average out
+            REFINE_RELAXATION * math.sqrt(share),  # less and less, so that frames average out
             self.settings.field_rates.scaled(REFINE_FIELD_SHARE * share),
         )
         self.iteration += 1
@@ -175,6 +176,8 @@ class Fit:
             found |= {"residuals": residuals.values, "residuals.times": residuals.times_ns}
             found |= {"residuals.moments": np.stack([adam.moments for adam in residuals.adam])}
             found |= {"residuals.shares": np.stack([adam.shares for adam in residuals.adam])}
+        if model.slopes is not None:
+            found["slopes"] = model.slopes
         return found | {
             "ids": model.ids,
             "start": self._start_means,
@@ -205,8 +208,9 @@ class Fit:
             adam = zip(arrays["residuals.moments"], arrays["residuals.shares"], strict=True)
             residuals.adam = [AdamState(moments, shares) for moments, shares in adam]
         model = DeformableModel(
-            arrays["rows"], field, self._make_exposure(), self.settings.antialias, residuals
-        )
+            arrays["rows"], field, self._make_exposure(), self.settings.antialias, residuals,
+            arrays.get("slopes"),
+        )  # fmt: skip
         if isinstance(field, NodeField):
             field.index, field.weight = arrays["index"], arrays["weight"]
         deltas = field.deltas

@@ -105,11 +105,12 @@ def _is_cut(before: ClipFrame, after: ClipFrame) -> bool:
 
 def follow_online(
     clip: Clip, rasterizer: Rasterizer, exposure: Exposure, settings: FitSettings, progress: Progress
-) -> tuple[F32, Paths]:
+) -> tuple[F32, F32, Paths]:
     """Play the training frames through the online mapper.
 
     Returns:
-        Canonical rows [N, 14], placed as the tissue lay in the first frame, and the paths, without exposure.
+        Canonical rows [N, 14], placed as the tissue lay in the first frame, slopes [N, 3], and the paths, all
+        without exposure.
 
     Raises:
         SagsError: no frame had depth enough to start a model, or the clip is too long for its memory.
@@ -119,7 +120,7 @@ def follow_online(
     refiner = CpuRefiner(lambda width, height: rasterizer)  # all frames have its size
     mapper, budget = Mapper(refiner, TissueMap(settings.max_gaussians)), StepBudget(ONLINE_STEPS)
     surface, last = SurfaceTracker(), None
-    seen: list[tuple[I64, F32]] = []
+    seen: list[tuple[I64, F32, F32]] = []
     first = _Places()
     for done, frame in enumerate(clip.train):
         observation = frame.observation()
@@ -133,23 +134,31 @@ def follow_online(
         first.add(gaussians.ids, gaussians.means)
         if done in slots:
             rows = deactivate(gaussians)
-            rows[:, columns.COLOR] /= exposure.at(frame.t_capture_ns)
-            seen.append((gaussians.ids.copy(), rows))  # the mapper goes on writing into its own
+            gain = exposure.at(frame.t_capture_ns)
+            rows[:, columns.COLOR] /= gain
+            slopes = mapper.model.slopes / gain.mean()
+            seen.append((gaussians.ids.copy(), rows, slopes))  # the mapper goes on writing into its own
         progress("following the tissue", done + 1, len(clip.train))
-    ids, lives = np.unique(np.concatenate([ids for ids, _ in seen]), return_counts=True)
+    ids, lives = np.unique(np.concatenate([ids for ids, *_ in seen]), return_counts=True)
     if len(ids) > settings.max_gaussians:  # after a cut in the recording
         ids = np.sort(ids[np.argsort(-lives, kind="stable")[: settings.max_gaussians]])
     if len(ids) == 0:
         raise SagsError("no training frame had depth enough to start a model; check vision.stereo")
-    states = np.zeros((len(seen), len(ids), columns.COUNT), np.float32)
+    states, slopes = (
+        np.zeros((len(seen), len(ids), columns.COUNT), np.float32),
+        np.zeros((len(ids), 3), np.float32),
+    )
     known = np.zeros(states.shape[:2], np.bool_)
-    for slot, (those, rows) in enumerate(seen):
+    for slot, (those, rows, there) in enumerate(seen):
         kept = np.isin(those, ids)
         at = np.searchsorted(ids, those[kept])
         states[slot, at], known[slot, at] = rows[kept], True
+        slopes[at] += there[kept]
+    slopes /= known.sum(0)[:, None]
     rows = (states * (known[..., None] / known.sum(0)[None, :, None]).astype(np.float32)).sum(0)
     rows[:, columns.MEAN] = first.of(ids)
-    return rows, Paths(np.array([clip.train[slot].t_capture_ns for slot in sorted(slots)]), states, known)
+    times_ns = np.array([clip.train[slot].t_capture_ns for slot in sorted(slots)])
+    return rows, slopes, Paths(times_ns, states, known)
 
 
 class _Places:

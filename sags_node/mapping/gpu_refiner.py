@@ -289,7 +289,7 @@ class GpuRefiner:
         gain = optimiser.COLOUR_RELAXATION / (seen + optimiser.COLOUR_DAMPING)
         colors = rows["colors"] - gain[:, None] * gradients["colors"]
         self._put(moves, "colors", colors.clamp(*optimiser.COLOR_RANGE))
-        per_slope = gain[:, None] * float(optimiser.PER_CHANNEL)
+        per_slope = (gain / (3 * (gradients["spread"] / seen - 1).clamp(min=1)))[:, None]
         slopes = optimiser.SLOPE_DECAY * rows["slopes"] - per_slope * gradients["slopes"]
         self._put(moves, "slopes", slopes.clamp(-optimiser.STEEPEST, optimiser.STEEPEST))
         self._put(broken, "adam_m", torch.zeros_like(m))

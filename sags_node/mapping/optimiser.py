@@ -31,7 +31,6 @@ class LearningRates:
 
 
 COLOUR_RELAXATION = 0.9  # of the SIRT step
-PER_CHANNEL = np.float32(1 / 3)  # a slope is seen in three colours
 SLOPE_DECAY = 0.99  # per step: what the picture does not ask for fades
 STEEPEST = 0.25  # for each standard deviation
 COLOUR_DAMPING = 0.3  # px of coverage: a barely seen Gaussian changes its colour slowly
@@ -52,14 +51,15 @@ class Optimiser:
     reconstruction step goes: each colour moves by the mean residual of the pixels it covers, weighted by
     its share in them, and each slope by the mean of residual times place. It replaces many gradient steps.
 
-    It converges where its relaxation is below 2 / max(1, m). Let w be a Gaussian's share in a pixel's colour,
-    sum w = 1, e the pixel's place in its standard deviations, c and a changes of colours and slopes. Then
+    Let w be a Gaussian's share in a pixel's colour, sum w = 1, e the pixel's place in its standard
+    deviations, c and a changes of colours and slopes, and m the mean of |e|^2 under w (`spread` over
+    `contribution`). By Cauchy and Schwarz, summed over pixels and channels,
 
-        sum over pixels and channels of (sum w (c + a . e))^2
-            <= sum over Gaussians of (sum w) (|c|^2 + 3 m |a|^2)
+        sum (sum w (c + a . e))^2  <=  sum over Gaussians of (sum w) (|c|^2 + 3 |a|^2)
 
-    by Cauchy and Schwarz, with m the largest mean of e e^T under w: 1 for a Gaussian that is seen whole, more
-    where others hide its middle, which 0.9 allows up to 2.2.
+    where all are seen whole, which makes m = 2. Where others hide their middle the pixels lie in a ring or on
+    one side, and it is at most (sum w) (2 |c|^2 + 6 m |a|^2). So the step is r / (sum w) for colours and
+    r / (3 max(1, m - 1) sum w) for slopes: no error grows while r < 1, nearly so in between.
     """
 
     def __init__(self) -> None:
@@ -78,7 +78,7 @@ class Optimiser:
             model.means, model.quats, model.log_scales, model.opacity_logits,
             model.scales, model.opacities, model.colors, model.slopes, model.adam_m, model.adam_v,
             gradients.means, gradients.quats, gradients.scales, gradients.opacities,
-            gradients.colors, gradients.slopes, gradients.contribution,
+            gradients.colors, gradients.slopes, gradients.contribution, gradients.spread,
             lengths, viewmat.astype(np.float32), float(camera.K[0, 0]), corrections.astype(np.float32),
         )  # fmt: skip
 
@@ -88,14 +88,14 @@ def _step(
     means: F32, quats: F32, log_scales: F32, opacity_logits: F32, scales: F32, opacities: F32, colors: F32,
     slopes: F32, adam_m: F32, adam_v: F32,
     v_means: F32, v_quats: F32, v_scales: F32, v_opacities: F32, v_colors: F32, v_slopes: F32,
-    contribution: F32,
+    contribution: F32, spread: F32,
     lengths: F32, view_z: F32, focal: float, corrections: F32,
 ) -> None:  # fmt: skip
     for piece in prange(-(-len(means) // PIECE)):
         first = np.int64(piece) * PIECE
         _step_rows(
             means, quats, log_scales, opacity_logits, scales, opacities, colors, slopes, adam_m, adam_v,
-            v_means, v_quats, v_scales, v_opacities, v_colors, v_slopes, contribution,
+            v_means, v_quats, v_scales, v_opacities, v_colors, v_slopes, contribution, spread,
             lengths, view_z, focal, corrections, first, min(first + PIECE, len(means)),
         )  # fmt: skip
 
@@ -105,7 +105,7 @@ def _step_rows(
     means: F32, quats: F32, log_scales: F32, opacity_logits: F32, scales: F32, opacities: F32, colors: F32,
     slopes: F32, adam_m: F32, adam_v: F32,
     v_means: F32, v_quats: F32, v_scales: F32, v_opacities: F32, v_colors: F32, v_slopes: F32,
-    contribution: F32,
+    contribution: F32, spread: F32,
     lengths: F32, view_z: F32, focal: Any, corrections: F32, first: Any, end: Any,
 ) -> None:  # fmt: skip
     one = np.float32(1)
@@ -129,10 +129,12 @@ def _step_rows(
             _fix(log_scales[i], opacity_logits, scales[i], opacities, adam_m[i], adam_v[i], g, i)
             continue
         gain = np.float32(COLOUR_RELAXATION) / (contribution[i] + np.float32(COLOUR_DAMPING))
+        # a slope is seen in three colours, and by so much as the pixels are apart
+        steeper = gain / (np.float32(3) * max(spread[i] / contribution[i] - one, one))
         for k in range(3):
             color = colors[i, k] - gain * v_colors[i, k]
             colors[i, k] = min(max(color, np.float32(COLOR_RANGE[0])), np.float32(COLOR_RANGE[1]))
-            slope = np.float32(SLOPE_DECAY) * slopes[i, k] - gain * PER_CHANNEL * v_slopes[i, k]
+            slope = np.float32(SLOPE_DECAY) * slopes[i, k] - steeper * v_slopes[i, k]
             slopes[i, k] = min(max(slope, -np.float32(STEEPEST)), np.float32(STEEPEST))
         for k in range(ADAM_PARAMETERS):
             adam_m[i, k] += np.float32(1 - BETA1) * (g[k] - adam_m[i, k])

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from sags_node.model.activation import activate, activate_backward
 from sags_node.model.alias_free import smoothing_variances
 from sags_node.model.exposure import Exposure
 from sags_node.model.field import Field, FieldRates
-from sags_node.model.residuals import Residuals, Steps
+from sags_node.model.residuals import COLOR_DAMPING, Residuals, Steps
 from sags_node.types import F32, I64, Bool, Camera, Gaussians
 
 BETAS = (0.9, 0.999)
@@ -35,6 +36,7 @@ class DeformableModel:
         exposure: Exposure,
         smooth: bool = True,
         residuals: Residuals | None = None,
+        slopes: F32 | None = None,
     ) -> None:
         """
         Args:
@@ -43,12 +45,15 @@ class DeformableModel:
             exposure: scales their colours.
             smooth: whether the 3D filter is on.
             residuals: of these Gaussians.
+            slopes: [N, 3] of the luminance, see `types.Gaussians`; they turn with the Gaussian, and neither
+                field nor residuals change them. None: every Gaussian has one colour.
         """
         self.rows = np.ascontiguousarray(rows, np.float32)
         self.ids: I64 = np.arange(len(rows))
         self.field = field
         self.exposure = exposure
         self.residuals = residuals
+        self.slopes = slopes
         self.smooth = smooth
         self.next_id = len(rows)
         self.adam = AdamState.new(*self.rows.shape)
@@ -116,6 +121,8 @@ class DeformableModel:
         means = np.ascontiguousarray(rows[:, columns.MEAN])
         smoothing = smoothing_variances(means, cameras) if self.smooth else None
         self._drawn = activate(rows, self.ids, smoothing)
+        if self.slopes is not None:
+            self._drawn = replace(self._drawn, slopes=self.slopes * self._gain.mean())
         return self._drawn
 
     def descend(
@@ -139,12 +146,12 @@ class DeformableModel:
         adam_step(self.rows, v_rows, self.adam, rates, rows=seen, betas=BETAS)
 
     def refine(self, gradients: Gradients, rates: F32, relaxation: float, field_rates: FieldRates) -> None:
-        """One step on residuals and field, against the gradients of what `at` gave last.
+        """One step on residuals, slopes and field, against the gradients of what `at` gave last.
 
         Args:
             gradients: of half the squared colour residuals, weighted for SIRT, by those Gaussians.
             rates: [14] lengths of the residuals' steps; none for colours.
-            relaxation: of the colour step.
+            relaxation: of the step on colours; on slopes it is half as much (`mapping.optimiser.Optimiser`).
             field_rates: of the field. It is not moved by colours: those are the residuals'.
 
         Raises:
@@ -156,6 +163,11 @@ class DeformableModel:
         v_rows[:, columns.COLOR] = 0
         steps = Steps(rates, np.float32(relaxation) / self._gain)
         self.residuals.refine(self._t_ns, v_rows, gradients.colors, gradients.contribution, steps)
+        if self.slopes is not None:
+            seen = gradients.contribution + COLOR_DAMPING
+            wide = np.maximum(gradients.spread / seen - 1, 1)
+            length = relaxation / (6 * self._gain.mean() * wide * seen)
+            self.slopes -= length.astype(np.float32)[:, None] * gradients.slopes
         self.field.backward(v_rows)
         self.field.step(field_rates)
 
@@ -163,12 +175,16 @@ class DeformableModel:
         """Remove the Gaussians where `kept` [N] is False."""
         if self.residuals is not None:
             self.residuals.keep(kept)
+        if self.slopes is not None:
+            self.slopes = self.slopes[kept]
         self._replace(self.rows[kept], self.ids[kept], self.adam.moments[kept], self.adam.shares[kept])
 
     def append(self, rows: F32, parents: I64) -> None:
         """Add Gaussians [M, 14], canonical, that otherwise do as their parents, rows [M] of the model."""
         if self.residuals is not None:
             self.residuals.append(parents)
+        if self.slopes is not None:
+            self.slopes = np.concatenate([self.slopes, self.slopes[parents]])
         new = AdamState.new(*rows.shape)
         ids = np.arange(self.next_id, self.next_id + len(rows))
         self.next_id += len(rows)

@@ -14,6 +14,7 @@ from engine_scenes import (
     DERIVATIVES,
     EXPONENTIAL,
     INPUTS,
+    Truth,
     camera,
     cotangents,
     draw_and_differentiate,
@@ -26,10 +27,10 @@ from engine_scenes import (
     with_view_dependence,
 )
 from numpy.typing import NDArray
-from rounding import after
+from rounding import U, after
 
 from sags_node import geometry
-from sags_node.engine.interface import MAX_OPACITY, MIN_ALPHA, NEAR_PLANE
+from sags_node.engine.interface import MAX_OPACITY, MIN_ALPHA, MIP_VARIANCE, NEAR_PLANE
 from sags_node.engine.rasterizer.rasterize import (
     TILE_HEIGHT,
     TILE_WIDTH,
@@ -70,7 +71,15 @@ class Backend:
         some pixel."""
         true = truth(gaussians, view, **options)
         assert true.planes[4].max() > shown
-        true.check(*self.draw(gaussians, view, **options))
+        self.check(true, view, *self.draw(gaussians, view, **options))
+
+    def check(self, true: Truth, view: Camera, planes: F32, gradients: dict[str, Any]) -> None:
+        """Against the twin. gsplat's spread comes from moments about the picture's middle, px^2, over
+        variances that are the 2D filter's at least."""
+        if self.name == "gsplat":
+            half = U * (view.width**2 + view.height**2) / (4 * MIP_VARIANCE)
+            true.gradients_within["spread"] += half * float(np.linalg.norm(true.gradients["contribution"]))
+        true.check(planes, gradients)
 
     def same(self, found: dict[str, Any], true: dict[str, Any], keep: Any = ...) -> None:
         """The gradients of `keep` are those, bit by bit where the order of sums is fixed."""
@@ -486,7 +495,7 @@ def test_tiles_agree_with_the_twin(backend: Backend) -> None:
     planes = rasterizer.forward(gaussians, WIDE, tiles).copy()
     true = truth(gaussians, WIDE, given=(np.where(drawn, v_planes, 0), np.where(drawn, weight, 0)))
     planes = np.where(drawn, planes, true.planes)  # elsewhere is what was there before
-    true.check(planes, copies(rasterizer.backward(v_planes, weight)))
+    backend.check(true, WIDE, planes, copies(rasterizer.backward(v_planes, weight)))
 
 
 @ours

@@ -295,7 +295,8 @@ def test_a_fit_is_exported_at_any_time(
         near, far = (np.median(Truth(phantom, frame).distances(cloud)) for frame in (here, elsewhere))
         assert near < 0.5 and near < 0.5 * far  # the tissue moves by 0.9 mm between the two
     figures = json.loads((tmp_path / "fit/figures.json").read_text())
-    assert len(splats_of(splats)["x"]) == figures["gaussians"]
+    count = figures["gaussians"]
+    assert count < len(splats_of(splats)["x"]) <= 2 * count  # steep ones in two
     for frames in (9, 11):
         other = ("--session", phantom_session, f"source.frames:={frames}", "--fit", tmp_path / "fit")
         refused(2, "export", *other, "--splats", tmp_path / "new.ply", said=("frames",))

@@ -131,7 +131,7 @@ def test_an_online_start_is_what_the_mapper_saw(clip: Clip, tokens: Any) -> None
     settings = dataclasses.replace(SMALL, tokens=tokens)
     fit = Fit(clip, settings)
     fit.start(quietly)
-    rows, paths = follow_online(clip, fit.rasterizer, fit.model.exposure, settings, quietly)
+    rows, _, paths = follow_online(clip, fit.rasterizer, fit.model.exposure, settings, quietly)
     assert list(paths.times_ns) == [clip.train[t].t_capture_ns for t in (0, 3, 6, 9)]
     np.testing.assert_array_equal(rows, fit.model.rows)
     residuals = fit.model.residuals
@@ -272,7 +272,8 @@ def test_the_command_leaves_model_pictures_and_figures(phantom_session: Path, tm
     assert 0 < found["gaussians"] <= 1500
     assert sorted(path.name for path in (out / "test").iterdir()) == ["000001.png", "000009.png"]
     header = (out / "model.ply").read_bytes()[:400]
-    assert f"element vertex {found['gaussians']}".encode() in header
+    in_file = int(header.split(b"element vertex ")[1].split()[0])
+    assert found["gaussians"] < in_file <= 2 * found["gaussians"]  # steep ones in two
 
     again = sags_fit(phantom_session, "source.frames:=10", *options, "--resume")
     assert again.exit_code == 0, again.output

@@ -52,9 +52,8 @@ def make_gradients(seed: int) -> Gradients:
     contribution = rng.uniform(0, 2, COUNT).astype(np.float32)
     contribution[::5] = 0
     contribution[1::5] = 9e-4
-    return Gradients(
-        rows(3), rows(4), rows(3), rows(), rows(3), rows(3), np.zeros((COUNT, 0, 3), np.float32), contribution
-    )
+    tables = rows(3), rows(4), rows(3), rows(), rows(3), rows(3), np.zeros((COUNT, 0, 3), np.float32)
+    return Gradients(*tables, contribution, contribution * rng.uniform(1, 4, COUNT).astype(np.float32))
 
 
 def in_torch(gradients: Gradients) -> dict[str, torch.Tensor]:

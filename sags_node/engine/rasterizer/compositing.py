@@ -324,7 +324,7 @@ def _composite_tiles_backward(
             red, green, blue, depth = splat.red, splat.green, splat.blue, splat.depth
             slope_u, slope_v = splat.slope_u, splat.slope_v
             g_sum = g_u = g_v = g_uu = g_uv = g_vv = spread(ZERO)
-            w_red = w_green = w_blue = w_depth = w_weight = w_u = w_v = spread(ZERO)
+            w_red = w_green = w_blue = w_depth = w_weight = w_spread = w_u = w_v = spread(ZERO)
             for column in range(COLUMNS):
                 first, beyond = pair.begin[column] // BLOCK_HEIGHT, pair.end[column]
                 blocks = (beyond + BLOCK_HEIGHT - 1) // BLOCK_HEIGHT - first
@@ -336,7 +336,8 @@ def _composite_tiles_backward(
                 at = (column * BLOCKS + first) * DERIVED
                 g_here = gv_here = gvv_here = w_here = wv_here = spread(ZERO)
                 for _ in range(blocks):
-                    alpha = alpha_of(log2_opacity - v * v - u * u)
+                    exponent = log2_opacity - v * v - u * u
+                    alpha = alpha_of(exponent)
                     transmittance = load(tile, at + TRANSMITTANCE)
                     w = alpha * transmittance
                     store(tile, at + TRANSMITTANCE, transmittance - w)
@@ -360,7 +361,9 @@ def _composite_tiles_backward(
                     w_green += w * v_green
                     w_blue += w * v_blue
                     w_depth += w * v_depth
-                    w_weight += w * load(tile, at + WEIGHT)
+                    counted = w * load(tile, at + WEIGHT)
+                    w_weight += counted
+                    w_spread += counted * (log2_opacity - exponent)
                     lit = w * v_luminance
                     w_here += lit
                     wv_here += lit * v
@@ -383,7 +386,7 @@ def _composite_tiles_backward(
                 pair.slot * RECORD,
                 (
                     g_sum, g_u, g_v, g_uu, g_uv, g_vv, w_red, w_green, w_blue, w_depth, w_weight,
-                    w_u, w_v,
+                    w_u, w_v, w_spread,
                 ),
             )  # fmt: skip
         for p in range(end, tile_starts[t + 1]):  # hidden behind a finished tile, or nothing is asked of it

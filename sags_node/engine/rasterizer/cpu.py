@@ -56,7 +56,8 @@ class NumbaRasterizer:
         self._order, self._spare_order, self._keys, self._spare_keys = (
             aligned((room,), np.int32) for _ in range(4)
         )
-        self._v_colors, self._contribution = aligned((room, 3)), aligned((room,))
+        self._v_colors = aligned((room, 3))
+        self._contribution, self._spread = aligned((room,)), aligned((room,))
 
     def forward(self, gaussians: Gaussians, pinhole: Pinhole, tiles: Bool | None) -> F32:
         n = self._count = len(gaussians)
@@ -147,11 +148,11 @@ class NumbaRasterizer:
             weight.reshape(-1),
             self._v_pairs,
         )
-        v_colors, contribution = self._v_colors[:n], self._contribution[:n]
+        v_colors, contribution, spread = self._v_colors[:n], self._contribution[:n], self._spread[:n]
         means, quats, scales, opacities, sh_rest, slopes = self._projector.backward(
-            self._slots[:n], self._v_pairs, v_colors, contribution
+            self._slots[:n], self._v_pairs, v_colors, contribution, spread
         )
-        return Gradients(means, quats, scales, opacities, v_colors, slopes, sh_rest, contribution)
+        return Gradients(means, quats, scales, opacities, v_colors, slopes, sh_rest, contribution, spread)
 
     def median(self) -> tuple[F32, I32]:
         median.median(

@@ -78,8 +78,9 @@ SPLAT_GRADIENT = np.dtype(
             "contribution",
             "slope_u",
             "slope_v",
+            "spread",
         ],
-        "formats": ["f4"] * 13,
+        "formats": ["f4"] * 14,
         "itemsize": 64,
     }
 )

@@ -73,7 +73,9 @@ V_SLOPE_X, V_SLOPE_Y, V_SLOPE_Z = ((INPUTS + k) * BLOCK for k in range(12, 15))
 RECORDS = (INPUTS + 15) * BLOCK  # the block's SPLAT_GRADIENT, one after the other
 SCRATCH = RECORDS + RECORD * BLOCK  # floats per worker
 # Places in a record
-V_RED, CONTRIBUTION = (list(SPLAT_GRADIENT.names or ()).index(name) for name in ("red", "contribution"))
+V_RED, CONTRIBUTION, SPREAD = (
+    list(SPLAT_GRADIENT.names or ()).index(name) for name in ("red", "contribution", "spread")
+)
 
 
 @inlined
@@ -111,7 +113,7 @@ def _clear(
 @kernel
 def _blocks_backward(
     means: F32, quats: F32, scales: F32, opacities: F32, slopes: F32, view: F32, screen_filter: Row, S: F32,
-    next_block: I64, slots: Any, v_pairs: F32, v_colors: F32, contribution: F32, v_means: F32,
+    next_block: I64, slots: Any, v_pairs: F32, v_colors: F32, contribution: F32, spreads: F32, v_means: F32,
     v_quats: F32, v_scales: F32, v_opacities: F32, v_slopes: F32,
 ) -> None:  # fmt: skip
     count, blocks = means.shape[0], (means.shape[0] + BLOCK - 1) // BLOCK
@@ -133,6 +135,7 @@ def _blocks_backward(
             for k in range(3):
                 v_colors[i, k] = S[record + V_RED + k]
             contribution[i] = S[record + CONTRIBUTION]
+            spreads[i] = TWO_LN2 * S[record + SPREAD]
         if not any_drawn:
             _clear(v_means, v_quats, v_scales, v_opacities, v_slopes, first, filled)
             continue
@@ -272,6 +275,7 @@ def project_backward(
     v_pairs: F32,  # [16 slots] of `composite_backward`
     v_colors: F32,  # [N 3] written, as what follows: 0 where not drawn
     contribution: F32,  # [N]
+    spreads: F32,  # [N]
     v_means: F32,
     v_quats: F32,
     v_scales: F32,
@@ -283,5 +287,5 @@ def project_backward(
     for worker in numba.prange(scratch.shape[0]):
         _blocks_backward(
             means, quats, scales, opacities, slopes, view, screen_filter, scratch[worker], next_block, slots,
-            v_pairs, v_colors, contribution, v_means, v_quats, v_scales, v_opacities, v_slopes,
+            v_pairs, v_colors, contribution, spreads, v_means, v_quats, v_scales, v_opacities, v_slopes,
         )  # fmt: skip

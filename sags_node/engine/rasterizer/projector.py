@@ -84,7 +84,7 @@ class Projector:
         )
 
     def backward(
-        self, slots: Records, v_pairs: F32, v_colors: F32, contribution: F32
+        self, slots: Records, v_pairs: F32, v_colors: F32, contribution: F32, spread: F32
     ) -> tuple[F32, F32, F32, F32, F32, F32]:
         """Gradients of means, quats, scales, opacities, sh_rest and slopes.
 
@@ -92,7 +92,7 @@ class Projector:
             slots: [N] SLOTS.
             v_pairs: [16 slots] a SPLAT_GRADIENT per slot.
             v_colors: [N, 3] written: 0 where not drawn.
-            contribution: [N] written.
+            contribution, spread: [N] written.
         """
         n, gaussians, given = self._count, self._smoothed, self._given
         v_scales, v_opacities, v_slopes = self._v_scales[:n], self._v_opacities[:n], self._v_slopes[:n]
@@ -110,6 +110,7 @@ class Projector:
             v_pairs,
             v_colors,
             contribution,
+            spread,
             self._v_means[:n],
             self._v_quats[:n],
             v_scales,

@@ -70,8 +70,8 @@ class ReferenceRasterizer:
             self._planes, self._inputs, cotangent, retain_graph=True, materialize_grads=True
         )
         counted = torch.tensor(np.where(self._drawn, weight, 0), dtype=torch.float64)
-        contribution = contributions(self._splats, counted, len(self._inputs[0]))
-        return Gradients(*(gradient.numpy().astype(np.float32) for gradient in (*found, contribution)))
+        sums = contributions(self._splats, counted, len(self._inputs[0]))
+        return Gradients(*(gradient.numpy().astype(np.float32) for gradient in (*found, *sums)))
 
     def median(self) -> tuple[F32, I32]:
         return self._depths, self._rows
@@ -274,16 +274,21 @@ def alphas(
 
 
 def contributions(splats: Splats, weight: Tensor, count: int) -> Tensor:
-    """Sums over pixels of (blending weight of a Gaussian) * (weight of the pixel [H, W]), [count]."""
+    """Sums over pixels of (blending weight of a Gaussian) * (weight of the pixel [H, W]), and of that times
+    the squared distance in standard deviations, [2, count]."""
     import torch
 
     height, width = weight.shape
-    sums = weight.new_zeros(count)
+    sums = weight.new_zeros(2, count)
 
     def tile(left: int, top: int, right: int, bottom: int) -> Tensor:
-        alpha, before, touching, _ = alphas(splats, left, top, right, bottom)
+        alpha, before, touching, offset = alphas(splats, left, top, right, bottom)
         seen = weight[top:bottom, left:right]
-        sums.index_add_(0, splats.rows[touching], (alpha * before).T @ seen.reshape(-1))
+        counted = alpha * before * seen.reshape(-1, 1)
+        conic = torch.linalg.inv(splats.covariance[touching])
+        apart = torch.einsum("psi,sij,psj->ps", offset, conic, offset)
+        sums[0].index_add_(0, splats.rows[touching], counted.sum(0))
+        sums[1].index_add_(0, splats.rows[touching], (counted * apart).sum(0))
         return seen[None]
 
     with torch.no_grad():

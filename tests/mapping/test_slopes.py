@@ -1,0 +1,90 @@
+"""The closed-form step on colours and slopes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from engine_scenes import as_bytes, camera
+
+from sags_node.engine.losses.tissue import tissue_loss
+from sags_node.engine.rasterizer.rasterize import make_rasterizer
+from sags_node.geometry import unproject
+from sags_node.mapping.optimiser import LearningRates, Optimiser
+from sags_node.model.gaussians import GaussianModel
+from sags_node.types import F32, U8, Bool
+
+VIEW = camera(width=96, height=80, focal=120.0)
+STILL = LearningRates(0.0, 0.0, 0.0, 0.0)  # of the geometry
+
+
+def model_of(width_px: float, seed: int = 0) -> GaussianModel:
+    """Gaussians 4 px apart on a plane 7 cm away, as those of tissue, all gray."""
+    rng = np.random.default_rng(seed)
+    pixels = np.stack(np.meshgrid(np.arange(-2, 100, 4.0), np.arange(-2, 84, 4.0)), -1).reshape(-1, 2)
+    pixels += rng.uniform(-0.5, 0.5, pixels.shape)
+    count, pixel = len(pixels), 0.07 / VIEW.K[0, 0]
+    model = GaussianModel(count)
+    means = unproject(VIEW, pixels, np.full(count, 0.07)).astype(np.float32)
+    sides = np.array([width_px, width_px, 0.5 * width_px]) * pixel
+    scales = (sides * rng.uniform(0.8, 1.2, (count, 3))).astype(np.float32)
+    model.append(means, scales, np.full((count, 3), 0.5, np.float32), 0.8)
+    model.quats[:] = rng.normal(size=(count, 4)) * [0, 0, 0, 1] + [1, 0, 0, 0]
+    return model
+
+
+def picture_of(model: GaussianModel, seed: int = 1) -> U8:
+    """What the same Gaussians show with other colours and slopes."""
+    rng = np.random.default_rng(seed)
+    colors = rng.uniform(0.3, 0.7, model.colors.shape).astype(np.float32)
+    slopes = rng.normal(0, 0.05, model.slopes.shape).astype(np.float32)
+    planes = make_rasterizer("numba", VIEW.width, VIEW.height).forward(
+        replace(model.gaussians(), colors=colors, slopes=slopes), VIEW
+    )
+    return as_bytes((planes[:3] / np.maximum(planes[4], 0.05)).transpose(1, 2, 0))
+
+
+def errors(model: GaussianModel, picture: U8, steps: int, slopes: bool = True) -> list[float]:
+    """Mean squared error of the colour before each step."""
+    rasterizer, optimiser = make_rasterizer("numba", VIEW.width, VIEW.height), Optimiser()
+    tissue: Bool = np.ones(picture.shape[:2], np.bool_)
+    depth: F32 = np.zeros(tissue.shape, np.float32)
+    found = []
+    for _ in range(steps):
+        planes = rasterizer.forward(model.gaussians(), VIEW)
+        shown = (planes[:3] / np.maximum(planes[4], 0.05)).transpose(1, 2, 0)
+        found.append(float(np.mean((shown - picture / 255) ** 2)))
+        v_planes, weight = np.zeros_like(planes), np.zeros_like(planes[0])
+        tissue_loss(planes, picture, tissue, depth, v_planes, weight, 0.0, 1.0, 0.0)
+        optimiser.step(model, rasterizer.backward(v_planes, weight), VIEW, STILL)
+        if not slopes:
+            model.slopes[:] = 0
+    return found
+
+
+@pytest.mark.parametrize("width_px", [1.2, 2.0, 4.0, 8.0])
+def test_no_step_makes_the_picture_worse_however_much_they_overlap(width_px: float) -> None:
+    """As the bound in `Optimiser` says. What fades with SLOPE_DECAY may come to a hundredth of the error."""
+    model = model_of(width_px)
+    found = np.array(errors(model, picture_of(model), 60))
+    assert (found[1:] < 1.001 * found[:-1]).all()
+    assert found[-1] < 0.5 * found[0]
+
+
+def test_slopes_show_more_than_the_best_colours() -> None:
+    picture = picture_of(model_of(2.0))
+    with_slopes, without = (
+        errors(model_of(2.0), picture, 100),
+        errors(model_of(2.0), picture, 100, slopes=False),
+    )
+    assert with_slopes[-1] < without[-1] / 2  # 3 dB
+
+
+def test_noise_does_not_pile_up_in_slopes() -> None:
+    """On a gray picture with noise that changes every frame slopes stay as small as one step makes them."""
+    model, rng = model_of(2.0), np.random.default_rng(3)
+    for _ in range(150):
+        noise = rng.normal(0.5, 0.02, (VIEW.height, VIEW.width, 3))
+        errors(model, as_bytes(noise), 1)
+    assert np.abs(model.slopes).mean() < 0.02  # of one pixel's noise, per standard deviation
