@@ -336,8 +336,7 @@ def _composite_tiles_backward(
                 at = (column * BLOCKS + first) * DERIVED
                 g_here = gv_here = gvv_here = w_here = wv_here = spread(ZERO)
                 for _ in range(blocks):
-                    exponent = log2_opacity - v * v - u * u
-                    alpha = alpha_of(exponent)
+                    alpha = alpha_of(log2_opacity - v * v - u * u)
                     transmittance = load(tile, at + TRANSMITTANCE)
                     w = alpha * transmittance
                     store(tile, at + TRANSMITTANCE, transmittance - w)
@@ -363,7 +362,9 @@ def _composite_tiles_backward(
                     w_depth += w * v_depth
                     counted = w * load(tile, at + WEIGHT)
                     w_weight += counted
-                    w_spread += counted * (log2_opacity - exponent)
+                    # not counted (u u + v v): alpha would then be rounded otherwise than where it is drawn
+                    w_spread += counted * u * u
+                    w_spread += counted * v * v
                     lit = w * v_luminance
                     w_here += lit
                     wv_here += lit * v
