@@ -70,13 +70,13 @@ def given(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 @pytest.mark.live
 @pytest.mark.parametrize(
     ("overrides", "ms"),
-    [(["source.rate:=60"], 1000 / 60), (["source.rate:=25"], 40), ([], 100),
+    [(["source.rate:=60"], 0.9 * 1000 / 60), (["source.rate:=25"], 0.9 * 40), ([], 0.9 * 100),
      (["source.rate:=60", "mapping.budget_ms:=25"], 25), (["source.pace:=fast"], 33)],
 )  # fmt: skip
 def test_a_node_gives_a_frame_the_time_until_the_next(
     overrides: list[str], ms: float, given: list[float], tmp_path: Path
 ) -> None:
-    """The recording has ten frames a second."""
+    """Nine tenths of it. The recording has ten frames a second."""
     launch = ["source.frames:=3", *overrides, *RUN_HERE, f"publish.run_dir:={tmp_path}"]
     opened = open_session(SESSION, launch)
     node = Node(opened.config, opened.rig, opened.source)
@@ -92,10 +92,10 @@ def test_a_node_follows_what_a_live_source_really_sends(given: list[float], tmp_
     node = Node(load_launch(None, launch), load_rig(SESSION / "calib"), Camera(60.0, 1000))
     node.start()
     deadline = time.monotonic() + 30
-    while time.monotonic() < deadline and given[-1:] != [pytest.approx(1000 / 60)]:
+    while time.monotonic() < deadline and given[-1:] != [pytest.approx(0.9 * 1000 / 60)]:
         time.sleep(0.05)
     node.stop()
-    assert given[0] == pytest.approx(1000 / 30) and given[-1] == pytest.approx(1000 / 60)
+    assert given[0] == pytest.approx(0.9 * 1000 / 30) and given[-1] == pytest.approx(0.9 * 1000 / 60)
 
 
 def test_a_rate_is_measured_over_the_frames_that_are_taken() -> None:

@@ -155,6 +155,7 @@ def check_splats(message: Received) -> dict[str, np.ndarray]:
     assert named[: len(SPLAT_FIELDS)] == SPLAT_FIELDS, "what came later stands after what was there"
     rows = message.array()[:, : len(SPLAT_FIELDS)].copy()
     columns = {name: rows[:, i] for i, name in enumerate(SPLAT_FIELDS)}
+    columns |= {name: message.array()[:, i] for i, name in enumerate(named) if name.startswith("slope_")}
     columns["id"] = rows.view(np.uint32)[:, SPLAT_FIELDS.index("id")]
     assert np.isfinite(rows[:, :-1]).all()
     scales = rows[:, 3:6]

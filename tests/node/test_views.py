@@ -136,6 +136,7 @@ def test_a_view_is_the_published_model_drawn_from_there(node: RunningNode, contr
         stack("x", "y", "z"), stack("rot_w", "rot_x", "rot_y", "rot_z"),
         stack("scale_0", "scale_1", "scale_2"), columns["opacity"].copy(),
         client.splat_colors(columns).astype(np.float32), columns["id"].astype(np.int64),
+        slopes=stack("slope_0", "slope_1", "slope_2"),
     )  # fmt: skip
     expected = rasterize(gaussians, Camera(240, 200, info["K"], np.array(CLOSE_UP)))
     shown = client.check_image(both[-1], "rgba8", 240, 200).astype(float)
