@@ -18,7 +18,7 @@ class RunningNode:
     """`sags run` in its own process."""
 
     def __init__(self, session: Path, folder: Path, *overrides: str) -> None:
-        self.run_dir = folder / "sags"
+        self.run_dir = folder / "run"
         self.process = subprocess.Popen(
             [
                 sys.executable, "-m", "sags_node", "run", str(session), "source.loop:=true",
