@@ -12,7 +12,6 @@ from zipfile import BadZipFile
 import msgspec
 import numpy as np
 
-from sags_node.confidence import error_of
 from sags_node.errors import SagsError, UsageError
 from sags_node.fitting import checkpoint
 from sags_node.fitting.clip import ClipFrame, read_clip
@@ -20,12 +19,12 @@ from sags_node.fitting.fit import Fit
 from sags_node.fitting.settings import FitSettings
 from sags_node.kernels.threads import configure_threads
 from sags_node.messaging.address import NodeAddress
-from sags_node.messaging.content import SLOPE_FIELDS, SPLAT_FIELDS
+from sags_node.messaging.content import SLOPE_FIELDS, SPLAT_FIELDS, gaussians_of
 from sags_node.messaging.received import ReceivedCameraInfo, ReceivedCloud, ReceivedRos, TopicName
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import Session
-from sags_node.types import F32, SH_DEGREE_0, Camera, Gaussians
+from sags_node.types import Camera, Gaussians
 
 SPLATS = TopicName("splats", ReceivedCloud)
 INFO = TopicName("left/camera_info", ReceivedCameraInfo)
@@ -74,20 +73,7 @@ def _gaussians(cloud: ReceivedCloud) -> Gaussians:
     fields = cloud.points.dtype.names or ()
     if not set(SPLAT_FIELDS) - {"confidence", *SLOPE_FIELDS} <= set(fields):
         raise SagsError(f"{cloud.topic} is not what this version reads: {cloud.meta.encoding}")
-
-    def columns(*names: str) -> F32:
-        return np.stack([cloud.points[name] for name in names], axis=-1)
-
-    return Gaussians(
-        means=cloud.xyz(),
-        quats=columns("rot_w", "rot_x", "rot_y", "rot_z"),
-        scales=columns("scale_0", "scale_1", "scale_2"),
-        opacities=np.ascontiguousarray(cloud.points["opacity"]),
-        colors=0.5 + np.float32(SH_DEGREE_0) * columns("f_dc_0", "f_dc_1", "f_dc_2"),
-        ids=cloud.points["id"].astype(np.int64),
-        depth_errors=error_of(cloud.points["confidence"]) if "confidence" in fields else None,
-        slopes=columns(*SLOPE_FIELDS) if set(SLOPE_FIELDS) <= set(fields) else None,
-    )
+    return gaussians_of(cloud.points)
 
 
 # ---- a recording -----------------------------------------------------------------------------------------

@@ -67,13 +67,13 @@ def _split(model: GaussianModel, wholes: I64, spare: I64) -> None:
     count = len(wholes)
     longest = np.argmax(model.scales[wholes], axis=1)
     axes = quat_to_matrix(model.quats[wholes])[np.arange(count), :, longest]
-    size = np.sqrt(model.scales[wholes, longest] ** 2 + model.smoothing[wholes])
+    scale, smoothing = model.scales[wholes, longest], model.smoothing[wholes]
+    variance, part = scale**2 + smoothing, (PART_SIZE * scale) ** 2 + smoothing  # as they are drawn
+    size = np.sqrt(variance)
     offsets = (np.float32(APART) * size)[:, None] * axes
-    # A part shows what the whole showed there, and as steep a slope in fewer metres.
-    brighter = (np.float32(APART) * size / model.scales[wholes, longest] * model.slopes[wholes, longest])[
-        :, None
-    ]
-    model.slopes[wholes, longest] *= np.float32(PART_SIZE)
+    # A part shows what the whole showed there, and gets brighter by as much a metre.
+    brighter = (np.float32(APART) * model.slopes[wholes, longest] * scale / size)[:, None]
+    model.slopes[wholes, longest] *= part / (np.float32(PART_SIZE) * variance)
     model.scales[wholes, longest] *= np.float32(PART_SIZE)
     model.log_scales[wholes, longest] += np.float32(np.log(PART_SIZE))
     model.contribution[wholes] /= 3

@@ -8,8 +8,9 @@ from typing import Any
 import cv2
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
-from sags_node.confidence import confidence_of
+from sags_node.confidence import confidence_of, error_of
 from sags_node.findings import by_code, in_words
 from sags_node.geometry import project
 from sags_node.messaging import cdr
@@ -61,6 +62,25 @@ def splats(result: FrameResult) -> Content:
     bits = rows.view(np.uint32)
     bits[:, 14], bits[:, 16] = gaussians.ids & 0xFFFFFFFF, gaussians.ids >> 32  # not 0 after a day or more
     return cdr.point_cloud(rows, SPLAT_FIELDS, result.pair.t_capture_ns)
+
+
+def gaussians_of(points: NDArray[Any]) -> Gaussians:
+    """Rows [N] of the topic `splats`, by their names. Older nodes send neither confidence nor slopes."""
+    names = points.dtype.names or ()
+
+    def columns(*wanted: str) -> F32:
+        return np.stack([points[name] for name in wanted], axis=-1)
+
+    return Gaussians(
+        means=columns("x", "y", "z"),
+        quats=columns("rot_w", "rot_x", "rot_y", "rot_z"),
+        scales=columns("scale_0", "scale_1", "scale_2"),
+        opacities=np.ascontiguousarray(points["opacity"]),
+        colors=0.5 + np.float32(SH_DEGREE_0) * columns("f_dc_0", "f_dc_1", "f_dc_2"),
+        ids=points["id"].astype(np.int64),
+        depth_errors=error_of(points["confidence"]) if "confidence" in names else None,
+        slopes=columns(*SLOPE_FIELDS) if set(SLOPE_FIELDS) <= set(names) else None,
+    )
 
 
 def points(result: FrameResult) -> Content:

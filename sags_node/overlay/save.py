@@ -33,19 +33,23 @@ class Layers:
 
     def __init__(self, file: Path, force: bool = False) -> None:
         check_file(file, force)
-        self._file: BinaryIO = file.open("wb")
+        self._path = file
+        with writing(file):
+            self._file: BinaryIO = file.open("wb")
 
     def add(self, frame_id: int, rgba: U8 | None) -> None:
         """Of one frame [H, W, 4]; None: it was blank."""
         top = left = height = width = 0
         if rgba is not None and rgba[..., 3].any():
             left, top, width, height = cv2.boundingRect(rgba[..., 3])
-        self._file.write(_LAYER.pack(frame_id, top, left, height, width))
-        if rgba is not None:
-            self._file.write(np.ascontiguousarray(rgba[top : top + height, left : left + width]).data)
+        with writing(self._path):
+            self._file.write(_LAYER.pack(frame_id, top, left, height, width))
+            if rgba is not None:
+                self._file.write(np.ascontiguousarray(rgba[top : top + height, left : left + width]).data)
 
     def close(self) -> None:
-        self._file.close()
+        with writing(self._path):
+            self._file.close()
 
 
 class Layer(NamedTuple):
@@ -57,11 +61,13 @@ class Layer(NamedTuple):
 
 
 def read_layers(file: Path) -> dict[int, Layer]:
-    """Of every frame that came, by its number."""
+    """Of every frame that came, by its number, until where an overlay that was killed had written."""
     data, at, found = file.read_bytes(), 0, {}
-    while at < len(data):
+    while at + _LAYER.size <= len(data):
         frame_id, top, left, height, width = _LAYER.unpack_from(data, at)
         at += _LAYER.size
+        if at + 4 * height * width > len(data):
+            break
         part = np.frombuffer(data, np.uint8, 4 * height * width, at).reshape(height, width, 4)
         at += part.size
         found[frame_id] = Layer(top, left, part)

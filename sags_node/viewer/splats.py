@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sags_node.geometry import quat_to_matrix
-from sags_node.messaging.content import SLOPE_FIELDS
+from sags_node.messaging.content import gaussians_of
 from sags_node.model.constant_colours import with_constant_colours
-from sags_node.types import F32, F64, SH_DEGREE_0, Gaussians
+from sags_node.types import F32, F64
 
 MAX_SPLATS = 60_000  # that a browser draws smoothly; of more, those that cover most
 REACH = 3.0  # standard deviations within which a Gaussian is met
@@ -59,18 +59,7 @@ class Splats:
 
 def splats_of(points: NDArray[Any]) -> Splats:
     """The rows of the topic `splats`, in colours that a browser knows; at most `MAX_SPLATS`."""
-    f_dc = _columns(points, "f_dc_0", "f_dc_1", "f_dc_2")
-    gaussians = with_constant_colours(
-        Gaussians(
-            means=_columns(points, "x", "y", "z"),
-            quats=_columns(points, "rot_w", "rot_x", "rot_y", "rot_z"),
-            scales=_columns(points, "scale_0", "scale_1", "scale_2"),
-            opacities=np.ascontiguousarray(points["opacity"]),
-            colors=0.5 + np.float32(SH_DEGREE_0) * f_dc,
-            ids=np.zeros(len(points), np.int64),
-            slopes=_columns(points, *SLOPE_FIELDS) if SLOPE_FIELDS[0] in (points.dtype.names or ()) else None,
-        )
-    )
+    gaussians = with_constant_colours(gaussians_of(points))
     rows = np.arange(len(gaussians))
     if len(rows) > MAX_SPLATS:
         scales = np.sort(gaussians.scales, axis=1)
@@ -83,7 +72,3 @@ def splats_of(points: NDArray[Any]) -> Splats:
         colors=np.clip(gaussians.colors[rows], 0, 1),
         opacities=gaussians.opacities[rows],
     )
-
-
-def _columns(points: NDArray[Any], *names: str) -> F32:
-    return np.stack([points[name] for name in names], axis=1)

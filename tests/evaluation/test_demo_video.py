@@ -53,6 +53,18 @@ def test_a_display_shows_what_was_drawn_and_for_a_missed_frame_what_was_there_be
         np.testing.assert_array_equal(got, expected)
 
 
+def test_an_overlay_that_was_killed_leaves_what_it_had_written(tmp_path: Path) -> None:
+    file, rgba = tmp_path / "layers", drawn(np.random.default_rng(0))
+    layers = Layers(file)
+    for frame_id in (4, 5):
+        layers.add(frame_id, rgba)
+    layers.close()
+    whole = file.read_bytes()
+    for length in range(len(whole) // 2, len(whole), 101):
+        file.write_bytes(whole[:length])
+        assert set(read_layers(file)) == {4}
+
+
 def test_its_file_is_what_browsers_play(tmp_path: Path) -> None:
     """H.264 in yuv420p, whose sides are even; its index stands first."""
     file = H264File(tmp_path / "video.mp4", RATE, (WIDTH, HEIGHT))

@@ -9,6 +9,7 @@ import pytest
 from places import SESSION
 
 from sags_node.engine.losses.pieces import LEVEL
+from sags_node.engine.rasterizer.smoothing import bake_filter
 from sags_node.evaluation.metrics import as_float, psnr
 from sags_node.geometry import project, unproject
 from sags_node.mapping import densify, initialise, mapper, split
@@ -76,6 +77,26 @@ def test_the_parts_cover_what_the_whole_did_and_the_middle_one_keeps_its_identit
     assert model.means[outer].mean(0) == pytest.approx(means[LARGE], abs=1e-7)
     assert np.allclose(np.exp(model.log_scales), model.scales, rtol=1e-5)
     assert model.contribution[[LARGE, *outer]].sum() == pytest.approx(60.0)
+
+
+@pytest.mark.parametrize("smoothing", [0.0, 1e-5])
+def test_a_slope_goes_on_through_the_parts(scene: Scene, smoothing: float) -> None:
+    """At the middle of each part the luminance, and how it changes for a metre, are those of the whole as it
+    is drawn, with the 3D filter."""
+    model = scene.model
+    model.smoothing[LARGE] = smoothing
+    model.slopes[LARGE] = 0, 0.1, 0
+    whole, middle = bake_filter(model.gaussians()), model.means[LARGE].copy()
+    assert whole.slopes is not None
+    per_metre = whole.slopes[LARGE, 1] / whole.scales[LARGE, 1]
+    scene.split()
+    parts = bake_filter(model.gaussians())
+    assert parts.slopes is not None
+    rows = np.flatnonzero(np.abs(parts.slopes[:, 1]) > 0)
+    assert len(rows) == 3 and LARGE in rows
+    along = (parts.means[rows] - middle) @ np.array([-np.sin(np.pi / 4), np.cos(np.pi / 4), 0])
+    np.testing.assert_allclose(parts.slopes[rows, 1] / parts.scales[rows, 1], per_metre, rtol=1e-4)
+    np.testing.assert_allclose(parts.colors[rows, 0], 0.5 + per_metre * along, atol=1e-6)
 
 
 def test_who_shows_is_not_given_up(scene: Scene) -> None:

@@ -63,7 +63,7 @@ BLOCKS = TILE_HEIGHT // BLOCK_HEIGHT  # in a column
 # Planes of a block in the scratch
 TRANSMITTANCE, RED, GREEN, BLUE, DEPTH, COVERAGE, REMAINING, WEIGHT, LUMINANCE = (k * LANES for k in range(9))
 DRAWN = 5 * LANES  # floats from one block to the next when drawing, which needs the first five,
-DERIVED = 9 * LANES  # and for the derivative
+DERIVED = 9 * LANES  # and for the derivative; eight would be 512 bytes, which share few cache sets
 SCRATCH = COLUMNS * BLOCKS * DERIVED  # floats per worker
 
 ZERO, HALF, ONE = f4(0.0), f4(0.5), f4(1.0)
