@@ -626,6 +626,12 @@ LONGEST_MS = 100.0  # of a frame, where they come more seldom: what is shown of 
 class MappingConfig(Section):
     """How the model is built, and what it may cost."""
 
+    method: Literal["nodes", "sags"] = Field(
+        "nodes",
+        description="how tissue moves. nodes: control nodes follow optical flow and depth; sags: the paper's "
+        "deformation field, on the CPU, slower and less sharp, which also tells of the last two seconds. "
+        "docs/how-it-works.md compares them",
+    )
     budget_ms: float | None = Field(
         None,
         gt=0,
@@ -650,6 +656,14 @@ class MappingConfig(Section):
         description="remember how tissue moves: hidden tissue goes on as it did before, and motion is "
         "predicted to the moment of a display; default: once an anchor or a view asks for `ahead_ms`",
     )
+
+    @model_validator(mode="after")
+    def _one_memory(self) -> Self:
+        if self.method == "sags" and self.field:
+            raise ValueError(
+                "field remembers how control nodes move, which method sags has none of: leave it out"
+            )
+        return self
 
     def frame_ms(self, rate: float | None = None) -> float:
         """What a frame may take, ms.
@@ -715,6 +729,19 @@ class LaunchConfig(Section):
     def _one_pose(self) -> Self:
         if self.robot is not None and self.vision.pose not in ("session", "refine"):
             raise ValueError(f"robot says where the scope is, vision.pose {self.vision.pose} too: choose one")
+        return self
+
+    @model_validator(mode="after")
+    def _sags_can(self) -> Self:
+        if self.mapping.method == "sags" and self.vision.pose == "estimate":
+            raise ValueError(
+                "mapping.method sags cannot go back to an earlier map, as vision.pose estimate wants: use "
+                "another pose, or mapping.method nodes"
+            )
+        if self.mapping.method == "sags" and self.device == "cuda":
+            raise ValueError(
+                "mapping.method sags runs on the CPU: leave device out, or use mapping.method nodes"
+            )
         return self
 
     @property

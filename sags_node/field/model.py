@@ -81,16 +81,19 @@ class DeformableModel:
         """Rows [N, 14] at one time, without exposure; `deformed`: False leaves the field out."""
         return self.field.deform(self.rows, t_ns) if deformed else self.rows
 
-    def draw(self, rasterizer: Rasterizer, t_ns: int, camera: Camera, deformed: bool = True) -> Drawing:
+    def draw(
+        self, rasterizer: Rasterizer, t_ns: int, camera: Camera, deformed: bool = True,
+        whole: Camera | None = None,
+    ) -> Drawing:  # fmt: skip
         """The model at one time, drawn for a camera it is fitted to, to learn from: `Drawing.differentiate`,
-        then `descend`."""
+        then `descend`. `whole`: that camera with all its pixels, for the 3D filter; None: it has them."""
         self._t_ns = t_ns
         self._gain = torch.from_numpy(self.exposure.at(t_ns)).requires_grad_()
-        return self._drawn(rasterizer, self.rows_at(t_ns, deformed), camera)
+        return self._drawn(rasterizer, self.rows_at(t_ns, deformed), camera, whole or camera)
 
-    def _drawn(self, rasterizer: Rasterizer, rows: Tensor, camera: Camera) -> Drawing:
+    def _drawn(self, rasterizer: Rasterizer, rows: Tensor, camera: Camera, whole: Camera) -> Drawing:
         exposed, slopes = self._exposed(rows, self._gain)
-        return Drawing(rasterizer, camera, exposed, slopes, self.ids, [camera] if self.smooth else None)
+        return Drawing(rasterizer, camera, exposed, slopes, self.ids, [whole] if self.smooth else None)
 
     @torch.no_grad()
     def at(self, t_ns: int, cameras: Sequence[Camera], deformed: bool = True) -> Gaussians:

@@ -19,7 +19,7 @@ from sags_node.fitting.clip import ClipFrame
 from sags_node.fitting.field import make_box, make_decoder, make_field, row_rates
 from sags_node.fitting.settings import RowRates, Tokens
 from sags_node.mapping import densify, initialise
-from sags_node.mapping.mapper import MIN_FIRST_DEPTHS
+from sags_node.mapping.mapped import MIN_FIRST_DEPTHS
 from sags_node.model import columns
 from sags_node.model.activation import deactivate
 from sags_node.model.field import Deltas, Field, FieldRates

@@ -1,4 +1,4 @@
 """The online model while the video runs: motion, new Gaussians, refinement, pose, anchors, the ladder.
 
-Imports config, engine, kernels, model and vision.
+Imports config, engine, field, kernels, model and vision.
 """

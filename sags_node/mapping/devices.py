@@ -33,7 +33,7 @@ ALL_SKIPS = Skips()
 
 def device_of(config: LaunchConfig) -> Device:
     """The device that refines. UsageError: a GPU is wanted and none can be used."""
-    return choose_device(config.device)
+    return choose_device("cpu" if config.mapping.method == "sags" else config.device)
 
 
 def affordable(config: LaunchConfig, width: int, height: int) -> int:

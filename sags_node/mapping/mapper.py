@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from sags_node.engine.rasterizer.confidence import with_confidence
-from sags_node.engine.rasterizer.views import to_view
 from sags_node.mapping import densify, initialise
 from sags_node.mapping.budget import Budget
 from sags_node.mapping.depth_memory import remember
 from sags_node.mapping.focus import tile_grid, tiles_of, with_neighbours
+from sags_node.mapping.mapped import Mapped, as_view, can_start, is_lost, snapshot_of
 from sags_node.mapping.motion import Tracks, depth_pull, scene_flow
 from sags_node.mapping.optimiser import LearningRates
 from sags_node.mapping.refiner import Refiner
@@ -21,7 +20,7 @@ from sags_node.mapping.tissue_map import TissueMap
 from sags_node.model.alias_free import narrow
 from sags_node.model.deformation import NodeDeformation
 from sags_node.model.gaussians import GaussianModel
-from sags_node.types import F32, Bool, Forecast, Observation, RenderedView, Snapshot
+from sags_node.types import F32, Bool, Forecast, Observation, RenderedView
 from sags_node.vision.observe import resized
 
 CONTROL_NODES = 512
@@ -34,19 +33,9 @@ EXPOSURE_JUMP = 0.01  # smaller changes of the gain are left to the colour steps
 SETTLED = 10  # frames: a model that has not changed for so long has little more to learn
 SETTLED_EVERY = 5  # frames: then it is refined so rarely
 FOCUS = 0.15  # of the picture; measured: half the gain of a whole step in a quarter of its time
-MIN_FIRST_DEPTHS = 200  # px
-LOST_COVERAGE = 0.3  # of the tissue
 FIRST_RATES = LearningRates().scaled(4.0)
 UNHURRIED_RATES = 0.6  # measured with six steps: +0.3 dB; with one step a frame it loses as much
 NODE_STEP_PX = 0.08
-
-
-@dataclass(frozen=True, slots=True)
-class Mapped:
-    """What the mapper made of one frame."""
-
-    snapshot: Snapshot
-    view: RenderedView  # the model drawn for the left eye
 
 
 class Mapper:
@@ -120,7 +109,11 @@ class Mapper:
         else:
             counts = self._follow(observation, tracks, budget)
         assert self._view is not None
-        mapped = Mapped(self._snapshot(observation, counts, still > 0, right), self._view)
+        forecast = self._forecast(observation.t_capture_ns, still > 0)
+        snapshot = snapshot_of(
+            self.model, observation, self.step, self._refiner.loss, counts, right, forecast
+        )
+        mapped = Mapped(snapshot, self._view)
         if learn and not still:
             self._split_worst(observation, budget)
         return mapped
@@ -135,9 +128,9 @@ class Mapper:
         return self.map.model
 
     def _initialise(self, observation: Observation, budget: Budget) -> dict[str, int]:
-        if not self._can_start(observation):  # a black or covered picture: try again with the next frame
+        if not can_start(observation):  # a black or covered picture: try again with the next frame
             planes = self._refiner.show(self.model.gaussians(), observation.camera)
-            self._view = self._as_view(planes, observation)
+            self._view = as_view(planes, self.model, observation)
             return {"inserted": 0}
         drawn = resized(observation, self._scale)
         limit = int(initialise.INITIAL_SHARE * self._limit(budget))
@@ -180,7 +173,7 @@ class Mapper:
             self._refiner.take(self._all_rows)
             self._refiner.draw()
         planes = self._refiner.planes()
-        if _is_lost(planes, drawn) and self._can_start(observation):
+        if is_lost(planes, drawn) and can_start(observation):
             self.map.restart()
             return self._initialise(observation, budget) | {"restarted": 1}
         # 4. Refine once on that drawing, before inserting: it serves both, since it shows the holes, too.
@@ -257,11 +250,7 @@ class Mapper:
         """Draw the model to be shown; see `Refiner.redraw`."""
         self._refiner.redraw(share, tiles)
         self._split = False
-        self._view = self._as_view(self._refiner.planes(), observation)
-
-    def _as_view(self, planes: F32, observation: Observation) -> RenderedView:
-        view = to_view(planes, observation.camera, observation.frame_id, observation.t_capture_ns)
-        return with_confidence(view, self.model.gaussians(), observation.grid)
+        self._view = as_view(self._refiner.planes(), self.model, observation)
 
     @property
     def _all_rows(self) -> slice:
@@ -309,22 +298,6 @@ class Mapper:
             grown = round(GROWN * limit) - self.model.count
             self._split = split_worst(self.model, observation, self._view, max(0, grown)) > 0
 
-    def _snapshot(
-        self, observation: Observation, counts: dict[str, int], still: bool, right: bool
-    ) -> Snapshot:
-        return Snapshot(
-            frame_id=observation.frame_id,
-            t_capture_ns=observation.t_capture_ns,
-            step=self.step,
-            gaussians=self.model.snapshot(),
-            velocities=self.model.velocities.copy(),
-            camera=observation.camera,
-            loss=self._refiner.loss,
-            counts=counts,
-            forecast=self._forecast(observation.t_capture_ns, still),
-            right_colors=self.model.right_colors.copy() if right else None,
-        )
-
     def _forecast(self, t_ns: int, still: bool) -> Forecast | None:
         """What the remembered motion, with the nodes' places at the end of this frame, expects next."""
         motion, deformation, model = self.map.motion, self.map.deformation, self.model
@@ -342,16 +315,3 @@ class Mapper:
     def _limit(self, budget: Budget) -> int:
         """How many Gaussians this machine can afford."""
         return min(budget.plan.rung.gaussians, round(self._refiner.share * self.model.capacity))
-
-    def _can_start(self, observation: Observation) -> bool:
-        """Whether this frame has depth enough for a first model."""
-        return bool(np.count_nonzero(observation.depth) >= MIN_FIRST_DEPTHS)
-
-
-def _is_lost(planes: F32, observation: Observation) -> bool:
-    """Whether the model, moved to this frame, hardly covers it: after damage, or where the camera is known to
-    be in another place. Looking at every eighth pixel is enough. What the picture shows is judged before, see
-    `vision.scene_watch`."""
-    tissue = observation.tissue[::8, ::8]
-    covered = tissue & (planes[4, ::8, ::8] > densify.HOLE_ALPHA)
-    return bool(np.count_nonzero(covered) < LOST_COVERAGE * np.count_nonzero(tissue))

@@ -21,7 +21,7 @@ from numba import prange
 from sags_node.engine.pinhole import pack, to_camera, to_pixel
 from sags_node.engine.rasterizer.views import to_view
 from sags_node.kernels.jit import PIECE, kernel, parallel_kernel
-from sags_node.mapping.mapper import Mapped
+from sags_node.mapping.mapped import Mapped
 from sags_node.mapping.right_eye import right_eye_mask
 from sags_node.model.gaussians import GaussianModel, for_right_eye
 from sags_node.types import F32, F64, U8, Bool, Camera, Gaussians, Observation, RenderedView

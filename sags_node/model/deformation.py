@@ -120,6 +120,12 @@ class NodeDeformation:
         self.nodes += motion
         _skin(motion, model.node_index, model.node_weight, model.means)
 
+    def accompany(self, model: GaussianModel, displacements: F32) -> None:
+        """Let the nodes go with their Gaussians, which somebody else moves by `displacements` [N, 3] m."""
+        all_seen = np.ones(len(displacements), np.float32)
+        motion, _ = _average(displacements, all_seen, model.node_index, model.node_weight, len(self.nodes))
+        self.nodes += motion
+
     def settle(self, share: float) -> None:
         """Let where the tissue rests follow where it is now, by a share of the way."""
         self._rest += np.float32(share) * (self.nodes - self._rest)

@@ -132,6 +132,11 @@ class GaussianModel:
         self.count = kept
         return removed
 
+    def reorder(self, order: I64) -> None:
+        """Row k becomes what row `order[k]` was."""
+        for values in self.rows.values():
+            values[: self.count] = values[order]
+
     def grow(self, factor: float) -> None:
         """Make all as much larger; what they show gets no steeper by it, per metre."""
         self.slopes[:] *= np.float32(factor)

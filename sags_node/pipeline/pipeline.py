@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,7 +19,8 @@ from sags_node.mapping.budget import Budget, FramePlan
 from sags_node.mapping.camera_tracker import CameraTracker
 from sags_node.mapping.depth_memory import UNWATCHED
 from sags_node.mapping.devices import ALL_SKIPS, Skips, affordable, make_budget, make_refiner
-from sags_node.mapping.mapper import Mapped, Mapper
+from sags_node.mapping.mapped import Mapped
+from sags_node.mapping.mapper import Mapper
 from sags_node.mapping.motion import Drawn, SurfaceTracker, Tracks
 from sags_node.mapping.pose_refiner import PoseRefiner
 from sags_node.mapping.right_view import RightView
@@ -47,6 +49,9 @@ from sags_node.vision.rectify import Rectifier
 from sags_node.vision.scene_watch import SceneWatch, enlarged, exposed
 from sags_node.vision.tissue import TissueMask
 from sags_node.vision.tissue_topic import NearestMask
+
+if TYPE_CHECKING:
+    from sags_node.mapping.sags_mapper import SagsMapper
 
 UNHURRIED_MS = 60.0  # a budget that has room for several steps and a finer flow
 NOTICED_LATE = HALVING  # m: what was measured before matches are found to be wrong may be wrong by so much
@@ -98,7 +103,13 @@ class Pipeline:
         self._config = config
         self.map = TissueMap(affordable(config, width, height), field=config.mapping.field is True)
         unhurried = config.mapping.frame_ms(rate) >= UNHURRIED_MS
-        self.mapper = Mapper(self._refiner, self.map, unhurried=unhurried)
+        self.mapper: Mapper | SagsMapper
+        if config.mapping.method == "sags":
+            from sags_node.mapping.sags_mapper import SagsMapper  # and torch, which takes a second
+
+            self.mapper = SagsMapper(self.map)
+        else:
+            self.mapper = Mapper(self._refiner, self.map, unhurried=unhurried)
         self._surface = SurfaceTracker(unhurried)
         self._right = RightView()
         self._camera: CameraTracker | PoseRefiner | None = None  # None: its pose is given, or fixed
@@ -137,7 +148,7 @@ class Pipeline:
 
     def predict_motion(self) -> None:
         """Somebody wants motion predicted. Any thread may call this."""
-        if self._config.mapping.field is not False:
+        if self._config.mapping.field is not False and self._config.mapping.method == "nodes":
             self.map.remember_motion()
 
     @property

@@ -45,7 +45,7 @@ def warm_up(config: LaunchConfig) -> None:
     small = config.model_copy(
         update={
             "vision": VisionConfig(stereo=config.vision.stereo, pose=config.vision.pose),
-            "mapping": MappingConfig(max_gaussians=1000),
+            "mapping": MappingConfig(method=config.mapping.method, max_gaussians=1000),
         }
     )
     pipeline = Pipeline(small, _rig())

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from sags_node.mapping.budget import Budget
-from sags_node.mapping.mapper import Mapped, Mapper
+from sags_node.mapping.mapped import Mapped
+from sags_node.mapping.mapper import Mapper
 from sags_node.mapping.motion import Drawn, SurfaceTracker
 from sags_node.types import Observation
 

@@ -12,7 +12,7 @@ from sags_node.engine.rasterizer.rasterize import make_rasterizer, rasterize
 from sags_node.evaluation import metrics
 from sags_node.evaluation.warp import warp_to_right
 from sags_node.mapping.budget import StepBudget
-from sags_node.mapping.mapper import Mapped
+from sags_node.mapping.mapped import Mapped
 from sags_node.mapping.right_eye import right_eye_mask
 from sags_node.mapping.right_view import FADING, RightView
 from sags_node.pipeline.pipeline import FrameRequest, Pipeline

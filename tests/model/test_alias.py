@@ -30,7 +30,8 @@ from sags_node.engine.rasterizer.smoothing import bake_filter
 from sags_node.evaluation.metrics import as_float, psnr
 from sags_node.geometry import project
 from sags_node.mapping.budget import StepBudget
-from sags_node.mapping.mapper import Mapped, Mapper
+from sags_node.mapping.mapped import Mapped
+from sags_node.mapping.mapper import Mapper
 from sags_node.mapping.refiner import CpuRefiner
 from sags_node.mapping.tissue_map import TissueMap
 from sags_node.model.alias_free import FILTER_VARIANCE, smoothing_variances

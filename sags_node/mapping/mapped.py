@@ -1,0 +1,64 @@
+"""What every mapper makes of a frame, and how it judges one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from sags_node.engine.rasterizer.confidence import with_confidence
+from sags_node.engine.rasterizer.views import to_view
+from sags_node.mapping.densify import HOLE_ALPHA
+from sags_node.model.gaussians import GaussianModel
+from sags_node.types import F32, Forecast, Observation, RenderedView, Snapshot
+
+MIN_FIRST_DEPTHS = 200  # px
+LOST_COVERAGE = 0.3  # of the tissue
+
+
+@dataclass(frozen=True, slots=True)
+class Mapped:
+    """What the mapper made of one frame."""
+
+    snapshot: Snapshot
+    view: RenderedView  # the model drawn for the left eye
+
+
+def can_start(observation: Observation) -> bool:
+    """Whether this frame has depth enough for a first model."""
+    return bool(np.count_nonzero(observation.depth) >= MIN_FIRST_DEPTHS)
+
+
+def is_lost(planes: F32, observation: Observation) -> bool:
+    """Whether the model, moved to this frame, hardly covers it: after damage, or where the camera is known to
+    be in another place. Looking at every eighth pixel is enough. What the picture shows is judged before, see
+    `vision.scene_watch`."""
+    tissue = observation.tissue[::8, ::8]
+    covered = tissue & (planes[4, ::8, ::8] > HOLE_ALPHA)
+    return bool(np.count_nonzero(covered) < LOST_COVERAGE * np.count_nonzero(tissue))
+
+
+def as_view(planes: F32, model: GaussianModel, observation: Observation) -> RenderedView:
+    """Planes [5, h, w] of the model, drawn for a frame at any size, as they are published."""
+    view = to_view(planes, observation.camera, observation.frame_id, observation.t_capture_ns)
+    return with_confidence(view, model.gaussians(), observation.grid)
+
+
+def snapshot_of(
+    model: GaussianModel, observation: Observation, step: int, loss: float, counts: Mapping[str, int],
+    right: bool, forecast: Forecast | None = None,
+) -> Snapshot:  # fmt: skip
+    """The model as it is at the time of a frame; `right`: also what the right eye sees more."""
+    return Snapshot(
+        frame_id=observation.frame_id,
+        t_capture_ns=observation.t_capture_ns,
+        step=step,
+        gaussians=model.snapshot(),
+        velocities=model.velocities.copy(),
+        camera=observation.camera,
+        loss=loss,
+        counts=counts,
+        forecast=forecast,
+        right_colors=model.right_colors.copy() if right else None,
+    )

@@ -1,0 +1,336 @@
+"""The paper's model (SAGS, arXiv 2510.27318) learnt while the video runs: `mapping.method` sags.
+
+The field (`sags_node.field`) knows the last seconds: canonical Gaussians, a HexPlane and a self-adaptive
+decoder say how they are at each time of the window. The map (`TissueMap`) has them as they are in the newest
+frame: that is published. What prunes, inserts, splits and lights Gaussians works on the map, as with
+`Mapper`; the field then takes over what was done (`_take_over`).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from sags_node.engine.interface import Rasterizer
+from sags_node.engine.losses.tissue import tissue_loss
+from sags_node.engine.rasterizer.rasterize import make_rasterizer
+from sags_node.field.decoder import Decoder
+from sags_node.field.deformation import Deltas, FieldRates, NodeField
+from sags_node.field.hexplane import HexPlane
+from sags_node.field.model import Rates
+from sags_node.field.window import WindowModel
+from sags_node.mapping import densify, initialise
+from sags_node.mapping.budget import Budget
+from sags_node.mapping.depth_memory import remember
+from sags_node.mapping.exposure import exposure_gain
+from sags_node.mapping.mapped import Mapped, as_view, can_start, is_lost, snapshot_of
+from sags_node.mapping.mapper import (
+    ADDED,
+    EXPOSURE_JUMP,
+    FIRST_STEPS,
+    GROWN,
+    HOLES,
+    SETTLED,
+    SETTLED_EVERY,
+)  # fmt: skip
+from sags_node.mapping.motion import DEPTH_PULL, Tracks
+from sags_node.mapping.optimiser import COLOUR_DAMPING, COLOUR_RELAXATION
+from sags_node.mapping.refiner import DEPTH_SCALE, DEPTH_WEIGHT
+from sags_node.mapping.split import split_worst
+from sags_node.mapping.surface import surface_at
+from sags_node.mapping.tissue_map import TissueMap
+from sags_node.model import columns
+from sags_node.model.deformation import NodeDeformation
+from sags_node.model.gaussians import GaussianModel
+from sags_node.types import F32, F64, Camera, Gaussians, Observation, RenderedView
+from sags_node.vision.observe import resized
+
+WINDOW_NS = 2_000_000_000  # that the field remembers
+SLOT_NS = 100_000_000  # from one of its times to the next
+MOST_KEPT = 64  # frames of the window, at any frame rate
+NODES = 128  # that ask the field; 512 take twice the time of a step, and show no more with few steps
+CELLS, CHANNELS = 32, 16  # of the HexPlane; twice as many of both show no more either
+OUTLIERS = 1e-3  # of the Gaussians, on each side of the field's box: strays must not blow it up
+LEAST_SIDE = 1e-3  # m, of that box
+# Lengths of a step of Adam on the canonical Gaussians. Positions: px at the tissue's median depth. Colours
+# take a step in closed form instead (`_refine`).
+MEAN_PX, LOG_SCALE, QUAT, LOGIT = 0.08, 5e-3, 1e-3, 0.05
+FIRST_SPEED = 4.0  # times as long, in the first steps of a model
+EARLIER_RELAXATION = 0.3  # of the step on colours on an earlier frame; what is published is the newest
+LOOK_BACK_NS = SLOT_NS  # the velocity is the field's mean over this time
+
+
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """A frame to learn from."""
+
+    t_ns: int  # on the field's clock
+    drawn: Observation  # at the size in which the model was drawn
+    camera: Camera  # of the whole picture, for the 3D filter
+
+
+class SagsMapper:
+    """Canonical Gaussians, field and decoder of SAGS over a window that slides with the video. To be used as
+    `Mapper` is; where tissue went is said by the field, not by optical flow.
+
+    Attributes:
+        map: what is published of it.
+        step: how many steps were taken.
+    """
+
+    def __init__(self, tissue_map: TissueMap, seed: int = 0) -> None:
+        """`seed`: of the field's first values and of which frames are learnt again."""
+        torch.set_num_threads(1)  # results do not depend on it then; so few nodes gain little from more
+        self.map = tissue_map
+        self.step = 0
+        self._seed = seed
+        self._field: WindowModel | None = None  # its rows are the map's, by their ids
+        self._kept: deque[Kept] = deque()  # of the window, oldest first; the newest is always there
+        self._rasterizers: dict[tuple[int, int], Rasterizer] = {}
+        self._now_ns = self._ahead_ns = 0  # the field's clock, and by how much it is ahead of the stamps
+        self._frames = self._first_steps = 0
+        self._loss = 0.0
+        self._view: RenderedView | None = None  # the model as it was drawn last
+
+    def update(
+        self, observation: Observation, tracks: Tracks | None, budget: Budget, still: int = 0,
+        learn: bool = True, right: bool = False,
+    ) -> Mapped:  # fmt: skip
+        """Take one frame in; see `Mapper.update`. `tracks` are not needed."""
+        self._frames += 1
+        before_ns = self._now_ns
+        drawn = resized(observation, budget.plan.rung.scale)
+        frame = Kept(self._time_of(observation), drawn, observation.camera)
+        if self.map.deformation is None:
+            counts = self._initialise(observation, frame, budget)
+        else:
+            counts = self._follow(observation, frame, budget, still, learn)
+            surface, pull = surface_at(self.model.means, observation), DEPTH_PULL * observation.depth_is_new
+            remember(self.model, surface, pull, (self._now_ns - before_ns) * 1e-9)
+        assert self._view is not None
+        snapshot = snapshot_of(self.model, observation, self.step, self._loss, counts, right)
+        return Mapped(snapshot, self._view)
+
+    def pace(self, unhurried: bool) -> None:
+        """See `Mapper.pace`: steps are as long whatever time there is."""
+
+    @property
+    def model(self) -> GaussianModel:
+        """The Gaussians of the map."""
+        return self.map.model
+
+    def at(self, t_ns: int, cameras: Sequence[Camera]) -> Gaussians:
+        """The Gaussians at a time of the window; see `WindowModel.at`."""
+        return self._known.at(t_ns + self._ahead_ns, cameras)
+
+    def _initialise(self, observation: Observation, frame: Kept, budget: Budget) -> dict[str, int]:
+        drawn, model = frame.drawn, self.model
+        if not can_start(observation):  # a black or covered picture: try again with the next frame
+            self._show(observation, frame)
+            return {"inserted": 0}
+        limit = int(initialise.INITIAL_SHARE * self._limit(budget))
+        pixels, depths, errors, spacing = initialise.first_pixels(drawn, limit)
+        rows = initialise.insert(model, drawn, pixels, depths, errors, spacing, smoothing=True)
+        self.map.deformation = NodeDeformation(model.means, NODES)
+        self.map.deformation.attach(model, rows)
+        self.map.lamp = observation.camera.T_world_cam
+        self._field = WindowModel(rows_of(model), self._make_field(model.means, frame.t_ns))
+        self._ids, self._written = model.ids.copy(), rows_of(model)
+        self._kept = deque([frame])
+        pixel = float(np.median(depths)) / float(drawn.camera.K[0, 0])  # m
+        lengths = [MEAN_PX * pixel] * 3 + [LOG_SCALE] * 3 + [QUAT] * 4 + [0.0] * 3 + [LOGIT]
+        self._rates = np.array(lengths, np.float32)
+        self._rng = np.random.default_rng(self._seed)
+        steps = self._first_steps = 0
+        while steps < FIRST_STEPS and budget.more_at_first(steps):
+            self._refine(frame, COLOUR_RELAXATION, deformed=False)
+            steps += 1
+        self._write(frame)
+        self._show(observation, frame)
+        self.step += steps
+        return {"inserted": len(pixels), "iterations": steps}
+
+    def _make_field(self, means: F32, t_ns: int) -> NodeField:
+        low, high = np.quantile(means, [OUTLIERS, 1 - OUTLIERS], axis=0)
+        box: F64 = np.array([low, np.maximum(high, low + LEAST_SIDE)])
+        slots = WINDOW_NS // SLOT_NS + 2  # the newest slot lies up to one slot after the newest frame
+        hexplane = HexPlane(box, t_ns, SLOT_NS, slots, cells=CELLS, channels=CHANNELS, seed=self._seed)
+        decoder = Decoder(hexplane.features, "nodes", seed=self._seed)
+        decoder.awaken(self._seed)
+        return NodeField(Deltas(hexplane, decoder), self._nodes.nodes.copy())
+
+    def _follow(
+        self, observation: Observation, frame: Kept, budget: Budget, still: int, learn: bool
+    ) -> dict[str, int]:
+        # 1. Predict: the window reaches this frame, old slots are folded, the field says how things are now.
+        self._known.advance(frame.t_ns)
+        self._write(frame)
+        self.map.move_light(observation.camera)
+        inserted = removed = iterations = 0
+        if learn:
+            self._keep(frame)
+            # 2. Draw; let the colours follow a jump of the exposure. Then prune, split and fill holes.
+            if not still:
+                planes = self._exposed(frame)
+                if is_lost(planes, frame.drawn) and can_start(observation):
+                    self.map.restart()
+                    return self._initialise(observation, frame, budget) | {"restarted": 1}
+                inserted, removed = self._tidy(observation, frame, planes, budget)
+            self._take_over(frame.t_ns)
+            # 3. Refine while the time lasts, on the newest frame and on earlier ones, lest they be lost.
+            settled = still > SETTLED
+            rests = settled and self._frames % SETTLED_EVERY > 0
+            while not (rests or (settled and iterations)) and budget.more():
+                if iterations % 2 == 0:
+                    self._refine(frame, COLOUR_RELAXATION)
+                else:
+                    self._refine(self._kept[self._rng.integers(len(self._kept))], EARLIER_RELAXATION)
+                iterations += 1
+            self._write(frame)
+        # 4. Say how it moves, and draw what is shown.
+        self.model.velocities[:] = 0 if still else self._velocities(frame.t_ns)
+        self._show(observation, frame)
+        self.step += iterations
+        return {"inserted": inserted, "removed": removed, "iterations": iterations}
+
+    def _exposed(self, frame: Kept) -> F32:
+        """The map drawn for a frame, in its exposure."""
+        planes = self._draw(frame)
+        gain = exposure_gain(planes, frame.drawn.image, frame.drawn.tissue)
+        if np.abs(gain - 1).max() > EXPOSURE_JUMP:
+            self.model.colors[:] *= gain
+            self._kept = deque([frame])  # the others are in another exposure
+            planes = self._draw(frame)
+        return planes
+
+    def _tidy(self, observation: Observation, frame: Kept, planes: F32, budget: Budget) -> tuple[int, int]:
+        """Prune, split and fill holes by the rules of `Mapper`; how many were inserted and removed."""
+        model, drawn, limit = self.model, frame.drawn, self._limit(budget)
+        surface = surface_at(model.means, observation)
+        removed = model.remove(densify.prune_mask(model, surface, observation.depth_is_new, limit))
+        removed += densify.prune_to_budget(model, limit)
+        if limit - model.count > HOLES:  # else what hardly shows is needed to fill holes
+            room = max(0, round(GROWN * limit) - model.count)
+            split_worst(model, observation, as_view(planes, model, observation), room)
+        pixels, depths, errors = densify.candidates(planes, drawn, phase=7 * self._frames)
+        room = max(ADDED, limit - model.count)
+        lacking = min(len(pixels[:room]), HOLES) - max(0, limit - model.count)
+        if 0 < lacking < model.count:
+            removed += model.remove(densify.least_shown(model, lacking))
+        new = pixels[:room], depths[:room], errors[:room]
+        rows = initialise.insert(model, drawn, *new, densify.GRID, smoothing=True)
+        self._nodes.attach(model, rows)
+        return rows.stop - rows.start, removed
+
+    def _refine(self, frame: Kept, relaxation: float, deformed: bool = True) -> None:
+        """One step on a frame: Adam on field, decoder and canonical Gaussians; on their colours the step in
+        closed form of `optimiser.Optimiser`. With Adam on colours the phantom loses 3 dB."""
+        field, seen = self._known, frame.drawn
+        rasterizer = self._rasterizer(seen.camera)
+        drawing = field.draw(rasterizer, frame.t_ns, seen.camera, deformed, whole=frame.camera)
+        planes = drawing.planes.detach().numpy()
+        v_planes, weight = np.zeros_like(planes), np.zeros_like(planes[0])
+        loss = tissue_loss(
+            planes, seen.image, seen.tissue, seen.depth, v_planes, weight, DEPTH_WEIGHT, DEPTH_SCALE
+        )
+        drawing.differentiate(v_planes, weight)
+        assert field.rows.grad is not None
+        share = np.float32(relaxation) / (drawing.contribution + np.float32(COLOUR_DAMPING))
+        field.table[:, columns.COLOR] -= share[:, None] * field.rows.grad.numpy()[:, columns.COLOR]
+        speed = np.float32(FIRST_SPEED if self._first_steps < FIRST_STEPS else 1)
+        field.descend(drawing, Rates(self._rates * speed, FieldRates()))
+        self._first_steps += 1
+        if frame is self._kept[-1]:
+            self.model.contribution[:], self._loss = drawing.contribution, loss
+
+    def _write(self, frame: Kept) -> None:
+        """The map becomes what the field says of a frame's time."""
+        model, now = self.model, self._known.at(frame.t_ns, [frame.camera])
+        self._nodes.accompany(model, now.means - model.means)
+        model.means[:], model.quats[:], model.colors[:] = now.means, now.quats, now.colors
+        model.scales[:], model.opacities[:] = now.scales, now.opacities
+        model.log_scales[:] = np.log(now.scales)
+        opacities = np.clip(now.opacities, 1e-6, 1 - 1e-6)
+        model.opacity_logits[:] = np.log(opacities / (1 - opacities))
+        assert now.smoothing is not None
+        model.smoothing[:] = now.smoothing
+        self._written = rows_of(model)
+
+    def _take_over(self, t_ns: int) -> None:
+        """Do to the field what was done to the map since `_write`: what was changed, rotations apart, changes
+        at all times alike; what is new was there all the time, moved as its neighbours."""
+        model, field = self.model, self._known
+        model.reorder(np.argsort(model.ids))  # as in the field: the oldest first
+        kept = np.isin(self._ids, model.ids, assume_unique=True)
+        if not kept.all():
+            field.keep(kept)
+        rows, known = rows_of(model), int(np.count_nonzero(kept))
+        changes = rows[:known] - self._written[kept]
+        changes[:, columns.QUAT] = 0
+        field.table[:] += changes
+        if known < model.count:
+            field.insert(rows[known:], t_ns)
+        self._ids = model.ids.copy()
+
+    def _velocities(self, t_ns: int) -> F32:
+        """[N, 3] m/s, by the field over the last `LOOK_BACK_NS`."""
+        with torch.no_grad():
+            before = self._known.rows_at(t_ns - LOOK_BACK_NS)[:, columns.MEAN].numpy()
+        velocities: F32 = (self.model.means - before) / np.float32(LOOK_BACK_NS * 1e-9)
+        return velocities
+
+    def _time_of(self, observation: Observation) -> int:
+        """On the field's clock, which stands still where a camera's goes back."""
+        self._ahead_ns = max(self._ahead_ns, self._now_ns - observation.t_capture_ns)
+        self._now_ns = observation.t_capture_ns + self._ahead_ns
+        return self._now_ns
+
+    def _keep(self, frame: Kept) -> None:
+        """Also this one; forget those that the window has left, and such as are closer than memory allows."""
+        kept = self._kept
+        if len(kept) > 1 and kept[-1].t_ns - kept[-2].t_ns < WINDOW_NS // MOST_KEPT:
+            kept.pop()
+        kept.append(frame)
+        while kept[0].t_ns < frame.t_ns - WINDOW_NS or len(kept) > MOST_KEPT:
+            kept.popleft()
+
+    def _show(self, observation: Observation, frame: Kept) -> None:
+        self._view = as_view(self._draw(frame), self.model, observation)
+
+    def _draw(self, frame: Kept) -> F32:
+        camera = frame.drawn.camera
+        return self._rasterizer(camera).forward(self.model.gaussians(), camera)
+
+    def _rasterizer(self, camera: Camera) -> Rasterizer:
+        size = camera.width, camera.height
+        if size not in self._rasterizers:
+            self._rasterizers[size] = make_rasterizer("numba", *size)
+        return self._rasterizers[size]
+
+    def _limit(self, budget: Budget) -> int:
+        """How many Gaussians this machine can afford."""
+        return min(budget.plan.rung.gaussians, self.model.capacity)
+
+    @property
+    def _known(self) -> WindowModel:
+        """The field, of a map that has tissue."""
+        assert self._field is not None
+        return self._field
+
+    @property
+    def _nodes(self) -> NodeDeformation:
+        """That go with the Gaussians; of a map that has tissue."""
+        assert self.map.deformation is not None
+        return self.map.deformation
+
+
+def rows_of(model: GaussianModel) -> F32:
+    """Raw rows [N, 14] (`columns`) of a map's Gaussians, copies."""
+    logits = model.opacity_logits[:, None]
+    parts = [model.means, model.log_scales, model.quats, model.colors, logits]
+    rows: F32 = np.concatenate(parts, axis=1, dtype=np.float32)
+    return rows
