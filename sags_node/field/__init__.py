@@ -3,11 +3,11 @@
 
 A model is canonical Gaussians in raw rows [N, 14] (`model.columns`) and a field that deforms them:
 
-    hexplane = HexPlane(box, t0_ns, slot_ns, slots)                  features of (x, y, z, t); the window slides
+    hexplane = HexPlane(box, t0_ns, slot_ns, slots)                  features of (x, y, z, t)
     decoder = Decoder(hexplane.features, tokens)                     features -> changes of a row
     field = NodeField(Deltas(hexplane, decoder), nodes)              or PointField(Deltas(...))
-    model = WindowModel(rows, field, slopes=slopes)                  over a stream, or DeformableModel: a clip
-    decoder.awaken(seed)                                             only with WindowModel, before the first step
+    model = WindowModel(rows, field, slopes=slopes)                  or DeformableModel: of a clip
+    decoder.awaken(seed)                                             WindowModel: before it learns
 
     model.at(t_ns, cameras) -> Gaussians                             numpy, ready to draw; len(model)
     model.advance(t_ns); model.keep(kept); model.insert(rows, t_ns, slopes)

@@ -134,13 +134,13 @@ def skin(rows: Tensor, nodes: Tensor, deltas: Tensor, index: Tensor, weight: Ten
     """
     middle = nodes.mean(0)
     unturned = deltas.new_tensor([1.0, 0, 0, 0])
-    A = rotations(unturned + deltas[:, columns.QUAT]) - torch.eye(3, dtype=deltas.dtype)
-    shift = deltas[:, columns.MEAN] - torch.einsum("mij,mj->mi", A, nodes - middle)
+    A = turns(unturned + deltas[:, columns.QUAT])
+    shift = deltas[:, columns.MEAN] - (A @ (nodes - middle)[:, :, None])[:, :, 0]
     records = torch.cat([A.flatten(1), shift, deltas[:, columns.LOG_SCALE.start :]], 1)
     blend = gather(records, index, weight)
     A, shift, change = blend[:, :9].view(-1, 3, 3), blend[:, 9:12], blend[:, 9:]
     mean, quat = rows[:, columns.MEAN], rows[:, columns.QUAT]
-    moved = mean + torch.einsum("nij,nj->ni", A, mean - middle) + shift
+    moved = mean + (A * (mean - middle)[:, None]).sum(2) + shift
     turned = product(unturned + change[:, columns.QUAT], quat)
     scale, rest = columns.LOG_SCALE, slice(columns.QUAT.stop, None)
     return torch.cat([moved, rows[:, scale] + change[:, scale], turned, rows[:, rest] + change[:, rest]], 1)
@@ -148,15 +148,9 @@ def skin(rows: Tensor, nodes: Tensor, deltas: Tensor, index: Tensor, weight: Ten
 
 def product(a: Tensor, b: Tensor) -> Tensor:
     """Hamilton products a b of quaternions [N, 4], wxyz: first b, then a."""
-    aw, ax, ay, az = a.unbind(1)
-    bw, bx, by, bz = b.unbind(1)
-    parts = [
-        aw * bw - ax * bx - ay * by - az * bz,
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-    ]
-    return torch.stack(parts, 1)
+    aw, av, bw, bv = a[:, :1], a[:, 1:], b[:, :1], b[:, 1:]
+    w = aw * bw - (av * bv).sum(1, keepdim=True)
+    return torch.cat([w, aw * bv + bw * av + torch.linalg.cross(av, bv)], 1)
 
 
 def conjugate(q: Tensor) -> Tensor:
@@ -168,14 +162,9 @@ def unit(q: Tensor) -> Tensor:
     return normalize(q, dim=1, eps=SHORTEST)
 
 
-def rotations(quats: Tensor) -> Tensor:
-    """Rotation matrices [N, 3, 3] of quaternions of any length."""
+def turns(quats: Tensor) -> Tensor:
+    """R - 1 of the rotations R [N, 3, 3] of quaternions of any length: 2 (w K + K K), K v = (x, y, z) x v."""
     w, x, y, z = unit(quats).unbind(1)
-    parts = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    return torch.stack(parts, 1).view(-1, 3, 3)
-
-
+    zero = torch.zeros_like(w)
+    K = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], 1).view(-1, 3, 3)
+    return 2 * (w[:, None, None] * K + K @ K)

@@ -58,9 +58,10 @@ class Drawing:
 
     Attributes:
         planes: [5, H, W] of `Rasterizer.forward`, differentiable in rows and slopes.
-        contribution, spread: [N] as `interface.Gradients` has them, after `differentiate`.
+        v_means, contribution, spread: as `interface.Gradients` has them, after `differentiate`.
     """
 
+    v_means: F32
     contribution: F32
     spread: F32
 
@@ -77,7 +78,7 @@ class Drawing:
         self.rasterizer, self.camera = rasterizer, camera
         self.weight: F32 | None = None
         self.gaussians = to_gaussians(rows, slopes, ids, cameras)
-        self.planes: Tensor = _Rasterize.apply(*activate(rows), slopes, self)
+        self.planes: Tensor = _Rasterize.apply(*activate(rows), slopes, self)  # type: ignore[no-untyped-call]
 
     def differentiate(self, loss: Tensor | F32, weight: F32) -> None:
         """Add the gradients of a loss to all leaves that the drawing came from.
@@ -88,9 +89,9 @@ class Drawing:
         """
         self.weight = weight
         if isinstance(loss, Tensor):
-            loss.backward()
+            loss.backward()  # type: ignore[no-untyped-call]
         else:
-            self.planes.backward(torch.from_numpy(loss))
+            self.planes.backward(torch.from_numpy(loss))  # type: ignore[no-untyped-call]
 
 
 class _Rasterize(torch.autograd.Function):
@@ -109,7 +110,7 @@ class _Rasterize(torch.autograd.Function):
         drawing: Drawing = ctx.drawing
         weight = np.zeros(v_planes.shape[1:], np.float32) if drawing.weight is None else drawing.weight
         found = drawing.rasterizer.backward(v_planes.numpy(), weight)
-        drawing.contribution, drawing.spread = found.contribution, found.spread
+        drawing.v_means, drawing.contribution, drawing.spread = found.means, found.contribution, found.spread
         by = (found.means, found.quats, found.scales, found.opacities, found.colors)
         slopes = torch.from_numpy(found.slopes) if ctx.has_slopes else None
         return *map(torch.from_numpy, by), slopes, None

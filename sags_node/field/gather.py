@@ -1,6 +1,6 @@
 """Weighted sums of a table's rows: what bilinear sampling and following nodes have in common.
 
-torch's own gradient of it sorts all indices, and takes eight times as long as the kernels here; those are for
+torch's own gradient of it sorts all indices and takes several times as long as the kernels here; those are for
 float32 on the CPU, and a test compares them with torch's.
 """
 
@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn.functional import embedding_bag
 
 from sags_node.kernels.jit import kernel, parallel_kernel, read_only
-from sags_node.types import F32, I64
+from sags_node.types import F32, I64, Bool
 
 u8 = np.uint64
 LANES = 16  # columns of the table that one thread adds up: the same bits on any number of threads
@@ -34,7 +34,7 @@ def gather(table: Tensor, index: Tensor, weight: Tensor) -> Tensor:
         [B, C], differentiable in table and weight.
     """
     if table.dtype == torch.float32 and table.device.type == "cpu":
-        gathered: Tensor = _Gather.apply(table, index, weight)
+        gathered: Tensor = _Gather.apply(table, index, weight)  # type: ignore[no-untyped-call]
         return gathered
     return embedding_bag(index, table, per_sample_weights=weight, mode="sum")
 
@@ -43,7 +43,10 @@ class _Gather(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, table: Tensor, index: Tensor, weight: Tensor) -> Tensor:
         ctx.save_for_backward(table, index, weight)
-        return embedding_bag(index, table, per_sample_weights=weight, mode="sum")
+        sums = table.new_empty((len(index), table.shape[1]))
+        tables, rows, shares = (read_only(each.detach().numpy()) for each in (table, index, weight))
+        _sum(tables, rows, shares, sums.numpy())
+        return sums
 
     @staticmethod
     def backward(ctx: Any, v_sums: Tensor) -> tuple[Tensor | None, None, Tensor | None]:
@@ -59,8 +62,34 @@ class _Gather(torch.autograd.Function):
         return v_table, None, v_weight
 
 
+def rows_of(table: F32) -> I64:
+    """The rows [K] of a table that hold anything but zeros, ascending."""
+    filled = np.empty(len(table), np.bool_)
+    _find_filled(read_only(table), filled)
+    return np.flatnonzero(filled)
+
+
 @kernel
-def _scatter_columns(first: int, end: int, index: I64, weight: F32, v_sums: F32, v_table: F32) -> None:
+def _sum_piece(first: Any, end: Any, table: F32, index: I64, weight: F32, sums: F32) -> None:
+    for bag in range(first, end):
+        for c in range(table.shape[1]):
+            sums[bag, u8(c)] = np.float32(0)
+        for k in range(index.shape[1]):
+            row, w = u8(index[bag, k]), weight[bag, k]
+            for c in range(table.shape[1]):
+                sums[u8(bag), u8(c)] += w * table[row, u8(c)]
+
+
+@parallel_kernel
+def _sum(table: F32, index: I64, weight: F32, sums: F32) -> None:
+    for piece in prange(-(-len(index) // PIECE)):
+        first = np.int64(piece) * PIECE
+        end = min(first + PIECE, len(index))
+        _sum_piece(first, end, table, index, weight, sums)
+
+
+@kernel
+def _scatter_columns(first: Any, end: Any, index: I64, weight: F32, v_sums: F32, v_table: F32) -> None:
     a, b = u8(first), u8(end)
     for bag in range(len(index)):
         for k in range(index.shape[1]):
@@ -78,7 +107,7 @@ def _scatter(index: I64, weight: F32, v_sums: F32, v_table: F32) -> None:
 
 
 @kernel
-def _dot_piece(first: int, end: int, index: I64, table: F32, v_sums: F32, v_weight: F32) -> None:
+def _dot_piece(first: Any, end: Any, index: I64, table: F32, v_sums: F32, v_weight: F32) -> None:
     for bag in range(first, end):
         for k in range(index.shape[1]):
             row, total = u8(index[bag, k]), np.float32(0)
@@ -91,4 +120,22 @@ def _dot_piece(first: int, end: int, index: I64, table: F32, v_sums: F32, v_weig
 def _dot(index: I64, table: F32, v_sums: F32, v_weight: F32) -> None:
     for piece in prange(-(-len(index) // PIECE)):
         first = np.int64(piece) * PIECE
-        _dot_piece(first, min(first + PIECE, len(index)), index, table, v_sums, v_weight)
+        end = min(first + PIECE, len(index))
+        _dot_piece(first, end, index, table, v_sums, v_weight)
+
+
+@kernel
+def _find_filled_piece(first: Any, end: Any, table: F32, filled: Bool) -> None:
+    for row in range(first, end):
+        total = np.float32(0)
+        for c in range(table.shape[1]):
+            total += np.float32(table[u8(row), u8(c)] != np.float32(0))
+        filled[row] = total > np.float32(0)
+
+
+@parallel_kernel
+def _find_filled(table: F32, filled: Bool) -> None:
+    for piece in prange(-(-len(table) // PIECE)):
+        first = np.int64(piece) * PIECE
+        end = min(first + PIECE, len(table))
+        _find_filled_piece(first, end, table, filled)

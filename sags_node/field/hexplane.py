@@ -1,7 +1,8 @@
 """The HexPlane: features of every place and time (SAGS, arXiv 2510.27318, equation of the feature field;
 HexPlane, Cao & Johnson, CVPR 2023; the product is that of K-Planes, Fridovich-Keil et al., CVPR 2023).
 
-    f(x, y, z, t) = concat over levels l of  prod over c in {xy, xz, yz, xt, yt, zt} of  interp(P_c^l, (x, y, z, t)_c)
+    f(x, y, z, t) = concat over levels l of prod over c of interp(P_c^l, (x, y, z, t)_c)
+    c in {xy, xz, yz, xt, yt, zt}
 
 Six planes of feature vectors on each level are sampled bilinearly. The first and last node of an axis in
 space lie on the faces of the box; outside it, the border's value holds.
@@ -21,10 +22,10 @@ from collections.abc import Callable
 import numpy as np
 import torch
 from torch import Tensor
-from sags_node.field.gather import gather
 
 from sags_node.engine.adam import AdamState, adam_step
 from sags_node.errors import SagsError, UsageError
+from sags_node.field.gather import gather, rows_of
 from sags_node.types import F64, I64
 
 PAIRS = ((0, 1), (0, 2), (1, 2))  # the planes in space: xy, xz, yz
@@ -82,12 +83,14 @@ class HexPlane:
         counts = np.broadcast_to(np.asarray(cells, np.int64), 3)
         box = np.array(box, np.float64)
         if box.shape != (2, 3) or not np.isfinite(box).all() or not (box[0] < box[1]).all():
-            raise UsageError(f"a HexPlane needs a finite box [2, 3] with room on every axis, got {box.tolist()} m")
+            raise UsageError(
+                f"a HexPlane needs a finite box [2, 3] with room on every axis, got {box.tolist()} m"
+            )
         if min(slot_ns, slots, channels, counts.min()) < 1 or not 1 <= levels <= MAX_LEVELS:
             raise UsageError(
-                f"a HexPlane needs 1 to {MAX_LEVELS} levels, and slots, channels, cells and ns of a slot of at "
-                f"least 1, got {levels} levels, {slots} slots, {channels} channels, {counts.tolist()} cells "
-                f"and {slot_ns} ns"
+                f"a HexPlane needs 1 to {MAX_LEVELS} levels, and slots, channels, cells and ns of a slot of "
+                f"at least 1, got {levels} levels, {slots} slots, {channels} channels, {counts.tolist()} "
+                f"cells and {slot_ns} ns"
             )
         self.t0_ns, self.slot_ns, self.slots, self.channels = int(t0_ns), int(slot_ns), slots, channels
         self.newest = 0
@@ -144,41 +147,40 @@ class HexPlane:
 
     def sample(self, points: Tensor, t_ns: int) -> Tensor:
         """Features [N, levels * C] of points [N, 3] m at one time, differentiable in both."""
-        index, weight = self._corners(points, t_ns)
-        sampled = gather(self.cells, index, weight)
-        x_y, x_z, y_z, x_t, y_t, z_t = sampled.view(len(points), len(self.nodes), 6, self.channels).unbind(2)
-        return ((x_y * x_z * y_z) * (x_t * y_t * z_t)).flatten(1)
+        sampled = gather(self.cells, *self._corners(points, t_ns))
+        x_y, x_z, y_z, x_t, y_t, z_t = sampled.view(6, len(points), self.features)
+        features: Tensor = (x_y * x_z * y_z) * (x_t * y_t * z_t)
+        return features
 
     def _corners(self, points: Tensor, t_ns: int) -> tuple[Tensor, Tensor]:
-        """Rows and weights [N * levels * 6, 4] of the four nodes around each point, on each plane."""
+        """Rows and weights of the four nodes around each point, on each plane: [6 * N * levels, 4]."""
         before, after, share = self.locate(t_ns)
         slots = torch.tensor([self.slot(before).start, self.slot(after).start])
         when = torch.tensor([1 - share, share], dtype=points.dtype)
+        nodes, planes, lines = (  # [3, 1, levels, 1, 1]
+            torch.from_numpy(table.T[:, None, :, None, None])
+            for table in (self.nodes, self._plane_rows, self._line_rows)
+        )
         low, high = torch.tensor(self.box, dtype=points.dtype)
         places = torch.nan_to_num((points - low) / (high - low)).clamp(0, 1)
-        rows, weights = [], []
-        for nodes, planes, lines in zip(self.nodes, self._plane_rows, self._line_rows, strict=True):
-            last = torch.from_numpy(nodes - 1)
-            at = places * last
-            node = torch.minimum(at.detach().long(), last - 1)
-            share_of_next = at - node
-            near = torch.stack([node, node + 1], 2)  # [N, 3, 2]
-            weight = torch.stack([1 - share_of_next, share_of_next], 2)
-            for (a, b), first in zip(PAIRS, planes.tolist(), strict=True):
-                rows.append(first + near[:, a, :, None] * int(nodes[b]) + near[:, b, None, :])
-                weights.append(weight[:, a, :, None] * weight[:, b, None, :])
-            for axis, first in enumerate(lines.tolist()):
-                rows.append(first + near[:, axis, :, None] + slots)
-                weights.append(weight[:, axis, :, None] * when)
-        return torch.stack(rows, 1).view(-1, 4), torch.stack(weights, 1).view(-1, 4)
+        at = places.T[:, :, None] * (nodes[..., 0, 0] - 1)  # [3, N, levels]
+        node = torch.minimum(at.detach().long(), nodes[..., 0, 0] - 2)
+        later = at - node
+        near, weight = torch.stack([node, node + 1], 3), torch.stack([1 - later, later], 3)
+        (x, y, z), (wx, wy, wz) = near, weight
+        first, second = torch.stack([x, x, y])[..., None], torch.stack([y, z, z])[..., None, :]
+        of_planes = planes + first * nodes[[1, 2, 2]] + second
+        by_planes = torch.stack([wx, wx, wy])[..., None] * torch.stack([wy, wz, wz])[..., None, :]
+        rows = torch.cat([of_planes, lines + near[..., None] + slots])  # [6, N, levels, 2, 2]
+        return rows.view(-1, 4), torch.cat([by_planes, weight[..., None] * when]).view(-1, 4)
 
     def step(self, rate: float) -> None:
         """Adam on the cells that the last backward pass touched, against their gradient."""
         gradient = self.cells.grad
         if gradient is not None:
-            touched = torch.nonzero((gradient != 0).any(1))[:, 0].numpy()
             rates = np.full(self.channels, rate, np.float32)
-            adam_step(self.cells.detach().numpy(), gradient.numpy(), self.adam, rates, rows=touched)
+            values, touched = self.cells.detach().numpy(), rows_of(gradient.numpy())
+            adam_step(values, gradient.numpy(), self.adam, rates, rows=touched)
             self.cells.grad = None
 
     def advance(self, t_ns: int, retire: Callable[[int], None]) -> None:

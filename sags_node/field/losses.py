@@ -75,22 +75,20 @@ def compare(
     """
     explained, given = torch.from_numpy(tissue), torch.from_numpy(depth).to(planes.dtype)
     truth = torch.from_numpy(image).to(planes.dtype).permute(2, 0, 1) / 255
-    sound = planes.detach().isfinite().all(0)
-    coverage = torch.where(sound, planes[4], 0)
+    sound = planes.detach().sum(0).isfinite()
+    planes = torch.where(sound, planes, 0)
+    coverage = planes[4]
     covered, deep = coverage > COVERED, coverage > DEPTH_COVERED
-    inverse = 1 / torch.where(covered, coverage, 1)
-    color = torch.where(covered, planes[:3], 0) * inverse
-    distance = torch.where(deep, planes[3], 0) * inverse
+    drawn = planes[:4] / torch.where(covered, coverage, 1)
+    color, distance = drawn[:3], drawn[3]
     used = explained & covered
-    off = torch.where(used, color - truth, 0)
     count = used.sum().clamp(min=1)
-    terms = {"color": off.abs().sum() / (3 * count)}
+    terms = {"color": ((color - truth).abs() * used).sum() / (3 * count)}
     measured = explained & deep & given.isfinite() & (given > 0) & (distance > NEAREST)
     if weights.inverse_depth or weights.correlation:
-        inverse_drawn = torch.where(measured, 1 / torch.where(measured, distance, 1), 0)
-        inverse_given = torch.where(measured, 1 / torch.where(measured, given, 1), 0)
-        pixels = measured.sum().clamp(min=1)
-        terms["inverse_depth"] = (inverse_drawn - inverse_given).abs().sum() / pixels
+        inverse_drawn, inverse_given = (1 / torch.where(measured, each, 1) for each in (distance, given))
+        apart = (inverse_drawn - inverse_given).abs()  # 0 where nothing was measured
+        terms["inverse_depth"] = apart.sum() / measured.sum().clamp(min=1)
         if weights.correlation:
             terms["correlation"] = 1 - correlation(inverse_drawn[measured], inverse_given[measured])
     if weights.similarity:
@@ -100,10 +98,10 @@ def compare(
         terms["smoothness"] = total_variation(color, region, covered) / (3 * region.numel())
         terms["depth_smoothness"] = total_variation(distance[None], region, deep) / region.numel()
     if weights.coverage:
-        lack = torch.where(explained & sound, (FULL - coverage).clamp(min=0), 0)
+        lack = (FULL - coverage).clamp(min=0) * (explained & sound)
         terms["coverage"] = lack.sum() / explained.sum().clamp(min=1)
     loss = torch.stack([getattr(weights, name) * term for name, term in terms.items()]).sum()
-    counted = torch.where(used, inverse.detach(), 0).numpy()
+    counted = torch.where(used, 1 / coverage.detach(), 0).numpy()
     return Compared(loss, terms, counted.astype(np.float32, copy=False))
 
 
@@ -113,15 +111,16 @@ def correlation(drawn: Tensor, given: Tensor) -> Tensor:
     least = FLAT * len(drawn) ** 0.5
     if not (a.norm() > least * drawn.mean().abs() and b.norm() > least * given.mean().abs()):
         return drawn.new_ones(())
-    return (a @ b) / (a.norm() * b.norm())
+    pearson: Tensor = (a @ b) / (a.norm() * b.norm())
+    return pearson
 
 
 def total_variation(picture: Tensor, region: Tensor, known: Tensor) -> Tensor:
-    """Sum of |a - b| over neighbours in `picture` [K, H, W], both known, at least one of them in the region."""
+    """Sum of |a - b| over neighbours in `picture` [K, H, W], both known, one of them in the region."""
     across = (region[:, 1:] | region[:, :-1]) & known[:, 1:] & known[:, :-1]
     down = (region[1:] | region[:-1]) & known[1:] & known[:-1]
-    rows = torch.where(across, picture[:, :, 1:] - picture[:, :, :-1], 0).abs().sum()
-    return rows + torch.where(down, picture[:, 1:] - picture[:, :-1], 0).abs().sum()
+    rows = ((picture[:, :, 1:] - picture[:, :, :-1]).abs() * across).sum()
+    return rows + ((picture[:, 1:] - picture[:, :-1]).abs() * down).sum()
 
 
 def dissimilarity(picture: Tensor, truth: Tensor, counted: Tensor) -> Tensor:

@@ -122,7 +122,11 @@ class DeformableModel:
         return to_gaussians(exposed, slopes, self.ids, cameras if self.smooth else None)
 
     def _exposed(self, rows: Tensor, gain: Tensor) -> tuple[Tensor, Tensor | None]:
-        before, color, after = rows[:, : columns.COLOR.start], rows[:, columns.COLOR], rows[:, columns.LOGIT :]
+        before, color, after = (
+            rows[:, : columns.COLOR.start],
+            rows[:, columns.COLOR],
+            rows[:, columns.LOGIT :],
+        )
         slopes = None if self.slopes is None else self.slopes * gain.mean()
         return torch.cat([before, color * gain, after], 1), slopes
 
@@ -157,7 +161,8 @@ class DeformableModel:
         if self.slopes is not None:
             self.slopes = _leaf(self.slopes.detach().numpy()[np.concatenate([kept, parents])])
         self.rows = _leaf(np.concatenate([self.table[kept], rows]))
-        self.adam, self.slopes_adam = (_taken(state, kept, len(rows)) for state in (self.adam, self.slopes_adam))
+        self.adam = _taken(self.adam, kept, len(rows))
+        self.slopes_adam = _taken(self.slopes_adam, kept, len(rows))
         self.field.follow(self.means)
 
 

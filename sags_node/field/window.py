@@ -16,8 +16,11 @@ as those of the decoder and of the planes in space mostly do, would seem to help
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from sags_node.field.deformation import Deltas, Field, PointField, conjugate, product, unit
@@ -106,8 +109,14 @@ class WindowModel(DeformableModel):
     def nbytes(self) -> int:
         """Memory of all that is learnt and of its optimisers."""
         deltas = self.field.deltas
-        tables = [self.table, self._anchored.places, self.ids, deltas.hexplane.cells.detach().numpy()]
-        tables += [table for adam in (self.adam, deltas.hexplane.adam) for table in (adam.moments, adam.shares)]
+        tables: list[NDArray[Any]] = [
+            self.table,
+            self._anchored.places,
+            self.ids,
+            deltas.hexplane.cells.detach().numpy(),
+        ]
+        for adam in (self.adam, deltas.hexplane.adam):
+            tables += [adam.moments, adam.shares]
         parameters = sum(parameter.nbytes for parameter in deltas.decoder.parameters())
         return sum(table.nbytes for table in tables) + 3 * parameters
 
