@@ -89,11 +89,13 @@ class DeformableModel:
         then `descend`. `whole`: that camera with all its pixels, for the 3D filter; None: it has them."""
         self._t_ns = t_ns
         self._gain = torch.from_numpy(self.exposure.at(t_ns)).requires_grad_()
-        return self._drawn(rasterizer, self.rows_at(t_ns, deformed), camera, whole or camera)
+        return self._drawn(rasterizer, self.rows_at(t_ns, deformed), camera, whole)
 
-    def _drawn(self, rasterizer: Rasterizer, rows: Tensor, camera: Camera, whole: Camera) -> Drawing:
-        exposed, slopes = self._exposed(rows, self._gain)
-        return Drawing(rasterizer, camera, exposed, slopes, self.ids, [whole] if self.smooth else None)
+    def _drawn(
+        self, rasterizer: Rasterizer, rows: Tensor, camera: Camera, whole: Camera | None = None
+    ) -> Drawing:
+        (exposed, slopes), fitted = self._exposed(rows, self._gain), [whole or camera]
+        return Drawing(rasterizer, camera, exposed, slopes, self.ids, fitted if self.smooth else None)
 
     @torch.no_grad()
     def at(self, t_ns: int, cameras: Sequence[Camera], deformed: bool = True) -> Gaussians:

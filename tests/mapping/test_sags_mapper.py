@@ -20,12 +20,12 @@ from sags_node.geometry import project
 from sags_node.kernels.threads import configure_threads, thread_count
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.ladder import Rung
-from sags_node.mapping.sags_mapper import WINDOW_NS, SagsMapper
+from sags_node.mapping.sags_mapper import KEPT_NS, WINDOW_NS, SagsMapper
 from sags_node.pipeline.pipeline import FrameRequest, Pipeline
 from sags_node.pipeline.session import open_posed, open_session
 from sags_node.types import F32, Camera, FrameResult, StereoFrame
 
-RUNG = Rung(6000)
+RUNG = Rung(12_000)
 SAGS = "mapping.method:=sags"
 
 
@@ -159,7 +159,7 @@ def test_over_fifteen_windows_nothing_grows(phantom_session: Path) -> None:
         assert len(field.rows) == mapper.model.count <= 1000 + 500  # and what may appear in a frame
     cells, _, kept = zip(*sizes, strict=True)
     assert set(cells) == {cells[0]}
-    assert max(kept) == round(10 * WINDOW_NS * 1e-9) + 1  # both ends of the window
+    assert max(kept) == round(10 * KEPT_NS * 1e-9) + 1  # both ends
     assert np.isfinite(mapper_of(pipeline).model.means).all()
 
 
