@@ -12,6 +12,7 @@ from benchmarks.commands.engine import (
     bench_ablation,
     bench_alias,
     bench_kernels,
+    bench_methods,
     bench_stream,
 )
 from benchmarks.commands.masks import (
@@ -60,6 +61,7 @@ for command in (
     bench_kernels,
     bench_alias,
     bench_stream,
+    bench_methods,
     bench_ablation,
 ):
     main.add_command(command)

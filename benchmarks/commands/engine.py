@@ -253,6 +253,39 @@ def bench_stream(
     write_json(out, measured)
 
 
+@click.command("methods")
+@launch_argument
+@click.option(
+    "--iterations",
+    type=click.IntRange(1),
+    default=3,
+    show_default=True,
+    help="Steps per frame, step by step.",
+)
+@click.option("--rung", type=click.IntRange(0), default=7, show_default=True, help="Of the ladder, as well.")
+@figures_option
+@as_json
+def bench_methods(
+    launch: tuple[str, ...], iterations: int, rung: int, out: Path | None, json_out: bool
+) -> None:
+    """Control nodes or the paper's field: mapping.method nodes and sags on a recording, at two sizes.
+
+    Live: rate, latency and PSNR. Step by step: PSNR of the newest frame, the next and held-out ones, depth,
+    tracks, and of all frames of the last two seconds when the stream has ended. Takes some minutes.
+
+    \b
+    python -m benchmarks methods launch/d4d_pull.yaml --out methods.json
+    """
+    from benchmarks.quality import methods
+
+    path, overrides = split_recording(launch, "benchmarks methods plays recordings, not live cameras")
+    check_files(out)
+    with progress("measuring") as advance:
+        measured = methods.measure_methods(path, overrides, iterations, rung, advance)
+    show(measured if json_out else methods.table(measured))
+    write_json(out, measured)
+
+
 @click.command("ablation")
 @launch_argument
 @click.option(

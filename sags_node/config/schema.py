@@ -623,10 +623,13 @@ SHARE = 0.9
 LONGEST_MS = 100.0  # of a frame, where they come more seldom: what is shown of it must still be new
 
 
+MappingMethod = Literal["nodes", "sags"]
+
+
 class MappingConfig(Section):
     """How the model is built, and what it may cost."""
 
-    method: Literal["nodes", "sags"] = Field(
+    method: MappingMethod = Field(
         "nodes",
         description="how tissue moves. nodes: control nodes follow optical flow and depth; sags: the paper's "
         "deformation field, on the CPU, slower and less sharp, which also tells of the last two seconds. "

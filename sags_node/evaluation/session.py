@@ -140,8 +140,8 @@ def measure(
 
 def run_step(
     session: Session, options: MeasureOptions, spool: Spool, progress: Progress, skips: Skips = ALL_SKIPS
-) -> None:
-    """Every frame in turn, none lost; only the pipeline's own work is timed."""
+) -> Pipeline:
+    """Every frame in turn, none lost; only the pipeline's own work is timed. Returns it as it is then."""
     configure_threads(session.config.engine.threads)
     pipeline = Pipeline(session.config, session.rig, skips=skips)
     budget = pipeline.make_budget()
@@ -156,6 +156,7 @@ def run_step(
             frame_ms = (time.perf_counter() - started) * 1e3
             spool.add(result, frame_ms, time.monotonic_ns(), warnings=pipeline.warnings)
             progress("playing", len(spool))
+    return pipeline
 
 
 def run_realtime(

@@ -51,8 +51,8 @@ from sags_node.vision.observe import resized
 
 WINDOW_NS = 2_000_000_000  # that the field remembers
 SLOT_NS = 100_000_000  # from one of its times to the next
-# So far back frames are learnt again. Measured: from the whole window, the newest frame is 0.6 dB worse and the
-# window no better.
+# So far back frames are learnt again. Measured: from the whole window, the newest frame is 0.6 dB worse and
+# the window no better.
 KEPT_NS = 700_000_000
 MOST_KEPT = 24  # of them, at any frame rate
 NODES = 128  # that ask the field; 512 take twice the time of a step, and show no more with few steps
@@ -63,8 +63,8 @@ LEAST_SIDE = 1e-3  # m, of that box
 # take a step in closed form instead (`_refine`).
 MEAN_PX, LOG_SCALE, QUAT, LOGIT = 0.08, 5e-3, 1e-3, 0.05
 FIRST_SPEED = 4.0  # times as long, in the first steps of a model
-# A larger change of the gain makes what is kept useless; smaller ones are left to the colour steps, as a model
-# that does not fit yet seems to be darker or brighter by some per cent.
+# A larger change of the gain makes what is kept useless; smaller ones are left to the colour steps, as a
+# model that does not fit yet seems to be darker or brighter by some per cent.
 EXPOSURE_JUMP = 0.05
 EARLIER_RELAXATION = 0.3  # of the step on colours on an earlier frame; what is published is the newest
 LOOK_BACK_NS = SLOT_NS  # the velocity is the field's mean over this time

@@ -1,0 +1,119 @@
+"""Control nodes or the paper's field, `mapping.method`: what each shows of the same recordings.
+
+Live, on the recording's clock, for the rate; then frame by frame with a fixed number of steps, for the
+error. At the end of that the model is asked for all frames of the last two seconds. A field knows of each
+time; nodes only have what they are now.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+from sags_node.config.schema import MappingMethod
+from sags_node.engine.rasterizer.rasterize import make_rasterizer
+from sags_node.engine.rasterizer.views import colours_of
+from sags_node.evaluation.measure import MeasureOptions
+from sags_node.evaluation.metrics import as_float, psnr
+from sags_node.evaluation.session import evaluate, measure, run_step
+from sags_node.evaluation.spool import Spool
+from sags_node.mapping.mapper import Mapper
+from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.session import open_session
+from sags_node.pipeline.warm_up import warm_up
+from sags_node.types import U8
+
+METHODS: tuple[MappingMethod, ...] = ("nodes", "sags")
+SIZES = ((320, 256), (640, 512))
+WINDOW_NS = 2_000_000_000  # as long as the field remembers
+SHOWN = {"online": "psnr", "predict": "psnr", "heldout": "psnr", "depth": "median_mm", "track": "median_px"}
+
+Advance = Callable[[int, int, str], None]  # done, total, what comes next
+
+
+def measure_methods(
+    launch: Path | str | None, overrides: Sequence[str], iterations: int, rung: int, advance: Advance
+) -> list[dict[str, Any]]:
+    """A row for each size and method.
+
+    Args:
+        iterations, rung: of the run frame by frame.
+        advance: called with what is going on.
+
+    Raises:
+        UsageError, SagsError: see `evaluate`.
+    """
+    rows = []
+    for width, height in SIZES:
+        for method in METHODS:
+            advance(len(rows), len(SIZES) * len(METHODS), f"{method} at {width} x {height}")
+            chosen = [
+                *overrides, f"mapping.method:={method}", f"vision.width:={width}", f"vision.height:={height}"
+            ]  # fmt: skip
+            live = evaluate(launch, chosen, MeasureOptions(hold_out=0), pace="realtime").summary
+            fixed = [*chosen, f"mapping.iterations:={iterations}", f"mapping.rung:={rung}"]
+            row = {"method": method, "width": width, "height": height}
+            row["live"] = {
+                "rate_hz": live["rate_hz"],
+                "latency_ms": live["latency_ms"],
+                "frames": live["frames"],
+                "psnr": live["online"]["psnr"],
+            }
+            rows.append(row | _step_by_step(launch, fixed))
+    return rows
+
+
+def _step_by_step(launch: Path | str | None, overrides: Sequence[str]) -> dict[str, Any]:
+    forced = ["source.loop:=false", "source.pace:=step", "publish.right:=false"]
+    session = open_session(launch, [*overrides, *forced])
+    warm_up(session.config)
+    pictures: dict[int, U8] = {}
+    with Spool() as spool:
+        pipeline = run_step(session, MeasureOptions(), spool, lambda what, frames: None)
+        summary = measure(session, spool, MeasureOptions(), on_picture=pictures.__setitem__).summary
+        window = _window_psnr(pipeline, spool, pictures)
+    step = {group: summary[group][key] for group, key in SHOWN.items() if group in summary}
+    return {"step": step | {"window": window, "frame_ms": summary["frame_ms"]}}
+
+
+def _window_psnr(pipeline: Pipeline, spool: Spool, pictures: dict[int, U8]) -> float:
+    """dB over tissue, mean over the frames of the last two seconds: the model as it is at the end, asked for
+    the time of each."""
+    mapper, camera, found = pipeline.mapper, pipeline.rectifier.camera, []
+    rasterizer = make_rasterizer("numba", camera.width, camera.height)
+    last_ns = spool.read(len(spool) - 1).snapshot.t_capture_ns
+    for place in reversed(range(len(spool))):
+        shown = spool.read(place)
+        frame_id, t_ns, seen_by = shown.snapshot.frame_id, shown.snapshot.t_capture_ns, shown.snapshot.camera
+        if t_ns <= last_ns - WINDOW_NS:
+            break
+        now = mapper.model.gaussians() if isinstance(mapper, Mapper) else mapper.at(t_ns, [seen_by])
+        drawn = colours_of(rasterizer.forward(now, seen_by))
+        found.append(psnr(drawn, as_float(pictures[frame_id]), shown.tissue))
+    return float(np.mean(found))
+
+
+def table(rows: Sequence[dict[str, Any]]) -> Table:
+    """For people."""
+    columns = (
+        "size", "method", "rate Hz", "p50 / p99 ms", "live dB", "step: online", "next frame", "held out",
+        "window", "depth mm", "track px", "ms",
+    )  # fmt: skip
+    shown = Table(*columns, title="Control nodes, and the paper's field")
+    for row in rows:
+        live, step = row["live"], row["step"]
+        latency = f"{live['latency_ms']['p50']:.0f} / {live['latency_ms']['p99']:.0f}"
+        shown.add_row(
+            f"{row['width']} x {row['height']}", row["method"], f"{live['rate_hz']:.1f}", latency,
+            f"{live['psnr']:.1f}",
+            *(
+                f"{step[key]:.2f}" if key in step else "-"
+                for key in ("online", "predict", "heldout", "window", "depth", "track")
+            ),
+            f"{step['frame_ms']['p50']:.0f}",
+        )  # fmt: skip
+    return shown
