@@ -47,7 +47,7 @@ def measure_methods(
     Raises:
         UsageError, SagsError: see `evaluate`.
     """
-    rows = []
+    rows: list[dict[str, Any]] = []
     for width, height in SIZES:
         for method in METHODS:
             advance(len(rows), len(SIZES) * len(METHODS), f"{method} at {width} x {height}")
@@ -56,7 +56,7 @@ def measure_methods(
             ]  # fmt: skip
             live = evaluate(launch, chosen, MeasureOptions(hold_out=0), pace="realtime").summary
             fixed = [*chosen, f"mapping.iterations:={iterations}", f"mapping.rung:={rung}"]
-            row = {"method": method, "width": width, "height": height}
+            row: dict[str, Any] = {"method": method, "width": width, "height": height}
             row["live"] = {
                 "rate_hz": live["rate_hz"],
                 "latency_ms": live["latency_ms"],
