@@ -15,6 +15,7 @@ from sags_node.mapping.refiner import CpuRefiner, Refiner
 from sags_node.mapping.speed import SAMPLE_SIZE, measured_speed
 
 GPU_SPEED = 10.0  # times two CPU cores, in Gaussians of a rung: an ESTIMATE, never run on a GPU
+FIELD_TIMES = 5.0  # as long as prices say, a frame of the paper's model takes: where its ladder begins
 GAUSSIANS_PER_MS = 1100  # of the budget, where the number of steps is fixed; see benchmarks/mapping.md
 
 
@@ -84,6 +85,7 @@ def make_budget(
         return StepBudget(mapping.iterations, rung)
     if speed is None:
         speed = measured_speed(make_rasterizer("numba", *SAMPLE_SIZE))
+        speed *= FIELD_TIMES if mapping.method == "sags" else 1.0
     return TimeBudget(Ladder(rungs_of(config, skips), width * height, 1e-3 * mapping.frame_ms(rate), speed))
 
 

@@ -44,6 +44,12 @@ def test_the_phantom_session_gives_its_golden_figures(request: pytest.FixtureReq
     _check(request, outcome.summary, SESSION.with_suffix(".golden.json"))
 
 
+def test_the_papers_model_gives_its_golden_figures(request: pytest.FixtureRequest) -> None:
+    chosen = ["mapping.method:=sags", "mapping.rung:=3"]
+    outcome = evaluate(SESSION, chosen, options=MeasureOptions(every=10), pace="step", iterations=2)
+    _check(request, outcome.summary, ROOT / "replay/phantom_pull_sags.golden.json")
+
+
 def test_the_lift_of_a_real_recording_gives_its_golden_figures(
     request: pytest.FixtureRequest, data_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
