@@ -8,7 +8,7 @@ import numpy as np
 
 from benchmarks.kernels.scenes import surface
 from benchmarks.kernels.timing import median_ms
-from benchmarks.kernels.work import Work, bytes_of, stage_rows
+from benchmarks.kernels.work import Work, bytes_of, share_of_peak, stage_rows
 from sags_node.engine.losses import tissue as losses
 from sags_node.engine.rasterizer import views
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
@@ -46,5 +46,6 @@ def measure_losses(
         "threads": threads,
         "tissue_loss_ms": times["tissue loss"],
         "view_ms": times["view"],
+        "share_of_peak": share_of_peak(sum(times.values()), work, peak),
         "stages": stage_rows(times, work, peak),
     }
