@@ -1,5 +1,6 @@
-"""The model of SAGS (arXiv 2510.27318) in torch, to be read top to bottom: `hexplane`, `decoder`,
-`deformation`, `drawing`, `losses`, `model`, `window`.
+"""The model of SAGS (arXiv 2510.27318) in torch.
+
+To be read in this order: `hexplane`, `decoder`, `deformation`, `drawing`, `losses`, `model`, `window`.
 
 A model is canonical Gaussians in raw rows [N, 14] (`model.columns`) and a field that deforms them:
 
@@ -23,3 +24,5 @@ Importing it imports torch, which takes a second: only what fits imports it, and
 
 Imports engine, kernels and model.
 """
+
+import sags_node.kernels.threads  # noqa: F401 - before torch: it says how idle workers wait

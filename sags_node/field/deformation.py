@@ -86,11 +86,12 @@ class Field(Protocol):
 
     deltas: Deltas
 
-    def deform(self, rows: Tensor, t_ns: int) -> Tensor:
-        """Canonical rows [N, 14] at one time, differentiable in the rows and in the field."""
+    def deform(self, rows: Tensor, t_ns: int, which: Tensor | None = None) -> Tensor:
+        """Canonical rows [N, 14] at one time, differentiable in the rows and in the field. `which` [N]: those
+        of them that `follow` was told of; None: all."""
 
     def follow(self, means: F32) -> None:
-        """The canonical means [N, 3] m of what `deform` is given are these now."""
+        """The canonical means [N, 3] m are these now."""
 
 
 class PointField:
@@ -99,7 +100,7 @@ class PointField:
     def __init__(self, deltas: Deltas) -> None:
         self.deltas = deltas
 
-    def deform(self, rows: Tensor, t_ns: int) -> Tensor:
+    def deform(self, rows: Tensor, t_ns: int, which: Tensor | None = None) -> Tensor:
         return rows + self.deltas(rows[:, columns.MEAN], t_ns)
 
     def follow(self, means: F32) -> None:
@@ -118,9 +119,11 @@ class NodeField:
         index, weight, _ = nearest_nodes(np.ascontiguousarray(means), self.nodes)
         self.index, self.weight = torch.from_numpy(index.astype(np.int64)), torch.from_numpy(weight)
 
-    def deform(self, rows: Tensor, t_ns: int) -> Tensor:
-        nodes = torch.from_numpy(self.nodes)
-        return skin(rows, nodes, self.deltas(nodes, t_ns), self.index, self.weight)
+    def deform(self, rows: Tensor, t_ns: int, which: Tensor | None = None) -> Tensor:
+        nodes, index, weight = torch.from_numpy(self.nodes), self.index, self.weight
+        if which is not None:
+            index, weight = index[which], weight[which]
+        return skin(rows, nodes, self.deltas(nodes, t_ns), index, weight)
 
 
 def skin(rows: Tensor, nodes: Tensor, deltas: Tensor, index: Tensor, weight: Tensor) -> Tensor:

@@ -1,7 +1,7 @@
 """Weighted sums of a table's rows: what bilinear sampling and following nodes have in common.
 
-torch's own gradient of it sorts all indices and takes several times as long as the kernels here; those are for
-float32 on the CPU, and a test compares them with torch's.
+torch's own gradient of it sorts all indices and takes several times as long as the kernels here. They are for
+float32 on the CPU; a test compares them with torch's.
 """
 
 from __future__ import annotations

@@ -191,19 +191,18 @@ class _Places:
 def learn_paths(field: Field, rows: F32, paths: Paths, settings: FitSettings, progress: Progress) -> None:
     """Let the field learn the paths: mean absolute errors of positions, at random times."""
     rng = np.random.default_rng(settings.seed)
+    field.follow(rows[:, columns.MEAN])
     for step in range(PATH_STEPS):
         slot = int(rng.integers(len(paths.times_ns)))
         known = np.flatnonzero(paths.known[slot])
         picked = rng.choice(known, min(PATH_POINTS, len(known)), replace=False)
-        canonical = rows[picked]
-        field.follow(canonical[:, columns.MEAN])
-        deformed = field.deform(torch.from_numpy(canonical), int(paths.times_ns[slot]))[:, columns.MEAN]
-        wanted = torch.from_numpy(paths.states[slot, picked][:, columns.MEAN])
-        off: Tensor = (deformed - wanted).abs().sum() / len(picked)
+        canonical, which = torch.from_numpy(rows[picked]), torch.from_numpy(picked)
+        deformed = field.deform(canonical, int(paths.times_ns[slot]), which)
+        wanted = torch.from_numpy(paths.states[slot, picked])
+        off: Tensor = (deformed - wanted)[:, columns.MEAN].abs().sum() / len(picked)
         off.backward()  # type: ignore[no-untyped-call]
         field.deltas.step(settings.field_rates.scaled(settings.decay ** (step / PATH_STEPS)))
         progress("learning the paths", step + 1, PATH_STEPS)
-    field.follow(rows[:, columns.MEAN])
 
 
 def remainder(field: Field, rows: F32, paths: Paths) -> Residuals:
