@@ -20,7 +20,7 @@ from sags_node.engine.interface import Rasterizer
 from sags_node.engine.losses.tissue import tissue_loss
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.field.decoder import Decoder
-from sags_node.field.deformation import Deltas, FieldRates, NodeField, skin
+from sags_node.field.deformation import Deltas, FieldRates, NodeField
 from sags_node.field.hexplane import HexPlane
 from sags_node.field.model import Rates
 from sags_node.field.window import WindowModel
@@ -79,25 +79,26 @@ class Kept:
     camera: Camera  # of the whole picture, for the 3D filter
 
 
-class FrameField(NodeField):
-    """Asks HexPlane and decoder once for each time until `forget`, but for gradients: a frame wants the same
-    two times again and again."""
+class FrameDeltas(Deltas):
+    """Asks HexPlane and decoder once for each time, but for gradients: a frame wants the nodes at the same
+    few times again and again."""
 
-    def __init__(self, deltas: Deltas, nodes: F32) -> None:
-        super().__init__(deltas, nodes)
-        self._said: dict[int, Tensor] = {}
+    _said: dict[int, Tensor]
+
+    def __call__(self, points: Tensor, t_ns: int) -> Tensor:
+        if torch.is_grad_enabled():
+            return super().__call__(points, t_ns)
+        if t_ns not in self._said:
+            self._said[t_ns] = super().__call__(points, t_ns)
+        return self._said[t_ns]
+
+    def step(self, rates: FieldRates) -> None:
+        super().step(rates)
+        self.forget()
 
     def forget(self) -> None:
-        """They say something else now."""
-        self._said.clear()
-
-    def deform(self, rows: Tensor, t_ns: int) -> Tensor:
-        if torch.is_grad_enabled():
-            return super().deform(rows, t_ns)
-        nodes = torch.from_numpy(self.nodes)
-        if t_ns not in self._said:
-            self._said[t_ns] = self.deltas(nodes, t_ns)
-        return skin(rows, nodes, self._said[t_ns], self.index, self.weight)
+        """Ask anew."""
+        self._said = {}
 
 
 class SagsMapper:
@@ -165,8 +166,8 @@ class SagsMapper:
         self.map.deformation = NodeDeformation(model.means, NODES)
         self.map.deformation.attach(model, rows)
         self.map.lamp = observation.camera.T_world_cam
-        self._asked = self._make_field(model.means, frame.t_ns)
-        self._field = WindowModel(rows_of(model), self._asked)
+        self._deltas = self._make_deltas(model.means, frame.t_ns)
+        self._field = WindowModel(rows_of(model), NodeField(self._deltas, self._nodes.nodes.copy()))
         self._ids, self._written = model.ids.copy(), rows_of(model)
         self._kept = deque([frame])
         pixel = float(np.median(depths)) / float(drawn.camera.K[0, 0])  # m
@@ -182,21 +183,23 @@ class SagsMapper:
         self.step += steps
         return {"inserted": len(pixels), "iterations": steps}
 
-    def _make_field(self, means: F32, t_ns: int) -> FrameField:
+    def _make_deltas(self, means: F32, t_ns: int) -> FrameDeltas:
         low, high = np.quantile(means, [OUTLIERS, 1 - OUTLIERS], axis=0)
         box: F64 = np.array([low, np.maximum(high, low + LEAST_SIDE)])
         slots = WINDOW_NS // SLOT_NS + 2  # the newest slot lies up to one slot after the newest frame
         hexplane = HexPlane(box, t_ns, SLOT_NS, slots, cells=CELLS, channels=CHANNELS, seed=self._seed)
         decoder = Decoder(hexplane.features, "nodes", seed=self._seed)
         decoder.awaken(self._seed)
-        return FrameField(Deltas(hexplane, decoder), self._nodes.nodes.copy())
+        deltas = FrameDeltas(hexplane, decoder)
+        deltas.forget()
+        return deltas
 
     def _follow(
         self, observation: Observation, frame: Kept, budget: Budget, still: int, learn: bool
     ) -> dict[str, int]:
         # 1. Predict: the window reaches this frame, old slots are folded, the field says how things are now.
         self._known.advance(frame.t_ns)
-        self._asked.forget()
+        self._deltas.forget()
         self._write(frame)
         self.map.move_light(observation.camera)
         inserted = removed = iterations = 0
@@ -279,7 +282,6 @@ class SagsMapper:
             rates[columns.MEAN] *= not deformed
             self.model.contribution[:], self._loss = drawing.contribution, loss
         field.descend(drawing, Rates(rates, FieldRates()))
-        self._asked.forget()
         self._first_steps += 1
 
     def _write(self, frame: Kept) -> None:
