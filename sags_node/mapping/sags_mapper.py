@@ -137,7 +137,9 @@ class SagsMapper:
             counts = self._initialise(observation, frame, budget)
         else:
             counts = self._follow(observation, frame, budget, still, learn)
-            surface, pull = surface_at(self.model.means, observation), DEPTH_PULL * observation.depth_is_new
+            surface, pull = surface_at(self.model.means, observation), 0.0
+            if learn and observation.depth_is_new:
+                pull = DEPTH_PULL
             remember(self.model, surface, pull, (self._now_ns - before_ns) * 1e-9)
         assert self._view is not None
         snapshot = snapshot_of(self.model, observation, self.step, self._loss, counts, right)
@@ -205,13 +207,15 @@ class SagsMapper:
         inserted = removed = iterations = 0
         if learn:
             self._keep(frame)
-            # 2. Draw; let the colours follow a jump of the exposure. Then prune, split and fill holes.
+            # 2. Prune; draw, and let the colours follow a jump of the exposure; split, and fill holes.
             if not still:
+                removed = self._prune(observation, budget)
                 planes = self._exposed(frame)
                 if is_lost(planes, frame.drawn) and can_start(observation):
                     self.map.restart()
                     return self._initialise(observation, frame, budget) | {"restarted": 1}
-                inserted, removed = self._tidy(observation, frame, planes, budget)
+                inserted, given_up = self._densify(observation, frame, planes, budget)
+                removed += given_up
             self._take_over(frame.t_ns)
             # 3. Refine while the time lasts, on the newest frame and on earlier ones, lest they be lost.
             settled = still > SETTLED
@@ -239,12 +243,16 @@ class SagsMapper:
             planes = self._draw(frame)
         return planes
 
-    def _tidy(self, observation: Observation, frame: Kept, planes: F32, budget: Budget) -> tuple[int, int]:
-        """Prune, split and fill holes by the rules of `Mapper`; how many were inserted and removed."""
-        model, drawn, limit = self.model, frame.drawn, self._limit(budget)
+    def _prune(self, observation: Observation, budget: Budget) -> int:
+        """By the rules of `Mapper`, as `_densify`; how many were removed."""
+        model, limit = self.model, self._limit(budget)
         surface = surface_at(model.means, observation)
         removed = model.remove(densify.prune_mask(model, surface, observation.depth_is_new, limit))
-        removed += densify.prune_to_budget(model, limit)
+        return removed + densify.prune_to_budget(model, limit)
+
+    def _densify(self, observation: Observation, frame: Kept, planes: F32, budget: Budget) -> tuple[int, int]:
+        """Split, and fill holes; how many were inserted, and given up for them."""
+        model, drawn, limit, removed = self.model, frame.drawn, self._limit(budget), 0
         if limit - model.count > HOLES:  # else what hardly shows is needed to fill holes
             room = max(0, round(GROWN * limit) - model.count)
             split_worst(model, observation, as_view(planes, model, observation), room)
@@ -252,7 +260,7 @@ class SagsMapper:
         room = max(ADDED, limit - model.count)
         lacking = min(len(pixels[:room]), HOLES) - max(0, limit - model.count)
         if 0 < lacking < model.count:
-            removed += model.remove(densify.least_shown(model, lacking))
+            removed = model.remove(densify.least_shown(model, lacking))
         new = pixels[:room], depths[:room], errors[:room]
         rows = initialise.insert(model, drawn, *new, densify.GRID, smoothing=True)
         self._nodes.attach(model, rows)

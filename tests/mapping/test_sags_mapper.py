@@ -178,6 +178,30 @@ def test_a_reset_and_another_place_make_a_new_model_in_a_new_epoch(phantom_sessi
     assert quality(as_float(elsewhere.views["left"].rgb), elsewhere) > 25
 
 
+def test_a_damaged_model_is_made_anew(phantom_session: Path) -> None:
+    pipeline, frames = pipeline_of(phantom_session, "source.frames:=6")
+    taken = list(frames)
+    before = played(pipeline, taken[:3])[-1]
+    mapper_of(pipeline)._known.table[:] = np.nan
+    after = played(pipeline, taken[3:])[-1]
+    assert after.epoch == before.epoch + 1
+    assert quality(as_float(after.views["left"].rgb), after) > 25
+
+
+def test_a_veiled_picture_moves_nothing_and_a_dark_one_begins_nothing(phantom_session: Path) -> None:
+    pipeline, frames = pipeline_of(phantom_session, "source.frames:=5")
+    taken = list(frames)
+    dark = replace(taken[0], left=np.zeros_like(taken[0].left), right=np.zeros_like(taken[0].left))
+    assert played(pipeline, [dark])[-1].snapshot.counts["inserted"] == 0
+    last = played(pipeline, taken[1:4])[-1].observation
+    mapper, budget = mapper_of(pipeline), StepBudget(2, RUNG)
+    before = mapper.model.means.copy()
+    veiled = replace(last, t_capture_ns=last.t_capture_ns + 33_000_000, image=np.full_like(last.image, 128))
+    mapped = mapper.update(veiled, None, budget, learn=False)
+    assert mapped.snapshot.counts["iterations"] == 0
+    assert np.abs(mapped.snapshot.gaussians.means - before).max() < 1e-3
+
+
 def test_a_clock_that_goes_back_stops_nothing(phantom_session: Path) -> None:
     pipeline, frames = pipeline_of(phantom_session, "source.frames:=12")
     taken = list(frames)
