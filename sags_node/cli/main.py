@@ -129,9 +129,13 @@ def main(verbose: bool, form: str) -> None:
 def run(launch: tuple[str, ...], seconds: float | None, json_out: bool) -> None:
     """Run the node: map the source and publish until it ends.
 
-    Without a launch file the built-in phantom session plays in a loop.
+    It plays a launch file, a recording, a folder of videos or pictures (see sags import --check), or a video
+    that shows both eyes; without any the built-in phantom session in a loop. Without a calibration it plays
+    all the same: depth then has no unit, and all that is published says so.
 
     \b
+    sags run my_folder
+    sags run both_eyes.mp4 rig:=calib/mine
     sags run launch/d4d_pull.yaml
     sags run launch/v4l2.yaml source.left:=/dev/video-left mapping.budget_ms:=25
     """
@@ -146,7 +150,7 @@ def run(launch: tuple[str, ...], seconds: float | None, json_out: bool) -> None:
     path, overrides = split(launch)
     if path is None and isinstance(load_launch(None, overrides).source, PhantomSource):
         overrides = ["source.loop:=true", *overrides]
-    session = open_launched(path, overrides)
+    session = open_launched(path, overrides, guess=True)
     with stop_signals() as stop:
         node = Node(session.config, session.rig, session.source, manager=manager)
         where = escape(", ".join(node.endpoints))

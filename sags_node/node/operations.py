@@ -22,6 +22,7 @@ from sags_node.model.ply import write_ply
 from sags_node.node.health import Statistics
 from sags_node.node.views import Views
 from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.uncalibrated import MOST
 from sags_node.types import DrawnView, FrameResult
 
 LIVE_PARAMETERS = ("mapping.budget_ms",)
@@ -123,6 +124,7 @@ class Operations:
             self._state.pipeline.anchors.look_ahead(anchor, seconds)
             self._state.pipeline.predict_motion()
         sure = self._state.pipeline.anchors.depth_confidence(anchor)
+        sure = sure if self._state.pipeline.metric else min(sure, MOST)
         return {"id": anchor, "frame_id": newest.pair.frame_id, "depth_confidence": round(sure, 3)}
 
     def _remove_anchor(self, args: dict[str, Any]) -> dict[str, Any]:
