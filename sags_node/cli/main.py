@@ -31,6 +31,7 @@ from sags_node.cli.launching import (
     split,
     split_recording,
 )
+from sags_node.cli.new import new
 from sags_node.cli.node_options import node_options, ns_option
 from sags_node.cli.offline import evaluate, fit
 from sags_node.cli.overlay import overlay
@@ -348,7 +349,7 @@ def moved_bench(arguments: tuple[str, ...]) -> None:
     raise UsageError(f"sags bench is now, in a checkout of the sources: {asked}")
 
 
-for command in (evaluate, fit, export, bag, bridge, calib, overlay, view, topic):
+for command in (new, evaluate, fit, export, bag, bridge, calib, overlay, view, topic):
     main.add_command(command)
 for more in distribution("sags-node").entry_points.select(group="sags.commands"):
     more.load()(main)  # of packages that stand beside this one

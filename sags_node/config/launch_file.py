@@ -112,15 +112,25 @@ def is_launch(path: Path) -> bool:
     return path.suffix.lower() not in VIDEO_SUFFIXES
 
 
+def tree_of(overrides: Sequence[str]) -> dict[str, Any]:
+    """The sections and keys of a launch file that says what these `key:=value` say.
+
+    Raises:
+        UsageError: one is no override.
+    """
+    tree: dict[str, Any] = {}
+    for override in overrides:
+        _apply_override(tree, override)
+    return tree
+
+
 def section_of(kind: type[S], overrides: Sequence[str]) -> S:
     """A section by itself, as `key:=value` say.
 
     Raises:
         UsageError: an unknown key or a wrong value.
     """
-    tree: dict[str, Any] = {}
-    for override in overrides:
-        _apply_override(tree, override)
+    tree = tree_of(overrides)
     try:
         return kind.model_validate(tree)
     except ValidationError as error:

@@ -120,7 +120,7 @@ def _in_one_folder(folder: Path) -> list[Finding]:
 def _calibration(folder: Path, contents: Contents) -> list[Finding]:
     """The calibration beside the pictures, against them; sessions that are played as they are name theirs."""
     if contents.config is not None and (contents.right is not None or contents.left is None):
-        return _tried("calibration", lambda: _odd_or_last(check_calibration(folder)))
+        return _tried("calibration", lambda: odd_or_last(check_calibration(folder)))
     if contents.right is None or contents.left is None:
         return []
     eyes = [(contents.left, contents.right)]
@@ -130,18 +130,22 @@ def _calibration(folder: Path, contents: Contents) -> list[Finding]:
 def _calibrated(form: Path | None, read: Callable[[], Sequence[Pair]]) -> list[Finding]:
     """The calibration beside pictures, against them."""
     if form is None:
-        fix = "without one depth has no unit: sags calib stereo makes one (docs/calibration.md)"
-        return [Finding("warning", "no calibration lies beside the pictures", fix)]
+        return [without_calibration()]
 
     def compare() -> list[Finding]:
         pairs = read()
         height, width = pairs[0][0].shape[:2]
-        return _odd_or_last(judge(read_rig(form, (width, height)), pairs))
+        return odd_or_last(judge(read_rig(form, (width, height)), pairs))
 
     return _tried("calibration", compare)
 
 
-def _odd_or_last(found: list[Finding]) -> list[Finding]:
+def without_calibration() -> Finding:
+    fix = "without one depth has no unit: sags calib stereo makes one (docs/calibration.md), then set rig"
+    return Finding("warning", "no calibration lies beside the pictures", fix)
+
+
+def odd_or_last(found: list[Finding]) -> list[Finding]:
     """All is well in one line; else what is not."""
     odd = [finding for finding in found if finding.level != "ok"]
     return odd or [Finding("ok", f"calibration: {found[-1].what}", "", found[-1].figures)]

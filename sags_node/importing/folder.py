@@ -159,7 +159,7 @@ def is_video(file: Path) -> bool:
     return file.suffix.lower() in VIDEO_SUFFIXES and file.is_file()
 
 
-def override(key: str, path: Path) -> str:
+def override(key: str, path: Path | str) -> str:
     """`key:=path` as it is read back, whatever YAML would make of the path."""
     plain = f"{key}:={path}"
     return plain if parse_yaml(str(path), plain) == str(path) else f"{key}:={json.dumps(str(path))}"

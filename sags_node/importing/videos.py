@@ -120,14 +120,9 @@ def layout_of(way: Way, shown: Sequence[U8]) -> tuple[str, ...]:
     if way.layout == "panes":
         return f"{LAYOUT}panes", *(box.format(w=width // 2, h=height // 2) for box in PANES)
     pairs = [way.eyes(picture) for picture in shown]
-    swapped = "exchanged" in str(check_pairs(Path(), pairs))
-    return f"{LAYOUT}{way.layout}", *(("source.geometry.first:=right",) if swapped else ())
-
-
-def check_pairs(file: Path, pairs: Sequence[tuple[U8, U8]]) -> list[Finding]:
-    """What is odd about both eyes' pictures of one video."""
-    left, right = ([(file, np.ascontiguousarray(pair[eye])) for pair in pairs] for eye in (0, 1))
-    return pictures.check_eyes(left, right)
+    left, right = ([(Path(), np.ascontiguousarray(pair[eye])) for pair in pairs] for eye in (0, 1))
+    fixes = [fix for finding in pictures.check_eyes(left, right) for fix in finding.launch]
+    return f"{LAYOUT}{way.layout}", *fixes
 
 
 def _length(file: Path) -> Finding:

@@ -70,7 +70,7 @@ def open_session(
 
         rig = load_rig(cached_session(config.source, progress) / "calib")
     else:
-        rig = guess_rig(config.source) if guess and _lacks_rig(config) else rig_of(config)
+        rig = guess_rig(config.source) if guess and lacks_rig(config) else rig_of(config)
     source = open_posed(config, rig, references=False)
     return Session(_name(launch), config, rig, source)
 
@@ -101,7 +101,8 @@ def _name(launch: Path | str | None) -> str:
     return path.name if path.is_dir() else path.stem
 
 
-def _lacks_rig(config: LaunchConfig) -> bool:
+def lacks_rig(config: LaunchConfig) -> bool:
+    """Whether `open_session` would guess the calibration."""
     opens = isinstance(config.source, RecordedSource | V4l2Source | GstSource)  # by itself: nobody must send
     return config.rig is None and opens and recorded_rig(config.source) is None
 

@@ -12,8 +12,8 @@ from command_line import figures_of, ran, refused, sags
 from running_node import RunningNode
 
 from sags_node.client import ControlClient, ReceivedCloud, ReceivedImage, ReceivedText, Subscriber, TopicName
-from sags_node.config.launch_file import load_launch
 from sags_node.confidence import SURE
+from sags_node.config.launch_file import load_launch
 from sags_node.sources.source import recorded_rig
 
 pytestmark = [pytest.mark.live, pytest.mark.usefixtures("run_dir")]
