@@ -65,6 +65,20 @@ def split(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
     return paths[0], [*overrides_of(played), *overrides]
 
 
+session_option = click.option("--session", metavar="RECORDING", hidden=True, help="RECORDING, as before.")
+
+
+def played_instead(launch: Sequence[str], session: str | None) -> list[str] | None:
+    """What `split` takes, for a command that plays a recording where one is named; None: it asks a node.
+
+    Args:
+        launch: arguments, the recording among them.
+        session: the recording, where it is an option, as it was before it came first.
+    """
+    words = [*([] if session is None else [session]), *launch]
+    return words if session is not None or any(":=" not in word for word in launch) else None
+
+
 def split_recording(arguments: Sequence[str], no_cameras: str) -> tuple[str | None, list[str]]:
     """`split`, for a command that cannot do with live cameras; `no_cameras` says what to do instead.
 

@@ -20,6 +20,7 @@ from sags_node import __version__
 from sags_node.cli.bag import bag
 from sags_node.cli.bridge import bridge
 from sags_node.cli.calib import calib
+from sags_node.cli.control import anchor, param, pause, reset, resume
 from sags_node.cli.export import export
 from sags_node.cli.launching import (
     all_figures,
@@ -349,7 +350,10 @@ def moved_bench(arguments: tuple[str, ...]) -> None:
     raise UsageError(f"sags bench is now, in a checkout of the sources: {asked}")
 
 
-for command in (new, evaluate, fit, export, bag, bridge, calib, overlay, view, topic):
+for command in (
+    *(new, evaluate, fit, export, bag, bridge, calib, overlay, view, topic),
+    *(anchor, param, pause, resume, reset),
+):
     main.add_command(command)
 for more in distribution("sags-node").entry_points.select(group="sags.commands"):
     more.load()(main)  # of packages that stand beside this one

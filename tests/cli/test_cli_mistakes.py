@@ -154,7 +154,7 @@ def test_a_calibration_is_not_converted_onto_itself(user_files: Path, tmp_path: 
     [
         (["left/render/depth"], "--topics left/render/depth; without --topics all are recorded"),
         (["--topics", "left/depth", "tf"], "--topics left/depth --topics tf"),
-        (["rig:=x"], "rig:=x: key:=value needs --session"),
+        (["rig:=x"], "rig:=x: key:=value needs a recording"),
     ],
 )
 def test_topics_to_record_are_named_by_an_option(arguments: list[str], said: str) -> None:
