@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from sags_node.messaging.address import NodeAddress
 
 log = logging.getLogger(__name__)
+OF_THE_NODE = frozenset({"torch", "cv2", "open3d", "onnxruntime", "numba", "PIL", "mcap", "lz4", "zstandard"})
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT)  # of a disk; also of what stdout leads to
 
 
@@ -72,6 +73,11 @@ class Sags(click.Group):
             return super().invoke(ctx)
         except SagsError as error:
             said, code = str(error), error.exit_code
+        except ModuleNotFoundError as error:
+            if str(error.name).partition(".")[0] not in OF_THE_NODE:
+                raise
+            node = "pip install 'sags-node[node]'"
+            said, code = f"{error.name} is not installed: this is for a client; for all of it {node}", 2
         except OSError as error:
             if error.errno not in NO_ROOM:
                 raise

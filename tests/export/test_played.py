@@ -189,7 +189,7 @@ def test_statistics_of_several_episodes_are_those_of_all_their_numbers() -> None
 
 def test_what_does_not_go_together_is_refused(exported: Path, tmp_path: Path) -> None:
     session = exported / "session0"
-    refused(2, "export", "--depth", tmp_path / "d", said=("--depth is of every frame",))
+    refused(2, "export", "--depth", tmp_path / "d", said=("--depth exports all frames",))
     refused(
         2, "export", session, "--at", "0.1", "--tracks", tmp_path / "t.npz", said=("--tracks",)
     )  # fmt: skip
