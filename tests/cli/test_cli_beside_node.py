@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 from command_line import RUN_HERE, figures_of, pure_json, refused, sags, start, stopped, wait_for
+from places import ROOT
 
 from sags_node.messaging import introspection as topic
 from sags_node.messaging.received import ReceivedText
@@ -156,6 +160,18 @@ def test_anchors_are_pinned_listed_and_removed(beside_node: dict[str, Any]) -> N
         assert sags("anchor", "remove", anchor).stdout == f"anchor {anchor} is removed\n"
     refused(1, "anchor", "remove", first, said=(str(first),))
     refused(1, "anchor", "pin", "5000", "3", said=("5000",))
+
+
+def test_the_example_follows_a_point_and_removes_it(beside_node: dict[str, Any]) -> None:
+    """examples/follow_point.py, as its first lines say."""
+    command = [sys.executable, ROOT / "examples/follow_point.py", "160", "128", "--frames", "5"]
+    done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert len(re.findall(r"^pixel \d+\.\d \d+\.\d  -?0\.\d{4} ", done.stdout, re.MULTILINE)) == 5, (
+        done.stdout
+    )
+    while figures_of("anchor", "list", "--json"):  # it goes with the next frame
+        pass
 
 
 def test_parameters_are_read_and_set(beside_node: dict[str, Any]) -> None:
