@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from sags_node.config.launch_file import with_parameters
-from sags_node.config.schema import REMOVED, LaunchConfig
+from sags_node.config.schema import LIVE_PARAMETERS, REMOVED, LaunchConfig
 from sags_node.errors import SagsError
 from sags_node.mapping.budget import Budget
 from sags_node.messaging import content
@@ -24,8 +24,6 @@ from sags_node.node.views import Views
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.uncalibrated import MOST
 from sags_node.types import DrawnView, FrameResult
-
-LIVE_PARAMETERS = ("mapping.budget_ms",)
 
 
 @dataclass
