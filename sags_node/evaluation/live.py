@@ -82,7 +82,7 @@ class Copies:
         Raises:
             SagsError: the disk is full.
         """
-        name = message.topic.partition("/")[2]
+        name = next(name for name in TOPICS if message.topic.endswith(f"/{name}"))  # after the namespace
         if name == STATUS:
             status = interpret(message, received_ns)
             assert isinstance(status, ReceivedText)
