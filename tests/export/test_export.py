@@ -80,7 +80,7 @@ class Truth:
     """The tissue's true surface at one frame."""
 
     def __init__(self, phantom: Phantom, frame: int) -> None:
-        tissue = phantom._tissue
+        tissue = phantom.tissue
         self.surface = raycasting(tissue.vertices(frame / FRAMES).reshape(-1, 3), tissue.faces)
         self.depth = phantom.frame(frame, FRAMES).depth
 

@@ -143,7 +143,9 @@ def test_content_of_an_earlier_epoch_is_stale(tmp_path: Path) -> None:
         running.publish_health(health())
         subscriber.wait("status", 30)
         assert subscriber.ok("tf")
-        running._last = at_frame(result, 6, now, epoch=1)  # a frame of epoch 1 whose tf got lost
+        subscriber.pause()
+        until(lambda: running.poll(10) or not running.wanted("tf"))
+        running.publish_result(at_frame(result, 6, now, epoch=1), dropped=0)  # its tf does not come
         before = subscriber.latest("status")
         running.publish_health(health())
         subscriber.wait("status", 30, after=before)

@@ -61,7 +61,7 @@ class LongVideo:
 @pytest.fixture
 def opened(monkeypatch: pytest.MonkeyPatch) -> Callable[[Any, FoldersSource], Replay]:
     def open_pairs(pairs: Any, config: FoldersSource) -> Replay:
-        monkeypatch.setattr(replay, "_open_pairs", lambda config, references: pairs)
+        monkeypatch.setattr(replay, "open_pairs", lambda config, references: pairs)
         return Replay(config)
 
     return open_pairs
