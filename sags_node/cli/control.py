@@ -53,10 +53,10 @@ def anchor() -> None:
 @click.argument("pixel", nargs=2, type=float, metavar="U V")
 @asking
 def pin(pixel: tuple[float, float], json_out: bool, node: NodeAddress) -> None:
-    """Pin an anchor at pixel U V of the newest left picture; prints its number.
+    """Pin an anchor at pixel U V of the left picture.
 
-    The picture is the node's own, left/image_rect_color: its size is in left/camera_info. A pixel without
-    depth is refused.
+    Prints its number. The picture is the node's own, left/image_rect_color: its size is in left/camera_info.
+    A pixel without depth is refused.
 
     \b
     sags anchor pin 320 256
@@ -116,7 +116,7 @@ def remove(number: int, json_out: bool, node: NodeAddress) -> None:
 
 @click.group()
 def param() -> None:
-    """Look at the configuration of a running node, and change what may change.
+    """Look at a running node's configuration, and change it.
 
     docs/launch.md has all keys.
     """
@@ -200,6 +200,6 @@ reset = _plain(
     "reset",
     "reset_model",
     "the next frame begins a new model; anchors are gone",
-    "Forget the model: the next frame begins a new one, in a new epoch. All anchors are lost. For another "
-    "place, or after a new base frame of the robot.",
+    "Forget the model; the next frame begins a new one.\n\nIt is a new epoch, and all anchors are lost. For "
+    "another place, or after a new base frame of the robot.",
 )

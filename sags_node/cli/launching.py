@@ -41,13 +41,10 @@ figures_option = file_option(
 force_option = click.option("--force", is_flag=True, help="Replace files that exist.")
 
 
-def split(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
-    """A launch file, session or recording, if there is one, and the overrides; those that play a video, or a
-    folder without a launch file, come first."""
+def words_of(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
+    """The path among the arguments, if there is one, and the overrides."""
     overrides = [argument for argument in arguments if ":=" in argument]
     paths = [argument for argument in arguments if ":=" not in argument]
-    from sags_node.config.launch_file import is_launch, known_recording
-
     for path in paths:
         if "=" in path and not Path(path).exists():
             raise UsageError(f"'{path}' is not an override; write {path.replace('=', ':=', 1)}")
@@ -55,17 +52,23 @@ def split(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
             raise UsageError(f"'{path}' is no launch file: --json prints on stdout, --out FILE writes a file")
     if len(paths) > 1:
         raise UsageError(f"one launch file or session at a time, not {', '.join(paths)}")
-    if not paths:
-        return None, overrides
-    played = Path(paths[0])
-    if is_launch(played) or known_recording(played) is not None:
-        return paths[0], overrides
+    return (paths[0] if paths else None), overrides
+
+
+def split(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
+    """A launch file, session or recording, if there is one, and the overrides; those that play a video, or a
+    folder without a launch file, come first."""
+    from sags_node.config.launch_file import is_launch, known_recording
+
+    path, overrides = words_of(arguments)
+    if path is None or is_launch(Path(path)) or known_recording(Path(path)) is not None:
+        return path, overrides
     from sags_node.importing.check import overrides_of
 
-    return paths[0], [*overrides_of(played), *overrides]
+    return path, [*overrides_of(Path(path)), *overrides]
 
 
-session_option = click.option("--session", metavar="RECORDING", hidden=True, help="RECORDING, as before.")
+session_option = click.option("--session", metavar="RECORDING", help="The recording, named by an option.")
 
 
 def played_instead(launch: Sequence[str], session: str | None) -> list[str] | None:

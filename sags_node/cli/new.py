@@ -23,7 +23,9 @@ SAID_BY_PICTURES = ("source", "calibration")  # checks of the doctor that were m
 
 @click.command()
 @click.argument("said", nargs=-1, metavar="[FOLDER | VIDEO [VIDEO] | DEVICE [DEVICE]] [key:=value ...]")
-@click.option("--from", "also", multiple=True, hidden=True, metavar="PATH", help="The same as an argument.")
+@click.option(
+    "--from", "also", multiple=True, metavar="PATH", help="What to try, as an option; may be repeated."
+)
 @file_option("-o", "--out", metavar="FILE.yaml", help="The launch file; default: named after the source.")
 @force_option
 @as_json
