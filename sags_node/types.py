@@ -94,6 +94,8 @@ class StereoRig:
     name: str
     left: Eye
     right: Eye
+    # False: guessed, so that lengths are right up to a factor that nobody knows.
+    metric: bool = field(default=True, kw_only=True)
 
     @property
     def baseline(self) -> float:
