@@ -12,13 +12,12 @@ from sags_node.errors import UsageError
 
 SHORTEST_MS = 0.1  # shorter stages are mostly the start of threads, and are not compared
 TRIES = 3
-SECTIONS = ("rasterize", "hexplane", "decoder", "losses", "adam")
+SECTIONS = ("rasterize", "losses", "adam")
 # what tells rows of a section apart
 SETTINGS = (
     "n",
     "of",
     "columns",
-    "tokens",
     "width",
     "height",
     "scene",

@@ -9,15 +9,11 @@ from typing import Any
 
 from benchmarks.kernels.adam import measure_adam
 from benchmarks.kernels.contention import measure_contention, measure_rhythm
-from benchmarks.kernels.decoding import CONTROL_NODES, measure_decoder
-from benchmarks.kernels.fields import measure_hexplane
 from benchmarks.kernels.pictures import measure_losses
 from benchmarks.kernels.rasterizing import RasterCase, measure_rasterizer
-from benchmarks.kernels.step import measure_step
 from sags_node.evaluation.provenance import machine_name
 from sags_node.kernels.peak import Peak, measure_peak, peak_row
 from sags_node.kernels.threads import configure_threads
-from sags_node.model.decoder import TOKEN_CHOICES
 
 Advance = Callable[[int, int, str], None]  # done, total, what comes next
 
@@ -82,23 +78,13 @@ def _jobs(settings: Settings, peaks: Mapping[int, Peak]) -> Iterator[_Job]:
         # of more Gaussians the twin would take tens of GB
         measure = partial(measure_rasterizer, case, runs, peaks[case.threads], twin_runs if plain else 0)
         yield _Job("rasterize", f"rasteriser, {case.count} Gaussians", case.threads, measure)
-    for count in settings.counts[:2]:
-        measure = partial(measure_hexplane, count, every, runs, peak, twin_runs)
-        yield _Job("hexplane", f"HexPlane, {count} points", every, measure)
-    for tokens in TOKEN_CHOICES:
-        count = CONTROL_NODES if tokens == "nodes" else few
-        measure = partial(measure_decoder, count, tokens, every, runs, peak, twin_runs)
-        yield _Job("decoder", f"decoder, {tokens}", every, measure)
     for width, height in settings.sizes:
-        measure = partial(measure_losses, few, width, height, every, runs, peak, twin_runs)
+        measure = partial(measure_losses, few, width, height, every, runs, peak)
         yield _Job("losses", f"losses, {width}x{height}", every, measure)
     tables = [(count, count, GAUSSIAN_COLUMNS) for count in settings.counts[:2]]
     for count, of, columns in [*tables, (4 * few, 12 * few, CELL_COLUMNS)]:
         measure = partial(measure_adam, count, of, columns, every, runs, peak)
         yield _Job("adam", f"Adam, {count} rows of {columns}", every, measure)
-    for (width, height), structural in zip(settings.sizes, (True, False), strict=False):
-        whole = RasterCase(few, width, height, every)
-        yield _Job("step", "a whole step", every, partial(measure_step, whole, structural, runs))
     first = RasterCase(few, *settings.sizes[0], every)
     if settings.rhythm:
         yield _Job("rhythm", "in a camera's rhythm", every, partial(measure_rhythm, first, runs))

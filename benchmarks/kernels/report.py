@@ -20,8 +20,6 @@ def tables(measured: Row) -> Iterator[Table]:
     yield peaks_table(peaks, names, measured["machine"])
     yield _drawings(measured["rasterize"])
     yield _stages(measured)
-    yield _twins(measured)
-    yield _steps(measured)
     yield from _contention(measured)
 
 
@@ -60,20 +58,8 @@ def plot(measured: Row) -> str:
         for row in measured["rasterize"]
         if _is_plain(row, measured["threads"])
     ]
-    steps: list[Bar] = [
-        (
-            f"{_count(row['n'])}, {row['width']}x{row['height']}{', SSIM' if row['ssim'] else ''}",
-            row["stage_ms"],
-        )
-        for row in measured["step"]
-    ]
     threads = f"{measured['threads']} threads"
-    return stacked_bars(
-        [
-            (f"Rasteriser, forward and backward, {threads}", drawings),
-            (f"Whole optimisation step, {threads}", steps),
-        ]
-    )
+    return stacked_bars([(f"Rasteriser, forward and backward, {threads}", drawings)])
 
 
 def peaks_table(peaks: Sequence[Row], names: Sequence[str], title: str) -> Table:
@@ -109,7 +95,7 @@ def _stages(measured: Row) -> Table:
     for row in measured["rasterize"]:
         if _is_plain(row, measured["threads"]):
             add_stages(made, row, drawing_name(row))
-    for section in ("hexplane", "decoder", "losses", "adam"):
+    for section in ("losses", "adam"):
         for row in measured[section]:
             add_stages(made, row, _kernel(section, row))
     return made
@@ -120,39 +106,10 @@ def stages_table() -> Table:
     return new_table("stage", "of", "ms", "of peak", "bound by", "pairs/s")
 
 
-def _twins(measured: Row) -> Table:
-    """Beside the kernels of the field, the decoder and the loss."""
-    made = new_table("forward and backward", "ms", "torch twin ms", "faster")
-    for section, key in (
-        ("hexplane", "forward_backward_ms"),
-        ("decoder", "forward_backward_ms"),
-        ("losses", "photometric_ssim_ms"),
-    ):
-        for row in measured[section]:
-            if "speedup_over_twin" in row:
-                twin = f"{row['twin_forward_backward_ms']:.0f}"
-                made.add_row(
-                    _kernel(section, row), f"{row[key]:.2f}", twin, f"{row['speedup_over_twin']:.0f}x"
-                )
-    return made
-
-
 def _kernel(section: str, row: Row) -> str:
     if section == "losses":
         return f"losses, {row['width']}x{row['height']}"
-    kind = f" {row['tokens']}" if "tokens" in row else ""
-    return f"{section}{kind}, {_count(row['n'])}"
-
-
-def _steps(measured: Row) -> Table:
-    made = new_table("whole step", "ms", "its stages, ms")
-    made.columns[2].justify = "left"
-    for row in measured["step"]:
-        loss = "with SSIM" if row["ssim"] else "without SSIM"
-        what = f"{_count(row['n'])} at {row['width']}x{row['height']}, {loss}"
-        stages = ", ".join(f"{stage} {ms:.2f}" for stage, ms in row["stage_ms"].items())
-        made.add_row(what, f"{row['step_ms']:.2f}", stages)
-    return made
+    return f"{section}, {_count(row['n'])}"
 
 
 def _contention(measured: Row) -> Iterator[Table]:

@@ -43,7 +43,6 @@ VARIANTS: Mapping[str, FitSettings] = {
     "no_adaptive": replace(_PAPER, block="mlp"),
     "full": _PAPER,
     "no_block": replace(_PAPER, block="none"),
-    "planes": replace(_PAPER, tokens="planes"),
     "nodes": replace(_PAPER, tokens="nodes"),
     "online": _ONLINE,
     "online_no_alias_free": replace(_ONLINE, antialias=False),

@@ -149,8 +149,8 @@ def evaluate(
 )
 @click.option(
     "--tokens",
-    type=click.Choice(["self", "planes", "nodes"]),
-    help="What the attention sees: the Gaussian alone, its levels, or all control nodes.  "
+    type=click.Choice(["self", "nodes"]),
+    help="What the attention sees: the Gaussian alone, or all control nodes.  "
     "[default: nodes; not online: self]",
 )
 @click.option(

@@ -1,4 +1,4 @@
-"""The rasteriser, the space-time field and the losses, forward and backward, on CPU and GPU.
+"""The rasteriser and the mapper's loss, forward and backward, on CPU and GPU.
 
 Imports config and kernels.
 """

@@ -15,7 +15,7 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.files import whole
 from sags_node.fitting.fit import Fit
 
-VERSION = 3
+VERSION = 4
 
 
 def save(fit: Fit, path: Path) -> None:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from sags_node.engine.interface import Gradients
+from sags_node.field.model import DeformableModel
 from sags_node.model import columns
-from sags_node.model.deformable import DeformableModel
 from sags_node.types import F32
 
 MIN_OPACITY_LOGIT = float(np.log(0.005 / 0.995))
@@ -23,16 +22,16 @@ class Density:
         self._cap = cap
         self._forget()
 
-    def observe(self, gradients: Gradients) -> None:
-        """Count one iteration's pull at the means."""
-        self.pull += np.linalg.norm(gradients.means, axis=1)
-        self.seen += gradients.contribution > 0
+    def observe(self, v_means: F32, contribution: F32) -> None:
+        """Count one iteration's pull at the drawn means, and who was seen, [N, 3] and [N]."""
+        self.pull += np.linalg.norm(v_means, axis=1)
+        self.seen += contribution > 0
 
     def adapt(self, rng: np.random.Generator) -> tuple[int, int]:
         """Prune what is transparent, split what is pulled hardest while there is room; both counts."""
         model = self._model
-        kept = model.rows[:, columns.LOGIT] > MIN_OPACITY_LOGIT
-        kept &= np.isfinite(model.rows).all(1)
+        kept = model.table[:, columns.LOGIT] > MIN_OPACITY_LOGIT
+        kept &= np.isfinite(model.table).all(1)
         pull = (self.pull / np.maximum(self.seen, 1))[kept]
         pruned = int(np.count_nonzero(~kept))
         model.keep(kept)
@@ -40,7 +39,7 @@ class Density:
         split = np.argsort(-pull, kind="stable")[: max(room, 0)]
         split = split[pull[split] > 0]
         if len(split) > 0:
-            model.append(_split(model.rows, split, rng), split)
+            model.append(_split(model.table, split, rng), split)
         self._forget()
         return pruned, len(split)
 

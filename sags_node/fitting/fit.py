@@ -1,7 +1,7 @@
 """The offline fit: canonical Gaussians and the deformation field, learnt from a clip's training frames.
 
 `paper`: Adam on everything against the paper's loss. `online`: the start knows where the tissue went and how
-it looked; what is left are small corrections of the field and of single Gaussians (`model.residuals`), by
+it looked; what is left are small corrections of the field and of single Gaussians (`fitting.residuals`), by
 squared colour residuals and the closed-form colour step, as the online mapper does.
 """
 
@@ -12,23 +12,28 @@ import time
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from sags_node.engine.adam import AdamState
+from sags_node.engine.losses.tissue import tissue_loss
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
+from sags_node.field.decoder import Decoder
+from sags_node.field.deformation import Deltas, Field, NodeField
+from sags_node.field.hexplane import for_clip
+from sags_node.field.losses import compare
+from sags_node.field.model import DeformableModel, Rates
 from sags_node.fitting.clip import Clip, ClipFrame
 from sags_node.fitting.density import Density
-from sags_node.fitting.field import make_box, make_deltas, make_field, marked, row_rates
-from sags_node.fitting.learner import Learner
+from sags_node.fitting.field import make_box, make_field, marked, row_rates, unit_row
+from sags_node.fitting.refined import RefinedModel
+from sags_node.fitting.residuals import Residuals
 from sags_node.fitting.settings import FitSettings
 from sags_node.fitting.start import Progress, follow_online, learn_paths, pooled_rows, remainder
 from sags_node.mapping.optimiser import LearningRates
+from sags_node.mapping.refiner import DEPTH_SCALE, DEPTH_WEIGHT
 from sags_node.model import columns
-from sags_node.model.deformable import DeformableModel
 from sags_node.model.exposure import Exposure
-from sags_node.model.field import Field, NodeField
-from sags_node.model.hexplane import HexPlaneField
-from sags_node.model.residuals import Residuals
 from sags_node.types import F32, Gaussians
 
 REFINE_RATES = LearningRates()  # the mapper's, gentle: the start is good
@@ -54,8 +59,10 @@ class Fit:
         first = clip.train[0]
         height, width = first.tissue.shape
         self.rasterizer = make_rasterizer("numba", width, height, antialias=settings.antialias)
-        unseen = ~np.any([frame.tissue for frame in clip.train], axis=0) | settings.smooth_everywhere
-        self._learner = Learner(self.rasterizer, settings, unseen)
+        self.residual = 0.0  # mean absolute colour residual before the last iteration
+        self._unseen = ~np.any([frame.tissue for frame in clip.train], axis=0) | settings.smooth_everywhere
+        self._v_planes = np.zeros((5, height, width), np.float32)
+        self._weight = np.zeros((height, width), np.float32)
         self._rng = np.random.default_rng(settings.seed)
         self._order: list[int] = []
         known = first.depth[first.depth > 0]
@@ -74,18 +81,19 @@ class Fit:
             SagsError: no frame has depth enough.
         """
         started = time.perf_counter()
-        settings, exposure, residuals, slopes = self.settings, self._make_exposure(), None, None
+        settings, exposure = self.settings, self._make_exposure()
         if settings.schedule == "paper":
             rows = pooled_rows(self.clip, exposure, settings)
             field = self._make_field(rows[:, columns.MEAN])
+            self.model = DeformableModel(rows, field, exposure, settings.antialias)
         else:
             rows, slopes, paths = follow_online(self.clip, self.rasterizer, exposure, settings, progress)
             field = self._make_field(rows[:, columns.MEAN])
-            learn_paths(self._learner, field, rows, paths, settings, progress)
+            learn_paths(field, rows, paths, settings, progress)
             residuals = remainder(field, rows, paths)
+            self.model = RefinedModel(rows, field, exposure, settings.antialias, slopes, residuals)
         self._start_means = np.ascontiguousarray(rows[:, columns.MEAN])
-        model = DeformableModel(rows, field, exposure, settings.antialias, residuals, slopes)
-        self._begin(model, self._make_density(model))
+        self._density = self._make_density()
         self.seconds += time.perf_counter() - started
 
     @property
@@ -102,18 +110,13 @@ class Fit:
         """Iterations in all."""
         return self.warm_up + self.settings.iterations
 
-    @property
-    def residual(self) -> float:
-        """Mean absolute colour residual of the last iteration."""
-        return self._learner.residual
-
     def iterate(self) -> None:
         """One step on one training frame."""
         started = time.perf_counter()
-        if self.settings.schedule == "paper":
-            self._descend()
+        if isinstance(self.model, RefinedModel):
+            self._refine(self.model)
         else:
-            self._refine()
+            self._descend()
         self.seconds += time.perf_counter() - started
 
     def _descend(self) -> None:
@@ -122,24 +125,36 @@ class Fit:
         frame = self._next_frame() if deformed else self.clip.train[0]
         done, of = self._stage
         share = self.settings.decay ** (done / (self.settings.decay_over or max(1, of)))
-        self._learner.descend(
-            frame,
+        drawing = self.model.draw(self.rasterizer, frame.t_capture_ns, frame.camera, deformed)
+        found = compare(
+            drawing.planes, frame.image, frame.tissue, frame.depth, self._unseen, self.settings.weights
+        )
+        drawing.differentiate(found.loss, found.weight)
+        self.residual = float(found.terms["color"])
+        self._density.observe(drawing.v_means, drawing.contribution)
+        rates = Rates(
             self._rates * np.float32(share) ** self._decays,
             self.settings.field_rates.scaled(share),
             self.settings.exposure_rate * share,
-            deformed,
         )
+        self.model.descend(drawing, rates)
         self.iteration += 1
         growth = self.settings.growth
         if self.iteration % growth.every == 0 and self._progress() < growth.until:
             pruned, split = self._density.adapt(self._rng)
             self.pruned, self.split = self.pruned + pruned, self.split + split
 
-    def _refine(self) -> None:
+    def _refine(self, model: RefinedModel) -> None:
         """A step of the joint refinement after the online pass."""
-        share = REFINE_DECAY ** self._progress()
-        self._learner.refine(
-            self._next_frame(),
+        share, frame = REFINE_DECAY ** self._progress(), self._next_frame()
+        drawing = model.draw_to_refine(self.rasterizer, frame.t_capture_ns, frame.camera)
+        self.residual = tissue_loss(
+            drawing.planes.detach().numpy(), frame.image, frame.tissue, frame.depth, self._v_planes,
+            self._weight, DEPTH_WEIGHT, DEPTH_SCALE,
+        )  # fmt: skip
+        drawing.differentiate(self._v_planes, self._weight)
+        model.refine(
+            drawing,
             self._refine_rates * np.float32(share),
             REFINE_RELAXATION * math.sqrt(share),  # less and less, so that frames average out
             self.settings.field_rates.scaled(REFINE_FIELD_SHARE * share),
@@ -160,30 +175,31 @@ class Fit:
     def arrays(self) -> dict[str, NDArray[Any]]:
         """All arrays that `restore` needs."""
         model, deltas = self.model, self.model.field.deltas
-        tables = {
-            "rows": (model.rows, model.adam),
-            "gains": (model.exposure.gains, model.exposure.adam),
-            "cells": (deltas.hexplane.cells, deltas.hexplane.adam),
-            "decoder": (deltas.decoder.values, deltas.adam),
-        }
-        found: dict[str, NDArray[Any]] = {name: values for name, (values, _) in tables.items()}
-        for name, (_, adam) in tables.items():
-            found |= {f"{name}.moments": adam.moments, f"{name}.shares": adam.shares}
-        if isinstance(model.field, NodeField):
-            found |= {"index": model.field.index, "weight": model.field.weight}
-        residuals = model.residuals
-        if residuals is not None:
-            found |= {"residuals": residuals.values, "residuals.times": residuals.times_ns}
-            found |= {"residuals.moments": np.stack([adam.moments for adam in residuals.adam])}
-            found |= {"residuals.shares": np.stack([adam.shares for adam in residuals.adam])}
-        if model.slopes is not None:
-            found["slopes"] = model.slopes
-        return found | {
+        found: dict[str, NDArray[Any]] = {
+            "rows": model.table,
+            "gains": model.exposure.gains,
+            "cells": deltas.hexplane.cells.detach().numpy(),
             "ids": model.ids,
             "start": self._start_means,
             "pull": self._density.pull,
             "seen": self._density.seen,
         }
+        remembered = {"rows": [model.adam], "gains": [model.exposure.adam], "cells": [deltas.hexplane.adam]}
+        if isinstance(model.field, NodeField):
+            found |= {"index": model.field.index.numpy(), "weight": model.field.weight.numpy()}
+        if isinstance(model, RefinedModel) and model.slopes is not None:
+            residuals = model.residuals
+            found |= {"residuals": residuals.values, "residuals.times": residuals.times_ns}
+            found["slopes"] = model.slopes.detach().numpy()
+            remembered["residuals"] = residuals.adam
+        for name, states in remembered.items():
+            found[f"{name}.moments"] = np.stack([adam.moments for adam in states])
+            found[f"{name}.shares"] = np.stack([adam.shares for adam in states])
+        for name, values in deltas.decoder.state_dict().items():
+            found[f"decoder.{name}"] = values.numpy()
+        for number, state in deltas.optimizer.state_dict()["state"].items():
+            found |= {f"optimizer.{number}.{key}": values.numpy() for key, values in state.items()}
+        return found
 
     def state(self) -> dict[str, Any]:
         """The rest of what `restore` needs."""
@@ -199,40 +215,43 @@ class Fit:
 
     def restore(self, state: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
         """Go on from there, instead of `start`: the same bits as without the interruption."""
-        self._start_means = arrays["start"]
-        field = self._make_field(self._start_means)
-        residuals = None
+        self._start_means, rows = arrays["start"], arrays["rows"]
+        field, exposure, smooth = (
+            self._make_field(self._start_means),
+            self._make_exposure(),
+            self.settings.antialias,
+        )
         if self.settings.schedule == "online":
-            residuals = Residuals(arrays["residuals.times"], len(arrays["rows"]))
+            residuals = Residuals(arrays["residuals.times"], len(rows))
             residuals.values[:] = arrays["residuals"]
-            adam = zip(arrays["residuals.moments"], arrays["residuals.shares"], strict=True)
-            residuals.adam = [AdamState(moments, shares) for moments, shares in adam]
-        model = DeformableModel(
-            arrays["rows"], field, self._make_exposure(), self.settings.antialias, residuals,
-            arrays.get("slopes"),
-        )  # fmt: skip
+            residuals.adam = _remembered(arrays, "residuals")
+            self.model = RefinedModel(rows, field, exposure, smooth, arrays["slopes"], residuals)
+        else:
+            self.model = DeformableModel(rows, field, exposure, smooth)
+        model, deltas = self.model, field.deltas
         if isinstance(field, NodeField):
-            field.index, field.weight = arrays["index"], arrays["weight"]
-        deltas = field.deltas
-        deltas.hexplane.cells[:] = arrays["cells"]
-        deltas.decoder.values[:] = arrays["decoder"]
-        model.exposure.gains[:] = arrays["gains"]
-        model.exposure.adam = AdamState(arrays["gains.moments"], arrays["gains.shares"])
-        model.adam = AdamState(arrays["rows.moments"], arrays["rows.shares"])
-        deltas.hexplane.adam = AdamState(arrays["cells.moments"], arrays["cells.shares"])
-        deltas.adam = AdamState(arrays["decoder.moments"], arrays["decoder.shares"])
+            field.index, field.weight = torch.from_numpy(arrays["index"]), torch.from_numpy(arrays["weight"])
+        deltas.hexplane.cells.detach().numpy()[:] = arrays["cells"]
+        exposure.gains[:] = arrays["gains"]
+        (model.adam,), (exposure.adam,) = _remembered(arrays, "rows"), _remembered(arrays, "gains")
+        (deltas.hexplane.adam,) = _remembered(arrays, "cells")
         model.ids, model.next_id = arrays["ids"], int(state["next_id"])
-        density = self._make_density(model)
-        density.pull, density.seen = arrays["pull"], arrays["seen"]
-        self._begin(model, density)
+        of_decoder = {
+            name: torch.from_numpy(arrays[f"decoder.{name}"]) for name in deltas.decoder.state_dict()
+        }
+        deltas.decoder.load_state_dict(of_decoder)
+        optimizer = deltas.optimizer.state_dict()
+        for name, values in arrays.items():
+            if name.startswith("optimizer."):
+                _, number, key = name.split(".")
+                optimizer["state"].setdefault(int(number), {})[key] = torch.from_numpy(values)
+        deltas.optimizer.load_state_dict(optimizer)
+        self._density = self._make_density()
+        self._density.pull, self._density.seen = arrays["pull"], arrays["seen"]
         self.iteration, self._order = int(state["iteration"]), list(state["order"])
         self.seconds = float(state["seconds"])
         self.pruned, self.split = int(state["pruned"]), int(state["split"])
         self._rng.bit_generator.state = state["rng"]
-
-    def _begin(self, model: DeformableModel, density: Density) -> None:
-        self.model, self._density = model, density
-        self._learner.begin(model, density)
 
     def _progress(self) -> float:
         """How far the stage is, 0..1; each stage has its own schedule."""
@@ -265,12 +284,21 @@ class Fit:
         settings = self.settings
         times = [frame.t_capture_ns for frame in (*self.clip.train, *self.clip.test)]
         shape = settings.shape
-        hexplane = HexPlaneField.for_clip(
+        hexplane = for_clip(
             make_box(means), min(times), max(times), shape.slots(len(times)), cells=shape.cells,
             levels=shape.levels, channels=shape.channels, seed=settings.seed, space_range=shape.first_values,
         )  # fmt: skip
-        deltas = make_deltas(hexplane, shape, settings.tokens, settings.block, settings.seed)
-        return make_field(deltas, means, settings.tokens)
+        decoder = Decoder(
+            hexplane.features, settings.tokens, settings.block, seed=settings.seed, xavier=shape.xavier
+        )
+        return make_field(Deltas(hexplane, decoder, unit_row(shape.units)), means, settings.tokens)
 
-    def _make_density(self, model: DeformableModel) -> Density:
-        return Density(model, self.settings.max_gaussians, self.settings.growth.share)
+    def _make_density(self) -> Density:
+        return Density(self.model, self.settings.max_gaussians, self.settings.growth.share)
+
+
+def _remembered(arrays: dict[str, NDArray[Any]], name: str) -> list[AdamState]:
+    """What the optimisers of a table remember, as `Fit.arrays` has it."""
+    return [
+        AdamState(*each) for each in zip(arrays[f"{name}.moments"], arrays[f"{name}.shares"], strict=True)
+    ]

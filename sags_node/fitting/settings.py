@@ -10,11 +10,11 @@ from typing import Any, Literal
 from pydantic import TypeAdapter, ValidationError
 
 from sags_node.config.yaml_reader import parse_yaml
-from sags_node.engine.losses.photometric import LossWeights
 from sags_node.errors import UsageError
-from sags_node.model.field import Block, FieldRates
+from sags_node.field.decoder import Block, Tokens
+from sags_node.field.deformation import FieldRates
+from sags_node.field.losses import LossWeights
 
-Tokens = Literal["self", "planes", "nodes"]
 Schedule = Literal["paper", "online"]
 Part = Literal["means", "log_scales", "quats", "colors", "logits"]  # of a Gaussian's parameters
 

@@ -11,12 +11,16 @@ from collections.abc import Callable
 
 import cv2
 import numpy as np
+import torch
+from torch import Tensor
 
 from sags_node.engine.rasterizer.rasterize import Rasterizer
 from sags_node.errors import SagsError
+from sags_node.field.deformation import Field
+from sags_node.field.drawing import deactivate
 from sags_node.fitting.clip import Clip, ClipFrame
-from sags_node.fitting.learner import Learner
 from sags_node.fitting.paths import Paths
+from sags_node.fitting.residuals import Residuals, check_size
 from sags_node.fitting.settings import FitSettings
 from sags_node.geometry import unproject
 from sags_node.mapping.budget import StepBudget
@@ -25,10 +29,7 @@ from sags_node.mapping.motion import Drawn, SurfaceTracker
 from sags_node.mapping.refiner import CpuRefiner
 from sags_node.mapping.tissue_map import TissueMap
 from sags_node.model import columns
-from sags_node.model.activation import deactivate
 from sags_node.model.exposure import Exposure
-from sags_node.model.field import Field
-from sags_node.model.residuals import Residuals, check_size
 from sags_node.types import F32, I64, Gaussians
 
 POOLED_SHARE = 0.01  # of a frame's pixels
@@ -187,19 +188,21 @@ class _Places:
         return self._places[ids]
 
 
-def learn_paths(
-    learner: Learner, field: Field, rows: F32, paths: Paths, settings: FitSettings, progress: Progress
-) -> None:
+def learn_paths(field: Field, rows: F32, paths: Paths, settings: FitSettings, progress: Progress) -> None:
     """Let the field learn the paths: mean absolute errors of positions, at random times."""
     rng = np.random.default_rng(settings.seed)
-    learner.begin_paths(field, rows, paths)
-    for step in range(PATH_STEPS):
-        t = int(rng.integers(len(paths.times_ns)))
-        known = np.flatnonzero(paths.known[t])
-        picked = rng.choice(known, min(PATH_POINTS, len(known)), replace=False)
-        learner.learn_paths(t, picked, settings.field_rates.scaled(settings.decay ** (step / PATH_STEPS)))
-        progress("learning the paths", step + 1, PATH_STEPS)
     field.follow(rows[:, columns.MEAN])
+    for step in range(PATH_STEPS):
+        slot = int(rng.integers(len(paths.times_ns)))
+        known = np.flatnonzero(paths.known[slot])
+        picked = rng.choice(known, min(PATH_POINTS, len(known)), replace=False)
+        canonical, which = torch.from_numpy(rows[picked]), torch.from_numpy(picked)
+        deformed = field.deform(canonical, int(paths.times_ns[slot]), which)
+        wanted = torch.from_numpy(paths.states[slot, picked])
+        off: Tensor = (deformed - wanted)[:, columns.MEAN].abs().sum() / len(picked)
+        off.backward()  # type: ignore[no-untyped-call]
+        field.deltas.step(settings.field_rates.scaled(settings.decay ** (step / PATH_STEPS)))
+        progress("learning the paths", step + 1, PATH_STEPS)
 
 
 def remainder(field: Field, rows: F32, paths: Paths) -> Residuals:
@@ -207,7 +210,9 @@ def remainder(field: Field, rows: F32, paths: Paths) -> Residuals:
     nearest time it was known, but hides."""
     residuals = Residuals(paths.times_ns, len(rows))
     for slot, t_ns in enumerate(paths.times_ns.tolist()):
-        residuals.values[slot] = paths.states[slot] - field.deform(rows, t_ns)
+        with torch.no_grad():
+            deformed = field.deform(torch.from_numpy(rows), t_ns).numpy()
+        residuals.values[slot] = paths.states[slot] - deformed
     slots = np.arange(len(paths.times_ns))
     for slot in range(len(slots)):
         lost = np.flatnonzero(~paths.known[slot])

@@ -1,7 +1,7 @@
 """The SAGS model learnt from a stream that never ends, in bounded memory.
 
 Of the pictures only those of the last window are kept. With each frame the window advances, what leaves it is
-folded into the Gaussians (`model.window`), holes get new ones, and a few steps are taken: some on the newest
+folded into the Gaussians (`field.window`), holes get new ones, and a few steps are taken: some on the newest
 frame, to follow it, some on earlier ones, which the field would forget otherwise.
 """
 
@@ -12,25 +12,28 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sags_node.engine.losses.photometric import LossWeights, PhotometricLoss
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.errors import SagsError
+from sags_node.field.decoder import Decoder, Tokens
+from sags_node.field.deformation import Deltas, Field, FieldRates
+from sags_node.field.drawing import deactivate
+from sags_node.field.hexplane import HexPlane
+from sags_node.field.losses import LossWeights, compare
+from sags_node.field.model import Rates
+from sags_node.field.window import WindowModel
 from sags_node.fitting.clip import ClipFrame
-from sags_node.fitting.field import make_box, make_decoder, make_field, row_rates
-from sags_node.fitting.settings import RowRates, Tokens
+from sags_node.fitting.field import make_box, make_field, row_rates
+from sags_node.fitting.settings import RowRates
 from sags_node.mapping import densify, initialise
 from sags_node.mapping.mapper import MIN_FIRST_DEPTHS
 from sags_node.model import columns
-from sags_node.model.activation import deactivate
-from sags_node.model.field import Deltas, Field, FieldRates
 from sags_node.model.gaussians import GaussianModel
-from sags_node.model.hexplane import HexPlaneField
-from sags_node.model.window import WindowModel, awaken
 from sags_node.types import F32, I32, I64, Camera, Gaussians, Observation
 
 MOST_KEPT = 64  # frames, at any frame rate
 FIRST_STEPS, FIRST_SPEED = 30, 4.0  # on the first frame, without deformation; times the learning rates
 TIDY_EVERY = 3  # frames between two looks for holes and for what is transparent
+WEIGHTS = LossWeights(coverage=0.1)
 MIN_LOGIT = float(np.log(densify.MIN_OPACITY / (1 - densify.MIN_OPACITY)))
 
 
@@ -65,9 +68,6 @@ class StreamFit:
         self.inserted = self.pruned = 0
         self._model: WindowModel | None = None
         self._frames = 0
-        self._loss = PhotometricLoss(width, height, LossWeights(coverage=0.1))
-        self._v_planes = np.zeros((5, height, width), np.float32)
-        self._weight = np.zeros((height, width), np.float32)
         self._unseen = np.ones((height, width), np.bool_)
         self._drawn_ns: I64 = np.zeros(0, np.int64)  # [N] newest frame that each Gaussian had a part in
         self._rng = np.random.default_rng(settings.seed)
@@ -143,7 +143,7 @@ class StreamFit:
 
     def _make_field(self, means: F32, t0_ns: int) -> Field:
         settings = self.settings
-        hexplane = HexPlaneField(
+        hexplane = HexPlane(
             make_box(means),
             t0_ns,
             round(settings.slot * 1e9),
@@ -154,28 +154,23 @@ class StreamFit:
             channels=settings.channels,
             seed=settings.seed,
         )
-        decoder = make_decoder(hexplane, settings.tokens, settings.seed)
-        awaken(decoder, settings.seed)
+        decoder = Decoder(hexplane.features, settings.tokens, seed=settings.seed)
+        decoder.awaken(settings.seed)
         return make_field(Deltas(hexplane, decoder), means, settings.tokens)
 
     def _step(self, frame: ClipFrame, speed: float = 1.0, deformed: bool = True) -> None:
-        model, observation = self.model, frame.observation()
-        gaussians = model.at(frame.t_capture_ns, [frame.camera], deformed)
-        planes = self.rasterizer.forward(gaussians, frame.camera)
-        self._loss.evaluate(
-            planes, observation.image, frame.tissue, frame.depth, self._v_planes, self._weight,
-            self._unseen,
-        )  # fmt: skip
-        gradients = self.rasterizer.backward(self._v_planes, self._weight)
-        model.descend(gradients, self._rates * np.float32(speed), FieldRates(), exposure_rate=0.0)
-        drawn = gradients.contribution > densify.IDLE
+        drawing = self.model.draw(self.rasterizer, frame.t_capture_ns, frame.camera, deformed)
+        found = compare(drawing.planes, frame.image, frame.tissue, frame.depth, self._unseen, WEIGHTS)
+        drawing.differentiate(found.loss, found.weight)
+        self.model.descend(drawing, Rates(self._rates * np.float32(speed), FieldRates()))
+        drawn = drawing.contribution > densify.IDLE
         self._drawn_ns[drawn] = np.maximum(self._drawn_ns[drawn], frame.t_capture_ns)
 
     def _tidy(self, frame: ClipFrame) -> None:
         """Remove what is transparent, and when N nears its cap what did not show in the whole window; fill
         the holes."""
         model, cap = self.model, self.settings.max_gaussians
-        kept = (model.rows[:, columns.LOGIT] > MIN_LOGIT) & np.isfinite(model.rows).all(axis=1)
+        kept = (model.table[:, columns.LOGIT] > MIN_LOGIT) & np.isfinite(model.table).all(axis=1)
         if len(model) > densify.CROWDED * cap:
             kept &= self._drawn_ns >= self.kept[0].t_capture_ns
         self.pruned += len(kept) - int(np.count_nonzero(kept))

@@ -1,4 +1,4 @@
-"""The Gaussian model: its rows, how it deforms, its filters, light and files; the field of SAGS.
+"""The Gaussian model: its rows, how it deforms, its filters, light and files.
 
 Imports engine and kernels.
 """

@@ -1,12 +1,14 @@
-"""Skinning by control nodes against a float64 twin in torch."""
+"""Gaussians that follow control nodes, against the formula for each Gaussian and node in float64."""
 
 import numpy as np
 import pytest
 import torch
+from engine_scenes import on_one_thread
 
-from sags_node.kernels.threads import configure_threads
+from sags_node.field.decoder import Decoder
+from sags_node.field.deformation import Deltas, FieldRates, product, skin
+from sags_node.field.hexplane import HexPlane
 from sags_node.model import columns
-from sags_node.model.skinning import skin, skin_backward
 
 
 def scene(seed: int, count: int = 40, nodes: int = 7) -> tuple[np.ndarray, ...]:
@@ -19,11 +21,18 @@ def scene(seed: int, count: int = 40, nodes: int = 7) -> tuple[np.ndarray, ...]:
     return rows, places, deltas, index, weight / weight.sum(1, keepdims=True)
 
 
-def product(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """Hamilton product of quaternions [..., 4], wxyz."""
-    w = a[..., :1] * b[..., :1] - (a[..., 1:] * b[..., 1:]).sum(-1, keepdim=True)
-    v = a[..., :1] * b[..., 1:] + b[..., :1] * a[..., 1:] + torch.linalg.cross(a[..., 1:], b[..., 1:])
-    return torch.cat([w, v], -1)
+def of_each(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """Products of quaternions [N, K, 4]."""
+    return product(a.flatten(0, 1), b.flatten(0, 1)).view_as(a)
+
+
+def skinned_and_gradients(*arrays: np.ndarray) -> tuple[np.ndarray, ...]:
+    """As `twin_and_gradients`, of the model's own."""
+    rows, nodes, deltas, index, weight, cotangent = map(torch.tensor, arrays)
+    inputs = rows.requires_grad_(), deltas.requires_grad_()
+    skinned = skin(inputs[0], nodes, inputs[1], index.long(), weight)
+    found = torch.autograd.grad(skinned, inputs, cotangent)
+    return skinned.detach().numpy(), *(gradient.numpy() for gradient in found)
 
 
 def twin(
@@ -36,7 +45,7 @@ def twin(
     arm = rows[:, None, columns.MEAN] - nodes[index]
     arm4 = torch.cat([torch.zeros_like(arm[..., :1]), arm], -1)
     conjugate = unit * rows.new_tensor([1.0, -1, -1, -1])
-    turned = product(product(unit, arm4), conjugate)[..., 1:]
+    turned = of_each(of_each(unit, arm4), conjugate)[..., 1:]
     w = weight[..., None]
     mean = rows[:, columns.MEAN] + (w * (turned - arm + own[..., columns.MEAN])).sum(1)
     plain = rows + (w * own).sum(1)
@@ -67,13 +76,11 @@ def relative_error(got: np.ndarray, want: np.ndarray) -> float:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_skinning_and_its_gradients_equal_the_twin(seed: int) -> None:
-    rows, nodes, deltas, index, weight = scene(seed, count=(5, 40, 1500)[seed])
-    cotangent = np.random.default_rng(seed + 9).normal(size=rows.shape).astype(np.float32)
-    expected, *wanted = twin_and_gradients(rows, nodes, deltas, index, weight, cotangent)
-    skinned = np.empty_like(rows)
-    skin(rows, nodes, deltas, index, weight, skinned)
+    arrays = scene(seed, count=(5, 40, 1500)[seed])
+    cotangent = np.random.default_rng(seed + 9).normal(size=arrays[0].shape).astype(np.float32)
+    expected, *wanted = twin_and_gradients(*arrays, cotangent)
+    skinned, *found = skinned_and_gradients(*arrays, cotangent)
     np.testing.assert_allclose(skinned, expected, atol=2e-6)
-    found = skin_backward(rows, nodes, deltas, index, weight, cotangent)
     for got, want in zip(found, wanted, strict=True):
         assert relative_error(got, want) < 1e-5
 
@@ -83,10 +90,9 @@ def test_a_node_may_stand_twice_among_the_four() -> None:
     rows, nodes, deltas, index, weight = scene(3)
     index[::2, 2:] = index[::2, :1]
     expected, _, wanted = twin_and_gradients(rows, nodes, deltas, index, weight, rows)
-    skinned = np.empty_like(rows)
-    skin(rows, nodes, deltas, index, weight, skinned)
+    skinned, _, found = skinned_and_gradients(rows, nodes, deltas, index, weight, rows)
     np.testing.assert_allclose(skinned, expected, atol=2e-6)
-    assert relative_error(skin_backward(rows, nodes, deltas, index, weight, rows)[1], wanted) < 1e-5
+    assert relative_error(found, wanted) < 1e-5
 
 
 def test_rotations_learn_from_short_arms_far_from_the_origin() -> None:
@@ -98,17 +104,14 @@ def test_rotations_learn_from_short_arms_far_from_the_origin() -> None:
     pull = np.zeros_like(rows)
     pull[:, columns.MEAN] = [0.3, 0.5, 1.0]
     expected, _, wanted = twin_and_gradients(rows, nodes, deltas, index, weight, pull)
-    skinned = np.empty_like(rows)
-    skin(rows, nodes, deltas, index, weight, skinned)
+    skinned, _, found = skinned_and_gradients(rows, nodes, deltas, index, weight, pull)
     np.testing.assert_allclose(skinned[:, columns.MEAN], expected[:, columns.MEAN], atol=3e-6)
-    _, found = skin_backward(rows, nodes, deltas, index, weight, pull)
     assert relative_error(found[:, columns.QUAT], wanted[:, columns.QUAT]) < 1e-5
 
 
 def test_no_delta_leaves_everything_as_it_is() -> None:
     rows, nodes, deltas, index, weight = scene(0)
-    skinned = np.empty_like(rows)
-    skin(rows, nodes, np.zeros_like(deltas), index, weight, skinned)
+    skinned, *_ = skinned_and_gradients(rows, nodes, np.zeros_like(deltas), index, weight, rows)
     np.testing.assert_array_equal(skinned, rows)
 
 
@@ -121,18 +124,29 @@ def test_a_rigid_motion_of_all_nodes_moves_everything_rigidly() -> None:
     deltas[:] = 0
     deltas[:, columns.QUAT] = turn - [1, 0, 0, 0]
     deltas[:, columns.MEAN] = nodes @ R.T + shift - nodes
-    skinned = np.empty_like(rows)
-    skin(rows, nodes, deltas, index, weight, skinned)
+    skinned, *_ = skinned_and_gradients(rows, nodes, deltas, index, weight, rows)
     np.testing.assert_allclose(skinned[:, :3], rows[:, :3] @ R.T + shift, atol=2e-6)
 
 
 def test_the_same_bits_on_one_and_two_threads() -> None:
-    rows, nodes, deltas, index, weight = scene(2, count=1000, nodes=50)
-    found = []
-    for threads in (1, None):
-        configure_threads(threads)
-        skinned = np.empty_like(rows)
-        skin(rows, nodes, deltas, index, weight, skinned)
-        found.append([skinned, *skin_backward(rows, nodes, deltas, index, weight, rows)])
-    for one, two in zip(*found, strict=True):
+    arrays = scene(2, count=1000, nodes=50)
+    together = skinned_and_gradients(*arrays, arrays[0])
+    alone = on_one_thread(lambda: skinned_and_gradients(*arrays, arrays[0]))
+    for one, two in zip(together, alone, strict=True):
         np.testing.assert_array_equal(one, two)
+
+
+def test_a_field_that_is_not_finite_takes_no_step() -> None:
+    hexplane = HexPlane(np.array([[0, 0, 0], [1, 1, 1.0]]), 0, 1, slots=2, cells=4, channels=8)
+    deltas = Deltas(hexplane, Decoder(hexplane.features, xavier=True))
+    before = [parameter.clone() for parameter in deltas.decoder.parameters()]
+    (deltas(torch.rand(5, 3), 0) * torch.nan).sum().backward()
+    deltas.step(FieldRates())
+    for parameter, known in zip(deltas.decoder.parameters(), before, strict=True):
+        assert torch.equal(parameter, known) and parameter.grad is None
+    assert bool(hexplane.cells.isfinite().all())
+    deltas(torch.rand(5, 3), 0).sum().backward()
+    deltas.step(FieldRates())
+    assert not torch.equal(deltas.decoder.embed.weight, before[0]) or not torch.equal(
+        deltas.decoder.head_bias, before[-1]
+    )

@@ -1,1 +1,0 @@
-"""HexPlane field and self-adaptive decoder as kernels for the CPU."""

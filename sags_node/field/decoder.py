@@ -1,0 +1,159 @@
+"""The self-adaptive deformation decoder (SAGS, arXiv 2510.27318): features become changes of Gaussians.
+
+For the token x = GELU(W f + b) of a Gaussian or a node, with A(x) = alpha x + beta and the gates gamma learnt
+per channel,
+
+    y' = A_pre(x) + gamma_1 MSA(A_pre(x))
+    y  = A_post(y') + gamma_2 MLP(A_post(y')) + x
+
+and five heads Linear(GELU(Linear(GELU(y)))) give the changes of mean, scale, rotation, colour and opacity.
+
+There are two choices of tokens for the attention MSA. `self`: a Gaussian is a sequence of length one, as in
+the authors' code; softmax over one key is 1, so that MSA is its value layer and its output layer. `nodes`:
+control nodes are decoded, and every node attends to all of them.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import gelu, linear
+
+from sags_node.errors import UsageError
+
+Tokens = Literal["self", "nodes"]
+
+# What stands between the first layer and the heads. `adaptive`: the block of SAGS. `mlp`: only its linear
+# layers learn, an MLP of its size with residual connections: the gates stay 1, the adaptations hand on.
+# `none`: nothing is learnt there, as in EndoGaussian.
+Block = Literal["adaptive", "mlp", "none"]
+
+HEADS = {"mean": 3, "log_scale": 3, "quat": 4, "color": 3, "logit": 1}  # as in `model.columns`
+MAX_NODES = 1024
+INITIAL_GATE = 1e-4
+FIRST_HEAD = 0.01  # largest first weight of a last layer that has been awoken
+
+
+class Adaptation(nn.Module):
+    """A(x) = alpha x + beta."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.alpha = nn.Parameter(torch.ones(width))
+        self.beta = nn.Parameter(torch.zeros(width))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.alpha * x + self.beta
+
+
+class Attention(nn.Module):
+    """MSA: multi-head self-attention over the N nodes; over one token alone with `tokens` = self."""
+
+    def __init__(self, width: int, heads: int, tokens: Tokens) -> None:
+        super().__init__()
+        self.heads = heads
+        self.query_key = nn.Linear(width, 2 * width) if tokens == "nodes" else None
+        self.value = nn.Linear(width, width)
+        self.out = nn.Linear(width, width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        values = self.value(x)
+        if self.query_key is not None:
+            query, key = self.query_key(x).chunk(2, dim=1)
+            # [heads, N, width / heads]; torch's fused attention takes twice as long on a CPU
+            query, key, values = (
+                part.view(len(x), self.heads, -1).transpose(0, 1).contiguous()
+                for part in (query, key, values)
+            )
+            shares = torch.softmax(query / query.shape[2] ** 0.5 @ key.transpose(1, 2), dim=2)
+            values = (shares @ values).transpose(0, 1).reshape(x.shape)
+        mixed: Tensor = self.out(values)
+        return mixed
+
+
+class Decoder(nn.Module):
+    """Features [N, F] to changes [N, 14] of the raw parameters (`model.columns`), in the decoder's units."""
+
+    def __init__(
+        self,
+        features: int,
+        tokens: Tokens = "self",
+        block: Block = "adaptive",
+        width: int = 32,
+        heads: int = 4,
+        seed: int = 0,
+        xavier: bool = False,
+    ) -> None:
+        """Xavier-uniform weights from `seed`, biases 0.
+
+        Args:
+            features: F.
+            tokens: what attends to what.
+            block: what is learnt between the first layer and the heads.
+            width: of all hidden layers.
+            heads: of the attention; they divide the width.
+            seed: of the weights.
+            xavier: False: last layers are 0 instead, so that there is no change.
+
+        Raises:
+            UsageError: an MLP is asked for whose tokens attend to each other, or heads do not divide width.
+        """
+        super().__init__()
+        if block == "mlp" and tokens != "self":
+            raise UsageError(
+                f"an MLP in the place of the block has no attention; use tokens self, not {tokens}"
+            )
+        if min(features, width, heads) < 1 or width % heads:
+            raise UsageError(
+                f"deformation decoder: heads ({heads}) must divide width ({width}), features ({features}) "
+                "must be at least 1"
+            )
+        self.embed = nn.Linear(features, width)
+        self.pre, self.post = Adaptation(width), Adaptation(width)
+        self.attention = Attention(width, heads, tokens)
+        self.mlp = nn.Sequential(nn.Linear(width, width), nn.GELU(), nn.Linear(width, width))
+        gate = 1.0 if block == "mlp" else INITIAL_GATE
+        self.gamma_1 = nn.Parameter(torch.full((width,), gate))
+        self.gamma_2 = nn.Parameter(torch.full((width,), gate))
+        self.head_in = nn.Linear(width, len(HEADS) * width)  # the first layers of all heads side by side
+        self.head_out = nn.ParameterList(torch.zeros(count, width) for count in HEADS.values())
+        self.head_bias = nn.Parameter(torch.zeros(sum(HEADS.values())))
+        self._most = MAX_NODES if tokens == "nodes" else None
+        generator = torch.Generator().manual_seed(seed)
+        for name, parameter in self.named_parameters():
+            if name.endswith("bias"):
+                nn.init.zeros_(parameter)
+            elif name.endswith("weight") or (xavier and name.startswith("head_out")):
+                limit = (6.0 / (parameter.shape[1] + width)) ** 0.5
+                nn.init.uniform_(parameter, -limit, limit, generator=generator)
+        adapts = [self.pre, self.post]
+        still: dict[str, list[nn.Module]]
+        still = {"adaptive": [], "mlp": [*adapts], "none": [*adapts, self.attention, self.mlp]}
+        for module in still[block]:
+            module.requires_grad_(False)
+        for gamma in (self.gamma_1, self.gamma_2):
+            gamma.requires_grad_(block == "adaptive")
+
+    def awaken(self, seed: int) -> None:
+        """Give the last layers weights. Of a difference between two times, the gradient by weights of 0 is 0
+        while all times have the same features, and so is that by the features while the weights are 0: the
+        field would never begin to learn. There is still no change at first, as the times do not differ."""
+        generator = torch.Generator().manual_seed(seed)
+        for weights in self.head_out.parameters():
+            nn.init.uniform_(weights, -FIRST_HEAD, FIRST_HEAD, generator=generator)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """UsageError: too many nodes."""
+        if self._most is not None and len(features) > self._most:
+            raise UsageError(
+                f"{len(features)} control nodes are too many to attend to each other; "
+                f"use at most {self._most}"
+            )
+        x = gelu(self.embed(features))
+        adapted = self.pre(x)
+        y = self.post(adapted + self.gamma_1 * self.attention(adapted))
+        y = gelu(y + self.gamma_2 * self.mlp(y) + x)
+        last = torch.block_diag(*self.head_out)  # type: ignore[no-untyped-call]
+        return linear(gelu(self.head_in(y)), last, self.head_bias)

@@ -1,0 +1,116 @@
+"""From raw rows to a picture, as one differentiable step: activation, 3D filter, rasteriser.
+
+The 3D filter comes after the deformation, where a Gaussian's depth is known (`model.alias_free`); its
+variance is a constant of the gradient, as in Mip-Splatting. The 2D filter is part of the rasteriser.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sags_node.engine.interface import Rasterizer
+from sags_node.model import columns
+from sags_node.model.alias_free import smoothing_variances
+from sags_node.types import F32, I64, Camera, Gaussians
+
+
+def activate(rows: Tensor) -> tuple[Tensor, ...]:
+    """Means [N, 3] m, quats [N, 4], scales [N, 3] m, opacities [N] and colours [N, 3] of raw rows [N, 14]."""
+    return (
+        rows[:, columns.MEAN],
+        rows[:, columns.QUAT],
+        rows[:, columns.LOG_SCALE].exp(),
+        rows[:, columns.LOGIT].sigmoid(),
+        rows[:, columns.COLOR],
+    )
+
+
+def deactivate(gaussians: Gaussians) -> F32:
+    """Raw rows [N, 14] of Gaussians: the inverse of `activate`."""
+    opacities = np.clip(gaussians.opacities, 1e-6, 1 - 1e-6)
+    logits = np.log(opacities / (1 - opacities))[:, None]
+    parts = [gaussians.means, np.log(gaussians.scales), gaussians.quats, gaussians.colors, logits]
+    return np.concatenate(parts, axis=1, dtype=np.float32)
+
+
+def to_gaussians(
+    rows: Tensor, slopes: Tensor | None, ids: I64, cameras: Sequence[Camera] | None
+) -> Gaussians:
+    """Rows [N, 14] and slopes [N, 3] as they are drawn; `cameras`: those they were fitted to, for the 3D
+    filter; None: no filter."""
+    means, quats, scales, opacities, colors = (
+        np.ascontiguousarray(part.detach().numpy()) for part in activate(rows)
+    )
+    smoothing = None if cameras is None else smoothing_variances(means, cameras)
+    return Gaussians(
+        means, quats, scales, opacities, colors, ids, smoothing=smoothing,
+        slopes=None if slopes is None else slopes.detach().numpy(),
+    )  # fmt: skip
+
+
+class Drawing:
+    """Gaussians drawn for a camera. Only the last drawing of a rasteriser can be differentiated.
+
+    Attributes:
+        planes: [5, H, W] of `Rasterizer.forward`, differentiable in rows and slopes.
+        v_means, contribution, spread: as `interface.Gradients` has them, after `differentiate`.
+    """
+
+    v_means: F32
+    contribution: F32
+    spread: F32
+
+    def __init__(
+        self,
+        rasterizer: Rasterizer,
+        camera: Camera,
+        rows: Tensor,
+        slopes: Tensor | None,
+        ids: I64,
+        cameras: Sequence[Camera] | None,
+    ) -> None:
+        """See `to_gaussians`."""
+        self.rasterizer, self.camera = rasterizer, camera
+        self.weight: F32 | None = None
+        self.gaussians = to_gaussians(rows, slopes, ids, cameras)
+        self.planes: Tensor = _Rasterize.apply(*activate(rows), slopes, self)  # type: ignore[no-untyped-call]
+
+    def differentiate(self, loss: Tensor | F32, weight: F32) -> None:
+        """Add the gradients of a loss to all leaves that the drawing came from.
+
+        Args:
+            loss: made of the planes; or its gradient by them, [5, H, W].
+            weight: [H, W] of the pixels, for `contribution` and `spread`.
+        """
+        self.weight = weight
+        if isinstance(loss, Tensor):
+            loss.backward()  # type: ignore[no-untyped-call]
+        else:
+            self.planes.backward(torch.from_numpy(loss))  # type: ignore[no-untyped-call]
+
+
+class _Rasterize(torch.autograd.Function):
+    """The rasteriser, whichever stands behind `Rasterizer`."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor,
+        slopes: Tensor | None, drawing: Drawing,
+    ) -> Tensor:  # fmt: skip
+        ctx.drawing, ctx.has_slopes = drawing, slopes is not None
+        return torch.from_numpy(drawing.rasterizer.forward(drawing.gaussians, drawing.camera))
+
+    @staticmethod
+    def backward(ctx: Any, v_planes: Tensor) -> tuple[Tensor | None, ...]:
+        drawing: Drawing = ctx.drawing
+        weight = np.zeros(v_planes.shape[1:], np.float32) if drawing.weight is None else drawing.weight
+        found = drawing.rasterizer.backward(v_planes.numpy(), weight)
+        drawing.v_means, drawing.contribution, drawing.spread = found.means, found.contribution, found.spread
+        by = (found.means, found.quats, found.scales, found.opacities, found.colors)
+        slopes = torch.from_numpy(found.slopes) if ctx.has_slopes else None
+        return *map(torch.from_numpy, by), slopes, None

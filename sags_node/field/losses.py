@@ -1,0 +1,144 @@
+"""The training loss of SAGS and EndoGaussian between drawn planes and a frame.
+
+    L = lambda_1 L_colour + lambda_2 L_depth + lambda_3 TV(colour) + lambda_4 TV(depth)
+
+With coverage A, colour c = C / A and depth d = D / A of a pixel, each term is a mean over the pixels it
+applies to (the two kinds of smoothness over the whole picture, so that a small region is not pulled harder
+than a large one):
+
+    color             |c - image|                           tissue                         lambda_1
+    inverse_depth     |1/d - 1/depth|                       tissue with a depth            lambda_2
+    smoothness        total variation of c                  where tissue was never seen    lambda_3
+    depth_smoothness  total variation of d                  where tissue was never seen    lambda_4
+
+Beyond the paper's four, with a weight of 0 unless it is set:
+
+    correlation       1 - Pearson(1/d, 1/depth)             tissue with a depth; monocular
+    similarity        1 - SSIM(c, image)                    tissue
+    coverage          max(0, 0.9 - A)                       tissue
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sags_node.types import F32, U8, Bool
+
+COVERED = 0.05  # below this coverage the normalised colour means nothing
+DEPTH_COVERED = 0.3  # the same for depth
+FULL = 0.9  # coverage that tissue should reach
+NEAREST = 1e-3  # m: a nearer depth means nothing
+FLAT = 1e-6  # inverse depths whose relative spread is below this have no correlation
+
+
+@dataclass(frozen=True, slots=True)
+class LossWeights:
+    """Weights of the terms. The defaults are those of EndoGaussian and the released SAGS for stereo, whose
+    depths are in mm. For monocular depth they take correlation 1e-3 and inverse_depth 0; gsplat's surgical
+    trainer takes color 0.8 and similarity 0.2."""
+
+    color: float = 1.0
+    similarity: float = 0.0
+    inverse_depth: float = 1e-3  # per 1/m: 1 per 1/mm
+    correlation: float = 0.0
+    smoothness: float = 0.03
+    depth_smoothness: float = 30.0  # per m: 0.03 per mm
+    coverage: float = 0.0  # not in the paper; a pixel without coverage cannot learn from normalised planes
+
+
+class Compared(NamedTuple):
+    """Planes against a frame."""
+
+    loss: Tensor  # the weighted sum of all terms, differentiable in the planes
+    terms: dict[str, Tensor]  # by the names of `LossWeights`, not weighted; those that apply
+    weight: F32  # [H, W] derivative of a pixel's colour by its planes where the colour counts, else 0
+
+
+def compare(
+    planes: Tensor, image: U8, tissue: Bool, depth: F32, unseen: Bool, weights: LossWeights
+) -> Compared:
+    """The loss, differentiable in the planes. NaN and infinity in frame or planes take a pixel out.
+
+    Args:
+        planes: [5, H, W] of `Rasterizer.forward`.
+        image: [H, W, 3] RGB; above, its bytes over 255.
+        tissue: [H, W] True where the pixel is to be explained.
+        depth: [H, W] m, 0 unknown. For a monocular network, whose inverse depth has an unknown scale and
+            offset: 1 / that, and the term `correlation`.
+        unseen: [H, W] where the two kinds of smoothness apply.
+        weights: of the terms.
+    """
+    explained, given = torch.from_numpy(tissue), torch.from_numpy(depth).to(planes.dtype)
+    truth = torch.from_numpy(image).to(planes.dtype).permute(2, 0, 1) / 255
+    sound = planes.detach().sum(0).isfinite()
+    planes = torch.where(sound, planes, 0)
+    coverage = planes[4]
+    covered, deep = coverage > COVERED, coverage > DEPTH_COVERED
+    drawn = planes[:4] / torch.where(covered, coverage, 1)
+    color, distance = drawn[:3], drawn[3]
+    used = explained & covered
+    count = used.sum().clamp(min=1)
+    terms = {"color": ((color - truth).abs() * used).sum() / (3 * count)}
+    measured = explained & deep & given.isfinite() & (given > 0) & (distance > NEAREST)
+    if weights.inverse_depth or weights.correlation:
+        inverse_drawn, inverse_given = (1 / torch.where(measured, each, 1) for each in (distance, given))
+        apart = (inverse_drawn - inverse_given).abs()  # 0 where nothing was measured
+        terms["inverse_depth"] = apart.sum() / measured.sum().clamp(min=1)
+        if weights.correlation:
+            terms["correlation"] = 1 - correlation(inverse_drawn[measured], inverse_given[measured])
+    if weights.similarity:
+        terms["similarity"] = dissimilarity(color, truth, used) / (3 * count)
+    if unseen.any():
+        region = torch.from_numpy(unseen)
+        terms["smoothness"] = total_variation(color, region, covered) / (3 * region.numel())
+        terms["depth_smoothness"] = total_variation(distance[None], region, deep) / region.numel()
+    if weights.coverage:
+        lack = (FULL - coverage).clamp(min=0) * (explained & sound)
+        terms["coverage"] = lack.sum() / explained.sum().clamp(min=1)
+    loss = torch.stack([getattr(weights, name) * term for name, term in terms.items()]).sum()
+    counted = torch.where(used, 1 / coverage.detach(), 0).numpy()
+    return Compared(loss, terms, counted.astype(np.float32, copy=False))
+
+
+def correlation(drawn: Tensor, given: Tensor) -> Tensor:
+    """Pearson's; 1 where one of both is flat, so that there is nothing to learn."""
+    a, b = drawn - drawn.mean(), given - given.mean()
+    least = FLAT * len(drawn) ** 0.5
+    if not (a.norm() > least * drawn.mean().abs() and b.norm() > least * given.mean().abs()):
+        return drawn.new_ones(())
+    pearson: Tensor = (a @ b) / (a.norm() * b.norm())
+    return pearson
+
+
+def total_variation(picture: Tensor, region: Tensor, known: Tensor) -> Tensor:
+    """Sum of |a - b| over neighbours in `picture` [K, H, W], both known, one of them in the region."""
+    across = (region[:, 1:] | region[:, :-1]) & known[:, 1:] & known[:, :-1]
+    down = (region[1:] | region[:-1]) & known[1:] & known[:-1]
+    rows = ((picture[:, :, 1:] - picture[:, :, :-1]).abs() * across).sum()
+    return rows + ((picture[:, 1:] - picture[:, :-1]).abs() * down).sum()
+
+
+def dissimilarity(picture: Tensor, truth: Tensor, counted: Tensor) -> Tensor:
+    """Sum of 1 - SSIM (Wang et al. 2004, equation 13) over the counted pixels [H, W] and the channels of
+    pictures [3, H, W]. Pixels that do not count are set to the truth in both pictures."""
+    offsets = torch.arange(-5, 6, dtype=picture.dtype)
+    profile = torch.exp(-0.5 * (offsets / 1.5) ** 2)
+    window = torch.outer(profile, profile) / profile.sum() ** 2
+    rows, columns = (torch.tensor(np.pad(np.arange(n), 5, mode="reflect")) for n in picture.shape[1:])
+
+    def blur(values: Tensor) -> Tensor:
+        return torch.nn.functional.conv2d(values[:, None, rows][..., columns], window[None, None])[:, 0]
+
+    shown = torch.where(counted, picture, truth)
+    x, y = blur(shown), blur(truth)
+    variance_x, variance_y = blur(shown**2) - x**2, blur(truth**2) - y**2
+    covariance = blur(shown * truth) - x * y
+    c1, c2 = 0.01**2, 0.03**2
+    similarity = (2 * x * y + c1) * (2 * covariance + c2)
+    similarity = similarity / ((x**2 + y**2 + c1) * (variance_x + variance_y + c2))
+    return torch.where(counted, 1 - similarity, 0).sum()

@@ -1,0 +1,174 @@
+"""The SAGS model: canonical Gaussians, the field that deforms them, and the exposure they are seen with."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sags_node.engine.adam import AdamState, adam_step
+from sags_node.engine.interface import Rasterizer
+from sags_node.field.deformation import Field, FieldRates
+from sags_node.field.drawing import Drawing, to_gaussians
+from sags_node.model import columns
+from sags_node.model.exposure import Exposure
+from sags_node.types import F32, I64, Bool, Camera, Gaussians
+
+LOOK_BACK_NS = 200_000_000  # a prediction's velocity is the mean over this time
+FADE_NS = 150_000_000  # in which it falls to 1/e
+
+
+class Rates(NamedTuple):
+    """Lengths of a step of Adam."""
+
+    rows: F32  # [14] of the canonical rows
+    field: FieldRates
+    exposure: float = 0.0  # of the gains
+    slopes: float = 0.0
+
+    def scaled(self, factor: float) -> Rates:
+        rows = self.rows * np.float32(factor)
+        return Rates(rows, self.field.scaled(factor), factor * self.exposure, factor * self.slopes)
+
+
+class DeformableModel:
+    """Canonical Gaussians with their optimiser, and a field. Not for two threads.
+
+    Attributes:
+        rows: [N, 14] canonical (`model.columns`), differentiable.
+        slopes: [N, 3] of the luminance, see `types.Gaussians`, differentiable; they turn with the Gaussian,
+            and the field does not change them. None: every Gaussian has one colour.
+    """
+
+    def __init__(
+        self, rows: F32, field: Field, exposure: Exposure, smooth: bool = True, slopes: F32 | None = None
+    ) -> None:
+        """
+        Args:
+            rows: [N, 14] canonical.
+            field: deforms them.
+            exposure: scales their colours.
+            smooth: whether the 3D filter is on.
+            slopes: [N, 3]
+        """
+        self.rows = _leaf(rows)
+        self.slopes = None if slopes is None else _leaf(slopes)
+        self.ids: I64 = np.arange(len(rows))
+        self.next_id = len(rows)
+        self.field, self.exposure, self.smooth = field, exposure, smooth
+        self.adam = AdamState.new(*rows.shape)
+        self.slopes_adam = AdamState.new(len(rows), 3)
+        field.follow(self.means)
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    @property
+    def table(self) -> F32:
+        """The canonical rows, the same memory."""
+        rows: F32 = self.rows.detach().numpy()
+        return rows
+
+    @property
+    def means(self) -> F32:
+        return np.ascontiguousarray(self.table[:, columns.MEAN])
+
+    def rows_at(self, t_ns: int, deformed: bool = True) -> Tensor:
+        """Rows [N, 14] at one time, without exposure; `deformed`: False leaves the field out."""
+        return self.field.deform(self.rows, t_ns) if deformed else self.rows
+
+    def draw(self, rasterizer: Rasterizer, t_ns: int, camera: Camera, deformed: bool = True) -> Drawing:
+        """The model at one time, drawn for a camera it is fitted to, to learn from: `Drawing.differentiate`,
+        then `descend`."""
+        self._t_ns = t_ns
+        self._gain = torch.from_numpy(self.exposure.at(t_ns)).requires_grad_()
+        return self._drawn(rasterizer, self.rows_at(t_ns, deformed), camera)
+
+    def _drawn(self, rasterizer: Rasterizer, rows: Tensor, camera: Camera) -> Drawing:
+        exposed, slopes = self._exposed(rows, self._gain)
+        return Drawing(rasterizer, camera, exposed, slopes, self.ids, [camera] if self.smooth else None)
+
+    @torch.no_grad()
+    def at(self, t_ns: int, cameras: Sequence[Camera], deformed: bool = True) -> Gaussians:
+        """The Gaussians at one time; `cameras`: those they were fitted to, for the 3D filter."""
+        return self._shown(self.rows_at(t_ns, deformed), t_ns, cameras)
+
+    @torch.no_grad()
+    def between(self, t_ns: int, before_ns: int, after_ns: int, cameras: Sequence[Camera]) -> Gaussians:
+        """The Gaussians at a time between two that were learnt, on straight lines from the one to the other:
+        in between the field was given nothing to learn."""
+        share = (t_ns - before_ns) / (after_ns - before_ns)
+        return self._shown(torch.lerp(self.rows_at(before_ns), self.rows_at(after_ns), share), t_ns, cameras)
+
+    @torch.no_grad()
+    def predict(self, t_ns: int, last_ns: int, cameras: Sequence[Camera]) -> Gaussians:
+        """The Gaussians at a time after the last that was learnt: they go on as the field moved them just
+        before, slower and slower; all else stays as it was last."""
+        deform, rows = self.field.deform, self.rows_at(last_ns).clone()
+        moved = deform(self.rows, last_ns) - deform(self.rows, last_ns - LOOK_BACK_NS)
+        ahead = FADE_NS * -math.expm1((last_ns - t_ns) / FADE_NS)
+        rows[:, columns.MEAN] += ahead / LOOK_BACK_NS * moved[:, columns.MEAN]
+        return self._shown(rows, last_ns, cameras)
+
+    def _shown(self, rows: Tensor, t_ns: int, cameras: Sequence[Camera]) -> Gaussians:
+        exposed, slopes = self._exposed(rows, torch.from_numpy(self.exposure.at(t_ns)))
+        return to_gaussians(exposed, slopes, self.ids, cameras if self.smooth else None)
+
+    def _exposed(self, rows: Tensor, gain: Tensor) -> tuple[Tensor, Tensor | None]:
+        before, color, after = (
+            rows[:, : columns.COLOR.start],
+            rows[:, columns.COLOR],
+            rows[:, columns.LOGIT :],
+        )
+        slopes = None if self.slopes is None else self.slopes * gain.mean()
+        return torch.cat([before, color * gain, after], 1), slopes
+
+    def descend(self, drawing: Drawing, rates: Rates) -> None:
+        """One step of Adam on all that the drawing came from, against the gradients it was given; Gaussians
+        that were not seen stay as they are."""
+        seen = np.flatnonzero(drawing.contribution > 0)
+        assert self.rows.grad is not None
+        adam_step(self.table, self.rows.grad.numpy(), self.adam, rates.rows, rows=seen)
+        self.rows.grad = None
+        if self.slopes is not None and self.slopes.grad is not None:
+            slope_rates = np.full(3, rates.slopes, np.float32)
+            slopes = self.slopes.detach().numpy()
+            adam_step(slopes, self.slopes.grad.numpy(), self.slopes_adam, slope_rates, rows=seen)
+            self.slopes.grad = None
+        if self._gain.grad is not None:
+            self.exposure.descend(self._t_ns, self._gain.grad.numpy(), rates.exposure)
+        self.field.deltas.step(rates.field)
+
+    def keep(self, kept: Bool) -> None:
+        """Remove the Gaussians where `kept` [N] is False."""
+        self._take(np.flatnonzero(kept), self.table[:0], np.zeros(0, np.int64))
+
+    def append(self, rows: F32, parents: I64) -> None:
+        """Add Gaussians [M, 14], canonical, that otherwise do as their parents, rows [M] of the model."""
+        self._take(np.arange(len(self)), rows, parents)
+
+    def _take(self, kept: I64, rows: F32, parents: I64) -> None:
+        """The Gaussians in `kept`, then new ones."""
+        ids = np.arange(self.next_id, self.next_id + len(rows))
+        self.ids, self.next_id = np.concatenate([self.ids[kept], ids]), self.next_id + len(rows)
+        if self.slopes is not None:
+            self.slopes = _leaf(self.slopes.detach().numpy()[np.concatenate([kept, parents])])
+        self.rows = _leaf(np.concatenate([self.table[kept], rows]))
+        self.adam = _taken(self.adam, kept, len(rows))
+        self.slopes_adam = _taken(self.slopes_adam, kept, len(rows))
+        self.field.follow(self.means)
+
+
+def _leaf(values: F32) -> Tensor:
+    return torch.from_numpy(np.array(values, np.float32)).requires_grad_()
+
+
+def _taken(state: AdamState, kept: I64, fresh: int) -> AdamState:
+    """What an optimiser remembers of the rows in `kept`, then nothing of new ones."""
+    new = AdamState.new(len(kept) + fresh, state.moments.shape[1])
+    new.moments[: len(kept)], new.shares[: len(kept)] = state.moments[kept], state.shares[kept]
+    return new

@@ -1,0 +1,172 @@
+"""The SAGS model over a stream that never ends: what leaves the window of time is folded into the Gaussians.
+
+Every Gaussian has a fixed place p, where it asks the field, and canonical rows, which are its state at the
+oldest slot t0 of the field's window. At a time t within the window its state is
+
+    mean, log scale, colour, opacity logit:   row + g(p, t) - g(p, t0)
+    rotation:                                 g(p, t) g(p, t0)^-1 row      unit quaternions
+
+where g(p, t) is what the field makes of an unturned Gaussian at p. When the oldest slot retires and t1
+follows, the state at t1 becomes the canonical row. What the model says of every later time stays the same but
+for rounding, as differences and quotients telescope. So field and Gaussians never hold more than the window.
+
+Both evaluations have a gradient. Without that of g(p, t0) the fit diverges: steps that move all times alike,
+as those of the decoder and of the planes in space mostly do, would seem to help and change nothing.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sags_node.field.deformation import Deltas, Field, PointField, conjugate, product, unit
+from sags_node.field.model import DeformableModel
+from sags_node.model import columns
+from sags_node.model.deformation import nearest_nodes
+from sags_node.model.exposure import Exposure
+from sags_node.types import F32, F64, Bool
+
+MOST_GROWTH = 0.5  # of the first box, on each side: places beyond take the field's value at the border
+
+
+class AnchoredField:
+    """A field relative to the oldest slot of its window, at fixed places."""
+
+    def __init__(self, field: Field, places: F32) -> None:
+        """
+        Args:
+            field: evaluated for one Gaussian at each place.
+            places: [N, 3] m.
+        """
+        self._field = field
+        self.deltas: Deltas = field.deltas
+        self.place(places)
+
+    @property
+    def anchor_ns(self) -> int:
+        """Time of the oldest slot."""
+        hexplane = self.deltas.hexplane
+        return hexplane.t0_ns + hexplane.oldest * hexplane.slot_ns
+
+    def deform(self, rows: Tensor, t_ns: int, which: Tensor | None = None) -> Tensor:
+        """Of all Gaussians: `which` must be None."""
+        return _passed(rows, self._pose_at(self.anchor_ns), self._pose_at(t_ns))
+
+    def follow(self, means: F32) -> None:
+        """Nothing to do: places stay."""
+
+    @torch.no_grad()
+    def carry(self, rows: F32, from_ns: int, to_ns: int) -> F32:
+        """State [N, 14] at one time from that at another, both held within the window."""
+        # In float64: the roundings of ten thousand quotients near 1 would add up.
+        before, after = (self._pose_at(t_ns).double() for t_ns in (from_ns, to_ns))
+        carried: F32 = _passed(torch.from_numpy(rows).double(), before, after).float().numpy()
+        return carried
+
+    def place(self, places: F32) -> None:
+        """Places [N, 3] m of all Gaussians."""
+        self.places = np.ascontiguousarray(places)
+        reference = np.zeros((len(places), columns.COUNT), np.float32)
+        reference[:, columns.MEAN] = places
+        reference[:, columns.QUAT.start] = 1.0
+        self._reference = torch.from_numpy(reference)
+        self._field.follow(self.places)
+
+    def _pose_at(self, t_ns: int) -> Tensor:
+        """g(p, t), [N, 14]."""
+        return self._field.deform(self._reference, t_ns)
+
+
+def _passed(rows: Tensor, before: Tensor, after: Tensor) -> Tensor:
+    """Rows [N, 14], moved from where g is `before` to where it is `after`."""
+    quat = columns.QUAT
+    turn = product(unit(after[:, quat]), conjugate(unit(before[:, quat])))
+    moved, turned = rows + (after - before), product(turn, rows[:, quat])
+    return torch.cat([moved[:, : quat.start], turned, moved[:, quat.stop :]], 1)
+
+
+class WindowModel(DeformableModel):
+    """Gaussians and a field over a window of time that slides. There is no exposure."""
+
+    def __init__(self, rows: F32, field: Field, smooth: bool = True, slopes: F32 | None = None) -> None:
+        """
+        Args:
+            rows: [N, 14] of the first frame; where they are now become their places.
+            field: its HexPlane has a window that slides.
+            smooth: whether the 3D filter is on.
+            slopes: [N, 3] as in `DeformableModel`.
+        """
+        neutral = Exposure(np.zeros(1, np.int64), np.ones((1, 3), np.float32))
+        self._anchored = AnchoredField(field, rows[:, columns.MEAN])
+        super().__init__(rows, self._anchored, neutral, smooth, slopes)
+        self._asks_at_places = isinstance(field, PointField)  # control nodes stay where they are
+        self._first_box: F64 = field.deltas.hexplane.box.copy()
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of all that is learnt and of its optimisers."""
+        deltas = self.field.deltas
+        tables: list[NDArray[Any]] = [
+            self.table,
+            self._anchored.places,
+            self.ids,
+            deltas.hexplane.cells.detach().numpy(),
+        ]
+        for adam in (self.adam, deltas.hexplane.adam):
+            tables += [adam.moments, adam.shares]
+        parameters = sum(parameter.nbytes for parameter in deltas.decoder.parameters())
+        return sum(table.nbytes for table in tables) + 3 * parameters
+
+    def advance(self, t_ns: int, folds: bool = True) -> int:
+        """Let the window reach `t_ns`. Every slot that leaves it is folded into the canonical rows, or
+        forgotten, which only shows what folding is for.
+
+        Returns:
+            How many left it.
+        """
+        hexplane = self.field.deltas.hexplane
+        retired: list[int] = []
+
+        def fold(slot_ns: int) -> None:
+            if folds:
+                self.table[:] = self._anchored.carry(self.table, slot_ns, slot_ns + hexplane.slot_ns)
+            retired.append(slot_ns)
+
+        hexplane.advance(t_ns, fold)
+        return len(retired)
+
+    def keep(self, kept: Bool) -> None:
+        """Remove the Gaussians where `kept` [N] is False."""
+        self._anchored.place(self._anchored.places[kept])
+        super().keep(kept)
+
+    def insert(self, rows: F32, t_ns: int, slopes: F32 | None = None) -> None:
+        """Add Gaussians that are as `rows` [M, 14] and `slopes` [M, 3] say at `t_ns`.
+
+        They get places as if they had been there from the start, moved by what moved their neighbours.
+        """
+        count, anchored = len(self), self._anchored
+        means = np.ascontiguousarray(rows[:, columns.MEAN])
+        with torch.no_grad():
+            others = self.rows_at(t_ns)[:, columns.MEAN].contiguous().numpy()
+        index, weight, _ = nearest_nodes(means, others)
+        moved = ((others - anchored.places)[index] * weight[..., None]).sum(axis=1)
+        places = means - moved
+        if self._asks_at_places:
+            self._grow(places)
+        anchored.place(np.concatenate([anchored.places, places]))
+        there = np.concatenate([self.table, rows])
+        self.append(anchored.carry(there, t_ns, anchored.anchor_ns)[count:], index[:, 0].astype(np.int64))
+        if self.slopes is not None and slopes is not None:
+            self.slopes.detach()[count:] = torch.from_numpy(slopes)
+
+    def _grow(self, places: F32) -> None:
+        """Let the field's box hold the places, but never more than memory may grow."""
+        first = self._first_box
+        reach = MOST_GROWTH * (first[1] - first[0])
+        box = np.array([places.min(axis=0), places.max(axis=0)], np.float64)
+        self.field.deltas.hexplane.grow(np.clip(box, first[0] - reach, first[1] + reach))

@@ -1,0 +1,302 @@
+"""The HexPlane against its formula, and the window that slides and grows."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+
+from sags_node.errors import SagsError, UsageError
+from sags_node.field import hexplane as module
+from sags_node.field.hexplane import PAIRS, HexPlane, for_clip
+from sags_node.types import F32
+
+BOX = np.array([[-0.05, -0.04, 0.03], [0.05, 0.04, 0.1]])  # m
+SECOND = 1_000_000_000
+T0 = 1_700_000_000 * SECOND
+
+
+def small_field(slots: int = 4, levels: int = 2, channels: int = 16) -> HexPlane:
+    return HexPlane(BOX, T0, SECOND, slots, cells=(8, 6, 5), levels=levels, channels=channels)
+
+
+def shuffled(field: HexPlane, seed: int = 0) -> HexPlane:
+    """With random cells everywhere, and all its slots."""
+    field.newest = field.slots - 1
+    values = field.cells.detach().numpy()
+    values[:] = np.random.default_rng(seed).uniform(-1, 1, values.shape)
+    return field
+
+
+def by_the_formula(field: HexPlane, cells: torch.Tensor, points: torch.Tensor, t_ns: int) -> torch.Tensor:
+    """Features of points within the box, one plane after the other, by torch's own bilinear sampling."""
+    low, high = torch.tensor(field.box)
+    at = 2 * (points - low) / (high - low) - 1  # torch's coordinates: -1 and 1 are the first and last node
+    slot, share = divmod(t_ns - field.t0_ns, field.slot_ns)
+    when = torch.full_like(at[:, 0], 2 * share / field.slot_ns - 1)
+    levels, first = [], 0
+    for level, (x, y, z) in enumerate(field.nodes.tolist()):
+        feature = torch.ones((), dtype=points.dtype)
+        for a, b in PAIRS:
+            sizes = (x, y, z)[a], (x, y, z)[b]
+            plane = cells[first : first + sizes[0] * sizes[1]].view(*sizes, -1)
+            first += sizes[0] * sizes[1]
+            feature = feature * bilinear(plane, at[:, b], at[:, a])
+        skipped = int(field.nodes[:level].sum())
+        for axis, count in enumerate((x, y, z)):
+            begin = skipped + sum((x, y, z)[:axis])
+            lines = [cells[field.slot(slot + k)][begin : begin + count] for k in (0, 1)]
+            feature = feature * bilinear(torch.stack(lines), at[:, axis], when)
+        levels.append(feature)
+    return torch.cat(levels, 1)
+
+
+def bilinear(picture: torch.Tensor, across: torch.Tensor, down: torch.Tensor) -> torch.Tensor:
+    """Values [N, C] of a picture [rows, columns, C] at places from -1 to 1."""
+    places = torch.stack([across, down], -1)[None, None]
+    sampled = torch.nn.functional.grid_sample(picture.permute(2, 0, 1)[None], places, align_corners=True)
+    return sampled[0, :, 0].T
+
+
+def inside(count: int) -> F32:
+    return np.random.default_rng(1).uniform(*BOX, (count, 3)).astype(np.float32)
+
+
+@pytest.mark.parametrize("channels", [1, 16, 24])
+@pytest.mark.parametrize("after", [0.3, 1.75, 2.0])
+def test_features_and_gradients_are_those_of_the_formula(channels: int, after: float) -> None:
+    field, t_ns = shuffled(small_field(channels=channels)), T0 + int(after * SECOND)
+    points = torch.from_numpy(inside(300)).requires_grad_()
+    features = field.sample(points, t_ns)
+    v = torch.from_numpy(np.random.default_rng(2).normal(size=features.shape).astype(np.float32))
+    found = [features, *torch.autograd.grad(features, [field.cells, points], v)]
+    cells = field.cells.detach().double().requires_grad_()
+    exactly = points.detach().double().requires_grad_()
+    expected = by_the_formula(field, cells, exactly, t_ns)
+    wanted = [expected, *torch.autograd.grad(expected, [cells, exactly], v.double())]
+    for got, want, bound in zip(found, wanted, (1e-5, 1e-5, 1e-4), strict=True):
+        assert (got - want).norm() < bound * want.norm()
+
+
+def test_gradients_against_finite_differences() -> None:
+    field = shuffled(HexPlane(BOX, T0, SECOND, 3, cells=(3, 2, 4), levels=1, channels=2))
+    field.cells = field.cells.detach().double().requires_grad_()
+    points = torch.from_numpy(inside(6)).double().requires_grad_()
+
+    def sampled(cells: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
+        field.cells = cells
+        return field.sample(points, T0 + SECOND // 3)
+
+    assert torch.autograd.gradcheck(sampled, (field.cells, points), eps=1e-7)
+
+
+def test_points_outside_take_the_value_of_the_border() -> None:
+    field = shuffled(small_field())
+    points = np.random.default_rng(3).uniform(BOX[0] - 0.1, BOX[1] + 0.1, (500, 3)).astype(np.float32)
+    held = np.clip(points, *BOX.astype(np.float32))
+    points[0, 0], held[0, 0] = np.inf, BOX[1, 0]
+    asked = torch.from_numpy(points).requires_grad_()
+    features = field.sample(asked, T0 + SECOND)
+    (v_points,) = torch.autograd.grad(features.sum(), asked)
+    outside = torch.from_numpy(points != held)
+    assert outside.any(1).double().mean() > 0.5
+    assert not v_points[outside].any() and (v_points[~outside] != 0).double().mean() > 0.95
+    assert torch.allclose(features, field.sample(torch.from_numpy(held), T0 + SECOND), atol=1e-5)
+    assert bool(field.sample(torch.full((1, 3), torch.nan), T0).isfinite().all())
+
+
+def test_points_on_nodes_take_their_values() -> None:
+    field = shuffled(HexPlane(np.array([[0, 0, 0], [4, 4, 4.0]]), 0, 1, 1, cells=4, levels=1, channels=3))
+    points = torch.tensor(list(itertools.product(range(5), repeat=3)), dtype=torch.float32)
+    cells, first = field.cells.detach(), 0
+    expected = torch.ones(125, 3)
+    for a, b in PAIRS:
+        expected = expected * cells[first + (5 * points[:, a] + points[:, b]).long()]
+        first += 25
+    for axis in range(3):
+        expected = expected * cells[first + 5 * axis + points[:, axis].long()]
+    assert torch.allclose(field.sample(points, 0), expected, atol=1e-6)
+
+
+def test_a_step_moves_the_cells_that_took_part_and_no_other() -> None:
+    field = small_field()
+    before = field.cells.detach().clone()
+    field.sample(torch.tensor([[0.011, 0.007, 0.053]]), T0).sum().backward()
+    field.step(0.1)
+    moved = (field.cells.detach() != before).any(1)
+    assert 0 < int(moved.sum()) <= 2 * (3 * 4 + 3 * 2)  # levels, corners of planes, nodes of lines
+    assert torch.allclose((field.cells.detach() - before)[moved].abs(), torch.tensor(0.1), rtol=1e-3)
+    field.step(0.1)
+    assert field.cells.grad is None  # nothing is learnt from the same gradient twice
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"channels": 0}, {"slots": 0}, {"cells": (1, 0, 2)}, {"levels": 0}, {"levels": 9}, {"slot_ns": 0},
+     {"box": [[0, 0, 0], [1, 0, 1]]}, {"box": [[0, 0, 0], [1, np.nan, 1]]}, {"box": [[0, 0], [1, 1]]}],
+)  # fmt: skip
+def test_impossible_numbers_are_refused(change: dict[str, object]) -> None:
+    with pytest.raises(UsageError, match="needs"):
+        HexPlane(**{"box": BOX, "t0_ns": 0, "slot_ns": SECOND} | change)  # type: ignore[arg-type]
+
+
+# ---- The window over a stream ----------------------------------------------------------------------------
+
+
+def write_time(field: HexPlane, number: int, value: float) -> None:
+    """Make slot `number` say `value` on its lines of x."""
+    lines, first = field.cells.detach()[field.slot(number)], 0
+    for x, y, z in field.nodes.tolist():
+        lines[first : first + x] = value
+        first += x + y + z
+
+
+def without_space(field: HexPlane) -> HexPlane:
+    """What all planes in space say is 1, so that only time counts."""
+    field.cells.detach()[: field.slot(0).start] = 1.0
+    return field
+
+
+def time_of(field: HexPlane, t_ns: int) -> float:
+    """What the lines of x say at a time."""
+    features = field.sample(torch.tensor([[0.01, 0.01, 0.05]]), t_ns).detach()
+    assert features.max() - features.min() < 1e-4
+    return float(features[0, 0])
+
+
+def never(t_ns: int) -> None:
+    raise AssertionError(f"the slot of {t_ns} retired")
+
+
+def test_first_values() -> None:
+    field = small_field()
+    cells = field.cells.detach()
+    space, time = cells[: field.slot(0).start], cells[field.slot(0).start :]
+    assert 0.7 <= space.min() < 0.75 and 1.25 < space.max() <= 1.3
+    assert abs(space.mean() - 1.0) < 0.01
+    assert bool((time == 1).all())
+    assert torch.equal(cells, small_field().cells)
+
+
+def test_ring_over_a_stream_much_longer_than_the_window() -> None:
+    """Each slot says its own number; the window must go on saying the time, and retire each slot once."""
+    field = without_space(small_field(slots=4))
+    write_time(field, 0, 0.0)
+    cells, retired = field.cells, []
+
+    def retire(t_ns: int) -> None:
+        retired.append((t_ns, time_of(field, t_ns)))  # still there to be sampled
+
+    for step in range(1, 400):
+        t_ns = T0 + step * SECOND // 10
+        before = field.newest
+        field.advance(t_ns, retire)
+        if field.newest > before:
+            assert field.newest == before + 1
+            assert time_of(field, T0 + field.newest * SECOND) == before  # a copy of the one before
+            write_time(field, field.newest, field.newest)
+        assert time_of(field, t_ns) == pytest.approx(step / 10, rel=1e-5)
+    assert (field.oldest, field.newest) == (37, 40)
+    assert retired == [(T0 + k * SECOND, float(k)) for k in range(37)]
+    assert field.cells is cells
+    assert time_of(field, T0 + 999 * SECOND) == 40  # constant after the newest and before the oldest
+    assert time_of(field, T0) == time_of(field, T0 - 5) == 37
+
+
+def test_times_within_the_window_retire_nothing() -> None:
+    field = small_field(slots=4)
+    for t_ns in (T0 + 3 * SECOND, T0 + SECOND, T0 - SECOND):
+        field.advance(t_ns, never)
+    assert (field.oldest, field.newest) == (0, 3)
+
+
+def test_gap_longer_than_the_window() -> None:
+    """All slots go, each once; the newest goes on; an hour takes no longer than a window."""
+    field = without_space(small_field(slots=4))
+    field.advance(T0 + 5 * SECOND, lambda t_ns: None)
+    write_time(field, 5, 7.0)
+    field.adam.moments[field.slot(5)] = 3.0
+    retired: list[int] = []
+    field.advance(T0 + 10**9 * SECOND, retired.append)
+    assert retired == [T0 + k * SECOND for k in (2, 3, 4, 5)]
+    for back in range(5):
+        assert time_of(field, T0 + (10**9 - back) * SECOND) == 7.0
+    assert (field.adam.moments[field.slot(0).start :] == 3.0).all()
+
+
+def test_finished_clip() -> None:
+    first, last = T0, T0 + 7 * SECOND + 3
+    field = without_space(for_clip(BOX, first, last, slots=5, cells=4, channels=16))
+    for slot in range(5):
+        write_time(field, slot, slot)
+    field.advance(last, never)
+    assert time_of(field, first) == 0
+    assert time_of(field, last) == pytest.approx(4, abs=1e-6)
+    assert time_of(field, (first + last) // 2) == pytest.approx(2, abs=1e-6)
+
+
+def test_one_slot_is_constant_in_time() -> None:
+    field = small_field(slots=1)
+    assert field.locate(T0 + 5 * SECOND) == field.locate(T0) == (0, 0, 0.0)
+
+
+@pytest.mark.parametrize(
+    "more", [([-0.06, 0, 0], [0, 0, 0]), ([0, 0, 0], [0.03, 0.2, 0.001]), ([-0.1, -0.1, -0.02], [0.1] * 3)]
+)
+def test_growth_changes_no_feature(more: tuple[list[float], list[float]]) -> None:
+    field = small_field()
+    rng = np.random.default_rng(4)
+    field.advance(T0 + 9 * SECOND, lambda t_ns: None)
+    for rows in (field.cells.detach().numpy(), field.adam.moments, field.adam.shares):
+        rows[:] = rng.uniform(0.5, 1, rows.shape)
+    wanted = BOX + more
+    points = torch.from_numpy(rng.uniform(wanted[0] - 0.01, wanted[1] + 0.01, (2000, 3)).astype(np.float32))
+    t_ns = T0 + 17 * SECOND // 2
+    before, box, nodes = field.sample(points, t_ns), field.box, field.nodes
+    known = field.adam.shares[:, 0]
+    assert field.grow(wanted)
+    assert (field.box[0] <= wanted[0] + 1e-9).all() and (field.box[1] >= wanted[1] - 1e-9).all()
+    assert np.allclose(
+        (box[1] - box[0]) / (nodes[1] - 1), (field.box[1] - field.box[0]) / (field.nodes[1] - 1)
+    )
+    assert torch.allclose(field.sample(points, t_ns), before, atol=2e-4) and before.abs().max() > 0.3
+    assert np.isin(known, field.adam.shares[:, 0]).all()  # no row was lost
+    assert not field.grow(wanted) and not field.grow(field.box)
+
+
+def test_growth_keeps_old_cells_trainable() -> None:
+    """A target that was fitted stays fitted while the new part of the box is fitted to another one."""
+    field = HexPlane(BOX, T0, SECOND, slots=2, cells=8, channels=16)
+    first = np.random.default_rng(5).uniform(*BOX, (2000, 3)).astype(np.float32)
+
+    def residual(points: F32, target: float) -> torch.Tensor:
+        return (field.sample(torch.from_numpy(points), T0) - target).square().mean()
+
+    def fit(points: F32, target: float, steps: int) -> None:
+        for _ in range(steps):
+            residual(points, target).backward()  # type: ignore[no-untyped-call]
+            field.step(0.02)
+
+    assert residual(first, 0.5) > 0.2
+    fit(first, 0.5, 150)
+    assert residual(first, 0.5) < 1e-3
+    shift = 3 * (BOX[1] - BOX[0])
+    far = (first + shift).astype(np.float32)
+    field.grow(np.array([BOX[0], BOX[1] + shift]))
+    fit(far, 2.0, 100)
+    assert residual(far, 2.0) < 1e-2
+    assert residual(first, 0.5) < 1e-3
+
+
+def test_growth_has_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "MAX_BYTES", 1 << 20)
+    field = small_field()
+    cells, box, features = field.cells, field.box, field.sample(torch.from_numpy(inside(9)), T0)
+    with pytest.raises(SagsError, match="MB, the limit is 1 MB"):
+        field.grow(BOX * 1e6)
+    with pytest.raises(UsageError, match="not finite"):
+        field.grow(BOX * np.inf)
+    assert field.cells is cells and field.box is box
+    assert torch.equal(field.sample(torch.from_numpy(inside(9)), T0), features)
