@@ -476,7 +476,7 @@ def test_a_session_in_real_time_is_seen_as_a_subscriber_sees_it(
     session_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    played, options = ["source.rate:=10", "ns:=room/sags"], MeasureOptions(hold_out=0)
+    played, options = ["source.rate:=10", "ns:=a/b"], MeasureOptions(hold_out=0)
     outcome = evaluate(session_folder, played, options, "realtime")
     summary = outcome.summary
     assert summary["frames"] == 20 and summary["held_out"] == 0
