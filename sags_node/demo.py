@@ -82,7 +82,7 @@ def run_demo(session: Session, out: Path, progress: Callable[[int, int | None, s
         consumed = _finish_overlay(overlay)
         with whole(out / VIDEO) as partial:
             video = H264File(partial, session.source.rate, session.working_size)
-            shown = _Shown(video, read_layers(spool.folder / LAYERS))
+            shown = Shown(video, read_layers(spool.folder / LAYERS))
             outcome = measure(
                 session, spool, _OPTIONS, (), lambda what, done: progress(done, frames, what), shown.add
             )
@@ -92,7 +92,7 @@ def run_demo(session: Session, out: Path, progress: Callable[[int, int | None, s
     return Demo(outcome.summary, page)
 
 
-class _Shown:
+class Shown:
     """What a display showed: the camera's picture, and what the overlay drew over it. For a missed frame,
     what was there before."""
 

@@ -39,7 +39,7 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.importing.check import played
 from sags_node.kernels.cache import cache_root
 from sags_node.messaging.security import check_endpoint, read_allow_list, read_key_pair
-from sags_node.pipeline.session import rig_of
+from sags_node.pipeline.session import lacks_rig, rig_of
 from sags_node.rig.hand_eye import read_hand_eye
 from sags_node.ros.graph import domain_of
 from sags_node.sources.gst import whole_launch
@@ -115,7 +115,13 @@ def _launched(config: LaunchConfig) -> list[Check]:
         if isinstance(part, Ros2Source | Ros2Robot):
             checks.append(_ros(section, part))
     comes_with_pictures = isinstance(source, Ros2Source) and config.rig is None
-    if not (isinstance(source, PhantomSource) or comes_with_pictures):
+    uncalibrated = False
+    with suppress(SagsError):  # a recording that cannot be read was said
+        uncalibrated = not isinstance(source, PhantomSource) and lacks_rig(config)
+    if uncalibrated:
+        fix = "depth has no unit without one; sags calib stereo makes one, then set rig"
+        checks.append(Check("calibration", "warning", "no calibration", fix))
+    elif not (isinstance(source, PhantomSource) or comes_with_pictures):
         readable = all(check.level != "error" for check in checks)
         checks.append(_tried("calibration", lambda: _check_rig(config, readable), "can be used"))
     if robot is not None:

@@ -24,6 +24,7 @@ STAGES: Mapping[str, str] = {  # code -> which stage of the work it is about
     "eyes_exchanged": "eyes",
     "eyes_knocked": "eyes",
     "rows_differ": "calibration",
+    "uncalibrated": "calibration",
     "tissue_too_near": "depth",
     "picture_frozen": "picture",
     "picture_dark": "picture",

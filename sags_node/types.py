@@ -94,6 +94,8 @@ class StereoRig:
     name: str
     left: Eye
     right: Eye
+    # False: guessed, so that lengths are right up to a factor that nobody knows.
+    metric: bool = field(default=True, kw_only=True)
 
     @property
     def baseline(self) -> float:
@@ -423,6 +425,7 @@ class NodeHealth:
     state: str  # starting | running | held | waiting | paused | degraded | stopping
     rate_hz: float
     latency_ms: Mapping[str, float]  # p50, p90, p99, max over the last seconds
+    frame_ms: Mapping[str, float]  # the same of the work on a frame
     stage_ms: Mapping[str, float]
     dropped: Mapping[str, int]  # per slot
     gaussians: int

@@ -95,7 +95,7 @@ def test_what_stood_there_stays(disk: Path, tiny: Path) -> None:
     (disk / "x.ply").write_text("mine")
     (disk / "x.json").write_text('{"provenance": "older"}')
     fill(disk, 0)
-    session = ("export", "--session", tiny, *SMALL, "--force")
+    session = ("export", tiny, *SMALL, "--force")
     refused(1, *session, "--mesh", disk / "x.ply", said=(NO_SPACE,))
     assert NO_SPACE in sags("eval", tiny, *SMALL, "--pace", "step", "--out", disk / "x.json").stderr
     assert (disk / "x.ply").read_text() == "mine" and "older" in (disk / "x.json").read_text()
@@ -120,7 +120,7 @@ def a_data_set(disk: Path) -> None:
     pytest.importorskip("pyarrow", reason="the extra archive is not installed")
     session, one = disk.parent / "session", disk.parent / "one"
     write_tiny_session(session, seed=0)
-    assert sags("export", "--session", session, *SMALL, "--lerobot", one).exit_code == 0
+    assert sags("export", session, *SMALL, "--lerobot", one).exit_code == 0
     merge([one], disk / "all", "v3.0")
 
 

@@ -91,7 +91,7 @@ def test_what_a_decoder_says_of_a_picture_that_it_can_read_is_logged_once(
     caplog: pytest.LogCaptureFixture,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(picture_file, "_complaints", picture_file._Complaints())
+    monkeypatch.setattr(picture_file, "complaints", picture_file.Complaints())
     for name, content in (
         ("1.png", png(extra=chunk(b"iCCP", b"x\0\0garbage"))),
         ("2.png", png(extra=chunk(b"iCCP", b"y\0\0garbage"))),

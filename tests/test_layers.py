@@ -85,6 +85,59 @@ def test_the_package_imports_nothing_that_stands_beside_it() -> None:
     assert [name for name, file in FILES.items() if lines.search(file.read_text())] == []
 
 
+# Private names that tests use. The first three are gsplat's and Numba's; the package has such names, too.
+REACHED_INTO = {
+    ("engine/test_device.py", "_C"),
+    ("engine/test_device.py", "_backend"),
+    ("kernels/test_kernel_cache.py", "_cache"),
+    ("fitting/test_stream_fit.py", "_drawn_ns"),  # whose rows must stay those of the model it thins out
+    ("model/test_model.py", "_LEAST_STIFFNESS"),  # without stiffness: the twin that it must be better than
+}
+PRIVATE = re.compile(r"\b_[a-zA-Z]\w*")
+NAMED_TUPLES = {"_asdict", "_fields", "_make", "_replace"}
+
+
+def reached_into(code: str) -> set[str]:
+    """Private names of others that some code uses."""
+    found = set()
+    for node in ast.walk(ast.parse(code)):
+        if isinstance(node, ast.Attribute):
+            if not (isinstance(node.value, ast.Name) and node.value.id in ("self", "cls")):
+                found.add(node.attr)
+        elif isinstance(node, ast.ImportFrom):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(("setattr", "getattr")):
+            names = [arg.value for arg in node.args if isinstance(arg, ast.Constant)]
+            found |= {name.split(".")[-1] for name in names if isinstance(name, str)}
+    return {name for name in found if PRIVATE.fullmatch(name)} - NAMED_TUPLES
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "from sags_node.engine.device import _made",
+        "thing._made = 3",
+        "super()._made()",
+        "assert things[0]._made",
+        "monkeypatch.setattr(thing, '_made', 3)",
+        "monkeypatch.setattr('sags_node.engine.device._made', 3)",
+    ],
+)
+def test_no_way_to_reach_into_the_package_goes_unseen(code: str) -> None:
+    assert reached_into(code) == {"_made"}
+
+
+def test_tests_use_what_is_public() -> None:
+    """Else the inside of a part could not be changed without its tests."""
+    files = [file for part in ("sags_node", "sags_lab", "benchmarks") for file in (ROOT / part).rglob("*.py")]
+    private = {name for file in files for name in PRIVATE.findall(file.read_text())}
+    assert {
+        (file.relative_to(ROOT / "tests").as_posix(), name)
+        for file in (ROOT / "tests").rglob("*.py")
+        for name in reached_into(file.read_text()) & private
+    } <= REACHED_INTO
+
+
 def said_in(folder: Path) -> str:
     return ast.get_docstring(ast.parse((folder / "__init__.py").read_text())) or ""
 

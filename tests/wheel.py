@@ -50,19 +50,19 @@ def main() -> None:
     assert not missing and not strangers, (missing, strangers)
     print(f"{wheel.name}: {wheel.stat().st_size / 1e6:.1f} MB, {len(names)} files", flush=True)
 
-    venv.create(OUT / "venv", with_pip=True)
-    python, sags = OUT / "venv/bin/python", OUT / "venv/bin/sags"
-    run(
-        python,
-        "-m",
-        "pip",
-        "-q",
-        "--disable-pip-version-check",
-        "install",
-        "-c",
-        ROOT / "constraints.txt",
-        f"{wheel}[report]",
+    sags = _installed(OUT / "client", str(wheel))
+    light = OUT / "client/bin/python"
+    brought = json.loads(run(light, "-m", "pip", "list", "--format", "json", "--disable-pip-version-check"))
+    assert "torch" not in {each["name"] for each in brought}, brought
+    run(light, "-c", "import sags_node.client", folder=home)
+    refused = subprocess.run(
+        [sags, "run"], check=False, cwd=home, stderr=subprocess.PIPE, text=True, timeout=60
     )
+    assert refused.returncode == 2 and "sags-node[node]" in refused.stderr, refused.stderr
+    print(f"a client: {len(brought)} packages", flush=True)
+
+    sags = _installed(OUT / "venv", f"{wheel}[node,report]")
+    python = OUT / "venv/bin/python"
     where = run(python, "-c", "import sags_node; print(sags_node.__file__)", folder=home).strip()
     assert Path(where).is_relative_to(OUT), where
     print(run(sags, "--version", folder=home).strip(), flush=True)
@@ -70,6 +70,14 @@ def main() -> None:
     assert shown["processed"] > 0 and shown["overlay"]["frames"] > 0, shown
     assert {"report.html", "overlay.mp4"} <= {file.name for file in (home / "demo").iterdir()}
     print(f"sags demo: {shown['processed']} frames, {shown['overlay']['frames']} of the overlay", flush=True)
+
+
+def _installed(folder: Path, what: str) -> Path:
+    """The command `sags` of an environment of its own."""
+    venv.create(folder, with_pip=True)
+    pip = [folder / "bin/python", "-m", "pip", "-q", "--disable-pip-version-check"]
+    run(*pip, "install", "-c", ROOT / "constraints.txt", what)
+    return folder / "bin/sags"
 
 
 if __name__ == "__main__":

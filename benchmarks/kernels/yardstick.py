@@ -2,7 +2,7 @@
 
 A ratio of two times on one machine in one run says how good machine code is; the times themselves say more
 about the machine. The program is one file, not part of this project. It is compiled for this processor, and
-exports what `_Program` calls: project, sort, bin, blend, and the same backwards. It gives no
+exports what `Program` calls: project, sort, bin, blend, and the same backwards. It gives no
 contributions, which ours does, and its screen filter is 0.3 px^2.
 """
 
@@ -72,7 +72,7 @@ def measure_yardstick(source: Path, settings: YardstickSettings, advance: Advanc
 
 
 def _compare(library: ctypes.CDLL, case: RasterCase, runs: int) -> dict[str, Any]:
-    ours, program = Drawing(case), _Program(library, case)
+    ours, program = Drawing(case), Program(library, case)
     forward_ms, program_forward_ms = _alternate(ours.forward, program.forward, runs)
     both_ms, program_both_ms = _alternate(ours.forward_backward, program.forward_backward, runs)
     return {
@@ -123,7 +123,7 @@ def compiled(source: Path, threads: int) -> Iterator[ctypes.CDLL]:
             errors = [line for line in done.stderr.splitlines() if "error" in line] or [done.stderr.strip()]
             raise SagsError(f"g++ does not compile {source}: {errors[0]}")
         loaded = ctypes.CDLL(str(library))
-        missing = [name for name in _FUNCTIONS if not hasattr(loaded, name)]
+        missing = [name for name in FUNCTIONS if not hasattr(loaded, name)]
         if missing:
             raise SagsError(f"{source} is no yardstick: it does not define {', '.join(missing)}")
         loaded.bin.restype = ctypes.c_int64
@@ -131,7 +131,7 @@ def compiled(source: Path, threads: int) -> Iterator[ctypes.CDLL]:
         yield loaded
 
 
-_FUNCTIONS = (
+FUNCTIONS = (
     "tile_w", "tile_h", "proj_fwd", "depth_sort", "bin", "comp_fwd", "comp_bwd", "reduce_pairs", "proj_bwd",
     "omp_set_num_threads",
 )  # fmt: skip
@@ -144,7 +144,7 @@ class _Camera(ctypes.Structure):
     )  # fmt: skip
 
 
-class _Program:
+class Program:
     """The C++ program with a case's scene and its buffers."""
 
     def __init__(self, library: ctypes.CDLL, case: RasterCase) -> None:

@@ -1,44 +1,36 @@
 """The node live on hosts that have less to give: one core, or neighbours that want the same cores.
 
-Every host is this machine. The node runs in a process of its own, on the recording's clock, sockets
-included, and is measured at the full working size whatever its rung. Who reads stands for another machine and
+Every host is this machine. The node is run as users run it, on the recording's clock, and measured from
+outside: what a subscriber gets, enlarged to the full working size. Who reads stands for another machine and
 takes only what the node leaves of the cores.
 """
 
 from __future__ import annotations
 
-import multiprocessing
-import os
 import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, ExitStack
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
 from benchmarks.kernels.contention import burning_core
-from benchmarks.node.neighbours import NS, STARTING, STOPPING, find_browser, overlay, reader, viewer
-from benchmarks.pareto.full_size import online_at
-from sags_node.errors import SagsError
+from benchmarks.node.neighbours import NS, find_browser, overlay, reader, viewer
+from sags_node.evaluation import live
 from sags_node.evaluation.measure import MeasureOptions
-from sags_node.evaluation.session import measure, run_realtime
-from sags_node.evaluation.spool import Spool
-from sags_node.pipeline.session import at_best_scale, open_session
+from sags_node.evaluation.receipt import Receipt
+from sags_node.evaluation.session import again
+from sags_node.evaluation.summary import summarise
+from sags_node.messaging.address import NodeAddress
+from sags_node.pipeline.session import open_session
 from sags_node.pipeline.warm_up import warm_up
-
-MEASURING = 600.0  # s to measure a run beyond its length
+from sags_node.vision.rectify import Rectifier
 
 Row = dict[str, Any]
 Beside = Callable[[Path], AbstractContextManager[Any]]  # a neighbour of the node in that run directory
 
 
-def measure_hosts(
-    launch: str | None, overrides: Sequence[str], seconds: float, progress: Callable[[str], None]
-) -> list[Row]:
+def measure_hosts(launch: str | None, overrides: Sequence[str], progress: Callable[[str], None]) -> list[Row]:
     """One row for each host, keys as benchmarks/README.md lists them.
-
-    Args:
-        seconds: that the recording lasts.
 
     Raises:
         SagsError: a node or a neighbour does not run.
@@ -52,9 +44,11 @@ def measure_hosts(
             if beside is not None:
                 stack.enter_context(beside(run_dir))
             cores = 1 if name == "one core" else None
-            rows.append(
-                {"name": name, "part": "hosts", **_played(launch, overrides, run_dir, cores, seconds)}
-            )
+            row = {"name": name, "part": "hosts", **_played(launch, overrides, run_dir, cores)}
+        if name == "alone":  # what reading costs
+            with tempfile.TemporaryDirectory(prefix="sags-hosts-") as folder:
+                row["unread"] = _played(launch, overrides, Path(folder) / "sags", cores, read=False)
+        rows.append(row)
     return rows
 
 
@@ -73,70 +67,37 @@ def neighbours() -> dict[str, Beside | None]:
 
 
 def _played(
-    launch: str | None, overrides: Sequence[str], run_dir: Path, cores: int | None, seconds: float
+    launch: str | None, overrides: Sequence[str], run_dir: Path, cores: int | None, read: bool = True
 ) -> Row:
-    spawn = multiprocessing.get_context("spawn")
-    here, there = spawn.Pipe()
-    arguments = (launch, list(overrides), str(run_dir), there)
-    process = spawn.Process(target=_play, args=arguments, daemon=True)
-    mine = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, sorted(mine)[:cores])  # the process inherits it before it counts its cores
-    try:
-        process.start()
-    finally:
-        os.sched_setaffinity(0, mine)
-    there.close()
-    try:
-        if not here.poll(STARTING + seconds + MEASURING):
-            raise SagsError("a run did not end in time")
-        row: Row | str = here.recv()
-    except EOFError:
-        raise SagsError("the process of a run died") from None
-    finally:
-        process.terminate()
-        process.join(STOPPING)
-        process.kill()
-    if isinstance(row, str):
-        raise SagsError(row)
-    return row
-
-
-def _play(launch: str | None, overrides: list[str], run_dir: str, there: Connection) -> None:
-    """The process of a run: sends its row, or what went wrong."""
-    try:
-        there.send(_live(launch, overrides, run_dir))
-    except SagsError as error:
-        there.send(str(error))
-
-
-def _live(launch: str | None, overrides: list[str], run_dir: str) -> Row:
-    sockets = [
-        "publish.data:=[tcp://127.0.0.1:*]",
-        "publish.control:=tcp://127.0.0.1:*",
-        f"publish.run_dir:={run_dir}",
-    ]
-    live = ["source.loop:=false", "source.pace:=realtime", "mapping.iterations:=null", f"ns:={NS}"]
-    session = open_session(launch, [*overrides, *sockets, *live])
+    """One run, seen from outside; pictures are compared at the full working size."""
+    sockets = ["publish.data:=[tcp://127.0.0.1:*]", "publish.control:=tcp://127.0.0.1:*"]
+    played = ["source.loop:=false", "source.pace:=realtime", "mapping.iterations:=null", f"ns:={NS}"]
+    forced = [*sockets, *played, f"publish.run_dir:={run_dir}"]
+    session = open_session(launch, [*overrides, *forced])
     warm_up(session.config)
-    full = session.config.vision.model_copy(update={"scale": 1.0})
-    session = at_best_scale(session)
-    options = MeasureOptions(hold_out=0)
-    with Spool() as spool:
-        run_realtime(session, session.config.publish, options, spool, lambda what, frames: None)
-        outcome = measure(session, spool, options)
-        online = online_at(
-            full.working_size(session.rig.left.width, session.rig.left.height),
-            session,
-            spool,
-            options,
-            lambda what, frames: None,
-        )
-    after = outcome.rows[round(session.source.rate) :]
-    summary = outcome.summary
-    kept = ("first_render_ms", "frame_ms", "latency_ms", "online", "gaussians", "rungs")
+    arguments = [*([] if launch is None else [launch]), *overrides, *forced]
+    options, node = MeasureOptions(hold_out=0), NodeAddress(NS, run_dir=run_dir)
+    with live.Copies() as copies:
+        topics = live.TOPICS if read else [live.STATUS]
+        account = live.play(arguments, node, copies, lambda what, frames: None, topics, cores)
+        own = {key: account[key] for key in ("frame_ms", "latency_ms", "gaussians", "dropped")}
+        if not read:
+            return own
+        full = session.working_size
+        receipt = Receipt(session.rig, full, None)
+        judge = live.Judge(copies, Rectifier(session.rig, *full), options, receipt)
+        with again(session) as frames:
+            judge.run(frames, lambda what, frames: None)
+        size = list(copies.size())
+    after = judge.rows[round(session.source.rate) :]
+    summary = summarise(session.name, judge.rows, options, session.config.segments, None)
+    kept = ("first_render_ms", "latency_ms", "gaussians", "rungs", "depth")
     return {
         "share_after_first_second": sum(row.facts is not None for row in after) / max(1, len(after)),
         **{key: summary[key] for key in kept},
-        "size": list(session.working_size),
-        "online_at_full_size": online,
+        "frame_ms": own["frame_ms"],
+        "dropped": own["dropped"],
+        "size": size,
+        "receipt": receipt.as_json(),
+        "online_at_full_size": summary["online"],
     }

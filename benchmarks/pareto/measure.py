@@ -146,13 +146,11 @@ class _Comparison:
                 {"rule": rule, **_effect(_middle(runs[on]), _middle(runs[off]))}
                 for rule, (on, off) in skips.items()
             ],
-            "hosts": self._hosts(frames or 0, rate) if HOSTS in parts else [],
+            "hosts": self._hosts() if HOSTS in parts else [],
         }
 
-    def _hosts(self, frames: int, rate: float) -> list[Row]:
-        return measure_hosts(
-            self._launch, self._overrides, frames / rate, lambda what: self._progress(what)("", 0)
-        )
+    def _hosts(self) -> list[Row]:
+        return measure_hosts(self._launch, self._overrides, lambda what: self._progress(what)("", 0))
 
     @contextmanager
     def _played(self, setting: Setting, progress: Progress) -> Iterator[tuple[Session, Spool]]:

@@ -88,6 +88,15 @@ def _hosts(session: Row) -> Table:
             _decibels(row["online_at_full_size"], list(session["segments"])),
             _number(row["gaussians"]["mean"], ",.0f"),
         )
+        if "unread" in row:  # by its own account: nobody saw a picture
+            times = [
+                _number(row["unread"][key][place], ".1f")
+                for key in ("frame_ms", "latency_ms")
+                for place in ("p50", "p99")
+            ]
+            made.add_row(
+                "alone, nobody reads", "-", "-", *times, "-", "-", _number(row["unread"]["gaussians"], ",.0f")
+            )
     return made
 
 

@@ -12,6 +12,7 @@ from annotated_types import Ge, Gt, Le
 from pydantic.fields import FieldInfo
 
 from sags_node.config.schema import (
+    LIVE_PARAMETERS,
     BagRobot,
     Box,
     GeometryConfig,
@@ -48,6 +49,8 @@ mapping:
 
 - The first argument is the path of a launch file, of a folder with a `launch.yaml` in it, or of a
   [recording](recordings.md) that is recognised by its files. Without one the built-in phantom is played.
+- `sags new RECORDING -o my_launch.yaml` writes one.
+- `sags param set key:=value` changes keys of a running node. They say so below.
 - `key:=value` on the command line wins over the file. Keys are written with dots, as in the tables below.
   Values are YAML: `source.right:=null`, `'publish.data:=[tcp://*:5556]'`.
 - An unknown key is an error that names the nearest known one, or the key that replaced it. So is a wrong
@@ -127,7 +130,8 @@ def _table(section: type[Section], prefix: str, title: str, names: list[str]) ->
     yield "|---|---|---|---|"
     for name, field in fields.items():
         said, default = _said(field)
-        yield f"| `{prefix}{name}` | {_value(field)} | {default} | {said} |"
+        live = ". It can change while the node runs" if f"{prefix}{name}" in LIVE_PARAMETERS else ""
+        yield f"| `{prefix}{name}` | {_value(field)} | {default} | {said}{live} |"
     yield ""
 
 

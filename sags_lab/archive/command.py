@@ -22,8 +22,8 @@ from sags_node.cli.launching import (
     force_option,
     launch_argument,
     positive,
-    split,
     split_recording,
+    words_of,
     write_json,
 )
 from sags_node.errors import SagsError, UsageError
@@ -203,7 +203,7 @@ def run(
     from sags_lab.archive.work import Plan, needs
     from sags_node.evaluation.provenance import revision
 
-    path, overrides = split(source)
+    path, overrides = words_of(source)
     if path is None:
         raise UsageError("name a manifest (sags archive scan makes one), or a folder of recordings")
     if local and address is not None:

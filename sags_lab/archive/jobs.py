@@ -14,12 +14,12 @@ Arguments = Callable[[list[str], Path], list[str]]
 
 JOBS: dict[str, Arguments] = {
     "eval": lambda said, out: ["eval", *said, "--pace", "step", "--report", str(out / "report"), "--json"],
-    "depth": lambda said, out: ["export", "--session", *said, "--depth", str(out / "depth"), "--json"],
-    "tracks": lambda said, out: ["export", "--session", *said, "--tracks", str(out / "tracks.npz"), "--json"],
-    "render": lambda said, out: ["export", "--session", *said, "--render", str(out / "model.mp4"), "--json"],
-    "lerobot": lambda said, out: ["export", "--session", *said, "--lerobot", str(out / "lerobot"), "--json"],
+    "depth": lambda said, out: ["export", *said, "--depth", str(out / "depth"), "--json"],
+    "tracks": lambda said, out: ["export", *said, "--tracks", str(out / "tracks.npz"), "--json"],
+    "render": lambda said, out: ["export", *said, "--render", str(out / "model.mp4"), "--json"],
+    "lerobot": lambda said, out: ["export", *said, "--lerobot", str(out / "lerobot"), "--json"],
     "record": lambda said, out: [
-        *("bag", "record", "--session", *said),
+        *("bag", "record", *said),
         *("-o", str(out / "bag"), "--compression", "jpeg", "--json"),
     ],
     "fit": lambda said, out: ["fit", *said, "--out", str(out / "fit"), "--json"],

@@ -31,10 +31,14 @@ class Followed:
     pixels: F64  # [P, 2] px, raw left picture
     points: F64  # [P, 3] m, left rectified camera; NaN: never known
     found: Bool  # [P]
+    anchors: I64  # [P] that follow them; -1: none could be pinned there
 
     @staticmethod
     def unknown(pixels: F64) -> Followed:
-        return Followed(pixels, np.full((len(pixels), 3), np.nan), np.zeros(len(pixels), np.bool_))
+        count = len(pixels)
+        return Followed(
+            pixels, np.full((count, 3), np.nan), np.zeros(count, np.bool_), np.full(count, -1, np.int64)
+        )
 
 
 class PointTracker:
@@ -106,7 +110,7 @@ class PointTracker:
                 self._said[anchor] = pixel, point
                 found[number] = True
             pixels[number], points[number] = self._said[anchor]
-        return Followed(pixels, points, found)
+        return Followed(pixels, points, found, anchors)
 
     def _to_working(self, pixels: F64) -> F64:
         return to_working(self._rig.left, self._pipeline.rectifier.camera, pixels)

@@ -80,7 +80,7 @@ class _Displays:
     def __init__(self, launches: Mapping[str, str], options: GstOptions) -> None:
         self._launches, self._options = launches, options
         self._key: tuple[int, int, int] | None = None  # RGB
-        self._displays: dict[str, _Display] = {}
+        self._displays: dict[str, Display] = {}
 
     def wants(self, output: Output) -> bool:
         return True
@@ -99,7 +99,7 @@ class _Displays:
         if display is None or (display.size, display.key) != (size, self._key):
             if display is not None:
                 display.close()
-            display = _Display(self._launches[eye], size, self._key, self._options.rate)
+            display = Display(self._launches[eye], size, self._key, self._options.rate)
             self._displays[eye] = display
         age = (self._options.overlay.now_ns() - received.stamp_ns) * 1e-9
         display.show(received.array, self._options.max_age - age)
@@ -122,8 +122,14 @@ class _Displays:
             display.close()
 
 
-class _Display:
+class Display:
     """One eye's pipeline, and the thread that writes to it.
+
+    Args:
+        launch: what comes behind the pictures, as for gst-launch-1.0.
+        size: height and width of a picture, px.
+        key: RGB, what the display shows as nothing.
+        rate: Hz.
 
     Raises:
         SagsError: GStreamer is not there.

@@ -15,7 +15,15 @@ import click
 from rich.markup import escape
 
 from sags_node.cli import bag_text as say
-from sags_node.cli.launching import as_json, open_launched, positive, split_recording
+from sags_node.cli.launching import (
+    as_json,
+    launch_argument,
+    open_launched,
+    played_instead,
+    positive,
+    session_option,
+    split_recording,
+)
 from sags_node.cli.node_options import endpoint_option, node_options, ns_option
 from sags_node.errors import SagsError, UsageError
 from sags_node.terminal.console import console, on_stop_signals, progress, show
@@ -35,13 +43,8 @@ def bag() -> None:
 
 
 @bag.command()
-@click.argument("overrides", nargs=-1, metavar="[key:=value ...]")
-@click.option(
-    "--session",
-    metavar="LAUNCH.yaml",
-    help="Play this recording through a node of its own and record all of it; key:=value changes it, as for "
-    "sags run.",
-)
+@launch_argument
+@session_option
 @click.option(
     "-o",
     "--out",
@@ -96,7 +99,7 @@ def bag() -> None:
 @click.option("--seconds", type=positive, help="Stop after so long; default: Ctrl-C.")
 @as_json
 def record(
-    overrides: tuple[str, ...],
+    launch: tuple[str, ...],
     session: str | None,
     out: Path | None,
     topics: tuple[str, ...],
@@ -112,7 +115,7 @@ def record(
 ) -> None:
     """Record what a running node publishes until Ctrl-C.
 
-    With --session: all that comes of a recording.
+    Of a recording: it is played through a node of its own, and all that comes of it is recorded.
 
     Leaves a rosbag2 folder: MCAP files that Foxglove, PlotJuggler and `ros2 bag` open, and metadata.yaml.
     Calibration and parameters are attached. Messages that the disk was too slow for are counted as dropped,
@@ -123,22 +126,24 @@ def record(
     sags bag record --topics left/image_rect_color --topics right/image_rect_color
     sags bag record -o out/case2 --max-bag-size 4000000000
     sags bag record -o out/last --snapshot-mode 20 & kill -USR1 $!
-    sags bag record -o out/case3 --session launch/d4d_pull.yaml mapping.budget_ms:=100
+    sags bag record launch/d4d_pull.yaml -o out/case3 mapping.budget_ms:=100
     """
     from datetime import datetime
 
-    if session is None and (stray := [said for said in overrides if ":=" not in said]):
+    if stray := [said for said in launch if ":=" not in said and not Path(said).exists()]:
         named = " ".join(f"--topics {topic}" for topic in (*topics, *stray))
         raise UsageError(
-            f"{' '.join(stray)}: topics are named so: {named}; without --topics all are recorded"
+            f"{' '.join(stray)}: no such recording; topics are named so: {named}; without --topics all are "
+            "recorded"
         )
-    if overrides and session is None:
-        raise UsageError(f"{overrides[0]}: key:=value needs --session LAUNCH.yaml")
-    if session is not None and (
+    words = played_instead(launch, session)
+    if launch and words is None:
+        raise UsageError(f"{launch[0]}: key:=value needs a recording: sags bag record RECORDING key:=value")
+    if words is not None and (
         snapshot_mode is not None or from_stdin or seconds is not None or node.endpoint
     ):
         raise UsageError(
-            "--session records a whole recording: no --snapshot-mode, --stdin, --seconds, --endpoint"
+            "a recording is recorded as a whole: no --snapshot-mode, --stdin, --seconds, --endpoint"
         )
 
     from sags_node.messaging.stream import check_topic
@@ -166,8 +171,8 @@ def record(
             limits=Limits(max_bag_size, max_bag_duration),
             node=node,
         )
-        if session is not None:
-            summary = _recorded((session, *overrides), options)
+        if words is not None:
+            summary = _recorded(words, options)
             show(summary if json_out else say.recorded_table(summary))
             return
         recorder = Recorder(options)
@@ -187,7 +192,7 @@ def _recorded(launch: Sequence[str], options: RecordOptions) -> dict[str, Any]:
     from sags_node.cli.played_bag import record_session
 
     path, overrides = split_recording(
-        launch, "live cameras are recorded from the running node; leave out --session"
+        launch, "live cameras are recorded from the running node; name no recording"
     )
     if options.folder.exists():
         raise UsageError(f"{options.folder} exists already; name a new folder")

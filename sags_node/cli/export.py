@@ -13,8 +13,11 @@ from sags_node.cli.launching import (
     check_files,
     file_option,
     force_option,
+    launch_argument,
     open_launched,
+    played_instead,
     positive,
+    session_option,
     split_recording,
 )
 from sags_node.cli.node_options import endpoint_option, node_options, ns_option
@@ -25,16 +28,12 @@ from sags_node.terminal.console import progress, show
 if TYPE_CHECKING:
     from sags_node.messaging.address import NodeAddress
 
-NO_CAMERAS = "live cameras are exported from the running node; leave out --session"
+NO_CAMERAS = "live cameras are exported from the running node; name no recording"
 
 
 @click.command()
-@click.argument("overrides", nargs=-1, metavar="[key:=value ...]")
-@click.option(
-    "--session",
-    metavar="LAUNCH.yaml",
-    help="Play this recording instead, as fast as it goes; key:=value changes it, as for sags run.",
-)
+@launch_argument
+@session_option
 @click.option("--at", type=click.FloatRange(min=0), help="Seconds into the session; default: its end.")
 @click.option(
     "--fit",
@@ -56,16 +55,18 @@ NO_CAMERAS = "live cameras are exported from the running node; leave out --sessi
     "--sequence",
     metavar="FOLDER",
     type=click.Path(path_type=Path, file_okay=False),
-    help="All Gaussians of every frame of --session, a .ply each, and a video that plays in a loop. The same "
-    "command again goes on where it was ended.",
+    help="All Gaussians of every frame of a recording, a .ply each, and a video that plays in a loop. The "
+    "same command again goes on where it was ended.",
 )
-@file_option("--tracks", metavar="F.npz", help="64 points that are followed through all of --session, in 3D.")
-@file_option("--render", metavar="F.mp4", help="The model as the left eye sees it, every frame of --session.")
+@file_option("--tracks", metavar="F.npz", help="64 points that are followed through a recording, in 3D.")
+@file_option(
+    "--render", metavar="F.mp4", help="The model as the left eye sees it, each frame of a recording."
+)
 @click.option(
     "--depth",
     metavar="FOLDER",
     type=click.Path(path_type=Path, file_okay=False),
-    help="The model's depth of every frame of --session, 16-bit PNGs in units of 0.01 mm, 0 unknown.",
+    help="The model's depth of every frame of a recording, 16-bit PNGs in units of 0.01 mm, 0 unknown.",
 )
 @click.option(
     "--orbit-degrees",
@@ -81,7 +82,7 @@ NO_CAMERAS = "live cameras are exported from the running node; leave out --sessi
 @node_options
 @as_json
 def export(
-    overrides: tuple[str, ...],
+    launch: tuple[str, ...],
     session: str | None,
     at: float | None,
     fit: Path | None,
@@ -99,14 +100,15 @@ def export(
 ) -> None:
     """Write the model at one moment for other programs, in metres.
 
-    Of the running node, its newest frame; or of a recording at any time, with no node running.
+    Of the running node, its newest frame; or of a recording, played as fast as it goes, at any time; then no
+    node need run.
 
     \b
     sags export --mesh now.ply --points now.pcd
-    sags export --session launch/d4d_pull.yaml --at 3 --mesh lift.obj --orbit lift.mp4
-    sags export --session launch/d4d_pull.yaml --fit out/d4d --at 3 --splats lift.ply
-    sags export --session launch/d4d_pull.yaml --sequence out/frames
-    sags export --session launch/d4d_pull.yaml --depth out/depth --tracks out/tracks.npz
+    sags export launch/d4d_pull.yaml --at 3 --mesh lift.obj --orbit lift.mp4
+    sags export launch/d4d_pull.yaml --fit out/d4d --at 3 --splats lift.ply
+    sags export launch/d4d_pull.yaml --sequence out/frames
+    sags export launch/d4d_pull.yaml --depth out/depth --tracks out/tracks.npz
     """
     from sags_node.export import export as work
     from sags_node.export import scene as source
@@ -116,29 +118,30 @@ def export(
     played = {kind: path for kind, path in of_every_frame.items() if path is not None}
     asked = {"splats": splats, "points": points, "mesh": mesh, "orbit": orbit}
     targets = {kind: path for kind, path in asked.items() if path is not None}
-    if played and (targets or sequence or at is not None or fit is not None or session is None):
+    words = played_instead(launch, session)
+    if played and (targets or sequence or at is not None or fit is not None or words is None):
         raise UsageError(
-            f"--{next(iter(played))} is of every frame: it needs --session LAUNCH.yaml, and no files of one "
-            "moment, --sequence, --at or --fit beside it"
+            f"--{next(iter(played))} exports all frames: name a recording, and leave out --mesh, --points, "
+            "--splats, --orbit, --sequence, --at, --fit"
         )
-    if played and session is not None:
+    if played and words is not None:
         for kind, target in played.items():
             if KINDS[kind].is_folder:
                 new_folder(target)
             else:
                 check_files(target, force=force)
-        _export_played((session, *overrides), played, json_out)
+        _export_played(words, played, json_out)
         return
     if sequence is None:
         work.check_targets(targets, force)
-    elif targets or at is not None or session is None:
-        raise UsageError("--sequence needs --session LAUNCH.yaml, and neither --at nor other files beside it")
-    if session is None and (overrides or at is not None or fit is not None):
-        raise UsageError("--at, --fit and key:=value need --session LAUNCH.yaml")
-    if session is not None:
-        path, changed = split_recording((session, *overrides), NO_CAMERAS)
+    elif targets or at is not None or words is None:
+        raise UsageError("--sequence exports all frames: name a recording, no --at and no other files")
+    if words is None and (launch or at is not None or fit is not None):
+        raise UsageError("--at, --fit and key:=value need a recording: sags export RECORDING ...")
+    if words is not None:
+        path, changed = split_recording(words, NO_CAMERAS)
         opened = open_launched(path, [*changed, "source.loop:=false", "source.pace:=step"])
-    if sequence is not None and session is not None:
+    if sequence is not None and words is not None:
         fitted = None if fit is None else str(fit.resolve())
         about = {"session": opened.name, "overrides": changed, "fit": fitted}
         many.check_sequence(sequence, about, force)
@@ -154,7 +157,7 @@ def export(
         show(rows if json_out else text.rows_table(rows))
         return
     with progress("exporting") as advance:
-        if session is None:
+        if words is None:
             scene = source.from_node(node)
         elif fit is None:
             scene = source.from_session(opened, at, advance)

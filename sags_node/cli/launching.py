@@ -22,7 +22,9 @@ if TYPE_CHECKING:
 
 positive = click.FloatRange(min=0, min_open=True)
 
-launch_argument = click.argument("launch", nargs=-1, metavar="[LAUNCH.yaml | SESSION] [key:=value ...]")
+launch_argument = click.argument(
+    "launch", nargs=-1, metavar="[FOLDER | VIDEO | LAUNCH.yaml] [key:=value ...]"
+)
 as_json = click.option("--json", "json_out", is_flag=True, help="Print JSON on stdout, for machines.")
 all_figures = click.option("-v", "--verbose", is_flag=True, help="Print all figures, not the verdict alone.")
 lpips_option = click.option(
@@ -39,8 +41,8 @@ figures_option = file_option(
 force_option = click.option("--force", is_flag=True, help="Replace files that exist.")
 
 
-def split(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
-    """A launch file or session folder, if there is one, and the overrides."""
+def words_of(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
+    """The path among the arguments, if there is one, and the overrides."""
     overrides = [argument for argument in arguments if ":=" in argument]
     paths = [argument for argument in arguments if ":=" not in argument]
     for path in paths:
@@ -51,6 +53,33 @@ def split(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
     if len(paths) > 1:
         raise UsageError(f"one launch file or session at a time, not {', '.join(paths)}")
     return (paths[0] if paths else None), overrides
+
+
+def split(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
+    """A launch file, session or recording, if there is one, and the overrides; those that play a video, or a
+    folder without a launch file, come first."""
+    from sags_node.config.launch_file import is_launch, known_recording
+
+    path, overrides = words_of(arguments)
+    if path is None or is_launch(Path(path)) or known_recording(Path(path)) is not None:
+        return path, overrides
+    from sags_node.importing.check import overrides_of
+
+    return path, [*overrides_of(Path(path)), *overrides]
+
+
+session_option = click.option("--session", metavar="RECORDING", help="The recording, named by an option.")
+
+
+def played_instead(launch: Sequence[str], session: str | None) -> list[str] | None:
+    """What `split` takes, for a command that plays a recording where one is named; None: it asks a node.
+
+    Args:
+        launch: arguments, the recording among them.
+        session: the recording, where it is an option, as it was before it came first.
+    """
+    words = [*([] if session is None else [session]), *launch]
+    return words if session is not None or any(":=" not in word for word in launch) else None
 
 
 def split_recording(arguments: Sequence[str], no_cameras: str) -> tuple[str | None, list[str]]:
@@ -68,14 +97,18 @@ def split_recording(arguments: Sequence[str], no_cameras: str) -> tuple[str | No
     return path, overrides
 
 
-def open_launched(path: str | None, overrides: Sequence[str]) -> Session:
-    """Open a session and make its kernels ready; says what is played, what takes long and what it runs on."""
+def open_launched(path: str | None, overrides: Sequence[str], guess: bool = False) -> Session:
+    """Open a session and make its kernels ready; says what is played, what takes long and what it runs on.
+
+    Args:
+        guess: a calibration, where there is none, see `open_session`.
+    """
     from sags_node.mapping.devices import device_of
     from sags_node.pipeline.session import at_best_scale, open_session
     from sags_node.pipeline.warm_up import warm_up
 
     with progress("rendering the phantom (once)") as advance:
-        session = open_session(path, overrides, advance)
+        session = open_session(path, overrides, advance, guess)
     console.print(source_text(session.config.source), markup=False, soft_wrap=True)
     console.print(f"  {_pictures_text(session)}", markup=False, soft_wrap=True)
     with console.status("loading kernels (compiled once per machine, about half a minute)"):
@@ -99,10 +132,14 @@ def source_text(source: Source) -> str:
 
 def _pictures_text(session: Session) -> str:
     """Size, rate and calibration of what is played."""
+    from sags_node.rig import GUESSED_FOV
+
     eye, source, config = session.rig.left, session.source, session.config
     count = source.frame_count
     length = "" if count is None else f", {count} frames, {count / source.rate:.1f} s"
     rig = f"calibration {config.rig}" if config.rig is not None else "calibration of the recording"
+    if not session.rig.metric:
+        rig = f"no calibration: {GUESSED_FOV:g} degrees across are guessed, depth has no unit (sags calib)"
     return f"{eye.width}x{eye.height} px at {source.rate:g} frames/s{length}; {rig}"
 
 

@@ -20,6 +20,7 @@ from sags_node import __version__
 from sags_node.cli.bag import bag
 from sags_node.cli.bridge import bridge
 from sags_node.cli.calib import calib
+from sags_node.cli.control import anchor, param, pause, reset, resume
 from sags_node.cli.export import export
 from sags_node.cli.launching import (
     all_figures,
@@ -31,6 +32,7 @@ from sags_node.cli.launching import (
     split,
     split_recording,
 )
+from sags_node.cli.new import new
 from sags_node.cli.node_options import node_options, ns_option
 from sags_node.cli.offline import evaluate, fit
 from sags_node.cli.overlay import overlay
@@ -45,6 +47,7 @@ if TYPE_CHECKING:
     from sags_node.messaging.address import NodeAddress
 
 log = logging.getLogger(__name__)
+OF_THE_NODE = frozenset({"torch", "cv2", "open3d", "onnxruntime", "numba", "PIL", "mcap", "lz4", "zstandard"})
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT)  # of a disk; also of what stdout leads to
 
 
@@ -70,6 +73,11 @@ class Sags(click.Group):
             return super().invoke(ctx)
         except SagsError as error:
             said, code = str(error), error.exit_code
+        except ModuleNotFoundError as error:
+            if str(error.name).partition(".")[0] not in OF_THE_NODE:
+                raise
+            node = "pip install 'sags-node[node]'"
+            said, code = f"{error.name} is not installed: this is for a client; for all of it {node}", 2
         except OSError as error:
             if error.errno not in NO_ROOM:
                 raise
@@ -129,9 +137,13 @@ def main(verbose: bool, form: str) -> None:
 def run(launch: tuple[str, ...], seconds: float | None, json_out: bool) -> None:
     """Run the node: map the source and publish until it ends.
 
-    Without a launch file the built-in phantom session plays in a loop.
+    It plays a launch file, a recording, a folder of videos or pictures (see sags import --check), or a video
+    that shows both eyes; without any the built-in phantom session in a loop. Without a calibration it plays
+    all the same: depth then has no unit, and all that is published says so.
 
     \b
+    sags run my_folder
+    sags run both_eyes.mp4 rig:=calib/mine
     sags run launch/d4d_pull.yaml
     sags run launch/v4l2.yaml source.left:=/dev/video-left mapping.budget_ms:=25
     """
@@ -146,7 +158,7 @@ def run(launch: tuple[str, ...], seconds: float | None, json_out: bool) -> None:
     path, overrides = split(launch)
     if path is None and isinstance(load_launch(None, overrides).source, PhantomSource):
         overrides = ["source.loop:=true", *overrides]
-    session = open_launched(path, overrides)
+    session = open_launched(path, overrides, guess=True)
     with stop_signals() as stop:
         node = Node(session.config, session.rig, session.source, manager=manager)
         where = escape(", ".join(node.endpoints))
@@ -344,7 +356,10 @@ def moved_bench(arguments: tuple[str, ...]) -> None:
     raise UsageError(f"sags bench is now, in a checkout of the sources: {asked}")
 
 
-for command in (evaluate, fit, export, bag, bridge, calib, overlay, view, topic):
+for command in (
+    *(new, evaluate, fit, export, bag, bridge, calib, overlay, view, topic),
+    *(anchor, param, pause, resume, reset),
+):
     main.add_command(command)
 for more in distribution("sags-node").entry_points.select(group="sags.commands"):
     more.load()(main)  # of packages that stand beside this one

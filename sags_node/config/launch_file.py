@@ -59,7 +59,7 @@ _LIVE_PATHS = {  # of sources whose other keys are devices, topics and launch st
 
 def load_launch(path: Path | str | None = None, overrides: Sequence[str] = ()) -> LaunchConfig:
     """Read a launch file, or a folder that holds `launch.yaml` or a known recording, and apply `key:=value`
-    overrides.
+    overrides. Any other folder, or a video, is a name only: then `overrides` say what is played of it.
 
     `$SAGS_DATA` and other variables are expanded; relative paths in the file are relative to the file.
     `path=None` gives the defaults: the built-in phantom session.
@@ -73,14 +73,11 @@ def load_launch(path: Path | str | None = None, overrides: Sequence[str] = ()) -
     if path is not None:
         file = Path(path)
         recording = known_recording(file)
-        if file.is_dir() and recording is None:
+        played = any(override.startswith("source.kind:=") for override in overrides)
+        if recording is None and not is_launch(file) and played:
+            recording = {}
+        elif file.is_dir() and recording is None:
             file = file / "launch.yaml"
-        elif file.suffix.lower() in VIDEO_SUFFIXES:
-            raise UsageError(
-                f"{file} is a video, not a launch file; write source.kind:=videos source.left:={file} "
-                "source.right:=OTHER, or where it shows both eyes source.geometry.layout:=side_by_side, and "
-                "rig:=CALIBRATION"
-            )
         name = str(file)
         if recording is not None:
             tree = recording
@@ -108,15 +105,32 @@ def load_launch(path: Path | str | None = None, overrides: Sequence[str] = ()) -
     return config
 
 
+def is_launch(path: Path) -> bool:
+    """Whether it is a launch file, or a folder with one: neither a video nor a folder of something else."""
+    if path.is_dir():
+        return (path / "launch.yaml").exists()
+    return path.suffix.lower() not in VIDEO_SUFFIXES
+
+
+def tree_of(overrides: Sequence[str]) -> dict[str, Any]:
+    """The sections and keys of a launch file that says what these `key:=value` say.
+
+    Raises:
+        UsageError: one is no override.
+    """
+    tree: dict[str, Any] = {}
+    for override in overrides:
+        _apply_override(tree, override)
+    return tree
+
+
 def section_of(kind: type[S], overrides: Sequence[str]) -> S:
     """A section by itself, as `key:=value` say.
 
     Raises:
         UsageError: an unknown key or a wrong value.
     """
-    tree: dict[str, Any] = {}
-    for override in overrides:
-        _apply_override(tree, override)
+    tree = tree_of(overrides)
     try:
         return kind.model_validate(tree)
     except ValidationError as error:

@@ -140,7 +140,7 @@ class VideosSource(RecordedSource):
 
 
 class EndoNerfSource(RecordedSource):
-    """A clip in the layout of EndoNeRF; docs/recordings.md says what is read and how."""
+    """A clip in the layout of EndoNeRF; docs/datasets.md says what is read and how."""
 
     kind: Literal["endonerf"] = "endonerf"
     folder: Path = Field(description="holds images/, masks/, depth/ and poses_bounds.npy")
@@ -156,7 +156,7 @@ class EndoNerfSource(RecordedSource):
 
 
 class ScaredSource(RecordedSource):
-    """One keyframe folder of SCARED; docs/recordings.md says what is read and how."""
+    """One keyframe folder of SCARED; docs/datasets.md says what is read and how."""
 
     kind: Literal["scared"] = "scared"
     folder: Path = Field(description="dataset_D/keyframe_K, holds endoscope_calibration.yaml and data/")
@@ -759,6 +759,8 @@ class LaunchConfig(Section):
             return False
         return isinstance(self.source, FoldersSource | VideosSource) and self.source.right is None
 
+
+LIVE_PARAMETERS = ("mapping.budget_ms",)  # that `set_parameters` may change while the node runs
 
 # Keys of earlier versions, and what stands in their place: an error says it.
 ALWAYS_ON = "it is always on; `python -m benchmarks pareto --only skips` says what it brings"

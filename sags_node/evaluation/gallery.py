@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from sags_node.evaluation.spool import SpooledFrame
 from sags_node.types import F32, U8, Bool
 
 EVENLY_SPACED = 3
@@ -32,16 +31,11 @@ class Gallery:
         self._spaced: list[Picture] = []
         self.worst: Picture | None = None
 
-    def offer(self, place: int, shown: SpooledFrame, truth: U8, psnr: float) -> None:
+    def offer(self, place: int, picture: Picture) -> None:
         """Look at the frame processed as number `place`; NaN is never the worst."""
-        spaced = place in self._places
-        worst = not math.isnan(psnr) and (self.worst is None or psnr < self.worst.psnr)
-        if not spaced and not worst:
-            return
-        picture = Picture(shown.snapshot.frame_id, psnr, truth, shown.rgb, shown.depth, shown.tissue)
-        if spaced:
+        if place in self._places:
             self._spaced.append(picture)
-        if worst:
+        if not math.isnan(picture.psnr) and (self.worst is None or picture.psnr < self.worst.psnr):
             self.worst = picture
 
     @property

@@ -16,8 +16,9 @@ from sags_node.errors import UsageError
 from sags_node.evaluation import calibration, metrics
 from sags_node.evaluation.carried import Seen, carried
 from sags_node.evaluation.flicker import Flicker
-from sags_node.evaluation.gallery import Gallery
+from sags_node.evaluation.gallery import Gallery, Picture
 from sags_node.evaluation.lpips import Lpips
+from sags_node.evaluation.receipt import Receipt
 from sags_node.evaluation.spool import RunFacts, Spool, SpooledFrame
 from sags_node.evaluation.tracking import PointTracks, TrackErrors
 from sags_node.evaluation.trajectory import RigidOdometry
@@ -122,6 +123,7 @@ class Measurer:
         rectifier: Rectifier,
         tissue_of: TissueOf,
         options: MeasureOptions,
+        receipt: Receipt,
         exclude: tuple[Box, ...] = (),
         pose: PoseWay = "session",
         on_picture: OnPicture = lambda frame_id, left: None,
@@ -129,6 +131,7 @@ class Measurer:
         """
         Args:
             tissue_of: the run's own tissue mask, for frames that it held out.
+            receipt: takes note of what is compared.
             exclude: boxes of the raw pictures that are never measured (captions, burnt into both eyes).
             pose: where the run had its poses from.
             on_picture: called with each frame of the recording.
@@ -137,6 +140,7 @@ class Measurer:
         self.gallery = Gallery(len(spool))
         self.depth_kind: str | None = None
         self._spool = spool
+        self._receipt = receipt
         self._places = {frame_id: place for place, frame_id in enumerate(spool.frame_ids)}
         self._rectifier = rectifier
         self._tissue_of = tissue_of
@@ -178,6 +182,7 @@ class Measurer:
 
     def _processed(self, frame: StereoFrame, pair: RectifiedPair, seconds: float, place: int) -> FrameRow:
         shown = self._spool.read(place)
+        self._receipt.add(frame, shown.tissue)
         truth = metrics.as_float(pair.left)
         costly = place % self._options.every == 0
         figures = {"online": self._quality(metrics.as_float(shown.rgb), truth, shown.tissue, costly)}
@@ -197,7 +202,9 @@ class Measurer:
                 figures |= _depth_figures(shown, frame.reference.depth)
                 counts = _calibration(shown, frame.reference.depth)
             track = self._follow(shown, frame.reference, pair.camera)
-        self.gallery.offer(place, shown, pair.left, figures["online"]["psnr"])
+        psnr = figures["online"]["psnr"]
+        seen = Picture(frame.frame_id, psnr, pair.left, shown.rgb, shown.depth, shown.tissue)
+        self.gallery.offer(place, seen)
         after = _Before(shown, pair.camera, truth, seconds)
         if self._held is not None and seconds > self._earlier[0].seconds:
             self._held.row.figures["between"] = self._between(self._earlier[0], self._held, after)
@@ -261,16 +268,7 @@ class Measurer:
         }
 
     def _quality(self, picture: F32, truth: F32, tissue: Bool, costly: bool) -> Figures:
-        figures = {
-            "psnr": metrics.psnr(picture, truth, tissue),
-            "ssim": metrics.ssim(picture, truth, tissue),
-        }
-        if self._options.paper_psnr:
-            figures["paper_psnr"] = metrics.paper_psnr(picture, truth, tissue)
-            figures["paper_ssim"] = metrics.paper_ssim(picture, truth, tissue)
-        if costly and self._lpips is not None:
-            figures["lpips"] = self._lpips(picture, truth, tissue)
-        return figures
+        return quality(picture, truth, tissue, self._options, self._lpips if costly else None)
 
     def _draw(self, gaussians: Gaussians, camera: Camera) -> F32:
         return colours_of(self._rasterizer.forward(gaussians, camera))
@@ -330,6 +328,22 @@ class Measurer:
         if self._pose != "session":
             points = np.asarray(transform(self._in_world_of_run(given, shown), points), np.float64)
         return self._tracks.update(snapshot.gaussians, points, reference.points_visible, snapshot.camera)
+
+
+def quality(
+    picture: F32, truth: F32, tissue: Bool, options: MeasureOptions, lpips: Lpips | None = None
+) -> Figures:
+    """How near a picture [H, W, 3] is to the truth where there is tissue [H, W]."""
+    figures = {
+        "psnr": metrics.psnr(picture, truth, tissue),
+        "ssim": metrics.ssim(picture, truth, tissue),
+    }
+    if options.paper_psnr:
+        figures["paper_psnr"] = metrics.paper_psnr(picture, truth, tissue)
+        figures["paper_ssim"] = metrics.paper_ssim(picture, truth, tissue)
+    if lpips is not None:
+        figures["lpips"] = lpips(picture, truth, tissue)
+    return figures
 
 
 def _calibration(shown: SpooledFrame, reference: F32) -> I64 | None:

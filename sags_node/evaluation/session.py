@@ -3,33 +3,31 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 from sags_node.config.launch_file import load_launch
-from sags_node.config.schema import LaunchConfig, LiveSource, PublishConfig
+from sags_node.config.schema import LaunchConfig, LiveSource
 from sags_node.errors import SagsError, UsageError
+from sags_node.evaluation import live
 from sags_node.evaluation.gallery import Picture
 from sags_node.evaluation.measure import FrameRow, MeasureOptions, Measurer, OnPicture, Progress
+from sags_node.evaluation.receipt import Receipt
 from sags_node.evaluation.spool import Spool
 from sags_node.evaluation.summary import GROUPS, summarise
 from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.devices import ALL_SKIPS, Skips, affordable, device_of
-from sags_node.node.node import Node
+from sags_node.messaging.address import NodeAddress
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import Session, at_best_scale, open_posed, open_session
 from sags_node.pipeline.warm_up import warm_up
 from sags_node.sources.source import Source
-from sags_node.terminal.console import stop_signals
-from sags_node.types import FrameResult, StereoFrame
 from sags_node.vision.rectify import Rectifier
 from sags_node.vision.tissue import TissueMask
 
 Pace = Literal["realtime", "step"]
-PROGRESS_PERIOD = 0.2  # s
 DEFAULT_OPTIONS = MeasureOptions()
 
 
@@ -40,6 +38,7 @@ class Evaluation:
     summary: dict[str, Any]  # the keys of `sags eval --json`
     rows: list[FrameRow]
     pictures: list[Picture]
+    receipt: dict[str, Any]  # see `Receipt.as_json`
 
 
 def evaluate(
@@ -55,8 +54,9 @@ def evaluate(
     Args:
         launch: a launch file or a session folder; None: the built-in phantom.
         overrides: `key:=value`, as for `sags run`.
-        pace: `realtime` plays on the recording's clock through the node, sockets included, and drops what
-            comes too late; `step` takes every frame in turn, without threads or sockets.
+        options: a live node sees every frame: with `realtime` none can be held out.
+        pace: `realtime` plays on the recording's clock in a node of its own, and measures what a subscriber
+            gets of it (`live`); `step` takes every frame in turn, without threads or sockets.
         iterations: fixed steps per frame instead of the time budget; with `step`, figures are reproducible.
         progress: called with what is going on and the frames done.
 
@@ -78,16 +78,41 @@ def evaluate(
     )
     progress("loading kernels", 0)
     warm_up(session.config)
-    session = at_best_scale(session)
+    if pace == "realtime":
+        return _live(launch, overrides, forced, session, options, progress)
     with Spool() as spool:
-        if pace == "realtime":
-            # Its own sockets, away from those of a node that may be running on this machine.
-            private = {"data": (), "ipc": True, "control": None, "run_dir": spool.folder / "run"}
-            publish = session.config.publish.model_copy(update=private)
-            run_realtime(session, publish, options, spool, progress)
-        else:
-            run_step(session, options, spool, progress)
+        run_step(at_best_scale(session), options, spool, progress)
         return measure(session, spool, options, overrides, progress)
+
+
+def _live(
+    launch: Path | str | None,
+    overrides: Sequence[str],
+    forced: Sequence[str],
+    session: Session,
+    options: MeasureOptions,
+    progress: Progress,
+) -> Evaluation:
+    """Of a node in a process of its own."""
+    if options.hold_out:
+        raise UsageError("a live node sees every frame: leave --hold-out out, or add --pace step")
+    with live.Copies() as copies:
+        # Its own sockets, away from those of a node that may be running on this machine.
+        run_dir = copies.folder / "run"
+        sockets = ["publish.data:=[]", "publish.ipc:=true", "publish.control:=null"]
+        arguments = [*overrides, *forced, *sockets, f"publish.run_dir:={run_dir}"]
+        node = NodeAddress(session.config.ns, run_dir=run_dir)
+        account = live.play([*([] if launch is None else [str(launch)]), *arguments], node, copies, progress)
+        size = copies.size()
+        vision = session.config.vision.model_copy(update={"width": size[0], "height": size[1], "scale": 1.0})
+        session = replace(session, config=session.config.model_copy(update={"vision": vision}))
+        receipt = Receipt(session.rig, size, options.lpips_weights)
+        judge = live.Judge(copies, Rectifier(session.rig, *size), options, receipt)
+        with again(session) as frames:
+            judge.run(frames, progress)
+    summary = _summary(session, judge.rows, options, overrides, judge.depth_kind)
+    summary |= {key: account[key] for key in ("frame_ms", "stage_ms", "skipped")}  # only the node knows
+    return Evaluation(summary, judge.rows, judge.gallery.pictures, receipt.as_json())
 
 
 def measure(
@@ -110,17 +135,24 @@ def measure(
         raise SagsError(
             "no frame was processed; check source.start, source.frames, source.warm_up and the hold-out"
         )
+    receipt = Receipt(session.rig, session.working_size, options.lpips_weights)
+    measurer = _measured(session, spool, options, receipt, progress, on_picture)
+    summary = _summary(session, measurer.rows, options, overrides, measurer.depth_kind)
+    return Evaluation(summary, measurer.rows, measurer.gallery.pictures, receipt.as_json())
+
+
+def _summary(
+    session: Session,
+    rows: Sequence[FrameRow],
+    options: MeasureOptions,
+    overrides: Sequence[str],
+    depth_kind: str | None,
+) -> dict[str, Any]:
+    """Figures and settings of a run."""
     config = session.config
-    measurer = _measured(session, spool, options, progress, on_picture)
-    summary = summarise(
-        session.name,
-        measurer.rows,
-        options,
-        config.segments,
-        None
-        if config.mapping.iterations is not None
-        else config.mapping.frame_ms(session.source.rate if config.in_real_time else None),
-    )
+    rate = session.source.rate if config.in_real_time else None
+    budget_ms = None if config.mapping.iterations is not None else config.mapping.frame_ms(rate)
+    summary = summarise(session.name, rows, options, config.segments, budget_ms)
     summary["settings"] = {
         "overrides": list(overrides),
         "pace": None if isinstance(config.source, LiveSource) else config.source.pace,
@@ -131,11 +163,11 @@ def measure(
         "width": session.working_size[0],
         "height": session.working_size[1],
         "pose": config.vision.pose,
-        "depth_reference": measurer.depth_kind,
+        "depth_reference": depth_kind,
         "hold_out": options.hold_out,
         "novel_every": options.every,
     }
-    return Evaluation(summary, measurer.rows, measurer.gallery.pictures)
+    return summary
 
 
 def run_step(
@@ -159,76 +191,25 @@ def run_step(
     return pipeline
 
 
-def run_realtime(
-    session: Session, publish: PublishConfig, options: MeasureOptions, spool: Spool, progress: Progress
-) -> None:
-    """The node itself, threads and sockets included, on the recording's clock."""
-
-    def keep(result: FrameResult, latency_ms: float) -> None:
-        frame_ms, warnings = sum(result.timings_ms.values()), node.health().warnings
-        spool.add(result, frame_ms, time.monotonic_ns(), latency_ms, warnings)
-
-    config = session.config.model_copy(update={"publish": publish})
-    with stop_signals() as stop:
-        node = Node(config, session.rig, _WithoutHeldOut(session.source, options), on_result=keep)
-        try:
-            node.start()
-            while not (stop.is_set() or node.wait(PROGRESS_PERIOD)):
-                progress("playing", len(spool))
-        finally:
-            node.stop()
-    if stop.is_set():
-        raise KeyboardInterrupt
-
-
-class _WithoutHeldOut:
-    """A source whose held-out frames never reach the node."""
-
-    def __init__(self, source: Source, options: MeasureOptions) -> None:
-        self._source = source
-        self._options = options
-
-    @property
-    def rate(self) -> float:
-        return self._source.rate
-
-    @property
-    def frame_count(self) -> int | None:
-        return self._source.frame_count
-
-    @property
-    def dropped(self) -> int:
-        return self._source.dropped
-
-    def __enter__(self) -> Self:
-        self._source.__enter__()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._source.__exit__(kind, error, trace)
-
-    def __iter__(self) -> Iterator[StereoFrame]:
-        return (frame for frame in self._source if not self._options.holds_out(frame.frame_id))
-
-    def stop(self) -> None:
-        self._source.stop()
-
-
 def _measured(
-    session: Session, spool: Spool, options: MeasureOptions, progress: Progress, on_picture: OnPicture
-) -> Measurer:
+    session: Session, spool: Spool, options: MeasureOptions, receipt: Receipt, progress: Progress,
+    on_picture: OnPicture,
+) -> Measurer:  # fmt: skip
     """Read the recording again, with its truth, and measure every frame."""
     config = session.config
     rectifier = Rectifier(session.rig, *session.working_size)
     tissue = TissueMask(config.vision.tissue, rectifier)
     exclude = config.vision.tissue.exclude
-    measurer = Measurer(spool, rectifier, tissue, options, exclude, config.vision.pose, on_picture)
-    played = config.source.model_copy(update={"pace": "step"})
-    with open_posed(config.model_copy(update={"source": played}), session.rig) as frames:
+    measurer = Measurer(spool, rectifier, tissue, options, receipt, exclude, config.vision.pose, on_picture)
+    with again(session) as frames:
         measurer.run(frames, progress)
     return measurer
+
+
+def again(session: Session) -> Source:
+    """The recording once more, every frame, with its truth."""
+    played = session.config.source.model_copy(update={"pace": "step"})
+    return open_posed(session.config.model_copy(update={"source": played}), session.rig)
 
 
 def _check_segments(config: LaunchConfig) -> None:

@@ -41,7 +41,7 @@ class RunFacts:
     """What the run itself says of one processed frame."""
 
     t_shown_ns: int  # when its result was done or published; monotonic clock
-    frame_ms: float  # wall time of all stages
+    frame_ms: float | None  # wall time of all stages; None: the node alone knows
     latency_ms: float | None  # capture stamp to publish; None when nothing was published
     rss_mb: float
     timings_ms: dict[str, float]  # stage -> ms

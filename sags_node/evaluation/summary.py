@@ -88,7 +88,7 @@ def summarise(
 
 
 def _timings(facts: Sequence[RunFacts]) -> dict[str, Any]:
-    frame_ms = [run.frame_ms for run in facts]
+    frame_ms = [run.frame_ms for run in facts if run.frame_ms is not None]
     latency_ms = [run.latency_ms for run in facts if run.latency_ms is not None]
     stages = list(STAGES) + [stage for run in facts for stage in run.timings_ms]
     return {
@@ -108,7 +108,7 @@ def _rate(facts: Sequence[RunFacts]) -> float | None:
     if len(facts) < 2:
         return None
     if facts[0].latency_ms is None:
-        return 1e3 / float(np.mean([run.frame_ms for run in facts[1:]]))
+        return 1e3 / float(np.mean([run.frame_ms for run in facts[1:] if run.frame_ms is not None]))
     return (len(facts) - 1) / ((facts[-1].t_shown_ns - facts[0].t_shown_ns) * 1e-9)
 
 

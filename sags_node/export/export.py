@@ -42,7 +42,10 @@ def check_targets(targets: Mapping[str, Path], force: bool) -> None:
         SagsError: a folder cannot be written to.
     """
     if not targets:
-        raise UsageError("nothing to export; give --splats, --points, --mesh or --orbit and a file name")
+        raise UsageError(
+            "nothing to export; give --splats, --points, --mesh or --orbit and a file; of a recording also "
+            "--sequence, --depth, --render or --tracks"
+        )
     if len({path.resolve() for path in targets.values()}) < len(targets):
         raise UsageError("two exports would write the same file; give each a name of its own")
     for kind, path in targets.items():

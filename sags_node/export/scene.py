@@ -63,6 +63,11 @@ def from_node(node: NodeAddress) -> Scene:
             frame = newest and subscriber.aligned(names, newest.stamp_ns, WAIT_FOR_REST)
             if frame and all(subscriber.ok(name) for name in names):
                 info = frame[INFO]
+                if not info.metric:
+                    raise SagsError(
+                        "the node has no calibration, so its lengths have no unit, and files are in metres; "
+                        "calibrate (docs/calibration.md), then set rig"
+                    )
                 camera = Camera(info.width, info.height, info.K, frame[POSE].pose())
                 return Scene(_gaussians(frame[SPLATS]), camera, frame[SPLATS].stamp_ns)
         problem = subscriber.problem(SPLATS) or "the topics of one frame did not come together"

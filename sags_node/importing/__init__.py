@@ -1,4 +1,4 @@
-"""`sags import --check`: what a folder of recordings is, what is missing or odd in it, and how to fix it.
+"""`sags import --check`, `sags new`: what a folder of recordings is, what is odd in it, and how to play it.
 
 Imports calibration, config, media, rig and sources.
 """

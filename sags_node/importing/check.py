@@ -9,9 +9,9 @@ from pathlib import Path
 from sags_node.calibration.check import check_calibration, judge
 from sags_node.calibration.pictures import Pair, pairs_of_files
 from sags_node.config.schema import EndoNerfSource, LaunchConfig, RecordedSource, VideosSource
-from sags_node.errors import SagsError
+from sags_node.errors import SagsError, UsageError
 from sags_node.importing import pictures, videos
-from sags_node.importing.folder import Contents, both_eyes, calibration_of, recognise
+from sags_node.importing.folder import Contents, both_eyes, calibration_of, override, recognise
 from sags_node.importing.timing import LOOKED_AT, Timing, check_timing
 from sags_node.rig import Finding, read_rig
 from sags_node.sources.pictures import FolderPairs, size_text
@@ -25,23 +25,42 @@ def check_folder(folder: Path) -> list[Finding]:
         UsageError: it is no folder.
     """
     contents = recognise(folder)
-    fix = "" if contents.level == "ok" else contents.play
+    fix = "" if contents.level == "ok" else contents.instead
     found = [Finding(contents.level, f"{folder.name or folder} is {contents.what}", fix)]
     if contents.left is not None:
         found += _pictures(contents, contents.left)
-    play = contents.play
     if contents.videos:
-        form = calibration_of(folder)
-        looked, play, pairs = videos.look(contents.videos, form)
-        found += looked + (_calibrated(form, lambda: pairs) if pairs else [])
+        looked, pairs = videos.look(contents.videos)
+        found += looked + (_calibrated(calibration_of(folder), lambda: pairs) if pairs else [])
     if contents.config is not None:
         found += played(contents.config)
     found = _once(found + _calibration(folder, contents))
     if contents.level == "error":
         return found
-    wrong = any(finding.level == "error" for finding in found)
-    how = "when that is fixed: " if wrong else ""
-    return [*found, Finding("ok", f"to play it: {how}{play}")]
+    if any(finding.level == "error" for finding in found):
+        return [*found, Finding("ok", f"to play it: when that is fixed: sags run {folder}")]
+    if contents.instead:
+        return [*found, Finding("ok", f"to play it: {contents.instead}")]
+    launch = overrides_of(folder)
+    stands_for = f", which stands for {' '.join(launch)}" if launch else ""
+    return [*found, Finding("ok", f"to play it: sags run {folder}{stands_for}")]
+
+
+def overrides_of(path: Path) -> list[str]:
+    """`key:=value` that play what a folder holds, or a video; none where it is played as it is.
+
+    Raises:
+        UsageError: nothing can be made of it.
+        SagsError: a video cannot be read.
+    """
+    contents = recognise(path)
+    if contents.config is not None:
+        return []
+    launch = contents.launch or (videos.launch_of(contents.videos) if contents.videos else ())
+    if not launch:
+        raise UsageError(f"{path} is {contents.what}; {contents.instead}")
+    form = calibration_of(path if path.is_dir() else path.parent)
+    return [*launch, *([] if form is None else [override("rig", form)])]
 
 
 def _once(found: list[Finding]) -> list[Finding]:
@@ -101,7 +120,7 @@ def _in_one_folder(folder: Path) -> list[Finding]:
 def _calibration(folder: Path, contents: Contents) -> list[Finding]:
     """The calibration beside the pictures, against them; sessions that are played as they are name theirs."""
     if contents.config is not None and (contents.right is not None or contents.left is None):
-        return _tried("calibration", lambda: _odd_or_last(check_calibration(folder)))
+        return _tried("calibration", lambda: odd_or_last(check_calibration(folder)))
     if contents.right is None or contents.left is None:
         return []
     eyes = [(contents.left, contents.right)]
@@ -111,18 +130,22 @@ def _calibration(folder: Path, contents: Contents) -> list[Finding]:
 def _calibrated(form: Path | None, read: Callable[[], Sequence[Pair]]) -> list[Finding]:
     """The calibration beside pictures, against them."""
     if form is None:
-        fix = "without one there is no depth in mm: sags calib stereo makes one (docs/calibration.md)"
-        return [Finding("warning", "no calibration lies beside the pictures", fix)]
+        return [without_calibration()]
 
     def compare() -> list[Finding]:
         pairs = read()
         height, width = pairs[0][0].shape[:2]
-        return _odd_or_last(judge(read_rig(form, (width, height)), pairs))
+        return odd_or_last(judge(read_rig(form, (width, height)), pairs))
 
     return _tried("calibration", compare)
 
 
-def _odd_or_last(found: list[Finding]) -> list[Finding]:
+def without_calibration() -> Finding:
+    fix = "without one depth has no unit: sags calib stereo makes one (docs/calibration.md), then set rig"
+    return Finding("warning", "no calibration lies beside the pictures", fix)
+
+
+def odd_or_last(found: list[Finding]) -> list[Finding]:
     """All is well in one line; else what is not."""
     odd = [finding for finding in found if finding.level != "ok"]
     return odd or [Finding("ok", f"calibration: {found[-1].what}", "", found[-1].figures)]

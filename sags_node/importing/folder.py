@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ from typing import Literal
 
 from sags_node.config.launch_file import VIDEO_SUFFIXES, load_launch
 from sags_node.config.schema import LaunchConfig
+from sags_node.config.yaml_reader import parse_yaml
 from sags_node.errors import UsageError
 from sags_node.media.picture_header import SUFFIXES
 from sags_node.rig import find_form
@@ -27,7 +29,7 @@ class Contents:
     """What was found; None: it is not there."""
 
     what: str
-    play: str  # how, or what to do instead
+    instead: str = ""  # what to do where it is not played as it is
     level: Literal["ok", "error"] = "ok"  # error: nothing can be made of it as it is
     left: Path | None = None  # folders of pictures
     right: Path | None = None
@@ -35,16 +37,21 @@ class Contents:
     depth: Path | None = None
     config: LaunchConfig | None = None  # where it is played as it is
     videos: tuple[Path, ...] = ()  # of both eyes, or one that may show both
+    launch: tuple[str, ...] = ()  # `key:=value` that play two folders of pictures
 
 
 def recognise(folder: Path) -> Contents:
-    """Say what a folder is.
+    """Say what a folder, or a video, is.
 
     Raises:
-        UsageError: it is no folder.
+        UsageError: it is neither.
     """
+    if not folder.exists():
+        raise UsageError(f"{folder} does not exist; check the path")
+    if is_video(folder):
+        return Contents("one video", videos=(folder,))
     if not folder.is_dir():
-        raise UsageError(f"{folder} is not a folder; give the one that holds the recording")
+        raise UsageError(f"{folder} is neither a folder nor a video; give the one that holds the recording")
     try:
         config = load_launch(folder)
     except UsageError as error:
@@ -71,8 +78,7 @@ def _playable(folder: Path, config: LaunchConfig) -> Contents:
     if config.source.kind == "endonerf":
         right, masks = _first(folder, ("images_right",)), _first(folder, ("masks",))
         left = _first(folder, ("images",))
-    play = f"sags run {folder}"
-    return Contents(what, play, "ok", left, right, masks, _first(folder, DEPTHS), config)
+    return Contents(what, "", "ok", left, right, masks, _first(folder, DEPTHS), config)
 
 
 def _plain(folder: Path) -> Contents:
@@ -80,27 +86,28 @@ def _plain(folder: Path) -> Contents:
     eyes = _eye_folders(folder)
     if eyes is not None:
         left, right = eyes
-        play = f"sags run source.kind:=folders source.left:={left} source.right:={right}"
-        tools = "" if masks is None else f" source.tools:={masks}"
-        rig = f" rig:={calibration_of(folder) or 'CALIBRATION'}"
-        return Contents("two folders of pictures", f"{play}{tools}{rig}", "ok", left, right, masks, depth)
-    videos = sorted(file for file in folder.iterdir() if file.suffix.lower() in VIDEO_SUFFIXES)
+        launch = ("source.kind:=folders", override("source.left", left), override("source.right", right))
+        tools = () if masks is None else (override("source.tools", masks),)
+        return Contents(
+            "two folders of pictures", "", "ok", left, right, masks, depth, launch=(*launch, *tools)
+        )
+    videos = sorted(file for file in folder.iterdir() if is_video(file))
     if videos:
         what = "one video" if len(videos) == 1 else f"{len(videos)} videos"
-        return Contents(what, "", videos=_eye_videos(videos))
+        return Contents(what, videos=_eye_videos(videos))
     if has_pictures(folder):
         apart = both_eyes(folder)
         both = f" of both eyes, {len(apart)} pairs," if apart else ""
-        play = "put the pictures of each eye in a folder of its own, left/ and right/, and check again"
-        return Contents(f"pictures{both} in one folder", play, "error", left=folder)
+        instead = "put the pictures of each eye in a folder of its own, left/ and right/, and check again"
+        return Contents(f"pictures{both} in one folder", instead, "error", left=folder)
     below = sorted(each.name for each in folder.iterdir() if each.is_dir())
     if not below:
         what = (
             "a folder without pictures, videos or a recording" if any(folder.iterdir()) else "an empty folder"
         )
         return Contents(what, "give the folder that holds the recording", "error")
-    play = f"check one of the folders in it: {', '.join(below[:8])}"
-    return Contents("nothing that is known", play, "error")
+    instead = f"check one of the folders in it: {', '.join(below[:8])}"
+    return Contents("nothing that is known", instead, "error")
 
 
 def _eye_folders(folder: Path) -> tuple[Path, Path] | None:
@@ -145,6 +152,17 @@ def calibration_of(folder: Path) -> Path | None:
     """What lies beside the pictures, in a folder of a usual name or with them."""
     places = (folder / name for name in CALIBRATIONS)
     return next((place for place in places if place.is_dir() and find_form(place) is not None), None)
+
+
+def is_video(file: Path) -> bool:
+    """Whether it is called like one."""
+    return file.suffix.lower() in VIDEO_SUFFIXES and file.is_file()
+
+
+def override(key: str, path: Path | str) -> str:
+    """`key:=path` as it is read back, whatever YAML would make of the path."""
+    plain = f"{key}:={path}"
+    return plain if parse_yaml(str(path), plain) == str(path) else f"{key}:={json.dumps(str(path))}"
 
 
 def _is_stereomis(folder: Path) -> bool:

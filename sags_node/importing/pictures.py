@@ -25,6 +25,7 @@ POLARITY = 0.5  # share of a mask: instruments cover less
 ENDOSCOPE_DEPTH = (0.01, 0.3)  # m, the median
 DEPTH_UNITS = (1e-3, 1e-4, 1e-5, 1e-6, 1.0)  # m per count, the usual ones first
 FEWEST_MATCHES = 30
+RIGHT_FIRST = "source.geometry.first:=right"
 SAME_PICTURE = 1.0  # grey levels: less than two cameras' noise
 
 
@@ -87,14 +88,17 @@ def check_eye(what: str, pictures: Sequence[tuple[Path, U8]]) -> list[Finding]:
     found = []
     x, y, width, height = lit_box(np.max(gray, axis=0))
     if (width, height) != gray[0].shape[::-1]:
-        fix = f"set source.geometry.crop:=[{x},{y},{width},{height}] (videos, cameras) or cut both eyes alike"
+        crop = f"source.geometry.crop:=[{x},{y},{width},{height}]"
+        fix = f"set {crop} (videos, cameras) or cut both eyes alike"
         what_is = f"{what}: black borders; the picture is {size_text(width, height)} px at {x},{y}"
-        found.append(Finding("warning", f"{what_is}, of {size_text(*gray[0].shape[::-1])}", fix))
+        said = f"{what_is}, of {size_text(*gray[0].shape[::-1])}"
+        found.append(Finding("warning", said, fix, launch=(crop,)))
     combs = [(combing(each), combing(np.ascontiguousarray(each.T))) for each in gray]
     rows, columns = np.max([comb[0] for comb in combs]), np.median([comb[1] for comb in combs])
     if rows > COMB_SHARE and rows > COMB_RATIO * columns:
         fix = "videos: source.geometry.deinterlace:=top or bottom; folders: deinterlace before (ffmpeg bwdif)"
-        found.append(Finding("warning", f"{what}: interlaced, {rows:.0%} of the pixels show combs", fix))
+        said = f"{what}: interlaced, {rows:.0%} of the pixels show combs"
+        found.append(Finding("warning", said, fix, launch=("source.geometry.deinterlace:=top",)))
     return found or [
         Finding("ok", f"{what}: {size_text(*gray[0].shape[::-1])} px, not interlaced, no borders")
     ]
@@ -136,11 +140,8 @@ def check_eyes(left: Sequence[tuple[Path, U8]], right: Sequence[tuple[Path, U8]]
         fix = (
             "exchange left and right, unless each picture was cut out elsewhere (then calibrate as they are)"
         )
-        return [
-            Finding(
-                "warning", "points lie farther to the right in the right eye: eyes exchanged?", fix, figures
-            )
-        ]
+        what = "points lie farther to the right in the right eye: eyes exchanged?"
+        return [Finding("warning", what, fix, figures, launch=(RIGHT_FIRST,))]
     aligned = rows < 1 / 180 * pairs[0][0].shape[1]
     what = f"disparity {across:.1f} px, rows {'agree' if aligned else 'differ'} ({down:+.1f} px)"
     fix = "" if aligned else "not rectified: a calibration with distortion and rectification is needed"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import NamedTuple
@@ -13,8 +13,9 @@ import numpy as np
 from sags_node.calibration.matches import match_eyes
 from sags_node.calibration.pictures import Pair
 from sags_node.config.schema import GeometryConfig
-from sags_node.errors import SagsError
+from sags_node.errors import SagsError, UsageError
 from sags_node.importing import pictures
+from sags_node.importing.folder import override
 from sags_node.importing.timing import check_timing
 from sags_node.rig import Finding
 from sags_node.sources.layout import Layout
@@ -25,18 +26,19 @@ from sags_node.types import U8
 LOOKED_AT = 4  # pictures, spread over the video
 LEAST_ALONG = 0.8  # share of the matches whose rows agree, of two eyes
 ROWS = 1 / 40  # of the width: as far as rows of eyes that are not rectified differ
+ONE_EYE = "one eye is shown, or both in a way that was not recognised"
 APART = 1.0  # px: eyes see the tissue in different columns; fields of one picture do not
 
 
-VIDEO = "source.kind:=videos source.left:={file} source.geometry.layout:="
-PANES = VIDEO + "panes source.geometry.crop:=[0,0,{w},{h}] source.geometry.crop_right:=[{w},0,{w},{h}]"
+LAYOUT = "source.geometry.layout:="
+PANES = "source.geometry.crop:=[0,0,{w},{h}]", "source.geometry.crop_right:=[{w},0,{w},{h}]"
 
 
-class _Way(NamedTuple):
+class Way(NamedTuple):
     """How a picture may show both eyes."""
 
     what: str
-    launch: str
+    layout: str
     eyes: Callable[[U8], tuple[U8, U8]]
 
 
@@ -56,41 +58,71 @@ def _fields(picture: U8) -> tuple[U8, U8]:
 
 
 _WAYS = (  # a part before the whole: what is found in the one is found in the other, too
-    _Way("in the upper two of four panes", PANES, lambda picture: _quarters(picture)[0]),
-    _Way("side by side", VIDEO + "side_by_side", _halves),
-    _Way("one above the other", VIDEO + "over_under", lambda picture: _halves(picture, 0)),
-    _Way("in every other row", VIDEO + "row_interleaved", _fields),
+    Way("in the upper two of four panes", "panes", lambda picture: _quarters(picture)[0]),
+    Way("side by side", "side_by_side", _halves),
+    Way("one above the other", "over_under", lambda picture: _halves(picture, 0)),
+    Way("in every other row", "row_interleaved", _fields),
 )
 
 
-def look(files: tuple[Path, ...], calibration: Path | None) -> tuple[list[Finding], str, list[Pair]]:
-    """What is odd, how to play them, and some pairs of two videos.
-
-    Args:
-        files: of the left and the right eye, or one.
-        calibration: that lies beside them.
-    """
-    rig = f"rig:={calibration or 'CALIBRATION'}"
+def look(files: tuple[Path, ...]) -> tuple[list[Finding], list[Pair]]:
+    """What is odd about the videos of the left and the right eye, or one of both; and some pairs of two.
+    They are played as `launch_of` says."""
     try:
         found = [_length(file) for file in files]
         shown = [_some(file) for file in files]
     except SagsError as error:
-        play = f"sags run source.kind:=videos source.left:={files[0]} {rig}"
-        return [pictures.refused("video", error)], play, []
+        return [pictures.refused("video", error)], []
     if len(files) == 1:
-        odd, play = _one(files[0], shown[0], rig)
-        return found + odd, play, []
+        return found + _one(files[0], shown[0]), []
     (left_file, right_file), (left, right) = files, shown
-    play = f"sags run source.kind:=videos source.left:={left_file} source.right:={right_file} {rig}"
     found += pictures.check_eye("left", left) + pictures.check_eye("right", right)
     try:
         with closing(VideoPairs(left_file, right_file, Layout(GeometryConfig()))) as pairs:
             ends = check_ends(left_file, right_file, pairs.count)
             found += ends or check_timing(pairs)
     except SagsError as error:
-        return [*found, pictures.refused("videos", error)], play, []
+        return [*found, pictures.refused("videos", error)], []
     found += pictures.check_eyes(left, right)
-    return found, play, [(a, b) for (_, a), (_, b) in zip(left, right, strict=True)]
+    return found, [(a, b) for (_, a), (_, b) in zip(left, right, strict=True)]
+
+
+def launch_of(files: tuple[Path, ...]) -> tuple[str, ...]:
+    """`key:=value` that play the videos of the left and the right eye, or one of both.
+
+    Raises:
+        SagsError: it cannot be read.
+        UsageError: one alone does not show both eyes in a way that is known.
+    """
+    launch = "source.kind:=videos", override("source.left", files[0])
+    if len(files) == 2:
+        return *launch, override("source.right", files[1])
+    shown = [picture for _, picture in _some(files[0])]
+    way = way_of(shown)
+    if way is None:
+        raise UsageError(f"{files[0]}: {ONE_EYE}; {_both_needed(files[0])}")
+    return *launch, *layout_of(way, shown)
+
+
+def way_of(shown: Sequence[U8]) -> Way | None:
+    """How pictures [H, W, 3] RGB show both eyes; None: in no way that is known."""
+    for way in _WAYS:
+        pairs = [way.eyes(picture) for picture in shown]
+        lower = way.layout == "panes" and _are_eyes([_quarters(picture)[1] for picture in shown])
+        if _are_eyes(pairs) and not lower:
+            return way
+    return None
+
+
+def layout_of(way: Way, shown: Sequence[U8]) -> tuple[str, ...]:
+    """`key:=value` that take these pictures apart, the left eye first."""
+    height, width = shown[0].shape[:2]
+    if way.layout == "panes":
+        return f"{LAYOUT}panes", *(box.format(w=width // 2, h=height // 2) for box in PANES)
+    pairs = [way.eyes(picture) for picture in shown]
+    left, right = ([(Path(), np.ascontiguousarray(pair[eye])) for pair in pairs] for eye in (0, 1))
+    fixes = [fix for finding in pictures.check_eyes(left, right) for fix in finding.launch]
+    return f"{LAYOUT}{way.layout}", *fixes
 
 
 def _length(file: Path) -> Finding:
@@ -134,32 +166,31 @@ def _some(file: Path) -> list[tuple[Path, U8]]:
         video.close()
 
 
-def _one(file: Path, shown: list[tuple[Path, U8]], rig: str) -> tuple[list[Finding], str]:
-    height, width = shown[0][1].shape[:2]
-    for way in _WAYS:
-        pairs = [way.eyes(picture) for _, picture in shown]
-        panes = way.launch is PANES
-        if not _are_eyes(pairs) or (panes and _are_eyes([_quarters(picture)[1] for _, picture in shown])):
-            continue
-        left, right = ([(file, np.ascontiguousarray(pair[eye])) for pair in pairs] for eye in (0, 1))
-        eyes = pictures.check_eyes(left, right)
-        found = [Finding("ok", f"{size_text(width, height)} px show both eyes: {way.what}")]
-        looked = pictures.check_eye("left", left) + pictures.check_eye("right", right)
-        # Of every other row of a picture the rows lie far apart: that looks like a comb.
-        found += [
-            each for each in looked if way.eyes is not _fields or "interlaced, " not in each.what
-        ] + eyes
-        swapped = any("exchanged" in finding.what for finding in eyes)
-        first = " source.geometry.first:=right" if swapped and not panes else ""
-        return found, f"sags run {way.launch.format(file=file, w=width // 2, h=height // 2)}{first} {rig}"
-    what = f"{size_text(width, height)} px show one eye, or both in a way that was not recognised"
-    fix = "two videos or one of both eyes are needed; one camera alone needs a network (docs/networks.md)"
-    try_it = f"sags calib live source.kind:=videos source.left:={file} source.geometry.layout:=side_by_side"
-    found = [Finding("warning", what, fix), *pictures.check_eye("video", shown)]
-    return found, f"{try_it} shows what is in it"
+def _one(file: Path, shown: list[tuple[Path, U8]]) -> list[Finding]:
+    whole = [picture for _, picture in shown]
+    size = size_text(*whole[0].shape[1::-1])
+    way = way_of(whole)
+    if way is None:
+        found = Finding("error", f"{size} px: {ONE_EYE}", _both_needed(file))
+        return [found, *pictures.check_eye("video", shown)]
+    pairs = [way.eyes(picture) for picture in whole]
+    left, right = ([(file, np.ascontiguousarray(pair[eye])) for pair in pairs] for eye in (0, 1))
+    looked = pictures.check_eye("left", left) + pictures.check_eye("right", right)
+    if way.layout == "row_interleaved":  # of every other row of a picture the rows lie far apart: as a comb
+        looked = [each for each in looked if "interlaced, " not in each.what]
+    found = Finding("ok", f"{size} px show both eyes: {way.what}")
+    return [found, *looked, *pictures.check_eyes(left, right)]
 
 
-def _are_eyes(pairs: list[tuple[U8, U8]]) -> bool:
+def _both_needed(file: Path) -> str:
+    return (
+        f"two videos or one of both eyes are needed; sags calib live {override('source.left', file)} "
+        f"source.kind:=videos {LAYOUT}side_by_side shows what is in it; one camera alone needs a network "
+        "(docs/networks.md)"
+    )
+
+
+def _are_eyes(pairs: Sequence[tuple[U8, U8]]) -> bool:
     """Whether pictures match as two eyes do: in the same rows, and in other columns."""
     matches = np.concatenate([match_eyes(*(np.ascontiguousarray(eye) for eye in pair)) for pair in pairs])
     if len(matches) < pictures.FEWEST_MATCHES:

@@ -64,7 +64,7 @@ def measure_peak(threads: int) -> Peak:
     before = numba.get_num_threads()
     configure_threads(threads)
     try:
-        operations = max(_multiply_adds_per_second(lanes, run, threads) for lanes, run in _CHAINS.items())
+        operations = max(_multiply_adds_per_second(lanes, run, threads) for lanes, run in RUNS.items())
         return Peak(threads, operations, {size: _bytes_per_second(size, threads) for size in TRIAD_BYTES})
     finally:
         numba.set_num_threads(before)
@@ -135,8 +135,8 @@ def _run_chains_of_16(results: F32, rounds: int) -> None:
         results[worker] = _chains_of_16(f4(worker), rounds)
 
 
-# A processor's own vector width is the fastest of these; a wider one is cut into pieces.
-_CHAINS = {4: _run_chains_of_4, 8: _run_chains_of_8, 16: _run_chains_of_16}
+# By lanes. A processor's own vector width is the fastest; a wider one is cut into pieces.
+RUNS = {4: _run_chains_of_4, 8: _run_chains_of_8, 16: _run_chains_of_16}
 
 
 def _multiply_adds_per_second(lanes: int, run: Callable[[F32, int], None], threads: int) -> float:

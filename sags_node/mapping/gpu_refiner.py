@@ -14,24 +14,15 @@ import torch
 
 from sags_node.engine import gsplat_backend
 from sags_node.engine.gsplat_backend import Drawing, pixels_of, sent
-from sags_node.engine.interface import MAX_OPACITY
 from sags_node.engine.losses.pieces import LEVEL
 from sags_node.engine.losses.tissue import COVERAGE_WEIGHT, COVERED, DEPTH_COVERED, FULL, MAX_RESIDUAL
 from sags_node.engine.rasterizer.rasterize import TILE_HEIGHT, TILE_WIDTH, as_pinhole
-from sags_node.mapping import optimiser
 from sags_node.mapping.exposure import exposure_gain
 from sags_node.mapping.focus import EVERY, tile_grid
-from sags_node.mapping.optimiser import BETA1, BETA2, LearningRates
+from sags_node.mapping.gpu_map import GpuMap
+from sags_node.mapping.optimiser import LearningRates
 from sags_node.mapping.refiner import DEPTH_SCALE, DEPTH_WEIGHT, CpuRefiner
-from sags_node.model.deformation import (
-    CALM,
-    INERTIA,
-    LEAST_SEEN,
-    MIN_CONTRIBUTION,
-    NODE_EPS,
-    STEEPEST,
-    NodeDeformation,
-)
+from sags_node.model.deformation import NodeDeformation
 from sags_node.model.gaussians import GaussianModel
 from sags_node.types import F32, U8, Bool, Camera, Finding, Gaussians, Observation
 
@@ -39,14 +30,6 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 log = logging.getLogger(__name__)
-
-# Rows of the model, 212 bytes a Gaussian. The first come back, 176 bytes.
-REFINED = (
-    "means", "quats", "log_scales", "opacity_logits", "scales", "opacities", "colors", "slopes",
-    "adam_m", "adam_v", "contribution",
-)  # fmt: skip
-GIVEN = ("smoothing", "node_index", "node_weight")
-DRAWN = ("means", "quats", "scales", "opacities", "colors", "slopes", "smoothing")
 
 Given = ParamSpec("Given")
 Result = TypeVar("Result")
@@ -76,6 +59,9 @@ class GpuRefiner:
     A frame in which the GPU fails is finished on the CPU, which goes on for good: a CUDA error cannot be
     recovered from in the same process. The model still stands there as it was before the frame's steps, so
     nothing but these is lost.
+
+    Attributes:
+        on_gpu: the model as it stands there.
     """
 
     def __init__(self, cpu: CpuRefiner, cpu_share: float) -> None:
@@ -91,11 +77,9 @@ class GpuRefiner:
         self.problem: Finding | None = None
         self._cpu, self._cpu_share = cpu, cpu_share
         self._device = gsplat_backend.gpu()
+        self.on_gpu = GpuMap(self._device)
         self._loss = 0.0
-        self._steps = 0
         self._frame: tuple[GaussianModel, NodeDeformation, Observation, float] | None = None
-        self._rows: dict[str, Tensor] = {}
-        self._nodes = self._momentum = self._variance = torch.zeros((0, 3), device=self._device)
 
     @property
     def loss(self) -> float:
@@ -105,20 +89,19 @@ class GpuRefiner:
     def begin(
         self, model: GaussianModel, deformation: NodeDeformation, observation: Observation, node_step: float
     ) -> None:
-        if self._frame is None or self._frame[1] is not deformation:
-            self._momentum = self._variance = self._nodes[:0]
         self._frame = model, deformation, observation, node_step
         self._image = self._sent(observation.image).permute(2, 0, 1) * float(LEVEL)
         self._tissue, self._depth = self._sent(observation.tissue), self._sent(observation.depth)
         self._pinhole = as_pinhole(observation.camera)
         self._touched = self._sent(tile_grid(observation.tissue))
         self._changed = False
-        self._nodes = self._nodes[:0]
-        self._take(slice(0, model.count))
+        self.on_gpu.begin(model, deformation)
 
     @_or_on_the_cpu
     def take(self, rows: slice) -> None:
-        self._take(rows)
+        assert self._frame is not None
+        model, deformation, *_ = self._frame
+        self.on_gpu.take(model, deformation, rows)
 
     @_or_on_the_cpu
     def download(self) -> None:
@@ -127,11 +110,7 @@ class GpuRefiner:
         assert self._frame is not None
         model, deformation, *_ = self._frame
         loss = float(self._last_loss)
-        rows = {name: self._rows[name].cpu().numpy() for name in REFINED}
-        nodes = self._nodes.cpu().numpy()
-        for name, values in rows.items():  # nothing is written before all of it is here
-            getattr(model, name)[: len(values)] = values
-        deformation.nodes[: len(nodes)] = nodes
+        self.on_gpu.download(model, deformation)
         self._loss, self._changed = loss, False
 
     @_or_on_the_cpu
@@ -156,13 +135,13 @@ class GpuRefiner:
     @_or_on_the_cpu
     def refine(self, rates: LearningRates, share: float = 1.0) -> None:
         if share < 1.0:
-            self._step(rates, self._worst_tiles(share))
+            self._step(rates, self._worst(share))
             return
-        self._rows["contribution"] = self._step(rates, None)
+        self.on_gpu.rows["contribution"] = self._step(rates, None)
 
     @_or_on_the_cpu
     def refine_worst(self, share: float, rates: LearningRates, nodes: bool = True) -> None:
-        tiles = self._worst_tiles(share)
+        tiles = self._worst(share)
         self._draw()
         self._step(rates, tiles, nodes)
         self._touched |= tiles
@@ -193,21 +172,8 @@ class GpuRefiner:
             self._cpu.begin(*self._frame)
             self._cpu.draw()
 
-    def _take(self, rows: slice) -> None:
-        assert self._frame is not None
-        model, deformation, *_ = self._frame
-        for name in (*REFINED, *GIVEN):
-            given = self._sent(getattr(model, name)[rows])
-            here = self._rows.get(name, given[:0])
-            joined = torch.cat([here[: rows.start], given, here[rows.stop :]])
-            self._rows[name] = joined[: model.count]
-        self._nodes = torch.cat([self._nodes, self._sent(deformation.nodes[len(self._nodes) :])])
-        still = torch.zeros_like(self._nodes[len(self._momentum) :])
-        self._momentum = torch.cat([self._momentum, still])
-        self._variance = torch.cat([self._variance, still])
-
     def _draw(self) -> None:
-        self._drawing = Drawing({name: self._rows[name] for name in DRAWN}, self._pinhole)
+        self._drawing = Drawing(self.on_gpu.drawn(), self._pinhole)
         self._fetched: F32 | None = None
 
     def _fetched_planes(self) -> F32:
@@ -231,93 +197,13 @@ class GpuRefiner:
         gradients = self._drawing.backward(v_planes, weight)
         contribution = gradients["contribution"]
         if nodes:  # they move all that follows them, also far from the tiles that count
-            self._descend(gradients["means"], contribution, self._frame[3])
-        self._optimise(gradients, rates, self._frame[2].camera)
+            self.on_gpu.descend(gradients["means"], contribution, self._frame[3])
+        self.on_gpu.optimise(gradients, rates, self._frame[2].camera)
         self._changed = True
         return contribution
 
-    def _worst_tiles(self, share: float) -> Tensor:
-        """The tiles [rows, columns] with the largest squared colour residuals, by share, at least one: as
-        `focus.worst_tiles`. Nothing is fetched."""
-        some = (..., slice(None, None, EVERY), slice(None, None, EVERY))
-        planes, tissue = self._drawing.planes[some], self._tissue[some]
-        residuals = planes[:3] / planes[4] - self._image[some]
-        counted = tissue & (planes[4] > float(COVERED)) & (residuals.abs() < 1)
-        squares = torch.where(counted, residuals.square(), 0.0).sum(0)
-        sums = torch.nn.functional.avg_pool2d(
-            squares[None], (TILE_HEIGHT // EVERY, TILE_WIDTH // EVERY), ceil_mode=True, divisor_override=1
-        )[0]
-        worst = torch.topk(sums.flatten(), max(1, round(share * sums.numel())), sorted=False).indices
-        chosen = torch.zeros_like(sums, dtype=torch.bool)
-        chosen.view(-1)[worst] = True
-        return chosen
-
-    def _descend(self, v_means: Tensor, contribution: Tensor, step: float) -> None:
-        """`NodeDeformation.descend`. On a GPU a sum's order, and so its last bits, change from run to run."""
-        index, weight = self._rows["node_index"].long(), self._rows["node_weight"]
-        counted = (contribution > MIN_CONTRIBUTION)[:, None] & (weight >= 0) & (weight <= 1)
-        pulls = torch.where(counted[..., None], weight[..., None] * v_means[:, None], 0.0)  # [N, 4, 3]
-        total, mass = torch.zeros_like(self._nodes), torch.zeros_like(self._nodes[:, :1])
-        total.index_add_(0, index.flatten(), pulls.flatten(0, 1))
-        mass.index_add_(0, index.flatten(), torch.where(counted, weight, 0.0).flatten()[:, None])
-        gradient = torch.where(mass > LEAST_SEEN, total / mass, 0.0)
-        momentum = self._momentum + INERTIA * (gradient - self._momentum)
-        variance = self._variance + CALM * (gradient.square() - self._variance)
-        size = variance.sqrt()
-        sound = (momentum.abs() <= STEEPEST * size) & torch.isfinite(size)
-        self._momentum, self._variance = (torch.where(sound, kept, 0.0) for kept in (momentum, variance))
-        motion = -step * self._momentum / (torch.where(sound, size, 0.0) + NODE_EPS)
-        self._nodes = self._nodes + motion
-        self._rows["means"] = self._rows["means"] + (weight[..., None] * motion[index]).sum(1)
-
-    def _optimise(self, gradients: dict[str, Tensor], rates: LearningRates, camera: Camera) -> None:
-        """`optimiser.Optimiser.step`: a SIRT step on colours and slopes, Adam on the rest."""
-        self._steps += 1
-        rows, seen = self._rows, gradients["contribution"]
-        m, v, scales, opacities = rows["adam_m"], rows["adam_v"], rows["scales"], rows["opacities"]
-        by_logit = gradients["opacities"] * opacities * (1 - opacities)
-        by_raw = torch.cat(
-            [gradients["means"], gradients["quats"], gradients["scales"] * scales, by_logit[:, None]], 1
-        )
-        by_color = torch.cat([gradients["colors"], gradients["slopes"]], 1)
-        size = seen + (by_raw.abs() + m.abs() + v.abs()).sum(1) + by_color.abs().sum(1)
-        raw = rows["opacity_logits"].abs() + rows["log_scales"].abs().sum(1)
-        taken = seen > optimiser.MIN_CONTRIBUTION
-        moves = taken & (size < optimiser.LARGEST) & (raw < optimiser.LARGEST_RAW)
-        broken = taken & ~moves  # its hidden state is made anew from what is drawn of it
-
-        gain = optimiser.COLOUR_RELAXATION / (seen + optimiser.COLOUR_DAMPING)
-        colors = rows["colors"] - gain[:, None] * gradients["colors"]
-        self._put(moves, "colors", colors.clamp(*optimiser.COLOR_RANGE))
-        per_slope = (gain / (3 * (gradients["spread"] / seen - 1).clamp(min=1)))[:, None]
-        slopes = optimiser.SLOPE_DECAY * rows["slopes"] - per_slope * gradients["slopes"]
-        self._put(moves, "slopes", slopes.clamp(-optimiser.STEEPEST, optimiser.STEEPEST))
-        self._put(broken, "adam_m", torch.zeros_like(m))
-        self._put(broken, "adam_v", torch.where(torch.isfinite(by_raw), by_raw.square(), 0.0))
-        m, v = m + (1 - BETA1) * (by_raw - m), v + (1 - BETA2) * (by_raw.square() - v)
-        self._put(moves, "adam_m", m)
-        self._put(moves, "adam_v", v)
-        lengths = [rates.mean_px] * 3 + [rates.quat] * 4 + [rates.log_scale] * 3 + [rates.opacity_logit]
-        step = by_raw.new_tensor(lengths) * m / (1 - BETA1**self._steps)
-        step /= (v / (1 - BETA2**self._steps)).sqrt() + optimiser.EPS
-
-        view_z = by_raw.new_tensor(camera.viewmat[2])
-        pixel = (rows["means"] @ view_z[:3] + view_z[3]).abs() / float(camera.K[0, 0])  # m at its depth
-        self._put(moves, "means", rows["means"] - pixel[:, None] * step[:, :3])
-        self._put(moves, "quats", rows["quats"] - step[:, 3:7])
-        log_scales = (rows["log_scales"] - step[:, 7:10]).clamp(*optimiser.LOG_SCALE_RANGE)
-        logits = (rows["opacity_logits"] - step[:, 10]).clamp(*optimiser.LOGIT_RANGE)
-        self._put(broken, "log_scales", scales.log())
-        self._put(broken, "opacity_logits", torch.logit(opacities.clamp(max=MAX_OPACITY)))
-        self._put(moves, "log_scales", log_scales)
-        self._put(moves, "scales", log_scales.exp())
-        self._put(moves, "opacity_logits", logits)
-        self._put(moves, "opacities", logits.sigmoid())
-
-    def _put(self, where: Tensor, name: str, values: Tensor) -> None:
-        """Into the rows where [N] is True."""
-        rows = where.reshape(-1, *[1] * (values.ndim - 1))
-        self._rows[name] = torch.where(rows, values, self._rows[name])
+    def _worst(self, share: float) -> Tensor:
+        return worst_tiles(self._drawing.planes, self._image, self._tissue, share)
 
     def _sent(self, array: F32 | U8 | Bool) -> Tensor:
         """A copy on the device."""
@@ -356,3 +242,19 @@ def tissue_loss(
     mean = torch.where(used, size, 0.0).sum() / (3 * used.sum()).clamp(min=1)
     v_planes = torch.cat([v_color, v_depth[None], (-by_color - by_depth - push)[None]])
     return mean, v_planes, torch.where(used, inverse, 0.0)
+
+
+def worst_tiles(planes: Tensor, image: Tensor, tissue: Tensor, share: float) -> Tensor:
+    """`focus.worst_tiles`, [rows, columns]; nothing is fetched. Arguments as of `tissue_loss`."""
+    some = (..., slice(None, None, EVERY), slice(None, None, EVERY))
+    planes, tissue = planes[some], tissue[some]
+    residuals = planes[:3] / planes[4] - image[some]
+    counted = tissue & (planes[4] > float(COVERED)) & (residuals.abs() < 1)
+    squares = torch.where(counted, residuals.square(), 0.0).sum(0)
+    sums = torch.nn.functional.avg_pool2d(
+        squares[None], (TILE_HEIGHT // EVERY, TILE_WIDTH // EVERY), ceil_mode=True, divisor_override=1
+    )[0]
+    worst = torch.topk(sums.flatten(), max(1, round(share * sums.numel())), sorted=False).indices
+    chosen = torch.zeros_like(sums, dtype=torch.bool)
+    chosen.view(-1)[worst] = True
+    return chosen

@@ -62,11 +62,11 @@ def decode(data: bytes | NDArray[np.uint8], flags: int, where: str, fix: str) ->
     if picture is None:
         reason = f": {said[-1]}" if said else ""
         raise SagsError(f"{where} is damaged or cut off ({array.size} bytes){reason}; {fix}")
-    _complaints.tell(where, said)
+    complaints.tell(where, said)
     return picture
 
 
-class _Complaints:
+class Complaints:
     """What decoders say, once of each kind: all pictures of a recording often have the same flaw."""
 
     def __init__(self) -> None:
@@ -84,4 +84,4 @@ class _Complaints:
                 log.warning("%s: %s (said once, of the first such picture)", where, line)
 
 
-_complaints = _Complaints()
+complaints = Complaints()

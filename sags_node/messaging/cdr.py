@@ -7,7 +7,7 @@ array it lies in. The parts joined are byte for byte what a CDR library writes.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -178,6 +178,13 @@ def camera_info(camera: Camera, stamp_ns: int, frame: str = LEFT_FRAME, baseline
     P[:, :3] = camera.K
     P[0, 3] = -camera.K[0, 0] * baseline
     return _camera_info(camera.width, camera.height, np.zeros(5), camera.K, np.eye(3), P, stamp_ns, frame)
+
+
+def uncalibrated(camera_info: bytes) -> bytes:
+    """A `CameraInfo` whose matrices are zero: so ROS says that nobody has calibrated the camera."""
+    message = decode(camera_info, topics.CAMERA_INFO)
+    zeros = {name: np.zeros_like(getattr(message, name)) for name in "krp"}
+    return _serialize(replace(message, **zeros))
 
 
 def eye_info(eye: Eye, stamp_ns: int, frame: str = LEFT_FRAME) -> Content:

@@ -66,6 +66,7 @@ class Publisher:
         offered: what may be subscribed to, beside views.
         thins: whether somebody makes the thin pictures of `thin`.
         recording: what is played here by `sags bag play`; None: this is a node.
+        metric: False: lengths have no unit, as nobody has calibrated the eyes; every message says so.
 
     Attributes:
         thin: thin pictures that somebody subscribes to, by topic.
@@ -85,6 +86,7 @@ class Publisher:
         offered: Sequence[topics.Topic] = topics.TOPICS,
         thins: bool = False,
         recording: Path | None = None,
+        metric: bool = True,
     ) -> None:
         for endpoint in (*config.data, *([config.control] if config.control else [])):
             check_endpoint(endpoint, config)
@@ -98,6 +100,7 @@ class Publisher:
         self.thin: Mapping[str, topics.ThinPicture] = {}
         self._thins = thins
         self._recording = recording
+        self._metric = metric
         self._thin_seq = 0  # where the numbers of the next one begin
         self._last: FrameResult | None = None
         self._dropped = 0
@@ -278,6 +281,7 @@ class Publisher:
             ahead_ns=ahead_ns or msgspec.UNSET,
             scale=body.scale or msgspec.UNSET,
             window=list(body.window) or msgspec.UNSET,
+            units=msgspec.UNSET if self._metric else "relative",
         )
         frames = encode(Message(topics.full_name(self.ns, name), meta, body.parts))
         # An XPUB socket drops for a full peer instead of blocking. Arrays are never written again, so

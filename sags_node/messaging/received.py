@@ -33,6 +33,11 @@ class Received:
         """Capture time of what it shows."""
         return self.meta.stamp_ns
 
+    @property
+    def metric(self) -> bool:
+        """Whether lengths are metres; else the node has no calibration, and they have no unit."""
+        return self.meta.units is msgspec.UNSET
+
     def age(self, now_ns: int | None = None) -> float:
         """Seconds since what it shows was captured."""
         return ((time.time_ns() if now_ns is None else now_ns) - self.meta.stamp_ns) * 1e-9

@@ -56,11 +56,15 @@ class Receiver:
         clock: of the node's machine, where that is another one; in place of `clock_ns`. While it is not known
             every topic is stale.
         paused: begin as after `pause`.
+        patience: s to wait for a node that does not run yet; default: 10, and 0 for asyncio, whose loop must
+            not be blocked. With an `endpoint` none need run.
 
     Raises:
         UsageError: an unknown topic, or the node wants keys that are not given.
         SagsError: no node named `ns` runs here and no endpoint is given.
     """
+
+    _patience = 0.0
 
     def __init__(
         self,
@@ -73,6 +77,7 @@ class Receiver:
         keys: ClientKeys | None = None,
         clock: NodeClock | None = None,
         paused: bool = False,
+        patience: float | None = None,
     ) -> None:
         wanted = [check_topic(name) for name in dict.fromkeys([*names, "status"])]
         rates = rates or {}
@@ -92,15 +97,15 @@ class Receiver:
         self._asked = _ALWAYS if paused else frozenset(self._kept)
         self._find = NodeAddress(ns, endpoint, None, run_dir, keys).data
         self._resources = ExitStack()  # holds the socket; only the receiver thread uses it once it runs
-        self._connect(self._find())
+        self._connect(self._found(self._patience if patience is None else patience))
         self._thread = threading.Thread(target=self._receive_all, name="sags-subscriber", daemon=True)
         self._thread.start()
         atexit.register(self.close)  # the thread must not outlive the interpreter
 
     @classmethod
     def at(cls, node: NodeAddress, names: Iterable[str], **options: Any) -> Self:
-        """Subscribes to this node; see the class."""
-        return cls(names, node.endpoint, node.ns, node.run_dir, keys=node.keys, **options)
+        """Subscribes to this node, which runs; see the class."""
+        return cls(names, node.endpoint, node.ns, node.run_dir, keys=node.keys, **{"patience": 0.0} | options)
 
     @property
     def endpoint(self) -> str:
@@ -231,6 +236,19 @@ class Receiver:
 
     # ---- the receiver thread ---------------------------------------------------------------------------
 
+    def _found(self, patience: float) -> Address:
+        """Where the node is, once it runs; see the class."""
+        deadline = time.monotonic() + patience
+        while True:
+            try:
+                return self._find()
+            except UsageError:  # there is one, and it wants other keys
+                raise
+            except SagsError:
+                if time.monotonic() >= deadline:
+                    raise
+            time.sleep(POLL_MS * 1e-3)
+
     def _connect(self, address: Address) -> None:
         resources, asked = ExitStack(), self._asked
         prefixes = [full for full, name in self._names.items() if name in asked]
@@ -306,6 +324,8 @@ class Subscriber(Receiver):
 
     Arguments and errors: see `Receiver`. Any number of threads may ask.
     """
+
+    _patience = 10.0
 
     @overload
     def wait(self, name: TopicName[R], timeout: float, after: Received | None = None) -> R | None: ...

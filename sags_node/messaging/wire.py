@@ -57,6 +57,7 @@ class Meta(msgspec.Struct, frozen=True, kw_only=True):
     ahead_ns: Count | msgspec.UnsetType = msgspec.UNSET  # shown is what is expected so long after `stamp_ns`
     scale: Scale | msgspec.UnsetType = msgspec.UNSET  # of a thin picture whose numbers are whole
     window: Window | msgspec.UnsetType = msgspec.UNSET  # of a thin picture: x, y, and px for one of its own
+    units: Text | msgspec.UnsetType = msgspec.UNSET  # of lengths: "relative", of a guessed rig; unset: metres
 
 
 @dataclass(frozen=True, slots=True)

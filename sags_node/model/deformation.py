@@ -34,18 +34,25 @@ class NodeDeformation:
 
     Hundreds of nodes average thousands of noisy per-Gaussian motions, which is what keeps identity: a
     Gaussian stays on its piece of tissue.
+
+    Attributes:
+        spacing: m, between nodes.
+        nodes: [M, 3] m, where they are now.
+        rest: [M, 3] m, where they are most of the time.
+        momentum, variance: [M, 3] running means of the gradients of `descend`, and of their squares.
+        seen: [M] weight of what was seen of each in the last `follow`.
     """
 
     def __init__(self, means: F32, count: int) -> None:
         """Place about `count` nodes over `means` [N, 3] m: the centres of occupied cells of a cubic grid."""
         self.spacing = _spacing_for(means, count)
         self._most = 4 * count  # beyond this, new tissue follows the nodes there are
-        self.nodes = _cell_centres(means, self.spacing)  # [M, 3] m
-        self._rest = self.nodes.copy()  # [M, 3] m: where they are most of the time
-        self._momentum = np.zeros_like(self.nodes)
-        self._variance = np.zeros_like(self.nodes)
+        self.nodes = _cell_centres(means, self.spacing)
+        self.rest = self.nodes.copy()
+        self.momentum = np.zeros_like(self.nodes)
+        self.variance = np.zeros_like(self.nodes)
         self._neighbours = self._find_neighbours()
-        self.seen = np.zeros(len(self.nodes), np.float32)  # [M] weight of what was seen of each in `follow`
+        self.seen = np.zeros(len(self.nodes), np.float32)
 
     def attach(self, model: GaussianModel, rows: slice) -> None:
         """Let the Gaussians in `rows` follow the nodes."""
@@ -111,12 +118,12 @@ class NodeDeformation:
             model.node_weight,
             len(self.nodes),
         )
-        self._momentum += INERTIA * (gradient - self._momentum)
-        self._variance += CALM * (gradient * gradient - self._variance)
-        size = np.sqrt(self._variance)
-        damaged = ~((np.abs(self._momentum) <= STEEPEST * size) & np.isfinite(size))
-        self._momentum[damaged] = self._variance[damaged] = size[damaged] = 0
-        motion = (-step * self._momentum / (size + NODE_EPS)).astype(np.float32)
+        self.momentum += INERTIA * (gradient - self.momentum)
+        self.variance += CALM * (gradient * gradient - self.variance)
+        size = np.sqrt(self.variance)
+        damaged = ~((np.abs(self.momentum) <= STEEPEST * size) & np.isfinite(size))
+        self.momentum[damaged] = self.variance[damaged] = size[damaged] = 0
+        motion = (-step * self.momentum / (size + NODE_EPS)).astype(np.float32)
         self.nodes += motion
         _skin(motion, model.node_index, model.node_weight, model.means)
 
@@ -128,11 +135,11 @@ class NodeDeformation:
 
     def settle(self, share: float) -> None:
         """Let where the tissue rests follow where it is now, by a share of the way."""
-        self._rest += np.float32(share) * (self.nodes - self._rest)
+        self.rest += np.float32(share) * (self.nodes - self.rest)
 
     def away(self, index: I32, weight: F32) -> F32:
         """How far [N, 3] m from where it rests tissue is now, by its nodes [N, 4] and their weights."""
-        return np.asarray(np.einsum("nk,nka->na", weight, (self.nodes - self._rest)[index]), np.float32)
+        return np.asarray(np.einsum("nk,nka->na", weight, (self.nodes - self.rest)[index]), np.float32)
 
     def normals(self, towards: F64) -> F32:
         """Unit normals [M, 3] of the tissue at the nodes, to the side of a place [3] (m, world): of the plane
@@ -148,11 +155,11 @@ class NodeDeformation:
         """New tissue is taken to be as far from where it rests as the tissue next to it."""
         zeros = np.zeros_like(nodes)
         index, weight, _ = nearest_nodes(nodes, self.nodes)
-        self._rest = np.concatenate([self._rest, nodes - self.away(index, weight)])
+        self.rest = np.concatenate([self.rest, nodes - self.away(index, weight)])
         self.nodes = np.concatenate([self.nodes, nodes])
         self.seen = np.concatenate([self.seen, zeros[:, 0]])
-        self._momentum = np.concatenate([self._momentum, zeros])
-        self._variance = np.concatenate([self._variance, zeros])
+        self.momentum = np.concatenate([self.momentum, zeros])
+        self.variance = np.concatenate([self.variance, zeros])
         self._neighbours = self._find_neighbours()
 
     def _find_neighbours(self) -> I32:

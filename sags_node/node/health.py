@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from math import inf
 from statistics import median
 
@@ -57,6 +57,7 @@ class Statistics:
         self._published: deque[float] = deque(maxlen=WINDOW)
         self._taken_in = -inf  # when a frame was published that was
         self._latency: deque[float] = deque(maxlen=WINDOW)
+        self._worked: deque[float] = deque(maxlen=WINDOW)  # ms on each
         self._stages: dict[str, deque[float]] = {}
         self._skipped: dict[str, int] = {}
         self._gaussians = 0
@@ -84,6 +85,7 @@ class Statistics:
                 self._taken_in = self._published[-1]
             self._latency.append(latency_ms)
             self.latency_s = 1e-3 * median(self._latency)
+            self._worked.append(sum(result.timings_ms.values()))
             for stage, ms in result.timings_ms.items():
                 self._stages.setdefault(stage, deque(maxlen=WINDOW)).append(ms)
             for what in result.skipped:
@@ -131,16 +133,11 @@ class Statistics:
                 state = "held"
             else:
                 state = "running"
-            latency = np.array(self._latency) if self._latency else np.zeros(1)
             return NodeHealth(
                 state=state,
                 rate_hz=(len(self._published) - 1) / span if span > 0 and not (waiting or paused) else 0.0,
-                latency_ms={
-                    "p50": float(np.percentile(latency, 50)),
-                    "p90": float(np.percentile(latency, 90)),
-                    "p99": float(np.percentile(latency, 99)),
-                    "max": float(latency.max()),
-                },
+                latency_ms=_percentiles(self._latency),
+                frame_ms=_percentiles(self._worked),
                 stage_ms={stage: float(np.median(ms)) for stage, ms in self._stages.items()},
                 dropped=dropped,
                 gaussians=self._gaussians,
@@ -174,6 +171,12 @@ class Statistics:
             limit = MOST_LEFT_OUT * (BACK_AT if slot in self._too_many else 1.0)
             (self._too_many.add if count > limit * (count + WINDOW - 1) else self._too_many.discard)(slot)
         return slot in self._too_many
+
+
+def _percentiles(values: Sequence[float]) -> dict[str, float]:
+    """0 of nothing."""
+    p50, p90, p99, most = np.percentile(values or [0.0], [50, 90, 99, 100]).tolist()
+    return {"p50": p50, "p90": p90, "p99": p99, "max": most}
 
 
 def _remedies(source: Source | None) -> tuple[str, str]:

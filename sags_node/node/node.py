@@ -105,7 +105,9 @@ class Node:
         self._error: BaseException | None = None
         self._stopping = threading.Event()
         self._last_sent: FrameResult | None = None
-        self._publisher = Publisher(config.publish, config.ns, uuid.uuid4().hex, self._handlers(), thins=True)
+        self._publisher = Publisher(
+            config.publish, config.ns, uuid.uuid4().hex, self._handlers(), thins=True, metric=rig.metric
+        )
         ipc = [endpoint for endpoint in self.endpoints if endpoint.startswith("ipc:")]
         self._recorder = RecorderProcess(config.ns, ipc[0] if ipc else None)
         work = {

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from sags_node.config.launch_file import with_parameters
-from sags_node.config.schema import REMOVED, LaunchConfig
+from sags_node.config.schema import LIVE_PARAMETERS, REMOVED, LaunchConfig
 from sags_node.errors import SagsError
 from sags_node.mapping.budget import Budget
 from sags_node.messaging import content
@@ -22,9 +22,8 @@ from sags_node.model.ply import write_ply
 from sags_node.node.health import Statistics
 from sags_node.node.views import Views
 from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.uncalibrated import MOST
 from sags_node.types import DrawnView, FrameResult
-
-LIVE_PARAMETERS = ("mapping.budget_ms",)
 
 
 @dataclass
@@ -123,6 +122,7 @@ class Operations:
             self._state.pipeline.anchors.look_ahead(anchor, seconds)
             self._state.pipeline.predict_motion()
         sure = self._state.pipeline.anchors.depth_confidence(anchor)
+        sure = sure if self._state.pipeline.metric else min(sure, MOST)
         return {"id": anchor, "frame_id": newest.pair.frame_id, "depth_confidence": round(sure, 3)}
 
     def _remove_anchor(self, args: dict[str, Any]) -> dict[str, Any]:

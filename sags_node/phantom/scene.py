@@ -57,7 +57,12 @@ class PhantomFrame:
 
 
 class Phantom:
-    """A seeded scene; a frame is a pure function of its place in the session."""
+    """A seeded scene; a frame is a pure function of its place in the session.
+
+    Attributes:
+        rig: that looks at it.
+        tissue: where its surface is at each moment.
+    """
 
     def __init__(self, config: PhantomSource) -> None:
         self._scene = scene = PhantomScene.of(config)
@@ -74,11 +79,11 @@ class Phantom:
         self._noise_key = streams[4].generate_state(2)
         self._clock = Clock(config.seconds)
         self._relief = make_relief(shape, self._half_view)
-        self._tissue = Tissue(self._relief, self._clock)
+        self.tissue = Tissue(self._relief, self._clock)
         self._skin = paint_skin(self._relief, paint, footprint=0.8 * BED_DEPTH / float(self.rig.left.K[0, 0]))
         self._skin.surface[..., 2] *= np.sqrt(scene.gloss)  # highlights go with the square of the wetness
         self._instruments = Instruments()
-        self._tracks = self._tissue.track_indices(tracks, self._half_view, TRACKS)
+        self._tracks = self.tissue.track_indices(tracks, self._half_view, TRACKS)
         self._cloud = fractal_noise(smoke, (512, 512), 70, 4)
 
     def frame(self, index: int, count: int, T_world_cam: F64 | None = None) -> PhantomFrame:
@@ -87,10 +92,10 @@ class Phantom:
         phase = index / count
         if T_world_cam is None:
             T_world_cam = self._scope(phase)
-        vertices = self._tissue.vertices(0.0 if self._scene.still_tissue else phase)
+        vertices = self.tissue.vertices(0.0 if self._scene.still_tissue else phase)
         hook_view = HOOK_DEPTH * np.array(self._half_view)
-        tools = self._instruments.mesh(self._clock.action(phase), self._tissue.grip(vertices), hook_view)
-        bodies = Bodies(self._tissue, vertices, tools)
+        tools = self._instruments.mesh(self._clock.action(phase), self.tissue.grip(vertices), hook_view)
+        bodies = Bodies(self.tissue, vertices, tools)
         lamp = Lamp.at_tip(T_world_cam, self.rig.baseline)
 
         pictures, masks = [], []
@@ -129,8 +134,8 @@ class Phantom:
     def still(self, phase: float) -> Still:
         """The tissue alone at a phase 0..1 of the session, as the left rectified camera there sees it."""
         T_world_cam = self._scope(phase)
-        vertices = self._tissue.vertices(0.0 if self._scene.still_tissue else phase)
-        bodies = Bodies(self._tissue, vertices, NOTHING)
+        vertices = self.tissue.vertices(0.0 if self._scene.still_tissue else phase)
+        bodies = Bodies(self.tissue, vertices, NOTHING)
         lamp = Lamp.at_tip(T_world_cam, self.rig.baseline)
         return Still(bodies, self._relief, self._skin, lamp, eye=T_world_cam[:3, 3])
 

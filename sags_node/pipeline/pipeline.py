@@ -26,6 +26,7 @@ from sags_node.mapping.pose_refiner import PoseRefiner
 from sags_node.mapping.right_view import RightView
 from sags_node.mapping.tissue_map import TissueMap
 from sags_node.pipeline.repeats import doubted, repeated, unseen
+from sags_node.pipeline.uncalibrated import FINDING, unsure
 from sags_node.types import (
     Bool,
     Camera,
@@ -80,6 +81,7 @@ class Pipeline:
     Attributes:
         rate: frames that come a second; None: they come when they are taken. `reconfigure` after a change.
         newest: the frame mapped last; None before the first, and after a reset.
+        metric: lengths are metres: the calibration is no guess.
     """
 
     def __init__(
@@ -92,6 +94,7 @@ class Pipeline:
         skips: Skips = ALL_SKIPS,
     ) -> None:
         self.rate = rate
+        self.metric = rig.metric
         self._skips = skips
         vision = config.vision
         width, height = vision.working_size(rig.left.width, rig.left.height)
@@ -161,6 +164,8 @@ class Pipeline:
         if lost is not None:
             back = "bring the scope back to tissue that it saw before"
             found.append(Finding("camera_lost", f"the camera is lost: {lost}; {back}"))
+        if not self.metric:
+            found.append(FINDING)
         if self.tissue.problem:
             found.append(Finding("mask_missing", self.tissue.problem))
         if self._refiner.problem is not None:
@@ -184,6 +189,10 @@ class Pipeline:
         self, frame: StereoFrame, budget: Budget, request: FrameRequest = NOTHING_ASKED
     ) -> FrameResult:
         """Everything that happens to one frame."""
+        result = self._processed(frame, budget, request)
+        return result if self.metric else unsure(result)
+
+    def _processed(self, frame: StereoFrame, budget: Budget, request: FrameRequest) -> FrameResult:
         plan, clock = budget.start(request.waited), Stopwatch()
         with clock("rectify"):
             pair = self._rectified(frame)

@@ -6,8 +6,18 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from sags_node.calibration.guess import guess_rig
 from sags_node.config.launch_file import load_launch
-from sags_node.config.schema import BagSource, EndoNerfSource, LaunchConfig, PhantomSource, Ros2Source
+from sags_node.config.schema import (
+    BagSource,
+    EndoNerfSource,
+    GstSource,
+    LaunchConfig,
+    PhantomSource,
+    RecordedSource,
+    Ros2Source,
+    V4l2Source,
+)
 from sags_node.errors import UsageError
 from sags_node.mapping.devices import with_scale
 from sags_node.rig import load_camera, load_rig
@@ -35,11 +45,13 @@ def open_session(
     launch: Path | str | None,
     overrides: Sequence[str] = (),
     progress: Callable[[int, int], None] | None = None,
+    guess: bool = False,
 ) -> Session:
     """Read a launch file or session folder (None: the built-in phantom) and open what it names.
 
     Args:
         progress: called with (frames done, frames in all) while the phantom is rendered for the first time.
+        guess: where no calibration is named, play with a guessed one, see `guess_rig`.
 
     Raises:
         UsageError: a wrong key, value or path.
@@ -58,7 +70,7 @@ def open_session(
 
         rig = load_rig(cached_session(config.source, progress) / "calib")
     else:
-        rig = rig_of(config)
+        rig = guess_rig(config.source) if guess and lacks_rig(config) else rig_of(config)
     source = open_posed(config, rig, references=False)
     return Session(_name(launch), config, rig, source)
 
@@ -89,6 +101,12 @@ def _name(launch: Path | str | None) -> str:
     return path.name if path.is_dir() else path.stem
 
 
+def lacks_rig(config: LaunchConfig) -> bool:
+    """Whether `open_session` would guess the calibration."""
+    opens = isinstance(config.source, RecordedSource | V4l2Source | GstSource)  # by itself: nobody must send
+    return config.rig is None and opens and recorded_rig(config.source) is None
+
+
 def rig_of(config: LaunchConfig) -> StereoRig:
     """The calibration that comes with the pictures, or the one that the launch file names."""
     if config.rig is not None and isinstance(config.source, BagSource | Ros2Source):
@@ -101,7 +119,8 @@ def rig_of(config: LaunchConfig) -> StereoRig:
     if config.rig is None:
         raise UsageError(
             "no calibration: set rig to the folder with left.yaml and right.yaml of this scope; "
-            "docs/calibration.md says how to make one"
+            "docs/calibration.md says how to make one. sags run plays recordings and cameras without one; "
+            "depth then has no unit"
         )
     if config.one_camera and not config.rig.is_dir():
         return load_camera(config.rig)

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 import cv2
+import msgspec
 from mcap.records import Schema
 
 from sags_node import __version__
@@ -58,8 +59,12 @@ class MessageWriter:
                 "sags",
                 {"session": meta.session, "protocol": PROTOCOL, "ns": self._ns, "version": __version__},
             )
-        self._attach(arrived)
+        guessed = meta.type == CAMERA_INFO and meta.units is not msgspec.UNSET
+        if not guessed:
+            self._attach(arrived)
         name, kind, data = message.topic, meta.type, b"".join(message.parts)
+        if guessed:  # a bag tells no units: played as a source it must not pass for calibrated
+            data = cdr.uncalibrated(data)
         if self._compression != "none" and kind == IMAGE and meta.encoding in _COMPRESSIBLE:
             form = "jpeg" if self._compression == "jpeg" and meta.encoding == "rgb8" else "png"
             name, kind, data = f"{name}/compressed", cdr.COMPRESSED, _compressed(message, data, form)

@@ -69,6 +69,7 @@ class Recorder:
         self._topics: dict[str, _Topic] = {}
         self._rejected = 0
         self._bytes = 0
+        self._began = time.monotonic()
         self._error: SagsError | None = None
 
     def stop(self) -> None:
@@ -90,16 +91,18 @@ class Recorder:
             UsageError: something is at the folder already, or an unknown topic.
             SagsError: no node is known, it refuses this client, or the disk is full.
         """
-        began = time.monotonic()
+        self._began = time.monotonic()
         if self._options.snapshot_seconds is None:
             self._record(tell)
         else:
             self._keep_last(self._options.snapshot_seconds, tell)
         if self._error is not None:
             raise self._error
-        return self._summary(time.monotonic() - began)
+        return self.summary()
 
-    def _summary(self, seconds: float) -> dict[str, Any]:
+    def summary(self) -> dict[str, Any]:
+        """What was recorded until now, see `run`. Any thread may call this."""
+        seconds = time.monotonic() - self._began
         rows = {
             name: {"messages": topic.messages, "dropped": topic.dropped, "lost": topic.fresh.lost}
             for name, topic in sorted(self._topics.items())

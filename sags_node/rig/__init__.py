@@ -11,7 +11,16 @@ from sags_node.rig.check import (
     check_rig,
     refuse_errors,
 )
-from sags_node.rig.read import Form, find_form, load_camera, load_rig, read_rig, unknown_form
+from sags_node.rig.read import (
+    GUESSED_FOV,
+    Form,
+    find_form,
+    guessed_rig,
+    load_camera,
+    load_rig,
+    read_rig,
+    unknown_form,
+)
 from sags_node.rig.rig import (
     fit_distortion,
     rectified_camera,
@@ -22,6 +31,7 @@ from sags_node.rig.rig import (
 from sags_node.rig.ros import eye_files, eye_text, save_rig
 
 __all__ = [
+    "GUESSED_FOV",
     "Finding",
     "Form",
     "check_eyes",
@@ -32,6 +42,7 @@ __all__ = [
     "eye_text",
     "find_form",
     "fit_distortion",
+    "guessed_rig",
     "load_camera",
     "load_rig",
     "read_rig",

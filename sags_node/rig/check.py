@@ -29,6 +29,7 @@ class Finding:
     what: str
     fix: str = ""
     figures: Mapping[str, float] = field(default_factory=dict)  # what was measured, for programs
+    launch: tuple[str, ...] = ()  # `key:=value` that fix it
 
 
 def refuse_errors(findings: list[Finding], where: Path | str) -> None:

@@ -11,9 +11,11 @@ import numpy as np
 from sags_node.errors import UsageError
 from sags_node.rig import opencv, ros, scikit_surgery
 from sags_node.rig.check import check_rig, refuse_errors
+from sags_node.rig.rig import rectified_rig
 from sags_node.types import StereoRig
 
-NOMINAL_BASELINE = 0.005  # m, of one camera alone
+NOMINAL_BASELINE = 0.005  # m, of one camera alone, and of eyes that nobody has calibrated
+GUESSED_FOV = 60.0  # degrees across a picture: D4D has 58, the Hamlyn heart 44, da Vinci's scopes 60 to 70
 ARCHIVE = "calibrationdata.tar.gz"
 ARCHIVE_SUFFIXES = (".tar.gz", ".tgz")
 
@@ -48,6 +50,13 @@ def load_camera(file: Path) -> StereoRig:
     rig = ros.read_one(Path(file), NOMINAL_BASELINE)
     refuse_errors(check_rig(rig), file)
     return rig
+
+
+def guessed_rig(width: int, height: int) -> StereoRig:
+    """Eyes of usual optics for pictures of this size (px) that nobody has calibrated; not `metric`."""
+    focal = 0.5 * width / np.tan(np.radians(0.5 * GUESSED_FOV))
+    K = np.array([[focal, 0, 0.5 * (width - 1)], [0, focal, 0.5 * (height - 1)], [0, 0, 1]])
+    return replace(rectified_rig("guessed", width, height, K, NOMINAL_BASELINE), metric=False)
 
 
 def read_rig(path: Path, size: tuple[int, int] | None = None, metres: float | None = None) -> StereoRig:

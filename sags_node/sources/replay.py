@@ -92,7 +92,7 @@ class Replay:
         self._sleep = sleep or self._stopped.wait
         self._poses = None if config.poses is None else Poses(config.poses)
         self._references = References(config.reference) if references else None
-        self._pairs = _open_pairs(config, references)
+        self._pairs = open_pairs(config, references)
         self._count = -(-self._pairs.count // config.stride)  # rounded up
         self.rate = (config.rate or self._pairs.rate or DEFAULT_RATE) / config.stride
         self._stamps: I64 | None = None  # [turns, 2] ns, of the left and the right picture
@@ -250,8 +250,8 @@ class Replay:
         return self._began[1] + self._elapsed(frame_id)
 
 
-def _open_pairs(config: Recording, references: bool) -> Pairs:  # noqa: PLR0911, one return per kind
-    """The reader that fits the kind of recording."""
+def open_pairs(config: Recording, references: bool) -> Pairs:  # noqa: PLR0911, one return per kind
+    """The reader that fits the kind of recording; `references`: of the recording's truth, too."""
     match config:
         case cfg.FoldersSource():
             return FolderPairs(config.left, config.right, config.tools)

@@ -59,7 +59,7 @@ class NearLimit:
         if self._looked_ns is not None and 0 <= t_capture_ns - self._looked_ns < PERIOD_NS:
             return
         self._looked_ns = t_capture_ns
-        self._found.append(self._nearest(left, right, tissue))
+        self._found.append(nearest_tissue(left, right, tissue, self._focal_baseline))
         latest = list(self._found)[-AGREED:]
         agrees = len(latest) == AGREED or first  # before there is a model nothing can be spoilt
         if self._is_set:
@@ -72,28 +72,33 @@ class NearLimit:
         elif len(self._found) == RETREAT and ROOM * min(self._found) > self.limit:
             self.limit = min(self._usual, ROOM * min(self._found))
 
-    def _nearest(self, left: GrayPyramid, right: GrayPyramid, tissue: Bool) -> float:
-        """Depth of the nearest tissue, m; that of the nearest `LEAST_SHARE` of it."""
-        halvings = 0
-        while halvings < len(left.halves) and left.full.shape[1] >> halvings > GUESS_WIDTH:
-            halvings += 1
-        scale = 1 << halvings
-        eyes = level(left, halvings), level(right, halvings)
-        height, width = (side - 2 * BORDER for side in eyes[0].shape)
-        most = min(self._focal_baseline / scale / NEAREST, width - 1.0)
-        disparity = coarse_disparity(*eyes, 0.0, most)
-        first, second = (np.ascontiguousarray(inner(eye)) for eye in eyes)
-        columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-        there = columns - disparity
-        seen = cv2.remap(second, there, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        small = tissue[scale // 2 :: scale, scale // 2 :: scale][:height, :width]
-        both = small & (there >= 0)
-        known = both & (_agreement(first, seen) > MATCHES)
-        count = round(LEAST_SHARE * np.count_nonzero(both))
-        found = disparity[known & (disparity > 0)]
-        if count == 0 or len(found) < count:
-            return np.inf
-        return float(self._focal_baseline / scale / np.partition(found, -count)[-count])
+
+def nearest_tissue(left: GrayPyramid, right: GrayPyramid, tissue: Bool, focal_baseline: float) -> float:
+    """Depth of the nearest `LEAST_SHARE` of the tissue [H, W] that both eyes see, m; infinite: nothing tells.
+
+    Args:
+        focal_baseline: px m, of the whole picture.
+    """
+    halvings = 0
+    while halvings < len(left.halves) and left.full.shape[1] >> halvings > GUESS_WIDTH:
+        halvings += 1
+    scale = 1 << halvings
+    eyes = level(left, halvings), level(right, halvings)
+    height, width = (side - 2 * BORDER for side in eyes[0].shape)
+    most = min(focal_baseline / scale / NEAREST, width - 1.0)
+    disparity = coarse_disparity(*eyes, 0.0, most)
+    first, second = (np.ascontiguousarray(inner(eye)) for eye in eyes)
+    columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    there = columns - disparity
+    seen = cv2.remap(second, there, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    small = tissue[scale // 2 :: scale, scale // 2 :: scale][:height, :width]
+    both = small & (there >= 0)
+    known = both & (_agreement(first, seen) > MATCHES)
+    count = round(LEAST_SHARE * np.count_nonzero(both))
+    found = disparity[known & (disparity > 0)]
+    if count == 0 or len(found) < count:
+        return np.inf
+    return float(focal_baseline / scale / np.partition(found, -count)[-count])
 
 
 def _agreement(first: F32, second: F32) -> F32:

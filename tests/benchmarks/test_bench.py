@@ -121,7 +121,7 @@ def test_chains_compute_every_multiply_add() -> None:
     """Nothing was left out by the compiler: y = y / 2 + s, so many times, from the numbers of the chains."""
     before = thread_count()
     chains = np.arange(peak.CHAINS, dtype=np.float64)
-    for run in peak._CHAINS.values():
+    for run in peak.RUNS.values():
         results = np.zeros(2, np.float32)
         run(results, 1)
         left = 0.5**peak.STEPS

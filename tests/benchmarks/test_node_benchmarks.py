@@ -50,21 +50,22 @@ SHORT = ["source.frames:=20"]  # at 10 Hz
 def test_hosts_are_played_and_leave_the_machine_as_it_was(
     phantom_session: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    chosen = {"one core": None, "with a reader of everything": hosts.reader}
+    chosen = {"alone": None, "one core": None, "with a reader of everything": hosts.reader}
     monkeypatch.setattr(hosts, "neighbours", lambda: chosen)
     mine, said = os.sched_getaffinity(0), []
-    rows = hosts.measure_hosts(str(phantom_session), SHORT, 2.0, said.append)
-    assert [row["name"] for row in rows] == list(chosen) and len(said) == 2
+    rows = hosts.measure_hosts(str(phantom_session), SHORT, said.append)
+    assert [row["name"] for row in rows] == list(chosen) and len(said) == 3
+    assert rows[0]["unread"]["latency_ms"]["p50"] > 0
     for row in rows:
         assert 0 < row["share_after_first_second"] <= 1 and row["latency_ms"]["p50"] > 0
-        assert row["online"]["psnr"] > 15 and sum(row["rungs"].values()) > 0
+        assert row["online_at_full_size"]["psnr"] > 15 and sum(row["rungs"].values()) > 0
     assert os.sched_getaffinity(0) == mine
 
 
 def test_a_run_that_fails_says_why(phantom_session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hosts, "neighbours", lambda: {"alone": None})
     with pytest.raises(SagsError, match=r"mapping\.rung 99"):
-        hosts.measure_hosts(str(phantom_session), [*SHORT, "mapping.rung:=99"], 2.0, lambda what: None)
+        hosts.measure_hosts(str(phantom_session), [*SHORT, "mapping.rung:=99"], lambda what: None)
 
 
 # ---- `benchmarks soak` on a small node with all its neighbours: real processes and sockets -------------

@@ -55,7 +55,7 @@ def test_both_draw_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     case = RasterCase(500, 64, 64, 1)
     ours = Drawing(case).forward()[:3]
     with yardstick.compiled(PROGRAM, 1) as library:
-        program = yardstick._Program(library, case)
+        program = yardstick.Program(library, case)
         program.forward_backward()
     # 2^x of both is off by 2.6e-6, and colours are below 1; a splat cut at 1/255 may show in a few pixels
     apart = np.abs(program.picture - ours)
@@ -78,7 +78,7 @@ def test_a_file_that_is_no_yardstick(tmp_path: Path, code: str, message: str) ->
 @needs_compiler
 def test_too_many_pairs_for_the_program(tmp_path: Path) -> None:
     bodies = [
-        f"long {name}(...) {{ return {-(10**6) if name == 'bin' else 16}; }}" for name in yardstick._FUNCTIONS
+        f"long {name}(...) {{ return {-(10**6) if name == 'bin' else 16}; }}" for name in yardstick.FUNCTIONS
     ]
     file = tmp_path / "program.cpp"
     file.write_text('extern "C" {\n' + "\n".join(bodies) + "\n}")

@@ -135,10 +135,13 @@ def test_what_comes_seldom_is_asked_for_when_due(monkeypatch: pytest.MonkeyPatch
 class Pipe:
     """Stands for a display's pipeline: the other end of its pipe."""
 
-    def __init__(self, _: object, keep: tuple[int]) -> None:
+    def __call__(self, _: object, keep: tuple[int]) -> Pipe:
         self._end = os.dup(keep[0])
+        return self
 
     def start(self) -> None: ...
+
+    def close(self) -> None: ...
 
     def pictures(self, size: int) -> list[bytes]:
         data = os.read(self._end, 1 << 20)
@@ -147,15 +150,15 @@ class Pipe:
 
 
 def test_a_display_gets_its_rate_and_nothing_old(monkeypatch: pytest.MonkeyPatch) -> None:
-    world, rate, shape = World(0), 50.0, (8, 8, 3)
-    for name, replaced in (("time", world), ("threading", world.threading), ("GstProcess", Pipe)):
+    world, pipe, rate, shape = World(0), Pipe(), 50.0, (8, 8, 3)
+    for name, replaced in (("time", world), ("threading", world.threading), ("GstProcess", pipe)):
         monkeypatch.setattr(gst, name, replaced)
-    display = gst._Display("", shape[:2], (10, 200, 30), rate)
+    display = gst.Display("", shape[:2], (10, 200, 30), rate)
     world.run(lambda: world.now >= 0.5)
     display.show(np.zeros(shape, np.uint8), 0.4)
     world.run(lambda: world.now >= 2.0)
-    display._stop.set()
+    display.close()
     key, black = bytes([30, 200, 10, 255] * 64), bytes([0, 0, 0, 255] * 64)
-    shown = display._process.pictures(len(key))  # type: ignore[attr-defined]
+    shown = pipe.pictures(len(key))
     assert shown == [key] * 25 + [black] * 20 + [key] * (len(shown) - 45)
     assert len(shown) == pytest.approx(2.0 * rate, abs=1)

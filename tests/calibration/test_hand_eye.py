@@ -19,8 +19,9 @@ from sags_node.calibration.boards import StereoView
 from sags_node.calibration.hand_eye_solve import solve_hand_eye
 from sags_node.cli.main import main
 from sags_node.config.launch_file import load_launch
+from sags_node.engine.rasterizer.rasterize import Rasterizer, make_rasterizer
 from sags_node.errors import SagsError, UsageError
-from sags_node.evaluation.measure import MeasureOptions, Measurer
+from sags_node.evaluation.measure import MeasureOptions
 from sags_node.evaluation.session import evaluate
 from sags_node.fitting.clip import read_clip
 from sags_node.geometry import invert, matrix_to_quat
@@ -33,7 +34,7 @@ from sags_node.rig import save_rig
 from sags_node.rig.hand_eye import HandEye, read_hand_eye, save_hand_eye
 from sags_node.sources.pose_track import NoPoseError, PoseTrack
 from sags_node.sources.robot import open_robot, rectified
-from sags_node.types import F32, F64, Camera, RectifiedPair, StereoFrame, StereoRig
+from sags_node.types import F32, F64, Bool, Camera, Gaussians, StereoRig
 
 S, MS = 1_000_000_000, 1_000_000
 START = 1_700_000_000 * S
@@ -280,22 +281,35 @@ def test_fits_and_figures_know_where_the_robot_says_the_scope_is(
         f"robot.hand_eye:={tmp_path / 'hand_eye.yaml'}", "source.pace:=step", "source.rate:=5",
         "vision.width:=160", "vision.height:=120", "mapping.max_gaussians:=2000",
     ]  # fmt: skip
-    seen: dict[int, Camera] = {}  # of what is held out
-    held_out = Measurer._held_out
+    drawn: list[Camera] = []  # from where the figures' pictures were
 
-    def noted(self: Measurer, frame: StereoFrame, pair: RectifiedPair, *rest: Any) -> Any:
-        row = held_out(self, frame, pair, *rest)
-        seen[frame.frame_id] = self._held.camera
-        return row
+    def noting(backend: str, width: int, height: int) -> Rasterizer:
+        made = make_rasterizer(backend, width, height)
+        forward = made.forward
 
-    monkeypatch.setattr(Measurer, "_held_out", noted)
+        def noted(gaussians: Gaussians, camera: Camera, tiles: Bool | None = None) -> F32:
+            drawn.append(camera)
+            return forward(gaussians, camera, tiles)
+
+        monkeypatch.setattr(made, "forward", noted)
+        return made
+
+    monkeypatch.setattr("sags_node.evaluation.measure.make_rasterizer", noting)
     session = open_session(recording, [*played, "source.frames:=4"])
     clip = read_clip(session, lambda number: number == 1)
-    evaluate(recording, [*played, "source.frames:=4"], MeasureOptions(hold_out=4), iterations=0)
-    assert list(seen) == [frame.frame_id for frame in clip.test] == [1] and len(clip.train) == 3
-    for number, camera in (*seen.items(), *((f.frame_id, f.camera) for f in (*clip.train, *clip.test))):
+    measured = evaluate(recording, [*played, "source.frames:=4"], MeasureOptions(hold_out=4), iterations=0)
+    held_out = [row.frame_id for row in measured.rows if "heldout" in row.figures]
+    assert held_out == [frame.frame_id for frame in clip.test] == [1] and len(clip.train) == 3
+
+    def off(number: int, camera: Camera) -> float:
+        """m, from where the camera was in that frame."""
         exact = camera_at(number / RATE, 5.0) @ rectified(np.eye(4), session.rig)
-        assert np.linalg.norm(camera.T_world_cam[:3, 3] - exact[:3, 3]) < 0.1e-3
+        return float(np.linalg.norm(camera.T_world_cam[:3, 3] - exact[:3, 3]))
+
+    for frame in (*clip.train, *clip.test):
+        assert off(frame.frame_id, frame.camera) < 0.1e-3
+        assert (off(1, frame.camera) < 0.1e-3) == (frame.frame_id == 1)
+    assert min(off(1, camera) for camera in drawn) < 0.1e-3
 
     # The poses end 2.95 s after the first picture: a second later there is none for the last four.
     late = open_session(recording, [*played, "robot.offset_ms:=1000"])

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 import pytest
-from command_line import RUN_HERE, pure_json, refused, sags, start, stopped, wait_for
+from command_line import RUN_HERE, figures_of, pure_json, refused, sags, start, stopped, wait_for
+from places import ROOT
 
 from sags_node.messaging import introspection as topic
 from sags_node.messaging.received import ReceivedText
@@ -137,6 +142,57 @@ def test_overlay_in_words_and_in_json(beside_node: dict[str, Any], tmp_path: Pat
     assert "with the overlay" in sags("overlay", "--seconds", "1.5", "--save", video).stdout
     assert cv2.VideoCapture(str(video)).read()[0]
     refused(2, "overlay", "--pin", "5000", "3", said=("pin 5000 3", "320x256"))
+
+
+# ---- requests --------------------------------------------------------------------------------------------
+
+
+def test_anchors_are_pinned_listed_and_removed(beside_node: dict[str, Any]) -> None:
+    assert "no anchors; pin one" in sags("anchor", "list").stdout
+    first = figures_of("anchor", "pin", "160", "128", "--json")["id"]
+    assert f"anchor {first + 1} in frame" in sags("anchor", "pin", 150.5, 120).stdout
+    rows = {row["id"]: row for row in figures_of("anchor", "list", "--json")}
+    while first + 1 not in rows:  # it comes with the next frame
+        rows = {row["id"]: row for row in figures_of("anchor", "list", "--json")}
+    assert np.hypot(rows[first]["u"] - 160, rows[first]["v"] - 128) < 10 and rows[first]["z"] > 0
+    assert str(first) in sags("anchor", "list").stdout
+    for anchor in rows:
+        assert sags("anchor", "remove", anchor).stdout == f"anchor {anchor} is removed\n"
+    refused(1, "anchor", "remove", first, said=(str(first),))
+    refused(1, "anchor", "pin", "5000", "3", said=("5000",))
+
+
+def test_the_example_follows_a_point_and_removes_it(beside_node: dict[str, Any]) -> None:
+    """examples/follow_point.py, as its first lines say."""
+    command = [sys.executable, ROOT / "examples/follow_point.py", "160", "128", "--frames", "5"]
+    done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert len(re.findall(r"^pixel \d+\.\d \d+\.\d  -?0\.\d{4} ", done.stdout, re.MULTILINE)) == 5, (
+        done.stdout
+    )
+    while figures_of("anchor", "list", "--json"):  # it goes with the next frame
+        pass
+
+
+def test_parameters_are_read_and_set(beside_node: dict[str, Any]) -> None:
+    assert figures_of("param", "get", "mapping.budget_ms", "--json") == {"mapping.budget_ms": None}
+    assert figures_of("param", "get", "--json")["source"]["kind"] == "folders"
+    assert "max_gaussians:" in sags("param", "get", "mapping").stdout
+    assert sags("param", "set", "mapping.budget_ms:=20").stdout == "mapping.budget_ms is 20\n"
+    assert sags("param", "get", "mapping.budget_ms").stdout == "20.0\n"
+    assert sags("param", "set", "mapping.budget_ms:=null").exit_code == 0
+    refused(2, "param", "get", "mapping.budget", said=("unknown key 'mapping.budget'", "budget_ms"))
+    refused(2, "param", "set", "mapping.budget_ms", "20", said=("write mapping.budget_ms:=20",))
+    refused(1, "param", "set", "mapping.rung:=2", said=("mapping.rung", "cannot be changed", "budget_ms"))
+
+
+def test_a_node_is_paused_resumed_and_reset(beside_node: dict[str, Any]) -> None:
+    assert sags("pause").stdout == "paused; sags resume goes on\n"
+    assert sags("health").stdout.startswith("paused")
+    assert figures_of("resume", "--json") == {"paused": False}
+    assert "new model" in sags("reset").stdout
+    for command in (["pause"], ["reset"], ["anchor", "list"], ["param", "get"]):
+        refused(1, *command, "--ns", "other", said=("no node runs as 'other'",))
 
 
 # ---- Ctrl-C ----------------------------------------------------------------------------------------------

@@ -33,7 +33,7 @@ pytestmark = [pytest.mark.live, pytest.mark.usefixtures("run_dir")]
             ["source.kind:=videos", "source.left:=a.mp4"],
             ("source.right is missing", "vision.onnx.declared_depth", "docs/networks.md"),
         ),
-        (["clip.MP4"], ("clip.MP4 is a video", "layout:=side_by_side", "source.left:=clip.MP4", "rig:=")),
+        (["clip.MP4"], ("clip.MP4 does not exist", "check the path")),
         (["mapping.budget_ms=25"], ("'mapping.budget_ms=25'", "write mapping.budget_ms:=25")),
         ([":=25"], ("':=25'", "write key:=value")),
     ],
@@ -43,7 +43,8 @@ def test_a_wrong_launch(command: str, arguments: list[str], said: tuple[str, ...
 
 
 def test_a_folder_that_is_no_session(user_files: Path) -> None:
-    refused(2, "run", user_files / "empty", said=(str(user_files / "empty/launch.yaml"), "check the path"))
+    said = (f"{user_files / 'empty'} is an empty folder", "give the folder that holds the recording")
+    refused(2, "run", user_files / "empty", said=said)
 
 
 @pytest.mark.parametrize(
@@ -153,7 +154,7 @@ def test_a_calibration_is_not_converted_onto_itself(user_files: Path, tmp_path: 
     [
         (["left/render/depth"], "--topics left/render/depth; without --topics all are recorded"),
         (["--topics", "left/depth", "tf"], "--topics left/depth --topics tf"),
-        (["rig:=x"], "rig:=x: key:=value needs --session"),
+        (["rig:=x"], "rig:=x: key:=value needs a recording"),
     ],
 )
 def test_topics_to_record_are_named_by_an_option(arguments: list[str], said: str) -> None:

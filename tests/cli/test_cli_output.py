@@ -194,7 +194,6 @@ NAMED_IN_A_LAUNCH = {  # what it names -> the launch, the row that says what is 
     ),
     "a calibration": (("VIDEOS", "rig:=FILES/gone"), "calibration", "gone/left.yaml"),
     "a calibration of another size": (("VIDEOS", "rig:=FILES/double"), "calibration", "640x512"),
-    "no calibration": (("VIDEOS", "rig:=null"), "calibration", "no calibration"),
     "a camera": ((*CAMERAS, "source.left:=/dev/no-camera"), "/dev/no-camera", "no such camera"),
     "a camera's size": (
         (*CAMERAS, "rig:=FILES/calib"),
@@ -256,6 +255,12 @@ def test_doctor_lets_gstreamer_read_the_launch_string(user_files: Path) -> None:
         code, checks = doctor(user_files, "source.kind:=gst", "rig:=FILES/calib", *launch)
         assert (code, checks["source"]["level"]) == (int(level == "error"), level)
         assert said in checks["source"]["found"]
+
+
+def test_a_recording_without_a_calibration_plays_and_the_doctor_says_how(user_files: Path) -> None:
+    code, checks = doctor(user_files, "VIDEOS", "rig:=null")
+    assert code == 0 and checks["calibration"]["level"] == "warning"
+    assert checks["calibration"]["found"] == "no calibration" and "no unit" in checks["calibration"]["fix"]
 
 
 def test_doctor_is_content_with_a_launch_that_runs(user_files: Path) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import av
 import numpy as np
 
-from sags_node.demo import _Shown
+from sags_node.demo import Shown
 from sags_node.media.h264_file import H264File
 from sags_node.overlay.draw import over
 from sags_node.overlay.save import Layers, read_layers
@@ -44,7 +44,7 @@ def test_a_display_shows_what_was_drawn_and_for_a_missed_frame_what_was_there_be
     layers.close()
     assert (tmp_path / "layers").stat().st_size < rgba.nbytes / 4
     kept = Kept()
-    shown = _Shown(kept, read_layers(tmp_path / "layers"))  # type: ignore[arg-type]
+    shown = Shown(kept, read_layers(tmp_path / "layers"))  # type: ignore[arg-type]
     for frame_id, picture in enumerate(pictures):
         shown.add(frame_id, picture)
     with_it = over(pictures[1], rgba)

@@ -23,6 +23,7 @@ from sags_node.evaluation import plotting
 from sags_node.evaluation.golden import Golden, Tolerance, compare, read_golden, write_golden
 from sags_node.evaluation.measure import MeasureOptions, Measurer
 from sags_node.evaluation.plots import Series, line_plot
+from sags_node.evaluation.receipt import Receipt
 from sags_node.evaluation.report import write_report
 from sags_node.evaluation.session import evaluate
 from sags_node.evaluation.spool import Spool
@@ -144,7 +145,9 @@ def measured_run(
                 continue
             result = frame_result(frame, velocity, late)
             spool.add(with_right_eye(result) if right else result, 21.0, frame.t_capture_ns)
-        measurer = Measurer(spool, Rectifier(rig(), WIDTH, HEIGHT), lambda frame, pair: frame.tissue, options)
+        receipt = Receipt(rig(), (WIDTH, HEIGHT), options.lpips_weights)
+        rectifier = Rectifier(rig(), WIDTH, HEIGHT)
+        measurer = Measurer(spool, rectifier, lambda frame, pair: frame.tissue, options, receipt)
         measurer.run(frames, lambda what, done: None)
     return measurer
 
@@ -469,16 +472,46 @@ def test_a_session_in_steps_is_measured_and_reproducible(session_folder: Path) -
     assert first["settings"]["depth_reference"] == "exact"
 
 
-def test_a_session_in_real_time_goes_through_the_node(
+def test_a_session_in_real_time_is_seen_as_a_subscriber_sees_it(
     session_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    summary = evaluate(session_folder, ["source.rate:=10"], pace="realtime").summary
-    assert summary["frames"] == 20 and summary["held_out"] == 3
-    assert 1 <= summary["processed"] == 17 - summary["dropped"]
+    played, options = ["source.rate:=10", "ns:=a/b"], MeasureOptions(hold_out=0)
+    outcome = evaluate(session_folder, played, options, "realtime")
+    summary = outcome.summary
+    assert summary["frames"] == 20 and summary["held_out"] == 0
+    assert 1 <= summary["processed"] == 20 - summary["dropped"]
     assert summary["latency_ms"]["p50"] > 0 and summary["rss_mb"]["max"] > 50
-    assert summary["online"]["ssim"] > 0.8
+    assert summary["frame_ms"]["p50"] <= summary["latency_ms"]["max"]
+    assert summary["online"]["ssim"] > 0.8 and summary["predict"]["copy_psnr"] > 20
+    assert summary["depth"]["median_mm"] < 1.5 and summary["settings"]["depth_reference"] == "exact"
+    assert outcome.pictures[0].render.shape == outcome.pictures[0].truth.shape
     assert not list(tmp_path.glob("sags-eval-*"))
+    with pytest.raises(UsageError, match=r"sees every frame.*--pace step"):
+        evaluate(session_folder, played, pace="realtime")
+    with pytest.raises(SagsError, match=r"the node failed: .*mapping\.rung 99"):
+        evaluate(session_folder, ["mapping.rung:=99"], options, "realtime")
+
+
+def test_a_receipt_tells_what_was_compared_apart(frames: list[StereoFrame]) -> None:
+    def receipt(kept: list[StereoFrame], tissue: np.ndarray, of: StereoRig) -> dict[str, Any]:
+        found = Receipt(of, (WIDTH, HEIGHT), None)
+        for frame in kept:
+            found.add(frame, tissue)
+        return found.as_json()
+
+    tissue = np.ones((HEIGHT, WIDTH), bool)
+    tissue[:4] = False
+    kept = [frames[i] for i in (0, 1, 2, 5)]
+    whole = receipt(kept, tissue, rig())
+    assert whole["frames"]["ids"] == "0-2, 5" and whole["frames"]["count"] == 4
+    assert whole["masks"]["pixels_counted"] == 4 * (HEIGHT - 4) * WIDTH
+    assert receipt(kept, tissue, rig()) == whole
+    changed = replace(frames[5], left=frames[5].left ^ np.uint8(1))
+    assert receipt([*kept[:3], changed], tissue, rig())["frames"]["digest"] != whole["frames"]["digest"]
+    assert receipt(kept, ~tissue, rig())["masks"]["digest"] != whole["masks"]["digest"]
+    other = replace(rig(), left=replace(rig().left, K=rig().left.K + 0.01))
+    assert receipt(kept, tissue, other)["calibration"] != whole["calibration"]
 
 
 def test_options_out_of_range_are_refused(tmp_path: Path) -> None:

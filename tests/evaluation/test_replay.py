@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +43,10 @@ NEW_GOLDEN = Golden(
 def test_the_phantom_session_gives_its_golden_figures(request: pytest.FixtureRequest) -> None:
     outcome = evaluate(SESSION, options=MeasureOptions(every=10), pace="step", iterations=2)
     _check(request, outcome.summary, SESSION.with_suffix(".golden.json"))
+    committed = SESSION.with_suffix(".receipt.json")
+    if request.config.getoption("--update-golden"):
+        committed.write_text(json.dumps(outcome.receipt, indent=1) + "\n", encoding="utf-8")
+    assert outcome.receipt == json.loads(committed.read_text(encoding="utf-8"))
 
 
 def test_the_papers_model_gives_its_golden_figures(request: pytest.FixtureRequest) -> None:

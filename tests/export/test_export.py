@@ -80,7 +80,7 @@ class Truth:
     """The tissue's true surface at one frame."""
 
     def __init__(self, phantom: Phantom, frame: int) -> None:
-        tissue = phantom._tissue
+        tissue = phantom.tissue
         self.surface = raycasting(tissue.vertices(frame / FRAMES).reshape(-1, 3), tissue.faces)
         self.depth = phantom.frame(frame, FRAMES).depth
 
@@ -111,7 +111,7 @@ def test_splats_are_read_by_their_names_and_by_another_program(
     phantom_session: Path, scene: Scene, tmp_path: Path
 ) -> None:
     file = tmp_path / "model.ply"
-    done = sags("export", "--session", phantom_session, *STEP, "--at", "2", "--splats", file, "--json")
+    done = sags("export", phantom_session, *STEP, "--at", "2", "--splats", file, "--json")
     assert done.exit_code == 0, done.stderr
     (row,) = json.loads(done.stdout)
     gaussians, columns = with_constant_colours(scene.gaussians), splats_of(file)
@@ -287,7 +287,7 @@ def test_a_fit_is_exported_at_any_time(
     splats, points = tmp_path / "splats.ply", tmp_path / "points.ply"
     for at, here, elsewhere in (("0.0", 0, 9), ("0.9", 9, 0)):
         done = sags(
-            "export", "--session", *session, "--fit", tmp_path / "fit", "--at", at,
+            "export", *session, "--fit", tmp_path / "fit", "--at", at,
             "--splats", splats, "--points", points, "--force",
         )  # fmt: skip
         assert done.exit_code == 0, done.stderr
@@ -298,7 +298,7 @@ def test_a_fit_is_exported_at_any_time(
     count = figures["gaussians"]
     assert count < len(splats_of(splats)["x"]) <= 2 * count  # steep ones in two
     for frames in (9, 11):
-        other = ("--session", phantom_session, f"source.frames:={frames}", "--fit", tmp_path / "fit")
+        other = (phantom_session, f"source.frames:={frames}", "--fit", tmp_path / "fit")
         refused(2, "export", *other, "--splats", tmp_path / "new.ply", said=("frames",))
 
 
@@ -306,7 +306,7 @@ def test_a_fit_is_exported_at_any_time(
 
 
 def test_mistakes_are_one_message_before_any_work(phantom_session: Path, tmp_path: Path) -> None:
-    session = ("export", "--session", phantom_session)
+    session = ("export", phantom_session)
     (tmp_path / "file").write_text("mine")
     (tmp_path / "folder.ply").mkdir()
     (tmp_path / "empty").mkdir()
@@ -325,9 +325,9 @@ def test_mistakes_are_one_message_before_any_work(phantom_session: Path, tmp_pat
         ((*session, "--mesh", ply, "--orbit-degrees", "90"), ("--orbit-degrees",)),
         ((*session, "--mesh", ply, "--fit", tmp_path / "empty"), ("checkpoint.npz", "sags fit")),
         ((*session, "--mesh", ply, "sorce.start:=1"), ("sorce", "source")),
-        (("export", "--session", tmp_path / "gone.yaml", "--mesh", ply), ("gone.yaml",)),
-        (("export", "--mesh", ply, "--at", "1"), ("need --session",)),
-        (("export", "--mesh", ply, "source.start:=1"), ("need --session",)),
+        (("export", tmp_path / "gone.yaml", "--mesh", ply), ("gone.yaml",)),
+        (("export", "--mesh", ply, "--at", "1"), ("need a recording",)),
+        (("export", "--mesh", ply, "source.start:=1"), ("need a recording",)),
     ):
         refused(2, *arguments, said=said)
     (tmp_path / "empty/checkpoint.npz").write_bytes(b"PK\x03\x04 not a checkpoint")
@@ -343,7 +343,7 @@ def test_what_exists_is_replaced_only_when_told_and_only_by_something_whole(
     folder.mkdir()
     file = folder / "mesh.ply"
     file.write_text("mine")
-    command = ("export", "--session", phantom_session, *STEP, "--at", "0", "--mesh", file)
+    command = ("export", phantom_session, *STEP, "--at", "0", "--mesh", file)
     refused(2, *command, said=("exists already", "--force"))
     assert file.read_text() == "mine"
 

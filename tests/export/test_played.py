@@ -39,7 +39,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
         out.mkdir()
         rows = pure_json(
             sags(
-                *("export", "--session", session, "mapping.iterations:=1", "mapping.max_gaussians:=4000"),
+                *("export", session, "mapping.iterations:=1", "mapping.max_gaussians:=4000"),
                 *("--depth", out / "depth", "--tracks", out / "tracks.npz"),
                 *("--render", out / "model.mp4", "--lerobot", out / "lerobot", "--json"),
                 *("--lerobot-version", "v2.1" if number == 1 else "v3.0"),
@@ -189,8 +189,8 @@ def test_statistics_of_several_episodes_are_those_of_all_their_numbers() -> None
 
 def test_what_does_not_go_together_is_refused(exported: Path, tmp_path: Path) -> None:
     session = exported / "session0"
-    refused(2, "export", "--depth", tmp_path / "d", said=("--depth is of every frame",))
+    refused(2, "export", "--depth", tmp_path / "d", said=("--depth exports all frames",))
     refused(
-        2, "export", "--session", session, "--at", "0.1", "--tracks", tmp_path / "t.npz", said=("--tracks",)
+        2, "export", session, "--at", "0.1", "--tracks", tmp_path / "t.npz", said=("--tracks",)
     )  # fmt: skip
-    refused(2, "export", "--session", session, "--depth", exported / "0/depth", said=("is not empty",))
+    refused(2, "export", session, "--depth", exported / "0/depth", said=("is not empty",))

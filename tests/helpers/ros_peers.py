@@ -95,7 +95,7 @@ class RosNode:
 
     def __init__(self, words: tuple[str, ...], variables: Mapping[str, str]) -> None:
         self.came: dict[str, list[Came]] = defaultdict(list)
-        self._said: list[dict[str, Any]] = []
+        self.said: list[dict[str, Any]] = []
         self.process = subprocess.Popen(
             [rclpy_python(), ROOT / "tests/ros2/peer.py", *words],
             env={**os.environ, "ROS_DOMAIN_ID": str(DOMAIN), **variables},
@@ -112,16 +112,16 @@ class RosNode:
             said = json.loads(line)
             topic = said.pop("topic", None)
             if topic is None:
-                self._said.append(said)
+                self.said.append(said)
             else:
                 self.came[topic].append(Came(**said))
 
     def names(self) -> dict[str, Any]:
         """Which nodes and topics it sees."""
-        count = len(self._said)
+        count = len(self.said)
         self._order(do="names")
-        until(lambda: len(self._said) > count)
-        return self._said[-1]
+        until(lambda: len(self.said) > count)
+        return self.said[-1]
 
     def publish(self, kind: str, topic: str, **fields: object) -> None:
         """`point_x=1` sets `point.x`."""
@@ -143,7 +143,7 @@ class RosNode:
 def ros_node(*words: str, **variables: str) -> Iterator[RosNode]:
     joined = RosNode(words, variables)
     try:
-        until(lambda: joined._said)  # importing rclpy takes seconds
+        until(lambda: joined.said)  # importing rclpy takes seconds
         yield joined
     finally:
         joined.close()

@@ -261,7 +261,8 @@ class Run:
                 source=PushSource(rate=RATE), publish=PublishConfig(data=(), ipc=False, run_dir=self._folder)
             )
             self.source = Source(self)
-            self.node = node.Node(config, None, self.source, self._note)  # type: ignore[arg-type]
+            rig = SimpleNamespace(metric=True)
+            self.node = node.Node(config, rig, self.source, self._note)  # type: ignore[arg-type]
             self._data = self._network.sockets[zmq.XPUB]
             self._control = self._network.sockets[zmq.ROUTER]
             self._data.incoming.extend([b"\x01sags/" + name.encode()] for name in TOPICS)

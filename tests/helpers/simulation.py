@@ -109,7 +109,11 @@ class World:
                 self._work, self._name, self.ident = lambda: target(*args), name, None
 
             def start(self) -> None:
-                self.ident = id(world.spawn(self._work, self._name))
+                self._task = world.spawn(self._work, self._name)
+                self.ident = id(self._task)
+
+            def join(self, timeout: float | None = None) -> None:
+                world.wait(lambda: bool(self._task.runs.dead), timeout)
 
         class Event:
             def __init__(self) -> None:

@@ -111,6 +111,7 @@ def health(state: str = "running") -> NodeHealth:
         state=state,
         rate_hz=30.0,
         latency_ms={"p50": 40.0, "max": float("nan")},
+        frame_ms={"p50": 20.0},
         stage_ms={"rectify": 2.0, "map": 20.0},
         dropped={"capture": 3},
         gaussians=384,

@@ -14,7 +14,9 @@ from numbered_pictures import write_video
 from places import SESSION
 
 from sags_node.cli.main import main
-from sags_node.importing.check import check_folder
+from sags_node.config.launch_file import load_launch
+from sags_node.errors import UsageError
+from sags_node.importing.check import check_folder, overrides_of
 from sags_node.importing.pictures import combing, lit_box
 from sags_node.rig import Finding
 from sags_node.types import U8
@@ -185,7 +187,9 @@ def test_one_broken_file_is_said_once(tmp_path: Path) -> None:
     (folder / "left/000.bmp").write_bytes(b"")
     shutil.copytree(SESSION / "calib", folder / "calib")
     assert sum("000.bmp" in each.what for each in check_folder(folder)) == 1
-    assert f"rig:={folder / 'calib'}" in check_folder(folder)[-1].what
+    assert check_folder(folder)[-1].what == f"to play it: when that is fixed: sags run {folder}"
+    shutil.copy(folder / "left/001.bmp", folder / "left/000.bmp")
+    assert overrides_of(folder)[-1] == f"rig:={folder / 'calib'}"
 
 
 def test_eyes_are_told_by_names(tmp_path: Path) -> None:
@@ -212,16 +216,16 @@ def shown(left: U8, right: U8) -> dict[str, tuple[U8, str]]:
     rows[1::2] = right[1::2]
     dark = np.full_like(left, 20)
     return {
-        "side by side": (np.hstack([left, right]), "layout:=side_by_side rig"),
+        "side by side": (np.hstack([left, right]), "layout:=side_by_side"),
         "exchanged": (np.hstack([right, left]), "layout:=side_by_side source.geometry.first:=right"),
-        "above": (np.vstack([left, right]), "layout:=over_under rig"),
-        "rows": (rows, "layout:=row_interleaved rig"),
+        "above": (np.vstack([left, right]), "layout:=over_under"),
+        "rows": (rows, "layout:=row_interleaved"),
         "panes": (
             np.vstack([np.hstack([left, right]), np.hstack([dark, left])]),
             f"layout:=panes source.geometry.crop:=[0,0,{2 * WIDTH},{2 * HEIGHT}] "
-            f"source.geometry.crop_right:=[{2 * WIDTH},0,{2 * WIDTH},{2 * HEIGHT}] rig",
+            f"source.geometry.crop_right:=[{2 * WIDTH},0,{2 * WIDTH},{2 * HEIGHT}]",
         ),
-        "one eye": (left, "layout:=side_by_side shows what is in it"),
+        "one eye": (left, "layout:=side_by_side shows what is in it"),  # not played: the fix
     }
 
 
@@ -235,7 +239,14 @@ def test_a_video_says_how_it_shows_both_eyes(name: str, tmp_path: Path) -> None:
         pictures.append(picture)
     write_video(tmp_path / "case.avi", pictures)
     found = check_folder(tmp_path)
-    assert play in found[-1].what, found
+    if name == "one eye":
+        assert play in found[2].fix and found[2].level == "error", found
+        with pytest.raises(UsageError, match="one eye"):
+            overrides_of(tmp_path)
+    else:
+        assert found[-1].what.endswith(play), found
+        for played in (tmp_path, tmp_path / "case.avi"):
+            assert " ".join(overrides_of(played)).endswith(play)
     assert found[1].what.startswith("case.avi: 3 frames of ") and "px at 25 Hz, 0.1 s" in found[1].what
     assert ("one eye" in found[2].what) == (name == "one eye")
     assert ("exchanged" in str(found)) == (name == "exchanged")
@@ -251,6 +262,23 @@ def test_two_videos_are_looked_at(tmp_path: Path) -> None:
     whole = (tmp_path / "left.avi").read_bytes()
     (tmp_path / "left.avi").write_bytes(whole[: len(whole) // 2])
     assert any(each.level == "error" and "left.avi" in each.what for each in check_folder(tmp_path))
+
+
+def test_what_is_recognised_is_played(tmp_path: Path) -> None:
+    """Also from a folder whose name YAML would read as something else."""
+    folder = made(tmp_path / "case: 3 #1")
+    config = load_launch(folder, overrides_of(folder))
+    assert config.source.model_dump(include={"kind", "left", "right", "tools"}) == {
+        "kind": "folders",
+        "left": folder / "left",
+        "right": folder / "right",
+        "tools": folder / "masks",
+    }
+    assert config.rig is None
+    assert overrides_of(SESSION) == []  # it has a launch file
+    for nothing, said in ((tmp_path / "gone", "does not exist"), (tmp_path, "nothing that is known")):
+        with pytest.raises(UsageError, match=said):
+            overrides_of(nothing)
 
 
 def test_noise_is_no_comb_and_fields_are() -> None:
@@ -301,7 +329,7 @@ def test_the_command(tmp_path: Path) -> None:
     result = CliRunner().invoke(main, ["import", "--check", str(folder)])
     assert result.exit_code == 1 and "cannot be played" in result.stderr and "polarity" in result.stdout
     missing = CliRunner().invoke(main, ["import", "--check", str(tmp_path / "none")])
-    assert missing.exit_code == 2 and "is not a folder" in missing.stderr
+    assert missing.exit_code == 2 and "does not exist" in missing.stderr
 
 
 # ---- what sags run would refuse --------------------------------------------------------------------------

@@ -11,9 +11,9 @@ import sys
 from pathlib import Path
 
 import numba
-import numpy as np
 import pytest
 
+from sags_node.engine.pinhole import to_pixel
 from sags_node.kernels import cache, digest
 from sags_node.kernels.cache import cache_root
 from sags_node.kernels.jit import kernel
@@ -24,10 +24,12 @@ SAMPLING = """
 import json, numpy as np
 from sags_node.engine import pinhole
 from sags_node.model import alias_free
-cam = np.concatenate([np.eye(4, dtype=np.float32)[:3].ravel(), np.float32([100, 100, 50, 50])])
-intervals = np.full(1, np.inf, np.float32)
-alias_free._sampling_intervals(np.float32([[0, 0, 2]]), cam, 100, 100, intervals)
-used = [alias_free._sampling_intervals, alias_free._sampling_interval, pinhole.to_camera, pinhole.to_pixel]
+from sags_node.types import Camera
+camera = Camera(100, 100, np.float64([[100, 0, 50], [0, 100, 50], [0, 0, 1]]), np.eye(4))
+variances = alias_free.smoothing_variances(np.float32([[0, 0, 2]]), [camera])
+intervals = np.sqrt(variances / alias_free.FILTER_VARIANCE).astype(float).round(6)
+used = {id(one): one for module in (pinhole, alias_free) for one in vars(module).values()
+        if hasattr(one, "stats")}.values()
 """
 # A constant that comes through two files, a helper through one, and a kernel made around a function.
 MADE = {
@@ -84,10 +86,10 @@ planes, depth = (random.random(shape, np.float32) for shape in ((5, 64, 80), (64
 image = random.integers(0, 256, (64, 80, 3), np.uint8)
 slopes, weight = np.empty_like(planes), np.empty_like(depth)
 tissue.tissue_loss(planes, image, depth > 0.1, depth, slopes, weight, 2e-3, 1e-3)
-(kernel,) = tissue._tissue_loss.overloads.values()
+used = [one for one in vars(tissue).values() if getattr(one, "targetoptions", {}).get("parallel")]
+(kernel,) = used[0].overloads.values()
 shared = [f for f in kernel.library.get_defined_functions() if f.linkage == Linkage.linkonce_odr]
 intervals = [int(hashlib.sha256(slopes).hexdigest()[:12], 16), len(shared)]
-used = [tissue._tissue_loss]
 """
 
 
@@ -134,12 +136,12 @@ def edit(file: Path, old: str, new: str) -> None:
 def test_a_changed_helper_recompiles_the_kernels_that_call_it(whole_copy: Path) -> None:
     """The interval is z / f. The helper stands in another file than its caller, which is left alone."""
     helper = whole_copy / "sags_node/engine/pinhole.py"
-    assert run(whole_copy, SAMPLING)[:2] == [np.float32(0.02), 4]
+    assert run(whole_copy, SAMPLING)[:2] == [0.02, 4]
     assert run(whole_copy, SAMPLING)[1] == 0  # of an unchanged package all is loaded
     edit(helper, "cam[10] * z + cam[11]", "3 * cam[10] * z + cam[11]")
-    assert run(whole_copy, SAMPLING)[:2] == [np.float32(0.06), 4]
+    assert run(whole_copy, SAMPLING)[:2] == [0.06, 4]
     edit(helper, "3 * cam[10] * z + cam[11]", "cam[10] * z + cam[11]")
-    assert run(whole_copy, SAMPLING)[:2] == [np.float32(0.02), 0]  # the former state is still there
+    assert run(whole_copy, SAMPLING)[:2] == [0.02, 0]  # the former state is still there
 
 
 def test_constants_and_helpers_are_followed_through_any_number_of_files(whole_copy: Path) -> None:
@@ -276,19 +278,22 @@ def test_folders_that_were_not_used_for_longest_are_cleared(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(cache, "KEPT", 3)
-    for age, name in enumerate("abcde"):
-        (tmp_path / f"engine.{name}-1").mkdir()
-        (tmp_path / f"engine.{name}-1/index").touch()
-        os.utime(tmp_path / f"engine.{name}-1", (1e9 - age, 1e9 - age))
-    cache._used.__wrapped__(tmp_path / "engine.e-1")
+    monkeypatch.setattr(cache, "cache_root", lambda: tmp_path)
+    used = str(digest.kernel_name(to_pixel.py_func))  # type: ignore[attr-defined]
+    names = [*(f"engine.{name}-1" for name in "abcd"), used]
+    for age, name in enumerate(names):
+        (tmp_path / name).mkdir()
+        (tmp_path / f"{name}/index").touch()
+        os.utime(tmp_path / name, (1e9 - age, 1e9 - age))
+    assert not cache.is_cold(to_pixel)
     cache.clear_old(tmp_path)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["engine.a-1", "engine.b-1", "engine.e-1"]
+    assert {path.name for path in tmp_path.iterdir()} == {*names[:2], used}
 
 
 def test_a_kernel_is_cold_until_it_was_compiled_once(whole_copy: Path) -> None:
     cold = "\nfrom sags_node.kernels.cache import is_cold\nbefore = is_cold(pinhole.to_pixel)"
-    imported, called = SAMPLING.split("cam = ")
-    code = f"{imported}{cold}\ncam = {called}\nprint(json.dumps([before, is_cold(pinhole.to_pixel)]))\n"
+    imported, called = SAMPLING.split("camera = ")
+    code = f"{imported}{cold}\ncamera = {called}\nprint(json.dumps([before, is_cold(pinhole.to_pixel)]))\n"
     environment = {"NUMBA_CACHE_DIR": str(whole_copy / "another cache")}
     for expected in ([True, False], [False, False]):
         stdout, stderr = start(whole_copy, code, **environment).communicate(timeout=120)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,9 +11,9 @@ from places import SESSION
 
 from sags_node.engine.losses.tissue import COVERED
 from sags_node.engine.rasterizer.rasterize import TILE_HEIGHT, TILE_WIDTH
-from sags_node.mapping import focus
+from sags_node.mapping import focus, refiner
 from sags_node.mapping.budget import StepBudget
-from sags_node.mapping.focus import EVERY, with_neighbours, worst_tiles
+from sags_node.mapping.focus import EVERY, largest, with_neighbours, worst_tiles
 from sags_node.mapping.ladder import Rung
 from sags_node.mapping.refiner import CpuRefiner
 from sags_node.mapping.split import SPLIT
@@ -134,17 +135,22 @@ def test_in_a_hurry_the_first_step_leaves_alone_what_fits_best() -> None:
 
 def test_the_worst_tiles_are_those_of_what_was_drawn_last(monkeypatch: pytest.MonkeyPatch) -> None:
     """Tiles that were not drawn again are not looked at again: nothing in them has changed."""
-    asked = 0
-    of_the_refiner = CpuRefiner._worst_tiles
+    asked, frame_of, begin = 0, dict[str, Any](), CpuRefiner.begin
 
-    def compared(refiner: CpuRefiner, share: float) -> Bool:
+    def noted(one: CpuRefiner, *given: Any) -> None:
+        begin(one, *given)
+        frame_of.update(refiner=one, seen=given[2])
+
+    def compared(residuals: F32, share: float) -> Bool:
         nonlocal asked
         asked += 1
-        found, seen = of_the_refiner(refiner, share), refiner._observation
-        np.testing.assert_array_equal(found, worst_tiles(refiner.planes(), seen.image, seen.tissue, share))
+        found, seen = largest(residuals, share), frame_of["seen"]
+        planes = frame_of["refiner"].planes()
+        np.testing.assert_array_equal(found, worst_tiles(planes, seen.image, seen.tissue, share))
         return found
 
-    monkeypatch.setattr(CpuRefiner, "_worst_tiles", compared)
+    monkeypatch.setattr(CpuRefiner, "begin", noted)
+    monkeypatch.setattr(refiner, "largest", compared)
     session = open_session(SESSION, ["source.pace:=step", "mapping.max_gaussians:=4000"])
     pipeline = Pipeline(session.config, session.rig)
     with session.source as source:

@@ -29,7 +29,8 @@ from sags_node.mapping import densify, exposure, mapper
 from sags_node.mapping.anchors import Anchors
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.devices import Skips
-from sags_node.mapping.gpu_refiner import REFINED, GpuRefiner
+from sags_node.mapping.gpu_map import REFINED, GpuMap
+from sags_node.mapping.gpu_refiner import GpuRefiner
 from sags_node.mapping.mapper import Mapper
 from sags_node.mapping.optimiser import LearningRates
 from sags_node.mapping.refiner import CpuRefiner, Refiner
@@ -96,6 +97,11 @@ class Played:
     def take(self, observation: Observation, steps: int = 1, still: int = 0) -> tuple[Snapshot, RenderedView]:
         mapped = self.frames.take(observation, StepBudget(steps), still)
         return mapped.snapshot, mapped.view
+
+    def begin(self, observation: Observation) -> None:
+        """Take a frame in by hand."""
+        assert self.mapper.map.deformation is not None
+        self.refiner.begin(self.mapper.model, self.mapper.map.deformation, observation, 1e-4)
 
     def row(self, name: str) -> np.ndarray:
         return np.array(getattr(self.mapper.model, name))
@@ -196,15 +202,26 @@ def test_as_many_steps_as_the_budget_gives() -> None:
     assert losses[1] < losses[0]  # before the last step
 
 
+def only_of_a_camera(makes_tensor: Callable[..., torch.Tensor]) -> Callable[..., torch.Tensor]:
+    """Lets no array through to the device but the matrices of a camera."""
+
+    def checked(data: Any, **options: Any) -> torch.Tensor:
+        assert not (isinstance(data, np.ndarray) and data.size > 16), "sent to the device"
+        return makes_tensor(data, **options)
+
+    return checked
+
+
 def test_nothing_is_copied_between_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     played = on_device()
     played.take(frame(0))
-    played.mapper._begin(frame(1))
+    played.begin(frame(1))
     played.refiner.draw()
     before = {name: played.row(name) for name in REFINED}
     with monkeypatch.context() as forbidden:
         forbidden.setattr(torch.Tensor, "cpu", lambda self: pytest.fail("fetched from the device"))
-        forbidden.setattr(GpuRefiner, "_sent", lambda self, array: pytest.fail("sent to the device"))
+        for name in ("tensor", "as_tensor", "from_numpy"):
+            forbidden.setattr(torch, name, only_of_a_camera(getattr(torch, name)))
         played.refiner.refine(LearningRates())
         played.refiner.refine_worst(0.3, LearningRates())
     assert all(np.array_equal(before[name], played.row(name)) for name in REFINED)
@@ -254,7 +271,7 @@ def test_damage_is_healed(where: str) -> None:
     count = played.mapper.model.count
     if where == "nodes":
         assert isinstance(played.refiner, GpuRefiner)
-        played.refiner._momentum[3] = torch.nan
+        played.refiner.on_gpu.momentum[3] = torch.nan
     else:
         getattr(played.mapper.model, where)[5] = np.nan
     _, view = played.take(frame(1))
@@ -292,7 +309,7 @@ def test_tissue_that_comes_into_view_gets_nodes_on_the_device_too() -> None:
     assert counts[1] > counts[0] and counts[2:] == counts[:2]
     assert played.mapper.model.node_index.max() >= counts[0]
     assert isinstance(played.refiner, GpuRefiner)
-    on_gpu = played.refiner._nodes.cpu().numpy()
+    on_gpu = played.refiner.on_gpu.nodes.cpu().numpy()
     np.testing.assert_array_equal(on_gpu, played.mapper.map.deformation.nodes)
 
 
@@ -323,7 +340,7 @@ class Fault:
 
 FAULTS = [
     (Drawing, "__init__", 1), (Drawing, "__init__", 2), (Drawing, "__init__", 3), (Drawing, "backward", 2),
-    (GpuRefiner, "_take", 1), (GpuRefiner, "_take", 2), (torch.Tensor, "cpu", 6),
+    (GpuMap, "take", 1), (GpuMap, "take", 2), (torch.Tensor, "cpu", 6),
 ]  # fmt: skip
 
 
@@ -345,7 +362,6 @@ def test_a_cuda_error_anywhere_leaves_the_cpu_to_go_on(
     assert "illegal memory access" in problem.text and "restart the node" in problem.text
     assert "and much more" not in problem.text
     assert played.refiner.share == CPU_SHARE
-    assert played.mapper._limit(StepBudget(1)) == CPU_SHARE * CAPACITY
     after, view = played.take(frame(2))
     assert fault.calls == call and psnr(view, frame(2)) > 19 and after.loss > 0
 
@@ -353,7 +369,7 @@ def test_a_cuda_error_anywhere_leaves_the_cpu_to_go_on(
 def test_what_was_fetched_by_half_is_not_in_the_model(monkeypatch: pytest.MonkeyPatch) -> None:
     played = on_device()
     played.take(frame(0))
-    played.mapper._begin(frame(1))
+    played.begin(frame(1))
     played.refiner.draw()
     played.refiner.refine(LearningRates())
     before = {name: played.row(name) for name in REFINED}
@@ -430,11 +446,11 @@ def pipeline_on(device: str, steps: int) -> tuple[Pipeline, Callable[[int], Any]
 def test_the_pipeline_runs_on_the_device_and_says_when_it_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sags_node.vision.stereo.SMALLEST_SIDE", 16)  # the frames bring their depth
     pipeline, take = pipeline_on("cuda", 1)
-    assert isinstance(pipeline._refiner, GpuRefiner)
     assert psnr(take(0).views["left"], frame(0)) > 19
     take(1)
     assert "device" not in pipeline.warnings
-    Fault(CUDA_ERROR, 1).break_(monkeypatch, Drawing, "backward")
+    fault = Fault(CUDA_ERROR, 1).break_(monkeypatch, Drawing, "backward")
     result = take(2)
+    assert fault.calls == 1  # it was the device that drew
     assert psnr(result.views["left"], frame(2)) > 20 and len(result.snapshot.gaussians) > 60
     assert "the CPU goes on" in pipeline.warnings["device"][0].text

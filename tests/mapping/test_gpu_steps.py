@@ -1,9 +1,8 @@
-"""What `GpuRefiner` does in torch against the CPU: the mapper's optimiser, control nodes, worst tiles."""
+"""What is done in torch on a GPU against the CPU: the mapper's optimiser, control nodes, worst tiles."""
 
 from __future__ import annotations
 
 import dataclasses
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,16 +10,14 @@ import pytest
 import torch
 from engine_scenes import camera, relative_error
 
-from sags_node.engine import gsplat_backend
 from sags_node.engine.interface import Gradients
-from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.mapping import focus, optimiser
-from sags_node.mapping.gpu_refiner import GpuRefiner
+from sags_node.mapping.gpu_map import GpuMap
+from sags_node.mapping.gpu_refiner import worst_tiles
 from sags_node.mapping.optimiser import LearningRates, Optimiser
-from sags_node.mapping.refiner import CpuRefiner
 from sags_node.model.deformation import NodeDeformation
 from sags_node.model.gaussians import GaussianModel
-from sags_node.types import F32, Observation
+from sags_node.types import F32
 
 COUNT = 141
 VIEW = camera(moved=True)
@@ -63,39 +60,35 @@ def in_torch(gradients: Gradients) -> dict[str, torch.Tensor]:
 
 
 @pytest.fixture
-def pair(monkeypatch: pytest.MonkeyPatch) -> Pair:
-    monkeypatch.setattr(gsplat_backend, "gpu", lambda: torch.device("cpu"))
+def pair() -> Pair:
     return Pair()
 
 
 class Pair:
-    """A model with control nodes on the host, and the same with a refiner."""
+    """A model with control nodes on the host, and the same in torch."""
 
     def __init__(self, nodes: int = 20) -> None:
         self.model = make_model()
         self.deformation = NodeDeformation(self.model.means, nodes)
         self.deformation.attach(self.model, slice(0, COUNT))
-        self.refiner = GpuRefiner(CpuRefiner(partial(make_rasterizer, "numba")), 1.0)
+        self.on_gpu = GpuMap(torch.device("cpu"))
         self.optimiser = Optimiser()
         self.begin()
 
     def begin(self) -> None:
-        size = VIEW.height, VIEW.width
-        ones, image = np.ones(size, np.float32), np.zeros((*size, 3), np.uint8)
-        observation = Observation(0, 0, VIEW, image, image[..., 0], ones > 0, ones, ones)
-        self.refiner.begin(self.model, self.deformation, observation, 1e-4)
+        self.on_gpu.begin(self.model, self.deformation)
 
     def optimise(self, gradients: Gradients, rates: LearningRates) -> None:
         self.optimiser.step(self.model, gradients, VIEW, rates)
-        self.refiner._optimise(in_torch(gradients), rates, VIEW)
+        self.on_gpu.optimise(in_torch(gradients), rates, VIEW)
 
     def descend(self, gradients: Gradients, step: float = 1e-4) -> None:
         self.deformation.descend(self.model, gradients.means, gradients.contribution, step)
         given = in_torch(gradients)
-        self.refiner._descend(given["means"], given["contribution"], step)
+        self.on_gpu.descend(given["means"], given["contribution"], step)
 
     def row(self, name: str) -> Any:
-        return self.refiner._rows[name].numpy()
+        return self.on_gpu.rows[name].numpy()
 
     def check_rows(self) -> None:
         for name in TABLES:
@@ -103,7 +96,7 @@ class Pair:
             np.testing.assert_allclose(self.row(name), expected, rtol=1e-4, atol=1e-6, err_msg=name)
 
     def check_nodes(self) -> None:
-        np.testing.assert_allclose(self.refiner._nodes.numpy(), self.deformation.nodes, atol=1e-7)
+        np.testing.assert_allclose(self.on_gpu.nodes.numpy(), self.deformation.nodes, atol=1e-7)
         np.testing.assert_allclose(self.row("means"), self.model.means, atol=1e-7)
 
 
@@ -157,7 +150,6 @@ def test_the_nodes_of_a_new_model_remember_nothing(pair: Pair) -> None:
     pair.model, pair.deformation = make_model(), NodeDeformation(pair.model.means, 6)
     pair.deformation.attach(pair.model, slice(0, COUNT))
     pair.begin()
-    assert pair.refiner.problem is None
     pair.descend(make_gradients(1))
     pair.check_nodes()
 
@@ -168,11 +160,11 @@ def test_a_node_that_little_was_seen_of_stays(pair: Pair) -> None:
     gradients = make_gradients(0)
     gradients.contribution[:] = 1e-4
     pair.descend(gradients)
-    np.testing.assert_array_equal(pair.refiner._nodes.numpy(), before)
+    np.testing.assert_array_equal(pair.on_gpu.nodes.numpy(), before)
     gradients.contribution[8] = 1.0
     pair.descend(gradients)
     pair.check_nodes()
-    assert (pair.refiner._nodes.numpy() != before).any(axis=1).sum() <= 1
+    assert (pair.on_gpu.nodes.numpy() != before).any(axis=1).sum() <= 1
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
@@ -183,20 +175,17 @@ def test_a_broken_gradient_stops_its_nodes_only(pair: Pair, value: float) -> Non
     pair.descend(gradients)
     pair.descend(make_gradients(1))
     pair.check_nodes()
-    assert np.isfinite(pair.refiner._nodes.numpy()).all()
+    assert np.isfinite(pair.on_gpu.nodes.numpy()).all()
 
 
 @pytest.mark.parametrize("share", [0.0, 0.2, 0.5])
-def test_the_worst_tiles_are_the_cpus(pair: Pair, share: float) -> None:
+def test_the_worst_tiles_are_the_cpus(share: float) -> None:
     """Of a picture that is no whole number of tiles, with pixels that do not count."""
     rng = np.random.default_rng(0)
     height, width = VIEW.height - 3, VIEW.width - 5
     planes = rng.uniform(0, 1, (5, height, width)).astype(np.float32)
     image = rng.integers(0, 256, (height, width, 3), np.uint8)
     tissue = rng.uniform(size=(height, width)) < 0.8
-    refiner = pair.refiner
-    refiner._drawing = type("Drawn", (), {"planes": torch.tensor(planes)})()  # type: ignore[assignment]
-    refiner._image = torch.tensor(image).permute(2, 0, 1) / 255
-    refiner._tissue = torch.tensor(tissue)
     expected = focus.worst_tiles(planes, image, tissue, share)
-    np.testing.assert_array_equal(refiner._worst_tiles(share).numpy(), expected)
+    given = torch.tensor(planes), torch.tensor(image).permute(2, 0, 1) / 255, torch.tensor(tissue)
+    np.testing.assert_array_equal(worst_tiles(*given, share).numpy(), expected)

@@ -16,7 +16,7 @@ from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.camera_pose import exponential, towards
 from sags_node.mapping.motion import Tracks
 from sags_node.mapping.pose_refiner import SECONDS, PoseRefiner
-from sags_node.mapping.resting_tissue import TissueFit
+from sags_node.mapping.resting_tissue import RestingTissue, TissueFit
 from sags_node.mapping.tissue_map import TissueMap
 from sags_node.phantom.scene import Phantom
 from sags_node.pipeline.pipeline import Pipeline
@@ -39,7 +39,7 @@ def refined(monkeypatch: pytest.MonkeyPatch, given: list[F64], seen: list[F64 | 
     poses = []
     for number, (T, says) in enumerate(zip(given, seen, strict=True)):
         fit = "hardly any tissue in view" if says is None else TissueFit(says, says)
-        monkeypatch.setattr(refiner._tissue, "fit", lambda observation, last, tracks, start, fit=fit: fit)
+        monkeypatch.setattr(RestingTissue, "fit", lambda *_, fit=fit: fit)
         guess = refiner.guess(T)
         assert guess is not None
         observation: Any = SimpleNamespace(t_capture_ns=round(number / RATE * 1e9), camera=camera(guess))

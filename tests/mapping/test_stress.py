@@ -137,7 +137,7 @@ ARRAYS = (
     "means", "quats", "log_scales", "scales", "smoothing", "opacities", "opacity_logits", "colors",
     "velocities", "contribution", "adam_m", "adam_v", "node_weight",
 )  # fmt: skip
-NODE_ARRAYS = ("nodes", "_momentum", "_variance")
+NODE_ARRAYS = ("nodes", "momentum", "variance")
 NOT_NUMBERS = np.array([np.nan, np.inf, -np.inf, 1e30], np.float32)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import selectors
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,12 +11,13 @@ from typing import Any
 
 import pytest
 from synthetic import publisher, stream
+from waiting import until
 
 from sags_node.errors import SagsError
 from sags_node.messaging.async_subscriber import AsyncSubscriber
 from sags_node.messaging.freshness import StaleError
 from sags_node.messaging.publisher import Publisher
-from sags_node.messaging.received import Received, ReceivedImage, TopicName
+from sags_node.messaging.received import ReceivedImage, TopicName
 
 pytestmark = pytest.mark.live
 
@@ -81,26 +83,33 @@ def test_silence_ends_a_wait_and_a_strict_read_raises(running: Publisher) -> Non
     asyncio.run(listen())
 
 
-class Counting(AsyncSubscriber):
-    """Counts how often a waiting task looks whether its message has come."""
+class Turns(selectors.DefaultSelector):
+    """Counts how often a loop goes round."""
 
-    looked = 0
+    count = 0
 
-    def _newer(self, name: str, after: Received | None) -> Received | None:
-        self.looked += 1
-        return super()._newer(name, after)
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        self.count += 1
+        return super().select(timeout)
 
 
 def test_a_waiting_task_sleeps(running: Publisher) -> None:
+    """Its loop goes round for the wait that begins, for its time limit, and for its end."""
+    turns = Turns()
+
     async def wait() -> int:
-        async with Counting([PICTURE], endpoint=running.connection.data[0]) as subscriber:
+        async with subscribed(running, PICTURE) as subscriber:
+            before = turns.count
             assert await subscriber.wait(PICTURE, 0.5) is None
-            return subscriber.looked
+            return turns.count - before
 
-    assert asyncio.run(wait()) == 1
+    with asyncio.Runner(loop_factory=lambda: asyncio.SelectorEventLoop(turns)) as runner:
+        assert runner.run(wait()) <= 3
 
 
-def test_a_cancelled_wait_leaves_the_others_alone(running: Publisher) -> None:
+def test_a_cancelled_wait_leaves_the_others_alone(
+    running: Publisher, monkeypatch: pytest.MonkeyPatch
+) -> None:
     async def cancel() -> None:
         async with subscribed(running, PICTURE) as subscriber:
             waiting = [asyncio.create_task(subscriber.wait(PICTURE, 30)) for _ in range(3)]
@@ -108,25 +117,33 @@ def test_a_cancelled_wait_leaves_the_others_alone(running: Publisher) -> None:
             waiting[1].cancel()
             with pytest.raises(asyncio.CancelledError):
                 await waiting[1]
-            assert len(subscriber._wakes) == 2
             with stream(running):
-                assert None not in await asyncio.gather(waiting[0], waiting[2])
-            assert not subscriber._wakes
+                newest = await asyncio.gather(waiting[0], waiting[2])
+                assert None not in newest
+                woken: list[object] = []
+                monkeypatch.setattr(asyncio.get_running_loop(), "call_soon_threadsafe", woken.append)
+                until(lambda: subscriber.read(PICTURE).meta.seq > newest[0].meta.seq + 3)
+                monkeypatch.undo()
+            assert not woken  # nobody waits any more
 
     asyncio.run(cancel())
 
 
 def test_cancelled_while_closing_it_still_closes(running: Publisher) -> None:
-    async def cancel() -> AsyncSubscriber:
+    def receiving() -> bool:
+        return "sags-subscriber" in {thread.name for thread in threading.enumerate()}
+
+    async def cancel() -> None:
         subscriber = subscribed(running, PICTURE)
+        assert receiving()
         closing = asyncio.create_task(subscriber.__aexit__(None, None, None))
         await asyncio.sleep(0)
         closing.cancel()
         with pytest.raises(asyncio.CancelledError):
             await closing
-        return subscriber
 
-    assert not asyncio.run(cancel())._thread.is_alive()
+    asyncio.run(cancel())
+    assert not receiving()
 
 
 def test_one_subscriber_serves_two_loops(running: Publisher) -> None:

@@ -26,8 +26,6 @@ from sags_node.messaging.requests import MAX_VIEW_HZ
 from sags_node.messaging.roles import ROLES, Client, needed
 from sags_node.messaging.security import read_allow_list, read_key_pair, read_public_key, write_key_pair
 from sags_node.messaging.subscriber import Subscriber
-from sags_node.node.node import Node
-from sags_node.node.operations import Operations
 from sags_node.node.views import MAX_VIEWS
 
 TOPIC = "left/depth"
@@ -55,18 +53,8 @@ def test_of_a_key_in_several_folders_the_least_role_counts(tmp_path: Path) -> No
     assert list(read_allow_list([tmp_path]).values()) == [Client("twice", "listen")]
 
 
-def test_each_operation_of_a_node_has_its_role() -> None:
-    """One that was forgotten takes the highest role, and no client of a lower one could use it."""
-    node = Node.__new__(Node)
-    node._operations = Operations(None, lambda *_: None)  # type: ignore[arg-type]  # none of them is called
-    reading = {name for name in node._handlers() if name.startswith("get_")}
-    writing = {
-        name for name in node._handlers() if "recording" in name or "save" in name or "snapshot" in name
-    }
-    for name in node._handlers():
-        expected = "listen" if name in reading else "files" if name in writing else "control"
-        assert needed(name) == expected, name
-    assert needed("ping") == needed("get_clock") == "listen"
+def test_an_operation_that_was_forgotten_takes_the_highest_role() -> None:
+    """The operations of a node: `tests/node/test_node.py`."""
     assert needed("of_tomorrow") == "files"
 
 
@@ -182,13 +170,25 @@ def test_a_bucket_gives_its_burst_and_then_its_rate() -> None:
     assert sum(rate.wait(b"a") == 0.0 for _ in range(20)) == 5  # no more than its burst is ever saved up
 
 
+class Name(bytes):
+    """Of a client; tells how many are held in memory."""
+
+    held = 0
+
+    def __init__(self, _: bytes) -> None:
+        Name.held += 1
+
+    def __del__(self) -> None:
+        Name.held -= 1
+
+
 def test_clients_are_forgotten_when_nothing_is_lost_by_it() -> None:
     now = [0.0]
     rate = RequestRate(rate=10, burst=2, clock=lambda: now[0])
     for number in range(3 * FORGET_ABOVE):
         now[0] += 0.1  # so that those before it are full again
-        assert rate.wait(b"%d" % number) == 0.0
-        assert len(rate._buckets) <= FORGET_ABOVE
+        assert rate.wait(Name(b"%d" % number)) == 0.0
+        assert Name.held <= FORGET_ABOVE
     assert rate.wait(b"%d" % number) == 0.0 and rate.wait(b"%d" % number) > 0.0
 
 
@@ -196,13 +196,20 @@ def test_clients_are_forgotten_when_nothing_is_lost_by_it() -> None:
 def test_a_client_that_was_refused_asks_again_by_itself(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    limited = RequestRate(rate=20, burst=1)
-    monkeypatch.setattr("sags_node.messaging.control.RequestRate", lambda: limited)
+    monkeypatch.setattr("sags_node.messaging.control.RequestRate", lambda: RequestRate(rate=20, burst=1))
     with answering(tmp_path / "run") as running, ControlClient(running.connection.control) as asker:
         began = time.monotonic()
         assert [asker.request("pause", timeout=60) for _ in range(5)] == ["done"] * 5
         assert time.monotonic() - began > 0.19  # four waits of 1/20 s
-        limited._rate = 1e-3  # the next one has to wait for longer than it may
+
+
+@pytest.mark.live
+def test_a_client_that_would_have_to_wait_for_longer_than_it_may_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sags_node.messaging.control.RequestRate", lambda: RequestRate(rate=1e-3, burst=1))
+    with answering(tmp_path / "run") as running, ControlClient(running.connection.control) as asker:
+        assert asker.request("pause", timeout=60) == "done"
         with pytest.raises(SagsError, match=r"requests a second of one client"):
             asker.request("pause", timeout=5)
 

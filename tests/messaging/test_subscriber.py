@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, cast
@@ -142,7 +143,9 @@ def test_content_of_an_earlier_epoch_is_stale(tmp_path: Path) -> None:
         running.publish_health(health())
         subscriber.wait("status", 30)
         assert subscriber.ok("tf")
-        running._last = at_frame(result, 6, now, epoch=1)  # a frame of epoch 1 whose tf got lost
+        subscriber.pause()
+        until(lambda: running.poll(10) or not running.wanted("tf"))
+        running.publish_result(at_frame(result, 6, now, epoch=1), dropped=0)  # its tf does not come
         before = subscriber.latest("status")
         running.publish_health(health())
         subscriber.wait("status", 30, after=before)
@@ -182,9 +185,21 @@ def test_mistakes_are_named(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="did you mean 'left/render/depth'"):
         Subscriber(["left/rendr/depth"], endpoint="tcp://127.0.0.1:9")
     with pytest.raises(SagsError, match="no node runs as 'sags'"):
-        Subscriber(["tf"], run_dir=tmp_path)
+        Subscriber(["tf"], run_dir=tmp_path, patience=0)
     with pytest.raises(SagsError, match="cannot connect to 127"):
         Subscriber(["tf"], endpoint="127.0.0.1:5556")
+
+
+def test_a_subscriber_waits_for_a_node_that_is_not_there_yet(tmp_path: Path) -> None:
+    """As programs that are started together need it; not for ever."""
+    with ThreadPoolExecutor() as pool:
+        waiting = pool.submit(Subscriber, ["tf"], run_dir=tmp_path / "run", patience=60)
+        with publisher(tmp_path / "run") as running, waiting.result(60) as subscriber, stream(running):
+            assert subscriber.wait("tf", 60) is not None
+    began = time.monotonic()
+    with pytest.raises(SagsError, match="no node runs as 'sags'"):
+        Subscriber(["tf"], run_dir=tmp_path / "gone", patience=0.3)
+    assert time.monotonic() - began >= 0.3
 
 
 def test_a_subscriber_that_nobody_closed_lets_the_program_end_in_silence(tmp_path: Path) -> None:

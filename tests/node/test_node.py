@@ -20,6 +20,7 @@ from waiting import until
 
 from sags_node.errors import SagsError
 from sags_node.messaging.control import ControlClient
+from sags_node.messaging.roles import needed
 from sags_node.messaging.subscriber import Subscriber
 
 pytestmark = pytest.mark.live
@@ -31,6 +32,18 @@ def node(phantom_session: Path, tmp_path_factory: pytest.TempPathFactory) -> Ite
     running = RunningNode(phantom_session, tmp_path_factory.mktemp("node"), "source.pace:=fast")
     yield running
     running.stop()
+
+
+def test_each_operation_has_its_role(node: RunningNode) -> None:
+    """One that was forgotten takes the highest, and no client of a lower one could use it."""
+    with ControlClient(node.connection["control"]) as asker, pytest.raises(SagsError) as refused:
+        asker.request("what is there?")
+    names = str(refused.value).split("this node knows: ")[1].split(", ")
+    assert len(names) > 15
+    for name in names:
+        reads = name == "ping" or name.startswith("get_")
+        writes = "recording" in name or "save" in name or "snapshot" in name
+        assert needed(name) == ("listen" if reads else "files" if writes else "control"), name
 
 
 def truth_depth(session: Path, frame_id: int) -> np.ndarray:

@@ -119,8 +119,22 @@ def test_the_latency_is_told_while_the_health_is_being_counted(monkeypatch: pyte
     assert statistics.latency_s == 0
     for latency_ms in (10.0, 20.0, 90.0):
         statistics.add(TAKEN_IN, latency_ms, {})
-    with ThreadPoolExecutor(1) as other, statistics._lock:
-        assert other.submit(lambda: statistics.latency_s).result(timeout=10) == pytest.approx(0.020)
+    counting, goes_on = threading.Event(), threading.Event()
+
+    def resident_mb() -> float:
+        counting.set()
+        assert goes_on.wait(60)
+        return 0.0
+
+    monkeypatch.setattr("sags_node.node.health.resident_mb", resident_mb)
+    with ThreadPoolExecutor(2) as others:
+        others.submit(statistics.health, {}, False, False, None, {}, {}, {})
+        try:
+            assert counting.wait(60)
+            latency = others.submit(lambda: statistics.latency_s)
+            assert latency.result(timeout=10) == pytest.approx(0.020)
+        finally:
+            goes_on.set()
 
 
 # ---- `save_model`: the disk is written by a thread that nobody waits for -------------------------------

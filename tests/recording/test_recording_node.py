@@ -227,7 +227,7 @@ def test_every_frame_after_the_warm_up_is_recorded_and_plays_again(session: Path
 
 def test_what_does_not_go_together_is_refused(session: Path, tmp_path: Path) -> None:
     record = ("bag", "record", "-o", tmp_path)
-    refused(2, *record, "mapping.rung:=1", said=("mapping.rung:=1", "--session"))
+    refused(2, *record, "mapping.rung:=1", said=("mapping.rung:=1", "needs a recording"))
     refused(2, *record, "--session", session, "--seconds", "2", said=("no --snapshot-mode",))
     refused(2, *record, "--session", session, said=("exists already",))
-    refused(2, *record, "--session", "source.kind:=v4l2", said=("leave out --session",))
+    refused(2, *record, "--session", "source.kind:=v4l2", said=("name no recording",))

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from synthetic import plane_result
 from waiting import until
 
 from sags_node.cli.foreground import inputs_text
@@ -70,7 +71,8 @@ def test_a_sender_that_was_away_has_lost_nothing() -> None:
 )
 def test_what_helps_depends_on_where_pictures_come_from(source: Source, said: str) -> None:
     statistics = Statistics(source)
-    statistics._started = True  # once there were frames
+    statistics.add(plane_result(), 1.0, {})
+    statistics.forget_rate()
     warnings = by_code(statistics.health({}, False, False, None, {}, {}, {}).warnings)
     assert warnings["no_frames"] == f"no frame comes: {said}"
 

@@ -207,18 +207,20 @@ def test_delivers_pairs_with_both_stamps(plugs: Plugs) -> None:
 
 
 def test_what_fails_because_all_ends_is_not_told_of(plugs: Plugs, caplog: pytest.LogCaptureFixture) -> None:
-    opening = threading.Event()
+    opening, ended = threading.Event(), threading.Event()
 
     def open_device(path: str, config: V4l2Source) -> FakeCamera:
         if plugs.opened["/dev/right"]:  # it is opened again: until the end
             opening.set()
-            assert source._pairs.stopped.wait(10)
+            assert ended.wait(10)
             raise SagsError("the end has broken it off")
         return plugs(path, config)
 
     with open_cameras(CONFIG, open_device=open_device) as source:
         plugs.opened["/dev/right"][0].pictures.put(None)
         assert opening.wait(10)
+        source.stop()
+        ended.set()
     assert "camera is gone" in caplog.text and "broken it off" not in caplog.text
 
 
@@ -395,10 +397,12 @@ def test_more_than_eight_bits_are_kept(
 ) -> None:
     """OpenCV hands such pictures over as bytes in a row when it is not to convert them."""
     counts = np.linspace(0, 2**bits - 1, 32).astype(np.uint16)
-    monkeypatch.setattr(FakeCapture, "read", lambda self: (True, counts.view(np.uint8)[None]))
-    camera = device([0.0], fourcc=fourcc)
-    assert camera._capture.values[cv2.CAP_PROP_CONVERT_RGB] == 0
-    picture = camera.read(0.1)
+
+    def read(self: FakeCapture) -> tuple[bool, np.ndarray]:
+        return self.values[cv2.CAP_PROP_CONVERT_RGB] == 0, counts.view(np.uint8)[None]
+
+    monkeypatch.setattr(FakeCapture, "read", read)
+    picture = device([0.0], fourcc=fourcc).read(0.1)
     assert picture is not None and picture.image.shape == (4, 8, 3)
     bright = picture.image[..., 1].ravel() / 65535
     assert np.abs(bright - counts / (2**bits - 1)).max() < 2.0**-bits

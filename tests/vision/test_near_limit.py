@@ -101,7 +101,7 @@ def test_the_limit_comes_at_once_and_goes_slowly(monkeypatch: pytest.MonkeyPatch
     limit = NearLimit(StereoConfig(), 1000.0)
     looks = [far, near, far, *[near] * AGREED, *[far] * RETREAT]
     for number, nearest in enumerate(looks):
-        monkeypatch.setattr(near_limit.NearLimit, "_nearest", lambda *_, nearest=nearest: nearest)
+        monkeypatch.setattr(near_limit, "nearest_tissue", lambda *_, nearest=nearest: nearest)
         for part in range(3):  # of a period: only one look each
             limit.look(number * PERIOD_NS + part * PERIOD_NS // 3, left, right, everywhere(pair))
         limits.append(limit.limit)

@@ -61,7 +61,7 @@ class LongVideo:
 @pytest.fixture
 def opened(monkeypatch: pytest.MonkeyPatch) -> Callable[[Any, FoldersSource], Replay]:
     def open_pairs(pairs: Any, config: FoldersSource) -> Replay:
-        monkeypatch.setattr(replay, "_open_pairs", lambda config, references: pairs)
+        monkeypatch.setattr(replay, "open_pairs", lambda config, references: pairs)
         return Replay(config)
 
     return open_pairs
@@ -162,7 +162,7 @@ def test_exports_leave_the_warm_up_out(tiny_session: Path, tmp_path: Path) -> No
     said = ("source.start:=0.1", "source.warm_up:=2", "source.frames:=4", *STEPS)
     made = pure_json(
         sags(
-            *("export", "--session", tiny_session, *said, "--depth", tmp_path / "depth"),
+            *("export", tiny_session, *said, "--depth", tmp_path / "depth"),
             *("--tracks", tmp_path / "t.npz", "--render", tmp_path / "m.mp4"),
             *("--lerobot", tmp_path / "lerobot", "--json"),
         ).stdout

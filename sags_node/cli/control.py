@@ -1,0 +1,205 @@
+"""What is asked of a running node from the shell: anchors, parameters, pause and reset."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from sags_node.cli.launching import as_json
+from sags_node.cli.node_options import endpoint_option, node_options, ns_option
+from sags_node.errors import SagsError, UsageError
+from sags_node.terminal import text
+from sags_node.terminal.console import show
+
+if TYPE_CHECKING:
+    from sags_node.messaging.address import NodeAddress
+
+ANCHORS_WAIT = 3.0  # s for the anchors of a frame
+
+
+def asking(command: Callable[..., None]) -> Callable[..., None]:
+    """Options of a command that asks a node; it gets the node as `node`."""
+    control = click.option(
+        "--control", metavar="ENDPOINT", help="Control socket; default: the node's connection file."
+    )
+    run_dir = click.option("--run-dir", type=click.Path(path_type=Path), help="Of the connection file.")
+    return control(ns_option(run_dir(node_options(as_json(command)))))
+
+
+def ask(node: NodeAddress, op: str, args: dict[str, Any] | None = None) -> Any:
+    """The node's answer; see `ControlClient.request`."""
+    from sags_node.messaging.control import ControlClient
+
+    with ControlClient.at(node) as client:
+        return client.request(op, args)
+
+
+# ---- anchors ---------------------------------------------------------------------------------------------
+
+
+@click.group()
+def anchor() -> None:
+    """Pin points to the tissue, look at them and remove them.
+
+    The node carries an anchor with the tissue, also while an instrument hides it. docs/wire.md says what each
+    column means and how sure it is.
+    """
+
+
+@anchor.command()
+@click.argument("pixel", nargs=2, type=float, metavar="U V")
+@asking
+def pin(pixel: tuple[float, float], json_out: bool, node: NodeAddress) -> None:
+    """Pin an anchor at pixel U V of the left picture.
+
+    Prints its number. The picture is the node's own, left/image_rect_color: its size is in left/camera_info.
+    A pixel without depth is refused.
+
+    \b
+    sags anchor pin 320 256
+    """
+    pinned = ask(node, "add_anchor", {"u": pixel[0], "v": pixel[1]})
+    if json_out:
+        show(pinned)
+        return
+    sure = pinned["depth_confidence"]
+    unsure = "" if sure >= 0.5 else "; below 0.5 its depth is a guess"
+    show(f"anchor {pinned['id']} in frame {pinned['frame_id']}; depth confidence {sure:.2f}{unsure}")
+
+
+@anchor.command("list")
+@endpoint_option
+@asking
+def list_anchors(json_out: bool, node: NodeAddress) -> None:
+    """Where the anchors are in the newest frame.
+
+    Columns: number, x y z (m, world), pixel, visibility, confidence (it is still on its tissue) and depth
+    confidence. Show no anchor as sure whose confidence is below 0.5.
+    """
+    from sags_node.messaging.received import ReceivedCloud, TopicName
+    from sags_node.messaging.subscriber import Subscriber
+
+    name = TopicName("anchors", ReceivedCloud)
+    with Subscriber.at(node, [name]) as subscriber:
+        newest = subscriber.wait(name, ANCHORS_WAIT)
+        if newest is None:
+            raise SagsError(f"no anchors came: {subscriber.problem(name)}")
+    columns = ("id", "x", "y", "z", "u", "v", "visibility", "confidence", "depth_confidence")
+    rows = [{key: point[key].item() for key in columns} for point in newest.points]
+    if json_out:
+        show(rows)
+    elif not rows:
+        show("no anchors; pin one: sags anchor pin U V")
+    else:
+        show(text.rows_table([{key: _short(key, value) for key, value in row.items()} for row in rows]))
+
+
+def _short(key: str, value: float) -> str:
+    digits = {"id": 0, "x": 4, "y": 4, "z": 4, "u": 1, "v": 1}
+    return f"{value:.{digits.get(key, 2)}f}"
+
+
+@anchor.command()
+@click.argument("number", type=int)
+@asking
+def remove(number: int, json_out: bool, node: NodeAddress) -> None:
+    """Remove the anchor with this NUMBER."""
+    ask(node, "remove_anchor", {"id": number})
+    show({"removed": number} if json_out else f"anchor {number} is removed")
+
+
+# ---- parameters ------------------------------------------------------------------------------------------
+
+
+@click.group()
+def param() -> None:
+    """Look at a running node's configuration, and change it.
+
+    docs/launch.md has all keys.
+    """
+
+
+@param.command()
+@click.argument("name", metavar="KEY", required=False)
+@asking
+def get(name: str | None, json_out: bool, node: NodeAddress) -> None:
+    """Print the configuration in force, or the part of it that KEY names.
+
+    \b
+    sags param get                      # all of it, as a launch file says it
+    sags param get mapping.budget_ms    # null: it follows the rate of the frames
+    """
+    import yaml
+
+    found: Any = ask(node, "get_parameters")
+    for part in name.split(".") if name else ():
+        if not isinstance(found, dict) or part not in found:
+            known = f"; there are {', '.join(found)}" if isinstance(found, dict) else ""
+            raise UsageError(f"unknown key '{name}'{known}")
+        found = found[part]
+    if json_out:
+        show({name: found} if name else found)
+    else:
+        show(yaml.safe_dump(found, sort_keys=False).removesuffix("...\n").rstrip())
+
+
+@param.command("set")
+@click.argument("overrides", nargs=-1, required=True, metavar="key:=value ...")
+@asking
+def set_parameters(overrides: tuple[str, ...], json_out: bool, node: NodeAddress) -> None:
+    """Change parameters while the node runs; the model stays.
+
+    What can change is in docs/launch.md; the node says so, too, where it refuses.
+
+    \b
+    sags param set mapping.budget_ms:=25
+    """
+    from sags_node.config.yaml_reader import parse_yaml
+
+    if len(overrides) == 2 and not any(":=" in word for word in overrides):
+        raise UsageError(f"write {overrides[0]}:={overrides[1]}, as for sags run")
+    for word in overrides:
+        if ":=" not in word:
+            raise UsageError(f"'{word}' is not an override; write key:=value, e.g. mapping.budget_ms:=25")
+    said = {key: parse_yaml(value, f"the value of {key}:=") for key, _, value in map(_parts, overrides)}
+    ask(node, "set_parameters", said)
+    show(said if json_out else ", ".join(f"{key} is {value}" for key, value in said.items()))
+
+
+def _parts(override: str) -> tuple[str, str, str]:
+    return override.partition(":=")
+
+
+# ---- pause, resume, reset --------------------------------------------------------------------------------
+
+
+def _plain(name: str, op: str, done: str, doc: str) -> click.Command:
+    """A command that asks for one operation without arguments."""
+
+    @click.command(name, help=doc)
+    @asking
+    def command(json_out: bool, node: NodeAddress) -> None:
+        answer = ask(node, op)
+        show(answer if json_out else done)
+
+    return command
+
+
+pause = _plain(
+    "pause",
+    "pause",
+    "paused; sags resume goes on",
+    "Stop mapping and publishing until sags resume. Anchors and views stay. Live frames are dropped "
+    "meanwhile; a recording with pace fast or step waits.",
+)
+resume = _plain("resume", "resume", "running", "Go on after sags pause.")
+reset = _plain(
+    "reset",
+    "reset_model",
+    "the next frame begins a new model; anchors are gone",
+    "Forget the model; the next frame begins a new one.\n\nIt is a new epoch, and all anchors are lost. For "
+    "another place, or after a new base frame of the robot.",
+)

@@ -1,0 +1,103 @@
+"""`sags new`: a launch file for a recording or for cameras, once they have been tried."""
+
+from __future__ import annotations
+
+import os
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import click
+import yaml
+from rich.markup import escape
+
+from sags_node.cli.launching import as_json, file_option, force_option
+from sags_node.errors import SagsError, UsageError
+from sags_node.files import check_file, whole
+from sags_node.terminal import text
+from sags_node.terminal.console import console, show
+
+SAID_BY_PICTURES = ("source", "calibration")  # checks of the doctor that were made already
+
+
+@click.command()
+@click.argument("said", nargs=-1, metavar="[FOLDER | VIDEO [VIDEO] | DEVICE [DEVICE]] [key:=value ...]")
+@click.option(
+    "--from", "also", multiple=True, metavar="PATH", help="What to try, as an option; may be repeated."
+)
+@file_option("-o", "--out", metavar="FILE.yaml", help="The launch file; default: named after the source.")
+@force_option
+@as_json
+def new(said: tuple[str, ...], also: tuple[str, ...], out: Path | None, force: bool, json_out: bool) -> None:
+    """Try a recording or cameras, and write a launch file for it.
+
+    Of two videos, folders or devices the left eye comes first. It is opened, and some of its pictures are
+    looked at: size and rate, how one picture shows both eyes, borders, interlacing, whether the eyes are
+    swapped, late, or their rows apart, and whether the calibration fits. What a key can fix is set.
+    key:=value are written too. Without arguments it asks, where there is a terminal.
+
+    Exit code 1: it cannot be played; then nothing is written.
+
+    \b
+    sags new my_folder -o mine.yaml
+    sags new left.mp4 right.mp4 rig:=calib/mine
+    sags new /dev/video0 source.width:=1920 source.height:=1080
+    """
+    from sags_node.config.launch_file import load_launch, tree_of
+    from sags_node.doctor import examine
+    from sags_node.importing.proposal import propose
+
+    words = [*also, *said]
+    named = [Path(word) for word in words if ":=" not in word]
+    if not named:
+        named, out = _asked(out)
+    file = out or Path(f"{named[0].resolve().stem}.yaml")
+    check_file(file, force)
+    with console.status("looking at the pictures"):
+        found = propose(named, [word for word in words if ":=" in word])
+    rows: list[dict[str, Any]] = [asdict(finding) for finding in found.findings]
+    if not any(row["level"] == "error" for row in rows):
+        checks = examine(load_launch(named[0], found.launch))
+        rows += [
+            {"level": check.level, "what": f"{check.name}: {check.found}", "fix": check.fix}
+            for check in checks
+            if check.level != "ok" and check.name not in SAID_BY_PICTURES
+        ]
+    people = [{key: row[key] for key in ("level", "what", "fix")} for row in rows]
+    wrong = any(finding.level == "error" for finding in found.findings)
+    if not wrong:
+        tree = _beside(tree_of(found.launch), file)
+        with whole(file) as partial:
+            partial.write_text(yaml.safe_dump(tree, sort_keys=False, allow_unicode=True), encoding="utf-8")
+    show({"launch": None if wrong else str(file), "found": rows} if json_out else text.rows_table(people))
+    if wrong:
+        raise SagsError(f"{named[0]} cannot be played as it is; see the fixes above")
+    where = escape(str(file))
+    console.print(f"launch file: [bold]{where}[/]; play it: sags run {where}", soft_wrap=True)
+
+
+def _asked(out: Path | None) -> tuple[list[Path], Path | None]:
+    """What the user answers."""
+    if not sys.stdin.isatty():
+        raise UsageError("name a folder, a video or a device, e.g. sags new my_folder -o mine.yaml")
+    said = click.prompt("Folder, video or device (two: left and right, with a space between)", err=True)
+    named = [Path(word) for word in said.split()]
+    if out is None:
+        out = Path(click.prompt("Launch file", default=f"{named[0].resolve().stem}.yaml", err=True))
+    return named, out
+
+
+def _beside(tree: dict[str, Any], file: Path) -> dict[str, Any]:
+    """Paths as a launch file there reads them: from its folder if they lie below it, else from the root."""
+    folder = file.resolve().parent
+
+    def moved(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: moved(each) for key, each in value.items()}
+        if not isinstance(value, str) or not os.path.exists(value):
+            return value
+        path = Path(value).resolve() if not value.startswith("/dev/") else Path(value)
+        return str(path.relative_to(folder)) if path.is_relative_to(folder) else str(path)
+
+    return {section: moved(value) for section, value in tree.items()}

@@ -1,0 +1,95 @@
+"""`sags new`: what is odd about a recording is set right in the launch file that it writes."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from command_line import figures_of, ran, refused
+from places import SESSION
+from user_files import write_video
+
+from sags_node.config.launch_file import load_launch
+from sags_node.errors import UsageError
+from sags_node.importing.proposal import propose
+from sags_node.sources.source import open_source
+from sags_node.types import U8
+
+FRAMES = 6
+LEFT, RIGHT = (
+    [cv2.imread(str(file)) for file in sorted((SESSION / side).iterdir())[:FRAMES]]
+    for side in ("left", "right")
+)
+
+
+def videos(folder: Path, left: list[U8], right: list[U8]) -> tuple[Path, Path]:
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, pictures in (("a.mp4", left), ("b.mp4", right)):
+        write_video(folder / name, pictures)
+    return folder / "a.mp4", folder / "b.mp4"
+
+
+def set_by(launch: list[str]) -> dict[str, str]:
+    return dict(each.split(":=", 1) for each in launch)
+
+
+def test_swapped_videos_are_put_in_order(tmp_path: Path) -> None:
+    left, right = videos(tmp_path, LEFT, RIGHT)
+    for named in ((left, right), (right, left)):
+        found = propose(named)
+        assert set_by(found.launch)["source.left"] == str(left)
+        assert ("exchanged" in str(found.findings)) == (named[0] == right)
+        assert not [each for each in found.findings if each.level == "error"]
+
+
+def test_both_eyes_in_one_picture_and_which_is_first(tmp_path: Path) -> None:
+    file = tmp_path / "both.mp4"
+    write_video(file, [np.vstack(pair) for pair in zip(RIGHT, LEFT, strict=True)])
+    said = set_by(propose([file]).launch)
+    assert said["source.geometry.layout"] == "over_under" and said["source.geometry.first"] == "right"
+
+
+def test_black_borders_are_cut_off(tmp_path: Path) -> None:
+    framed = [
+        [cv2.copyMakeBorder(picture, 16, 16, 32, 32, cv2.BORDER_CONSTANT) for picture in eye]
+        for eye in (LEFT, RIGHT)
+    ]
+    launch = propose(videos(tmp_path, *framed)).launch
+    x, y, width, height = yaml.safe_load(set_by(launch)["source.geometry.crop"])
+    assert abs(x - 32) <= 2 and abs(y - 16) <= 2  # compressed: the edge is soft
+    assert abs(width - LEFT[0].shape[1]) <= 4 and abs(height - LEFT[0].shape[0]) <= 4
+
+
+def test_the_file_plays_from_wherever_it_lies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also without a terminal; the calibration is compared."""
+    videos(tmp_path / "case", LEFT, RIGHT)
+    monkeypatch.chdir(tmp_path)
+    rig = f"rig:={os.path.relpath(SESSION / 'calib', tmp_path)}"
+    report = figures_of("new", "case", rig, "mapping.max_gaussians:=5000", "-o", "mine.yaml", "--json")
+    assert report["launch"] == "mine.yaml"
+    said = " ".join(row["what"] for row in report["found"])
+    assert f"{FRAMES} frames of 320x256 px at 10 Hz" in said and "rows agree" in said
+    monkeypatch.chdir("/")
+    config = load_launch(tmp_path / "mine.yaml")
+    assert config.rig is not None and config.mapping.max_gaussians == 5000
+    with open_source(config.source.model_copy(update={"pace": "step"}), references=False) as source:
+        assert len(list(source)) == FRAMES
+    refused(2, "new", tmp_path / "case", "-o", tmp_path / "mine.yaml", said=("exists already", "--force"))
+
+
+def test_what_cannot_be_played_gets_no_file(tmp_path: Path) -> None:
+    left, right = videos(tmp_path, LEFT, RIGHT[:3])
+    file = tmp_path / "mine.yaml"
+    code, out, said = ran("new", left, right, "-o", file)
+    assert code == 1 and "ends after 3 frames" in out and "cannot be played" in said and not file.exists()
+    refused(2, "new", "-o", file, said=("name a folder, a video or a device",))  # there is nobody to ask
+    refused(2, "new", tmp_path / "gone", "-o", file, said=("does not exist",))
+    refused(2, "new", left, SESSION, "-o", file, said=("neither two videos nor two folders",))
+    refused(2, "new", SESSION, "-o", file, said=("has a launch file already",))
+    refused(1, "new", "/dev/no-camera", "-o", file, said=("/dev/no-camera", "does not exist"))
+    with pytest.raises(UsageError, match="two of one kind"):
+        propose([left, right, left])
