@@ -76,7 +76,7 @@ def _step_by_step(launch: Path | str | None, overrides: Sequence[str]) -> dict[s
         pipeline = run_step(session, MeasureOptions(), spool, lambda what, frames: None)
         summary = measure(session, spool, MeasureOptions(), on_picture=pictures.__setitem__).summary
         window = _window_psnr(pipeline, spool, pictures)
-    step = {group: summary[group][key] for group, key in SHOWN.items() if group in summary}
+    step = {group: summary[group][key] for group, key in SHOWN.items() if summary.get(group)}
     return {"step": step | {"window": window, "frame_ms": summary["frame_ms"]}}
 
 

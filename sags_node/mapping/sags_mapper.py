@@ -108,6 +108,7 @@ class SagsMapper:
     Attributes:
         map: what is published of it.
         step: how many steps were taken.
+        kept: frames that are learnt again, oldest first; the newest is always there.
     """
 
     def __init__(self, tissue_map: TissueMap, seed: int = 0) -> None:
@@ -117,7 +118,7 @@ class SagsMapper:
         self.step = 0
         self._seed = seed
         self._field: WindowModel | None = None  # its rows are the map's, by their ids
-        self._kept: deque[Kept] = deque()  # oldest first; the newest is always there
+        self.kept: deque[Kept] = deque()
         self._rasterizers: dict[tuple[int, int], Rasterizer] = {}
         self._now_ns = self._ahead_ns = 0  # the field's clock, and by how much it is ahead of the stamps
         self._frames = self._first_steps = 0
@@ -155,7 +156,7 @@ class SagsMapper:
 
     def at(self, t_ns: int, cameras: Sequence[Camera]) -> Gaussians:
         """The Gaussians at a time of the window; see `WindowModel.at`."""
-        return self._known.at(t_ns + self._ahead_ns, cameras)
+        return self.field.at(t_ns + self._ahead_ns, cameras)
 
     def _initialise(self, observation: Observation, frame: Kept, budget: Budget) -> dict[str, int]:
         drawn, model = frame.drawn, self.model
@@ -171,7 +172,7 @@ class SagsMapper:
         self._deltas = self._make_deltas(model.means, frame.t_ns)
         self._field = WindowModel(rows_of(model), NodeField(self._deltas, self._nodes.nodes.copy()))
         self._ids, self._written = model.ids.copy(), rows_of(model)
-        self._kept = deque([frame])
+        self.kept = deque([frame])
         pixel = float(np.median(depths)) / float(drawn.camera.K[0, 0])  # m
         lengths = [MEAN_PX * pixel] * 3 + [LOG_SCALE] * 3 + [QUAT] * 4 + [0.0] * 3 + [LOGIT]
         self._rates = np.array(lengths, np.float32)
@@ -200,7 +201,7 @@ class SagsMapper:
         self, observation: Observation, frame: Kept, budget: Budget, still: int, learn: bool
     ) -> dict[str, int]:
         # 1. Predict: the window reaches this frame, old slots are folded, the field says how things are now.
-        self._known.advance(frame.t_ns)
+        self.field.advance(frame.t_ns)
         self._deltas.forget()
         self._write(frame)
         self.map.move_light(observation.camera)
@@ -224,7 +225,7 @@ class SagsMapper:
                 if iterations % 2 == 0:
                     self._refine(frame, COLOUR_RELAXATION)
                 else:
-                    self._refine(self._kept[self._rng.integers(len(self._kept))], EARLIER_RELAXATION)
+                    self._refine(self.kept[self._rng.integers(len(self.kept))], EARLIER_RELAXATION)
                 iterations += 1
             self._write(frame)
         # 4. Say how it moves, and draw what is shown.
@@ -239,7 +240,7 @@ class SagsMapper:
         gain = exposure_gain(planes, frame.drawn.image, frame.drawn.tissue)
         if np.abs(gain - 1).max() > EXPOSURE_JUMP:
             self.model.colors[:] *= gain
-            self._kept = deque([frame])  # the others are in another exposure
+            self.kept = deque([frame])  # the others are in another exposure
             planes = self._draw(frame)
         return planes
 
@@ -273,7 +274,7 @@ class SagsMapper:
         For the newest frame canonical places stay: its motion is the field's to learn. They would move at all
         times alike, which tells nothing of earlier frames.
         """
-        field, seen = self._known, frame.drawn
+        field, seen = self.field, frame.drawn
         rasterizer = self._rasterizer(seen.camera)
         drawing = field.draw(rasterizer, frame.t_ns, seen.camera, deformed, whole=frame.camera)
         planes = drawing.planes.detach().numpy()
@@ -286,7 +287,7 @@ class SagsMapper:
         share = np.float32(relaxation) / (drawing.contribution + np.float32(COLOUR_DAMPING))
         field.table[:, columns.COLOR] -= share[:, None] * field.rows.grad.numpy()[:, columns.COLOR]
         rates = self._rates * np.float32(FIRST_SPEED if self._first_steps < FIRST_STEPS else 1)
-        if frame is self._kept[-1]:
+        if frame is self.kept[-1]:
             rates[columns.MEAN] *= not deformed
             self.model.contribution[:], self._loss = drawing.contribution, loss
         field.descend(drawing, Rates(rates, FieldRates()))
@@ -294,7 +295,7 @@ class SagsMapper:
 
     def _write(self, frame: Kept) -> None:
         """The map becomes what the field says of a frame's time."""
-        model, now = self.model, self._known.at(frame.t_ns, [frame.camera])
+        model, now = self.model, self.field.at(frame.t_ns, [frame.camera])
         self._nodes.accompany(model, now.means - model.means)
         model.means[:], model.quats[:], model.colors[:] = now.means, now.quats, now.colors
         model.scales[:], model.opacities[:] = now.scales, now.opacities
@@ -308,7 +309,7 @@ class SagsMapper:
     def _take_over(self, t_ns: int) -> None:
         """Do to the field what was done to the map since `_write`: what was changed, rotations apart, changes
         at all times alike; what is new was there all the time, moved as its neighbours."""
-        model, field = self.model, self._known
+        model, field = self.model, self.field
         model.reorder(np.argsort(model.ids))  # as in the field: the oldest first
         kept = np.isin(self._ids, model.ids, assume_unique=True)
         if not kept.all():
@@ -324,7 +325,7 @@ class SagsMapper:
     def _velocities(self, t_ns: int) -> F32:
         """[N, 3] m/s, by the field over the last `LOOK_BACK_NS`."""
         with torch.no_grad():
-            before = self._known.rows_at(t_ns - LOOK_BACK_NS)[:, columns.MEAN].numpy()
+            before = self.field.rows_at(t_ns - LOOK_BACK_NS)[:, columns.MEAN].numpy()
         velocities: F32 = (self.model.means - before) / np.float32(LOOK_BACK_NS * 1e-9)
         return velocities
 
@@ -336,7 +337,7 @@ class SagsMapper:
 
     def _keep(self, frame: Kept) -> None:
         """Also this one; forget what is too old, and what is closer to the next than memory allows."""
-        kept = self._kept
+        kept = self.kept
         if len(kept) > 1 and kept[-1].t_ns - kept[-2].t_ns < KEPT_NS // MOST_KEPT:
             kept.pop()
         kept.append(frame)
@@ -361,7 +362,7 @@ class SagsMapper:
         return min(budget.plan.rung.gaussians, self.model.capacity)
 
     @property
-    def _known(self) -> WindowModel:
+    def field(self) -> WindowModel:
         """The field, of a map that has tissue."""
         assert self._field is not None
         return self._field

@@ -152,8 +152,8 @@ def test_over_fifteen_windows_nothing_grows(phantom_session: Path) -> None:
     for frame in frames:
         pipeline.process(frame, budget)
         mapper = mapper_of(pipeline)
-        field = mapper._known
-        sizes.append((field.field.deltas.hexplane.cells.nbytes, len(field.rows), len(mapper._kept)))
+        field = mapper.field
+        sizes.append((field.field.deltas.hexplane.cells.nbytes, len(field.rows), len(mapper.kept)))
         assert len(field.rows) == mapper.model.count <= 1000 + 500  # and what may appear in a frame
     cells, _, kept = zip(*sizes, strict=True)
     assert set(cells) == {cells[0]}
@@ -182,7 +182,7 @@ def test_a_damaged_model_is_made_anew(phantom_session: Path) -> None:
     pipeline, frames = pipeline_of(phantom_session, "source.frames:=6")
     taken = list(frames)
     before = played(pipeline, taken[:3])[-1]
-    mapper_of(pipeline)._known.table[:] = np.nan
+    mapper_of(pipeline).field.table[:] = np.nan
     after = played(pipeline, taken[3:])[-1]
     assert after.epoch == before.epoch + 1
     assert quality(as_float(after.views["left"].rgb), after) > 25
