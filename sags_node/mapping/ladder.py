@@ -73,7 +73,7 @@ FIRST_FRAMES = FIRST_LOOKS[-1]
 
 
 SCALES = (1.0, 0.75, 0.5, 0.375, 0.25)  # of the working size, that a machine may choose from
-PIXELS_PER_GAUSSIAN = 2  # fewer pixels have no more to tell
+PIXELS_PER_GAUSSIAN = 4  # fewer pixels have no more to tell of its colour, slopes and place
 WITH_OTHERS = 1.1  # times as long as prices say: the least that live frames take (`benchmarks/ladder.md`)
 
 

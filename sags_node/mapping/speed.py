@@ -13,11 +13,11 @@ from sags_node.types import Camera, Gaussians
 SAMPLE_SIZE = 320, 256  # px
 SAMPLE_GAUSSIANS = 8000
 SAMPLE_MS = 1.9  # of one drawing and its gradients, back to back, where live frames take their prices
-TRIES = 7
+TRIES = 21
 
 
 def measured_speed(rasterizer: Rasterizer) -> float:
-    """`Ladder.speed` of this machine: the median of a few drawings of made-up Gaussians with their gradients.
+    """`Ladder.speed` of this machine: the median of some drawings of made-up Gaussians with their gradients.
 
     Args:
         rasterizer: for pictures of `SAMPLE_SIZE`.
