@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from sags_node.cli.launching import check_files, split, write_json
+from sags_node.cli.launching import check_files, words_of, write_json
 from sags_node.errors import UsageError
 from sags_node.evaluation.verdict import flat
 from sags_node.terminal import text
@@ -37,7 +37,7 @@ def evaluate_protocol(
     from sags_lab.protocols import run
     from sags_lab.protocols.d4d import measure_d4d
 
-    path, overrides = split(launch)
+    path, overrides = words_of(launch)
     if path is None:
         raise UsageError(f"--protocol {protocol} needs the data set's folder")
     if iterations is not None:
