@@ -31,7 +31,7 @@ def line_plot(
     """An SVG file of several series; empty text when there is nothing to draw.
 
     Args:
-        spans: first and last frame of what is shaded and named.
+        spans: first and last frame of what is shaded and named, unless it is half of all or more.
         across: what lies across; empty: the title says it.
         gaps: frames that are shaded grey.
     """
@@ -47,7 +47,8 @@ def line_plot(
             axes.plot(places, values, color=each.colour, label=each.label, **style)
         first, last = axes.get_xlim()
         for name, (begin, end) in spans.items():
-            if begin <= last and first <= end:
+            whole = end - begin >= (last - first) / 2  # no stretch of it: shaded, it would hide the others
+            if begin <= last and first <= end and not whole:
                 axes.axvspan(max(begin, first), min(end, last), color="#f2e3c6", zorder=0)
                 corner = max(begin, first), 1
                 axes.annotate(name, corner, (3, -9), ("data", "axes fraction"), "offset points")

@@ -137,7 +137,8 @@ def warning_table(rows: Sequence[FrameRow]) -> str:
 def _plots(rows: Sequence[FrameRow], spans: Mapping[str, tuple[int, int]]) -> str:
     def figure(label: str, colour: str, key: str, dots: bool = False) -> Series:
         group, _, name = key.partition(".")
-        points = [(row.frame_id, row.figures[group][name]) for row in rows if group in row.figures]
+        found = ((row.frame_id, row.figures.get(group, {}).get(name)) for row in rows)
+        points = [(frame, value) for frame, value in found if value is not None]
         return Series(label, colour, points, dots)
 
     def run(label: str, colour: str, value: Callable[[RunFacts], float | None]) -> Series:

@@ -486,6 +486,8 @@ def test_a_session_in_real_time_is_seen_as_a_subscriber_sees_it(
     assert summary["online"]["ssim"] > 0.8 and summary["predict"]["copy_psnr"] > 20
     assert summary["depth"]["median_mm"] < 1.5 and summary["settings"]["depth_reference"] == "exact"
     assert outcome.pictures[0].render.shape == outcome.pictures[0].truth.shape
+    page = write_report(tmp_path / "report", summary, outcome.rows, outcome.pictures)
+    assert page.read_text(encoding="utf-8").count('alt="plot"') >= 3
     assert not list(tmp_path.glob("sags-eval-*"))
     with pytest.raises(UsageError, match=r"sees every frame.*--pace step"):
         evaluate(session_folder, played, pace="realtime")
