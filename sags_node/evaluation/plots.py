@@ -46,11 +46,11 @@ def line_plot(
             style = {"linestyle": "", "marker": "o", "markersize": 3} if each.dots else {"linewidth": 1.2}
             axes.plot(places, values, color=each.colour, label=each.label, **style)
         first, last = axes.get_xlim()
-        for name, (begin, end) in spans.items():
-            whole = end - begin >= (last - first) / 2  # no stretch of it: shaded, it would hide the others
-            if begin <= last and first <= end and not whole:
-                axes.axvspan(max(begin, first), min(end, last), color="#f2e3c6", zorder=0)
-                corner = max(begin, first), 1
+        for name, span in spans.items():
+            begin, end = max(span[0], first), min(span[1], last)
+            if 0 <= end - begin < (last - first) / 2:  # half a clip, shaded, would hide the others
+                axes.axvspan(begin, end, color="#f2e3c6", zorder=0)
+                corner = begin, 1
                 axes.annotate(name, corner, (3, -9), ("data", "axes fraction"), "offset points")
         for frame in gaps:
             axes.axvspan(frame - 0.5, frame + 0.5, color="#dddddd", linewidth=0, zorder=0)

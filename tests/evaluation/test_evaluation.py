@@ -405,10 +405,11 @@ def test_report_of_a_run_without_anything_optional(frames: list[StereoFrame], tm
 
 def test_a_plot_is_valid_svg_with_a_gap_where_nothing_is_known() -> None:
     points = [(0, 10.0), (1, 35.0), (2, float("nan")), (3, 20.0), (4, 22.0)]
-    svg = line_plot("a < b, $5 and $6", [Series("one", "#123456", points)], {"motion": (1, 99)})
+    spans = {"motion": (3, 99), "half": (-1, 2)}
+    svg = line_plot("a < b, $5 and $6", [Series("one", "#123456", points)], spans)
     tree = ElementTree.fromstring(svg)
     texts = {text.text for text in tree.iter("{http://www.w3.org/2000/svg}text")}
-    assert {"a < b, $5 and $6", "motion"} <= texts
+    assert {"a < b, $5 and $6", "motion"} <= texts and "half" not in texts
     lines = [each.attrib for each in tree.iter("{http://www.w3.org/2000/svg}path")]
     (line,) = (each["d"] for each in lines if "stroke: #123456" in each.get("style", ""))
     assert line.count("M") == 2 and line.count("L") == 2
