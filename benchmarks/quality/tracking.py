@@ -24,6 +24,7 @@ from sags_node.evaluation.point_tracks import (
     calibration_error,
     reliability,
     shares_within,
+    surely_seen,
 )
 from sags_node.geometry import project, transform
 from sags_node.kernels.threads import configure_threads
@@ -37,7 +38,6 @@ from sags_node.types import F32, F64, I64, AnchorStates, Bool, FrameResult, Ster
 SPACING = 34  # px between anchors
 BESIDE = 40  # points, at most, that all methods are compared on: CSRT is slow
 BORDER = 60  # px: what is nearer to the picture's edge soon leaves it
-SURE = 0.5  # confidence
 RIGHT = 4.0 / 640  # of the width: so near to its point a confident anchor should be
 RIGHT_MM = 2.0  # the same in space
 WRONG = 8.0 / 640  # of the width: what is farther, and said to be seen there, is wrong
@@ -144,9 +144,8 @@ class _Run:
         if measured:
             states = result.anchors
             self._states.append(states)
-            seen = (states.confidence >= SURE) & (states.visibility >= SURE)
             self._said["anchors"].pixels.append(states.pixels[self._shared].astype(np.float64))
-            self._said["anchors"].seen.append(seen[self._shared])
+            self._said["anchors"].seen.append(surely_seen(states)[self._shared])
 
     def measured(self, number: int, frame: StereoFrame, result: FrameResult) -> dict[str, Any]:
         """One frame; to be asked after it was followed."""

@@ -6,10 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from sags_node.evaluation.point_tracks import average_jaccard
 from sags_node.types import F32, F64, Bool
 
 STIR_PX = (4, 8, 16, 32, 64)  # of the 2D ranking (stir-challenge.github.io, evaluation)
 STIR_MM = (2, 4, 8, 16, 32)  # of the 3D ranking
+STIR_2026 = (2, 4, 8, 16, 32)  # px and mm (the same page since 2026)
 STEREOMIS_PX = (1, 2, 4, 8, 16)  # of a picture of 256x256 (github.com/mhayoz/online_endo_track)
 STEREOMIS_LOST = 16  # the same
 LEAST_KNOWN = 0.1  # of a picture: SCARED leaves out frames with less true depth (arXiv 2101.01133, III-D)
@@ -35,6 +37,21 @@ def stereo_points_mm(left: F64, right: F64, K_left: F64, K_right: F64, baseline_
 def latency_score(times_ms: Sequence[float]) -> float:
     """STIR's figure of efficiency: (p99 + p95 + mean) / 3 of the time a frame takes, ms."""
     return float((np.percentile(times_ms, 99) + np.percentile(times_ms, 95) + np.mean(times_ms)) / 3)
+
+
+def stir_2026_figures(distances: F64, visible: Bool, said: Bool) -> dict[str, float]:
+    """As STIR is measured since 2026, of points [N] of all frames and sequences: their distances from the
+    truth, px or mm, whether they are visible, and whether they are said to be.
+
+    The first is what ranks. ATA: share of the visible points within each threshold, whatever is said of their
+    visibility, mean over thresholds. OA: share of the points of whose visibility the right thing is said.
+    """
+    shares = [np.mean(distances[visible] < threshold) for threshold in STIR_2026] if visible.any() else [0.0]
+    return {
+        "average_jaccard": average_jaccard(distances, visible, said, STIR_2026),
+        "average_tracking_accuracy": float(np.mean(shares)),
+        "occlusion_accuracy": float(np.mean(visible == said)),
+    }
 
 
 def trajectory_figures(estimated: F64, known: F64) -> dict[str, float]:

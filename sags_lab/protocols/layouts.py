@@ -24,6 +24,9 @@ from sags_node.types import F64, I64, Bool, StereoRig
 LARGEST_TEXT = 64 << 20  # bytes
 ROWS_APART, LEAST_PX, MOST_PX = 10, 8, 105  # of marks in both eyes of STIR that may be one point
 COEFFICIENTS = 8  # of distortion in StereoCalibration.ini
+# In calib.json: intrinsics, distortion, rotation and translation.
+STIR_NAMES = ("{}cameramat", "{}distortioncoeffs", "rotation", "translation")
+STIR_NAMES_2026 = ("K_{}", "D_{}", "R_left_to_right", "t_left_to_right")
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,8 +127,13 @@ def marked_in_both(left: Path, right: Path, when: str, rig: StereoRig) -> F64:
         if found:
             pairs.append((*middle, min(found)[1]))
     points = np.array(pairs, np.float64).reshape(-1, 3)
+    return as_stir_counts(rig, points[:, :2], points[:, 2:])
+
+
+def as_stir_counts(rig: StereoRig, left: F64, right: F64) -> F64:
+    """Points [P, 3] mm where the arithmetic of STIR's truth puts pixels [P, 2] of both raw pictures."""
     baseline_mm = 1e3 * abs(float(rig.T_right_left[0, 3]))
-    return stereo_points_mm(points[:, :2], points[:, 2:], rig.left.K, rig.right.K, baseline_mm)
+    return stereo_points_mm(left, right, rig.left.K, rig.right.K, baseline_mm)
 
 
 def _correlation(a: F64, b: F64) -> float:
@@ -135,7 +143,8 @@ def _correlation(a: F64, b: F64) -> float:
 
 
 def stir_rig(file: Path, size: tuple[int, int]) -> StereoRig:
-    """From `calib.json`: metres, from left to right or from right to left; the baseline is what counts.
+    """From `calib.json`, of any year: metres, from left to right or from right to left; the baseline is what
+    counts.
 
     Args:
         size: width and height of the pictures, px.
@@ -145,10 +154,11 @@ def stir_rig(file: Path, size: tuple[int, int]) -> StereoRig:
     """
     try:
         said = json.loads(read_file(file, LARGEST_TEXT))
-        K = [np.array(said[f"{side}cameramat"], np.float64).reshape(3, 3) for side in ("left", "right")]
-        lenses = [np.array(said[f"{side}distortioncoeffs"], np.float64).ravel() for side in ("left", "right")]
-        R = np.array(said["rotation"], np.float64).reshape(3, 3)
-        T = np.array(said["translation"], np.float64).reshape(3)
+        matrix, lens, turn, way = STIR_NAMES_2026 if "K_left" in said else STIR_NAMES
+        K = [np.array(said[matrix.format(side)], np.float64).reshape(3, 3) for side in ("left", "right")]
+        lenses = [np.array(said[lens.format(side)], np.float64).ravel() for side in ("left", "right")]
+        R = np.array(said[turn], np.float64).reshape(3, 3)
+        T = np.array(said[way], np.float64).reshape(3)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UsageError(f"{file} is no calibration of STIR ({error}); download it again") from None
     T = T if T[0] < 0 else -R.T @ T  # the right eye sees points farther to the left

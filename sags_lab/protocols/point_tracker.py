@@ -16,29 +16,30 @@ import numpy as np
 
 from sags_node.config.schema import LaunchConfig
 from sags_node.errors import SagsError
+from sags_node.evaluation.point_tracks import surely_seen
 from sags_node.geometry import transform
 from sags_node.mapping.anchors import MAX_ANCHORS
 from sags_node.pipeline.pipeline import Pipeline
-from sags_node.types import F64, I64, Bool, Camera, Eye, FrameResult, StereoFrame, StereoRig
+from sags_node.types import F64, I64, AnchorStates, Bool, Camera, Eye, FrameResult, StereoFrame, StereoRig
 
 SAME = 0.01  # px: a point so near to where it was said to be is the same, whatever type of number kept it
 
 
 @dataclass(frozen=True, slots=True)
 class Followed:
-    """Points in the later of two frames; where one is not found, as it was known last."""
+    """Points in one frame; where one is not found, as it was known last."""
 
     pixels: F64  # [P, 2] px, raw left picture
     points: F64  # [P, 3] m, left rectified camera; NaN: never known
     found: Bool  # [P]
+    visible: Bool  # [P] found, and surely seen by the left eye
     anchors: I64  # [P] that follow them; -1: none could be pinned there
 
     @staticmethod
     def unknown(pixels: F64) -> Followed:
         count = len(pixels)
-        return Followed(
-            pixels, np.full((count, 3), np.nan), np.zeros(count, np.bool_), np.full(count, -1, np.int64)
-        )
+        nowhere, no = np.full((count, 3), np.nan), np.zeros(count, np.bool_)
+        return Followed(pixels, nowhere, no, no, np.full(count, -1, np.int64))
 
 
 class PointTracker:
@@ -65,18 +66,30 @@ class PointTracker:
         Raises:
             SagsError: there are more points than anchors, or the frames do not fit the rig or each other.
         """
-        if len(pixels) > MAX_ANCHORS:
-            raise SagsError(f"{len(pixels)} points, {MAX_ANCHORS} at most; follow them in several trackers")
         if following.t_capture_ns <= now.t_capture_ns:
             raise SagsError("the following frame is not later than the one before it; look at t_capture_ns")
+        anchors = self._pinned(pixels, now)
+        self._newest = self._pipeline.process(following, self._budget)
+        return self._found(anchors, pixels, self._newest, self._newest.anchors)
+
+    def pin(self, pixels: F64, now: StereoFrame) -> Followed:
+        """The points at `pixels` [P, 2] (px, raw left picture) of frame `now`, in that frame: what else is
+        known of them, where they lie in space.
+
+        Raises:
+            SagsError: as `follow`.
+        """
+        anchors = self._pinned(pixels, now)
+        assert self._newest is not None  # it is `now`
+        return self._found(anchors, pixels, self._newest, self._pipeline.anchors.at(now.t_capture_ns))
+
+    def _pinned(self, pixels: F64, now: StereoFrame) -> I64:
+        """Anchors of the points [P], -1: it cannot be pinned. Those of points not asked for are removed."""
+        if len(pixels) > MAX_ANCHORS:
+            raise SagsError(f"{len(pixels)} points, {MAX_ANCHORS} at most; follow them in several trackers")
         if self._newest is None or self._newest.pair.t_capture_ns != now.t_capture_ns:
             self._newest = self._pipeline.process(now, self._budget)
-        anchors = self._anchors_of(np.asarray(pixels, np.float64).reshape(-1, 2), self._newest)
-        self._newest = self._pipeline.process(following, self._budget)
-        return self._found(anchors, np.asarray(pixels, np.float64).reshape(-1, 2), self._newest)
-
-    def _anchors_of(self, pixels: F64, newest: FrameResult) -> I64:
-        """Of each point [P], -1: it cannot be pinned. Anchors of points not asked for are removed."""
+        newest, pixels = self._newest, np.asarray(pixels, np.float64).reshape(-1, 2)
         anchors = np.full(len(pixels), -1, np.int64)
         for anchor, (place, _) in list(self._said.items()):
             away = np.where(anchors < 0, np.linalg.norm(pixels - place, axis=1), np.inf)
@@ -96,11 +109,11 @@ class PointTracker:
             self._said[anchor] = pixels[point], np.full(3, np.nan)
         return anchors
 
-    def _found(self, anchors: I64, pixels: F64, newest: FrameResult) -> Followed:
-        states, camera = newest.anchors, newest.snapshot.camera
+    def _found(self, anchors: I64, pixels: F64, newest: FrameResult, states: AnchorStates) -> Followed:
+        camera, seen = newest.snapshot.camera, surely_seen(states)
         rows = {int(anchor): row for row, anchor in enumerate(states.ids)}
-        pixels, points = pixels.copy(), np.full((len(pixels), 3), np.nan)
-        found = np.zeros(len(pixels), np.bool_)
+        pixels, points = np.array(pixels, np.float64).reshape(-1, 2), np.full((len(pixels), 3), np.nan)
+        found, visible = np.zeros((2, len(pixels)), np.bool_)
         for number in np.flatnonzero(anchors >= 0):
             anchor = int(anchors[number])
             row = rows.get(anchor)
@@ -108,9 +121,9 @@ class PointTracker:
                 point = transform(camera.viewmat, states.points[row].astype(np.float64)[None])[0]
                 pixel = to_raw(self._rig.left, camera, states.pixels[row].astype(np.float64)[None])[0]
                 self._said[anchor] = pixel, point
-                found[number] = True
+                found[number], visible[number] = True, seen[row]
             pixels[number], points[number] = self._said[anchor]
-        return Followed(pixels, points, found, anchors)
+        return Followed(pixels, points, found, visible, anchors)
 
     def _to_working(self, pixels: F64) -> F64:
         return to_working(self._rig.left, self._pipeline.rectifier.camera, pixels)
@@ -129,3 +142,16 @@ def to_raw(eye: Eye, camera: Camera, pixels: F64) -> F64:
     rays = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(camera.K).T @ eye.R
     raw: F64 = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), eye.K, eye.distortion)[0][:, 0]
     return raw
+
+
+def raw_pair(rig: StereoRig, points: F64) -> tuple[F64, F64]:
+    """Points [P, 3] (m, of the rectified left camera) in the raw pictures of both eyes, [P, 2] px each."""
+    if not len(points):
+        return np.empty((0, 2)), np.empty((0, 2))
+    left = points @ rig.left.R  # the raw camera's
+    T = rig.T_right_left
+    left_px, right_px = (
+        cv2.projectPoints(seen[:, None], np.zeros(3), np.zeros(3), eye.K, eye.distortion)[0][:, 0]
+        for seen, eye in ((left, rig.left), (left @ T[:3, :3].T + T[:3, 3], rig.right))
+    )
+    return left_px, right_px

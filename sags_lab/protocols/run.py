@@ -9,13 +9,19 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from sags_lab.protocols import arithmetic
-from sags_lab.protocols.layouts import StereoMisSequence, check_sizes, stereomis_sequence, stir_clips
+from sags_lab.protocols.layouts import (
+    StereoMisSequence,
+    as_stir_counts,
+    check_sizes,
+    stereomis_sequence,
+    stir_clips,
+)
 from sags_lab.protocols.playing import AS_GIVEN, STEP, Progress
-from sags_lab.protocols.point_tracker import Followed, PointTracker
+from sags_lab.protocols.point_tracker import Followed, PointTracker, raw_pair
+from sags_lab.protocols.stir_2026 import is_stir_2026, measure_stir_2026
 from sags_lab.protocols.tracked_points import is_tracked, measure_tracked
 from sags_node.config.launch_file import load_launch
 from sags_node.config.schema import LaunchConfig, RecordedSource
@@ -92,7 +98,10 @@ def mean(rows: Sequence[tuple[float, ...]], column: int) -> float:
 
 def measure_stir(folder: Path, overrides: Sequence[str], progress: Progress) -> dict[str, Any]:
     """Points pinned in each clip's first frame and followed to its last. In 2D a point that cannot be pinned
-    or is lost counts where it was last; in 3D one that cannot be pinned counts as missed."""
+    or is lost counts where it was last; in 3D one that cannot be pinned counts as missed. Sequences of 2026
+    are measured by their own rules."""
+    if is_stir_2026(folder):
+        return measure_stir_2026(folder, overrides, progress)
     clips, distances, unmoved, times, lost = {}, [], [], [], 0
     deep, deep_unmoved = [], []
     for clip in stir_clips(folder):
@@ -202,21 +211,9 @@ def _follow(launch: Sequence[str], rig: StereoRig, starts: F64, name: str, progr
             started = time.perf_counter()
             followed = tracker.follow(followed.pixels, now, following)
             times.append((time.perf_counter() - started) * 1e3)
-            points_mm[followed.found] = as_stir_counts(rig, followed.points[followed.found])
+            pixels = raw_pair(rig, followed.points[followed.found])
+            points_mm[followed.found] = as_stir_counts(rig, *pixels)
             progress(number + 2, name)
     if not times:
         raise SagsError(f"{name} has fewer than two frames; is its video whole?")
     return _Tracks(followed.pixels, points_mm, int(np.count_nonzero(~followed.found)), times)
-
-
-def as_stir_counts(rig: StereoRig, points: F64) -> F64:
-    """Points [P, 3] (m, of the rectified left camera) where the arithmetic of STIR's truth puts them, mm:
-    each is said as a pixel of both raw pictures first."""
-    left = points @ rig.left.R  # the raw camera's
-    T = rig.T_right_left
-    pixels = [
-        cv2.projectPoints(seen[:, None], np.zeros(3), np.zeros(3), eye.K, eye.distortion)[0][:, 0]
-        for seen, eye in ((left, rig.left), (left @ T[:3, :3].T + T[:3, 3], rig.right))
-    ]
-    baseline_mm = 1e3 * abs(float(T[0, 3]))
-    return arithmetic.stereo_points_mm(pixels[0], pixels[1], rig.left.K, rig.right.K, baseline_mm)

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sags_node.types import F64, Bool
+from sags_node.types import F64, AnchorStates, Bool
 
 THRESHOLDS_PX = (2, 4, 8, 16, 32)
+SURE = 0.5  # confidence
 BINS = (0.0, 0.02, 0.1, 0.2, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)  # of confidence
 
 
@@ -34,6 +35,11 @@ def average_jaccard(
         wrong = said & ~right
         found.append(right.sum() / max(1, visible.sum() + wrong.sum()))
     return float(np.mean(found))
+
+
+def surely_seen(states: AnchorStates) -> Bool:
+    """Which anchors [A] are said to be seen where they are."""
+    return (states.confidence >= SURE) & (states.visibility >= SURE)
 
 
 @dataclass(frozen=True, slots=True)

@@ -41,6 +41,29 @@ def test_stir_makes_points_of_pixels_of_both_eyes() -> None:
     assert shares_within(distances, arithmetic.STIR_MM)["average"] == pytest.approx(4 / 5 / 2)
 
 
+def test_stir_of_2026() -> None:
+    """Four points: near; 5 px off; visible but not said to be; hidden but said to be visible.
+
+    Within 2 and 4 px one of the three visible ones is right, and two of those said are wrong: 1 / (3 + 2).
+    Within 8, 16 and 32 px it is 2 / (3 + 1). Of the visible ones one of three is within 2 and 4, two within
+    the others. Of two points the right visibility is said.
+    """
+    distances = np.array([1.0, 5.0, 40.0, 1.0])
+    visible, said = np.array([1, 1, 1, 0], bool), np.array([1, 1, 0, 1], bool)
+    figures = arithmetic.stir_2026_figures(distances, visible, said)
+    assert figures == {
+        "average_jaccard": pytest.approx((2 * 1 / 5 + 3 * 2 / 4) / 5),
+        "average_tracking_accuracy": pytest.approx((2 * 1 / 3 + 3 * 2 / 3) / 5),
+        "occlusion_accuracy": 0.5,
+    }
+    on_the_line = arithmetic.stir_2026_figures(np.array([16.0]), np.ones(1, bool), np.ones(1, bool))
+    assert (
+        on_the_line["average_jaccard"] == on_the_line["average_tracking_accuracy"] == 1 / 5
+    )  # below it only
+    hidden = arithmetic.stir_2026_figures(np.array([1.0]), np.zeros(1, bool), np.zeros(1, bool))
+    assert list(hidden.values()) == [0, 0, 1]
+
+
 def test_stir_latency() -> None:
     """1 to 101 ms: mean 51, p95 96, p99 100."""
     assert arithmetic.latency_score(list(range(1, 102))) == pytest.approx((51 + 96 + 100) / 3)

@@ -15,9 +15,14 @@ from command_line import figures_of
 from numbered_pictures import write_video
 from places import SESSION
 
-from sags_lab.protocols.layouts import marked_in_both, read_tum, stereomis_sequence, stir_clips
-from sags_lab.protocols.point_tracker import to_raw, to_working
-from sags_lab.protocols.run import as_stir_counts
+from sags_lab.protocols.layouts import (
+    as_stir_counts,
+    marked_in_both,
+    read_tum,
+    stereomis_sequence,
+    stir_clips,
+)
+from sags_lab.protocols.point_tracker import raw_pair, to_raw, to_working
 from sags_node.cli.main import main
 from sags_node.config.launch_file import load_launch
 from sags_node.errors import SagsError, UsageError
@@ -140,7 +145,9 @@ def test_marks_of_both_eyes_are_points_in_3d(tmp_path: Path) -> None:
 def test_a_point_counts_in_3d_where_stir_puts_it() -> None:
     """Of a pair that is rectified as it comes, that is where it is."""
     points = np.random.default_rng(0).uniform((-0.02, -0.02, 0.05), (0.02, 0.02, 0.1), (20, 3))
-    np.testing.assert_allclose(as_stir_counts(rectified_stir(), points), 1e3 * points, atol=0.01)
+    rig = rectified_stir()
+    np.testing.assert_allclose(as_stir_counts(rig, *raw_pair(rig, points)), 1e3 * points, atol=0.01)
+    assert len(as_stir_counts(rig, *raw_pair(rig, points[:0]))) == 0
 
 
 def test_stir_end_to_end(stir: Path) -> None:

@@ -17,7 +17,7 @@ import yaml
 from click.testing import CliRunner
 from places import SESSION
 
-from sags_lab.protocols.point_tracker import PointTracker, to_raw
+from sags_lab.protocols.point_tracker import PointTracker, raw_pair, to_raw
 from sags_lab.protocols.tracked_points import CONVERT, tracked_sequence
 from sags_node.cli.main import main
 from sags_node.config.launch_file import load_launch
@@ -62,6 +62,22 @@ def raw(rig: StereoRig, pixels: F64) -> F64:
 
 def tracker(rig: StereoRig) -> PointTracker:
     return PointTracker(load_launch(SESSION, ["mapping.iterations:=1", "source.pace:=step"]), rig)
+
+
+def test_points_lie_in_space_in_the_frame_that_they_are_pinned_in(
+    frames: list[StereoFrame], rig: StereoRig
+) -> None:
+    """They stay there, and go on as the same points. A point outside the picture is not found."""
+    pixels, _ = truth(frames, rig)
+    places = np.concatenate([raw(rig, pixels[:6, 0]), [[-5.0, -5.0]]])
+    follower = tracker(rig)
+    first = follower.pin(places, frames[0])
+    assert first.found[:6].sum() >= 5 and first.visible[first.found].all()
+    assert not first.found[6] and not first.visible[6]
+    np.testing.assert_allclose(first.pixels, places, atol=0.02)
+    np.testing.assert_allclose(raw_pair(rig, first.points[first.found])[0], places[first.found], atol=0.02)
+    second = follower.follow(first.pixels, frames[0], frames[1])
+    np.testing.assert_array_equal(second.anchors, first.anchors)
 
 
 def test_points_are_handed_from_frame_to_frame(frames: list[StereoFrame], rig: StereoRig) -> None:
