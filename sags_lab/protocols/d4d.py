@@ -12,6 +12,7 @@ import numpy as np
 
 from sags_lab.protocols.arithmetic import depth_figures
 from sags_lab.protocols.d4d_files import D4dClip, Scan, d4d_clips, instruments_are_white, read_tools
+from sags_lab.protocols.d4d_population import in_population
 from sags_lab.protocols.d4d_scan import check_scan, read_surface, scan_depth
 from sags_lab.protocols.playing import AS_GIVEN, STEP, Progress
 from sags_node.config.launch_file import load_launch
@@ -27,25 +28,34 @@ from sags_node.sources.truth import load_npy
 from sags_node.types import F32, Bool, FrameResult
 
 Figures = dict[str, Any]  # numbers, in groups
+WHEN = ("start", "end")  # of a clip's scans
+REGIONS = ("visible", "occluded")
 
 
 def measure_d4d(folder: Path, overrides: Sequence[str], progress: Progress) -> dict[str, Any]:
     """Of each clip: depth errors at its first frame against the scan before it, and at its last against the
     one after it; of stereo (`measured`), the drawn model, and the data set's own stereo depth; where the left
     eye sees tissue (`visible`), and where it sees an instrument and the scan tissue (`occluded`). PSNR of the
-    drawn model over tissue, beside that of the frame before. All figures are means over clips.
+    drawn model over tissue, beside that of the frame before. All figures are means over clips; `population`
+    has those over the public population, in which no scan is refused.
 
     Raises:
         SagsError: no scan lies where stereo sees the surface, or a file is wrong. A single scan that does not
-            is `refused`, and says why.
+            is `refused`, says why, and counts in the population only.
     """
     clips = {clip.name: _measure_clip(clip, overrides, progress) for clip in d4d_clips(folder)}
-    scans = [found for clip in clips.values() for when in ("start", "end") if (found := clip.get(when))]
-    refused = [found["refused"] for found in scans if "refused" in found]
+    scans = [(name, when) for name, clip in clips.items() for when in WHEN if when in clip]
+    refused = [found["refused"] for name, when in scans if "refused" in (found := clips[name][when])]
     if len(refused) == len(scans):
         raise SagsError(refused[0] if refused else f"{folder}: no frame that belongs to a scan was played")
     counts = {"clips": len(clips), "scans": len(scans) - len(refused), "refused": len(refused)}
-    return {**counts, **_mean(list(clips.values())), "of_each": clips}
+    ours = [
+        {**clip, **{when: {} for when in WHEN if "refused" in clip.get(when, {})}} for clip in clips.values()
+    ]
+    kept = [(when, clips[name][when]) for name, when in scans if in_population(name, when)]
+    theirs = [{when: {key: found[key] for key in REGIONS if key in found}} for when, found in kept]
+    population = {"scans": len(kept), "left_out": len(scans) - len(kept), **_mean(theirs)}
+    return {**counts, **_mean(ours), "population": population, "of_each": clips}
 
 
 def _measure_clip(clip: D4dClip, overrides: Sequence[str], progress: Progress) -> Figures:
@@ -104,9 +114,9 @@ class _Run:
         seen = result.observation
         points, is_tissue = read_surface(scan)
         try:
-            agreeing = check_scan(scan, points, seen.camera, seen.depth)
+            checked: Figures = {"agrees_with_stereo": check_scan(scan, points, seen.camera, seen.depth)}
         except SagsError as error:
-            return {"refused": str(error)}
+            checked = {"refused": str(error)}
         tissue = points if is_tissue is None else points[is_tissue]
         truth = scan_depth(tissue, scan.T_cloud_cam, seen.camera)
         said = {"measured": seen.depth, "model": result.views["left"].depth}
@@ -118,7 +128,7 @@ class _Run:
             hidden = metrics.resample_nearest(tools.astype(np.float32), width, height) > 0
             regions["occluded"] = hidden
         return {
-            "agrees_with_stereo": agreeing,
+            **checked,
             "scan_coverage": float(np.mean(truth > 0)),
             **{
                 region: {

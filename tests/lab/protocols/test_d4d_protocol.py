@@ -15,6 +15,7 @@ from command_line import figures_of
 from places import SESSION
 
 from sags_lab.protocols.d4d_files import d4d_clips, instruments_are_white
+from sags_lab.protocols.d4d_population import LEFT_OUT, in_population
 from sags_lab.protocols.d4d_scan import check_scan, read_surface, scan_depth
 from sags_node.cli.main import main
 from sags_node.config.launch_file import load_launch
@@ -112,6 +113,9 @@ def test_d4d_end_to_end(d4d: Path) -> None:
         assert figures["visible"]["model"]["given"] > 0.5
         assert "measured" not in figures["occluded"]  # stereo is not asked where an instrument is
     assert found["psnr"]["drawn"] > 20 and found["psnr"]["frame_before"] > 20
+    population = found["population"]
+    assert (population["scans"], population["left_out"]) == (2, 0)
+    assert population["start"]["visible"] == found["start"]["visible"]
 
 
 def test_one_scan_that_is_elsewhere_stops_no_other(d4d: Path, tmp_path: Path) -> None:
@@ -127,6 +131,39 @@ def test_one_scan_that_is_elsewhere_stops_no_other(d4d: Path, tmp_path: Path) ->
     assert found["end"]["visible"]["measured"] == of_clip["end"]["visible"]["measured"]
     result = CliRunner().invoke(main, [*command, "source.frames:=1"])
     assert result.exit_code == 1 and "the other way round" in result.stderr
+
+
+def test_the_public_population() -> None:
+    """487 of 542 scans, 269 of 271 clips: two have lost both."""
+    starts, ends = (
+        {(session, clip) for session, clips in LEFT_OUT[when].items() for clip in clips}
+        for when in ("start", "end")
+    )
+    assert 542 - len(starts) - len(ends) == 487 and 271 - len(starts & ends) == 269
+    assert in_population("specimen_1/2025_03_06-16_56_00/Clip_3", "start")
+    assert not in_population("specimen_1/2025_03_06-16_56_00/Clip_4", "start")
+    assert in_population("specimen_1/2025_03_06-16_56_00/Clip_4", "end")
+
+
+def test_the_population_asks_no_stereo(d4d: Path, tmp_path: Path) -> None:
+    """Of a clip the public list leaves the scan before it out, and stereo disagrees with the one after it,
+    whose pose is 30 mm too far back: by our rule more than half of it is more than a tenth off."""
+    session = tmp_path / "specimen_5/2025_09_09-15_28_11"
+    shutil.copytree(d4d / "specimen_1/2025_03_06-16_49_40", session)
+    back = np.eye(4)
+    back[2, 3] = -0.03
+    np.savetxt(session / "clips/Clip_1/curated_camera_pose_end.txt", scanner_pose() @ back)
+    found = figures_of(
+        "eval", "--protocol", "d4d", str(tmp_path), "--iterations", "1", "vision.pose:=session", "--json"
+    )
+    assert (found["scans"], found["refused"]) == (1, 1)
+    assert found["end"] == {} and found["start"]["visible"]["measured"]["median_mm"] < 1
+    population = found["population"]
+    assert (population["scans"], population["left_out"]) == (1, 1) and "start" not in population
+    (clip,) = d4d_clips(tmp_path)
+    points, _ = read_surface(clip.scans[1])
+    nearest = transform(invert(scanner_pose()), points)[:, 2].min()
+    assert population["end"]["visible"]["measured"]["median_mm"] > 0.1 * nearest * 1e3
 
 
 def test_clips_of_d4d(d4d: Path) -> None:
