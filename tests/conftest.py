@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import signal
 from pathlib import Path
@@ -44,9 +45,14 @@ def data_folder() -> Path:
 
 @pytest.fixture(scope="session")
 def phantom_session(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Forty frames of the phantom at a small size, with their truth."""
-    folder = tmp_path_factory.mktemp("phantom") / "session"
-    write_session(PhantomSource(seconds=4.0, width=320, height=256, seed=1), folder, rate=10.0)
+    """Forty frames of the phantom at a small size, with their truth; one worker renders them for all."""
+    own = tmp_path_factory.getbasetemp()
+    shared = own.parent if "PYTEST_XDIST_WORKER" in os.environ else own
+    folder = shared / "phantom"
+    with (shared / "phantom.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not folder.exists():
+            write_session(PhantomSource(seconds=4.0, width=320, height=256, seed=1), folder, rate=10.0)
     return folder
 
 

@@ -90,7 +90,7 @@ REACHED_INTO = {
     ("engine/test_device.py", "_C"),
     ("engine/test_device.py", "_backend"),
     ("kernels/test_kernel_cache.py", "_cache"),
-    ("fitting/test_stream_fit.py", "_drawn_ns"),  # whose rows must stay those of the model it thins out
+    ("benchmarks/test_stream_fit.py", "_drawn_ns"),  # whose rows must stay those of the model it thins out
     ("model/test_model.py", "_LEAST_STIFFNESS"),  # without stiffness: the twin that it must be better than
 }
 PRIVATE = re.compile(r"\b_[a-zA-Z]\w*")

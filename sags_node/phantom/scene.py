@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from pydantic import Field
@@ -14,10 +15,10 @@ from sags_node.phantom.casting import Bodies
 from sags_node.phantom.instruments import NOTHING, Instruments
 from sags_node.phantom.motion import Clock, scope_pose
 from sags_node.phantom.noise import fractal_noise
-from sags_node.phantom.relief import BED_DEPTH, make_relief
+from sags_node.phantom.relief import BED_DEPTH, Relief, make_relief
 from sags_node.phantom.rig import phantom_rig, raw_rays, rectified_rays
 from sags_node.phantom.shading import Lamp
-from sags_node.phantom.skin import paint_skin
+from sags_node.phantom.skin import Skin, paint_skin
 from sags_node.phantom.still import Still
 from sags_node.phantom.tissue import Tissue
 from sags_node.types import F32, F64, U8, Bool
@@ -56,6 +57,14 @@ class PhantomFrame:
     T_world_cam: F64  # [4, 4] left rectified camera
 
 
+@lru_cache(maxsize=1)
+def _material(seed: int, half_view: tuple[float, float], focal_px: float) -> tuple[Relief, Skin]:
+    """The tissue at rest and its texture: most of the time that a new scene takes, and many share them."""
+    shape, paint = (np.random.default_rng(stream) for stream in np.random.SeedSequence(seed).spawn(2))
+    relief = make_relief(shape, half_view)
+    return relief, paint_skin(relief, paint, footprint=0.8 * BED_DEPTH / focal_px)
+
+
 class Phantom:
     """A seeded scene; a frame is a pure function of its place in the session.
 
@@ -75,12 +84,12 @@ class Phantom:
 
         # Independent random streams, so that changing one part of the scene leaves the others as they are.
         streams = np.random.SeedSequence(config.seed).spawn(5)
-        shape, paint, tracks, smoke = (np.random.default_rng(stream) for stream in streams[:4])
+        tracks, smoke = (np.random.default_rng(stream) for stream in streams[2:4])
         self._noise_key = streams[4].generate_state(2)
         self._clock = Clock(config.seconds)
-        self._relief = make_relief(shape, self._half_view)
+        self._relief, skin = _material(config.seed, self._half_view, float(self.rig.left.K[0, 0]))
         self.tissue = Tissue(self._relief, self._clock)
-        self._skin = paint_skin(self._relief, paint, footprint=0.8 * BED_DEPTH / float(self.rig.left.K[0, 0]))
+        self._skin = replace(skin, surface=skin.surface.copy())
         self._skin.surface[..., 2] *= np.sqrt(scene.gloss)  # highlights go with the square of the wetness
         self._instruments = Instruments()
         self._tracks = self.tissue.track_indices(tracks, self._half_view, TRACKS)

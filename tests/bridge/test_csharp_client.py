@@ -26,7 +26,7 @@ from websockets.sync.server import ServerConnection, serve
 from sags_node.bridge.feed import Place
 from sags_node.bridge.web import WebOptions, run_web
 
-pytestmark = pytest.mark.live
+pytestmark = [pytest.mark.live, pytest.mark.beside]
 
 SOURCE = ROOT / "examples/unity"
 UNITY = """

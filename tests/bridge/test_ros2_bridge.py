@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from bridging import anchored, anchored_at, bridged, sockets
-from made_messages import meta
+from made_messages import message_of
 from ros_peers import DOMAIN, KEPT, Listener, listener
 from synthetic import HEIGHT, WIDTH, plane_camera, plane_depth, stream
 from waiting import until
@@ -27,7 +27,6 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import cdr, topics
 from sags_node.messaging.received import ReceivedImage, interpret
 from sags_node.messaging.subscriber import Subscriber
-from sags_node.messaging.wire import Message
 from sags_node.ros.endpoints import Delivery
 from sags_node.ros.graph import kernel_buffer
 
@@ -235,10 +234,7 @@ def test_what_compresses_badly_is_made_coarser_until_it_fits(name: str) -> None:
 def received(name: str, array: np.ndarray) -> ReceivedImage:
     encoding = {3: "rgb8", 4: "rgba8"}[array.shape[2]] if array.ndim == 3 else "32FC1"
     body = cdr.image(array, encoding, 1)
-    said = meta(
-        1, 0, type_hash=cdr.type_hash(body.type), encoding=encoding, shape=list(body.shape), dtype=body.dtype
-    )
-    found = interpret(Message(f"sags/{name}", said, body.parts), 0)
+    found = interpret(message_of(name, body), 0)
     assert isinstance(found, ReceivedImage)
     return found
 

@@ -279,7 +279,7 @@ def test_a_running_node_is_exported_as_it_is_now(
 def test_a_fit_is_exported_at_any_time(
     phantom_session: Path, phantom: Phantom, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(start, "PATH_STEPS", 600)  # ten frames are learnt sooner than a clip
+    monkeypatch.setattr(start, "PATH_STEPS", 100)  # ten frames are learnt sooner than a clip
     session = (phantom_session, "source.frames:=10")
     small = ("--iterations", "3", "--max-gaussians", "6000")
     done = sags("fit", *session, "--out", tmp_path / "fit", *small, "--json")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from unittest.mock import ANY
@@ -36,6 +37,7 @@ SMALL = FitSettings(
     iterations=120, max_gaussians=3000, shape=FieldShape(cells=16, channels=16, frames_per_slot=12 / 7)
 )
 PAPER = dataclasses.replace(SMALL, schedule="paper", warm_up=60)
+QUICK_PATHS = 300  # steps of the regression: twelve frames are learnt sooner than a clip
 FRAMES = ["source.pace:=step", "source.loop:=false", "source.frames:=12"]
 
 
@@ -49,8 +51,7 @@ def quietly(what: str, done: int, of: int) -> None:
 
 @pytest.fixture(autouse=True)
 def short_regression(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Twelve frames are learnt sooner than a clip."""
-    monkeypatch.setattr(start, "PATH_STEPS", 600)
+    monkeypatch.setattr(start, "PATH_STEPS", QUICK_PATHS)
 
 
 @pytest.fixture(scope="module")
@@ -67,6 +68,25 @@ def fitted(clip: Clip, settings: FitSettings, iterations: int | None = None) -> 
     return fit
 
 
+@dataclass(frozen=True)
+class Refined:
+    """A fit from an online start, and how good it was before its first iteration."""
+
+    before: dict[str, Any]
+    fit: Fit
+
+
+@pytest.fixture(scope="module")
+def refined(clip: Clip) -> Refined:
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(start, "PATH_STEPS", QUICK_PATHS)
+        fit = fitted(clip, SMALL, iterations=0)
+    before = score(fit, clip.test, {})
+    while not fit.done:
+        fit.iterate()
+    return Refined(before, fit)
+
+
 def test_a_clip_is_split_and_whole(clip: Clip) -> None:
     assert [frame.frame_id for frame in clip.test] == [3, 8]
     assert [frame.frame_id for frame in clip.train] == [0, 1, 2, 4, 5, 6, 7, 9, 10, 11]
@@ -79,10 +99,11 @@ def test_a_clip_is_split_and_whole(clip: Clip) -> None:
 @pytest.mark.parametrize("tokens", ["self", "nodes"])
 def test_a_fit_learns_frames_it_never_saw(clip: Clip, tokens: Any) -> None:
     settings = dataclasses.replace(PAPER, tokens=tokens, iterations=240)
-    fresh = Fit(clip, settings)
-    fresh.start(quietly)
-    before = score(fresh, clip.test, {})
-    after = score(fitted(clip, settings), clip.test, {})
+    fit = fitted(clip, settings, iterations=0)
+    before = score(fit, clip.test, {})
+    while not fit.done:
+        fit.iterate()
+    after = score(fit, clip.test, {})
     assert after["psnr"] > before["psnr"] + 2
     assert after["ssim"] > before["ssim"]
     assert after["paper_psnr"] > after["psnr"]  # masked pixels count as perfect
@@ -93,7 +114,7 @@ def test_each_part_of_the_method_has_its_share_in_the_result(clip: Clip) -> None
     frame = clip.test[0]
 
     def drawn(**changed: Any) -> F32:
-        fit = fitted(clip, dataclasses.replace(PAPER, warm_up=10, iterations=30, **changed))
+        fit = fitted(clip, dataclasses.replace(PAPER, warm_up=3, iterations=20, **changed))
         return fit.rasterizer.forward(fit.gaussians(frame), frame.camera)[:3, frame.tissue]
 
     whole, alone = drawn(), drawn(tokens="self")
@@ -150,34 +171,26 @@ def test_an_online_start_is_what_the_mapper_saw(clip: Clip, tokens: Any) -> None
     assert np.mean(learnt[1:]) < 0.5 * np.mean(still[1:])  # most of the motion is the field's
 
 
-def test_refining_an_online_start_helps_frames_it_never_saw(clip: Clip) -> None:
-    settings = dataclasses.replace(SMALL, iterations=200)
-    fit = Fit(clip, settings)
-    fit.start(quietly)
-    before = score(fit, clip.test, {})
-    while not fit.done:
-        fit.iterate()
-    after = score(fit, clip.test, {})
+def test_refining_an_online_start_helps_frames_it_never_saw(clip: Clip, refined: Refined) -> None:
+    before, after = refined.before, score(refined.fit, clip.test, {})
     assert after["psnr"] > before["psnr"] + 0.2
     assert after["ssim"] > before["ssim"]
-    depth = score_depth(fit, clip.test, {"first": (0, 5)})
+    depth = score_depth(refined.fit, clip.test, {"first": (0, 5)})
     assert depth is not None and depth["frames"] == 2 and depth["first"]["frames"] == 1
     assert depth["median_mm"] < 0.6 and depth["coverage"] > 0.98
 
 
-def test_gaussians_stay_on_their_tissue(clip: Clip) -> None:
+def test_gaussians_stay_on_their_tissue(clip: Clip, refined: Refined) -> None:
     frames = sorted((*clip.train, *clip.test), key=lambda frame: frame.frame_id)
-    fit = fitted(clip, SMALL)
-    tracks = score_tracks(fit, frames)
+    tracks = score_tracks(refined.fit, frames)
     assert tracks is not None
     assert 0 < tracks["median_mm"] < 0.5
     bare = [dataclasses.replace(frame, reference=None) for frame in frames]
-    assert score_tracks(fit, bare) is None
+    assert score_tracks(refined.fit, bare) is None
 
 
-def test_between_two_frames_the_model_goes_straight(clip: Clip) -> None:
-    fit = fitted(clip, SMALL, iterations=20)
-    frame = clip.test[0]
+def test_between_two_frames_the_model_goes_straight(clip: Clip, refined: Refined) -> None:
+    fit, frame = refined.fit, clip.test[0]
     around = clip.around(frame.t_capture_ns)
     assert around is not None and [near.frame_id for near in around] == [2, 4]
     before, after = (fit.gaussians(near).means for near in around)
@@ -191,9 +204,9 @@ def test_between_two_frames_the_model_goes_straight(clip: Clip) -> None:
     assert clip.around(clip.train[-1].t_capture_ns + 1) is None
 
 
-def test_pictures_carried_along_the_motion_beat_their_mean(clip: Clip) -> None:
+def test_pictures_carried_along_the_motion_beat_their_mean(clip: Clip, refined: Refined) -> None:
     """The phantom's tissue moves all the time, so that the mean of two pictures is blurred."""
-    found = score_between(fitted(clip, SMALL), clip.test, {"first": (0, 5)})
+    found = score_between(refined.fit, clip.test, {"first": (0, 5)})
     assert found is not None
     carried, mean = found["carried"], found["mean"]
     assert carried["frames"] == mean["frames"] == 2 and carried["first"]["frames"] == 1
@@ -202,13 +215,13 @@ def test_pictures_carried_along_the_motion_beat_their_mean(clip: Clip) -> None:
     frame = clip.test[0]
     by_hand = psnr(before / 2 + after / 2, frame.image / np.float32(255), frame.tissue)
     assert mean["first"]["psnr"] == pytest.approx(by_hand, abs=0.01)
-    assert score_between(fitted(clip, SMALL, iterations=0), clip.train, {}) is None
+    assert score_between(refined.fit, clip.train, {}) is None
 
 
 def test_the_number_of_gaussians_stays_under_its_cap(clip: Clip) -> None:
-    settings = dataclasses.replace(PAPER, max_gaussians=2000, iterations=900)
-    fit = Fit(clip, settings)
-    fit.start(quietly)
+    often = dataclasses.replace(PAPER.growth, every=10)
+    settings = dataclasses.replace(PAPER, max_gaussians=2000, warm_up=10, iterations=100, growth=often)
+    fit = fitted(clip, settings, iterations=0)
     fit.model.keep(np.arange(len(fit.model)) < 1500)  # room to grow
     fit = _restarted(fit)
     while not fit.done:
@@ -298,9 +311,8 @@ def test_a_fit_that_cannot_be_says_why(
     assert said in result.output and "Traceback" not in result.output
 
 
-def test_beyond_the_last_frame_the_model_moves_on_and_comes_to_rest(clip: Clip) -> None:
-    fit = fitted(clip, SMALL, iterations=1)
-    model, last = fit.model, clip.train[-1]
+def test_beyond_the_last_frame_the_model_moves_on_and_comes_to_rest(clip: Clip, refined: Refined) -> None:
+    model, last = refined.fit.model, clip.train[-1]
     t_ns, cameras = last.t_capture_ns, [last.camera]
 
     def means(later_ns: int) -> Any:
@@ -314,7 +326,7 @@ def test_beyond_the_last_frame_the_model_moves_on_and_comes_to_rest(clip: Clip) 
     np.testing.assert_allclose(means(1_000_000), now + velocity * 1e6, atol=1e-6)
     np.testing.assert_allclose(means(10**12), now + velocity * FADE_NS, atol=1e-6)
     later = dataclasses.replace(last, t_capture_ns=t_ns + 30_000_000)
-    np.testing.assert_array_equal(fit.gaussians(later).means, means(30_000_000))
+    np.testing.assert_array_equal(refined.fit.gaussians(later).means, means(30_000_000))
 
 
 def test_monocular_depth_is_for_the_papers_schedule(phantom_session: Path, tmp_path: Path) -> None:

@@ -26,6 +26,7 @@ import msgspec
 import numpy as np
 from bag_files import KINDS, play
 from hypothesis import strategies as st
+from made_messages import message_of
 from numbered_pictures import write_video
 from onnx_networks import save_matcher
 from places import ROOT
@@ -40,7 +41,7 @@ from sags_node.messaging import cdr, content, thin, topics
 from sags_node.messaging.control import ControlServer
 from sags_node.messaging.received import ReceivedImage, interpret
 from sags_node.messaging.requests import AnchorName, AnchorRequest, ViewName, ViewRequest, parse
-from sags_node.messaging.wire import Message, Meta, decode, encode
+from sags_node.messaging.wire import decode, encode
 from sags_node.overlay.mesh import mesh_of
 from sags_node.overlay.scene import ObjectSpec
 from sags_node.recording.info import bag_info
@@ -223,16 +224,11 @@ def messages(_: Path) -> list[bytes]:
     made = {
         name: make(result) for name, make in content.FRAME_CONTENT.items() if content.tells_of(result, name)
     }
-    return [PARTS.join(bytes(part) for part in encode(_message(name, body))) for name, body in made.items()]
+    return [joined(name, body) for name, body in made.items()]
 
 
-def _message(name: str, body: cdr.Content) -> Message:
-    meta = Meta(
-        type=body.type, type_hash=cdr.type_hash(body.type), encoding=body.encoding, shape=list(body.shape),
-        dtype=body.dtype, seq=1, frame_id=1, stamp_ns=1_000_000, publish_ns=1, session="s", epoch=0, step=0,
-        dropped=0,
-    )  # fmt: skip
-    return Message(f"sags/{name}", meta, body.parts)
+def joined(name: str, body: cdr.Content) -> bytes:
+    return PARTS.join(bytes(part) for part in encode(message_of(name, body, stamp_ms=1)))
 
 
 def read_message(data: bytes, _: Path) -> None:
@@ -244,7 +240,7 @@ def read_message(data: bytes, _: Path) -> None:
 def masks(_: Path) -> list[bytes]:
     result = plane_result(stamp_ns=1_000_000)
     body = content.FRAME_CONTENT["left/tissue_mask"](result)
-    return [PARTS.join(bytes(part) for part in encode(_message("left/tissue_mask", body)))]
+    return [joined("left/tissue_mask", body)]
 
 
 def use_mask(data: bytes, _: Path) -> None:

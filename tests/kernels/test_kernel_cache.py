@@ -6,12 +6,11 @@ import ast
 import json
 import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import numba
 import pytest
+from forked import Forked, Said
 
 from sags_node.engine.pinhole import to_pixel
 from sags_node.kernels import cache, digest
@@ -103,25 +102,21 @@ def whole_copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return copy
 
 
-def start(copy: Path, code: str, **environment: str) -> subprocess.Popen[str]:
-    own = {"PYTHONPATH": str(copy), "NUMBA_CACHE_DIR": str(copy / "cache"), "PYTHONDONTWRITEBYTECODE": "1"}
-    return subprocess.Popen(
-        [sys.executable, "-c", code],
-        env=os.environ | own | environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        cwd=copy,
-    )
+def start(copy: Path, code: str, cache: Path | None = None, **environment: str) -> Forked:
+    """Kernels are kept in `cache`, or beside the copy."""
+    return Forked(copy, code, NUMBA_CACHE_DIR=str(cache or copy / "cache"), **environment)
+
+
+def numbers(said: Said) -> list[float]:
+    """What code that ends with `COUNTED` found, then the numbers of kernels compiled and loaded."""
+    assert said.stdout, said.stderr
+    found: list[float] = json.loads(said.stdout)
+    return found
 
 
 def run(copy: Path, code: str, **environment: str) -> list[float]:
-    """What the code found in a process of its own, then the numbers of kernels compiled and loaded."""
-    process = start(copy, code + COUNTED, **environment)
-    stdout, stderr = process.communicate(timeout=120)
-    assert process.returncode == 0, stderr
-    numbers: list[float] = json.loads(stdout)
-    return numbers
+    """The numbers of a process of its own."""
+    return numbers(start(copy, code + COUNTED, **environment).said())
 
 
 def edit(file: Path, old: str, new: str) -> None:
@@ -222,7 +217,7 @@ intervals = [scaled(getattr(np, kind)(4)) for kind in {}]
 """
     edit(whole_copy / "sags_node/made/deep.py", "FACTOR = ", "FACTOR = 1.5 * ")  # nothing of it on disk yet
     processes = [start(whole_copy, code.format([kind]) + COUNTED) for kind in types]
-    alone = [json.loads(process.communicate(timeout=120)[0]) for process in processes]
+    alone = [numbers(process.said()) for process in processes]
     together = run(whole_copy, code.format(types))
     assert together == [*(found[0] for found in alone), 0, len(types)]
 
@@ -247,16 +242,13 @@ def test_damaged_files_are_compiled_anew(whole_copy: Path) -> None:
     assert run(whole_copy, CALLED)[2:] == LOADED
 
 
-def test_a_full_disk_costs_the_cache_and_nothing_else(
-    whole_copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_costs_the_cache_and_nothing_else(whole_copy: Path, tmp_path: Path) -> None:
     full = "import resource, signal\nsignal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
     full += "resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))\n"
     for _ in range(2):
-        process = start(whole_copy, full + CALLED + COUNTED, NUMBA_CACHE_DIR=str(tmp_path))
-        stdout, stderr = process.communicate(timeout=120)
-        assert json.loads(stdout)[2:] == COMPILED, stderr
-        assert stderr.count("cannot be kept") == 1
+        said = start(whole_copy, full + CALLED + COUNTED, cache=tmp_path).said()
+        assert numbers(said)[2:] == COMPILED
+        assert said.stderr.count("cannot be kept") == 1
 
 
 def test_place_of_the_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -294,7 +286,5 @@ def test_a_kernel_is_cold_until_it_was_compiled_once(whole_copy: Path) -> None:
     cold = "\nfrom sags_node.kernels.cache import is_cold\nbefore = is_cold(pinhole.to_pixel)"
     imported, called = SAMPLING.split("camera = ")
     code = f"{imported}{cold}\ncamera = {called}\nprint(json.dumps([before, is_cold(pinhole.to_pixel)]))\n"
-    environment = {"NUMBA_CACHE_DIR": str(whole_copy / "another cache")}
     for expected in ([True, False], [False, False]):
-        stdout, stderr = start(whole_copy, code, **environment).communicate(timeout=120)
-        assert json.loads(stdout or "null") == expected, stderr
+        assert numbers(start(whole_copy, code, cache=whole_copy / "another cache").said()) == expected

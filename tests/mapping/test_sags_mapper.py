@@ -145,8 +145,8 @@ def test_two_runs_give_the_same_bits_whatever_the_number_of_threads() -> None:
         assert np.array_equal(a.views["right"].rgb, b.views["right"].rgb)
 
 
-def test_over_fifteen_windows_nothing_grows(phantom_session: Path) -> None:
-    small = ["vision.width:=96", "vision.height:=76", "source.loop:=true", "source.frames:=300"]
+def test_over_eight_windows_nothing_grows(phantom_session: Path) -> None:
+    small = ["vision.width:=96", "vision.height:=76", "source.loop:=true", "source.frames:=160"]
     pipeline, frames = pipeline_of(phantom_session, *small)
     budget, sizes = StepBudget(1, Rung(1000)), []
     for frame in frames:

@@ -18,20 +18,21 @@ import numpy as np
 import pytest
 import zmq
 from independent_client import zmq_socket
+from made_messages import message_of
 from places import ROOT
 from running_node import RunningNode
 from synthetic import plane_result
 
 from sags_node.config.schema import PushSource
-from sags_node.messaging import cdr, content
+from sags_node.messaging import content
 from sags_node.messaging.control import ControlClient
 from sags_node.messaging.received import ReceivedImage, TopicName
 from sags_node.messaging.subscriber import Subscriber
-from sags_node.messaging.wire import Message, Meta, encode
+from sags_node.messaging.wire import encode
 from sags_node.sources.push import PushedPictures
 from sags_node.types import FrameResult
 
-pytestmark = pytest.mark.live
+pytestmark = [pytest.mark.live, pytest.mark.beside]
 
 SOURCE = ROOT / "examples/cpp"
 HEADERS = "#include <zmq_addon.hpp>\n#include <msgpack.hpp>\n"
@@ -138,7 +139,7 @@ def test_hostile_messages_are_left_out(read_depth: Path) -> None:
         with running(read_depth, socket.getsockopt_string(zmq.LAST_ENDPOINT), "1") as process:
             for _ in range(2):
                 assert socket.poll(60_000) and socket.recv()[:1] == b"\x01"
-            good = {name: message(name, result) for name in (IMAGE, DEPTH)}
+            good = {name: parts_of(name, result) for name in (IMAGE, DEPTH)}
             topic, meta, head, pixels = good[DEPTH]
             bad = [
                 [topic, b"\xc1", head, pixels],
@@ -176,15 +177,13 @@ def test_pictures_are_handed_in_and_a_wrong_size_is_told(examples: Path) -> None
     assert frames[0].right is not None and frames[0].right[0, 0, 0] == drawn + 12
 
 
-def message(name: str, result: FrameResult) -> list[bytes]:
+def parts_of(name: str, result: FrameResult) -> list[bytes]:
     """The parts of a message, with everything that belongs there."""
     said = content.FRAME_CONTENT[name](result)
-    meta = Meta(
-        type=said.type, type_hash=cdr.type_hash(said.type), seq=1, frame_id=1, session="s", epoch=0, step=0,
-        stamp_ns=result.pair.t_capture_ns, publish_ns=time.time_ns(), dropped=0,
-        encoding=said.encoding, shape=list(said.shape), dtype=said.dtype,
-    )  # fmt: skip
-    return [bytes(part) for part in encode(Message(f"sags/{name}", meta, said.parts))]
+    stamp_ns = result.pair.t_capture_ns
+    return [
+        bytes(part) for part in encode(message_of(name, said, stamp_ns=stamp_ns, publish_ns=time.time_ns()))
+    ]
 
 
 def changed(meta: bytes, **fields: object) -> bytes:

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import zmq
 from independent_client import zmq_socket
-from made_messages import MS, meta
+from made_messages import MS, message_of
 from places import ROOT
 from synthetic import HEIGHT, WIDTH, at_frame, health, plane_result, publisher, stream
 from waiting import until
@@ -33,7 +33,7 @@ from sags_node.messaging.received import (
     TopicName,
 )
 from sags_node.messaging.subscriber import Subscriber
-from sags_node.messaging.wire import Message, Meta, encode
+from sags_node.messaging.wire import encode
 
 pytestmark = pytest.mark.live
 
@@ -164,14 +164,14 @@ def test_hostile_messages_are_counted_and_nothing_more() -> None:
     said = cdr.image(np.zeros((4, 5), np.float32), "32FC1", 1)
     with _sender() as (socket, endpoint), Subscriber(["left/depth", "tf"], endpoint=endpoint) as subscriber:
         _send(socket, subscriber, "sags/left/depth", 1)
-        good = encode(Message("sags/left/depth", _image_meta(said, 2), said.parts))
+        good = encode(message_of("left/depth", said, 2))
         bad = [
             [b"sags/left/depth"],
             [b"sags/left/depth", b"\xc1", b""],
             [b"sags/tf", *good[1:]],  # an image where a transform is due
             [*good[:3], b"short"],
             [*good, *[b"more"] * 40],
-            encode(Message("sags/left/depth", _image_meta(said, 2, shape=[2**30, 2**30]), said.parts)),
+            encode(message_of("left/depth", said, 2, shape=[2**30, 2**30])),
         ]
         unasked = [b"sags/left/depth/deeper", *good[1:]]  # which the prefix brings
         for frames in [*bad, unasked]:
@@ -298,24 +298,12 @@ def _sender() -> Iterator[tuple[zmq.Socket[bytes], str]]:
         yield socket, socket.getsockopt_string(zmq.LAST_ENDPOINT)
 
 
-def _image_meta(said: cdr.Content, seq: int, **changes: Any) -> Meta:
-    fields: dict[str, Any] = {
-        "type": said.type,
-        "type_hash": cdr.type_hash(said.type),
-        "encoding": said.encoding,
-        "shape": list(said.shape),
-        "dtype": said.dtype,
-        **changes,
-    }
-    return meta(seq, seq * 33.0, **fields)
-
-
 def _send(socket: zmq.Socket[bytes], subscriber: Subscriber, topic: str, seq: int) -> None:
     """Send a good depth picture and wait until it has come."""
     while socket.poll(60_000 if seq == 1 else 0):
         if socket.recv() == b"\x01" + topic.encode():
             break
     said = cdr.image(np.zeros((4, 5), np.float32), "32FC1", 1)
-    socket.send_multipart(encode(Message(topic, _image_meta(said, seq), said.parts)))
     name = topic.removeprefix("sags/")
+    socket.send_multipart(encode(message_of(name, said, seq, seq * 33.0)))
     until(lambda: (newest := subscriber.latest(name)) is not None and newest.meta.seq == seq)

@@ -10,13 +10,14 @@ import msgpack
 import numpy as np
 import pytest
 from independent_client import META_KEYS
+from made_messages import message_of
 from rosbags.typesys import Stores, get_typestore
 from synthetic import health, plane_camera, plane_result
 
 from sags_node.messaging import cdr, content, topics
 from sags_node.messaging.cdr import Content
 from sags_node.messaging.received import ReceivedCloud, interpret
-from sags_node.messaging.wire import Message, Meta, WireError, decode, encode
+from sags_node.messaging.wire import Message, WireError, decode, encode
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 STAMP = 1_700_000_000_123_456_789
@@ -32,27 +33,10 @@ def contents() -> dict[str, Content]:
     return said
 
 
-def meta_of(said: Content, **changes: Any) -> Meta:
-    fields: dict[str, Any] = {
-        "type": said.type,
-        "type_hash": cdr.type_hash(said.type),
-        "seq": 3,
-        "frame_id": 5,
-        "stamp_ns": STAMP,
-        "publish_ns": STAMP + 1,
-        "session": "s",
-        "epoch": 0,
-        "step": 9,
-        "encoding": said.encoding,
-        "shape": list(said.shape),
-        "dtype": said.dtype,
-        "dropped": 1,
-    }
-    return Meta(**{**fields, **changes})
-
-
-def message_of(said: Content, **changes: Any) -> Message:
-    return Message("sags/x", meta_of(said, **changes), said.parts)
+def x_message(said: Content, **changes: Any) -> Message:
+    times = {"stamp_ns": STAMP, "publish_ns": STAMP + 1}
+    header: dict[str, Any] = {**times, "frame_id": 5, "step": 9, "dropped": 1}
+    return message_of("x", said, 3, **{**header, **changes})
 
 
 def test_every_topic_has_content_of_its_type() -> None:
@@ -65,7 +49,7 @@ def test_every_topic_has_content_of_its_type() -> None:
 @pytest.mark.parametrize("name", topics.BY_NAME)
 def test_joined_parts_are_stock_cdr(name: str) -> None:
     said = contents()[name]
-    joined = message_of(said).cdr()
+    joined = x_message(said).cdr()
     ros = STORE.deserialize_cdr(joined, said.type)
     assert bytes(STORE.serialize_cdr(ros, said.type)) == joined
     if hasattr(ros, "header"):
@@ -80,7 +64,7 @@ def test_type_hash_is_the_published_one() -> None:
 @pytest.mark.parametrize("frame", ["", "a", "ab", "abc", "abcd", "left_optical_frame"])
 def test_image_header_is_aligned_for_every_frame_name(frame: str) -> None:
     picture = np.arange(5 * 7 * 3, dtype=np.uint8).reshape(5, 7, 3)
-    ros = STORE.deserialize_cdr(message_of(cdr.image(picture, "rgb8", STAMP, frame)).cdr(), topics.IMAGE)
+    ros = STORE.deserialize_cdr(x_message(cdr.image(picture, "rgb8", STAMP, frame)).cdr(), topics.IMAGE)
     assert (ros.height, ros.width, ros.step, ros.encoding, ros.header.frame_id) == (5, 7, 21, "rgb8", frame)
     assert np.array_equal(ros.data.reshape(5, 7, 3), picture)
 
@@ -92,7 +76,7 @@ def test_bulk_part_is_the_array_itself() -> None:
 
 def test_point_cloud_fields_describe_the_rows() -> None:
     said = contents()["splats"]
-    ros = STORE.deserialize_cdr(message_of(said).cdr(), said.type)
+    ros = STORE.deserialize_cdr(x_message(said).cdr(), said.type)
     assert [field.name for field in ros.fields] == list(content.SPLAT_FIELDS)
     assert [field.offset for field in ros.fields] == list(range(0, 80, 4))
     kinds = {field.name: field.datatype for field in ros.fields}
@@ -108,7 +92,7 @@ def test_ids_beyond_32_bit_stay_those_of_one_gaussian() -> None:
     ids = result.snapshot.gaussians.ids + 2**32 - 1100  # some below, some above
     gaussians = replace(result.snapshot.gaussians, ids=ids)
     said = content.splats(replace(result, snapshot=replace(result.snapshot, gaussians=gaussians)))
-    cloud = interpret(message_of(said), 0)
+    cloud = interpret(x_message(said), 0)
     assert isinstance(cloud, ReceivedCloud)
     received = cloud.points["id"] + (cloud.points["id_high"].astype(np.int64) << 32)
     assert len(np.unique(ids >> 32)) == 2 and np.array_equal(received, ids)
@@ -116,14 +100,14 @@ def test_ids_beyond_32_bit_stay_those_of_one_gaussian() -> None:
 
 def test_an_empty_cloud_and_an_empty_model_are_messages() -> None:
     said = cdr.point_cloud(np.empty((0, 5), np.float32), content.POINT_FIELDS, STAMP)
-    ros = STORE.deserialize_cdr(message_of(said).cdr(), said.type)
+    ros = STORE.deserialize_cdr(x_message(said).cdr(), said.type)
     assert ros.width == 0 and len(ros.data) == 0
-    assert interpret(message_of(said), 0).meta.shape == [0, 5]
+    assert interpret(x_message(said), 0).meta.shape == [0, 5]
 
 
 def test_right_camera_info_holds_the_baseline() -> None:
     camera = plane_camera()
-    ros = cdr.parse(message_of(cdr.camera_info(camera, STAMP, cdr.RIGHT_FRAME, 0.0042)))
+    ros = cdr.parse(x_message(cdr.camera_info(camera, STAMP, cdr.RIGHT_FRAME, 0.0042)))
     assert ros.p[3] == pytest.approx(-camera.K[0, 0] * 0.0042)
     assert np.array_equal(ros.k.reshape(3, 3), camera.K)
 
@@ -146,7 +130,7 @@ def test_points_leave_out_what_is_hidden_or_outside() -> None:
 
 def test_round_trip_and_unknown_keys() -> None:
     said = contents()["left/depth"]
-    frames = encode(message_of(said))
+    frames = encode(x_message(said))
     fields = msgpack.unpackb(frames[1])
     assert set(fields) == META_KEYS
     frames[1] = msgpack.packb({**fields, "colour_of_the_sky": ["blue", {"deep": 1}], "v": "1.9"})
@@ -173,7 +157,7 @@ FORGERIES: list[tuple[str, Any]] = [
 
 @pytest.mark.parametrize(("key", "value"), FORGERIES)
 def test_forged_meta_is_refused(key: str, value: Any) -> None:
-    frames = encode(message_of(contents()["left/depth"]))
+    frames = encode(x_message(contents()["left/depth"]))
     frames[1] = msgpack.packb({**msgpack.unpackb(frames[1]), key: value})
     with pytest.raises(WireError):
         decode(frames)
@@ -181,7 +165,7 @@ def test_forged_meta_is_refused(key: str, value: Any) -> None:
 
 @pytest.mark.parametrize("key", sorted(META_KEYS - {"v"}))
 def test_missing_key_is_refused(key: str) -> None:
-    frames = encode(message_of(contents()["left/depth"]))
+    frames = encode(x_message(contents()["left/depth"]))
     fields = msgpack.unpackb(frames[1])
     del fields[key]
     frames[1] = msgpack.packb(fields)
@@ -191,7 +175,7 @@ def test_missing_key_is_refused(key: str) -> None:
 
 def test_a_claimed_size_is_never_allocated() -> None:
     said = contents()["left/depth"]
-    frames = encode(message_of(said, shape=[2**31 - 1, 2**31 - 1]))
+    frames = encode(x_message(said, shape=[2**31 - 1, 2**31 - 1]))
     tracemalloc.start()
     with pytest.raises(WireError, match="claims"):
         decode(frames).array()
@@ -212,7 +196,7 @@ def test_a_claimed_size_is_never_allocated() -> None:
         [b"t", b"\x80"],
         [b"t", b"\x80", b""],
         [b"\xff\xfe", b"\x80", b""],
-        [b"sags/tf\nerror: all is lost", encode(message_of(contents()["tf"]))[1], b""],
+        [b"sags/tf\nerror: all is lost", encode(x_message(contents()["tf"]))[1], b""],
         [b"t" * 256, b"\x80", b""],
         [b"t", b"\x91" * 5000, b""],
         [b"t", b"\x91" * 4000, b""],
@@ -243,4 +227,4 @@ def test_wrong_parts_are_refused(frames: list[bytes]) -> None:
 )
 def test_content_that_does_not_fit_its_meta_is_refused(name: str, changes: dict[str, Any]) -> None:
     with pytest.raises(WireError):
-        interpret(message_of(contents()[name], **changes), 0)
+        interpret(x_message(contents()[name], **changes), 0)

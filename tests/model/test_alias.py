@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from engine_scenes import (
     DERIVATIVES,
     as_bytes,
@@ -22,7 +20,6 @@ from engine_scenes import (
 from following import Following
 from splat_files import splats_of
 
-from benchmarks.__main__ import main
 from benchmarks.quality.alias import VARIANTS, Settings, Trained, train
 from benchmarks.quality.alias_truth import moved, resized
 from sags_node.engine.rasterizer.rasterize import make_rasterizer, rasterize
@@ -185,22 +182,6 @@ def test_a_thin_bright_line_keeps_its_light(factor: float) -> None:
 
 def test_a_thin_bright_line_grows_with_the_dilation() -> None:
     assert light_of_a_line(0.25, False) > 1.8 * light_of_a_line(1, False)
-
-
-def test_bench_alias_measures_the_phantom(tmp_path: Path) -> None:
-    """The command, and that its figures say what the test above says of a wall."""
-    out, drawn = tmp_path / "alias.json", tmp_path / "alias.png"
-    arguments = ["alias", "--quick", "--json", "--out", str(out), "--picture", str(drawn)]
-    result = CliRunner().invoke(main, arguments)
-    assert result.exit_code == 0, result.output
-    table = json.loads(out.read_text())
-    assert table.pop("provenance") and table == json.loads(result.stdout)
-    assert table["gain_db_quarter"] > 3
-    assert table["gain_db_distance_4"] > 3
-    quarter = table["psnr_at_size"][0]
-    assert quarter["both"] - quarter["none"] == pytest.approx(table["gain_db_quarter"])
-    assert all(abs(row["both"]) < 0.02 for row in table["thin_vessel_brightness_change"])
-    assert drawn.read_bytes().startswith(b"\x89PNG")
 
 
 # ---- the 3D filter's width ---------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ import msgspec
 import pytest
 import zmq
 from independent_client import zmq_socket
-from made_messages import meta
+from made_messages import message_of
 from recorded_plane import by_topic, recording
 from synthetic import HEIGHT, WIDTH, at_frame, plane_result, publisher, stream
 from waiting import until
@@ -27,9 +27,7 @@ pytestmark = pytest.mark.live
 
 
 def text_message(seq: int, text: str = "x") -> Message:
-    content = cdr.string(text)
-    of_text = meta(seq, seq, type=content.type, type_hash=cdr.type_hash(content.type), frame_id=-1)
-    return Message("sags/status", of_text, content.parts)
+    return message_of("status", cdr.string(text), seq, seq, frame_id=-1)
 
 
 def test_gaps_repeats_and_strangers_are_counted(tmp_path: Path) -> None:

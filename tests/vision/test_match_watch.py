@@ -108,7 +108,7 @@ def test_a_knock_while_tissue_moves_is_no_late_eye() -> None:
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("late") / "session"
-    write_session(PhantomSource(seconds=3.0, width=320, height=256), folder)
+    write_session(PhantomSource(seconds=2.0, width=160, height=128), folder)
     return folder
 
 
