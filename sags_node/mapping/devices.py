@@ -10,11 +10,11 @@ from sags_node.engine.device import Device, choose_device
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.errors import UsageError
 from sags_node.mapping.budget import Budget, StepBudget, TimeBudget
-from sags_node.mapping.ladder import EVERYTHING, RUNGS, Ladder, Rung, best_scale
+from sags_node.mapping.ladder import EVERYTHING, PIXELS_PER_GAUSSIAN, RUNGS, Ladder, Rung, best_scale
 from sags_node.mapping.refiner import CpuRefiner, Refiner
 from sags_node.mapping.speed import SAMPLE_SIZE, measured_speed
 
-LEAST_PIXELS = 2  # of the picture for each Gaussian
+LEAST_PIXELS = 2  # of the picture for each Gaussian, where time does not count
 GPU_SPEED = 10.0  # times two CPU cores, in Gaussians of a rung: an ESTIMATE, never run on a GPU
 FIELD_TIMES = 5.0  # as long as prices say, a frame of the paper's model takes: where its ladder begins
 GAUSSIANS_PER_MS = 1100  # of the budget, where the number of steps is fixed; see benchmarks/mapping.md
@@ -42,7 +42,9 @@ def affordable(config: LaunchConfig, width: int, height: int) -> int:
     """How many Gaussians a model of pictures of this size may have on the launch's device."""
     if config.mapping.max_gaussians is not None:
         return config.mapping.max_gaussians
-    most = max(100, width * height // LEAST_PIXELS)
+    # Where time is short, steps show more than Gaussians that share few pixels (`benchmarks/ladder.md`).
+    each = PIXELS_PER_GAUSSIAN if config.mapping.iterations is None else LEAST_PIXELS
+    most = max(100, width * height // each)
     if config.mapping.iterations is None or config.mapping.rung is not None:
         return min(most, max(rung.gaussians for rung in rungs_of(config)))
     return max(100, min(most, round(_speed(config) * GAUSSIANS_PER_MS * config.mapping.frame_ms())))

@@ -49,12 +49,13 @@ RUNGS = (
 
 
 USED = 0.82  # of the Gaussians that a rung allows: so many a model has, the rest is room for what appears
-# Prices, ms on two cores of the machine in `benchmarks/results/ladder.json`, at 640x512 px.
-EVERY_FRAME = 9.8  # what depends on neither: pictures, flow, masks
-DEPTH = 2.9  # matched once
-DRAWN = 2.8  # a whole picture drawn
-STEPPED = 1.9  # a step on a whole picture
-PER_THOUSAND = 0.31  # Gaussians
+# Prices, ms on two cores of one machine, by 18 rungs at three working sizes (`benchmarks/ladder.md`).
+EVERY_FRAME = 8.5  # what depends on nothing: the camera's pictures, watches, tracks
+DEPTH = 3.0  # matched once
+WORKED = 0.8  # pictures of `FULL` px: flow, masks
+DRAWN = 3.6  # a picture of `FULL` px drawn
+STEPPED = 2.4  # a step on one
+PER_THOUSAND = 0.33  # Gaussians
 FULL = 640 * 512  # px
 
 AVERAGED = 12  # frames behind the measured speed; the two slowest of them are left out
@@ -73,6 +74,7 @@ FIRST_FRAMES = FIRST_LOOKS[-1]
 
 
 SCALES = (1.0, 0.75, 0.5, 0.375, 0.25)  # of the working size, that a machine may choose from
+SMALLEST = 320 * 256  # px, that it may choose: less saves nothing
 PIXELS_PER_GAUSSIAN = 4  # fewer pixels have no more to tell of its colour, slopes and place
 WITH_OTHERS = 1.1  # times as long as prices say: the least that live frames take (`benchmarks/ladder.md`)
 
@@ -86,7 +88,7 @@ def price(rung: Rung, gaussians: float, pixels: int) -> float:
     """
     pictures = pixels / FULL
     drawn = rung.scale**2 * pictures
-    vision = pictures * (EVERY_FRAME + DEPTH / rung.depth_every)
+    vision = EVERY_FRAME + DEPTH / rung.depth_every + WORKED * pictures
     return (
         vision + drawn * (DRAWN * (1 + rung.redraw) + STEPPED * rung.step) + PER_THOUSAND * 1e-3 * gaussians
     )
@@ -101,17 +103,15 @@ def best_scale(rungs: Sequence[Rung], pixels: int, seconds: float, speed: float)
         seconds, speed: see `Ladder`.
     """
     affords = FIRST_AIM * 1e3 * seconds / (WITH_OTHERS * speed)  # ms, in units of the prices
-    shown = {SCALES[-1]: 0.0}
-    for scale in SCALES:
-        worked = scale**2 * pixels
-        spare = [affords - price(rung, USED * rung.gaussians, round(worked)) for rung in rungs]
-        fitting = [
-            USED * r.gaussians + 1e3 * ms / PER_THOUSAND
-            for r, ms in zip(rungs, spare, strict=True)
-            if ms >= 0
-        ]
-        if fitting:  # a frame has room for some more than the last rung that fits allows
-            shown[scale] = 1 / (1 / fitting[-1] + PIXELS_PER_GAUSSIAN / worked)
+    scales = [scale for scale in SCALES if scale == 1 or scale**2 * pixels >= SMALLEST]
+    shown = {scales[-1]: 0.0}
+    for scale in scales:
+        for rung in rungs:
+            spare = affords - price(rung, USED * rung.gaussians, round(scale**2 * pixels))
+            if spare >= 0:  # a frame has room for some more than the rung says
+                most = (rung.scale * scale) ** 2 * pixels / PIXELS_PER_GAUSSIAN
+                gaussians = min(USED * rung.gaussians + 1e3 * spare / PER_THOUSAND, most)
+                shown[scale] = max(shown.get(scale, 0.0), 1 / (1 / gaussians + 1 / most))
     return max(shown, key=shown.__getitem__)
 
 

@@ -12,13 +12,23 @@ import pytest
 from sags_node.config.schema import LaunchConfig, MappingConfig
 from sags_node.errors import UsageError
 from sags_node.mapping import devices
-from sags_node.mapping.devices import ALL_SKIPS, Skips, affordable, make_budget, rungs_of, with_scale
+from sags_node.mapping.devices import (
+    ALL_SKIPS,
+    LEAST_PIXELS,
+    Skips,
+    affordable,
+    make_budget,
+    rungs_of,
+    with_scale,
+)
 from sags_node.mapping.ladder import (
     FIRST_FRAMES,
     FULL,
+    PIXELS_PER_GAUSSIAN,
     RUNGS,
     SCALES,
     SETTLING,
+    SMALLEST,
     SPARE,
     USED,
     Ladder,
@@ -173,8 +183,9 @@ def test_how_many_gaussians_a_model_may_have() -> None:
         config = LaunchConfig(device="cpu", mapping=MappingConfig.model_validate(mapping))
         return affordable(config, width, height)
 
-    assert most() == RUNGS[-1].gaussians
-    assert most(100, 100) == 100 * 100 // 2
+    assert most() == FULL // PIXELS_PER_GAUSSIAN
+    assert most(1280, 1024) == RUNGS[-1].gaussians
+    assert most(100, 100, iterations=1) == 100 * 100 // LEAST_PIXELS
     assert most(max_gaussians=777) == 777
     assert most(rung=2) == RUNGS[2].gaussians
     assert most(iterations=1, budget_ms=20) == 22_000
@@ -190,7 +201,7 @@ def test_a_new_budget_goes_on_at_the_speed_of_the_one_before() -> None:
 def test_the_slower_a_machine_the_smaller_its_pictures() -> None:
     """By steps of two: rungs lie so far apart that less may change nothing, or too much."""
     scales = [best_scale(RUNGS, FULL, SECONDS, speed) for speed in 0.1 * 2.0 ** np.arange(10)]
-    assert scales[0] == SCALES[0] and scales[-1] == SCALES[-1]  # at the last nothing fits
+    assert scales[0] == SCALES[0] and scales[-1] ** 2 * FULL == SMALLEST  # at the last nothing fits
     assert scales == sorted(scales, reverse=True)
 
 
@@ -202,13 +213,13 @@ def test_many_gaussians_in_few_pixels_are_worth_no_less_of_the_picture() -> None
 def test_the_scale_is_chosen_in_real_time_only_and_never_over_a_person(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(devices, "measured_speed", lambda rasterizer: 1.6)
+    monkeypatch.setattr(devices, "measured_speed", lambda rasterizer: 2.0)
 
     def chosen(**asked: object) -> object:
         config = LaunchConfig.model_validate({"device": "cpu", **asked})
         return with_scale(config, 640, 512, 30.0).vision.scale
 
-    assert chosen() == best_scale(RUNGS, FULL, PERIOD, 1.6) < 1
+    assert chosen() == best_scale(RUNGS, FULL, 1e-3 * MappingConfig().frame_ms(30.0), 2.0) < 1
     assert chosen(source={"kind": "phantom", "pace": "step"}) == 1.0  # results repeat
     assert chosen(mapping={"iterations": 2}) == 1.0
     assert chosen(vision={"scale": 0.5}) == 0.5 and chosen(vision={"scale": 1}) == 1
