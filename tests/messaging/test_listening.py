@@ -134,7 +134,8 @@ def looks_often(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def the_directory(run_dir: Path) -> None:
-    shutil.rmtree(run_dir)
+    """At once: while it is emptied, the node would put its file back."""
+    shutil.rmtree(run_dir.rename(run_dir.with_name("gone")))
 
 
 def the_connection_file(run_dir: Path) -> None:
