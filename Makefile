@@ -95,10 +95,12 @@ lint: setup
 golden: setup
 	$(BIN)/python -m pytest tests/evaluation/test_replay.py --update-golden -s
 
-# Rewrite the pages that are made: docs/launch.md from the configuration, docs/dev/faults.md from the tests' marks.
+# Rewrite what is made: docs/launch.md from the configuration, docs/dev/faults.md from the tests' marks, tables of figures
+# in both READMEs from benchmarks/results.
 docs: setup
 	$(BIN)/python docs/dev/launch_page.py
 	$(BIN)/python docs/dev/faults_page.py
+	$(BIN)/python docs/dev/figures_page.py
 
 # The wheel in an empty environment, and its demo: some minutes, 2 GB in out/wheel.
 wheel-test: setup

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import runpy
 import subprocess
 from datetime import datetime
 from pathlib import Path
@@ -37,6 +38,13 @@ def test_every_result_is_explained() -> None:
     explained = (ROOT / "benchmarks/README.md").read_text()
     kinds = {re.sub("^depth_.*", "depth_", file.stem) for file in RESULTS}
     assert [kind for kind in kinds if f"results/{kind}" not in explained] == []
+
+
+def test_the_tables_of_both_readmes_are_of_these_results() -> None:
+    """A claim without its file fails here, too."""
+    pages: dict[Path, str] = runpy.run_path(str(ROOT / "docs/dev/figures_page.py"))["pages"]()
+    stale = [page.name for page, text in pages.items() if page.read_text() != text]
+    assert stale == [], "write them anew with: make docs"
 
 
 def test_results_are_written_with_their_origin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,119 @@
+"""Writes the tables of figures in README.md and benchmarks/README.md from benchmarks/results: `make docs`.
+
+A table stands between two comments. What is asked of a file that is not there ends with its name.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[2]
+BEGIN, END = "<!-- Written by `make docs` from benchmarks/results -->\n", "<!-- end -->"
+TURNS = (1, 2, 3)  # runs of each clip, in turns with the others
+CLIPS = {"d4d": "D4D, 30 Hz", "phantom": "phantom, seeds 1 to 3, 30 Hz", "hamlyn": "Hamlyn heart, 25 Hz"}
+
+
+def result(name: str) -> dict[str, Any]:
+    """A committed result."""
+    found: dict[str, Any] = json.loads((ROOT / f"benchmarks/results/{name}.json").read_text(encoding="utf-8"))
+    return found
+
+
+def replaced(page: str, table: str) -> str:
+    """A page with its table written anew."""
+    before, rest = page.split(BEGIN)
+    return before + BEGIN + table + END + rest.split(END, 1)[1]
+
+
+def pages() -> dict[Path, str]:
+    """What each page should be."""
+    tables = {ROOT / "README.md": _headline(), ROOT / "benchmarks/README.md": _live()}
+    return {page: replaced(page.read_text(encoding="utf-8"), table) for page, table in tables.items()}
+
+
+def _each(clip: str, value: Callable[[dict[str, Any]], float | None], digits: int = 1) -> str:
+    """A value of each of the three runs."""
+    values = [value(result(f"{clip}_realtime_{turn}")) for turn in TURNS]
+    return ", ".join("-" if each is None else f"{each:.{digits}f}" for each in values)
+
+
+def _shown(run: dict[str, Any]) -> float:
+    return 100 * float(run["processed"]) / float(run["frames"])
+
+
+def _test_part(group: dict[str, Any]) -> dict[str, Any]:
+    """Of a clip that constants were chosen on, the half that they were not; else all of it."""
+    found: dict[str, Any] = group.get("test") or group
+    return found
+
+
+def _live() -> str:
+    rows = [
+        "| three runs each | frames shown, % | latency p50; p99, ms | Gaussians, thousands | dB "
+        "| the picture before, dB | depth, median, mm |\n|---|---|---|---|---|---|---|\n"
+    ]
+    for clip, name in CLIPS.items():
+        cells = (
+            name,
+            _each(clip, _shown),
+            f"{_each(clip, lambda run: run['latency_ms']['p50'], 0)}; "
+            f"{_each(clip, lambda run: run['latency_ms']['p99'], 0)}",
+            _each(clip, lambda run: run["gaussians"]["mean"] / 1e3),
+            _each(clip, lambda run: _test_part(run["online"])["psnr"]),
+            _each(clip, lambda run: _test_part(run["predict"])["copy_psnr"]),
+            _each(clip, lambda run: _test_part(run["depth"])["median_mm"] if run["depth"] else None, 2),
+        )
+        rows.append(f"| {' | '.join(cells)} |\n")
+    return "".join(rows)
+
+
+def _headline() -> str:
+    """Of README.md: live as it came, then frame by frame, which repeats."""
+    step, phantom = result("d4d_step"), result("phantom_step")
+    online, kept, depth, stereo = (step[key] for key in ("online", "heldout", "depth", "measured_depth"))
+    before = step["predict"]["copy_psnr"]
+    rows = (
+        (
+            "three live runs: frames shown; latency p50; p99",
+            f"{_each('d4d', _shown)} %; {_each('d4d', lambda run: run['latency_ms']['p50'], 0)}; "
+            f"{_each('d4d', lambda run: run['latency_ms']['p99'], 0)} ms",
+            "the camera's 30 Hz; 33 ms a frame",
+        ),
+        (
+            f"picture, {_each('d4d', lambda run: run['gaussians']['mean'] / 1e3, 0)} thousand Gaussians",
+            f"{_each('d4d', lambda run: run['online']['psnr'])} dB",
+            f"the picture before, shown again: {before:.1f} dB",
+        ),
+        (
+            f"frame by frame, {step['gaussians']['mean'] / 1e3:.0f} thousand: picture, in the lift",
+            f"{online['psnr']:.1f}, {online['motion']['psnr']:.1f} dB",
+            f"the picture before, shown again: {before:.1f}, {step['predict']['motion']['copy_psnr']:.1f} dB",
+        ),
+        (
+            "frames kept back, in the lift",
+            f"{kept['psnr']:.1f}, {kept['motion']['psnr']:.1f} dB",
+            f"the picture before: {kept['copy_psnr']:.1f}, {kept['motion']['copy_psnr']:.1f} dB",
+        ),
+        (
+            "depth, median and nine of ten",
+            f"{depth['median_mm']:.2f}, {depth['p90_mm']:.2f} mm, on {100 * depth['coverage']:.0f} % "
+            "of the tissue",
+            f"stereo alone: {stereo['median_mm']:.2f}, {stereo['p90_mm']:.2f} mm, on "
+            f"{100 * stereo['coverage']:.0f} %; both against a stereo network",
+        ),
+        ("phantom: depth, median", f"{phantom['depth']['median_mm']:.2f} mm", "exact truth"),
+    )
+    body = "".join(f"| {' | '.join(row)} |\n" for row in rows)
+    return f"| D4D | model | compared with |\n|---|---|---|\n{body}"
+
+
+def main() -> None:
+    for page, text in pages().items():
+        page.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
