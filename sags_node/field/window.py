@@ -60,10 +60,11 @@ class AnchoredField:
         """Nothing to do: places stay."""
 
     @torch.no_grad()
-    def carry(self, rows: F32, from_ns: int, to_ns: int) -> F32:
-        """State [N, 14] at one time from that at another, both held within the window."""
+    def carry(self, rows: F32, from_ns: int, to_ns: int, which: Tensor | None = None) -> F32:
+        """State [N, 14] at one time from that at another, both held within the window; `which` [N]: of those
+        Gaussians; None: of all."""
         # In float64: the roundings of ten thousand quotients near 1 would add up.
-        before, after = (self._pose_at(t_ns).double() for t_ns in (from_ns, to_ns))
+        before, after = (self._pose_at(t_ns, which).double() for t_ns in (from_ns, to_ns))
         carried: F32 = _passed(torch.from_numpy(rows).double(), before, after).float().numpy()
         return carried
 
@@ -76,9 +77,10 @@ class AnchoredField:
         self._reference = torch.from_numpy(reference)
         self._field.follow(self.places)
 
-    def _pose_at(self, t_ns: int) -> Tensor:
+    def _pose_at(self, t_ns: int, which: Tensor | None = None) -> Tensor:
         """g(p, t), [N, 14]."""
-        return self._field.deform(self._reference, t_ns)
+        reference = self._reference if which is None else self._reference[which]
+        return self._field.deform(reference, t_ns, which)
 
 
 def _passed(rows: Tensor, before: Tensor, after: Tensor) -> Tensor:
@@ -159,8 +161,8 @@ class WindowModel(DeformableModel):
         if self._asks_at_places:
             self._grow(places)
         anchored.place(np.concatenate([anchored.places, places]))
-        there = np.concatenate([self.table, rows])
-        self.append(anchored.carry(there, t_ns, anchored.anchor_ns)[count:], index[:, 0].astype(np.int64))
+        new = torch.arange(count, count + len(rows))
+        self.append(anchored.carry(rows, t_ns, anchored.anchor_ns, new), index[:, 0].astype(np.int64))
         if self.slopes is not None and slopes is not None:
             self.slopes.detach()[count:] = torch.from_numpy(slopes)
 

@@ -269,11 +269,7 @@ class SagsMapper:
 
     def _refine(self, frame: Kept, relaxation: float, deformed: bool = True) -> None:
         """One step on a frame: Adam on field, decoder and canonical Gaussians; on their colours the step in
-        closed form of `optimiser.Optimiser`. With Adam on colours the phantom loses 3 dB.
-
-        For the newest frame canonical places stay: its motion is the field's to learn. They would move at all
-        times alike, which tells nothing of earlier frames.
-        """
+        closed form of `optimiser.Optimiser`. With Adam on colours the phantom loses 3 dB."""
         field, seen = self.field, frame.drawn
         rasterizer = self._rasterizer(seen.camera)
         drawing = field.draw(rasterizer, frame.t_ns, seen.camera, deformed, whole=frame.camera)
@@ -288,7 +284,6 @@ class SagsMapper:
         field.table[:, columns.COLOR] -= share[:, None] * field.rows.grad.numpy()[:, columns.COLOR]
         rates = self._rates * np.float32(FIRST_SPEED if self._first_steps < FIRST_STEPS else 1)
         if frame is self.kept[-1]:
-            rates[columns.MEAN] *= not deformed
             self.model.contribution[:], self._loss = drawing.contribution, loss
         field.descend(drawing, Rates(rates, FieldRates()))
         self._first_steps += 1
