@@ -16,6 +16,7 @@ as those of the decoder and of the planes in space mostly do, would seem to help
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -140,6 +141,14 @@ class WindowModel(DeformableModel):
 
         hexplane.advance(t_ns, fold)
         return len(retired)
+
+    def settle(self, t_ns: int, change: Callable[[], None]) -> None:
+        """Change the field. Gaussians stay as they are at `t_ns`, within the ranges of `columns`: there they
+        are brought, at all times alike. At other times of the window they are as the field says now."""
+        anchored = self._anchored
+        state = columns.bounded(anchored.carry(self.table, anchored.anchor_ns, t_ns))
+        change()
+        self.table[:] = anchored.carry(state, t_ns, anchored.anchor_ns)
 
     def keep(self, kept: Bool) -> None:
         """Remove the Gaussians where `kept` [N] is False."""
