@@ -22,7 +22,7 @@ from sags_node.engine.losses.tissue import tissue_loss
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.field.decoder import Decoder
 from sags_node.field.deformation import Deltas, FieldRates, NodeField
-from sags_node.field.hexplane import HexPlane
+from sags_node.field.hexplane import FIRST_LINE, HexPlane
 from sags_node.field.model import Rates
 from sags_node.field.window import WindowModel
 from sags_node.mapping import densify, initialise
@@ -66,7 +66,7 @@ MOST_KEPT = 24  # of them, at any frame rate
 # Only differences of what the field says at two times of its window are seen in pictures. What moves all
 # times alike walks at random: without forgetting, features of about 1 are up to 130 after 1200 frames, a step
 # changes scales by powers of e, and at last a scale is 0 or covers the picture.
-FORGOTTEN_NS = 2 * WINDOW_NS  # in which the field goes all but 1/e of the way back to its first values
+FORGOTTEN_NS = 2 * WINDOW_NS  # in which its cells go all but 1/e of the way back to their first values
 NODES = 128  # that ask the field; 512 take twice the time of a step, and show no more with few steps
 CELLS, CHANNELS = 32, 16  # of the HexPlane; twice as many of both show no more either
 OUTLIERS = 1e-3  # of the Gaussians, on each side of the field's box: strays must not blow it up
@@ -98,7 +98,8 @@ class FrameDeltas(Deltas):
     def __init__(self, hexplane: HexPlane, decoder: Decoder) -> None:
         super().__init__(hexplane, decoder)
         self._said: dict[int, Tensor] = {}
-        self._first = [each.detach().clone() for each in self._learnt]
+        self._first_planes = hexplane.cells[: hexplane.slot(0).start].detach().clone()
+        self._first = [each.detach().clone() for each in decoder.parameters()]
 
     def __call__(self, points: Tensor, t_ns: int) -> Tensor:
         if torch.is_grad_enabled():
@@ -113,18 +114,21 @@ class FrameDeltas(Deltas):
 
     @torch.no_grad()
     def fade(self, share: float) -> None:
-        """All that was learnt goes a share of the way back to its first values."""
-        for each, first in zip(self._learnt, self._first, strict=True):
-            each.lerp_(first, share)
+        """The cells go a share of the way back to their first values; the decoder, which takes shorter steps,
+        a share as much smaller (decoupled weight decay: Loshchilov & Hutter, ICLR 2019). The lines in time go
+        together, by their mean over the window: they differ as before."""
+        rates, first_line = FieldRates(), self.hexplane.slot(0).start
+        cells = self.hexplane.cells
+        lines = cells[first_line:].view(self.hexplane.slots, -1, cells.shape[1])
+        lines -= share * (lines.mean(0) - FIRST_LINE)
+        cells[:first_line].lerp_(self._first_planes, share)
+        for each, first in zip(self.decoder.parameters(), self._first, strict=True):
+            each.lerp_(first, share * rates.decoder / rates.cells)
         self.forget()
 
     def forget(self) -> None:
         """Ask anew."""
         self._said = {}
-
-    @property
-    def _learnt(self) -> list[Tensor]:
-        return [self.hexplane.cells, *self.decoder.parameters()]
 
 
 class SagsMapper:
