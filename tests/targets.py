@@ -21,7 +21,7 @@ import llvmlite.binding as llvm
 ROOT = Path(__file__).parent.parent
 TESTS = (
     "rasterizer", "cpu_rasterizer", "projection", "losses", "photometric", "ssim", "adam", "hexplane",
-    "decoder", "residuals", "skinning", "kernels", "matching_kernels", "replay",
+    "sampling", "decoder", "residuals", "skinning", "kernels", "matching_kernels", "replay",
 )  # fmt: skip
 THREADS = (1, 2)
 _AVX2 = ("avx", "avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe", "popcnt")

@@ -1,6 +1,7 @@
 """The model of SAGS (arXiv 2510.27318) in torch.
 
-To be read in this order: `hexplane`, `decoder`, `deformation`, `drawing`, `losses`, `model`, `window`.
+To be read in this order: `hexplane`, `sampling`, `decoder`, `deformation`, `drawing`, `losses`, `model`,
+`window`.
 
 A model is canonical Gaussians in raw rows [N, 14] (`model.columns`) and a field that deforms them:
 

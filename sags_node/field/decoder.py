@@ -33,6 +33,7 @@ Block = Literal["adaptive", "mlp", "none"]
 HEADS = {"mean": 3, "log_scale": 3, "quat": 4, "color": 3, "logit": 1}  # as in `model.columns`
 MAX_NODES = 1024
 INITIAL_GATE = 1e-4
+PART = 8192  # tokens decoded at a time, if they do not attend to each other: all at once leave the cache
 FIRST_HEAD = 0.01  # largest first weight of a last layer that has been awoken
 
 
@@ -146,11 +147,16 @@ class Decoder(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         """UsageError: too many nodes."""
-        if self._most is not None and len(features) > self._most:
+        if self._most is None:
+            return torch.cat([self._decode(part) for part in torch.split(features, PART)])
+        if len(features) > self._most:
             raise UsageError(
                 f"{len(features)} control nodes are too many to attend to each other; "
                 f"use at most {self._most}"
             )
+        return self._decode(features)
+
+    def _decode(self, features: Tensor) -> Tensor:
         x = gelu(self.embed(features))
         adapted = self.pre(x)
         y = self.post(adapted + self.gamma_1 * self.attention(adapted))

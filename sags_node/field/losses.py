@@ -79,7 +79,7 @@ def compare(
     planes = torch.where(sound, planes, 0)
     coverage = planes[4]
     covered, deep = coverage > COVERED, coverage > DEPTH_COVERED
-    drawn = planes[:4] / torch.where(covered, coverage, 1)
+    drawn = planes[:4] * (1 / torch.where(covered, coverage, 1))  # one division, not four and their gradients
     color, distance = drawn[:3], drawn[3]
     used = explained & covered
     count = used.sum().clamp(min=1)

@@ -16,6 +16,7 @@ as those of the decoder and of the planes in space mostly do, would seem to help
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -60,10 +61,11 @@ class AnchoredField:
         """Nothing to do: places stay."""
 
     @torch.no_grad()
-    def carry(self, rows: F32, from_ns: int, to_ns: int) -> F32:
-        """State [N, 14] at one time from that at another, both held within the window."""
+    def carry(self, rows: F32, from_ns: int, to_ns: int, which: Tensor | None = None) -> F32:
+        """State [N, 14] at one time from that at another, both held within the window; `which` [N]: of those
+        Gaussians; None: of all."""
         # In float64: the roundings of ten thousand quotients near 1 would add up.
-        before, after = (self._pose_at(t_ns).double() for t_ns in (from_ns, to_ns))
+        before, after = (self._pose_at(t_ns, which).double() for t_ns in (from_ns, to_ns))
         carried: F32 = _passed(torch.from_numpy(rows).double(), before, after).float().numpy()
         return carried
 
@@ -76,9 +78,10 @@ class AnchoredField:
         self._reference = torch.from_numpy(reference)
         self._field.follow(self.places)
 
-    def _pose_at(self, t_ns: int) -> Tensor:
+    def _pose_at(self, t_ns: int, which: Tensor | None = None) -> Tensor:
         """g(p, t), [N, 14]."""
-        return self._field.deform(self._reference, t_ns)
+        reference = self._reference if which is None else self._reference[which]
+        return self._field.deform(reference, t_ns, which)
 
 
 def _passed(rows: Tensor, before: Tensor, after: Tensor) -> Tensor:
@@ -139,6 +142,14 @@ class WindowModel(DeformableModel):
         hexplane.advance(t_ns, fold)
         return len(retired)
 
+    def settle(self, t_ns: int, change: Callable[[], None]) -> None:
+        """Change the field. Gaussians stay as they are at `t_ns`, within the ranges of `columns`: there they
+        are brought, at all times alike. At other times of the window they are as the field says now."""
+        anchored = self._anchored
+        state = columns.bounded(anchored.carry(self.table, anchored.anchor_ns, t_ns))
+        change()
+        self.table[:] = anchored.carry(state, t_ns, anchored.anchor_ns)
+
     def keep(self, kept: Bool) -> None:
         """Remove the Gaussians where `kept` [N] is False."""
         self._anchored.place(self._anchored.places[kept])
@@ -159,8 +170,8 @@ class WindowModel(DeformableModel):
         if self._asks_at_places:
             self._grow(places)
         anchored.place(np.concatenate([anchored.places, places]))
-        there = np.concatenate([self.table, rows])
-        self.append(anchored.carry(there, t_ns, anchored.anchor_ns)[count:], index[:, 0].astype(np.int64))
+        new = torch.arange(count, count + len(rows))
+        self.append(anchored.carry(rows, t_ns, anchored.anchor_ns, new), index[:, 0].astype(np.int64))
         if self.slopes is not None and slopes is not None:
             self.slopes.detach()[count:] = torch.from_numpy(slopes)
 

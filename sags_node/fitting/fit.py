@@ -130,7 +130,7 @@ class Fit:
             drawing.planes, frame.image, frame.tissue, frame.depth, self._unseen, self.settings.weights
         )
         drawing.differentiate(found.loss, found.weight)
-        self.residual = float(found.terms["color"])
+        self.residual = found.terms["color"].item()
         self._density.observe(drawing.v_means, drawing.contribution)
         rates = Rates(
             self._rates * np.float32(share) ** self._decays,

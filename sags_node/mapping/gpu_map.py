@@ -9,6 +9,7 @@ import torch
 from sags_node.engine.interface import MAX_OPACITY
 from sags_node.mapping import optimiser
 from sags_node.mapping.optimiser import BETA1, BETA2, LearningRates
+from sags_node.model import columns
 from sags_node.model.deformation import (
     CALM,
     INERTIA,
@@ -119,7 +120,7 @@ class GpuMap:
 
         gain = optimiser.COLOUR_RELAXATION / (seen + optimiser.COLOUR_DAMPING)
         colors = rows["colors"] - gain[:, None] * gradients["colors"]
-        self._put(moves, "colors", colors.clamp(*optimiser.COLOR_RANGE))
+        self._put(moves, "colors", colors.clamp(*columns.COLOR_RANGE))
         per_slope = (gain / (3 * (gradients["spread"] / seen - 1).clamp(min=1)))[:, None]
         slopes = optimiser.SLOPE_DECAY * rows["slopes"] - per_slope * gradients["slopes"]
         self._put(moves, "slopes", slopes.clamp(-optimiser.STEEPEST, optimiser.STEEPEST))
@@ -136,8 +137,8 @@ class GpuMap:
         pixel = (rows["means"] @ view_z[:3] + view_z[3]).abs() / float(camera.K[0, 0])  # m at its depth
         self._put(moves, "means", rows["means"] - pixel[:, None] * step[:, :3])
         self._put(moves, "quats", rows["quats"] - step[:, 3:7])
-        log_scales = (rows["log_scales"] - step[:, 7:10]).clamp(*optimiser.LOG_SCALE_RANGE)
-        logits = (rows["opacity_logits"] - step[:, 10]).clamp(*optimiser.LOGIT_RANGE)
+        log_scales = (rows["log_scales"] - step[:, 7:10]).clamp(*columns.LOG_SCALE_RANGE)
+        logits = (rows["opacity_logits"] - step[:, 10]).clamp(*columns.LOGIT_RANGE)
         self._put(broken, "log_scales", scales.log())
         self._put(broken, "opacity_logits", torch.logit(opacities.clamp(max=MAX_OPACITY)))
         self._put(moves, "log_scales", log_scales)

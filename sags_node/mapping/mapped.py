@@ -7,14 +7,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sags_node.engine.losses.pieces import LEVEL
 from sags_node.engine.rasterizer.confidence import with_confidence
-from sags_node.engine.rasterizer.views import to_view
+from sags_node.engine.rasterizer.views import colours_of, to_view
 from sags_node.mapping.densify import HOLE_ALPHA
 from sags_node.model.gaussians import GaussianModel
 from sags_node.types import F32, Forecast, Observation, RenderedView, Snapshot
+from sags_node.vision.picture_fit import MISFIT
 
 MIN_FIRST_DEPTHS = 200  # px
 LOST_COVERAGE = 0.3  # of the tissue
+SOME = slice(None, None, 8)  # rows and columns of a picture that are enough to judge by
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,11 +35,22 @@ def can_start(observation: Observation) -> bool:
 
 def is_lost(planes: F32, observation: Observation) -> bool:
     """Whether the model, moved to this frame, hardly covers it: after damage, or where the camera is known to
-    be in another place. Looking at every eighth pixel is enough. What the picture shows is judged before, see
-    `vision.scene_watch`."""
-    tissue = observation.tissue[::8, ::8]
-    covered = tissue & (planes[4, ::8, ::8] > HOLE_ALPHA)
+    be in another place. What the picture shows is judged before, see `vision.scene_watch`."""
+    tissue = observation.tissue[SOME, SOME]
+    covered = tissue & (planes[4, SOME, SOME] > HOLE_ALPHA)
     return bool(np.count_nonzero(covered) < LOST_COVERAGE * np.count_nonzero(tissue))
+
+
+def is_worse_than_one_colour(planes: F32, observation: Observation) -> bool:
+    """Whether one colour would show the tissue of this frame better than the model does, and the model's are
+    wrong on the whole. If it has just learnt from the frame, it is broken, and beside it every later picture
+    seems to show another scene."""
+    tissue = observation.tissue[SOME, SOME]
+    if not tissue.any():
+        return False
+    seen = observation.image[SOME, SOME][tissue] * LEVEL
+    shown = colours_of(planes[:, SOME, SOME])[tissue]
+    return not np.mean((shown - seen) ** 2) <= max(seen.var(axis=0).mean(), MISFIT**2)
 
 
 def as_view(planes: F32, model: GaussianModel, observation: Observation) -> RenderedView:

@@ -11,6 +11,7 @@ from numba import prange
 
 from sags_node.engine.interface import MAX_OPACITY, Gradients
 from sags_node.kernels.jit import PIECE, kernel, parallel_kernel
+from sags_node.model.columns import COLOR_RANGE, LOG_SCALE_RANGE, LOGIT_RANGE
 from sags_node.model.gaussians import ADAM_PARAMETERS, GaussianModel
 from sags_node.types import F32, Camera
 
@@ -37,9 +38,6 @@ COLOUR_DAMPING = 0.3  # px of coverage: a barely seen Gaussian changes its colou
 BETA1, BETA2 = 0.5, 0.99  # low momentum: a few steps per frame must not coast
 MIN_CONTRIBUTION = 1e-3  # px: rows that were not seen are not touched
 EPS = 1e-8  # of Adam
-COLOR_RANGE = (-0.5, 1.5)  # wider than what can be shown
-LOG_SCALE_RANGE = (math.log(1e-6), math.log(5e-3))  # m
-LOGIT_RANGE = (-6.0, 6.0)
 LARGEST = 1e20  # sum of a row's gradients, momenta and variances
 LARGEST_RAW = 100.0  # sum of a row's log scales and logit: no honest value comes near
 

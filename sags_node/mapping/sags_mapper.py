@@ -8,6 +8,7 @@ frame: that is published. What prunes, inserts, splits and lights Gaussians work
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,14 +22,21 @@ from sags_node.engine.losses.tissue import tissue_loss
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.field.decoder import Decoder
 from sags_node.field.deformation import Deltas, FieldRates, NodeField
-from sags_node.field.hexplane import HexPlane
+from sags_node.field.hexplane import FIRST_LINE, HexPlane
 from sags_node.field.model import Rates
 from sags_node.field.window import WindowModel
 from sags_node.mapping import densify, initialise
 from sags_node.mapping.budget import Budget
 from sags_node.mapping.depth_memory import remember
 from sags_node.mapping.exposure import exposure_gain
-from sags_node.mapping.mapped import Mapped, as_view, can_start, is_lost, snapshot_of
+from sags_node.mapping.mapped import (
+    Mapped,
+    as_view,
+    can_start,
+    is_lost,
+    is_worse_than_one_colour,
+    snapshot_of,
+)
 from sags_node.mapping.mapper import (
     ADDED,
     FIRST_STEPS,
@@ -55,6 +63,10 @@ SLOT_NS = 100_000_000  # from one of its times to the next
 # the window no better.
 KEPT_NS = 700_000_000
 MOST_KEPT = 24  # of them, at any frame rate
+# Only differences of what the field says at two times of its window are seen in pictures. What moves all
+# times alike walks at random: without forgetting, features of about 1 are up to 130 after 1200 frames, a step
+# changes scales by powers of e, and at last a scale is 0 or covers the picture.
+FORGOTTEN_NS = 2 * WINDOW_NS  # in which its cells go all but 1/e of the way back to their first values
 NODES = 128  # that ask the field; 512 take twice the time of a step, and show no more with few steps
 CELLS, CHANNELS = 32, 16  # of the HexPlane; twice as many of both show no more either
 OUTLIERS = 1e-3  # of the Gaussians, on each side of the field's box: strays must not blow it up
@@ -81,9 +93,13 @@ class Kept:
 
 class FrameDeltas(Deltas):
     """Asks HexPlane and decoder once for each time, but for gradients: a frame wants the nodes at the same
-    few times again and again."""
+    few times again and again. Its box may not grow."""
 
-    _said: dict[int, Tensor]
+    def __init__(self, hexplane: HexPlane, decoder: Decoder) -> None:
+        super().__init__(hexplane, decoder)
+        self._said: dict[int, Tensor] = {}
+        self._first_planes = hexplane.cells[: hexplane.slot(0).start].detach().clone()
+        self._first = [each.detach().clone() for each in decoder.parameters()]
 
     def __call__(self, points: Tensor, t_ns: int) -> Tensor:
         if torch.is_grad_enabled():
@@ -94,6 +110,20 @@ class FrameDeltas(Deltas):
 
     def step(self, rates: FieldRates) -> None:
         super().step(rates)
+        self.forget()
+
+    @torch.no_grad()
+    def fade(self, share: float) -> None:
+        """The cells go a share of the way back to their first values; the decoder, which takes shorter steps,
+        a share as much smaller (decoupled weight decay: Loshchilov & Hutter, ICLR 2019). The lines in time go
+        together, by their mean over the window: they differ as before."""
+        rates, first_line = FieldRates(), self.hexplane.slot(0).start
+        cells = self.hexplane.cells
+        lines = cells[first_line:].view(self.hexplane.slots, -1, cells.shape[1])
+        lines -= share * (lines.mean(0) - FIRST_LINE)
+        cells[:first_line].lerp_(self._first_planes, share)
+        for each, first in zip(self.decoder.parameters(), self._first, strict=True):
+            each.lerp_(first, share * rates.decoder / rates.cells)
         self.forget()
 
     def forget(self) -> None:
@@ -193,28 +223,29 @@ class SagsMapper:
         hexplane = HexPlane(box, t_ns, SLOT_NS, slots, cells=CELLS, channels=CHANNELS, seed=self._seed)
         decoder = Decoder(hexplane.features, "nodes", seed=self._seed)
         decoder.awaken(self._seed)
-        deltas = FrameDeltas(hexplane, decoder)
-        deltas.forget()
-        return deltas
+        return FrameDeltas(hexplane, decoder)
 
     def _follow(
         self, observation: Observation, frame: Kept, budget: Budget, still: int, learn: bool
     ) -> dict[str, int]:
-        # 1. Predict: the window reaches this frame, old slots are folded, the field says how things are now.
-        self.field.advance(frame.t_ns)
+        # 1. Predict: the window reaches this frame, old slots are folded and forgotten, the field says how
+        # things are now.
+        folded = self.field.advance(frame.t_ns)
         self._deltas.forget()
+        if folded:
+            share = -math.expm1(-folded * SLOT_NS / FORGOTTEN_NS)
+            self.field.settle(frame.t_ns, lambda: self._deltas.fade(share))
         self._write(frame)
         self.map.move_light(observation.camera)
         inserted = removed = iterations = 0
         if learn:
             self._keep(frame)
             # 2. Prune; draw, and let the colours follow a jump of the exposure; split, and fill holes.
-            if not still:
-                removed = self._prune(observation, budget)
+            removed = self._prune(observation, budget)  # also if still: a broken row breaks all gradients
+            if removed or not still:
                 planes = self._exposed(frame)
                 if is_lost(planes, frame.drawn) and can_start(observation):
-                    self.map.restart()
-                    return self._initialise(observation, frame, budget) | {"restarted": 1}
+                    return self._restart(observation, frame, budget)
                 inserted, given_up = self._densify(observation, frame, planes, budget)
                 removed += given_up
             self._take_over(frame.t_ns)
@@ -230,9 +261,15 @@ class SagsMapper:
             self._write(frame)
         # 4. Say how it moves, and draw what is shown.
         self.model.velocities[:] = 0 if still else self._velocities(frame.t_ns)
-        self._show(observation, frame)
+        planes = self._show(observation, frame)
         self.step += iterations
+        if iterations and is_worse_than_one_colour(planes, frame.drawn) and can_start(observation):
+            return self._restart(observation, frame, budget)
         return {"inserted": inserted, "removed": removed, "iterations": iterations}
+
+    def _restart(self, observation: Observation, frame: Kept, budget: Budget) -> dict[str, int]:
+        self.map.restart()
+        return self._initialise(observation, frame, budget) | {"restarted": 1}
 
     def _exposed(self, frame: Kept) -> F32:
         """The map drawn for a frame, in its exposure."""
@@ -269,11 +306,7 @@ class SagsMapper:
 
     def _refine(self, frame: Kept, relaxation: float, deformed: bool = True) -> None:
         """One step on a frame: Adam on field, decoder and canonical Gaussians; on their colours the step in
-        closed form of `optimiser.Optimiser`. With Adam on colours the phantom loses 3 dB.
-
-        For the newest frame canonical places stay: its motion is the field's to learn. They would move at all
-        times alike, which tells nothing of earlier frames.
-        """
+        closed form of `optimiser.Optimiser`. With Adam on colours the phantom loses 3 dB."""
         field, seen = self.field, frame.drawn
         rasterizer = self._rasterizer(seen.camera)
         drawing = field.draw(rasterizer, frame.t_ns, seen.camera, deformed, whole=frame.camera)
@@ -288,7 +321,6 @@ class SagsMapper:
         field.table[:, columns.COLOR] -= share[:, None] * field.rows.grad.numpy()[:, columns.COLOR]
         rates = self._rates * np.float32(FIRST_SPEED if self._first_steps < FIRST_STEPS else 1)
         if frame is self.kept[-1]:
-            rates[columns.MEAN] *= not deformed
             self.model.contribution[:], self._loss = drawing.contribution, loss
         field.descend(drawing, Rates(rates, FieldRates()))
         self._first_steps += 1
@@ -344,8 +376,11 @@ class SagsMapper:
         while kept[0].t_ns < frame.t_ns - KEPT_NS or len(kept) > MOST_KEPT:
             kept.popleft()
 
-    def _show(self, observation: Observation, frame: Kept) -> None:
-        self._view = as_view(self._draw(frame), self.model, observation)
+    def _show(self, observation: Observation, frame: Kept) -> F32:
+        """What is drawn."""
+        planes = self._draw(frame)
+        self._view = as_view(planes, self.model, observation)
+        return planes
 
     def _draw(self, frame: Kept) -> F32:
         camera = frame.drawn.camera

@@ -5,9 +5,31 @@ All are raw: the drawn scale is exp, the drawn opacity the logistic function of 
 
 from __future__ import annotations
 
+import math
+
+import numpy as np
+
+from sags_node.types import F32
+
 MEAN = slice(0, 3)  # m, world
 LOG_SCALE = slice(3, 6)  # of metres
 QUAT = slice(6, 10)  # wxyz
 COLOR = slice(10, 13)  # RGB 0..1
 LOGIT = 13  # of the opacity
 COUNT = 14
+
+# Where an optimiser may take them. What no picture tells, as how thin a Gaussian is along the ray, walks at
+# random: without bounds a scale gets to 0, or as large as the scene.
+LOG_SCALE_RANGE = (math.log(1e-6), math.log(5e-3))  # m
+COLOR_RANGE = (-0.5, 1.5)  # wider than what can be shown
+LOGIT_RANGE = (-6.0, 6.0)
+
+
+def bounded(rows: F32) -> F32:
+    """Rows [N, 14] within these ranges, with quaternions of length 1; what is not a number stays so."""
+    within = rows.copy()
+    within[:, LOG_SCALE] = rows[:, LOG_SCALE].clip(*LOG_SCALE_RANGE)
+    within[:, COLOR] = rows[:, COLOR].clip(*COLOR_RANGE)
+    within[:, LOGIT] = rows[:, LOGIT].clip(*LOGIT_RANGE)
+    within[:, QUAT] /= np.linalg.norm(rows[:, QUAT], axis=1, keepdims=True)
+    return within

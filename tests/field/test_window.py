@@ -264,3 +264,29 @@ def test_a_fresh_field_learns_a_motion_and_leaves_the_oldest_slot_alone(tokens: 
         deltas.step(FieldRates(cells=5e-3))
     assert left().mean() < 0.3 * shift.abs().mean()
     assert torch.allclose(field.deform(rows, 0), rows, rtol=0, atol=ROUNDING)
+
+
+@pytest.mark.parametrize("tokens", TOKENS)
+def test_when_the_field_forgets_the_state_at_that_time_stays(tokens: str) -> None:
+    model = moving_model(tokens)
+    cells = model.field.deltas.hexplane.cells.detach()
+    canonical, before = model.table.copy(), states(model, [NEWEST_NS])[0]
+    model.settle(NEWEST_NS, lambda: cells.copy_(1 + 0.5 * (cells - 1)))
+    np.testing.assert_allclose(states(model, [NEWEST_NS])[0], columns.bounded(before), atol=ROUNDING)
+    assert np.abs(model.table - canonical)[:, columns.MEAN].max() > 1e-3
+
+
+def test_what_has_left_its_range_is_brought_back_and_nothing_else_changes() -> None:
+    model = moving_model("nodes")
+    before = states(model, [NEWEST_NS])[0]
+    model.table[0, columns.LOG_SCALE] = -200, 200, -7
+    model.table[0, columns.COLOR], model.table[0, columns.LOGIT] = (-9, 9, 0.5), 99
+    model.table[1, columns.MEAN] = np.nan
+    model.settle(NEWEST_NS, lambda: None)
+    after = states(model, [NEWEST_NS])[0]
+    low, high = columns.LOG_SCALE_RANGE
+    np.testing.assert_allclose(after[0, columns.LOG_SCALE][:2], [low, high], atol=1e-4)
+    np.testing.assert_allclose(after[0, columns.COLOR][:2], columns.COLOR_RANGE, atol=1e-4)
+    np.testing.assert_allclose(after[0, columns.LOGIT], columns.LOGIT_RANGE[1], atol=1e-4)
+    assert np.isnan(after[1, columns.MEAN]).all()
+    np.testing.assert_allclose(after[2:], columns.bounded(before[2:]), atol=ROUNDING)

@@ -21,7 +21,8 @@ from sags_node.geometry import project
 from sags_node.kernels.threads import configure_threads, thread_count
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.ladder import Rung
-from sags_node.mapping.sags_mapper import KEPT_NS, WINDOW_NS, SagsMapper
+from sags_node.mapping.sags_mapper import FORGOTTEN_NS, KEPT_NS, WINDOW_NS, SagsMapper
+from sags_node.model import columns
 from sags_node.pipeline.pipeline import FrameRequest, Pipeline
 from sags_node.pipeline.session import open_posed, open_session
 from sags_node.types import F32, Camera, FrameResult, StereoFrame
@@ -186,6 +187,57 @@ def test_a_damaged_model_is_made_anew(phantom_session: Path) -> None:
     after = played(pipeline, taken[3:])[-1]
     assert after.epoch == before.epoch + 1
     assert quality(as_float(after.views["left"].rgb), after) > 25
+
+
+def test_a_model_that_shows_less_than_one_colour_would_is_made_anew_before_it_is_shown(
+    phantom_session: Path,
+) -> None:
+    """Beside it every later picture would seem too dark, too bright or of another scene, and be held."""
+    pipeline, frames = pipeline_of(phantom_session, "source.frames:=8")
+    taken = list(frames)
+    before = played(pipeline, taken[:6])[-1]
+    mapper_of(pipeline).field.table[:, columns.COLOR] = 10  # one step takes nine tenths off: it stays white
+    after, later = played(pipeline, taken[6:], steps=1)
+    assert after.epoch == later.epoch == before.epoch + 1
+    assert quality(as_float(after.views["left"].rgb), after) > 25
+    assert not later.held and quality(as_float(later.views["left"].rgb), later) > 25
+
+
+@pytest.mark.filterwarnings("error")
+def test_what_walked_away_in_a_long_session_is_brought_back(phantom_session: Path) -> None:
+    """A scale of exp(-200) m is 0 in float32, one of exp(50) m infinite."""
+    pipeline, frames = pipeline_of(phantom_session, "source.frames:=8")
+    taken = list(frames)
+    played(pipeline, taken[:6])
+    mapper = mapper_of(pipeline)
+    mapper.field.table[::9, columns.LOG_SCALE] = -200
+    mapper.field.table[::200, columns.LOG_SCALE] = 50
+    later = [replace(each, t_capture_ns=each.t_capture_ns + WINDOW_NS) for each in taken[6:]]
+    result = played(pipeline, later)[-1]
+    least, most = np.exp(columns.LOG_SCALE_RANGE)
+    assert least / 2 < mapper.model.scales.min()  # four steps were taken since they were brought back
+    assert mapper.model.scales.max() < 2 * most
+    assert quality(as_float(result.views["left"].rgb), result) > 25
+
+
+def test_what_the_field_forgets_moves_nothing(phantom_session: Path) -> None:
+    """After three times `FORGOTTEN_NS` the twentieth part is left of what it learnt. Before, the window has
+    to be full, and then full of what it learnt last: that takes two windows."""
+    pipeline, frames = pipeline_of(phantom_session, "source.frames:=7")
+    last = played(pipeline, list(frames))[-1].observation
+    mapper, budget = mapper_of(pipeline), StepBudget(0, RUNG)
+    cells, before = mapper.field.field.deltas.hexplane.cells, mapper.model.means.copy()
+
+    def unlike_the_first() -> float:
+        lines = cells.detach().numpy()[mapper.field.field.deltas.hexplane.slot(0).start :]
+        return float(np.abs(lines - 1).max())  # lines in time are 1 at first
+
+    learnt = unlike_the_first()
+    for each in range(1, 31):
+        later = replace(last, t_capture_ns=last.t_capture_ns + each * 4 * FORGOTTEN_NS // 30)
+        mapper.update(later, None, budget, learn=False)
+    assert 2 * WINDOW_NS <= FORGOTTEN_NS and unlike_the_first() < 1.1 * np.exp(-3) * learnt
+    assert np.abs(mapper.model.means - before).max() < 1e-5
 
 
 def test_a_veiled_picture_moves_nothing_and_a_dark_one_begins_nothing(phantom_session: Path) -> None:

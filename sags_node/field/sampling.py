@@ -1,0 +1,190 @@
+"""What the HexPlane says of places: bilinear samples of six planes, multiplied.
+
+`by_formula` is the formula in torch. It keeps six samples of every place, and as much for the gradient. For
+float32 on the CPU, `sample` takes kernels that keep none: a test compares both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numba import prange
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sags_node.field.gather import gather
+from sags_node.kernels.jit import add_lanes, copy, inlined, kernel, parallel_kernel, read_only, stack_floats
+from sags_node.types import F32, I64
+
+OUTER = (0, 0, 1, 3, 3, 3)  # of x, y, z, t: what counts the rows of the planes xy, xz, yz, tx, ty, tz
+INNER = (1, 2, 2, 0, 1, 2)  # what counts the columns
+LANES = 16  # channels that a loop takes at a time
+PIECE = 512  # places that a thread takes at a time
+
+u8 = np.uint64
+ZERO, ONE = np.float32(0), np.float32(1)
+
+
+class Places(NamedTuple):
+    """Where N places lie between the nodes of L levels."""
+
+    node: Tensor  # [N, L, 4] the nodes before them along x, y, z and t
+    share: Tensor  # [N, L, 4] of the nodes after them, differentiable
+    first: Tensor  # [L, 6] first row of each plane in the table
+    step: Tensor  # [L, 6] rows of the table from one row of a plane to the next
+
+
+def sample(cells: Tensor, places: Places) -> Tensor:
+    """Features [N, L * C] of places in a table of planes [M, C], differentiable in cells and shares."""
+    if cells.dtype == torch.float32 and cells.device.type == "cpu" and cells.shape[1] % LANES == 0:
+        features: Tensor = _Sample.apply(cells, *places)  # type: ignore[no-untyped-call]
+        return features
+    return by_formula(cells, places)
+
+
+def by_formula(cells: Tensor, places: Places) -> Tensor:
+    """As `sample`."""
+    node, share, first, step = places
+    at = first + node[..., OUTER] * step + node[..., INNER]  # [N, L, 6]
+    a, b = share[..., OUTER], share[..., INNER]
+    rows = torch.stack([at, at + 1, at + step, at + step + 1], -1).view(-1, 4)
+    weights = torch.stack([(1 - a) * (1 - b), (1 - a) * b, a * (1 - b), a * b], -1).view(-1, 4)
+    return gather(cells, rows, weights).view(*at.shape, -1).prod(2).flatten(1)
+
+
+class _Sample(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, cells: Tensor, *places: Tensor) -> Tensor:
+        ctx.save_for_backward(cells, *places)
+        levels, channels = places[0].shape[1], cells.shape[1]
+        features = cells.new_empty((len(places[0]), levels * channels))
+        table, node, share, first, step = _arrays(cells, places)
+        _sample(table, node, share, first, step, channels, features.view(-1).numpy())
+        return features
+
+    @staticmethod
+    def backward(ctx: Any, v_features: Tensor) -> tuple[Tensor | None, ...]:
+        cells, *places = ctx.saved_tensors
+        channels, v_cells = cells.shape[1], torch.zeros_like(cells)
+        v_shares = cells.new_zeros((channels // LANES, *places[0].shape))
+        table, node, share, first, step = _arrays(cells, places)
+        v, by_cells = read_only(v_features.contiguous().view(-1).numpy()), v_cells.view(-1).numpy()
+        _differentiate(table, node, share, first, step, channels, v, by_cells, v_shares.numpy())
+        return v_cells, None, v_shares.sum(0), None, None
+
+
+def _arrays(cells: Tensor, places: Sequence[Tensor]) -> Iterator[NDArray[Any]]:
+    return (read_only(each.detach().numpy()) for each in (cells.view(-1), *places))
+
+
+@inlined
+def _corners(
+    node: I64, share: F32, first: I64, step: I64, channels: Any, block: Any, i: Any, level: Any, plane: Any
+) -> Any:
+    """Where a place's cells lie in a plane, in the row before it and in the row after; its two shares."""
+    outer, inner = OUTER[plane], INNER[plane]
+    row = first[level, plane] + node[i, level, outer] * step[level, plane] + node[i, level, inner]
+    low, high = u8(row * channels + block), u8((row + step[level, plane]) * channels + block)
+    return low, high, share[i, level, outer], share[i, level, inner]
+
+
+@inlined
+def _bilinear(cells: F32, low: Any, high: Any, right: Any, a: Any, b: Any) -> Any:
+    """A sample, and its derivatives by both shares."""
+    across, above = cells[low + right] - cells[low], cells[high + right] - cells[high]
+    before, after = cells[low] + b * across, cells[high] + b * above
+    return before + a * (after - before), after - before, across + a * (above - across)
+
+
+@kernel
+def _sample_piece(
+    begin: Any, end: Any, cells: F32, node: I64, share: F32, first: I64, step: I64, channels: Any,
+    features: F32,
+) -> None:  # fmt: skip
+    found, right, levels = stack_floats(16), u8(channels), node.shape[1]
+    for item in range(begin * levels, end * levels):
+        i, level = item // levels, item % levels
+        for block in range(0, channels, LANES):
+            p0, q0, a0, b0 = _corners(node, share, first, step, channels, block, i, level, 0)
+            p1, q1, a1, b1 = _corners(node, share, first, step, channels, block, i, level, 1)
+            p2, q2, a2, b2 = _corners(node, share, first, step, channels, block, i, level, 2)
+            p3, q3, a3, b3 = _corners(node, share, first, step, channels, block, i, level, 3)
+            p4, q4, a4, b4 = _corners(node, share, first, step, channels, block, i, level, 4)
+            p5, q5, a5, b5 = _corners(node, share, first, step, channels, block, i, level, 5)
+            for k in range(LANES):
+                c = u8(k)
+                xy, _, _ = _bilinear(cells, p0 + c, q0 + c, right, a0, b0)
+                xz, _, _ = _bilinear(cells, p1 + c, q1 + c, right, a1, b1)
+                yz, _, _ = _bilinear(cells, p2 + c, q2 + c, right, a2, b2)
+                tx, _, _ = _bilinear(cells, p3 + c, q3 + c, right, a3, b3)
+                ty, _, _ = _bilinear(cells, p4 + c, q4 + c, right, a4, b4)
+                tz, _, _ = _bilinear(cells, p5 + c, q5 + c, right, a5, b5)
+                found[c] = (xy * xz * yz) * (tx * ty * tz)
+            copy(features, u8(item * channels + block), found, u8(0), u8(LANES))
+
+
+@parallel_kernel
+def _sample(cells: F32, node: I64, share: F32, first: I64, step: I64, channels: int, features: F32) -> None:
+    for piece in prange(-(-len(node) // PIECE)):
+        begin = np.int64(piece) * PIECE
+        end = min(begin + PIECE, len(node))
+        _sample_piece(begin, end, cells, node, share, first, step, channels, features)
+
+
+@kernel
+def _differentiate_block(
+    level: Any, block: Any, cells: F32, node: I64, share: F32, first: I64, step: I64, channels: Any,
+    v_features: F32, v_cells: F32, v_share: F32,
+) -> None:  # fmt: skip
+    """All places' gradients by some channels of a level: its cells have one writer."""
+    by, v, right = stack_floats(96), stack_floats(16), u8(channels)
+    for i in range(len(node)):
+        p0, q0, a0, b0 = _corners(node, share, first, step, channels, block, i, level, 0)
+        p1, q1, a1, b1 = _corners(node, share, first, step, channels, block, i, level, 1)
+        p2, q2, a2, b2 = _corners(node, share, first, step, channels, block, i, level, 2)
+        p3, q3, a3, b3 = _corners(node, share, first, step, channels, block, i, level, 3)
+        p4, q4, a4, b4 = _corners(node, share, first, step, channels, block, i, level, 4)
+        p5, q5, a5, b5 = _corners(node, share, first, step, channels, block, i, level, 5)
+        copy(v, u8(0), v_features, u8((i * node.shape[1] + level) * channels + block), u8(LANES))
+        by_x = by_y = by_z = ZERO
+        for k in range(LANES):
+            c = u8(k)
+            xy, xy_x, xy_y = _bilinear(cells, p0 + c, q0 + c, right, a0, b0)
+            xz, xz_x, xz_z = _bilinear(cells, p1 + c, q1 + c, right, a1, b1)
+            yz, yz_y, yz_z = _bilinear(cells, p2 + c, q2 + c, right, a2, b2)
+            tx, _, tx_x = _bilinear(cells, p3 + c, q3 + c, right, a3, b3)
+            ty, _, ty_y = _bilinear(cells, p4 + c, q4 + c, right, a4, b4)
+            tz, _, tz_z = _bilinear(cells, p5 + c, q5 + c, right, a5, b5)
+            in_space, in_time = v[c] * (tx * ty * tz), v[c] * (xy * xz * yz)
+            v_xy, v_xz, v_yz = in_space * (xz * yz), in_space * (xy * yz), in_space * (xy * xz)
+            v_tx, v_ty, v_tz = in_time * (ty * tz), in_time * (tx * tz), in_time * (tx * ty)
+            by_x += v_xy * xy_x + v_xz * xz_x + v_tx * tx_x
+            by_y += v_xy * xy_y + v_yz * yz_y + v_ty * ty_y
+            by_z += v_xz * xz_z + v_yz * yz_z + v_tz * tz_z
+            by[c], by[c + u8(16)], by[c + u8(32)] = v_xy, v_xz, v_yz
+            by[c + u8(48)], by[c + u8(64)], by[c + u8(80)] = v_tx, v_ty, v_tz
+        v_share[i, level, 0], v_share[i, level, 1], v_share[i, level, 2] = by_x, by_y, by_z
+        for plane in range(6):
+            low, high, a, b = _corners(node, share, first, step, channels, block, i, level, plane)
+            at = u8(plane * LANES)
+            add_lanes(v_cells, low, (ONE - a) * (ONE - b), by, at)
+            add_lanes(v_cells, low + right, (ONE - a) * b, by, at)
+            add_lanes(v_cells, high, a * (ONE - b), by, at)
+            add_lanes(v_cells, high + right, a * b, by, at)
+
+
+@parallel_kernel
+def _differentiate(
+    cells: F32, node: I64, share: F32, first: I64, step: I64, channels: int, v_features: F32, v_cells: F32,
+    v_shares: F32,
+) -> None:  # fmt: skip
+    blocks = channels // LANES
+    for task in prange(blocks * node.shape[1]):
+        level, block = np.int64(task) // blocks, np.int64(task) % blocks
+        _differentiate_block(
+            level, block * LANES, cells, node, share, first, step, channels, v_features, v_cells,
+            v_shares[block],
+        )  # fmt: skip
