@@ -87,8 +87,7 @@ def make_budget(
         rung = EVERYTHING if mapping.rung is None else rungs_of(config, skips)[0]
         return StepBudget(mapping.iterations, rung)
     if speed is None:
-        speed = measured_speed(make_rasterizer("numba", *SAMPLE_SIZE))
-        speed *= FIELD_TIMES if mapping.method == "sags" else 1.0
+        speed = _measured_speed(config)
     return TimeBudget(Ladder(rungs_of(config, skips), width * height, 1e-3 * mapping.frame_ms(rate), speed))
 
 
@@ -105,9 +104,8 @@ def with_scale(config: LaunchConfig, width: int, height: int, rate: float | None
         return config
     scale = 1.0
     if config.in_real_time and config.mapping.iterations is None and device_of(config).kind == "cpu":
-        speed = measured_speed(make_rasterizer("numba", *SAMPLE_SIZE))
         seconds = 1e-3 * config.mapping.frame_ms(rate)
-        scale = best_scale(rungs_of(config), width * height, seconds, speed)
+        scale = best_scale(rungs_of(config), width * height, seconds, _measured_speed(config))
     return config.model_copy(update={"vision": config.vision.model_copy(update={"scale": scale})})
 
 
@@ -124,6 +122,12 @@ def make_refiner(config: LaunchConfig, width: int, height: int) -> Refiner:
 
     on_cpu = affordable(config.model_copy(update={"device": "cpu"}), width, height)
     return GpuRefiner(cpu, on_cpu / affordable(config, width, height))
+
+
+def _measured_speed(config: LaunchConfig) -> float:
+    """`Ladder.speed` before the first frame."""
+    times = FIELD_TIMES if config.mapping.method == "sags" else 1.0
+    return times * measured_speed(make_rasterizer("numba", *SAMPLE_SIZE))
 
 
 def _speed(config: LaunchConfig) -> float:

@@ -220,6 +220,7 @@ def test_the_scale_is_chosen_in_real_time_only_and_never_over_a_person(
         return with_scale(config, 640, 512, 30.0).vision.scale
 
     assert chosen() == best_scale(RUNGS, FULL, 1e-3 * MappingConfig().frame_ms(30.0), 2.0) < 1
+    assert chosen(mapping={"method": "sags"}) == 0.5  # its frames take several times as long
     assert chosen(source={"kind": "phantom", "pace": "step"}) == 1.0  # results repeat
     assert chosen(mapping={"iterations": 2}) == 1.0
     assert chosen(vision={"scale": 0.5}) == 0.5 and chosen(vision={"scale": 1}) == 1
