@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from sags_node.types import F32, I32, Observation
 from sags_node.vision.depth_grid import depth_at, grid_of
 
 SCALE_PER_SPACING = 0.4  # of the distance between neighbours; measured best (0.3-0.5), 0.8 loses 4 dB
-LEAST_SIZE = 0.8  # px: the filters take so much opacity from smaller ones that the first pictures have gaps
+FILTERED = 0.45  # px, in quadrature: filters take so much opacity from small ones that gaps were left
 FLATNESS = 0.5  # the extent along the ray against the extent across it
 OPACITY = 0.9
 LEAST_SHARE = 0.3  # of the drawn scale that is left when the 3D filter's share is taken off
@@ -44,7 +45,7 @@ def insert(
     """
     x, y = pixels[:, 0], pixels[:, 1]
     camera = observation.camera
-    across = max(SCALE_PER_SPACING * spacing, LEAST_SIZE) * z / np.float32(camera.K[0, 0])
+    across = math.hypot(SCALE_PER_SPACING * spacing, FILTERED) * z / np.float32(camera.K[0, 0])
     scales = np.stack([across, across, FLATNESS * across], 1).astype(np.float32)
     means = unproject(camera, pixels.astype(np.float32), z).astype(np.float32)
     variances = smoothing_variances(means, [camera]) if smoothing else np.zeros(len(means), np.float32)
