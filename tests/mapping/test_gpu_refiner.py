@@ -65,7 +65,7 @@ def frame(i: int, seed: int = 1, brightness: float = 1.0, instrument: bool = Tru
     image = as_bytes(texture(seed)[:, i : i + WIDTH] * brightness)
     K = np.array([[FOCAL, 0, (WIDTH - 1) / 2], [0, FOCAL, (HEIGHT - 1) / 2], [0, 0, 1]])
     tissue = np.ones((HEIGHT, WIDTH), np.bool_)
-    tissue[6:14, 30:38] = not instrument
+    tissue[5:15, 29:39] = not instrument
     y, x = np.mgrid[:HEIGHT, :WIDTH]
     depth = (DEPTH + 1e-4 * x + 1.3e-4 * y).astype(np.float32) * tissue  # no two Gaussians lie equally far
     return Observation(
