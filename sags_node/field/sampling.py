@@ -81,7 +81,7 @@ def _arrays(cells: Tensor, places: Sequence[Tensor]) -> Iterator[NDArray[Any]]:
 
 
 @inlined
-def _corners(
+def _corner(
     node: I64, share: F32, first: I64, step: I64, channels: Any, block: Any, i: Any, level: Any, plane: Any
 ) -> Any:
     """Where a place's cells lie in a plane, in the row before it and in the row after; its two shares."""
@@ -92,8 +92,24 @@ def _corners(
 
 
 @inlined
-def _bilinear(cells: F32, low: Any, high: Any, right: Any, a: Any, b: Any) -> Any:
-    """A sample, and its derivatives by both shares."""
+def _corners(
+    node: I64, share: F32, first: I64, step: I64, channels: Any, block: Any, i: Any, level: Any
+) -> Any:
+    """`_corner` of each plane."""
+    return (
+        _corner(node, share, first, step, channels, block, i, level, 0),
+        _corner(node, share, first, step, channels, block, i, level, 1),
+        _corner(node, share, first, step, channels, block, i, level, 2),
+        _corner(node, share, first, step, channels, block, i, level, 3),
+        _corner(node, share, first, step, channels, block, i, level, 4),
+        _corner(node, share, first, step, channels, block, i, level, 5),
+    )
+
+
+@inlined
+def _bilinear(cells: F32, corner: Any, c: Any, right: Any) -> Any:
+    """A sample of channel c, and its derivatives by both shares."""
+    low, high, a, b = corner[0] + c, corner[1] + c, corner[2], corner[3]
     across, above = cells[low + right] - cells[low], cells[high + right] - cells[high]
     before, after = cells[low] + b * across, cells[high] + b * above
     return before + a * (after - before), after - before, across + a * (above - across)
@@ -108,20 +124,17 @@ def _sample_piece(
     for item in range(begin * levels, end * levels):
         i, level = item // levels, item % levels
         for block in range(0, channels, LANES):
-            p0, q0, a0, b0 = _corners(node, share, first, step, channels, block, i, level, 0)
-            p1, q1, a1, b1 = _corners(node, share, first, step, channels, block, i, level, 1)
-            p2, q2, a2, b2 = _corners(node, share, first, step, channels, block, i, level, 2)
-            p3, q3, a3, b3 = _corners(node, share, first, step, channels, block, i, level, 3)
-            p4, q4, a4, b4 = _corners(node, share, first, step, channels, block, i, level, 4)
-            p5, q5, a5, b5 = _corners(node, share, first, step, channels, block, i, level, 5)
+            of_xy, of_xz, of_yz, of_tx, of_ty, of_tz = _corners(
+                node, share, first, step, channels, block, i, level
+            )
             for k in range(LANES):
                 c = u8(k)
-                xy, _, _ = _bilinear(cells, p0 + c, q0 + c, right, a0, b0)
-                xz, _, _ = _bilinear(cells, p1 + c, q1 + c, right, a1, b1)
-                yz, _, _ = _bilinear(cells, p2 + c, q2 + c, right, a2, b2)
-                tx, _, _ = _bilinear(cells, p3 + c, q3 + c, right, a3, b3)
-                ty, _, _ = _bilinear(cells, p4 + c, q4 + c, right, a4, b4)
-                tz, _, _ = _bilinear(cells, p5 + c, q5 + c, right, a5, b5)
+                xy, _, _ = _bilinear(cells, of_xy, c, right)
+                xz, _, _ = _bilinear(cells, of_xz, c, right)
+                yz, _, _ = _bilinear(cells, of_yz, c, right)
+                tx, _, _ = _bilinear(cells, of_tx, c, right)
+                ty, _, _ = _bilinear(cells, of_ty, c, right)
+                tz, _, _ = _bilinear(cells, of_tz, c, right)
                 found[c] = (xy * xz * yz) * (tx * ty * tz)
             copy(features, u8(item * channels + block), found, u8(0), u8(LANES))
 
@@ -142,22 +155,19 @@ def _differentiate_block(
     """All places' gradients by some channels of a level: its cells have one writer."""
     by, v, right = stack_floats(96), stack_floats(16), u8(channels)
     for i in range(len(node)):
-        p0, q0, a0, b0 = _corners(node, share, first, step, channels, block, i, level, 0)
-        p1, q1, a1, b1 = _corners(node, share, first, step, channels, block, i, level, 1)
-        p2, q2, a2, b2 = _corners(node, share, first, step, channels, block, i, level, 2)
-        p3, q3, a3, b3 = _corners(node, share, first, step, channels, block, i, level, 3)
-        p4, q4, a4, b4 = _corners(node, share, first, step, channels, block, i, level, 4)
-        p5, q5, a5, b5 = _corners(node, share, first, step, channels, block, i, level, 5)
+        of_xy, of_xz, of_yz, of_tx, of_ty, of_tz = _corners(
+            node, share, first, step, channels, block, i, level
+        )
         copy(v, u8(0), v_features, u8((i * node.shape[1] + level) * channels + block), u8(LANES))
         by_x = by_y = by_z = ZERO
         for k in range(LANES):
             c = u8(k)
-            xy, xy_x, xy_y = _bilinear(cells, p0 + c, q0 + c, right, a0, b0)
-            xz, xz_x, xz_z = _bilinear(cells, p1 + c, q1 + c, right, a1, b1)
-            yz, yz_y, yz_z = _bilinear(cells, p2 + c, q2 + c, right, a2, b2)
-            tx, _, tx_x = _bilinear(cells, p3 + c, q3 + c, right, a3, b3)
-            ty, _, ty_y = _bilinear(cells, p4 + c, q4 + c, right, a4, b4)
-            tz, _, tz_z = _bilinear(cells, p5 + c, q5 + c, right, a5, b5)
+            xy, xy_x, xy_y = _bilinear(cells, of_xy, c, right)
+            xz, xz_x, xz_z = _bilinear(cells, of_xz, c, right)
+            yz, yz_y, yz_z = _bilinear(cells, of_yz, c, right)
+            tx, _, tx_x = _bilinear(cells, of_tx, c, right)
+            ty, _, ty_y = _bilinear(cells, of_ty, c, right)
+            tz, _, tz_z = _bilinear(cells, of_tz, c, right)
             in_space, in_time = v[c] * (tx * ty * tz), v[c] * (xy * xz * yz)
             v_xy, v_xz, v_yz = in_space * (xz * yz), in_space * (xy * yz), in_space * (xy * xz)
             v_tx, v_ty, v_tz = in_time * (ty * tz), in_time * (tx * tz), in_time * (tx * ty)
@@ -168,7 +178,7 @@ def _differentiate_block(
             by[c + u8(48)], by[c + u8(64)], by[c + u8(80)] = v_tx, v_ty, v_tz
         v_share[i, level, 0], v_share[i, level, 1], v_share[i, level, 2] = by_x, by_y, by_z
         for plane in range(6):
-            low, high, a, b = _corners(node, share, first, step, channels, block, i, level, plane)
+            low, high, a, b = _corner(node, share, first, step, channels, block, i, level, plane)
             at = u8(plane * LANES)
             add_lanes(v_cells, low, (ONE - a) * (ONE - b), by, at)
             add_lanes(v_cells, low + right, (ONE - a) * b, by, at)

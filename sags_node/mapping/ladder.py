@@ -49,7 +49,7 @@ RUNGS = (
 
 
 USED = 0.82  # of the Gaussians that a rung allows: so many a model has, the rest is room for what appears
-# Prices, ms on two cores of one machine, by 18 rungs at three working sizes (`benchmarks/ladder.md`).
+# Prices, ms on two cores of one machine, by 18 runs at three working sizes (`benchmarks/ladder.md`).
 EVERY_FRAME = 8.5  # what depends on nothing: the camera's pictures, watches, tracks
 DEPTH = 3.0  # matched once
 WORKED = 0.8  # pictures of `FULL` px: flow, masks
