@@ -151,7 +151,13 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("small")
 def test_everything_is_measured_on_a_tiny_session(phantom_session: Path, tmp_path: Path) -> None:
-    fit = {"session": "session", "seconds": 9.0, "gaussians": 800, "heldout": {"psnr": 41.0}, "depth": None}
+    fit = {
+        "session": phantom_session.name,
+        "seconds": 9.0,
+        "gaussians": 800,
+        "heldout": {"psnr": 41.0},
+        "depth": None,
+    }
     (tmp_path / "fit.json").write_text(json.dumps(fit))
     out, plot = tmp_path / "pareto.json", tmp_path / "pareto.png"
     files = ["--fit", tmp_path / "fit.json", "--out", out, "--plot", plot]
