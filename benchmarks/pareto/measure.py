@@ -6,6 +6,7 @@ of time. Rules that leave work out are compared with a fixed number of steps, so
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -122,8 +123,8 @@ class _Comparison:
         baselines: list[Row] = []
         for place, setting in enumerate(turns, 1):
             progress = self._progress(f"{setting.name} ({place} of {len(turns)})")
-            with self._played(setting, progress) as (played, spool):
-                runs[setting].append(self._measured(setting, played, spool, progress))
+            with self._played(setting, progress) as (played, spool, cpu_ms):
+                runs[setting].append(self._measured(setting, played, spool, progress) | {"cpu_ms": cpu_ms})
                 if place == 1:  # the default
                     baselines = baselines_of_run(runs[setting][0])
                     baselines += measured_baselines(played, spool, self._size, self._sweep.options, progress)
@@ -153,16 +154,19 @@ class _Comparison:
         return measure_hosts(self._launch, self._overrides, lambda what: self._progress(what)("", 0))
 
     @contextmanager
-    def _played(self, setting: Setting, progress: Progress) -> Iterator[tuple[Session, Spool]]:
+    def _played(self, setting: Setting, progress: Progress) -> Iterator[tuple[Session, Spool, float]]:
+        """What was played, what it showed, and processor time for a frame, ms: reading the recording too."""
         session = self._open(setting.overrides)
         with Spool() as spool:
+            before = time.process_time()
             run_step(session, self._sweep.options, spool, progress, setting.skips)
+            spent = time.process_time() - before
             if len(spool) < SHORTEST:
                 raise SagsError(
                     f"{session.name}: {len(spool)} frames were processed and {SHORTEST} are needed to tell "
                     "a time; play more (--frames, source.frames, source.start)"
                 )
-            yield session, spool
+            yield session, spool, round(1e3 * spent / len(spool), 2)
 
     def _measured(self, setting: Setting, session: Session, spool: Spool, progress: Progress) -> Row:
         summary = measure(session, spool, self._sweep.options, setting.overrides, progress).summary

@@ -27,6 +27,7 @@ def _settings(session: Row) -> Table:
         "",
         "ms p50",
         "p99",
+        "of cores",
         "online, dB",
         "at full size",
         "predict",
@@ -35,6 +36,7 @@ def _settings(session: Row) -> Table:
         "depth, mm",
         "p90",
         "cover",
+        "points, mm",
         "N",
     )
     segments = list(session["segments"])
@@ -107,10 +109,12 @@ def _figures(row: Row, segments: Sequence[str]) -> list[str]:
     return [
         _number(times.get("p50"), ".1f"),
         _number(times.get("p99"), ".1f"),
+        _number(row.get("cpu_ms"), ".1f"),
         *(_decibels(row.get(group), segments) for group in pictures),
         _number(depth.get("median_mm"), ".2f"),
         _number(depth.get("p90_mm"), ".2f"),
         _number(depth.get("coverage"), ".1%"),
+        _number((row.get("track") or {}).get("median_mm"), ".2f"),
         _number((row.get("gaussians") or {}).get("mean"), ",.0f"),
     ]
 
