@@ -6,7 +6,6 @@ of time. Rules that leave work out are compared with a fixed number of steps, so
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -33,8 +32,8 @@ from sags_node.pipeline.warm_up import warm_up
 
 SHORTEST = 3  # frames: the first one, in which the model is made, has times of its own
 KEPT = (
-    "frame_ms", "stage_ms", "rate_hz", "iterations_per_frame", "online", "predict", "heldout", "between",
-    "novel", "depth", "measured_depth", "track", "gaussians", "skipped",
+    "frame_ms", "cpu_ms", "stage_ms", "rate_hz", "iterations_per_frame", "online", "predict", "heldout",
+    "between", "novel", "depth", "measured_depth", "track", "gaussians", "skipped",
 )  # fmt: skip
 
 Row = dict[str, Any]
@@ -123,8 +122,8 @@ class _Comparison:
         baselines: list[Row] = []
         for place, setting in enumerate(turns, 1):
             progress = self._progress(f"{setting.name} ({place} of {len(turns)})")
-            with self._played(setting, progress) as (played, spool, cpu_ms):
-                runs[setting].append(self._measured(setting, played, spool, progress) | {"cpu_ms": cpu_ms})
+            with self._played(setting, progress) as (played, spool):
+                runs[setting].append(self._measured(setting, played, spool, progress))
                 if place == 1:  # the default
                     baselines = baselines_of_run(runs[setting][0])
                     baselines += measured_baselines(played, spool, self._size, self._sweep.options, progress)
@@ -154,19 +153,16 @@ class _Comparison:
         return measure_hosts(self._launch, self._overrides, lambda what: self._progress(what)("", 0))
 
     @contextmanager
-    def _played(self, setting: Setting, progress: Progress) -> Iterator[tuple[Session, Spool, float]]:
-        """What was played, what it showed, and processor time for a frame, ms: reading the recording too."""
+    def _played(self, setting: Setting, progress: Progress) -> Iterator[tuple[Session, Spool]]:
         session = self._open(setting.overrides)
         with Spool() as spool:
-            before = time.process_time()
             run_step(session, self._sweep.options, spool, progress, setting.skips)
-            spent = time.process_time() - before
             if len(spool) < SHORTEST:
                 raise SagsError(
                     f"{session.name}: {len(spool)} frames were processed and {SHORTEST} are needed to tell "
                     "a time; play more (--frames, source.frames, source.start)"
                 )
-            yield session, spool, round(1e3 * spent / len(spool), 2)
+            yield session, spool
 
     def _measured(self, setting: Setting, session: Session, spool: Spool, progress: Progress) -> Row:
         summary = measure(session, spool, self._sweep.options, setting.overrides, progress).summary

@@ -27,7 +27,7 @@ def _settings(session: Row) -> Table:
         "",
         "ms p50",
         "p99",
-        "of cores",
+        "CPU",
         "online, dB",
         "at full size",
         "predict",
@@ -109,7 +109,7 @@ def _figures(row: Row, segments: Sequence[str]) -> list[str]:
     return [
         _number(times.get("p50"), ".1f"),
         _number(times.get("p99"), ".1f"),
-        _number(row.get("cpu_ms"), ".1f"),
+        _number((row.get("cpu_ms") or {}).get("p50"), ".1f"),
         *(_decibels(row.get(group), segments) for group in pictures),
         _number(depth.get("median_mm"), ".2f"),
         _number(depth.get("p90_mm"), ".2f"),

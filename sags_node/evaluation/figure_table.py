@@ -45,6 +45,7 @@ GROUPS: dict[str, list[Figure]] = {
         *_times("camera's stamp to sending", "latency_ms"),
         *_times("work on a frame", "frame_ms", "the time it may take", "budget_ms"),
         Figure("of that, median of", "stage_ms.*", "ms", 2),
+        *_times("processor time for a frame", "cpu_ms"),
         Figure("steps of refinement for a frame", "iterations_per_frame", "", 1),
         Figure("Gaussians, mean", "gaussians.mean"),
         Figure("Gaussians, at most", "gaussians.max"),

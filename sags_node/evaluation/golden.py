@@ -13,7 +13,7 @@ from sags_node.errors import UsageError
 
 # These differ from machine to machine and from run to run.
 TIMING_KEYS = frozenset(
-    {"rate_hz", "first_render_ms", "latency_ms", "frame_ms", "stage_ms", "rss_mb", "machine", "threads"}
+    "rate_hz first_render_ms latency_ms frame_ms cpu_ms stage_ms rss_mb machine threads".split()
 )
 
 

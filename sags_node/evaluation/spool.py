@@ -50,6 +50,7 @@ class RunFacts:
     counts: dict[str, int]  # inserted, removed, iterations, ...
     rung: int | None = None  # of the ladder of quality; None: fixed steps
     warnings: dict[str, str] = field(default_factory=dict)  # code -> what is wrong and how to fix it
+    cpu_ms: float | None = None  # processor time of all threads for the frame; None: not measured
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +97,7 @@ class Spool:
         t_shown_ns: int,
         latency_ms: float | None = None,
         warnings: Findings = NOTHING,
+        cpu_ms: float | None = None,
     ) -> None:
         """Keep one frame: about 6 MB and 2 to 3 ms at 640x512 with 30,000 Gaussians.
 
@@ -115,6 +117,7 @@ class Spool:
             dict(snapshot.counts),
             None if result.rung is None else result.rung.number,
             by_code(warnings),
+            cpu_ms,
         )
         header = {
             "facts": asdict(facts),

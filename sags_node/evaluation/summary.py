@@ -96,6 +96,7 @@ def _timings(facts: Sequence[RunFacts]) -> dict[str, Any]:
         "first_render_ms": next(iter(latency_ms or frame_ms), None),
         "latency_ms": percentiles(latency_ms),
         "frame_ms": percentiles(frame_ms),
+        "cpu_ms": percentiles([run.cpu_ms for run in facts if run.cpu_ms is not None]),
         "stage_ms": {
             stage: _median([run.timings_ms[stage] for run in facts if stage in run.timings_ms])
             for stage in dict.fromkeys(stages)
