@@ -1,4 +1,4 @@
-"""Writes the tables of figures in README.md and benchmarks/README.md from benchmarks/results: `make docs`.
+"""Writes the tables of figures that stand in README.md and other pages from benchmarks/results: `make docs`.
 
 A table stands between two comments. What is asked of a file that is not there ends with its name.
 """
@@ -10,9 +10,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from sags_node.mapping.ladder import FULL, RUNGS, USED, price
+
 ROOT = Path(__file__).parents[2]
 BEGIN, END = "<!-- Written by `make docs` from benchmarks/results -->\n", "<!-- end -->"
 TURNS = (1, 2, 3)  # runs of each clip, in turns with the others
+METHODS = {  # results of `python -m benchmarks methods`
+    "phantom": "phantom, 90 frames", "d4d": "D4D, the lift, 60 frames", "hamlyn": "Hamlyn heart, 100 frames",
+    "pulling": "pulling, 63 frames, left eye",
+}  # fmt: skip
 CLIPS = {"d4d": "D4D, 30 Hz", "phantom": "phantom, seeds 1 to 3, 30 Hz", "hamlyn": "Hamlyn heart, 25 Hz"}
 
 
@@ -30,8 +36,16 @@ def replaced(page: str, table: str) -> str:
 
 def pages() -> dict[Path, str]:
     """What each page should be."""
-    tables = {ROOT / "README.md": _headline(), ROOT / "benchmarks/README.md": _live()}
-    return {page: replaced(page.read_text(encoding="utf-8"), table) for page, table in tables.items()}
+    tables = {
+        "README.md": _headline(),
+        "benchmarks/README.md": _live(),
+        "benchmarks/ladder.md": _ladder(),
+        "docs/how-it-works.md": _methods(),
+    }
+    return {
+        ROOT / page: replaced((ROOT / page).read_text(encoding="utf-8"), table)
+        for page, table in tables.items()
+    }
 
 
 def _each(clip: str, value: Callable[[dict[str, Any]], float | None], digits: int = 1) -> str:
@@ -67,6 +81,63 @@ def _live() -> str:
             _each(clip, lambda run: _test_part(run["depth"])["median_mm"] if run["depth"] else None, 2),
         )
         rows.append(f"| {' | '.join(cells)} |\n")
+    return "".join(rows)
+
+
+def _ladder() -> str:
+    """Every rung on D4D and on the phantom, whose depth and points are known exactly."""
+    d4d, phantom = result("ladder")["sessions"]
+    runs = [
+        {row["name"]: row for row in session["settings"] if row["part"] == "rungs"}
+        for session in (d4d, phantom)
+    ]
+    rows = [
+        "| rung | Gaussians | size | depth every | step | redrawn | price, ms | frame, ms | CPU, ms "
+        "| Gaussians there were | online, dB | predict | right eye | depth, mm "
+        "| phantom: frame, ms | online, dB | depth, mm | points, mm |\n" + "|---" * 18 + "|\n"
+    ]
+    for place, rung in enumerate(RUNGS):
+        real, exact = (run[f"rung {place}"] for run in runs)
+        cells = (
+            f"{place}",
+            f"{rung.gaussians:,}",
+            *(f"{value:g}" for value in (rung.scale, rung.depth_every, rung.step, rung.redraw)),
+            f"{price(rung, USED * rung.gaussians, FULL):.1f}",
+            f"{real['frame_ms']['p50']:.1f}",
+            f"{real['cpu_ms']['p50']:.0f}",
+            f"{real['gaussians']['mean']:,.0f}",
+            *(f"{real[group]['psnr']:.1f}" for group in ("online", "predict", "novel")),
+            f"{real['depth']['median_mm']:.2f}",
+            f"{exact['frame_ms']['p50']:.1f}",
+            f"{exact['online']['psnr']:.1f}",
+            *(f"{exact[group]['median_mm']:.3f}" for group in ("depth", "track")),
+        )
+        rows.append(f"| {' | '.join(cells)} |\n")
+    return "".join(rows)
+
+
+def _methods() -> str:
+    """Control nodes and the paper's field, side by side."""
+    rows = [
+        "| | live rate, p50 / p99 | live | newest | next frame | held out | depth | points | `window` |\n"
+        + "|---" * 9
+        + "|\n"
+    ]
+    for clip, name in METHODS.items():
+        rows.append(f"| {name}: | | | | | | | | |\n")
+        for row in result(f"methods_{clip}")["rows"]:
+            live, step = row["live"], row["step"]
+            late = live["latency_ms"]
+            cells = (
+                f"{row['width']}x{row['height']} `{row['method']}`",
+                f"{live['rate_hz']:.1f} Hz, {late['p50']:.0f} / {late['p99']:.0f} ms",
+                f"{live['psnr']:.1f} dB",
+                *(f"{step[key]:.1f} dB" for key in ("online", "predict", "heldout")),
+                f"{step['depth']:.2f} mm" if "depth" in step else "",
+                f"{step['track']:.2f} px" if "track" in step else "",
+                f"{step['window']:.1f} dB",
+            )
+            rows.append(f"| {' | '.join(cells)} |\n")
     return "".join(rows)
 
 
