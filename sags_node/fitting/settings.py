@@ -47,13 +47,15 @@ class FieldShape:
     # How many of the clip's frames from one slot of time to the next. The paths are given at every third
     # training frame: each slot has two of their times, as one without any is left to chance.
     frames_per_slot: float = 7.0
+    most_slots: int | None = None  # however long the clip is
     first_values: tuple[float, float] = (0.7, 1.3)  # of the planes in space, at random between these
     units: Units = Units()
     xavier: bool = False  # whether the last layers start at random, rather than at 0
 
     def slots(self, frames: int) -> int:
         """Slots of time for a clip of so many frames."""
-        return max(2, math.ceil(frames / self.frames_per_slot) + 1)
+        slots = max(2, math.ceil(frames / self.frames_per_slot) + 1)
+        return slots if self.most_slots is None else min(slots, self.most_slots)
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +121,7 @@ PAPER = FitSettings(
     schedule="paper",
     tokens="self",
     iterations=3000,
-    shape=FieldShape(frames_per_slot=3.0),
+    shape=FieldShape(frames_per_slot=3.0, most_slots=25),  # each slot needs its share of the iterations
     field_rates=FieldRates(cells=5e-2),
     exposure_rate=0.0,
     decay=0.03,

@@ -74,6 +74,8 @@ def test_a_change_that_cannot_be_says_why(change: str, said: str) -> None:
 def test_slots_of_time_grow_with_the_clip() -> None:
     shape = FieldShape(frames_per_slot=3.0)
     assert [shape.slots(frames) for frames in (1, 3, 30, 300)] == [2, 2, 11, 101]
+    shape = FieldShape(frames_per_slot=3.0, most_slots=25)
+    assert [shape.slots(frames) for frames in (1, 30, 63, 300)] == [2, 11, 22, 25]
 
 
 @pytest.mark.parametrize("frames", [30, 63, 179, 1000])
