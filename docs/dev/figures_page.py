@@ -160,12 +160,12 @@ def _headline() -> str:
             f"the picture before, shown again: {seen['copy_psnr']:.1f} dB",
         ),
         (
-            f"frame by frame, {step['gaussians']['mean'] / 1e3:.0f} thousand: picture; in the lift",
+            f"frame by frame, {step['gaussians']['mean'] / 1e3:.0f} thousand: picture; the whole lift",
             f"{online['psnr']:.1f}; {lift['online']['psnr']:.1f} dB",
             f"the picture before: {before['copy_psnr']:.1f}; {lift['predict']['copy_psnr']:.1f} dB",
         ),
         (
-            "frames kept back; in the lift",
+            "frames kept back; the whole lift",
             f"{kept['psnr']:.1f}; {lift['heldout']['psnr']:.1f} dB",
             f"the picture before: {kept['copy_psnr']:.1f}; {lift['heldout']['copy_psnr']:.1f} dB",
         ),
