@@ -72,6 +72,17 @@ def test_every_file_that_is_named_exists(page: Path) -> None:
     assert sorted(path for path in named if not (ROOT / path).exists()) == []
 
 
+@pytest.mark.parametrize("script", ["Makefile", ".ci/run", ".ci/nightly"])
+def test_every_file_that_a_script_runs_exists(script: str) -> None:
+    run = set(re.findall(r"(?:tests|docs)/[\w/]+\.(?:py|sh)", (ROOT / script).read_text(encoding="utf-8")))
+    assert sorted(path for path in run if not (ROOT / path).is_file()) == []
+
+
+def test_the_tests_for_other_processors_exist() -> None:
+    files = runpy.run_path(str(ROOT / "tests/targets.py"))["TESTS"]
+    assert [file.name for file in files if not file.is_file()] == []
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_every_link_leads_to_a_file_and_to_a_title_in_it(page: Path) -> None:
     links = re.findall(r"\]\((?!https?:)([^)#\s]*)(?:#([^)\s]*))?\)", page.read_text(encoding="utf-8"))
