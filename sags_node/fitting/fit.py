@@ -123,8 +123,7 @@ class Fit:
         """A step of the paper's schedule."""
         deformed = self.iteration >= self.warm_up
         frame = self._next_frame() if deformed else self.clip.train[0]
-        done, of = self._stage
-        share = self.settings.decay ** (done / (self.settings.decay_over or max(1, of)))
+        share = self.settings.rate_share(*self._stage)
         drawing = self.model.draw(self.rasterizer, frame.t_capture_ns, frame.camera, deformed)
         found = compare(
             drawing.planes, frame.image, frame.tissue, frame.depth, self._unseen, self.settings.weights

@@ -100,6 +100,9 @@ class FitSettings:
     exposure_rate: float = 2e-3  # of the gains
     decay: float = 0.01  # rates that decay fall to this share of their first values
     decay_over: int | None = None  # in so many iterations of a stage; None: in all that it has
+    # Share of a stage after which they fall in a straight line (Hu et al. 2024, MiniCPM, section 4); None:
+    # all along by the same factor.
+    stable: float | None = None
     growth: Growth = Growth()
     weights: LossWeights = STEREO  # only with schedule = paper
     smooth_everywhere: bool = False  # False: the two kinds of smoothness are for what no frame shows
@@ -107,12 +110,21 @@ class FitSettings:
     def __post_init__(self) -> None:
         """
         Raises:
-            UsageError: the block is an MLP, but its tokens attend to each other.
+            UsageError: the block is an MLP, but its tokens attend to each other; `stable` is no share.
         """
         if self.block == "mlp" and self.tokens != "self":
             raise UsageError(
                 f"an MLP in the place of the block has no attention; use tokens self, not {self.tokens}"
             )
+        if self.stable is not None and not 0 <= self.stable < 1:
+            raise UsageError(f"stable is a share of a stage from 0 to below 1, not {self.stable}")
+
+    def rate_share(self, done: int, of: int) -> float:
+        """Of rates that decay: the share that is left after `done` of a stage's iterations."""
+        if self.stable is None:
+            falling: float = self.decay ** (done / (self.decay_over or max(1, of)))
+            return falling
+        return 1 - (1 - self.decay) * max(0.0, (done / max(1, of) - self.stable) / (1 - self.stable))
 
 
 ONLINE = FitSettings()
@@ -122,10 +134,11 @@ PAPER = FitSettings(
     tokens="self",
     iterations=3000,
     shape=FieldShape(frames_per_slot=3.0, most_slots=25),  # each slot needs its share of the iterations
-    field_rates=FieldRates(cells=5e-2),
+    field_rates=FieldRates(cells=2.5e-2, decoder=5e-4),
     exposure_rate=0.0,
     decay=0.03,
-    growth=Growth(opacity=0.9, scale=0.6, share=0.15),
+    stable=0.7,
+    growth=Growth(first=60_000, opacity=0.9, scale=0.6, share=0.15),
 )
 # Each number as in the authors' code for EndoNeRF (H-Wenfeng/SAGS and EndoGaussian, which it is built on).
 # Their SH degree is 3: with one camera that stands still this is a second rate for the same colours, and is

@@ -55,6 +55,15 @@ def test_any_setting_can_be_changed() -> None:
         assert with_changes(preset, []) == preset
 
 
+def test_rates_fall_by_a_factor_all_along_or_in_a_line_at_the_end() -> None:
+    falling = with_changes(ONLINE, ["decay=0.01"])
+    assert [falling.rate_share(done, 100) for done in (0, 50, 100)] == pytest.approx([1, 0.1, 0.01])
+    stable = with_changes(falling, ["stable=0.5"])
+    shares = [stable.rate_share(done, 100) for done in (0, 50, 75, 100)]
+    assert shares == pytest.approx([1, 1, 0.505, 0.01])
+    assert with_changes(falling, ["decay_over=200"]).rate_share(100, 100) == pytest.approx(0.1)
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -63,6 +72,7 @@ def test_any_setting_can_be_changed() -> None:
         ("levels", "KEY=VALUE"),
         ("shape.levels=many", "shape.levels"),
         ("rates.decaying=[everything]", "means"),
+        ("stable=1.0", "below 1"),
         ("block=big", "adaptive"),
     ],
 )
