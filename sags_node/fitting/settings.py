@@ -100,8 +100,8 @@ class FitSettings:
     exposure_rate: float = 2e-3  # of the gains
     decay: float = 0.01  # rates that decay fall to this share of their first values
     decay_over: int | None = None  # in so many iterations of a stage; None: in all that it has
-    # Share of a stage after which they fall in a straight line (Hu et al. 2024, MiniCPM, section 4); None:
-    # all along by the same factor.
+    # Only with schedule = paper: share of a stage after which they fall, in a straight line (Hu et al. 2024,
+    # MiniCPM, section 4); None: all along, by the same factor.
     stable: float | None = None
     growth: Growth = Growth()
     weights: LossWeights = STEREO  # only with schedule = paper
