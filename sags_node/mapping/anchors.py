@@ -42,6 +42,7 @@ SOFT = 1e-4  # m; Gaussians nearer than this weigh the same
 RENEW_BELOW = 0.8  # share of the weight still there: below it new neighbours are taken
 RENEWED_PER_FRAME = 8  # anchors; taking neighbours costs a third of a millisecond
 
+POINTING = 4  # px: a place is not pointed at more exactly; a speck without depth is smaller
 SEEN_RADIUS = 2  # px around the anchor that must be free for it to be fully visible
 PATCH_RADIUS = 10  # px
 SEARCH_RADIUS = 4  # px, of an anchor found in the frame before
@@ -130,7 +131,7 @@ class Anchors:
             if self._usable is not None and not self._usable[row, column]:
                 why = "lies in a box of vision.tissue.exclude, or outside the camera's own picture"
             raise SagsError(f"pixel ({u:g}, {v:g}) {why}, so no tissue is known there; choose another")
-        depth = float(view.depth[row, column]) or float(observation.depth[row, column])
+        depth = _depth_near(row, column, observation, view)
         if depth <= 0:
             raise SagsError(
                 f"there is no depth at pixel ({u:g}, {v:g}) in this frame, or only one borrowed from afar; "
@@ -382,6 +383,18 @@ def _hold(table: _Table, i: int, carriers: tuple[I64, F64, F64]) -> None:
     if count:
         table.carriers[i], table.weights[i] = _NOBODY, 0
         table.carriers[i, :count], table.weights[i, :count], table.means[i, :count] = carriers
+
+
+def _depth_near(row: int, column: int, observation: Observation, view: RenderedView) -> float:
+    """Depth (m) drawn or measured at a pixel, or at the nearest one of tissue within POINTING; 0: unknown."""
+    rows, columns = (slice(max(0, at - POINTING), at + POINTING + 1) for at in (row, column))
+    drawn, measured = view.depth[rows, columns], observation.depth[rows, columns]
+    depth = np.where(drawn > 0, drawn, measured) * observation.tissue[rows, columns]
+    y, x = np.nonzero(depth > 0)
+    if len(y) == 0:
+        return 0.0
+    nearest = np.hypot(y + rows.start - row, x + columns.start - column).argmin()
+    return float(depth[y[nearest], x[nearest]])
 
 
 def _row(anchor_id: int, point: F64, carriers: tuple[I64, F64, F64]) -> _Table:

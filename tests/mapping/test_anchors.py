@@ -93,6 +93,19 @@ def test_it_knows_its_depth_as_well_as_the_tissue_that_carries_it() -> None:
         assert anchors.at(PERIOD_NS).depth_confidence[0] == pytest.approx(2 ** (-1 / 3), rel=1e-3)
 
 
+def test_a_speck_without_depth_takes_the_nearest_depth_of_tissue() -> None:
+    """Drawn surfaces have such specks; a finger points no better than to some pixels."""
+    observation, snapshot, view = flat(0)
+    observation.depth[47:54, 37:44] = view.depth[47:54, 37:44] = 0
+    view.depth[50, 36] = 0.99 * DEPTH
+    for row, column in ((46, 40), (50, 44), (54, 40)):  # as near
+        observation.tissue[row, column] = False
+    anchors = Anchors()
+    anchors.add_pixel(40, 50, observation, snapshot, view)
+    point, pixel, _, _ = only(anchors.at(0))
+    assert point[2] == pytest.approx(0.99 * DEPTH) and np.allclose(pixel, [40, 50], atol=1e-3)
+
+
 def test_gaussians_far_away_do_not_move_it() -> None:
     anchors = Anchors()
     anchors.add_pixel(30, 50, *flat(0))

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 
 import independent_client
@@ -179,11 +180,12 @@ def test_the_consumer_of_the_readme_runs_as_it_stands(
     )
     try:
         assert consumer.stdout is not None
-        lines = [consumer.stdout.readline() for _ in range(5)]
+        known = (line for line in consumer.stdout if not line.startswith("depth nan"))
+        lines = list(islice(known, 5))
     finally:
         running.stop()
         said = consumer.communicate(timeout=60)[1]  # nothing comes any more, so it ends
-    assert consumer.returncode == 0 and all(lines), said
+    assert consumer.returncode == 0 and len(lines) == 5, said
     for line in lines:
         found = re.fullmatch(r"depth (\S+) m, anchor (\S+) (\S+) (\S+) m\n", line)
         assert found is not None, line
