@@ -129,7 +129,7 @@ def _iterate(fit: Fit, stored: Path, advance: Advance) -> None:
         while not fit.done:
             fit.iterate()
             if fit.iteration % SHOWN_EVERY == 0 or fit.done:
-                what = f"fitting, L1 {fit.residual:.4f}, {len(fit.model)} Gaussians"
+                what = f"fitting, colours differ by {fit.residual:.4f}, {len(fit.model)} Gaussians"
                 advance(fit.iteration, fit.total, what)
             if time.monotonic() - saved > CHECKPOINT_PERIOD:
                 checkpoint.save(fit, stored)

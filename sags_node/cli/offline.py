@@ -235,7 +235,7 @@ def fit(
         "tokens": tokens,
         "block": block,
         "max_gaussians": max_gaussians,
-        "weights": MONOCULAR if monocular else None,
+        "weights": replace(settings.weights, **MONOCULAR) if monocular else None,
     }
     given: dict[str, Any] = {name: value for name, value in asked.items() if value is not None}
     settings = replace(settings, antialias=not no_alias_free, seed=seed, **given)

@@ -6,7 +6,7 @@ With coverage A, colour c = C / A and depth d = D / A of a pixel, each term is a
 applies to (the two kinds of smoothness over the whole picture, so that a small region is not pulled harder
 than a large one):
 
-    color             |c - image|                           tissue                         lambda_1
+    color             |c - image|, or softer                tissue                         lambda_1
     inverse_depth     |1/d - 1/depth|                       tissue with a depth            lambda_2
     smoothness        total variation of c                  where tissue was never seen    lambda_3
     depth_smoothness  total variation of d                  where tissue was never seen    lambda_4
@@ -60,7 +60,13 @@ class Compared(NamedTuple):
 
 
 def compare(
-    planes: Tensor, image: U8, tissue: Bool, depth: F32, unseen: Bool, weights: LossWeights
+    planes: Tensor,
+    image: U8,
+    tissue: Bool,
+    depth: F32,
+    unseen: Bool,
+    weights: LossWeights,
+    softness: float = 0,
 ) -> Compared:
     """The loss, differentiable in the planes. NaN and infinity in frame or planes take a pixel out.
 
@@ -72,6 +78,8 @@ def compare(
             offset: 1 / that, and the term `correlation`.
         unseen: [H, W] where the two kinds of smoothness apply.
         weights: of the terms.
+        softness: s of sqrt(d^2 + s^2) - s, which is what a difference d of colours counts (Charbonnier et
+            al. 1994): where it is smaller than s by its square, as in PSNR. 0, as in the paper: |d|.
     """
     explained, given = torch.from_numpy(tissue), torch.from_numpy(depth).to(planes.dtype)
     truth = torch.from_numpy(image).to(planes.dtype).permute(2, 0, 1) / 255
@@ -83,7 +91,7 @@ def compare(
     color, distance = drawn[:3], drawn[3]
     used = explained & covered
     count = used.sum().clamp(min=1)
-    terms = {"color": ((color - truth).abs() * used).sum() / (3 * count)}
+    terms = {"color": (_distance(color - truth, softness) * used).sum() / (3 * count)}
     measured = explained & deep & given.isfinite() & (given > 0) & (distance > NEAREST)
     if weights.inverse_depth or weights.correlation:
         inverse_drawn, inverse_given = (1 / torch.where(measured, each, 1) for each in (distance, given))
@@ -103,6 +111,10 @@ def compare(
     loss = torch.stack([getattr(weights, name) * term for name, term in terms.items()]).sum()
     counted = torch.where(used, 1 / coverage.detach(), 0).numpy()
     return Compared(loss, terms, counted.astype(np.float32, copy=False))
+
+
+def _distance(difference: Tensor, softness: float) -> Tensor:
+    return (difference**2 + softness**2).sqrt() - softness if softness else difference.abs()
 
 
 def correlation(drawn: Tensor, given: Tensor) -> Tensor:

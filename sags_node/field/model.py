@@ -27,12 +27,11 @@ class Rates(NamedTuple):
 
     rows: F32  # [14] of the canonical rows
     field: FieldRates
-    exposure: float = 0.0  # of the gains
     slopes: float = 0.0
 
     def scaled(self, factor: float) -> Rates:
         rows = self.rows * np.float32(factor)
-        return Rates(rows, self.field.scaled(factor), factor * self.exposure, factor * self.slopes)
+        return Rates(rows, self.field.scaled(factor), factor * self.slopes)
 
 
 class DeformableModel:
@@ -87,14 +86,12 @@ class DeformableModel:
     ) -> Drawing:  # fmt: skip
         """The model at one time, drawn for a camera it is fitted to, to learn from: `Drawing.differentiate`,
         then `descend`. `whole`: that camera with all its pixels, for the 3D filter; None: it has them."""
-        self._t_ns = t_ns
-        self._gain = torch.from_numpy(self.exposure.at(t_ns)).requires_grad_()
-        return self._drawn(rasterizer, self.rows_at(t_ns, deformed), camera, whole)
+        return self._drawn(rasterizer, self.rows_at(t_ns, deformed), t_ns, camera, whole)
 
     def _drawn(
-        self, rasterizer: Rasterizer, rows: Tensor, camera: Camera, whole: Camera | None = None
+        self, rasterizer: Rasterizer, rows: Tensor, t_ns: int, camera: Camera, whole: Camera | None = None
     ) -> Drawing:
-        (exposed, slopes), fitted = self._exposed(rows, self._gain), [whole or camera]
+        (exposed, slopes), fitted = self._exposed(rows, t_ns), [whole or camera]
         return Drawing(rasterizer, camera, exposed, slopes, self.ids, fitted if self.smooth else None)
 
     @torch.no_grad()
@@ -120,10 +117,11 @@ class DeformableModel:
         return self._shown(rows, last_ns, cameras)
 
     def _shown(self, rows: Tensor, t_ns: int, cameras: Sequence[Camera]) -> Gaussians:
-        exposed, slopes = self._exposed(rows, torch.from_numpy(self.exposure.at(t_ns)))
+        exposed, slopes = self._exposed(rows, t_ns)
         return to_gaussians(exposed, slopes, self.ids, cameras if self.smooth else None)
 
-    def _exposed(self, rows: Tensor, gain: Tensor) -> tuple[Tensor, Tensor | None]:
+    def _exposed(self, rows: Tensor, t_ns: int) -> tuple[Tensor, Tensor | None]:
+        gain = torch.from_numpy(self.exposure.at(t_ns))
         before, color, after = (
             rows[:, : columns.COLOR.start],
             rows[:, columns.COLOR],
@@ -132,10 +130,10 @@ class DeformableModel:
         slopes = None if self.slopes is None else self.slopes * gain.mean()
         return torch.cat([before, color * gain, after], 1), slopes
 
-    def descend(self, drawing: Drawing, rates: Rates) -> None:
-        """One step of Adam on all that the drawing came from, against the gradients it was given; Gaussians
-        that were not seen stay as they are."""
-        seen = np.flatnonzero(drawing.contribution > 0)
+    def descend(self, drawings: Sequence[Drawing], rates: Rates) -> None:
+        """One step of Adam on all that the drawings came from, against the gradients they were given.
+        Gaussians that none of them saw stay as they are."""
+        seen = np.flatnonzero(np.any([drawing.contribution > 0 for drawing in drawings], axis=0))
         assert self.rows.grad is not None
         adam_step(self.table, self.rows.grad.numpy(), self.adam, rates.rows, rows=seen)
         self.rows.grad = None
@@ -144,8 +142,6 @@ class DeformableModel:
             slopes = self.slopes.detach().numpy()
             adam_step(slopes, self.slopes.grad.numpy(), self.slopes_adam, slope_rates, rows=seen)
             self.slopes.grad = None
-        if self._gain.grad is not None:
-            self.exposure.descend(self._t_ns, self._gain.grad.numpy(), rates.exposure)
         self.field.deltas.step(rates.field)
 
     def keep(self, kept: Bool) -> None:

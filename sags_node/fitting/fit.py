@@ -59,7 +59,7 @@ class Fit:
         first = clip.train[0]
         height, width = first.tissue.shape
         self.rasterizer = make_rasterizer("numba", width, height, antialias=settings.antialias)
-        self.residual = 0.0  # mean absolute colour residual before the last iteration
+        self.residual = 0.0  # how much colours differed in the last iteration, as its loss counts it
         self._unseen = ~np.any([frame.tissue for frame in clip.train], axis=0) | settings.smooth_everywhere
         self._v_planes = np.zeros((5, height, width), np.float32)
         self._weight = np.zeros((height, width), np.float32)
@@ -122,21 +122,23 @@ class Fit:
     def _descend(self) -> None:
         """A step of the paper's schedule."""
         deformed = self.iteration >= self.warm_up
-        frame = self._next_frame() if deformed else self.clip.train[0]
-        share = self.settings.rate_share(*self._stage)
-        drawing = self.model.draw(self.rasterizer, frame.t_capture_ns, frame.camera, deformed)
-        found = compare(
-            drawing.planes, frame.image, frame.tissue, frame.depth, self._unseen, self.settings.weights
-        )
-        drawing.differentiate(found.loss, found.weight)
+        drawings = []
+        for _ in range(self.settings.frames if deformed else 1):
+            frame = self._next_frame() if deformed else self.clip.train[0]
+            drawing = self.model.draw(self.rasterizer, frame.t_capture_ns, frame.camera, deformed)
+            found = compare(
+                drawing.planes, frame.image, frame.tissue, frame.depth, self._unseen, self.settings.weights,
+                self.settings.color_softness,
+            )  # fmt: skip
+            drawing.differentiate(found.loss, found.weight)
+            self._density.observe(drawing.v_means, drawing.contribution)
+            drawings.append(drawing)
         self.residual = found.terms["color"].item()
-        self._density.observe(drawing.v_means, drawing.contribution)
+        share = self.settings.rate_share(*self._stage)
         rates = Rates(
-            self._rates * np.float32(share) ** self._decays,
-            self.settings.field_rates.scaled(share),
-            self.settings.exposure_rate * share,
+            self._rates * np.float32(share) ** self._decays, self.settings.field_rates.scaled(share)
         )
-        self.model.descend(drawing, rates)
+        self.model.descend(drawings, rates)
         self.iteration += 1
         growth = self.settings.growth
         if self.iteration % growth.every == 0 and self._progress() < growth.until:
@@ -183,7 +185,7 @@ class Fit:
             "pull": self._density.pull,
             "seen": self._density.seen,
         }
-        remembered = {"rows": [model.adam], "gains": [model.exposure.adam], "cells": [deltas.hexplane.adam]}
+        remembered = {"rows": [model.adam], "cells": [deltas.hexplane.adam]}
         if isinstance(model.field, NodeField):
             found |= {"index": model.field.index.numpy(), "weight": model.field.weight.numpy()}
         if isinstance(model, RefinedModel) and model.slopes is not None:
@@ -232,8 +234,7 @@ class Fit:
             field.index, field.weight = torch.from_numpy(arrays["index"]), torch.from_numpy(arrays["weight"])
         deltas.hexplane.cells.detach().numpy()[:] = arrays["cells"]
         exposure.gains[:] = arrays["gains"]
-        (model.adam,), (exposure.adam,) = _remembered(arrays, "rows"), _remembered(arrays, "gains")
-        (deltas.hexplane.adam,) = _remembered(arrays, "cells")
+        (model.adam,), (deltas.hexplane.adam,) = _remembered(arrays, "rows"), _remembered(arrays, "cells")
         model.ids, model.next_id = arrays["ids"], int(state["next_id"])
         of_decoder = {
             name: torch.from_numpy(arrays[f"decoder.{name}"]) for name in deltas.decoder.state_dict()

@@ -32,12 +32,12 @@ class RefinedModel(DeformableModel):
     def draw_to_refine(self, rasterizer: Rasterizer, t_ns: int, camera: Camera) -> Drawing:
         """The model at one time, drawn to `refine` it. The field is not moved by colours: those are the
         residuals'."""
-        self._t_ns, self._gain = t_ns, torch.from_numpy(self.exposure.at(t_ns))
+        self._t_ns = t_ns
         self._own = torch.from_numpy(self.residuals.at(t_ns)).requires_grad_()
         rows = self.field.deform(self.rows.detach(), t_ns)
         color = columns.COLOR
         still = torch.cat([rows[:, : color.start], rows[:, color].detach(), rows[:, color.stop :]], 1)
-        return self._drawn(rasterizer, still + self._own, camera)
+        return self._drawn(rasterizer, still + self._own, t_ns, camera)
 
     def refine(self, drawing: Drawing, rates: F32, relaxation: float, field_rates: FieldRates) -> None:
         """One step on residuals, slopes and field, against the gradients that the drawing was given: of half
@@ -50,8 +50,9 @@ class RefinedModel(DeformableModel):
             field_rates: of the field.
         """
         assert self._own.grad is not None and self.slopes is not None and self.slopes.grad is not None
-        gain, v_rows = self._gain.numpy(), self._own.grad.numpy()
-        v_colors = v_rows[:, columns.COLOR] / gain
+        gain: F32 = self.exposure.at(self._t_ns)
+        v_rows: F32 = self._own.grad.numpy()
+        v_colors: F32 = v_rows[:, columns.COLOR] / gain
         v_rows[:, columns.COLOR] = 0
         steps = Steps(rates, (relaxation / gain).astype(np.float32))
         self.residuals.refine(self._t_ns, v_rows, v_colors, drawing.contribution, steps)

@@ -22,7 +22,7 @@ PARTS: tuple[Part, ...] = ("means", "log_scales", "quats", "colors", "logits")
 
 
 STEREO = LossWeights(coverage=0.1)
-MONOCULAR = LossWeights(inverse_depth=0.0, correlation=1e-3, coverage=0.1)  # depth up to scale and shift
+MONOCULAR = {"inverse_depth": 0.0, "correlation": 1e-3}  # of these weights: depth up to scale and shift
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,20 +97,22 @@ class FitSettings:
     shape: FieldShape = FieldShape()
     rates: RowRates = RowRates()  # only with schedule = paper
     field_rates: FieldRates = field(default_factory=FieldRates)
-    exposure_rate: float = 2e-3  # of the gains
     decay: float = 0.01  # rates that decay fall to this share of their first values
     decay_over: int | None = None  # in so many iterations of a stage; None: in all that it has
     # Only with schedule = paper: share of a stage after which they fall, in a straight line (Hu et al. 2024,
     # MiniCPM, section 4); None: all along, by the same factor.
     stable: float | None = None
     growth: Growth = Growth()
+    frames: int = 1  # training frames of an iteration, whose gradients are added; only with schedule = paper
     weights: LossWeights = STEREO  # only with schedule = paper
+    color_softness: float = 0.0  # of 1, see `field.losses.compare`; the same
     smooth_everywhere: bool = False  # False: the two kinds of smoothness are for what no frame shows
 
     def __post_init__(self) -> None:
         """
         Raises:
-            UsageError: the block is an MLP, but its tokens attend to each other; `stable` is no share.
+            UsageError: the block is an MLP, but its tokens attend to each other; `stable` is no share; an
+                iteration has no frame.
         """
         if self.block == "mlp" and self.tokens != "self":
             raise UsageError(
@@ -118,6 +120,8 @@ class FitSettings:
             )
         if self.stable is not None and not 0 <= self.stable < 1:
             raise UsageError(f"stable is a share of a stage from 0 to below 1, not {self.stable}")
+        if self.frames < 1:
+            raise UsageError(f"an iteration needs at least 1 of the training frames, not {self.frames}")
 
     def rate_share(self, done: int, of: int) -> float:
         """Of rates that decay: the share that is left after `done` of a stage's iterations."""
@@ -133,12 +137,13 @@ PAPER = FitSettings(
     schedule="paper",
     tokens="self",
     iterations=3000,
-    shape=FieldShape(frames_per_slot=3.0, most_slots=25),  # each slot needs its share of the iterations
+    shape=FieldShape(frames_per_slot=3.0, most_slots=40),  # each slot needs its share of the iterations
     field_rates=FieldRates(cells=2.5e-2, decoder=5e-4),
-    exposure_rate=0.0,
     decay=0.03,
     stable=0.7,
     growth=Growth(first=60_000, opacity=0.9, scale=0.6, share=0.15),
+    frames=2,
+    color_softness=0.15,  # more than most differences
 )
 # Each number as in the authors' code for EndoNeRF (H-Wenfeng/SAGS and EndoGaussian, which it is built on).
 # Their SH degree is 3: with one camera that stands still this is a second rate for the same colours, and is
@@ -157,7 +162,6 @@ RELEASED = FitSettings(
         xavier=True,
     ),
     rates=RowRates(mean_px=0.015, color=7.05e-4, decaying=("means",)),  # 1.6e-3 mm at 60 mm and 569 px
-    exposure_rate=0.0,  # they have no exposure
     decay_over=4000,
     growth=Growth(share=1.0),
     weights=LossWeights(),

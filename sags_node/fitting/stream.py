@@ -162,7 +162,7 @@ class StreamFit:
         drawing = self.model.draw(self.rasterizer, frame.t_capture_ns, frame.camera, deformed)
         found = compare(drawing.planes, frame.image, frame.tissue, frame.depth, self._unseen, WEIGHTS)
         drawing.differentiate(found.loss, found.weight)
-        self.model.descend(drawing, Rates(self._rates * np.float32(speed), FieldRates()))
+        self.model.descend([drawing], Rates(self._rates * np.float32(speed), FieldRates()))
         drawn = drawing.contribution > densify.IDLE
         self._drawn_ns[drawn] = np.maximum(self._drawn_ns[drawn], frame.t_capture_ns)
 

@@ -322,7 +322,7 @@ class SagsMapper:
         rates = self._rates * np.float32(FIRST_SPEED if self._first_steps < FIRST_STEPS else 1)
         if frame is self.kept[-1]:
             self.model.contribution[:], self._loss = drawing.contribution, loss
-        field.descend(drawing, Rates(rates, FieldRates()))
+        field.descend([drawing], Rates(rates, FieldRates()))
         self._first_steps += 1
 
     def _write(self, frame: Kept) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from sags_node.engine.adam import AdamState, adam_step
 from sags_node.types import F32, I64
 
 NEUTRAL = 1e-6  # below this brightness a picture says nothing of its exposure
@@ -22,22 +21,14 @@ class Exposure:
         """
         Args:
             times_ns: [T] ascending.
-            brightness: [T, 3] mean colour of the tissue at these times: the first guess of the gains.
+            brightness: [T, 3] mean colour of the tissue at these times.
         """
         self.times_ns = times_ns
         lit = brightness.min(axis=1) > NEUTRAL
         reference = np.exp(np.log(np.maximum(brightness[lit], NEUTRAL)).mean(axis=0)) if lit.any() else 1.0
         self.gains = np.where(lit[:, None], brightness / reference, 1.0).astype(np.float32)
-        self.adam = AdamState.new(len(times_ns), 3)
 
     def at(self, t_ns: int) -> F32:
         """Gain [3] at one time."""
         gain = [np.interp(t_ns, self.times_ns, self.gains[:, channel]) for channel in range(3)]
         return np.array(gain, np.float32)
-
-    def descend(self, t_ns: int, v_gain: F32, rate: float) -> None:
-        """One step of Adam on the gain of the frame nearest in time, against its gradient [3]."""
-        nearest = np.array([np.abs(self.times_ns - t_ns).argmin()])
-        gradients = np.zeros_like(self.gains)
-        gradients[nearest] = v_gain
-        adam_step(self.gains, gradients, self.adam, np.full(3, rate, np.float32), rows=nearest)

@@ -83,6 +83,20 @@ def test_gradients_against_differences(term: str) -> None:
     assert slope == pytest.approx(float((gradient * direction).sum()), rel=1e-3)
 
 
+def test_soft_differences_of_colours_by_hand_and_their_gradient() -> None:
+    given = frame()
+    off, softness = dataclasses.replace(OFF, color=1.0), 0.15
+    planes = given.pop("planes").requires_grad_()
+    found = compare(planes, **given, weights=off, softness=softness)
+    used, A = given["tissue"] & (planes[4] > 0.05).numpy(), planes[4].detach().numpy()
+    difference = (planes[:3].detach().numpy() / A - np.moveaxis(given["image"] / 255, 2, 0))[:, used]
+    length = np.hypot(difference, softness)
+    assert float(found.loss) == pytest.approx(float(np.mean(length - softness)), rel=1e-6)
+    (gradient,) = torch.autograd.grad(found.loss, planes)
+    expected = difference / length / A[used] / difference.size
+    np.testing.assert_allclose(gradient[:3].numpy()[:, used], expected, rtol=1e-6)
+
+
 def test_a_correlation_does_not_care_for_scale_and_offset() -> None:
     given = frame()
     weights = dataclasses.replace(OFF, correlation=1.0)

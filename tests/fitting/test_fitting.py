@@ -20,6 +20,7 @@ from sags_node.cli.main import main
 from sags_node.errors import SagsError, UsageError
 from sags_node.evaluation.metrics import psnr
 from sags_node.field.decoder import Decoder
+from sags_node.field.losses import compare
 from sags_node.field.model import FADE_NS, LOOK_BACK_NS
 from sags_node.fitting import checkpoint, start
 from sags_node.fitting.clip import Clip, read_clip
@@ -216,6 +217,26 @@ def test_pictures_carried_along_the_motion_beat_their_mean(clip: Clip, refined: 
     by_hand = psnr(before / 2 + after / 2, frame.image / np.float32(255), frame.tissue)
     assert mean["first"]["psnr"] == pytest.approx(by_hand, abs=0.01)
     assert score_between(refined.fit, clip.train, {}) is None
+
+
+def test_an_iteration_of_several_frames_descends_on_all_of_them(clip: Clip) -> None:
+    """The first step of Adam goes by the sign of the gradient: that of the frames' losses together."""
+    settings = dataclasses.replace(PAPER, warm_up=0, iterations=1, frames=len(clip.train))
+    start = fitted(clip, settings, iterations=0)
+    model, unseen = start.model, ~np.any([frame.tissue for frame in clip.train], axis=0)
+    slopes = []
+    for frame in clip.train:
+        drawing = model.draw(start.rasterizer, frame.t_capture_ns, frame.camera)
+        given = frame.image, frame.tissue, frame.depth, unseen, settings.weights
+        drawing.differentiate(compare(drawing.planes, *given).loss, np.ones(frame.tissue.shape, np.float32))
+        assert model.rows.grad is not None
+        slopes.append(model.rows.grad.numpy().copy())  # summed up
+    moved = fitted(clip, settings).model.table - model.table
+    seen = moved.any(axis=1)  # others lie where there is no tissue
+    clear = seen[:, None] & (np.abs(slopes[-1]) > 1e-3 * np.abs(slopes[-1]).max(axis=0))
+    assert seen.mean() > 0.99
+    assert (np.sign(moved) == -np.sign(slopes[-1]))[clear].all()
+    assert (np.sign(moved) != -np.sign(slopes[0]))[clear].any()  # not those of one frame
 
 
 def test_the_number_of_gaussians_stays_under_its_cap(clip: Clip) -> None:
