@@ -44,11 +44,12 @@ SHORTEST = 1e-12  # a shorter quaternion has no direction
 class FieldRates:
     """Learning rates of Adam."""
 
-    cells: float = 1.6e-2  # EndoGaussian and SAGS
+    cells: float = 1.6e-2  # EndoGaussian and SAGS; of the planes in space
     decoder: float = 1.6e-3
+    lines: float = 1.6e-2  # of the lines in time
 
     def scaled(self, factor: float) -> FieldRates:
-        return FieldRates(factor * self.cells, factor * self.decoder)
+        return FieldRates(factor * self.cells, factor * self.decoder, factor * self.lines)
 
 
 class Deltas:
@@ -78,7 +79,7 @@ class Deltas:
             self.optimizer.param_groups[0]["lr"] = rates.decoder
             self.optimizer.step()
         self.optimizer.zero_grad()
-        self.hexplane.step(rates.cells)
+        self.hexplane.step(rates.cells, rates.lines)
 
 
 class Field(Protocol):

@@ -165,13 +165,15 @@ class HexPlane:
         step[:, :3] = nodes[:, [1, 2, 2]]
         return Places(node, shares, torch.from_numpy(first), step)
 
-    def step(self, rate: float) -> None:
-        """Adam on the cells that the last backward pass touched, against their gradient."""
+    def step(self, planes: float, lines: float) -> None:
+        """Adam on the cells that the last backward pass touched, against their gradient; both rates."""
         gradient = self.cells.grad
         if gradient is not None:
-            rates = np.full(self.channels, rate, np.float32)
             values, touched = self.cells.detach().numpy(), rows_of(gradient.numpy())
-            adam_step(values, gradient.numpy(), self.adam, rates, rows=touched)
+            in_space = touched < self._space_rows
+            for rate, rows in ((planes, touched[in_space]), (lines, touched[~in_space])):
+                rates = np.full(self.channels, rate, np.float32)
+                adam_step(values, gradient.numpy(), self.adam, rates, rows=rows)
             self.cells.grad = None
 
     def advance(self, t_ns: int, retire: Callable[[int], None]) -> None:

@@ -137,8 +137,8 @@ PAPER = FitSettings(
     schedule="paper",
     tokens="self",
     iterations=3000,
-    shape=FieldShape(frames_per_slot=3.0, most_slots=40),  # each slot needs its share of the iterations
-    field_rates=FieldRates(cells=2.5e-2, decoder=5e-4),
+    shape=FieldShape(frames_per_slot=3.0, most_slots=25),  # each slot needs its share of the iterations
+    field_rates=FieldRates(cells=2.5e-2, decoder=5e-4, lines=5e-2),
     decay=0.03,
     stable=0.7,
     growth=Growth(first=60_000, opacity=0.9, scale=0.6, share=0.15),

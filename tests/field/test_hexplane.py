@@ -124,11 +124,12 @@ def test_a_step_moves_the_cells_that_took_part_and_no_other() -> None:
     field = small_field()
     before = field.cells.detach().clone()
     field.sample(torch.tensor([[0.011, 0.007, 0.053]]), T0).sum().backward()
-    field.step(0.1)
+    field.step(0.1, 0.2)
     moved = (field.cells.detach() != before).any(1)
     assert 0 < int(moved.sum()) <= 2 * (3 * 4 + 3 * 2)  # levels, corners of planes, nodes of lines
-    assert torch.allclose((field.cells.detach() - before)[moved].abs(), torch.tensor(0.1), rtol=1e-3)
-    field.step(0.1)
+    rates = torch.where(torch.arange(len(before)) < field.slot(0).start, 0.1, 0.2)  # planes, lines
+    assert torch.allclose((field.cells.detach() - before)[moved].abs(), rates[moved, None], rtol=1e-3)
+    field.step(0.1, 0.2)
     assert field.cells.grad is None  # nothing is learnt from the same gradient twice
 
 
@@ -277,7 +278,7 @@ def test_growth_keeps_old_cells_trainable() -> None:
     def fit(points: F32, target: float, steps: int) -> None:
         for _ in range(steps):
             residual(points, target).backward()  # type: ignore[no-untyped-call]
-            field.step(0.02)
+            field.step(0.02, 0.02)
 
     assert residual(first, 0.5) > 0.2
     fit(first, 0.5, 150)

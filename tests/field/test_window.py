@@ -212,7 +212,7 @@ def test_slopes_are_learnt_and_stay_with_their_gaussians() -> None:
     rasterizer = make_rasterizer("numba", 160, 128)
     drawing = model.draw(rasterizer, NEWEST_NS, camera)
     drawing.differentiate(drawing.planes[:3].square().sum(), np.ones((128, 160), np.float32))
-    model.descend([drawing], Rates(np.zeros(columns.COUNT, np.float32), FieldRates(0, 0), slopes=0.01))
+    model.descend([drawing], Rates(np.zeros(columns.COUNT, np.float32), FieldRates(0, 0, 0), slopes=0.01))
     seen = drawing.contribution > 0
     assert model.slopes is not None and seen.any()
     learnt = model.slopes.detach().numpy()
@@ -261,7 +261,7 @@ def test_a_fresh_field_learns_a_motion_and_leaves_the_oldest_slot_alone(tokens: 
 
     for _ in range(150):
         left().sum().backward()
-        deltas.step(FieldRates(cells=5e-3))
+        deltas.step(FieldRates(cells=5e-3, lines=5e-3))
     assert left().mean() < 0.3 * shift.abs().mean()
     assert torch.allclose(field.deform(rows, 0), rows, rtol=0, atol=ROUNDING)
 
