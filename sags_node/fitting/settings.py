@@ -138,6 +138,7 @@ PAPER = FitSettings(
     tokens="self",
     iterations=3000,
     shape=FieldShape(frames_per_slot=3.0, most_slots=25),  # each slot needs its share of the iterations
+    rates=RowRates(mean_px=0.16, log_scale=1e-2, color=5e-3),
     field_rates=FieldRates(cells=2.5e-2, decoder=5e-4, lines=5e-2),
     decay=0.03,
     stable=0.7,
