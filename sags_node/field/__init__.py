@@ -19,7 +19,7 @@ One step of learning, with any loss of the planes, or its gradient by them [5, H
     drawing = model.draw(rasterizer, t_ns, camera)                   .planes [5, H, W], a tensor with a graph
     found = compare(drawing.planes, image, tissue, depth, unseen, LossWeights())
     drawing.differentiate(found.loss, found.weight)                  then .contribution, .spread [N]
-    model.descend([drawing], Rates(rows, FieldRates(), slopes=rate))   Adam
+    model.descend([drawing], Rates(rows, FieldRates(), slopes=rate)) Adam
 
 Importing it imports torch, which takes a second: only what fits imports it, and where it does.
 
