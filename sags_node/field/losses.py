@@ -91,7 +91,7 @@ def compare(
     color, distance = drawn[:3], drawn[3]
     used = explained & covered
     count = used.sum().clamp(min=1)
-    terms = {"color": (_distance(color - truth, softness) * used).sum() / (3 * count)}
+    terms = {"color": (_charbonnier(color - truth, softness) * used).sum() / (3 * count)}
     measured = explained & deep & given.isfinite() & (given > 0) & (distance > NEAREST)
     if weights.inverse_depth or weights.correlation:
         inverse_drawn, inverse_given = (1 / torch.where(measured, each, 1) for each in (distance, given))
@@ -113,7 +113,7 @@ def compare(
     return Compared(loss, terms, counted.astype(np.float32, copy=False))
 
 
-def _distance(difference: Tensor, softness: float) -> Tensor:
+def _charbonnier(difference: Tensor, softness: float) -> Tensor:
     return (difference**2 + softness**2).sqrt() - softness if softness else difference.abs()
 
 

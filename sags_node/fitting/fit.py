@@ -123,7 +123,7 @@ class Fit:
         """A step of the paper's schedule."""
         deformed = self.iteration >= self.warm_up
         drawings = []
-        for _ in range(self.settings.frames if deformed else 1):
+        for _ in range(self.settings.batch_size if deformed else 1):
             frame = self._next_frame() if deformed else self.clip.train[0]
             drawing = self.model.draw(self.rasterizer, frame.t_capture_ns, frame.camera, deformed)
             found = compare(

@@ -103,16 +103,16 @@ class FitSettings:
     # MiniCPM, section 4); None: all along, by the same factor.
     stable: float | None = None
     growth: Growth = Growth()
-    frames: int = 1  # training frames of an iteration, whose gradients are added; only with schedule = paper
+    batch_size: int = 1  # frames of an iteration, whose losses are added; only with schedule = paper
     weights: LossWeights = STEREO  # only with schedule = paper
-    color_softness: float = 0.0  # of 1, see `field.losses.compare`; the same
+    color_softness: float = 0.0  # of RGB 0..1, see `field.losses.compare`; only with schedule = paper
     smooth_everywhere: bool = False  # False: the two kinds of smoothness are for what no frame shows
 
     def __post_init__(self) -> None:
         """
         Raises:
-            UsageError: the block is an MLP, but its tokens attend to each other; `stable` is no share; an
-                iteration has no frame.
+            UsageError: the block is an MLP, but its tokens attend to each other; `stable` is no share;
+                `batch_size` is below 1.
         """
         if self.block == "mlp" and self.tokens != "self":
             raise UsageError(
@@ -120,8 +120,8 @@ class FitSettings:
             )
         if self.stable is not None and not 0 <= self.stable < 1:
             raise UsageError(f"stable is a share of a stage from 0 to below 1, not {self.stable}")
-        if self.frames < 1:
-            raise UsageError(f"an iteration needs at least 1 of the training frames, not {self.frames}")
+        if self.batch_size < 1:
+            raise UsageError(f"batch_size is at least 1 frame, not {self.batch_size}")
 
     def rate_share(self, done: int, of: int) -> float:
         """Of rates that decay: the share that is left after `done` of a stage's iterations."""
@@ -143,7 +143,7 @@ PAPER = FitSettings(
     decay=0.03,
     stable=0.7,
     growth=Growth(first=60_000, opacity=0.9, scale=0.6, share=0.15),
-    frames=2,
+    batch_size=2,
     color_softness=0.15,  # more than most differences
 )
 # Each number as in the authors' code for EndoNeRF (H-Wenfeng/SAGS and EndoGaussian, which it is built on).

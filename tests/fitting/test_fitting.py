@@ -221,12 +221,12 @@ def test_pictures_carried_along_the_motion_beat_their_mean(clip: Clip, refined: 
 
 def test_an_iteration_of_several_frames_descends_on_all_of_them(clip: Clip) -> None:
     """The first step of Adam goes by the sign of the gradient: that of the frames' losses together."""
-    settings = dataclasses.replace(PAPER, warm_up=0, iterations=1, frames=len(clip.train))
-    start = fitted(clip, settings, iterations=0)
-    model, unseen = start.model, ~np.any([frame.tissue for frame in clip.train], axis=0)
+    settings = dataclasses.replace(PAPER, warm_up=0, iterations=1, batch_size=len(clip.train))
+    fit = fitted(clip, settings, iterations=0)
+    model, unseen = fit.model, ~np.any([frame.tissue for frame in clip.train], axis=0)
     slopes = []
     for frame in clip.train:
-        drawing = model.draw(start.rasterizer, frame.t_capture_ns, frame.camera)
+        drawing = model.draw(fit.rasterizer, frame.t_capture_ns, frame.camera)
         given = frame.image, frame.tissue, frame.depth, unseen, settings.weights
         drawing.differentiate(compare(drawing.planes, *given).loss, np.ones(frame.tissue.shape, np.float32))
         assert model.rows.grad is not None

@@ -73,7 +73,7 @@ def test_rates_fall_by_a_factor_all_along_or_in_a_line_at_the_end() -> None:
         ("shape.levels=many", "shape.levels"),
         ("rates.decaying=[everything]", "means"),
         ("stable=1.0", "below 1"),
-        ("frames=0", "at least 1"),
+        ("batch_size=0", "at least 1"),
         ("block=big", "adaptive"),
     ],
 )
