@@ -19,7 +19,7 @@ SIZES = (0.75, 0.5)  # of the launch file's working size
 COUNTS = (10_000, 20_000, 30_000, 50_000, 70_000)
 COUNT_BUDGETS_MS = (33.0, 100.0)
 SKIP_STEPS = 2  # per frame, where rules that leave work out are compared
-HURRIED_RULES = ("depth", "fitted")  # that act on rungs of the ladder where time is short
+HURRIED_RULES = ("depth",)  # that act on rungs of the ladder where time is short
 
 BUDGET, COUNT = "mapping.budget_ms", "mapping.max_gaussians"
 WIDTH, HEIGHT = "vision.width", "vision.height"
@@ -92,7 +92,7 @@ def skip_settings() -> dict[str, tuple[Setting, Setting]]:
     ladder on which it acts.
     """
     steps = Setting("skips", "all rules", (f"mapping.iterations:={SKIP_STEPS}",))
-    rung = max(i for i, each in enumerate(RUNGS) if each.step < 1 and each.depth_every > 1)
+    rung = max(i for i, each in enumerate(RUNGS) if each.depth_every > 1)
     hurry = Setting("skips", "in a hurry", ("mapping.iterations:=1", f"mapping.rung:={rung}"))
     pairs = {}
     for rule in (field.name for field in fields(Skips)):

@@ -92,16 +92,16 @@ def _ladder() -> str:
         for session in (d4d, phantom)
     ]
     rows = [
-        "| rung | Gaussians | size | depth every | step | redrawn | price, ms | frame, ms | CPU, ms "
+        "| rung | Gaussians | size | depth every | redrawn | price, ms | frame, ms | CPU, ms "
         "| Gaussians there were | online, dB | predict | right eye | depth, mm "
-        "| phantom: frame, ms | online, dB | depth, mm | points, mm |\n" + "|---" * 18 + "|\n"
+        "| phantom: frame, ms | online, dB | depth, mm | points, mm |\n" + "|---" * 17 + "|\n"
     ]
     for place, rung in enumerate(RUNGS):
         real, exact = (run[f"rung {place}"] for run in runs)
         cells = (
             f"{place}",
             f"{rung.gaussians:,}",
-            *(f"{value:g}" for value in (rung.scale, rung.depth_every, rung.step, rung.redraw)),
+            *(f"{value:g}" for value in (rung.scale, rung.depth_every, rung.redraw)),
             f"{price(rung, USED * rung.gaussians, FULL):.1f}",
             f"{real['frame_ms']['p50']:.1f}",
             f"{real['cpu_ms']['p50']:.0f}",

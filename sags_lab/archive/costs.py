@@ -80,7 +80,8 @@ def of_an_hour(job: str, short: Cost, long: Cost, frames: int, rate: float) -> d
     def scaled(less: float, more: float) -> int:
         if job in IN_CLIPS:
             return round(more * count / frames)
-        return round(more + (more - less) / (frames - fewer) * (count - frames))
+        further = max(0.0, more - less) / (frames - fewer)  # a report may be smaller for more frames
+        return round(more + further * (count - frames))
 
     return {
         "cpu_s": scaled(short.cpu_s, long.cpu_s),

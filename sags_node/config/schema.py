@@ -775,7 +775,7 @@ REMOVED = {
     "mapping.smoothing": "it is always on; `python -m benchmarks alias` says what it brings",
     "mapping.skip_duplicates": ALWAYS_ON,
     "mapping.skip_depth": ALWAYS_ON,
-    "mapping.skip_fitted": ALWAYS_ON,
+    "mapping.skip_fitted": "the first step is on the whole picture now: a part saved 0.2 ms and cost 0.26 dB",
     "mapping.skip_still": ALWAYS_ON,
     "source.smoke": SCENE,
     "source.noise": SCENE,

@@ -15,7 +15,6 @@ LEARNING = 0.2  # share of a new measurement in a running mean
 FORGET = 0.95  # of the cost of a step, per frame in which it seemed not to fit
 LEAST_FIRST_STEPS = 3  # of a new model in its first frame, whatever the time
 FIRST_SECONDS = 0.1  # of its first frame, after which the rest is left to those that follow
-WHOLE_EVERY = 8  # frames: a first step on the whole picture tells what each Gaussian shows
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,9 +24,6 @@ class FramePlan:
     rung: Rung  # at most
     state: RungState | None  # which rung that is and why; None: it is none of a ladder
     depth: bool  # may be matched
-    # Of the picture, where it is worst: what the first step is on. Often enough 1: only a step on all of it
-    # says which Gaussians show.
-    first_share: float
 
 
 class Budget(Protocol):
@@ -64,14 +60,12 @@ class StepBudget:
         self._steps = steps
         self._left = steps
         self._frames = 0
-        self.plan = FramePlan(rung, None, depth=True, first_share=1.0)
+        self.plan = FramePlan(rung, None, depth=True)
 
     def start(self, waited: float = 0.0) -> FramePlan:
         self._left = self._steps
         self._frames += 1
-        rung, whole = self._rung, self._frames % WHOLE_EVERY == 0
-        matched = self._frames % rung.depth_every == 0
-        self.plan = FramePlan(rung, None, matched, 1.0 if whole else rung.step)
+        self.plan = FramePlan(self._rung, None, self._frames % self._rung.depth_every == 0)
         return self.plan
 
     def more(self) -> bool:
@@ -101,7 +95,6 @@ class TimeBudget:
         self._after_cost = _RunningMean()
         self._cost_with_depth = _RunningMean()
         self._since_depth = 0  # frames, this one included
-        self._since_whole = 0
         self.plan = self.start()
 
     @property
@@ -114,14 +107,10 @@ class TimeBudget:
         self._deadline = self._started + max(0.0, self.ladder.seconds - waited)
         self._asks = 0
         self._since_depth += 1
-        self._since_whole += 1
         self._optional = 0.0  # s, spent on all steps but the first
         late = self._started + self._cost_with_depth.value > self._deadline
         depth = self._since_depth >= rung.depth_every + late
-        whole = self._since_whole >= WHOLE_EVERY or rung.step == 1
-        if whole:
-            self._since_whole = 0
-        self.plan = FramePlan(rung, self.ladder.state, depth, 1.0 if whole else rung.step)
+        self.plan = FramePlan(rung, self.ladder.state, depth)
         return self.plan
 
     def more_at_first(self, steps: int) -> bool:

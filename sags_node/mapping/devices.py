@@ -26,7 +26,6 @@ class Skips:
 
     duplicates: bool = True  # a frame equal to its predecessor is not mapped again
     depth: bool = True  # when time is short, depth is matched in some of the frames only
-    fitted: bool = True  # when time is short, it is refined where it fits worst only
     still: bool = True  # while nothing moves: no matching, a step where it pays most
 
 
@@ -65,7 +64,6 @@ def rungs_of(config: LaunchConfig, skips: Skips = ALL_SKIPS) -> tuple[Rung, ...]
             rung,
             gaussians=round(_speed(config) * rung.gaussians),
             depth_every=rung.depth_every if skips.depth else 1,
-            step=rung.step if skips.fitted else 1.0,
         )
         for rung in rungs
     )

@@ -56,12 +56,6 @@ def tiles_of(pixels: I32, mask: Bool) -> Bool:
     return tiles
 
 
-def pixels_of(tiles: Bool, shape: tuple[int, ...]) -> Bool:
-    """The pixels [H, W] of the tiles [rows, columns] of a picture of that shape."""
-    rows = np.repeat(tiles, TILE_HEIGHT, axis=0)[: shape[0]]
-    return np.repeat(rows, TILE_WIDTH, axis=1)[:, : shape[1]]
-
-
 def with_neighbours(tiles: Bool) -> Bool:
     """The tiles [rows, columns] and those less than `REACH` px away: a Gaussian may reach into them."""
     rows, columns = -(-REACH // TILE_HEIGHT), -(-REACH // TILE_WIDTH)

@@ -133,10 +133,7 @@ class GpuRefiner:
         return exposure_gain(self._fetched_planes(), observation.image, observation.tissue)
 
     @_or_on_the_cpu
-    def refine(self, rates: LearningRates, share: float = 1.0) -> None:
-        if share < 1.0:
-            self._step(rates, self._worst(share))
-            return
+    def refine(self, rates: LearningRates) -> None:
         self.on_gpu.rows["contribution"] = self._step(rates, None)
 
     @_or_on_the_cpu

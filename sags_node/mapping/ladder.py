@@ -22,7 +22,6 @@ class Rung:
     gaussians: int  # at most
     scale: float = 1.0  # of the working size: at which the model is drawn and refined
     depth_every: int = 1  # frames: how often depth is matched
-    step: float = 1.0  # share of the picture, where it is worst, that the first step is on
     redraw: float = 1.0  # share of the picture, where it was worst, that is drawn anew after the steps
 
 
@@ -33,7 +32,7 @@ RUNGS = (
     Rung(8_000, scale=0.5, depth_every=3, redraw=0.4),
     Rung(12_000, scale=0.5, depth_every=3, redraw=0.4),
     Rung(16_000, scale=0.5, depth_every=2, redraw=0.4),
-    Rung(16_000, scale=0.75, depth_every=2, step=0.6, redraw=0.4),
+    Rung(16_000, scale=0.75, depth_every=2, redraw=0.4),
     Rung(20_000, scale=0.75, depth_every=2, redraw=0.4),
     Rung(25_000, scale=0.75, depth_every=2, redraw=0.4),
     Rung(30_000, scale=0.75, depth_every=2, redraw=0.4),
@@ -89,9 +88,7 @@ def price(rung: Rung, gaussians: float, pixels: int) -> float:
     pictures = pixels / FULL
     drawn = rung.scale**2 * pictures
     vision = EVERY_FRAME + DEPTH / rung.depth_every + WORKED * pictures
-    return (
-        vision + drawn * (DRAWN * (1 + rung.redraw) + STEPPED * rung.step) + PER_THOUSAND * 1e-3 * gaussians
-    )
+    return vision + drawn * (DRAWN * (1 + rung.redraw) + STEPPED) + PER_THOUSAND * 1e-3 * gaussians
 
 
 def best_scale(rungs: Sequence[Rung], pixels: int, seconds: float, speed: float) -> float:

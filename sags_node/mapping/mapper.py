@@ -180,7 +180,7 @@ class Mapper:
         pixels, depths, errors = densify.candidates(planes, drawn, phase=7 * self._frames)
         iterations = 0
         if budget.more():
-            self._refiner.refine(self._next_rates(), budget.plan.first_share)
+            self._refiner.refine(self._next_rates())
             iterations = 1
         # 5. Densify: new Gaussians in the holes. A full model gives up what shows least for them.
         room = max(ADDED, limit - self.model.count)

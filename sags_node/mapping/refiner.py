@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -11,7 +10,7 @@ import numpy as np
 from sags_node.engine.losses.tissue import tissue_loss
 from sags_node.engine.rasterizer.rasterize import Gradients, Rasterizer
 from sags_node.mapping.exposure import exposure_gain
-from sags_node.mapping.focus import largest, pixels_of, sum_residuals, tile_grid
+from sags_node.mapping.focus import largest, sum_residuals, tile_grid
 from sags_node.mapping.optimiser import LearningRates, Optimiser
 from sags_node.model.deformation import NodeDeformation
 from sags_node.model.gaussians import GaussianModel
@@ -73,12 +72,10 @@ class Refiner(Protocol):
     def exposure_gain(self) -> F32:
         """[3] see `exposure.exposure_gain`, of what was drawn last."""
 
-    def refine(self, rates: LearningRates, share: float = 1.0) -> None:
+    def refine(self, rates: LearningRates) -> None:
         """One step on what was drawn last: loss and its gradient, back-propagation, nodes, Gaussians.
 
-        Args:
-            share: of the picture that counts, where it is worst. Only a step on all of it teaches the model
-                what each Gaussian contributes to the picture: the part does not tell what they show beyond.
+        Teaches the model what each Gaussian contributes to the picture, too; a part of it would not tell.
         """
 
     def refine_worst(self, share: float, rates: LearningRates, nodes: bool = True) -> None:
@@ -144,18 +141,13 @@ class CpuRefiner:
     def exposure_gain(self) -> F32:
         return exposure_gain(self._planes, self._observation.image, self._observation.tissue)
 
-    def refine(self, rates: LearningRates, share: float = 1.0) -> None:
-        observation, tissue = self._observation, self._observation.tissue
-        if share >= 1.0:
-            self._model.contribution[:] = self._step(observation, rates).contribution
-            return
-        tiles = self._worst_tiles(share)
-        self._step(replace(observation, tissue=tissue & pixels_of(tiles, tissue.shape)), rates)
+    def refine(self, rates: LearningRates) -> None:
+        self._model.contribution[:] = self._step(rates).contribution
 
     def refine_worst(self, share: float, rates: LearningRates, nodes: bool = True) -> None:
         tiles = self._worst_tiles(share)
         self._forward(tiles)
-        self._step(self._observation, rates, nodes)
+        self._step(rates, nodes)
         self._touched |= tiles
 
     def touched(self) -> Bool:
@@ -190,8 +182,8 @@ class CpuRefiner:
             made[size] = self._make_rasterizer(*size)
         return made[size]
 
-    def _step(self, observation: Observation, rates: LearningRates, nodes: bool = True) -> Gradients:
-        planes = self._planes
+    def _step(self, rates: LearningRates, nodes: bool = True) -> Gradients:
+        planes, observation = self._planes, self._observation
         if self._v_planes.shape != planes.shape:
             self._v_planes, self._weight = np.zeros_like(planes), np.zeros_like(planes[0])
         v_planes, weight = self._v_planes, self._weight

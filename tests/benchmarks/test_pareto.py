@@ -31,7 +31,7 @@ from sags_node.rig import load_rig
 from sags_node.sources.source import open_source
 from sags_node.vision.rectify import Rectifier
 
-RULES = {"skip_duplicates", "skip_depth", "skip_fitted", "skip_still"}
+RULES = {"skip_duplicates", "skip_depth", "skip_still"}
 
 
 def bench(*arguments: Any) -> Result:

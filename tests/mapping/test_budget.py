@@ -13,7 +13,6 @@ from sags_node.config.schema import LaunchConfig, MappingConfig
 from sags_node.mapping.budget import (
     FIRST_SECONDS,
     LEAST_FIRST_STEPS,
-    WHOLE_EVERY,
     StepBudget,
     TimeBudget,
 )
@@ -40,7 +39,6 @@ class Machine:
     now: float = 0.0
     budget: TimeBudget = field(init=False)
     matched: list[bool] = field(default_factory=list)  # whether depth was, frame by frame
-    shares: list[float] = field(default_factory=list)  # of the picture, in the first step
 
     def __post_init__(self) -> None:
         self.budget = TimeBudget(Ladder((self.rung,), FULL, self.seconds), clock=lambda: self.now)
@@ -55,8 +53,6 @@ class Machine:
             self.now += self.depth * self.matched[-1]
         while self.budget.more():
             steps += 1
-            if steps == 1:
-                self.shares.append(plan.first_share)
             self.now += self.step + 0.080 * (spike == "step" and steps == 2)
         self.now += self.after + 0.080 * (spike == "after")
         self.budget.finish(8000, matched=bool(self.depth) and plan.depth)
@@ -145,19 +141,6 @@ def test_depth_is_matched_as_often_as_the_rung_says_and_a_frame_later_where_one_
     for waited in (0.0, 0.030, 0.030, 0.0, 0.0, 0.0):
         machine.frame(waited)
     assert machine.matched == [True, False, False, True, False, True]
-
-
-def test_a_rung_with_steps_on_part_of_the_picture_has_one_on_all_of_it_now_and_then() -> None:
-    """Else nobody knows which Gaussians show, and the model loses 0.14 dB in 1000 frames."""
-    machine = Machine(Rung(10_000, step=0.6))
-    machine.play(100)
-    whole = np.flatnonzero(np.array(machine.shares) == 1)
-    assert set(machine.shares) == {0.6, 1.0} and set(np.diff(whole)) == {WHOLE_EVERY}
-    steps = StepBudget(1, Rung(10_000, step=0.6))
-    shares = []
-    for _ in range(3 * WHOLE_EVERY):
-        shares.append(steps.start().first_share)
-    assert shares.count(1.0) == 3
 
 
 def test_a_new_model_gets_its_first_steps_in_one_frame_or_leaves_them_to_the_next() -> None:

@@ -16,7 +16,6 @@ from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.focus import EVERY, largest, with_neighbours, worst_tiles
 from sags_node.mapping.ladder import Rung
 from sags_node.mapping.refiner import CpuRefiner
-from sags_node.mapping.split import SPLIT
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import open_session
 from sags_node.types import F32, U8, Bool
@@ -108,31 +107,6 @@ def test_neighbours_are_all_around_and_stay_inside(place: tuple[int, int]) -> No
     assert (reach.max(0) - reach.min(0) <= [2, 4]).all()  # tiles are twice as high as wide
 
 
-def test_in_a_hurry_the_first_step_leaves_alone_what_fits_best() -> None:
-    """The rest of the model keeps its colours. How much a Gaussian shows beyond the part is not told by a
-    step on it: who stands on the edge would be given up for showing little."""
-    session = open_session(SESSION, ["source.pace:=step", "mapping.max_gaussians:=4000"])
-    pipeline, budget = Pipeline(session.config, session.rig), StepBudget(1)
-    with session.source as source:
-        first, second, third = (frame for frame, _ in zip(source, range(3), strict=False))
-    pipeline.process(first, budget)
-    model = pipeline.map.model
-
-    def rows() -> dict[int, tuple[F32, float]]:
-        found = zip(model.ids, model.colors.copy(), model.contribution, strict=True)
-        return {int(i): (color, float(shown)) for i, color, shown in found}
-
-    before = rows()
-    pipeline.process(second, StepBudget(1, Rung(4000, step=0.4)))
-    hurried = rows()
-    common = before.keys() & hurried.keys()
-    assert np.mean([before[i][1] != hurried[i][1] for i in common]) <= SPLIT  # what is split shows less
-    assert 0.1 < np.mean([np.array_equal(before[i][0], hurried[i][0]) for i in common]) < 0.6
-    pipeline.process(third, budget)
-    whole = rows()
-    assert np.mean([hurried[i][1] == whole[i][1] for i in hurried.keys() & whole.keys()]) < 0.01
-
-
 def test_the_worst_tiles_are_those_of_what_was_drawn_last(monkeypatch: pytest.MonkeyPatch) -> None:
     """Tiles that were not drawn again are not looked at again: nothing in them has changed."""
     asked, frame_of, begin = 0, dict[str, Any](), CpuRefiner.begin
@@ -155,5 +129,5 @@ def test_the_worst_tiles_are_those_of_what_was_drawn_last(monkeypatch: pytest.Mo
     pipeline = Pipeline(session.config, session.rig)
     with session.source as source:
         for frame, _ in zip(source, range(4), strict=False):
-            pipeline.process(frame, StepBudget(3, Rung(4000, step=0.4, redraw=0.4)))
-    assert asked == 3 * 4  # a step on a part, two on what is worst, and what is shown; not in the first frame
+            pipeline.process(frame, StepBudget(3, Rung(4000, redraw=0.4)))
+    assert asked == 3 * 3  # two steps on what is worst, and what is shown; not in the first frame

@@ -150,23 +150,6 @@ def test_a_step_is_the_cpus() -> None:
     assert device.refiner.loss == pytest.approx(cpu.refiner.loss, rel=1e-4)
 
 
-def test_a_hurried_step_is_the_cpus(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mapper, "FIRST_STEPS", 0)
-    both = on_cpu(), on_device()
-    for played in both:
-        played.take(frame(0), 0)
-        played.refiner.draw()
-        played.mapper.model.contribution[:] = 7.0
-        colors = played.row("colors").copy()
-        played.refiner.take(slice(0, played.mapper.model.count))
-        played.refiner.refine(LearningRates(), 0.6)
-        played.refiner.download()
-    assert_same_rows(*both)
-    assert (both[1].row("contribution") == 7.0).all()
-    kept = (both[1].row("colors") == colors).all(axis=1)
-    assert 0.05 < kept.mean() < 0.6
-
-
 def test_follows_the_tissue_as_the_cpu_does() -> None:
     """Motion, insertion at the edge and where the instrument was, a jump of the exposure, anchors."""
     frames = [frame(0), frame(1), frame(2, instrument=False), frame(3, brightness=0.8)]

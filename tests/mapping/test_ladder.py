@@ -173,7 +173,6 @@ def test_what_a_launch_pins_and_switches_off() -> None:
     assert rungs() == RUNGS
     assert rungs(rung=3) == (RUNGS[3],)
     assert {rung.depth_every for rung in rungs(skips=Skips(depth=False))} == {1}
-    assert {rung.step for rung in rungs(skips=Skips(fitted=False))} == {1.0}
     with pytest.raises(UsageError, match=r"mapping\.rung 99: the ladder's rungs are 0 to \d+"):
         rungs(rung=99)
 

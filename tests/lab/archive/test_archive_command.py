@@ -103,6 +103,8 @@ def test_a_start_counts_once_and_each_frame_the_same() -> None:
         "bytes": 108_000_050,
     }
     assert of_an_hour("fit", long, long, 120, 30.0)["cpu_s"] == 900 * 15  # so many clips
+    fewer_bytes = Cost(15, 28, 300.0, 40)  # a report of more frames that is smaller
+    assert of_an_hour("eval", short, fewer_bytes, 120, 30.0)["bytes"] == 40
 
 
 def test_the_command_measures_a_recording(tiny_session: Path) -> None:
