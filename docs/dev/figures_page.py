@@ -5,10 +5,11 @@ A table stands between two comments. What is asked of a file that is not there e
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+from claims_page import result, table
 
 from sags_node.mapping.ladder import FULL, RUNGS, USED, price
 
@@ -22,29 +23,24 @@ METHODS = {  # results of `python -m benchmarks methods`
 CLIPS = {"d4d": "D4D, 30 Hz", "phantom": "phantom, seeds 1 to 3, 30 Hz", "hamlyn": "Hamlyn heart, 25 Hz"}
 
 
-def result(name: str) -> dict[str, Any]:
-    """A committed result."""
-    found: dict[str, Any] = json.loads((ROOT / f"benchmarks/results/{name}.json").read_text(encoding="utf-8"))
-    return found
-
-
-def replaced(page: str, table: str) -> str:
-    """A page with its table written anew."""
-    before, rest = page.split(BEGIN)
-    return before + BEGIN + table + END + rest.split(END, 1)[1]
+def replaced(page: str, *tables: str) -> str:
+    """A page with its tables written anew."""
+    before, *rests = page.split(BEGIN)
+    after = (END + rest.split(END, 1)[1] for rest in rests)
+    return before + "".join(BEGIN + table + rest for table, rest in zip(tables, after, strict=True))
 
 
 def pages() -> dict[Path, str]:
     """What each page should be."""
     tables = {
-        "README.md": _headline(),
-        "benchmarks/README.md": _live(),
-        "benchmarks/ladder.md": _ladder(),
-        "docs/how-it-works.md": _methods(),
+        "README.md": (_headline(),),
+        "benchmarks/README.md": (table(), _live()),
+        "benchmarks/ladder.md": (_ladder(),),
+        "docs/how-it-works.md": (_methods(),),
     }
     return {
-        ROOT / page: replaced((ROOT / page).read_text(encoding="utf-8"), table)
-        for page, table in tables.items()
+        ROOT / page: replaced((ROOT / page).read_text(encoding="utf-8"), *written)
+        for page, written in tables.items()
     }
 
 
