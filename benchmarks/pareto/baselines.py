@@ -122,13 +122,13 @@ def baselines_of_run(run: Row) -> list[Row]:
     return rows
 
 
-def read_fits(files: Sequence[Path]) -> dict[str, Row]:
-    """Offline fits by the session they were made of: rows from the figures that `sags fit` wrote.
+def read_fits(files: Sequence[Path]) -> list[Row]:
+    """Offline fits, with the session they were made of: rows from the figures that `sags fit` wrote.
 
     Raises:
         UsageError: a file cannot be read or holds something else.
     """
-    rows = {}
+    rows = []
     for file in files:
         try:
             figures = json.loads(file.read_text(encoding="utf-8"))
@@ -136,13 +136,15 @@ def read_fits(files: Sequence[Path]) -> dict[str, Row]:
             raise UsageError(f"cannot read {file} as figures of a fit: {error}") from None
         if not isinstance(figures, dict) or not {"session", "seconds", "heldout"} <= figures.keys():
             raise UsageError(f"{file} holds no figures of a fit; give the figures.json that sags fit wrote")
-        rows[figures["session"]] = {
+        row = {
+            "session": figures["session"],
             "name": f"offline fit, {figures['seconds']:.0f} s in all",
             "heldout": figures["heldout"],
             "depth": figures.get("depth"),
             "gaussians": {"mean": figures.get("gaussians")},
             "file": str(file),
         }
+        rows.append(row)
     return rows
 
 

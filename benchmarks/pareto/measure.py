@@ -6,7 +6,7 @@ of time. Rules that leave work out are compared with a fixed number of steps, so
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -44,7 +44,7 @@ def measure_pareto(
     launches: Sequence[str | None],
     overrides: Sequence[str],
     sweep: Sweep,
-    fits: Mapping[str, Row],
+    fits: Sequence[Row],
     advance: Advance,
 ) -> Row:
     """Play every setting over every recording and measure it.
@@ -52,7 +52,7 @@ def measure_pareto(
     Args:
         launches: launch files or session folders; None: the built-in phantom.
         overrides: `key:=value`, for all of them.
-        fits: by session, rows of `pareto_baselines.read_fits`.
+        fits: of any sessions, `baselines.read_fits`.
         advance: called with what is going on.
 
     Returns:
@@ -111,7 +111,7 @@ class _Comparison:
         self._size = self._session.working_size
         warm_up(self._session.config)
 
-    def measure(self, fits: Mapping[str, Row]) -> Row:
+    def measure(self, fits: Sequence[Row]) -> Row:
         session, parts = self._session, self._sweep.parts
         timed = time_settings(session.config, self._size, parts)
         timed += rung_settings() if RUNG_PART in parts else []
@@ -127,8 +127,7 @@ class _Comparison:
                 if place == 1:  # the default
                     baselines = baselines_of_run(runs[setting][0])
                     baselines += measured_baselines(played, spool, self._size, self._sweep.options, progress)
-        if session.name in fits:
-            baselines.append(fits[session.name])
+        baselines += [fit for fit in fits if fit["session"] == session.name]
         rows = [_middle(runs[setting]) for setting in timed]
         for row, best in zip(rows, non_dominated([_place(row) for row in rows]), strict=True):
             row["non_dominated"] = best

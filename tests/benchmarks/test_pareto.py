@@ -158,9 +158,12 @@ def test_everything_is_measured_on_a_tiny_session(phantom_session: Path, tmp_pat
         "heldout": {"psnr": 41.0},
         "depth": None,
     }
-    (tmp_path / "fit.json").write_text(json.dumps(fit))
+    fits = {"fit": fit, "slow": fit | {"seconds": 900.0}, "other": fit | {"session": "other"}}
+    for name, figures in fits.items():
+        (tmp_path / f"{name}.json").write_text(json.dumps(figures))
     out, plot = tmp_path / "pareto.json", tmp_path / "pareto.png"
-    files = ["--fit", tmp_path / "fit.json", "--out", out, "--plot", plot]
+    given = [word for name in fits for word in ("--fit", tmp_path / f"{name}.json")]
+    files = [*given, "--out", out, "--plot", plot]
     asked = ["mapping.max_gaussians:=3000", "mapping.rung:=8", "--frames", 10]  # whatever the machine affords
     found = figures_of("pareto", phantom_session, *asked, *files, "--json", command=main)
     assert json.loads(out.read_text()) == {"provenance": ANY} | found
@@ -180,7 +183,8 @@ def test_everything_is_measured_on_a_tiny_session(phantom_session: Path, tmp_pat
         assert each["frame_ms"]["p50"] > 0 and each["depth"]["median_mm"] > 0 and each["novel"]["psnr"] > 15
         assert each["cpu_ms"]["p50"] > 0
 
-    copied, stereo, warp, model, full, halved, offline = session["baselines"]
+    copied, stereo, warp, model, full, halved, offline, slow = session["baselines"]
+    assert slow["name"] == "offline fit, 900 s in all"
     assert copied["predict"]["psnr"] == default["predict"]["copy_psnr"]
     assert stereo["depth"] == default["measured_depth"]
     assert 0.3 < warp["coverage"] <= 1 and warp["novel"]["psnr"] > 20 and model["novel"]["psnr"] > 20
