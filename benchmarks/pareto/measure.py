@@ -120,11 +120,14 @@ class _Comparison:
         runs: dict[Setting, list[Row]] = {setting: [] for setting in (*timed, *pairs)}
         turns = [setting for _ in range(self._sweep.repeat) for setting in runs]
         baselines: list[Row] = []
+        compared: Row = {}
         for place, setting in enumerate(turns, 1):
             progress = self._progress(f"{setting.name} ({place} of {len(turns)})")
             with self._played(setting, progress) as (played, spool):
-                runs[setting].append(self._measured(setting, played, spool, progress))
+                row, receipt = self._measured(setting, played, spool, progress)
+                runs[setting].append(row)
                 if place == 1:  # the default
+                    compared = receipt
                     baselines = baselines_of_run(runs[setting][0])
                     baselines += measured_baselines(played, spool, self._size, self._sweep.options, progress)
         baselines += [fit for fit in fits if fit["session"] == session.name]
@@ -137,6 +140,7 @@ class _Comparison:
             "session": session.name,
             "frames": frames,
             "rate_hz": rate,
+            "receipt": compared,  # of the default; the others play the same frames
             "segments": {name: list(span) for name, span in session.config.segments.items()},
             "why_default": why_default(rows, 1e3 / rate),
             "settings": rows,
@@ -163,8 +167,12 @@ class _Comparison:
                 )
             yield session, spool
 
-    def _measured(self, setting: Setting, session: Session, spool: Spool, progress: Progress) -> Row:
-        summary = measure(session, spool, self._sweep.options, setting.overrides, progress).summary
+    def _measured(
+        self, setting: Setting, session: Session, spool: Spool, progress: Progress
+    ) -> tuple[Row, Row]:
+        """The setting's row, and its receipt."""
+        found = measure(session, spool, self._sweep.options, setting.overrides, progress)
+        summary = found.summary
         at_full_size = summary["online"]
         if session.working_size != self._size:
             at_full_size = online_at(self._size, session, spool, self._sweep.options, progress)
@@ -172,13 +180,14 @@ class _Comparison:
             raise SagsError(
                 f"{session.name}: no frame shows tissue, so there is nothing to compare; see vision.tissue"
             )
-        return {
+        row = {
             "name": setting.name,
             "part": setting.part,
             "overrides": list(setting.overrides),
             **{key: summary[key] for key in KEPT},
             "online_at_full_size": at_full_size,
         }
+        return row, found.receipt
 
     def _open(self, overrides: Sequence[str]) -> Session:
         def rendering(done: int, of: int) -> None:

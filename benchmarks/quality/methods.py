@@ -54,7 +54,8 @@ def measure_methods(
             chosen = [
                 *overrides, f"mapping.method:={method}", f"vision.width:={width}", f"vision.height:={height}"
             ]  # fmt: skip
-            live = evaluate(launch, chosen, MeasureOptions(hold_out=0), pace="realtime").summary
+            seen = evaluate(launch, chosen, MeasureOptions(hold_out=0), pace="realtime")
+            live = seen.summary
             fixed = [*chosen, f"mapping.iterations:={iterations}", f"mapping.rung:={rung}"]
             row: dict[str, Any] = {"method": method, "width": width, "height": height}
             row["live"] = {
@@ -62,6 +63,7 @@ def measure_methods(
                 "latency_ms": live["latency_ms"],
                 "frames": live["frames"],
                 "psnr": live["online"]["psnr"],
+                "receipt": seen.receipt,
             }
             rows.append(row | _step_by_step(launch, fixed))
     return rows
@@ -74,10 +76,12 @@ def _step_by_step(launch: Path | str | None, overrides: Sequence[str]) -> dict[s
     pictures: dict[int, U8] = {}
     with Spool() as spool:
         pipeline = run_step(session, MeasureOptions(), spool, lambda what, frames: None)
-        summary = measure(session, spool, MeasureOptions(), on_picture=pictures.__setitem__).summary
+        found = measure(session, spool, MeasureOptions(), on_picture=pictures.__setitem__)
+        summary = found.summary
         window = _window_psnr(pipeline, spool, pictures)
     step = {group: summary[group][key] for group, key in SHOWN.items() if summary.get(group)}
-    return {"step": step | {"window": window, "frame_ms": summary["frame_ms"]}}
+    more = {"window": window, "frame_ms": summary["frame_ms"], "receipt": found.receipt}
+    return {"step": step | more}
 
 
 def _window_psnr(pipeline: Pipeline, spool: Spool, pictures: dict[int, U8]) -> float:

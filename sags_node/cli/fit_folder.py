@@ -16,6 +16,7 @@ from sags_node.errors import UsageError
 from sags_node.evaluation.lpips import BACKBONE, Lpips
 from sags_node.evaluation.measure import MeasureOptions
 from sags_node.evaluation.provenance import machine_name
+from sags_node.evaluation.receipt import Receipt
 from sags_node.files import check_results, is_result
 from sags_node.fitting import checkpoint
 from sags_node.fitting.clip import read_clip
@@ -26,6 +27,7 @@ from sags_node.kernels.threads import configure_threads
 from sags_node.model.ply import write_ply
 from sags_node.pipeline.session import Session
 from sags_node.terminal import text
+from sags_node.types import Bool, StereoFrame
 
 CHECKPOINT, FIGURES, MODEL, DRAWN = "checkpoint.npz", "figures.json", "model.ply", "test"
 CHECKPOINT_PERIOD = 60.0  # s; it holds hundreds of MB
@@ -77,7 +79,13 @@ def fit_session(
     lpips = None if options.lpips_weights is None else Lpips(options.lpips_weights)
     configure_threads(session.config.engine.threads)
     count = session.source.frame_count
-    clip = read_clip(session, options.holds_out, lambda done: advance(done, count, "reading"))
+    receipt = Receipt(session.rig, session.working_size, options.lpips_weights)
+
+    def noted(frame: StereoFrame, tissue: Bool) -> None:
+        if options.holds_out(frame.frame_id):
+            receipt.add(frame, tissue)
+
+    clip = read_clip(session, options.holds_out, lambda done: advance(done, count, "reading"), noted)
     fit = Fit(clip, settings)
     if resume:
         advance(0, None, "reading the checkpoint")
@@ -109,6 +117,7 @@ def fit_session(
         "depth": score_depth(fit, everything, segments),
         "track": score_tracks(fit, everything),
         "train": score(fit, clip.train[:: max(1, options.hold_out)], segments),
+        "receipt": receipt.as_json(),  # of the frames held out
         "psnr_convention": "tissue",
         "lpips_backbone": BACKBONE if lpips is not None else None,
         "published": published(

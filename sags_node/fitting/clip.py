@@ -14,9 +14,11 @@ import numpy as np
 from sags_node.errors import SagsError
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import Session, open_posed
-from sags_node.types import F32, U8, Bool, Camera, Observation, Reference
+from sags_node.types import F32, U8, Bool, Camera, Observation, Reference, StereoFrame
 
 log = logging.getLogger(__name__)
+
+OnFrame = Callable[[StereoFrame, Bool], None]  # as it was recorded; [H, W] its tissue
 
 MEMORY_SHARE = 0.5  # of what is free: the fit itself needs the rest
 
@@ -62,7 +64,9 @@ class Clip:
         return self.train[place - 1], self.train[place]
 
 
-def play(session: Session, references: bool) -> Iterator[ClipFrame]:
+def play(
+    session: Session, references: bool, on_frame: OnFrame = lambda frame, tissue: None
+) -> Iterator[ClipFrame]:
     """Frames of a session, which is opened anew, through the node's own front end.
 
     Those whose pose the robot does not tell are left out: nobody knows from where they were seen. So are
@@ -71,6 +75,7 @@ def play(session: Session, references: bool) -> Iterator[ClipFrame]:
     Args:
         session: it is played from its start.
         references: also deliver what it knows to be true.
+        on_frame: called with each frame that is delivered.
 
     Raises:
         SagsError: the recording cannot be read.
@@ -87,6 +92,7 @@ def play(session: Session, references: bool) -> Iterator[ClipFrame]:
             pair = pipeline.rectifier(frame)
             tissue = pipeline.tissue(frame, pair)
             depth = pipeline.depth(frame, pair, tissue).depth
+            on_frame(frame, tissue)
             yield ClipFrame(
                 pair.frame_id, pair.t_capture_ns, pair.camera, pair.left, tissue, depth, frame.reference
             )
@@ -95,7 +101,10 @@ def play(session: Session, references: bool) -> Iterator[ClipFrame]:
 
 
 def read_clip(
-    session: Session, held_out: Callable[[int], bool], progress: Callable[[int], None] = lambda done: None
+    session: Session,
+    held_out: Callable[[int], bool],
+    progress: Callable[[int], None] = lambda done: None,
+    on_frame: OnFrame = lambda frame, tissue: None,
 ) -> Clip:
     """Play a session once through the node's own front end and keep every frame.
 
@@ -103,13 +112,14 @@ def read_clip(
         session: it is opened anew, with what it knows to be true.
         held_out: whether the frame of that number is for testing only.
         progress: called with the frames done.
+        on_frame: called with each frame.
 
     Raises:
         SagsError: no frame to learn from, the recording cannot be read, or it does not fit into memory.
     """
     train: list[ClipFrame] = []
     test: list[ClipFrame] = []
-    for frame in play(session, references=True):
+    for frame in play(session, references=True, on_frame=on_frame):
         if not train and not test:
             _check_memory(frame, session.source.frame_count)
         (test if held_out(frame.frame_id) else train).append(frame)

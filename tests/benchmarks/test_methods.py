@@ -24,6 +24,9 @@ def test_a_field_knows_the_last_seconds_and_nodes_do_not(phantom_session: Path) 
     assert [row["method"] for row in rows] == ["nodes", "sags"] * 2
     for nodes, sags in zip(rows[::2], rows[1::2], strict=True):
         assert sags["step"]["window"] > nodes["step"]["window"]
+        assert (
+            sags["step"]["receipt"] == nodes["step"]["receipt"] and sags["live"]["receipt"]["frames"]["count"]
+        )
         assert all(row["live"]["rate_hz"] > 0 and row["step"]["online"] > 20 for row in (nodes, sags))
 
 

@@ -190,6 +190,7 @@ def test_everything_is_measured_on_a_tiny_session(phantom_session: Path, tmp_pat
     assert 0.3 < warp["coverage"] <= 1 and warp["novel"]["psnr"] > 20 and model["novel"]["psnr"] > 20
     assert full["depth"]["median_mm"] < halved["depth"]["median_mm"] < 3 and full["frame_ms"]["p50"] > 0
     assert offline["heldout"]["psnr"] == 41.0
+    assert session["receipt"]["frames"]["ids"] == "0, 2-8"  # every eighth is held out
 
     assert {each["rule"] for each in session["skips"]} == RULES
     depth = next(each for each in session["skips"] if each["rule"] == "skip_depth")

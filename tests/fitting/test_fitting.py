@@ -304,6 +304,7 @@ def test_the_command_leaves_model_pictures_and_figures(phantom_session: Path, tm
     found = figures_of("fit", phantom_session, "source.frames:=10", *options)
     assert json.loads((out / "figures.json").read_text()) == {"provenance": ANY} | found
     assert found["heldout"]["frames"] == 2 and found["heldout"]["psnr"] > 15
+    assert found["receipt"]["frames"]["count"] == 2
     assert found["depth"]["median_mm"] < 10
     assert 0 < found["gaussians"] <= 1500
     assert sorted(path.name for path in (out / "test").iterdir()) == ["000001.png", "000009.png"]
