@@ -19,6 +19,7 @@ from rich.table import Table
 from sags_node.errors import SagsError
 from sags_node.evaluation.metrics import as_float, psnr
 from sags_node.evaluation.provenance import machine_name
+from sags_node.evaluation.receipt import Receipt
 from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import Budget
 from sags_node.mapping.mapper import SETTLED
@@ -74,6 +75,7 @@ class _Run:
         self._budget: Budget = self.pipeline.make_budget()
         self._rate = session.source.rate
         self._number = 0
+        self.receipt = Receipt(session.rig, session.working_size, None)
 
     def take(self, frame: StereoFrame) -> _Taken:
         stamp = round(self._number * 1e9 / self._rate)
@@ -84,6 +86,7 @@ class _Run:
         ms, cpu_ms = (time.perf_counter() - began) * 1e3, (time.process_time() - cpu_began) * 1e3
         shown, seen = as_float(result.views["left"].rgb), result.observation
         quality = psnr(shown, as_float(seen.image), seen.tissue)
+        self.receipt.add(frame, seen.tissue)
         still = "motion" in result.skipped
         return _Taken(ms, cpu_ms, quality, still, not still and "depth" in result.skipped)
 
@@ -154,6 +157,7 @@ def measure_endurance(
         "windows": [asdict(window) for window in windows],
         "per_1000_frames": {figure: slope(windows, figure) for figure in FIGURES},
         "still": _stillness(moving, still),
+        "receipt": run.receipt.as_json(),
     }
 
 

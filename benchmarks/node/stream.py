@@ -18,6 +18,7 @@ from rich.table import Table
 from sags_node.engine.rasterizer.views import colours_of
 from sags_node.evaluation.metrics import as_float, psnr
 from sags_node.evaluation.provenance import machine_name
+from sags_node.evaluation.receipt import Receipt
 from sags_node.fitting.clip import ClipFrame, play
 from sags_node.fitting.stream import StreamFit, StreamSettings
 from sags_node.kernels.threads import configure_threads
@@ -89,10 +90,11 @@ def _play(
 ) -> dict[str, Any]:
     """One model through the whole stream. `remembered` s back it is asked for what it still knows."""
     fit: StreamFit | None = None
+    receipt = Receipt(session.rig, session.working_size, None)
     arrivals: list[_Arrival] = []
     by_second: list[dict[str, Any]] = []
     first_ns, per_second = 0, max(1, round(session.source.rate))
-    for done, frame in enumerate(play(session, references=False)):
+    for done, frame in enumerate(play(session, references=False, on_frame=receipt.add)):
         if fit is None:
             height, width = frame.tissue.shape
             fit, first_ns = StreamFit(width, height, settings), frame.t_capture_ns
@@ -113,6 +115,7 @@ def _play(
         "psnr_predicted_at_retirement": _mean(each.predicted for each in moved),
         "psnr_predicted_elsewhere": _mean(each.predicted for each in still),
         "by_second": by_second,
+        "receipt": receipt.as_json(),
     }
 
 

@@ -23,6 +23,7 @@ from sags_node.evaluation import metrics
 from sags_node.evaluation.lpips import Lpips
 from sags_node.evaluation.measure import MeasureOptions
 from sags_node.evaluation.provenance import machine_name
+from sags_node.evaluation.receipt import Receipt
 from sags_node.fitting.clip import Clip, ClipFrame, read_clip
 from sags_node.fitting.fit import Fit
 from sags_node.fitting.score import score, score_between, score_depth, score_tracks
@@ -99,7 +100,8 @@ def measure_ablation(
     lpips = None if options.lpips_weights is None else Lpips(options.lpips_weights)
     configure_threads(session.config.engine.threads)
     count = session.source.frame_count
-    clip = read_clip(session, options.holds_out, lambda done: advance(done, count, "reading"))
+    receipt = Receipt(session.rig, session.working_size, options.lpips_weights)
+    clip = read_clip(session, options.holds_out, lambda done: advance(done, count, "reading"), receipt.add)
     known, ahead = _split(clip)
     chosen = {
         name: replace(
@@ -124,6 +126,7 @@ def measure_ablation(
         "seeds": seeds,
         "settings": {name: asdict(settings) for name, settings in chosen.items()},
         "machine": machine_name(),
+        "receipt": receipt.as_json(),  # of all frames
         "variants": variants,
         "parts": {
             part: {"paper_db": claim, **_gain(variants[whole], variants[without])}

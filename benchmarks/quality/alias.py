@@ -20,13 +20,14 @@ from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.engine.rasterizer.views import colours_of
 from sags_node.evaluation.metrics import psnr
 from sags_node.evaluation.provenance import machine_name
+from sags_node.evaluation.receipt import Receipt
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.mapper import Mapper
 from sags_node.mapping.motion import Drawn, SurfaceTracker
 from sags_node.mapping.refiner import CpuRefiner
 from sags_node.mapping.tissue_map import TissueMap
 from sags_node.model.alias_free import smoothing_variances
-from sags_node.types import F32, Camera, Gaussians, Observation
+from sags_node.types import F32, Camera, Gaussians, Observation, StereoFrame
 
 SIZES = (0.25, 0.5, 1.0, 2.0, 4.0)
 DISTANCES = (0.5, 1.0, 2.0, 4.0)
@@ -105,10 +106,13 @@ def measure_alias(settings: Settings, advance: Advance) -> Measured:
     total = len(VARIANTS) + 2
     advance(0, total, "the truth")
     truth = AliasTruth(PhantomSource(width=settings.width, height=settings.height))
+    still = truth.observation()
+    receipt = Receipt(truth.rig, (settings.width, settings.height), None)
+    receipt.add(StereoFrame(0, 0, 0, still.image, None), still.tissue)
     models = {}
     for done, (name, filters) in enumerate(VARIANTS.items(), 1):
         advance(done, total, f"training: {name.replace('_', ' ')}")
-        models[name] = train(truth.observation(), filters, settings)
+        models[name] = train(still, filters, settings)
     advance(total - 1, total, "other sizes and distances, slow motion")
     size = [{"factor": k, **_psnrs(models, truth.at_size(k))} for k in SIZES]
     distance = [{"factor": k, **_psnrs(models, truth.at_distance(k))} for k in DISTANCES]
@@ -129,6 +133,7 @@ def measure_alias(settings: Settings, advance: Advance) -> Measured:
         ],
         "flicker": _flicker(models, truth, settings.frames),
         "requested_view_in_filter": _requested_view(models["both"], truth),
+        "receipt": receipt.as_json(),  # of what trains
     }
     return Measured(table, truth, models)
 

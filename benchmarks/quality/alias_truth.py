@@ -36,7 +36,8 @@ class AliasTruth:
 
     def __init__(self, config: PhantomSource) -> None:
         phantom = Phantom(config)
-        eye = phantom.rig.left
+        self.rig = phantom.rig
+        eye = self.rig.left
         self.camera = Camera(eye.width, eye.height, eye.P[:, :3].copy(), np.eye(4))
         self._still = phantom.still(PHASE)
         finest = resized(self.camera, FINEST)

@@ -18,9 +18,10 @@ from sags_node.config.schema import OnnxConfig, StereoConfig, VisionConfig
 from sags_node.errors import SagsError
 from sags_node.evaluation import metrics
 from sags_node.evaluation.provenance import machine_name
+from sags_node.evaluation.receipt import Receipt
 from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import StepBudget
-from sags_node.phantom.scene import Phantom, PhantomScene
+from sags_node.phantom.scene import Phantom, PhantomFrame, PhantomScene
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import Session
 from sags_node.sources.source import open_source
@@ -222,6 +223,7 @@ def measure_recording(
     camera, size = pipeline.rectifier.camera, session.working_size
     matchers = make_matchers(config.vision.stereo, camera, pipeline.rectifier.baseline, network)
     comparison, regions = Comparison(matchers), Regions()
+    receipt = Receipt(session.rig, size, None)
     measured, kind, next_number = 0, "", 0
     focal_baseline = float(camera.K[0, 0]) * pipeline.rectifier.baseline
     with open_source(config.source) as frames:
@@ -236,6 +238,7 @@ def measure_recording(
             drawn, tissue = result.views["left"].depth, result.observation.tissue
             stage = comparison.add(result.pair, tissue, truth, {MODEL: drawn})
             regions.add(stage, drawn, truth, regions_of(truth, tissue, focal_baseline))
+            receipt.add(frame, tissue)
             measured += 1
     if measured == 0:
         raise SagsError(f"{session.name} has no reference depth to compare with; set source.reference.depth")
@@ -248,6 +251,7 @@ def measure_recording(
         "settings": comparison.rows(),
         "confidence": comparison.tallies["as configured"].by_confidence(),
         "regions": regions.rows(),
+        "receipt": receipt.as_json(),
     }
 
 
@@ -274,9 +278,11 @@ def measure_faults(
         rectifier = Rectifier(phantom.rig, *size)
         matchers = make_matchers(StereoConfig(), rectifier.camera, rectifier.baseline, network)
         comparison = Comparison(matchers)
-        white = []
-        for pair, tissue, truth in _phantom_pairs(phantom, rectifier, frames):
-            comparison.add(pair, tissue, truth, {})
+        receipt, white = Receipt(phantom.rig, size, None), []
+        for frame, truth in _phantom_frames(phantom, frames):
+            pair, tissue = rectifier(frame), rectifier.mask(~truth.tool)
+            comparison.add(pair, tissue, truth.depth, {})
+            receipt.add(frame, tissue)
             white.append(float((pair.left.min(-1) >= WHITE)[tissue].mean()))
         rows.append(
             {
@@ -285,6 +291,7 @@ def measure_faults(
                 "white": rounded(statistics.mean(white)),
                 "settings": comparison.rows(),
                 "confidence": comparison.tallies["as configured"].by_confidence(),
+                "receipt": receipt.as_json(),
             }
         )
     return {
@@ -297,10 +304,7 @@ def measure_faults(
     }
 
 
-def _phantom_pairs(
-    phantom: Phantom, rectifier: Rectifier, count: int
-) -> Iterable[tuple[RectifiedPair, Bool, F32]]:
+def _phantom_frames(phantom: Phantom, count: int) -> Iterable[tuple[StereoFrame, PhantomFrame]]:
     for index in range(count):
-        frame = phantom.frame(index, count)
-        pair = rectifier(StereoFrame(index, 0, 0, frame.left, frame.right))
-        yield pair, rectifier.mask(~frame.tool), frame.depth
+        truth = phantom.frame(index, count)
+        yield StereoFrame(index, 0, 0, truth.left, truth.right), truth

@@ -25,6 +25,7 @@ from benchmarks.quality.depth import (
 from sags_node.config.schema import StereoConfig
 from sags_node.errors import UsageError
 from sags_node.evaluation.provenance import machine_name
+from sags_node.evaluation.receipt import Receipt
 from sags_node.geometry import project, unproject
 from sags_node.rig import read_rig
 from sags_node.sources.pictures import read_picture
@@ -52,6 +53,7 @@ class CTPair:
     evaluated: Bool  # [H, W] of the left rectified picture
     points: F64  # [P, 3] m, left rectified camera: seen, and in the evaluated region
     pixels: F64  # [P, 2] where they are seen
+    receipt: dict[str, Any]  # see `Receipt.as_json`
 
 
 def read_ct_pair(folder: Path) -> CTPair:
@@ -70,8 +72,11 @@ def read_ct_pair(folder: Path) -> CTPair:
     evaluated = _largest_piece(rectifier.mask(ignored == 0))
     points = _read_points(_only(folder, SURFACE)) * MILLIMETRE @ rig.left.R.T
     pixels, seen = _seen(rectifier, points, evaluated)
-    pair = rectifier(StereoFrame(0, 0, 0, left, right))
-    return CTPair(folder.resolve().name, pair, evaluated, points[seen], pixels[seen])
+    frame, receipt = StereoFrame(0, 0, 0, left, right), Receipt(rig, (width, height), None)
+    receipt.add(frame, evaluated)
+    return CTPair(
+        folder.resolve().name, rectifier(frame), evaluated, points[seen], pixels[seen], receipt.as_json()
+    )
 
 
 def _largest_piece(mask: Bool) -> Bool:
@@ -169,6 +174,7 @@ def measure_ct(ct: CTPair, advance: Advance, network: Path | None = None) -> dic
         "coverage": first["coverage"],
         "settings": rows,
         "confidence": by_confidence(errors, confidence[y, x]),
+        "receipt": ct.receipt,
     }
 
 

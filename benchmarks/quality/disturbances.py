@@ -14,6 +14,7 @@ from benchmarks.disturbances import DISTURBANCES, Disturbance, Scene, Taken, dis
 from benchmarks.quality.tracking import true_points
 from sags_node.errors import SagsError, UsageError
 from sags_node.evaluation import metrics
+from sags_node.evaluation.receipt import Receipt
 from sags_node.findings import by_code
 from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import StepBudget
@@ -117,6 +118,7 @@ def measure_disturbances(
         if name in names:
             rows.append(run.row())
             look(name, run.shots)
+    assert clean is not None  # it was played first
     return {
         "session": session.name,
         "settings": {
@@ -128,6 +130,7 @@ def measure_disturbances(
             "height": session.working_size[1],
         },
         "rows": rows,
+        "receipt": clean.receipt.as_json(),
     }
 
 
@@ -185,6 +188,7 @@ class _Run:
         given = session.config.vision.tissue.model_copy(update={"method": "session"})
         self._true_tissue = TissueMask(given, self._pipeline.rectifier)
         self._shown: dict[int, _Shown] = {}  # by frame_id
+        self.receipt = Receipt(session.rig, session.working_size, None)  # of what it is compared with
         self._measured_in: I64 | None = None  # [H, W] frame_id in which each pixel's depth was measured last
         self._anchors = _PinnedAnchors(self._pipeline)
         self._shoot_at = [during.start - 1, during.start + len(during) // 2, during.stop]
@@ -197,6 +201,7 @@ class _Run:
         frame, view = taken.clean, result.views["left"]
         truth = self._pipeline.rectifier(frame)
         tissue = self._true_tissue(frame, truth)
+        self.receipt.add(frame, tissue)
         borrowed = self._borrowed(frame.frame_id, result)
         published = view.depth > 0
         confident = published & _is_confident(view)

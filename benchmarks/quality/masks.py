@@ -11,6 +11,7 @@ from rich.table import Table
 from sags_node.config.schema import TissueConfig
 from sags_node.errors import SagsError
 from sags_node.evaluation import metrics
+from sags_node.evaluation.receipt import Receipt
 from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import StepBudget
 from sags_node.pipeline.pipeline import Pipeline
@@ -58,6 +59,7 @@ class _Run:
         self._mask_ms: list[float] = []
         self._psnr: list[float] = []
         self._depth: list[metrics.DepthErrors] = []
+        self._receipt = Receipt(session.rig, session.working_size, None)
         self.frames = 0
 
     def _mask(self, config: TissueConfig) -> TissueMask:
@@ -76,7 +78,9 @@ class _Run:
         self.frames += 1
         self._mask_ms.append(result.timings_ms.get("mask", 0.0))
         self._compare(frame, result, before)
-        self._measure(result, self._given(frame, result.pair), frame.reference)
+        given = self._given(frame, result.pair)
+        self._measure(result, given, frame.reference)
+        self._receipt.add(frame, given)
 
     def _compare(self, frame: StereoFrame, result: FrameResult, before: FrameResult | None) -> None:
         usable = self._everything(frame, result.pair)
@@ -111,6 +115,7 @@ class _Run:
             "depth_median_mm": _mean([errors.median_mm for errors in self._depth]),
             "depth_p90_mm": _mean([errors.p90_mm for errors in self._depth]),
             "depth_coverage": _mean([errors.coverage for errors in self._depth]),
+            "receipt": self._receipt.as_json(),
         }
 
 
@@ -124,7 +129,8 @@ def _mean(values: Sequence[float]) -> float | None:
 
 def table(rows: Sequence[Row]) -> Table:
     """For people; each row as `measure_masks` returns it."""
-    made = Table(*rows[0])
+    columns = [key for key in rows[0] if key != "receipt"]
+    made = Table(*columns)
     for row in rows:
-        made.add_row(*("-" if value is None else str(value) for value in row.values()))
+        made.add_row(*("-" if row[key] is None else str(row[key]) for key in columns))
     return made

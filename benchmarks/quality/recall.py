@@ -19,6 +19,7 @@ from benchmarks.quality.tracking_report import reliability_tables
 from sags_node.config.schema import PhantomSource
 from sags_node.errors import SagsError, UsageError
 from sags_node.evaluation.point_tracks import SURE
+from sags_node.evaluation.receipt import Receipt
 from sags_node.geometry import project
 from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import StepBudget
@@ -125,10 +126,13 @@ def _played(
 ) -> dict[str, Any]:
     before = counts[0]
     pipeline, budget = Pipeline(session.config, film.phantom.rig), StepBudget(STEPS)
+    receipt = Receipt(film.phantom.rig, session.working_size, None)
     pinned: dict[int, int] = {}
     width, _ = session.working_size
     for number, moment in enumerate(_moments(film, scenario, counts)):
-        result = pipeline.process(_stereo(number, moment), budget)
+        frame = _stereo(number, moment)
+        result = pipeline.process(frame, budget)
+        receipt.add(frame, result.observation.tissue)
         truth, visible = _truth(result, moment)
         if number == before // 3:
             pinned = _pin(pipeline, result, truth, visible)
@@ -146,6 +150,7 @@ def _played(
         "before": at_last,
         "unmoved": unmoved["found"],
         "restarts": pipeline.map.restarts,
+        "receipt": receipt.as_json(),
     }
 
 

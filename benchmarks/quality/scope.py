@@ -18,6 +18,7 @@ from rich.table import Table
 from sags_node.config.schema import LaunchConfig, PhantomSource, PoseWay
 from sags_node.errors import UsageError
 from sags_node.evaluation import metrics
+from sags_node.evaluation.receipt import Receipt
 from sags_node.evaluation.trajectory import RigidOdometry, drift, trajectory_errors
 from sags_node.geometry import project
 from sags_node.kernels.threads import configure_threads
@@ -124,9 +125,11 @@ def measure_scope(
     configure_threads(config.engine.threads)
     rate = source.rate or RATE
     rows: list[dict[str, Any]] = []
+    receipts: dict[str, Any] = {}
     for motion in motions:
         moving = source.model_copy(update={"seconds": seconds, "camera_motion": motion})
-        rows += _measured(config, Phantom(moving), motion, seconds, rate, advance)
+        found, receipts[motion] = _measured(config, Phantom(moving), motion, seconds, rate, advance)
+        rows += found
     return {
         "seconds": seconds,
         "rate": rate,
@@ -135,16 +138,20 @@ def measure_scope(
         "height": source.height,
         "still_tissue": PhantomScene.of(source).still_tissue,
         "rows": rows,
+        "receipts": receipts,  # by motion
     }
 
 
 def _measured(
     config: LaunchConfig, phantom: Phantom, motion: Motion, seconds: float, rate: float, advance: Advance
-) -> list[dict[str, Any]]:
+) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Its rows, and the receipt of what the ways to know the pose were shown."""
     count, robot = round(seconds * rate), Robot()
     ways: dict[str, PoseWay] = {way: way for way in ("session", "estimate", "refine")} | {"robot": "session"}
     played = {name: _Played(Pipeline(_with_pose(config, way), phantom.rig)) for name, way in ways.items()}
     rigid, rigid_poses, points = RigidOdometry(), list[F64](), _Points(phantom)
+    raw = phantom.rig.left
+    receipt = Receipt(phantom.rig, config.vision.working_size(raw.width, raw.height), None)
     for number in range(count):
         truth = phantom.frame(number, count)
         given = robot.gives(truth.T_world_cam, number / rate)
@@ -155,6 +162,7 @@ def _measured(
         last = played["session"].pipeline.newest
         assert last is not None
         seen = last.observation
+        receipt.add(frame, seen.tissue)
         rigid_poses.append(rigid(last.pair.left, seen.depth, seen.tissue, seen.camera))
         points.add(truth)
         advance(number + 1, count, motion)
@@ -166,7 +174,7 @@ def _measured(
         errors = trajectory_errors(np.stack(found), known) | drift(np.stack(found), known, period)
         figures = played[name].figures() if name in played else {}
         rows.append({"motion": motion, "way": name, **errors, **figures})
-    return rows
+    return rows, receipt.as_json()
 
 
 def _with_pose(config: LaunchConfig, way: PoseWay) -> LaunchConfig:

@@ -26,6 +26,7 @@ from sags_node.evaluation.point_tracks import (
     shares_within,
     surely_seen,
 )
+from sags_node.evaluation.receipt import Receipt
 from sags_node.geometry import project, transform
 from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import StepBudget
@@ -85,11 +86,13 @@ def measure_tracking(
     warm_up(session.config)
     configure_threads(session.config.engine.threads)
     pipeline, budget, last = Pipeline(session.config, session.rig), StepBudget(1), max(frames)
+    receipt = Receipt(session.rig, session.working_size, None)
     run: _Run | None = None
     rows = []
     with open_posed(session.config, session.rig) as source:
         for number, frame in enumerate(source):
             result = pipeline.process(frame, budget)
+            receipt.add(frame, result.observation.tissue)
             if run is None:
                 run = _Run(pipeline, frame, result, beside)
             else:
@@ -101,7 +104,8 @@ def measure_tracking(
                 break
     if run is None or len(rows) < len(set(frames)):
         raise SagsError(f"the recording ends before frame {last}; choose earlier --frames")
-    return {"session": session.name, "anchors": run.count, "frames": rows, **run.figures()}
+    figures = {"anchors": run.count, "frames": rows, **run.figures()}
+    return {"session": session.name, **figures, "receipt": receipt.as_json()}
 
 
 class _Run:

@@ -42,6 +42,7 @@ def test_all_variants_are_measured_on_the_same_frames(
     arguments += [f"--variant={name}" for name in small if name != "nodes"] + ["--out", str(out), "--json"]
     found = figures_of("ablation", str(phantom_session), *arguments, command=main)
     assert json.loads(out.read_text()) == {"provenance": ANY} | found
+    assert found["receipt"]["frames"]["count"] == 12
     del small["nodes"]
     assert list(found["variants"]) == list(small)
     assert learnt == [[0, 2, 3, 4, 5, 6, 7, 8]] * len(small) * 2

@@ -16,6 +16,7 @@ def test_its_figures_say_of_the_phantom_what_the_tests_say_of_a_wall(tmp_path: P
     figures = figures_of("alias", "--quick", "--json", "--out", out, "--picture", drawn, command=main)
     table = json.loads(out.read_text())
     assert table.pop("provenance") and table == figures
+    assert table["receipt"]["frames"]["count"] == 1
     assert table["gain_db_quarter"] > 3
     assert table["gain_db_distance_4"] > 3
     quarter = table["psnr_at_size"][0]

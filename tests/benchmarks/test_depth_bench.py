@@ -198,6 +198,7 @@ def test_a_recording_with_exact_depth() -> None:
     measured = measure_recording(open_session(SESSION, overrides), silent)
     rows = {row["name"]: row for row in measured["settings"]}
     assert measured["frames"] == 2 and measured["truth"] == "exact"
+    assert measured["receipt"]["frames"]["ids"] == "0, 16"  # every eighth has a reference
     ours, plain = rows["as configured"], rows["plain SGBM, scale 1"]
     assert ours["median_mm"] < 0.5 and ours["coverage"] > 0.75
     assert ours["where_configured_knows"]["median_mm"] < plain["where_configured_knows"]["median_mm"]
@@ -245,6 +246,8 @@ def test_faults_make_depth_worse(tmp_path: Path) -> None:
     clean, noisy, dull, shiny = measured["faults"]
     assert noisy["settings"][0]["median_mm"] > 1.3 * clean["settings"][0]["median_mm"]
     assert dull["white"] < 0.001 and shiny["white"] > 0.01
+    digests = {row["receipt"]["frames"]["digest"] for row in measured["faults"]}
+    assert len(digests) == 4
     blocks = clean["settings"][-1]
     assert blocks["name"] == "network blocks.onnx"
     assert blocks["coverage"] > 0.5
@@ -301,7 +304,7 @@ def test_errors_along_z_and_to_the_surface() -> None:
     depths = tilted_surface(0.0)[v.ravel(), u.ravel()].astype(np.float64)
     points = np.asarray(unproject(CAMERA, pixels, depths), np.float64)
     pair = RectifiedPair(0, 0, CAMERA, BASELINE, np.zeros((HEIGHT, WIDTH, 3), np.uint8), None)
-    ct = CTPair("plane", pair, region, points, pixels)
+    ct = CTPair("plane", pair, region, points, pixels, {})
     measured = tilted_surface(1e-3)
     measured[:, 180:] = 0
     errors, given = errors_along_z(ct, measured)
@@ -337,6 +340,7 @@ def test_hidden_points_and_those_outside_the_region_do_not_count(tmp_path: Path)
     assert len(ct.points) > 500
     assert ct.pixels[:, 0].max() < WIDTH // 2 and ct.pixels[:, 0].min() > 19
     assert ct.pair.baseline == pytest.approx(BASELINE)
+    assert ct.receipt["masks"]["pixels_counted"] == np.count_nonzero(ct.evaluated)
 
 
 def test_a_wrong_ct_folder_is_named(tmp_path: Path) -> None:

@@ -289,6 +289,7 @@ def test_the_bench_measures_the_phantom(tmp_path: Path) -> None:
     assert "black_right" in result.stdout
     table = json.loads(file.read_text())
     assert table["provenance"]["revision"] and table["settings"]["from"] == 12
+    assert table["receipt"]["frames"]["count"] == 36
     clean, black = table["rows"]
     assert set(clean) == set(black) == KEYS
     assert (clean["name"], black["name"]) == ("clean", "black_right")

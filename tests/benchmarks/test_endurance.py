@@ -116,6 +116,7 @@ def test_the_statement_names_a_leak_and_leaves_noise_alone() -> None:
 def test_windows_cover_the_run_and_the_still_scene_is_recognised() -> None:
     found = measure_endurance(opened(), 130, 30, "there-and-back", ignore)
     assert [window["frames"] for window in found["windows"]] == [30, 60, 90, 120]
+    assert found["receipt"]["frames"]["count"] == 130 + STILL_FRAMES
     for window in found["windows"]:
         assert 0 < window["ms_p50"] <= window["ms_p99"]
         assert 25 < window["psnr"] < 60

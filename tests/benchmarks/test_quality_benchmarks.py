@@ -40,7 +40,9 @@ def measured(monkeypatch: pytest.MonkeyPatch, scenario: recall.Scenario) -> dict
         bins = found[key]["bins"]
         assert sum(row["count"] for row in bins) > 500
         assert bins[-1]["right"] > max(0.9, bins[0]["right"])  # who says to be sure is
-    return dict(found["rows"][0])
+    row = dict(found["rows"][0])
+    assert row["receipt"]["frames"]["count"] == round((1.2 + 2.0 + 1.2) * recall.RATE)
+    return row
 
 
 def test_most_anchors_come_back_after_the_scope_looked_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -76,6 +78,7 @@ def test_what_is_told_is_exact_and_what_a_robot_is_off_by_is_what_was_planted() 
     assert rows["points"]["max_mm"] < 1e-2
     assert rows["robot"]["max_mm"] > 15 * np.sin(np.linalg.norm(scope.HAND_EYE))
     assert scope.table(measured).row_count == len(rows)
+    assert measured["receipts"]["zoom"]["frames"]["count"] == 20
 
 
 def test_only_the_phantom_knows_its_scope() -> None:
@@ -104,6 +107,7 @@ def test_anchors_stay_where_the_flow_goes() -> None:
         assert row["anchors"] > 10 and row["gaussians"] > 1000
         assert row["anchors_px"]["p50"] < 0.3 and row["gaussians_px"]["p50"] < 0.8
     assert found["frames"][1]["motion_px"]["p90"] > 1.5  # they had to move
+    assert found["receipt"]["frames"]["ids"] == "0-12"
     assert found["truth"] == "direct flow" and found["methods"]["anchors"]["average_jaccard"] is None
     assert [table.row_count for table in tables(found)][:2] == [2, 1]
 

@@ -160,6 +160,7 @@ def test_the_command_shows_that_a_stream_may_go_on(phantom_session: Path, tmp_pa
     assert json.loads(out.read_text()) == {"provenance": ANY} | found
     assert found["frames"] == 21 and found["window_s"] == 0.5
     window, forgetful, whole = (found[name] for name in ("window", "no_folding", "window_covers_all"))
+    assert window["receipt"] == whole["receipt"] and window["receipt"]["frames"]["count"] == 21
     assert window["retired_slots"] > 10 and whole["retired_slots"] == 0
     assert window["largest_jump"] < 2e-3 < forgetful["largest_jump"]
     assert window["psnr_predicted"] > forgetful["psnr_predicted"] + 0.3
