@@ -69,14 +69,14 @@ def table() -> str:
         names = claimed(line)
         filled = line.format(**{name: Figure(result(name)) for name in names})
         rows.append(f"| {filled} | {', '.join(f'`{name}`' for name in names)} |\n")
-    return HEAD + "".join(rows) + f"\n{revisions()}\n"
+    return HEAD + "".join(rows) + f"\n{origin('revision')} {origin('machine')}\n"
 
 
-def revisions() -> str:
-    """The state of the sources that most results are of, and those of another one by name."""
+def origin(key: str) -> str:
+    """What most results are of by this key of their provenance, and those of another one by name."""
     found: dict[str, list[str]] = {}
     for file in sorted(RESULTS.glob("*.json")):
-        found.setdefault(result(file.stem)["provenance"]["revision"], []).append(f"`{file.stem}`")
-    most, *others = sorted(found, key=lambda revision: -len(found[revision]))
-    apart = "".join(f" Of `{revision}`: {', '.join(found[revision])}." for revision in others)
-    return f"{len(found[most])} of {sum(map(len, found.values()))} files are of revision `{most}`.{apart}"
+        found.setdefault(result(file.stem)["provenance"][key], []).append(f"`{file.stem}`")
+    most, *others = sorted(found, key=lambda value: -len(found[value]))
+    apart = "".join(f" Of `{value}`: {', '.join(found[value])}." for value in others)
+    return f"{len(found[most])} of {sum(map(len, found.values()))} files are of {key} `{most}`.{apart}"
