@@ -17,6 +17,8 @@ from sags_node.cli.launching import write_json
 from sags_node.evaluation.provenance import provenance, revision
 
 RESULTS = sorted((ROOT / "benchmarks/results").glob("*.json"))
+# They measure time, bytes or memory. `soak` judges single pictures of a phantom that never ends.
+COMPARE_NOTHING = set("archive_costs archive_costs_fit bridges crowd inputs kernels soak thin".split())
 
 
 def check(found: Any) -> None:
@@ -32,6 +34,22 @@ def check(found: Any) -> None:
 @pytest.mark.parametrize("file", RESULTS, ids=lambda file: file.stem)
 def test_every_result_says_where_it_comes_from(file: Path) -> None:
     check(json.loads(file.read_text()))
+
+
+def receipts(found: Any) -> list[Any]:
+    """All receipts in a result, wherever they lie."""
+    if isinstance(found, dict) and {"frames", "values", "calibration"} <= set(found):
+        return [found]
+    parts = found.values() if isinstance(found, dict) else found if isinstance(found, list) else []
+    return [receipt for part in parts for receipt in receipts(part)]
+
+
+@pytest.mark.parametrize("file", RESULTS, ids=lambda file: file.stem)
+def test_every_result_that_compares_pictures_or_depth_has_receipts(file: Path) -> None:
+    found = receipts(json.loads(file.read_text()))
+    assert bool(found) == (file.stem not in COMPARE_NOTHING)
+    for receipt in found:
+        assert receipt["frames"]["count"] >= 1 and re.fullmatch("[0-9a-f]{16}", receipt["frames"]["digest"])
 
 
 def test_every_result_is_claimed_and_every_claim_has_one() -> None:
