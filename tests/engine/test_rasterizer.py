@@ -1,11 +1,10 @@
-"""What every rasteriser must do: the CPU's kernels and gsplat (on the torch versions of its stages,
-`gsplat_on_cpu`), against the float64 twin, a closed form, or the same scene without what was spoilt."""
+"""What every rasteriser must do: Numba's kernels and Warp's, here on its CPU device, against the twin in
+float64, a closed form, or the same scene without what was spoilt."""
 
 from __future__ import annotations
 
 import dataclasses
 import importlib
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -14,23 +13,22 @@ from engine_scenes import (
     DERIVATIVES,
     EXPONENTIAL,
     INPUTS,
-    Truth,
     camera,
     cotangents,
     draw_and_differentiate,
     one_gaussian,
     random_gaussians,
-    relative_error,
     rows,
     truth,
     with_filter,
     with_view_dependence,
 )
 from numpy.typing import NDArray
-from rounding import U, after
+from rounding import after
+from warp_on_cpu import use_warp_on_cpu
 
 from sags_node import geometry
-from sags_node.engine.interface import MAX_OPACITY, MIN_ALPHA, MIP_VARIANCE, NEAR_PLANE
+from sags_node.engine.interface import MAX_OPACITY, MIN_ALPHA, NEAR_PLANE
 from sags_node.engine.rasterizer.rasterize import (
     TILE_HEIGHT,
     TILE_WIDTH,
@@ -45,14 +43,13 @@ from sags_node.types import F32, Bool, Camera, Gaussians
 
 @dataclasses.dataclass(frozen=True)
 class Backend:
-    """One of them, and a scene's size that suits it: gsplat's stages in torch are slow."""
+    """One of them, and a scene's size that suits it."""
 
     name: str
     width: int
     height: int
     count: int  # Gaussians
-    rounding: float  # of the sums of gradients in another order; 0: the order is always the same
-    module: str = ""  # where its MAX_PAIRS stands
+    module: str  # where its MAX_PAIRS stands
 
     def camera(self, **options: Any) -> Camera:
         return camera(self.width, self.height, **options)
@@ -71,42 +68,21 @@ class Backend:
         some pixel."""
         true = truth(gaussians, view, **options)
         assert true.planes[4].max() > shown
-        self.check(true, view, *self.draw(gaussians, view, **options))
-
-    def check(self, true: Truth, view: Camera, planes: F32, gradients: dict[str, Any]) -> None:
-        """Against the twin. gsplat's spread comes from moments about the picture's middle, px^2, over
-        variances that are the 2D filter's at least."""
-        if self.name == "gsplat":
-            half = U * (view.width**2 + view.height**2) / (4 * MIP_VARIANCE)
-            true.gradients_within["spread"] += half * float(np.linalg.norm(true.gradients["contribution"]))
-        true.check(planes, gradients)
-
-    def same(self, found: dict[str, Any], true: dict[str, Any], keep: Any = ...) -> None:
-        """The gradients of `keep` are those, bit by bit where the order of sums is fixed."""
-        for name in DERIVATIVES:
-            if self.rounding and true[name].any():
-                assert relative_error(found[name][keep], true[name]) < self.rounding, name
-            else:
-                np.testing.assert_array_equal(found[name][keep], true[name], err_msg=name)
+        true.check(*self.draw(gaussians, view, **options))
 
 
-NUMBA = pytest.param(Backend("numba", 48, 40, 60, 0.0, "sags_node.engine.rasterizer.cpu"), id="numba")
-GSPLAT = pytest.param(Backend("gsplat", 50, 44, 40, after(50 * 44)), id="gsplat", marks=pytest.mark.beside)
+@pytest.fixture(params=["numba", "warp"])
+def backend(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Backend:
+    if request.param == "numba":
+        return Backend("numba", 48, 40, 60, "sags_node.engine.rasterizer.cpu")
+    use_warp_on_cpu(monkeypatch)
+    return Backend("warp", 48, 40, 60, "sags_node.engine.gpu.rasterizer")
 
 
-@pytest.fixture(params=[NUMBA, GSPLAT])
-def backend(request: pytest.FixtureRequest) -> Iterator[Backend]:
-    chosen: Backend = request.param
-    with pytest.MonkeyPatch.context() as patch:
-        if chosen.name == "gsplat":
-            pytest.importorskip("gsplat", reason="it is optional: pip install 'sags-node[gsplat]'")
-            from gsplat_on_cpu import use_gsplat_on_cpu
-
-            use_gsplat_on_cpu(patch)
-        yield chosen
-
-
-ours = pytest.mark.parametrize("backend", [NUMBA], indirect=True)  # gsplat's differ: test_gsplat.py
+def same(found: dict[str, Any], true: dict[str, Any], keep: Any = ...) -> None:
+    """The gradients of `keep` are those, bit by bit."""
+    for name in DERIVATIVES:
+        np.testing.assert_array_equal(found[name][keep], true[name], err_msg=name)
 
 
 def copies(gradients: Gradients) -> dict[str, NDArray[np.floating]]:
@@ -154,7 +130,6 @@ def test_a_jacobian_held_within_the_frustum(backend: Backend) -> None:
     backend.agrees(gaussians, view)
 
 
-@ours
 @pytest.mark.parametrize("scale", [1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0])
 @pytest.mark.parametrize("filtered", [False, True])
 def test_scales_from_a_vanishing_dot_to_a_wall(backend: Backend, scale: float, filtered: bool) -> None:
@@ -166,7 +141,6 @@ def test_scales_from_a_vanishing_dot_to_a_wall(backend: Backend, scale: float, f
     backend.agrees(gaussians, view)
 
 
-@ours
 @pytest.mark.parametrize(
     "axes", [(1e-3, 1e-7, 2e-3), (1e-3, 1.1e-3, 1e-7), (3e-3, 3e-4, 3e-7), (0.1, 1e-5, 1e-3)]
 )
@@ -185,15 +159,20 @@ def test_flat_as_paper_and_thin_as_a_thread(
     backend.agrees(gaussians, view, shown=0.01)
 
 
-@ours
 @pytest.mark.parametrize("opacity", [1e-6, 1 / 255, 0.0045, 0.5, 0.9985, 0.9995, 1 - 1e-6, 1.0])
 def test_opacities_from_nothing_to_everything(backend: Backend, opacity: float) -> None:
+    """On the GPU a pixel ends by itself where it lets 1e-4 through, not with its tile. What is left out there
+    counts a thousandfold, 1 / (1 - alpha), in the gradients of what hides it."""
     view = backend.camera()
     gaussians = random_gaussians(5, 8, view, spread=3.0)
     gaussians = dataclasses.replace(gaussians, opacities=np.full(8, opacity, np.float32))
     planes, found = backend.draw(gaussians, view)
     assert planes[4].any() == (opacity > 1 / 255)
-    truth(gaussians, view).check(planes, found)
+    true = truth(gaussians, view)
+    if backend.name == "warp" and opacity > 0.9:
+        np.testing.assert_allclose(planes, true.planes, rtol=0, atol=1e-4 + true.off.max())
+    else:
+        true.check(planes, found)
 
 
 def test_even_a_wall_lets_a_thousandth_through(backend: Backend) -> None:
@@ -202,7 +181,6 @@ def test_even_a_wall_lets_a_thousandth_through(backend: Backend) -> None:
     assert planes[4].max() == pytest.approx(MAX_OPACITY, rel=EXPONENTIAL)
 
 
-@ours
 def test_quaternions_of_any_length_are_the_same_turn(backend: Backend) -> None:
     view = backend.camera()
     gaussians = scene_of(random_gaussians(8, 8, view), 2, True)
@@ -213,7 +191,6 @@ def test_quaternions_of_any_length_are_the_same_turn(backend: Backend) -> None:
     true.check(planes, found | {"quats": found["quats"].astype(np.float64) * lengths})
 
 
-@ours
 @pytest.mark.parametrize("height", [1.0 + 1e-6, 1.01, 2.0])  # in near planes
 @pytest.mark.parametrize("scale", [1e-6, 1e-4, 1e-2])
 def test_just_in_front_of_the_near_plane_and_not_behind_it(
@@ -233,7 +210,6 @@ def test_just_in_front_of_the_near_plane_and_not_behind_it(
     assert not any(found[name][3:].any() for name in DERIVATIVES)
 
 
-@ours
 @pytest.mark.parametrize("z", [NEAR_PLANE, 1e-6, 0.0, -1e-6, -0.05, -1e9])
 def test_at_or_behind_the_near_plane_nothing_is_drawn(backend: Backend, z: float) -> None:
     gaussians = with_view_dependence(one_gaussian(np.array([0.001, 0.0, z]), 0.01), 3)
@@ -242,7 +218,6 @@ def test_at_or_behind_the_near_plane_nothing_is_drawn(backend: Backend, z: float
     assert not any(found[name].any() for name in DERIVATIVES)
 
 
-@ours
 @pytest.mark.parametrize("factor", [0.03, 1e3, 1e6, 1e9])
 def test_a_larger_world_further_away_looks_the_same(backend: Backend, factor: float) -> None:
     """Pictures do not know the unit of length: depths and derivatives scale, the rest stays."""
@@ -266,14 +241,12 @@ def test_a_larger_world_further_away_looks_the_same(backend: Backend, factor: fl
         true.check_gradient(name, gradient.astype(np.float64) * lengths.get(name, 1.0))
 
 
-@ours
 def test_a_principal_point_far_outside_and_a_telephoto_lens(backend: Backend) -> None:
     K = np.array([[20000.0, 0, -900.0], [0, 21000, 700], [0, 0, 1]])
     view = Camera(31, 29, K, np.eye(4))
     backend.agrees(random_gaussians(2, min(backend.count, 40), view), view, shown=0.2)
 
 
-@ours
 @pytest.mark.parametrize("scale", [1e-7, 1e-5, 1e-3, 1e-1, 1.0])
 @pytest.mark.parametrize("distance", [1.001e-3, 0.07, 1e3])
 def test_extreme_values_give_finite_pictures_and_gradients(
@@ -289,7 +262,6 @@ def test_extreme_values_give_finite_pictures_and_gradients(
 CROWDS = [(100_000, 0.9), (100_000, 0.01), (300, 0.01)]  # how many of which opacity
 
 
-@ours
 def test_a_crowd_on_one_pixel_follows_the_law_of_absorption(backend: Backend) -> None:
     """n equal Gaussians behind each other, larger than the picture and smaller than a tile, whose rest beyond
     its border never fills: what is left is (1 - alpha)^n, down to 1e-4, where a tile stops. Those that it
@@ -350,8 +322,6 @@ def test_a_spoilt_gaussian_is_left_out_and_harms_no_other(
     """One of each kind among sound ones, and the same scene without them: the same bits."""
     view = backend.camera()
     filtered = kinds is WITH_FILTER
-    if backend.name == "gsplat":
-        kinds = [kind for kind in kinds if kind != ("quats", 1e19)]  # it draws that, turned anyhow
     spoilt = scene_of(random_gaussians(8, 2 * len(kinds), view, spread=0.9), 1, filtered)
     for index, (name, number) in enumerate(kinds):
         getattr(spoilt, name)[2 * index] = number
@@ -360,13 +330,12 @@ def test_a_spoilt_gaussian_is_left_out_and_harms_no_other(
     expected, true = backend.draw(rows(spoilt, sound), view)
     assert expected[4].mean() > 0.3
     np.testing.assert_array_equal(planes, expected)
-    backend.same(found, true, sound)
+    same(found, true, sound)
     for name in DERIVATIVES:
         harmed = np.nonzero(found[name][~sound].reshape(len(kinds), -1).any(1))[0]
         assert not len(harmed), (name, [kinds[index] for index in harmed])
 
 
-@ours
 def test_a_negative_filter_is_none(backend: Backend) -> None:
     view = backend.camera()
     negative, none = (scene_of(random_gaussians(8, 8, view), 1, True) for _ in range(2))
@@ -375,16 +344,15 @@ def test_a_negative_filter_is_none(backend: Backend) -> None:
     planes, found = backend.draw(negative, view)
     expected, true = backend.draw(none, view)
     np.testing.assert_array_equal(planes, expected)
-    backend.same(found, true)
+    same(found, true)
 
 
-@ours
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 @pytest.mark.parametrize("what", ["v_planes", "weight"])
 def test_a_spoilt_cotangent_stays_in_its_tile(backend: Backend, what: str, value: float) -> None:
     """Gaussians that do not reach the pixel's tile keep their gradients bit by bit."""
     view = camera(width=110, height=80, focal=140.0)
-    count = 200 if backend.name == "numba" else 24
+    count = 200
     gaussians = scene_of(random_gaussians(8, count, view, spread=np.sqrt(count / 200)), 1, True)
     rasterizer = backend.rasterizer(view)
     rasterizer.forward(gaussians, view)
@@ -407,16 +375,13 @@ def test_nothing_to_draw(backend: Backend) -> None:
     some = scene_of(random_gaussians(2, 6, view), 2, True)
     away = dataclasses.replace(some, means=some.means + np.array([0, 50, 0], np.float32))
     nothing = [rows(some, np.zeros(6, bool)), away]
-    for gaussians in nothing[
-        : 1 if backend.name == "gsplat" else 2
-    ]:  # its torch stages give no gradient then
+    for gaussians in nothing:
         rasterizer = backend.rasterizer(view)
         assert rasterizer.forward(some, view).any()
         planes = rasterizer.forward(gaussians, view)
         assert planes.shape == (5, view.height, view.width) and not planes.any()
-        if backend.name != "gsplat":  # it has no median
-            depths, rows_of = rasterizer.median()
-            assert not depths.any() and (rows_of == -1).all()
+        depths, rows_of = rasterizer.median()
+        assert not depths.any() and (rows_of == -1).all()
         found = rasterizer.backward(*cotangents(view, 0))
         assert found.sh_rest.shape == (len(gaussians), 8, 3)
         assert not any(getattr(found, name).any() for name in DERIVATIVES)
@@ -435,9 +400,8 @@ WIDE = camera(width=100, height=77, focal=110.0, moved=True)  # no whole number 
 SHAPE = (-(-77 // TILE_HEIGHT), -(-100 // TILE_WIDTH))
 
 
-def wide_scene(backend: Backend, seed: int = 5) -> Gaussians:
-    count = {"numba": 400, "gsplat": 60}[backend.name]
-    return with_view_dependence(random_gaussians(seed, count, WIDE, spread=0.5), 1)
+def wide_scene(seed: int = 5) -> Gaussians:
+    return with_view_dependence(random_gaussians(seed, 400, WIDE, spread=0.5), 1)
 
 
 def some_tiles(seed: int) -> tuple[Bool, Bool]:
@@ -457,37 +421,33 @@ def test_a_rasterizer_used_again_gives_what_a_fresh_one_gives(backend: Backend) 
         planes = rasterizer.forward(gaussians, view).copy()
         expected, true = backend.draw(gaussians, view)
         np.testing.assert_array_equal(planes, expected)
-        backend.same(copies(rasterizer.backward(*cotangents(view, 0))), true)
+        same(copies(rasterizer.backward(*cotangents(view, 0))), true)
 
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_active_tiles_are_those_of_the_whole_drawing(backend: Backend, seed: int) -> None:
     """What is not asked for stays, counts for nothing, and has left nothing behind from before."""
-    gaussians, before = wide_scene(backend), random_gaussians(9, backend.count, WIDE, spread=0.5)
+    gaussians, before = wide_scene(), random_gaussians(9, backend.count, WIDE, spread=0.5)
     tiles, drawn = some_tiles(seed)
     v_planes, weight = cotangents(WIDE, seed)
     whole, part = backend.rasterizer(WIDE), backend.rasterizer(WIDE)
     everything = whole.forward(gaussians, WIDE).copy()
-    if backend.name == "numba":
-        whole.backward(v_planes, weight)  # its pairs hold gradients of tiles that are then passed over
+    whole.backward(v_planes, weight)  # its pairs hold gradients of tiles that are then passed over
     expected = copies(whole.backward(np.where(drawn, v_planes, 0), np.where(drawn, weight, 0)))
     old = part.forward(before, WIDE).copy()
-    medians = []
-    if backend.name != "gsplat":
-        medians = [[array.copy() for array in rasterizer.median()] for rasterizer in (whole, part)]
+    medians = [[array.copy() for array in rasterizer.median()] for rasterizer in (whole, part)]
     planes = part.forward(gaussians, WIDE, tiles).copy()
     np.testing.assert_array_equal(planes, np.where(drawn, everything, old))
     found = copies(part.backward(v_planes, weight))
-    backend.same(found, expected)
+    same(found, expected)
     untouched = int((found["contribution"] == 0).sum())
     assert 2 < untouched < len(gaussians) - 2
-    if medians:
-        for now, all_of_it, then in zip(part.median(), *medians, strict=True):
-            np.testing.assert_array_equal(now, np.where(drawn, all_of_it, then))
+    for now, all_of_it, then in zip(part.median(), *medians, strict=True):
+        np.testing.assert_array_equal(now, np.where(drawn, all_of_it, then))
 
 
 def test_tiles_agree_with_the_twin(backend: Backend) -> None:
-    gaussians = rows(wide_scene(backend), slice(80))
+    gaussians = rows(wide_scene(), slice(80))
     tiles, drawn = some_tiles(3)
     v_planes, weight = cotangents(WIDE, 0)
     rasterizer = backend.rasterizer(WIDE)
@@ -495,25 +455,23 @@ def test_tiles_agree_with_the_twin(backend: Backend) -> None:
     planes = rasterizer.forward(gaussians, WIDE, tiles).copy()
     true = truth(gaussians, WIDE, given=(np.where(drawn, v_planes, 0), np.where(drawn, weight, 0)))
     planes = np.where(drawn, planes, true.planes)  # elsewhere is what was there before
-    backend.check(true, WIDE, planes, copies(rasterizer.backward(v_planes, weight)))
+    true.check(planes, copies(rasterizer.backward(v_planes, weight)))
 
 
-@ours
 def test_without_active_tiles_nothing_happens(backend: Backend) -> None:
     rasterizer = backend.rasterizer(WIDE)
-    before = rasterizer.forward(wide_scene(backend), WIDE).copy()
+    before = rasterizer.forward(wide_scene(), WIDE).copy()
     others, nothing = random_gaussians(9, 12, WIDE), np.zeros(SHAPE, bool)
     np.testing.assert_array_equal(rasterizer.forward(others, WIDE, nothing), before)
     for name, found in copies(rasterizer.backward(*cotangents(WIDE, 0))).items():
         assert not found.any(), name
 
 
-@ours
 def test_pairs_are_made_for_active_tiles_only_and_too_many_are_refused(
     backend: Backend, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Room for half of the Gaussians is enough for one of 28 tiles; the CPU reserves it in blocks."""
-    count = 5000 if backend.name == "numba" else 40
+    count = 5000
     gaussians, tiles = random_gaussians(5, count, WIDE, spread=0.1), np.zeros(SHAPE, bool)
     tiles[0, 2] = True
     rasterizer = backend.rasterizer(WIDE)
@@ -525,11 +483,10 @@ def test_pairs_are_made_for_active_tiles_only_and_too_many_are_refused(
         rasterizer.forward(gaussians, WIDE)
 
 
-@ours
 def test_median_agrees_with_the_twin(backend: Backend) -> None:
     """A pixel whose transmittance passes 1/2 by less than rounding may name the next Gaussian: transmittances
     are off by 1e-5 of themselves, so this is one pixel in 100,000."""
-    gaussians = random_gaussians(5, len(wide_scene(backend)), WIDE)
+    gaussians = random_gaussians(5, len(wide_scene()), WIDE)
     results = []
     for name in (backend.name, "reference"):
         rasterizer = make_rasterizer(name, WIDE.width, WIDE.height)
@@ -543,7 +500,6 @@ def test_median_agrees_with_the_twin(backend: Backend) -> None:
     assert not depths[found < 0].any()
 
 
-@ours
 def test_median_is_the_surface_that_is_seen(backend: Backend) -> None:
     """Behind a thin veil the wall, in front of it the veil if that is dense enough."""
     view = camera(48, 40)

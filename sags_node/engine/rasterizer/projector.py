@@ -51,7 +51,7 @@ class Projector:
             self._allocate(max(self._room, int(n * SPARE)))
         if len(self._scratch) != thread_count():
             self._scratch = aligned((thread_count(), projection_backward.SCRATCH))
-        self._view, self._centre = _view_of(pinhole), _centre(pinhole)
+        self._view, self._centre = _view_of(pinhole), centre_of(pinhole)
         self._given = self._smoothed = gaussians
         given_slopes = read_only(self._no_slopes[:n]) if gaussians.slopes is None else gaussians.slopes
         self._given_slopes = self._smoothed_slopes = given_slopes
@@ -139,7 +139,7 @@ class Projector:
         return self._v_means[:n], self._v_quats[:n], v_scales, v_opacities, self._v_sh_rest[:n], v_slopes
 
 
-def _centre(pinhole: Pinhole) -> Row:
+def centre_of(pinhole: Pinhole) -> Row:
     """The camera's place in the world."""
     return tuple(np.float32(v) for v in -pinhole.R.T @ pinhole.t)
 

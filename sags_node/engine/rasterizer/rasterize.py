@@ -30,8 +30,7 @@ def make_rasterizer(backend: str, width: int, height: int, antialias: bool = Tru
     """A rasteriser for pictures of one size (px).
 
     Args:
-        backend: "numba" (CPU), "gsplat" (that package's kernels on a GPU, without median depth) or
-            "reference" (torch, slow).
+        backend: "numba" (CPU), "warp" (GPU), "gsplat" or "reference" (torch, slow).
         width, height: px.
         antialias: the 2D filter of Mip-Splatting. False: the fixed dilation of 3D Gaussian Splatting in its
             place, which grows brighter and thicker when the picture gets smaller. For comparison only.
@@ -45,6 +44,11 @@ def make_rasterizer(backend: str, width: int, height: int, antialias: bool = Tru
         from sags_node.engine.rasterizer.cpu import NumbaRasterizer
 
         return _CheckedRasterizer(NumbaRasterizer(width, height, antialias), width, height)
+    if backend == "warp":
+        from sags_node.engine.gpu import runtime
+        from sags_node.engine.gpu.rasterizer import WarpBackend
+
+        return _CheckedRasterizer(WarpBackend(width, height, antialias, runtime.gpu()), width, height)
     if backend == "gsplat":
         from sags_node.engine.gsplat_backend import GsplatBackend
 
@@ -53,7 +57,7 @@ def make_rasterizer(backend: str, width: int, height: int, antialias: bool = Tru
         from sags_node.engine.reference.rasterizer import ReferenceRasterizer
 
         return _CheckedRasterizer(ReferenceRasterizer(antialias), width, height)
-    raise UsageError(f"unknown engine backend '{backend}'; choose numba, gsplat or reference")
+    raise UsageError(f"unknown engine backend '{backend}'; choose numba, warp or reference")
 
 
 def rasterize(

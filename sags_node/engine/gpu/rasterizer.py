@@ -1,0 +1,248 @@
+"""Gaussians to planes and back on one of Warp's devices; nothing leaves it but the number of pairs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from sags_node.engine.gpu import runtime
+
+runtime.start()  # before kernels are looked at: it says where compiled ones lie
+
+import warp as wp  # noqa: E402
+
+from sags_node.engine.gpu import binning, compositing, projection  # noqa: E402
+from sags_node.engine.gpu.binning import LANES, TILE  # noqa: E402
+from sags_node.engine.interface import DILATION_VARIANCE, MIP_VARIANCE, Gradients, Pinhole  # noqa: E402
+from sags_node.engine.rasterizer import spherical_harmonics  # noqa: E402
+from sags_node.engine.rasterizer.compositing import TILE_HEIGHT, TILE_WIDTH  # noqa: E402
+from sags_node.engine.rasterizer.projector import centre_of  # noqa: E402
+from sags_node.errors import SagsError  # noqa: E402
+from sags_node.types import F32, I32, Bool, Gaussians  # noqa: E402
+
+MAX_PAIRS = 1 << 25  # 3 GiB
+SPARE = 1.25  # what is asked for beyond the need when a buffer grows
+KINDS: dict[str, Any] = {
+    "means": wp.vec3, "quats": wp.vec4, "scales": wp.vec3, "opacities": float, "colors": wp.vec3,
+    "slopes": wp.vec3, "smoothing": float,
+}  # of what is drawn, by its name in `types.Gaussians`  # fmt: skip
+DERIVED: dict[str, Any] = {
+    "means": wp.vec3, "quats": wp.vec4, "scales": wp.vec3, "opacities": float, "colors": wp.vec3,
+    "slopes": wp.vec3, "contribution": float, "spread": float,
+}  # of `interface.Gradients`  # fmt: skip
+
+
+class DeviceRasterizer:
+    """Draws and differentiates arrays of a device. Not for use by two threads at once.
+
+    Buffers grow with the numbers of Gaussians and pairs and are never given back.
+
+    Attributes:
+        planes: [5, H, W] as `interface.Rasterizer.forward` has them, overwritten by the next `forward`.
+    """
+
+    def __init__(self, width: int, height: int, device: wp.Device | str, antialias: bool = True) -> None:
+        """
+        Args:
+            width, height: px.
+            device: Warp's.
+            antialias: as `rasterize.make_rasterizer` has it.
+        """
+        self.device = wp.get_device(device)
+        self._size = [width, height]
+        self._filter = [MIP_VARIANCE if antialias else DILATION_VARIANCE, int(antialias)]
+        self._shape = (-(-height // TILE), -(-width // TILE))
+        self._tiles = self._shape[0] * self._shape[1]
+        self.planes = self._new((5, height, width))
+        self._everywhere = self._new(self._tiles, int)
+        self._everywhere.fill_(1)
+        self._active = self._everywhere
+        self._starts, self._tile_ends = self._new(self._tiles + 1, int), self._new(self._tiles, int)
+        self._view = self._new(20)
+        self._total = wp.zeros(1, dtype=int, device="cpu", pinned=self.device.is_cuda)
+        self._room = self._pair_room = 0
+        self._hold(1024)
+        self._hold_pairs(4096)
+
+    def forward(
+        self, tables: Mapping[str, wp.array], pinhole: Pinhole, tiles: Bool | None = None
+    ) -> wp.array:
+        """Draw for a camera.
+
+        Args:
+            tables: by the names and of the types of `KINDS`.
+            pinhole: of the rasteriser's picture size.
+            tiles: as `interface.Rasterizer.forward` has them.
+
+        Returns:
+            `planes`.
+
+        Raises:
+            SagsError: the picture needs more memory than the engine allows itself.
+        """
+        n = self._count = len(tables["means"])
+        self._tables = tables
+        if n > self._room:
+            self._hold(int(n * SPARE))
+        limits = [pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy, *pinhole.limits]
+        self._view.assign(np.array([*pinhole.R.ravel(), *pinhole.t, *limits], np.float32))
+        self._choose(tiles)
+        total = self._sort_by_depth(tables) if n else 0
+        if total > MAX_PAIRS:
+            raise SagsError(
+                f"drawing {n} Gaussians takes {total} Gaussian-tile pairs, the limit is {MAX_PAIRS}: the "
+                "Gaussians are too large for the picture; draw fewer or smaller ones"
+            )
+        if total > self._pair_room:
+            self._hold_pairs(int(total * SPARE))
+        self._sort_into_tiles(total)
+        self._tile_ends.zero_()
+        self._launch(compositing.composite, (self._tiles, LANES), [
+            self._splats, self._pairs, self._starts, *self._size, self._active, self.planes, self._tile_ends,
+        ])  # fmt: skip
+        return self.planes
+
+    def backward(self, v_planes: wp.array, weight: wp.array) -> dict[str, wp.array]:
+        """Gradients of sum(v_planes * planes) for the last `forward`, whose tables must be unchanged.
+
+        Args:
+            v_planes: [5, H, W] cotangent of the planes.
+            weight: [H, W] pixel weights for the contribution.
+
+        Returns:
+            By the names and of the types of `DERIVED`, overwritten by the next `backward`.
+        """
+        found = {name: array[: self._count] for name, array in self._found.items()}
+        if self._count == 0:
+            return found
+        self._sums.zero_()
+        self._launch(compositing.composite_backward, (self._tiles, LANES), [
+            self._splats, self._pairs, self._starts, self._tile_ends, *self._size, self._active, self.planes,
+            v_planes, weight, self._slots, self._sums,
+        ])  # fmt: skip
+        given = [
+            self._tables[name] for name in ("means", "quats", "scales", "opacities", "slopes", "smoothing")
+        ]
+        self._launch(projection.project_backward, self._count, [
+            *given, self._view, *self._filter, self._own_slots, self._records,
+            *(found[name] for name in ("means", "quats", "scales", "opacities", "colors", "slopes")),
+            found["contribution"], found["spread"],
+        ])  # fmt: skip
+        return found
+
+    def median(self) -> tuple[wp.array, wp.array]:
+        """Depth [H, W] m and row [H, W] of where the transmittance of the last `forward` falls to one half;
+        as `interface.Rasterizer.median`."""
+        if self._medians is None:
+            shape = self.planes.shape[1:]
+            self._medians = self._new(shape), self._new(shape, int)
+            self._medians[1].fill_(-1)
+        self._launch(compositing.median, (self._tiles, LANES), [
+            self._splats, self._pairs, self._starts, *self._size, self._active, *self._medians,
+        ])  # fmt: skip
+        return self._medians
+
+    def _choose(self, tiles: Bool | None) -> None:
+        """Say which of our tiles are drawn, given those of the CPU's engine."""
+        self._active = self._everywhere
+        if tiles is not None:
+            chosen = np.repeat(np.repeat(tiles, TILE_HEIGHT // TILE, 0), TILE_WIDTH // TILE, 1)
+            rows, columns = self._shape
+            flat = np.ascontiguousarray(chosen[:rows, :columns], np.int32).ravel()
+            self._active = wp.array(flat, dtype=int, device=self.device)
+
+    def _sort_by_depth(self, tables: Mapping[str, wp.array]) -> int:
+        """Splats, near to far; returns how many pairs they make."""
+        n, counts, ends = self._count, self._counts[: self._count], self._ends[: self._count]
+        self._launch(projection.project, n, [
+            *(tables[name] for name in KINDS), self._view, *self._filter, self._splats, self._keys,
+            self._order,
+        ])  # fmt: skip
+        wp.utils.radix_sort_pairs(self._keys, self._order, n, end_bit=31)
+        self._launch(binning.count_pairs, n, [
+            self._splats, self._keys, self._order, *self._size, self._active, counts,
+        ])  # fmt: skip
+        wp.utils.array_scan(counts, ends, inclusive=True)
+        wp.copy(self._total, ends, src_offset=n - 1, count=1)
+        if self.device.is_cuda:
+            wp.synchronize_stream(self.device.stream)
+        return int(self._total.numpy()[0])
+
+    def _sort_into_tiles(self, total: int) -> None:
+        if self._count:
+            self._launch(binning.emit_pairs, self._count, [
+                self._splats, self._keys, self._order, *self._size, self._active, self._counts, self._ends,
+                self._pair_tiles, self._slots, self._slot_splats, self._own_slots,
+            ])  # fmt: skip
+            wp.utils.radix_sort_pairs(self._pair_tiles, self._slots, total, end_bit=self._tiles.bit_length())
+        self._launch(binning.find_ranges, total + 1, [
+            self._pair_tiles, self._slots, self._slot_splats, total, self._starts, self._pairs,
+        ])  # fmt: skip
+
+    def _hold(self, room: int) -> None:
+        """Make room for so many Gaussians."""
+        self._room = room
+        self._splats = self._new((room, projection.RECORD), wp.vec4)
+        self._keys, self._order = self._new(2 * room, int), self._new(2 * room, int)  # a sort needs twice
+        self._counts, self._ends = self._new(room, int), self._new(room, int)
+        self._own_slots = self._new(room, wp.vec2i)
+        self._found = {name: self._new(room, kind) for name, kind in DERIVED.items()}
+
+    def _hold_pairs(self, room: int) -> None:
+        self._pair_room = room
+        self._pair_tiles, self._slots = self._new(2 * room, int), self._new(2 * room, int)
+        self._slot_splats, self._pairs = self._new(room, int), self._new(room, int)
+        self._records = self._new(room, projection.vec16)
+        self._sums = wp.array(ptr=self._records.ptr, shape=(room, 16), dtype=float, device=self.device)
+
+    def _new(self, shape: Any, kind: Any = float) -> wp.array:
+        return wp.zeros(shape, dtype=kind, device=self.device)
+
+    def _launch(self, kernel: Any, dim: Any, inputs: list[Any]) -> None:
+        wp.launch(kernel, dim, inputs=inputs, device=self.device, block_dim=LANES)
+
+    _medians: tuple[wp.array, wp.array] | None = None
+
+
+class WarpBackend:
+    """Backend `warp`: arrays of the host in and out, copied on every call."""
+
+    def __init__(self, width: int, height: int, antialias: bool, device: wp.Device) -> None:
+        self._on_device = DeviceRasterizer(width, height, device, antialias)
+        self._device = device
+
+    def forward(self, gaussians: Gaussians, pinhole: Pinhole, tiles: Bool | None) -> F32:
+        self._given = gaussians
+        self._centre = centre_of(pinhole)
+        planes: F32 = self._on_device.forward(self._sent(gaussians), pinhole, tiles).numpy()
+        return planes
+
+    def backward(self, v_planes: F32, weight: F32) -> Gradients:
+        given = (wp.array(array, dtype=float, device=self._device) for array in (v_planes, weight))
+        found = {name: array.numpy() for name, array in self._on_device.backward(*given).items()}
+        count, rest = len(self._given), self._given.sh_rest
+        v_rest = np.zeros((count, 0 if rest is None else rest.shape[1], 3), np.float32)
+        if rest is not None:
+            means, colors = found["means"], found["colors"]
+            spherical_harmonics.color_backward(self._given.means, rest, self._centre, colors, v_rest, means)
+        return Gradients(**found, sh_rest=v_rest)
+
+    def median(self) -> tuple[F32, I32]:
+        depths, rows = self._on_device.median()
+        return depths.numpy(), rows.numpy()
+
+    def _sent(self, gaussians: Gaussians) -> dict[str, wp.array]:
+        arrays = {name: getattr(gaussians, name) for name in KINDS}
+        count = len(gaussians)
+        if gaussians.sh_rest is not None:
+            arrays["colors"] = np.empty((count, 3), np.float32)
+            spherical_harmonics.color(
+                gaussians.means, gaussians.colors, gaussians.sh_rest, self._centre, arrays["colors"]
+            )
+        absent = {"slopes": np.zeros((count, 3), np.float32), "smoothing": np.zeros(count, np.float32)}
+        return {
+            name: wp.array(absent[name] if array is None else array, dtype=KINDS[name], device=self._device)
+            for name, array in arrays.items()
+        }
