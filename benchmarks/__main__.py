@@ -11,6 +11,7 @@ from benchmarks.commands.disturbances import (
 from benchmarks.commands.engine import (
     bench_ablation,
     bench_alias,
+    bench_gpu,
     bench_kernels,
     bench_methods,
     bench_stream,
@@ -59,6 +60,7 @@ for command in (
     bench_thin,
     bench_inputs,
     bench_kernels,
+    bench_gpu,
     bench_alias,
     bench_stream,
     bench_methods,

@@ -246,12 +246,15 @@ def check_memory(root: Path = host.ROOT) -> Check:
 
 
 def check_gpu(config: LaunchConfig) -> Check:
-    """Whether gsplat can draw there. A machine without one is no worse for it, unless one is wanted."""
+    """Whether Warp can draw there. A machine without one is no worse for it, unless one is wanted."""
     if config.device == "cpu":
         return Check("GPU", "ok", f"not used: device is {config.device}")
     found = find_gpu()
     if found.kind == "cuda":
-        return Check("GPU", "ok", f"{found.name}, gsplat {importlib.metadata.version('gsplat')}")
+        from sags_node.engine.gpu.runtime import driver
+
+        version = importlib.metadata.version("warp-lang")
+        return Check("GPU", "ok", f"{found.name}, driver's CUDA {driver()}, Warp {version}")
     level: Level = "error" if config.device == "cuda" else "warning" if has_gpu() else "ok"
     return Check("GPU", level, f"not used: {found.reason}", found.fix if level != "ok" else "")
 

@@ -151,7 +151,7 @@ def _kernels(quick: bool, large: bool, contention: bool, no_twin: bool, checks: 
 
 
 def _compare_gpu(quick: bool, out: Path | None, json_out: bool) -> None:
-    from benchmarks.kernels.gpu import QUICK, GpuSettings, gpu_table, measure_gpu
+    from benchmarks.gpu.refining import QUICK, GpuSettings, gpu_table, measure_gpu
 
     check_files(out)
     with progress("measuring") as advance:
@@ -341,4 +341,24 @@ def bench_ablation(
         )
     for table in [measured] if json_out else ablation.tables(measured):
         show(table)
+    write_json(out, measured)
+
+
+@click.command("gpu")
+@click.option("--small", is_flag=True, help="Tiny sizes and no live runs: does it work, not how fast is it.")
+@click.option("--fit", is_flag=True, help="Also the paper's fit, which takes minutes.")
+@figures_option
+@as_json
+def bench_gpu(small: bool, fit: bool, out: Path | None, json_out: bool) -> None:
+    """All that a GPU should do: parity, times, live runs. `make gpu-check` calls it.
+
+    \b
+    python -m benchmarks gpu --fit --out benchmarks/results/gpu.json
+    """
+    from benchmarks.gpu.check import gpu_check
+
+    check_files(out)
+    measured = gpu_check(small, fit, lambda line: click.echo(line, err=True))
+    if json_out:
+        show([measured])
     write_json(out, measured)

@@ -1,7 +1,6 @@
-"""Which processor the model is refined on: the CPU, or a GPU if gsplat can draw there.
+"""Which processor the model is refined on: the CPU, or a GPU if Warp can use it.
 
-torch takes more than a second to import. What tells that there is no GPU costs nothing and is looked at
-first.
+Warp takes most of a second to start. What tells that there is no GPU costs nothing and is looked at first.
 """
 
 from __future__ import annotations
@@ -10,14 +9,15 @@ import functools
 import importlib.util
 import os
 import shutil
-import sys
-from contextlib import redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from sags_node.config.schema import DeviceName
 from sags_node.errors import UsageError
+
+if TYPE_CHECKING:
+    import warp as wp
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,13 +46,25 @@ def choose_device(wanted: DeviceName) -> Device:
 
 @functools.cache
 def find_gpu() -> Device:
-    """The GPU, or the CPU and why. gsplat builds its kernels when they are looked for first: minutes."""
+    """The GPU, or the CPU and why."""
     missing = _missing_hardware() or _missing_software()
     if missing is not None:
         return Device("cpu", "the CPU", *missing)
-    import torch
+    import warp as wp
 
-    return Device("cuda", torch.cuda.get_device_name())
+    return Device("cuda", wp.get_device("cuda").name)
+
+
+def gpu() -> wp.Device:
+    """Warp's device that is drawn on.
+
+    Raises:
+        UsageError: no GPU can be used.
+    """
+    choose_device("cuda")
+    from sags_node.engine.gpu import runtime
+
+    return runtime.device_named("cuda")
 
 
 def has_gpu() -> bool:
@@ -75,29 +87,17 @@ def _missing_hardware() -> tuple[str, str] | None:
 
 def _missing_software() -> tuple[str, str] | None:
     """The reason and its remedy."""
-    if importlib.util.find_spec("gsplat") is None:
-        return "gsplat is not installed", "pip install 'sags-node[gsplat]'"
-    import torch
+    if importlib.util.find_spec("warp") is None:
+        return "NVIDIA Warp is not installed", "pip install warp-lang"
+    from sags_node.engine.gpu import runtime
 
-    if torch.version.cuda is None:
+    runtime.start()
+    import warp as wp
+
+    if not wp.is_cuda_available():
         return (
-            f"torch {torch.__version__} is a build without CUDA",
-            "install one with CUDA: pip install --force-reinstall torch",
-        )
-    if not torch.cuda.is_available():
-        return (
-            f"torch (CUDA {torch.version.cuda}) finds no GPU that its driver can use",
-            "look at nvidia-smi and install a newer driver",
-        )
-    try:
-        with redirect_stdout(sys.stderr):  # it reports its progress; our results are alone on stdout
-            from gsplat.cuda import _backend  # nothing public says whether the kernels are there
-    except Exception as error:  # CUDA's compiler and the one that it calls fail in many ways
-        first = (str(error).strip() or type(error).__name__).splitlines()[0]
-        return f"gsplat's kernels could not be built: {first}", "see gsplat's installation"
-    if _backend._C is None:
-        return (
-            "gsplat has no kernels and found no CUDA compiler to build them",
-            f"install the CUDA toolkit {torch.version.cuda} (nvcc)",
+            f"Warp {wp.config.version} finds no GPU that its driver can use",
+            "install a newer driver (nvidia-smi names yours; since 1.18 it must be R580), or an older Warp: "
+            "pip install warp-lang==1.17.0",
         )
     return None

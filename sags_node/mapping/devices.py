@@ -116,7 +116,7 @@ def make_refiner(config: LaunchConfig, width: int, height: int) -> Refiner:
     cpu = CpuRefiner(partial(make_rasterizer, "numba"))
     if device_of(config).kind == "cpu":
         return cpu
-    from sags_node.mapping.gpu_refiner import GpuRefiner
+    from sags_node.mapping.gpu.refiner import GpuRefiner
 
     on_cpu = affordable(config.model_copy(update={"device": "cpu"}), width, height)
     return GpuRefiner(cpu, on_cpu / affordable(config, width, height))

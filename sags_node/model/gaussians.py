@@ -53,6 +53,7 @@ class GaussianModel:
     depth_errors = _Column(np.float32)  # m, predicted, see `mapping.depth_memory`
     ids = _Column(np.int64)
     contribution = _Column(np.float32)  # px, in the last step on a whole picture
+    origin = _Column(np.int32)  # row + 1 of its optimiser's state on a GPU, see `mapping.gpu`; 0: it has none
     in_front = _Column(np.int32)  # frames in a row in front of the measured surface
     node_index = _Column(np.int32, NEIGHBOURS)
     node_weight = _Column(np.float32, NEIGHBOURS)

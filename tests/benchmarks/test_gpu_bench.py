@@ -1,4 +1,4 @@
-"""`benchmarks kernels --device cuda` with gsplat's stages in torch: everything but the speed."""
+"""`benchmarks kernels --device cuda` on Warp's CPU device: everything but the speed."""
 
 from __future__ import annotations
 
@@ -7,23 +7,22 @@ from pathlib import Path
 from unittest.mock import ANY
 
 import pytest
+import warp as wp
 from command_line import refused, sags
-
-pytest.importorskip("gsplat", reason="it is optional: pip install 'sags-node[gsplat]'")
-
-from gsplat_on_cpu import use_gsplat_on_cpu
+from warp_on_cpu import use_warp_on_cpu
 
 from benchmarks.__main__ import main
-from benchmarks.kernels import gpu
+from benchmarks.gpu import refining
+from benchmarks.gpu.check import GpuCheck, gpu_check
 from sags_node.engine import device
-from sags_node.engine.gsplat_backend import Drawing
+from sags_node.engine.gpu.rasterizer import DeviceRasterizer
 from sags_node.errors import SagsError
 
 COMMAND = ("kernels", "--device", "cuda")
 
 
 def test_a_gpu_is_compared_with_the_cpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    use_gsplat_on_cpu(monkeypatch)
+    use_warp_on_cpu(monkeypatch)
     file = tmp_path / "gpu.json"
     result = sags(*COMMAND, "--quick", "--json", "--out", file, command=main)
     assert result.exit_code == 0, result.output
@@ -33,27 +32,29 @@ def test_a_gpu_is_compared_with_the_cpu(tmp_path: Path, monkeypatch: pytest.Monk
     assert row["n"] == 8 and (row["width"], row["height"]) == (32, 16)
     assert all(row[f"{where}_{what}_ms"] > 0 for where in ("cpu", "gpu") for what in ("frame", "step"))
     assert row["planes_apart"] < 1e-5 and row["colors_apart"] < 1e-3
-    shown = str(gpu.gpu_table(table).columns[0].header)
-    assert table["device"] in shown and table["gsplat"] in shown
+    shown = str(refining.gpu_table(table).columns[0].header)
+    assert table["device"] in shown and table["warp"] in shown
 
 
 def test_a_wrong_drawing_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
-    use_gsplat_on_cpu(monkeypatch)
-    backward = Drawing.backward
-    monkeypatch.setattr(Drawing, "backward", lambda self, v, w: backward(self, 2 * v, w))
-    assert gpu.measure_case(8, 32, 16, 1)["colors_apart"] > 0.5
+    use_warp_on_cpu(monkeypatch)
+    backward = DeviceRasterizer.backward
+    monkeypatch.setattr(
+        DeviceRasterizer, "backward", lambda self, v, w: backward(self, wp.array(2 * v.numpy()), w)
+    )
+    assert refining.measure_case(8, 32, 16, 1)["colors_apart"] > 0.5
 
 
 def test_a_gpu_that_fails_gives_no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Else the CPU's times would stand as the GPU's."""
-    use_gsplat_on_cpu(monkeypatch)
+    use_warp_on_cpu(monkeypatch)
 
     def fails(*_: object) -> None:
         raise RuntimeError("CUDA error")
 
-    monkeypatch.setattr(Drawing, "backward", fails)
+    monkeypatch.setattr(DeviceRasterizer, "backward", fails)
     with pytest.raises(SagsError, match="CUDA error"):
-        gpu.measure_case(8, 32, 16, 1)
+        refining.measure_case(8, 32, 16, 1)
 
 
 def test_what_cannot_be_measured_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -61,3 +62,22 @@ def test_what_cannot_be_measured_is_said(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr(device, "has_gpu", lambda: False)
     device.find_gpu.cache_clear()
     refused(2, *COMMAND, "--quick", said=("no NVIDIA GPU", "nvidia-smi"), command=main)
+
+
+def test_the_check_tries_everything_and_goes_on_after_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    use_warp_on_cpu(monkeypatch)
+    figures = gpu_check(small=True, fit=False, say=lambda line: None)
+    assert not [name for name, row in figures.items() if "error" in row]
+    (apart,) = (row for name, row in figures.items() if name.startswith("parity"))
+    assert apart["repeats"] and apart["gradients_apart"] < 1e-4
+
+    def fails() -> None:
+        raise RuntimeError("CUDA error")
+
+    check = GpuCheck()
+    check.part("first", fails, print)
+    check.part("second", lambda: {"ms": 1.0}, print)
+    assert "CUDA error" in check.figures["first"]["error"] and check.figures["second"] == {"ms": 1.0}
+    check.seconds = -1.0
+    check.part("third", fails, print)
+    assert "time is up" in check.figures["third"]["error"]

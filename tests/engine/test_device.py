@@ -6,10 +6,10 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import ModuleType
+from types import SimpleNamespace
 
 import pytest
-import torch
+import warp as wp
 from click.testing import CliRunner
 
 from sags_node import doctor
@@ -24,7 +24,7 @@ from sags_node.mapping import devices as mapping_devices
 
 @pytest.fixture
 def machine(monkeypatch: pytest.MonkeyPatch) -> Iterator[pytest.MonkeyPatch]:
-    """A machine with a GPU, as far as can be seen without torch, and gsplat installed."""
+    """A machine with a GPU, as far as can be seen without Warp, and Warp installed."""
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
     monkeypatch.setattr(devices, "has_gpu", lambda: True)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: name)
@@ -41,54 +41,25 @@ def hidden(machine: pytest.MonkeyPatch) -> None:
     machine.setenv("CUDA_VISIBLE_DEVICES", "-1")
 
 
-def without_gsplat(machine: pytest.MonkeyPatch) -> None:
-    machine.setattr("importlib.util.find_spec", lambda name: None if name == "gsplat" else name)
-
-
-def without_cuda_build(machine: pytest.MonkeyPatch) -> None:
-    machine.setattr(torch.version, "cuda", None)
+def without_warp(machine: pytest.MonkeyPatch) -> None:
+    machine.setattr("importlib.util.find_spec", lambda name: None if name == "warp" else name)
 
 
 def without_driver(machine: pytest.MonkeyPatch) -> None:
-    machine.setattr(torch.version, "cuda", "12.8")
-    machine.setattr(torch.cuda, "is_available", lambda: False)
-
-
-def with_kernels(machine: pytest.MonkeyPatch, kernels: object) -> None:
-    """A GPU that torch can use, and gsplat's package with what it built."""
-    machine.setattr(torch.version, "cuda", "12.8")
-    machine.setattr(torch.cuda, "is_available", lambda: True)
-    machine.setattr(torch.cuda, "get_device_name", lambda: "NVIDIA H100")
-    built = ModuleType("gsplat.cuda._backend")
-    built._C = kernels  # type: ignore[attr-defined]
-    for name in ("gsplat", "gsplat.cuda"):
-        machine.setitem(sys.modules, name, ModuleType(name))
-    machine.setitem(sys.modules, built.__name__, built)
-    machine.setattr(sys.modules["gsplat.cuda"], "_backend", built, raising=False)
+    machine.setattr(wp, "is_cuda_available", lambda: False)
 
 
 def usable(machine: pytest.MonkeyPatch) -> None:
-    with_kernels(machine, object())
-
-
-def without_compiler(machine: pytest.MonkeyPatch) -> None:
-    with_kernels(machine, None)
-
-
-def not_building(machine: pytest.MonkeyPatch) -> None:
-    with_kernels(machine, None)
-    machine.delattr(sys.modules["gsplat.cuda"], "_backend")
-    machine.delitem(sys.modules, "gsplat.cuda._backend")
+    machine.setattr(wp, "is_cuda_available", lambda: True)
+    machine.setattr(wp, "get_cuda_driver_version", lambda: (13, 0))
+    machine.setattr(wp, "get_device", lambda name: SimpleNamespace(name="NVIDIA H100"))
 
 
 UNUSABLE = [
     (without_hardware, "no NVIDIA GPU", "nvidia-smi"),
     (hidden, "CUDA_VISIBLE_DEVICES hides every GPU", "unset it"),
-    (without_gsplat, "gsplat is not installed", "pip install 'sags-node[gsplat]'"),
-    (without_cuda_build, "build without CUDA", "pip install --force-reinstall torch"),
+    (without_warp, "Warp is not installed", "pip install warp-lang"),
     (without_driver, "finds no GPU that its driver can use", "newer driver"),
-    (without_compiler, "found no CUDA compiler", "install the CUDA toolkit 12.8 (nvcc)"),
-    (not_building, "gsplat's kernels could not be built", "gsplat's installation"),
 ]  # fmt: skip
 
 
@@ -129,7 +100,8 @@ def test_a_usable_gpu_is_chosen_and_gets_more_gaussians(machine: pytest.MonkeyPa
     usable(machine)
     assert choose_device("auto").name == choose_device("cuda").name == "NVIDIA H100"
     assert choose_device("cpu").kind == "cpu"
-    assert doctor.check_gpu(LaunchConfig()).level == "ok" and "H100" in doctor.check_gpu(LaunchConfig()).found
+    check = doctor.check_gpu(LaunchConfig())
+    assert check.level == "ok" and "H100" in check.found and "CUDA 13.0" in check.found
     cpu = mapping_devices.affordable(LaunchConfig(device="cpu"), 1280, 1024)
     gpu = mapping_devices.affordable(LaunchConfig(), 1280, 1024)
     assert gpu > 2 * cpu
@@ -137,7 +109,7 @@ def test_a_usable_gpu_is_chosen_and_gets_more_gaussians(machine: pytest.MonkeyPa
     assert mapping_devices.affordable(fixed, 640, 512) == 5000
 
 
-def test_machines_without_a_gpu_never_wait_for_torch() -> None:
+def test_machines_without_a_gpu_never_wait_for_torch_or_warp() -> None:
     """`auto` looks for the hardware first, and the frame path needs no torch."""
     code = """
 import sys
@@ -147,7 +119,7 @@ from sags_node.config.schema import LaunchConfig
 from sags_node.pipeline.warm_up import warm_up
 warm_up(LaunchConfig())
 assert "sags_node.mapping.mapper" in sys.modules
-print([name for name in ("torch", "gsplat") if name in sys.modules])
+print([name for name in ("torch", "warp") if name in sys.modules])
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"
@@ -156,4 +128,4 @@ print([name for name in ("torch", "gsplat") if name in sys.modules])
 def test_device_is_a_launch_key() -> None:
     assert load_launch().device == "auto"
     with pytest.raises(UsageError, match="device"):
-        load_launch(None, ["device:=gsplat"])
+        load_launch(None, ["device:=gpu"])

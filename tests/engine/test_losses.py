@@ -1,4 +1,4 @@
-"""The tissue loss, the kernel's and that in torch for a GPU, against autograd of what it states."""
+"""The tissue loss, on the CPU and by the kernel for a GPU, against autograd of what it states."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import pytest
 from engine_scenes import as_bytes, camera, on_one_thread, random_gaussians
 from rounding import after, exact
 
-from sags_node.engine.losses.pieces import LEVEL, PIECE
+from sags_node.engine.losses.pieces import PIECE
 from sags_node.engine.losses.tissue import tissue_loss
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
+from sags_node.mapping.refiner import DEPTH_SCALE, DEPTH_WEIGHT
 from sags_node.types import F32
 
 HEIGHT, WIDTH = 23, 31
-DEPTH_WEIGHT, DEPTH_SCALE = 0.02, 1e-3
 
 
 def frame(seed: int = 0) -> dict[str, Any]:
@@ -51,19 +51,19 @@ def on_cpu(inputs: dict[str, Any]) -> tuple[float, F32, F32]:
     return mean, v_planes, weight
 
 
-def in_torch(inputs: dict[str, Any]) -> tuple[float, F32, F32]:
-    import torch
+def in_warp(inputs: dict[str, Any]) -> tuple[float, F32, F32]:
+    from sags_node.engine.gpu import runtime
+    from sags_node.mapping.gpu.picture import Picture
 
-    from sags_node.mapping import gpu_refiner
+    height, width = inputs["tissue"].shape
+    picture = Picture(width, height, runtime.device_named("cpu"))
+    picture.rasterizer.planes.assign(inputs["planes"])
+    picture.show(inputs["image"], inputs["tissue"], inputs["depth"])
+    v_planes, weight = (each.numpy() for each in picture.compare())
+    return picture.loss(), v_planes, weight
 
-    given = {name: torch.tensor(array) for name, array in inputs.items()}
-    given["image"] = given["image"].permute(2, 0, 1) * float(LEVEL)
-    mean, *rest = gpu_refiner.tissue_loss(**given, depth_weight=DEPTH_WEIGHT, depth_scale=DEPTH_SCALE)
-    v_planes, weight = (each.numpy() for each in rest)
-    return mean.item(), v_planes, weight
 
-
-@pytest.fixture(params=[on_cpu, in_torch])
+@pytest.fixture(params=[on_cpu, in_warp])
 def run(request: pytest.FixtureRequest) -> Run:
     found: Run = request.param
     return found

@@ -12,4 +12,4 @@ from sags_node.engine.gpu import runtime
 def use_warp_on_cpu(patch: pytest.MonkeyPatch) -> None:
     """Until `patch` is undone, this machine has a GPU."""
     patch.setattr(device, "find_gpu", lambda: device.Device("cuda", "Warp's CPU device"))
-    patch.setattr(runtime, "gpu", lambda: runtime.device_named("cpu"))
+    patch.setattr(device, "gpu", lambda: runtime.device_named("cpu"))

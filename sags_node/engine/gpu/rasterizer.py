@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import warp as wp
 
-from sags_node.engine.gpu import runtime
-
-runtime.start()  # before kernels are looked at: it says where compiled ones lie
-
-import warp as wp  # noqa: E402
-
-from sags_node.engine.gpu import binning, compositing, projection  # noqa: E402
-from sags_node.engine.gpu.binning import LANES, TILE  # noqa: E402
-from sags_node.engine.interface import DILATION_VARIANCE, MIP_VARIANCE, Gradients, Pinhole  # noqa: E402
-from sags_node.engine.rasterizer import spherical_harmonics  # noqa: E402
-from sags_node.engine.rasterizer.compositing import TILE_HEIGHT, TILE_WIDTH  # noqa: E402
-from sags_node.engine.rasterizer.projector import centre_of  # noqa: E402
-from sags_node.errors import SagsError  # noqa: E402
-from sags_node.types import F32, I32, Bool, Gaussians  # noqa: E402
+from sags_node.engine.gpu import binning, compositing, projection, runtime
+from sags_node.engine.gpu.binning import LANES, TILE
+from sags_node.engine.interface import DILATION_VARIANCE, MIP_VARIANCE, Gradients, Pinhole
+from sags_node.engine.rasterizer import spherical_harmonics
+from sags_node.engine.rasterizer.compositing import TILE_HEIGHT, TILE_WIDTH
+from sags_node.engine.rasterizer.projector import centre_of
+from sags_node.errors import SagsError
+from sags_node.types import F32, I32, Bool, Gaussians
 
 MAX_PAIRS = 1 << 25  # 3 GiB
 SPARE = 1.25  # what is asked for beyond the need when a buffer grows
@@ -50,6 +46,7 @@ class DeviceRasterizer:
             device: Warp's.
             antialias: as `rasterize.make_rasterizer` has it.
         """
+        runtime.start()
         self.device = wp.get_device(device)
         self._size = [width, height]
         self._filter = [MIP_VARIANCE if antialias else DILATION_VARIANCE, int(antialias)]
@@ -214,35 +211,39 @@ class WarpBackend:
         self._device = device
 
     def forward(self, gaussians: Gaussians, pinhole: Pinhole, tiles: Bool | None) -> F32:
-        self._given = gaussians
-        self._centre = centre_of(pinhole)
-        planes: F32 = self._on_device.forward(self._sent(gaussians), pinhole, tiles).numpy()
+        self._given, self._centre = gaussians, centre_of(pinhole)
+        if gaussians.sh_rest is not None:  # the one thing that the host's kernels do
+            seen = np.empty_like(gaussians.colors)
+            spherical_harmonics.color(
+                gaussians.means, gaussians.colors, gaussians.sh_rest, self._centre, seen
+            )
+            gaussians = replace(gaussians, colors=seen)
+        tables = sent(gaussians, self._device)
+        planes: F32 = self._on_device.forward(tables, pinhole, tiles).numpy()
         return planes
 
     def backward(self, v_planes: F32, weight: F32) -> Gradients:
         given = (wp.array(array, dtype=float, device=self._device) for array in (v_planes, weight))
         found = {name: array.numpy() for name, array in self._on_device.backward(*given).items()}
-        count, rest = len(self._given), self._given.sh_rest
-        v_rest = np.zeros((count, 0 if rest is None else rest.shape[1], 3), np.float32)
+        rest = self._given.sh_rest
+        v_rest = np.zeros((len(self._given), 0 if rest is None else rest.shape[1], 3), np.float32)
         if rest is not None:
-            means, colors = found["means"], found["colors"]
-            spherical_harmonics.color_backward(self._given.means, rest, self._centre, colors, v_rest, means)
+            spherical_harmonics.color_backward(
+                self._given.means, rest, self._centre, found["colors"], v_rest, found["means"]
+            )
         return Gradients(**found, sh_rest=v_rest)
 
     def median(self) -> tuple[F32, I32]:
         depths, rows = self._on_device.median()
         return depths.numpy(), rows.numpy()
 
-    def _sent(self, gaussians: Gaussians) -> dict[str, wp.array]:
-        arrays = {name: getattr(gaussians, name) for name in KINDS}
-        count = len(gaussians)
-        if gaussians.sh_rest is not None:
-            arrays["colors"] = np.empty((count, 3), np.float32)
-            spherical_harmonics.color(
-                gaussians.means, gaussians.colors, gaussians.sh_rest, self._centre, arrays["colors"]
-            )
-        absent = {"slopes": np.zeros((count, 3), np.float32), "smoothing": np.zeros(count, np.float32)}
-        return {
-            name: wp.array(absent[name] if array is None else array, dtype=KINDS[name], device=self._device)
-            for name, array in arrays.items()
-        }
+
+def sent(gaussians: Gaussians, device: wp.Device) -> dict[str, wp.array]:
+    """What `DeviceRasterizer.forward` takes of Gaussians, copied to the device."""
+    count = len(gaussians)
+    absent = {"slopes": np.zeros((count, 3), np.float32), "smoothing": np.zeros(count, np.float32)}
+    given = {name: getattr(gaussians, name) for name in KINDS}
+    return {
+        name: wp.array(absent[name] if array is None else array, dtype=KINDS[name], device=device)
+        for name, array in given.items()
+    }

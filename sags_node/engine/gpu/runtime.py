@@ -6,7 +6,6 @@ import functools
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sags_node.engine.device import choose_device
 from sags_node.kernels.cache import cache_root
 
 if TYPE_CHECKING:
@@ -30,14 +29,11 @@ def start() -> None:
     wp.init()
 
 
-def gpu() -> wp.Device:
-    """The GPU that is drawn on.
+def driver() -> str:
+    """The driver's CUDA version."""
+    import warp as wp
 
-    Raises:
-        UsageError: none can be used.
-    """
-    choose_device("cuda")
-    return device_named("cuda")
+    return ".".join(map(str, wp.get_cuda_driver_version() or ("none",)))
 
 
 def device_named(name: str) -> wp.Device:

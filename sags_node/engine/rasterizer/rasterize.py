@@ -11,6 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from sags_node.engine import device
 from sags_node.engine.interface import Backend, Gradients, Pinhole, Rasterizer
 from sags_node.engine.rasterizer.compositing import TILE_HEIGHT, TILE_WIDTH
 from sags_node.engine.rasterizer.views import to_view
@@ -30,7 +31,7 @@ def make_rasterizer(backend: str, width: int, height: int, antialias: bool = Tru
     """A rasteriser for pictures of one size (px).
 
     Args:
-        backend: "numba" (CPU), "warp" (GPU), "gsplat" or "reference" (torch, slow).
+        backend: "numba" (CPU), "warp" (GPU) or "reference" (torch, slow).
         width, height: px.
         antialias: the 2D filter of Mip-Splatting. False: the fixed dilation of 3D Gaussian Splatting in its
             place, which grows brighter and thicker when the picture gets smaller. For comparison only.
@@ -45,14 +46,9 @@ def make_rasterizer(backend: str, width: int, height: int, antialias: bool = Tru
 
         return _CheckedRasterizer(NumbaRasterizer(width, height, antialias), width, height)
     if backend == "warp":
-        from sags_node.engine.gpu import runtime
         from sags_node.engine.gpu.rasterizer import WarpBackend
 
-        return _CheckedRasterizer(WarpBackend(width, height, antialias, runtime.gpu()), width, height)
-    if backend == "gsplat":
-        from sags_node.engine.gsplat_backend import GsplatBackend
-
-        return _CheckedRasterizer(GsplatBackend(width, height, antialias), width, height)
+        return _CheckedRasterizer(WarpBackend(width, height, antialias, device.gpu()), width, height)
     if backend == "reference":
         from sags_node.engine.reference.rasterizer import ReferenceRasterizer
 

@@ -63,7 +63,7 @@ def measure_gpu(settings: GpuSettings, advance: Advance) -> dict[str, Any]:
     return {
         "machine": machine_name(),
         "device": device.name,
-        "gsplat": version("gsplat"),
+        "warp": version("warp-lang"),
         "settings": asdict(settings),
         "refine": rows,
     }
@@ -71,7 +71,7 @@ def measure_gpu(settings: GpuSettings, advance: Advance) -> dict[str, Any]:
 
 def measure_case(count: int, width: int, height: int, runs: int) -> dict[str, Any]:
     """A row of the table."""
-    from sags_node.mapping.gpu_refiner import GpuRefiner  # torch takes seconds to import
+    from sags_node.mapping.gpu.refiner import GpuRefiner  # Warp takes a second to import
 
     def on_cpu() -> CpuRefiner:
         return CpuRefiner(partial(make_rasterizer, "numba"))
@@ -133,7 +133,7 @@ class Refining:
 def gpu_table(measured: dict[str, Any]) -> Table:
     """`measured` as `measure_gpu` returns it."""
     made = new_table(
-        f"{measured['device']}, gsplat {measured['gsplat']}", "frame ms", "CPU", "faster", "step ms", "CPU",
+        f"{measured['device']}, Warp {measured['warp']}", "frame ms", "CPU", "faster", "step ms", "CPU",
         "faster", "planes apart", "colours apart",
     )  # fmt: skip
     for row in measured["refine"]:

@@ -1,0 +1,131 @@
+"""`make gpu-check`: all that a GPU should do, once, on the machine that has it.
+
+A part that fails is noted and the others go on. None begins after the time is up.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from benchmarks.gpu.drawing import measure_drawing, parity
+from benchmarks.gpu.refining import measure_case
+from sags_node.engine import device
+from sags_node.engine.gpu import runtime
+from sags_node.evaluation.provenance import machine_name
+
+Row = dict[str, Any]
+SECONDS = 420.0  # after which nothing new begins
+COMMAND = 300.0  # s that one of our commands may take
+COUNTS = (10_000, 30_000, 100_000, 300_000, 1_000_000)
+SIZES = ((640, 512), (1280, 1024))
+LIVE = (
+    ("D4D, 30 Hz", ["launch/d4d_pull.yaml"]),
+    ("D4D, 60 Hz", ["launch/d4d_pull.yaml", "source.rate:=60"]),
+    ("phantom, 30 Hz", ["launch/phantom.yaml"]),
+    ("phantom, 60 Hz", ["launch/phantom.yaml", "source.rate:=60"]),
+)
+LIVE_FIGURES = (
+    "frames", "processed", "rate_hz", "latency_ms", "frame_ms", "stage_ms", "iterations_per_frame", "online",
+    "depth", "gaussians", "rungs", "warnings", "settings",
+)  # fmt: skip
+
+
+@dataclass
+class GpuCheck:
+    """Runs parts and keeps what each gave.
+
+    Attributes:
+        figures: by the name of each part; of one that failed, `error`.
+    """
+
+    seconds: float = SECONDS
+    figures: dict[str, Any] = field(default_factory=dict)
+    began: float = field(default_factory=time.monotonic)
+
+    def part(self, name: str, run: Callable[[], Any], say: Callable[[str], None]) -> None:
+        if time.monotonic() - self.began > self.seconds:
+            self.figures[name] = {"error": "left out: the time is up"}
+            return
+        try:
+            self.figures[name] = run()
+        except Exception as error:  # whatever it is, the other parts go on
+            self.figures[name] = {"error": f"{type(error).__name__}: {error}"[:2000]}
+        say(f"{name}: {json.dumps(self.figures[name])[:300]}")
+
+
+def gpu_check(small: bool, fit: bool, say: Callable[[str], None]) -> dict[str, Any]:
+    """Everything, by the name of its part.
+
+    Args:
+        small: tiny sizes and no live runs, for Warp's CPU device.
+        fit: also the paper's fit.
+        say: called with a line for each part.
+    """
+    check = GpuCheck()
+    check.part("environment", environment, say)
+    counts, sizes, runs = ((300,), ((64, 48),), 1) if small else (COUNTS, SIZES, 21)
+    for count, size in ((200, (96, 80)),) if small else ((2_000, (150, 117)), (100_000, (640, 512))):
+        check.part(f"parity {count}", partial(parity, count, *size), say)
+    for size in sizes:
+        for count in counts:
+            name = f"{count} at {size[0]}x{size[1]}"
+            check.part(f"draw {name}", partial(measure_drawing, count, *size, runs), say)
+            if count <= 300_000:
+                check.part(f"refine {name}", partial(measure_case, count, *size, runs), say)
+    if small:
+        return check.figures
+    for name, arguments in LIVE:
+        for kind in ("cuda", "cpu"):
+            check.part(f"live {name}, {kind}", partial(live, arguments, kind), say)
+    if fit:
+        check.part("fit", paper_fit, say)
+    return check.figures
+
+
+def environment() -> Row:
+    """The card, its driver, and what compiling our kernels takes."""
+    import warp as wp
+
+    chosen = device.gpu()
+    begun = time.perf_counter()
+    measure_case(8, 32, 16, 1)
+    return {
+        "machine": machine_name(),
+        "device": chosen.name,
+        "arch": getattr(chosen, "arch", None),
+        "driver_cuda": runtime.driver(),
+        "warp": wp.config.version,
+        "python": sys.version.split()[0],
+        "compile_s": time.perf_counter() - begun,
+    }
+
+
+def live(arguments: list[str], kind: str) -> Row:
+    """What a subscriber got of a node that plays a recording."""
+    found = _sags("eval", *arguments, f"device:={kind}")
+    return found if "error" in found else {key: found[key] for key in LIVE_FIGURES}
+
+
+def paper_fit() -> Row:
+    """The schedule of SAGS on the GPU."""
+    return _sags("fit", "launch/d4d_pull.yaml", "--schedule", "paper", "device:=cuda")
+
+
+def _sags(*arguments: str) -> Row:
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "out.json"
+        command = [sys.executable, "-m", "sags_node", *arguments, "--out", str(out)]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=COMMAND, check=False)
+        if not out.exists():
+            return {"error": f"{done.returncode}: {done.stderr[-1500:]}"}
+        found: Row = json.loads(out.read_text())
+        return found

@@ -1,0 +1,1 @@
+"""The mapper's steps on a GPU: `refiner.GpuRefiner` in the place of `mapping.refiner.CpuRefiner`."""

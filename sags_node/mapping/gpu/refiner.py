@@ -1,0 +1,192 @@
+"""The refiner on a GPU; the CPU goes on where the GPU fails.
+
+The model's rows go up once per frame and come down once. Motion, removal and insertion stay on the CPU.
+"""
+
+from __future__ import annotations
+
+import functools
+import logging
+from collections.abc import Callable
+from typing import Concatenate, ParamSpec, TypeVar
+
+import warp as wp
+
+from sags_node.engine import device
+from sags_node.engine.gpu.rasterizer import sent
+from sags_node.engine.rasterizer.rasterize import as_pinhole
+from sags_node.mapping.exposure import exposure_gain
+from sags_node.mapping.focus import largest, tile_grid
+from sags_node.mapping.gpu.device_map import DeviceMap
+from sags_node.mapping.gpu.picture import Picture
+from sags_node.mapping.optimiser import LearningRates
+from sags_node.mapping.refiner import CpuRefiner
+from sags_node.model.deformation import NodeDeformation
+from sags_node.model.gaussians import GaussianModel
+from sags_node.types import F32, Bool, Camera, Finding, Gaussians, Observation
+
+log = logging.getLogger(__name__)
+
+Given = ParamSpec("Given")
+Result = TypeVar("Result")
+
+
+def _or_on_the_cpu(
+    method: Callable[Concatenate[GpuRefiner, Given], Result],
+) -> Callable[Concatenate[GpuRefiner, Given], Result]:
+    """Where the GPU fails, and ever after, the CPU's method of that name does it."""
+
+    @functools.wraps(method)
+    def guarded(self: GpuRefiner, /, *args: Given.args, **names: Given.kwargs) -> Result:
+        if self.problem is None:
+            try:
+                return method(self, *args, **names)
+            except RuntimeError as error:  # Warp raises the driver's errors so, and those of memory
+                self._give_up(error)
+        result: Result = getattr(self._cpu, method.__name__)(*args, **names)
+        return result
+
+    return guarded
+
+
+class GpuRefiner:
+    """`refiner.Refiner` on the current GPU.
+
+    A frame in which the GPU fails is finished on the CPU, which goes on for good: a CUDA error cannot be
+    recovered from in the same process. The model still stands there as it was before the frame's steps, so
+    nothing but these is lost, and what Adam remembers.
+
+    Attributes:
+        on_gpu: the model as it stands there.
+    """
+
+    def __init__(self, cpu: CpuRefiner, cpu_share: float) -> None:
+        """
+        Args:
+            cpu: goes on where the GPU fails.
+            cpu_share: how much of the model's capacity it can refine, 0..1.
+
+        Raises:
+            UsageError: no GPU can be used.
+        """
+        self.share = 1.0
+        self.problem: Finding | None = None
+        self._cpu, self._cpu_share = cpu, cpu_share
+        self._device = device.gpu()
+        self.on_gpu = DeviceMap(self._device)
+        self._loss = 0.0
+        self._frame: tuple[GaussianModel, NodeDeformation, Observation, float] | None = None
+        self._pictures: dict[tuple[int, int], Picture] = {}  # by their size
+        self._viewers: dict[tuple[int, int], Picture] = {}  # those of `show`
+
+    @property
+    def loss(self) -> float:
+        return self._loss if self.problem is None else self._cpu.loss
+
+    @_or_on_the_cpu
+    def begin(
+        self, model: GaussianModel, deformation: NodeDeformation, observation: Observation, node_step: float
+    ) -> None:
+        self._frame = model, deformation, observation, node_step
+        self._picture = self._picture_for(observation.camera, self._pictures)
+        self._picture.show(observation.image, observation.tissue, observation.depth)
+        self._pinhole = as_pinhole(observation.camera)
+        self._touched = tile_grid(observation.tissue)
+        self._changed = False
+        self.on_gpu.begin(model, deformation)
+
+    @_or_on_the_cpu
+    def take(self, rows: slice) -> None:
+        self.on_gpu.take(rows)
+
+    @_or_on_the_cpu
+    def download(self) -> None:
+        if self._changed:
+            loss = self._picture.loss()
+            self.on_gpu.download()
+            self._loss, self._changed = loss, False
+
+    @_or_on_the_cpu
+    def draw(self) -> None:
+        self._draw(None)
+
+    @_or_on_the_cpu
+    def redraw(self, share: float, tiles: Bool) -> None:
+        some = None
+        if share < 1.0:
+            some = tiles | self._touched
+            if share > 0:
+                some |= self._worst_tiles(share)
+        self._draw(some)
+
+    @_or_on_the_cpu
+    def planes(self) -> F32:
+        return self._picture.fetched()
+
+    @_or_on_the_cpu
+    def exposure_gain(self) -> F32:
+        assert self._frame is not None
+        observation = self._frame[2]
+        return exposure_gain(self._picture.fetched(), observation.image, observation.tissue)
+
+    @_or_on_the_cpu
+    def refine(self, rates: LearningRates) -> None:
+        self.on_gpu.note_contribution(self._step(rates))
+
+    @_or_on_the_cpu
+    def refine_worst(self, share: float, rates: LearningRates, nodes: bool = True) -> None:
+        tiles = self._worst_tiles(share)
+        self._draw(tiles)
+        self._step(rates, nodes)
+        self._touched |= tiles
+
+    @_or_on_the_cpu
+    def touched(self) -> Bool:
+        return self._touched
+
+    @_or_on_the_cpu
+    def show(self, gaussians: Gaussians, camera: Camera) -> F32:
+        picture = self._picture_for(camera, self._viewers)
+        picture.rasterizer.forward(sent(gaussians, self._device), as_pinhole(camera))
+        return picture.fetched(anew=True)
+
+    def _give_up(self, error: RuntimeError) -> None:
+        said = (str(error).strip() or type(error).__name__).splitlines()[0]
+        full = "allocate" in said  # Warp has no error of its own for it
+        remedy = "end what else uses the GPU, or lower mapping.max_gaussians, and " if full else ""
+        self.problem = Finding(
+            "gpu_memory" if full else "gpu_failed",
+            f"the GPU failed and the CPU goes on: {said}; {remedy}restart the node to use the GPU again",
+        )
+        log.info("%s", self.problem.text, exc_info=error)
+        self.share = self._cpu_share
+        if self._frame is not None:
+            self._cpu.begin(*self._frame)
+            self._cpu.draw()
+
+    def _draw(self, tiles: Bool | None) -> None:
+        self._picture.rasterizer.forward(self.on_gpu.drawn(), self._pinhole, tiles)
+        self._picture.is_fetched = False
+
+    def _step(self, rates: LearningRates, nodes: bool = True) -> wp.array:
+        """A step on what was drawn last: `CpuRefiner._step`.
+
+        Returns:
+            [N] px, what each Gaussian contributes.
+        """
+        assert self._frame is not None
+        gradients = self._picture.rasterizer.backward(*self._picture.compare())
+        if nodes:  # they move all that follows them, also far from the tiles that were drawn
+            self.on_gpu.descend(gradients, self._frame[3])
+        self.on_gpu.optimise(gradients, rates, self._frame[2].camera)
+        self._changed = True
+        return gradients["contribution"]
+
+    def _worst_tiles(self, share: float) -> Bool:
+        return largest(self._picture.residuals(), share)
+
+    def _picture_for(self, camera: Camera, made: dict[tuple[int, int], Picture]) -> Picture:
+        size = camera.width, camera.height
+        if size not in made:
+            made[size] = Picture(*size, self._device)
+        return made[size]
