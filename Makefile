@@ -18,7 +18,7 @@ unexport PYTHONDONTWRITEBYTECODE
 missing = $(shell for p in $(1); do dpkg -s $$p >/dev/null 2>&1 || echo $$p; done)
 apt_install = apt-get update -qq && apt-get install -y -qq --no-install-recommends $(1) >/dev/null
 
-.PHONY: setup run test test-all bench test-targets test-tools simulate stops soak fuzz wheel-test sbom audit licences lint golden docs clean
+.PHONY: setup run test test-all bench gpu-check test-targets test-tools simulate stops soak fuzz wheel-test sbom audit licences lint golden docs clean
 
 setup: $(STAMP)
 
@@ -55,6 +55,10 @@ test-all: setup test-tools
 # Run time against error on this machine, and its plot: out/pareto.json and out/pareto.png. LAUNCH: other recordings.
 bench: setup
 	$(BIN)/python -m benchmarks pareto $(LAUNCH) --frames 40 --out out/pareto.json --plot out/pareto.png --force
+
+# All that a GPU should do, on a machine that has one: eight minutes. A wheel of warp-lang must be installed.
+gpu-check: setup
+	$(BIN)/python -m benchmarks gpu --fit --out out/gpu.json
 
 # The kernels' tests for other processors than this one, on one and on two threads: a quarter of an hour.
 test-targets: setup

@@ -347,9 +347,16 @@ def bench_ablation(
 @click.command("gpu")
 @click.option("--small", is_flag=True, help="Tiny sizes and no live runs: does it work, not how fast is it.")
 @click.option("--fit", is_flag=True, help="Also the paper's fit, which takes minutes.")
+@click.option(
+    "--seconds",
+    type=click.FloatRange(min=1),
+    default=420.0,
+    show_default=True,
+    help="After which no part begins.",
+)
 @figures_option
 @as_json
-def bench_gpu(small: bool, fit: bool, out: Path | None, json_out: bool) -> None:
+def bench_gpu(small: bool, fit: bool, seconds: float, out: Path | None, json_out: bool) -> None:
     """All that a GPU should do: parity, times, live runs. `make gpu-check` calls it.
 
     \b
@@ -358,7 +365,7 @@ def bench_gpu(small: bool, fit: bool, out: Path | None, json_out: bool) -> None:
     from benchmarks.gpu.check import gpu_check
 
     check_files(out)
-    measured = gpu_check(small, fit, lambda line: click.echo(line, err=True))
+    measured = gpu_check(small, fit, lambda line: click.echo(line, err=True), seconds)
     if json_out:
         show([measured])
     write_json(out, measured)

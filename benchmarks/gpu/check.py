@@ -62,15 +62,16 @@ class GpuCheck:
         say(f"{name}: {json.dumps(self.figures[name])[:300]}")
 
 
-def gpu_check(small: bool, fit: bool, say: Callable[[str], None]) -> dict[str, Any]:
+def gpu_check(small: bool, fit: bool, say: Callable[[str], None], seconds: float = SECONDS) -> dict[str, Any]:
     """Everything, by the name of its part.
 
     Args:
         small: tiny sizes and no live runs, for Warp's CPU device.
         fit: also the paper's fit.
         say: called with a line for each part.
+        seconds: after which no part begins.
     """
-    check = GpuCheck()
+    check = GpuCheck(seconds)
     check.part("environment", environment, say)
     counts, sizes, runs = ((300,), ((64, 48),), 1) if small else (COUNTS, SIZES, 21)
     for count, size in ((200, (96, 80)),) if small else ((2_000, (150, 117)), (100_000, (640, 512))):
@@ -80,7 +81,7 @@ def gpu_check(small: bool, fit: bool, say: Callable[[str], None]) -> dict[str, A
             name = f"{count} at {size[0]}x{size[1]}"
             check.part(f"draw {name}", partial(measure_drawing, count, *size, runs), say)
             if count <= 300_000:
-                check.part(f"refine {name}", partial(measure_case, count, *size, runs), say)
+                check.part(f"refine {name}", partial(measure_case, count, *size, runs, 3), say)
     if small:
         return check.figures
     for name, arguments in LIVE:

@@ -69,8 +69,10 @@ def measure_gpu(settings: GpuSettings, advance: Advance) -> dict[str, Any]:
     }
 
 
-def measure_case(count: int, width: int, height: int, runs: int) -> dict[str, Any]:
-    """A row of the table."""
+def measure_case(
+    count: int, width: int, height: int, runs: int, cpu_runs: int | None = None
+) -> dict[str, Any]:
+    """A row of the table. `cpu_runs`: fewer, of the CPU."""
     from sags_node.mapping.gpu.refiner import GpuRefiner  # Warp takes a second to import
 
     def on_cpu() -> CpuRefiner:
@@ -81,9 +83,9 @@ def measure_case(count: int, width: int, height: int, runs: int) -> dict[str, An
     truth, found = (each.frame() for each in (cpu, gpu))  # before any other step
     moved, moved_on_gpu = (each.model.colors - each.before for each in (cpu, gpu))
     row: dict[str, Any] = {"n": cpu.model.count, "width": width, "height": height}
-    for name, each in (("cpu", cpu), ("gpu", gpu)):
-        row[f"{name}_frame_ms"] = median_ms(each.frame, runs)
-        row[f"{name}_step_ms"] = median_ms(each.steps, runs) / STEPS
+    for name, each, times in (("cpu", cpu, cpu_runs or runs), ("gpu", gpu, runs)):
+        row[f"{name}_frame_ms"] = median_ms(each.frame, times)
+        row[f"{name}_step_ms"] = median_ms(each.steps, times) / STEPS
     if gpu.refiner.problem is not None:  # else the CPU's times would stand as the GPU's
         raise SagsError(gpu.refiner.problem.text)
     return row | {

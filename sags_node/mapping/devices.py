@@ -37,6 +37,11 @@ def device_of(config: LaunchConfig) -> Device:
     return choose_device("cpu" if config.mapping.method == "sags" else config.device)
 
 
+def backend_of(config: LaunchConfig) -> str:
+    """The rasteriser's backend on that device."""
+    return "warp" if device_of(config).kind == "cuda" else "numba"
+
+
 def affordable(config: LaunchConfig, width: int, height: int) -> int:
     """How many Gaussians a model of pictures of this size may have on the launch's device."""
     if config.mapping.max_gaussians is not None:

@@ -25,6 +25,7 @@ from sags_node.config.schema import LaunchConfig, LiveSource
 from sags_node.errors import SagsError
 from sags_node.findings import by_code
 from sags_node.kernels.threads import configure_threads
+from sags_node.mapping.devices import backend_of
 from sags_node.messaging import content
 from sags_node.messaging.cdr import Content
 from sags_node.messaging.masks import MaskSubscriber
@@ -86,7 +87,8 @@ class Node:
             pipeline = Pipeline(config, rig, rate=rate)
         statistics = Statistics(config.source)
         self._allowance = Allowance()
-        views = Views(self._allowance, latency=lambda: statistics.latency_s)
+        backend = backend_of(config)
+        views = Views(self._allowance, latency=lambda: statistics.latency_s, backend=backend)
         self._state = NodeState(config, pipeline, pipeline.make_budget(), views, statistics=statistics)
         self._operations = Operations(self._state, self._hand_over_view)
         self._pictures: Latest[tuple[RectifiedPair, int]] = Latest(on_put=self._wake_publishing)  # and epoch

@@ -24,7 +24,7 @@ from sags_node.messaging.requests import ViewRequest
 from sags_node.model.forecast import gaussians_ahead, reached
 from sags_node.model.gaussians import for_right_eye
 from sags_node.node.allowance import SHARE, Allowance
-from sags_node.types import Camera, DrawnView, FrameResult, RenderedView, ViewStatus
+from sags_node.types import F32, Camera, DrawnView, FrameResult, Gaussians, RenderedView, ViewStatus
 
 MAX_VIEWS = 8
 HELD_OVER = 5.0  # s over which the held rate is counted
@@ -64,11 +64,13 @@ class Views:
         clock: Clock = time.monotonic,
         processor_clock: Clock = time.thread_time,
         latency: Clock = lambda: 0.0,
+        backend: str = "numba",
     ) -> None:
         """
         Args:
             allowance: what drawing may take of one core.
             latency: s from capture to published, as it was lately.
+            backend: as `make_rasterizer` has it.
         """
         self.status: Mapping[str, ViewStatus] = {}
         self.pairs: Collection[str] = ()
@@ -76,6 +78,7 @@ class Views:
         self._clock = clock
         self._processor_clock = processor_clock
         self._latency = latency
+        self._backend = backend
         self._views: dict[str, _View] = {}
         self._rasterizers: dict[tuple[int, int], Rasterizer] = {}
         self._watched: Collection[str] = ()
@@ -149,9 +152,6 @@ class Views:
     def _draw(self, view: _View, scene: FrameResult) -> DrawnView:
         request = view.request
         started = self._processor_clock()
-        size = request.width, request.height
-        if size not in self._rasterizers:
-            self._rasterizers[size] = make_rasterizer("numba", *size)
         snapshot = scene.snapshot
         camera = view_camera(request, snapshot.camera)
         eyes = {"": camera}
@@ -165,7 +165,7 @@ class Views:
             shown = _published(scene, camera) if eye == "right" and ahead == 0 else None
             if shown is None:
                 seen = for_right_eye(gaussians, snapshot) if eye == "right" else gaussians
-                planes = self._rasterizers[size].forward(seen, camera)
+                planes = self._planes(seen, camera)
                 shown = to_view(planes, camera, snapshot.frame_id, snapshot.t_capture_ns)
             pictures[eye] = with_confidence(shown, gaussians)
         spent = self._processor_clock() - started
@@ -173,6 +173,20 @@ class Views:
         view.failure = ""
         view.drawn_at.append(self._clock())
         return DrawnView(pictures, scene.pair.baseline, request.depth, request.static, scene.epoch, ahead)
+
+    def _planes(self, gaussians: Gaussians, camera: Camera) -> F32:
+        """As `Rasterizer.forward`. Where a GPU fails the CPU draws, and ever after."""
+        size = camera.width, camera.height
+        try:
+            if size not in self._rasterizers:
+                self._rasterizers[size] = make_rasterizer(self._backend, *size)
+            return self._rasterizers[size].forward(gaussians, camera)
+        except RuntimeError:
+            if self._backend == "numba":
+                raise
+            log.exception("the GPU cannot draw views any more; the CPU does")
+            self._backend, self._rasterizers = "numba", {}
+            return self._planes(gaussians, camera)
 
     # ---- rates -----------------------------------------------------------------------------------------
 

@@ -1,5 +1,4 @@
-"""What is done on a GPU, here on Warp's CPU device, against the CPU: the mapper's optimiser, control nodes and
-worst tiles."""
+"""The mapper's steps on a GPU, here on Warp's CPU device: as on the CPU."""
 
 from __future__ import annotations
 

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import independent_client as client
 import msgpack
@@ -16,7 +17,9 @@ import pytest
 from running_node import START_SECONDS, RunningNode
 from synthetic import at_frame, plane_result
 from waiting import until
+from warp_on_cpu import use_warp_on_cpu
 
+from sags_node.engine.gpu.rasterizer import DeviceRasterizer
 from sags_node.engine.interface import Rasterizer
 from sags_node.engine.rasterizer.rasterize import make_rasterizer, rasterize
 from sags_node.errors import SagsError
@@ -437,3 +440,16 @@ def test_a_view_ahead_is_drawn_where_the_tissue_is_expected_and_says_so() -> Non
             assert np.abs(apart).max() <= 1
     with pytest.raises(SagsError, match="ahead_ms"):
         parse(ViewRequest, {"name": "a", "ahead_ms": "soon"})
+
+
+def test_a_view_is_drawn_on_the_gpu_and_on_the_cpu_where_that_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    use_warp_on_cpu(monkeypatch)
+    scene = plane_result()
+    views = Views(Allowance(), lambda: 0.0, lambda: 0.0, backend="warp")
+    drawn = []
+    for name in ("gpu", "cpu"):
+        drawn.append(views.open(parse(ViewRequest, {"name": name, "width": 64, "height": 48}), scene))
+        monkeypatch.setattr(DeviceRasterizer, "forward", Mock(side_effect=RuntimeError("CUDA error")))
+    assert drawn[0] is not None and drawn[1] is not None and drawn[0].eyes[""].alpha.mean() > 0.5
+    apart = drawn[0].eyes[""].rgb.astype(int) - drawn[1].eyes[""].rgb
+    assert np.abs(apart).max() <= 1 and not np.array_equal(drawn[0].eyes[""].depth, drawn[1].eyes[""].depth)
