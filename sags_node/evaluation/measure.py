@@ -127,6 +127,7 @@ class Measurer:
         exclude: tuple[Box, ...] = (),
         pose: PoseWay = "session",
         on_picture: OnPicture = lambda frame_id, left: None,
+        backend: str = "numba",
     ) -> None:
         """
         Args:
@@ -135,6 +136,7 @@ class Measurer:
             exclude: boxes of the raw pictures that are never measured (captions, burnt into both eyes).
             pose: where the run had its poses from.
             on_picture: called with each frame of the recording.
+            backend: what draws, as `make_rasterizer` has it.
         """
         self.rows: list[FrameRow] = []
         self.gallery = Gallery(len(spool))
@@ -147,7 +149,7 @@ class Measurer:
         self._options = options
         self._exclude = exclude
         camera = rectifier.camera
-        self._rasterizer = make_rasterizer("numba", camera.width, camera.height)
+        self._rasterizer = make_rasterizer(backend, camera.width, camera.height)
         self._lpips = Lpips(options.lpips_weights) if options.lpips_weights else None
         self._usable_right: Bool | None = None
         self._right_before: U8 | None = None  # of the frame processed before

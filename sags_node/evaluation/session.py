@@ -18,7 +18,7 @@ from sags_node.evaluation.receipt import Receipt
 from sags_node.evaluation.spool import Spool
 from sags_node.evaluation.summary import GROUPS, summarise
 from sags_node.kernels.threads import configure_threads
-from sags_node.mapping.devices import ALL_SKIPS, Skips, affordable, device_of
+from sags_node.mapping.devices import ALL_SKIPS, Skips, affordable, backend_of, device_of
 from sags_node.messaging.address import NodeAddress
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import Session, at_best_scale, open_posed, open_session
@@ -158,7 +158,7 @@ def _summary(
         "pace": None if isinstance(config.source, LiveSource) else config.source.pace,
         "iterations": config.mapping.iterations,
         "max_gaussians": affordable(config, *session.working_size),
-        "backend": "numba",  # what draws for the measuring
+        "backend": backend_of(config),  # what draws for the measuring
         "device": device_of(config).kind,
         "width": session.working_size[0],
         "height": session.working_size[1],
@@ -200,7 +200,10 @@ def _measured(
     rectifier = Rectifier(session.rig, *session.working_size)
     tissue = TissueMask(config.vision.tissue, rectifier)
     exclude = config.vision.tissue.exclude
-    measurer = Measurer(spool, rectifier, tissue, options, receipt, exclude, config.vision.pose, on_picture)
+    backend = backend_of(config)
+    measurer = Measurer(
+        spool, rectifier, tissue, options, receipt, exclude, config.vision.pose, on_picture, backend
+    )
     with again(session) as frames:
         measurer.run(frames, progress)
     return measurer
