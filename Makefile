@@ -46,7 +46,7 @@ test: setup test-tools lint
 	$(BIN)/python -m pytest -m 'not live and not beside' -n 2 --dist worksteal
 	$(BIN)/python -m pytest -m 'live and not beside and not alone' -n 3 --dist loadfile
 
-# What `make test` leaves out: benchmarks, sags_lab, gsplat on the CPU, clients in C++ and C#, and what needs the
+# What `make test` leaves out: benchmarks, sags_lab, clients in C++ and C#, and what needs the
 # machine for itself.
 test-all: setup test-tools
 	$(BIN)/python -m pytest -m 'beside and not alone' -n 2 --dist loadfile
