@@ -1,7 +1,7 @@
 """The model of SAGS (arXiv 2510.27318) in torch.
 
 To be read in this order: `hexplane`, `sampling`, `decoder`, `deformation`, `drawing`, `losses`, `model`,
-`window`.
+`window`. With cells on a GPU all else is there, too, and `canvas` draws it: `twins` says who computes what.
 
 A model is canonical Gaussians in raw rows [N, 14] (`model.columns`) and a field that deforms them:
 

@@ -148,7 +148,8 @@ class Decoder(nn.Module):
     def forward(self, features: Tensor) -> Tensor:
         """UsageError: too many nodes."""
         if self._most is None:
-            return torch.cat([self._decode(part) for part in torch.split(features, PART)])
+            part = PART if features.device.type == "cpu" else max(1, len(features))
+            return torch.cat([self._decode(each) for each in torch.split(features, part)])
         if len(features) > self._most:
             raise UsageError(
                 f"{len(features)} control nodes are too many to attend to each other; "

@@ -62,9 +62,9 @@ class Deltas:
             decoder: turns them into deltas.
             units: [14] what an output of 1 means; 0: that parameter is not deformed.
         """
-        self.hexplane, self.decoder = hexplane, decoder
+        self.hexplane, self.decoder = hexplane, decoder.to(hexplane.cells.device)
         self.optimizer = torch.optim.Adam(decoder.parameters(), lr=0.0, eps=1e-15, fused=True)
-        self._units = torch.from_numpy(units)
+        self._units = torch.from_numpy(units).to(hexplane.cells.device)
 
     def __call__(self, points: Tensor, t_ns: int) -> Tensor:
         """Deltas [N, 14] of raw parameters (`model.columns`) of points [N, 3] m."""
@@ -74,8 +74,10 @@ class Deltas:
     def step(self, rates: FieldRates) -> None:
         """Move cells and decoder against their gradients, which are forgotten. If one of the decoder is not
         finite, it stays as it is."""
-        found = [each.grad for each in self.decoder.parameters() if each.grad is not None]
-        if all(bool(gradient.isfinite().all()) for gradient in found):
+        found = [each.grad.ravel() for each in self.decoder.parameters() if each.grad is not None]
+        if found:
+            # torch's fused Adam leaves everything as it is where this is 1, and nobody has to wait for it
+            self.optimizer.found_inf = (~torch.cat(found).isfinite().all()).float()  # type: ignore[attr-defined]
             self.optimizer.param_groups[0]["lr"] = rates.decoder
             self.optimizer.step()
         self.optimizer.zero_grad()
@@ -114,14 +116,20 @@ class NodeField:
     def __init__(self, deltas: Deltas, nodes: F32) -> None:
         """Nodes [M, 3] m are places among the canonical Gaussians; they stay where they are."""
         self.deltas, self.nodes = deltas, np.ascontiguousarray(nodes)
+        self._device = deltas.hexplane.cells.device
+        self._asked = torch.from_numpy(self.nodes).to(self._device)
         self.follow(self.nodes)
 
     def follow(self, means: F32) -> None:
         index, weight, _ = nearest_nodes(np.ascontiguousarray(means), self.nodes)
-        self.index, self.weight = torch.from_numpy(index.astype(np.int64)), torch.from_numpy(weight)
+        self.attach(torch.from_numpy(index.astype(np.int64)), torch.from_numpy(weight))
+
+    def attach(self, index: Tensor, weight: Tensor) -> None:
+        """Which nodes each Gaussian follows, [N, K], and their weights."""
+        self.index, self.weight = index.to(self._device), weight.to(self._device)
 
     def deform(self, rows: Tensor, t_ns: int, which: Tensor | None = None) -> Tensor:
-        nodes, index, weight = torch.from_numpy(self.nodes), self.index, self.weight
+        nodes, index, weight = self._asked, self.index, self.weight
         if which is not None:
             index, weight = index[which], weight[which]
         return skin(rows, nodes, self.deltas(nodes, t_ns), index, weight)
@@ -137,7 +145,7 @@ def skin(rows: Tensor, nodes: Tensor, deltas: Tensor, index: Tensor, weight: Ten
         index, weight: [N, K] the nodes of each Gaussian; weights sum to 1.
     """
     middle = nodes.mean(0)
-    unturned = deltas.new_tensor([1.0, 0, 0, 0])
+    unturned = torch.eye(1, 4, dtype=deltas.dtype, device=deltas.device)[0]
     A = turns(unturned + deltas[:, columns.QUAT])
     shift = deltas[:, columns.MEAN] - (A @ (nodes - middle)[:, :, None])[:, :, 0]
     records = torch.cat([A.flatten(1), shift, deltas[:, columns.LOG_SCALE.start :]], 1)

@@ -14,9 +14,13 @@ import torch
 from torch import Tensor
 
 from sags_node.engine.interface import Rasterizer
+from sags_node.field.canvas import Canvas, smoothing
 from sags_node.model import columns
 from sags_node.model.alias_free import smoothing_variances
 from sags_node.types import F32, I64, Camera, Gaussians
+
+# What is drawn, by its name in `types.Gaussians`; the first five have the gradients of a row
+TABLES = ("means", "quats", "scales", "opacities", "colors", "slopes")
 
 
 def activate(rows: Tensor) -> tuple[Tensor, ...]:
@@ -44,12 +48,12 @@ def to_gaussians(
     """Rows [N, 14] and slopes [N, 3] as they are drawn; `cameras`: those they were fitted to, for the 3D
     filter; None: no filter."""
     means, quats, scales, opacities, colors = (
-        np.ascontiguousarray(part.detach().numpy()) for part in activate(rows)
+        np.ascontiguousarray(part.detach().cpu().numpy()) for part in activate(rows)
     )
-    smoothing = None if cameras is None else smoothing_variances(means, cameras)
     return Gaussians(
-        means, quats, scales, opacities, colors, ids, smoothing=smoothing,
-        slopes=None if slopes is None else slopes.detach().numpy(),
+        means, quats, scales, opacities, colors, ids,
+        smoothing=None if cameras is None else smoothing_variances(means, cameras),
+        slopes=None if slopes is None else slopes.detach().cpu().numpy(),
     )  # fmt: skip
 
 
@@ -61,13 +65,13 @@ class Drawing:
         v_means, contribution, spread: as `interface.Gradients` has them, after `differentiate`.
     """
 
-    v_means: F32
-    contribution: F32
-    spread: F32
+    v_means: Tensor
+    contribution: Tensor
+    spread: Tensor
 
     def __init__(
         self,
-        rasterizer: Rasterizer,
+        rasterizer: Rasterizer | Canvas,
         camera: Camera,
         rows: Tensor,
         slopes: Tensor | None,
@@ -75,19 +79,20 @@ class Drawing:
         cameras: Sequence[Camera] | None,
     ) -> None:
         """See `to_gaussians`."""
-        self.rasterizer, self.camera = rasterizer, camera
-        self.weight: F32 | None = None
-        self.gaussians = to_gaussians(rows, slopes, ids, cameras)
+        self.rasterizer, self.camera, self.cameras = rasterizer, camera, cameras
+        self.weight: Tensor | None = None
+        if not isinstance(rasterizer, Canvas):
+            self.gaussians = to_gaussians(rows, slopes, ids, cameras)
         self.planes: Tensor = _Rasterize.apply(*activate(rows), slopes, self)  # type: ignore[no-untyped-call]
 
-    def differentiate(self, loss: Tensor | F32, weight: F32) -> None:
+    def differentiate(self, loss: Tensor | F32, weight: Tensor | F32) -> None:
         """Add the gradients of a loss to all leaves that the drawing came from.
 
         Args:
             loss: made of the planes; or its gradient by them, [5, H, W].
             weight: [H, W] of the pixels, for `contribution` and `spread`.
         """
-        self.weight = weight
+        self.weight = torch.as_tensor(weight)
         if isinstance(loss, Tensor):
             loss.backward()  # type: ignore[no-untyped-call]
         else:
@@ -103,14 +108,25 @@ class _Rasterize(torch.autograd.Function):
         slopes: Tensor | None, drawing: Drawing,
     ) -> Tensor:  # fmt: skip
         ctx.drawing, ctx.has_slopes = drawing, slopes is not None
-        return torch.from_numpy(drawing.rasterizer.forward(drawing.gaussians, drawing.camera))
+        rasterizer, cameras = drawing.rasterizer, drawing.cameras
+        if not isinstance(rasterizer, Canvas):
+            return torch.from_numpy(rasterizer.forward(drawing.gaussians, drawing.camera))
+        slopes = torch.zeros_like(means) if slopes is None else slopes
+        tables = dict(zip(TABLES, (means, quats, scales, opacities, colors, slopes), strict=True))
+        filters = torch.zeros_like(opacities) if cameras is None else smoothing(means, cameras)
+        return rasterizer.forward(tables | {"smoothing": filters}, drawing.camera)
 
     @staticmethod
     def backward(ctx: Any, v_planes: Tensor) -> tuple[Tensor | None, ...]:
         drawing: Drawing = ctx.drawing
-        weight = np.zeros(v_planes.shape[1:], np.float32) if drawing.weight is None else drawing.weight
-        found = drawing.rasterizer.backward(v_planes.numpy(), weight)
-        drawing.v_means, drawing.contribution, drawing.spread = found.means, found.contribution, found.spread
-        by = (found.means, found.quats, found.scales, found.opacities, found.colors)
-        slopes = torch.from_numpy(found.slopes) if ctx.has_slopes else None
-        return *map(torch.from_numpy, by), slopes, None
+        weight = torch.zeros_like(v_planes[0]) if drawing.weight is None else drawing.weight
+        if isinstance(drawing.rasterizer, Canvas):
+            found = drawing.rasterizer.backward(v_planes, weight)
+        else:
+            arrays = drawing.rasterizer.backward(v_planes.numpy(), weight.numpy())
+            names = (*TABLES, "contribution", "spread")
+            found = {name: torch.from_numpy(getattr(arrays, name)) for name in names}
+        drawing.v_means = found["means"]
+        drawing.contribution, drawing.spread = found["contribution"], found["spread"]
+        *v_rows, v_slopes = (found[name] for name in TABLES)
+        return *v_rows, v_slopes if ctx.has_slopes else None, None

@@ -14,6 +14,7 @@ from numba import prange
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
+from sags_node.field import twins
 from sags_node.kernels.jit import kernel, parallel_kernel, read_only
 from sags_node.types import F32, I64, Bool
 
@@ -33,7 +34,7 @@ def gather(table: Tensor, index: Tensor, weight: Tensor) -> Tensor:
     Returns:
         [B, C], differentiable in table and weight.
     """
-    if table.dtype == torch.float32 and table.device.type == "cpu":
+    if twins.by_kernels(table):
         gathered: Tensor = _Gather.apply(table, index, weight)  # type: ignore[no-untyped-call]
         return gathered
     return embedding_bag(index, table, per_sample_weights=weight, mode="sum")
@@ -62,11 +63,13 @@ class _Gather(torch.autograd.Function):
         return v_table, None, v_weight
 
 
-def rows_of(table: F32) -> I64:
-    """The rows [K] of a table that hold anything but zeros, ascending."""
-    filled = np.empty(len(table), np.bool_)
-    _find_filled(read_only(table), filled)
-    return np.flatnonzero(filled)
+def filled(table: Tensor) -> Tensor:
+    """[M] which rows of a table hold anything but zeros."""
+    if not twins.by_kernels(table):
+        return (table != 0).any(1)
+    found = np.empty(len(table), np.bool_)
+    _find_filled(read_only(table.numpy()), found)
+    return torch.from_numpy(found)
 
 
 @kernel

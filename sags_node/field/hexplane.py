@@ -24,13 +24,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from sags_node.engine.adam import AdamState, adam_step
 from sags_node.errors import SagsError, UsageError
-from sags_node.field.gather import rows_of
-from sags_node.field.sampling import Places, sample
+from sags_node.field.adam import RowAdam
+from sags_node.field.gather import filled
+from sags_node.field.sampling import PAIRS, Level, Places, by_planes, has_kernels, sample
 from sags_node.types import F64, I64
 
-PAIRS = ((0, 1), (0, 2), (1, 2))  # the planes in space: xy, xz, yz
 MAX_BYTES = 1 << 29  # of the cells; their optimiser's state takes twice as much again, their gradients once
 MAX_LEVELS = 8
 GROWTH_MARGIN = 4  # coarsest cells added beyond the need, so that the box does not grow every frame
@@ -65,6 +64,7 @@ class HexPlane:
         channels: int = 32,
         seed: int = 0,
         space_range: tuple[float, float] = SPACE_RANGE,
+        device: torch.device | str = "cpu",
     ) -> None:
         """Start a stream's window: it holds slot 0 and grows up to `slots`.
 
@@ -78,6 +78,7 @@ class HexPlane:
             channels: C, of each level.
             seed: of the first values.
             space_range: lowest and highest first value of the planes in space.
+            device: that keeps the cells.
 
         Raises:
             UsageError: the box is empty or not finite, or a number is out of range.
@@ -104,8 +105,8 @@ class HexPlane:
         values[: self._space_rows] = np.random.default_rng(seed).uniform(
             *space_range, (self._space_rows, channels)
         )
-        self.cells: Tensor = torch.from_numpy(values).requires_grad_()
-        self.adam = AdamState.new(*values.shape)
+        self.cells: Tensor = torch.from_numpy(values).to(device).requires_grad_()
+        self.adam = RowAdam.of(self.cells)
 
     def _lay_out(self, low: F64, counts: I64, levels: int) -> None:
         """The grid of `counts` [3] cells on the coarsest level, from the corner `low` [3] m."""
@@ -151,13 +152,33 @@ class HexPlane:
 
     def sample(self, points: Tensor, t_ns: int) -> Tensor:
         """Features [N, levels * C] of points [N, 3] m at one time, differentiable in both."""
-        return sample(self.cells, self._places(points, t_ns))
+        box = torch.tensor(self.box, dtype=points.dtype).to(points.device, non_blocking=True)
+        low, high = box.unbind()
+        within = torch.nan_to_num((points - low) / (high - low)).clamp(0, 1)
+        if has_kernels(self.cells):
+            return sample(self.cells, self._places(within, t_ns))
+        return by_planes(self._levels(t_ns), within)
 
-    def _places(self, points: Tensor, t_ns: int) -> Places:
+    def _levels(self, t_ns: int) -> list[Level]:
+        """The planes in space and the lines at one time, views of the table where they can be."""
+        before, after, share = self.locate(t_ns)
+        planes = [int(level[a] * level[b]) for level in self.nodes for a, b in PAIRS]
+        parts = torch.split(self.cells, planes + [self._slot_rows] * self.slots)  # at once: one gradient
+        slots = parts[len(planes) :]
+        at = torch.lerp(slots[before % self.slots], slots[after % self.slots], share)
+        lines = torch.split(at, self.nodes.ravel().tolist())
+        return [
+            Level(
+                [parts[3 * k + c].view(level[a], level[b], -1) for c, (a, b) in enumerate(PAIRS)],
+                [lines[3 * k + axis][None] for axis in range(3)],
+            )
+            for k, level in enumerate(self.nodes.tolist())
+        ]
+
+    def _places(self, within: Tensor, t_ns: int) -> Places:
         before, after, share = self.locate(t_ns)
         slot, nodes = self.slot(before).start, torch.from_numpy(self.nodes)  # [levels, 3]
-        low, high = torch.tensor(self.box, dtype=points.dtype)
-        at = torch.nan_to_num((points - low) / (high - low)).clamp(0, 1)[:, None] * (nodes - 1)
+        at = within[:, None] * (nodes - 1)
         node = torch.minimum(at.detach().long(), nodes - 2)
         node, shares = pad(node, (0, 1)), pad(at - node, (0, 1), value=share)
         first = np.concatenate([self._plane_rows, self._line_rows + slot], axis=1)
@@ -169,11 +190,10 @@ class HexPlane:
         """Adam on the cells that the last backward pass touched, against their gradient; both rates."""
         gradient = self.cells.grad
         if gradient is not None:
-            values, touched = self.cells.detach().numpy(), rows_of(gradient.numpy())
-            in_space = touched < self._space_rows
-            for rate, rows in ((planes, touched[in_space]), (lines, touched[~in_space])):
-                rates = np.full(self.channels, rate, np.float32)
-                adam_step(values, gradient.numpy(), self.adam, rates, rows=rows)
+            touched, space = filled(gradient), slice(0, self._space_rows)
+            for rate, rows in ((planes, space), (lines, slice(space.stop, None))):
+                rates = gradient.new_full((self.channels,), rate)
+                self.adam.rows(rows).step(self.cells[rows], gradient[rows], rates, touched[rows])
             self.cells.grad = None
 
     def advance(self, t_ns: int, retire: Callable[[int], None]) -> None:
@@ -191,8 +211,8 @@ class HexPlane:
         oldest = max(0, newest - self.slots + 1)
         for number in range(self.oldest, min(oldest, self.newest + 1)):
             retire(self.t0_ns + number * self.slot_ns)
-        for rows in (self.cells.detach().numpy(), self.adam.moments, self.adam.shares):
-            last = rows[self.slot(self.newest)].copy()
+        for rows in (self.cells.detach(), self.adam.moments, self.adam.shares):
+            last = rows[self.slot(self.newest)].clone()
             for number in range(max(oldest, self.newest + 1), newest + 1):
                 rows[self.slot(number)] = last
         self.newest = newest
@@ -230,9 +250,9 @@ class HexPlane:
                 rows.append(old_planes[level, plane] + (near[a][:, None] * old[b] + near[b]).ravel())
             lines += [old_lines[level, axis] + near[axis] for axis in range(3)]
         rows += [first + np.concatenate(lines) for first in old_slots]
-        source = np.concatenate(rows)
-        self.cells = self.cells.detach()[torch.from_numpy(source)].requires_grad_()
-        self.adam = AdamState(self.adam.moments[source], self.adam.shares[source])
+        source = torch.from_numpy(np.concatenate(rows))
+        self.cells = self.cells.detach()[source].requires_grad_()
+        self.adam = self.adam.rows(source)
         return True
 
 

@@ -56,19 +56,21 @@ class Compared(NamedTuple):
 
     loss: Tensor  # the weighted sum of all terms, differentiable in the planes
     terms: dict[str, Tensor]  # by the names of `LossWeights`, not weighted; those that apply
-    weight: F32  # [H, W] derivative of a pixel's colour by its planes where the colour counts, else 0
+    weight: Tensor  # [H, W] derivative of a pixel's colour by its planes where the colour counts, else 0
 
 
 def compare(
     planes: Tensor,
-    image: U8,
-    tissue: Bool,
-    depth: F32,
-    unseen: Bool,
+    image: U8 | Tensor,
+    tissue: Bool | Tensor,
+    depth: F32 | Tensor,
+    unseen: Bool | Tensor,
     weights: LossWeights,
     softness: float = 0,
 ) -> Compared:
     """The loss, differentiable in the planes. NaN and infinity in frame or planes take a pixel out.
+
+    What is not on the planes' device is copied there.
 
     Args:
         planes: [5, H, W] of `Rasterizer.forward`.
@@ -81,8 +83,10 @@ def compare(
         softness: s of sqrt(d^2 + s^2) - s, which is what a difference d of colours counts (Charbonnier et
             al. 1994): where it is smaller than s by its square, as in PSNR. 0, as in the paper: |d|.
     """
-    explained, given = torch.from_numpy(tissue), torch.from_numpy(depth).to(planes.dtype)
-    truth = torch.from_numpy(image).to(planes.dtype).permute(2, 0, 1) / 255
+    device = planes.device
+    explained, given = torch.as_tensor(tissue, device=device), torch.as_tensor(depth, device=device)
+    given, truth = given.to(planes.dtype), torch.as_tensor(image, device=device)
+    truth = truth.to(planes.dtype).permute(2, 0, 1) / 255
     sound = planes.detach().sum(0).isfinite()
     planes = torch.where(sound, planes, 0)
     coverage = planes[4]
@@ -101,16 +105,15 @@ def compare(
             terms["correlation"] = 1 - correlation(inverse_drawn[measured], inverse_given[measured])
     if weights.similarity:
         terms["similarity"] = dissimilarity(color, truth, used) / (3 * count)
-    if unseen.any():
-        region = torch.from_numpy(unseen)
+    if isinstance(unseen, Tensor) or unseen.any():  # to ask a tensor would be to wait for it
+        region = torch.as_tensor(unseen, device=device)
         terms["smoothness"] = total_variation(color, region, covered) / (3 * region.numel())
         terms["depth_smoothness"] = total_variation(distance[None], region, deep) / region.numel()
     if weights.coverage:
         lack = (FULL - coverage).clamp(min=0) * (explained & sound)
         terms["coverage"] = lack.sum() / explained.sum().clamp(min=1)
     loss = torch.stack([getattr(weights, name) * term for name, term in terms.items()]).sum()
-    counted = torch.where(used, 1 / coverage.detach(), 0).numpy()
-    return Compared(loss, terms, counted.astype(np.float32, copy=False))
+    return Compared(loss, terms, torch.where(used, 1 / coverage.detach(), 0).float())
 
 
 def _charbonnier(difference: Tensor, softness: float) -> Tensor:
@@ -138,10 +141,13 @@ def total_variation(picture: Tensor, region: Tensor, known: Tensor) -> Tensor:
 def dissimilarity(picture: Tensor, truth: Tensor, counted: Tensor) -> Tensor:
     """Sum of 1 - SSIM (Wang et al. 2004, equation 13) over the counted pixels [H, W] and the channels of
     pictures [3, H, W]. Pixels that do not count are set to the truth in both pictures."""
-    offsets = torch.arange(-5, 6, dtype=picture.dtype)
+    offsets = torch.arange(-5, 6, dtype=picture.dtype, device=picture.device)
     profile = torch.exp(-0.5 * (offsets / 1.5) ** 2)
     window = torch.outer(profile, profile) / profile.sum() ** 2
-    rows, columns = (torch.tensor(np.pad(np.arange(n), 5, mode="reflect")) for n in picture.shape[1:])
+    rows, columns = (
+        torch.tensor(np.pad(np.arange(n), 5, mode="reflect"), device=picture.device)
+        for n in picture.shape[1:]
+    )
 
     def blur(values: Tensor) -> Tensor:
         return torch.nn.functional.conv2d(values[:, None, rows][..., columns], window[None, None])[:, 0]

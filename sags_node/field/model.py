@@ -10,8 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sags_node.engine.adam import AdamState, adam_step
 from sags_node.engine.interface import Rasterizer
+from sags_node.field.adam import RowAdam
+from sags_node.field.canvas import Canvas
 from sags_node.field.deformation import Field, FieldRates
 from sags_node.field.drawing import Drawing, to_gaussians
 from sags_node.model import columns
@@ -54,13 +55,14 @@ class DeformableModel:
             smooth: whether the 3D filter is on.
             slopes: [N, 3]
         """
-        self.rows = _leaf(rows)
-        self.slopes = None if slopes is None else _leaf(slopes)
+        self.device = field.deltas.hexplane.cells.device  # of all that is learnt
+        self.rows = self._leaf(rows)
+        self.slopes = None if slopes is None else self._leaf(slopes)
         self.ids: I64 = np.arange(len(rows))
         self.next_id = len(rows)
         self.field, self.exposure, self.smooth = field, exposure, smooth
-        self.adam = AdamState.new(*rows.shape)
-        self.slopes_adam = AdamState.new(len(rows), 3)
+        self.adam = RowAdam.of(self.rows.detach())
+        self.slopes_adam = RowAdam.of(self.rows.detach()[:, :3])
         field.follow(self.means)
 
     def __len__(self) -> int:
@@ -68,8 +70,8 @@ class DeformableModel:
 
     @property
     def table(self) -> F32:
-        """The canonical rows, the same memory."""
-        rows: F32 = self.rows.detach().numpy()
+        """The canonical rows: the same memory, or a copy of what a GPU has."""
+        rows: F32 = self.rows.detach().cpu().numpy()
         return rows
 
     @property
@@ -81,7 +83,7 @@ class DeformableModel:
         return self.field.deform(self.rows, t_ns) if deformed else self.rows
 
     def draw(
-        self, rasterizer: Rasterizer, t_ns: int, camera: Camera, deformed: bool = True,
+        self, rasterizer: Rasterizer | Canvas, t_ns: int, camera: Camera, deformed: bool = True,
         whole: Camera | None = None,
     ) -> Drawing:  # fmt: skip
         """The model at one time, drawn for a camera it is fitted to, to learn from: `Drawing.differentiate`,
@@ -89,8 +91,9 @@ class DeformableModel:
         return self._drawn(rasterizer, self.rows_at(t_ns, deformed), t_ns, camera, whole)
 
     def _drawn(
-        self, rasterizer: Rasterizer, rows: Tensor, t_ns: int, camera: Camera, whole: Camera | None = None
-    ) -> Drawing:
+        self, rasterizer: Rasterizer | Canvas, rows: Tensor, t_ns: int, camera: Camera,
+        whole: Camera | None = None,
+    ) -> Drawing:  # fmt: skip
         (exposed, slopes), fitted = self._exposed(rows, t_ns), [whole or camera]
         return Drawing(rasterizer, camera, exposed, slopes, self.ids, fitted if self.smooth else None)
 
@@ -121,7 +124,7 @@ class DeformableModel:
         return to_gaussians(exposed, slopes, self.ids, cameras if self.smooth else None)
 
     def _exposed(self, rows: Tensor, t_ns: int) -> tuple[Tensor, Tensor | None]:
-        gain = torch.from_numpy(self.exposure.at(t_ns))
+        gain = torch.from_numpy(self.exposure.at(t_ns)).to(self.device, non_blocking=True)
         before, color, after = (
             rows[:, : columns.COLOR.start],
             rows[:, columns.COLOR],
@@ -133,14 +136,14 @@ class DeformableModel:
     def descend(self, drawings: Sequence[Drawing], rates: Rates) -> None:
         """One step of Adam on all that the drawings came from, against the gradients they were given.
         Gaussians that none of them saw stay as they are."""
-        seen = np.flatnonzero(np.any([drawing.contribution > 0 for drawing in drawings], axis=0))
+        seen = torch.stack([drawing.contribution > 0 for drawing in drawings]).any(0)
         assert self.rows.grad is not None
-        adam_step(self.table, self.rows.grad.numpy(), self.adam, rates.rows, rows=seen)
+        row_rates = torch.from_numpy(rates.rows).to(self.device, non_blocking=True)
+        self.adam.step(self.rows, self.rows.grad, row_rates, seen)
         self.rows.grad = None
         if self.slopes is not None and self.slopes.grad is not None:
-            slope_rates = np.full(3, rates.slopes, np.float32)
-            slopes = self.slopes.detach().numpy()
-            adam_step(slopes, self.slopes.grad.numpy(), self.slopes_adam, slope_rates, rows=seen)
+            slope_rates = self.slopes.grad.new_full((3,), rates.slopes)
+            self.slopes_adam.step(self.slopes, self.slopes.grad, slope_rates, seen)
             self.slopes.grad = None
         self.field.deltas.step(rates.field)
 
@@ -157,19 +160,12 @@ class DeformableModel:
         ids = np.arange(self.next_id, self.next_id + len(rows))
         self.ids, self.next_id = np.concatenate([self.ids[kept], ids]), self.next_id + len(rows)
         if self.slopes is not None:
-            self.slopes = _leaf(self.slopes.detach().numpy()[np.concatenate([kept, parents])])
-        self.rows = _leaf(np.concatenate([self.table[kept], rows]))
-        self.adam = _taken(self.adam, kept, len(rows))
-        self.slopes_adam = _taken(self.slopes_adam, kept, len(rows))
+            self.slopes = self._leaf(self.slopes.detach().cpu().numpy()[np.concatenate([kept, parents])])
+        self.rows = self._leaf(np.concatenate([self.table[kept], rows]))
+        known = torch.from_numpy(kept).to(self.device)
+        self.adam = self.adam.rows(known).grown(len(rows))
+        self.slopes_adam = self.slopes_adam.rows(known).grown(len(rows))
         self.field.follow(self.means)
 
-
-def _leaf(values: F32) -> Tensor:
-    return torch.from_numpy(np.array(values, np.float32)).requires_grad_()
-
-
-def _taken(state: AdamState, kept: I64, fresh: int) -> AdamState:
-    """What an optimiser remembers of the rows in `kept`, then nothing of new ones."""
-    new = AdamState.new(len(kept) + fresh, state.moments.shape[1])
-    new.moments[: len(kept)], new.shares[: len(kept)] = state.moments[kept], state.shares[kept]
-    return new
+    def _leaf(self, values: F32) -> Tensor:
+        return torch.from_numpy(np.array(values, np.float32)).to(self.device).requires_grad_()

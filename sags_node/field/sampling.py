@@ -1,7 +1,7 @@
 """What the HexPlane says of places: bilinear samples of six planes, multiplied.
 
-`by_formula` is the formula in torch. It keeps six samples of every place, and as much for the gradient. For
-float32 on the CPU, `sample` takes kernels that keep none: a test compares both.
+`by_planes` is the formula in torch. It keeps six samples of every place, and as much for the gradient. For
+float32 on the CPU, `sample` is kernels that keep none: a test compares both.
 """
 
 from __future__ import annotations
@@ -14,11 +14,13 @@ import torch
 from numba import prange
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn.functional import grid_sample
 
-from sags_node.field.gather import gather
+from sags_node.field import twins
 from sags_node.kernels.jit import add_lanes, copy, inlined, kernel, parallel_kernel, read_only, stack_floats
 from sags_node.types import F32, I64
 
+PAIRS = ((0, 1), (0, 2), (1, 2))  # the planes in space: xy, xz, yz
 OUTER = (0, 0, 1, 3, 3, 3)  # of x, y, z, t: what counts the rows of the planes xy, xz, yz, tx, ty, tz
 INNER = (1, 2, 2, 0, 1, 2)  # what counts the columns
 LANES = 16  # channels that a loop takes at a time
@@ -37,22 +39,38 @@ class Places(NamedTuple):
     step: Tensor  # [L, 6] rows of the table from one row of a plane to the next
 
 
+class Level(NamedTuple):
+    """One level's planes at a time."""
+
+    planes: Sequence[Tensor]  # xy, xz, yz: each [nodes of the first axis, nodes of the second, C]
+    lines: Sequence[Tensor]  # of x, y, z: each [1, nodes, C]
+
+
+def has_kernels(cells: Tensor) -> bool:
+    """Whether `sample` can take this table [M, C]."""
+    return twins.by_kernels(cells) and cells.shape[1] % LANES == 0
+
+
 def sample(cells: Tensor, places: Places) -> Tensor:
     """Features [N, L * C] of places in a table of planes [M, C], differentiable in cells and shares."""
-    if cells.dtype == torch.float32 and cells.device.type == "cpu" and cells.shape[1] % LANES == 0:
-        features: Tensor = _Sample.apply(cells, *places)  # type: ignore[no-untyped-call]
-        return features
-    return by_formula(cells, places)
+    features: Tensor = _Sample.apply(cells, *places)  # type: ignore[no-untyped-call]
+    return features
 
 
-def by_formula(cells: Tensor, places: Places) -> Tensor:
-    """As `sample`."""
-    node, share, first, step = places
-    at = first + node[..., OUTER] * step + node[..., INNER]  # [N, L, 6]
-    a, b = share[..., OUTER], share[..., INNER]
-    rows = torch.stack([at, at + 1, at + step, at + step + 1], -1).view(-1, 4)
-    weights = torch.stack([(1 - a) * (1 - b), (1 - a) * b, a * (1 - b), a * b], -1).view(-1, 4)
-    return gather(cells, rows, weights).view(*at.shape, -1).prod(2).flatten(1)
+def by_planes(levels: Sequence[Level], within: Tensor) -> Tensor:
+    """Features as of `sample`, of places [N, 3] in the box, 0..1, differentiable in tables and places."""
+    x, y, z = (2 * within - 1).unbind(1)
+    pairs = [y, x, z, x, z, y, x, x, y, y, z, z]  # column and row of each; a line has one row
+    grids = torch.split(torch.stack(pairs, 1).view(1, -1, 6, 2), 1, dim=2)
+    features = []
+    for level in levels:
+        found = [
+            grid_sample(table.permute(2, 0, 1)[None], grid, padding_mode="border", align_corners=True)
+            for table, grid in zip((*level.planes, *level.lines), grids, strict=True)
+        ]  # each [1, C, N, 1]
+        xy, xz, yz, of_x, of_y, of_z = found
+        features.append(((xy * xz * yz) * (of_x * of_y * of_z))[0, :, :, 0])
+    return torch.cat(features).T
 
 
 class _Sample(torch.autograd.Function):

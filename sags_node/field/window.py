@@ -120,7 +120,7 @@ class WindowModel(DeformableModel):
             deltas.hexplane.cells.detach().numpy(),
         ]
         for adam in (self.adam, deltas.hexplane.adam):
-            tables += [adam.moments, adam.shares]
+            tables += [adam.moments.numpy(), adam.shares.numpy()]
         parameters = sum(parameter.nbytes for parameter in deltas.decoder.parameters())
         return sum(table.nbytes for table in tables) + 3 * parameters
 

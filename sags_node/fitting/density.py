@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from sags_node.field.model import DeformableModel
 from sags_node.model import columns
@@ -22,45 +24,51 @@ class Density:
         self._cap = cap
         self._forget()
 
-    def observe(self, v_means: F32, contribution: F32) -> None:
+    def observe(self, v_means: Tensor, contribution: Tensor) -> None:
         """Count one iteration's pull at the drawn means, and who was seen, [N, 3] and [N]."""
-        self.pull += np.linalg.norm(v_means, axis=1)
+        x, y, z = v_means.square().unbind(1)
+        self.pull += (x + y + z).double().sqrt().float()  # torch's root of a float32 is an ulp off
         self.seen += contribution > 0
 
     def adapt(self, rng: np.random.Generator) -> tuple[int, int]:
         """Prune what is transparent, split what is pulled hardest while there is room; both counts."""
-        model = self._model
-        kept = model.table[:, columns.LOGIT] > MIN_OPACITY_LOGIT
-        kept &= np.isfinite(model.table).all(1)
-        pull = (self.pull / np.maximum(self.seen, 1))[kept]
+        model, rows = self._model, self._model.table
+        kept = rows[:, columns.LOGIT] > MIN_OPACITY_LOGIT
+        kept &= np.isfinite(rows).all(1)
+        pull = (self.pull.cpu().numpy() / np.maximum(self.seen.cpu().numpy(), 1))[kept]
         pruned = int(np.count_nonzero(~kept))
         model.keep(kept)
         room = min(self._cap - len(model), int(self._share * len(model)))
         split = np.argsort(-pull, kind="stable")[: max(room, 0)]
         split = split[pull[split] > 0]
         if len(split) > 0:
-            model.append(_split(model.table, split, rng), split)
+            halves, twins = _split(model.table[split], rng)
+            model.rows.detach()[torch.from_numpy(split).to(model.device)] = torch.from_numpy(halves).to(
+                model.device
+            )
+            model.append(twins, split)
         self._forget()
         return pruned, len(split)
 
     def _forget(self) -> None:
-        self.pull = np.zeros(len(self._model), np.float32)
-        self.seen = np.zeros(len(self._model), np.int64)
+        count, device = len(self._model), self._model.device
+        self.pull = torch.zeros(count, device=device)
+        self.seen = torch.zeros(count, dtype=torch.int64, device=device)
 
 
-def _split(rows: F32, split: np.ndarray, rng: np.random.Generator) -> F32:
-    """Shrink `rows[split]` and shift them along their longest axis; returns their twins on the other side."""
-    parents = rows[split]
+def _split(parents: F32, rng: np.random.Generator) -> tuple[F32, F32]:
+    """What becomes of rows [M, 14]: smaller ones, shifted along their longest axis to either side."""
+    every = np.arange(len(parents))
     longest = parents[:, columns.LOG_SCALE].argmax(1)
-    along = _axes(parents[:, columns.QUAT])[np.arange(len(split)), :, longest]
-    reach = np.exp(parents[:, columns.LOG_SCALE][np.arange(len(split)), longest])
-    shift = along * (reach * rng.uniform(0.5, 1.0, len(split)))[:, None].astype(np.float32)
-    twins: F32 = parents.copy()
-    twins[:, columns.LOG_SCALE] -= np.float32(np.log(SHRINK))
-    rows[split] = twins
-    rows[split, columns.MEAN] += shift
-    twins[:, columns.MEAN] -= shift
-    return twins
+    along = _axes(parents[:, columns.QUAT])[every, :, longest]
+    reach = np.exp(parents[:, columns.LOG_SCALE][every, longest])
+    shift = along * (reach * rng.uniform(0.5, 1.0, len(parents)))[:, None].astype(np.float32)
+    there: F32 = parents.copy()
+    there[:, columns.LOG_SCALE] -= np.float32(np.log(SHRINK))
+    here: F32 = there.copy()
+    there[:, columns.MEAN] += shift
+    here[:, columns.MEAN] -= shift
+    return there, here
 
 
 def _axes(quats: F32) -> F32:

@@ -9,15 +9,19 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from sags_node.engine.adam import AdamState
 from sags_node.engine.losses.tissue import tissue_loss
-from sags_node.engine.rasterizer.rasterize import make_rasterizer
+from sags_node.engine.rasterizer.rasterize import Rasterizer, make_rasterizer
+from sags_node.field.adam import RowAdam
+from sags_node.field.canvas import Canvas
 from sags_node.field.decoder import Decoder
 from sags_node.field.deformation import Deltas, Field, NodeField
 from sags_node.field.hexplane import for_clip
@@ -45,22 +49,30 @@ REFINE_DECAY = 0.1
 class Fit:
     """A model being fitted: `start`, then `iterate` until `done`."""
 
-    def __init__(self, clip: Clip, settings: FitSettings) -> None:
+    def __init__(self, clip: Clip, settings: FitSettings, device: str | None = None) -> None:
         """
         Args:
             clip: what it learns from.
             settings: of the fit.
+            device: on which Warp draws and torch keeps all that is learnt, and the pictures; not for
+                schedule = online. None: the kernels of the CPU.
         """
         self.clip = clip
         self.settings = settings
+        self._device = torch.device(device or "cpu")
         self.iteration = 0
         self.seconds = 0.0  # spent on starting and iterating
         self.pruned = self.split = 0
         first = clip.train[0]
         height, width = first.tissue.shape
         self.rasterizer = make_rasterizer("numba", width, height, antialias=settings.antialias)
-        self.residual = 0.0  # how much colours differed in the last iteration, as its loss counts it
-        self._unseen = ~np.any([frame.tissue for frame in clip.train], axis=0) | settings.smooth_everywhere
+        self._learning: Rasterizer | Canvas = self.rasterizer
+        if device is not None:
+            self._learning = Canvas(width, height, self._device, settings.antialias)
+        self._residual: float | Tensor = 0.0
+        unseen = ~np.any([frame.tissue for frame in clip.train], axis=0) | settings.smooth_everywhere
+        self._unseen = unseen if device is None else torch.from_numpy(unseen).to(self._device)
+        self._shown: dict[int, tuple[Tensor, ...]] = {}
         self._v_planes = np.zeros((5, height, width), np.float32)
         self._weight = np.zeros((height, width), np.float32)
         self._rng = np.random.default_rng(settings.seed)
@@ -83,7 +95,8 @@ class Fit:
         started = time.perf_counter()
         settings, exposure = self.settings, self._make_exposure()
         if settings.schedule == "paper":
-            rows = pooled_rows(self.clip, exposure, settings)
+            on_device = self._device if isinstance(self._learning, Canvas) else None
+            rows = pooled_rows(self.clip, exposure, settings, on_device)
             field = self._make_field(rows[:, columns.MEAN])
             self.model = DeformableModel(rows, field, exposure, settings.antialias)
         else:
@@ -95,6 +108,11 @@ class Fit:
         self._start_means = np.ascontiguousarray(rows[:, columns.MEAN])
         self._density = self._make_density()
         self.seconds += time.perf_counter() - started
+
+    @property
+    def residual(self) -> float:
+        """How much colours differed in the last iteration, as its loss counts it. Waits for the device."""
+        return float(self._residual)
 
     @property
     def warm_up(self) -> int:
@@ -125,15 +143,16 @@ class Fit:
         drawings = []
         for _ in range(self.settings.batch_size if deformed else 1):
             frame = self._next_frame() if deformed else self.clip.train[0]
-            drawing = self.model.draw(self.rasterizer, frame.t_capture_ns, frame.camera, deformed)
+            drawing = self.model.draw(self._learning, frame.t_capture_ns, frame.camera, deformed)
+            image, tissue, depth = self._tensors(frame)
             found = compare(
-                drawing.planes, frame.image, frame.tissue, frame.depth, self._unseen, self.settings.weights,
+                drawing.planes, image, tissue, depth, self._unseen, self.settings.weights,
                 self.settings.color_softness,
             )  # fmt: skip
             drawing.differentiate(found.loss, found.weight)
             self._density.observe(drawing.v_means, drawing.contribution)
             drawings.append(drawing)
-        self.residual = found.terms["color"].item()
+        self._residual = found.terms["color"].detach()
         share = self.settings.rate_share(*self._stage)
         rates = Rates(
             self._rates * np.float32(share) ** self._decays, self.settings.field_rates.scaled(share)
@@ -149,7 +168,7 @@ class Fit:
         """A step of the joint refinement after the online pass."""
         share, frame = REFINE_DECAY ** self._progress(), self._next_frame()
         drawing = model.draw_to_refine(self.rasterizer, frame.t_capture_ns, frame.camera)
-        self.residual = tissue_loss(
+        self._residual = tissue_loss(
             drawing.planes.detach().numpy(), frame.image, frame.tissue, frame.depth, self._v_planes,
             self._weight, DEPTH_WEIGHT, DEPTH_SCALE,
         )  # fmt: skip
@@ -179,27 +198,28 @@ class Fit:
         found: dict[str, NDArray[Any]] = {
             "rows": model.table,
             "gains": model.exposure.gains,
-            "cells": deltas.hexplane.cells.detach().numpy(),
+            "cells": _array(deltas.hexplane.cells),
             "ids": model.ids,
             "start": self._start_means,
-            "pull": self._density.pull,
-            "seen": self._density.seen,
+            "pull": _array(self._density.pull),
+            "seen": _array(self._density.seen),
         }
+        remembered: dict[str, Sequence[AdamState | RowAdam]]
         remembered = {"rows": [model.adam], "cells": [deltas.hexplane.adam]}
         if isinstance(model.field, NodeField):
-            found |= {"index": model.field.index.numpy(), "weight": model.field.weight.numpy()}
+            found |= {"index": _array(model.field.index), "weight": _array(model.field.weight)}
         if isinstance(model, RefinedModel) and model.slopes is not None:
             residuals = model.residuals
             found |= {"residuals": residuals.values, "residuals.times": residuals.times_ns}
             found["slopes"] = model.slopes.detach().numpy()
             remembered["residuals"] = residuals.adam
         for name, states in remembered.items():
-            found[f"{name}.moments"] = np.stack([adam.moments for adam in states])
-            found[f"{name}.shares"] = np.stack([adam.shares for adam in states])
+            found[f"{name}.moments"] = np.stack([_array(adam.moments) for adam in states])
+            found[f"{name}.shares"] = np.stack([_array(adam.shares) for adam in states])
         for name, values in deltas.decoder.state_dict().items():
-            found[f"decoder.{name}"] = values.numpy()
+            found[f"decoder.{name}"] = _array(values)
         for number, state in deltas.optimizer.state_dict()["state"].items():
-            found |= {f"optimizer.{number}.{key}": values.numpy() for key, values in state.items()}
+            found |= {f"optimizer.{number}.{key}": _array(values) for key, values in state.items()}
         return found
 
     def state(self) -> dict[str, Any]:
@@ -225,16 +245,20 @@ class Fit:
         if self.settings.schedule == "online":
             residuals = Residuals(arrays["residuals.times"], len(rows))
             residuals.values[:] = arrays["residuals"]
-            residuals.adam = _remembered(arrays, "residuals")
+            remembered = zip(arrays["residuals.moments"], arrays["residuals.shares"], strict=True)
+            residuals.adam = [AdamState(*each) for each in remembered]
             self.model = RefinedModel(rows, field, exposure, smooth, arrays["slopes"], residuals)
         else:
             self.model = DeformableModel(rows, field, exposure, smooth)
         model, deltas = self.model, field.deltas
         if isinstance(field, NodeField):
-            field.index, field.weight = torch.from_numpy(arrays["index"]), torch.from_numpy(arrays["weight"])
-        deltas.hexplane.cells.detach().numpy()[:] = arrays["cells"]
+            field.attach(torch.from_numpy(arrays["index"]), torch.from_numpy(arrays["weight"]))
+        deltas.hexplane.cells.detach()[:] = self._tensor(arrays["cells"])
         exposure.gains[:] = arrays["gains"]
-        (model.adam,), (deltas.hexplane.adam,) = _remembered(arrays, "rows"), _remembered(arrays, "cells")
+        model.adam, deltas.hexplane.adam = (
+            RowAdam(*(self._tensor(arrays[f"{name}.{part}"][0]) for part in ("moments", "shares")))
+            for name in ("rows", "cells")
+        )
         model.ids, model.next_id = arrays["ids"], int(state["next_id"])
         of_decoder = {
             name: torch.from_numpy(arrays[f"decoder.{name}"]) for name in deltas.decoder.state_dict()
@@ -247,7 +271,7 @@ class Fit:
                 optimizer["state"].setdefault(int(number), {})[key] = torch.from_numpy(values)
         deltas.optimizer.load_state_dict(optimizer)
         self._density = self._make_density()
-        self._density.pull, self._density.seen = arrays["pull"], arrays["seen"]
+        self._density.pull, self._density.seen = map(self._tensor, (arrays["pull"], arrays["seen"]))
         self.iteration, self._order = int(state["iteration"]), list(state["order"])
         self.seconds = float(state["seconds"])
         self.pruned, self.split = int(state["pruned"]), int(state["split"])
@@ -271,6 +295,15 @@ class Fit:
             self._order = self._rng.permutation(len(self.clip.train)).tolist()
         return self.clip.train[self._order.pop()]
 
+    def _tensors(self, frame: ClipFrame) -> tuple[Tensor, ...]:
+        """Picture, tissue and depth of a frame on the device, where they stay."""
+        if frame.frame_id not in self._shown:
+            self._shown[frame.frame_id] = tuple(map(self._tensor, (frame.image, frame.tissue, frame.depth)))
+        return self._shown[frame.frame_id]
+
+    def _tensor(self, array: NDArray[Any]) -> Tensor:
+        return torch.from_numpy(array).to(self._device)
+
     def _make_exposure(self) -> Exposure:
         times = np.array([frame.t_capture_ns for frame in self.clip.train])
         brightness = [
@@ -287,6 +320,7 @@ class Fit:
         hexplane = for_clip(
             make_box(means), min(times), max(times), shape.slots(len(times)), cells=shape.cells,
             levels=shape.levels, channels=shape.channels, seed=settings.seed, space_range=shape.first_values,
+            device=self._device,
         )  # fmt: skip
         decoder = Decoder(
             hexplane.features, settings.tokens, settings.block, seed=settings.seed, xavier=shape.xavier
@@ -297,8 +331,6 @@ class Fit:
         return Density(self.model, self.settings.max_gaussians, self.settings.growth.share)
 
 
-def _remembered(arrays: dict[str, NDArray[Any]], name: str) -> list[AdamState]:
-    """What the optimisers of a table remember, as `Fit.arrays` has it."""
-    return [
-        AdamState(*each) for each in zip(arrays[f"{name}.moments"], arrays[f"{name}.shares"], strict=True)
-    ]
+def _array(values: Tensor | NDArray[Any]) -> NDArray[Any]:
+    found: NDArray[Any] = values.detach().cpu().numpy() if isinstance(values, Tensor) else values
+    return found

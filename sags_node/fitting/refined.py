@@ -54,10 +54,11 @@ class RefinedModel(DeformableModel):
         v_rows: F32 = self._own.grad.numpy()
         v_colors: F32 = v_rows[:, columns.COLOR] / gain
         v_rows[:, columns.COLOR] = 0
+        contribution: F32 = drawing.contribution.numpy()
         steps = Steps(rates, (relaxation / gain).astype(np.float32))
-        self.residuals.refine(self._t_ns, v_rows, v_colors, drawing.contribution, steps)
-        seen = drawing.contribution + COLOR_DAMPING
-        wide = np.maximum(drawing.spread / seen - 1, 1)
+        self.residuals.refine(self._t_ns, v_rows, v_colors, contribution, steps)
+        seen = contribution + COLOR_DAMPING
+        wide = np.maximum(drawing.spread.numpy() / seen - 1, 1)
         length = relaxation / (6 * gain.mean() ** 2 * wide * seen)
         self.slopes.detach().numpy()[:] -= length.astype(np.float32)[:, None] * self.slopes.grad.numpy()
         self.slopes.grad = None

@@ -39,13 +39,17 @@ PATH_POINTS = 8192  # Gaussians per step of the regression
 PATH_STEPS = 1500
 PATH_EVERY = 3  # training frames from one time of the paths to the next
 CARRIERS = 8  # Gaussians that tell a new one where it lay before
+NEIGHBOURS_AT_A_TIME = 2048  # points whose distances to all others a GPU holds
 HIDDEN = -5.0  # of an opacity logit
 
 Progress = Callable[[str, int, int], None]  # what, done, of
 
 
-def pooled_rows(clip: Clip, exposure: Exposure, settings: FitSettings) -> F32:
-    """Canonical rows [N, 14], without exposure, from random pixels of all training frames.
+def pooled_rows(
+    clip: Clip, exposure: Exposure, settings: FitSettings, device: torch.device | None = None
+) -> F32:
+    """Canonical rows [N, 14], without exposure, from random pixels of all training frames. `device`: which
+    finds their neighbours; None: Open3D does.
 
     Raises:
         SagsError: no frame has a depth.
@@ -61,7 +65,7 @@ def pooled_rows(clip: Clip, exposure: Exposure, settings: FitSettings) -> F32:
     gaussians = Gaussians(
         means,
         np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
-        np.repeat(np.float32(settings.growth.scale) * _neighbour_distance(means)[:, None], 3, axis=1),
+        np.repeat(np.float32(settings.growth.scale) * _neighbour_distance(means, device)[:, None], 3, axis=1),
         np.full(count, settings.growth.opacity, np.float32),
         colors,
         np.arange(count),
@@ -78,9 +82,15 @@ def _random_points(frame: ClipFrame, exposure: Exposure, rng: np.random.Generato
     return points, frame.image[y, x] / (np.float32(255) * exposure.at(frame.t_capture_ns))
 
 
-def _neighbour_distance(points: F32) -> F32:
+def _neighbour_distance(points: F32, device: torch.device | None) -> F32:
     """Root mean square distance [N] m to the three nearest others."""
-    _, squared = _nearest(points, points, 4)  # the nearest is the point itself
+    if device is None:
+        _, squared = _nearest(points, points, 4)  # the nearest is the point itself
+    else:
+        exact, there = "donot_use_mm_for_euclid_dist", torch.from_numpy(points).to(device)
+        parts = torch.split(there, NEIGHBOURS_AT_A_TIME)
+        near = [torch.cdist(part, there, compute_mode=exact).topk(4, largest=False)[0] for part in parts]
+        squared = torch.cat(near).square().cpu().numpy()
     distances: F32 = np.sqrt(np.maximum(squared[:, 1:].mean(1), 1e-10))
     return distances
 

@@ -163,7 +163,7 @@ class StreamFit:
         found = compare(drawing.planes, frame.image, frame.tissue, frame.depth, self._unseen, WEIGHTS)
         drawing.differentiate(found.loss, found.weight)
         self.model.descend([drawing], Rates(self._rates * np.float32(speed), FieldRates()))
-        drawn = drawing.contribution > densify.IDLE
+        drawn = drawing.contribution.numpy() > densify.IDLE
         self._drawn_ns[drawn] = np.maximum(self._drawn_ns[drawn], frame.t_capture_ns)
 
     def _tidy(self, frame: ClipFrame) -> None:

@@ -317,11 +317,12 @@ class SagsMapper:
         )
         drawing.differentiate(v_planes, weight)
         assert field.rows.grad is not None
-        share = np.float32(relaxation) / (drawing.contribution + np.float32(COLOUR_DAMPING))
+        contribution: F32 = drawing.contribution.numpy()
+        share = np.float32(relaxation) / (contribution + np.float32(COLOUR_DAMPING))
         field.table[:, columns.COLOR] -= share[:, None] * field.rows.grad.numpy()[:, columns.COLOR]
         rates = self._rates * np.float32(FIRST_SPEED if self._first_steps < FIRST_STEPS else 1)
         if frame is self.kept[-1]:
-            self.model.contribution[:], self._loss = drawing.contribution, loss
+            self.model.contribution[:], self._loss = contribution, loss
         field.descend([drawing], Rates(rates, FieldRates()))
         self._first_steps += 1
 

@@ -250,8 +250,8 @@ def test_growth_changes_no_feature(more: tuple[list[float], list[float]]) -> Non
     field = small_field()
     rng = np.random.default_rng(4)
     field.advance(T0 + 9 * SECOND, lambda t_ns: None)
-    for rows in (field.cells.detach().numpy(), field.adam.moments, field.adam.shares):
-        rows[:] = rng.uniform(0.5, 1, rows.shape)
+    for rows in (field.cells.detach(), field.adam.moments, field.adam.shares):
+        rows.numpy()[:] = rng.uniform(0.5, 1, rows.shape)
     wanted = BOX + more
     points = torch.from_numpy(rng.uniform(wanted[0] - 0.01, wanted[1] + 0.01, (2000, 3)).astype(np.float32))
     t_ns = T0 + 17 * SECOND // 2

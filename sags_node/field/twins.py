@@ -1,0 +1,11 @@
+"""Which of two twins computes: a kernel of Numba's, or the same formula in torch."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def by_kernels(table: Tensor) -> bool:
+    """Whether kernels can take a table: float32, in the memory of the host."""
+    return table.dtype == torch.float32 and table.device.type == "cpu"
