@@ -8,11 +8,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import torch
 from rich.table import Table
 
 from sags_node.cli.launching import write_json
-from sags_node.config.schema import EndoNerfSource
-from sags_node.errors import UsageError
+from sags_node.config.schema import DeviceName, EndoNerfSource
+from sags_node.engine.device import choose_device
+from sags_node.errors import SagsError, UsageError
 from sags_node.evaluation.lpips import BACKBONE, Lpips
 from sags_node.evaluation.measure import MeasureOptions
 from sags_node.evaluation.provenance import machine_name
@@ -22,7 +24,7 @@ from sags_node.fitting import checkpoint
 from sags_node.fitting.clip import read_clip
 from sags_node.fitting.fit import Fit
 from sags_node.fitting.score import published, score, score_between, score_depth, score_tracks
-from sags_node.fitting.settings import FitSettings
+from sags_node.fitting.settings import FitSettings, Schedule
 from sags_node.kernels.threads import configure_threads
 from sags_node.model.ply import write_ply
 from sags_node.pipeline.session import Session
@@ -48,6 +50,31 @@ def check_fit(out: Path) -> None:
     check_results(out, (CHECKPOINT, FIGURES, MODEL, DRAWN), ours)
 
 
+def device_of(wanted: DeviceName, schedule: Schedule) -> str | None:
+    """Where a fit learns, as `Fit` takes it.
+
+    Raises:
+        UsageError: a GPU is wanted, and none can be used, or not for this schedule.
+    """
+    if schedule == "online":
+        if wanted == "cuda":
+            raise UsageError(
+                "device: cuda: a fit from an online start runs on the CPU; give --schedule paper, or set "
+                "device:=cpu"
+            )
+        return None
+    if choose_device(wanted).kind == "cpu":
+        return None
+    if torch.cuda.is_available():
+        return "cuda"
+    if wanted == "cuda":
+        raise UsageError(
+            f"device: cuda: torch {torch.__version__} finds no GPU, and a fit needs it; install one with "
+            "CUDA: pip install --force-reinstall torch, or set device:=cpu"
+        )
+    return None
+
+
 def fit_session(
     session: Session,
     settings: FitSettings,
@@ -55,6 +82,7 @@ def fit_session(
     out: Path,
     resume: bool,
     advance: Advance,
+    device: str | None = None,
 ) -> dict[str, Any]:
     """Fit a recording and leave `checkpoint.npz`, `model.ply`, `test/` and `figures.json` in `out`.
 
@@ -65,13 +93,14 @@ def fit_session(
         out: an existing folder. An earlier result there is replaced.
         resume: go on from its checkpoint.
         advance: called with what is going on.
+        device: of `device_of`.
 
     Returns:
         The figures.
 
     Raises:
         UsageError: nothing to resume, or made with other settings or frames.
-        SagsError: the recording cannot be used, or a file cannot be written.
+        SagsError: the recording cannot be used, a file cannot be written, or the GPU failed.
     """
     stored = out / CHECKPOINT
     if resume and not stored.is_file():
@@ -86,14 +115,21 @@ def fit_session(
             receipt.add(frame, tissue)
 
     clip = read_clip(session, options.holds_out, lambda done: advance(done, count, "reading"), noted)
-    fit = Fit(clip, settings)
-    if resume:
-        advance(0, None, "reading the checkpoint")
-        checkpoint.load(fit, stored)
-    else:
-        advance(0, None, "starting; the first time, kernels are compiled for a minute")
-        fit.start(lambda what, done, of: advance(done, of, what))
-    _iterate(fit, stored, advance)
+    try:
+        fit = Fit(clip, settings, device)
+        if resume:
+            advance(0, None, "reading the checkpoint")
+            checkpoint.load(fit, stored)
+        else:
+            advance(0, None, "starting; the first time, kernels are compiled for a minute")
+            fit.start(lambda what, done, of: advance(done, of, what))
+        _iterate(fit, stored, advance)
+    except RuntimeError as error:  # which is what torch and Warp raise
+        if device is None:
+            raise
+        go_on = "to go on from the checkpoint add --resume and" if stored.is_file() else "start again and"
+        first = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise SagsError(f"the GPU failed: {first}; {go_on} set device:=cpu") from error
 
     drawn = out / DRAWN
     drawn.mkdir(exist_ok=True)
@@ -104,6 +140,7 @@ def fit_session(
         "session": session.name,
         "settings": asdict(settings),
         "machine": machine_name(),
+        "device": "cpu" if device is None else choose_device("auto").name,
         "seconds": round(fit.seconds, 1),
         "gaussians": len(fit.model),
         "cap": settings.max_gaussians,
@@ -167,7 +204,8 @@ def fit_verdict(found: dict[str, Any]) -> list[tuple[str, str]]:
     if track is not None:
         lines["points"] = f"{track['median_mm']:.2f} mm off (median); {track['lost']:.0%} lost"
     size = f"{found['gaussians']:,} Gaussians (at most {found['cap']:,})"
-    lines["model"] = f"{size}, fitted in {found['seconds']:.0f} s"
+    where = "" if found["device"] == "cpu" else f" on {found['device']}"
+    lines["model"] = f"{size}, fitted in {found['seconds']:.0f} s{where}"
     lines["machine"] = found["machine"]
     return list(lines.items())
 

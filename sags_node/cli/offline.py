@@ -209,22 +209,22 @@ def fit(
     parameters together. --schedule released is the same with each number as in the authors' code.
 
     DATASET is a folder in EndoNeRF or SCARED layout, or any session the node can play. Leaves a checkpoint,
-    the model as PLY (standard 3DGS fields, filters folded in), the drawn test frames and figures.json. It
-    runs on the CPU; with device:=cuda it is refused.
+    the model as PLY (standard 3DGS fields, filters folded in), the drawn test frames and figures.json.
+
+    The schedules paper and released learn on a GPU where one can be used (device:=auto or cuda); online runs
+    on the CPU.
 
     \b
     sags fit launch/d4d_pull.yaml --out out/d4d
     sags fit /data/endonerf/pulling_soft_tissues --schedule paper
     """
-    from sags_node.cli.fit_folder import check_fit, figures_table, fit_session, fit_verdict
+    from sags_node.cli.fit_folder import check_fit, device_of, figures_table, fit_session, fit_verdict
     from sags_node.config.launch_file import load_launch
     from sags_node.evaluation.measure import MeasureOptions
     from sags_node.fitting.settings import MONOCULAR, PRESETS, with_changes
 
     no_cameras = "live cameras cannot be fitted; record them first, then fit the recording"
     path, overrides = split_recording(dataset, no_cameras)
-    if load_launch(path, overrides).device == "cuda":
-        raise UsageError("device: cuda: sags fit runs on the CPU; leave that out, or set device:=cpu")
     settings = PRESETS[schedule]
     if monocular and settings.schedule == "online":
         raise UsageError("--monocular needs --schedule paper: the online start measures distances")
@@ -241,9 +241,10 @@ def fit(
     settings = replace(settings, antialias=not no_alias_free, seed=seed, **given)
     settings = with_changes(settings, changes)
     check_fit(out)
+    device = device_of(load_launch(path, overrides).device, settings.schedule)
     session = open_launched(path, [*overrides, "device:=cpu", "source.loop:=false", "source.pace:=step"])
     with progress("fitting") as advance:
-        found = fit_session(session, settings, options, out, resume, advance)
+        found = fit_session(session, settings, options, out, resume, advance, device)
     if json_out:
         show(found)
         return

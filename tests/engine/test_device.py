@@ -90,10 +90,10 @@ def test_a_missing_gpu_ends_the_command_with_one_message(
         assert said.startswith("error: device: cuda cannot be used: this machine has no NVIDIA GPU")
 
 
-def test_a_fit_on_a_gpu_is_refused(phantom_session: Path) -> None:
+def test_a_fit_from_an_online_start_is_refused_on_a_gpu(phantom_session: Path) -> None:
     result = CliRunner().invoke(main, ["fit", str(phantom_session), "device:=cuda"])
     assert result.exit_code == 2 and result.stdout == ""
-    assert "sags fit runs on the CPU" in result.stderr and "device:=cpu" in result.stderr
+    assert "--schedule paper" in result.stderr and "device:=cpu" in result.stderr
 
 
 def test_a_usable_gpu_is_chosen_and_gets_more_gaussians(machine: pytest.MonkeyPatch) -> None:
