@@ -37,6 +37,7 @@ LIVE_FIGURES = (
     "frames", "processed", "rate_hz", "latency_ms", "frame_ms", "stage_ms", "iterations_per_frame", "online",
     "depth", "gaussians", "rungs", "warnings", "settings",
 )  # fmt: skip
+FIT_FIGURES = ("seconds", "gaussians", "heldout", "train", "depth", "device", "settings")
 
 
 @dataclass
@@ -117,16 +118,19 @@ def live(arguments: list[str], kind: str) -> Row:
 
 
 def paper_fit() -> Row:
-    """The schedule of SAGS on the GPU."""
-    return _sags("fit", "launch/d4d_pull.yaml", "--schedule", "paper", "device:=cuda")
+    """The schedule of SAGS on the GPU, from start to figures."""
+    found = _sags("fit", "launch/d4d_pull.yaml", "--schedule", "paper", "device:=cuda", out="fit")
+    return found if "error" in found else {key: found[key] for key in FIT_FIGURES}
 
 
-def _sags(*arguments: str) -> Row:
+def _sags(*arguments: str, out: str = "figures.json") -> Row:
+    """What one of our commands writes: a file, or a folder with figures in it."""
     with tempfile.TemporaryDirectory() as folder:
-        out = Path(folder) / "out.json"
-        command = [sys.executable, "-m", "sags_node", *arguments, "--out", str(out)]
+        written = Path(folder) / out
+        command = [sys.executable, "-m", "sags_node", *arguments, "--out", str(written)]
         done = subprocess.run(command, capture_output=True, text=True, timeout=COMMAND, check=False)
-        if not out.exists():
+        figures = written / "figures.json" if written.is_dir() else written
+        if not figures.exists():
             return {"error": f"{done.returncode}: {done.stderr[-1500:]}"}
-        found: Row = json.loads(out.read_text())
+        found: Row = json.loads(figures.read_text())
         return found
