@@ -136,13 +136,14 @@ def _overlay(figures: Flat) -> str:
 
 
 def _quality(figures: Flat) -> str:
-    from sags_node.mapping.ladder import RUNGS  # only here: all commands load this file, and this needs numpy
+    from sags_node.mapping.ladder import GPU_RUNGS, RUNGS  # only here: all load this file; numpy is slow
 
     rungs = Counter({int(rung): count for rung, count in below(figures, "rungs").items() if count})
     said = []
     if rungs:
         most = rungs.most_common(1)[0][0]
-        said.append(f"rung {most} of 0 to {len(RUNGS) - 1} for most frames ({min(rungs)} to {max(rungs)})")
+        highest = len(GPU_RUNGS if figures.get("settings.device") == "cuda" else RUNGS) - 1
+        said.append(f"rung {most} of 0 to {highest} for most frames ({min(rungs)} to {max(rungs)})")
     if figures.get("gaussians.mean") is not None:
         said.append(f"{figures['gaussians.mean']:,.0f} Gaussians on average")
     if figures.get("settings.width") is not None:

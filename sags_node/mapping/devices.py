@@ -10,12 +10,21 @@ from sags_node.engine.device import Device, choose_device
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.errors import UsageError
 from sags_node.mapping.budget import Budget, StepBudget, TimeBudget
-from sags_node.mapping.ladder import EVERYTHING, PIXELS_PER_GAUSSIAN, RUNGS, Ladder, Rung, best_scale
+from sags_node.mapping.ladder import (
+    EVERYTHING,
+    GPU_RUNGS,
+    ON_CPU,
+    ON_GPU,
+    PIXELS_PER_GAUSSIAN,
+    RUNGS,
+    Ladder,
+    Rung,
+    best_scale,
+)
 from sags_node.mapping.refiner import CpuRefiner, Refiner
 from sags_node.mapping.speed import SAMPLE_SIZE, measured_speed
 
 LEAST_PIXELS = 2  # of the picture for each Gaussian, where time does not count
-GPU_SPEED = 10.0  # times two CPU cores, in Gaussians of a rung: an ESTIMATE, never run on a GPU
 FIELD_TIMES = 5.0  # as long as prices say, a frame of the paper's model takes: where its ladder begins
 GAUSSIANS_PER_MS = 1100  # of the budget, where the number of steps is fixed; see benchmarks/mapping.md
 
@@ -46,12 +55,14 @@ def affordable(config: LaunchConfig, width: int, height: int) -> int:
     """How many Gaussians a model of pictures of this size may have on the launch's device."""
     if config.mapping.max_gaussians is not None:
         return config.mapping.max_gaussians
+    on_gpu = device_of(config).kind == "cuda"
+    per_ms = GAUSSIANS_PER_MS * (ON_CPU.per_thousand / ON_GPU.per_thousand if on_gpu else 1.0)
     # Where time is short, steps show more than Gaussians that share few pixels (`benchmarks/ladder.md`).
     each = PIXELS_PER_GAUSSIAN if config.mapping.iterations is None else LEAST_PIXELS
     most = max(100, width * height // each)
     if config.mapping.iterations is None or config.mapping.rung is not None:
         return min(most, max(rung.gaussians for rung in rungs_of(config)))
-    return max(100, min(most, round(_speed(config) * GAUSSIANS_PER_MS * config.mapping.frame_ms())))
+    return max(100, min(most, round(per_ms * config.mapping.frame_ms())))
 
 
 def rungs_of(config: LaunchConfig, skips: Skips = ALL_SKIPS) -> tuple[Rung, ...]:
@@ -60,18 +71,13 @@ def rungs_of(config: LaunchConfig, skips: Skips = ALL_SKIPS) -> tuple[Rung, ...]
     Raises:
         UsageError: `mapping.rung` names none.
     """
-    mapping = config.mapping
-    if mapping.rung is not None and mapping.rung >= len(RUNGS):
-        raise UsageError(f"mapping.rung {mapping.rung}: the ladder's rungs are 0 to {len(RUNGS) - 1}")
-    rungs = RUNGS if mapping.rung is None else (RUNGS[mapping.rung],)
-    return tuple(
-        replace(
-            rung,
-            gaussians=round(_speed(config) * rung.gaussians),
-            depth_every=rung.depth_every if skips.depth else 1,
-        )
-        for rung in rungs
-    )
+    number = config.mapping.rung
+    rungs: tuple[Rung, ...] = RUNGS if device_of(config).kind == "cpu" else GPU_RUNGS
+    if number is not None and number >= len(rungs):
+        raise UsageError(f"mapping.rung {number}: the ladder's rungs are 0 to {len(rungs) - 1}")
+    if number is not None:
+        rungs = (rungs[number],)
+    return rungs if skips.depth else tuple(replace(rung, depth_every=1) for rung in rungs)
 
 
 def make_budget(
@@ -91,7 +97,9 @@ def make_budget(
         return StepBudget(mapping.iterations, rung)
     if speed is None:
         speed = _measured_speed(config)
-    return TimeBudget(Ladder(rungs_of(config, skips), width * height, 1e-3 * mapping.frame_ms(rate), speed))
+    prices = ON_CPU if device_of(config).kind == "cpu" else ON_GPU
+    seconds = 1e-3 * mapping.frame_ms(rate)
+    return TimeBudget(Ladder(rungs_of(config, skips), width * height, seconds, speed, prices))
 
 
 def with_scale(config: LaunchConfig, width: int, height: int, rate: float | None) -> LaunchConfig:
@@ -131,7 +139,3 @@ def _measured_speed(config: LaunchConfig) -> float:
     """`Ladder.speed` before the first frame."""
     times = FIELD_TIMES if config.mapping.method == "sags" else 1.0
     return times * measured_speed(make_rasterizer("numba", *SAMPLE_SIZE))
-
-
-def _speed(config: LaunchConfig) -> float:
-    return GPU_SPEED if device_of(config).kind == "cuda" else 1.0

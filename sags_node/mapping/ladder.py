@@ -47,14 +47,39 @@ RUNGS = (
 )
 
 
+# On a GPU small pictures save little, and Gaussians are cheap.
+GPU_RUNGS = (
+    Rung(15_000, scale=0.5, depth_every=3, redraw=0.4),
+    Rung(20_000, scale=0.75, depth_every=2, redraw=0.4),
+    Rung(30_000, depth_every=2),
+    Rung(45_000, depth_every=2),
+    Rung(60_000, depth_every=2),
+    Rung(80_000, depth_every=2),
+    Rung(80_000),
+    Rung(110_000),
+    Rung(150_000),
+    Rung(200_000),
+    Rung(300_000),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Prices:
+    """What a frame costs on one machine, ms; only ratios count."""
+
+    every_frame: float  # what depends on nothing: the camera's pictures, watches, tracks
+    depth: float  # matched once
+    worked: float  # pictures of `FULL` px: flow, masks
+    drawn: float  # a picture of `FULL` px drawn
+    stepped: float  # a step on one
+    per_thousand: float  # Gaussians
+
+
 USED = 0.82  # of the Gaussians that a rung allows: so many a model has, the rest is room for what appears
-# Prices, ms on two cores of one machine, by 18 runs at three working sizes (`benchmarks/ladder.md`).
-EVERY_FRAME = 8.5  # what depends on nothing: the camera's pictures, watches, tracks
-DEPTH = 3.0  # matched once
-WORKED = 0.8  # pictures of `FULL` px: flow, masks
-DRAWN = 3.6  # a picture of `FULL` px drawn
-STEPPED = 2.4  # a step on one
-PER_THOUSAND = 0.33  # Gaussians
+# Two cores of one machine, by 18 runs at three working sizes (`benchmarks/ladder.md`).
+ON_CPU = Prices(every_frame=8.5, depth=3.0, worked=0.8, drawn=3.6, stepped=2.4, per_thousand=0.33)
+# One H200 beside 16 cores, by five runs (`benchmarks/gpu.md`); they took 1.1 to 1.3 times as long.
+ON_GPU = Prices(every_frame=8.5, depth=5.0, worked=0.8, drawn=3.6, stepped=1.2, per_thousand=0.08)
 FULL = 640 * 512  # px
 
 AVERAGED = 12  # frames behind the measured speed; the two slowest of them are left out
@@ -78,17 +103,17 @@ PIXELS_PER_GAUSSIAN = 4  # fewer pixels have no more to tell of its colour, slop
 WITH_OTHERS = 1.1  # times as long as prices say: the least that live frames take (`benchmarks/ladder.md`)
 
 
-def price(rung: Rung, gaussians: float, pixels: int) -> float:
-    """What a frame costs, ms on the machine of the constants.
+def price(rung: Rung, gaussians: float, pixels: int, prices: Prices = ON_CPU) -> float:
+    """What a frame costs, ms on the machine of the prices.
 
     Args:
         gaussians: that the model has.
         pixels: of the working size.
     """
     pictures = pixels / FULL
-    drawn = rung.scale**2 * pictures
-    vision = EVERY_FRAME + DEPTH / rung.depth_every + WORKED * pictures
-    return vision + drawn * (DRAWN * (1 + rung.redraw) + STEPPED) + PER_THOUSAND * 1e-3 * gaussians
+    drawn = rung.scale**2 * pictures * (prices.drawn * (1 + rung.redraw) + prices.stepped)
+    vision = prices.every_frame + prices.depth / rung.depth_every + prices.worked * pictures
+    return vision + drawn + prices.per_thousand * 1e-3 * gaussians
 
 
 def best_scale(rungs: Sequence[Rung], pixels: int, seconds: float, speed: float) -> float:
@@ -107,7 +132,7 @@ def best_scale(rungs: Sequence[Rung], pixels: int, seconds: float, speed: float)
             spare = affords - price(rung, USED * rung.gaussians, round(scale**2 * pixels))
             if spare >= 0:  # a frame has room for some more than the rung says
                 most = (rung.scale * scale) ** 2 * pixels / PIXELS_PER_GAUSSIAN
-                gaussians = min(USED * rung.gaussians + 1e3 * spare / PER_THOUSAND, most)
+                gaussians = min(USED * rung.gaussians + 1e3 * spare / ON_CPU.per_thousand, most)
                 shown[scale] = max(shown.get(scale, 0.0), 1 / (1 / gaussians + 1 / most))
     return max(shown, key=shown.__getitem__)
 
@@ -128,15 +153,24 @@ class Ladder:
         reason: why it is that one, for people.
     """
 
-    def __init__(self, rungs: Sequence[Rung], pixels: int, seconds: float, speed: float = 1.0) -> None:
+    def __init__(
+        self,
+        rungs: Sequence[Rung],
+        pixels: int,
+        seconds: float,
+        speed: float = 1.0,
+        prices: Prices = ON_CPU,
+    ) -> None:
         """
         Args:
             rungs: from the cheapest to the best.
             pixels: of the working size.
             seconds: that a frame may take.
             speed: how long the machine takes, in units of the prices' machine.
+            prices: what frames cost there.
         """
         self._rungs = rungs
+        self._prices = prices
         self._pixels = pixels
         self.speed = speed
         self._took: deque[float] = deque(maxlen=AVERAGED)  # frames, in units of their prices
@@ -164,7 +198,7 @@ class Ladder:
 
     def learn(self, seconds: float, gaussians: int) -> None:
         """A frame took so long, further steps left out, with so many Gaussians."""
-        usual_ms = price(self.rung, gaussians, self._pixels)
+        usual_ms = price(self.rung, gaussians, self._pixels, self._prices)
         took = 1e3 * seconds / usual_ms
         self._frames += 1
         self._since += 1
@@ -195,7 +229,7 @@ class Ladder:
     def _expected(self, place: int) -> float:
         """ms that a frame takes on that rung."""
         rung = self._rungs[place]
-        return self.speed * price(rung, USED * rung.gaussians, self._pixels)
+        return self.speed * price(rung, USED * rung.gaussians, self._pixels, self._prices)
 
     def _tail(self, late: int, frames: int) -> float:
         """ms beyond what was expected: all but `late` of the last so many frames stayed below."""

@@ -20,6 +20,7 @@ from sags_node.engine import device as devices
 from sags_node.engine.device import choose_device, find_gpu
 from sags_node.errors import UsageError
 from sags_node.mapping import devices as mapping_devices
+from sags_node.mapping.ladder import GPU_RUNGS
 
 
 @pytest.fixture
@@ -104,7 +105,7 @@ def test_a_usable_gpu_is_chosen_and_gets_more_gaussians(machine: pytest.MonkeyPa
     assert check.level == "ok" and "H100" in check.found and "CUDA 13.0" in check.found
     cpu = mapping_devices.affordable(LaunchConfig(device="cpu"), 1280, 1024)
     gpu = mapping_devices.affordable(LaunchConfig(), 1280, 1024)
-    assert gpu > 2 * cpu
+    assert gpu > cpu and mapping_devices.rungs_of(LaunchConfig()) == GPU_RUNGS
     fixed = LaunchConfig(mapping=MappingConfig(max_gaussians=5000))
     assert mapping_devices.affordable(fixed, 640, 512) == 5000
 

@@ -1,5 +1,4 @@
-"""The kernels for a GPU, compiled for one by Warp's own NVRTC, which needs neither card nor toolkit: what a block
-of 256 threads takes of a multiprocessor."""
+"""The kernels for a GPU, compiled by Warp's own NVRTC, which needs neither card nor toolkit."""
 
 from __future__ import annotations
 

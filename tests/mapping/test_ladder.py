@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,6 +24,9 @@ from sags_node.mapping.devices import (
 from sags_node.mapping.ladder import (
     FIRST_FRAMES,
     FULL,
+    GPU_RUNGS,
+    ON_CPU,
+    ON_GPU,
     PIXELS_PER_GAUSSIAN,
     RUNGS,
     SCALES,
@@ -32,6 +35,7 @@ from sags_node.mapping.ladder import (
     SPARE,
     USED,
     Ladder,
+    Prices,
     Rung,
     best_scale,
     price,
@@ -94,9 +98,13 @@ def changes(done: list[Played]) -> list[tuple[int, int]]:
     return [(b.number, b.place - a.place) for a, b in itertools.pairwise(late) if a.place != b.place]
 
 
-def test_every_rung_costs_more_than_the_one_below() -> None:
-    prices = [price(rung, USED * rung.gaussians, FULL) for rung in RUNGS]
-    assert all(a < b for a, b in itertools.pairwise(prices)), prices
+@pytest.mark.parametrize(("rungs", "prices"), [(RUNGS, ON_CPU), (GPU_RUNGS, ON_GPU)])
+def test_every_rung_costs_more_than_the_one_below(rungs: Sequence[Rung], prices: Prices) -> None:
+    costs = [price(rung, USED * rung.gaussians, FULL, prices) for rung in rungs]
+    assert all(a < b for a, b in itertools.pairwise(costs)), costs
+
+
+def test_the_lowest_rung_is_for_slow_machines_and_the_highest_leaves_nothing_out() -> None:
     assert RUNGS[0].gaussians <= 5000 and RUNGS[0].scale == 0.5 and RUNGS[-1] == Rung(RUNGS[-1].gaussians)
 
 
