@@ -165,6 +165,8 @@ class HexPlane:
         planes = [int(level[a] * level[b]) for level in self.nodes for a, b in PAIRS]
         parts = torch.split(self.cells, planes + [self._slot_rows] * self.slots)  # at once: one gradient
         slots = parts[len(planes) :]
+        # as float32: what has no share in it then gets no gradient, of which Adam would make a whole step
+        share = float(np.float32(share))
         at = torch.lerp(slots[before % self.slots], slots[after % self.slots], share)
         lines = torch.split(at, self.nodes.ravel().tolist())
         return [
