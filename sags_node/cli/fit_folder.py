@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable
 from dataclasses import asdict
@@ -30,6 +31,8 @@ from sags_node.model.ply import write_ply
 from sags_node.pipeline.session import Session
 from sags_node.terminal import text
 from sags_node.types import Bool, StereoFrame
+
+log = logging.getLogger(__name__)
 
 CHECKPOINT, FIGURES, MODEL, DRAWN = "checkpoint.npz", "figures.json", "model.ply", "test"
 CHECKPOINT_PERIOD = 60.0  # s; it holds hundreds of MB
@@ -67,11 +70,11 @@ def device_of(wanted: DeviceName, schedule: Schedule) -> str | None:
         return None
     if torch.cuda.is_available():
         return "cuda"
+    lacks = f"torch {torch.__version__} finds no GPU, and a fit needs it"
+    fix = "install one with CUDA: pip install --force-reinstall torch"
     if wanted == "cuda":
-        raise UsageError(
-            f"device: cuda: torch {torch.__version__} finds no GPU, and a fit needs it; install one with "
-            "CUDA: pip install --force-reinstall torch, or set device:=cpu"
-        )
+        raise UsageError(f"device: cuda: {lacks}; {fix}, or set device:=cpu")
+    log.warning("%s: this one runs on the CPU; %s", lacks, fix)
     return None
 
 

@@ -242,7 +242,8 @@ def fit(
     settings = with_changes(settings, changes)
     check_fit(out)
     device = device_of(load_launch(path, overrides).device, settings.schedule)
-    session = open_launched(path, [*overrides, "device:=cpu", "source.loop:=false", "source.pace:=step"])
+    fixed = [f"device:={device or 'cpu'}", "source.loop:=false", "source.pace:=step"]
+    session = open_launched(path, [*overrides, *fixed])
     with progress("fitting") as advance:
         found = fit_session(session, settings, options, out, resume, advance, device)
     if json_out:

@@ -101,10 +101,10 @@ def test_the_3d_filter_is_that_of_the_kernels() -> None:
     np.testing.assert_allclose(found, smoothing_variances(means, cameras), rtol=1e-5)
 
 
-def test_where_a_fit_learns(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_a_fit_learns(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
     use_warp_on_cpu(monkeypatch)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert fit_folder.device_of("auto", "paper") is None
+    assert fit_folder.device_of("auto", "paper") is None and "runs on the CPU" in caplog.text
     with pytest.raises(UsageError, match=r"torch .* finds no GPU.*device:=cpu"):
         fit_folder.device_of("cuda", "paper")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
