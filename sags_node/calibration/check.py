@@ -7,16 +7,27 @@ from pathlib import Path
 
 import numpy as np
 
+from sags_node.calibration.guess import first_pairs
 from sags_node.calibration.matches import match_eyes
 from sags_node.calibration.pictures import Pair, pairs_of_files, pairs_of_session
 from sags_node.calibration.principal_points import judge_known_depths
-from sags_node.calibration.rows import Rows, judge_matches, judge_scale, rectified_rows
+from sags_node.calibration.rows import Rows, judge_matches, judge_rectified, judge_scale, rectified_rows
 from sags_node.config.launch_file import load_launch
 from sags_node.config.schema import LaunchConfig, PhantomSource
-from sags_node.errors import UsageError
+from sags_node.errors import SagsError, UsageError
 from sags_node.phantom import cached_session
-from sags_node.rig import Finding, check_eyes, check_pair, find_form, read_rig, unknown_form
+from sags_node.rig import (
+    Finding,
+    already_rectified,
+    check_eyes,
+    check_pair,
+    find_form,
+    read_rig,
+    rectifies,
+    unknown_form,
+)
 from sags_node.sources.pictures import size_text
+from sags_node.sources.rectified import as_named, as_pictures_come
 from sags_node.sources.source import recorded_rig
 from sags_node.types import F32, StereoFrame, StereoRig
 from sags_node.vision.rectify import Rectifier
@@ -24,6 +35,7 @@ from sags_node.vision.row_error import measure_rows
 
 Progress = Callable[[int, int], None]
 GOOD_ROWS = (0.7, 2.0)  # px of the full picture, median and 90 %
+FIRST_PAIRS = 2  # that tell whether pictures were rectified
 DISPARITY_MARGIN = 4.0  # px beyond those of matched points
 
 
@@ -59,8 +71,25 @@ def check_calibration(
         pairs, depths = pairs_of_session(config, progress)
     if pairs and size is None:
         size = pairs[0][0].shape[1], pairs[0][0].shape[0]
-    rig = read_rig(path, size, metres) if own is None else _rig_of(own, size, metres)
+    if own is not None:
+        rig = _rig_of(own, size, metres)
+    elif config is not None:
+        rig = as_pictures_come(read_rig(path, size, metres), config.model_copy(update={"rig": path}))
+    else:
+        rig = as_named(read_rig(path, size, metres), *(file for pair in images for file in pair))
     return judge(rig, pairs, depths)
+
+
+def read_calibration(path: Path, size: tuple[int, int] | None, metres: float | None) -> StereoRig:
+    """A calibration of any known form, or the one that a session uses, not judged yet; `size`, `metres` as in
+    `read_rig`.
+
+    Raises:
+        UsageError: nothing known is there, or it is malformed.
+    """
+    if find_form(path) is not None:
+        return read_rig(path, size, metres)
+    return _rig_of(_launched(path, ()), size, metres)
 
 
 def judge(rig: StereoRig, pairs: Sequence[Pair], depths: Sequence[F32 | None] = ()) -> list[Finding]:
@@ -69,6 +98,8 @@ def judge(rig: StereoRig, pairs: Sequence[Pair], depths: Sequence[F32 | None] = 
     if _broken(findings):
         return findings
     findings += check_pair(rig)
+    if rig.left.P[0, 3] == rig.right.P[0, 3]:  # without a baseline pictures tell nothing
+        return findings
     return findings + (check_pictures(rig, pairs, depths) if pairs else [])
 
 
@@ -83,14 +114,30 @@ def check_pictures(rig: StereoRig, pairs: Sequence[Pair], depths: Sequence[F32 |
         return [_wrong_size(rig, size)]
     found = [match_eyes(*pair) for pair in pairs]
     matches = np.concatenate(found)
-    findings = judge_matches(rig, matches)
-    if findings[0].level == "ok":
+    rectified = judge_rectified(rig, matches)
+    if rectified:
+        rig = already_rectified(rig)
+    findings = rectified + judge_matches(rig, matches)
+    if findings[-1].level == "ok":
         rows = rectified_rows(rig, matches)
         findings.append(_check_rows(rig, pairs, rows))
         findings += judge_scale(rig, rows)
         if depths:
             findings += judge_known_depths(rig, found, depths)
     return findings
+
+
+def rectified_before(config: LaunchConfig) -> bool:
+    """Whether the first pictures of a session show that they were rectified, though their names do not say
+    so; False where they cannot be read."""
+    try:
+        rig = _rig_of(config, None, None)
+        if config.rectified is not None or not rectifies(rig):
+            return False
+        matches = [match_eyes(*pair) for pair in first_pairs(config.source, FIRST_PAIRS)[1]]
+    except SagsError:  # whoever plays it says so
+        return False
+    return bool(matches) and bool(judge_rectified(rig, np.concatenate(matches)))
 
 
 def _launched(path: Path, overrides: Sequence[str]) -> LaunchConfig:
@@ -108,12 +155,10 @@ def _rig_of(config: LaunchConfig, size: tuple[int, int] | None, metres: float | 
     """The calibration that a session would use, not judged yet."""
     if isinstance(config.source, PhantomSource):
         return read_rig(cached_session(config.source) / "calib")
-    if config.rig is not None:
-        return read_rig(config.rig, size, metres)
-    rig = recorded_rig(config.source)
+    rig = recorded_rig(config.source) if config.rig is None else read_rig(config.rig, size, metres)
     if rig is None:
         raise UsageError("the session names no calibration: set rig to its folder")
-    return rig
+    return as_pictures_come(rig, config)
 
 
 def _broken(findings: Sequence[Finding]) -> bool:

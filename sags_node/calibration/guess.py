@@ -15,7 +15,7 @@ from sags_node.config.schema import RecordedSource, Source
 from sags_node.errors import SagsError
 from sags_node.rig import guessed_rig
 from sags_node.sources.source import open_source
-from sags_node.types import F64, U8, Eye, StereoRig
+from sags_node.types import F64, Eye, StereoRig
 
 LOOKED_AT = 4  # frames, and
 EVERY = 10  # between them
@@ -28,9 +28,7 @@ def guess_rig(source: Source) -> StereoRig:
     Raises:
         SagsError: it gives no frame.
     """
-    if isinstance(source, RecordedSource):
-        source = source.model_copy(update={"pace": "step", "loop": False, "warm_up": 0})
-    size, pairs = _first_pairs(source)
+    size, pairs = first_pairs(source)
     return with_equal_rows(guessed_rig(*size), pairs)
 
 
@@ -56,15 +54,21 @@ def _turned(eye: Eye, pitch: float, roll: float, scale: float) -> Eye:
     return replace(eye, K=K, R=turn @ eye.R)
 
 
-def _first_pairs(source: Source) -> tuple[tuple[int, int], list[tuple[U8, U8]]]:
-    """Width and height of an eye's picture, px, and some pairs; none where there is one eye."""
-    size, pairs = None, []
+def first_pairs(source: Source, count: int = LOOKED_AT) -> tuple[tuple[int, int], list[Pair]]:
+    """Width and height of an eye's picture, px, and some pairs; none where there is one eye.
+
+    Raises:
+        SagsError: it gives no frame.
+    """
+    if isinstance(source, RecordedSource):
+        source = source.model_copy(update={"pace": "step", "loop": False, "warm_up": 0})
+    size, pairs = None, list[Pair]()
     with open_source(source, references=False) as opened:
         for index, frame in enumerate(opened):
             size = size or (frame.left.shape[1], frame.left.shape[0])
             if frame.right is not None and index % EVERY == 0:
                 pairs.append((frame.left, frame.right))
-            if frame.right is None or len(pairs) == LOOKED_AT:
+            if frame.right is None or len(pairs) == count:
                 break
     if size is None:
         raise SagsError("no calibration, and not one frame came that could tell a size; set rig")

@@ -14,7 +14,9 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from sags_node.rig.check import RECALIBRATE, Finding, size_made_for
+from sags_node.config.units import fitting_units, in_metres
+from sags_node.rig import already_rectified, rectifies, rectify_eyes
+from sags_node.rig.check import ENDOSCOPE_BASELINE, RECALIBRATE, Finding, size_made_for
 from sags_node.types import F64, Eye, StereoRig
 
 FEWEST_MATCHES = 30
@@ -27,6 +29,9 @@ LEAST_SCALE = 0.004  # between the eyes: beyond it depth leans by more than matc
 SURE_SCALE = 4.0  # times its standard error
 EXPLAINED = 0.7  # px: where turn and scale leave more, the lenses are off too, and no scale fixes depth
 ROUNDS = 10
+ALIGNED = (1 / 2000, 1 / 600)  # of the width, median and 90 %: rows of pictures that were rectified
+WORSE = 2.0  # times: rows of these after they were rectified once more
+RECTIFIED = "rectified:=true"
 PICTURES_SWAPPED = "the pictures are swapped: the left ones come from the right camera"
 PLAUSIBLE_DEPTH = (0.005, 1.0)  # m, the median: in an endoscope's view
 
@@ -100,6 +105,23 @@ def judge_matches(rig: StereoRig, matches: F64) -> list[Finding]:
     return _depth(rig, as_is.rows)
 
 
+def judge_rectified(rig: StereoRig, matches: F64) -> list[Finding]:
+    """A warning where rows agree in the pictures as they are, and less after rectification: these were
+    rectified before they came. Matches [M, 4] as in `judge_matches`."""
+    if len(matches) < FEWEST_MATCHES or not rectifies(rig):
+        return []
+    before, after = rectified_rows(already_rectified(rig), matches), rectified_rows(rig, matches)
+    aligned = before.median <= ALIGNED[0] * rig.left.width and before.p90 <= ALIGNED[1] * rig.left.width
+    if not aligned or after.median < WORSE * before.median or after.p90 < WORSE * before.p90:
+        return []
+    what = (
+        f"rows agree to {before.median:.2f} px (median) as the pictures are, and to {after.median:.2f} px "
+        "once this calibration has rectified them: they are rectified already"
+    )
+    figures = {"rows_as_they_are_px": round(before.median, 3), "rows_rectified_px": round(after.median, 3)}
+    return [Finding("warning", what, f"set {RECTIFIED}", figures, launch=(RECTIFIED,))]
+
+
 def _readings(rig: StereoRig, matches: F64) -> Iterator[Reading]:
     """As it is, then all that users get wrong; of two that fit alike the first is meant."""
     rows = rectified_rows(rig, matches)
@@ -129,6 +151,7 @@ def _readings(rig: StereoRig, matches: F64) -> Iterator[Reading]:
             "exchange left and right of the source, and both files of the calibration",
         )
         yield from (swapped_files, wrong_sign) if rig.left.P[0, 3] < 0 else (wrong_sign, swapped_files)
+    yield from _other_directions(rig, matches)
     size = size_made_for(rig)
     if size is not None:
         yield Reading(
@@ -136,6 +159,30 @@ def _readings(rig: StereoRig, matches: F64) -> Iterator[Reading]:
             f"camera_matrix is for pictures of {size:.3g} times the size that the calibration states",
             f"multiply camera_matrix and projection_matrix by {1 / size:.3g}, or calibrate at full size",
         )
+
+
+def _other_directions(rig: StereoRig, matches: F64) -> Iterator[Reading]:
+    """What becomes of R and T, from left to right camera, on their way between programs."""
+    R, T = rig.T_right_left[:3, :3], rig.T_right_left[:3, 3]
+    if not T.any():
+        return
+    size = rig.left.width, rig.left.height
+    K, distortion = (rig.left.K, rig.right.K), (rig.left.distortion, rig.right.distortion)
+    for there, what, fix in (
+        (
+            T,
+            "R, from left to right camera, is transposed, as MATLAB keeps it",
+            "write its transpose in its place",
+        ),
+        (
+            -R.T @ T,
+            "R and T go from the right to the left camera",
+            "write the transpose of R in its place, and minus that transpose times T in the place of T",
+        ),
+    ):
+        other = rectify_eyes(rig.name, size, K, distortion, R.T, there)
+        anew = f"{fix}, leave R1 R2 P1 P2 out, and read the file again (sags calib convert)"
+        yield Reading(rectified_rows(other, matches), what, anew)
 
 
 def _swapped_or_shifted(rows: Rows) -> Finding:
@@ -249,8 +296,8 @@ def _depth(rig: StereoRig, rows: Rows) -> list[Finding]:
     figures = _figures(rows) | {"depth_median_m": round(depth, 4)}
     if not PLAUSIBLE_DEPTH[0] <= depth <= PLAUSIBLE_DEPTH[1]:
         what = f"points would lie at {depth:.3g} m (median); an endoscope sees 0.005 to 1 m"
-        thousandth = PLAUSIBLE_DEPTH[0] <= depth / 1000 <= PLAUSIBLE_DEPTH[1]
-        fix = "the calibration is in millimetres: divide by 1000, or --unit mm" if thousandth else RECALIBRATE
+        units = fitting_units(_signed_baseline(rig), *ENDOSCOPE_BASELINE)
+        fix = in_metres(units) if units else RECALIBRATE
         return [Finding("error", what, fix, figures)]
     per_pixel = depth**2 / (rig.left.P[0, 0] * _signed_baseline(rig))
     what = (

@@ -12,6 +12,7 @@ import click
 from rich.markup import escape
 
 from sags_node.cli.launching import as_json, check_files, force_option, launch_argument, positive, split
+from sags_node.config.units import UNITS
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import check_file, whole
 from sags_node.terminal import text
@@ -20,7 +21,6 @@ from sags_node.terminal.console import console, progress, show
 if TYPE_CHECKING:
     from sags_node.calibration.boards import Board
 
-UNITS = {"m": 1.0, "mm": 1e-3}
 OUT = ("-o", "--out", "--output")
 EYES = Path("eyes.png")
 
@@ -150,17 +150,18 @@ def check(
 def convert(
     path: Path, out: Path, size: tuple[int, int] | None, unit: str | None, scale: float, force: bool
 ) -> None:
-    """Write any known calibration as left.yaml and right.yaml.
+    """Write any known calibration, or that of a session, as left.yaml and right.yaml.
 
     \b
     sags calib convert stereo_calib/ -o calib/mine --size 1280x720 --unit mm
     sags calib convert calibrationdata.tar.gz -o calib/mine
     """
-    from sags_node.rig import check_rig, eye_files, read_rig, refuse_errors, resized_rig, save_rig
+    from sags_node.calibration.check import read_calibration
+    from sags_node.rig import check_rig, eye_files, refuse_errors, resized_rig, save_rig
 
     if path.resolve() in (file.resolve() for file in (out, *eye_files(out))):
         raise UsageError(f"{out} is what is converted, and would be replaced; name another folder")
-    rig = resized_rig(read_rig(path, size, UNITS.get(unit or "")), scale)
+    rig = resized_rig(read_calibration(path, size, UNITS.get(unit or "")), scale)
     refuse_errors(check_rig(rig), path)
     check_files(*eye_files(out), force=force)
     save_rig(rig, out)

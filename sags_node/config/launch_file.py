@@ -30,6 +30,7 @@ MOST_MISTAKES = 10  # named at once
 COMMAND_LINE = "command line"
 DEFAULT_DATA = "../shared/data"
 BAG_SUFFIXES = (".mcap", ".db3", ".bag")
+UNFINISHED = ".bag.active"  # of ROS 1, while it is recorded
 VIDEO_SUFFIXES = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".ts", ".wmv")
 SIDECAR_TYPE = "dvrk_data:video_sidecar@"
 SIDECAR_LOOK = 65536  # bytes at either end; jsoncpp sorts the keys, so the type comes after the frames
@@ -142,8 +143,9 @@ def known_recording(folder: Path) -> dict[str, Any] | None:
     if (folder / "launch.yaml").exists():
         return None
     is_folder = folder.is_dir()
-    if folder.suffix in BAG_SUFFIXES or (folder / "metadata.yaml").is_file() or any(folder.glob("*.mcap")):
-        return {"source": {"kind": "bag", "path": str(folder)}}
+    bag = _bag_of(folder)
+    if bag is not None:
+        return {"source": {"kind": "bag", "path": str(bag)}}
     if any(is_sidecar(file) for file in (folder.glob("*.json") if is_folder else [folder])):
         return {"source": {"kind": "dvrk", "path": str(folder)}}
     if (folder / "poses_bounds.npy").is_file() or all(
@@ -157,6 +159,17 @@ def known_recording(folder: Path) -> dict[str, Any] | None:
             "vision": {"tissue": {"method": "none"}},
         }
     return None
+
+
+def _bag_of(path: Path) -> Path | None:
+    """The ROS recording that a file or folder is; its metadata may be missing, as of a recorder that was
+    killed. Of ROS 1 a folder may hold one bag."""
+    if path.suffix in BAG_SUFFIXES or path.name.endswith(UNFINISHED):
+        return path
+    if (path / "metadata.yaml").is_file() or any(path.glob("*.mcap")) or any(path.glob("*.db3")):
+        return path
+    bags = [*path.glob("*.bag"), *path.glob(f"*{UNFINISHED}")]
+    return bags[0] if len(bags) == 1 else None
 
 
 def is_sidecar(file: Path) -> bool:

@@ -168,7 +168,9 @@ class BagSource(RecordedSource):
     kind: Literal["bag"] = "bag"
     path: Path = Field(description="folder with metadata.yaml, or a .mcap, .db3 or .bag file")
     left: str | None = Field(
-        None, description="picture topic of the left eye; default: guessed, e.g. /RIG/left/image_raw"
+        None,
+        description="picture topic of the left eye, or of both where source.geometry.layout says so; "
+        "default: guessed, e.g. /RIG/left/image_raw",
     )
     right: str | None = Field(None, description="picture topic of the right eye; default: guessed")
     left_info: str | None = Field(
@@ -178,6 +180,22 @@ class BagSource(RecordedSource):
         None, description="camera_info topic of the right eye; default: beside its pictures"
     )
     tolerance: float = Field(0.02, gt=0, description="s; how far the stamps of a pair may lie apart")
+    clocks: Literal["one", "two"] = Field(
+        "one",
+        description="one: both eyes are stamped by one clock; two: by clocks that differ, and the right "
+        "eye's is set by when its pictures were recorded",
+    )
+    geometry: GeometryConfig = GeometryConfig()
+
+    @model_validator(mode="after")
+    def _one_topic_of_both(self) -> BagSource:
+        if self.geometry.layout == "frame_sequential":
+            raise ValueError("geometry.layout frame_sequential is for cameras and videos, not for bags")
+        if self.geometry.layout != "separate" and self.right is not None:
+            raise ValueError(
+                f"geometry.layout {self.geometry.layout}: source.left shows both, leave right out"
+            )
+        return self
 
 
 class DvrkSource(RecordedSource):
@@ -715,6 +733,11 @@ class LaunchConfig(Section):
         None,
         description="the calibration, in any form of docs/calibration.md; needed unless the recording brings "
         "one",
+    )
+    rectified: bool | None = Field(
+        None,
+        description="the pictures are rectified already: only the projection_matrix of the calibration is "
+        "used; default: what the names of their folders, files or topics say (rect, rectified, image_rect)",
     )
     source: Source = PhantomSource()
     robot: Robot | None = Field(

@@ -6,16 +6,22 @@ from collections.abc import Callable, Sequence
 from itertools import islice
 from pathlib import Path
 
-from sags_node.calibration.check import check_calibration, judge
+from sags_node.calibration.check import check_calibration, judge, rectified_before
 from sags_node.calibration.pictures import Pair, pairs_of_files
-from sags_node.config.schema import EndoNerfSource, LaunchConfig, RecordedSource, VideosSource
+from sags_node.calibration.rows import RECTIFIED
+from sags_node.config.launch_file import load_launch
+from sags_node.config.schema import BagSource, EndoNerfSource, LaunchConfig, RecordedSource, VideosSource
 from sags_node.errors import SagsError, UsageError
 from sags_node.importing import pictures, videos
 from sags_node.importing.folder import Contents, both_eyes, calibration_of, override, recognise
 from sags_node.importing.timing import LOOKED_AT, Timing, check_timing
 from sags_node.rig import Finding, read_rig
 from sags_node.sources.pictures import FolderPairs, size_text
+from sags_node.sources.rectified import as_named
+from sags_node.sources.replay import Replay
 from sags_node.sources.source import open_source
+
+CLOCKS = "one eye's stamps are off: set source.clocks:=two, or set both clocks before recording"
 
 
 def check_folder(folder: Path) -> list[Finding]:
@@ -31,10 +37,12 @@ def check_folder(folder: Path) -> list[Finding]:
         found += _pictures(contents, contents.left)
     if contents.videos:
         looked, pairs = videos.look(contents.videos)
-        found += looked + (_calibrated(calibration_of(folder), lambda: pairs) if pairs else [])
+        found += looked + (_calibrated(folder, contents.videos, pairs) if pairs else [])
     if contents.config is not None:
         found += played(contents.config)
-    found = _once(found + _calibration(folder, contents))
+    if not any("clocks_differ_ms" in finding.figures for finding in found):  # else rows tell of the clocks
+        found += _calibration(folder, contents)
+    found = _once(found)
     if contents.level == "error":
         return found
     if any(finding.level == "error" for finding in found):
@@ -60,7 +68,10 @@ def overrides_of(path: Path) -> list[str]:
     if not launch:
         raise UsageError(f"{path} is {contents.what}; {contents.instead}")
     form = calibration_of(path if path.is_dir() else path.parent)
-    return [*launch, *([] if form is None else [override("rig", form)])]
+    if form is None:
+        return list(launch)
+    with_rig = [*launch, override("rig", form)]
+    return [*with_rig, RECTIFIED] if rectified_before(load_launch(path, with_rig)) else with_rig
 
 
 def _once(found: list[Finding]) -> list[Finding]:
@@ -123,19 +134,20 @@ def _calibration(folder: Path, contents: Contents) -> list[Finding]:
         return _tried("calibration", lambda: odd_or_last(check_calibration(folder)))
     if contents.right is None or contents.left is None:
         return []
-    eyes = [(contents.left, contents.right)]
-    return _calibrated(calibration_of(folder), lambda: pairs_of_files(eyes))
+    return _calibrated(folder, (contents.left, contents.right))
 
 
-def _calibrated(form: Path | None, read: Callable[[], Sequence[Pair]]) -> list[Finding]:
-    """The calibration beside pictures, against them."""
+def _calibrated(folder: Path, eyes: tuple[Path, ...], pairs: Sequence[Pair] = ()) -> list[Finding]:
+    """The calibration beside the pictures of both eyes, against some `pairs` of them; default: of the files
+    in two folders."""
+    form = calibration_of(folder)
     if form is None:
         return [without_calibration()]
 
     def compare() -> list[Finding]:
-        pairs = read()
-        height, width = pairs[0][0].shape[:2]
-        return odd_or_last(judge(read_rig(form, (width, height)), pairs))
+        looked_at = pairs or pairs_of_files([(eyes[0], eyes[1])])
+        height, width = looked_at[0][0].shape[:2]
+        return odd_or_last(judge(as_named(read_rig(form, (width, height)), *eyes), looked_at))
 
     return _tried("calibration", compare)
 
@@ -173,7 +185,9 @@ def played(config: LaunchConfig) -> list[Finding]:
             if size is None:
                 return [Finding("error", "not one frame can be read", "check the files")]
             said = f"{opened.frame_count} frames of {size_text(*size)} px at {opened.rate:g} Hz"
-        return [Finding("ok", said), *ends, *timing.findings()]
+            stamped = list(opened.findings) if isinstance(opened, Replay) else []
+            late = CLOCKS if isinstance(source, BagSource) else None
+        return [Finding("ok", said), *ends, *(stamped or timing.findings(late))]
 
     return _tried("frames", look)
 

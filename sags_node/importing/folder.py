@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from sags_node.config.launch_file import VIDEO_SUFFIXES, load_launch
+from sags_node.config.launch_file import VIDEO_SUFFIXES, known_recording, load_launch
 from sags_node.config.schema import LaunchConfig
 from sags_node.config.yaml_reader import parse_yaml
 from sags_node.errors import UsageError
@@ -50,7 +50,7 @@ def recognise(folder: Path) -> Contents:
         raise UsageError(f"{folder} does not exist; check the path")
     if is_video(folder):
         return Contents("one video", videos=(folder,))
-    if not folder.is_dir():
+    if not folder.is_dir() and known_recording(folder) is None:
         raise UsageError(f"{folder} is neither a folder nor a video; give the one that holds the recording")
     try:
         config = load_launch(folder)
@@ -228,5 +228,6 @@ def _folder_of(value: object) -> Path | None:
 
 
 def _first(folder: Path, names: tuple[str, ...]) -> Path | None:
-    by_name = {each.name.lower(): each for each in folder.iterdir() if each.is_dir()}
+    inside = folder.iterdir() if folder.is_dir() else ()
+    by_name = {each.name.lower(): each for each in inside if each.is_dir()}
     return next((by_name[name] for name in names if name in by_name and has_pictures(by_name[name])), None)

@@ -20,6 +20,7 @@ from sags_node.importing.check import odd_or_last, overrides_of, played, without
 from sags_node.importing.folder import is_video, override
 from sags_node.rig import Finding, read_rig
 from sags_node.sources.pictures import size_text
+from sags_node.sources.rectified import as_pictures_come
 from sags_node.sources.source import recorded_rig
 
 DEVICES = Path("/dev")
@@ -148,6 +149,6 @@ def _calibration(config: LaunchConfig) -> list[Finding]:
         height, width = pairs[0][0].shape[:2]
         rig = recorded if config.rig is None else read_rig(config.rig, (width, height))
         assert rig is not None
-        return odd_or_last(judge(rig, pairs, depths))
+        return odd_or_last(judge(as_pictures_come(rig, config), pairs, depths))
     except SagsError as error:
         return [pictures.refused("calibration", error)]

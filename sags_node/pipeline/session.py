@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,9 +22,13 @@ from sags_node.config.schema import (
 from sags_node.errors import UsageError
 from sags_node.mapping.devices import with_scale
 from sags_node.rig import load_camera, load_rig
+from sags_node.sources.rectified import as_pictures_come
+from sags_node.sources.replay import Replay
 from sags_node.sources.robot import Posed
 from sags_node.sources.source import Source, open_source, recorded_rig
 from sags_node.types import StereoRig
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +96,8 @@ def open_posed(config: LaunchConfig, rig: StereoRig, references: bool = True) ->
         UsageError, SagsError: see `open_source` and `Posed`.
     """
     source = open_source(config.source, references, size=(rig.left.width, rig.left.height))
+    for finding in source.findings if isinstance(source, Replay) else ():
+        log.warning("%s; %s", finding.what, finding.fix)
     return source if config.robot is None else Posed(source, config, rig)
 
 
@@ -108,7 +115,12 @@ def lacks_rig(config: LaunchConfig) -> bool:
 
 
 def rig_of(config: LaunchConfig) -> StereoRig:
-    """The calibration that comes with the pictures, or the one that the launch file names."""
+    """The calibration that comes with the pictures, or the one that the launch file names; of pictures as
+    they come, rectified or not."""
+    return as_pictures_come(_named_rig(config), config)
+
+
+def _named_rig(config: LaunchConfig) -> StereoRig:
     if config.rig is not None and isinstance(config.source, BagSource | Ros2Source):
         return load_rig(config.rig)  # what drivers say is often uncalibrated, or of another day
     recorded = recorded_rig(config.source)

@@ -17,6 +17,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
 from sags_node.config.launch_file import BAG_SUFFIXES as SUFFIXES
+from sags_node.config.launch_file import UNFINISHED
 from sags_node.config.yaml_reader import read_yaml
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import open_file
@@ -71,13 +72,20 @@ def storage_files(path: Path) -> tuple[list[Path], bool]:
     if not path.is_dir():
         if not path.is_file():
             raise UsageError(f"recording {path} does not exist; check the path")
+        if path.name.endswith(UNFINISHED):
+            raise UsageError(
+                f"{path} was not closed: its recorder was killed; with ROS 1 at hand: rosbag reindex {path}, "
+                f"then mv {path} {path.with_suffix('')}"
+            )
         if path.suffix not in SUFFIXES:
             raise UsageError(f"{path} is not a recording; what is read: folders, {', '.join(SUFFIXES)}")
         return [path], False
     if not (path / METADATA).is_file():
-        files = mcap_files(path)
+        files = files_in(path, ".mcap") or files_in(path, ".db3")
         if not files:
-            raise UsageError(f"{path} holds neither {METADATA} nor a .mcap file; it is not a rosbag2 folder")
+            raise UsageError(
+                f"{path} holds neither {METADATA} nor a .mcap or .db3 file; it is not a rosbag2 folder"
+            )
         return files, False
     information = _metadata(path / METADATA)
     mode = str(information.get("compression_mode") or "").lower()
@@ -85,7 +93,7 @@ def storage_files(path: Path) -> tuple[list[Path], bool]:
         raise UsageError(f"{path} is compressed file by file; unpack it first: ros2 bag convert, or zstd -d")
     names = information.get("relative_file_paths")
     if not isinstance(names, list) or not names or not all(isinstance(name, str) for name in names):
-        raise UsageError(f"{path / METADATA} names no files; remove it to read the .mcap files beside it")
+        raise UsageError(f"{path / METADATA} names no files; remove it to read the files beside it")
     files = [path / Path(name).name for name in names]  # a name cannot lead out of the folder
     for file in files:
         if not file.is_file() or file.suffix not in (".mcap", ".db3"):
@@ -93,9 +101,9 @@ def storage_files(path: Path) -> tuple[list[Path], bool]:
     return files, mode == "message"
 
 
-def mcap_files(folder: Path) -> list[Path]:
-    """The MCAP files in a folder in the order of their numbers: case_2 before case_10."""
-    return sorted(folder.glob("*.mcap"), key=lambda file: (_number(file.stem), file.name))
+def files_in(folder: Path, suffix: str) -> list[Path]:
+    """The files in a folder with a suffix in the order of their numbers: case_2 before case_10."""
+    return sorted(folder.glob(f"*{suffix}"), key=lambda file: (_number(file.stem), file.name))
 
 
 def _number(stem: str) -> int:
@@ -222,7 +230,12 @@ class Channels:
 def _read_with_rosbags(file: Path, topics: Collection[str] | None, start_ns: int) -> Iterator[BagMessage]:
     from rosbags import rosbag1, rosbag2
 
-    ros1 = file.suffix == ".bag"
+    ros1, log = file.suffix == ".bag", Path(f"{file}-wal")
+    if log.is_file() and log.stat().st_size:  # `rosbags` would pass over it
+        raise SagsError(
+            f"{log} holds messages that {file.name} lacks: its recorder was killed or still runs; "
+            f'then: sqlite3 {file} "PRAGMA wal_checkpoint(TRUNCATE)"'
+        )
     positions = rosbag1_check.chunk_positions(file) if ros1 else frozenset()
     reader: Any = rosbag1.Reader(file) if ros1 else rosbag2.Reader(file)
     with _damage_as_one_error(), reader:

@@ -17,7 +17,8 @@ from sags_node.messaging.topics import CAMERA_INFO, IMAGE
 from sags_node.messaging.wire import PROTOCOL, Message, WireError
 from sags_node.recording.backlog import Arrived
 from sags_node.recording.bag_writer import NO_LIMITS, BagWriter, Limits
-from sags_node.recording.pictures import encode_file, read_eye
+from sags_node.recording.camera_info import read_eye
+from sags_node.recording.pictures import encode_file
 from sags_node.rig import eye_text
 
 Compression = Literal["none", "jpeg", "png"]
@@ -87,9 +88,10 @@ class MessageWriter:
             text = cdr.parse(message).data.encode()
             self.bag.attach("parameters.json", "application/json", text, arrived.received_ns)
         elif message.meta.type == CAMERA_INFO and topic.removeprefix(f"{self._ns}/") in topics.BY_NAME:
-            side = topic.split("/")[-2]
-            text = eye_text(read_eye(message.cdr(), topic), side).encode()
-            self.bag.attach(f"calib/{side}.yaml", "application/yaml", text, arrived.received_ns)
+            side, eye = topic.split("/")[-2], read_eye(message.cdr(), topic)
+            if eye is not None:  # else there is none to keep
+                text = eye_text(eye, side).encode()
+                self.bag.attach(f"calib/{side}.yaml", "application/yaml", text, arrived.received_ns)
         else:
             return
         self._attached.add(topic)

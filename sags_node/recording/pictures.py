@@ -1,4 +1,4 @@
-"""What cameras say in ROS: pictures, raw and compressed, and their calibration, checked and decoded."""
+"""What cameras say in ROS: pictures, raw and compressed, checked and decoded."""
 
 from __future__ import annotations
 
@@ -10,12 +10,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sags_node.errors import SagsError, UsageError
+from sags_node.errors import SagsError
 from sags_node.media.picture_file import decode
 from sags_node.messaging import cdr
-from sags_node.messaging.topics import CAMERA_INFO, IMAGE
-from sags_node.rig import fit_distortion
-from sags_node.types import U8, Eye
+from sags_node.messaging.topics import IMAGE
+from sags_node.types import U8
 
 IMAGE_TYPES = (IMAGE, cdr.COMPRESSED)
 LARGEST_SIDE = 16384  # px
@@ -76,7 +75,7 @@ def decode_picture(data: bytes | memoryview, kind: str, where: str) -> U8:
     Raises:
         SagsError: the message is damaged, or of an encoding that is not read.
     """
-    message = _decoded(data, kind, where)
+    message = decode_message(data, kind, where)
     if kind == cdr.COMPRESSED:
         decoded = decode_file(np.asarray(message.data, np.uint8), where)
         channels = 1 if decoded.ndim == 2 else decoded.shape[2]
@@ -139,30 +138,12 @@ def encode_file(picture: NDArray[Any], encoding: str, form: str, options: Sequen
     return bytes(file.data)
 
 
-def read_eye(data: bytes | memoryview, where: str) -> Eye:
-    """The calibration in a `CameraInfo`.
+def decode_message(data: bytes | memoryview, kind: str, where: str) -> Any:
+    """A message of ROS type `kind`.
 
     Raises:
-        SagsError: the message is damaged.
-        UsageError: a distortion model that is not supported.
+        SagsError: it is damaged; `where` it stands is said.
     """
-    message = _decoded(data, CAMERA_INFO, where)
-    if message.distortion_model not in ("plumb_bob", "rational_polynomial", ""):
-        raise UsageError(
-            f"{where}: distortion model {message.distortion_model!r} is not supported; calibrate with "
-            "'plumb_bob' or 'rational_polynomial', or set rig"
-        )
-    return Eye(
-        width=message.width,
-        height=message.height,
-        K=np.array(message.k, np.float64).reshape(3, 3),
-        distortion=fit_distortion(np.asarray(message.d, np.float64), where),
-        R=np.array(message.r, np.float64).reshape(3, 3),
-        P=np.array(message.p, np.float64).reshape(3, 4),
-    )
-
-
-def _decoded(data: bytes | memoryview, kind: str, where: str) -> Any:
     try:
         return cdr.decode(data, kind)
     except SagsError as error:

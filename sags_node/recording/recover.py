@@ -15,7 +15,7 @@ from mcap.records import Channel, Schema
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import open_file
 from sags_node.recording import mcap_file
-from sags_node.recording.bag import Channels, mcap_files, read_messages, records_of, storage_files
+from sags_node.recording.bag import Channels, files_in, read_messages, records_of, storage_files
 from sags_node.recording.bag_writer import BagWriter
 from sags_node.recording.mcap_file import HEAD, MAGIC, MAX_RECORD_BYTES, DamagedError, Entry, Head
 
@@ -49,7 +49,7 @@ def recover(path: Path, out: Path) -> dict[str, Any]:
         UsageError: there is no MCAP file, or something is at `out` already.
         SagsError: nothing can be saved, or the new bag cannot be written.
     """
-    files = mcap_files(path) if path.is_dir() else storage_files(path)[0]
+    files = files_in(path, ".mcap") if path.is_dir() else storage_files(path)[0]
     if not files or files[0].suffix != ".mcap":
         raise UsageError(
             f"{path}: only MCAP is recovered; for ROS 1 use rosbag reindex, for db3 sqlite3 .recover"

@@ -22,18 +22,23 @@ from sags_node.rig.read import (
     unknown_form,
 )
 from sags_node.rig.rig import (
+    already_rectified,
     fit_distortion,
+    part_of_sensor,
     rectified_camera,
     rectified_rig,
+    rectifies,
     rectify_eyes,
     resized_rig,
 )
-from sags_node.rig.ros import eye_files, eye_text, save_rig
+from sags_node.rig.ros import MODELS, eye_files, eye_text, save_rig
 
 __all__ = [
     "GUESSED_FOV",
+    "MODELS",
     "Finding",
     "Form",
+    "already_rectified",
     "check_eyes",
     "check_intrinsics",
     "check_pair",
@@ -45,9 +50,11 @@ __all__ = [
     "guessed_rig",
     "load_camera",
     "load_rig",
+    "part_of_sensor",
     "read_rig",
     "rectified_camera",
     "rectified_rig",
+    "rectifies",
     "rectify_eyes",
     "refuse_errors",
     "resized_rig",

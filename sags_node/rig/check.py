@@ -10,14 +10,17 @@ from typing import Literal
 import numpy as np
 
 from sags_node import geometry
+from sags_node.config.units import NAMES, fitting_units, in_metres
 from sags_node.errors import UsageError
 from sags_node.types import F64, Eye, StereoRig
 
 ENDOSCOPE_BASELINE = (0.003, 0.010)  # m
-LARGEST_BASELINE = 0.5  # m; more can only be another unit
+LARGEST_BASELINE = 0.25  # m; more can only be another unit, as centimetres of an endoscope are
+SMALLEST_BASELINE = 1e-4  # m; less can only be a baseline that was not multiplied by fx
 OTHER_SIZES = (0.25, 1 / 3, 0.5, 2.0, 3.0, 4.0)  # of the picture that a calibration may have been made for
 SAME_CENTRE = 0.12  # of the ratio of principal point to middle: how well both axes and eyes must agree
 LARGEST_RADIUS, RADII = 4.0, 4001  # at distance 1: 76 degrees from the axis
+WIDE = 90  # degrees from corner to corner: beyond it lenses are often calibrated by fisheye models
 RECALIBRATE = "run the stereo calibration again and save both files from one run"
 
 
@@ -100,7 +103,7 @@ def _check_eyes(rig: StereoRig) -> list[Finding]:
             found.append(Finding("error", f"{file}: rectification_matrix is not a rotation", RECALIBRATE))
         for key, K in (("camera_matrix", eye.K), ("projection_matrix", eye.P[:, :3])):
             found += check_intrinsics(f"{file}: {key}", K, eye.width, eye.height)
-        found += _check_distortion(file, eye)
+        found += _check_distortion(file, eye) + _check_model(file, eye)
     return found or [Finding("ok", "rotations, focal lengths and principal points are plausible")]
 
 
@@ -135,6 +138,18 @@ def _check_distortion(file: str, eye: Eye) -> list[Finding]:
     reach = distorted[turns[0]] * eye.K[0, 0]
     what = f"{file}: the distortion turns back {reach:.0f} px from the principal point, inside the picture"
     return [Finding("warning", what, "what lies farther out is wrong: calibrate with the board there too")]
+
+
+def _check_model(file: str, eye: Eye) -> list[Finding]:
+    """Four coefficients of a wide view may be those of a fisheye model, whose files look the same."""
+    view = 2 * np.degrees(np.arctan(np.hypot(eye.width, eye.height) / (eye.K[0, 0] + eye.K[1, 1])))
+    if view <= WIDE or len(eye.distortion) > 5 or eye.distortion[4] or not eye.distortion.any():
+        return []
+    what = (
+        f"{file}: four coefficients and a view of {view:.0f} degrees from corner to corner: are they of a "
+        "fisheye model (equidistant)? They are read as plumb_bob"
+    )
+    return [Finding("warning", what, "if they are, depth is wrong: calibrate with sags calib stereo")]
 
 
 def size_made_for(rig: StereoRig) -> float | None:
@@ -184,7 +199,7 @@ def _check_rows(rig: StereoRig) -> list[Finding]:
 
 
 def _check_order(rig: StereoRig) -> list[Finding]:
-    left, right = float(rig.left.P[0, 3]), float(rig.right.P[0, 3])
+    left, right = float(rig.left.P[0, 3]) + 0.0, float(rig.right.P[0, 3]) + 0.0  # no minus before a zero
     what = f"projection_matrix[3] is {left:g} in left.yaml and {right:g} in right.yaml"
     if left < 0 and right == 0:
         return [Finding("error", f"{what}: the eyes are swapped", "exchange left.yaml and right.yaml")]
@@ -200,13 +215,21 @@ def _check_order(rig: StereoRig) -> list[Finding]:
 
 def _check_baseline(rig: StereoRig) -> list[Finding]:
     baseline = rig.baseline
+    units = fitting_units(baseline, *ENDOSCOPE_BASELINE)
     if baseline > LARGEST_BASELINE:
-        what = f"the baseline of {baseline:g} m looks like millimetres"
-        fix = (
-            "lengths are metres: divide projection_matrix[3] in right.yaml by 1000, or read it with --unit mm"
+        looks = (
+            f" looks like {' or '.join(NAMES[unit] for unit in units)}"
+            if units
+            else " is none of an endoscope"
         )
+        fix = in_metres(units) if units else f"is the side of the board's squares right? {RECALIBRATE}"
+        return [Finding("error", f"the baseline of {baseline:g} m{looks}", fix)]
+    if baseline < SMALLEST_BASELINE:
+        what = f"a baseline of {baseline * 1e3:.3g} mm is too small: projection_matrix[3] is -fx * baseline"
+        fix = f"multiply it in right.yaml by fx, {rig.right.P[0, 0]:g}, if it holds the baseline itself"
         return [Finding("error", what, fix)]
     if not ENDOSCOPE_BASELINE[0] <= baseline <= ENDOSCOPE_BASELINE[1]:
         what = f"a baseline of {baseline * 1e3:.3g} mm is unusual for a stereo endoscope (3 to 10 mm)"
-        return [Finding("warning", what, "check the unit of projection_matrix[3] in right.yaml: fx * metres")]
+        fix = in_metres(units) if units else "check projection_matrix[3] in right.yaml: it is -fx * metres"
+        return [Finding("warning", what, fix)]
     return [Finding("ok", f"baseline {baseline * 1e3:.3g} mm")]

@@ -6,6 +6,7 @@ matrices under the names that are in use. The files do not say the unit of T.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -30,6 +31,10 @@ NAMES = {
     "R": ("R",),
     "T": ("T", "t"),
 }
+OTHER_MODELS = ("fisheye", "equidist", "kannala", "omni", "unified", "doublesphere", "scaramuzza", "ocam")
+SHORT_MODELS = ("mei", "kb", "kb4", "kb8", "ucm", "eucm", "ds", "fov", "ftheta")
+MEI = ("xi", "xi1", "xi2")  # what only that model has
+DEEPEST = 3  # sections within sections that are looked through
 SIZES = (("image_width", "image_height"), ("imageWidth", "imageHeight"), ("width", "height"))
 SIZE_LISTS = ("imageSize", "image_size")
 
@@ -63,6 +68,8 @@ def read_files(
         UsageError: a file cannot be read, a matrix is missing or malformed, or the size is not known.
     """
     storages = [(file, open_storage(file)) for file in files]
+    for file, storage in storages:
+        _refuse_other_models(file, storage.root())
     where = " and ".join(map(str, files))
     K = _matrix(storages, "M1", (9,)).reshape(3, 3), _matrix(storages, "M2", (9,)).reshape(3, 3)
     left, right = (
@@ -84,6 +91,29 @@ def read_files(
         P[:, 3] *= metres or 1.0
         eyes.append(Eye(*size, eye.K, eye.distortion, R, P))
     return StereoRig(name, *eyes)
+
+
+def _refuse_other_models(file: Path, node: cv2.FileNode, depth: int = 0) -> None:
+    """The matrices of other models look like those of the pinhole camera.
+
+    Raises:
+        UsageError: the file says that it is of another one.
+    """
+    for key in node.keys() if node.isMap() and depth < DEEPEST else ():
+        value, name = node.getNode(key), _plain(key)
+        said = value.string() if value.isString() else f"{value.real():g}"
+        other = any(word in _plain(said) for word in OTHER_MODELS) or _plain(said) in SHORT_MODELS
+        flag = ("fisheye" in name or name in MEI) and _plain(said) not in ("", "0", "false", "no")
+        if flag or (other and any(word in name for word in ("model", "type"))):
+            raise UsageError(
+                f"{file}: {key}: {said} is not supported; calibrate with 'plumb_bob' or "
+                "'rational_polynomial' (sags calib stereo)"
+            )
+        _refuse_other_models(file, value, depth + 1)
+
+
+def _plain(text: str) -> str:
+    return re.sub(r"[^a-z0-9.]", "", text.lower())
 
 
 Storages = Sequence[tuple[Path, cv2.FileStorage]]

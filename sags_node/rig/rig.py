@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 
@@ -12,6 +14,7 @@ from sags_node.types import F64, Camera, Eye, StereoRig
 LARGEST_SIDE = 16384  # px
 PLUMB_BOB = 5  # k1 k2 p1 p2 k3
 RATIONAL = 8  # and k4 k5 k6
+STILL = 1 / 180  # of the width, median: a calibration that moves no more is of pictures that were rectified
 
 
 def rectified_rig(name: str, width: int, height: int, K: F64, baseline: float) -> StereoRig:
@@ -24,6 +27,59 @@ def rectified_rig(name: str, width: int, height: int, K: F64, baseline: float) -
     right[0, 3] = -K[0, 0] * baseline
     eyes = [Eye(width, height, K, np.zeros(PLUMB_BOB), np.eye(3), P) for P in (left, right)]
     return StereoRig(name, *eyes)
+
+
+def already_rectified(rig: StereoRig) -> StereoRig:
+    """The rig of pictures that were rectified with it: only P is true of them, as in ROS of `image_rect`."""
+    left, right = (
+        replace(eye, K=eye.P[:, :3].copy(), distortion=np.zeros(PLUMB_BOB), R=np.eye(3))
+        for eye in (rig.left, rig.right)
+    )
+    return replace(rig, left=left, right=right)
+
+
+def rectifies(rig: StereoRig) -> bool:
+    """Whether the rig straightens or turns pictures, rather than only zooming them."""
+    return any(_moves(eye) > STILL * eye.width for eye in (rig.left, rig.right))
+
+
+def _moves(eye: Eye) -> float:
+    """How far distortion and rotation move a pixel, px, the median over the picture."""
+    side = np.linspace(0, 1, 9)
+    pixels = np.stack(np.meshgrid(side * (eye.width - 1), side * (eye.height - 1)), -1).reshape(-1, 1, 2)
+    moved = cv2.undistortPoints(pixels, eye.K, eye.distortion, R=eye.R, P=eye.K)
+    return float(np.median(np.linalg.norm(moved - pixels, axis=-1)))
+
+
+def part_of_sensor(eye: Eye, roi: tuple[int, int, int, int], binning: tuple[int, int], where: str) -> Eye:
+    """The eye of pictures that show a part of the sensor, binned: offset, then division (ROS, REP 104).
+
+    Args:
+        roi: x and y of the part's first pixel, its width and height, px of the sensor; 0: all of it.
+        binning: across and down; 0: none.
+        where: it is said, for the message.
+
+    Raises:
+        UsageError: this is no part of the sensor.
+    """
+    x, y, *sides = roi
+    across, down = max(binning[0], 1), max(binning[1], 1)
+    width, height = (sides[0] or eye.width), (sides[1] or eye.height)
+    binned = width // across, height // down
+    if min(x, y) < 0 or x + width > eye.width or y + height > eye.height or 0 in binned:
+        raise UsageError(
+            f"{where}: roi {x},{y} {width}x{height} with binning {across}x{down} is no part of "
+            f"{eye.width}x{eye.height} px; set rig to a calibration of these pictures"
+        )
+    if (x, y, *binned) == (0, 0, eye.width, eye.height):
+        return eye
+    K, K_rectified = eye.K.copy(), eye.P[:, :3].copy()
+    for each in (K, K_rectified):
+        each[:2, 2] -= x, y
+    whole = binned[0] * across, binned[1] * down
+    K, K_rectified = (geometry.scale_intrinsics(each, whole, binned) for each in (K, K_rectified))
+    P = np.column_stack([K_rectified, eye.P[:, 3] / [across, down, 1]])
+    return replace(eye, width=binned[0], height=binned[1], K=K, P=P)
 
 
 def rectify_eyes(

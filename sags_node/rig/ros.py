@@ -7,6 +7,7 @@ cameracalibrator` are used unchanged. Lengths are metres.
 from __future__ import annotations
 
 import gzip
+import re
 import tarfile
 import zlib
 from dataclasses import replace
@@ -19,13 +20,23 @@ import yaml
 from sags_node.config.yaml_reader import parse_yaml
 from sags_node.errors import UsageError, brief
 from sags_node.files import check_folder, open_file, read_file, whole
-from sags_node.rig.rig import LARGEST_SIDE, PLUMB_BOB, RATIONAL
+from sags_node.rig.rig import LARGEST_SIDE, PLUMB_BOB, RATIONAL, part_of_sensor
 from sags_node.types import F64, Eye, StereoRig
 
 LARGEST_FILE = 2**20  # bytes of one camera_info file
 LARGEST_READ = 2**24  # bytes taken from an archive at once
 LARGEST_ARCHIVE = 2**32  # bytes, unpacked
-MODELS = {"plumb_bob": (4, PLUMB_BOB), "rational_polynomial": (RATIONAL,)}  # numbers of coefficients
+MODELS = {  # numbers of coefficients; kalibr calls plumb_bob radtan
+    "plumb_bob": (4, PLUMB_BOB),
+    "radtan": (4, PLUMB_BOB),
+    "rational_polynomial": (RATIONAL,),
+}
+MATRICES = {  # in the message and in files
+    "k": "camera_matrix",
+    "d": "distortion_coefficients",
+    "r": "rectification_matrix",
+    "p": "projection_matrix",
+}
 SIDES = ("left.yaml", "right.yaml")
 
 
@@ -153,7 +164,7 @@ def _eye_to_tree(eye: Eye, side: str) -> dict[str, Any]:
 
 def _read_eye(content: bytes, file: str) -> Eye:
     tree = _read_yaml(content, file)
-    return Eye(
+    eye = Eye(
         width=_side(tree, "image_width", file),
         height=_side(tree, "image_height", file),
         K=_matrix(tree, "camera_matrix", 9, file).reshape(3, 3),
@@ -161,15 +172,38 @@ def _read_eye(content: bytes, file: str) -> Eye:
         R=_matrix(tree, "rectification_matrix", 9, file).reshape(3, 3),
         P=_matrix(tree, "projection_matrix", 12, file).reshape(3, 4),
     )
+    if not eye.K.any():
+        raise UsageError(
+            f"{file}: camera_matrix is all zeros: so ROS says that nobody has calibrated the camera"
+        )
+    roi = tree.get("roi") or {}
+    x, y, width, height = (_count(roi, key, file) for key in ("x_offset", "y_offset", "width", "height"))
+    across, down = (_count(tree, f"binning_{axis}", file) for axis in "xy")
+    return part_of_sensor(eye, (x, y, width, height), (across, down), file)
 
 
 def _read_yaml(content: bytes, file: str) -> dict[str, Any]:
+    """The keys of a camera_info file, or of what `ros2 topic echo` prints of the message."""
     if len(content) > LARGEST_FILE:
         raise UsageError(f"{file} is larger than {LARGEST_FILE} bytes: it is no calibration; check the path")
-    tree = parse_yaml(content, file)
+    documents = (parse_yaml(part, file) for part in re.split(rb"^---\s*$", content, flags=re.MULTILINE))
+    tree = next((document for document in documents if document is not None), None)
     if not isinstance(tree, dict):
         raise UsageError(f"{file} is not a ROS camera_info file: it holds no keys such as camera_matrix")
-    return tree
+    lower = {str(key).lower(): value for key, value in tree.items()}
+    if "camera_matrix" in tree or "k" not in lower:
+        return tree
+    named = {key: {"data": lower.get(short)} for short, key in MATRICES.items()}
+    sides = {f"image_{side}": lower.get(side) for side in ("width", "height")}
+    return lower | named | sides
+
+
+def _count(tree: Any, key: str, file: str) -> int:
+    """A number of pixels of a region; 0 where it is not said."""
+    value = tree.get(key, 0) if isinstance(tree, dict) else None
+    if not isinstance(value, int) or not 0 <= value <= LARGEST_SIDE:
+        raise UsageError(f"{file}: {key}: {brief(value)} is not a number of pixels up to {LARGEST_SIDE}")
+    return value
 
 
 def _field(tree: dict[str, Any], key: str, file: str) -> Any:
@@ -190,7 +224,7 @@ def _side(tree: dict[str, Any], key: str, file: str) -> int:
 def _distortion(tree: dict[str, Any], file: str) -> F64:
     model = tree.get("distortion_model", "plumb_bob")
     if model not in MODELS:
-        fix = f"calibrate with {' or '.join(map(repr, MODELS))}"
+        fix = "calibrate with 'plumb_bob' or 'rational_polynomial'"
         raise UsageError(f"{file}: distortion_model: {brief(model)} is not supported; {fix}")
     coefficients = _numbers(tree, "distortion_coefficients", file)
     lengths = MODELS[model]
@@ -213,6 +247,10 @@ def _matrix(tree: dict[str, Any], key: str, count: int, file: str) -> F64:
 def _numbers(tree: dict[str, Any], key: str, file: str) -> F64:
     value = _field(tree, key, file)
     data = value.get("data") if isinstance(value, dict) else None
+    if (
+        isinstance(data, list) and len(data) == 1 and isinstance(data[0], str)
+    ):  # without commas, as of Kinetic
+        data = data[0].split()
     try:
         numbers = np.array(data, dtype=np.float64)
     except (TypeError, ValueError):

@@ -7,8 +7,7 @@ calibration. Playing reads it forward again.
 from __future__ import annotations
 
 import difflib
-import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -20,21 +19,20 @@ from sags_node.config.schema import BagSource
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging.topics import CAMERA_INFO
 from sags_node.recording.bag import BagMessage, read_messages
-from sags_node.recording.pictures import IMAGE_TYPES, decode_picture, header_stamp, read_eye
+from sags_node.recording.camera_info import Said, changes, in_force, read_eye
+from sags_node.recording.pictures import IMAGE_TYPES, decode_picture, header_stamp
 from sags_node.rig import check_rig, refuse_errors
+from sags_node.sources.bag_stamps import DIFFER_FIX, Key, judge_stamps, pair_messages
+from sags_node.sources.layout import Layout
 from sags_node.sources.pictures import RawPair, size_text
-from sags_node.sources.stamps import nearest, pair
-from sags_node.types import I64, U8, StereoRig
-
-log = logging.getLogger(__name__)
+from sags_node.types import I64, U8, Eye, StereoRig
 
 # What drivers and this node call an eye's picture, the most usual first; "/compressed" may follow.
 PICTURE_NAMES = ("image_raw", "image_rect_color", "image_color", "image_rect", "image", "image_mono")
 COMPRESSED = "/compressed"
 MAX_WAITING = 64  # pictures read ahead of their partner
-FEW_PAIRS = 0.9  # of the left pictures; fewer are worth a warning
-
-Key = tuple[int, int]  # when a message was recorded and its own stamp, ns: names it within its topic
+STAMP_END = 12  # bytes: encoding and stamp of a message with a header
+MOST_INFOS = 10_000  # of one topic that differ: a zoom that moves all the time says enough
 
 
 @dataclass(slots=True)
@@ -49,7 +47,7 @@ class Contents:
 
     types: dict[str, str]  # every topic
     pictures: dict[str, _Topic]
-    infos: dict[str, bytes]  # the first camera_info of each topic
+    infos: dict[str, list[tuple[int, bytes]]]  # of each topic the camera_info that differ from those before
 
 
 class Eyes(NamedTuple):
@@ -74,14 +72,21 @@ def read_contents(path: Path) -> Contents:
 def _read_contents(path: Path, changed: int) -> Contents:
     types: dict[str, str] = {}
     pictures: dict[str, _Topic] = {}
-    infos: dict[str, bytes] = {}
+    infos: dict[str, list[tuple[int, bytes]]] = {}
+    newest: dict[str, bytes] = {}
     for message in read_messages(path):
         types.setdefault(message.topic, message.type)
         if message.type in IMAGE_TYPES:
             key = message.log_ns, _stamp(path, message)
             pictures.setdefault(message.topic, _Topic(message.type)).keys.append(key)
         elif message.type == CAMERA_INFO:
-            infos.setdefault(message.topic, bytes(message.data))
+            data = bytes(message.data)
+            if (
+                newest.get(message.topic) != data[STAMP_END:]
+                and len(infos.get(message.topic, ())) < MOST_INFOS
+            ):
+                infos.setdefault(message.topic, []).append((_stamp(path, message), data))
+            newest[message.topic] = data[STAMP_END:]
     return Contents(types, pictures, infos)
 
 
@@ -109,24 +114,14 @@ class BagPairs:
         contents = read_contents(config.path)
         self._eyes = find_eyes(config, contents)
         left, right = (contents.pictures[name].keys for name in self._eyes)
-        pairs = pair(np.array(left, np.int64)[:, 1], np.array(right, np.int64)[:, 1], config.tolerance)
-        if not len(pairs):
-            raise UsageError(_nothing_pairs(config, self._eyes, left, right))
-        if len(pairs) < FEW_PAIRS * len(left):
-            log.warning(
-                "%s: %d pairs of %d left and %d right pictures",
-                config.path,
-                len(pairs),
-                len(left),
-                len(right),
-            )
-        self._keys = [(left[i], right[j]) for i, j in pairs]
-        self.stamps: I64 = np.array([[a[1], b[1]] for a, b in self._keys], np.int64)
+        self._keys, self.stamps = pair_messages(config, left, right)
         self.count = len(self._keys)
         steps = np.diff(self.stamps[:, 0])
         self.rate: float | None = (
             float(1e9 / np.median(steps)) if len(steps) and np.median(steps) > 0 else None
         )
+        self.findings = judge_stamps(self._keys, self.stamps, self.rate, (len(left), len(right)))
+        self._layout = Layout(config.geometry)
         self._turns = [{keys[eye]: turn for turn, keys in enumerate(self._keys)} for eye in (0, 1)]
         self._size: tuple[int, int] | None = None
         self.seek(0)
@@ -151,7 +146,12 @@ class BagPairs:
         if self._messages is None:
             start_ns = min(key[0] for keys in self._keys[self._next :] for key in keys)
             self._messages = read_messages(self._path, self._eyes, start_ns)
-        left, right = (self._picture(eye, key) for eye, key in enumerate(self._keys[self._next]))
+        left_key, right_key = self._keys[self._next]
+        if self._layout.shows_both:
+            left, right = self._layout.eyes(self._picture(0, left_key))
+        else:
+            left = self._layout.eye(self._picture(0, left_key), "left")
+            right = self._layout.eye(self._picture(1, right_key), "right")
         self._next += 1
         return RawPair(left, right, None)
 
@@ -163,13 +163,19 @@ class BagPairs:
         where = f"{self._path}: {message.topic} at {key[1]} ns"
         picture = decode_picture(message.data, message.type, where)
         size = picture.shape[1], picture.shape[0]
-        self._size = self._size or size
+        if self._size is None:
+            self._layout.size(*size, where)  # refuses what cannot be split
+            self._size = size
         if size != self._size:
             raise SagsError(
                 f"{where}: {size_text(*size)} px, but the pictures before are {size_text(*self._size)}; "
                 "all pictures must have one size"
             )
         return picture
+
+    def _is_sorted(self) -> bool:
+        topics = read_contents(self._path).pictures
+        return all((np.diff([key[0] for key in topics[eye].keys]) >= 0).all() for eye in self._eyes)
 
     def _find(self, eye: int, key: Key) -> BagMessage:
         """Read forward to one message; those of later pairs wait in memory."""
@@ -185,8 +191,8 @@ class BagPairs:
                 self._waiting[side, found] = message
             if len(self._waiting) > MAX_WAITING:
                 raise SagsError(
-                    f"{self._path}: left and right pictures of one moment lie too far apart in the file; "
-                    "sort it by time (ros2 bag convert)"
+                    f"{self._path}: left and right pictures of one stamp lie too far apart in the file; "
+                    + (DIFFER_FIX if self._is_sorted() else "sort it by time (ros2 bag convert)")
                 )
         raise SagsError(f"{self._path} changed while it was read")
 
@@ -200,6 +206,15 @@ def find_eyes(config: BagSource, contents: Contents) -> Eyes:
     Raises:
         UsageError: a named topic is missing or holds no pictures, or none or several pairs are there.
     """
+    if config.geometry.layout != "separate":
+        if config.left is None and len(contents.pictures) != 1:
+            there = ", ".join(sorted(contents.pictures)) or "none"
+            raise UsageError(
+                f"source.left is missing: the topic that shows both eyes; picture topics: {there}"
+            )
+        both = next(iter(contents.pictures)) if config.left is None else config.left
+        both = _named(config, contents, "left", both)
+        return Eyes(both, both)
     if config.left is not None:
         left = _named(config, contents, "left", config.left)
         right = config.right or _counterpart(config.left)
@@ -216,8 +231,18 @@ def find_eyes(config: BagSource, contents: Contents) -> Eyes:
     there = ", ".join(sorted(contents.pictures)) or "none"
     raise UsageError(
         f"{config.path}: stereo pairs of topics that look usable: {listed}; set source.left and "
-        f"source.right. Picture topics: {there}. (sags bag record takes both eyes, unless topics are named)"
+        f"source.right, or where one topic shows both eyes source.left and source.geometry.layout. Picture "
+        f"topics: {there}. (sags bag record takes both eyes, unless topics are named)"
     )
+
+
+def topics_of(config: BagSource) -> Eyes:
+    """The picture topics of a bag's eyes.
+
+    Raises:
+        UsageError, SagsError: see `find_eyes` and `read_contents`.
+    """
+    return find_eyes(config, read_contents(config.path))
 
 
 def _pairs(contents: Contents) -> Iterator[Eyes]:
@@ -257,19 +282,6 @@ def _named(config: BagSource, contents: Contents, key: str, name: str) -> str:
     raise UsageError(f"source.{key}: {config.path} has no topic {name}; {hint}")
 
 
-# ---- which pictures --------------------------------------------------------------------------------------
-
-
-def _nothing_pairs(config: BagSource, eyes: Eyes, left: Sequence[Key], right: Sequence[Key]) -> str:
-    stamps = [np.array(keys, np.int64)[:, 1] for keys in (left, right)]
-    skew = float(np.median(np.abs(stamps[0] - stamps[1][nearest(*stamps)]))) * 1e-6
-    return (
-        f"{config.path}: left {len(left)} pictures ({eyes.left}), right {len(right)} ({eyes.right}), "
-        f"pairs 0: the median skew is {skew:.3g} ms, source.tolerance {config.tolerance * 1e3:g} ms; if that "
-        f"is right, set source.tolerance:={skew * 1.5e-3:.3g}"
-    )
-
-
 # ---- calibration -----------------------------------------------------------------------------------------
 
 
@@ -288,8 +300,11 @@ def read_rig(config: BagSource) -> StereoRig | None:
             ("left_info", "right_info"), (config.left_info, config.right_info), eyes, strict=True
         )
     ]
-    read = [None if topic is None else read_eye(contents.infos[topic], topic) for topic in found]
-    left, right = (None if eye is None or eye.K[0, 0] == 0 else eye for eye in read)  # ROS: 0 = uncalibrated
+    played = _played(config, contents, eyes)
+    left, right = (
+        None if topic is None else _eye_of(config, contents, topic, played[:, eye])
+        for eye, topic in enumerate(found)
+    )
     if left is None and right is None:
         return None
     if left is None or right is None:
@@ -298,6 +313,39 @@ def read_rig(config: BagSource) -> StereoRig | None:
     rig = StereoRig(config.path.stem, left, right)
     refuse_errors(check_rig(rig), config.path)
     return rig
+
+
+def _played(config: BagSource, contents: Contents, eyes: Eyes) -> I64:
+    """Stamps [N, 2] of the pairs that are played, ns."""
+    left, right = (contents.pictures[name].keys for name in eyes)
+    stamps = pair_messages(config, left, right)[1][:: config.stride]
+    first = int(np.searchsorted(stamps[:, 0], stamps[0, 0] + round(config.start * 1e9)))
+    return stamps[first:][: config.frames]
+
+
+def _eye_of(config: BagSource, contents: Contents, topic: str, played: I64) -> Eye | None:
+    """What a camera_info topic says of the pictures with these stamps; None: nothing.
+
+    Raises:
+        UsageError: it changes while they are played.
+    """
+    read = [(since, read_eye(data, topic)) for since, data in contents.infos[topic]]
+    said = changes([Said(since, eye) for since, eye in read if eye is not None])
+    if not said:
+        return None
+    counts = in_force(said, played)
+    turns = np.flatnonzero(np.diff(counts))
+    if len(turns):
+        before, after = (said[counts[turns[0] + k]].eye.K[0, 0] for k in (0, 1))
+        # cut off, not rounded: a little before a picture playing begins with it
+        start = int(round(config.start * 1e4) + (played[turns[0] + 1] - played[0]) // 100_000) / 1e4
+        raise UsageError(
+            f"{config.path}: {topic} changes while it is played ({len(turns)} times), first {start:g} s from "
+            f"the start (fx {before:g} to {after:g} px): zoom, focus or picture size was changed; play what "
+            f"is before with source.frames:={turns[0] + 1}, what is after with source.start:={start:g}, or "
+            "set rig"
+        )
+    return said[counts[0]].eye if len(counts) else said[0].eye
 
 
 def _info(config: BagSource, contents: Contents, key: str, name: str | None, topic: str) -> str | None:

@@ -30,6 +30,7 @@ FASTEST = 1.0  # m/s: a person pulls a scope out of a trocar with less
 FASTEST_TURN = 2 * np.pi  # rad/s
 SMALLEST_JUMP = 0.002  # m, and 1 degree: below it fast samples only jitter
 SMALLEST_TURN = np.radians(1)
+LATE_NS = 1_000_000_000  # a stamp that is so much older was not overtaken: the robot was started anew
 JUMP_HELD_NS = 1_000_000_000  # so long a track must be smooth again after a jump
 MOST_FRAMES = 1000  # of a tf tree
 
@@ -62,10 +63,14 @@ class _Edge:
         return self._stamps[-1] if self._stamps else None
 
     def add(self, stamp_ns: int, sample: Sample) -> None:
-        if self._stamps and stamp_ns <= self._stamps[-1]:
-            if stamp_ns == self._stamps[-1]:
-                return
+        if self._stamps and stamp_ns < self._stamps[-1] - LATE_NS:
             self._stamps, self._samples, self._jumps = [], [], []  # the robot was started anew
+        if self._stamps and stamp_ns <= self._stamps[-1]:  # overtaken on its way, or sent twice
+            at = bisect_left(self._stamps, stamp_ns)
+            if self._stamps[at] != stamp_ns:
+                self._stamps.insert(at, stamp_ns)
+                self._samples.insert(at, sample)
+            return
         if self._stamps and _jumps(self._samples[-1], sample, stamp_ns - self._stamps[-1]):
             self._jumps.append(stamp_ns)
         self._stamps.append(stamp_ns)
@@ -145,28 +150,34 @@ class PoseTrack:
         """A message of one of `POSE_TYPES`, as CDR; `fixed`: from `tf_static`.
 
         Raises:
-            SagsError: it is damaged, or no pose.
+            SagsError: it is damaged, or no pose. What else it holds is taken.
         """
         message: Any = cdr.decode(data, kind)
+        wrong: SagsError | None = None
         with self._came:
-            if kind == cdr.POSE:
-                there = message.pose
-                self._add(BASE, HAND, message.header, there.orientation, there.position, fixed)
-            else:
-                for one in message.transforms if kind == topics.TF else [message]:
+            for one in message.transforms if kind == topics.TF else [message]:
+                parent, child = BASE, HAND
+                if kind == topics.TF:
                     parent, child = _plain(one.header.frame_id), _plain(one.child_frame_id)
-                    if kind == TRANSFORM:
-                        parent, child = BASE, HAND
-                    there = one.transform
-                    self._add(parent, child, one.header, there.rotation, there.translation, fixed)
+                there = one.pose if kind == cdr.POSE else one.transform
+                turn = there.orientation if kind == cdr.POSE else there.rotation
+                place = there.position if kind == cdr.POSE else there.translation
+                try:
+                    self._add(parent, child, one.header, turn, place, fixed)
+                except SagsError as error:
+                    wrong = error
             self._came.notify_all()
+        if wrong is not None:
+            raise wrong
 
     def _add(self, parent: str, child: str, header: Any, turn: Any, place: Any, fixed: bool) -> None:
         quat = np.array([turn.w, turn.x, turn.y, turn.z], np.float64)
         position = np.array([place.x, place.y, place.z], np.float64)
         length = float(np.linalg.norm(quat))
         if not (np.isfinite(position).all() and 0.9 < length < 1.1):
-            raise SagsError(f"the pose of {child} holds numbers that are no pose")
+            raise SagsError(
+                f"the pose of {child} holds numbers that are no pose (a quaternion of length {length:.3g})"
+            )
         if child not in self._edges and len(self._edges) >= MOST_FRAMES:
             raise SagsError(f"tf holds more than {MOST_FRAMES} frames")
         sample = Sample(quat / length, position)

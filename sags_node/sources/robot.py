@@ -48,7 +48,7 @@ class _BagPoses:
 
     Raises:
         UsageError: the source is no bag, or the topic is not there or holds no poses.
-        SagsError: it is damaged.
+        SagsError: the file is damaged.
     """
 
     def __init__(self, config: BagRobot, source: object) -> None:
@@ -57,11 +57,20 @@ class _BagPoses:
         self.track = PoseTrack(config.base, config.hand, kept=WHOLE)
         wanted = absolute(config.topic)
         seen: dict[str, str] = {}
+        wrong: list[str] = []  # messages that are no pose: at their time there is none, as in tf2
         for message in read_messages(source.path):
             topic = absolute(message.topic)
             seen[topic] = message.type
             if topic in (wanted, STATIC) and message.type in POSE_TYPES:
-                self.track.add(message.data, message.type, fixed=topic == STATIC)
+                try:
+                    self.track.add(message.data, message.type, fixed=topic == STATIC)
+                except SagsError as error:
+                    wrong.append(f"{topic} at {message.log_ns * 1e-9:.3f} s: {error}")
+        if wrong:
+            log.warning(
+                "%s: %d messages are no pose and are left out, the first is %s; was the robot homed?",
+                *(source.path, len(wrong), wrong[0]),
+            )
         if seen.get(wanted) not in POSE_TYPES:
             there = ", ".join(sorted(name for name, kind in seen.items() if kind in POSE_TYPES)) or "none"
             raise UsageError(

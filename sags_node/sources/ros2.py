@@ -14,7 +14,8 @@ from sags_node.config.schema import Ros2Source
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging.security import RateLimitedLog
 from sags_node.messaging.topics import CAMERA_INFO
-from sags_node.recording.pictures import IMAGE_TYPES, decode_picture, header_stamp, read_eye
+from sags_node.recording.camera_info import read_eye
+from sags_node.recording.pictures import IMAGE_TYPES, decode_picture, header_stamp
 from sags_node.rig import check_rig, refuse_errors
 from sags_node.ros.endpoints import Reader
 from sags_node.ros.graph import Graph, receive_buffer
@@ -29,6 +30,7 @@ CLOSE_S = 5.0
 QUIET_S = 3.0  # without a picture: it is said what is there instead
 MUCH_LOST = 0.1  # of the pictures; as much as a strict reader of ours allows
 INFO_S = 10.0  # longest wait for the calibration: cameras may just be starting
+ZEROS_S = 2.0  # longest wait where they say that they have none: drivers start before they have read it
 
 
 class RosCameras:
@@ -168,9 +170,14 @@ def read_rig(config: Ros2Source, seconds: float = INFO_S) -> StereoRig | None:
     }
     readers = {eye: graph.reader(name, CAMERA_INFO) for eye, name in named.items()}
     found: dict[Side, Calibrated] = {}
+    zeros: set[Side] = set()
     deadline = time.monotonic() + seconds
     while len(found) < len(named):
+        if zeros | found.keys() == named.keys():
+            deadline = min(deadline, time.monotonic() + ZEROS_S)
         if time.monotonic() > deadline:
+            if zeros | found.keys() == named.keys():
+                break
             missing = " and ".join(name for eye, name in named.items() if eye not in found)
             raise UsageError(
                 f"no camera_info on {missing} in {seconds:g} s ({graph.where()}): start the cameras first, "
@@ -179,12 +186,15 @@ def read_rig(config: Ros2Source, seconds: float = INFO_S) -> StereoRig | None:
         graph.wait(POLL_S)
         for eye, reader in readers.items():
             for data in reader.take():
-                found[eye] = read_eye(data, named[eye])
-    empty = [named[eye] for eye, said in found.items() if said.K[0, 0] == 0]  # ROS: 0 = uncalibrated
-    if len(empty) == len(named):
+                said = read_eye(data, named[eye])
+                if said is None:
+                    zeros.add(eye)
+                else:
+                    found[eye] = said
+    if not found:
         return None
-    if empty:
-        raise UsageError(f"{empty[0]} says that its eye is not calibrated; set rig")
+    for eye in named.keys() - found.keys():
+        raise UsageError(f"{named[eye]} says that its eye is not calibrated; set rig")
     rig = StereoRig("ros2", found["left"], found["right"])
     refuse_errors(check_rig(rig), graph.where())
     return rig

@@ -171,6 +171,7 @@ MIRROR = {"rectification_matrix": {"data": [1.0, 0, 0, 0, 1.0, 0, 0, 0, -1.0]}}
         (lambda folder: with_P(folder, 0, 3, -1), r"must be -fx \* baseline"),
         (lambda folder: with_P(folder, 0, 3, 0), "no baseline"),
         (lambda folder: with_P(folder, 0, 3, 1000), "looks like millimetres.*divide"),
+        (lambda folder: with_P(folder, 0, 3, 1 / make_rig().right.P[0, 0]), "too small.*by fx"),
         (lambda folder: with_P(folder, 1, 1, 1, 2), "rectified fy differs"),
         (lambda folder: with_P(folder, 1, 2, 1, 2), "rectified cy differs"),
         (lambda folder: with_P(folder, 0, 0, 1, 2), "rectified fx differs"),

@@ -111,6 +111,45 @@ def test_models_that_are_not_read(tmp_path: Path, model: object) -> None:
     assert f"distortion_model: {model!r} is not supported" in refusal(tmp_path)
 
 
+def echoed(rig: StereoRig, names: str = "dkrp", **more: object) -> dict[str, str]:
+    """What `topic echo` prints of the camera_info of both eyes; ROS 1 has capitals."""
+    d, k, r, p = names
+    return {
+        f"{side}.yaml": yaml.safe_dump(
+            {
+                "header": {"stamp": {"sec": 3, "nanosec": 5}, "frame_id": side},
+                **{"height": eye.height, "width": eye.width, "distortion_model": "plumb_bob"},
+                **{d: eye.distortion.tolist(), k: eye.K.ravel().tolist()},
+                **{r: eye.R.ravel().tolist(), p: eye.P.ravel().tolist()},
+                **{"binning_x": 0, "binning_y": 0, **more},
+            }
+        )
+        + "---\n"
+        for side, eye in (("left", rig.left), ("right", rig.right))
+    }
+
+
+@pytest.mark.parametrize("names", ["dkrp", "DKRP"])
+@pytest.mark.parametrize("copies", [1, 2])
+def test_what_topic_echo_prints(tmp_path: Path, names: str, copies: int) -> None:
+    for name, text in echoed(make_rig(), names).items():
+        (tmp_path / name).write_text(text * copies)
+    assert_same(load_rig(tmp_path), make_rig(), 0)
+    for name, text in echoed(make_rig(), names, binning_x=2, binning_y=2).items():
+        (tmp_path / name).write_text(text)
+    assert_same(load_rig(tmp_path), resized_rig(make_rig(), 0.5))
+
+
+def test_coefficients_without_commas(tmp_path: Path, ros_files: dict[str, bytes]) -> None:
+    for name, text in ros_files.items():
+        tree = yaml.safe_load(text)
+        for value in tree.values():
+            if isinstance(value, dict):
+                value["data"] = [" ".join(map(str, value["data"]))]
+        (tmp_path / name).write_text(yaml.safe_dump(tree | {"distortion_model": "radtan"}))
+    assert_same(load_rig(tmp_path), make_rig(), 0)
+
+
 @pytest.fixture
 def ros_files(tmp_path: Path) -> dict[str, bytes]:
     save_rig(make_rig(), tmp_path / "written")
@@ -164,6 +203,40 @@ def test_the_pair_of_opencv_files(tmp_path: Path, suffix: str, distortion: tuple
     folder = write_pair(tmp_path / "rig", suffix, distortion, T * 1000)
     assert_same(read_rig(folder, SIZE, 1e-3), expected(distortion))
     assert_same(read_rig(folder / f"extrinsics{suffix}", SIZE, 1e-3), expected(distortion))
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        {"fisheye_model": 1},
+        {"use_fisheye": "yes"},
+        {"model": "fisheye"},
+        {"distortion_model": "equidistant"},
+        {"camera_model": "KannalaBrandt8"},
+        {"cameraModel": "omnidirectional"},
+        {"xi": 1.2},
+    ],
+    ids=str,
+)
+def test_other_models_of_opencv_files_are_refused(tmp_path: Path, said: dict[str, object]) -> None:
+    """By what the file says of itself; what says that it is of no other model is read."""
+    folder = write_pair(tmp_path / "rig", ".yml", PLUMB_BOB, T)
+    key, intrinsics = next(iter(said)), folder / "intrinsics.yml"
+    text = intrinsics.read_text()
+    intrinsics.write_text(f"{text}{key}: {said[key]}\n")
+    assert f"{key}: {said[key]} is not supported" in refusal(folder, SIZE)
+    intrinsics.write_text(f"{text}fisheye_model: 0\nxi: 0.\nmodel: plumb_bob\ncamera_model: SN-4711\n")
+    assert_same(read_rig(folder, SIZE), expected())
+
+
+@pytest.mark.parametrize(("focal", "asked"), [(352.0, True), (552.0, False)])
+def test_four_coefficients_of_a_wide_view_are_asked_about(focal: float, asked: bool) -> None:
+    """640x480 px: 800 px from corner to corner are 97 degrees of 352 px, and 72 of 552 px."""
+    K_wide = np.array([[focal, 0, 320], [0, focal, 240], [0, 0, 1]])
+    for distortion, fits in ((np.array([0.06, -0.02, 0.01, -0.003, 0]), asked), (PLUMB_BOB[0], False)):
+        rig = rectify_eyes("rig", SIZE, (K_wide, K_wide), (distortion, distortion), R, T)
+        said = [finding for finding in check_rig(rig) if "fisheye" in finding.what]
+        assert bool(said) is fits
 
 
 def test_millimetres_must_be_said(tmp_path: Path) -> None:

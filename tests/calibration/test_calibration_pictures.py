@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -15,17 +16,19 @@ import pytest
 from command_line import ran
 from places import ROOT
 
-from sags_node.calibration.check import check_pictures
+from sags_node.calibration.check import check_pictures, judge
 from sags_node.calibration.matches import match_eyes
 from sags_node.calibration.pictures import pairs_of_files, pairs_of_session
 from sags_node.calibration.principal_points import judge_known_depths
 from sags_node.calibration.rows import judge_scale, rectified_rows
 from sags_node.config.launch_file import load_launch
+from sags_node.config.units import UNITS
 from sags_node.errors import SagsError
+from sags_node.geometry import invert
 from sags_node.rig import Finding, check_rig, load_rig, read_rig, rectified_rig, rectify_eyes, save_rig
 from sags_node.rig.check import size_made_for
 from sags_node.sources.pictures import read_picture
-from sags_node.types import U8, Eye, StereoFrame, StereoRig
+from sags_node.types import F64, U8, Eye, StereoFrame, StereoRig
 from sags_node.vision.rectify import Rectifier
 
 Pairs = list[tuple[U8, U8]]
@@ -66,14 +69,28 @@ def with_T_negated(rig: StereoRig) -> StereoRig:
     return from_matrices(rig, -1.0)
 
 
-def in_millimetres(rig: StereoRig) -> StereoRig:
-    return from_matrices(rig, 1000.0)
+def in_unit(unit: str) -> Callable[[StereoRig], StereoRig]:
+    return lambda rig: from_matrices(rig, 1 / UNITS[unit])
+
+
+def with_R_transposed(rig: StereoRig) -> StereoRig:
+    """As what MATLAB says is copied."""
+    return rectify_anew(rig, rig.T_right_left[:3, :3].T, rig.T_right_left[:3, 3])
+
+
+def from_right_to_left(rig: StereoRig) -> StereoRig:
+    T = invert(rig.T_right_left)
+    return rectify_anew(rig, T[:3, :3], T[:3, 3])
 
 
 def from_matrices(rig: StereoRig, factor: float) -> StereoRig:
-    left, right, T = rig.left, rig.right, rig.T_right_left
+    return rectify_anew(rig, rig.T_right_left[:3, :3], factor * rig.T_right_left[:3, 3])
+
+
+def rectify_anew(rig: StereoRig, R: F64, T: F64) -> StereoRig:
+    left, right = rig.left, rig.right
     size, K, distortion = (left.width, left.height), (left.K, right.K), (left.distortion, right.distortion)
-    return rectify_eyes(rig.name, size, K, distortion, T[:3, :3], factor * T[:3, 3])
+    return rectify_eyes(rig.name, size, K, distortion, R, T)
 
 
 def half_size(rig: StereoRig) -> StereoRig:
@@ -148,7 +165,10 @@ PLANTED: dict[str, tuple[Any, Any, tuple[str, str], tuple[str, str]]] = {
         with_T_negated, unchanged, ("has the wrong sign", "pictures are in order"), ("", "must be -fx")
     ),
     "both ends swapped": (swapped_files, swapped, ("pictures and calibration agree", ""), NOTHING),
-    "millimetres": (in_millimetres, unchanged, ("", "millimetres"), ("looks like millimetres", "")),
+    "millimetres": (in_unit("mm"), unchanged, ("", "--unit mm"), ("looks like millimetres", "--unit mm")),
+    "centimetres": (in_unit("cm"), unchanged, ("", "--unit cm"), ("looks like centimetres", "--unit cm")),
+    "inches": (in_unit("inch"), unchanged, ("", "--unit inch"), ("unusual", "--unit inch")),
+    "micrometres": (in_unit("um"), unchanged, ("", "--unit um"), ("looks like micrometres", "--unit um")),
     "half size": (half_size, unchanged, ("0.5 times the size", ""), ("camera_matrix is of", "by 2")),
 }  # fmt: skip
 
@@ -161,6 +181,38 @@ def test_a_planted_error_is_found_and_named(subject: tuple[StereoRig, Pairs], na
     finding, numbers = worst(check_pictures(rig, of_pairs(subject[1]))), worst(check_rig(rig))
     assert finding.level == "error" and said[0] in finding.what and said[1] in finding.fix
     assert said_of_numbers[0] in numbers.what and said_of_numbers[1] in numbers.fix
+
+
+@pytest.mark.parametrize(
+    ("change", "what", "fix"),
+    [
+        (with_R_transposed, "R, from left to right camera, is transposed", "its transpose"),
+        (from_right_to_left, "R and T go from the right to the left camera", "minus that transpose times T"),
+    ],
+)
+def test_directions_of_turned_eyes_are_told_apart(
+    phantom: tuple[StereoRig, Pairs], change: Callable[[StereoRig], StereoRig], what: str, fix: str
+) -> None:
+    """What is said to do undoes it, since it is its own inverse."""
+    rig, pairs = phantom
+    finding = worst(check_pictures(change(rig), pairs))
+    assert finding.level == "error" and what in finding.what and fix in finding.fix
+    again = change(change(rig))
+    np.testing.assert_allclose(again.right.R, rectify_anew(rig, *of_eyes(rig)).right.R, atol=1e-9)
+    assert worst(judge(again, pairs)).level == "ok"
+
+
+def of_eyes(rig: StereoRig) -> tuple[F64, F64]:
+    return rig.T_right_left[:3, :3], rig.T_right_left[:3, 3]
+
+
+def test_without_a_baseline_nothing_is_said_of_its_sign(phantom: tuple[StereoRig, Pairs]) -> None:
+    rig, pairs = phantom
+    P = rig.right.P * [1, 1, 1, 0]
+    found = judge(StereoRig("two mono", rig.left, replace(rig.right, P=P)), pairs)
+    assert [finding.what for finding in found if finding.level != "ok"] == [
+        "projection_matrix[3] is 0 in left.yaml and 0 in right.yaml: there is no baseline"
+    ]
 
 
 @every_subject

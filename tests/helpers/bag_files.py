@@ -13,7 +13,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from sags_node.config.schema import BagSource
 from sags_node.sources.replay import Replay
-from sags_node.types import StereoFrame
+from sags_node.types import Eye, StereoFrame
 
 ROS2, ROS1 = get_typestore(Stores.ROS2_JAZZY), get_typestore(Stores.ROS1_NOETIC)
 IMAGE, COMPRESSED, INFO = (f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "CameraInfo"))
@@ -54,12 +54,28 @@ def compressed(store: Any, rgb: np.ndarray, stamp_ns: int, kind: str = "png") ->
     return store.types[COMPRESSED](header(store, stamp_ns), f"rgb8; {kind} compressed bgr8", data)
 
 
-def camera_info(store: Any, stamp_ns: int, eye: int) -> Any:
-    K = np.array([FOCAL, 0, WIDTH / 2, 0, FOCAL, HEIGHT / 2, 0, 0, 1.0])
-    P = np.column_stack([K.reshape(3, 3), [-FOCAL * BASELINE * eye, 0, 0]]).ravel()
-    roi = store.types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
-    numbers = (np.zeros(5), K, np.eye(3).ravel(), P)
-    return store.types[INFO](header(store, stamp_ns), HEIGHT, WIDTH, "plumb_bob", *numbers, 0, 0, roi)
+def eye_of(eye: int, focal: float = FOCAL) -> Eye:
+    """What `camera_info` tells, unless it is told otherwise."""
+    K = np.array([[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1.0]])
+    P = np.column_stack([K, [-focal * BASELINE * eye, 0, 0]])
+    return Eye(WIDTH, HEIGHT, K, np.zeros(5), np.eye(3), P)
+
+
+def camera_info(
+    store: Any,
+    stamp_ns: int,
+    eye: int | Eye,
+    model: str = "plumb_bob",
+    binning: tuple[int, int] = (0, 0),
+    roi: tuple[int, int, int, int] = (0, 0, 0, 0),
+) -> Any:
+    """`roi`: x, y, width, height."""
+    said = eye if isinstance(eye, Eye) else eye_of(eye)
+    x, y, width, height = roi
+    region = store.types["sensor_msgs/msg/RegionOfInterest"](x, y, height, width, False)
+    numbers = said.distortion, said.K.ravel(), said.R.ravel(), said.P.ravel()
+    head = header(store, stamp_ns), said.height, said.width, model
+    return store.types[INFO](*head, *numbers, *binning, region)
 
 
 def stereo_rows(
@@ -112,12 +128,20 @@ def write_rosbag1(path: Path, rows: list[Row], compression: str | None = None) -
     return path
 
 
+def without_metadata(bag: Path) -> Path:
+    (bag / "metadata.yaml").unlink()
+    return bag
+
+
 KINDS: dict[str, Callable[[Path], Path]] = {
     "mcap folder": lambda p: write_rosbag2(p / "bag", stereo_rows(ROS2)),
     "mcap file": lambda p: write_rosbag2(p / "bag", stereo_rows(ROS2)) / "bag.mcap",
     "mcap zstd": lambda p: write_rosbag2(p / "bag", stereo_rows(ROS2), compression="STORAGE"),
     "db3 folder": lambda p: write_rosbag2(p / "bag", stereo_rows(ROS2), "SQLITE3"),
     "db3 file": lambda p: write_rosbag2(p / "bag", stereo_rows(ROS2), "SQLITE3") / "bag.db3",
+    "db3 whose recorder was killed": lambda p: without_metadata(
+        write_rosbag2(p / "bag", stereo_rows(ROS2), "SQLITE3")
+    ),
     "db3 messages": lambda p: write_rosbag2(p / "b", stereo_rows(ROS2), "SQLITE3", "MESSAGE"),
     "ros1": lambda p: write_rosbag1(p / "a.bag", stereo_rows(ROS1)),
     "ros1 lz4": lambda p: write_rosbag1(p / "a.bag", stereo_rows(ROS1), "LZ4"),

@@ -17,6 +17,7 @@ from mcap.writer import Writer as McapWriter
 from sags_node.config.launch_file import load_launch
 from sags_node.config.schema import BagSource
 from sags_node.errors import SagsError, UsageError
+from sags_node.importing.check import check_folder
 from sags_node.messaging import cdr
 from sags_node.pipeline.session import open_session
 from sags_node.recording import rosbag1_check
@@ -59,6 +60,27 @@ def test_every_kind_of_file(kind: str, tmp_path: Path) -> None:
     assert rows["/rig/left/image_raw"]["messages"] == COUNT and found["messages"] == 4 * COUNT
     assert rows["/rig/left/image_raw"]["rate_hz"] == pytest.approx(25)
     assert rows["/rig/left/image_raw"]["type"] == "sensor_msgs/msg/Image"
+
+
+def test_what_a_killed_recorder_leaves(tmp_path: Path) -> None:
+    """A remedy, or all of it: nothing is left out without a word."""
+    bag = files.write_rosbag2(tmp_path / "bag", files.stereo_rows(ROS2), "SQLITE3")
+    (bag / "bag.db3-wal").write_bytes(b"messages")
+    with pytest.raises(SagsError, match=r"bag\.db3-wal holds messages that bag\.db3 lacks: .*wal_checkpoint"):
+        play(bag)
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    ros1 = files.write_rosbag1(folder / "case.bag", files.stereo_rows(ROS1))
+    assert load_launch(folder).source == BagSource(path=ros1)  # a folder with one bag is that bag
+    ros1 = ros1.rename(folder / "case.bag.active")
+    for path in (ros1, folder):
+        source = load_launch(path).source
+        assert isinstance(source, BagSource)
+        with pytest.raises(
+            UsageError, match=r"was not closed: .*rosbag reindex .*case\.bag\.active, then mv"
+        ):
+            play(source.path)
+        assert any("rosbag reindex" in finding.fix for finding in check_folder(path))
 
 
 @pytest.mark.parametrize("encoding", ["rgb8", "bgr8", "rgba8", "bgra8", "mono8"])

@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from bag_files import ROS2
 from places import SESSION
 from waiting import until
 
@@ -54,6 +55,56 @@ def problem(track: PoseTrack, t_ns: int) -> str:
     with pytest.raises(NoPoseError) as said:
         track.at(t_ns)
     return said.value.finding.code
+
+
+def encoded(message: object, kind: str) -> bytes:
+    return bytes(ROS2.serialize_cdr(message, kind))
+
+
+def no_pose(t_ns: int, kind: str = "zeros") -> bytes:
+    """What drivers send before the robot is homed, or of a joint that is not there."""
+    message = cdr.decode(bytes(cdr.pose(shifted(0.0), t_ns).parts[0]), cdr.POSE)
+    turn, place = message.pose.orientation, message.pose.position
+    if kind == "zeros":
+        turn = replace(turn, w=0.0)
+    elif kind == "NaN":
+        place = replace(place, x=float("nan"))
+    else:
+        turn = replace(turn, w=2.0)
+    return encoded(replace(message, pose=replace(message.pose, orientation=turn, position=place)), cdr.POSE)
+
+
+@pytest.mark.parametrize("kind", ["zeros", "NaN", "twice as long"])
+def test_a_message_that_is_no_pose_is_none_at_its_time(kind: str) -> None:
+    track = moving(1.0)
+    with pytest.raises(SagsError, match="numbers that are no pose"):
+        track.add(no_pose(S + 20 * MS, kind), cdr.POSE)
+    told(track, shifted(0.102), S + 20 * MS)
+    np.testing.assert_allclose(track.at(S + 10 * MS)[0, 3], 0.1, atol=2e-3)
+
+
+def test_of_a_message_with_several_frames_only_the_wrong_one_is_left_out() -> None:
+    track = PoseTrack("world", "scope")
+    for number in range(3):
+        message = cdr.decode(bytes(cdr.transform(shifted(0.1), number * 50 * MS).parts[0]), topics.TF)
+        good = replace(
+            message.transforms[0],
+            header=replace(message.transforms[0].header, frame_id="world"),
+            child_frame_id="scope",
+        )
+        zero = replace(good.transform.rotation, x=0.0, y=0.0, z=0.0, w=0.0)
+        wrong = replace(good, child_frame_id="arm", transform=replace(good.transform, rotation=zero))
+        with pytest.raises(SagsError, match="the pose of arm"):
+            track.add(encoded(replace(message, transforms=[wrong, good]), topics.TF), topics.TF)
+    assert track.at(60 * MS)[0, 3] == pytest.approx(0.1)
+
+
+def test_a_message_that_was_overtaken_ends_nothing() -> None:
+    track = PoseTrack()
+    for number in (0, 1, 3, 2, 4, 4):
+        told(track, shifted(0.002 * number), number * 20 * MS)
+    for t_ns in (10 * MS, 50 * MS, 70 * MS):  # 0.1 m/s, from the first sample on
+        assert track.at(t_ns)[0, 3] == pytest.approx(1e-10 * t_ns)
 
 
 def test_a_pose_lies_between_its_neighbours() -> None:

@@ -1,0 +1,18 @@
+"""Units of length in which calibrations are kept."""
+
+UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "inch": 0.0254, "um": 1e-6}  # metres
+NAMES = {"m": "metres", "mm": "millimetres", "cm": "centimetres", "inch": "inches", "um": "micrometres"}
+
+
+def fitting_units(length: float, least: float, most: float) -> list[str]:
+    """The units but the metre in which a length lies between two others, m."""
+    return [unit for unit, metres in UNITS.items() if unit != "m" and least <= length * metres <= most]
+
+
+def in_metres(units: list[str]) -> str:
+    """How to fix lengths that are in one of these units."""
+    ways = [
+        f"of {NAMES[unit]} divide it by {1 / UNITS[unit]:.5g}, or read it with --unit {unit}"
+        for unit in units
+    ]
+    return f"projection_matrix[3] in right.yaml (or T) is in metres: {'; '.join(ways)}"

@@ -1,0 +1,86 @@
+"""Which messages of a bag's two eyes are pairs, by their stamps, and whether these can be believed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sags_node.config.schema import BagSource
+from sags_node.errors import UsageError
+from sags_node.rig import Finding
+from sags_node.sources.stamps import nearest, pair
+from sags_node.types import I64
+
+Key = tuple[int, int]  # when a message was recorded and its own stamp, ns: names it within its topic
+
+FEW_PAIRS = 0.9  # of the left pictures; fewer are worth a warning
+SYNCHRONISED_MS = 5.0  # between the eyes of a pair: as live pictures are paired
+LATE_STEPS = 1.5  # from one picture to the next: one eye's way to the recorder is not so much longer
+DIFFER_FIX = (
+    "set source.clocks:=two, which sets one by the other by when pictures were recorded; better, set both "
+    "machines' clocks (chrony, PTP) before recording"
+)
+
+
+def pair_messages(
+    config: BagSource, left: Sequence[Key], right: Sequence[Key]
+) -> tuple[list[tuple[Key, Key]], I64]:
+    """The messages of each pair, and their stamps [N, 2] ns, by one clock.
+
+    Raises:
+        UsageError: nothing pairs.
+    """
+    stamps, others = (np.array(keys, np.int64)[:, 1] for keys in (left, right))
+    ahead = came_later(right) - came_later(left)  # the left eye's clock, of the right one's
+    if config.clocks == "two":
+        others = others + ahead
+    pairs = pair(stamps, others, config.tolerance)
+    if not len(pairs):
+        count = f"{config.path}: left {len(left)} pictures, right {len(right)} pictures, pairs 0"
+        if config.clocks == "one" and len(pair(stamps, others + ahead, config.tolerance)):
+            raise UsageError(f"{count}: the eyes' clocks differ by {abs(ahead) * 1e-9:.3g} s; {DIFFER_FIX}")
+        skew = float(np.median(np.abs(stamps - others[nearest(stamps, others)]))) * 1e-6
+        raise UsageError(
+            f"{count}: the median skew is {skew:.3g} ms, source.tolerance {config.tolerance * 1e3:g} ms; if "
+            f"that is right, set source.tolerance:={skew * 1.5e-3:.3g}"
+        )
+    keys = [(left[i], right[j]) for i, j in pairs]
+    return keys, np.stack([stamps[pairs[:, 0]], others[pairs[:, 1]]], axis=1)
+
+
+def came_later(keys: Sequence[Key]) -> int:
+    """How much later than their stamps say messages were recorded, ns, the median."""
+    return int(np.median([log_ns - stamp for log_ns, stamp in keys]))
+
+
+def judge_stamps(
+    keys: Sequence[tuple[Key, Key]], stamps: I64, rate: float | None, counts: tuple[int, int]
+) -> tuple[Finding, ...]:
+    """What is odd about pairs: few, of clocks that differ, or not of one moment.
+
+    Args:
+        counts: of pictures of each eye.
+    """
+    found = []
+    came = np.array([[each[0] for each in pair] for pair in keys], np.int64)
+    later = float(np.median((came - stamps) @ [-1, 1])) * 1e-6
+    skew = float(np.median(stamps @ [-1, 1])) * 1e-6
+    if abs(later) > LATE_STEPS * 1e3 / (rate or np.inf):
+        eye, other = ("right", "left") if later > 0 else ("left", "right")
+        what = (
+            f"{eye} pictures were recorded {abs(later):.0f} ms later than the {other} ones of the same "
+            "stamps: the clocks of the eyes differ, and pairs are of other moments"
+        )
+        found.append(Finding("warning", what, DIFFER_FIX, {"clocks_differ_ms": round(later, 1)}))
+    elif abs(skew) > SYNCHRONISED_MS:
+        what = (
+            f"right pictures were taken {abs(skew):.1f} ms {'after' if skew > 0 else 'before'} the left ones "
+            "(median): the cameras are not synchronised"
+        )
+        fix = "depth is wrong where tissue moves: trigger both cameras together, or use genlock"
+        found.append(Finding("warning", what, fix, {"skew_ms": round(skew, 2)}))
+    if len(keys) < FEW_PAIRS * counts[0]:
+        what = f"{len(keys)} pairs of {counts[0]} left and {counts[1]} right pictures"
+        found.append(Finding("warning", what, "what has no partner in time is left out"))
+    return tuple(found)

@@ -1,0 +1,63 @@
+"""Whether pictures come rectified: they must not be rectified a second time."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from sags_node.config import schema as cfg
+from sags_node.rig import already_rectified, rectifies
+from sags_node.types import StereoRig
+
+RECTIFIED, RAW = {"rect", "rectified"}, {"raw", "unrectified"}
+NOT = {"not", "non", "un", "no"}
+
+
+def as_pictures_come(rig: StereoRig, config: cfg.LaunchConfig) -> StereoRig:
+    """The rig of a session's pictures: of those that come rectified P alone is true.
+
+    A calibration in files that hardly moves a pixel was made with such pictures: it stays as it is.
+    """
+    if not come_rectified(config):
+        return rig
+    return already_rectified(rig) if config.rig is None or rectifies(rig) else rig
+
+
+def as_named(rig: StereoRig, *names: Path) -> StereoRig:
+    """The same of pictures in files or folders, by their names."""
+    return already_rectified(rig) if named_rectified(*names) and rectifies(rig) else rig
+
+
+def come_rectified(config: cfg.LaunchConfig) -> bool:
+    """Whether a session's pictures are rectified: as the launch file says, else by the names of its folders,
+    videos or topics."""
+    source = config.source
+    if config.rectified is not None:
+        return config.rectified
+    if isinstance(source, cfg.BagSource):
+        from sags_node.sources.bags import topics_of
+
+        return named_rectified(*topics_of(source))
+    if isinstance(source, cfg.Ros2Source):
+        return named_rectified(source.left, *([source.right] if source.geometry.layout == "separate" else []))
+    if isinstance(source, cfg.FoldersSource | cfg.VideosSource):
+        return named_rectified(*(path for path in (source.left, source.right) if path is not None))
+    return False
+
+
+def named_rectified(*names: Path | str) -> bool:
+    """Whether topics, folders or files say that their pictures are rectified."""
+    return bool(names) and all(_says_rectified(name) for name in names)
+
+
+def _says_rectified(name: Path | str) -> bool:
+    """The last part of a name that speaks of it counts: of a path it or its folder, of a topic any."""
+    parts = [name.parent.absolute().name, name.name] if isinstance(name, Path) else name.split("/")
+    for part in reversed(parts):
+        words = re.split(r"[^a-z]+", re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", part).lower())
+        at = next((k for k, word in enumerate(words) if word in RECTIFIED), None)
+        if at is not None:
+            return at == 0 or words[at - 1] not in NOT
+        if RAW & set(words):
+            return False
+    return False
