@@ -151,7 +151,14 @@ class EndoNerfSource(RecordedSource):
         None,
         gt=0,
         le=0.5,
-        description="m between the eyes; makes images_right/ usable, the files do not say it",
+        description="m between the eyes; makes images_right/ usable, the files do not say it; default: "
+        "4.324e-3 of the published clips, which their author states, else none",
+    )
+    pose_axes: Literal["auto", "opencv", "llff", "opengl", "world_to_camera"] = Field(
+        "auto",
+        description="of poses_bounds.npy. Camera to world with axes right, down, forward (opencv), down, "
+        "right, back (llff, as imgs2poses writes) or right, up, back (opengl); world_to_camera: the inverse "
+        "of opencv. auto: what explains the pictures, else opencv",
     )
 
 

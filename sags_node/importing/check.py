@@ -16,6 +16,7 @@ from sags_node.importing import pictures, videos
 from sags_node.importing.folder import Contents, both_eyes, calibration_of, override, recognise
 from sags_node.importing.timing import LOOKED_AT, Timing, check_timing
 from sags_node.rig import Finding, read_rig
+from sags_node.sources.endonerf import is_published
 from sags_node.sources.pictures import FolderPairs, size_text
 from sags_node.sources.rectified import as_named
 from sags_node.sources.replay import Replay
@@ -114,7 +115,8 @@ def _pictures(contents: Contents, left_folder: Path) -> list[Finding]:
         found += _tried("masks", lambda: pictures.check_masks(masks, size, polarity))
     if depth is not None:
         unit = None if clip is None else clip.depth_unit
-        found += _tried("depth", lambda: pictures.check_depth(depth, size, unit))
+        stated = clip is not None and clip.depth_unit == 1e-3 and is_published(clip)
+        found += _tried("depth", lambda: pictures.check_depth(depth, size, unit, stated))
     return found
 
 

@@ -172,8 +172,10 @@ def check_masks(folder: Path, size: tuple[int, int], instruments: str = "white")
     return [Finding("ok", f"masks: {share:.0%} of the picture is instrument")]
 
 
-def check_depth(folder: Path, size: tuple[int, int], unit: float | None = None) -> list[Finding]:
-    """Kind, size and unit (m per count) of depth pictures."""
+def check_depth(
+    folder: Path, size: tuple[int, int], unit: float | None = None, stated: bool = False
+) -> list[Finding]:
+    """Kind, size and unit (m per count) of depth pictures; `stated`: whoever made them says that unit."""
     medians = []
     for file, depth in sample(folder, cv2.IMREAD_UNCHANGED):
         if (wrong := _no_depth(file, depth, size)) is not None:
@@ -186,8 +188,13 @@ def check_depth(folder: Path, size: tuple[int, int], unit: float | None = None) 
         return [Finding("error", "depth: no picture knows a pixel", "export it again")]
     median = float(np.median(medians))
     fitting = [one for one in DEPTH_UNITS if ENDOSCOPE_DEPTH[0] <= median * one <= ENDOSCOPE_DEPTH[1]]
+    ask = "the files do not say it: ask who made them"
+    few = "only 8 bit"
     if unit is not None and unit in fitting:
-        return [Finding("ok", f"depth: {median * unit * 1e3:.0f} mm (median) with {unit:g} m per count")]
+        said = f"depth: {median * unit * 1e3:.0f} mm (median) with {unit:g} m per count"
+        if stated:
+            return [Finding("ok", f"{said}, as their author states")]
+        return [Finding("warning" if coarse else "ok", f"{said}; {few}" if coarse else said, ask)]
     if not fitting:
         what = f"depth: a median of {median:g} counts is no distance in an endoscope's view in any usual unit"
         return [Finding("error", what, "is it a disparity, or inverse depth? Convert it to depth")]
@@ -197,12 +204,12 @@ def check_depth(folder: Path, size: tuple[int, int], unit: float | None = None) 
             "ok" if unit is None else "warning",
             f"depth: {median:g} counts (median): {distance}",
             f"set source.depth_unit (EndoNeRF's layout) or source.reference.depth_unit to {fitting[0]:g}; "
-            "the files do not say it: ask who made them",
+            f"{ask}",
         )
     ]
     if coarse:
         fix = "steps of a whole count: export 16 bit"
-        found.append(Finding("warning", "depth: only 8 bit", fix))
+        found.append(Finding("warning", f"depth: {few}", fix))
     return found
 
 

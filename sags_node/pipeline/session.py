@@ -22,6 +22,7 @@ from sags_node.config.schema import (
 from sags_node.errors import UsageError
 from sags_node.mapping.devices import with_scale
 from sags_node.rig import load_camera, load_rig
+from sags_node.sources.endonerf import baseline_of
 from sags_node.sources.rectified import as_pictures_come
 from sags_node.sources.replay import Replay
 from sags_node.sources.robot import Posed
@@ -63,7 +64,7 @@ def open_session(
         SagsError: the recording or the calibration cannot be used.
     """
     config = load_launch(launch, overrides)
-    one_eyed = isinstance(config.source, EndoNerfSource) and config.source.baseline is None
+    one_eyed = isinstance(config.source, EndoNerfSource) and baseline_of(config.source) is None
     if config.one_camera or one_eyed:
         if config.publish.right is True:
             raise UsageError(

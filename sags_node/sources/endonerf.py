@@ -16,7 +16,7 @@ import numpy as np
 from sags_node import geometry
 from sags_node.config.schema import EndoNerfSource
 from sags_node.errors import SagsError, UsageError
-from sags_node.rig import check_intrinsics, rectified_rig, refuse_errors
+from sags_node.rig import Finding, check_intrinsics, rectified_rig, refuse_errors
 from sags_node.sources.pictures import (
     FolderPairs,
     RawPair,
@@ -25,12 +25,15 @@ from sags_node.sources.pictures import (
     read_picture,
     size_text,
 )
+from sags_node.sources.pose_axes import READINGS, Seen, reading_that_fits
 from sags_node.sources.truth import load_npy
 from sags_node.types import F32, F64, StereoRig
 
 # Of a frame's known depths: what lies outside is drawn to them, as EndoGaussian's loader does.
 DEPTH_PERCENTILES = (3.0, 99.8)
 PLAUSIBLE_DEPTH = (0.01, 1.0)  # m, the median of a frame: in an endoscope's view
+PUBLISHED = (640, 512, 569.4682)  # px: width, height and focal length of the clips of EndoNeRF
+PUBLISHED_BASELINE = 4.324e-3  # m, which their author states
 NOMINAL_BASELINE = 0.005  # m; without a right picture nothing depends on it
 CHECKED_MASKS = 9  # spread over the clip
 
@@ -41,7 +44,7 @@ class Llff(NamedTuple):
     width: int  # px
     height: int
     focal: float  # px
-    T_world_cam: F64  # [N, 4, 4] m
+    T_world_cam: F64  # [N, 4, 4] m, or its inverse, with whatever axes the file has
 
 
 class EndoNerfPairs:
@@ -53,7 +56,7 @@ class EndoNerfPairs:
 
     def __init__(self, config: EndoNerfSource) -> None:
         folder = config.folder
-        right = None if config.baseline is None else folder / "images_right"
+        right = None if baseline_of(config) is None else folder / "images_right"
         self._llff = read_llff(config)
         self._pictures = FolderPairs(folder / "images", right, folder / "masks")
         self._depth_unit = config.depth_unit
@@ -62,6 +65,8 @@ class EndoNerfPairs:
         self.rate: float | None = None
         self.count = self._pictures.count
         self._next = 0
+        self._T_world_cam = self._llff.T_world_cam
+        self.findings: tuple[Finding, ...] = ()
         self._check_camera(folder)
         _check_masks(folder / "masks", config.instruments)
         if (folder / "depth").is_dir():
@@ -73,6 +78,27 @@ class EndoNerfPairs:
                 f"{folder} holds no depth/; set source.baseline (m between the eyes) to measure depth from "
                 "images/ and images_right/"
             )
+        self._read_axes(config.pose_axes)
+
+    def _read_axes(self, said: str) -> None:
+        """Read the poses as it is said, or as they explain the pictures."""
+        poses, axes = self._llff.T_world_cam, said
+        if said == "auto":
+            K = _intrinsics(self._llff.width, self._llff.height, self._llff.focal)
+            fits = None if self._depth_files is None else reading_that_fits(poses, K, self._look)
+            axes = fits or "opencv"
+            self.seek(0)
+        self._T_world_cam = READINGS[axes](poses)
+        if said == "auto" and axes != "opencv":
+            what = f"poses_bounds.npy: of two frames with depth the poses fit as {axes}, and are read so"
+            fix = f"set source.pose_axes:={axes} if that is right, or opencv"
+            self.findings = (Finding("warning", what, fix),)
+
+    def _look(self, index: int) -> Seen:
+        self.seek(index)
+        pair = self.read()
+        assert pair is not None and pair.depth is not None and pair.tissue is not None  # `count` is checked
+        return Seen(pair.left, pair.depth, pair.tissue)
 
     def seek(self, index: int) -> None:
         self._pictures.seek(index)
@@ -96,7 +122,7 @@ class EndoNerfPairs:
         return pair._replace(
             tissue=~pair.tissue if self._black else pair.tissue,
             depth=None if self._depth_files is None else self._read_depth(self._depth_files[index]),
-            T_world_cam=self._llff.T_world_cam[index],
+            T_world_cam=self._T_world_cam[index],
         )
 
     def close(self) -> None:
@@ -151,8 +177,8 @@ class EndoNerfPairs:
 def read_llff(config: EndoNerfSource) -> Llff:
     """Read `poses_bounds.npy`: [N, 17], per row a 3x5 matrix and two depth bounds.
 
-    The matrix is [R | t | (height, width, focal length)], camera to world. Unlike in other LLFF files the
-    axes are OpenCV's. Lengths are in the unit of `depth/`; the bounds are not needed.
+    The matrix is [R | t | (height, width, focal length)]; see `pose_axes` for what it maps. Lengths are in
+    the unit of `depth/`; the bounds are not needed.
 
     Raises:
         UsageError: the file is missing, damaged, of another form, or its camera is implausible.
@@ -187,7 +213,28 @@ def read_rig(config: EndoNerfSource) -> StereoRig:
     """
     width, height, focal, _ = read_llff(config)
     K = _intrinsics(width, height, focal)
-    return rectified_rig(config.folder.name, width, height, K, config.baseline or NOMINAL_BASELINE)
+    return rectified_rig(config.folder.name, width, height, K, baseline_of(config) or NOMINAL_BASELINE)
+
+
+def baseline_of(config: EndoNerfSource) -> float | None:
+    """m between the eyes; None: nobody says it, and right pictures are of no use.
+
+    Raises:
+        UsageError: as `read_llff`.
+    """
+    if config.baseline is not None or not (config.folder / "images_right").is_dir():
+        return config.baseline
+    return PUBLISHED_BASELINE if is_published(config) else None
+
+
+def is_published(config: EndoNerfSource) -> bool:
+    """Whether a clip is one of EndoNeRF's own, whose author states unit and baseline; by its camera.
+
+    Raises:
+        UsageError: as `read_llff`.
+    """
+    width, height, focal, _ = read_llff(config)
+    return (width, height, round(focal, 4)) == PUBLISHED
 
 
 def _intrinsics(width: int, height: int, focal: float) -> F64:

@@ -64,7 +64,7 @@ class Replay:
 
     Attributes:
         first: number of the first frame.
-        findings: what is odd about its stamps.
+        findings: what is odd about its stamps or poses.
 
     Args:
         config: which recording, and how to play it.
@@ -103,7 +103,7 @@ class Replay:
         self._recorded = (
             self._pairs.stamps[:: config.stride, 0] if isinstance(self._pairs, BagPairs) else None
         )
-        self.findings = self._pairs.findings if isinstance(self._pairs, BagPairs) else ()
+        self.findings = self._pairs.findings if isinstance(self._pairs, BagPairs | EndoNerfPairs) else ()
         self.dropped = 0
         self._began: tuple[float, int] | None = None  # monotonic seconds and wall clock of the first turn
         self._dropped_in_a_row = 0

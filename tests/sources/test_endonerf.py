@@ -18,6 +18,7 @@ from sags_node.cli.main import main
 from sags_node.config import schema as cfg
 from sags_node.config.launch_file import load_launch
 from sags_node.errors import SagsError, UsageError
+from sags_node.importing.check import check_folder
 from sags_node.mapping.budget import StepBudget
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import open_session
@@ -91,6 +92,92 @@ def test_every_frame_comes_as_it_was_written(clip: Path) -> None:
         assert frame.depth is not None and frame.depth.dtype == np.float32
         assert np.array_equal(frame.depth, (depth_counts(number) * 1e-3).astype(np.float32))
         assert frame.T_world_cam is not None and (frame.T_world_cam == np.eye(4)).all()
+
+
+def around(number: int) -> np.ndarray:
+    """A camera that goes right and down, and turns to keep the scene in view; camera to world, mm."""
+    T = np.eye(4)
+    T[:3, :3] = cv2.Rodrigues(np.array([0.01, -0.015, 0.02]) * number)[0]
+    T[:3, 3] = np.array([0.5, 0.4, 0.2]) * number
+    return T
+
+
+FILES: dict[str, Callable[[np.ndarray], np.ndarray]] = {  # what other tools write of such a pose
+    "opencv": lambda T: T,
+    "llff": lambda T: np.column_stack([T[:, 1], T[:, 0], -T[:, 2], T[:, 3]]),
+    "opengl": lambda T: np.column_stack([T[:, 0], -T[:, 1], -T[:, 2], T[:, 3]]),
+    "world_to_camera": np.linalg.inv,
+}
+
+
+@pytest.fixture(scope="module")
+def moving_clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A textured plane at z = 60 mm of the first camera, seen as it goes around; depth in 10 um."""
+    folder = tmp_path_factory.mktemp("moving")
+    K = np.array([[FOCAL, 0, (WIDTH - 1) / 2], [0, FOCAL, (HEIGHT - 1) / 2], [0, 0, 1]])
+    rng = np.random.default_rng(3)
+    texture = cv2.GaussianBlur(rng.integers(0, 256, (400, 400, 3), np.uint8), (0, 0), 2.0)
+    texture = cv2.normalize(texture, None, 20, 235, cv2.NORM_MINMAX)
+    v, u = np.mgrid[:HEIGHT, :WIDTH]
+    rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(K).T
+    for number in range(FRAMES):
+        T = around(number)
+        turned = rays @ T[:3, :3].T
+        z = (60 - T[2, 3]) / turned[..., 2]  # of the camera: its rays have z = 1
+        points = turned * z[..., None] + T[:3, 3]
+        at = (points[..., :2] * 2.4 + 200).astype(np.float32)
+        picture = cv2.remap(texture, at[..., 0], at[..., 1], cv2.INTER_LINEAR)
+        write(folder / f"images/{number:03}.png", picture)
+        write(folder / f"masks/{number:03}.png", np.zeros((HEIGHT, WIDTH), np.uint8))
+        write(folder / f"depth/{number:03}.png", np.rint(z * 100).astype(np.uint16))
+    return folder
+
+
+@pytest.mark.parametrize("tool", FILES)
+def test_poses_are_read_as_they_explain_the_pictures(
+    moving_clip: Path, tool: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Whatever the tool, the camera moves as it did; what is not usual is said, and the key has the last
+    word."""
+    table = poses_bounds()
+    for number in range(FRAMES):
+        T = FILES[tool](around(number))
+        T[:3, 3] *= 100  # in the unit of the depth
+        table[number, :15] = np.column_stack([T[:3], [HEIGHT, WIDTH, FOCAL]]).ravel()
+    np.save(moving_clip / "poses_bounds.npy", table)
+    session = open_session(moving_clip, ["source.depth_unit:=1e-5", "source.pace:=step"])
+    assert (f"fit as {tool}" in caplog.text) is (tool != "opencv")
+    with session.source as source:
+        poses = [frame.T_world_cam for frame in source]
+    for number, T in enumerate(poses):
+        assert T is not None
+        moved = np.linalg.inv(poses[0]) @ T
+        moved[:3, 3] *= 1e3
+        np.testing.assert_allclose(moved, around(number), atol=1e-6)
+    raw = play(moving_clip, depth_unit=1e-5, pose_axes="opencv")[3].T_world_cam
+    assert raw is not None
+    np.testing.assert_allclose(raw[:3, :3], FILES[tool](around(3))[:3, :3], atol=1e-9)
+
+
+def test_the_published_clips_have_the_baseline_that_their_author_states(clip: Path) -> None:
+    """By their camera; a clip of another one that was converted to the layout has none."""
+    for number in range(FRAMES):
+        write(clip / f"images_right/{number:06d}.png", left_picture(number + 5))
+    assert play(clip)[0].right is None
+    table = poses_bounds()
+    table[:, [4, 9, 14]] = 512, 640, 569.46820041
+    np.save(clip / "poses_bounds.npy", table)
+    for folder in ("images", "images_right", "masks", "depth"):
+        for file in (clip / folder).iterdir():
+            write(file, cv2.resize(cv2.imread(str(file), cv2.IMREAD_UNCHANGED), (640, 512)))
+    session = open_session(clip, ["source.pace:=step"])
+    assert session.rig.baseline == pytest.approx(4.324e-3) and session.rig.left.K[0, 0] == pytest.approx(
+        569.4682
+    )
+    with session.source as source:
+        assert next(iter(source)).right is not None
+    said = {finding.what for finding in check_folder(clip)}
+    assert any("as their author states" in what for what in said)
 
 
 def test_zero_is_unknown_and_outliers_are_drawn_to_the_percentiles(clip: Path) -> None:
