@@ -25,6 +25,7 @@ from sags_node.rig import (
     read_rig,
     rectifies,
     unknown_form,
+    with_unit,
 )
 from sags_node.sources.pictures import size_text
 from sags_node.sources.rectified import as_named, as_pictures_come
@@ -81,15 +82,9 @@ def check_calibration(
 
 
 def read_calibration(path: Path, size: tuple[int, int] | None, metres: float | None) -> StereoRig:
-    """A calibration of any known form, or the one that a session uses, not judged yet; `size`, `metres` as in
-    `read_rig`.
-
-    Raises:
-        UsageError: nothing known is there, or it is malformed.
-    """
-    if find_form(path) is not None:
-        return read_rig(path, size, metres)
-    return _rig_of(_launched(path, ()), size, metres)
+    """`read_rig`, also of the calibration that a session uses."""
+    known = find_form(path) is not None
+    return read_rig(path, size, metres) if known else _rig_of(_launched(path, ()), size, metres)
 
 
 def judge(rig: StereoRig, pairs: Sequence[Pair], depths: Sequence[F32 | None] = ()) -> list[Finding]:
@@ -155,10 +150,12 @@ def _rig_of(config: LaunchConfig, size: tuple[int, int] | None, metres: float | 
     """The calibration that a session would use, not judged yet."""
     if isinstance(config.source, PhantomSource):
         return read_rig(cached_session(config.source) / "calib")
-    rig = recorded_rig(config.source) if config.rig is None else read_rig(config.rig, size, metres)
+    if config.rig is not None:
+        return as_pictures_come(read_rig(config.rig, size, metres), config)
+    rig = recorded_rig(config.source, judged=False)
     if rig is None:
         raise UsageError("the session names no calibration: set rig to its folder")
-    return as_pictures_come(rig, config)
+    return as_pictures_come(with_unit(rig, metres), config)
 
 
 def _broken(findings: Sequence[Finding]) -> bool:

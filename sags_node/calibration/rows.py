@@ -168,21 +168,17 @@ def _other_directions(rig: StereoRig, matches: F64) -> Iterator[Reading]:
         return
     size = rig.left.width, rig.left.height
     K, distortion = (rig.left.K, rig.right.K), (rig.left.distortion, rig.right.distortion)
+    transpose, anew = "write its transpose in the place of R", "leave R1 R2 P1 P2 out, and read the file anew"
     for there, what, fix in (
-        (
-            T,
-            "R, from left to right camera, is transposed, as MATLAB keeps it",
-            "write its transpose in its place",
-        ),
+        (T, "R, from left to right camera, is transposed, as MATLAB keeps it", f"{transpose}, {anew}"),
         (
             -R.T @ T,
             "R and T go from the right to the left camera",
-            "write the transpose of R in its place, and minus that transpose times T in the place of T",
+            f"{transpose}, minus that transpose times T in the place of T, {anew}",
         ),
     ):
         other = rectify_eyes(rig.name, size, K, distortion, R.T, there)
-        anew = f"{fix}, leave R1 R2 P1 P2 out, and read the file again (sags calib convert)"
-        yield Reading(rectified_rows(other, matches), what, anew)
+        yield Reading(rectified_rows(other, matches), what, fix)
 
 
 def _swapped_or_shifted(rows: Rows) -> Finding:

@@ -133,11 +133,14 @@ def source_text(source: Source) -> str:
 def _pictures_text(session: Session) -> str:
     """Size, rate and calibration of what is played."""
     from sags_node.rig import GUESSED_FOV
+    from sags_node.sources.rectified import come_rectified
 
     eye, source, config = session.rig.left, session.source, session.config
     count = source.frame_count
     length = "" if count is None else f", {count} frames, {count / source.rate:.1f} s"
     rig = f"calibration {config.rig}" if config.rig is not None else "calibration of the recording"
+    if come_rectified(config):
+        rig += ", the pictures are rectified already"
     if not session.rig.metric:
         rig = f"no calibration: {GUESSED_FOV:g} degrees across are guessed, depth has no unit (sags calib)"
     return f"{eye.width}x{eye.height} px at {source.rate:g} frames/s{length}; {rig}"

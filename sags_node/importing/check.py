@@ -10,7 +10,7 @@ from sags_node.calibration.check import check_calibration, judge, rectified_befo
 from sags_node.calibration.pictures import Pair, pairs_of_files
 from sags_node.calibration.rows import RECTIFIED
 from sags_node.config.launch_file import load_launch
-from sags_node.config.schema import BagSource, EndoNerfSource, LaunchConfig, RecordedSource, VideosSource
+from sags_node.config.schema import EndoNerfSource, LaunchConfig, RecordedSource, VideosSource
 from sags_node.errors import SagsError, UsageError
 from sags_node.importing import pictures, videos
 from sags_node.importing.folder import Contents, both_eyes, calibration_of, override, recognise
@@ -21,8 +21,6 @@ from sags_node.sources.pictures import FolderPairs, size_text
 from sags_node.sources.rectified import as_named
 from sags_node.sources.replay import Replay
 from sags_node.sources.source import open_source
-
-CLOCKS = "one eye's stamps are off: set source.clocks:=two, or set both clocks before recording"
 
 
 def check_folder(folder: Path) -> list[Finding]:
@@ -188,8 +186,7 @@ def played(config: LaunchConfig) -> list[Finding]:
                 return [Finding("error", "not one frame can be read", "check the files")]
             said = f"{opened.frame_count} frames of {size_text(*size)} px at {opened.rate:g} Hz"
             stamped = list(opened.findings) if isinstance(opened, Replay) else []
-            late = CLOCKS if isinstance(source, BagSource) else None
-        return [Finding("ok", said), *ends, *(stamped or timing.findings(late))]
+        return [Finding("ok", said), *ends, *(stamped or timing.findings())]
 
     return _tried("frames", look)
 

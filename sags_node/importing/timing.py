@@ -35,9 +35,8 @@ class Timing:
             gray = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).astype(np.float32)
             rows.append(cv2.resize(gray, (1, ROWS), interpolation=cv2.INTER_AREA)[:, 0])
 
-    def findings(self, fix: str | None = None) -> list[Finding]:
-        """A warning where one eye is late, and how to fix it (default: by cutting); nothing where too little
-        moves to tell."""
+    def findings(self) -> list[Finding]:
+        """A warning where one eye is late; nothing where too little moves to tell."""
         if len(self._rows[0]) < FEWEST:
             return []
         left, right = (np.diff(np.stack(rows), axis=0) for rows in self._rows)
@@ -48,8 +47,8 @@ class Timing:
         eye = "right" if late > 0 else "left"
         what = f"the {eye} eye is {abs(late)} frames late: it shows what the other one showed before"
         fix = (
-            fix
-            or f"cut the first {abs(late)} frames off the {eye} eye's recording, or record both by one clock"
+            f"cut the first {abs(late)} frames off the {eye} eye's recording (of a bag: source.clocks:=two), "
+            "or record both by one clock"
         )
         return [Finding("warning", what, fix, {"right_late_frames": late})]
 

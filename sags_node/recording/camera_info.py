@@ -68,11 +68,8 @@ def in_force(said: Sequence[Said], stamps: I64) -> I64:
 
 
 def _same(one: Eye, other: Eye) -> bool:
-    return (one.width, one.height) == (other.width, other.height) and all(
-        a.shape == b.shape and np.allclose(a, b, rtol=SAME, atol=0.1 * SAME)
-        for a, b in zip(_numbers(one), _numbers(other), strict=True)
+    a, b = (
+        np.concatenate([[eye.width, eye.height], *map(np.ravel, (eye.K, eye.R, eye.P, eye.distortion))])
+        for eye in (one, other)
     )
-
-
-def _numbers(eye: Eye) -> tuple[np.ndarray, ...]:
-    return eye.K, eye.distortion, eye.R, eye.P
+    return len(a) == len(b) and np.allclose(a, b, rtol=SAME, atol=0.1 * SAME)

@@ -20,6 +20,7 @@ from sags_node.rig.read import (
     load_rig,
     read_rig,
     unknown_form,
+    with_unit,
 )
 from sags_node.rig.rig import (
     already_rectified,
@@ -60,4 +61,5 @@ __all__ = [
     "resized_rig",
     "save_rig",
     "unknown_form",
+    "with_unit",
 ]

@@ -217,13 +217,9 @@ def _check_baseline(rig: StereoRig) -> list[Finding]:
     baseline = rig.baseline
     units = fitting_units(baseline, *ENDOSCOPE_BASELINE)
     if baseline > LARGEST_BASELINE:
-        looks = (
-            f" looks like {' or '.join(NAMES[unit] for unit in units)}"
-            if units
-            else " is none of an endoscope"
-        )
+        looks = f"looks like {' or '.join(NAMES[unit] for unit in units)}" if units else "is too large"
         fix = in_metres(units) if units else f"is the side of the board's squares right? {RECALIBRATE}"
-        return [Finding("error", f"the baseline of {baseline:g} m{looks}", fix)]
+        return [Finding("error", f"the baseline of {baseline:g} m {looks}", fix)]
     if baseline < SMALLEST_BASELINE:
         what = f"a baseline of {baseline * 1e3:.3g} mm is too small: projection_matrix[3] is -fx * baseline"
         fix = f"multiply it in right.yaml by fx, {rig.right.P[0, 0]:g}, if it holds the baseline itself"

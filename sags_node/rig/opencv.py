@@ -94,21 +94,15 @@ def read_files(
 
 
 def _refuse_other_models(file: Path, node: cv2.FileNode, depth: int = 0) -> None:
-    """The matrices of other models look like those of the pinhole camera.
-
-    Raises:
-        UsageError: the file says that it is of another one.
-    """
+    """Raises UsageError for a file that says that it is of another lens model: its matrices look the same."""
     for key in node.keys() if node.isMap() and depth < DEEPEST else ():
         value, name = node.getNode(key), _plain(key)
         said = value.string() if value.isString() else f"{value.real():g}"
         other = any(word in _plain(said) for word in OTHER_MODELS) or _plain(said) in SHORT_MODELS
         flag = ("fisheye" in name or name in MEI) and _plain(said) not in ("", "0", "false", "no")
         if flag or (other and any(word in name for word in ("model", "type"))):
-            raise UsageError(
-                f"{file}: {key}: {said} is not supported; calibrate with 'plumb_bob' or "
-                "'rational_polynomial' (sags calib stereo)"
-            )
+            fix = "calibrate with 'plumb_bob' or 'rational_polynomial' (sags calib stereo)"
+            raise UsageError(f"{file}: {key}: {said} is not supported; {fix}")
         _refuse_other_models(file, value, depth + 1)
 
 

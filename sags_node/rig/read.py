@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 from enum import Enum
 from pathlib import Path
@@ -13,6 +14,8 @@ from sags_node.rig import opencv, ros, scikit_surgery
 from sags_node.rig.check import check_rig, refuse_errors
 from sags_node.rig.rig import rectified_rig
 from sags_node.types import StereoRig
+
+log = logging.getLogger(__name__)
 
 NOMINAL_BASELINE = 0.005  # m, of one camera alone, and of eyes that nobody has calibrated
 GUESSED_FOV = 60.0  # degrees across a picture: D4D has 58, the Hamlyn heart 44, da Vinci's scopes 60 to 70
@@ -37,7 +40,11 @@ def load_rig(path: Path) -> StereoRig:
         UsageError: it cannot be read, as `read_rig`, or `check_rig` finds an error.
     """
     rig = read_rig(path)
-    refuse_errors(check_rig(rig), path)
+    found = check_rig(rig)
+    refuse_errors(found, path)
+    for finding in found:
+        if finding.level == "warning":
+            log.warning("%s: %s; %s", path, finding.what, finding.fix)
     return rig
 
 
@@ -75,9 +82,9 @@ def read_rig(path: Path, size: tuple[int, int] | None = None, metres: float | No
     form = find_form(path)
     folder = path if path.is_dir() else path.parent
     if form is Form.ROS_FOLDER:
-        return _in_metres(ros.read_folder(folder), metres)
+        return with_unit(ros.read_folder(folder), metres)
     if form is Form.ROS_ARCHIVE:
-        return _in_metres(ros.read_archive(path / ARCHIVE if path.is_dir() else path), metres)
+        return with_unit(ros.read_archive(path / ARCHIVE if path.is_dir() else path), metres)
     if form is Form.OPENCV_PAIR:
         return opencv.read_files(opencv.pair_in(folder), folder.resolve().name, size, metres)
     if form is Form.OPENCV_FILE:
@@ -87,7 +94,8 @@ def read_rig(path: Path, size: tuple[int, int] | None = None, metres: float | No
     raise UsageError(unknown_form(path))
 
 
-def _in_metres(rig: StereoRig, metres: float | None) -> StereoRig:
+def with_unit(rig: StereoRig, metres: float | None) -> StereoRig:
+    """The rig whose lengths were read in another unit than metres."""
     factors = np.array([1.0, 1.0, 1.0, metres or 1.0])
     left, right = (replace(eye, P=eye.P * factors) for eye in (rig.left, rig.right))
     return StereoRig(rig.name, left, right)

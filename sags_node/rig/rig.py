@@ -40,27 +40,24 @@ def already_rectified(rig: StereoRig) -> StereoRig:
 
 def rectifies(rig: StereoRig) -> bool:
     """Whether the rig straightens or turns pictures, rather than only zooming them."""
-    return any(_moves(eye) > STILL * eye.width for eye in (rig.left, rig.right))
-
-
-def _moves(eye: Eye) -> float:
-    """How far distortion and rotation move a pixel, px, the median over the picture."""
-    side = np.linspace(0, 1, 9)
-    pixels = np.stack(np.meshgrid(side * (eye.width - 1), side * (eye.height - 1)), -1).reshape(-1, 1, 2)
-    moved = cv2.undistortPoints(pixels, eye.K, eye.distortion, R=eye.R, P=eye.K)
-    return float(np.median(np.linalg.norm(moved - pixels, axis=-1)))
+    across = np.linspace(0, 1, 9)
+    for eye in (rig.left, rig.right):
+        pixels = np.stack(np.meshgrid(across * eye.width, across * eye.height), -1).reshape(-1, 1, 2)
+        moved = cv2.undistortPoints(pixels, eye.K, eye.distortion, R=eye.R, P=eye.K)
+        if np.median(np.linalg.norm(moved - pixels, axis=-1)) > STILL * eye.width:
+            return True
+    return False
 
 
 def part_of_sensor(eye: Eye, roi: tuple[int, int, int, int], binning: tuple[int, int], where: str) -> Eye:
     """The eye of pictures that show a part of the sensor, binned: offset, then division (ROS, REP 104).
 
     Args:
-        roi: x and y of the part's first pixel, its width and height, px of the sensor; 0: all of it.
+        roi: x, y, width and height of the part, px of the sensor; no width or height: all of it.
         binning: across and down; 0: none.
-        where: it is said, for the message.
 
     Raises:
-        UsageError: this is no part of the sensor.
+        UsageError: this is no part of the sensor; `where` it is said.
     """
     x, y, *sides = roi
     across, down = max(binning[0], 1), max(binning[1], 1)

@@ -26,17 +26,14 @@ from sags_node.types import F64, Eye, StereoRig
 LARGEST_FILE = 2**20  # bytes of one camera_info file
 LARGEST_READ = 2**24  # bytes taken from an archive at once
 LARGEST_ARCHIVE = 2**32  # bytes, unpacked
-MODELS = {  # numbers of coefficients; kalibr calls plumb_bob radtan
-    "plumb_bob": (4, PLUMB_BOB),
-    "radtan": (4, PLUMB_BOB),
-    "rational_polynomial": (RATIONAL,),
-}
-MATRICES = {  # in the message and in files
-    "k": "camera_matrix",
-    "d": "distortion_coefficients",
-    "r": "rectification_matrix",
-    "p": "projection_matrix",
-}
+MODELS = {"plumb_bob": (4, PLUMB_BOB), "rational_polynomial": (RATIONAL,)}  # numbers of coefficients
+MODELS["radtan"] = MODELS["plumb_bob"]  # as kalibr calls it
+MATRICES = (
+    "camera_matrix",
+    "distortion_coefficients",
+    "rectification_matrix",
+    "projection_matrix",
+)  # k d r p
 SIDES = ("left.yaml", "right.yaml")
 
 
@@ -173,9 +170,7 @@ def _read_eye(content: bytes, file: str) -> Eye:
         P=_matrix(tree, "projection_matrix", 12, file).reshape(3, 4),
     )
     if not eye.K.any():
-        raise UsageError(
-            f"{file}: camera_matrix is all zeros: so ROS says that nobody has calibrated the camera"
-        )
+        raise UsageError(f"{file}: camera_matrix is zero: so ROS says that nobody has calibrated the camera")
     roi = tree.get("roi") or {}
     x, y, width, height = (_count(roi, key, file) for key in ("x_offset", "y_offset", "width", "height"))
     across, down = (_count(tree, f"binning_{axis}", file) for axis in "xy")
@@ -193,7 +188,7 @@ def _read_yaml(content: bytes, file: str) -> dict[str, Any]:
     lower = {str(key).lower(): value for key, value in tree.items()}
     if "camera_matrix" in tree or "k" not in lower:
         return tree
-    named = {key: {"data": lower.get(short)} for short, key in MATRICES.items()}
+    named = {key: {"data": lower.get(short)} for short, key in zip("kdrp", MATRICES, strict=True)}
     sides = {f"image_{side}": lower.get(side) for side in ("width", "height")}
     return lower | named | sides
 
@@ -247,10 +242,8 @@ def _matrix(tree: dict[str, Any], key: str, count: int, file: str) -> F64:
 def _numbers(tree: dict[str, Any], key: str, file: str) -> F64:
     value = _field(tree, key, file)
     data = value.get("data") if isinstance(value, dict) else None
-    if (
-        isinstance(data, list) and len(data) == 1 and isinstance(data[0], str)
-    ):  # without commas, as of Kinetic
-        data = data[0].split()
+    if isinstance(data, list) and len(data) == 1 and isinstance(data[0], str):
+        data = data[0].split()  # without commas, as Kinetic wrote it
     try:
         numbers = np.array(data, dtype=np.float64)
     except (TypeError, ValueError):

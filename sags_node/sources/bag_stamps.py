@@ -57,20 +57,16 @@ def came_later(keys: Sequence[Key]) -> int:
 def judge_stamps(
     keys: Sequence[tuple[Key, Key]], stamps: I64, rate: float | None, counts: tuple[int, int]
 ) -> tuple[Finding, ...]:
-    """What is odd about pairs: few, of clocks that differ, or not of one moment.
-
-    Args:
-        counts: of pictures of each eye.
-    """
+    """What is odd about pairs of `counts` pictures: few, of clocks that differ, or not of one moment."""
     found = []
     came = np.array([[each[0] for each in pair] for pair in keys], np.int64)
     later = float(np.median((came - stamps) @ [-1, 1])) * 1e-6
     skew = float(np.median(stamps @ [-1, 1])) * 1e-6
-    if abs(later) > LATE_STEPS * 1e3 / (rate or np.inf):
+    if rate is not None and abs(later) > LATE_STEPS * 1e3 / rate:
         eye, other = ("right", "left") if later > 0 else ("left", "right")
         what = (
             f"{eye} pictures were recorded {abs(later):.0f} ms later than the {other} ones of the same "
-            "stamps: the clocks of the eyes differ, and pairs are of other moments"
+            "stamps: if they did not come so late, the eyes' clocks differ, and pairs are of other moments"
         )
         found.append(Finding("warning", what, DIFFER_FIX, {"clocks_differ_ms": round(later, 1)}))
     elif abs(skew) > SYNCHRONISED_MS:

@@ -80,12 +80,9 @@ def _read_contents(path: Path, changed: int) -> Contents:
             key = message.log_ns, _stamp(path, message)
             pictures.setdefault(message.topic, _Topic(message.type)).keys.append(key)
         elif message.type == CAMERA_INFO:
-            data = bytes(message.data)
-            if (
-                newest.get(message.topic) != data[STAMP_END:]
-                and len(infos.get(message.topic, ())) < MOST_INFOS
-            ):
-                infos.setdefault(message.topic, []).append((_stamp(path, message), data))
+            data, said = bytes(message.data), infos.setdefault(message.topic, [])
+            if newest.get(message.topic) != data[STAMP_END:] and len(said) < MOST_INFOS:
+                said.append((_stamp(path, message), data))
             newest[message.topic] = data[STAMP_END:]
     return Contents(types, pictures, infos)
 
@@ -207,13 +204,10 @@ def find_eyes(config: BagSource, contents: Contents) -> Eyes:
         UsageError: a named topic is missing or holds no pictures, or none or several pairs are there.
     """
     if config.geometry.layout != "separate":
-        if config.left is None and len(contents.pictures) != 1:
-            there = ", ".join(sorted(contents.pictures)) or "none"
-            raise UsageError(
-                f"source.left is missing: the topic that shows both eyes; picture topics: {there}"
-            )
-        both = next(iter(contents.pictures)) if config.left is None else config.left
-        both = _named(config, contents, "left", both)
+        named = [config.left] if config.left is not None else sorted(contents.pictures)
+        if len(named) != 1:
+            raise UsageError(f"source.left is missing, the topic of both eyes: {', '.join(named) or 'none'}")
+        both = _named(config, contents, "left", named[0])
         return Eyes(both, both)
     if config.left is not None:
         left = _named(config, contents, "left", config.left)
@@ -234,15 +228,6 @@ def find_eyes(config: BagSource, contents: Contents) -> Eyes:
         f"source.right, or where one topic shows both eyes source.left and source.geometry.layout. Picture "
         f"topics: {there}. (sags bag record takes both eyes, unless topics are named)"
     )
-
-
-def topics_of(config: BagSource) -> Eyes:
-    """The picture topics of a bag's eyes.
-
-    Raises:
-        UsageError, SagsError: see `find_eyes` and `read_contents`.
-    """
-    return find_eyes(config, read_contents(config.path))
 
 
 def _pairs(contents: Contents) -> Iterator[Eyes]:
@@ -285,7 +270,7 @@ def _named(config: BagSource, contents: Contents, key: str, name: str) -> str:
 # ---- calibration -----------------------------------------------------------------------------------------
 
 
-def read_rig(config: BagSource) -> StereoRig | None:
+def read_rig(config: BagSource, judged: bool = True) -> StereoRig | None:
     """The calibration in the bag's camera_info topics; None where both are missing or say nothing.
 
     Raises:
@@ -311,7 +296,8 @@ def read_rig(config: BagSource) -> StereoRig | None:
         side = "left" if left is None else "right"
         raise UsageError(f"{config.path} calibrates one eye only, the {side} one is missing; set rig")
     rig = StereoRig(config.path.stem, left, right)
-    refuse_errors(check_rig(rig), config.path)
+    if judged:
+        refuse_errors(check_rig(rig), config.path)
     return rig
 
 

@@ -28,55 +28,32 @@ class Seen(NamedTuple):
     tissue: Bool  # [H, W]
 
 
-def _world_to_camera(poses: F64) -> F64:
-    inverse = np.tile(np.eye(4), (len(poses), 1, 1))
-    turn = np.swapaxes(poses[:, :3, :3], -1, -2)
-    inverse[:, :3, :3] = turn
-    inverse[:, :3, 3] = -(turn @ poses[:, :3, 3, None])[..., 0]
-    return inverse
-
-
 READINGS: dict[str, Callable[[F64], F64]] = {  # to camera to world [N, 4, 4] with axes right, down, forward
     "opencv": lambda poses: poses,
     "llff": lambda poses: poses[..., [1, 0, 2, 3]] * [1, 1, -1, 1],  # down, right, back: imgs2poses
     "opengl": lambda poses: poses * [1, -1, -1, 1],  # right, up, back
-    "world_to_camera": _world_to_camera,
+    "world_to_camera": lambda poses: np.linalg.inv(poses).astype(np.float64),
 }
 
 
 def reading_that_fits(poses: F64, K: F64, look: Callable[[int], Seen]) -> str | None:
-    """Which of `READINGS` explains the pictures best; None where they do not tell, as of a camera that stands
-    still.
-
-    Args:
-        poses: [N, 4, 4] m, as the file has them.
-        look: gives a frame by its number.
-
-    Raises:
-        SagsError: a picture cannot be read.
-    """
+    """Which of `READINGS` of poses [N, 4, 4] (m) explains the frames that `look` gives by their numbers; None
+    where they do not tell, as of a camera that stands still."""
     if np.allclose(poses, poses[0], atol=1e-9):
         return None
     first, still, left = look(0), 0.0, dict.fromkeys(READINGS, 0.0)
-    told = 0
     for number in sorted({round(at) for at in np.linspace(1, len(poses) - 1, 8)}):
         ways = {name: _moved(first, read(poses)[[0, number]], K) for name, read in READINGS.items()}
         motion = float(np.nanmedian(np.linalg.norm(ways["opencv"] - _pixels(first.depth.shape), axis=-1)))
         if not MOVES[0] <= motion <= MOVES[1] * first.depth.shape[1]:
             continue
-        told, other = told + 1, look(number)
+        other = look(number)
         still += _difference(first, other, _pixels(first.depth.shape))
         for name, way in ways.items():
             left[name] += _difference(first, other, way)
     best = min(left, key=lambda name: left[name])
-    return best if told and left[best] < CLEARLY * min(still, *_others(left, best)) else None
-
-
-def _others(left: dict[str, float], best: str) -> list[float]:
-    """What the readings leave that differ from the best one."""
-    return [each for name, each in left.items() if name != best and each > left[best] * (1 + 1e-6)] or [
-        np.inf
-    ]
+    others = [each for each in left.values() if each > left[best] * (1 + 1e-6)]  # as of the best: the same
+    return best if left[best] < CLEARLY * min([still, *others]) else None
 
 
 def _pixels(shape: tuple[int, ...]) -> F64:

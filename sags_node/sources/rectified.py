@@ -35,14 +35,13 @@ def come_rectified(config: cfg.LaunchConfig) -> bool:
     if config.rectified is not None:
         return config.rectified
     if isinstance(source, cfg.BagSource):
-        from sags_node.sources.bags import topics_of
+        from sags_node.sources.bags import find_eyes, read_contents
 
-        return named_rectified(*topics_of(source))
-    if isinstance(source, cfg.Ros2Source):
-        return named_rectified(source.left, *([source.right] if source.geometry.layout == "separate" else []))
-    if isinstance(source, cfg.FoldersSource | cfg.VideosSource):
-        return named_rectified(*(path for path in (source.left, source.right) if path is not None))
-    return False
+        return named_rectified(*find_eyes(source, read_contents(source.path)))
+    if not isinstance(source, cfg.Ros2Source | cfg.FoldersSource | cfg.VideosSource):
+        return False
+    both = isinstance(source, cfg.Ros2Source) and source.geometry.layout != "separate"
+    return named_rectified(source.left, *([] if both or source.right is None else [source.right]))
 
 
 def named_rectified(*names: Path | str) -> bool:

@@ -57,7 +57,7 @@ class _BagPoses:
         self.track = PoseTrack(config.base, config.hand, kept=WHOLE)
         wanted = absolute(config.topic)
         seen: dict[str, str] = {}
-        wrong: list[str] = []  # messages that are no pose: at their time there is none, as in tf2
+        wrong, first_wrong = 0, ""  # messages that are no pose: at their time there is none, as in tf2
         for message in read_messages(source.path):
             topic = absolute(message.topic)
             seen[topic] = message.type
@@ -65,12 +65,11 @@ class _BagPoses:
                 try:
                     self.track.add(message.data, message.type, fixed=topic == STATIC)
                 except SagsError as error:
-                    wrong.append(f"{topic} at {message.log_ns * 1e-9:.3f} s: {error}")
+                    wrong += 1
+                    first_wrong = first_wrong or f"{topic} at {message.log_ns * 1e-9:.3f} s: {error}"
         if wrong:
-            log.warning(
-                "%s: %d messages are no pose and are left out, the first is %s; was the robot homed?",
-                *(source.path, len(wrong), wrong[0]),
-            )
+            said = "%s: %d messages are no pose and are left out, the first is %s; was the robot homed?"
+            log.warning(said, source.path, wrong, first_wrong)
         if seen.get(wanted) not in POSE_TYPES:
             there = ", ".join(sorted(name for name, kind in seen.items() if kind in POSE_TYPES)) or "none"
             raise UsageError(

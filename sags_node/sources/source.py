@@ -85,8 +85,9 @@ def open_source(
     return Replay(config, references=references)
 
 
-def recorded_rig(config: cfg.Source) -> StereoRig | None:
-    """The calibration that comes with the pictures; None where the launch file must name one.
+def recorded_rig(config: cfg.Source, judged: bool = True) -> StereoRig | None:
+    """The calibration that comes with the pictures; None where the launch file must name one. If it is not
+    `judged`, a bag's may be implausible.
 
     Raises:
         UsageError: it is missing, damaged or implausible.
@@ -102,7 +103,7 @@ def recorded_rig(config: cfg.Source) -> StereoRig | None:
     if isinstance(config, cfg.BagSource):
         from sags_node.sources import bags
 
-        return bags.read_rig(config)
+        return bags.read_rig(config, judged)
     if isinstance(config, cfg.Ros2Source):
         from sags_node.sources import ros2
 

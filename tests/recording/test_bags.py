@@ -14,6 +14,7 @@ from bag_files import KINDS, MS, ROS1, ROS2, START, picture, play
 from mcap.records import Schema
 from mcap.writer import Writer as McapWriter
 
+from sags_node.calibration.check import read_calibration
 from sags_node.config.launch_file import load_launch
 from sags_node.config.schema import BagSource
 from sags_node.errors import SagsError, UsageError
@@ -305,8 +306,10 @@ def test_one_eye_calibrated_or_nonsense_is_refused(tmp_path: Path) -> None:
     for _, message, _ in rows:
         if message.__msgtype__ == files.INFO:
             message.p[3] *= 1000
-    with pytest.raises(UsageError, match="looks like millimetres"):
-        read_rig(BagSource(path=files.write_rosbag2(tmp_path / "mm", rows)))
+    in_mm = files.write_rosbag2(tmp_path / "mm", rows)
+    with pytest.raises(UsageError, match=r"looks like millimetres.*--unit mm"):
+        read_rig(BagSource(path=in_mm))
+    assert read_calibration(in_mm, None, 1e-3).baseline == pytest.approx(files.BASELINE)  # sags calib convert
     for _, message, _ in rows:
         if message.__msgtype__ == files.INFO:
             message.k[:] = 0  # ROS: not calibrated
