@@ -139,7 +139,7 @@ def _opened(root: Path, name: str, rig: Path | None, cut: Cut | None) -> list[Re
         row = Recording(name, str(root), None, (), _weight(frames, once.width, once.height))
         return [row] if cut is None else _segments(row, once, cut)
     rig_name = None
-    if config.rig is None and recorded_rig(once) is None:
+    if config.rig is None and recorded_rig(once, judged=False) is None:
         found = rig or _nearest_calib(path, root)
         if found is None:
             raise UsageError("no calibration: name one with --rig, or put a folder calib beside it")

@@ -150,7 +150,9 @@ def check(
 def convert(
     path: Path, out: Path, size: tuple[int, int] | None, unit: str | None, scale: float, force: bool
 ) -> None:
-    """Write any known calibration, or that of a session, as left.yaml and right.yaml.
+    """Write any known calibration as left.yaml and right.yaml.
+
+    PATH may be a session, as a bag: its calibration is written.
 
     \b
     sags calib convert stereo_calib/ -o calib/mine --size 1280x720 --unit mm

@@ -112,7 +112,7 @@ def _name(launch: Path | str | None) -> str:
 def lacks_rig(config: LaunchConfig) -> bool:
     """Whether `open_session` would guess the calibration."""
     opens = isinstance(config.source, RecordedSource | V4l2Source | GstSource)  # by itself: nobody must send
-    return config.rig is None and opens and recorded_rig(config.source) is None
+    return config.rig is None and opens and recorded_rig(config.source, judged=False) is None
 
 
 def rig_of(config: LaunchConfig) -> StereoRig:

@@ -5,6 +5,7 @@ Imports config.
 
 from sags_node.rig.check import (
     Finding,
+    accept_rig,
     check_eyes,
     check_intrinsics,
     check_pair,
@@ -39,6 +40,7 @@ __all__ = [
     "MODELS",
     "Finding",
     "Form",
+    "accept_rig",
     "already_rectified",
     "check_eyes",
     "check_intrinsics",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +14,8 @@ from sags_node import geometry
 from sags_node.config.units import NAMES, fitting_units, in_metres
 from sags_node.errors import UsageError
 from sags_node.types import F64, Eye, StereoRig
+
+log = logging.getLogger(__name__)
 
 ENDOSCOPE_BASELINE = (0.003, 0.010)  # m
 LARGEST_BASELINE = 0.25  # m; more can only be another unit, as centimetres of an endoscope are
@@ -44,6 +47,20 @@ def refuse_errors(findings: list[Finding], where: Path | str) -> None:
     errors = [finding for finding in findings if finding.level == "error"]
     if errors:
         raise UsageError("\n".join(f"{where}: {error.what}; {error.fix}" for error in errors))
+
+
+def accept_rig(rig: StereoRig, where: Path | str) -> StereoRig:
+    """A rig that is to be used: what is odd about it is said.
+
+    Raises:
+        UsageError: it cannot be right.
+    """
+    findings = check_rig(rig)
+    refuse_errors(findings, where)
+    for finding in findings:
+        if finding.level == "warning":
+            log.warning("%s: %s; %s", where, finding.what, finding.fix)
+    return rig
 
 
 def check_rig(rig: StereoRig) -> list[Finding]:

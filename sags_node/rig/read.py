@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import replace
 from enum import Enum
 from pathlib import Path
@@ -11,11 +10,9 @@ import numpy as np
 
 from sags_node.errors import UsageError
 from sags_node.rig import opencv, ros, scikit_surgery
-from sags_node.rig.check import check_rig, refuse_errors
+from sags_node.rig.check import accept_rig
 from sags_node.rig.rig import rectified_rig
 from sags_node.types import StereoRig
-
-log = logging.getLogger(__name__)
 
 NOMINAL_BASELINE = 0.005  # m, of one camera alone, and of eyes that nobody has calibrated
 GUESSED_FOV = 60.0  # degrees across a picture: D4D has 58, the Hamlyn heart 44, da Vinci's scopes 60 to 70
@@ -39,13 +36,7 @@ def load_rig(path: Path) -> StereoRig:
     Raises:
         UsageError: it cannot be read, as `read_rig`, or `check_rig` finds an error.
     """
-    rig = read_rig(path)
-    found = check_rig(rig)
-    refuse_errors(found, path)
-    for finding in found:
-        if finding.level == "warning":
-            log.warning("%s: %s; %s", path, finding.what, finding.fix)
-    return rig
+    return accept_rig(read_rig(path), path)
 
 
 def load_camera(file: Path) -> StereoRig:
@@ -54,9 +45,7 @@ def load_camera(file: Path) -> StereoRig:
     Raises:
         UsageError: it cannot be read, or `check_rig` finds an error.
     """
-    rig = ros.read_one(Path(file), NOMINAL_BASELINE)
-    refuse_errors(check_rig(rig), file)
-    return rig
+    return accept_rig(ros.read_one(Path(file), NOMINAL_BASELINE), file)
 
 
 def guessed_rig(width: int, height: int) -> StereoRig:

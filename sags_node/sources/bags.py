@@ -21,7 +21,7 @@ from sags_node.messaging.topics import CAMERA_INFO
 from sags_node.recording.bag import BagMessage, read_messages
 from sags_node.recording.camera_info import Said, changes, in_force, read_eye
 from sags_node.recording.pictures import IMAGE_TYPES, decode_picture, header_stamp
-from sags_node.rig import check_rig, refuse_errors
+from sags_node.rig import accept_rig
 from sags_node.sources.bag_stamps import DIFFER_FIX, Key, judge_stamps, pair_messages
 from sags_node.sources.layout import Layout
 from sags_node.sources.pictures import RawPair, size_text
@@ -296,9 +296,7 @@ def read_rig(config: BagSource, judged: bool = True) -> StereoRig | None:
         side = "left" if left is None else "right"
         raise UsageError(f"{config.path} calibrates one eye only, the {side} one is missing; set rig")
     rig = StereoRig(config.path.stem, left, right)
-    if judged:
-        refuse_errors(check_rig(rig), config.path)
-    return rig
+    return accept_rig(rig, config.path) if judged else rig
 
 
 def _played(config: BagSource, contents: Contents, eyes: Eyes) -> I64:

@@ -16,7 +16,7 @@ from sags_node.messaging.security import RateLimitedLog
 from sags_node.messaging.topics import CAMERA_INFO
 from sags_node.recording.camera_info import read_eye
 from sags_node.recording.pictures import IMAGE_TYPES, decode_picture, header_stamp
-from sags_node.rig import check_rig, refuse_errors
+from sags_node.rig import accept_rig
 from sags_node.ros.endpoints import Reader
 from sags_node.ros.graph import Graph, receive_buffer
 from sags_node.sources.sent import SentPictures
@@ -195,9 +195,7 @@ def read_rig(config: Ros2Source, seconds: float = INFO_S) -> StereoRig | None:
         return None
     for eye in named.keys() - found.keys():
         raise UsageError(f"{named[eye]} says that its eye is not calibrated; set rig")
-    rig = StereoRig("ros2", found["left"], found["right"])
-    refuse_errors(check_rig(rig), graph.where())
-    return rig
+    return accept_rig(StereoRig("ros2", found["left"], found["right"]), graph.where())
 
 
 def _beside(topic: str) -> str:
