@@ -29,7 +29,7 @@ LEAST_SCALE = 0.004  # between the eyes: beyond it depth leans by more than matc
 SURE_SCALE = 4.0  # times its standard error
 EXPLAINED = 0.7  # px: where turn and scale leave more, the lenses are off too, and no scale fixes depth
 ROUNDS = 10
-ALIGNED = (1 / 2000, 1 / 600)  # of the width, median and 90 %: rows of pictures that were rectified
+ALIGNED = (0.35, 1.0)  # px of a picture 640 px wide, or smaller, median and 90 %: rows that were rectified
 WORSE = 2.0  # times: rows of these after they were rectified once more
 RECTIFIED = "rectified:=true"
 PICTURES_SWAPPED = "the pictures are swapped: the left ones come from the right camera"
@@ -111,7 +111,8 @@ def judge_rectified(rig: StereoRig, matches: F64) -> list[Finding]:
     if len(matches) < FEWEST_MATCHES or not rectifies(rig):
         return []
     before, after = rectified_rows(already_rectified(rig), matches), rectified_rows(rig, matches)
-    aligned = before.median <= ALIGNED[0] * rig.left.width and before.p90 <= ALIGNED[1] * rig.left.width
+    wide = max(rig.left.width / 640, 1.0)
+    aligned = before.median <= ALIGNED[0] * wide and before.p90 <= ALIGNED[1] * wide
     if not aligned or after.median < WORSE * before.median or after.p90 < WORSE * before.p90:
         return []
     what = (

@@ -11,6 +11,7 @@ from sags_node.types import StereoRig
 
 RECTIFIED, RAW = {"rect", "rectified"}, {"raw", "unrectified"}
 NOT = {"not", "non", "un", "no"}
+OF_PICTURES = {"image", "images", "img", "frames", "left", "right", "l", "r"}  # beside them rect is no rectum
 
 
 def as_pictures_come(rig: StereoRig, config: cfg.LaunchConfig) -> StereoRig:
@@ -50,13 +51,24 @@ def named_rectified(*names: Path | str) -> bool:
 
 
 def _says_rectified(name: Path | str) -> bool:
-    """The last part of a name that speaks of it counts: of a path it or its folder, of a topic any."""
-    parts = [name.parent.absolute().name, name.name] if isinstance(name, Path) else name.split("/")
-    for part in reversed(parts):
-        words = re.split(r"[^a-z]+", re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", part).lower())
-        at = next((k for k, word in enumerate(words) if word in RECTIFIED), None)
+    """The last part of a name that speaks of it counts: of a topic any; of a path itself, or its folder where
+    that is called after pictures, not after a case."""
+    parts = [
+        _words(part) for part in (name.absolute().parts[-2:] if isinstance(name, Path) else name.split("/"))
+    ]
+    if isinstance(name, Path) and set(parts[0]) - OF_PICTURES - RECTIFIED - NOT:
+        del parts[0]
+    for words in reversed(parts):
+        short = len(words) == 1 or OF_PICTURES & set(words)
+        at = next(
+            (k for k, word in enumerate(words) if word in RECTIFIED and (short or word != "rect")), None
+        )
         if at is not None:
             return at == 0 or words[at - 1] not in NOT
         if RAW & set(words):
             return False
     return False
+
+
+def _words(part: str) -> list[str]:
+    return re.findall("[a-z]+", re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", part).lower())

@@ -38,7 +38,11 @@ from sags_node.vision.rectify import Rectifier
         (Path("case/leftRectified"), True),
         (Path("hamlyn/rectified01/image01"), True),
         (Path("rectified.mp4"), True),
+        (Path("case/rect/left"), True),
         (Path("case/left"), False),
+        (Path("rect_resection/left"), False),
+        (Path("test_what_is_rectified/left"), False),
+        (Path("/data/rect_resection_3.mp4"), False),
         (Path("case/left_unrectified"), False),
         (Path("case/not_rectified/left"), False),
         (Path("case/rectified/left_raw"), False),
@@ -94,7 +98,7 @@ def test_what_is_rectified_already_is_never_rectified_twice(
 ) -> None:
     """By its name, or without one by its rows. A rectifier then has nothing to do, and depth is right."""
     rig, raw, rectified = scope
-    path, overrides = write(tmp_path / "rectified", rig, rectified, name)
+    path, overrides = write(tmp_path / "case", rig, rectified, name)
     session = open_session(path, [*overrides, "source.pace:=step"])
     np.testing.assert_array_equal(session.rig.right.K, rig.right.P[:, :3])
     assert session.rig.baseline == pytest.approx(rig.baseline)
@@ -105,7 +109,7 @@ def test_what_is_rectified_already_is_never_rectified_twice(
     assert all(finding.level != "error" for finding in check_folder(path))
     unlike = open_session(path, [*overrides, "rectified:=false", "source.pace:=step"])
     np.testing.assert_array_equal(unlike.rig.left.K, rig.left.K)  # whoever knows better has the last word
-    path, overrides = write(tmp_path / "raw", rig, raw, name.replace("rect_color", "raw").split("_rect")[0])
+    path, overrides = write(tmp_path / "other", rig, raw, name.replace("rect_color", "raw").split("_rect")[0])
     assert open_session(path, [*overrides, "source.pace:=step"]).rig.left.distortion.any()
 
 
